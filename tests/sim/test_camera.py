@@ -215,7 +215,7 @@ def test_a_folder_without_pictures_has_no_truth_about_them(tmp_path: Path) -> No
 
 
 def test_cameras_want_a_world_in_3d() -> None:
-    with pytest.raises(InputError, match="cameras want a world in 3D"):
+    with pytest.raises(InputError, match="cameras need a 3D world"):
         scene_by_name("hall", {"camera": {"enabled": True}})
 
 

@@ -1,4 +1,4 @@
-"""Simulated recordings of places where people, doors and cars move, with the truth of each beam."""
+"""Simulated recordings of places with people, doors and vehicles, with the truth of each beam."""
 
 from stillmap.sim.appearance import compute_static_color
 from stillmap.sim.options import (
@@ -30,12 +30,12 @@ __all__ = [
     "DoorOptions",
     "GroundOptions",
     "HeightOptions",
+    "ImageTruth",
     "Lane",
     "LaserOptions",
     "LidarOptions",
     "Light",
     "OdometryOptions",
-    "ImageTruth",
     "RigOptions",
     "RigSimulation",
     "RobotOptions",
@@ -45,13 +45,13 @@ __all__ = [
     "Thing",
     "TrafficOptions",
     "Truth",
+    "compute_static_color",
     "load_image_truth",
     "load_truth",
     "sample_mover",
     "scene_by_name",
     "simulate",
     "simulate_rig",
-    "compute_static_color",
     "write_rig",
     "write_simulation",
 ]

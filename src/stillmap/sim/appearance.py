@@ -1,9 +1,8 @@
-"""What the surfaces of simulated worlds look like: colours as functions of places.
+"""Appearance of simulated surfaces: colors as functions of position.
 
-What stands still is cut from a solid texture, as from a block of marble: its colour is a function
-of the place in the world alone, and so is the truth for any point of a model. Its lattices are
-turned against the world, so that no wall runs along them. What moves has patterns of its own, in
-the frames of its parts.
+Static surfaces have a solid texture: the color is a function of the position in the world alone,
+which gives the true color of any point of a model. Its lattices are rotated, so that no wall is
+parallel to them. Movers have patterns in the frames of their parts.
 """
 
 from typing import NamedTuple
@@ -18,8 +17,8 @@ Color = NDArray[np.uint8]
 
 _TURNED = (0.5257, 0.4142, 0.7321)  # rad, roll, pitch, yaw of the lattices
 _TILE, _CHIP, _STRIPE = 0.55, 0.17, 0.09  # m
-_FLOOR = 0.07  # m, up to where walls have a skirting
-_CHIPS, _STRIPES, _DRIFT = 0.10, 0.05, 0.08  # relative, how much they show
+_FLOOR = 0.07  # m, height of skirtings
+_CHIPS, _STRIPES, _DRIFT = 0.10, 0.05, 0.08  # relative contrast
 
 # red, green, blue of 255
 _WALLS = np.array(
@@ -58,13 +57,13 @@ _ZENITH, _HORIZON = np.array((120, 170, 232.0)), np.array((206, 226, 244.0))
 
 
 class SurfacePoints(NamedTuple):
-    """Places on one part of something that moves.
+    """Points on one part of a mover.
 
     Attributes:
         mover: its number.
-        form, half, z: of the part, as Solids have them.
-        local: (n, 3) metres ahead and to the left of the part's middle, and above its foot.
-        seed: as in `static_colour`.
+        form, half, z: of the part, see Solids.
+        local: (n, 3) metres ahead and to the left of the part's center, and above its foot.
+        seed: see `compute_static_color`.
     """
 
     mover: int
@@ -76,12 +75,12 @@ class SurfacePoints(NamedTuple):
 
 
 def compute_static_color(points: Float, seed: int, blur: Float | float = 0.0) -> Color:
-    """(n, 3) red, green, blue of what stands still at points (n, 3) in the world.
+    """(n, 3) RGB of static surfaces at points (n, 3) in the world.
 
     Args:
         points: metres, z up.
-        seed: of the world's colours, `colour_seed` in its truth.
-        blur: metres, (n,) or one for all: what is finer is averaged, as far off it is in a pixel.
+        seed: of the world's appearance, `colour_seed` in its truth.
+        blur: metres, (n,) or one for all: finer patterns are averaged, as within a distant pixel.
     """
     x, y, z = points.T
     q = points @ _rotation(*_TURNED).T
@@ -92,23 +91,23 @@ def compute_static_color(points: Float, seed: int, blur: Float | float = 0.0) ->
         [np.sin(0.9 * x + 0.5 * y + k) + np.sin(0.6 * y - 0.7 * x + 2 * k) for k in range(3)], 1
     )
     chip = _hash(np.floor(q / _CHIP), seed + 1)
-    light = _CHIPS * ((chip & 255) / 127.5 - 1.0) * _left(blur, _CHIP)
+    light = _CHIPS * ((chip & 255) / 127.5 - 1.0) * _contrast(blur, _CHIP)
     along = np.where(tile & 256, q[:, 0] + q[:, 1], q[:, 1] - q[:, 2])
-    light += _STRIPES * np.sin(2 * np.pi / _STRIPE * along) * _left(blur, _STRIPE)
+    light += _STRIPES * np.sin(2 * np.pi / _STRIPE * along) * _contrast(blur, _STRIPE)
     colour = base * (1.0 + light[:, None] + _DRIFT / 2 * drift)
-    return _rounded(colour)
+    return _to_uint8(colour)
 
 
 def compute_sky_color(direction: Float) -> Color:
-    """(n, 3) of the sky along directions (n, 3) of length one."""
+    """(n, 3) RGB of the sky along unit directions (n, 3)."""
     up = np.clip(direction[:, 2:], 0.0, 1.0)
-    return _rounded(_HORIZON + (_ZENITH - _HORIZON) * np.sqrt(up))
+    return _to_uint8(_HORIZON + (_ZENITH - _HORIZON) * np.sqrt(up))
 
 
 def compute_mover_color(kind: str, spot: SurfacePoints) -> Color:
-    """(n, 3) of places on what moves: "person", "door", "car", "forklift" or "thing"."""
+    """(n, 3) RGB of points on a "person", "door", "car", "forklift" or "thing"."""
     paint = {"person": _person, "door": _door, "thing": _thing}.get(kind, _vehicle)
-    return _rounded(paint(spot))
+    return _to_uint8(paint(spot))
 
 
 def _person(spot: SurfacePoints) -> Float:
@@ -121,11 +120,11 @@ def _person(spot: SurfacePoints) -> Float:
         colour = np.where(face[:, None], _SKIN, _HAIR)
         eyes = face & (np.abs(up - 0.55) < 0.07) & (np.abs(np.abs(around) - 0.45) < 0.16)
         return np.where(eyes[:, None], (20.0, 20.0, 30.0), colour)
-    one, other = _two(_CLOTHES, mover, seed)
+    one, other = _pick_colors(_CLOTHES, mover, seed)
     if z[0] <= 0.0:
         trousers = 0.55 * other * (1.0 + 0.25 * np.sin(8 * around))[:, None]
         return np.where((w < 0.09)[:, None], _SHOE, trousers)
-    pattern = _number(mover, seed + 7) % 3
+    pattern = _hash_number(mover, seed + 7) % 3
     bands, spokes = np.floor(w / 0.07), np.floor(around / (np.pi / 5))
     checked = (bands, spokes, bands + spokes)[pattern].astype(np.int64) % 2 == 0
     belt = (w < z[0] + 0.05)[:, None]
@@ -135,7 +134,7 @@ def _person(spot: SurfacePoints) -> Float:
 def _vehicle(spot: SurfacePoints) -> Float:
     mover, form, half, z, p, seed = spot
     u, v, w = p.T
-    paint = _two(_CARS, mover, seed)[0]
+    paint = _pick_colors(_CARS, mover, seed)[0]
     if form == BOX and half[0] <= 0.31 and z[0] <= 0.0:  # a wheel
         r = np.hypot(u, w - z[1] / 2)
         return np.where(((r < 0.16) & (np.abs(v) > half[1] - 1e-3))[:, None], _RIM, _TYRE)
@@ -161,29 +160,29 @@ def _door(spot: SurfacePoints) -> Float:
 
 
 def _thing(spot: SurfacePoints) -> Float:
-    one, other = _two(_CLOTHES, spot.mover, spot.seed)
+    one, other = _pick_colors(_CLOTHES, spot.mover, spot.seed)
     squares = np.floor(spot.local / 0.15 + 0.01).astype(np.int64).sum(axis=1)
     return np.where((squares % 2 == 0)[:, None], one, 0.7 * one + 0.3 * other)
 
 
-def _two(palette: Float, mover: int, seed: int) -> tuple[Float, Float]:
-    """Two colours that differ."""
-    first = _number(mover, seed) % len(palette)
-    step = 1 + _number(mover, seed + 3) % (len(palette) - 1)
+def _pick_colors(palette: Float, mover: int, seed: int) -> tuple[Float, Float]:
+    """Two different colors."""
+    first = _hash_number(mover, seed) % len(palette)
+    step = 1 + _hash_number(mover, seed + 3) % (len(palette) - 1)
     return palette[first], palette[(first + step) % len(palette)]
 
 
-def _rounded(colour: Float) -> Color:
+def _to_uint8(colour: Float) -> Color:
     out: Color = np.clip(np.rint(colour), 0, 255).astype(np.uint8)
     return out
 
 
-def _left(blur: Float, size: float) -> Float:
-    """What is left of the contrast of a pattern of that size."""
+def _contrast(blur: Float, size: float) -> Float:
+    """Remaining contrast of a pattern of that size."""
     return np.asarray(np.exp(-((blur / (0.35 * size)) ** 2)))
 
 
-def _number(value: int, seed: int) -> int:
+def _hash_number(value: int, seed: int) -> int:
     return int(_hash(np.array([[value, 0, 0]], float), seed)[0])
 
 

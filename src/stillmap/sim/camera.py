@@ -1,7 +1,4 @@
-"""Cameras: where they sit, where each pixel looks, and when pictures are taken.
-
-Pictures of a simulated world: rendered when they are read, each the same however often.
-"""
+"""Cameras: poses, pixel rays, image times; images are rendered on access, reproducibly."""
 
 import math
 from typing import NamedTuple
@@ -24,24 +21,22 @@ Float = NDArray[np.float64]
 
 Color = NDArray[np.uint8]
 
-_LATER = 0.31  # of the time between two scans: no picture is taken at a scan's stamp
+_OFFSET = 0.31  # of the scan period, from a scan's stamp to the first image
+_MAX_ITERATIONS = 50  # of Newton's method, to undistort
+_TOLERANCE = 1e-10  # of the focal length
 
-_STEPS = 50  # that undo a lens
-
-_EXACT = 1e-10  # of the focal length
-
-# x right, y down, z ahead in the camera, of x ahead, y left, z up
+# x right, y down, z ahead in the camera, from x ahead, y left, z up
 _AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 class ImageTimes(NamedTuple):
-    """N pictures, in the order of their stamps.
+    """Times of N images, in the order of their stamps.
 
     Attributes:
         stamp_ns: (N,) int64, by the clock of the scans.
         camera: (N,) int32.
-        scan: (N,) the last scan before.
-        seconds: (N,) after it.
+        scan: (N,) preceding scan.
+        seconds: (N,) after its stamp.
     """
 
     stamp_ns: NDArray[np.int64]
@@ -51,13 +46,13 @@ class ImageTimes(NamedTuple):
 
     @classmethod
     def of(cls, happening: Episode, o: CameraOptions) -> "ImageTimes":
-        """Pictures at an even rate while the robot scans."""
+        """Images at a constant rate during the recording."""
         motion, T = happening.motion, len(happening.motion.robot)
         step = 1.0 / (o.rate * motion.period)  # in scans
-        at = np.arange(_LATER, max(T - 1, _LATER), step)
+        at = np.arange(_OFFSET, max(T - 1, _OFFSET), step)
         scan = at.astype(np.int64)
         seconds = (at - scan) * motion.period
-        # rounded as the recorder rounds them, stamps of scans could lie on either side
+        # from exact stamps: rounded ones could lie on either side
         since = np.round(seconds * 1e9).astype(np.int64)
         stamp_ns = happening.exact_ns[scan] + since
         which = np.tile(np.arange(o.count, dtype=np.int32), len(at))
@@ -66,7 +61,7 @@ class ImageTimes(NamedTuple):
 
 
 def place_cameras(o: CameraOptions) -> tuple[Camera, ...]:
-    """The cameras; the centre of the first pixel is at (0, 0)."""
+    """The cameras; the center of the first pixel is at (0, 0)."""
     f = 0.5 * o.width / math.tan(0.5 * o.fov)
     K = np.array([[f, 0.0, 0.5 * (o.width - 1)], [0.0, f, 0.5 * (o.height - 1)], [0.0, 0.0, 1.0]])
     model = "plumb_bob" if o.distortion else ""
@@ -85,11 +80,11 @@ def place_cameras(o: CameraOptions) -> tuple[Camera, ...]:
 
 
 def compute_pixel_rays(camera: Camera, right: float = 0.0, down: float = 0.0) -> Float:
-    """(3, height, width) of length one: where each pixel looks, in the camera's frame.
+    """(3, height, width) unit ray of each pixel, in the camera frame.
 
     Args:
         camera: ideal, or of the model `plumb_bob`.
-        right, down: pixels beside their centres.
+        right, down: offset from the pixel centers, in pixels.
     """
     assert camera.K is not None
     u, v = np.arange(camera.width) + right, np.arange(camera.height) + down
@@ -105,10 +100,10 @@ def compute_pixel_rays(camera: Camera, right: float = 0.0, down: float = 0.0) ->
 
 
 def distort(xy: Float, distortion: Float) -> Float:
-    """(2, ...) where a lens k1, k2, p1, p2, k3 shows what an ideal one shows at (2, ...).
+    """(2, ...) distorted by a lens k1, k2, p1, p2, k3, from ideal image coordinates (2, ...).
 
-    Both in units of the focal length: Brown, "Decentering distortion of lenses", 1966, as OpenCV
-    writes it. Not the code that maps with pictures (`texture/lens.py`): each checks the other.
+    Both in units of the focal length: Brown, "Decentering distortion of lenses", 1966, in OpenCV's
+    form. Independent of `core/camera.py`, so that each checks the other.
     """
     k1, k2, p1, p2, k3 = distortion
     x, y = xy
@@ -126,11 +121,11 @@ def undistort(shown: Float, distortion: Float) -> Float:
     """The inverse of `bent`, by Newton's method.
 
     Raises:
-        InputError: the lens shows nothing there, or several things.
+        InputError: no ray, or several, meet such a point.
     """
     k1, k2, p1, p2, k3 = distortion
     xy = shown.copy()
-    for _ in range(_STEPS):
+    for _ in range(_MAX_ITERATIONS):
         x, y = xy
         rr = x * x + y * y
         radial, slope = 1.0 + rr * (k1 + rr * (k2 + rr * k3)), k1 + rr * (2 * k2 + rr * 3 * k3)
@@ -138,7 +133,7 @@ def undistort(shown: Float, distortion: Float) -> Float:
         yy = radial + 2.0 * y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x
         across = 2.0 * x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y
         left, size = shown - distort(xy, distortion), xx * yy - across * across
-        if np.abs(left).max() < _EXACT:
+        if np.abs(left).max() < _TOLERANCE:
             break
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             xy = (
@@ -146,24 +141,24 @@ def undistort(shown: Float, distortion: Float) -> Float:
                 + np.stack([yy * left[0] - across * left[1], xx * left[1] - across * left[0]])
                 / size
             )
-    if not (np.abs(left).max() < _EXACT and (size > 0).all() and (xx > 0).all()):
+    if not (np.abs(left).max() < _TOLERANCE and (size > 0).all() and (xx > 0).all()):
         hint = "a smaller camera.fov, or a larger camera.k2"
-        raise InputError("the camera's lens does not reach the corners of its pictures", hint=hint)
+        raise InputError("the camera's lens does not reach the corners of its images", hint=hint)
     return xy
 
 
-SKY = 65535  # in masks: nothing there
+SKY = 65535  # in masks
 
 MAX_MOVERS = SKY - 1
 
 
 class TrueImage(NamedTuple):
-    """One picture and its truth.
+    """An image and its truth.
 
     Attributes:
         colour: (h, w, 3) uint8.
-        mask: (h, w) uint16, 0: something that stands still, k + 1: mover k, `SKY`: nothing.
-        distance: (h, w) float32 metres along the pixel's ray; inf where nothing is.
+        mask: (h, w) uint16, 0: static, k + 1: mover k, `SKY`: nothing.
+        distance: (h, w) float32 metres along the pixel's ray; inf: nothing.
     """
 
     color: Color
@@ -172,12 +167,12 @@ class TrueImage(NamedTuple):
 
 
 class CameraSimulator:
-    """All pictures that the cameras of a world take.
+    """All images of the cameras of a world.
 
     Attributes:
-        images: as a recording has them.
-        T_world_camera: (N, 4, 4) from where each was taken.
-        colour_seed: of what they look like.
+        images: as in a recording.
+        T_world_camera: (N, 4, 4) pose of each.
+        colour_seed: of the appearance.
     """
 
     def __init__(self, world: World) -> None:
@@ -187,8 +182,8 @@ class CameraSimulator:
         self._world, self._options, self.colour_seed = world, o, happening.colour_seed
         self._shots = ImageTimes.of(happening, o)
         cameras = place_cameras(o)
-        # all alike
-        self._lenses = [_lens(cameras[0], *offset) for offset in _within_a_pixel(o.antialias)]
+        # identical cameras
+        self._lenses = [_lens(cameras[0], *offset) for offset in _subpixel_offsets(o.antialias)]
         T_base_camera = np.stack([c.T_base_camera for c in cameras if c.T_base_camera is not None])
         moment = world.moment(self._shots.scan, self._shots.seconds)
         self.T_world_camera = world.T_world_base(moment) @ T_base_camera[self._shots.camera]
@@ -198,13 +193,15 @@ class CameraSimulator:
         return len(self.images)
 
     def render(self, image: int) -> TrueImage:
-        """One picture with its truth.
+        """Render an image with its truth.
 
-        With several rays for each pixel, one that a mover touches is his, and the nearest of its
-        distances counts.
+        With several rays per pixel, the mask shows a mover that any of them hits, and the distance
+        is the least one.
         """
         moving = self._moving(image)
-        parts = [self._rendered(lens, self.T_world_camera[image], moving) for lens in self._lenses]
+        parts = [
+            self._render_once(lens, self.T_world_camera[image], moving) for lens in self._lenses
+        ]
         mask, distance = parts[0].mask, parts[0].distance
         total = parts[0].color.astype(np.float64)
         for one in parts[1:]:
@@ -212,7 +209,7 @@ class CameraSimulator:
             mask = np.where(theirs & (one.mask != SKY), one.mask, mask)
             distance = np.minimum(distance, one.distance)
             total += one.color
-        return TrueImage(self._developed(total / len(parts), image), mask, distance)
+        return TrueImage(self._expose(total / len(parts), image), mask, distance)
 
     def _colours(self, image: int) -> Color:
         return self.render(image).color
@@ -222,7 +219,7 @@ class CameraSimulator:
         moment = self._world.moment(np.array([scan]), self._shots.seconds[image : image + 1])
         return self._world.carried.at(moment, scan)
 
-    def _rendered(self, lens: Lens, T_world_camera: Float, moving: Solids) -> TrueImage:
+    def _render_once(self, lens: Lens, T_world_camera: Float, moving: Solids) -> TrueImage:
         world, R = self._world, T_world_camera[:3, :3]
         ceiling = world.happening.scene.heights.ceiling
         seen = renderer.render(
@@ -255,8 +252,8 @@ class CameraSimulator:
             spot = SurfacePoints(mover, *part, to_local(p, moving.pose[0, k]), self.colour_seed)
             colour[pixels] = appearance.compute_mover_color(kinds[mover], spot)
 
-    def _developed(self, colour: Float, image: int) -> Color:
-        """With the exposure and the noise of this picture."""
+    def _expose(self, colour: Float, image: int) -> Color:
+        """Apply the exposure and the noise of this image."""
         rng = np.random.default_rng((self.colour_seed, image))
         o = self._options
         gain = np.exp(o.exposure * rng.standard_normal())
@@ -270,7 +267,7 @@ def _lens(one: Camera, right: float, down: float) -> Lens:
     return Lens.of(compute_pixel_rays(one, right, down), one.K)
 
 
-def _within_a_pixel(n: int) -> list[tuple[float, float]]:
-    """Pixels beside its centre, of n x n rays."""
+def _subpixel_offsets(n: int) -> list[tuple[float, float]]:
+    """Offsets from the pixel center, in pixels, of n x n rays."""
     steps = ((np.arange(n) + 0.5) / n - 0.5).tolist()
     return [(right, down) for down in steps for right in steps]

@@ -1,4 +1,4 @@
-"""Everybody and everything moves, scan by scan: robot, people, doors, vehicles and things."""
+"""Motion of robot, people, doors, vehicles and movable objects, sampled at the scans."""
 
 import math
 from collections.abc import Callable
@@ -21,34 +21,33 @@ Float = NDArray[np.float64]
 Progress = Callable[[float], None]
 Rngs = tuple[np.random.Generator, np.random.Generator, np.random.Generator, np.random.Generator]
 
-_STEP = 0.1  # s, at most, between two positions of people and robot
-_ROBOT_MARGIN = 0.15  # m beyond its radius that the robot's way keeps from walls
+_MAX_STEP = 0.1  # s of a time step
+_ROBOT_MARGIN = 0.15  # m between the robot's footprint and walls along its route
 _PERSON_MARGIN = 0.1  # m
-_SLOWEST = 5.0  # times the time that the route takes undisturbed: then something holds the robot
-_STILL = 1e-6  # m
-_CARRIED = 20.0  # s, for which a robot that is carried elsewhere records nothing
-_SETTLING = 30.0  # s of a pause after which nobody is where he was: the rest is not acted out
+_MAX_DELAY = 5.0  # times the nominal time of the route, after which the robot is stuck
+_MIN_MOTION = 1e-6  # m
+_CARRY_TIME = 20.0  # s without scans while the robot is carried
+_MAX_SIMULATED_PAUSE = 30.0  # s; the rest of a pause is not simulated
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Where everything is at each of T scans.
+    """Poses of everything at each of T scans.
 
     Attributes:
         period: seconds from one scan to the next.
-        seconds: (T,) since the recording began.
-        carried: the first scan after the robot was carried elsewhere; T if it never is.
-        paused: the first scan after the robot stood without recording; T if it never does.
+        seconds: (T,) since the beginning of the recording.
+        carried: first scan after the robot was carried; T if it never was.
+        paused: first scan after the pause; T without a pause.
         robot: (T, 3) x, y in metres, theta in radians.
-        poses: (T, P, 3) the same of all movers: people, doors, vehicles, things; NaN where there
-            is no such thing.
-        kinds: (P) what each mover is.
-        people: what the laser sees of people.
-        outlines: what it sees of doors and vehicles.
-        things: what it sees of things: from one scan to the next they are elsewhere, or nowhere.
-        still: (K, 4) faces of those among all these that never moved.
+        poses: (T, P, 3) the same of all movers: people, doors, vehicles, things; NaN where absent.
+        kinds: (P) kind of each mover.
+        people: cross sections of people.
+        outlines: faces of doors and vehicles.
+        things: faces of movable objects, which change between scans.
+        still: (K, 4) faces of movers that never moved.
         sizes: (P, 2) metres, length and width of doors and vehicles; NaN of people and things.
-        moved: (P,) whether each mover is anywhere else at any time.
+        moved: (P,) whether each mover ever moved.
     """
 
     period: float
@@ -67,19 +66,19 @@ class Motion:
 
 
 def simulate_motion(scene: Scene, rngs: Rngs, tell: Progress) -> Motion:
-    """Let everything move, and note where it is at each scan.
+    """Simulate the motion of everything, and sample it at each scan.
 
     Args:
         scene: the world and all parameters.
-        rngs: for people, doors, vehicles, and the place that the robot is carried to.
-        tell: called now and then with the share that is done.
+        rngs: of people, doors, vehicles, and the place that the robot is carried to.
+        tell: called with the completed share.
 
     Raises:
         InputError: no room for the robot on its route or for the people, or the robot is held up.
     """
     world = _World(scene, rngs)
     o, rate = scene.robot, scene.scan_rate
-    steps = max(1, math.ceil(1.0 / (rate * _STEP) - 1e-9))
+    steps = max(1, math.ceil(1.0 / (rate * _MAX_STEP) - 1e-9))
     dt = 1.0 / (rate * steps)
     expected = o.scans or world.robot.nominal_time() * rate
     carried = None if o.carried_at is None else max(1, round(o.carried_at * expected))
@@ -89,7 +88,7 @@ def simulate_motion(scene: Scene, rngs: Rngs, tell: Progress) -> Motion:
         if len(log.robot) == carried:
             world.carry_robot(dt, rngs[3])
         if len(log.robot) == paused:
-            world.rest_robot(min(o.pause, _SETTLING), dt)
+            world.rest_robot(min(o.pause, _MAX_SIMULATED_PAUSE), dt)
         log.note(world)
         if len(log.robot) % 50 == 0:
             tell(min(len(log.robot) / expected, 1.0))
@@ -99,7 +98,7 @@ def simulate_motion(scene: Scene, rngs: Rngs, tell: Progress) -> Motion:
 
 
 class _Clock(NamedTuple):
-    """When T scans were taken; fields as in `Motion`."""
+    """Times of T scans; fields as in `Motion`."""
 
     period: float
     seconds: Float
@@ -110,16 +109,16 @@ class _Clock(NamedTuple):
 def _clock(T: int, period: float, carried: int | None, paused: int | None, pause: float) -> _Clock:
     scan = np.arange(T)
     first = [T if one is None else min(one, T) for one in (carried, paused)]
-    seconds = scan * period + _CARRIED * (scan >= first[0]) + pause * (scan >= first[1])
+    seconds = scan * period + _CARRY_TIME * (scan >= first[0]) + pause * (scan >= first[1])
     return _Clock(period, seconds, *first)
 
 
 class _World:
-    """Robot, people with what is seen of them, doors, vehicles and things of a scene."""
+    """State of robot, people, doors, vehicles and movable objects of a scene."""
 
     def __init__(self, scene: Scene, rngs: Rngs) -> None:
         start, o = np.array(scene.route[0], float), scene.robot
-        # an open leaf is in the way, a closed one opens for whoever comes
+        # an open leaf is an obstacle, a closed one opens
         leaves = [door.leaf(door.opened) for door in scene.leaves]
         self.things = MovableObjects(scene.things)
         solid = [
@@ -144,28 +143,28 @@ class _World:
         self._radius = o.radius
 
     def carry_robot(self, dt: float, rng: np.random.Generator) -> None:
-        """Take the robot to another place; everything else goes on, by steps of dt seconds."""
-        self.robot.put_down(rng, self._in_the_way())
-        self.rest_robot(_CARRIED, dt)
+        """Carry the robot to another place, while everything else moves in steps of dt seconds."""
+        self.robot.put_down(rng, self._obstacles())
+        self.rest_robot(_CARRY_TIME, dt)
 
     def rest_robot(self, seconds: float, dt: float) -> None:
-        """The robot stands for so long; everything else goes on, by steps of dt seconds."""
+        """Stop the robot, while everything else moves in steps of dt seconds."""
         for _ in range(round(seconds / dt)):
             self.robot.stand(dt)
-            self._others_step(dt)
+            self._step_others(dt)
 
     def step(self, dt: float) -> None:
-        """Everything goes on for dt seconds."""
-        self.robot.step(dt, self._in_the_way(), self._radius + BODY_RADIUS)
-        self._others_step(dt)
+        """Advance everything by dt seconds."""
+        self.robot.step(dt, self._obstacles(), self._radius + BODY_RADIUS)
+        self._step_others(dt)
 
-    def _in_the_way(self) -> Float:
-        """(N, 2) where people and corners of vehicles are."""
+    def _obstacles(self) -> Float:
+        """(N, 2) positions of people and corners of vehicles."""
         if not self.traffic.kinds:
             return self.crowd.xy
         return np.concatenate([self.crowd.xy, self.traffic.faces().reshape(-1, 2)])
 
-    def _others_step(self, dt: float) -> None:
+    def _step_others(self, dt: float) -> None:
         robot, crowd, contact = self.robot, self.crowd, self._radius + BODY_RADIUS
         crowd.step(dt, robot.pose, contact, robot.is_impatient)
         self.figures.step(dt, crowd, robot.pose[:2], self._radius)
@@ -183,7 +182,7 @@ class _World:
 def _is_done(scene: Scene, robot: Robot, scans: int, expected: float) -> bool:
     if scene.robot.scans is not None:
         return scans >= scene.robot.scans
-    if scans > _SLOWEST * expected + 100:
+    if scans > _MAX_DELAY * expected + 100:
         x, y, _ = robot.pose
         raise InputError(
             f"the robot gets stuck at ({x:.1f}, {y:.1f})",
@@ -219,7 +218,7 @@ class _Log:
             np.stack(self._xy), np.stack(self._heading), figures.semi_axes, figures.mover
         )
         poses, faces = np.stack(self._poses), np.stack(self._faces)
-        moved = np.any(np.ptp(poses, axis=0) > _STILL, axis=1)
+        moved = np.any(np.ptp(poses, axis=0) > _MIN_MOTION, axis=1)
         others = np.arange(persons, len(kinds), dtype=np.int32)
         mover = np.concatenate([others[:doors], np.repeat(others[doors:], 4)])
         moving = moved[mover]

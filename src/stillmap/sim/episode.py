@@ -1,4 +1,4 @@
-"""What happens in a scene, whichever sensor looks on, and what is known of it afterwards."""
+"""Everything in a scene that does not depend on the sensor: motion, stamps, odometry, truth."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -20,17 +20,17 @@ _FIRST_STAMP_NS = 1_000_000_000 * 10**9
 
 @dataclass(frozen=True, eq=False)
 class Episode:
-    """Everybody's motion, and what the robot's wheels say.
+    """Motion of robot and movers, and odometry.
 
     Attributes:
         scene: the world and all parameters.
-        seed: that of the generator, as far as it is known.
-        motion: where everything is at each of T scans.
-        walls: (W, 4) segments of everything that stands still: walls, glass, what never moved.
+        seed: of the generator; None where it is unknown.
+        motion: poses of everything at each of T scans.
+        walls: (W, 4) static segments: walls, glass, and everything that never moved.
         T_odom_base: (T, 3, 3) odometry.
-        sensor_rng: what a planar laser, or the first sensor in 3D, draws from.
-        body_rng: how tall people are, how the robot shakes, and what a second sensor in 3D draws.
-        colour_seed: what pictures look like; None: there are none.
+        sensor_rng: generator of a planar laser, or of the first 3D sensor.
+        body_rng: generator of body heights, vibration, and a second 3D sensor.
+        colour_seed: of the appearance; None without cameras.
     """
 
     scene: Scene
@@ -44,18 +44,18 @@ class Episode:
 
     @property
     def stamp_ns(self) -> NDArray[np.int64]:
-        """(T,) nanoseconds, as well as the recorder knows them."""
+        """(T,) recorded stamps in ns, rounded."""
         o, exact = self.scene.robot, self.exact_ns
         tick = max(1, round(o.stamp_rounding * 1e9))
         return _FIRST_STAMP_NS + (exact - _FIRST_STAMP_NS + tick // 2) // tick * tick
 
     @property
     def exact_ns(self) -> NDArray[np.int64]:
-        """(T,) the same, not rounded."""
+        """(T,) exact stamps in ns."""
         return _FIRST_STAMP_NS + np.round(self.motion.seconds * 1e9).astype(np.int64)
 
     def source(self, sensors: list[dict[str, Any]]) -> dict[str, Any]:
-        """What a recording says of where it is from."""
+        """Metadata of a recording."""
         name = self.scene.name
         return {"format": "simulation", "scene": name, "seed": self.seed, "sensors": sensors}
 
@@ -66,7 +66,7 @@ class Episode:
         T_world_base: Float,
         more: dict[str, Any] | None = None,
     ) -> Truth:
-        """The truth about beams; `more` is told of the scene after `mover_kinds`."""
+        """The truth about beams; `more` is added to the scene after `mover_kinds`."""
         motion = self.motion
         about = {
             **describe_scene(self.scene, self.seed),
@@ -83,12 +83,12 @@ class Episode:
 
 
 def simulate_episode(scene: Scene, rng: np.random.Generator, tell: Progress) -> Episode:
-    """Let everybody move and the odometry drift.
+    """Simulate motion and odometry.
 
     Args:
         scene: the world and all parameters.
-        rng: generators are spawned from it, for each kind of thing one.
-        tell: called now and then with the share that is done.
+        rng: one generator is spawned from it per kind of mover.
+        tell: called with the completed share.
 
     Raises:
         InputError: no room for the robot on its route or for the people, or the robot is held up.
@@ -101,13 +101,13 @@ def simulate_episode(scene: Scene, rng: np.random.Generator, tell: Progress) -> 
     T_odom_base = odometry.simulate_odometry(driven, scene.odometry, odometry_rng)
     T_odom_base = odometry.add_faults(T_odom_base, motion.seconds, scene.odometry, mishap_rngs[1])
     body_rng = rng.spawn(1)[0]
-    # spawned last, so that all else stays as it is without a camera
+    # spawned last, so that a camera changes nothing else
     seed_of_colours = int(rng.spawn(1)[0].integers(1 << 31)) if scene.camera.enabled else None
     return Episode(scene, seed, motion, walls, T_odom_base, sensor_rng, body_rng, seed_of_colours)
 
 
 def describe_scene(scene: Scene, seed: Any) -> dict[str, Any]:
-    """Name, seed and all parameters of a scene, JSON-able; its walls lie beside as an array."""
+    """Name, seed and all parameters of a scene as JSON; walls are written as an array."""
     parameters = dataclasses.asdict(scene)
     del parameters["walls"], parameters["kerbs"]
     unused: tuple[str, ...]

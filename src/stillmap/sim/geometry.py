@@ -1,9 +1,4 @@
-"""What a lidar can hit: upright faces that stand still, and solids that stand still or move.
-
-The ground: a paraboloid with pavements above it, and the ceiling, which follows it.
-
-The parts of cars, people, trees and the like, about their middles; metres.
-"""
+"""Geometry of 3D worlds: upright faces, solids, ground, and the parts of vehicles and people."""
 
 import math
 from collections.abc import Sequence
@@ -24,7 +19,7 @@ class Faces(NamedTuple):
 
     Attributes:
         ends: (F, 4) x0, y0, x1, y1 in metres.
-        z: (F, 2) metres above the street, their lower and upper edges, which follow its slope.
+        z: (F, 2) lower and upper edges in metres above the street, parallel to it.
         is_glass: (F,) bool.
     """
 
@@ -37,11 +32,11 @@ class Solids(NamedTuple):
     """P upright boxes, elliptic cylinders and ellipsoids, at n times or at all times (n = 1).
 
     Attributes:
-        pose: (n, P, 4) x, y of the middle in metres, heading in rad, height of the foot in metres.
+        pose: (n, P, 4) x, y of the center in metres, heading in rad, height of the foot in metres.
         form: (P,) BOX, CYLINDER or ELLIPSOID.
-        half: (P, 2) metres, half of what they measure along and across the heading.
-        z: (P, 2) metres above the foot, from where to where they reach.
-        mover: (P,) int32 whose part it is; -1: it stands still.
+        half: (P, 2) half extents along and across the heading, metres.
+        z: (P, 2) lower and upper end above the foot, metres.
+        mover: (P,) int32 mover of each; -1: static.
     """
 
     pose: Float
@@ -51,13 +46,13 @@ class Solids(NamedTuple):
     mover: NDArray[np.int32]
 
     def select(self, kept: NDArray[np.bool_] | NDArray[np.intp]) -> "Solids":
-        """Those that are kept."""
+        """A subset of the solids."""
         return Solids(
             self.pose[:, kept], self.form[kept], self.half[kept], self.z[kept], self.mover[kept]
         )
 
     def concatenate(self, others: "Solids") -> "Solids":
-        """These, and then others at the same times."""
+        """These solids followed by others at the same times."""
         return Solids(
             np.concatenate([self.pose, others.pose], axis=1),
             np.concatenate([self.form, others.form]),
@@ -68,7 +63,7 @@ class Solids(NamedTuple):
 
 
 class Part(NamedTuple):
-    """A solid as a part of something: where it sits on it, ahead and to the left, in metres.
+    """A solid as a part of an object, at an offset ahead and to the left, in metres.
 
     `half` and `z` as in Solids; `turn` in rad against the heading of the whole.
     """
@@ -82,11 +77,11 @@ class Part(NamedTuple):
 
 
 class Assembly(NamedTuple):
-    """Parts of things, each of which is carried by one of K carriers.
+    """Parts attached to K carriers.
 
     Attributes:
-        carrier: (P,) which one carries it.
-        offset: (P, 3) metres ahead and to the left of the carrier's middle, rad to the left.
+        carrier: (P,) carrier of each part.
+        offset: (P, 3) metres ahead and to the left of the carrier's center, rad to the left.
         form, half, z: see Solids.
         mover: see Solids.
     """
@@ -99,11 +94,11 @@ class Assembly(NamedTuple):
     mover: NDArray[np.int32]
 
     def at(self, poses: Float, foot: Float) -> Solids:
-        """Where all parts are.
+        """The solids of all parts.
 
         Args:
             poses: (n, K, 3) of the carriers: x, y in metres, heading in rad.
-            foot: (n, K) how high the floor is on which they stand, metres.
+            foot: (n, K) height of the floor below them, metres.
         """
         x, y, heading = np.moveaxis(poses, -1, 0)
         c, s = np.cos(heading)[:, self.carrier], np.sin(heading)[:, self.carrier]
@@ -116,7 +111,7 @@ class Assembly(NamedTuple):
 
 
 def assemble(parts: Sequence[tuple[int, int, Part]]) -> Assembly:
-    """The parts of things: number of the carrier, number of the mover, and the part itself."""
+    """Assemble parts, given with the numbers of carrier and mover."""
     return Assembly(
         np.array([carrier for carrier, _, _ in parts], np.int64),
         np.array([(p.ahead, p.aside, p.turn) for _, _, p in parts], float).reshape(-1, 3),
@@ -133,7 +128,7 @@ class Ground(NamedTuple):
     Attributes:
         slope: (2,) metres per metre.
         bend: (2,) per metre.
-        pavements: (R, 4) rectangles, their least and their greatest x and y: x0, y0, x1, y1.
+        pavements: (R, 4) rectangles x0, y0, x1, y1.
         kerb: metres.
     """
 
@@ -149,12 +144,12 @@ class Ground(NamedTuple):
         return cls(np.array(slope), np.array(bend), pavements, options.kerb)
 
     def level(self, x: Float, y: Float) -> Float:
-        """(...) metres, how high the street is at points (...), or would be under pavements."""
+        """(...) metres, height of the street at points (...), also below pavements."""
         (sx, sy), (bx, by) = self.slope, self.bend
         return np.asarray(x * (sx + bx / 2 * x) + y * (sy + by / 2 * y))
 
     def height(self, x: Float, y: Float) -> Float:
-        """(...) metres, what one stands on at points (...)."""
+        """(...) metres, height of the floor at points (...)."""
         return np.asarray(self.level(x, y) + self.kerb * self.is_paved(x, y))
 
     def is_paved(self, x: Float, y: Float) -> NDArray[np.bool_]:
@@ -165,17 +160,17 @@ class Ground(NamedTuple):
         return inside
 
     def gradient(self, x: Float, y: Float) -> tuple[Float, Float]:
-        """How steeply it rises to the east and to the north at points (...), metres per metre."""
+        """Slopes to the east and north at points (...), metres per metre."""
         (sx, sy), (bx, by) = self.slope, self.bend
         return np.asarray(sx + bx * x), np.asarray(sy + by * y)
 
     def distance(self, origin: Float, direction: Float, above: float = 0.0) -> Float:
-        """(...) metres along rays to the level that lies `above` that of the street; inf: never.
+        """(...) metres along rays to the surface `above` the street; inf: no intersection.
 
         Args:
             origin: (3, ...) metres.
-            direction: (3, ...) of length one.
-            above: metres; the level is met from above and from below alike.
+            direction: (3, ...) unit vectors.
+            above: metres; the surface is hit from both sides.
         """
         (x, y, z), (dx, dy, dz) = origin, direction
         gx, gy = self.gradient(x, y)
@@ -190,29 +185,21 @@ class Ground(NamedTuple):
         return np.asarray(np.where((root >= 0) & (t > 0), t, np.inf))
 
 
-VAN = 5.2  # m, cars that are longer are vans
-
-LEAF = 0.04  # m, how thick doors are
+VAN = 5.2  # m, minimum length of a van
+LEAF = 0.04  # m, thickness of doors
 
 _PANEL_HEIGHT = 2.0  # m
-
-_THIN = 0.2  # m, furniture that is thinner is a panel
-
-_LEG = 0.1  # m, what is smaller is the leg of a chair
-
+_THIN = 0.2  # m, maximum thickness of a panel
+_LEG = 0.1  # m, maximum size of a chair leg
 _SEAT = 0.45  # m
-
-_LAMP, _LAMP_RADIUS = 6.0, 0.1  # m, posts that are thinner are of lamps
-
-_CROWN = 9.0  # times as wide as its trunk
-
-_WIDEST = 7.0  # m, half of what a crown measures
-
-_BRANCHES = 2.3  # m, where crowns begin
+_LAMP, _LAMP_RADIUS = 6.0, 0.1  # m, height and maximum radius of lamp posts
+_CROWN = 9.0  # ratio of the radii of crown and trunk
+_MAX_CROWN = 7.0  # m, radius
+_BRANCHES = 2.3  # m, lower end of crowns
 
 
 def make_vehicle(length: float, width: float, kind: str) -> list[Part]:
-    """A car, a van or a forklift that heads along its length."""
+    """Parts of a car, van or forklift."""
     if kind == "forklift":
         return _forklift(length, width)
     half = width / 2
@@ -244,26 +231,23 @@ def _forklift(length: float, width: float) -> list[Part]:
 
 
 def make_leg(half: tuple[float, float], tall: float) -> list[Part]:
-    """One leg of a person so many metres tall."""
+    """A leg of a person `tall` metres tall."""
     return [Part(CYLINDER, 0.0, 0.0, half, (0.0, 0.48 * tall))]
 
 
 def make_torso_and_head(half: tuple[float, float], tall: float) -> list[Part]:
-    """What is above the legs."""
+    """Torso and head of a person."""
     torso = Part(CYLINDER, 0.0, 0.0, half, (0.46 * tall, 0.83 * tall))
     return [torso, Part(ELLIPSOID, 0.02, 0.0, (0.1, 0.08), (0.84 * tall, tall))]
 
 
 def make_door(width: float, height: float) -> list[Part]:
-    """A leaf."""
+    """A door leaf."""
     return [Part(BOX, 0.0, 0.0, (width / 2, LEAF / 2), (0.01, height))]
 
 
 def make_box(length: float, width: float, heights: HeightOptions) -> list[Part]:
-    """What is drawn as a box with sides along and across its heading.
-
-    Under the open sky what measures as much as a car is one; else it is furniture.
-    """
+    """Parts of a rectangle of the plan: a parked car under the open sky, else furniture."""
     if heights.ceiling is None and 3.8 <= length <= 6.0 and 1.5 <= width <= 2.3:
         return make_vehicle(length, width, "car")
     if max(length, width) < _LEG:
@@ -274,14 +258,14 @@ def make_box(length: float, width: float, heights: HeightOptions) -> list[Part]:
 
 
 def make_round_object(radius: float, heights: HeightOptions) -> list[Part]:
-    """What is drawn as a circle: a column; under the open sky a lamp post, or a tree."""
+    """Parts of a circle of the plan: a column; under the open sky a lamp post or a tree."""
     around = (radius, radius)
     if heights.ceiling is not None:
         return [Part(CYLINDER, 0.0, 0.0, around, (0.0, heights.ceiling))]
     if radius < _LAMP_RADIUS:
         lamp = Part(BOX, 0.0, 0.0, (0.35, 0.12), (_LAMP, _LAMP + 0.15))
         return [Part(CYLINDER, 0.0, 0.0, around, (0.0, _LAMP)), lamp]
-    crown = min(_CROWN * radius, _WIDEST)
+    crown = min(_CROWN * radius, _MAX_CROWN)
     tall = _BRANCHES + math.sqrt(crown) * 2.0
     trunk = Part(CYLINDER, 0.0, 0.0, around, (0.0, _BRANCHES + 0.5))
     return [trunk, Part(ELLIPSOID, 0.0, 0.0, (crown, crown), (_BRANCHES, tall))]

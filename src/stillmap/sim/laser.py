@@ -1,7 +1,7 @@
-"""What a laser scanner measures among walls and movers: exact ranges, then noise and losses.
+"""A planar laser: exact ranges to walls and movers, then noise and losses.
 
-A wall or a mover covers an interval of beams in each scan. Only those beams are intersected with
-it, for all scans at once, so the work grows with what is covered, not with beams times walls.
+A wall or mover covers an interval of beams in each scan. Only those beams are intersected with it,
+for all scans at once.
 """
 
 from dataclasses import dataclass
@@ -15,20 +15,20 @@ from stillmap.sim.options import LaserOptions
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-_CHUNK = 1000  # scans worked on together
-_EDGE = 1e-9  # beams, so that no ray slips between two walls that share a corner
-_NEAREST = 1e-3  # m, the laser sees nothing nearer
+_CHUNK = 1000  # scans processed at once
+_SLACK = 1e-9  # beams, so that no ray passes between two walls that share a corner
+_MIN_RANGE = 1e-3  # m
 
 
 @dataclass(frozen=True, eq=False)
 class Movers:
-    """What the laser sees of people: upright cylinders with elliptic outline.
+    """Cross sections of people: upright elliptic cylinders.
 
     Attributes:
         xy: (T, Q, 2) centres in metres at each scan.
         heading: (T, Q) direction of the first axis in radians.
         semi_axes: (Q, 2) metres.
-        mover: (Q,) whose part this is.
+        mover: (Q,) mover of each part.
     """
 
     xy: Float
@@ -39,12 +39,12 @@ class Movers:
 
 @dataclass(frozen=True, eq=False)
 class Outlines:
-    """What the laser sees of doors, vehicles and things: upright faces that move.
+    """Moving upright faces of doors, vehicles and movable objects.
 
     Attributes:
-        faces: (T, Q, 4) segments x0, y0, x1, y1 in metres at each scan. No beam meets one that
-            has no length.
-        mover: (Q,) whose face this is.
+        faces: (T, Q, 4) segments x0, y0, x1, y1 in metres at each scan. No beam hits one of length
+            0.
+        mover: (Q,) mover of each face.
     """
 
     faces: Float
@@ -52,12 +52,12 @@ class Outlines:
 
 
 class Returns(NamedTuple):
-    """The nearest thing on each beam.
+    """The nearest surface on each beam.
 
     Attributes:
-        range: (T, n) metres, inf where there is nothing.
-        wall: (T, n) int32 index of the wall that is hit, -1: none.
-        mover: (T, n) int32 id of the mover that is hit, -1: none.
+        range: (T, n) metres, inf without a hit.
+        wall: (T, n) int32 index of the wall, -1: none.
+        mover: (T, n) int32 id of the mover, -1: none.
     """
 
     range: Float
@@ -125,8 +125,8 @@ class _Scans:
         low = ((start - self.theta - self.first) % (2 * np.pi)) / self.step
         scans, beams = [], []
         for shift in (0.0, turn):
-            a = np.ceil(low - shift - _EDGE).astype(np.int64)
-            b = np.floor(low - shift + span / self.step + _EDGE).astype(np.int64)
+            a = np.ceil(low - shift - _SLACK).astype(np.int64)
+            b = np.floor(low - shift + span / self.step + _SLACK).astype(np.int64)
             a, b = np.maximum(a, 0), np.minimum(b, self.n - 1)
             count = np.maximum(b - a + 1, 0)
             scan = np.repeat(np.arange(len(low)), count)
@@ -138,7 +138,7 @@ class _Scans:
 
 
 def _within(reach: float, scans: _Scans, walls: Float) -> Index:
-    """The walls that come as near as `reach` to the box around all sensors."""
+    """Indices of walls within `reach` of the box around all sensors."""
     x, y = walls[:, ::2], walls[:, 1::2]
     near = (x.max(axis=1) >= scans.x.min() - reach) & (x.min(axis=1) <= scans.x.max() + reach)
     near &= (y.max(axis=1) >= scans.y.min() - reach) & (y.min(axis=1) <= scans.y.max() + reach)
@@ -150,7 +150,7 @@ def _cast_walls(
 ) -> None:
     flat, flat_which = ranges.reshape(-1), which.reshape(-1)
     for w in near.tolist():
-        flat_which[_lowered(scans, walls[w], flat)] = w
+        flat_which[_lower_ranges(scans, walls[w], flat)] = w
 
 
 def _cast_outlines(
@@ -158,11 +158,11 @@ def _cast_outlines(
 ) -> None:
     flat, flat_which = ranges.reshape(-1), which.reshape(-1)
     for q, mover in enumerate(outlines.mover):
-        flat_which[_lowered(scans, outlines.faces[part, q].T, flat)] = mover
+        flat_which[_lower_ranges(scans, outlines.faces[part, q].T, flat)] = mover
 
 
-def _lowered(scans: _Scans, face: Float, ranges: Float) -> Index:
-    """Lower flat ranges to a face (4,), or (4, T) if it moves; the beams that it is nearest on."""
+def _lower_ranges(scans: _Scans, face: Float, ranges: Float) -> Index:
+    """Lower flat ranges to a face (4,), or (4, T) if it moves; returns the beams that changed."""
     x0, y0, x1, y1 = face
     bearing = np.arctan2(y0 - scans.y, x0 - scans.x)
     other = np.arctan2(y1 - scans.y, x1 - scans.x)
@@ -172,7 +172,7 @@ def _lowered(scans: _Scans, face: Float, ranges: Float) -> Index:
     height = nx * (x0 - scans.x) + ny * (y0 - scans.y)
     with np.errstate(divide="ignore", invalid="ignore"):
         r = height[scan] / (nx[scan] * scans.cos[beam] + ny[scan] * scans.sin[beam])
-    nearer = (r > _NEAREST) & (r < ranges[beam])
+    nearer = (r > _MIN_RANGE) & (r < ranges[beam])
     ranges[beam[nearer]] = r[nearer]
     return np.asarray(beam[nearer])
 
@@ -194,7 +194,7 @@ def _cast_movers(
         A, B = dirx**2 + diry**2, ox * dirx + oy * diry
         rest = B**2 - A * (ox**2 + oy**2 - 1)
         r = np.where(rest >= 0, (-B - np.sqrt(np.maximum(rest, 0))) / A, np.inf)
-        nearer = (r > _NEAREST) & (r < flat[beam])
+        nearer = (r > _MIN_RANGE) & (r < flat[beam])
         flat[beam[nearer]] = r[nearer]
         flat_which[beam[nearer]] = movers.mover[q]
 
@@ -202,13 +202,13 @@ def _cast_movers(
 def simulate_measurement(
     exact: Returns, is_glass: NDArray[np.bool_], options: LaserOptions, rng: np.random.Generator
 ) -> tuple[Float, NDArray[np.bool_]]:
-    """Measured ranges (T, n) and whether something came back (T, n).
+    """Measured ranges (T, n) and whether each is a hit (T, n).
 
     Args:
-        exact: what the beams meet.
-        is_glass: (W,) which walls lose beams.
+        exact: exact returns.
+        is_glass: (W,) walls on which beams get lost.
         options: noise and losses. A beam without return gets options.max_range.
-        rng: noise and losses.
+        rng: of noise and losses.
     """
     lost = rng.random(exact.range.shape)
     share = np.full(exact.range.shape, options.no_return_share)
@@ -216,4 +216,4 @@ def simulate_measurement(
     share[on_wall] += is_glass[exact.wall[on_wall]] * options.glass_no_return_share
     noisy = exact.range + options.range_noise * rng.standard_normal(exact.range.shape)
     hit = (noisy < options.max_range) & (lost >= share)
-    return np.where(hit, np.maximum(noisy, _NEAREST), options.max_range), hit
+    return np.where(hit, np.maximum(noisy, _MIN_RANGE), options.max_range), hit

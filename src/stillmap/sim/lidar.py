@@ -1,4 +1,4 @@
-"""Sensors in 3D: where they look, from where, and what they measure."""
+"""3D sensors: beam patterns, poses and measurements."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -25,8 +25,8 @@ class Pattern(NamedTuple):
         azimuth: (n,) rad, rising, of the columns.
         elevation: (C,) rad, rising, of the channels.
         direction: (3, n, C) of length one.
-        seconds: (n,) after the scan's stamp, when each column looks.
-        off: rad, how far off its channel's elevation a beam may be.
+        seconds: (n,) time of each column after the stamp.
+        off: rad, maximum deviation of a beam from its channel's elevation.
     """
 
     azimuth: Float
@@ -37,7 +37,7 @@ class Pattern(NamedTuple):
 
     @classmethod
     def of(cls, o: LidarOptions) -> "Pattern":
-        """That of a lidar that turns to the left and begins each turn behind it."""
+        """Pattern of a lidar that turns to the left, from behind."""
         share = np.arange(o.columns) / o.columns
         azimuth = -np.pi + 2 * np.pi * share
         elevation = np.linspace(*o.field, o.channels)
@@ -54,7 +54,7 @@ class Pattern(NamedTuple):
 
     @classmethod
     def tilted(cls, o: LaserOptions, joint: Float, seconds: Float) -> "Pattern":
-        """That of a planar laser which at each of its beams is tilted by (n,) rad, nose down."""
+        """Pattern of a planar laser tilted by (n,) rad, nose down, at its beams."""
         angle = laser.compute_beam_angles(o.beams, o.fov)
         direction = np.stack(
             [np.cos(angle) * np.cos(joint), np.sin(angle), -np.cos(angle) * np.sin(joint)]
@@ -64,17 +64,17 @@ class Pattern(NamedTuple):
 
 
 class Sensor(NamedTuple):
-    """What records, and how.
+    """A sensor.
 
     Attributes:
-        name: for the recording.
+        name: in the recording.
         dimension: of its recording, 2 or 3.
         T_base_sensor: (4, 4).
         options: ranges, noise and losses.
         pattern: the beams of each scan.
-        takes_time: whether the beams of a scan are taken one after the other.
+        takes_time: whether the beams of a scan have different times.
         leaves_out: whether beams without return are left out.
-        own: what of the robot itself it sees.
+        own: returns from the robot itself.
     """
 
     name: str
@@ -97,7 +97,7 @@ def make_spinning_lidar(scene: Scene) -> Sensor:
 
 
 def make_rig_lasers(scene: Scene) -> tuple[Sensor, Sensor]:
-    """The laser of a scene, lying flat, and another one like it that tilts."""
+    """The laser of a scene, mounted horizontally, and an identical one that tilts."""
     o, rig = scene.laser, scene.rig
     angle = laser.compute_beam_angles(o.beams, o.fov)
     seconds = o.sweep_time * (angle - angle[0]) / o.fov
@@ -118,13 +118,13 @@ def make_rig_lasers(scene: Scene) -> tuple[Sensor, Sensor]:
 
 
 def compute_joint_angle(seconds: Float, rig: RigOptions) -> Float:
-    """(...) rad, nose down, of the laser that tilts; it begins in the middle, on its way down."""
+    """(...) rad, nose down, of the tilting laser; it starts at the mean, moving down."""
     share = (seconds / rig.period + 0.25) % 1.0
     return np.asarray(rig.middle + rig.amplitude * (1.0 - 4.0 * np.abs(share - 0.5)))
 
 
 def make_pose(xyz: Float, roll: Float, pitch: Float, yaw: Float) -> Float:
-    """(..., 4, 4) poses: turned by roll about x, then pitch about y, then yaw about z, in rad.
+    """(..., 4, 4) poses, rotated by roll about x, then pitch about y, then yaw about z.
 
     Args:
         xyz: (..., 3) metres.
@@ -142,13 +142,13 @@ def make_pose(xyz: Float, roll: Float, pitch: Float, yaw: Float) -> Float:
 def compute_robot_poses(
     robot: Float, ground: Ground, o: LidarOptions, rng: np.random.Generator
 ) -> Float:
-    """(T, 6) x, y, z, roll, pitch, yaw of a robot that stands on the ground and shakes.
+    """(T, 6) x, y, z, roll, pitch, yaw of a robot on the ground, with vibration.
 
     Args:
-        robot: (T, 3) x, y, theta in the plan.
-        ground: what it stands on.
-        o: how much it shakes.
-        rng: how it shakes.
+        robot: (T, 3) x, y, theta in the plane.
+        ground: the ground.
+        o: standard deviations of the vibration.
+        rng: of the vibration.
     """
     x, y, yaw = robot.T
     gx, gy = ground.gradient(x, y)
@@ -164,8 +164,8 @@ def transform_rays(pattern: Pattern, T_world_sensor: Float) -> Rays:
     """The beams of one turn in the world.
 
     Args:
-        pattern: the same in the sensor's frame.
-        T_world_sensor: (n, 4, 4) where the sensor is when each column looks, or (1, 4, 4).
+        pattern: the beams in the sensor frame.
+        T_world_sensor: (n, 4, 4) sensor pose at each column, or (1, 4, 4).
     """
     n = len(pattern.azimuth)
     R = T_world_sensor[:, :3, :3]
@@ -183,7 +183,7 @@ def transform_rays(pattern: Pattern, T_world_sensor: Float) -> Rays:
 
 
 def cast_robot_body(scene: Scene, pattern: Pattern, T_base_sensor: Float) -> RayReturns:
-    """What of the robot itself its lidar sees: a box as large as its footprint, or as given."""
+    """Returns from the robot itself: a box as large as its footprint, or as given."""
     o, radius = scene.lidar, scene.robot.radius
     top = max(o.z - o.roof_below, 0.1)
     ahead = radius if o.roof_length is None else 0.5 * o.roof_length
@@ -202,12 +202,12 @@ def cast_robot_body(scene: Scene, pattern: Pattern, T_base_sensor: Float) -> Ray
 def simulate_measurement(
     exact: RayReturns, o: LidarOptions | LaserOptions, rng: np.random.Generator
 ) -> tuple[Float, NDArray[np.bool_]]:
-    """Measured ranges (n, C) and whether something came back (n, C).
+    """Measured ranges (n, C) and whether each is a hit (n, C).
 
     Args:
-        exact: what the beams meet.
+        exact: exact returns.
         o: noise and losses. A beam without return gets o.max_range.
-        rng: noise and losses.
+        rng: of noise and losses.
     """
     lost = rng.random(exact.range.shape)
     noisy = exact.range + o.range_noise * rng.standard_normal(exact.range.shape)
@@ -217,7 +217,7 @@ def simulate_measurement(
 
 
 def lift_poses(poses: Float) -> Float:
-    """(T, 4, 4) of poses (T, 3, 3) in the plane."""
+    """(T, 4, 4) of planar poses (T, 3, 3)."""
     x, y, yaw = se2.parameters(poses).T
     still = np.zeros_like(x)
     return make_pose(np.stack([x, y, still], axis=-1), still, still, yaw)

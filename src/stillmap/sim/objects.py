@@ -1,7 +1,4 @@
-"""Things that are moved, brought and taken away: where each of them is, by the clock.
-
-Doors: leaves that swing open and shut by themselves, and for whoever wants to pass.
-"""
+"""Movable objects, placed by the clock, and doors, which open at random and for people."""
 
 from typing import NamedTuple
 
@@ -17,14 +14,13 @@ Float = NDArray[np.float64]
 
 
 class PlacedObjects(NamedTuple):
-    """Where P things are at T scans.
+    """P movable objects at T scans.
 
     Attributes:
-        poses: (T, P, 3) x, y in metres, yaw in rad; NaN where a thing is nowhere.
-        outlines: the faces of those that are not the same at all scans; of no length while a thing
-            is nowhere.
-        still: (K, 4) the faces of those that are.
-        moved: (P,) which are not the same at all scans.
+        poses: (T, P, 3) x, y in metres, yaw in rad; NaN where absent.
+        outlines: faces of those that move; of length 0 while absent.
+        still: (K, 4) faces of those that never move.
+        moved: (P,) whether each ever moves.
     """
 
     poses: Float
@@ -34,22 +30,22 @@ class PlacedObjects(NamedTuple):
 
 
 class MovableObjects:
-    """P things and all their places."""
+    """P movable objects and all their places."""
 
     def __init__(self, things: tuple[Thing, ...]) -> None:
         self._things = things
 
     def faces_at_all_places(self) -> Float:
-        """(K, 4) the faces of all things at all places where they ever stand."""
+        """(K, 4) faces of all objects at all their places."""
         faces = [place_faces(thing, stay) for thing in self._things for stay in thing.stays]
         return np.concatenate([np.empty((0, 4)), *faces])
 
     def place(self, seconds: Float, first: int) -> PlacedObjects:
-        """Where they are when scans are taken.
+        """Poses and faces at each scan.
 
         Args:
-            seconds: (T,) since the recording began.
-            first: the number of the first of them among all movers.
+            seconds: (T,) since the beginning of the recording.
+            first: mover number of the first object.
         """
         T, poses, still = len(seconds), [], [np.empty((0, 4))]
         moving, mover = [np.empty((T, 0, 4))], [np.empty(0, np.int32)]
@@ -73,28 +69,28 @@ class MovableObjects:
 
 
 def place_faces(thing: Thing, stay: Stay) -> Float:
-    """(K, 4) the faces of a thing in the world, as it stands during a stay."""
+    """(K, 4) faces of an object in the world during a stay."""
     return np.asarray(transform_faces(thing, np.array([[stay.x, stay.y, stay.yaw]]))[0])
 
 
 def transform_faces(thing: Thing, poses: Float) -> Float:
-    """(T, K, 4) the faces of a thing at poses (T, 3); of no length where these are NaN."""
+    """(T, K, 4) faces of an object at poses (T, 3); of length 0 where these are NaN."""
     T = se2.matrix(*poses.T)[:, None]
     ends = np.reshape(thing.faces, (-1, 2)).astype(float)
     moved = np.einsum("tkij,nj->tni", T[..., :2, :2], ends) + T[..., :2, 2]
     return np.asarray(np.nan_to_num(moved.reshape(len(poses), -1, 4)), np.float64)
 
 
-DOOR_RANGE = 3.0  # m before the doorway somebody's coming opens the door
+DOOR_RANGE = 3.0  # m from the doorway, at which a person opens the door
 
-_NEAR = 1.2  # m around the doorway's middle: no leaf closes while somebody is there
+_MIN_CLEARANCE = 1.2  # m from the doorway's center to people, for a leaf to close
 
 
 class Doors:
     """State of D doors.
 
     Attributes:
-        share: (D,) how far each is open, from 0 to 1.
+        share: (D,) opening, from 0 to 1.
         width: (D,) metres.
     """
 
@@ -111,7 +107,7 @@ class Doors:
         self._end, self._middle = self._hinge + leaf, self._hinge + leaf / 2
         self._opens = rng.random(D) < 0.5
         self.share = self._opens.astype(float)
-        self._left = rng.random(D) * [self._lasts(opens) for opens in self._opens.tolist()]
+        self._left = rng.random(D) * [self._draw_duration(opens) for opens in self._opens.tolist()]
 
     @property
     def angle(self) -> Float:
@@ -119,7 +115,7 @@ class Doors:
         return np.asarray(self._closed + self.share * self._sweep)
 
     def poses(self) -> Float:
-        """(D, 3) the middle of each leaf in metres and its direction in radians."""
+        """(D, 3) center of each leaf in metres and its direction in radians."""
         middle = self._hinge + self.width[:, None] / 2 * _direction(self.angle)
         return np.column_stack([middle, self.angle])
 
@@ -129,15 +125,15 @@ class Doors:
         return np.concatenate([self._hinge, end], axis=1)
 
     def step(self, dt: float, standing: Float, ways: Float) -> None:
-        """The leaves go on for dt seconds.
+        """Advance by dt seconds.
 
         Args:
             dt: seconds.
-            standing: (N, 2) where people and robot are, metres.
-            ways: (K, 4) the legs of the ways that they want to go next, x0, y0, x1, y1.
+            standing: (N, 2) positions of people and robot, metres.
+            ways: (K, 4) next segments of their paths, x0, y0, x1, y1.
         """
         delta = self._middle[:, None] - standing
-        near = np.any(np.hypot(delta[..., 0], delta[..., 1]) < _NEAR, axis=1)
+        near = np.any(np.hypot(delta[..., 0], delta[..., 1]) < _MIN_CLEARANCE, axis=1)
         passing = self._crossed_by(ways)
         self._left -= dt
         for door in np.flatnonzero(passing & ~self._opens).tolist():
@@ -150,15 +146,15 @@ class Doors:
 
     def _turn(self, door: int, opens: bool) -> None:
         self._opens[door] = opens
-        self._left[door] = self._lasts(opens)
+        self._left[door] = self._draw_duration(opens)
 
-    def _lasts(self, opens: bool) -> float:
+    def _draw_duration(self, opens: bool) -> float:
         o = self._options
         low, high = (o.min_open, o.max_open) if opens else (o.min_closed, o.max_closed)
         return float(np.exp(self._rng.uniform(np.log(low), np.log(high))))
 
     def _crossed_by(self, ways: Float) -> NDArray[np.bool_]:
-        """(D,) whether a leg of the ways (K, 4) goes through the doorway."""
+        """(D,) whether a path segment (K, 4) crosses the doorway."""
         start, end = ways[:, None, :2], ways[:, None, 2:]
         aside = _turned(self._hinge, self._end, start) * _turned(self._hinge, self._end, end)
         through = _turned(start, end, self._hinge) * _turned(start, end, self._end)
@@ -166,7 +162,7 @@ class Doors:
 
 
 def split_into_segments(corners: Float) -> Float:
-    """(N (K - 1), 4) the legs of N ways with K corners (N, K, 2)."""
+    """(N (K - 1), 4) segments of N paths with K corners (N, K, 2)."""
     return np.concatenate([corners[:, :-1], corners[:, 1:]], axis=-1).reshape(-1, 4)
 
 

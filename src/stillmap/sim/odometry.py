@@ -1,4 +1,4 @@
-"""Odometry of a differential drive: true motion, seen through imperfect wheels."""
+"""Odometry of a differential drive with imperfect wheels, stalls and resets."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +16,9 @@ def simulate_odometry(
 
     Between two scans the left and right wheel roll d -+ b theta / 2. They are misread by their
     own relative errors, turned back into d and theta with a wrong base b, and noise is added
-    whose variance grows with the way driven and turned, so that it does not depend on the scan
-    rate (Thrun, Burgard, Fox, Probabilistic Robotics, 5.4, with random-walk scaling). Wheels that
-    slip roll farther than the robot gets, one at a time, on short pieces of the way.
+    whose variance grows with the distance and angle, independent of the scan rate (Thrun, Burgard,
+    Fox, Probabilistic Robotics, 5.4, with random-walk scaling). A slipping wheel rolls farther than
+    the robot moves, on short parts of the path.
     """
     x, y, turn = se2.parameters(se2.inverse(T_world_base[:-1]) @ T_world_base[1:]).T
     # an arc as chord at half its angle
@@ -50,21 +50,20 @@ def simulate_odometry(
 def add_faults(
     T_odom_base: Float, seconds: Float, options: OdometryOptions, rng: np.random.Generator
 ) -> Float:
-    """What a recorder gets of odometry (T, 3, 3) that stalls and resets at times.
+    """Add stalls and resets to odometry (T, 3, 3).
 
-    While it stalls nothing moves; what the robot did meanwhile is not made up for. At a reset the
-    pose is the identity again, and what follows goes on from there.
+    Motion during a stall is lost for good. At a reset the pose returns to the identity.
 
     Args:
-        T_odom_base: the odometry, gone wrong no other way yet.
-        seconds: (T,) when the scans were taken.
-        options: how often.
-        rng: when.
+        T_odom_base: odometry without faults.
+        seconds: (T,) times of the scans.
+        options: rates.
+        rng: of the times.
     """
     if options.stall_rate > 0:
         moves = se2.parameters(se2.inverse(T_odom_base[:-1]) @ T_odom_base[1:])
         moves[_stalls(seconds, options, rng)] = 0.0
-        T_odom_base = _chained(moves)
+        T_odom_base = _chain(moves)
     count = min(options.resets, len(T_odom_base) - 1)
     for scan in np.sort(rng.choice(np.arange(1, len(seconds)), count, replace=False)).tolist():
         again = se2.inverse(T_odom_base[scan]) @ T_odom_base[scan:]
@@ -73,7 +72,7 @@ def add_faults(
 
 
 def remove_jump(T_world_base: Float, scan: int) -> Float:
-    """Poses (T, 3, 3) as if nobody had moved the robot before `scan`, if there is such a scan."""
+    """Poses (T, 3, 3) without the jump before `scan`, if there is such a scan."""
     if scan >= len(T_world_base):
         return T_world_base
     back = T_world_base[scan - 1] @ se2.inverse(T_world_base[scan])
@@ -83,7 +82,7 @@ def remove_jump(T_world_base: Float, scan: int) -> Float:
 def _stalls(
     seconds: Float, options: OdometryOptions, rng: np.random.Generator
 ) -> NDArray[np.bool_]:
-    """(T - 1,) whether the odometry misses what the robot does between two scans."""
+    """(T - 1,) whether odometry misses the motion between two scans."""
     often = rng.poisson(options.stall_rate / 60 * (seconds[-1] - seconds[0]))
     stalls = np.zeros(len(seconds) - 1, bool)
     for begin in rng.uniform(seconds[0], seconds[-1], often).tolist():
@@ -91,8 +90,8 @@ def _stalls(
     return stalls
 
 
-def _chained(moves: Float) -> Float:
-    """(T, 3, 3) poses from the identity on, for moves (T - 1, 3) each in the frame before it."""
+def _chain(moves: Float) -> Float:
+    """(T, 3, 3) poses from the identity on, for relative moves (T - 1, 3)."""
     heading = np.concatenate([[0.0], np.cumsum(moves[:, 2])])
     c, s = np.cos(heading[:-1]), np.sin(heading[:-1])
     x, y = moves[:, 0], moves[:, 1]
@@ -102,7 +101,7 @@ def _chained(moves: Float) -> Float:
 
 
 def _slips(way: Float, options: OdometryOptions, rng: np.random.Generator) -> Float:
-    """(2, T - 1) how much farther than the robot each wheel rolls, relative to the way (T - 1,)."""
+    """(2, T - 1) excess roll of each wheel, relative to the distance (T - 1,)."""
     extra = np.zeros((2, len(way)))
     ends = np.cumsum(way)
     for begin in np.flatnonzero(rng.random(len(way)) < options.slip_rate * way).tolist():

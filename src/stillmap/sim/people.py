@@ -1,7 +1,4 @@
-"""People who walk from place to place, stop at times, and keep clear of walls and one another.
-
-What a laser at knee or waist height sees of a person: two swinging legs, or a body.
-"""
+"""People: a social-force crowd that walks between places, and the legs and bodies of each."""
 
 from typing import Literal
 
@@ -14,19 +11,14 @@ from stillmap.sim.planner import FreeSpace, Planner
 
 Float = NDArray[np.float64]
 
-BODY_RADIUS = 0.26  # m, nobody comes nearer to a wall
+BODY_RADIUS = 0.26  # m, minimum distance from walls
 
-_PLACES = 80  # where people want to go
-
+_PLACES = 80  # goals that people walk to
 _PERSONAL = 0.7  # m between two people passing
-
-_REACTION = 0.4  # s until somebody walks as he wants to
-
-_ARRIVED = 0.45  # m
-
+_REACTION = 0.4  # s, time constant of the velocity
+_ARRIVED = 0.45  # m from a goal
 _STUCK_AFTER = 4.0  # s without half a metre of progress
-
-_FIRST_GAP = 1.5  # m between the robot and anybody when it starts
+_MIN_START_DISTANCE = 1.5  # m from the robot to people at the start
 
 
 class Crowd:
@@ -34,8 +26,8 @@ class Crowd:
 
     Attributes:
         xy: (P, 2) positions.
-        heading: (P,) where they face.
-        speed: (P,) how fast they walk now.
+        heading: (P,) rad.
+        speed: (P,) current speed.
     """
 
     def __init__(
@@ -49,12 +41,12 @@ class Crowd:
         P = options.people
         self._options, self._space, self._planner, self._rng = options, space, planner, rng
         places = rng.choice(planner.nodes, min(_PLACES, len(planner.nodes)), replace=False)
-        self._places = [_in_part(planner, places, k) for k in range(planner.parts)]
+        self._places = [_goals_in_part(planner, places, k) for k in range(planner.parts)]
         self.xy = self._start(P, robot)
         self.heading = rng.uniform(-np.pi, np.pi, P)
         self._velocity = np.zeros((P, 2))
         self._wanted_speed = rng.uniform(options.min_speed, options.max_speed, P)
-        # a fixed number of people who stop, so that a share means what it says in small crowds
+        # a fixed number, so that the share holds in small crowds
         self._stops = rng.permutation(P) < round(options.stopping_share * P)
         self._stop_left = np.zeros(P)
         self._routes: list[list[Float]] = [[] for _ in range(P)]
@@ -68,10 +60,10 @@ class Crowd:
         return np.asarray(np.hypot(*self._velocity.T))
 
     def next_corners(self, reach: float) -> Float:
-        """(P, 3, 2) where everybody is, and the next two corners of their ways, as far as `reach`.
+        """(P, 3, 2) positions and the next two corners of the paths, cut off at `reach` metres.
 
         Args:
-            reach: metres to go from where they are.
+            reach: metres along the path.
         """
         following = [r[0] if r else t for r, t in zip(self._routes, self._target, strict=True)]
         corners = np.stack([self.xy, self._target, np.reshape(following, (-1, 2))], axis=1)
@@ -83,13 +75,13 @@ class Crowd:
         return corners
 
     def step(self, dt: float, robot: Float, contact: float, robot_waits: bool) -> None:
-        """Everybody goes on for dt seconds.
+        """Advance by dt seconds.
 
         Args:
             dt: seconds.
             robot: (3,) its pose x, y, theta.
-            contact: m, no centre of a body comes nearer to the robot's centre.
-            robot_waits: it has lost patience: whoever stands in its way stops standing.
+            contact: m, minimum distance from people to the robot's center.
+            robot_waits: the robot is impatient: people who stand in its way walk on.
         """
         if not len(self.xy):
             return
@@ -102,11 +94,11 @@ class Crowd:
         self._accelerate(dt, robot, from_robot, distance, contact)
         self._move(dt, robot[:2], contact)
         self._turn(dt)
-        self._free_the_stuck(dt)
+        self._reroute_stuck(dt)
 
     def _start(self, P: int, robot: Float) -> Float:
         nodes = self._planner.point(self._planner.nodes)
-        nodes = nodes[np.hypot(*(nodes - robot).T) > _FIRST_GAP]
+        nodes = nodes[np.hypot(*(nodes - robot).T) > _MIN_START_DISTANCE]
         taken = np.empty((P, 2))
         for person in range(P):
             if not len(nodes):
@@ -116,12 +108,12 @@ class Crowd:
         return taken
 
     def _set_off(self, person: int) -> None:
-        """Choose a place to go to; those who stop do it anywhere on the way there."""
+        """Choose a goal; people who stop do so anywhere on the path."""
         part = int(self._planner.part_of(self._planner.node(self.xy[person])))
         path = self._planner.path(self.xy[person], int(self._rng.choice(self._places[part])))
         if self._stops[person]:
-            path = _first_part(self.xy[person], path, self._rng.uniform(0.2, 1.0))
-        # people keep to their own line, not all to the same one
+            path = _cut_path(self.xy[person], path, self._rng.uniform(0.2, 1.0))
+        # people do not all walk on the same line
         shifted = path + self._rng.uniform(-0.5, 0.5, path.shape)
         clear, _ = self._space.clearance_at(shifted)
         path = np.where((clear > 2 * BODY_RADIUS)[:, None], shifted, path)
@@ -146,17 +138,17 @@ class Crowd:
         way /= np.maximum(np.hypot(*way.T), 1e-6)[:, None]
         stands = self._stop_left > 0
         wanted = way * (self._wanted_speed * ~stands)[:, None]
-        push = self._push_of_others(way) + self._push_of_walls()
-        # those who stand only give way when somebody comes really close
+        push = self._repulsion_of_others(way) + self._repulsion_of_walls()
+        # who stands gives way only at close distance
         push[stands & (np.hypot(*push.T) < 0.5)] = 0.0
-        push += _push_of_robot(robot, from_robot, distance, contact)
+        push += _repulsion_of_robot(robot, from_robot, distance, contact)
         self._velocity += (wanted + push - self._velocity) * min(dt / _REACTION, 1.0)
         limit = np.maximum(self._wanted_speed, 0.7)
         speed = np.hypot(*self._velocity.T)
         self._velocity *= np.minimum(1.0, limit / np.maximum(speed, 1e-9))[:, None]
         self._velocity[stands & (speed < 0.05)] = 0.0
 
-    def _push_of_others(self, way: Float) -> Float:
+    def _repulsion_of_others(self, way: Float) -> Float:
         delta = self.xy[:, None] - self.xy
         distance = np.hypot(delta[..., 0], delta[..., 1])
         np.fill_diagonal(distance, 9.0)
@@ -168,25 +160,25 @@ class Crowd:
         push += right * (facing * strength).sum(axis=1)[:, None]
         return np.asarray(push)
 
-    def _push_of_walls(self) -> Float:
+    def _repulsion_of_walls(self) -> Float:
         clear, gradient = self._space.clearance_at(self.xy)
         return gradient * np.exp((BODY_RADIUS - clear) / 0.08)[:, None]
 
     def _move(self, dt: float, robot: Float, contact: float) -> None:
         xy = self.xy + self._velocity * dt
-        xy = self._off_the_walls(xy)
+        xy = self._push_out_of_walls(xy)
         delta = xy - robot
         distance = np.hypot(*delta.T)
         touching = distance < contact
         xy[touching] = robot + delta[touching] * (1.001 * contact / distance[touching])[:, None]
         clear, _ = self._space.clearance_at(xy)
-        # the robot has checked that nobody has to move for it: staying is always possible
+        # the robot keeps its distance from everybody: staying is always possible
         blocked = clear < BODY_RADIUS
         xy[blocked] = self.xy[blocked]
         self._velocity = (xy - self.xy) / dt
         self.xy = xy
 
-    def _off_the_walls(self, xy: Float) -> Float:
+    def _push_out_of_walls(self, xy: Float) -> Float:
         clear, gradient = self._space.clearance_at(xy)
         missing = np.maximum(1.02 * BODY_RADIUS - clear, 0.0)
         length = np.maximum(np.hypot(*gradient.T), 0.3)
@@ -198,7 +190,7 @@ class Crowd:
         turn = (direction - self.heading + np.pi) % (2 * np.pi) - np.pi
         self.heading = self.heading + np.where(walks, turn * min(dt / 0.3, 1.0), 0.0)
 
-    def _free_the_stuck(self, dt: float) -> None:
+    def _reroute_stuck(self, dt: float) -> None:
         moved = np.hypot(*(self.xy - self._last_seen).T) > 0.5
         self._stuck_for += dt
         fresh = moved | (self._stop_left > 0)
@@ -209,15 +201,15 @@ class Crowd:
             self._set_off(person)
 
 
-def _in_part(planner: Planner, places: NDArray[np.int64], part: int) -> NDArray[np.int64]:
-    """The places in a part; a part too small for any has all of its nodes."""
+def _goals_in_part(planner: Planner, places: NDArray[np.int64], part: int) -> NDArray[np.int64]:
+    """The goals in a part of free space; all its nodes where it has none."""
     inside = places[planner.part_of(places) == part]
     every = planner.nodes
     return inside if len(inside) else np.asarray(every[planner.part_of(every) == part])
 
 
-def _push_of_robot(robot: Float, from_robot: Float, distance: Float, contact: float) -> Float:
-    """People keep away from the robot and step out of the lane ahead of it."""
+def _repulsion_of_robot(robot: Float, from_robot: Float, distance: Float, contact: float) -> Float:
+    """Repulsion from the robot, and sideways out of its path."""
     away = from_robot / np.maximum(distance, 1e-6)[:, None]
     push = away * np.exp((contact + 0.3 - distance) / 0.2)[:, None]
     ahead = np.array([np.cos(robot[2]), np.sin(robot[2])])
@@ -228,8 +220,8 @@ def _push_of_robot(robot: Float, from_robot: Float, distance: Float, contact: fl
     return np.minimum(np.maximum(push, -2.0), 2.0)
 
 
-def _first_part(start: Float, path: Float, share: float) -> Float:
-    """The corners of the first `share` of a way, which ends between two of them."""
+def _cut_path(start: Float, path: Float, share: float) -> Float:
+    """The corners of the first `share` of a path, cut between two of them."""
     corners = np.concatenate([start[None], path])
     lengths = np.hypot(*np.diff(corners, axis=0).T)
     ends = np.cumsum(lengths)
@@ -243,12 +235,12 @@ def _first_part(start: Float, path: Float, share: float) -> Float:
 class Figures:
     """Legs and bodies of a crowd.
 
-    During one half of the gait a foot goes back under the body as fast as the body goes on, so
-    that it stands still on the floor, while the other swings forward; then they change over.
+    In the stance half of the gait a foot is at rest on the floor, moving back relative to the body,
+    while the other one swings forward.
 
     Attributes:
         semi_axes: (Q, 2) metres, along and across the heading; a person has one part or two.
-        mover: (Q,) int32, whose part this is: first left legs, then right ones, then bodies.
+        mover: (Q,) int32, person of each part: left legs, right legs, then bodies.
     """
 
     def __init__(
@@ -277,11 +269,11 @@ class Figures:
         self._side = np.repeat([1.0, -1.0, 0.0], [len(legs), len(legs), len(bodies)])
 
     def step(self, dt: float, crowd: Crowd, robot: Float, radius: float) -> None:
-        """The gait goes on for dt seconds; steps get short close to walls and to the robot.
+        """Advance the gait by dt seconds; steps are short near walls and the robot.
 
         Args:
             dt: seconds.
-            crowd: where everybody is and how fast they walk.
+            crowd: positions and speeds.
             robot: (2,) the robot's position, metres.
             radius: m, of the robot.
         """
@@ -293,7 +285,7 @@ class Figures:
         self._phase += np.pi * crowd.speed * dt / (2 * np.maximum(self._half_step, 0.1))
 
     def parts(self, crowd: Crowd) -> tuple[Float, Float]:
-        """Centres (Q, 2) and headings (Q,) of all parts."""
+        """Centers (Q, 2) and headings (Q,) of all parts."""
         heading = crowd.heading[self.mover]
         phase = self._phase[self.mover] + np.where(self._side < 0, np.pi, 0.0)
         # 1 to -1 in the stance half, back in the swing half

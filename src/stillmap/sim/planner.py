@@ -1,4 +1,4 @@
-"""Where there is room between walls, and the shortest way through it."""
+"""Clearance grid of free space, and shortest paths through it."""
 
 from functools import cached_property
 from typing import Any
@@ -14,9 +14,9 @@ Float = NDArray[np.float64]
 _SPACING = 0.1  # m between nodes of the clearance grid
 _STRIDE = 2  # the planner uses every second node
 _MARGIN = 0.5  # m around the walls
-_FARTHEST = 1.5  # m: farther away nobody minds a wall
-_LOOK_AHEAD = 80  # nodes that a shortcut may skip
-_NEAR_WALL_COST = 0.6  # how much longer a metre along a wall feels than one in the open
+_MAX_CLEARANCE = 1.5  # m
+_MAX_SHORTCUT = 80  # nodes
+_NEAR_WALL_COST = 0.6  # additional cost of a metre along a wall
 
 
 def compute_segment_distance(points: Float, segment: Float) -> Float:
@@ -39,14 +39,14 @@ class FreeSpace:
         ends = walls.reshape(-1, 2)
         self.origin = ends.min(axis=0) - _MARGIN
         size = np.ceil((ends.max(axis=0) + _MARGIN - self.origin) / _SPACING).astype(int) + 1
-        self.clearance: Float = np.full((size[1], size[0]), _FARTHEST)
+        self.clearance: Float = np.full((size[1], size[0]), _MAX_CLEARANCE)
         for wall in walls:
-            self._lower_around(wall)
+            self._add_wall(wall)
 
-    def _lower_around(self, wall: Float) -> None:
+    def _add_wall(self, wall: Float) -> None:
         ends = wall.reshape(2, 2)
-        low = (ends.min(axis=0) - _FARTHEST - self.origin) / _SPACING
-        high = (ends.max(axis=0) + _FARTHEST - self.origin) / _SPACING
+        low = (ends.min(axis=0) - _MAX_CLEARANCE - self.origin) / _SPACING
+        high = (ends.max(axis=0) + _MAX_CLEARANCE - self.origin) / _SPACING
         (x0, y0), (x1, y1) = np.maximum(low, 0).astype(int), high.astype(int) + 2
         window = self.clearance[y0:y1, x0:x1]
         rows, columns = np.indices(window.shape)
@@ -68,17 +68,16 @@ class FreeSpace:
 
 
 class Planner:
-    """Shortest ways that keep clear of the walls, within the parts that `inside` belongs to.
+    """Shortest paths that keep a clearance, within the connected parts of free space of `inside`.
 
     Args:
         space: the clearance grid.
-        inside: (2,) a point of the part, metres, or (K, 2) points of several parts between which
-            there is no way.
-        clearance: m, the least distance from walls.
+        inside: (2,) a point of the part, metres, or (K, 2) points of several unconnected parts.
+        clearance: m, minimum distance from walls.
 
     Attributes:
-        nodes: those of all parts.
-        parts: how many parts there are.
+        nodes: of all parts.
+        parts: number of parts.
 
     Raises:
         InputError: there is no room at `inside`.
@@ -99,7 +98,7 @@ class Planner:
         self.nodes = np.flatnonzero(self._part >= 0)
         self._trees: dict[int, NDArray[np.int32]] = {}
 
-    # only built where a way has to be looked for: in a town that takes long
+    # built on demand: slow in a large world
 
     @cached_property
     def _graph(self) -> "scipy.sparse.csr_array":
@@ -123,7 +122,7 @@ class Planner:
         return int(parts[row, column])
 
     def part_of(self, node: int | NDArray[np.int64]) -> NDArray[np.int64]:
-        """Which part the nodes belong to, as the points `inside` are numbered."""
+        """Part of the nodes, numbered as the points `inside`."""
         return np.asarray(self._part[node])
 
     def point(self, node: NDArray[np.int64]) -> Float:
@@ -139,7 +138,7 @@ class Planner:
         return here if self._part[here] >= 0 else int(self._nearest[row, column])
 
     def path(self, start: Float, goal: int) -> Float:
-        """(K, 2) corner points of a short way from a point (2,) to a node, the start left out."""
+        """(K, 2) corners of a short path from a point (2,) to a node, without the start."""
         if goal not in self._trees:
             end = int(np.searchsorted(self.nodes, goal))
             _, previous = scipy.sparse.csgraph.dijkstra(
@@ -150,10 +149,10 @@ class Planner:
         chain = [int(np.searchsorted(self.nodes, self.node(start)))]
         while tree[chain[-1]] >= 0:
             chain.append(int(tree[chain[-1]]))
-        return self._pulled_tight(start, self.point(self.nodes[chain]))
+        return self._shorten(start, self.point(self.nodes[chain]))
 
     def is_visible(self, start: Float, ends: Float) -> NDArray[np.bool_]:
-        """Whether the straight ways from a point (2,) to points (K, 2) keep the clearance."""
+        """(K,) whether straight lines from a point (2,) to points (K, 2) keep the clearance."""
         delta = ends - start
         steps = int(np.ceil(np.abs(delta).max(initial=0.0) / _SPACING)) + 1
         along = start + delta[:, None, :] * np.linspace(0.0, 1.0, steps + 1)[1:, None]
@@ -162,10 +161,10 @@ class Planner:
         cell = np.clip(cell, 0, (W - 1, H - 1))
         return np.asarray(np.all(self._clear[cell[..., 1], cell[..., 0]], axis=1))
 
-    def _pulled_tight(self, start: Float, points: Float) -> Float:
+    def _shorten(self, start: Float, points: Float) -> Float:
         corners, at, here = [], 0, start
         while at < len(points) - 1:
-            ahead = points[at + 1 : at + 1 + _LOOK_AHEAD]
+            ahead = points[at + 1 : at + 1 + _MAX_SHORTCUT]
             seen = np.flatnonzero(self.is_visible(here, ahead))
             at += 1 + (int(seen[-1]) if len(seen) else 0)
             here = points[at]
@@ -174,9 +173,9 @@ class Planner:
 
 
 def _graph(part: NDArray[np.bool_], clearance: Float, least: float) -> "scipy.sparse.csr_array":
-    """Neighbouring nodes of `part`, eight around each; ways along walls cost a little more.
+    """8-neighbour graph of the nodes of `part`; edges along walls cost more.
 
-    The nodes are numbered as they come in `part`, those outside left out.
+    Nodes are numbered in the order of `part`, without those outside.
     """
     H, W = part.shape
     index = np.cumsum(part).reshape(H, W) - 1

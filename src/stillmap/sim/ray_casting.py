@@ -1,6 +1,6 @@
-"""Exact ranges of the beams of one turn of a lidar, among faces, solids, ground and ceiling.
+"""Exact ranges of the beams of one lidar turn to faces, solids, ground and ceiling.
 
-A thing covers an interval of columns and one of channels. Only the beams within both are
+A surface covers an interval of columns and one of channels. Only the beams within both are
 intersected with it, all at once.
 """
 
@@ -15,21 +15,22 @@ from stillmap.sim.geometry import BOX, CYLINDER, Faces, Ground, Solids
 Float = NDArray[np.float64]
 Window = tuple[int, slice, slice]
 
-_NEAREST = 1e-3  # m, the lidar sees nothing nearer
-_EDGE = 1e-9  # rad, so that no beam slips between two faces that share an edge
-_NOWHERE = 1e9  # m, where things are that are nowhere
+MIN_RANGE = 1e-3  # m
+
+_SLACK = 1e-9  # rad, so that no beam passes between two faces that share an edge
+_ABSENT = 1e9  # m, position of absent solids
 
 
 class Rays(NamedTuple):
-    """n columns of C beams each; those of a column are taken at once.
+    """n columns of C simultaneous beams each.
 
     Attributes:
         origin: (3, n, 1) metres, in the world.
-        direction: (3, n, C) of length one, in the world.
-        azimuth: (n,) rad, rising, over one turn or little more; that of each column in the world.
-        spread: rad, how far off that a beam of the column may be.
+        direction: (3, n, C) unit vectors, in the world.
+        azimuth: (n,) rad, rising over about one turn; of each column in the world.
+        spread: rad, maximum deviation of a beam from its column's azimuth.
         elevation: (C,) rad, rising.
-        tilt: rad, how far off that a beam of the channel may be, in the world.
+        tilt: rad, maximum deviation of a beam from its channel's elevation, in the world.
     """
 
     origin: Float
@@ -41,11 +42,11 @@ class Rays(NamedTuple):
 
 
 class RayReturns(NamedTuple):
-    """The nearest thing on each of (n, C) beams.
+    """The nearest surface on each of (n, C) beams.
 
     Attributes:
-        range: metres, inf where there is nothing.
-        mover: int32 id of the mover that is hit, -1: none.
+        range: metres, inf without a hit.
+        mover: int32 id of the mover, -1: none.
         on_glass: bool.
     """
 
@@ -57,14 +58,14 @@ class RayReturns(NamedTuple):
 def cast_rays(
     rays: Rays, faces: Faces, solids: list[Solids], ground: Ground, ceiling: float | None
 ) -> RayReturns:
-    """What each beam meets first.
+    """Intersect beams with a world.
 
     Args:
         rays: the beams.
-        faces: what stands still.
-        solids: what stands still or moves, at all times or at those of the columns.
+        faces: static faces.
+        solids: static or moving solids, at all times or at those of the columns.
         ground: the ground.
-        ceiling: metres above it; None: the open sky.
+        ceiling: metres above it; None: open sky.
     """
     range = ground.distance(rays.origin, rays.direction)
     if ground.kerb > 0 and len(ground.pavements):
@@ -74,7 +75,7 @@ def cast_rays(
         np.copyto(range, upper, where=ground.is_paved(x, y))
     if ceiling is not None:
         np.minimum(range, ground.distance(rays.origin, rays.direction, ceiling), out=range)
-    range[range < _NEAREST] = np.inf
+    range[range < MIN_RANGE] = np.inf
     mover = np.full(range.shape, -1, np.int32)
     on_glass = np.zeros(range.shape, bool)
     for k, columns, channels in _windows_of_faces(rays, faces, ground):
@@ -96,7 +97,7 @@ def cast_rays(
 
 
 def intersect_face(origin: Float, direction: Float, ends: Float, z: Float, ground: Ground) -> Float:
-    """(n, C) metres along rays from (3, n, 1) to an upright face; inf: they pass it by."""
+    """(n, C) metres along rays from (3, n, 1) to an upright face; inf: no intersection."""
     (ox, oy, oz), (dx, dy, dz) = origin, direction
     x0, y0, x1, y1 = ends
     ux, uy = x1 - x0, y1 - y0
@@ -105,7 +106,7 @@ def intersect_face(origin: Float, direction: Float, ends: Float, z: Float, groun
         x, y = ox + t * dx, oy + t * dy
         along = (x - x0) * ux + (y - y0) * uy
         above = oz + t * dz - ground.level(x, y)
-        met = (t > _NEAREST) & (along >= -_EDGE) & (along <= ux * ux + uy * uy + _EDGE)
+        met = (t > MIN_RANGE) & (along >= -_SLACK) & (along <= ux * ux + uy * uy + _SLACK)
         met &= (above >= z[0]) & (above <= z[1])
     return np.asarray(np.where(met, t, np.inf))
 
@@ -116,42 +117,42 @@ def intersect_solid(origin: Float, direction: Float, solids: Solids, k: int, pos
     (a, b), (z0, z1), form = solids.half[k], solids.z[k], solids.form[k]
     c, s, h = np.cos(heading), np.sin(heading), (z1 - z0) / 2
     (ox, oy, oz), (dx, dy, dz) = origin, direction
-    # scaled so that it is the unit cube, cylinder or sphere; distances along beams stay
+    # scaled to the unit cube, cylinder or sphere; distances along beams stay
     u, v = ((ox - x) * c + (oy - y) * s) / a, ((oy - y) * c - (ox - x) * s) / b
     w = (oz - foot - z0 - h) / h
     du, dv, dw = dx * (c / a) + dy * (s / a), dy * (c / b) - dx * (s / b), dz / h
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         if form == BOX:
-            enters, leaves = _between(_slab(u, du), _slab(v, dv))
+            enters, leaves = _intersect(_slab(u, du), _slab(v, dv))
         elif form == CYLINDER:
-            enters, leaves = _round(du * du + dv * dv, u * du + v * dv, u * u + v * v)
+            enters, leaves = _sphere(du * du + dv * dv, u * du + v * dv, u * u + v * v)
         else:
             squares = du * du + dv * dv + dw * dw
-            enters, leaves = _round(squares, u * du + v * dv + w * dw, u * u + v * v + w * w)
+            enters, leaves = _sphere(squares, u * du + v * dv + w * dw, u * u + v * v + w * w)
         if form in (BOX, CYLINDER):
-            enters, leaves = _between((enters, leaves), _slab(w, dw))
-        return np.asarray(np.where((enters <= leaves) & (enters > _NEAREST), enters, np.inf))
+            enters, leaves = _intersect((enters, leaves), _slab(w, dw))
+        return np.asarray(np.where((enters <= leaves) & (enters > MIN_RANGE), enters, np.inf))
 
 
 def _slab(u: Float, du: Float) -> tuple[Float, Float]:
-    """Where rays enter and leave -1 <= u <= 1."""
+    """Distances at which rays enter and leave -1 <= u <= 1."""
     one = 1.0 / du  # infinite for rays along it: within from -inf to inf, or never
     near, far = (-1.0 - u) * one, (1.0 - u) * one
     return np.minimum(near, far), np.maximum(near, far)
 
 
-def _round(squares: Float, product: Float, rest: Float) -> tuple[Float, Float]:
-    """Where rays enter and leave |u| <= 1; |du|^2, u . du and |u|^2 are given."""
-    root = np.sqrt(product * product - squares * (rest - 1.0))  # NaN: passed by
+def _sphere(squares: Float, product: Float, rest: Float) -> tuple[Float, Float]:
+    """Distances at which rays enter and leave |u| <= 1, from |du|^2, u . du and |u|^2."""
+    root = np.sqrt(product * product - squares * (rest - 1.0))  # NaN: no intersection
     return (-product - root) / squares, (-product + root) / squares
 
 
-def _between(one: tuple[Float, Float], other: tuple[Float, Float]) -> tuple[Float, Float]:
+def _intersect(one: tuple[Float, Float], other: tuple[Float, Float]) -> tuple[Float, Float]:
     return np.maximum(one[0], other[0]), np.minimum(one[1], other[1])
 
 
 def _windows_of_faces(rays: Rays, faces: Faces, ground: Ground) -> Iterator[Window]:
-    """Number of each face, and the columns and channels that may meet it."""
+    """Number of each face, and the columns and channels that may hit it."""
     if not len(faces.ends):
         return
     ox, oy, oz, move = _middle(rays)
@@ -172,11 +173,11 @@ def _windows_of_faces(rays: Rays, faces: Faces, ground: Ground) -> Iterator[Wind
 
 
 def _windows_of_solids(rays: Rays, solids: Solids) -> Iterator[Window]:
-    """Number of each solid, and the columns and channels that may meet it."""
+    """Number of each solid, and the columns and channels that may hit it."""
     if not len(solids.form):
         return
     ox, oy, oz, move = _middle(rays)
-    pose = np.nan_to_num(solids.pose, nan=_NOWHERE)
+    pose = np.nan_to_num(solids.pose, nan=_ABSENT)
     at = pose[len(pose) // 2]
     own = np.hypot(pose[..., 0] - at[:, 0], pose[..., 1] - at[:, 1]).max(axis=0)
     a, b = solids.half.T
@@ -192,7 +193,7 @@ def _windows_of_solids(rays: Rays, solids: Solids) -> Iterator[Window]:
 
 
 def _middle(rays: Rays) -> tuple[float, float, float, float]:
-    """x, y, z of the lidar in the middle of its turn, and how far off that it gets, metres."""
+    """x, y, z of the lidar in the middle of its turn and its maximum distance from there, m."""
     at = rays.origin[:, rays.origin.shape[1] // 2]
     x, y, z = at[:, 0].tolist()
     return x, y, z, float(np.sqrt(((rays.origin - at[:, None]) ** 2).sum(axis=0)).max())
@@ -207,25 +208,24 @@ def _windows(
     heights: tuple[Float, Float],
     move: float,
 ) -> Iterator[Window]:
-    """Columns and channels that may meet things.
+    """Columns and channels that may hit P surfaces.
 
     Args:
         rays: the beams.
-        bearing, half: (P,) rad, things lie within bearing +- half, seen from the middle of the
-            turn.
-        near, far: (P,) metres, how near and how far they come there.
-        heights: two of (P,) metres, their least and their greatest height over the lidar.
-        move: metres, how far from there the lidar moves.
+        bearing, half: (P,) rad, they lie within bearing +- half, seen from the middle of the turn.
+        near, far: (P,) metres, minimum and maximum distance from there.
+        heights: minimum and maximum height over the lidar, (P,) metres each.
+        move: metres, maximum distance of the lidar from there.
     """
     n, first = len(rays.azimuth), rays.azimuth[0]
     near, far = near - move, far + move
     half = half + np.arcsin(np.minimum(move / np.maximum(near + move, 1e-9), 1.0))
-    half += rays.spread + _EDGE
+    half += rays.spread + _SLACK
     half[(near <= 0) | (half >= np.pi)] = np.inf
     low, high = heights[0] - move, heights[1] + move
     closest = np.maximum(near, 1e-3)
-    lowest = np.arctan2(low, np.where(low > 0, far, closest)) - rays.tilt - _EDGE
-    highest = np.arctan2(high, np.where(high > 0, closest, far)) + rays.tilt + _EDGE
+    lowest = np.arctan2(low, np.where(low > 0, far, closest)) - rays.tilt - _SLACK
+    highest = np.arctan2(high, np.where(high > 0, closest, far)) + rays.tilt + _SLACK
     begin = np.searchsorted(rays.elevation, lowest, side="left")
     end = np.searchsorted(rays.elevation, highest, side="right")
     middle = first + (bearing - first) % (2 * np.pi)

@@ -1,4 +1,4 @@
-"""What a sensor records in 3D, scan by scan; what does not fit into memory goes to files."""
+"""Recording of a 3D sensor, scan by scan, in bounded memory."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,13 +23,13 @@ Float = NDArray[np.float64]
 
 
 class World(NamedTuple):
-    """A scene in which everything has happened, in 3D.
+    """A simulated scene in 3D.
 
     Attributes:
-        happening: what happened, in the plan.
-        ground: what everything stands on.
-        faces, still: what stands still.
-        carried: what moves.
+        happening: the motion, in the plane.
+        ground: the ground.
+        faces, still: static surfaces.
+        carried: solids of the movers.
         ridden: (T, 6) x, y, z, roll, pitch, yaw of the robot.
     """
 
@@ -42,7 +42,7 @@ class World(NamedTuple):
 
     @classmethod
     def of(cls, happening: Episode) -> "World":
-        """The world of a happening; people get their heights, the robot is shaken."""
+        """The 3D world of an episode, with heights of people and vibration of the robot."""
         scene, rng = happening.scene, happening.body_rng
         ground = Ground.of(scene.ground, np.reshape(scene.pavements, (-1, 4)).astype(float))
         carried = MoverSolids(scene, happening.motion, ground, rng)
@@ -50,16 +50,16 @@ class World(NamedTuple):
         return cls(happening, ground, *make_static_world(scene, ground), carried, ridden)
 
     def moment(self, scans: NDArray[np.int64], seconds: Float) -> Moment:
-        """N times: so many seconds after the stamps of scans."""
+        """N times: `seconds` after the stamps of scans."""
         return Moment(self.happening.motion, scans, seconds)
 
     def T_world_base(self, moment: Moment) -> Float:
-        """(N, 4, 4) where the robot is at the times of a moment."""
+        """(N, 4, 4) pose of the robot at the times of a moment."""
         x, y, z, *angles = moment.interpolate(self.ridden).T
         return lidar.make_pose(np.stack([x, y, z], axis=-1), *angles)
 
     def cast_rays(self, sensor: Sensor, pattern: Pattern, scan: int) -> RayReturns:
-        """What the beams of one scan meet."""
+        """Exact returns of the beams of one scan."""
         moment = self.moment(np.full(len(pattern.azimuth), scan), pattern.seconds)
         T = self.T_world_base(moment) @ sensor.T_base_sensor
         solids = [self.still, self.carried.at(moment, scan)]
@@ -77,14 +77,14 @@ def record(
     tell: Progress,
     scratch: Path | None = None,
 ) -> tuple[Recording, Truth]:
-    """What a sensor records, and the truth about it.
+    """Simulate the recording of a sensor, with its truth.
 
     Args:
-        world: what there is to be seen.
-        sensor: it takes a scan at each of T stamps.
-        rng: noise and losses.
-        tell: called now and then with the share that is done.
-        scratch: folder for what is large; None: the system's temporary folder.
+        world: the world.
+        sensor: takes a scan at each of T stamps.
+        rng: of noise and losses.
+        tell: called with the completed share.
+        scratch: folder for large arrays; None: the system's temporary folder.
 
     Raises:
         OSError: the disk is full.
@@ -128,7 +128,7 @@ def _nearer(one: RayReturns, other: RayReturns) -> RayReturns:
 
 
 def _sizes(world: World) -> list[list[float | None]]:
-    """Length, width and height of each mover in metres; None where they are not of one size."""
+    """Length, width and height of each mover in metres; None where undefined."""
     rows: list[list[Any]]
     rows = np.column_stack([world.happening.motion.sizes, world.carried.tall]).tolist()
     return [[None if value != value else value for value in row] for row in rows]
@@ -146,7 +146,7 @@ class _Recorded(NamedTuple):
 
 
 class _Beams:
-    """The beams of all scans so far."""
+    """Builder of the per-beam arrays."""
 
     def __init__(self, sensor: Sensor, folder: Path | None) -> None:
         self._sensor = sensor
@@ -160,7 +160,7 @@ class _Beams:
         self._offset = [0]
 
     def add(self, exact: RayReturns, pattern: Pattern, rng: np.random.Generator) -> None:
-        """One scan, seen exactly."""
+        """Append a scan, given its exact returns."""
         range, hit = lidar.simulate_measurement(exact, self._sensor.options, rng)
         points = (range * pattern.direction[: self._sensor.dimension]).astype(np.float32)
         mover = np.where(hit, exact.mover, np.int32(-1))
@@ -175,7 +175,7 @@ class _Beams:
         self._offset.append(len(self._hit))
 
     def columns(self) -> _Recorded:
-        """All of them; nothing can be added any more."""
+        """All arrays; nothing can be added afterwards."""
         return _Recorded(
             offset=np.array(self._offset, np.int64),
             points=self._points.finish(),

@@ -1,7 +1,7 @@
-"""What each pixel of a picture shows, among faces, solids, ground and ceiling.
+"""Rendering: the surface on each pixel's ray, among faces, solids, ground and ceiling.
 
-The same rays as a lidar's, in another order: a thing lies within a rectangle of pixels, and things
-are looked at from the nearest on, so that what is hidden costs little.
+A surface lies within a rectangle of pixels. Surfaces are rendered from the nearest on, so that
+occluded ones cost little.
 """
 
 from collections.abc import Iterator
@@ -17,8 +17,7 @@ Float = NDArray[np.float64]
 
 STATIC, NOTHING = -1, -2
 
-_NEAR = 0.05  # m ahead of the camera: nothing nearer is looked for
-_NEAREST = 1e-3  # m, as a lidar's
+_NEAR = 0.05  # m, near plane
 _EDGES = np.array(
     [(0, 1), (2, 3), (4, 5), (6, 7), (0, 2), (1, 3), (4, 6), (5, 7), (0, 4), (1, 5), (2, 6), (3, 7)]
 )
@@ -26,12 +25,12 @@ _EDGES_OF_FACE = np.array([(0, 1), (1, 3), (3, 2), (2, 0)])
 
 
 class Lens(NamedTuple):
-    """Where the pixels of a camera look.
+    """Pixel rays of a camera.
 
     Attributes:
-        direction: (3, h, w) of length one, in the camera's frame.
+        direction: (3, h, w) unit vectors, in the camera frame.
         K: (3, 3) pinhole matrix.
-        bends: pixels, how far off its place for an ideal lens anything is shown, at most.
+        bends: pixels, maximum distortion.
     """
 
     direction: Float
@@ -40,7 +39,7 @@ class Lens(NamedTuple):
 
     @classmethod
     def of(cls, direction: Float, K: Float) -> "Lens":
-        """That of rays (3, h, w) in a camera's frame."""
+        """The lens of rays (3, h, w) in the camera frame."""
         _, h, w = direction.shape
         x, y = direction[:2] / direction[2]
         right = np.abs(K[0, 0] * x + K[0, 2] - np.arange(w)).max()
@@ -49,19 +48,19 @@ class Lens(NamedTuple):
 
 
 class RenderedImage(NamedTuple):
-    """What each pixel (h, w) shows.
+    """The surface at each pixel (h, w).
 
     Attributes:
-        range: metres along its ray, inf where there is nothing.
-        part: int32, the number of the moving solid; STATIC, or NOTHING.
+        range: metres along its ray; inf: nothing.
+        part: int32, number of the moving solid, STATIC or NOTHING.
     """
 
     range: Float
     part: NDArray[np.int32]
 
 
-class _Thing(NamedTuple):
-    """Something that may be seen: face k, or solid k of a group, and the pixels it lies within."""
+class _Candidate(NamedTuple):
+    """A surface that may be visible: face k, or solid k of a group, and its window of pixels."""
 
     near: float
     group: int
@@ -79,25 +78,25 @@ def render(
     ground: Ground,
     ceiling: float | None,
 ) -> RenderedImage:
-    """What each pixel shows.
+    """Render the nearest surface at each pixel.
 
     Args:
-        lens: where they look.
+        lens: the pixel rays.
         T_world_camera: (4, 4).
-        faces, still: what stands still.
-        moving: the solids that move, at one time; those of no mover stand still.
+        faces, still: static surfaces.
+        moving: moving solids at one time; those without a mover are static.
         ground: the ground.
-        ceiling: metres above it; None: the open sky.
+        ceiling: metres above it; None: open sky.
     """
     R, at = T_world_camera[:3, :3], T_world_camera[:3, 3]
     direction = np.einsum("ij,jhw->ihw", R, lens.direction)
     origin = np.ascontiguousarray(at[:, None, None])
-    range = _level_ground(origin, direction, ground, ceiling)
+    range = _intersect_ground(origin, direction, ground, ceiling)
     part = np.where(np.isinf(range), np.int32(NOTHING), np.int32(STATIC))
     groups = (still, moving)
-    things = [*_seen_faces(lens, T_world_camera, faces, ground)]
+    things = [*_visible_faces(lens, T_world_camera, faces, ground)]
     for number, group in enumerate(groups):
-        things += _seen_solids(lens, T_world_camera, group, number)
+        things += _visible_solids(lens, T_world_camera, group, number)
     for near, number, k, rows, columns in sorted(things, key=lambda one: one.near):
         before = range[rows, columns]
         if before.max(initial=0.0) <= near:
@@ -116,7 +115,9 @@ def render(
     return RenderedImage(range, part)
 
 
-def _level_ground(origin: Float, direction: Float, ground: Ground, ceiling: float | None) -> Float:
+def _intersect_ground(
+    origin: Float, direction: Float, ground: Ground, ceiling: float | None
+) -> Float:
     """(h, w) metres to street, pavements and ceiling."""
     range = ground.distance(origin, direction)
     if ground.kerb > 0 and len(ground.pavements):
@@ -126,13 +127,13 @@ def _level_ground(origin: Float, direction: Float, ground: Ground, ceiling: floa
         np.copyto(range, upper, where=ground.is_paved(x, y))
     if ceiling is not None:
         np.minimum(range, ground.distance(origin, direction, ceiling), out=range)
-    range[range < _NEAREST] = np.inf
+    range[range < ray_casting.MIN_RANGE] = np.inf
     return range
 
 
-def _seen_faces(
+def _visible_faces(
     lens: Lens, T_world_camera: Float, faces: Faces, ground: Ground
-) -> Iterator[_Thing]:
+) -> Iterator[_Candidate]:
     if not len(faces.ends):
         return
     x0, y0, x1, y1 = faces.ends.T
@@ -155,9 +156,9 @@ def _seen_faces(
     yield from _windows(lens, T_world_camera, corners, _EDGES_OF_FACE, near, -1)
 
 
-def _seen_solids(
+def _visible_solids(
     lens: Lens, T_world_camera: Float, solids: Solids, number: int
-) -> Iterator[_Thing]:
+) -> Iterator[_Candidate]:
     if not len(solids.form):
         return
     x, y, heading, foot = np.moveaxis(solids.pose[0], -1, 0)
@@ -185,14 +186,14 @@ def _windows(
     edges: NDArray[np.int64],
     near: Float,
     number: int,
-) -> Iterator[_Thing]:
-    """The pixels within which convex things lie, those that lie within the picture.
+) -> Iterator[_Candidate]:
+    """The windows of pixels of convex shapes that lie within the image.
 
     Args:
         lens, T_world_camera: the camera.
-        corners: (P, C, 3) metres, in the world; NaN of what is nowhere.
-        edges: (E, 2) which corners are joined.
-        near: (P,) metres, nearer to the camera they are not.
+        corners: (P, C, 3) metres, in the world; NaN of absent shapes.
+        edges: (E, 2) connected corners.
+        near: (P,) metres, minimum distance from the camera.
         number: of the group.
     """
     R, t = T_world_camera[:3, :3], T_world_camera[:3, 3]
@@ -215,4 +216,4 @@ def _windows(
     left, right, top, bottom = bounds
     for k in np.flatnonzero(ahead.any(axis=1) & (left < right) & (top < bottom)).tolist():
         rows, columns = slice(int(top[k]), int(bottom[k])), slice(int(left[k]), int(right[k]))
-        yield _Thing(float(near[k]), number, k, rows, columns)
+        yield _Candidate(float(near[k]), number, k, rows, columns)

@@ -1,4 +1,4 @@
-"""A robot that follows its route, waits for people in its way, and goes on when patience ends."""
+"""A robot that follows its route (pure pursuit) and waits for people in its way."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,15 +11,15 @@ from stillmap.sim.vehicles import SpeedProfile
 Float = NDArray[np.float64]
 
 _SPACING = 0.05  # m between points of the route
-_PATIENCE = 3.0  # s that it waits for somebody in its way before it creeps on
-_CARROT = 0.35  # m ahead of the robot, the point of the route that it steers for
-_CARROT_TIME = 0.5  # s, the same for a fast one
-_SEES_AHEAD = 1.5  # m
-_SEES_AHEAD_TIME = 1.2  # s, the same for a fast one
-_CREEP = 0.12  # m/s
-_ELSEWHERE = 0.3  # of the way to the farthest place: nearer ones are not elsewhere
-_ROOM = 2.0  # m from anybody, where it is put down
-_TURN_IN_PLACE = 0.4  # rad off the route
+_PATIENCE = 3.0  # s of waiting, after which it creeps on
+_LOOK_AHEAD = 0.35  # m from the robot to the point of the route that it steers for
+_LOOK_AHEAD_TIME = 0.5  # s, the same for a fast robot
+_VIEW_DISTANCE = 1.5  # m ahead in which it gives way
+_VIEW_TIME = 1.2  # s, the same for a fast robot
+_CREEP_SPEED = 0.12  # m/s
+_MIN_CARRY = 0.3  # of the distance to the farthest point of the route, when it is carried
+_MIN_ROOM = 2.0  # m to people and vehicles where it is set down
+_TURN_IN_PLACE = 0.4  # rad of heading error
 
 
 class Robot:
@@ -54,21 +54,21 @@ class Robot:
 
         Args:
             dt: seconds.
-            people: (P, 2) where people and corners of vehicles are, metres.
-            contact: m, the nearest one of these may be to the robot's centre.
+            people: (P, 2) positions of people and corners of vehicles, metres.
+            contact: m, their minimum distance from the robot's center.
         """
         self._advance()
         o = self._options
         x, y, theta = self.pose
-        to = self._way[self._ahead(self._carrot())[-1]] - self.pose[:2]
+        to = self._way[self._ahead(self._look_ahead())[-1]] - self.pose[:2]
         error = np.arctan2(to[1], to[0]) - theta
         error = (error + np.pi) % (2 * np.pi) - np.pi
         turn = float(np.clip(2.0 * error, -o.turn_rate, o.turn_rate))
         past = (x - self._way[self._at, 0]) * np.cos(theta)
         past += (y - self._way[self._at, 1]) * np.sin(theta)
         speed = self._pace.limit_speed(self._at, float(past), self._speed, self._seconds, dt)
-        speed = self._pace.accelerate(speed * self._facing(error), self._speed, dt)
-        speed = self._careful(dt, min(speed, np.hypot(*to) / dt), people, contact)
+        speed = self._pace.accelerate(speed * self._speed_share(error), self._speed, dt)
+        speed = self._give_way(dt, min(speed, np.hypot(*to) / dt), people, contact)
         middle = theta + turn * dt / 2
         new = np.array([x + speed * dt * np.cos(middle), y + speed * dt * np.sin(middle)])
         if not self._is_free(new, people, contact):
@@ -81,26 +81,26 @@ class Robot:
         self._seconds, self._speed = self._seconds + dt, 0.0
 
     def put_down(self, rng: np.random.Generator, others: Float) -> None:
-        """Go on from a place of its way far from here, facing anywhere.
+        """Set the robot down on a distant point of its route with a random heading.
 
         Args:
-            rng: which one.
-            others: (N, 2) where people and corners of vehicles are, metres.
+            rng: generator.
+            others: (N, 2) positions of people and corners of vehicles, metres.
         """
         away = np.hypot(*(self._way - self.pose[:2]).T)
-        places = np.flatnonzero(away > _ELSEWHERE * away.max())
+        places = np.flatnonzero(away > _MIN_CARRY * away.max())
         if not self._closed:  # or the recording would soon be over
-            places = places[places < (1.0 - _ELSEWHERE) * len(self._way)]
+            places = places[places < (1.0 - _MIN_CARRY) * len(self._way)]
         for at in rng.permutation(places).tolist():
             near = np.hypot(*(others - self._way[at]).T).min(initial=np.inf)
-            if near > _ROOM:
+            if near > _MIN_ROOM:
                 self._at = at
                 break
         self.pose = np.array([*self._way[self._at], rng.uniform(-np.pi, np.pi)])
         self._speed, self._waited = 0.0, 0.0
 
     def nominal_time(self) -> float:
-        """Seconds that one lap takes at full speed."""
+        """Seconds of one lap at full speed."""
         return len(self._way) * _SPACING / self._options.speed
 
     def route_ahead(self, reach: float) -> Float:
@@ -112,33 +112,33 @@ class Robot:
         last = len(self._way) - 1
         return ahead % len(self._way) if self._closed else np.minimum(ahead, last)
 
-    def _facing(self, error: float) -> float:
-        """How much of its speed it drives so many rad off its way; what brakes slowly, later."""
+    def _speed_share(self, error: float) -> float:
+        """Share of its speed at a heading error in rad; larger if it brakes slowly."""
         share = 1.0 - abs(error) / _TURN_IN_PLACE
         if self._options.acceleration is not None:
             share = min(1.0, 1.0 + share)
         return max(0.0, share)
 
     def _fast(self) -> float:
-        """m/s, the speed that it looks ahead for: its own, if it takes time to change that."""
+        """m/s, the speed that determines how far it looks ahead."""
         return self._options.speed if self._options.acceleration is None else self._speed
 
-    def _carrot(self) -> int:
-        """How many points of the way ahead the one is that it steers for."""
-        return round(max(_CARROT, _CARROT_TIME * self._fast()) / _SPACING)
+    def _look_ahead(self) -> int:
+        """Points of the route from the robot to the one that it steers for."""
+        return round(max(_LOOK_AHEAD, _LOOK_AHEAD_TIME * self._fast()) / _SPACING)
 
     def _advance(self) -> None:
-        ahead = self._ahead(2 * self._carrot())
+        ahead = self._ahead(2 * self._look_ahead())
         nearest = int(ahead[np.argmin(np.hypot(*(self._way[ahead] - self.pose[:2]).T))])
         self.arrived = not self._closed and nearest == len(self._way) - 1
         self._at = nearest
 
-    def _careful(self, dt: float, speed: float, people: Float, contact: float) -> float:
-        """The speed that people ahead allow."""
+    def _give_way(self, dt: float, speed: float, people: Float, contact: float) -> float:
+        """m/s, the speed limited by people ahead."""
         c, s = np.cos(self.pose[2]), np.sin(self.pose[2])
         dx, dy = (people - self.pose[:2]).T
         x, y = c * dx + s * dy, c * dy - s * dx
-        sees = max(_SEES_AHEAD, contact + 0.1 + _SEES_AHEAD_TIME * self._fast())
+        sees = max(_VIEW_DISTANCE, contact + 0.1 + _VIEW_TIME * self._fast())
         ahead = (x > 0) & (x < sees) & (np.abs(y) < contact)
         gap = float(x[ahead].min(initial=np.inf)) - contact
         allowed = max(0.0, gap - 0.1)
@@ -147,17 +147,17 @@ class Robot:
         else:
             self._waited = max(0.0, self._waited - dt)
         self.is_impatient = self._waited > _PATIENCE
-        return min(speed, max(allowed, _CREEP if self.is_impatient else 0.0))
+        return min(speed, max(allowed, _CREEP_SPEED if self.is_impatient else 0.0))
 
     def _is_free(self, xy: Float, people: Float, contact: float) -> bool:
         clear, _ = self._space.clearance_at(np.stack([xy, self.pose[:2]]))
         near = np.hypot(*(people - xy).T).min(initial=np.inf)
-        # a robot that has cut a corner may always go back to where there is more room
+        # a robot that cut a corner may always return to where there is more room
         return bool(clear[0] >= min(self._options.radius, clear[1]) and near >= contact)
 
 
 def plan_route(route: tuple[Point, ...], planner: Planner, closed: bool) -> Float:
-    """(N, 2) points every few centimetres along the route, around walls; closed: and back."""
+    """(N, 2) points every few centimetres along the route, around walls; closed: a loop."""
     stops = [np.array(p, float) for p in route]
     if closed:
         stops.append(stops[0])

@@ -1,4 +1,4 @@
-"""What a simulated world consists of: data only, so that a new world is a new value."""
+"""The data of a simulated world."""
 
 import itertools
 import math
@@ -42,7 +42,7 @@ class Door:
     opened: float
 
     def leaf(self, angle: float) -> Segment:
-        """The leaf that points to `angle`."""
+        """The leaf in direction `angle`."""
         x, y = self.hinge
         return (x, y, x + self.width * math.cos(angle), y + self.width * math.sin(angle))
 
@@ -52,9 +52,9 @@ class Light:
     """A traffic light.
 
     Attributes:
-        at: metres, where the first one stops: a point of the robot's route or of a lane.
-        red: seconds from when to when it is red, for the first time.
-        cycle: seconds until it is red again.
+        at: metres, stop line: a point of the robot's route or of a lane.
+        red: s, begin and end of the first red phase.
+        cycle: s, period.
     """
 
     at: Point
@@ -62,22 +62,21 @@ class Light:
     cycle: float
 
     def is_red(self, seconds: float) -> bool:
-        """Whether it is red so many seconds after the recording began."""
+        """Whether it is red, in seconds since the beginning of the recording."""
         return (seconds - self.red[0]) % self.cycle < self.red[1] - self.red[0]
 
 
 @dataclass(frozen=True)
 class Lane:
-    """Where vehicles drive: from the first point to the last, then from the first again.
+    """A lane of vehicles, which restart at its begin when they reach its end.
 
     Attributes:
-        path: points in metres. If it comes back to where it began the lane is a circuit; else its
-            ends lie where the laser does not see a vehicle vanish and appear.
-        kind: what drives there.
-        waiting: vehicles that stand in a queue. A lane with a queue has no others.
-        stop: metres along the path, where the first of the queue stands.
-        go: metres, the queue drives on when the robot comes by here.
-        lights: where vehicles stop while it is red.
+        path: points in metres: a circuit, or a line whose ends lie out of the laser's sight.
+        kind: kind of its vehicles.
+        waiting: number of vehicles in a queue; a lane with a queue has no others.
+        stop: metres along the path, position of the first one of the queue.
+        go: metres, point that releases the queue when the robot passes it.
+        lights: where vehicles stop while they are red.
     """
 
     path: tuple[Point, ...]
@@ -90,13 +89,13 @@ class Lane:
 
 @dataclass(frozen=True)
 class Stay:
-    """Where a thing stands, and from when to when.
+    """A pose of a movable object during a time span.
 
     Attributes:
-        x, y: metres, of its middle.
+        x, y: metres, of its center.
         yaw: rad.
-        since: seconds after the recording began.
-        until: the same; None: for good.
+        since: seconds since the beginning of the recording.
+        until: the same; None: unlimited.
     """
 
     x: float
@@ -111,11 +110,11 @@ class Stay:
 
 @dataclass(frozen=True)
 class Thing:
-    """What stands still, but not for good: moved, brought or taken away while nobody looks.
+    """A movable object: moved, brought or taken away while the robot does not observe it.
 
     Attributes:
-        faces: segments in metres, about its middle.
-        stays: one after the other. Between them it is nowhere.
+        faces: segments in metres, about its center.
+        stays: one after the other; between them it is absent.
     """
 
     faces: tuple[Segment, ...]
@@ -136,19 +135,17 @@ class Scene:
 
     Attributes:
         name: the world's name.
-        walls: segments x0, y0, x1, y1 in metres: everything that stands still and is opaque.
-        route: the robot's way, points in metres; the way between them is planned around walls.
+        walls: segments x0, y0, x1, y1 in metres of all static opaque surfaces.
+        route: via points of the robot in metres; paths between them avoid walls.
         glass: further segments, on which beams get lost more often.
-        kerbs: segments that neither people nor the robot cross and that no laser sees.
-        people_at: a point in each part of the world where people walk about, if kerbs or walls
-            part it; not given: where the robot starts.
-        leaves: doors that swing.
-        lanes: where vehicles drive.
-        things: what is moved, brought or taken away. People and the robot keep clear of every
-            place at which one ever stands.
-        lights: where the robot stops while it is red.
-        pavements: rectangles that only a lidar sees, a kerb higher than the street: their least
-            and their greatest x and y, x0, y0, x1, y1.
+        kerbs: segments that neither people nor the robot cross, invisible to lasers.
+        people_at: a point in each unconnected part of the world with people; default: the start of
+            the route.
+        leaves: doors.
+        lanes: lanes of vehicles.
+        things: movable objects. People and the robot keep clear of all their places.
+        lights: where the robot stops while they are red.
+        pavements: rectangles x0, y0, x1, y1, a kerb higher than the street, visible to lidars only.
     """
 
     name: str
@@ -178,19 +175,19 @@ class Scene:
         require(len(self.walls) + len(self.glass) > 0, "a scene needs walls")
         require(len(self.route) > 0, "a scene needs a route")
         sweep_share = self.laser.sweep_time * self.robot.scan_rate
-        require(sweep_share <= 1 + 1e-9, "sweep_time must not be longer than from scan to scan")
+        require(sweep_share <= 1 + 1e-9, "sweep_time must not exceed the scan period")
         if self.rig.tilts:
             require(not self.lidar.channels, "a rig of two lasers has no lidar")
             usual = not self.laser.second_laser and self.laser.upside_down == "no"
-            require(usual, "a rig has one laser that lies flat, and upright")
+            require(usual, "a rig has one upright horizontal laser")
         require(
             self.in_3d or not self.camera.enabled,
-            "cameras want a world in 3D: a lidar, or a laser that tilts",
+            "cameras need a 3D world: a lidar, or a tilting laser",
         )
 
     @property
     def in_3d(self) -> bool:
-        """Whether a lidar takes the place of the laser, or another laser tilts."""
+        """Whether there is a lidar or a tilting laser."""
         return self.lidar.channels > 0 or self.rig.tilts
 
     @property

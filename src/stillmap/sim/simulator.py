@@ -1,4 +1,4 @@
-"""The simulation itself: people and robot move, the laser looks, odometry drifts."""
+"""Simulation of a recording: motion, odometry, sensors and cameras."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,20 +23,20 @@ from stillmap.sim.truth_images import ImageTruth, make_image_truth
 
 Float = NDArray[np.float64]
 
-_MOTION_SHARE = 0.7  # of the time that a simulation takes, for progress
+_MOTION_SHARE = 0.7  # of the computing time, for progress
 _MOTION_SHARE_3D = 0.05  # the same with a lidar
 
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """A scene, what the robot recorded in it, and what really happened.
+    """A simulated recording with its truth.
 
     Attributes:
         scene: the world and all parameters.
-        recording: what was recorded; its pictures are rendered when they are read.
+        recording: the recording; its images are rendered on access.
         truth: of the beams.
-        photographs: the pictures of its cameras with the truth about them; None: there are none.
-        surfaces: the truth about these and about what they show.
+        photographs: the camera images with their truth; None without cameras.
+        surfaces: the truth about images and surfaces.
     """
 
     scene: Scene
@@ -48,11 +48,11 @@ class Simulation:
 
 @dataclass(frozen=True, eq=False)
 class RigSimulation:
-    """What a laser that lies flat and one that tilts recorded in the same world, on one clock.
+    """Recordings of a horizontal and a tilting laser in the same world, on one clock.
 
     Attributes:
         horizontal: the first, in 2D.
-        tilting: the second, in 3D; its points are in the frame of the pivot, which does not tilt.
+        tilting: the second, in 3D; its points are in the frame of the pivot, not of the joint.
         joint_angle: (T,) rad at each stamp of `tilting`, nose down.
     """
 
@@ -67,20 +67,19 @@ def simulate(
     progress: Progress | None = None,
     scratch: Path | None = None,
 ) -> Simulation:
-    """Let a robot record a scene.
+    """Simulate the recording of a scene.
 
-    People, laser, odometry, doors, vehicles and mishaps draw from generators of their own, spawned
-    from `rng`: another laser or odometry leaves the way everybody goes unchanged.
+    People, laser, odometry, doors, vehicles and mishaps have random generators of their own,
+    spawned from `rng`, so that another laser or odometry does not change the motion.
 
-    A door, vehicle or thing that does not move once while the robot records is a wall: no recording
-    could tell it from one.
+    A door, vehicle or movable object that never moves during the recording counts as a wall.
 
     Args:
         scene: the world and all parameters. With a lidar the recording and its truth are in 3D.
-        rng: the generator, or a seed for one. The same seed gives the same recording to the bit.
-        progress: called now and then with the share that is done, 0 to 1.
-        scratch: folder for what a lidar records, where that is too large for memory; None: the
-            system's temporary folder.
+        rng: generator or seed. The same seed gives the same recording to the bit.
+        progress: called with the completed share, 0 to 1.
+        scratch: folder for arrays of a lidar that exceed memory; None: the system's temporary
+            folder.
 
     Raises:
         InputError: no room for the robot on its route or for the people, or the robot is held up;
@@ -90,11 +89,13 @@ def simulate(
     if scene.rig.tilts:
         raise InputError("a rig of two lasers makes two recordings", hint="simulate_rig")
     tell, share = progress or _silent, _MOTION_SHARE_3D if scene.in_3d else _MOTION_SHARE
-    happening = simulate_episode(scene, np.random.default_rng(rng), _between(0.0, share, tell))
+    happening = simulate_episode(
+        scene, np.random.default_rng(rng), _partial_progress(0.0, share, tell)
+    )
     if scene.in_3d:
         world, sensor = World.of(happening), lidar.make_spinning_lidar(scene)
-        rest, own_rng = _between(share, 1.0, tell), happening.sensor_rng
-        made = _photographed(world, *recorder.record(world, sensor, own_rng, rest, scratch))
+        rest, own_rng = _partial_progress(share, 1.0, tell), happening.sensor_rng
+        made = _with_images(world, *recorder.record(world, sensor, own_rng, rest, scratch))
     else:
         recording, mover = _record(happening)
         static, T_world_base = recording.hit & (mover < 0), se2.matrix(*happening.motion.robot.T)
@@ -109,7 +110,7 @@ def simulate_rig(
     progress: Progress | None = None,
     scratch: Path | None = None,
 ) -> RigSimulation:
-    """Let a robot with two lasers record a scene, one of which tilts.
+    """Simulate the recordings of a robot with a horizontal and a tilting laser.
 
     Arguments and errors are those of `simulate`; `scene.rig.tilts` must be set.
     """
@@ -117,20 +118,20 @@ def simulate_rig(
         raise InputError("no laser of the scene tilts", hint="rig.tilts=true")
     tell, share = progress or _silent, _MOTION_SHARE_3D
     rng = np.random.default_rng(rng)
-    happening = simulate_episode(scene, rng, _between(0.0, share, tell))
+    happening = simulate_episode(scene, rng, _partial_progress(0.0, share, tell))
     world, (flat, tilted), half = World.of(happening), lidar.make_rig_lasers(scene), (1 + share) / 2
-    first, second = _between(share, half, tell), _between(half, 1.0, tell)
+    first, second = _partial_progress(share, half, tell), _partial_progress(half, 1.0, tell)
     below = recorder.record(world, flat, happening.sensor_rng, first, scratch)
     above = recorder.record(world, tilted, happening.body_rng, second, scratch)
-    # that which builds in 3D has the pictures
-    horizontal, tilting = Simulation(scene, *below), _photographed(world, *above)
+    # images belong to the 3D recording
+    horizontal, tilting = Simulation(scene, *below), _with_images(world, *above)
     tell(1.0)
     stamps = np.arange(len(happening.motion.robot)) / scene.scan_rate
     return RigSimulation(horizontal, tilting, lidar.compute_joint_angle(stamps, scene.rig))
 
 
-def _photographed(world: World, recording: Recording, truth: Truth) -> Simulation:
-    """A recording in 3D with the pictures of the scene's cameras, if it has any."""
+def _with_images(world: World, recording: Recording, truth: Truth) -> Simulation:
+    """A 3D recording with the images of the scene's cameras, if there are any."""
     scene = world.happening.scene
     if not scene.camera.enabled:
         return Simulation(scene, recording, truth)
@@ -140,7 +141,7 @@ def _photographed(world: World, recording: Recording, truth: Truth) -> Simulatio
 
 
 def _record(happening: Episode) -> tuple[Recording, NDArray[np.int32]]:
-    """The recording of a planar laser, and the mover (M,) that each of its beams met."""
+    """The recording of a planar laser, and the mover (M,) that reflected each beam."""
     scene, motion, walls = happening.scene, happening.motion, happening.walls
     o, T = scene.laser, len(motion.robot)
     T_base_sensor, sensor = _sensors(o), np.arange(T, dtype=np.int32) % o.count
@@ -184,8 +185,8 @@ def _described(o: LaserOptions, angles: Float) -> list[dict[str, Any]]:
     ]
 
 
-def _between(first: float, last: float, tell: Progress) -> Progress:
-    """Tells of a part of the whole."""
+def _partial_progress(first: float, last: float, tell: Progress) -> Progress:
+    """Progress of a part of the whole."""
     return lambda share: tell(first + (last - first) * share)
 
 

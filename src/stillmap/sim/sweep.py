@@ -1,4 +1,4 @@
-"""A scan takes time: its beams are taken one after the other, while robot and movers go on."""
+"""Scans whose beams are taken one after the other, while robot and movers move."""
 
 import math
 from dataclasses import dataclass
@@ -15,18 +15,18 @@ from stillmap.sim.options import LaserOptions
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-_GROUPS = 64  # at most, in which the beams of a scan are taken; those of a group at once
-_TOGETHER = 1000  # groups of beams worked on together
-_SURELY = 10.0  # standard deviations of a range
-_FASTEST = 40.0  # m/s; what is farther away at the next scan has begun its lane again
+_MAX_GROUPS = 64  # of simultaneous beams per scan
+_BLOCK = 1000  # groups of beams processed at once
+_MAX_SIGMAS = 10.0  # of a range
+_MAX_SPEED = 40.0  # m/s; anything faster has restarted its lane
 
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """When the beams of a scan are taken.
+    """Times of the beams of a scan.
 
     Attributes:
-        group: how many beams are taken at once; the last group may be smaller.
+        group: number of simultaneous beams; the last group may be smaller.
         seconds: (G,) after the scan's stamp, of each group.
     """
 
@@ -35,11 +35,11 @@ class Sweep:
 
     @classmethod
     def of(cls, options: LaserOptions) -> "Sweep":
-        """The sweep of a laser: times grow with the beams' angles, the field of view takes all."""
+        """The sweep of a laser: times proportional to the beam angles."""
         n = options.beams
         if options.sweep_time == 0:
             return cls(n, np.zeros(1))
-        group = max(2, math.ceil(n / _GROUPS))
+        group = max(2, math.ceil(n / _MAX_GROUPS))
         first = np.arange(0, n, group)
         middle = (first + np.minimum(first + group, n) - 1) / 2
         angles = laser.compute_beam_angles(n, options.fov)
@@ -52,27 +52,27 @@ class Sweep:
 
 
 def cast_sweeps(motion: Motion, walls: Float, T_base_sensor: Float, o: LaserOptions) -> Returns:
-    """The nearest thing on every beam of every scan.
+    """The nearest surface on every beam of every scan.
 
     Args:
-        motion: where everything is at T scans.
+        motion: of T scans.
         walls: (W, 4) segments in metres.
-        T_base_sensor: (T, 3, 3) where the laser sits that took each scan.
+        T_base_sensor: (T, 3, 3) pose of the laser of each scan.
         o: the lasers.
 
     Returns:
-        Beams in the order in which a scan has them: from the last angle to the first if the laser
-        hangs upside down.
+        Beams in the order of the scan: from the last angle to the first if the laser is mounted
+        upside down.
     """
     sweep, angles = Sweep.of(o), laser.compute_beam_angles(o.beams, o.fov)
     T, G = len(motion.robot), len(sweep.seconds)
-    reach = o.max_range + _SURELY * o.range_noise
-    # a group of beams is a scan of its own, turned so that the first group's angles fit
+    reach = o.max_range + _MAX_SIGMAS * o.range_noise
+    # a group of beams is cast as a scan of its own, rotated to the angles of the first group
     turned, group = np.arange(G) * sweep.group * (angles[1] - angles[0]), angles[: sweep.group]
     order = slice(None)
     if o.upside_down != "no":
         turned, group, order = -turned, -group[::-1], slice(None, None, -1)
-    block = max(1, _TOGETHER // G)
+    block = max(1, _BLOCK // G)
     parts = []
     for first in range(0, T, block):
         scans = np.arange(first, min(first + block, T))
@@ -88,28 +88,28 @@ def cast_sweeps(motion: Motion, walls: Float, T_base_sensor: Float, o: LaserOpti
 
 
 class Moment:
-    """Where everything is at N times: `seconds` (N,) after the stamps of `scans` (N,).
+    """N times, `seconds` (N,) after the stamps of `scans` (N,), for interpolation of the motion.
 
-    Between two scans all goes on evenly; after the last one as before it.
+    Motion is linear between scans, and extrapolated after the last one.
     """
 
     def __init__(self, motion: Motion, scans: Index, seconds: Float) -> None:
         self._motion = motion
         later = seconds / motion.period
-        # nothing goes on evenly while the robot is carried elsewhere, or stands overnight
+        # no interpolation across the gaps where the robot is carried or pauses
         breaks = np.unique([0, motion.carried, motion.paused, len(motion.robot)])
         piece = np.searchsorted(breaks, scans, side="right")
         self._last = breaks[piece] - 1
         first, last = breaks[piece - 1], self._last - (later > 0)
-        self._scan, self._leap = scans, _FASTEST * motion.period
+        self._scan, self._leap = scans, _MAX_SPEED * motion.period
         self._before = np.maximum(np.minimum(scans + later.astype(np.int64), last), first)
         self._share = scans + later - self._before
 
     def interpolate_movers(self) -> tuple[Movers, Outlines]:
-        """What a laser sees of the movers."""
+        """Cross sections and faces of the movers."""
         people, outlines, things = self._motion.people, self._motion.outlines, self._motion.things
         xy, heading = self.interpolate(people.xy), self.interpolate(people.heading)
-        # things do not fly from place to place
+        # movable objects jump from place to place
         faces = np.concatenate([self.interpolate(outlines.faces), things.faces[self._scan]], axis=1)
         return (
             Movers(xy, heading, people.semi_axes, people.mover),
@@ -117,7 +117,7 @@ class Moment:
         )
 
     def interpolate(self, values: Float) -> Float:
-        """(N, ...) values, which are given at all scans (T, ...)."""
+        """(N, ...) values interpolated from those of all scans (T, ...)."""
         before = values[self._before]
         change = values[np.minimum(self._before + 1, self._last)] - before
         share = self._share.reshape(-1, *[1] * (values.ndim - 1))

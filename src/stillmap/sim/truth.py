@@ -1,4 +1,4 @@
-"""What really happened in a simulation: read by evaluation, never by the mapping."""
+"""The truth of a simulation: read by the scores, never by the mapping."""
 
 import json
 from dataclasses import dataclass, field
@@ -24,18 +24,17 @@ class Truth:
     """The truth about T scans with M beams in all, among P movers and W walls.
 
     Attributes:
-        static: (M,) bool, the beam was reflected by something that stands still for good.
-        mover: (M,) int32, the id of the mover that reflected the beam, -1: none did, -2: the robot
-            itself.
+        static: (M,) bool, whether a static surface reflected the beam.
+        mover: (M,) int32, id of the mover that reflected the beam; -1: none, -2: the robot itself.
         T_world_base: (T, D+1, D+1) float64 true poses.
         walls: (W, 4) float64 segments x0, y0, x1, y1 in metres.
-        movers: (T, P, 3) float64, where each mover is at each scan: x, y of its middle in metres,
+        movers: (T, P, 3) float64, pose of each mover at each scan: x, y of its center in metres,
             heading in rad. First people, then doors (heading: from the hinge), then vehicles, then
-            things; NaN where there is no such thing at that scan.
-        scene: name, seed and all parameters, JSON-able; under `mover_kinds` what each mover is:
-            "person", "door", "car", "forklift" or "thing". With a lidar, under `mover_sizes` the
-            length, width and height of each in metres, null where it has no such measure.
-        lasting: (K, 4) faces of things that were moved or brought, where they stand at the end.
+            movable objects; NaN while absent.
+        scene: name, seed and all parameters as JSON; `mover_kinds`: kind of each mover ("person",
+            "door", "car", "forklift" or "thing"); with a lidar `mover_sizes`: length, width and
+            height of each in metres, null where undefined.
+        lasting: (K, 4) faces of moved or added objects, at the end.
     """
 
     static: NDArray[np.bool_]
@@ -52,7 +51,7 @@ def write_truth(truth: Truth, stamp_ns: NDArray[np.int64], folder: Path) -> None
     inside = folder / FOLDER
     inside.mkdir()
     for name in (*_ARRAYS, *([_LASTING] if len(truth.lasting) else [])):
-        # those of each beam may be larger than memory
+        # per-beam arrays may be larger than memory
         write = write_npy if name in _PER_BEAM else np.save
         write(inside / f"{name}.npy", getattr(truth, name))
     write_tum(inside / "trajectory.tum", stamp_ns, truth.T_world_base)
@@ -60,7 +59,7 @@ def write_truth(truth: Truth, stamp_ns: NDArray[np.int64], folder: Path) -> None
 
 
 def load_truth(path: str | Path) -> Truth:
-    """The truth of a simulation, given its folder or the `truth` folder inside.
+    """Load the truth of a simulation, given its folder or the `truth` folder inside.
 
     Raises:
         InputError: there is none, or it is damaged.

@@ -1,5 +1,4 @@
-"""The truth about pictures, surfaces and colours of a simulation, as files beside the truth of its
-beams."""
+"""Truth about images and surfaces of a simulation, as files beside the truth about its beams."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,20 +23,19 @@ Float = NDArray[np.float64]
 _IMAGES = "images"
 _STANDING, _MOVING, _POSE = "standing.npz", "moving.npz", "moving_pose.npy"
 _CAMERAS = "T_world_camera.npy"
-_FARTHEST = 65.535  # m, that a picture of millimetres holds
+_MAX_DISTANCE = 65.535  # m, of a 16-bit image in millimetres
 
 
 @dataclass(frozen=True, eq=False)
 class ImageTruth:
-    """What is known of N pictures and of the world that they show.
+    """Truth about N images and the surfaces that they show.
 
     Attributes:
         colour_seed: of `colours.static_colour`.
         standing, moving: the true surfaces.
-        T_world_camera: (N, 4, 4) from where each picture was taken.
-        mask: of a picture, (h, w) uint16; 0: something that stands still, k + 1: mover k, 65535:
-            nothing.
-        distance: of a picture, (h, w) float32 metres along each pixel's ray; inf: nothing, or too
+        T_world_camera: (N, 4, 4) pose of each image.
+        mask: of an image, (h, w) uint16; 0: static, k + 1: mover k, 65535: nothing.
+        distance: of an image, (h, w) float32 metres along each pixel's ray; inf: nothing, or too
             far.
     """
 
@@ -50,7 +48,7 @@ class ImageTruth:
 
 
 def make_image_truth(world: World, photographs: CameraSimulator) -> ImageTruth:
-    """The truth about the pictures of a world."""
+    """The truth about the images of a world."""
     return ImageTruth(
         photographs.colour_seed,
         *collect_surfaces(world),
@@ -61,7 +59,7 @@ def make_image_truth(world: World, photographs: CameraSimulator) -> ImageTruth:
 
 
 def collect_surfaces(world: World) -> tuple[StaticSurfaces, MovingSurfaces]:
-    """The surfaces of a world; what might have moved, and never did, stands still."""
+    """The surfaces of a world; movers that never moved are static."""
     poses = []
     for scan in range(len(world.ridden)):
         moment = world.moment(np.array([scan]), np.zeros(1))
@@ -76,7 +74,7 @@ def collect_surfaces(world: World) -> tuple[StaticSurfaces, MovingSurfaces]:
 
 
 def write_image_truth(truth: ImageTruth, folder: Path) -> None:
-    """Write all but the pictures' own truth into an existing folder."""
+    """Write all but masks and distances into an existing folder."""
     faces, solids, ground, ceiling = truth.standing
     standing: dict[str, NDArray[Any]] = {
         "faces_ends": faces.ends,
@@ -95,17 +93,14 @@ def write_image_truth(truth: ImageTruth, folder: Path) -> None:
 
 
 def write_truth_on_read(photographs: CameraSimulator, folder: Path) -> Images:
-    """The pictures; when one is read, its truth goes into a folder.
-
-    So each is rendered once only.
-    """
+    """The images; reading one writes its truth, so that each is rendered once only."""
     inside = folder / _IMAGES
     inside.mkdir()
 
     def load(image: int) -> NDArray[np.uint8]:
         one = photographs.render(image)
         write_png(one.mask, inside / f"{image:06d}.png")
-        near = np.where(one.distance < _FARTHEST, one.distance, 0.0)
+        near = np.where(one.distance < _MAX_DISTANCE, one.distance, 0.0)
         write_png(np.rint(1e3 * near).astype(np.uint16), inside / _distance(image))
         return one.color
 
@@ -114,7 +109,7 @@ def write_truth_on_read(photographs: CameraSimulator, folder: Path) -> Images:
 
 
 def load_image_truth(path: str | Path) -> ImageTruth:
-    """The truth about the pictures of a simulation, given its folder or the `truth` inside.
+    """Load the truth about images, given the folder of a simulation or the `truth` inside.
 
     Raises:
         InputError: there is none, or it is damaged.
@@ -124,7 +119,7 @@ def load_image_truth(path: str | Path) -> ImageTruth:
         folder = folder / "truth"
     if not (folder / _STANDING).is_file():
         hint = "a folder that 'stillmap simulate ... --camera' wrote"
-        raise InputError("holds no truth about pictures", where=str(path), hint=hint)
+        raise InputError("holds no truth about images", where=str(path), hint=hint)
     try:
         of, moves = _arrays(folder / _STANDING), _arrays(folder / _MOVING)
         faces = Faces(of["faces_ends"], of["faces_z"], of["faces_glass"])

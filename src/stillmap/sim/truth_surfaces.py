@@ -1,7 +1,4 @@
-"""The true surfaces of what stands still in a simulated world: how far points are from them.
-
-The true surfaces of what moves in a simulated world, as points.
-"""
+"""True surfaces of a simulated world: projection of points to static ones, samples of movers."""
 
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -16,20 +13,19 @@ Float = NDArray[np.float64]
 
 Nearest = Callable[[Float], Float]
 
-_Thing = tuple[Float, Float, Nearest]
+_Surface = tuple[Float, Float, Nearest]
 
-_SQUARE = 4.0  # m, within which points have the same things near
-
-_HALVINGS = 80  # after which the nearest point of an ellipse is known to the last digit
+_SQUARE = 4.0  # m, points within one share their candidate surfaces
+_BISECTIONS = 80  # of the root for the nearest point of an ellipse, to the last digit
 
 
 class StaticSurfaces(NamedTuple):
-    """What stands still in a world.
+    """The static surfaces of a world.
 
     Attributes:
-        faces, solids: what there is; the solids at all times.
+        faces, solids: static ones; the solids at all times.
         ground: the ground.
-        ceiling: metres above it; None: the open sky.
+        ceiling: metres above it; None: open sky.
     """
 
     faces: Faces
@@ -38,20 +34,20 @@ class StaticSurfaces(NamedTuple):
     ceiling: float | None
 
     def project(self, points: Float) -> tuple[Float, Float]:
-        """The nearest places of the surfaces.
+        """Project points to the nearest surface.
 
         Exact for solids, and for faces and ground where the ground is level; where it slopes, up
-        to the square of the slope. Surfaces within others count: the floor below a cupboard.
+        to the square of the slope. Hidden surfaces count, as the floor below a cupboard.
 
         Args:
             points: (n, 3) metres.
 
         Returns:
-            (n,) distances in metres, and the places (n, 3).
+            Distances (n,) in metres, and the projected points (n, 3).
         """
         places = _on_ground(points, self.ground, self.ceiling)
         distance = np.linalg.norm(places - points, axis=1)
-        things = list(self._things())
+        things = list(self._surfaces())
         lowest = np.array([low for low, _, _ in things]).reshape(-1, 2)
         highest = np.array([high for _, high, _ in things]).reshape(-1, 2)
         for part in _in_squares(points):
@@ -59,12 +55,12 @@ class StaticSurfaces(NamedTuple):
             low, high = some[:, :2].min(axis=0), some[:, :2].max(axis=0)
             off = np.maximum(np.maximum(lowest - high, low - highest), 0.0)
             for k in np.flatnonzero((off * off).sum(axis=1) < d.max() ** 2).tolist():
-                _take_nearer(some, d, at, things[k])
+                _replace_nearer(some, d, at, things[k])
             distance[part], places[part] = d, at
         return distance, places
 
-    def _things(self) -> Iterator[_Thing]:
-        """Least and greatest x and y of each thing, and its nearest places."""
+    def _things(self) -> Iterator[_Surface]:
+        """Minimum and maximum x and y of each surface, and its projection."""
         for ends, z in zip(self.faces.ends, self.faces.z, strict=True):
             low, high = np.minimum(ends[:2], ends[2:]), np.maximum(ends[:2], ends[2:])
             yield low, high, partial(_on_face, ends=ends, z=z, ground=self.ground)
@@ -75,7 +71,7 @@ class StaticSurfaces(NamedTuple):
 
 
 def _in_squares(points: Float) -> Iterator[NDArray[np.intp]]:
-    """Numbers of the points (n, 3) in each square of the plane that has any."""
+    """Indices of the points (n, 3) in each non-empty square of the plane."""
     if not len(points):
         return
     cell = np.floor(points[:, :2] / _SQUARE).astype(np.int64)
@@ -85,8 +81,8 @@ def _in_squares(points: Float) -> Iterator[NDArray[np.intp]]:
     yield from np.split(order, np.flatnonzero(np.diff(key[order])) + 1)
 
 
-def _take_nearer(points: Float, distance: Float, places: Float, thing: _Thing) -> None:
-    """Replaces places (n, 3) and how far they are from points by those of a thing, if nearer."""
+def _replace_nearer(points: Float, distance: Float, places: Float, thing: _Surface) -> None:
+    """Replace projections (n, 3) and distances by those of a surface where it is nearer."""
     low, high, nearest = thing
     off = np.maximum(np.maximum(low - points[:, :2], points[:, :2] - high), 0.0)
     near = np.flatnonzero((off * off).sum(axis=1) < distance * distance)
@@ -99,7 +95,7 @@ def _take_nearer(points: Float, distance: Float, places: Float, thing: _Thing) -
 
 
 def to_world(local: Float, pose: Float) -> Float:
-    """(n, 3) of points in the frame of a solid at poses (4,) or (n, 4): x, y, heading, foot."""
+    """(n, 3) points in the frame of a solid at poses (4,) or (n, 4): x, y, heading, foot."""
     x, y, heading, foot = np.moveaxis(pose, -1, 0)
     c, s = np.cos(heading), np.sin(heading)
     u, v, w = local.T
@@ -115,8 +111,7 @@ def to_local(points: Float, pose: Float) -> Float:
 
 
 def project_to_solid(points: Float, solids: Solids, k: int) -> Float:
-    """(n, 3) the places of the surface of solid k nearest to points (n, 3), each at a time of its
-    own, or all at one."""
+    """(n, 3) projection of points (n, 3) to the surface of solid k, at n times or at one."""
     (a, b), (z0, z1) = solids.half[k], solids.z[k]
     pose, form = solids.pose[:, k], solids.form[k]
     middle, h = np.array([0.0, 0.0, (z0 + z1) / 2]), (z1 - z0) / 2
@@ -131,7 +126,7 @@ def project_to_solid(points: Float, solids: Solids, k: int) -> Float:
 
 
 def _on_ground(points: Float, ground: Ground, ceiling: float | None) -> Float:
-    """The nearest places of street, pavements and ceiling."""
+    """Projection to street, pavements and ceiling."""
     x, y, z = points.T
     level = ground.level(x, y)
     gx, gy = ground.gradient(x, y)
@@ -180,11 +175,11 @@ def _on_cylinder(p: Float, half: Float, h: float) -> Float:
 
 
 def _on_ellipsoid(p: Float, half: Float) -> Float:
-    """The nearest places of an ellipse or ellipsoid (D half axes) to points (n, D).
+    """Projection of points (n, D) to an ellipse or ellipsoid with D half axes.
 
     They are half^2 |p| / (t + half^2) for the greatest root t of sum (half |p| / (t + half^2))^2
     = 1 (Eberly, "Distance from a point to an ellipse, an ellipsoid, or a hyperellipsoid", 2013),
-    found by halving.
+    found by bisection.
     """
     if not len(p):
         return p.copy()
@@ -192,7 +187,7 @@ def _on_ellipsoid(p: Float, half: Float) -> Float:
     squares, least = half * half, half.argmin()
     low = -squares[least] + half[least] * q[:, least]
     high = -squares[least] + np.linalg.norm(half * q, axis=1)
-    for _ in range(_HALVINGS):
+    for _ in range(_BISECTIONS):
         t = 0.5 * (low + high)
         beyond = ((half * q / (t[:, None] + squares)) ** 2).sum(axis=1) > 1.0
         low, high = np.where(beyond, t, low), np.where(beyond, high, t)
@@ -200,13 +195,12 @@ def _on_ellipsoid(p: Float, half: Float) -> Float:
     return np.asarray(np.copysign(found, p))
 
 
-_FASTEST = 40.0  # m/s; what goes faster has begun its way again elsewhere
-
-_INSIDE = 1e-6  # m, points less deep in another part are on the surface
+_MAX_SPEED = 40.0  # m/s; anything faster has restarted its lane
+_MIN_DEPTH = 1e-6  # m, of a point inside another part
 
 
 class MovingSurfaces(NamedTuple):
-    """The parts of what moves, at T scans.
+    """The parts of the movers at T scans.
 
     Attributes:
         stamp_ns: (T,) by the clock of the scans.
@@ -221,7 +215,7 @@ class MovingSurfaces(NamedTuple):
         return np.flatnonzero(self.solids.mover == mover)
 
     def at(self, parts: NDArray[np.intp], stamp_ns: NDArray[np.int64] | int) -> Solids:
-        """Some parts at n times; between two scans, and during the last one, they go on evenly."""
+        """Some parts at n times; interpolated between scans, extrapolated after the last one."""
         at_ns, last = np.atleast_1d(np.asarray(stamp_ns, np.int64)), len(self.stamp_ns) - 1
         t = np.clip(np.searchsorted(self.stamp_ns, at_ns, side="right") - 1, 0, max(last - 1, 0))
         after = np.minimum(t + 1, last)
@@ -231,8 +225,8 @@ class MovingSurfaces(NamedTuple):
         change = self.solids.pose[after[:, None], parts] - before
         change[..., 2] = (change[..., 2] + np.pi) % (2 * np.pi) - np.pi
         way = np.hypot(change[..., 0], change[..., 1])
-        goes_on = way < _FASTEST * 1e-9 * np.maximum(span, 1)[:, None]
-        # who is somewhere else in the next scan was put there
+        goes_on = way < _MAX_SPEED * 1e-9 * np.maximum(span, 1)[:, None]
+        # a jump between scans is not interpolated
         stays = np.where(share < 1.0, before, before + change)
         pose = np.where(goes_on[..., None], before + share * change, stays)
         return self.solids._replace(pose=self.solids.pose[:1]).select(parts)._replace(pose=pose)
@@ -241,19 +235,16 @@ class MovingSurfaces(NamedTuple):
 def sample_mover(
     moving: MovingSurfaces, mover: int, stamp_ns: int, spacing: float
 ) -> tuple[Float, NDArray[np.intp]]:
-    """Points on the surface of a mover at one time.
-
-    What lies within another of its parts is no surface.
+    """Sample the surface of a mover at one time, without points inside another of its parts.
 
     Args:
-        moving: what moves.
-        mover: which.
-        stamp_ns: when.
-        spacing: metres from one point to the next, about.
+        moving: the movers.
+        mover: number of the mover.
+        stamp_ns: time.
+        spacing: approximate distance between points, metres.
 
     Returns:
-        (n, 3) metres in the world, none where it is nowhere; (n,) which of `moving.parts(mover)`
-        each is on.
+        (n, 3) metres in the world, none while absent; (n,) index into `moving.parts(mover)`.
     """
     parts = moving.parts(mover)
     solids = moving.at(parts, stamp_ns)
@@ -270,7 +261,7 @@ def sample_mover(
 
 
 def _is_within(points: Float, solids: Solids, k: int) -> NDArray[np.bool_]:
-    (a, b), (z0, z1) = solids.half[k] - _INSIDE, solids.z[k] + (_INSIDE, -_INSIDE)
+    (a, b), (z0, z1) = solids.half[k] - _MIN_DEPTH, solids.z[k] + (_MIN_DEPTH, -_MIN_DEPTH)
     u, v, w = to_local(points, solids.pose[0, k]).T
     h, up = (z1 - z0) / 2, w - (z0 + z1) / 2
     if solids.form[k] == BOX:
@@ -327,11 +318,11 @@ def _box_samples(half: Float, spacing: float) -> Float:
 
 
 def _along(half: float, spacing: float) -> Float:
-    """Middles of equal parts of -half to half."""
+    """Centers of equal parts of -half to half."""
     return half * (2.0 * _even(2.0 * half, spacing) - 1.0)
 
 
 def _even(length: float, spacing: float) -> Float:
-    """Middles of equal parts of 0 to 1, each no longer than `spacing` of `length`."""
+    """Centers of equal parts of 0 to 1, each at most `spacing` / `length` long."""
     n = max(1, int(np.ceil(length / spacing - 1e-9)))
     return np.asarray((np.arange(n) + 0.5) / n)

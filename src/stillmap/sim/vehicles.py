@@ -1,7 +1,4 @@
-"""Vehicles that follow lanes, keep their distance, stop at times, or wait in a queue.
-
-How fast a robot drives: curves, red lights, and the time that it takes to gain speed.
-"""
+"""Vehicles on lanes (car following, lights, queues), and the speed profile of the robot."""
 
 import math
 
@@ -15,30 +12,30 @@ Float = NDArray[np.float64]
 
 _SPACING = 0.25  # m between points of a lane
 
-_GAP = 2.0  # m between two that stand
+_GAP = 2.0  # m between standing vehicles
 
-_HEADWAY = 1.2  # s between two that drive
+_HEADWAY = 1.2  # s between moving ones
 
 _ACCELERATION = 2.5  # m/s^2
 
 _BRAKING = 8.0  # m/s^2
 
-_ASIDE = 0.6  # m, how near the robot comes to the side of a vehicle that need not wait
+_SIDE_MARGIN = 0.6  # m between the robot and a vehicle that passes it
 
-_RELEASE = 4.0  # m from the point where the robot lets a queue go
+_RELEASE = 4.0  # m from the robot to the point that releases a queue
 
 _MIN_STOP = 3.0  # s
 
 _VAN_SHARE = 0.25  # of the cars
 
-_WAY_TO_STOP = (20.0, 120.0)  # m between two stops of those who stop
+_STOP_DISTANCE = (20.0, 120.0)  # m between two stops
 
 
 class Traffic:
     """State of V vehicles, lane by lane.
 
     Attributes:
-        kinds: what they are.
+        kinds: car or forklift.
         size: (V, 2) length and width, metres.
         speed: (V,) m/s.
     """
@@ -55,14 +52,14 @@ class Traffic:
         self.size = _sizes(self.kinds, rng)
         self._wanted = rng.uniform(options.min_speed, options.max_speed, V)
         self._stops = rng.random(V) < options.stopping_share
-        self._way_left = rng.uniform(*_WAY_TO_STOP, V)
+        self._way_left = rng.uniform(*_STOP_DISTANCE, V)
         self._stop_left = np.zeros(V)
         self._waits = np.array([lanes[k].waiting > 0 for k in self._lane.tolist()], bool)
         self._at = self._first_places(rng.uniform(0.0, 0.5, V))
         self.speed = np.where(self._waits, 0.0, self._wanted)
 
     def poses(self) -> Float:
-        """(V, 3) centres in metres and headings in radians."""
+        """(V, 3) centers in metres and headings in radians."""
         poses = np.zeros((len(self._at), 3))
         for k, track in enumerate(self._lanes):
             on = self._lane == k
@@ -83,7 +80,7 @@ class Traffic:
         return np.concatenate([corners, np.roll(corners, -1, axis=1)], axis=-1).reshape(-1, 4)
 
     def step(self, dt: float, robot: Float, radius: float) -> None:
-        """Everybody drives on for dt seconds.
+        """Advance by dt seconds.
 
         Args:
             dt: seconds.
@@ -97,7 +94,7 @@ class Traffic:
         gap = self._gaps(robot, radius)
         wanted = np.minimum(wanted, np.maximum(gap - _GAP, 0.0) / _HEADWAY)
         change = np.clip(wanted - self.speed, -_BRAKING * dt, _ACCELERATION * dt)
-        # however late somebody brakes, nobody touches
+        # vehicles never touch, however late one brakes
         room = np.maximum(gap - 0.25 * _GAP, 0.0) / dt
         self.speed = np.minimum(np.maximum(self.speed + change, 0.0), room)
         self._at = self._at + self.speed * dt
@@ -122,7 +119,7 @@ class Traffic:
                 self._waits[self._lane == k] = False
 
     def _gaps(self, robot: Float, radius: float) -> Float:
-        """(V,) metres to whatever is ahead on the same lane."""
+        """(V,) metres to the next obstacle on the same lane."""
         gaps = np.full(len(self._at), np.inf)
         for k, track in enumerate(self._lanes):
             on = np.flatnonzero(self._lane == k)
@@ -132,13 +129,16 @@ class Traffic:
                 between = (self._at[ahead] - self._at[on]) % track.length
                 gaps[on] = between - (self.size[on, 0] + self.size[ahead, 0]) / 2
             gaps[on] = np.minimum(gaps[on], self._to_red_light(track, on))
-            if track.distance(robot) < radius + _ASIDE + self.size[on, 1].max(initial=0.0) / 2:
+            if (
+                track.distance(robot)
+                < radius + _SIDE_MARGIN + self.size[on, 1].max(initial=0.0) / 2
+            ):
                 between = (track.nearest(robot) - self._at[on]) % track.length
                 gaps[on] = np.minimum(gaps[on], between - self.size[on, 0] / 2 - radius)
         return gaps
 
     def _to_red_light(self, track: "_Track", on: NDArray[np.int64]) -> Float:
-        """(N,) metres from the vehicles `on` a lane to the next red light that they can stop at."""
+        """(N,) metres from vehicles `on` a lane to the next red light that they can stop at."""
         gaps = np.full(len(on), np.inf)
         for light, line in zip(track.lane.lights, track.lines, strict=True):
             if light.is_red(self._seconds):
@@ -151,11 +151,11 @@ class Traffic:
         self._way_left -= way
         due = np.flatnonzero(self._stops & (self._way_left < 0))
         self._stop_left[due] = self._rng.uniform(_MIN_STOP, self._options.max_stop, len(due))
-        self._way_left[due] = self._rng.uniform(*_WAY_TO_STOP, len(due))
+        self._way_left[due] = self._rng.uniform(*_STOP_DISTANCE, len(due))
 
 
 class _Track:
-    """A lane as points every few centimetres; past its end it begins again."""
+    """A lane as dense points; past its end it begins again."""
 
     def __init__(self, lane: Lane) -> None:
         self.lane = lane
@@ -183,7 +183,7 @@ class _Track:
 
 
 def _spread(lanes: tuple[Lane, ...], vehicles: int) -> list[int]:
-    """Whose lane each vehicle is on: the queues, and the others spread over the free lanes."""
+    """Lane of each vehicle: queues, and the others spread over the free lanes."""
     free = [k for k, lane in enumerate(lanes) if not lane.waiting]
     count = [lane.waiting for lane in lanes]
     for n in range(vehicles if free else 0):
@@ -202,65 +202,65 @@ def _sizes(kinds: list[str], rng: np.random.Generator) -> Float:
     return np.reshape(usual, (-1, 2)) * spread
 
 
-_AT_ONCE = 1e3  # m/s^2, as good as no limit
+_UNLIMITED = 1e3  # m/s^2
 
-_OVER = 0.5  # m past the line that somebody stops who brakes for it
+_MAX_OVERSHOOT = 0.5  # m past the stop line
 
-_BEND = 1.0  # m before and after a point, over which a curve is measured
+_CURVE_SPAN = 1.0  # m before and after a point, over which its curvature is measured
 
 
 class SpeedProfile:
-    """Speeds along a way.
+    """Speed limits along a route from curves, lights and acceleration.
 
     Args:
         way: (N, 2) points in metres, evenly spaced.
-        closed: the way begins again at its end.
-        options: the robot's.
+        closed: whether the route is a loop.
+        options: of the robot.
         lights: where it stops while they are red.
     """
 
     def __init__(
         self, way: Float, closed: bool, options: RobotOptions, lights: tuple[Light, ...]
     ) -> None:
-        self._acceleration = options.acceleration or _AT_ONCE
+        self._acceleration = options.acceleration or _UNLIMITED
         self._spacing = float(np.hypot(*(way[1] - way[0]))) if len(way) > 1 else 0.0
         self._closed, self._lights = closed, lights
         self._lines = [int(np.argmin(np.hypot(*(way - light.at).T))) for light in lights]
-        self._allowed = self._through_curves(way, options.speed)
+        self._allowed = self._limit_by_curves(way, options.speed)
 
     def accelerate(self, wanted: float, now: float, dt: float) -> float:
-        """m/s, how much of a wanted speed is reached in dt seconds."""
+        """m/s, speed reached in dt seconds."""
         return min(wanted, now + self._acceleration * dt)
 
     def limit_speed(self, at: int, past: float, now: float, seconds: float, dt: float) -> float:
-        """m/s, how fast the robot may drive next.
+        """m/s, maximum speed of the next step.
 
         Args:
-            at: the point of the way that the robot is nearest to.
-            past: m, how far it is past that.
-            now: m/s, its speed so far.
-            seconds: since the recording began.
-            dt: s, for how long.
+            at: index of the point of the route nearest to the robot.
+            past: m from that point to the robot, along the route.
+            now: m/s, current speed.
+            seconds: since the beginning of the recording.
+            dt: s, of the step.
         """
         a, points = self._acceleration, len(self._allowed)
         speed = float(self._allowed[at])
         for light, line in zip(self._lights, self._lines, strict=True):
             ahead = (line - at) % points if self._closed else line - at
             left = ahead * self._spacing - past
-            # whoever is past it or cannot stop any more drives on
-            if light.is_red(seconds) and left + _OVER > now**2 / (2 * a):
-                # what is left is driven in this step and while braking after it
+            # a robot past the line, or unable to stop, drives on
+            if light.is_red(seconds) and left + _MAX_OVERSHOOT > now**2 / (2 * a):
+                # the rest is driven in this step and while braking after it
                 left = max(left, 0.0)
                 speed = min(speed, math.sqrt((a * dt) ** 2 + 2 * a * left) - a * dt)
         return speed
 
-    def _through_curves(self, way: Float, fastest: float) -> Float:
-        """(N,) m/s, no faster than curves allow, and slow enough to brake for those ahead."""
+    def _limit_by_curves(self, way: Float, fastest: float) -> Float:
+        """(N,) m/s, limited by lateral acceleration, and by braking for later curves."""
         if len(way) < 3:
             return np.full(len(way), fastest)
         laps = np.concatenate([way, way[1:]]) if self._closed else way
         heading = np.unwrap(np.arctan2(*np.diff(laps, axis=0).T[::-1]))
-        half = max(1, round(_BEND / self._spacing))
+        half = max(1, round(_CURVE_SPAN / self._spacing))
         ends = np.pad(heading, half, mode="edge")
         bend = np.abs(ends[2 * half :] - ends[: -2 * half]) / (2 * half * self._spacing)
         squares = np.minimum(fastest**2, self._acceleration / np.maximum(bend, 1e-9))

@@ -1,7 +1,4 @@
-"""What stands in a world, in 3D: told from its plan, where everything is lines.
-
-Everything that moves, or might have, in 3D: solids carried along by the plan's poses.
-"""
+"""3D worlds from plans: closed outlines become solids, other lines walls; movers get solids."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -19,15 +16,13 @@ from stillmap.sim.sweep import Moment
 
 Float = NDArray[np.float64]
 
-_LARGEST = 6.0  # m, a loop that is longer is a room or a house
-
-_MOST_SIDES = 16
-
-_BELOW = -0.5  # m, how deep walls go, so that no beam gets below them
+_MAX_SIZE = 6.0  # m, of a loop that is not a room or a house
+_MAX_SIDES = 16
+_WALL_BOTTOM = -0.5  # m, so that no beam passes below walls
 
 
 class Loop(NamedTuple):
-    """A closed outline: x, y of its middle, heading, length along and width across it, sides."""
+    """A closed outline: x, y of its center, heading, length, width, number of sides."""
 
     x: float
     y: float
@@ -43,8 +38,8 @@ def make_static_world(scene: Scene, ground: Ground) -> tuple[Faces, Solids]:
     top = scene.heights.top
     lintels = [door.leaf(door.closed) for door in scene.leaves if scene.heights.doors < top]
     kerbs = [side for x0, y0, x1, y1 in scene.pavements for side in _sides(x0, y0, x1, y1)]
-    z = [(_BELOW, top)] * (len(lines) + len(scene.glass))
-    z += [(scene.heights.doors, top)] * len(lintels) + [(_BELOW, ground.kerb)] * len(kerbs)
+    z = [(_WALL_BOTTOM, top)] * (len(lines) + len(scene.glass))
+    z += [(scene.heights.doors, top)] * len(lintels) + [(_WALL_BOTTOM, ground.kerb)] * len(kerbs)
     ends = [*lines, *scene.glass, *lintels, *kerbs]
     is_glass = np.zeros(len(ends), bool)
     is_glass[len(lines) : len(lines) + len(scene.glass)] = True
@@ -55,14 +50,14 @@ def make_static_world(scene: Scene, ground: Ground) -> tuple[Faces, Solids]:
 
 
 def make_parts(loop: Loop, heights: HeightOptions) -> list[Part]:
-    """What a closed outline is, in 3D, about its middle and heading."""
+    """3D parts of a closed outline, about its center and heading."""
     if loop.sides == 4:
         return geometry.make_box(loop.length, loop.width, heights)
     return geometry.make_round_object(loop.length / 2, heights)
 
 
 def trace_loops(walls: Sequence[Segment]) -> tuple[list[Loop], list[Segment]]:
-    """The closed outlines of things in a plan, and the lines that are left."""
+    """The closed outlines of objects in a plan, and the remaining lines."""
     loops: list[Loop] = []
     lines: list[Segment] = []
     for chain in _chains(walls):
@@ -75,7 +70,7 @@ def trace_loops(walls: Sequence[Segment]) -> tuple[list[Loop], list[Segment]]:
 
 
 def _chains(walls: Sequence[Segment]) -> Iterator[list[Segment]]:
-    """Segments that follow one another, up to where an outline closes."""
+    """Consecutive segments, up to where an outline closes."""
     chain: list[Segment] = []
     for segment in walls:
         if chain and not np.allclose(chain[-1][2:], segment[:2], rtol=0.0, atol=1e-6):
@@ -90,9 +85,9 @@ def _chains(walls: Sequence[Segment]) -> Iterator[list[Segment]]:
 
 
 def _loop(chain: list[Segment]) -> Loop | None:
-    """The outline of a thing; None: the chain is not closed, or it is a room or a house."""
+    """The outline of an object; None: the chain is not closed, or is a room or a house."""
     starts, ends = np.array(chain)[:, :2], np.array(chain)[:, 2:]
-    if not 4 <= len(chain) <= _MOST_SIDES or not np.allclose(starts[0], ends[-1], atol=1e-6):
+    if not 4 <= len(chain) <= _MAX_SIDES or not np.allclose(starts[0], ends[-1], atol=1e-6):
         return None
     sides, middle = ends - starts, starts.mean(axis=0)
     length, width = np.hypot(*sides[0]), np.hypot(*sides[1])
@@ -100,7 +95,7 @@ def _loop(chain: list[Segment]) -> Loop | None:
         length = width = 2 * np.hypot(*(starts - middle).T).mean()
     elif abs(sides[0] @ sides[1]) > 1e-6 * max(length * width, 1e-9):
         return None
-    if max(length, width) > _LARGEST:
+    if max(length, width) > _MAX_SIZE:
         return None
     along = sides[0] if length >= width else sides[1]
     heading = float(np.arctan2(along[1], along[0]))
@@ -113,26 +108,24 @@ def _sides(x0: float, y0: float, x1: float, y1: float) -> list[Segment]:
     return [(x0, y0, x1, y0), (x1, y0, x1, y1), (x1, y1, x0, y1), (x0, y1, x0, y0)]
 
 
-_TALL = (1.7, 0.09)  # m, mean and standard deviation of how tall people are
-
-_TALLEST = 2.0  # m
-
-_THIN = 0.02  # m, faces of things that are no closed outlines
+_TALL = (1.7, 0.09)  # m, mean and standard deviation of the height of people
+_MAX_TALL = 2.0  # m
+_THIN = 0.02  # m, thickness of faces that are not closed outlines
 
 
 class MoverSolids:
-    """People, doors, vehicles and things of a scene.
+    """Solids of the people, doors, vehicles and movable objects of a scene.
 
-    Those that never moved have no mover's number: nobody could tell that they might have.
+    Those that never moved have no mover number.
 
     Args:
         scene: the world.
-        motion: where everything is at each scan.
-        ground: what it stands on.
-        rng: how tall people are.
+        motion: poses at each scan.
+        ground: the ground.
+        rng: of the heights of people.
 
     Attributes:
-        tall: (P,) metres, how high each mover reaches above its foot.
+        tall: (P,) metres, height of each mover.
     """
 
     def __init__(
@@ -141,7 +134,7 @@ class MoverSolids:
         self._motion, self._ground = motion, ground
         persons, Q = motion.kinds.count("person"), len(motion.people.mover)
         self._persons = persons
-        # NaN of things is nowhere; headings of vehicles go round and round
+        # poses of absent objects are NaN; headings of vehicles are unwrapped
         others = motion.poses[:, persons:].copy()
         solid = np.array([kind != "thing" for kind in motion.kinds[persons:]], bool)
         others[:, solid, 2] = np.unwrap(others[:, solid, 2], axis=0)
@@ -149,7 +142,7 @@ class MoverSolids:
         parts: list[tuple[int, int, Part]] = []
         self.tall = np.zeros(len(motion.kinds))
         self.tall[:persons] = np.minimum(
-            _TALL[0] + _TALL[1] * rng.standard_normal(persons), _TALLEST
+            _TALL[0] + _TALL[1] * rng.standard_normal(persons), _MAX_TALL
         )
         for q, person in enumerate(motion.people.mover.tolist()):
             half = tuple(motion.people.semi_axes[q].tolist())
@@ -163,9 +156,9 @@ class MoverSolids:
         self._assembly = assemble(parts)
 
     def at(self, moment: Moment, scan: int) -> Solids:
-        """Where they are at the n times of a moment within one scan."""
+        """The solids at the n times of a moment within one scan."""
         people, others = self._motion.people, moment.interpolate(self._others)
-        # things do not fly from place to place
+        # movable objects jump from place to place
         others[:, self._is_thing] = self._others[scan, self._is_thing]
         walking = np.concatenate(
             [moment.interpolate(people.xy), moment.interpolate(people.heading)[..., None]], axis=-1
@@ -176,7 +169,7 @@ class MoverSolids:
 
 
 def _parts_of(scene: Scene, motion: Motion, number: int, kind: str) -> list[Part]:
-    """The parts of a door, a vehicle or a thing."""
+    """The parts of a door, vehicle or movable object."""
     length, width = motion.sizes[number].tolist()
     if kind == "door":
         return geometry.make_door(length, min(scene.heights.doors, scene.heights.top))
@@ -192,7 +185,7 @@ def _parts_of(scene: Scene, motion: Motion, number: int, kind: str) -> list[Part
 
 
 def _placed(part: Part, loop: Loop) -> Part:
-    """A part about the middle of a loop, as one about the middle of the whole."""
+    """A part of a loop, relative to the center of the whole object."""
     c, s = math.cos(loop.heading), math.sin(loop.heading)
     ahead = loop.x + c * part.ahead - s * part.aside
     aside = loop.y + s * part.ahead + c * part.aside

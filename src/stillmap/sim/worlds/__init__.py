@@ -38,16 +38,13 @@ _WORLDS: dict[str, Callable[[], Scene]] = {
 _GROWING: dict[str, Callable[[int], Scene]] = {"building": building}  # given the number of scans
 
 
-def _crowded(scene: Scene, people: int) -> Scene:
+def _with_people(scene: Scene, people: int) -> Scene:
     crowd = dataclasses.replace(scene.crowd, people=people)
     return dataclasses.replace(scene, name=f"{scene.name}-crowd", crowd=crowd)
 
 
 def _empty(scene: Scene) -> Scene:
-    """The world with nobody in it, all doors open for good, and no vehicles but the parked ones.
-
-    Things are moved all the same.
-    """
+    """The world without people and moving vehicles, its doors open; objects are moved as before."""
     return dataclasses.replace(
         scene,
         name=f"{scene.name}{_EMPTY}",
@@ -59,12 +56,12 @@ def _empty(scene: Scene) -> Scene:
     )
 
 
-def _emptied(world: Callable[[], Scene]) -> Callable[[], Scene]:
+def _make_empty(world: Callable[[], Scene]) -> Callable[[], Scene]:
     return lambda: _empty(world())
 
 
-def _grown(name: str, scans: int) -> Scene | None:
-    """The world as large as a robot that takes so many scans needs it; None: it has one size."""
+def _grow(name: str, scans: int) -> Scene | None:
+    """The world in a size for this number of scans; None if its size is fixed."""
     grow = _GROWING.get(name.removesuffix(_EMPTY))
     if grow is None or scans < 1:
         return None
@@ -73,9 +70,9 @@ def _grown(name: str, scans: int) -> Scene | None:
 
 SCENES: dict[str, Callable[[], Scene]] = {
     **_WORLDS,
-    "hall-crowd": lambda: _crowded(hall(), 60),
-    "corridor-crowd": lambda: _crowded(corridor(), 40),
-    **{f"{name}{_EMPTY}": _emptied(world) for name, world in _WORLDS.items()},
+    "hall-crowd": lambda: _with_people(hall(), 60),
+    "corridor-crowd": lambda: _with_people(corridor(), 40),
+    **{f"{name}{_EMPTY}": _make_empty(world) for name, world in _WORLDS.items()},
 }
 
 
@@ -94,5 +91,5 @@ def scene_by_name(name: str, changes: Mapping[str, Any] | None = None) -> Scene:
         raise InputError(f"there is no scene '{name}'", hint=hint)
     robot = (changes or {}).get("robot")
     scans = robot.get("scans") if isinstance(robot, Mapping) else None
-    scene = _grown(name, scans) if type(scans) is int else None
+    scene = _grow(name, scans) if type(scans) is int else None
     return override(scene or SCENES[name](), changes or {})

@@ -1,4 +1,4 @@
-"""Worlds in which something is moved, brought or taken away between two visits of the robot."""
+"""Worlds with objects that are moved, brought or taken away between two visits of the robot."""
 
 import dataclasses
 from collections.abc import Iterable, Sequence
@@ -17,14 +17,14 @@ _NIGHT = 215.0  # s, when the robot of the warehouse stops for eight hours
 
 
 @dataclass(frozen=True)
-class _Lifted:
-    """What stands in a world for good, and now only until `until`.
+class _MovedObject:
+    """An object that stands in another world for good, and here until `until`.
 
     Attributes:
-        at: metres, the middle of a rectangle that holds all of it and nothing else.
+        at: metres, center of a rectangle that contains it and nothing else.
         size: metres, of the rectangle.
-        until: seconds after the recording began.
-        then: where it stands afterwards; none: it is taken away.
+        until: seconds since the beginning of the recording.
+        then: stays afterwards; none: it is taken away.
     """
 
     at: Point
@@ -39,12 +39,12 @@ _CHAIR = tuple(
 _CAR = tuple(box(0, 0, 4.4, 1.8))
 
 # the robot comes by twice, the second time some 230 s after the first
-_OFFICE_LIFTED = (
-    _Lifted((14.4, 4.2), (0.6, 0.6), 120.0, (Stay(16.7, 4.9, 0.4, since=120.0),)),  # a chair
-    _Lifted((20.25, 21.75), (0.6, 0.6), 250.0, (Stay(22.3, 19.7, 1.0, since=250.0),)),
-    _Lifted((12.0, 8.5), (1.4, 0.55), 150.0, (Stay(17.5, 8.5, since=150.0),)),  # a copier
-    _Lifted((26.2, 6.85), (1.0, 0.45), 100.0),  # a cupboard
-    _Lifted((39.7, 12.5), (0.55, 1.7), 200.0),  # a bench
+_OFFICE_MOVED = (
+    _MovedObject((14.4, 4.2), (0.6, 0.6), 120.0, (Stay(16.7, 4.9, 0.4, since=120.0),)),  # a chair
+    _MovedObject((20.25, 21.75), (0.6, 0.6), 250.0, (Stay(22.3, 19.7, 1.0, since=250.0),)),
+    _MovedObject((12.0, 8.5), (1.4, 0.55), 150.0, (Stay(17.5, 8.5, since=150.0),)),  # a copier
+    _MovedObject((26.2, 6.85), (1.0, 0.45), 100.0),  # a cupboard
+    _MovedObject((39.7, 12.5), (0.55, 1.7), 200.0),  # a bench
 )
 _OFFICE_THINGS = (
     Thing(tuple(box(0, 0, 1.0, 0.4)), (Stay(26.0, 18.15, since=240.0),)),  # a cupboard
@@ -66,7 +66,7 @@ def office_moved() -> Scene:
     """
     lap: list[Point] = [(1.1, 7.7), (14.5, 7.7), (14.5, 4.6), (14.5, 7.7), (38.9, 7.7)]
     lap += [(38.9, 17.3), (20.5, 17.3), (20.5, 20.6), (20.5, 17.3), (1.1, 17.3)]
-    scene = _lift(office(), _OFFICE_LIFTED, _OFFICE_THINGS)
+    scene = _add_objects(office(), _OFFICE_MOVED, _OFFICE_THINGS)
     return dataclasses.replace(scene, name="office-moved", route=(*lap, *lap, lap[0]))
 
 
@@ -74,14 +74,14 @@ def street_moved() -> Scene:
     """The street, down and up twice: parked cars drive off, others come, one parks elsewhere."""
     elsewhere = (Stay(144.8, PARKED, 0.02, since=75.0),)
     leaving = ((28.9, -1, 45.0), (96.0, -1, 55.0), (59.4, 1, 85.0), (108.2, 1, 90.0))
-    lifted = [_Lifted((x, side * PARKED), _SLOT, until) for x, side, until in leaving]
-    lifted.append(_Lifted((41.1, -PARKED), _SLOT, 50.0, elsewhere))
+    lifted = [_MovedObject((x, side * PARKED), _SLOT, until) for x, side, until in leaving]
+    lifted.append(_MovedObject((41.1, -PARKED), _SLOT, 50.0, elsewhere))
     coming = (Stay(114.3, -PARKED, since=60.0), Stay(41.1, PARKED, 0.03, since=80.0))
     east: list[Point] = [(6.0, -OUTER), (166.0, -OUTER), (170.5, -4.2), (173.4, 0.0)]
     west: list[Point] = [(170.5, 4.2), (166.0, OUTER), (8.0, OUTER)]
     turn: list[Point] = [(3.5, 4.2), (0.6, 0.0), (3.5, -4.2)]
-    scene = _lift(street(), lifted, [Thing(_CAR, (stay,)) for stay in coming])
-    # who stands in its way holds it up: it records for so long, however far it comes
+    scene = _add_objects(street(), lifted, [Thing(_CAR, (stay,)) for stay in coming])
+    # people hold it up: the number of scans is fixed, however far it comes
     robot = dataclasses.replace(scene.robot, scans=1500)
     lap = (*east, *west, *turn)
     return dataclasses.replace(scene, name="street-moved", route=(*lap, *lap), robot=robot)
@@ -95,27 +95,27 @@ def warehouse_moved() -> Scene:
     """
     scene = warehouse()
     robot = RobotOptions(pause_at=_NIGHT)
-    lifted: list[_Lifted] = []
+    lifted: list[_MovedObject] = []
     filled: list[Thing] = []
     for number, (x, y) in enumerate(_bays(RACKS[:3])):
         when = _NIGHT + (1.0 + number * 5 % 7) * _HOUR
         goods = tuple(box(0, 0, 1.5 - 0.1 * (number % 5), 0.9 - 0.1 * (number % 3)))
         other = Thing(goods, (Stay(x, y, 0.03 * (number % 4 - 2), since=when + 0.5 * _HOUR),))
         slot = (BAY - 0.14, 1.6)  # between the posts
-        is_full = bool(_held(scene.walls, (x, y), slot)[0])
+        is_full = bool(_walls_within(scene.walls, (x, y), slot)[0])
         if is_full and number % 3 == 0:
-            lifted.append(_Lifted((x, y), slot, when))
+            lifted.append(_MovedObject((x, y), slot, when))
         if not is_full or number % 6 == 0:
             filled.append(other)
     lap: list[Point] = [(2.4, 4.3), (23.9, 4.3), (47, 4.3), (47, 7.6), (23.9, 7.6), (2.4, 7.6)]
-    scene = _lift(scene, lifted, filled)
+    scene = _add_objects(scene, lifted, filled)
     return dataclasses.replace(
         scene, name="warehouse-moved", route=(*lap, *lap, lap[0]), robot=robot
     )
 
 
 def _bays(rows: Sequence[float]) -> list[Point]:
-    """The middles of the bays of these rows of racks."""
+    """Centers of the bays of these rows of racks."""
     return [
         (low + (k + 0.5) * BAY, y)
         for y in rows
@@ -124,18 +124,18 @@ def _bays(rows: Sequence[float]) -> list[Point]:
     ]
 
 
-def _lift(scene: Scene, lifted: Iterable[_Lifted], others: Iterable[Thing]) -> Scene:
-    """The scene with things, some of which are walls of it."""
+def _add_objects(scene: Scene, lifted: Iterable[_MovedObject], others: Iterable[Thing]) -> Scene:
+    """The scene with movable objects, some of them made of its walls."""
     walls, things = scene.walls, []
     for one in lifted:
-        faces, walls = _held(walls, one.at, one.size)
+        faces, walls = _walls_within(walls, one.at, one.size)
         x, y = one.at
         about = tuple((a - x, b - y, c - x, d - y) for a, b, c, d in faces)
         things.append(Thing(about, (Stay(x, y, until=one.until), *one.then)))
     return dataclasses.replace(scene, walls=walls, things=(*things, *others))
 
 
-def _held(
+def _walls_within(
     walls: Sequence[Segment], at: Point, size: Point
 ) -> tuple[tuple[Segment, ...], tuple[Segment, ...]]:
     """The walls within a rectangle, and all others."""

@@ -1,7 +1,4 @@
-"""A crossing with lights, old trees above road and pavement, a narrow pavement, and a park.
-
-A street corner where cars wait to turn: the robot passes them once, and they never stir.
-"""
+"""A crossing with lights and a park, and a street corner with cars that wait to turn."""
 
 import math
 

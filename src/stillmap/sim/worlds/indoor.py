@@ -1,9 +1,4 @@
-"""An exhibition hall.
-
-A loop of corridors.
-
-A warehouse: racks and pallets of all sizes, thin posts, narrow aisles, forklifts.
-"""
+"""An exhibition hall, a loop of corridors, and a warehouse with racks and forklifts."""
 
 import math
 

@@ -1,7 +1,4 @@
-"""A building that grows with the recording: wing after wing, floor after floor.
-
-A wing of a building: a ring of corridors with rooms on both sides, and ways through it.
-"""
+"""A building whose wings and floors grow with the number of scans."""
 
 import itertools
 import math

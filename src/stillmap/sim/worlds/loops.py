@@ -1,7 +1,4 @@
-"""Corridors around courtyards: loops of 160 to 260 m, joined to one another, and full of people.
-
-Ten corridors that look the same: whoever closes loops by looks alone takes one for another.
-"""
+"""Joined loops of corridors around courtyards, and ten identical corridors."""
 
 import itertools
 

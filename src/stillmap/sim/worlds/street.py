@@ -1,7 +1,4 @@
-"""A street with house fronts, trees, lamp posts, parked cars and traffic; the robot is a car.
-
-The street when everybody is on the road: cars stop and go, wait at lights, and stand in line.
-"""
+"""A street with parked cars and traffic, and its version with lights and a queue."""
 
 import dataclasses
 from collections.abc import Iterable, Sequence
