@@ -1,8 +1,8 @@
-"""Bags and surveys changed inside, their containers kept as they ought to be.
+"""Mutates the content of bags, E57 and PCD files inside valid containers.
 
-What is packed, indexed or summed up hides from changes of single bytes: it is taken apart, changed,
-and put together again. Each function takes the bytes of a file and `change`, which changes some;
-what cannot be taken apart is changed as it is.
+Mutations of single bytes hardly reach compressed, indexed or checksummed content: it is unpacked,
+mutated and packed again. Each function takes the bytes of a file and `mutate`, which mutates some
+bytes; a file that cannot be unpacked is mutated as it is.
 """
 
 import bz2
@@ -13,21 +13,21 @@ import struct
 import lz4.frame
 import lzf
 from backports import zstd
-from parts import Change
+from parts import Mutation
 
 Record = tuple[bytes, bytes]  # header, content
 
 
-def _resized(new: bytes, old: bytes, chance: random.Random) -> bytes:
-    """As long as before, half of the time: then all that lies behind stays where it is said."""
+def _resize(new: bytes, old: bytes, chance: random.Random) -> bytes:
+    """Half of the time keep the old length, so that later offsets stay valid."""
     return new[: len(old)].ljust(len(old), b"\0") if chance.random() < 0.5 else new
 
 
 # ROS 1
 
 
-def _bag_records(data: bytes) -> tuple[list[Record], bytes]:
-    """Records, and what follows them."""
+def _split_bag(data: bytes) -> tuple[list[Record], bytes]:
+    """Records, and the bytes after them."""
     found, at = [], 0
     while at + 8 <= len(data):
         (n,) = struct.unpack_from("<I", data, at)
@@ -42,7 +42,7 @@ def _bag_records(data: bytes) -> tuple[list[Record], bytes]:
     return found, data[at:]
 
 
-def _bag_joined(records: list[Record]) -> bytes:
+def _join_bag(records: list[Record]) -> bytes:
     return b"".join(
         struct.pack("<I", len(head)) + head + struct.pack("<I", len(content)) + content
         for head, content in records
@@ -67,29 +67,29 @@ _PACK = {b"none": bytes, b"bz2": bz2.compress, b"lz4": lz4.frame.compress}
 _UNPACK = {b"none": bytes, b"bz2": bz2.decompress, b"lz4": lz4.frame.decompress}
 
 
-def changed_bag(data: bytes, change: Change, chance: random.Random) -> bytes:
-    """A ROS 1 bag whose records, or what its chunk holds, are changed."""
+def mutate_bag(data: bytes, mutate: Mutation, chance: random.Random) -> bytes:
+    """Mutate a record of a ROS 1 bag or of its chunk."""
     start = data.find(b"\n") + 1
-    records, rest = _bag_records(data[start:])
+    records, rest = _split_bag(data[start:])
     chunks = [k for k, (head, _) in enumerate(records) if _fields(head).get(b"op") == b"\5"]
     try:
         if not chunks or chance.random() < 0.3:
             k = chance.randrange(len(records))
             head, content = records[k]
-            new = (change(head), content) if chance.random() < 0.5 else (head, change(content))
+            new = (mutate(head), content) if chance.random() < 0.5 else (head, mutate(content))
             records[k] = new
-            return data[:start] + _bag_joined(records) + rest
+            return data[:start] + _join_bag(records) + rest
         k = chance.choice(chunks)
         fields = _fields(records[k][0])
         inside = _UNPACK[fields[b"compression"]](records[k][1])
-        inner, tail = _bag_records(inside)
+        inner, tail = _split_bag(inside)
         if inner and chance.random() < 0.8:
             m = chance.randrange(len(inner))
             head, content = inner[m]
-            inner[m] = head, _resized(change(content), content, chance)
-            inside = _bag_joined(inner) + tail
+            inner[m] = head, _resize(mutate(content), content, chance)
+            inside = _join_bag(inner) + tail
         else:
-            inside = _resized(change(inside), inside, chance)
+            inside = _resize(mutate(inside), inside, chance)
         packed = _PACK[fields[b"compression"]](inside)
         fields[b"size"] = struct.pack("<I", len(inside))
         moved = len(packed) - len(records[k][1])
@@ -99,8 +99,8 @@ def changed_bag(data: bytes, change: Change, chance: random.Random) -> bytes:
         first[b"index_pos"] = struct.pack("<Q", index + moved)
         records[0] = _head(first), records[0][1]
     except (LookupError, ValueError, OSError, RuntimeError, struct.error):
-        return change(data)
-    return data[:start] + _bag_joined(records) + rest
+        return mutate(data)
+    return data[:start] + _join_bag(records) + rest
 
 
 # MCAP
@@ -110,7 +110,7 @@ _PACK2 = {b"": bytes, b"lz4": lz4.frame.compress, b"zstd": zstd.compress}
 _UNPACK2 = {b"": bytes, b"lz4": lz4.frame.decompress, b"zstd": zstd.decompress}
 
 
-def _mcap_records(data: bytes) -> list[tuple[int, bytes]]:
+def _split_mcap(data: bytes) -> list[tuple[int, bytes]]:
     found, at = [], 0
     while at + 9 <= len(data):
         (size,) = struct.unpack_from("<Q", data, at + 1)
@@ -119,47 +119,49 @@ def _mcap_records(data: bytes) -> list[tuple[int, bytes]]:
     return found
 
 
-def _mcap_joined(records: list[tuple[int, bytes]]) -> bytes:
+def _join_mcap(records: list[tuple[int, bytes]]) -> bytes:
     return b"".join(
         bytes([kind]) + struct.pack("<Q", len(content)) + content for kind, content in records
     )
 
 
-def changed_mcap(data: bytes, change: Change, chance: random.Random) -> bytes:
-    """An MCAP file whose records, or what its first chunk holds, are changed."""
-    records = _mcap_records(data[8:-8])
+def mutate_mcap(data: bytes, mutate: Mutation, chance: random.Random) -> bytes:
+    """Mutate a record of an MCAP file or of its first chunk."""
+    records = _split_mcap(data[8:-8])
     chunk = next((k for k, (kind, _) in enumerate(records) if kind == 6), None)
     try:
         if chunk is None or chance.random() < 0.3:
             k = chance.randrange(len(records))
             kind, content = records[k]
-            records[k] = kind, _resized(change(content), content, chance)
-            return _MAGIC + _mcap_joined(records) + _MAGIC
+            records[k] = kind, _resize(mutate(content), content, chance)
+            return _MAGIC + _join_mcap(records) + _MAGIC
         content = records[chunk][1]
         (n,) = struct.unpack_from("<I", content, 28)
         packing = content[32 : 32 + n]
         inside = _UNPACK2[packing](content[40 + n :])
-        inner = _mcap_records(inside)
+        inner = _split_mcap(inside)
         if inner and chance.random() < 0.8:
             m = chance.randrange(len(inner))
             kind, old = inner[m]
             keep = 22 if kind == 5 and chance.random() < 0.8 else 0
-            inner[m] = kind, old[:keep] + _resized(change(old[keep:]), old[keep:], chance)
-            inside = _mcap_joined(inner)
+            inner[m] = kind, old[:keep] + _resize(mutate(old[keep:]), old[keep:], chance)
+            inside = _join_mcap(inner)
         else:
-            inside = _resized(change(inside), inside, chance)
+            inside = _resize(mutate(inside), inside, chance)
         packed = _PACK2[packing](inside)
         new = content[:16] + struct.pack("<QI", len(inside), 0) + content[28 : 32 + n]
         records[chunk] = 6, new + struct.pack("<Q", len(packed)) + packed
         moved = len(records[chunk][1]) - len(content)
-        records = [_moved(record, moved, len(inside), len(packed)) for record in records]
+        records = [_shift_offsets(record, moved, len(inside), len(packed)) for record in records]
     except (LookupError, ValueError, OSError, RuntimeError, struct.error, zstd.ZstdError):
-        return change(data)
-    return _MAGIC + _mcap_joined(records) + _MAGIC
+        return mutate(data)
+    return _MAGIC + _join_mcap(records) + _MAGIC
 
 
-def _moved(record: tuple[int, bytes], by: int, unpacked: int, packed: int) -> tuple[int, bytes]:
-    """A record of the index or the end, after the only chunk grew."""
+def _shift_offsets(
+    record: tuple[int, bytes], by: int, unpacked: int, packed: int
+) -> tuple[int, bytes]:
+    """A record of the index or footer after the only chunk grew."""
     kind, content = record
     out = bytearray(content)
     if kind == 2:
@@ -203,10 +205,10 @@ _HOSTILE = (
 )
 
 
-def changed_db3(data: bytes, change: Change, chance: random.Random) -> bytes:
-    """A SQLite file with another value in a row, or another schema."""
+def mutate_db3(data: bytes, mutate: Mutation, chance: random.Random) -> bytes:
+    """Mutate a value or the schema of a SQLite file."""
     if chance.random() < 0.3:
-        return change(data)
+        return mutate(data)
     try:
         base = sqlite3.connect(":memory:")
         base.deserialize(data)
@@ -220,16 +222,16 @@ def changed_db3(data: bytes, change: Change, chance: random.Random) -> bytes:
             query = f"SELECT {column} FROM {table} WHERE rowid = ?"
             (old,) = base.execute(query, (row,)).fetchone() or (None,)
             if isinstance(old, bytes) and chance.random() < 0.8:
-                new = change(old)
+                new = mutate(old)
             elif isinstance(old, str) and chance.random() < 0.5:
-                new = change(old.encode()).decode("utf-8", "replace")
+                new = mutate(old.encode()).decode("utf-8", "replace")
             else:
                 new = chance.choice(_ODD)
             base.execute(f"UPDATE {table} SET {column} = ? WHERE rowid = ?", (new, row))
         base.commit()
         return bytes(base.serialize())
     except (sqlite3.Error, LookupError, ValueError, OverflowError):
-        return change(data)
+        return mutate(data)
 
 
 # E57
@@ -237,7 +239,7 @@ def changed_db3(data: bytes, change: Change, chance: random.Random) -> bytes:
 _PAGE, _KEPT = 1024, 1020
 
 
-def _crc32c_table() -> list[int]:
+def _make_crc32c_table() -> list[int]:
     out = []
     for value in range(256):
         for _ in range(8):
@@ -246,7 +248,7 @@ def _crc32c_table() -> list[int]:
     return out
 
 
-_CRC32C = _crc32c_table()
+_CRC32C = _make_crc32c_table()
 
 
 def _crc32c(data: bytes) -> int:
@@ -256,24 +258,24 @@ def _crc32c(data: bytes) -> int:
     return crc ^ 0xFFFFFFFF
 
 
-def changed_e57(data: bytes, change: Change, chance: random.Random) -> bytes:
-    """An E57 file with sound checksums, changed beneath them: a page, or its description."""
+def mutate_e57(data: bytes, mutate: Mutation, chance: random.Random) -> bytes:
+    """Mutate a page or the XML section of an E57 file, with valid checksums."""
     pages = [data[at : at + _KEPT] for at in range(0, len(data), _PAGE)]
     text = b"".join(pages)
     at = text.find(b"<?xml")
     if at >= 0 and chance.random() < 0.6:
-        # the description is the last thing in the file: its length may change
+        # the XML section is the last one: its length may change
         end = text.rfind(b">") + 1
-        new = change(text[at:end])[: 16 * _KEPT]
+        new = mutate(text[at:end])[: 16 * _KEPT]
         text = text[:at] + new.ljust(end - at, b" ")
         text = text[:32] + struct.pack("<Q", len(new.ljust(end - at, b" "))) + text[40:]
     else:
         at = chance.randrange(max(len(pages), 1)) * _KEPT
         old = text[at : at + _KEPT]
-        text = text[:at] + change(old)[: len(old)].ljust(len(old), b"\0") + text[at + _KEPT :]
+        text = text[:at] + mutate(old)[: len(old)].ljust(len(old), b"\0") + text[at + _KEPT :]
     pages = [text[at : at + _KEPT].ljust(_KEPT, b"\0") for at in range(0, len(text), _KEPT)]
     if pages:
-        # the physical length of the file stands in its head
+        # the header holds the physical length of the file
         pages[0] = pages[0][:16] + struct.pack("<Q", len(pages) * _PAGE) + pages[0][24:]
     return b"".join(page + struct.pack(">I", _crc32c(page)) for page in pages)
 
@@ -281,18 +283,18 @@ def changed_e57(data: bytes, change: Change, chance: random.Random) -> bytes:
 # compressed PCD
 
 
-def changed_pcd(data: bytes, change: Change, chance: random.Random) -> bytes:
-    """A PCD file; where its points are packed they are changed unpacked."""
+def mutate_pcd(data: bytes, mutate: Mutation, chance: random.Random) -> bytes:
+    """Mutate a PCD file; compressed points are mutated uncompressed."""
     mark = b"DATA binary_compressed\n"
     at = data.find(mark)
     if at < 0 or chance.random() < 0.5:
-        return change(data)
+        return mutate(data)
     at += len(mark)
     try:
         packed, unpacked = struct.unpack_from("<II", data, at)
         inside = lzf.decompress(data[at + 8 : at + 8 + packed], min(unpacked, 1 << 20))
-        inside = _resized(change(inside), inside, chance)
+        inside = _resize(mutate(inside), inside, chance)
         new = lzf.compress(inside, 2 * len(inside) + 64)
         return data[:at] + struct.pack("<II", len(new), len(inside)) + new
     except (ValueError, TypeError, struct.error):
-        return change(data)
+        return mutate(data)

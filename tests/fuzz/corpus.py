@@ -1,4 +1,4 @@
-"""What fuzzing begins with: small sound recordings of every format, made here and now."""
+"""Seeds of fuzzing: small valid recordings of every format."""
 
 import gzip
 import io
@@ -9,7 +9,7 @@ from pathlib import Path
 import lzf
 import numpy as np
 import pye57
-from parts import joined
+from parts import join_parts
 from PIL import Image
 
 from stillmap.core import se2
@@ -25,8 +25,8 @@ from stillmap.pipeline.options import Options
 START = 1_700_000_000_000_000_000
 
 
-def planar(scans: int = 6, beams: int = 9) -> Recording:
-    """A robot that drives past a wall."""
+def recording_2d(scans: int = 6, beams: int = 9) -> Recording:
+    """A robot with a laser on a slightly curved path."""
     rng = np.random.default_rng(1)
     angle = np.linspace(-1.2, 1.2, beams)
     length = rng.uniform(1.0, 8.0, (scans, beams, 1))
@@ -43,8 +43,8 @@ def planar(scans: int = 6, beams: int = 9) -> Recording:
     )
 
 
-def space(scans: int = 3, beams: int = 12) -> Recording:
-    """The same in space, with poses, times of beams and pictures."""
+def recording_3d(scans: int = 3, beams: int = 12) -> Recording:
+    """A 3D recording with poses, beam times and images."""
     rng = np.random.default_rng(2)
     T = np.tile(np.eye(4), (scans, 1, 1))
     T[:, 0, 3] = 6.0 + np.arange(scans)
@@ -67,14 +67,14 @@ def space(scans: int = 3, beams: int = 12) -> Recording:
     )
 
 
-def parts_of(place: Path, names: tuple[str, ...]) -> bytes:
-    """The files of a folder in the order of their names here; none where one is not there."""
+def read_files(place: Path, names: tuple[str, ...]) -> bytes:
+    """The files of a folder in the order of `names`; empty where one is missing."""
     files = [place / name for name in names]
-    return joined([file.read_bytes() if file.is_file() else b"" for file in files])
+    return join_parts([file.read_bytes() if file.is_file() else b"" for file in files])
 
 
 def carmen(work: Path) -> Iterator[bytes]:
-    writers.write(planar(), work / "a.log")
+    writers.write(recording_2d(), work / "a.log")
     log = (work / "a.log").read_bytes()
     yield log
     yield gzip.compress(log)
@@ -91,17 +91,17 @@ def carmen(work: Path) -> Iterator[bytes]:
     yield "".join(f"{line}\n" for line in lines).encode()
 
 
-OURS = (
+STILLMAP = (
     *("recording.json", "stamp_ns.npy", "offset.npy", "points.npy", "hit.npy"),
     *("T_base_sensor.npy", "sensor.npy", "T_odom_base.npy", "beam_time.npy", "T_recorded_base.npy"),
     *("image_stamp_ns.npy", "image_camera.npy", "images/000000.png", "images/000001.npy"),
 )
 
 
-def ours(work: Path) -> Iterator[bytes]:
-    for name, recording in (("flat", planar()), ("space", space())):
+def stillmap(work: Path) -> Iterator[bytes]:
+    for name, recording in (("flat", recording_2d()), ("space", recording_3d())):
         stillmap_folder.write(recording, work / name)
-        yield parts_of(work / name, OURS)
+        yield read_files(work / name, STILLMAP)
 
 
 KITTI = (
@@ -117,13 +117,13 @@ DRIVE = (
 
 
 def kitti(work: Path) -> Iterator[bytes]:
-    writers.write(space(), work / "k", name="kitti")
+    writers.write(recording_3d(), work / "k", name="kitti")
     (work / "k" / "image_2").mkdir()
     for k in range(3):
         Image.new("L", (4, 3), 60 * k).save(work / "k" / "image_2" / f"{k:06d}.png")
     row = "1 0 0 0 0 1 0 0 0 0 1 0"
     (work / "k" / "calib.txt").write_text(f"P0: {row}\nP2: {row}\nTr: {row}\n")
-    yield parts_of(work / "k", KITTI)
+    yield read_files(work / "k", KITTI)
 
 
 def drive(work: Path) -> Iterator[bytes]:  # noqa: ARG001
@@ -135,7 +135,7 @@ def drive(work: Path) -> Iterator[bytes]:  # noqa: ARG001
     sweep = np.random.default_rng(4).normal(0, 5, (6, 4)).astype("<f4").tobytes()
     out = io.BytesIO()
     Image.new("L", (4, 3)).save(out, format="PNG")
-    yield joined(
+    yield join_parts(
         [
             *(times.encode(), placed, cameras, placed, where, where, times.encode()[:30]),
             *(sweep, sweep, out.getvalue()),
@@ -144,7 +144,7 @@ def drive(work: Path) -> Iterator[bytes]:  # noqa: ARG001
 
 
 def pcd(work: Path) -> Iterator[bytes]:
-    writers.write(space(), work / "p", name="pcd")
+    writers.write(recording_3d(), work / "p", name="pcd")
     binary = next((work / "p").glob("*.pcd")).read_bytes()
     yield binary
     at = binary.find(b"DATA binary\n")
@@ -159,7 +159,7 @@ def pcd(work: Path) -> Iterator[bytes]:
 
 
 def ply(work: Path) -> Iterator[bytes]:
-    writers.write(space(), work / "a.ply")
+    writers.write(recording_3d(), work / "a.ply")
     yield (work / "a.ply").read_bytes()
     yield (
         b"ply\nformat ascii 1.0\nelement camera 1\nproperty short a\nelement vertex 2\n"
@@ -175,11 +175,11 @@ def ply(work: Path) -> Iterator[bytes]:
 
 def las(work: Path) -> Iterator[bytes]:
     for name in ("a.las", "a.laz"):
-        writers.write(space(), work / name)
+        writers.write(recording_3d(), work / name)
         yield (work / name).read_bytes()
     import laspy
 
-    # a later version, with another format of points
+    # a later version, with another point format
     head = laspy.LasHeader(point_format=6, version="1.4")
     head.scales = _make_header(laspy, np.eye(4)[None]).scales
     for packed in (False, True):
@@ -204,13 +204,13 @@ def e57(work: Path) -> Iterator[bytes]:
     yield path.read_bytes()
 
 
-UOS = ("scan000.3d", "scan000.pose", "scan001.3d.gz", "scan001.pose")
+THREEDTK = ("scan000.3d", "scan000.pose", "scan001.3d.gz", "scan001.pose")
 
 
-def uos(work: Path) -> Iterator[bytes]:  # noqa: ARG001
+def threedtk(work: Path) -> Iterator[bytes]:  # noqa: ARG001
     text = "".join(f"{k}.5 {2 * k} 300\n" for k in range(20)).encode()
     pose = b"100 20 300\n0 90 0\n"
-    yield joined([b"20 3\n" + text, pose, gzip.compress(b"# x y z\n" + text), pose])
+    yield join_parts([b"20 3\n" + text, pose, gzip.compress(b"# x y z\n" + text), pose])
 
 
 def toml(work: Path) -> Iterator[bytes]:  # noqa: ARG001
@@ -223,7 +223,7 @@ def rows(work: Path) -> Iterator[bytes]:
     yield (work / "a.txt").read_bytes()
     yield b"# t x y theta\n1.5 0 0 0.1\n2.5 1 2 0.2 # said\n"
     yield b"1.5 2.5 1 0 0 0 0 0.1\n2.5 3.5 1 0 0 0 0 0.1\n"
-    writers.write(planar(2, 3), work / "a.log")
+    writers.write(recording_2d(2, 3), work / "a.log")
     yield (work / "a.log").read_bytes()
 
 
@@ -235,7 +235,7 @@ RESULT = (
 
 
 def result(work: Path) -> Iterator[bytes]:
-    recording = planar()
+    recording = recording_2d()
     place = work / "result"
     for inner in ("beams", "truth"):
         (place / inner).mkdir(parents=True)
@@ -259,4 +259,4 @@ def result(work: Path) -> Iterator[bytes]:
         "resolution": np.array(0.05),
     }
     write_npz(place / "map.npz", grid)
-    yield parts_of(place, RESULT)
+    yield read_files(place, RESULT)

@@ -1,4 +1,4 @@
-"""What fuzzing begins with: bags of every kind, and the messages in them."""
+"""Seeds of fuzzing: bags of every kind, and messages."""
 
 import io
 import shutil
@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from corpus import START
-from parts import joined
+from parts import join_parts
 from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "io" / "ros"))
@@ -51,7 +51,7 @@ def _image(messages: Messages, stamp: int) -> tuple[str, Any]:
     return kind, messages.make(kind, messages.header(stamp, "cam"), 2, 3, "rgb8", 0, 9, data)
 
 
-def _packed_image(messages: Messages, stamp: int) -> tuple[str, Any]:
+def _compressed_image(messages: Messages, stamp: int) -> tuple[str, Any]:
     kind, out = "sensor_msgs/msg/CompressedImage", io.BytesIO()
     Image.new("RGB", (4, 3), (9, 99, 200)).save(out, format="PNG")
     data = np.frombuffer(out.getvalue(), np.uint8)
@@ -122,7 +122,7 @@ def cloud_messages(messages: Messages) -> list[tuple[str, int, tuple[str, Any]]]
         *out,
         ("/cam/image_raw", START, _image(messages, START)),
         ("/cam/camera_info", START, _camera_info(messages, START)),
-        ("/other/image/compressed", START + 5, _packed_image(messages, START + 5)),
+        ("/other/image/compressed", START + 5, _compressed_image(messages, START + 5)),
     ]
 
 
@@ -159,10 +159,10 @@ def db3(work: Path) -> Iterator[bytes]:
 
 
 def messages_of(encoding: str) -> Iterator[bytes]:
-    """Messages as parts: their type and topic in a line, then their bytes."""
+    """Messages as parts: a line with type and topic, then the content."""
     messages = Messages(encoding)
     for content in (laser_messages(messages), cloud_messages(messages)):
-        yield joined(
+        yield join_parts(
             [
                 f"{kind} {topic}\n".encode() + messages.raw(kind, message)
                 for topic, _, (kind, message) in content

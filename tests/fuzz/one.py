@@ -1,4 +1,4 @@
-"""Fuzzes one reader, until it is told to stop or something is found; options are libFuzzer's.
+"""Fuzzes one reader; options are those of libFuzzer.
 
 python tests/fuzz/one.py bag -max_total_time=60      with new inputs
 python tests/fuzz/one.py bag found/crash-...         with this one
@@ -16,7 +16,7 @@ import atheris
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 MEMORY, ADDRESSES, SECONDS = 1 << 30, 4 << 30, 10  # of one input: bytes, bytes, s
-_LARGEST = 1 << 15  # bytes of an input that is made here
+_MAX_INPUT = 1 << 15  # bytes
 
 with atheris.instrument_imports(
     include=["stillmap", "rosbags", "laspy", "tomllib", "numpy.lib.format", "yaml", "pye57"]
@@ -25,10 +25,10 @@ with atheris.instrument_imports(
 
 
 def main(words: list[str]) -> None:
-    """Runs libFuzzer, which never returns."""
+    """Run libFuzzer, which never returns."""
     name, *options = words
     target = TARGETS[name]
-    # a wild count shall be an error here, and not bring the machine down
+    # a wild count becomes an error instead of exhausting the machine
     resource.setrlimit(resource.RLIMIT_AS, (ADDRESSES, ADDRESSES))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     work = Path(tempfile.mkdtemp(prefix="stillmap-fuzz-"))
@@ -38,7 +38,7 @@ def main(words: list[str]) -> None:
         (corpus / f"{number}").write_bytes(seed)
     given = [word for word in options if not word.startswith("-")]
     more = [] if given else [str(corpus)]
-    limits = [f"-rss_limit_mb={MEMORY >> 20}", f"-timeout={SECONDS}", f"-max_len={_LARGEST}"]
+    limits = [f"-rss_limit_mb={MEMORY >> 20}", f"-timeout={SECONDS}", f"-max_len={_MAX_INPUT}"]
     place = work / "input"
 
     def run(data: bytes) -> None:
@@ -47,7 +47,7 @@ def main(words: list[str]) -> None:
     atheris.Setup(
         [sys.argv[0], *limits, *options, *more],
         run,
-        **({"custom_mutator": _mutator(target)} if target.change is not None else {}),
+        **({"custom_mutator": _mutator(target)} if target.mutate is not None else {}),
     )
     atheris.Fuzz()
 
@@ -56,19 +56,19 @@ def _mutator(target: Target):  # type: ignore[no-untyped-def]
     def mutated(data: bytes, largest: int, seed: int) -> bytes:
         chance = random.Random(seed)
 
-        def change(some: bytes) -> bytes:
+        def mutate(some: bytes) -> bytes:
             return bytes(atheris.Mutate(some, max(2 * len(some), 64)))
 
         if chance.random() < 0.2:
             return bytes(atheris.Mutate(data, largest))
-        assert target.change is not None
-        return target.change(data, change, chance)[:largest]
+        assert target.mutate is not None
+        return target.mutate(data, mutate, chance)[:largest]
 
     return mutated
 
 
 def _new(folder: Path) -> Path:
-    """The folder, empty."""
+    """Empty the folder."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
     return folder

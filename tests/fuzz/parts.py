@@ -1,19 +1,19 @@
-"""Several files, or messages, as the bytes of one input; and how one of them is changed."""
+"""Several files, or messages, as the bytes of one input, and mutation of one of them."""
 
 import random
 import struct
 from collections.abc import Callable
 
-Change = Callable[[bytes], bytes]
+Mutation = Callable[[bytes], bytes]
 
 
-def joined(parts: list[bytes]) -> bytes:
-    """Each with its length before it."""
+def join_parts(parts: list[bytes]) -> bytes:
+    """Each part with its length before it."""
     return b"".join(struct.pack("<I", len(part)) + part for part in parts)
 
 
-def split(data: bytes) -> list[bytes]:
-    """What was joined; whatever the bytes are, they are parts of something."""
+def split_parts(data: bytes) -> list[bytes]:
+    """The inverse of `join_parts`; any bytes can be split."""
     parts, at = [], 0
     while at + 4 <= len(data):
         size = struct.unpack_from("<I", data, at)[0]
@@ -22,11 +22,11 @@ def split(data: bytes) -> list[bytes]:
     return parts
 
 
-def changed(data: bytes, change: Change, chance: random.Random) -> bytes:
-    """One part changed; now and then one lost, doubled, or put where another was."""
-    parts = split(data)
+def mutate_parts(data: bytes, mutate: Mutation, chance: random.Random) -> bytes:
+    """Mutate a part; sometimes empty, copy, append or delete one."""
+    parts = split_parts(data)
     if not parts:
-        return joined([change(data)])
+        return join_parts([mutate(data)])
     at, other = chance.randrange(len(parts)), chance.randrange(len(parts))
     kind = chance.randrange(12)
     if kind == 0:
@@ -38,5 +38,5 @@ def changed(data: bytes, change: Change, chance: random.Random) -> bytes:
     elif kind == 3 and len(parts) > 1:
         del parts[at]
     else:
-        parts[at] = change(parts[at])
-    return joined(parts)
+        parts[at] = mutate(parts[at])
+    return join_parts(parts)

@@ -1,4 +1,4 @@
-"""Fuzzes the readers one after the other; stops at the first finding and says where its input is.
+"""Fuzzes the readers one after the other, up to the first finding, whose input is kept.
 
 python tests/fuzz/run.py              60 s each
 python tests/fuzz/run.py 600 bag e57  ten minutes each, these two
@@ -14,13 +14,13 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 FOUND = HERE.parent.parent / "build" / "fuzz"
 NAMES = (
-    *("carmen", "ours", "bag", "mcap", "db3", "ros1", "cdr", "kitti", "drive", "pcd", "ply"),
+    *("carmen", "stillmap", "bag", "mcap", "db3", "ros1", "cdr", "kitti", "drive", "pcd", "ply"),
     *("las", "e57", "3dtk", "scenes", "tum", "cameras", "toml", "rows", "result"),
 )
 
 
 def main(words: list[str]) -> int:
-    """The exit status: 1 where something was found."""
+    """Returns the exit status: 1 after a finding."""
     seconds = int(words[0]) if words else 60
     FOUND.mkdir(parents=True, exist_ok=True)
     print(f"{'reader':<8} {'inputs':>8} {'coverage':>13} {'peak MB':>8}")
@@ -31,7 +31,7 @@ def main(words: list[str]) -> int:
 
 
 def _fuzz(name: str, seconds: int) -> bool:
-    """Fuzzes one reader in a process of its own; whether nothing was found."""
+    """Fuzz one reader in a process of its own; returns whether nothing was found."""
     log = FOUND / f"{name}.log"
     options = [f"-max_total_time={seconds}", f"-artifact_prefix={FOUND}/{name}-"]
     shm = Path("/dev/shm")
@@ -39,13 +39,13 @@ def _fuzz(name: str, seconds: int) -> bool:
         tempfile.TemporaryDirectory(dir=shm if shm.is_dir() else None) as folder,
         log.open("wb") as file,
     ):
-        # OpenBLAS sets aside memory for every thread it could have
-        changes = {"TMPDIR": folder, "OPENBLAS_NUM_THREADS": "1"}
+        # OpenBLAS reserves memory for every possible thread
+        variables = {"TMPDIR": folder, "OPENBLAS_NUM_THREADS": "1"}
         process = subprocess.Popen(
             [sys.executable, str(HERE / "one.py"), name, *options, "-print_final_stats=1"],
             stdout=file,
             stderr=subprocess.STDOUT,
-            env=os.environ | changes,
+            env=os.environ | variables,
         )
         _, state, used = os.wait4(process.pid, 0)
     text = log.read_text("utf-8", "replace")

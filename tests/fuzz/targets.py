@@ -1,4 +1,4 @@
-"""Readers, each as a function of bytes: only InputError may come out, or a sound recording."""
+"""Readers as functions of bytes: they may raise InputError only, or return a valid recording."""
 
 import random
 import struct
@@ -10,7 +10,7 @@ from typing import NamedTuple
 import containers
 import corpus
 import corpus_bags
-import corpus_pictures
+import corpus_images
 import numpy as np
 import parts
 
@@ -21,7 +21,7 @@ from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.eval import readers
 from stillmap.io import read
-from stillmap.io.ros import reader as reader_module  # noqa: F401  (loaded now, not at the first bag)
+from stillmap.io.ros import reader as reader_module  # noqa: F401  (instrumented at import)
 from stillmap.io.trajectory import read_tum
 from stillmap.pipeline.options import Options
 from stillmap.preprocessing.options import ReadOptions
@@ -31,37 +31,37 @@ from stillmap.results.reader import read_tracks
 from stillmap.sim import load_truth
 
 Run = Callable[[bytes, Path], None]
-Change = Callable[[bytes, parts.Change, random.Random], bytes]
+Mutate = Callable[[bytes, parts.Mutation, random.Random], bytes]
 
 
 class Target(NamedTuple):
-    """A reader that is fuzzed.
+    """A reader to fuzz.
 
     Attributes:
-        run: reads bytes, with an empty folder to put them in.
-        seeds: sound inputs, made in a folder.
-        change: how inputs are changed beyond single bytes; None: not at all.
+        run: reads bytes, by way of an empty folder.
+        seeds: creates valid inputs in a folder.
+        mutate: mutates inputs beyond single bytes; None: libFuzzer does.
     """
 
     run: Run
     seeds: Callable[[Path], Iterator[bytes]]
-    change: Change | None = None
+    mutate: Mutate | None = None
 
 
-def require_sound(path: Path, options: ReadOptions | None = None) -> None:
-    """Read a recording; what comes out is sound, and nothing is said but in words of ours."""
+def require_valid(path: Path, options: ReadOptions | None = None) -> None:
+    """Read a recording: it is valid or refused in one line, and libraries do not warn."""
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         try:
             recording = read(path, options, scratch=path.parent)
-            _walk(recording)
+            _check_recording(recording)
         except InputError as error:
             if "\n" in str(error):
                 raise AssertionError("an error of several lines") from error
     assert not said, f"a library said: {said[0].message} ({said[0].filename}:{said[0].lineno})"
 
 
-def _walk(recording: Recording) -> None:
+def _check_recording(recording: Recording) -> None:
     assert np.all(recording.stamp_ns[1:] >= recording.stamp_ns[:-1])
     assert recording.offset[0] == 0
     assert recording.offset[-1] == recording.n_beams
@@ -84,13 +84,13 @@ def _walk(recording: Recording) -> None:
 def _file(name: str) -> Run:
     def run(data: bytes, folder: Path) -> None:
         (folder / name).write_bytes(data)
-        require_sound(folder / name)
+        require_valid(folder / name)
 
     return run
 
 
 def _write(data: bytes, folder: Path, names: tuple[str, ...]) -> None:
-    for name, content in zip(names, parts.split(data), strict=False):
+    for name, content in zip(names, parts.split_parts(data), strict=False):
         if content:
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_bytes(content)
@@ -100,31 +100,31 @@ def _folder(names: tuple[str, ...]) -> Run:
     def run(data: bytes, folder: Path) -> None:
         _write(data, folder / "in", names)
         (folder / "in").mkdir(exist_ok=True)
-        require_sound(folder / "in")
+        require_valid(folder / "in")
 
     return run
 
 
 def _messages(encoding: str) -> Run:
-    """Messages in a bag without index: their bytes alone are in question."""
+    """Messages in a bag without an index, so that only their content is mutated."""
 
     def run(data: bytes, folder: Path) -> None:
         ending = "bag" if encoding == "ros1" else "mcap"
-        content = _bare_bag(data) if encoding == "ros1" else _bare_mcap(data)
+        content = _unindexed_bag(data) if encoding == "ros1" else _unindexed_mcap(data)
         (folder / f"in.{ending}").write_bytes(content)
-        require_sound(folder / f"in.{ending}")
+        require_valid(folder / f"in.{ending}")
 
     return run
 
 
 def _each(data: bytes) -> Iterator[tuple[int, str, str, bytes]]:
-    for number, part in enumerate(parts.split(data)):
+    for number, part in enumerate(parts.split_parts(data)):
         line, _, raw = part.partition(b"\n")
         kind, _, topic = line.decode("latin1").partition(" ")
         yield number, kind, topic, raw
 
 
-def _bare_mcap(data: bytes) -> bytes:
+def _unindexed_mcap(data: bytes) -> bytes:
     def text(word: str) -> bytes:
         return struct.pack("<I", len(word.encode())) + word.encode()
 
@@ -139,7 +139,7 @@ def _bare_mcap(data: bytes) -> bytes:
     return out
 
 
-def _bare_bag(data: bytes) -> bytes:
+def _unindexed_bag(data: bytes) -> bytes:
     def record(fields: dict[str, bytes], content: bytes) -> bytes:
         lines = [name.encode() + b"=" + value for name, value in fields.items()]
         head = b"".join(struct.pack("<I", len(line)) + line for line in lines)
@@ -166,13 +166,17 @@ def _toml(data: bytes, folder: Path) -> None:
 
 
 def _cameras(data: bytes, folder: Path) -> None:
-    """Beside a sound recording, with a folder of further pictures."""
+    """A camera file for a valid recording, with a folder of further images."""
     place = folder / "in"
-    scenes = next(corpus_pictures.scenes(folder))
-    _write(scenes, place, corpus_pictures.SCENES)
-    _write(parts.joined([parts.split(scenes)[1], b"0.01\n"]), folder, ("more/0.png", "times.txt"))
+    scenes = next(corpus_images.scenes(folder))
+    _write(scenes, place, corpus_images.SCENES)
+    _write(
+        parts.join_parts([parts.split_parts(scenes)[1], b"0.01\n"]),
+        folder,
+        ("more/0.png", "times.txt"),
+    )
     (folder / "in.toml").write_bytes(data)
-    require_sound(place, ReadOptions(cameras=str(folder / "in.toml")))
+    require_valid(place, ReadOptions(cameras=str(folder / "in.toml")))
 
 
 def _rows(data: bytes, folder: Path) -> None:
@@ -195,7 +199,7 @@ def _rows(data: bytes, folder: Path) -> None:
 def _result(data: bytes, folder: Path) -> None:
     place = folder / "result"
     _write(data, place, corpus.RESULT)
-    _write(parts.joined(_OURS), place, corpus.OURS)
+    _write(parts.join_parts(_recording_files), place, corpus.STILLMAP)
     for reader in (
         lambda: arguments.found(place, None).read_options,
         lambda: arguments.found(place, str(place)).read(),
@@ -213,34 +217,36 @@ def _result(data: bytes, folder: Path) -> None:
             continue
 
 
-_OURS: list[bytes] = []
+_recording_files: list[bytes] = []
 
 
 def _results(work: Path) -> Iterator[bytes]:
-    """The recording that results are of is made with them, and lies in their folder."""
-    _OURS[:] = parts.split(next(corpus.ours(work / "of")))
+    """Seeds of results, which lie in the folder of their recording."""
+    _recording_files[:] = parts.split_parts(next(corpus.stillmap(work / "of")))
     yield from corpus.result(work)
 
 
 TARGETS = {
     "carmen": Target(_file("in.log"), corpus.carmen),
-    "ours": Target(_folder(corpus.OURS), corpus.ours, parts.changed),
-    "bag": Target(_file("in.bag"), corpus_bags.bag1, containers.changed_bag),
-    "mcap": Target(_file("in.mcap"), corpus_bags.mcap, containers.changed_mcap),
-    "db3": Target(_file("in.db3"), corpus_bags.db3, containers.changed_db3),
-    "ros1": Target(_messages("ros1"), lambda _: corpus_bags.messages_of("ros1"), parts.changed),
-    "cdr": Target(_messages("cdr"), lambda _: corpus_bags.messages_of("cdr"), parts.changed),
-    "kitti": Target(_folder(corpus.KITTI), corpus.kitti, parts.changed),
-    "drive": Target(_folder(corpus.DRIVE), corpus.drive, parts.changed),
-    "pcd": Target(_file("in.pcd"), corpus.pcd, containers.changed_pcd),
+    "stillmap": Target(_folder(corpus.STILLMAP), corpus.stillmap, parts.mutate_parts),
+    "bag": Target(_file("in.bag"), corpus_bags.bag1, containers.mutate_bag),
+    "mcap": Target(_file("in.mcap"), corpus_bags.mcap, containers.mutate_mcap),
+    "db3": Target(_file("in.db3"), corpus_bags.db3, containers.mutate_db3),
+    "ros1": Target(
+        _messages("ros1"), lambda _: corpus_bags.messages_of("ros1"), parts.mutate_parts
+    ),
+    "cdr": Target(_messages("cdr"), lambda _: corpus_bags.messages_of("cdr"), parts.mutate_parts),
+    "kitti": Target(_folder(corpus.KITTI), corpus.kitti, parts.mutate_parts),
+    "drive": Target(_folder(corpus.DRIVE), corpus.drive, parts.mutate_parts),
+    "pcd": Target(_file("in.pcd"), corpus.pcd, containers.mutate_pcd),
     "ply": Target(_file("in.ply"), corpus.ply),
     "las": Target(_file("in.las"), corpus.las),
-    "e57": Target(_file("in.e57"), corpus.e57, containers.changed_e57),
-    "3dtk": Target(_folder(corpus.UOS), corpus.uos, parts.changed),
-    "scenes": Target(_folder(corpus_pictures.SCENES), corpus_pictures.scenes, parts.changed),
-    "tum": Target(_folder(corpus_pictures.TUM), corpus_pictures.tum, parts.changed),
-    "cameras": Target(_cameras, corpus_pictures.cameras),
+    "e57": Target(_file("in.e57"), corpus.e57, containers.mutate_e57),
+    "3dtk": Target(_folder(corpus.THREEDTK), corpus.threedtk, parts.mutate_parts),
+    "scenes": Target(_folder(corpus_images.SCENES), corpus_images.scenes, parts.mutate_parts),
+    "tum": Target(_folder(corpus_images.TUM), corpus_images.tum, parts.mutate_parts),
+    "cameras": Target(_cameras, corpus_images.cameras),
     "toml": Target(_toml, corpus.toml),
     "rows": Target(_rows, corpus.rows),
-    "result": Target(_result, _results, parts.changed),
+    "result": Target(_result, _results, parts.mutate_parts),
 }

@@ -1,4 +1,4 @@
-"""Whatever a log holds, reading it gives a sound recording or an InputError."""
+"""Reading any log gives a valid recording or an InputError."""
 
 import gzip
 import os
@@ -29,7 +29,7 @@ PARAM = st.sampled_from(
 
 @st.composite
 def nearly_a_line(draw):
-    """A line of the grammar with one or two of its fields replaced, added or lost."""
+    """A line of the grammar with up to two fields replaced, added or deleted."""
     kind = draw(KIND)
     n = draw(st.integers(1, 4))
     ranges = draw(st.lists(NUMBER, min_size=n, max_size=n))
@@ -52,7 +52,7 @@ def nearly_a_line(draw):
 LINE = st.one_of(nearly_a_line(), nearly_a_line(), st.binary(max_size=40))
 
 
-def require_sound(content):
+def require_valid(content):
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "fuzz.log"
         path.write_bytes(content)
@@ -72,7 +72,7 @@ def require_sound(content):
 @settings(max_examples=300, deadline=None)
 @given(st.lists(LINE, max_size=8), st.sampled_from([b"\n", b"\r\n"]), st.booleans())
 def test_random_lines(lines, end, ended):
-    require_sound(end.join(lines) + (end if ended else b""))
+    require_valid(end.join(lines) + (end if ended else b""))
 
 
 @settings(max_examples=100, deadline=None)
@@ -84,17 +84,17 @@ def test_damaged_gzip(lines, data):
         del packed[at:]
     else:
         packed[at] = data.draw(st.integers(0, 255))
-    require_sound(bytes(packed))
+    require_valid(bytes(packed))
 
 
 @settings(max_examples=100, deadline=None)
 @given(st.binary(max_size=300))
 def test_random_bytes(content):
-    require_sound(content)
+    require_valid(content)
 
 
 def mutated(log, rng):
-    """A log with a few bytes changed, pieces lost, doubled or moved."""
+    """A log with bytes changed, and pieces deleted, repeated or moved."""
     log = bytearray(log)
     for _ in range(rng.integers(1, 9)):
         at, to = (int(i) for i in rng.integers(0, len(log), 2))
@@ -115,7 +115,7 @@ def mutated(log, rng):
 
 @pytest.fixture(scope="module")
 def healthy_log():
-    """What a recording looks like: messages of every kind between each other."""
+    """Interleaved messages of every kind."""
     rng = np.random.default_rng(1)
     lines = ["PARAM robot_frontlaser_offset 0.1", "PARAM robot_front_laser_max 20.0"]
     for t in range(12):
@@ -134,7 +134,7 @@ def healthy_log():
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(8))
 def test_mutations_of_a_recording(healthy_log, seed):
-    require_sound(healthy_log)
+    require_valid(healthy_log)
     rng = np.random.default_rng(seed)
     for _ in range(1000):
-        require_sound(mutated(healthy_log, rng))
+        require_valid(mutated(healthy_log, rng))

@@ -1,11 +1,11 @@
-"""What fuzzing begins with: folders of pictures of depth and colour, and files of cameras."""
+"""Seeds of fuzzing: RGB-D folders and camera files."""
 
 import io
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from parts import joined
+from parts import join_parts
 from PIL import Image
 
 SCENES = (
@@ -19,8 +19,8 @@ TUM = (
 )
 
 
-def _pictures() -> tuple[list[bytes], list[bytes]]:
-    """Two pictures of depth, two of colours, as small as they are of use."""
+def _make_images() -> tuple[list[bytes], list[bytes]]:
+    """Two depth and two color images, as PNG."""
     rng = np.random.default_rng(5)
     out: tuple[list[bytes], list[bytes]] = ([], [])
     for values in (rng.integers(900, 1100, (12, 16)), rng.integers(0, 255, (12, 16, 3))):
@@ -33,17 +33,17 @@ def _pictures() -> tuple[list[bytes], list[bytes]]:
 
 
 def scenes(work: Path) -> Iterator[bytes]:  # noqa: ARG001
-    depth, colour = _pictures()
+    depth, color = _make_images()
     pose = b"0 0 1 0\n-1 0 0 0\n0 -1 0 0.5\n0 0 0 1\n"
-    each = [part for k in range(2) for part in (depth[k], colour[k], pose)]
-    yield joined([*each, b"20 0 7.5\n0 20 5.5\n0 0 1\n"])
+    each = [part for k in range(2) for part in (depth[k], color[k], pose)]
+    yield join_parts([*each, b"20 0 7.5\n0 20 5.5\n0 0 1\n"])
 
 
 def tum(work: Path) -> Iterator[bytes]:  # noqa: ARG001
-    depth, colour = _pictures()
+    depth, color = _make_images()
     lists = (b"# a\n1.5 depth/0.png\n1.6 depth/1.png\n", b"1.5 rgb/0.png\n")
     poses = b"# t\n1.45 0 0 1 0 0 0 1\n1.65 0.1 0 1 0 0 0 1\n"
-    yield joined([*lists, poses, *depth, colour[0], b"20 0 7.5\n0 20 5.5\n0 0 1\n"])
+    yield join_parts([*lists, poses, *depth, color[0], b"20 0 7.5\n0 20 5.5\n0 0 1\n"])
 
 
 def cameras(work: Path) -> Iterator[bytes]:  # noqa: ARG001
