@@ -1,7 +1,7 @@
 """Poses from sweeps of spinning lidars, beside kiss-icp, one after the other in one run.
 
 python benchmarks/lidar_poses.py RECORDING ... [--kiss-python PYTHON] [--kiss-range M ...]
-    [--threads 2] [--odometry] [--beam-times-from-azimuth] [--set slam.spinning.KEY=VALUE ...]
+    [--threads 2] [--odometry] [--beam-times-from-azimuth] [--set slam.odometry.KEY=VALUE ...]
 
 RECORDING is a folder written by `stillmap simulate WORLD --lidar CHANNELS`, or any recording in
 space that states poses. Poses are compared with the true ones, or else with those stated, which may
@@ -108,9 +108,8 @@ def stillmap(
 ) -> tuple[Float, float]:
     """(T, 4, 4) poses at the stamps, and seconds per sweep."""
     started = time.perf_counter()
-    slam = chosen.slam
     found = lidar_odometry.register_sweeps(
-        case.recording, e, slam.spinning, slam.motion, _silent, threads
+        case.recording, e, chosen.slam.odometry, _silent, threads
     )
     return found.poses, (time.perf_counter() - started) / case.recording.n_scans
 

@@ -14,12 +14,15 @@ those of `stillmap.build` and of reading.
 """
 
 import argparse
+import contextlib
 import itertools
 import tempfile
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from cases import TRAJECTORY, Case, chosen
@@ -91,26 +94,39 @@ COLUMNS = (*RELATIONS, *ABSOLUTE, *LOOPS, *COST)
 
 @dataclass(frozen=True)
 class Variant:
-    """Options laid over the defaults."""
+    """Options and constants of `stillmap.slam` ("module.NAME") that differ from the defaults."""
 
     name: str
     settings: tuple[str, ...] = ()
     odometry: bool = True
+    constants: dict[str, float] = field(default_factory=dict)
+
+    @contextlib.contextmanager
+    def patched(self) -> Iterator[None]:
+        """Sets the constants."""
+        with contextlib.ExitStack() as stack:
+            for path, value in self.constants.items():
+                module, _, name = f"stillmap.slam.{path}".rpartition(".")
+                stack.enter_context(patch.object(import_module(module), name, value))
+            yield
 
 
 DEFAULTS = Variant("defaults")
 NO_ODOMETRY = Variant("no odometry", odometry=False)
 ABLATION = (
     DEFAULTS,
-    Variant("no loops", ("slam.loops.enabled=false",)),
+    Variant("no loops", ("slam.loop_closure=false",)),
     Variant("no e: the first M-step", ("em.max_iterations=1",)),
-    Variant("loops need no others that agree", ("slam.loops.agreeing=0",)),
-    Variant("every loop is believed", ("slam.loops.misfit=1e9",)),
-    Variant("no annealing", ("slam.loops.annealing=1",)),
-    Variant("no second registration", ("slam.loops.sweeps=0",)),
-    Variant("surfaces are not filled", ("slam.surface.gap=0",)),
-    Variant("loops from single scans", ("slam.loops.view=0",)),
-    Variant("beams count up to their end", ("slam.registration.approach=0",)),
+    Variant("loops need no others that agree", constants={"loop_candidates._MIN_AGREEING": 0}),
+    Variant("every loop is believed", constants={"loop_closure._MAX_CHI2": 1e9}),
+    Variant("no annealing", constants={"pose_graph._ANNEALING_STEPS": 1}),
+    Variant("no refinement pass", constants={"m_step._REFINEMENT_PASSES": 0}),
+    Variant("surfaces are not filled", constants={"scan_matching._MAX_GAP": 0.0}),
+    Variant("loops from single scans", constants={"loop_verification._VIEW_TRAVEL": 0.0}),
+    Variant(
+        "beams count up to their end",
+        constants={"FREE_SPACE_MARGIN": 0.0, "scan_matching.FREE_SPACE_MARGIN": 0.0},
+    ),
 )
 
 
@@ -170,7 +186,8 @@ def scored(folder: Path, variant: Variant, job: Job) -> Scores:
     recording = stillmap.read(folder, options.read)
     if not variant.odometry:
         recording = recording.without_odometry()
-    return scores_and_cost(recording, options, folder)
+    with variant.patched():
+        return scores_and_cost(recording, options, folder)
 
 
 def scores_and_cost(

@@ -23,7 +23,7 @@ OURS: dict[str, dict[str, Any]] = {
     "stillmap": {},
     # (6) and (8) as printed, with voxels in place of cells: at 0.15 m the sums of every voxel that
     # beams cross take more memory than there is
-    "paper, 0.3 m": {"estimator": "paper", "slam": {"voxel": 0.3}},
+    "paper, 0.3 m": {"estimator": "paper", "slam": {"voxel_size": 0.3}},
 }
 ESTIMATED = "stillmap, poses estimated"
 # what the other Python runs, with the arguments of space_peer_worker.py

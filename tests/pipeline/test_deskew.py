@@ -72,7 +72,7 @@ def test_map_and_labels_are_made_of_the_same_points(room, swept, estimator, give
         points = slam.deskew_recording(swept, it.estimate.poses, chosen.slam).points
         np.testing.assert_array_equal(it.deskewed.points, points)
         assert not np.array_equal(points, swept.points)
-        grid = _core.OccupancyGrid2D(RESOLUTION, chosen.slam.registration.approach)
+        grid = _core.OccupancyGrid2D(RESOLUTION, slam.FREE_SPACE_MARGIN)
         em.add_recording(grid, it.deskewed, it.estimate.poses, it.estimate.weights)
         for ours, theirs in zip(it.estimate.m_step.grid.dense(), grid.dense(), strict=True):
             np.testing.assert_array_equal(ours, theirs)
@@ -94,9 +94,9 @@ def test_what_tells_of_the_motion(swept, monkeypatch, odometry):
     """Odometry, or else poses of the scans as they were taken; then the poses so far."""
     built, found, plain = [], [], odometry_2d.register_scans
 
-    def noted(recording, *rest):
+    def noted(recording, *rest, **how):
         built.append(recording)
-        found.append(plain(recording, *rest))
+        found.append(plain(recording, *rest, **how))
         return found[-1]
 
     monkeypatch.setattr(odometry_2d, "register_scans", noted)
