@@ -19,6 +19,7 @@ from stillmap.em.observations import (
     OccupancyHmm,
     Rows,
     SurfelMap,
+    iter_surfel_rows,
     probability_in_cell,
     surfel_cells,
 )
@@ -117,7 +118,9 @@ def track_changes(
 def decode_histories(seen: Observations, options: EmOptions) -> CellHistories:
     """The most probable path of each cell; `track_changes` was called before the observations."""
     groups, weights = _class_groups(seen), _fit_weights(seen, options)
-    blocks = [_decode_rows(seen, rows, groups, weights) for rows in seen.iter_rows()]
+    blocks = [
+        _decode_rows(seen, rows, groups, weights) for rows in iter_surfel_rows(seen.surfel_map)
+    ]
     columns = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
     return _group_cells(
         CellHistories(
@@ -148,7 +151,7 @@ def label_cells(seen: Observations, options: EmOptions) -> CellLabels:
     """Labels of each surfel; `track_changes` was called before the observations."""
     (static, *_, changing), weights = _class_groups(seen), _fit_weights(seen, options)
     p_static, change = np.empty((2, seen.surfel_map.size), np.float32)
-    for rows in seen.iter_rows():
+    for rows in iter_surfel_rows(seen.surfel_map):
         likelihood = _likelihood(seen, rows)
         p_static[slice(*rows)] = posterior(likelihood, weights, static)
         log_changed, log_static = (
@@ -185,9 +188,9 @@ def _class_groups(seen: Observations) -> tuple[NDArray[np.bool_], ...]:
 
 def _likelihood(seen: Observations, rows: Rows) -> NDArray[np.float32]:
     """(E, C + 1) of some surfels under these classes and the change HMM, relative to the best."""
-    classes = seen.likelihoods(_classes(seen), rows)
-    log_ratio = np.minimum(seen.hmm.change_log_likelihood(rows) - classes.log_best, _MAX_LOG_RATIO)
-    table = np.column_stack([classes.likelihood, np.exp(log_ratio).astype(np.float32)])
+    likelihood, log_best = seen.likelihood(_classes(seen), rows)
+    log_ratio = np.minimum(seen.hmm.change_log_likelihood(rows) - log_best, _MAX_LOG_RATIO)
+    table = np.column_stack([likelihood, np.exp(log_ratio).astype(np.float32)])
     table /= np.exp(np.maximum(log_ratio, 0.0)).astype(np.float32)[:, None]
     return table
 

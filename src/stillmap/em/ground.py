@@ -6,10 +6,7 @@ from numpy.typing import NDArray
 import stillmap._core as _core
 from stillmap.core.chunks import iter_chunks
 from stillmap.core.recording import Recording
-from stillmap.em.observations import (
-    SurfelMap,
-    iter_surfel_rows,
-)
+from stillmap.em.observations import SurfelMap, iter_surfel_rows
 from stillmap.em.types import DYNAMIC_BELOW, GROUND_SQUARE, Float, GroundMap
 
 Index = NDArray[np.intp]

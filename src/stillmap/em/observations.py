@@ -83,23 +83,6 @@ LOOP_CLASSES = HmmClasses()
 
 
 @dataclass(frozen=True, eq=False)
-class ClassLikelihoods:
-    """Likelihood of the observations of E surfels under each of C classes.
-
-    Attributes:
-        rho, tau, view_angle: (C,) of the classes; the first `n_static` are static.
-        likelihood: (E, C) relative to the best class, whose logarithm is `log_best` (E,).
-    """
-
-    rho: Float
-    tau: Float
-    view_angle: Float
-    n_static: int
-    likelihood: NDArray[np.float32]
-    log_best: Float
-
-
-@dataclass(frozen=True, eq=False)
 class Observations:
     """All observations of E surfels, filtered.
 
@@ -120,24 +103,19 @@ class Observations:
     n_static: int
     threads: int = 1
 
-    def likelihoods(
+    def likelihood(
         self, classes: NDArray[np.bool_] | None = None, rows: Rows | None = None
-    ) -> ClassLikelihoods:
-        """Likelihood of some surfels under some classes.
+    ) -> tuple[NDArray[np.float32], Float]:
+        """Likelihood of the observations of surfels under some classes, as if there were no others.
 
         Args:
-            classes: (C,) with all static ones, as if there were no others; None: all.
+            classes: (C,) mask with all static ones; None: all.
             rows: first, last + 1 and step of the surfels; None: all.
-        """
-        some = slice(None) if classes is None else classes
-        found = self.hmm.likelihood(classes, rows, self.threads)
-        return ClassLikelihoods(
-            self.rho[some], self.tau[some], self.view_angle[some], self.n_static, *found
-        )
 
-    def iter_rows(self) -> Iterator[Rows]:
-        """All surfels in blocks: the likelihoods of all at once would need much memory."""
-        return iter_surfel_rows(self.surfel_map)
+        Returns:
+            (E, C) relative to the best class, and the logarithm (E,) of that one.
+        """
+        return self.hmm.likelihood(classes, rows, self.threads)
 
     def sample_rows(self) -> Rows:
         """Every k-th surfel, enough of them to fit mixture weights."""
@@ -243,22 +221,23 @@ def make_hmm(
     """The forward filters of all surfels, without observations."""
     rho, tau, view_angle = classes.grid()
     cell, noise_std = surfel_map.resolution, surfel_map.noise_std
-    arguments: dict[str, Any] = {
-        "rho": rho,
-        "tau": tau,
-        "view_angle": view_angle,
-        "p_detection": options.p_detection,
-        "bin_seconds": options.time_bin,
-        "lateral_std": max(_LATERAL * noise_std, _MIN_LATERAL * cell),
-        "margin": _MARGIN * noise_std + 0.5 * cell,
-        "hit_radius": _HIT_RADIUS * noise_std + 0.7 * cell,  # half a cell's diagonal
-        "end_margin": MAX_RANGE_MARGIN,
-        "use_normals": _USE_NORMALS,
-        "threads": threads,
-    }
-    if isinstance(surfel_map, _core.SurfelMap2D):
-        return _core.OccupancyHmm2D(surfel_map, **arguments)
-    return _core.OccupancyHmm3D(surfel_map, **arguments)
+    is_2d = isinstance(surfel_map, _core.SurfelMap2D)
+    kind: Any = _core.OccupancyHmm2D if is_2d else _core.OccupancyHmm3D
+    hmm: OccupancyHmm = kind(
+        surfel_map,
+        rho=rho,
+        tau=tau,
+        view_angle=view_angle,
+        p_detection=options.p_detection,
+        bin_seconds=options.time_bin,
+        lateral_std=max(_LATERAL * noise_std, _MIN_LATERAL * cell),
+        margin=_MARGIN * noise_std + 0.5 * cell,
+        hit_radius=_HIT_RADIUS * noise_std + 0.7 * cell,  # half a cell's diagonal
+        end_margin=MAX_RANGE_MARGIN,
+        use_normals=_USE_NORMALS,
+        threads=threads,
+    )
+    return hmm
 
 
 def _estimate_trust(

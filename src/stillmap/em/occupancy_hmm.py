@@ -13,36 +13,25 @@ from numpy.typing import NDArray
 
 from stillmap.core.chunks import iter_chunks
 from stillmap.core.recording import Recording
-from stillmap.em.changepoints import (
-    CellHistories,
-    decode_histories,
-    label_cells,
-    select_changed_cells,
-    track_changes,
-)
+from stillmap.em import changepoints, spatial_prior
+from stillmap.em.changepoints import CellHistories
 from stillmap.em.ground import ground_from_surfels
 from stillmap.em.mixture import MixtureWeights, fit_weights, posterior_static
 from stillmap.em.observations import (
     HALF_TIME_RHO,
     LOOP_CLASSES,
     MAX_RANGE_MARGIN,
-    ClassLikelihoods,
     HmmClasses,
     Observations,
     OccupancyHmm,
     SurfelMap,
     collect_observations,
+    iter_surfel_rows,
     probability_in_cell,
     surfel_cells,
 )
 from stillmap.em.options import EmOptions
-from stillmap.em.spatial_prior import (
-    GroundContact,
-    make_ground_contact,
-    pool_clusters,
-    select_obstacles,
-    smooth_mean_field,
-)
+from stillmap.em.spatial_prior import GroundContact
 from stillmap.em.types import (
     CellProbabilities,
     EStepResult,
@@ -102,26 +91,28 @@ def e_step_3d(
         return e_step(recording, poses, resolution, options, threads)
 
     def prepare(hmm: OccupancyHmm) -> None:
-        track_changes(hmm, recording, options, with_paths=options.change_detection_3d)
+        changepoints.track_changes(hmm, recording, options, with_paths=options.change_detection_3d)
 
     seen = collect_observations(
         recording, poses, resolution, options, threads, _CLASSES_3D, prepare
     )
-    cells = label_cells(seen, options)
-    p_static = smooth_mean_field(cells.p_static, seen.surfel_map, threads)
+    cells = changepoints.label_cells(seen, options)
+    p_static = spatial_prior.smooth_mean_field(cells.p_static, seen.surfel_map, threads)
     T_map_sensor = recording.T_map_sensor(poses)
     ground = ground_from_surfels(seen.surfel_map, p_static, T_map_sensor[:, :3, 3])
-    obstacles = select_obstacles(ground, seen.surfel_map)
+    obstacles = spatial_prior.select_obstacles(ground, seen.surfel_map)
     contact = None
     if obstacles is not None:
-        p_static = pool_clusters(
+        p_static = spatial_prior.pool_clusters(
             p_static, cells.change, obstacles, recording, T_map_sensor, threads
         )
-        contact = make_ground_contact(obstacles, p_static)
+        contact = spatial_prior.make_ground_contact(obstacles, p_static)
     found = label_beams(seen, None, recording, poses, options, p_static, contact)
     changed_cells = None
     if options.change_detection_3d:
-        changed_cells = select_changed_cells(decode_histories(seen, options))
+        changed_cells = changepoints.select_changed_cells(
+            changepoints.decode_histories(seen, options)
+        )
     return replace(
         found,
         learned={**found.learned, "changing": round(cells.changing_weight, 6)},
@@ -149,14 +140,16 @@ def final_e_step(
 
     def prepare(hmm: OccupancyHmm) -> None:
         if options.change_detection:
-            track_changes(hmm, recording, options)
+            changepoints.track_changes(hmm, recording, options)
 
     classes = _FINAL_CLASSES if _VIEW_CLASSES else replace(_FINAL_CLASSES, view_rho=())
     seen = collect_observations(recording, poses, resolution, options, threads, classes, prepare)
     labels = None
     if _VIEW_CLASSES:
         labels = label_beams(seen, _label_classes(seen), recording, poses, options)
-    return labels, decode_histories(seen, options) if options.change_detection else None
+    return labels, changepoints.decode_histories(
+        seen, options
+    ) if options.change_detection else None
 
 
 def _label_classes(seen: Observations) -> NDArray[np.bool_]:
@@ -185,8 +178,8 @@ def label_beams(
         p_static: (E,) P(static) of each surfel to use instead of the posterior.
         contact: relabels beams that end on the ground below something that moves.
     """
-    sample = seen.likelihoods(classes, seen.sample_rows())
-    weights = fit_weights(sample.likelihood, sample.n_static, options.prior)
+    sample, _ = seen.likelihood(classes, seen.sample_rows())
+    weights = fit_weights(sample, seen.n_static, options.prior)
     posterior, likelihood = _surfel_posterior(seen, classes, weights)
     prior = weights.static
     if p_static is None:
@@ -201,7 +194,7 @@ def label_beams(
         occupied=CellProbabilities(
             surfel_cells(surfel_map), p_static * probability_in_cell(surfel_map), _FREE_PRIOR
         ),
-        learned=_learned(seen, sample, weights) | {"p_static": prior},
+        learned=_learned(seen, classes, weights) | {"p_static": prior},
         no_return=NoReturnModel(seen.hmm.solid_cells(), end_margin),
     )
 
@@ -235,29 +228,30 @@ def _surfel_posterior(
 ) -> tuple[NDArray[np.float32], Likelihood]:
     """(E,) P(static) of each surfel, and the bound sum ln sum_c w_c L_c."""
     p_static, bound, entropy = np.empty(seen.surfel_map.size, np.float32), 0.0, 0.0
-    for rows in seen.iter_rows():
-        table = seen.likelihoods(classes, rows)
-        p_static[slice(*rows)] = posterior_static(table.likelihood, weights.classes, table.n_static)
-        joint = table.likelihood * weights.classes
+    for rows in iter_surfel_rows(seen.surfel_map):
+        table, log_best = seen.likelihood(classes, rows)
+        p_static[slice(*rows)] = posterior_static(table, weights.classes, seen.n_static)
+        joint = table * weights.classes
         evidence = joint.sum(axis=1)
         r = joint / evidence[:, None]
         entropy -= float(np.sum(r * np.log(np.maximum(r, 1e-30))))
-        bound += float(np.sum(np.log(evidence) + table.log_best))
+        bound += float(np.sum(np.log(evidence) + log_best))
     return p_static, Likelihood(expected=bound - entropy, bound=bound)
 
 
 def _learned(
-    seen: Observations, table: ClassLikelihoods, weights: MixtureWeights
+    seen: Observations, classes: NDArray[np.bool_] | None, weights: MixtureWeights
 ) -> dict[str, object]:
     """The fitted parameters, as `run.json` lists them."""
-    static, dynamic = slice(None, table.n_static), slice(table.n_static, None)
+    static, dynamic = slice(None, seen.n_static), slice(seen.n_static, None)
+    rho, tau = (values if classes is None else values[classes] for values in (seen.rho, seen.tau))
     return {
         "scatter": seen.surfel_map.noise_std,
         "p_static": weights.static,
         "no_return_trusted": round(seen.trust, 6),
-        "static_occupied": _weight_by_value(table.rho[static], weights.classes[static]),
-        "mover_occupied": _weight_by_value(table.rho[dynamic], weights.classes[dynamic]),
-        "mover_seconds": _weight_by_value(table.tau[dynamic], weights.classes[dynamic]),
+        "static_occupied": _weight_by_value(rho[static], weights.classes[static]),
+        "mover_occupied": _weight_by_value(rho[dynamic], weights.classes[dynamic]),
+        "mover_seconds": _weight_by_value(tau[dynamic], weights.classes[dynamic]),
     }
 
 

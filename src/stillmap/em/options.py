@@ -27,9 +27,7 @@ class EmOptions(Section, section="em"):
     )
     patience: int = option(2, "Stop after this many iterations without a better bound.", ge=1)
     held_out: int = option(
-        20,
-        "Leave every n-th scan out of the map and score the map with it; 0: none.",
-        ge=0,
+        20, "Leave every n-th scan out of the map and score the map with it; 0: none.", ge=0
     )
     time_bin: float = option(
         0.5,

@@ -130,10 +130,7 @@ class EStepResult:
 
 
 def fill_beams(
-    points: NDArray[np.float32],
-    hit: NDArray[np.bool_],
-    values: NDArray[np.float32],
-    prior: float,
+    points: NDArray[np.float32], hit: NDArray[np.bool_], values: NDArray[np.float32], prior: float
 ) -> NDArray[np.float32]:
     """(M,) `values` for hits, the prior for maximum-range beams, NaN for unusable ones."""
     e = np.where(hit, values, np.float32(prior)).astype(np.float32, copy=False)
