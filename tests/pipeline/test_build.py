@@ -242,7 +242,7 @@ def test_movers_are_told_from_walls(room, estimator):
 
 @pytest.mark.parametrize("estimator", ["stillmap", "paper"])
 def test_the_history_is_complete(room, estimator):
-    chosen = options(estimator, max_iterations=3, tolerance=0.0, settled=0.0, patience=9)
+    chosen = options(estimator, max_iterations=3, tolerance=0.0, label_tolerance=0.0, patience=9)
     result = stillmap.build(room.recording, chosen)
     assert [it.number for it in result.iterations] == [1, 2, 3]
     for it in result.iterations:

@@ -38,7 +38,7 @@ def test_every_iteration_has_its_figure(room, tmp_path, estimator):
     result.save(tmp_path / "out")
     run = json.loads((tmp_path / "out" / "run.json").read_text())
     assert [it["held_out_log_likelihood"] for it in run["iterations"]] == figures
-    assert f"foreseen with {expected:.3f} nats" in (tmp_path / "out" / "report.html").read_text()
+    assert f"predicted {expected:.3f} nats" in (tmp_path / "out" / "report.html").read_text()
 
 
 @pytest.mark.parametrize("every", [0, 61])
@@ -46,7 +46,7 @@ def test_without_held_out_scans_there_is_none(room, tmp_path, every):
     result = stillmap.build(room.recording, options("stillmap", held_out=every, max_iterations=1))
     assert [it.held_out_log_likelihood for it in result.iterations] == [None]
     result.save(tmp_path / "out")
-    assert "foreseen" not in (tmp_path / "out" / "report.html").read_text()
+    assert "are predicted" not in (tmp_path / "out" / "report.html").read_text()
 
 
 def test_what_is_mapped_does_not_depend_on_it(room):

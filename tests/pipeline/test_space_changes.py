@@ -8,7 +8,7 @@ from choices import options
 
 import stillmap
 from stillmap.core.config import override
-from stillmap.pipeline.checkpoint_files import packed, unpacked
+from stillmap.pipeline.checkpoint_files import pack_state, unpack_state
 from stillmap.pipeline.options import Options
 from stillmap.sim import CrowdOptions, LidarOptions, RobotOptions, Scene, simulate
 from stillmap.sim.scene import Stay, Thing
@@ -39,12 +39,12 @@ def hall():
 
 @pytest.fixture(scope="module")
 def built(hall):
-    """The result, and how far the run had come after its only iteration."""
-    loops = []
+    """The result, and the state of the run after its only iteration."""
+    states = []
     result = stillmap.build(
-        hall.recording, LISTED, poses=hall.truth.T_world_base, keep=loops.append
+        hall.recording, LISTED, poses=hall.truth.T_world_base, checkpoint=states.append
     )
-    return result, loops[-1]
+    return result, states[-1]
 
 
 def test_both_are_listed_and_nothing_else(built):
@@ -82,14 +82,14 @@ def test_the_files_say_so(built, tmp_path):
 
 
 def test_a_run_that_goes_on_knows_them(built, hall):
-    result, loop = built
-    values, arrays = packed(loop)
-    again = unpacked(json.loads(json.dumps(values)), arrays, loop.options)
-    resumed = stillmap.build(hall.recording, LISTED, poses=hall.truth.T_world_base, go_on=again)
-    kept, known = again.kept.ground, loop.kept.ground
-    np.testing.assert_array_equal(kept.z, known.z)
+    result, state = built
+    values, arrays = pack_state(state)
+    again = unpack_state(json.loads(json.dumps(values)), arrays, state.options)
+    resumed = stillmap.build(hall.recording, LISTED, poses=hall.truth.T_world_base, resume=again)
+    kept, known = again.best.e_step.ground, state.best.e_step.ground
+    np.testing.assert_array_equal(kept.height, known.height)
     np.testing.assert_array_equal(kept.corner, known.corner)
-    assert (kept.sensor, kept.seen) == (known.sensor, True)
+    assert (kept.sensor_height, kept.observed) == (known.sensor_height, True)
     assert len(resumed.changes) == len(result.changes) == 2
     for one, known in zip(resumed.changes, result.changes, strict=True):
         assert (one.x, one.y, one.z, one.stamp_ns) == (known.x, known.y, known.z, known.stamp_ns)
@@ -97,7 +97,7 @@ def test_a_run_that_goes_on_knows_them(built, hall):
 
 
 def test_nothing_is_listed_that_was_not_asked_for(hall):
-    chosen = options("stillmap", changes={"enabled": False})
+    chosen = options("stillmap", change_detection=False)
     result = stillmap.build(hall.recording, chosen, poses=hall.truth.T_world_base)
     assert result.changes == []
     assert "changing" not in result.learned

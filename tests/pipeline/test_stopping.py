@@ -53,7 +53,7 @@ def made_up(recording, number, bound, changed_share) -> Iteration:
     grid = _core.OccupancyGrid2D(0.1)
     em.add_recording(grid, recording, poses, e)
     m_step = slam.MStepResult(
-        poses, np.full((T, 3, 3), float(number)), grid, np.ones(T), [], loops=[]
+        poses, np.full((T, 3, 3), float(number)), grid, np.ones(T), slam.Diagnostics()
     )
     likelihood = em.Likelihood(expected=bound - 1.0, bound=bound)
     e_step = em.EStepResult(e, likelihood, learned={"number": number})
