@@ -201,7 +201,7 @@ def test_points_that_are_too_far_off_are_refused(name, tmp_path):
         3, np.zeros(3), None, lambda: iter([point_cloud.Block(far, np.ones(3, np.float32), None)])
     )
     form = point_cloud_files.format_for(tmp_path / name)
-    with pytest.raises(InputError, match=f"{name}: cannot be written: a point lies"):
+    with pytest.raises(InputError, match=f"{name}: cannot be written: a point is beyond"):
         point_cloud_files.write(points, tmp_path / name, form)
     assert not list(tmp_path.iterdir())
 

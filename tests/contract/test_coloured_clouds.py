@@ -24,7 +24,7 @@ def points() -> point_cloud.Block:
 @pytest.fixture
 def written(points, tmp_path):
     def write(ending: str, *, coloured: bool = True) -> Path:
-        block = points if coloured else points._replace(colours=None)
+        block = points if coloured else points._replace(colors=None)
         path = tmp_path / f"{'coloured' if coloured else 'plain'}{ending}"
         whole = point_cloud.Cloud(N, np.zeros(3), 0, lambda: iter([block]), coloured)
         point_cloud_files.write(whole, path, point_cloud_files.format_for(path))
@@ -39,7 +39,7 @@ def test_las(written, points, ending):
     found = laspy.read(written(ending))
     assert found.point_format.id == 7
     rgb = np.stack([found.red, found.green, found.blue], axis=1)
-    np.testing.assert_array_equal(rgb, points.colours.astype(np.uint16) * 256)
+    np.testing.assert_array_equal(rgb, points.colors.astype(np.uint16) * 256)
     np.testing.assert_array_equal(found["p_static"], points.p_static)
     np.testing.assert_allclose(found.xyz, points.points, atol=0.51e-4)
     assert laspy.read(written(ending, coloured=False)).point_format.id == 6
@@ -53,7 +53,7 @@ def test_e57(written, points):
     assert limits["colorRedMaximum"].value() == 255
     file.close()
     rgb = np.stack([found[f"color{name}"] for name in ("Red", "Green", "Blue")], axis=1)
-    np.testing.assert_array_equal(rgb, points.colours)
+    np.testing.assert_array_equal(rgb, points.colors)
     np.testing.assert_array_equal(found["intensity"], points.p_static)
     plain = pye57.E57(str(written(".e57", coloured=False)))
     assert "colorRed" not in plain.read_scan_raw(0)
@@ -62,7 +62,7 @@ def test_e57(written, points):
 
 def test_ply(written, points):
     found = trimesh.load(written(".ply"))
-    np.testing.assert_array_equal(found.colors[:, :3], points.colours)
+    np.testing.assert_array_equal(found.colors[:, :3], points.colors)
     np.testing.assert_allclose(found.vertices, points.points, atol=4e-6)
 
 
@@ -73,7 +73,7 @@ def test_pcd(written, points):
     assert lines["FIELDS"] == "x y z p_static rgb"
     assert (lines["SIZE"], lines["TYPE"]) == ("4 4 4 4 4", "F F F F F")
     rows = np.frombuffer(data, np.uint8).reshape(N, 20)
-    np.testing.assert_array_equal(rows[:, 16:19], points.colours[:, ::-1])
+    np.testing.assert_array_equal(rows[:, 16:19], points.colors[:, ::-1])
     assert not rows[:, 19].any()
     # none of them is NaN, or readers would drop it
     assert np.isfinite(rows[:, 16:].copy().view("<f4")).all()
@@ -83,7 +83,7 @@ def test_text(written, points):
     path = written(".xyz")
     assert path.read_text().split("\n", 1)[0] == "x y z p_static red green blue"
     found = np.loadtxt(path, skiprows=1)
-    np.testing.assert_array_equal(found[:, 4:], points.colours)
+    np.testing.assert_array_equal(found[:, 4:], points.colors)
     np.testing.assert_array_equal(found[:, 3].astype(np.float32), points.p_static)
     np.testing.assert_allclose(found[:, :3], points.points, atol=0.51e-4)
 
@@ -94,14 +94,14 @@ def test_clouds_of_a_folder_have_the_colours_of_both_files(points, tmp_path):
     for name, column in zip("xyz", points.points.T, strict=True):
         rows[name] = column
     rows["p_static"] = np.where(np.arange(N) < 9, 0.1, 0.9)
-    put_colours(rows, points.colours)
+    put_colours(rows, points.colors)
     for part, its in (("dynamic", rows[:9]), ("static", rows[9:])):
         head = ply_header(FIELDS + COLOURS, len(its))
         (tmp_path / f"{part}.ply").write_bytes(head + its.tobytes())
     found = point_cloud.cloud_from_folder(tmp_path)
     assert found.has_colors
     colours = np.concatenate([block.colors for block in found.make_blocks()])
-    np.testing.assert_array_equal(colours, np.roll(points.colours, -9, axis=0))
+    np.testing.assert_array_equal(colours, np.roll(points.colors, -9, axis=0))
     plain = np.zeros(2, FIELDS)
     (tmp_path / "dynamic.ply").write_bytes(ply_header(FIELDS, 2) + plain.tobytes())
     found = point_cloud.cloud_from_folder(tmp_path)

@@ -177,11 +177,15 @@ def test_layer_of_thinly_observed_cells_is_reduced_as_the_map_is(result):
 
 def test_thinly_observed_area(page, result):
     text = " ".join("".join(page.text).split())
-    thin, known = (np.count_nonzero(one) for one in (result.evidence.thinly_observed, result.map.beta > 0))
+    thin, known = (
+        np.count_nonzero(one) for one in (result.evidence.thinly_observed, result.map.beta > 0)
+    )
     assert f"{0.01 * thin:,.1f} m² of the filtered map" in text
     assert f"{100 * thin / known:.1f} % of the known area" in text
     assert "fewer than 3 observations" in text
-    nothing = dataclasses.replace(result.evidence, thinly_observed=np.zeros_like(result.evidence.thinly_observed))
+    nothing = dataclasses.replace(
+        result.evidence, thinly_observed=np.zeros_like(result.evidence.thinly_observed)
+    )
     text = render_report(dataclasses.replace(result, evidence=nothing))
     assert "All of the known area is well observed." in text
 

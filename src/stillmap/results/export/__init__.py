@@ -1,1 +1,1 @@
-"""Results in the forms of other programs."""
+"""Export of results to the formats of other programs."""

@@ -1,4 +1,4 @@
-"""A result as a ROS bag that shows it moving: scans with what moves apart, map, way, objects."""
+"""Write a result as a ROS bag: static and dynamic scans, map, trajectory, moving objects."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -17,20 +17,20 @@ from stillmap.io.ros.recording_writer import LaserScanEncoder, number_names, wri
 from stillmap.mapping.beam_statistics import DYNAMIC_BELOW
 from stillmap.results.reader import Exported, Track
 
-_COLOUR = (0.9, 0.4, 0.0, 0.8)  # the orange of the report
-_HEIGHT, _LEAST = 0.5, 0.1  # m, of the boxes
+_COLOR = (0.9, 0.4, 0.0, 0.8)  # RGBA, the orange of the report
+_HEIGHT, _MIN_SIZE = 0.5, 0.1  # m, of the boxes
 _CUBE, _ADD, _DELETE_ALL = 1, 0, 3  # of visualization_msgs/Marker
 
 
 def write(result: Exported, path: Path, kind: BagKind, *, overwrite: bool = False) -> list[str]:
     """Write a result as a ROS bag.
 
-    `/scan` holds the beams that something static reflected and those at maximum range,
-    `/scan_dynamic` those on what moves, with NaN for each other's beams; `/map`, `/trajectory`
-    and `/objects` the rest. Transforms go from map over base_link to the lasers.
+    `/scan` holds static and maximum-range beams, `/scan_dynamic` the dynamic ones; beams of the
+    other topic are NaN. Further topics: `/map`, `/trajectory`, `/objects` (markers), and
+    transforms from map over base_link to the lasers.
 
     Returns:
-        What could not be said, a sentence each.
+        What the format cannot represent, a sentence each.
 
     Raises:
         InputError: the bag cannot be written or cannot hold the scans.
@@ -40,12 +40,12 @@ def write(result: Exported, path: Path, kind: BagKind, *, overwrite: bool = Fals
     lasers = LaserScanEncoder(recording)
     with new_bag(path, kind, overwrite=overwrite) as bag:
         frames = write_sensor_frames(bag, recording)
-        _show_whole(bag, result)
+        _write_latched_topics(bag, result)
         names = [f"/{name}" for name in number_names("scan", len(frames))]
         static = [bag.add_topic(name, LASER_SCAN) for name in names]
         dynamic = [bag.add_topic(f"{name}_dynamic", LASER_SCAN) for name in names]
         send_tf = bag.add_topic("/tf", TF)
-        show_objects = _shown_objects(bag, result)
+        write_objects = _make_object_writer(bag, result)
         for t in recording.iter_scans(range(recording.n_scans), result.p_static):
             stamp = stamps[t]
             send_tf(
@@ -53,16 +53,16 @@ def write(result: Exported, path: Path, kind: BagKind, *, overwrite: bool = Fals
             )
             s = int(recording.sensor[t])
             beams, ranges = recording.beams_of(t), lasers.ranges(t)
-            moves = recording.hit[beams] & (result.p_static[beams] < DYNAMIC_BELOW)
-            for sends, its in ((static, ~moves), (dynamic, moves)):
-                apart = np.where(its, ranges, np.float32(np.nan))
-                sends[s](stamp, lasers.make_message(bag, t, frames[s], apart))
-            show_objects(t)
+            is_dynamic = recording.hit[beams] & (result.p_static[beams] < DYNAMIC_BELOW)
+            for sends, selected in ((static, ~is_dynamic), (dynamic, is_dynamic)):
+                part = np.where(selected, ranges, np.float32(np.nan))
+                sends[s](stamp, lasers.make_message(bag, t, frames[s], part))
+            write_objects(t)
     return lasers.describe_losses()
 
 
-def _show_whole(bag: BagWriter, result: Exported) -> None:
-    """What holds for the whole recording, sent once."""
+def _write_latched_topics(bag: BagWriter, result: Exported) -> None:
+    """Map and trajectory, as one latched message each."""
     stamp_ns, grid = result.recording.stamp_ns, result.map
     first = int(stamp_ns[0])
     send = bag.add_topic("/map", message_writer.GRID, latched=True)
@@ -75,8 +75,8 @@ def _show_whole(bag: BagWriter, result: Exported) -> None:
     send(first, message_writer.make_path(bag, stamp_ns, result.poses))
 
 
-def _shown_objects(bag: BagWriter, result: Exported) -> Callable[[int], None]:
-    """A function that shows where everything is that moves at a scan."""
+def _make_object_writer(bag: BagWriter, result: Exported) -> Callable[[int], None]:
+    """A function that writes the markers of all objects at a scan."""
     send = bag.add_topic("/objects", message_writer.MARKERS)
     stamp_ns = result.recording.stamp_ns
     first = [int(np.searchsorted(stamp_ns, one.stamp_ns[0])) for one in result.tracks]
@@ -86,7 +86,7 @@ def _shown_objects(bag: BagWriter, result: Exported) -> Callable[[int], None]:
         starting.setdefault(scan, []).append(number)
     shown: list[int] = []
 
-    def show(t: int) -> None:
+    def write_markers(t: int) -> None:
         nonlocal shown
         before, stamp = shown, int(stamp_ns[t])
         shown = [n for n in (*shown, *starting.get(t, ())) if last[n] > t]
@@ -96,18 +96,18 @@ def _shown_objects(bag: BagWriter, result: Exported) -> Callable[[int], None]:
         markers += [_box(bag, stamp, result.tracks[n]) for n in shown]
         send(stamp, bag.make(message_writer.MARKERS, markers=markers))
 
-    return show
+    return write_markers
 
 
 def _box(bag: BagWriter, stamp: int, one: Track) -> Any:
-    """A box where a thing is, between where it was seen before and after."""
-    since = 1e-9 * (one.stamp_ns - stamp)
-    x, y, vx, vy = (np.interp(0.0, since, row) for row in (*one.xy.T, *one.velocity.T))
+    """The box of an object at the interpolated position of its track."""
+    seconds = 1e-9 * (one.stamp_ns - stamp)
+    x, y, vx, vy = (np.interp(0.0, seconds, row) for row in (*one.xy.T, *one.velocity.T))
     T = np.eye(4)
     T[:2, :2] = se2.matrix(0.0, 0.0, np.arctan2(vy, vx))[:2, :2]
     T[:3, 3] = x, y, _HEIGHT / 2
-    along, across = (max(metres, _LEAST) for metres in one.size[:2])
-    return _marker(bag, stamp, _ADD, one.id, T, (along, across, _HEIGHT))
+    length, width = (max(edge, _MIN_SIZE) for edge in one.size[:2])
+    return _marker(bag, stamp, _ADD, one.id, T, (length, width, _HEIGHT))
 
 
 def _marker(
@@ -119,7 +119,7 @@ def _marker(
     size: tuple[float, float, float] = (1.0, 1.0, 1.0),
 ) -> Any:
     x, y, z = size
-    r, g, b, a = _COLOUR
+    r, g, b, a = _COLOR
     fields = {
         "header": bag.header(stamp, MAP),
         "ns": "objects",
@@ -138,17 +138,17 @@ def _marker(
         "mesh_use_embedded_materials": False,
     }
     if not bag.is_ros1:
-        fields |= _of_ros2(bag, stamp)
+        fields |= _ros2_fields(bag, stamp)
     return bag.make("visualization_msgs/msg/Marker", **fields)
 
 
-def _of_ros2(bag: BagWriter, stamp: int) -> dict[str, Any]:
-    nothing = np.empty(0, np.uint8)
-    picture = {"header": bag.header(stamp, ""), "format": "", "data": nothing}
-    mesh = {"filename": "", "data": nothing}
+def _ros2_fields(bag: BagWriter, stamp: int) -> dict[str, Any]:
+    empty = np.empty(0, np.uint8)
+    image = {"header": bag.header(stamp, ""), "format": "", "data": empty}
+    mesh = {"filename": "", "data": empty}
     return {
         "texture_resource": "",
-        "texture": bag.make("sensor_msgs/msg/CompressedImage", **picture),
+        "texture": bag.make("sensor_msgs/msg/CompressedImage", **image),
         "uv_coordinates": [],
         "mesh_file": bag.make("visualization_msgs/msg/MeshFile", **mesh),
     }

@@ -1,8 +1,7 @@
-"""A cloud as the one scan of an E57 file, by libe57 (of pye57).
+"""Write a point cloud as an E57 file with one scan, through libe57 (pye57).
 
-E57 names the fields that a point may have. `p_static` is none of them; fields of other names are
-allowed, but pye57 refuses to read files that have one, or `timeStamp`. So P(static) stands as
-`intensity`, from 0 to 1, which a recording here has none of; there are no times.
+pye57 does not read files with fields beyond the standard ones, nor with `timeStamp`. P(static) is
+therefore written as `intensity`, from 0 to 1, and there are no times.
 """
 
 import hashlib
@@ -19,39 +18,42 @@ from stillmap.core.errors import InputError, import_extra
 from stillmap.io.point_cloud.e57 import GPS_EPOCH_S
 from stillmap.results.export.point_cloud import Block, Cloud
 
-_BLOCK = 1 << 16  # points written together
+_BLOCK = 1 << 16  # points written at a time
 _SCALE = 0.0001  # m
-_LARGEST = 2**31 - 1  # 32 bits for each coordinate
+_MAX_INTEGER = 2**31 - 1  # of a coordinate
 _AXES = ("cartesianX", "cartesianY", "cartesianZ")
-_COLOURS = ("colorRed", "colorGreen", "colorBlue")
+_COLORS = ("colorRed", "colorGreen", "colorBlue")
 
 
-def write(cloud: Cloud, path: Path, tell: Callable[[float], None] | None) -> None:
-    """Write `cartesianX`, `Y`, `Z` and `intensity`; coordinates are rounded to 0.1 mm. Where there
-    are colours `colorRed`, `Green` and `Blue`, too, from 0 to 255.
+def write(cloud: Cloud, path: Path, progress: Callable[[float], None] | None) -> None:
+    """Write `cartesianX`, `Y`, `Z`, `intensity` and, with colors, `colorRed`, `Green`, `Blue`.
+
+    Coordinates are rounded to 0.1 mm; colors are 0 to 255.
 
     Raises:
         InputError: pye57 is missing, or the file cannot be written or cannot hold the points.
-        OSError: the file cannot be made.
+        OSError: the file cannot be created.
     """
     library = import_extra("pye57.libe57", path, "written")
     if not str(path).isprintable():
-        raise InputError("has a name that its library cannot open", where=str(path))
-    path.open("wb").close()  # the library does not say why it cannot
+        raise InputError("has a name that libe57 cannot open", where=str(path))
+    path.open("wb").close()  # raises an OSError that names the reason; libe57 does not
     try:
         file = library.ImageFile(str(path), "w")
         try:
-            _fill(library, file, cloud, tell)
+            _write_scan(library, file, cloud, progress)
             file.close()
         finally:
             if file.isOpen():
-                file.cancel()  # to leave the half of it
+                file.cancel()  # leaves the incomplete file
     except library.E57Exception as error:
         what = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(f"cannot be written: {what}", where=str(path)) from error
 
 
-def _fill(library: Any, file: Any, cloud: Cloud, tell: Callable[[float], None] | None) -> None:
+def _write_scan(
+    library: Any, file: Any, cloud: Cloud, progress: Callable[[float], None] | None
+) -> None:
     root = file.root()
     file.extensionsAdd("", library.E57_V1_0_URI)
     root.set("formatName", library.StringNode(file, "ASTM E57 3D Imaging Data File"))
@@ -65,46 +67,46 @@ def _fill(library: Any, file: Any, cloud: Cloud, tell: Callable[[float], None] |
     scan = library.StructureNode(file)
     scans.append(scan)
     scan.set("name", library.StringNode(file, "points in the map frame"))
-    text = "intensity is the probability that the point is of something static"
+    text = "intensity is the probability that the point is static"
     scan.set("description", library.StringNode(file, f"stillmap: {text}"))
     limits = {"intensityMinimum": 0.0, "intensityMaximum": 1.0}
-    scan.set("intensityLimits", _numbers(library, file, limits))
+    scan.set("intensityLimits", _float_nodes(library, file, limits))
     if cloud.has_colors:
-        scan.set("colorLimits", _colour_limits(library, file))
+        scan.set("colorLimits", _color_limits(library, file))
     if cloud.start_ns is not None and cloud.start_ns >= GPS_EPOCH_S * 10**9:
         start = {"dateTimeValue": 1e-9 * cloud.start_ns - GPS_EPOCH_S}
-        scan.set("acquisitionStart", _numbers(library, file, start))
+        scan.set("acquisitionStart", _float_nodes(library, file, start))
     codecs, columns = library.VectorNode(file, True), _Columns(library, file, cloud)
     points = library.CompressedVectorNode(file, columns.prototype, codecs)
     scan.set("points", points)
     with closing(points.writer(columns.buffers)) as writer:
-        for block in cloud.iter_blocks(tell):
-            for n in columns.filled(block):
+        for block in cloud.iter_blocks(progress):
+            for n in columns.fill(block):
                 writer.write(n)
-    scan.set("cartesianBounds", _numbers(library, file, columns.bounds()))
-    # made of the points: those of a random one would make other bytes of the same result
+    scan.set("cartesianBounds", _float_nodes(library, file, columns.bounds()))
+    # derived from the points, so that the file is reproducible
     for node, name in ((root, "file"), (scan, "scan")):
         guid = uuid.uuid5(uuid.NAMESPACE_URL, f"{name} {columns.digest.hexdigest()}")
         node.set("guid", library.StringNode(file, f"{{{guid}}}"))
 
 
-def _numbers(library: Any, file: Any, values: dict[str, float]) -> Any:
+def _float_nodes(library: Any, file: Any, values: dict[str, float]) -> Any:
     node = library.StructureNode(file)
     for name, value in values.items():
         node.set(name, library.FloatNode(file, float(value)))
     return node
 
 
-def _colour_limits(library: Any, file: Any) -> Any:
+def _color_limits(library: Any, file: Any) -> Any:
     node = library.StructureNode(file)
-    for name in _COLOURS:
+    for name in _COLORS:
         node.set(f"{name}Minimum", library.IntegerNode(file, 0, 0, 255))
         node.set(f"{name}Maximum", library.IntegerNode(file, 255, 0, 255))
     return node
 
 
 class _Columns:
-    """What libe57 takes the points from, as many as are written together."""
+    """The buffers from which libe57 writes the points."""
 
     def __init__(self, library: Any, file: Any, cloud: Cloud) -> None:
         self._origin = cloud.origin
@@ -112,12 +114,14 @@ class _Columns:
         self.digest = hashlib.sha256()
         self.prototype = library.StructureNode(file)
         nodes = {
-            name: library.ScaledIntegerNode(file, 0, -_LARGEST, _LARGEST, _SCALE, float(middle))
-            for name, middle in zip(_AXES, cloud.origin, strict=True)
+            name: library.ScaledIntegerNode(
+                file, 0, -_MAX_INTEGER, _MAX_INTEGER, _SCALE, float(center)
+            )
+            for name, center in zip(_AXES, cloud.origin, strict=True)
         }
         nodes["intensity"] = library.FloatNode(file, 0.0, library.E57_SINGLE, 0.0, 1.0)
         if cloud.has_colors:
-            nodes |= {name: library.IntegerNode(file, 0, 0, 255) for name in _COLOURS}
+            nodes |= {name: library.IntegerNode(file, 0, 0, 255) for name in _COLORS}
         self._values: dict[str, NDArray[np.float64]] = {}
         self.buffers = library.VectorSourceDestBuffer()
         for name, node in nodes.items():
@@ -127,28 +131,30 @@ class _Columns:
                 library.SourceDestBuffer(file, name, self._values[name], _BLOCK, True, True)
             )
 
-    def filled(self, block: Block) -> Iterator[int]:
-        """Numbers of points, one after the other, that lie there now."""
+    def fill(self, block: Block) -> Iterator[int]:
+        """Fill the buffers with the points, block by block; yields the number of points in them."""
         for first in range(0, len(block.points), _BLOCK):
             part = slice(first, min(first + _BLOCK, len(block.points)))
             n, points = part.stop - part.start, block.points[part]
-            if np.abs(points - self._origin).max() >= _LARGEST * _SCALE:
-                raise InputError("cannot be written: a point lies farther off than E57 can say")
+            if np.abs(points - self._origin).max() >= _MAX_INTEGER * _SCALE:
+                raise InputError(
+                    "cannot be written: a point is beyond the range of E57 coordinates"
+                )
             self._low = np.minimum(self._low, points.min(axis=0))
             self._high = np.maximum(self._high, points.max(axis=0))
             for name, column in zip(_AXES, points.T, strict=True):
                 self._values[name][:n] = column
             self._values["intensity"][:n] = block.p_static[part]
             if block.colors is not None:
-                for name, column in zip(_COLOURS, block.colors[part].T, strict=True):
+                for name, column in zip(_COLORS, block.colors[part].T, strict=True):
                     self._values[name][:n] = column
             for column in self._values.values():
                 self.digest.update(column[:n].data)
             yield n
 
     def bounds(self) -> dict[str, float]:
-        """Of the points so far."""
+        """`cartesianBounds` of the points so far."""
         if not np.isfinite(self._low).all():
             return {}
-        ends = {"Minimum": self._low, "Maximum": self._high}
-        return {f"{axis}{end}": at[k] for k, axis in enumerate("xyz") for end, at in ends.items()}
+        limits = {"Minimum": self._low, "Maximum": self._high}
+        return {f"{axis}{end}": at[k] for k, axis in enumerate("xyz") for end, at in limits.items()}

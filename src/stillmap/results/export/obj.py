@@ -1,4 +1,4 @@
-"""The model in a result, as OBJ."""
+"""Export the mesh of a result as OBJ."""
 
 import io
 from contextlib import ExitStack
@@ -16,29 +16,29 @@ from stillmap.results.reader import require_model
 
 ENDING = ".obj"
 
-_MOST = 2 << 30  # bytes
+_MAX_BYTES = 2 << 30
 _PAGE = "page"
 
 
 def read_model(path: Path) -> TexturedMesh | Mesh:
-    """A model that stillmap wrote, z up.
+    """Read a `.glb` file written by stillmap; z is up.
 
     Raises:
         InputError: it is missing or damaged.
         MissingExtra: trimesh is not installed.
     """
     trimesh = import_extra("trimesh", path, group="mesh")
-    data = read_glb(path, _MOST)
+    data = read_glb(path, _MAX_BYTES)
     try:
         scene = trimesh.load_scene(io.BytesIO(data), file_type="glb", process=False)
-        return _model(scene)
+        return _mesh_from_scene(scene)
     except MemoryError:
         raise
-    except Exception as error:  # whatever trimesh, NumPy or Pillow say of what is no such file
+    except Exception as error:  # of trimesh, NumPy or Pillow, for a damaged file
         raise InputError(f"is damaged: {error!r}", where=str(path)) from error
 
 
-def _model(scene: Any) -> TexturedMesh | Mesh:
+def _mesh_from_scene(scene: Any) -> TexturedMesh | Mesh:
     vertices, faces, uv, page, count = [], [], [], [], 0
     pages: list[Image] = []
     for node in scene.graph.nodes_geometry:
@@ -47,10 +47,10 @@ def _model(scene: Any) -> TexturedMesh | Mesh:
         vertices.append(to_z_up(np.asarray(part.vertices, np.float64) @ T[:3, :3].T + T[:3, 3]))
         faces.append(np.asarray(part.faces, np.int32) + count)
         count += len(part.vertices)
-        painted = name.startswith(_PAGE)
-        uv.append(flip_v(part.visual.uv) if painted else np.zeros((len(part.vertices), 2)))
-        page.append(np.full(len(part.faces), len(pages) if painted else -1, np.int32))
-        if painted:
+        textured = name.startswith(_PAGE)
+        uv.append(flip_v(part.visual.uv) if textured else np.zeros((len(part.vertices), 2)))
+        page.append(np.full(len(part.faces), len(pages) if textured else -1, np.int32))
+        if textured:
             pages.append(np.asarray(part.visual.material.baseColorTexture.convert("RGB")))
     points, corners = np.concatenate(vertices), np.concatenate(faces)
     if not np.isfinite(points).all():
@@ -64,21 +64,21 @@ def _model(scene: Any) -> TexturedMesh | Mesh:
 
 
 def write_obj(folder: Path, output: Path, quality: int, overwrite: bool = False) -> tuple[int, int]:
-    """Writes the model in a result as `NAME.obj`, with `NAME.mtl` and `NAME_page0.jpg`, ... beside.
+    """Write the mesh as `NAME.obj`, with `NAME.mtl` and `NAME_page0.jpg`, ... beside it.
 
-    All of them are whole before the first appears, and the `.obj` is the last.
+    The files appear after all have been written, the `.obj` last.
 
     Args:
-        folder: what `stillmap map` wrote.
+        folder: a result folder.
         output: NAME.obj.
-        quality: of the pages as JPEG; 0: PNG.
-        overwrite: replace what is there.
+        quality: JPEG quality of the pages; 0: PNG.
+        overwrite: replace existing files.
 
     Returns:
-        How many faces and pages there are.
+        Number of faces and of pages.
 
     Raises:
-        InputError: there is no model, or a file is in the way or cannot be written.
+        InputError: there is no mesh, a file exists already or cannot be written.
         MissingExtra: trimesh is not installed.
     """
     require_new_file(output, overwrite)
@@ -87,7 +87,7 @@ def write_obj(folder: Path, output: Path, quality: int, overwrite: bool = False)
     named = {output.with_name(name): data for name, data in files.items()}
     for one in named:
         require_new_file(one, overwrite)
-    with ExitStack() as all_of_them:  # what is entered first appears last
+    with ExitStack() as stack:  # files appear in reverse order
         for one, data in named.items():
-            all_of_them.enter_context(atomic_file(one)).write_bytes(data)
+            stack.enter_context(atomic_file(one)).write_bytes(data)
     return len(model), len(model.pages) if isinstance(model, TexturedMesh) else 0

@@ -1,4 +1,4 @@
-"""Every beam of a result as a row of a Parquet table."""
+"""Export all beams of a result as a Parquet table."""
 
 import importlib
 from collections.abc import Iterator
@@ -13,14 +13,14 @@ from stillmap.core.files import atomic_file
 from stillmap.core.recording import Recording
 from stillmap.results.reader import Exported
 
-_ROWS = 1 << 20  # of a row group, about
+_ROW_GROUP = 1 << 20  # rows, approximately
 
 
 def require_pyarrow() -> Any:
-    """The library that writes such tables.
+    """Import pyarrow.parquet.
 
     Raises:
-        InputError: it is not there.
+        InputError: pyarrow is not installed.
     """
     try:
         return importlib.import_module("pyarrow.parquet")
@@ -29,20 +29,20 @@ def require_pyarrow() -> Any:
         raise InputError("Parquet needs the package pyarrow", hint=hint) from error
 
 
-def write(result: Exported, seen: Recording, path: Path) -> None:
-    """Write a row per beam, in the recording's order.
+def write(result: Exported, deskewed: Recording, path: Path) -> None:
+    """Write a row per beam, in the order of the recording.
 
-    Columns: `scan` (int32, from 0), `stamp_ns` (int64), `beam` (int32, its number in the scan),
-    `x`, `y` (float32, metres in the map frame, where it ended), `range` (float32, metres), `hit`
-    (bool), `p_static` (float32). NaN where a beam is unusable.
+    Columns: `scan` (int32, from 0), `stamp_ns` (int64), `beam` (int32, index in the scan), `x`, `y`
+    (float32, end point in m in the map frame), `range` (float32, m), `hit` (bool), `p_static`
+    (float32). Unusable beams are NaN.
 
     Args:
         result: labels and poses.
-        seen: its recording without the motion during scans.
-        path: the file; it appears whole or not at all.
+        deskewed: its recording without the motion during scans.
+        path: the file, written atomically.
 
     Raises:
-        InputError: pyarrow is not there, or the file cannot be written.
+        InputError: pyarrow is not installed, or the file cannot be written.
     """
     parquet = require_pyarrow()
     arrow = importlib.import_module("pyarrow")
@@ -61,28 +61,31 @@ def write(result: Exported, seen: Recording, path: Path) -> None:
         atomic_file(path) as work,
         parquet.ParquetWriter(str(work), schema, compression="zstd") as writer,
     ):
-        for scans in _blocks(result.recording):
-            columns = _columns(result, seen, scans)
+        for scans in _row_groups(result.recording):
+            columns = _columns(result, deskewed, scans)
             writer.write_table(arrow.table(columns, schema=schema), row_group_size=1 << 40)
 
 
-def _blocks(recording: Recording) -> Iterator[slice]:
-    """Scans that are written together: as many as a row group holds, one at least."""
+def _row_groups(recording: Recording) -> Iterator[slice]:
+    """Ranges of scans for the row groups, at least one scan each."""
     first, T = 0, recording.n_scans
     while first < T:
-        end = int(np.searchsorted(recording.offset, recording.offset[first] + _ROWS, "right")) - 1
+        end = (
+            int(np.searchsorted(recording.offset, recording.offset[first] + _ROW_GROUP, "right"))
+            - 1
+        )
         end = min(max(end, first + 1), T)
         yield slice(first, end)
         first = end
 
 
-def _columns(result: Exported, seen: Recording, scans: slice) -> dict[str, NDArray[Any]]:
+def _columns(result: Exported, deskewed: Recording, scans: slice) -> dict[str, NDArray[Any]]:
     recording = result.recording
     offset = recording.offset[scans.start : scans.stop + 1]
     beams = slice(int(offset[0]), int(offset[-1]))
     scan = np.repeat(np.arange(scans.start, scans.stop, dtype=np.int32), np.diff(offset))
     number = np.arange(beams.start, beams.stop)
-    ends = seen.end_points(number, result.poses).astype(np.float32)
+    ends = deskewed.end_points(number, result.poses).astype(np.float32)
     x, y = recording.points[beams].astype(np.float64).T
     return {
         "scan": scan,

@@ -1,4 +1,4 @@
-"""The points of a result in 3D, in the map frame, some at a time."""
+"""The points of a 3D result in the map frame, block by block."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -21,17 +21,17 @@ Part = Literal["static", "dynamic"]
 PARTS: tuple[Part, ...] = ("static", "dynamic")
 
 _FIELDS = ("x", "y", "z", "p_static")
-_COLOURS = ("red", "green", "blue")
+_COLORS = ("red", "green", "blue")
 
 
 class Block(NamedTuple):
-    """Some n points.
+    """n points.
 
     Attributes:
-        points: (n, 3) float64 metres in the map frame.
+        points: (n, 3) float64 m in the map frame.
         p_static: (n,) float32.
-        stamp_ns: (n,) int64, when each was taken; None where nobody knows.
-        colours: (n, 3) uint8; None where the cloud has none.
+        stamp_ns: (n,) int64; None where unknown.
+        colors: (n, 3) uint8; None for a cloud without colors.
     """
 
     points: NDArray[np.float64]
@@ -42,14 +42,14 @@ class Block(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """All points.
+    """A point cloud that is produced block by block.
 
     Attributes:
-        count: how many.
-        origin: (3,) whole metres that lie among them.
-        start_ns: none was taken before; None where nobody knows when.
-        blocks: makes them anew.
-        coloured: whether points have colours.
+        count: number of points.
+        origin: (3,) whole m near the points.
+        start_ns: lower bound of the stamps; None where unknown.
+        make_blocks: starts a new iteration.
+        has_colors: whether blocks have colors.
     """
 
     count: int
@@ -58,84 +58,84 @@ class Cloud:
     make_blocks: Callable[[], Iterator[Block]]
     has_colors: bool = False
 
-    def iter_blocks(self, tell: Callable[[float], None] | None) -> Iterator[Block]:
-        """The blocks; `tell` hears which share of the points was taken."""
+    def iter_blocks(self, progress: Callable[[float], None] | None) -> Iterator[Block]:
+        """The blocks; `progress` is called with the share of the points that is done."""
         done = 0
         for block in self.make_blocks():
             yield block
             done += len(block.points)
-            if tell is not None:
-                tell(done / max(self.count, 1))
+            if progress is not None:
+                progress(done / max(self.count, 1))
 
 
 def cloud_from_recording(
     recording: Recording,
-    seen: Recording,
+    deskewed: Recording,
     poses: NDArray[np.float64],
     p_static: NDArray[np.float32],
     only: Part | None = None,
-    colours: NDArray[np.uint8] | None = None,
+    colors: NDArray[np.uint8] | None = None,
 ) -> Cloud:
-    """Every hit, in the recording's order; memory is that of some scans.
+    """All returns, in the order of the recording; memory is that of a few scans.
 
     Args:
         recording: 3D, T scans with M beams, T >= 1.
-        seen: the same without the motion during its scans.
+        deskewed: the same without the motion during its scans.
         poses: (T, 4, 4) T_map_base.
         p_static: (M,) P(c = 1).
-        only: the points on one side of one half alone.
-        colours: (M, 3); None: without.
+        only: static or dynamic points; None: both.
+        colors: (M, 3); None: without.
     """
     times = recording.beam_time
     earliest = 0.0
     for block in () if times is None else arrays.iter_blocks(times):
         earliest = min(earliest, float(times[block].min()) if times is not None else 0.0)
-    T_map_sensor = seen.T_map_sensor(poses)
+    T_map_sensor = deskewed.T_map_sensor(poses)
 
-    def made() -> Iterator[Block]:
-        beside = [one for one in (p_static, times, colours) if one is not None]
-        for chunk in iter_chunks(seen, release=beside):
-            hits = _wanted(seen.hit[chunk.beams], p_static[chunk.beams], only)
-            points = _placed(seen, chunk, hits, T_map_sensor)
+    def make_blocks() -> Iterator[Block]:
+        mapped = [one for one in (p_static, times, colors) if one is not None]
+        for chunk in iter_chunks(deskewed, release=mapped):
+            hits = _select(deskewed.hit[chunk.beams], p_static[chunk.beams], only)
+            points = _to_map_frame(deskewed, chunk, hits, T_map_sensor)
             stamp_ns = beam_stamps_ns(recording, chunk.scans)[hits]
-            its = None if colours is None else np.asarray(colours[chunk.beams][hits])
-            yield Block(points, np.asarray(p_static[chunk.beams][hits]), stamp_ns, its)
+            selected = None if colors is None else np.asarray(colors[chunk.beams][hits])
+            yield Block(points, np.asarray(p_static[chunk.beams][hits]), stamp_ns, selected)
 
     return Cloud(
         count=sum(
-            int(np.count_nonzero(_wanted(seen.hit[block], p_static[block], only)))
-            for block in arrays.iter_blocks(seen.hit, p_static)
+            int(np.count_nonzero(_select(deskewed.hit[block], p_static[block], only)))
+            for block in arrays.iter_blocks(deskewed.hit, p_static)
         ),
         origin=np.round(poses[0, :3, 3]),
         start_ns=int(recording.stamp_ns[0]) + int(np.floor(1e9 * earliest)),
-        make_blocks=made,
-        has_colors=colours is not None,
+        make_blocks=make_blocks,
+        has_colors=colors is not None,
     )
 
 
 def cloud_from_folder(folder: Path, only: Part | None = None) -> Cloud:
-    """The points of `static.ply` and `dynamic.ply`: nobody knows any more when each was taken.
+    """The points of `static.ply` and `dynamic.ply`, without times.
 
     Raises:
         InputError: one of them is missing or damaged.
     """
     layouts = [ply.read_layout(folder / f"{part}.ply") for part in PARTS if only in (part, None)]
-    coloured = all(set(_COLOURS) <= {one.name for one in layout.fields} for layout in layouts)
-    wanted = (*_FIELDS, *(_COLOURS if coloured else ()))
+    has_colors = all(set(_COLORS) <= {one.name for one in layout.fields} for layout in layouts)
+    wanted = (*_FIELDS, *(_COLORS if has_colors else ()))
 
-    def made() -> Iterator[Block]:
+    def make_blocks() -> Iterator[Block]:
         for layout in layouts:
             for values in read_columns(layout, wanted):
                 points = np.stack(values[:3], axis=1).astype(np.float64)
                 if not np.isfinite(points).all():
                     raise InputError("holds a point that is not finite", where=str(layout.path))
-                colours = np.stack(values[4:], axis=1).astype(np.uint8) if coloured else None
-                yield Block(points, values[3].astype(np.float32), None, colours)
+                colors = np.stack(values[4:], axis=1).astype(np.uint8) if has_colors else None
+                yield Block(points, values[3].astype(np.float32), None, colors)
 
-    return Cloud(sum(layout.rows for layout in layouts), np.zeros(3), None, made, coloured)
+    return Cloud(sum(layout.rows for layout in layouts), np.zeros(3), None, make_blocks, has_colors)
 
 
-def _wanted(
+def _select(
     hit: NDArray[np.bool_], p_static: NDArray[np.float32], only: Part | None
 ) -> NDArray[np.bool_]:
     if only is None:
@@ -144,15 +144,18 @@ def _wanted(
     return np.asarray(hit & (dynamic if only == "dynamic" else ~dynamic))
 
 
-def _placed(
-    seen: Recording, chunk: Chunk, chosen: NDArray[np.bool_], T_map_sensor: NDArray[np.float64]
+def _to_map_frame(
+    deskewed: Recording,
+    chunk: Chunk,
+    selected: NDArray[np.bool_],
+    T_map_sensor: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """(n, 3) metres in the map frame: the chosen of a chunk's beams."""
-    out = np.empty((int(np.count_nonzero(chosen)), 3))
-    taken, points = 0, seen.points[chunk.beams]
+    """Selected end points of a chunk, (n, 3) m in the map frame."""
+    out = np.empty((int(np.count_nonzero(selected)), 3))
+    done, points = 0, deskewed.points[chunk.beams]
     for n, t in enumerate(range(chunk.scans.start, chunk.scans.stop)):
         beams, T = slice(int(chunk.offset[n]), int(chunk.offset[n + 1])), T_map_sensor[t]
-        its = points[beams][chosen[beams]].astype(np.float64)
-        out[taken : taken + len(its)] = its @ T[:3, :3].T + T[:3, 3]
-        taken += len(its)
+        ends = points[beams][selected[beams]].astype(np.float64)
+        out[done : done + len(ends)] = ends @ T[:3, :3].T + T[:3, 3]
+        done += len(ends)
     return out

@@ -1,5 +1,4 @@
-"""The points of a result as one file: PLY, PCD, LAS, LAZ, E57 or text, with `p_static` at each,
-and where there are colours with those."""
+"""Write a point cloud with `p_static` and colors as PLY, PCD, LAS, LAZ, E57 or text."""
 
 from collections.abc import Callable
 from datetime import date
@@ -16,36 +15,36 @@ from stillmap.results.export import e57
 from stillmap.results.export.point_cloud import Block, Cloud
 from stillmap.results.points import COLOURS, FIELDS, ply_header, put_colours
 
-Tell = Callable[[float], None]
+Progress = Callable[[float], None]
 
 _SCALE = 0.0001  # m, of coordinates in LAS
-_POINTS, _COLOURED = 6, 7  # the LAS formats of points that have a time, and a colour too
-_FULL = 256  # LAS's colours are 16 bit: so many times those of pictures
-_PACKED = [("rgb", "<u4")]  # 0x00RRGGBB, which PCL and others expect to be called a float
-_LARGEST = 2**31 - 1  # LAS's coordinates are 32 bit
-_LINES = 1 << 14  # of text, made together
+_POINT_FORMAT, _COLOR_POINT_FORMAT = 6, 7  # of LAS: with time, and with color too
+_COLOR_SCALE = 256  # LAS has 16-bit colors
+_PACKED = [("rgb", "<u4")]  # 0x00RRGGBB; by convention of PCL its type is F, float
+_MAX_INTEGER = 2**31 - 1  # of a coordinate in LAS
+_LINES = 1 << 14  # of text formatted at a time
 
 
 class Format(NamedTuple):
-    """A form of clouds.
+    """A file format of point clouds.
 
     Attributes:
-        name: what it is called on the command line.
-        about: for people.
-        endings: of names of such files, in small letters.
-        needs: modules of stillmap's extra `io` without which it cannot be written.
-        write: writes points to a path, telling which share of them is written.
+        name: on the command line.
+        description: for messages.
+        endings: of file names, lower case.
+        requires: modules of the extra `io` that writing needs.
+        write: writes a cloud to a path; arguments: compressed (LAZ), progress.
     """
 
     name: str
     description: str
     endings: tuple[str, ...]
     requires: tuple[str, ...]
-    write: Callable[[Cloud, Path, bool, Tell | None], None]
+    write: Callable[[Cloud, Path, bool, Progress | None], None]
 
 
 def format_for(path: Path, name: str | None = None) -> Format | None:
-    """The form that is named, else that of the path's ending; None: no cloud is wanted."""
+    """The format by name, else by the ending of the path; None if there is none."""
     ending = path.suffix.lower()
     for one in FORMATS:
         if one.name == name if name else ending in one.endings:
@@ -53,44 +52,44 @@ def format_for(path: Path, name: str | None = None) -> Format | None:
     return None
 
 
-def require_extras(form: Format, path: Path) -> None:
-    """Refuses what cannot be written here, before any work is done.
+def require_extras(file_format: Format, path: Path) -> None:
+    """Check that the libraries for a format are installed.
 
     Raises:
         InputError: a library is missing.
     """
-    packed = path.suffix.lower() == ".laz"
-    for module in (*form.requires, *(("lazrs",) if packed else ())):
+    compressed = path.suffix.lower() == ".laz"
+    for module in (*file_format.requires, *(("lazrs",) if compressed else ())):
         import_extra(module, path, "written")
 
 
-def write(cloud: Cloud, path: Path, form: Format, tell: Tell | None = None) -> None:
-    """Write the points; the file appears whole or not at all.
+def write(cloud: Cloud, path: Path, file_format: Format, progress: Progress | None = None) -> None:
+    """Write a cloud atomically.
 
     Args:
         cloud: the points.
-        path: where to.
-        form: one of `FORMATS`.
-        tell: hears which share of them is written.
+        path: the file.
+        file_format: one of `FORMATS`.
+        progress: called with the share of the points that is written.
 
     Raises:
         InputError: a library is missing, the file cannot be written or cannot hold the points.
     """
-    require_extras(form, path)
+    require_extras(file_format, path)
     with atomic_file(path) as work:
         try:
-            form.write(cloud, work, path.suffix.lower() == ".laz", tell)
+            file_format.write(cloud, work, path.suffix.lower() == ".laz", progress)
         except InputError as error:
             where = str(path) if error.where in ("", str(work)) else error.where
             raise InputError(error.what, where=where, hint=error.hint) from error
 
 
-def _write_ply(cloud: Cloud, path: Path, _: bool, tell: Tell | None) -> None:
+def _write_ply(cloud: Cloud, path: Path, _: bool, progress: Progress | None) -> None:
     fields = FIELDS + COLOURS if cloud.has_colors else FIELDS
-    _write_records(cloud, path, ply_header(fields, cloud.count), fields, tell)
+    _write_records(cloud, path, ply_header(fields, cloud.count), fields, progress)
 
 
-def _write_pcd(cloud: Cloud, path: Path, _: bool, tell: Tell | None) -> None:
+def _write_pcd(cloud: Cloud, path: Path, _: bool, progress: Progress | None) -> None:
     fields = FIELDS + _PACKED if cloud.has_colors else FIELDS
     names = [name for name, _ in fields]
     lines = (
@@ -107,15 +106,19 @@ def _write_pcd(cloud: Cloud, path: Path, _: bool, tell: Tell | None) -> None:
         "DATA binary",
     )
     header = "".join(f"{line}\n" for line in lines).encode()
-    _write_records(cloud, path, header, fields, tell)
+    _write_records(cloud, path, header, fields, progress)
 
 
 def _write_records(
-    cloud: Cloud, path: Path, header: bytes, fields: list[tuple[str, str]], tell: Tell | None
+    cloud: Cloud,
+    path: Path,
+    header: bytes,
+    fields: list[tuple[str, str]],
+    progress: Progress | None,
 ) -> None:
     with path.open("wb") as file:
         file.write(header)
-        for block in cloud.iter_blocks(tell):
+        for block in cloud.iter_blocks(progress):
             file.write(_records(block, fields).tobytes())
 
 
@@ -131,12 +134,12 @@ def _records(block: Block, fields: list[tuple[str, str]]) -> NDArray[np.void]:
     return out
 
 
-def _write_text(cloud: Cloud, path: Path, _: bool, tell: Tell | None) -> None:
+def _write_text(cloud: Cloud, path: Path, _: bool, progress: Progress | None) -> None:
     names = [name for name, _ in (FIELDS + COLOURS if cloud.has_colors else FIELDS)]
     line = "%.4f %.4f %.4f %.9g" + (" %d %d %d" if cloud.has_colors else "") + "\n"
     with path.open("w", encoding="ascii", newline="\n") as file:
         file.write(" ".join(names) + "\n")
-        for block in cloud.iter_blocks(tell):
+        for block in cloud.iter_blocks(progress):
             for first in range(0, len(block.points), _LINES):
                 part = slice(first, first + _LINES)
                 values: list[NDArray[Any]] = [
@@ -149,37 +152,37 @@ def _write_text(cloud: Cloud, path: Path, _: bool, tell: Tell | None) -> None:
                 file.write(line * len(rows) % tuple(rows.ravel().tolist()))
 
 
-def _write_las(cloud: Cloud, path: Path, packed: bool, tell: Tell | None) -> None:
+def _write_las(cloud: Cloud, path: Path, compressed: bool, progress: Progress | None) -> None:
     laspy = import_extra("laspy", path, "written")
-    kind = _COLOURED if cloud.has_colors else _POINTS
-    head = laspy.LasHeader(point_format=kind, version="1.4")
-    head.scales, head.offsets = np.full(3, _SCALE), cloud.origin
-    head.add_extra_dim(laspy.ExtraBytesParams("p_static", "float32", "probability to be static"))
-    head.global_encoding.wkt = True  # as LAS 1.4 wants it, also where no place on earth is known
-    head.generating_software = "stillmap"
-    # the day of writing would make other bytes of the same result
-    head.creation_date = date(1970, 1, 1)
-    with open_las_writer(path, laspy, head, packed) as writer:
-        for block in cloud.iter_blocks(tell):
-            writer.write_points(_las_points(laspy, head, block))
+    kind = _COLOR_POINT_FORMAT if cloud.has_colors else _POINT_FORMAT
+    header = laspy.LasHeader(point_format=kind, version="1.4")
+    header.scales, header.offsets = np.full(3, _SCALE), cloud.origin
+    header.add_extra_dim(laspy.ExtraBytesParams("p_static", "float32", "probability to be static"))
+    header.global_encoding.wkt = True  # required by LAS 1.4, even without a coordinate system
+    header.generating_software = "stillmap"
+    # a fixed date, so that the file is reproducible
+    header.creation_date = date(1970, 1, 1)
+    with open_las_writer(path, laspy, header, compressed) as writer:
+        for block in cloud.iter_blocks(progress):
+            writer.write_points(_las_points(laspy, header, block))
 
 
-def _las_points(laspy: Any, head: Any, block: Block) -> Any:
-    if np.abs(block.points - head.offsets).max(initial=0.0) >= _LARGEST * _SCALE:
-        raise InputError("cannot be written: a point lies farther off than LAS can say")
-    out = laspy.ScaleAwarePointRecord.zeros(len(block.points), header=head)
+def _las_points(laspy: Any, header: Any, block: Block) -> Any:
+    if np.abs(block.points - header.offsets).max(initial=0.0) >= _MAX_INTEGER * _SCALE:
+        raise InputError("cannot be written: a point is beyond the range of LAS coordinates")
+    out = laspy.ScaleAwarePointRecord.zeros(len(block.points), header=header)
     out.x, out.y, out.z = block.points.T
     out.return_number = out.number_of_returns = np.ones(len(block.points), np.uint8)
     out["p_static"] = block.p_static
     if block.stamp_ns is not None:
         out.gps_time = 1e-9 * block.stamp_ns
     if block.colors is not None:
-        out.red, out.green, out.blue = block.colors.T.astype(np.uint16) * np.uint16(_FULL)
+        out.red, out.green, out.blue = block.colors.T.astype(np.uint16) * np.uint16(_COLOR_SCALE)
     return out
 
 
-def _write_e57(cloud: Cloud, path: Path, _: bool, tell: Tell | None) -> None:
-    e57.write(cloud, path, tell)
+def _write_e57(cloud: Cloud, path: Path, _: bool, progress: Progress | None) -> None:
+    e57.write(cloud, path, progress)
 
 
 FORMATS = (
