@@ -96,7 +96,7 @@ def by_several(sources: MeshInputs, lidars: int, seconds: float = 0.09) -> MeshI
     )
     recording = dataclasses.replace(seen, beam_time=np.tile(np.concatenate(times), T).astype("f4"))
     poses = np.repeat(sources.poses, lidars, axis=0)
-    return dataclasses.replace(sources, recording=recording, seen=seen, poses=poses)
+    return dataclasses.replace(sources, recording=recording, deskewed=seen, poses=poses)
 
 
 def _to_box(looking: Float, middle: Float, half: Float) -> Float:

@@ -18,7 +18,7 @@ def _wholes(pairs: PairCounts, n: int, may: list[bool] | None = None) -> list[li
 
 
 def test_pairs_are_counted_as_in_a_square_of_all(monkeypatch) -> None:
-    monkeypatch.setattr(merging, "_AT_ONCE", 3)
+    monkeypatch.setattr(merging, "_SCANS_PER_BLOCK", 3)
     rng = np.random.default_rng(0)
     for _ in range(50):
         n, scans = int(rng.integers(1, 12)), []
@@ -44,7 +44,7 @@ def test_what_always_hangs_together_is_one_however_long_the_chain() -> None:
 def test_a_link_between_two_that_are_seen_apart_joins_the_one_it_is_nearer_to() -> None:
     pairs = _pairs((0, 1, 0, 100), (0, 2, 30, 40), (1, 2, 20, 40))
     assert _wholes(pairs, 3) == [[0, 2], [1]]
-    assert _wholes(pairs._replace(met=np.array([0, 20, 30])), 3) == [[0], [1, 2]]
+    assert _wholes(pairs._replace(connected=np.array([0, 20, 30])), 3) == [[0], [1, 2]]
 
 
 def test_wholes_are_weighed_against_each_other() -> None:

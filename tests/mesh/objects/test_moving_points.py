@@ -54,7 +54,7 @@ def board_seen(*others: TrackedBox) -> TrackedReturns:
     )
     sources = SimpleNamespace(
         recording=recording,
-        seen=recording,
+        deskewed=recording,
         poses=np.tile(np.eye(4), (2, 1, 1)),
         p_static=np.full(2 * n, 0.1, np.float32),
         objects=[SimpleNamespace(id=7, beams=np.arange(2 * n))],

@@ -99,7 +99,7 @@ def test_a_picture_that_cannot_be_read_leaves_grey():
     textured = bake_texture(mesh, view, views, read)
     assert len(textured.unread) == 2
     assert "2.png" in textured.unread[0]
-    assert "picture 4 is (3, 3) uint16" in textured.unread[1]
+    assert "image 4: expected 300 x 400 of 8 bits, got (3, 3) uint16" in textured.unread[1]
     np.testing.assert_array_equal(textured.view, np.where((view == 2) | (view == 4), -1, view))
     of_texel = textured.face_of_texel(0)
     lost = (of_texel >= 0) & (view[of_texel] == 2)

@@ -61,7 +61,7 @@ def test_a_thing_is_on_its_way_and_a_little_beyond() -> None:
     np.testing.assert_allclose(half_way.half_size, [0.2, 0.3, 0.9])
     (later,) = boxes_at([_walker()], 2.4)
     np.testing.assert_allclose(later.center, [1.0, 1.4, 1.1])
-    np.testing.assert_allclose(later.ahead, [0.0, 1.0])
+    np.testing.assert_allclose(later.heading, [0.0, 1.0])
     (before,) = boxes_at([_walker()], -0.3)
     np.testing.assert_allclose(before.center, [-0.3, 0.0, 0.9])
     assert boxes_at([_walker()], 2.6) == []
@@ -97,7 +97,7 @@ def test_what_lies_behind_a_box_or_within_it() -> None:
     expected = [_meets_by_sampling(start, end, box.half_size) for end in ends]
     assert 20 < np.sum(expected) < 380
     assert np.mean(found != expected) <= 0.005  # grazed edges
-    other = box._replace(middle=np.array([2.0, 1.5, 1.0]))
+    other = box._replace(center=np.array([2.0, 1.5, 1.0]))
     both = is_in_or_behind_box([box, other], place, points)
     np.testing.assert_array_equal(both, found | is_in_or_behind_box([other], place, points))
     assert not is_in_or_behind_box([], place, points).any()
