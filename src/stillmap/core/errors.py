@@ -1,7 +1,4 @@
-"""The one exception that stands for bad input or a bad call.
-
-Libraries that only some formats and models need.
-"""
+"""InputError, the one exception for invalid input or calls, and import of optional libraries."""
 
 import re
 from collections.abc import Iterable
@@ -10,47 +7,45 @@ from typing import Any
 
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f]")
 
-_LONGEST = 1000  # letters of a line: what a damaged file holds is no reading matter
+_MAX_LENGTH = 1000  # characters of a message: damaged files may hold long words
 
 
 class InputError(Exception):
-    """Input or call at fault: says what is wrong, where, and what to do.
-
-    The command line prints it as one line and exits with status 2.
+    """Invalid input or call; the command line prints it as one line and exits with status 2.
 
     Args:
-        what: what is wrong.
-        where: file and position (`log.clf:17`), empty when there is none.
-        hint: what the user can do about it, empty when there is nothing to add.
+        what: the fault.
+        where: file and position (`log.clf:17`), or empty.
+        hint: a remedy, or empty.
     """
 
     def __init__(self, what: str, *, where: str = "", hint: str = "") -> None:
-        self.what = _short(what)
+        self.what = _truncate(what)
         self.where = where
-        self.hint = _short(hint)
+        self.hint = _truncate(hint)
         super().__init__(str(self))
 
     def __str__(self) -> str:
         place = f"{self.where}: " if self.where else ""
         advice = f" ({self.hint})" if self.hint else ""
         line = f"{place}{self.what}{advice}".replace("\n", " ")
-        # names in files and of files may hold what a terminal obeys
+        # names may hold control characters of terminals
         return _CONTROL.sub(lambda found: f"\\x{ord(found[0]):02x}", line)
 
 
-def _short(text: str) -> str:
-    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
+def _truncate(text: str) -> str:
+    return text if len(text) <= _MAX_LENGTH else f"{text[: _MAX_LENGTH - 3]}..."
 
 
 def closest_match(word: str, known: Iterable[str], min_similarity: float = 0.6) -> str | None:
-    """The known word most like `word`, for hints; None where none is like it.
+    """The known word most similar to `word`, for hints; None where none is similar.
 
     Args:
-        word: what was written.
-        known: what could have been meant.
-        least: how much alike they have to be, 0 (anything is) to 1 (the same).
+        word: the word given.
+        known: the valid words.
+        min_similarity: 0 (any) to 1 (equal).
     """
-    from difflib import get_close_matches  # only where something went wrong
+    from difflib import get_close_matches  # only for messages
 
     originals = {one.lower(): one for one in known}
     found = get_close_matches(word.lower(), originals, n=1, cutoff=min_similarity)
@@ -58,17 +53,17 @@ def closest_match(word: str, known: Iterable[str], min_similarity: float = 0.6) 
 
 
 class MissingExtra(InputError):
-    """A library is not there: no file at fault, and none that could be skipped for it."""
+    """An optional library is not installed: no file is at fault, none is to be skipped."""
 
 
 def import_extra(module: str, path: object, action: str = "read", *, group: str = "io") -> Any:
-    """A module that comes with one of stillmap's extras.
+    """Import a module of one of stillmap's optional dependencies.
 
     Args:
-        module: what to import.
-        path: what it is wanted for.
-        to_be: what is to be done with it.
-        group: the extra.
+        module: name of the module.
+        path: the file that needs it.
+        action: participle of the operation on the file, for the message.
+        group: name of the extra.
 
     Raises:
         MissingExtra: it is not installed.

@@ -1,7 +1,4 @@
-"""Outputs that appear complete or not at all.
-
-Text files of bounded size: a name may lead to a device that never ends, or to a pipe.
-"""
+"""Atomic output of files and folders; bounded reading of text files."""
 
 import os
 import shutil
@@ -14,15 +11,15 @@ from stillmap.core.errors import InputError
 
 
 def require_new(path: Path, marker: str, overwrite: bool = False) -> None:
-    """Refuse an output folder that already holds something, before any work is done.
+    """Refuse an output folder that is not empty.
 
     Args:
-        path: the folder to be.
-        mark: name, or pattern of names, of what every such folder holds. Others are not replaced.
-        overwrite: whether it may be replaced.
+        path: the output folder.
+        marker: glob of a file that every such folder holds; others are never overwritten.
+        overwrite: whether such a folder may be replaced.
 
     Raises:
-        InputError: `path` is a file, or a folder that is not empty and not to be replaced.
+        InputError: `path` is a file, or a folder that is not empty and may not be replaced.
     """
     if not path.exists() and not path.is_symlink():
         return
@@ -40,10 +37,10 @@ def require_new(path: Path, marker: str, overwrite: bool = False) -> None:
 
 
 def require_new_file(path: Path, overwrite: bool = False) -> None:
-    """Refuse an output file that is there already, before any work is done.
+    """Refuse an output file that exists already.
 
     Raises:
-        InputError: something is there that is not to be replaced, or there is no such folder.
+        InputError: the path exists and may not be replaced, or its folder does not exist.
     """
     if path.is_dir():
         raise InputError("is in the way: a folder", where=str(path))
@@ -61,15 +58,16 @@ def require_new_file(path: Path, overwrite: bool = False) -> None:
 def atomic_folder(
     path: Path, marker: str, overwrite: bool = False, *, staging_folder: Path | None = None
 ) -> Iterator[Path]:
-    """A temporary sibling folder that becomes `path` when the block ends without an exception.
+    """Context manager of a temporary folder that is renamed to `path` on success.
 
     Args:
-        path: the folder to be.
-        mark, overwrite: see `require_new`.
-        within: a folder on the same file system that the temporary one is put into instead.
+        path: the output folder.
+        marker, overwrite: see `require_new`.
+        staging_folder: parent of the temporary folder, on the same file system; None: that of
+            `path`.
 
     Raises:
-        InputError: `path` is taken or its parent cannot be written to.
+        InputError: `path` is taken, or its parent cannot be written.
     """
     path = Path(os.path.abspath(path))
     require_new(path, marker, overwrite)
@@ -95,7 +93,7 @@ def atomic_folder(
 
 @contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
-    """A temporary sibling file that becomes `path` when the block ends without an exception."""
+    """Context manager of a temporary file that is renamed to `path` on success."""
     path = Path(os.path.abspath(path))
     work, free = path.with_name(f".{path.name}.{os.getpid()}.part"), not path.exists()
     try:
@@ -106,7 +104,7 @@ def atomic_file(path: Path) -> Iterator[Path]:
     except OSError as error:
         raise InputError(f"cannot be written: {error.strerror}", where=str(path)) from error
     finally:
-        with suppress(OSError):  # where nothing can be written, nothing can be removed
+        with suppress(OSError):  # read-only file systems refuse this, too
             work.unlink()
 
 
@@ -114,15 +112,15 @@ def _move_into_place(work: Path, path: Path) -> None:
     if not path.exists():
         os.rename(work, path)
         return
-    # a folder that is not empty cannot be replaced in one step: the old one steps aside first
-    aside = work.with_suffix(".old")
-    os.rename(path, aside)
+    # rename(2) does not replace a folder that is not empty
+    old = work.with_suffix(".old")
+    os.rename(path, old)
     try:
         os.rename(work, path)
     except OSError:
-        os.rename(aside, path)
+        os.rename(old, path)
         raise
-    shutil.rmtree(aside, ignore_errors=True)
+    shutil.rmtree(old, ignore_errors=True)
 
 
 def _umask() -> int:
@@ -132,11 +130,11 @@ def _umask() -> int:
 
 
 def read_text(path: Path, max_bytes: int) -> str:
-    """The text of a file in UTF-8, of `largest` bytes at most.
+    """Read a UTF-8 file of at most `max_bytes` bytes.
 
     Raises:
         InputError: it cannot be read, or is larger.
-        UnicodeDecodeError: it is no such text.
+        UnicodeDecodeError: it is not UTF-8.
     """
     try:
         with path.open("rb") as file:
@@ -149,12 +147,12 @@ def read_text(path: Path, max_bytes: int) -> str:
 
 
 def require_regular(path: Path) -> None:
-    """Refuse pipes and devices that lie where a file should: reading may wait for ever.
+    """Refuse pipes and devices, on which reading may block for ever.
 
-    A folder, or what is not there at all, is left to who opens it.
+    Folders and missing paths pass: opening them fails.
 
     Raises:
-        InputError: there is something else than a file.
+        InputError: the path is a pipe, socket or device.
     """
     if path.exists() and not path.is_file() and not path.is_dir():
         raise InputError("is no regular file", where=str(path))

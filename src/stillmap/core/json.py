@@ -8,21 +8,21 @@ import numpy as np
 
 
 def version() -> str:
-    """The version of stillmap that runs."""
-    # the package is still being imported when this module is
+    """The version of the running package."""
+    # deferred: a circular import otherwise
     from stillmap import __version__
 
     return __version__
 
 
 def count_skipped(source: Mapping[str, Any]) -> int:
-    """How many records the reader left out; `skipped` is `{reason: {"count", "lines"}}`."""
+    """Count of skipped records; `skipped` is `{reason: {"count", "lines"}}`."""
     skipped: Mapping[str, Mapping[str, Any]] = source.get("skipped") or {}
     return sum(int(one["count"]) for one in skipped.values())
 
 
 def to_jsonable(value: Any) -> Any:
-    """`value` in JSON's own types: arrays as lists, paths as text, NaN and infinity as None."""
+    """Convert to types of JSON: arrays to lists, paths to text, NaN and infinity to None."""
     if isinstance(value, Mapping):
         return {str(key): to_jsonable(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):

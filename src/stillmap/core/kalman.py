@@ -1,4 +1,4 @@
-"""Kalman filters of many things that go on as they went: both axes alike, and all at once."""
+"""Constant-velocity Kalman filters in 2D, vectorized over K tracks; both axes share P."""
 
 from dataclasses import dataclass
 
@@ -10,12 +10,12 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class TrackStates:
-    """Where K things are, and how fast.
+    """States of K tracks.
 
     Attributes:
-        x: (K, 2) metres.
-        v: (K, 2) metres per second.
-        P: (K, 3) covariance on either axis: of place, of place with speed, of speed.
+        x: (K, 2) positions, m.
+        v: (K, 2) velocities, m/s.
+        P: (K, 3) covariance per axis: position, position-velocity, velocity.
     """
 
     x: Float
@@ -27,35 +27,35 @@ class TrackStates:
 
     @property
     def position_std(self) -> Float:
-        """(K,) standard deviation of the place on either axis, metres."""
+        """(K,) standard deviation of the position per axis, m."""
         return np.asarray(np.sqrt(self.P[:, 0]))
 
     def select(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> "TrackStates":
-        """Some of them."""
+        """The states of a subset of tracks."""
         return TrackStates(self.x[chosen], self.v[chosen], self.P[chosen])
 
 
 def initialize(x: Float, position_std: float, speed_std: float) -> TrackStates:
-    """Things at (K, 2) of which nothing is known but that; metres, and metres per second."""
+    """States at positions x (K, 2) with zero velocity; standard deviations in m and m/s."""
     return TrackStates(
         x, np.zeros_like(x), np.tile([position_std**2, 0.0, speed_std**2], (len(x), 1))
     )
 
 
 def concatenate(a: TrackStates, b: TrackStates) -> TrackStates:
-    """The things of both."""
+    """Concatenate two sets of tracks."""
     return TrackStates(*(np.concatenate([p, q]) for p, q in ((a.x, b.x), (a.v, b.v), (a.P, b.P))))
 
 
-def predict(motion: TrackStates, dt: float, acceleration: float) -> TrackStates:
-    """After so many seconds; back in time where they are negative.
+def predict(states: TrackStates, dt: float, acceleration: float) -> TrackStates:
+    """Predict the states after dt.
 
     Args:
-        motion: now.
-        dt: seconds.
-        acceleration: m2/s3, density of white acceleration.
+        states: current states.
+        dt: s; negative: backwards in time.
+        acceleration: spectral density of white acceleration noise, m2/s3.
     """
-    xx, xv, vv = motion.P.T
+    xx, xv, vv = states.P.T
     q, t = acceleration, abs(dt)
     P = np.stack(
         [
@@ -65,24 +65,24 @@ def predict(motion: TrackStates, dt: float, acceleration: float) -> TrackStates:
         ],
         axis=-1,
     )
-    return TrackStates(motion.x + motion.v * dt, motion.v, P)
+    return TrackStates(states.x + states.v * dt, states.v, P)
 
 
 def update(
-    motion: TrackStates, is_observed: NDArray[np.bool_], positions: Float, position_std: float
+    states: TrackStates, is_observed: NDArray[np.bool_], positions: Float, position_std: float
 ) -> TrackStates:
-    """After some things were seen.
+    """Update the states with position measurements.
 
     Args:
-        motion: as predicted.
-        seen: (K,) which.
-        at: (K, 2) where; not looked at where a thing was not seen.
-        sigma: metres, of that.
+        states: predicted states.
+        is_observed: (K,) mask of the tracks with a measurement.
+        positions: (K, 2) measured positions, m; ignored where not observed.
+        position_std: standard deviation of a measured position, m.
     """
-    xx, xv, vv = motion.P.T
+    xx, xv, vv = states.P.T
     innovation = np.where(is_observed, xx + position_std**2, np.inf)
     gain_x, gain_v = xx / innovation, xv / innovation
-    residual = np.where(is_observed[:, None], positions - motion.x, 0.0)
+    residual = np.where(is_observed[:, None], positions - states.x, 0.0)
     P = np.stack([xx * (1.0 - gain_x), xv * (1.0 - gain_x), vv - gain_v * xv], axis=-1)
-    x, v = motion.x + gain_x[:, None] * residual, motion.v + gain_v[:, None] * residual
+    x, v = states.x + gain_x[:, None] * residual, states.v + gain_v[:, None] * residual
     return TrackStates(x, v, P)

@@ -1,4 +1,4 @@
-"""How many threads to use, and work that they share. Results do not depend on it."""
+"""Thread counts and ordered parallel map; results do not depend on the number of threads."""
 
 import os
 from collections import deque
@@ -14,7 +14,7 @@ _Outcome = TypeVar("_Outcome")
 
 
 def resolve_threads(requested: int) -> int:
-    """`asked`, or the number of processors this process may use when that is 0."""
+    """`requested`, or for 0 the number of processors available to this process."""
     if requested > 0:
         return requested
     if hasattr(os, "sched_getaffinity"):
@@ -24,13 +24,12 @@ def resolve_threads(requested: int) -> int:
 
 @contextmanager
 def limit_blas_threads() -> Iterator[None]:
-    """Linear algebra by one thread meanwhile, in the whole process.
+    """Limit BLAS to one thread in the whole process.
 
-    Matrices are small here, and kernels have threads of their own. BLAS's wait for each other
-    busily: where other processes want the processors, that costs more than all the work. Sums no
-    longer depend on how many processors there are, either.
+    Matrices are small, kernels have threads of their own, and the busy waiting of BLAS threads
+    costs more than the work on a loaded machine. It also makes sums independent of the processors.
     """
-    import scipy.linalg  # noqa: F401  (SciPy has a BLAS of its own; takes long to load)
+    import scipy.linalg  # noqa: F401  (SciPy has a BLAS of its own; slow to load)
 
     with threadpool_limits(limits=1, user_api="blas"):
         yield
@@ -39,10 +38,10 @@ def limit_blas_threads() -> Iterator[None]:
 def map_ordered(
     work: Callable[[_Item], _Outcome], items: Iterable[_Item], threads: int
 ) -> Iterator[_Outcome]:
-    """`map` by several threads: what comes of the items, in their order.
+    """`map` over several threads, results in order of the items.
 
-    Each thread is one item ahead at most, so that little waits in memory. It pays where `work` is
-    long and most of it lets other threads run, as NumPy does on large arrays and kernels do.
+    Each thread is at most one item ahead, so that few results wait in memory. Worth it where `work`
+    is long and releases the GIL, as NumPy does on large arrays and kernels do.
     """
     if threads <= 1:
         yield from map(work, items)

@@ -16,15 +16,14 @@ def no_progress(stage: str, iteration: int, done: int, total: int) -> None:
 
 
 class StageTimer:
-    """Wall clock and CPU seconds per named stage, added up over calls; the peak memory when it
-    last ended."""
+    """Wall-clock and CPU time per stage, summed over calls, and peak memory after the last one."""
 
     def __init__(self) -> None:
         self._stages: dict[str, dict[str, Any]] = {}
 
     @contextmanager
     def measure(self, name: str) -> Iterator[None]:
-        """Adds the time of the block to stage `name`."""
+        """Add the time of the block to stage `name`."""
         started, cpu = time.perf_counter(), time.process_time()
         try:
             yield
@@ -35,7 +34,7 @@ class StageTimer:
             stage["peak_memory_bytes"] = peak_memory_bytes()
 
     def add(self, earlier: Mapping[str, Mapping[str, Any]]) -> None:
-        """Stages of a run that this one goes on from, as `to_dict` gave them."""
+        """Add the stages of the run that this one resumes, as `to_dict` returned them."""
         for name, one in earlier.items():
             stage = self._stages.setdefault(name, {"seconds": 0.0, "cpu_seconds": 0.0})
             stage["seconds"] += one["seconds"]
@@ -44,11 +43,11 @@ class StageTimer:
             stage["peak_memory_bytes"] = max(known, one["peak_memory_bytes"])
 
     def to_dict(self) -> dict[str, dict[str, Any]]:
-        """Stage to `seconds`, `cpu_seconds` and `peak_memory_bytes` (of the process, till then)."""
+        """`seconds`, `cpu_seconds` and `peak_memory_bytes` (of the process so far) by stage."""
         return {name: dict(stage) for name, stage in self._stages.items()}
 
 
 def peak_memory_bytes() -> int:
-    """Largest resident size of this process so far."""
+    """Peak resident memory of this process."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024

@@ -1,4 +1,4 @@
-"""The one data shape of a recording, 2D and 3D alike: flat arrays."""
+"""Recording: flat arrays of scans and beams, 2D and 3D alike."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
@@ -11,7 +11,7 @@ from numpy.typing import DTypeLike, NDArray
 from stillmap.core import arrays
 from stillmap.core.camera import Images
 
-_ENDS = 1 << 14  # beams that are asked for their ends together
+_BLOCK = 1 << 14  # end points transformed at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,21 +20,20 @@ class Recording:
 
     Attributes:
         stamp_ns: (T,) int64, the recording's own stamps in nanoseconds, non-decreasing.
-        offset: (T+1,) int64, scan t owns the beams offset[t]:offset[t+1].
+        offset: (T+1,) int64, scan t has the beams offset[t]:offset[t+1].
         points: (M, D) float32, end points in the sensor frame in metres. NaN marks an unusable
-            beam; a maximum-range beam (not hit, finite) ends where free space is known to end.
-        hit: (M,) bool, True where something reflected the beam: zeta = 0 of (1), and usable.
-        T_base_sensor: (S, D+1, D+1) float64, where each sensor sits on the robot.
-        sensor: (T,) int32, the sensor that took each scan.
-        T_odom_base: (T, D+1, D+1) float64, odometry at each scan; None where there is none.
-        beam_time: (M,) float32, seconds after its scan's stamp at which each beam was taken,
-            finite; None where the beams of a scan count as taken at once.
-        source: what the recording was read from and how, what was skipped: JSON-able.
-        T_recorded_base: (T, D+1, D+1) float64, poses that the recording itself states, of a survey
-            or another program; used only when asked for. None where there are none.
-        images: pictures taken meanwhile; None where there are none.
-        scratch: folder for what becomes known of each beam, where that is too large for memory;
-            None: the system's temporary folder.
+            beam; a maximum-range beam (not hit, finite) ends where known free space ends.
+        hit: (M,) bool, True for beams with a return: zeta = 0 in equation (1), and usable.
+        T_base_sensor: (S, D+1, D+1) float64, sensor poses on the robot.
+        sensor: (T,) int32, sensor index of each scan.
+        T_odom_base: (T, D+1, D+1) float64, odometry at each scan; None: no odometry.
+        beam_time: (M,) float32, seconds after the stamp of the scan, finite; None: all beams of a
+            scan have its stamp.
+        source: JSON-able notes of the reader: input, format, sensors, warnings, skipped records.
+        T_recorded_base: (T, D+1, D+1) float64, poses stored in the recording, of a survey or other
+            programs; used only on request. None: no poses.
+        images: camera images; None: no images.
+        scratch: folder of memory-mapped per-beam arrays; None: the system's temporary folder.
     """
 
     stamp_ns: NDArray[np.int64]
@@ -74,7 +73,7 @@ class Recording:
             or self.offset[-1] != M
             or np.any(self.offset[1:] < self.offset[:-1])
         ):
-            raise ValueError(f"offset: must rise from 0 to {M}")
+            raise ValueError(f"offset: must not decrease, from 0 to {M}")
         if T and (self.sensor.min() < 0 or self.sensor.max() >= S):
             raise ValueError(f"sensor: indices must lie in [0, {S})")
 
@@ -91,11 +90,11 @@ class Recording:
         return int(self.points.shape[-1])
 
     def beams_of(self, scan: int) -> slice:
-        """The beams of one scan, as a slice into `points`, `hit` and results per beam."""
+        """The beams of one scan as a slice of per-beam arrays."""
         return slice(int(self.offset[scan]), int(self.offset[scan + 1]))
 
     def allocate_per_beam(self, dtype: DTypeLike, row: tuple[int, ...] = ()) -> NDArray[Any]:
-        """A new array (M, *row), its content not defined; in a file where it is large.
+        """Allocate an uninitialized array (M, *row), memory-mapped where it is large.
 
         Raises:
             OSError: the disk is full.
@@ -103,34 +102,33 @@ class Recording:
         return arrays.empty((self.n_beams, *row), dtype, self.scratch)
 
     def release_pages(self, *more: NDArray[Any]) -> None:
-        """What lies in memory of the beams, and of other arrays, only because it was looked at."""
+        """Release the resident pages of the per-beam arrays, and of others."""
         for array in (self.points, self.hit, self.beam_time, *more):
             if array is not None:
                 arrays.release_pages(array)
 
     def iter_scans(self, scans: Iterable[int], *more: NDArray[Any]) -> Iterator[int]:
-        """The same numbers of scans; what was looked at of the beams, and of other arrays, leaves
-        memory on the way."""
+        """Yield the scan indices, releasing pages of per-beam and other arrays on the way."""
         rows = self.n_beams / max(self.n_scans, 1)
         return arrays.release_periodically(scans, lambda: self.release_pages(*more), rows)
 
     def T_map_sensor(self, T_map_base: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Sensor poses (T, D+1, D+1) that belong to robot poses (T, D+1, D+1)."""
+        """Sensor poses (T, D+1, D+1) of robot poses (T, D+1, D+1)."""
         return T_map_base @ self.T_base_sensor[self.sensor]
 
     def scans_of(self, beams: NDArray[np.intp]) -> NDArray[np.intp]:
-        """(n,) the scans that beams (n,) belong to."""
+        """(n,) scan indices of beams (n,)."""
         return np.searchsorted(self.offset, beams, side="right") - 1
 
     def end_points(
         self, beams: NDArray[np.intp], T_map_base: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """(n, D) where beams (n,), rising, ended: metres in the map frame, at robot poses
+        """(n, D) end points in the map frame (m) of ascending beams (n,), at robot poses
         (T, D+1, D+1)."""
         D, ends = self.dimension, np.empty((len(beams), self.dimension))
-        for part in arrays.split_by_block(beams, _ENDS):
+        for part in arrays.split_by_block(beams, _BLOCK):
             scan = self.scans_of(beams[part])
-            # beams may be few: only the scans that they are of
+            # few beams: only the poses of their scans
             T = T_map_base[scan] @ self.T_base_sensor[self.sensor[scan]]
             points = self.points[beams[part]].astype(np.float64)
             ends[part] = np.einsum("nij,nj->ni", T[:, :D, :D], points) + T[:, :D, D]
@@ -138,7 +136,7 @@ class Recording:
         return ends
 
     def without_odometry(self) -> "Recording":
-        """The same recording as if no odometry had been recorded."""
+        """The recording without odometry."""
         return replace(self, T_odom_base=None)
 
 

@@ -1,4 +1,4 @@
-"""Poses in the plane as homogeneous matrices, vectorised over leading axes."""
+"""SE(2): poses in the plane as homogeneous matrices, vectorized over leading axes."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -7,7 +7,7 @@ Float = NDArray[np.float64]
 
 
 def matrix(x: ArrayLike, y: ArrayLike, theta: ArrayLike) -> Float:
-    """(..., 3, 3) homogeneous matrices of poses x, y in metres and theta in radians."""
+    """(..., 3, 3) homogeneous matrices of x, y (m) and theta (rad)."""
     T = np.zeros((*np.broadcast(x, y, theta).shape, 3, 3))
     T[..., 0, 0] = T[..., 1, 1] = np.cos(theta)
     T[..., 1, 0] = np.sin(theta)
@@ -17,7 +17,7 @@ def matrix(x: ArrayLike, y: ArrayLike, theta: ArrayLike) -> Float:
 
 
 def parameters(T: Float) -> Float:
-    """(..., 3) poses x, y, theta of (..., 3, 3) matrices; theta in (-pi, pi]."""
+    """(..., 3) x, y, theta of matrices (..., 3, 3); theta in (-pi, pi]."""
     x = np.empty((*T.shape[:-2], 3))  # np.stack would take twice as long for a single pose
     x[..., :2] = T[..., :2, 2]
     x[..., 2] = np.arctan2(T[..., 1, 0], T[..., 0, 0])
@@ -25,7 +25,7 @@ def parameters(T: Float) -> Float:
 
 
 def normalize(T: Float) -> Float:
-    """(..., 3, 3) the same poses with exact rotations: chains of products drift away from them."""
+    """(..., 3, 3) poses with exact rotations; products accumulate rounding errors."""
     return matrix(*np.moveaxis(parameters(T), -1, 0))
 
 
@@ -40,17 +40,17 @@ def inverse(T: Float) -> Float:
 
 
 def log(T: Float) -> Float:
-    """(..., 3) twists x, y, theta whose exponentials are (..., 3, 3): even motion along an arc."""
+    """(..., 3) twists x, y, theta of transforms (..., 3, 3): constant motion along an arc."""
     x, y, theta = np.moveaxis(parameters(T), -1, 0)
     half = 0.5 * theta
     c, s = np.cos(half), np.sin(half)
-    # the chord points half the turn to the side and is shorter than the arc
+    # the chord is rotated by half the angle and shorter than the arc
     arc = 1.0 / sinc(half, s)
     return np.stack([arc * (c * x + s * y), arc * (c * y - s * x), theta], axis=-1)
 
 
 def exp(xi: Float) -> Float:
-    """(..., 3, 3) motions of twists (..., 3) x, y, theta: along an arc; the inverse of `log`."""
+    """(..., 3, 3) transforms of twists (..., 3) x, y, theta; the inverse of `log`."""
     x, y, theta = np.moveaxis(xi, -1, 0)
     half = 0.5 * theta
     c, s = np.cos(half), np.sin(half)
@@ -64,12 +64,12 @@ def sinc(angle: Float, sine: Float) -> Float:
 
 
 def wrap(angle: ArrayLike) -> Float:
-    """Angles mapped to [-pi, pi]; which end pi itself goes to is left to rounding."""
+    """Wrap angles to [-pi, pi]; odd multiples of pi go to either end."""
     return (np.asarray(angle, float) + np.pi) % (2 * np.pi) - np.pi
 
 
 def rotate_covariance(covariance: Float, T: Float) -> Float:
-    """Covariances (..., 3, 3) of x, y, heading along the axes that poses (..., 3, 3) turn into."""
+    """Rotate covariances (..., 3, 3) of x, y, theta by the rotations of poses (..., 3, 3)."""
     R = np.zeros(T.shape)
     R[..., :2, :2] = T[..., :2, :2]
     R[..., 2, 2] = 1.0
@@ -77,6 +77,6 @@ def rotate_covariance(covariance: Float, T: Float) -> Float:
 
 
 def project_to_plane(poses: Float) -> Float:
-    """(T, 3, 3) place and heading of poses (T, 4, 4) in space."""
+    """(T, 3, 3) position and yaw of 3D poses (T, 4, 4)."""
     yaw = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
     return matrix(poses[:, 0, 3], poses[:, 1, 3], yaw)

@@ -1,7 +1,6 @@
-"""Motions in space as homogeneous matrices, vectorised over leading axes.
+"""SE(3): poses in space as homogeneous matrices, vectorized over leading axes.
 
-A twist is (velocity, rate of turn) in the moving frame: T Exp(tau xi) is where steady motion leads
-within tau. `se2.inverse` holds in any dimension.
+A twist is (linear, angular velocity) in the moving frame. `se2.inverse` holds in any dimension.
 """
 
 import numpy as np
@@ -9,11 +8,11 @@ from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
 
-_SMALL = 1e-6  # radians, below which series are exact
+_SMALL = 1e-6  # rad, below which the series are exact
 
 
 def skew(v: Float) -> Float:
-    """(..., 3, 3) matrices whose products are the cross products of (..., 3) vectors."""
+    """(..., 3, 3) cross product matrices of vectors (..., 3)."""
     out = np.zeros((*v.shape, 3))
     out[..., 2, 1], out[..., 0, 2], out[..., 1, 0] = v[..., 0], v[..., 1], v[..., 2]
     out -= np.swapaxes(out, -1, -2).copy()
@@ -21,7 +20,7 @@ def skew(v: Float) -> Float:
 
 
 def exp(xi: Float) -> Float:
-    """(..., 4, 4) motions of twists (..., 6): Rodrigues' formula, and its integral."""
+    """(..., 4, 4) transforms of twists (..., 6): Rodrigues' formula and its integral."""
     v, w = xi[..., :3], xi[..., 3:]
     angle = np.linalg.norm(w, axis=-1)[..., None, None]
     near = angle < _SMALL
@@ -39,12 +38,12 @@ def exp(xi: Float) -> Float:
 
 
 def log(T: Float) -> Float:
-    """(..., 6) the twists of motions (..., 4, 4), turns below pi."""
+    """(..., 6) twists of transforms (..., 4, 4), rotations below pi."""
     w = log_rotation(T[..., :3, :3])
     angle = np.linalg.norm(w, axis=-1)[..., None, None]
     near = angle < 1e-4
     half = np.where(near, 0.5, 0.5 * angle)
-    # of the inverse of the integral of Rodrigues' formula
+    # coefficient of the inverse left Jacobian
     c = np.where(near, 1.0 / 12.0, (1.0 - half / np.tan(half)) / (4.0 * half**2))
     W = skew(w)
     V_inverse = np.eye(3) - 0.5 * W + c * (W @ W)
@@ -53,8 +52,8 @@ def log(T: Float) -> Float:
 
 
 def log_rotation(R: Float) -> Float:
-    """(..., 3) axes of rotations (..., 3, 3) times their angles."""
-    from scipy.spatial.transform import Rotation  # takes long to load
+    """(..., 3) rotation vectors of rotations (..., 3, 3)."""
+    from scipy.spatial.transform import Rotation  # slow to load
 
     flat = R.reshape(-1, 3, 3)
     if not len(flat):
@@ -64,7 +63,7 @@ def log_rotation(R: Float) -> Float:
 
 
 def adjoint(T: Float) -> Float:
-    """(..., 6, 6) Ad with T Exp(xi) = Exp(Ad xi) T."""
+    """(..., 6, 6) adjoint: T exp(xi) = exp(Ad xi) T."""
     R, t = T[..., :3, :3], T[..., :3, 3]
     out = np.zeros((*T.shape[:-2], 6, 6))
     out[..., :3, :3] = out[..., 3:, 3:] = R
@@ -73,7 +72,7 @@ def adjoint(T: Float) -> Float:
 
 
 def normalize(T: Float) -> Float:
-    """(..., 4, 4) the same poses with exact rotations: chains of products drift away from them."""
+    """(..., 4, 4) poses with exact rotations; products accumulate rounding errors."""
     out = T.copy()
     U, _, Vt = np.linalg.svd(T[..., :3, :3])
     out[..., :3, :3] = U @ Vt

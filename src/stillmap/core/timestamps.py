@@ -1,4 +1,4 @@
-"""Time stamps: exact nanoseconds from decimal text, and time that runs backwards."""
+"""Time stamps: exact nanoseconds from decimal text, clock jumps, and times of beams."""
 
 from bisect import bisect_right
 from collections.abc import Sequence
@@ -10,27 +10,25 @@ from numpy.typing import NDArray
 from stillmap.core import arrays
 from stillmap.core.recording import Recording
 
-_LARGEST_S = 9_000_000_000  # int64 holds 9.22e9 s in nanoseconds
+_MAX_SECONDS = 9_000_000_000  # int64 holds 9.22e9 s in nanoseconds
 
 
 def parse_ns(text: str) -> int:
-    """Nanoseconds of a decimal number of seconds, without a detour through floating point.
-
-    Digits beyond the nanosecond are rounded, half to even.
+    """Nanoseconds of a decimal number of seconds, exact; rounded half to even.
 
     Raises:
-        ValueError: not a number, not finite, or beyond what int64 nanoseconds hold.
+        ValueError: not a number, not finite, or outside the range of int64 nanoseconds.
     """
     try:
         seconds = Decimal(text)
     except InvalidOperation as error:
         raise ValueError(f"not a time stamp: {text!r}") from error
-    # the size is checked before any arithmetic: 1e999999999 must not be written out
+    # checked before any arithmetic: 1e999999999 would be expanded
     if "_" in text or not seconds.is_finite() or seconds.adjusted() > 9:
         raise ValueError(f"not a time stamp: {text!r}")
     if seconds.adjusted() < -12:
         return 0
-    if abs(seconds) > _LARGEST_S:
+    if abs(seconds) > _MAX_SECONDS:
         raise ValueError(f"not a time stamp: {text!r}")
     return int(seconds.scaleb(9).to_integral_value(ROUND_HALF_EVEN))
 
@@ -44,7 +42,7 @@ def format_seconds(stamp_ns: int) -> str:
 def longest_non_decreasing(values: Sequence[int]) -> NDArray[np.intp]:
     """Indices of a longest non-decreasing subsequence, in O(n log n) (patience sorting).
 
-    One stamp that jumps ahead costs that one element, not all that follow it.
+    One stamp that jumps ahead costs that element alone, not all that follow it.
     """
     tails: list[int] = []  # smallest last value of a subsequence of each length
     tail_index: list[int] = []
@@ -68,20 +66,19 @@ def longest_non_decreasing(values: Sequence[int]) -> NDArray[np.intp]:
 
 
 def beam_stamps_ns(recording: Recording, scans: slice) -> NDArray[np.int64]:
-    """(n,) when each beam of these scans was taken, in nanoseconds."""
+    """(n,) stamp in nanoseconds of each beam of a slice of scans."""
     offset = recording.offset[scans.start : scans.stop + 1]
     stamps = np.repeat(recording.stamp_ns[scans], np.diff(offset))
     if recording.beam_time is None:
         return stamps
-    later = recording.beam_time[offset[0] : offset[-1]].astype(np.float64)
-    return np.asarray(stamps + np.round(1e9 * later).astype(np.int64))
+    seconds = recording.beam_time[offset[0] : offset[-1]].astype(np.float64)
+    return np.asarray(stamps + np.round(1e9 * seconds).astype(np.int64))
 
 
 def max_scan_duration_ns(recording: Recording) -> int:
-    """Nanoseconds from a scan's stamp, at most, to the times of its beams; where these are not
-    known, about as many as from one scan to the next.
+    """Maximum time in nanoseconds from the stamp of a scan to its beams.
 
-    Several sensors may begin at once: their scans follow one another sooner than they end.
+    Without beam times the median time between stamps (of all sensors, which may be interleaved).
     """
     steps, times = np.diff(recording.stamp_ns), recording.beam_time
     longest = float(np.median(steps)) if len(steps) else 0.0

@@ -141,7 +141,7 @@ UNUSABLE = [
         colours,
         "whose pose on the robot is not finite",
     ),
-    (replace(CAMERA, model="omni"), colours, "a lens of a model that is not known (omni)"),
+    (replace(CAMERA, model="omni"), colours, "a lens of an unknown model (omni)"),
     (CAMERA, lambda _: np.zeros((12, 16), np.uint16), "without color (depth, or 16 bits)"),
     (CAMERA, lambda _: np.zeros((12, 16), np.float32), "without color (depth, or 16 bits)"),
     (CAMERA, lambda _: np.zeros((24, 32, 3), np.uint8), "of 32 x 24 pixels, calibrated for 16 x"),
