@@ -6,14 +6,13 @@ import os
 import numpy as np
 import pytest
 
-from stillmap.mesh.options import TextureOptions
-from stillmap.mesh.texture.atlas import Textured
+from stillmap.mesh.texture.atlas import TexturedMesh
 from stillmap.mesh.triangle_mesh import Mesh
 from stillmap.results.gltf import write_glb
 
 trimesh = pytest.importorskip("trimesh")
 
-PNG = TextureOptions(quality=0)
+PNG = 0
 
 
 def model():
@@ -24,7 +23,7 @@ def model():
     uv = np.array([[0.25, 0.75], [0.25, 0.25], [0.75, 0.25], [0, 0], [0, 0], [0, 0]])
     page = np.random.default_rng(0).integers(0, 255, (32, 48, 3)).astype(np.uint8)
     of_face = np.array([0, -1], np.int32)
-    return Textured(vertices, faces, uv, of_face, (page,), of_face, np.full(6, -1, np.int32))
+    return TexturedMesh(vertices, faces, uv, of_face, (page,), of_face, np.full(6, -1, np.int32))
 
 
 @pytest.fixture
@@ -32,7 +31,7 @@ def out(tmp_path):
     """As much of a result as is needed."""
     folder = tmp_path / "out"
     folder.mkdir()
-    options = {"mesh": {"texture": {"quality": 0}}}
+    options = {"mesh": {"texture_quality": 0}}
     record = {"input": {"path": str(tmp_path / "gone")}, "options": options}
     (folder / "run.json").write_text(json.dumps(record))
     write_glb(folder / "mesh.glb", model(), PNG)

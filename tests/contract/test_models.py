@@ -5,9 +5,8 @@ import pytest
 from made_up_rooms import all_round, furnished, looking, photograph, rectangle, sharpest
 from opening_models import shown, validated
 
-from stillmap.mesh.options import TextureOptions
-from stillmap.mesh.texture.baking import baked
-from stillmap.mesh.triangle_mesh import joined
+from stillmap.mesh.texture.baking import bake_texture
+from stillmap.mesh.triangle_mesh import concatenate_meshes
 from stillmap.results.gltf import write_glb, write_obj
 
 trimesh = pytest.importorskip("trimesh")
@@ -20,9 +19,8 @@ CORNERS = np.array([[[230, 30, 40], [20, 200, 60]], [[40, 50, 220], [240, 220, 3
 @pytest.fixture(scope="module")
 def room():
     mesh, views = furnished(), all_round()
-    options = TextureOptions(page=512)
     read = {view.image: photograph(mesh, view, 1) for view in views}.__getitem__
-    return baked(mesh, sharpest(mesh, views), views, read, options)
+    return bake_texture(mesh, sharpest(mesh, views), views, read, 512)
 
 
 @pytest.fixture(scope="module")
@@ -32,11 +30,11 @@ def poster():
     wall = rectangle([-2.0, 3.0, -1.4], [4, 0, 0], [0, 0, 2.9], 4)
     floor = rectangle([-2.0, 0.5, -1.4], [4, 0, 0], [0, 2.5, 0], 2)
     low = rectangle([-2.0, 0.5, -1.4], [0, 2.5, 0], [0, 0, 1.4], 2)
-    mesh = joined([wall, floor, low])
+    mesh = concatenate_meshes([wall, floor, low])
     view = np.zeros(len(mesh), np.int32)
     view[len(wall) :] = -1
     picture = CORNERS.repeat(150, axis=0).repeat(200, axis=1)
-    return baked(mesh, view, [looking([0, 0, 0], [0, 1, 0])], lambda _: picture)
+    return bake_texture(mesh, view, [looking([0, 0, 0], [0, 1, 0])], lambda _: picture)
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +42,7 @@ def written(room, poster, tmp_path_factory):
     folder = tmp_path_factory.mktemp("models")
     paths = {name: folder / f"{name}.glb" for name in ("room", "png", "plain", "poster", "far")}
     write_glb(paths["room"], room)
-    write_glb(paths["png"], room, TextureOptions(quality=0))
+    write_glb(paths["png"], room, 0)
     write_glb(paths["plain"], furnished())
     write_glb(paths["poster"], poster)
     far = rectangle([4e5, 5e6, 100.0], [4, 0, 0], [0, 0, 3])

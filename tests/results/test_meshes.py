@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from stillmap.core.errors import InputError
-from stillmap.mesh.options import TextureOptions
-from stillmap.mesh.texture.atlas import Textured
+from stillmap.mesh.texture.atlas import TexturedMesh
 from stillmap.mesh.triangle_mesh import Mesh
 from stillmap.results.gltf import write_glb, write_obj
 
@@ -25,7 +24,7 @@ def textured():
     uv = np.array([[0.25, 0.75], [0.75, 0.75], [0.75, 0.25], [0, 0], [0, 0], [0, 0]])
     page = np.random.default_rng(0).integers(0, 255, (32, 48, 3)).astype(np.uint8)
     of_face, vertex = np.array([0, -1], np.int32), np.array([0, 1, 2, 3, 0, 2], np.int32)
-    return Textured(vertices, faces, uv, of_face, (page,), of_face, vertex)
+    return TexturedMesh(vertices, faces, uv, of_face, (page,), of_face, vertex)
 
 
 def tree_of(path):
@@ -116,9 +115,3 @@ def test_whole_or_not_at_all(tmp_path, monkeypatch):
     with pytest.raises(InputError, match="cannot be written"):
         write_glb(tmp_path / "a.glb", textured())
     assert {path.name for path in tmp_path.iterdir()} == {"obj"}
-
-
-@pytest.mark.parametrize("change", [{"page": 10}, {"pages": 0}, {"quality": 99}, {"gutter": 0}])
-def test_options_are_checked(change):
-    with pytest.raises(ValueError, match=r"mesh\.texture\."):
-        TextureOptions(**change)

@@ -13,12 +13,12 @@ from stillmap.em import GroundMap
 from stillmap.mesh.range_image import is_row_scanner
 from stillmap.mesh.texture.occluders import TrackedBox
 from stillmap.mesh.texture.occlusion import LidarReturns
+from stillmap.rig.build import HOLD
+from stillmap.rig.removal import MAX_OBJECT_HEIGHT, MIN_VEHICLE_LENGTH
 from stillmap.tracking import MovingObject
 from stillmap.tracking.boxes import Box, fit_box
 
 Float = NDArray[np.float64]
-
-_HOLD = 0.5  # s for which an object persists before its first and after its last detection
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,16 +77,12 @@ def box_objects(objects: Sequence[MovingObject], start_ns: int) -> list[TrackedB
         if one.z is None:
             raise ValueError("objects: expected those of a recording in 3D")
         height = float(one.size[2])
-        boxes.append(TrackedBox(fit_box(one, start_ns, _HOLD), one.z - 0.5 * height, height))
+        boxes.append(TrackedBox(fit_box(one, start_ns, HOLD), one.z - 0.5 * height, height))
     return boxes
 
 
 def extrude_boxes(
-    boxes: Sequence[Box],
-    objects: Sequence[MovingObject],
-    ground: GroundMap,
-    min_height: float,
-    long: float,
+    boxes: Sequence[Box], objects: Sequence[MovingObject], ground: GroundMap
 ) -> list[TrackedBox]:
     """Planar boxes of a flat laser with the heights that a second laser measured.
 
@@ -94,13 +90,12 @@ def extrude_boxes(
         boxes: planar boxes.
         objects: moving objects with heights, of the second laser.
         ground: ground height below the boxes.
-        min_height: metres, minimum height of a box shorter than `long`.
-        long: metres.
     """
     heights = {one.id: float(one.size[2]) for one in objects}
     out = []
     for box in boxes:
-        usual = min_height if 2.0 * max(box.half_size) < long else 0.0
-        height = max(heights.get(box.object_id, 0.0), usual)
+        is_vehicle = 2.0 * max(box.half_size) >= MIN_VEHICLE_LENGTH
+        min_height = 0.0 if is_vehicle else MAX_OBJECT_HEIGHT
+        height = max(heights.get(box.object_id, 0.0), min_height)
         out.append(TrackedBox(box, ground.height_at(box.xy), height))
     return out

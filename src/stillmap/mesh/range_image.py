@@ -24,13 +24,13 @@ from stillmap.mesh.triangulation import (
     triangulate_grid,
     triangulate_strips,
 )
+from stillmap.rig.trajectory import MAX_SCAN_GAP
 
 Bool = NDArray[np.bool_]
 Faces = NDArray[np.int32]
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-MAX_SCAN_GAP = 1.0  # s: between scans farther apart the motion is unknown
 _MAX_SPACING_RATIO = 3.0  # of an unordered triangle's longest edge to the median: else a hole
 _SAMPLES = 2000  # beams by which row lengths are tested
 _MIN_ROW_LENGTH = 4  # beams

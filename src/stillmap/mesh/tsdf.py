@@ -81,7 +81,7 @@ class StreamingSurface:
         return self.volume.memory_bytes > self._held + _EXTRACT_BYTES
 
     def extract_complete(self, extents: PatchExtents, done: int) -> None:
-        """Extracts tiles that patches from number `done` on do not reach, and frees their voxels."""
+        """Extracts tiles that patches from number `done` on do not reach; frees their voxels."""
         tiles = marching_cubes.occupied_tiles(self.volume)
         edge = marching_cubes.TILE * self.volume.voxel
         self._extract(tiles[extents.is_complete(tiles, edge, done)])

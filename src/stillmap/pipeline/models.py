@@ -8,7 +8,6 @@ from stillmap.mesh.build import Models
 from stillmap.mesh.inputs import MeshInputs, box_objects, extrude_boxes
 from stillmap.pipeline.result import MappingResult
 from stillmap.rig.build import HOLD, TiltingResult
-from stillmap.rig.removal import MAX_OBJECT_HEIGHT, MIN_VEHICLE_LENGTH
 from stillmap.tracking.boxes import fit_boxes
 
 
@@ -72,7 +71,7 @@ def _rig_inputs(result: MappingResult, tilting: TiltingResult, threads: int) -> 
         tilting.poses,
         tilting.p_static,
         tilting.objects,
-        extrude_boxes(boxes, tilting.objects, ground, MAX_OBJECT_HEIGHT, MIN_VEHICLE_LENGTH),
+        extrude_boxes(boxes, tilting.objects, ground),
         int(flat.stamp_ns[0]),
         ground,
     )

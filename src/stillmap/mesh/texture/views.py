@@ -12,7 +12,7 @@ from stillmap.core import se2, se3
 from stillmap.core.camera import Camera, Images, calibration_error
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.mesh.range_image import MAX_SCAN_GAP
+from stillmap.rig.trajectory import MAX_SCAN_GAP
 from stillmap.slam.deskew import MAX_SPEED, MAX_TURN_RATE
 
 Float = NDArray[np.float64]
