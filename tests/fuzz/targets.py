@@ -14,7 +14,6 @@ import corpus_images
 import numpy as np
 import parts
 
-from stillmap.cli import arguments
 from stillmap.cli.recording_info import facts
 from stillmap.core.config import load_toml, override
 from stillmap.core.errors import InputError
@@ -26,6 +25,7 @@ from stillmap.io.trajectory import read_tum
 from stillmap.pipeline.options import Options
 from stillmap.preprocessing.options import ReadOptions
 from stillmap.results import reader as result_reader
+from stillmap.results.folder import open_result
 from stillmap.results.labels import read_labels
 from stillmap.results.reader import read_tracks
 from stillmap.sim import load_truth
@@ -201,8 +201,8 @@ def _result(data: bytes, folder: Path) -> None:
     _write(data, place, corpus.RESULT)
     _write(parts.join_parts(_recording_files), place, corpus.STILLMAP)
     for reader in (
-        lambda: arguments.found(place, None).read_options,
-        lambda: arguments.found(place, str(place)).read(),
+        lambda: open_result(place, None).read_options,
+        lambda: open_result(place, str(place)).read(),
         lambda: read_labels(place),
         lambda: result_reader.read_grid(place),
         lambda: read_tracks(place / "objects.json"),

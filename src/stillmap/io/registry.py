@@ -129,7 +129,7 @@ def read(
     progress: Progress | None = None,
     scratch: Path | None = None,
 ) -> Recording:
-    """Read a recording, whatever its format.
+    """Read a recording of any format.
 
     Args:
         path: a file or a folder, see `FORMATS`.

@@ -65,7 +65,7 @@ def test_no_transforms(bag, messages):
     recording = read(bag(scans))
     assert recording.T_odom_base is None
     np.testing.assert_array_equal(recording.T_base_sensor[0], np.eye(3))
-    assert "took the laser as the base" in recording.source["warnings"][0]
+    assert "is used as the base frame" in recording.source["warnings"][0]
 
 
 def test_odometry_messages(bag, messages):
@@ -185,7 +185,7 @@ def test_unconnected_lasers(bag, messages):
         content.append(("/b", stamp, messages.scan(stamp, ranges_at(k), "other")))
     recording = read(bag(content))
     assert recording.n_scans == 6
-    assert "nothing says where 'other' is" in recording.source["duplicates"][0]
+    assert "no transform connects 'other'" in recording.source["duplicates"][0]
 
 
 def test_duplicate_topics_are_dropped(bag, messages):

@@ -1,4 +1,4 @@
-"""Opens bags of every kind, told apart by their first bytes."""
+"""Opens bags of every kind, detected by their first bytes."""
 
 import tempfile
 from collections.abc import Callable, Iterator

@@ -15,7 +15,7 @@ from stillmap.preprocessing.options import ReadOptions
 
 Float = NDArray[np.float64]
 
-SENSOR_IS_BASE = "the sensor is taken for the robot: nothing says where it sits on one"
+SENSOR_IS_BASE = "the sensor's frame: no transform gives its pose on a robot"
 
 _BASE_NAMES = ("base_link", "base_footprint", "base")
 _MAX_GAP = 1.0  # s without odometry before a warning
@@ -51,7 +51,7 @@ def find_sensor_poses(
     tree = content.transforms
     base, how = _find_base_frame(tree, [frame for frame, _ in sensors], content.odometry, options)
     found = [tree.lookup(base, frame, at_ns) for frame, at_ns in sensors]
-    warning = f"no transform says where {base!r} sits on a robot: took the laser as the base"
+    warning = f"no transform gives the pose of {base!r} on a robot: it is used as the base frame"
     warnings = [warning] if how == SENSOR_IS_BASE else []
     return SensorPoses(base, how, [None if f is None else f.T for f in found], warnings)
 
@@ -116,11 +116,11 @@ def select_lasers(content: BagContent, options: ReadOptions) -> LaserSelection:
     T: list[Float] = []
     for scans, found in zip(lasers, poses.T_base_sensor, strict=True):
         if found is None and options.base_frame is not None and not used:
-            raise InputError(f"nothing says where {scans.frame!r} is in {poses.base!r}")
+            raise InputError(f"no transform connects {scans.frame!r} with {poses.base!r}")
         if found is None and used:
             omitted.append(
-                f"{scans.topic}: {scans.n_scans} scans, nothing says where {scans.frame!r} is on "
-                f"the robot beside {used[0].frame!r} (--topic {scans.topic} takes it instead)"
+                f"{scans.topic}: {scans.n_scans} scans, no transform connects {scans.frame!r} with "
+                f"{used[0].frame!r} (--topic {scans.topic} takes it instead)"
             )
             continue
         used.append(scans)
@@ -192,7 +192,7 @@ def _odometry_from_topic(
     if T_child_base is not None:
         T = T @ T_child_base.T
     elif one.child not in ("", base):
-        warnings = [f"{one.topic}: taken for {base}, though it is of {one.child}"]
+        warnings = [f"{one.topic}: used as the pose of {base}, although it is of {one.child}"]
     gap = _largest_gap(np.asarray(one.stamp_ns), at_ns)
     origin, more = _describe_odometry(one.topic, found.outside, gap)
     return T, origin, warnings + more

@@ -95,7 +95,7 @@ def _find_mountings(
         flat, upside_down, tilts = base_frame.project_to_plane(T)
         given = options.laser(number)
         if tilts:
-            warnings.append(f"{scans.topic}: the laser is tilted; its scans are taken for level")
+            warnings.append(f"{scans.topic}: the laser is tilted; its scans are treated as level")
         x, y, theta = se2.parameters(flat)[0].tolist()
         if not _moves(flat) or given.pose != (None, None, None):
             same = scans.frame == base

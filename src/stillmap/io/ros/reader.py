@@ -193,7 +193,7 @@ def _place_sensors(
     for k, rows, found in zip(used, scans, poses.T_base_sensor, strict=True):
         topic, frame = names[k]
         if found is None and (kept or options.base_frame is not None):
-            text = f"nothing says where {frame!r} is on the robot"
+            text = f"no transform connects {frame!r} with {poses.base!r}"
             if not kept:
                 raise InputError(text)
             omitted.append(f"{topic}: {len(rows)} clouds, {text}")
