@@ -11,8 +11,6 @@ what some picture sees without movers, or sees from within 10 m, that is texture
 Movers: the share of those that were tracked of which there is a model, and of those of them that
 100 beams met within a second; chamfer distance in cm, and the share of their textures that shows
 anything else.
-Beside it the same models with pictures chosen by their resolution alone (`mesh.choice.believe`),
-unless --alone is given.
 """
 
 import argparse
@@ -21,6 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -57,7 +56,8 @@ WORLDS: dict[str, dict[str, Any]] = {
         "crowd": {"people": 30},
     },
 }
-_NO_BELIEF = "mesh.choice.believe=false"
+STILLMAP = ("-m", "stillmap")
+RESOLUTION_ALONE = (str(Path(__file__).with_name("resolution_alone.py")),)
 WAYS = ("by P(static)", "by resolution alone")
 WALKERS = 0.3  # share of pictures that show somebody, at least
 _NEAR = 10.0  # m
@@ -94,7 +94,6 @@ class Job:
     world: str
     seed: int
     settings: tuple[str, ...]
-    ways: tuple[str, ...]
     keep: Path | None
 
 
@@ -105,29 +104,25 @@ def main() -> None:
     add_arguments(p, [])
     add_seed_arguments(p)
     p.add_argument("--worlds", nargs="+", choices=WORLDS, default=list(WORLDS))
-    p.add_argument("--alone", action="store_true", help="not by resolution alone, too")
     p.add_argument("--keep", type=Path, metavar="DIR", help="leave recordings and results there")
     p.set_defaults(n_seeds=3, processes=1)
     args = p.parse_args()
     options_of("stillmap", args.set)  # refuses before hours have passed
-    ways = WAYS[:1] if args.alone else WAYS
     jobs = [
-        Job(world, seed, tuple(args.set), ways, args.keep)
+        Job(world, seed, tuple(args.set), args.keep)
         for world in args.worlds
         for seed in seeds_of(args)
     ]
     done = sorted(outcomes(rows, jobs, args.processes), key=lambda pair: jobs.index(pair[0]))
     print("Means over seeds, in brackets the worst.")
-    for way in ways:
-        of_way = [{"case": job.world, **by_way[way]} for job, by_way in done]
-        print(f"\n## Pictures chosen {way}\n\n{means_and_worst(of_way, COLUMNS)}")
-    for job, by_way in done:
-        if (share := by_way[ways[0]]["walkers"]) < 100 * WALKERS:
+    print(means_and_worst([{"case": job.world, **row} for job, row in done], COLUMNS))
+    for job, row in done:
+        if (share := row["walkers"]) < 100 * WALKERS:
             print(f"\n{job.world}, seed {job.seed}: movers in {share:.0f} % of the pictures only")
 
 
-def rows(job: Job) -> dict[str, Scores]:
-    """The scores of each way to choose pictures."""
+def rows(job: Job) -> Scores:
+    """The scores of a job."""
     if job.keep:
         return _rows(job, job.keep / f"{job.world}-{job.seed}")
     with tempfile.TemporaryDirectory() as folder:
@@ -149,10 +144,10 @@ def _rows(job: Job, folder: Path) -> dict[str, Scores]:
     out = {}
     for number, way in enumerate(job.ways):
         result = folder / f"result-{number}"
-        settings = [*job.settings, *([_NO_BELIEF] if way == WAYS[1] else [])]
-        flags = [part for one in settings for part in ("--set", one)]
+        flags = [part for one in job.settings for part in ("--set", one)]
         started = time.monotonic()
-        _stillmap("map", *inputs, "-o", result, "--overwrite", "--quiet", *flags)
+        words = ["map", *inputs, "-o", result, "--overwrite", "--quiet", *flags]
+        _stillmap(*words, program=RESOLUTION_ALONE if way == WAYS[1] else STILLMAP)
         seconds = time.monotonic() - started
         found = json.loads(_stillmap("eval", "model", result, sim, "--json"))
         near = json.loads(_stillmap("eval", "model", result, sim, "--json", "--within", _NEAR))
@@ -166,8 +161,8 @@ def _rows(job: Job, folder: Path) -> dict[str, Scores]:
     return out
 
 
-def _stillmap(*args: object) -> str:
-    command = [sys.executable, "-m", "stillmap", *(str(arg) for arg in args)]
+def _stillmap(*args: object, program: Sequence[str] = STILLMAP) -> str:
+    command = [sys.executable, *program, *(str(arg) for arg in args)]
     return subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
 
 

@@ -4,7 +4,7 @@ python benchmarks/pasted.py ../shared/data/rgbd/kitchenette OUT
 python benchmarks/pasted_scores.py OUT [--set section.key=value ...] [--alone] [--keep DIR]
 
 `stillmap map` makes the model with the recorded poses, and again with pictures chosen by their
-resolution alone (`mesh.choice.believe`), unless --alone is given. Points that lie as densely on
+resolution alone, unless --alone is given. Points that lie as densely on
 every square metre are looked up in what of the picture that paints them is a person. Free is what
 some picture shows without one.
 """
@@ -14,6 +14,7 @@ import json
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,7 +36,10 @@ from stillmap.preprocessing.options import ReadOptions
 
 Mask = NDArray[np.bool_]
 
-WAYS = {"by P(static)": (), "by resolution alone": ("mesh.choice.believe=false",)}
+WAYS = {
+    "by P(static)": ("-m", "stillmap"),
+    "by resolution alone": (str(Path(__file__).with_name("resolution_alone.py")),),
+}
 COLUMNS = (
     Column("area", "area, m2", ".1f"),
     Column("painted", "painted, %", ".1f", True),
@@ -115,17 +119,20 @@ def _mean(values: Mask) -> float:
     return float(np.mean(values)) if len(values) else float("nan")
 
 
-def row(source: Path, result: Path, settings: tuple[str, ...]) -> dict[str, Any]:
+def row(
+    source: Path, result: Path, settings: Sequence[str], program: Sequence[str]
+) -> dict[str, Any]:
     """Map a folder that `pasted.py` wrote, and score it; shares in percent.
 
     Args:
         source: that folder.
         result: where the model goes; what is there is replaced.
         settings: `section.key=value`.
+        program: arguments of Python that run `stillmap`.
     """
     flags = [part for one in settings for part in ("--set", one)]
     words = ["map", source, "--poses", "recording", "-o", result, "--overwrite", "--quiet", *flags]
-    subprocess.run([sys.executable, "-m", "stillmap", *map(str, words)], check=True)
+    subprocess.run([sys.executable, *program, *map(str, words)], check=True)
     images = stillmap.read(source, options=ReadOptions(depth_step=64)).images
     if images is None:
         raise InputError("has no pictures", where=str(source))
@@ -154,8 +161,8 @@ def main() -> None:
         kept.mkdir(parents=True, exist_ok=True)
         ways = list(WAYS.items())[: 1 if args.alone else None]
         rows = [
-            {"case": way, **row(args.source, kept / f"result-{k}", (*args.set, *settings))}
-            for k, (way, settings) in enumerate(ways)
+            {"case": way, **row(args.source, kept / f"result-{k}", args.set, program)}
+            for k, (way, program) in enumerate(ways)
         ]
     header = ["pictures chosen", *(column.title for column in COLUMNS)]
     lines = [[one["case"], *(c.mean_and_worst([one]) for c in COLUMNS)] for one in rows]
