@@ -1,4 +1,4 @@
-"""What elements say of those beside them: the core against its plain twin, and by hand."""
+"""Mean-field smoothing: kernel against twin, and by hand."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from stillmap.em.spatial_prior import smooth_mean_field
 
 
 def surfaces(seed):
-    """A wall, the ground and stray points, hit at random looks; the same for both."""
+    """Surfel maps of a wall, the ground and stray points, with random time bins."""
     rng = np.random.default_rng(seed)
     wall = np.column_stack([rng.normal(4.0, 0.02, 400), *rng.uniform(-1.5, 1.5, (2, 400))])
     ground = np.column_stack([*rng.uniform(-1.5, 1.5, (2, 300)), rng.normal(-1.5, 0.02, 300)])
@@ -33,7 +33,7 @@ def order(surface):
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 @pytest.mark.parametrize("changes", [{}, {"radius": 1.0, "tolerance": 0.0}, {"max_iterations": 1}])
-def test_core_and_twin_agree(seed, changes):
+def test_agreement(seed, changes):
     core, plain = surfaces(seed)
     own = np.random.default_rng(seed + 7).normal(1.0, 3.0, plain.size).astype(np.float32)
     of_core, of_plain = order(core), order(plain)
@@ -44,7 +44,7 @@ def test_core_and_twin_agree(seed, changes):
     expected = reference.smooth_mean_field(plain, own, **{**MEAN_FIELD, **changes})
     assert found.dtype == np.float32
     np.testing.assert_allclose(found[of_core], expected[of_plain], atol=2e-5)
-    assert np.mean((expected > 0.5) != (own > 0.0)) > 0.02  # somebody changed its mind
+    assert np.mean((expected > 0.5) != (own > 0.0)) > 0.02  # some labels change
 
 
 def test_threads_change_nothing():
@@ -84,8 +84,8 @@ def car_beside_wall(at_car, at_wall):
     return surface, cells[:, 1] == 10, cells[:, 0]
 
 
-def test_what_has_no_evidence_follows_its_neighbours():
-    # both ends of a side were seen to come, of the middle nobody knows
+def test_surfels_without_evidence_follow_their_neighbours():
+    # both ends are dynamic, the middle is unknown
     surface, car, x = car_beside_wall([5, 6, 7], [0, 9])
     own = np.where(car, np.where(abs(x - 7) > 2, -4.0, 1.5), 4.0).astype(np.float32)
     p = _core.smooth_mean_field(surface, own, **MEAN_FIELD)
@@ -93,8 +93,8 @@ def test_what_has_no_evidence_follows_its_neighbours():
     assert (p[~car] > 0.9).all()
 
 
-def test_those_hit_at_other_times_are_not_asked():
-    # the same, but the rest of the side was hit before what moves came
+def test_disjoint_time_spans_do_not_interact():
+    # the same, but the rest was hit before the mover came
     surface, car, x = car_beside_wall([5, 6, 7], [0, 9])
     other = _core.SurfelMap3D(0.2)
     cells = surface.surfels()[0]
@@ -116,7 +116,7 @@ def test_those_hit_at_other_times_are_not_asked():
     np.testing.assert_array_equal(p > 0.5, x >= 4)
 
 
-def test_one_that_lies_off_the_surface_does_not_speak_for_it():
+def test_surfels_off_the_plane_do_not_interact():
     # a wheel that rolled by stands on the ground: 0.2 m above it, in the next cell
     rng = np.random.default_rng(0)
     ground = np.column_stack([rng.uniform(0, 3, (2000, 2)), np.full(2000, 0.1)])
@@ -133,10 +133,10 @@ def test_one_that_lies_off_the_surface_does_not_speak_for_it():
     np.testing.assert_array_equal(p < 0.5, off)
 
 
-def test_refusals():
+def test_argument_errors():
     core, _ = surfaces(0)
     own = np.zeros(core.size, np.float32)
-    with pytest.raises(ValueError, match="log_odds: expected one per element"):
+    with pytest.raises(ValueError, match="log_odds: expected one per surfel"):
         _core.smooth_mean_field(core, own[1:], **MEAN_FIELD)
     with pytest.raises(ValueError, match="log_odds: not a number"):
         _core.smooth_mean_field(core, own + np.float32(np.nan), **MEAN_FIELD)
@@ -163,7 +163,7 @@ def test_refusals():
             _core.SurfelMap3D(0.3).add_end_points(*one, np.array(look))
 
 
-def test_it_is_for_3d_alone():
+def test_2d_maps_are_rejected():
     core, _ = surfaces(0)
     smoothed = smooth_mean_field(np.linspace(0.0, 1.0, core.size).astype(np.float32), core)
     assert smoothed.dtype == np.float32

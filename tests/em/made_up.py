@@ -1,4 +1,4 @@
-"""Recordings made up by hand: one look a second at a wall, with things in front of it."""
+"""Synthetic recordings: one scan a second of a wall, with objects in front of it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -66,7 +66,7 @@ def cone(side: int = 25, width: float = 90.0) -> Any:
 
 @dataclass(frozen=True)
 class Watched:
-    """A recording of one look after the other from one place, and what reflected each beam."""
+    """A recording from one position, and what reflected each beam."""
 
     recording: Recording
     what: Any  # (M,) number of the wall or ball, -1: nothing

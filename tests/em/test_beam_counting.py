@@ -35,7 +35,7 @@ def counted(recording, threshold):
 
 @pytest.mark.parametrize(("hits", "passes"), [(1, 3), (2, 3), (5, 5), (1, 0), (1, 19)])
 @pytest.mark.parametrize("threshold", [0.1, 0.25, 0.4, 0.6])
-def test_a_half_is_at_the_threshold(hits, passes, threshold):
+def test_half_at_the_threshold(hits, passes, threshold):
     recording = lane(hits, passes)
     grid, found = counted(recording, threshold)
     ratio = hits / (hits + passes)
@@ -52,7 +52,7 @@ def test_a_half_is_at_the_threshold(hits, passes, threshold):
     assert found.occupied.cells.tolist() == [[3, 0]]
 
 
-def test_cells_that_were_only_passed_are_free():
+def test_passed_cells_are_free():
     grid, found = counted(lane(1, 1), 0.25)
     m = em.make_occupancy_map(grid, found.occupied)
     known = m.alpha + m.beta > 0
@@ -60,7 +60,7 @@ def test_cells_that_were_only_passed_are_free():
     assert np.isnan(m.p_occupied[~known]).all()
 
 
-def test_in_the_order_of_the_ratio():
+def test_monotone_in_the_hit_ratio():
     seen = watch([Wall((1, 0), 4.05), Ball(2.0, 0.0, 3, 5), Ball(2.0, 1.0, 5, 15)], 20)
     p = seen.e_step(estimator="hit-ratio").p_static
     briefly, longer, always = (np.median(seen.of(p, k)) for k in (1, 2, 0))
@@ -68,7 +68,7 @@ def test_in_the_order_of_the_ratio():
     assert (p[~seen.recording.hit] == np.float32(0.75)).all()
 
 
-def test_one_iteration_and_all_believed():
+def test_one_iteration_from_all_static():
     options = em.EmOptions()
     assert em.max_iterations("hit-ratio", options) == 1
     assert em.max_iterations("stillmap", options) == em.max_iterations("paper", options) == 6

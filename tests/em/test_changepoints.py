@@ -21,7 +21,7 @@ SECONDS = 200
 STATES = ("last", "majority")
 
 
-def courses(**changed):
+def histories(**changed):
     """Four cells: static; came and shown; left; comes and goes."""
     usual = {
         "cells": np.array([[0, 0], [1, 0], [2, 0], [3, 0]]),
@@ -39,38 +39,38 @@ def courses(**changed):
     return em.CellHistories(**(usual | changed))
 
 
-def test_the_last_state():
+def test_last_state():
     # what comes and goes is not there, whatever was seen at last
-    shown = courses().p_in_map("last")
+    shown = histories().p_in_map("last")
     np.testing.assert_allclose(shown, [0.91, 0.9, 0.2, 0.05], atol=1e-6)
     assert shown.dtype == np.float32
-    twice = courses(n_changes=np.array([0, 2, 2, 2], np.int32)).p_in_map("last")
+    twice = histories(n_changes=np.array([0, 2, 2, 2], np.int32)).p_in_map("last")
     np.testing.assert_allclose(twice, [0.91, 0.9, 0.2, 0.05 + 0.9 * 0.9], atol=1e-6)
 
 
-def test_the_state_that_held_for_longest():
-    shown = courses().p_in_map("majority")
+def test_majority_state():
+    shown = histories().p_in_map("majority")
     np.testing.assert_allclose(shown, [0.92, 0.1, 0.9, 0.95], atol=1e-6)
-    half = courses(occupied_share=np.full(4, 0.5, np.float32)).p_in_map("majority")
-    np.testing.assert_allclose(half, courses().p_static)
+    half = histories(occupied_share=np.full(4, 0.5, np.float32)).p_in_map("majority")
+    np.testing.assert_allclose(half, histories().p_static)
 
 
 @pytest.mark.parametrize("state", STATES)
-def test_what_changed_is_not_what_the_view_hides(state):
+def test_changes_are_shown_where_the_view_may_hide(state):
     # where both may be, what is listed as a change is shown as one
-    shown = courses().p_in_map(state)
-    half = {name: 0.5 * getattr(courses(), name) for name in ("p_static", "p_changing")}
+    shown = histories().p_in_map(state)
+    half = {name: 0.5 * getattr(histories(), name) for name in ("p_static", "p_changing")}
     np.testing.assert_allclose(
-        courses(**half, p_view_dependent=np.full(4, 0.5, np.float32)).p_in_map(state),
+        histories(**half, p_view_dependent=np.full(4, 0.5, np.float32)).p_in_map(state),
         shown,
         atol=1e-6,
     )
 
 
 @pytest.mark.parametrize("state", STATES)
-def test_no_probability_exceeds_one(state):
+def test_probabilities_stay_below_one(state):
     p = np.full(4, 0.6, np.float32)
-    one = courses(p_static=p, p_changing=p, p_object=np.ones(4, np.float32))
+    one = histories(p_static=p, p_changing=p, p_object=np.ones(4, np.float32))
     assert one.p_in_map(state).max() == 1.0
 
 
@@ -92,26 +92,26 @@ def row(p_changing, *, came=True, between=(10, 12), count=1, static=0.01, apart=
     )
 
 
-def decided(courses):
-    return _group_cells(courses).p_changing
+def decided(histories):
+    return _group_cells(histories).p_changing
 
 
-def same(courses):
-    return np.array_equal(decided(courses), courses.p_changing)
+def same(histories):
+    return np.array_equal(decided(histories), histories.p_changing)
 
 
 THIRD = [*[0.9] * 5, 0.8, *[0.1] * 10]
 LESS = [*[0.9] * 5, *[0.1] * 11]
 
 
-def test_a_third_of_its_cells_decides_for_a_thing():
+def test_a_third_of_a_group_decides():
     np.testing.assert_allclose(decided(row(THIRD)), 0.8)
     np.testing.assert_allclose(decided(row(LESS)), 0.1)
     np.testing.assert_allclose(decided(row([0.9, 0.8, 0.1, 0.1])), 0.8)
     np.testing.assert_allclose(decided(row(THIRD, came=False)), 0.8)
 
 
-def test_what_is_not_one_thing_is_left_alone():
+def test_cells_outside_groups_are_unchanged():
     assert not same(row(THIRD))
     assert same(row(THIRD[4:7]))  # too few cells
     assert same(row(THIRD, apart=4))
@@ -122,29 +122,29 @@ def test_what_is_not_one_thing_is_left_alone():
     assert same(row([0.9, 0.9, 0.9, *[0.02] * 10]))  # most have no say
 
 
-def test_cells_that_came_beside_cells_that_left_are_another_thing():
+def test_arrivals_and_departures_are_separate_groups():
     one = row(THIRD)
     p_object = one.p_object.copy()
     p_object[6:] = 0.1
     np.testing.assert_allclose(decided(replace(one, p_object=p_object)), [0.9] * 6 + [0.1] * 10)
 
 
-@pytest.mark.parametrize(("looks", "apart"), [(5, False), (6, True)])
-def test_cells_that_changed_at_other_times_are_another_thing(looks, apart):
-    # 10 to 12, and `looks` later: within four looks it may have been the same
+@pytest.mark.parametrize(("bins", "separate"), [(5, False), (6, True)])
+def test_changes_at_different_times_are_separate_groups(bins, separate):
+    # 10 to 12, and `bins` later: within four time bins it may have been the same
     one = row(THIRD)
     between = one.change_bins.copy()
-    between[6:] += looks
-    expected = [0.9] * 6 + [0.1] * 10 if apart else 0.8
+    between[6:] += bins
+    expected = [0.9] * 6 + [0.1] * 10 if separate else 0.8
     np.testing.assert_allclose(decided(replace(one, change_bins=between)), expected)
 
 
-def test_nobody_becomes_more_than_certain():
+def test_group_probability_is_limited_by_static():
     one = row([0.99, 0.98, 0.1, 0.1], static=0.4)
     np.testing.assert_allclose(decided(one), 0.6)
 
 
-def test_rounding_makes_nothing_impossible(monkeypatch):
+def test_posteriors_survive_rounding(monkeypatch):
     """Cells of which one class is certain, each in its turn."""
     rng = np.random.default_rng(0)
     rho, turn = [0.99, 0.65, 0.1, observations.HALF_TIME_RHO], [np.inf, 0.2, np.inf, np.inf]
@@ -179,7 +179,7 @@ def test_rounding_makes_nothing_impossible(monkeypatch):
     static, change, share = module.label_cells(seen, em.EmOptions())
     assert static.tobytes() == found.p_static.tobytes()
     assert share == found.changing_weight
-    always = likelihood[:, 0]  # the only static class of these that is met from all around
+    always = likelihood[:, 0]  # the only static class of these that does not depend on the view
     np.testing.assert_allclose(change, np.clip(changes[0] - np.log(always), -4, 4), atol=1e-4)
     assert np.ptp(change) == 8.0
     for p in (found.p_static, found.p_view_dependent, found.p_changing):
@@ -213,14 +213,14 @@ class Everywhere(NamedTuple):
 
 
 def final_e_step(seen, state="last", threads=1, **options):
-    """(p_static, occupied) of a map that shows it everywhere, and the courses."""
+    """(p_static, occupied) of a map that shows it everywhere, and the histories."""
     chosen = em.EmOptions(**options)
     _, found = em.final_e_step(seen.recording, seen.poses, RESOLUTION, chosen, threads)
-    nobody = np.ones(seen.recording.n_beams, np.float32)
+    all_static = np.ones(seen.recording.n_beams, np.float32)
     before = em.CellProbabilities(found.cells, np.zeros(len(found.cells), np.float32), 0.2)
     places = [Everywhere(found.cells)]
     shown = relabel_changes(
-        seen.recording, seen.poses, nobody, before, found, places, state, threads
+        seen.recording, seen.poses, all_static, before, found, places, state, threads
     )
     return shown, found
 
@@ -235,7 +235,7 @@ def majority(seen):
     return final_e_step(seen, "majority")
 
 
-def test_labels_say_what_the_last_map_shows(seen, last):
+def test_labels_of_the_last_map(seen, last):
     e = last[0][0]
     assert np.median(seen.of(e, CAME)) > 0.9
     assert np.quantile(seen.of(e, LEFT), 0.95) < 0.1
@@ -244,7 +244,7 @@ def test_labels_say_what_the_last_map_shows(seen, last):
     assert np.quantile(seen.of(e, STOOD), 0.95) < 0.1
 
 
-def test_labels_say_what_the_map_of_most_of_the_time_shows(seen, majority):
+def test_labels_of_the_majority_map(seen, majority):
     e = majority[0][0]
     assert np.quantile(seen.of(e, CAME), 0.9) < 0.1
     assert np.median(seen.of(e, LEFT)) > 0.9
@@ -252,7 +252,7 @@ def test_labels_say_what_the_map_of_most_of_the_time_shows(seen, majority):
     assert np.quantile(seen.of(e, STOOD), 0.95) < 0.1
 
 
-def test_who_walks_over_the_place_it_left_leaves_no_trace(seen, last):
+def test_walkers_over_a_left_place_are_dynamic(seen, last):
     over = seen.of(last[0][0], *range(PASSED, PASSED + 10))
     assert len(over) > 80
     assert np.quantile(over, 0.95) < 0.1
@@ -274,13 +274,13 @@ def test_labels_follow_from_the_map(seen, last, majority, state):
     assert (occupied.p_occupied <= found.p_in_map(state)).all()
 
 
-def test_both_maps_are_of_the_same_courses(last, majority):
+def test_both_maps_have_the_same_histories(last, majority):
     for name in set(em.CellHistories.__dataclass_fields__) - {"surfel_map", "changing_weight"}:
         one, other = getattr(last[1], name), getattr(majority[1], name)
         np.testing.assert_array_equal(one, other)
 
 
-def test_every_probability_is_one(last, majority):
+def test_probabilities_lie_in_range(last, majority):
     for (p_static, _), found in (last, majority):
         for p in (found.p_static, found.p_changing, found.p_object, found.occupied_share):
             assert p.dtype == np.float32
@@ -292,7 +292,7 @@ def test_every_probability_is_one(last, majority):
         assert 0.0 < found.changing_weight < 1.0
 
 
-def test_when_it_was(seen, last):
+def test_change_times(seen, last):
     found = detect_changes(last[1], seen.recording, RESOLUTION, 0.5)
     assert [one.kind for one in found] == ["came", "left"]
     assert [(one.before_ns, one.stamp_ns) for one in found] == [
@@ -304,7 +304,7 @@ def test_when_it_was(seen, last):
     assert (found[1].x, found[1].y) == pytest.approx((1.87, -1.16), abs=0.1)
 
 
-def test_how_much_of_the_time_it_was_there(last):
+def test_occupied_share(last):
     _, found = last
     share = found.occupied_share[(found.p_changing > 0.5) & (found.p_object > 0.5)]
     assert np.median(share) == pytest.approx(80 / SECONDS, abs=0.01)
@@ -312,7 +312,7 @@ def test_how_much_of_the_time_it_was_there(last):
     assert np.median(share) == pytest.approx(140 / SECONDS, abs=0.03)
 
 
-def test_what_comes_and_goes_again_and_again():
+def test_recurring_changes():
     times = [(t, t + 25) for t in range(0, 300, 50)]
     gate = [Ball(2.2, 0.3, *time, 0.5) for time in times]
     watched = watch([*WALLS, *gate, *passing(35, 1.2)], 300)
@@ -328,13 +328,13 @@ def test_what_comes_and_goes_again_and_again():
     ("name", "value"),
     [("_PASSER_BY_TAU", 60.0), ("_STATE_DURATION", 0.2), ("_MAX_STATE_DURATION", 30.0)],
 )
-def test_the_model_matters(seen, last, monkeypatch, name, value):
+def test_constants_of_the_model_matter(seen, last, monkeypatch, name, value):
     monkeypatch.setattr(module, name, value)
     (other, _), _ = final_e_step(seen)
     assert other.tobytes() != last[0][0].tobytes()
 
 
-def test_cells_decide_together_before_anything_is_shown(seen, monkeypatch):
+def test_cells_are_grouped_before_labelling(seen, monkeypatch):
     def nothing_changed(found):
         return replace(found, p_changing=np.zeros_like(found.p_changing))
 
@@ -346,7 +346,7 @@ def test_cells_decide_together_before_anything_is_shown(seen, monkeypatch):
 
 @pytest.mark.parametrize("beams", [1000, 5000])
 @pytest.mark.parametrize("threads", [1, 3])
-def test_pieces_and_threads_change_no_bit(seen, last, monkeypatch, beams, threads):
+def test_chunks_and_threads_change_no_bit(seen, last, monkeypatch, beams, threads):
     monkeypatch.setattr(chunks, "CHUNK_BEAMS", beams)
     (p_static, _), found = final_e_step(seen, threads=threads)
     assert p_static.tobytes() == last[0][0].tobytes()
@@ -354,20 +354,20 @@ def test_pieces_and_threads_change_no_bit(seen, last, monkeypatch, beams, thread
 
 
 @pytest.mark.parametrize("scans", [1, 2])
-def test_so_short_a_recording_shows_no_change(scans):
+def test_short_recordings_have_no_changes(scans):
     watched = watch([*WALLS, Ball(2.2, 0.3, 0, 9, 0.5)], scans)
     (p_static, _), found = final_e_step(watched)
     assert detect_changes(found, watched.recording, RESOLUTION, 0.5) == []
     assert np.isfinite(p_static).all()
 
 
-def test_nothing_hit():
+def test_no_hits():
     (p_static, _), found = final_e_step(watch([], 10), prior=0.8)
     assert len(found.cells) == len(found.p_in_map("last")) == 0
     np.testing.assert_array_equal(p_static, 1)
 
 
-def test_a_clock_that_leaps_by_decades_ends_nothing(seen):
+def test_clock_that_leaps_by_decades(seen):
     stamps = seen.recording.stamp_ns - seen.recording.stamp_ns[0]
     stamps[1:] += 17 * 10**17  # from 1970 on
     leaping = replace(seen.recording, stamp_ns=stamps)

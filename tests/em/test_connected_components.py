@@ -23,13 +23,13 @@ def test_pairs_in_space():
 
 
 @pytest.mark.parametrize("n", [0, 1])
-def test_nobody_has_no_pairs(n):
+def test_no_cells_no_pairs(n):
     pairs = neighbor_pairs(np.empty((n, 2), np.int64), 3.0)
     assert pairs.shape == (0, 2)
     assert [one.tolist() for one in connected_components(pairs, n)] == [[0]] * n
 
 
-def test_sets_are_those_that_pairs_connect():
+def test_components():
     pairs = np.array([[4, 1], [1, 6], [5, 2]])
     assert sorted(one.tolist() for one in connected_components(pairs, 7)) == [
         [0],
@@ -39,7 +39,7 @@ def test_sets_are_those_that_pairs_connect():
     ]
 
 
-def test_every_member_is_in_one_set():
+def test_components_partition_the_nodes():
     rng = np.random.default_rng(0)
     pairs = rng.integers(0, 100, (60, 2))
     sets = connected_components(pairs, 100)

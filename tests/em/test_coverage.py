@@ -56,7 +56,7 @@ def at(occupancy, layer, x, y):
 
 @pytest.fixture(scope="module")
 def visitors():
-    """A wall 4 m ahead, twenty looks; to the left somebody stands 2 m ahead at each but two."""
+    """A wall 4 m ahead, twenty scans; on the left a person 2 m ahead in all but two."""
     T, N = 20, 201
     ranges = np.full((T, N), 4.0) / np.cos(np.linspace(-0.5, 0.5, N))
     e = np.ones((T, N), np.float32)
@@ -65,19 +65,19 @@ def visitors():
     return recording_of(ranges, np.ones((T, N), bool), np.arange(T)), e.reshape(-1)
 
 
-def test_where_somebody_stood_the_place_is_not_known(visitors):
+def test_obstructed_cells_are_thinly_observed(visitors):
     occupancy, found = coverage_of(*visitors)
-    told = {
+    expected = {
         (4.0, 0.0): (20, 20),  # the wall that everybody sees
         (2.0, 0.0): (20, 20),
         (4.0, 1.8): (2, 2),  # behind whoever stands there
         (1.8, 0.8): (20, 2),  # where they stand, and before them
         (1.2, 0.5): (20, 20),
     }
-    for place, (looks, clear) in told.items():
-        assert at(occupancy, found.observations, *place) == looks
-        assert at(occupancy, found.unobstructed, *place) == clear
-        assert at(occupancy, found.thinly_observed, *place) == (clear < 3)
+    for place, (observations, unobstructed) in expected.items():
+        assert at(occupancy, found.observations, *place) == observations
+        assert at(occupancy, found.unobstructed, *place) == unobstructed
+        assert at(occupancy, found.thinly_observed, *place) == (unobstructed < 3)
     assert (found.unobstructed <= found.observations).all()
     known = ~np.isnan(occupancy.p_occupied)
     np.testing.assert_array_equal(found.observations > 0, known)
@@ -93,7 +93,7 @@ def test_thresholds(visitors, monkeypatch):
     assert at(occupancy, found.unobstructed, 1.2, 0.5) == 2
 
 
-def test_scans_of_half_a_second_are_one_look(visitors):
+def test_scans_within_a_time_bin_are_one_observation(visitors):
     recording, e = visitors
     T, N = recording.n_scans, recording.n_beams // recording.n_scans
     ranges = np.linalg.norm(recording.points, axis=1).reshape(T, N)
@@ -103,7 +103,7 @@ def test_scans_of_half_a_second_are_one_look(visitors):
     assert found.thinly_observed.sum() == (~np.isnan(occupancy.p_occupied)).sum()
 
 
-def test_threads_and_chunks_do_not_matter(visitors, monkeypatch):
+def test_threads_and_chunks_change_nothing(visitors, monkeypatch):
     _, found = coverage_of(*visitors)
     _, threaded = coverage_of(*visitors, threads=3)
     monkeypatch.setattr(chunks, "CHUNK_BEAMS", 500)
@@ -113,7 +113,7 @@ def test_threads_and_chunks_do_not_matter(visitors, monkeypatch):
         np.testing.assert_array_equal(getattr(found, name), getattr(chunked, name))
 
 
-def test_beams_without_a_return_count_as_far_as_they_are_believed():
+def test_beams_without_a_return_count_as_far_as_trusted():
     T, N = 5, 101
     ranges, hit = np.full((T, N), 4.0), np.zeros((T, N), bool)
     hit[:, :50] = True
@@ -130,7 +130,7 @@ def test_beams_without_a_return_count_as_far_as_they_are_believed():
         np.testing.assert_array_equal(found.observations > 0, ~np.isnan(occupancy.p_occupied))
         np.testing.assert_array_equal(
             found.unobstructed, found.observations
-        )  # what got lost met nobody
+        )  # beams without a return are not dynamic
         # the map may end before
         room = np.pad(found.observations, ((0, 40), (0, 40)))
         assert tuple(int(at(occupancy, room, *place)) for place in here) == expected

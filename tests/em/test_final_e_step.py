@@ -12,11 +12,11 @@ from stillmap.core.recording import Recording
 from stillmap.em import occupancy_hmm as module
 
 POST, RADIUS, WALL = (5.0, 3.0), 0.15, 5.0
-LOOKS, SECONDS = 80, 0.5
+SCANS, SECONDS = 80, 0.5
 
 
-def seen(at, met):
-    """A sensor at x = `at` of each look before a wall, and a post that it meets or sees through.
+def seen(at, hit_mask):
+    """A sensor at x = `at` in each scan, before a wall and a post that it hits or misses.
 
     Returns the recording, its poses, and which beams end on the post (T, 181).
     """
@@ -26,7 +26,7 @@ def seen(at, met):
     off = np.array(POST) - np.column_stack([at, np.zeros(len(at))])
     along = off @ directions.T
     depth = RADIUS**2 - ((off**2).sum(axis=1)[:, None] - along**2)
-    on = (depth > 0) & (along > 0) & np.asarray(met)[:, None]
+    on = (depth > 0) & (along > 0) & np.asarray(hit_mask)[:, None]
     ranges = np.where(on, along - np.sqrt(np.maximum(depth, 0)), ranges)
     T = np.tile(np.eye(3), (len(at), 1, 1))
     T[:, 0, 2] = at
@@ -43,9 +43,9 @@ def seen(at, met):
     return recording, T, on.ravel()
 
 
-def labels(at, met):
+def labels(at, hit_mask):
     """(M,) p_static in the loop and in the last E-step, and which beams end on the post."""
-    recording, T, on = seen(at, met)
+    recording, T, on = seen(at, hit_mask)
     loop = em.e_step(recording, T, _core.OccupancyGrid2D(0.05), "stillmap", em.EmOptions(), 1)
     last, histories = em.final_e_step(recording, T, 0.05, em.EmOptions())
     assert on.sum() > 5
@@ -54,16 +54,16 @@ def labels(at, met):
 
 
 def by_views(at, turn=0.25):
-    """From half of the views something is met: pieces of the angle under which it is seen."""
+    """Hits from half of the views, in sectors of the viewing angle."""
     angle = np.arctan2(POST[1], POST[0] - np.asarray(at))
     return np.floor(angle / turn) % 2 == 1
 
 
-ROUNDS = 5.0 + 4.0 * np.sin(np.linspace(0, 6 * np.pi, LOOKS))
+ROUNDS = 5.0 + 4.0 * np.sin(np.linspace(0, 6 * np.pi, SCANS))
 
 
 @pytest.mark.parametrize("turn", [0.25, 0.4, 0.6])
-def test_a_thing_that_is_met_from_some_places_stands_still(turn):
+def test_view_dependent_surface_is_static(turn):
     loop, last, on = labels(ROUNDS, by_views(ROUNDS, turn))
     assert np.median(last[on]) > 0.9
     assert np.median(loop[on]) < 0.1
@@ -71,17 +71,17 @@ def test_a_thing_that_is_met_from_some_places_stands_still(turn):
     assert np.quantile(last[wall], 0.05) > 0.9
 
 
-@pytest.mark.parametrize("at", [np.full(LOOKS, 2.0), ROUNDS], ids=["stands", "moves"])
-def test_who_passes_is_a_passer_by(at):
-    met = (np.arange(LOOKS) >= 30) & (np.arange(LOOKS) < 34)
-    _, last, on = labels(at, met)
+@pytest.mark.parametrize("at", [np.full(SCANS, 2.0), ROUNDS], ids=["stands", "moves"])
+def test_passers_by_are_dynamic(at):
+    hit_mask = (np.arange(SCANS) >= 30) & (np.arange(SCANS) < 34)
+    _, last, on = labels(at, hit_mask)
     assert np.median(last[on]) < 0.1
 
 
-def test_what_comes_and_goes_before_a_sensor_that_stands_moves():
-    at = np.full(LOOKS, 2.0)
-    met = np.random.default_rng(1).random(LOOKS) < 0.5
-    loop, last, on = labels(at, met)
+def test_alternation_before_a_standing_sensor_is_dynamic():
+    at = np.full(SCANS, 2.0)
+    hit_mask = np.random.default_rng(1).random(SCANS) < 0.5
+    loop, last, on = labels(at, hit_mask)
     assert np.median(loop[on]) < 0.1
     assert np.median(last[on]) < 0.1
 
@@ -102,11 +102,11 @@ def test_without_view_classes_no_history_knows_of_them(views, monkeypatch):
 
 APART = 1.2  # m, of two lasers
 # for seconds, half of the time
-COMES_AND_GOES = np.logical_xor.accumulate(np.random.default_rng(2).random(4 * LOOKS) < 0.15)
+COMES_AND_GOES = np.logical_xor.accumulate(np.random.default_rng(2).random(4 * SCANS) < 0.15)
 
 
-def test_who_stands_with_two_lasers_stands():
-    """They look in turn, three scans to a look: once or twice from the second laser."""
+def test_two_lasers_do_not_turn_the_view():
+    """They scan by turns, three scans to a time bin: one or two of the second laser."""
     at = np.full(3 * len(COMES_AND_GOES), 2.0)
     second = np.arange(len(at)) % 2 == 1
     recording, _, on = seen(at + APART * second, np.repeat(COMES_AND_GOES, 3))
@@ -124,8 +124,8 @@ def test_who_stands_with_two_lasers_stands():
     assert np.median(last.p_static[on]) < 0.1
 
 
-def test_labels_know_neither_crowds_nor_who_waits_nor_what_comes_often():
-    """A chair that a robot passes looks like them."""
+def test_label_classes_leave_out_crowds_waiting_and_half_time():
+    """A chair that a robot passes resembles them."""
     rho, tau, _ = (np.array(values) for values in module._FINAL_CLASSES.grid())
     n_static = module._FINAL_CLASSES.n_static
     kept = module._label_classes(SimpleNamespace(rho=rho, tau=tau, n_static=n_static))

@@ -30,7 +30,7 @@ def way_over(height, sensor=1.5):
 
 
 @pytest.mark.parametrize("height", [0.0, -30.0])
-def test_a_slope_is_followed_and_tables_are_none_of_it(height):
+def test_slopes_are_followed_and_tables_left_out(height):
     means, normals, table = floor_with_tables(np.random.default_rng(0), height)
     ground = fit_ground(level(means, normals), way_over(height))
     assert ground.observed
@@ -41,7 +41,7 @@ def test_a_slope_is_followed_and_tables_are_none_of_it(height):
     assert np.abs(below - 0.8).max() < 0.1
 
 
-def test_walls_tell_nothing_of_the_ground():
+def test_walls_are_no_ground():
     rng = np.random.default_rng(1)
     means = rng.uniform([-5, 3, 0], [25, 3.1, 3], (500, 3))
     ground = fit_ground(level(means, np.tile([0.0, 1.0, 0.0], (500, 1))), way_over(0.0))
@@ -50,7 +50,7 @@ def test_walls_tell_nothing_of_the_ground():
     assert np.isfinite(ground.height).all()
 
 
-def test_beyond_the_edge_it_is_that_of_the_edge():
+def test_height_outside_is_that_of_the_edge():
     means, normals, _ = floor_with_tables(np.random.default_rng(2))
     ground = fit_ground(level(means, normals), way_over(0.0))
     far = ground.height_at(np.array([[1e4, 0.0], [-1e4, 0.0]]))

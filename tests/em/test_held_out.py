@@ -38,7 +38,7 @@ def figure(sim, e=None, poses=None, recording=None, every=EVERY, **more):
     return em.score_held_out_scans(recording, poses, e, RESOLUTION, every, **more)
 
 
-def test_true_labels_and_poses_foresee_best(room):
+def test_true_labels_and_poses_score_best(room):
     static, T = room.truth.static, room.truth.T_world_base
     rng = np.random.default_rng(0)
     e = static.astype(np.float32)
@@ -73,7 +73,7 @@ def test_which_scans(every):
     assert 0 < np.flatnonzero(held)[0] < every
 
 
-def test_no_figure_where_there_is_nothing_to_hold_out(room):
+def test_no_score_without_held_out_scans(room):
     assert figure(room, every=0) is None
     assert figure(room, every=121) is None
     assert figure(room, every=120) is not None

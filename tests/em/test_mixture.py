@@ -36,7 +36,7 @@ def test_no_iteration_lowers_the_likelihood(seed, start):
     assert values[-1] > values[0] + 0.1
 
 
-def test_known_shares_are_found():
+def test_known_weights_are_found():
     true = np.array([0.45, 0.3, 0.2, 0.05])
     likelihood, kind = members(np.random.default_rng(1), true, 40000, spread=2.5)
     found = fit_weights(likelihood, N_STATIC, 0.5)
@@ -51,7 +51,7 @@ def test_known_shares_are_found():
         assert p[these].mean() == pytest.approx((kind[these] < N_STATIC).mean(), abs=0.04)
 
 
-def test_it_stops_when_nothing_is_gained():
+def test_stops_when_nothing_is_gained():
     likelihood, _ = members(np.random.default_rng(3), [0.5, 0.2, 0.2, 0.1], 500)
     enough, more = (
         fit_weights(likelihood, N_STATIC, 0.5, max_iterations=n, tolerance=1e-4) for n in (200, 400)
@@ -63,7 +63,7 @@ def test_it_stops_when_nothing_is_gained():
 
 
 @pytest.mark.parametrize("start", [0.3, 0.9])
-def test_without_members_it_knows_what_it_was_told(start):
+def test_without_rows_the_initial_weight_stays(start):
     found = fit_weights(np.zeros((0, 4), np.float32), N_STATIC, start)
     assert found.static == pytest.approx(start)
     assert found.classes.sum() == pytest.approx(1.0)
@@ -72,7 +72,7 @@ def test_without_members_it_knows_what_it_was_told(start):
 
 
 @pytest.mark.parametrize("sure", range(4))
-def test_members_all_of_one_kind(sure):
+def test_rows_of_one_class(sure):
     likelihood = np.full((1, 4), 1e-30, np.float32)
     likelihood[0, sure] = 1.0
     found = fit_weights(np.repeat(likelihood, 50, axis=0), N_STATIC, 0.5)
@@ -84,7 +84,7 @@ def test_members_all_of_one_kind(sure):
     assert (posterior_static(likelihood, found.classes, N_STATIC)[0] > 0.5) == static
 
 
-def test_a_member_that_says_nothing_keeps_the_start():
+def test_uninformative_row_keeps_the_initial_weight():
     found = fit_weights(np.ones((1, 4), np.float32), N_STATIC, 0.3)
     assert found.static == pytest.approx(0.3, abs=1e-9)
     assert found.log_likelihood == pytest.approx(0.0, abs=1e-9)

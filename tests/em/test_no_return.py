@@ -25,14 +25,14 @@ def room_with(beams=181, seconds=20):
 
 
 def known(seen, threads=1):
-    """The map, what looks up values at points, and how far rows of lost beams are trusted."""
+    """The map, look-ups of values at points, and the trust in beams without a return."""
     found = seen.e_step()
     grid = _core.OccupancyGrid2D(RESOLUTION)
     e, no_return = found.p_static, found.no_return
-    told = em.add_trusted_beams(grid, seen.recording, seen.poses, e, no_return, threads)
+    observed = em.add_trusted_beams(grid, seen.recording, seen.poses, e, no_return, threads)
     for a, b in zip(grid.dense(), seen.grid(e).dense(), strict=True):
         np.testing.assert_array_equal(a, b)
-    m = em.make_occupancy_map(grid, found.occupied, told)
+    m = em.make_occupancy_map(grid, found.occupied, observed)
     first = np.round(np.array(m.origin[:2]) / RESOLUTION)
 
     def p_occupied(*points):
@@ -47,7 +47,7 @@ def known(seen, threads=1):
     return p_occupied, beta, found.learned["no_return_trusted"], m
 
 
-def test_a_lone_lost_beam_shows_nothing():
+def test_a_lone_beam_without_return_shows_nothing():
     seen = room_with()
     p_occupied, beta, _, _ = known(with_lost(seen, np.arange(len(seen.what)) % 181 == 90))
     assert np.isnan(p_occupied((5.05, 0.05), (20.05, 0.05))).all()
@@ -56,8 +56,8 @@ def test_a_lone_lost_beam_shows_nothing():
     assert p_occupied((4.05, 0.35)) > 0.8
 
 
-def test_a_row_into_the_open_shows_free_space():
-    # a wall on one side only: all else looks into the open
+def test_neighbouring_beams_show_free_space_in_the_open():
+    # a wall on one side only: all other beams are in the open
     seen = watch([Wall((0, 1), 3.0)], 20)
     p_occupied, beta, trust, _ = known(seen)
     assert trust > 0.9
@@ -68,8 +68,8 @@ def test_a_row_into_the_open_shows_free_space():
     assert beta((29.85, 0.05)) > 0
 
 
-def test_a_row_shows_nothing_behind_a_wall():
-    # a few rows get lost where a wall was seen, most look into the open
+def test_neighbouring_beams_show_nothing_behind_a_wall():
+    # a few beams miss their return at the wall, most are in the open
     seen = watch([Wall((1, 0), 4.0, width=0.6), Wall((0, 1), 3.0)], 40)
     scan, beam = np.divmod(np.arange(len(seen.what)), 181)
     p_occupied, beta, trust, _ = known(with_lost(seen, (scan % 20 == 3) & (np.abs(beam - 90) < 4)))
@@ -79,8 +79,8 @@ def test_a_row_shows_nothing_behind_a_wall():
     assert p_occupied((20.05, -5.05)) < 0.1
 
 
-def test_where_walls_swallow_beams_rows_show_nothing_at_all():
-    # glass: half of the looks at the wall ahead are lost in it, and those beside it in the gap too
+def test_nothing_is_shown_where_walls_swallow_beams():
+    # glass: half of the beams on the wall ahead have no return, as those in the gap beside it
     seen = watch([Wall((1, 0), 4.0, width=2.0), Wall((0, 1), 3.0), Wall((0, -1), 3.0)], 40)
     scan, beam = np.divmod(np.arange(len(seen.what)), 181)
     p_occupied, beta, trust, _ = known(with_lost(seen, (scan % 2 == 0) & (np.abs(beam - 90) < 24)))
@@ -94,7 +94,7 @@ def test_where_walls_swallow_beams_rows_show_nothing_at_all():
 
 @pytest.mark.parametrize("threads", [1, 3])
 @pytest.mark.parametrize("beams", [1, 500])
-def test_pieces_and_threads_change_no_bit(monkeypatch, threads, beams):
+def test_chunks_and_threads_change_no_bit(monkeypatch, threads, beams):
     seen = room_with()
     lost = np.random.default_rng(1).random(len(seen.what)) < 0.2
     seen = with_lost(seen, lost)
@@ -104,7 +104,7 @@ def test_pieces_and_threads_change_no_bit(monkeypatch, threads, beams):
 
 
 @pytest.mark.parametrize("estimator", ["paper", "hit-ratio", "tracker"])
-def test_others_believe_every_beam(estimator):
+def test_other_estimators_count_every_beam(estimator):
     seen = room_with()
     found = seen.e_step(estimator=estimator)
     assert found.no_return is None

@@ -30,7 +30,7 @@ def odds_after(length):
 
 
 @pytest.mark.parametrize("p", [0.0, 0.3, 1.0])
-def test_a_cell_is_occupied_by_what_stays_or_as_free_as_it_looks(p):
+def test_surfaces_are_added_to_passed_cells(p):
     m = laid_out([p], [(3, 0)], hits=4)
     row, column = -round(m.origin[1]), -round(m.origin[0])
     lane = m.p_occupied[row, column : column + 5]
@@ -43,7 +43,7 @@ def test_a_cell_is_occupied_by_what_stays_or_as_free_as_it_looks(p):
     np.testing.assert_array_equal(np.isnan(m.p_occupied), ~known)
 
 
-def test_nothing_known_is_nothing_occupied():
+def test_empty_grid():
     m = em.make_occupancy_map(
         _core.OccupancyGrid2D(1.0),
         em.CellProbabilities(np.zeros((0, 2), np.int64), np.zeros(0, "f4"), 0.2),
@@ -100,7 +100,7 @@ def around(m, x, y, cells=2):
 
 
 @pytest.mark.parametrize("y", [0.05, -1.25])
-def test_noise_beside_a_thing_is_not_the_thing(y):
+def test_range_noise_fills_no_cells(y):
     post = Ball(2.08, y, 0, 60, radius=0.03)
     seen = watch([Wall((1, 0), 4.05), post], 60, fan(721, 90), noise=0.025)
     found = seen.e_step(RESOLUTION)
@@ -130,7 +130,7 @@ def test_thin_posts_stay(x, y, radius):
     assert np.median(ends) > 0.8
 
 
-def test_movers_leave_the_floor_free():
+def test_floor_under_movers_is_free():
     seen, moves, m = a_room_with(4.05)
     ends = seen.recording.points[moves]
     assert (at(m, ends) < 0.3).mean() > 0.97
@@ -142,7 +142,7 @@ def test_movers_leave_the_floor_free():
     assert np.isfinite(m.p_occupied[m.alpha + m.beta > 0]).all()
 
 
-def test_without_more_knowledge_it_is_15():
+def test_without_cell_probabilities_it_is_15():
     seen = watch([Wall((1, 0), 4.05)], 5)
     m = em.make_occupancy_map(seen.grid())
     known = m.alpha + m.beta > 0
@@ -153,7 +153,7 @@ def test_without_more_knowledge_it_is_15():
 
 
 @pytest.mark.parametrize("printed", [False, True])
-def test_a_part_of_a_map_is_what_the_whole_has_there(printed, monkeypatch):
+def test_windows_and_tiles_equal_the_whole(printed, monkeypatch):
     grid = watch([Wall([1.0, 0.0], 3.0)], 6.0, fan()).grid(None, RESOLUTION)
     occupied = None
     if not printed:

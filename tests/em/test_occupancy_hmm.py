@@ -19,7 +19,7 @@ BALL = len(WALLS)  # the number of the first ball
 
 
 def passing(since, x=1.5, speed=1.0):
-    """Walks past along y, each look in another place."""
+    """Walks past along y, a metre per second."""
     return [Ball(x, -2.4 + speed * k, since + k, since + k + 1) for k in range(int(4.8 / speed))]
 
 
@@ -34,19 +34,19 @@ def known(busy):
     return busy.e_step()
 
 
-def test_a_wall_that_always_stood_there_is_static(busy, known):
+def test_walls_are_static(busy, known):
     e = busy.of(known.p_static, 0, 1, 2)
     assert np.median(e) > 0.99
     assert np.quantile(e, 0.02) > 0.9
 
 
-def test_who_walks_past_is_not(busy, known):
+def test_walkers_are_dynamic(busy, known):
     e = busy.of(known.p_static, *range(BALL, BALL + 4))
     assert len(e) > 30
     assert e.max() < 0.1
 
 
-def test_who_stands_for_a_while_and_leaves_is_not(busy, known):
+def test_standing_then_leaving_is_dynamic(busy, known):
     e = busy.of(known.p_static, BALL + 4)
     assert len(e) > 100
     assert np.median(e) < 0.05
@@ -54,13 +54,13 @@ def test_who_stands_for_a_while_and_leaves_is_not(busy, known):
 
 
 @pytest.mark.parametrize(("since", "until"), [(0, 25), (65, 90)])
-def test_who_was_there_at_the_beginning_or_stays_to_the_end_is_not(since, until):
+def test_present_at_the_start_or_the_end_is_dynamic(since, until):
     seen = watch([*WALLS, *passing(30), Ball(2.5, 1.0, since, until)], seconds=90)
     e = seen.of(seen.e_step().p_static, BALL + 4)
     assert np.median(e) < 0.2
 
 
-def test_what_it_learned(busy, known):
+def test_fitted_parameters(busy, known):
     hit = busy.what >= 0
     cells = np.floor(busy.recording.points[hit] / RESOLUTION).astype(int)
     _, cell = np.unique(cells, axis=0, return_inverse=True)
@@ -71,8 +71,8 @@ def test_what_it_learned(busy, known):
         assert sum(row["share"] for row in known.learned[name]) == pytest.approx(1, abs=1e-4)
 
 
-def test_who_was_seen_once_and_nothing_before_or_after_is_anybodys_guess():
-    # in the last look alone the sensor turns round, and sees another wall and somebody
+def test_a_single_observation_has_the_prior():
+    # in the last scan the sensor turns round, and sees another wall and somebody
     u = fan()
     behind = [Wall((-1, 0), 5.0), Ball(-2.0, 1.0, 0, 90)]
     seen = watch([*WALLS, *passing(30), *behind], 60, lambda t: u if t < 59 else -u)
@@ -83,7 +83,7 @@ def test_who_was_seen_once_and_nothing_before_or_after_is_anybodys_guess():
     assert np.ptp(found.p_static) > 0.9
 
 
-def test_maximum_range_tells_the_prior_and_unusable_nothing(busy):
+def test_labels_of_maximum_range_and_unusable_beams(busy):
     r = busy.recording
     points, hit = r.points.copy(), r.hit.copy()
     points[50:60], hit[50:60] = np.nan, False
@@ -97,7 +97,7 @@ def test_maximum_range_tells_the_prior_and_unusable_nothing(busy):
 
 
 @pytest.mark.parametrize("slant", [70, 80, 85])
-def test_a_wall_at_a_slant_that_beams_graze_stays(slant):
+def test_slanted_walls_are_static(slant):
     # each beam passes close by all of the wall before the place where it ends
     distance = 6 * np.cos(np.radians(slant))  # this far away under the slant
     u = fan(161, width=2 * (90 - slant + 6))
@@ -109,7 +109,7 @@ def test_a_wall_at_a_slant_that_beams_graze_stays(slant):
     assert np.quantile(e, 0.05) > 0.9
 
 
-def test_a_corner_that_beams_pass_closely_stays():
+def test_corners_are_static():
     # the end of a wall: beside it beams go on, within a cell of its last end points
     seen = watch([Wall((1, 0), 2.0, width=0.53), *WALLS, *passing(30)], 60, fan(361))
     e = seen.of(seen.e_step().p_static, 0)
@@ -132,7 +132,7 @@ def rows(seen, x, y, radius):
     return {tuple(c): v for c, v in zip(cells[near].tolist(), values[near], strict=True)}
 
 
-def test_people_far_apart_do_not_help_each_other():
+def test_cells_are_independent():
     alone = Ball(2.0, 1.2, 10, 20)
     other = Ball(2.0, -1.2, 20, 60)
     one = rows(watch([*WALLS, alone], 60), 2.0, 1.2, 0.5)
@@ -143,7 +143,7 @@ def test_people_far_apart_do_not_help_each_other():
         np.testing.assert_array_equal(row, both[cell])
 
 
-def test_companions_of_the_same_look_do_not_vote(busy, known):
+def test_beams_of_one_time_bin_are_one_observation(busy, known):
     r = busy.recording
     twice = replace(
         r, points=np.repeat(r.points, 2, axis=0), hit=np.repeat(r.hit, 2), offset=2 * r.offset
@@ -153,7 +153,7 @@ def test_companions_of_the_same_look_do_not_vote(busy, known):
     np.testing.assert_array_equal(found.p_static[::2], found.p_static[1::2])
 
 
-def test_a_look_may_be_many_scans(busy, known):
+def test_a_time_bin_may_span_scans(busy, known):
     r = busy.recording
     offset = np.unique(np.concatenate([r.offset, (r.offset[1:] + r.offset[:-1]) // 2]))
     split = replace(
@@ -168,7 +168,7 @@ def test_a_look_may_be_many_scans(busy, known):
 
 
 @pytest.mark.parametrize("beams", [1, 1000, 5000])
-def test_pieces_and_threads_change_no_bit(busy, known, monkeypatch, beams):
+def test_chunks_and_threads_change_no_bit(busy, known, monkeypatch, beams):
     monkeypatch.setattr(chunks, "CHUNK_BEAMS", beams)
     for threads in (1, 3):
         options = em.EmOptions()
@@ -179,7 +179,7 @@ def test_pieces_and_threads_change_no_bit(busy, known, monkeypatch, beams):
         assert found.learned == known.learned
 
 
-def test_where_it_begins_does_not_matter(busy, known):
+def test_invariant_to_stamp_and_map_origin(busy, known):
     # stamps and the place of the map are only conventions
     r = busy.recording
     later = replace(busy, recording=replace(r, stamp_ns=r.stamp_ns + 123 * 10**15))
@@ -190,7 +190,7 @@ def test_where_it_begins_does_not_matter(busy, known):
     np.testing.assert_allclose(found.p_static, known.p_static, atol=0.02)
 
 
-def test_the_bound_is_above_the_expectation_and_prefers_true_poses(busy, known):
+def test_the_bound_prefers_true_poses(busy, known):
     assert known.likelihood.bound > known.likelihood.expected
     rng = np.random.default_rng(0)
     shaken = busy.poses
@@ -206,7 +206,7 @@ def test_options_reach_it(busy, known, options):
     assert np.median(busy.of(found.p_static, 0, 1, 2)) > 0.9
 
 
-def test_the_same_in_space():
+def test_3d():
     wall, ball = Wall((1, 0, 0), 4.1), Ball(2.0, 0.3, 15, 25, radius=0.5)
     seen = watch([wall, ball], 40, cone())
     found = seen.e_step(resolution=0.3)
@@ -217,7 +217,7 @@ def test_the_same_in_space():
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_nothing_hit_is_as_static_as_the_prior_says(dimension):
+def test_without_hits_labels_are_the_prior(dimension):
     seen = watch([], 10, fan() if dimension == 2 else cone(5))
     found = seen.e_step(prior=0.8)
     np.testing.assert_array_equal(found.p_static, np.float32(0.8))
@@ -247,7 +247,7 @@ def crowd():
     return simulate(scene, np.random.default_rng(7))
 
 
-def test_it_knows_how_sure_it_is(crowd):
+def test_labels_are_calibrated(crowd):
     r = crowd.recording
     found = occupancy_hmm.e_step(r, crowd.truth.T_world_base, 0.05, em.EmOptions())
     p, static = found.p_static[r.hit].astype(float), crowd.truth.static[r.hit]

@@ -43,7 +43,7 @@ def test_in_the_frame_of_the_map():
         ((3.0, 0.0, 0.2), (1.5, 0.12, 0.1)),  # half behind something, which is a feature itself
     ],
 )
-def test_what_is_no_leg(things):
+def test_segments_that_are_no_legs(things):
     seen = found(before(wall(), *things))
     hidden = len(things) == 2
     assert len(seen.scan) == int(hidden)
@@ -51,7 +51,7 @@ def test_what_is_no_leg(things):
         np.testing.assert_allclose(seen.xy, [(1.42, 0.12)], atol=0.05)
 
 
-def test_corners_and_edges_are_none():
+def test_corners_and_edges_are_no_detections():
     wide = wall()
     corner = np.minimum(wide, 2.0 / np.maximum(np.sin(np.abs(ANGLES)), 1e-9))  # a corridor's end
     outer = np.where(ANGLES > 0.1, 3.0 / np.cos(ANGLES - 0.1), wide)  # a wall that ends
@@ -60,7 +60,7 @@ def test_corners_and_edges_are_none():
         assert len(found(ranges).scan) == 0
 
 
-def test_what_a_scan_begins_or_ends_with_is_none():
+def test_segments_at_the_end_of_a_scan_are_no_detections():
     ranges = wall()
     ranges[:3] = ranges[-3:] = 2.0
     assert len(found(ranges).scan) == 0
@@ -72,7 +72,7 @@ def test_what_a_scan_begins_or_ends_with_is_none():
     assert len(found(inside).scan) == 1
 
 
-def test_before_nothing_and_beside_unusable_beams():
+def test_detections_beside_missing_and_unusable_beams():
     ranges = np.full(len(ANGLES), np.inf)
     ranges[90:94] = 3.0
     assert len(found(ranges).scan) == 1
@@ -93,7 +93,7 @@ def test_the_limits_of_a_segment(monkeypatch):
 
 
 @pytest.mark.parametrize("way", [1, -1])
-def test_a_place_that_was_seen_through(way, monkeypatch):
+def test_positions_that_were_free(way, monkeypatch):
     interval(monkeypatch, 1.0)
     pillar = (3.0, 1.0, 0.2)
     scans = [before(wall(), pillar, (3.0, -1.0, 0.2))] + 9 * [before(wall(), pillar)]
@@ -119,7 +119,7 @@ def test_before_or_after_is_enough(monkeypatch):
         assert find_changed(r, poses(r), seen).tolist() == said
 
 
-def test_a_post_that_most_beams_miss_has_not_gone(monkeypatch):
+def test_a_thin_post_that_beams_miss_is_not_changed(monkeypatch):
     interval(monkeypatch, 1.0)
     monkeypatch.setattr(detector, "_MIN_SEGMENT_WIDTH", 0.08)
     thick, thin = wall(), wall()
@@ -130,7 +130,7 @@ def test_a_post_that_most_beams_miss_has_not_gone(monkeypatch):
         assert find_changed(r, poses(r), seen).tolist() == said
 
 
-def test_what_is_not_in_view_has_not_gone(monkeypatch):
+def test_out_of_view_is_not_changed(monkeypatch):
     interval(monkeypatch, 1.0)
     r = recording([before(wall(), (3.0, 0.0, 0.2)), wall()], seconds=[0.0, 1.5])
     for turned, said in ((0.0, True), (np.radians(80), True), (np.radians(120), False)):
@@ -139,7 +139,7 @@ def test_what_is_not_in_view_has_not_gone(monkeypatch):
         assert find_changed(r, T, seen).tolist() == [said]
 
 
-def test_only_the_same_laser_says_so(monkeypatch):
+def test_only_scans_of_the_same_laser_are_compared(monkeypatch):
     interval(monkeypatch, 1.0)
     scans = [before(wall(), (3.0, -1.0, 0.2)), wall()]
     for sensors, said in (((0, 0), True), ((0, 1), False)):

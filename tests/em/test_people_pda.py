@@ -27,14 +27,14 @@ def at(*xy):
     return np.array(xy, float).reshape(-1, 2)
 
 
-def test_one_feature():
+def test_one_detection():
     beta = tracker.association_probabilities(tracks((0, 0)), at((0.2, 0)))
     G = PEAK * np.exp(-0.5)
     assert beta == pytest.approx(np.array([[G / (G + NONE)]]))
     assert beta[0, 0] == pytest.approx(0.9975, abs=1e-4)
 
 
-def test_two_features_and_none():
+def test_two_detections_and_none():
     beta = tracker.association_probabilities(tracks((0, 0)), at((0.2, 0), (0, -0.4), (0.61, 0)))
     G = PEAK * np.exp([-0.5, -2.0])
     assert beta[0, :2] == pytest.approx(G / (G.sum() + NONE))
@@ -42,7 +42,7 @@ def test_two_features_and_none():
     assert tracker.gate(tracks((0, 0)), at((0.59, 0), (0.61, 0))).tolist() == [[True, False]]
 
 
-def test_a_feature_between_two_tracks_is_shared():
+def test_a_detection_between_two_tracks_is_shared():
     two = tracker.association_probabilities(tracks((0, 0), (0.4, 0)), at((0.2, 0)))
     G = PEAK * np.exp(-0.5)
     assert two[:, 0] == pytest.approx(G / (2 * G + NONE))
@@ -53,7 +53,7 @@ def test_a_feature_between_two_tracks_is_shared():
     assert own.sum(axis=1).max() < 1.0
 
 
-def test_one_certain_feature_is_a_kalman_update():
+def test_one_certain_detection_is_a_kalman_update():
     motion = tracks((0, 0), (5, 5))
     seen, where = np.array([True, True]), at((0.2, 0.1), (5.1, 4.9))
     theirs = kalman.update(motion, seen, where, 0.1)
@@ -62,7 +62,7 @@ def test_one_certain_feature_is_a_kalman_update():
         np.testing.assert_allclose(getattr(ours, name), getattr(theirs, name), atol=1e-12)
 
 
-def test_without_features_the_prediction_stays():
+def test_without_detections_the_prediction_stays():
     motion = tracks((0, 0), (5, 5))
     for where in (at(), at((9, 9))):
         after = tracker.update_pda(motion, where, tracker.association_probabilities(motion, where))
@@ -86,7 +86,7 @@ def test_mean_innovation_and_its_spread():
     assert one_side.P[0, 0] < after.P[0, 0]
 
 
-def test_of_nothing():
+def test_no_tracks():
     none = tracks()
     assert tracker.association_probabilities(none, at((1, 1))).shape == (0, 1)
     assert len(tracker.update_pda(none, at((1, 1)), np.zeros((0, 1)))) == 0

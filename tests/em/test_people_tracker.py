@@ -26,7 +26,7 @@ def tracks_of(r):
     return track_people(found, np.ones(len(found.scan), bool), seconds)
 
 
-def test_a_walker_is_dropped_from_the_first_scan_and_walls_stay():
+def test_walkers_are_labelled_from_the_first_scan():
     ranges, on = crossing(TIMES, pillar=PILLAR)
     off = labelled(recording(ranges))
     assert off[on].mean() > 0.95
@@ -34,7 +34,7 @@ def test_a_walker_is_dropped_from_the_first_scan_and_walls_stay():
     assert not off[~on].any()  # wall and pillar are far from him
 
 
-def test_what_stands_is_never_labelled():
+def test_standing_objects_are_not_labelled():
     ranges = np.tile(before(wall(), PILLAR, (3.0, 0.0, 0.2)), (20, 1))
     rng = np.random.default_rng(0)
     assert not labelled(recording(ranges + rng.normal(scale=0.02, size=ranges.shape))).any()
@@ -81,7 +81,7 @@ def test_only_hits_are_labelled(monkeypatch):
     assert find_beams_in_boxes(r, poses(r), somebody).nonzero()[0].tolist() == [90]
 
 
-def test_a_track_goes_on_while_somebody_is_hidden_and_ends_where_he_was_last_seen():
+def test_tracks_bridge_occlusion_and_end_at_the_last_detection():
     ranges, _ = crossing(TIMES)
     hidden = ranges.copy()
     hidden[7:10] = wall()
@@ -94,7 +94,7 @@ def test_a_track_goes_on_while_somebody_is_hidden_and_ends_where_he_was_last_see
     assert np.abs(tracks.xy[:, 1] - y).max() < 0.35
 
 
-def test_two_who_cross():
+def test_crossing_walkers():
     one, on_one = crossing(TIMES, x=3.0)
     two, on_two = crossing(TIMES, speed=-1.2, x=4.0, start=2.0)
     off = labelled(recording(np.minimum(one, two)))
@@ -111,7 +111,7 @@ def test_a_large_gap_ends_all_tracks(gap):
     assert off[on].mean() > 0.9
 
 
-def test_stamps_that_repeat_or_come_at_random():
+def test_repeated_and_irregular_stamps():
     ranges, on = crossing(TIMES)
     twice = recording(np.repeat(ranges, 2, axis=0), np.repeat(TIMES, 2))
     assert labelled(twice)[np.repeat(on, 2, axis=0)].mean() > 0.9
@@ -120,7 +120,7 @@ def test_stamps_that_repeat_or_come_at_random():
     assert labelled(recording(ranges, times))[on].mean() > 0.9
 
 
-def test_next_to_nothing():
+def test_degenerate_recordings():
     ranges, _ = crossing(TIMES)
     one = recording(ranges[:1])
     assert not labelled(one).any()
@@ -146,7 +146,7 @@ def e_step(r, threads=1, **options):
     return em.e_step(r, poses(r), grid, "tracker", chosen, threads=threads)
 
 
-def test_labels_are_hard_and_the_map_counts_the_rest():
+def test_labels_are_hard_and_the_map_counts_the_others():
     ranges, _ = crossing(TIMES, pillar=PILLAR)
     ranges[:, 170] = np.inf
     ranges[:, 175] = np.nan
@@ -184,7 +184,7 @@ def test_the_same_to_the_bit_with_any_number_of_threads():
         assert again.occupied.p_occupied.tobytes() == first.occupied.p_occupied.tobytes()
 
 
-def test_two_iterations_that_begin_with_all_believed():
+def test_two_iterations_from_all_static():
     r = recording(wall())
     assert em.max_iterations("tracker", em.EmOptions()) == 2
     assert em.max_iterations("tracker", em.EmOptions(max_iterations=1)) == 1

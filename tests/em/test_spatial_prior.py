@@ -55,7 +55,7 @@ def standing(*things, scans=3):
 
 
 def labelled(surface, moving):
-    """P(static) of elements whose means are known to move, and of others."""
+    """P(static) of surfels, low where `moving` says so."""
     means = surface.surfels()[1]
     return np.where(moving(means), 0.02, 0.99).astype(np.float32), means
 
@@ -72,7 +72,7 @@ def front(means):
     return (means[:, 0] > 4.0) & (means[:, 1] > 1.9) & (means[:, 2] > 0.2)
 
 
-def test_the_rest_of_a_car_goes_with_its_front_and_nothing_else_does():
+def test_a_cluster_follows_its_dynamic_part():
     recording, T, surface = standing(CAR, OTHER, WALL)
     p, means = labelled(surface, front)
     found = pooled(surface, p, 0 * p, recording, T)
@@ -82,7 +82,7 @@ def test_the_rest_of_a_car_goes_with_its_front_and_nothing_else_does():
     assert (p[car] > 0.5).mean() > 0.4  # before
 
 
-def test_what_all_of_it_says_a_little_it_says_loudly():
+def test_weak_evidence_of_all_surfels_adds_up():
     recording, T, surface = standing(CAR, OTHER, WALL)
     p, means = labelled(surface, lambda means: np.zeros(len(means), bool))
     car = (means[:, 0] > 1.9) & (means[:, 1] > 1.9) & (means[:, 2] > 0.25)
@@ -96,13 +96,13 @@ def test_what_all_of_it_says_a_little_it_says_loudly():
     np.testing.assert_array_equal(calm, p)
 
 
-def test_too_little_of_it_moves():
+def test_small_dynamic_parts_do_not_move_a_cluster():
     recording, T, surface = standing(CAR)
     p, _ = labelled(surface, lambda means: front(means) & (means[:, 0] > 5.5))
     np.testing.assert_array_equal(pooled(surface, p, 0 * p, recording, T), p)
 
 
-def test_who_touches_a_wall_leaves_it_there():
+def test_a_person_at_a_wall_does_not_move_it():
     person = box(0.0, -4.9, 0.4, width=0.3, height=1.8)
     recording, T, surface = standing(WALL, person)
     p, _ = labelled(
@@ -112,7 +112,7 @@ def test_who_touches_a_wall_leaves_it_there():
     np.testing.assert_array_equal(pooled(surface, p, 0 * p, recording, T), p)
 
 
-def test_left_out_without_ground():
+def test_no_obstacles_without_ground():
     _, _, surface = standing(CAR)
     assert select_obstacles(dataclasses.replace(FLAT, observed=False), surface) is None
 
@@ -136,7 +136,7 @@ def test_the_clearance_follows_from_the_noise_of_end_points(monkeypatch):
         assert make_ground_contact(obstacles, p).min_end_height == expected
 
 
-def test_ground_under_what_stands_still():
+def test_ground_from_static_surfels():
     _, T, surface = standing(CAR)
     T[:, :3, 3] = [0.0, 0.0, 1.8]
     means = surface.surfels()[1]
@@ -149,7 +149,7 @@ def test_ground_under_what_stands_still():
     assert not unknown.observed or unknown.sensor_height < 1.0  # roofs at most
 
 
-def test_how_far_it_is_lowered(monkeypatch):
+def test_pooled_log_odds(monkeypatch):
     monkeypatch.setattr(spatial_prior, "_POOLED_P_DYNAMIC", 0.25)
     p = np.array([0.9, 0.9, 0.9, 0.9, 0.3, 0.9, 0.52, 0.9, 0.9, 0.001], np.float32)
     moves = [np.nan, 0.2, 0.3, 1.0, 1.0, 0.25, 0.251, 0.0, 0.3, 1.0]

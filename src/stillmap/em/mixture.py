@@ -53,7 +53,7 @@ def fit_weights(
     weights[n_static:] = (1.0 - initial_static) / (C - n_static)
     last = -np.inf
     for _ in range(max_iterations):
-        evidence = np.einsum("kc,c->k", rows, weights)
+        evidence = np.einsum("kc,c->k", rows, weights)  # sum_c w_c L_kc
         log_likelihood = float(np.sum(np.log(evidence))) / max(len(rows), 1)
         counts = weights * np.einsum("kc,k->c", rows, 1.0 / evidence)  # expected rows per class
         weights = _normalize(counts, n_static, initial_static)

@@ -89,7 +89,7 @@ class Observations:
     Attributes:
         surfel_map: the surfels.
         hmm: the forward filters.
-        trust: share of their length at which beams without a return are used, 0 to 1.
+        trust: weight of misses by beams without a return beyond a solid cell, 0 to 1.
         rho, tau, view_angle: (C,) of the classes; the first `n_static` are static.
         threads: does not change the result.
     """

@@ -7,6 +7,7 @@ loop, view-dependent surface would explain walls that are drawn twice and hold t
 """
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,6 @@ from stillmap.em.observations import (
     MAX_RANGE_MARGIN,
     HmmClasses,
     Observations,
-    OccupancyHmm,
     SurfelMap,
     collect_observations,
     iter_surfel_rows,
@@ -90,9 +90,12 @@ def e_step_3d(
     if not options.change_detection:
         return e_step(recording, poses, resolution, options, threads)
 
-    def prepare(hmm: OccupancyHmm) -> None:
-        changepoints.track_changes(hmm, recording, options, with_paths=options.change_detection_3d)
-
+    prepare = partial(
+        changepoints.track_changes,
+        recording=recording,
+        options=options,
+        with_paths=options.change_detection_3d,
+    )
     seen = collect_observations(
         recording, poses, resolution, options, threads, _CLASSES_3D, prepare
     )
@@ -137,11 +140,9 @@ def final_e_step(
         labels, None without view classes; histories of the same cells, None without
         `change_detection`.
     """
-
-    def prepare(hmm: OccupancyHmm) -> None:
-        if options.change_detection:
-            changepoints.track_changes(hmm, recording, options)
-
+    prepare = None
+    if options.change_detection:
+        prepare = partial(changepoints.track_changes, recording=recording, options=options)
     classes = _FINAL_CLASSES if _VIEW_CLASSES else replace(_FINAL_CLASSES, view_rho=())
     seen = collect_observations(recording, poses, resolution, options, threads, classes, prepare)
     labels = None
@@ -232,8 +233,8 @@ def _surfel_posterior(
         table, log_best = seen.likelihood(classes, rows)
         p_static[slice(*rows)] = posterior_static(table, weights.classes, seen.n_static)
         joint = table * weights.classes
-        evidence = joint.sum(axis=1)
-        r = joint / evidence[:, None]
+        evidence = joint.sum(axis=1)  # sum_c w_c L_c
+        r = joint / evidence[:, None]  # responsibilities of the classes
         entropy -= float(np.sum(r * np.log(np.maximum(r, 1e-30))))
         bound += float(np.sum(np.log(evidence) + log_best))
     return p_static, Likelihood(expected=bound - entropy, bound=bound)
