@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
-from stillmap.io.carmen.log import LaserLog, param_number
+from stillmap.io.carmen.log import LaserLog, laser_position, param_number
 from stillmap.preprocessing.options import LaserOptions
 
 # differences between laser and robot pose that agree: old logs round to cm. A corrected pose in
@@ -99,20 +99,6 @@ def find_field_of_view(kind: str, params: dict[str, str], given: LaserOptions) -
         return given.fov
     degrees = param_number(params, f"laser_{laser_position(kind, params)}_laser_fov")
     return math.radians(degrees) if degrees is not None and 0.0 < degrees <= 360.0 else None
-
-
-def laser_position(kind: str, params: dict[str, str]) -> str:
-    """`front`, `rear` or the kind itself: kinds of the same position show the same laser."""
-    if kind in ("FLASER", "ROBOTLASER1"):
-        return "front"
-    if kind in ("RLASER", "ROBOTLASER2"):
-        return "rear"
-    number = float(kind[-1])
-    for place, default in (("front", 1.0), ("rear", 2.0)):
-        stated = param_number(params, f"robot_{place}laser_id")
-        if number == (default if stated is None else stated):
-            return place
-    return kind
 
 
 def find_max_range(laser: LaserLog, params: dict[str, str]) -> float | None:

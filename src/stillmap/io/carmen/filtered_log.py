@@ -11,9 +11,14 @@ from numpy.typing import NDArray
 from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_file
 from stillmap.core.recording import Recording
-from stillmap.io.carmen.log import BYTE_ORDER_MARK, read_log
+from stillmap.io.carmen.log import (
+    BYTE_ORDER_MARK,
+    Sensor,
+    read_log,
+    scan_order,
+    select_scans,
+)
 from stillmap.io.carmen.messages import SCAN_PARSERS
-from stillmap.io.carmen.reader import Sensor, scan_order, select_scans
 from stillmap.io.text_lines import is_gzip_name, open_for_writing, read_lines
 from stillmap.preprocessing.max_range import find_max_range
 from stillmap.preprocessing.options import MAX_PLAUSIBLE_RANGE

@@ -1,6 +1,5 @@
 """Reads CARMEN logs (`.log`, `.clf`, plain or gzip) as recordings."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,91 +9,14 @@ from numpy.typing import NDArray
 from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.core.timestamps import longest_non_decreasing
 from stillmap.io import trajectory
 from stillmap.io.carmen import extrinsics
 from stillmap.io.carmen.extrinsics import Extrinsics
-from stillmap.io.carmen.log import CarmenLog, LaserLog, read_log
-from stillmap.io.carmen.messages import SCAN_PARSERS, WRONG_COUNT, flaser_config
+from stillmap.io.carmen.log import CarmenLog, Sensor, read_log, scan_order, select_scans
+from stillmap.io.carmen.messages import SCAN_PARSERS, flaser_config
 from stillmap.io.text_lines import Progress, is_gzip
 from stillmap.preprocessing import max_range
 from stillmap.preprocessing.options import LaserOptions, ReadOptions
-
-TIME_BACKWARDS = "time running backwards"
-
-_KIND_ORDER = ("ROBOTLASER", "FLASER", "RLASER", "RAWLASER")  # preference for the same laser
-
-
-@dataclass(frozen=True, eq=False)
-class Sensor:
-    """T usable scans of one laser with n beams each."""
-
-    laser: LaserLog
-    line: NDArray[np.int64]  # (T,) line numbers, from 1
-    stamp_ns: NDArray[np.int64]  # (T,)
-    ranges: NDArray[np.float32]  # (T, n)
-    config: NDArray[np.int64]  # (T,) index into laser.configs
-    poses: NDArray[np.float64] | None  # (T, 6) laser and robot pose on the scan lines
-
-
-def select_scans(log: CarmenLog) -> tuple[list[Sensor], list[str]]:
-    """The usable scans of each laser, and sentences on dropped kinds of lines."""
-    lasers, notes = _select_lasers(log)
-    return [_select_usable_scans(laser, log) for laser in lasers], notes
-
-
-def scan_order(sensors: list[Sensor]) -> NDArray[np.intp]:
-    """(T,) indices that sort the concatenated scans of all sensors by stamp."""
-    return np.argsort(np.concatenate([s.stamp_ns for s in sensors]), kind="stable")
-
-
-def _select_lasers(log: CarmenLog) -> tuple[list[LaserLog], list[str]]:
-    """One kind of line per laser: newer logs hold each scan raw and with the robot's pose."""
-    by_position: dict[str, list[LaserLog]] = {}
-    for laser in log.lasers.values():
-        position = extrinsics.laser_position(laser.kind, log.params)
-        by_position.setdefault(position, []).append(laser)
-    used, notes = [], []
-    for same in by_position.values():
-        most = max(len(laser.line) for laser in same)
-        # a kind with only a few of the scans cannot replace the others
-        complete = [laser for laser in same if 2 * len(laser.line) >= most]
-        best = min(complete, key=lambda laser: _KIND_ORDER.index(laser.kind.rstrip("1234")))
-        used.append(best)
-        notes += [
-            f"{laser.kind}: {len(laser.line)} scans not used, {best.kind} shows the same laser"
-            for laser in same
-            if laser is not best
-        ]
-    return sorted(used, key=lambda laser: list(SCAN_PARSERS).index(laser.kind.encode())), notes
-
-
-def _select_usable_scans(laser: LaserLog, log: CarmenLog) -> Sensor:
-    """The scans with the typical number of readings and non-decreasing stamps.
-
-    The longest non-decreasing subsequence of the laser's stamps is kept, so that a stamp that jumps
-    ahead costs one scan. Stamps of different lasers need not be in order.
-    """
-    count, line = np.asarray(laser.count), np.asarray(laser.line)
-    shifted = np.asarray(laser.host_is_number, np.bool_)
-    # a number in place of the host name: the fields before it are shifted
-    usable = (count == laser.typical_count()) & ~(shifted & (shifted.mean() < 0.5))
-    skipped = log.skipped_scans[laser.kind]
-    skipped.add_all(WRONG_COUNT, line[~usable])
-    scans = np.flatnonzero(usable)
-    stamp_ns = np.asarray(laser.stamp_ns, np.int64)[scans]
-    forward = longest_non_decreasing(stamp_ns.tolist())
-    skipped.add_all(TIME_BACKWARDS, np.delete(line[scans], forward))
-    scans = scans[forward]
-    poses = np.asarray(laser.poses).reshape(-1, 6)[scans] if laser.has_poses else None
-    return Sensor(
-        laser,
-        line[scans],
-        stamp_ns[forward],
-        laser.stack_readings(scans),
-        np.asarray(laser.config)[scans],
-        poses,
-    )
 
 
 def read(
@@ -154,6 +76,7 @@ def _build_recording(sensors: list[Sensor], log: CarmenLog, options: ReadOptions
     beams = np.array([s.ranges.shape[1] for s in sensors], np.int64)[sensor_of[order]]
     offset = np.concatenate([[0], np.cumsum(beams)]).astype(np.int64)
     points, hit = _interleave(parts, sensor_of[order], offset)
+    params = {k: v for k, v in log.params.items() if k.startswith("robot_") and "laser" in k}
     return Recording(
         stamp_ns=stamp_ns[order],
         offset=offset,
@@ -163,7 +86,13 @@ def _build_recording(sensors: list[Sensor], log: CarmenLog, options: ReadOptions
         sensor=sensor_of[order].astype(np.int32),
         T_odom_base=None if odometry is None else se2.matrix(*odometry[order].T),
         source={
-            **_source(log, infos, odometry_info),
+            "lines": log.n_lines,
+            "records": dict(log.records),
+            "ignored": dict(log.ignored),
+            "sensors": infos,
+            "odometry": odometry_info,
+            "params": params,
+            "skipped_odometry": log.skipped_odometry.to_dict(),
             "skipped": skipped.to_dict(),
             "warnings": warnings,
         },
@@ -292,21 +221,4 @@ def _sensor_info(
         "upside_down_how": upside_down[1],
         "extrinsics": pose.to_dict(),
         "ranges": rule.to_dict(),
-    }
-
-
-def _source(
-    log: CarmenLog,
-    sensors: list[dict[str, Any]],
-    odometry_info: dict[str, Any],
-) -> dict[str, Any]:
-    used = {k: v for k, v in log.params.items() if k.startswith("robot_") and "laser" in k}
-    return {
-        "lines": log.n_lines,
-        "records": dict(log.records),
-        "ignored": dict(log.ignored),
-        "sensors": sensors,
-        "odometry": odometry_info,
-        "params": used,
-        "skipped_odometry": log.skipped_odometry.to_dict(),
     }
