@@ -1,4 +1,4 @@
-"""Random beams on which the core and its plain twin must agree."""
+"""Random beams and rooms on which kernels and twins must agree."""
 
 import resource
 from collections.abc import Callable, Iterator
@@ -74,7 +74,7 @@ def random_beams(seed: int, dimension: int, scans: int = 12, beams: int = 240) -
 
 
 def ranges(origins: Any, directions: Any, walls: Any, mover: Any, radius: float) -> Any:
-    """Along rays from inside a convex room (normals, distances) to its walls or to a ball."""
+    """Ranges of rays in a convex room (normals, distances) to its walls or a ball."""
     normals, distances = walls
     with np.errstate(divide="ignore"):
         to_walls = (distances - origins @ normals.T) / (directions @ normals.T)
@@ -88,10 +88,10 @@ def ranges(origins: Any, directions: Any, walls: Any, mover: Any, radius: float)
 
 @dataclass(frozen=True)
 class Room:
-    """Beams of some scans and the looks that these belong to."""
+    """Beams of some scans and the time bins of these."""
 
     beams: Beams
-    look: Any
+    time_bin: Any
     lengths: dict[str, float]
 
     def surface(self, kernels: ModuleType) -> Any:
@@ -102,7 +102,7 @@ class Room:
         surface.fit()
         return surface
 
-    def dwell(
+    def hmm(
         self,
         kernels: ModuleType,
         surface: Any,
@@ -132,7 +132,7 @@ class Room:
 def make_room(
     seed: int, dimension: int, resolution: float, scans: int, beams: int, noise: float = 0.01
 ) -> Room:
-    """A slanted box of walls with a ball that wanders, on both sides of the origin."""
+    """A slanted box of walls around the origin with a moving ball."""
     rng = np.random.default_rng(seed)
     R = random_rotation(rng, dimension)
     walls = np.concatenate([R, -R]), rng.uniform(1.2, 2.2, 2 * dimension)
@@ -163,7 +163,7 @@ def make_room(
             e=np.ones(len(points), np.float32),
             resolution=resolution,
         ),
-        look=np.cumsum(step),
+        time_bin=np.cumsum(step),
         lengths={
             "lateral_std": 0.4 * resolution,
             "margin": 1.2 * resolution,
@@ -193,9 +193,9 @@ def beams(request: pytest.FixtureRequest) -> Beams:
 
 @pytest.fixture
 def bounded_memory() -> Iterator[None]:
-    """A walk that never ends runs into MemoryError before it brings the machine down."""
+    """An endless traversal raises MemoryError before it exhausts the machine."""
     before = resource.getrlimit(resource.RLIMIT_AS)
-    # on top of what is mapped: address sanitizers reserve terabytes
+    # in addition to mapped memory: address sanitizers reserve terabytes
     mapped = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (mapped + (6 << 30), before[1]))
     yield

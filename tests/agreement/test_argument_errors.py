@@ -1,4 +1,4 @@
-"""What the core refuses, and that it says which array is at fault."""
+"""Invalid arguments raise errors that name the argument."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ KERNELS = ["add_beams", "e_step", "log_likelihood"]
 
 
 def arguments(kernel, dimension=2):
-    """Good arguments: 5 beams in 2 scans."""
+    """Valid arguments: 5 beams in 2 scans."""
     out = {
         "grid": (_core.OccupancyGrid2D if dimension == 2 else _core.OccupancyGrid3D)(0.5),
         "points": np.ones((5, dimension), np.float32),
@@ -26,7 +26,7 @@ def arguments(kernel, dimension=2):
     return out
 
 
-def refused(kernel, error, match, dimension=2, **changes):
+def assert_raises(kernel, error, match, dimension=2, **changes):
     good = arguments(kernel, dimension)
     getattr(_core, kernel)(**good)
     if not set(changes) <= set(good):
@@ -59,14 +59,14 @@ def refused(kernel, error, match, dimension=2, **changes):
     ],
 )
 def test_wrong_lengths_and_values(kernel, dimension, name, value):
-    refused(kernel, ValueError, name, dimension, **{name: value})
+    assert_raises(kernel, ValueError, name, dimension, **{name: value})
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_number_of_poses_against_scans(kernel):
     for poses in (0, 1, 3):
         T = np.tile(np.eye(3), (poses, 1, 1))
-        refused(kernel, ValueError, "T_map_sensor", T_map_sensor=T)
+        assert_raises(kernel, ValueError, "T_map_sensor", T_map_sensor=T)
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -90,16 +90,16 @@ def test_number_of_poses_against_scans(kernel):
     ],
 )
 def test_wrong_types_and_shapes(kernel, name, value):
-    refused(kernel, TypeError, name, **{name: value})
+    assert_raises(kernel, TypeError, name, **{name: value})
 
 
 @pytest.mark.parametrize("bad", [-0.01, 1.01, np.nan, np.inf])
 def test_expectations_of_hits_are_probabilities(bad):
     e = np.full(5, 0.5, np.float32)
     e[3] = bad
-    refused("add_beams", ValueError, "e: ", e=e)
+    assert_raises("add_beams", ValueError, "e: ", e=e)
     good = arguments("add_beams")
-    good["hit"][3] = False  # the e of a maximum-range beam is not looked at
+    good["hit"][3] = False  # e of a maximum-range beam is not used
     _core.add_beams(**{**good, "e": e})
 
 
@@ -112,7 +112,7 @@ def test_poses_that_are_not_finite_or_far_away(kernel, bad, dimension):
         for column in range(dimension + 1):
             T = np.tile(np.eye(dimension + 1), (2, 1, 1))
             T[1, row, column] = bad
-            refused(kernel, ValueError, "pose", dimension, T_map_sensor=T)
+            assert_raises(kernel, ValueError, "pose", dimension, T_map_sensor=T)
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -120,12 +120,12 @@ def test_poses_that_are_not_finite_or_far_away(kernel, bad, dimension):
 def test_end_points_far_away(kernel):
     points = np.ones((5, 2), np.float32)
     points[4, 1] = 1e30
-    refused(kernel, ValueError, "end point", points=points)
+    assert_raises(kernel, ValueError, "end point", points=points)
 
 
 @pytest.mark.parametrize("make", [_core.OccupancyGrid2D, _core.OccupancyGrid3D])
 @pytest.mark.parametrize("resolution", [0.0, -0.1, np.nan, np.inf])
-def test_grids_of_no_resolution(make, resolution):
+def test_grid_resolution(make, resolution):
     with pytest.raises(ValueError, match="resolution"):
         make(resolution)
 
@@ -179,7 +179,7 @@ def test_registration(kernel, name, value, error):
         getattr(_core, kernel)(**{**good, name: value})
 
 
-def surface_of(dimension=2, fitted=True):
+def surfel_map_of(dimension=2, fitted=True):
     surface = (_core.SurfelMap2D if dimension == 2 else _core.SurfelMap3D)(0.5)
     good = arguments("add_beams", dimension)
     surface.add_end_points(*(good[k] for k in ("points", "hit", "offset", "T_map_sensor")))
@@ -188,7 +188,7 @@ def surface_of(dimension=2, fitted=True):
     return surface
 
 
-def dwell_of(surface, **changes):
+def hmm_of(surface, **changes):
     chosen = {
         "rho": [0.9, 0.1],
         "tau": [1.0, 2.0],
@@ -219,11 +219,11 @@ WRONG_BEAMS = [
 
 @pytest.mark.parametrize("call", ["add_end_points", "associate_beams", "add"])
 @pytest.mark.parametrize(("name", "value", "error"), WRONG_BEAMS)
-def test_beams_of_looks(call, name, value, error):
-    surface = surface_of(fitted=call != "add_end_points")
+def test_beams_of_surfel_maps_and_hmms(call, name, value, error):
+    surface = surfel_map_of(fitted=call != "add_end_points")
     beams = arguments("add_beams")
     beams = {k: beams[k] for k in ("points", "hit", "offset", "T_map_sensor")}
-    target = dwell_of(surface) if call == "add" else surface
+    target = hmm_of(surface) if call == "add" else surface
     more = {"time_bin": np.arange(2)} if call == "add" else {}
     getattr(target, call)(**beams, **more)
     with pytest.raises(error, match=name):
@@ -231,31 +231,31 @@ def test_beams_of_looks(call, name, value, error):
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_places_and_classes_of_looks(dimension):
-    dwell, scans = dwell_of(surface_of(dimension)), arguments("add_beams", dimension)
+def test_positions_and_classes(dimension):
+    hmm, scans = hmm_of(surfel_map_of(dimension)), arguments("add_beams", dimension)
     beams = {k: scans[k] for k in ("points", "hit", "offset", "T_map_sensor")}
     beams["time_bin"] = np.arange(2)
     for wrong in (np.zeros((3, dimension)), np.full((2, dimension), np.nan)):
         with pytest.raises(ValueError, match="positions"):
-            dwell.add(**beams, positions=wrong)
+            hmm.add(**beams, positions=wrong)
     for wrong in (np.zeros((2, dimension), np.float32), np.zeros((2, dimension + 1))):
         with pytest.raises(TypeError, match="positions"):
-            dwell.add(**beams, positions=wrong)
-    dwell.add(**beams, positions=np.zeros((2, dimension)))
+            hmm.add(**beams, positions=wrong)
+    hmm.add(**beams, positions=np.zeros((2, dimension)))
     for wrong in (np.ones(3, bool), np.zeros(2, bool)):
         with pytest.raises(ValueError, match="classes"):
-            dwell.likelihood(wrong)
+            hmm.likelihood(wrong)
     with pytest.raises(TypeError):
-        dwell.likelihood("all")
+        hmm.likelihood("all")
 
 
 @pytest.mark.parametrize("call", ["add_end_points", "associate_beams", "add"])
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_looks_from_nowhere(call, dimension):
-    surface = surface_of(dimension, fitted=call != "add_end_points")
+def test_poses_of_surfel_maps_and_hmms(call, dimension):
+    surface = surfel_map_of(dimension, fitted=call != "add_end_points")
     beams = arguments("add_beams", dimension)
     beams = {k: beams[k] for k in ("points", "hit", "offset", "T_map_sensor")}
-    target = dwell_of(surface) if call == "add" else surface
+    target = hmm_of(surface) if call == "add" else surface
     more = {"time_bin": np.arange(2)} if call == "add" else {}
     for bad in (np.nan, 1e30):
         T = beams["T_map_sensor"].copy()
@@ -266,7 +266,7 @@ def test_looks_from_nowhere(call, dimension):
 
 @pytest.mark.parametrize("make", [_core.SurfelMap2D, _core.SurfelMap3D])
 @pytest.mark.parametrize("resolution", [0.0, -0.1, np.nan, np.inf])
-def test_surfaces_of_no_resolution(make, resolution):
+def test_surfel_map_resolution(make, resolution):
     with pytest.raises(ValueError, match="resolution"):
         make(resolution)
 
@@ -293,48 +293,48 @@ def test_surfaces_of_no_resolution(make, resolution):
           for v in (0.0, -1.0, np.nan, np.inf)),
     ],
 )  # fmt: skip
-def test_chains_of_no_sense(dimension, name, value):
-    surface = surface_of(dimension)
-    dwell_of(surface)
+def test_hmm_parameters(dimension, name, value):
+    surface = surfel_map_of(dimension)
+    hmm_of(surface)
     with pytest.raises(ValueError, match=name):
-        dwell_of(surface, **{name: value})
+        hmm_of(surface, **{name: value})
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_looks_that_fall(dimension):
-    dwell = dwell_of(surface_of(dimension))
+def test_decreasing_time_bins(dimension):
+    hmm = hmm_of(surfel_map_of(dimension))
     good = arguments("add_beams", dimension)
     beams = [good[k] for k in ("points", "hit", "offset", "T_map_sensor")]
-    dwell.add(*beams, np.array([3, 5]))
-    before = dwell.likelihood()
-    for look in ([6, 5], [4, 6], [2**40, -(2**40)]):
+    hmm.add(*beams, np.array([3, 5]))
+    before = hmm.likelihood()
+    for bins in ([6, 5], [4, 6], [2**40, -(2**40)]):
         with pytest.raises(ValueError, match="time_bin"):
-            dwell.add(*beams, np.array(look))
-    for a, b in zip(before, dwell.likelihood(), strict=True):
-        assert a.tobytes() == b.tobytes()  # what is refused changes nothing
-    for look in (np.array([6]), np.array([6, 7, 8])):
+            hmm.add(*beams, np.array(bins))
+    for a, b in zip(before, hmm.likelihood(), strict=True):
+        assert a.tobytes() == b.tobytes()  # a failed call changes nothing
+    for bins in (np.array([6]), np.array([6, 7, 8])):
         with pytest.raises(ValueError, match="time_bin"):
-            dwell.add(*beams, look)
-    for look in (np.array([6, 7], np.int32), np.array([[6, 7]]), np.array([6.0, 7.0])):
+            hmm.add(*beams, bins)
+    for bins in (np.array([6, 7], np.int32), np.array([[6, 7]]), np.array([6.0, 7.0])):
         with pytest.raises(TypeError, match="time_bin"):
-            dwell.add(*beams, look)
+            hmm.add(*beams, bins)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_a_surface_that_was_not_fitted(dimension):
+def test_hmm_of_an_unfitted_map(dimension):
     with pytest.raises(ValueError, match="fit"):
-        dwell_of(surface_of(dimension, fitted=False))
+        hmm_of(surfel_map_of(dimension, fitted=False))
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_elements_of_a_surface_that_was_not_fitted(dimension):
+def test_surfels_of_an_unfitted_map(dimension):
     with pytest.raises(ValueError, match="fit"):
-        surface_of(dimension, fitted=False).surfels()
+        surfel_map_of(dimension, fitted=False).surfels()
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_a_surface_that_was_fitted_takes_no_more(dimension):
-    surface = surface_of(dimension)
+def test_add_end_points_after_fit(dimension):
+    surface = surfel_map_of(dimension)
     before = surface.surfels()
     points = np.zeros((400, dimension), np.float32)
     points[:, 0] = np.linspace(-100, 100, 400)

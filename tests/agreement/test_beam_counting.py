@@ -1,4 +1,4 @@
-"""Sums, E-step and likelihoods of the core against the plain twin on random beams."""
+"""Sums, E-step and likelihoods of kernel against twin on random beams."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import reference
 
 from stillmap import _core
 
-STEP = 2.0**-24  # the core counts in integer multiples of this
+STEP = 2.0**-24  # of the fixed-point sums of the kernel
 
 
 def all_cells(*grids):
@@ -27,7 +27,7 @@ def test_sums(beams):
     cells = all_cells(core, plain)
     expected = sums(plain, cells)
     assert expected.sum() > 100
-    # each of the beams that touch a cell is rounded once or twice, to half a step
+    # each beam in a cell is rounded once or twice, by half a step
     assert np.abs(sums(core, cells) - expected).max() <= len(beams.hit) * STEP
 
 
@@ -39,7 +39,7 @@ def test_alpha_is_exact_when_e_is(beams):
     assert (sums(core, cells)[:, 0] == sums(plain, cells)[:, 0]).all()
 
 
-def test_ends_with_another_e_are_sums_with_it(beams):
+def test_updating_e_equals_adding_with_the_new_e(beams):
     other = beams.with_(e=np.ones(len(beams.hit), np.float32))
     points, hit, offset, T = beams.arguments
     grids = []
@@ -53,16 +53,16 @@ def test_ends_with_another_e_are_sums_with_it(beams):
     np.testing.assert_allclose(sums(grids[1], cells), sums(other.grid(reference), cells), atol=1e-9)
 
 
-def test_untouched_cells_are_unknown_in_both(beams):
+def test_unobserved_cells(beams):
     core, plain = beams.grid(_core), beams.grid(reference)
     cells = all_cells(core, plain)
     touched = sums(plain, cells).sum(axis=1)
-    clear = (touched == 0) | (touched > STEP)  # shorter chords the core may round to nothing
+    clear = (touched == 0) | (touched > STEP)  # the kernel may round shorter chords to zero
     assert (touched == 0).any()
     assert ((sums(core, cells).sum(axis=1) > 0) == (touched > 0))[clear].all()
 
 
-def test_dense_lays_the_same_sums_out(beams):
+def test_dense(beams):
     for kernels in (_core, reference):
         grid = beams.grid(kernels)
         first, alpha, beta = grid.dense()
@@ -87,7 +87,7 @@ def test_dense_of_an_empty_grid(beams):
         assert seen.shape == alpha.shape
 
 
-def test_part_of_a_dense_grid(beams):
+def test_dense_of_a_box(beams):
     rng = np.random.default_rng(3)
     for kernels in (_core, reference):
         grid = beams.grid(kernels)
@@ -95,7 +95,7 @@ def test_part_of_a_dense_grid(beams):
         whole_first, *whole = grid.dense()
         assert first.tolist() == whole_first.tolist()
         assert tuple(shape) == whole[0].shape
-        # boxes that hang over the edge, lie beside the cells, or hold nothing
+        # boxes that overlap the border, are disjoint from it, or empty
         for _ in range(20):
             low = rng.integers(-20, np.array(shape[::-1]) + 20)
             size = rng.integers(0, 30, len(shape))
@@ -118,12 +118,12 @@ def test_part_of_a_dense_grid(beams):
         ((-(2**63), 0), (1, 1)),
     ],
 )
-def test_boxes_that_cannot_be_are_refused(first, shape):
+def test_invalid_boxes(first, shape):
     with pytest.raises(ValueError, match="first_cell, shape"):
         _core.OccupancyGrid2D(0.1).dense(first, shape)
 
 
-def test_seen(beams):
+def test_observed_mask(beams):
     for kernels in (_core, reference):
         grid = beams.grid(kernels)
         first, alpha, beta = grid.dense()
@@ -137,7 +137,7 @@ def test_seen(beams):
 @pytest.mark.parametrize("prior", [0.05, 0.5, 0.9, 0.0, 1.0])
 def test_e_step(beams, prior):
     core, plain = beams.grid(_core), beams.grid(reference)
-    # half of the beams are the map's own, half end where others may never have been
+    # half of the beams are in the map, half may end in unobserved cells
     moved = beams.T_map_sensor.copy()
     moved[::2, 0, -1] += 1.5
     looks = beams.with_(T_map_sensor=moved)
@@ -180,12 +180,12 @@ def test_log_likelihood_of_another_map(beams):
     terms = _core.log_likelihood(core, *looks, 0.8)
     expected = reference.log_likelihood(plain, *looks, 0.8)
     assert expected[:, 0].min() < -27  # ln of the floor 1e-12
-    # where m = 1 but for a chord of almost no length, ln(1 - m) hangs on the core's rounding
+    # where 1 - m comes from a very short chord, ln(1 - m) depends on the rounding of the kernel
     np.testing.assert_allclose(terms, expected, rtol=1e-4, atol=1e-3)
 
 
 @pytest.mark.parametrize("threads", [2, 3, 64])
-def test_threads_change_no_bit(beams, threads):
+def test_any_number_of_threads_gives_the_same_bits(beams, threads):
     one, many = beams.grid(_core, 1), beams.grid(_core, threads)
     for a, b in zip(one.dense(), many.dense(), strict=True):
         assert (a == b).all()
@@ -198,7 +198,7 @@ def test_threads_change_no_bit(beams, threads):
     assert one_terms.tobytes() == many_terms.tobytes()
 
 
-def test_order_of_scans_changes_no_bit(beams):
+def test_any_order_of_scans_gives_the_same_bits(beams):
     whole, piecewise = beams.grid(_core), beams.empty_grid(_core)
     for t in range(len(beams.T_map_sensor) - 1, -1, -1):
         a, b = beams.offset[t], beams.offset[t + 1]
@@ -243,7 +243,7 @@ def test_no_beams_and_no_scans(dimension):
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_cells_far_apart_stay_apart(dimension):
-    # one end point 2^22 cells out: none of its powers-of-two neighbours may be taken for it
+    # one end point at 2^22 cells: no collision with cells at distances of powers of two
     far = 2**22 + 2**21 + 5
     points = np.zeros((1, dimension), np.float32)
     T = np.eye(dimension + 1)[None].copy()

@@ -1,4 +1,4 @@
-"""Scans taken out of a map again leave no trace; lengths on the approach leave (10) alone."""
+"""Removal of scans is exact; lengths on the approach do not change (10)."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def beams(D, rng, n=200):
 
 @pytest.mark.parametrize("D", [2, 3])
 @pytest.mark.parametrize("approach", [0.0, 0.5])
-def test_what_is_taken_out_was_never_there(D, approach):
+def test_removal_is_exact(D, approach):
     rng = np.random.default_rng(D)
     one, other = beams(D, rng), beams(D, rng)
     grids = [
@@ -40,7 +40,7 @@ def test_what_is_taken_out_was_never_there(D, approach):
 
 
 @pytest.mark.parametrize("D", [2, 3])
-def test_the_approach_changes_registration_alone(D):
+def test_the_approach_changes_only_registration(D):
     rng = np.random.default_rng(D)
     taken = beams(D, rng)
     Grid = _core.OccupancyGrid2D if D == 2 else _core.OccupancyGrid3D
@@ -56,7 +56,7 @@ def test_the_approach_changes_registration_alone(D):
 
 
 def test_a_grazed_wall_keeps_its_weight():
-    # along a wall, 0.3 m of the way through the wall's own cells
+    # along a wall, 0.3 m of it in the cells of the wall
     n = 40
     wall = np.column_stack([np.linspace(1.0, 3.0, n), np.full(n, 0.02)]).astype(np.float32)
     T = np.eye(3)[None].copy()

@@ -1,4 +1,4 @@
-"""Things that come and leave, in the core against the plain twin: lanes with one cell each."""
+"""Change HMM: kernel against twin on lanes with one cell each, and by hand."""
 
 import numpy as np
 import pytest
@@ -6,36 +6,36 @@ import reference
 
 from stillmap import _core
 
-LANES, LOOKS = 120, 160
+LANES, BINS = 120, 160
 SECONDS = 0.5
 MODEL = {"tau": 300.0, "passer_by_rho": 0.1, "passer_by_tau": 1.5, "p_detection": 0.9}
 NOT_SEEN, HIT, THROUGH = range(3)
 
 
 def lanes(seed=3):
-    """(LANES, LOOKS) what is seen of the cell of each lane, as the model has it, and the looks."""
+    """(LANES, BINS) observations of each lane drawn from the model, and their time bins."""
     rng = np.random.default_rng(seed)
-    number = np.cumsum(rng.choice([1, 1, 1, 2, 5, 70], LOOKS)) + 3
+    number = np.cumsum(rng.choice([1, 1, 1, 2, 5, 70], BINS)) + 3
     model = reference.ChangeModel(**MODEL)
     state = rng.choice(3, LANES, p=model.prior)
-    seen = np.empty((LANES, LOOKS), int)
-    for k in range(LOOKS):
+    seen = np.empty((LANES, BINS), int)
+    for k in range(BINS):
         p = model.transition(SECONDS * (number[k] - number[k - 1]) if k else 0.0)
         state = np.array([rng.choice(3, p=p[s]) for s in state])
         struck = (state != reference.change_hmm.EMPTY) & (rng.random(LANES) < 0.9)
         seen[:, k] = np.where(struck, HIT, THROUGH)
     seen[rng.random(seen.shape) < 0.3] = NOT_SEEN
-    seen[:, 0] = HIT  # each has a cell
-    seen[:4, 1:] = NOT_SEEN  # seen once
+    seen[:, 0] = HIT  # one return each
+    seen[:4, 1:] = NOT_SEEN  # observed once
     return seen, number
 
 
 def beams_of(seen):
-    """One scan a look, lanes 1 m apart: beams end in the cell at x = 2.05, or behind it."""
+    """One scan per time bin, lanes 1 m apart: beams end in the cell at x = 2.05, or behind it."""
     points, hit, offset = [], [], [0]
-    for look in seen.T:
-        for lane in np.flatnonzero(look != NOT_SEEN):
-            points.append((2.05 if look[lane] == HIT else 4.05, lane + 0.05))
+    for of_bin in seen.T:
+        for lane in np.flatnonzero(of_bin != NOT_SEEN):
+            points.append((2.05 if of_bin[lane] == HIT else 4.05, lane + 0.05))
             hit.append(True)
         offset.append(len(points))
     return np.array(points, np.float32), np.array(hit), np.array(offset)
@@ -46,17 +46,17 @@ def parallel_poses(points, offset):
     T = np.tile(np.eye(3), (len(points), 1, 1))
     T[:, 1, 2] = points[:, 1]
     along = np.stack([points[:, 0], np.zeros(len(points))], axis=1).astype(np.float32)
-    look = np.repeat(np.arange(len(offset) - 1), np.diff(offset))
-    return along, np.arange(len(points) + 1), T, look
+    bins = np.repeat(np.arange(len(offset) - 1), np.diff(offset))
+    return along, np.arange(len(points) + 1), T, bins
 
 
-def watched(kernels, seen, number, threads=1, chunk=None, **asked):
+def changes_of(kernels, seen, number, threads=1, chunk=None, **asked):
     points, hit, offset = beams_of(seen)
-    along, own, T, look = parallel_poses(points, offset)
+    along, own, T, bins = parallel_poses(points, offset)
     surface = kernels.SurfelMap2D(0.1)
     surface.add_end_points(along, hit, own, T)
     surface.fit()
-    dwell = kernels.OccupancyHmm2D(
+    hmm = kernels.OccupancyHmm2D(
         surface,
         rho=[0.5],
         tau=[1.0],
@@ -68,23 +68,23 @@ def watched(kernels, seen, number, threads=1, chunk=None, **asked):
         end_margin=0.3,
         use_normals=False,
     )
-    dwell.track_changes(**MODEL, **asked)
+    hmm.track_changes(**MODEL, **asked)
     step = chunk or len(number)
     for first in range(0, len(number), step):
-        of = np.flatnonzero((look >= first) & (look < first + step))
+        of = np.flatnonzero((bins >= first) & (bins < first + step))
         part = slice(of[0], of[-1] + 1)
-        dwell.add(along[part], hit[part], own[: len(of) + 1], T[part], number[look[part]], threads)
+        hmm.add(along[part], hit[part], own[: len(of) + 1], T[part], number[bins[part]], threads)
     cells = surface.surfels()[0]
     at = np.flatnonzero(cells[:, 0] == 20)
     order = at[np.argsort(cells[at, 1])]
-    found = dwell.changes() if asked.get("with_paths", True) else [dwell.change_log_likelihood()]
+    found = hmm.changes() if asked.get("with_paths", True) else [hmm.change_log_likelihood()]
     return [values[order] for values in found]
 
 
 @pytest.fixture(scope="module")
 def both():
     seen, number = lanes()
-    return watched(_core, seen, number), watched(reference, seen, number)
+    return changes_of(_core, seen, number), changes_of(reference, seen, number)
 
 
 def test_likelihood_and_last_state(both):
@@ -96,7 +96,7 @@ def test_likelihood_and_last_state(both):
     assert ((plain[2][:, 0] > 0.9).sum() > 10) & ((plain[2][:, 0] < 0.1).sum() > 10)
 
 
-def test_the_most_probable_course(both):
+def test_viterbi_path(both):
     core, plain = both
     for k in (3, 4):
         np.testing.assert_array_equal(core[k], plain[k])
@@ -105,26 +105,28 @@ def test_the_most_probable_course(both):
     count = plain[3]
     assert (count[:, 0] == 0).any() & (count[:, 0] == 1).any() & (count[:, 0] > 2).any()
     assert (count[:, 1] > count[:, 0]).any()
-    assert (plain[4][:4] == -1).all()  # nothing changes in one look
+    assert (plain[4][:4] == -1).all()  # no changes in one observation
     np.testing.assert_array_equal(plain[1][:4], 1)
 
 
 @pytest.mark.parametrize(("threads", "chunk"), [(3, None), (1, 7), (2, 50)])
-def test_neither_threads_nor_chunks_change_a_bit(both, threads, chunk):
+def test_threads_and_chunks_give_the_same_bits(both, threads, chunk):
     seen, number = lanes()
-    for one, other in zip(both[0], watched(_core, seen, number, threads, chunk), strict=True):
+    for one, other in zip(both[0], changes_of(_core, seen, number, threads, chunk), strict=True):
         assert one.tobytes() == other.tobytes()
 
 
-def test_how_probable_it_is_does_not_depend_on_courses(both):
-    [found] = watched(_core, *lanes(), with_paths=False)
+def test_likelihood_without_paths(both):
+    [found] = changes_of(_core, *lanes(), with_paths=False)
     assert found.tobytes() == both[0][0].tobytes()
 
 
 def by_hand(pattern):
-    """The course of a cell that is hit (H), seen through (T) or not seen (.) in each look."""
-    looks = [(k, None if c == "H" else 1.0) for k, c in enumerate(pattern) if c != "."]
-    return reference.summarise_changes(looks, SECONDS, reference.ChangeModel(60.0, 0.05, 2.0, 0.97))
+    """Changes of a cell that is hit (H), missed (T) or unobserved (.) in each time bin."""
+    observations = [(k, None if c == "H" else 1.0) for k, c in enumerate(pattern) if c != "."]
+    return reference.summarise_changes(
+        observations, SECONDS, reference.ChangeModel(60.0, 0.05, 2.0, 0.97)
+    )
 
 
 @pytest.mark.parametrize(
@@ -133,46 +135,46 @@ def by_hand(pattern):
         ("T" * 30 + "H" * 30, 1, (29, 30), (29, 30)),
         ("H" * 30 + "." * 9 + "T" * 30, 1, (29, 39), (29, 39)),
         ("T" * 30 + "H" * 40 + "T" * 30, 2, (29, 30), (69, 70)),
-        ("T" * 30 + "HH" + "T" * 30, 0, (-1, -1), (-1, -1)),  # somebody passed
-        ("H" * 30 + "T" + "H" * 30, 0, (-1, -1), (-1, -1)),  # a look that missed it
+        ("T" * 30 + "HH" + "T" * 30, 0, (-1, -1), (-1, -1)),  # a passer-by
+        ("H" * 30 + "T" + "H" * 30, 0, (-1, -1), (-1, -1)),  # one false miss
     ],
 )
-def test_courses_worked_by_hand(pattern, count, first, last):
+def test_changes_by_hand(pattern, count, first, last):
     found = by_hand(pattern)
     assert found.count[0] == count
     assert found.change_bins[0] == (first, last)
 
 
-def test_how_long_it_was_occupied():
+def test_occupied_share():
     assert by_hand("T" * 30 + "H" * 30).occupied_share == pytest.approx(29.5 / 59)
     assert by_hand("H").occupied_share == 1
     assert by_hand("T").occupied_share == 0
 
 
-def test_two_looks_by_hand():
+def test_two_observations_by_hand():
     model = reference.ChangeModel(60.0, 0.05, 2.0, 0.97)
     p = model.transition(0.5)
     np.testing.assert_allclose(p.sum(axis=1), 1)
-    np.testing.assert_allclose(model.prior @ p, model.prior)  # it is stationary
+    np.testing.assert_allclose(model.prior @ p, model.prior)  # stationary
     hit_hit = sum(model.prior[a] * 0.97 * p[a, b] * 0.97 for a in (0, 2) for b in (0, 2))
     expected = np.log(hit_hit / (0.525 * 0.97))
     assert by_hand("HH").log_likelihood == pytest.approx(expected)
 
 
-def test_refusals():
+def test_argument_errors():
     seen, number = lanes()
     with pytest.raises(ValueError, match="time_bin: expected 0 to 2147483647"):
-        watched(_core, seen, number - 100)
+        changes_of(_core, seen, number - 100)
     with pytest.raises(ValueError, match="time_bin: expected 0 to 2147483647"):
-        watched(_core, seen, number + 2**31)
+        changes_of(_core, seen, number + 2**31)
     surface = _core.SurfelMap2D(0.1)
     surface.fit()
     lengths = dict.fromkeys(
         ("lateral_std", "margin", "hit_radius", "end_margin", "bin_seconds"), 0.1
     )
-    dwell = _core.OccupancyHmm2D(surface, rho=[0.5], tau=[1.0], p_detection=0.9, **lengths)
+    hmm = _core.OccupancyHmm2D(surface, rho=[0.5], tau=[1.0], p_detection=0.9, **lengths)
     with pytest.raises(ValueError, match="expected track_changes"):
-        dwell.changes()
+        hmm.changes()
     for name, value in (
         ("tau", 0.0),
         ("tau", np.inf),
@@ -180,12 +182,12 @@ def test_refusals():
         ("p_detection", 1.0),
     ):
         with pytest.raises(ValueError, match="expected p"):
-            dwell.track_changes(**{**MODEL, name: value})
-    dwell.track_changes(**MODEL, with_paths=False)
-    assert dwell.change_log_likelihood().shape == (0,)
+            hmm.track_changes(**{**MODEL, name: value})
+    hmm.track_changes(**MODEL, with_paths=False)
+    assert hmm.change_log_likelihood().shape == (0,)
     with pytest.raises(ValueError, match="expected track_changes"):
-        dwell.changes([0, 0, 1])
+        hmm.changes([0, 0, 1])
     none = np.empty((0, 2), np.float32), np.empty(0, bool), np.zeros(2, np.int64)
-    dwell.add(*none, np.eye(3)[None], np.array([0]))
+    hmm.add(*none, np.eye(3)[None], np.array([0]))
     with pytest.raises(ValueError, match="before the first observation"):
-        dwell.track_changes(**MODEL)
+        hmm.track_changes(**MODEL)

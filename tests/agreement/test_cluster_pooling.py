@@ -1,4 +1,4 @@
-"""Bodies of sweeps: the core against its plain twin, and by hand."""
+"""Cluster pooling and ground contact: kernel against twin, and by hand."""
 
 import itertools
 
@@ -12,7 +12,7 @@ IDENTITY = np.eye(4)[None]
 
 
 def scattered(seed, n=900, scans=6):
-    """Ends in clumps, on both sides of zero, as many as there are in scans that turn."""
+    """End points in clumps around zero, in scans that rotate."""
     rng = np.random.default_rng(seed)
     middle = rng.uniform(-4, 4, (25, 3)) * [1, 1, 0.3]
     ends = middle[rng.integers(0, 25, n)] + rng.normal(0, 0.3, (n, 3))
@@ -40,7 +40,7 @@ def order(surface):
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 @pytest.mark.parametrize(("column", "fewest"), [(1, 1), (2, 5), (3, 12)])
-def test_core_and_twin_agree(seed, column, fewest):
+def test_agreement(seed, column, fewest):
     beams = scattered(seed)
     core, plain = surfaces(beams)
     of_core, of_plain = order(core), order(plain)
@@ -50,15 +50,15 @@ def test_core_and_twin_agree(seed, column, fewest):
     for kernels, surface, of in ((_core, core, of_core), (reference, plain, of_plain)):
         mine = np.empty(plain.size, bool), np.empty((plain.size, 2), np.float32)
         mine[0][of], mine[1][of] = stands, values
-        bodies = kernels.ClusterPooling3D(surface, *mine, column_cells=column, min_surfels=fewest)
-        bodies.add(*beams)
-        shares.append(bodies.means()[of])
+        pooling = kernels.ClusterPooling3D(surface, *mine, column_cells=column, min_surfels=fewest)
+        pooling.add(*beams)
+        shares.append(pooling.means()[of])
     assert shares[0].dtype == np.float32
     np.testing.assert_allclose(shares[0], shares[1], atol=3e-6)
     known = np.isfinite(shares[1]).all(axis=1)
     assert not known[~stands].any()
     assert known.mean() > 0.3
-    assert np.std(shares[1][known]) > 0.02  # bodies differ
+    assert np.std(shares[1][known]) > 0.02  # clusters differ
 
 
 def test_threads_and_chunks_change_nothing():
@@ -70,19 +70,19 @@ def test_threads_and_chunks_change_nothing():
     stands = np.ones(surface.size, bool)
     found = []
     for threads, cuts in ((1, (0, 60)), (3, (0, 60)), (2, (0, 7, 31, 60))):
-        bodies = _core.ClusterPooling3D(surface, stands, values, column_cells=1, min_surfels=2)
+        pooling = _core.ClusterPooling3D(surface, stands, values, column_cells=1, min_surfels=2)
         for a, b in itertools.pairwise(cuts):
             beams = slice(offset[a], offset[b])
             within = offset[a : b + 1] - offset[a]
-            bodies.add(points[beams], hit[beams], within, T[a:b], threads)
-        found.append(bodies.means())
+            pooling.add(points[beams], hit[beams], within, T[a:b], threads)
+        found.append(pooling.means())
     np.testing.assert_array_equal(found[0], found[1])
     np.testing.assert_array_equal(found[0], found[2])
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 @pytest.mark.parametrize(("column", "least"), [(2, 0.02), (3, 0.0)])
-def test_feet_of_core_and_twin_agree(seed, column, least):
+def test_ground_contact_agreement(seed, column, least):
     rng = np.random.default_rng(seed + 40)
     xy = rng.uniform(-2.5, 2.5, (1600, 2))
     floor = np.column_stack([xy, rng.normal(0.1, 0.01, 1600) * np.sign(rng.normal(2, 1, 1600))])
@@ -99,13 +99,13 @@ def test_feet_of_core_and_twin_agree(seed, column, least):
         mine = np.empty((2, plain.size), np.float32)
         stands[of], mine[0][of], mine[1][of] = ~low, np.where(low, 0.5 + p / 2, 0.6 * p), ground
         known = {"is_obstacle": stands, "p_static": mine[0], "ground_height": mine[1]}
-        element = surface.associate_beams(*beams)
+        surfel = surface.associate_beams(*beams)
         for threads in (1, 3):
             found.append(
                 kernels.relabel_ground_contact(
                     surface,
                     *beams,
-                    element,
+                    surfel,
                     **known,
                     column_cells=column,
                     max_ground_height=0.15,
@@ -119,8 +119,8 @@ def test_feet_of_core_and_twin_agree(seed, column, least):
     assert np.nanmax(found[2]) < 0.5
 
 
-def feet_of(points, *, is_obstacle, p_static, ground=0.0, least=0.05, scans=1):
-    """Beams that end in cells of a metre, as feet; elements by rising x, then z."""
+def relabelled(points, *, is_obstacle, p_static, ground=0.0, least=0.05, scans=1):
+    """Relabelled beams in cells of 1 m; surfels by ascending x, then z."""
     points = np.array(points, np.float32)
     hit, offset = np.ones(len(points), bool), np.linspace(0, len(points), scans + 1).astype(int)
     T = np.repeat(IDENTITY, scans, axis=0)
@@ -130,7 +130,7 @@ def feet_of(points, *, is_obstacle, p_static, ground=0.0, least=0.05, scans=1):
     of = np.lexsort(surface.surfels()[0].T[[2, 1, 0]])
     values = np.empty((3, surface.size), np.float32)
     values[0][of], values[1][of], values[2][of] = is_obstacle, p_static, ground
-    element = surface.associate_beams(points, hit, offset, T)
+    surfel = surface.associate_beams(points, hit, offset, T)
     known = {
         "is_obstacle": values[0].astype(bool),
         "p_static": values[1],
@@ -142,7 +142,7 @@ def feet_of(points, *, is_obstacle, p_static, ground=0.0, least=0.05, scans=1):
         hit,
         offset,
         T,
-        element,
+        surfel,
         **known,
         column_cells=1,
         max_ground_height=0.3,
@@ -150,29 +150,29 @@ def feet_of(points, *, is_obstacle, p_static, ground=0.0, least=0.05, scans=1):
     )
 
 
-def test_a_sole_under_a_leg_that_moves():
+def test_sole_below_a_moving_leg():
     leg, sole, below, beside = [0.5, 0.5, 1.2], [0.5, 0.5, 0.07], [0.5, 0.5, 0.04], [1.5, 0.5, 0.9]
     given = {"is_obstacle": [0, 1, 0], "p_static": [0.9, 0.2, 0.9]}
-    found = feet_of([leg, sole, below, beside], **given)
+    found = relabelled([leg, sole, below, beside], **given)
     np.testing.assert_array_equal(found, np.array([np.nan, 0.2, np.nan, np.nan], np.float32))
-    assert np.isnan(feet_of([leg, sole, below, beside], **given, ground=0.03)).all()
+    assert np.isnan(relabelled([leg, sole, below, beside], **given, ground=0.03)).all()
     static = {**given, "p_static": [0.9, 0.6, 0.9]}
-    assert np.isnan(feet_of([leg, sole, below, beside], **static)).all()
-    known = {**given, "p_static": [0.4, 0.2, 0.9]}  # the foot's own element moves
-    assert np.isnan(feet_of([leg, sole, below, beside], **known)).all()
+    assert np.isnan(relabelled([leg, sole, below, beside], **static)).all()
+    known = {**given, "p_static": [0.4, 0.2, 0.9]}  # the surfel of the foot is dynamic
+    assert np.isnan(relabelled([leg, sole, below, beside], **known)).all()
 
 
-def test_crowns_over_what_moves_are_no_feet():
+def test_beams_above_a_mover_are_kept():
     leg, sole, crown = [0.5, 0.5, 1.2], [0.5, 0.5, 0.07], [0.5, 0.5, 4.2]
-    found = feet_of([leg, sole, crown], is_obstacle=[0, 1, 0], p_static=[0.9, 0.2, 0.9])
+    found = relabelled([leg, sole, crown], is_obstacle=[0, 1, 0], p_static=[0.9, 0.2, 0.9])
     assert np.isfinite(found).tolist() == [False, True, False]
 
 
-def test_feet_are_of_the_same_sweep():
+def test_ground_contact_within_one_sweep():
     leg, sole = [0.5, 0.5, 1.2], [0.5, 0.5, 0.07]
     given = {"is_obstacle": [0, 1], "p_static": [0.9, 0.2]}
-    assert np.isnan(feet_of([leg, sole], **given, scans=2)).all()
-    assert np.isfinite(feet_of([leg, sole], **given)[1])
+    assert np.isnan(relabelled([leg, sole], **given, scans=2)).all()
+    assert np.isfinite(relabelled([leg, sole], **given)[1])
 
 
 @pytest.mark.parametrize(
@@ -181,9 +181,9 @@ def test_feet_are_of_the_same_sweep():
         ({"surfel": np.array([0], np.int32)}, "surfel: expected one per beam"),
         ({"surfel": np.array([0, 2], np.int32)}, "surfel: out of range"),
         ({"surfel": np.array([0, -2], np.int32)}, "surfel: out of range"),
-        ({"is_obstacle": np.ones(1, bool)}, "is_obstacle: expected one per element"),
-        ({"p_static": np.ones(3, np.float32)}, "p_static: expected one per element"),
-        ({"ground_height": np.ones(1, np.float32)}, "ground_height: expected one per element"),
+        ({"is_obstacle": np.ones(1, bool)}, "is_obstacle: expected one per surfel"),
+        ({"p_static": np.ones(3, np.float32)}, "p_static: expected one per surfel"),
+        ({"ground_height": np.ones(1, np.float32)}, "ground_height: expected one per surfel"),
         ({"p_static": np.array([0.5, 1.5], np.float32)}, "p_static: expected a probability"),
         ({"ground_height": np.array([0.0, np.nan], np.float32)}, "ground_height: not finite"),
         ({"column_cells": 0}, "column_cells"),
@@ -191,7 +191,7 @@ def test_feet_are_of_the_same_sweep():
         ({"min_end_height": -1.0}, "min_end_height"),
     ],
 )
-def test_feet_refuse(changes, match):
+def test_ground_contact_argument_errors(changes, match):
     beams = row_of(0, 1), np.ones(2, bool), np.array([0, 2]), IDENTITY
     surface = _core.SurfelMap3D(1.0)
     surface.add_end_points(*beams)
@@ -210,7 +210,7 @@ def test_feet_refuse(changes, match):
         _core.relabel_ground_contact(surface, *beams, **{**given, **changes})
 
 
-def test_feet_refuse_unusable_beams():
+def test_ground_contact_with_unusable_beams():
     points = row_of(0, 1)
     surface = _core.SurfelMap3D(1.0)
     surface.add_end_points(points, np.ones(2, bool), np.array([0, 2]), IDENTITY)
@@ -235,43 +235,43 @@ def test_feet_refuse_unusable_beams():
 
 
 def row_of(*x):
-    """Ends side by side, one in the middle of each cell of a metre."""
+    """End points in the centres of cells of 1 m in a row."""
     return np.array([[v + 0.5, 0.5, 0.5] for v in x], np.float32)
 
 
 def share_of(scans, moving, column=1, fewest=1):
-    """By x of each cell: the share of the bodies around it."""
+    """{x of the cell: mean of its cluster}."""
     points, offset = np.concatenate(scans), np.cumsum([0, *map(len, scans)])
     hit, T = np.ones(len(points), bool), np.repeat(IDENTITY, len(scans), axis=0)
     surface = _core.SurfelMap3D(1.0)
     surface.add_end_points(points, hit, offset, T)
     surface.fit()
     x = surface.surfels()[0][:, 0]
-    moves = np.isin(x, moving).astype(np.float32)[:, None]
-    bodies = _core.ClusterPooling3D(
-        surface, np.ones(len(x), bool), moves, column_cells=column, min_surfels=fewest
+    is_moving = np.isin(x, moving).astype(np.float32)[:, None]
+    pooling = _core.ClusterPooling3D(
+        surface, np.ones(len(x), bool), is_moving, column_cells=column, min_surfels=fewest
     )
-    bodies.add(points, hit, offset, T)
-    return dict(zip(x.tolist(), bodies.means()[:, 0].tolist(), strict=True))
+    pooling.add(points, hit, offset, T)
+    return dict(zip(x.tolist(), pooling.means()[:, 0].tolist(), strict=True))
 
 
-def test_what_is_apart_says_nothing():
+def test_separate_clusters():
     share = share_of([row_of(0, 1, 2, 3, 5, 6)], moving=[3])
     assert share == {0: 0.25, 1: 0.25, 2: 0.25, 3: 0.25, 5: 0.0, 6: 0.0}
 
 
-def test_columns_wider_than_a_cell_reach_farther_on_both_sides_of_zero():
+def test_wide_columns_around_zero():
     assert share_of([row_of(-5, -3, -1)], moving=[-5]) == pytest.approx({-5: 1, -3: 0, -1: 0})
     share = share_of([row_of(-5, -3, -1)], moving=[-5], column=2)
     assert share == pytest.approx({-5: 1 / 3, -3: 1 / 3, -1: 1 / 3}, abs=1e-6)
 
 
-def test_each_sweep_has_the_same_say():
+def test_sweeps_have_equal_weights():
     share = share_of([row_of(0, 1), row_of(0), row_of(0), row_of(0)], moving=[1])
     assert share == {0: 0.125, 1: 0.5}
 
 
-def test_small_bodies_tell_nothing():
+def test_small_clusters_are_ignored():
     share = share_of([row_of(0, 1, 2), row_of(0, 1)], moving=[1, 2], fewest=3)
     assert share == pytest.approx({0: 2 / 3, 1: 2 / 3, 2: 2 / 3}, abs=1e-6)
     assert np.isnan(list(share_of([row_of(0, 1)], moving=[1], fewest=3).values())).all()
@@ -292,14 +292,14 @@ def bad(**changes):
     ("changes", "match"),
     [
         ({"raw": True}, "fit it first"),
-        ({"is_obstacle": np.ones(3, bool)}, "is_obstacle: expected one per element"),
-        ({"values": np.ones((1, 2), np.float32)}, "values: expected a row per element"),
-        ({"values": np.ones((2, 0), np.float32)}, "values: expected a row per element"),
+        ({"is_obstacle": np.ones(3, bool)}, "is_obstacle: expected one per surfel"),
+        ({"values": np.ones((1, 2), np.float32)}, "values: expected a row per surfel"),
+        ({"values": np.ones((2, 0), np.float32)}, "values: expected a row per surfel"),
         ({"values": np.array([[0.5], [np.nan]], np.float32)}, "values: expected -1e6"),
         ({"column_cells": 0}, "column_cells"),
         ({"min_surfels": 0}, "min_surfels"),
     ],
 )
-def test_refusals(changes, match):
+def test_argument_errors(changes, match):
     with pytest.raises(ValueError, match=match):
         bad(**changes)

@@ -1,4 +1,4 @@
-"""The core's branch and bound finds the best pose of the lattice that brute force finds."""
+"""Branch and bound finds the best lattice pose of the brute-force twin."""
 
 import numpy as np
 import pytest
@@ -8,12 +8,12 @@ from reference.likelihood_field import retract
 from stillmap import _core
 
 FLOOR, GAIN = 0.05, 0.2
-# a step of the raster more or less for two beams: rounding may fall either way
+# rounding may differ by one raster step for two beams
 TIED = 2 * GAIN * np.log((1 + FLOOR) / FLOOR) / 255
 
 
 class World:
-    """A map of three scans in a slanted room, and a fourth one to be laid on it."""
+    """A map of three scans in a slanted room, and a fourth one to register."""
 
     def __init__(self, a_room, seed, dimension, beams=60):
         self.beams = a_room(seed, dimension, (0.1, 0.2)[dimension - 2], 4, 150).beams
@@ -29,7 +29,7 @@ class World:
         self.sigma = b.resolution
 
     def prior(self, translation, rotation):
-        """A pose somewhere in the window around the true one."""
+        """A random pose in the window around the true one."""
         d = np.zeros(self.dof)
         D = self.beams.dimension
         rng = np.random.default_rng(self.seed)
@@ -80,7 +80,7 @@ def information(kind, dof, seed):
         "even": np.diag([20.0] * dof),
         "one way only": np.diag([50.0, *[0.0] * (dof - 1)]),
         "correlated": 5 * A @ A.T,
-        # as after a way along a curve: turn and shift go together, across it hardly anything goes
+        # correlated rotation and translation, as after a curve; little lateral motion
         "narrow": 400 * np.outer(A[0], A[0]) + np.eye(dof),
         "singular": 100 * np.outer(A[0], A[0]),
     }[kind]
@@ -100,7 +100,7 @@ def assert_finds_the_best(world, kind, window):
     assert np.abs(off).max() < 1e-6
     best = lattice.scores.max()
     assert lattice.scores[index] >= best - TIED
-    # it is worth finding: the others are worse
+    # the others are worse
     assert best > np.median(lattice.scores) + 0.5
     return lattice, tried
 
@@ -111,14 +111,14 @@ def assert_finds_the_best(world, kind, window):
 @pytest.mark.parametrize(
     ("dimension", "window"), [(D, window) for D, windows in WINDOWS.items() for window in windows]
 )
-def test_the_best_of_the_lattice(a_room, dimension, window, kind):
+def test_best_lattice_pose(a_room, dimension, window, kind):
     for seed in range(3 if dimension == 2 else 1):
         assert_finds_the_best(World(a_room, seed, dimension), kind, window)
 
 
 @pytest.mark.parametrize(("dimension", "window"), [(2, (3.0, np.pi)), (3, (1.7, 0.5))])
 @pytest.mark.parametrize("kind", ["even", "correlated"])
-def test_wide_windows_are_not_gone_through_pose_by_pose(a_room, dimension, window, kind):
+def test_branch_and_bound_prunes(a_room, dimension, window, kind):
     lattice, tried = assert_finds_the_best(World(a_room, 4, dimension, 40), kind, window)
     assert lattice.scores.size > 4e4
     assert tried < 0.2 * lattice.scores.size
@@ -126,7 +126,7 @@ def test_wide_windows_are_not_gone_through_pose_by_pose(a_room, dimension, windo
 
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("seed", range(3))
-def test_more_starts_are_never_worse(a_room, dimension, seed):
+def test_more_candidates_are_never_worse(a_room, dimension, seed):
     world, window = World(a_room, seed, dimension), (0.5, 0.5)
     T_prior, Lambda = world.prior(*window), information("correlated", world.dof, seed)
     for iterations in (0, 20):
@@ -180,7 +180,7 @@ def test_the_raster_by_hand():
         ("floor", 0.0, ValueError),
     ],
 )
-def test_refusals(name, value, error):
+def test_argument_errors(name, value, error):
     good = {
         "grid": _core.OccupancyGrid2D(0.5),
         "points": np.ones((5, 2), np.float32),

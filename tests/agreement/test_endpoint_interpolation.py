@@ -1,4 +1,4 @@
-"""End points between neighbouring ones on a flat surface: the core against the plain twin."""
+"""End-point interpolation: kernel against twin, and by hand."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ LOOSE = {"max_gap": 0.6, "tolerance": 0.15, "max_gap_ratio": 1.6}  # for random 
 
 
 def filled(kernels, beams, options=OPTIONS):
-    """A grid of nothing but what fills the gaps."""
+    """A grid of the interpolated end points only."""
     grid = beams.empty_grid(kernels)
     kernels.interpolate_end_points(
         grid, beams.points, beams.hit, beams.e, beams.offset, beams.T_map_sensor, **options
@@ -20,20 +20,20 @@ def filled(kernels, beams, options=OPTIONS):
 
 
 def assert_agree(core, plain, n):
-    """Sums and what registration sees of them; each of n end points is rounded once."""
+    """Same sums and registration costs; each of n end points is rounded once."""
     first, alpha, beta = core.dense()
     first_plain, alpha_plain, beta_plain = plain.dense()
     np.testing.assert_array_equal(first, first_plain)
     np.testing.assert_allclose(alpha, alpha_plain, rtol=0, atol=n * 2.0**-24)
-    assert not beta.any()  # nothing passes through cells for them
+    assert not beta.any()  # no crossings
     assert not beta_plain.any()
     cells = np.array(list(plain.alpha), np.int64)
-    # end points to the side of the cells' centres: the moments count
-    look = ((cells + 0.2) * plain.resolution).astype(np.float32)
-    weights, T = np.ones(len(look), np.float32), np.eye(look.shape[1] + 1)
+    # off the cell centres, where the moments matter
+    probes = ((cells + 0.2) * plain.resolution).astype(np.float32)
+    weights, T = np.ones(len(probes), np.float32), np.eye(probes.shape[1] + 1)
     options = 0.6 * plain.resolution, 2, 0.02, 0.3
     costs = [
-        kernels.registration_cost(grid, look, weights, T, *options)
+        kernels.registration_cost(grid, probes, weights, T, *options)
         for kernels, grid in ((_core, core), (reference, plain))
     ]
     assert costs[0] == pytest.approx(costs[1], rel=1e-5, abs=1e-4)
@@ -41,13 +41,13 @@ def assert_agree(core, plain, n):
 
 @pytest.fixture
 def wandering(beams):
-    """Ragged scans whose end points wander about, now straight on, now not, near and far apart."""
+    """Ragged scans whose end points follow a random walk, in part straight."""
     rng = np.random.default_rng(7)
     points, v = np.zeros_like(beams.points), np.zeros(beams.dimension)
     for n in range(1, len(points)):
         v = 0.85 * v - 0.05 * points[n - 1] + rng.normal(scale=0.15, size=len(v))
         points[n] = points[n - 1] + rng.lognormal(sigma=0.6) * v
-    there = points + 0 * beams.points  # what was not finite is not
+    there = points + 0 * beams.points  # keeps NaN
     return beams.with_(points=there, resolution=0.05)
 
 
@@ -58,7 +58,7 @@ def test_random_scans(wandering):
 
 
 @pytest.mark.parametrize("name", ["max_gap", "tolerance", "max_gap_ratio"])
-def test_every_option_bounds_what_is_filled(wandering, name):
+def test_every_option_limits_the_interpolation(wandering, name):
     sizes = []
     for factor in (0.0, 0.5, 1.0, 2.0):
         options = {**LOOSE, name: factor * LOOSE[name]}
@@ -72,7 +72,7 @@ def test_every_option_bounds_what_is_filled(wandering, name):
 
 
 def ranges_to(walls, angles):
-    """Along rays from the origin to the nearest of half planes (normal, distance)."""
+    """Ranges of rays from the origin to the nearest of half planes (normal, distance)."""
     rays = np.column_stack([np.cos(angles), np.sin(angles)])
     with np.errstate(divide="ignore"):
         found = np.array([d / (rays @ np.asarray(n)) for n, d in walls])
@@ -102,7 +102,7 @@ def scene(kind):
 
 @pytest.fixture(params=[2, 3], ids=["2D", "3D"])
 def laid(request, a_room):
-    """Lays flat scenes into a map of some dimension; several scans, each from a pose of its own."""
+    """Makes beams of flat scenes in 2D or 3D; several scans from different poses."""
     room = a_room(5, request.param, (0.05, 0.07)[request.param - 2], 3, 4).beams
 
     def lay(*kinds):
@@ -130,7 +130,7 @@ def test_scenes(laid, kind):
 
 
 @pytest.mark.parametrize("kind", list(SURFACES))
-def test_what_is_added_lies_on_the_surfaces(laid, kind):
+def test_interpolated_points_lie_on_the_surfaces(laid, kind):
     beams = laid(kind)
     plain = filled(reference, beams)
     added = np.array([plain.moment[cell] / plain.alpha[cell] for cell in plain.alpha])
@@ -143,7 +143,7 @@ def test_what_is_added_lies_on_the_surfaces(laid, kind):
         assert (distances < 1e-5).sum() > 10
 
 
-def test_a_wall_far_away_is_left_without_a_gap(laid):
+def test_distant_wall_has_no_gaps(laid):
     beams = laid("wall")
     plain = filled(reference, beams)
     added = np.array([plain.moment[cell] / plain.alpha[cell] for cell in plain.alpha])
@@ -151,11 +151,11 @@ def test_a_wall_far_away_is_left_without_a_gap(laid):
     seen = beams.points[beams.hit]
     along = np.sort(np.concatenate([seen, (added - T[:D, D]) @ T[:D, :D]])[:, 0])
     assert np.abs(np.diff(seen[:, 0])).max() > 0.8
-    # end points that share a cell are one mean there
+    # end points in one cell share their mean
     assert np.diff(along).max() < 2 * beams.resolution
 
 
-def test_several_scans_do_not_touch_one_another(laid):
+def test_scans_are_independent(laid):
     kinds = "wall", "jump", "missing"
     beams = laid(*kinds)
     core, plain = filled(_core, beams), filled(reference, beams)
@@ -176,7 +176,7 @@ def test_several_scans_do_not_touch_one_another(laid):
 
 
 @pytest.mark.parametrize("kind", list(SURFACES))
-def test_remove_takes_everything_out_to_the_bit(laid, kind):
+def test_removal_is_exact(laid, kind):
     beams = laid(kind, "wall")
     filling = beams.points, beams.hit, beams.e, beams.offset, beams.T_map_sensor
     grid, never = beams.grid(_core), beams.grid(_core)
@@ -185,19 +185,19 @@ def test_remove_takes_everything_out_to_the_bit(laid, kind):
     assert [a.tobytes() for a in grid.dense()] != before
     _core.interpolate_end_points(grid, *filling, **OPTIONS, remove=True)
     assert [a.tobytes() for a in grid.dense()] == before
-    look, weights = beams.points, np.ones(len(beams.points), np.float32)
+    probes, weights = beams.points, np.ones(len(beams.points), np.float32)
     costs = [
-        _core.registration_cost(g, look, weights, beams.T_map_sensor[0], 0.04, 2, 0.05, 0.05)
+        _core.registration_cost(g, probes, weights, beams.T_map_sensor[0], 0.04, 2, 0.05, 0.05)
         for g in (grid, never)
     ]
-    assert costs[0] == costs[1]  # the moments too
+    assert costs[0] == costs[1]  # moments as well
 
 
 # by hand: which gaps are filled, on cells of 0.1 m
 
 
 def between(kernels, points, hit=None, e=None, **changes):
-    """{cell along x: alpha} of what is added."""
+    """{cell along x: alpha} of the interpolated end points."""
     points = np.array(points, np.float32).reshape(-1, 2) + np.float32([0, 0.05])
     n = len(points)
     grid = kernels.OccupancyGrid2D(0.1)
@@ -219,7 +219,7 @@ both = pytest.mark.parametrize("kernels", [reference, _core])
 
 
 @both
-def test_the_cells_between_by_hand(kernels):
+def test_cells_by_hand(kernels):
     # from 0.06 on over 0.38 m in four steps: 0.155, 0.25, 0.345; then 0.27 m in three: 0.53, 0.62
     there = [(0.06, 0), (0.44, 0), (0.71, 0)]
     assert between(kernels, there) == {1: 1, 2: 1, 3: 1, 5: 1, 6: 1}
@@ -235,7 +235,7 @@ def test_the_cells_between_by_hand(kernels):
 
 
 @both
-def test_two_are_not_a_surface(kernels):
+def test_two_end_points_are_not_a_surface(kernels):
     assert between(kernels, [(0.06, 0), (0.44, 0)]) == {}
     assert between(kernels, []) == {}
     assert between(kernels, [(0.06, 0), (0.44, 0), (0.71, 0)], hit=[1, 1, 0]) == {}
@@ -244,7 +244,7 @@ def test_two_are_not_a_surface(kernels):
 
 
 @both
-def test_a_gap_is_not_much_wider_than_the_one_beside_it(kernels):
+def test_max_gap_ratio(kernels):
     # 0.1 m, then 0.35 m: more than three times as wide, and the other way round less
     there = [(0.06, 0), (0.16, 0), (0.51, 0)]
     assert between(kernels, there) == {}
@@ -253,7 +253,7 @@ def test_a_gap_is_not_much_wider_than_the_one_beside_it(kernels):
 
 
 @both
-def test_a_surface_that_turns_back_or_bends_is_none(kernels):
+def test_bent_surfaces(kernels):
     assert between(kernels, [(0.06, 0), (0.44, 0), (0.11, 0)]) == {}
     # the last one is 0.11 m off the line of the others, the first one 0.14 m
     bend = [(0.06, 0), (0.44, 0), (0.71, 0.11)]

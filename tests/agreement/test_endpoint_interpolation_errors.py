@@ -1,4 +1,4 @@
-"""What filling gaps on surfaces refuses, and that it says which array is at fault."""
+"""Invalid arguments of end-point interpolation."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ FILL = {"max_gap": 1.5, "tolerance": 0.1, "max_gap_ratio": 3.0}
 
 
 def gaps(dimension=2):
-    """Good arguments: 5 beams in 2 scans; the gaps of the second one are filled."""
+    """Valid arguments: 5 beams in 2 scans; the gaps of the second one are interpolated."""
     points = np.ones((5, dimension), np.float32)
     points[:, 0] = [1.0, 2.0, 1.0, 2.0, 3.0]
     return {
@@ -47,7 +47,7 @@ def gaps(dimension=2):
     ],
 )
 @pytest.mark.parametrize("remove", [False, True])
-def test_gaps_on_surfaces(dimension, name, value, error, remove):
+def test_argument_errors(dimension, name, value, error, remove):
     good = gaps(dimension)
     _core.interpolate_end_points(**good, remove=remove)
     with pytest.raises(error, match=name):
@@ -56,7 +56,7 @@ def test_gaps_on_surfaces(dimension, name, value, error, remove):
 
 @pytest.mark.parametrize("bad", [-0.01, 1.01, np.nan, np.inf])
 @pytest.mark.parametrize("beam", [2, 3, 4])
-def test_expectations_between_which_gaps_are_filled(bad, beam):
+def test_e_out_of_range(bad, beam):
     e = np.full(5, 0.5, np.float32)
     e[beam] = bad
     for kernels, grid in (
@@ -66,14 +66,14 @@ def test_expectations_between_which_gaps_are_filled(bad, beam):
         with pytest.raises(ValueError, match="e: "):
             kernels.interpolate_end_points(**{**gaps(), "e": e, "grid": grid})
     e = np.full(5, 0.5, np.float32)
-    e[:2] = bad  # two alone are not a surface: nobody looks at them
+    e[:2] = bad  # e of two beams that are not a surface is not used
     _core.interpolate_end_points(**{**gaps(), "e": e})
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -1e30])
 @pytest.mark.usefixtures("bounded_memory")
-def test_gaps_that_are_not_finite_or_far_away(bad, dimension):
+def test_end_points_not_finite_or_far_away(bad, dimension):
     for row in range(dimension):
         T = np.tile(np.eye(dimension + 1), (2, 1, 1))
         T[1, row, -1] = bad
@@ -81,19 +81,19 @@ def test_gaps_that_are_not_finite_or_far_away(bad, dimension):
             _core.interpolate_end_points(**{**gaps(dimension), "T_map_sensor": T})
     far = gaps(dimension)
     far["points"][:, 0] *= np.float32(1e30)
-    _core.interpolate_end_points(**far)  # so are the gaps: none is filled
+    _core.interpolate_end_points(**far)  # too wide: no gap is filled
     with pytest.raises(ValueError, match="end point"):
         _core.interpolate_end_points(**{**far, "max_gap": np.inf})
     assert not far["grid"].dense()[1].any()
     lost = gaps(dimension)
     lost["points"][3, 0] = bad
-    _core.interpolate_end_points(**lost)  # a beam without an end point is on no surface
+    _core.interpolate_end_points(**lost)  # a beam without an end point is skipped
     assert not lost["grid"].dense()[1].any()
 
 
 @pytest.mark.parametrize("name", list(FILL))
 @pytest.mark.parametrize("bad", [-0.1, np.nan])
-def test_the_twin_refuses_the_same_gaps(name, bad):
+def test_twin_raises_the_same_errors(name, bad):
     grid = reference.OccupancyGrid2D(0.5)
     with pytest.raises(ValueError, match=name):
         reference.interpolate_end_points(**{**gaps(), "grid": grid, name: bad})

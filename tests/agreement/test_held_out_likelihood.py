@@ -1,4 +1,4 @@
-"""The density of held-out ranges: core against the plain twin, and that it is a density."""
+"""Held-out likelihood: kernel against twin, and normalisation of the density."""
 
 import numpy as np
 import pytest
@@ -42,12 +42,12 @@ def test_rates(beams, held):
 @pytest.mark.parametrize(
     "changes", [{}, {"late_share": 0.0}, {"late_share": 1.0}, {"range_std": 0.5}]
 )
-def test_gains(beams, held, changes):
+def test_scores(beams, held, changes):
     core, plain = filled(_core, beams, held), filled(reference, beams, held)
-    looks = *beams.arguments, held
+    scans = *beams.arguments, held
     model = {**MODEL, **changes}
-    ours = _core.score_held_out(core, *looks, **model)
-    expected = reference.score_held_out(plain, *looks, **model)
+    ours = _core.score_held_out(core, *scans, **model)
+    expected = reference.score_held_out(plain, *scans, **model)
     assert ours.shape == expected.shape == (len(held), 2)
     assert not ours[~held].any()
     assert expected[:, 1].sum() > 20
@@ -56,13 +56,13 @@ def test_gains(beams, held, changes):
 
 
 @pytest.mark.parametrize("threads", [2, 3, 64])
-def test_threads_change_no_bit(beams, held, threads):
-    shares, looks = filled(_core, beams, held), (*beams.arguments, held)
-    one, many = (_core.score_held_out(shares, *looks, **MODEL, threads=n) for n in (1, threads))
+def test_any_number_of_threads_gives_the_same_bits(beams, held, threads):
+    shares, scans = filled(_core, beams, held), (*beams.arguments, held)
+    one, many = (_core.score_held_out(shares, *scans, **MODEL, threads=n) for n in (1, threads))
     assert one.tobytes() == many.tobytes()
 
 
-def test_order_of_scans_changes_no_bit(beams, held):
+def test_any_order_of_scans_gives_the_same_bits(beams, held):
     whole = filled(_core, beams, held)
     piecewise = shares_of(_core, beams.dimension, beams.resolution)
     for t in reversed(range(len(held))):
@@ -71,13 +71,13 @@ def test_order_of_scans_changes_no_bit(beams, held):
             beams.points[a:b], beams.hit[a:b], beams.e[a:b], np.array([0, b - a]),
             beams.T_map_sensor[t : t + 1], held[t : t + 1],
         )  # fmt: skip
-    looks = *beams.arguments, held
-    gains = [_core.score_held_out(shares, *looks, **MODEL) for shares in (whole, piecewise)]
+    scans = *beams.arguments, held
+    gains = [_core.score_held_out(shares, *scans, **MODEL) for shares in (whole, piecewise)]
     assert gains[0].tobytes() == gains[1].tobytes()
 
 
 def wall_and_clutter(kernels, dimension):
-    """Hits around 3 m and 4 m along the first axis, of e = 0.7 and 1, and movers before them."""
+    """Returns around 3 m (e = 0.7) and 4 m (e = 1) along x, dynamic ones before them."""
     rng = np.random.default_rng(8)
     x = np.concatenate([rng.normal(3, 0.1, 40), rng.normal(4, 0.1, 40), rng.uniform(1, 3, 20)])
     points = np.zeros((len(x), dimension), np.float32)
@@ -94,7 +94,7 @@ def wall_and_clutter(kernels, dimension):
 @pytest.mark.parametrize(
     "model", [MODEL, {**MODEL, "stopping_rate": 30.0}, {**MODEL, "late_share": 1.0}]
 )
-def test_ranges_have_a_density_that_integrates_to_one(dimension, model):
+def test_density_integrates_to_one(dimension, model):
     shares = wall_and_clutter(_core, dimension)
     step, longest = 0.002, 12.0
     z = np.append(np.arange(step / 2, longest, step), longest)
@@ -111,16 +111,16 @@ def test_ranges_have_a_density_that_integrates_to_one(dimension, model):
     log_q = np.where(hit, np.log(q), 0.0) - q * np.linalg.norm(points, axis=1)
     p = np.exp(gain + log_q)
     assert p[:-1].sum() * step + p[-1] == pytest.approx(1.0, abs=2e-3)
-    assert p[:-1].max() > 3 * np.exp(log_q[:-1]).max()  # the map says something
+    assert p[:-1].max() > 3 * np.exp(log_q[:-1]).max()  # the map is informative
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("kernels", [_core, reference])
-def test_a_world_of_which_nothing_is_known_gains_nothing(kernels, dimension):
-    # no beam seen: everything ends at one end per metre, in the map and without it
+def test_empty_map_scores_zero(kernels, dimension):
+    # no beams: one end per metre with and without the map
     shares = shares_of(kernels, dimension, 0.1)
     points = np.full((3, dimension), 0.7, np.float32)
-    points[2] = 0.0  # of no length
+    points[2] = 0.0  # zero range
     args = points, np.array([True, False, True]), np.array([0, 3]), np.eye(dimension + 1)[None]
     gain, beams = kernels.score_held_out(shares, *args, np.array([True]), **MODEL)[0]
     assert gain == pytest.approx(0.0, abs=1e-12)
@@ -142,7 +142,7 @@ def test_a_world_of_which_nothing_is_known_gains_nothing(kernels, dimension):
         ("offset", np.array([0, 5])),
     ],
 )
-def test_refusals(name, value):
+def test_argument_errors(name, value):
     good = {
         "points": np.ones((5, 2), np.float32),
         "hit": np.ones(5, bool),
@@ -157,16 +157,16 @@ def test_refusals(name, value):
 
 
 @pytest.mark.parametrize("e", [-0.1, 1.5, np.nan])
-def test_expectations_of_others_are_probabilities(e):
+def test_e_out_of_range(e):
     scan = np.ones((1, 2), np.float32), np.array([True]), np.array([e], np.float32)
     at = np.array([0, 1]), np.eye(3)[None]
-    _core.StaticFractionGrid2D(0.1).add(*scan, *at, np.array([True]))  # held out: not looked at
+    _core.StaticFractionGrid2D(0.1).add(*scan, *at, np.array([True]))  # held out: not used
     with pytest.raises(ValueError, match="e: "):
         _core.StaticFractionGrid2D(0.1).add(*scan, *at, np.array([False]))
 
 
-def test_hits_at_the_end_of_the_world():
-    # the walk goes on behind a hit, but not beyond where cells can be counted
+def test_returns_near_the_largest_cell():
+    # the traversal continues behind a return and would leave the range of cell indices
     points = np.array([[2.0**24 - 1, 0.5]], np.float32)
     args = points, np.array([True]), np.array([0, 1]), np.eye(3)[None], np.array([True])
     with pytest.raises(ValueError, match="too far"):

@@ -1,4 +1,4 @@
-"""The registration field of the core against the plain twin."""
+"""Likelihood field of registration: kernel against twin."""
 
 import numpy as np
 import pytest
@@ -67,8 +67,8 @@ def test_gradient(beams, grids):
         assert core == pytest.approx(plain, rel=1e-4, abs=1e-3 * np.abs(plain).max())
 
 
-def test_a_line_in_space_is_no_plane_that_goes_on():
-    # beams along x from x = 0: around the line nobody looked, and all sides of it are alike
+def test_line_in_3d_is_not_extrapolated():
+    # beams along x from x = 0: unobserved around the line, symmetric about it
     points = np.zeros((12, 3), np.float32)
     points[:, 0] = np.linspace(0.3, 1.4, 12)
     T = np.eye(4)[None].copy()
@@ -90,7 +90,7 @@ def test_a_line_in_space_is_no_plane_that_goes_on():
 
 
 def curvature_of(grid, points, weights, T, sigma, radius):
-    """The core's, out of the covariance at a pose that no step is made from."""
+    """Curvature of the kernel from the covariance without a step."""
     prior = np.eye(3 if len(T) == 3 else 6)
     _, covariance, *_ = _core.register_scan(
         grid, points, weights, T, prior, sigma=sigma, radius=radius, floor=FLOOR, unknown=UNKNOWN,
@@ -126,10 +126,10 @@ def test_curvature_has_no_negative_part(beams, grids):
         values = np.linalg.eigvalsh(plain[:D, :D])
         assert values.min() > -1e-6
         kinds.add(int((values > 1e-3).sum()))
-    assert kinds == set(range(D + 1))  # from nowhere to everywhere
+    assert kinds == set(range(D + 1))  # from no axis to all axes
 
 
-def test_far_from_everything(beams, grids):
+def test_far_from_the_map(beams, grids):
     points, weights, T = scan(beams)
     T = T.copy()
     T[0, -1] += 1000

@@ -1,4 +1,4 @@
-"""The faces nearest to points: the core against its plain twin, and by hand."""
+"""Closest faces: kernel against twin, and by hand."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def soup(seed, n, away=0.0):
 
 @pytest.mark.parametrize("away", [0.0, 3e5])
 @pytest.mark.parametrize(("seed", "reach"), [(0, 0.02), (1, 0.1), (2, 0.1), (3, 1.0), (4, 30.0)])
-def test_core_and_twin_agree(seed, reach, away):
+def test_agreement(seed, reach, away):
     vertices, faces, points, origins = soup(seed, 300, away)
     found = _core.MeshDistance(vertices, faces, max_distance=reach).closest_faces(points, origins)
     expected = reference.MeshDistance(vertices, faces, max_distance=reach).closest_faces(
@@ -46,8 +46,8 @@ def test_core_and_twin_agree(seed, reach, away):
         assert (found[0] < 0).any()
 
 
-def test_a_mesh_of_faces_that_share_edges():
-    """Of feet on an edge one of its faces is found, and no other one is nearer."""
+def test_shared_edges():
+    """Closest points on an edge belong to one of its faces."""
     rng = np.random.default_rng(5)
     n = 30
     u, v = (a.ravel() for a in np.mgrid[:n, :n])
@@ -70,7 +70,7 @@ def test_a_mesh_of_faces_that_share_edges():
     np.testing.assert_allclose(places(found), places(expected), atol=1e-9)
 
 
-def test_the_nearest_place_of_a_triangle_is_that_of_all_its_places():
+def test_closest_point_against_dense_samples():
     rng = np.random.default_rng(1)
     corners, points = rng.normal(size=(300, 3, 3)), 2.0 * rng.normal(size=(300, 3))
     corners[:20, 2] = corners[:20, 0] + 0.3 * (corners[:20, 1] - corners[:20, 0])  # slivers
@@ -103,7 +103,7 @@ def test_by_hand():
     assert (near.closest_faces(points, points + 9.0 * np.roll(UP, 1))[0] == -1).all()  # their edges
 
 
-def test_of_several_at_one_distance_the_lowest_number_counts():
+def test_ties_go_to_the_lowest_index():
     faces = np.array([[0, 1, 2]] * 3 + [[0, 2, 1]], np.int32)[[3, 0, 1, 2]]
     points = np.array([[0.2, 0.2, 0.01], [0.7, 0.1, 0.0], [0.2, -0.05, 0.0]])
     near = _core.MeshDistance(TRIANGLE, faces, max_distance=0.1)
@@ -111,7 +111,7 @@ def test_of_several_at_one_distance_the_lowest_number_counts():
     assert near.closest_faces(points, points - UP)[0].tolist() == [0, 0, 0]
 
 
-def test_faces_without_area_are_nothing():
+def test_degenerate_faces_are_skipped():
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
     faces = np.array([[0, 1, 2], [1, 1, 1], [0, 1, 0]], np.int32)
     points = np.array([[0.5, 0, 0], [1.0, 0.01, 0]])
@@ -136,8 +136,8 @@ def test_an_empty_mesh_and_no_points():
 
 
 @pytest.mark.usefixtures("bounded_memory")
-def test_faces_much_larger_than_the_reach_take_no_more_memory():
-    """And neither does a mesh that spans far more cells than can be numbered."""
+def test_memory_with_large_faces():
+    """Nor with a mesh that spans more cells than can be indexed."""
     rng = np.random.default_rng(6)
     for size, reach in ((1.0, 0.1), (1e3, 0.1), (1e8, 0.1), (1e8, 1e-6)):
         vertices = size * rng.uniform(-1.0, 1.0, (3000, 3))
@@ -150,7 +150,7 @@ def test_faces_much_larger_than_the_reach_take_no_more_memory():
         assert (np.maximum(face, back) >= 0).mean() > 0.9 or reach < 1e-3
 
 
-def test_a_small_face_beside_a_huge_one():
+def test_small_face_next_to_a_huge_one():
     vertices = np.concatenate([2000.0 * (TRIANGLE - 0.3), 0.05 * TRIANGLE + [0.0, 0, 600.02]])
     vertices[:3, 2] = 600.0
     faces = np.array([[0, 1, 2], [3, 4, 5]], np.int32)
@@ -159,7 +159,7 @@ def test_a_small_face_beside_a_huge_one():
     assert near.closest_faces(points, points + UP)[0].tolist() == [1, 0, 0]
 
 
-def test_points_far_away_have_none():
+def test_distant_points():
     points = np.array([[1e300, 0, 0], [-1e15, 1e15, 0], [0.2, 0.2, 5.0]])
     face, _ = _core.MeshDistance(TRIANGLE, ONE, max_distance=0.1).closest_faces(
         points, points * 1.0
@@ -183,20 +183,20 @@ def test_threads_change_nothing():
     [
         ({"vertices": np.full((3, 3), np.nan)}, "vertices: not finite"),
         ({"vertices": np.full((3, 3), -1e10)}, "vertices: not finite, or beyond"),
-        ({"faces": np.array([[0, 1, 3]], np.int32)}, "faces: a vertex that is not there"),
-        ({"faces": np.array([[0, 1, -1]], np.int32)}, "faces: a vertex that is not there"),
+        ({"faces": np.array([[0, 1, 3]], np.int32)}, "faces: vertex index out of range"),
+        ({"faces": np.array([[0, 1, -1]], np.int32)}, "faces: vertex index out of range"),
         ({"max_distance": 0.0}, "max_distance: expected"),
         ({"max_distance": np.nan}, "max_distance: expected"),
         ({"max_distance": np.inf}, "max_distance: expected"),
     ],
 )
-def test_what_is_no_mesh_is_refused(changes, said):
+def test_invalid_meshes(changes, said):
     given = {"vertices": TRIANGLE, "faces": ONE, "max_distance": 0.1}
     with pytest.raises(ValueError, match=said):
         _core.MeshDistance(**{**given, **changes})
 
 
-def test_what_are_no_points_is_refused():
+def test_invalid_points():
     near = _core.MeshDistance(TRIANGLE, ONE, max_distance=0.1)
     points = np.zeros((4, 3))
     spoilt = points.copy()

@@ -1,4 +1,4 @@
-"""Beams without a return, as far as they are believed: the core against the plain twin."""
+"""Beams without a return: kernel against twin, and by hand."""
 
 from itertools import pairwise
 
@@ -11,7 +11,7 @@ from stillmap import _core
 
 @pytest.fixture(scope="module", params=[(2, 0.15, 120), (3, 0.4, 160)], ids=["2D", "3D"])
 def lossy(request, a_room):
-    """A room in which some beams are lost, alone and in rows, and go on behind the wall."""
+    """A room where some beams have no return, alone and in runs, and end behind the wall."""
     dimension, resolution, beams = request.param
     room = a_room(3, dimension, resolution, 16, beams)
     rng = np.random.default_rng(3)
@@ -26,7 +26,7 @@ def lossy(request, a_room):
 
 
 def parts(kernels, beams, stops, end_margin, threads=1):
-    """What is believed and what is not."""
+    """Grids of the trusted part and of the remainder."""
     grids = beams.empty_grid(kernels), beams.empty_grid(kernels)
     kernels.add_no_return_beams(*grids, *beams.arguments, stops, end_margin, threads)
     return grids
@@ -40,8 +40,8 @@ def cells_of(*grids):
 @pytest.mark.parametrize("stopped", [False, True])
 def test_add_no_return_beams(lossy, stopped, end_margin):
     room, beams = lossy
-    dwell = room.dwell(_core, room.surface(_core), [0.5], [1.0])
-    stops = dwell.solid_cells() if stopped else np.zeros((0, beams.dimension), np.int64)
+    hmm = room.hmm(_core, room.surface(_core), [0.5], [1.0])
+    stops = hmm.solid_cells() if stopped else np.zeros((0, beams.dimension), np.int64)
     assert stops.dtype == np.int64
     assert (len(stops) > 20) == stopped
     everything = beams.grid(reference)
@@ -51,7 +51,7 @@ def test_add_no_return_beams(lossy, stopped, end_margin):
     for core, plain in zip(*found, strict=True):
         a, b = core.alpha_beta(cells), plain.alpha_beta(cells)
         assert (a[:, 0] == 0).all()
-        # a cell that is left just where belief ends may fall to either side
+        # cells left at the limit may fall on either side
         assert (np.abs(a - b)[:, 1] > 1e-5).mean() < 2e-3
         shares.append(b[:, 1].sum() / sum(everything.beta.values()))
     assert 0.1 < sum(shares) < 0.7
@@ -59,18 +59,18 @@ def test_add_no_return_beams(lossy, stopped, end_margin):
     assert (shares[0] > 0.01) == (end_margin < np.inf)
 
 
-def test_solid(lossy):
+def test_solid_cells(lossy):
     room, _ = lossy
-    found = [room.dwell(k, room.surface(k), [0.5], [1.0]).solid_cells() for k in (_core, reference)]
+    found = [room.hmm(k, room.surface(k), [0.5], [1.0]).solid_cells() for k in (_core, reference)]
     assert set(map(tuple, found[0])) == set(map(tuple, found[1]))
     assert len(found[0]) > 20
-    round_ones = room.dwell(_core, room.surface(_core), [0.5], [1.0], use_normals=False)
+    round_ones = room.hmm(_core, room.surface(_core), [0.5], [1.0], use_normals=False)
     assert round_ones.solid_cells().shape == (0, room.beams.dimension)
 
 
-def test_nearer_stops_leave_less(lossy):
+def test_nearer_stop_cells_trust_less(lossy):
     room, beams = lossy
-    solid = room.dwell(_core, room.surface(_core), [0.5], [1.0]).solid_cells()
+    solid = room.hmm(_core, room.surface(_core), [0.5], [1.0]).solid_cells()
     none = solid[:0]
     cells = cells_of(beams.grid(reference))
     beta = [
@@ -83,9 +83,9 @@ def test_nearer_stops_leave_less(lossy):
 
 
 @pytest.mark.parametrize("threads", [1, 3])
-def test_hits_and_both_parts_are_the_sums_to_the_bit(lossy, threads):
+def test_parts_sum_up_exactly(lossy, threads):
     room, beams = lossy
-    stops = room.dwell(_core, room.surface(_core), [0.5], [1.0]).solid_cells()
+    stops = room.hmm(_core, room.surface(_core), [0.5], [1.0]).solid_cells()
     hits = np.where(beams.hit[:, None], beams.points, np.float32(np.nan)).astype(np.float32)
     grid = beams.with_(points=hits).grid(_core)
     for part in parts(_core, beams, stops, 0.3, threads):
@@ -94,8 +94,8 @@ def test_hits_and_both_parts_are_the_sums_to_the_bit(lossy, threads):
         np.testing.assert_array_equal(a, b)
 
 
-def test_lone_ones_are_never_believed():
-    # rows of two and of four, and of three that the end of a scan cuts
+def test_short_runs_are_not_trusted():
+    # runs of two and four, and of three cut by the end of a scan
     T = np.tile(np.eye(3), (4, 1, 1))
     T[:, 1, 2] = 0.5, 2.5, 4.5, 4.5
     offset = np.array([0, 3, 7, 9, 10])
@@ -118,7 +118,7 @@ def test_lone_ones_are_never_believed():
             assert found == [pytest.approx(row) for row in expected]
 
 
-def test_refusals():
+def test_argument_errors():
     grid, rest = _core.OccupancyGrid2D(0.1), _core.OccupancyGrid2D(0.1)
     nothing = np.zeros((0, 2), np.float32), np.zeros(0, bool), np.zeros(1, np.int64)
     poses, stops = np.zeros((0, 3, 3)), np.zeros((0, 2), np.int64)

@@ -1,4 +1,4 @@
-"""In how many looks cells were looked at: the core against its twin, by hand, and refusals."""
+"""Observation counts: kernel against twin, by hand, and invalid arguments."""
 
 import numpy as np
 import pytest
@@ -16,10 +16,10 @@ def empty(kernels, dimension, resolution, **options):
     return kind(resolution, **{"radius": 2.3 * resolution, **options})
 
 
-def counted(kernels, beams, look, dynamic, threads=1, **options):
+def counted(kernels, beams, time_bin, dynamic, threads=1, **options):
     counts = empty(kernels, beams.dimension, beams.resolution, **options)
     points, hit, offset, T = beams.arguments
-    counts.add(points, hit, dynamic, offset, T, look, threads)
+    counts.add(points, hit, dynamic, offset, T, time_bin, threads)
     return counts
 
 
@@ -29,14 +29,14 @@ def box_of(beams):
     return (first - 3).tolist(), tuple(n + 6 for n in shape)
 
 
-def looks_of(beams, seed):
-    """Looks of one scan to five, with gaps, and who moves."""
+def time_bins_of(beams, seed):
+    """Time bins of one to five scans, with gaps, and dynamic returns."""
     rng = np.random.default_rng(seed)
-    look = np.cumsum(rng.choice([0, 0, 1, 7], len(beams.T_map_sensor))).astype(np.int64)
-    return look, rng.random(len(beams.points)) < 0.1
+    time_bin = np.cumsum(rng.choice([0, 0, 1, 7], len(beams.T_map_sensor))).astype(np.int64)
+    return time_bin, rng.random(len(beams.points)) < 0.1
 
 
-BELIEF = [
+TRUST = [
     {},
     {"end_margin": 0.2},
     {"stop_cells": 5, "end_margin": 0.2},
@@ -44,66 +44,68 @@ BELIEF = [
 ]
 
 
-@pytest.mark.parametrize("belief", BELIEF, ids=str)
-def test_the_core_counts_as_its_twin(beams, belief):
-    look, dynamic = looks_of(beams, 1)
-    options = dict(belief)
+@pytest.mark.parametrize("trust", TRUST, ids=str)
+def test_agreement(beams, trust):
+    time_bin, dynamic = time_bins_of(beams, 1)
+    options = dict(trust)
     if "stop_cells" in options:
         cells = np.array(list(beams.grid(reference).alpha), np.int64)
-        some = cells[:: 1 + len(cells) // 5][: belief["stop_cells"]]
+        some = cells[:: 1 + len(cells) // 5][: trust["stop_cells"]]
         options["stop_cells"] = np.ascontiguousarray(some)
     for a, b in zip(
-        *(counted(k, beams, look, dynamic, **options).dense(*box_of(beams)) for k in KERNELS),
+        *(counted(k, beams, time_bin, dynamic, **options).dense(*box_of(beams)) for k in KERNELS),
         strict=True,
     ):
         assert a.dtype == np.uint16
         assert a.max() > 2
-        # chords of length zero, and cells that are left just where belief ends
+        # chords of length zero, and cells left at the limit of trust
         assert (a != b).mean() < 1e-3
         assert np.abs(a.astype(int) - b).max() <= 1
 
 
-def test_clear_looks_are_some_of_the_looks(beams):
-    look, dynamic = looks_of(beams, 2)
+def test_clear_is_at_most_observed(beams):
+    time_bin, dynamic = time_bins_of(beams, 2)
     box = box_of(beams)
-    looks, clear = counted(_core, beams, look, dynamic).dense(*box)
-    assert (clear <= looks).all()
-    assert 0.05 < (clear < looks)[looks > 0].mean() < 0.9
+    observed, clear = counted(_core, beams, time_bin, dynamic).dense(*box)
+    assert (clear <= observed).all()
+    assert 0.05 < (clear < observed)[observed > 0].mean() < 0.9
     for a, b in zip(
-        counted(_core, beams, look, 0 * dynamic == 1).dense(*box), (looks, looks), strict=True
+        counted(_core, beams, time_bin, 0 * dynamic == 1).dense(*box),
+        (observed, observed),
+        strict=True,
     ):
         np.testing.assert_array_equal(a, b)
-    wider = counted(_core, beams, look, dynamic, radius=4 * beams.resolution).dense(*box)[1]
+    wider = counted(_core, beams, time_bin, dynamic, radius=4 * beams.resolution).dense(*box)[1]
     assert (wider <= clear).all()
     assert wider.sum() < clear.sum()
 
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([2, 3]), st.integers(2, 9))
-def test_threads_and_calls_do_not_matter(some_beams, seed, dimension, threads):
+def test_threads_and_calls_give_the_same_counts(some_beams, seed, dimension, threads):
     beams = some_beams(seed, dimension)
-    look, dynamic = looks_of(beams, seed)
+    time_bin, dynamic = time_bins_of(beams, seed)
     box = box_of(beams)
     options = {"stop_cells": np.zeros((1, dimension), np.int64), "end_margin": 0.1}
-    whole = counted(_core, beams, look, dynamic, **options)
-    others = [counted(_core, beams, look, dynamic, threads, **options)]
+    whole = counted(_core, beams, time_bin, dynamic, **options)
+    others = [counted(_core, beams, time_bin, dynamic, threads, **options)]
     others.append(empty(_core, dimension, beams.resolution, **options))
-    starts = np.flatnonzero(np.diff(look, prepend=look[0] - 1))
-    for first, last in zip(starts, [*starts[1:], len(look)], strict=True):
+    starts = np.flatnonzero(np.diff(time_bin, prepend=time_bin[0] - 1))
+    for first, last in zip(starts, [*starts[1:], len(time_bin)], strict=True):
         part = slice(beams.offset[first], beams.offset[last])
         offset = beams.offset[first : last + 1] - beams.offset[first]
         T = beams.T_map_sensor[first:last]
         points, hit, moves = beams.points[part], beams.hit[part], dynamic[part]
-        others[-1].add(points, hit, moves, offset, T, look[first:last], threads)
+        others[-1].add(points, hit, moves, offset, T, time_bin[first:last], threads)
     for other in others:
         for a, b in zip(whole.dense(*box), other.dense(*box), strict=True):
             np.testing.assert_array_equal(a, b)
 
 
 @pytest.mark.parametrize("believed", [False, True])
-def test_looked_at_is_where_something_is_added_to_the_sums(beams, believed):
+def test_observed_where_the_sums_are_not_zero(beams, believed):
     grid, rest = beams.empty_grid(_core), beams.empty_grid(_core)
-    look, dynamic = looks_of(beams, 3)
+    time_bin, dynamic = time_bins_of(beams, 3)
     options = {}
     if believed:
         stops = np.ones((1, beams.dimension), np.int64)
@@ -113,48 +115,48 @@ def test_looked_at_is_where_something_is_added_to_the_sums(beams, believed):
         grid.merge(beams.with_(points=hits).grid(_core))
     else:
         grid = beams.grid(_core)
-    looks, _ = counted(_core, beams, look, dynamic, **options).dense(*box_of(beams))
+    observed, _ = counted(_core, beams, time_bin, dynamic, **options).dense(*box_of(beams))
     _, alpha, beta = grid.dense(*box_of(beams))
-    np.testing.assert_array_equal(looks > 0, alpha + beta > 0)
+    np.testing.assert_array_equal(observed > 0, alpha + beta > 0)
 
 
 ROW = np.array([[x, 0] for x in range(8)])
 
 
 def row_of(kernels, scans, **options):
-    """Looks and clear ones of eight cells of 1 m along x, (range, hit, dynamic, look) by scan."""
+    """Observed and clear counts of eight cells of 1 m; scans: (range, hit, dynamic, time bin)."""
     counts = kernels.ObservationCounts2D(1.0, **{"radius": 1.0, **options})
-    reach, hit, dynamic, look = (np.array(column) for column in zip(*scans, strict=True))
+    reach, hit, dynamic, time_bin = (np.array(column) for column in zip(*scans, strict=True))
     points = np.stack([reach, np.zeros(len(reach))], axis=1).astype(np.float32)
     T = np.tile(np.eye(3), (len(scans), 1, 1))
     T[:, :2, 2] = 0.5
-    counts.add(points, hit, dynamic, np.arange(len(scans) + 1), T, look)
+    counts.add(points, hit, dynamic, np.arange(len(scans) + 1), T, time_bin)
     return [rows.ravel().tolist() for rows in counts.dense([0, 0], (1, 8))]
 
 
 @pytest.mark.parametrize("kernels", KERNELS, ids=["core", "reference"])
 def test_by_hand(kernels):
     wall, walker = (6.0, True, False), (4.0, True, True)
-    # scans of one look count once
+    # scans of one time bin count once
     scans = [(*wall, 3), (*wall, 3), (*wall, 5)]
     assert row_of(kernels, scans) == [[2] * 7 + [0]] * 2
-    # somebody in cell 4: nobody knows what is there or beside it, the place before it is clear
+    # dynamic return in cell 4: it and its neighbours are not clear
     assert row_of(kernels, [(*walker, 0)]) == [[1] * 5 + [0] * 3, [1, 1, 1, 0, 0, 0, 0, 0]]
     assert row_of(kernels, [(*walker, 0)], radius=2.5)[1] == [1, 1, 0, 0, 0, 0, 0, 0]
     assert row_of(kernels, [(*walker, 0)], radius=0.0)[1] == [1, 1, 1, 1, 0, 0, 0, 0]
-    # whoever leaves within a look has been there
+    # a mover that leaves within the time bin counts
     both = [(*walker, 0), (*wall, 0), (*wall, 1)]
     assert row_of(kernels, both) == [[2] * 7 + [0], [2, 2, 2, 1, 1, 1, 2, 0]]
-    # what did not come back says nothing of its end, and moves never
+    # a beam without a return does not observe its end cell and is never dynamic
     assert row_of(kernels, [(4.0, False, True, 0)]) == [[1] * 4 + [0] * 4] * 2
-    # alone it is not believed where beams without a return have to be
+    # a single one is not trusted with stop_cells
     stops = np.zeros((0, 2), np.int64)
     assert row_of(kernels, [(4.0, False, False, 0)], stop_cells=stops) == [[0] * 8] * 2
 
 
 @pytest.mark.parametrize("kernels", KERNELS, ids=["core", "reference"])
-def test_a_radius_of_whole_cells_reaches_so_many(kernels):
-    assert 0.3 / 0.1 < 3.0  # as doubles have it
+def test_radius_of_whole_cells(kernels):
+    assert 0.3 / 0.1 < 3.0  # in floating point
     counts = kernels.ObservationCounts2D(0.1, radius=0.3)
     points, T = np.array([[0.75, 0.0]], np.float32), np.eye(3)[None].copy()
     T[0, :2, 2] = 0.05
@@ -163,7 +165,7 @@ def test_a_radius_of_whole_cells_reaches_so_many(kernels):
     assert counts.dense([0, 0], (1, 9))[1].ravel().tolist() == [1] * 5 + [0] * 4
 
 
-def test_counts_stop_where_they_are_full():
+def test_counts_saturate():
     counts = _core.ObservationCounts2D(1.0, radius=0.4)
     n = 70_000
     points, T = np.tile(np.float32([[1.0, 0.0]]), (n, 1)), np.tile(np.eye(3), (n, 1, 1))
@@ -207,7 +209,7 @@ def arguments():
     ],
 )
 @pytest.mark.usefixtures("bounded_memory")
-def test_refusals(name, value, error):
+def test_argument_errors(name, value, error):
     what = {"points": "end point|points", "T_map_sensor": "pose|T_map_sensor"}.get(name, name)
     for threads in (1, 2):
         counts = _core.ObservationCounts2D(0.5, radius=0.3)
@@ -215,12 +217,12 @@ def test_refusals(name, value, error):
             counts.add(**{**arguments(), name: value}, threads=threads)
 
 
-def test_looks_that_were_added_to_before():
+def test_repeated_time_bins():
     counts = _core.ObservationCounts2D(0.5, radius=0.3)
     counts.add(**arguments())
-    for look in ([4, 5], [3, 5], [-1, 9]):
+    for time_bin in ([4, 5], [3, 5], [-1, 9]):
         with pytest.raises(ValueError, match="time_bin"):
-            counts.add(**{**arguments(), "time_bin": np.array(look)})
+            counts.add(**{**arguments(), "time_bin": np.array(time_bin)})
     counts.add(**{**arguments(), "time_bin": np.array([5, 5])})
     assert counts.dense([2, 2], [1, 1])[0].item() == 3
     nothing = {"points": np.zeros((0, 2), np.float32), "hit": np.zeros(0, bool)}
@@ -242,12 +244,12 @@ def test_looks_that_were_added_to_before():
         ({"end_margin": np.nan}, "end_margin"),
     ],
 )
-def test_counts_that_cannot_be(make, options, what):
+def test_invalid_parameters(make, options, what):
     with pytest.raises(ValueError, match=what):
         make(**{"resolution": 0.1, "radius": 0.3, **options})
 
 
-def test_stops_and_boxes_that_cannot_be():
+def test_invalid_stop_cells_and_boxes():
     with pytest.raises(TypeError):
         _core.ObservationCounts2D(0.1, radius=0.3, stop_cells=np.zeros((1, 3), np.int64))
     with pytest.raises(ValueError, match="cells"):

@@ -1,4 +1,4 @@
-"""How much of a scan would have to look through walls: by hand, and what is refused."""
+"""Share of beams through occupied cells, by hand."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def wall(alpha=4, beta=0):
     return grid
 
 
-def through(grid, points, weights=None, T=None, T_sensor=None, **options):
+def share(grid, points, weights=None, T=None, T_sensor=None, **options):
     points = np.array(points, np.float32)
     weights = np.ones(len(points)) if weights is None else weights
     return _core.occluded_share(
@@ -40,50 +40,48 @@ def through(grid, points, weights=None, T=None, T_sensor=None, **options):
 AHEAD = [[9.0, 0.5], [3.0, 0.5], [-9.0, 0.5], [9.0, 9.0]]
 
 
-def test_one_of_four_beams_looks_through():
+def test_one_of_four_beams_is_occluded():
     # ahead through the wall; before it; away from it; past its end
-    assert through(wall(), AHEAD) == 0.25
-    assert through(wall(), AHEAD, [1, 0.5, 0.5, 0]) == 0.5
-    assert through(wall(), AHEAD, [0, 1, 1, 1]) == 0.0
+    assert share(wall(), AHEAD) == 0.25
+    assert share(wall(), AHEAD, [1, 0.5, 0.5, 0]) == 0.5
+    assert share(wall(), AHEAD, [0, 1, 1, 1]) == 0.0
 
 
-def test_what_ends_at_a_wall_does_not_look_through_it():
-    # looked through once it is left at x = 6, 0.5 m of margin before the end
-    assert through(wall(), [[5.4, 0.5]]) == 0.0
-    assert through(wall(), [[6.4, 0.5]]) == 0.0
-    assert through(wall(), [[6.6, 0.5]]) == 1.0
-    assert through(wall(), [[6.6, 0.5]], margin=0.7) == 0.0
-    assert through(wall(), [[6.4, 0.5]], margin=0.3) == 1.0
-    assert through(wall(), [[0.3, 0.5]]) == 0.0  # shorter than the margin
+def test_beams_that_end_at_the_wall():
+    # crossed from x = 6.5 on: 0.5 m of margin before the end
+    assert share(wall(), [[5.4, 0.5]]) == 0.0
+    assert share(wall(), [[6.4, 0.5]]) == 0.0
+    assert share(wall(), [[6.6, 0.5]]) == 1.0
+    assert share(wall(), [[6.6, 0.5]], margin=0.7) == 0.0
+    assert share(wall(), [[6.4, 0.5]], margin=0.3) == 1.0
+    assert share(wall(), [[0.3, 0.5]]) == 0.0  # shorter than the margin
 
 
-def test_what_is_hardly_occupied_is_no_wall():
+def test_min_occupancy():
     # one beam of four ended there: m = 1/4
     often_crossed = wall(alpha=1, beta=3)
-    assert through(often_crossed, AHEAD, min_occupancy=0.3) == 0.0
-    assert through(often_crossed, AHEAD, min_occupancy=0.2) == 0.25
-    assert (
-        through(_core.OccupancyGrid2D(1.0), AHEAD, min_occupancy=0.0) == 0.0
-    )  # nobody looked there
+    assert share(often_crossed, AHEAD, min_occupancy=0.3) == 0.0
+    assert share(often_crossed, AHEAD, min_occupancy=0.2) == 0.25
+    assert share(_core.OccupancyGrid2D(1.0), AHEAD, min_occupancy=0.0) == 0.0  # unobserved
 
 
 def test_beams_begin_at_the_sensor_and_move_with_the_pose():
-    # from behind the wall nothing but what looks back goes through it
+    # from behind the wall only backward beams cross it
     behind = se2.matrix(7.0, 0.0, 0.0)
-    assert through(wall(), [[9.0, 0.5], [2.0, 0.5]], T_sensor=behind) == 0.5
-    # the robot turned about behind the wall: ahead is through it
+    assert share(wall(), [[9.0, 0.5], [2.0, 0.5]], T_sensor=behind) == 0.5
+    # robot turned around behind the wall: ahead crosses it
     about = se2.matrix(8.0, 0.0, np.pi)
-    assert through(wall(), [[5.0, 0.5], [-5.0, 0.5]], T=about) == 0.5
+    assert share(wall(), [[5.0, 0.5], [-5.0, 0.5]], T=about) == 0.5
 
 
-def test_nothing_to_judge_by():
-    assert through(wall(), np.zeros((0, 2))) == 0.0
-    assert through(wall(), AHEAD, np.zeros(4)) == 0.0
-    # beyond all maps: no beam that crosses anything
-    assert through(wall(), AHEAD, T=se2.matrix(1e12, 0.0, 0.0)) == 0.0
+def test_no_beams():
+    assert share(wall(), np.zeros((0, 2))) == 0.0
+    assert share(wall(), AHEAD, np.zeros(4)) == 0.0
+    # outside the map
+    assert share(wall(), AHEAD, T=se2.matrix(1e12, 0.0, 0.0)) == 0.0
 
 
-def test_in_space():
+def test_3d():
     grid = _core.OccupancyGrid3D(1.0)
     beam = np.array([[0.75, 0.0, 0.0]], np.float32)
     T = np.eye(4)
@@ -117,7 +115,7 @@ def test_in_space():
         ("min_occupancy", np.nan, ValueError),
     ],
 )
-def test_refusals(name, value, error):
+def test_argument_errors(name, value, error):
     good = {
         "grid": wall(),
         "points": np.array(AHEAD, np.float32),

@@ -1,4 +1,4 @@
-"""Elements and looks of the core against the plain twin on small rooms."""
+"""Surfel map and occupancy HMM: kernel against twin on small rooms."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -26,11 +26,11 @@ def room(request, a_room):
 
 
 def order(surface):
-    """The elements by cell, whatever order they are numbered in."""
+    """Order of the surfels by cell."""
     return np.lexsort(surface.surfels()[0].T)
 
 
-def assert_same_surface(core, plain):
+def assert_same_surfels(core, plain):
     of_core, of_plain = order(core), order(plain)
     assert core.size == plain.size == len(of_core) > 50
     cells, means, normals, off_plane, prominence, beams = (a[of_core] for a in core.surfels())
@@ -38,7 +38,7 @@ def assert_same_surface(core, plain):
     np.testing.assert_array_equal(cells, expected[0])
     np.testing.assert_array_equal(beams, expected[5])
     np.testing.assert_allclose(prominence, expected[4], rtol=1e-12)
-    assert prominence.max() == 1  # the richest cell of its own window
+    assert prominence.max() == 1  # cells with the most returns in their window
     assert prominence.min() < 0.5
     np.testing.assert_allclose(means, expected[1], atol=1e-6)
     flat = expected[2].any(axis=1)
@@ -51,9 +51,9 @@ def assert_same_surface(core, plain):
     assert core.noise_std == pytest.approx(plain.noise_std, rel=1e-3)
 
 
-def test_elements(room):
+def test_surfels(room):
     core, plain = room.surface(_core), room.surface(reference)
-    assert_same_surface(core, plain)
+    assert_same_surfels(core, plain)
     assert 0.005 < plain.noise_std < 0.6 * room.beams.resolution
 
 
@@ -61,11 +61,11 @@ def test_elements(room):
 def test_noise_widens_the_window(a_room, noise, least):
     loud = a_room(5, 2, 0.05, 24, 120, noise=noise)
     core, plain = loud.surface(_core), loud.surface(reference)
-    assert_same_surface(core, plain)
+    assert_same_surfels(core, plain)
     assert plain.noise_std > least  # a window of two cells to each side would see less
 
 
-def test_elements_of(room, a_room):
+def test_associate_beams(room, a_room):
     core, plain = room.surface(_core), room.surface(reference)
     other = a_room(9, room.beams.dimension, room.beams.resolution, 8, 60).beams
     for beams in (room.beams, other):
@@ -82,12 +82,12 @@ def test_elements_of(room, a_room):
     np.testing.assert_array_equal(core.associate_beams(*room.beams.arguments) >= 0, room.beams.hit)
 
 
-def reliability(dwell):
-    """What one look said of each element: HIT, 0 for nothing, else how surely it saw through.
+def reliability(hmm):
+    """Observation of each surfel: HIT, 0 for none, else the reliability of the miss.
 
     One class with rho = a = 1/2: a hit has probability 1/4, seeing through 1 - R / 4.
     """
-    _, log_best = dwell.likelihood()
+    _, log_best = hmm.likelihood()
     p = np.exp(log_best) / 4
     return np.where(p < 0.5, HIT, np.round(4 * (1 - p), 6))
 
@@ -96,18 +96,18 @@ def reliability(dwell):
     "changes",
     [{}, {"use_normals": False}, {"margin": 0.25}, {"use_normals": False, "lateral_std": 0.01}],
 )
-def test_what_a_look_says(room, changes):
+def test_observations(room, changes):
     surfaces = room.surface(_core), room.surface(reference)
     seen = hits = partly = silent = 0
-    for t in range(0, len(room.look), 2):
+    for t in range(0, len(room.time_bin), 2):
         found = []
         for kernels, surface in zip((_core, reference), surfaces, strict=True):
-            dwell = room.dwell(kernels, surface, [0.5], [1.0], p_detection=0.5, **changes)
-            dwell.add(*room.scans(t, t + 2), np.array([7, 7]))
-            found.append(reliability(dwell)[order(surface)])
+            hmm = room.hmm(kernels, surface, [0.5], [1.0], p_detection=0.5, **changes)
+            hmm.add(*room.scans(t, t + 2), np.array([7, 7]))
+            found.append(reliability(hmm)[order(surface)])
         core, plain = found
         np.testing.assert_array_equal(core == HIT, plain == HIT)
-        # what nearly is sure or nearly nothing may be rounded to it or not
+        # values near the thresholds may be on either side of them
         edge = (np.abs(plain - SURE) < 0.012) | (plain < 0.03) & (core < 0.03)
         sure = (plain == 1.0) & (core > SURE - 0.012)
         np.testing.assert_allclose(core[~(edge | sure)], plain[~(edge | sure)], atol=0.012)
@@ -122,7 +122,7 @@ def test_what_a_look_says(room, changes):
 
 @pytest.fixture(scope="module")
 def swallowed(room):
-    """The room with some beams in a row without a return, through walls and past them."""
+    """The room with runs of beams without a return, through walls and beyond."""
     beams = room.beams
     hit, points = beams.hit.copy(), beams.points.copy()
     for start in beams.offset[:-1]:
@@ -132,31 +132,31 @@ def swallowed(room):
     return replace(room, beams=beams.with_(hit=hit, points=points))
 
 
-def test_lost_beams_through_what_is_solid(room, swallowed):
+def test_count_no_return_beams(room, swallowed):
     counts = []
     for kernels in (_core, reference):
-        dwell = room.dwell(kernels, room.surface(kernels), *CLASSES)
+        hmm = room.hmm(kernels, room.surface(kernels), *CLASSES)
         counts.append(
-            [dwell.count_no_return_beams(*some.beams.arguments) for some in (room, swallowed)]
+            [hmm.count_no_return_beams(*some.beams.arguments) for some in (room, swallowed)]
         )
     assert counts[0] == counts[1]
     (few, few_through), (more, through) = counts[0]
-    assert more >= few + 3 * len(room.look)
+    assert more >= few + 3 * len(room.time_bin)
     assert 20 < through - few_through < more
 
 
 @pytest.mark.parametrize("trusted", [0.0, 0.4, 1.0])
-def test_lost_beams_are_trusted_so_far(room, swallowed, trusted):
+def test_trust_beyond_solid(room, swallowed, trusted):
     points, hit, offset, T = swallowed.scans(4, 14)
-    points = np.where(hit[:, None], np.float32(np.nan), points)  # no hit wins over them
+    points = np.where(hit[:, None], np.float32(np.nan), points)  # no returns
     found = {}
     for kernels in (_core, reference):
         surface = room.surface(kernels)
         for how in (trusted, 1.0):
-            dwell = room.dwell(kernels, surface, [0.5], [1.0], p_detection=0.5)
-            dwell.set_trust_beyond_solid(how)
-            dwell.add(points, hit, offset, T, np.full(10, 7))
-            found[kernels, how] = reliability(dwell)[order(surface)]
+            hmm = room.hmm(kernels, surface, [0.5], [1.0], p_detection=0.5)
+            hmm.set_trust_beyond_solid(how)
+            hmm.add(points, hit, offset, T, np.full(10, 7))
+            found[kernels, how] = reliability(hmm)[order(surface)]
     core, plain, all_the_way = found[_core, trusted], found[reference, trusted], found[_core, 1.0]
     edge = (np.abs(plain - SURE) < 0.012) | (np.abs(plain) < 0.03) & (np.abs(core) < 0.03)
     sure = (plain == 1.0) & (core > SURE - 0.012)
@@ -172,13 +172,13 @@ def test_likelihood(room, moves):
     found = []
     for kernels in (_core, reference):
         surface = room.surface(kernels)
-        dwell = room.dwell(kernels, surface, rho, tau, turn)
+        hmm = room.hmm(kernels, surface, rho, tau, turn)
         place = None
-        if moves is not None:  # the robot, of which the sensors sit anywhere
-            steps = np.random.default_rng(1).normal(size=(len(room.look), surface.dimension))
+        if moves is not None:  # robot positions differ from sensor positions
+            steps = np.random.default_rng(1).normal(size=(len(room.time_bin), surface.dimension))
             place = moves * surface.resolution * steps.cumsum(axis=0)
-        dwell.add(*room.beams.arguments, room.look, positions=place)
-        relative, log_best = dwell.likelihood()
+        hmm.add(*room.beams.arguments, room.time_bin, positions=place)
+        relative, log_best = hmm.likelihood()
         assert relative.dtype == np.float32
         assert relative.max(axis=1) == pytest.approx(1.0)
         values = np.log(np.maximum(relative, 1e-30)) + log_best[:, None]
@@ -186,19 +186,19 @@ def test_likelihood(room, moves):
     core, plain = found
     error = np.abs(core - plain)
     assert np.quantile(error, 0.9) < 0.03
-    assert error.max() < 0.3  # a few looks at the edge of being sure
+    assert error.max() < 0.3  # a few observations near the thresholds
     assert np.abs(np.diff(plain, axis=1)).max() > 5
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5, 100])
 @pytest.mark.parametrize("cuts", [[], [3], [1, 2, 7, 8, 15]])
 @pytest.mark.parametrize("dated", [False, True])
-def test_elements_are_the_same_and_in_order_with_any_threads(room, threads, cuts, dated):
+def test_surfels_with_any_number_of_threads(room, threads, cuts, dated):
     surfaces = [type(room.surface(_core))(room.beams.resolution) for _ in range(2)]
     for surface, pieces, many in zip(surfaces, ([], cuts), (1, threads), strict=True):
-        for first, last in pairwise([0, *pieces, len(room.look)]):
-            look = room.look[first:last] if dated else None
-            surface.add_end_points(*room.scans(first, last), look, many)
+        for first, last in pairwise([0, *pieces, len(room.time_bin)]):
+            bins = room.time_bin[first:last] if dated else None
+            surface.add_end_points(*room.scans(first, last), bins, many)
         surface.fit()
     whole, shared = surfaces
     assert whole.noise_std == shared.noise_std
@@ -210,63 +210,67 @@ def test_elements_are_the_same_and_in_order_with_any_threads(room, threads, cuts
 
 @pytest.mark.parametrize("threads", [1, 2, 5])
 @pytest.mark.parametrize("cuts", [[], [3], [1, 2, 7, 8, 15]])
-def test_threads_and_pieces_change_no_bit(room, threads, cuts):
+def test_threads_and_chunks_give_the_same_bits(room, threads, cuts):
     surface = room.surface(_core)
-    whole = room.dwell(_core, surface, *CLASSES, 0.97)
-    whole.add(*room.beams.arguments, room.look)
-    pieces = room.dwell(_core, surface, *CLASSES, 0.97)
-    bounds = [0, *(int(np.searchsorted(room.look, room.look[c])) for c in cuts), len(room.look)]
-    for first, last in pairwise(bounds):  # looks stay whole
-        pieces.add(*room.scans(first, last), room.look[first:last], threads)
+    whole = room.hmm(_core, surface, *CLASSES, 0.97)
+    whole.add(*room.beams.arguments, room.time_bin)
+    pieces = room.hmm(_core, surface, *CLASSES, 0.97)
+    bounds = [
+        0,
+        *(int(np.searchsorted(room.time_bin, room.time_bin[c])) for c in cuts),
+        len(room.time_bin),
+    ]
+    for first, last in pairwise(bounds):  # time bins stay whole
+        pieces.add(*room.scans(first, last), room.time_bin[first:last], threads)
     for a, b in zip(whole.likelihood(), pieces.likelihood(), strict=True):
         assert a.tobytes() == b.tobytes()
 
 
-def test_asking_on_the_way_changes_nothing(room):
+def test_intermediate_queries_change_nothing(room):
     surface = room.surface(_core)
-    whole, asked = (room.dwell(_core, surface, *CLASSES, 0.97) for _ in range(2))
-    whole.add(*room.beams.arguments, np.arange(len(room.look)))
-    for t in range(len(room.look)):
+    whole, asked = (room.hmm(_core, surface, *CLASSES, 0.97) for _ in range(2))
+    whole.add(*room.beams.arguments, np.arange(len(room.time_bin)))
+    for t in range(len(room.time_bin)):
         asked.add(*room.scans(t, t + 1), np.array([t]))
         asked.likelihood()
     for a, b in zip(whole.likelihood(), asked.likelihood(), strict=True):
         assert a.tobytes() == b.tobytes()
 
 
-def test_the_order_of_the_beams_of_a_look_does_not_matter(room):
+def test_order_of_beams_within_a_time_bin(room):
     surface = room.surface(_core)
     values = []
     for flip in (False, True):
-        dwell = room.dwell(_core, surface, *CLASSES, 0.97)
+        hmm = room.hmm(_core, surface, *CLASSES, 0.97)
         points, hit, offset, T = room.beams.arguments
         if flip:
             points, hit = points.copy(), hit.copy()
             for a, b in pairwise(offset):
                 points[a:b], hit[a:b] = points[a:b][::-1].copy(), hit[a:b][::-1].copy()
-        dwell.add(points, hit, offset, T, room.look)
-        values.append(dwell.likelihood())
+        hmm.add(points, hit, offset, T, room.time_bin)
+        values.append(hmm.likelihood())
     for a, b in zip(*values, strict=True):
         np.testing.assert_allclose(a, b, rtol=2e-2, atol=2e-2)
-        assert (a == b).mean() > 0.9  # the first to be nearly sure stops the search
+        assert (a == b).mean() > 0.9  # the order of nearly certain crossings matters slightly
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_nothing_was_ever_hit(a_room, dimension):
+def test_no_returns(a_room, dimension):
     far = a_room(1, dimension, 0.2, 4, 20)
     beams = far.beams.with_(hit=np.zeros(len(far.beams.hit), bool))
     nothing = replace(far, beams=beams)
     for kernels in (_core, reference):
         surface = nothing.surface(kernels)
         assert (surface.size, surface.noise_std) == (0, 0.0)
-        dwell = nothing.dwell(kernels, surface, *CLASSES)
-        dwell.add(*beams.arguments, nothing.look)
-        relative, log_best = dwell.likelihood()
+        hmm = nothing.hmm(kernels, surface, *CLASSES)
+        hmm.add(*beams.arguments, nothing.time_bin)
+        relative, log_best = hmm.likelihood()
         assert (relative.shape, log_best.shape) == ((0, len(CLASSES[0])), (0,))
         assert (surface.associate_beams(*beams.arguments) == -1).all()
 
 
-def test_lost_beams_say_nothing():
-    # two without a return side by side are lost; three are not, unless a scan ends between them
+def test_short_runs_are_not_observed():
+    # runs of two beams without a return are skipped, runs of three within a scan are used
     surface = _core.SurfelMap2D(0.1), reference.SurfelMap2D(0.1)
     T = np.tile(np.eye(3), (2, 1, 1))
     end, none = np.array([[1.05, 0.05]], np.float32), np.array([[4, 0.2]], np.float32)
@@ -286,12 +290,12 @@ def test_lost_beams_say_nothing():
         if "usable" in name:
             points[2] = np.nan
         for kernels, s in zip((_core, reference), surface, strict=True):
-            dwell = kernels.OccupancyHmm2D(
+            hmm = kernels.OccupancyHmm2D(
                 s, rho=[0.5], tau=[1.0], p_detection=0.5, bin_seconds=1.0,
                 lateral_std=0.01, margin=0.1, hit_radius=0.05, end_margin=0.3,
             )  # fmt: skip
-            dwell.add(points, hit, np.array(offset), T, np.array([3, 3]))
-            seen.setdefault(name, []).append(bool(reliability(dwell)[0]))
+            hmm.add(points, hit, np.array(offset), T, np.array([3, 3]))
+            seen.setdefault(name, []).append(bool(reliability(hmm)[0]))
     expected = {"two": False, "three": True, "three at the end": True, "cut": False}
     expected["next to what is not usable"] = False
     assert seen == {name: [says, says] for name, says in expected.items()}

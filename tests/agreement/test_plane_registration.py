@@ -1,4 +1,4 @@
-"""Sweeps on maps of moments: the core against the plain twin."""
+"""NDT map and point-to-plane registration: kernel against twin."""
 
 import numpy as np
 import pytest
@@ -54,7 +54,7 @@ def test_planes(maps, level):
             assert variances[k] == pytest.approx(variance, abs=1e-9)
 
 
-def test_what_is_far_is_forgotten(maps):
+def test_crop(maps):
     core, plain = maps
     before = len(core)
     for one in maps:
@@ -82,8 +82,8 @@ def test_linearised(maps, level, slack):
     assert 0.0 < plain.inlier_weight <= plain.matched_weight < plain.total_weight
 
 
-def test_gradient_is_that_of_the_cost(maps):
-    """Nearly: that planes change from place to place is left out of it."""
+def test_gradient_matches_the_cost(maps):
+    """Approximately: the gradient ignores the change of the planes."""
     points, weights, _ = cloud(5)
     times, T = np.zeros(len(points), np.float32), pose(6, 0.01)
 
@@ -97,7 +97,7 @@ def test_gradient_is_that_of_the_cost(maps):
     assert np.linalg.norm(slope - gradient) < 0.3 * np.linalg.norm(gradient)
 
 
-def test_registered(maps):
+def test_register_sweep(maps):
     points, weights, times = cloud(9, 600)
     prior, twist = pose(10, 0.03), np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.4])
     information = np.diag([100.0] * 3 + [400.0] * 3 + [10.0] * 6)
@@ -120,7 +120,7 @@ def test_registered(maps):
     assert np.linalg.norm(core[0][:3, 3] - prior[:3, 3]) > 0.005
 
 
-def test_threads_do_not_matter(maps):
+def test_any_number_of_threads_gives_the_same_bits(maps):
     points, weights, times = cloud(9, 5000)
     information = np.eye(12)
 
@@ -137,7 +137,7 @@ def test_threads_do_not_matter(maps):
             assert np.array_equal(a, b)
 
 
-def test_carried_and_first_in_cells():
+def test_transform_by_twist_and_voxel_downsample():
     points, weights, times = cloud(11)
     twist = np.array([3.0, -1.0, 0.5, 0.4, -2.0, 5.0])
     moved = _core.transform_by_twist(points, times, twist)
@@ -149,7 +149,7 @@ def test_carried_and_first_in_cells():
         assert kept.tolist() == reference.voxel_downsample(points, weights, edge).tolist()
 
 
-def test_refusals(maps):
+def test_argument_errors(maps):
     points, weights, times = cloud(1, 20)
     core = maps[0]
     eye, zeros, information = np.eye(4), np.zeros(6), np.eye(12)

@@ -1,4 +1,4 @@
-"""Ray traversal of the core against the plain twin."""
+"""Ray traversal of kernel against twin."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Which texels triangles cover: the core against its plain twin, and by hand."""
+"""Rasterisation of triangles: kernel against twin, and by hand."""
 
 import numpy as np
 import pytest
@@ -8,11 +8,11 @@ from stillmap import _core
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_core_and_twin_agree(seed):
+def test_agreement(seed):
     rng = np.random.default_rng(seed)
     middle = rng.uniform(-3.0, 33.0, (80, 1, 2))
     corners = middle + rng.normal(0.0, 1.0, (80, 3, 2)) * rng.choice([0.1, 1.0, 8.0], (80, 1, 1))
-    corners[5] = corners[5, 0]  # without area
+    corners[5] = corners[5, 0]  # degenerate
     found, expected = (
         _core.rasterise_texels(corners, 30, 25),
         reference.rasterise_texels(corners, 30, 25),
@@ -35,7 +35,7 @@ def test_by_hand():
     np.testing.assert_allclose(np.einsum("ij,ijk->ik", w, corners[face]), at, atol=1e-6)
 
 
-def test_a_triangle_between_centres_has_one_texel():
+def test_triangle_without_texel_centre():
     corners = np.array([[[4.6, 2.6], [4.9, 2.6], [4.7, 2.9]], [[-9.0, -9], [-9, -8], [-8, -9]]])
     texel, face, weight = _core.rasterise_texels(corners, 10, 8)
     assert texel.tolist() == [24, 0]
@@ -51,6 +51,6 @@ def test_a_triangle_between_centres_has_one_texel():
         (np.zeros((1, 3, 2)), 1 << 16, "width, height"),
     ],
 )
-def test_what_is_refused(corners, width, said):
+def test_argument_errors(corners, width, said):
     with pytest.raises(ValueError, match=said):
         _core.rasterise_texels(corners, width, 4)

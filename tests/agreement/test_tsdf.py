@@ -1,4 +1,4 @@
-"""Signed distances: the core against its plain twin, and by hand."""
+"""TSDF integration: kernel against twin, and by hand."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ VOXEL, REACH = 0.1, {"truncation_front": 0.3, "truncation_back": 0.2}
 
 
 def seen(seed, n=60, m=80, size=0.6):
-    """Triangles of any shape around the origin, on all sides of where the sensor was."""
+    """Triangles of any shape on all sides of the sensor."""
     rng = np.random.default_rng(seed)
     middle = rng.uniform(-2.0, 2.0, (n, 3))
     points = middle + rng.normal(0.0, 0.05, (n, 3))
@@ -30,7 +30,7 @@ def box(distances):
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2, 3])
-def test_core_and_twin_agree(seed):
+def test_agreement(seed):
     both = [kernels.TsdfVolume(VOXEL, **REACH) for kernels in (_core, reference)]
     for one in both:
         one.integrate(*seen(seed))
@@ -50,7 +50,7 @@ def test_core_and_twin_agree(seed):
     assert {tuple(b) for b in both[1].blocks()} <= {tuple(b) for b in both[0].blocks()}
 
 
-def test_what_is_forgotten_is_as_if_never_met():
+def test_remove_blocks():
     both = [kernels.TsdfVolume(VOXEL, **REACH) for kernels in (_core, reference)]
     for one in both:
         one.integrate(*seen(1))
@@ -65,7 +65,7 @@ def test_what_is_forgotten_is_as_if_never_met():
     plain_metres, plain_weight = both[1].dense(*where)
     assert np.sum((weight > 0) != (plain_weight > 0)) <= 2
     assert np.nanmax(np.abs(metres - plain_metres)) < 2e-6
-    # in its place there is what comes later, and nothing else
+    # removed blocks can be integrated again
     fresh = _core.TsdfVolume(VOXEL, **REACH)
     for one in (both[0], fresh):
         one.integrate(*seen(2))
@@ -114,7 +114,7 @@ def test_distances_from_a_wall_are_exact():
     np.testing.assert_allclose(weight[2, 3][known], behind[known], atol=1e-6)
 
 
-def test_a_wall_seen_at_a_flat_angle_is_as_far_as_one_seen_from_the_front():
+def test_distances_at_a_grazing_angle():
     points, origin, _, faces, weight = wall()
     origin = origin + np.array([1.6, -6.0, 0.0])
     distances = _core.TsdfVolume(VOXEL, **REACH)
@@ -128,7 +128,7 @@ def test_a_wall_seen_at_a_flat_angle_is_as_far_as_one_seen_from_the_front():
     )
 
 
-def test_nothing_is_known_from_triangles_edge_on_or_behind():
+def test_triangles_edge_on_or_from_behind_are_skipped():
     points, origin, standoff, faces, weight = wall()
     distances = _core.TsdfVolume(VOXEL, **REACH)
     distances.integrate(points, origin + np.array([2.0, 5.0, 0.0]), standoff, faces, weight)
@@ -137,7 +137,7 @@ def test_nothing_is_known_from_triangles_edge_on_or_behind():
     assert len(distances.blocks()) == 0
 
 
-def test_wrong_arrays_are_refused():
+def test_argument_errors():
     good = wall()
 
     def refused(place, value, match):
@@ -150,11 +150,11 @@ def test_wrong_arrays_are_refused():
     refused(1, good[1][:3], "origin: expected a row per point")
     refused(2, good[2][:3], "standoff: expected one per point")
     refused(2, good[2] * np.inf, "standoff: not finite")
-    refused(3, np.full((2, 3), 4, np.int32), "faces: a point that is not there")
-    refused(3, np.full((2, 3), -1, np.int32), "faces: a point that is not there")
+    refused(3, np.full((2, 3), 4, np.int32), "faces: point index out of range")
+    refused(3, np.full((2, 3), -1, np.int32), "faces: point index out of range")
     refused(4, good[4][:1], "weight: expected one per face")
-    refused(4, -good[4], "weight: expected finite ones")
-    refused(4, good[4] * np.nan, "weight: expected finite ones")
+    refused(4, -good[4], "weight: expected finite values")
+    refused(4, good[4] * np.nan, "weight: expected finite values")
     refused(0, good[0] * 1e7, "points: too far away")
     for bad in (
         {"voxel": 0.0},
@@ -166,7 +166,7 @@ def test_wrong_arrays_are_refused():
             _core.TsdfVolume(**{"voxel": VOXEL, **REACH, **bad})
 
 
-def test_too_large_a_triangle_is_refused():
+def test_too_large_triangle():
     points, origin, standoff, faces, weight = wall(2000.0, 1900.0)
     with pytest.raises(ValueError, match="too large"):
         _core.TsdfVolume(0.01, truncation_front=0.03, truncation_back=0.02).integrate(
@@ -175,7 +175,7 @@ def test_too_large_a_triangle_is_refused():
 
 
 @pytest.mark.parametrize("standoff", [1e-3, 1e-9, 1e-300])
-def test_a_surface_that_is_met_at_next_to_no_angle_ends(standoff):
+def test_extent_at_grazing_angles(standoff):
     points, origin, _, faces, weight = wall(20.0, 0.1)
     both = [
         k.TsdfVolume(0.03, truncation_front=0.18, truncation_back=0.15) for k in (_core, reference)

@@ -1,4 +1,4 @@
-"""Chains in time of the core, one element before a sensor, against the plain twin."""
+"""Two-state chains of one surfel in front of a sensor: kernel against twin."""
 
 from itertools import pairwise, product
 from math import inf, log
@@ -15,12 +15,12 @@ CLASSES = HmmClasses(view_rho=(0.65,)).grid()
 
 
 def lane(seen, rho, tau, turn, detection, seconds=1.0, at=None):
-    """Log likelihood per class of one element of which (look, hit or seen through) was seen.
+    """Log likelihood per class of one surfel with observations (time bin, whether it is a hit).
 
-    The sensor looks from x = `at` of each look, along x.
+    The sensor is at x = `at` in each time bin and looks along x.
     """
     surface = _core.SurfelMap2D(0.1)
-    offset = np.array([0, 3])  # fewer without return would be lost
+    offset = np.array([0, 3])  # shorter runs without a return would be skipped
     yes, no = np.ones(3, bool), np.zeros(3, bool)
 
     def beams(x, end):
@@ -31,18 +31,18 @@ def lane(seen, rho, tau, turn, detection, seconds=1.0, at=None):
     ends, T = beams(0.0, 1.05)
     surface.add_end_points(ends, yes, offset, T)
     surface.fit()
-    dwell = _core.OccupancyHmm2D(
+    hmm = _core.OccupancyHmm2D(
         surface, rho=rho, tau=tau, view_angle=turn, p_detection=detection, bin_seconds=seconds,
         lateral_std=0.01, margin=0.1, hit_radius=0.05, end_margin=0.3,
     )  # fmt: skip
-    for (look, hit), x in zip(seen, [0.0] * len(seen) if at is None else at, strict=True):
+    for (n, hit), x in zip(seen, [0.0] * len(seen) if at is None else at, strict=True):
         points, T = beams(x, 1.05 if hit else 4)
-        dwell.add(points, yes if hit else no, offset, T, np.array([look]))
-    return np.array([dwell.likelihood(one)[1][0] for one in np.eye(len(rho), dtype=bool)])
+        hmm.add(points, yes if hit else no, offset, T, np.array([n]))
+    return np.array([hmm.likelihood(one)[1][0] for one in np.eye(len(rho), dtype=bool)])
 
 
 def stays_for_half_a_cell(at):
-    """Places of a robot that stands while it moves less."""
+    """Robot positions, constant while it moves less than a step."""
     out = list(at[:1])
     for x in at[1:]:
         out.append(x if abs(x - out[-1]) >= 0.05 else out[-1])
@@ -52,19 +52,19 @@ def stays_for_half_a_cell(at):
 def chain(seen, rho, tau, turn, detection, seconds=1.0, at=None):
     at = stays_for_half_a_cell([0.0] * len(seen) if at is None else at)
     turned = [0.0, *(abs(b - a) / max(abs(1.05 - b), 0.1) for a, b in pairwise(at))]
-    looks = [
+    observations = [
         (n * seconds, HIT if hit else 1.0, v) for (n, hit), v in zip(seen, turned, strict=True)
     ]
     return np.array(
         [
-            chain_log_likelihood(looks, r, t, detection, v) - log(r * detection)
+            chain_log_likelihood(observations, r, t, detection, v) - log(r * detection)
             for r, t, v in zip(rho, tau, turn, strict=True)
         ]
     )
 
 
 def random_looks(seed, n, stays):
-    """Runs of hits and of misses; gaps of one look mostly, some beyond any table."""
+    """Runs of hits and misses; mostly gaps of one time bin, some very long."""
     rng = np.random.default_rng(seed)
     hit = np.logical_xor.accumulate(rng.random(n) > stays)
     gaps = np.where(rng.random(n) < 0.9, 1, rng.choice([2, 5, 63, 64, 65, 300, 10**6], n))
@@ -78,7 +78,7 @@ def test_a_chain(seed, n, stays, seconds):
     seen = random_looks(seed, n, stays)
     found = lane(seen, *CLASSES, 0.97, seconds)
     expected = chain(seen, *CLASSES, 0.97, seconds)
-    over_time = np.isinf(CLASSES[2])  # each as exact as the best, however unlikely it is
+    over_time = np.isinf(CLASSES[2])  # as exact as the best class, however unlikely
     np.testing.assert_allclose(found[over_time], expected[over_time], rtol=1e-5, atol=0.1)
     likely = expected > expected.max() - 20  # further down it only has to stay there
     np.testing.assert_allclose(found[likely], expected[likely], atol=0.1)
@@ -87,7 +87,7 @@ def test_a_chain(seed, n, stays, seconds):
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("step", [0.0, 0.08, 0.3])
-def test_a_chain_over_the_view(seed, step):
+def test_chain_over_the_view_angle(seed, step):
     seen = random_looks(seed, 100, 0.8)
     at = np.random.default_rng(seed).uniform(-step, step, len(seen)).cumsum().clip(-3, 0.6)
     found, expected = (f(seen, *CLASSES, 0.97, at=at) for f in (lane, chain))
@@ -95,15 +95,15 @@ def test_a_chain_over_the_view(seed, step):
     np.testing.assert_allclose(found[likely], expected[likely], atol=0.1)
     views = np.isfinite(CLASSES[2])
     assert views.sum() == 1
-    # what is met or not depends on nothing but the view, so it is one or the other while that stays
+    # with an unchanged view the state stays the same
     still = chain(seen, *CLASSES, 0.97)
     assert (still[views] < still.max() - 10).all()
     assert (expected[views] > still[views] + 10).all() == (step > 0.0)
     assert (expected[~views] == still[~views]).all()
 
 
-def test_classes_among_others_that_are_far_better():
-    """Hundreds of nats worse than what it is, and still as exact as if there were no others."""
+def test_very_unlikely_classes():
+    """Hundreds of nats below the best class, yet as exact as without the others."""
     seen = random_looks(3, 4000, 0.9)
     turn = CLASSES[2]
     all_of_them = lane(seen, *CLASSES, 0.97)
@@ -116,7 +116,7 @@ def test_classes_among_others_that_are_far_better():
 
 
 @pytest.mark.parametrize("seconds", [1.0, 3.0])
-def test_a_chain_that_flickers(seconds):
+def test_flickering_chain(seconds):
     for gap in (1, 2):
         seen = [(gap * i, i % 2 == 0) for i in range(201)]
         found, expected = (f(seen, *CLASSES, 0.97, seconds) for f in (lane, chain))
@@ -127,7 +127,7 @@ def test_a_chain_that_flickers(seconds):
 
 @pytest.mark.parametrize("detection", [0.6, 0.8, 0.9, 0.99])
 @pytest.mark.parametrize("misses", [3, 6, 20, 200])
-def test_seen_through_again_and_again(detection, misses):
+def test_many_misses(detection, misses):
     seen = [(0, True), *((1 + i, False) for i in range(misses)), (1 + misses, True)]
     found, expected = lane(seen, *CLASSES, detection), chain(seen, *CLASSES, detection)
     likely = expected > expected.max() - 20
@@ -141,7 +141,7 @@ def test_chain_that_never_changes():
     assert np.isfinite(found).all()
 
 
-def test_chain_by_all_its_histories():
+def test_chain_by_all_state_sequences():
     # the forward algorithm against the sum over every sequence of empty and occupied
     rng = np.random.default_rng(3)
     for rho, tau, detection in ((0.3, 2.0, 0.9), (0.95, 10.0, 0.6)):

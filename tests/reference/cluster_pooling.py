@@ -130,11 +130,11 @@ def relabel_ground_contact(
         ):
             continue
         of_scan = of[bounds[beam.scan] : bounds[beam.scan + 1]]
-        met = {other for other in of_scan.tolist() if other >= 0 and obstacle[other]}
+        hit_surfels = {other for other in of_scan.tolist() if other >= 0 and obstacle[other]}
         x, y, _ = (cell_of(beam.end, surfel_map.resolution) // column_cells).tolist()
         over = [
             j
-            for j in met
+            for j in hit_surfels
             if tuple(np.floor_divide(surfel_map.fitted[j].cell[:2], column_cells)) == (x, y)
         ]
         if over and np.mean(p[over]) < 0.5:

@@ -69,7 +69,7 @@ def neighbours(surfel_map: SurfelMap, i: int, radius: float) -> Iterator[int]:
 
 
 def coplanarity(surfel_map: SurfelMap, i: int, j: int, coplanar_std: float) -> float:
-    """How far two elements can be of one surfel_map."""
+    """Weight of a pair by the distance of each mean from the plane of the other."""
     one, other = surfel_map.fitted[i], surfel_map.fitted[j]
     offset = (other.mean - one.mean) / surfel_map.resolution
     distance = max(abs(e.plane.normal @ offset) if e.plane else 0.0 for e in (one, other))

@@ -74,12 +74,15 @@ class ObservationCounts:
         self, first_cell: ArrayLike, shape: tuple[int, ...]
     ) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
         """Observed and clear counts over a box of cells, axes as of `OccupancyGrid.dense`."""
-        looks, clear = np.zeros(shape, np.uint16), np.zeros(shape, np.uint16)
+        observed, clear = np.zeros(shape, np.uint16), np.zeros(shape, np.uint16)
         for cell, count in self.observed.items():
             index = tuple((np.array(cell) - np.asarray(first_cell))[::-1].tolist())
             if all(0 <= i < n for i, n in zip(index, shape, strict=True)):
-                looks[index], clear[index] = min(count, MAX_COUNT), min(self.clear[cell], MAX_COUNT)
-        return looks, clear
+                observed[index], clear[index] = (
+                    min(count, MAX_COUNT),
+                    min(self.clear[cell], MAX_COUNT),
+                )
+        return observed, clear
 
     def _observed_cells(self, beam: Beam, in_rows: set[int]) -> set[Cell]:
         """Cells that a beam observes: those where it adds to the sums of (10)."""

@@ -155,8 +155,8 @@ class SurfelMap:
         own = number.get(self._end_cell(beam), -1)
         if self.dimension == 2 or own < 0 or not self._is_off_plane(own, beam.end):
             return own
-        beside = [number[c] for c in window_cells(self._end_cell(beam), 1) if c in number]
-        fit = [k for k in beside if not self._is_off_plane(k, beam.end)]
+        adjacent = [number[c] for c in window_cells(self._end_cell(beam), 1) if c in number]
+        fit = [k for k in adjacent if not self._is_off_plane(k, beam.end)]
         return min(fit, key=lambda k: np.sum((self.fitted[k].mean - beam.end) ** 2), default=own)
 
     def _is_off_plane(self, k: int, end: Float) -> bool:
