@@ -5,8 +5,7 @@ from numpy.typing import NDArray
 
 from stillmap.core.arrays import iter_blocks
 from stillmap.core.recording import Recording
-
-DYNAMIC_BELOW = 0.5
+from stillmap.em.types import DYNAMIC_BELOW
 
 
 def count_beams(recording: Recording, p_static: NDArray[np.float32]) -> dict[str, int]:

@@ -6,7 +6,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.mapping.beam_statistics import DYNAMIC_BELOW
+from stillmap.em.types import DYNAMIC_BELOW
 
 Window = tuple[float, float, float, float]
 Value = TypeVar("Value", np.float32, np.bool_)
