@@ -54,7 +54,7 @@ def box_of(one, hold=0.5):
     return fit_boxes(empty, standing(), np.zeros(0, np.float32), [one], 0.7, hold)[0]
 
 
-def test_a_box_goes_along_and_turns_with_its_thing():
+def test_box_moves_and_turns_with_its_object():
     box = box_of(walker([0.5, 1.0, 1.5]))
     seconds = np.full(6, 1.25)
     xy = [[2.0, 0.25], [2.0, 0.54], [2.19, 0.25], [2.0, 0.56], [2.21, 0.25], [2.0, -0.1]]
@@ -63,14 +63,14 @@ def test_a_box_goes_along_and_turns_with_its_thing():
     assert box.contains(seconds, np.array(xy), 0.02).tolist()[:5] == [True] * 5
 
 
-def test_it_goes_on_for_a_while_only():
+def test_box_persists_for_hold_seconds():
     box = box_of(walker([0.5, 1.0, 1.5]), hold=0.3)
     seconds = np.array([0.25, 1.75, 0.15, 1.85])
     xy = np.stack([np.full(4, 2.0), seconds - 1.0], axis=1)
     assert box.contains(seconds, xy, 0.0).tolist() == [True, True, False, False]
 
 
-def test_what_is_in_no_object_has_a_box_for_a_moment():
+def test_untracked_clusters_have_a_short_box():
     # two that belong together, and one alone: noise
     points = [[3.0, 0.0], [3.0, 0.1], [5.0, 5.0]]
     offset = np.where(np.arange(len(STAMPS) + 1) > 4, 3, 0)
@@ -97,7 +97,7 @@ def test_what_is_in_no_object_has_a_box_for_a_moment():
         ([], 1.0),
     ],
 )
-def test_things_reach_as_high_as_what_is_connected(above, top):
+def test_object_height(above, top):
     assert object_height(np.array(above), 2.0) == top
 
 
@@ -127,7 +127,7 @@ PERSON = [[2.0, 0.0, 0.1], [2.1, 0.1, 0.6], [2.0, 0.3, 0.9], [2.0, 0.0, 1.3], [2
 BESIDE = [[2.4, 0.0, 1.0], [2.0, 0.5, 1.0], [2.0, 0.0, 0.0], [2.0, 0.0, 2.6]]
 
 
-def test_in_a_box_beams_are_dynamic_and_nowhere_else():
+def test_only_beams_in_boxes_are_dynamic():
     found, p_static = built(PERSON + BESIDE, [1000] * 9, [walker([0.5, 1.0, 1.5])])
     assert (p_static[:5] < 0.5).all()
     np.testing.assert_allclose(p_static[5:], 0.9, atol=1e-5)
@@ -155,12 +155,12 @@ def test_evidence_and_boxes_multiply_their_odds(monkeypatch):
     assert static[0] == np.float32(share)
 
 
-def test_after_it_has_left_the_place_is_static():
+def test_static_after_the_object_has_left():
     _, p_static = built(PERSON, [2000] * 5, [walker([0.5, 1.0, 1.5])])
     assert (p_static > 0.5).all()
 
 
-def test_what_is_long_may_be_high():
+def test_vehicles_may_be_higher():
     tall = [[2.0, 0.0, z] for z in (0.5, 0.9, 1.3, 1.7, 2.1, 2.5)]
     _, as_person = built(tall, [1000] * 6, [walker([0.5, 1.0, 1.5])])
     assert (as_person < 0.5).tolist() == [True] * 4 + [False] * 2
@@ -168,7 +168,7 @@ def test_what_is_long_may_be_high():
     assert (as_van < 0.5).all()
 
 
-def test_who_stands_looks_where_he_went():
+def test_standing_object_keeps_its_heading():
     one = walker([0.5, 1.0, 1.5])
     one.velocity[1:] = 0.0
     np.testing.assert_allclose(box_of(one).heading, [[0.0, 1.0]] * 3)

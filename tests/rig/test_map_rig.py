@@ -108,7 +108,7 @@ def test_objects_have_a_height_and_points(mapped):
     assert max(one["size"][2] for one in objects) > 1.2
 
 
-def test_the_flat_result_is_as_without_it(rig, mapped, tmp_path):
+def test_planar_result_is_unchanged(rig, mapped, tmp_path):
     assert main(["map", str(rig / "horizontal"), "-o", str(tmp_path / "out"), *QUICK]) == 0
     for name in ("map.pgm", "beams/p_static.npy", "objects/objects.json", "trajectory.tum"):
         assert (tmp_path / "out" / name).read_bytes() == (mapped / name).read_bytes()
@@ -124,7 +124,7 @@ def refused(capsys, *words):
     return err
 
 
-def test_a_recording_of_another_time_is_refused(rig, tmp_path, capsys):
+def test_no_overlap_in_time_is_refused(rig, tmp_path, capsys):
     tilting = stillmap_folder.read(rig / "tilting")
     later = replace(tilting, stamp_ns=tilting.stamp_ns + 3_600_000_000_000)
     stillmap_folder.write(later, tmp_path / "later")
@@ -135,13 +135,13 @@ def test_a_recording_of_another_time_is_refused(rig, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-def test_two_flat_ones_and_two_in_3d_are_refused(rig, tmp_path, capsys):
+def test_wrong_dimensions_are_refused(rig, tmp_path, capsys):
     flat, tilting, out = rig / "horizontal", rig / "tilting", tmp_path / "out"
     assert "is in 2D" in refused(capsys, "map", flat, "--tilting", flat, "-o", out)
     assert "lies flat" in refused(capsys, "map", tilting, "--tilting", tilting, "-o", out)
 
 
-def test_wrong_options_and_places_are_refused(rig, tmp_path, capsys):
+def test_wrong_options_and_folders_are_refused(rig, tmp_path, capsys):
     words = ("map", rig / "horizontal", "--tilting", rig / "tilting", "-o")
     assert "rig.margin" in refused(capsys, *words, tmp_path / "out", "--set", "rig.margin=-1")
     assert "holds" in refused(capsys, *words, rig, "--overwrite")

@@ -19,7 +19,7 @@ def rig():
     )
 
 
-def test_a_simulated_rig_comes_back_from_its_planar_scans():
+def test_simulated_rig_from_planar_scans():
     whole, joint = rig().tilting.recording, rig().joint_angle
     # the joint goes on evenly while a scan is taken, but for the one in which it turns round
     even = np.flatnonzero(np.abs(np.diff(joint, 2, prepend=joint[0], append=joint[-1])) < 1e-9)
@@ -47,7 +47,7 @@ def test_a_simulated_rig_comes_back_from_its_planar_scans():
     np.testing.assert_array_equal(found.T_base_sensor, whole.T_base_sensor)
 
 
-def test_a_laser_beside_the_joint_goes_round_it():
+def test_laser_beside_the_joint():
     flat = Recording(
         stamp_ns=np.array([0], np.int64),
         offset=np.array([0, 1]),
@@ -68,7 +68,7 @@ def test_a_laser_beside_the_joint_goes_round_it():
         assemble_tilting_laser(flat, flat.stamp_ns, np.zeros(2), (0.0, 1.0, 0.0), np.eye(4))
 
 
-def test_a_sweep_ends_where_the_joint_turns_round():
+def test_sweeps_end_where_the_joint_reverses():
     joint = np.array([0.0, 0.1, 0.2, 0.195, 0.3, 0.2, 0.1, 0.0, 0.0, 0.1, 0.2])
     assert sweep_indices(joint).tolist() == [0, 0, 0, 0, 0, 1, 1, 1, 1, 2, 2]
     assert sweep_indices(np.zeros(4)).tolist() == [0, 0, 0, 0]

@@ -23,27 +23,27 @@ def test_exp_is_the_inverse_of_log(theta):
     np.testing.assert_allclose(se2.log(se2.exp(xi)), xi, atol=1e-12)
 
 
-def test_between_scans_the_robot_goes_on_along_the_arc():
+def test_interpolation_along_an_arc():
     at = np.array([0, 70, 199, 200, 333, 500, 777, 900], np.int64) * 1_000_000
     poses, known = interpolate_poses(STAMPS, way(STAMPS), at, max_gap=1.0)
     assert known.all()
     np.testing.assert_allclose(poses, way(at), atol=1e-12)
 
 
-def test_outside_the_time_and_over_pauses_nobody_knows():
+def test_unknown_outside_and_over_gaps():
     at = np.array([-1, 0, 1, 200, 300, 450, 901], np.int64) * 1_000_000
     _, known = interpolate_poses(STAMPS, way(STAMPS), at, max_gap=0.22)
     assert known.tolist() == [False, True, True, True, False, True, False]
 
 
-def test_over_a_leap_nobody_knows():
+def test_unknown_over_a_leap():
     poses = way(STAMPS)
     poses[3:, 0, 2] += 20.0  # 50 ms later
     _, known = interpolate_poses(STAMPS, poses, np.array([440, 470, 600]) * 1_000_000, max_gap=1.0)
     assert known.tolist() == [True, False, True]
 
 
-def test_a_single_scan_tells_its_own_moment_alone():
+def test_single_scan():
     poses, known = interpolate_poses(STAMPS[:1], way(STAMPS[:1]), np.array([0, 1]), max_gap=1.0)
     assert known.tolist() == [True, False]
     np.testing.assert_array_equal(poses[1], START)
@@ -72,7 +72,7 @@ def seen_on_the_way(times):
     )
 
 
-def test_every_beam_ends_where_the_thing_is():
+def test_beams_end_at_the_point():
     point, recording = seen_on_the_way(np.array([-0.05, 0.0, 0.07, 0.2]))
     found = pose_recording(recording, STAMPS, way(STAMPS))
     assert found.unposed_beams == 0
@@ -81,7 +81,7 @@ def test_every_beam_ends_where_the_thing_is():
     np.testing.assert_allclose(ends, np.tile(point, (8, 1)), atol=1e-5)
 
 
-def test_beams_after_the_last_scan_are_left_out():
+def test_beams_after_the_last_scan_are_unusable():
     _, recording = seen_on_the_way(np.array([-0.2, 0.2, 0.31]))
     found = pose_recording(recording, STAMPS, way(STAMPS))
     assert found.unposed_beams == 2

@@ -1,4 +1,4 @@
-"""Sweeps of a spinning lidar among boxes, with truth: what poses in space are tested on."""
+"""Simulated sweeps of a spinning lidar among boxes, with truth."""
 
 from dataclasses import dataclass, replace
 

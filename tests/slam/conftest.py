@@ -1,4 +1,4 @@
-"""Rooms, and scans taken in them; drives can be imported from here."""
+"""Rooms and simulated scans."""
 
 import sys
 from collections.abc import Callable

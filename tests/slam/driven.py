@@ -1,4 +1,4 @@
-"""Robots that drive among walls, where loops can be looked for."""
+"""Simulated drives as contexts of loop closure."""
 
 import numpy as np
 

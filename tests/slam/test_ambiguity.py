@@ -1,4 +1,4 @@
-"""Views that fit elsewhere about as well: their closures have to say so."""
+"""Covariance of ambiguous loop closures."""
 
 import functools
 
@@ -22,20 +22,20 @@ def corridor(*landmarks):
     return driven(walls, ((0, -0.2), (25, -0.2)), laser, speed=0.5)
 
 
-def closed(track, sigma):
+def closed(context, sigma):
     """Standard deviations of a closure halfway, and by how much it misses the truth along x."""
-    earlier = int(np.searchsorted(track.travelled, 13.0))
+    earlier = int(np.searchsorted(context.travelled, 13.0))
     later = earlier + 3
-    T = se2.inverse(track.poses[earlier]) @ track.poses[later]
-    grid = build_submap(track, float(track.travelled[earlier]))
-    closure = verify_candidate(track, grid, LoopCandidate(earlier, later, T, 0.0), sigma, 0.05)
+    T = se2.inverse(context.poses[earlier]) @ context.poses[later]
+    grid = build_submap(context, float(context.travelled[earlier]))
+    closure = verify_candidate(context, grid, LoopCandidate(earlier, later, T, 0.0), sigma, 0.05)
     assert closure.refused == ""
     off = se2.parameters(se2.inverse(T) @ closure.T)
     return np.sqrt(np.diag(closure.covariance)), float(off[0])
 
 
 @pytest.mark.parametrize("sigma", [1.0, 1.5, 3.0])
-def test_a_wide_window_over_doors_that_look_alike_makes_unsure(sigma):
+def test_ambiguity_widens_the_covariance(sigma):
     wide, off = closed(corridor(), sigma)
     assert wide[0] > 0.8  # the next door is 2 m away
     assert abs(off) < 2.0 * wide[0]
@@ -43,19 +43,19 @@ def test_a_wide_window_over_doors_that_look_alike_makes_unsure(sigma):
     assert wide[2] < 0.01
 
 
-def test_a_window_that_holds_one_door_does_not():
+def test_no_ambiguity_in_a_narrow_window():
     wide, off = closed(corridor(), 0.3)
     assert wide[0] < 0.1
     assert abs(off) < 0.02
 
 
-def test_one_thing_that_is_nowhere_else_settles_it():
+def test_unique_landmark_resolves_ambiguity():
     wide, off = closed(corridor(*box(15.3, -1.1, 0.5, 0.5)), 3.0)
     assert wide[0] < 0.1
     assert abs(off) < 0.02
 
 
-def test_a_mixture_by_hand():
+def test_ambiguity_covariance_by_hand():
     # 2 m ahead, ln 3 nats worse: a quarter of the probability, 0.25 * 2^2 of the variance
     rivals = np.array([[0.0, 0.0, 0.0, 0.0], [2.0, 0.0, 0.0, np.log(3.0)]])
     np.testing.assert_allclose(_ambiguity_covariance(rivals), np.diag([1.0, 0.0, 0.0]))

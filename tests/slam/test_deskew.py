@@ -1,4 +1,4 @@
-"""Points of a scan that took time, as if it had been taken at its stamp."""
+"""Deskewing against scans taken at one instant."""
 
 from dataclasses import replace
 
@@ -89,7 +89,7 @@ def laid(recording: Recording, poses: Float) -> Float:
 @pytest.mark.parametrize("place", PLACES.values(), ids=PLACES)
 @pytest.mark.parametrize("twist", TWISTS.values(), ids=TWISTS)
 @pytest.mark.parametrize(("first", "last"), [(0.0, 0.1), (-0.1, 0.0), (-0.05, 0.05), (0.0, 0.03)])
-def test_what_stands_still_is_where_it_is(twist, place, first, last):
+def test_posts_stay_in_place(twist, place, first, last):
     recording, poses, posts = even(twist, np.linspace(first, last, 12), place)
     seen = deskew_recording(recording, poses, OPTIONS)
     np.testing.assert_allclose(laid(seen, poses), posts, atol=2e-5)
@@ -131,7 +131,7 @@ def test_nothing_else_changes():
     np.testing.assert_allclose(elsewhere.points, seen.points, atol=1e-5)
 
 
-def test_it_is_left_as_it_is_where_nothing_is_known_or_wanted():
+def test_unchanged_without_times_poses_or_option():
     recording, poses, _ = even((5.0, 0.0, 1.0), np.linspace(0.0, 0.1, 12))
     assert deskew_recording(recording, None, OPTIONS) is recording
     assert deskew_recording(recording, poses, SlamOptions(deskew=False)) is recording
@@ -139,7 +139,7 @@ def test_it_is_left_as_it_is_where_nothing_is_known_or_wanted():
     assert deskew_recording(at_once, poses, OPTIONS) is at_once
 
 
-def test_errors_that_alternate_do_not_feed_themselves():
+def test_alternating_errors_are_suppressed():
     """A pose that lies ahead must not pull its own scan back, and the one before ahead."""
     recording, poses, posts = even((5.0, 0.0, 0.0), np.linspace(0.0, 0.1, 12), T=9)
     off = poses @ se2.matrix(0.03 * (-1.0) ** np.arange(9), 0.0, 0.0)
@@ -166,7 +166,7 @@ def test_two_lasers_in_turns(early):
 
 
 @pytest.mark.parametrize("leap", [(40.0, 0.0, 0.0), (0.0, -3.0, 1.0), (0.0, 0.0, 2.0)])
-def test_a_leap_is_no_motion(leap):
+def test_leaps_are_no_motion(leap):
     recording, poses, posts = even((1.0, 0.0, 0.0), np.linspace(0.0, 0.1, 12), T=30)
     leaping, leap = poses.copy(), poses[4] @ se2.matrix(*leap) @ se2.inverse(poses[4])
     leaping[4:] = leap @ leaping[4:]
@@ -177,7 +177,7 @@ def test_a_leap_is_no_motion(leap):
     assert errors.max() < 0.06
 
 
-def test_scans_in_one_instant_one_scan_and_none():
+def test_equal_stamps_single_scan_and_no_beams():
     recording, poses, _ = even((5.0, 0.0, 1.0), np.linspace(0.0, 0.1, 12))
     together = replace(recording, stamp_ns=np.full(5, 10**18))
     np.testing.assert_array_equal(
@@ -195,7 +195,7 @@ def test_scans_in_one_instant_one_scan_and_none():
     assert deskew_recording(empty, poses, OPTIONS).n_beams == 0
 
 
-def test_scans_without_beams_among_others():
+def test_scans_without_beams():
     recording, poses, posts = even((5.0, 0.0, 1.0), np.linspace(0.0, 0.1, 12))
     kept = np.ones(60, bool)
     kept[24:36] = kept[:12] = False
@@ -210,7 +210,7 @@ def test_scans_without_beams_among_others():
     np.testing.assert_allclose(laid(seen, poses), posts[kept], atol=2e-5)
 
 
-def test_more_beams_than_are_worked_on_at_a_time():
+def test_several_blocks():
     recording, poses, posts = even((5.0, 0.3, 1.0), np.linspace(-0.02, 0.08, 500), T=40)
     seen = deskew_recording(recording, poses, OPTIONS)
     np.testing.assert_allclose(laid(seen, poses), posts, atol=5e-5)

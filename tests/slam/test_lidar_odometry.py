@@ -1,4 +1,4 @@
-"""Poses in space from sweeps of a spinning lidar, against truth."""
+"""Lidar odometry against truth."""
 
 from dataclasses import replace
 
@@ -57,7 +57,7 @@ def test_poses_and_motion_in_a_room(room):
     assert found.explained[1:].min() > 0.5
 
 
-def test_what_moves_does_not_pull():
+def test_movers_do_not_bias_poses():
     """In a convoy of lorries, with two towers beside the road: without e the robot stands still."""
     rows = [[0.0, 0.0, -2.0, 200.0, 200.0, 0.8, 0, 0, 0]]
     rows += [[x, y, 5.0, 3.0, 3.0, 14.0, 0, 0, 0] for x, y in ((-14, 9), (14, -9))]
@@ -102,7 +102,7 @@ def test_another_base_frame_moves_the_poses(room):
     assert np.abs(apart[:, 3:]).max() < np.radians(0.3)
 
 
-def test_covariance_tells_what_is_not_seen():
+def test_covariance_is_long_along_a_bare_corridor():
     """In a bare corridor nothing says how far along it; everything else is known."""
     corridor = Boxes.of([[0.0, 0.0, 1.0, 400.0, 2.6, 3.0, 0, 0, 0]])
     recording, _, e = recorded(corridor, SPARSE, wobbling(12, turn=0.0), 12, seed=3)
@@ -110,16 +110,18 @@ def test_covariance_tells_what_is_not_seen():
     assert sigma[0] > 5.0 * max(sigma[1], sigma[2])
 
 
-def test_odometry_holds_where_nothing_is_seen():
+def test_odometry_helps_in_a_bare_corridor():
     """Not as well as it should: see what registration3d.md says of corridors."""
     corridor = Boxes.of([[0.0, 0.0, 1.0, 400.0, 2.6, 3.0, 0, 0, 0]])
     recording, truth, e = recorded(corridor, SPARSE, wobbling(25, turn=0.0), 25, seed=4)
-    told = replace(recording, T_odom_base=np.ascontiguousarray(truth))
-    errors = [compute_absolute_errors(built(r, e).poses, truth).rmse for r in (told, recording)]
+    with_odometry = replace(recording, T_odom_base=np.ascontiguousarray(truth))
+    errors = [
+        compute_absolute_errors(built(r, e).poses, truth).rmse for r in (with_odometry, recording)
+    ]
     assert errors[0] < 0.6 * errors[1], errors
 
 
-def test_odometry_that_lies_is_disbelieved():
+def test_odometry_gate():
     state = constant_velocity.initial_state(np.array([1.0, 0, 0, 0, 0, 0]), 0.2, 0.2)
     options = OdometryOptions()
     leap = se3.exp(np.array([3.0, 0, 0, 0, 0, 0]))
@@ -130,7 +132,7 @@ def test_odometry_that_lies_is_disbelieved():
     assert 1.0 < true.twist[0] < 1.2
 
 
-def test_empty_sweeps_go_on_as_before(room):
+def test_empty_sweeps(room):
     recording, truth, e = room
     gone = recording.hit.copy()
     gone[recording.beams_of(15)] = False
@@ -141,7 +143,7 @@ def test_empty_sweeps_go_on_as_before(room):
     assert np.abs(nothing.poses - np.eye(4)).max() < 1e-9
 
 
-def test_memory_is_bounded_by_the_reach():
+def test_memory_is_bounded_by_the_radius():
     street = Boxes.of([[0.0, 0.0, 1.0, 4000.0, 12.0, 5.0, 0, 0, 0]])
     recording, _, e = recorded(street, SPARSE, wobbling(40, speed=30.0, turn=0.0), 40, seed=4)
     local = _core.NdtMap3D(0.4, 4, 60.0)
@@ -155,7 +157,7 @@ def test_memory_is_bounded_by_the_reach():
     assert max(sizes[20:]) < 1.2 * max(sizes[10:20])
 
 
-def test_only_in_space(room):
+def test_2d_is_refused(room):
     flat = replace(
         room[0], points=np.ascontiguousarray(room[0].points[:, :2]), T_base_sensor=np.eye(3)[None]
     )

@@ -1,4 +1,4 @@
-"""The map of the last stretch: what is kept, and that it forgets to the bit."""
+"""The local map: spacing and exact removal."""
 
 import functools
 
@@ -44,7 +44,7 @@ def assert_same(one, other):
         np.testing.assert_array_equal(*gradients)
 
 
-def test_it_forgets_to_the_bit():
+def test_removal_is_exact():
     poses = hall().truth.T_world_base
     e = np.random.default_rng(0).random(hall().recording.n_beams).astype(np.float32)
     all_of_it, rest = empty(e), empty(e)
@@ -59,7 +59,7 @@ def test_it_forgets_to_the_bit():
     assert not any(sums.any() for sums in all_of_it.grid.dense()[1:])
 
 
-def test_it_forgets_nothing_too_early():
+def test_removal_before_zero_travel_removes_nothing():
     poses = hall().truth.T_world_base
     one, other = empty(), empty()
     for t in range(0, 120, 4):
@@ -80,7 +80,7 @@ def test_it_forgets_nothing_too_early():
         ((0.12, 0.0, 0.12), True),
     ],
 )
-def test_scans_that_show_the_same_are_left_out(monkeypatch, move, kept):
+def test_scans_are_spaced(monkeypatch, move, kept):
     # scan 1 is taken 0.2 s later, which counts as 0.04 of the 5 s that make a scan worth keeping
     monkeypatch.setattr(local_map, "SCAN_SPACING", 0.2 + 0.04)
     so_far, first = empty(), empty()
@@ -91,7 +91,7 @@ def test_scans_that_show_the_same_are_left_out(monkeypatch, move, kept):
     assert (after > before) == kept
 
 
-def test_who_stands_still_is_looked_at_again_after_a_while(monkeypatch):
+def test_spacing_in_time(monkeypatch):
     # 0.2 per second: 24 scans are 4.8 s, 26 are 5.2 s and count as much as 1.04 m
     monkeypatch.setattr(local_map, "SCAN_SPACING", 1.0)
     for t, kept in ((24, False), (26, True)):
@@ -102,7 +102,7 @@ def test_who_stands_still_is_looked_at_again_after_a_while(monkeypatch):
         assert (so_far.grid.dense()[1].sum() > before) == kept
 
 
-def test_scans_can_be_taken_back():
+def test_remove_since():
     T = hall().truth.T_world_base
     one, other = empty(), empty()
     for t in range(0, 60, 5):
@@ -115,7 +115,7 @@ def test_scans_can_be_taken_back():
     assert not other.has_sensor(0)
 
 
-def test_each_laser_has_its_own_scans():
+def test_sensors_are_spaced_separately():
     options = {"robot": {"scans": 80}, "laser": {"second_laser": True}}
     simulation = simulate(scene_by_name("hall", options), 1)
     recording, T = simulation.recording, simulation.truth.T_world_base

@@ -1,4 +1,4 @@
-"""Where loops are looked for, and how widely: what the graph knows, not what odometry fears."""
+"""Loop candidates, their drift by the graph, and stages."""
 
 import dataclasses
 from itertools import accumulate, pairwise
@@ -37,7 +37,7 @@ OPTIONS = SlamOptions()
 SURE = np.diag([0.03**2, 0.03**2, 0.006**2])
 
 
-def track_of(poses):
+def make_context(poses):
     """Poses (K, 3, 3) a metre of travel apart, each a keyframe."""
     n = len(poses)
     recording = Recording(
@@ -64,36 +64,36 @@ def track_of(poses):
 
 
 def straight(n):
-    return track_of(se2.matrix(np.arange(float(n)), 0.0, 0.0))
+    return make_context(se2.matrix(np.arange(float(n)), 0.0, 0.0))
 
 
 def laps(n):
     """n times along the same 20 m, each time from the start again."""
-    return track_of(se2.matrix(np.tile(np.arange(21.0), n), 0.0, 0.0))
+    return make_context(se2.matrix(np.tile(np.arange(21.0), n), 0.0, 0.0))
 
 
 def tie(earlier, later, covariance=SURE, T=None):
     return LoopClosure(earlier, later, np.eye(3) if T is None else T, covariance, 1.0)
 
 
-def test_without_closures_metres_are_those_of_travel():
+def test_drift_without_closures_is_travel():
     np.testing.assert_array_equal(graph_distances(straight(50), 30, []), np.arange(30, -1, -1))
 
 
-def test_the_way_through_a_closure_counts_where_it_is_shorter():
+def test_shortest_path_through_a_closure():
     metres = graph_distances(straight(50), 41, [tie(10, 31)])
     np.testing.assert_allclose(metres[[10, 0, 20, 31, 41]], [15, 25, 21, 10, 0])
 
 
-def test_loops_in_two_rooms_leave_the_way_between_as_it_is():
+def test_closures_in_two_rooms_do_not_shorten_the_way_between():
     rooms = [tie(0, 20), tie(60, 80)]
     metres = graph_distances(straight(81), 80, rooms)
     assert metres[60] == pytest.approx(5.0)  # the same room
-    assert metres[20] == pytest.approx(5.0 + 40.0)  # the other, and the way there
+    assert metres[20] == pytest.approx(5.0 + 40.0)  # the other room and the way there
     assert metres[0] == pytest.approx(5.0 + 40.0 + 5.0)
 
 
-def test_a_closure_that_may_slide_ties_less():
+def test_uncertain_closures_count_as_more_travel():
     sliding = SURE + np.diag([0.6**2, 0.0, 0.0])
     across = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     for covariance in (sliding, across @ sliding @ across.T):
@@ -102,27 +102,28 @@ def test_a_closure_that_may_slide_ties_less():
         assert metres[50] == pytest.approx(expected)
 
 
-def test_candidates_are_as_unsure_as_the_graph():
-    track = laps(3)
-    ties = [tie(k, 21 + k) for k in range(21)]
-    # the third time, as unsure as the way from the start of the lap
+def test_drift_of_candidates_follows_the_graph():
+    context = laps(3)
+    closures = [tie(k, 21 + k) for k in range(21)]
+    # third lap: as uncertain as the way from its start
     third = {
         c.later: c
-        for c in propose_candidates(track, track.poses, view_centers(track), 42, 63, ties)
+        for c in propose_candidates(context, context.poses, view_centers(context), 42, 63, closures)
     }
     assert set(third) == set(range(42, 63))
     for later, candidate in third.items():
         assert candidate.drift_distance <= later - 42 + 1 + 20 + 5
         assert candidate.drift_distance <= later - candidate.earlier
     alone = {
-        c.later: c for c in propose_candidates(track, track.poses, view_centers(track), 42, 63, [])
+        c.later: c
+        for c in propose_candidates(context, context.poses, view_centers(context), 42, 63, [])
     }
     assert alone[50].drift_distance == 50 - alone[50].earlier
 
 
-def test_candidates_are_found_where_the_graph_puts_them():
+def test_candidates_use_corrected_poses():
     n = 60
-    drifted = track_of(se2.matrix(np.arange(float(n)), 0.0, 0.0))
+    drifted = make_context(se2.matrix(np.arange(float(n)), 0.0, 0.0))
     there_and_back = np.concatenate([np.arange(30.0), np.arange(30.0)])
     corrected = se2.matrix(there_and_back, 0.3, 0.0)
     assert list(propose_candidates(drifted, drifted.poses, view_centers(drifted), 30, 60, [])) == []
@@ -132,7 +133,7 @@ def test_candidates_are_found_where_the_graph_puts_them():
 
 
 @pytest.mark.parametrize("n", [1, 2, 41, 500])
-def test_stages_leave_out_nothing(n):
+def test_stages_cover_all_keyframes(n):
     ranges = list(split_stages(straight(n)))
     assert ranges[0][0] == 0
     assert ranges[-1][1] == n
@@ -140,7 +141,7 @@ def test_stages_leave_out_nothing(n):
     assert all(first < last for first, last in ranges)
 
 
-def test_stages_grow_with_the_way():
+def test_stages_grow_with_travel():
     ranges = list(split_stages(straight(20000)))
     length = np.diff(ranges, axis=1).ravel()
     assert length[0] == loop_candidates._MIN_STAGE
@@ -148,19 +149,19 @@ def test_stages_grow_with_the_way():
     assert len(ranges) < 110  # 500, were all as long as the first
 
 
-def test_stage_by_stage_agrees_like_all_at_once():
-    track = laps(2)
-    way = odometry_constraints(track, OPTIONS.odometry, [])
+def test_consistency_by_stages_equals_consistency_at_once():
+    context = laps(2)
+    chain = odometry_constraints(context, OPTIONS.odometry, [])
     rng = np.random.default_rng(3)
     shifts = rng.choice([0.2, 0.2, -0.3], 21)
     found = [tie(k, 21 + k, T=se2.matrix(shift, 0.0, 0.0)) for k, shift in enumerate(shifts)]
-    at_once = [c.refused for c in reject_inconsistent(track, way, found)]
+    at_once = [c.refused for c in reject_inconsistent(context, chain, found)]
     assert {bool(reason) for reason in at_once} == {True, False}
     for stage in (1, 2, 3, 7):
         decided: list[LoopClosure] = []
         for first in range(0, 21, stage):
             new = found[: first + stage]
-            decided = reject_inconsistent_since(track, way, new, decided, 21 + first)
+            decided = reject_inconsistent_since(context, chain, new, decided, 21 + first)
         assert [c.refused for c in decided] == at_once
 
 
@@ -201,23 +202,23 @@ def missed(T, truth, candidate):
     return np.hypot(*se2.parameters(se2.inverse(true) @ T)[:2])
 
 
-def test_loops_are_looked_for_where_those_before_put_them(monkeypatch):
+def test_candidates_follow_from_corrected_stages(monkeypatch):
     asked = []
     attempts = loop_verification.verify_candidates
 
-    def recorded(track, candidates):
+    def recorded(context, candidates):
         asked.append(list(candidates))
-        return attempts(track, asked[-1])
+        return attempts(context, asked[-1])
 
     monkeypatch.setattr(loop_verification, "verify_candidates", recorded)
     recording, truth, poses = rounds(drift=4.0)
     e = np.full(recording.n_beams, 0.9, np.float32)
-    told = []
+    calls = []
     monkeypatch.setattr(loop_candidates, "_MIN_STAGE", 8.0)
-    close_loops(recording, e, OPTIONS, local(poses), lambda *at: told.append(at))
-    assert len(told) > 3
-    assert told == sorted(told)
-    assert {total for _, total in told} == {recording.n_scans}
+    close_loops(recording, e, OPTIONS, local(poses), lambda *at: calls.append(at))
+    assert len(calls) > 3
+    assert calls == sorted(calls)
+    assert {total for _, total in calls} == {recording.n_scans}
     third = [c for stage in asked for c in stage if c.later > 600]
     without = [missed(se2.inverse(poses[c.earlier]) @ poses[c.later], truth, c) for c in third]
     assert len(third) > 40
@@ -225,25 +226,25 @@ def test_loops_are_looked_for_where_those_before_put_them(monkeypatch):
     assert max(missed(c.T, truth, c) for c in third) < 0.28
 
 
-def test_a_scan_is_laid_where_the_candidate_says():
+def test_verification_starts_at_the_candidate_pose():
     recording, truth, poses = rounds(drift=4.0)
     frames = local_map.select_keyframes(poses, 1.0, 0.5)
     later = int(frames[np.searchsorted(local_map.travelled_distance(poses)[frames], 60.0)])
     earlier = min(range(200), key=lambda t: np.linalg.norm(truth[t] - truth[later]))
-    track = dataclasses.replace(
-        track_of(poses),
+    context = dataclasses.replace(
+        make_context(poses),
         recording=recording,
         e=np.full(recording.n_beams, 0.9, np.float32),
         travelled=local_map.travelled_distance(poses),
         keyframes=frames,
     )
     T = se2.inverse(truth[earlier]) @ truth[later]
-    (found,) = loop_verification.verify_candidates(track, [LoopCandidate(earlier, later, T, 0.0)])
+    (found,) = loop_verification.verify_candidates(context, [LoopCandidate(earlier, later, T, 0.0)])
     assert missed(se2.inverse(poses[earlier]) @ poses[later], truth, found) > 0.5
     assert missed(found.T, truth, found) < 0.05  # though no more than 0.2 m are searched
 
 
-def test_a_round_passed_again_is_not_searched_more_widely(monkeypatch):
+def test_repeated_rounds_do_not_widen_the_search(monkeypatch):
     windows = []
     search = scan_matching.search_pose
 

@@ -1,4 +1,4 @@
-"""Loop closure on small worlds: loops that close, and loops that must not."""
+"""Loop closure on small worlds: true loops close, false ones are refused."""
 
 import dataclasses
 import functools
@@ -30,7 +30,7 @@ REASONS = {"explains too little", "closures around disagree", "other loops disag
 
 
 def silent(*_):
-    """Tells nobody."""
+    """Ignores progress."""
 
 
 def mapped(simulation, options=OPTIONS, threads=1, start=None):
@@ -133,7 +133,7 @@ def test_a_repetitive_corridor_makes_no_false_loop():
     assert chi2.max() < 25
 
 
-def test_a_straight_way_has_no_loops():
+def test_straight_travel_has_no_loops():
     recording = repetitive().recording
     n = 250  # 25 m
     short = dataclasses.replace(
@@ -159,18 +159,18 @@ def test_refusals_carry_reasons(monkeypatch):
     assert "" not in {c.refused for c in mapped(square()).loops}
 
 
-def track_of(recording, poses, travelled, frames):
+def make_context(recording, poses, travelled, frames):
     """What loops are looked for in; all of it is explained, and no beam is believed."""
     e, explained = np.zeros(recording.n_beams, np.float32), np.ones(len(poses))
     return LoopContext(recording, e, poses, travelled, explained, frames, 0.05, 1.0, 6.0)
 
 
-def straight_track():
+def straight_context():
     """Twice along the same 20 m, keyframes a metre apart."""
     x = np.concatenate([np.arange(21.0), np.arange(21.0)])
     recording = dataclasses.replace(square().recording, T_odom_base=None)
     n = len(x)
-    return track_of(recording, se2.matrix(x, 0.0, 0.0), np.arange(float(n)), np.arange(n))
+    return make_context(recording, se2.matrix(x, 0.0, 0.0), np.arange(float(n)), np.arange(n))
 
 
 def closures(shifts):
@@ -182,30 +182,30 @@ def closures(shifts):
     ]
 
 
-def test_one_closure_that_wants_something_else_is_refused():
-    track = straight_track()
-    way = odometry_constraints(track, OPTIONS.odometry, [])
+def test_inconsistent_closure_is_refused():
+    context = straight_context()
+    chain = odometry_constraints(context, OPTIONS.odometry, [])
     shifts = [0.5] * 8
     shifts[4] = -0.5
-    refused = [c.refused for c in reject_inconsistent(track, way, closures(shifts))]
+    refused = [c.refused for c in reject_inconsistent(context, chain, closures(shifts))]
     assert refused == ["closures around disagree" if k == 4 else "" for k in range(8)]
 
 
-def test_a_closure_on_its_own_is_refused():
-    track = straight_track()
-    way = odometry_constraints(track, OPTIONS.odometry, [])
-    assert [bool(c.refused) for c in reject_inconsistent(track, way, closures([0.1]))] == [True]
+def test_single_closure_is_refused():
+    context = straight_context()
+    chain = odometry_constraints(context, OPTIONS.odometry, [])
+    assert [bool(c.refused) for c in reject_inconsistent(context, chain, closures([0.1]))] == [True]
 
 
-def test_a_way_that_odometry_contradicts_is_loose():
+def test_leap_from_odometry_widens_the_constraint():
     simulation = square()
     recording, poses = simulation.recording, simulation.truth.T_world_base.copy()
     frames = local_map.select_keyframes(poses, 1.0, 0.5)
     at = int(frames[5]) + 1
     poses[at:] = se2.matrix(0.0, 0.8, 0.0) @ poses[at:]  # a leap of 0.8 m in the map's y
-    track = track_of(recording, poses, local_map.travelled_distance(poses), frames)
-    way = odometry_constraints(track, OPTIONS.odometry, [])
-    widths = np.array([np.sqrt(np.linalg.eigvalsh(r.covariance[:2, :2]).max()) for r in way])
+    context = make_context(recording, poses, local_map.travelled_distance(poses), frames)
+    chain = odometry_constraints(context, OPTIONS.odometry, [])
+    widths = np.array([np.sqrt(np.linalg.eigvalsh(r.covariance[:2, :2]).max()) for r in chain])
     assert widths[5] == pytest.approx(0.8, abs=0.1)
     assert np.delete(widths, 5).max() < 0.1
 
@@ -227,7 +227,7 @@ def test_keyframes_by_hand():
     assert local_map.travelled_distance(x).tolist() == [0, 1, 2, 2, 2, 2]
 
 
-def test_scans_of_each_laser_are_chosen_by_themselves():
+def test_keyframes_per_sensor():
     x = np.tile(np.eye(3), (8, 1, 1))
     x[:, 0, 2] = 0.3 * np.arange(8)
     sensor = np.array([0, 1, 0, 1, 0, 1, 0, 1])
@@ -247,7 +247,7 @@ def test_the_grid_is_what_the_poses_make():
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-def test_twice_and_with_any_number_of_threads_the_same(threads):
+def test_reproducible_with_any_number_of_threads(threads):
     one, two = mapped(square()), mapped(square(), threads=threads)
     for name in ("poses", "covariance", "explained"):
         np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
@@ -266,7 +266,7 @@ def test_twice_and_with_any_number_of_threads_the_same(threads):
         np.testing.assert_array_equal(ours, theirs)
 
 
-def test_the_graph_is_what_was_found():
+def test_graph_holds_chain_and_accepted_loops():
     found = mapped(square())
     graph, accepted = found.graph, [c for c in found.loops if not c.refused]
     K = len(graph.keyframes)
@@ -288,10 +288,10 @@ def test_without_loops_poses_are_incremental():
     assert found.loops == []
 
 
-def test_a_start_is_only_swept():
+def test_start_is_only_refined():
     first = mapped(square())
     again = mapped(square(), start=first)
-    assert again.loops == first.loops  # none are looked for, those found are still told
+    assert again.loops == first.loops  # no search; the closures are kept
     assert first.loops
     assert np.linalg.norm(again.poses[:, :2, 2] - first.poses[:, :2, 2], axis=1).max() < 0.03
 
@@ -311,7 +311,7 @@ def test_corridors_close(seed):
     assert ate(mapped(simulation), simulation) < 0.03
 
 
-def test_drift_grows_with_the_way_and_then_no_more(monkeypatch):
+def test_drift_is_bounded(monkeypatch):
     monkeypatch.setattr(loop_candidates, "_MAX_DRIFT_TRAVEL", 500.0)
     near, far, lost = (loop_candidates.drift_std(metres) for metres in (50.0, 500.0, 1e6))
     assert near < far == lost

@@ -1,4 +1,4 @@
-"""Loops in space: found, verified, spread; false ones refused."""
+"""Loop closure in 3D: found, verified, propagated; false loops refused."""
 
 from dataclasses import replace
 
@@ -62,7 +62,7 @@ def closed(drive, driven):
     return loop_closure_3d.close_loops_3d(recording, e, SlamOptions(), driven, _silent, 1)
 
 
-def test_drift_is_taken_out(drive):
+def test_loops_correct_drift(drive):
     truth = drive[1]
     driven = drifted(drive[3], [0.005, 0.0, 0.005, 0.0, 0.0, 0.0005])
     found, loops, graph = closed(drive, driven)
@@ -77,7 +77,7 @@ def test_drift_is_taken_out(drive):
     assert len(graph.constraints) == len(graph.keyframes) - 1 + len(accepted)
 
 
-def test_places_that_only_seem_near_are_refused(drive, monkeypatch):
+def test_false_candidates_are_refused(drive, monkeypatch):
     """Turned so far that the far side of the block seems to be where the drive began."""
     driven = drive[3]
     wrong = driven.poses.copy()
@@ -95,7 +95,7 @@ def test_places_that_only_seem_near_are_refused(drive, monkeypatch):
     assert np.isfinite(poses).all()
 
 
-def test_a_street_is_not_every_street():
+def test_similar_streets_are_refused():
     """Two streets of the same width: the ground and the rows of houses meet, their ends do not."""
     rng = np.random.default_rng(7)
     rows = [[60.0, 0.0, -2.0, 300.0, 300.0, 0.4, 0, 0, 0]]
@@ -116,7 +116,7 @@ def test_a_street_is_not_every_street():
     assert all(loop.refused for loop in loops)
 
 
-def test_graph_in_space():
+def test_pose_graph_3d():
     """Two steps said to be 1.2 m long, yet the end is known to be at 2 m."""
     step = se3.exp(np.array([1.2, 0, 0, 0, 0, 0.0]))
     covariance = np.diag([1e-2] * 3 + [1e-4] * 3)
@@ -131,7 +131,7 @@ def test_graph_in_space():
     assert robust[2, 0, 3] == pytest.approx(2.0, abs=0.01)
 
 
-def test_covariance_turns_as_gtsam_has_it():
+def test_covariance_convention_of_gtsam():
     """Loose in x of the second pose, which looks along y: the middle gives way along y."""
     turned = se3.exp(np.array([0, 0, 0, 0, 0, np.pi / 2]))
     ahead = se3.exp(np.array([1.0, 0, 0, 0, 0, 0]))

@@ -1,4 +1,4 @@
-"""Views from the other side: the backs of walls say nothing, and who comes back looks alike."""
+"""Loop verification of views from the other side of walls and streets."""
 
 import functools
 
@@ -30,16 +30,16 @@ def divided(width):
     return driven(walls, route, LaserOptions(beams=180, max_range=30.0))
 
 
-def over_the_wall(track):
+def over_the_wall(context):
     """(N, 3) by what closures over the wall miss the truth, and their chi-square (N,)."""
-    x, off, chi = se2.parameters(track.poses), [], []
-    south = [k for k in track.keyframes if track.travelled[k] < 16.0]
-    north = [k for k in track.keyframes if track.travelled[k] > 28.0]
-    grid = build_submap(track, 8.0)
+    x, off, chi = se2.parameters(context.poses), [], []
+    south = [k for k in context.keyframes if context.travelled[k] < 16.0]
+    north = [k for k in context.keyframes if context.travelled[k] > 28.0]
+    grid = build_submap(context, 8.0)
     for k in north:
         i = min(south, key=lambda i: np.linalg.norm(x[i, :2] - x[k, :2]))
-        T = se2.inverse(track.poses[i]) @ track.poses[k]
-        closure = verify_candidate(track, grid, LoopCandidate(i, k, T, 0.0), 0.2, 0.02)
+        T = se2.inverse(context.poses[i]) @ context.poses[k]
+        closure = verify_candidate(context, grid, LoopCandidate(i, k, T, 0.0), 0.2, 0.02)
         if not closure.refused:
             d = se2.parameters(se2.inverse(T) @ closure.T)
             off.append(d)
@@ -58,7 +58,7 @@ def test_the_back_of_a_wall_is_not_its_front(monkeypatch):
 
 
 @pytest.mark.parametrize("width", [5, 7])
-def test_what_is_seen_beside_a_wall_puts_a_view_beyond_it(width):
+def test_structure_beside_a_wall_locates_a_view_behind_it(width):
     off, chi = over_the_wall(divided(width))
     assert len(off) >= 3
     assert np.abs(off[:, 1]).max() < 0.02
@@ -80,37 +80,37 @@ def street():
     return driven(tuple(fronts), route, LaserOptions(beams=361, max_range=80.0), speed=5.0)
 
 
-def test_who_comes_back_on_the_other_side_of_a_street_has_seen_it_before():
-    track = street()
-    looks = loop_candidates.view_centers(track)
+def test_loops_close_across_a_street():
+    context = street()
+    looks = loop_candidates.view_centers(context)
     asked = list(
         loop_candidates.propose_candidates(
-            track, track.poses[track.keyframes], looks, 0, len(looks), []
+            context, context.poses[context.keyframes], looks, 0, len(looks), []
         )
     )
     # never nearer than that
-    assert min(np.linalg.norm(c.T[:2, 2]) for c in asked if track.travelled[c.later] > 90.0) > 9.9
-    found = [c for c in verify_candidates(track, asked) if not c.refused]
+    assert min(np.linalg.norm(c.T[:2, 2]) for c in asked if context.travelled[c.later] > 90.0) > 9.9
+    found = [c for c in verify_candidates(context, asked) if not c.refused]
     assert len(found) > 20
     for closure in found:
-        T = se2.inverse(track.poses[closure.earlier]) @ track.poses[closure.later]
+        T = se2.inverse(context.poses[closure.earlier]) @ context.poses[closure.later]
         assert np.linalg.norm((se2.inverse(T) @ closure.T)[:2, 2]) < 0.2
 
 
-def test_where_a_keyframe_looks_by_hand():
-    track = street()
+def test_view_center_by_hand():
+    context = street()
     k = 3
-    t = int(track.keyframes[k])
-    beams = track.recording.beams_of(t)
-    hit = track.recording.hit[beams]
+    t = int(context.keyframes[k])
+    beams = context.recording.beams_of(t)
+    hit = context.recording.hit[beams]
     # weights are all alike; the laser sits 8 cm ahead of the middle of the robot
-    expected = track.recording.points[beams][hit].mean(axis=0)
+    expected = context.recording.points[beams][hit].mean(axis=0)
     np.testing.assert_allclose(
-        loop_candidates.view_centers(track)[k] - (0.08, 0.0), expected, atol=1e-4
+        loop_candidates.view_centers(context)[k] - (0.08, 0.0), expected, atol=1e-4
     )
 
 
-def test_select_comparable_is_what_was_looked_at_from_the_same_side():
+def test_comparable_beams_were_observed_from_the_same_side():
     # one beam along x that ends at 5 m: the wall is seen from the left
     grid = _core.OccupancyGrid2D(0.1, 0.5)
     T = np.eye(3)[None]
@@ -128,7 +128,7 @@ def test_select_comparable_is_what_was_looked_at_from_the_same_side():
     assert part.points is view.points
 
 
-def test_where_beams_were_before_their_ends():
+def test_points_before_ends_by_hand():
     scan = Scan(
         np.array([[5.0, 1.0], [1.0, 4.0], [1.0, 2.0]], np.float32),
         np.ones(3, np.float32),

@@ -1,4 +1,4 @@
-"""The motion prior: where it is, how wide it is, and that it stays a pose."""
+"""The motion prior: mean, standard deviations, orthonormality."""
 
 import dataclasses
 
@@ -29,7 +29,7 @@ def test_a_constant_velocity_repeats_the_last_motion():
     assert not prior.is_odometry
 
 
-def test_how_steady_the_motion_is_by_hand(monkeypatch):
+def test_velocity_noise_by_hand(monkeypatch):
     # 0.75 * 0.4^2 + 0.25 * (0.2^2 + 0.4^2) / 2 = 0.145 m^2, 0.75 * 0.2^2 + 0.25 * 0.6^2 rad^2
     monkeypatch.setattr(motion_model, "_FORGETTING", 0.25)
     after = VelocityNoise(0.4, 0.2).update(np.array([0.2, -0.4, 0.6]), 0.1)
@@ -42,7 +42,7 @@ def test_how_steady_the_motion_is_by_hand(monkeypatch):
     # 1/2 a t^2 of 2 m/s^2 and 4 rad/s^2: not below the floor of 0.02 m, not above 0.15
     [(0.01, 0.02, 0.02), (0.2, 0.04, 0.08), (1.0, 0.15, 0.15)],
 )
-def test_a_robot_that_was_steady_may_still_turn(seconds, metres, radians):
+def test_velocity_noise_floor(seconds, metres, radians):
     found = VelocityNoise()
     for _ in range(200):
         found = found.update(np.zeros(3), seconds)
@@ -50,7 +50,7 @@ def test_a_robot_that_was_steady_may_still_turn(seconds, metres, radians):
     assert found.rotation == pytest.approx(radians)
 
 
-def test_steps_that_nobody_made_are_told_from_the_others():
+def test_leaps_are_implausible_steps():
     x = np.cumsum([0.0, *[0.3] * 30, 40.0, *[0.3] * 30])
     steps = motion_model.compute_odometry_steps(se2.matrix(x, 0 * x, 0 * x))
     np.testing.assert_array_equal(np.flatnonzero(~steps.plausible), [30])
@@ -59,7 +59,7 @@ def test_steps_that_nobody_made_are_told_from_the_others():
     assert motion_model.compute_odometry_steps(T0[None]).plausible.shape == (0,)
 
 
-def test_widths_by_hand():
+def test_standard_deviations_by_hand():
     # 0.5 m and 0.4 rad: 0.02 + 0.2 * 0.5 + 0.3 * 0.4 = 0.24 m, 0.02 + 0.1 * 0.5 + 0.5 * 0.4 rad
     options = OdometryOptions(0.2, 0.3, 0.1, 0.5)
     prior = motion_model.odometry_prior(T0, se2.matrix(0.3, 0.4, -0.4), options)
@@ -68,7 +68,7 @@ def test_widths_by_hand():
     np.testing.assert_allclose(prior.information, np.diag([0.24**-2, 0.24**-2, 0.27**-2]))
 
 
-def test_standing_still_is_the_surest():
+def test_standing_still_is_most_certain():
     still = motion_model.odometry_prior(T0, np.eye(3), OPTIONS)
     for increment in (se2.matrix(0.1, 0, 0), se2.matrix(0, 0, -0.1), se2.matrix(-0.1, 0, 0)):
         moving = motion_model.odometry_prior(T0, increment, OPTIONS)
@@ -76,7 +76,7 @@ def test_standing_still_is_the_surest():
         assert moving.rotation_std > still.rotation_std > 0
 
 
-def test_widened_is_never_narrower():
+def test_widened_prior_is_never_narrower():
     prior = motion_model.odometry_prior(T0, se2.matrix(0.5, 0, 0), OPTIONS)
     wide = motion_model.widen_prior(prior, 10 * prior.translation_std, 0.1 * prior.rotation_std)
     assert wide.translation_std == pytest.approx(10 * prior.translation_std)
@@ -85,7 +85,7 @@ def test_widened_is_never_narrower():
     np.testing.assert_allclose(np.diag(wide.information)[:2], wide.translation_std**-2)
 
 
-def test_poses_stay_poses_however_long_the_chain():
+def test_long_chains_stay_orthonormal():
     # R R'^T R multiplies what rounding leaves beside a rotation by 2.4 from scan to scan
     before, now = T0, T0 @ se2.matrix(0.1, 0.01, 0.3)
     by_odometry, step = T0, se2.matrix(0.1, 0.01, 0.3)
@@ -99,7 +99,7 @@ def test_poses_stay_poses_however_long_the_chain():
     assert np.linalg.norm(now[:2, 2] - T0[:2, 2]) < 1.0
 
 
-def test_every_width_can_be_chosen():
+def test_every_option_widens_the_prior():
     increment = se2.matrix(0.2, 0.1, 0.3)
     for name in (f.name for f in dataclasses.fields(OdometryOptions)):
         more = dataclasses.replace(OPTIONS, **{name: 2 * getattr(OPTIONS, name)})

@@ -1,4 +1,4 @@
-"""Incremental registration of whole recordings, from simulated ones to empty ones."""
+"""Incremental scan matching of whole recordings, down to empty ones."""
 
 import dataclasses
 import functools
@@ -19,7 +19,7 @@ OPTIONS = SlamOptions()
 
 
 def silent(*_):
-    """Tells nobody."""
+    """Ignores progress."""
 
 
 def prior(recording):
@@ -66,7 +66,7 @@ def assert_poses(mapped):
 
 @pytest.mark.parametrize("scene", ["hall", "corridor"])
 @pytest.mark.parametrize("odometry", [True, False])
-def test_a_populated_place_is_followed(scene, odometry):
+def test_populated_places(scene, odometry):
     simulation = run_through(scene)
     recording = simulation.recording
     mapped = build(recording if odometry else recording.without_odometry())
@@ -119,7 +119,7 @@ def test_covariances_are_covariances():
     assert np.sqrt(C[:, 0, 0].max()) < 0.1
 
 
-def test_a_leap_of_the_odometry_is_survived():
+def test_odometry_leap():
     # wheels slip: from scan 30 on odometry has turned by 80 degrees that nobody has turned
     simulation = small_room()
     T = simulation.recording.T_odom_base.copy()
@@ -128,7 +128,7 @@ def test_a_leap_of_the_odometry_is_survived():
     assert ate(mapped, simulation) < 0.01
 
 
-def test_a_crowd_that_is_known_has_no_pull():
+def test_known_movers_do_not_bias_poses():
     # everybody marches off with the robot: with e = 0 only walls count
     simulation = small_room(people=3)
     e = np.where(simulation.truth.mover >= 0, 0.0, 1.0).astype(np.float32)
@@ -149,7 +149,7 @@ def test_a_crowd_that_is_known_has_no_pull():
     [(-0.04, 0.0, np.pi), (0.3, 0.0, 0.0), (0.1, -0.2, -1.2)],
     ids=["turned round", "ahead", "askew"],
 )
-def test_where_the_sensor_sits_is_honoured(x, y, yaw):
+def test_sensor_extrinsics(x, y, yaw):
     # all round: wherever the sensor looks, it sees the same world
     plain = LaserOptions(beams=240, fov=2 * np.pi, range_noise=0.005, max_range=8.0, x=0.0)
     there = dataclasses.replace(plain, x=x, y=y, yaw=yaw)
@@ -201,7 +201,7 @@ def blank(recording: Recording, scans, how: str) -> Recording:
 
 @pytest.mark.parametrize("how", ["no hits", "unusable", "no beams"])
 @pytest.mark.parametrize("odometry", [True, False])
-def test_scans_that_say_nothing_are_bridged(how, odometry):
+def test_scans_without_hits_are_bridged(how, odometry):
     simulation = small_room()
     recording = blank(simulation.recording, [0, 20, 21, 59], how)
     mapped = build(recording if odometry else recording.without_odometry())
@@ -209,7 +209,7 @@ def test_scans_that_say_nothing_are_bridged(how, odometry):
     assert ate(mapped, simulation) < (0.01 if odometry else 0.1)
 
 
-def test_without_odometry_a_blind_robot_is_thought_to_drive_on():
+def test_constant_velocity_bridges_blind_scans():
     # straight ahead, 0.1 m from scan to scan
     simulation = small_room()
     truth = se2.inverse(simulation.truth.T_world_base[0]) @ simulation.truth.T_world_base
@@ -221,7 +221,7 @@ def test_without_odometry_a_blind_robot_is_thought_to_drive_on():
 
 
 @pytest.mark.parametrize("how", ["no hits", "unusable", "no beams"])
-def test_nothing_but_such_scans_leaves_odometry(how):
+def test_only_scans_without_hits_leave_odometry(how):
     recording = blank(small_room(scans=10).recording, range(10), how)
     odometry = se2.inverse(recording.T_odom_base[0]) @ recording.T_odom_base
     np.testing.assert_allclose(build(recording).poses, odometry, atol=1e-9)
@@ -237,21 +237,21 @@ def test_one_scan():
 
 def test_progress_counts_every_scan():
     recording = small_room(scans=10).recording
-    told = []
-    odometry_2d.register_scans(recording, prior(recording), OPTIONS, lambda *at: told.append(at))
-    assert told == [(t, 10) for t in range(1, 11)]
+    calls = []
+    odometry_2d.register_scans(recording, prior(recording), OPTIONS, lambda *at: calls.append(at))
+    assert calls == [(t, 10) for t in range(1, 11)]
 
 
 def test_given_poses_are_not_touched():
     simulation = small_room(people=2)
     recording, poses = simulation.recording, simulation.truth.T_world_base
     e = np.random.default_rng(0).random(recording.n_beams).astype(np.float32)
-    told = []
+    calls = []
     mapped = [
-        m_step(recording, e, OPTIONS, poses, threads, lambda *at: told.append(at))
+        m_step(recording, e, OPTIONS, poses, threads, lambda *at: calls.append(at))
         for threads in (1, 2)
     ]
-    assert told == [("mapping", 60, 60)] * 2
+    assert calls == [("mapping", 60, 60)] * 2
     grid = _core.OccupancyGrid2D(OPTIONS.resolution)
     em.add_recording(grid, recording, poses, e)
     for one in mapped:
@@ -271,7 +271,7 @@ def test_resolutions_out_of_range():
 @pytest.mark.parametrize("scene", ["hall", "corridor"])
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("odometry", [True, False])
-def test_a_long_run_stays_on_its_way(scene, seed, odometry):
+def test_long_run(scene, seed, odometry):
     simulation = run_through(scene, 1000, seed)
     recording = simulation.recording
     mapped = build(recording if odometry else recording.without_odometry())

@@ -1,4 +1,4 @@
-"""Odometry that lies, or that there is none of; and a second laser, which makes up for little."""
+"""Wrong odometry, no odometry, and two lasers."""
 
 import dataclasses
 import functools
@@ -18,7 +18,7 @@ OPTIONS = SlamOptions()
 
 
 def silent(*_):
-    """Tells nobody."""
+    """Ignores progress."""
 
 
 def followed(recording):
@@ -59,20 +59,20 @@ def chained(steps):
     return np.array([*accumulate(steps, np.matmul, initial=np.eye(3))])
 
 
-def test_odometry_that_tells_the_truth_is_believed():
+def test_valid_odometry_is_accepted():
     assert survived(room().recording.T_odom_base) == []
 
 
 @pytest.mark.parametrize(
     "origin", [(0.0, 0.0, 0.0), (-25.0, 40.0, 2.0), (3000.0, -1000.0, -3.0)], ids=str
 )
-def test_odometry_that_begins_again(origin):
+def test_odometry_restart(origin):
     T = room().recording.T_odom_base.copy()
     T[30:] = se2.matrix(*origin) @ se2.inverse(T[30]) @ T[30:]
     assert survived(T) == [30]
 
 
-def test_odometry_that_stalls_while_the_robot_turns():
+def test_slip_while_turning():
     turn = room().truth.T_world_base[[44, 62]]
     assert abs(se2.parameters(se2.inverse(turn[0]) @ turn[1])[2]) > np.radians(80)
     moved = steps()
@@ -82,7 +82,7 @@ def test_odometry_that_stalls_while_the_robot_turns():
     assert set(disagreeing) <= set(range(45, 63))
 
 
-def test_odometry_that_stalls_while_the_robot_drives_on():
+def test_slip_while_driving():
     way = room().truth.T_world_base[[15, 40]]
     assert np.linalg.norm(way[1] - way[0]) > 2.0
     moved = steps()
@@ -93,7 +93,7 @@ def test_odometry_that_stalls_while_the_robot_drives_on():
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_stalls_in_the_corridors_of_an_office(seed):
+def test_slip_in_office_corridors(seed):
     options = {"robot": {"scans": 500}, "odometry": {"stall_rate": 2.0}}
     simulation = simulate(scene_by_name("office", options), seed)
     recording, T = simulation.recording, simulation.truth.T_world_base
@@ -105,7 +105,7 @@ def metres(T):
     return np.linalg.norm((T[1:] - T[:-1])[:, :2, 2], axis=1)
 
 
-def test_a_robot_that_stops_between_bare_walls_has_stopped():
+def test_stop_between_bare_walls_is_no_slip():
     corridor = Scene(
         "corridor",
         walls=box(0, 0, 60, 2.4),
@@ -126,7 +126,7 @@ def test_a_robot_that_stops_between_bare_walls_has_stopped():
     assert compute_absolute_errors(found.poses, T[stood]).rmse < 0.1
 
 
-def test_a_robot_that_was_carried_and_put_down_stands():
+def test_kidnapped_robot_that_stands_is_no_slip():
     office = simulate(scene_by_name("office", {"robot": {"scans": 300}}), 1)
     scans = np.r_[70:100, 280, 280, 280, 280:300]
     recording, T = picked(office.recording, scans), office.truth.T_world_base[scans]
@@ -140,7 +140,7 @@ def test_a_robot_that_was_carried_and_put_down_stands():
     assert compute_absolute_errors(found.poses[30:], T[30:]).rmse < 0.02
 
 
-def test_nothing_is_followed_by_scans_that_hit_nothing():
+def test_no_slip_hypothesis_without_hits():
     scans = np.r_[:20, np.full(30, 20)]
     recording = picked(room().recording, scans)
     hit = recording.hit.copy()
@@ -151,7 +151,7 @@ def test_nothing_is_followed_by_scans_that_hit_nothing():
 
 
 @pytest.mark.parametrize("times", [3.5, 0.0, -1.0], ids=["spinning", "blocked", "backwards"])
-def test_wheels_that_slip(times):
+def test_wrong_wheel_odometry(times):
     moved = se2.parameters(steps())
     moved[20:30, 0] *= times
     assert survived(chained(se2.matrix(*moved.T))) == list(range(21, 31))
@@ -185,7 +185,7 @@ def office(seed):
 
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("n", [1, 3])
-def test_scans_alone_are_hardly_worse(seed, n):
+def test_without_odometry(seed, n):
     # a third of the scans: 0.3 m and up to 28 degrees from one to the next
     kept = np.arange(0, office(seed).recording.n_scans, n)
     recording, T = picked(office(seed).recording, kept), office(seed).truth.T_world_base[kept]
@@ -205,12 +205,12 @@ def two_lasers(seed, both):
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_two_lasers_are_as_good_as_one(seed):
+def test_two_lasers_without_odometry(seed):
     assert two_lasers(seed, both=True) < 1.2 * two_lasers(seed, both=False)
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_two_lasers_that_share_nothing_without_odometry(seed):
+def test_two_lasers_without_overlap_or_odometry(seed):
     options = {"robot": {"scans": 800}, "laser": {"second_laser": True}}
     simulation = simulate(scene_by_name("office", options), seed)
     recording = simulation.recording.without_odometry()

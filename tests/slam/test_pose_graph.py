@@ -1,4 +1,4 @@
-"""The pose graph: graphs whose answer is known by hand."""
+"""Pose graphs with answers known by hand."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def apart(a, b):
     return np.linalg.norm(a[:, :2, 2] - b[:, :2, 2], axis=1)
 
 
-def test_an_error_is_shared_evenly_along_the_way():
+def test_error_is_shared_evenly():
     # four steps said to be 1.1 m long, yet the end is known to be at 4 m: 1 m each
     chain = [Constraint(k, k + 1, se2.matrix(1.1, 0, 0), STEP) for k in range(4)]
     loop = Constraint(0, 4, se2.matrix(4.0, 0, 0), 1e-6 * np.eye(3))
@@ -47,7 +47,7 @@ def test_an_error_is_shared_evenly_along_the_way():
     np.testing.assert_allclose(x[:, 1:], 0, atol=1e-6)
 
 
-def test_a_looser_step_takes_more_of_it():
+def test_uncertain_step_takes_more_error():
     chain = [
         Constraint(0, 1, se2.matrix(1, 0, 0), STEP),
         Constraint(1, 2, se2.matrix(1, 0, 0), 3 * STEP),
@@ -97,7 +97,7 @@ def test_one_false_loop_is_survived():
     assert squared_mahalanobis(robust, true).max() < 16
 
 
-def test_misfit_by_hand():
+def test_squared_mahalanobis_by_hand():
     poses = np.array([np.eye(3), se2.matrix(2.0, 0.0, 0.0)])
     relation = Constraint(0, 1, se2.matrix(1.7, 0.4, 0.0), np.diag([0.01, 0.04, 1.0]))
     fits = Constraint(0, 1, poses[1], np.eye(3))
@@ -183,7 +183,7 @@ def test_annealing_depends_less_on_the_start(monkeypatch):
     assert at_once > 3.0 * annealed
 
 
-def test_one_step_is_sharp_at_once(monkeypatch):
+def test_one_step_has_sharp_weights(monkeypatch):
     # from the plain solution one more with the weights of Geman and McClure's loss there
     _, chain, loops = false_alone()
     plain = optimize_poses(dead_reckoned(chain), chain, loops, None)
@@ -198,7 +198,7 @@ def test_one_step_is_sharp_at_once(monkeypatch):
     np.testing.assert_allclose(found, expected, atol=1e-7)  # it starts from there, to rounding
 
 
-def test_loops_that_agree_keep_all_their_weight():
+def test_consistent_loops_keep_their_weight():
     _, chain, loops = rounds(np.random.default_rng(1), laps=2, false=0)
     plain = optimize_poses(dead_reckoned(chain), chain, loops, None)
     robust = optimize_poses(dead_reckoned(chain), chain, loops, MAX_CHI2)

@@ -1,4 +1,4 @@
-"""Robots that are carried elsewhere: noticed, and put where they belong or beside the rest."""
+"""Kidnapped robots: detected, relocalized or put beside the rest."""
 
 import dataclasses
 
@@ -34,7 +34,7 @@ def assert_noticed_and_placed(simulation):
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_a_robot_that_was_carried_is_found_again(seed):
+def test_kidnapped_robot_is_relocalized(seed):
     simulation = carried("office", seed, 90, scans=500, speed=1.5, carried_at=0.7)
     truth = simulation.truth
     before, at = np.array([-1, 0]) + truth.scene["carried_at_scan"]
@@ -44,13 +44,13 @@ def test_a_robot_that_was_carried_is_found_again(seed):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
-def test_wherever_it_was_put_down_in_an_office(seed):
+def test_relocalization_in_an_office(seed):
     assert_noticed_and_placed(carried("office", seed, 180, scans=1500, carried_at=0.6))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
-def test_wherever_it_was_put_down_in_a_warehouse(seed):
+def test_relocalization_in_a_warehouse(seed):
     assert_noticed_and_placed(carried("warehouse", seed, 120, scans=900, speed=1.0, carried_at=0.6))
 
 
@@ -109,7 +109,7 @@ def rooms():
     return one, other, one_after_the_other(one.recording, other.recording)
 
 
-def test_a_place_that_has_nothing_in_common_is_put_beside(rooms):
+def test_unconnected_segment_is_put_beside(rooms):
     one, other, recording = rooms
     found = mapped(recording)
     assert found.diagnostics.breaks == [60]
@@ -126,13 +126,13 @@ def test_a_place_that_has_nothing_in_common_is_put_beside(rooms):
     assert right[:, 0].min() > left[:, 0].max() + 5.0
 
 
-def test_pieces_beside_one_another_are_ever_the_same(rooms):
+def test_unconnected_segments_are_reproducible(rooms):
     one, other = mapped(rooms[2]), mapped(rooms[2])
     np.testing.assert_array_equal(one.poses, other.poses)
     assert one.diagnostics == other.diagnostics
 
 
-def test_the_same_room_again_is_the_same_room(rooms):
+def test_return_to_the_same_room(rooms):
     # carried back to where it was, turned about: 5 m from where odometry goes on
     one = rooms[0]
     again = one_after_the_other(one.recording, one.recording)
@@ -143,7 +143,7 @@ def test_the_same_room_again_is_the_same_room(rooms):
     assert compute_absolute_errors(found.poses, truth).rmse < 0.02
 
 
-def test_nothing_reaches_across_a_break():
+def test_breaks_separate_travel():
     travelled = np.arange(6.0)
     got = separate_segments(travelled, [2, 5], 30.0)
     np.testing.assert_array_equal(got, [0, 1, 32, 33, 34, 65])

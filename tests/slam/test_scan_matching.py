@@ -1,4 +1,4 @@
-"""Registration of one scan: does it find the pose that the scan was taken from?"""
+"""Scan matching against the true pose of the scan."""
 
 import dataclasses
 
@@ -84,7 +84,7 @@ def test_a_wrong_place_is_found_by_a_wider_search(room, mapped, scan):
     assert turn < np.radians(0.5)
 
 
-def test_odometry_is_disbelieved_where_a_scan_says_otherwise(room, mapped, scan):
+def test_scan_overrules_odometry(room, mapped, scan):
     truth = np.array([0.3, -0.2, 0.7])
     points = scan(room, truth)
     for shift, is_off in (((0.04, -0.03, 0.03), False), ((0.12, 0.1, 0.0), True)):
@@ -99,7 +99,7 @@ def test_odometry_is_disbelieved_where_a_scan_says_otherwise(room, mapped, scan)
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_robot_is_found_metres_away_and_in_any_direction(room, mapped, scan, seed):
+def test_search_finds_a_robot_metres_away_at_any_heading(room, mapped, scan, seed):
     rng = np.random.default_rng(20 + seed)
     truth = rng.uniform([-0.8, -0.8, -np.pi], [0.8, 0.8, np.pi])
     points = scan(room, truth, seed=seed)
@@ -111,7 +111,7 @@ def test_a_robot_is_found_metres_away_and_in_any_direction(room, mapped, scan, s
     assert turn < np.radians(0.4)
 
 
-def test_a_place_that_was_never_seen_stays_where_odometry_says(hall, mapped, scan):
+def test_unknown_place_keeps_odometry(hall, mapped, scan):
     # nothing in the map explains the scan: no search may drag it anywhere
     points = scan(hall, (0, 0, 0))
     prior = prior_at((200.0, 100.0, 1.0), 0.05, 0.05)
@@ -121,7 +121,7 @@ def test_a_place_that_was_never_seen_stays_where_odometry_says(hall, mapped, sca
     assert not found.widened
 
 
-def test_beams_of_weight_zero_are_as_if_absent(hall, mapped, scan):
+def test_zero_weight_equals_absence(hall, mapped, scan):
     grid, truth = mapped(hall), np.array([0.2, 0.1, 0.3])
     points = scan(hall, truth)
     absent = np.random.default_rng(0).random(len(points)) < 0.3
@@ -144,7 +144,7 @@ def corridor(x_of_walker=None):
     return np.array(walls, float)
 
 
-def test_a_mover_that_is_known_as_one_has_no_pull(scan, put):
+def test_known_mover_does_not_bias_the_match(scan, put):
     # the walker ahead of the robot has gone on by 0.25 m since the map was made
     grid = _core.OccupancyGrid2D(0.05)
     for k, x in enumerate(np.linspace(-0.6, 0.6, 9)):
@@ -181,7 +181,7 @@ def test_covariance_is_long_along_a_corridor(scan, put, turned):
     assert C[2, 2] < 0.02**2
 
 
-def test_covariance_shrinks_with_what_is_seen(hall, mapped, scan):
+def test_covariance_shrinks_with_more_beams(hall, mapped, scan):
     grid, truth = mapped(hall), (0.1, 0.2, 0.3)
     points, prior = scan(hall, truth), prior_at(truth, 0.2, 0.2)
     all_of_them = placed(grid, points, ones(points), prior)
