@@ -87,7 +87,7 @@ def both(result: Path) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("ending", READERS)
-def test_the_points_are_those_of_the_map(converted, mapped_street, ending):
+def test_points_equal_those_of_the_result(converted, mapped_street, ending):
     """With the motion during sweeps taken out, as the map has them."""
     found, known = READERS[ending](converted(ending)), both(mapped_street)
     assert len(known["dynamic"]) > 100
@@ -99,19 +99,19 @@ def test_the_points_are_those_of_the_map(converted, mapped_street, ending):
 
 @pytest.mark.parametrize("ending", READERS)
 @pytest.mark.parametrize("part", ["static", "dynamic"])
-def test_one_part_alone(converted, mapped_street, ending, part):
+def test_static_or_dynamic_points_only(converted, mapped_street, ending, part):
     found = READERS[ending](converted(ending, "--only", part))
     known = both(mapped_street)[part]
     np.testing.assert_allclose(found, known, atol=ROUNDED + 1e-5)
 
 
 @pytest.mark.parametrize("ending", READERS)
-def test_the_same_result_gives_the_same_bytes(converted, ending):
+def test_files_are_reproducible(converted, ending):
     first = converted(ending).read_bytes()
     assert converted(ending, "--overwrite").read_bytes() == first
 
 
-def test_motion_during_sweeps_is_more_than_rounding(street, mapped_street):
+def test_deskewing_exceeds_rounding(street, mapped_street):
     """Else the above would say nothing of it."""
     recording = stillmap_folder.read(street)
     hits, poses = np.flatnonzero(recording.hit), np.load(street / "truth/T_world_base.npy")
@@ -121,7 +121,7 @@ def test_motion_during_sweeps_is_more_than_rounding(street, mapped_street):
     assert np.median(apart) > 0.1
 
 
-def test_times_are_those_of_the_beams(converted, street):
+def test_las_times(converted, street):
     laspy = pytest.importorskip("laspy")
     recording = stillmap_folder.read(street)
     scan = np.repeat(np.arange(recording.n_scans), np.diff(recording.offset))
@@ -131,7 +131,7 @@ def test_times_are_those_of_the_beams(converted, street):
     assert np.ptp(found) > 1.0
 
 
-def test_other_readers_of_ply_and_of_whole_clouds(converted, mapped_street):
+def test_other_readers(converted, mapped_street):
     n = sum(len(points) for points in both(mapped_street).values())
     assert trimesh.load(converted(".ply")).vertices.shape == (n, 3)
     for ending in (".pcd", ".e57", ".las"):
@@ -139,7 +139,7 @@ def test_other_readers_of_ply_and_of_whole_clouds(converted, mapped_street):
 
 
 @pytest.mark.parametrize("name", ["a.mcap", "a.parquet"])
-def test_what_a_result_in_space_cannot_become(mapped_street, tmp_path, capsys, name):
+def test_formats_for_2d_only(mapped_street, tmp_path, capsys, name):
     assert main(["convert", str(mapped_street), "-o", str(tmp_path / name)]) == 2
     assert "3D recording" in (said := capsys.readouterr().err)
     assert ".laz" in said
@@ -148,7 +148,7 @@ def test_what_a_result_in_space_cannot_become(mapped_street, tmp_path, capsys, n
 
 
 @pytest.mark.parametrize("form", point_cloud_files.FORMATS, ids=lambda form: form.name)
-def test_memory_is_that_of_some_scans(form, tmp_path):
+def test_memory_is_bounded(form, tmp_path):
     point_cloud_files.require_extras(form, tmp_path)
     n, blocks = 1 << 14, 40
 
@@ -171,7 +171,7 @@ def test_memory_is_that_of_some_scans(form, tmp_path):
 
 
 @pytest.mark.parametrize("form", point_cloud_files.FORMATS, ids=lambda form: form.name)
-def test_no_points_are_a_cloud(form, tmp_path):
+def test_empty_cloud(form, tmp_path):
     empty = point_cloud.Block(np.empty((0, 3)), np.empty(0, np.float32), None)
     path = tmp_path / f"a{form.endings[0]}"
     point_cloud_files.write(
@@ -183,7 +183,7 @@ def test_no_points_are_a_cloud(form, tmp_path):
 
 
 @pytest.mark.parametrize("form", point_cloud_files.FORMATS, ids=lambda form: form.name)
-def test_what_stops_it_leaves_nothing(form, tmp_path):
+def test_interrupted_write_leaves_no_file(form, tmp_path):
     def made():
         yield point_cloud.Block(np.zeros((9, 3)), np.zeros(9, np.float32), None)
         raise KeyboardInterrupt
@@ -195,7 +195,7 @@ def test_what_stops_it_leaves_nothing(form, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["a.las", "a.laz", "a.e57"])
-def test_points_that_are_too_far_off_are_refused(name, tmp_path):
+def test_points_out_of_range_are_refused(name, tmp_path):
     far = np.full((3, 3), 3e5)
     points = point_cloud.Cloud(
         3, np.zeros(3), None, lambda: iter([point_cloud.Block(far, np.ones(3, np.float32), None)])
@@ -207,7 +207,7 @@ def test_points_that_are_too_far_off_are_refused(name, tmp_path):
 
 
 @pytest.mark.parametrize("form", point_cloud_files.FORMATS, ids=lambda form: form.name)
-def test_why_a_file_cannot_be_made_is_said(form, tmp_path):
+def test_error_names_the_reason(form, tmp_path):
     (tmp_path / "file").write_text("")
     path = tmp_path / f"file/a{form.endings[0]}"
     points = point_cloud.Cloud(0, np.zeros(3), None, lambda: iter(()))
@@ -217,7 +217,7 @@ def test_why_a_file_cannot_be_made_is_said(form, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["a.las", "a.laz", "a.e57", "a.pcd", "a.ply", "a.xyz"])
-def test_a_full_disk_is_said(name, tmp_path):
+def test_full_disk(name, tmp_path):
     """A limit on the size of files stands for it; the process it holds for is one of its own."""
     program = f"""
 import resource, signal, sys

@@ -88,7 +88,7 @@ def test_text(written, points):
     np.testing.assert_allclose(found[:, :3], points.points, atol=0.51e-4)
 
 
-def test_clouds_of_a_folder_have_the_colours_of_both_files(points, tmp_path):
+def test_cloud_from_folder_has_colors(points, tmp_path):
     """Where one of them has none, neither has the whole."""
     rows = np.zeros(N, FIELDS + COLOURS)
     for name, column in zip("xyz", points.points.T, strict=True):

@@ -37,7 +37,7 @@ def matrix(translation, q):
     return T[np.ix_([0, 1, 3], [0, 1, 3])]
 
 
-def test_every_schema_says_what_its_parts_are(decoded):
+def test_schemas_are_complete(decoded):
     summary, _ = decoded
     for schema in summary.schemas.values():
         assert schema.encoding == "ros2msg"
@@ -65,7 +65,7 @@ def test_every_schema_says_what_its_parts_are(decoded):
         assert latched == (topic in ("/map", "/trajectory", "/tf_static"))
 
 
-def test_frames_are_one_tree(decoded):
+def test_frames_form_a_tree(decoded):
     _, topics = decoded
     parents = defaultdict(set)
     for topic in ("/tf", "/tf_static"):
@@ -81,7 +81,7 @@ def test_frames_are_one_tree(decoded):
                 assert nanoseconds(part.header) == time
 
 
-def test_beams_are_in_one_of_two_scans(decoded, result, recording):
+def test_each_beam_is_in_one_scan_topic(decoded, result, recording):
     _, topics = decoded
     p_static = np.load(result / "beams/p_static.npy")
     length = np.linalg.norm(recording.points.astype(float), axis=1)
@@ -104,7 +104,7 @@ def test_beams_are_in_one_of_two_scans(decoded, result, recording):
     assert dynamic > 100
 
 
-def test_the_way_is_the_trajectory(decoded, result, recording):
+def test_trajectory_topic(decoded, result, recording):
     _, topics = decoded
     poses = poses_from_tum(result / "trajectory.tum", recording)
     [(_, path)] = topics["/trajectory"]
@@ -118,7 +118,7 @@ def test_the_way_is_the_trajectory(decoded, result, recording):
         np.testing.assert_allclose(moved, T, atol=1e-12)
 
 
-def test_the_map_is_the_map(decoded, result):
+def test_map_topic(decoded, result):
     _, topics = decoded
     [(_, grid)] = topics["/map"]
     with np.load(result / "map.npz") as archive:
@@ -131,7 +131,7 @@ def test_the_map_is_the_map(decoded, result):
     np.testing.assert_allclose([place.x, place.y], origin[:2])
 
 
-def test_things_are_shown_where_they_are_while_they_are_seen(decoded, result):
+def test_object_markers(decoded, result):
     import json
 
     _, topics = decoded
@@ -156,7 +156,7 @@ def test_things_are_shown_where_they_are_while_they_are_seen(decoded, result):
     assert any(gone) or topics["/objects"][-1][0] == topics["/tf"][-1][0]
 
 
-def test_the_table_says_where_beams_ended(result, recording):
+def test_parquet_table(result, recording):
     """In the map frame: what is static lies on the walls of the map."""
     parquet = pytest.importorskip("pyarrow.parquet")
     path = result.parent / "beams.parquet"

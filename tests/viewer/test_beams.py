@@ -1,4 +1,4 @@
-"""The beams of a scan are those of the whole recording, without its motion."""
+"""Beams of a scan in the viewer."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ def beams(request, result_of):
     return Beams(recording, p_static, poses, SlamOptions())
 
 
-def test_they_end_where_those_of_the_result_end(beams):
+def test_end_points_equal_those_of_the_result(beams):
     whole = deskew_recording(beams.recording, beams.poses, beams.slam)
     for scan in range(whole.n_scans):
         seen, own = beams.scan_view(scan), whole.beams_of(scan)
@@ -34,21 +34,21 @@ def test_they_end_where_those_of_the_result_end(beams):
         assert seen.origin[:D] == pytest.approx(sensor)
 
 
-def test_there_are_no_more_than_asked_for(beams):
+def test_number_of_beams_is_limited(beams):
     seen = beams.scan_view(2, max_count=7)
     assert (len(seen.ends), len(seen.p_static)) == (7, 7)
     every = beams.scan_view(2)
     assert all((every.ends == end).all(axis=1).any() for end in seen.ends)
 
 
-def test_a_part_is_the_same_scans(beams):
+def test_slice_scans(beams):
     some = slice_scans(beams.recording, 2, 4)
     assert (some.n_scans, some.T_odom_base) == (2, None)
     assert np.array_equal(some.points, beams.recording.points[80:160])
     assert some.offset.tolist() == [0, 40, 80]
 
 
-def test_a_scan_without_beams_shows_none(beams):
+def test_scan_without_beams(beams):
     recording = beams.recording
     nothing = replace(recording, hit=np.zeros(recording.n_beams, bool))
     seen = replace(beams, recording=nothing).scan_view(0)

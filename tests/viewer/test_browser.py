@@ -1,4 +1,4 @@
-"""A browser shows the page, and asks nobody else for anything."""
+"""The page in a headless Chromium."""
 
 import base64
 import io
@@ -129,7 +129,7 @@ def tiled(path, tones):
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_it_shows_the_result_and_asks_nobody_else(result_of, tab, dimension):
+def test_page_shows_the_result_without_foreign_requests(result_of, tab, dimension):
     from test_window import beams_of
 
     out = result_of(dimension, with_models=dimension == 3)
@@ -153,7 +153,7 @@ def test_it_shows_the_result_and_asks_nobody_else(result_of, tab, dimension):
     assert not any("Security Policy" in text for text in refused)
 
 
-def test_colours_of_a_model_are_as_they_were_photographed(result_of, tab):
+def test_texture_colors_are_shown_unchanged(result_of, tab):
     pytest.importorskip("trimesh", reason="the extra `mesh` is not installed")
     out = result_of(3)
     tones = [(118, 13, 41), (250, 248, 240), (230, 60, 40), (60, 200, 60)]

@@ -1,4 +1,4 @@
-"""Models that are whole are shown; those that need something from elsewhere are not."""
+"""Checks of glTF files before they are shown."""
 
 import struct
 
@@ -18,12 +18,12 @@ def refusal(path, data, most=1 << 20):
     return caught.value.what
 
 
-def test_a_whole_model_comes_back_as_it_is(tmp_path, glb):
+def test_self_contained_model_is_read_unchanged(tmp_path, glb):
     (tmp_path / "a.glb").write_bytes(glb)
     assert read_glb(tmp_path / "a.glb", len(glb)) == glb
 
 
-def test_what_lies_in_the_file_may_be_named(tmp_path):
+def test_embedded_buffers_are_allowed(tmp_path):
     data = glb_of({"buffers": [{"uri": "data:application/octet-stream;base64,AAAA"}]})
     (tmp_path / "a.glb").write_bytes(data)
     assert read_glb(tmp_path / "a.glb", 1000) == data
@@ -38,11 +38,11 @@ def test_what_lies_in_the_file_may_be_named(tmp_path):
         {"images": [{"uri": 3}]},
     ],
 )
-def test_what_names_another_file_is_refused(tmp_path, document):
+def test_reference_to_another_file_is_refused(tmp_path, document):
     assert "another file" in refusal(tmp_path / "a.glb", glb_of(document))
 
 
-def test_what_is_packed_is_refused(tmp_path):
+def test_compressed_model_is_refused(tmp_path):
     data = glb_of({"extensionsUsed": ["KHR_draco_mesh_compression"]})
     assert "draco" in refusal(tmp_path / "a.glb", data)
 
@@ -60,15 +60,15 @@ def test_what_is_packed_is_refused(tmp_path):
         struct.pack("<4sIII4s", b"glTF", 2, 24, 4, b"JSON") + b"\xff\xff\xff\xff",
     ],
 )
-def test_what_is_no_model_is_refused(tmp_path, data):
+def test_damaged_model_is_refused(tmp_path, data):
     assert "no whole .glb" in refusal(tmp_path / "a.glb", data)
 
 
-def test_what_is_too_large_is_refused(tmp_path, glb):
+def test_size_limit(tmp_path, glb):
     assert "larger" in refusal(tmp_path / "a.glb", glb, len(glb) - 1)
 
 
-def test_up_of_a_model_is_up_in_the_map():
+def test_y_up_becomes_z_up():
     x, y, z = np.eye(4)[:3]
     assert (MAP_FROM_GLTF @ y == z).all()
     assert (MAP_FROM_GLTF @ x == x).all()

@@ -1,4 +1,4 @@
-"""What of a result is shown."""
+"""Reading a result folder for the viewer."""
 
 import json
 
@@ -13,7 +13,7 @@ from stillmap.viewer.scene import read_scene
 from stillmap.viewer.window import default_view
 
 
-def test_a_result_in_the_plane(result_of):
+def test_2d_result(result_of):
     scene = read_scene(result_of(2))
     assert scene.is_2d
     assert (scene.clouds, scene.surface, scene.models, scene.notes) == ({}, None, [], [])
@@ -23,7 +23,7 @@ def test_a_result_in_the_plane(result_of):
     assert (scene.map_image.picture[0, 0, :3] == UNKNOWN).all()
 
 
-def test_the_plan_lies_as_the_map_does(result_of):
+def test_map_image_has_the_orientation_of_the_map(result_of):
     plan = read_scene(result_of(2)).map_image
     x0, y0, x1, y1 = plan.window
     height, width = plan.picture.shape[:2]
@@ -36,7 +36,7 @@ def test_the_plan_lies_as_the_map_does(result_of):
     assert (x0 + edge * column.min(), x0 + edge * (column.max() + 1)) == pytest.approx((-3.0, 3.0))
 
 
-def test_a_result_in_space(result_of):
+def test_3d_result(result_of):
     out = result_of(3, with_models=True)
     scene = read_scene(out)
     assert not scene.is_2d
@@ -50,7 +50,7 @@ def test_a_result_in_space(result_of):
     assert z.min() <= scene.ground <= np.median(z)
 
 
-def test_points_have_their_own_colours_and_without_one_what_moves_stays_orange(result_of):
+def test_points_keep_colors_and_uncolored_dynamic_points_are_orange(result_of):
     out, (grey, red) = result_of(3), ((128, 128, 128), (200, 0, 0))
     for part in ("static", "dynamic"):
         rows = np.zeros(2, FIELDS + COLOURS)
@@ -61,14 +61,14 @@ def test_points_have_their_own_colours_and_without_one_what_moves_stays_orange(r
     assert clouds["dynamic"].colors.tolist() == [[*ORANGE], [*red]]
 
 
-def test_no_more_points_than_a_browser_bears(result_of, monkeypatch):
+def test_number_of_points_is_limited(result_of, monkeypatch):
     monkeypatch.setitem(module.MAX_POINTS, "static", 11)
     static = read_scene(result_of(3)).clouds["static"]
     assert len(static.points) == len(static.colors) == 11
     assert static.total > 11
 
 
-def test_models_go_as_their_tracks_do(result_of):
+def test_models_move_along_their_tracks(result_of):
     scene = read_scene(result_of(3, with_models=True))
     (model,) = scene.models
     own = model.pose_at(model.stamp_ns)
@@ -88,7 +88,7 @@ def test_models_go_as_their_tracks_do(result_of):
         ("objects/0007.json", None, "cannot be read"),
     ],
 )
-def test_a_model_that_cannot_be_shown_is_noted(result_of, name, content, said):
+def test_unusable_model_is_noted(result_of, name, content, said):
     out = result_of(3, with_models=True)
     if content is None:
         (out / name).unlink()
@@ -100,7 +100,7 @@ def test_a_model_that_cannot_be_shown_is_noted(result_of, name, content, said):
     assert (scene.surface is None) == (name == "mesh.glb")
 
 
-def test_a_place_that_is_no_pose_is_noted(result_of):
+def test_invalid_pose_is_noted(result_of):
     out = result_of(3, with_models=True)
     place = {"T_map_object": np.diag([2.0, 2.0, 2.0, 1.0]).tolist(), "stamp_ns": 0}
     (out / "objects/0007.json").write_text(json.dumps(place))
@@ -109,7 +109,7 @@ def test_a_place_that_is_no_pose_is_noted(result_of):
     assert "not a pose" in scene.notes[0]
 
 
-def test_models_are_bounded_together(result_of, glb, monkeypatch):
+def test_total_size_of_models_is_limited(result_of, glb, monkeypatch):
     out = result_of(3, with_models=True)
     monkeypatch.setattr(module, "_MAX_MODELS", len(glb) - 1)
     scene = read_scene(out)
@@ -118,7 +118,7 @@ def test_models_are_bounded_together(result_of, glb, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["map.npz", "trajectory.tum", "objects/objects.json"])
-def test_a_damaged_file_is_refused(result_of, name):
+def test_damaged_file_is_refused(result_of, name):
     out = result_of(2)
     (out / name).write_bytes(b"nonsense")
     with pytest.raises(InputError) as caught:
@@ -126,7 +126,7 @@ def test_a_damaged_file_is_refused(result_of, name):
     assert str(out / name) in caught.value.where
 
 
-def test_far_from_the_origin_nothing_is_lost(result_of):
+def test_origin_is_shifted_far_from_zero(result_of):
     """A survey's coordinates have more digits than a float32."""
     out = result_of(3)
     text = (out / "trajectory.tum").read_text().split("\n")
@@ -138,7 +138,7 @@ def test_far_from_the_origin_nothing_is_lost(result_of):
     assert np.abs(scene.poses[:, :3, 3] - scene.origin).max() < 10.0
 
 
-def test_the_eye_sees_all_of_it(result_of):
+def test_default_view_shows_the_whole_scene(result_of):
     flat, space = read_scene(result_of(2)), read_scene(result_of(3))
     above = default_view(flat)
     x0, y0, x1, y1 = flat.map_image.window

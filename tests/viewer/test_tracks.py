@@ -1,4 +1,4 @@
-"""Where things are at a time."""
+"""Poses and boxes of moving objects at a time."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def track(seconds, xy, velocity, size=(2.0, 1.0, 1.5), z=0.7, number=1):
     return Track(number, size, stamp_ns, np.array(xy, float), np.array(velocity, float), high)
 
 
-def test_it_goes_on_looking_where_it_went_while_it_stands():
+def test_heading_is_kept_while_standing():
     velocity = np.array([[0, 0], [0, 2], [0, 0.01], [-2, 0]], float)
     angles = headings(velocity)
     assert angles[:2] == pytest.approx([np.pi / 2, np.pi / 2])
@@ -30,17 +30,17 @@ def test_it_goes_on_looking_where_it_went_while_it_stands():
     assert angles[2] == pytest.approx(0.75 * np.pi)  # half-way on its turn
 
 
-def test_it_turns_the_short_way_past_the_back():
+def test_heading_turns_the_short_way():
     a = np.radians([170.0, -170.0])
     angles = headings(2.0 * np.stack([np.cos(a), np.sin(a)], 1))
     assert angles[1] - angles[0] == pytest.approx(np.radians(20.0))
 
 
-def test_what_never_moves_looks_along_x():
+def test_heading_without_motion():
     assert headings(np.zeros((3, 2))).tolist() == [0.0, 0.0, 0.0]
 
 
-def test_between_two_times_it_is_between_two_places():
+def test_position_is_interpolated():
     one = track([0, 1], [[0, 0], [4, 0]], [[4, 0], [4, 0]])
     T = interpolate_pose(one, NOW + 250_000_000)
     assert T[:3, 3] == pytest.approx([1.0, 0.0, 0.7])
@@ -49,13 +49,13 @@ def test_between_two_times_it_is_between_two_places():
     assert interpolate_pose(one, NOW + 10**10)[:2, 3].tolist() == [4.0, 0.0]
 
 
-def test_nanoseconds_are_not_lost():
+def test_nanoseconds_are_resolved():
     """A double holds stamps of today to a quarter of a microsecond only."""
     one = track([0, 1e-7], [[0, 0], [1, 0]], [[1, 0], [1, 0]])
     assert interpolate_pose(one, NOW + 50)[0, 3] == pytest.approx(0.5)
 
 
-def test_only_those_are_there_that_are_seen_before_and_after():
+def test_object_poses_at_a_time():
     one = track([0, 1], [[0, 0], [1, 0]], [[1, 0], [1, 0]])
     late = track([5, 6], [[0, 0], [1, 0]], [[1, 0], [1, 0]])
     assert [is_present(one, NOW + s) for s in (-1, 0, 10**9, 10**9 + 1)] == [
@@ -69,7 +69,7 @@ def test_only_those_are_there_that_are_seen_before_and_after():
     assert box_edges(nobody).shape == (0, 4, 2, 3)
 
 
-def test_boxes_have_twelve_edges_of_its_lengths():
+def test_box_edges():
     one = track([0, 1], [[3, 4], [3, 5]], [[0, 1], [0, 1]])
     lines = box_edges(object_poses_at([one], NOW))
     assert lines.shape == (1, 12, 2, 3)
@@ -81,14 +81,14 @@ def test_boxes_have_twelve_edges_of_its_lengths():
     assert corners.max(axis=0) == pytest.approx([3.5, 5.0, 0.7 + 0.75])
 
 
-def test_in_the_plane_boxes_are_flat():
+def test_box_edges_2d():
     one = track([0, 1], [[0, 0], [1, 0]], [[1, 0], [1, 0]], size=(2.0, 1.0), z=None)
     lines = box_edges(object_poses_at([one], NOW))
     assert lines.shape == (1, 4, 2, 3)
     assert not lines[..., 2].any()
 
 
-def test_ways_say_whose_they_are():
+def test_track_segments():
     a = track([0, 1, 2], [[0, 0], [1, 0], [2, 0]], np.ones((3, 2)))
     b = track([0], [[9, 9]], np.ones((1, 2)))
     c = track([0, 1], [[5, 5], [6, 6]], np.ones((2, 2)), z=None)

@@ -1,4 +1,4 @@
-"""The page is served to this machine alone, shows the time, and ends."""
+"""The viewer's page, its layers and controls."""
 
 import gzip
 import socket
@@ -58,7 +58,7 @@ def get(window, path="/", **headers):
     return urllib.request.urlopen(request, timeout=10)
 
 
-def test_the_page_is_served_and_may_reach_nothing_else(window):
+def test_page_is_served_with_its_policy(window):
     with get(window) as page:
         assert page.status == 200
         assert b"<html" in page.read()
@@ -69,7 +69,7 @@ def test_the_page_is_served_and_may_reach_nothing_else(window):
 @pytest.mark.parametrize(
     "headers", [{"Host": "example.org"}, {"Origin": "https://example.org"}, {"Origin": "null"}]
 )
-def test_a_page_from_elsewhere_is_refused(window, headers):
+def test_foreign_page_is_refused(window, headers):
     with pytest.raises(urllib.error.HTTPError) as caught:
         get(window, **headers)
     with caught.value:
@@ -77,7 +77,7 @@ def test_a_page_from_elsewhere_is_refused(window, headers):
 
 
 @pytest.mark.parametrize("packed", ["gzip", "identity"])
-def test_the_page_shows_colours_as_they_are(window, packed):
+def test_page_disables_tone_mapping(window, packed):
     """It is what viser has, and before all of its own scripts the one that does so."""
     with get(window, **{"Accept-Encoding": packed}) as answer:
         page, headers = answer.read(), answer.headers
@@ -90,7 +90,7 @@ def test_the_page_shows_colours_as_they_are(window, packed):
     assert page.replace(first + b"</script>", b"") == plain
 
 
-def test_its_socket_answers_this_page_alone(window):
+def test_socket_answers_only_its_page(window):
     address, protocol = f"ws://127.0.0.1:{port_of(window)}", [f"viser-v{viser.__version__}"]
     with sockets.connect(address, subprotocols=protocol, origin=window.url) as socket_:
         assert len(socket_.recv(timeout=10)) > 0
@@ -98,7 +98,7 @@ def test_its_socket_answers_this_page_alone(window):
         sockets.connect(address, subprotocols=protocol, origin="https://example.org")
 
 
-def test_other_interfaces_do_not_answer(window):
+def test_only_loopback_answers(window):
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as one:
         # another address of loopback, which stands for those of the network
         assert one.connect_ex(("127.0.0.2", port_of(window))) != 0
@@ -109,7 +109,7 @@ def test_other_interfaces_do_not_answer(window):
                 assert one.connect_ex(address) != 0
 
 
-def test_nobody_far_away_is_asked_for_an_address(window, monkeypatch):
+def test_no_share_url_is_requested(window, monkeypatch):
     def refused(*_words, **_more):
         raise AssertionError("a tunnel")
 
@@ -117,7 +117,7 @@ def test_nobody_far_away_is_asked_for_an_address(window, monkeypatch):
     assert window._server.request_share_url() is None
 
 
-def test_after_it_is_closed_nothing_is_served(result_of):
+def test_close_stops_the_server(result_of):
     window = Window(read_scene(result_of(2)), None)
     window.close()
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as one:
@@ -130,7 +130,7 @@ def test_nothing_is_printed(result_of, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-def test_requests_that_make_no_sense_are_not_told_of(window, capfd):
+def test_malformed_requests_are_not_logged(window, capfd):
     for what in (b"nonsense\r\n\r\n", b"GET / HTTP/1.1\r\n\r\n", b""):
         with socket.create_connection(("127.0.0.1", port_of(window)), timeout=10) as one:
             one.sendall(what)
@@ -142,19 +142,19 @@ def test_requests_that_make_no_sense_are_not_told_of(window, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_port_that_is_taken_is_refused(window, result_of):
+def test_taken_port_is_refused(window, result_of):
     with pytest.raises(InputError, match="is taken"):
         Window(read_scene(result_of(2)), None, port_of(window))
 
 
-def test_a_port_that_is_free_is_used(result_of, opened):
+def test_free_port_is_used(result_of, opened):
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as one:
         one.bind(("127.0.0.1", 0))
         port = one.getsockname()[1]
     assert port_of(opened(read_scene(result_of(2)), None, port)) == port
 
 
-def test_a_version_of_viser_that_is_not_guarded_is_not_used(result_of, monkeypatch):
+def test_unknown_viser_is_refused(result_of, monkeypatch):
     """Where its server starts otherwise than we know, it would answer anybody."""
     from contextlib import contextmanager
 
@@ -167,7 +167,7 @@ def test_a_version_of_viser_that_is_not_guarded_is_not_used(result_of, monkeypat
         Window(read_scene(result_of(2)), None)
 
 
-def test_layers_are_those_that_there_is_something_of(result_of, opened, window):
+def test_layers_without_data_are_left_out(result_of, opened, window):
     flat = opened(read_scene(result_of(2)), None)
     objects = ["Objects", "Object tracks", "Object numbers"]
     assert list(flat._boxes) == ["Map", "Robot", *objects]
@@ -178,7 +178,7 @@ def test_layers_are_those_that_there_is_something_of(result_of, opened, window):
     ]
 
 
-def test_at_a_scan_what_was_there_is_shown(window):
+def test_show_scan(window):
     layers, scene = window._layers, window._scene
     window._boxes["Beams"].value = True
     window.step()
@@ -195,26 +195,26 @@ def test_at_a_scan_what_was_there_is_shown(window):
         assert len(layers._box.points) == (12 if there else 0)
 
 
-def test_the_slider_moves_the_time(window):
+def test_slider(window):
     window._slider.value = 4
     window.step()
     assert window.scan == 4
 
 
-def test_where_there_is_a_surface_nothing_lies_on_it_at_first(window):
+def test_default_layers_with_a_surface(window):
     shown = {name for name, box in window._boxes.items() if box.value}
     assert shown == {"Surface", "Robot", "Objects", "Object models"}
     assert all(node.visible is (name in shown) for name, node in window._layers._nodes.items())
 
 
-def test_without_a_surface_map_points_and_beams_are_shown(result_of, opened):
+def test_default_layers_without_a_surface(result_of, opened):
     out = result_of(3)
     bare = opened(read_scene(out), beams_of(out))
     shown = {name for name, box in bare._boxes.items() if box.value}
     assert shown == {"Map", "Static points", "Robot", "Beams", "Objects"}
 
 
-def test_the_plan_lies_below_a_floor_that_is_drawn(result_of, opened, window):
+def test_map_lies_below_the_surface(result_of, opened, window):
     def height(of):
         plan = of._server.scene.get_handle_by_name("/map/plan")
         return float(plan.position[2]) + of._scene.origin[2]
@@ -224,7 +224,7 @@ def test_the_plan_lies_below_a_floor_that_is_drawn(result_of, opened, window):
     assert height(flat) == flat._scene.ground
 
 
-def test_notes_stand_beside_what_is_shown(result_of, opened, monkeypatch):
+def test_notes_are_shown_with_their_layers(result_of, opened, monkeypatch):
     monkeypatch.setitem(scenes.MAX_POINTS, "static", 11)
     out = result_of(3, with_models=True)
     window = opened(read_scene(out), beams_of(out))
@@ -253,14 +253,14 @@ def test_check_boxes_show_and_hide(window):
     assert [label.text for label in window._layers._label] == ["7"]
 
 
-def test_points_grow(window):
+def test_point_size(window):
     before = window._layers._ends.point_size
     window._size.value = 2.0
     window.step()
     assert window._layers._ends.point_size == pytest.approx(2 * before)
 
 
-def test_it_plays_on_and_begins_again(window):
+def test_playback_starts_again_at_the_end(window):
     window._speed.value = "10 x"
     window.play(True)
     assert window._button.label == "Pause"
@@ -278,7 +278,7 @@ def test_it_plays_on_and_begins_again(window):
     assert window.scan == 0
 
 
-def test_one_scan_alone_is_shown(result_of, opened):
+def test_result_of_one_scan(result_of, opened):
     from dataclasses import replace
 
     scene = read_scene(result_of(2))
@@ -288,5 +288,5 @@ def test_one_scan_alone_is_shown(result_of, opened):
     assert one.scan == 0
 
 
-def test_names_say_nothing_of_how_they_are_shown():
+def test_markdown_is_escaped():
     assert _escape_markdown("a_b <img src=x>") == r"a\_b \<img src=x\>"

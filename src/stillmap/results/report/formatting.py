@@ -26,7 +26,9 @@ def format_duration(seconds: float) -> str:
 
 
 def format_milliseconds(seconds: float) -> str:
-    """Seconds in ms, with two significant digits below 10 ms."""
+    """Seconds in ms below 1 s, with two significant digits below 10 ms."""
+    if seconds >= 1:
+        return format_duration(seconds)
     milliseconds = 1e3 * seconds
     return f"{milliseconds:.0f} ms" if milliseconds >= 10 else f"{milliseconds:.2g} ms"
 

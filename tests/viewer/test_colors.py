@@ -1,4 +1,4 @@
-"""Colours that say something."""
+"""Color maps of the viewer."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from stillmap.results.report.figures import ORANGE
 from stillmap.viewer import display
 
 
-def test_dynamic_is_orange_and_static_blue():
+def test_color_by_p_static():
     shown = display.color_by_p_static(np.array([0.0, 0.5, 1.0], np.float32))
     assert shown.dtype == np.uint8
     assert shown[0].tolist() == list(ORANGE)
@@ -14,7 +14,7 @@ def test_dynamic_is_orange_and_static_blue():
     assert len(set(shown[1].tolist())) == 1  # grey
 
 
-def test_heights_beyond_the_ends_have_their_colours():
+def test_heights_beyond_the_limits_are_clamped():
     shown = display.color_by_height(np.array([-9.0, 0.0, 1.0, 2.0, 9.0]), 0.0, 2.0)
     assert (shown[0] == shown[1]).all()
     assert (shown[3] == shown[4]).all()
@@ -22,7 +22,7 @@ def test_heights_beyond_the_ends_have_their_colours():
     assert (display.color_by_height(np.zeros(2), 0.0, 0.0) == shown[1]).all()
 
 
-def test_neighbours_differ():
+def test_colors_of_successive_ids_differ():
     shown = display.color_by_id(range(40)).astype(int)
     assert np.abs(np.diff(shown, axis=0)).sum(axis=1).min() > 100
     assert display.color_by_id([]).shape == (0, 3)

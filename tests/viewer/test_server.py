@@ -1,4 +1,4 @@
-"""Which requests are answered, and what the page may reach."""
+"""Which requests the viewer answers, and its content security policy."""
 
 import pytest
 
@@ -22,11 +22,11 @@ from stillmap.viewer.server import content_security_policy, is_local_request
         ({}, False),
     ],
 )
-def test_only_this_page_is_answered(headers, ours):
+def test_is_local_request(headers, ours):
     assert is_local_request(headers) is ours
 
 
-def test_the_page_may_reach_nothing_but_where_it_came_from():
+def test_content_security_policy():
     parts = dict(
         part.split(" ", 1) for part in content_security_policy("127.0.0.1:8123").split("; ")
     )

@@ -1,4 +1,4 @@
-"""Which points are shown, and what is read of a file."""
+"""Subsampling of point clouds for the viewer."""
 
 import numpy as np
 import pytest
@@ -8,23 +8,23 @@ from stillmap.results.points import ply_header
 from stillmap.viewer.display import sample_indices, sample_ply
 
 
-def test_all_are_taken_where_there_are_few():
+def test_few_points_are_all_taken():
     assert sample_indices(5, 9).tolist() == [0, 1, 2, 3, 4]
 
 
-def test_those_chosen_rise_and_are_spread_over_the_row():
+def test_sample_is_sorted_and_even():
     use = sample_indices(10_000, 100)
     assert (np.diff(use) > 0).all()
     assert (use // 100).tolist() == list(range(100))
 
 
-def test_every_ring_of_a_lidar_is_left():
+def test_sample_contains_every_lidar_ring():
     """At even steps 16 rings that come in turn would show one of them."""
     rings = np.bincount(sample_indices(160_000, 10_000) % 16, minlength=16)
     assert rings.min() > 400
 
 
-def test_the_same_ones_are_chosen_every_time():
+def test_sample_is_deterministic():
     assert np.array_equal(sample_indices(10_000, 77), sample_indices(10_000, 77))
 
 
@@ -33,7 +33,7 @@ def written(path, rows, fields):
     return path
 
 
-def test_points_of_a_file_are_those_chosen(tmp_path):
+def test_sampled_points_of_a_file(tmp_path):
     fields = [(name, "<f4") for name in ("x", "y", "z", "p_static")]
     rows = np.zeros(600_000, fields)  # more than are read at a time
     rows["x"], rows["z"] = np.arange(len(rows)), 2.0
@@ -43,7 +43,7 @@ def test_points_of_a_file_are_those_chosen(tmp_path):
     assert (found.colors, found.total) == (None, 600_000)
 
 
-def test_colours_come_along_where_there_are_any(tmp_path):
+def test_colors_of_a_file(tmp_path):
     head = b"ply\nformat ascii 1.0\nelement vertex 2\n"
     head += b"".join(b"property float %c\n" % name for name in b"xyz")
     head += b"property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
@@ -52,7 +52,7 @@ def test_colours_come_along_where_there_are_any(tmp_path):
     assert found.colors.tolist() == [[1, 2, 3], [250, 251, 252]]
 
 
-def test_a_point_that_is_not_finite_is_refused(tmp_path):
+def test_point_that_is_not_finite_is_refused(tmp_path):
     fields = [(name, "<f4") for name in ("x", "y", "z")]
     rows = np.zeros(3, fields)
     rows["y"][1] = np.nan
