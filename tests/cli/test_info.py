@@ -110,7 +110,7 @@ def test_a_laser_upside_down(path, capsys):
 
 
 def test_flags_of_the_second_laser(path, capsys):
-    with pytest.raises(InputError, match="second laser"):
+    with pytest.raises(InputError, match="has one laser"):
         run(path, "--laser2-upside-down")
     with path.open("a") as file:
         file.write("RLASER 4 1 2 3 4 3 4 0.5 3 4 0.5 102.0 host 0.1\n")

@@ -30,7 +30,7 @@ def test_axes_and_units(tmp_path):
     np.testing.assert_allclose(T[1, :3, :3] @ [1, 0, 0], [0, -1, 0], atol=1e-12)
     assert np.linalg.det(T[1]) == pytest.approx(1.0)
     assert found.stamp_ns.tolist() == [0, 10**9]
-    assert any("a second apart" in warning for warning in found.source["warnings"])
+    assert any("one second apart" in warning for warning in found.source["warnings"])
 
 
 @pytest.mark.parametrize("heading", ["# x y z\n", "2 1\n", "\n", ""])
@@ -54,7 +54,7 @@ def test_a_pose_that_is_missing_costs_the_poses(tmp_path, pose):
 
 
 def test_damage(tmp_path, monkeypatch):
-    monkeypatch.setattr(threedtk, "_LARGEST_UNPACKED", 1 << 20)
+    monkeypatch.setattr(threedtk, "_MAX_UNPACKED", 1 << 20)
     write(tmp_path, 0, "1 2 3\n")
     write(tmp_path, 1, "1 2 3\n1 2\n")
     write(tmp_path, 2, "1 2 3\n1 2 x\n")

@@ -156,7 +156,7 @@ def test_clouds_far_from_zero_keep_their_millimetres(space, tmp_path, module, en
     placed = space.end_points(np.arange(space.n_beams), T)
     np.testing.assert_allclose(found.points + origin, placed, atol=2e-4)
     assert np.abs(found.points).max() < 200
-    assert any("the new zero" in warning for warning in found.source["warnings"])
+    assert any("the new origin" in warning for warning in found.source["warnings"])
 
 
 def test_ranges_are_narrowed_while_reading(space, tmp_path):

@@ -185,7 +185,7 @@ def test_colour_of_another_size_is_not_calibrated(scenes):
         Image.fromarray(np.zeros((2 * H, 2 * W, 3), np.uint8)).save(file)
     found = read(scenes)
     assert found.images.cameras[0].K is None
-    assert any("--cameras FILE says so" in warning for warning in found.source["warnings"])
+    assert any("--cameras FILE calibrates it" in warning for warning in found.source["warnings"])
 
 
 @pytest.mark.parametrize("place", ["seq-01/camera.txt", "camera-intrinsics.txt", None])
@@ -284,7 +284,7 @@ def test_a_camera_file_says_how_depth_is_seen(scenes, tmp_path):
     file.write_text(file.read_text().replace("[color]", "[depth]"))
     found = read(scenes, ReadOptions(depth_step=1, cameras=str(file)))
     np.testing.assert_array_equal(found.points.reshape(half.shape), half)
-    said = "camera 'depth': its principal point, 31.5, 2350, lies outside of pictures"
+    said = "camera 'depth': its principal point, 31.5, 2350, lies outside images"
     assert not any(said in text for text in found.source["warnings"])
     file.write_text(file.read_text().replace("cy = 23.5", "cy = 2350"))
     found = read(scenes, ReadOptions(cameras=str(file)))
@@ -293,7 +293,7 @@ def test_a_camera_file_says_how_depth_is_seen(scenes, tmp_path):
     with pytest.raises(InputError, match=r"no camera 'dept' \(nearest: 'depth'"):
         read(scenes, ReadOptions(cameras=str(file)))
     file.write_text("[depth]\nwidth = 5\nheight = 7\n")
-    with pytest.raises(InputError, match="camera 'depth' is given others"):
+    with pytest.raises(InputError, match="the size given for 'depth' differs"):
         read(scenes, ReadOptions(cameras=str(file)))
 
 

@@ -60,7 +60,7 @@ def test_a_full_disk_is_an_error(monkeypatch):
     if not full.exists():
         pytest.skip("no /dev/full here")
     with full.open("r+b", buffering=0) as file:
-        monkeypatch.setattr(arrays, "_nameless", lambda _: file)
+        monkeypatch.setattr(arrays, "_open_unlinked", lambda _: file)
         with pytest.raises(OSError, match="No space left"):
             arrays.ArrayBuilder(np.float32).append(np.ones(3))
 

@@ -132,7 +132,7 @@ def release_pages(array: NDArray[Any]) -> None:
 
 
 def iter_blocks(*arrays: NDArray[Any], rows: int | None = None) -> Iterator[slice]:
-    """Yield slices of `rows` rows (default BLOCK) of arrays of equal length; release their pages."""
+    """Yield slices of `rows` rows (BLOCK) of arrays of equal length; release their pages."""
     rows = rows or BLOCK
     for first in range(0, len(arrays[0]), rows):
         yield slice(first, min(first + rows, len(arrays[0])))
