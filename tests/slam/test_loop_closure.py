@@ -26,7 +26,7 @@ from stillmap.slam.types import LoopClosure, LoopContext, MStepResult
 
 OPTIONS = SlamOptions()
 OPEN = SlamOptions(loop_closure=False)
-REASONS = {"explains too little", "closures around disagree", "other loops disagree"}
+REASONS = {"explains too little", "nearby closures disagree", "other loops disagree"}
 
 
 def silent(*_):
@@ -188,7 +188,7 @@ def test_inconsistent_closure_is_refused():
     shifts = [0.5] * 8
     shifts[4] = -0.5
     refused = [c.refused for c in reject_inconsistent(context, chain, closures(shifts))]
-    assert refused == ["closures around disagree" if k == 4 else "" for k in range(8)]
+    assert refused == ["nearby closures disagree" if k == 4 else "" for k in range(8)]
 
 
 def test_single_closure_is_refused():

@@ -145,7 +145,7 @@ def _sensor_twists(recording: Recording, poses: Float, first: Index, second: Ind
     is_leap = _has_leap(poses, first, second) | (np.abs(twists[:, 2]) > MAX_TURN_RATE)
     twists[is_leap] = 0.0
     vx, vy, turn = _smooth(twists).T
-    # lever arm: a sensor off the centre of rotation moves with the rotation
+    # lever arm: a sensor off the center of rotation moves with the rotation
     x, y, theta = se2.parameters(recording.T_base_sensor[recording.sensor]).T
     vx, vy = vx - turn * y, vy + turn * x
     c, s = np.cos(theta), np.sin(theta)
@@ -163,7 +163,7 @@ def _has_leap(poses: Float, first: Index, second: Index) -> NDArray[np.bool_]:
 def _smooth(twists: Float) -> Float:
     """Twists (T, 3), filtered by 1/4, 1/2, 1/4, which suppresses alternating errors.
 
-    A pose ahead of its neighbours shortens its own scan and stretches the one before by as much;
+    A pose ahead of its neighbors shortens its own scan and stretches the one before by as much;
     unfiltered, such errors would reproduce themselves in every iteration.
     """
     padded = np.pad(twists, ((1, 1), (0, 0)), mode="edge")

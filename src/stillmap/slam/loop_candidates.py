@@ -201,7 +201,7 @@ def reject_inconsistent(
             others = [accepted[n] for n in np.flatnonzero((off < nearby).all(axis=1))]
             votes = [_agree(context, accumulated, closure, c) for c in others if c is not closure]
             if sum(votes) < max(_MIN_AGREEING, len(votes) / 2):
-                closure = closure.refuse("closures around disagree")
+                closure = closure.refuse("nearby closures disagree")
         out.append(closure)
     return out
 
@@ -223,7 +223,7 @@ def reject_inconsistent_since(
     """
     later = [context.travelled[closure.later] for closure in attempted]
     near = _NEARBY[1] * context.keyframe_distance
-    # new votes reach back one neighbourhood, whose closures depend on one more
+    # new votes reach back one neighborhood, whose closures depend on one more
     here = context.travelled[context.keyframes[k]]
     changed, relevant = np.searchsorted(later, here - [near, 2 * near])
     again = reject_inconsistent(context, chain, attempted[relevant:])

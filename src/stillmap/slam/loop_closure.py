@@ -95,9 +95,9 @@ def _correct_stage(
     last: int,
     found: list[LoopClosure],
 ) -> tuple[Float, list[LoopClosure]]:
-    """Keyframes (K, 3, 3) with those before `last` optimised, and the closures that fit them.
+    """Keyframes (K, 3, 3) with those before `last` optimized, and the closures that fit them.
 
-    Later keyframes move rigidly with the last optimised one.
+    Later keyframes move rigidly with the last optimized one.
     """
     accepted = [closure for closure in found if not closure.refused]
     if not accepted:
@@ -119,7 +119,7 @@ def solve_graph(
     closures: list[LoopClosure],
     max_chi2: float,
 ) -> tuple[Float, list[LoopClosure]]:
-    """Optimised keyframes (K, D+1, D+1), and the closures with those that the graph rejects.
+    """Optimized keyframes (K, D+1, D+1), and the closures with those that the graph rejects.
 
     Args:
         keyframes: (K,) scans.

@@ -174,13 +174,13 @@ class _LoopCloser:
         if explained < _MIN_EXPLAINED_RATIO * odometry.explained[later]:
             return closure.refuse("explains too little")
         if self._plane_overlap(planes, sweep, later, state) < _MIN_PLANE_OVERLAP:
-            return closure.refuse("surfaces do not meet")
+            return closure.refuse("surfaces do not overlap")
         grid, usual = self._build_grid(earlier)
         if self._occluded_share(grid, sweep, later, state) > usual + _MAX_OCCLUDED:
-            return closure.refuse("looks through what is there")
+            return closure.refuse("passes through occupied space")
         off = se3.log(se2.inverse(T) @ found)
         if off @ np.linalg.solve(covariance[:6, :6], off) > _MAX_CHI2:
-            return closure.refuse("lies farther off than it can have drifted")
+            return closure.refuse("exceeds the possible drift")
         return closure
 
     def _sweeps_around(self, center: int) -> Iterator[tuple[int, Sweep]]:

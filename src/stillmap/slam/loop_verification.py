@@ -51,10 +51,10 @@ def verify_candidates(
     return sorted(found, key=lambda closure: closure.later)
 
 
-def build_submap(context: LoopContext, centre: float) -> _core.OccupancyGrid2D:
-    """Map of the scans around `centre` m of travel."""
+def build_submap(context: LoopContext, center: float) -> _core.OccupancyGrid2D:
+    """Map of the scans around `center` m of travel."""
     first, last = np.searchsorted(
-        context.travelled, [centre - SUBMAP_TRAVEL, centre + SUBMAP_TRAVEL]
+        context.travelled, [center - SUBMAP_TRAVEL, center + SUBMAP_TRAVEL]
     )
     grid = _core.OccupancyGrid2D(context.resolution, scan_matching.FREE_SPACE_MARGIN)
     spacing = _SUBMAP_SPACING * context.keyframe_distance, _SUBMAP_SPACING * KEYFRAME_ANGLE

@@ -1,4 +1,4 @@
-"""Pose graph optimisation. The only module that uses GTSAM.
+"""Pose graph optimization. The only module that uses GTSAM.
 
 Residuals of constraints are x, y, heading in the frame of the second pose in 2D, and the twist
 (translation, rotation) to it in 3D. The shape of the poses, (K, 3, 3) or (K, 4, 4), decides.
@@ -42,7 +42,7 @@ class PoseGraph:
 
     Attributes:
         keyframes: (K,) scan numbers, increasing.
-        poses: (K, D+1, D+1) optimised T_map_base.
+        poses: (K, D+1, D+1) optimized T_map_base.
         constraints: between keyframes: successive ones first, then accepted loop closures.
     """
 

@@ -1,6 +1,6 @@
 """Scan matching in 2D, (9): the pose of one scan given the map so far and the motion prior.
 
-Likelihood field around end points, correlative search, Newton refinement; what is maximised is in
+Likelihood field around end points, correlative search, Newton refinement; what is maximized is in
 `docs/registration.md`. Also adds single scans to such maps and removes them again.
 """
 
@@ -19,7 +19,7 @@ Float = NDArray[np.float64]
 Points = NDArray[np.float32]
 
 FREE_SPACE_MARGIN = 0.5  # m before its end in which a beam is not used as free space
-# gaps between neighbouring end points on a surface that are filled: at most m wide, m that three of
+# gaps between neighboring end points on a surface that are filled: at most m wide, m that three of
 # them may be off a straight line, times the gap beside it
 _MAX_GAP, _STRAIGHTNESS, _MAX_GAP_RATIO = 1.5, 0.1, 3.0
 # likelihood field: m, std around end points; value of an unexplained end point; value added in

@@ -64,7 +64,7 @@ class Diagnostics:
         widened: matched only by a wider search.
         odometry_faults: odometry was rejected.
         breaks: first scans after the robot got lost or was carried elsewhere.
-        unconnected: those breaks after which no known place was recognised; before loop closure,
+        unconnected: those breaks after which no known place was recognized; before loop closure,
             those whose scan fits nowhere nearby.
     """
 
