@@ -1,7 +1,7 @@
 """Textured models of simulated places and of what moved there, against the truth.
 
 python benchmarks/models.py [--seeds tuning|reporting] [--n-seeds 3] [--worlds hall corridor street]
-    [--set section.key=value ...] [--alone] [--processes 1] [--keep DIR]
+    [--set section.key=value ...] [--processes 1] [--keep DIR]
 
 Each world is recorded for a minute with a camera: hall and corridor by a rig of two lasers, the
 street by a spinning lidar. `stillmap map` makes the models, `stillmap eval model` scores them.
@@ -19,7 +19,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -56,9 +55,6 @@ WORLDS: dict[str, dict[str, Any]] = {
         "crowd": {"people": 30},
     },
 }
-STILLMAP = ("-m", "stillmap")
-RESOLUTION_ALONE = (str(Path(__file__).with_name("resolution_alone.py")),)
-WAYS = ("by P(static)", "by resolution alone")
 WALKERS = 0.3  # share of pictures that show somebody, at least
 _NEAR = 10.0  # m
 _SEEN = 1e-3  # share of a picture's pixels
@@ -129,7 +125,7 @@ def rows(job: Job) -> Scores:
         return _rows(job, Path(folder))
 
 
-def _rows(job: Job, folder: Path) -> dict[str, Scores]:
+def _rows(job: Job, folder: Path) -> Scores:
     folder.mkdir(parents=True, exist_ok=True)
     sim, recorded = folder / "sim", WORLDS[job.world]
     scene = scene_by_name(job.world, recorded)
@@ -141,28 +137,24 @@ def _rows(job: Job, folder: Path) -> dict[str, Scores]:
             write_simulation(simulate(scene, job.seed), sim)
     inputs = [sim / "horizontal", "--tilting", sim / "tilting"] if tilts else [sim]
     share = walkers(sim / "tilting" if tilts else sim)
-    out = {}
-    for number, way in enumerate(job.ways):
-        result = folder / f"result-{number}"
-        flags = [part for one in job.settings for part in ("--set", one)]
-        started = time.monotonic()
-        words = ["map", *inputs, "-o", result, "--overwrite", "--quiet", *flags]
-        _stillmap(*words, program=RESOLUTION_ALONE if way == WAYS[1] else STILLMAP)
-        seconds = time.monotonic() - started
-        found = json.loads(_stillmap("eval", "model", result, sim, "--json"))
-        near = json.loads(_stillmap("eval", "model", result, sim, "--json", "--within", _NEAR))
-        out[way] = {
-            **flat(found),
-            "complete_near": flat(near)["complete"],
-            "covered_near": flat(near)["covered"],
-            "walkers": 100.0 * share,
-            "seconds": seconds,
-        }
-    return out
+    result = folder / "result-0"
+    flags = [part for one in job.settings for part in ("--set", one)]
+    started = time.monotonic()
+    _stillmap("map", *inputs, "-o", result, "--overwrite", "--quiet", *flags)
+    seconds = time.monotonic() - started
+    found = json.loads(_stillmap("eval", "model", result, sim, "--json"))
+    near = json.loads(_stillmap("eval", "model", result, sim, "--json", "--within", _NEAR))
+    return {
+        **flat(found),
+        "complete_near": flat(near)["complete"],
+        "covered_near": flat(near)["covered"],
+        "walkers": 100.0 * share,
+        "seconds": seconds,
+    }
 
 
-def _stillmap(*args: object, program: Sequence[str] = STILLMAP) -> str:
-    command = [sys.executable, *program, *(str(arg) for arg in args)]
+def _stillmap(*args: object) -> str:
+    command = [sys.executable, "-m", "stillmap", *(str(arg) for arg in args)]
     return subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
 
 

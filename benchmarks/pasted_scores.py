@@ -1,12 +1,10 @@
 """How much of a room's texture shows the people who were pasted into its pictures.
 
 python benchmarks/pasted.py ../shared/data/rgbd/kitchenette OUT
-python benchmarks/pasted_scores.py OUT [--set section.key=value ...] [--alone] [--keep DIR]
+python benchmarks/pasted_scores.py OUT [--set section.key=value ...] [--keep DIR]
 
-`stillmap map` makes the model with the recorded poses, and again with pictures chosen by their
-resolution alone, unless --alone is given. Points that lie as densely on
-every square metre are looked up in what of the picture that paints them is a person. Free is what
-some picture shows without one.
+`stillmap map` makes the model with the recorded poses. Points uniform over its area are looked up
+in the masks of people of their source images. Free is what some image shows without people.
 """
 
 import argparse
@@ -36,10 +34,6 @@ from stillmap.preprocessing.options import ReadOptions
 
 Mask = NDArray[np.bool_]
 
-WAYS = {
-    "by P(static)": ("-m", "stillmap"),
-    "by resolution alone": (str(Path(__file__).with_name("resolution_alone.py")),),
-}
 COLUMNS = (
     Column("area", "area, m2", ".1f"),
     Column("painted", "painted, %", ".1f", True),
@@ -119,20 +113,17 @@ def _mean(values: Mask) -> float:
     return float(np.mean(values)) if len(values) else float("nan")
 
 
-def row(
-    source: Path, result: Path, settings: Sequence[str], program: Sequence[str]
-) -> dict[str, Any]:
+def row(source: Path, result: Path, settings: Sequence[str]) -> dict[str, Any]:
     """Map a folder that `pasted.py` wrote, and score it; shares in percent.
 
     Args:
         source: that folder.
         result: where the model goes; what is there is replaced.
         settings: `section.key=value`.
-        program: arguments of Python that run `stillmap`.
     """
     flags = [part for one in settings for part in ("--set", one)]
     words = ["map", source, "--poses", "recording", "-o", result, "--overwrite", "--quiet", *flags]
-    subprocess.run([sys.executable, *program, *map(str, words)], check=True)
+    subprocess.run([sys.executable, "-m", "stillmap", *map(str, words)], check=True)
     images = stillmap.read(source, options=ReadOptions(depth_step=64)).images
     if images is None:
         raise InputError("has no pictures", where=str(source))
@@ -153,20 +144,14 @@ def main() -> None:
     )
     p.add_argument("source", type=Path, help="what pasted.py wrote")
     p.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE")
-    p.add_argument("--alone", action="store_true", help="not by resolution alone, too")
     p.add_argument("--keep", type=Path, metavar="DIR", help="leave the results there")
     args = p.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         kept = args.keep or Path(folder)
         kept.mkdir(parents=True, exist_ok=True)
-        ways = list(WAYS.items())[: 1 if args.alone else None]
-        rows = [
-            {"case": way, **row(args.source, kept / f"result-{k}", args.set, program)}
-            for k, (way, program) in enumerate(ways)
-        ]
-    header = ["pictures chosen", *(column.title for column in COLUMNS)]
-    lines = [[one["case"], *(c.mean_and_worst([one]) for c in COLUMNS)] for one in rows]
-    print(markdown(header, lines))
+        found = row(args.source, kept / "result-0", args.set)
+    header = [column.title for column in COLUMNS]
+    print(markdown(header, [[c.mean_and_worst([found]) for c in COLUMNS]]))
 
 
 if __name__ == "__main__":

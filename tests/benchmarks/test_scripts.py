@@ -1,0 +1,26 @@
+"""Every benchmark imports against the current package, and prints its help."""
+
+import importlib
+import sys
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).resolve().parents[2] / "benchmarks"
+# workers run in environments of other programs
+SCRIPTS = sorted(path.stem for path in FOLDER.glob("*.py") if not path.stem.endswith("_worker"))
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_script(name, monkeypatch, capsys):
+    if name in ("pasted", "pasted_scores"):
+        pytest.importorskip("PIL")
+    if name in ("calibration", "crowds", "rig", "rig_figures"):
+        pytest.importorskip("matplotlib")
+    module = importlib.import_module(name)
+    if hasattr(module, "main"):
+        monkeypatch.setattr(sys, "argv", [f"{name}.py", "--help"])
+        with pytest.raises(SystemExit) as stopped:
+            module.main()
+        assert stopped.value.code == 0
+        assert "usage:" in capsys.readouterr().out
