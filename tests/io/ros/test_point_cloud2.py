@@ -199,7 +199,7 @@ def image_message(messages, stamp, pixels, encoding, row_bytes=None, **changes):
     return kind, messages.make(kind, messages.header(stamp, "camera"), **stated)
 
 
-def bag_with_images(messages, rng, pictures):
+def bag_with_images(messages, rng, image_messages):
     x, y, z = xyz(rng)
     columns = [("x", FLOAT, x), ("y", FLOAT, y), ("z", FLOAT, z)]
     mounts = [
@@ -209,7 +209,7 @@ def bag_with_images(messages, rng, pictures):
     for k in range(3):
         stamp = START + k * SECOND
         content.append(("/points", stamp, cloud_message(messages, stamp, columns)))
-    return content + pictures
+    return content + image_messages
 
 
 def test_images_are_decoded_on_demand(bag, messages, rng):
@@ -224,7 +224,7 @@ def test_images_are_decoded_on_demand(bag, messages, rng):
         "png",
         np.frombuffer(stream.getvalue(), np.uint8),
     )
-    pictures = [
+    image_messages = [
         ("/cam/image", START + 1, image_message(messages, START + 1, colours, "rgb8")),
         (
             "/cam/image",
@@ -235,7 +235,7 @@ def test_images_are_decoded_on_demand(bag, messages, rng):
         ("/other/image/compressed", START + 4, ("sensor_msgs/msg/CompressedImage", packed)),
         ("/depth/image", START + 5, image_message(messages, START + 5, depth, "16UC1")),
     ]
-    images = read(bag(bag_with_images(messages, rng, pictures))).images
+    images = read(bag(bag_with_images(messages, rng, image_messages))).images
     assert images is not None
     np.testing.assert_array_equal(images.stamp_ns, START + np.arange(1, 6))
     for number, expected in enumerate((colours, colours, grey, colours, depth)):
@@ -248,8 +248,8 @@ def test_images_are_decoded_on_demand(bag, messages, rng):
 
 def test_unknown_image_encoding(bag, messages, rng):
     grey = rng.integers(0, 256, (6, 4), np.uint8)
-    pictures = [("/cam/image", START + 1, image_message(messages, START + 1, grey, "yuv999"))]
-    images = read(bag(bag_with_images(messages, rng, pictures))).images
+    image_messages = [("/cam/image", START + 1, image_message(messages, START + 1, grey, "yuv999"))]
+    images = read(bag(bag_with_images(messages, rng, image_messages))).images
     with pytest.raises(InputError, match="'yuv999', which is not read"):
         images.read(0)
 
@@ -259,20 +259,20 @@ def test_unknown_image_encoding(bag, messages, rng):
 )
 def test_damaged_images(bag, messages, rng, changes):
     grey = rng.integers(0, 256, (6, 4), np.uint8)
-    pictures = [
+    image_messages = [
         ("/cam/image", START + 1, image_message(messages, START + 1, grey, "mono8", **changes))
     ]
-    images = read(bag(bag_with_images(messages, rng, pictures))).images
-    with pytest.raises(InputError, match="a picture is"):
+    images = read(bag(bag_with_images(messages, rng, image_messages))).images
+    with pytest.raises(InputError, match="an image is"):
         images.read(0)
 
 
 def test_bayer(bag, messages, rng):
     mosaic = np.array([[10, 20], [40, 30]], np.uint8)  # red, green, green, blue
-    pictures = [
+    image_messages = [
         ("/cam/image", START + 1, image_message(messages, START + 1, mosaic, "bayer_rggb8"))
     ]
-    images = read(bag(bag_with_images(messages, rng, pictures))).images
+    images = read(bag(bag_with_images(messages, rng, image_messages))).images
     np.testing.assert_array_equal(images.read(0), np.full((2, 2, 3), [10, 30, 30]))
 
 
@@ -289,11 +289,11 @@ def test_camera_calibration(bag, messages, rng):
     info = messages.make(
         kind, messages.header(START, "camera"), 6, 4, *values, np.zeros(12), 0, 0, region
     )
-    pictures = [
+    image_messages = [
         ("/cam/camera_info", START, (kind, info)),
         ("/cam/image_raw", START + 1, image_message(messages, START + 1, grey, "mono8")),
     ]
-    camera = read(bag(bag_with_images(messages, rng, pictures))).images.cameras[0]
+    camera = read(bag(bag_with_images(messages, rng, image_messages))).images.cameras[0]
     np.testing.assert_array_equal(camera.K, [[9, 0, 2], [0, 9, 3], [0, 0, 1]])
     assert camera.model == "plumb_bob"
     np.testing.assert_array_equal(camera.distortion, np.arange(5.0))
@@ -309,11 +309,11 @@ def test_rectified_images_use_the_projection_matrix(bag, messages, rng, name):
     P = np.array([8.0, 0, 2.5, -0.8, 0, 8, 3.5, 0, 0, 0, 1, 0])
     values = ["plumb_bob", np.arange(5.0), raw, turn.ravel(), P, 0, 0, region]
     info = messages.make(kind, messages.header(START, "camera"), 6, 4, *values)
-    pictures = [
+    image_messages = [
         ("/cam/camera_info", START, (kind, info)),
         (f"/cam/{name}", START + 1, image_message(messages, START + 1, grey, "mono8")),
     ]
-    camera = read(bag(bag_with_images(messages, rng, pictures))).images.cameras[0]
+    camera = read(bag(bag_with_images(messages, rng, image_messages))).images.cameras[0]
     np.testing.assert_array_equal(camera.K, [[8, 0, 2.5], [0, 8, 3.5], [0, 0, 1]])
     assert (camera.model, len(camera.distortion)) == ("", 0)
     # what the camera saw ahead, the rectified one sees turned

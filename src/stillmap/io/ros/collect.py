@@ -127,7 +127,7 @@ def _describe_topic(
         "scans": selection.lasers | selection.clouds,
         "transforms": selection.tf,
         "odometry": selection.odometry,
-        "pictures": selection.images,
+        "images": selection.images,
     }
     use = next((use for use, topics in uses.items() if channel.topic in topics), None)
     is_relevant = channel.type in (*_SCAN_TYPES, ODOMETRY, TF, ROS1_TF)

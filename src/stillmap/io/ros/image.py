@@ -150,10 +150,10 @@ def _load_image(bag: Bag, topic: str, log_ns: int, stamp: int) -> NDArray[Any]:
     except InputError:
         raise
     except Exception as error:  # any error of a library about damaged bytes
-        raise InputError(f"a picture on {topic} cannot be decoded: {error}") from error
+        raise InputError(f"an image on {topic} cannot be decoded: {error}") from error
     finally:
         bag.close()
-    raise InputError(f"the picture on {topic} at {stamp} ns is no longer there")
+    raise InputError(f"the image on {topic} at {stamp} ns is no longer there")
 
 
 def decode_pixels(message: Any, compressed: bool) -> NDArray[Any]:
@@ -168,11 +168,11 @@ def decode_pixels(message: Any, compressed: bool) -> NDArray[Any]:
     encoding = str(message.encoding)
     kind, channels, order = _RAW.get(encoding, ("u1", 1, None))
     if encoding not in _RAW and encoding not in _BAYER:
-        raise InputError(f"a picture is encoded as {encoding!r}, which is not read")
+        raise InputError(f"an image is encoded as {encoding!r}, which is not read")
     dtype = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
     packed = width * channels * dtype.itemsize
     if step < packed or not height or (height - 1) * step + packed > len(message.data):
-        raise InputError("a picture is smaller than it states")
+        raise InputError("an image is smaller than it states")
     strides = (step, channels * dtype.itemsize, dtype.itemsize)
     values = np.ndarray((height, width, channels), dtype, message.data, strides=strides)
     if encoding in _BAYER:
@@ -186,7 +186,7 @@ def _decompress(data: bytes) -> NDArray[Any]:
         warnings.simplefilter("error", Image.DecompressionBombWarning)
         with Image.open(io.BytesIO(data), formats=("JPEG", "PNG", "WEBP", "TIFF")) as image:
             if image.width * image.height > _MAX_PIXELS:
-                raise InputError("a picture is too large")
+                raise InputError("an image is too large")
             whole = image if image.mode in ("L", "I;16", "F") else image.convert("RGB")
             return np.array(whole)
 
