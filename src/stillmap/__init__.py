@@ -71,7 +71,9 @@ def __getattr__(name: str) -> Any:
     if name in _MODULES:
         value = getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
     elif name == "__version__":
-        value = _version()
+        from stillmap.core.version import package_version
+
+        value = package_version()
     elif name in _ROOMS:
         return importlib.import_module(f"{__name__}.{name}")
     else:
@@ -82,12 +84,3 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__, *_ROOMS})
-
-
-def _version() -> str:
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        return version("stillmap")
-    except PackageNotFoundError:  # run from a source tree that is not installed
-        return "0+unknown"

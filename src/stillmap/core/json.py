@@ -1,18 +1,10 @@
-"""Conversion of values to JSON, and the package version."""
+"""Conversion of values to JSON."""
 
 import math
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-
-
-def version() -> str:
-    """The version of the running package."""
-    # deferred: a circular import otherwise
-    from stillmap import __version__
-
-    return __version__
 
 
 def count_skipped(source: Mapping[str, Any]) -> int:

@@ -15,8 +15,9 @@ from stillmap import em
 from stillmap.core.arrays import iter_blocks
 from stillmap.core.config import to_dict
 from stillmap.core.errors import InputError
-from stillmap.core.json import to_jsonable, version
+from stillmap.core.json import to_jsonable
 from stillmap.core.recording import Recording
+from stillmap.core.version import package_version
 from stillmap.pipeline.estimate import EmState
 from stillmap.pipeline.options import Options
 
@@ -149,7 +150,7 @@ def identify_run(recording: Recording, options: Options, poses: Float | None) ->
     }
     chosen = {name: value for name, value in to_dict(options).items() if name not in _NO_MATTER}
     return {
-        "version": version(),
+        "version": package_version(),
         "options": to_jsonable(chosen),
         "arrays": {name: None if a is None else _hash(a) for name, a in arrays.items()},
     }

@@ -12,8 +12,9 @@ import numpy as np
 
 from stillmap.core.config import to_dict
 from stillmap.core.files import atomic_folder
-from stillmap.core.json import count_skipped, to_jsonable, version
+from stillmap.core.json import count_skipped, to_jsonable
 from stillmap.core.parallel import resolve_threads
+from stillmap.core.version import package_version
 from stillmap.io.trajectory import write_tum
 from stillmap.mapping import Change
 from stillmap.mapping.beam_statistics import count_beams
@@ -52,7 +53,7 @@ def run_record(result: MappingResult, more: Mapping[str, Any] | None = None) -> 
     }
     record = {
         "format_version": FORMAT_VERSION,
-        "version": version(),
+        "version": package_version(),
         "input": result.recording.source,
         "options": to_dict(result.options),
         "iterations": [_iteration(it) for it in result.iterations],

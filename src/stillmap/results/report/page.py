@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stillmap.core.config import to_dict
-from stillmap.core.json import count_skipped, to_jsonable, version
+from stillmap.core.json import count_skipped, to_jsonable
+from stillmap.core.version import package_version
 from stillmap.mapping.beam_statistics import count_beams
 from stillmap.pipeline.result import MappingResult
 from stillmap.results.report.curves import curve_of
@@ -54,7 +55,7 @@ def render_report(
         "source": _source_data(result),
         "stages": result.stages,
         "options": list(_flatten(to_jsonable(to_dict(result.options)), "")),
-        "version": version(),
+        "version": package_version(),
     }
     return environment().get_template("report.html.j2").render(data)
 
