@@ -66,7 +66,7 @@ def test_recordings_in_a_folder_are_listed(tmp_path):
     assert f"{outer / 'horizontal'}, {outer / 'tilting'} (both: " in both
     assert f"map {outer / 'horizontal'} --tilting {outer / 'tilting'} -o DIR" in both
     (outer / "run.json").write_text("")
-    assert "is a folder without a recording" in said()  # but a result: clouds in it are objects
+    assert "is a folder without a recording" in said()  # a result folder: its clouds are objects
     (outer / "run.json").unlink()
     many = said("a", "b", "c")
     assert f"{outer / 'a'}, {outer / 'b'}, {outer / 'c'} and 2 more (name one of them)" in many

@@ -39,7 +39,7 @@ def test_upside_down_by_params(read_log, flaser, place, kind):
 
 
 def test_readings_reversed_by_the_driver(read_log, flaser):
-    # laser_..._flipped is what CARMEN's laser server did already before the log was written
+    # laser_..._flipped: CARMEN's laser server has already reversed the readings
     lines = [flaser(1.0)]
     plain = read_log(lines)
     turned = read_log(["PARAM laser_front_laser_flipped 1", "PARAM laser_laser1_flipped 1", *lines])
@@ -106,7 +106,7 @@ def test_four_raw_lasers(read_log):
     assert recording.sensor.tolist() == [0, 1, 2, 3]
     x = np.degrees(se2.parameters(recording.T_base_sensor)[:, 2])
     np.testing.assert_allclose(np.abs(x), 0)
-    unknown = [w for w in recording.source["warnings"] if "does not say where it sits" in w]
+    unknown = [w for w in recording.source["warnings"] if "does not state its pose" in w]
     assert len(unknown) == 3
 
 

@@ -41,7 +41,7 @@ def test_other_bytes_are_unchanged(made, tmp_path):
     assert recording.n_scans == 3
     assert (done.scans, done.beams, done.omitted) == (3, 3, 1)
     before, after = (path.read_text().splitlines() for path in (source, out))
-    # time ran backwards there: nothing is known of its beams
+    # its stamp decreases: it was skipped
     assert before.pop(7).split()[-3] == "0.25"
     assert len(after) == len(before)
     changed = [k for k, (a, b) in enumerate(zip(before, after, strict=True)) if a != b]
@@ -121,8 +121,8 @@ def rule(threshold=None, zero="unusable", free=20.0):
 @pytest.mark.parametrize(
     ("readings", "said", "expected"),
     [
-        ([[1.0, 81.91, 81.83, 81.91]], rule(81.83), b"81.91"),  # the one that is in use
-        ([[1.0, 25.31, 25.31, 7.0]], rule(20.0), b"81.91"),  # given: what is beyond is no code
+        ([[1.0, 81.91, 81.83, 81.91]], rule(81.83), b"81.91"),  # the frequent one
+        ([[1.0, 25.31, 25.31, 7.0]], rule(20.0), b"81.91"),  # given, not a code
         ([[1.0, np.inf]], rule(None), b"inf"),
         ([[1.0, 0.0]], rule(None, "max-range"), b"0.00"),
         ([[1.0, 2.0]], rule(None, free=None), b"81.91"),

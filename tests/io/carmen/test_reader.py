@@ -51,12 +51,12 @@ def test_front_and_rear_laser(read_log, flaser):
         [
             flaser(1.0, pose=(1.0, 0, 0)),
             flaser(1.2, [5.0, 6.0], kind="RLASER"),
-            flaser(1.1, [5.5, 6.5], pose=(1.1, 0, 0), kind="RLASER"),  # behind its own time
+            flaser(1.1, [5.5, 6.5], pose=(1.1, 0, 0), kind="RLASER"),  # decreasing stamp
             flaser(1.15, pose=(1.15, 0, 0)),
             flaser(2.0, [7.0, 8.0], pose=(2.0, 0, 0), kind="RLASER"),
         ]
     )
-    # one of 1.2 and 1.1 has to go; the front laser's 1.15 is no reason to drop either
+    # one of 1.2 and 1.1 is dropped; the front laser's 1.15 does not matter
     assert recording.stamp_ns.tolist() == [10**9, 1_100_000_000, 1_150_000_000, 2 * 10**9]
     assert recording.sensor.tolist() == [0, 1, 0, 1]
     np.testing.assert_array_equal(recording.T_odom_base[:, 0, 2], [1.0, 1.1, 1.15, 2.0])
@@ -229,7 +229,7 @@ def test_host_may_be_a_number(read_log):
 def test_gzip_is_detected_by_content(log, flaser):
     text = "".join(f"{flaser(i)}\n" for i in range(5)).encode()
     plain = read(log(text, "a.log"))
-    packed = read(log(gzip.compress(text), "packed.log"))  # the name says nothing of gzip
+    packed = read(log(gzip.compress(text), "packed.log"))  # the name does not matter
     unpacked = read(log(text, "unpacked.clf.gz"))
     np.testing.assert_array_equal(plain.points, packed.points)
     np.testing.assert_array_equal(plain.points, unpacked.points)

@@ -84,7 +84,7 @@ def test_lasers_at_the_robot_center(tmp_path):
     """The default of a rear laser faces backwards."""
     recording = simulated(second_laser=True, x=0.0)
     place = np.tile(np.eye(3), (2, 1, 1))
-    place[0] = se2.matrix(0.001, 0.0, 0.0)  # less than scan lines tell
+    place[0] = se2.matrix(0.001, 0.0, 0.0)  # below the rounding of scan lines
     again(dataclasses.replace(recording, T_base_sensor=place), tmp_path / "a.log")
 
 

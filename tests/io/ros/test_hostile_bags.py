@@ -112,7 +112,7 @@ def test_tree_with_a_shared_page(db3, monkeypatch):
     path.write_bytes(content)
     recording = read(path)
     assert recording.source["damage"]["rows that cannot be read"]["count"] == 1
-    assert recording.n_scans <= 3  # the others have their stamps and readings
+    assert recording.n_scans <= 3  # the others repeat stamps and readings
 
 
 def test_names_of_any_bytes(db3, tmp_path):
@@ -177,7 +177,7 @@ def test_log_time_beyond_64_bits(tmp_path):
     late = struct.pack("<Q", START + 1), struct.pack("<Q", 2**64 - 1)
     content = path.read_bytes().replace(*late)
     path.write_bytes(content)
-    assert read(path).n_scans == 2  # the library passes over it
+    assert read(path).n_scans == 2  # rosbags skips it
     path.write_bytes(content[:-50])
     assert read(path).n_scans == 3
 

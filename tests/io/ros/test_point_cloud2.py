@@ -316,7 +316,7 @@ def test_rectified_images_use_the_projection_matrix(bag, messages, rng, name):
     camera = read(bag(bag_with_images(messages, rng, image_messages))).images.cameras[0]
     np.testing.assert_array_equal(camera.K, [[8, 0, 2.5], [0, 8, 3.5], [0, 0, 1]])
     assert (camera.model, len(camera.distortion)) == ("", 0)
-    # what the camera saw ahead, the rectified one sees turned
+    # the rectified camera is rotated
     ahead = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
     np.testing.assert_allclose(camera.T_base_camera[:3, :3], ahead @ turn.T, atol=1e-12)
     np.testing.assert_allclose(camera.T_base_camera[:3, 3], [0.1, 0.2, 0.3])

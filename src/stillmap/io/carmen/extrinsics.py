@@ -63,8 +63,8 @@ def find_extrinsics(
     if laser.kind == "RLASER":
         return Extrinsics(0.0, 0.0, math.pi, "a rear laser faces backwards"), warnings
     if laser.kind in ("RAWLASER2", "RAWLASER3", "RAWLASER4"):
-        warnings.append(f"{laser.kind}: the log does not say where it sits: robot centre assumed")
-    return Extrinsics(0.0, 0.0, 0.0, "robot centre assumed"), warnings
+        warnings.append(f"{laser.kind}: the log does not state its pose: robot center assumed")
+    return Extrinsics(0.0, 0.0, 0.0, "robot center assumed"), warnings
 
 
 def is_stated_by_lines(x: float, y: float, theta: float) -> bool:
