@@ -66,7 +66,7 @@ def kernels_of(recording: stillmap.Recording, poses: NDArray[np.float64]) -> dic
     scans = (recording.points, recording.hit, e, recording.offset, T_map_sensor)
     grid = _core.OccupancyGrid2D(RESOLUTION)
     _core.add_beams(grid, *scans, 1)
-    surface = observations.build_surfel_map(recording, T_map_sensor, RESOLUTION)
+    surface = observations.build_surfel_map(recording, poses, RESOLUTION)
 
     def elements(threads: int) -> object:
         seen = observations.make_hmm(surface, options, observations.LOOP_CLASSES)

@@ -61,7 +61,7 @@ def known():
     hit, usable = rng.random(M) < 0.8, rng.random(M) < 0.95
     points[~usable] = np.nan
     seen = replace(recording(range(SCANS), BEAMS), points=points, hit=hit & usable)
-    surface = build_surfel_map(seen, seen.T_map_sensor(poses), RESOLUTION)
+    surface = build_surfel_map(seen, poses, RESOLUTION)
     cells = surface.elements()[0]
     loop = rng.random(M).astype(np.float32)
     loop[~usable] = np.nan

@@ -26,6 +26,42 @@ class Chunk(NamedTuple):
     offset: NDArray[np.int64]
 
 
+class ScanBeams(NamedTuple):
+    """Beams of n scans, as the kernels take them.
+
+    Attributes:
+        points: (m, D) float32 end points in the sensor frame.
+        hit: (m,) bool.
+        offset: (n + 1,) where the beams of each scan begin.
+        T_map_sensor: (n, D+1, D+1).
+    """
+
+    points: NDArray[np.float32]
+    hit: NDArray[np.bool_]
+    offset: NDArray[np.int64]
+    T_map_sensor: NDArray[np.float64]
+
+
+def iter_beams(
+    recording: Recording,
+    poses: NDArray[np.float64],
+    group: NDArray[np.int64] | None = None,
+    *,
+    min_groups: int = 1,
+    release: Sequence[NDArray[Any]] = (),
+) -> Iterator[tuple[slice, slice, ScanBeams]]:
+    """Yields the scans, the beams, and the data of each chunk; see `iter_chunks`.
+
+    poses: (T, D+1, D+1) T_map_base.
+    """
+    T_map_sensor = recording.T_map_sensor(poses)
+    for scans, beams, offset in iter_chunks(
+        recording, group, min_groups=min_groups, release=release
+    ):
+        points, hit = recording.points[beams], recording.hit[beams]
+        yield scans, beams, ScanBeams(points, hit, offset, T_map_sensor[scans])
+
+
 def iter_chunks(
     recording: Recording,
     group: NDArray[np.int64] | None = None,

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
-from stillmap.core.chunks import iter_chunks
+from stillmap.core.chunks import iter_beams, iter_chunks
 from stillmap.core.recording import Recording
 from stillmap.em.types import CellProbabilities, EStepResult, Float, Grid, Likelihood, fill_beams
 
@@ -28,11 +28,8 @@ def paper_e_step(
         threads: does not change the result.
     """
     e = recording.allocate_per_beam(np.float32)
-    T_map_sensor = recording.T_map_sensor(poses)
-    for scans, beams, offset in iter_chunks(recording, release=[e]):
-        points, hit = recording.points[beams], recording.hit[beams]
-        T = T_map_sensor[scans]
-        e[beams] = _core.e_step(grid, points, hit, offset, T, prior, threads)  # (6), (8)
+    for _, beams, data in iter_beams(recording, poses, release=[e]):
+        e[beams] = _core.e_step(grid, *data, prior, threads)  # (6), (8)
     return EStepResult(e, log_likelihood(recording, poses, grid, e, prior, threads))
 
 
@@ -46,10 +43,7 @@ def log_likelihood(
 ) -> Likelihood:
     """Expected log likelihood (5) and the bound of EM at the map of `grid`."""
     total = np.zeros(4)  # the terms of (5), and the entropy of the posterior
-    T_map_sensor = recording.T_map_sensor(poses)
-    for scans, beams, offset in iter_chunks(recording, release=[e]):
-        points, hit = recording.points[beams], recording.hit[beams]
-        T = T_map_sensor[scans]
+    for _, beams, (points, hit, offset, T) in iter_beams(recording, poses, release=[e]):
         per_scan = _core.log_likelihood(grid, points, hit, e[beams], offset, T, prior, threads)
         total += per_scan.sum(axis=0)
     expected = float(total[:3].sum())  # (5)

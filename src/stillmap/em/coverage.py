@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
-from stillmap.core.chunks import iter_chunks
+from stillmap.core.chunks import iter_beams
 from stillmap.core.recording import Recording
 from stillmap.em.observations import time_bin_index
 from stillmap.em.occupancy_grid import OccupancyMap
@@ -65,17 +65,10 @@ def count_observations(
         end_margin=0.0 if no_return is None else no_return.end_margin,
     )
     time_bin = time_bin_index(recording, options.time_bin)
-    T_map_sensor = recording.T_map_sensor(poses)
-    for scans, beams, offset in iter_chunks(recording, time_bin, release=[p_static]):
-        counts.add(
-            recording.points[beams],
-            recording.hit[beams],
-            p_static[beams] < DYNAMIC_BELOW,
-            offset,
-            T_map_sensor[scans],
-            time_bin[scans],
-            threads,
-        )
+    chunks = iter_beams(recording, poses, time_bin, release=[p_static])
+    for scans, beams, (points, hit, offset, T) in chunks:
+        is_dynamic = p_static[beams] < DYNAMIC_BELOW
+        counts.add(points, hit, is_dynamic, offset, T, time_bin[scans], threads)
     window = occupancy.window
     observations, unobstructed = counts.dense(window.first_cell.tolist(), window.shape)
     thin = (unobstructed < MIN_OBSERVATIONS) & ~np.isnan(occupancy.p_occupied)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core.arrays import iter_blocks
-from stillmap.core.chunks import iter_chunks
+from stillmap.core.chunks import iter_beams, iter_chunks
 from stillmap.core.recording import Recording
 from stillmap.em import beam_counting, occupancy_hmm
 from stillmap.em.occupancy_grid import ObservedCells
@@ -129,22 +129,19 @@ def add_recording(
         threads: does not change the result.
         hits_only: leaves out beams without a return.
     """
-    T_map_sensor = recording.T_map_sensor(poses)
-    for scans, beams, offset in iter_chunks(recording, release=[] if e is None else [e]):
-        points, hit = recording.points[beams], recording.hit[beams]
+    release = [] if e is None else [e]
+    for _, beams, (points, hit, offset, T) in iter_beams(recording, poses, release=release):
         if hits_only:
             points = np.where(hit[:, None], points, np.float32(np.nan))
         weights = np.ones(len(hit), np.float32) if e is None else e[beams]
-        _core.add_beams(grid, points, hit, weights, offset, T_map_sensor[scans], threads)
+        _core.add_beams(grid, points, hit, weights, offset, T, threads)
 
 
 def recount_as_static(
     grid: Grid, recording: Recording, poses: Float, e: NDArray[np.float32]
 ) -> None:
     """Turns counts that were added with e into those with e = 1, to the bit."""
-    T_map_sensor = recording.T_map_sensor(poses)
-    for scans, beams, offset in iter_chunks(recording, release=[e]):
-        points, hit, T = recording.points[beams], recording.hit[beams], T_map_sensor[scans]
+    for _, beams, (points, hit, offset, T) in iter_beams(recording, poses, release=[e]):
         _core.add_end_points(grid, points, hit, e[beams], offset, T, remove=True)
         _core.add_end_points(grid, points, hit, np.ones(len(hit), np.float32), offset, T)
 
@@ -167,18 +164,9 @@ def add_trusted_beams(
         return None
     add_recording(grid, recording, poses, e, threads, hits_only=True)
     rest = _core.OccupancyGrid2D(grid.resolution, grid.approach)
-    T_map_sensor = recording.T_map_sensor(poses)
-    for scans, beams, offset in iter_chunks(recording):
+    for *_, data in iter_beams(recording, poses):
         _core.add_no_return_beams(
-            grid,
-            rest,
-            recording.points[beams],
-            recording.hit[beams],
-            offset,
-            T_map_sensor[scans],
-            no_return.stop_cells,
-            no_return.end_margin,
-            threads,
+            grid, rest, *data, no_return.stop_cells, no_return.end_margin, threads
         )
     first_cell, mask = grid.observed_mask()
     grid.merge(rest)

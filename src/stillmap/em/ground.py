@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
-from stillmap.core.chunks import iter_chunks
+from stillmap.core.chunks import iter_beams
 from stillmap.core.recording import Recording
 from stillmap.em.observations import SurfelMap, iter_surfel_rows
 from stillmap.em.types import DYNAMIC_BELOW, GROUND_SQUARE, Float, GroundMap
@@ -31,16 +31,13 @@ def estimate_ground(
         p_static: (M,) P(c = 1) of every beam.
         threads: does not change the result.
     """
-    T_map_sensor = recording.T_map_sensor(poses)
     surfel_map = _core.SurfelMap3D(_RESOLUTION)
-    for scans, beams, offset in iter_chunks(recording, release=[p_static]):
-        static = recording.hit[beams] & (p_static[beams] >= DYNAMIC_BELOW)
-        surfel_map.add_end_points(
-            recording.points[beams], static, offset, T_map_sensor[scans], threads=threads
-        )
+    for _, beams, (points, hit, offset, T) in iter_beams(recording, poses, release=[p_static]):
+        static = hit & (p_static[beams] >= DYNAMIC_BELOW)
+        surfel_map.add_end_points(points, static, offset, T, threads=threads)
     surfel_map.fit(threads)
     every = np.ones(surfel_map.size, np.float32)
-    return ground_from_surfels(surfel_map, every, T_map_sensor[:, :3, 3])
+    return ground_from_surfels(surfel_map, every, recording.T_map_sensor(poses)[:, :3, 3])
 
 
 def ground_from_surfels(

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
-from stillmap.core.chunks import iter_chunks
+from stillmap.core.chunks import iter_beams
 from stillmap.core.recording import Recording
 from stillmap.em.types import Float
 
@@ -60,19 +60,15 @@ def score_held_out_scans(
     if every == 0 or recording.n_scans < every:
         return None
     held_out = select_held_out_scans(recording.n_scans, every)
-    T_map_sensor = recording.T_map_sensor(poses)
     kind = _core.StaticFractionGrid2D if recording.dimension == 2 else _core.StaticFractionGrid3D
     fractions = kind(resolution)
-    for scans, beams, offset in iter_chunks(recording, release=[e]):
-        points, hit = recording.points[beams], recording.hit[beams]
-        fractions.add(points, hit, e[beams], offset, T_map_sensor[scans], held_out[scans])
+    for scans, beams, (points, hit, offset, T) in iter_beams(recording, poses, release=[e]):
+        fractions.add(points, hit, e[beams], offset, T, held_out[scans])
     gain, count = 0.0, 0.0
-    for scans, beams, offset in iter_chunks(recording):
-        points, hit = recording.points[beams], recording.hit[beams]
+    for scans, _, (points, hit, offset, T) in iter_beams(recording, poses):
         per_scan = _core.score_held_out(
-            fractions, points, hit, offset, T_map_sensor[scans], held_out[scans], threads=threads,
-            **BEAM_MODEL,
-        )  # fmt: skip
+            fractions, points, hit, offset, T, held_out[scans], threads=threads, **BEAM_MODEL
+        )
         gain += float(per_scan[:, 0].sum())
         count += float(per_scan[:, 1].sum())
     return gain / count if count else None

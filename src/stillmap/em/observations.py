@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
-from stillmap.core.chunks import iter_chunks
+from stillmap.core.chunks import iter_beams
 from stillmap.core.recording import Recording
 from stillmap.em.mixture import MAX_FIT_ROWS
 from stillmap.em.options import EmOptions
@@ -138,11 +138,10 @@ def collect_observations(
         classes: of the filters.
         prepare: called with the filters before the first observation.
     """
-    T_map_sensor = recording.T_map_sensor(poses)
     time_bin = time_bin_index(recording, options.time_bin) if recording.dimension == 3 else None
-    surfel_map = build_surfel_map(recording, T_map_sensor, resolution, threads, time_bin)
+    surfel_map = build_surfel_map(recording, poses, resolution, threads, time_bin)
     hmm = make_hmm(surfel_map, options, classes, threads)
-    trust = _estimate_trust(recording, T_map_sensor, hmm, threads)
+    trust = _estimate_trust(recording, poses, hmm, threads)
     hmm.set_trust_beyond_solid(trust)
     if prepare is not None:
         prepare(hmm)
@@ -154,7 +153,7 @@ def collect_observations(
 
 def build_surfel_map(
     recording: Recording,
-    T_map_sensor: Float,
+    poses: Float,
     resolution: float,
     threads: int = 1,
     time_bin: NDArray[np.int64] | None = None,
@@ -165,10 +164,8 @@ def build_surfel_map(
     """
     kind = _core.SurfelMap2D if recording.dimension == 2 else _core.SurfelMap3D
     surfel_map = kind(resolution)
-    for scans, beams, offset in iter_chunks(recording):
-        points, hit = recording.points[beams], recording.hit[beams]
-        of_scans = None if time_bin is None else time_bin[scans]
-        surfel_map.add_end_points(points, hit, offset, T_map_sensor[scans], of_scans, threads)
+    for scans, _, data in iter_beams(recording, poses):
+        surfel_map.add_end_points(*data, None if time_bin is None else time_bin[scans], threads)
     surfel_map.fit(threads)
     return surfel_map
 
@@ -199,20 +196,10 @@ def add_observations(
 ) -> None:
     """Adds the observations of all time bins to the filters, in order."""
     time_bin, D = time_bin_index(recording, seconds), recording.dimension
-    T_map_sensor = recording.T_map_sensor(poses)
     positions = np.ascontiguousarray(poses[:, :D, D])
-    for scans, beams, offset in iter_chunks(
-        recording, time_bin, min_groups=_BINS_PER_THREAD * threads
-    ):
-        hmm.add(
-            recording.points[beams],
-            recording.hit[beams],
-            offset,
-            T_map_sensor[scans],
-            time_bin[scans],
-            threads,
-            positions[scans],
-        )
+    min_groups = _BINS_PER_THREAD * threads
+    for scans, _, data in iter_beams(recording, poses, time_bin, min_groups=min_groups):
+        hmm.add(*data, time_bin[scans], threads, positions[scans])
 
 
 def make_hmm(
@@ -240,18 +227,14 @@ def make_hmm(
     return hmm
 
 
-def _estimate_trust(
-    recording: Recording, T_map_sensor: Float, hmm: OccupancyHmm, threads: int
-) -> float:
+def _estimate_trust(recording: Recording, poses: Float, hmm: OccupancyHmm, threads: int) -> float:
     """Trust max(0, 1 - 4 nu) in beams without a return, nu the share that crosses solid cells.
 
     In open space nu is small; where glass or black surfaces swallow beams it is large.
     """
     n_beams = n_crossing = 0
-    for scans, beams, offset in iter_chunks(recording):
-        counts = hmm.count_no_return_beams(
-            recording.points[beams], recording.hit[beams], offset, T_map_sensor[scans], threads
-        )
+    for *_, data in iter_beams(recording, poses):
+        counts = hmm.count_no_return_beams(*data, threads)
         n_beams, n_crossing = n_beams + counts[0], n_crossing + counts[1]
     return max(0.0, 1.0 - _TRUST_SLOPE * n_crossing / n_beams) if n_beams else 0.0
 

@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.chunks import iter_chunks
+from stillmap.core.chunks import iter_beams
 from stillmap.core.recording import Recording
 from stillmap.em import changepoints, spatial_prior
 from stillmap.em.changepoints import CellHistories
@@ -101,13 +101,13 @@ def e_step_3d(
     )
     cells = changepoints.label_cells(seen, options)
     p_static = spatial_prior.smooth_mean_field(cells.p_static, seen.surfel_map, threads)
-    T_map_sensor = recording.T_map_sensor(poses)
-    ground = ground_from_surfels(seen.surfel_map, p_static, T_map_sensor[:, :3, 3])
+    positions = recording.T_map_sensor(poses)[:, :3, 3]
+    ground = ground_from_surfels(seen.surfel_map, p_static, positions)
     obstacles = spatial_prior.select_obstacles(ground, seen.surfel_map)
     contact = None
     if obstacles is not None:
         p_static = spatial_prior.pool_clusters(
-            p_static, cells.change, obstacles, recording, T_map_sensor, threads
+            p_static, cells.change, obstacles, recording, poses, threads
         )
         contact = spatial_prior.make_ground_contact(obstacles, p_static)
     found = label_beams(seen, None, recording, poses, options, p_static, contact)
@@ -212,13 +212,11 @@ def _beam_labels(
     """(M,) P(static) of the surfel (E,) in which each beam ended."""
     with_prior = np.append(p_static, np.float32(prior))  # surfel -1: none
     e = recording.allocate_per_beam(np.float32)
-    T_map_sensor = recording.T_map_sensor(poses)
-    for scans, beams, offset in iter_chunks(recording, release=[e]):
-        points, hit, T = recording.points[beams], recording.hit[beams], T_map_sensor[scans]
-        surfel = surfel_map.associate_beams(points, hit, offset, T, threads)
-        labels = fill_beams(points, hit, with_prior.take(surfel), prior)
+    for _, beams, data in iter_beams(recording, poses, release=[e]):
+        surfel = surfel_map.associate_beams(*data, threads)
+        labels = fill_beams(data.points, data.hit, with_prior.take(surfel), prior)
         if contact is not None:
-            above = contact.label_above(points, hit, offset, T, surfel, threads)
+            above = contact.label_above(data, surfel, threads)
             labels = np.where(np.isnan(above), labels, above)
         e[beams] = labels
     return e

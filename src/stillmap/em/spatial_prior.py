@@ -11,7 +11,7 @@ import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
 
 import stillmap._core as _core
-from stillmap.core.chunks import iter_chunks
+from stillmap.core.chunks import ScanBeams, iter_beams
 from stillmap.core.recording import Recording
 from stillmap.em.observations import SurfelMap, iter_surfel_rows
 from stillmap.em.types import MIN_PROBABILITY, Float, GroundMap
@@ -108,7 +108,7 @@ def pool_clusters(
     change: NDArray[np.float32],
     obstacles: ObstacleSurfels,
     recording: Recording,
-    T_map_sensor: Float,
+    poses: Float,
     threads: int = 1,
 ) -> NDArray[np.float32]:
     """(E,) P(static), lowered for surfels of clusters that move, arrived or left.
@@ -118,7 +118,7 @@ def pool_clusters(
         change: (E,) nats, log likelihood ratio of changed to static; see `CellLabels`.
         obstacles: the surfels that form clusters.
         recording: 3D, M beams, deskewed.
-        T_map_sensor: (T, 4, 4).
+        poses: (T, 4, 4) T_map_base.
         threads: does not change the result.
     """
     pooling = _core.ClusterPooling3D(
@@ -128,9 +128,8 @@ def pool_clusters(
         column_cells=obstacles.column_cells,
         min_surfels=_MIN_CLUSTER_SURFELS,
     )
-    for scans, beams, offset in iter_chunks(recording):
-        points, hit = recording.points[beams], recording.hit[beams]
-        pooling.add(points, hit, offset, T_map_sensor[scans], threads)
+    for *_, data in iter_beams(recording, poses):
+        pooling.add(*data, threads)
     return apply_pooled_evidence(p_static, pooling.means())
 
 
@@ -167,27 +166,18 @@ class GroundContact:
     min_end_height: float
 
     def label_above(
-        self,
-        points: NDArray[np.float32],
-        hit: NDArray[np.bool_],
-        offset: NDArray[np.int64],
-        T_map_sensor: Float,
-        surfel: NDArray[np.int32],
-        threads: int = 1,
+        self, data: ScanBeams, surfel: NDArray[np.int32], threads: int = 1
     ) -> NDArray[np.float32]:
         """(M,) P(static) of what moves above the end of each beam in its sweep; NaN: nothing.
 
         Args:
-            points, hit, offset, T_map_sensor: M beams of some scans.
+            data: M beams of some scans.
             surfel: (M,) in which each ended, -1: none.
             threads: does not change the result.
         """
         return _core.relabel_ground_contact(
             self.obstacles.surfel_map,
-            points,
-            hit,
-            offset,
-            T_map_sensor,
+            *data,
             surfel,
             is_obstacle=self.obstacles.is_obstacle,
             p_static=self.p_static,
