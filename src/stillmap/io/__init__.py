@@ -1,4 +1,4 @@
-"""Recordings: one shape for all formats, one file per format."""
+"""Readers and writers of recordings, one module per format."""
 
 from stillmap.core.recording import Recording
 from stillmap.io.registry import read

@@ -1,6 +1,6 @@
 """Ground and ceiling planes of lidar scans, and range profiles of the obstacles between them.
 
-The profiles tell whether scans were taken at different positions, without poses.
+The profiles show, without poses, whether scans were taken at different positions.
 """
 
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""What a laser's driver would have said of scans in the plane."""
+"""2D recordings in the form of LaserScan messages."""
 
 import dataclasses
 

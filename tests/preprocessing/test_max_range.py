@@ -1,4 +1,4 @@
-"""The maximum-range code, what zero means, and what a maximum-range beam shows."""
+"""Detection of the maximum-range code, of the meaning of zero, and of free ranges."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Poses in the plane against complex numbers and 3 x 3 algebra."""
+"""SE(2) against complex numbers and 3 x 3 algebra."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Plain arrays of points."""
+"""Helpers for arrays of points and of indices."""
 
 import numpy as np
 import pytest

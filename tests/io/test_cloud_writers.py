@@ -1,4 +1,4 @@
-"""What is written as clouds is read again as it was, as far as the format goes."""
+"""Clouds are read back as they were written, as far as the format allows."""
 
 from dataclasses import replace
 

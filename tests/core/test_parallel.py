@@ -1,4 +1,4 @@
-"""Work that threads share."""
+"""Ordered parallel map."""
 
 import threading
 

@@ -1,4 +1,4 @@
-"""Exact stamps, and the longest stretch of time that runs forwards."""
+"""Exact stamps, and the longest subsequence of non-decreasing ones."""
 
 from itertools import combinations
 

@@ -1,4 +1,4 @@
-"""PLY, LAS, LAZ and E57: surveys, and files that lie."""
+"""PLY, LAS, LAZ and E57 clouds, damaged and hostile ones too."""
 
 import re
 import struct

@@ -1,4 +1,4 @@
-"""Times of beams from how a lidar turns."""
+"""Beam times of spinning lidars."""
 
 import math
 from dataclasses import replace

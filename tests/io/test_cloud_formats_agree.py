@@ -1,4 +1,4 @@
-"""A 3D recording in every form that holds one is the same recording."""
+"""A 3D recording is the same in every format that holds one."""
 
 import numpy as np
 import pytest

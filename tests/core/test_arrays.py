@@ -1,4 +1,4 @@
-"""Arrays that are in memory or in a file without anybody noticing."""
+"""Memory-mapped buffers, `.npy` files."""
 
 import os
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Readings of the robot itself."""
+"""Self filter of 2D lasers."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Returns of the robot itself in 3D recordings."""
+"""Self filter of 3D recordings."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Where the colour camera sits beside the depth camera, found by edges."""
+"""Calibration of the color camera against depth edges."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What is said of pictures that cannot be read."""
+"""Errors on images that cannot be read."""
 
 from pathlib import Path
 
