@@ -1,8 +1,8 @@
 """Scans that took time: the motion of the robot meanwhile is taken out of them."""
 
 import dataclasses
-import sys
 import functools
+import sys
 
 import numpy as np
 import pytest

@@ -16,7 +16,12 @@ from stillmap.pipeline.options import Options
 
 def options(estimator="stillmap", **changes):
     """Without the last E-step, which asks the recording once more."""
-    wanted = {"max_iterations": 10, "tolerance": 0.0, "label_tolerance": 0.0, "patience": 3} | changes
+    wanted = {
+        "max_iterations": 10,
+        "tolerance": 0.0,
+        "label_tolerance": 0.0,
+        "patience": 3,
+    } | changes
     wanted |= {"change_detection": False}
     chosen = {"estimator": estimator, "em": wanted, "slam": {"resolution": 0.1}, "threads": 1}
     return override(Options(), chosen)
@@ -182,7 +187,9 @@ def test_without_a_share_labels_never_settle(build):
 
 
 def test_labels_that_settle_in_a_dip_leave_the_best(build):
-    result, asked = build([-5.0, -3.0, -4.0, -2.0], options(label_tolerance=0.01), [0.5, 0.1, 0.0, 0.0])
+    result, asked = build(
+        [-5.0, -3.0, -4.0, -2.0], options(label_tolerance=0.01), [0.5, 0.1, 0.0, 0.0]
+    )
     assert (asked, result.converged) == (3, True)
     assert_kept(result, 2)
 

@@ -194,7 +194,7 @@ def _option_changes(args: argparse.Namespace) -> dict[str, Any]:
 def _require_usable_output(args: argparse.Namespace, output: Path, replace: bool) -> None:
     """Refuses an output that is taken, holds an input or cannot be written, before any work."""
     from stillmap.core.files import require_new
-    from stillmap.results.save import RECORD
+    from stillmap.results.run_json import RECORD
 
     require_new(output, RECORD, replace)
     for source in filter(None, (args.input, args.tilting)):

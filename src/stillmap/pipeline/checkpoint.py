@@ -129,7 +129,7 @@ class CheckpointFolder:
         self._clear(*(path for path in self.folder.iterdir() if path.name != _LOCK))
 
     def recover(self, output: Path) -> None:
-        """Removes the leftovers of a killed run; an earlier result that it moved aside goes back."""
+        """Removes the leftovers of a killed run; puts back a result that it had moved aside."""
         for path in list(self.folder.iterdir()):
             if path.name.endswith(".old") and not output.exists():
                 os.rename(path, output)

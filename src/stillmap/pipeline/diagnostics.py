@@ -61,26 +61,25 @@ def _reader_warnings(source: Mapping[str, Any]) -> list[str]:
 
 
 def _pose_warnings(diagnostics: slam.Diagnostics) -> list[str]:
-    out = []
-    if diagnostics.odometry_faults:
-        n = len(diagnostics.odometry_faults)
+    out, faults, widened = [], diagnostics.odometry_faults, diagnostics.widened
+    if faults:
         out.append(
-            f"odometry and scans disagree at {n} scan{'s' * (n > 1)} (wheels that slip or "
-            f"stall, odometry that begins again), first at scan {diagnostics.odometry_faults[0]}: poses "
-            "follow the scans there"
+            f"odometry and scans disagree at {len(faults)} scan{'s' * (len(faults) > 1)} (wheel slip "
+            f"or stall, odometry that starts again), first at scan {faults[0]}: poses follow the "
+            "scans there"
         )
-    if diagnostics.widened:
+    if widened:
         out.append(
-            f"{len(diagnostics.widened)} scans lay outside what odometry allows and were found by a "
-            f"wider search, the first is scan {diagnostics.widened[0]}"
+            f"{len(widened)} scans lay outside the odometry's uncertainty and were found by a wider "
+            f"search, the first is scan {widened[0]}"
         )
     for scan in diagnostics.breaks:
         out.append(
             f"before scan {scan} the robot lost its way or was carried elsewhere: "
             + (
-                "nothing seen after it is known from before, so it stands beside the rest"
+                "no place seen after it is known from before, so it is not connected to the rest"
                 if scan in diagnostics.unconnected
-                else "where it went on was found among the places known from before"
+                else "it was relocalized among the places known from before"
             )
         )
     return out

@@ -135,7 +135,7 @@ class EmState:
     single_pass: bool = False
 
     def update(self, iteration: Iteration) -> None:
-        """Records an iteration, keeps its estimate if it is the best, applies the stopping rules."""
+        """Records an iteration, keeps its estimate if it is the best, checks convergence."""
         estimate, record, options = iteration.estimate, iteration.record, self.options.em
         self.records.append(record)
         gain = np.inf if self.best is None else estimate.bound - self.best.bound

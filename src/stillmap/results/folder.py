@@ -16,7 +16,7 @@ from stillmap.io.text_lines import Progress
 from stillmap.mesh.options import MeshOptions
 from stillmap.preprocessing.options import ReadOptions
 from stillmap.results.labels import Labels, read_labels
-from stillmap.results.save import RECORD
+from stillmap.results.run_json import RECORD
 
 _MAX_RUN = 32 << 20  # bytes of a run.json
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from stillmap.core.arrays import iter_blocks
 from stillmap.core.chunks import iter_chunks
 from stillmap.core.recording import Recording
-from stillmap.mapping.beam_statistics import DYNAMIC_BELOW
+from stillmap.em.types import DYNAMIC_BELOW
 
 FIELDS = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("p_static", "<f4")]
 

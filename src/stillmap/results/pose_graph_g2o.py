@@ -1,8 +1,8 @@
 """`graph.g2o`: the pose graph as text that g2o and GTSAM read (Kuemmerle et al., ICRA 2011).
 
 g2o's SE(2) error is x, y, heading in the frame of the second pose as it was measured. Constraint
-covariances are given in that frame, so the information matrix is their plain inverse; GTSAM's errors
-differ in second order only.
+covariances are given in that frame, so the information matrix is their plain inverse; GTSAM's
+errors differ in second order only.
 """
 
 from collections.abc import Iterator

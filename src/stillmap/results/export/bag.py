@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.io.ros import message_writer
 from stillmap.io.ros.bag_types import BagKind
 from stillmap.io.ros.bag_writer import BagWriter, new_bag, require_stamps
 from stillmap.io.ros.message_writer import BASE, MAP
 from stillmap.io.ros.messages import LASER_SCAN, TF
 from stillmap.io.ros.recording_writer import LaserScanEncoder, number_names, write_sensor_frames
-from stillmap.mapping.beam_statistics import DYNAMIC_BELOW
 from stillmap.results.reader import Exported, Track
 
 _COLOR = (0.9, 0.4, 0.0, 0.8)  # RGBA, the orange of the report

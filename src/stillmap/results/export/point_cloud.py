@@ -13,9 +13,9 @@ from stillmap.core.chunks import Chunk, iter_chunks
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.core.timestamps import beam_stamps_ns
+from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.io.point_cloud import ply
 from stillmap.io.point_cloud.binary_table import read_columns
-from stillmap.mapping.beam_statistics import DYNAMIC_BELOW
 
 Part = Literal["static", "dynamic"]
 PARTS: tuple[Part, ...] = ("static", "dynamic")

@@ -1,0 +1,107 @@
+"""`run.json`: the input, the resolved options, the iterations, counts, times and warnings."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from stillmap.core.config import to_dict
+from stillmap.core.json import count_skipped, to_jsonable
+from stillmap.core.version import package_version
+from stillmap.mapping import Change
+from stillmap.mapping.beam_statistics import count_beams
+from stillmap.pipeline.estimate import IterationRecord
+from stillmap.pipeline.result import MappingResult
+from stillmap.results.map_npz import known_area
+from stillmap.slam import LoopClosure
+
+FORMAT_VERSION = 1
+
+_MILLIMETRES = 3  # digits
+
+
+def run_record(result: MappingResult, more: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """The content of `run.json` as JSON values; numbers that are not finite become None.
+
+    Args:
+        result: the mapped recording.
+        more: further keys and their values.
+    """
+    counts = count_beams(result.recording, result.p_static)
+    counts = {
+        "scans": result.recording.n_scans,
+        **{name: counts[name] for name in ("beams", "hits", "max_range", "unusable")},
+        "skipped": count_skipped(result.recording.source),
+    }
+    record = {
+        "format_version": FORMAT_VERSION,
+        "version": package_version(),
+        "input": result.recording.source,
+        "options": to_dict(result.options),
+        "iterations": [_iteration(it) for it in result.iterations],
+        "converged": result.converged,
+        "best_iteration": result.best_iteration,
+        **{
+            key: {name: stage.get(key) for name, stage in result.stages.items()}
+            for key in ("seconds", "cpu_seconds", "peak_memory_bytes")
+        },
+        "counts": counts,
+        "area": known_area(result),
+        "warnings": list(result.warnings),
+        "learned": result.learned,
+        "doubts": {
+            "odometry_disagrees": result.doubts.odometry_faults,
+            "found_by_wider_search": result.doubts.widened,
+            "carried_before": result.doubts.breaks,
+            "beside_the_map_from": result.doubts.unconnected,
+        },
+        "changes": [_change(one) for one in result.changes],
+        "loops": {
+            "accepted": [_loop(one) for one in result.loops if not one.refused],
+            "refused": [_loop(one) | {"why": one.refused} for one in result.loops if one.refused],
+        },
+        **(more or {}),
+    }
+    plain: dict[str, Any] = to_jsonable(record)
+    return plain
+
+
+RECORD = "run.json"  # every result has it
+
+
+def write_run_json(
+    path: Path, result: MappingResult, more: Mapping[str, Any] | None = None
+) -> None:
+    """Write `run_record` to `path`."""
+    text = json.dumps(run_record(result, more), indent=2, ensure_ascii=False, allow_nan=False)
+    path.write_text(text + "\n", encoding="utf-8")
+
+
+def _loop(one: LoopClosure) -> dict[str, Any]:
+    return {"earlier": one.earlier, "later": one.later, "explained": one.explained}
+
+
+def _change(one: Change) -> dict[str, Any]:
+    return {
+        "kind": one.kind,
+        "x": round(one.x, _MILLIMETRES),
+        "y": round(one.y, _MILLIMETRES),
+        **({} if one.z is None else {"z": round(one.z, _MILLIMETRES)}),
+        "size": [round(metres, _MILLIMETRES) for metres in one.size],
+        "cells": len(one.cells),
+        "before_ns": one.before_ns,
+        "stamp_ns": one.stamp_ns,
+        "last_ns": one.last_ns,
+        "times": one.times,
+    }
+
+
+def _iteration(it: IterationRecord) -> dict[str, Any]:
+    return {
+        "number": it.number,
+        "bound": it.bound,
+        "expected_log_likelihood": it.expected_log_likelihood,
+        "held_out_log_likelihood": it.held_out_log_likelihood,
+        "changed_share": it.changed_share,
+        "seconds": it.seconds,
+    }
