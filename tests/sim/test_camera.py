@@ -78,7 +78,7 @@ def test_pixels_show_the_true_surfaces_in_their_colours(
     for image in range(len(one.recording.images)):
         places, mask = _seen(one, image)
         static = places[mask == 0]
-        off, _ = one.surfaces.standing.nearest(static)
+        off, _ = one.surfaces.standing.project(static)
         assert off.max() < 1e-4  # float32 of 100 m
         near = np.linalg.norm(static - one.surfaces.T_world_camera[image, :3, 3], axis=1) < 3.0
         shows = one.recording.images.read(image)[mask == 0][near].astype(float)
@@ -210,7 +210,7 @@ def test_folders_hold_pictures_and_their_truth(rig: RigSimulation, tmp_path: Pat
 
 def test_a_folder_without_pictures_has_no_truth_about_them(tmp_path: Path) -> None:
     write_simulation(simulate(scene_by_name("hall", {"robot": {"scans": 2}}), 1), tmp_path / "sim")
-    with pytest.raises(InputError, match="no truth about pictures"):
+    with pytest.raises(InputError, match="no truth about images"):
         load_image_truth(tmp_path / "sim")
 
 

@@ -59,7 +59,7 @@ class StaticSurfaces(NamedTuple):
             distance[part], places[part] = d, at
         return distance, places
 
-    def _things(self) -> Iterator[_Surface]:
+    def _surfaces(self) -> Iterator[_Surface]:
         """Minimum and maximum x and y of each surface, and its projection."""
         for ends, z in zip(self.faces.ends, self.faces.z, strict=True):
             low, high = np.minimum(ends[:2], ends[2:]), np.maximum(ends[:2], ends[2:])
