@@ -78,7 +78,7 @@ def test_nothing_is_replaced_unless_one_says_so(out, call, tmp_path, there):
     ("damage", "said"),
     [
         (lambda _: None, "holds no model"),
-        (lambda data: data[:-40], "no whole .glb"),
+        (lambda data: data[:-40], "no complete .glb"),
         (lambda data: data.replace(b'"bufferView":0', b'"bufferView":9'), "is damaged"),
         (lambda data: data.replace(b"\x89PNG", b"\x89PNK"), "is damaged"),
     ],

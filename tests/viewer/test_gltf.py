@@ -61,7 +61,7 @@ def test_compressed_model_is_refused(tmp_path):
     ],
 )
 def test_damaged_model_is_refused(tmp_path, data):
-    assert "no whole .glb" in refusal(tmp_path / "a.glb", data)
+    assert "no complete .glb" in refusal(tmp_path / "a.glb", data)
 
 
 def test_size_limit(tmp_path, glb):

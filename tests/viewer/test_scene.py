@@ -82,7 +82,7 @@ def test_models_move_along_their_tracks(result_of):
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
-        ("mesh.glb", b"glTF", "no whole .glb"),
+        ("mesh.glb", b"glTF", "no complete .glb"),
         ("objects/0007.json", b"{}", "damaged"),
         ("objects/0007.json", b'{"T_map_object": [[1]], "stamp_ns": 0}', "damaged"),
         ("objects/0007.json", None, "cannot be read"),

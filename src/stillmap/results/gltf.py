@@ -1,8 +1,6 @@
-"""Meshes as files that other programs open: glTF in one file, and OBJ. y is up in both.
+"""Writes meshes as binary glTF and OBJ (y up), and reads self-contained glTF files.
 
-trimesh writes them, with marks where the pages are to be, which are compressed here.
-
-Models as they lie in a result: binary glTF files that hold all that they need.
+trimesh writes the files with 1 x 1 placeholder images, which are replaced by compressed pages.
 """
 
 import io
@@ -23,15 +21,13 @@ from stillmap.mesh.triangle_mesh import Mesh
 
 Float = NDArray[np.float64]
 
-_LINEAR, _LINEAR_MIPMAP_LINEAR, _CLAMP_TO_EDGE = 9729, 9987, 33071  # as glTF calls them
-
-_VERTICES, _INDICES = 34962, 34963
-
-_FAR = 1000.0  # m, from where on floats of 32 bits are coarse
+_LINEAR, _LINEAR_MIPMAP_LINEAR, _CLAMP_TO_EDGE = 9729, 9987, 33071  # of glTF samplers
+_VERTICES, _INDICES = 34962, 34963  # targets of glTF buffer views
+_FAR = 1000.0  # m, coordinates from which on 32-bit floats are coarse
 
 
 class Page(NamedTuple):
-    """A page, compressed."""
+    """A compressed texture page."""
 
     suffix: str
     kind: str
@@ -39,7 +35,7 @@ class Page(NamedTuple):
 
 
 class Part(NamedTuple):
-    """The faces of one page, or the grey ones (page -1), with vertices of their own."""
+    """The faces of one page, or the gray ones (page -1), with their own vertices."""
 
     page: int
     vertices: Float
@@ -48,8 +44,7 @@ class Part(NamedTuple):
 
 
 def write_glb(path: Path, mesh: TexturedMesh | Mesh, quality: int = 90) -> None:
-    """Writes binary glTF: one mesh per page, unlit, so that colours are seen as they were
-    photographed, and one of what is grey, lit, as without shades its form is not seen.
+    """Writes binary glTF: one unlit mesh per page, and one lit mesh of the gray faces.
 
     Where coordinates are large, nodes have a translation of whole metres.
 
@@ -122,13 +117,13 @@ def write_obj(folder: Path, mesh: TexturedMesh | Mesh, quality: int = 90) -> Non
 def encode_obj(
     mesh: TexturedMesh | Mesh, quality: int, name: str = "mesh", before: str = ""
 ) -> dict[str, bytes]:
-    """`NAME.obj`, `NAME.mtl` and the pages, by their names.
+    """The content of `NAME.obj`, `NAME.mtl` and the pages, by file name.
 
     Args:
         mesh: with one face at least.
         quality: JPEG quality of the pages; 0: PNG.
         name: of the first two.
-        before: what the names of pages begin with.
+        before: prefix of the names of pages.
 
     Raises:
         MissingExtra: trimesh is not installed.
@@ -137,11 +132,11 @@ def encode_obj(
     pages = _compressed(mesh, quality)
     simple = trimesh.visual.material.SimpleMaterial
     scene = trimesh.Scene()
-    for part in _parts(mesh):  # the grey one is the last: trimesh counts on uv for all before
+    for part in _parts(mesh):  # the gray one last: trimesh expects uv for all before
         title = _name(part.page)
         paint = 255 if part.page >= 0 else GRAY[0]
         material = simple(
-            image=_mark(part.page) if part.page >= 0 else None,
+            image=_placeholder(part.page) if part.page >= 0 else None,
             diffuse=[paint, paint, paint, 255],
             specular=[0, 0, 0, 255],
         )
@@ -169,7 +164,7 @@ def _trimesh(path: Path) -> Any:
 
 
 def _parts(mesh: TexturedMesh | Mesh) -> list[Part]:
-    """By page, the grey one last."""
+    """Parts by page, the gray one last."""
     if not len(mesh):
         raise ValueError("a mesh without faces")
     uv_of_all = mesh.uv if isinstance(mesh, TexturedMesh) else np.zeros((len(mesh.vertices), 2))
@@ -186,31 +181,31 @@ def _name(page: int) -> str:
 
 
 def _y_up(points: Float) -> Float:
-    """(..., 3) z up as y up."""
+    """(..., 3) points with z up in a frame with y up."""
     return np.stack([points[..., 0], points[..., 2], -points[..., 1]], axis=-1)
 
 
 def to_z_up(points: Float) -> Float:
-    """(..., 3) y up as z up."""
+    """(..., 3) points with y up in a frame with z up."""
     return np.stack([points[..., 0], -points[..., 2], points[..., 1]], axis=-1)
 
 
 def flip_v(uv: Float) -> Float:
-    """As trimesh and OBJ count rows."""
+    """uv counted from the bottom, as in trimesh and OBJ."""
     return np.column_stack([uv[:, 0], 1.0 - uv[:, 1]])
 
 
-def _mark(page: int) -> Image.Image:
-    """A picture in the place of a page, like no other."""
+def _placeholder(page: int) -> Image.Image:
+    """A placeholder image that is unique to a page."""
     return Image.new("RGB", (1, 1), (page & 255, page >> 8, 0))
 
 
 def _material(trimesh: Any, page: int) -> Any:
-    """Of a page, or grey; colours that are no pictures are linear in glTF."""
+    """Material of a page, or gray; color factors are linear in glTF."""
     linear = ((GRAY[0] / 255.0 + 0.055) / 1.055) ** 2.4
     return trimesh.visual.material.PBRMaterial(
         name=_name(page),
-        baseColorTexture=_mark(page) if page >= 0 else None,
+        baseColorTexture=_placeholder(page) if page >= 0 else None,
         baseColorFactor=None if page >= 0 else [linear, linear, linear, 1.0],
         metallicFactor=0.0,
         roughnessFactor=1.0,
@@ -234,7 +229,7 @@ def _each_compressed(mesh: TexturedMesh, quality: int) -> Iterator[Page]:
 
 
 def _finish(tree: dict[str, Any]) -> None:
-    """What trimesh does not say. Without normals, programs light faces as flat ones."""
+    """Adds samplers, unlit textures and buffer targets; without normals shading is flat."""
     tree["asset"]["generator"] = "stillmap"
     if tree.get("textures"):
         sampler = {"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAP_LINEAR}
@@ -255,7 +250,7 @@ def _finish(tree: dict[str, Any]) -> None:
                 tree["bufferViews"][view]["target"] = target
 
 
-# of the map frame, z up, where a model's y is up
+# from a model's frame, y up, to the map frame, z up
 MAP_FROM_GLTF: NDArray[np.float64] = np.array(
     [[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]]
 )
@@ -266,17 +261,17 @@ _HEAD = struct.Struct("<4sII")  # magic, version, length of all
 
 _CHUNK = struct.Struct("<I4s")  # length, kind
 
-_MOST_JSON = 64 << 20
+_MAX_JSON = 64 << 20
 
-# a browser would fetch what unpacks it from elsewhere
+# viewers fetch its decoder from elsewhere
 _PACKED = "KHR_draco_mesh_compression"
 
 
 def read_glb(path: Path, most: int) -> bytes:
-    """A .glb file of at most so many bytes that needs nothing from anywhere else.
+    """The bytes of a self-contained .glb file of at most `most` bytes.
 
     Raises:
-        InputError: it is missing, too large, damaged, or names other files.
+        InputError: it is missing, too large, damaged, or refers to other files.
     """
     require_regular(path)
     if path.stat().st_size > most:
@@ -285,10 +280,10 @@ def read_glb(path: Path, most: int) -> bytes:
     try:
         document = _document(data)
     except (ValueError, RecursionError, struct.error) as error:
-        raise InputError(f"is no whole .glb file: {error}", where=str(path)) from error
-    for uri in _addresses(document):
+        raise InputError(f"is no complete .glb file: {error}", where=str(path)) from error
+    for uri in _uris(document):
         if not (isinstance(uri, str) and uri.startswith("data:")):
-            raise InputError("names another file: it is not shown", where=str(path))
+            raise InputError("refers to another file: it is not shown", where=str(path))
     if _PACKED in document.get("extensionsUsed", []):
         raise InputError(f"uses {_PACKED}: it is not shown", where=str(path))
     return data
@@ -299,17 +294,17 @@ def _document(data: bytes) -> dict[str, Any]:
     size, kind = _CHUNK.unpack_from(data, _HEAD.size)
     start = _HEAD.size + _CHUNK.size
     if magic != _MAGIC or version != 2 or length != len(data):
-        raise ValueError("its header is that of something else")
-    if kind != _JSON or size > min(len(data) - start, _MOST_JSON):
-        raise ValueError("its first part is not what it is made of")
+        raise ValueError("its header is not that of glTF 2")
+    if kind != _JSON or size > min(len(data) - start, _MAX_JSON):
+        raise ValueError("its first chunk is not JSON")
     document = json.loads(data[start : start + size].decode("utf-8"))
     if not isinstance(document, dict):
-        raise ValueError("what it is made of is no object")
+        raise ValueError("its JSON is no object")
     return document
 
 
-def _addresses(document: object) -> Iterator[object]:
-    """Every `uri`, wherever it stands."""
+def _uris(document: object) -> Iterator[object]:
+    """Every `uri` of a document."""
     rest = [document]
     while rest:
         one = rest.pop()

@@ -1,4 +1,4 @@
-"""`mesh.glb` and `objects/NNNN.glb`: the place without its people, and the people."""
+"""Writes models: `mesh.glb`, `objects/NNNN.glb`, and the views that texture their faces."""
 
 import json
 from collections.abc import Sequence
@@ -21,25 +21,26 @@ _SQUARE_CENTIMETRES = 4
 
 
 def write_models(folder: Path, models: Models, n_images: int, quality: int) -> None:
-    """Write models into a new result folder, and beside each what painted its faces.
+    """Writes models into a new result folder, and beside each the views of its faces.
 
     Args:
         folder: of the result; its `objects/` may be there already.
-        models: of the place and of what moved.
+        models: the static surface and the moving objects.
         n_images: of the recording.
         quality: JPEG quality of texture pages; 0: PNG.
     """
     if len(models.textured):
-        write_glb(folder / "mesh.glb", _seen(models.textured), quality)
+        write_glb(folder / "mesh.glb", _lit_if_untextured(models.textured), quality)
         write_faces(folder / "mesh_faces.npz", models.assignment, models.views, n_images, "map")
     objects = folder / "objects"
     if models.objects:
         objects.mkdir(exist_ok=True)
     for one in models.objects:
         name = f"{one.shape.id:04d}"
-        write_glb(objects / f"{name}.glb", _seen(one.textured), quality)
-        painted, views = one.face_views.assignment, one.face_views.views
-        write_faces(objects / f"{name}_faces.npz", painted, views, n_images, "object")
+        write_glb(objects / f"{name}.glb", _lit_if_untextured(one.textured), quality)
+        found = one.face_views
+        path = objects / f"{name}_faces.npz"
+        write_faces(path, found.assignment, found.views, n_images, "object")
         record = {
             "stamp_ns": one.stamp_ns,
             "first_stamp_ns": one.span_ns[0],
@@ -51,22 +52,18 @@ def write_models(folder: Path, models: Models, n_images: int, quality: int) -> N
         (objects / f"{name}.json").write_text(text + "\n", encoding="utf-8")
 
 
-def _seen(model: TexturedMesh) -> TexturedMesh | Mesh:
-    """What no picture shows is lit: its form is seen."""
+def _lit_if_untextured(model: TexturedMesh) -> TexturedMesh | Mesh:
+    """A mesh without pages loses its texture, so that viewers shade it."""
     return model if model.pages else Mesh(model.vertices, model.faces)
 
 
 def write_faces(
-    path: Path,
-    painted: ViewAssignment,
-    views: Sequence[View],
-    n_images: int,
-    frame: str,
+    path: Path, assignment: ViewAssignment, views: Sequence[View], n_images: int, frame: str
 ) -> None:
-    """Write which picture paints each face.
+    """Writes which image textures each face.
 
-    `vertices` (V, 3) metres, `faces` (F, 3), `image` (F,) number of the picture or -1, `p_static`
-    (F,), and `T_camera_map` or `T_camera_object` (N, 4, 4) of all pictures, NaN where not used.
+    `vertices` (V, 3) metres, `faces` (F, 3), `image` (F,) number of the image or -1, `p_static`
+    (F,), and `T_camera_map` or `T_camera_object` (N, 4, 4) of all images, NaN where not used.
     """
     number = np.array([view.image for view in views] + [-1], np.int32)
     poses = np.full((n_images, 4, 4), np.nan)
@@ -75,30 +72,30 @@ def write_faces(
     write_npz(
         path,
         {
-            "vertices": painted.mesh.vertices,
-            "faces": painted.mesh.faces,
-            "image": number[painted.view],
-            "p_static": painted.p_static,
+            "vertices": assignment.mesh.vertices,
+            "faces": assignment.mesh.faces,
+            "image": number[assignment.view],
+            "p_static": assignment.p_static,
             f"T_camera_{frame}": poses,
         },
     )
 
 
 def models_record(models: Models) -> dict[str, Any]:
-    """What `run.json` says of them."""
-    painted = models.assignment
-    areas = painted.mesh.areas()
+    """The entry `models` of `run.json`."""
+    place = models.assignment
+    areas = place.mesh.areas()
 
     def area(of: NDArray[np.bool_]) -> float:
         return round(float(areas[of].sum()), _SQUARE_CENTIMETRES)
 
     points = {} if models.point_colors is None else {"points": dict(models.point_colors.counts)}
-    used = {view.image for k, view in enumerate(models.views) if (painted.view == k).any()}
+    used = {view.image for k, view in enumerate(models.views) if (place.view == k).any()}
     return {
         "faces": len(areas),
         "area": area(np.ones(len(areas), np.bool_)),
-        "area_seen": area(painted.visible),
-        "area_painted": area(painted.view >= 0),
+        "area_seen": area(place.visible),
+        "area_painted": area(place.view >= 0),
         "pictures": {
             "used": len(used),
             "usable": len(models.views),

@@ -12,7 +12,6 @@ import pytest
 import trimesh
 
 import stillmap
-from stillmap.cli import map
 from stillmap.cli.main import main
 from stillmap.core import se2
 from stillmap.core.camera import project
@@ -178,11 +177,11 @@ def test_damaged_pictures_are_told_of_and_others_paint_in_their_place(
     record = json.loads((out / "run.json").read_text())
     told = record["models"]["pictures"]
     assert told["usable"] == n - 2
-    assert told["left_out"] == {"pictures that cannot be read": 2}
+    assert told["left_out"] == {"images that cannot be read": 2}
     first, second = told["unread"]
     assert pictures[1].name in first
     assert pictures[4].name in second
-    assert f"2 pictures are not used, the first: {first}" in record["warnings"]
+    assert f"2 images are not used, the first: {first}" in record["warnings"]
     # what paints is what was left; but for what only those two saw, all is painted as before
     image = np.load(out / "mesh_faces.npz")["image"]
     assert not np.isin(image, (1, 4)).any()
@@ -225,7 +224,7 @@ def test_a_laser_that_tilts_and_pictures_beside_it(rig, tmp_path):
     assert record["area_painted"] > 0.5 * record["area_seen"] > 5.0
     assert spoiled(out, rig / "tilting") < 0.03
     assert "page0" in trimesh.load(out / "mesh.glb").geometry
-    assert "The surface that stands still" in (out / "report.html").read_text()
+    assert "The static surface" in (out / "report.html").read_text()
 
 
 def test_results_in_the_plane_have_none(rig, tmp_path):
@@ -251,7 +250,7 @@ def test_interrupted_on_full_disks_and_gone_on_with(room, result, tmp_path, monk
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(map, "build_models", interrupted)
+        patch.setattr("stillmap.pipeline.models.build_models", interrupted)
         assert main(words) == 130
     assert [path.name for path in tmp_path.iterdir()] == [".out.resume"]
     with monkeypatch.context() as patch:

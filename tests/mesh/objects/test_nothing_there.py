@@ -19,6 +19,6 @@ def test_a_few_lonely_points(room, tmp_path):
     assert main([str(word) for word in words]) == 0
     record = json.loads((out / "run.json").read_text())
     assert record["models"]["faces"] == record["models"]["area"] == 0
-    assert any(one.startswith("no model of the place") for one in record["warnings"])
+    assert any(one.startswith("no mesh of the place") for one in record["warnings"])
     assert not (out / "mesh.glb").exists()
     assert (out / "static.ply").exists()
