@@ -245,8 +245,9 @@ def main() -> None:
     n_hits = int(np.count_nonzero(recording.hit))
     records = []
     for iteration in stillmap.iterate(recording):
-        records.append((iteration.record.number, iteration.record.bound, iteration.record.changed_share))
-        if iteration.record.number == 5:
+        record = iteration.record
+        records.append((record.number, record.bound, record.changed_share))
+        if record.number == 5:
             break
     numbers, bounds, changed = zip(*records, strict=True)
     draw_bound(list(numbers), [b / n_hits for b in bounds], list(changed))

@@ -16,7 +16,7 @@ from stillmap.results.map_npz import changed_cells, write_map_npz
 from stillmap.results.report import maps
 from stillmap.results.report.maps import changes_data
 from stillmap.results.report.page import render_report
-from stillmap.results.save import run_record
+from stillmap.results.run_json import run_record
 
 S = 10**9
 RESOLUTION = 0.1

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from stillmap.core.json import count_skipped, to_jsonable
-from stillmap.results.save import write_run_json
+from stillmap.results.run_json import write_run_json
 
 
 def no_constant(name):
@@ -43,7 +43,8 @@ def test_the_keys_that_scripts_rely_on(tmp_path, result):
     assert isinstance(run["version"], str)
     assert run["input"]["path"] == "logs/hall <1>.clf"
     assert run["options"]["em"] == {"prior": 0.9, "note": result.options.em.note, "seed": None}
-    shown = {"map_mode": "trinary", "map_state": "last"}
+    heights = {"min_obstacle_height": 0.2, "max_obstacle_height": 1.8}
+    shown = {"map_mode": "trinary", "map_state": "last", **heights}
     assert run["options"]["output"] == shown
     assert (run["converged"], run["best_iteration"]) == (True, 3)
     assert run["seconds"] == {"read": 0.21, "em": 7.1, "map": 0.02}

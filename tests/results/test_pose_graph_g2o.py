@@ -18,14 +18,14 @@ def way(scans, rng):
     K = len(scans)
     poses = se2.matrix(*np.cumsum(rng.normal([1, 0.2, 0.4], [0.3, 0.3, 0.5], (K, 3)), axis=0).T)
     pairs = [(k, k + 1) for k in range(K - 1)] + [(0, K - 1), (2, K - 2), (1, K // 2)]
-    relations = []
+    constraints = []
     for i, j in pairs:
         root = rng.normal(size=(3, 3)) * [0.05, 0.02, 0.03]
         covariance = root @ root.T + 1e-5 * np.eye(3)
         noise = se2.matrix(*rng.multivariate_normal(np.zeros(3), covariance))
-        relations.append(Constraint(i, j, se2.inverse(poses[i]) @ poses[j] @ noise, covariance))
-    found = optimize_poses(poses, relations[: K - 1], relations[K - 1 :], None)
-    return PoseGraph(np.array(scans), found, relations)
+        constraints.append(Constraint(i, j, se2.inverse(poses[i]) @ poses[j] @ noise, covariance))
+    found = optimize_poses(poses, constraints[: K - 1], constraints[K - 1 :], None)
+    return PoseGraph(np.array(scans), found, constraints)
 
 
 @pytest.fixture
@@ -35,12 +35,12 @@ def graph():
 
 def all_poses(graph, rng=None, spread=0.0):
     """Poses of all scans, those of keyframes as the graph has them, or moved about."""
-    T = np.tile(se2.matrix(7.0, 7.0, 7.0), (graph.scans[-1] + 5, 1, 1))
-    T[graph.scans] = graph.poses
+    T = np.tile(se2.matrix(7.0, 7.0, 7.0), (graph.keyframes[-1] + 5, 1, 1))
+    T[graph.keyframes] = graph.poses
     if rng is not None:
-        moves = rng.normal(scale=spread, size=(len(graph.scans), 3))
+        moves = rng.normal(scale=spread, size=(len(graph.keyframes), 3))
         moves[0] = 0
-        T[graph.scans] = graph.poses @ se2.matrix(*moves.T)
+        T[graph.keyframes] = graph.poses @ se2.matrix(*moves.T)
     return T
 
 
@@ -77,14 +77,14 @@ def test_what_is_written(tmp_path, graph):
     write_g2o(tmp_path / "graph.g2o", graph, all_poses(graph))
     rows = parsed(tmp_path / "graph.g2o")
     assert set(rows) == {"VERTEX_SE2", "FIX", "EDGE_SE2"}
-    assert [row[0] for row in rows["VERTEX_SE2"]] == graph.scans.tolist()
+    assert [row[0] for row in rows["VERTEX_SE2"]] == graph.keyframes.tolist()
     vertices = np.array(rows["VERTEX_SE2"])[:, 1:]
     np.testing.assert_array_equal(vertices, se2.parameters(graph.poses))
     assert rows["FIX"] == [[0.0]]
-    for row, relation in zip(rows["EDGE_SE2"], graph.relations, strict=True):
-        assert row[:2] == [graph.scans[relation.first], graph.scans[relation.second]]
-        np.testing.assert_array_equal(row[2:5], se2.parameters(relation.T))
-        information = np.linalg.inv(relation.covariance)
+    for row, constraint in zip(rows["EDGE_SE2"], graph.constraints, strict=True):
+        assert row[:2] == [graph.keyframes[constraint.first], graph.keyframes[constraint.second]]
+        np.testing.assert_array_equal(row[2:5], se2.parameters(constraint.T))
+        information = np.linalg.inv(constraint.covariance)
         expected = [information[a, b] for a in range(3) for b in range(a, 3)]
         np.testing.assert_allclose(row[5:], expected, rtol=1e-9)
 
@@ -93,7 +93,7 @@ def test_the_errors_that_g2o_sees_are_ours(tmp_path, graph):
     poses = all_poses(graph, np.random.default_rng(1), 0.3)
     write_g2o(tmp_path / "graph.g2o", graph, poses)
     found = chi2(parsed(tmp_path / "graph.g2o"))
-    expected = squared_mahalanobis(poses[graph.scans], graph.relations)
+    expected = squared_mahalanobis(poses[graph.keyframes], graph.constraints)
     assert expected.min() > 1
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
@@ -102,13 +102,13 @@ def test_gtsam_reads_the_same_errors(tmp_path, graph):
     # small ones: those of GTSAM go along the curve of a turn
     exact = [
         dataclasses.replace(r, T=se2.inverse(graph.poses[r.first]) @ graph.poses[r.second])
-        for r in graph.relations
+        for r in graph.constraints
     ]
-    graph = dataclasses.replace(graph, relations=exact)
+    graph = dataclasses.replace(graph, constraints=exact)
     poses = all_poses(graph, np.random.default_rng(1), 1e-4)
     write_g2o(tmp_path / "graph.g2o", graph, poses)
     factors, values = gtsam.readG2o(str(tmp_path / "graph.g2o"), False)
-    assert factors.size() == len(graph.relations)
+    assert factors.size() == len(graph.constraints)
     errors = [2.0 * factors.at(k).error(values) for k in range(factors.size())]
     np.testing.assert_allclose(errors, chi2(parsed(tmp_path / "graph.g2o")), rtol=1e-2)
 
@@ -121,9 +121,9 @@ def test_gtsam_finds_the_poses_again(tmp_path, graph):
     fixed = gtsam.noiseModel.Isotropic.Sigma(3, 1e-6)
     factors.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(*se2.parameters(poses[0])), fixed))
     found = gtsam.LevenbergMarquardtOptimizer(factors, values).optimize()
-    at = [found.atPose2(int(scan)) for scan in graph.scans]
+    at = [found.atPose2(int(scan)) for scan in graph.keyframes]
     T = se2.matrix(*np.array([[p.x(), p.y(), p.theta()] for p in at]).T)
-    assert np.abs(poses[graph.scans] - graph.poses).max() > 0.05
+    assert np.abs(poses[graph.keyframes] - graph.poses).max() > 0.05
     np.testing.assert_allclose(T, graph.poses, atol=1e-4)
 
 
