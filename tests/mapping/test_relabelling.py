@@ -26,17 +26,17 @@ CHANGES = [change(cells) for cells in LISTED]
 
 @dataclass(frozen=True)
 class Known:
-    """A recording, the cells in which its beams end, what the loop said of them, and courses."""
+    """A recording, the cells in which its beams end, what the loop said of them, and histories."""
 
     seen: Recording
     poses: np.ndarray
     ends: np.ndarray  # (M, 2) cells
     p_static: np.ndarray
     occupied: em.CellProbabilities
-    courses: em.CellHistories
+    histories: em.CellHistories
 
     def relabelled(self, changes=CHANGES, state="last", threads=1, **other):
-        said = {"occupied": self.occupied, "courses": self.courses} | other
+        said = {"occupied": self.occupied, "histories": self.histories} | other
         return relabel_changes(
             self.seen,
             self.poses,
@@ -62,7 +62,7 @@ def known():
     points[~usable] = np.nan
     seen = replace(recording(range(SCANS), BEAMS), points=points, hit=hit & usable)
     surface = build_surfel_map(seen, poses, RESOLUTION)
-    cells = surface.elements()[0]
+    cells = surface.surfels()[0]
     loop = rng.random(M).astype(np.float32)
     loop[~usable] = np.nan
     of_cells, thing, share, covered = rng.random((4, len(cells))).astype(np.float32)
@@ -74,10 +74,10 @@ def known():
         em.CellProbabilities(cells, of_cells, 0.2),
         replace(
             course(cells, True, (10, 12)),
-            p_thing=thing,
+            p_object=thing,
             occupied_share=share,
-            covered=covered,
-            surface=surface,
+            p_in_cell=covered,
+            surfel_map=surface,
         ),
     )
 
@@ -94,7 +94,7 @@ def test_labels_of_beams_that_end_there_are_what_is_shown(known, state):
     there = listed(known.ends) & known.seen.hit
     assert 50 < there.sum() < 400
     of_cell = dict(
-        zip(map(tuple, known.courses.cells.tolist()), known.courses.p_in_map(state), strict=True)
+        zip(map(tuple, known.histories.cells.tolist()), known.histories.p_in_map(state), strict=True)
     )
     shown = np.array([of_cell.get(tuple(cell), np.nan) for cell in known.ends.tolist()], np.float32)
     assert p_static.dtype == np.float32
@@ -107,7 +107,7 @@ def test_the_map_says_there_what_is_shown_as_far_as_it_covers_the_cell(known, st
     _, occupied = known.relabelled(state=state)
     there = listed(known.occupied.cells)
     assert 15 < there.sum() < 30
-    shown = known.courses.p_in_map(state) * known.courses.p_in_cell
+    shown = known.histories.p_in_map(state) * known.histories.p_in_cell
     assert occupied.p_occupied.dtype == np.float32
     np.testing.assert_array_equal(
         occupied.p_occupied, np.where(there, shown, known.occupied.p_occupied)
