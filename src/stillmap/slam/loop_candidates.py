@@ -11,7 +11,6 @@ from stillmap.core.recording import Recording
 from stillmap.slam import motion_model
 from stillmap.slam.options import OdometryOptions
 from stillmap.slam.pose_graph import Constraint
-from stillmap.slam.scan_matching import select_hits
 from stillmap.slam.types import LoopCandidate, LoopClosure, LoopContext
 
 Float = NDArray[np.float64]
@@ -85,7 +84,7 @@ def view_centers(context: LoopContext) -> Float:
     out = np.zeros((len(context.keyframes), 2))
     keyframes = context.recording.iter_scans(context.keyframes.tolist(), context.e)
     for k, t in enumerate(keyframes):
-        scan = select_hits(context.recording, context.e, t)
+        scan = context.hits(t)
         if scan.weights.sum() > 0.0:
             out[k] = np.average(scan.points, axis=0, weights=scan.weights)
     return out

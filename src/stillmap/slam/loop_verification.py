@@ -11,7 +11,7 @@ from stillmap.core import se2
 from stillmap.slam import motion_model, scan_matching
 from stillmap.slam.local_map import KEYFRAME_ANGLE, select_keyframes_per_sensor
 from stillmap.slam.loop_candidates import drift_std
-from stillmap.slam.scan_matching import Points, Scan, add_scan, select_hits, transform_points
+from stillmap.slam.scan_matching import Points, Scan, transform_points
 from stillmap.slam.types import LoopCandidate, LoopClosure, LoopContext
 
 Float = NDArray[np.float64]
@@ -56,12 +56,10 @@ def build_submap(context: LoopContext, center: float) -> _core.OccupancyGrid2D:
     first, last = np.searchsorted(
         context.travelled, [center - SUBMAP_TRAVEL, center + SUBMAP_TRAVEL]
     )
-    grid = _core.OccupancyGrid2D(context.resolution, scan_matching.FREE_SPACE_MARGIN)
     spacing = _SUBMAP_SPACING * context.keyframe_distance, _SUBMAP_SPACING * KEYFRAME_ANGLE
     sensor = context.recording.sensor[first:last]
-    for t in first + select_keyframes_per_sensor(context.poses[first:last], sensor, *spacing):
-        add_scan(grid, context.recording, context.e, t, context.poses[t])
-    return grid
+    scans = first + select_keyframes_per_sensor(context.poses[first:last], sensor, *spacing)
+    return context.build_map(scans)
 
 
 def verify_candidate(
@@ -122,7 +120,7 @@ def _collect_view(context: LoopContext, t: int) -> tuple[Scan, Points]:
     )
     last = max(last - 1, t)
     scans = sorted({min(first, t), t, last})
-    seen = [select_hits(context.recording, context.e, s) for s in scans]
+    seen = [context.hits(s) for s in scans]
     to_t = se2.inverse(context.poses[t]) @ context.poses[scans]
     points = [transform_points(scan.points, T) for scan, T in zip(seen, to_t, strict=True)]
     before = [

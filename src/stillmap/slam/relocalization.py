@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 import stillmap._core as _core
 from stillmap.core import se2
 from stillmap.slam import loop_verification, motion_model, scan_matching
-from stillmap.slam.scan_matching import add_scan, select_hits
 from stillmap.slam.types import Index, LoopCandidate, LoopClosure, LoopContext
 
 Float = NDArray[np.float64]
@@ -94,7 +93,7 @@ def _nearest_stretches(stretches: Float, distance: Float) -> list[float]:
 
 def _range_signature(context: LoopContext, t: int) -> Float:
     """(24,) cumulative range histogram of a scan, which is invariant to rotation."""
-    scan = select_hits(context.recording, context.e, t)
+    scan = context.hits(t)
     ranges = np.linalg.norm(scan.points, axis=1)
     total = np.histogram(ranges, _RANGE_BINS, weights=scan.weights)[0].cumsum()
     shares: Float = total / max(float(total[-1]), 1e-9)
@@ -136,11 +135,8 @@ def _deduplicate(context: LoopContext, closures: list[LoopClosure]) -> list[Loop
 
 def _build_map_before(context: LoopContext, first: int) -> _core.OccupancyGrid2D:
     """Map of the keyframes before scan `first`."""
-    grid = _core.OccupancyGrid2D(context.resolution, scan_matching.FREE_SPACE_MARGIN)
     before = context.keyframes[context.keyframes < first].tolist()
-    for t in context.recording.iter_scans(before, context.e):
-        add_scan(grid, context.recording, context.e, t, context.poses[t])
-    return grid
+    return context.build_map(context.recording.iter_scans(before, context.e))
 
 
 def _count_support(
@@ -150,7 +146,7 @@ def _count_support(
     keyframes = context.keyframes[(context.keyframes >= first) & (context.keyframes < last)]
     fitting = contradicting = 0
     for t in _select_evenly(keyframes, _MAX_TESTED):
-        scan = select_hits(context.recording, context.e, t)
+        scan = context.hits(t)
         prior = motion_model.gaussian_prior(C @ context.poses[t], _SAME_DISTANCE, _SAME_ANGLE)
         match = scan_matching.refine_pose(before, scan, prior, prior.T_map_base)
         occluded = scan_matching.occluded_share(before, scan, match.T_map_base)
@@ -179,9 +175,7 @@ def _offset_beside(context: LoopContext, first: int) -> Float:
     """(3, 3) that moves the scans from `first` on to the right of all earlier ones."""
     max_range = np.array(
         [
-            np.linalg.norm(select_hits(context.recording, context.e, t).points, axis=1).max(
-                initial=0.0
-            )
+            np.linalg.norm(context.hits(t).points, axis=1).max(initial=0.0)
             for t in context.keyframes.tolist()
         ]
     )

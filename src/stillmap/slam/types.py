@@ -1,7 +1,7 @@
 """Results of the M-step, and what the parts of loop closure pass to each other."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core.recording import Recording
+from stillmap.slam import scan_matching
 from stillmap.slam.pose_graph import PoseGraph
+from stillmap.slam.scan_matching import Scan
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -126,3 +128,14 @@ class LoopContext:
     resolution: float
     keyframe_distance: float
     search_distance: float
+
+    def hits(self, t: int) -> Scan:
+        """The hits of scan t."""
+        return scan_matching.select_hits(self.recording, self.e, t)
+
+    def build_map(self, scans: Iterable[int]) -> _core.OccupancyGrid2D:
+        """A map for registration of some of the scans."""
+        grid = _core.OccupancyGrid2D(self.resolution, scan_matching.FREE_SPACE_MARGIN)
+        for t in scans:
+            scan_matching.add_scan(grid, self.recording, self.e, t, self.poses[t])
+        return grid
