@@ -110,7 +110,11 @@ def select_lasers(content: BagContent, options: ReadOptions) -> LaserSelection:
     if not lasers:
         total = SkippedRecords().merge(*skipped.values())
         raise InputError(f"holds no usable laser scan: {total.summary('message')}")
-    lasers, omitted = _drop_duplicates(lasers, options.topic is not None)
+    # most scans first, of equal ones most beams, then by name
+    lasers.sort(key=lambda s: (-s.n_scans, -int(s.lengths[0]), s.topic))
+    sensors = [(s.topic, s.frame, s.n_scans) for s in lasers]
+    order, omitted = drop_duplicates(sensors, "scans", named=options.topic is not None)
+    lasers = [lasers[k] for k in order]
     poses = find_sensor_poses(content, [(s.frame, s.stamp_ns) for s in lasers], options)
     used: list[LaserScans] = []
     T: list[Float] = []
@@ -128,25 +132,30 @@ def select_lasers(content: BagContent, options: ReadOptions) -> LaserSelection:
     return LaserSelection(used, T, poses, skipped, omitted)
 
 
-def _drop_duplicates(lasers: list[LaserScans], named: bool) -> tuple[list[LaserScans], list[str]]:
-    """The lasers in order of their number of scans, and sentences on those that are dropped.
+def drop_duplicates(
+    sensors: list[tuple[str, str, int]], unit: str, *, named: bool
+) -> tuple[list[int], list[str]]:
+    """Keep one topic per sensor: of topics in the same frame the first.
 
-    Of topics in the same frame, which show the same laser, the one with most scans is kept, of
-    equal ones the one with most beams, then the first by name. Topics with few scans are dropped
-    unless the user `named` the topics.
+    Args:
+        sensors: topic, frame and number of scans, in order of preference.
+        unit: of the scans.
+        named: the user named the topics; otherwise topics with few scans are dropped too.
+
+    Returns:
+        Indices of those to use, and sentences on the others.
     """
-    order = sorted(lasers, key=lambda s: (-s.n_scans, -int(s.lengths[0]), s.topic))
-    used: list[LaserScans] = []
+    most = max(n for _, _, n in sensors)
+    used: list[int] = []
     dropped = []
-    for scans in order:
-        same = next((u for u in used if u.frame == scans.frame), None)
-        prefix = f"{scans.topic}: {scans.n_scans} scans"
+    for k, (topic, frame, n) in enumerate(sensors):
+        same = next((sensors[u][0] for u in used if sensors[u][1] == frame), None)
         if same is not None:
-            dropped.append(f"{prefix}, {same.topic} shows the same laser")
-        elif not named and used and scans.n_scans < _MIN_SHARE * used[0].n_scans:
-            dropped.append(f"{prefix} are too few beside {used[0].topic}")
+            dropped.append(f"{topic}: {n} {unit}, {same} shows the same sensor")
+        elif not named and n < _MIN_SHARE * most:
+            dropped.append(f"{topic}: {n} {unit} are too few")
         else:
-            used.append(scans)
+            used.append(k)
     return used, dropped
 
 

@@ -20,7 +20,6 @@ WRONG_SIZE = "cloud whose size is not what it states"
 
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _MAX_STEP = 1 << 16  # bytes of one point
-_MIN_SHARE = 0.25  # of the most frequent sensor's scans: rarer topics are no sensors of their own
 
 
 class Cloud(NamedTuple):
@@ -128,27 +127,3 @@ class CloudCollector:
         self.sensor.append(sensor)
         self.number.append(self._count[topic])
         self.beams.append(len(cloud.points))
-
-
-def select_sensors(clouds: CloudCollector, named: bool) -> tuple[list[int], list[str]]:
-    """The sensors to use, and sentences on those that are dropped.
-
-    Of topics in the same frame, which show the same sensor, the one with most points is kept: the
-    others are derived from it. Topics with few scans are dropped unless the user `named` them.
-    """
-    sensor, beams = np.asarray(clouds.sensor), np.asarray(clouds.beams)
-    names = list(clouds.sensors)
-    scans = [int(np.count_nonzero(sensor == k)) for k in range(len(names))]
-    points = [int(beams[sensor == k].sum()) for k in range(len(names))]
-    used: list[int] = []
-    dropped = []
-    for k in sorted(range(len(names)), key=lambda k: (-points[k], names[k])):
-        same = next((u for u in used if names[u][1] == names[k][1]), None)
-        prefix = f"{names[k][0]}: {scans[k]} clouds"
-        if same is not None:
-            dropped.append(f"{prefix}, {names[same][0]} shows the same sensor")
-        elif not named and scans[k] < _MIN_SHARE * max(scans):
-            dropped.append(f"{prefix} are too few")
-        else:
-            used.append(k)
-    return used, dropped

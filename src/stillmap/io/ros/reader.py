@@ -19,7 +19,7 @@ from stillmap.io.ros.bag_types import Bag, DamagedBagError
 from stillmap.io.ros.collect import BagContent, collect_messages, select_topics
 from stillmap.io.ros.laser_scan import TIME_BACKWARDS
 from stillmap.io.ros.limits import limit_output
-from stillmap.io.ros.point_cloud2 import CloudCollector, select_sensors
+from stillmap.io.ros.point_cloud2 import CloudCollector
 from stillmap.io.text_lines import Progress
 from stillmap.preprocessing.options import ReadOptions
 
@@ -142,8 +142,9 @@ def _build_cloud_recording(
     if not len(clouds.scans):
         total = SkippedRecords().merge(*clouds.skipped.values())
         raise InputError(f"holds no usable cloud: {total.summary('message')}")
-    used, omitted = select_sensors(clouds, options.topic is not None)
     names = list(clouds.sensors)
+    counts = np.bincount(np.asarray(clouds.sensor), minlength=len(names)).tolist()
+    used, omitted = _select_sensors(clouds, counts, named=options.topic is not None)
     stamps = np.asarray(clouds.stamp_ns, np.int64)
     scans = [_select_forward_scans(clouds, names[k][0], k, stamps) for k in used]
     frames = [(names[k][1], stamps[rows]) for k, rows in zip(used, scans, strict=True)]
@@ -151,7 +152,6 @@ def _build_cloud_recording(
     T, selection, warnings = _place_sensors(poses, names, used, scans, options, omitted)
     odom, origin, more = base_frame.find_odometry(content, poses.base, stamps, options)
     skipped = SkippedRecords().merge(*clouds.skipped.values())
-    counts = np.bincount(np.asarray(clouds.sensor), minlength=len(names)).tolist()
     sensors = [
         {"name": topic, "frame": frame, "scans": n}
         for (topic, frame), n in zip(names, counts, strict=True)
@@ -173,6 +173,19 @@ def _build_cloud_recording(
     )
     timed = clouds.timed.intersection(used)
     return recording if timed else dataclasses.replace(recording, beam_time=None)
+
+
+def _select_sensors(
+    clouds: CloudCollector, counts: list[int], *, named: bool
+) -> tuple[list[int], list[str]]:
+    """The sensors to use, most points first: other clouds are derived from these."""
+    names = list(clouds.sensors)
+    sensor, beams = np.asarray(clouds.sensor), np.asarray(clouds.beams)
+    points = [int(beams[sensor == k].sum()) for k in range(len(names))]
+    order = sorted(range(len(names)), key=lambda k: (-points[k], names[k]))
+    candidates = [(*names[k], counts[k]) for k in order]
+    chosen, omitted = base_frame.drop_duplicates(candidates, "clouds", named=named)
+    return [order[k] for k in chosen], omitted
 
 
 def _place_sensors(
