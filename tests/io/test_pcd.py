@@ -90,7 +90,7 @@ def test_names_that_are_no_times(tmp_path, names):
     assert found.stamp_ns.tolist() == [0, 10**9, 2 * 10**9]
     if names[0] == "9":
         assert found.points[:, 0].tolist() == [1, 2, 3]
-    assert any("a second apart" in warning for warning in found.source["warnings"])
+    assert any("one second apart" in warning for warning in found.source["warnings"])
 
 
 @pytest.mark.parametrize(
