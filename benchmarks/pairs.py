@@ -1,6 +1,6 @@
 """Relations between poses: pairs of scans of one place, from the truth or from files beside a log.
 
-As Kuemmerle et al. 2009 judge trajectories, see `stillmap.evaluation.relations`.
+As Kuemmerle et al. 2009 judge trajectories, see `stillmap.eval.relations`.
 """
 
 from pathlib import Path

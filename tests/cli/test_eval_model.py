@@ -254,4 +254,4 @@ def test_records_of_other_pictures_are_refused(result, simulated, capsys) -> Non
 
 def test_a_simulation_without_cameras_is_refused(result, simulated, capsys) -> None:
     assert main(["eval", "model", str(result), str(simulated / "horizontal")]) == 2
-    assert "no truth about pictures" in capsys.readouterr().err
+    assert "no truth about images" in capsys.readouterr().err
