@@ -219,7 +219,10 @@ REFUSED = [
     (f"[a]\n{AHEAD}rpy = [0, 0, 0]\n", "wants 'translation', and one of"),
     ("[a]\ntranslation = [0, 0, 0]\nquaternion = [0, 0, 0, 2]\n", "not of length one"),
     ("[a]\nT_base_camera = [1]\n", "'T_base_camera' wants 4 x 4 numbers"),
-    ("[a]\nT_base_camera = [2, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]\n", "no rotation matrix"),
+    (
+        "[a]\nT_base_camera = [2, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]\n",
+        "no rotation matrix",
+    ),
     ("[a]\nT_base_camera = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 1, 1]\n", "last row of"),
     ("[a]\ntranslation = 3\nT_base_camera = [[1]]\n", "'T_base_camera' wants 4 x 4"),
     ('[a]\ntimes = "b"\n', "'times' is for a 'folder'"),

@@ -165,7 +165,11 @@ def test_pickles_are_never_opened(tmp_path):
     ("name", "change", "what"),
     [
         ("stamp_ns", lambda a: a[::-1].copy(), "stamps decrease"),
-        ("stamp_ns", lambda a: np.where(a == a[1], np.iinfo(np.int64).max, -(2**62)), "stamps decrease"),
+        (
+            "stamp_ns",
+            lambda a: np.where(a == a[1], np.iinfo(np.int64).max, -(2**62)),
+            "stamps decrease",
+        ),
         ("offset", lambda a: a + 1, "rise"),
         ("offset", lambda a: a[[0, 3, 1, 3]], "rise"),
         ("offset", lambda a: np.where(a == 3, np.iinfo(np.int64).min, a), "rise"),

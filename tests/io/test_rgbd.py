@@ -362,9 +362,7 @@ def test_other_folders_are_none_of_these(tmp_path, scenes):
     assert detect_layout(tmp_path) is None
 
 
-@pytest.mark.parametrize(
-    "given", [{"depth_step": 0}, {"depth_scale": 0.0}, {"cameras": " "}]
-)
+@pytest.mark.parametrize("given", [{"depth_step": 0}, {"depth_scale": 0.0}, {"cameras": " "}])
 def test_options_that_cannot_be(given):
     with pytest.raises(ValueError, match=next(iter(given))):
         ReadOptions(**given)
