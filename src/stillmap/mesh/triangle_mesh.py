@@ -51,12 +51,12 @@ class Mesh:
 
     def areas(self) -> Float:
         """(F,) square metres."""
-        return 0.5 * _length(self._cross_products())
+        return 0.5 * row_lengths(self._cross_products())
 
     def normals(self) -> Float:
         """(F, 3) unit vectors towards the sensor, zero for faces without area."""
         cross = self._cross_products()
-        length = _length(cross)
+        length = row_lengths(cross)
         return cross / np.where(length > 0.0, length, 1.0)[:, None]
 
     def _cross_products(self) -> Float:
@@ -109,5 +109,24 @@ def concatenate_meshes(meshes: list[Mesh]) -> Mesh:
     )
 
 
-def _length(vectors: Float) -> Float:
+def cross_columns(a: Float, b: Float) -> Float:
+    """(3, n) cross products of vectors (3, n): operations on long rows are fast."""
+    return np.stack(
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    )
+
+
+def dot_columns(a: Float, b: Float) -> Float:
+    """(n,) dot products of vectors (3, n)."""
+    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
+
+
+def normalize_columns(vectors: Float) -> Float:
+    """(3, n) unit vectors; zero vectors stay."""
+    length = np.sqrt(dot_columns(vectors, vectors))
+    return np.asarray(vectors / np.where(length > 0.0, length, 1.0))
+
+
+def row_lengths(vectors: Float) -> Float:
+    """(n,) lengths of vectors (n, 3)."""
     return np.asarray(np.sqrt(np.einsum("ni,ni->n", vectors, vectors)))

@@ -6,6 +6,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.mesh.triangle_mesh import (
+    cross_columns,
+    dot_columns,
+    normalize_columns,
+    row_lengths,
+)
+
 Bool = NDArray[np.bool_]
 Faces = NDArray[np.int32]
 Float = NDArray[np.float64]
@@ -108,41 +115,33 @@ def filter_faces(points: Float, origin: Float, faces: Faces) -> SurfaceFaces:
     columns, corners = _columns(points), [np.ascontiguousarray(k) for k in faces.T]
     a, b, c = (columns[:, k] for k in corners)
     ab, bc, ca = b - a, c - b, a - c
-    cross, sight = _cross(ca, ab), _columns(origin)[:, corners[0]] - (a + b + c) / 3.0
-    area, range = np.sqrt(_dot(cross, cross)), np.sqrt(_dot(sight, sight))
-    longest = np.sqrt(np.maximum(np.maximum(_dot(ab, ab), _dot(bc, bc)), _dot(ca, ca)))
-    facing = _dot(cross, sight)
+    cross, sight = cross_columns(ca, ab), _columns(origin)[:, corners[0]] - (a + b + c) / 3.0
+    area, range = np.sqrt(dot_columns(cross, cross)), np.sqrt(dot_columns(sight, sight))
+    longest = np.sqrt(
+        np.maximum(np.maximum(dot_columns(ab, ab), dot_columns(bc, bc)), dot_columns(ca, ca))
+    )
+    facing = dot_columns(cross, sight)
     # counter-clockwise as seen from the sensor
     away = facing < 0.0
     faces = np.column_stack(
         [np.where(away, corners[2], corners[0]), corners[1], np.where(away, *corners[::2])]
     )
     cosine = np.abs(facing) / np.maximum(area * range, 1e-300)
-    level = has_equal_ranges(_length(origin - points), faces)
+    level = has_equal_ranges(row_lengths(origin - points), faces)
     limit = np.minimum(_MAX_EDGE, _MAX_EDGE_SHARE * range)
     kept = (longest <= limit) & (level | (cosine >= np.cos(_MAX_INCIDENCE))) & (area > 0.0)
     faces, cosine = faces[kept], cosine[kept]
     normals = cross[:, kept] * (np.where(away, -1.0, 1.0) / np.maximum(area, 1e-300))[kept]
     steep = np.flatnonzero((cosine < np.cos(_STEEP)) & ~level[kept])
     at_points = vertex_normals(normals, faces, len(points), 0)
-    along = [_dot(at_points[:, faces[steep, k]], normals[:, steep]) for k in (0, 1, 2)]
+    along = [dot_columns(at_points[:, faces[steep, k]], normals[:, steep]) for k in (0, 1, 2)]
     fits = np.ones(len(faces), np.bool_)
     # at two corners: the third may lie in the corner of a room
     fits[steep] = _median_of_three(*along) >= np.cos(_MAX_BEND)
     faces, normals = faces[fits], normals[:, fits]
     smooth = vertex_normals(normals, faces, len(points), _SMOOTHING_ROUNDS)
-    standoff = _dot(smooth, _columns(origin - points))
+    standoff = dot_columns(smooth, _columns(origin - points))
     return SurfaceFaces(faces.astype(np.int32), np.where(np.isfinite(standoff), standoff, 0.0))
-
-
-def _cross(a: Float, b: Float) -> Float:
-    return np.stack(
-        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-    )
-
-
-def _dot(a: Float, b: Float) -> Float:
-    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
 def _median_of_three(a: Float, b: Float, c: Float) -> Float:
@@ -190,7 +189,7 @@ def vertex_normals(normals: Float, faces: Faces, n: int, rounds: int) -> Float:
     a, b, c = (np.ascontiguousarray(k) for k in faces.T)
     out = _average_at_points(normals, corner, n)
     for _ in range(rounds):
-        mean = _normalize(np.stack([x[a] + x[b] + x[c] for x in out]))
+        mean = normalize_columns(np.stack([x[a] + x[b] + x[c] for x in out]))
         out = _average_at_points(mean, corner, n)
     return out
 
@@ -199,16 +198,7 @@ def _average_at_points(normals: Float, corner: Index, n: int) -> Float:
     out = np.empty((3, n))
     for d, along in enumerate(normals):
         out[d] = np.bincount(corner, np.repeat(along, 3), n)
-    return _normalize(out)
-
-
-def _normalize(vectors: Float) -> Float:
-    length = np.sqrt(_dot(vectors, vectors))
-    return np.asarray(vectors / np.where(length > 0.0, length, 1.0))
-
-
-def _length(vectors: Float) -> Float:
-    return np.asarray(np.sqrt(np.einsum("ni,ni->n", vectors, vectors)))
+    return normalize_columns(out)
 
 
 def split_rows(directions: Float) -> Rows | None:

@@ -136,8 +136,7 @@ def test_the_limit_is_no_narrower_than_needed(model, distortion):
     r, around = np.tan(limit + np.radians([0.1, 0.12])), np.linspace(0.0, 2.0 * np.pi, 64)
     u = np.column_stack([np.cos(around), np.sin(around)])
     a, b = (
-        camera_module._distort(camera_module._lens(camera(model, distortion)), one * u)
-        for one in r
+        camera_module._distort(camera_module._lens(camera(model, distortion)), one * u) for one in r
     )
     assert (np.sum((b - a) * u, axis=1) < 1e-6).any()
 

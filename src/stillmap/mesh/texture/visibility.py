@@ -15,7 +15,7 @@ from scipy import ndimage
 import stillmap._core as _core
 from stillmap.core.camera import Camera, project, unproject
 from stillmap.mesh.texture.views import View
-from stillmap.mesh.triangle_mesh import Mesh
+from stillmap.mesh.triangle_mesh import Mesh, cross_columns, dot_columns, normalize_columns
 
 Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -204,22 +204,13 @@ def _max_view_tangent(camera: Camera) -> float:
 def _view_cosines(corners: Float) -> Float32:
     """(n,) of the angle between normals and lines of sight, for corners (3, 3, n)."""
     normal, center = _face_normals(corners), corners.sum(axis=0) / 3.0
-    dot, length = -_dot(center, normal), np.sqrt(_dot(center, center))
+    dot, length = -dot_columns(center, normal), np.sqrt(dot_columns(center, center))
     return np.asarray(dot / np.where(length > 0.0, length, 1.0), np.float32)
 
 
 def _face_normals(corners: Float) -> Float:
     """(3, n) unit vectors, zero for faces without area."""
-    a, b = corners[1] - corners[0], corners[2] - corners[0]
-    normal = np.stack(
-        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-    )
-    length = np.sqrt(_dot(normal, normal))
-    return np.asarray(normal / np.where(length > 0.0, length, 1.0))
-
-
-def _dot(a: Float, b: Float) -> Float:
-    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
+    return normalize_columns(cross_columns(corners[1] - corners[0], corners[2] - corners[0]))
 
 
 def _pixel_areas(uv: Float, faces: NDArray[np.int32]) -> Float32:
@@ -281,7 +272,7 @@ def _passes_depth_test(buffer: DepthBuffer, around: Float32, points: Float, norm
     inside = (u >= 0) & (v >= 0) & (u < w) & (v < h)
     at = np.clip(v, 0, h - 1) * w + np.clip(u, 0, w - 1)
     z = points[2]
-    along = np.abs(_dot(normals, points)) / z
+    along = np.abs(dot_columns(normals, points)) / z
     slope = np.abs(normals[0]) / buffer.K[0, 0] + np.abs(normals[1]) / buffer.K[1, 1]
     rise = z * slope / np.maximum(along, 1e-6)
     allowed = _DEPTH_TOLERANCE + _RELATIVE_TOLERANCE * z
