@@ -225,7 +225,7 @@ def test_poses_and_pictures_are_shown_where_there_are_any(path, tmp_path, capsys
     assert "front, 3 of 8 x 6 pixels, calibrated and placed" in out
     assert "rear, 2 of 80 x 60 pixels, uncalibrated" in out
     assert "5, 0 of them usable" in out
-    assert "left out        5: of a recording in 2D" in out
+    assert "left out        5: of a 2D recording" in out
     run(tmp_path / "rec", "--json")
     found = json.loads(capsys.readouterr().out)
     assert found["recorded_poses"]["path_length_m"] == pytest.approx(7.0)
