@@ -11,11 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.sim.geometry import BOX, ELLIPSOID
+from stillmap.sim.lidar import make_pose
 
 Float = NDArray[np.float64]
 Color = NDArray[np.uint8]
 
-_TURNED = (0.5257, 0.4142, 0.7321)  # rad, roll, pitch, yaw of the lattices
+# rotation of the lattices
+_LATTICE = make_pose(np.zeros(3), *np.array([0.5257, 0.4142, 0.7321]))[:3, :3]
 _TILE, _CHIP, _STRIPE = 0.55, 0.17, 0.09  # m
 _FLOOR = 0.07  # m, height of skirtings
 _CHIPS, _STRIPES, _DRIFT = 0.10, 0.05, 0.08  # relative contrast
@@ -83,7 +85,7 @@ def compute_static_color(points: Float, seed: int, blur: Float | float = 0.0) ->
         blur: metres, (n,) or one for all: finer patterns are averaged, as within a distant pixel.
     """
     x, y, z = points.T
-    q = points @ _rotation(*_TURNED).T
+    q = points @ _LATTICE.T
     blur = np.broadcast_to(blur, x.shape)
     tile = _hash(np.floor(q / _TILE), seed)
     base = np.where((z > _FLOOR)[:, None], _WALLS[tile % 16], _FLOORS[tile % 8])
@@ -194,14 +196,3 @@ def _hash(cell: Float, seed: int) -> NDArray[np.uint32]:
     for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35)):
         h = (h ^ (h >> np.uint32(shift))) * np.uint32(factor)
     return np.asarray(h ^ (h >> np.uint32(16)))
-
-
-def _rotation(roll: float, pitch: float, yaw: float) -> Float:
-    (a, b, c), (u, v, w) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
-    return np.array(
-        [
-            [c * b, c * v * u - w * a, c * v * a + w * u],
-            [w * b, w * v * u + c * a, w * v * a - c * u],
-            [-v, b * u, b * a],
-        ]
-    )

@@ -67,15 +67,7 @@ def cast_rays(
         ground: the ground.
         ceiling: metres above it; None: open sky.
     """
-    range = ground.distance(rays.origin, rays.direction)
-    if ground.kerb > 0 and len(ground.pavements):
-        upper = ground.distance(rays.origin, rays.direction, ground.kerb)
-        with np.errstate(invalid="ignore"):
-            x, y = (rays.origin + upper * rays.direction)[:2]
-        np.copyto(range, upper, where=ground.is_paved(x, y))
-    if ceiling is not None:
-        np.minimum(range, ground.distance(rays.origin, rays.direction, ceiling), out=range)
-    range[range < MIN_RANGE] = np.inf
+    range = intersect_ground(rays.origin, rays.direction, ground, ceiling)
     mover = np.full(range.shape, -1, np.int32)
     on_glass = np.zeros(range.shape, bool)
     for k, columns, channels in _windows_of_faces(rays, faces, ground):
@@ -94,6 +86,22 @@ def cast_rays(
             mover[columns, channels][nearer] = group.mover[k]
             on_glass[columns, channels][nearer] = False
     return RayReturns(range, mover, on_glass)
+
+
+def intersect_ground(
+    origin: Float, direction: Float, ground: Ground, ceiling: float | None
+) -> Float:
+    """(...) metres along rays to street, pavements and ceiling; inf: no intersection."""
+    range = ground.distance(origin, direction)
+    if ground.kerb > 0 and len(ground.pavements):
+        upper = ground.distance(origin, direction, ground.kerb)
+        with np.errstate(invalid="ignore"):
+            x, y = (origin + upper * direction)[:2]
+        np.copyto(range, upper, where=ground.is_paved(x, y))
+    if ceiling is not None:
+        np.minimum(range, ground.distance(origin, direction, ceiling), out=range)
+    range[range < MIN_RANGE] = np.inf
+    return range
 
 
 def intersect_face(origin: Float, direction: Float, ends: Float, z: Float, ground: Ground) -> Float:

@@ -91,7 +91,7 @@ def render(
     R, at = T_world_camera[:3, :3], T_world_camera[:3, 3]
     direction = np.einsum("ij,jhw->ihw", R, lens.direction)
     origin = np.ascontiguousarray(at[:, None, None])
-    range = _intersect_ground(origin, direction, ground, ceiling)
+    range = ray_casting.intersect_ground(origin, direction, ground, ceiling)
     part = np.where(np.isinf(range), np.int32(NOTHING), np.int32(STATIC))
     groups = (still, moving)
     things = [*_visible_faces(lens, T_world_camera, faces, ground)]
@@ -113,22 +113,6 @@ def render(
         before[nearer] = t[nearer]
         part[rows, columns][nearer] = what
     return RenderedImage(range, part)
-
-
-def _intersect_ground(
-    origin: Float, direction: Float, ground: Ground, ceiling: float | None
-) -> Float:
-    """(h, w) metres to street, pavements and ceiling."""
-    range = ground.distance(origin, direction)
-    if ground.kerb > 0 and len(ground.pavements):
-        upper = ground.distance(origin, direction, ground.kerb)
-        with np.errstate(invalid="ignore"):
-            x, y = (origin + upper * direction)[:2]
-        np.copyto(range, upper, where=ground.is_paved(x, y))
-    if ceiling is not None:
-        np.minimum(range, ground.distance(origin, direction, ceiling), out=range)
-    range[range < ray_casting.MIN_RANGE] = np.inf
-    return range
 
 
 def _visible_faces(
