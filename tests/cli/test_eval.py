@@ -304,7 +304,7 @@ def test_labels_of_another_recording_are_refused(capsys, simulated, result):
     stamps = np.load(path)
     stamps[5] += 1
     np.save(path, stamps)
-    assert "scan 5 is another one" in refusal(capsys, "labels", result, simulated)
+    assert "scan 5 differs" in refusal(capsys, "labels", result, simulated)
 
 
 @pytest.mark.parametrize(

@@ -106,15 +106,16 @@ def test_another_state_is_refused(stillmap, moved, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("state", "seen"), [("last", "as it was last seen"), ("majority", "as it was most")]
+    ("state", "shown"),
+    [("last", "in its last state"), ("majority", "in the state that it was in for longest")],
 )
-def test_it_says_how_many_places_changed(moved, tmp_path, capsys, state, seen):
+def test_it_says_how_many_places_changed(moved, tmp_path, capsys, state, shown):
     words = ["map", moved, "-o", tmp_path / "out", "--map-state", state]
     words += ["--poses", moved / "truth/trajectory.tum"]
     assert main([str(word) for word in words]) == 0
     n = len(json.loads((tmp_path / "out/run.json").read_text())["changes"])
     assert n >= 1
-    places = "1 place changed meanwhile, the map shows it" if n == 1 else f"{n} places changed"
+    places = "1 place changed, the map shows it" if n == 1 else f"{n} places changed"
     said = capsys.readouterr().err
     assert places in said
-    assert seen in said
+    assert shown in said

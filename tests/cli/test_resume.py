@@ -31,9 +31,7 @@ def contents(folder) -> dict[str, bytes]:
         del run[name]
     for iteration in run["iterations"]:
         del iteration["seconds"]
-    report = re.sub(
-        rb"Run time and memory.*?</section>", b"", out["report.html"], flags=re.S
-    )
+    report = re.sub(rb"Run time and memory.*?</section>", b"", out["report.html"], flags=re.S)
     report = re.sub(rb"<div><dt>(Run time|Peak memory)</dt>.*?</div>", b"", report)
     report = re.sub(rb"<td[^<>]*>[0-9.,]+ (ms|s|min)</td>", b"", report)
     return {**out, "run.json": json.dumps(run).encode(), "report.html": report}

@@ -25,7 +25,8 @@ def test_citation_and_changelog_name_the_version():
 
 
 @pytest.mark.parametrize(
-    "page", sorted(str(p.relative_to(ROOT)) for p in [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
+    "page",
+    sorted(str(p.relative_to(ROOT)) for p in [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")]),
 )
 def test_links_lead_somewhere(page):
     links = re.findall(r"\]\((?!\w+:|#)([^)#]+)", (ROOT / page).read_text())
