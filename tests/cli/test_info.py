@@ -260,12 +260,12 @@ def test_ranges_of_huge_recordings_are_those_of_a_sample(monkeypatch, few):
         sensor=np.zeros(400, np.int32),
         T_odom_base=None,
     )
-    exact = module.facts(recording)
+    exact = module.summarize_recording(recording)
     assert exact["hit_ranges_m"]["max"] == pytest.approx(points.max(), abs=1e-4)
     monkeypatch.setattr(module, "_SAMPLED", 2000)
     monkeypatch.setattr(module, "_FEW", few)
     assert len(module._hit_ranges(recording)) <= 2000
-    sampled = module.facts(recording)
+    sampled = module.summarize_recording(recording)
     assert sampled["hit_ranges_m"]["median"] == pytest.approx(6.0, abs=0.3)
     assert sampled["counts"] == exact["counts"]
 

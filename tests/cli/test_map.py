@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from maps import FILES, QUICK, files_in
+from maps import FILES, QUICK, list_files
 from refusals import refused
 
 from stillmap.io import read, write
@@ -41,7 +41,7 @@ def mapped(stillmap, room, tmp_path_factory):
 
 def test_writes_the_files_of_the_contract(mapped):
     out, _ = mapped
-    assert files_in(out) >= FILES
+    assert list_files(out) >= FILES
     T = len(np.load(out / "beams/stamp_ns.npy"))
     p_static = np.load(out / "beams/p_static.npy", mmap_mode="r")
     hit = np.load(out / "beams/hit.npy", mmap_mode="r")

@@ -4,7 +4,7 @@ import os
 import shutil
 
 import pytest
-from maps import ENDLESS, FILES, QUICK, files_in
+from maps import ENDLESS, FILES, QUICK, list_files
 from refusals import refused
 
 
@@ -15,12 +15,12 @@ def test_a_folder_with_something_in_it_is_refused(call, room, tmp_path):
     refused(call("map", room, "-o", out, *QUICK), out, "--overwrite")
     for more in ("--overwrite", "--resume"):  # only results are replaced
         refused(call("map", room, "-o", out, more, *QUICK), out, "run.json")
-    assert files_in(out) == {"mine.txt"}
+    assert list_files(out) == {"mine.txt"}
     (out / "run.json").write_text("")
     done = call("map", room, "-o", out, "--overwrite", *QUICK)
     assert done.returncode == 0
-    assert files_in(out) >= FILES
-    assert "mine.txt" not in files_in(out)
+    assert list_files(out) >= FILES
+    assert "mine.txt" not in list_files(out)
 
 
 def test_the_recording_is_not_written_over(call, room, tmp_path):
@@ -28,19 +28,19 @@ def test_the_recording_is_not_written_over(call, room, tmp_path):
     shutil.copytree(room, recording)
     (tmp_path / "in" / "run.json").write_text("")
     (recording / "run.json").write_text("")  # as if they were results, too
-    before = files_in(recording)
+    before = list_files(recording)
     for given in (recording, recording / "recording.json"):
         done = call("map", given, "-o", recording, "--overwrite", *QUICK)
         refused(done, "is the recording itself")
     for more in ("--overwrite", "--resume"):
         refused(call("map", recording, "-o", tmp_path / "in", more, *QUICK), "holds the recording")
-    assert files_in(recording) == before
+    assert list_files(recording) == before
 
 
 def test_an_empty_folder_will_do(call, room, tmp_path, nothing_left):
     (tmp_path / "out").mkdir()
     assert call("map", room, "-o", tmp_path / "out", *QUICK).returncode == 0
-    assert files_in(tmp_path / "out") >= FILES
+    assert list_files(tmp_path / "out") >= FILES
     nothing_left("out")
 
 

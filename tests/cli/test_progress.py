@@ -5,7 +5,7 @@ import time
 import pytest
 
 from stillmap.cli import console as module
-from stillmap.cli.console import shown_progress
+from stillmap.cli.console import show_progress
 
 
 @pytest.fixture
@@ -29,7 +29,7 @@ def lines(monkeypatch):
 
 def test_long_steps_are_told_of_again_and_again(lines):
     said, another = lines
-    with shown_progress(False, 6) as progress:
+    with show_progress(False, 6) as progress:
         assert another("preparing: ").endswith("s so far")
         progress("mapping", 1, 20, 80)
         assert "mapping, iteration 1 of at most 6: 20 of 80 scans, " in another("20 of 80")
@@ -52,7 +52,7 @@ def test_long_steps_are_told_of_again_and_again(lines):
 def test_an_iteration_is_told_of_once_where_it_is_short(lines, monkeypatch):
     monkeypatch.setattr(module, "_EVERY", 1000.0)
     said, _ = lines
-    with shown_progress(False, 3) as progress:
+    with show_progress(False, 3) as progress:
         for iteration in (1, 2):
             for what in ("mapping", "mapping again"):
                 for done in range(1, 4):
@@ -67,7 +67,7 @@ def test_an_iteration_is_told_of_once_where_it_is_short(lines, monkeypatch):
 
 def test_quiet(lines):
     said, _ = lines
-    with shown_progress(True, 3) as progress:
+    with show_progress(True, 3) as progress:
         progress("mapping", 1, 3, 3)
         time.sleep(0.1)
     assert said == []

@@ -6,7 +6,7 @@ import subprocess
 import time
 
 import pytest
-from maps import ENDLESS, FILES, QUICK, files_in
+from maps import ENDLESS, FILES, QUICK, list_files
 
 
 def test_who_listens_to_the_progress_may_leave(start, room, tmp_path):
@@ -18,7 +18,7 @@ def test_who_listens_to_the_progress_may_leave(start, room, tmp_path):
     assert "iteration 1" in process.stderr.readline()
     process.stderr.close()
     assert process.wait(60) == 0
-    assert files_in(tmp_path / "out") >= FILES
+    assert list_files(tmp_path / "out") >= FILES
     process.stdout.close()
 
 
@@ -73,14 +73,14 @@ def test_stopped_while_writing_nothing_stays_behind(
             break
         # the signal came when everything had been written: all of it stands there
         assert got in (0, status)
-        assert files_in(tmp_path / "out") >= FILES
+        assert list_files(tmp_path / "out") >= FILES
         nothing_left("out")
         shutil.rmtree(tmp_path / "out")
     else:
         pytest.skip("this machine is too busy to send a signal in time")
     assert got == status
     nothing_left(".out.resume")
-    assert files_in(tmp_path / ".out.resume") >= {"lock", "iteration-1/state.json"}
+    assert list_files(tmp_path / ".out.resume") >= {"lock", "iteration-1/state.json"}
     assert list((tmp_path / ".out.resume").glob(".out.*")) == []
 
 
@@ -90,7 +90,7 @@ def test_killed_while_writing_all_or_nothing_stands_there(start, room, tmp_path,
     process = start("map", room, "-o", out, "--quiet", *QUICK)
     status = stopped_while_writing(process, tmp_path, signal.SIGKILL, delay)
     assert status in (-signal.SIGKILL, 0)
-    assert not out.exists() or files_in(out) >= FILES
+    assert not out.exists() or list_files(out) >= FILES
 
 
 def test_killed_while_overwriting_the_old_result_or_the_new_stands_there(start, room, tmp_path):
@@ -100,7 +100,7 @@ def test_killed_while_overwriting_the_old_result_or_the_new_stands_there(start, 
     process = start("map", room, "-o", out, "--overwrite", "--quiet", *QUICK)
     status = stopped_while_writing(process, tmp_path, signal.SIGKILL)
     assert status in (-signal.SIGKILL, 0)
-    assert files_in(out) == {"run.json"} or files_in(out) >= FILES
+    assert list_files(out) == {"run.json"} or list_files(out) >= FILES
 
 
 GREEDY = """
@@ -114,9 +114,9 @@ except BaseException:
 PROGRAM = """
 import signal, sys, time
 signal.signal(signal.SIGINT, signal.default_int_handler)  # it may be ignored where tests run
-from stillmap.cli.console import hear_signals
+from stillmap.cli.console import handle_signals
 def command():
-    hear_signals(command.__code__)
+    handle_signals(command.__code__)
     exec("import greedy")
     print("imported")
     while True:
@@ -141,10 +141,10 @@ import signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)  # it may be ignored where tests run
 from pathlib import Path
 import numpy as np
-from stillmap.cli.console import hear_signals
+from stillmap.cli.console import handle_signals
 from stillmap.results.export import point_cloud, point_cloud_files
 def command():
-    hear_signals(command.__code__)
+    handle_signals(command.__code__)
     points = np.random.default_rng(1).normal(size=(50_000, 3))
     block = point_cloud.Block(points, np.ones(50_000, "f4"), None)
     def endless():
@@ -179,7 +179,7 @@ def test_a_signal_waits_for_points_to_be_packed(tmp_path, command):
 def test_ctrl_c_stays_ignored_in_the_background_of_a_script(command):
     program = (
         "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
-        "from stillmap.cli.console import hear_signals\n"
-        "hear_signals(hear_signals.__code__); signal.raise_signal(signal.SIGINT)\n"
+        "from stillmap.cli.console import handle_signals\n"
+        "handle_signals(handle_signals.__code__); signal.raise_signal(signal.SIGINT)\n"
     )
     assert subprocess.run([command[0], "-c", program], timeout=50).returncode == 0

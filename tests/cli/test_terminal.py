@@ -6,7 +6,7 @@ import re
 import pytest
 from maps import ENDLESS
 
-from stillmap.cli.console import coloured, is_terminal, painted
+from stillmap.cli.console import colorize, is_terminal, uses_color
 
 VARIABLES = ("NO_COLOR", "FORCE_COLOR", "CLICOLOR_FORCE", "TERM")
 RED, PLAIN = "\x1b[1;31m", "\x1b[0m"
@@ -38,14 +38,14 @@ def test_who_gets_colours(monkeypatch, environment, on_terminal, elsewhere):
         monkeypatch.delenv(name, raising=False)
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
-    assert coloured(Terminal()) == on_terminal
-    assert coloured(io.StringIO()) == elsewhere
-    assert painted("no", "error", Terminal()) == (f"{RED}no{PLAIN}" if on_terminal else "no")
+    assert uses_color(Terminal()) == on_terminal
+    assert uses_color(io.StringIO()) == elsewhere
+    assert colorize("no", "error", Terminal()) == (f"{RED}no{PLAIN}" if on_terminal else "no")
 
 
 def test_a_stream_that_was_closed_is_no_terminal():
     assert not is_terminal(None)
-    assert painted("no", "error", None) == "no"
+    assert colorize("no", "error", None) == "no"
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ import corpus_images
 import numpy as np
 import parts
 
-from stillmap.cli.recording_info import facts
+from stillmap.cli.recording_info import summarize_recording
 from stillmap.core.config import load_toml, override
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
@@ -72,7 +72,7 @@ def _check_recording(recording: Recording) -> None:
     for T in (recording.T_odom_base, recording.T_recorded_base):
         assert T is None or np.isfinite(T).all()
     assert recording.beam_time is None or np.isfinite(recording.beam_time).all()
-    facts(recording)
+    summarize_recording(recording)
     images = recording.images
     for image in range(min(len(images), 4) if images is not None else 0):
         try:

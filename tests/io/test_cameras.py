@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from stillmap.cli.recording_info import facts
+from stillmap.cli.recording_info import summarize_recording
 from stillmap.core.errors import InputError
 from stillmap.io import read, write
 from stillmap.io.camera_file import read_camera_file as read_file
@@ -59,8 +59,8 @@ def with_cameras(drive, path):
 def test_what_a_recording_lacks(drive, file):
     plain = read(drive)
     assert plain.images.cameras[0].K is None
-    assert facts(plain)["images"]["usable"] == 0
-    assert facts(plain)["images"]["left_out"] == {"a camera without calibration": 4}
+    assert summarize_recording(plain)["images"]["usable"] == 0
+    assert summarize_recording(plain)["images"]["left_out"] == {"a camera without calibration": 4}
     text = f'model = "plumb_bob"\ndistortion = [-0.1, 0.01, 0.001, 0]\n{AHEAD}'
     found = with_cameras(drive, file(f"[image_2]\n{LENS}{text}"))
     (camera,) = found.images.cameras
@@ -71,8 +71,8 @@ def test_what_a_recording_lacks(drive, file):
     T = [[0, 0, 1, 0.2], [-1, 0, 0, 0], [0, -1, 0, 0.5], [0, 0, 0, 1]]
     np.testing.assert_allclose(camera.T_base_camera, T, atol=1e-12)
     np.testing.assert_array_equal(found.images.stamp_ns, plain.images.stamp_ns)
-    assert facts(found)["images"]["usable"] == 4
-    assert facts(found)["images"]["cameras"][0]["usable"] == 4
+    assert summarize_recording(found)["images"]["usable"] == 4
+    assert summarize_recording(found)["images"]["cameras"][0]["usable"] == 4
 
 
 def test_it_goes_before_what_the_recording_says(drive, file):
@@ -153,7 +153,9 @@ def test_cameras_and_pictures_that_are_not_there(drive, file, more, text, what):
 
 
 def warned(recording) -> list[str]:
-    return [text for text in facts(recording)["warnings"] if "principal point" in text]
+    return [
+        text for text in summarize_recording(recording)["warnings"] if "principal point" in text
+    ]
 
 
 @pytest.mark.parametrize(
@@ -166,7 +168,9 @@ def test_a_centre_outside_of_the_pictures_is_doubted(drive, file, old, new, at):
     (said,) = warned(found)
     assert said.startswith(f"camera 'image_2': its principal point, {at}, lies outside images")
     assert " 16 x 12 pixels" in said
-    assert facts(found)["images"]["usable"] == 4  # parts of larger pictures may have such
+    assert (
+        summarize_recording(found)["images"]["usable"] == 4
+    )  # parts of larger pictures may have such
 
 
 def test_a_centre_that_the_recording_has_wrong_is_doubted_once(drive, tmp_path):

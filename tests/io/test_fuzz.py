@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stillmap.cli.recording_info import facts
+from stillmap.cli.recording_info import summarize_recording
 from stillmap.core.errors import InputError
 from stillmap.io import read
 
@@ -66,7 +66,7 @@ def require_valid(content):
     assert not np.isinf(recording.points).any()
     assert np.isfinite(recording.T_base_sensor).all()
     assert recording.T_odom_base is None or np.isfinite(recording.T_odom_base).all()
-    assert facts(recording)["scans"] == recording.n_scans
+    assert summarize_recording(recording)["scans"] == recording.n_scans
 
 
 @settings(max_examples=300, deadline=None)

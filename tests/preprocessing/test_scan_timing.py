@@ -8,7 +8,7 @@ import pytest
 
 from stillmap import slam
 from stillmap.cli.main import main
-from stillmap.cli.recording_info import facts
+from stillmap.cli.recording_info import summarize_recording
 from stillmap.core import config
 from stillmap.core.errors import InputError
 from stillmap.io import read, stillmap_folder, writers
@@ -111,7 +111,7 @@ def test_raw_drives_of_kitti_turn_clockwise(tmp_path, timeless):
     (tmp_path / "a" / "velodyne").rename(tmp_path / "raw" / "velodyne_points" / "data")
     (tmp_path / "a" / "times.txt").rename(tmp_path / "raw" / "velodyne_points" / "timestamps.txt")
     drive = read(tmp_path / "raw")
-    assert facts(drive)["spin"] == "clockwise"
+    assert summarize_recording(drive)["spin"] == "clockwise"
     x, y, _ = drive.points.T
     left = np.abs(np.arctan2(y, x) - math.pi / 2) < 0.02
     np.testing.assert_allclose(drive.beam_time[left], -0.025, atol=0.001)

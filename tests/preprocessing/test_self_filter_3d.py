@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stillmap.cli.main import main
-from stillmap.cli.recording_info import facts
+from stillmap.cli.recording_info import summarize_recording
 from stillmap.core.recording import Recording
 from stillmap.io import read, stillmap_folder, writers
 from stillmap.preprocessing import self_filter
@@ -47,7 +47,7 @@ def test_a_car_that_sees_its_roof(drive):
 
 def test_what_was_found_is_noted(drive):
     out = self_filter.remove_self_returns(drive.recording)
-    (noted,) = facts(out)["self_filter"]
+    (noted,) = summarize_recording(out)["self_filter"]
     assert noted["beams"] == np.count_nonzero(drive.recording.hit & ~out.hit)
     np.testing.assert_allclose(noted["low"], [-2.0, -0.85, -0.35], atol=0.25)
     np.testing.assert_allclose(noted["high"], [2.0, 0.85, -0.35], atol=0.25)
@@ -152,4 +152,4 @@ def test_info_says_so(tmp_path, drive, capsys):
 @pytest.mark.parametrize("noted", [3, [4], [{}], [{"sensor": 0, "beams": 1, "low": 2, "high": []}]])
 def test_odd_notes_are_not_shown(drive, noted):
     odd = replace(drive.recording, source={"self_filter": noted})
-    assert facts(odd)["self_filter"] == []
+    assert summarize_recording(odd)["self_filter"] == []

@@ -107,7 +107,7 @@ def read_changes(args: argparse.Namespace) -> dict[str, Any]:
 
 
 @contextmanager
-def parents_made(output: Path) -> Iterator[None]:
+def make_parents(output: Path) -> Iterator[None]:
     """Makes the folders above an output that are not there; they go again where the block fails.
 
     Raises:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 _STYLES = {"error": "1;31", "warning": "33"}  # bold red, yellow
 
 
-def coloured(stream: IO[str]) -> bool:
+def uses_color(stream: IO[str]) -> bool:
     """Whether to write colours: as NO_COLOR, FORCE_COLOR, CLICOLOR_FORCE and TERM say."""
     if os.environ.get("NO_COLOR"):
         return False
@@ -45,9 +45,9 @@ def is_terminal(stream: IO[str] | None) -> bool:
     return stream is not None and stream.isatty() and os.environ.get("TERM") != "dumb"
 
 
-def painted(text: str, style: str, stream: IO[str] | None) -> str:
+def colorize(text: str, style: str, stream: IO[str] | None) -> str:
     """The text in the colour of a style, "error" or "warning", where the stream shows colours."""
-    if stream is None or not coloured(stream):
+    if stream is None or not uses_color(stream):
         return text
     return f"\x1b[{_STYLES[style]}m{text}\x1b[0m"
 
@@ -61,13 +61,13 @@ def say(line: str) -> None:
     """One line on stderr. That nobody listens there any more is no reason to give up the work."""
     marked = "warning:"
     if line.startswith(marked):
-        line = painted(marked, "warning", sys.stderr) + line[len(marked) :]
+        line = colorize(marked, "warning", sys.stderr) + line[len(marked) :]
     _write(f"stillmap: {line}")
 
 
 def fail(line: str) -> None:
     """The one line that says why nothing came of it."""
-    _write(f"{painted('stillmap:', 'error', sys.stderr)} {line}")
+    _write(f"{colorize('stillmap:', 'error', sys.stderr)} {line}")
 
 
 def _write(line: str) -> None:
@@ -80,7 +80,7 @@ def _write(line: str) -> None:
 
 
 @contextmanager
-def shown_progress(quiet: bool, iterations: int) -> "Iterator[Progress]":
+def show_progress(quiet: bool, iterations: int) -> "Iterator[Progress]":
     """A Progress that shows step, iteration, scans, rate and time left."""
     if quiet or sys.stderr is None:  # None: it was closed before we began
         from stillmap.core.profiling import no_progress
@@ -95,7 +95,7 @@ def shown_progress(quiet: bool, iterations: int) -> "Iterator[Progress]":
 
 
 @contextmanager
-def shown_share(quiet: bool, what: str) -> "Iterator[Callable[[float], None] | None]":
+def show_share(quiet: bool, what: str) -> "Iterator[Callable[[float], None] | None]":
     """What shows the share of a job that is done, from 0 to 1; None where nobody looks."""
     if quiet or sys.stderr is None:
         yield None
@@ -234,7 +234,7 @@ def print_json(content: dict[str, Any]) -> None:
     print(json.dumps(to_jsonable(content), allow_nan=False))
 
 
-def files_in(folder: Path) -> list[str]:
+def list_files(folder: Path) -> list[str]:
     """The files of a folder, with those of its folders, as paths below it."""
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
 
@@ -248,7 +248,7 @@ _IMPORTS = "<frozen importlib"  # where Python says that the code of its imports
 _PACKING = "lazrsbackend.py"  # of laspy
 
 
-def hear_signals(command: CodeType) -> None:
+def handle_signals(command: CodeType) -> None:
     """From now on Ctrl-C raises KeyboardInterrupt, and SIGTERM SystemExit, within `command`.
 
     Both leave through the clean-up of any exception: temporary folders go. Ctrl-C that was

@@ -7,8 +7,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
-from stillmap.cli.arguments import add_read_flags, parents_made, read_changes, require_apart
-from stillmap.cli.console import say, shown_share
+from stillmap.cli.arguments import add_read_flags, make_parents, read_changes, require_apart
+from stillmap.cli.console import say, show_share
 from stillmap.cli.parser import COMMANDS
 from stillmap.core.errors import InputError
 
@@ -97,10 +97,10 @@ def converted(args: argparse.Namespace) -> tuple[list[str], str]:
 
     source, output = Path(args.input), Path(args.output)
     if is_result(source):
-        with parents_made(output):
+        with make_parents(output):
             return _convert_result(args, source, output)
     detect_format(source)  # what is not there is told before what cannot be written
-    with parents_made(output):
+    with make_parents(output):
         return _convert_recording(args, source, output)
 
 
@@ -118,7 +118,7 @@ def _convert_recording(
     require_apart(output, source)
     writer = writers.find_writer(output, args.to)
     writers.require_free(output, writer, args.overwrite)
-    with shown_share(args.quiet, "reading") as tell:
+    with show_share(args.quiet, "reading") as tell:
         recording = read(source, read_options, progress=tell, scratch=output.absolute().parent)
     if not recording.n_scans:
         raise InputError("holds no scan", where=str(source))
@@ -193,7 +193,7 @@ def _convert_to_cloud(
         points = point_cloud.cloud_from_folder(mapped.folder, args.only)
     else:
         points = _cloud_of(args, mapped, output)
-    with shown_share(args.quiet, "writing") as tell:
+    with show_share(args.quiet, "writing") as tell:
         point_cloud_files.write(points, output, form, tell)
     return f"{points.count} points as {form.description}"
 
@@ -205,7 +205,7 @@ def _cloud_of(
     from stillmap.results.export import point_cloud
     from stillmap.results.labels import read_colors
 
-    with shown_share(args.quiet, "reading") as tell:
+    with show_share(args.quiet, "reading") as tell:
         recording, labels = mapped.read(tell, output.absolute().parent)
     if recording.dimension != 3:
         raise InputError(

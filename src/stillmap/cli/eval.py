@@ -362,9 +362,9 @@ def _map_lines(s: "MapScores") -> Iterable[str]:
 
 
 def _score_model(args: argparse.Namespace) -> Scores:
-    from stillmap.cli.eval_model import of_model
+    from stillmap.cli.eval_model import score_model
 
-    return of_model(args)
+    return score_model(args)
 
 
 _SCORES = {

@@ -21,7 +21,7 @@ from stillmap.sim.truth import load_truth
 Float = NDArray[np.float64]
 
 
-def of_model(args: argparse.Namespace) -> tuple[dict[str, Any], Iterable[str]]:
+def score_model(args: argparse.Namespace) -> tuple[dict[str, Any], Iterable[str]]:
     """Surface, texture, and models of what moved; what a result does not have is left out."""
     require_there(args.result, args.truth)
     seen = model_readers.read_camera_simulation(args.truth)

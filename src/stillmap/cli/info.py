@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from stillmap.cli.arguments import add_read_flags, read_changes
-from stillmap.cli.console import shown_share
+from stillmap.cli.console import show_share
 from stillmap.cli.parser import COMMANDS
 
 _LINES_SHOWN = 10
@@ -41,15 +41,15 @@ def run(args: argparse.Namespace) -> int:
         InputError: it could not.
     """
     # these take long to load
-    from stillmap.cli.recording_info import facts
+    from stillmap.cli.recording_info import summarize_recording
     from stillmap.core import config
     from stillmap.io import read
     from stillmap.preprocessing.options import ReadOptions
 
     read_options = config.override(ReadOptions(), read_changes(args).get("read", {}))
-    with shown_share(args.quiet, "reading") as tell:
+    with show_share(args.quiet, "reading") as tell:
         recording = read(args.input, read_options, progress=tell)
-    found = {"input": args.input, **facts(recording)}
+    found = {"input": args.input, **summarize_recording(recording)}
     if args.json:
         print(json.dumps(found, indent=2, allow_nan=False))
     else:

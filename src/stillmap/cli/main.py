@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import NoReturn
 
-from stillmap.cli.console import EXIT_INTERRUPTED, EXIT_TERMINATED, fail, hear_signals, say
+from stillmap.cli.console import EXIT_INTERRUPTED, EXIT_TERMINATED, fail, handle_signals, say
 from stillmap.cli.parser import COMMANDS, EXIT_INPUT, parser
 from stillmap.core.errors import InputError, closest_match
 
@@ -27,7 +27,7 @@ def main(argv: list[str] | None = None) -> int:
             _complete()
         args = _parsed(sys.argv[1:] if argv is None else argv)
         _log(args)
-        hear_signals(main.__code__)
+        handle_signals(main.__code__)
         status: int = args.run(args)
         _flush_stdout()
         return status

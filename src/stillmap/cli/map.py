@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from stillmap.cli.arguments import add_read_flags, read_changes, require_apart
 from stillmap.cli.config import add_option_flags, options_from_args
-from stillmap.cli.console import files_in, print_json, say, shown_progress
+from stillmap.cli.console import list_files, print_json, say, show_progress
 from stillmap.cli.parser import COMMANDS
 from stillmap.core.errors import InputError
 
@@ -152,7 +152,7 @@ def run(args: argparse.Namespace) -> int:
     stages = StageTimer()
     with lock_checkpoints(request.output) as checkpoints, _explain_failure(request, checkpoints):
         inputs, options = read_inputs(request, options, checkpoints.folder, stages)
-        with shown_progress(request.quiet, options.em.max_iterations) as progress:
+        with show_progress(request.quiet, options.em.max_iterations) as progress:
             built = build_all(
                 inputs,
                 options,
@@ -250,7 +250,7 @@ def _summarize(output: Path) -> dict[str, Any]:
     record = json.loads((output / "run.json").read_text(encoding="utf-8"))
     return {
         "output": str(output),
-        "files": files_in(output),
+        "files": list_files(output),
         "iterations": len(record["iterations"]),
         **{key: record[key] for key in (*_IN_SUMMARY, "tilting") if key in record},
     }

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import em
-from stillmap.cli.console import shown_share
+from stillmap.cli.console import show_share
 from stillmap.core.errors import InputError
 from stillmap.core.profiling import StageTimer
 from stillmap.core.recording import Recording
@@ -37,14 +37,14 @@ def read_inputs(
 ) -> tuple[Inputs, Options]:
     """Read the inputs, and resolve the options for them."""
     with stages.measure("read"):
-        with shown_share(request.quiet, "reading") as progress:
+        with show_share(request.quiet, "reading") as progress:
             recording = read(Path(request.input), options.read, progress=progress, scratch=scratch)
         _require_mappable(recording, options, request.input)
         recording = _note_path(recording, request.input)
         if not request.odometry:
             recording = recording.without_odometry()
         poses = _read_poses(request, recording)
-        with shown_share(request.quiet, "reading") as progress:
+        with show_share(request.quiet, "reading") as progress:
             tilting = _read_tilting_laser(
                 request.input, request.tilting, recording, options, progress, scratch
             )

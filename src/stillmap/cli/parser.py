@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterable, Sequence
 from importlib import import_module
 from typing import Any, NoReturn
 
-from stillmap.cli.console import painted
+from stillmap.cli.console import colorize
 from stillmap.core.errors import closest_match
 
 EXIT_INPUT = 2
@@ -60,7 +60,7 @@ class Parser(argparse.ArgumentParser):
         """Says what is wrong with the call, on one line, and exits."""
         advice = f"{hint} see" if hint else "see"
         line = f"{message} ({advice} {self.prog} --help)".replace("\n", " ")
-        self.exit(EXIT_INPUT, f"{painted(f'{self.prog}:', 'error', sys.stderr)} {line}\n")
+        self.exit(EXIT_INPUT, f"{colorize(f'{self.prog}:', 'error', sys.stderr)} {line}\n")
 
     def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
         """Flushes first: --help and --version may be going into a pipe that has closed."""

@@ -24,7 +24,7 @@ _SENSOR_NOTES = (
 _RULE = {field.name for field in dataclasses.fields(RangeRule)}
 
 
-def facts(recording: Recording) -> dict[str, Any]:
+def summarize_recording(recording: Recording) -> dict[str, Any]:
     """Everything that `stillmap info` shows, JSON-able: metres, seconds, degrees."""
     source = _notes(recording.source)
     beams = np.diff(recording.offset)

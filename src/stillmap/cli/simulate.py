@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stillmap.cli.config import add_set_flag, complete_assignments
-from stillmap.cli.console import files_in, print_json, say, shown_share
+from stillmap.cli.console import list_files, print_json, say, show_share
 from stillmap.cli.parser import COMMANDS
 from stillmap.core.errors import InputError
 
@@ -175,7 +175,7 @@ def run(args: argparse.Namespace) -> int:
         require_carmen(scene)
     output = Path(args.output)
     require_new(output, RIG_MARK if scene.rig.tilts else MARK, args.overwrite)
-    with shown_share(args.quiet, "simulating") as progress:
+    with show_share(args.quiet, "simulating") as progress:
         rng, beside = np.random.default_rng(args.seed), output.absolute().parent
         scratch = beside if beside.is_dir() else None
         if scene.rig.tilts:
@@ -249,7 +249,7 @@ def _summary(made: "list[Simulation]", output: Path) -> dict[str, Any]:
     movers = [one.truth.mover for one in made]
     return {
         "output": str(output),
-        "files": files_in(output),
+        "files": list_files(output),
         "scene": made[0].scene.name,
         "scans": made[0].recording.n_scans,
         "beams": sum(one.recording.n_beams for one in made),

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from stillmap.cli.console import say, shown_share
+from stillmap.cli.console import say, show_share
 from stillmap.cli.parser import COMMANDS
 from stillmap.core.errors import InputError, MissingExtra, import_extra
 
@@ -163,7 +163,7 @@ def _read_beams(result: "ResultFolder", quiet: bool) -> "Beams":
     from stillmap.slam import SlamOptions
     from stillmap.viewer.tracks import Beams
 
-    with shown_share(quiet, "reading") as progress:
+    with show_share(quiet, "reading") as progress:
         recording, labels = result.read(progress)
     poses = poses_from_tum(result.folder / "trajectory.tum", recording)
     slam = SlamOptions(deskew=is_deskewed(result.record))

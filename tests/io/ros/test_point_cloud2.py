@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from stillmap.cli.recording_info import facts
+from stillmap.cli.recording_info import summarize_recording
 from stillmap.core.errors import InputError
 from stillmap.io import read
 from stillmap.io.ros import point_cloud2
@@ -149,7 +149,7 @@ def test_implausible_points_are_unusable(bag, messages, rng):
     np.testing.assert_array_equal(recording.hit, ~wild)
     assert np.isnan(recording.points[wild]).all()
     with np.errstate(all="raise"):
-        assert facts(recording)["counts"]["unusable"] == 4
+        assert summarize_recording(recording)["counts"]["unusable"] == 4
 
 
 def test_extrinsics_and_odometry(bag, messages, rng):
