@@ -192,9 +192,9 @@ def test_what_a_result_cannot_become(call, room, mapped, tmp_path, nothing_left)
 
 
 @pytest.mark.parametrize("ending", [".las", ".laz", ".e57", ".pcd", ".ply", ".xyz"])
-def test_results_in_the_plane_have_no_clouds(call, mapped, tmp_path, nothing_left, ending):
+def test_2d_results_have_no_clouds(call, mapped, tmp_path, nothing_left, ending):
     done = call("convert", mapped, "-o", tmp_path / f"a{ending}")
-    refused(done, "out: is of a recording in the plane", ".parquet")
+    refused(done, "out: is a 2D result", ".parquet")
     nothing_left()
 
 
