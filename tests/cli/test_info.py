@@ -221,7 +221,7 @@ def test_poses_and_pictures_are_shown_where_there_are_any(path, tmp_path, capsys
     run(tmp_path / "rec")
     out = capsys.readouterr().out
     assert "path 7.00 m, turned 0 deg: used with --poses recording" in out
-    assert "pictures          5" in out
+    assert "images            5" in out
     assert "front, 3 of 8 x 6 pixels, calibrated and placed" in out
     assert "rear, 2 of 80 x 60 pixels, uncalibrated" in out
     assert "5, 0 of them usable" in out
@@ -262,9 +262,9 @@ def test_ranges_of_huge_recordings_are_those_of_a_sample(monkeypatch, few):
     )
     exact = module.summarize_recording(recording)
     assert exact["hit_ranges_m"]["max"] == pytest.approx(points.max(), abs=1e-4)
-    monkeypatch.setattr(module, "_SAMPLED", 2000)
-    monkeypatch.setattr(module, "_FEW", few)
-    assert len(module._hit_ranges(recording)) <= 2000
+    monkeypatch.setattr(module, "_MAX_SAMPLE", 2000)
+    monkeypatch.setattr(module, "_MIN_SCANS", few)
+    assert len(module._sample_hit_ranges(recording)) <= 2000
     sampled = module.summarize_recording(recording)
     assert sampled["hit_ranges_m"]["median"] == pytest.approx(6.0, abs=0.3)
     assert sampled["counts"] == exact["counts"]
@@ -285,7 +285,7 @@ def test_cameras_from_a_file(tmp_path, capsys):
     file.write_text(f"[image_2]\nfx = 9\nfy = 9\ncx = 3.5\ncy = 2.5\n{place}")
     run(folder, "--cameras", str(file))
     out = capsys.readouterr().out
-    assert "pictures          2, 2 of them usable" in out
+    assert "images            2, 2 of them usable" in out
     assert "2 of 8 x 6 pixels, calibrated and placed" in out
     file.write_text("[image_3]\n")
     with pytest.raises(InputError, match="nearest: 'image_2'"):

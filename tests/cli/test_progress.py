@@ -14,7 +14,7 @@ def lines(monkeypatch):
     said = []
     monkeypatch.setattr(module, "say", said.append)
     monkeypatch.setattr(module, "is_terminal", lambda _: False)
-    monkeypatch.setattr(module, "_EVERY", 0.02)
+    monkeypatch.setattr(module, "_LINE_PERIOD", 0.02)
 
     def another(wanted):
         before = len(said)
@@ -50,7 +50,7 @@ def test_long_steps_are_told_of_again_and_again(lines):
 
 
 def test_an_iteration_is_told_of_once_where_it_is_short(lines, monkeypatch):
-    monkeypatch.setattr(module, "_EVERY", 1000.0)
+    monkeypatch.setattr(module, "_LINE_PERIOD", 1000.0)
     said, _ = lines
     with show_progress(False, 3) as progress:
         for iteration in (1, 2):

@@ -1,9 +1,4 @@
-"""The flags that say how a recording is read, shared by the commands.
-
-Folders that an output is to lie in.
-
-What `stillmap map` wrote, and the recording that it was made from.
-"""
+"""Arguments shared by the commands: flags for reading a recording, checks of output paths."""
 
 import argparse
 import math
@@ -16,7 +11,7 @@ from typing import Any
 
 from stillmap.core.errors import InputError
 
-_PLAIN = (
+_FLAGS = (
     *("min_range", "max_range", "zero_means", "spin", "cameras"),
     *("base_frame", "odom_frame"),
 )
@@ -25,46 +20,46 @@ _LASERS = {"laser": "first", "laser2": "second"}  # flags and options begin with
 
 
 def add_read_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of ranges and of where the lasers sit to a command."""
+    """Add the flags for reading a recording to a command."""
     group = parser.add_argument_group("reading the recording")
     group.add_argument(
         "--min-range",
         type=float,
         metavar="M",
-        help="nearer readings are unusable (the robot) (default: 0)",
+        help="shorter readings are unusable, say from the robot itself (default: 0)",
     )
     group.add_argument(
         "--max-range",
         type=float,
         metavar="M",
-        help="readings at or above M mean that nothing came back (default: found in the readings)",
+        help="readings of M and more are maximum-range beams (default: estimated)",
     )
     group.add_argument(
         "--zero-means",
         choices=("auto", "unusable", "max-range"),
-        help="what a reading of zero stands for (default: auto)",
+        help="meaning of a reading of zero (default: auto)",
     )
     group.add_argument(
         "--spin",
         choices=("none", "clockwise", "counter-clockwise"),
-        help="how a lidar turns, seen from above, whose beams have no times (default: found)",
+        help="rotation of a lidar without beam times, seen from above (default: estimated)",
     )
     group.add_argument(
         "--cameras",
         metavar="FILE.toml",
-        help="what the recording lacks of its cameras, and further pictures (docs/input.md)",
+        help="calibration and images that the recording lacks (docs/input.md)",
     )
     group.add_argument(
         "--topic",
         action="append",
         metavar="TOPIC",
-        help="of a bag: take the scans from here; can be given again (default: by type and rate)",
+        help="scans of a bag; can be given again (default: by type and rate)",
     )
     group.add_argument(
-        "--base-frame", metavar="FRAME", help="of a bag: the robot's own frame (default: found)"
+        "--base-frame", metavar="FRAME", help="robot frame of a bag (default: detected)"
     )
     group.add_argument(
-        "--odom-frame", metavar="FRAME", help="of a bag: where odometry moves it (default: found)"
+        "--odom-frame", metavar="FRAME", help="odometry frame of a bag (default: detected)"
     )
     for laser, which in _LASERS.items():
         group.add_argument(
@@ -72,25 +67,25 @@ def add_read_flags(parser: argparse.ArgumentParser) -> None:
             type=float,
             nargs=3,
             metavar=("X", "Y", "DEG"),
-            help=f"where the {which} laser sits on the robot: m ahead, m left, degrees turned left",
+            help=f"pose of the {which} laser on the robot: m ahead, m left, degrees to the left",
         )
         group.add_argument(
             f"--{laser}-upside-down",
             action="store_true",
-            help=f"the {which} laser hangs upside down: its beams turn clockwise",
+            help=f"the {which} laser is mounted upside down: its beams turn clockwise",
         )
         group.add_argument(
             f"--{laser}-fov",
             type=float,
             metavar="DEG",
-            help=f"field of view of the {which} laser, of FLASER and RLASER lines (default: 180)",
+            help=f"field of view of the {which} laser in FLASER and RLASER lines (default: 180)",
         )
 
 
 def read_changes(args: argparse.Namespace) -> dict[str, Any]:
-    """The flags that were given, as changes to the options: `{"read": {...}}`, `{}` for none."""
+    """The given flags as changes of options: `{"read": {...}}`, `{}` for none."""
     changes: dict[str, Any] = {
-        name: value for name in _PLAIN if (value := getattr(args, name)) is not None
+        name: value for name in _FLAGS if (value := getattr(args, name)) is not None
     }
     if args.topic:
         changes["topic"] = ",".join(args.topic)
@@ -108,20 +103,20 @@ def read_changes(args: argparse.Namespace) -> dict[str, Any]:
 
 @contextmanager
 def make_parents(output: Path) -> Iterator[None]:
-    """Makes the folders above an output that are not there; they go again where the block fails.
+    """Create the parent folders of an output; remove them again if the block fails.
 
     Raises:
-        InputError: they cannot be made, or nothing can be written there. Nothing was read yet.
+        InputError: they cannot be created, or are not writable; before anything is read.
     """
     parent = Path(os.path.abspath(output)).parent
-    made: list[Path] = []
+    created: list[Path] = []
     try:
         try:
             for folder in reversed((parent, *parent.parents)):
                 if not folder.exists():
                     folder.mkdir(exist_ok=True)
-                    made.append(folder)
-            # a device in the way is told of by who writes
+                    created.append(folder)
+            # the writer reports a device at this path
             if not output.exists() or output.is_file() or output.is_dir():
                 tempfile.TemporaryFile(dir=parent).close()
         except OSError as error:
@@ -129,14 +124,14 @@ def make_parents(output: Path) -> Iterator[None]:
             raise InputError(what, where=str(output)) from error
         yield
     except BaseException:
-        with suppress(OSError):  # something may lie in them by now
-            for folder in reversed(made):
+        with suppress(OSError):  # not empty
+            for folder in reversed(created):
                 folder.rmdir()
         raise
 
 
 def require_apart(output: Path, recording: Path, result: Path | None = None) -> None:
-    """Refuses to write over what is read, or over a folder that holds it.
+    """Refuse to overwrite what is read, or a folder that holds it.
 
     Raises:
         InputError: the output is the recording or the result, or one of them lies inside.
@@ -145,10 +140,10 @@ def require_apart(output: Path, recording: Path, result: Path | None = None) -> 
 
     if recording.name == stillmap_folder.HEADER:
         recording = recording.parent
-    there, kept = output.resolve(), [recording.resolve()]
-    if there == kept[0]:
+    target, inputs = output.resolve(), [recording.resolve()]
+    if target == inputs[0]:
         raise InputError("is the recording itself", where=str(output))
     if result is not None:
-        kept.append(result.resolve())
-    if any(there == one or there in one.parents for one in kept):
+        inputs.append(result.resolve())
+    if any(target == path or target in path.parents for path in inputs):
         raise InputError("holds the recording or the result", where=str(output))

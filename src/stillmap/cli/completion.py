@@ -1,4 +1,4 @@
-"""`stillmap completion SHELL`: the script that lets a shell complete stillmap's command lines."""
+"""`stillmap completion SHELL`: print the completion script of a shell."""
 
 import argparse
 from collections.abc import Callable, Iterable, Iterator
@@ -16,13 +16,13 @@ _EPILOG = """to install it:
 
 
 def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Adds the command."""
+    """Add the command."""
     p = commands.add_parser(
         "completion",
         help=COMMANDS["completion"],
         description="Print the script with which a shell completes commands, flags, their choices, "
-        "files and folders, and the options of --set. The script asks the installed stillmap, so "
-        "it need not be made anew after an update.",
+        "files and folders, and the options of --set. It asks the installed stillmap and stays "
+        "valid after an update.",
         epilog=_EPILOG,
     )
     p.add_argument("shell", metavar="SHELL", choices=("bash", "zsh", "fish"), help="%(choices)s")
@@ -30,33 +30,33 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
 
 
 def run(args: argparse.Namespace) -> int:
-    """Prints the script."""
+    """Print the script."""
     from argcomplete.shell_integration import shellcode
 
     print(shellcode(["stillmap"], shell=args.shell))
     return 0
 
 
-def answer(top: Parser) -> NoReturn:
-    """Tells the shell that asks how the line in its environment may go on, and ends the process."""
+def answer_shell(top: Parser) -> NoReturn:
+    """Print the completions of the command line in the environment, and exit."""
     import argcomplete
 
-    for action in _actions(top):
-        completer = _completer(action)
+    for action in _iter_actions(top):
+        completer = _find_completer(action)
         if completer is not None and not hasattr(action, "completer"):
             action.completer = completer  # type: ignore[attr-defined]
     argcomplete.autocomplete(top, always_complete_options=False)
-    raise SystemExit(1)  # the shell's question has no form that argcomplete knows
+    raise SystemExit(1)  # argcomplete does not know this form of request
 
 
-def _actions(parser: Parser) -> Iterator[argparse.Action]:
+def _iter_actions(parser: Parser) -> Iterator[argparse.Action]:
     yield from parser._actions
     for command in (parser.subcommands() or {}).values():
-        yield from _actions(command)
+        yield from _iter_actions(command)
 
 
-def _completer(action: argparse.Action) -> "Callable[..., Iterable[str]] | None":
-    """What completes an argument, by what it takes; None: its choices, or any file."""
+def _find_completer(action: argparse.Action) -> "Callable[..., Iterable[str]] | None":
+    """The completer of an argument by its type; None: its choices, or any file."""
     from argcomplete.completers import DirectoriesCompleter, FilesCompleter
 
     shown: Any = action.metavar

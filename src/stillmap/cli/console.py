@@ -1,16 +1,4 @@
-"""What is said, on stderr: a bar on a terminal, a line now and then elsewhere, nothing if quiet.
-
-What goes to stdout for machines: one JSON object, alone.
-
-Ctrl-C and SIGTERM: an exception in the main thread, but none while a module is being imported.
-
-A library that is just being imported may take the exception for a missing module and go on
-without it, may turn it into an error of its own, or may execute text as code, after which Python
-believes that nobody caught the interrupt. So the signal is sent again until the import is over.
-Likewise while points are packed as LAZ: an exception on the way to the file becomes another one.
-
-Colours, on terminals alone.
-"""
+"""Messages and progress on stderr, JSON on stdout, and signals."""
 
 import json
 import os
@@ -32,7 +20,7 @@ _STYLES = {"error": "1;31", "warning": "33"}  # bold red, yellow
 
 
 def uses_color(stream: IO[str]) -> bool:
-    """Whether to write colours: as NO_COLOR, FORCE_COLOR, CLICOLOR_FORCE and TERM say."""
+    """Whether to use colors, by NO_COLOR, FORCE_COLOR, CLICOLOR_FORCE and TERM."""
     if os.environ.get("NO_COLOR"):
         return False
     if os.environ.get("FORCE_COLOR") or os.environ.get("CLICOLOR_FORCE", "0") not in ("", "0"):
@@ -41,32 +29,31 @@ def uses_color(stream: IO[str]) -> bool:
 
 
 def is_terminal(stream: IO[str] | None) -> bool:
-    """Whether a stream goes to a terminal that knows more than plain text."""
+    """Whether a stream is a terminal with control sequences."""
     return stream is not None and stream.isatty() and os.environ.get("TERM") != "dumb"
 
 
 def colorize(text: str, style: str, stream: IO[str] | None) -> str:
-    """The text in the colour of a style, "error" or "warning", where the stream shows colours."""
+    """The text in the color of a style, "error" or "warning", if the stream shows colors."""
     if stream is None or not uses_color(stream):
         return text
     return f"\x1b[{_STYLES[style]}m{text}\x1b[0m"
 
 
-_AT_ONCE = 0.01  # s: what takes no longer has no rate
-
-_EVERY = 10.0  # s between lines where there is no terminal
+_MIN_RATED = 0.01  # s: shorter steps show no rate
+_LINE_PERIOD = 10.0  # s between lines of progress without a terminal
 
 
 def say(line: str) -> None:
-    """One line on stderr. That nobody listens there any more is no reason to give up the work."""
-    marked = "warning:"
-    if line.startswith(marked):
-        line = colorize(marked, "warning", sys.stderr) + line[len(marked) :]
+    """Print one line to stderr; a closed stderr is ignored."""
+    prefix = "warning:"
+    if line.startswith(prefix):
+        line = colorize(prefix, "warning", sys.stderr) + line[len(prefix) :]
     _write(f"stillmap: {line}")
 
 
 def fail(line: str) -> None:
-    """The one line that says why nothing came of it."""
+    """Print the error that ends the command."""
     _write(f"{colorize('stillmap:', 'error', sys.stderr)} {line}")
 
 
@@ -75,14 +62,14 @@ def _write(line: str) -> None:
         return
     try:
         print(line, file=sys.stderr, flush=True)
-    except OSError:  # nobody listens any more, or a full disk does
+    except OSError:  # closed by the reader, or a full disk
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
 
 
 @contextmanager
 def show_progress(quiet: bool, iterations: int) -> "Iterator[Progress]":
     """A Progress that shows step, iteration, scans, rate and time left."""
-    if quiet or sys.stderr is None:  # None: it was closed before we began
+    if quiet or sys.stderr is None:  # None: closed before the start
         from stillmap.core.profiling import no_progress
 
         yield no_progress
@@ -96,7 +83,7 @@ def show_progress(quiet: bool, iterations: int) -> "Iterator[Progress]":
 
 @contextmanager
 def show_share(quiet: bool, what: str) -> "Iterator[Callable[[float], None] | None]":
-    """What shows the share of a job that is done, from 0 to 1; None where nobody looks."""
+    """A function that shows the share of a job that is done, 0 to 1; None if quiet."""
     if quiet or sys.stderr is None:
         yield None
     elif is_terminal(sys.stderr):
@@ -107,7 +94,7 @@ def show_share(quiet: bool, what: str) -> "Iterator[Callable[[float], None] | No
         task = bar.add_task(what, total=1.0)
 
         def update(share: float) -> None:
-            bar.start()  # not before there is something to show
+            bar.start()  # not before the first progress
             bar.update(task, completed=share)
 
         try:
@@ -115,18 +102,18 @@ def show_share(quiet: bool, what: str) -> "Iterator[Callable[[float], None] | No
         finally:
             bar.stop()
     else:
-        yield _Shares(what)
+        yield _ShareLines(what)
 
 
-class _Shares:
-    """A line every few seconds: none of what takes no longer."""
+class _ShareLines:
+    """Print the share done every `_LINE_PERIOD` seconds."""
 
     def __init__(self, what: str) -> None:
         self._what, self._last = what, time.monotonic()
 
     def __call__(self, share: float) -> None:
         now = time.monotonic()
-        if now - self._last >= _EVERY:
+        if now - self._last >= _LINE_PERIOD:
             self._last = now
             say(f"{self._what}: {100.0 * share:.0f} %")
 
@@ -157,14 +144,14 @@ def _bar(iterations: int) -> "Iterator[Progress]":
                 counted = f"{done}/{total}"
                 if shown.of_scans:
                     counted += f" scans {shown.rate(done):.0f}/s"
-                # however short it was: what is done is seen
+                # a finished step is shown even if it was short
                 bar.update(task, completed=done, counted=counted, refresh=done == total)
 
         yield progress
 
 
 class _Step:
-    """What is being done, since when; only iterations count scans."""
+    """The current step and its start; only iterations count scans."""
 
     def __init__(self, what: str, iteration: int, iterations: int) -> None:
         self.name = f"{what}, iteration {iteration} of at most {iterations}" if iteration else what
@@ -178,25 +165,25 @@ class _Step:
         return time.monotonic() - self._started
 
     def rate(self, done: int) -> float:
-        """How many per second."""
+        """Items per second."""
         return done / max(self.seconds(), 1e-3)
 
 
 class _Lines:
-    """A line every few seconds, and when an iteration has looked at all scans."""
+    """Print progress every `_LINE_PERIOD` seconds, and at the end of each iteration."""
 
     def __init__(self, iterations: int) -> None:
-        self._iterations, self._said = iterations, 0
+        self._iterations, self._reported = iterations, 0
         self._now = _Step("preparing", 0, iterations), 0, 0
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._now_and_then, daemon=True)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
 
     def __enter__(self) -> "_Lines":
         self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._ended.set()
+        self._stop.set()
         self._thread.join()
 
     def __call__(self, what: str, iteration: int, done: int, total: int) -> None:
@@ -204,15 +191,15 @@ class _Lines:
         if not step.is_same(what, iteration):
             step = _Step(what, iteration, self._iterations)
         self._now = step, done, total
-        if 0 < total == done and iteration > self._said:
-            self._said = iteration
-            self._say()
+        if 0 < total == done and iteration > self._reported:
+            self._reported = iteration
+            self._report()
 
-    def _now_and_then(self) -> None:
-        while not self._ended.wait(_EVERY):
-            self._say()
+    def _run(self) -> None:
+        while not self._stop.wait(_LINE_PERIOD):
+            self._report()
 
-    def _say(self) -> None:
+    def _report(self) -> None:
         step, done, total = self._now
         if not total:
             say(f"{step.name}: {step.seconds():.0f} s so far")
@@ -220,7 +207,7 @@ class _Lines:
         text, rate = f"{step.name}: {done} of {total}", step.rate(done)
         if step.of_scans:
             text += " scans"
-            if step.seconds() > _AT_ONCE:
+            if step.seconds() > _MIN_RATED:
                 text += f", {rate:.0f}/s"
         if done < total:
             text += f", {(total - done) / max(rate, 1e-3):.0f} s left"
@@ -228,38 +215,38 @@ class _Lines:
 
 
 def print_json(content: dict[str, Any]) -> None:
-    """One object on stdout; numbers that are not finite become null."""
+    """Print one JSON object to stdout; non-finite numbers become null."""
     from stillmap.core.json import to_jsonable
 
     print(json.dumps(to_jsonable(content), allow_nan=False))
 
 
 def list_files(folder: Path) -> list[str]:
-    """The files of a folder, with those of its folders, as paths below it."""
+    """Sorted relative paths of all files below a folder."""
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
 
 
 EXIT_INTERRUPTED, EXIT_TERMINATED = 130, 143
 
-_SOON = 0.02  # s until a signal that came at a bad moment is sent again
-
-_IMPORTS = "<frozen importlib"  # where Python says that the code of its imports is
-
+_RETRY = 0.02  # s until a deferred signal is sent again
+_IMPORTS = "<frozen importlib"  # file name of the frames of an import
 _PACKING = "lazrsbackend.py"  # of laspy
 
 
 def handle_signals(command: CodeType) -> None:
-    """From now on Ctrl-C raises KeyboardInterrupt, and SIGTERM SystemExit, within `command`.
+    """Make Ctrl-C raise KeyboardInterrupt, and SIGTERM SystemExit, within `command`.
 
-    Both leave through the clean-up of any exception: temporary folders go. Ctrl-C that was
-    ignored when we began, as in the background of a shell script, stays ignored.
+    Both run the clean-up of any exception: temporary folders go. Ctrl-C that was ignored at the
+    start, as in the background of a shell script, stays ignored. During an import a signal is
+    deferred: a library may take the exception for a missing module, turn it into another error,
+    or execute text as code, after which Python reports an uncaught interrupt. Likewise while
+    points are packed as LAZ, where the exception becomes another one.
     """
+    main = threading.get_ident()  # Python handles signals in this thread alone
 
-    main = threading.get_ident()  # Python hears signals in it alone
-
-    def heard(number: int, frame: FrameType | None) -> None:
-        if _is_at_a_bad_moment(frame, command):
-            again = threading.Timer(_SOON, signal.pthread_kill, (main, number))
+    def handle(number: int, frame: FrameType | None) -> None:
+        if _must_defer(frame, command):
+            again = threading.Timer(_RETRY, signal.pthread_kill, (main, number))
             again.daemon = True
             again.start()
         elif number == signal.SIGINT:
@@ -267,12 +254,12 @@ def handle_signals(command: CodeType) -> None:
         else:
             sys.exit(EXIT_TERMINATED)
 
-    signal.signal(signal.SIGTERM, heard)
+    signal.signal(signal.SIGTERM, handle)
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
-        signal.signal(signal.SIGINT, heard)
+        signal.signal(signal.SIGINT, handle)
 
 
-def _is_at_a_bad_moment(frame: FrameType | None, command: CodeType) -> bool:
+def _must_defer(frame: FrameType | None, command: CodeType) -> bool:
     while frame is not None and frame.f_code is not command:
         name = frame.f_code.co_filename
         if name.startswith(_IMPORTS) or name.endswith(_PACKING):

@@ -1,4 +1,4 @@
-"""`stillmap info INPUT`: what is in a recording."""
+"""`stillmap info INPUT`: print a summary of a recording."""
 
 import argparse
 import json
@@ -19,12 +19,12 @@ _EPILOG = """examples:
 
 
 def add_parser(subparsers: Any) -> None:
-    """Register the command with argparse's `subparsers`."""
+    """Add the command."""
     parser = subparsers.add_parser(
         "info",
         help=COMMANDS["info"],
         description="Show what is in a recording: scans, beams, field of view, ranges, duration, "
-        "odometry, and what is damaged. What was found out from the readings is marked so.",
+        "odometry and damage; values estimated from the readings are marked.",
         epilog=_EPILOG,
     )
     parser.add_argument("input", metavar="INPUT", help="a file or folder with a recording")
@@ -35,29 +35,28 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the facts; 0 when the recording could be read.
+    """Print the summary.
 
     Raises:
-        InputError: it could not.
+        InputError: the recording cannot be read.
     """
-    # these take long to load
     from stillmap.cli.recording_info import summarize_recording
     from stillmap.core import config
     from stillmap.io import read
     from stillmap.preprocessing.options import ReadOptions
 
     read_options = config.override(ReadOptions(), read_changes(args).get("read", {}))
-    with show_share(args.quiet, "reading") as tell:
-        recording = read(args.input, read_options, progress=tell)
+    with show_share(args.quiet, "reading") as progress:
+        recording = read(args.input, read_options, progress=progress)
     found = {"input": args.input, **summarize_recording(recording)}
     if args.json:
         print(json.dumps(found, indent=2, allow_nan=False))
     else:
-        print("\n".join(_text(found)))
+        print("\n".join(_format_summary(found)))
     return 0
 
 
-def _text(found: dict[str, Any]) -> Iterator[str]:
+def _format_summary(found: dict[str, Any]) -> Iterator[str]:
     yield f"{found['input']}: {found['format'] or 'stillmap recording'}, {found['dimension']}D"
     if found["path"] not in (None, found["input"]):
         yield _row("made from", str(found["path"]))
@@ -78,23 +77,23 @@ def _text(found: dict[str, Any]) -> Iterator[str]:
             "ranges of hits",
             "min {min:.2f}, median {median:.2f}, 99 % {p99:.2f}, max {max:.2f} m".format(**spread),
         )
-    yield from _time(found["time"])
+    yield from _format_time(found["time"])
     if found["beam_times_s"] is not None:
         first, last = found["beam_times_s"]
         how = f", as it turns {found['spin']}" if found["spin"] else ""
         yield _row("beam times", f"{first:g} to {last:g} s after a scan's stamp{how}")
-    yield from _odometry(found["odometry"])
-    yield from _more(found)
+    yield from _format_odometry(found["odometry"])
+    yield from _format_poses_and_images(found)
     if found["base_frame"] is not None:
         yield _row("robot's frame", f"{found['base_frame']} ({found['base_frame_how']})")
     for sensor in found["sensors"]:
-        yield from _sensor(sensor)
-    for own in found["self_filter"]:
-        yield _row("robot itself", _own(own, found))
-    yield from _notes(found)
+        yield from _format_sensor(sensor)
+    for box in found["self_filter"]:
+        yield _row("robot itself", _format_self_filter(box, found))
+    yield from _format_notes(found)
 
 
-def _time(time: dict[str, Any]) -> Iterator[str]:
+def _format_time(time: dict[str, Any]) -> Iterator[str]:
     from stillmap.core.timestamps import format_seconds
 
     first, last = (format_seconds(time[key]) for key in ("first_stamp_ns", "last_stamp_ns"))
@@ -104,7 +103,7 @@ def _time(time: dict[str, Any]) -> Iterator[str]:
     yield _row("stamps", f"{first} to {last}")
 
 
-def _odometry(odometry: dict[str, Any] | None) -> Iterator[str]:
+def _format_odometry(odometry: dict[str, Any] | None) -> Iterator[str]:
     if odometry is None:
         yield _row("odometry", "none")
         return
@@ -124,15 +123,15 @@ def _odometry(odometry: dict[str, Any] | None) -> Iterator[str]:
         )
 
 
-def _more(found: dict[str, Any]) -> Iterator[str]:
-    """Poses and pictures, where there are any."""
+def _format_poses_and_images(found: dict[str, Any]) -> Iterator[str]:
+    """Recorded poses and images, where there are any."""
     way, images = found["recorded_poses"], found["images"]
     if way is not None:
         text = f"path {way['path_length_m']:.2f} m, turned {way['turned_deg']:.0f} deg"
         yield _row("recorded poses", f"{text}: used with --poses recording")
     if images is None:
         return
-    yield _row("pictures", f"{images['count']}, {images['usable']} of them usable")
+    yield _row("images", f"{images['count']}, {images['usable']} of them usable")
     for camera in images["cameras"]:
         known = [word for word in ("calibrated", "placed") if camera[word]]
         size = f"{camera['count']} of {camera['width']} x {camera['height']} pixels"
@@ -141,7 +140,7 @@ def _more(found: dict[str, Any]) -> Iterator[str]:
         yield _row("  left out", f"{count}: {reason}")
 
 
-def _sensor(sensor: dict[str, Any]) -> Iterator[str]:
+def _format_sensor(sensor: dict[str, Any]) -> Iterator[str]:
     frame = f", frame {sensor['frame']}" if sensor.get("frame") else ""
     yield _row("sensor", f"{sensor.get('name', 'unnamed')}, {sensor['scans']} scans{frame}")
     view = sensor.get("field_of_view_deg")
@@ -174,15 +173,15 @@ def _sensor(sensor: dict[str, Any]) -> Iterator[str]:
         yield _row("  zero means", f"{rule['zero_means']}: {rule['zero_how']}")
 
 
-def _own(own: dict[str, Any], found: dict[str, Any]) -> str:
-    """What a lidar sees of its robot."""
-    of = f" of sensor {own['sensor'] + 1}" if len(found["sensors"]) > 1 else ""
-    spans = zip("xyz", own["low"], own["high"], strict=True)
+def _format_self_filter(box: dict[str, Any], found: dict[str, Any]) -> str:
+    """The box of a lidar's returns from its robot."""
+    of = f" of sensor {box['sensor'] + 1}" if len(found["sensors"]) > 1 else ""
+    spans = zip("xyz", box["low"], box["high"], strict=True)
     where = ", ".join(f"{axis} {low:g} to {high:g}" for axis, low, high in spans)
-    return f"{own['beams']} beams{of} end on it: unusable; {where} m from the sensor"
+    return f"{box['beams']} beams{of} end on it: unusable; {where} m from the sensor"
 
 
-def _notes(found: dict[str, Any]) -> Iterator[str]:
+def _format_notes(found: dict[str, Any]) -> Iterator[str]:
     if found["params"]:
         yield _row("PARAM", ", ".join(f"{k} {v}" for k, v in found["params"].items()))
     if found["ignored"]:

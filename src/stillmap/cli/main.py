@@ -1,4 +1,4 @@
-"""The command line: one file per command. Only this package prints and exits."""
+"""Entry point of `stillmap`: parse, run one command, turn errors into exit statuses."""
 
 import argparse
 import io
@@ -12,21 +12,21 @@ from stillmap.cli.console import EXIT_INTERRUPTED, EXIT_TERMINATED, fail, handle
 from stillmap.cli.parser import COMMANDS, EXIT_INPUT, parser
 from stillmap.core.errors import InputError, closest_match
 
-EXIT_OURS = 1
+EXIT_DEFECT = 1
 
-_MANY = 10_000  # names of a folder in which one like a missing one is looked for
+_MAX_NAMES = 10_000  # of a folder that are compared with a missing file's name
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs one command; returns its exit status."""
-    if isinstance(sys.stdout, io.TextIOWrapper):  # file names need not be text
+    """Run one command and return its exit status."""
+    if isinstance(sys.stdout, io.TextIOWrapper):  # file names need not be valid UTF-8
         sys.stdout.reconfigure(errors="backslashreplace")
     args = argparse.Namespace()
     try:
         if "_ARGCOMPLETE" in os.environ:
             _complete()
-        args = _parsed(sys.argv[1:] if argv is None else argv)
-        _log(args)
+        args = _parse(sys.argv[1:] if argv is None else argv)
+        _set_up_logging(args)
         handle_signals(main.__code__)
         status: int = args.run(args)
         _flush_stdout()
@@ -35,13 +35,13 @@ def main(argv: list[str] | None = None) -> int:
         fail(str(_with_similar_name(error, args)))
         return EXIT_INPUT
     except KeyboardInterrupt:
-        return _interrupted()
+        return _report_interrupt()
     except BrokenPipeError:
-        # the reader of our output has gone: nothing more can be said, and nothing is wrong
+        # the reader of stdout has closed it: not an error
         _drop_stdout()
         return 0
     except OSError as error:
-        # a full disk behind stdout, a file that vanished while it was read
+        # a full disk behind stdout, or a file that vanished while it was read
         fail(f"{error.filename or 'the output'}: {error.strerror or error}")
         _drop_stdout()
         return EXIT_INPUT
@@ -49,14 +49,14 @@ def main(argv: list[str] | None = None) -> int:
         fail(f"not enough memory{': ' if str(error) else ''}{error}")
         return EXIT_INPUT
     except Exception as error:
-        behind = _stopped_by(error)
-        if behind is not None:
-            return EXIT_TERMINATED if isinstance(behind, SystemExit) else _interrupted()
+        cause = _find_interrupt(error)
+        if cause is not None:
+            return EXIT_TERMINATED if isinstance(cause, SystemExit) else _report_interrupt()
         _report_defect(error)
-        return EXIT_OURS
+        return EXIT_DEFECT
 
 
-def _parsed(words: list[str]) -> argparse.Namespace:
+def _parse(words: list[str]) -> argparse.Namespace:
     command = next((word for word in words if not word.startswith("-")), "")
     top = parser([command])
     args = top.parse_args(words)
@@ -66,35 +66,35 @@ def _parsed(words: list[str]) -> argparse.Namespace:
 
 
 def _show_commands(top: argparse.ArgumentParser) -> NoReturn:
-    """What to do with a call without a command."""
+    """List the commands and exit, for a call without one."""
     listed = "".join(f"  {name:<12} {about}\n" for name, about in COMMANDS.items())
     usage = f"{top.format_usage()}\ncommands:\n{listed}\nsee stillmap --help\n"
     top.exit(EXIT_INPUT, usage)
 
 
 def _complete() -> NoReturn:
-    """Answers the shell that asks how a line may go on."""
-    from stillmap.cli.completion import answer
+    """Answer the completion request of a shell."""
+    from stillmap.cli.completion import answer_shell
 
-    answer(parser(os.environ.get("COMP_LINE", "").split()))
+    answer_shell(parser(os.environ.get("COMP_LINE", "").split()))
 
 
-class _Said(logging.Handler):
-    """What the package has to say goes where everything is said, above a bar that is shown."""
+class _Handler(logging.Handler):
+    """Print log messages like all others, above a progress bar."""
 
     def emit(self, record: logging.LogRecord) -> None:
         say(record.getMessage())
 
 
-def _log(args: argparse.Namespace) -> None:
+def _set_up_logging(args: argparse.Namespace) -> None:
     root = logging.getLogger()
     root.setLevel(logging.INFO if args.verbose else logging.WARNING)
-    if not any(isinstance(handler, _Said) for handler in root.handlers):
-        root.addHandler(_Said())
+    if not any(isinstance(handler, _Handler) for handler in root.handlers):
+        root.addHandler(_Handler())
 
 
 def _with_similar_name(error: InputError, args: argparse.Namespace) -> InputError:
-    """A file that was named but is not there: one beside it with nearly that name was meant?"""
+    """Add a hint to the error of a missing file: the file beside it with a similar name."""
     path = Path(error.where)
     given = {Path(word) for word in vars(args).values() if isinstance(word, str | Path)}
     if not error.what.startswith(("does not exist", "cannot be read")) or path not in given:
@@ -103,7 +103,7 @@ def _with_similar_name(error: InputError, args: argparse.Namespace) -> InputErro
         if os.path.lexists(path) or not path.parent.is_dir():
             return error
         with os.scandir(path.parent) as entries:
-            names = [entry.name for entry, _ in zip(entries, range(_MANY), strict=False)]
+            names = [entry.name for entry, _ in zip(entries, range(_MAX_NAMES), strict=False)]
     except (OSError, ValueError):
         return error
     similar = closest_match(path.name, names)
@@ -114,7 +114,7 @@ def _with_similar_name(error: InputError, args: argparse.Namespace) -> InputErro
 
 
 def _report_defect(error: Exception) -> None:
-    """The trace is what we want to be sent: without it a report says little."""
+    """Print the trace and ask for a report."""
     import traceback
 
     if sys.stderr is not None:
@@ -122,24 +122,24 @@ def _report_defect(error: Exception) -> None:
     fail("this is a defect of stillmap: please report it, with the lines above")
 
 
-def _stopped_by(error: BaseException | None) -> BaseException | None:
-    """The Ctrl-C or SIGTERM behind an error that was made of it while something was closed."""
+def _find_interrupt(error: BaseException | None) -> BaseException | None:
+    """The Ctrl-C or SIGTERM that an error was raised from during clean-up, or None."""
     while error is not None and not isinstance(error, KeyboardInterrupt | SystemExit):
         error = error.__cause__ or error.__context__
     return error
 
 
-def _interrupted() -> int:
+def _report_interrupt() -> int:
     say("interrupted, nothing was half-written")
     return EXIT_INTERRUPTED
 
 
 def _flush_stdout() -> None:
-    if sys.stdout is not None:  # None: it was closed before we began
+    if sys.stdout is not None:  # None: closed before the start
         sys.stdout.flush()
 
 
 def _drop_stdout() -> None:
-    """What is still buffered goes nowhere, instead of failing once more when Python ends."""
+    """Discard what is buffered, which would fail once more when Python exits."""
     if sys.stdout is not None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

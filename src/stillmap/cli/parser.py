@@ -1,7 +1,4 @@
-"""argparse as people expect it: one line per error, with a hint; help as wide as the terminal.
-
-All commands by name. The module of one is loaded when it is called: that is what takes long.
-"""
+"""The argument parser: commands loaded on demand, errors of one line with a hint."""
 
 import argparse
 import re
@@ -17,7 +14,7 @@ EXIT_INPUT = 2
 
 
 class _Help(argparse.HelpFormatter):
-    """Paragraphs are as wide as the terminal; examples stay as they are written."""
+    """Wrap paragraphs to the terminal; keep examples as they are."""
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
         if "\n" in text:
@@ -26,7 +23,7 @@ class _Help(argparse.HelpFormatter):
 
 
 class Parser(argparse.ArgumentParser):
-    """Errors are one line, name what was meant, and exit with status 2."""
+    """An ArgumentParser whose errors are one line with a suggestion and status 2."""
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(**{"formatter_class": _Help, **settings})
@@ -34,9 +31,9 @@ class Parser(argparse.ArgumentParser):
     def parse_known_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> tuple[argparse.Namespace, list[str]]:
-        """Refuses unknown flags before it misses arguments that may be behind them."""
+        """Refuse unknown flags before missing arguments, which may follow them."""
         words = list(sys.argv[1:] if args is None else args)
-        # as a path it would be the folder one is in, which --overwrite would replace
+        # an empty path is the working directory, which --overwrite would replace
         if any(re.fullmatch(r"(--[^=]+=)?", word) for word in words):
             self.error("an argument is empty", "a variable that is not set?")
         if self.subcommands() is None:
@@ -46,25 +43,25 @@ class Parser(argparse.ArgumentParser):
         return found, unknown
 
     def subcommands(self) -> dict[str, "Parser"] | None:
-        """The commands below this one by name; None: it is one that does something."""
+        """Parsers of the commands below this one by name; None: there are none."""
         for action in self._actions:
             if isinstance(action, argparse._SubParsersAction):
                 return action.choices
         return None
 
     def flags(self) -> list[str]:
-        """Every flag, long and short."""
+        """All flags, long and short."""
         return [flag for action in self._actions for flag in action.option_strings]
 
     def error(self, message: str, hint: str = "") -> NoReturn:
-        """Says what is wrong with the call, on one line, and exits."""
+        """Print the error on one line and exit."""
         advice = f"{hint} see" if hint else "see"
         line = f"{message} ({advice} {self.prog} --help)".replace("\n", " ")
         self.exit(EXIT_INPUT, f"{colorize(f'{self.prog}:', 'error', sys.stderr)} {line}\n")
 
     def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
-        """Flushes first: --help and --version may be going into a pipe that has closed."""
-        if sys.stdout is not None:  # None: it was closed before we began
+        """Flush and exit: --help and --version may go into a closed pipe."""
+        if sys.stdout is not None:  # None: closed before the start
             sys.stdout.flush()
         super().exit(status, message)
 
@@ -73,15 +70,15 @@ class Parser(argparse.ArgumentParser):
             return
         choices = [str(one) for one in action.choices]
         if isinstance(action, argparse._SubParsersAction):
-            self.error(f"unknown {str(action.metavar).lower()} '{value}'", _meant(value, choices))
+            self.error(f"unknown {str(action.metavar).lower()} '{value}'", _suggest(value, choices))
         name = argparse.ArgumentError(action, "").argument_name
         what = f"argument {name}: invalid choice: '{value}' (choose from {', '.join(choices)})"
-        self.error(what, _meant(str(value), choices))
+        self.error(what, _suggest(str(value), choices))
 
     def _refuse(self, unknown: list[str]) -> None:
         if unknown:
             flag = unknown[0].partition("=")[0]
-            hint = _meant(flag, self.flags()) if flag.startswith("-") else ""
+            hint = _suggest(flag, self.flags()) if flag.startswith("-") else ""
             self.error(f"unrecognized arguments: {' '.join(unknown)}", hint)
 
     def _knows(self, word: str) -> bool:
@@ -96,7 +93,7 @@ def _flags(words: list[str]) -> Iterable[str]:
     return (word for word in words[:end] if word.startswith("--") and " " not in word)
 
 
-def _meant(word: str, known: Iterable[str]) -> str:
+def _suggest(word: str, known: Iterable[str]) -> str:
     meant = closest_match(word, known)
     return f"did you mean '{meant}'?" if meant else ""
 
@@ -105,22 +102,22 @@ COMMANDS = {
     "map": "the main job: recording in, folder out",
     "info": "what is in a recording",
     "view": "look at a result",
-    "filter": "the recording again, without beams on what moves, for other mappers",
+    "filter": "the recording without dynamic beams, for other mapping programs",
     "convert": "one recording format to another; results for other programs",
     "simulate": "a recording with truth, for tests and demos",
     "eval": "score a trajectory, labels or a map",
     "config": "every option with its default, unit and meaning, as TOML",
-    "completion": "what lets a shell complete commands, flags and options",
+    "completion": "the completion script of a shell",
 }
 
 _COMMANDS_EPILOG = """examples:
   stillmap info log.clf.gz              what is in a recording
   stillmap map log.clf.gz -o out        map it
   stillmap view out                     look at the map and the report
-  stillmap filter out -o clean.clf      the recording without what moved
+  stillmap filter out -o clean.clf      the recording without dynamic beams
   stillmap convert log.bag -o log.mcap  one format to another
   stillmap simulate hall -o sim         a recording with truth
-  stillmap eval labels out sim          how good the labels are
+  stillmap eval labels out sim          score the labels
 
 exit status:
   0    done
@@ -131,10 +128,10 @@ exit status:
 
 
 def parser(wanted: Collection[str] = tuple(COMMANDS)) -> Parser:
-    """The command line; flags and arguments are there for the commands that are wanted."""
+    """Build the parser, with the flags and arguments of the commands in `wanted` alone."""
     top = Parser(
         prog="stillmap",
-        description="Clean maps of what stands still, from recordings of places full of movers.",
+        description="Clean maps of static environments from recordings full of moving objects.",
         epilog=_COMMANDS_EPILOG,
     )
     top.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
@@ -150,7 +147,7 @@ def parser(wanted: Collection[str] = tuple(COMMANDS)) -> Parser:
 
 
 class _Version(argparse.Action):
-    """Looked up when it is asked for."""
+    """Print the version, looked up on demand."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
         from stillmap import __version__
@@ -160,12 +157,12 @@ class _Version(argparse.Action):
 
 
 def _add_common(parser: Parser) -> None:
-    """-v and --quiet, before the command and behind it."""
+    """Add -v and --quiet, before the command and after it."""
     if not any(action.dest == "quiet" for action in parser._actions):
         parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
-    parser.add_argument("-v", "--verbose", action="store_true", help="say more while working")
+    parser.add_argument("-v", "--verbose", action="store_true", help="print more messages")
     for action in parser._actions:
         if action.dest in ("quiet", "verbose"):
-            action.default = argparse.SUPPRESS  # not given here: what was said before it stays
+            action.default = argparse.SUPPRESS  # keep the value given before the command
     for command in (parser.subcommands() or {}).values():
         _add_common(command)

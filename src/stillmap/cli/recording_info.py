@@ -1,4 +1,4 @@
-"""What is in a recording, in numbers."""
+"""Summary statistics of a recording, for `stillmap info`."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -11,8 +11,8 @@ from stillmap.core import arrays, se2
 from stillmap.core.recording import Recording
 from stillmap.preprocessing.max_range import RangeRule
 
-_SAMPLED = 1 << 24  # beams of which quantiles are taken; of more than that, of as many
-_FEW = 100  # scans that a sample needs
+_MAX_SAMPLE = 1 << 24  # beams used for quantiles of ranges
+_MIN_SCANS = 100  # scans that a sample needs
 _DAMAGE = ("skipped", "skipped_odometry", "damage")
 _TABLES = ("records", "ignored", "params", "read_options")
 _LISTS = ("duplicates", "warnings", "topics")
@@ -21,12 +21,12 @@ _SENSOR_NOTES = (
     *("name", "beams_per_scan", "start_angle", "angle_step", "extrinsics", "ranges"),
     *("upside_down", "upside_down_how", "frame"),
 )
-_RULE = {field.name for field in dataclasses.fields(RangeRule)}
+_RANGE_RULE = {field.name for field in dataclasses.fields(RangeRule)}
 
 
 def summarize_recording(recording: Recording) -> dict[str, Any]:
-    """Everything that `stillmap info` shows, JSON-able: metres, seconds, degrees."""
-    source = _notes(recording.source)
+    """Summarize a recording for `stillmap info`, JSON-able, in metres, seconds and degrees."""
+    source = _read_notes(recording.source)
     beams = np.diff(recording.offset)
     return {
         "path": source.get("path"),
@@ -34,23 +34,23 @@ def summarize_recording(recording: Recording) -> dict[str, Any]:
         "dimension": recording.dimension,
         "scans": recording.n_scans,
         "beams": recording.n_beams,
-        "beams_per_scan": _spread(beams, ("min", "median", "max")),
-        "counts": _counts(recording),
-        "hit_ranges_m": _spread(_hit_ranges(recording), ("min", "median", "p99", "max")),
-        "time": _time(recording.stamp_ns),
-        "beam_times_s": _spread_of_times(recording.beam_time),
+        "beams_per_scan": _quantiles(beams, ("min", "median", "max")),
+        "counts": _count_beams(recording),
+        "hit_ranges_m": _quantiles(_sample_hit_ranges(recording), ("min", "median", "p99", "max")),
+        "time": _summarize_time(recording.stamp_ns),
+        "beam_times_s": _beam_time_range(recording.beam_time),
         "spin": source["spin"].get("direction"),
-        "odometry": _odometry(recording, source["odometry"]),
-        "recorded_poses": _way(recording.T_recorded_base),
-        "images": _pictures(recording),
-        "sensors": _sensors(recording, source["sensors"]),
+        "odometry": _summarize_odometry(recording, source["odometry"]),
+        "recorded_poses": _summarize_path(recording.T_recorded_base),
+        "images": _summarize_images(recording),
+        "sensors": _summarize_sensors(recording, source["sensors"]),
         "self_filter": [noted for noted in source["self_filter"] if _is_box(noted)],
         **{key: source[key] for key in (*_DAMAGE, "skipped_unit", *_TABLES, *_LISTS, *_WORDS)},
     }
 
 
-def _notes(source: dict[str, Any]) -> dict[str, Any]:
-    """What the reader noted; notes of another shape than expected (other writers) are left out."""
+def _read_notes(source: dict[str, Any]) -> dict[str, Any]:
+    """Notes of the reader by key; those of unexpected type (other writers) are dropped."""
     tables = {key: source.get(key) for key in (*_DAMAGE, *_TABLES, "odometry", "spin")}
     notes: dict[str, Any] = {k: v if isinstance(v, dict) else {} for k, v in tables.items()}
     lists = {key: source.get(key) for key in (*_LISTS, "sensors", "self_filter")}
@@ -69,29 +69,29 @@ def _notes(source: dict[str, Any]) -> dict[str, Any]:
     return notes
 
 
-def _hit_ranges(recording: Recording) -> NDArray[np.float32]:
-    """Ranges of the hits; of huge recordings, of evenly spaced scans only."""
-    step = -(-recording.n_beams // _SAMPLED)
+def _sample_hit_ranges(recording: Recording) -> NDArray[np.float32]:
+    """Ranges of the hits, m; a regular sample of them in huge recordings."""
+    step = -(-recording.n_beams // _MAX_SAMPLE)
     parts = [np.empty(0, np.float32)]
     for beams in (
         arrays.iter_blocks(recording.points, recording.hit)
         if step <= 1
-        else _scans(recording, step)
+        else _iter_sample(recording, step)
     ):
         points = recording.points[beams][recording.hit[beams]]
         parts.append(np.linalg.norm(points.astype(np.float64), axis=1).astype(np.float32))
     return np.concatenate(parts)
 
 
-def _scans(recording: Recording, step: int) -> Iterator[slice]:
-    """Every so many scans; of the scans every so many beams where they are few and large."""
-    every = step if recording.n_scans >= _FEW * step else 1
+def _iter_sample(recording: Recording, step: int) -> Iterator[slice]:
+    """Slices of every `step`-th scan, or of every `step`-th beam where scans are few."""
+    every = step if recording.n_scans >= _MIN_SCANS * step else 1
     for scan in recording.iter_scans(range(0, recording.n_scans, every)):
         beams = recording.beams_of(scan)
         yield slice(beams.start, beams.stop, step // every)
 
 
-def _spread(values: NDArray[Any], wanted: tuple[str, ...]) -> dict[str, float] | None:
+def _quantiles(values: NDArray[Any], wanted: tuple[str, ...]) -> dict[str, float] | None:
     """Quantiles by name; values that occur, so that 81.83 stays 81.83."""
     if values.size == 0:
         return None
@@ -100,7 +100,7 @@ def _spread(values: NDArray[Any], wanted: tuple[str, ...]) -> dict[str, float] |
     return {name: round(float(value), 4) for name, value in zip(wanted, found, strict=True)}
 
 
-def _counts(recording: Recording) -> dict[str, Any]:
+def _count_beams(recording: Recording) -> dict[str, Any]:
     hits = unusable = 0
     for block in arrays.iter_blocks(recording.points, recording.hit):
         hits += int(np.count_nonzero(recording.hit[block]))
@@ -114,7 +114,7 @@ def _counts(recording: Recording) -> dict[str, Any]:
     return {**counts, "shares": {name: count / total for name, count in counts.items()}}
 
 
-def _time(stamp_ns: NDArray[np.int64]) -> dict[str, Any] | None:
+def _summarize_time(stamp_ns: NDArray[np.int64]) -> dict[str, Any] | None:
     if len(stamp_ns) == 0:
         return None
     first, last = int(stamp_ns[0]), int(stamp_ns[-1])
@@ -129,8 +129,8 @@ def _time(stamp_ns: NDArray[np.int64]) -> dict[str, Any] | None:
     }
 
 
-def _spread_of_times(beam_time: NDArray[np.float32] | None) -> list[float] | None:
-    """When after its scan's stamp the first and the last beam of any scan was taken."""
+def _beam_time_range(beam_time: NDArray[np.float32] | None) -> list[float] | None:
+    """Earliest and latest beam time of all scans, s after the scan's stamp."""
     if beam_time is None or not len(beam_time):
         return None
     blocks = arrays.iter_blocks(beam_time)
@@ -138,12 +138,12 @@ def _spread_of_times(beam_time: NDArray[np.float32] | None) -> list[float] | Non
     return [float(min(first)), float(max(last))]
 
 
-def _odometry(recording: Recording, noted: dict[str, Any]) -> dict[str, Any] | None:
+def _summarize_odometry(recording: Recording, noted: dict[str, Any]) -> dict[str, Any] | None:
     T = recording.T_odom_base
     if T is None:
         return None
     found = {key: noted[key] for key in ("from", "outside") if noted.get(key) is not None}
-    metres, degrees = _steps(T)
+    metres, degrees = _step_lengths(T)
     at = int(metres.argmax()) if len(metres) else 0
     return {
         **found,
@@ -155,8 +155,8 @@ def _odometry(recording: Recording, noted: dict[str, Any]) -> dict[str, Any] | N
     }
 
 
-def _steps(T: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(T-1,) metres and degrees from pose to pose."""
+def _step_lengths(T: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(T-1,) distances, m, and rotations, degrees, between consecutive poses."""
     step = se2.inverse(T[:-1]) @ T[1:]
     # the angle of a rotation in any dimension follows from its trace
     trace = np.trace(step[:, :-1, :-1], axis1=1, axis2=2)
@@ -165,14 +165,14 @@ def _steps(T: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.floa
     return metres, np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
-def _way(T: NDArray[np.float64] | None) -> dict[str, Any] | None:
+def _summarize_path(T: NDArray[np.float64] | None) -> dict[str, Any] | None:
     if T is None:
         return None
-    metres, degrees = _steps(T)
+    metres, degrees = _step_lengths(T)
     return {"path_length_m": float(metres.sum()), "turned_deg": float(degrees.sum())}
 
 
-def _pictures(recording: Recording) -> dict[str, Any] | None:
+def _summarize_images(recording: Recording) -> dict[str, Any] | None:
     images = recording.images
     if images is None:
         return None
@@ -199,25 +199,27 @@ def _pictures(recording: Recording) -> dict[str, Any] | None:
     }
 
 
-def _sensors(recording: Recording, noted: list[Any]) -> list[dict[str, Any]]:
-    """Every sensor; one that moves on its robot has many places in the arrays and one note."""
+def _summarize_sensors(recording: Recording, noted: list[Any]) -> list[dict[str, Any]]:
+    """Summaries of all sensors; a moving sensor has several extrinsics and one note."""
     out, first, number = [], 0, 0
     while first < len(recording.T_base_sensor):
         notes = noted[number] if number < len(noted) and isinstance(noted[number], dict) else {}
         places = notes.get("places", 1)
         places = places if isinstance(places, int) and places > 0 else 1
-        out.append(_sensor(recording, range(first, first + places), notes))
+        out.append(_summarize_sensor(recording, range(first, first + places), notes))
         first, number = first + places, number + 1
     return out
 
 
-def _sensor(recording: Recording, numbers: range, noted: dict[str, Any]) -> dict[str, Any]:
-    """One sensor: what its reader noted, else what shows in the arrays."""
+def _summarize_sensor(
+    recording: Recording, numbers: range, noted: dict[str, Any]
+) -> dict[str, Any]:
+    """Summarize one sensor from the notes of its reader, else from the arrays."""
     its = (recording.sensor >= numbers.start) & (recording.sensor < numbers.stop)
     scans = np.flatnonzero(its)
     out: dict[str, Any] = {"scans": len(scans)}
     out.update((key, noted[key]) for key in _SENSOR_NOTES if key in noted)
-    if not _is_rule(out.get("ranges")):
+    if not _is_range_rule(out.get("ranges")):
         out.pop("ranges", None)
     if recording.dimension == 2:
         x, y, theta = (float(v) for v in se2.parameters(recording.T_base_sensor[numbers.start]))
@@ -228,33 +230,33 @@ def _sensor(recording: Recording, numbers: range, noted: dict[str, Any]) -> dict
     return out
 
 
-def _is_rule(noted: Any) -> bool:
+def _is_range_rule(noted: Any) -> bool:
     return (
         isinstance(noted, dict)
-        and set(noted) | {"self_filter"} == _RULE  # older recordings do not have it
+        and set(noted) | {"self_filter"} == _RANGE_RULE  # older recordings lack it
         and all(isinstance(noted[k], float | int | None) for k in ("threshold", "free_range"))
-        and all(_is_part(part) for part in noted.get("self_filter", ()))
+        and all(_is_triple(part) for part in noted.get("self_filter", ()))
     )
 
 
-def _is_part(noted: Any) -> bool:
+def _is_triple(noted: Any) -> bool:
     numbers = list(noted) if isinstance(noted, list | tuple) else []
     return len(numbers) == 3 and all(isinstance(number, float | int) for number in numbers)
 
 
 def _is_box(noted: Any) -> bool:
-    """What a sensor of a 3D recording sees of its robot."""
+    """Whether a note is the box of a robot's own returns in a 3D recording."""
     return (
         isinstance(noted, dict)
         and all(isinstance(noted.get(key), int) for key in ("sensor", "beams"))
-        and all(_is_part(noted.get(key)) for key in ("low", "high"))
+        and all(_is_triple(noted.get(key)) for key in ("low", "high"))
     )
 
 
 def _field_of_view(
     recording: Recording, scans: NDArray[np.intp], noted: dict[str, Any]
 ) -> list[float] | None:
-    """First and last beam in degrees: as noted, else the extremes of all usable beams."""
+    """First and last beam angle, degrees: as noted, else the extremes of all usable beams."""
     first, step, n = (noted.get(k) for k in ("start_angle", "angle_step", "beams_per_scan"))
     if isinstance(first, float) and isinstance(step, float) and isinstance(n, int):
         last = first + (n - 1) * step
