@@ -1,6 +1,5 @@
-"""What `stillmap eval model` computes: scores of textured models."""
+"""Compute and format the scores of `stillmap eval model`."""
 
-import argparse
 import math
 from collections.abc import Iterable
 from pathlib import Path
@@ -21,35 +20,43 @@ from stillmap.sim.truth import load_truth
 Float = NDArray[np.float64]
 
 
-def score_model(args: argparse.Namespace) -> tuple[dict[str, Any], Iterable[str]]:
-    """Surface, texture, and models of what moved; what a result does not have is left out."""
-    require_there(args.result, args.truth)
-    seen = model_readers.read_camera_simulation(args.truth)
-    T_world_map = _alignment(args.result, seen)
+def score_model(
+    result: Path, truth_folder: Path, max_distance: float
+) -> tuple[dict[str, Any], Iterable[str]]:
+    """Scores of surface, texture and object models, of those that the result has.
+
+    Args:
+        result: result folder.
+        truth_folder: simulation with cameras.
+        max_distance: expect only what was seen from at most this far, m.
+    """
+    require_there(result, truth_folder)
+    seen = model_readers.read_camera_simulation(truth_folder)
+    T_world_map = _align(result, seen)
     scores: dict[str, Any] = {"alignment": T_world_map.tolist()}
     lines: list[str] = []
-    glb = model_readers.read_glb(require_model(args.result))
-    standing, places = seen.image_truth.standing, seen.observed_places(args.within)
+    glb = model_readers.read_glb(require_model(result))
+    standing, places = seen.image_truth.standing, seen.observed_places(max_distance)
     surface = score_surface(glb.vertices, glb.faces, standing, places, T_world_map)
     scores["surface"] = surface.to_dict()
-    lines += _surface_lines(surface)
+    lines += _format_surface(surface)
     n = len(seen.images.camera)
-    record = model_readers.read_record(args.result / model_readers.RECORD, n)
+    record = model_readers.read_record(result / model_readers.RECORD, n)
     if record is not None:
         seed = seen.image_truth.colour_seed
         texture = score_texture(
-            record, glb.colored, seen.images, standing, seed, T_world_map, args.within
+            record, glb.colored, seen.images, standing, seed, T_world_map, max_distance
         )
         scores["texture"] = texture.to_dict()
-        lines += _texture_lines(texture)
-    if (model_readers.find_objects_folder(args.result) / "objects.json").exists():
-        movers = _movers(args.result, seen, T_world_map)
+        lines += _format_texture(texture)
+    if (model_readers.find_objects_folder(result) / "objects.json").exists():
+        movers = _score_movers(result, seen, T_world_map)
         scores["movers"] = movers.to_dict()
-        lines += _mover_lines(movers)
+        lines += _format_movers(movers)
     return scores, lines
 
 
-def _alignment(result: Path, seen: CameraSimulation) -> Float:
+def _align(result: Path, seen: CameraSimulation) -> Float:
     """(4, 4) T_world_map."""
     T = trajectory.align(
         *trajectory.project_flat_trajectories(*read_paired_poses(result, seen.truth))
@@ -57,7 +64,7 @@ def _alignment(result: Path, seen: CameraSimulation) -> Float:
     return T if len(T) == 4 else lift_poses(T[None])[0]
 
 
-def _movers(result: Path, seen: CameraSimulation, T_world_map: Float) -> MoverScores:
+def _score_movers(result: Path, seen: CameraSimulation, T_world_map: Float) -> MoverScores:
     truth, folder = load_truth(seen.truth.folder), model_readers.find_objects_folder(result)
     kinds, sizes = truth.scene["mover_kinds"], truth.scene["mover_sizes"]
     length = np.array([np.nan if size[0] is None else size[0] for size in sizes], float)
@@ -77,22 +84,22 @@ def _movers(result: Path, seen: CameraSimulation, T_world_map: Float) -> MoverSc
     return score_object_models(tracked, models, kinds, moving, sighted, seen.images, T_world_map)
 
 
-def _surface_lines(s: SurfaceScores) -> Iterable[str]:
+def _format_surface(s: SurfaceScores) -> Iterable[str]:
     yield f"surface      {s.faces} faces, {s.area:.1f} m2"
     yield f"off truth    mean {_cm(s.mean)}, 95 % below {_cm(s.p95)}"
     yield f"complete     {_percent(s.complete)} of {s.places} places within 5 cm"
 
 
-def _texture_lines(t: TextureScores) -> Iterable[str]:
+def _format_texture(t: TextureScores) -> Iterable[str]:
     yield (
         f"textured     {_percent(t.textured)} of the area, {_percent(t.covered)} of the "
-        f"{_percent(t.in_view)} that a picture sees without a mover"
+        f"{_percent(t.in_view)} that an image sees without a mover"
     )
     yield f"shows        movers {_percent(t.mover)}, nothing {_percent(t.nothing)}"
     yield f"CIEDE2000    median {t.colour_median:.2f}, 95 % below {t.colour_p95:.2f}"
 
 
-def _mover_lines(m: MoverScores) -> Iterable[str]:
+def _format_movers(m: MoverScores) -> Iterable[str]:
     yield (
         f"movers       {m.tracked} tracked, {_percent(m.modelled)} with a model; "
         f"of {m.seen_well} seen by 100 beams in a second {_percent(m.modelled_well)}"
