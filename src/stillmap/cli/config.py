@@ -1,7 +1,4 @@
-"""`stillmap config` prints every option; `--config` and `--set` of all commands.
-
-Precedence: default < file < --set < flag.
-"""
+"""`stillmap config`: print every option; the flags `--config` and `--set` of all commands."""
 
 import argparse
 from collections.abc import Iterator
@@ -16,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def add_option_flags(p: argparse.ArgumentParser) -> None:
-    """Adds `--config` and `--set`."""
+    """Add `--config` and `--set`."""
     group = p.add_argument_group("any other option, see `stillmap config`")
     group.add_argument("--config", metavar="FILE.toml", help="options from a TOML file")
     add_set_flag(
@@ -25,7 +22,7 @@ def add_option_flags(p: argparse.ArgumentParser) -> None:
 
 
 def add_set_flag(p: argparse._ActionsContainer, help: str) -> argparse.Action:
-    """Adds `--set`; the last one wins."""
+    """Add `--set`; the last value of an option counts."""
     return p.add_argument(
         "--set",
         dest="assignments",
@@ -37,7 +34,7 @@ def add_set_flag(p: argparse._ActionsContainer, help: str) -> argparse.Action:
 
 
 def options_from_args(args: argparse.Namespace, *flags: dict[str, Any]) -> "Options":
-    """Options from the file, --set and flags.
+    """Resolve options by precedence: default < file < --set < flag.
 
     Raises:
         InputError: an unknown key or a wrong value, and where it came from.
@@ -53,7 +50,7 @@ def options_from_args(args: argparse.Namespace, *flags: dict[str, Any]) -> "Opti
 
 
 def complete_option_names(**_: Any) -> Iterator[str]:
-    """Names of options and sections, for shell completion."""
+    """Yield names of options and sections, for shell completion."""
     from stillmap.core.config import iter_names
     from stillmap.pipeline.options import DEFAULTS
 
@@ -67,7 +64,7 @@ def _assignments(prefix: str, **_: Any) -> Iterator[str]:
 
 
 def complete_assignments(options: Any, prefix: str) -> Iterator[str]:
-    """Completes an argument of --set: names of options, or values of the option it names."""
+    """Complete an argument of --set: names of options, or values of the named option."""
     from stillmap.core.config import iter_options
 
     name, equals, _ = prefix.partition("=")
@@ -83,17 +80,17 @@ _EPILOG = """examples:
   stillmap config                       every option
   stillmap config slam.odometry         one section
   stillmap config --set em.prior=0.8    with changes, as `stillmap map` would use them
-  stillmap config > options.toml        to be changed, for `stillmap map --config options.toml`
+  stillmap config > options.toml        to edit, for `stillmap map --config options.toml`
 """
 
 
 def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Adds the command."""
+    """Add the command."""
     p = commands.add_parser(
         "config",
         help=COMMANDS["config"],
-        description="Print every option with its default, meaning and range, as TOML that --config "
-        "reads back. Precedence: defaults < file of --config < --set < other flags.",
+        description="Print every option with its default, meaning and range, as TOML for --config."
+        " Precedence: defaults < file of --config < --set < other flags.",
         epilog=_EPILOG,
     )
     only = p.add_argument(
@@ -110,7 +107,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
 
 
 def run(args: argparse.Namespace) -> int:
-    """Prints the options."""
+    """Print the options."""
     from stillmap.core.config import to_toml
 
     options = options_from_args(args)

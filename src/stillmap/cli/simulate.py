@@ -1,4 +1,4 @@
-"""`stillmap simulate SCENE`: a recording with truth, for tests and demos."""
+"""`stillmap simulate SCENE`: simulate a recording with truth, for tests and demos."""
 
 import argparse
 import math
@@ -20,24 +20,24 @@ _SCENES = {
     "corridor": "a loop of 36 x 22 m, 20 people",
     "corridor-crowd": "the same with 40 people",
     "office": "40 x 25 m, 22 doors, 10 people",
-    "office-moved": "things stand elsewhere the second time",
+    "office-moved": "things are moved between two visits",
     "warehouse": "50 x 30 m, 12 people, 2 forklifts",
     "warehouse-moved": "racks are emptied and filled overnight",
     "street": "180 m, there and back, 14 cars, 16 pedestrians",
     "street-moved": "parked cars drive off, others park",
-    "street-turn": "185 m, once, cars that wait and cars that drive",
-    "street-jam": "the street with lights and a queue; everybody stops now and then",
+    "street-turn": "185 m, one way, waiting and driving cars",
+    "street-jam": "the street with lights and a queue; everybody stops at times",
     "crossing": "two streets of 180 m, lights, old trees, a park, 16 cars, 30 pedestrians",
     "drive": "970 m by car, with a red light",
     "building": "grows with --scans, wing by wing",
-    "ten-corridors": "56 x 37 m, corridors that all look the same",
+    "ten-corridors": "56 x 37 m, corridors of the same shape",
     "rounds": "197 x 82 m, corridors around six courtyards, 40 people",
 }
 
 _LISTED = "".join(f"  {name:<16} {what}\n" for name, what in _SCENES.items())
 _EPILOG = f"""scenes:
 {_LISTED}\
-  NAME-empty       any of them but the -crowd ones, without people and vehicles
+  NAME-empty       any but the -crowd ones, without people and vehicles
 
 examples:
   stillmap simulate hall -o sim
@@ -50,25 +50,25 @@ examples:
 
 # flag, metavar, type, section and key of the option it sets, help
 _FLAGS: tuple[tuple[str, str, type, str, str, str], ...] = (
-    ("people", "N", int, "crowd", "people", "how many walk about"),
+    ("people", "N", int, "crowd", "people", "number of people"),
     ("stopping", "SHARE", float, "crowd", "stopping_share", "share of people who stop at times"),
-    ("min-stop", "S", float, "crowd", "min_stop", "the shortest stop, seconds"),
-    ("max-stop", "S", float, "crowd", "max_stop", "the longest stop, seconds"),
-    ("scans", "N", int, "robot", "scans", "scans to take; the route goes round and round"),
+    ("min-stop", "S", float, "crowd", "min_stop", "shortest stop, seconds"),
+    ("max-stop", "S", float, "crowd", "max_stop", "longest stop, seconds"),
+    ("scans", "N", int, "robot", "scans", "number of scans; the route is repeated"),
     ("rate", "HZ", float, "robot", "scan_rate", "scans per second"),
     ("beams", "N", int, "laser", "beams", "beams per scan"),
     ("fov", "DEG", float, "laser", "fov", "field of view in degrees"),
     ("max-range", "M", float, "laser", "max_range", "range of the laser, metres"),
     ("range-noise", "M", float, "laser", "range_noise", "standard deviation of ranges, metres"),
-    ("sweep-time", "S", float, "laser", "sweep_time", "how long a scan takes, seconds"),
-    ("slip-rate", "N", float, "odometry", "slip_rate", "how often wheels slip, per metre driven"),
-    ("stall-rate", "N", float, "odometry", "stall_rate", "how often odometry stalls, per minute"),
-    ("resets", "N", int, "odometry", "resets", "how often odometry begins again at its origin"),
-    ("carried-at", "SHARE", float, "robot", "carried_at", "when the robot is carried elsewhere"),
-    ("stamp-rounding", "S", float, "robot", "stamp_rounding", "how coarse stamps are, seconds"),
+    ("sweep-time", "S", float, "laser", "sweep_time", "duration of a scan, seconds"),
+    ("slip-rate", "N", float, "odometry", "slip_rate", "wheel slips per metre driven"),
+    ("stall-rate", "N", float, "odometry", "stall_rate", "odometry stalls per minute"),
+    ("resets", "N", int, "odometry", "resets", "number of resets of odometry to its origin"),
+    ("carried-at", "SHARE", float, "robot", "carried_at", "when the robot is carried, 0 to 1"),
+    ("stamp-rounding", "S", float, "robot", "stamp_rounding", "resolution of stamps, seconds"),
 )
-# section and key of options of the laser that a lidar has too, and its own key
-_OF_LIDAR = (
+# (section, key) of options of the laser that a lidar has too, and its own key
+_LIDAR_KEYS = (
     ("laser", "max_range", "max_range"),
     ("laser", "range_noise", "range_noise"),
     ("robot", "scan_rate", "rate"),
@@ -84,12 +84,12 @@ _ODOMETRY_ERRORS = (
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Register the command with argparse's `subparsers`."""
+    """Add the command."""
     p = subparsers.add_parser(
         "simulate",
         help=COMMANDS["simulate"],
-        description="Simulate a robot that records a place where people, doors and cars move, and "
-        "write what it recorded together with the truth. What is not given is as the scene has it.",
+        description="Simulate a robot in a place with moving people, doors and cars, and write its "
+        "recording with the truth. Options that are not given are those of the scene.",
         epilog=_EPILOG,
     )
     scene = p.add_argument("scene", metavar="SCENE", help="one of those listed below")
@@ -99,28 +99,27 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     for flag, metavar, kind, section, _, text in _FLAGS:
         groups[section].add_argument(f"--{flag}", metavar=metavar, type=kind, help=text)
     groups["crowd"].add_argument(
-        "--shape", choices=("legs", "bodies", "mixed"), help="what the laser sees of people"
+        "--shape", choices=("legs", "bodies", "mixed"), help="shape of people in a scan"
     )
     groups["laser"].add_argument(
-        "--second-laser", action="store_true", help="another one, that looks backwards"
+        "--second-laser", action="store_true", help="a second laser that looks backwards"
     )
     groups["laser"].add_argument(
         "--lidar",
         metavar="N",
-        help="a spinning lidar of so many channels instead: the world and the recording in 3D; or "
-        "'tilting': another laser that tilts",
+        help="a spinning lidar of N channels instead, in 3D; 'tilting': a second laser that tilts",
     )
     groups["laser"].add_argument(
         "--camera",
         action="store_true",
-        help="cameras beside it, with --lidar; their pictures show what stands and what moves",
+        help="cameras, with --lidar; their images show static and moving things",
     )
     groups["odometry"].add_argument(
         "--odometry-noise",
         metavar="FACTOR",
         type=float,
         default=1.0,
-        help="errors of the odometry against their defaults; 0: perfect (default: %(default)g)",
+        help="factor on the default errors of odometry; 0: perfect (default: %(default)g)",
     )
     others = p.add_argument_group("any other option of the scene, see docs/simulation.md")
     add_set_flag(others, "e.g. traffic.vehicles=3; can be given again").completer = _assignments  # type: ignore[attr-defined]
@@ -128,17 +127,19 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 
 def _add_output_flags(p: argparse.ArgumentParser) -> None:
-    p.add_argument("-o", "--output", metavar="DIR", required=True, help="where it goes")
+    p.add_argument(
+        "-o", "--output", metavar="DIR", required=True, help="folder for recording and truth"
+    )
     p.add_argument("--overwrite", action="store_true", help="replace what is in DIR")
     p.add_argument(
         "--format",
         choices=("stillmap", "carmen"),
         default="stillmap",
-        help="the recording folder, or recording.log with FLASER, RLASER and ODOM lines "
+        help="a recording folder, or recording.log with FLASER, RLASER and ODOM lines "
         "(default: %(default)s)",
     )
     p.add_argument(
-        "--seed", metavar="N", type=int, default=0, help="another one, another run (default: 0)"
+        "--seed", metavar="N", type=int, default=0, help="seed of the random numbers (default: 0)"
     )
     p.add_argument("--json", action="store_true", help="the summary as one JSON object on stdout")
     p.add_argument("--quiet", action="store_true", help="no progress, no summary")
@@ -153,22 +154,22 @@ def _assignments(prefix: str, **_: Any) -> Iterator[str]:
     from stillmap.sim import scene_by_name
 
     found = complete_assignments(scene_by_name("hall"), prefix)
-    return (text for text in found if "." in text)  # what is no section is the scene's geometry
+    return (text for text in found if "." in text)  # names without a section are geometry
 
 
 def run(args: argparse.Namespace) -> int:
-    """Simulate and write; 0 when the folder is there.
+    """Simulate, and write recording and truth.
 
     Raises:
         InputError: unknown scene, a value out of range, or a folder that is in the way.
     """
-    import numpy as np  # this and what follows takes long to load
+    import numpy as np
 
     from stillmap.core.files import require_new
     from stillmap.sim import scene_by_name, simulate, simulate_rig
     from stillmap.sim.writer import MARK, RIG_MARK, require_carmen, write_rig, write_simulation
 
-    scene = scene_by_name(args.scene, _changes(args))
+    scene = scene_by_name(args.scene, _option_changes(args))
     if args.seed < 0:
         raise InputError(f"--seed must not be negative, got {args.seed}")
     if args.format == "carmen":
@@ -176,30 +177,26 @@ def run(args: argparse.Namespace) -> int:
     output = Path(args.output)
     require_new(output, RIG_MARK if scene.rig.tilts else MARK, args.overwrite)
     with show_share(args.quiet, "simulating") as progress:
-        rng, beside = np.random.default_rng(args.seed), output.absolute().parent
-        scratch = beside if beside.is_dir() else None
+        rng, parent = np.random.default_rng(args.seed), output.absolute().parent
+        scratch = parent if parent.is_dir() else None
         if scene.rig.tilts:
             rig = simulate_rig(scene, rng, progress, scratch)
-            made = [rig.horizontal, rig.tilting]
+            simulations = [rig.horizontal, rig.tilting]
         else:
-            made = [simulate(scene, rng, progress, scratch)]
+            simulations = [simulate(scene, rng, progress, scratch)]
     if scene.rig.tilts:
         write_rig(rig, output, overwrite=args.overwrite)
     else:
-        write_simulation(made[0], output, format=args.format, overwrite=args.overwrite)
-    summary = _summary(made, output)
+        write_simulation(simulations[0], output, format=args.format, overwrite=args.overwrite)
+    summary = _summarize(simulations, output)
     if not args.quiet:
-        share = 100 * summary["dynamic"] / max(summary["hits"], 1)
-        say(
-            f"{summary['scene']}: {summary['scans']} scans, {summary['beams']} beams, "
-            f"{share:.1f} % of the hits on movers; in {output}"
-        )
+        _print_summary(summary)
     if args.json:
         print_json(summary)
     return 0
 
 
-def _changes(args: argparse.Namespace) -> dict[str, Any]:
+def _option_changes(args: argparse.Namespace) -> dict[str, Any]:
     from stillmap.core.config import merge_nested, parse_assignment
     from stillmap.sim import scene_by_name
 
@@ -223,16 +220,16 @@ def _changes(args: argparse.Namespace) -> dict[str, Any]:
     if args.lidar == "tilting":
         changes["rig"] = {"tilts": True}
     elif args.lidar is not None:
-        _give_to_lidar(args.lidar, changes)
+        _move_to_lidar(args.lidar, changes)
     return merge_nested(*map(parse_assignment, args.assignments), changes)
 
 
-def _give_to_lidar(channels: str, changes: dict[str, dict[str, Any]]) -> None:
-    """What the flags say of the laser, for the lidar that takes its place."""
+def _move_to_lidar(channels: str, changes: dict[str, dict[str, Any]]) -> None:
+    """Move the changes of the laser to the lidar that takes its place."""
     if not channels.isascii() or not channels.isdigit() or int(channels[:9]) < 1:
         raise InputError(f"--lidar wants a number of channels or 'tilting', got '{channels}'")
     lidar: dict[str, Any] = {"channels": int(channels[:9])}
-    for section, key, own in _OF_LIDAR:
+    for section, key, own in _LIDAR_KEYS:
         if key in changes.get(section, {}):
             lidar[own] = changes[section].pop(key)
     if changes.get("laser"):
@@ -241,20 +238,28 @@ def _give_to_lidar(channels: str, changes: dict[str, dict[str, Any]]) -> None:
     changes["lidar"] = lidar
 
 
-def _summary(made: "list[Simulation]", output: Path) -> dict[str, Any]:
-    """What there is of one recording, or of several taken at the same stamps."""
+def _summarize(simulations: "list[Simulation]", output: Path) -> dict[str, Any]:
+    """Counts over one recording, or over several with the same stamps."""
     from stillmap.core.arrays import iter_blocks
 
-    hits = [one.recording.hit for one in made]
-    movers = [one.truth.mover for one in made]
+    hits = [one.recording.hit for one in simulations]
+    movers = [one.truth.mover for one in simulations]
     return {
         "output": str(output),
         "files": list_files(output),
-        "scene": made[0].scene.name,
-        "scans": made[0].recording.n_scans,
-        "beams": sum(one.recording.n_beams for one in made),
+        "scene": simulations[0].scene.name,
+        "scans": simulations[0].recording.n_scans,
+        "beams": sum(one.recording.n_beams for one in simulations),
         "hits": sum(int(hit[part].sum()) for hit in hits for part in iter_blocks(hit)),
         "dynamic": sum(
             int((mover[part] >= 0).sum()) for mover in movers for part in iter_blocks(mover)
         ),
     }
+
+
+def _print_summary(summary: dict[str, Any]) -> None:
+    share = 100 * summary["dynamic"] / max(summary["hits"], 1)
+    say(
+        f"{summary['scene']}: {summary['scans']} scans, {summary['beams']} beams, "
+        f"{share:.1f} % of the hits on movers; in {summary['output']}"
+    )
