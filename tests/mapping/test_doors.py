@@ -5,7 +5,7 @@ import pytest
 from synthetic_histories import RESOLUTION, block, course, found
 
 from stillmap.mapping import compute_swept_cells
-from stillmap.mapping.doors import _sector
+from stillmap.mapping.doors import _fit_sector
 
 LENGTH = 18.0  # cells
 HINGE = np.array([-7, 12])
@@ -84,7 +84,7 @@ def test_a_leaf_that_is_seen_on_its_way_now_and_then_is_still_a_door():
 @pytest.mark.parametrize("length", [10.0, 18.0, 40.0])
 def test_a_leaf_is_as_long_as_those_of_doors(length):
     cells = door(0.0, np.pi / 2, length=length)
-    assert _sector(cells).length == pytest.approx(length, abs=1.0)
+    assert _fit_sector(cells).length == pytest.approx(length, abs=1.0)
 
     def sweeps(metres):
         return len(compute_swept_cells(cells, metres / length)) > len(cells)
@@ -102,21 +102,21 @@ def test_a_blob_is_its_cells():
     x, y = block(-8, -8, 17, 17).T
     disc = np.column_stack([x, y])[np.hypot(x, y) < 8]
     ring = disc[np.hypot(*disc.T) > 5]
-    assert _sector(ring) is None
+    assert _fit_sector(ring) is None
     assert alone(disc)
     assert alone(ring)  # and not what it goes round
 
 
 def test_two_bays_beside_each_other_are_their_cells():
     bays = np.concatenate([block(0, 0, 6, 3), block(12, 0, 6, 3)])
-    assert _sector(bays) is None
+    assert _fit_sector(bays) is None
     assert alone(bays)
 
 
 def test_a_wide_shelf_round_a_corner_is_its_cells():
     # thicker than a leaf
     shelf = np.concatenate([block(0, 0, 20, 7), block(0, 7, 7, 13)])
-    assert _sector(shelf) is None
+    assert _fit_sector(shelf) is None
     assert alone(shelf)
 
 

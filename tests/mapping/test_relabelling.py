@@ -94,7 +94,9 @@ def test_labels_of_beams_that_end_there_are_what_is_shown(known, state):
     there = listed(known.ends) & known.seen.hit
     assert 50 < there.sum() < 400
     of_cell = dict(
-        zip(map(tuple, known.histories.cells.tolist()), known.histories.p_in_map(state), strict=True)
+        zip(
+            map(tuple, known.histories.cells.tolist()), known.histories.p_in_map(state), strict=True
+        )
     )
     shown = np.array([of_cell.get(tuple(cell), np.nan) for cell in known.ends.tolist()], np.float32)
     assert p_static.dtype == np.float32

@@ -58,7 +58,7 @@ def em_fixed_poses(
         prior: p(c), in [0, 1].
         resolution: metres.
         iterations: how many times both steps are done.
-        kernels: a module with the same functions, `stillmap.reference` by default.
+        kernels: a module with the same functions, `reference` by default.
     """
     k = kernels or reference
     beams = points, hit, offset, T_map_sensor

@@ -1,6 +1,6 @@
-"""Change points of single cells: Viterbi paths of the change HMM, in which objects stay a while.
+"""Change points of cells: Viterbi paths of the change HMM.
 
-An object arrives and stays, or leaves, while others pass by. `docs/estimator/changes.md` has the
+Its three states are object, empty and passer-by. `docs/estimator/changes.md` has the
 three-state HMM.
 """
 
@@ -27,22 +27,22 @@ from stillmap.em.options import EmOptions, MapState
 from stillmap.em.spatial_prior import connected_components, neighbor_pairs
 from stillmap.em.types import MIN_PROBABILITY, ChangedCells, Float
 
-_STATE_DURATION = 2.0  # lengths of the recording, mean duration of a state of a changing cell
+_STATE_DURATION = 2.0  # mean duration of a state, in units of the recording's length
 _MAX_STATE_DURATION = 3600.0  # s
 _PASSER_BY_RHO, _PASSER_BY_TAU = 0.05, 12.0  # share of the time, and correlation time in s
 
 _MAX_DYNAMIC_TAU = 12.0  # s, of the dynamic classes: what stays longer is an object
-_MAX_LOG_RATIO = 60.0  # nats by which the change likelihood may exceed the best class
-_MAX_CHANGE = 4.0  # nats, evidence of a change from one surfel
+_MAX_LOG_RATIO = 60.0  # nats, upper bound of the log likelihood ratio of change HMM to best class
+_MAX_CHANGE = 4.0  # nats, bound of one surfel's log likelihood ratio of changed to static
 _MIN_LIKELIHOOD = 1e-30
 _MIN_P_CHANGED = 0.02  # cells below are not grouped
 
 _GROUP_RADIUS = 3.0  # cells between cells of one object
-_GROUP_BINS = 4  # time bins by which cells of one object may seem to change apart
+_GROUP_BINS = 4  # maximum difference, in time bins, of the change times of cells of one object
 _MIN_GROUP = 4  # cells
-_DECIDING_SHARE = 1.0 / 3.0  # of the cells of a group, whose P(changing) all of them take
+_DECIDING_SHARE = 1.0 / 3.0  # a group takes the P(changing) that this share of its cells reaches
 
-_MIN_LOG_RATIO = 1.0  # nats by which a change explains a listed 3D cell better than all else
+_MIN_LOG_RATIO = 1.0  # nats, minimum gain in log odds of a listed 3D cell over the prior
 
 MIN_RECURRING_CHANGES = 3  # changes from which on something comes and goes, as doors do
 
@@ -55,8 +55,8 @@ class CellHistories:
         cells: (E, D) int64.
         p_static: (E,) float32, probability of surface that never left and is seen from all sides.
         p_view_dependent: (E,) float32, of surface that never left and is seen from some sides.
-        p_changing: (E,) float32, that objects arrived or left, or come and go.
-        p_object: (E,) float32, that one was there at the last observation, if so.
+        p_changing: (E,) float32, P(changing): objects arrived, left, or come and go.
+        p_object: (E,) float32, P(an object is present at the last observation | changing).
         occupied_share: (E,) float32, share of the time between the first and the last observation
             in which the cell was not empty.
         n_changes: (E,) int32, number of arrivals and departures.
@@ -91,7 +91,7 @@ class CellHistories:
         """
         last = np.where(self.n_changes < MIN_RECURRING_CHANGES, self.p_object, np.float32(0.0))
         there = last if state == "last" else (self.occupied_share > 0.5).astype(np.float32)
-        # given that it is not the view that changed
+        # conditional on the cell not being view-dependent
         seen = np.maximum(1.0 - self.p_view_dependent, _MIN_P_CHANGED)
         p = (self.p_static + self.p_changing * there) / seen
         return np.asarray(np.minimum(p, 1.0), np.float32)
@@ -178,7 +178,7 @@ def _classes(seen: Observations) -> NDArray[np.bool_]:
 
 
 def _class_groups(seen: Observations) -> tuple[NDArray[np.bool_], ...]:
-    """(C + 1,) masks of these classes and the change HMM: static, by view, half-time, changing."""
+    """(C + 1,) masks: static, view-dependent, half-time classes, and the change HMM."""
     kept = _classes(seen)
     view = np.append(np.isfinite(seen.view_angle[kept]), False)
     static = np.arange(len(view)) < seen.n_static
@@ -208,7 +208,8 @@ def _decode_rows(
     likelihood = _likelihood(seen, rows)
     _, occupied_share, p_last, n_changes, change_bins = seen.hmm.changes(rows)
     static, view, half_time, changing = (posterior(likelihood, weights, of) for of in groups)
-    # what comes and goes does not stay long enough for an object: 1 counts passers-by as well
+    # index 0: changes of objects only; 1: of occupancy, passers-by included. In half-time cells
+    # objects stay too briefly for the object state
     of = (half_time > changing).astype(np.intp)
     each = np.arange(len(of))
     return {
@@ -223,7 +224,7 @@ def _decode_rows(
 
 
 def _group_cells(cells: CellHistories) -> CellHistories:
-    """Gives neighbouring cells that changed alike one P(changing): that of a third of them."""
+    """Gives neighbouring cells with the same change one P(changing): the upper-third quantile."""
     of = np.flatnonzero(
         (cells.n_changes > 0)
         & (cells.n_changes < MIN_RECURRING_CHANGES)

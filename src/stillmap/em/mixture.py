@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from stillmap.em.types import Float
 
-MAX_FIT_ROWS = 100_000  # rows that weights are fitted to: more change no digit that matters
+MAX_FIT_ROWS = 100_000  # maximum number of rows used in the fit; more make no relevant difference
 _PSEUDO_COUNT = 1.0  # per class, so that none becomes impossible
-_MAX_STATIC_WEIGHT = 0.998  # a recording cannot show that nothing ever moves
+_MAX_STATIC_WEIGHT = 0.998  # upper bound: no recording proves that nothing moves
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,7 +19,8 @@ class MixtureWeights:
     Attributes:
         static: total weight of the static classes.
         classes: (C,) weights of all classes, static ones first; they sum to one.
-        log_likelihood: mean over the rows, in nats.
+        log_likelihood: mean over the fitted rows, in nats relative to their best classes; at the
+            weights before the last update. Not the bound: see `occupancy_hmm`.
     """
 
     static: float
@@ -34,7 +35,7 @@ def fit_weights(
     max_iterations: int = 100,
     tolerance: float = 1e-6,
 ) -> MixtureWeights:
-    """Maximises sum_k ln sum_c w_c L_kc over the weights w.
+    """Fits the weights w by EM: maximises sum_k ln sum_c w_c L_kc, up to a pseudo-count per class.
 
     Args:
         likelihood: (K, C) L, each row relative to its best class.

@@ -27,31 +27,31 @@ MAX_RANGE_MARGIN = 0.3  # m, end of a maximum-range beam that is not used as fre
 
 # multiples of the noise of end points, to which a part of the cell is added
 _LATERAL = 0.7  # standard deviation of a beam's lateral position
-_MARGIN = 3.0  # distance behind a surface from which on a beam has passed it
+_MARGIN = 3.0  # a beam has passed a surface if it ends at least this far behind it
 _HIT_RADIUS = 4.0  # distance from a surfel's mean within which end points are hits
 _MIN_LATERAL = 0.3  # cells
-_USE_NORMALS = True  # surfels have planes, seen at a slant or face on
+_USE_NORMALS = True  # model surfels as planes, with the angle of incidence
 
-_TRUST_SLOPE = 4.0  # trust in beams without a return is 0 where one in four crosses solid cells
+_TRUST_SLOPE = 4.0  # trust reaches 0 where one in four beams without a return crosses solid cells
 _SURFELS_PER_BLOCK = 1 << 14
-_BINS_PER_THREAD = 2  # a time bin is never shared between threads, and some take longer
+_BINS_PER_THREAD = 2  # minimum, for load balance: a time bin is processed by one thread
 _MAX_BIN = 2**31 - 1  # the kernels count in 32 bits
 
-_MIN_PROMINENCE = 0.1  # share of the richest neighbour's end points that noise alone hardly reaches
+_MIN_PROMINENCE = 0.1  # share of the most-hit neighbour's end points that noise hardly exceeds
 _EDGE = 0.15  # cells, how sharply a surface ends
 
 
 @dataclass(frozen=True)
 class HmmClasses:
-    """Grid of two-state chains that a cell may follow; their weights are learned.
+    """Grid of two-state Markov chains, the classes of the mixture; their weights are learned.
 
-    The grid only has to be wide and fine enough.
+    The grid must cover the range of rho and tau finely enough; its exact values do not matter.
 
     Attributes:
         static_rho, static_tau: stationary probability of being occupied, and correlation time in
             seconds, of static surface; misses of it come in runs.
-        view_rho, view_angle: the same of static surface that depends on the view: its chains run
-            over the change of view, with a correlation angle in radians.
+        view_rho, view_angle: of view-dependent static surface, whose chains evolve with the
+            viewing direction instead of time: rho, and the correlation angle in radians.
         dynamic_rho, dynamic_tau: of what moves.
         half_time_tau: of what is there for half of the time, with rho = HALF_TIME_RHO.
     """
@@ -84,7 +84,7 @@ LOOP_CLASSES = HmmClasses()
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """All observations of E surfels, filtered.
+    """Forward filters of E surfels, run over all observations.
 
     Attributes:
         surfel_map: the surfels.
@@ -106,7 +106,7 @@ class Observations:
     def likelihood(
         self, classes: NDArray[np.bool_] | None = None, rows: Rows | None = None
     ) -> tuple[NDArray[np.float32], Float]:
-        """Likelihood of the observations of surfels under some classes, as if there were no others.
+        """Likelihood of the observations of surfels under some of the classes.
 
         Args:
             classes: (C,) mask with all static ones; None: all.
@@ -184,7 +184,7 @@ def surfel_cells(surfel_map: SurfelMap) -> NDArray[np.int64]:
 def time_bin_index(recording: Recording, seconds: float) -> NDArray[np.int64]:
     """(T,) time bin of each scan, counted from the first scan.
 
-    All scans after a clock that leaps by decades fall into the last bin.
+    After a clock jump of decades all scans fall into the last bin.
     """
     since = recording.stamp_ns - recording.stamp_ns[0]
     number = since // max(round(seconds * 1e9), 1)
@@ -219,7 +219,7 @@ def make_hmm(
         bin_seconds=options.time_bin,
         lateral_std=max(_LATERAL * noise_std, _MIN_LATERAL * cell),
         margin=_MARGIN * noise_std + 0.5 * cell,
-        hit_radius=_HIT_RADIUS * noise_std + 0.7 * cell,  # half a cell's diagonal
+        hit_radius=_HIT_RADIUS * noise_std + 0.7 * cell,  # half the diagonal of a 2D cell
         end_margin=MAX_RANGE_MARGIN,
         use_normals=_USE_NORMALS,
         threads=threads,
@@ -241,7 +241,7 @@ def _estimate_trust(recording: Recording, poses: Float, hmm: OccupancyHmm, threa
 
 def probability_in_cell(surfel_map: SurfelMap) -> NDArray[np.float32]:
     """(E,) probability that the surface runs through the cell: noise also fills cells beside it."""
-    from scipy.special import ndtr  # takes long to load
+    from scipy.special import ndtr  # slow import
 
     out = np.empty(surfel_map.size, np.float32)
     for rows in iter_surfel_rows(surfel_map):

@@ -1,8 +1,8 @@
 """E-step of the occupancy HMM: a forward filter per cell under several classes.
 
-In 3D objects that arrived or left are dynamic as well, and neighbouring voxels are labelled
-together. The final E-step, at the poses that are kept, has more classes than the loop: within the
-loop, view-dependent surface would explain walls that are drawn twice and hold the scans to them.
+In 3D, objects that arrived or left are dynamic as well, and neighbouring voxels are labelled
+jointly. The final E-step, at the final poses, has additional classes. Within the loop a
+view-dependent class would explain walls duplicated by pose error, and preserve that error.
 `docs/estimator.md` derives the equations.
 """
 
@@ -42,13 +42,13 @@ from stillmap.em.types import (
 )
 
 _FREE_PRIOR = 0.2  # occupancy probability of a cell in which no beam ended and none passed
-_MIN_TRUST = 0.5  # in beams without a return, from which on they show free space
+_MIN_TRUST = 0.5  # in beams without a return, above which they clear free space
 _VIEW_CLASSES = True  # the final E-step has view-dependent static classes
 
 _CLASSES_3D = HmmClasses(dynamic_tau=(0.5, 3.0, 6.0, 12.0), half_time_tau=(8.0, 24.0))
 
-_CROWD_RHO, _CROWD_TAU = 0.15, 3.0  # where many people pass, some seconds each
-_WAITING_TAU = 6.0  # s, of changes only
+_CROWD_RHO, _CROWD_TAU = 0.15, 3.0  # rho and tau (s) of places crossed by many people
+_WAITING_TAU = 6.0  # s; used for change detection only, not for labels
 _FINAL_CLASSES = HmmClasses(
     view_rho=(0.65,),
     dynamic_rho=(0.01, 0.04, _CROWD_RHO),
@@ -65,7 +65,7 @@ def e_step(
     threads: int = 1,
     classes: HmmClasses = LOOP_CLASSES,
 ) -> EStepResult:
-    """P(c = 1) of every beam: the probability that its end cell holds something that stays.
+    """P(c = 1) of every beam: the probability that the surface in its end cell is static.
 
     Args:
         recording: 2D or 3D.
@@ -154,7 +154,7 @@ def final_e_step(
 
 
 def _label_classes(seen: Observations) -> NDArray[np.bool_]:
-    """(C,) classes for labels: without crowds of some seconds, which a chair resembles."""
+    """(C,) classes used for labels; without the crowd class, which explains chairs as well."""
     crowds = (seen.rho == _CROWD_RHO) & (seen.tau == _CROWD_TAU)
     kept = ~crowds & (seen.tau != _WAITING_TAU) & (seen.rho != HALF_TIME_RHO)
     kept[: seen.n_static] = True

@@ -24,8 +24,8 @@ _MEAN_FIELD = {
     "static_coupling": 5.0,  # nats if all neighbours are static
     "dynamic_coupling": 10.0,  # nats if all are dynamic
     "min_log_odds": -4.0,  # of a surfel's own observations
-    "max_log_odds": 3.0,  # the same: ten seconds of hits in a row are a wall or somebody who waits
-    "tolerance": 0.1,  # change of a probability that neighbours are told
+    "max_log_odds": 3.0,  # the same; ten seconds of hits fit a wall and a person who waits
+    "tolerance": 0.1,  # change of P(static) above which neighbours are updated again
     "max_iterations": 10,
 }
 
@@ -33,11 +33,11 @@ _MIN_CLUSTER_HEIGHT, _MAX_CLUSTER_HEIGHT = 0.2, 3.0  # m above the ground, of ob
 _COLUMN = 0.3  # m, edge of the columns that touch within a cluster, rounded to voxels
 _MIN_CLUSTER_SURFELS = 5  # in a sweep
 _POOLED_P_DYNAMIC = 0.3  # mean P(dynamic) above which a whole cluster is dynamic
-_POOLED_CHANGE = 1.0  # nats, mean evidence of a change above which it is
+_POOLED_CHANGE = 1.0  # nats, mean evidence of a change above which it is dynamic
 _POOLING_SLOPE = 20.0  # nats per unit above these two
 _MAX_POOLED = 4.0  # nats
-_GROUND_CLEARANCE = 0.05  # m, and this many noise_std, below which end points are ground:
-_CLEARANCE_STD = 2.5
+_GROUND_CLEARANCE = 0.05  # m; end points closer to the ground belong to it
+_CLEARANCE_STD = 2.5  # the same in noise_std; the larger of the two counts
 
 
 def smooth_mean_field(
@@ -158,7 +158,7 @@ class GroundContact:
     Attributes:
         obstacles: the surfels above the ground.
         p_static: (E,) of each surfel.
-        min_end_height: metres above the ground from which on a beam did not end on it.
+        min_end_height: metres above the ground; a beam that ends lower ended on the ground.
     """
 
     obstacles: ObstacleSurfels
@@ -172,7 +172,7 @@ class GroundContact:
 
         Args:
             data: M beams of some scans.
-            surfel: (M,) in which each ended, -1: none.
+            surfel: (M,) index of the surfel in which each ended, -1: none.
             threads: does not change the result.
         """
         return _core.relabel_ground_contact(

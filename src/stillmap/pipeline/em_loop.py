@@ -68,8 +68,8 @@ def iterate(
         poses: (T, D+1, D+1) T_map_base to keep instead of estimating them.
         progress: called with the stage, the iteration, scans done, and of how many.
         stages: where time and memory per stage are noted.
-        scratch: folder for per-beam arrays too large for memory; the files have no name and vanish
-            with the process. None: the system's temporary folder.
+        scratch: folder for per-beam arrays too large for memory, in anonymous files that the
+            process's end deletes. None: the system's temporary folder.
         after: estimate of an earlier iteration with the same arguments, to continue from.
 
     Yields:
@@ -97,7 +97,7 @@ def iterate(
             m_step = _m_step(recording, e, after, options, poses, _tell(progress, number))
             deskewed = slam.deskew_recording(recording, m_step.poses, options.slam, threads)
         progress("labelling beams", number, 0, 0)
-        with stages.measure("e_step"):  # (6), (8) or its successor, and the bound
+        with stages.measure("e_step"):  # (6), and (8) or the occupancy HMM; the bound
             e_step = em.e_step(
                 deskewed, m_step.poses, m_step.grid, options.estimator, options.em, threads
             )
@@ -141,7 +141,7 @@ def _m_step(
         poses,
         resolve_threads(options.threads),
         progress,
-        # the first labels change most: from the second poses on, refinement is enough
+        # labels change most in the first iteration; after the second, poses only need refinement
         start=before.m_step if before is not None and before.number > 1 else None,
         earlier_poses=None if before is None else before.poses,
         with_grid=em.needs_sums(recording.dimension, options.estimator),

@@ -31,7 +31,7 @@ class ImageTruth:
     """Truth about N images and the surfaces that they show.
 
     Attributes:
-        colour_seed: of `colours.static_colour`.
+        colour_seed: of `appearance.compute_static_color`.
         standing, moving: the true surfaces.
         T_world_camera: (N, 4, 4) pose of each image.
         mask: of an image, (h, w) uint16; 0: static, k + 1: mover k, 65535: nothing.

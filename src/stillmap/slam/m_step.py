@@ -1,4 +1,4 @@
-"""The M-step over poses and map: scan matching, loop closure, refinement, (9) and (10)-(15)."""
+"""The M-step over poses (9) and map (10)-(15): scan matching, loop closure, refinement."""
 
 import dataclasses
 from collections.abc import Callable
@@ -42,7 +42,7 @@ def m_step(
     """The most likely poses and map given e: (9), (10)-(15).
 
     Args:
-        recording: as taken; its scans are deskewed here.
+        recording: as recorded, not deskewed.
         e: (M,) P(static) of every beam.
         options: see SlamOptions.
         poses: (T, D+1, D+1) known T_map_base: only the map is computed.
@@ -119,7 +119,7 @@ def _estimate_poses_2d(
     for _ in range(_REFINEMENT_PASSES):
         deskewed = deskew_recording(recording, refined.poses, options)
         refined = refine_poses(deskewed, e, options, refined, mapping)
-    # in the map of all scans, one that went astray explains itself: keep the local map's share
+    # a misregistered scan agrees with a map that contains it: keep the share from the local map
     return dataclasses.replace(refined, explained=start.explained)
 
 
@@ -131,7 +131,7 @@ def _match_scans(
     earlier_poses: Float | None,
     free_space_margin: float,
 ) -> MStepResult:
-    """Incremental scan matching of scans deskewed as well as their motion is known."""
+    """Incremental scan matching; scans are deskewed by the best motion estimate so far."""
     max_travel = _LOCAL_MAP_TRAVEL if options.loop_closure else np.inf
 
     def match(scans: Recording) -> MStepResult:
@@ -139,5 +139,5 @@ def _match_scans(
 
     motion = recording.T_odom_base if earlier_poses is None else earlier_poses
     if motion is None and options.deskew and recording.beam_time is not None:
-        motion = match(recording).poses  # distorted scans are similar enough to tell the motion
+        motion = match(recording).poses  # skewed scans are good enough to estimate the motion
     return match(deskew_recording(recording, motion, options))

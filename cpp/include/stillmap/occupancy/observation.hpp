@@ -1,4 +1,4 @@
-// Observations of surfels: evidence of the beams of one time bin.
+// Observations of surfels: data structures, and the probability that a beam intersects a surfel.
 #pragma once
 
 #include <algorithm>
@@ -14,12 +14,13 @@ struct ObservationOptions {
   double lateral_std;  // cells, standard deviation of a beam's lateral position
   double margin;       // cells, distance by which a beam must end behind a surfel to be a miss
   double hit_radius;   // cells, hits spread to neighbours within this radius
-  double end_margin;   // cells before the end of a beam without a return that do not count
+  double end_margin;   // cells, last part of a beam without a return that is not used
   double trust_beyond_solid;  // reliability of no-return beams behind the first solid surfel
   bool use_normals;           // false: all surfels are isotropic
 };
 
-// Number of beams without a return in runs, and of those that cross a solid surfel.
+// Number of beams without a return (in runs of at least three), and of those among them that cross
+// a solid surfel.
 struct NoReturnStats {
   int64_t beam_count = 0, through_solid = 0;
 };
@@ -31,8 +32,8 @@ struct Observation {
   float reliability;  // kHit, or P(some beam intersected the surfel's extent) in (0, 1]
 };
 
-// Observations of one time bin, grouped by spans of surfels. The state of one span fits the cache,
-// so many bins are applied to a span before the next.
+// Observations of one time bin, grouped by spans of surfels. The state of one span fits in
+// the cache, so many bins are applied to a span before the next.
 struct ObservationBatch {
   static constexpr int32_t kSpan = 2048;  // surfels
   std::vector<Observation> observations;

@@ -1,4 +1,4 @@
-// Ray casting of the beams of one time bin: which surfels they hit and which they missed.
+// Ray traversal of the beams of one time bin: hits and misses of surfels.
 #pragma once
 
 #include <algorithm>
@@ -29,7 +29,7 @@ inline bool is_solid(const SurfelMap<D>& surfel_map, int32_t k, bool use_normals
          surfel_map.beam_count(k) >= kMinBeams;
 }
 
-// End of the free part of a beam; nullopt if there is none.
+// End of the free space along a beam; nullopt if there is none.
 template <int D>
 inline std::optional<Vec<D>> free_space_end(const BeamSegment<D>& beam, bool hit,
                                             double end_margin) {
@@ -119,7 +119,7 @@ class ObservationCollector {
   using Vecf = Eigen::Matrix<float, D, 1>;
   static constexpr float kHitMark = -1.0f, kUntouched = 2.0f;
   static constexpr float kSaturated = 0.05f;  // further beams of the time bin are skipped
-  static constexpr float kMaxMissed = 0.98f;
+  static constexpr float kMaxMissed = 0.98f;   // p_missed above this is no observation
 
   // Per-surfel data in few bytes, since memory access dominates the run time.
   struct SurfelState {
@@ -188,8 +188,8 @@ class ObservationCollector {
     bool hit;
   };
 
-  // Lists the surfels along the free part of a beam that may still change; nullopt for a beam of no
-  // length. The end cell is not visited: a return in it is a hit, and the free part ends before it.
+  // Lists the unsaturated surfels along the free part of a beam; nullopt for a beam of zero length.
+  // The end cell is not visited: a return in it is a hit, and the free part ends before it.
   std::optional<LocalRay> list_crossings(const BeamSegment<D>& beam, bool hit) {
     crossings_.clear();
     const Vec<D> chord = beam.end - beam.start;
@@ -209,7 +209,7 @@ class ObservationCollector {
   }
 
   // Updates p_missed of the surfels that a beam passed. Behind the first solid surfel a beam
-  // without a return counts by trust_beyond_solid. Returns false for a beam of no length.
+  // without a return counts by trust_beyond_solid. Returns false for a beam of zero length.
   bool record_pass(const BeamSegment<D>& beam, bool hit) {
     const std::optional<LocalRay> ray = list_crossings(beam, hit);
     if (!ray) return false;
@@ -268,7 +268,7 @@ class ObservationCollector {
   std::vector<int32_t> hit_surfels_;
   std::vector<typename SurfelTraversal<D>::Crossing> crossings_;  // of one beam, prefetched
   std::vector<typename SurfelBitmap<D>::BlockBits>
-      open_bits_;                      // cells that further beams may change
+      open_bits_;                      // cells that are not saturated
   std::vector<size_t> closed_blocks_;  // with excluded cells
   SurfelTraversal<D> traversal_;
 };

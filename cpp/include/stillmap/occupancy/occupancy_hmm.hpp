@@ -1,11 +1,11 @@
-// Occupancy HMM per surfel (Meyer-Delius et al. 2012): likelihood of its observations under classes
-// of objects that stay for different times.
+// Occupancy HMM of each surfel (after Meyer-Delius et al. 2012): likelihood of its observations
+// under several classes with different persistence. The filter: two_state_chains.hpp.
 //
 // Each class is a two-state Markov chain (occupied, empty) with stationary probability rho of being
 // occupied and correlation exp(-dt / tau), or with a correlation over the viewing angle for what is
 // visible from some places only. An observation is a hit, which needs an occupied cell, or a miss,
-// which an occupied cell allows with probability 1 - p_detection * reliability. The static class is
-// the one with rho near one.
+// which an occupied cell allows with probability 1 - p_detection * reliability. Which classes count
+// as static is decided in Python (HmmClasses).
 #pragma once
 
 #include <algorithm>

@@ -1,7 +1,7 @@
-// Bank of two-state Markov chains: forward algorithm for every member under every class. States
-// persist from one observation to the next with correlation exp(-dt / tau - dv / view_angle), dt
-// being the time between them and dv the viewing angle: displacement of the robot / its distance
-// from the member.
+// Forward filter (E-step): bank of two-state hidden Markov models, one per surfel and class. The
+// occupancy at two successive observations has the correlation exp(-dt / tau - dv / view_angle),
+// with dt the time between them and dv the change of the viewing direction: displacement of the
+// robot / its distance from the surfel.
 #pragma once
 
 #include <Eigen/Core>
@@ -18,7 +18,7 @@ constexpr size_t kMaxClasses = 64;
 struct OccupancyClasses {
   std::vector<double> rho;         // stationary probability of being occupied, in (0, 1)
   std::vector<double> tau;         // seconds, correlation time
-  std::vector<double> view_angle;  // radians, correlation angle of the view
+  std::vector<double> view_angle;  // radians, correlation angle of the viewing direction
   double p_detection;              // P(return | occupied)
 };
 
@@ -56,8 +56,8 @@ class TwoStateChains {
   size_t members() const { return last_observation_.size(); }
 
   // Registers the next viewpoint: its time bin and position in cells. Returns its index, the
-  // argument of `hit` and `miss`. Moves of less than half a cell are ignored: a standing robot has
-  // noise.
+  // argument of `hit` and `miss`. Moves of less than half a cell are ignored: pose noise of a
+  // standing robot.
   int32_t begin_observation(int64_t time_bin, const Eigen::Vector3d& position) {
     const bool is_stationary =
         !viewpoints_.empty() && (position - viewpoints_.back().position).norm() < kMinMove;
