@@ -138,7 +138,8 @@ def test_no_overlap_in_time_is_refused(rig, tmp_path, capsys):
 def test_wrong_dimensions_are_refused(rig, tmp_path, capsys):
     flat, tilting, out = rig / "horizontal", rig / "tilting", tmp_path / "out"
     assert "is in 2D" in refused(capsys, "map", flat, "--tilting", flat, "-o", out)
-    assert "the planar laser decides" in refused(capsys, "map", tilting, "--tilting", tilting, "-o", out)
+    said = refused(capsys, "map", tilting, "--tilting", tilting, "-o", out)
+    assert "the planar laser decides" in said
 
 
 def test_wrong_options_and_folders_are_refused(rig, tmp_path, capsys):

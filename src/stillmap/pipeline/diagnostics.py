@@ -64,14 +64,14 @@ def _pose_warnings(diagnostics: slam.Diagnostics) -> list[str]:
     out, faults, widened = [], diagnostics.odometry_faults, diagnostics.widened
     if faults:
         out.append(
-            f"odometry and scans disagree at {len(faults)} scan{'s' * (len(faults) > 1)} (wheel slip "
-            f"or stall, odometry that starts again), first at scan {faults[0]}: poses follow the "
-            "scans there"
+            f"odometry and scans disagree at {len(faults)} scan{'s' * (len(faults) > 1)} (wheel "
+            f"slip or stall, odometry that starts again), first at scan {faults[0]}: poses follow "
+            "the scans there"
         )
     if widened:
         out.append(
-            f"{len(widened)} scans lay outside the odometry's uncertainty and were found by a wider "
-            f"search, the first is scan {widened[0]}"
+            f"{len(widened)} scans lay outside the odometry's uncertainty and were found by a "
+            f"wider search, the first is scan {widened[0]}"
         )
     for scan in diagnostics.breaks:
         out.append(
