@@ -1,4 +1,4 @@
-"""The command as a process of its own, and a small room to map."""
+"""Fixtures: the command as a process, and a small room to map."""
 
 import os
 import select

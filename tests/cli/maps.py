@@ -1,4 +1,4 @@
-"""What `stillmap map` is called with and what it writes."""
+"""Arguments and outputs of `stillmap map` for tests."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""What the command does with what it cannot take."""
+"""Check of refused calls."""
 
 import subprocess
 

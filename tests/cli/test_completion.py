@@ -1,4 +1,4 @@
-"""Shells complete stillmap's lines: the scripts run in the shells themselves."""
+"""Completion scripts, run in the shells."""
 
 import os
 import shutil
@@ -102,7 +102,7 @@ def test_bash(ask):
     assert ask(["bash", "--norc"], BASH, list(wanted)) == wanted
 
 
-def test_bash_knows_every_section_of_options(ask):
+def test_bash_completes_sections_of_options(ask):
     (found,) = ask(["bash", "--norc"], BASH, ["stillmap map log --set "]).values()
     sections = {name.rpartition(".")[0] for name in found}
     assert {"", "em", "slam", "read", "objects", "output"} <= sections
@@ -121,7 +121,7 @@ def test_fish(ask):
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_scripts_are_of_their_shells(shell, capsys):
+def test_script_is_valid_for_its_shell(shell, capsys):
     assert main(["completion", shell]) == 0
     out, err = capsys.readouterr()
     assert err == ""

@@ -38,7 +38,7 @@ def test_prints_every_option_with_its_default(capsys):
     assert tomllib.loads(config(capsys)) == without_none(to_dict(Options()))
 
 
-def test_every_option_has_its_meaning_behind_it(capsys):
+def test_every_option_has_a_comment(capsys):
     lines = config(capsys).splitlines()
     headings = {i - 1 for i, line in enumerate(lines) if line.startswith("[")}
     for i, line in enumerate(lines):
@@ -57,7 +57,7 @@ def test_config_takes_its_own_output_unchanged(capsys, tmp_path):
     assert tomllib.loads(file.read_text())["em"]["prior"] == 0.75
 
 
-def test_set_wins_over_the_file_and_the_last_set_wins(capsys, tmp_path):
+def test_set_overrides_file_and_last_set_counts(capsys, tmp_path):
     file = tmp_path / "options.toml"
     file.write_text("threads = 5\n[em]\nprior = 0.6\nmax_iterations = 9\n")
     sets = ("--set", "em.prior=0.7", "--set", "em.prior=0.8")
@@ -69,7 +69,7 @@ def test_set_wins_over_the_file_and_the_last_set_wins(capsys, tmp_path):
         assert options["em"]["patience"] == Options().em.patience
 
 
-def test_a_flag_wins_over_set_and_file(capsys, tmp_path, room):
+def test_flag_overrides_set_and_file(capsys, tmp_path, room):
     file = tmp_path / "options.toml"
     file.write_text(
         "threads = 3\n[em]\nmax_iterations = 1\n[slam]\nresolution = 0.4\n[read]\nmin_range = 0.1\n"
@@ -87,7 +87,7 @@ def test_a_flag_wins_over_set_and_file(capsys, tmp_path, room):
     assert options["output"]["map_mode"] == "raw"
 
 
-def test_each_step_wins_over_the_one_before(capsys, tmp_path, room):
+def test_precedence(capsys, tmp_path, room):
     """Default < file < --set < flag, one step at a time."""
     file = tmp_path / "options.toml"
     file.write_text("[slam]\nresolution = 0.4\n")
@@ -108,7 +108,7 @@ SECTIONS = [
 
 
 @pytest.mark.parametrize("section", SECTIONS)
-def test_a_section_alone_can_be_read_back(capsys, tmp_path, section):
+def test_one_section_can_be_read_back(capsys, tmp_path, section):
     whole = tomllib.loads(config(capsys))
     text = config(capsys, section)
     alone = whole
@@ -135,7 +135,7 @@ def test_one_option_alone(capsys):
     assert "# max_range is not set" in config(capsys, "read.max_range")
 
 
-def test_choices_stand_in_the_comment(capsys):
+def test_comment_lists_choices(capsys):
     for one in iter_options(Options()):
         if one.choices:
             comment = config(capsys, one.name).partition("  # ")[2]
@@ -152,7 +152,7 @@ def test_choices_stand_in_the_comment(capsys):
         ("thread", "threads"),
     ],
 )
-def test_an_unknown_option_names_the_nearest(capsys, tmp_path, key, nearest):
+def test_unknown_option_suggests_the_nearest(capsys, tmp_path, key, nearest):
     assert refusal(capsys, "--set", f"{key}=1") == (
         f"stillmap: --set: unknown option '{key}' (nearest: '{nearest}')\n"
     )
@@ -181,13 +181,13 @@ def test_an_unknown_option_names_the_nearest(capsys, tmp_path, key, nearest):
         (("--config", "/nowhere/options.toml"), ("/nowhere/options.toml: cannot be read",)),
     ],
 )
-def test_wrong_values_say_where(capsys, words, said):
+def test_wrong_value_names_its_source(capsys, words, said):
     message = refusal(capsys, *words)
     for part in said:
         assert part in message
 
 
-def test_a_file_that_is_no_toml(capsys, tmp_path):
+def test_file_is_not_toml(capsys, tmp_path):
     file = tmp_path / "options.toml"
     file.write_text("threads = 2\nem.prior: 0.8\n")
     assert f"{file}:2: is not TOML" in refusal(capsys, "--config", file)

@@ -57,19 +57,19 @@ def test_to_a_recording_folder(call, room, tmp_path):
     assert after.source == before.source
 
 
-def test_flags_of_reading_count(call, room, tmp_path):
+def test_read_flags_apply(call, room, tmp_path):
     assert call("convert", room, "-o", tmp_path / "a", "--max-range", "3").returncode == 0
     length = np.linalg.norm(stillmap_folder.read(tmp_path / "a").points, axis=1)
     assert length.max() <= 3.00001
     assert np.linalg.norm(stillmap_folder.read(room).points, axis=1).max() > 5
 
 
-def test_a_format_by_its_name(call, room, tmp_path):
+def test_format_by_name(call, room, tmp_path):
     assert call("convert", room, "-o", tmp_path / "a.xyz", "--to", "carmen").returncode == 0
     assert read(tmp_path / "a.xyz").source["format"] == "carmen"
 
 
-def test_what_is_left_out_is_said(call, tmp_path, nothing_left):
+def test_losses_are_reported(call, tmp_path, nothing_left):
     call("simulate", "hall", "-o", tmp_path / "s", "--scans", 3, "--sweep-time", 0.1, "--quiet")
     done = call("convert", tmp_path / "s", "-o", tmp_path / "a.log")
     assert "warning: beam times are left out" in done.stderr
@@ -104,7 +104,7 @@ def test_refusals(call, room, tmp_path, nothing_left):
 
 
 @pytest.mark.parametrize("name", ["conv/c.log", "conv/more/c.bag", "conv/c"])
-def test_folders_above_the_output_are_made(call, room, mapped, tmp_path, nothing_left, name):
+def test_parent_folders_are_created(call, room, mapped, tmp_path, nothing_left, name):
     output = tmp_path / name
     refused(call("convert", room, "-o", output, "--only", "static"), "--only is for results")
     refused(call("convert", mapped, "-o", output, "--min-range", 1), "no flags")
@@ -114,7 +114,7 @@ def test_folders_above_the_output_are_made(call, room, mapped, tmp_path, nothing
     nothing_left("conv")
 
 
-def test_what_cannot_be_written_is_said_by_its_name(call, room, tmp_path, monkeypatch):
+def test_unwritable_output_is_named(call, room, tmp_path, monkeypatch):
     """Where nobody may write; root may nearly everywhere."""
 
     def denied(*_, **__):
@@ -129,14 +129,14 @@ def test_what_cannot_be_written_is_said_by_its_name(call, room, tmp_path, monkey
 
 
 @pytest.mark.parametrize("name", ["a.log", "a.mcap", "a"])
-def test_overwriting_must_be_asked_for(call, room, tmp_path, name):
+def test_overwrite_flag(call, room, tmp_path, name):
     for more, status in (((), 0), ((), 2), (("--overwrite",), 0)):
         to = ["--to", "ros2"] if name == "a" else []
         assert call("convert", room, "-o", tmp_path / name, *to, *more).returncode == status
 
 
 @pytest.mark.parametrize("name", ["a.bag", "a.db3", "a.mcap", "a"])
-def test_a_result_as_a_bag(call, mapped, tmp_path, nothing_left, name):
+def test_result_as_bag(call, mapped, tmp_path, nothing_left, name):
     to = ["--to", "ros2"] if name == "a" else []
     done = call("convert", mapped, "-o", tmp_path / name, *to)
     assert done.returncode == 0, done.stderr
@@ -150,7 +150,7 @@ def test_a_result_as_a_bag(call, mapped, tmp_path, nothing_left, name):
     nothing_left(name)
 
 
-def test_a_result_as_a_table(call, room, mapped, tmp_path):
+def test_result_as_table(call, room, mapped, tmp_path):
     parquet = pytest.importorskip("pyarrow.parquet")
     assert call("convert", mapped, "-o", tmp_path / "a.parquet").returncode == 0
     table = parquet.read_table(tmp_path / "a.parquet")
@@ -173,14 +173,14 @@ def test_a_result_as_a_table(call, room, mapped, tmp_path):
     assert (tmp_path / "a.parquet").read_bytes() == (tmp_path / "b.parquet").read_bytes()
 
 
-def test_without_pyarrow_there_are_no_tables(call, mapped, tmp_path, monkeypatch, nothing_left):
+def test_table_needs_pyarrow(call, mapped, tmp_path, monkeypatch, nothing_left):
     monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
     done = call("convert", mapped, "-o", tmp_path / "a.parquet")
     refused(done, "needs the package pyarrow", "pip install 'stillmap[io]'")
     nothing_left()
 
 
-def test_what_a_result_cannot_become(call, room, mapped, tmp_path, nothing_left):
+def test_formats_that_results_do_not_have(call, room, mapped, tmp_path, nothing_left):
     refused(call("convert", mapped, "-o", tmp_path / "a.log"), "as a CARMEN log", "filter")
     refused(call("convert", mapped, "-o", tmp_path / "a"), "as a recording folder")
     refused(call("convert", mapped, "-o", tmp_path / "a.abc"), "'.abc'", ".mcap", ".e57", ".pcd")
@@ -198,7 +198,7 @@ def test_2d_results_have_no_clouds(call, mapped, tmp_path, nothing_left, ending)
     nothing_left()
 
 
-def test_parts_are_of_clouds(call, room, mapped, tmp_path, nothing_left):
+def test_only_is_for_clouds(call, room, mapped, tmp_path, nothing_left):
     refused(
         call("convert", mapped, "-o", tmp_path / "a.mcap", "--only", "static"), "--only", ".las"
     )
@@ -215,7 +215,7 @@ def test_parts_are_of_clouds(call, room, mapped, tmp_path, nothing_left):
         ("a.e57", "pye57.libe57", "pye57"),
     ],
 )
-def test_without_libraries_there_are_no_such_clouds(
+def test_clouds_need_their_libraries(
     call, mapped, tmp_path, monkeypatch, nothing_left, name, module, package
 ):
     pytest.importorskip("laspy")  # it looks for lazrs once, and remembers what it found
@@ -225,7 +225,7 @@ def test_without_libraries_there_are_no_such_clouds(
     nothing_left()
 
 
-def test_a_result_whose_recording_was_moved(call, room, mapped, tmp_path):
+def test_moved_recording(call, room, mapped, tmp_path):
     result = tmp_path / "result"
     shutil.copytree(mapped, result)
     record = json.loads((result / "run.json").read_text())
@@ -256,7 +256,7 @@ def test_damaged_objects(call, mapped, tmp_path, text, words):
     assert call("convert", result, "-o", tmp_path / "a.mcap").returncode == 0
 
 
-def test_the_help_knows_every_format():
+def test_help_lists_every_format():
     from stillmap.cli import convert
     from stillmap.io.writers import WRITERS
     from stillmap.results.export.point_cloud_files import FORMATS

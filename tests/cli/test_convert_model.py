@@ -1,4 +1,4 @@
-"""`stillmap convert DIR -o model.obj`: the model of the place for programs that read no glTF."""
+"""`stillmap convert DIR -o model.obj`: export of the model as OBJ."""
 
 import json
 import os
@@ -38,7 +38,7 @@ def out(tmp_path):
     return folder
 
 
-def test_the_model_with_its_pages(out, call, tmp_path):
+def test_model_with_textures(out, call, tmp_path):
     done = call("convert", out, "-o", tmp_path / "a.obj")
     assert done.returncode == 0, done.stderr
     assert "2 faces and 1 page of texture" in done.stderr
@@ -56,7 +56,7 @@ def test_the_model_with_its_pages(out, call, tmp_path):
     assert by_name["grey"].visual.material.diffuse[:3].tolist() == [128, 128, 128]
 
 
-def test_without_pictures(out, call, tmp_path):
+def test_model_without_images(out, call, tmp_path):
     write_glb(out / "mesh.glb", Mesh(model().vertices, model().faces))
     assert call("convert", out, "-o", tmp_path / "a.obj", "--quiet").returncode == 0
     assert sorted(os.listdir(tmp_path)) == ["a.mtl", "a.obj", "out"]
@@ -64,7 +64,7 @@ def test_without_pictures(out, call, tmp_path):
 
 
 @pytest.mark.parametrize("there", ["a.obj", "a.mtl", "a_page0.png"])
-def test_nothing_is_replaced_unless_one_says_so(out, call, tmp_path, there):
+def test_overwrite_flag(out, call, tmp_path, there):
     (tmp_path / there).write_text("mine")
     done = call("convert", out, "-o", tmp_path / "a.obj")
     assert done.returncode == 2
@@ -95,7 +95,7 @@ def test_damaged_and_missing_models(out, call, tmp_path, damage, said):
     assert os.listdir(tmp_path) == ["out"]
 
 
-def test_a_full_disk_leaves_nothing(out, call, tmp_path, monkeypatch):
+def test_full_disk_leaves_nothing(out, call, tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
@@ -106,7 +106,7 @@ def test_a_full_disk_leaves_nothing(out, call, tmp_path, monkeypatch):
     assert os.listdir(tmp_path) == ["out"]
 
 
-def test_only_some_of_it_is_refused(out, call, tmp_path):
+def test_only_is_refused(out, call, tmp_path):
     done = call("convert", out, "-o", tmp_path / "a.obj", "--only", "static")
     assert done.returncode == 2
     assert "--only is for clouds" in done.stderr

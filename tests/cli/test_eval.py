@@ -123,7 +123,7 @@ def test_relations_with_odometry(capsys, texts, tmp_path):
     assert s["used"] == 1
 
 
-def test_relations_that_none_can_be_used_of(capsys, texts):
+def test_no_usable_relation(capsys, texts):
     texts.relations.write_text("50 60 1 0 0 0 0 0\n")
     said = refusal(capsys, "relations", texts.trajectory, texts.relations)
     assert str(texts.relations) in said
@@ -181,7 +181,7 @@ def test_labels(capsys, simulated, result):
     assert "F1 1.0000" in capsys.readouterr().out
 
 
-def test_labels_the_wrong_way_round_score_badly(capsys, simulated, result):
+def test_inverted_labels_score_badly(capsys, simulated, result):
     path = result / "beams/p_static.npy"
     np.save(path, 1 - np.load(path))
     s = scores(capsys, "labels", result, simulated)
@@ -200,7 +200,7 @@ def test_map(capsys, simulated, result):
     assert "walls kept   100.00 %" in capsys.readouterr().out
 
 
-def test_map_with_people_in_it_and_another_as_reference(capsys, simulated, result, tmp_path):
+def test_map_with_people_against_reference_map(capsys, simulated, result, tmp_path):
     recording = stillmap_folder.read(simulated)
     T_world_base = np.load(simulated / "truth/T_world_base.npy")
     other = tmp_path / "raw"
@@ -217,7 +217,7 @@ def test_map_with_people_in_it_and_another_as_reference(capsys, simulated, resul
     assert scores(capsys, "map", result, simulated, *again) == s
 
 
-def test_what_was_brought_and_is_still_there_is_no_ghost(capsys, simulated, tmp_path):
+def test_things_brought_in_are_not_ghosts(capsys, simulated, tmp_path):
     recording, there = stillmap_folder.read(simulated), tmp_path / "there"
     shutil.copytree(simulated, there)
     T_world_base = np.load(there / "truth/T_world_base.npy")
@@ -233,7 +233,7 @@ def test_what_was_brought_and_is_still_there_is_no_ghost(capsys, simulated, tmp_
     assert scores(capsys, "map", out, there)["ghost_cells"] > 10
 
 
-def test_map_that_lost_its_walls(capsys, simulated, result):
+def test_map_without_walls(capsys, simulated, result):
     with np.load(result / "map.npz") as archive:
         arrays = dict(archive)
     arrays["p_occupied"][: SIZE // 2] = np.nan
@@ -241,7 +241,7 @@ def test_map_that_lost_its_walls(capsys, simulated, result):
     assert 0.2 < scores(capsys, "map", result, simulated)["walls_kept"] < 0.8
 
 
-def test_a_carmen_simulation_carries_its_truth(capsys, result, tmp_path):
+def test_carmen_simulation_has_truth(capsys, result, tmp_path):
     scene = Scene("room", tuple(box(0, 0, 8, 6)), ((-2, 0), (2, 0)), robot=RobotOptions(scans=5))
     path = tmp_path / "carmen"
     write_simulation(simulate(scene, np.random.default_rng(0)), path, format="carmen")
@@ -286,12 +286,12 @@ def test_missing_and_damaged_files_are_named(
         ("beams/stamp_ns.npy", np.zeros(60)),
     ],
 )
-def test_arrays_of_another_kind_are_refused(capsys, simulated, result, name, array):
+def test_wrong_array_types_are_refused(capsys, simulated, result, name, array):
     np.save(result / name, array)
     assert str(result / name) in refusal(capsys, "labels", result, simulated)
 
 
-def test_labels_beyond_probability_are_refused(capsys, simulated, result):
+def test_labels_outside_0_to_1_are_refused(capsys, simulated, result):
     path = result / "beams/p_static.npy"
     p = np.load(path)
     p[17] = 1.5
@@ -317,7 +317,7 @@ def test_labels_of_another_recording_are_refused(capsys, simulated, result):
         {"resolution": np.array("wide")},
     ],
 )
-def test_maps_of_another_kind_are_refused(capsys, simulated, result, change):
+def test_wrong_map_types_are_refused(capsys, simulated, result, change):
     with np.load(result / "map.npz") as archive:
         arrays = dict(archive)
     np.savez(result / "map.npz", **arrays | change)
@@ -329,7 +329,7 @@ def test_folders_without_truth_are_refused(capsys, result, tmp_path):
         assert "holds no truth" in refusal(capsys, kind, result, tmp_path)
 
 
-def test_folders_that_are_not_there_are_named(capsys, result, simulated, tmp_path):
+def test_missing_folders_are_named(capsys, result, simulated, tmp_path):
     nothere = tmp_path / "nothere"
     for kind in ("labels", "map"):
         for pair in ((nothere, simulated), (result, nothere)):
@@ -338,7 +338,7 @@ def test_folders_that_are_not_there_are_named(capsys, result, simulated, tmp_pat
     assert f"{nothere}: does not exist" in said
 
 
-def test_a_map_of_another_recording_is_refused(capsys, result, simulated, tmp_path):
+def test_map_of_another_recording_is_refused(capsys, result, simulated, tmp_path):
     other = shutil.copytree(simulated, tmp_path / "other")
     np.save(other / "stamp_ns.npy", np.load(other / "stamp_ns.npy") + 10**12)
     said = refusal(capsys, "map", result, other)
@@ -359,7 +359,7 @@ def rig(tmp_path_factory) -> Path:
 
 
 @pytest.mark.parametrize("part", ["horizontal", "tilting"])
-def test_of_a_rig_the_labels_say_whose_truth_counts(capsys, rig, tmp_path, part):
+def test_rig_labels_select_the_truth(capsys, rig, tmp_path, part):
     out, recording = tmp_path / "out", stillmap_folder.read(rig / part)
     (out / "beams").mkdir(parents=True)
     p_static = np.where(np.load(rig / part / "truth/static.npy"), 0.9, 0.2).astype(np.float32)
@@ -372,7 +372,7 @@ def test_of_a_rig_the_labels_say_whose_truth_counts(capsys, rig, tmp_path, part)
     assert found["hits"] == np.count_nonzero(recording.hit)
 
 
-def test_of_a_rig_the_flat_laser_made_the_map(capsys, rig, tmp_path):
+def test_rig_map_is_of_the_planar_laser(capsys, rig, tmp_path):
     out, recording = tmp_path / "out", stillmap_folder.read(rig / "horizontal")
     out.mkdir()
     T_world_base = np.load(rig / "horizontal/truth/T_world_base.npy")

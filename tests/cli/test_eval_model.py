@@ -155,7 +155,7 @@ def _scores(capsys, *args: object) -> dict:
     return json.loads(out)
 
 
-def test_a_floor_that_is_too_high(made, simulated, scored, capsys) -> None:
+def test_raised_floor(made, simulated, scored, capsys) -> None:
     found = scored
     assert found["surface"]["mean"] == pytest.approx(UP, abs=1e-3)
     assert found["surface"]["area"] == pytest.approx(16.0, abs=1e-3)
@@ -168,7 +168,7 @@ def test_a_floor_that_is_too_high(made, simulated, scored, capsys) -> None:
     assert _scores(capsys, made, simulated / "tilting") == found
 
 
-def test_a_person_as_a_box(scored) -> None:
+def test_person_modelled_as_box(scored) -> None:
     movers = scored["movers"]
     assert (movers["tracked"], movers["modelled"]) == (1, 1.0)
     (one,) = movers["models"]
@@ -178,7 +178,7 @@ def test_a_person_as_a_box(scored) -> None:
     assert one["background"] is None
 
 
-def test_beams_that_are_too_long_do_not_count(made, simulated, scored, capsys) -> None:
+def test_within_limits_beam_length(made, simulated, scored, capsys) -> None:
     everything = scored["surface"]
     near = _scores(capsys, made, simulated, "--within", 3)["surface"]
     assert near["places"] < everything["places"]
@@ -193,7 +193,7 @@ def test_text(made, simulated, capsys) -> None:
     assert "1 tracked, 100.00 % with a model; of " in text
 
 
-def test_what_is_not_there_is_not_scored(result, simulated, capsys) -> None:
+def test_missing_parts_are_not_scored(result, simulated, capsys) -> None:
     (result / "mesh_faces.npz").unlink()
     (result / "tilting/objects/objects.json").unlink()
     assert set(_scores(capsys, result, simulated)) == {"alignment", "surface"}
@@ -217,7 +217,7 @@ def test_damaged_files_are_named(name: str, what: str, result, simulated, capsys
     assert name in err
 
 
-def test_a_result_without_a_mesh_is_refused(result, simulated, capsys) -> None:
+def test_result_without_mesh_is_refused(result, simulated, capsys) -> None:
     (result / "mesh.glb").unlink()
     assert main(["eval", "model", str(result), str(simulated)]) == 2
     err = capsys.readouterr().err
@@ -225,7 +225,7 @@ def test_a_result_without_a_mesh_is_refused(result, simulated, capsys) -> None:
     assert "pip install 'stillmap[mesh]'" in err
 
 
-def test_a_result_of_another_recording_is_refused(result, simulated, tmp_path, capsys) -> None:
+def test_result_of_another_recording_is_refused(result, simulated, tmp_path, capsys) -> None:
     other = shutil.copytree(simulated, tmp_path / "other")
     stamps = np.load(other / "tilting/stamp_ns.npy")
     np.save(other / "tilting/stamp_ns.npy", stamps + 10**12)
@@ -236,14 +236,14 @@ def test_a_result_of_another_recording_is_refused(result, simulated, tmp_path, c
 
 
 @pytest.mark.parametrize("missing", [0, 1])
-def test_folders_that_are_not_there_are_named(missing, result, simulated, tmp_path, capsys) -> None:
+def test_missing_folders_are_named(missing, result, simulated, tmp_path, capsys) -> None:
     words = [str(result), str(simulated)]
     words[missing] = str(tmp_path / "nothere")
     assert main(["eval", "model", *words]) == 2
     assert f"{tmp_path / 'nothere'}: does not exist" in capsys.readouterr().err
 
 
-def test_records_of_other_pictures_are_refused(result, simulated, capsys) -> None:
+def test_records_of_other_images_are_refused(result, simulated, capsys) -> None:
     with np.load(result / "mesh_faces.npz") as archive:
         arrays = dict(archive)
     arrays["T_camera_map"] = arrays["T_camera_map"][:1]
@@ -252,6 +252,6 @@ def test_records_of_other_pictures_are_refused(result, simulated, capsys) -> Non
     assert "has 1 images" in capsys.readouterr().err
 
 
-def test_a_simulation_without_cameras_is_refused(result, simulated, capsys) -> None:
+def test_simulation_without_cameras_is_refused(result, simulated, capsys) -> None:
     assert main(["eval", "model", str(result), str(simulated / "horizontal")]) == 2
     assert "no truth about images" in capsys.readouterr().err

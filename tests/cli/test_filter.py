@@ -1,4 +1,4 @@
-"""`stillmap filter`: recordings without what moved."""
+"""`stillmap filter`: recordings without dynamic beams."""
 
 import json
 import shutil
@@ -22,7 +22,7 @@ def mapped(stillmap, room, tmp_path_factory):
 
 
 @pytest.mark.parametrize("below", [None, 0.9, 0.0])
-def test_dynamic_beams_met_nothing(call, room, mapped, tmp_path, below):
+def test_dynamic_beams_become_misses(call, room, mapped, tmp_path, below):
     more = [] if below is None else ["--below", below]
     done = call("filter", mapped, "-o", tmp_path / "clean", *more)
     assert done.returncode == 0, done.stderr
@@ -36,7 +36,7 @@ def test_dynamic_beams_met_nothing(call, room, mapped, tmp_path, below):
     assert f"{np.count_nonzero(blank)} beams blanked" in done.stderr
 
 
-def test_a_log_stays_a_log(call, tmp_path):
+def test_filtered_log(call, tmp_path):
     """A walker in front of a wall, as a log: the same log comes out, without him."""
     rng = np.random.default_rng(0)
     lines = []
@@ -59,7 +59,7 @@ def test_a_log_stays_a_log(call, tmp_path):
     assert (gone & ~walker).sum() < 0.02 * before.hit.sum()
 
 
-def test_a_bag_stays_a_bag(call, room, tmp_path):
+def test_filtered_bag(call, room, tmp_path):
     """Its ending has to say so; scans that were not mapped are named."""
     assert call("convert", room, "-o", tmp_path / "a.bag", "--quiet").returncode == 0
     done = call("map", tmp_path / "a.bag", "-o", tmp_path / "out", *QUICK)
@@ -76,7 +76,7 @@ def test_a_bag_stays_a_bag(call, room, tmp_path):
     assert call("filter", tmp_path / "out", "-o", tmp_path / "clean.bag", *same).returncode == 0
 
 
-def test_logs_of_any_name_stay_logs(call, room, tmp_path):
+def test_logs_of_any_name(call, room, tmp_path):
     assert call("convert", room, "-o", tmp_path / "a.clf", "--quiet").returncode == 0
     (tmp_path / "a.clf").rename(tmp_path / "log of the hall")
     done = call("map", tmp_path / "log of the hall", "-o", tmp_path / "out", *QUICK)
@@ -88,7 +88,7 @@ def test_logs_of_any_name_stay_logs(call, room, tmp_path):
     refused(call("filter", tmp_path / "out", "-o", tmp_path / "clean.ply"), "clean.ply")
 
 
-def test_a_recording_that_was_moved(call, room, mapped, tmp_path):
+def test_moved_recording(call, room, mapped, tmp_path):
     elsewhere = tmp_path / "moved"
     shutil.copytree(room, elsewhere)
     result = tmp_path / "result"
@@ -114,14 +114,14 @@ def test_refusals(call, room, mapped, tmp_path):
     assert not (tmp_path / "c").exists()
 
 
-def test_folders_above_the_output_are_made(call, mapped, tmp_path):
+def test_parent_folders_are_created(call, mapped, tmp_path):
     refused(call("filter", tmp_path / "none", "-o", tmp_path / "a/b/clean"), "run.json")
     assert not list(tmp_path.iterdir())
     assert call("filter", mapped, "-o", tmp_path / "a/b/clean").returncode == 0
     assert read(tmp_path / "a/b/clean").n_scans == 40
 
 
-def test_what_is_read_is_never_overwritten(call, room, mapped, tmp_path):
+def test_inputs_are_never_overwritten(call, room, mapped, tmp_path):
     shutil.copytree(room, tmp_path / "all/room")
     (tmp_path / "all/precious").write_text("")
     given = ("--input", tmp_path / "all/room/recording.json", "--overwrite")
@@ -133,7 +133,7 @@ def test_what_is_read_is_never_overwritten(call, room, mapped, tmp_path):
     np.testing.assert_array_equal(before.hit, after.hit)
 
 
-def test_a_recording_is_overwritten_when_asked(call, mapped, tmp_path):
+def test_overwrite_flag(call, mapped, tmp_path):
     for more, status in (((), 0), ((), 2), (("--overwrite",), 0)):
         assert call("filter", mapped, "-o", tmp_path / "clean", *more).returncode == status
 
@@ -149,14 +149,14 @@ def test_a_recording_is_overwritten_when_asked(call, mapped, tmp_path):
         ('{"input": {"path": "x"}, "options": {"read": {"no_such": 1}}}', "options that cannot be"),
     ],
 )
-def test_records_that_are_none(call, mapped, tmp_path, content, words):
+def test_damaged_run_json(call, mapped, tmp_path, content, words):
     result = tmp_path / "result"
     shutil.copytree(mapped, result)
     (result / "run.json").write_text(content)
     refused(call("filter", result, "-o", tmp_path / "c"), words)
 
 
-def test_another_recording_is_refused(call, room, mapped, tmp_path):
+def test_other_recording_is_refused(call, room, mapped, tmp_path):
     shorter = stillmap_folder.read(room)
     path = tmp_path / "shorter"
     n = int(shorter.offset[10])

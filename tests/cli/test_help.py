@@ -1,4 +1,4 @@
-"""What the command line says of itself is true: choices, defaults, examples."""
+"""Help texts agree with the options: choices, defaults, examples."""
 
 import argparse
 import re
@@ -35,7 +35,7 @@ def action(command: str, flag: str) -> argparse.Action:
     return found
 
 
-def test_every_command_is_there():
+def test_every_command_is_listed():
     assert set(TOP.subcommands()) == set(COMMANDS)
     assert {"map", "info", "view", "filter", "simulate", "config", "eval labels"} <= set(ALL)
 
@@ -66,7 +66,7 @@ def examples(text: str) -> list[list[str]]:
     return [shlex.split(re.split(r"  +| > ", line)[0])[1:] for line in lines]
 
 
-def test_examples_are_calls_that_stillmap_takes():
+def test_examples_parse():
     texts = [TOP.epilog, TOP.subcommands()["eval"].epilog, *(p.epilog for p in ALL.values())]
     found = [words for text in texts for words in examples(text)]
     assert len(found) > 30
@@ -76,7 +76,7 @@ def test_examples_are_calls_that_stillmap_takes():
     assert {words[0] for words in found} == set(COMMANDS) - {"completion"}
 
 
-def test_the_top_names_the_exit_statuses():
+def test_top_level_help_names_exit_statuses():
     for status in ("0    done", "1    a defect", "2    the input or the call", "130  interrupted"):
         assert status in TOP.epilog
 

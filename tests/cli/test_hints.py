@@ -1,4 +1,4 @@
-"""Bad calls say what was meant; our own defects say that they are ours."""
+"""Suggestions for bad calls; reports of defects."""
 
 import logging
 import subprocess
@@ -39,7 +39,7 @@ def refusal(capsys, *words: object) -> str:
         (("completion", "bsh"), "'bsh'", "'bash'"),
     ],
 )
-def test_what_was_meant(capsys, words, said, meant):
+def test_suggestions(capsys, words, said, meant):
     message = refusal(capsys, *words)
     assert said in message
     assert meant in message
@@ -48,7 +48,7 @@ def test_what_was_meant(capsys, words, said, meant):
 @pytest.mark.parametrize(
     "words", [("zzzz",), ("map", "log", "-o", "out", "--zzzz"), ("map", "a", "b", "-o", "out")]
 )
-def test_nothing_is_made_up(capsys, words):
+def test_no_suggestion_without_similar_name(capsys, words):
     assert "did you mean" not in refusal(capsys, *words)
 
 
@@ -65,16 +65,16 @@ def test_nothing_is_made_up(capsys, words):
         ("em.prior=1\nthreads=2", "'em.prior' must be float"),
     ],
 )
-def test_options_that_cannot_be(capsys, assignment, said):
+def test_invalid_options(capsys, assignment, said):
     assert said in refusal(capsys, "config", "--set", assignment)
 
 
-def test_a_flag_on_several_lines_is_still_one_line(capsys):
+def test_error_for_multiline_flag_is_one_line(capsys):
     refusal(capsys, "map", "log", "-o", "out", "--a\nb")
     refusal(capsys, "info", "no\nsuch\nfile")
 
 
-def test_a_file_with_nearly_that_name_is_named(capsys, tmp_path):
+def test_similar_file_name_is_suggested(capsys, tmp_path):
     (tmp_path / "walk.log").write_text("")
     (tmp_path / "options.toml").write_text("")
     meant = f"did you mean '{tmp_path / 'walk.log'}'?"
@@ -99,14 +99,14 @@ def test_a_file_with_nearly_that_name_is_named(capsys, tmp_path):
         ("config", "--config", ""),
     ],
 )
-def test_a_variable_that_is_not_set_does_no_harm(capsys, tmp_path, monkeypatch, words):
+def test_empty_argument_is_refused(capsys, tmp_path, monkeypatch, words):
     (tmp_path / "mine").write_text("mine")
     monkeypatch.chdir(tmp_path)
     assert "an argument is empty" in refusal(capsys, *words)
     assert (tmp_path / "mine").read_text() == "mine"
 
 
-def test_nearest():
+def test_closest_match():
     assert closest_match("resoluton", ["paper", "resolution"]) == "resolution"
     assert closest_match("PAPER", ["paper"]) == "paper"
     assert closest_match("xyz", ["paper"]) is None
@@ -114,7 +114,7 @@ def test_nearest():
     assert closest_match("x", []) is None
 
 
-def test_without_a_command_it_lists_them(stillmap):
+def test_no_command_lists_commands(stillmap):
     done = stillmap()
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith("usage: stillmap ")
@@ -122,7 +122,7 @@ def test_without_a_command_it_lists_them(stillmap):
     assert len(done.stderr.splitlines()) < 20
 
 
-def test_a_defect_says_so_after_its_trace(command):
+def test_defect_is_reported_after_its_trace(command):
     program = (
         "import sys, stillmap.cli.config as c\n"
         "def fail(args): raise RuntimeError('ours')\n"
@@ -147,7 +147,7 @@ def test_a_defect_says_so_after_its_trace(command):
         (InputError("is odd", where="log:3", hint="mend it"), 2, "log:3: is odd (mend it)"),
     ],
 )
-def test_what_goes_wrong_is_one_line(monkeypatch, capsys, error, status, said):
+def test_system_errors_are_one_line(monkeypatch, capsys, error, status, said):
     def fail(_):
         raise error
 
@@ -172,7 +172,7 @@ def test_what_goes_wrong_is_one_line(monkeypatch, capsys, error, status, said):
         (("eval", "labels", "a", "b", "-v"), True, False),
     ],
 )
-def test_verbose_and_quiet_stand_anywhere(monkeypatch, words, verbose, quiet):
+def test_verbose_and_quiet_anywhere(monkeypatch, words, verbose, quiet):
     got = []
     for name in ("config", "map", "eval"):
         monkeypatch.setattr(f"stillmap.cli.{name}.run", lambda args: got.append(args) or 0)
@@ -180,7 +180,7 @@ def test_verbose_and_quiet_stand_anywhere(monkeypatch, words, verbose, quiet):
     assert (got[0].verbose, got[0].quiet) == (verbose, quiet)
 
 
-def test_verbose_says_more_on_stderr(monkeypatch, capsys):
+def test_verbose_prints_more_to_stderr(monkeypatch, capsys):
     def run(_):
         logging.getLogger("stillmap.pipeline.result").info("iteration %d", 3)
         return 0
@@ -215,5 +215,5 @@ def test_ctrl_c_in_any_command(monkeypatch, capsys, words):
     assert capsys.readouterr() == ("", "stillmap: interrupted, nothing was half-written\n")
 
 
-def test_there_is_a_call_of_every_command():
+def test_every_command_has_a_call():
     assert {words[0] for words in CALLS} == set(COMMANDS)

@@ -1,4 +1,4 @@
-"""`stillmap info`: what it says, to people and to machines."""
+"""`stillmap info`: text and JSON."""
 
 import argparse
 import json
@@ -97,7 +97,7 @@ def test_flags_reach_the_reader(path, capsys):
     assert (place["x"], place["y"], place["theta_deg"]) == pytest.approx((1, 2, 90))
 
 
-def test_a_laser_upside_down(path, capsys):
+def test_upside_down_laser(path, capsys):
     run(path)
     assert "upside down" not in capsys.readouterr().out
     run(path, "--laser-upside-down", "--laser-fov", "90")
@@ -122,7 +122,7 @@ def test_flags_of_the_second_laser(path, capsys):
     assert second["field_of_view_deg"] == pytest.approx([-22.5, 45.0])
 
 
-def test_flag_out_of_range_is_the_callers_fault(path):
+def test_flag_out_of_range(path):
     with pytest.raises(InputError, match="min_range"):
         run(path, "--min-range", "-1")
 
@@ -135,7 +135,7 @@ def test_only_given_flags_are_changes():
     assert changes == {"read": {"zero_means": "unusable", "min_range": 0.0}}
 
 
-def test_recording_folder_says_the_same(path, tmp_path, capsys):
+def test_recording_folder_gives_same_summary(path, tmp_path, capsys):
     write(read(path), tmp_path / "rec")
     run(path, "--json")
     run(tmp_path / "rec", "--json")
@@ -156,7 +156,7 @@ def test_recording_folder_says_the_same(path, tmp_path, capsys):
         {"skipped": {"a": 1}, "sensors": [{"ranges": {}, "extrinsics": 1, "start_angle": "x"}]},
     ],
 )
-def test_notes_of_other_writers_do_no_harm(path, tmp_path, capsys, source):
+def test_notes_of_other_writers(path, tmp_path, capsys, source):
     recording = read(path)
     recording.source.clear()
     recording.source.update(source)
@@ -166,7 +166,7 @@ def test_notes_of_other_writers_do_no_harm(path, tmp_path, capsys, source):
 
 
 @pytest.mark.parametrize("scans", [0, 2])
-def test_recording_in_3d(tmp_path, capsys, scans):
+def test_3d_recording(tmp_path, capsys, scans):
     points = np.tile(np.array([[3, 4, 0], [0, 0, 2]], np.float32), (scans, 1))
     recording = Recording(
         stamp_ns=np.arange(scans, dtype=np.int64),
@@ -185,7 +185,7 @@ def test_recording_in_3d(tmp_path, capsys, scans):
     assert run(tmp_path / "rec", "--json") == 0
 
 
-def test_beam_times_are_shown_where_there_are_any(path, tmp_path, capsys):
+def test_beam_times(path, tmp_path, capsys):
     recording = read(path)
     run(path)
     assert "beam times" not in capsys.readouterr().out
@@ -198,12 +198,12 @@ def test_beam_times_are_shown_where_there_are_any(path, tmp_path, capsys):
     assert found["beam_times_s"] == pytest.approx([-0.05, 0.1])
 
 
-def test_no_scan_is_an_input_error(tmp_path):
+def test_no_scan(tmp_path):
     with pytest.raises(InputError, match="does not exist"):
         run(tmp_path / "missing.log")
 
 
-def test_poses_and_pictures_are_shown_where_there_are_any(path, tmp_path, capsys):
+def test_poses_and_images(path, tmp_path, capsys):
     recording = read(path)
     run(path)
     out = capsys.readouterr().out
@@ -232,7 +232,7 @@ def test_poses_and_pictures_are_shown_where_there_are_any(path, tmp_path, capsys
     assert (found["images"]["count"], found["images"]["cameras"][1]["count"]) == (5, 2)
 
 
-def test_skipped_files_are_called_so(tmp_path, capsys):
+def test_skipped_files(tmp_path, capsys):
     (tmp_path / "velodyne").mkdir()
     (tmp_path / "velodyne" / "0.bin").write_bytes(np.ones(8, "<f4").tobytes())
     (tmp_path / "velodyne" / "1.bin").write_bytes(b"cut")
@@ -246,7 +246,7 @@ def test_skipped_files_are_called_so(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("few", [1, 100])
-def test_ranges_of_huge_recordings_are_those_of_a_sample(monkeypatch, few):
+def test_ranges_of_huge_recordings_are_sampled(monkeypatch, few):
     counts = np.full(400, 50)
     rng = np.random.default_rng(0)
     points = np.zeros((20_000, 2), np.float32)

@@ -1,4 +1,4 @@
-"""`--json`: one object on stdout, alone and strict; nothing there where something went wrong."""
+"""`--json`: one strict JSON object on stdout, nothing after an error."""
 
 import json
 import math
@@ -90,7 +90,7 @@ def test_scores_without_a_number(call, tmp_path):
     assert found["rpe"]["translation"]["rmse"] is None
 
 
-def test_what_is_not_finite_becomes_null(capsys):
+def test_non_finite_becomes_null(capsys):
     print_json({"a": [math.nan, math.inf, 1.5], "b": {"c": -math.inf}})
     assert capsys.readouterr().out == '{"a": [null, null, 1.5], "b": {"c": null}}\n'
 

@@ -1,4 +1,4 @@
-"""The command as others see it: exit status, one line of error, pipes that close."""
+"""Exit statuses, one-line errors, closed pipes."""
 
 import json
 import os
@@ -58,7 +58,7 @@ def test_version(stillmap):
         (("eval",), "eval"),
     ],
 )
-def test_a_bad_call_is_one_line(words, said, capsys):
+def test_bad_call_is_one_line(words, said, capsys):
     from stillmap.cli.main import main
 
     with pytest.raises(SystemExit) as left:
@@ -71,12 +71,12 @@ def test_a_bad_call_is_one_line(words, said, capsys):
     assert "--help" in err
 
 
-def test_a_bad_call_is_one_line_from_outside_too(stillmap, tmp_path):
+def test_bad_call_as_process_is_one_line(stillmap, tmp_path):
     refused(stillmap("info", tmp_path / "absent.log"), str(tmp_path / "absent.log"))
     refused(stillmap("frobnicate"), "frobnicate")
 
 
-def test_json_stands_alone_on_stdout(stillmap, tmp_path):
+def test_only_json_on_stdout(stillmap, tmp_path):
     # a damaged line is reported, but not there
     log = tmp_path / "some.log"
     scan = "FLASER 3 1.0 1.0 1.0 0 0 0 0 0 0 {} host {}\n"
@@ -87,7 +87,7 @@ def test_json_stands_alone_on_stdout(stillmap, tmp_path):
     assert json.loads(done.stdout)["scans"] == 2
 
 
-def test_an_eager_reader_is_no_error(stillmap, room):
+def test_reader_that_closes_early_is_no_error(stillmap, room):
     for words in (("info", room), ("info", room, "--json"), ("config",), ("--help",)):
         reader, writer = os.pipe()
         os.close(reader)  # as `| head -0`: gone before the first line
@@ -111,7 +111,7 @@ def test_closed_streams_are_no_error(room, command):
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full here")
-def test_a_full_disk_behind_stdout_is_one_line(stillmap):
+def test_full_disk_behind_stdout_is_one_line(stillmap):
     with open("/dev/full", "w") as full:
         done = stillmap("config", capture_output=False, stdout=full, stderr=subprocess.PIPE)
     assert done.returncode == 2
@@ -119,7 +119,7 @@ def test_a_full_disk_behind_stdout_is_one_line(stillmap):
     assert done.stderr.startswith("stillmap: ")
 
 
-def test_a_defect_of_ours_exits_with_1(command):
+def test_defect_exits_with_1(command):
     # not caught: the trace is what we want to be sent
     program = (
         "import sys, stillmap.cli.config as c\n"
@@ -141,9 +141,7 @@ def test_a_defect_of_ours_exits_with_1(command):
     ],
 )
 @pytest.mark.parametrize("cause", [True, False])
-def test_what_stopped_it_counts_and_not_the_error_made_of_it(
-    monkeypatch, capsys, stop, status, said, cause
-):
+def test_interrupt_behind_another_error(monkeypatch, capsys, stop, status, said, cause):
     # as Python does where a class is made: its names are set within a module that is imported
     def fail(_):
         try:

@@ -1,4 +1,4 @@
-"""`stillmap map` as a process: what it writes, what stops it, what is left behind."""
+"""`stillmap map` as a process: outputs and refusals."""
 
 import filecmp
 import json
@@ -58,7 +58,7 @@ def test_writes_the_files_of_the_contract(mapped):
     assert described["resolution"] == arrays["resolution"] == 0.05
 
 
-def test_run_json_tells_the_run(mapped):
+def test_run_json(mapped):
     run = json.loads((mapped[0] / "run.json").read_text())
     assert [it["number"] for it in run["iterations"]] == list(range(1, len(run["iterations"]) + 1))
     assert run["best_iteration"] in range(1, len(run["iterations"]) + 1)
@@ -70,7 +70,7 @@ def test_run_json_tells_the_run(mapped):
     assert set(run["seconds"]) == set(run["cpu_seconds"]) == set(run["peak_memory_bytes"])
 
 
-def test_progress_goes_to_stderr_as_lines_without_a_terminal(mapped):
+def test_progress_lines_without_terminal(mapped):
     _, done = mapped
     assert done.stdout == ""
     lines = done.stderr.splitlines()
@@ -82,7 +82,7 @@ def test_progress_goes_to_stderr_as_lines_without_a_terminal(mapped):
     assert str(mapped[0] / "report.html") in lines[-1]
 
 
-def test_quiet_says_nothing(call, room, tmp_path, nothing_left):
+def test_quiet(call, room, tmp_path, nothing_left):
     done = call("map", room, "-o", tmp_path / "out", "--quiet", *QUICK)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     nothing_left("out")
@@ -95,15 +95,13 @@ def same_result(a, b) -> None:
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3])
-def test_any_process_and_number_of_threads_gives_the_same_bytes(
-    call, room, mapped, tmp_path, threads
-):
+def test_same_bytes_for_any_number_of_threads(call, room, mapped, tmp_path, threads):
     words = ("--set", "em.max_iterations=2", "--threads", threads)
     assert call("map", room, "-o", tmp_path / "out", *words).returncode == 0
     same_result(mapped[0], tmp_path / "out")
 
 
-def test_any_number_of_threads_gives_the_same_bytes_with_given_poses(call, room, tmp_path):
+def test_same_bytes_with_given_poses(call, room, tmp_path):
     outs = [tmp_path / name for name in ("a", "b", "c")]
     for out, threads in zip(outs, (1, 1, 2), strict=True):
         words = ("--poses", room / "truth/trajectory.tum", "--threads", threads)
@@ -112,7 +110,7 @@ def test_any_number_of_threads_gives_the_same_bytes_with_given_poses(call, room,
     same_result(outs[0], outs[2])
 
 
-def test_what_the_reader_warns_of_is_said_and_kept(call, room, tmp_path):
+def test_reader_warnings_are_printed_and_kept(call, room, tmp_path):
     assert call("convert", room, "-o", tmp_path / "a.bag", "--quiet").returncode == 0
     content = (tmp_path / "a.bag").read_bytes()
     (tmp_path / "a.bag").write_bytes(content[: int(0.8 * len(content))])
@@ -125,13 +123,13 @@ def test_what_the_reader_warns_of_is_said_and_kept(call, room, tmp_path):
 
 
 @pytest.mark.parametrize("content", ["", "no recording\n"])
-def test_what_is_no_recording_is_refused(call, tmp_path, nothing_left, content):
+def test_non_recording_is_refused(call, tmp_path, nothing_left, content):
     (tmp_path / "input.log").write_text(content)
     refused(call("map", tmp_path / "input.log", "-o", tmp_path / "out"), "input.log")
     nothing_left("input.log")
 
 
-def test_an_estimator_that_knows_nothing_of_space_is_refused(call, tmp_path, nothing_left):
+def test_2d_estimator_refuses_3d(call, tmp_path, nothing_left):
     (tmp_path / "sweep.pcd").write_text(PCD)
     done = call("map", tmp_path / "sweep.pcd", "-o", tmp_path / "out", "--estimator", "tracker")
     refused(done, "is 3D", "'tracker'", "--estimator stillmap or paper")
@@ -150,7 +148,7 @@ def test_no_odometry(call, room, tmp_path):
     assert np.linalg.norm(T[-1, :2, 3]) == pytest.approx(way, abs=0.1)
 
 
-def test_given_poses_are_kept(call, room, tmp_path):
+def test_given_poses(call, room, tmp_path):
     poses = room / "truth/trajectory.tum"
     done = call("map", room, "-o", tmp_path / "out", "--poses", poses, *QUICK)
     assert done.returncode == 0, done.stderr
@@ -159,7 +157,7 @@ def test_given_poses_are_kept(call, room, tmp_path):
     np.testing.assert_allclose(kept[1], given[1], atol=1e-8)
 
 
-def test_poses_of_the_recording_are_kept_when_asked_for(call, room, tmp_path):
+def test_recorded_poses(call, room, tmp_path):
     truth = np.load(room / "truth/T_world_base.npy")
     write(replace(read(room), T_recorded_base=truth), tmp_path / "rec")
     words = ("map", tmp_path / "rec", "-o", tmp_path / "out", "--poses", "recording", *QUICK)
@@ -169,13 +167,13 @@ def test_poses_of_the_recording_are_kept_when_asked_for(call, room, tmp_path):
     np.testing.assert_allclose(kept[:, [0, 1]][:, :, [0, 1, 3]], truth[:, :2], atol=1e-8)
 
 
-def test_a_recording_without_poses_is_refused_where_they_are_asked_for(call, room, tmp_path):
+def test_recorded_poses_are_missing(call, room, tmp_path):
     done = call("map", room, "-o", tmp_path / "out", "--poses", "recording")
     refused(done, room, "states no poses", "--poses FILE.tum")
     assert not (tmp_path / "out").exists()
 
 
-def test_poses_of_another_tool_may_be_unsorted_more_and_rounded(call, room, tmp_path):
+def test_poses_may_be_unsorted_more_and_rounded(call, room, tmp_path):
     lines = (room / "truth/trajectory.tum").read_text().splitlines()
     rounded = [re.sub(r"^(\d+\.\d\d)\d*", r"\1", line) for line in lines]
     more = ["# a comment", "", "0 9 9 9 0 0 0 1", *rounded[::-1]]
@@ -189,7 +187,7 @@ def test_poses_of_another_tool_may_be_unsorted_more_and_rounded(call, room, tmp_
     )
 
 
-def test_poses_that_do_not_fit_are_refused(call, room, tmp_path, nothing_left):
+def test_poses_that_do_not_match_are_refused(call, room, tmp_path, nothing_left):
     lines = (room / "truth/trajectory.tum").read_text().splitlines(keepends=True)
     file = tmp_path / "poses.tum"
     for text, said in (
@@ -204,7 +202,7 @@ def test_poses_that_do_not_fit_are_refused(call, room, tmp_path, nothing_left):
     nothing_left("poses.tum")
 
 
-def test_the_run_record_says_where_the_recording_is(call, room, tmp_path):
+def test_run_json_has_the_recording_path(call, room, tmp_path):
     call("map", room, "-o", tmp_path / "out", *QUICK)
     record = json.loads((tmp_path / "out" / "run.json").read_text())
     assert record["input"]["path"] == str(room)

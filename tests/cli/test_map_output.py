@@ -1,4 +1,4 @@
-"""The folder that `stillmap map` writes to: what it replaces and what it leaves alone."""
+"""The folder that `stillmap map` writes to: what is replaced and what is refused."""
 
 import os
 import shutil
@@ -8,7 +8,7 @@ from maps import ENDLESS, FILES, QUICK, list_files
 from refusals import refused
 
 
-def test_a_folder_with_something_in_it_is_refused(call, room, tmp_path):
+def test_non_empty_folder_is_refused(call, room, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     (out / "mine.txt").write_text("mine")
@@ -23,7 +23,7 @@ def test_a_folder_with_something_in_it_is_refused(call, room, tmp_path):
     assert "mine.txt" not in list_files(out)
 
 
-def test_the_recording_is_not_written_over(call, room, tmp_path):
+def test_recording_is_not_overwritten(call, room, tmp_path):
     recording = tmp_path / "in" / "room"
     shutil.copytree(room, recording)
     (tmp_path / "in" / "run.json").write_text("")
@@ -37,20 +37,20 @@ def test_the_recording_is_not_written_over(call, room, tmp_path):
     assert list_files(recording) == before
 
 
-def test_an_empty_folder_will_do(call, room, tmp_path, nothing_left):
+def test_empty_folder_is_accepted(call, room, tmp_path, nothing_left):
     (tmp_path / "out").mkdir()
     assert call("map", room, "-o", tmp_path / "out", *QUICK).returncode == 0
     assert list_files(tmp_path / "out") >= FILES
     nothing_left("out")
 
 
-def test_a_file_in_the_way_is_refused(call, room, tmp_path):
+def test_existing_file_is_refused(call, room, tmp_path):
     (tmp_path / "out").write_text("mine")
     refused(call("map", room, "-o", tmp_path / "out", "--overwrite"), tmp_path / "out")
     assert (tmp_path / "out").read_text() == "mine"
 
 
-def test_a_place_that_cannot_be_written_to_is_refused_before_the_work(call, room, tmp_path):
+def test_unwritable_folder_is_refused_before_the_work(call, room, tmp_path):
     (tmp_path / "file").write_text("")
     places = [tmp_path / "file/out"]
     if os.geteuid() != 0:  # root may write everywhere
@@ -61,5 +61,5 @@ def test_a_place_that_cannot_be_written_to_is_refused_before_the_work(call, room
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="no /proc here")
-def test_a_place_that_only_seems_to_be_writable_is_refused_after_it(call, room):
+def test_failed_write_is_refused_after_the_work(call, room):
     refused(call("map", room, "-o", "/proc/out", "--quiet", *QUICK), "/proc/out: cannot be written")

@@ -1,4 +1,4 @@
-"""`stillmap map --map-state`: which state of places that changed the map shows."""
+"""`stillmap map --map-state`: the state of changed places."""
 
 import json
 import subprocess
@@ -55,7 +55,7 @@ def mapped(moved, tmp_path, capsys):
     return run
 
 
-def test_the_states_differ_where_the_crate_came(mapped):
+def test_states_differ_at_the_crate(mapped):
     last, changed, told = mapped()
     assert told["options"]["output"]["map_state"] == "last"
     most, layer, told_of_most = mapped("--map-state", "majority")
@@ -70,14 +70,14 @@ def test_the_states_differ_where_the_crate_came(mapped):
     np.testing.assert_array_equal(np.isnan(last), np.isnan(most))
 
 
-def test_the_flag_wins_over_set(mapped):
+def test_flag_overrides_set(mapped):
     words = ("--map-state", "majority", "--set", "output.map_state=last", "--map-mode", "scale")
     chosen = mapped(*words)[2]["options"]["output"]
     assert (chosen["map_mode"], chosen["map_state"]) == ("scale", "majority")
 
 
 @pytest.mark.parametrize("estimator", ["paper", "hit-ratio"])
-def test_other_estimators_know_of_no_states(mapped, estimator):
+def test_other_estimators_have_no_changes(mapped, estimator):
     words = ("--estimator", estimator, "--set", "em.max_iterations=1")
     p, changed, told = mapped(*words, "--map-state", "majority")
     same, *_ = mapped(*words)
@@ -86,7 +86,7 @@ def test_other_estimators_know_of_no_states(mapped, estimator):
     assert not changed.any()
 
 
-def test_they_may_be_left_alone(mapped):
+def test_change_detection_off(mapped):
     p, changed, told = mapped("--set", "em.change_detection=false")
     assert told["changes"] == []
     assert not changed.any()
@@ -95,7 +95,7 @@ def test_they_may_be_left_alone(mapped):
     assert np.isfinite(p).any()
 
 
-def test_another_state_is_refused(stillmap, moved, tmp_path):
+def test_unknown_state_is_refused(stillmap, moved, tmp_path):
     done: subprocess.CompletedProcess[str]
     done = stillmap("map", moved, "-o", tmp_path / "out", "--map-state", "first")
     assert done.returncode == 2
@@ -109,7 +109,7 @@ def test_another_state_is_refused(stillmap, moved, tmp_path):
     ("state", "shown"),
     [("last", "in its last state"), ("majority", "in the state that it was in for longest")],
 )
-def test_it_says_how_many_places_changed(moved, tmp_path, capsys, state, shown):
+def test_number_of_changed_places_is_printed(moved, tmp_path, capsys, state, shown):
     words = ["map", moved, "-o", tmp_path / "out", "--map-state", state]
     words += ["--poses", moved / "truth/trajectory.tum"]
     assert main([str(word) for word in words]) == 0

@@ -1,4 +1,4 @@
-"""What is said while work goes on, where there is no terminal."""
+"""Progress without a terminal."""
 
 import time
 
@@ -27,7 +27,7 @@ def lines(monkeypatch):
     return said, another
 
 
-def test_long_steps_are_told_of_again_and_again(lines):
+def test_long_steps_are_reported_periodically(lines):
     said, another = lines
     with show_progress(False, 6) as progress:
         assert another("preparing: ").endswith("s so far")
@@ -49,7 +49,7 @@ def test_long_steps_are_told_of_again_and_again(lines):
     assert len(said) == count
 
 
-def test_an_iteration_is_told_of_once_where_it_is_short(lines, monkeypatch):
+def test_short_iteration_is_reported_once(lines, monkeypatch):
     monkeypatch.setattr(module, "_LINE_PERIOD", 1000.0)
     said, _ = lines
     with show_progress(False, 3) as progress:

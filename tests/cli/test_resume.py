@@ -1,4 +1,4 @@
-"""`stillmap map --resume`: an interrupted run goes on, and nobody sees that it was interrupted."""
+"""`stillmap map --resume`: the result equals that of an uninterrupted run."""
 
 import errno
 import fcntl
@@ -77,9 +77,7 @@ def interrupted(call, room, tmp_path, stop_after):
 
 
 @pytest.mark.parametrize("number", [1, 2, 3])
-def test_the_result_is_that_of_a_run_nobody_stopped(
-    call, room, tmp_path, stop_after, whole, number
-):
+def test_result_equals_uninterrupted_run(call, room, tmp_path, stop_after, whole, number):
     stop_after(number)
     assert call("map", room, "-o", tmp_path / "out", *WORDS).returncode == 130
     stop_after(ALL)
@@ -90,7 +88,7 @@ def test_the_result_is_that_of_a_run_nobody_stopped(
     assert os.listdir(tmp_path) == ["out"]
 
 
-def test_it_may_be_stopped_again_and_again(call, room, tmp_path, stop_after, whole):
+def test_repeated_interruptions(call, room, tmp_path, stop_after, whole):
     stop_after(1)
     for _ in range(ALL - 1):
         done = call("map", room, "-o", tmp_path / "out", "--resume", *WORDS)
@@ -124,7 +122,7 @@ def test_given_poses(call, room, tmp_path, stop_after):
     assert contents(tmp_path / "out") == contents(tmp_path / "whole")
 
 
-def test_nothing_to_resume_simply_starts(call, room, tmp_path, whole):
+def test_nothing_to_resume(call, room, tmp_path, whole):
     assert call("map", room, "-o", tmp_path / "out", "--resume", *WORDS).returncode == 0
     assert contents(tmp_path / "out") == whole
     # and once more over its own result
@@ -132,7 +130,7 @@ def test_nothing_to_resume_simply_starts(call, room, tmp_path, whole):
     assert contents(tmp_path / "out") == whole
 
 
-def test_without_resume_it_begins_anew_and_says_so(call, room, tmp_path, interrupted, whole):
+def test_without_resume_starts_anew(call, room, tmp_path, interrupted, whole):
     done = call("map", room, "-o", tmp_path / "out", *WORDS)
     assert done.returncode == 0
     assert "starts anew" in done.stderr
@@ -168,7 +166,7 @@ def test_another_recording_is_refused(call, room, tmp_path, interrupted):
     assert interrupted.exists()
 
 
-def test_the_same_recording_elsewhere_will_do(call, room, tmp_path, interrupted):
+def test_moved_recording_resumes(call, room, tmp_path, interrupted):
     shutil.copytree(room, tmp_path / "moved")
     done = call("map", tmp_path / "moved", "-o", tmp_path / "out", "--resume", *WORDS)
     assert done.returncode == 0
@@ -176,7 +174,7 @@ def test_the_same_recording_elsewhere_will_do(call, room, tmp_path, interrupted)
     assert not interrupted.exists()
 
 
-def test_threads_make_no_difference(call, room, tmp_path, interrupted, whole):
+def test_resume_with_other_threads(call, room, tmp_path, interrupted, whole):
     words = (*WORDS[:-1], "2")
     assert call("map", room, "-o", tmp_path / "out", "--resume", *words).returncode == 0
     assert not interrupted.exists()
@@ -197,9 +195,7 @@ def cut(path) -> None:
 
 @pytest.mark.parametrize("damage", [flip, cut, os.remove])
 @pytest.mark.parametrize("name", ["state.json", "best.m_step.poses.npy", "e-2.npy"])
-def test_a_damaged_checkpoint_is_named_and_begun_anew(
-    call, room, tmp_path, interrupted, whole, damage, name
-):
+def test_damaged_checkpoint_starts_anew(call, room, tmp_path, interrupted, whole, damage, name):
     damage(interrupted / "iteration-2" / name)
     done = call("map", room, "-o", tmp_path / "out", "--resume", *WORDS)
     assert done.returncode == 0
@@ -208,7 +204,7 @@ def test_a_damaged_checkpoint_is_named_and_begun_anew(
     assert contents(tmp_path / "out") == whole
 
 
-def test_two_runs_into_one_folder(call, room, tmp_path, interrupted):
+def test_concurrent_runs_into_one_folder(call, room, tmp_path, interrupted):
     with (interrupted / "lock").open("ab") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         done = call("map", room, "-o", tmp_path / "out", "--resume", *WORDS)
@@ -239,7 +235,7 @@ class _Full:
 
 
 @pytest.mark.parametrize("after", [0, 5, 12])
-def test_a_full_disk_leaves_the_checkpoint_before(
+def test_full_disk_keeps_previous_checkpoint(
     call, room, tmp_path, interrupted, whole, monkeypatch, after
 ):
     with monkeypatch.context() as here:
@@ -253,7 +249,7 @@ def test_a_full_disk_leaves_the_checkpoint_before(
     assert contents(tmp_path / "out") == whole
 
 
-def test_a_full_disk_leaves_the_earlier_result(call, room, tmp_path, whole, monkeypatch):
+def test_full_disk_keeps_earlier_result(call, room, tmp_path, whole, monkeypatch):
     out = tmp_path / "out"
     out.mkdir()
     (out / "run.json").write_text("old")
@@ -269,7 +265,7 @@ def test_a_full_disk_leaves_the_earlier_result(call, room, tmp_path, whole, monk
 
 
 @pytest.mark.slow
-def test_killed_at_any_moment_it_goes_on(start, room, tmp_path, whole):
+def test_resume_after_kill(start, room, tmp_path, whole):
     rng = random.Random(3)
     for _ in range(6):
         process = start("map", room, "-o", tmp_path / "out", "--resume", "--quiet", *WORDS)

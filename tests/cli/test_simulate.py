@@ -1,4 +1,4 @@
-"""`stillmap simulate`: flags reach the scene, bad calls are one line, the folder is readable."""
+"""`stillmap simulate`: flags, refusals, readable output."""
 
 import argparse
 import json
@@ -24,7 +24,7 @@ def call(*words: str) -> int:
     return status
 
 
-def test_writes_a_recording_that_reads_back_with_its_truth(tmp_path: Path) -> None:
+def test_recording_reads_back_with_truth(tmp_path: Path) -> None:
     out = tmp_path / "sim"
     assert call("hall", "-o", str(out), *QUICK, "--seed", "7") == 0
     read = io.read(out)
@@ -36,7 +36,7 @@ def test_writes_a_recording_that_reads_back_with_its_truth(tmp_path: Path) -> No
     assert json.loads((out / "truth/scene.json").read_text())["name"] == "hall"
 
 
-def test_the_folder_has_every_file_of_the_format_and_nothing_else(tmp_path: Path) -> None:
+def test_files_of_the_folder(tmp_path: Path) -> None:
     call("corridor", "-o", str(tmp_path / "sim"), *QUICK)
     names = {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()}
     arrays = ["stamp_ns", "offset", "points", "hit", "T_base_sensor", "sensor", "T_odom_base"]
@@ -75,14 +75,14 @@ def test_any_option_can_be_set_and_flags_win(tmp_path: Path) -> None:
     assert scene["odometry"]["slip_length"] == 2.0
 
 
-def test_a_scan_that_takes_time_says_when_its_beams_were_taken(tmp_path: Path) -> None:
+def test_sweep_time_gives_beam_times(tmp_path: Path) -> None:
     call("hall", "-o", str(tmp_path / "sim"), *QUICK, "--sweep-time", "0.1")
     times = io.read(tmp_path / "sim").beam_time
     assert times is not None
     assert 0.09 < np.ptp(times) < 0.1
 
 
-def test_a_second_laser_and_one_upside_down(tmp_path: Path) -> None:
+def test_second_and_upside_down_laser(tmp_path: Path) -> None:
     flags = ("--second-laser", "--set", "laser.upside_down=unknown")
     call("hall", "-o", str(tmp_path / "sim"), *QUICK, *flags)
     read = io.read(tmp_path / "sim")
@@ -102,7 +102,7 @@ def test_a_lidar_records_in_3d(tmp_path: Path) -> None:
     assert len(truth.static) == read.n_beams
 
 
-def test_a_laser_that_tilts_makes_two_recordings(
+def test_tilting_laser_makes_two_recordings(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     call("hall", "-o", str(tmp_path / "sim"), "--lidar", "tilting", *QUICK, "--json", "--quiet")
@@ -125,13 +125,13 @@ def test_a_laser_that_tilts_makes_two_recordings(
         ("--lidar 16 --format carmen", "3D"),
     ],
 )
-def test_what_a_lidar_has_not_is_refused(tmp_path: Path, flags: str, what: str) -> None:
+def test_laser_options_are_refused_for_lidar(tmp_path: Path, flags: str, what: str) -> None:
     with pytest.raises(InputError, match=what):
         call("hall", "-o", str(tmp_path / "sim"), *flags.split())
     assert not (tmp_path / "sim").exists()
 
 
-def test_scenes_with_more_than_people_say_what_moves(tmp_path: Path) -> None:
+def test_scenes_with_vehicles(tmp_path: Path) -> None:
     call("office", "-o", str(tmp_path / "sim"), *QUICK)
     truth = load_truth(tmp_path / "sim")
     doors = truth.scene["mover_kinds"].count("door")
@@ -140,7 +140,7 @@ def test_scenes_with_more_than_people_say_what_moves(tmp_path: Path) -> None:
     assert truth.movers.shape == (20, 3 + doors, 3)
 
 
-def test_carmen_log_says_the_same_as_the_recording_folder(tmp_path: Path) -> None:
+def test_carmen_log_equals_recording_folder(tmp_path: Path) -> None:
     call("hall", "-o", str(tmp_path / "a"), *QUICK)
     call("hall", "-o", str(tmp_path / "b"), *QUICK, "--format", "carmen")
     own, log = io.read(tmp_path / "a"), io.read(tmp_path / "b/recording.log")
@@ -155,7 +155,7 @@ def test_carmen_log_says_the_same_as_the_recording_folder(tmp_path: Path) -> Non
     np.testing.assert_array_equal(a.mover, b.mover)
 
 
-def test_an_unknown_scene_is_named_beside_the_known_ones(tmp_path: Path) -> None:
+def test_unknown_scene(tmp_path: Path) -> None:
     with pytest.raises(
         InputError, match=r"'hull'.*hall, corridor, office, .*street-turn, .*hall-empty"
     ):
@@ -189,7 +189,7 @@ def test_values_out_of_range_are_refused(tmp_path: Path, flags: list[str], messa
     assert not list(tmp_path.iterdir())
 
 
-def test_an_output_folder_that_holds_something_is_left_alone(tmp_path: Path) -> None:
+def test_non_empty_folder_is_refused(tmp_path: Path) -> None:
     out = tmp_path / "sim"
     out.mkdir()
     (out / "mine").write_text("x")
@@ -204,9 +204,7 @@ def test_an_output_folder_that_holds_something_is_left_alone(tmp_path: Path) -> 
     assert not (out / "mine").exists()
 
 
-def test_says_what_came_of_it_unless_quiet(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_summary_unless_quiet(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     call("hall", "-o", str(tmp_path / "a"), *QUICK)
     said = capsys.readouterr()
     assert said.out == ""

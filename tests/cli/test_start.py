@@ -1,4 +1,4 @@
-"""It starts quickly: what takes long to load is loaded by the commands that need it."""
+"""Quick start: slow imports happen in the commands that need them."""
 
 import subprocess
 
@@ -34,7 +34,7 @@ def test_help_version_and_completion_load_nothing_heavy(command):
     assert done.returncode == 0
 
 
-def test_the_package_gives_its_names_when_they_are_used(command):
+def test_package_loads_names_on_use(command):
     program = (
         "import sys, stillmap\n"
         "assert 'numpy' not in sys.modules\n"
@@ -51,7 +51,7 @@ def test_the_package_gives_its_names_when_they_are_used(command):
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_the_parts_of_scipy_load_when_they_are_called(command):
+def test_scipy_loads_on_call(command):
     program = (
         "import sys, stillmap.pipeline.result, stillmap.sim, stillmap.cli.eval\n"
         "late = {'scipy.sparse', 'scipy.spatial', 'scipy.ndimage', 'matplotlib', 'gtsam'}\n"

@@ -1,4 +1,4 @@
-"""What stops `stillmap map` on its way, and what is left behind then."""
+"""Interrupted and killed runs of `stillmap map`."""
 
 import shutil
 import signal
@@ -9,7 +9,7 @@ import pytest
 from maps import ENDLESS, FILES, QUICK, list_files
 
 
-def test_who_listens_to_the_progress_may_leave(start, room, tmp_path):
+def test_closed_stderr_during_progress(start, room, tmp_path):
     # `stillmap map ... 2>&1 | head -1` still makes the map
     process = start(
         *("map", room, "-o", tmp_path / "out", "--set", "em.max_iterations=3"),
@@ -37,7 +37,7 @@ def only_a_checkpoint_left(folder) -> None:
 
 
 @pytest.mark.parametrize(("number", "expected"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_stopped_while_mapping(start, hall, tmp_path, number, expected):
+def test_interrupted_while_mapping(start, hall, tmp_path, number, expected):
     process = start("map", hall, "-o", tmp_path / "out", *ENDLESS)
     status, err = stopped_after_a_line(process, number)
     assert status == expected
@@ -63,9 +63,7 @@ def stopped_while_writing(process, folder, number, delay=0.0) -> int:
 
 
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_stopped_while_writing_nothing_stays_behind(
-    start, room, tmp_path, nothing_left, number, status
-):
+def test_interrupted_while_writing(start, room, tmp_path, nothing_left, number, status):
     for _ in range(20):
         process = start("map", room, "-o", tmp_path / "out", "--quiet", *QUICK)
         got = stopped_while_writing(process, tmp_path, number)
@@ -85,7 +83,7 @@ def test_stopped_while_writing_nothing_stays_behind(
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.1, 0.4])
-def test_killed_while_writing_all_or_nothing_stands_there(start, room, tmp_path, delay):
+def test_killed_while_writing(start, room, tmp_path, delay):
     out = tmp_path / "out"
     process = start("map", room, "-o", out, "--quiet", *QUICK)
     status = stopped_while_writing(process, tmp_path, signal.SIGKILL, delay)
@@ -93,7 +91,7 @@ def test_killed_while_writing_all_or_nothing_stands_there(start, room, tmp_path,
     assert not out.exists() or list_files(out) >= FILES
 
 
-def test_killed_while_overwriting_the_old_result_or_the_new_stands_there(start, room, tmp_path):
+def test_killed_while_overwriting(start, room, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     (out / "run.json").write_text("old")
@@ -129,7 +127,7 @@ except KeyboardInterrupt:
 
 
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_waits_for_the_end_of_an_import(tmp_path, command, number, status):
+def test_signal_is_deferred_during_import(tmp_path, command, number, status):
     (tmp_path / "greedy.py").write_text(GREEDY.format(number=int(number)))
     words = [command[0], "-c", PROGRAM]
     done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=50)
@@ -161,7 +159,7 @@ except KeyboardInterrupt:
 """
 
 
-def test_a_signal_waits_for_points_to_be_packed(tmp_path, command):
+def test_signal_is_deferred_while_packing(tmp_path, command):
     pytest.importorskip("lazrs")
     words = [command[0], "-c", PACKING]
     for blocks in (1, 3, 5):
@@ -176,7 +174,7 @@ def test_a_signal_waits_for_points_to_be_packed(tmp_path, command):
         assert list(tmp_path.iterdir()) == []
 
 
-def test_ctrl_c_stays_ignored_in_the_background_of_a_script(command):
+def test_ignored_ctrl_c_stays_ignored(command):
     program = (
         "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
         "from stillmap.cli.console import handle_signals\n"

@@ -1,4 +1,4 @@
-"""A terminal: colours where it wants them, a bar, and the cursor back when it ends."""
+"""Output on a terminal: colors, progress bar, cursor."""
 
 import io
 import re
@@ -33,7 +33,7 @@ class Terminal(io.StringIO):
         ({"FORCE_COLOR": "1", "NO_COLOR": "1"}, False, False),
     ],
 )
-def test_who_gets_colours(monkeypatch, environment, on_terminal, elsewhere):
+def test_uses_color(monkeypatch, environment, on_terminal, elsewhere):
     for name in VARIABLES:
         monkeypatch.delenv(name, raising=False)
     for name, value in environment.items():
@@ -43,7 +43,7 @@ def test_who_gets_colours(monkeypatch, environment, on_terminal, elsewhere):
     assert colorize("no", "error", Terminal()) == (f"{RED}no{PLAIN}" if on_terminal else "no")
 
 
-def test_a_stream_that_was_closed_is_no_terminal():
+def test_closed_stream_is_no_terminal():
     assert not is_terminal(None)
     assert colorize("no", "error", None) == "no"
 
@@ -60,11 +60,11 @@ def test_errors_are_red_on_a_terminal(on_a_terminal, words, prefix):
     assert coloured_line.replace(RED, "").replace(PLAIN, "") == plain_line
 
 
-def test_errors_are_plain_elsewhere(stillmap):
+def test_errors_are_plain_without_terminal(stillmap):
     assert "\x1b" not in stillmap("info", "nowhere").stderr
 
 
-def test_warnings_are_marked_and_a_dumb_terminal_gets_lines(on_a_terminal, room, tmp_path):
+def test_dumb_terminal_gets_lines(on_a_terminal, room, tmp_path):
     words = ("map", room, "--no-odometry", "--set", "em.max_iterations=1")
     _, written = on_a_terminal(*words, "-o", tmp_path / "a")
     assert "stillmap: \x1b[33mwarning:\x1b[0m no odometry" in written
@@ -74,7 +74,7 @@ def test_warnings_are_marked_and_a_dumb_terminal_gets_lines(on_a_terminal, room,
     assert "stillmap: mapping, iteration 1" in written
 
 
-def test_what_is_logged_stands_above_the_bar(on_a_terminal, room, tmp_path):
+def test_log_messages_appear_above_the_bar(on_a_terminal, room, tmp_path):
     words = ("-v", "map", room, "-o", tmp_path / "out", "--set", "em.max_iterations=1")
     status, written = on_a_terminal(*words)
     assert status == 0
@@ -102,7 +102,7 @@ def left_on_screen(written: str) -> list[str]:
     return [line for line in lines if line.strip()]
 
 
-def test_a_bar_on_a_terminal_and_no_garbage_after_it(on_a_terminal, room, tmp_path):
+def test_bar_is_removed_at_the_end(on_a_terminal, room, tmp_path):
     status, written = on_a_terminal(
         "map", room, "-o", tmp_path / "out", "--set", "em.max_iterations=2"
     )
@@ -115,7 +115,7 @@ def test_a_bar_on_a_terminal_and_no_garbage_after_it(on_a_terminal, room, tmp_pa
     assert "report.html" in lines[-1]
 
 
-def test_ctrl_c_on_a_terminal_gives_the_cursor_back(on_a_terminal, hall, tmp_path, nothing_left):
+def test_ctrl_c_restores_the_cursor(on_a_terminal, hall, tmp_path, nothing_left):
     status, written = on_a_terminal(
         "map", hall, "-o", tmp_path / "out", *ENDLESS, send_at=b"iteration 2 of"
     )

@@ -1,4 +1,4 @@
-"""`stillmap view`: a result in a browser over time, or its report."""
+"""`stillmap view`: a result in the browser, or its report."""
 
 import os
 import re
@@ -81,7 +81,7 @@ def without_a_screen():
 
 
 @pytest.mark.skipif(sys.platform == "darwin", reason="there is always a screen")
-def test_a_result_is_served_until_ctrl_c(start, mapped):
+def test_result_is_served_until_ctrl_c(start, mapped):
     pytest.importorskip("viser")
     process = start("view", mapped, env=without_a_screen())
     address, said = served(process)
@@ -92,14 +92,14 @@ def test_a_result_is_served_until_ctrl_c(start, mapped):
     assert ended(process) == (0, "", "")
 
 
-def test_terminated_it_goes_at_once(start, mapped):
+def test_sigterm_ends_at_once(start, mapped):
     pytest.importorskip("viser")
     process = start("view", mapped, env=without_a_screen())
     served(process)
     assert ended(process, signal.SIGTERM) == (143, "", "")
 
 
-def test_the_browser_of_the_environment_is_opened(start, mapped, browser):
+def test_opens_browser_of_the_environment(start, mapped, browser):
     pytest.importorskip("viser")
     environment, note = browser
     process = start("view", mapped, "--no-beams", env=environment)
@@ -114,7 +114,7 @@ def test_the_browser_of_the_environment_is_opened(start, mapped, browser):
     assert note.read_text() == f"{address}\n"
 
 
-def test_the_port_that_is_wanted(start, mapped):
+def test_port(start, mapped):
     pytest.importorskip("viser")
     with socket.socket() as one:
         one.bind(("127.0.0.1", 0))
@@ -126,7 +126,7 @@ def test_the_port_that_is_wanted(start, mapped):
 
 
 @pytest.mark.usefixtures("elsewhere")
-def test_a_port_that_is_taken_is_refused(call, mapped):
+def test_taken_port_is_refused(call, mapped):
     pytest.importorskip("viser")
     with socket.socket() as one:
         one.bind(("127.0.0.1", 0))
@@ -137,13 +137,13 @@ def test_a_port_that_is_taken_is_refused(call, mapped):
 
 
 @pytest.mark.parametrize("port", [-1, 65_536])
-def test_a_port_that_cannot_be_is_refused(call, report, port):
+def test_invalid_port_is_refused(call, report, port):
     done = call("view", report, "--port", port)
     assert done.returncode == 2
     assert "--port wants 0 to 65535" in done.stderr
 
 
-def test_without_its_recording_a_result_is_shown_without_beams(start, mapped, room, tmp_path):
+def test_missing_recording_shows_no_beams(start, mapped, room, tmp_path):
     pytest.importorskip("viser")
     out = shutil.copytree(mapped, tmp_path / "out")
     record = (out / "run.json").read_text()
@@ -154,14 +154,14 @@ def test_without_its_recording_a_result_is_shown_without_beams(start, mapped, ro
     assert ended(process)[0] == 0
 
 
-def test_a_recording_that_was_named_has_to_be_there(call, mapped, tmp_path):
+def test_named_recording_must_exist(call, mapped, tmp_path):
     pytest.importorskip("viser")
     done = call("view", mapped, "--input", tmp_path / "nothing")
     assert done.returncode == 2
     assert "nothing" in done.stderr
 
 
-def test_a_damaged_result_is_refused(call, mapped, tmp_path):
+def test_damaged_result_is_refused(call, mapped, tmp_path):
     pytest.importorskip("viser")
     out = shutil.copytree(mapped, tmp_path / "out")
     (out / "map.npz").write_bytes(b"nonsense")
@@ -172,7 +172,7 @@ def test_a_damaged_result_is_refused(call, mapped, tmp_path):
 
 @pytest.mark.usefixtures("elsewhere", "without_viser")
 @pytest.mark.skipif(sys.platform == "darwin", reason="there is always a screen")
-def test_without_the_extra_it_is_the_report(call, report):
+def test_report_without_the_extra(call, report):
     done = call("view", report)
     assert (done.returncode, done.stdout) == (0, "")
     first, second = done.stderr.splitlines()
@@ -180,7 +180,7 @@ def test_without_the_extra_it_is_the_report(call, report):
     assert str(report / "report.html") in second
 
 
-def test_prints_where_the_report_is(call, report, monkeypatch):
+def test_prints_path_of_report(call, report, monkeypatch):
     monkeypatch.chdir(report.parent)
     done = call("view", "a result", "--print")
     assert (done.returncode, done.stdout, done.stderr) == (0, f"{report / 'report.html'}\n", "")
@@ -188,20 +188,20 @@ def test_prints_where_the_report_is(call, report, monkeypatch):
 
 @pytest.mark.skipif(sys.platform == "darwin", reason="there is always a screen")
 @pytest.mark.usefixtures("elsewhere")
-def test_without_a_screen_it_says_where_the_report_is(call, report):
+def test_path_of_report_without_screen(call, report):
     done = call("view", report, "--report")
     assert (done.returncode, done.stdout) == (0, "")
     assert str(report / "report.html") in done.stderr
 
 
-def test_opens_the_report_in_the_browser_of_the_environment(stillmap, report, browser):
+def test_opens_report_in_browser(stillmap, report, browser):
     environment, note = browser
     done = stillmap("view", report, "--report", env=environment)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     assert note.read_text() == f"{(report / 'report.html').as_uri()}\n"
 
 
-def test_what_is_no_result_is_refused(call, tmp_path):
+def test_non_result_is_refused(call, tmp_path):
     (tmp_path / "results").mkdir()
     (tmp_path / "file").write_text("")
     for name, said in (
