@@ -76,9 +76,7 @@ def sample_lattice(vertices: Float, faces: Index, spacing: float) -> SurfaceSamp
     return SurfaceSamples(_at(vertices, faces, face, weight), face, weight)
 
 
-def distance_to_mesh(
-    points: Float, vertices: Float, faces: Index, spacing: float
-) -> Float:
+def distance_to_mesh(points: Float, vertices: Float, faces: Index, spacing: float) -> Float:
     """(n,) metres from points (n, 3) to the nearest triangle.
 
     Exact up to `spacing` except for slivers, because only the triangles with the nearest lattice
