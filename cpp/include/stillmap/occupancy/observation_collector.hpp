@@ -119,7 +119,7 @@ class ObservationCollector {
   using Vecf = Eigen::Matrix<float, D, 1>;
   static constexpr float kHitMark = -1.0f, kUntouched = 2.0f;
   static constexpr float kSaturated = 0.05f;  // further beams of the time bin are skipped
-  static constexpr float kMaxMissed = 0.98f;   // p_missed above this is no observation
+  static constexpr float kMaxMissed = 0.98f;  // p_missed above this is no observation
 
   // Per-surfel data in few bytes, since memory access dominates the run time.
   struct SurfelState {
@@ -267,9 +267,8 @@ class ObservationCollector {
   std::vector<std::vector<int32_t>> touched_;  // by span
   std::vector<int32_t> hit_surfels_;
   std::vector<typename SurfelTraversal<D>::Crossing> crossings_;  // of one beam, prefetched
-  std::vector<typename SurfelBitmap<D>::BlockBits>
-      open_bits_;                      // cells that are not saturated
-  std::vector<size_t> closed_blocks_;  // with excluded cells
+  std::vector<typename SurfelBitmap<D>::BlockBits> open_bits_;    // cells that are not saturated
+  std::vector<size_t> closed_blocks_;                             // with excluded cells
   SurfelTraversal<D> traversal_;
 };
 
