@@ -1,4 +1,4 @@
-"""A small populated place, mapped: the files that other people's programs read."""
+"""Fixtures: results of a small hall and a street, to be read by other programs."""
 
 import sys
 from pathlib import Path
@@ -16,7 +16,7 @@ sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1] / "mes
 
 @pytest.fixture(scope="session")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording folder: a hall with people, 240 scans of two lasers that take their time."""
+    """A recording folder: a hall with people, 240 scans of two lasers with beam times."""
     path = tmp_path_factory.mktemp("contract") / "recording"
     laser = {"beams": 90, "second_laser": True, "sweep_time": 0.05, "x": 0.2}
     changes = {"robot": {"scans": 240}, "laser": laser, "crowd": {"people": 12}}
@@ -26,13 +26,13 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def recording(recorded: Path) -> Recording:
-    """The same as arrays."""
+    """That recording as arrays."""
     return stillmap_folder.read(recorded)
 
 
 @pytest.fixture(scope="session")
 def result(recorded: Path) -> Path:
-    """What `stillmap map` made of it."""
+    """Its result folder."""
     out = recorded.parent / "result"
     words = ["map", recorded, "-o", out, "--quiet", "--set", "em.max_iterations=2"]
     assert main([*map(str, words)]) == 0
@@ -41,7 +41,7 @@ def result(recorded: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording folder in 3D: a street with cars, 40 sweeps that take their time."""
+    """A recording folder in 3D: a street with cars, 40 sweeps with beam times."""
     path = tmp_path_factory.mktemp("contract") / "street"
     lidar = {"channels": 32, "columns": 300}
     scene = scene_by_name("street", {"lidar": lidar, "robot": {"scans": 40}})
@@ -51,7 +51,7 @@ def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def mapped_street(street: Path) -> Path:
-    """What `stillmap map` made of it."""
+    """Its result folder."""
     out = street.parent / "mapped"
     words = ["map", street, "-o", out, "--quiet", "--poses", street / "truth/trajectory.tum"]
     words += ["--set", "mesh.enabled=false"]

@@ -1,4 +1,4 @@
-"""Other people's programs that open models: the Khronos validator, and three.js in a browser."""
+"""Open models with the Khronos validator, and with three.js in a browser."""
 
 import base64
 import io
@@ -21,7 +21,7 @@ SWIFTSHADER = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swi
 
 
 def require(name, package):
-    """Skips, saying so, where a program or a package is missing."""
+    """Skip where a program or a package is missing."""
     found = shutil.which(name)
     if found is None:
         pytest.skip(f"no {name}")
@@ -31,7 +31,7 @@ def require(name, package):
 
 
 def validated(*paths):
-    """What the validator reports of each file: issues and info."""
+    """Reports of the validator by file: issues and info."""
     node = require("node", "gltf-validator")
     words = [node, HERE / "validate_gltf.js", MODULES, *paths]
     done = subprocess.run([str(w) for w in words], capture_output=True, text=True, timeout=120)
@@ -73,7 +73,7 @@ def _served(model, answer):
 
 
 def shown(path, place, towards, folder, size=(600, 400)):
-    """(h, w, 3) uint8, what three.js draws of a model from a place, y up, 60 degrees high."""
+    """(h, w, 3) uint8, a model drawn by three.js from a place, y up, 60 degrees field of view."""
     browser = require("chromium", "three")
     numbers = {"from": place, "to": towards, "size": size}
     asked = "&".join(f"{k}={','.join(map(str, v))}" for k, v in numbers.items())

@@ -1,4 +1,4 @@
-"""Clouds of results in 3D, as the libraries of others read them: the points of `static.ply`."""
+"""Point clouds of 3D results, read by other libraries."""
 
 import re
 import subprocess
@@ -72,7 +72,7 @@ READERS = {
 
 @pytest.fixture
 def converted(mapped_street, tmp_path):
-    """Makes a cloud of the street."""
+    """Convert the street to a cloud."""
 
     def convert(ending: str, *more: str) -> Path:
         path = tmp_path / f"{'-'.join(more)}cloud{ending}"
@@ -88,7 +88,7 @@ def both(result: Path) -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize("ending", READERS)
 def test_points_equal_those_of_the_result(converted, mapped_street, ending):
-    """With the motion during sweeps taken out, as the map has them."""
+    """Deskewed, as in the map."""
     found, known = READERS[ending](converted(ending)), both(mapped_street)
     assert len(known["dynamic"]) > 100
     moves = found[:, 3] < 0.5
@@ -112,7 +112,7 @@ def test_files_are_reproducible(converted, ending):
 
 
 def test_deskewing_exceeds_rounding(street, mapped_street):
-    """Else the above would say nothing of it."""
+    """Otherwise the test above would not see deskewing."""
     recording = stillmap_folder.read(street)
     hits, poses = np.flatnonzero(recording.hit), np.load(street / "truth/T_world_base.npy")
     known, found = both(mapped_street), recording.end_points(hits, poses)
@@ -218,7 +218,7 @@ def test_error_names_the_reason(form, tmp_path):
 
 @pytest.mark.parametrize("name", ["a.las", "a.laz", "a.e57", "a.pcd", "a.ply", "a.xyz"])
 def test_full_disk(name, tmp_path):
-    """A limit on the size of files stands for it; the process it holds for is one of its own."""
+    """Simulated by a limit on file size in a process of its own."""
     program = f"""
 import resource, signal, sys
 from pathlib import Path

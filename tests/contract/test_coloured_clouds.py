@@ -1,4 +1,4 @@
-"""Colours in clouds, as the libraries of others read them."""
+"""Colors of point clouds, read by other libraries."""
 
 from pathlib import Path
 
@@ -67,7 +67,7 @@ def test_ply(written, points):
 
 
 def test_pcd(written, points):
-    """As PCL has it: four bytes that are called a float, blue first."""
+    """As in PCL: four bytes in a float, blue first."""
     head, _, data = written(".pcd").read_bytes().partition(b"DATA binary\n")
     lines = dict(line.split(" ", 1) for line in head.decode().splitlines())
     assert lines["FIELDS"] == "x y z p_static rgb"
@@ -89,7 +89,7 @@ def test_text(written, points):
 
 
 def test_cloud_from_folder_has_colors(points, tmp_path):
-    """Where one of them has none, neither has the whole."""
+    """A cloud has no colors if one of its parts has none."""
     rows = np.zeros(N, FIELDS + COLOURS)
     for name, column in zip("xyz", points.points.T, strict=True):
         rows[name] = column

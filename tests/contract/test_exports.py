@@ -1,4 +1,4 @@
-"""Results converted: the MCAP by its makers' library, as Foxglove reads it, and Parquet."""
+"""Exports of results: MCAP, read by the library of its authors, and Parquet."""
 
 from collections import defaultdict
 
@@ -157,7 +157,7 @@ def test_object_markers(decoded, result):
 
 
 def test_parquet_table(result, recording):
-    """In the map frame: what is static lies on the walls of the map."""
+    """In the map frame: static end points lie on the walls of the map."""
     parquet = pytest.importorskip("pyarrow.parquet")
     path = result.parent / "beams.parquet"
     assert main(["convert", str(result), "-o", str(path), "--quiet", "--overwrite"]) == 0

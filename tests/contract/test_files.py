@@ -1,4 +1,4 @@
-"""The files of a result, and recordings as clouds, read by other people's programs."""
+"""Files of a result, and recordings as clouds, read by other programs."""
 
 import json
 import re
@@ -18,7 +18,7 @@ def planar(T):
 
 @pytest.fixture(scope="module")
 def stamps_and_poses(result, recording):
-    """What stillmap itself reads of the trajectory."""
+    """The trajectory as stillmap reads it."""
     path = result / "trajectory.tum"
     return recording.stamp_ns, given_poses.poses_from_tum(path, recording)
 
@@ -38,7 +38,7 @@ def test_evo_reads_the_trajectory(result, stamps_and_poses, tmp_path, monkeypatc
     np.testing.assert_allclose(planar(np.array(found.poses_se3)), T, atol=1e-8)
 
 
-def test_gtsam_reads_the_graph_and_leaves_the_poses_where_they_are(result, stamps_and_poses):
+def test_gtsam_optimum_is_near_the_trajectory(result, stamps_and_poses):
     gtsam = pytest.importorskip("gtsam")
     factors, values = gtsam.readG2o(str(result / "graph.g2o"), False)
     lines = (result / "graph.g2o").read_text().splitlines()
@@ -62,7 +62,7 @@ def test_gtsam_reads_the_graph_and_leaves_the_poses_where_they_are(result, stamp
     assert moved[:, :2].max() < 0.05
 
 
-def test_trimesh_reads_the_points_of_what_moved(result):
+def test_trimesh_reads_object_points(result):
     trimesh = pytest.importorskip("trimesh")
     objects = json.loads((result / "objects/objects.json").read_text())
     assert objects
@@ -100,7 +100,7 @@ class Links(HTMLParser):
             self.wrong.append(tag)
 
 
-def test_the_report_is_whole_and_fetches_nothing(result):
+def test_report_is_complete_and_fetches_nothing(result):
     page, text = Links(), (result / "report.html").read_text(encoding="utf-8")
     page.feed(text)
     assert (page.open, page.wrong) == ([], [])
@@ -111,7 +111,7 @@ def test_the_report_is_whole_and_fetches_nothing(result):
     assert "@import" not in text
 
 
-def test_numpy_reads_the_labels_without_loading_them(result, recording):
+def test_numpy_maps_the_labels(result, recording):
     p_static, hit = (np.load(result / f"beams/{n}.npy", mmap_mode="r") for n in ("p_static", "hit"))
     assert isinstance(p_static, np.memmap)
     np.testing.assert_array_equal(hit, recording.hit)

@@ -1,4 +1,4 @@
-"""The map as map_server and nav2 load it: their public rules, written out here.
+"""The map as map_server and nav2 load it, by their public rules.
 
 The rules are those of http://wiki.ros.org/map_server (image format, value interpretation) and of
 nav2_map_server's README, with the modes trinary, scale and raw. Nothing here is shared with the
@@ -63,7 +63,7 @@ def load(path):
 
 @pytest.fixture(scope="module", params=["trinary", "scale", "raw"])
 def mapped(request, recorded, result):
-    """A mode, the map as others load it, and the map as it was meant."""
+    """A mode, the loaded map, and the expected map."""
     mode, folder = request.param, result
     if mode != "trinary":
         folder = recorded.parent / mode
@@ -74,7 +74,7 @@ def mapped(request, recorded, result):
         return mode, load(folder / "map.yaml"), dict(meant)
 
 
-def test_every_cell_is_what_it_was_meant_to_be(mapped):
+def test_cell_values(mapped):
     mode, grid, meant = mapped
     p = meant["p_occupied"]
     assert grid.cells.shape == p.shape
@@ -97,7 +97,7 @@ def test_every_cell_is_what_it_was_meant_to_be(mapped):
         assert np.abs(grid.cells - expected)[between].max(initial=0) <= step + 0.5
 
 
-def test_places_are_where_the_map_has_them(mapped):
+def test_origin_and_resolution(mapped):
     _, grid, meant = mapped
     assert grid.resolution == meant["resolution"]
     np.testing.assert_allclose(grid.origin, meant["origin"])
@@ -109,7 +109,7 @@ def test_places_are_where_the_map_has_them(mapped):
         assert grid.at(x0 + middle[0], y0 + middle[1]) > 85
 
 
-def test_where_the_robot_was_is_free(mapped, result):
+def test_trajectory_is_free(mapped, result):
     mode, grid, _ = mapped
     rows = np.loadtxt(result / "trajectory.tum")
     cells = [grid.at(x, y) for x, y in rows[:, 1:3]]

@@ -1,4 +1,4 @@
-"""Models, opened by other people's programs."""
+"""Models, opened by other programs."""
 
 import numpy as np
 import pytest
@@ -50,7 +50,7 @@ def written(room, poster, tmp_path_factory):
     return paths
 
 
-def test_the_validator_finds_nothing_wrong(written, room):
+def test_validator_reports_no_issue(written, room):
     reports = validated(*written.values())
     for name, report in zip(written, reports, strict=True):
         issues = report["issues"]
@@ -82,7 +82,7 @@ def test_trimesh_reads_it_back(written, room):
         np.testing.assert_allclose(uv, room.uv[room.faces[mine]], atol=1e-6)
 
 
-def test_without_loss(written, room):
+def test_lossless_textures(written, room):
     scene = trimesh.load(written["png"])
     for number, page in enumerate(room.pages):
         picture = scene.geometry[f"page{number}"].visual.material.baseColorTexture
@@ -114,7 +114,7 @@ def test_trimesh_reads_obj_back(room, tmp_path):
     np.testing.assert_allclose(uv, room.uv[room.faces[room.page == 0]], atol=1e-6)
 
 
-def test_a_browser_shows_colours_as_they_were_photographed(written, tmp_path):
+def test_browser_shows_photographed_colors(written, tmp_path):
     picture = shown(written["poster"], [0, 0, 0], [0, 0, -1], tmp_path)
     # 60 degrees in 400 rows, 3 m ahead: 115 pixels per metre
     for row, column in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
@@ -124,14 +124,14 @@ def test_a_browser_shows_colours_as_they_were_photographed(written, tmp_path):
     assert (picture[5, 5] == 255).all()  # beyond the wall
 
 
-def test_and_what_is_grey_with_light_and_shade(written, tmp_path):
+def test_browser_shades_grey_faces(written, tmp_path):
     picture = shown(written["poster"], [0, 0, 0], [0, 0, -1], tmp_path)
     # linear 0.216 under a light of 3 / pi from above, and half of that and half of 0.246 from aside
     for row, column, expected in ((390, 300, 126), (297, 23, 101)):
         assert np.abs(picture[row, column].astype(int) - expected).max() <= 3, (row, column)
 
 
-def test_a_browser_shows_a_room(written, tmp_path):
+def test_browser_shows_a_room(written, tmp_path):
     for name, shades in (("room", 1000), ("plain", 10)):
         # from within; y up, so that -z is ahead
         picture = shown(written[name], [1.0, 1.5, -1.0], [3.0, 0.8, -4.0], tmp_path)

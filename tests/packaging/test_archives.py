@@ -1,4 +1,4 @@
-"""Source archive and wheel hold what they should; the archive builds and works elsewhere."""
+"""Contents of source archive and wheel; the wheel works in a fresh environment."""
 
 import os
 import re
@@ -61,7 +61,7 @@ def wheel(sdist, tmp_path_factory):
     return archive
 
 
-def test_source_archive_is_whole(sdist):
+def test_source_archive_is_complete(sdist):
     with tarfile.open(sdist) as archive:
         names = [name.partition("/")[2] for name in archive.getnames()]
     assert [name for name in names if JUNK.search(f"/{name}")] == []
@@ -73,7 +73,7 @@ def test_source_archive_is_whole(sdist):
     assert top <= set(names)
 
 
-def test_wheel_holds_the_package_alone(wheel):
+def test_wheel_holds_only_the_package(wheel):
     names = zipfile.ZipFile(wheel).namelist()
     assert len(names) == len(set(names))
     info = "-".join(wheel.name.split("-")[:2]) + ".dist-info"
@@ -84,7 +84,7 @@ def test_wheel_holds_the_package_alone(wheel):
     assert f"{info}/licenses/LICENSE" in names
 
 
-def test_wheel_does_the_main_job_in_a_fresh_environment(wheel, tmp_path):
+def test_wheel_maps_in_a_fresh_environment(wheel, tmp_path):
     run(sys.executable, "-m", "venv", "venv", cwd=tmp_path)
     run("venv/bin/python", "-m", "pip", "install", wheel, cwd=tmp_path)
     assert run("venv/bin/python", "-c", IMPORT_ALL, cwd=tmp_path).split() == []

@@ -1,4 +1,4 @@
-"""What is tested is what was installed, and it is whole."""
+"""The installed package is complete, and the one under test."""
 
 import ast
 import re
@@ -66,7 +66,7 @@ def functions(body, prefix=""):
 
 
 def at_run_time(holder, prefix=""):
-    """The same of the compiled module."""
+    """Parameter names of the compiled module."""
     found = {}
     for name, value in vars(holder).items():
         if isinstance(value, type):
@@ -82,7 +82,7 @@ def at_run_time(holder, prefix=""):
     return found
 
 
-def test_stub_says_what_the_kernels_are():
+def test_stub_matches_the_kernels():
     path = Path(_core.__file__).with_name("_core.pyi")
     if not path.is_file():
         pytest.skip("no stub beside the compiled module: run from the source tree")

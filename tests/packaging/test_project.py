@@ -1,4 +1,4 @@
-"""The files at the top of the repository agree with each other and with the machine."""
+"""Citation, changelog, links of the docs, and the check of build tools."""
 
 import os
 import re
@@ -28,7 +28,7 @@ def test_citation_and_changelog_name_the_version():
     "page",
     sorted(str(p.relative_to(ROOT)) for p in [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")]),
 )
-def test_links_lead_somewhere(page):
+def test_links_exist(page):
     links = re.findall(r"\]\((?!\w+:|#)([^)#]+)", (ROOT / page).read_text())
     assert [link for link in links if not ((ROOT / page).parent / link).exists()] == []
 
@@ -65,7 +65,7 @@ needs_compiler = pytest.mark.skipif(not shutil.which("g++"), reason="no g++ here
 
 
 @needs_compiler
-def test_nothing_is_lacking_here():
+def test_require_passes_here():
     assert lacking(os.environ["PATH"], sys.executable, CXX="g++") == (0, [])
 
 

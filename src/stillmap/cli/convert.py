@@ -68,7 +68,7 @@ _PARQUET = ".parquet"
 
 
 class _Request(NamedTuple):
-    """What the command line asks for.
+    """Parsed arguments.
 
     Attributes:
         input: recording or result.

@@ -49,7 +49,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
 
 
 class _Request(NamedTuple):
-    """What the command line asks for.
+    """Parsed arguments.
 
     Attributes:
         result: result folder.
@@ -67,7 +67,7 @@ class _Request(NamedTuple):
 
 
 class _Filtered(NamedTuple):
-    """What was written.
+    """Counts of the filtered copy.
 
     Attributes:
         hits: beams of the recording that hit something.

@@ -116,7 +116,7 @@ _IN_SUMMARY = ("version", "converged", "best_iteration", "counts", "area", "seco
 
 
 class Request(NamedTuple):
-    """What the command line asks for, apart from options.
+    """Parsed arguments, apart from options.
 
     Attributes:
         input: recording, as it was given.

@@ -215,8 +215,8 @@ def _summarize_sensor(
     recording: Recording, numbers: range, noted: dict[str, Any]
 ) -> dict[str, Any]:
     """Summarize one sensor from the notes of its reader, else from the arrays."""
-    its = (recording.sensor >= numbers.start) & (recording.sensor < numbers.stop)
-    scans = np.flatnonzero(its)
+    of_sensor = (recording.sensor >= numbers.start) & (recording.sensor < numbers.stop)
+    scans = np.flatnonzero(of_sensor)
     out: dict[str, Any] = {"scans": len(scans)}
     out.update((key, noted[key]) for key in _SENSOR_NOTES if key in noted)
     if not _is_range_rule(out.get("ranges")):

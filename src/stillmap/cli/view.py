@@ -52,7 +52,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
 
 
 class _Request(NamedTuple):
-    """What the command line asks for."""
+    """Parsed arguments."""
 
     folder: Path
     recording: str | None
