@@ -99,7 +99,7 @@ def run(job: Job) -> tuple[RigSimulation, NDArray[np.float32], dict[str, Tilting
     rig = simulate_rig(scene, job.seed)
     chosen = options_of("stillmap", job.settings)
     result = stillmap.build(rig.horizontal.recording, chosen)
-    flat = PlanarResult.from_labels(result.seen, result.poses, result.p_static, result.objects)
+    flat = PlanarResult.from_labels(result.deskewed, result.poses, result.p_static, result.objects)
     tilting = rig.tilting.recording
     built = {
         way: build_tilting(

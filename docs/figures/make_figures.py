@@ -58,7 +58,7 @@ def filter_forward(
 
 def observe(result: stillmap.Result, centre: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Times (K,) in s and hits (K,) bool of the time bins in which beams observed a cell."""
-    recording, poses = result.seen, result.poses
+    recording, poses = result.deskewed, result.poses
     seconds = (recording.stamp_ns - recording.stamp_ns[0]) * 1e-9
     sensors = recording.T_map_sensor(poses)
     found: dict[int, bool] = {}
@@ -83,7 +83,7 @@ def observe(result: stillmap.Result, centre: np.ndarray) -> tuple[np.ndarray, np
 
 def end_points(result: stillmap.Result) -> np.ndarray:
     """End points (M, 2) of all beams in the map frame, in metres."""
-    recording = result.seen
+    recording = result.deskewed
     sensors = recording.T_map_sensor(result.poses)
     scan = np.repeat(np.arange(recording.n_scans), np.diff(recording.offset))
     turned = np.einsum("nij,nj->ni", sensors[scan, :2, :2], recording.points)
@@ -92,7 +92,7 @@ def end_points(result: stillmap.Result) -> np.ndarray:
 
 def choose_cells(result: stillmap.Result) -> tuple[np.ndarray, np.ndarray]:
     """Centres of a wall cell and of a cell in which somebody stood when it was first observed."""
-    ends, hit = end_points(result), result.seen.hit
+    ends, hit = end_points(result), result.deskewed.hit
     chosen = []
     for dynamic in (False, True):
         mask = hit & (result.p_static < 0.1 if dynamic else result.p_static > 0.99)
@@ -115,7 +115,7 @@ def _interest(times: np.ndarray, hits: np.ndarray, dynamic: bool) -> float:
 def draw_maps(result: stillmap.Result) -> None:
     """Raw map beside clean map, within the bounds of what stands still."""
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.8), layout="constrained", sharey=True)
-    static = end_points(result)[result.seen.hit & (result.p_static > 0.5)]
+    static = end_points(result)[result.deskewed.hit & (result.p_static > 0.5)]
     low, high = static.min(axis=0) - 1, static.max(axis=0) + 1
     maps = (result.raw_map, result.map)
     titles = ("every hit counted as static", "hits weighted by P(static)")

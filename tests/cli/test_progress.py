@@ -31,8 +31,8 @@ def test_long_steps_are_reported_periodically(lines):
     said, another = lines
     with show_progress(False, 6) as progress:
         assert another("preparing: ").endswith("s so far")
-        progress("mapping", 1, 20, 80)
-        assert "mapping, iteration 1 of at most 6: 20 of 80 scans, " in another("20 of 80")
+        progress("matching scans", 1, 20, 80)
+        assert "matching scans, iteration 1 of at most 6: 20 of 80 scans, " in another("20 of 80")
         assert another("20 of 80").endswith("s left")
         progress("labelling beams", 1, 0, 0)
         another("labelling beams, iteration 1 of at most 6: 0 s so far")
@@ -54,13 +54,13 @@ def test_short_iteration_is_reported_once(lines, monkeypatch):
     said, _ = lines
     with show_progress(False, 3) as progress:
         for iteration in (1, 2):
-            for what in ("mapping", "mapping again"):
+            for what in ("matching scans", "refining poses"):
                 for done in range(1, 4):
                     progress(what, iteration, done, 3)
             progress("labelling beams", iteration, 0, 0)
     assert [line.split(":")[0] for line in said] == [
-        "mapping, iteration 1 of at most 3",
-        "mapping, iteration 2 of at most 3",
+        "matching scans, iteration 1 of at most 3",
+        "matching scans, iteration 2 of at most 3",
     ]
     assert all("3 of 3 scans" in line and "left" not in line for line in said)
 
@@ -68,6 +68,6 @@ def test_short_iteration_is_reported_once(lines, monkeypatch):
 def test_quiet(lines):
     said, _ = lines
     with show_progress(True, 3) as progress:
-        progress("mapping", 1, 3, 3)
+        progress("matching scans", 1, 3, 3)
         time.sleep(0.1)
     assert said == []

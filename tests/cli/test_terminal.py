@@ -71,7 +71,7 @@ def test_dumb_terminal_gets_lines(on_a_terminal, room, tmp_path):
     _, written = on_a_terminal(*words, "-o", tmp_path / "b", TERM="dumb")
     assert "\x1b" not in written
     assert "stillmap: warning: no odometry" in written
-    assert "stillmap: mapping, iteration 1" in written
+    assert "stillmap: matching scans, iteration 1" in written
 
 
 def test_log_messages_appear_above_the_bar(on_a_terminal, room, tmp_path):

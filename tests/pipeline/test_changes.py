@@ -117,12 +117,12 @@ def test_labels_are_those_of_the_map_shown():
 def test_what_is_not_listed_stays_what_it_is_without_changes():
     result, without = built(), built(changes=False)
     _, courses = em.final_e_step(
-        result.seen, result.poses, result.map.resolution, result.options.em
+        result.deskewed, result.poses, result.map.resolution, result.options.em
     )
     cells = {tuple(cell) for one in result.changes for cell in one.cells.tolist()}
     element = courses.surfel_map.associate_beams(
-        result.seen.points, result.seen.hit, result.seen.offset,
-        result.seen.T_map_sensor(result.poses),
+        result.deskewed.points, result.deskewed.hit, result.deskewed.offset,
+        result.deskewed.T_map_sensor(result.poses),
     )  # fmt: skip
     of_cells = np.array([tuple(cell) in cells for cell in courses.cells.tolist()])
     there = (element >= 0) & of_cells[element]

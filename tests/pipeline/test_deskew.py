@@ -52,7 +52,7 @@ def test_it_can_be_left_and_the_printed_method_leaves_it(room, swept, estimator)
     at_once = stillmap.build(room.recording, chosen)
     left = stillmap.build(swept, override(chosen, AT_ONCE))
     assert outcome(left) == outcome(at_once)
-    assert left.seen is left.recording is swept
+    assert left.deskewed is left.recording is swept
     taken_out = stillmap.build(swept, chosen)
     assert (outcome(taken_out) == outcome(at_once)) == (estimator == "paper")
 
@@ -81,7 +81,7 @@ def test_map_and_labels_are_made_of_the_same_points(room, swept, estimator, give
     result = stillmap.build(swept, chosen, poses=poses)
     assert result.recording is swept
     raw = _core.OccupancyGrid2D(RESOLUTION)
-    em.add_recording(raw, result.seen, result.poses, None)
+    em.add_recording(raw, result.deskewed, result.poses, None)
     m = result.raw_map
     first_cell = np.round(np.array(m.origin[:2]) / RESOLUTION).astype(int).tolist()
     _, alpha, beta = raw.dense(first_cell, m.alpha.shape)

@@ -85,14 +85,20 @@ def test_progress_is_told(short):
     iterations = sorted({iteration for _, iteration, _, _ in told if iteration})
     assert iterations == list(range(1, len(iterations) + 1))
     for iteration in iterations:
-        mapping = [at for at in told if at[0] == "mapping" and at[1] == iteration]
+        mapping = [at for at in told if at[0] == "matching scans" and at[1] == iteration]
         assert mapping[-1][2:] == (T, T)
     first = [what for what, iteration, _, _ in told if iteration == 1]
-    steps = ["mapping", "closing loops", "mapping again", "drawing the map", "labelling beams"]
+    steps = [
+        "matching scans",
+        "closing loops",
+        "refining poses",
+        "counting beams",
+        "labelling beams",
+    ]
     assert list(dict.fromkeys(first)) == steps
     assert all(done <= total for _, _, done, total in told)
     after = [at for at in told if at[1] == 0]
-    steps = ["labelling beams", "making the map", "counting looks", "following what moves"]
+    steps = ["labelling beams", "making the map", "counting observations", "tracking objects"]
     assert after == [(step, 0, 0, 0) for step in steps] == told[-4:]
 
 

@@ -251,7 +251,7 @@ def test_given_poses_are_not_touched():
         m_step(recording, e, OPTIONS, poses, threads, lambda *at: calls.append(at))
         for threads in (1, 2)
     ]
-    assert calls == [("mapping", 60, 60)] * 2
+    assert calls == [("matching scans", 60, 60)] * 2
     grid = _core.OccupancyGrid2D(OPTIONS.resolution)
     em.add_recording(grid, recording, poses, e)
     for one in mapped:

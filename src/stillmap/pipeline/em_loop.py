@@ -40,7 +40,7 @@ def run_em(
         poses=poses,
         progress=progress,
         stages=stages,
-        after=state.latest,
+        previous=state.latest,
     )
     while not state.converged and (iteration := next(steps, None)) is not None:
         state.update(iteration)
@@ -58,7 +58,7 @@ def iterate(
     progress: Progress = no_progress,
     stages: StageTimer | None = None,
     scratch: Path | None = None,
-    after: Estimate | None = None,
+    previous: Estimate | None = None,
 ) -> Iterator[Iteration]:
     """Alternates the M-step and the E-step; the caller decides when to stop.
 
@@ -86,15 +86,17 @@ def iterate(
         recording = dataclasses.replace(recording, scratch=scratch)
     stages, options = stages or StageTimer(), resolve_options(options, recording)
     threads = resolve_threads(options.threads)
-    first = 1 if after is None else after.number + 1
+    first = 1 if previous is None else previous.number + 1
     for number in range(first, em.max_iterations(options.estimator, options.em) + 1):
         started = time.perf_counter()
-        if after is None:
+        if previous is None:
             e = em.initial_p_static(recording, options.estimator, options.em)  # e := p(c = 1)
         else:
-            e = after.p_static
+            e = previous.p_static
         with stages.measure("m_step"), limit_blas_threads():  # (9)-(15)
-            m_step = _m_step(recording, e, after, options, poses, _tell(progress, number))
+            m_step = _m_step(
+                recording, e, previous, options, poses, _with_iteration(progress, number)
+            )
             deskewed = slam.deskew_recording(recording, m_step.poses, options.slam, threads)
         progress("labelling beams", number, 0, 0)
         with stages.measure("e_step"):  # (6), and (8) or the occupancy HMM; the bound
@@ -119,7 +121,7 @@ def iterate(
             held_out_log_likelihood=held_out,
         )
         iteration = Iteration(Estimate(number, e, m_step, e_step), record, deskewed)
-        after = iteration.estimate.for_next_iteration()
+        previous = iteration.estimate.for_next_iteration()
         del m_step, e_step, deskewed  # grids are large: only the caller decides how long one lives
         yield iteration
         del iteration
@@ -150,6 +152,6 @@ def _m_step(
     )
 
 
-def _tell(progress: Progress, number: int) -> slam.StepProgress:
+def _with_iteration(progress: Progress, number: int) -> slam.StepProgress:
     """The progress of one iteration's M-step."""
     return lambda stage, done, total: progress(stage, number, done, total)

@@ -110,7 +110,7 @@ def make_maps(
             )
             planar, estimate = _project(deskewed, estimate, ground, options, threads)
         filtered, raw = _occupancy_maps(planar, estimate, options, threads)
-    progress("counting looks", 0, 0, 0)
+    progress("counting observations", 0, 0, 0)
     with stages.measure("evidence"):
         evidence = em.count_observations(
             planar,

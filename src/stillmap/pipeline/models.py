@@ -44,7 +44,7 @@ def build_models(
 
 
 def _recording_inputs(result: MappingResult, threads: int) -> MeshInputs:
-    seen = result.seen
+    seen = result.deskewed
     start = int(seen.stamp_ns[0])
     boxes = box_objects(result.objects, start)
     ground = estimate_ground(seen, result.poses, result.p_static, threads)
@@ -55,7 +55,7 @@ def _recording_inputs(result: MappingResult, threads: int) -> MeshInputs:
 
 def _rig_inputs(result: MappingResult, tilting: TiltingResult, threads: int) -> MeshInputs:
     """The flat laser gives the tracks, the tilting laser the 3D data."""
-    flat = result.seen
+    flat = result.deskewed
     ground = estimate_ground(tilting.deskewed, tilting.poses, tilting.p_static, threads)
     boxes = fit_boxes(
         flat,

@@ -108,7 +108,7 @@ class MappingResult:
         return self.estimate.m_step.graph
 
     @property
-    def seen(self) -> Recording:
+    def deskewed(self) -> Recording:
         """The recording without the motion during its scans, computed at every call.
 
         Where beams have no times it is `recording` itself.
@@ -163,7 +163,7 @@ def _finish(
     with stages.measure("changes"):
         deskewed, estimate, changes = final_estimate(recording, state.require_best(), options)
     maps = make_maps(deskewed, estimate, options, progress, stages)
-    progress("following what moves", 0, 0, 0)
+    progress("tracking objects", 0, 0, 0)
     with stages.measure("objects"):
         objects = find_objects(deskewed, estimate, maps, changes, options)
         crossings = compute_flow_map(objects)

@@ -19,7 +19,7 @@ _MILLIMETRES = 3  # digits: finer is noise, and makes the file twice as long
 
 def write_objects(folder: Path, result: MappingResult) -> None:
     """Write `objects.json` and `NNNN.ply` of each object into a new folder."""
-    write_objects_of(folder, result.objects, result.seen, result.poses, result.p_static)
+    write_objects_of(folder, result.objects, result.deskewed, result.poses, result.p_static)
 
 
 def write_objects_of(

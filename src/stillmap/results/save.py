@@ -56,7 +56,7 @@ def save(
         is_3d = result.recording.dimension == 3
         write_labels(folder / "beams", result.recording, result.p_static, colors if is_3d else None)
         if is_3d:
-            write_clouds(folder, result.seen, result.poses, result.p_static, colors)
+            write_clouds(folder, result.deskewed, result.poses, result.p_static, colors)
         if result.options.objects.enabled:
             write_objects(folder / "objects", result)
             write_traffic(folder / "traffic.npz", result.traffic)

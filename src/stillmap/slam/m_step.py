@@ -66,13 +66,13 @@ def m_step(
             recording, e, options, progress, start, earlier_poses, free_space_margin
         )
     if poses is None:
-        progress("drawing the map", 0, 0)
+        progress("counting beams", 0, 0)
     grid = em.make_grid(D, options.resolution, free_space_margin)
     if with_grid:
         deskewed = deskew_recording(recording, found.poses, options, threads)
         em.add_recording(grid, deskewed, found.poses, e, threads)
     if poses is not None:
-        progress("mapping", T, T)
+        progress("matching scans", T, T)
     return dataclasses.replace(found, grid=grid)
 
 
@@ -85,7 +85,7 @@ def _estimate_poses_3d(
 ) -> MStepResult:
     """Lidar odometry and loop closure; the grid is empty."""
     odometry = register_sweeps(
-        recording, e, options.odometry, partial(progress, "mapping"), threads
+        recording, e, options.odometry, partial(progress, "matching scans"), threads
     )
     empty = em.make_grid(3, options.resolution)
     found = MStepResult(odometry.poses, odometry.covariance, empty, odometry.explained)
@@ -106,7 +106,7 @@ def _estimate_poses_2d(
     free_space_margin: float,
 ) -> MStepResult:
     """Scan matching, loop closure and refinement; the grid is empty."""
-    mapping = partial(progress, "mapping")
+    mapping = partial(progress, "matching scans")
     if start is None or not options.loop_closure:
         found = _match_scans(recording, e, options, mapping, earlier_poses, free_space_margin)
         if not options.loop_closure:
@@ -114,7 +114,7 @@ def _estimate_poses_2d(
         deskewed = deskew_recording(recording, found.poses, options)
         closing = partial(progress, "closing loops")
         start = close_loops(deskewed, e, options, found, closing)
-        mapping = partial(progress, "mapping again")
+        mapping = partial(progress, "refining poses")
     refined = start
     for _ in range(_REFINEMENT_PASSES):
         deskewed = deskew_recording(recording, refined.poses, options)

@@ -33,7 +33,7 @@ def map_data(result: MappingResult) -> dict[str, Any] | None:
     if not result.map.p_occupied.size:
         return None
     view = MapView.of([result.raw_map, result.map])
-    ends = sample_dynamic_points(result.seen, result.poses, result.p_static)[:, :2]
+    ends = sample_dynamic_points(result.deskewed, result.poses, result.p_static)[:, :2]
     poses = result.poses
     if result.recording.dimension == 3:
         poses = se2.project_to_plane(poses)
