@@ -31,7 +31,9 @@ def order(surface):
     return np.lexsort(surface.surfels()[0].T)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))]
+)
 @pytest.mark.parametrize("changes", [{}, {"radius": 1.0, "tolerance": 0.0}, {"max_iterations": 1}])
 def test_agreement(seed, changes):
     core, plain = surfaces(seed)

@@ -93,6 +93,7 @@ def test_doors_and_what_comes_and_goes_are_no_things() -> None:
     assert _of_things([*on_leaf, *apart], simulation, T_world_map) == [*on_leaf, *apart]
 
 
+@pytest.mark.slow
 def test_a_run_is_scored_and_shown() -> None:
     case = Case("street", "moved", "street-moved", SHORT)
     scores = _scored(Run(case, 0, "stillmap", ("em.max_iterations=1",), True))

@@ -35,7 +35,9 @@ def moved() -> Prepared:
     return prepare(Case("street", "", "street-moved", {"robot": {"scans": 570}}), 3)
 
 
-@pytest.mark.parametrize(("which", "kind"), [("run", "door"), ("moved", "thing")])
+@pytest.mark.parametrize(
+    ("which", "kind"), [("run", "door"), pytest.param("moved", "thing", marks=pytest.mark.slow)]
+)
 def test_what_ended_on_doors_and_things_is_left_out_of_the_scores_without_them(
     which: str, kind: str, request: pytest.FixtureRequest
 ) -> None:

@@ -147,7 +147,13 @@ def test_formats_for_2d_only(mapped_street, tmp_path, capsys, name):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("form", point_cloud_files.FORMATS, ids=lambda form: form.name)
+@pytest.mark.parametrize(
+    "form",
+    [
+        pytest.param(form, id=form.name, marks=[pytest.mark.slow] if form.name == "xyz" else [])
+        for form in point_cloud_files.FORMATS
+    ],
+)
 def test_memory_is_bounded(form, tmp_path):
     point_cloud_files.require_extras(form, tmp_path)
     n, blocks = 1 << 14, 40

@@ -173,7 +173,10 @@ def test_other_estimators_of_the_plane_are_refused(street):
         )
 
 
-def test_the_printed_method_runs_in_space(street):
+def test_the_printed_method_runs_in_3d():
+    lidar = {"channels": 16, "columns": 300, "sweep": False}
+    scene = scene_by_name("street", {"lidar": lidar, "robot": {"scans": 10}})
+    street = simulate(scene, 3)
     result = stillmap.build(
         street.recording,
         options(estimator="paper", max_iterations=2),

@@ -99,7 +99,7 @@ class FakeResult:
     doubts: Diagnostics = field(default_factory=Diagnostics)
 
     @property
-    def seen(self) -> Recording:
+    def deskewed(self) -> Recording:
         return self.recording
 
 

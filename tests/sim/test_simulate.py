@@ -34,7 +34,14 @@ def short(name: str, **crowd: object) -> Scene:
     return scene_by_name(name, changes)
 
 
-@pytest.mark.parametrize("name", [n for n in SCENES if not n.endswith(("-crowd", "-empty"))])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.slow] if name in ("drive", "rounds") else [])
+        for name in SCENES
+        if not name.endswith(("-crowd", "-empty"))
+    ],
+)
 def test_one_seed_one_recording(name: str) -> None:
     first, again = simulate(short(name), 11), simulate(short(name), 11)
     for a, b in zip(arrays(first), arrays(again), strict=True):
