@@ -1,6 +1,5 @@
 """Messages and progress on stderr, JSON on stdout, and signals."""
 
-import json
 import os
 import signal
 import sys
@@ -216,6 +215,8 @@ class _Lines:
 
 def print_json(content: dict[str, Any]) -> None:
     """Print one JSON object to stdout; non-finite numbers become null."""
+    import json
+
     from stillmap.core.json import to_jsonable
 
     print(json.dumps(to_jsonable(content), allow_nan=False))
