@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from stillmap.cli.arguments import add_read_flags, read_changes, require_apart
 from stillmap.cli.config import add_option_flags, options_from_args
@@ -17,6 +17,7 @@ from stillmap.core.errors import InputError
 
 if TYPE_CHECKING:
     from stillmap.cli.map_build import Built
+    from stillmap.cli.map_inputs import Request
     from stillmap.pipeline.checkpoint import CheckpointFolder
     from stillmap.pipeline.options import Options
     from stillmap.results.result import Result
@@ -115,30 +116,6 @@ _DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _IN_SUMMARY = ("version", "converged", "best_iteration", "counts", "area", "seconds", "warnings")
 
 
-class Request(NamedTuple):
-    """Parsed arguments, apart from options.
-
-    Attributes:
-        input: recording, as it was given.
-        output: result folder.
-        tilting: recording of a tilting laser, or None.
-        poses: file of poses to keep, "recording" or None.
-        odometry: use the recording's odometry.
-        overwrite: replace what is in the result folder.
-        resume: continue from a checkpoint.
-        quiet: no progress, no summary.
-    """
-
-    input: str
-    output: Path
-    tilting: str | None
-    poses: str | None
-    odometry: bool
-    overwrite: bool
-    resume: bool
-    quiet: bool
-
-
 def run(args: argparse.Namespace) -> int:
     """Map a recording into a folder."""
     from stillmap.cli.map_build import build_all
@@ -181,6 +158,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _parse(args: argparse.Namespace) -> "tuple[Request, Options]":
     """The paths and switches of the call, and its options."""
+    from stillmap.cli.map_inputs import Request
+
     request = Request(
         input=args.input,
         output=Path(args.output),
@@ -213,7 +192,7 @@ def _option_changes(args: argparse.Namespace) -> dict[str, Any]:
     return changes
 
 
-def _require_usable_output(request: Request) -> None:
+def _require_usable_output(request: "Request") -> None:
     """Refuse an output that is taken, holds an input or cannot be written, before any work."""
     from stillmap.core.files import require_new
     from stillmap.results.run_json import RECORD
@@ -230,7 +209,7 @@ def _require_usable_output(request: Request) -> None:
 
 
 @contextmanager
-def _explain_failure(request: Request, checkpoints: "CheckpointFolder") -> Iterator[None]:
+def _explain_failure(request: "Request", checkpoints: "CheckpointFolder") -> Iterator[None]:
     """Report a full disk in one line, and after an interruption the checkpoint to resume from."""
     try:
         yield

@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +20,29 @@ from stillmap.pipeline.options import Options, resolve_options
 from stillmap.preprocessing.options import ReadOptions
 from stillmap.rig.build import check_rig
 
-if TYPE_CHECKING:
-    from stillmap.cli.map import Request
+
+class Request(NamedTuple):
+    """Parsed arguments, apart from options.
+
+    Attributes:
+        input: recording, as it was given.
+        output: result folder.
+        tilting: recording of a tilting laser, or None.
+        poses: file of poses to keep, "recording" or None.
+        odometry: use the recording's odometry.
+        overwrite: replace what is in the result folder.
+        resume: continue from a checkpoint.
+        quiet: no progress, no summary.
+    """
+
+    input: str
+    output: Path
+    tilting: str | None
+    poses: str | None
+    odometry: bool
+    overwrite: bool
+    resume: bool
+    quiet: bool
 
 
 class Inputs(NamedTuple):
@@ -33,7 +54,7 @@ class Inputs(NamedTuple):
 
 
 def read_inputs(
-    request: "Request", options: Options, scratch: Path, stages: StageTimer
+    request: Request, options: Options, scratch: Path, stages: StageTimer
 ) -> tuple[Inputs, Options]:
     """Read the inputs, and resolve the options for them."""
     with stages.measure("read"):
@@ -71,7 +92,7 @@ def _note_path(recording: Recording, path: str) -> Recording:
     return dataclasses.replace(recording, source=source)
 
 
-def _read_poses(request: "Request", recording: Recording) -> NDArray[np.float64] | None:
+def _read_poses(request: Request, recording: Recording) -> NDArray[np.float64] | None:
     if not request.poses:
         return None
     if request.poses != "recording":
