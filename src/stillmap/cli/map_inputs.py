@@ -128,7 +128,7 @@ def _read_tilting_laser(
     if not tilting_path and topic is None:
         return None
     if planar.dimension != 2:
-        what = "the planar laser decides what moves, but this recording is in 3D"
+        what = "the planar laser decides which objects move, but this recording is 3D"
         raise InputError(what, where=planar_path)
     if topic is not None:
         base_frame = planar.source.get("base_frame") or None

@@ -12,7 +12,7 @@ Progress = Callable[[str, int, int, int], None]
 
 
 def no_progress(stage: str, iteration: int, done: int, total: int) -> None:
-    """Reports progress to nobody."""
+    """Discards progress."""
 
 
 class StageTimer:

@@ -52,7 +52,7 @@ class HmmClasses:
             seconds, of static surface; misses of it come in runs.
         view_rho, view_angle: of view-dependent static surface, whose chains evolve with the
             viewing direction instead of time: rho, and the correlation angle in radians.
-        dynamic_rho, dynamic_tau: of what moves.
+        dynamic_rho, dynamic_tau: of movers.
         half_time_tau: of what is there for half of the time, with rho = HALF_TIME_RHO.
     """
 

@@ -153,7 +153,7 @@ def apply_pooled_evidence(
 
 @dataclass(frozen=True, eq=False)
 class GroundContact:
-    """Labels beams that end just above the ground by what moves in the same column.
+    """Labels beams that end just above the ground by the mover in the same column.
 
     Attributes:
         obstacles: the surfels above the ground.
@@ -168,7 +168,7 @@ class GroundContact:
     def label_above(
         self, data: ScanBeams, surfel: NDArray[np.int32], threads: int = 1
     ) -> NDArray[np.float32]:
-        """(M,) P(static) of what moves above the end of each beam in its sweep; NaN: nothing.
+        """(M,) P(static) of the mover above each end point in its sweep; NaN: none.
 
         Args:
             data: M beams of some scans.

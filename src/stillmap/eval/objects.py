@@ -34,7 +34,7 @@ class Sighting:
 
 @dataclass(frozen=True)
 class ObjectScores:
-    """How well objects agree with movers.
+    """Scores of tracked objects against the true movers.
 
     Attributes:
         sightings: number of sightings of movers.

@@ -66,7 +66,7 @@ class Patch(NamedTuple):
 
 
 class ScanLayout(NamedTuple):
-    """How the scans of a recording form range images.
+    """Layout of a recording's scans as range images.
 
     Attributes:
         is_planar: whether each scan is a row.

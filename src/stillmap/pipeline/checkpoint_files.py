@@ -136,7 +136,7 @@ def _hints(kind: Any) -> dict[str, Any]:
 
 
 def identify_run(recording: Recording, options: Options, poses: Float | None) -> dict[str, Any]:
-    """What is mapped, and how, JSON-able: hashes of the arrays, whatever files they came from."""
+    """Identifies a run by its version, options and hashes of the input arrays, as JSON values."""
     arrays: dict[str, NDArray[Any] | None] = {
         "stamps": recording.stamp_ns,
         "scans": recording.offset,

@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """What one EM iteration estimated: the results of its M-step and of its E-step.
+    """Estimate of one EM iteration: the results of its M-step and of its E-step.
 
     Attributes:
         number: iteration, from 1.
@@ -55,7 +55,7 @@ class Estimate:
         return dataclasses.replace(self, m_step=self.m_step.without_grid())
 
     def for_next_iteration(self) -> "Estimate":
-        """What the next iteration starts from: poses and labels, without grid and cells."""
+        """The initial state of the next iteration: poses and labels, without grid and cells."""
         labels = em.EStepResult(self.p_static, self.e_step.likelihood)
         return dataclasses.replace(self.without_grid(), e_step=labels)
 

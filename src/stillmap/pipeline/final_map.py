@@ -183,6 +183,6 @@ def find_objects(
 
 
 def _count_common(one: NDArray[np.intp], other: NDArray[np.intp]) -> int:
-    """How many numbers two rising arrays have in common."""
+    """Number of values that two sorted arrays have in common."""
     at = np.searchsorted(other, one)
     return int(np.count_nonzero(one[at < len(other)] == other[at[at < len(other)]]))

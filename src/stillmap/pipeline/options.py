@@ -20,7 +20,7 @@ MapMode = Literal["trinary", "scale", "raw"]
 
 @dataclass(frozen=True)
 class OutputOptions(Section, section="output"):
-    """How the result folder is written."""
+    """Options of the result folder."""
 
     map_mode: MapMode = option(
         "trinary",

@@ -89,7 +89,7 @@ class MappingResult:
 
     @property
     def learned(self) -> dict[str, object]:
-        """What the estimator learned from the recording, JSON-able."""
+        """Parameters that the E-step fitted to the recording, as JSON values."""
         return self.estimate.e_step.learned
 
     @property
@@ -157,7 +157,7 @@ def map_recording(
 def _finish(
     state: EmState, recording: Recording, progress: Progress, stages: StageTimer
 ) -> MappingResult:
-    """What follows from the best estimate: last labels, maps, objects, changes."""
+    """Computes final labels, maps, objects and changes from the best estimate."""
     options = state.options
     progress("labelling beams", 0, 0, 0)
     with stages.measure("changes"):

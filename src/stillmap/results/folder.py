@@ -39,7 +39,7 @@ class ResultFolder:
 
     @property
     def read_options(self) -> ReadOptions:
-        """How its recording was read.
+        """The options with which its recording was read.
 
         Raises:
             InputError: the record does not say so.

@@ -149,12 +149,12 @@ def encode_obj(
     text, beside = trimesh.exchange.obj.export_obj(
         scene, include_normals=False, return_texture=True, mtl_name=materials, header=None
     )
-    told, named = beside[materials].decode("utf-8"), {}
+    material_text, named = beside[materials].decode("utf-8"), {}
     for number, page in enumerate(pages):
         file = f"{before}{_name(number)}{page.suffix}"
-        told = told.replace(f"map_Kd {_name(number)}.png\n", f"map_Kd {file}\n")
+        material_text = material_text.replace(f"map_Kd {_name(number)}.png\n", f"map_Kd {file}\n")
         named[file] = page.data
-    return {f"{name}.obj": text.encode("utf-8"), materials: told.encode("utf-8"), **named}
+    return {f"{name}.obj": text.encode("utf-8"), materials: material_text.encode("utf-8"), **named}
 
 
 def _trimesh(path: Path) -> Any:

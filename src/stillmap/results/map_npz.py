@@ -50,7 +50,7 @@ def write_map_npz(
 
 
 def changed_cells(occupancy: OccupancyMap, changes: Sequence[Change]) -> NDArray[np.uint8]:
-    """(H, W) how each cell changed, 0: it did not. The last change of several is told."""
+    """(H, W) code of the last change of each cell; 0: unchanged."""
     height, width = occupancy.p_occupied.shape
     out = np.zeros((height, width), np.uint8)
     first = np.round(np.array(occupancy.origin[:2]) / occupancy.resolution).astype(np.int64)

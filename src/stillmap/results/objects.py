@@ -1,4 +1,4 @@
-"""`objects/`: what moved, as JSON and as points; `traffic.npz`: where, and how fast."""
+"""`objects/`: tracked objects as JSON and point clouds; `traffic.npz`: their crossings and speeds."""
 
 import json
 from collections.abc import Sequence

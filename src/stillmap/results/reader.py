@@ -152,14 +152,14 @@ class Track:
 
 @dataclass(frozen=True, eq=False)
 class Exported:
-    """What others are told of a result in the plane.
+    """A 2D result for export: recording, poses, labels, map and tracks.
 
     Attributes:
         recording: T scans with M beams.
         poses: (T, 3, 3) T_map_base.
         p_static: (M,) float32, NaN for unusable beams.
-        map: what stands still.
-        tracks: what moved.
+        map: occupancy of the static cells.
+        tracks: of the moving objects.
     """
 
     recording: Recording
@@ -189,7 +189,7 @@ def read(folder: Path, recording: Recording, p_static: NDArray[np.float32]) -> E
 
 
 def read_tracks(path: Path) -> list[Track]:
-    """What moved, from `objects.json`; nothing where there is no such file.
+    """Reads the tracks of `objects.json`; empty where the file is missing.
 
     Raises:
         InputError: the file is damaged.

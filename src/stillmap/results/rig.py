@@ -1,4 +1,4 @@
-"""What a second laser built in 3D, beside the result of the flat one that told it what moves."""
+"""`tilting/`: 3D data of a rig's tilting laser, beside the result of its planar laser."""
 
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ FOLDER = "tilting"
 def write_tilting(
     folder: Path, tilting: TiltingResult, colours: NDArray[np.uint8] | None = None
 ) -> None:
-    """Write `static.ply`, `dynamic.ply` and `tilting/`: labels, poses and what moved, in 3D; with
+    """Write `static.ply`, `dynamic.ply` and `tilting/`: labels, poses and objects in 3D; with
     the colours (M, 3) of its beams' ends."""
     seen, poses, p_static = tilting.deskewed, tilting.poses, tilting.p_static
     write_clouds(folder, seen, poses, p_static, colours)
@@ -32,7 +32,7 @@ def write_tilting(
 
 
 def tilting_record(tilting: TiltingResult) -> dict[str, Any]:
-    """What `run.json` says of it, JSON-able but for arrays."""
+    """The `tilting` entry of `run.json`."""
     counts = count_beams(tilting.deskewed, tilting.p_static)
     return {
         "input": tilting.recording.source,

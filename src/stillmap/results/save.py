@@ -75,7 +75,7 @@ def save(
 
 
 def _previews(models: Models, threads: int) -> ModelPreviews:
-    """What the report shows of models."""
+    """Previews of the meshes for the report."""
     return render_previews(
         models.textured,
         models.unfiltered,

@@ -1,1 +1,1 @@
-"""Two lasers on one robot: a planar one finds what moves, a tilting one builds in 3D."""
+"""Two lasers on one robot: a planar laser labels moving objects, a tilting laser maps in 3D."""

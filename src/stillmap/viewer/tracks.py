@@ -1,4 +1,4 @@
-"""What the viewer draws at a time: poses and boxes of moving objects, and the beams of a scan."""
+"""Poses and boxes of moving objects, and the beams of a scan, at a time."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

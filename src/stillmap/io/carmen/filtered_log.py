@@ -31,7 +31,7 @@ _FIELD = re.compile(rb"\S+")
 
 @dataclass(frozen=True)
 class FilteredLog:
-    """What a filtered copy holds.
+    """Counts of a filtered copy.
 
     Attributes:
         scans: number of scan lines copied, with readings blanked.

@@ -38,7 +38,7 @@ _ALTERNATIVE = "write a bag or a recording folder instead"
 
 @dataclass(frozen=True)
 class LaserFormat:
-    """How the scans of one laser are written.
+    """Line format of one laser's scans.
 
     Attributes:
         kind: of its lines.
@@ -53,7 +53,7 @@ class LaserFormat:
 
 @dataclass(frozen=True, eq=False)
 class LogFormat:
-    """How a recording is written.
+    """Line formats of a recording.
 
     Attributes:
         lasers: one or two.

@@ -1,4 +1,4 @@
-"""What bags of all kinds share: channels of messages as bytes, and how bags are recognized."""
+"""Types shared by all bag formats (channels, raw messages), and format detection."""
 
 from collections.abc import Iterator
 from pathlib import Path

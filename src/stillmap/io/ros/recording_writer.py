@@ -97,7 +97,7 @@ class LaserScanEncoder:
         )
 
     def describe_losses(self) -> list[str]:
-        """What the messages cannot hold, a sentence each."""
+        """Lists the parts of a recording that ROS messages cannot hold, one sentence each."""
         if not self._n_uneven:
             return []
         return [
@@ -162,7 +162,7 @@ def _describe_cloud_losses(recording: Recording) -> list[str]:
 
 @dataclass(frozen=True)
 class FilteredBag:
-    """What a filtered copy holds.
+    """Counts and omissions of a filtered copy.
 
     Attributes:
         scans: number of scan messages copied, with readings blanked.

@@ -26,7 +26,7 @@ _UNKNOWN_INDEX, _ORANGE_INDEX = 101, 102
 
 @dataclass(frozen=True)
 class MapView:
-    """What the layers of a map figure share.
+    """Window and scale shared by the layers of a map figure.
 
     Attributes:
         window: x0, y0, x1, y1 in m, in the map frame.

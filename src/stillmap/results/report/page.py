@@ -162,7 +162,7 @@ def fitted_data(result: MappingResult) -> dict[str, Any] | None:
 
 
 def _source_data(result: MappingResult) -> dict[str, Any]:
-    """What the reader found in the recording, without empty entries."""
+    """The reader's notes on the recording, without empty entries."""
     source = to_jsonable(result.recording.source)
     skipped = {name: source.pop(name, None) or {} for name in ("skipped", "skipped_odometry")}
     return {

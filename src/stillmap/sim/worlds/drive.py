@@ -82,7 +82,7 @@ def _arc(middle: Point, radius: float, start: float, end: float) -> list[Point]:
 
 
 def _sections() -> list[tuple[Point, float, Side]]:
-    """Where house fronts begin, how long they are, and where the houses stand."""
+    """Start, length and position of the house fronts."""
     west, east = _SIDE_STREET - _NARROW, _SIDE_STREET + _NARROW
     near, far = _CORNER - FRONT, _CORNER + FRONT
     sections: list[tuple[Point, float, Side]] = []

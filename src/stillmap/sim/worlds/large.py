@@ -217,7 +217,7 @@ _HUB: Point = (-_HALF, 0.0)
 
 @dataclass(frozen=True)
 class _Place:
-    """Where a wing stands: its own origin in metres, and whether y goes down."""
+    """Origin of a wing in metres, and whether its y axis points down."""
 
     x: float
     y: float
@@ -308,7 +308,7 @@ def _floor(floor: int, wings: int) -> list[Segment]:
 
 
 def _spaced(length: float, rng: np.random.Generator) -> list[float]:
-    """Where closed doors begin along a wall."""
+    """Start positions of closed doors along a wall."""
     places, at = [], float(rng.uniform(3.0, 6.0))
     while at < length - 3.0:
         places.append(at)

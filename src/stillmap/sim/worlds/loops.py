@@ -51,7 +51,7 @@ def rounds(people: int = 40) -> Scene:
 
 
 def _starts(sizes: tuple[float, ...]) -> list[float]:
-    """Where corridors begin, with courtyards of these sizes between them."""
+    """Start positions of corridors, with courtyards of these sizes between them."""
     starts = [0.0]
     for size in sizes:
         starts.append(starts[-1] + _WIDTH + size)
