@@ -25,7 +25,7 @@ class Coverage:
         observations: (H, W) uint16, time bins in which a beam crossed the cell or ended in it,
             65535 at most.
         unobstructed: (H, W) uint16, those in which no beam ended on something dynamic within
-            `mover_radius`: a cell behind or under a mover is not observed.
+            `mover_radius`: where a mover stood, the cell itself was not observed.
         thinly_observed: (H, W) bool, known cells with fewer than `min_observations` of these.
         min_observations: unobstructed observations that a cell should have.
         mover_radius: metres.

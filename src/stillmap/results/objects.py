@@ -1,4 +1,4 @@
-"""`objects/`: tracked objects as JSON and point clouds; `traffic.npz`: their crossings and speeds."""
+"""`objects/`: tracked objects as JSON and point clouds; `traffic.npz`: crossings and speeds."""
 
 import json
 from collections.abc import Sequence
