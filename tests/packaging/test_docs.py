@@ -40,6 +40,12 @@ def test_paths_exist(page):
 @pages
 def test_options_exist(page):
     known = set(iter_names(Options()))
-    for name in re.findall(rf"`({SECTIONS}\.[a-z_]+)(?:=[^`]*)?`", page.read_text()):
-        is_file = name.endswith((".glb", ".json", ".py", ".npy", ".obj"))
-        assert is_file or name in known, name
+    for code in re.findall(r"`([^`\n]+)`", page.read_text()):
+        for name in re.findall(rf"(?<![\w./]){SECTIONS}\.[a-z_0-9]+(?![\w(/])", code):
+            is_file = name.endswith((".glb", ".json", ".py", ".npy", ".npz", ".obj"))
+            assert is_file or name in known, name
+
+
+def test_options_are_found():
+    text = (ROOT / "README.md").read_text()
+    assert "em.prior" in re.findall(rf"{SECTIONS}\.[a-z_]+", text)

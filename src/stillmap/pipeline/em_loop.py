@@ -70,7 +70,7 @@ def iterate(
         stages: where time and memory per stage are noted.
         scratch: folder for per-beam arrays too large for memory, in anonymous files that the
             process's end deletes. None: the system's temporary folder.
-        after: estimate of an earlier iteration with the same arguments, to continue from.
+        previous: estimate of an earlier iteration with the same arguments, to continue from.
 
     Yields:
         at most `options.em.max_iterations` iterations.
