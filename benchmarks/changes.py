@@ -17,13 +17,13 @@ from dataclasses import asdict
 
 import numpy as np
 from cases import MOVED
+from change_scores import Beams, Stay, list_true_changes, score_change_times, score_changes
 from common import Run, Scores, options_of, rows_of
 from numpy.typing import NDArray
 from prepared import grid_of
 from tables import Column, means_and_worst
 
 import stillmap
-from stillmap.eval.changes import Beams, Stay, list_true_changes, score_change_times, score_changes
 from stillmap.eval.trajectory import align, compute_absolute_errors
 from stillmap.mapping import Change
 from stillmap.results.reader import moved

@@ -17,18 +17,18 @@ import numpy as np
 from cases import POPULATED
 from common import Run, Scores, options_of, rows_of
 from numpy.typing import NDArray
+from object_scores import (
+    compute_rank_correlation,
+    compute_true_flow_map,
+    find_sightings,
+    score_objects,
+)
 from prepared import grid_of
 from tables import Column, means_and_worst
 
 import stillmap
 from stillmap.core import se2
 from stillmap.core.profiling import StageTimer
-from stillmap.eval.objects import (
-    compute_rank_correlation,
-    compute_true_flow_map,
-    find_sightings,
-    score_objects,
-)
 from stillmap.eval.trajectory import align
 from stillmap.sim import Simulation, simulate
 from stillmap.tracking import compute_flow_map

@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from change_scores import Beams, Stay, list_true_changes, score_change_times, score_changes
 
 from stillmap.core import se2
-from stillmap.eval.changes import Beams, Stay, list_true_changes, score_change_times, score_changes
 from stillmap.results.reader import Grid
 from stillmap.sim.walls import box
 

@@ -5,12 +5,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from cases import Case
+from change_scores import list_true_changes
 from changes import COLUMNS, _of_things, _scored, beams_of, scores_of, stays_of
 from common import Run
 from tables import means_and_worst
 
 from stillmap.core.se2 import inverse, matrix
-from stillmap.eval.changes import list_true_changes
 from stillmap.sim import Simulation, scene_by_name, simulate
 
 SHORT = {"robot": {"scans": 1000}}

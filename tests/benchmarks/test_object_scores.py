@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-
-from stillmap.eval.objects import (
+from object_scores import (
     compute_rank_correlation,
     compute_true_flow_map,
     find_sightings,
     score_objects,
 )
+
 from stillmap.tracking import FlowMap, MovingObject
 from stillmap.tracking.flow_map import compute_flow_map
 
