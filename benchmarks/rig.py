@@ -12,7 +12,7 @@ every laser. --figures draws the first seed: all points, those kept, and the obj
 """
 
 import argparse
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from tables import Column, means_and_worst
 import stillmap
 from stillmap.core import config
 from stillmap.eval.labels import score_labels
-from stillmap.rig.build import PlanarResult, TiltingResult, build_tilting, label_by_occupancy
+from stillmap.rig.build import PlanarResult, TiltingResult, build_tilting
 from stillmap.sim import RigSimulation, scene_by_name, simulate_rig
 
 WORLDS: dict[str, dict[str, Any]] = {
@@ -99,7 +99,7 @@ def run(job: Job) -> tuple[RigSimulation, NDArray[np.float32], dict[str, Tilting
     rig = simulate_rig(scene, job.seed)
     chosen = options_of("stillmap", job.settings)
     result = stillmap.build(rig.horizontal.recording, chosen)
-    flat = PlanarResult.from_labels(result.deskewed, result.poses, result.p_static, result.objects)
+    flat = PlanarResult(result.deskewed, result.poses, result.p_static, result.objects)
     tilting = rig.tilting.recording
     built = {
         way: build_tilting(
@@ -107,7 +107,9 @@ def run(job: Job) -> tuple[RigSimulation, NDArray[np.float32], dict[str, Tilting
         )
         for way in WAYS[:2]
     }
-    return rig, label_by_occupancy(flat, tilting, chosen.em).p_static, built
+    unlabelled = replace(flat, p_static=np.ones_like(flat.p_static), objects=[])
+    alone = build_tilting(unlabelled, tilting, chosen.rig, chosen.objects, chosen.em)
+    return rig, alone.p_static, built
 
 
 def scores(rig: RigSimulation, p_static: NDArray[np.float32]) -> Scores:

@@ -116,8 +116,8 @@ def built(points, ms, objects):
         sensor=np.zeros(n + 1, np.int32),
         T_odom_base=None,
     )
-    seen = flat_recording(np.zeros((0, 2)), np.zeros(len(STAMPS) + 1))
-    flat = PlanarResult(seen, standing(), np.zeros(0, np.float32), objects, 0.9)
+    seen = flat_recording([[9.0, 9.0]], np.append(np.zeros(len(STAMPS)), 1))
+    flat = PlanarResult(seen, standing(), np.full(1, 0.9, np.float32), objects)
     options = RigOptions(margin=0.1), ObjectOptions(), EmOptions()
     found = build_tilting(flat, recording, *options, use_evidence=False)
     return found, found.p_static[-n:]
@@ -132,7 +132,7 @@ def test_only_beams_in_boxes_are_dynamic():
     assert (p_static[:5] < 0.5).all()
     np.testing.assert_allclose(p_static[5:], 0.9, atol=1e-5)
     (one,) = found.objects
-    assert found.boxes == 1
+    assert found.boxes_hit == 1
     assert one.beams.tolist() == list(range(found.deskewed.n_beams - 9, found.deskewed.n_beams - 4))
     assert len(one.size) == 3
     assert one.size[2] == pytest.approx(1.7, abs=0.05)

@@ -5,6 +5,7 @@ import pytest
 
 from stillmap.core import se2
 from stillmap.core.recording import Recording
+from stillmap.rig import trajectory
 from stillmap.rig.trajectory import interpolate_poses, pose_recording
 
 TWIST = np.array([0.8, 0.1, 0.6])  # m/s, m/s, rad/s
@@ -25,26 +26,27 @@ def test_exp_is_the_inverse_of_log(theta):
 
 def test_interpolation_along_an_arc():
     at = np.array([0, 70, 199, 200, 333, 500, 777, 900], np.int64) * 1_000_000
-    poses, known = interpolate_poses(STAMPS, way(STAMPS), at, max_gap=1.0)
+    poses, known = interpolate_poses(STAMPS, way(STAMPS), at)
     assert known.all()
     np.testing.assert_allclose(poses, way(at), atol=1e-12)
 
 
-def test_unknown_outside_and_over_gaps():
+def test_unknown_outside_and_over_gaps(monkeypatch):
+    monkeypatch.setattr(trajectory, "MAX_SCAN_GAP", 0.22)
     at = np.array([-1, 0, 1, 200, 300, 450, 901], np.int64) * 1_000_000
-    _, known = interpolate_poses(STAMPS, way(STAMPS), at, max_gap=0.22)
+    _, known = interpolate_poses(STAMPS, way(STAMPS), at)
     assert known.tolist() == [False, True, True, True, False, True, False]
 
 
 def test_unknown_over_a_leap():
     poses = way(STAMPS)
     poses[3:, 0, 2] += 20.0  # 50 ms later
-    _, known = interpolate_poses(STAMPS, poses, np.array([440, 470, 600]) * 1_000_000, max_gap=1.0)
+    _, known = interpolate_poses(STAMPS, poses, np.array([440, 470, 600]) * 1_000_000)
     assert known.tolist() == [True, False, True]
 
 
 def test_single_scan():
-    poses, known = interpolate_poses(STAMPS[:1], way(STAMPS[:1]), np.array([0, 1]), max_gap=1.0)
+    poses, known = interpolate_poses(STAMPS[:1], way(STAMPS[:1]), np.array([0, 1]))
     assert known.tolist() == [True, False]
     np.testing.assert_array_equal(poses[1], START)
 

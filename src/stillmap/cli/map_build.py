@@ -112,8 +112,6 @@ def _load_checkpoint(
 @limit_blas_threads()
 def _map_tilting_laser(result: Result, tilting: Recording, options: Options) -> TiltingResult:
     """Map the tilting laser in 3D, given the labels and objects of the planar one."""
-    planar = PlanarResult.from_labels(
-        result.deskewed, result.poses, result.p_static, result.objects
-    )
+    planar = PlanarResult(result.deskewed, result.poses, result.p_static, result.objects)
     threads = resolve_threads(options.threads)
     return build_tilting(planar, tilting, options.rig, options.objects, options.em, threads)

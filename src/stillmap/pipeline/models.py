@@ -7,8 +7,7 @@ from stillmap.mesh import build
 from stillmap.mesh.build import Models
 from stillmap.mesh.inputs import MeshInputs, box_objects, extrude_boxes
 from stillmap.pipeline.result import MappingResult
-from stillmap.rig.build import HOLD, TiltingResult
-from stillmap.tracking.boxes import fit_boxes
+from stillmap.rig.build import TiltingResult
 
 
 @limit_blas_threads()
@@ -55,23 +54,14 @@ def _recording_inputs(result: MappingResult, threads: int) -> MeshInputs:
 
 def _rig_inputs(result: MappingResult, tilting: TiltingResult, threads: int) -> MeshInputs:
     """The flat laser gives the tracks, the tilting laser the 3D data."""
-    flat = result.deskewed
     ground = estimate_ground(tilting.deskewed, tilting.poses, tilting.p_static, threads)
-    boxes = fit_boxes(
-        flat,
-        result.poses,
-        result.p_static,
-        result.objects,
-        result.options.objects.min_p_dynamic,
-        HOLD,
-    )
     return MeshInputs(
         tilting.recording,
         tilting.deskewed,
         tilting.poses,
         tilting.p_static,
         tilting.objects,
-        extrude_boxes(boxes, tilting.objects, ground),
-        int(flat.stamp_ns[0]),
+        extrude_boxes(tilting.boxes, tilting.objects, ground),
+        int(result.deskewed.stamp_ns[0]),
         ground,
     )

@@ -43,7 +43,7 @@ def tilting_record(tilting: TiltingResult) -> dict[str, Any]:
             "skipped": count_skipped(tilting.recording.source),
         },
         "dynamic": counts["dynamic"],
-        "boxes": tilting.boxes,
+        "boxes": tilting.boxes_hit,
         "objects": len(tilting.objects),
         "learned": tilting.learned,
     }

@@ -13,11 +13,10 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap import em
 from stillmap.core.arrays import copy, iter_blocks
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.em import EmOptions, GroundMap, estimate_ground, occupancy_hmm
+from stillmap.em import EmOptions, EStepResult, GroundMap, estimate_ground, occupancy_hmm
 from stillmap.em.types import DYNAMIC_BELOW, MIN_PROBABILITY
 from stillmap.rig.options import RigOptions
 from stillmap.rig.removal import GROUND_CLEARANCE, BoxBeams, select_box_beams
@@ -45,7 +44,8 @@ class TiltingResult:
         p_static: (M,) float32, P(c = 1); NaN: unusable.
         objects: moving objects, with height and beams of this recording.
         unposed_beams: number of beams without a known pose.
-        boxes: number of boxes that hold beams.
+        boxes: around the objects that the planar laser tracked.
+        boxes_hit: number of boxes that hold beams.
         learned: what the occupancy evidence learned, JSON-able; empty without.
     """
 
@@ -55,7 +55,8 @@ class TiltingResult:
     p_static: NDArray[np.float32]
     objects: list[MovingObject]
     unposed_beams: int
-    boxes: int
+    boxes: list[Box]
+    boxes_hit: int
     learned: dict[str, Any]
 
 
@@ -68,28 +69,18 @@ class PlanarResult:
         poses: (T, 3, 3) T_map_base.
         p_static: (M,) float32, P(c = 1).
         objects: moving objects.
-        static_share: share of its hits that is static.
     """
 
     deskewed: Recording
     poses: Float
     p_static: NDArray[np.float32]
     objects: Sequence[MovingObject]
-    static_share: float
 
-    @classmethod
-    def from_labels(
-        cls,
-        deskewed: Recording,
-        poses: Float,
-        p_static: NDArray[np.float32],
-        objects: Sequence[MovingObject],
-    ) -> "PlanarResult":
-        """The result with the share of static hits computed from the labels."""
-        hit = deskewed.hit
-        sums = [float(p_static[b][hit[b]].sum(dtype=float)) for b in iter_blocks(p_static)]
-        share = sum(sums) / max(sum(int(hit[b].sum()) for b in iter_blocks(hit)), 1)
-        return cls(deskewed, poses, p_static, objects, share)
+    def static_share(self) -> float:
+        """Share of its hits that is static."""
+        p, hit = self.p_static, self.deskewed.hit
+        sums = [float(p[b][hit[b]].sum(dtype=float)) for b in iter_blocks(p)]
+        return sum(sums) / max(sum(int(hit[b].sum()) for b in iter_blocks(hit)), 1)
 
 
 def check_rig(planar: Recording, tilting: Recording, where: str) -> None:
@@ -129,13 +120,16 @@ def build_tilting(
         use_evidence: whether the tilting laser's own occupancy evidence counts.
     """
     posed = pose_recording(recording, planar.deskewed.stamp_ns, planar.poses)
-    ground = _estimate_ground(posed)
-    static, share = _constant_labels(posed.deskewed, planar.static_share), planar.static_share
+    # from all level surfaces, as nothing is labelled yet
+    ground = estimate_ground(posed.deskewed, posed.poses, _constant_labels(posed.deskewed, 1.0))
     learned: dict[str, Any] = {}
     if use_evidence:
         evidence = _occupancy_evidence(posed, ground, em_options, threads)
         static, learned = evidence.p_static, evidence.learned
         share = cast(float, learned["p_static"])
+    else:
+        share = planar.static_share()
+        static = _constant_labels(posed.deskewed, share)
     boxes = fit_boxes(
         planar.deskewed,
         planar.poses,
@@ -154,30 +148,15 @@ def build_tilting(
         p_static,
         _extend_objects(planar.objects, boxes, in_boxes, posed, ground, p_static),
         posed.unposed_beams,
+        boxes,
         sum(len(one.beams) > 0 for one in in_boxes),
         learned,
     )
 
 
-def label_by_occupancy(
-    planar: PlanarResult, recording: Recording, em_options: EmOptions, threads: int = 1
-) -> em.EStepResult:
-    """Labels of a tilting laser's beams by its own occupancy evidence alone.
-
-    Arguments are those of `build_tilting`.
-    """
-    posed = pose_recording(recording, planar.deskewed.stamp_ns, planar.poses)
-    return _occupancy_evidence(posed, _estimate_ground(posed), em_options, threads)
-
-
-def _estimate_ground(posed: PosedRecording) -> GroundMap:
-    """The ground from all level surfaces, as nothing is labelled yet."""
-    return estimate_ground(posed.deskewed, posed.poses, _constant_labels(posed.deskewed, 1.0))
-
-
 def _occupancy_evidence(
     posed: PosedRecording, ground: GroundMap, em_options: EmOptions, threads: int
-) -> em.EStepResult:
+) -> EStepResult:
     """The E-step of the tilting laser.
 
     A voxel border is put just above the floor, so that feet share no voxel with it.

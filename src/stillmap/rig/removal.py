@@ -61,12 +61,8 @@ def select_box_beams(
         first = int(np.searchsorted(seconds, box.seconds[0] - box.hold - late))
         stop = int(np.searchsorted(seconds, box.seconds[-1] + box.hold - early, side="right"))
         beams = slice(int(recording.offset[first]), int(recording.offset[stop]))
-        if beams.start == beams.stop:
-            out.append(BoxBeams(np.zeros(0, np.intp), np.zeros(0, np.bool_)))
-            continue
-        at = np.asarray(
-            1e-9 * (beam_stamps_ns(recording, slice(first, stop)) - start_ns), np.float64
-        )
+        stamps = beam_stamps_ns(recording, slice(first, stop))
+        at = np.asarray(1e-9 * (stamps - start_ns), np.float64)
         near = np.flatnonzero(_is_near_path(box, ends[beams], margin))
         xyz = np.asarray(ends[beams][near], np.float64)
         within = box.contains(at[near], xyz[:, :2], margin)

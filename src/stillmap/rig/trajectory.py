@@ -34,16 +34,13 @@ class PosedRecording:
     unposed_beams: int
 
 
-def interpolate_poses(
-    stamp_ns: Stamps, poses: Float, at_ns: Stamps, max_gap: float = MAX_SCAN_GAP
-) -> tuple[Float, Bool]:
+def interpolate_poses(stamp_ns: Stamps, poses: Float, at_ns: Stamps) -> tuple[Float, Bool]:
     """Poses at given times, along the arc from one scan to the next.
 
     Args:
         stamp_ns: (T,) of the scans, non-decreasing, T > 0.
         poses: (T, 3, 3) T_map_base.
         at_ns: (N,) times.
-        max_gap: s between two scans over which the pose is unknown.
 
     Returns:
         (N, 3, 3) poses, outside the scans' time the first or the last one; (N,) whether they are
@@ -59,7 +56,7 @@ def interpolate_poses(
     known = (at_ns >= stamp_ns[0]) & (at_ns <= stamp_ns[-1])
     leaps = np.linalg.norm(twist[:, :2], axis=1) > MAX_SPEED * seconds
     between = (share > 0.0) & (share < 1.0)
-    known &= ~(between & ((seconds > max_gap) | leaps))
+    known &= ~(between & ((seconds > MAX_SCAN_GAP) | leaps))
     return poses[before] @ se2.exp(share[:, None] * twist), known
 
 
@@ -72,17 +69,14 @@ def pose_recording(recording: Recording, stamp_ns: Stamps, poses: Float) -> Pose
         poses: (T, 3, 3) T_map_base of these.
     """
     at_scan, known = interpolate_poses(stamp_ns, poses, recording.stamp_ns)
-    points, hit = (
-        recording.allocate_per_beam(np.float32, (3,)),
-        recording.allocate_per_beam(np.bool_),
-    )
+    points = recording.allocate_per_beam(np.float32, (3,))
+    hit = recording.allocate_per_beam(np.bool_)
     unposed, step = 0, max(1, _BLOCK * recording.n_scans // max(recording.n_beams, 1))
     for first in range(0, recording.n_scans, step):
         scans = slice(first, min(first + step, recording.n_scans))
         beams = slice(int(recording.offset[scans.start]), int(recording.offset[scans.stop]))
-        scan = np.repeat(
-            np.arange(scans.start, scans.stop), np.diff(recording.offset[scans.start :][: step + 1])
-        )
+        counts = np.diff(recording.offset[scans.start : scans.stop + 1])
+        scan = np.repeat(np.arange(scans.start, scans.stop), counts)
         moved, posed = recording.points[beams], known[scan]
         if recording.beam_time is not None:
             T, posed = interpolate_poses(stamp_ns, poses, beam_stamps_ns(recording, scans))
