@@ -62,6 +62,7 @@ def test_what_ended_on_doors_and_things_is_left_out_of_the_scores_without_them(
     assert scored[1]["ece_unsure_no_doors"] == scored[1]["ece_unsure"] == pytest.approx(0.9)
 
 
+@pytest.mark.slow
 def test_things_are_where_they_were_without_people(moved: Prepared) -> None:
     sim = moved.simulation
     thing = np.array([*sim.truth.scene["mover_kinds"], "none"])[sim.truth.mover] == "thing"

@@ -86,6 +86,7 @@ def test_the_printed_method_finds_movers_and_keeps_the_place(crowded):
     assert ours < 0.99 * raw
 
 
+@slow
 def test_it_finds_movers_where_poses_are_loose_and_keeps_walls(crowded):
     # end points scatter by most of a cell: what stands beside anything is believed to stand too
     result, e = crowded("stillmap")

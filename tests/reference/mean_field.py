@@ -44,6 +44,7 @@ def smooth_mean_field(
         for i in range(surfel_map.size)
     ]
     p, active = _probability(own), set(range(surfel_map.size))
+    hit_spans = surfel_map.hit_spans.tolist()
     for _ in range(max_iterations):
         before = p.copy()
         for i in active:
@@ -51,7 +52,7 @@ def smooth_mean_field(
             p[i] = _probability(
                 odds
                 + _neighbour_log_odds(
-                    surfel_map, i, adjacent[i], before, static_coupling, dynamic_coupling
+                    hit_spans, i, adjacent[i], before, static_coupling, dynamic_coupling
                 )
             )
         changed = np.flatnonzero(np.abs(p - before) > tolerance)
@@ -77,7 +78,7 @@ def coplanarity(surfel_map: SurfelMap, i: int, j: int, coplanar_std: float) -> f
 
 
 def _neighbour_log_odds(
-    surfel_map: SurfelMap,
+    hit_spans: list[list[int]],
     i: int,
     adjacent: list[tuple[int, float]],
     p: Float,
@@ -87,9 +88,9 @@ def _neighbour_log_odds(
     """Log odds contributed by the neighbours of a surfel."""
     static = dynamic = 0.0
     weight = 1.0
-    first, last = surfel_map.hit_spans[i].tolist()
+    first, last = hit_spans[i]
     for j, w_coplanar in adjacent:
-        others_first, others_last = surfel_map.hit_spans[j].tolist()
+        others_first, others_last = hit_spans[j]
         overlap = min(last, others_last) - max(first, others_first) + 1
         if overlap <= 0:
             continue

@@ -15,8 +15,8 @@ NOBODY = Movers(np.empty((9, 0, 2)), np.empty((9, 0)), np.empty((0, 2)), np.empt
 
 @pytest.fixture(scope="module")
 def whole() -> Simulation:
-    """The whole route, with few beams."""
-    return simulate(scene_by_name("ten-corridors", {"laser": {"beams": 8}}), 1)
+    """The whole route with nobody about, and few beams."""
+    return simulate(scene_by_name("ten-corridors-empty", {"laser": {"beams": 8}}), 1)
 
 
 def seen_from(x: float, facing: float) -> Float:
