@@ -17,10 +17,7 @@ from stillmap.mesh.texture.visibility import (
     project_pinhole,
     render_depth,
 )
-
-Float = NDArray[np.float64]
-Float32 = NDArray[np.float32]
-Image = NDArray[np.uint8]
+from stillmap.mesh.types import Bool, Float, Float32, Image
 
 _TOLERANCE = 0.1  # m by which the background may lie in front of a point
 _BUFFER_WIDTH = 320.0  # pixels of the z-buffers
@@ -49,7 +46,7 @@ class Background:
         """(h, w, 3) of a view; None: it is damaged."""
         return self._read(number)
 
-    def is_unoccluded(self, number: int, points: Float) -> NDArray[np.bool_]:
+    def is_unoccluded(self, number: int, points: Float) -> Bool:
         """(n,) whether no background lies in front of map points (n, 3) in a view."""
         at = self.views[number].to_camera(points)
         free = at[:, 2] > NEAR

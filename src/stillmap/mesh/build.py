@@ -31,10 +31,9 @@ from stillmap.mesh.texture.views import (
     read_color_image,
 )
 from stillmap.mesh.tsdf import build_surface
+from stillmap.mesh.types import Float, Tell
 
-Float = NDArray[np.float64]
 Read = Callable[[int], NDArray[Any]]
-Tell = Callable[[int, int], None]
 
 _LIBRARIES = ("skimage.measure", "pyfqmr", "xatlas", "trimesh")  # of the extra `mesh`
 _MAX_P_SPOILED = 0.5  # that an image shows static surface only: below, a mover is in front

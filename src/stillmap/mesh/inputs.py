@@ -4,21 +4,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
-from numpy.typing import NDArray
-
 from stillmap.core.recording import Recording
 from stillmap.core.timestamps import max_scan_duration_ns
 from stillmap.em import GroundMap
 from stillmap.mesh.range_image import is_row_scanner
 from stillmap.mesh.texture.occluders import TrackedBox
 from stillmap.mesh.texture.occlusion import LidarReturns
+from stillmap.mesh.types import Float, Float32
 from stillmap.rig.build import HOLD
 from stillmap.rig.removal import MAX_OBJECT_HEIGHT, MIN_VEHICLE_LENGTH
 from stillmap.tracking import MovingObject
 from stillmap.tracking.boxes import Box, fit_box
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +35,7 @@ class MeshInputs:
     recording: Recording
     deskewed: Recording
     poses: Float
-    p_static: NDArray[np.float32]
+    p_static: Float32
     objects: Sequence[MovingObject]
     boxes: Sequence[TrackedBox]
     start_ns: int

@@ -11,12 +11,13 @@ from scipy.sparse.csgraph import connected_components
 import stillmap._core as _core
 from stillmap.core.errors import import_extra
 from stillmap.mesh.triangle_mesh import Mesh, concatenate_meshes
+from stillmap.mesh.types import Int64
 
 TILE = 64  # voxels along a tile, whole blocks
 _MAX_STEP = 2.5  # voxels between distances within a cube: more, and two surfaces meet there
 
 
-def occupied_tiles(volume: _core.TsdfVolume) -> NDArray[np.int64]:
+def occupied_tiles(volume: _core.TsdfVolume) -> Int64:
     """(N, 3) tiles with observed voxels, sorted."""
     return np.unique(volume.blocks() // blocks_per_tile(volume), axis=0)
 
@@ -26,7 +27,7 @@ def blocks_per_tile(volume: _core.TsdfVolume) -> int:
     return TILE // volume.block_edge
 
 
-def extract_tile(volume: _core.TsdfVolume, tile: NDArray[np.int64], min_weight: float) -> Mesh:
+def extract_tile(volume: _core.TsdfVolume, tile: Int64, min_weight: float) -> Mesh:
     """The surface within one tile, in metres; see `march_tile`."""
     mesh = march_tile(volume, tile, min_weight)
     if not len(mesh):
@@ -36,7 +37,7 @@ def extract_tile(volume: _core.TsdfVolume, tile: NDArray[np.int64], min_weight: 
     return Mesh((mesh.vertices + 0.5) * volume.voxel, mesh.faces)
 
 
-def march_tile(volume: _core.TsdfVolume, tile: NDArray[np.int64], min_weight: float) -> Mesh:
+def march_tile(volume: _core.TsdfVolume, tile: Int64, min_weight: float) -> Mesh:
     """The surface within one tile, in voxels; border vertices equal those of adjacent tiles.
 
     Cubes with an unobserved corner are skipped, and cubes in which distances step: there the back

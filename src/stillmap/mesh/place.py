@@ -1,11 +1,10 @@
 """View assignment: the image that textures each face of the static surface (Sect. 4.4)."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from stillmap.core.camera import project
@@ -31,10 +30,7 @@ from stillmap.mesh.texture.view_selection import (
 from stillmap.mesh.texture.views import View, read_color_image
 from stillmap.mesh.texture.visibility import find_visible_faces
 from stillmap.mesh.triangle_mesh import Mesh
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int32]
-Tell = Callable[[int, int], None]
+from stillmap.mesh.types import Bool, Float, Float32, Index, Int32, Tell
 
 CANDIDATES = 6  # views compared for each face
 SEAM_COST = 1.0  # e-folds of resolution where two images meet
@@ -58,11 +54,11 @@ class ViewAssignment:
     """
 
     mesh: Mesh
-    view: Index
-    p_static: NDArray[np.float32]
-    visible: NDArray[np.bool_]
-    sharpest: Index
-    p_sharpest: NDArray[np.float32]
+    view: Int32
+    p_static: Float32
+    visible: Bool
+    sharpest: Int32
+    p_sharpest: Float32
 
 
 def assign_views(
@@ -92,7 +88,7 @@ def assign_views(
     candidates = Candidates.empty(len(mesh), min(CANDIDATES, max(len(views), 1)))
     sharpest = Candidates.empty(len(mesh), 1)
 
-    def evaluate(view: View) -> tuple[NDArray[np.intp], Float, Float]:
+    def evaluate(view: View) -> tuple[Index, Float, Float]:
         found = find_visible_faces(mesh, view)
         faces = np.flatnonzero(found.visible)
         p = np.zeros(0)
@@ -148,7 +144,7 @@ def resolve_assignment(mesh: Mesh, candidates: Candidates, sharpest: Candidates)
 
 def p_unoccluded(
     mesh: Mesh,
-    faces: NDArray[np.intp],
+    faces: Index,
     view: View,
     returns: LidarReturns,
     boxes: Sequence[TrackedBox],

@@ -1,12 +1,11 @@
 """Point coloring: static end points take the color of the textured surface, dynamic ones that of
 images near their time, into which they are moved along their track."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core import arrays
 from stillmap.core.camera import project
@@ -31,12 +30,7 @@ from stillmap.mesh.texture.sampling import TextureSampler, avoid_gray, sample_bi
 from stillmap.mesh.texture.view_selection import MIN_P_VISIBLE
 from stillmap.mesh.texture.views import View
 from stillmap.mesh.texture.visibility import IMAGE_MARGIN, NEAR
-
-Bool = NDArray[np.bool_]
-Colors = NDArray[np.uint8]
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
-Tell = Callable[[int, int], None]
+from stillmap.mesh.types import Bool, Float, Float32, Image, Index, Tell
 
 _MAX_SURFACE_DISTANCE = 0.1  # m of a static point from the surface
 _OUTLINE_INSET = 0.02  # m inside an object's outline, where an image may show the background
@@ -54,7 +48,7 @@ class PointColors:
             `static_coloured`, `dynamic_coloured`.
     """
 
-    colors: Colors
+    colors: Image
     counts: dict[str, int]
 
 
@@ -79,7 +73,7 @@ def color_points(
         tell: called with the scans and images done and the total.
     """
     recording = inputs.recording
-    out: Colors = recording.allocate_per_beam(np.uint8, (3,))
+    out: Image = recording.allocate_per_beam(np.uint8, (3,))
     scans, n = recording.n_scans, recording.n_scans + len(background.views)
     sampler = TextureSampler(textured, _MAX_SURFACE_DISTANCE)
     T_map_sensor = inputs.deskewed.T_map_sensor(inputs.poses)
@@ -100,7 +94,7 @@ def color_points(
     return PointColors(out, _count_colored(out, inputs))
 
 
-def _count_colored(colors: Colors, inputs: MeshInputs) -> dict[str, int]:
+def _count_colored(colors: Image, inputs: MeshInputs) -> dict[str, int]:
     hit, p_static = inputs.deskewed.hit, inputs.p_static
     out = dict.fromkeys(("static", "static_coloured", "dynamic", "dynamic_coloured"), 0)
     for block in arrays.iter_blocks(hit, p_static, colors):
@@ -112,7 +106,7 @@ def _count_colored(colors: Colors, inputs: MeshInputs) -> dict[str, int]:
 
 
 def _color_static(
-    out: Colors,
+    out: Image,
     chunk: Chunk,
     inputs: MeshInputs,
     T_map_sensor: Float,
@@ -126,7 +120,7 @@ def _color_static(
     scan = np.searchsorted(chunk.offset, numbers, side="right") - 1 + chunk.scans.start
     parts = [slice(k, k + _POINTS_PER_BLOCK) for k in range(0, len(numbers), _POINTS_PER_BLOCK)]
 
-    def sample(part: slice) -> tuple[slice, Colors, Bool]:
+    def sample(part: slice) -> tuple[slice, Image, Bool]:
         T = T_map_sensor[scan[part]]
         local = inputs.deskewed.points[beams.start + numbers[part]].astype(np.float64)
         ends = np.einsum("nij,nj->ni", T[:, :3, :3], local) + T[:, :3, 3]
@@ -176,8 +170,8 @@ class TrackedReturns:
 
 
 def color_moving(
-    out: Colors,
-    delay: NDArray[np.float32],
+    out: Image,
+    delay: Float32,
     tracked: TrackedReturns,
     number: int,
     background: Background,

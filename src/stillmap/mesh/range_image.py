@@ -24,12 +24,8 @@ from stillmap.mesh.triangulation import (
     triangulate_grid,
     triangulate_strips,
 )
+from stillmap.mesh.types import Bool, Float, Index, Int32
 from stillmap.rig.trajectory import MAX_SCAN_GAP
-
-Bool = NDArray[np.bool_]
-Faces = NDArray[np.int32]
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 _MAX_SPACING_RATIO = 3.0  # of an unordered triangle's longest edge to the median: else a hole
 _SAMPLES = 2000  # beams by which row lengths are tested
@@ -59,7 +55,7 @@ class Patch(NamedTuple):
     """
 
     points: Float
-    faces: Faces
+    faces: Int32
     beam: Index
     origin: Float
     standoff: Float
@@ -235,7 +231,7 @@ def _make_patch(
     return Patch(points[used], number[kept.faces], beam[used], origin[used], kept.standoff[used])
 
 
-def _triangulate_rows(points: Float, use: Bool, number: Faces, directions: Float) -> Faces:
+def _triangulate_rows(points: Float, use: Bool, number: Int32, directions: Float) -> Int32:
     """Triangles between successive planar scans, (R, W) numbers of their points."""
     angle = np.array([median_angle(directions[a], directions[b]) for a, b in pairwise(number)])
     usual = float(np.nanmedian(angle)) if np.isfinite(angle).any() else 0.0
@@ -256,7 +252,7 @@ def _triangulate_rows(points: Float, use: Bool, number: Faces, directions: Float
 
 def _triangulate_image(
     points: Float, use: Bool, directions: Float, row_length: int, stride: int
-) -> Faces:
+) -> Int32:
     """Triangles of one scan; a row length of 0 means that it is no grid."""
     if not row_length:
         return _triangulate_unordered(use, directions)
@@ -272,7 +268,7 @@ def _triangulate_image(
     return triangulate_grid(points, use, number[::stride, ::stride])
 
 
-def _triangulate_unordered(use: Bool, directions: Float) -> Faces:
+def _triangulate_unordered(use: Bool, directions: Float) -> Int32:
     """Triangles between valid beams in strips or in no order; without those that span holes."""
     beams = np.flatnonzero(use)
     if len(beams) < 3:
@@ -287,7 +283,7 @@ def _triangulate_unordered(use: Bool, directions: Float) -> Faces:
     return np.asarray(beams[faces], np.int32)
 
 
-def triangulate_directions(directions: Float) -> Faces:
+def triangulate_directions(directions: Float) -> Int32:
     """(m, 3) the Delaunay triangulation of unit vectors (n, 3)."""
     middle = directions.mean(axis=0)
     middle /= max(float(np.linalg.norm(middle)), 1e-12)

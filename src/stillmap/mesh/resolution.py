@@ -3,14 +3,12 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from stillmap.core.recording import Recording
 from stillmap.mesh.range_image import Patch, ScanLayout, triangulate_scans
 from stillmap.mesh.triangulation import range_std
-
-Float = NDArray[np.float64]
+from stillmap.mesh.types import Bool, Float, Int64
 
 _TILE_RADIUS = 2.9  # tile edges from a tile's center to the farthest corner around, and some slack
 _SAMPLED_PATCHES = 8
@@ -36,7 +34,7 @@ class PatchExtents(NamedTuple):
     position: Float
     range: Float
 
-    def is_complete(self, tiles: NDArray[np.int64], edge: float, done: int) -> NDArray[np.bool_]:
+    def is_complete(self, tiles: Int64, edge: float, done: int) -> Bool:
         """(N,) whether patches from number `done` on reach neither a tile nor its neighbors.
 
         Args:

@@ -4,13 +4,10 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core.errors import import_extra
 from stillmap.mesh.triangle_mesh import Mesh
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int32]
+from stillmap.mesh.types import Bool, Float, Index, Int32
 
 _MIN_ERROR, _ERROR_SHARE = 0.01, 0.25  # m, and of a voxel's edge: how far a surface may move
 
@@ -79,9 +76,7 @@ def simplify_to_budget(mesh: Mesh, error: float, most: int, *, whole_border: boo
     return mesh
 
 
-def subdivide(
-    mesh: Mesh, max_edge: float | Callable[[Float], Float]
-) -> tuple[Mesh, NDArray[np.intp]]:
+def subdivide(mesh: Mesh, max_edge: float | Callable[[Float], Float]) -> tuple[Mesh, Index]:
     """Subdivides faces until no edge is too long; adjacent faces stay adjacent.
 
     Long edges are halved; triangles with one, two or three of them become two, three or four.
@@ -113,13 +108,13 @@ def _edge_limits(max_edge: float | Callable[[Float], Float], points: Float) -> F
     return max_edge(points) if callable(max_edge) else np.full(len(points), float(max_edge))
 
 
-def _is_long(vertices: Float, limit: Float, a: Index, b: Index) -> NDArray[np.bool_]:
+def _is_long(vertices: Float, limit: Float, a: Int32, b: Int32) -> Bool:
     """(F,) whether edges from a to b are too long."""
     x, y, z = (vertices[a] - vertices[b]).T
     return np.asarray(x * x + y * y + z * z > np.minimum(limit[a], limit[b]) ** 2)
 
 
-def _add_midpoints(ends: Index, long: NDArray[np.bool_], vertices: Float) -> tuple[Index, Float]:
+def _add_midpoints(ends: Int32, long: Bool, vertices: Float) -> tuple[Int32, Float]:
     """(F, 3) midpoint vertices of long edges, -1 for others; all vertices, with these."""
     one, other = ends[long].astype(np.int64).T
     key = np.minimum(one, other) * len(vertices) + np.maximum(one, other)
@@ -130,9 +125,7 @@ def _add_midpoints(ends: Index, long: NDArray[np.bool_], vertices: Float) -> tup
     return middle, np.concatenate([vertices, 0.5 * (vertices[a] + vertices[b])])
 
 
-def _split_faces(
-    faces: Index, middle: Index, of: NDArray[np.intp]
-) -> tuple[Index, NDArray[np.intp]]:
+def _split_faces(faces: Int32, middle: Int32, of: Index) -> tuple[Int32, Index]:
     """Splits faces by the midpoints of their edges."""
     count = (middle >= 0).sum(axis=1)
     parts, origin = [faces[count == 0]], [of[count == 0]]

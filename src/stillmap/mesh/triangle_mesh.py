@@ -3,10 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
-Index = NDArray[np.int32]
+from stillmap.mesh.types import Bool, Float, Index, Int32
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,7 +17,7 @@ class Mesh:
     """
 
     vertices: Float
-    faces: Index
+    faces: Int32
 
     def __post_init__(self) -> None:
         V = len(self.vertices)
@@ -66,7 +64,7 @@ class Mesh:
             [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]
         )
 
-    def adjacent_faces(self) -> Index:
+    def adjacent_faces(self) -> Int32:
         """(N, 2) pairs of faces that share an edge, the lower number first, unique and sorted.
 
         Of an edge with more than two faces, each is paired with the next.
@@ -82,11 +80,11 @@ class Mesh:
         both = np.unique((low * F + high)[low < high])
         return np.column_stack([both // F, both % F]).astype(np.int32)
 
-    def select(self, kept: NDArray[np.bool_]) -> "Mesh":
+    def select(self, kept: Bool) -> "Mesh":
         """The faces marked in `kept` (F,) with their vertices, in order."""
         return self.subset(np.flatnonzero(kept))
 
-    def subset(self, numbers: NDArray[np.intp]) -> "Mesh":
+    def subset(self, numbers: Index) -> "Mesh":
         """The faces with numbers (n,) with their vertices, in order."""
         faces = self.faces[numbers]
         used = np.zeros(len(self.vertices), np.bool_)

@@ -4,7 +4,6 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.mesh.triangle_mesh import (
     cross_columns,
@@ -12,11 +11,7 @@ from stillmap.mesh.triangle_mesh import (
     normalize_columns,
     row_lengths,
 )
-
-Bool = NDArray[np.bool_]
-Faces = NDArray[np.int32]
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
+from stillmap.mesh.types import Bool, Float, Index, Int32
 
 _MAX_EDGE = 1.5  # m: longer edges span holes
 _MAX_EDGE_SHARE = 0.15  # of the range, likewise
@@ -44,7 +39,7 @@ class SurfaceFaces(NamedTuple):
         standoff: (n,) metres from the sensor to the tangent plane at each point; 0: no triangle.
     """
 
-    faces: Faces
+    faces: Int32
     standoff: Float
 
 
@@ -62,7 +57,7 @@ class Rows(NamedTuple):
     closed: bool
 
 
-def triangulate_grid(points: Float, use: Bool, number: Faces) -> Faces:
+def triangulate_grid(points: Float, use: Bool, number: Int32) -> Int32:
     """(m, 3) two triangles per cell of a range image, one where a corner is missing.
 
     Cells are split along the shorter diagonal.
@@ -96,11 +91,11 @@ def _columns(points: Float) -> Float:
     return np.ascontiguousarray(points.T)
 
 
-def _squared_distances(columns: Float, a: Faces, b: Faces) -> Float:
+def _squared_distances(columns: Float, a: Int32, b: Int32) -> Float:
     return np.asarray(sum((x[a] - x[b]) ** 2 for x in columns))
 
 
-def filter_faces(points: Float, origin: Float, faces: Faces) -> SurfaceFaces:
+def filter_faces(points: Float, origin: Float, faces: Int32) -> SurfaceFaces:
     """The triangles that do not span holes or depth discontinuities.
 
     A triangle at grazing incidence is either part of such a surface, as distant floor, and then
@@ -148,7 +143,7 @@ def _median_of_three(a: Float, b: Float, c: Float) -> Float:
     return np.asarray(np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c)))
 
 
-def has_equal_ranges(range: Float, faces: Faces) -> Bool:
+def has_equal_ranges(range: Float, faces: Int32) -> Bool:
     """(m,) whether the corners of triangles are equally distant up to noise.
 
     Args:
@@ -160,7 +155,7 @@ def has_equal_ranges(range: Float, faces: Faces) -> Bool:
     return np.asarray(between <= _MAX_NOISE_RATIO * range_std(range, faces))
 
 
-def range_std(range: Float, faces: Faces) -> float:
+def range_std(range: Float, faces: Int32) -> float:
     """Standard deviation of the noise of ranges (n,) in metres; 0 where it is unknown.
 
     From the median distance of each range from the mean of its neighbors.
@@ -176,7 +171,7 @@ def range_std(range: Float, faces: Faces) -> float:
     return float(np.median(np.abs(around - range[inside]))) / _MEDIAN_DEVIATION
 
 
-def vertex_normals(normals: Float, faces: Faces, n: int, rounds: int) -> Float:
+def vertex_normals(normals: Float, faces: Int32, n: int, rounds: int) -> Float:
     """(3, n) unit normals of n points: the means of those of the triangles around.
 
     Args:
@@ -229,7 +224,7 @@ def split_rows(directions: Float) -> Rows | None:
     return None
 
 
-def triangulate_strips(rows: Rows) -> Faces:
+def triangulate_strips(rows: Rows) -> Int32:
     """(m, 3) triangle strips between successive rows, which may differ in length.
 
     After the last row comes the first one, which may be far away.

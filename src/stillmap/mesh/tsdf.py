@@ -11,7 +11,6 @@ from itertools import chain, product
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core.parallel import map_ordered
@@ -23,10 +22,8 @@ from stillmap.mesh.range_image import Patch, find_scan_layout, triangulate_scans
 from stillmap.mesh.resolution import PatchExtents, choose_resolution, patch_extents
 from stillmap.mesh.simplification import simplification_error, simplify, simplify_to_budget
 from stillmap.mesh.triangle_mesh import Mesh
+from stillmap.mesh.types import Float, Float32, Index, Int32, Int64, Tell
 
-Float = NDArray[np.float64]
-Float32 = NDArray[np.float32]
-Tell = Callable[[int, int], None]
 Tile = tuple[int, int, int]
 
 _MIN_P_STATIC = 0.5  # product over a triangle's beams below which it is left out
@@ -96,7 +93,7 @@ class StreamingSurface:
         whole = remove_small_components(self._mesh, o.min_component_area)
         return simplify_to_budget(simplify(whole, self._error), self._error, o.max_faces)
 
-    def _extract(self, tiles: NDArray[np.int64], tell: Tell | None = None) -> None:
+    def _extract(self, tiles: Int64, tell: Tell | None = None) -> None:
         for done, tile in enumerate(tiles, start=1):
             key = _key(tile)
             if key not in self._extracted:
@@ -132,7 +129,7 @@ class StreamingSurface:
         self._mesh = whole
 
 
-def _key(tile: NDArray[np.int64]) -> Tile:
+def _key(tile: Int64) -> Tile:
     x, y, z = tile.tolist()
     return x, y, z
 
@@ -236,7 +233,7 @@ def median_range(recording: Recording) -> float:
     return float(np.median(ranges)) if len(ranges) else 0.0
 
 
-def select_scans(T_map_sensor: Float, sensor: NDArray[np.int32], range: float) -> NDArray[np.intp]:
+def select_scans(T_map_sensor: Float, sensor: Int32, range: float) -> Index:
     """The first `_SCANS_PER_PLACE` scans from each viewpoint.
 
     Args:

@@ -3,11 +3,9 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.mesh.texture.occluders import TrackedBox
-
-Float = NDArray[np.float64]
+from stillmap.mesh.types import Float
 
 
 class ObjectFrame(NamedTuple):

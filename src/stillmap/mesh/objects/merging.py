@@ -9,7 +9,6 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
@@ -24,11 +23,8 @@ from stillmap.mesh.objects.segmentation import (
     segment_object,
 )
 from stillmap.mesh.texture.occluders import TrackedBox
+from stillmap.mesh.types import Bool, Float, Index
 from stillmap.tracking import MovingObject
-
-Bool = NDArray[np.bool_]
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 MAJORITY = 0.5
 _SCANS_PER_BLOCK = 1000  # after which pairs are counted

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from stillmap.mesh.inputs import MeshInputs
@@ -38,9 +37,7 @@ from stillmap.mesh.simplification import subdivide
 from stillmap.mesh.texture.occluders import TrackedBox
 from stillmap.mesh.triangle_mesh import Mesh
 from stillmap.mesh.tsdf import TsdfParameters, integrate_patches
-
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
+from stillmap.mesh.types import Float, Index
 
 IMAGE_WINDOW = 0.5  # s between an observation and an image of an object that is not rigid
 MERGE_WINDOW = 0.5  # s before and after the best partial scan, of those registered to it

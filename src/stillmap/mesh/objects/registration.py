@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from stillmap.mesh.inputs import MeshInputs
@@ -27,9 +26,7 @@ from stillmap.mesh.objects.segmentation import (
 from stillmap.mesh.objects.sweep_surface import ObjectBeams, triangulate_beams
 from stillmap.mesh.range_image import Patch
 from stillmap.mesh.triangle_mesh import Mesh
-
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
+from stillmap.mesh.types import Float, Index
 
 MIN_COMPONENT_AREA = 0.005  # m2: smaller components of an object's surface are dropped
 _MAX_SPACING_RATIO = 2.5  # edge over median edge of an object's surface

@@ -3,7 +3,6 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -15,11 +14,8 @@ from stillmap.mesh.objects.frame import ObjectFrame
 from stillmap.mesh.objects.sweep_surface import ObjectBeams
 from stillmap.mesh.range_image import beam_directions, has_planar_scans
 from stillmap.mesh.texture.occluders import TrackedBox
+from stillmap.mesh.types import Bool, Float, Float32, Index, Int32
 from stillmap.tracking import MovingObject
-
-Bool = NDArray[np.bool_]
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 NO_OWNER = -1
 BOX_MARGIN = 0.15  # m around an object's box within which returns are its own
@@ -52,7 +48,7 @@ class DynamicReturns(NamedTuple):
     beam: Index
     seconds: Float
     ends: Float
-    owner: NDArray[np.int32]
+    owner: Int32
     is_dynamic: Bool
     is_planar: bool
 
@@ -75,7 +71,7 @@ class DynamicReturns(NamedTuple):
         return slice(int(a), int(b))
 
 
-def _dynamic_beams(hit: Bool, p_static: NDArray[np.float32]) -> Index:
+def _dynamic_beams(hit: Bool, p_static: Float32) -> Index:
     """Beams that hit something rather dynamic than static, found block by block."""
     found = [np.zeros(0, np.intp)]
     for block in arrays.iter_blocks(hit, p_static):

@@ -12,11 +12,7 @@ from scipy.spatial import Delaunay, QhullError
 
 from stillmap.mesh.objects.frame import ObjectFrame
 from stillmap.mesh.triangle_mesh import Mesh
-
-Bool = NDArray[np.bool_]
-Faces = NDArray[np.int32]
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
+from stillmap.mesh.types import Bool, Float, Index, Int32
 
 _MIN_COSINE = 0.2  # from an object's center, up to which points are in one perspective image
 _PASS_MARGIN = 0.25  # m behind a triangle from which on a beam has passed it
@@ -157,14 +153,14 @@ def _is_passed(
     return out
 
 
-def _orient(points: Float, faces: NDArray[np.integer], sensor: Float) -> Faces:
+def _orient(points: Float, faces: NDArray[np.integer], sensor: Float) -> Int32:
     """(m, 3) the faces, counter-clockwise as seen from the sensor."""
     a, b, c = (points[faces[:, k]] for k in (0, 1, 2))
     away = np.einsum("ni,ni->n", np.cross(b - a, c - a), sensor - a) < 0.0
     return np.where(away[:, None], faces[:, ::-1], faces).astype(np.int32)
 
 
-def _smooth_ranges(points: Float, faces: Faces, sensor: Float) -> Float:
+def _smooth_ranges(points: Float, faces: Int32, sensor: Float) -> Float:
     """(n, 3) points, their ranges averaged with those of neighbors, but not across steps."""
     off = points - sensor
     length = np.linalg.norm(off, axis=1)

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from stillmap.core.camera import is_in_image, project
@@ -17,8 +16,7 @@ from stillmap.mesh.texture.view_selection import NONE, Candidates, view_utility
 from stillmap.mesh.texture.views import View
 from stillmap.mesh.texture.visibility import DEPTH_SCALE, find_visible_faces, render_depth
 from stillmap.mesh.triangle_mesh import Mesh
-
-Float = NDArray[np.float64]
+from stillmap.mesh.types import Bool, Float, Index
 
 OUTLINE_DRIFT = 0.05  # of an object's motion since its observation: error of its outline
 _OUTLINE_INSET = 0.01  # m inside an object's outline, where an image may show the background
@@ -109,9 +107,7 @@ def assign_object_views(
     return TexturedViews(assignment, own)
 
 
-def _shows_object(
-    points: Float, depth: Float, number: int, background: Background
-) -> NDArray[np.bool_]:
+def _shows_object(points: Float, depth: Float, number: int, background: Background) -> Bool:
     """(n,) whether a view shows an object, and not the background, at map points (n, 3).
 
     They lie `depth` (n,) metres farther inside its outline than they need to.
@@ -131,7 +127,7 @@ def _travel(shape: ObjectShape, seconds: float) -> float:
     return float(np.linalg.norm(at[1] - at[0]))
 
 
-def _depth_inside_outline(mesh: Mesh, faces: NDArray[np.intp], view: View) -> Float:
+def _depth_inside_outline(mesh: Mesh, faces: Index, view: View) -> Float:
     """(n,) metres by which faces (n,) lie inside the outline of a mesh in a view."""
     if not len(faces):
         return np.zeros(0)

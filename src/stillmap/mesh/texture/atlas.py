@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -18,11 +17,7 @@ from stillmap.core.camera import project
 from stillmap.core.errors import import_extra
 from stillmap.mesh.texture.views import View
 from stillmap.mesh.triangle_mesh import Mesh
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int32]
-Number = NDArray[np.int64]
-Image = NDArray[np.uint8]
+from stillmap.mesh.types import Bool, Float, Image, Index, Int32, Int64
 
 GRAY = (128, 128, 128)  # of faces that no image textures
 GUTTER = 4  # texels around each chart that continue its colors
@@ -46,13 +41,13 @@ class AtlasLayout(NamedTuple):
         sizes: (P, 2) int64, width and height of the pages.
     """
 
-    vertex: Index
-    faces: Index
+    vertex: Int32
+    faces: Int32
     uv: Float
-    page: Index
-    view: Index
+    page: Int32
+    view: Int32
     scale: Float
-    sizes: Number
+    sizes: Int64
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,18 +69,18 @@ class TexturedMesh:
     """
 
     vertices: Float
-    faces: Index
+    faces: Int32
     uv: Float
-    page: Index
+    page: Int32
     pages: tuple[Image, ...]
-    view: Index
-    vertex: Index
+    view: Int32
+    vertex: Int32
     unread: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.faces)
 
-    def face_of_texel(self, page: int) -> Index:
+    def face_of_texel(self, page: int) -> Int32:
         """(h, w) int32, the face of each texel of a page; -1: gutter or unused."""
         h, w = self.pages[page].shape[:2]
         out = np.full(h * w, -1, np.int32)
@@ -96,7 +91,7 @@ class TexturedMesh:
         return out.reshape(h, w)
 
 
-def replace_faces(whole: TexturedMesh, of: NDArray[np.bool_], part: TexturedMesh) -> TexturedMesh:
+def replace_faces(whole: TexturedMesh, of: Bool, part: TexturedMesh) -> TexturedMesh:
     """A mesh with the faces marked in `of` (F,) textured as in `part`, which has them in order."""
     if of.shape != (len(whole),) or np.count_nonzero(of) != len(part):
         raise ValueError(f"of: expected ({len(whole)},) with {len(part)} faces")
@@ -117,7 +112,7 @@ def replace_faces(whole: TexturedMesh, of: NDArray[np.bool_], part: TexturedMesh
 
 
 def build_layout(
-    mesh: Mesh, view_of_face: Index, views: list[View], texture_size: int = 4096
+    mesh: Mesh, view_of_face: Int32, views: list[View], texture_size: int = 4096
 ) -> AtlasLayout:
     """Packs the charts of all textured faces onto as many pages as they need.
 
@@ -148,7 +143,7 @@ def build_layout(
     )
 
 
-def find_charts(mesh: Mesh, view: Index) -> Number:
+def find_charts(mesh: Mesh, view: Int32) -> Int64:
     """(F,) int64 number of each face's chart: adjacent faces with one view; -1 without one."""
     F = len(mesh)
     pairs = mesh.adjacent_faces()
@@ -162,7 +157,7 @@ def find_charts(mesh: Mesh, view: Index) -> Number:
     return out
 
 
-def _project_faces(mesh: Mesh, view_of_face: Index, views: list[View]) -> tuple[Index, Float]:
+def _project_faces(mesh: Mesh, view_of_face: Int32, views: list[View]) -> tuple[Int32, Float]:
     """(F,) the view of each face, -1 also where its image does not show it; and the corners of the
     face in the image, (F, 3, 2)."""
     view = np.array(view_of_face, np.int32)
@@ -185,7 +180,7 @@ def _areas(corners: Float) -> Float:
     return 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 
-def _initial_scales(area: Float, corners: Float, chart: Number, n_charts: int, room: int) -> Float:
+def _initial_scales(area: Float, corners: Float, chart: Int64, n_charts: int, room: int) -> Float:
     """(C,) texels per pixel of each chart: 1, less where pixels are finer than `_MIN_TEXEL`, where
     a chart exceeds a page, and where all of them exceed the pages."""
     pixels = np.bincount(chart, _areas(corners), n_charts)
@@ -201,8 +196,8 @@ def _initial_scales(area: Float, corners: Float, chart: Number, n_charts: int, r
 
 
 def _pack(
-    uv: Float, corner: Number, of_chart: Number, scale: Float, room: int
-) -> tuple[Float, Number, Float]:
+    uv: Float, corner: Int64, of_chart: Int64, scale: Float, room: int
+) -> tuple[Float, Int64, Float]:
     """Positions (n, 2) in texels and pages (n,) of the vertices of all charts, and the final scales
     of the charts (C,).
 
@@ -222,7 +217,7 @@ def _pack(
     return local + np.rint(low - 0.5)[of_chart] + GUTTER, page, scale
 
 
-def _run_xatlas(local: Float, corner: Number, of_chart: Number, room: int) -> tuple[Float, Number]:
+def _run_xatlas(local: Float, corner: Int64, of_chart: Int64, room: int) -> tuple[Float, Int64]:
     """Packed positions of the vertices of charts, (n, 2) texels, and their pages (n,); -1: none.
 
     xatlas stretches charts by less than a texel, which the caller undoes.
@@ -252,12 +247,12 @@ def _run_xatlas(local: Float, corner: Number, of_chart: Number, room: int) -> tu
 
 def _add_gray_faces(
     mesh: Mesh,
-    view: Index,
-    textured: NDArray[np.intp],
-    vertex: Number,
-    corner: Number,
+    view: Int32,
+    textured: Index,
+    vertex: Int64,
+    corner: Int64,
     placed: Float,
-    page: Number,
+    page: Int64,
     scale: Float,
     texture_size: int,
 ) -> AtlasLayout:

@@ -13,10 +13,7 @@ from stillmap.mesh.texture.atlas import GRAY, GUTTER, AtlasLayout, TexturedMesh,
 from stillmap.mesh.texture.sampling import downsample, sample_bilinear
 from stillmap.mesh.texture.views import View, as_color_image
 from stillmap.mesh.triangle_mesh import Mesh
-
-Index = NDArray[np.int32]
-Mask = NDArray[np.bool_]
-Image = NDArray[np.uint8]
+from stillmap.mesh.types import Bool, Float, Image, Index, Int32
 
 _AROUND = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if r or c]
 _TEXELS_PER_BLOCK = 1 << 17
@@ -24,7 +21,7 @@ _TEXELS_PER_BLOCK = 1 << 17
 
 def bake_texture(
     mesh: Mesh,
-    view_of_face: Index,
+    view_of_face: Int32,
     views: list[View],
     read: Callable[[int], NDArray[Any]],
     texture_size: int = 4096,
@@ -68,7 +65,7 @@ def bake_texture(
     )
 
 
-def _check_views(mesh: Mesh, view_of_face: Index, n_views: int) -> None:
+def _check_views(mesh: Mesh, view_of_face: Int32, n_views: int) -> None:
     if view_of_face.shape != (len(mesh),) or view_of_face.dtype != np.int32:
         got = f"{view_of_face.shape} {view_of_face.dtype}"
         raise ValueError(f"view_of_face: expected ({len(mesh)},) int32, got {got}")
@@ -76,7 +73,7 @@ def _check_views(mesh: Mesh, view_of_face: Index, n_views: int) -> None:
         raise ValueError(f"view_of_face: a view that is not there, of {n_views}")
 
 
-def _faces_by_view(layout: AtlasLayout) -> Iterator[tuple[int, NDArray[np.intp]]]:
+def _faces_by_view(layout: AtlasLayout) -> Iterator[tuple[int, Index]]:
     """Views that texture anything, and their faces, rising."""
     order = np.argsort(layout.view, kind="stable")
     numbers, first = np.unique(layout.view[order], return_index=True)
@@ -89,10 +86,10 @@ def _faces_by_view(layout: AtlasLayout) -> Iterator[tuple[int, NDArray[np.intp]]
 
 def _bake_view(
     pages: list[Image],
-    filled: list[Mask],
+    filled: list[Bool],
     layout: AtlasLayout,
-    vertices: NDArray[np.float64],
-    faces: NDArray[np.intp],
+    vertices: Float,
+    faces: Index,
     view: View,
     image: Image,
 ) -> None:
@@ -119,7 +116,7 @@ def _bake_view(
                 mask[texel[part]] = True
 
 
-def fill_gutters(page: Image, filled: Mask, gutter: int) -> None:
+def fill_gutters(page: Image, filled: Bool, gutter: int) -> None:
     """Extends colors outwards by `gutter` texels and fills the rest with their mean; in place.
 
     So filtering between texels shows no seams.
@@ -147,7 +144,7 @@ def fill_gutters(page: Image, filled: Mask, gutter: int) -> None:
     flat[~mask] = np.rint(rest).astype(np.uint8)
 
 
-def _dilate(mask: Mask) -> Mask:
+def _dilate(mask: Bool) -> Bool:
     """The mask with the eight neighbors of each texel."""
     out = mask.copy()
     out[1:] |= mask[:-1]

@@ -11,10 +11,7 @@ from scipy.sparse.linalg import spsolve
 
 from stillmap.core.camera import Images
 from stillmap.mesh.texture.views import View
-
-Float = NDArray[np.float64]
-Colors = NDArray[np.float32]
-Index = NDArray[np.integer]
+from stillmap.mesh.types import Float, Float32, Index, Int32
 
 _DARK, _BRIGHT = 16.0, 240.0  # of 255: beyond these a value may be clipped
 _MIN_FACES = 30  # that two images must share
@@ -25,7 +22,7 @@ _REGULARIZATION = 0.01  # weight of gains against differences
 _MAX_LOG_GAIN = np.log(2.0)
 
 
-def estimate_gains(view: NDArray[np.int32], colors: Colors, n: int) -> Float:
+def estimate_gains(view: Int32, colors: Float32, n: int) -> Float:
     """(n, 3) gains of red, green and blue by which n images agree best.
 
     Pixel values are about a power of the light, so exposure and white balance are factors of
@@ -58,7 +55,7 @@ def estimate_gains(view: NDArray[np.int32], colors: Colors, n: int) -> Float:
     return np.asarray(np.exp(g))
 
 
-def _solve(i: Index, j: Index, w: Float, d: Float, n: int) -> Float:
+def _solve(i: NDArray[np.integer], j: NDArray[np.integer], w: Float, d: Float, n: int) -> Float:
     """(n, 3) log gains of m pairs i, j (m,) with weights (m,) and log ratios (m, 3)."""
     rows, columns = np.concatenate([i, j, i, j]), np.concatenate([i, j, j, i])
     normal = coo_array((np.concatenate([w, w, -w, -w]), (rows, columns)), shape=(n, n)).tocsc()
@@ -69,9 +66,7 @@ def _solve(i: Index, j: Index, w: Float, d: Float, n: int) -> Float:
     return np.asarray(np.clip(g, -_MAX_LOG_GAIN, _MAX_LOG_GAIN), np.float64)
 
 
-def _log_ratios(
-    view: NDArray[np.int32], colors: Colors
-) -> tuple[NDArray[np.int32], NDArray[np.int32], Colors]:
+def _log_ratios(view: Int32, colors: Float32) -> tuple[Int32, Int32, Float32]:
     """Pairs (m,), (m,) of images of one face, the lower number first, and the log ratio (m, 3) of
     the second to the first; of each face's best with all others, and of neighbors in rank."""
     with np.errstate(invalid="ignore"):
@@ -90,7 +85,7 @@ def _log_ratios(
     return np.concatenate(ones), np.concatenate(others), np.concatenate(ratios)
 
 
-def _group_medians(of: NDArray[np.intp], values: Colors, count: NDArray[np.intp]) -> Float:
+def _group_medians(of: Index, values: Float32, count: Index) -> Float:
     """(m,) lower median of the values of each of m groups."""
     order = np.lexsort((values, of))
     middle = np.cumsum(count) - count + (count - 1) // 2

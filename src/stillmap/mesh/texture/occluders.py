@@ -4,11 +4,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.mesh.types import Bool, Float
 from stillmap.tracking.boxes import Box
-
-Float = NDArray[np.float64]
 
 OUTLINE_MARGIN = 0.05  # m around the observed extent of an object
 OUTLINE_SIGMA = 0.05  # m, standard deviation of its outline beyond that margin
@@ -102,9 +100,7 @@ def occlusion_probability(
     return 1.0 - free
 
 
-def is_in_or_behind_box(
-    boxes: Sequence[OrientedBox], position: Float, points: Float
-) -> NDArray[np.bool_]:
+def is_in_or_behind_box(boxes: Sequence[OrientedBox], position: Float, points: Float) -> Bool:
     """(n,) whether the line of sight from a camera (3,) to points (n, 3) meets a box."""
     out = np.zeros(len(points), np.bool_)
     along, square = _sights(position, points)
@@ -133,7 +129,7 @@ def squared_segment_distances(center: Float, along: Float, square: Float) -> Flo
     return np.asarray(center @ center + share * (share * square - 2.0 * dot))
 
 
-def intersects_box(start: Float, ends: Float, half_size: Float) -> NDArray[np.bool_]:
+def intersects_box(start: Float, ends: Float, half_size: Float) -> Bool:
     """(n,) whether segments from `start` (3,) to `ends` (n, 3) meet a box around the origin.
 
     Slab test: a segment lies between each pair of faces over an interval of its length.

@@ -7,7 +7,6 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from stillmap.core.camera import Camera, project
@@ -15,10 +14,8 @@ from stillmap.core.recording import Recording
 from stillmap.core.timestamps import beam_stamps_ns, max_scan_duration_ns
 from stillmap.mesh.texture.occluders import OUTLINE_MARGIN
 from stillmap.mesh.texture.views import View
+from stillmap.mesh.types import Bool, Float, Float32, Index, Int64
 from stillmap.tracking.boxes import Box
-
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 _WINDOW = 0.06  # s around an image: longer, and untracked movers smear
 _WINDOW_TILTING = 0.15  # s, for planar scans: each row is only a line across the image
@@ -67,7 +64,7 @@ class OcclusionMask(NamedTuple):
 
 
 def build_occlusion_mask(
-    view: View, points: Float, p_static: NDArray[np.float32], margin: float = OUTLINE_MARGIN
+    view: View, points: Float, p_static: Float32, margin: float = OUTLINE_MARGIN
 ) -> OcclusionMask:
     """The occlusion mask of an image from the returns near its timestamp.
 
@@ -124,7 +121,7 @@ def _draw_discs(
     dynamic: Float,
     at: Float,
     away: Float,
-    p_dynamic: NDArray[np.float32],
+    p_dynamic: Float32,
     focal: float,
     margin: float,
 ) -> None:
@@ -178,13 +175,13 @@ class LidarReturns:
     recording: Recording
     deskewed: Recording
     T_map_sensor: Float
-    p_static: NDArray[np.float32]
+    p_static: Float32
     boxes: Sequence[Box]
     owned: Sequence[Index]
     start_ns: int
     is_planar: bool = False
 
-    def near_time(self, stamp_ns: int) -> tuple[Float, NDArray[np.float32]]:
+    def near_time(self, stamp_ns: int) -> tuple[Float, Float32]:
         """Returns near a time; those on tracked objects moved along their track to that time.
 
         Returns:
@@ -213,7 +210,7 @@ class LidarReturns:
         return ends, self.p_static[beams]
 
     @cached_property
-    def _on_dynamic_object(self) -> NDArray[np.bool_]:
+    def _on_dynamic_object(self) -> Bool:
         """(M,) whether a beam ended on an object and is rather dynamic."""
         out = np.zeros(len(self.p_static), np.bool_)
         for owned in self.owned:
@@ -232,9 +229,7 @@ class LidarReturns:
         last = int(np.searchsorted(stamps, stamp_ns + reach, side="right"))
         return slice(first, last)
 
-    def _compensate_motion(
-        self, ends: Float, beams: Index, at_ns: NDArray[np.int64], stamp_ns: int
-    ) -> None:
+    def _compensate_motion(self, ends: Float, beams: Index, at_ns: Int64, stamp_ns: int) -> None:
         """Moves end points (n, 3) on tracked objects along the tracks to a time; in place."""
         for box, owned in zip(self.boxes, self.owned, strict=True):
             if not len(owned) or not len(beams) or owned[-1] < beams[0] or owned[0] > beams[-1]:

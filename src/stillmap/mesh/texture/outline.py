@@ -1,10 +1,9 @@
 """The outline of an object in an image, from its points alone."""
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
-Float = NDArray[np.float64]
+from stillmap.mesh.types import Float
 
 _CELL = 0.01  # m
 _MAX_CELLS = 1 << 10  # along an edge, beyond which cells are larger

@@ -5,10 +5,7 @@ from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.mesh.texture.atlas import GRAY, TexturedMesh
-
-Colors = NDArray[np.uint8]
-Float = NDArray[np.float64]
-Float32 = NDArray[np.float32]
+from stillmap.mesh.types import Bool, Float, Float32, Image
 
 _OTHER_GRAY = (128, 128, 127)  # stands for an image's gray, as GRAY means no color
 
@@ -56,7 +53,7 @@ class TextureSampler:
         # the last entry stands for no face
         self._page = np.append(np.where(textured.view >= 0, textured.page, -1), -1)
 
-    def colors(self, points: Float, origins: Float) -> tuple[Colors, NDArray[np.bool_]]:
+    def colors(self, points: Float, origins: Float) -> tuple[Image, Bool]:
         """(n, 3) uint8 colors, none of them GRAY, and whether (n,) there are any.
 
         The color at the closest place on faces that face the point's sensor.
@@ -78,7 +75,7 @@ class TextureSampler:
         return avoid_gray(out), found >= 0
 
 
-def avoid_gray(colors: Colors) -> Colors:
+def avoid_gray(colors: Image) -> Image:
     """(n, 3) the colors with GRAY, which means that there is none, replaced by its neighbor."""
     is_gray = (colors == GRAY).all(axis=1, keepdims=True)
     return np.where(is_gray, np.array(_OTHER_GRAY, np.uint8), colors)

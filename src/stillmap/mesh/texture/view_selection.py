@@ -8,16 +8,12 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core.camera import project
 from stillmap.mesh.texture.sampling import sample_bilinear
 from stillmap.mesh.texture.views import View
 from stillmap.mesh.triangle_mesh import Mesh
-
-Float = NDArray[np.float64]
-Float32 = NDArray[np.float32]
-Index = NDArray[np.int32]
+from stillmap.mesh.types import Float, Float32, Image, Index, Int32
 
 NONE = -1
 MIN_P_VISIBLE = 0.6  # probability below which an image does not texture a face
@@ -38,7 +34,7 @@ class Candidates(NamedTuple):
         p_static: (F, K) probability that the image shows static surface only.
     """
 
-    view: Index
+    view: Int32
     utility: Float32
     p_static: Float32
 
@@ -52,7 +48,7 @@ class Candidates(NamedTuple):
             np.zeros(shape, np.float32),
         )
 
-    def add(self, view: int, faces: NDArray[np.intp], utility: Float, p_static: Float) -> None:
+    def add(self, view: int, faces: Index, utility: Float, p_static: Float) -> None:
         """Inserts a view of faces (n,) by its utility (n,); the worst candidate drops out."""
         better = utility > self.utility[faces, -1]
         faces = faces[better]
@@ -81,7 +77,7 @@ def view_utility(p_static: Float, pixels: Float, area: Float, use_occlusion: boo
     return np.where(p_static >= MIN_P_VISIBLE, sharpness + certainty, -np.inf)
 
 
-def select_views(candidates: Candidates, pairs: Index, seam_cost: float) -> Index:
+def select_views(candidates: Candidates, pairs: Int32, seam_cost: float) -> Int32:
     """(F,) the view of each face, -1 where there is none.
 
     Minimises the sum of the utility lost against each face's best view, plus `seam_cost` for each
@@ -113,7 +109,7 @@ def select_views(candidates: Candidates, pairs: Index, seam_cost: float) -> Inde
 
 
 def _update_messages(
-    view: Index, belief: Float32, pairs: Index, messages: Float32, seam_cost: float
+    view: Int32, belief: Float32, pairs: Int32, messages: Float32, seam_cost: float
 ) -> None:
     """The next messages (2, n, K) between pairs (n, 2); in place."""
     a, b = pairs.T
@@ -140,7 +136,7 @@ def sample_face_colors(
     mesh: Mesh,
     candidates: Candidates,
     views: Sequence[View],
-    read: Callable[[View], NDArray[np.uint8] | None],
+    read: Callable[[View], Image | None],
 ) -> Float32:
     """(F, K, 3) colors of the candidates at the centers of faces, 0 to 255; NaN: unknown.
 

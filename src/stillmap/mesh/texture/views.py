@@ -1,7 +1,7 @@
 """Images of a recording with a calibrated camera and a known pose."""
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,13 +12,9 @@ from stillmap.core import se2, se3
 from stillmap.core.camera import Camera, Images, calibration_error
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
+from stillmap.mesh.types import Bool, Float, Image, Index, Int64, Tell
 from stillmap.rig.trajectory import MAX_SCAN_GAP
 from stillmap.slam.deskew import MAX_SPEED, MAX_TURN_RATE
-
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
-Stamps = NDArray[np.int64]
-Tell = Callable[[int, int], None]
 
 _MAX_IMAGE_EXTRAPOLATION = 0.1  # s before or after a scan where there is none on the other side
 _TRIED = 5  # images of a camera that are tried to find a readable one
@@ -88,7 +84,7 @@ def find_views(recording: Recording, poses: Float) -> tuple[list[View], dict[str
     return views, dict(left_out)
 
 
-def usable_images(recording: Recording) -> tuple[NDArray[np.bool_], dict[str, int]]:
+def usable_images(recording: Recording) -> tuple[Bool, dict[str, int]]:
     """(N,) which images could be used if the poses were known; how many not, by reason."""
     out = np.zeros(0 if recording.images is None else len(recording.images), np.bool_)
     if recording.dimension != 3:
@@ -122,7 +118,7 @@ def filter_readable(
     return kept, unread
 
 
-def read_color_image(images: Images, view: View) -> NDArray[np.uint8] | None:
+def read_color_image(images: Images, view: View) -> Image | None:
     """(height, width, 3) the image of a view; None where it is damaged or missing."""
     try:
         return as_color_image(images.read(view.image), view)
@@ -130,7 +126,7 @@ def read_color_image(images: Images, view: View) -> NDArray[np.uint8] | None:
         return None
 
 
-def as_color_image(image: NDArray[Any], view: View) -> NDArray[np.uint8]:
+def as_color_image(image: NDArray[Any], view: View) -> Image:
     """(height, width, 3) an image (height, width[, 3 or more]) of a view as RGB.
 
     Raises:
@@ -147,7 +143,7 @@ def as_color_image(image: NDArray[Any], view: View) -> NDArray[np.uint8]:
     return np.broadcast_to(image[:, :, :3], (*image.shape[:2], 3))
 
 
-def interpolate_poses(stamp_ns: Stamps, poses: Float, wanted_ns: Stamps) -> tuple[Float, list[str]]:
+def interpolate_poses(stamp_ns: Int64, poses: Float, wanted_ns: Int64) -> tuple[Float, list[str]]:
     """Robot poses at other times than those of the scans.
 
     Args:
@@ -187,7 +183,7 @@ def interpolate_poses(stamp_ns: Stamps, poses: Float, wanted_ns: Stamps) -> tupl
     return T, reasons.tolist()
 
 
-def _nearest_scan_ns(stamp_ns: Stamps, wanted_ns: Stamps) -> Stamps:
+def _nearest_scan_ns(stamp_ns: Int64, wanted_ns: Int64) -> Int64:
     """(n,) nanoseconds to the nearest scan."""
     right = np.minimum(np.searchsorted(stamp_ns, wanted_ns), len(stamp_ns) - 1)
     left = np.maximum(right - 1, 0)
@@ -195,7 +191,7 @@ def _nearest_scan_ns(stamp_ns: Stamps, wanted_ns: Stamps) -> Stamps:
     return np.asarray(np.minimum(*ways))
 
 
-def _bracketing_scans(stamp_ns: Stamps, left: Index, right: Index) -> tuple[Index, Index]:
+def _bracketing_scans(stamp_ns: Int64, left: Index, right: Index) -> tuple[Index, Index]:
     """(n,), (n,) the scans between which poses are interpolated; at the ends the outermost two."""
     last = len(stamp_ns) - 1
     # the first scan of the last two stamps, the last of the first two

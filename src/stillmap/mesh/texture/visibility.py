@@ -9,18 +9,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 import stillmap._core as _core
 from stillmap.core.camera import Camera, project, unproject
 from stillmap.mesh.texture.views import View
 from stillmap.mesh.triangle_mesh import Mesh, cross_columns, dot_columns, normalize_columns
-
-Float = NDArray[np.float64]
-Float32 = NDArray[np.float32]
-Index = NDArray[np.intp]
-Mask = NDArray[np.bool_]
+from stillmap.mesh.types import Bool, Float, Float32, Index, Int32
 
 DEPTH_SCALE = 0.5  # pixels of the z-buffer per pixel of the image
 NEAR = 0.05  # m ahead of a camera: nothing nearer is visible
@@ -48,7 +43,7 @@ class VisibleFaces(NamedTuple):
             below 0 from behind; 0 where it is not all in the image.
     """
 
-    visible: Mask
+    visible: Bool
     pixels: Float32
     cosine: Float32
 
@@ -65,7 +60,7 @@ class DepthBuffer:
 
     K: Float
     depth: Float32
-    face: NDArray[np.int32]
+    face: Int32
 
 
 def scale_intrinsics(K: Float, scale: float) -> Float:
@@ -107,7 +102,7 @@ def find_visible_faces(mesh: Mesh, view: View, threads: int = 1) -> VisibleFaces
     return VisibleFaces(visible, area, cosine)
 
 
-def _face_corners(points: Float, faces: NDArray[np.int32]) -> Float:
+def _face_corners(points: Float, faces: Int32) -> Float:
     """(3, 3, n) corners of faces (n, 3), by corner and coordinate: long rows are fast."""
     columns = np.ascontiguousarray(points.T)
     return np.stack([columns[:, faces[:, k]] for k in range(3)])
@@ -174,7 +169,7 @@ def project_pinhole(K: Float, points: Float) -> tuple[Float, Float]:
     return K[0, 0] * x + K[0, 1] * y + K[0, 2], K[1, 1] * y + K[1, 2]
 
 
-def _project_near(view: View, points: Float, margin: float) -> tuple[Float, Mask]:
+def _project_near(view: View, points: Float, margin: float) -> tuple[Float, Bool]:
     """(V, 2) pixels of points (V, 3) in the camera's frame, and whether they are in the image.
 
     NaN far outside of the field of view, where lens models do not hold.
@@ -213,7 +208,7 @@ def _face_normals(corners: Float) -> Float:
     return normalize_columns(cross_columns(corners[1] - corners[0], corners[2] - corners[0]))
 
 
-def _pixel_areas(uv: Float, faces: NDArray[np.int32]) -> Float32:
+def _pixel_areas(uv: Float, faces: Int32) -> Float32:
     """(n,) square pixels of triangles (n, 3) over pixels (V, 2)."""
     u, v = (np.ascontiguousarray(column) for column in uv.T)
     a, b, c = faces.T
@@ -221,7 +216,7 @@ def _pixel_areas(uv: Float, faces: NDArray[np.int32]) -> Float32:
     return np.asarray(0.5 * np.abs(au * bv - av * bu), np.float32)
 
 
-def _is_unoccluded(buffer: DepthBuffer, corners: Float) -> Mask:
+def _is_unoccluded(buffer: DepthBuffer, corners: Float) -> Bool:
     """(n,) whether nothing lies in front of triangles (3, 3, n) in the camera's frame."""
     free = np.ones(corners.shape[2], np.bool_)
     normal = _face_normals(corners)
@@ -261,7 +256,7 @@ def _sample_faces(buffer: DepthBuffer, corners: Float) -> Iterator[tuple[Index, 
         yield np.flatnonzero(halvings == times), np.concatenate([center, inset])
 
 
-def _passes_depth_test(buffer: DepthBuffer, around: Float32, points: Float, normals: Float) -> Mask:
+def _passes_depth_test(buffer: DepthBuffer, around: Float32, points: Float, normals: Float) -> Bool:
     """(n,) whether points (3, n) in the camera's frame are no farther than the depth at their
     pixel, and not much farther than that of the pixels around.
 

@@ -9,8 +9,9 @@ import numpy as np
 
 from stillmap.core.errors import InputError, import_extra
 from stillmap.core.files import atomic_file, require_new_file
-from stillmap.mesh.texture.atlas import Image, TexturedMesh
+from stillmap.mesh.texture.atlas import TexturedMesh
 from stillmap.mesh.triangle_mesh import Mesh
+from stillmap.mesh.types import Image
 from stillmap.results.gltf import encode_obj, flip_v, read_glb, to_z_up
 from stillmap.results.reader import require_model
 
