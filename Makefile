@@ -42,16 +42,29 @@ $(VENV)/created:
 	@"$(PYTHON)" -m venv --clear $(VENV)
 	@touch $@
 
-# The developer's way: no isolation, so that a second build compiles only what changed.
+# The developer's way: no isolation, so that a second build compiles only what changed. The kernels
+# compile while pip fetches what the tests need.
 $(VENV)/tools: $(VENV)/created pyproject.toml
-	@echo "installing build and test tools into $(VENV)"
-	@$(BIN)/python tools/build_requirements.py | $(PIP) install -r /dev/stdin
+	@echo "installing build tools into $(VENV)"
+	@$(BIN)/python tools/requirements.py build | $(PIP) install -r /dev/stdin
+	@touch $@
+
+$(VENV)/dependencies: $(VENV)/tools
+	@echo "installing test tools into $(VENV)"
+	@$(BIN)/python tools/requirements.py dev | $(PIP) install -r /dev/stdin
+	@touch $@
+
+$(VENV)/wheel: $(VENV)/tools $(SOURCES)
+	@echo "building stillmap, warnings are errors"
+	@rm -rf build/wheel
+	@$(PIP) wheel --no-build-isolation --no-deps --wheel-dir build/wheel \
+	  --config-settings=build-dir=build/tested \
+	  --config-settings=cmake.define.STILLMAP_WERROR=ON .
 	@touch $@
 
 $(VENV)/tested: $(VENV)/tools $(SOURCES)
-	@echo "building stillmap, warnings are errors"
-	@$(PIP) install --no-build-isolation --config-settings=build-dir=build/tested \
-	  --config-settings=cmake.define.STILLMAP_WERROR=ON '.[dev]'
+	@$(MAKE) --no-print-directory --jobs=2 $(VENV)/dependencies $(VENV)/wheel
+	@$(PIP) install --no-deps --force-reinstall build/wheel/*.whl
 	@touch $@ $(VENV)/installed
 
 demo: $(VENV)/installed
