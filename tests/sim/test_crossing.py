@@ -52,9 +52,8 @@ def test_cars_that_cross_do_not_meet() -> None:
 
 def test_crowns_reach_above_the_road_and_over_who_passes() -> None:
     scene = scene_by_name("crossing")
-    _, solids = make_static_world(
-        scene, Ground.of(scene.ground, np.reshape(scene.pavements, (-1, 4)))
-    )
+    ground = Ground.of(scene.ground, np.reshape(scene.pavements, (-1, 4)))
+    solids = make_static_world(scene, ground).solids
     crowns = solids.form == ELLIPSOID
     x, y, _, foot = solids.pose[0, crowns].T
     assert crowns.sum() >= 15

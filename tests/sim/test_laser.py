@@ -177,18 +177,14 @@ def test_beams_point_where_sick_scanners_point_them(
     np.testing.assert_allclose(np.diff(angles), angles[1] - angles[0])
 
 
-def exact(ranges: Float, wall: int) -> Returns:
-    return Returns(
-        ranges, np.full(ranges.shape, wall, np.int32), np.full(ranges.shape, -1, np.int32)
-    )
+def on_glass(ranges: Float, is_glass: bool = False) -> NDArray[np.bool_]:
+    return np.full(ranges.shape, is_glass)
 
 
 def test_noise_has_its_standard_deviation_and_no_bias() -> None:
     options = LaserOptions(range_noise=0.03, no_return_share=0.0)
     true = np.full((200, 500), 4.0)
-    ranges, hit = simulate_measurement(
-        exact(true, 0), np.array([False]), options, np.random.default_rng(1)
-    )
+    ranges, hit = simulate_measurement(true, on_glass(true), options, np.random.default_rng(1))
     assert hit.all()
     assert (ranges - true).std() == pytest.approx(0.03, rel=0.01)
     assert (ranges - true).mean() == pytest.approx(0.0, abs=5 * 0.03 / math.sqrt(true.size))
@@ -197,10 +193,9 @@ def test_noise_has_its_standard_deviation_and_no_bias() -> None:
 def test_beams_get_lost_at_their_rates_and_end_at_maximum_range() -> None:
     options = LaserOptions(max_range=20.0, no_return_share=0.01, glass_no_return_share=0.3)
     true = np.full((400, 500), 4.0)
-    is_glass = np.array([False, True])
-    for wall, share in ((0, 0.01), (1, 0.31)):
+    for is_glass, share in ((False, 0.01), (True, 0.31)):
         ranges, hit = simulate_measurement(
-            exact(true, wall), is_glass, options, np.random.default_rng(4)
+            true, on_glass(true, is_glass), options, np.random.default_rng(4)
         )
         assert 1 - hit.mean() == pytest.approx(share, rel=0.1)
         np.testing.assert_array_equal(ranges[~hit], 20.0)
@@ -209,8 +204,6 @@ def test_beams_get_lost_at_their_rates_and_end_at_maximum_range() -> None:
 def test_what_lies_beyond_maximum_range_gives_no_return() -> None:
     options = LaserOptions(max_range=8.0, no_return_share=0.0, range_noise=0.0)
     true = np.array([[7.9, 8.0, 8.1, np.inf]])
-    ranges, hit = simulate_measurement(
-        exact(true, 0), np.array([False]), options, np.random.default_rng(4)
-    )
+    ranges, hit = simulate_measurement(true, on_glass(true), options, np.random.default_rng(4))
     np.testing.assert_array_equal(hit, [[True, False, False, False]])
     np.testing.assert_array_equal(ranges, [[7.9, 8.0, 8.0, 8.0]])

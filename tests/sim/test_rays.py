@@ -10,6 +10,7 @@ from stillmap.sim import GroundOptions, LidarOptions, ray_casting
 from stillmap.sim.geometry import BOX, CYLINDER, ELLIPSOID, Faces, Ground, Solids
 from stillmap.sim.lidar import Pattern, make_pose, transform_rays
 from stillmap.sim.ray_casting import RayReturns, Rays
+from stillmap.sim.truth_surfaces import StaticSurfaces
 
 Float = NDArray[np.float64]
 
@@ -35,6 +36,16 @@ def solid(form: int, pose: Float, half: tuple[float, float], z: tuple[float, flo
     return Solids(np.reshape(pose, (1, 1, 4)), form_of, np.array([half]), np.array([z]), mover)
 
 
+NO_SOLIDS = solid(BOX, [0, 0, 0, 0], (1, 1), (0, 1)).select(np.zeros(1, bool))
+
+
+def cast(
+    beams: Rays, faces: Faces, moving: list[Solids], ground: Ground, ceiling: float | None
+) -> RayReturns:
+    static = StaticSurfaces(faces, NO_SOLIDS, ground, ceiling)
+    return ray_casting.cast_rays(beams, static, *moving)
+
+
 def ends(beams: Rays, seen: RayReturns, which: NDArray[np.bool_]) -> Float:
     range = np.where(which, seen.range, 0.0)
     return np.asarray((beams.origin + range * beams.direction)[:, which])
@@ -42,7 +53,7 @@ def ends(beams: Rays, seen: RayReturns, which: NDArray[np.bool_]) -> Float:
 
 def test_flat_ground_lies_as_far_as_the_elevation_says() -> None:
     pattern, beams = lidar()
-    seen = ray_casting.cast_rays(beams, NO_FACES, [], flat(), None)
+    seen = cast(beams, NO_FACES, [], flat(), None)
     down = pattern.elevation < 0
     expected = 1.8 / np.sin(-pattern.elevation[down])
     np.testing.assert_allclose(seen.range[:, down], np.tile(expected, (360, 1)))
@@ -53,7 +64,7 @@ def test_sloping_and_bent_ground_and_its_ceiling() -> None:
     options = GroundOptions(slope_x=0.03, slope_y=-0.02, bend_x=0.002, bend_y=-0.001)
     ground = Ground.of(options, NO_PAVEMENT)
     _, beams = lidar(3.0, -2.0, z=float(ground.level(np.array(3.0), np.array(-2.0))) + 1.8)
-    seen = ray_casting.cast_rays(beams, NO_FACES, [], ground, 4.0)
+    seen = cast(beams, NO_FACES, [], ground, 4.0)
     x, y, z = ends(beams, seen, np.isfinite(seen.range))
     above = z - (0.03 * x - 0.02 * y + 0.001 * x**2 - 0.0005 * y**2)
     near = np.minimum(np.abs(above), np.abs(above - 4.0))
@@ -64,15 +75,13 @@ def test_sloping_and_bent_ground_and_its_ceiling() -> None:
 def test_an_upright_face_has_a_lower_and_an_upper_edge() -> None:
     face = Faces(np.array([[5.0, -9.0, 5.0, 9.0]]), np.array([[1.0, 2.5]]), np.array([True]))
     _, beams = lidar()
-    seen = ray_casting.cast_rays(beams, face, [], flat(), None)
+    seen = cast(beams, face, [], flat(), None)
     x, y, z = ends(beams, seen, seen.on_glass)
     np.testing.assert_allclose(x, 5.0)
     assert 1.0 <= z.min() < 1.1
     assert 2.4 < z.max() <= 2.5
     assert np.abs(y).max() <= 9.0
-    hidden = ray_casting.cast_rays(
-        beams, face, [solid(BOX, [3, 0, 0, 0], (0.5, 20), (0, 9))], flat(), None
-    )
+    hidden = cast(beams, face, [solid(BOX, [3, 0, 0, 0], (0.5, 20), (0, 9))], flat(), None)
     assert not hidden.on_glass[seen.on_glass].any()
     # below it one looks through to the ground behind
     x, _, z = ends(beams, seen, ~seen.on_glass & np.isfinite(seen.range))
@@ -81,7 +90,7 @@ def test_an_upright_face_has_a_lower_and_an_upper_edge() -> None:
 
 def test_a_cylinder_and_an_ellipse() -> None:
     _, beams = lidar()
-    seen = ray_casting.cast_rays(
+    seen = cast(
         beams, NO_FACES, [solid(CYLINDER, [4, 3, 0.5, 0.1], (0.3, 0.6), (0, 1.5))], flat(), None
     )
     x, y, z = ends(beams, seen, seen.mover == 7)
@@ -92,17 +101,13 @@ def test_a_cylinder_and_an_ellipse() -> None:
     assert z.max() == pytest.approx(1.6, abs=0.1)
     # straight ahead: as far as its surface
     _, beams = lidar(z=0.8)
-    seen = ray_casting.cast_rays(
-        beams, NO_FACES, [solid(CYLINDER, [0, 6, 0, 0], (0.5, 0.5), (0, 2))], flat(), None
-    )
+    seen = cast(beams, NO_FACES, [solid(CYLINDER, [0, 6, 0, 0], (0.5, 0.5), (0, 2))], flat(), None)
     assert seen.range[seen.mover == 7].min() == pytest.approx(5.5, abs=0.01)
 
 
 def test_a_box_has_sides_and_a_top() -> None:
     _, beams = lidar(z=3.0)
-    seen = ray_casting.cast_rays(
-        beams, NO_FACES, [solid(BOX, [5, -2, 0.3, 0.2], (2, 1), (0, 1))], flat(), None
-    )
+    seen = cast(beams, NO_FACES, [solid(BOX, [5, -2, 0.3, 0.2], (2, 1), (0, 1))], flat(), None)
     x, y, z = ends(beams, seen, seen.mover == 7)
     c, s = np.cos(0.3), np.sin(0.3)
     u, v = (x - 5) * c + (y + 2) * s, (y + 2) * c - (x - 5) * s
@@ -117,18 +122,16 @@ def test_a_box_has_sides_and_a_top() -> None:
 def test_level_beams_along_an_axis_meet_what_is_in_their_way(form: int) -> None:
     pattern = Pattern.of(LidarOptions(channels=1, columns=4, low=0.0, high=0.0))
     beams = transform_rays(pattern, make_pose(np.array([[0.0, 0.0, 1.0]]), *np.zeros((3, 1))))
-    seen = ray_casting.cast_rays(
-        beams, NO_FACES, [solid(form, [5, 0, 0, 0], (1, 2), (0, 2))], flat(), None
-    )
+    seen = cast(beams, NO_FACES, [solid(form, [5, 0, 0, 0], (1, 2), (0, 2))], flat(), None)
     np.testing.assert_allclose(seen.range[:, 0], [np.inf, np.inf, 4.0, np.inf])
     above = solid(form, [5, 0, 0, 1.5], (1, 2), (0, 2))
-    assert np.isinf(ray_casting.cast_rays(beams, NO_FACES, [above], flat(), None).range).all()
+    assert np.isinf(cast(beams, NO_FACES, [above], flat(), None).range).all()
 
 
 def test_an_ellipsoid_hangs_above_what_passes_under_it() -> None:
     _, beams = lidar()
     crown = solid(ELLIPSOID, [8, 0, 0, 0], (2, 3), (2.2, 4.2))
-    seen = ray_casting.cast_rays(beams, NO_FACES, [crown], flat(), None)
+    seen = cast(beams, NO_FACES, [crown], flat(), None)
     x, y, z = ends(beams, seen, seen.mover == 7)
     np.testing.assert_allclose((x - 8) ** 2 / 4 + y**2 / 9 + (z - 3.2) ** 2, 1.0)
     assert len(x) > 100
@@ -138,7 +141,7 @@ def test_pavements_are_a_kerb_higher() -> None:
     pavements = np.array([[-50.0, 3.0, 50.0, 9.0]])
     edge = Faces(np.array([[-50.0, 3.0, 50.0, 3.0]]), np.array([[-0.5, 0.1]]), np.zeros(1, bool))
     _, beams = lidar()
-    seen = ray_casting.cast_rays(beams, edge, [], flat(0.1, pavements), None)
+    seen = cast(beams, edge, [], flat(0.1, pavements), None)
     x, y, z = ends(beams, seen, np.isfinite(seen.range))
     on = (y > 3 + 1e-6) & (y < 9) & (np.abs(x) < 50)
     np.testing.assert_allclose(z[on], 0.1)
@@ -176,12 +179,12 @@ def test_nothing_is_missed(monkeypatch: pytest.MonkeyPatch, roll: float, moving:
     T = make_pose(xyz, roll * np.ones(360), 0.5 * roll * t, 3.0 + 0.2 * t)
     beams = transform_rays(pattern, T)
     ground = Ground.of(GroundOptions(slope_x=0.02, bend_y=0.003), NO_PAVEMENT)
-    fast = ray_casting.cast_rays(beams, faces, [solids], ground, None)
+    fast = cast(beams, faces, [solids], ground, None)
     monkeypatch.setattr(
         ray_casting, "_windows_of_faces", lambda b, f, _: everything(b, len(f.ends))
     )
     monkeypatch.setattr(ray_casting, "_windows_of_solids", lambda b, s: everything(b, len(s.form)))
-    slow = ray_casting.cast_rays(beams, faces, [solids], ground, None)
+    slow = cast(beams, faces, [solids], ground, None)
     np.testing.assert_array_equal(fast.range, slow.range)
     np.testing.assert_array_equal(fast.mover, slow.mover)
     assert len(np.unique(fast.mover)) > 12

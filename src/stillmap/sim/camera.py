@@ -149,8 +149,6 @@ def undistort(shown: Float, distortion: Float) -> Float:
 
 SKY = 65535  # in masks
 
-MAX_MOVERS = SKY - 1
-
 
 class TrueImage(NamedTuple):
     """An image and its truth.
@@ -187,7 +185,8 @@ class CameraSimulator:
         T_base_camera = np.stack([c.T_base_camera for c in cameras if c.T_base_camera is not None])
         moment = world.moment(self._shots.scan, self._shots.seconds)
         self.T_world_camera = world.T_world_base(moment) @ T_base_camera[self._shots.camera]
-        self.images = Images(self._shots.stamp_ns, self._shots.camera, cameras, self._colours)
+        stamp_ns, camera = self._shots.stamp_ns, self._shots.camera
+        self.images = Images(stamp_ns, camera, cameras, lambda image: self.render(image).color)
 
     def __len__(self) -> int:
         return len(self.images)
@@ -211,9 +210,6 @@ class CameraSimulator:
             total += one.color
         return TrueImage(self._expose(total / len(parts), image), mask, distance)
 
-    def _colours(self, image: int) -> Color:
-        return self.render(image).color
-
     def _moving(self, image: int) -> Solids:
         scan = int(self._shots.scan[image])
         moment = self._world.moment(np.array([scan]), self._shots.seconds[image : image + 1])
@@ -221,10 +217,7 @@ class CameraSimulator:
 
     def _render_once(self, lens: Lens, T_world_camera: Float, moving: Solids) -> TrueImage:
         world, R = self._world, T_world_camera[:3, :3]
-        ceiling = world.happening.scene.heights.ceiling
-        seen = renderer.render(
-            lens, T_world_camera, world.faces, world.still, moving, world.ground, ceiling
-        )
+        seen = renderer.render(lens, T_world_camera, world.static, moving)
         direction = np.einsum("ij,jhw->hwi", R, lens.direction)
         colour = np.empty((*seen.part.shape, 3), np.uint8)
         sky, static = seen.part == NOTHING, seen.part == renderer.STATIC

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,19 @@ class Faces(NamedTuple):
     z: Float
     is_glass: NDArray[np.bool_]
 
+    def distance(self, x: float, y: float) -> Float:
+        """(F,) metres from a point to each face, in the plane."""
+        x0, y0, x1, y1 = self.ends.T
+        ux, uy = x1 - x0, y1 - y0
+        share = ((x - x0) * ux + (y - y0) * uy) / np.maximum(ux * ux + uy * uy, 1e-12)
+        share = np.clip(share, 0.0, 1.0)
+        return np.asarray(np.hypot(x0 + share * ux - x, y0 + share * uy - y))
+
+    def sag(self, ground: "Ground") -> Float:
+        """(F,) metres, by how much bent ground departs from the line between a face's ends."""
+        x0, y0, x1, y1 = self.ends.T
+        return np.asarray(np.abs(ground.bend).max() * ((x1 - x0) ** 2 + (y1 - y0) ** 2) / 8)
+
 
 class Solids(NamedTuple):
     """P upright boxes, elliptic cylinders and ellipsoids, at n times or at all times (n = 1).
@@ -45,21 +58,21 @@ class Solids(NamedTuple):
     z: Float
     mover: NDArray[np.int32]
 
+    @property
+    def radius(self) -> Float:
+        """(P,) metres from the center to the farthest point, in the plane."""
+        a, b = self.half.T
+        return np.asarray(np.where(self.form == BOX, np.hypot(a, b), np.maximum(a, b)))
+
     def select(self, kept: NDArray[np.bool_] | NDArray[np.intp]) -> "Solids":
         """A subset of the solids."""
-        return Solids(
-            self.pose[:, kept], self.form[kept], self.half[kept], self.z[kept], self.mover[kept]
-        )
+        return Solids._make([self.pose[:, kept], *(values[kept] for values in self[1:])])
 
     def concatenate(self, others: "Solids") -> "Solids":
         """These solids followed by others at the same times."""
-        return Solids(
-            np.concatenate([self.pose, others.pose], axis=1),
-            np.concatenate([self.form, others.form]),
-            np.concatenate([self.half, others.half]),
-            np.concatenate([self.z, others.z]),
-            np.concatenate([self.mover, others.mover]),
-        )
+        pose = np.concatenate([self.pose, others.pose], axis=1)
+        rest: Any = zip(self[1:], others[1:], strict=True)
+        return Solids._make([pose, *map(np.concatenate, rest)])
 
 
 class Part(NamedTuple):

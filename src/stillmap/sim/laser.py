@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.sim.options import LaserOptions
+from stillmap.sim.options import LaserOptions, LidarOptions
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -101,11 +101,13 @@ def cast_beams(
     for first in range(0, len(poses), _CHUNK):
         part = slice(first, first + _CHUNK)
         scans = _Scans(poses[part], angles)
-        near = _within(reach, scans, walls)
-        _cast_walls(scans, walls, near, out.range[part], out.wall[part])
-        _cast_movers(scans, movers, part, out.range[part], out.mover[part])
+        ranges, mover = out.range[part].reshape(-1), out.mover[part].reshape(-1)
+        for w in _within(reach, scans, walls).tolist():
+            out.wall[part].reshape(-1)[_lower_ranges(scans, walls[w], ranges)] = w
+        _cast_movers(scans, movers, part, ranges, mover)
         if outlines is not None:
-            _cast_outlines(scans, outlines, part, out.range[part], out.mover[part])
+            for q, number in enumerate(outlines.mover):
+                mover[_lower_ranges(scans, outlines.faces[part, q].T, ranges)] = number
     out.wall[out.mover >= 0] = -1
     return out
 
@@ -145,22 +147,6 @@ def _within(reach: float, scans: _Scans, walls: Float) -> Index:
     return np.flatnonzero(near)
 
 
-def _cast_walls(
-    scans: _Scans, walls: Float, near: Index, ranges: Float, which: NDArray[np.int32]
-) -> None:
-    flat, flat_which = ranges.reshape(-1), which.reshape(-1)
-    for w in near.tolist():
-        flat_which[_lower_ranges(scans, walls[w], flat)] = w
-
-
-def _cast_outlines(
-    scans: _Scans, outlines: Outlines, part: slice, ranges: Float, which: NDArray[np.int32]
-) -> None:
-    flat, flat_which = ranges.reshape(-1), which.reshape(-1)
-    for q, mover in enumerate(outlines.mover):
-        flat_which[_lower_ranges(scans, outlines.faces[part, q].T, flat)] = mover
-
-
 def _lower_ranges(scans: _Scans, face: Float, ranges: Float) -> Index:
     """Lower flat ranges to a face (4,), or (4, T) if it moves; returns the beams that changed."""
     x0, y0, x1, y1 = face
@@ -172,6 +158,11 @@ def _lower_ranges(scans: _Scans, face: Float, ranges: Float) -> Index:
     height = nx * (x0 - scans.x) + ny * (y0 - scans.y)
     with np.errstate(divide="ignore", invalid="ignore"):
         r = height[scan] / (nx[scan] * scans.cos[beam] + ny[scan] * scans.sin[beam])
+    return _keep_nearer(r, beam, ranges)
+
+
+def _keep_nearer(r: Float, beam: Index, ranges: Float) -> Index:
+    """Lower the flat ranges of beams to `r` where it is less; returns the beams that changed."""
     nearer = (r > _MIN_RANGE) & (r < ranges[beam])
     ranges[beam[nearer]] = r[nearer]
     return np.asarray(beam[nearer])
@@ -180,7 +171,6 @@ def _lower_ranges(scans: _Scans, face: Float, ranges: Float) -> Index:
 def _cast_movers(
     scans: _Scans, movers: Movers, part: slice, ranges: Float, which: NDArray[np.int32]
 ) -> None:
-    flat, flat_which = ranges.reshape(-1), which.reshape(-1)
     for q, (a, b) in enumerate(movers.semi_axes):
         dx = movers.xy[part, q, 0] - scans.x
         dy = movers.xy[part, q, 1] - scans.y
@@ -194,26 +184,24 @@ def _cast_movers(
         A, B = dirx**2 + diry**2, ox * dirx + oy * diry
         rest = B**2 - A * (ox**2 + oy**2 - 1)
         r = np.where(rest >= 0, (-B - np.sqrt(np.maximum(rest, 0))) / A, np.inf)
-        nearer = (r > _MIN_RANGE) & (r < flat[beam])
-        flat[beam[nearer]] = r[nearer]
-        flat_which[beam[nearer]] = movers.mover[q]
+        which[_keep_nearer(r, beam, ranges)] = movers.mover[q]
 
 
 def simulate_measurement(
-    exact: Returns, is_glass: NDArray[np.bool_], options: LaserOptions, rng: np.random.Generator
+    exact: Float,
+    on_glass: NDArray[np.bool_],
+    o: LidarOptions | LaserOptions,
+    rng: np.random.Generator,
 ) -> tuple[Float, NDArray[np.bool_]]:
     """Measured ranges (T, n) and whether each is a hit (T, n).
 
     Args:
-        exact: exact returns.
-        is_glass: (W,) walls on which beams get lost.
-        options: noise and losses. A beam without return gets options.max_range.
+        exact: (T, n) exact ranges, metres; inf without a hit.
+        on_glass: (T, n) whether a beam hits glass, on which more are lost.
+        o: noise and losses. A beam without return gets o.max_range.
         rng: of noise and losses.
     """
-    lost = rng.random(exact.range.shape)
-    share = np.full(exact.range.shape, options.no_return_share)
-    on_wall = exact.wall >= 0
-    share[on_wall] += is_glass[exact.wall[on_wall]] * options.glass_no_return_share
-    noisy = exact.range + options.range_noise * rng.standard_normal(exact.range.shape)
-    hit = (noisy < options.max_range) & (lost >= share)
-    return np.where(hit, np.maximum(noisy, _MIN_RANGE), options.max_range), hit
+    lost = rng.random(exact.shape)
+    noisy = exact + o.range_noise * rng.standard_normal(exact.shape)
+    hit = (noisy < o.max_range) & (lost >= o.no_return_share + on_glass * o.glass_no_return_share)
+    return np.where(hit, np.maximum(noisy, _MIN_RANGE), o.max_range), hit

@@ -12,6 +12,7 @@ from stillmap.sim.geometry import BOX, Faces, Ground, Part, assemble
 from stillmap.sim.options import GroundOptions, LaserOptions, LidarOptions, RigOptions
 from stillmap.sim.ray_casting import RayReturns, Rays
 from stillmap.sim.scene import Scene
+from stillmap.sim.truth_surfaces import StaticSurfaces
 
 Float = NDArray[np.float64]
 
@@ -192,28 +193,9 @@ def cast_robot_body(scene: Scene, pattern: Pattern, T_base_sensor: Float) -> Ray
     body = box.at(np.zeros((1, 1, 3)), np.zeros((1, 1)))
     nothing = Faces(np.empty((0, 4)), np.empty((0, 2)), np.empty(0, bool))
     below = Ground.of(GroundOptions(), np.empty((0, 4)))
-    seen = ray_casting.cast_rays(
-        transform_rays(pattern, T_base_sensor[None]), nothing, [body], below, None
-    )
-    range = np.where(seen.mover == ROBOT, seen.range, np.inf)
-    return seen._replace(range=range)
-
-
-def simulate_measurement(
-    exact: RayReturns, o: LidarOptions | LaserOptions, rng: np.random.Generator
-) -> tuple[Float, NDArray[np.bool_]]:
-    """Measured ranges (n, C) and whether each is a hit (n, C).
-
-    Args:
-        exact: exact returns.
-        o: noise and losses. A beam without return gets o.max_range.
-        rng: of noise and losses.
-    """
-    lost = rng.random(exact.range.shape)
-    noisy = exact.range + o.range_noise * rng.standard_normal(exact.range.shape)
-    share = o.no_return_share + exact.on_glass * o.glass_no_return_share
-    hit = (noisy < o.max_range) & (lost >= share)
-    return np.where(hit, np.maximum(noisy, 1e-3), o.max_range), hit
+    robot = StaticSurfaces(nothing, body, below, None)
+    seen = ray_casting.cast_rays(transform_rays(pattern, T_base_sensor[None]), robot)
+    return seen._replace(range=np.where(seen.mover == ROBOT, seen.range, np.inf))
 
 
 def lift_poses(poses: Float) -> Float:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.sim.geometry import BOX, CYLINDER, Faces, Ground, Solids
+from stillmap.sim.truth_surfaces import StaticSurfaces
 
 Float = NDArray[np.float64]
 Window = tuple[int, slice, slice]
@@ -55,19 +56,16 @@ class RayReturns(NamedTuple):
     on_glass: NDArray[np.bool_]
 
 
-def cast_rays(
-    rays: Rays, faces: Faces, solids: list[Solids], ground: Ground, ceiling: float | None
-) -> RayReturns:
+def cast_rays(rays: Rays, static: StaticSurfaces, *moving: Solids) -> RayReturns:
     """Intersect beams with a world.
 
     Args:
         rays: the beams.
-        faces: static faces.
-        solids: static or moving solids, at all times or at those of the columns.
-        ground: the ground.
-        ceiling: metres above it; None: open sky.
+        static: the static surfaces.
+        moving: further solids, at all times or at those of the columns.
     """
-    range = intersect_ground(rays.origin, rays.direction, ground, ceiling)
+    faces, ground = static.faces, static.ground
+    range = intersect_ground(rays.origin, rays.direction, ground, static.ceiling)
     mover = np.full(range.shape, -1, np.int32)
     on_glass = np.zeros(range.shape, bool)
     for k, columns, channels in _windows_of_faces(rays, faces, ground):
@@ -76,7 +74,7 @@ def cast_rays(
         nearer = t < range[columns, channels]
         range[columns, channels][nearer] = t[nearer]
         on_glass[columns, channels][nearer] = faces.is_glass[k]
-    for group in solids:
+    for group in (static.solids, *moving):
         for k, columns, channels in _windows_of_solids(rays, group):
             pose = group.pose[columns if len(group.pose) > 1 else slice(None), k]
             origin, direction = rays.origin[:, columns], rays.direction[:, columns, channels]
@@ -167,16 +165,12 @@ def _windows_of_faces(rays: Rays, faces: Faces, ground: Ground) -> Iterator[Wind
     x0, y0, x1, y1 = faces.ends.T
     bearing, other = np.arctan2(y0 - oy, x0 - ox), np.arctan2(y1 - oy, x1 - ox)
     turn = (other - bearing + np.pi) % (2 * np.pi) - np.pi
-    ux, uy = x1 - x0, y1 - y0
-    share = ((ox - x0) * ux + (oy - y0) * uy) / np.maximum(ux * ux + uy * uy, 1e-12)
-    share = np.clip(share, 0.0, 1.0)
-    near = np.hypot(x0 + share * ux - ox, y0 + share * uy - oy)
     far = np.maximum(np.hypot(x0 - ox, y0 - oy), np.hypot(x1 - ox, y1 - oy))
     levels = np.stack([ground.level(x0, y0), ground.level(x1, y1)])
-    sag = np.abs(ground.bend).max() * (ux * ux + uy * uy) / 8
+    sag = faces.sag(ground)
     low = levels.min(axis=0) - sag + faces.z[:, 0] - oz
     high = levels.max(axis=0) + sag + faces.z[:, 1] - oz
-    middle = bearing + turn / 2
+    near, middle = faces.distance(ox, oy), bearing + turn / 2
     yield from _windows(rays, middle, np.abs(turn) / 2, near, far, (low, high), move)
 
 
@@ -188,8 +182,7 @@ def _windows_of_solids(rays: Rays, solids: Solids) -> Iterator[Window]:
     pose = np.nan_to_num(solids.pose, nan=_ABSENT)
     at = pose[len(pose) // 2]
     own = np.hypot(pose[..., 0] - at[:, 0], pose[..., 1] - at[:, 1]).max(axis=0)
-    a, b = solids.half.T
-    radius = np.where(solids.form == BOX, np.hypot(a, b), np.maximum(a, b)) + own
+    radius = solids.radius + own
     distance = np.hypot(at[:, 0] - ox, at[:, 1] - oy)
     z = solids.z + at[:, 3:] - oz
     z[:, 0] -= np.ptp(pose[..., 3], axis=0)

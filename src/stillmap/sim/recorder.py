@@ -1,7 +1,7 @@
 """Recording of a 3D sensor, scan by scan, in bounded memory."""
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +12,13 @@ from stillmap.core.recording import Recording
 from stillmap.sim import lidar, ray_casting
 from stillmap.sim.dynamics import Progress
 from stillmap.sim.episode import Episode
-from stillmap.sim.geometry import Faces, Ground, Solids
+from stillmap.sim.geometry import Ground
+from stillmap.sim.laser import simulate_measurement
 from stillmap.sim.lidar import Pattern, Sensor
 from stillmap.sim.ray_casting import RayReturns
 from stillmap.sim.sweep import Moment
 from stillmap.sim.truth import Truth
+from stillmap.sim.truth_surfaces import StaticSurfaces
 from stillmap.sim.world_3d import MoverSolids, make_static_world
 
 Float = NDArray[np.float64]
@@ -27,16 +29,13 @@ class World(NamedTuple):
 
     Attributes:
         happening: the motion, in the plane.
-        ground: the ground.
-        faces, still: static surfaces.
+        static: the static surfaces.
         carried: solids of the movers.
         ridden: (T, 6) x, y, z, roll, pitch, yaw of the robot.
     """
 
     happening: Episode
-    ground: Ground
-    faces: Faces
-    still: Solids
+    static: StaticSurfaces
     carried: MoverSolids
     ridden: Float
 
@@ -47,7 +46,7 @@ class World(NamedTuple):
         ground = Ground.of(scene.ground, np.reshape(scene.pavements, (-1, 4)).astype(float))
         carried = MoverSolids(scene, happening.motion, ground, rng)
         ridden = lidar.compute_robot_poses(happening.motion.robot, ground, scene.lidar, rng)
-        return cls(happening, ground, *make_static_world(scene, ground), carried, ridden)
+        return cls(happening, make_static_world(scene, ground), carried, ridden)
 
     def moment(self, scans: NDArray[np.int64], seconds: Float) -> Moment:
         """N times: `seconds` after the stamps of scans."""
@@ -62,12 +61,12 @@ class World(NamedTuple):
         """Exact returns of the beams of one scan."""
         moment = self.moment(np.full(len(pattern.azimuth), scan), pattern.seconds)
         T = self.T_world_base(moment) @ sensor.T_base_sensor
-        solids = [self.still, self.carried.at(moment, scan)]
-        ceiling = self.happening.scene.heights.ceiling
-        exact = ray_casting.cast_rays(
-            lidar.transform_rays(pattern, T), self.faces, solids, self.ground, ceiling
-        )
-        return exact if sensor.own is None else _nearer(sensor.own, exact)
+        rays = lidar.transform_rays(pattern, T)
+        exact = ray_casting.cast_rays(rays, self.static, self.carried.at(moment, scan))
+        if sensor.own is None:
+            return exact
+        nearer, both = sensor.own.range < exact.range, zip(sensor.own, exact, strict=True)
+        return RayReturns._make(np.where(nearer, own, other) for own, other in both)
 
 
 def record(
@@ -101,86 +100,46 @@ def record(
     if sensor.dimension == 2:
         T_world_base, T_odom_base = se2.matrix(*happening.motion.robot.T), happening.T_odom_base
         T_base_sensor = T_base_sensor[np.ix_([0, 1, 3], [0, 1, 3])]
-    columns = beams.columns()
     recording = Recording(
         stamp_ns=happening.stamp_ns,
-        offset=columns.offset,
-        points=columns.points,
-        hit=columns.hit,
+        offset=np.array(beams.offset, np.int64),
+        points=beams.points.finish(),
+        hit=beams.hit.finish(),
         T_base_sensor=T_base_sensor[None],
         sensor=np.zeros(T, np.int32),
         T_odom_base=T_odom_base,
         source=happening.source([{"name": sensor.name}]),
-        beam_time=columns.beam_time,
+        beam_time=None if beams.time is None else beams.time.finish(),
         scratch=scratch,
     )
-    more = {"mover_sizes": _sizes(world)}
-    return recording, happening.truth(columns.static, columns.mover, T_world_base, more)
-
-
-def _nearer(one: RayReturns, other: RayReturns) -> RayReturns:
-    nearer = one.range < other.range
-    return RayReturns(
-        np.where(nearer, one.range, other.range),
-        np.where(nearer, one.mover, other.mover),
-        np.where(nearer, one.on_glass, other.on_glass),
-    )
-
-
-def _sizes(world: World) -> list[list[float | None]]:
-    """Length, width and height of each mover in metres; None where undefined."""
-    rows: list[list[Any]]
-    rows = np.column_stack([world.happening.motion.sizes, world.carried.tall]).tolist()
-    return [[None if value != value else value for value in row] for row in rows]
-
-
-class _Recorded(NamedTuple):
-    """Fields of Recording and Truth."""
-
-    offset: NDArray[np.int64]
-    points: NDArray[np.float32]
-    hit: NDArray[np.bool_]
-    beam_time: NDArray[np.float32] | None
-    static: NDArray[np.bool_]
-    mover: NDArray[np.int32]
+    sizes = np.column_stack([happening.motion.sizes, world.carried.tall])
+    more = {"mover_sizes": np.where(np.isnan(sizes), np.array(None), sizes).tolist()}
+    static, mover = beams.static.finish(), beams.mover.finish()
+    return recording, happening.truth(static, mover, T_world_base, more)
 
 
 class _Beams:
-    """Builder of the per-beam arrays."""
+    """Builders of the per-beam arrays of Recording and Truth."""
 
     def __init__(self, sensor: Sensor, folder: Path | None) -> None:
         self._sensor = sensor
-        self._points = ArrayBuilder(np.float32, (sensor.dimension,), folder)
-        self._hit, self._static = (
-            ArrayBuilder(np.bool_, (), folder),
-            ArrayBuilder(np.bool_, (), folder),
-        )
-        self._mover = ArrayBuilder(np.int32, (), folder)
-        self._time = ArrayBuilder(np.float32, (), folder) if sensor.takes_time else None
-        self._offset = [0]
+        self.points = ArrayBuilder(np.float32, (sensor.dimension,), folder)
+        self.hit, self.static = (ArrayBuilder(np.bool_, (), folder) for _ in range(2))
+        self.mover = ArrayBuilder(np.int32, (), folder)
+        self.time = ArrayBuilder(np.float32, (), folder) if sensor.takes_time else None
+        self.offset = [0]
 
     def add(self, exact: RayReturns, pattern: Pattern, rng: np.random.Generator) -> None:
         """Append a scan, given its exact returns."""
-        range, hit = lidar.simulate_measurement(exact, self._sensor.options, rng)
+        range, hit = simulate_measurement(exact.range, exact.on_glass, self._sensor.options, rng)
         points = (range * pattern.direction[: self._sensor.dimension]).astype(np.float32)
         mover = np.where(hit, exact.mover, np.int32(-1))
         time = np.repeat(pattern.seconds, hit.shape[1]).reshape(hit.shape)
         use = hit if self._sensor.leaves_out else np.ones_like(hit)
-        self._points.append(np.moveaxis(points, 0, -1)[use])
-        self._hit.append(hit[use])
-        self._static.append((hit & (mover == -1))[use])
-        self._mover.append(mover[use])
-        if self._time is not None:
-            self._time.append(time[use])
-        self._offset.append(len(self._hit))
-
-    def columns(self) -> _Recorded:
-        """All arrays; nothing can be added afterwards."""
-        return _Recorded(
-            offset=np.array(self._offset, np.int64),
-            points=self._points.finish(),
-            hit=self._hit.finish(),
-            beam_time=None if self._time is None else self._time.finish(),
-            static=self._static.finish(),
-            mover=self._mover.finish(),
-        )
+        self.points.append(np.moveaxis(points, 0, -1)[use])
+        self.hit.append(hit[use])
+        self.static.append((hit & (mover == -1))[use])
+        self.mover.append(mover[use])
+        if self.time is not None:
+            self.time.append(time[use])
+        self.offset.append(len(self.hit))

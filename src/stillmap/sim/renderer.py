@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.sim import ray_casting
-from stillmap.sim.geometry import BOX, Faces, Ground, Solids
+from stillmap.sim.geometry import Faces, Ground, Solids
+from stillmap.sim.truth_surfaces import StaticSurfaces
 
 Float = NDArray[np.float64]
 
@@ -70,30 +71,22 @@ class _Candidate(NamedTuple):
 
 
 def render(
-    lens: Lens,
-    T_world_camera: Float,
-    faces: Faces,
-    still: Solids,
-    moving: Solids,
-    ground: Ground,
-    ceiling: float | None,
+    lens: Lens, T_world_camera: Float, static: StaticSurfaces, moving: Solids
 ) -> RenderedImage:
     """Render the nearest surface at each pixel.
 
     Args:
         lens: the pixel rays.
         T_world_camera: (4, 4).
-        faces, still: static surfaces.
+        static: the static surfaces.
         moving: moving solids at one time; those without a mover are static.
-        ground: the ground.
-        ceiling: metres above it; None: open sky.
     """
+    faces, ground, groups = static.faces, static.ground, (static.solids, moving)
     R, at = T_world_camera[:3, :3], T_world_camera[:3, 3]
     direction = np.einsum("ij,jhw->ihw", R, lens.direction)
     origin = np.ascontiguousarray(at[:, None, None])
-    range = ray_casting.intersect_ground(origin, direction, ground, ceiling)
+    range = ray_casting.intersect_ground(origin, direction, ground, static.ceiling)
     part = np.where(np.isinf(range), np.int32(NOTHING), np.int32(STATIC))
-    groups = (still, moving)
     things = [*_visible_faces(lens, T_world_camera, faces, ground)]
     for number, group in enumerate(groups):
         things += _visible_solids(lens, T_world_camera, group, number)
@@ -121,7 +114,7 @@ def _visible_faces(
     if not len(faces.ends):
         return
     x0, y0, x1, y1 = faces.ends.T
-    sag = np.abs(ground.bend).max() * ((x1 - x0) ** 2 + (y1 - y0) ** 2) / 8
+    sag = faces.sag(ground)
     low, high = faces.z[:, 0] - sag, faces.z[:, 1] + sag
     start, end = ground.level(x0, y0), ground.level(x1, y1)
     corners = np.stack(
@@ -132,11 +125,7 @@ def _visible_faces(
         ],
         axis=1,
     )
-    cx, cy, _ = T_world_camera[:3, 3]
-    ux, uy = x1 - x0, y1 - y0
-    share = ((cx - x0) * ux + (cy - y0) * uy) / np.maximum(ux * ux + uy * uy, 1e-12)
-    share = np.clip(share, 0.0, 1.0)
-    near = np.hypot(x0 + share * ux - cx, y0 + share * uy - cy)
+    near = faces.distance(*T_world_camera[:2, 3])
     yield from _windows(lens, T_world_camera, corners, _EDGES_OF_FACE, near, -1)
 
 
@@ -158,8 +147,7 @@ def _visible_solids(
         axis=1,
     )
     cx, cy, _ = T_world_camera[:3, 3]
-    radius = np.where(solids.form == BOX, np.hypot(a, b), np.maximum(a, b))
-    near = np.hypot(x - cx, y - cy) - radius
+    near = np.hypot(x - cx, y - cy) - solids.radius
     yield from _windows(lens, T_world_camera, corners, _EDGES, near, number)
 
 

@@ -146,9 +146,10 @@ def _record(happening: Episode) -> tuple[Recording, NDArray[np.int32]]:
     o, T = scene.laser, len(motion.robot)
     T_base_sensor, sensor = _sensors(o), np.arange(T, dtype=np.int32) % o.count
     exact = sweep.cast_sweeps(motion, walls, T_base_sensor[sensor], o)
-    is_glass = np.zeros(len(walls), bool)
-    is_glass[len(scene.walls) : len(scene.walls) + len(scene.glass)] = True
-    ranges, hit = laser.simulate_measurement(exact, is_glass, o, happening.sensor_rng)
+    # glass comes after the other walls of the scene
+    pane = exact.wall - len(scene.walls)
+    on_glass = (pane >= 0) & (pane < len(scene.glass))
+    ranges, hit = laser.simulate_measurement(exact.range, on_glass, o, happening.sensor_rng)
     angles = laser.compute_beam_angles(o.beams, o.fov)
     if o.upside_down == "known":
         angles = -angles

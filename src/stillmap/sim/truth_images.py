@@ -68,8 +68,7 @@ def collect_surfaces(world: World) -> tuple[StaticSurfaces, MovingSurfaces]:
     carried = carried._replace(pose=np.stack(poses))
     moves = carried.mover >= 0
     never = carried._replace(pose=carried.pose[:1]).select(~moves)
-    ceiling = world.happening.scene.heights.ceiling
-    standing = StaticSurfaces(world.faces, world.still.concatenate(never), world.ground, ceiling)
+    standing = world.static._replace(solids=world.static.solids.concatenate(never))
     return standing, MovingSurfaces(world.happening.exact_ns, carried.select(moves))
 
 

@@ -13,6 +13,7 @@ from stillmap.sim.geometry import BOX, Faces, Ground, Part, Solids, assemble
 from stillmap.sim.options import HeightOptions
 from stillmap.sim.scene import Scene, Segment
 from stillmap.sim.sweep import Moment
+from stillmap.sim.truth_surfaces import StaticSurfaces
 
 Float = NDArray[np.float64]
 
@@ -32,7 +33,7 @@ class Loop(NamedTuple):
     sides: int
 
 
-def make_static_world(scene: Scene, ground: Ground) -> tuple[Faces, Solids]:
+def make_static_world(scene: Scene, ground: Ground) -> StaticSurfaces:
     """Walls, lintels and kerbs as faces; columns, furniture, trees and parked cars as solids."""
     loops, lines = trace_loops(scene.walls)
     top = scene.heights.top
@@ -46,7 +47,8 @@ def make_static_world(scene: Scene, ground: Ground) -> tuple[Faces, Solids]:
     faces = Faces(np.reshape(ends, (-1, 4)).astype(float), np.reshape(z, (-1, 2)), is_glass)
     parts = [(k, -1, p) for k, one in enumerate(loops) for p in make_parts(one, scene.heights)]
     poses = np.reshape([one[:3] for one in loops], (1, -1, 3)).astype(float)
-    return faces, assemble(parts).at(poses, ground.height(poses[..., 0], poses[..., 1]))
+    solids = assemble(parts).at(poses, ground.height(poses[..., 0], poses[..., 1]))
+    return StaticSurfaces(faces, solids, ground, scene.heights.ceiling)
 
 
 def make_parts(loop: Loop, heights: HeightOptions) -> list[Part]:
@@ -133,7 +135,6 @@ class MoverSolids:
     ) -> None:
         self._motion, self._ground = motion, ground
         persons, Q = motion.kinds.count("person"), len(motion.people.mover)
-        self._persons = persons
         # poses of absent objects are NaN; headings of vehicles are unwrapped
         others = motion.poses[:, persons:].copy()
         solid = np.array([kind != "thing" for kind in motion.kinds[persons:]], bool)
