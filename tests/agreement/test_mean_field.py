@@ -5,8 +5,8 @@ import pytest
 import reference
 
 from stillmap import _core
-from stillmap.em.spatial_prior import _MEAN_FIELD as MEAN_FIELD
-from stillmap.em.spatial_prior import smooth_mean_field
+from stillmap.em.spatial_coupling import _MEAN_FIELD as MEAN_FIELD
+from stillmap.em.spatial_coupling import smooth_mean_field
 
 
 def surfaces(seed):

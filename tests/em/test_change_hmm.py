@@ -10,9 +10,9 @@ from made_up import RESOLUTION, Ball, Wall, watch
 
 from stillmap import em
 from stillmap.core import chunks
-from stillmap.em import changepoints as module
+from stillmap.em import change_hmm as module
 from stillmap.em import observations
-from stillmap.em.changepoints import _group_cells
+from stillmap.em.change_hmm import _group_cells
 from stillmap.mapping import detect_changes, relabel_changes
 
 WALLS = (Wall((1, 0), 4.03), Wall((0, 1), 3.04), Wall((0, -1), 3.04))
@@ -175,10 +175,11 @@ def test_posteriors_survive_rounding(monkeypatch):
         n_static=2,
     )
     monkeypatch.setattr(module, "probability_in_cell", lambda _: np.ones(20_000, np.float32))
-    found = module.decode_histories(seen, em.EmOptions())
-    static, change, share = module.label_cells(seen, em.EmOptions())
+    mixture = module.ChangeMixture(seen, em.EmOptions())
+    found = mixture.decode_histories()
+    static, change = mixture.label_surfels()
     assert static.tobytes() == found.p_static.tobytes()
-    assert share == found.changing_weight
+    assert mixture.changing_weight == found.changing_weight
     always = likelihood[:, 0]  # the only static class of these that does not depend on the view
     np.testing.assert_allclose(change, np.clip(changes[0] - np.log(always), -4, 4), atol=1e-4)
     assert np.ptp(change) == 8.0

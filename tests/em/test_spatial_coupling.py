@@ -7,11 +7,10 @@ import pytest
 
 from stillmap import _core
 from stillmap.core.recording import Recording
-from stillmap.em import spatial_prior
+from stillmap.em import spatial_coupling
 from stillmap.em.ground import ground_from_surfels
-from stillmap.em.spatial_prior import (
+from stillmap.em.spatial_coupling import (
     apply_pooled_evidence,
-    make_ground_contact,
     pool_clusters,
     select_obstacles,
 )
@@ -130,10 +129,9 @@ def test_the_clearance_follows_from_the_noise_of_end_points(monkeypatch):
     _, _, surface = standing(CAR)
     obstacles = select_obstacles(FLAT, surface)
     assert obstacles.column_cells == 2  # of 0.15 m
-    p = np.ones(surface.size, np.float32)
     for clearance, expected in ((0.06, 0.06), (0.0, 2.5 * surface.noise_std)):
-        monkeypatch.setattr(spatial_prior, "_GROUND_CLEARANCE", clearance)
-        assert make_ground_contact(obstacles, p).min_end_height == expected
+        monkeypatch.setattr(spatial_coupling, "_GROUND_CLEARANCE", clearance)
+        assert obstacles.min_end_height == expected
 
 
 def test_ground_from_static_surfels():
@@ -150,7 +148,7 @@ def test_ground_from_static_surfels():
 
 
 def test_pooled_log_odds(monkeypatch):
-    monkeypatch.setattr(spatial_prior, "_POOLED_P_DYNAMIC", 0.25)
+    monkeypatch.setattr(spatial_coupling, "_POOLED_P_DYNAMIC", 0.25)
     p = np.array([0.9, 0.9, 0.9, 0.9, 0.3, 0.9, 0.52, 0.9, 0.9, 0.001], np.float32)
     moves = [np.nan, 0.2, 0.3, 1.0, 1.0, 0.25, 0.251, 0.0, 0.3, 1.0]
     change = [np.nan, 0.9, 0.0, -4.0, 4.0, 1.0, 0.0, 1.1, 4.0, 0.0]

@@ -7,7 +7,7 @@ import pytest
 from synthetic_histories import EVERY_SECOND, S, course, recording, seconds, together
 
 from stillmap.core.recording import Recording
-from stillmap.em.changepoints import select_changed_cells
+from stillmap.em.change_hmm import select_changed_cells
 from stillmap.mapping import Change, detect_changes_3d
 from stillmap.mapping.dwell_time import measure_dwell_times
 

@@ -1,6 +1,6 @@
 """The E-step: labels of beams, the occupancy map and the likelihood. No I/O."""
 
-from stillmap.em.changepoints import CellHistories
+from stillmap.em.change_hmm import CellHistories
 from stillmap.em.coverage import Coverage, count_observations
 from stillmap.em.estimator import (
     ESTIMATORS_3D,
@@ -20,7 +20,7 @@ from stillmap.em.ground import estimate_ground
 from stillmap.em.held_out import score_held_out_scans
 from stillmap.em.observations import time_bin_index
 from stillmap.em.occupancy_grid import GridWindow, ObservedCells, OccupancyMap, make_occupancy_map
-from stillmap.em.occupancy_hmm import final_e_step, has_final_e_step
+from stillmap.em.occupancy_hmm import final_e_step
 from stillmap.em.options import EmOptions, MapState
 from stillmap.em.types import (
     CellProbabilities,
@@ -57,7 +57,6 @@ __all__ = [
     "estimate_ground",
     "final_e_step",
     "fixed_iterations",
-    "has_final_e_step",
     "initial_p_static",
     "make_grid",
     "make_occupancy_map",

@@ -6,7 +6,7 @@ three-state HMM.
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,6 @@ from stillmap.em.mixture import fit_weights, posterior
 from stillmap.em.observations import (
     HALF_TIME_RHO,
     Observations,
-    OccupancyHmm,
     Rows,
     SurfelMap,
     iter_surfel_rows,
@@ -24,7 +23,7 @@ from stillmap.em.observations import (
     surfel_cells,
 )
 from stillmap.em.options import EmOptions, MapState
-from stillmap.em.spatial_prior import connected_components, neighbor_pairs
+from stillmap.em.spatial_coupling import connected_components, neighbor_pairs
 from stillmap.em.types import MIN_PROBABILITY, ChangedCells, Float
 
 _STATE_DURATION = 2.0  # mean duration of a state, in units of the recording's length
@@ -48,33 +47,24 @@ MIN_RECURRING_CHANGES = 3  # changes from which on something comes and goes, as 
 
 
 @dataclass(frozen=True, eq=False)
-class CellHistories:
-    """Most probable state paths of E cells in which beams ended.
+class CellHistories(ChangedCells):
+    """Most probable state paths of all E cells in which beams ended, changed or not.
 
-    Attributes:
-        cells: (E, D) int64.
+    Attributes, besides those of ChangedCells (p_object given that the cell changed):
         p_static: (E,) float32, probability of surface that never left and is seen from all sides.
         p_view_dependent: (E,) float32, of surface that never left and is seen from some sides.
         p_changing: (E,) float32, P(changing): objects arrived, left, or come and go.
-        p_object: (E,) float32, P(an object is present at the last observation | changing).
         occupied_share: (E,) float32, share of the time between the first and the last observation
             in which the cell was not empty.
-        n_changes: (E,) int32, number of arrivals and departures.
-        change_bins: (E, 2, 2) int32, time bins of the observations before and after the first and
-            the last change; -1: there was none.
         p_in_cell: (E,) float32, probability that the surface runs through the cell itself.
         changing_weight: weight of the change HMM in the mixture.
         surfel_map: the cells as surfels.
     """
 
-    cells: NDArray[np.int64]
     p_static: NDArray[np.float32]
     p_view_dependent: NDArray[np.float32]
     p_changing: NDArray[np.float32]
-    p_object: NDArray[np.float32]
     occupied_share: NDArray[np.float32]
-    n_changes: NDArray[np.int32]
-    change_bins: NDArray[np.int32]
     p_in_cell: NDArray[np.float32]
     changing_weight: float
     surfel_map: SurfelMap
@@ -92,74 +82,118 @@ class CellHistories:
         last = np.where(self.n_changes < MIN_RECURRING_CHANGES, self.p_object, np.float32(0.0))
         there = last if state == "last" else (self.occupied_share > 0.5).astype(np.float32)
         # conditional on the cell not being view-dependent
-        seen = np.maximum(1.0 - self.p_view_dependent, _MIN_P_CHANGED)
-        p = (self.p_static + self.p_changing * there) / seen
+        visible = np.maximum(1.0 - self.p_view_dependent, _MIN_P_CHANGED)
+        p = (self.p_static + self.p_changing * there) / visible
         return np.asarray(np.minimum(p, 1.0), np.float32)
 
 
-def track_changes(
-    hmm: OccupancyHmm, recording: Recording, options: EmOptions, with_paths: bool = True
-) -> None:
-    """Adds the change HMM to the filters, before the first observation.
+def change_parameters(
+    recording: Recording, options: EmOptions, with_paths: bool = True
+) -> dict[str, Any]:
+    """Parameters of the change HMM; see `collect_observations`.
 
-    Without paths only its likelihood is computed, which `label_cells` needs.
+    Without paths only its likelihood is computed, which `label_surfels` needs.
     """
     seconds = 1e-9 * float(np.ptp(recording.stamp_ns))
     duration = float(np.clip(_STATE_DURATION * seconds, 1.0, _MAX_STATE_DURATION))
-    hmm.track_changes(
-        tau=0.5 * duration,  # the mean duration of a state is 2 tau
-        passer_by_rho=_PASSER_BY_RHO,
-        passer_by_tau=_PASSER_BY_TAU,
-        p_detection=options.p_detection,
-        with_paths=with_paths,
-    )
+    return {
+        "tau": 0.5 * duration,  # the mean duration of a state is 2 tau
+        "passer_by_rho": _PASSER_BY_RHO,
+        "passer_by_tau": _PASSER_BY_TAU,
+        "p_detection": options.p_detection,
+        "with_paths": with_paths,
+    }
 
 
-def decode_histories(seen: Observations, options: EmOptions) -> CellHistories:
-    """The most probable path of each cell; `track_changes` was called before the observations."""
-    groups, weights = _class_groups(seen), _fit_weights(seen, options)
-    blocks = [
-        _decode_rows(seen, rows, groups, weights) for rows in iter_surfel_rows(seen.surfel_map)
-    ]
-    columns = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
-    return _group_cells(
-        CellHistories(
-            cells=surfel_cells(seen.surfel_map),
-            **columns,
-            p_in_cell=probability_in_cell(seen.surfel_map),
-            changing_weight=float(weights[-1]),
-            surfel_map=seen.surfel_map,
-        )
-    )
+class ChangeMixture:
+    """Mixture of classes with the change HMM as the last one, its weights fitted to observations.
 
-
-class CellLabels(NamedTuple):
-    """Labels of E surfels with the change HMM among the classes.
+    Args:
+        observations: of E surfels, collected with the change HMM.
+        options: see EmOptions.
 
     Attributes:
-        p_static: (E,) float32, see CellHistories.
-        change: (E,) float32 nats, log likelihood ratio of changed to static, within +-4.
-        changing_weight: see CellHistories.
+        changing_weight: weight of the change HMM.
     """
 
-    p_static: NDArray[np.float32]
-    change: NDArray[np.float32]
-    changing_weight: float
+    def __init__(self, observations: Observations, options: EmOptions) -> None:
+        rho, n_static = observations.rho, observations.n_static
+        # dynamic classes that stay as long as objects are left to the change HMM
+        kept = (observations.tau <= _MAX_DYNAMIC_TAU) | (rho == HALF_TIME_RHO)
+        kept[:n_static] = True
+        self._observations, self._kept = observations, kept
+        # (C + 1,) masks of the classes
+        view = np.append(np.isfinite(observations.view_angle[kept]), False)
+        self._static = (np.arange(len(view)) < n_static) & ~view
+        changing = np.arange(len(view)) == len(view) - 1
+        half_time = np.append(rho[kept] == HALF_TIME_RHO, False)
+        self._groups = self._static, view, half_time, changing
+        sample = self._likelihood(observations.sample_rows())
+        self._weights = fit_weights(sample, n_static, options.prior)
+        self.changing_weight = float(self._weights[-1])
 
+    def _likelihood(self, rows: Rows) -> NDArray[np.float32]:
+        """(K, C + 1) of some surfels, relative to the best class; the change HMM is bounded."""
+        hmm = self._observations.hmm
+        likelihood, log_best = self._observations.likelihood(self._kept, rows)
+        log_ratio = np.minimum(hmm.change_log_likelihood(rows) - log_best, _MAX_LOG_RATIO)
+        table = np.column_stack([likelihood, np.exp(log_ratio).astype(np.float32)])
+        table /= np.exp(np.maximum(log_ratio, 0.0)).astype(np.float32)[:, None]
+        return table
 
-def label_cells(seen: Observations, options: EmOptions) -> CellLabels:
-    """Labels of each surfel; `track_changes` was called before the observations."""
-    (static, *_, changing), weights = _class_groups(seen), _fit_weights(seen, options)
-    p_static, change = np.empty((2, seen.surfel_map.size), np.float32)
-    for rows in iter_surfel_rows(seen.surfel_map):
-        likelihood = _likelihood(seen, rows)
-        p_static[slice(*rows)] = posterior(likelihood, weights, static)
-        log_changed, log_static = (
-            np.log(np.maximum(_mean_likelihood(likelihood, weights, of), _MIN_LIKELIHOOD))
-            for of in (changing, static)
+    def label_surfels(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Labels of each surfel.
+
+        Returns:
+            p_static (E,), see CellHistories; log likelihood ratio (E,) of changed to static, in
+            nats within +-4.
+        """
+        surfel_map = self._observations.surfel_map
+        p_static, change = np.empty((2, surfel_map.size), np.float32)
+        for rows in iter_surfel_rows(surfel_map):
+            likelihood = self._likelihood(rows)
+            p_static[slice(*rows)] = posterior(likelihood, self._weights, self._static)
+            log_changed, log_static = (
+                np.log(np.maximum(_mean_likelihood(likelihood, self._weights, of), _MIN_LIKELIHOOD))
+                for of in (self._groups[-1], self._static)
+            )
+            change[slice(*rows)] = np.clip(log_changed - log_static, -_MAX_CHANGE, _MAX_CHANGE)
+        return p_static, change
+
+    def decode_histories(self) -> CellHistories:
+        """The most probable path of each cell."""
+        surfel_map = self._observations.surfel_map
+        blocks = [self._decode_rows(rows) for rows in iter_surfel_rows(surfel_map)]
+        columns = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
+        return _group_cells(
+            CellHistories(
+                cells=surfel_cells(surfel_map),
+                **columns,
+                p_in_cell=probability_in_cell(surfel_map),
+                changing_weight=self.changing_weight,
+                surfel_map=surfel_map,
+            )
         )
-        change[slice(*rows)] = np.clip(log_changed - log_static, -_MAX_CHANGE, _MAX_CHANGE)
-    return CellLabels(p_static, change, float(weights[-1]))
+
+    def _decode_rows(self, rows: Rows) -> dict[str, NDArray[Any]]:
+        """Columns of CellHistories for some surfels."""
+        likelihood = self._likelihood(rows)
+        static, view, half_time, changing = (
+            posterior(likelihood, self._weights, of) for of in self._groups
+        )
+        _, occupied_share, p_last, n_changes, change_bins = self._observations.hmm.changes(rows)
+        # index 0: changes of objects only; 1: of occupancy, passers-by included. In half-time cells
+        # objects stay too briefly for the object state
+        each, of = np.arange(len(static)), (half_time > changing).astype(np.intp)
+        return {
+            "p_static": static,
+            "p_view_dependent": view,
+            "p_changing": np.minimum(changing + half_time, np.float32(1.0)),
+            "p_object": p_last[each, of],
+            "occupied_share": occupied_share,
+            "n_changes": n_changes[each, of],
+            "change_bins": change_bins[each, of],
+        }
 
 
 def _mean_likelihood(
@@ -168,59 +202,6 @@ def _mean_likelihood(
     """(K,) likelihood under some classes (C,), averaged by their weights."""
     w = np.where(among, weights, 0.0) / max(float(weights[among].sum()), _MIN_LIKELIHOOD)
     return np.asarray(np.einsum("kc,c->k", likelihood, w.astype(np.float32)), np.float32)
-
-
-def _classes(seen: Observations) -> NDArray[np.bool_]:
-    """(C,) classes beside the change HMM: without dynamic ones that stay as long as objects."""
-    kept = (seen.tau <= _MAX_DYNAMIC_TAU) | (seen.rho == HALF_TIME_RHO)
-    kept[: seen.n_static] = True
-    return np.asarray(kept)
-
-
-def _class_groups(seen: Observations) -> tuple[NDArray[np.bool_], ...]:
-    """(C + 1,) masks: static, view-dependent, half-time classes, and the change HMM."""
-    kept = _classes(seen)
-    view = np.append(np.isfinite(seen.view_angle[kept]), False)
-    static = np.arange(len(view)) < seen.n_static
-    half_time = np.append(seen.rho[kept] == HALF_TIME_RHO, False)
-    return static & ~view, view, half_time, np.arange(len(view)) == len(view) - 1
-
-
-def _likelihood(seen: Observations, rows: Rows) -> NDArray[np.float32]:
-    """(E, C + 1) of some surfels under these classes and the change HMM, relative to the best."""
-    likelihood, log_best = seen.likelihood(_classes(seen), rows)
-    log_ratio = np.minimum(seen.hmm.change_log_likelihood(rows) - log_best, _MAX_LOG_RATIO)
-    table = np.column_stack([likelihood, np.exp(log_ratio).astype(np.float32)])
-    table /= np.exp(np.maximum(log_ratio, 0.0)).astype(np.float32)[:, None]
-    return table
-
-
-def _fit_weights(seen: Observations, options: EmOptions) -> Float:
-    """(C + 1,) weights of these classes and the change HMM."""
-    likelihood = _likelihood(seen, seen.sample_rows())
-    return fit_weights(likelihood, seen.n_static, options.prior).classes
-
-
-def _decode_rows(
-    seen: Observations, rows: Rows, groups: tuple[NDArray[np.bool_], ...], weights: Float
-) -> dict[str, NDArray[Any]]:
-    """Columns of CellHistories for some surfels."""
-    likelihood = _likelihood(seen, rows)
-    _, occupied_share, p_last, n_changes, change_bins = seen.hmm.changes(rows)
-    static, view, half_time, changing = (posterior(likelihood, weights, of) for of in groups)
-    # index 0: changes of objects only; 1: of occupancy, passers-by included. In half-time cells
-    # objects stay too briefly for the object state
-    of = (half_time > changing).astype(np.intp)
-    each = np.arange(len(of))
-    return {
-        "p_static": static,
-        "p_view_dependent": view,
-        "p_changing": np.minimum(changing + half_time, np.float32(1.0)),
-        "p_object": p_last[each, of],
-        "occupied_share": occupied_share,
-        "n_changes": n_changes[each, of],
-        "change_bins": change_bins[each, of],
-    }
 
 
 def _group_cells(cells: CellHistories) -> CellHistories:
@@ -252,11 +233,8 @@ def select_changed_cells(cells: CellHistories) -> ChangedCells:
     static surface that was missed for a while.
     """
     odds = _log_odds(cells.p_changing) - _log_odds(np.array([cells.changing_weight]))
-    of = np.flatnonzero(
+    return cells.select(
         (cells.n_changes > 0) & (cells.n_changes < MIN_RECURRING_CHANGES) & (odds > _MIN_LOG_RATIO)
-    )
-    return ChangedCells(
-        cells.cells[of], cells.p_object[of], cells.n_changes[of], cells.change_bins[of]
     )
 
 

@@ -1,7 +1,5 @@
 """Mixture weights of the HMM classes, fitted by expectation maximisation."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,30 +10,14 @@ _PSEUDO_COUNT = 1.0  # per class, so that none becomes impossible
 _MAX_STATIC_WEIGHT = 0.998  # upper bound: no recording proves that nothing moves
 
 
-@dataclass(frozen=True, eq=False)
-class MixtureWeights:
-    """A fitted mixture.
-
-    Attributes:
-        static: total weight of the static classes.
-        classes: (C,) weights of all classes, static ones first; they sum to one.
-        log_likelihood: mean over the fitted rows, in nats relative to their best classes; at the
-            weights before the last update. Not the bound: see `occupancy_hmm`.
-    """
-
-    static: float
-    classes: Float
-    log_likelihood: float
-
-
 def fit_weights(
     likelihood: NDArray[np.float32],
     n_static: int,
     initial_static: float,
     max_iterations: int = 100,
     tolerance: float = 1e-6,
-) -> MixtureWeights:
-    """Fits the weights w by EM: maximises sum_k ln sum_c w_c L_kc, up to a pseudo-count per class.
+) -> Float:
+    """(C,) weights w, which sum to one: EM maximises sum_k ln sum_c w_c L_kc, up to a pseudo-count.
 
     Args:
         likelihood: (K, C) L, each row relative to its best class.
@@ -61,7 +43,7 @@ def fit_weights(
         if log_likelihood - last < tolerance:
             break
         last = log_likelihood
-    return MixtureWeights(float(weights[:n_static].sum()), weights, log_likelihood)
+    return weights
 
 
 def _normalize(counts: Float, n_static: int, initial_static: float) -> Float:

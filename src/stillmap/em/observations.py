@@ -4,7 +4,7 @@ All beams of a cell within one time bin make at most one observation. `docs/esti
 observation model; the kernels follow it.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,7 +30,6 @@ _LATERAL = 0.7  # standard deviation of a beam's lateral position
 _MARGIN = 3.0  # a beam has passed a surface if it ends at least this far behind it
 _HIT_RADIUS = 4.0  # distance from a surfel's mean within which end points are hits
 _MIN_LATERAL = 0.3  # cells
-_USE_NORMALS = True  # model surfels as planes, with the angle of incidence
 
 _TRUST_SLOPE = 4.0  # trust reaches 0 where one in four beams without a return crosses solid cells
 _SURFELS_PER_BLOCK = 1 << 14
@@ -129,22 +128,22 @@ def collect_observations(
     options: EmOptions,
     threads: int,
     classes: HmmClasses = LOOP_CLASSES,
-    prepare: Callable[[OccupancyHmm], None] | None = None,
+    changes: dict[str, Any] | None = None,
 ) -> Observations:
     """Runs the forward filters of all cells in which beams ended over a recording.
 
     Args:
         recording, poses, resolution, options, threads: see `occupancy_hmm.e_step`.
         classes: of the filters.
-        prepare: called with the filters before the first observation.
+        changes: parameters of the change HMM, which runs along; None: it does not.
     """
     time_bin = time_bin_index(recording, options.time_bin) if recording.dimension == 3 else None
     surfel_map = build_surfel_map(recording, poses, resolution, threads, time_bin)
     hmm = make_hmm(surfel_map, options, classes, threads)
     trust = _estimate_trust(recording, poses, hmm, threads)
     hmm.set_trust_beyond_solid(trust)
-    if prepare is not None:
-        prepare(hmm)
+    if changes is not None:
+        hmm.track_changes(**changes)
     add_observations(recording, poses, hmm, options.time_bin, threads)
     hmm.release_buffers()
     rho, tau, view_angle = (np.array(values) for values in classes.grid())
@@ -221,7 +220,7 @@ def make_hmm(
         margin=_MARGIN * noise_std + 0.5 * cell,
         hit_radius=_HIT_RADIUS * noise_std + 0.7 * cell,  # half the diagonal of a 2D cell
         end_margin=MAX_RANGE_MARGIN,
-        use_normals=_USE_NORMALS,
+        use_normals=True,  # planes, with the angle of incidence
         threads=threads,
     )
     return hmm

@@ -85,6 +85,39 @@ class ObstacleSurfels:
     ground_height: NDArray[np.float32]
     column_cells: int
 
+    @property
+    def min_end_height(self) -> float:
+        """Metres above the ground; a beam that ends lower ended on the ground."""
+        return max(_GROUND_CLEARANCE, _CLEARANCE_STD * self.surfel_map.noise_std)
+
+    def label_ground_contact(
+        self,
+        p_static: NDArray[np.float32],
+        data: ScanBeams,
+        surfel: NDArray[np.int32],
+        threads: int = 1,
+    ) -> NDArray[np.float32]:
+        """(M,) P(static) of the mover above each end point near the ground; NaN: none.
+
+        Args:
+            p_static: (E,) of each surfel.
+            data: M beams of some scans.
+            surfel: (M,) index of the surfel in which each ended, -1: none.
+            threads: does not change the result.
+        """
+        return _core.relabel_ground_contact(
+            self.surfel_map,
+            *data,
+            surfel,
+            is_obstacle=self.is_obstacle,
+            p_static=p_static,
+            ground_height=self.ground_height,
+            column_cells=self.column_cells,
+            max_ground_height=_MIN_CLUSTER_HEIGHT,
+            min_end_height=self.min_end_height,
+            threads=threads,
+        )
+
 
 def select_obstacles(ground: GroundMap, surfel_map: SurfelMap) -> ObstacleSurfels | None:
     """The surfels of obstacles on the ground; None where no ground was observed."""
@@ -115,7 +148,7 @@ def pool_clusters(
 
     Args:
         p_static: (E,) after `smooth_mean_field`.
-        change: (E,) nats, log likelihood ratio of changed to static; see `CellLabels`.
+        change: (E,) nats, log likelihood ratio of changed to static.
         obstacles: the surfels that form clusters.
         recording: 3D, M beams, deskewed.
         poses: (T, 4, 4) T_map_base.
@@ -149,50 +182,6 @@ def apply_pooled_evidence(
     nats = np.minimum(_POOLING_SLOPE * above.max(axis=1), _MAX_POOLED)
     lower = np.where(nats > 0.0, 1.0 / (1.0 + np.exp(nats)), 1.0)
     return np.minimum(p_static, lower.astype(np.float32))
-
-
-@dataclass(frozen=True, eq=False)
-class GroundContact:
-    """Labels beams that end just above the ground by the mover in the same column.
-
-    Attributes:
-        obstacles: the surfels above the ground.
-        p_static: (E,) of each surfel.
-        min_end_height: metres above the ground; a beam that ends lower ended on the ground.
-    """
-
-    obstacles: ObstacleSurfels
-    p_static: NDArray[np.float32]
-    min_end_height: float
-
-    def label_above(
-        self, data: ScanBeams, surfel: NDArray[np.int32], threads: int = 1
-    ) -> NDArray[np.float32]:
-        """(M,) P(static) of the mover above each end point in its sweep; NaN: none.
-
-        Args:
-            data: M beams of some scans.
-            surfel: (M,) index of the surfel in which each ended, -1: none.
-            threads: does not change the result.
-        """
-        return _core.relabel_ground_contact(
-            self.obstacles.surfel_map,
-            *data,
-            surfel,
-            is_obstacle=self.obstacles.is_obstacle,
-            p_static=self.p_static,
-            ground_height=self.obstacles.ground_height,
-            column_cells=self.obstacles.column_cells,
-            max_ground_height=_MIN_CLUSTER_HEIGHT,
-            min_end_height=self.min_end_height,
-            threads=threads,
-        )
-
-
-def make_ground_contact(obstacles: ObstacleSurfels, p_static: NDArray[np.float32]) -> GroundContact:
-    """Ground contact of obstacles, with the clearance that the noise of end points allows."""
-    min_end_height = max(_GROUND_CLEARANCE, _CLEARANCE_STD * obstacles.surfel_map.noise_std)
-    return GroundContact(obstacles, p_static, min_end_height)
 
 
 def neighbor_pairs(cells: NDArray[np.int64], max_distance: float) -> Index:

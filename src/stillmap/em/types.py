@@ -62,20 +62,26 @@ class NoReturnModel:
 
 @dataclass(frozen=True, eq=False)
 class ChangedCells:
-    """K candidate cells of objects that arrived or left; only groups of them are significant.
+    """K cells in which objects may have arrived or left; only groups of them are significant.
 
     Attributes:
         cells: (K, D) int64.
         p_object: (K,) float32, probability that an object stood there at the last observation.
-        n_changes: (K,) int32, number of arrivals and departures: one or two.
+        n_changes: (K,) int32, number of arrivals and departures.
         change_bins: (K, 2, 2) int32, time bins of the observations before and after the first and
-            the last change.
+            the last change; -1: there was none.
     """
 
     cells: NDArray[np.int64]
     p_object: NDArray[np.float32]
     n_changes: NDArray[np.int32]
     change_bins: NDArray[np.int32]
+
+    def select(self, kept: NDArray[np.bool_]) -> "ChangedCells":
+        """Some of the cells."""
+        return ChangedCells(
+            self.cells[kept], self.p_object[kept], self.n_changes[kept], self.change_bins[kept]
+        )
 
 
 @dataclass(frozen=True, eq=False)

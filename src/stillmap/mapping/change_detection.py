@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from stillmap.core.recording import Recording
 from stillmap.em import CellHistories, ChangedCells, time_bin_index
-from stillmap.em.changepoints import MIN_RECURRING_CHANGES
-from stillmap.em.spatial_prior import connected_components, neighbor_pairs
+from stillmap.em.change_hmm import MIN_RECURRING_CHANGES
+from stillmap.em.spatial_coupling import connected_components, neighbor_pairs
 from stillmap.mapping.doors import compute_swept_cells
 
 Cells = NDArray[np.int64]
@@ -78,12 +78,8 @@ def detect_changes(
         resolution: m, edge of a cell.
         time_bin: s, width of a time bin.
     """
-    kept = (histories.p_changing > _MIN_PROBABILITY) & (histories.n_changes > 0)
-    changed = ChangedCells(
-        histories.cells[kept],
-        histories.p_object[kept],
-        histories.n_changes[kept],
-        histories.change_bins[kept],
+    changed = histories.select(
+        (histories.p_changing > _MIN_PROBABILITY) & (histories.n_changes > 0)
     )
     unchanged = histories.cells[histories.p_unchanged > _MIN_PROBABILITY]
     return group_changes(changed, unchanged, recording, resolution, time_bin)

@@ -56,10 +56,4 @@ def _select_lasting(changed: ChangedCells, min_bins: float, bins: float) -> Chan
     before, after = changed.change_bins[..., 0], changed.change_bins[..., 1]
     once = (after[:, 1] >= min_bins) & (bins - before[:, 1] >= min_bins)
     twice = before[:, 1] - after[:, 0] >= min_bins
-    kept = np.flatnonzero(np.where(changed.n_changes == 1, once, twice))
-    return ChangedCells(
-        changed.cells[kept],
-        changed.p_object[kept],
-        changed.n_changes[kept],
-        changed.change_bins[kept],
-    )
+    return changed.select(np.where(changed.n_changes == 1, once, twice))

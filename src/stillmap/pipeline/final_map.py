@@ -58,17 +58,10 @@ def final_estimate(
     if changed is not None:  # 3D: every E-step knows of them
         changes = detect_changes_3d(changed, deskewed, best.poses, cell, look)
         return deskewed, best, changes
-    if (
-        recording.dimension == 3
-        or options.estimator != "stillmap"
-        or not em.has_final_e_step(options.em)
-    ):
+    if recording.dimension == 3 or options.estimator != "stillmap":
         return deskewed, best, []
     found, courses = em.final_e_step(deskewed, best.poses, cell, options.em, threads)
-    if found is not None:
-        best = best.with_labels(
-            p_static=found.p_static, occupied=found.occupied, learned=found.learned
-        )
+    best = best.with_labels(p_static=found.p_static, occupied=found.occupied, learned=found.learned)
     if courses is None:
         return deskewed, best, []
     if best.e_step.occupied is None:
