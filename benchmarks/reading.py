@@ -21,6 +21,7 @@ from stillmap import build
 from stillmap.core.profiling import StageTimer
 from stillmap.core.recording import Recording
 from stillmap.io import read, writers
+from stillmap.io.builder import ReadContext
 from stillmap.io.ros.bag import open_bag
 from stillmap.io.ros.bag_types import ENDINGS
 from stillmap.io.ros.collect import collect_messages, select_topics
@@ -90,8 +91,8 @@ def _speeds(paths: list[Path], scans: int, repeats: int) -> str:
 
 
 def _gathered(path: Path) -> None:
-    bag, options = open_bag(path, None, trusted=True), ReadOptions()
-    collect_messages(bag, select_topics(bag, options), options, None, None)
+    bag, context = open_bag(path, None, trusted=True), ReadContext(ReadOptions())
+    collect_messages(bag, select_topics(bag, context.options), context)
     bag.close()
 
 

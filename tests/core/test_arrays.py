@@ -8,7 +8,7 @@ import pytest
 
 from stillmap.core import arrays
 from stillmap.io import builder
-from stillmap.io.builder import RecordingBuilder
+from stillmap.io.builder import ReadContext, RecordingBuilder
 from stillmap.preprocessing.options import ReadOptions
 
 
@@ -69,7 +69,7 @@ def test_a_full_disk_is_an_error(monkeypatch):
 def test_scans_are_put_in_order(limit, tmp_path, rng, monkeypatch, block):  # noqa: ARG001
     monkeypatch.setattr(builder, "_BLOCK", block)
     scans = [rng.normal(size=(n, 3)).astype(np.float32) for n in (4, 0, 9)]
-    gathered = RecordingBuilder(3, ReadOptions(), beam_times=True, folder=tmp_path)
+    gathered = RecordingBuilder(3, ReadContext(ReadOptions(), scratch=tmp_path), beam_times=True)
     for stamp, points in zip((30, 10, 20), scans, strict=True):
         gathered.add_scan(stamp, points, beam_time=np.full(len(points), stamp / 100.0))
     found = gathered.build(np.eye(4)[None], source={})
@@ -80,7 +80,7 @@ def test_scans_are_put_in_order(limit, tmp_path, rng, monkeypatch, block):  # no
 
 
 def test_ranges_of_clouds():
-    gathered = RecordingBuilder(2, ReadOptions(min_range=1.0, max_range=4.0))
+    gathered = RecordingBuilder(2, ReadContext(ReadOptions(min_range=1.0, max_range=4.0)))
     x = [0.5, 2.0, 8.0, np.nan, np.inf, 0.0]
     gathered.add_scan(0, np.stack([x, np.zeros(6)], axis=1))
     found = gathered.build(np.eye(3)[None], source={})

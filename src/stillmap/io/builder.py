@@ -4,16 +4,31 @@ from array import array
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.arrays import ArrayBuilder, empty
 from stillmap.core.recording import Recording
+from stillmap.io.text_lines import Progress
 from stillmap.preprocessing.options import MAX_POINT_DISTANCE, ReadOptions
 
 _BLOCK = 1 << 20  # points of a scan at a time
+
+
+class ReadContext(NamedTuple):
+    """What every reader is given besides the path.
+
+    Attributes:
+        options: see ReadOptions.
+        progress: called with the share of the input that is read, 0 to 1; None: nobody asks.
+        scratch: folder of memory-mapped buffers; None: the system's temporary folder.
+    """
+
+    options: ReadOptions
+    progress: Progress | None = None
+    scratch: Path | None = None
 
 
 class RecordingBuilder:
@@ -21,25 +36,17 @@ class RecordingBuilder:
 
     Args:
         dimension: D, 2 or 3.
-        options: points nearer than `min_range` are unusable, those from `max_range` on are at
-            maximum range.
+        context: points nearer than the option `min_range` are unusable, those from `max_range` on
+            are at maximum range; its scratch folder holds the buffers.
         beam_times: whether scans have beam times.
-        folder: of the buffers; None: the system's temporary folder.
     """
 
-    def __init__(
-        self,
-        dimension: int,
-        options: ReadOptions,
-        *,
-        beam_times: bool = False,
-        folder: Path | None = None,
-    ) -> None:
-        self._options, self._folder = options, folder
+    def __init__(self, dimension: int, context: ReadContext, *, beam_times: bool = False) -> None:
+        self._options, self._folder = context.options, context.scratch
         self._stamp_ns, self._length, self._sensor = array("q"), array("q"), array("i")
-        self._points = ArrayBuilder(np.float32, (dimension,), folder)
-        self._hit = ArrayBuilder(np.bool_, (), folder)
-        self._times = ArrayBuilder(np.float32, (), folder) if beam_times else None
+        self._points = ArrayBuilder(np.float32, (dimension,), self._folder)
+        self._hit = ArrayBuilder(np.bool_, (), self._folder)
+        self._times = ArrayBuilder(np.float32, (), self._folder) if beam_times else None
 
     def __len__(self) -> int:
         return len(self._stamp_ns)

@@ -16,8 +16,13 @@ from stillmap.core.recording import Recording
 from stillmap.io import camera_file
 from stillmap.io.camera_file import CameraOverride
 from stillmap.io.images import EXTENSIONS, read_image, read_image_size
-from stillmap.io.point_cloud.files import list_files, stamps_from_names, strip_extension
-from stillmap.io.point_cloud.kitti_times import assign_rows, read_times
+from stillmap.io.point_cloud.files import (
+    assign_rows,
+    list_files,
+    read_times,
+    stamps_from_names,
+    strip_extension,
+)
 
 _NO_IMAGES = Images(np.zeros(0, np.int64), np.zeros(0, np.int32), (), lambda _: np.zeros((0, 0)))
 

@@ -14,6 +14,7 @@ import numpy as np
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.io import cameras, rgbd, stillmap_folder
+from stillmap.io.builder import ReadContext
 from stillmap.io.carmen import reader
 from stillmap.io.carmen.messages import SCAN_PARSERS
 from stillmap.io.point_cloud import e57, kitti, las, pcd, ply, threedtk
@@ -32,7 +33,7 @@ _HEAD = 1 << 16  # bytes from which a format is detected
 _MAX_ENTRIES = 1000  # of a folder, searched for recordings
 _MAX_LISTED = 3  # recordings in a message
 
-Reader = Callable[[Path, ReadOptions, Progress | None, Path | None], Recording]
+Reader = Callable[[Path, ReadContext], Recording]
 
 
 class Format(NamedTuple):
@@ -42,7 +43,7 @@ class Format(NamedTuple):
         name: readable name.
         endings: of names of its files or folders; they decide where the content does not.
         matches: whether a file with these first bytes, or a folder (None), has the format.
-        read: reader of a path with options, progress and a folder for memory-mapped buffers.
+        read: reader of a path.
     """
 
     name: str
@@ -62,26 +63,16 @@ def _is_stillmap_folder(path: Path, start: bytes | None) -> bool:
     return header.is_file() if start is None else path.name == stillmap_folder.HEADER
 
 
-def _read_stillmap_folder(
-    path: Path,
-    options: ReadOptions,
-    progress: Progress | None,  # noqa: ARG001
-    scratch: Path | None,  # noqa: ARG001
-) -> Recording:
-    return apply_options(stillmap_folder.read(path if path.is_dir() else path.parent), options)
+def _read_stillmap_folder(path: Path, context: ReadContext) -> Recording:
+    folder = path if path.is_dir() else path.parent
+    return apply_options(stillmap_folder.read(folder), context.options)
 
 
-def _read_bag(
-    path: Path, options: ReadOptions, progress: Progress | None, scratch: Path | None
-) -> Recording:
+def _read_bag(path: Path, context: ReadContext) -> Recording:
     # loading the message types takes a moment
     from stillmap.io.ros.reader import read as read_bag
 
-    return read_bag(path, options, progress, scratch)
-
-
-def _is_kitti(path: Path, start: bytes | None) -> bool:
-    return start is None and kitti.is_kitti_folder(path)
+    return read_bag(path, context)
 
 
 def _point_cloud_format(
@@ -104,7 +95,7 @@ FORMATS = (
         "stillmap recording", (stillmap_folder.HEADER,), _is_stillmap_folder, _read_stillmap_folder
     ),
     Format("ROS bag", bag_types.ENDINGS, bag_types.is_bag, _read_bag),
-    Format("KITTI folder", ("velodyne/", "velodyne_points/"), _is_kitti, kitti.read),
+    Format("KITTI folder", ("velodyne/", "velodyne_points/"), kitti.is_kitti_folder, kitti.read),
     Format("RGB-D folder", ("frame-*.depth.png", "depth.txt"), rgbd.is_rgbd_folder, rgbd.read),
     _point_cloud_format("PCD", pcd.EXTENSIONS, is_pcd, pcd.read),
     _point_cloud_format("3DTK", threedtk.EXTENSIONS, None, threedtk.read),
@@ -117,7 +108,7 @@ FORMATS = (
         "CARMEN log",
         (".log", ".clf", ".txt", ".log.gz", ".clf.gz", ".txt.gz", ".gz"),
         _is_carmen,
-        lambda path, options, progress, _: reader.read(path, options, progress),
+        reader.read,
     ),
 )
 
@@ -146,7 +137,7 @@ def read(
         # damaged numbers are handled below: no warnings of NumPy
         with np.errstate(over="ignore", invalid="ignore"):
             options = options or ReadOptions()
-            recording = detect_format(path).read(path, options, progress, scratch)
+            recording = detect_format(path).read(path, ReadContext(options, progress, scratch))
             if recording.dimension == 3:
                 return _prepare_3d(recording, options, scratch)
         for name, given in (
@@ -193,7 +184,16 @@ def detect_format(path: Path) -> Format:
             return known
     if start is None:
         raise _no_recording_error(path)
-    return _detect_by_name(path, start)
+    what = "is no recording that stillmap reads"
+    if path.stat().st_size == 0:
+        what = "is empty"
+    elif b"\0" in start:
+        what = "is binary, no recording that stillmap reads"
+    else:
+        for known in FORMATS:
+            if path.name.lower().endswith(known.endings):
+                return known
+    raise InputError(what, where=str(path), hint=_list_formats())
 
 
 def _no_recording_error(path: Path) -> InputError:
@@ -221,19 +221,6 @@ def _find_recordings(path: Path) -> list[Path]:
     except OSError:
         return []
     return [one for one in sorted(folders) if any(known.matches(one, None) for known in FORMATS)]
-
-
-def _detect_by_name(path: Path, start: bytes) -> Format:
-    if path.stat().st_size == 0:
-        raise InputError("is empty", where=str(path), hint=_list_formats())
-    if b"\0" in start:
-        raise InputError(
-            "is binary, no recording that stillmap reads", where=str(path), hint=_list_formats()
-        )
-    for known in FORMATS:
-        if path.name.lower().endswith(known.endings):
-            return known
-    raise InputError("is no recording that stillmap reads", where=str(path), hint=_list_formats())
 
 
 def _list_formats() -> str:

@@ -18,13 +18,19 @@ from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.io import camera_file, cameras, rgbd_folders
+from stillmap.io.builder import ReadContext
 from stillmap.io.camera_file import CameraOverride
 from stillmap.io.extrinsic_calibration import calibrate_color_camera
 from stillmap.io.images import read_image, read_image_size
 from stillmap.io.point_cloud.gravity_alignment import align_to_gravity
-from stillmap.io.point_cloud.scans import Cloud, CloudSource, DatasetInfo, build_recording
+from stillmap.io.point_cloud.scans import (
+    Cloud,
+    CloudSource,
+    DatasetInfo,
+    build_recording,
+    refuse,
+)
 from stillmap.io.rgbd_folders import Frames
-from stillmap.io.text_lines import Progress
 from stillmap.preprocessing.options import ReadOptions
 
 Float = NDArray[np.float64]
@@ -61,12 +67,7 @@ def is_rgbd_folder(path: Path, head: bytes | None) -> bool:
     return head is None and rgbd_folders.detect_layout(path) is not None
 
 
-def read(
-    path: Path,
-    options: ReadOptions,
-    progress: Progress | None = None,
-    scratch: Path | None = None,
-) -> Recording:
+def read(path: Path, context: ReadContext) -> Recording:
     """Read a folder of depth images, with the color images and poses that it holds.
 
     Where at least half of the depth images have a pose, the others are skipped. Recorded poses
@@ -75,7 +76,7 @@ def read(
     Raises:
         InputError: no depth image can be read.
     """
-    frames = rgbd_folders.list_frames(path)
+    frames, options = rgbd_folders.list_frames(path), context.options
     overrides = {}
     if options.cameras is not None:
         overrides = camera_file.read_camera_file(Path(options.cameras), (DEPTH, COLOR))
@@ -84,11 +85,12 @@ def read(
     grid = _make_grid(depth, options, options.depth_scale or frames.scale)
     sources = _list_sources(frames, depth, grid)
     if options.max_range is None:
-        options = replace(options, max_range=max(_MAX_DEPTH, options.min_range + 1e-3))
+        nearest = max(_MAX_DEPTH, options.min_range + 1e-3)
+        context = context._replace(options=replace(options, max_range=nearest))
     may_differ = frames.format == rgbd_folders.SCENES
     may_differ &= overrides.keys().isdisjoint((COLOR, DEPTH))
     images = _read_color_images(frames, depth, grid.scale if may_differ else None, info.warnings)
-    recording = build_recording(sources, info, options, progress, scratch, images=images)
+    recording = build_recording(sources, info, context, images=images)
     rows, columns = grid.rays.shape[:2]
     recording.source["sensors"] = [{"name": DEPTH, "grid": [rows, columns]}]
     return align_to_gravity(recording)
@@ -100,11 +102,10 @@ def _list_sources(frames: Frames, depth: Camera, grid: _Grid) -> list[CloudSourc
     pose_count = sum(T is not None for T in frames.T_world_camera)
     sources = []
     for (stamp_ns, file), T in zip(frames.depth, frames.T_world_camera, strict=True):
+        read_cloud = partial(_read_cloud, file, None if T is None else T @ T_camera_base, grid)
         if T is None and 2 * pose_count >= len(frames.depth):
-            sources.append(CloudSource(file.name, partial(_refuse_without_pose, file), stamp_ns))
-        else:
-            pose = None if T is None else T @ T_camera_base
-            sources.append(CloudSource(file.name, partial(_read_cloud, file, pose, grid), stamp_ns))
+            read_cloud = partial(refuse, file, "has no pose, as most others have")
+        sources.append(CloudSource(file.name, read_cloud, stamp_ns))
     return sources
 
 
@@ -169,10 +170,6 @@ def _read_cloud(file: Path, T: Float | None, grid: _Grid) -> Cloud:
         raise InputError("holds no depth", where=str(file))
     metres = np.where(usable, depth / np.float32(grid.scale), np.float32(np.nan))
     return Cloud((grid.rays * metres[..., None]).reshape(-1, 3), T)
-
-
-def _refuse_without_pose(file: Path) -> Cloud:
-    raise InputError("has no pose, as most others have", where=str(file))
 
 
 def _read_color_images(

@@ -10,6 +10,7 @@ from stillmap.cli.main import main
 from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.io import read, writers
+from stillmap.io.builder import ReadContext
 from stillmap.io.ros.reader import read_tilting
 from stillmap.preprocessing.options import ReadOptions
 from stillmap.sim import RigOptions, load_truth, scene_by_name, simulate_rig, write_rig
@@ -20,7 +21,7 @@ NOD = {"tilts": True, "period": 2.0}
 JOINT_NS = 5_000_000  # from one transform of the joint to the next; turns happen at some of them
 QUICK = ("--quiet", "--threads", "1", "--set", "em.max_iterations=1")
 
-TILT = ReadOptions(topic="tilt_scan", base_frame="base_link")
+TILT = ReadContext(ReadOptions(topic="tilt_scan", base_frame="base_link"))
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +98,7 @@ def in_base(recording):
 
 
 def test_points_follow_the_joint(rig, path):
-    found, true = read_tilting(path, TILT, None, None), rig.tilting.recording
+    found, true = read_tilting(path, TILT), rig.tilting.recording
     assert found.dimension == 3
     np.testing.assert_array_equal(found.stamp_ns, true.stamp_ns)
     np.testing.assert_array_equal(found.hit, true.hit)
@@ -111,8 +112,8 @@ def test_points_follow_the_joint(rig, path):
 
 @pytest.mark.parametrize("kind", ["bag", "folder"])
 def test_other_kinds_of_bags(rig, path, tmp_path, kind):
-    found = read_tilting(bag_of(tmp_path, rig, kind=kind), TILT, None, None)
-    np.testing.assert_array_equal(found.points, read_tilting(path, TILT, None, None).points)
+    found = read_tilting(bag_of(tmp_path, rig, kind=kind), TILT)
+    np.testing.assert_array_equal(found.points, read_tilting(path, TILT).points)
 
 
 def test_not_used_for_the_map(rig, path):
@@ -129,7 +130,7 @@ def test_beams_without_transforms_are_unusable(rig, tmp_path):
     joint_ns = np.arange(first, last, JOINT_NS)
     after = (joint_ns - first) / 1e9
     joint_ns = joint_ns[(after >= 1.0) & ((after <= 3.0) | (after >= 5.0))]
-    found = read_tilting(bag_of(tmp_path, rig, joint_ns), TILT, None, None)
+    found = read_tilting(bag_of(tmp_path, rig, joint_ns), TILT)
     taken = (stamps.repeat(91) - first) / 1e9 + found.beam_time
     known = (taken >= 1.0) & ((taken <= 3.0) | (taken >= 5.0))
     np.testing.assert_array_equal(found.hit, rig.tilting.recording.hit & known)
@@ -157,8 +158,8 @@ def test_map_command(rig, path, tmp_path):
 
 def test_point_clouds_instead_of_scans(rig, tmp_path):
     writers.write(rig.tilting.recording, tmp_path / "a.mcap")
-    wanted = ReadOptions(topic="/points", base_frame="base_link")
-    found = read_tilting(tmp_path / "a.mcap", wanted, None, None)
+    wanted = ReadContext(ReadOptions(topic="/points", base_frame="base_link"))
+    found = read_tilting(tmp_path / "a.mcap", wanted)
     hit = rig.tilting.recording.hit
     np.testing.assert_array_equal(found.points[hit], rig.tilting.recording.points[hit])
 
@@ -186,6 +187,6 @@ def test_wrong_topics(rig, path, tmp_path, capsys):
 
 
 def test_fixed_laser_is_refused(path):
-    flat = ReadOptions(topic="/scan", base_frame="base_link")
+    flat = ReadContext(ReadOptions(topic="/scan", base_frame="base_link"))
     with pytest.raises(InputError, match="does not tilt"):
-        read_tilting(path, flat, None, None)
+        read_tilting(path, flat)

@@ -10,18 +10,17 @@ from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.io import trajectory
+from stillmap.io.builder import ReadContext
 from stillmap.io.carmen import extrinsics
 from stillmap.io.carmen.extrinsics import Extrinsics
 from stillmap.io.carmen.log import CarmenLog, Sensor, read_log, scan_order, select_scans
 from stillmap.io.carmen.messages import SCAN_PARSERS, flaser_config
-from stillmap.io.text_lines import Progress, is_gzip
+from stillmap.io.text_lines import is_gzip
 from stillmap.preprocessing import max_range
 from stillmap.preprocessing.options import LaserOptions, ReadOptions
 
 
-def read(
-    path: Path, options: ReadOptions | None = None, progress: Progress | None = None
-) -> Recording:
+def read(path: Path, context: ReadContext) -> Recording:
     """Read a CARMEN log.
 
     Bad records are counted in `source["skipped"]` (scans) and `source["skipped_odometry"]`, by
@@ -30,12 +29,11 @@ def read(
     Raises:
         InputError: the file cannot be read or holds no usable scan.
     """
-    options = options or ReadOptions()
-    log = read_log(path, progress)
+    log = read_log(path, context.progress)
     sensors, notes = select_scans(log)
     if not sensors:
         raise _no_scan_error(path, log)
-    recording = _build_recording(sensors, log, options)
+    recording = _build_recording(sensors, log, context.options)
     recording.source.update(path=str(path), format="carmen", gzip=is_gzip(path))
     recording.source["duplicates"] = notes
     return recording

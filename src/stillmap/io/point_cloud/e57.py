@@ -4,7 +4,8 @@ Read by libe57 (through pye57). Counts are checked against the size of the file.
 """
 
 import re
-from contextlib import closing
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,20 +13,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.errors import InputError, import_extra
 from stillmap.core.recording import Recording
+from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud.binary_table import truncated_error
-from stillmap.io.point_cloud.files import list_files, pose_from_quaternion, require_nonempty_file
+from stillmap.io.point_cloud.files import (
+    damaged_error,
+    library_errors,
+    pose_from_quaternion,
+    require_nonempty_file,
+)
 from stillmap.io.point_cloud.scans import (
     Cloud,
     CloudSource,
     DatasetInfo,
     Origin,
-    PointBuffer,
     build_recording,
+    files_of,
 )
-from stillmap.io.text_lines import Progress
-from stillmap.preprocessing.options import ReadOptions
 
 EXTENSIONS = (".e57",)
 MAGIC = b"ASTM-E57"
@@ -40,21 +46,15 @@ _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 GPS_EPOCH_S = 315_964_800  # 6 January 1980 since 1970, without leap seconds
 
 
-def read(
-    path: Path,
-    options: ReadOptions,
-    progress: Progress | None = None,
-    scratch: Path | None = None,
-) -> Recording:
+def read(path: Path, context: ReadContext) -> Recording:
     """Read one E57 file or a folder of them.
 
     Raises:
         InputError: no scan can be read, or pye57 is missing.
     """
     import_extra("pye57.libe57", path)
-    files = [path] if path.is_file() else list_files(path, EXTENSIONS)
     origin, sources = Origin(), []
-    for file in files:
+    for file in files_of(path, EXTENSIONS):
         try:
             count = _count_scans(file)
         except InputError:
@@ -63,41 +63,29 @@ def read(
             count = 1  # reading it fails again, and is counted as skipped
         for scan in range(count):
             name = file.name if count == 1 else f"{file.name} scan {scan + 1}"
-            sources.append(CloudSource(name, partial(_read_cloud, file, scan, origin, scratch)))
+            read_cloud = partial(_read_cloud, file, scan, origin, context.scratch)
+            sources.append(CloudSource(name, read_cloud))
     info = DatasetInfo(path, "E57", [], single=path.is_file() and len(sources) == 1)
-    recording = build_recording(sources, info, options, progress, scratch)
+    recording = build_recording(sources, info, context)
     if recording.T_recorded_base is None:
-        recording.source.update(origin.notes())
-        recording.source["warnings"] += origin.warnings()
+        origin.add_notes(recording)
     return recording
 
 
-class _E57File:
-    """Context manager of an open file; errors of the library become InputError."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self.library = import_extra("pye57.libe57", path)
-
-    def __enter__(self) -> Any:
-        require_nonempty_file(self._path)
-        if not str(self._path).isprintable():
-            raise InputError("has a name that libe57 cannot open", where=str(self._path))
-        _check_xml(self._path)
-        try:
-            self._file = self.library.ImageFile(str(self._path), "r")
-        except Exception as error:
-            raise self._damaged_error(error) from error
-        return self._file
-
-    def __exit__(self, kind: object, error: object, trace: object) -> None:
-        self._file.close()
-        if isinstance(error, Exception) and not isinstance(error, InputError | MemoryError):
-            raise self._damaged_error(error) from error
-
-    def _damaged_error(self, error: Exception) -> InputError:
-        what = (str(error).splitlines() or [type(error).__name__])[0]
-        return InputError(f"is damaged: {what}", where=str(self._path))
+@contextmanager
+def _open(path: Path) -> Iterator[tuple[Any, Any]]:
+    """The library and an open file; errors of the library become InputError."""
+    library = import_extra("pye57.libe57", path)
+    require_nonempty_file(path)
+    if not str(path).isprintable():
+        raise InputError("has a name that libe57 cannot open", where=str(path))
+    _check_xml(path)
+    try:
+        file = library.ImageFile(str(path), "r")
+    except Exception as error:
+        raise damaged_error(path, error) from error
+    with library_errors(path), closing(file):
+        yield library, file
 
 
 def _check_xml(path: Path) -> None:
@@ -139,30 +127,29 @@ def _nesting_depth(xml: bytes) -> int:
 
 
 def _count_scans(path: Path) -> int:
-    with _E57File(path) as file:
+    with _open(path) as (_, file):
         root = file.root()
         return len(root["data3D"]) if root.isDefined("data3D") else 0
 
 
 def _read_cloud(path: Path, scan: int, origin: Origin, scratch: Path | None) -> Cloud:
-    opened = _E57File(path)
-    with opened as file:
+    with _open(path) as (library, file):
         node = file.root()["data3D"][scan]
         T = _read_pose(node)
         if T is not None and not np.array_equal(T, np.eye(4)):
             origin = Origin(np.zeros(3))
-        growing = PointBuffer(origin, scratch)
-        points, fields = node["points"], _find_fields(opened.library, node, path)
+        growing = ArrayBuilder(np.float32, (3,), scratch)
+        points, fields = node["points"], _find_fields(library, node, path)
         expected, found = points.childCount(), 0
         if expected > 8 * path.stat().st_size:
             raise truncated_error(path, 0, expected)  # less than one bit per point
         values = {name: np.zeros(_BLOCK, kind) for name, kind in fields.items()}
-        buffers = opened.library.VectorSourceDestBuffer()
+        buffers = library.VectorSourceDestBuffer()
         for name, array in values.items():
-            buffers.append(opened.library.SourceDestBuffer(file, name, array, _BLOCK, True, True))
+            buffers.append(library.SourceDestBuffer(file, name, array, _BLOCK, True, True))
         with closing(points.reader(buffers)) as reader:
             while n := reader.read():
-                growing.add(_to_xyz(values, n))
+                growing.append(origin.shift(_to_xyz(values, n)))
                 found += n
         stamp_ns = _read_stamp(node)
     if found < expected:

@@ -1,7 +1,9 @@
-"""Files of scan folders, stamps in their names, poses as numbers, and hits for writers."""
+"""Files of scan folders and their stamps, poses as numbers, and hits for writers."""
 
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TypeVar
 
@@ -12,10 +14,13 @@ from numpy.typing import ArrayLike, NDArray
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.core.timestamps import parse_ns
+from stillmap.io.text_lines import read_lines
 
 _NUMBER = re.compile(r"(?:^-)?\d+(?:\.\d+)?$")
 
 _REPEATED = re.compile(r"(-?\d{19})_\d+")  # a further scan of the same stamp, as pcd.write names it
+
+_DATE = re.compile(r"(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d)(\.\d+)?")
 
 _NS_BY_DIGITS = {19: 1, 16: 10**3, 13: 10**6}  # digits of ns, us, ms since 1970
 
@@ -27,7 +32,7 @@ def list_files(folder: Path, extensions: tuple[str, ...]) -> list[Path]:
         InputError: the folder cannot be read.
     """
     try:
-        entries = [e for e in folder.iterdir() if has_extension(e, extensions) and not e.is_dir()]
+        entries = list(_iter_files(folder, extensions))
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", where=str(folder)) from error
     return sorted(entries, key=lambda entry: (_natural_key(entry.name), entry.name))
@@ -41,11 +46,13 @@ def has_extension(path: Path, extensions: tuple[str, ...]) -> bool:
 def contains_files(folder: Path, extensions: tuple[str, ...]) -> bool:
     """Whether a folder has files of these extensions; False where it cannot be read."""
     try:
-        return any(
-            has_extension(entry, extensions) and not entry.is_dir() for entry in folder.iterdir()
-        )
+        return any(_iter_files(folder, extensions))
     except OSError:
         return False
+
+
+def _iter_files(folder: Path, extensions: tuple[str, ...]) -> Iterator[Path]:
+    return (e for e in folder.iterdir() if has_extension(e, extensions) and not e.is_dir())
 
 
 def require_nonempty_file(path: Path) -> None:
@@ -64,6 +71,27 @@ def require_nonempty_file(path: Path) -> None:
         raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
 
 
+@contextmanager
+def library_errors(path: Path) -> Iterator[None]:
+    """Turn errors of a library about damaged bytes into InputError."""
+    try:
+        with np.errstate(all="ignore"):
+            yield
+    except (InputError, MemoryError):
+        raise
+    except BaseException as error:
+        # panics of Rust derive from BaseException
+        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
+            raise
+        raise damaged_error(path, error) from error
+
+
+def damaged_error(path: Path, error: BaseException) -> InputError:
+    """The error for a file on which a library fails."""
+    what = (str(error).splitlines() or [type(error).__name__])[0]
+    return InputError(f"is damaged: {what}", where=str(path))
+
+
 def strip_extension(name: str, extensions: tuple[str, ...]) -> str:
     """The name without its extension."""
     for extension in extensions:
@@ -78,12 +106,10 @@ def stamps_from_names(stems: Sequence[str]) -> list[int] | None:
     Numbers with decimals are seconds; integers of 13, 16 or 19 digits are milli-, micro- or
     nanoseconds since 1970.
     """
-    found = [_parse_stamp(stem) for stem in stems]
-    if not found or any(one is None for one in found):
+    found = [one for stem in stems if (one := _parse_stamp(stem)) is not None]
+    if len(found) < len(stems) or len({unit for unit, _ in found}) != 1:
         return None
-    if len({kind for kind, _ in (one for one in found if one is not None)}) > 1:
-        return None
-    return [stamp for _, stamp in (one for one in found if one is not None)]
+    return [stamp for _, stamp in found]
 
 
 def _parse_stamp(stem: str) -> tuple[int, int] | None:
@@ -102,6 +128,54 @@ def _parse_stamp(stem: str) -> tuple[int, int] | None:
     if scale is None or not -(2**63) < int(match[0]) * scale < 2**63:
         return None
     return scale, int(match[0]) * scale
+
+
+def read_times(path: Path) -> list[int | None]:
+    """Read a stamp (ns) per line, of seconds or of a date and time; None where unreadable.
+
+    Dates are taken as UTC.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
+    out: list[int | None] = []
+    for line in read_lines(path):
+        out.append(_parse_line(line.text.decode("ascii", "replace").strip()))
+    end = len(out)
+    while end and out[end - 1] is None:
+        end -= 1
+    return out[:end]
+
+
+def _parse_line(text: str) -> int | None:
+    date = _DATE.fullmatch(text)
+    try:
+        if date is None:
+            return parse_ns(text)
+        at = datetime.fromisoformat(date[1]).replace(tzinfo=UTC)
+        whole = parse_ns(str(int(at.timestamp())))  # refuses years beyond int64 ns
+        return whole + parse_ns(f"0{date[2] or '.0'}")
+    except (ValueError, OverflowError):
+        return None
+
+
+def assign_rows(files: Sequence[Path], rows: int, where: Path) -> list[int | None]:
+    """Index of the line that belongs to each file; None: there is none.
+
+    File names that are numbers are line indices (scans may be missing); otherwise there must be as
+    many files as lines.
+
+    Raises:
+        InputError: neither holds.
+    """
+    numbers = [int(f.stem) if re.fullmatch(r"[0-9]{1,18}", f.stem) else -1 for f in files]
+    are_indices = all(number >= 0 for number in numbers) and len(set(numbers)) == len(numbers)
+    if len(files) == rows and not (are_indices and max(numbers, default=0) < rows):
+        return list(range(rows))
+    if not are_indices or numbers[0] >= rows:
+        what = f"has {rows} stamps for {len(files)} files whose names are no line numbers"
+        raise InputError(what, where=str(where))
+    return [number if number < rows else None for number in numbers]
 
 
 def _natural_key(name: str) -> list[tuple[int, int | str]]:
@@ -126,10 +200,11 @@ def rigid_transform(R: ArrayLike, t: ArrayLike) -> NDArray[np.float64]:
         raise ValueError("a pose is not finite")
     if np.abs(R @ R.T - np.eye(3)).max() > _TOLERANCE or np.linalg.det(R) < 0:
         raise ValueError("a pose has no rotation matrix")
+    if not np.array_equal(R @ R.T, np.eye(3)):  # an exact rotation stays bit-identical
+        U, _, Vt = np.linalg.svd(R)
+        R = U @ Vt
     T = np.eye(4)
-    # an exact rotation stays bit-identical
-    T[:3, :3] = R if np.array_equal(R @ R.T, np.eye(3)) else _nearest_rotation(R)
-    T[:3, 3] = t
+    T[:3, :3], T[:3, 3] = R, t
     return T
 
 
@@ -171,12 +246,6 @@ def embed_in_3d(T: NDArray[np.float64]) -> NDArray[np.float64]:
     out[..., :2, :2], out[..., :2, 3] = T[..., :2, :2], T[..., :2, 2]
     out[..., 2, 2] = out[..., 3, 3] = 1.0
     return out
-
-
-def _nearest_rotation(R: NDArray[np.float64]) -> NDArray[np.float64]:
-    U, _, Vt = np.linalg.svd(R)
-    nearest: NDArray[np.float64] = U @ Vt
-    return nearest
 
 
 _Number = TypeVar("_Number", np.float32, np.float64)

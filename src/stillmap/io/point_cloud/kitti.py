@@ -13,11 +13,14 @@ from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_folder
 from stillmap.core.recording import Recording
 from stillmap.core.timestamps import format_seconds
+from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud import kitti_cameras
 from stillmap.io.point_cloud.binary_table import iter_text_lines, parse_numbers, truncated_error
 from stillmap.io.point_cloud.files import (
+    assign_rows,
     list_files,
     pose_from_row,
+    read_times,
     require_nonempty_file,
     require_single_sensor,
     rigid_transform,
@@ -25,10 +28,13 @@ from stillmap.io.point_cloud.files import (
     sensor_poses,
 )
 from stillmap.io.point_cloud.kitti_cameras import Calibration, find_images
-from stillmap.io.point_cloud.kitti_times import assign_rows, read_times
-from stillmap.io.point_cloud.scans import Cloud, CloudSource, DatasetInfo, build_recording
-from stillmap.io.text_lines import Progress
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.io.point_cloud.scans import (
+    Cloud,
+    CloudSource,
+    DatasetInfo,
+    build_recording,
+    refuse,
+)
 from stillmap.preprocessing.scan_timing import add_beam_times
 
 Poses = list[NDArray[np.float64]]
@@ -128,17 +134,12 @@ _LAYOUTS = (  # scans and their stamps
 )
 
 
-def is_kitti_folder(path: Path) -> bool:
-    """Whether a folder has a layout of KITTI."""
-    return any((path / scans).is_dir() for scans, _ in _LAYOUTS)
+def is_kitti_folder(path: Path, head: bytes | None) -> bool:
+    """Whether a path is a folder (no `head`) with a layout of KITTI."""
+    return head is None and any((path / scans).is_dir() for scans, _ in _LAYOUTS)
 
 
-def read(
-    path: Path,
-    options: ReadOptions,
-    progress: Progress | None = None,
-    scratch: Path | None = None,
-) -> Recording:
+def read(path: Path, context: ReadContext) -> Recording:
     """Read an odometry sequence or a raw drive; the laser is the base of the robot.
 
     Scans of odometry sequences are deskewed, those of raw drives are not: their laser turns
@@ -166,13 +167,13 @@ def read(
         stamp_ns = None if row is None else times[row]
         index = row if by_line else number
         T = None if index is None else poses.get(index)
-        read_cloud = partial(_refuse_without_stamp, file)
-        if stamp_ns is not None:
-            read_cloud = partial(_read_scan, file, T)
+        read_cloud = partial(_read_scan, file, T)
+        if stamp_ns is None:
+            read_cloud = partial(refuse, file, "has no stamp")
         sources.append(CloudSource(file.name, read_cloud, stamp_ns))
-    recording = build_recording(sources, info, options, progress, scratch, images=images)
-    is_raw_drive = options.spin == "auto" and scans == _RAW
-    direction = "clockwise" if is_raw_drive else options.spin
+    recording = build_recording(sources, info, context, images=images)
+    spin = context.options.spin
+    direction = "clockwise" if spin == "auto" and scans == _RAW else spin
     return add_beam_times(recording, direction, _STAMP_AZIMUTH)
 
 
@@ -182,10 +183,6 @@ def _read_scan(path: Path, T: NDArray[np.float64] | None) -> Cloud:
     if size % _RECORD:
         raise truncated_error(path, size // _RECORD, size // _RECORD + 1)
     return Cloud(np.fromfile(path, "<f4").reshape(-1, 4)[:, :3], T)
-
-
-def _refuse_without_stamp(path: Path) -> Cloud:
-    raise InputError("has no stamp", where=str(path))
 
 
 def write(recording: Recording, path: str | Path, *, overwrite: bool = False) -> None:

@@ -3,7 +3,6 @@
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +11,13 @@ from stillmap.core import se2
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
 from stillmap.io import cameras, images
-from stillmap.io.point_cloud.files import list_files, pose_from_row, rigid_transform
-from stillmap.io.point_cloud.kitti_times import assign_rows, read_times
+from stillmap.io.point_cloud.files import (
+    assign_rows,
+    list_files,
+    pose_from_row,
+    read_times,
+    rigid_transform,
+)
 
 _MAX_BYTES = 1 << 20  # bytes of a calibration file
 
@@ -35,13 +39,6 @@ class Calibration:
     warnings: tuple[str, ...] = ()
 
 
-class CameraParameters(NamedTuple):
-    """Intrinsics (3, 3) and pose on the laser (4, 4) of a camera; None: unknown."""
-
-    K: NDArray[np.float64] | None
-    T_laser_camera: NDArray[np.float64] | None
-
-
 def find_calibration(folder: Path) -> Calibration:
     """Read the calibration of an odometry folder, or of a raw drive or its parent folder."""
     try:
@@ -55,23 +52,25 @@ def find_calibration(folder: Path) -> Calibration:
     return Calibration()
 
 
-def camera_parameters(calibration: Calibration, camera: int) -> CameraParameters:
-    """Intrinsics and pose of a camera.
+def _camera_parameters(
+    calibration: Calibration, camera: int
+) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:
+    """Intrinsics (3, 3) and pose on the laser (4, 4) of a camera; None: unknown.
 
     P = K [I | t] projects points of the first rectified camera; t is the offset between both.
     """
     P = calibration.projection.get(camera)
     if P is None:
-        return CameraParameters(None, None)
+        return None, None
     K = P[:, :3].copy()
     if calibration.T_camera_laser is None:
-        return CameraParameters(K, None)
+        return K, None
     T = np.eye(4)
     try:
         T[:3, 3] = np.linalg.solve(K, P[:, 3])
     except np.linalg.LinAlgError:
-        return CameraParameters(None, None)
-    return CameraParameters(K, se2.inverse(T @ calibration.T_camera_laser))
+        return None, None
+    return K, se2.inverse(T @ calibration.T_camera_laser)
 
 
 def _read_odometry_calibration(entries: dict[str, NDArray[np.float64]]) -> Calibration:
@@ -171,5 +170,5 @@ def _make_camera(
     if not files:
         raise InputError("there are none")
     width, height = images.read_image_size(files[0][1])
-    K, T = camera_parameters(calibration, number)
+    K, T = _camera_parameters(calibration, number)
     return Camera(name, width, height, K, "", np.zeros(0), T)

@@ -11,14 +11,14 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.errors import InputError, import_extra
 from stillmap.core.files import atomic_file, require_new_file
 from stillmap.core.recording import Recording
+from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud.binary_table import truncated_error
-from stillmap.io.point_cloud.files import iter_map_points, require_nonempty_file
-from stillmap.io.point_cloud.scans import Cloud, Origin, PointBuffer, read_clouds
-from stillmap.io.text_lines import Progress
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.io.point_cloud.files import iter_map_points, library_errors, require_nonempty_file
+from stillmap.io.point_cloud.scans import Cloud, Origin, read_clouds
 
 EXTENSIONS = (".las", ".laz")
 MAGIC = b"LASF"
@@ -32,29 +32,24 @@ _MIN_CHUNK = 20  # bytes: the first point of a chunk is not compressed
 SCALE = 0.0001  # m, coordinate step of written files
 
 
-def read(
-    path: Path,
-    options: ReadOptions,
-    progress: Progress | None = None,
-    scratch: Path | None = None,
-) -> Recording:
+def read(path: Path, context: ReadContext) -> Recording:
     """Read one LAS or LAZ file or a folder of them.
 
     Raises:
         InputError: no cloud can be read, or laspy is missing.
     """
     import_extra("laspy", path)
-    return read_clouds(path, "LAS", EXTENSIONS, _read_cloud, options, progress, scratch)
+    return read_clouds(path, "LAS", EXTENSIONS, _read_cloud, context)
 
 
 def _read_cloud(path: Path, origin: Origin, scratch: Path | None) -> Cloud:
     require_nonempty_file(path)
     _check_header(path)
     laspy = import_extra("laspy", path)
-    points, expected, found = PointBuffer(origin, scratch), 0, 0
+    points, expected, found = ArrayBuilder(np.float32, (3,), scratch), 0, 0
     # single-threaded: the parallel backend trusts chunk sizes
     backend = laspy.LazBackend.Lazrs
-    with _library_errors(path), laspy.open(path, read_evlrs=False, laz_backend=backend) as reader:
+    with library_errors(path), laspy.open(path, read_evlrs=False, laz_backend=backend) as reader:
         expected = reader.header.point_count
         if expected > max(_MAX_POINTS_PER_BYTE * path.stat().st_size, _MIN_POINT_LIMIT):
             raise truncated_error(path, 0, expected)
@@ -62,7 +57,7 @@ def _read_cloud(path: Path, origin: Origin, scratch: Path | None) -> Cloud:
         for block in reader.chunk_iterator(rows):
             if len(block) > rows:
                 raise InputError("is damaged: the size of its points", where=str(path))
-            points.add(np.stack([block.x, block.y, block.z], axis=1))
+            points.append(origin.shift(np.stack([block.x, block.y, block.z], axis=1)))
             found += len(block)
     if found < expected:
         raise truncated_error(path, found, expected)
@@ -100,22 +95,6 @@ def _count_chunks(file: IO[bytes], start: int, size: int) -> int:
         return size  # no chunk table
     file.seek(table + 4)
     return int.from_bytes(file.read(4), "little")
-
-
-@contextmanager
-def _library_errors(path: Path) -> Iterator[None]:
-    """Turn errors of the library into InputError."""
-    try:
-        with np.errstate(all="ignore"):
-            yield
-    except (InputError, MemoryError):
-        raise
-    except BaseException as error:
-        # panics of Rust derive from BaseException
-        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
-            raise
-        what = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"is damaged: {what}", where=str(path)) from error
 
 
 def write(

@@ -16,6 +16,7 @@ from stillmap.core import se2
 from stillmap.core.errors import InputError, import_extra
 from stillmap.core.files import atomic_folder
 from stillmap.core.recording import Recording
+from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud.binary_table import (
     Field,
     TableLayout,
@@ -24,24 +25,24 @@ from stillmap.io.point_cloud.binary_table import (
     truncated_error,
 )
 from stillmap.io.point_cloud.files import (
-    list_files,
     pose_from_quaternion,
     quaternion_from_pose,
     require_nonempty_file,
     require_single_sensor,
     scan_hits,
     sensor_poses,
-    stamps_from_names,
-    strip_extension,
 )
-from stillmap.io.point_cloud.scans import Cloud, CloudSource, DatasetInfo, Origin, build_recording
+from stillmap.io.point_cloud.scans import (
+    Cloud,
+    DatasetInfo,
+    Origin,
+    build_recording,
+    files_of,
+    sources_of,
+)
 from stillmap.io.point_cloud.time_field import find_time_column
-from stillmap.io.text_lines import Progress
-from stillmap.preprocessing.options import ReadOptions
 
 _MAX_HEADER = 1 << 14  # bytes
-
-_TYPES = {"F": "f", "I": "i", "U": "u"}
 
 _SIZES = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
 
@@ -128,7 +129,7 @@ def _parse_viewpoint(words: list[str] | None) -> NDArray[np.float64] | None:
 def _make_field(name: str, kind: str, size: int, count: int) -> Field:
     if size not in _SIZES[kind] or count < 1:
         raise ValueError(f"a column of type {kind}, size {size}, count {count}")
-    return Field(name, np.dtype(f"<{_TYPES[kind]}{size}"), count)
+    return Field(name, np.dtype(f"<{kind.lower()}{size}"), count)
 
 
 def read_values(head: PcdHeader, wanted: list[str]) -> list[NDArray[Any]]:
@@ -188,12 +189,7 @@ MARKER = "*.pcd"  # only folders with such a file are overwritten
 _MIN_VIEWPOINT_DISTANCE = 5.0  # m from the origin, to detect the frame of the points
 
 
-def read(
-    path: Path,
-    options: ReadOptions,
-    progress: Progress | None = None,
-    scratch: Path | None = None,
-) -> Recording:
+def read(path: Path, context: ReadContext) -> Recording:
     """Read one PCD file or a folder of them.
 
     VIEWPOINT becomes `T_recorded_base`. Points are in the sensor frame; where a program wrote them
@@ -202,27 +198,15 @@ def read(
     Raises:
         InputError: no scan can be read.
     """
-    files = [path] if path.is_file() else list_files(path, EXTENSIONS)
-    stamps = stamps_from_names([strip_extension(file.name, EXTENSIONS) for file in files])
+    files, origin = files_of(path, EXTENSIONS), Origin()
     info = DatasetInfo(path, "PCD", [], single=path.is_file())
     in_map_frame = _detect_map_frame(files)
     if in_map_frame:
-        info.warnings.append(
-            "points are in the map frame: transformed to the sensor frame by VIEWPOINT"
-        )
-    origin = Origin()
-    sources = [
-        CloudSource(
-            file.name,
-            partial(_read_cloud, file, in_map_frame, origin),
-            stamps[i] if stamps else None,
-        )
-        for i, file in enumerate(files)
-    ]
-    recording = build_recording(sources, info, options, progress, scratch)
-    if notes := origin.notes():
-        recording.source.update(notes)
-        recording.source["warnings"] += origin.warnings()
+        text = "points are in the map frame: transformed to the sensor frame by VIEWPOINT"
+        info.warnings.append(text)
+    read_cloud = partial(_read_cloud, in_map_frame=in_map_frame, origin=origin)
+    recording = build_recording(sources_of(files, EXTENSIONS, read_cloud), info, context)
+    origin.add_notes(recording, in_sensor_frame=True)
     return recording
 
 

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_file, require_new_file
 from stillmap.core.recording import Recording
+from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud.binary_table import Field, TableLayout, read_columns
 from stillmap.io.point_cloud.files import iter_map_points, require_nonempty_file
-from stillmap.io.point_cloud.scans import Cloud, Origin, PointBuffer, read_clouds
-from stillmap.io.text_lines import Progress
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.io.point_cloud.scans import Cloud, Origin, read_clouds
 
 EXTENSIONS = (".ply",)
 
@@ -28,24 +28,19 @@ _TYPES = {
 }
 
 
-def read(
-    path: Path,
-    options: ReadOptions,
-    progress: Progress | None = None,
-    scratch: Path | None = None,
-) -> Recording:
+def read(path: Path, context: ReadContext) -> Recording:
     """Read the vertices of one PLY file or of a folder of them.
 
     Raises:
         InputError: no cloud can be read.
     """
-    return read_clouds(path, "PLY", EXTENSIONS, _read_cloud, options, progress, scratch)
+    return read_clouds(path, "PLY", EXTENSIONS, _read_cloud, context)
 
 
 def _read_cloud(path: Path, origin: Origin, scratch: Path | None) -> Cloud:
-    points = PointBuffer(origin, scratch)
+    points = ArrayBuilder(np.float32, (3,), scratch)
     for block in read_columns(read_layout(path), ("x", "y", "z")):
-        points.add(np.stack(block, axis=1))
+        points.append(origin.shift(np.stack(block, axis=1)))
     return Cloud(points.finish())
 
 

@@ -8,13 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.arrays import ArrayBuilder, finite_rows
+from stillmap.core.arrays import finite_rows
 from stillmap.core.errors import InputError, MissingExtra
 from stillmap.core.recording import Recording
-from stillmap.io.builder import RecordingBuilder, SkippedRecords
+from stillmap.io.builder import ReadContext, RecordingBuilder, SkippedRecords
 from stillmap.io.point_cloud.files import list_files, stamps_from_names, strip_extension
 from stillmap.io.point_cloud.time_field import Clock, convert_times, detect_clock
-from stillmap.io.text_lines import Progress
 from stillmap.preprocessing.options import MAX_POINT_DISTANCE, ReadOptions
 
 _MAX_NAMES = 5  # of skipped files in a warning
@@ -63,9 +62,7 @@ class DatasetInfo(NamedTuple):
 def build_recording(
     sources: Sequence[CloudSource],
     info: DatasetInfo,
-    options: ReadOptions,
-    progress: Progress | None = None,
-    scratch: Path | None = None,
+    context: ReadContext,
     **more: Any,
 ) -> Recording:
     """Build a recording from clouds; unreadable ones are skipped and counted in `source`.
@@ -73,16 +70,14 @@ def build_recording(
     Args:
         sources: in order; scans without stamps are taken one second apart.
         info: see DatasetInfo.
-        options: see ReadOptions; the one sensor is the base of the robot.
-        progress: called with the share of clouds read.
-        scratch: folder for large arrays.
+        context: see ReadContext; the one sensor is the base of the robot.
         more: other fields of the Recording.
 
     Raises:
         InputError: no cloud can be read, or a library is missing.
     """
-    reject_laser_poses(options)
-    skipped, scans = SkippedRecords(), _ScanBuilder(sources, info, options, scratch)
+    _reject_laser_poses(context.options)
+    skipped, scans = SkippedRecords(), _ScanBuilder(sources, info, context)
     lost: list[str] = []
     for number, source in enumerate(sources):
         try:
@@ -96,17 +91,18 @@ def build_recording(
             lost.append(source.name)
         else:
             scans.add(number, source.stamp_ns, cloud)
-        if progress is not None:
-            progress((number + 1) / len(sources))
+        if context.progress is not None:
+            context.progress((number + 1) / len(sources))
     if not len(scans):
-        raise no_usable_scan_error(info, skipped)
+        reasons = f"usable scan: {skipped.summary('file')}" if skipped.total else "scan"
+        raise InputError(f"holds no {reasons}", where=str(info.path))
     if lost:
         shown = ", ".join(lost[:_MAX_NAMES]) + (", ..." if len(lost) > _MAX_NAMES else "")
         info.warnings.append(f"skipped {len(lost)} of {len(sources)}: {shown}")
     return scans.recording(skipped, **more)
 
 
-def reject_laser_poses(options: ReadOptions) -> None:
+def _reject_laser_poses(options: ReadOptions) -> None:
     """Refuse laser options, which are for 2D recordings.
 
     Raises:
@@ -118,13 +114,12 @@ def reject_laser_poses(options: ReadOptions) -> None:
         raise InputError("the laser's place on the robot can be given for 2D recordings only")
 
 
-def no_usable_scan_error(info: DatasetInfo, skipped: SkippedRecords) -> InputError:
-    """The error for a recording without a usable scan."""
-    what = f"holds no usable scan: {skipped.summary('file')}" if skipped.total else "holds no scan"
-    return InputError(what, where=str(info.path))
+def refuse(file: Path, what: str) -> Cloud:
+    """The reader of a file that is known to be unusable."""
+    raise InputError(what, where=str(file))
 
 
-def range_options_note(options: ReadOptions) -> dict[str, Any]:
+def _range_options_note(options: ReadOptions) -> dict[str, Any]:
     """The range options that are set, for Recording.source."""
     default = ReadOptions()
     names = ("min_range", "max_range", "free_range")
@@ -145,13 +140,9 @@ class _ScanBuilder:
     """Collects clouds; the first one decides whether points have times."""
 
     def __init__(
-        self,
-        sources: Sequence[CloudSource],
-        info: DatasetInfo,
-        options: ReadOptions,
-        scratch: Path | None,
+        self, sources: Sequence[CloudSource], info: DatasetInfo, context: ReadContext
     ) -> None:
-        self._info, self._options, self._scratch = info, options, scratch
+        self._info, self._context = info, context
         self._period = _median_period(sources)
         self._gathered: RecordingBuilder | None = None
         self._clock: Clock | None = None
@@ -165,9 +156,8 @@ class _ScanBuilder:
         points = cloud.points
         if self._gathered is None:
             self._clock = self._detect_clock(cloud)
-            self._gathered = RecordingBuilder(
-                3, self._options, beam_times=self._clock is not None, folder=self._scratch
-            )
+            timed = self._clock is not None
+            self._gathered = RecordingBuilder(3, self._context, beam_times=timed)
         stamp_ns = cloud.stamp_ns if stamp_ns is None else stamp_ns
         beam_time = None
         if self._clock is not None and cloud.times is not None:
@@ -193,9 +183,8 @@ class _ScanBuilder:
         assert self._gathered is not None
         info, warnings = self._info, self._info.warnings
         if self._without_stamp and len(self) > 1:
-            warnings.append(
-                f"{self._without_stamp} scans without a stamp are taken one second apart"
-            )
+            text = f"{self._without_stamp} scans without a stamp are taken one second apart"
+            warnings.append(text)
         T = self._stack_poses()
         source = {
             "path": str(info.path),
@@ -203,7 +192,7 @@ class _ScanBuilder:
             "skipped": skipped.to_dict(),
             "skipped_unit": "file",
             "warnings": warnings,
-            **range_options_note(self._options),
+            **_range_options_note(self._context.options),
         }
         return self._gathered.build(
             np.eye(4)[None], source=source, **{"T_recorded_base": T, **more}
@@ -235,8 +224,6 @@ def _usable_mask(points: NDArray[Any]) -> NDArray[np.bool_]:
 
 _MAX_COORDINATE = 4096.0  # m: float32 resolves half a millimetre up to there
 
-NO_SENSOR = "no sensor pose is recorded: beams start at the origin"
-
 
 class Origin:
     """Common origin of all clouds of a recording, so that float32 coordinates stay precise.
@@ -256,22 +243,18 @@ class Origin:
         with np.errstate(over="ignore"):
             return (points - (0.0 if self.position is None else self.position)).astype(np.float32)
 
-    def notes(self) -> dict[str, Any]:
-        """Entry for Recording.source; valid after the first cloud."""
-        is_shifted = self.position is not None and bool(np.any(self.position != 0.0))
-        return (
-            {"origin": [float(v) for v in self.position]}
-            if is_shifted and self.position is not None
-            else {}
-        )
-
-    def warnings(self) -> list[str]:
-        """Warnings on the assumed sensor position."""
-        place = self.notes().get("origin")
-        if place is None:
-            return [NO_SENSOR]
-        at = " ".join(f"{value:.0f}" for value in place)
-        return [f"no sensor pose is recorded: beams start at {at}, the new origin"]
+    def add_notes(self, recording: Recording, *, in_sensor_frame: bool = False) -> None:
+        """Note the origin in the source of a recording, and warn that the sensor is assumed there;
+        neither where points are `in_sensor_frame` and near its origin."""
+        if self.position is not None and np.any(self.position != 0.0):
+            recording.source["origin"] = self.position.tolist()
+            at = " ".join(f"{value:.0f}" for value in self.position)
+            at = f"{at}, the new origin"
+        elif in_sensor_frame:
+            return
+        else:
+            at = "the origin"
+        recording.source["warnings"].append(f"no sensor pose is recorded: beams start at {at}")
 
 
 def _find_origin(points: NDArray[np.float64]) -> NDArray[np.float64] | None:
@@ -283,55 +266,45 @@ def _find_origin(points: NDArray[np.float64]) -> NDArray[np.float64] | None:
     return np.round(middle) if np.abs(middle).max() > _MAX_COORDINATE else np.zeros(3)
 
 
-class PointBuffer:
-    """Collects blocks of points (n, 3) relative to an origin; memory-mapped where large."""
-
-    def __init__(self, origin: Origin, scratch: Path | None) -> None:
-        self._origin = origin
-        self._points = ArrayBuilder(np.float32, (3,), scratch)
-
-    def add(self, points: NDArray[Any]) -> None:
-        self._points.append(self._origin.shift(points))
-
-    def finish(self) -> NDArray[np.float32]:
-        return self._points.finish()
+def files_of(path: Path, extensions: tuple[str, ...]) -> list[Path]:
+    """A file itself, or the files of a folder."""
+    return [path] if path.is_file() else list_files(path, extensions)
 
 
-CloudReader = Callable[[Path, Origin, Path | None], Cloud]
+def sources_of(
+    files: Sequence[Path], extensions: tuple[str, ...], read_cloud: Callable[[Path], Cloud]
+) -> list[CloudSource]:
+    """A source per file, with the stamp that its name holds."""
+    names = [strip_extension(file.name, extensions) for file in files]
+    stamps: Sequence[int | None] = stamps_from_names(names) or [None] * len(files)
+    return [
+        CloudSource(file.name, partial(read_cloud, file), stamp)
+        for file, stamp in zip(files, stamps, strict=True)
+    ]
 
 
 def read_clouds(
     path: Path,
-    name: str,
+    format: str,
     extensions: tuple[str, ...],
-    read_cloud: CloudReader,
-    options: ReadOptions,
-    progress: Progress | None,
-    scratch: Path | None,
+    read_cloud: Callable[..., Cloud],
+    context: ReadContext,
 ) -> Recording:
     """Read a file or folder of clouds without sensor poses.
 
     Args:
         path: of the file or folder.
-        name: of the format.
+        format: its name.
         extensions: of its files.
-        read_cloud: reads one file, given the common origin and a scratch folder.
-        options, progress, scratch: see `build_recording`.
+        read_cloud: reads one file, given the common `origin` and a `scratch` folder.
+        context: see ReadContext.
 
     Raises:
         InputError: no cloud can be read.
     """
-    files = [path] if path.is_file() else list_files(path, extensions)
-    stamps = stamps_from_names([strip_extension(file.name, extensions) for file in files])
     origin = Origin()
-    info = DatasetInfo(path, name, [], single=path.is_file())
-    sources = [
-        CloudSource(
-            file.name, partial(read_cloud, file, origin, scratch), stamps[i] if stamps else None
-        )
-        for i, file in enumerate(files)
-    ]
-    recording = build_recording(sources, info, options, progress, scratch)
-    recording.source.update(origin.notes())
-    recording.source["warnings"] += origin.warnings()
+    read_cloud = partial(read_cloud, origin=origin, scratch=context.scratch)
+    sources = sources_of(files_of(path, extensions), extensions, read_cloud)
+    recording = build_recording(sources, DatasetInfo(path, format, [], path.is_file()), context)
+    origin.add_notes(recording)
     return recording

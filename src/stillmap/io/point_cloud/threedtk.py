@@ -14,16 +14,16 @@ from numpy.typing import NDArray
 
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
+from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud.binary_table import iter_text_lines, parse_numbers
-from stillmap.io.point_cloud.files import (
-    list_files,
-    require_nonempty_file,
-    rigid_transform,
-    strip_extension,
+from stillmap.io.point_cloud.files import require_nonempty_file, rigid_transform, strip_extension
+from stillmap.io.point_cloud.scans import (
+    Cloud,
+    CloudSource,
+    DatasetInfo,
+    build_recording,
+    files_of,
 )
-from stillmap.io.point_cloud.scans import Cloud, CloudSource, DatasetInfo, build_recording
-from stillmap.io.text_lines import Progress
-from stillmap.preprocessing.options import ReadOptions
 
 EXTENSIONS = (".3d", ".3d.gz")
 
@@ -37,25 +37,20 @@ _CODE_WIDTH, _CODE_GAP, _MIN_CODE_SHARE = 0.012, 0.3, 0.001
 _AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
-def read(
-    path: Path,
-    options: ReadOptions,
-    progress: Progress | None = None,
-    scratch: Path | None = None,
-) -> Recording:
+def read(path: Path, context: ReadContext) -> Recording:
     """Read one 3DTK scan or a folder of them.
 
     Raises:
         InputError: no scan can be read.
     """
-    files = [path] if path.is_file() else list_files(path, EXTENSIONS)
+    files, options = files_of(path, EXTENSIONS), context.options
     info = DatasetInfo(path, "3DTK", [], single=path.is_file())
     code = _find_max_range_code(files) if options.max_range is None else None
     if code is not None:
         info.warnings.append(f"ranges from {code:.2f} m on are a maximum-range code of the laser")
-        options = replace(options, max_range=code)
+        context = context._replace(options=replace(options, max_range=code))
     sources = [CloudSource(file.name, partial(_read_cloud, file)) for file in files]
-    return build_recording(sources, info, options, progress, scratch)
+    return build_recording(sources, info, context)
 
 
 def _find_max_range_code(files: list[Path]) -> float | None:

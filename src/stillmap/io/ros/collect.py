@@ -1,11 +1,10 @@
 """Selects the topics of a bag that make a recording, and collects their messages in one pass."""
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from stillmap.core.errors import InputError
-from stillmap.io.builder import SkippedRecords
+from stillmap.io.builder import ReadContext, SkippedRecords
 from stillmap.io.ros.bag_types import Bag, Channel, Message
 from stillmap.io.ros.image import ImageCollector
 from stillmap.io.ros.laser_scan import UNREADABLE, LaserCollector
@@ -25,7 +24,6 @@ from stillmap.io.ros.messages import (
 )
 from stillmap.io.ros.point_cloud2 import CloudCollector
 from stillmap.io.ros.tf import Odometry, TransformTree
-from stillmap.io.text_lines import Progress
 from stillmap.preprocessing.options import ReadOptions
 
 _SCAN_TYPES = (LASER_SCAN, MULTI_ECHO, POINT_CLOUD)
@@ -179,21 +177,13 @@ class BagContent:
         )
 
 
-def collect_messages(
-    bag: Bag,
-    selection: TopicSelection,
-    options: ReadOptions,
-    progress: Progress | None,
-    scratch: Path | None,
-) -> BagContent:
+def collect_messages(bag: Bag, selection: TopicSelection, context: ReadContext) -> BagContent:
     """Read the selected topics.
 
     Raises:
         DamagedBagError: an indexed bag is damaged.
     """
-    content = BagContent(
-        LaserCollector(scratch), CloudCollector(options, scratch), ImageCollector()
-    )
+    content = BagContent(LaserCollector(context.scratch), CloudCollector(context), ImageCollector())
     total = sum(c.n_messages for c in bag.channels if c.topic in selection.all)
     for number, message in enumerate(bag.messages(selection.all), start=1):
         topic = message.channel.topic
@@ -206,8 +196,8 @@ def collect_messages(
             content.images.add_message(message)
         else:
             _add_pose(content, message, selection, number)
-        if progress is not None and number % _PROGRESS_INTERVAL == 0:
-            progress(min(number / max(total, 1), 1.0))
+        if context.progress is not None and number % _PROGRESS_INTERVAL == 0:
+            context.progress(min(number / max(total, 1), 1.0))
     return content
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from stillmap.core import arrays, se2
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.io.builder import SkippedRecords
+from stillmap.io.builder import ReadContext, SkippedRecords
 from stillmap.io.carmen import extrinsics
 from stillmap.io.carmen.extrinsics import Extrinsics
 from stillmap.io.ros import base_frame, scan_beams
@@ -26,14 +26,13 @@ _MAX_PAUSE = 500_000_000  # ns between transforms over which the joint's angle i
 _BLOCK = 1 << 14  # beams at a time
 
 
-def build_laser_recording(
-    content: BagContent, options: ReadOptions, scratch: Path | None
-) -> Recording:
+def build_laser_recording(content: BagContent, context: ReadContext) -> Recording:
     """Build the 2D recording of all lasers.
 
     Raises:
         InputError: no scan can be used, or options do not fit the lasers.
     """
+    options = context.options
     lasers = base_frame.select_lasers(content, options)
     used, poses = lasers.scans, lasers.poses
     options.check_laser_count(len(used))
@@ -46,7 +45,7 @@ def build_laser_recording(
         rules.append(rule)
         warnings += [f"{scans.topic}: {text}" for text in more]
     mirrored = [mounting.upside_down for mounting in mountings]
-    beams = scan_beams.convert_to_beams(used, rules, mirrored, scratch)
+    beams = scan_beams.convert_to_beams(used, rules, mirrored, context.scratch)
     stamp_ns = np.concatenate([s.stamp_ns for s in used])[beams.scan]
     odom, origin, more = base_frame.find_odometry(content, poses.base, stamp_ns, options)
     skipped = SkippedRecords().merge(*(lasers.skipped[topic] for topic in {s.topic for s in used}))
@@ -140,9 +139,7 @@ def _number_sensors(lasers: list[LaserScans], mountings: list[_Mounting]) -> NDA
     return np.concatenate(numbers)
 
 
-def build_tilting_recording(
-    content: BagContent, options: ReadOptions, scratch: Path | None
-) -> Recording:
+def build_tilting_recording(content: BagContent, context: ReadContext) -> Recording:
     """Build the 3D recording of a laser that tilts or pans.
 
     Every scan has a sensor of its own at the laser's pose at the scan's stamp; beams are placed by
@@ -151,7 +148,8 @@ def build_tilting_recording(
     Raises:
         InputError: there are several lasers, or this one does not move on the robot.
     """
-    lasers = base_frame.select_lasers(content, options)
+    scratch = context.scratch
+    lasers = base_frame.select_lasers(content, context.options)
     scans, T_base_sensor, poses = lasers.scans[0], lasers.T_base_sensor[0], lasers.poses
     if len(lasers.scans) > 1:
         raise InputError(f"{scans.topic}: scans of several lasers: only one can tilt")
@@ -160,7 +158,7 @@ def build_tilting_recording(
             f"{scans.topic}: {scans.frame!r} does not tilt in {poses.base!r}",
             hint="transforms must say how the joint moves, as robot_state_publisher does",
         )
-    rule, more = scan_beams.find_range_rule(scans, options)
+    rule, more = scan_beams.find_range_rule(scans, context.options)
     beams = scan_beams.convert_to_beams([scans], [rule], [False], scratch)
     points, n_lost = _convert_to_3d(content, poses.base, scans, beams, T_base_sensor, scratch)
     hit = arrays.copy(beams.hit, scratch)

@@ -2,18 +2,16 @@
 
 from array import array
 from collections import Counter
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.io.builder import RecordingBuilder, SkippedRecords
+from stillmap.io.builder import ReadContext, RecordingBuilder, SkippedRecords
 from stillmap.io.point_cloud import time_field
 from stillmap.io.ros.bag_types import Message
 from stillmap.io.ros.laser_scan import UNREADABLE
 from stillmap.io.ros.messages import decode, frame_name, stamp_ns
-from stillmap.preprocessing.options import ReadOptions
 
 NO_COORDINATES = "cloud without x, y and z"
 WRONG_SIZE = "cloud whose size is not what it states"
@@ -94,14 +92,14 @@ class CloudCollector:
         skipped: messages that were skipped, by topic.
     """
 
-    def __init__(self, options: ReadOptions, scratch: Path | None) -> None:
+    def __init__(self, context: ReadContext) -> None:
         self._count: Counter[str] = Counter()  # messages by topic
         self.skipped: dict[str, SkippedRecords] = {}
         self.sensors: dict[tuple[str, str], int] = {}
         self.timed: set[int] = set()
         self.stamp_ns, self.sensor, self.number = array("q"), array("i"), array("q")
         self.beams = array("q")
-        self.scans = RecordingBuilder(3, options, beam_times=True, folder=scratch)
+        self.scans = RecordingBuilder(3, context, beam_times=True)
 
     def add_message(self, message: Message) -> None:
         """Add a message; one that cannot be used is counted."""

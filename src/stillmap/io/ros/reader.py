@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.core.timestamps import longest_non_decreasing
-from stillmap.io.builder import SkippedRecords
+from stillmap.io.builder import ReadContext, SkippedRecords
 from stillmap.io.ros import base_frame, laser_recording
 from stillmap.io.ros.bag import bag_size, open_bag
 from stillmap.io.ros.bag_types import Bag, DamagedBagError
@@ -20,17 +20,14 @@ from stillmap.io.ros.collect import BagContent, collect_messages, select_topics
 from stillmap.io.ros.laser_scan import TIME_BACKWARDS
 from stillmap.io.ros.limits import limit_output
 from stillmap.io.ros.point_cloud2 import CloudCollector
-from stillmap.io.text_lines import Progress
 from stillmap.preprocessing.options import ReadOptions
 
-_BuildFromLasers = Callable[[BagContent, ReadOptions, Path | None], Recording]
+_BuildFromLasers = Callable[[BagContent, ReadContext], Recording]
 
 _STILL = 1e-3  # m and entries of a rotation matrix: a sensor that moves less is fixed
 
 
-def read(
-    path: Path, options: ReadOptions, progress: Progress | None, scratch: Path | None
-) -> Recording:
+def read(path: Path, context: ReadContext) -> Recording:
     """Read a bag: ROS 1, or a file or folder of ROS 2.
 
     Bad messages are skipped and counted. A bag that is cut, damaged or without an index is read
@@ -39,38 +36,30 @@ def read(
     Raises:
         InputError: it cannot be read, or holds no usable scan.
     """
-    return _read(path, options, progress, scratch, laser_recording.build_laser_recording)
+    return _read(path, context, laser_recording.build_laser_recording)
 
 
-def read_tilting(
-    path: Path, options: ReadOptions, progress: Progress | None, scratch: Path | None
-) -> Recording:
+def read_tilting(path: Path, context: ReadContext) -> Recording:
     """Read the scans of a laser that tilts or pans as 3D points, by the bag's transform tree.
 
     Args:
         path: of the bag.
-        options: `topic` names the scans, or clouds made from them; `base_frame` the robot.
-        progress, scratch: as for any recording.
+        context: the option `topic` names the scans, or clouds made from them; `base_frame` the
+            robot.
 
     Raises:
         InputError: it cannot be read, or transforms do not say how the laser moves.
     """
-    return _read(path, options, progress, scratch, laser_recording.build_tilting_recording)
+    return _read(path, context, laser_recording.build_tilting_recording)
 
 
-def _read(
-    path: Path,
-    options: ReadOptions,
-    progress: Progress | None,
-    scratch: Path | None,
-    build: _BuildFromLasers,
-) -> Recording:
+def _read(path: Path, context: ReadContext, build: _BuildFromLasers) -> Recording:
     damage, size = "", bag_size(path)
     for trusted in (True, False):
-        reopen = partial(open_bag, path, scratch, trusted=trusted)
+        reopen = partial(open_bag, path, context.scratch, trusted=trusted)
         try:
             with limit_output(size), closing(reopen()) as bag:
-                recording = _build_recording(bag, options, progress, scratch, reopen, build)
+                recording = _build_recording(bag, context, reopen, build)
         except DamagedBagError as error:
             damage = str(error)
         except InputError as error:
@@ -88,39 +77,32 @@ def _read(
     raise InputError(f"is damaged: {damage}", where=str(path))
 
 
-def list_scan_messages(
-    bag: Bag, options: ReadOptions, scratch: Path | None
-) -> list[tuple[str, int]]:
+def list_scan_messages(bag: Bag, context: ReadContext) -> list[tuple[str, int]]:
     """(T,) topic and number of the message, from 1, of each scan that is read from a bag.
 
     Raises:
         DamagedBagError: an indexed bag is damaged.
         InputError: it holds no usable scan, or point clouds.
     """
-    topics = select_topics(bag, options)
+    topics = select_topics(bag, context.options)
     if topics.clouds:
         raise InputError("holds point clouds: only beams of laser scans can be blanked")
-    content = collect_messages(bag, topics, options, None, scratch)
-    lasers = base_frame.select_lasers(content, options).scans
+    content = collect_messages(bag, topics, context)
+    lasers = base_frame.select_lasers(content, context.options).scans
     stamps = np.concatenate([scans.stamp_ns for scans in lasers])
     keys = [(scans.topic, int(number)) for scans in lasers for number in scans.number]
     return [keys[scan] for scan in np.argsort(stamps, kind="stable")]
 
 
 def _build_recording(
-    bag: Bag,
-    options: ReadOptions,
-    progress: Progress | None,
-    scratch: Path | None,
-    reopen: Callable[[], Bag],
-    build: _BuildFromLasers,
+    bag: Bag, context: ReadContext, reopen: Callable[[], Bag], build: _BuildFromLasers
 ) -> Recording:
-    topics = select_topics(bag, options)
-    content = collect_messages(bag, topics, options, progress, scratch)
+    topics = select_topics(bag, context.options)
+    content = collect_messages(bag, topics, context)
     if topics.clouds:
-        recording = _build_cloud_recording(content, options, reopen)
+        recording = _build_cloud_recording(content, context.options, reopen)
     else:
-        recording = build(content, options, scratch)
+        recording = build(content, context)
     recording.source.update(
         topics=topics.notes,
         skipped_unit="message",

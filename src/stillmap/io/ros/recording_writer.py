@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
+from stillmap.io.builder import ReadContext
 from stillmap.io.ros import message_writer
 from stillmap.io.ros.bag import open_bag
 from stillmap.io.ros.bag_types import Bag, BagKind, DamagedBagError, Message, detect_kind
@@ -221,7 +222,7 @@ def _copy(
     overwrite: bool,
 ) -> FilteredBag:
     kind, mcap = detect_kind(source)
-    keys = list_scan_messages(bag, options, out.absolute().parent)
+    keys = list_scan_messages(bag, ReadContext(options, scratch=out.absolute().parent))
     scan_of = {key: t for t, key in enumerate(keys)}
     if len(scan_of) != recording.n_scans:
         raise InputError("is not the bag that was mapped: other scans", where=str(source))
