@@ -6,7 +6,7 @@ import pytest
 from stillmap import _core, em
 from stillmap.core import chunks, se2
 from stillmap.core.recording import Recording
-from stillmap.em import coverage
+from stillmap.em import quality
 from stillmap.em.types import NoReturnModel
 
 RESOLUTION = 0.1
@@ -85,8 +85,8 @@ def test_obstructed_cells_are_thinly_observed(visitors):
 
 
 def test_thresholds(visitors, monkeypatch):
-    monkeypatch.setattr(coverage, "MIN_OBSERVATIONS", 2)
-    monkeypatch.setattr(coverage, "MOVER_RADIUS", 1.0)
+    monkeypatch.setattr(quality, "MIN_OBSERVATIONS", 2)
+    monkeypatch.setattr(quality, "MOVER_RADIUS", 1.0)
     occupancy, found = coverage_of(*visitors)
     assert (found.min_observations, found.mover_radius) == (2, 1.0)
     assert not at(occupancy, found.thinly_observed, 4.0, 1.8)

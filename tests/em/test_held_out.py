@@ -8,7 +8,7 @@ import pytest
 from stillmap import em
 from stillmap.core import chunks, se2
 from stillmap.core.recording import Recording
-from stillmap.em.held_out import select_held_out_scans
+from stillmap.em.quality import select_held_out_scans
 from stillmap.sim import CrowdOptions, LaserOptions, RobotOptions, Scene, simulate
 from stillmap.sim.walls import box
 

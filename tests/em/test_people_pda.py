@@ -5,7 +5,7 @@ import pytest
 
 from stillmap.core import kalman
 from stillmap.core.kalman import TrackStates
-from stillmap.em.people import tracker
+from stillmap.em import people_tracker as tracker
 
 
 # S = 0.03 + 0.1^2 = 0.04: one standard deviation of an innovation is 0.2 m, the gate 0.6 m

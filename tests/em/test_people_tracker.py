@@ -7,9 +7,14 @@ import pytest
 from made_up_scans import before, crossing, poses, recording, wall
 
 from stillmap import _core, em
-from stillmap.em.people import label_people, tracker
-from stillmap.em.people.detector import detect_segments
-from stillmap.em.people.tracker import Tracks, find_beams_in_boxes, track_people
+from stillmap.em import people_tracker as tracker
+from stillmap.em.people_detector import detect_segments
+from stillmap.em.people_tracker import (
+    Tracks,
+    find_beams_in_boxes,
+    label_people,
+    track_people,
+)
 
 TIMES = np.arange(0.0, 3.4, 0.2)
 PILLAR = (2.0, 2.6, 0.15)
@@ -44,7 +49,7 @@ def test_standing_objects_are_not_labelled():
     ("name", "value"),
     [
         ("_MIN_DISPLACEMENT", 10.0),
-        ("_MIN_TRACK_SCANS", 100),
+        ("MIN_TRACK_SCANS", 100),
         ("_MIN_CHANGED_SHARE", 1.0),
         ("_MAX_MISSED", 0.05),
     ],

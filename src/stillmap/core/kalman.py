@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
 
+SPEED_STD = 1.0  # m/s, of a new track: people walk
+
 
 @dataclass(frozen=True, eq=False)
 class TrackStates:
@@ -35,7 +37,7 @@ class TrackStates:
         return TrackStates(self.x[chosen], self.v[chosen], self.P[chosen])
 
 
-def initialize(x: Float, position_std: float, speed_std: float) -> TrackStates:
+def initialize(x: Float, position_std: float, speed_std: float = SPEED_STD) -> TrackStates:
     """States at positions x (K, 2) with zero velocity; standard deviations in m and m/s."""
     return TrackStates(
         x, np.zeros_like(x), np.tile([position_std**2, 0.0, speed_std**2], (len(x), 1))

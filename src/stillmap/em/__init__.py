@@ -1,7 +1,6 @@
 """The E-step: labels of beams, the occupancy map and the likelihood. No I/O."""
 
 from stillmap.em.change_hmm import CellHistories
-from stillmap.em.coverage import Coverage, count_observations
 from stillmap.em.estimator import (
     ESTIMATORS_3D,
     Estimator,
@@ -17,11 +16,11 @@ from stillmap.em.estimator import (
     recount_as_static,
 )
 from stillmap.em.ground import estimate_ground
-from stillmap.em.held_out import score_held_out_scans
 from stillmap.em.observations import time_bin_index
 from stillmap.em.occupancy_grid import GridWindow, ObservedCells, OccupancyMap, make_occupancy_map
 from stillmap.em.occupancy_hmm import final_e_step
 from stillmap.em.options import EmOptions, MapState
+from stillmap.em.quality import Coverage, count_observations, score_held_out_scans
 from stillmap.em.types import (
     CellProbabilities,
     ChangedCells,

@@ -12,7 +12,7 @@ from stillmap.core.recording import Recording
 from stillmap.em import beam_counting, occupancy_hmm
 from stillmap.em.occupancy_grid import ObservedCells
 from stillmap.em.options import EmOptions
-from stillmap.em.people import label_people
+from stillmap.em.people_tracker import label_people
 from stillmap.em.types import EStepResult, Float, Grid, NoReturnModel, fill_beams
 
 Estimator = Literal["stillmap", "paper", "hit-ratio", "tracker"]

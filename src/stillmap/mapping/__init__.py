@@ -2,9 +2,8 @@
 
 from stillmap.mapping.change_detection import Change, detect_changes
 from stillmap.mapping.change_detection_3d import detect_changes_3d
-from stillmap.mapping.changed_objects import find_changed_object_beams
+from stillmap.mapping.changed_beams import find_changed_object_beams, relabel_changes
 from stillmap.mapping.doors import compute_swept_cells
-from stillmap.mapping.relabelling import relabel_changes
 
 __all__ = [
     "Change",

@@ -30,34 +30,24 @@ def sample_dynamic_points(
     recording: Recording,
     poses: NDArray[np.float64],
     p_static: NDArray[np.float32],
-    threshold: float = DYNAMIC_BELOW,
     limit: int = 200_000,
 ) -> NDArray[np.float32]:
-    """Sample the end points, in the map frame, of the hits with p_static below `threshold`.
+    """Sample the end points, in the map frame, of the hits with p_static < 0.5.
 
     Args:
         recording: T scans with M beams in D dimensions.
         poses: (T, D+1, D+1) float64, T_map_base.
         p_static: (M,) float32.
-        threshold: of p_static.
         limit: maximum number of points; of more, evenly spaced ones are taken.
 
     Returns:
         (K, D) float32 in metres, in the recording's order, K <= limit.
     """
-    beams = _dynamic_beams(recording, p_static, threshold, limit)
-    return recording.end_points(beams, poses).astype(np.float32)
-
-
-def _dynamic_beams(
-    recording: Recording, p_static: NDArray[np.float32], threshold: float, limit: int
-) -> NDArray[np.int64]:
-    """(K,) indices of at most `limit` dynamic beams, evenly spaced."""
+    arrays = recording.hit, p_static
 
     def is_dynamic(block: slice) -> NDArray[np.bool_]:
-        return recording.hit[block] & (p_static[block] < threshold)
+        return recording.hit[block] & (p_static[block] < DYNAMIC_BELOW)
 
-    arrays = recording.hit, p_static
     counts = [int(np.count_nonzero(is_dynamic(block))) for block in iter_blocks(*arrays)]
     total = sum(counts)
     kept = min(total, limit)
@@ -68,4 +58,4 @@ def _dynamic_beams(
         low, high = np.searchsorted(chosen, [start, end])
         found = np.flatnonzero(is_dynamic(block))
         parts.append(block.start + found[chosen[low:high] - start])
-    return np.concatenate(parts)
+    return recording.end_points(np.concatenate(parts), poses).astype(np.float32)

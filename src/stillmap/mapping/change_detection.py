@@ -117,17 +117,14 @@ class _BinStamps:
     """First and last stamps of the scans of each time bin, in ns."""
 
     def __init__(self, recording: Recording, time_bin: float) -> None:
-        number = time_bin_index(recording, time_bin)
-        begins = np.flatnonzero(np.diff(number, prepend=number[:1] - 1))
-        ends = np.append(begins[1:], len(number)) - 1
-        self._number = number[begins]
-        self._first, self._last = recording.stamp_ns[begins], recording.stamp_ns[ends]
+        self._number = time_bin_index(recording, time_bin)
+        self._stamp_ns = recording.stamp_ns
 
     def first(self, bins: NDArray[np.int32]) -> NDArray[np.int64]:
-        return np.asarray(self._first[np.searchsorted(self._number, bins)], np.int64)
+        return self._stamp_ns[np.searchsorted(self._number, bins)]
 
     def last(self, bins: NDArray[np.int32]) -> NDArray[np.int64]:
-        return np.asarray(self._last[np.searchsorted(self._number, bins)], np.int64)
+        return self._stamp_ns[np.searchsorted(self._number, bins, side="right") - 1]
 
 
 class _Events(NamedTuple):
@@ -139,9 +136,7 @@ class _Events(NamedTuple):
     after: NDArray[np.int64]
 
     def select(self, chosen: Index) -> "_Events":
-        return _Events(
-            self.cell[chosen], self.came[chosen], self.before[chosen], self.after[chosen]
-        )
+        return _Events._make(column[chosen] for column in self)
 
 
 def _make_events(changed: ChangedCells, cells: Index, stamps: _BinStamps) -> _Events:

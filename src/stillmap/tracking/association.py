@@ -23,7 +23,6 @@ SPLIT_WINDOW = 6.0  # s: how far back in time a track is split
 ACCELERATION = 1.0  # m2/s3: spectral density of the random acceleration
 
 _POSITION_STD = 0.12  # m: of the mean of an object's end points
-_SPEED_STD = 1.0  # m/s: of the initial speed
 _GATE = 0.2  # m: association distance
 _WIDE_GATE = 0.35  # m: the same for a track without any nearer point
 _GATE_SIGMAS = 2.0  # standard deviations of the prediction in addition
@@ -60,7 +59,7 @@ def split_track(points: DynamicPoints, owned: Index, one: Index, other: Index) -
     xy, seconds = points.xy, points.seconds[points.scan]
     now = float(seconds[one[0]])
     centroids = np.array([xy[one].mean(axis=0), xy[other].mean(axis=0)])
-    states = kalman.initialize(centroids, _POSITION_STD, _SPEED_STD)
+    states = kalman.initialize(centroids, _POSITION_STD)
     seen = np.array([now, now])
     shares: tuple[list[Index], list[Index]] = ([owned[:0]], [owned[:0]])
     owned = owned[seconds[owned] > now - SPLIT_WINDOW]
@@ -133,7 +132,7 @@ class _Tracker:
         self.owner = arrays.empty((len(points.scan),), np.intp, points.scratch)
         self._points, self._max_gap = points, max_gap
         self._now, self._count = 0.0, 0
-        self._states = kalman.initialize(np.zeros((0, 2)), 1.0, 1.0)
+        self._states = kalman.initialize(np.zeros((0, 2)), _POSITION_STD)
         self._id, self._last = np.zeros(0, np.intp), np.zeros(0)
         # shape points: offset from the track's position, track (rising), time
         self._offset, self._of, self._when = np.zeros((0, 2)), np.zeros(0, np.intp), np.zeros(0)
@@ -207,7 +206,7 @@ class _Tracker:
     def _set(self, k: int, current: Index, velocity: Float) -> None:
         """Reset track k to these points and this velocity; append it where it is new."""
         xy = self._points.xy[current]
-        begun = kalman.initialize(xy.mean(axis=0)[None], _POSITION_STD, _SPEED_STD)
+        begun = kalman.initialize(xy.mean(axis=0)[None], _POSITION_STD)
         if k == len(self._states):
             self._append(TrackStates(begun.x, velocity[None], begun.P))
         else:
@@ -240,7 +239,7 @@ class _Tracker:
         _, which = np.unique(self._points.cluster[here[free]], return_inverse=True)
         xy, first = self._points.xy[here[free]], len(self._states)
         means = _means(xy, which, np.bincount(which))
-        self._append(kalman.initialize(means, _POSITION_STD, _SPEED_STD))
+        self._append(kalman.initialize(means, _POSITION_STD))
         claims[free] = first + which
         self._add_to_shapes(xy, claims[free])
 

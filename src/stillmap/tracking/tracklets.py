@@ -7,13 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays
+from stillmap.em.people_tracker import MIN_TRACK_SCANS
 from stillmap.tracking.association import ACCELERATION, HORIZON, regress_velocity
 from stillmap.tracking.clustering import DynamicPoints
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
-
-MIN_TRACK_SCANS = 4  # scans with detections of a confirmed track
 
 _MIN_DURATION = 0.6  # s from the first to the last detection of a confirmed track
 _PAIR_DISTANCE = 0.55  # m between two tracks that always move together: legs

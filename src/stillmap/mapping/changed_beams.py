@@ -1,17 +1,64 @@
-"""Beams that ended on objects which arrived or departed, while those stood there."""
+"""Beams of changed places: their labels, and those that ended on objects which came or left."""
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
 import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
 
-from stillmap.core.arrays import ArrayBuilder, iter_blocks
+from stillmap import em
+from stillmap.core import arrays
+from stillmap.core.chunks import iter_beams
 from stillmap.core.recording import Recording
 from stillmap.mapping.change_detection import Change
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
+Labels = NDArray[np.float32]
+
+
+def relabel_changes(
+    recording: Recording,
+    poses: Float,
+    p_static: Labels,
+    occupied: em.CellProbabilities,
+    histories: em.CellHistories,
+    changes: list[Change],
+    state: em.MapState,
+    threads: int = 1,
+) -> tuple[Labels, em.CellProbabilities]:
+    """Labels (M,) and map cells, taken from the cell histories within the listed changes.
+
+    There p_static of a beam is the probability that the map in this state shows the object that
+    reflected it. Changes of cells that are not listed are noise.
+
+    Args:
+        recording: M beams.
+        poses: (T, 3, 3) T_map_base.
+        p_static, occupied, histories: from the final E-step at these poses.
+        changes: from `detect_changes`.
+        state: state of changed places that the map shows.
+        threads: number of threads; the result does not depend on it.
+    """
+    if not changes:
+        return p_static, occupied
+    if not np.array_equal(occupied.cells, histories.cells):
+        raise ValueError("occupied: expected the cells of the final E-step")
+    listed = np.isin(_keys(histories.cells), _keys(np.concatenate([one.cells for one in changes])))
+    p_in_map, out = histories.p_in_map(state), arrays.copy(p_static, recording.scratch)
+    for _, beams, data in iter_beams(recording, poses, release=[out]):
+        surfel = histories.surfel_map.associate_beams(*data, threads)
+        ended = np.flatnonzero(surfel >= 0)
+        ended = ended[listed[surfel[ended]]]
+        out[beams][ended] = p_in_map[surfel[ended]]
+    p_occupied = np.where(listed, p_in_map * histories.p_in_cell, occupied.p_occupied)
+    return out, dataclasses.replace(occupied, p_occupied=p_occupied)
+
+
+def _keys(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(N,) one key per cell (N, 2); map coordinates stay far below 2 ** 31 cells."""
+    return np.asarray((cells[:, 0] << 32) + cells[:, 1], np.int64)
 
 
 def find_changed_object_beams(
@@ -30,8 +77,8 @@ def find_changed_object_beams(
         for one in changes
         if one.kind != "comes and goes" or len(one.swept_cells) != len(one.cells)
     ]
-    found = ArrayBuilder(np.intp, (), recording.scratch)
-    for block in iter_blocks(recording.hit, p_static) if stays else ():
+    found = arrays.ArrayBuilder(np.intp, (), recording.scratch)
+    for block in arrays.iter_blocks(recording.hit, p_static) if stays else ():
         beam = block.start + np.flatnonzero(recording.hit[block] & (p_static[block] < 0.5))
         ends, scan = recording.end_points(beam, poses), recording.scans_of(beam)
         cells, stamp = np.floor(ends / resolution).astype(np.int64), recording.stamp_ns[scan]

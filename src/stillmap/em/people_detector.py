@@ -148,7 +148,7 @@ def _is_free(recording: Recording, scan: int, T_map_sensor: Float, xy: Float) ->
     position = (offset[:, :, None] * T_map_sensor[:2, :2]).sum(axis=1)
     angle = np.arctan2(points[:, 1], points[:, 0])
     turn = np.arctan2(position[:, 1], position[:, 0])[:, None] - angle
-    error = np.abs((turn + np.pi) % (2.0 * np.pi) - np.pi)
+    error = np.abs(se2.wrap(turn))
     nearest = np.argsort(error, axis=1, kind="stable")[:, :_NEAREST_BEAMS]
     close = np.take_along_axis(error, nearest, axis=1).max(axis=1) <= _MAX_BEARING_ERROR
     return np.asarray(close & (r[nearest].min(axis=1) > np.hypot(*position.T) + _RANGE_JUMP))

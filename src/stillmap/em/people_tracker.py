@@ -1,11 +1,14 @@
-"""Tracking of people by probabilistic data association (PDA), and the beams on them.
+"""Tracking of people by probabilistic data association (PDA), and the beams on them: a baseline.
+
+After D. Haehnel, D. Schulz, W. Burgard, *Map Building with Mobile Robots in Populated
+Environments*, IROS 2002; docs/tracker.md lists what is simpler here.
 
 Bar-Shalom and Fortmann, *Tracking and Data Association* (1988), for one track. Where tracks compete
 for a detection its weight is shared as in R. J. Fitzgerald, *Development of practical PDA logic for
 multitarget tracking by microprocessor* (ACC 1986), instead of by joint events over all tracks.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,14 +17,13 @@ from stillmap.core import kalman
 from stillmap.core.arrays import iter_blocks
 from stillmap.core.kalman import TrackStates
 from stillmap.core.recording import Recording
-from stillmap.em.people.detector import Detections, detect_segments, find_changed
+from stillmap.em.people_detector import Detections, detect_segments, find_changed
 from stillmap.em.types import Float
 
 Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
 _DETECTION_STD = 0.1  # m, of a detection from the middle of its person: legs swing
-_SPEED_STD = 1.0  # m/s, of a new track
 _ACCELERATION = 0.5  # m2/s3, spectral density of random acceleration
 _GATE = 2.5  # standard deviations within which detections may belong to a track
 _P_DETECTION = 0.9  # of a person in sight
@@ -33,7 +35,7 @@ _MIN_P_CHANGED = 0.25  # the same of changed detections: of two legs, one stands
 
 _MIN_DISPLACEMENT = 0.5  # m from its start that confirms a track as a person
 _MIN_CHANGED_SHARE = 0.2  # of the scans, in which a person's position was free shortly before
-_MIN_TRACK_SCANS = 4  # with detections
+MIN_TRACK_SCANS = 4  # with detections
 _HALF_BOX = 0.4  # m to each side of a person within which beams are dynamic
 
 
@@ -56,8 +58,7 @@ class Tracks(NamedTuple):
 
     def select(self, chosen: Mask) -> "Tracks":
         """Some of the entries."""
-        columns: tuple[Any, ...] = tuple(column[chosen] for column in self)
-        return Tracks(*columns)
+        return Tracks._make(column[chosen] for column in self)
 
 
 class _ActiveTracks(NamedTuple):
@@ -77,8 +78,8 @@ class _ActiveTracks(NamedTuple):
     changed: Mask
 
     def select(self, chosen: Mask) -> "_ActiveTracks":
-        columns: tuple[Any, ...] = tuple(column[chosen] for column in self[1:])
-        return _ActiveTracks(self.states.select(chosen), *columns)
+        rest = (column[chosen] for column in self[1:])
+        return _ActiveTracks._make([self.states.select(chosen), *rest])
 
 
 def gate(states: TrackStates, xy: Float) -> NDArray[np.bool_]:
@@ -146,7 +147,7 @@ def track_people(detections: Detections, changed: Mask, seconds: Float) -> Track
     np.maximum.at(last, at.track, at.scan)
     scans = np.bincount(at.track, minlength=n)
     moving = np.bincount(at.track, at.changed, n) >= _MIN_CHANGED_SHARE * scans
-    person = (displacement >= _MIN_DISPLACEMENT) & (scans >= _MIN_TRACK_SCANS) & moving
+    person = (displacement >= _MIN_DISPLACEMENT) & (scans >= MIN_TRACK_SCANS) & moving
     return tracks.select(person[tracks.track] & (tracks.scan <= last[tracks.track]))
 
 
@@ -187,7 +188,7 @@ def _update_tracks(
 def _start_tracks(xy: Float, changed: Mask, first_number: int, now: float) -> _ActiveTracks:
     """A new track at each detection (N, 2)."""
     n = len(xy)
-    states = kalman.initialize(xy, _DETECTION_STD, _SPEED_STD)
+    states = kalman.initialize(xy, _DETECTION_STD)
     numbers = first_number + np.arange(n)
     return _ActiveTracks(states, numbers, np.full(n, now), np.ones(n, bool), changed)
 
