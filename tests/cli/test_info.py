@@ -36,9 +36,8 @@ def path(tmp_path):
 
 def run(*arguments):
     parser = argparse.ArgumentParser()
-    info.add_parser(parser.add_subparsers())
-    args = parser.parse_args(["info", *map(str, arguments)])
-    return args.run(args)
+    info.add_arguments(parser)
+    return info.run(parser.parse_args([*map(str, arguments)]))
 
 
 def test_json(path, capsys):

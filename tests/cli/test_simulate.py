@@ -17,11 +17,9 @@ QUICK = ("--scans", "20", "--beams", "90", "--people", "3")
 
 
 def call(*words: str) -> int:
-    top = argparse.ArgumentParser()
-    simulate.add_parser(top.add_subparsers())
-    args = top.parse_args(["simulate", *words])
-    status: int = args.run(args)
-    return status
+    parser = argparse.ArgumentParser()
+    simulate.add_arguments(parser)
+    return simulate.run(parser.parse_args(words))
 
 
 def test_recording_reads_back_with_truth(tmp_path: Path) -> None:

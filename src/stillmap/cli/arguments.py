@@ -7,9 +7,12 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from stillmap.core.errors import InputError
+
+if TYPE_CHECKING:
+    from stillmap.preprocessing.options import ReadOptions
 
 _FLAGS = (
     *("min_range", "max_range", "zero_means", "spin", "cameras"),
@@ -99,6 +102,14 @@ def read_changes(args: argparse.Namespace) -> dict[str, Any]:
         if fov is not None:
             changes[f"{laser}_fov"] = math.radians(fov)
     return {"read": changes} if changes else {}
+
+
+def read_options(args: argparse.Namespace) -> "ReadOptions":
+    """The options of reading by the given flags."""
+    from stillmap.core.config import override
+    from stillmap.preprocessing.options import ReadOptions
+
+    return override(ReadOptions(), read_changes(args).get("read", {}))
 
 
 @contextmanager

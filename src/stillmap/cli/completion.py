@@ -5,9 +5,14 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NoReturn
 
-from stillmap.cli.parser import COMMANDS, Parser
+from stillmap.cli.parser import Parser
 
-_EPILOG = """to install it:
+DESCRIPTION = (
+    "Print the script with which a shell completes commands, flags, their choices, "
+    "files and folders, and the options of --set. It asks the installed stillmap and stays "
+    "valid after an update."
+)
+EPILOG = """to install it:
   bash  stillmap completion bash > ~/.local/share/bash-completion/completions/stillmap
         (with the package bash-completion), or in ~/.bashrc: eval "$(stillmap completion bash)"
   zsh   in ~/.zshrc, after compinit: eval "$(stillmap completion zsh)"
@@ -15,18 +20,9 @@ _EPILOG = """to install it:
 """
 
 
-def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Add the command."""
-    p = commands.add_parser(
-        "completion",
-        help=COMMANDS["completion"],
-        description="Print the script with which a shell completes commands, flags, their choices, "
-        "files and folders, and the options of --set. It asks the installed stillmap and stays "
-        "valid after an update.",
-        epilog=_EPILOG,
-    )
+def add_arguments(p: argparse.ArgumentParser) -> None:
+    """Add the flags and arguments."""
     p.add_argument("shell", metavar="SHELL", choices=("bash", "zsh", "fish"), help="%(choices)s")
-    p.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stillmap.cli.console import print_json
-from stillmap.cli.parser import COMMANDS
 
 if TYPE_CHECKING:
     from stillmap.pipeline.options import Options
@@ -76,7 +75,11 @@ def complete_assignments(options: Any, prefix: str) -> Iterator[str]:
             yield from (f"{one.name}={value}" for value in values)
 
 
-_EPILOG = """examples:
+DESCRIPTION = (
+    "Print every option with its default, meaning and range, as TOML for --config."
+    " Precedence: defaults < file of --config < --set < other flags."
+)
+EPILOG = """examples:
   stillmap config                       every option
   stillmap config slam.odometry         one section
   stillmap config --set em.prior=0.8    with changes, as `stillmap map` would use them
@@ -84,15 +87,8 @@ _EPILOG = """examples:
 """
 
 
-def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Add the command."""
-    p = commands.add_parser(
-        "config",
-        help=COMMANDS["config"],
-        description="Print every option with its default, meaning and range, as TOML for --config."
-        " Precedence: defaults < file of --config < --set < other flags.",
-        epilog=_EPILOG,
-    )
+def add_arguments(p: argparse.ArgumentParser) -> None:
+    """Add the flags and arguments."""
     only = p.add_argument(
         "only",
         metavar="NAME",
@@ -103,7 +99,6 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     only.completer = complete_option_names  # type: ignore[attr-defined]
     p.add_argument("--json", action="store_true", help="one JSON object on stdout, by option")
     add_option_flags(p)
-    p.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

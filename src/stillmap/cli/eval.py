@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stillmap.cli.console import print_json
-from stillmap.cli.parser import COMMANDS
 
 if TYPE_CHECKING:
     from stillmap.cli.eval_scores import Scores
@@ -15,7 +14,12 @@ _TRAJECTORY = "rows 't x y theta' or TUM rows 'stamp x y z qx qy qz qw'"
 _MAX_DT_RELATIONS = 0.1  # s between a relation's time and a pose, as in the authors' program
 _MAX_DT_TRAJECTORY = 0.02  # s between the stamps of two systems for one scan
 
-_EPILOG = """examples:
+DESCRIPTION = (
+    "Score a result, as text or with --json as one object on stdout. `relations` "
+    "and `trajectory` compare poses with a reference; `labels`, `map` and `model` compare a "
+    "result with the truth that `stillmap simulate` writes."
+)
+EPILOG = """examples:
   stillmap eval relations out/trajectory.tum log.relations
   stillmap eval trajectory out/trajectory.tum truth.tum --json
   stillmap eval labels out sim
@@ -24,17 +28,8 @@ _EPILOG = """examples:
 """
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Add the command and its five scores."""
-    parser = subparsers.add_parser(
-        "eval",
-        help=COMMANDS["eval"],
-        description="Score a result, as text or with --json as one object on stdout. `relations` "
-        "and `trajectory` compare poses with a reference; `labels`, `map` and `model` compare a "
-        "result with the truth that `stillmap simulate` writes.",
-        epilog=_EPILOG,
-    )
-    parser.set_defaults(run=run)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the five scores."""
     scores = parser.add_subparsers(title="scores", dest="score", required=True, metavar="SCORE")
     _add_relations(scores)
     _add_trajectory(scores)

@@ -3,11 +3,10 @@
 import argparse
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from stillmap.cli.arguments import make_parents, require_apart
 from stillmap.cli.console import print_json, say
-from stillmap.cli.parser import COMMANDS
 from stillmap.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -17,21 +16,18 @@ if TYPE_CHECKING:
     from stillmap.core.recording import Recording
     from stillmap.results.folder import ResultFolder
 
-_EPILOG = """examples:
+DESCRIPTION = (
+    "Write the recording again, in its own format, with dynamic beams blanked: for "
+    "mapping and localization programs that assume a static world. Nothing else changes."
+)
+EPILOG = """examples:
   stillmap filter out -o clean.clf.gz
   stillmap filter out -o clean.log --below 0.3 --input moved/log.log
 """
 
 
-def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Add the command."""
-    p = commands.add_parser(
-        "filter",
-        help=COMMANDS["filter"],
-        description="Write the recording again, in its own format, with dynamic beams blanked: for "
-        "mapping and localization programs that assume a static world. Nothing else changes.",
-        epilog=_EPILOG,
-    )
+def add_arguments(p: argparse.ArgumentParser) -> None:
+    """Add the flags and arguments."""
     p.add_argument("result", metavar="DIR", help="folder that `stillmap map` wrote")
     p.add_argument("-o", "--output", metavar="FILE", required=True, help="filtered recording")
     p.add_argument("--input", metavar="FILE", help="the recording, if it was moved")
@@ -45,113 +41,74 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     p.add_argument("--overwrite", action="store_true", help="replace what is there")
     p.add_argument("--json", action="store_true", help="the summary as one JSON object on stdout")
     p.add_argument("--quiet", action="store_true", help="no summary")
-    p.set_defaults(run=run)
-
-
-class _Request(NamedTuple):
-    """Parsed arguments.
-
-    Attributes:
-        result: result folder.
-        output: filtered recording.
-        recording: path of the recording, None: where the result says.
-        below: blank beams whose P(static) is below this.
-        overwrite: replace what is there.
-    """
-
-    result: Path
-    output: Path
-    recording: str | None
-    below: float
-    overwrite: bool
-
-
-class _Filtered(NamedTuple):
-    """Counts of the filtered copy.
-
-    Attributes:
-        hits: beams of the recording that hit something.
-        blanked: how many of these were blanked.
-        omitted: scans left out.
-        omitted_topics: topics of a bag left out.
-        unfiltered_topics: topics of a bag with scans of other lasers, copied unchanged.
-    """
-
-    hits: int
-    blanked: int
-    omitted: int
-    omitted_topics: list[str]
-    unfiltered_topics: list[str]
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read labels and recording, and write the recording without dynamic beams."""
-    if not 0.0 <= args.below <= 1.0:
-        raise InputError(f"--below wants 0 to 1, got {args.below:g}")
-    request = _Request(Path(args.result), Path(args.output), args.input, args.below, args.overwrite)
-    with make_parents(request.output):
-        source, done = _filter(request)
-    if args.json:
-        counts = {"hits": done.hits, "blanked": done.blanked, "scans_left_out": done.omitted}
-        print_json({"output": str(request.output), "input": str(source), **counts})
-    if not args.quiet:
-        _print_summary(done, request.output)
-    return 0
-
-
-def _print_summary(done: _Filtered, output: Path) -> None:
-    share = 100.0 * done.blanked / max(done.hits, 1)
-    say(f"{done.blanked} beams blanked, {share:.1f} % of the hits; in {output}")
-    if done.omitted:
-        say(f"{done.omitted} scans left out that were not mapped")
-    for topic in done.unfiltered_topics:
-        say(f"warning: {topic} is as it was: it was not mapped")
-    for topic in done.omitted_topics:
-        say(f"warning: {topic} left out: the bag does not say what its messages are made of")
-
-
-def _filter(request: _Request) -> tuple[Path, _Filtered]:
-    """Write the filtered recording; return the path of the recording and what was written.
+    """Read labels and recording, and write the recording without dynamic beams.
 
     Raises:
         InputError: the result or its recording is not there, or the output is taken.
     """
+    from stillmap.results.folder import open_result
+
+    if not 0.0 <= args.below <= 1.0:
+        raise InputError(f"--below wants 0 to 1, got {args.below:g}")
+    output = Path(args.output)
+    with make_parents(output):
+        result = open_result(Path(args.result), args.input)
+        _require_free(result, output, args.overwrite)
+        recording, labels = result.read()
+        scratch = output.absolute().parent
+        blank, hits, blanked = _select_beams(recording, labels.p_static, args.below, scratch)
+        omitted, notes = _write(result, output, recording, blank, args.overwrite)
+    if args.json:
+        counts = {"hits": hits, "blanked": blanked, "scans_left_out": omitted}
+        print_json({"output": str(output), "input": str(result.source), **counts})
+    if not args.quiet:
+        share = 100.0 * blanked / max(hits, 1)
+        say(f"{blanked} beams blanked, {share:.1f} % of the hits; in {output}")
+        if omitted:
+            say(f"{omitted} scans left out that were not mapped")
+        for note in notes:
+            say(f"warning: {note}")
+    return 0
+
+
+def _select_beams(
+    recording: "Recording", p_static: "NDArray[np.float32]", below: float, scratch: Path
+) -> "tuple[NDArray[np.bool_], int, int]":
+    """(M,) the beams to blank; how many hit something, and how many of these are blanked."""
     import numpy as np
 
     from stillmap.core import arrays
-    from stillmap.results.folder import open_result
 
-    result = open_result(request.result, request.recording)
-    _require_free(request, result)
-    recording, labels = result.read()
     hits = blanked = 0
-    blank = arrays.empty(recording.hit.shape, np.bool_, request.output.absolute().parent)
-    for block in arrays.iter_blocks(recording.hit, labels.p_static, blank):
+    blank = arrays.empty(recording.hit.shape, np.bool_, scratch)
+    for block in arrays.iter_blocks(recording.hit, p_static, blank):
         hit = recording.hit[block]
         # p_static of unusable beams is NaN: never blanked
-        blank[block] = hit & (labels.p_static[block] < request.below)
+        blank[block] = hit & (p_static[block] < below)
         hits += int(np.count_nonzero(hit))
         blanked += int(np.count_nonzero(blank[block]))
-    written = _write(result, request, recording, blank)
-    return result.source, _Filtered(hits, blanked, *written)
+    return blank, hits, blanked
 
 
-def _require_free(request: _Request, result: "ResultFolder") -> None:
+def _require_free(result: "ResultFolder", output: Path, overwrite: bool) -> None:
     """Refuse an output of another format, one that is taken, or one that holds an input."""
     from stillmap.core.files import require_new, require_new_file
     from stillmap.io import stillmap_folder
     from stillmap.io.registry import detect_format
 
-    source, output = result.source, request.output
+    source = result.source
     form = detect_format(source).name if source.exists() else None
     if form is not None:
         _require_ending(output, source, form)
     require_apart(output, source, result.folder)
     if source.is_dir() or source.name == stillmap_folder.HEADER:
         mark = "metadata.yaml" if form == "ROS bag" else stillmap_folder.HEADER
-        require_new(output, mark, request.overwrite)
+        require_new(output, mark, overwrite)
     else:
-        require_new_file(output, request.overwrite)
+        require_new_file(output, overwrite)
 
 
 def _require_ending(output: Path, source: Path, form: str) -> None:
@@ -172,40 +129,38 @@ def _require_ending(output: Path, source: Path, form: str) -> None:
 
 def _write(
     result: "ResultFolder",
-    request: _Request,
+    output: Path,
     recording: "Recording",
     blank: "NDArray[np.bool_]",
-) -> tuple[int, list[str], list[str]]:
-    """Write the copy; return omitted scans, omitted topics and unfiltered topics."""
+    overwrite: bool,
+) -> tuple[int, list[str]]:
+    """Write the copy; return the number of scans left out, and what else is not filtered."""
+    from stillmap.core import arrays
     from stillmap.io import stillmap_folder
     from stillmap.io.carmen import filtered_log
     from stillmap.io.registry import detect_format
 
-    source, output, overwrite = result.source, request.output, request.overwrite
-    form = detect_format(source)
-    if form.name == "ROS bag":
+    source, form = result.source, detect_format(result.source).name
+    if form == "ROS bag":
         from stillmap.io.ros import recording_writer
 
         bag = recording_writer.write_filtered_bag(
             source, output, recording, blank, result.read_options, overwrite=overwrite
         )
-        return bag.omitted, bag.omitted_topics, bag.unfiltered_topics
-    if form.name == "stillmap recording":
-        filtered = _blank_beams(recording, blank, output.absolute().parent)
-        stillmap_folder.write(filtered, output, overwrite=overwrite)
-        return 0, [], []
-    if form.name == "CARMEN log":
+        unknown = "left out: the bag does not say what its messages are made of"
+        return bag.omitted, [
+            *(f"{topic} is as it was: it was not mapped" for topic in bag.unfiltered_topics),
+            *(f"{topic} {unknown}" for topic in bag.omitted_topics),
+        ]
+    if form == "stillmap recording":
+        # blanked beams are misses of the same length
+        hit = arrays.copy(recording.hit, output.absolute().parent)
+        for block in arrays.iter_blocks(hit, blank):
+            hit[block] &= ~blank[block]
+        stillmap_folder.write(dataclasses.replace(recording, hit=hit), output, overwrite=overwrite)
+        return 0, []
+    if form == "CARMEN log":
         log = filtered_log.write_filtered_log(source, output, recording, blank)
-        return log.omitted, [], []
+        return log.omitted, []
     hint = "`stillmap convert` writes it in a format that can be"
-    raise InputError(f"a {form.name} cannot be written again", where=str(source), hint=hint)
-
-
-def _blank_beams(recording: "Recording", blank: "NDArray[np.bool_]", scratch: Path) -> "Recording":
-    """The blanked beams as misses of the same length."""
-    from stillmap.core import arrays
-
-    hit = arrays.copy(recording.hit, scratch)
-    for block in arrays.iter_blocks(hit, blank):
-        hit[block] &= ~blank[block]
-    return dataclasses.replace(recording, hit=hit)
+    raise InputError(f"a {form} cannot be written again", where=str(source), hint=hint)

@@ -6,32 +6,27 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
-from stillmap.cli.arguments import add_read_flags, read_changes
+from stillmap.cli.arguments import add_read_flags, read_options
 from stillmap.cli.console import show_share
-from stillmap.cli.parser import COMMANDS
 
 _LINES_SHOWN = 10
-_EPILOG = """examples:
+DESCRIPTION = (
+    "Show what is in a recording: scans, beams, field of view, ranges, duration, "
+    "odometry and damage; values estimated from the readings are marked."
+)
+EPILOG = """examples:
   stillmap info log.clf.gz
   stillmap info sim --json
   stillmap info log.log --max-range 30 --laser-offset 0.2 0 0
 """
 
 
-def add_parser(subparsers: Any) -> None:
-    """Add the command."""
-    parser = subparsers.add_parser(
-        "info",
-        help=COMMANDS["info"],
-        description="Show what is in a recording: scans, beams, field of view, ranges, duration, "
-        "odometry and damage; values estimated from the readings are marked.",
-        epilog=_EPILOG,
-    )
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the flags and arguments."""
     parser.add_argument("input", metavar="INPUT", help="a file or folder with a recording")
     parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
     parser.add_argument("--quiet", action="store_true", help="no progress")
     add_read_flags(parser)
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -41,13 +36,11 @@ def run(args: argparse.Namespace) -> int:
         InputError: the recording cannot be read.
     """
     from stillmap.cli.recording_info import summarize_recording
-    from stillmap.core import config
     from stillmap.io import read
-    from stillmap.preprocessing.options import ReadOptions
 
-    read_options = config.override(ReadOptions(), read_changes(args).get("read", {}))
+    options = read_options(args)
     with show_share(args.quiet, "reading") as progress:
-        recording = read(args.input, read_options, progress=progress)
+        recording = read(args.input, options, progress=progress)
     found = {"input": args.input, **summarize_recording(recording)}
     if args.json:
         print(json.dumps(found, indent=2, allow_nan=False))

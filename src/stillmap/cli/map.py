@@ -12,18 +12,19 @@ from typing import TYPE_CHECKING, Any
 from stillmap.cli.arguments import add_read_flags, read_changes, require_apart
 from stillmap.cli.config import add_option_flags, options_from_args
 from stillmap.cli.console import list_files, print_json, say, show_progress
-from stillmap.cli.parser import COMMANDS
 from stillmap.core.errors import InputError
 
 if TYPE_CHECKING:
-    from stillmap.cli.map_build import Built
-    from stillmap.cli.map_inputs import Request
     from stillmap.pipeline.checkpoint import CheckpointFolder
-    from stillmap.pipeline.options import Options
     from stillmap.results.result import Result
     from stillmap.rig.build import TiltingResult
 
-_EPILOG = """examples:
+DESCRIPTION = (
+    "Map a recording: estimate the pose of every scan, the probability of every "
+    "beam to have hit something static, and the map of what is static. The result is a folder; "
+    "open it with `stillmap view`."
+)
+EPILOG = """examples:
   stillmap map log.clf.gz -o out
   stillmap map sim -o out --overwrite --resolution 0.1
   stillmap map log.clf.gz -o out --min-range 0.3 --set em.max_iterations=3
@@ -34,16 +35,8 @@ _EPILOG = """examples:
 """
 
 
-def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Add the command."""
-    p = commands.add_parser(
-        "map",
-        help=COMMANDS["map"],
-        description="Map a recording: estimate the pose of every scan, the probability of every "
-        "beam to have hit something static, and the map of what is static. The result is a folder; "
-        "open it with `stillmap view`.",
-        epilog=_EPILOG,
-    )
+def add_arguments(p: argparse.ArgumentParser) -> None:
+    """Add the flags and arguments."""
     p.add_argument(
         "input",
         metavar="INPUT",
@@ -74,7 +67,6 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     _add_map_flags(p.add_argument_group("map"))
     add_read_flags(p)
     add_option_flags(p)
-    p.set_defaults(run=run)
 
 
 def _add_method_flags(p: argparse._ArgumentGroup) -> None:
@@ -118,59 +110,33 @@ _IN_SUMMARY = ("version", "converged", "best_iteration", "counts", "area", "seco
 
 def run(args: argparse.Namespace) -> int:
     """Map a recording into a folder."""
-    from stillmap.cli.map_build import build_all
-    from stillmap.cli.map_inputs import read_inputs
+    from stillmap.cli.map_run import build_all, read_inputs
     from stillmap.core.profiling import StageTimer
     from stillmap.pipeline.checkpoint import lock_checkpoints
     from stillmap.results.save import save
 
-    request, options = _parse(args)
-    _require_usable_output(request)
-    stages = StageTimer()
-    with lock_checkpoints(request.output) as checkpoints, _explain_failure(request, checkpoints):
-        inputs, options = read_inputs(request, options, checkpoints.folder, stages)
-        with show_progress(request.quiet, options.em.max_iterations) as progress:
-            built = build_all(
-                inputs,
-                options,
-                checkpoints,
-                progress,
-                stages,
-                resume=request.resume,
-                quiet=request.quiet,
-            )
+    options = options_from_args(args, read_changes(args), _option_changes(args))
+    output, stages = Path(args.output), StageTimer()
+    _require_usable_output(args, output)
+    with lock_checkpoints(output) as checkpoints, _explain_failure(args.quiet, checkpoints):
+        inputs = read_inputs(args, options, checkpoints.folder, stages)
+        with show_progress(args.quiet, options.em.max_iterations) as progress:
+            result, tilting, models = build_all(args, inputs, checkpoints, progress, stages)
             progress("writing", 0, 0, 0)
             save(
-                built.result,
-                request.output,
-                request.overwrite or request.resume,
+                result,
+                output,
+                args.overwrite or args.resume,
                 staging_folder=checkpoints.folder,
-                tilting=built.tilting,
-                models=built.models,
+                tilting=tilting,
+                models=models,
             )
         checkpoints.clear()
-    if not request.quiet:
-        _print_summary(built, request.output)
+    if not args.quiet:
+        _print_summary(result, tilting, output)
     if args.json:
-        print_json(_summarize(request.output))
+        print_json(_summarize(output))
     return 0
-
-
-def _parse(args: argparse.Namespace) -> "tuple[Request, Options]":
-    """The paths and switches of the call, and its options."""
-    from stillmap.cli.map_inputs import Request
-
-    request = Request(
-        input=args.input,
-        output=Path(args.output),
-        tilting=args.tilting,
-        poses=args.poses,
-        odometry=not args.no_odometry,
-        overwrite=args.overwrite,
-        resume=args.resume,
-        quiet=args.quiet,
-    )
-    return request, options_from_args(args, read_changes(args), _option_changes(args))
 
 
 def _option_changes(args: argparse.Namespace) -> dict[str, Any]:
@@ -192,14 +158,13 @@ def _option_changes(args: argparse.Namespace) -> dict[str, Any]:
     return changes
 
 
-def _require_usable_output(request: "Request") -> None:
+def _require_usable_output(args: argparse.Namespace, output: Path) -> None:
     """Refuse an output that is taken, holds an input or cannot be written, before any work."""
     from stillmap.core.files import require_new
     from stillmap.results.run_json import RECORD
 
-    output = request.output
-    require_new(output, RECORD, request.overwrite or request.resume)
-    for source in filter(None, (request.input, request.tilting)):
+    require_new(output, RECORD, args.overwrite or args.resume)
+    for source in filter(None, (args.input, args.tilting)):
         require_apart(output, Path(source))
     parent = Path(os.path.abspath(output)).parent
     while not parent.exists():
@@ -209,7 +174,7 @@ def _require_usable_output(request: "Request") -> None:
 
 
 @contextmanager
-def _explain_failure(request: "Request", checkpoints: "CheckpointFolder") -> Iterator[None]:
+def _explain_failure(quiet: bool, checkpoints: "CheckpointFolder") -> Iterator[None]:
     """Report a full disk in one line, and after an interruption the checkpoint to resume from."""
     try:
         yield
@@ -219,7 +184,7 @@ def _explain_failure(request: "Request", checkpoints: "CheckpointFolder") -> Ite
         where = str(checkpoints.folder)
         raise InputError(f"cannot continue: {error.strerror}", where=where) from error
     except (KeyboardInterrupt, SystemExit):
-        if checkpoints.newest is not None and not request.quiet:
+        if checkpoints.newest is not None and not quiet:
             say(f"{checkpoints.folder} has the last checkpoint: --resume continues there")
         raise
 
@@ -235,10 +200,10 @@ def _summarize(output: Path) -> dict[str, Any]:
     }
 
 
-def _print_summary(built: "Built", output: Path) -> None:
+def _print_summary(result: "Result", tilting: "TiltingResult | None", output: Path) -> None:
     from stillmap.mapping.beam_statistics import count_beams
 
-    result, n = built.result, len(built.result.iterations)
+    n = len(result.iterations)
     counts = count_beams(result.recording, result.p_static)
     lines = [
         f"{result.recording.n_scans} scans, {counts['hits']} beams that hit something, "
@@ -246,7 +211,7 @@ def _print_summary(built: "Built", output: Path) -> None:
         f"{n} iteration{'s' * (n > 1)}, {'' if result.converged else 'not '}converged, "
         f"the best is {result.best_iteration}",
         *_describe_changes(result),
-        *([] if built.tilting is None else [_describe_tilting(built.tilting)]),
+        *([] if tilting is None else [_describe_tilting(tilting)]),
         *(f"warning: {warning}" for warning in result.warnings),
         f"wrote {output}: open {output / 'report.html'}",
     ]

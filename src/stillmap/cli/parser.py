@@ -139,7 +139,12 @@ def parser(wanted: Collection[str] = tuple(COMMANDS)) -> Parser:
     commands = top.add_subparsers(title="commands", metavar="COMMAND", dest="command")
     for name, about in COMMANDS.items():
         if name in wanted:
-            import_module(f"stillmap.cli.{name}").add_parser(commands)
+            module = import_module(f"stillmap.cli.{name}")
+            command = commands.add_parser(
+                name, help=about, description=module.DESCRIPTION, epilog=module.EPILOG
+            )
+            module.add_arguments(command)
+            command.set_defaults(run=module.run)
         else:
             commands.add_parser(name, help=about)
     _add_common(top)

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 from stillmap.cli.config import add_set_flag, complete_assignments
 from stillmap.cli.console import list_files, print_json, say, show_share
-from stillmap.cli.parser import COMMANDS
 from stillmap.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -35,7 +34,11 @@ _SCENES = {
 }
 
 _LISTED = "".join(f"  {name:<16} {what}\n" for name, what in _SCENES.items())
-_EPILOG = f"""scenes:
+DESCRIPTION = (
+    "Simulate a robot in a place with moving people, doors and cars, and write its "
+    "recording with the truth. Options that are not given are those of the scene."
+)
+EPILOG = f"""scenes:
 {_LISTED}\
   NAME-empty       any but the -crowd ones, without people and vehicles
 
@@ -83,15 +86,8 @@ _ODOMETRY_ERRORS = (
 )
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Add the command."""
-    p = subparsers.add_parser(
-        "simulate",
-        help=COMMANDS["simulate"],
-        description="Simulate a robot in a place with moving people, doors and cars, and write its "
-        "recording with the truth. Options that are not given are those of the scene.",
-        epilog=_EPILOG,
-    )
+def add_arguments(p: argparse.ArgumentParser) -> None:
+    """Add the flags and arguments."""
     scene = p.add_argument("scene", metavar="SCENE", help="one of those listed below")
     scene.completer = _scene_names  # type: ignore[attr-defined]
     _add_output_flags(p)
@@ -123,7 +119,6 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     )
     others = p.add_argument_group("any other option of the scene, see docs/simulation.md")
     add_set_flag(others, "e.g. traffic.vehicles=3; can be given again").completer = _assignments  # type: ignore[attr-defined]
-    p.set_defaults(run=run)
 
 
 def _add_output_flags(p: argparse.ArgumentParser) -> None:

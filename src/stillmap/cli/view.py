@@ -6,10 +6,9 @@ import sys
 import threading
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from stillmap.cli.console import say, show_share
-from stillmap.cli.parser import COMMANDS
 from stillmap.core.errors import InputError, MissingExtra, import_extra
 
 if TYPE_CHECKING:
@@ -21,7 +20,13 @@ _REPORT = "report.html"
 
 _LAST_PORT = 65_535
 
-_EPILOG = """examples:
+DESCRIPTION = (
+    "Show a result in the browser, scan by scan: map, beams, points, surface, "
+    "trajectory and moving objects. The page is served to this machine only, until Ctrl-C, and "
+    "requests nothing from outside. It needs `pip install 'stillmap[viewer]'`; without it the "
+    "report is opened. Without a screen, the address is printed."
+)
+EPILOG = """examples:
   stillmap view out                     map, beams, points, models and objects over time
   stillmap view out --report            the report
   firefox "$(stillmap view out --print)"
@@ -29,17 +34,8 @@ _EPILOG = """examples:
 """
 
 
-def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Add the command."""
-    p = commands.add_parser(
-        "view",
-        help=COMMANDS["view"],
-        description="Show a result in the browser, scan by scan: map, beams, points, surface, "
-        "trajectory and moving objects. The page is served to this machine only, until Ctrl-C, and "
-        "requests nothing from outside. It needs `pip install 'stillmap[viewer]'`; without it the "
-        "report is opened. Without a screen, the address is printed.",
-        epilog=_EPILOG,
-    )
+def add_arguments(p: argparse.ArgumentParser) -> None:
+    """Add the flags and arguments."""
     p.add_argument("result", metavar="DIR", help="folder that `stillmap map` wrote")
     p.add_argument("--report", action="store_true", help="open the report instead")
     p.add_argument("--print", action="store_true", help="print the path of the report")
@@ -48,17 +44,6 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     )
     p.add_argument("--input", metavar="FILE", help="the recording, if it was moved")
     p.add_argument("--no-beams", action="store_true", help="do not read the recording")
-    p.set_defaults(run=run)
-
-
-class _Request(NamedTuple):
-    """Parsed arguments."""
-
-    folder: Path
-    recording: str | None
-    port: int
-    beams: bool
-    quiet: bool
 
 
 def run(args: argparse.Namespace) -> int:
@@ -82,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
             say(f"{error}; the report is shown")
             _show_report(report)
         else:
-            _serve(_Request(folder, args.input, args.port, not args.no_beams, args.quiet))
+            _serve(args, folder)
     return 0
 
 
@@ -108,7 +93,7 @@ def _has_screen() -> bool:
 
 
 def _open_browser(address: str) -> bool:
-    """Open an address and return whether that succeeded; some browsers block until closed."""
+    """Open an address and return whether that succeeded."""
     if not _has_screen():
         return False
     import webbrowser
@@ -116,15 +101,7 @@ def _open_browser(address: str) -> bool:
     return webbrowser.open(address)
 
 
-def _open_browser_in_background(address: str) -> bool:
-    """Open an address without waiting for the browser; return whether there is a screen."""
-    if not _has_screen():
-        return False
-    threading.Thread(target=_open_browser, args=(address,), daemon=True).start()
-    return True
-
-
-def _serve(request: _Request) -> None:
+def _serve(args: argparse.Namespace, folder: Path) -> None:
     """Serve the page until Ctrl-C.
 
     Raises:
@@ -134,21 +111,22 @@ def _serve(request: _Request) -> None:
     from stillmap.viewer.scene import read_scene
     from stillmap.viewer.window import Window
 
-    result = open_result(request.folder, request.recording)
-    scene, beams = read_scene(request.folder), None
+    result = open_result(folder, args.input)
+    scene, beams = read_scene(folder), None
     try:
-        if request.beams:
-            beams = _read_beams(result, request.quiet)
+        if not args.no_beams:
+            beams = _read_beams(result, args.quiet)
     except InputError as error:
-        if request.recording:
+        if args.input:
             raise
         say(f"without beams: {error}")
         scene = replace(scene, notes=[f"Without beams: {error}", *scene.notes])
-    window = Window(scene, beams, request.port)
+    window = Window(scene, beams, args.port)
     try:
-        opened = _open_browser_in_background(window.url)
-        prefix = "" if opened else "no browser found; "
-        say(f"{prefix}{request.folder} is at {window.url}, until Ctrl-C")
+        # some browsers block until they are closed
+        threading.Thread(target=_open_browser, args=(window.url,), daemon=True).start()
+        prefix = "" if _has_screen() else "no browser found; "
+        say(f"{prefix}{folder} is at {window.url}, until Ctrl-C")
         while True:
             window.step()
     except KeyboardInterrupt:  # the regular end
@@ -159,12 +137,9 @@ def _serve(request: _Request) -> None:
 
 def _read_beams(result: "ResultFolder", quiet: bool) -> "Beams":
     from stillmap.io.trajectory import poses_from_tum
-    from stillmap.results.folder import is_deskewed
-    from stillmap.slam import SlamOptions
     from stillmap.viewer.tracks import Beams
 
     with show_share(quiet, "reading") as progress:
         recording, labels = result.read(progress)
     poses = poses_from_tum(result.folder / "trajectory.tum", recording)
-    slam = SlamOptions(deskew=is_deskewed(result.record))
-    return Beams(recording, labels.p_static, poses, slam)
+    return Beams(recording, labels.p_static, poses, result.slam_options)

@@ -39,22 +39,31 @@ class GridWindow(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class OccupancyMap:
-    """A 2D map.
+class GridMap:
+    """Occupancy of a rectangle of cells.
 
     Attributes:
         p_occupied: (H, W) float32; NaN where unobserved, which is not free. Row 0 has the lowest y.
-        alpha: (H, W) float32, expected number of static hits.
-        beta: (H, W) float32, expected number of dynamic hits + beam length through the cell.
         origin: x, y (metres) and yaw of the lower-left corner of the lower-left cell.
         resolution: metres.
     """
 
     p_occupied: NDArray[np.float32]
-    alpha: NDArray[np.float32]
-    beta: NDArray[np.float32]
     origin: tuple[float, float, float]
     resolution: float
+
+
+@dataclass(frozen=True, eq=False)
+class OccupancyMap(GridMap):
+    """A 2D map with the sums that it is made from.
+
+    Attributes:
+        alpha: (H, W) float32, expected number of static hits.
+        beta: (H, W) float32, expected number of dynamic hits + beam length through the cell.
+    """
+
+    alpha: NDArray[np.float32]
+    beta: NDArray[np.float32]
 
     @property
     def window(self) -> GridWindow:
@@ -98,7 +107,7 @@ def make_occupancy_map(
     if observed is not None:
         p_occupied[~observed.mask] = np.nan
     x, y = (float(c) * grid.resolution for c in window.first_cell)
-    return OccupancyMap(p_occupied, a, b, (x, y, 0.0), grid.resolution)
+    return OccupancyMap(p_occupied, (x, y, 0.0), grid.resolution, a, b)
 
 
 def _iter_tiles(

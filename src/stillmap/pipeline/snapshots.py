@@ -1,11 +1,12 @@
 """Small parts of a map, to show how it evolves (Fig. 8) without keeping every map."""
 
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.em.occupancy_grid import GridMap
 from stillmap.em.types import DYNAMIC_BELOW
 
 Window = tuple[float, float, float, float]
@@ -13,34 +14,16 @@ Value = TypeVar("Value", np.float32, np.bool_)
 _MOST_POINTS = 50_000
 
 
-class GridMap(Protocol):
-    """An occupancy map: `p_occupied` (H, W), NaN where unknown, row 0 = lowest y; `origin` (x, y,
-    yaw) of the lower-left corner; `resolution` in m."""
-
-    @property
-    def p_occupied(self) -> NDArray[Any]: ...
-    @property
-    def origin(self) -> tuple[float, float, float]: ...
-    @property
-    def resolution(self) -> float: ...
-
-
 @dataclass(frozen=True, eq=False)
-class Snapshot:
+class Snapshot(GridMap):
     """A part of the map at one iteration.
 
     Attributes:
         number: the iteration, from 1.
-        p_occupied: (h, w) float32, NaN where unknown, row 0 = lowest y.
-        origin: x, y, yaw of the lower-left cell's lower-left corner in the map frame.
-        resolution: edge of a cell in metres.
         dynamic_points: (K, 2) float32, end points in the map frame that lie in this part.
     """
 
     number: int
-    p_occupied: NDArray[np.float32]
-    origin: tuple[float, float, float]
-    resolution: float
     dynamic_points: NDArray[np.float32]
 
 

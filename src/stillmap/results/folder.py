@@ -3,7 +3,7 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -17,6 +17,9 @@ from stillmap.mesh.options import MeshOptions
 from stillmap.preprocessing.options import ReadOptions
 from stillmap.results.labels import Labels, read_labels
 from stillmap.results.run_json import RECORD
+from stillmap.slam import SlamOptions
+
+T = TypeVar("T")
 
 _MAX_RUN = 32 << 20  # bytes of a run.json
 
@@ -39,24 +42,39 @@ class ResultFolder:
 
     @property
     def read_options(self) -> ReadOptions:
-        """The options with which its recording was read.
+        """The options with which its recording was read: the same beams have the same numbers.
 
         Raises:
             InputError: the record does not say so.
         """
-        return _read_options(self.record, self.folder)
+        read_as = self._section("read")
+        if read_as is None:
+            raise InputError("names no options", where=str(self.folder / RECORD))
+        return self._override(ReadOptions(), read_as)
+
+    @property
+    def slam_options(self) -> SlamOptions:
+        """The options that deskew its recording as it was deskewed for the map."""
+        section = self._section("slam") or {}
+        return SlamOptions(deskew=section.get("deskew") is not False)
 
     @property
     def texture_quality(self) -> int:
         """JPEG quality of the texture pages; the default where the record does not have it."""
-        options: Any = self.record.get("options")
-        mesh = options.get("mesh") if isinstance(options, dict) else None
-        quality = mesh.get("texture_quality") if isinstance(mesh, dict) else None
+        quality = (self._section("mesh") or {}).get("texture_quality")
+        return self._override(MeshOptions(), {"texture_quality": quality}).texture_quality
+
+    def _section(self, name: str) -> dict[str, Any] | None:
+        """A section of the options in the record; None where there is none."""
+        options = self.record.get("options")
+        section = options.get(name) if isinstance(options, dict) else None
+        return section if isinstance(section, dict) else None
+
+    def _override(self, options: T, changes: dict[str, Any]) -> T:
+        """The options with those of the record that are set."""
         try:
-            return (
-                MeshOptions() if quality is None else MeshOptions(texture_quality=quality)
-            ).texture_quality
-        except (ValueError, TypeError) as error:
+            return config.override(options, {k: v for k, v in changes.items() if v is not None})
+        except InputError as error:
             where = str(self.folder)
             raise InputError(f"has options that cannot be: {error}", where=where) from error
 
@@ -77,38 +95,25 @@ class ResultFolder:
             hint = "that is where it was when it was mapped: name it with --input"
             raise InputError("does not exist", where=str(self.source), hint=hint)
         recording = read(self.source, read_as, progress=progress, scratch=scratch)
-        labels = read_labels(self.folder)
+        labels, other = read_labels(self.folder), ""
         if not np.array_equal(recording.stamp_ns, labels.stamp_ns) or not np.array_equal(
             recording.offset, labels.offset
         ):
-            raise InputError(
-                "is not the recording that was mapped: other scans or beams",
-                where=str(self.source),
-                hint="name it with --input",
-            )
-        if any(
+            other = "scans or beams"
+        elif any(
             (recording.hit[b] != labels.hit[b]).any()
             for b in arrays.iter_blocks(recording.hit, labels.hit)
         ):
-            raise InputError(
-                "is not the recording that was mapped: other beams hit something",
-                where=str(self.source),
-                hint="name it with --input",
-            )
+            other = "beams hit something"
+        if other:
+            what = f"is not the recording that was mapped: other {other}"
+            raise InputError(what, where=str(self.source), hint="name it with --input")
         return recording, labels
 
 
 def is_result(path: Path) -> bool:
     """Whether a folder is a result."""
     return (path / RECORD).is_file()
-
-
-def is_deskewed(record: dict[str, Any]) -> bool:
-    """Whether scans were deskewed, by a run.json."""
-    chosen = record.get("options")
-    section = chosen.get("slam") if isinstance(chosen, dict) else None
-    deskew = section.get("deskew") if isinstance(section, dict) else None
-    return deskew is not False
 
 
 def open_result(result: Path, recording: str | None = None) -> ResultFolder:
@@ -118,9 +123,11 @@ def open_result(result: Path, recording: str | None = None) -> ResultFolder:
         InputError: it is none, or names no recording.
     """
     record = _run_record(result / RECORD)
-    return ResultFolder(
-        result, record, Path(recording or _path_of(record, result)), bool(recording)
-    )
+    path = recording or record["input"].get("path")
+    if not isinstance(path, str) or not path:
+        where, hint = str(result / RECORD), "name it with --input"
+        raise InputError("names no recording", where=where, hint=hint)
+    return ResultFolder(result, record, Path(path), bool(recording))
 
 
 def _run_record(path: Path) -> dict[str, Any]:
@@ -135,24 +142,3 @@ def _run_record(path: Path) -> dict[str, Any]:
     if not isinstance(record, dict) or not isinstance(record.get("input"), dict):
         raise InputError("is no record of a run: no input named", where=str(path))
     return record
-
-
-def _read_options(record: dict[str, Any], result: Path) -> ReadOptions:
-    """As the recording was read: the same beams have the same numbers."""
-    chosen = record.get("options")
-    read_as = chosen.get("read") if isinstance(chosen, dict) else None
-    if not isinstance(read_as, dict):
-        raise InputError("names no options", where=str(result / RECORD))
-    known = {key: value for key, value in read_as.items() if value is not None}
-    try:
-        return config.override(ReadOptions(), known)
-    except (ValueError, InputError) as error:
-        raise InputError(f"has options that cannot be: {error}", where=str(result)) from error
-
-
-def _path_of(record: dict[str, Any], result: Path) -> str:
-    path = record["input"].get("path")
-    if not isinstance(path, str) or not path:
-        where, hint = str(result / RECORD), "name it with --input"
-        raise InputError("names no recording", where=where, hint=hint)
-    return path

@@ -12,33 +12,26 @@ from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.core.files import require_regular
 from stillmap.core.recording import Recording
+from stillmap.em.occupancy_grid import GridMap
 from stillmap.io.trajectory import poses_from_tum
+from stillmap.results.folder import ResultFolder
 from stillmap.results.labels import shape_text
+from stillmap.results.map_server import FREE_THRESH, OCCUPIED_THRESH
 
 Float = NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False)
-class Grid:
-    """An occupancy map as stored in `map.npz`.
+class Grid(GridMap):
+    """An occupancy map as stored in `map.npz`."""
 
-    Attributes:
-        p_occupied: (H, W) probabilities, NaN where unknown, row 0 = lowest y.
-        origin: x, y, yaw of the lower-left corner of the lower-left cell in the map frame.
-        resolution: metres.
-    """
-
-    p_occupied: NDArray[np.floating]
-    origin: tuple[float, float, float]
-    resolution: float
-
+    # map_server's thresholds, so that the scores speak of the map as others load it
     @property
     def occupied(self) -> NDArray[np.bool_]:
-        return self.p_occupied > OCCUPIED
+        return self.p_occupied > OCCUPIED_THRESH
 
     @property
     def free(self) -> NDArray[np.bool_]:
-        return self.p_occupied < FREE
+        return self.p_occupied < FREE_THRESH
 
     def cells(self, points: Float) -> NDArray[np.int64]:
         """(N, 2) row and column of the cells that hold (N, 2) points; may lie outside the map."""
@@ -49,8 +42,6 @@ class Grid:
         """(N, 2) centres in the map frame of (N, 2) cells, row and column."""
         return moved(se2.matrix(*self.origin), (cells[:, ::-1] + np.float64(0.5)) * self.resolution)
 
-
-MODEL = "mesh.glb"
 
 _MAX_MAP = 1 << 29  # bytes of a map when it is unpacked: a thousand times what they take packed
 
@@ -73,7 +64,7 @@ def require_model(result: Path) -> Path:
     Raises:
         InputError: there is none.
     """
-    path = result / MODEL
+    path = result / "mesh.glb"
     if not path.is_file():
         hint = "`stillmap map` makes them of 3D recordings, with pip install 'stillmap[mesh]'"
         raise InputError("holds no model", where=str(result), hint=hint)
@@ -100,7 +91,7 @@ def read_grid(result: Path) -> Grid:
     except InputError:
         raise
     except OSError as error:
-        raise InputError(read_failure(error), where=str(path)) from error
+        raise InputError(f"cannot be read: {error.strerror or error}", where=str(path)) from error
     except Exception as error:  # whatever NumPy, zip and zlib make of damaged bytes
         raise InputError(f"is damaged: {error}", where=str(path)) from error
     if p_occupied.ndim != 2 or p_occupied.dtype.kind != "f":
@@ -114,17 +105,9 @@ def read_grid(result: Path) -> Grid:
     return Grid(p_occupied, (x, y, yaw), resolution)
 
 
-# map_server's thresholds, so that the scores speak of the map as others load it
-OCCUPIED = 0.65
-
-FREE = 0.196
-
-
 def moved(T: Float, points: Float) -> Float:
     return np.asarray(points @ T[:2, :2].T + T[:2, 2])
 
-
-_NUMBERS = ("x", "y", "vx", "vy")
 
 _MAX_OBJECTS = 256 << 20  # bytes of an objects.json
 
@@ -169,12 +152,14 @@ class Exported:
     tracks: list[Track]
 
 
-def read(folder: Path, recording: Recording, p_static: NDArray[np.float32]) -> Exported:
-    """The result in `folder` of a recording, with its labels.
+def read(result: ResultFolder) -> Exported:
+    """A 2D result with its recording and labels.
 
     Raises:
         InputError: a file is missing or damaged, or the recording is 3D.
     """
+    recording, labels = result.read()
+    folder = result.folder
     if recording.dimension != 2:
         what = "is of a 3D recording: its points can be written, as a cloud"
         hint = ".las, .laz, .e57, .pcd, .ply or .xyz; .obj writes its model, if there is one"
@@ -182,7 +167,7 @@ def read(folder: Path, recording: Recording, p_static: NDArray[np.float32]) -> E
     return Exported(
         recording,
         poses_from_tum(folder / "trajectory.tum", recording),
-        p_static,
+        labels.p_static,
         read_grid(folder),
         read_tracks(folder / "objects" / "objects.json"),
     )
@@ -210,7 +195,7 @@ def read_tracks(path: Path) -> list[Track]:
 def _track(one: dict[str, Any]) -> Track:
     track = one["track"]
     stamp_ns = np.array(track["stamp_ns"], np.int64)
-    x, y, vx, vy = (np.array(track[name], np.float64) for name in _NUMBERS)
+    x, y, vx, vy = (np.array(track[name], np.float64) for name in ("x", "y", "vx", "vy"))
     numbers = np.stack([x, y, vx, vy], axis=-1)
     z = np.array(track["z"], np.float64) if "z" in track else None
     size = tuple(float(metres) for metres in one["size"])
@@ -221,7 +206,3 @@ def _track(one: dict[str, Any]) -> Track:
     if not np.isfinite([*numbers.ravel(), *size, *([] if z is None else z)]).all():
         raise ValueError("a number is not finite")
     return Track(int(one["id"]), size, stamp_ns, numbers[:, :2], numbers[:, 2:], z)
-
-
-def read_failure(error: OSError) -> str:
-    return f"cannot be read: {error.strerror or error}"

@@ -1,0 +1,229 @@
+"""Read what `stillmap map` is given, and map it: EM, then a tilting laser and the meshes."""
+
+import argparse
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap import em
+from stillmap.cli.console import say, show_share
+from stillmap.core.errors import InputError, MissingExtra
+from stillmap.core.parallel import limit_blas_threads, resolve_threads
+from stillmap.core.profiling import Progress, StageTimer
+from stillmap.core.recording import Recording
+from stillmap.io import read
+from stillmap.io.registry import detect_format
+from stillmap.io.text_lines import Progress as ReadProgress
+from stillmap.io.trajectory import poses_from_tum
+from stillmap.pipeline.checkpoint import CheckpointFolder, DamagedCheckpoint
+from stillmap.pipeline.checkpoint_files import identify_run
+from stillmap.pipeline.estimate import EmState
+from stillmap.pipeline.models import build_models
+from stillmap.pipeline.options import Options, resolve_options
+from stillmap.preprocessing.options import ReadOptions
+from stillmap.results.result import Result, build
+from stillmap.rig.build import PlanarResult, TiltingResult, build_tilting, check_rig
+
+if TYPE_CHECKING:
+    from stillmap.mesh.build import Models
+
+
+class Inputs(NamedTuple):
+    """The recording, its options, poses to keep, and the recording of a tilting laser."""
+
+    recording: Recording
+    options: Options
+    poses: NDArray[np.float64] | None
+    tilting: Recording | None
+
+
+def read_inputs(
+    args: argparse.Namespace, options: Options, scratch: Path, stages: StageTimer
+) -> Inputs:
+    """Read the inputs, and resolve the options for them."""
+    with stages.measure("read"):
+        with show_share(args.quiet, "reading") as progress:
+            recording = read(Path(args.input), options.read, progress=progress, scratch=scratch)
+        _require_mappable(recording, options, args.input)
+        recording = _note_path(recording, args.input)
+        if args.no_odometry:
+            recording = recording.without_odometry()
+        poses = _read_poses(args, recording)
+        with show_share(args.quiet, "reading") as progress:
+            tilting = _read_tilting_laser(
+                args.input, args.tilting, recording, options, progress, scratch
+            )
+        return Inputs(recording, resolve_options(options, recording), poses, tilting)
+
+
+def _require_mappable(recording: Recording, options: Options, path: str) -> None:
+    if recording.n_scans == 0:
+        raise InputError("holds no scan that can be used", where=path)
+    if recording.dimension == 3 and options.estimator not in em.ESTIMATORS_3D:
+        raise InputError(
+            f"is 3D: estimator '{options.estimator}' is for 2D recordings",
+            where=path,
+            hint=f"--estimator {' or '.join(em.ESTIMATORS_3D)}",
+        )
+
+
+def _note_path(recording: Recording, path: str) -> Recording:
+    """Note where the recording lies, and what it was made from where that is noted."""
+    original = recording.source.get("path", path)
+    source = {**recording.source, "path": path}
+    if original != path:
+        source["made_from"] = original
+    return dataclasses.replace(recording, source=source)
+
+
+def _read_poses(args: argparse.Namespace, recording: Recording) -> NDArray[np.float64] | None:
+    if not args.poses:
+        return None
+    if args.poses != "recording":
+        return poses_from_tum(Path(args.poses), recording)
+    if recording.T_recorded_base is None:
+        raise InputError(
+            "states no poses",
+            where=args.input,
+            hint="--poses FILE.tum gives them; a file of the name `recording` is ./recording",
+        )
+    return recording.T_recorded_base
+
+
+def _read_tilting_laser(
+    planar_path: str,
+    tilting_path: str | None,
+    planar: Recording,
+    options: Options,
+    progress: ReadProgress | None,
+    scratch: Path,
+) -> Recording | None:
+    """Read the tilting laser from its own recording, or from a topic of the planar one's bag.
+
+    Returns:
+        The recording, None where neither `tilting_path` nor `read.tilting_topic` is given.
+
+    Raises:
+        InputError: it cannot be read, or is not of the same robot and time as the planar one.
+    """
+    topic = options.read.tilting_topic
+    if tilting_path and topic is not None:
+        raise InputError("--tilting and --tilting-topic exclude each other")
+    if not tilting_path and topic is None:
+        return None
+    if planar.dimension != 2:
+        what = "the planar laser decides which objects move, but this recording is 3D"
+        raise InputError(what, where=planar_path)
+    if topic is not None:
+        base_frame = planar.source.get("base_frame") or None
+        read_as = dataclasses.replace(
+            options.read, topic=topic, tilting_topic=None, base_frame=base_frame
+        )
+        tilting = _read_topic(Path(planar_path), read_as, progress, scratch)
+    else:
+        # a topic chosen for INPUT is not in the other recording
+        read_as = dataclasses.replace(options.read, topic=None)
+        tilting = read(Path(str(tilting_path)), read_as, progress=progress, scratch=scratch)
+    path = tilting_path or planar_path
+    check_rig(planar, tilting, path)
+    return dataclasses.replace(tilting, source={**tilting.source, "path": path})
+
+
+def _read_topic(
+    path: Path, options: ReadOptions, progress: ReadProgress | None, scratch: Path
+) -> Recording:
+    from stillmap.io.builder import ReadContext
+    from stillmap.io.ros.reader import read_tilting  # message types take long to load
+
+    if detect_format(path).name != "ROS bag":
+        raise InputError("--tilting-topic is for bags", where=str(path))
+    with np.errstate(over="ignore", invalid="ignore"):
+        return read_tilting(path, ReadContext(options, progress, scratch))
+
+
+def build_all(
+    args: argparse.Namespace,
+    inputs: Inputs,
+    checkpoints: CheckpointFolder,
+    progress: Progress,
+    stages: StageTimer,
+) -> "tuple[Result, TiltingResult | None, Models | None]":
+    """EM with a checkpoint per iteration, then the tilting laser and the meshes."""
+    options = inputs.options
+    with stages.measure("read"):
+        run_id = identify_run(inputs.recording, options, inputs.poses)
+    result = build(
+        inputs.recording,
+        options,
+        poses=inputs.poses,
+        progress=progress,
+        stages=stages,
+        scratch=checkpoints.folder,
+        resume=_load_checkpoint(args, checkpoints, run_id, options, stages),
+        checkpoint=lambda state: checkpoints.save(state, run_id, stages),
+    )
+    tilting = None
+    if inputs.tilting is not None:
+        progress("removing moving objects", 0, 0, 0)
+        with stages.measure("tilting"):
+            tilting = _map_tilting_laser(result, inputs.tilting, options)
+    models, warnings = _build_models(result, tilting, progress, stages)
+    warnings = [*result.warnings, *warnings]
+    result = dataclasses.replace(result, warnings=warnings, stages=stages.to_dict())
+    return result, tilting, models
+
+
+def _build_models(
+    result: Result, tilting: TiltingResult | None, progress: Progress, stages: StageTimer
+) -> "tuple[Models | None, list[str]]":
+    """Build the meshes of a 3D recording where they are enabled; return them and warnings."""
+    if not result.options.mesh.enabled or (tilting is None and result.recording.dimension == 2):
+        return None, []
+    try:
+        models = build_models(result, tilting=tilting, progress=progress, stages=stages)
+    except MissingExtra as error:
+        return None, [f"no models: {error}"]
+    warnings = []
+    if not len(models.assignment.mesh):
+        warnings.append("no mesh of the place: hardly any beams are neighbours on a surface")
+    if count := len(models.unread):
+        what = "an image is not used" if count == 1 else f"{count} images are not used, the first"
+        warnings.append(f"{what}: {models.unread[0]}")
+    return models, warnings
+
+
+def _load_checkpoint(
+    args: argparse.Namespace,
+    checkpoints: CheckpointFolder,
+    run_id: dict[str, Any],
+    options: Options,
+    stages: StageTimer,
+) -> EmState | None:
+    """The state of an interrupted run, where there is one and `--resume` is given."""
+    if checkpoints.newest is None:
+        return None
+    if not args.resume:
+        if not args.quiet:
+            say("an earlier run was interrupted: starts anew; --resume would continue it")
+        checkpoints.clear()
+        return None
+    try:
+        state = checkpoints.load(run_id, options, stages)
+    except DamagedCheckpoint as error:
+        say(f"warning: {error}; starts anew")
+        checkpoints.clear()
+        return None
+    if state is not None and not args.quiet:
+        say(f"continues after iteration {len(state.records)}")
+    return state
+
+
+@limit_blas_threads()
+def _map_tilting_laser(result: Result, tilting: Recording, options: Options) -> TiltingResult:
+    """Map the tilting laser in 3D, given the labels and objects of the planar one."""
+    planar = PlanarResult(result.deskewed, result.poses, result.p_static, result.objects)
+    threads = resolve_threads(options.threads)
+    return build_tilting(planar, tilting, options.rig, options.objects, options.em, threads)
