@@ -34,6 +34,9 @@ class ReadContext(NamedTuple):
 class RecordingBuilder:
     """Collects point clouds, in any order, in memory-mapped buffers.
 
+    Attributes:
+        stamp_ns, length, sensor: stamp, number of points and sensor of each scan, as added.
+
     Args:
         dimension: D, 2 or 3.
         context: points nearer than the option `min_range` are unusable, those from `max_range` on
@@ -43,13 +46,13 @@ class RecordingBuilder:
 
     def __init__(self, dimension: int, context: ReadContext, *, beam_times: bool = False) -> None:
         self._options, self._folder = context.options, context.scratch
-        self._stamp_ns, self._length, self._sensor = array("q"), array("q"), array("i")
+        self.stamp_ns, self.length, self.sensor = array("q"), array("q"), array("i")
         self._points = ArrayBuilder(np.float32, (dimension,), self._folder)
         self._hit = ArrayBuilder(np.bool_, (), self._folder)
         self._times = ArrayBuilder(np.float32, (), self._folder) if beam_times else None
 
     def __len__(self) -> int:
-        return len(self._stamp_ns)
+        return len(self.stamp_ns)
 
     def add_scan(
         self,
@@ -76,9 +79,9 @@ class RecordingBuilder:
             if self._times is not None:
                 times = np.zeros(len(known)) if beam_time is None else beam_time[block]
                 self._times.append(np.where(np.isfinite(times), times, 0.0))
-        self._stamp_ns.append(stamp_ns)
-        self._length.append(len(points))
-        self._sensor.append(sensor)
+        self.stamp_ns.append(stamp_ns)
+        self.length.append(len(points))
+        self.sensor.append(sensor)
 
     def build(
         self,
@@ -99,8 +102,8 @@ class RecordingBuilder:
             selection: indices of the scans to use; None: all.
             more: other fields of the Recording.
         """
-        stamp_ns = np.asarray(self._stamp_ns, np.int64)
-        length = np.asarray(self._length, np.int64)
+        stamp_ns = np.asarray(self.stamp_ns, np.int64)
+        length = np.asarray(self.length, np.int64)
         selection = np.arange(len(stamp_ns)) if selection is None else np.sort(selection)
         order = selection[np.argsort(stamp_ns[selection], kind="stable")]
         start = np.cumsum(length) - length
@@ -115,7 +118,7 @@ class RecordingBuilder:
             points=columns[0],
             hit=columns[1],
             T_base_sensor=T_base_sensor,
-            sensor=np.asarray(self._sensor, np.int32)[order],
+            sensor=np.asarray(self.sensor, np.int32)[order],
             T_odom_base=None if T_odom_base is None else T_odom_base[order],
             source=source,
             beam_time=columns[2] if self._times is not None else None,

@@ -14,8 +14,7 @@ from stillmap.core.camera import Images
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.io import writers
-from stillmap.io.ros import message_writer
-from stillmap.io.ros.recording_writer import write_recording
+from stillmap.io.ros.recording_writer import LaserScanEncoder, write_recording
 from stillmap.sim import scene_by_name, simulate
 
 KINDS = {"bag": "out.bag", "ros2": "out", "db3": "out.db3", "mcap": "out.mcap"}
@@ -207,7 +206,7 @@ def test_a_bag_appears_complete_or_not_at_all(tmp_path, driven, kind, monkeypatc
     path = tmp_path / KINDS[kind]
     write_recording(driven, path, kind)
     before = [(p, p.read_bytes()) for p in sorted(Path(tmp_path).rglob("*")) if p.is_file()]
-    monkeypatch.setattr(message_writer, "make_laser_scan", lambda *_: 1 / 0)
+    monkeypatch.setattr(LaserScanEncoder, "make_message", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         write_recording(driven, path, kind, overwrite=True)
     assert [(p, p.read_bytes()) for p in sorted(tmp_path.rglob("*")) if p.is_file()] == before

@@ -1,7 +1,8 @@
 """Opens bags of every kind, detected by their first bytes."""
 
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import yaml
@@ -21,8 +22,15 @@ from stillmap.io.ros.bag_types import (
     is_compressed,
     storage_files,
 )
+from stillmap.io.ros.damaged_bag import DamagedBag
+from stillmap.io.ros.indexed_bag import IndexedBag
 from stillmap.io.ros.limits import ZstdError, open_zstd
 
+_STORAGES = {  # first bytes: name, opener of the reader with an index, recovery without
+    b"#ROSBAG V2.0\n": ("ROS 1 bag", indexed_bag.open_bag1, damaged_bag.scan_bag1),
+    MCAP_MAGIC: ("MCAP", indexed_bag.open_mcap, damaged_bag.scan_mcap),
+    DB3_MAGIC: ("SQLite bag", indexed_bag.open_db3, damaged_bag.scan_db3),
+}
 _MAX_RATIO, _MIN_LIMIT = 100, 1 << 30  # of a compressed file: times its size; bytes
 _MAX_METADATA = 256 << 10  # bytes of YAML, which take two seconds to parse
 _PIECE = 1 << 20  # bytes
@@ -68,31 +76,23 @@ def _open_file(path: Path, scratch: Path | None, trusted: bool) -> Bag:
         raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
     if is_compressed(path, start):
         return _CompressedBag(path, scratch, trusted)
-    reader = indexed_bag if trusted else damaged_bag
-    openers: dict[bytes, Callable[[Path], Bag]] = {
-        b"#ROSBAG V2.0\n": reader.open_bag1,
-        MCAP_MAGIC: reader.open_mcap,
-        DB3_MAGIC: reader.open_db3,
-    }
-    for magic, opener in openers.items():
+    for magic, (kind, open_indexed, scan) in _STORAGES.items():
         if start.startswith(magic):
-            return _open(opener, path)
+            try:
+                if trusted:
+                    return IndexedBag(kind, open_indexed(path))
+                return DamagedBag(kind, partial(scan, path))
+            except InputError as error:
+                raise InputError(error.what, where=str(path), hint=error.hint) from error
+            except PermissionError as error:
+                raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
+            except Exception as error:  # any error of a library about damaged bytes
+                raise DamagedBagError(str(error) or type(error).__name__) from error
     if start.startswith(BAG1_MAGIC):
         version = start[8:13].decode("ascii", "replace").strip()
         hint = "`rosbag fix` or `rosbag reindex` of ROS 1 makes a V2.0 of it"
         raise InputError(f"is a bag of version {version}", where=str(path), hint=hint)
     raise InputError("is no bag, in spite of its name", where=str(path))
-
-
-def _open(opener: Callable[[Path], Bag], path: Path) -> Bag:
-    try:
-        return opener(path)
-    except InputError as error:
-        raise InputError(error.what, where=str(path), hint=error.hint) from error
-    except PermissionError as error:
-        raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
-    except Exception as error:  # any error of a library about damaged bytes
-        raise DamagedBagError(str(error) or type(error).__name__) from error
 
 
 def _list_files(folder: Path) -> list[Path]:

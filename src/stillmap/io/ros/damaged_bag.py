@@ -4,10 +4,10 @@ A chunk that cannot be decompressed is skipped and counted; at the first invalid
 ends and everything before it is kept.
 """
 
-import dataclasses
 import os
 import sqlite3
 import struct
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from functools import partial
@@ -26,13 +26,6 @@ CUT = "end that is no record"
 BAD_CHUNK = "chunk that cannot be decompressed"
 BAD_ROWS = "rows that cannot be read"
 
-_DECOMPRESS: dict[str, Callable[[bytes], bytes]] = {
-    "": bytes,
-    "none": bytes,
-    "bz2": limits.decompress_bz2,
-    "lz4": limits.decompress_lz4,
-    "zstd": limits.decompress_zstd,
-}
 _MCAP_SCHEMA, _MCAP_CHANNEL, _MCAP_MESSAGE, _MCAP_CHUNK = 0x03, 0x04, 0x05, 0x06
 _MCAP_MAGIC_BYTE = 0x89
 
@@ -44,21 +37,14 @@ class _CutError(Exception):
     """The records end before the file does."""
 
 
-@dataclasses.dataclass
 class DamagedBag:
     """See `Bag`. `scan` yields records and enters the channels that it meets."""
 
-    kind: str
-    scan: _Scan
-    channels: list[Channel] = dataclasses.field(default_factory=list)
-    damage: SkippedRecords = dataclasses.field(default_factory=SkippedRecords)
-
-    def __post_init__(self) -> None:
+    def __init__(self, kind: str, scan: _Scan) -> None:
+        self.kind, self.scan, self.damage = kind, scan, SkippedRecords()
         found: dict[int, Channel] = {}
-        count: dict[int, int] = {}
-        for channel, _, _ in self.scan(found, self.damage):
-            count[channel] = count.get(channel, 0) + 1
-        self.channels = [c._replace(n_messages=count.get(c.id, 0)) for c in found.values()]
+        count = Counter(channel for channel, _, _ in scan(found, self.damage))
+        self.channels = [c._replace(n_messages=count[c.id]) for c in found.values()]
 
     def messages(self, topics: set[str], since_ns: int | None = None) -> Iterator[Message]:
         """See `Bag`."""
@@ -73,22 +59,8 @@ class DamagedBag:
         """See `Bag`."""
 
 
-def open_bag1(path: Path) -> DamagedBag:
-    """Recover a ROS 1 bag."""
-    return DamagedBag("ROS 1 bag", lambda found, damage: _scan_bag1(path, found, damage))
-
-
-def open_mcap(path: Path) -> DamagedBag:
-    """Recover an MCAP file."""
-    return DamagedBag("MCAP", lambda found, damage: _scan_mcap(path, found, damage))
-
-
-def open_db3(path: Path) -> DamagedBag:
-    """Recover a SQLite file."""
-    return DamagedBag("SQLite bag", lambda found, damage: _scan_db3(path, found, damage))
-
-
-def _scan_bag1(path: Path, found: dict[int, Channel], damage: SkippedRecords) -> Records:
+def scan_bag1(path: Path, found: dict[int, Channel], damage: SkippedRecords) -> Records:
+    """Records of a ROS 1 bag."""
     with path.open("rb") as file:
         file.readline(64)  # #ROSBAG V2.0
         yield from _until_cut(file, damage, _bag1_records(file, found, damage))
@@ -109,10 +81,8 @@ def _bag1_records(
                 raise _CutError
             # the beginning of a cut chunk can be decompressed
             read = partial(_bag1_chunk, header, file.read(size))
-            inner = _decompress_chunk(read, damage, at)
-            if inner is not None:
-                records = _bag1_records(inner, found, damage, in_chunk=True)
-                yield from _until_cut(inner, damage, records, at)
+            records = partial(_bag1_records, found=found, damage=damage, in_chunk=True)
+            yield from _chunk_records(read, records, damage, at)
             continue
         data = _read_exactly(file, size, end)
         if kind == RecordType.CONNECTION:
@@ -133,7 +103,8 @@ def _bag1_channel(header: Header, data: bytes) -> Channel:
     return Channel(header.get_uint32("conn"), topic, kind, "ros1", 0, fields.get_string("md5sum"))
 
 
-def _scan_mcap(path: Path, found: dict[int, Channel], damage: SkippedRecords) -> Records:
+def scan_mcap(path: Path, found: dict[int, Channel], damage: SkippedRecords) -> Records:
+    """Records of an MCAP file."""
     with path.open("rb") as file:
         file.read(8)  # magic
         yield from _until_cut(file, damage, _mcap_records(file, {}, found, damage))
@@ -160,10 +131,11 @@ def _mcap_records(
         size = min(_read_number(file, 8), end)
         if kind == _MCAP_CHUNK:
             # the beginning of a cut chunk can be decompressed
-            inner = _decompress_chunk(partial(_mcap_chunk, file.read(size)), damage, at)
-            if inner is not None:
-                records = _mcap_records(inner, schemas, found, damage, in_chunk=True)
-                yield from _until_cut(inner, damage, records, at)
+            read = partial(_mcap_chunk, file.read(size))
+            records = partial(
+                _mcap_records, schemas=schemas, found=found, damage=damage, in_chunk=True
+            )
+            yield from _chunk_records(read, records, damage, at)
             continue
         data = _read_exactly(file, size, end)
         record = BytesIO(data)
@@ -187,21 +159,27 @@ def _mcap_chunk(data: bytes) -> tuple[str, bytes]:
     return compression, record.read(min(_read_number(record, 8), len(data)))
 
 
-def _decompress_chunk(
-    read: Callable[[], tuple[str, bytes]], damage: SkippedRecords, at: int
-) -> IO[bytes] | None:
-    """The records of a chunk of (compression, data); None, and counted, if it is damaged."""
+def _chunk_records(
+    read: Callable[[], tuple[str, bytes]],
+    records: Callable[[IO[bytes]], Records],
+    damage: SkippedRecords,
+    at: int,
+) -> Records:
+    """Records of a chunk of (compression, data) at a position; it is counted if it is damaged."""
     try:
         compression, data = read()
-        return BytesIO(_DECOMPRESS[compression](data))
+        raw = data if compression in ("", "none") else limits.decompress(compression, data)
     except limits.OutputLimitError:
         raise
     except Exception:  # any error of a library about damaged bytes
         damage.add(BAD_CHUNK, at)
-        return None
+    else:
+        chunk = BytesIO(raw)
+        yield from _until_cut(chunk, damage, records(chunk), at)
 
 
-def _scan_db3(path: Path, found: dict[int, Channel], damage: SkippedRecords) -> Records:
+def scan_db3(path: Path, found: dict[int, Channel], damage: SkippedRecords) -> Records:
+    """Records of a SQLite file."""
     rows = 0
     try:
         with closing(limits.open_database(path)) as database:

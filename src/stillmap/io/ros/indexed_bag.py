@@ -1,7 +1,7 @@
 """Undamaged bags, read by rosbags with their index."""
 
-import dataclasses
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,8 @@ from stillmap.io.ros import limits
 from stillmap.io.ros.bag_types import MAX_STAMP_NS, Channel, DamagedBagError, Message
 
 # rosbags decompresses without a limit; its table is where one can be set
-storage_mcap.DECOMPRESSORS["lz4"] = lambda data, _: limits.decompress_lz4(data)
-storage_mcap.DECOMPRESSORS["zstd"] = lambda data, _: limits.decompress_zstd(data)
+storage_mcap.DECOMPRESSORS["lz4"] = lambda data, _: limits.decompress("lz4", data)
+storage_mcap.DECOMPRESSORS["zstd"] = lambda data, _: limits.decompress("zstd", data)
 
 _MAX_QOS_TEXT = 16 << 10  # bytes of YAML: a megabyte takes rosbags half a minute
 
@@ -30,8 +30,7 @@ for _module in (storage_mcap, storage_sqlite3):
     vars(_module).update(parse_qos=_parse_qos)
 
 _BOUNDED = {
-    rosbag1.decompressors["bz2"]: limits.decompress_bz2,
-    rosbag1.decompressors["lz4"]: limits.decompress_lz4,
+    rosbag1.decompressors[name]: partial(limits.decompress, name) for name in ("bz2", "lz4")
 }
 
 
@@ -56,17 +55,12 @@ class _Bag1Reader(rosbag1.Reader):
         return chunk._replace(decompressor=decompress)
 
 
-@dataclasses.dataclass
 class IndexedBag:
     """See `Bag`."""
 
-    kind: str
-    reader: Any
-    channels: list[Channel] = dataclasses.field(default_factory=list)
-    damage: SkippedRecords = dataclasses.field(default_factory=SkippedRecords)
-
-    def __post_init__(self) -> None:
-        self.channels = [_channel(connection) for connection in self.reader.connections]
+    def __init__(self, kind: str, reader: Any) -> None:
+        self.kind, self.reader, self.damage = kind, reader, SkippedRecords()
+        self.channels = [_channel(connection) for connection in reader.connections]
 
     def messages(self, topics: set[str], since_ns: int | None = None) -> Iterator[Message]:
         """See `Bag`."""
@@ -94,27 +88,27 @@ class IndexedBag:
         self.reader.close()
 
 
-def open_bag1(path: Path) -> IndexedBag:
-    """Open a ROS 1 bag. Any error of rosbags means damage; likewise below."""
+def open_bag1(path: Path) -> Any:
+    """Open the reader of a ROS 1 bag. Any error of rosbags means damage; likewise below."""
     reader = _Bag1Reader(path)
     reader.open()
-    return IndexedBag("ROS 1 bag", reader)
+    return reader
 
 
-def open_mcap(path: Path) -> IndexedBag:
-    """Open an MCAP file of ROS 2."""
+def open_mcap(path: Path) -> Any:
+    """Open the reader of an MCAP file of ROS 2."""
     reader = storage_mcap.McapReader(path)
     reader.open()
-    return IndexedBag("MCAP", reader)
+    return reader
 
 
-def open_db3(path: Path) -> IndexedBag:
-    """Open a SQLite file of ROS 2."""
+def open_db3(path: Path) -> Any:
+    """Open the reader of a SQLite file of ROS 2."""
     # rosbags builds a URI from the path without quoting it
     reader = storage_sqlite3.Sqlite3Reader(Path(limits.database_path(path)))
     with limits.limit_databases(path):
         reader.open()
-    return IndexedBag("SQLite bag", reader)
+    return reader
 
 
 def _channel(connection: Any) -> Channel:

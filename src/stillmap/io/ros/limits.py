@@ -30,6 +30,12 @@ MAX_CHUNK = 256 << 20  # bytes of one chunk or message; recorders write chunks o
 RECORD_COST = 64  # bytes that a record counts for, even an empty one
 ZstdError = zstd.ZstdError
 
+_DECOMPRESSORS: dict[str, Callable[[], Any]] = {
+    "bz2": bz2.BZ2Decompressor,
+    "lz4": lz4.frame.LZ4FrameDecompressor,
+    "zstd": zstd.ZstdDecompressor,
+}
+
 _MAX_RATIO, _MIN_LIMIT = 300, 512 << 20  # output of a bag: times its size; bytes
 
 _TABLES = ("topics", "messages", "schema", "message_definitions")
@@ -72,35 +78,20 @@ def count_output(count: int) -> None:
         raise OutputLimitError(f"is damaged: it expands to more than {_MAX_RATIO} times its size")
 
 
-def decompress_bz2(data: bytes) -> bytes:
-    """Decompress a bz2 stream; errors as of `_decompress`."""
-    return _decompress(bz2.BZ2Decompressor().decompress, data)
-
-
-def decompress_lz4(data: bytes) -> bytes:
-    """Decompress a lz4 frame; errors as of `_decompress`."""
-    return _decompress(lz4.frame.LZ4FrameDecompressor().decompress, data)
-
-
-def decompress_zstd(data: bytes) -> bytes:
-    """Decompress a zstd frame; errors as of `_decompress`."""
-    return _decompress(zstd.ZstdDecompressor().decompress, data)
-
-
 def open_zstd(compressed: IO[bytes]) -> Any:
     """A readable stream over a file of zstd frames; a context manager."""
     return zstd.open(compressed, "rb")
 
 
-def _decompress(decompress: Callable[..., Any], data: bytes) -> bytes:
-    """Decompress up to `MAX_CHUNK` bytes.
+def decompress(compression: str, data: bytes) -> bytes:
+    """Decompress up to `MAX_CHUNK` bytes of a compression in `_DECOMPRESSORS`.
 
     Raises:
         InputError: there are more.
         Exception: any error of the library about damaged data.
     """
     count_output(0)
-    out = bytes(decompress(data, MAX_CHUNK + 1))
+    out = bytes(_DECOMPRESSORS[compression]().decompress(data, MAX_CHUNK + 1))
     count_output(len(out))
     if len(out) > MAX_CHUNK:
         raise InputError(

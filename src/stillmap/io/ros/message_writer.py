@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from stillmap.io.ros.bag_writer import BagWriter
-from stillmap.io.ros.messages import LASER_SCAN, ODOMETRY, POINT_CLOUD, TF
+from stillmap.io.ros.messages import ODOMETRY, POINT_CLOUD, TF
 
 BASE, ODOM, MAP = "base_link", "odom", "map"
 
@@ -16,43 +16,6 @@ GRID = "nav_msgs/msg/OccupancyGrid"
 MARKERS = "visualization_msgs/msg/MarkerArray"
 
 _FLOAT32 = 7  # of sensor_msgs/PointField
-_NONE = np.empty(0, np.float32)
-
-
-def make_laser_scan(
-    bag: BagWriter,
-    stamp_ns: int,
-    frame: str,
-    ranges: NDArray[np.float32],
-    angles: tuple[float, float],
-    time_increment: float,
-    range_max: float,
-) -> Any:
-    """A LaserScan.
-
-    Args:
-        bag: whose message types are used.
-        stamp_ns: time of the first beam.
-        frame: of the laser.
-        ranges: (n,) metres, +inf for no return, NaN for unusable (REP 117).
-        angles: first angle and step in radians, counterclockwise.
-        time_increment: seconds from beam to beam, 0 for none.
-        range_max: metres, above all finite ranges.
-    """
-    start, step = angles
-    return bag.make(
-        LASER_SCAN,
-        header=bag.header(stamp_ns, frame),
-        angle_min=start,
-        angle_max=start + step * max(len(ranges) - 1, 0),
-        angle_increment=step,
-        time_increment=time_increment,
-        scan_time=0.0,
-        range_min=0.0,
-        range_max=range_max,
-        ranges=ranges,
-        intensities=_NONE,
-    )
 
 
 def make_point_cloud(

@@ -9,8 +9,8 @@ from typing import Any
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+from stillmap.io.ros import limits
 from stillmap.io.ros.bag_types import ZSTD_MAGIC, Channel, Message
-from stillmap.io.ros.limits import decompress_zstd
 
 LASER_SCAN, MULTI_ECHO = "sensor_msgs/msg/LaserScan", "sensor_msgs/msg/MultiEchoLaserScan"
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -39,7 +39,7 @@ def decompress(message: Message) -> bytes:
     """The content of a message, which ROS 2 may have compressed one by one."""
     # a CDR message begins with a zero byte
     compressed = message.channel.encoding != "ros1" and message.raw.startswith(ZSTD_MAGIC)
-    return decompress_zstd(message.raw) if compressed else message.raw
+    return limits.decompress("zstd", message.raw) if compressed else message.raw
 
 
 def find_fault(channel: Channel) -> str | None:

@@ -2,13 +2,14 @@
 
 from array import array
 from collections import Counter
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.io.builder import ReadContext, RecordingBuilder, SkippedRecords
 from stillmap.io.point_cloud import time_field
+from stillmap.io.point_cloud.scans import Cloud
 from stillmap.io.ros.bag_types import Message
 from stillmap.io.ros.laser_scan import UNREADABLE
 from stillmap.io.ros.messages import decode, frame_name, stamp_ns
@@ -20,20 +21,11 @@ _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"
 _MAX_STEP = 1 << 16  # bytes of one point
 
 
-class Cloud(NamedTuple):
-    """The points of one message.
-
-    Attributes:
-        points: (n, 3) float32 metres; not finite for no return.
-        times: (n,) seconds after the stamp, None without a time field.
-    """
-
-    points: NDArray[np.float32]
-    times: NDArray[np.float64] | None
-
-
 def parse_cloud(message: Any) -> Cloud | str:
-    """The points of a PointCloud2 message with fields in any order, or why it cannot be used."""
+    """The cloud of a PointCloud2 message with fields in any order, or why it cannot be used.
+
+    Its times are in seconds after the stamp; points are not finite for no return.
+    """
     fields = {str(f.name).lower(): f for f in message.fields}
     step, width, height = int(message.point_step), int(message.width), int(message.height)
     row = int(message.row_step) or width * step
@@ -57,11 +49,11 @@ def parse_cloud(message: Any) -> Cloud | str:
         }
     )
     if end == 0:
-        return Cloud(np.empty((0, 3), np.float32), None)
+        return Cloud(np.empty((0, 3), np.float32))
     values = np.ndarray((height, width), dtype, message.data, strides=(row, step)).reshape(-1)
     points = np.stack([values[name].astype(np.float32) for name in "xyz"], axis=1)
     times = _times(values[time], points, stamp_ns(message.header)) if time in known else None
-    return Cloud(points, times)
+    return Cloud(points, times=times)
 
 
 def _times(
@@ -87,8 +79,8 @@ class CloudCollector:
     Attributes:
         sensors: number of each sensor, by topic and frame.
         timed: sensors with beam times.
-        stamp_ns, sensor, number, beams: (T,) per scan; number counts messages of the topic from 1.
-        scans: points.
+        number: (T,) number of the message of each scan on its topic, from 1.
+        scans: stamps, sensors and points.
         skipped: messages that were skipped, by topic.
     """
 
@@ -97,8 +89,7 @@ class CloudCollector:
         self.skipped: dict[str, SkippedRecords] = {}
         self.sensors: dict[tuple[str, str], int] = {}
         self.timed: set[int] = set()
-        self.stamp_ns, self.sensor, self.number = array("q"), array("i"), array("q")
-        self.beams = array("q")
+        self.number = array("q")
         self.scans = RecordingBuilder(3, context, beam_times=True)
 
     def add_message(self, message: Message) -> None:
@@ -121,7 +112,4 @@ class CloudCollector:
         if cloud.times is not None:
             self.timed.add(sensor)
         self.scans.add_scan(stamp, cloud.points, sensor=sensor, beam_time=cloud.times)
-        self.stamp_ns.append(stamp)
-        self.sensor.append(sensor)
         self.number.append(self._count[topic])
-        self.beams.append(len(cloud.points))

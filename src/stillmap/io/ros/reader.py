@@ -125,9 +125,9 @@ def _build_cloud_recording(
         total = SkippedRecords().merge(*clouds.skipped.values())
         raise InputError(f"holds no usable cloud: {total.summary('message')}")
     names = list(clouds.sensors)
-    counts = np.bincount(np.asarray(clouds.sensor), minlength=len(names)).tolist()
+    counts = np.bincount(np.asarray(clouds.scans.sensor), minlength=len(names)).tolist()
     used, omitted = _select_sensors(clouds, counts, named=options.topic is not None)
-    stamps = np.asarray(clouds.stamp_ns, np.int64)
+    stamps = np.asarray(clouds.scans.stamp_ns, np.int64)
     scans = [_select_forward_scans(clouds, names[k][0], k, stamps) for k in used]
     frames = [(names[k][1], stamps[rows]) for k, rows in zip(used, scans, strict=True)]
     poses = base_frame.find_sensor_poses(content, frames, options)
@@ -162,7 +162,7 @@ def _select_sensors(
 ) -> tuple[list[int], list[str]]:
     """The sensors to use, most points first: other clouds are derived from these."""
     names = list(clouds.sensors)
-    sensor, beams = np.asarray(clouds.sensor), np.asarray(clouds.beams)
+    sensor, beams = np.asarray(clouds.scans.sensor), np.asarray(clouds.scans.length)
     points = [int(beams[sensor == k].sum()) for k in range(len(names))]
     order = sorted(range(len(names)), key=lambda k: (-points[k], names[k]))
     candidates = [(*names[k], counts[k]) for k in order]
@@ -205,7 +205,7 @@ def _select_forward_scans(
     clouds: CloudCollector, topic: str, sensor: int, stamps: NDArray[np.int64]
 ) -> NDArray[np.intp]:
     """The scans of a sensor with non-decreasing stamps; others are counted."""
-    rows = np.flatnonzero(np.asarray(clouds.sensor) == sensor)
+    rows = np.flatnonzero(np.asarray(clouds.scans.sensor) == sensor)
     keep = longest_non_decreasing(stamps[rows].tolist())
     number = np.asarray(clouds.number)[rows]
     skipped = clouds.skipped.setdefault(topic, SkippedRecords())

@@ -87,14 +87,19 @@ class LaserScanEncoder:
 
     def make_message(self, bag: BagWriter, t: int, frame: str, ranges: NDArray[np.float32]) -> Any:
         """The message of scan t with ranges (n,)."""
-        return message_writer.make_laser_scan(
-            bag,
-            int(self._recording.stamp_ns[t]),
-            frame,
-            ranges,
-            (float(self._angles[t, 0]), float(self._angles[t, 1])),
-            float(self._time_increments[t]),
-            self._range_max[self._recording.sensor[t]],
+        start, step = self._angles[t].tolist()
+        return bag.make(
+            LASER_SCAN,
+            header=bag.header(int(self._recording.stamp_ns[t]), frame),
+            angle_min=start,
+            angle_max=start + step * max(len(ranges) - 1, 0),
+            angle_increment=step,
+            time_increment=float(self._time_increments[t]),
+            scan_time=0.0,
+            range_min=0.0,
+            range_max=self._range_max[self._recording.sensor[t]],
+            ranges=ranges,
+            intensities=np.empty(0, np.float32),
         )
 
     def describe_losses(self) -> list[str]:
