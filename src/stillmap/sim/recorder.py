@@ -66,7 +66,7 @@ class World(NamedTuple):
         if sensor.own is None:
             return exact
         nearer, both = sensor.own.range < exact.range, zip(sensor.own, exact, strict=True)
-        return RayReturns._make(np.where(nearer, own, other) for own, other in both)
+        return RayReturns._make(np.where(nearer, *pair) for pair in both)
 
 
 def record(

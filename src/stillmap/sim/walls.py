@@ -1,26 +1,21 @@
-"""Drawing worlds: common pieces of buildings as wall segments x0, y0, x1, y1."""
+"""Drawing worlds: common pieces of buildings as wall segments x0, y0, x1, y1, movable objects."""
 
+import dataclasses
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
-from stillmap.sim.scene import Door, Point, Segment
+from stillmap.sim.scene import Door, Point, Scene, Segment, Stay, Thing
 
 Side = Literal["north", "south", "east", "west"]
 
 # unit vectors along a wall and out of the hall through it
-_ALONG: dict[Side, Point] = {
-    "south": (1.0, 0.0),
-    "north": (1.0, 0.0),
-    "west": (0.0, 1.0),
-    "east": (0.0, 1.0),
-}
-_OUT: dict[Side, Point] = {
-    "south": (0.0, -1.0),
-    "north": (0.0, 1.0),
-    "west": (-1.0, 0.0),
-    "east": (1.0, 0.0),
+_AXES: dict[Side, tuple[Point, Point]] = {
+    "south": ((1.0, 0.0), (0.0, -1.0)),
+    "north": ((1.0, 0.0), (0.0, 1.0)),
+    "west": ((0.0, 1.0), (-1.0, 0.0)),
+    "east": ((0.0, 1.0), (1.0, 0.0)),
 }
 
 
@@ -62,26 +57,34 @@ def pillar(x: float, y: float, radius: float, sides: int = 8) -> list[Segment]:
     return polyline(corners, closed=True)
 
 
+def locate(start: Point, side: Side, along: float, out: float = 0.0) -> Point:
+    """The point `along` metres along a wall that begins at `start`, and `out` metres behind it."""
+    (ux, uy), (ox, oy) = _AXES[side]
+    return (start[0] + along * ux + out * ox, start[1] + along * uy + out * oy)
+
+
+def box_along(
+    start: Point, side: Side, at: Point, width: float, depth: float, angle: float = 0.0
+) -> list[Segment]:
+    """A box `width` metres along a wall, centred at `at`, metres along and behind that wall."""
+    size = (width, depth) if side in ("north", "south") else (depth, width)
+    return box(*locate(start, side, *at), *size, angle)
+
+
 def wall(
     start: Point, length: float, side: Side, openings: Iterable[Opening] = ()
 ) -> list[Segment]:
     """A straight wall along +x or +y whose openings step back to `side`, in ascending order."""
-    (ux, uy), (ox, oy) = _ALONG[side], _OUT[side]
-
-    def at(along: float, out: float) -> Point:
-        return (start[0] + along * ux + out * ox, start[1] + along * uy + out * oy)
-
     segments: list[Segment] = []
-    done = 0.0
+    line = [locate(start, side, 0.0)]
     for o in openings:
         end = o.start + o.width
-        segments.append((*at(done, 0), *at(o.start, 0)))
-        segments.append((*at(o.start, 0), *at(o.start, o.depth)))
-        if not o.is_open:
-            segments.append((*at(o.start, o.depth), *at(end, o.depth)))
-        segments.append((*at(end, o.depth), *at(end, 0)))
-        done = end
-    segments.append((*at(done, 0), *at(length, 0)))
+        line += [locate(start, side, o.start), locate(start, side, o.start, o.depth)]
+        if o.is_open:
+            segments += polyline(line)
+            line = []
+        line += [locate(start, side, end, o.depth), locate(start, side, end)]
+    segments += polyline([*line, locate(start, side, length)])
     return [s for s in segments if s[:2] != s[2:]]
 
 
@@ -101,7 +104,6 @@ def room(
         depth: metres, inside, measured from the back of the doorway.
         door: the doorway, an opening of that same wall.
     """
-    (ux, uy), (ox, oy) = _ALONG[side], _OUT[side]
     near, far = door.depth, door.depth + depth
     corners = [
         (door.start, near),
@@ -111,7 +113,7 @@ def room(
         (along[1], near),
         (door.start + door.width, near),
     ]
-    return polyline([(start[0] + a * ux + o * ox, start[1] + a * uy + o * oy) for a, o in corners])
+    return polyline([locate(start, side, *corner) for corner in corners])
 
 
 def leaf(
@@ -126,12 +128,52 @@ def leaf(
         swing: rad, how far it opens.
         hinged_at_end: its hinge is where the opening ends, seen along the wall.
     """
-    (ux, uy), (ox, oy) = _ALONG[side], _OUT[side]
+    (ux, uy), (ox, oy) = _AXES[side]
     gap = 0.02
     at = opening.start + (opening.width - gap if hinged_at_end else gap)
-    hinge = (start[0] + at * ux + opening.depth * ox, start[1] + at * uy + opening.depth * oy)
+    hinge = locate(start, side, at, opening.depth)
     if hinged_at_end:
         ux, uy = -ux, -uy
     closed = math.atan2(uy, ux)
     turn = swing if ux * oy - uy * ox > 0 else -swing
     return Door(hinge, opening.width - 2 * gap, closed, closed + turn)
+
+
+class MovedObject(NamedTuple):
+    """An object that stands in another world for good, and here until `until`.
+
+    Attributes:
+        at: metres, center of a rectangle that contains it and nothing else.
+        size: metres, of the rectangle.
+        until: seconds since the beginning of the recording.
+        then: stays afterwards; none: it is taken away.
+    """
+
+    at: Point
+    size: Point
+    until: float
+    then: tuple[Stay, ...] = ()
+
+
+def add_objects(scene: Scene, lifted: Iterable[MovedObject], others: Iterable[Thing]) -> Scene:
+    """The scene with movable objects, some of them made of its walls."""
+    walls, things = scene.walls, []
+    for one in lifted:
+        faces, walls = split_walls(walls, one.at, one.size)
+        x, y = one.at
+        about = tuple((a - x, b - y, c - x, d - y) for a, b, c, d in faces)
+        things.append(Thing(about, (Stay(x, y, until=one.until), *one.then)))
+    return dataclasses.replace(scene, walls=walls, things=(*things, *others))
+
+
+def split_walls(
+    walls: Sequence[Segment], at: Point, size: Point
+) -> tuple[tuple[Segment, ...], tuple[Segment, ...]]:
+    """The walls within a rectangle, and all others."""
+    held: list[Segment] = []
+    others: list[Segment] = []
+    for wall in walls:
+        ends = (wall[:2], wall[2:])
+        inside = all(abs(x - at[0]) < size[0] / 2 and abs(y - at[1]) < size[1] / 2 for x, y in ends)
+        (held if inside else others).append(wall)
+    return tuple(held), tuple(others)

@@ -2,19 +2,18 @@
 
 import dataclasses
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 from stillmap.core.config import override
 from stillmap.core.errors import InputError, closest_match
 from stillmap.sim.scene import Scene
-from stillmap.sim.worlds.changed import office_moved, street_moved, warehouse_moved
-from stillmap.sim.worlds.crossing import crossing, street_turn
-from stillmap.sim.worlds.drive import drive
-from stillmap.sim.worlds.indoor import corridor, hall, warehouse
+from stillmap.sim.worlds.drive import drive, street_turn
+from stillmap.sim.worlds.indoor import corridor, hall, warehouse, warehouse_moved
 from stillmap.sim.worlds.large import building
 from stillmap.sim.worlds.loops import rounds, ten_corridors
-from stillmap.sim.worlds.office import office
-from stillmap.sim.worlds.street import street, street_jam
+from stillmap.sim.worlds.office import office, office_moved
+from stillmap.sim.worlds.street import crossing, street, street_jam, street_moved
 
 _EMPTY = "-empty"
 
@@ -35,16 +34,17 @@ _WORLDS: dict[str, Callable[[], Scene]] = {
     "street-moved": street_moved,
     "warehouse-moved": warehouse_moved,
 }
-_GROWING: dict[str, Callable[[int], Scene]] = {"building": building}  # given the number of scans
 
 
-def _with_people(scene: Scene, people: int) -> Scene:
+def _with_people(world: Callable[[], Scene], people: int) -> Scene:
+    scene = world()
     crowd = dataclasses.replace(scene.crowd, people=people)
     return dataclasses.replace(scene, name=f"{scene.name}-crowd", crowd=crowd)
 
 
-def _empty(scene: Scene) -> Scene:
+def _empty(world: Callable[[], Scene]) -> Scene:
     """The world without people and moving vehicles, its doors open; objects are moved as before."""
+    scene = world()
     return dataclasses.replace(
         scene,
         name=f"{scene.name}{_EMPTY}",
@@ -56,23 +56,11 @@ def _empty(scene: Scene) -> Scene:
     )
 
 
-def _make_empty(world: Callable[[], Scene]) -> Callable[[], Scene]:
-    return lambda: _empty(world())
-
-
-def _grow(name: str, scans: int) -> Scene | None:
-    """The world in a size for this number of scans; None if its size is fixed."""
-    grow = _GROWING.get(name.removesuffix(_EMPTY))
-    if grow is None or scans < 1:
-        return None
-    return _empty(grow(scans)) if name.endswith(_EMPTY) else grow(scans)
-
-
 SCENES: dict[str, Callable[[], Scene]] = {
     **_WORLDS,
-    "hall-crowd": lambda: _with_people(hall(), 60),
-    "corridor-crowd": lambda: _with_people(corridor(), 40),
-    **{f"{name}{_EMPTY}": _make_empty(world) for name, world in _WORLDS.items()},
+    "hall-crowd": partial(_with_people, hall, 60),
+    "corridor-crowd": partial(_with_people, corridor, 40),
+    **{f"{name}{_EMPTY}": partial(_empty, world) for name, world in _WORLDS.items()},
 }
 
 
@@ -91,5 +79,8 @@ def scene_by_name(name: str, changes: Mapping[str, Any] | None = None) -> Scene:
         raise InputError(f"there is no scene '{name}'", hint=hint)
     robot = (changes or {}).get("robot")
     scans = robot.get("scans") if isinstance(robot, Mapping) else None
-    scene = _grow(name, scans) if type(scans) is int else None
-    return override(scene or SCENES[name](), changes or {})
+    world = SCENES[name]
+    if name.removesuffix(_EMPTY) == "building" and type(scans) is int and scans >= 1:
+        grown = partial(building, scans)
+        world = partial(_empty, grown) if name.endswith(_EMPTY) else grown
+    return override(world(), changes or {})

@@ -1,15 +1,27 @@
 """An exhibition hall, a loop of corridors, and a warehouse with racks and forklifts."""
 
+import dataclasses
 import math
 
 import numpy as np
 
-from stillmap.sim.options import CrowdOptions, HeightOptions, TrafficOptions
-from stillmap.sim.scene import Lane, Point, Scene, Segment
-from stillmap.sim.walls import Opening, Side, box, pillar, polyline, room, wall
+from stillmap.sim.options import CrowdOptions, HeightOptions, RobotOptions, TrafficOptions
+from stillmap.sim.scene import Lane, Point, Scene, Segment, Stay, Thing
+from stillmap.sim.walls import (
+    MovedObject,
+    Opening,
+    Side,
+    add_objects,
+    box,
+    pillar,
+    polyline,
+    room,
+    split_walls,
+    wall,
+)
 
 
-def hall(people: int = 15) -> Scene:
+def hall() -> Scene:
     """An exhibition hall of 45 x 30 m with columns, show cases and panels.
 
     Size and number of people are those of Haehnel, Triebel, Burgard, Thrun, Map building with
@@ -52,12 +64,12 @@ def hall(people: int = 15) -> Scene:
         walls=tuple(walls),
         glass=((45.0, 13.0, 45.0, 18.0),),
         route=(*west, *north, *east, *middle, *home),
-        crowd=CrowdOptions(people=people),
+        crowd=CrowdOptions(people=15),
         heights=HeightOptions(ceiling=6.0, furniture=1.2),
     )
 
 
-def corridor(people: int = 20) -> Scene:
+def corridor() -> Scene:
     """A loop of corridors 2.4 m wide around a block, with offices, closed doors and a lobby."""
     walls: list[Segment] = []
     for start, length, side, niches, rooms in _CORRIDOR_SIDES:
@@ -82,7 +94,7 @@ def corridor(people: int = 20) -> Scene:
         walls=tuple(walls),
         glass=((20.0, 25.0, 23.0, 25.0),),
         route=(*first, *second, (14.9, 1.2), (18, 1.2)),
-        crowd=CrowdOptions(people=people),
+        crowd=CrowdOptions(people=20),
     )
 
 
@@ -121,20 +133,15 @@ _CORRIDOR_FURNITURE = (
     (29.8, 9.4, 0.8, 1.6),
 )
 
-_LAYOUT_SEED = 12  # what stands where is part of the world, not of the recording
-
-RACKS = (2.6, 6.0, 9.2, 12.6, 15.8)  # m, y of the middles of the rows
-
-BLOCKS = ((5.0, 22.6), (25.4, 43.0))  # m, x from where to where racks stand
-
-BAY = 2.2  # m between two posts of a rack
-
+_RACKS = (2.6, 6.0, 9.2, 12.6, 15.8)  # m, y of the middles of the rows
+_BLOCKS = ((5.0, 22.6), (25.4, 43.0))  # m, x from where to where racks stand
+_BAY = 2.2  # m between two posts of a rack
 _DEPTH = 1.1  # m, of a rack
 
 
-def warehouse(people: int = 12) -> Scene:
+def warehouse() -> Scene:
     """A warehouse of 50 x 30 m; forklifts drive round in a lane along the north wall."""
-    rng = np.random.default_rng(_LAYOUT_SEED)
+    rng = np.random.default_rng(12)  # what stands where is part of the world, not of the recording
     docks = [Opening(x, 3.0, 0.6) for x in (6.0, 16.0, 26.0, 36.0)]
     walls = [
         *wall((0, 0), 50, "south", [Opening(9.0, 1.2), Opening(31.0, 4.0, 0.4)]),
@@ -142,8 +149,8 @@ def warehouse(people: int = 12) -> Scene:
         *wall((0, 0), 30, "west", [Opening(12.0, 1.2), Opening(20.0, 2.0, 0.5)]),
         *wall((50, 0), 30, "east", [Opening(5.0, 1.2), Opening(18.5, 1.2)]),
     ]
-    for y in RACKS:
-        for low, high in BLOCKS:
+    for y in _RACKS:
+        for low, high in _BLOCKS:
             walls += _rack(low, high, y, rng)
     walls += _stacks(rng)
     for x in (12.5, 24.0, 36.0):
@@ -157,7 +164,7 @@ def warehouse(people: int = 12) -> Scene:
         route=(*aisles, *more, *home, (23.9, 17.5), (23.9, 11.0)),
         kerbs=((0.0, 25.0, 50.0, 25.0),),
         lanes=(Lane(_circuit(3.0, 47.0, 26.3, 28.5), "forklift"),),
-        crowd=CrowdOptions(people=people),
+        crowd=CrowdOptions(people=12),
         heights=HeightOptions(ceiling=7.0),
         traffic=TrafficOptions(
             vehicles=2, min_speed=1.6, max_speed=2.4, stopping_share=1.0, max_stop=20.0
@@ -168,14 +175,14 @@ def warehouse(people: int = 12) -> Scene:
 def _rack(low: float, high: float, y: float, rng: np.random.Generator) -> list[Segment]:
     """Posts of 2 to 5 cm radius along both sides, and what the lowest shelf holds between them."""
     walls: list[Segment] = []
-    bays = round((high - low) / BAY)
+    bays = round((high - low) / _BAY)
     for k in range(bays + 1):
-        x = low + k * BAY
+        x = low + k * _BAY
         for side in (-1, 1):
             walls += pillar(x, y + side * _DEPTH / 2, rng.uniform(0.02, 0.05), 6)
         if k == bays or rng.random() < 0.15:
             continue
-        middle = x + BAY / 2
+        middle = x + _BAY / 2
         if rng.random() < 0.55:
             width, height = rng.uniform((1.0, 0.7), (1.8, 1.0)).tolist()
             shift, angle = rng.uniform(-0.05, 0.05, 2).tolist()
@@ -212,3 +219,37 @@ def _circuit(west: float, east: float, south: float, north: float) -> tuple[Poin
     right = [(east + radius * math.sin(a), middle - radius * math.cos(a)) for a in turns]
     left = [(west - radius * math.sin(a), middle + radius * math.cos(a)) for a in turns]
     return (*right, *left, right[0])
+
+
+def warehouse_moved() -> Scene:
+    """The warehouse, twice round a rack, and eight hours of a night between.
+
+    Overnight every third bay along the way that was full is emptied, every second one of these
+    filled with something else; those that were empty are filled.
+    """
+    scene, night = warehouse(), 215.0  # s, when the robot stops for eight hours
+    lifted: list[MovedObject] = []
+    filled: list[Thing] = []
+    bays: list[Point] = [
+        (low + (k + 0.5) * _BAY, y)
+        for y in _RACKS[:3]
+        for low, high in _BLOCKS
+        for k in range(round((high - low) / _BAY))
+    ]
+    for number, (x, y) in enumerate(bays):
+        when = night + (1.0 + number * 5 % 7) * 3600.0
+        goods = tuple(box(0, 0, 1.5 - 0.1 * (number % 5), 0.9 - 0.1 * (number % 3)))
+        other = Thing(goods, (Stay(x, y, 0.03 * (number % 4 - 2), since=when + 1800.0),))
+        slot = (_BAY - 0.14, 1.6)  # between the posts
+        is_full = bool(split_walls(scene.walls, (x, y), slot)[0])
+        if is_full and number % 3 == 0:
+            lifted.append(MovedObject((x, y), slot, when))
+        if not is_full or number % 6 == 0:
+            filled.append(other)
+    lap: list[Point] = [(2.4, 4.3), (23.9, 4.3), (47, 4.3), (47, 7.6), (23.9, 7.6), (2.4, 7.6)]
+    return dataclasses.replace(
+        add_objects(scene, lifted, filled),
+        name="warehouse-moved",
+        route=(*lap, *lap, lap[0]),
+        robot=RobotOptions(pause_at=night),
+    )

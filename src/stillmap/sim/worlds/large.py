@@ -3,32 +3,25 @@
 import itertools
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 
 from stillmap.sim.options import CrowdOptions, RobotOptions
 from stillmap.sim.scene import Point, Scene, Segment
-from stillmap.sim.walls import Opening, Side, box, pillar, room, wall
+from stillmap.sim.walls import Opening, Side, box, box_along, locate, pillar, room, wall
 
-LENGTH, DEPTH = 34.0, 21.6  # m, of the ground that a wing stands on
-
-ENTRANCE = 2.4  # m, how wide its entrance is
-
+_LENGTH, _DEPTH = 34.0, 21.6  # m, of the ground that a wing stands on
+_ENTRANCE = 2.4  # m, how wide its entrance is
 _WEST, _EAST, _SOUTH, _NORTH = 5.2, 28.8, 1.6, 16.8  # m, the outer walls of the ring
-
 _WIDTH = 2.2  # m, of its corridors
-
 _THICK = 0.15  # m, of walls
-
 _DOOR = 1.0  # m, width of a doorway
-
 _INSIDE = 1.5  # m behind its doorway, where one turns who looks into a room
 
 
-@dataclass(frozen=True)
-class _Row:
+class _Row(NamedTuple):
     """Rooms along a wall of the ring: where the wall begins, its length, their side and depth."""
 
     start: Point
@@ -46,8 +39,7 @@ _ROWS = (
 )
 
 
-@dataclass(frozen=True)
-class Wing:
+class _Wing(NamedTuple):
     """A wing with its entrance on the x axis, in metres; y into it.
 
     Attributes:
@@ -64,14 +56,18 @@ class Wing:
         """The way in, once round the ring with a look into these rooms of `looks`, and out."""
         near, far = _SOUTH + _WIDTH / 2, _NORTH - _WIDTH / 2
         west, east = _WEST + _WIDTH / 2, _EAST - _WIDTH / 2
-        gate: Point = (self.entrance + ENTRANCE / 2, near)
+        gate: Point = (self.entrance + _ENTRANCE / 2, near)
         corners: list[Point] = [gate, (west, near), (west, far), (east, far), (east, near), gate]
         if not westward:
             corners.reverse()
         way = [corners[0]]
         looks = [self.looks[k] for k in rooms]
         for a, b in itertools.pairwise(corners):
-            passed = [look for look in looks if _is_between(look[0], a, b)]
+            passed = [
+                look
+                for look in looks
+                if math.dist(a, look[0]) + math.dist(look[0], b) < math.dist(a, b) + 1e-6
+            ]
             looks = [look for look in looks if look not in passed]
             for before, behind in sorted(passed, key=lambda look: math.dist(a, look[0])):
                 way += [before, behind, before]
@@ -79,8 +75,10 @@ class Wing:
         return [(gate[0], 0.0), *way, (gate[0], 0.0)]
 
 
-def wing(rng: np.random.Generator) -> Wing:
-    """Another wing from each generator: doors, furniture, which rooms are open."""
+@cache
+def _wing(number: int) -> _Wing:
+    """Each has its own doors and furniture, and other rooms are open."""
+    rng = np.random.default_rng([_LAYOUT_SEED, number])
     entrance = float(rng.uniform(12.0, 19.0))
     walls: list[Segment] = []
     looks: list[tuple[Point, Point]] = []
@@ -88,14 +86,15 @@ def wing(rng: np.random.Generator) -> Wing:
         more, doors = _rooms(row, rng)
         walls += more
         looks += doors
-    gate = Opening(entrance - _WEST, ENTRANCE, _SOUTH, is_open=True)
+    gate = Opening(entrance - _WEST, _ENTRANCE, _SOUTH, is_open=True)
     closed = [Opening(float(rng.uniform(*ends)), 0.95, 0.18) for ends in ((1, 4), (18, 21))]
     walls += wall((_WEST, _SOUTH), _EAST - _WEST, "south", [closed[0], gate, closed[1]])
     inner = _NORTH - _SOUTH - 2 * _WIDTH
-    for x, side in ((_WEST + _WIDTH, "east"), (_EAST - _WIDTH, "west")):
+    sides: tuple[tuple[float, Side], ...] = ((_WEST + _WIDTH, "east"), (_EAST - _WIDTH, "west"))
+    for x, side in sides:
         niche = Opening(float(rng.uniform(1.0, inner - 2.0)), float(rng.uniform(0.8, 1.6)), 0.3)
-        walls += wall((x, _SOUTH + _WIDTH), inner, "east" if side == "east" else "west", [niche])
-    return Wing((*walls, *_in_corridors(rng)), entrance, tuple(looks))
+        walls += wall((x, _SOUTH + _WIDTH), inner, side, [niche])
+    return _Wing((*walls, *_in_corridors(rng)), entrance, tuple(looks))
 
 
 def _rooms(row: _Row, rng: np.random.Generator) -> tuple[list[Segment], list[tuple[Point, Point]]]:
@@ -118,7 +117,8 @@ def _rooms(row: _Row, rng: np.random.Generator) -> tuple[list[Segment], list[tup
         walls += room(row.start, row.side, (low, high), row.depth, opening)
         walls += _furnished(row, low, high, rng)
         middle = opening.start + _DOOR / 2
-        looks.append((_at(row, middle, -_WIDTH / 2), _at(row, middle, _THICK + _INSIDE)))
+        before = locate(row.start, row.side, middle, -_WIDTH / 2)
+        looks.append((before, locate(row.start, row.side, middle, _THICK + _INSIDE)))
     return walls, looks
 
 
@@ -130,10 +130,8 @@ def _furnished(row: _Row, low: float, high: float, rng: np.random.Generator) -> 
         width, deep = rng.uniform((0.7, 0.5), (1.9, 0.9)).tolist()
         width = min(width, high - at - 0.2)
         back = row.depth - deep / 2 - float(rng.uniform(0.05, 0.5))
-        x, y = _at(row, at + width / 2, _THICK + back)
-        if row.side in ("west", "east"):
-            width, deep = deep, width
-        walls += box(x, y, width, deep, float(rng.normal(0.0, 0.04)))
+        center, angle = (at + width / 2, _THICK + back), float(rng.normal(0.0, 0.04))
+        walls += box_along(row.start, row.side, center, width, deep, angle)
         at += max(width, deep) + float(rng.uniform(0.3, 1.6))
     return walls
 
@@ -149,34 +147,15 @@ def _in_corridors(rng: np.random.Generator) -> list[Segment]:
     return walls + pillar(x, _SOUTH + 0.3 if corner // 2 else _NORTH - 0.3, 0.2)
 
 
-def _at(row: _Row, along: float, into: float) -> Point:
-    """The point so far along the wall of a row, and so far into its rooms."""
-    x, y = row.start
-    out = 1.0 if row.side in ("north", "east") else -1.0
-    if row.side in ("north", "south"):
-        return (x + along, y + out * into)
-    return (x + out * into, y + along)
-
-
-def _is_between(point: Point, a: Point, b: Point) -> bool:
-    return math.dist(a, point) + math.dist(point, b) < math.dist(a, b) + 1e-6
-
-
 _LAYOUT_SEED = 41
-
 _COLUMNS = 4  # wings beside one another on each side of a floor's corridor
-
 _ON_FLOOR = 2 * _COLUMNS  # wings
-
 _HALF = 1.3  # m, half the width of the floors' corridors and of the one that joins them
-
-_PITCH = 2 * (_HALF + DEPTH) + 1.0  # m from floor to floor, which lie side by side
-
+_PITCH = 2 * (_HALF + _DEPTH) + 1.0  # m from floor to floor, which lie side by side
 _ROOMS = 4  # that the robot looks into when it is in a wing for the first time
-
 _ROBOT = RobotOptions(speed=0.8)
-
 _SHARE = 0.8  # of the way at full speed: it turns, and people are in its way
+_HUB: Point = (-_HALF, 0.0)
 
 
 def building(scans: int | None = None) -> Scene:
@@ -212,33 +191,12 @@ def building(scans: int | None = None) -> Scene:
     )
 
 
-_HUB: Point = (-_HALF, 0.0)
-
-
-@dataclass(frozen=True)
-class _Place:
-    """Origin of a wing in metres, and whether its y axis points down."""
-
-    x: float
-    y: float
-    south: bool
-
-    @classmethod
-    def of(cls, number: int) -> "_Place":
-        floor, on_floor = divmod(number, _ON_FLOOR)
-        column, side = divmod(on_floor, 2)
-        return cls(column * LENGTH, floor * _PITCH + (-_HALF if side else _HALF), bool(side))
-
-    def point(self, point: Point) -> Point:
-        return (self.x + point[0], self.y + (-point[1] if self.south else point[1]))
-
-    def segment(self, s: Segment) -> Segment:
-        return (*self.point(s[:2]), *self.point(s[2:]))
-
-
-@cache
-def _wing(number: int) -> Wing:
-    return wing(np.random.default_rng([_LAYOUT_SEED, number]))
+def _place(number: int, point: Point) -> Point:
+    """A point of a wing in the building; y points down in wings south of their corridor."""
+    floor, on_floor = divmod(number, _ON_FLOOR)
+    column, is_south = divmod(on_floor, 2)
+    y = floor * _PITCH + (-_HALF if is_south else _HALF)
+    return (column * _LENGTH + point[0], y + (-point[1] if is_south else point[1]))
 
 
 def _tours() -> Iterator[tuple[int, list[Point]]]:
@@ -260,10 +218,9 @@ def _tours() -> Iterator[tuple[int, list[Point]]]:
 
 
 def _tour(number: int, rooms: list[int], westward: bool) -> list[Point]:
-    place = _Place.of(number)
-    stops = [place.point(p) for p in _wing(number).tour(rooms, westward)]
-    corridor: Point = (stops[0][0], place.y + (_HALF if place.south else -_HALF))
-    return [corridor, *stops[1:-1], corridor]
+    gate, *stops, _ = _wing(number).tour(rooms, westward)
+    corridor = _place(number, (gate[0], -_HALF))
+    return [corridor, *(_place(number, stop) for stop in stops), corridor]
 
 
 def _walls(wings: int) -> list[Segment]:
@@ -271,8 +228,7 @@ def _walls(wings: int) -> list[Segment]:
     floors = (wings - 1) // _ON_FLOOR + 1
     walls: list[Segment] = []
     for number in range(wings):
-        place = _Place.of(number)
-        walls += [place.segment(s) for s in _wing(number).walls]
+        walls += [(*_place(number, s[:2]), *_place(number, s[2:])) for s in _wing(number).walls]
     for floor in range(floors):
         walls += _floor(floor, wings)
     north = (floors - 1) * _PITCH + _HALF
@@ -295,15 +251,15 @@ def _floor(floor: int, wings: int) -> list[Segment]:
         openings = []
         for column in range(_COLUMNS):
             number = floor * _ON_FLOOR + 2 * column + k
-            start = column * LENGTH
-            gate = start + _wing(number).entrance
+            start = column * _LENGTH
+            gate, is_there = start + _wing(number).entrance, number < wings
             before, after = rng.uniform((1.0, 22.5), (9.5, 31.0)).tolist()
             openings.append(Opening(start + before, 0.95, float(rng.uniform(0.1, 0.3))))
-            openings.append(Opening(gate, ENTRANCE, 0.0 if number < wings else 0.3, number < wings))
+            openings.append(Opening(gate, _ENTRANCE, 0.0 if is_there else 0.3, is_there))
             openings.append(Opening(start + after, 0.95, float(rng.uniform(0.1, 0.3))))
         y = floor * _PITCH + (-_HALF if k else _HALF)
-        walls += wall((0.0, y), _COLUMNS * LENGTH, side, openings)
-    end, y = _COLUMNS * LENGTH, floor * _PITCH
+        walls += wall((0.0, y), _COLUMNS * _LENGTH, side, openings)
+    end, y = _COLUMNS * _LENGTH, floor * _PITCH
     return [*walls, (end, y - _HALF, end, y + _HALF)]
 
 

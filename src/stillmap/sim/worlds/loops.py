@@ -1,14 +1,14 @@
 """Joined loops of corridors around courtyards, and ten identical corridors."""
 
+import dataclasses
 import itertools
+from collections.abc import Iterable
 
 import numpy as np
 
 from stillmap.sim.options import CrowdOptions, RobotOptions
 from stillmap.sim.scene import Point, Scene, Segment
-from stillmap.sim.walls import Opening, Side, box, pillar, room, wall
-
-_LAYOUT_SEED = 43
+from stillmap.sim.walls import Opening, Side, box, box_along, locate, pillar, room, wall
 
 _WIDTH = 2.8  # m, of the corridors
 
@@ -24,13 +24,13 @@ _WAY = (
 )
 
 
-def rounds(people: int = 40) -> Scene:
+def rounds() -> Scene:
     """Six courtyards with corridors around each: every corridor is part of one loop or two.
 
     The outer walls have offices and closed doors, those of the courtyards windows. The robot goes
     round the first loop, then from loop to loop through every corridor, and ends where it began.
     """
-    rng = np.random.default_rng(_LAYOUT_SEED)
+    rng = np.random.default_rng(43)
     x, y = _starts(_COLUMNS), _starts(_ROWS)
     walls, glass = _outside(x[-1] + _WIDTH, y[-1] + _WIDTH, rng), []
     for west, width in zip(x, _COLUMNS, strict=False):
@@ -45,7 +45,7 @@ def rounds(people: int = 40) -> Scene:
         walls=tuple(walls),
         glass=tuple(glass),
         route=tuple(route),
-        crowd=CrowdOptions(people=people),
+        crowd=CrowdOptions(people=40),
         robot=RobotOptions(speed=0.8),
     )
 
@@ -58,15 +58,19 @@ def _starts(sizes: tuple[float, ...]) -> list[float]:
     return starts
 
 
+def _sides(
+    corner: Point, width: float, depth: float, sides: tuple[Side, ...]
+) -> Iterable[tuple[Point, float, Side]]:
+    """Start and length of the walls in the south, north, west and east, which step to `sides`."""
+    x, y = corner
+    starts = (corner, (x, y + depth), corner, (x + width, y))
+    return zip(starts, (width, width, depth, depth), sides, strict=True)
+
+
 def _outside(width: float, depth: float, rng: np.random.Generator) -> list[Segment]:
-    sides: tuple[tuple[Point, float, Side], ...] = (
-        ((0.0, 0.0), width, "south"),
-        ((0.0, depth), width, "north"),
-        ((0.0, 0.0), depth, "west"),
-        ((width, 0.0), depth, "east"),
-    )
     walls: list[Segment] = []
-    for start, length, side in sides:
+    outwards: tuple[Side, ...] = ("south", "north", "west", "east")
+    for start, length, side in _sides((0.0, 0.0), width, depth, outwards):
         openings = _openings(length, rng, rooms=True)
         walls += wall(start, length, side, openings)
         for door in openings:
@@ -82,32 +86,19 @@ def _courtyard(
     start: Point, width: float, depth: float, rng: np.random.Generator
 ) -> tuple[list[Segment], list[Segment]]:
     """The walls around a courtyard, and the windows in them."""
-    x, y = start
-    sides: tuple[tuple[Point, float, Side], ...] = (
-        (start, width, "north"),
-        ((x, y + depth), width, "south"),
-        (start, depth, "east"),
-        ((x + width, y), depth, "west"),
-    )
-    walls: list[Segment] = []
+    (x, y), walls = start, []
     glass: list[Segment] = []
-    for begin, length, side in sides:
+    inwards: tuple[Side, ...] = ("north", "south", "east", "west")
+    for begin, length, side in _sides(start, width, depth, inwards):
         openings = _openings(length, rng, rooms=False)
         walls += wall(begin, length, side, openings)
         for window in openings:
             if window.is_open:
                 ends = (window.start, window.start + window.width)
-                if side in ("north", "south"):
-                    glass.append((begin[0] + ends[0], begin[1], begin[0] + ends[1], begin[1]))
-                else:
-                    glass.append((begin[0], begin[1] + ends[0], begin[0], begin[1] + ends[1]))
+                glass.append((*locate(begin, side, ends[0]), *locate(begin, side, ends[1])))
     corner = rng.integers(4)
-    walls += pillar(
-        x - 0.3 if corner % 2 else x + width + 0.3,
-        y - 0.3 if corner // 2 else y + depth + 0.3,
-        0.2,
-    )
-    return walls, glass
+    x = x - 0.3 if corner % 2 else x + width + 0.3
+    return walls + pillar(x, y - 0.3 if corner // 2 else y + depth + 0.3, 0.2), glass
 
 
 def _openings(length: float, rng: np.random.Generator, rooms: bool) -> list[Opening]:
@@ -134,40 +125,29 @@ def _cupboards(
 ) -> list[Segment]:
     """Cupboards and benches along a wall, where it has no door."""
     walls: list[Segment] = []
-    inwards = -1.0 if side in ("north", "east") else 1.0
     for before, after in itertools.pairwise(openings):
         low, high = before.start + before.width + 0.4, after.start - 0.4
         if rng.random() < 0.7 or high - low < 2.0:
             continue
         width, deep = rng.uniform((0.6, 0.3), (min(2.0, high - low), 0.5)).tolist()
-        along, off = float(rng.uniform(low, high - width)) + width / 2, inwards * deep / 2
-        if side in ("north", "south"):
-            walls += box(start[0] + along, start[1] + off, width, deep)
-        else:
-            walls += box(start[0] + off, start[1] + along, deep, width)
+        along = float(rng.uniform(low, high - width)) + width / 2
+        walls += box_along(start, side, (along, -deep / 2), width, deep)
     return walls
 
 
 _COUNT = 10
-
 _APART = 6.0  # m from one corridor to the next
-
 _CORRIDOR_WIDTH, _LENGTH = 2.2, 32.0  # m, of a corridor
-
 _SPINE = 2.4  # m, width of the two corridors across their ends
-
 # along each corridor, the same in all: closed doors, niches, and one open room with a desk
-_WEST_OPENINGS = (Opening(3.0, 0.95, 0.18), Opening(9.5, 0.95, 0.18), Opening(23.0, 1.6, 0.4))
-
+_WEST = (Opening(3.0, 0.95, 0.18), Opening(9.5, 0.95, 0.18), Opening(23.0, 1.6, 0.4))
 _EAST = (Opening(6.0, 0.95, 0.18), Opening(27.5, 0.95, 0.18))
-
 _DOOR, _ROOM, _DEPTH = Opening(15.0, 1.0, 0.15, is_open=True), (14.0, 19.5), 3.3
-
 # along the spines, before each corridor and between two
 _OPPOSITE, _BETWEEN = Opening(0.6, 1.0, 0.3), Opening(1.4, 0.95, 0.18)
 
 
-def ten_corridors(people: int = 4) -> Scene:
+def ten_corridors() -> Scene:
     """Ten parallel corridors of 32 m, alike to the millimetre, between two corridors across.
 
     The same doors and niches at the same places, and across their ends too; only the two outer
@@ -178,7 +158,8 @@ def ten_corridors(people: int = 4) -> Scene:
     for k in range(_COUNT):
         walls += _corridor(k * _APART)
     east, north = (_COUNT - 1) * _APART + _CORRIDOR_WIDTH, _LENGTH + _SPINE
-    opposite = [_moved(_OPPOSITE, k * _APART) for k in range(_COUNT)]
+    first = _OPPOSITE.start
+    opposite = [dataclasses.replace(_OPPOSITE, start=first + k * _APART) for k in range(_COUNT)]
     walls += wall((0.0, -_SPINE), east, "south", opposite)
     walls += wall((0.0, north), east, "north", opposite)
     for x in (0.0, east):
@@ -187,14 +168,14 @@ def ten_corridors(people: int = 4) -> Scene:
         name="ten-corridors",
         walls=tuple(walls),
         route=tuple(_route()),
-        crowd=CrowdOptions(people=people),
+        crowd=CrowdOptions(people=4),
     )
 
 
 def _corridor(x: float) -> list[Segment]:
     """A corridor with what lies between it and the next one, if there is one."""
     east = (x + _CORRIDOR_WIDTH, 0.0)
-    walls = wall((x, 0.0), _LENGTH, "west", _WEST_OPENINGS)
+    walls = wall((x, 0.0), _LENGTH, "west", _WEST)
     walls += wall(east, _LENGTH, "east", [_EAST[0], _DOOR, _EAST[1]])
     walls += room(east, "east", _ROOM, _DEPTH, _DOOR)
     walls += box(x + _CORRIDOR_WIDTH + 2.9, 18.4, 0.8, 1.6)
@@ -202,10 +183,6 @@ def _corridor(x: float) -> list[Segment]:
         walls += wall(east, _APART - _CORRIDOR_WIDTH, "north", [_BETWEEN])
         walls += wall((x + _CORRIDOR_WIDTH, _LENGTH), _APART - _CORRIDOR_WIDTH, "south", [_BETWEEN])
     return walls
-
-
-def _moved(opening: Opening, along: float) -> Opening:
-    return Opening(opening.start + along, opening.width, opening.depth, opening.is_open)
 
 
 def _route() -> list[Point]:
