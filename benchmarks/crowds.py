@@ -154,7 +154,7 @@ def poses_with(recording: stillmap.Recording, options: stillmap.Options, e: Weig
     start: slam.MStepResult | None = None
     for number in range(1, options.em.max_iterations + 1):
         mapped = slam.m_step(
-            recording, e, options.slam, None, options.threads, _silent, start=start
+            recording, e, options.slam, None, options.threads, _silent, initial=start
         )
         start = mapped.without_grid() if number > 1 else None
     return mapped.poses

@@ -235,8 +235,8 @@ def pose_scores(stamp_ns: NDArray[np.int64], poses: Float, truth: Float) -> Scor
 
 
 def loop_scores(loops: Sequence[slam.LoopClosure], truth: Float) -> Scores:
-    """How many were accepted, how many refused, and how many of the accepted are false."""
-    accepted = [loop for loop in loops if not loop.refused]
+    """How many were accepted, how many rejected, and how many of the accepted are false."""
+    accepted = [loop for loop in loops if not loop.rejected]
     return {
         "accepted": len(accepted),
         "refused": len(loops) - len(accepted),

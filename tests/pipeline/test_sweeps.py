@@ -52,7 +52,7 @@ def test_from_the_third_on_poses_are_those_of_the_one_before_swept(leaping):
     for it in stillmap.iterate(leaping, CHOSEN):
         start = before.estimate.m_step if it.estimate.number > 2 else None
         mapped = slam.m_step(
-            leaping, it.estimate.weights, CHOSEN.slam, None, 1, lambda *_: None, start=start
+            leaping, it.estimate.weights, CHOSEN.slam, None, 1, lambda *_: None, initial=start
         )
         np.testing.assert_array_equal(it.estimate.poses, mapped.poses)
         np.testing.assert_array_equal(it.estimate.m_step.covariance, mapped.covariance)

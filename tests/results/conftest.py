@@ -72,7 +72,7 @@ class FakeLoop:
     earlier: int
     later: int
     explained: float
-    refused: str = ""
+    rejected: str = ""
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,7 +29,7 @@ def closed(context, sigma):
     T = se2.inverse(context.poses[earlier]) @ context.poses[later]
     grid = build_submap(context, float(context.travelled[earlier]))
     closure = verify_candidate(context, grid, LoopCandidate(earlier, later, T, 0.0), sigma, 0.05)
-    assert closure.refused == ""
+    assert closure.rejected == ""
     off = se2.parameters(se2.inverse(T) @ closure.T)
     return np.sqrt(np.diag(closure.covariance)), float(off[0])
 

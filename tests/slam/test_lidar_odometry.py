@@ -157,7 +157,7 @@ def test_memory_is_bounded_by_the_radius():
     assert max(sizes[20:]) < 1.2 * max(sizes[10:20])
 
 
-def test_2d_is_refused(room):
+def test_2d_is_rejected(room):
     flat = replace(
         room[0], points=np.ascontiguousarray(room[0].points[:, :2]), T_base_sensor=np.eye(3)[None]
     )

@@ -155,14 +155,14 @@ def test_consistency_by_stages_equals_consistency_at_once():
     rng = np.random.default_rng(3)
     shifts = rng.choice([0.2, 0.2, -0.3], 21)
     found = [tie(k, 21 + k, T=se2.matrix(shift, 0.0, 0.0)) for k, shift in enumerate(shifts)]
-    at_once = [c.refused for c in reject_inconsistent(context, chain, found)]
+    at_once = [c.rejected for c in reject_inconsistent(context, chain, found)]
     assert {bool(reason) for reason in at_once} == {True, False}
     for stage in (1, 2, 3, 7):
         decided: list[LoopClosure] = []
         for first in range(0, 21, stage):
             new = found[: first + stage]
             decided = reject_inconsistent_since(context, chain, new, decided, 21 + first)
-        assert [c.refused for c in decided] == at_once
+        assert [c.rejected for c in decided] == at_once
 
 
 def rounds(drift=1.0):

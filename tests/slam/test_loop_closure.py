@@ -1,4 +1,4 @@
-"""Loop closure on small worlds: true loops close, false ones are refused."""
+"""Loop closure on small worlds: true loops close, false ones are rejected."""
 
 import dataclasses
 import functools
@@ -36,7 +36,7 @@ def silent(*_):
 def mapped(simulation, options=OPTIONS, threads=1, start=None):
     recording = simulation.recording
     e = np.full(recording.n_beams, 0.9, np.float32)
-    return m_step(recording, e, options, None, threads, silent, start=start)
+    return m_step(recording, e, options, None, threads, silent, initial=start)
 
 
 def ate(found, simulation):
@@ -86,7 +86,7 @@ def errors(found, simulation):
     Metres may be many where a view can slide along a wall: then the covariance has to say so.
     """
     truth = simulation.truth.T_world_base
-    accepted = [c for c in found if not c.refused]
+    accepted = [c for c in found if not c.rejected]
     wanted = [se2.inverse(truth[c.earlier]) @ truth[c.later] for c in accepted]
     missed = [se2.parameters(se2.inverse(T) @ c.T) for T, c in zip(wanted, accepted, strict=True)]
     chi2 = [d @ np.linalg.solve(c.covariance, d) for d, c in zip(missed, accepted, strict=True)]
@@ -148,15 +148,15 @@ def test_straight_travel_has_no_loops():
     assert mapped(dataclasses.replace(repetitive(), recording=short)).loops == []
 
 
-def test_refusals_carry_reasons(monkeypatch):
+def test_rejections_carry_reasons(monkeypatch):
     found = mapped(square())
-    refused = {closure.refused for closure in found.loops} - {""}
-    assert refused <= REASONS
+    reasons = {closure.rejected for closure in found.loops} - {""}
+    assert reasons <= REASONS
     with monkeypatch.context() as patch:
         patch.setattr(loop_verification, "MIN_EXPLAINED", 1.0)
-        assert {c.refused for c in mapped(square()).loops} == {"explains too little"}
+        assert {c.rejected for c in mapped(square()).loops} == {"explains too little"}
     monkeypatch.setattr(loop_candidates, "_MIN_AGREEING", 100)
-    assert "" not in {c.refused for c in mapped(square()).loops}
+    assert "" not in {c.rejected for c in mapped(square()).loops}
 
 
 def make_context(recording, poses, travelled, frames):
@@ -182,19 +182,21 @@ def closures(shifts):
     ]
 
 
-def test_inconsistent_closure_is_refused():
+def test_inconsistent_closure_is_rejected():
     context = straight_context()
     chain = odometry_constraints(context, OPTIONS.odometry, [])
     shifts = [0.5] * 8
     shifts[4] = -0.5
-    refused = [c.refused for c in reject_inconsistent(context, chain, closures(shifts))]
-    assert refused == ["nearby closures disagree" if k == 4 else "" for k in range(8)]
+    rejected = [c.rejected for c in reject_inconsistent(context, chain, closures(shifts))]
+    assert rejected == ["nearby closures disagree" if k == 4 else "" for k in range(8)]
 
 
-def test_single_closure_is_refused():
+def test_single_closure_is_rejected():
     context = straight_context()
     chain = odometry_constraints(context, OPTIONS.odometry, [])
-    assert [bool(c.refused) for c in reject_inconsistent(context, chain, closures([0.1]))] == [True]
+    assert [bool(c.rejected) for c in reject_inconsistent(context, chain, closures([0.1]))] == [
+        True
+    ]
 
 
 def test_leap_from_odometry_widens_the_constraint():
@@ -255,7 +257,7 @@ def test_reproducible_with_any_number_of_threads(threads):
     for a, b in zip(one.loops, two.loops, strict=True):
         np.testing.assert_array_equal(a.T, b.T)
         np.testing.assert_array_equal(a.covariance, b.covariance)
-        assert (a.earlier, a.later, a.refused) == (b.earlier, b.later, b.refused)
+        assert (a.earlier, a.later, a.rejected) == (b.earlier, b.later, b.rejected)
     np.testing.assert_array_equal(one.graph.keyframes, two.graph.keyframes)
     np.testing.assert_array_equal(one.graph.poses, two.graph.poses)
     for r, s in zip(one.graph.constraints, two.graph.constraints, strict=True):
@@ -268,7 +270,7 @@ def test_reproducible_with_any_number_of_threads(threads):
 
 def test_graph_holds_chain_and_accepted_loops():
     found = mapped(square())
-    graph, accepted = found.graph, [c for c in found.loops if not c.refused]
+    graph, accepted = found.graph, [c for c in found.loops if not c.rejected]
     K = len(graph.keyframes)
     assert len(graph.constraints) == K - 1 + len(accepted)
     along = [(r.first, r.second) for r in graph.constraints[: K - 1]]
@@ -326,6 +328,6 @@ def test_many_stages_are_as_good_as_few(monkeypatch):
         monkeypatch.setattr(loop_candidates, "_MIN_STAGE", stage)
         found.append(mapped(repetitive(), SlamOptions(keyframe_distance=0.4)))
     few, many = found
-    accepted = [sum(not c.refused for c in found.loops) for found in (few, many)]
+    accepted = [sum(not c.rejected for c in found.loops) for found in (few, many)]
     assert accepted[1] > 0.9 * accepted[0] > 20
     assert ate(many, repetitive()) < ate(few, repetitive()) + 0.01

@@ -1,4 +1,4 @@
-"""Loop closure in 3D: found, verified, propagated; false loops refused."""
+"""Loop closure in 3D: found, verified, propagated; false loops rejected."""
 
 from dataclasses import replace
 
@@ -69,7 +69,7 @@ def test_loops_correct_drift(drive):
     before, after = (compute_absolute_errors(poses, truth).rmse for poses in (driven.poses, found))
     assert before > 0.2
     assert after < 0.35 * before
-    accepted = [loop for loop in loops if not loop.refused]
+    accepted = [loop for loop in loops if not loop.rejected]
     assert len(accepted) >= 3
     for loop in accepted:
         true = se2.inverse(truth[loop.earlier]) @ truth[loop.later]
@@ -77,7 +77,7 @@ def test_loops_correct_drift(drive):
     assert len(graph.constraints) == len(graph.keyframes) - 1 + len(accepted)
 
 
-def test_false_candidates_are_refused(drive, monkeypatch):
+def test_false_candidates_are_rejected(drive, monkeypatch):
     """Turned so far that the far side of the block seems to be where the drive began."""
     driven = drive[3]
     wrong = driven.poses.copy()
@@ -91,11 +91,11 @@ def test_false_candidates_are_refused(drive, monkeypatch):
     for loop in tried:
         true = se2.inverse(drive[1][loop.earlier]) @ drive[1][loop.later]
         off = np.linalg.norm((se2.inverse(true) @ loop.T)[:3, 3])
-        assert loop.refused or off < 0.3
+        assert loop.rejected or off < 0.3
     assert np.isfinite(poses).all()
 
 
-def test_similar_streets_are_refused():
+def test_similar_streets_are_rejected():
     """Two streets of the same width: the ground and the rows of houses meet, their ends do not."""
     rng = np.random.default_rng(7)
     rows = [[60.0, 0.0, -2.0, 300.0, 300.0, 0.4, 0, 0, 0]]
@@ -113,7 +113,7 @@ def test_similar_streets_are_refused():
     wrong[70:, 0, 3] -= wrong[70, 0, 3] - wrong[10, 0, 3]  # as if the robot had been carried back
     _, loops, _ = closed((recording, truth, e, straight), replace(straight, poses=wrong))
     assert len(loops) >= 8
-    assert all(loop.refused for loop in loops)
+    assert all(loop.rejected for loop in loops)
 
 
 def test_pose_graph_3d():

@@ -40,7 +40,7 @@ def over_the_wall(context):
         i = min(south, key=lambda i: np.linalg.norm(x[i, :2] - x[k, :2]))
         T = se2.inverse(context.poses[i]) @ context.poses[k]
         closure = verify_candidate(context, grid, LoopCandidate(i, k, T, 0.0), 0.2, 0.02)
-        if not closure.refused:
+        if not closure.rejected:
             d = se2.parameters(se2.inverse(T) @ closure.T)
             off.append(d)
             chi.append(d @ np.linalg.solve(closure.covariance, d))
@@ -90,7 +90,7 @@ def test_loops_close_across_a_street():
     )
     # never nearer than that
     assert min(np.linalg.norm(c.T[:2, 2]) for c in asked if context.travelled[c.later] > 90.0) > 9.9
-    found = [c for c in verify_candidates(context, asked) if not c.refused]
+    found = [c for c in verify_candidates(context, asked) if not c.rejected]
     assert len(found) > 20
     for closure in found:
         T = se2.inverse(context.poses[closure.earlier]) @ context.poses[closure.later]

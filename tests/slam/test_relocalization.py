@@ -115,7 +115,7 @@ def test_unconnected_segment_is_put_beside(rooms):
     assert found.diagnostics.breaks == [60]
     assert found.diagnostics.unconnected == [60]
     # nobody knows how the robot came there: no loop says so, and the step itself says nothing
-    assert all(closure.refused for closure in found.loops if closure.later >= 60 > closure.earlier)
+    assert all(closure.rejected for closure in found.loops if closure.later >= 60 > closure.earlier)
     across = [r for r in found.graph.constraints if found.graph.keyframes[r.second] == 60]
     assert [np.linalg.eigvalsh(r.covariance).min() > 90.0 for r in across] == [True]
     # each room is as good as alone, and the two maps have 10 m between them

@@ -26,7 +26,7 @@ from stillmap.pipeline.checkpoint_files import pack_state, require_same_run, unp
 from stillmap.pipeline.estimate import EmState
 from stillmap.pipeline.options import Options
 
-_FORMAT_VERSION = 2
+_FORMAT_VERSION = 3
 _STATE, _LOCK = "state.json", "lock"
 _NAME = re.compile(r"[A-Za-z0-9_.-]+")
 _LARGEST_STATE = 1 << 30  # bytes

@@ -144,7 +144,7 @@ def _m_step(
         resolve_threads(options.threads),
         progress,
         # labels change most in the first iteration; after the second, poses only need refinement
-        start=before.m_step if before is not None and before.number > 1 else None,
+        initial=before.m_step if before is not None and before.number > 1 else None,
         earlier_poses=None if before is None else before.poses,
         with_grid=em.needs_sums(recording.dimension, options.estimator),
         # (10) as printed counts beams up to their end

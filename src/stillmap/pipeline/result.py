@@ -94,7 +94,7 @@ class MappingResult:
 
     @property
     def loops(self) -> list[slam.LoopClosure]:
-        """Attempts at closing loops, accepted or refused."""
+        """Attempts at closing loops, accepted or rejected."""
         return self.estimate.m_step.loops
 
     @property

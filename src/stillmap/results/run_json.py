@@ -57,8 +57,8 @@ def run_record(result: MappingResult, more: Mapping[str, Any] | None = None) -> 
         },
         "changes": [_change(one) for one in result.changes],
         "loops": {
-            "accepted": [_loop(one) for one in result.loops if not one.refused],
-            "refused": [_loop(one) | {"why": one.refused} for one in result.loops if one.refused],
+            "accepted": [_loop(one) for one in result.loops if not one.rejected],
+            "refused": [_loop(one) | {"why": one.rejected} for one in result.loops if one.rejected],
         },
         **(more or {}),
     }

@@ -184,23 +184,23 @@ def _find_leaps(recording: Recording, poses: Float, options: OdometryOptions) ->
 def reject_inconsistent(
     context: LoopContext, chain: list[Constraint], closures: list[LoopClosure]
 ) -> list[LoopClosure]:
-    """Refuses closures whose correction those nearby do not share.
+    """Rejects closures whose correction those nearby do not share.
 
     At least `_MIN_AGREEING` closures nearby and half of them all must agree.
     """
     travelled = context.travelled
-    accepted = [closure for closure in closures if not closure.refused]
+    accepted = [closure for closure in closures if not closure.rejected]
     at = np.array([[travelled[c.earlier], travelled[c.later]] for c in accepted]).reshape(-1, 2)
     nearby = _NEARBY * context.keyframe_distance
     accumulated = _accumulate_covariance(context, chain)
     out = []
     for closure in closures:
-        if not closure.refused:
+        if not closure.rejected:
             off = np.abs(at - [travelled[closure.earlier], travelled[closure.later]])
             others = [accepted[n] for n in np.flatnonzero((off < nearby).all(axis=1))]
             votes = [_agree(context, accumulated, closure, c) for c in others if c is not closure]
             if sum(votes) < max(_MIN_AGREEING, len(votes) / 2):
-                closure = closure.refuse("nearby closures disagree")
+                closure = closure.reject("nearby closures disagree")
         out.append(closure)
     return out
 

@@ -48,7 +48,7 @@ def close_loops(
         )
         new = loop_verification.verify_candidates(context, candidates)
         attempted += new
-        if all(closure.refused for closure in new):
+        if all(closure.rejected for closure in new):
             found = found + new
             continue
         found = ties + loop_candidates.reject_inconsistent_since(
@@ -99,7 +99,7 @@ def _correct_stage(
 
     Later keyframes move rigidly with the last optimized one.
     """
-    accepted = [closure for closure in found if not closure.refused]
+    accepted = [closure for closure in found if not closure.rejected]
     if not accepted:
         return poses, []
     loops = accepted_constraints(context.keyframes, found)
@@ -125,7 +125,7 @@ def solve_graph(
         keyframes: (K,) scans.
         chain: odometry constraints between them.
         start: (K, D+1, D+1).
-        closures: accepted and refused.
+        closures: accepted and rejected.
         max_chi2: chi-square above which a closure is rejected.
     """
     accepted = accepted_constraints(keyframes, closures)
@@ -135,7 +135,7 @@ def solve_graph(
     loops = [_to_constraint(keyframes, closure) for closure in closures]
     chi2 = pose_graph.squared_mahalanobis(robust, loops)
     closures = [
-        c.refuse("other loops disagree") if not c.refused and x > max_chi2 else c
+        c.reject("other loops disagree") if not c.rejected and x > max_chi2 else c
         for c, x in zip(closures, chi2, strict=True)
     ]
     accepted = accepted_constraints(keyframes, closures)
@@ -144,7 +144,7 @@ def solve_graph(
 
 def accepted_constraints(keyframes: Index, closures: list[LoopClosure]) -> list[Constraint]:
     """Constraints between keyframes, of the accepted closures."""
-    return [_to_constraint(keyframes, closure) for closure in closures if not closure.refused]
+    return [_to_constraint(keyframes, closure) for closure in closures if not closure.rejected]
 
 
 def _to_constraint(keyframes: Index, closure: LoopClosure) -> Constraint:

@@ -76,7 +76,7 @@ def close_loops_3d(
     )
     found, chain = closer.search_loops(progress), closer.odometry_constraints()
     start = poses[keyframes]
-    if all(closure.refused for closure in found):
+    if all(closure.rejected for closure in found):
         return poses, found, PoseGraph(keyframes, start, chain)
     corrected, found = solve_graph(keyframes, chain, start, found, _MAX_CHI2)
     graph = PoseGraph(keyframes, corrected, [*chain, *accepted_constraints(keyframes, found)])
@@ -144,7 +144,7 @@ class _LoopCloser:
             T = se2.inverse(corrected[i]) @ corrected[k]
             closure = self.verify(int(self.keyframes[i]), t, T, *_drift_std(metres))
             found.append(closure)
-            if not closure.refused:
+            if not closure.rejected:
                 corrected[k] = corrected[i] @ closure.T
                 correction, since = corrected[k] @ se2.inverse(poses[t]), here
         return found
@@ -172,15 +172,15 @@ class _LoopCloser:
             earlier, later, found, state.covariance[:6, :6] + np.diag(np.square(floor)), explained
         )
         if explained < _MIN_EXPLAINED_RATIO * odometry.explained[later]:
-            return closure.refuse("explains too little")
+            return closure.reject("explains too little")
         if self._plane_overlap(planes, sweep, later, state) < _MIN_PLANE_OVERLAP:
-            return closure.refuse("surfaces do not overlap")
+            return closure.reject("surfaces do not overlap")
         grid, usual = self._build_grid(earlier)
         if self._occluded_share(grid, sweep, later, state) > usual + _MAX_OCCLUDED:
-            return closure.refuse("passes through occupied space")
+            return closure.reject("passes through occupied space")
         off = se3.log(se2.inverse(T) @ found)
         if off @ np.linalg.solve(covariance[:6, :6], off) > _MAX_CHI2:
-            return closure.refuse("exceeds the possible drift")
+            return closure.reject("exceeds the possible drift")
         return closure
 
     def _sweeps_around(self, center: int) -> Iterator[tuple[int, Sweep]]:

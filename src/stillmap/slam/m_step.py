@@ -34,7 +34,7 @@ def m_step(
     threads: int,
     progress: StepProgress,
     *,
-    start: MStepResult | None = None,
+    initial: MStepResult | None = None,
     earlier_poses: Float | None = None,
     with_grid: bool = True,
     free_space_margin: float = FREE_SPACE_MARGIN,
@@ -48,7 +48,7 @@ def m_step(
         poses: (T, D+1, D+1) known T_map_base: only the map is computed.
         threads: of the 3D registration and of the map; the result does not depend on it.
         progress: called with the step, the number of scans done and their total.
-        start: an M-step with closed loops: its poses are only refined. 2D only.
+        initial: an M-step with closed loops: its poses are only refined. 2D only.
         earlier_poses: (T, 3, 3) estimate that is better than odometry for deskewing. 2D only.
         with_grid: whether to compute the sums of (10).
         free_space_margin: m before its end in which a beam is not used as free space; (10) as
@@ -56,14 +56,14 @@ def m_step(
     """
     D, T = recording.dimension, recording.n_scans
     if poses is not None:
-        freedom = D * (D + 1) // 2
+        dof = D * (D + 1) // 2
         empty = em.make_grid(D, options.resolution)
-        found = MStepResult(poses, np.zeros((T, freedom, freedom)), empty, np.full(T, np.nan))
+        found = MStepResult(poses, np.zeros((T, dof, dof)), empty, np.full(T, np.nan))
     elif D == 3:
         found = _estimate_poses_3d(recording, e, options, progress, threads)
     else:
         found = _estimate_poses_2d(
-            recording, e, options, progress, start, earlier_poses, free_space_margin
+            recording, e, options, progress, initial, earlier_poses, free_space_margin
         )
     if poses is None:
         progress("counting beams", 0, 0)
@@ -101,26 +101,26 @@ def _estimate_poses_2d(
     e: NDArray[np.float32],
     options: SlamOptions,
     progress: StepProgress,
-    start: MStepResult | None,
+    initial: MStepResult | None,
     earlier_poses: Float | None,
     free_space_margin: float,
 ) -> MStepResult:
     """Scan matching, loop closure and refinement; the grid is empty."""
     mapping = partial(progress, "matching scans")
-    if start is None or not options.loop_closure:
+    if initial is None or not options.loop_closure:
         found = _match_scans(recording, e, options, mapping, earlier_poses, free_space_margin)
         if not options.loop_closure:
             return found
         deskewed = deskew_recording(recording, found.poses, options)
         closing = partial(progress, "closing loops")
-        start = close_loops(deskewed, e, options, found, closing)
+        initial = close_loops(deskewed, e, options, found, closing)
         mapping = partial(progress, "refining poses")
-    refined = start
+    refined = initial
     for _ in range(_REFINEMENT_PASSES):
         deskewed = deskew_recording(recording, refined.poses, options)
         refined = refine_poses(deskewed, e, options, refined, mapping)
     # a misregistered scan agrees with a map that contains it: keep the share from the local map
-    return dataclasses.replace(refined, explained=start.explained)
+    return dataclasses.replace(refined, explained=initial.explained)
 
 
 def _match_scans(

@@ -22,7 +22,7 @@ def refine_poses(
     recording: Recording,
     e: NDArray[np.float32],
     options: SlamOptions,
-    start: MStepResult,
+    initial: MStepResult,
     progress: ScanProgress,
 ) -> MStepResult:
     """Poses, covariances and explained shares after one pass; the first pose is fixed.
@@ -31,13 +31,13 @@ def refine_poses(
         recording: 2D.
         e: (M,) P(static) of every beam.
         options: see SlamOptions.
-        start: poses to refine; its grid is not used.
+        initial: poses to refine; its grid is not used.
         progress: called with the number of scans done and their total.
     """
-    poses = start.poses.copy()
+    poses = initial.poses.copy()
     T = len(poses)
     covariance, explained = np.zeros((T, 3, 3)), np.ones(T)
-    prior = _NeighborPrior(recording, poses, start.diagnostics.breaks, options)
+    prior = _NeighborPrior(recording, poses, initial.diagnostics.breaks, options)
     grid = _core.OccupancyGrid2D(options.resolution, scan_matching.FREE_SPACE_MARGIN)
     kept = select_keyframes_per_sensor(poses, recording.sensor, SCAN_SPACING, SCAN_SPACING)
     for t in recording.iter_scans(kept, e):
@@ -54,7 +54,7 @@ def refine_poses(
         if is_in_map[t]:
             add_scan(grid, recording, e, t, poses[t])
         progress(t + 1, T)
-    return dataclasses.replace(start, poses=poses, covariance=covariance, explained=explained)
+    return dataclasses.replace(initial, poses=poses, covariance=covariance, explained=explained)
 
 
 class _NeighborPrior:

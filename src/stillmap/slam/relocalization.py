@@ -81,7 +81,7 @@ def _match_segment(context: LoopContext, first: int, last: int) -> Iterator[Loop
             earlier = int(before[same[np.argmin(distance[same])]])
             candidate = LoopCandidate(earlier, later, np.eye(3), 0.0)
             closure = loop_verification.verify_candidate(context, submaps[stretch], candidate, *std)
-            if not closure.refused:
+            if not closure.rejected:
                 yield closure
 
 

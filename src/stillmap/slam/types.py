@@ -43,7 +43,7 @@ class LoopClosure:
         T: (D+1, D+1) pose of the later scan in the frame of the earlier one.
         covariance: (3, 3) of x, y, heading in the frame of the later scan; in 3D (6, 6).
         explained: share of the comparable beams of the later scan that the earlier map explains.
-        refused: reason of the rejection; empty if accepted.
+        rejected: reason of the rejection; empty if accepted.
     """
 
     earlier: int
@@ -51,11 +51,11 @@ class LoopClosure:
     T: Float
     covariance: Float
     explained: float
-    refused: str = ""
+    rejected: str = ""
 
-    def refuse(self, reason: str) -> "LoopClosure":
+    def reject(self, reason: str) -> "LoopClosure":
         """The same closure, rejected."""
-        return dataclasses.replace(self, refused=reason)
+        return dataclasses.replace(self, rejected=reason)
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class MStepResult:
         grid: the sums alpha, beta of (10) over all scans.
         explained: (T,) share of each scan's beams that the local map explained; NaN: poses given.
         diagnostics: scans at which odometry and scan matching disagree.
-        loops: attempted loop closures, accepted or refused.
+        loops: attempted loop closures, accepted or rejected.
         graph: the pose graph; None without loop closure.
     """
 

@@ -137,7 +137,7 @@ def convergence_data(result: MappingResult) -> dict[str, Any] | None:
         ],
         "held_out": kept if kept is not None and math.isfinite(kept) else None,
         "loops": len(result.loops),
-        "rejected": Counter(one.refused for one in result.loops if one.refused).most_common(),
+        "rejected": Counter(one.rejected for one in result.loops if one.rejected).most_common(),
         "curves": curves if len(iterations) > 1 else [],
     }
 
