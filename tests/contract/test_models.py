@@ -7,7 +7,8 @@ from opening_models import shown, validated
 
 from stillmap.mesh.texture.baking import bake_texture
 from stillmap.mesh.triangle_mesh import concatenate_meshes
-from stillmap.results.gltf import write_glb, write_obj
+from stillmap.results.export.obj import encode_obj
+from stillmap.results.gltf import write_glb
 
 trimesh = pytest.importorskip("trimesh")
 pytest.importorskip("xatlas")
@@ -97,11 +98,12 @@ def test_large_coordinates_keep_their_millimetres(written):
 
 
 def test_trimesh_reads_obj_back(room, tmp_path):
-    write_obj(tmp_path / "obj", room)
-    files = {path.name for path in (tmp_path / "obj").iterdir()}
+    files = encode_obj(room, 90, "mesh")
+    for name, data in files.items():
+        (tmp_path / name).write_bytes(data)
     pages = {f"page{k}.jpg" for k in range(len(room.pages))}
-    assert files == {"mesh.obj", "mesh.mtl"} | pages
-    scene = trimesh.load(tmp_path / "obj" / "mesh.obj")
+    assert set(files) == {"mesh.obj", "mesh.mtl"} | pages
+    scene = trimesh.load(tmp_path / "mesh.obj")
     assert sum(len(part.faces) for part in scene.geometry.values()) == len(room)
     shapes = sorted(
         np.asarray(part.visual.material.image).shape

@@ -12,7 +12,8 @@ import pytest
 from stillmap.core.errors import InputError
 from stillmap.mesh.texture.atlas import TexturedMesh
 from stillmap.mesh.triangle_mesh import Mesh
-from stillmap.results.gltf import write_glb, write_obj
+from stillmap.results.export.obj import encode_obj
+from stillmap.results.gltf import write_glb
 
 pytest.importorskip("trimesh")
 
@@ -25,6 +26,12 @@ def textured():
     page = np.random.default_rng(0).integers(0, 255, (32, 48, 3)).astype(np.uint8)
     of_face, vertex = np.array([0, -1], np.int32), np.array([0, 1, 2, 3, 0, 2], np.int32)
     return TexturedMesh(vertices, faces, uv, of_face, (page,), of_face, vertex)
+
+
+def write_obj(folder, mesh):
+    folder.mkdir()
+    for name, data in encode_obj(mesh, 90, "mesh").items():
+        (folder / name).write_bytes(data)
 
 
 def tree_of(path):
@@ -105,13 +112,9 @@ def test_a_mesh_without_pictures_as_obj(tmp_path):
 def test_whole_or_not_at_all(tmp_path, monkeypatch):
     with pytest.raises(InputError, match="cannot be written"):
         write_glb(tmp_path / "missing" / "a.glb", textured())
-    (tmp_path / "obj").mkdir()
-    (tmp_path / "obj" / "mine.txt").write_text("mine")
-    with pytest.raises(InputError, match="already holds something"):
-        write_obj(tmp_path / "obj", textured())
     with pytest.raises(ValueError, match="without faces"):
         write_glb(tmp_path / "a.glb", Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32)))
     monkeypatch.setattr("os.replace", lambda *_: (_ for _ in ()).throw(OSError(28, "full")))
     with pytest.raises(InputError, match="cannot be written"):
         write_glb(tmp_path / "a.glb", textured())
-    assert {path.name for path in tmp_path.iterdir()} == {"obj"}
+    assert not list(tmp_path.iterdir())

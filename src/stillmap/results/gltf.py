@@ -1,4 +1,4 @@
-"""Writes meshes as binary glTF and OBJ (y up), and reads self-contained glTF files.
+"""Writes meshes as binary glTF (y up), and reads self-contained glTF files.
 
 trimesh writes the files with 1 x 1 placeholder images, which are replaced by compressed pages.
 """
@@ -6,7 +6,7 @@ trimesh writes the files with 1 x 1 placeholder images, which are replaced by co
 import io
 import json
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from stillmap.core.errors import InputError, import_extra
-from stillmap.core.files import atomic_file, atomic_folder, require_regular
+from stillmap.core.files import atomic_file, require_regular
 from stillmap.mesh.texture.atlas import GRAY, TexturedMesh
 from stillmap.mesh.triangle_mesh import Mesh
 
@@ -57,25 +57,12 @@ def write_glb(path: Path, mesh: TexturedMesh | Mesh, quality: int = 90) -> None:
         InputError: it cannot be written.
         MissingExtra: trimesh is not installed.
     """
-    trimesh = _trimesh(path)
-    pages = _compressed(mesh, quality)
-    parts = _parts(mesh)
+    trimesh = import_trimesh(path)
+    pages = compress_pages(mesh, quality)
     shift = np.zeros(3)
-    if max(np.abs(part.vertices).max() for part in parts) > _FAR:
-        shift = np.rint(np.mean([part.vertices.mean(axis=0) for part in parts], axis=0))
-    move = np.eye(4)
-    move[:3, 3] = _y_up(shift)
-    scene = trimesh.Scene()
-    for part in parts:
-        name, visual = _name(part.page), trimesh.visual.TextureVisuals
-        material = _material(trimesh, part.page)
-        made = trimesh.Trimesh(
-            _y_up(part.vertices - shift),
-            part.faces,
-            visual=visual(uv=flip_v(part.uv) if part.page >= 0 else None, material=material),
-            process=False,
-        )
-        scene.add_geometry(made, node_name=name, geom_name=name, transform=move)
+    if np.abs(mesh.vertices[mesh.faces]).max(initial=0.0) > _FAR:
+        shift = np.rint(np.mean([part.vertices.mean(axis=0) for part in _parts(mesh)], axis=0))
+    scene = make_scene(trimesh, mesh, _material, shift)
     images: list[dict[str, Any]] = []
 
     def put_pages(buffers: Any, tree: dict[str, Any]) -> None:
@@ -100,71 +87,49 @@ def write_glb(path: Path, mesh: TexturedMesh | Mesh, quality: int = 90) -> None:
         work.write_bytes(data)
 
 
-def write_obj(folder: Path, mesh: TexturedMesh | Mesh, quality: int = 90) -> None:
-    """Writes `mesh.obj`, `mesh.mtl` and `page0.jpg`, ... into a new folder; see `write_glb`.
+def import_trimesh(path: Path) -> Any:
+    """trimesh and what writes the file `path`.
 
     Raises:
-        InputError: the folder holds something, or cannot be written.
-        MissingExtra: trimesh is not installed.
+        MissingExtra: it is not installed.
     """
-    _trimesh(folder)  # it is the folder that cannot be written without
-    files = encode_obj(mesh, quality)
-    with atomic_folder(folder, "mesh.obj") as work:
-        for name, data in files.items():
-            (work / name).write_bytes(data)
-
-
-def encode_obj(
-    mesh: TexturedMesh | Mesh, quality: int, name: str = "mesh", before: str = ""
-) -> dict[str, bytes]:
-    """The content of `NAME.obj`, `NAME.mtl` and the pages, by file name.
-
-    Args:
-        mesh: with one face at least.
-        quality: JPEG quality of the pages; 0: PNG.
-        name: of the first two.
-        before: prefix of the names of pages.
-
-    Raises:
-        MissingExtra: trimesh is not installed.
-    """
-    trimesh = _trimesh(Path(f"{name}.obj"))
-    pages = _compressed(mesh, quality)
-    simple = trimesh.visual.material.SimpleMaterial
-    scene = trimesh.Scene()
-    for part in _parts(mesh):  # the gray one last: trimesh expects uv for all before
-        title = _name(part.page)
-        paint = 255 if part.page >= 0 else GRAY[0]
-        material = simple(
-            image=_placeholder(part.page) if part.page >= 0 else None,
-            diffuse=[paint, paint, paint, 255],
-            specular=[0, 0, 0, 255],
-        )
-        material.name = title
-        uv = flip_v(part.uv) if part.page >= 0 else None
-        visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
-        made = trimesh.Trimesh(_y_up(part.vertices), part.faces, visual=visual, process=False)
-        scene.add_geometry(made, node_name=title, geom_name=title)
-    materials = f"{name}.mtl"
-    text, beside = trimesh.exchange.obj.export_obj(
-        scene, include_normals=False, return_texture=True, mtl_name=materials, header=None
-    )
-    material_text, named = beside[materials].decode("utf-8"), {}
-    for number, page in enumerate(pages):
-        file = f"{before}{_name(number)}{page.suffix}"
-        material_text = material_text.replace(f"map_Kd {_name(number)}.png\n", f"map_Kd {file}\n")
-        named[file] = page.data
-    return {f"{name}.obj": text.encode("utf-8"), materials: material_text.encode("utf-8"), **named}
-
-
-def _trimesh(path: Path) -> Any:
     for name in ("trimesh.exchange.gltf", "trimesh.exchange.obj", "trimesh.visual.material"):
         import_extra(name, path, "written", group="mesh")
     return import_extra("trimesh", path, "written", group="mesh")
 
 
+def make_scene(
+    trimesh: Any,
+    mesh: TexturedMesh | Mesh,
+    make_material: Callable[[Any, int], Any],
+    shift: Float | None = None,
+) -> Any:
+    """A scene of trimesh with a geometry per part, y up, moved by `shift` (3,) m.
+
+    Args:
+        trimesh: the library.
+        mesh: with one face at least.
+        make_material: called with the library and the page, -1 for gray.
+        shift: subtracted from the vertices, and part of the transforms; None: zero.
+    """
+    shift = np.zeros(3) if shift is None else shift
+    move = np.eye(4)
+    move[:3, 3] = _y_up(shift)
+    scene = trimesh.Scene()
+    for part in _parts(mesh):
+        name = page_name(part.page)
+        visual = trimesh.visual.TextureVisuals(
+            uv=flip_v(part.uv) if part.page >= 0 else None,
+            material=make_material(trimesh, part.page),
+        )
+        vertices = _y_up(part.vertices - shift)
+        geometry = trimesh.Trimesh(vertices, part.faces, visual=visual, process=False)
+        scene.add_geometry(geometry, node_name=name, geom_name=name, transform=move)
+    return scene
+
+
 def _parts(mesh: TexturedMesh | Mesh) -> list[Part]:
-    """Parts by page, the gray one last."""
+    """Parts by page, the gray one last: in OBJ files trimesh expects uv for all before."""
     if not len(mesh):
         raise ValueError("a mesh without faces")
     uv_of_all = mesh.uv if isinstance(mesh, TexturedMesh) else np.zeros((len(mesh.vertices), 2))
@@ -176,7 +141,8 @@ def _parts(mesh: TexturedMesh | Mesh) -> list[Part]:
     return parts
 
 
-def _name(page: int) -> str:
+def page_name(page: int) -> str:
+    """Name of the geometry and material of a page, -1 for gray."""
     return f"page{page}" if page >= 0 else "grey"
 
 
@@ -195,7 +161,7 @@ def flip_v(uv: Float) -> Float:
     return np.column_stack([uv[:, 0], 1.0 - uv[:, 1]])
 
 
-def _placeholder(page: int) -> Image.Image:
+def placeholder(page: int) -> Image.Image:
     """A placeholder image that is unique to a page."""
     return Image.new("RGB", (1, 1), (page & 255, page >> 8, 0))
 
@@ -204,28 +170,27 @@ def _material(trimesh: Any, page: int) -> Any:
     """Material of a page, or gray; color factors are linear in glTF."""
     linear = ((GRAY[0] / 255.0 + 0.055) / 1.055) ** 2.4
     return trimesh.visual.material.PBRMaterial(
-        name=_name(page),
-        baseColorTexture=_placeholder(page) if page >= 0 else None,
+        name=page_name(page),
+        baseColorTexture=placeholder(page) if page >= 0 else None,
         baseColorFactor=None if page >= 0 else [linear, linear, linear, 1.0],
         metallicFactor=0.0,
         roughnessFactor=1.0,
     )
 
 
-def _compressed(mesh: TexturedMesh | Mesh, quality: int) -> list[Page]:
-    return list(_each_compressed(mesh, quality)) if isinstance(mesh, TexturedMesh) else []
-
-
-def _each_compressed(mesh: TexturedMesh, quality: int) -> Iterator[Page]:
-    for page in mesh.pages:
+def compress_pages(mesh: TexturedMesh | Mesh, quality: int) -> list[Page]:
+    """The texture pages as JPEG of a quality, or as PNG where it is 0."""
+    pages = []
+    for page in mesh.pages if isinstance(mesh, TexturedMesh) else ():
         out = io.BytesIO()
         if quality:
             # colours at full resolution: charts have sharp edges
             Image.fromarray(page).save(out, "JPEG", quality=quality, subsampling=0)
-            yield Page(".jpg", "image/jpeg", out.getvalue())
+            pages.append(Page(".jpg", "image/jpeg", out.getvalue()))
         else:
             Image.fromarray(page).save(out, "PNG")
-            yield Page(".png", "image/png", out.getvalue())
+            pages.append(Page(".png", "image/png", out.getvalue()))
+    return pages
 
 
 def _finish(tree: dict[str, Any]) -> None:
@@ -255,16 +220,9 @@ MAP_FROM_GLTF: NDArray[np.float64] = np.array(
     [[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]]
 )
 
-_MAGIC, _JSON = b"glTF", b"JSON"
-
-_HEAD = struct.Struct("<4sII")  # magic, version, length of all
-
-_CHUNK = struct.Struct("<I4s")  # length, kind
-
+_HEAD = struct.Struct("<4sIII4s")  # magic, version, length of all, length of a chunk, its kind
 _MAX_JSON = 64 << 20
-
-# viewers fetch its decoder from elsewhere
-_PACKED = "KHR_draco_mesh_compression"
+_PACKED = "KHR_draco_mesh_compression"  # viewers fetch its decoder from elsewhere
 
 
 def read_glb(path: Path, most: int) -> bytes:
@@ -281,21 +239,19 @@ def read_glb(path: Path, most: int) -> bytes:
         document = _document(data)
     except (ValueError, RecursionError, struct.error) as error:
         raise InputError(f"is no complete .glb file: {error}", where=str(path)) from error
-    for uri in _uris(document):
-        if not (isinstance(uri, str) and uri.startswith("data:")):
-            raise InputError("refers to another file: it is not shown", where=str(path))
+    if not all(isinstance(uri, str) and uri.startswith("data:") for uri in _uris(document)):
+        raise InputError("refers to another file: it is not shown", where=str(path))
     if _PACKED in document.get("extensionsUsed", []):
         raise InputError(f"uses {_PACKED}: it is not shown", where=str(path))
     return data
 
 
 def _document(data: bytes) -> dict[str, Any]:
-    magic, version, length = _HEAD.unpack_from(data)
-    size, kind = _CHUNK.unpack_from(data, _HEAD.size)
-    start = _HEAD.size + _CHUNK.size
-    if magic != _MAGIC or version != 2 or length != len(data):
+    magic, version, length, size, kind = _HEAD.unpack_from(data)
+    start = _HEAD.size
+    if magic != b"glTF" or version != 2 or length != len(data):
         raise ValueError("its header is not that of glTF 2")
-    if kind != _JSON or size > min(len(data) - start, _MAX_JSON):
+    if kind != b"JSON" or size > min(len(data) - start, _MAX_JSON):
         raise ValueError("its first chunk is not JSON")
     document = json.loads(data[start : start + size].decode("utf-8"))
     if not isinstance(document, dict):

@@ -9,16 +9,24 @@ import numpy as np
 
 from stillmap.core.errors import InputError, import_extra
 from stillmap.core.files import atomic_file, require_new_file
-from stillmap.mesh.texture.atlas import TexturedMesh
+from stillmap.mesh.texture.atlas import GRAY, TexturedMesh
 from stillmap.mesh.triangle_mesh import Mesh
 from stillmap.mesh.types import Image
-from stillmap.results.gltf import encode_obj, flip_v, read_glb, to_z_up
+from stillmap.results.gltf import (
+    compress_pages,
+    flip_v,
+    import_trimesh,
+    make_scene,
+    page_name,
+    placeholder,
+    read_glb,
+    to_z_up,
+)
 from stillmap.results.reader import require_model
 
 ENDING = ".obj"
 
 _MAX_BYTES = 2 << 30
-_PAGE = "page"
 
 
 def read_model(path: Path) -> TexturedMesh | Mesh:
@@ -48,7 +56,7 @@ def _mesh_from_scene(scene: Any) -> TexturedMesh | Mesh:
         vertices.append(to_z_up(np.asarray(part.vertices, np.float64) @ T[:3, :3].T + T[:3, 3]))
         faces.append(np.asarray(part.faces, np.int32) + count)
         count += len(part.vertices)
-        textured = name.startswith(_PAGE)
+        textured = name.startswith("page")
         uv.append(flip_v(part.visual.uv) if textured else np.zeros((len(part.vertices), 2)))
         page.append(np.full(len(part.faces), len(pages) if textured else -1, np.int32))
         if textured:
@@ -62,6 +70,46 @@ def _mesh_from_scene(scene: Any) -> TexturedMesh | Mesh:
     return TexturedMesh(
         points, corners, np.concatenate(uv), np.concatenate(page), tuple(pages), *none
     )
+
+
+def encode_obj(
+    mesh: TexturedMesh | Mesh, quality: int, name: str, prefix: str = ""
+) -> dict[str, bytes]:
+    """The content of `NAME.obj`, `NAME.mtl` and the pages, by file name.
+
+    Args:
+        mesh: with one face at least.
+        quality: JPEG quality of the pages; 0: PNG.
+        name: of the first two.
+        prefix: of the names of pages.
+
+    Raises:
+        MissingExtra: trimesh is not installed.
+    """
+    trimesh = import_trimesh(Path(f"{name}.obj"))
+    scene, materials = make_scene(trimesh, mesh, _material), f"{name}.mtl"
+    text, beside = trimesh.exchange.obj.export_obj(
+        scene, include_normals=False, return_texture=True, mtl_name=materials, header=None
+    )
+    material_text, named = beside[materials].decode("utf-8"), {}
+    for number, page in enumerate(compress_pages(mesh, quality)):
+        title = page_name(number)
+        file = f"{prefix}{title}{page.suffix}"
+        material_text = material_text.replace(f"map_Kd {title}.png\n", f"map_Kd {file}\n")
+        named[file] = page.data
+    return {f"{name}.obj": text.encode("utf-8"), materials: material_text.encode("utf-8"), **named}
+
+
+def _material(trimesh: Any, page: int) -> Any:
+    """Material of a page, or gray."""
+    paint = 255 if page >= 0 else GRAY[0]
+    material = trimesh.visual.material.SimpleMaterial(
+        image=placeholder(page) if page >= 0 else None,
+        diffuse=[paint, paint, paint, 255],
+        specular=[0, 0, 0, 255],
+    )
+    material.name = page_name(page)
+    return material
 
 
 def write_obj(folder: Path, output: Path, quality: int, overwrite: bool = False) -> tuple[int, int]:
