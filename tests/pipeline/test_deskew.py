@@ -112,7 +112,7 @@ def test_what_tells_of_the_motion(swept, monkeypatch, odometry):
 
 
 @pytest.mark.parametrize("odometry", [True, False])
-@pytest.mark.parametrize("world", list(FAST))
+@pytest.mark.parametrize("world", ["street", pytest.param("office", marks=pytest.mark.slow)])
 def test_poses_at_speed(world, odometry):
     """Seeds 100 to 102: 4 to 26 mm instead of 20 to 45, and 9 to 10 instead of 198 to 362."""
     simulation = fast(world)

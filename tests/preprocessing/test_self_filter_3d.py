@@ -72,7 +72,7 @@ def test_the_order_of_beams_means_nothing(drive):
     assert found[own].mean() > 0.99
 
 
-@pytest.mark.parametrize("world", ["hall", "corridor"])
+@pytest.mark.parametrize("world", ["hall", pytest.param("corridor", marks=pytest.mark.slow)])
 def test_a_small_robot_indoors(world):
     sim = run(world, 300, **SMALL)
     own, lost = sim.truth.mover == -2, gone(sim.recording)
@@ -86,8 +86,8 @@ def test_a_small_robot_indoors(world):
         ("street", 90, {}),
         ("street-jam", 90, {"channels": 16}),
         ("hall", 300, LOW),
-        ("corridor", 300, {"channels": 16}),
-        ("office", 300, {"channels": 16}),
+        pytest.param("corridor", 300, {"channels": 16}, marks=pytest.mark.slow),
+        pytest.param("office", 300, {"channels": 16}, marks=pytest.mark.slow),
     ],
 )
 def test_where_nothing_of_the_robot_shows_nothing_is_lost(world, scans, lidar):

@@ -17,6 +17,9 @@ from stillmap.sim.planner import FreeSpace, Planner
 from stillmap.sim.walls import box
 
 Float = NDArray[np.float64]
+# a scene of each kind: people, doors, things that are moved, cars, lights; the others are slow
+QUICK = {"hall", "office", "warehouse-moved", "street", "crossing"}
+
 Distance = Callable[[Float, Float], Float]
 EndPoints = Callable[[Simulation], tuple[Float, NDArray[np.int64]]]
 
@@ -37,7 +40,7 @@ def short(name: str, **crowd: object) -> Scene:
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=[pytest.mark.slow] if name in ("drive", "rounds") else [])
+        pytest.param(name, marks=[] if name in QUICK else [pytest.mark.slow])
         for name in SCENES
         if not name.endswith(("-crowd", "-empty"))
     ],

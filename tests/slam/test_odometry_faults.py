@@ -17,6 +17,11 @@ from stillmap.slam import SlamOptions, m_step, odometry_2d
 OPTIONS = SlamOptions()
 
 
+def seeds(n):
+    """0 to n - 1; all but the first are slow tests."""
+    return [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, n))]
+
+
 def silent(*_):
     """Ignores progress."""
 
