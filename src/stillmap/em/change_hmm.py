@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.components import connected_components, neighbor_pairs
 from stillmap.core.recording import Recording
 from stillmap.em.mixture import fit_weights, posterior
 from stillmap.em.observations import (
@@ -23,7 +24,6 @@ from stillmap.em.observations import (
     surfel_cells,
 )
 from stillmap.em.options import EmOptions, MapState
-from stillmap.em.spatial_coupling import connected_components, neighbor_pairs
 from stillmap.em.types import MIN_PROBABILITY, ChangedCells, Float
 
 _STATE_DURATION = 2.0  # mean duration of a state, in units of the recording's length

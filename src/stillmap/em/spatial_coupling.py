@@ -7,7 +7,6 @@ together. `docs/estimator/spatial.md` has the equations.
 from dataclasses import dataclass
 
 import numpy as np
-import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
 
 import stillmap._core as _core
@@ -15,8 +14,6 @@ from stillmap.core.chunks import ScanBeams, iter_beams
 from stillmap.core.recording import Recording
 from stillmap.em.observations import SurfelMap, iter_surfel_rows
 from stillmap.em.types import MIN_PROBABILITY, Float, GroundMap
-
-Index = NDArray[np.intp]
 
 _MEAN_FIELD = {
     "radius": 2.5,  # voxels
@@ -182,24 +179,3 @@ def apply_pooled_evidence(
     nats = np.minimum(_POOLING_SLOPE * above.max(axis=1), _MAX_POOLED)
     lower = np.where(nats > 0.0, 1.0 / (1.0 + np.exp(nats)), 1.0)
     return np.minimum(p_static, lower.astype(np.float32))
-
-
-def neighbor_pairs(cells: NDArray[np.int64], max_distance: float) -> Index:
-    """(P, 2) pairs of cells (K, D) within a distance of each other, in cells."""
-    if not len(cells):
-        return np.empty((0, 2), np.intp)
-    return np.asarray(
-        scipy.spatial.cKDTree(cells).query_pairs(max_distance, output_type="ndarray"), np.intp
-    )
-
-
-def connected_components(pairs: Index, n: int) -> list[Index]:
-    """Members, rising, of each connected component of a graph of n nodes with edges (P, 2)."""
-    if n == 0:
-        return []
-    graph = scipy.sparse.coo_array(
-        (np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(n, n)
-    )
-    _, label = scipy.sparse.csgraph.connected_components(graph, directed=False)
-    order = np.argsort(label, kind="stable")
-    return np.split(order, np.flatnonzero(np.diff(label[order])) + 1)

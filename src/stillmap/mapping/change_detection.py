@@ -7,10 +7,10 @@ import numpy as np
 import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
 
+from stillmap.core.components import connected_components, neighbor_pairs
 from stillmap.core.recording import Recording
 from stillmap.em import CellHistories, ChangedCells, time_bin_index
 from stillmap.em.change_hmm import MIN_RECURRING_CHANGES
-from stillmap.em.spatial_coupling import connected_components, neighbor_pairs
 from stillmap.mapping.doors import compute_swept_cells
 
 Cells = NDArray[np.int64]

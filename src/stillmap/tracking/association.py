@@ -5,8 +5,6 @@ relative to its position. A point goes to the track whose predicted shape is nea
 objects that were tracked as one separate, the past points are split between them as well.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,17 +34,9 @@ _REST_TIME = 0.3  # s: shrinks the speed of few points towards 0
 _MAX_RADIUS = 0.45  # m from the center of an object to its points
 
 
-@dataclass(frozen=True, eq=False)
-class TrackSplit:
-    """Points of the two objects of a split track, in the current scan and in the past."""
-
-    older_current: Index
-    older_past: Index
-    newer_current: Index
-    newer_past: Index
-
-
-def split_track(points: DynamicPoints, owned: Index, one: Index, other: Index) -> TrackSplit:
+def split_track(
+    points: DynamicPoints, owned: Index, one: Index, other: Index
+) -> list[tuple[Index, Index]]:
     """Divide the past points of a track between the two objects that it turned out to be.
 
     Both are tracked backwards in time from where they are seen apart.
@@ -55,6 +45,9 @@ def split_track(points: DynamicPoints, owned: Index, one: Index, other: Index) -
         points: dynamic end points.
         owned: past points of the track, rising.
         one, other: points of either object in the current scan.
+
+    Returns:
+        Points in the current scan and past points of the older object, and of the newer one.
     """
     xy, seconds = points.xy, points.seconds[points.scan]
     now = float(seconds[one[0]])
@@ -76,10 +69,8 @@ def split_track(points: DynamicPoints, owned: Index, one: Index, other: Index) -
         seen[count > 0] = now
         for i in (0, 1):
             shares[i].append(here[nearest == i])
-    past = [np.concatenate(share) for share in shares]
-    if seen[1] < seen[0]:
-        return TrackSplit(other, past[1], one, past[0])
-    return TrackSplit(one, past[0], other, past[1])
+    parts = [(one, np.concatenate(shares[0])), (other, np.concatenate(shares[1]))]
+    return parts[::-1] if seen[1] < seen[0] else parts
 
 
 def _assign_to_nearest(xy: Float, states: TrackStates) -> Index:
@@ -193,29 +184,21 @@ class _Tracker:
         points = self._points
         first = points.first[np.searchsorted(points.seconds, self._now - SPLIT_WINDOW)]
         owned = first + np.flatnonzero(self.owner[first : here[0]] == self._id[track])
-        split = split_track(points, owned, kept, gone)
         new = len(self._states)
-        for k, current, past in (
-            (track, split.older_current, split.older_past),
-            (new, split.newer_current, split.newer_past),
-        ):
+        parts = split_track(points, owned, kept, gone)
+        for k, (current, past) in zip((track, new), parts, strict=True):
             claims[np.isin(here, current)] = k
             self._set(k, current, estimate_velocity(points, past, self._now))
-        self.owner[split.newer_past] = self._id[new]
+        self.owner[parts[1][1]] = self._id[new]
 
     def _set(self, k: int, current: Index, velocity: Float) -> None:
         """Reset track k to these points and this velocity; append it where it is new."""
         xy = self._points.xy[current]
         begun = kalman.initialize(xy.mean(axis=0)[None], _POSITION_STD)
         if k == len(self._states):
-            self._append(TrackStates(begun.x, velocity[None], begun.P))
-        else:
-            for array, value in (
-                (self._states.x, begun.x[0]),
-                (self._states.v, velocity),
-                (self._states.P, begun.P[0]),
-            ):
-                array[k] = value
+            self._append(begun)
+        self._states.x[k], self._states.v[k] = begun.x[0], velocity
+        self._states.P[k] = begun.P[0]
         self._keep_shapes(self._of != k)
         self._add_to_shapes(xy, np.full(len(current), k))
 

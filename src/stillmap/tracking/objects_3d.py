@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.arrays import ArrayBuilder, take_rows
+from stillmap.core.components import component_labels, neighbor_pairs
 from stillmap.core.parallel import map_ordered
 from stillmap.core.recording import Recording
 from stillmap.em import GroundMap
@@ -130,8 +131,6 @@ def _select_above_ground(
 
 def _connect_columns(xy: Float) -> Index:
     """(n,) connected component of columns that each position (n, 2) lies in."""
-    import scipy  # its parts load when they are first used
-
     if not len(xy):
         return np.zeros(0, np.intp)
     column = np.floor(xy / _COLUMN).astype(np.int64)
@@ -139,12 +138,8 @@ def _connect_columns(xy: Float) -> Index:
     wide = int(y.max()) + 1
     flat, of = np.unique(x * wide + y, return_inverse=True)  # faster than that of rows
     cells = np.stack(np.divmod(flat, wide), axis=1)
-    pairs = scipy.spatial.cKDTree(cells).query_pairs(1.5, output_type="ndarray")
-    graph = scipy.sparse.coo_array(
-        (np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(cells),) * 2
-    )
-    label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
-    return np.asarray(label[of.reshape(-1)], np.intp)
+    label = component_labels(neighbor_pairs(cells, 1.5), len(cells))
+    return label[of.reshape(-1)]
 
 
 def _nearest_per_direction(local: Float) -> Index:

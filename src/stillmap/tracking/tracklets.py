@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays
+from stillmap.core.components import component_labels, group_indices
 from stillmap.em.people_tracker import MIN_TRACK_SCANS
 from stillmap.tracking.association import ACCELERATION, HORIZON, regress_velocity
 from stillmap.tracking.clustering import DynamicPoints
@@ -132,7 +133,7 @@ def _merge_pairs(points: DynamicPoints, owner: Index) -> Index:
     count = np.zeros(len(tracks), np.intp)
     np.add.at(count, which.reshape(-1), np.concatenate([count for _, count in parts]))
     together = count >= _MIN_SHARED * scans[tracks].min(axis=1)
-    label = _components(tracks[together], len(scans))
+    label = component_labels(tracks[together], len(scans))
     _, first, which = np.unique(label, return_index=True, return_inverse=True)
     merged = first[which]
     return _renumber(points, owner, lambda old: merged[old])
@@ -154,9 +155,9 @@ def _join_across_gaps(points: DynamicPoints, owner: Index) -> Index:
     before, after, cost = _candidates(ends)
     if len(before) == 0:
         return owner
-    label = _components(np.column_stack([before, after + len(tracks)]), 2 * len(tracks))
+    label = component_labels(np.column_stack([before, after + len(tracks)]), 2 * len(tracks))
     follows = np.arange(len(tracks))  # itself: nothing precedes it
-    for group in _groups(label[before]):
+    for group in group_indices(label[before]):
         rows, i = np.unique(before[group], return_inverse=True)
         columns, j = np.unique(after[group], return_inverse=True)
         costs = np.full((len(rows), len(columns)), _NO_MATCH)
@@ -252,19 +253,3 @@ def _confirm(points: DynamicPoints, owner: Index) -> Index:
     duration = np.subtract(last, first, out=np.zeros(len(scans)), where=scans > 0)
     confirmed = (scans >= MIN_TRACK_SCANS) & (duration >= _MIN_DURATION)
     return _renumber(points, owner, lambda old: np.where((old >= 0) & confirmed[old], old, -1))
-
-
-def _components(pairs: Index, n: int) -> Index:
-    """(n,) labels of the components connected by pairs (P, 2)."""
-    from scipy import sparse
-    from scipy.sparse import csgraph  # take long to load
-
-    ones: NDArray[np.float64] = np.ones(len(pairs))
-    graph: sparse.csr_array[np.float64] = sparse.csr_array((ones, pairs.T), shape=(n, n))
-    return np.asarray(csgraph.connected_components(graph, directed=False)[1], np.intp)
-
-
-def _groups(label: Index) -> list[Index]:
-    """Indices of equal labels."""
-    order = np.argsort(label, kind="stable")
-    return np.split(order, np.flatnonzero(np.diff(label[order])) + 1)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stillmap.em.spatial_coupling import connected_components, neighbor_pairs
+from stillmap.core.components import connected_components, neighbor_pairs
 
 
 def held(pairs):
