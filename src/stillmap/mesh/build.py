@@ -2,23 +2,20 @@
 (Sect. 4.4, 4.5)."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
-from stillmap.core.camera import Images
 from stillmap.core.errors import import_extra
 from stillmap.core.profiling import Progress, StageTimer, no_progress
-from stillmap.mesh.background import Background
 from stillmap.mesh.inputs import MeshInputs
 from stillmap.mesh.objects.merging import ObjectTrack, collect_tracks, merge_tracks
 from stillmap.mesh.objects.reconstruction import ObjectShape, reconstruct_object
 from stillmap.mesh.objects.segmentation import DynamicReturns
 from stillmap.mesh.objects.texturing import TexturedViews, assign_object_views, times_in_view
 from stillmap.mesh.options import MeshOptions
-from stillmap.mesh.place import ViewAssignment, assign_views
+from stillmap.mesh.place import Background, ViewAssignment, assign_views
 from stillmap.mesh.point_colors import PointColors, color_points
 from stillmap.mesh.texture.atlas import TexturedMesh, replace_faces
 from stillmap.mesh.texture.baking import bake_texture
@@ -30,10 +27,11 @@ from stillmap.mesh.texture.views import (
     find_views,
     read_color_image,
 )
+from stillmap.mesh.triangle_mesh import Mesh
 from stillmap.mesh.tsdf import build_surface
-from stillmap.mesh.types import Float, Tell
+from stillmap.mesh.types import Float, Int32, Tell
 
-Read = Callable[[int], NDArray[Any]]
+Bake = Callable[[Mesh, Int32, list[View]], TexturedMesh]
 
 _LIBRARIES = ("skimage.measure", "pyfqmr", "xatlas", "trimesh")  # of the extra `mesh`
 _MAX_P_SPOILED = 0.5  # that an image shows static surface only: below, a mover is in front
@@ -123,99 +121,52 @@ def build_models(
         return lambda done, total: progress(stage, 0, done, total)
 
     with stages.measure("surface"):
-        mesh = build_surface(
-            inputs.deskewed,
-            inputs.poses,
-            inputs.p_static,
-            options,
-            threads,
-            tell("building the surface"),
-        )
+        now = tell("building the surface")
+        mesh = build_surface(inputs.deskewed, inputs.poses, inputs.p_static, options, threads, now)
     with stages.measure("painting"):
-        views, left_out, unread = _usable_views(inputs, tell("reading images"))
+        views, left_out = find_views(inputs.recording, inputs.poses)
+        views, unread = filter_readable(inputs.images, views, tell("reading images"))
+        if unread:
+            left_out[UNREADABLE] = left_out.get(UNREADABLE, 0) + len(unread)
         place, gains = assign_views(mesh, views, inputs, threads, tell("selecting views"))
-        inputs = _compensate_exposure(inputs, views, gains)
+        images = apply_gains(inputs.images, views, gains)
     progress("baking textures", 0, 0, 0)
-    images = inputs.recording.images
     with stages.measure("texture"):
-        textured = bake_texture(
-            place.mesh, place.view, views, _reader(images), options.texture_size
-        )
-        unfiltered = _bake_unfiltered(textured, place, views, images, options.texture_size)
-    background = Background(
-        place, views, lambda view: None if images is None else read_color_image(images, view)
-    )
+        bake = partial(bake_texture, read=images.read, texture_size=options.texture_size)
+        textured = bake(place.mesh, place.view, views)
+        unfiltered = _bake_unfiltered(textured, place, views, bake)
+    background = Background(place, views, partial(read_color_image, images))
     with stages.measure("movers"):
         models, returns = [], DynamicReturns.collect(inputs)
         if options.objects:
-            models = _model_objects(
-                inputs, returns, background, options, tell("modelling moving objects")
-            )
+            models = _model_objects(returns, background, bake, tell("modelling moving objects"))
     colors = None
     if views:
         with stages.measure("points"):
-            now = tell("coloring points")
-            colors = color_points(inputs, textured, background, returns, threads, now)
+            colors = color_points(textured, background, returns, threads, tell("coloring points"))
     return Models(
         place, textured, unfiltered, views, left_out, unread, models, len(inputs.objects), colors
     )
 
 
-def _usable_views(inputs: MeshInputs, tell: Tell) -> tuple[list[View], dict[str, int], list[str]]:
-    """Readable images with known poses; how many are left out by reason; which cannot be read."""
-    views, left_out = find_views(inputs.recording, inputs.poses)
-    views, unread = filter_readable(inputs.recording.images, views, tell)
-    if unread:
-        left_out = {**left_out, UNREADABLE: left_out.get(UNREADABLE, 0) + len(unread)}
-    return views, left_out, unread
-
-
-def _compensate_exposure(inputs: MeshInputs, views: Sequence[View], gains: Float) -> MeshInputs:
-    """The inputs with gains (n, 3) applied to the images of n views."""
-    images = inputs.recording.images
-    if images is None:
-        return inputs
-    recording = replace(inputs.recording, images=apply_gains(images, views, gains))
-    return replace(inputs, recording=recording)
-
-
 def _bake_unfiltered(
-    textured: TexturedMesh,
-    place: ViewAssignment,
-    views: list[View],
-    images: Images | None,
-    texture_size: int,
+    textured: TexturedMesh, place: ViewAssignment, views: list[View], bake: Bake
 ) -> TexturedMesh | None:
     """The mesh with the sharpest image on the faces where that probably shows a mover."""
     spoiled = (place.sharpest >= 0) & (place.p_sharpest < _MAX_P_SPOILED)
     if not spoiled.any():
         return None
-    part = place.mesh.select(spoiled)
-    baked = bake_texture(part, place.sharpest[spoiled], views, _reader(images), texture_size)
+    baked = bake(place.mesh.select(spoiled), place.sharpest[spoiled], views)
     return replace_faces(textured, spoiled, baked)
 
 
-def _reader(images: Images | None) -> Read:
-    if images is not None:
-        return images.read
-
-    def none(image: int) -> NDArray[Any]:
-        raise IndexError(f"there is no image {image}")
-
-    return none
-
-
 def _model_objects(
-    inputs: MeshInputs,
-    returns: DynamicReturns,
-    background: Background,
-    options: MeshOptions,
-    tell: Tell,
+    returns: DynamicReturns, background: Background, bake: Bake, tell: Tell
 ) -> list[ObjectModel]:
-    groups = merge_tracks(collect_tracks(inputs, returns), returns, inputs)
+    groups = merge_tracks(collect_tracks(returns), returns)
     out = []
     for number, tracks in enumerate(groups):
-        model = _model_object(tracks, inputs, returns, background, options)
+        model = _model_object(tracks, returns, background, bake)
         if model is not None:
             out.append(model)
         tell(number + 1, len(groups))
@@ -223,29 +174,18 @@ def _model_objects(
 
 
 def _model_object(
-    tracks: Sequence[ObjectTrack],
-    inputs: MeshInputs,
-    returns: DynamicReturns,
-    background: Background,
-    options: MeshOptions,
+    tracks: Sequence[ObjectTrack], returns: DynamicReturns, background: Background, bake: Bake
 ) -> ObjectModel | None:
     """The model of one object; None where `reconstruct_object` finds none."""
-    start, views = inputs.start_ns, background.views
-    seconds = [times_in_view(one.box, views, start) for one in tracks]
-    shown = [some[np.isfinite(some)] for some in seconds]
-    shape = reconstruct_object(tracks, inputs, returns, shown)
+    start = returns.inputs.start_ns
+    seconds = [times_in_view(one.box, background.views, start) for one in tracks]
+    shape = reconstruct_object(tracks, returns, [some[np.isfinite(some)] for some in seconds])
     if shape is None:
         return None
     parts = {one.object.id for one in tracks if one.object.id != shape.id}
-    boxes = [one for one in inputs.boxes if one.box.object_id not in parts]
-    found = assign_object_views(shape, views, background, boxes, start)
-    textured = bake_texture(
-        found.assignment.mesh,
-        found.assignment.view,
-        found.views,
-        _reader(inputs.recording.images),
-        options.texture_size,
-    )
+    boxes = [one for one in returns.inputs.boxes if one.box.object_id not in parts]
+    found = assign_object_views(shape, background, boxes, start)
+    textured = bake(found.assignment.mesh, found.assignment.view, found.views)
     T = shape.frame.T_map_object(shape.seconds)
     first, middle, last = (
         start + round(1e9 * at) for at in (shape.span[0], shape.seconds, shape.span[1])

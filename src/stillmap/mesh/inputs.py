@@ -1,20 +1,26 @@
-"""Inputs of the mesh room: a posed and labelled 3D recording, its moving objects, the ground."""
+"""Inputs of the mesh room: a posed and labelled 3D recording and its moving objects."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
+import numpy as np
+
+from stillmap.core.camera import Images
 from stillmap.core.recording import Recording
-from stillmap.core.timestamps import max_scan_duration_ns
-from stillmap.em import GroundMap
+from stillmap.core.timestamps import beam_stamps_ns, max_scan_duration_ns
 from stillmap.mesh.range_image import is_row_scanner
-from stillmap.mesh.texture.occluders import TrackedBox
-from stillmap.mesh.texture.occlusion import LidarReturns
-from stillmap.mesh.types import Float, Float32
-from stillmap.rig.build import HOLD
-from stillmap.rig.removal import MAX_OBJECT_HEIGHT, MIN_VEHICLE_LENGTH
+from stillmap.mesh.tracked_boxes import TrackedBox
+from stillmap.mesh.types import Bool, Float, Float32, Index, Int64
 from stillmap.tracking import MovingObject
-from stillmap.tracking.boxes import Box, fit_box
+
+_SCANS_AROUND = 1  # before and after a time, whose beams may be of it
+_WINDOW = 0.06  # s around an image: longer, and untracked movers smear
+_WINDOW_TILTING = 0.15  # s, for planar scans: each row is only a line across the image
+_WINDOW_TRACKED = 0.5  # s, for planar scans of tracked objects, motion-compensated
+_NEVER = np.iinfo(np.int64).max
+_NO_IMAGES = Images(np.zeros(0, np.int64), np.zeros(0, np.int32), (), np.zeros)
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +35,6 @@ class MeshInputs:
         objects: moving objects with their beams.
         boxes: boxes along their tracks, and boxes of detections too short for a track.
         start_ns: stamp at which the seconds of these boxes begin.
-        ground: ground height.
     """
 
     recording: Recording
@@ -39,59 +44,103 @@ class MeshInputs:
     objects: Sequence[MovingObject]
     boxes: Sequence[TrackedBox]
     start_ns: int
-    ground: GroundMap
+
+    @property
+    def images(self) -> Images:
+        """The images of the recording; there may be none."""
+        return self.recording.images or _NO_IMAGES
 
     @cached_property
     def max_scan_ns(self) -> int:
         """Approximate maximum duration of a scan in nanoseconds."""
         return max_scan_duration_ns(self.recording)
 
-    def index_returns(self) -> LidarReturns:
-        """The returns, looked up by time."""
-        owned = {one.id: one.beams for one in self.objects}
-        boxes = [one.box for one in self.boxes if one.box.object_id in owned]
-        return LidarReturns(
-            self.recording,
-            self.deskewed,
-            self.deskewed.T_map_sensor(self.poses),
-            self.p_static,
-            boxes,
-            [owned[box.object_id] for box in boxes],
-            self.start_ns,
-            is_row_scanner(self.deskewed),
-        )
+    @cached_property
+    def T_map_sensor(self) -> Float:
+        """(T, 4, 4)."""
+        return self.deskewed.T_map_sensor(self.poses)
+
+    def seconds_of(self, beams: Index) -> Float:
+        """(n,) times of beams (n,), rising, by the clock of boxes."""
+        recording = self.recording
+        times = recording.stamp_ns[recording.scans_of(beams)]
+        if recording.beam_time is not None:
+            since = np.round(1e9 * recording.beam_time[beams].astype(np.float64))
+            times = times + since.astype(int)
+        return np.asarray(1e-9 * (times - self.start_ns), np.float64)
+
+    def scans_within(self, first: float, last: float) -> slice:
+        """Scans that may have beams between two times, and some around."""
+        stamps = 1e-9 * (self.deskewed.stamp_ns - self.start_ns)
+        slack = 1e-9 * self.max_scan_ns
+        a = int(np.searchsorted(stamps, first - slack)) - _SCANS_AROUND
+        b = int(np.searchsorted(stamps, last + slack, side="right")) + _SCANS_AROUND
+        return slice(max(a, 0), min(b, len(stamps)))
 
 
-def box_objects(objects: Sequence[MovingObject], start_ns: int) -> list[TrackedBox]:
-    """Boxes along the tracks of objects of a 3D recording.
+class LidarReturns:
+    """Returns of a 3D recording, looked up by time.
 
-    Raises:
-        ValueError: an object has no height.
+    Attributes:
+        inputs: the recording.
+        is_planar: whether each scan is a single row, as of a tilting laser.
     """
-    boxes = []
-    for one in objects:
-        if one.z is None:
-            raise ValueError("objects: expected those of a recording in 3D")
-        height = float(one.size[2])
-        boxes.append(TrackedBox(fit_box(one, start_ns, HOLD), one.z - 0.5 * height, height))
-    return boxes
 
+    def __init__(self, inputs: MeshInputs) -> None:
+        self.inputs, self.is_planar = inputs, is_row_scanner(inputs.deskewed)
+        beams = {one.id: one.beams for one in inputs.objects}
+        self._owned = [
+            (one.box, beams[one.box.object_id])
+            for one in inputs.boxes
+            if one.box.object_id in beams
+        ]
 
-def extrude_boxes(
-    boxes: Sequence[Box], objects: Sequence[MovingObject], ground: GroundMap
-) -> list[TrackedBox]:
-    """Planar boxes of a flat laser with the heights that a second laser measured.
+    def near_time(self, stamp_ns: int) -> tuple[Float, Float32]:
+        """Returns near a time; those on tracked objects moved along their track to that time.
 
-    Args:
-        boxes: planar boxes.
-        objects: moving objects with heights, of the second laser.
-        ground: ground height below the boxes.
-    """
-    heights = {one.id: float(one.size[2]) for one in objects}
-    out = []
-    for box in boxes:
-        is_vehicle = 2.0 * max(box.half_size) >= MIN_VEHICLE_LENGTH
-        min_height = 0.0 if is_vehicle else MAX_OBJECT_HEIGHT
-        height = max(heights.get(box.object_id, 0.0), min_height)
-        out.append(TrackedBox(box, ground.height_at(box.xy), height))
-    return out
+        Returns:
+            (n, 3) metres in the map frame, and P(static) (n,).
+        """
+        inputs, deskewed = self.inputs, self.inputs.deskewed
+        window = _WINDOW_TILTING if self.is_planar else _WINDOW
+        tracked = max(_WINDOW_TRACKED, window) if self.is_planar else window
+        reach, stamps = 1e9 * tracked + inputs.max_scan_ns, deskewed.stamp_ns
+        start = int(np.searchsorted(stamps, stamp_ns - reach))
+        stop = int(np.searchsorted(stamps, stamp_ns + reach, side="right"))
+        first, last = deskewed.offset[[start, stop]]
+        at_ns = beam_stamps_ns(inputs.recording, slice(start, stop))
+        apart = np.abs(at_ns - stamp_ns)
+        # at least the nearest, as scans without per-beam times share one stamp
+        near = apart <= max(int(1e9 * window), int(apart.min(initial=_NEVER)))
+        if tracked > window:
+            near |= (apart <= int(1e9 * tracked)) & self._on_dynamic_object[first:last]
+        kept = np.flatnonzero(deskewed.hit[first:last] & near)
+        beams = int(first) + kept
+        ends = np.empty((len(beams), 3))
+        bounds = np.searchsorted(beams, deskewed.offset[start : stop + 1])
+        for scan, (low, high) in zip(range(start, stop), pairwise(bounds), strict=True):
+            T = inputs.T_map_sensor[scan]
+            ends[low:high] = deskewed.points[beams[low:high]] @ T[:3, :3].T + T[:3, 3]
+        self._compensate_motion(ends, beams, at_ns[kept], stamp_ns)
+        return ends, inputs.p_static[beams]
+
+    @cached_property
+    def _on_dynamic_object(self) -> Bool:
+        """(M,) whether a beam ended on an object and is rather dynamic."""
+        p_static = self.inputs.p_static
+        out = np.zeros(len(p_static), np.bool_)
+        for _, owned in self._owned:
+            out[owned] = p_static[owned] < 0.5
+        return out
+
+    def _compensate_motion(self, ends: Float, beams: Index, at_ns: Int64, stamp_ns: int) -> None:
+        """Moves end points (n, 3) on tracked objects along the tracks to a time; in place."""
+        start_ns = self.inputs.start_ns
+        for box, owned in self._owned:
+            if not len(owned) or not len(beams) or owned[-1] < beams[0] or owned[0] > beams[-1]:
+                continue
+            place = np.searchsorted(owned, beams)
+            mine = np.flatnonzero(owned[np.minimum(place, len(owned) - 1)] == beams)
+            then = box.center_at(np.asarray(1e-9 * (at_ns[mine] - start_ns), np.float64))
+            now = box.center_at(np.array([1e-9 * (stamp_ns - start_ns)]))
+            ends[mine, :2] += now - then

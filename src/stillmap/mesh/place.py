@@ -1,25 +1,20 @@
-"""View assignment: the image that textures each face of the static surface (Sect. 4.4)."""
+"""The static surface in images: which textures each face (Sect. 4.4), and what they show of it."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from stillmap.core.camera import project
+from stillmap.core.camera import is_in_image, project, unproject
 from stillmap.core.parallel import map_ordered
-from stillmap.mesh.inputs import MeshInputs
+from stillmap.mesh.inputs import LidarReturns, MeshInputs
 from stillmap.mesh.simplification import subdivide
 from stillmap.mesh.texture.exposure import estimate_gains
-from stillmap.mesh.texture.occluders import (
-    OUTLINE_MARGIN,
-    TrackedBox,
-    boxes_at,
-    is_in_or_behind_box,
-    occlusion_probability,
-)
-from stillmap.mesh.texture.occlusion import LidarReturns, build_occlusion_mask
+from stillmap.mesh.texture.occlusion import build_occlusion_mask
+from stillmap.mesh.texture.sampling import sample_bilinear
 from stillmap.mesh.texture.view_selection import (
     Candidates,
     reject_inconsistent_views,
@@ -28,9 +23,17 @@ from stillmap.mesh.texture.view_selection import (
     view_utility,
 )
 from stillmap.mesh.texture.views import View, read_color_image
-from stillmap.mesh.texture.visibility import find_visible_faces
+from stillmap.mesh.texture.visibility import (
+    DEPTH_SCALE,
+    NEAR,
+    DepthBuffer,
+    find_visible_faces,
+    project_pinhole,
+    render_depth,
+)
+from stillmap.mesh.tracked_boxes import boxes_at, is_in_or_behind_box, occlusion_probability
 from stillmap.mesh.triangle_mesh import Mesh
-from stillmap.mesh.types import Bool, Float, Float32, Index, Int32, Tell
+from stillmap.mesh.types import Bool, Float, Float32, Image, Index, Int32, Tell, no_tell
 
 CANDIDATES = 6  # views compared for each face
 SEAM_COST = 1.0  # e-folds of resolution where two images meet
@@ -38,6 +41,11 @@ _P_UNOBSERVED = 0.9  # that an image shows static surface where no beam tells
 _MAX_COLOR_DIFFERENCE = 40.0  # of 442, from the median color of a face's candidates
 _MAX_FACE_EDGE = 0.25  # m: longer edges are subdivided, as each part has its own view
 _MIN_EDGE_PIXELS = 16.0  # edges shorter than this in the nearest image are not
+_BEHIND_TOLERANCE = 0.1  # m by which the background may lie in front of a point
+_BUFFER_WIDTH = 320.0  # pixels of the z-buffers
+_BORDER_RAYS = 16  # along an edge of an image, for its field of view
+_CACHED_IMAGES, _CACHED_BUFFERS = 8, 256
+_SHIFTS = [(x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0)]  # pixels of pose error
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +74,7 @@ def assign_views(
     views: Sequence[View],
     inputs: MeshInputs,
     threads: int = 1,
-    tell: Tell | None = None,
+    tell: Tell = no_tell,
     use_occlusion: bool = True,
 ) -> tuple[ViewAssignment, Float]:
     """Chooses for each face the view that most likely shows static surface only (Sect. 4.4).
@@ -84,26 +92,23 @@ def assign_views(
     """
     if views:
         mesh, _ = subdivide(mesh, partial(max_edge_at, views))
-    returns, areas = inputs.index_returns(), mesh.areas()
+    returns, areas = LidarReturns(inputs), mesh.areas()
     candidates = Candidates.empty(len(mesh), min(CANDIDATES, max(len(views), 1)))
     sharpest = Candidates.empty(len(mesh), 1)
 
     def evaluate(view: View) -> tuple[Index, Float, Float]:
         found = find_visible_faces(mesh, view)
         faces = np.flatnonzero(found.visible)
-        p = np.zeros(0)
-        if len(faces):
-            p = p_unoccluded(mesh, faces, view, returns, inputs.boxes)
+        p = p_unoccluded(mesh, faces, view, returns) if len(faces) else np.zeros(0)
         return faces, found.pixels[faces].astype(np.float64), p
 
     for number, (faces, pixels, p) in enumerate(map_ordered(evaluate, views, threads)):
         candidates.add(number, faces, view_utility(p, pixels, areas[faces], use_occlusion), p)
         sharpest.add(number, faces, pixels, p)
-        if tell is not None:
-            tell(number + 1, len(views))
-    images, gains = inputs.recording.images, np.ones((len(views), 3))
-    if views and images is not None:
-        colors = sample_face_colors(mesh, candidates, views, partial(read_color_image, images))
+        tell(number + 1, len(views))
+    gains, read = np.ones((len(views), 3)), partial(read_color_image, inputs.images)
+    if views:
+        colors = sample_face_colors(mesh, candidates, views, read)
         gains = estimate_gains(candidates.view, colors, len(views))
         colors *= gains[candidates.view]  # NaN where there is no view
         if use_occlusion:
@@ -142,13 +147,7 @@ def resolve_assignment(mesh: Mesh, candidates: Candidates, sharpest: Candidates)
     )
 
 
-def p_unoccluded(
-    mesh: Mesh,
-    faces: Index,
-    view: View,
-    returns: LidarReturns,
-    boxes: Sequence[TrackedBox],
-) -> Float:
+def p_unoccluded(mesh: Mesh, faces: Index, view: View, returns: LidarReturns) -> Float:
     """(n,) probability that a view shows static surface only at faces (n,).
 
     From the returns near its timestamp, and where there are none from the boxes of moving objects;
@@ -156,8 +155,7 @@ def p_unoccluded(
     """
     part = mesh.subset(faces)
     points = np.concatenate([part.vertices, part.centers])
-    seconds = 1e-9 * (view.stamp_ns - returns.start_ns)
-    there = boxes_at(boxes, seconds)
+    there = boxes_at(returns.inputs.boxes, 1e-9 * (view.stamp_ns - returns.inputs.start_ns))
     free = 1.0 - occlusion_probability(there, view.position, points)
     ends, p_static = returns.near_time(view.stamp_ns)
     # a laser sees past an object what the camera beside it does not see
@@ -166,6 +164,88 @@ def p_unoccluded(
     local = view.to_camera(points)
     uv, ok = project(view.camera, local)
     uv = np.where(ok[:, None], uv, 0.0)  # corners just outside: as at the border
-    p = mask.p_unoccluded(uv, local[:, 2], OUTLINE_MARGIN, _P_UNOBSERVED * free)
+    p = mask.p_unoccluded(uv, local[:, 2], _P_UNOBSERVED * free)
     a, b, c = (p[part.faces[:, k]] for k in range(3))
     return np.minimum(np.minimum(a, b), np.minimum(c, p[len(part.vertices) :]))
+
+
+class Background:
+    """The static surface in all views.
+
+    Args:
+        place: the surface, and which of `views` textures each face.
+        views: images and their poses.
+        read: (h, w, 3) the image of a view; None: it is damaged.
+    """
+
+    def __init__(
+        self, place: ViewAssignment, views: Sequence[View], read: Callable[[View], Image | None]
+    ) -> None:
+        self._place, self.views = place, views
+        self._buffer = lru_cache(_CACHED_BUFFERS)(self._render)
+        # (h, w, 3) by the number of a view; None: it is damaged
+        self.image = lru_cache(_CACHED_IMAGES)(lambda number: read(views[number]))
+
+    def is_unoccluded(self, number: int, points: Float) -> Bool:
+        """(n,) whether no background lies in front of map points (n, 3) in a view."""
+        at = self.views[number].to_camera(points)
+        free = at[:, 2] > NEAR
+        if not free.any() or not len(self._place.mesh):
+            return free
+        buffer = self._buffer(number)
+        free[free] = sample_buffer(buffer.depth, buffer, at[free]) > at[free, 2] - _BEHIND_TOLERANCE
+        return free
+
+    def color_difference(self, number: int, points: Float) -> Float32:
+        """(n,) distance of a view's colors at map points (n, 3) from those of the background.
+
+        In RGB, 0 to 442; background colors come from the views that texture it. NaN where no other
+        view textures the background.
+        """
+        view, out = self.views[number], np.full(len(points), np.nan, np.float32)
+        at = view.to_camera(points)
+        mine = self.image(number)
+        if mine is None or not len(points) or not len(self._place.mesh):
+            return out
+        buffer = self._buffer(number)
+        face = sample_buffer(buffer.face, buffer, at).astype(np.intp)
+        source = np.where(face >= 0, self._place.view[face], -1)
+        here, ok = project(view.camera, at)
+        source[~ok | (source == number)] = -1
+        for other in np.unique(source[source >= 0]).tolist():
+            image, some = self.image(other), np.flatnonzero(source == other)
+            if image is None:
+                continue
+            z = sample_buffer(buffer.depth, buffer, at[some])
+            behind = view.to_map(at[some] * (z / at[some, 2])[:, None])
+            there, ok = project(self.views[other].camera, self.views[other].to_camera(behind))
+            ok &= is_in_image(self.views[other].camera, there)
+            some, there = some[ok], there[ok]
+            shown = sample_bilinear(mine, here[some])
+            off = [
+                np.linalg.norm(shown - sample_bilinear(image, there + d), axis=1) for d in _SHIFTS
+            ]
+            out[some] = np.min(off, axis=0)
+        return out
+
+    def _render(self, number: int) -> DepthBuffer:
+        """A small z-buffer of all that a view shows."""
+        view = self.views[number]
+        across, down = np.meshgrid(
+            np.linspace(0, view.camera.width - 1, _BORDER_RAYS),
+            np.linspace(0, view.camera.height - 1, _BORDER_RAYS),
+        )
+        shown = unproject(view.camera, np.column_stack([across.ravel(), down.ravel()]))
+        shown = shown[np.isfinite(shown).all(axis=1)]
+        scale = min(_BUFFER_WIDTH / view.camera.width, DEPTH_SCALE)
+        return render_depth(self._place.mesh, view, shown, scale)
+
+
+def sample_buffer(values: NDArray[np.generic], buffer: DepthBuffer, at: Float) -> Float:
+    """(...,) values of an image (h, w) of a z-buffer at points (..., 3) in the camera's frame."""
+    h, w = values.shape
+    column, row = (
+        np.rint(a).astype(np.intp) for a in project_pinhole(buffer.K, at.reshape(-1, 3).T)
+    )
+    found = values[np.clip(row, 0, h - 1), np.clip(column, 0, w - 1)]
+    return np.asarray(found.reshape(at.shape[:-1]), np.float64)

@@ -12,25 +12,23 @@ from stillmap.core.camera import project
 from stillmap.core.chunks import Chunk, iter_chunks
 from stillmap.core.parallel import map_ordered
 from stillmap.em.types import DYNAMIC_BELOW
-from stillmap.mesh.background import Background
 from stillmap.mesh.inputs import MeshInputs
 from stillmap.mesh.objects.reconstruction import IMAGE_WINDOW
 from stillmap.mesh.objects.segmentation import NO_OWNER, DynamicReturns
-from stillmap.mesh.objects.texturing import OUTLINE_DRIFT
+from stillmap.mesh.objects.texturing import OUTLINE_DRIFT, outline_depth
+from stillmap.mesh.place import Background
 from stillmap.mesh.texture.atlas import GRAY, TexturedMesh
-from stillmap.mesh.texture.occluders import (
-    OUTLINE_MARGIN,
-    OrientedBox,
-    TrackedBox,
-    boxes_at,
-    occlusion_probability,
-)
-from stillmap.mesh.texture.outline import outline_depth
 from stillmap.mesh.texture.sampling import TextureSampler, avoid_gray, sample_bilinear
 from stillmap.mesh.texture.view_selection import MIN_P_VISIBLE
 from stillmap.mesh.texture.views import View
 from stillmap.mesh.texture.visibility import IMAGE_MARGIN, NEAR
-from stillmap.mesh.types import Bool, Float, Float32, Image, Index, Tell
+from stillmap.mesh.tracked_boxes import (
+    OUTLINE_MARGIN,
+    TrackedBox,
+    boxes_at,
+    occlusion_probability,
+)
+from stillmap.mesh.types import Bool, Float, Float32, Image, Index, Tell, no_tell
 
 _MAX_SURFACE_DISTANCE = 0.1  # m of a static point from the surface
 _OUTLINE_INSET = 0.02  # m inside an object's outline, where an image may show the background
@@ -53,44 +51,39 @@ class PointColors:
 
 
 def color_points(
-    inputs: MeshInputs,
     textured: TexturedMesh,
     background: Background,
     returns: DynamicReturns,
     threads: int = 1,
-    tell: Tell | None = None,
+    tell: Tell = no_tell,
 ) -> PointColors:
     """Colors the end points of all beams.
 
     Dynamic points without a track have no color.
 
     Args:
-        inputs: M beams.
         textured: the static surface.
         background: the static surface in the usable images.
         returns: dynamic returns.
         threads: same result with any number.
         tell: called with the scans and images done and the total.
     """
-    recording = inputs.recording
+    inputs, recording = returns.inputs, returns.inputs.recording
     out: Image = recording.allocate_per_beam(np.uint8, (3,))
     scans, n = recording.n_scans, recording.n_scans + len(background.views)
     sampler = TextureSampler(textured, _MAX_SURFACE_DISTANCE)
-    T_map_sensor = inputs.deskewed.T_map_sensor(inputs.poses)
     for chunk in iter_chunks(inputs.deskewed, release=[inputs.p_static, out]):
         out[chunk.beams] = GRAY
-        _color_static(out, chunk, inputs, T_map_sensor, sampler, threads)
-        if tell is not None:
-            tell(chunk.scans.stop, n)
+        _color_static(out, chunk, inputs, sampler, threads)
+        tell(chunk.scans.stop, n)
     delay = recording.allocate_per_beam(np.float32)
     for block in arrays.iter_blocks(delay):
         delay[block] = np.inf
-    tracked = TrackedReturns(inputs, returns)
+    tracked = TrackedReturns.collect(returns)
     for number in range(len(background.views)):
         color_moving(out, delay, tracked, number, background)
         inputs.deskewed.release_pages(inputs.p_static, out, delay)
-        if tell is not None:
-            tell(scans + number + 1, n)
+        tell(scans + number + 1, n)
     return PointColors(out, _count_colored(out, inputs))
 
 
@@ -106,12 +99,7 @@ def _count_colored(colors: Image, inputs: MeshInputs) -> dict[str, int]:
 
 
 def _color_static(
-    out: Image,
-    chunk: Chunk,
-    inputs: MeshInputs,
-    T_map_sensor: Float,
-    sampler: TextureSampler,
-    threads: int,
+    out: Image, chunk: Chunk, inputs: MeshInputs, sampler: TextureSampler, threads: int
 ) -> None:
     """Colors the static end points of a chunk of scans; in place."""
     beams = chunk.beams
@@ -121,7 +109,7 @@ def _color_static(
     parts = [slice(k, k + _POINTS_PER_BLOCK) for k in range(0, len(numbers), _POINTS_PER_BLOCK)]
 
     def sample(part: slice) -> tuple[slice, Image, Bool]:
-        T = T_map_sensor[scan[part]]
+        T = inputs.T_map_sensor[scan[part]]
         local = inputs.deskewed.points[beams.start + numbers[part]].astype(np.float64)
         ends = np.einsum("nij,nj->ni", T[:, :3, :3], local) + T[:, :3, 3]
         return part, *sampler.colors(ends, T[:, :3, 3])
@@ -130,51 +118,45 @@ def _color_static(
         out[beams.start + numbers[part][known]] = colors[known]
 
 
-class _Returns(NamedTuple):
-    """n returns on tracked objects.
+class TrackedReturns(NamedTuple):
+    """n dynamic returns on tracked objects, sorted by time.
 
     Attributes:
+        inputs: the recording.
         beam: (n,) beam numbers.
         ends: (n, 3) metres in the map frame.
-        seconds: (n,) times.
-        owner: (n,) number of the object's box among `boxes`.
+        seconds: (n,) times, by the clock of boxes.
+        owner: (n,) number of the object's box.
     """
 
+    inputs: MeshInputs
     beam: Index
     ends: Float
     seconds: Float
     owner: Index
 
-
-class TrackedReturns:
-    """The dynamic returns on tracked objects, looked up by time."""
-
-    def __init__(self, inputs: MeshInputs, returns: DynamicReturns) -> None:
-        self.inputs = inputs
-        place = {one.box.object_id: number for number, one in enumerate(inputs.boxes)}
+    @classmethod
+    def collect(cls, returns: DynamicReturns) -> "TrackedReturns":
+        """All dynamic returns on objects that have a box."""
+        place = {one.box.object_id: number for number, one in enumerate(returns.inputs.boxes)}
         ids, of = np.unique(returns.owner, return_inverse=True)
         owner = np.array([place.get(int(one), NO_OWNER) for one in ids], np.intp)[of]
         kept = np.flatnonzero(returns.is_dynamic & (owner != NO_OWNER))
         kept = kept[np.argsort(returns.seconds[kept], kind="stable")]
-        self._all = _Returns(
-            returns.beam[kept], returns.ends[kept], returns.seconds[kept], owner[kept]
-        )
+        seconds, ends = returns.seconds[kept], returns.ends[kept]
+        return cls(returns.inputs, returns.beam[kept], ends, seconds, owner[kept])
 
-    def near_time(self, now: float, window: float) -> _Returns:
+    def near_time(self, now: float, window: float) -> "TrackedReturns":
         """Returns within `window` seconds of a time."""
-        first = int(np.searchsorted(self._all.seconds, now - window))
-        last = int(np.searchsorted(self._all.seconds, now + window, side="right"))
-        beam, ends, seconds, owner = self._all
-        part = slice(first, last)
-        return _Returns(beam[part], ends[part], seconds[part], owner[part])
+        first = int(np.searchsorted(self.seconds, now - window))
+        last = int(np.searchsorted(self.seconds, now + window, side="right"))
+        beam, ends = self.beam[first:last], self.ends[first:last]
+        seconds, owner = self.seconds[first:last], self.owner[first:last]
+        return TrackedReturns(self.inputs, beam, ends, seconds, owner)
 
 
 def color_moving(
-    out: Image,
-    delay: Float32,
-    tracked: TrackedReturns,
-    number: int,
-    background: Background,
+    out: Image, delay: Float32, tracked: TrackedReturns, number: int, background: Background
 ) -> None:
     """Colors the tracked points that an image shows, where no image nearer in time does.
 
@@ -189,40 +171,36 @@ def color_moving(
     now = 1e-9 * (view.stamp_ns - inputs.start_ns)
     seen = tracked.near_time(now, IMAGE_WINDOW)
     away = np.abs(seen.seconds - now).astype(np.float32)
-    ends = _move_along_tracks(seen, inputs.boxes, now)
+    ends = _move_along_tracks(seen, now)
     local = view.to_camera(ends)
     uv, ok = project(view.camera, local)
     size = np.array([view.camera.width, view.camera.height])
     with np.errstate(invalid="ignore"):  # NaN: not in the image
         ok &= ((uv >= IMAGE_MARGIN) & (uv <= size - 1.0 - IMAGE_MARGIN)).all(axis=1)
     ok &= local[:, 2] > NEAR
-    ok &= _is_inside_outline(seen, local, ok, inputs.boxes, now)
+    ok &= _is_inside_outline(seen, local, ok, now)
     ok &= away < delay[seen.beam]
     shown = np.flatnonzero(ok)
-    shown = shown[background.is_unoccluded(number, ends[shown])] if len(shown) else shown
+    shown = shown[background.is_unoccluded(number, ends[shown])]
     shown = shown[_is_unoccluded_by_others(ends[shown], seen.owner[shown], inputs.boxes, view, now)]
-    if not len(shown):
-        return
-    image = background.image(number)
+    image = background.image(number) if len(shown) else None
     if image is None:
         return
-    colors = np.rint(sample_bilinear(np.ascontiguousarray(image[..., :3]), uv[shown]))
+    colors = np.rint(sample_bilinear(image, uv[shown]))
     out[seen.beam[shown]] = avoid_gray(colors.astype(np.uint8))
     delay[seen.beam[shown]] = away[shown]
 
 
-def _move_along_tracks(seen: _Returns, boxes: Sequence[TrackedBox], now: float) -> Float:
+def _move_along_tracks(seen: TrackedReturns, now: float) -> Float:
     """(n, 3) end points, each moved with its object to a time."""
     out = seen.ends.copy()
     for number in np.unique(seen.owner).tolist():
-        mine, box = seen.owner == number, boxes[number].box
+        mine, box = seen.owner == number, seen.inputs.boxes[number].box
         out[mine, :2] += box.center_at(np.array([now])) - box.center_at(seen.seconds[mine])
     return out
 
 
-def _is_inside_outline(
-    seen: _Returns, local: Float, shown: Bool, boxes: Sequence[TrackedBox], now: float
-) -> Bool:
+def _is_inside_outline(seen: TrackedReturns, local: Float, shown: Bool, now: float) -> Bool:
     """(n,) whether points lie inside the outline of their object in an image.
 
     By `_OUTLINE_INSET`, and by a share `OUTLINE_DRIFT` of the object's motion since.
@@ -231,7 +209,6 @@ def _is_inside_outline(
         seen: the returns.
         local: (n, 3) metres in the camera's frame, moved to the time of the image.
         shown: (n,) whether they are in the image.
-        boxes: of all objects.
         now: s, time of the image.
     """
     out = np.zeros(len(shown), np.bool_)
@@ -239,7 +216,7 @@ def _is_inside_outline(
         mine = np.flatnonzero(shown & (seen.owner == number))
         x, y, z = local[mine].T
         inside = outline_depth(np.stack([x / z, y / z], axis=1) * np.median(z), _POINT_RADIUS)
-        box = boxes[number].box
+        box = seen.inputs.boxes[number].box
         way = box.center_at(np.array([now])) - box.center_at(seen.seconds[mine])
         moved = np.linalg.norm(way, axis=1)
         out[mine] = inside >= _OUTLINE_INSET + OUTLINE_DRIFT * moved
@@ -256,11 +233,7 @@ def _is_unoccluded_by_others(
     free = np.ones(len(points))
     for number, tracked in enumerate(boxes):
         for box in boxes_at([tracked], now):
-            mine = (owner == number) | _is_in_box(box, points)
-            rest = np.flatnonzero(~mine)
+            within = (np.abs(box.local(points)) <= box.half_size + OUTLINE_MARGIN).all(axis=1)
+            rest = np.flatnonzero((owner != number) & ~within)
             free[rest] *= 1.0 - occlusion_probability([box], view.position, points[rest])
     return free >= MIN_P_VISIBLE
-
-
-def _is_in_box(box: OrientedBox, points: Float) -> Bool:
-    return np.asarray((np.abs(box.local(points)) <= box.half_size + OUTLINE_MARGIN).all(axis=1))

@@ -1,17 +1,24 @@
-"""Oriented boxes of moving objects, and the probability that they block a line of sight."""
+"""Upright boxes along the tracks of moving objects: their frames, and what they occlude."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from stillmap.mesh.types import Bool, Float
-from stillmap.tracking.boxes import Box
+from stillmap.em import GroundMap
+from stillmap.mesh.types import Bool, Float, Index
+from stillmap.rig.build import HOLD
+from stillmap.rig.removal import MAX_OBJECT_HEIGHT, MIN_VEHICLE_LENGTH
+from stillmap.tracking import MovingObject
+from stillmap.tracking.boxes import Box, fit_box
 
 OUTLINE_MARGIN = 0.05  # m around the observed extent of an object
-OUTLINE_SIGMA = 0.05  # m, standard deviation of its outline beyond that margin
+_OUTLINE_SIGMA = 0.05  # m, standard deviation of its outline beyond that margin
 _GROWTHS = (0.0, 1.0, 2.0, 3.0)  # sigmas beyond the margin at which occlusion is evaluated
 _P_IN_BOX = 0.99  # probability that an object is where its box is
+_MIN_RIGID_SIZE = 1.2  # m: objects at least so long or wide are no people
+_MIN_RIGID_SPEED = 2.0  # m/s: faster objects are no people
+_SPEED_QUANTILE = 0.9  # of an object's speeds that counts
 
 
 class TrackedBox(NamedTuple):
@@ -26,6 +33,96 @@ class TrackedBox(NamedTuple):
     box: Box
     bottom: Float
     height: float
+
+    @property
+    def is_fast(self) -> bool:
+        """Whether the object is faster than people."""
+        speed = np.linalg.norm(self.box.velocity, axis=1)
+        return bool(np.quantile(speed, _SPEED_QUANTILE) > _MIN_RIGID_SPEED)
+
+    @property
+    def is_large(self) -> bool:
+        """Whether the object is longer or wider than people."""
+        return 2.0 * max(self.box.half_size) >= _MIN_RIGID_SIZE
+
+
+def box_objects(objects: Sequence[MovingObject], start_ns: int) -> list[TrackedBox]:
+    """Boxes along the tracks of objects of a 3D recording."""
+    boxes = []
+    for one in objects:
+        assert one.z is not None
+        height = float(one.size[2])
+        boxes.append(TrackedBox(fit_box(one, start_ns, HOLD), one.z - 0.5 * height, height))
+    return boxes
+
+
+def extrude_boxes(
+    boxes: Sequence[Box], objects: Sequence[MovingObject], ground: GroundMap
+) -> list[TrackedBox]:
+    """Planar boxes of a flat laser with the heights that a second laser measured.
+
+    Args:
+        boxes: planar boxes.
+        objects: moving objects with heights, of the second laser.
+        ground: ground height below the boxes.
+    """
+    heights = {one.id: float(one.size[2]) for one in objects}
+    out = []
+    for box in boxes:
+        is_vehicle = 2.0 * max(box.half_size) >= MIN_VEHICLE_LENGTH
+        min_height = 0.0 if is_vehicle else MAX_OBJECT_HEIGHT
+        height = max(heights.get(box.object_id, 0.0), min_height)
+        out.append(TrackedBox(box, ground.height_at(box.xy), height))
+    return out
+
+
+class ObjectFrame(NamedTuple):
+    """Pose of an object's frame over time: that of its track, with corrections.
+
+    Attributes:
+        box: box along the track.
+        seconds: (S,) times of the corrections, rising; S > 0.
+        offset: (S, 3) corrections of points in the frame of the track: metres ahead and to the
+            left, rad to the left.
+    """
+
+    box: TrackedBox
+    seconds: Float
+    offset: Float
+
+    @classmethod
+    def from_track(cls, box: TrackedBox) -> "ObjectFrame":
+        """The frame of the track, uncorrected."""
+        return cls(box, box.box.seconds[:1], np.zeros((1, 3)))
+
+    def to_object(self, seconds: Float, points: Float) -> Float:
+        """(n, 3) metres in the object's frame, of map points (n, 3) at times (n,)."""
+        box = self.box.box
+        center = box.center_at(seconds)
+        heading = box.heading[np.clip(np.searchsorted(box.seconds, seconds, "right") - 1, 0, None)]
+        off = points[:, :2] - center
+        bottom = np.interp(seconds, box.seconds, self.box.bottom)
+        at = np.stack(
+            [
+                (off * heading).sum(axis=1),
+                off[:, 1] * heading[:, 0] - off[:, 0] * heading[:, 1],
+                points[:, 2] - bottom,
+            ],
+            axis=1,
+        )
+        dx, dy, turn = (np.interp(seconds, self.seconds, column) for column in self.offset.T)
+        c, s = np.cos(turn), np.sin(turn)
+        x, y = c * at[:, 0] - s * at[:, 1] + dx, s * at[:, 0] + c * at[:, 1] + dy
+        return np.stack([x, y, at[:, 2]], axis=1)
+
+    def T_map_object(self, seconds: float) -> Float:
+        """(4, 4) pose of the object's frame at a time."""
+        corners = np.vstack([np.zeros(3), np.eye(3)])
+        at = self.to_object(np.full(4, seconds), corners)
+        T_object_map = np.eye(4)
+        T_object_map[:3, :3] = (at[1:] - at[0]).T
+        T_object_map[:3, 3] = at[0]
+        return np.asarray(np.linalg.inv(T_object_map))
 
 
 class OrientedBox(NamedTuple):
@@ -65,37 +162,24 @@ def boxes_at(boxes: Sequence[TrackedBox], seconds: float) -> list[OrientedBox]:
     return out
 
 
-def occlusion_probability(
-    boxes: Sequence[OrientedBox],
-    position: Float,
-    points: Float,
-    margin: float = OUTLINE_MARGIN,
-    sigma: float = OUTLINE_SIGMA,
-) -> Float:
+def occlusion_probability(boxes: Sequence[OrientedBox], position: Float, points: Float) -> Float:
     """(n,) probability that a box blocks the line of sight from a camera to each point.
 
-    Within `margin` of a box it is nearly 1; farther out it falls like a normal distribution.
+    Within `OUTLINE_MARGIN` of a box it is nearly 1; farther out it falls like a normal
+    distribution.
 
     Args:
         boxes: at the time of the image.
         position: (3,) metres, camera center.
         points: (n, 3) metres.
-        margin: metres around each box.
-        sigma: metres, standard deviation of the outline beyond the margin.
     """
     free = np.ones(len(points))
-    along, square = _sights(position, points)
-    for one in boxes:
-        radius = float(np.linalg.norm(one.half_size)) + 2.0 * (margin + _GROWTHS[-1] * sigma)
-        distance = squared_segment_distances(one.center - position, along, square)
-        near = np.flatnonzero(distance <= radius**2)
-        if not len(near):
-            continue
-        start, ends = one.local(position[None])[0], one.local(points[near])
+    reach = 2.0 * (OUTLINE_MARGIN + _GROWTHS[-1] * _OUTLINE_SIGMA)
+    for one, near, start, ends in _sights_near_boxes(boxes, position, points, reach):
         shown = np.zeros(len(near))
         for growth in reversed(_GROWTHS):
-            meets = intersects_box(start, ends, one.half_size + margin + growth * sigma)
-            shown[meets] = _P_IN_BOX * np.exp(-0.5 * growth**2)
+            half_size = one.half_size + OUTLINE_MARGIN + growth * _OUTLINE_SIGMA
+            shown[intersects_box(start, ends, half_size)] = _P_IN_BOX * np.exp(-0.5 * growth**2)
         free[near] *= 1.0 - shown
     return 1.0 - free
 
@@ -103,20 +187,23 @@ def occlusion_probability(
 def is_in_or_behind_box(boxes: Sequence[OrientedBox], position: Float, points: Float) -> Bool:
     """(n,) whether the line of sight from a camera (3,) to points (n, 3) meets a box."""
     out = np.zeros(len(points), np.bool_)
-    along, square = _sights(position, points)
-    for one in boxes:
-        distance = squared_segment_distances(one.center - position, along, square)
-        near = np.flatnonzero(distance <= float(one.half_size @ one.half_size))
-        if len(near):
-            start, ends = one.local(position[None])[0], one.local(points[near])
-            out[near] |= intersects_box(start, ends, one.half_size)
+    for one, near, start, ends in _sights_near_boxes(boxes, position, points, 0.0):
+        out[near] |= intersects_box(start, ends, one.half_size)
     return out
 
 
-def _sights(position: Float, points: Float) -> tuple[Float, Float]:
-    """Lines of sight from a camera to points: vectors (3, n) and their squared lengths (n,)."""
+def _sights_near_boxes(
+    boxes: Sequence[OrientedBox], position: Float, points: Float, reach: float
+) -> Iterator[tuple[OrientedBox, Index, Float, Float]]:
+    """Boxes, the numbers of the points (k,) to which the line of sight passes within `reach` metres
+    of the sphere around the box, and both ends (3,), (k, 3) of these lines in its frame."""
     along = np.ascontiguousarray((points - position).T)
-    return along, np.maximum(along[0] ** 2 + along[1] ** 2 + along[2] ** 2, 1e-12)
+    square = np.maximum(along[0] ** 2 + along[1] ** 2 + along[2] ** 2, 1e-12)
+    for one in boxes:
+        distance = squared_segment_distances(one.center - position, along, square)
+        near = np.flatnonzero(distance <= (float(np.linalg.norm(one.half_size)) + reach) ** 2)
+        if len(near):
+            yield one, near, one.local(position[None])[0], one.local(points[near])
 
 
 def squared_segment_distances(center: Float, along: Float, square: Float) -> Float:

@@ -1,8 +1,12 @@
 """Triangle meshes."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from stillmap.mesh.types import Bool, Float, Index, Int32
 
@@ -59,10 +63,7 @@ class Mesh:
 
     def _cross_products(self) -> Float:
         a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
-        u, v = (b - a).T, (c - a).T
-        return np.column_stack(
-            [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]
-        )
+        return np.ascontiguousarray(cross_columns((b - a).T, (c - a).T).T)
 
     def adjacent_faces(self) -> Int32:
         """(N, 2) pairs of faces that share an edge, the lower number first, unique and sorted.
@@ -105,6 +106,14 @@ def concatenate_meshes(meshes: list[Mesh]) -> Mesh:
             ]
         ),
     )
+
+
+def label_components(one: NDArray[Any], other: NDArray[Any], n: int) -> Index:
+    """(n,) number of the connected component of each of n nodes; edges join `one` and `other`."""
+    if not n:
+        return np.zeros(0, np.intp)
+    graph = coo_array((np.ones(len(one), np.bool_), (one, other)), shape=(n, n))
+    return np.asarray(connected_components(graph, directed=False)[1], np.intp)
 
 
 def cross_columns(a: Float, b: Float) -> Float:

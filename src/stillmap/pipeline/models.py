@@ -5,7 +5,8 @@ from stillmap.core.profiling import Progress, StageTimer, no_progress
 from stillmap.em import estimate_ground
 from stillmap.mesh import build
 from stillmap.mesh.build import Models
-from stillmap.mesh.inputs import MeshInputs, box_objects, extrude_boxes
+from stillmap.mesh.inputs import MeshInputs
+from stillmap.mesh.tracked_boxes import box_objects, extrude_boxes
 from stillmap.pipeline.result import MappingResult
 from stillmap.rig.build import TiltingResult
 
@@ -34,34 +35,13 @@ def build_models(
         raise ValueError("result: expected one in 3D")
     build.require_extras()
     threads = resolve_threads(result.options.threads)
-    inputs = (
-        _recording_inputs(result, threads)
-        if tilting is None
-        else _rig_inputs(result, tilting, threads)
+    start_ns, seen = int(result.deskewed.stamp_ns[0]), result if tilting is None else tilting
+    if tilting is None:
+        boxes = box_objects(result.objects, start_ns)
+    else:  # the flat laser gives the tracks, the tilting laser the 3D data
+        ground = estimate_ground(tilting.deskewed, tilting.poses, tilting.p_static, threads)
+        boxes = extrude_boxes(tilting.boxes, tilting.objects, ground)
+    inputs = MeshInputs(
+        seen.recording, seen.deskewed, seen.poses, seen.p_static, seen.objects, boxes, start_ns
     )
     return build.build_models(inputs, result.options.mesh, threads, progress, stages)
-
-
-def _recording_inputs(result: MappingResult, threads: int) -> MeshInputs:
-    seen = result.deskewed
-    start = int(seen.stamp_ns[0])
-    boxes = box_objects(result.objects, start)
-    ground = estimate_ground(seen, result.poses, result.p_static, threads)
-    return MeshInputs(
-        result.recording, seen, result.poses, result.p_static, result.objects, boxes, start, ground
-    )
-
-
-def _rig_inputs(result: MappingResult, tilting: TiltingResult, threads: int) -> MeshInputs:
-    """The flat laser gives the tracks, the tilting laser the 3D data."""
-    ground = estimate_ground(tilting.deskewed, tilting.poses, tilting.p_static, threads)
-    return MeshInputs(
-        tilting.recording,
-        tilting.deskewed,
-        tilting.poses,
-        tilting.p_static,
-        tilting.objects,
-        extrude_boxes(tilting.boxes, tilting.objects, ground),
-        int(result.deskewed.stamp_ns[0]),
-        ground,
-    )

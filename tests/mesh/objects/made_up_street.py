@@ -7,9 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.recording import Recording
-from stillmap.em import GroundMap
 from stillmap.mesh.inputs import MeshInputs
-from stillmap.mesh.texture.occluders import TrackedBox
+from stillmap.mesh.tracked_boxes import TrackedBox
 from stillmap.tracking import MovingObject
 from stillmap.tracking.boxes import fit_box
 
@@ -75,9 +74,8 @@ def street(
     things = [
         TrackedBox(fit_box(one, 0, 0.5), one.z - 0.5 * one.size[2], one.size[2]) for one in objects
     ]
-    ground = GroundMap(np.zeros((1, 1)), np.zeros(2), 1.0, True)
     p_static = np.where(met >= 0, 0.05, 0.95).astype(np.float32)
-    return MeshInputs(recording, recording, poses, p_static, objects, things, 0, ground)
+    return MeshInputs(recording, recording, poses, p_static, objects, things, 0)
 
 
 def by_several(sources: MeshInputs, lidars: int, seconds: float = 0.09) -> MeshInputs:

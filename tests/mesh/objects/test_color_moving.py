@@ -10,13 +10,13 @@ from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.mesh import point_colors
-from stillmap.mesh.background import Background
+from stillmap.mesh.inputs import MeshInputs
 from stillmap.mesh.objects.segmentation import DynamicReturns
-from stillmap.mesh.place import ViewAssignment
+from stillmap.mesh.place import Background, ViewAssignment
 from stillmap.mesh.point_colors import TrackedReturns, color_moving
 from stillmap.mesh.texture.atlas import GRAY
-from stillmap.mesh.texture.occluders import TrackedBox
 from stillmap.mesh.texture.views import View, read_color_image
+from stillmap.mesh.tracked_boxes import TrackedBox
 from stillmap.mesh.triangle_mesh import Mesh
 from stillmap.tracking.boxes import Box
 
@@ -52,7 +52,7 @@ def board_seen(*others: TrackedBox) -> TrackedReturns:
         sensor=np.zeros(2, np.int32),
         T_odom_base=None,
     )
-    sources = SimpleNamespace(
+    sources = MeshInputs(
         recording=recording,
         deskewed=recording,
         poses=np.tile(np.eye(4), (2, 1, 1)),
@@ -61,7 +61,7 @@ def board_seen(*others: TrackedBox) -> TrackedReturns:
         boxes=[thing(7, 0.0, AHEAD, (0.6, 0.2), SPEED), *others],
         start_ns=0,
     )
-    return TrackedReturns(sources, DynamicReturns.collect(sources))
+    return TrackedReturns.collect(DynamicReturns.collect(sources))
 
 
 def view(number: int, seconds: float) -> View:
@@ -151,7 +151,7 @@ def test_what_is_of_no_track_and_what_stands_still_are_left_alone():
     moving = board_seen()
     moving.inputs.p_static[:100] = 0.9
     moving.inputs.objects[0].beams = np.arange(200, 2 * len(BOARD))
-    again = TrackedReturns(moving.inputs, DynamicReturns.collect(moving.inputs))
+    again = TrackedReturns.collect(DynamicReturns.collect(moving.inputs))
     colours, _ = tint(again, [view(1, 0.05)])
     assert (colours[0, :200] == GRAY).all()
     assert (colours[0, 200:] != GRAY).any()

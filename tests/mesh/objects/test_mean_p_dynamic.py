@@ -9,10 +9,10 @@ from made_up_street import Car, Part, street
 
 from stillmap.mesh.inputs import MeshInputs
 from stillmap.mesh.objects import reconstruction
-from stillmap.mesh.objects.frame import ObjectFrame
 from stillmap.mesh.objects.merging import collect_tracks
 from stillmap.mesh.objects.reconstruction import ObjectShape, mean_p_dynamic, reconstruct_object
 from stillmap.mesh.objects.segmentation import DynamicReturns
+from stillmap.mesh.tracked_boxes import ObjectFrame
 from stillmap.mesh.triangle_mesh import Mesh
 
 STANDS = Car((8.0, 0.0), (0.0, 0.0), (0.6, 2.0, 1.5))
@@ -20,8 +20,8 @@ STANDS = Car((8.0, 0.0), (0.0, 0.0), (0.6, 2.0, 1.5))
 
 def _shape(sources: MeshInputs) -> ObjectShape | None:
     moves = DynamicReturns.collect(sources)
-    followed = collect_tracks(sources, moves)
-    return reconstruct_object(followed, sources, moves, [np.zeros(0)] * len(followed))
+    followed = collect_tracks(moves)
+    return reconstruct_object(followed, moves, [np.zeros(0)] * len(followed))
 
 
 def _partly(sources: MeshInputs, share: float) -> MeshInputs:

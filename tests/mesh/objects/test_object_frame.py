@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from stillmap.mesh.objects.frame import ObjectFrame
-from stillmap.mesh.texture.occluders import TrackedBox
+from stillmap.mesh.tracked_boxes import ObjectFrame, TrackedBox
 from stillmap.tracking.boxes import Box
 
 

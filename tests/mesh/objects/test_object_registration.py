@@ -125,9 +125,9 @@ WRONG = Part(0, drift=(0.6, 0.2))
 
 def _shape(sources: MeshInputs) -> ObjectShape:
     moves = DynamicReturns.collect(sources)
-    followed = collect_tracks(sources, moves)
-    (whole,) = merge_tracks(followed, moves, sources)
-    shape = reconstruct_object(whole, sources, moves, [np.zeros(0)] * len(whole))
+    followed = collect_tracks(moves)
+    (whole,) = merge_tracks(followed, moves)
+    shape = reconstruct_object(whole, moves, [np.zeros(0)] * len(whole))
     assert shape is not None
     return shape
 
@@ -219,5 +219,5 @@ def test_without_enough_of_a_surface_there_is_no_model(
             monkeypatch.setattr(module, name, constants[name])
     sources = street([Car((8.0, -2.0), (6.0, 0.0))], [Part(0)])
     moves = DynamicReturns.collect(sources)
-    (whole,) = merge_tracks(collect_tracks(sources, moves), moves, sources)
-    assert (reconstruct_object(whole, sources, moves, [np.zeros(0)]) is not None) == any_model
+    (whole,) = merge_tracks(collect_tracks(moves), moves)
+    assert (reconstruct_object(whole, moves, [np.zeros(0)]) is not None) == any_model

@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 from made_up_rooms import looking, rectangle
 
-from stillmap.mesh.background import Background
 from stillmap.mesh.objects import texturing
-from stillmap.mesh.objects.frame import ObjectFrame
 from stillmap.mesh.objects.reconstruction import ObjectShape
 from stillmap.mesh.objects.texturing import assign_object_views, times_in_view
-from stillmap.mesh.place import ViewAssignment
-from stillmap.mesh.texture.occluders import TrackedBox
+from stillmap.mesh.place import Background, ViewAssignment
+from stillmap.mesh.tracked_boxes import ObjectFrame, TrackedBox
 from stillmap.mesh.triangle_mesh import concatenate_meshes
 from stillmap.tracking.boxes import Box
 
@@ -74,7 +72,7 @@ def pictures(gap=0.0, there=(0,), shift=0.0):
 def dress(views, place=None, colours=None, others=(), of=None):
     background = Background(place or place_of(), views, colours or pictures())
     things = [thing(), *others]
-    return assign_object_views(of or shape(), views, background, things, 0)
+    return assign_object_views(of or shape(), background, things, 0)
 
 
 def area_painted(found):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stillmap.mesh.texture.outline import outline_depth
+from stillmap.mesh.objects.texturing import outline_depth
 
 
 def grid(size: float, step: float) -> np.ndarray:

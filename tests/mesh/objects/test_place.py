@@ -5,10 +5,10 @@ import pytest
 from made_up_rooms import looking, rectangle
 
 from stillmap.core.recording import Recording
+from stillmap.mesh.inputs import LidarReturns, MeshInputs
 from stillmap.mesh.place import _P_UNOBSERVED, p_unoccluded
-from stillmap.mesh.texture.occluders import TrackedBox
-from stillmap.mesh.texture.occlusion import LidarReturns
 from stillmap.mesh.texture.view_selection import MIN_P_VISIBLE
+from stillmap.mesh.tracked_boxes import TrackedBox
 from stillmap.tracking.boxes import Box
 
 # 4 m ahead of a camera at the origin; faces of 0.2 m
@@ -30,7 +30,7 @@ def beams(ends, p, beside=0.3):
     )
     T = np.eye(4)[None].copy()
     T[0, 0, 3] = -beside
-    return LidarReturns(recording, recording, T, np.asarray(p, np.float32), [], [], 0)
+    return recording, T, np.asarray(p, np.float32)
 
 
 def person(x, y):
@@ -41,8 +41,9 @@ def person(x, y):
 
 
 def probabilities(found, things):
-    faces = np.arange(len(WALL))
-    return p_unoccluded(WALL, faces, VIEW, found, things)
+    recording, T, p = found
+    inputs = MeshInputs(recording, recording, T, p, [], things, 0)
+    return p_unoccluded(WALL, np.arange(len(WALL)), VIEW, LidarReturns(inputs))
 
 
 def on_wall():

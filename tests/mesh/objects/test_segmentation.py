@@ -4,19 +4,18 @@ import numpy as np
 import pytest
 from made_up_street import Car, Part, by_several, street
 
-from stillmap.mesh.objects.frame import ObjectFrame
+from stillmap.mesh.inputs import LidarReturns
 from stillmap.mesh.objects.segmentation import (
     DynamicReturns,
-    beam_seconds,
     beams_in_frame,
     cluster_cells,
     grow_segment,
     in_viewing_cone,
-    scans_within,
     segment_object,
     unique_cells,
 )
 from stillmap.mesh.point_colors import TrackedReturns
+from stillmap.mesh.tracked_boxes import ObjectFrame
 
 TWO = [Car((8.0, -2.0), (6.0, 0.0)), Car((20.0, 4.0), (-4.0, 0.0))]
 
@@ -43,8 +42,8 @@ def test_beams_have_times_of_their_own() -> None:
     object.__setattr__(sources.recording, "beam_time", later)
     scan = sources.recording.scans_of(beams)
     expected = 1e-9 * sources.recording.stamp_ns[scan] + later[beams]
-    np.testing.assert_allclose(beam_seconds(beams, sources), expected, atol=2e-9)
-    about = scans_within(0.3, 0.4, sources)
+    np.testing.assert_allclose(sources.seconds_of(beams), expected, atol=2e-9)
+    about = sources.scans_within(0.3, 0.4)
     assert about.start <= 2
     assert about.stop >= 5
 
@@ -52,17 +51,17 @@ def test_beams_have_times_of_their_own() -> None:
 @pytest.mark.parametrize("lidars", [1, 2, 6])
 def test_beams_of_lidars_that_begin_at_once_are_found(lidars: int) -> None:
     sources = by_several(street(TWO, [Part(0)]), lidars)
-    seconds = beam_seconds(np.arange(sources.recording.n_beams), sources)
+    seconds = sources.seconds_of(np.arange(sources.recording.n_beams))
     for now in (0.28, 0.3, 0.389):
-        scans = scans_within(now, now, sources)
+        scans = sources.scans_within(now, now)
         about = sources.recording.offset[[scans.start, scans.stop]]
         then = np.flatnonzero(np.abs(seconds - now) < 1e-3)
         assert about[0] <= then[0]
         assert then[-1] < about[1]
     # of a picture, too
-    ends, _ = sources.index_returns().near_time(280_000_000)
+    ends, _ = LidarReturns(sources).near_time(280_000_000)
     assert len(ends) == np.count_nonzero(np.abs(seconds - 0.28) <= 0.06)
-    moving = TrackedReturns(sources, DynamicReturns.collect(sources))
+    moving = TrackedReturns.collect(DynamicReturns.collect(sources))
     beams = sources.objects[0].beams
     found = moving.near_time(0.28, 0.07).beam
     np.testing.assert_array_equal(np.sort(found), beams[np.abs(seconds[beams] - 0.28) <= 0.07])
@@ -73,7 +72,7 @@ def test_a_thing_has_what_ended_in_its_box_and_nothing_of_others() -> None:
     sources = street(TWO, [Part(0), Part(1)])
     moves = DynamicReturns.collect(sources)
     for one, thing in zip(sources.objects, sources.boxes, strict=True):
-        own = segment_object(one, thing, moves, sources)
+        own = segment_object(one, thing, moves)
         np.testing.assert_array_equal(moves.beam[own], one.beams)
 
 
@@ -82,7 +81,7 @@ def test_what_is_followed_by_nobody_is_its_own_in_its_box() -> None:
     one, thing = sources.objects[0], sources.boxes[0]
     moves = DynamicReturns.collect(sources)
     free = moves._replace(owner=np.where(moves.owner == 0, -1, moves.owner).astype(np.int32))
-    own = segment_object(one, thing, free, sources)
+    own = segment_object(one, thing, free)
     # but for the lowest row, which may be the ground's
     assert set(moves.beam[own]) <= set(one.beams)
     assert len(own) > 0.9 * len(one.beams)
@@ -93,7 +92,7 @@ def test_a_part_grows_to_the_whole_and_not_to_the_next_car() -> None:
     sources = street(cars, [Part(0, 0.0, 0.2), Part(1)])
     moves = DynamicReturns.collect(sources)
     one, thing = sources.objects[0], sources.boxes[0]
-    own = segment_object(one, thing, moves, sources)
+    own = segment_object(one, thing, moves)
     within = moves.in_beam_range(0, int(sources.deskewed.offset[1]))
     every = np.arange(within.start, within.stop)
     own = own[own < within.stop]

@@ -17,7 +17,7 @@ from stillmap.mesh.objects.merging import (
 )
 from stillmap.mesh.objects.reconstruction import reconstruct_object
 from stillmap.mesh.objects.segmentation import DynamicReturns
-from stillmap.mesh.texture.occluders import TrackedBox
+from stillmap.mesh.tracked_boxes import TrackedBox
 from stillmap.tracking.boxes import fit_box
 
 CAR = Car((6.0, -2.5), (6.0, 0.0))
@@ -25,8 +25,8 @@ CAR = Car((6.0, -2.5), (6.0, 0.0))
 
 def _wholes(sources: MeshInputs) -> list[list[int]]:
     moves = DynamicReturns.collect(sources)
-    followed = collect_tracks(sources, moves)
-    found = merge_tracks(followed, moves, sources)
+    followed = collect_tracks(moves)
+    found = merge_tracks(followed, moves)
     return [[one.object.id for one in whole] for whole in found]
 
 
@@ -54,8 +54,8 @@ def test_a_track_of_two_cars_does_not_make_them_one() -> None:
     objects, things = [*sources.objects[:2], both], [*sources.boxes[:2], thing]
     sources = dataclasses.replace(sources, objects=objects, boxes=things)
     moves = DynamicReturns.collect(sources)
-    followed = collect_tracks(sources, moves)
-    pairs = count_pairs(list(merging._cluster_scans(followed, moves, sources)), 3)
+    followed = collect_tracks(moves)
+    pairs = count_pairs(list(merging._cluster_scans(followed, np.ones(3, np.bool_), moves)), 3)
     hangs = pairs.connected >= MAJORITY * pairs.observed
     assert pairs.pairs[hangs].tolist() == [[0, 2], [1, 2]]  # by twos they are all one
     assert sorted(_wholes(sources)) in ([[0, 2], [1]], [[0], [1, 2]])
@@ -86,9 +86,9 @@ def test_what_is_left_over_of_a_car_is_no_thing() -> None:
 def test_one_model_shows_all_of_a_car_that_was_followed_in_parts() -> None:
     sources = street([CAR], [Part(0, 0.0, 0.3), Part(0, 0.3, 1.0)])
     moves = DynamicReturns.collect(sources)
-    followed = collect_tracks(sources, moves)
-    (whole,) = merge_tracks(followed, moves, sources)
-    shape = reconstruct_object(whole, sources, moves, [np.zeros(0)] * len(whole))
+    followed = collect_tracks(moves)
+    (whole,) = merge_tracks(followed, moves)
+    shape = reconstruct_object(whole, moves, [np.zeros(0)] * len(whole))
     assert shape is not None
     assert shape.id in (0, 1)
     T = shape.frame.T_map_object(shape.seconds)
@@ -110,13 +110,13 @@ def test_points_hang_together_as_far_as_beams_are_apart() -> None:
 def test_many_tracks_that_never_meet_need_no_room() -> None:
     sources = street([CAR], [Part(0)])
     moves = DynamicReturns.collect(sources)
-    (one,) = collect_tracks(sources, moves)
+    (one,) = collect_tracks(moves)
     far = [
         one._replace(object=dataclasses.replace(one.object, id=k, beams=one.object.beams[:0]))
         for k in range(1, 3000)
     ]
     tracemalloc.start()
-    found = merge_tracks([one, *far], moves, sources)
+    found = merge_tracks([one, *far], moves)
     _, most = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert len(found) == 3000

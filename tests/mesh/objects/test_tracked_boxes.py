@@ -1,8 +1,10 @@
 """Things that stand between a camera and what it sees."""
 
 import numpy as np
+import pytest
 
-from stillmap.mesh.texture.occluders import (
+from stillmap.mesh import tracked_boxes
+from stillmap.mesh.tracked_boxes import (
     OrientedBox,
     TrackedBox,
     boxes_at,
@@ -68,22 +70,30 @@ def test_a_thing_is_on_its_way_and_a_little_beyond() -> None:
     assert boxes_at([_walker()], -0.6) == []
 
 
+@pytest.fixture
+def wide_outlines(monkeypatch):
+    monkeypatch.setattr(tracked_boxes, "OUTLINE_MARGIN", 0.1)
+    monkeypatch.setattr(tracked_boxes, "_OUTLINE_SIGMA", 0.1)
+
+
+@pytest.mark.usefixtures("wide_outlines")
 def test_who_stands_before_a_wall_hides_it_and_nobody_hides_what_is_nearer() -> None:
     one = OrientedBox(np.array([3.0, 0.0, 0.9]), np.array([1.0, 0.0]), np.array([0.2, 0.3, 0.9]))
     points = np.array([[5.0, 0, 1], [2.0, 0, 1], [5, 3, 1], [5.0, 0, 4.0], [5.0, 0.75, 1.0]])
-    p = occlusion_probability([one], np.array([0.0, 0.0, 1.0]), points, 0.1, 0.1)
+    p = occlusion_probability([one], np.array([0.0, 0.0, 1.0]), points)
     assert p[0] > 0.98
     np.testing.assert_array_equal(p[1:4], 0.0)
     # 0.75 * 3.1 / 5 = 0.47 to the side of its middle: within a sigma of the margin's edge
     assert 0.3 < p[4] < 0.7
 
 
+@pytest.mark.usefixtures("wide_outlines")
 def test_two_things_hide_more_than_one() -> None:
     near = OrientedBox(np.array([2.0, 0.45, 0.9]), np.array([1.0, 0.0]), np.array([0.2, 0.2, 0.9]))
     far = OrientedBox(np.array([3.0, 0.6, 0.9]), np.array([0.0, 1.0]), np.array([0.2, 0.2, 0.9]))
     points, place = np.array([[6.0, 0.0, 1.0]]), np.array([0.0, 0.0, 1.0])
-    alone = [occlusion_probability([one], place, points, 0.1, 0.1)[0] for one in (near, far)]
-    both = occlusion_probability([near, far], place, points, 0.1, 0.1)[0]
+    alone = [occlusion_probability([one], place, points)[0] for one in (near, far)]
+    both = occlusion_probability([near, far], place, points)[0]
     assert min(alone) > 0.0
     assert max(alone) < both < 1.0
 

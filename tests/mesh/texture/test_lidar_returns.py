@@ -1,12 +1,14 @@
 """Beams that were taken about when a picture was."""
 
+from types import SimpleNamespace
 from unittest import mock
 
 import numpy as np
 
 from stillmap.core.recording import Recording
-from stillmap.mesh.texture import occlusion
-from stillmap.mesh.texture.occlusion import LidarReturns
+from stillmap.mesh import inputs
+from stillmap.mesh.inputs import LidarReturns, MeshInputs
+from stillmap.mesh.tracked_boxes import TrackedBox
 from stillmap.tracking.boxes import Box
 
 
@@ -26,11 +28,21 @@ def _recording(times: np.ndarray | None) -> Recording:
     )
 
 
-def _beams(recording: Recording, boxes: list[Box], owned: list[np.ndarray]) -> LidarReturns:
+def _returns(
+    recording: Recording, poses: np.ndarray, p: np.ndarray, box: Box | None, owned: np.ndarray
+) -> LidarReturns:
+    objects = [SimpleNamespace(id=0, beams=owned)]
+    boxes = [] if box is None else [TrackedBox(box, np.zeros(2), 1.0)]
+    return LidarReturns(MeshInputs(recording, recording, poses, p, objects, boxes, 0))
+
+
+def _beams(
+    recording: Recording, box: Box | None = None, owned: np.ndarray | None = None
+) -> LidarReturns:
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[:, 1, 3] = [0.0, 10.0, 20.0, 30.0]
     p = np.linspace(0.0, 1.0, 12).astype(np.float32)
-    return LidarReturns(recording, recording, poses, p, boxes, owned, 0)
+    return _returns(recording, poses, p, box, np.zeros(0, int) if owned is None else owned)
 
 
 def near_time(
@@ -42,12 +54,12 @@ def near_time(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The returns near a time, by windows in seconds."""
     windows = {"_WINDOW": window, "_WINDOW_TILTING": tilting or window, "_WINDOW_TRACKED": tracked}
-    with mock.patch.multiple(occlusion, **windows):
+    with mock.patch.multiple(inputs, **windows):
         return beams.near_time(stamp_ns)
 
 
 def test_of_scans_taken_at_once_the_nearest_counts_at_least() -> None:
-    beams = _beams(_recording(None), [], [])
+    beams = _beams(_recording(None))
     ends, p = near_time(beams, 140_000_000, 0.01)
     np.testing.assert_allclose(ends, [[4, 10, 0], [5, 10, 0], [6, 10, 0]])
     np.testing.assert_allclose(p, np.arange(3, 6) / 11.0)
@@ -56,7 +68,7 @@ def test_of_scans_taken_at_once_the_nearest_counts_at_least() -> None:
 
 def test_with_times_each_beam_counts_by_its_own() -> None:
     times = np.tile(np.array([0.0, 0.03, 0.06], np.float32), 4)
-    beams = _beams(_recording(times), [], [])
+    beams = _beams(_recording(times))
     ends, _ = near_time(beams, 145_000_000, 0.02)
     np.testing.assert_allclose(ends[:, 0], [5.0, 6.0])
 
@@ -72,7 +84,7 @@ def test_what_is_of_a_thing_goes_on_with_it() -> None:
         (1.0, 1.0),
         0.5,
     )
-    beams = _beams(_recording(None), [box], [np.array([4, 9])])
+    beams = _beams(_recording(None), box, np.array([4, 9]))
     ends, _ = near_time(beams, 140_000_000, 0.01)
     np.testing.assert_allclose(ends, [[4, 10, 0], [5.04, 10.08, 0], [6, 10, 0]], atol=1e-6)
 
@@ -80,12 +92,12 @@ def test_what_is_of_a_thing_goes_on_with_it() -> None:
 def test_beams_that_hit_nothing_say_nothing() -> None:
     recording = _recording(None)
     recording.hit[4] = False
-    ends, _ = near_time(_beams(recording, [], []), 100_000_000, 0.01)
+    ends, _ = near_time(_beams(recording), 100_000_000, 0.01)
     np.testing.assert_allclose(ends[:, 0], [4.0, 6.0])
 
 
 def test_there_may_be_none() -> None:
-    assert len(near_time(_beams(_recording(None), [], []), 9_000_000_000, 0.1)[0]) == 0
+    assert len(near_time(_beams(_recording(None)), 9_000_000_000, 0.1)[0]) == 0
 
 
 def _row(p: list[float], planar: bool) -> LidarReturns:
@@ -101,8 +113,9 @@ def _row(p: list[float], planar: bool) -> LidarReturns:
     )
     poses, of_all = np.tile(np.eye(4), (4, 1, 1)), np.ones(12, np.float32)
     of_all[::3] = p
-    owned = [np.array([0, 3, 6, 9])]
-    return LidarReturns(_recording(None), _recording(None), poses, of_all, [box], owned, 0, planar)
+    out = _returns(_recording(None), poses, of_all, box, np.array([0, 3, 6, 9]))
+    out.is_planar = planar
+    return out
 
 
 def test_of_a_row_what_moves_is_told_longer_and_goes_on() -> None:

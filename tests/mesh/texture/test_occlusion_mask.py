@@ -1,8 +1,10 @@
 """What beams say of a picture."""
 
 import numpy as np
+import pytest
 
 from stillmap.core.camera import Camera
+from stillmap.mesh.texture import occlusion
 from stillmap.mesh.texture.occlusion import build_occlusion_mask
 from stillmap.mesh.texture.views import View
 
@@ -19,12 +21,15 @@ CAMERA = Camera(
 AHEAD = View(0, 0, CAMERA, np.eye(4))
 
 
-def _shown(
-    points: np.ndarray, p: np.ndarray, asked: np.ndarray, margin: float = 0.15
-) -> np.ndarray:
-    found = build_occlusion_mask(AHEAD, points, p.astype(np.float32), margin)
+@pytest.fixture(autouse=True)
+def wide_outlines(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(occlusion, "OUTLINE_MARGIN", 0.15)
+
+
+def _shown(points: np.ndarray, p: np.ndarray, asked: np.ndarray) -> np.ndarray:
+    found = build_occlusion_mask(AHEAD, points, p.astype(np.float32))
     uv = 400.0 * asked[:, :2] / asked[:, 2:] + [320.0, 240.0]
-    return found.p_unoccluded(uv, asked[:, 2], margin, np.full(len(asked), 0.9))
+    return found.p_unoccluded(uv, asked[:, 2], np.full(len(asked), 0.9))
 
 
 def test_behind_what_moves_nothing_is_seen_and_before_it_all() -> None:
@@ -38,7 +43,7 @@ def test_what_moves_is_larger_than_where_beams_met_it() -> None:
     mover, p = np.array([[0.0, 0.0, 3.0]]), np.array([0.0])
     aside = np.linspace(0.0, 0.5, 26)
     asked = np.stack([2.0 * aside, np.zeros(26), np.full(26, 6.0)], axis=1)
-    hidden = _shown(mover, p, asked, 0.15) < 0.5
+    hidden = _shown(mover, p, asked) < 0.5
     # 0.15 m and 1 cm per metre to the side, on cells of 8 pixels: 6 cm there
     assert hidden[aside <= 0.12].all()
     assert not hidden[aside >= 0.27].any()
@@ -55,13 +60,13 @@ def test_beams_that_end_on_what_stands_still_speak_for_a_picture() -> None:
 
 def test_the_nearest_of_two_things_counts() -> None:
     two = np.array([[0.0, 0, 8.0], [0.0, 0, 3.0], [0.0, 0, 6.0]])
-    found = build_occlusion_mask(AHEAD, two, np.array([0.1, 0.2, 0.3], np.float32), 0.1)
+    found = build_occlusion_mask(AHEAD, two, np.array([0.1, 0.2, 0.3], np.float32))
     at = tuple(int(x) for x in (240 / found.cell, 320 / found.cell))
     assert found.depth[at] == 3.0
     assert abs(found.dynamic[at] - 0.8) < 1e-6
 
 
 def test_what_is_behind_the_camera_says_nothing() -> None:
-    found = build_occlusion_mask(AHEAD, np.array([[0.0, 0, -3.0]]), np.zeros(1, np.float32), 0.1)
+    found = build_occlusion_mask(AHEAD, np.array([[0.0, 0, -3.0]]), np.zeros(1, np.float32))
     assert np.isinf(found.depth).all()
     assert not found.support.any()

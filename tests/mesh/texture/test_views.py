@@ -178,7 +178,6 @@ def test_damaged_pictures_are_found_when_they_are_wanted():
     assert unread[:2] == ["is no picture"] * 2
     assert "got (6, 16, 3)" in unread[2]
     assert told == [(k, 4) for k in (1, 2, 3, 4)]
-    assert filter_readable(None, []) == ([], [])
 
     def never(image: int) -> np.ndarray:
         raise InputError(f"{image} is no picture")

@@ -9,20 +9,16 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
-from stillmap.mesh.inputs import MeshInputs
 from stillmap.mesh.objects.segmentation import (
     LINK,
     SPACING,
     DynamicReturns,
     cluster_cells,
-    is_fast,
-    is_large,
     segment_object,
 )
-from stillmap.mesh.texture.occluders import TrackedBox
+from stillmap.mesh.tracked_boxes import TrackedBox
+from stillmap.mesh.triangle_mesh import label_components
 from stillmap.mesh.types import Bool, Float, Index
 from stillmap.tracking import MovingObject
 
@@ -66,32 +62,24 @@ class ObjectTrack(NamedTuple):
         object: as it was tracked.
         box: box along its track.
         returns: numbers within `DynamicReturns` of its returns, rising.
-        is_fast: whether it is faster than people.
-        is_large: whether it is longer or wider than people.
     """
 
     object: MovingObject
     box: TrackedBox
     returns: Index
-    is_fast: bool
-    is_large: bool
 
 
-def collect_tracks(inputs: MeshInputs, returns: DynamicReturns) -> list[ObjectTrack]:
+def collect_tracks(returns: DynamicReturns) -> list[ObjectTrack]:
     """The objects that have a box, each with its returns."""
-    boxes = {one.box.object_id: one for one in inputs.boxes}
-    out = []
-    for one in inputs.objects:
-        if one.id in boxes:
-            box = boxes[one.id]
-            own = segment_object(one, box, returns, inputs)
-            out.append(ObjectTrack(one, box, own, is_fast(box), is_large(box)))
-    return out
+    boxes = {one.box.object_id: one for one in returns.inputs.boxes}
+    return [
+        ObjectTrack(one, boxes[one.id], segment_object(one, boxes[one.id], returns))
+        for one in returns.inputs.objects
+        if one.id in boxes
+    ]
 
 
-def merge_tracks(
-    tracks: Sequence[ObjectTrack], returns: DynamicReturns, inputs: MeshInputs
-) -> list[list[ObjectTrack]]:
+def merge_tracks(tracks: Sequence[ObjectTrack], returns: DynamicReturns) -> list[list[ObjectTrack]]:
     """Groups of tracks that belong to one object each.
 
     Two tracks, one of them faster than people, are one object if they have one velocity and are
@@ -100,10 +88,10 @@ def merge_tracks(
     objects that passed, and are dropped.
     """
     n = len(tracks)
-    fast = np.array([one.is_fast for one in tracks], np.bool_)
+    fast = np.array([one.box.is_fast for one in tracks], np.bool_)
     if returns.is_planar or not fast.any():
         return [[one] for one in tracks]
-    scans = list(_cluster_scans(tracks, returns, inputs))
+    scans = list(_cluster_scans(tracks, fast, returns))
     counts = count_pairs(scans, n)
     alike = fast[counts.pairs].any(axis=1) & (counts.connected > 0)
     some = np.flatnonzero(alike)
@@ -128,9 +116,8 @@ def count_pairs(scans: Sequence[ScanClusters], n: int) -> PairCounts:
             together.append(np.where(cluster[a] == cluster[b], fewer, 0))
             seen.append(fewer)
         key, number = np.unique(np.concatenate(keys), return_inverse=True)
-        connected, observed = np.zeros(len(key), np.intp), np.zeros(len(key), np.intp)
-        np.add.at(connected, number, np.concatenate(together))
-        np.add.at(observed, number, np.concatenate(seen))
+        connected = np.bincount(number, np.concatenate(together), len(key)).astype(np.intp)
+        observed = np.bincount(number, np.concatenate(seen), len(key)).astype(np.intp)
     return PairCounts(np.stack([key // n, key % n], axis=1), connected, observed)
 
 
@@ -168,10 +155,8 @@ def group_tracks(counts: PairCounts, may: Bool, n: int) -> Index:
 
 def _merge_links(a: int, b: int, links: list[dict[int, tuple[int, int]]]) -> None:
     """Adds the counts of group b to those of group a."""
-    links[a].pop(b)
+    del links[a][b], links[b][a]
     for other, (connected, observed) in links[b].items():
-        if other == a:
-            continue
         m, n = links[a].get(other, (0, 0))
         links[a][other] = links[other][a] = m + connected, n + observed
         links[other].pop(b)
@@ -179,15 +164,15 @@ def _merge_links(a: int, b: int, links: list[dict[int, tuple[int, int]]]) -> Non
 
 
 def _cluster_scans(
-    tracks: Sequence[ObjectTrack], returns: DynamicReturns, inputs: MeshInputs
+    tracks: Sequence[ObjectTrack], fast: Bool, returns: DynamicReturns
 ) -> Iterator[ScanClusters]:
-    """Clusters the dynamic returns of each scan that saw something fast."""
-    n, deskewed = len(tracks), inputs.deskewed
-    fast = np.array([one.is_fast for one in tracks], np.bool_)
-    number = np.full(max(one.object.id for one in tracks) + 2, n, np.intp)  # last: NO_OWNER
-    number[[one.object.id for one in tracks]] = np.arange(n)
-    for scan, sensor in enumerate(deskewed.T_map_sensor(inputs.poses)[:, :3, 3]):
-        some = returns.in_beam_range(int(deskewed.offset[scan]), int(deskewed.offset[scan + 1]))
+    """Clusters the dynamic returns of each scan that saw something fast (n,)."""
+    n, offset = len(tracks), returns.inputs.deskewed.offset
+    ids = [one.object.id for one in tracks]
+    number = np.full(max(ids) + 2, n, np.intp)  # last: NO_OWNER
+    number[ids] = np.arange(n)
+    for scan, sensor in enumerate(returns.inputs.T_map_sensor[:, :3, 3]):
+        some = returns.in_beam_range(int(offset[scan]), int(offset[scan + 1]))
         whose = number[returns.owner[some]]
         if not fast[whose[whose < n]].any():
             continue
@@ -237,25 +222,17 @@ def cluster_points(points: Float, sensor: Float, link: float) -> Index:
         length = link + SPACING * far
         some = np.flatnonzero((away >= near - length) & (away <= far + length))
         if len(some):
-            factor = _depth_factors(away[some], near, far)
+            # distances across the line of sight stay as they are halfway between two ranges
+            halfway = 0.5 * (near + far)
+            factor = halfway + (away[some] - halfway) / _DEPTH_STRETCH
+            factor /= np.maximum(away[some], 1e-9)
             squeezed = sensor + (points[some] - sensor) * factor[:, None]
             cluster = cluster_cells(squeezed, length / _CELLS_PER_LINK, length)
             rows.append(some)
             columns.append(first + cluster)
             first += int(cluster.max()) + 1
         near, far = far, 2.0 * far
-    row, column = np.concatenate(rows), np.concatenate(columns)
-    graph = coo_matrix((np.ones(len(row), np.int8), (row, column)), (first, first))
-    return np.asarray(connected_components(graph, directed=False)[1][:n], np.intp)
-
-
-def _depth_factors(away: Float, near: float, far: float) -> Float:
-    """(n,) factors of ranges that divide differences in range by `_DEPTH_STRETCH`.
-
-    Distances across the line of sight stay as they are halfway between two ranges.
-    """
-    halfway = 0.5 * (near + far)
-    return (halfway + (away - halfway) / _DEPTH_STRETCH) / np.maximum(away, 1e-9)
+    return label_components(np.concatenate(rows), np.concatenate(columns), first)[:n]
 
 
 def _same_velocity(one: ObjectTrack, other: ObjectTrack) -> bool:

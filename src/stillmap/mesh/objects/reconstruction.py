@@ -12,7 +12,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from stillmap.mesh.inputs import MeshInputs
-from stillmap.mesh.objects.frame import ObjectFrame
 from stillmap.mesh.objects.merging import ObjectTrack
 from stillmap.mesh.objects.registration import (
     MIN_COMPONENT_AREA,
@@ -28,13 +27,11 @@ from stillmap.mesh.objects.registration import (
 from stillmap.mesh.objects.segmentation import (
     HALF_CAR,
     DynamicReturns,
-    beam_seconds,
-    scans_within,
 )
 from stillmap.mesh.objects.sweep_surface import find_best_interval
 from stillmap.mesh.range_image import Patch
 from stillmap.mesh.simplification import subdivide
-from stillmap.mesh.texture.occluders import TrackedBox
+from stillmap.mesh.tracked_boxes import ObjectFrame, TrackedBox
 from stillmap.mesh.triangle_mesh import Mesh
 from stillmap.mesh.tsdf import TsdfParameters, integrate_patches
 from stillmap.mesh.types import Float, Index
@@ -81,29 +78,25 @@ class ObjectShape:
 
 
 def reconstruct_object(
-    tracks: Sequence[ObjectTrack],
-    inputs: MeshInputs,
-    returns: DynamicReturns,
-    images: Sequence[Float],
+    tracks: Sequence[ObjectTrack], returns: DynamicReturns, images: Sequence[Float]
 ) -> ObjectShape | None:
     """The surface of a moving object; None where too little of it was seen, or it stood still.
 
     Args:
         tracks: of the object.
-        inputs: the beams.
         returns: the dynamic returns.
         images: (N,) s, times of the images that show each track's object.
     """
     own = np.unique(np.concatenate([one.returns for one in tracks]))
     if not len(own):
         return None
-    fast = any(one.is_fast for one in tracks)
-    rigid = fast or any(one.is_large for one in tracks)
+    fast = any(one.box.is_fast for one in tracks)
+    rigid = fast or any(one.box.is_large for one in tracks)
     durations = [k * _SWEEP_WINDOW for k in _SWEEP_FACTORS] if returns.is_planar else [0.0]
     for duration in durations:
-        one, span = _best_track(tracks, images, duration, inputs, returns)
+        one, span = _best_track(tracks, images, duration, returns)
         frame = ObjectFrame.from_track(one.box)
-        scan = extract_partial_scan(own, span, frame, fast, inputs, returns)
+        scan = extract_partial_scan(own, span, frame, fast, returns)
         if scan is None:
             continue
         mesh = triangulate_partial_scan(scan, rigid, HALF_CAR)
@@ -112,9 +105,9 @@ def reconstruct_object(
         now = 0.5 * sum(scan.span)
         shape = None
         if rigid and not returns.is_planar and len(mesh.vertices) >= _MIN_VERTICES:
-            shape = _merge_partial_scans(one, own, now, fast, inputs, returns)
+            shape = _merge_partial_scans(one, own, now, fast, returns)
         shape = shape or ObjectShape(one.object.id, mesh, frame, False, now, scan.span)
-        p_dynamic = mean_p_dynamic(shape.mesh, shape.frame, shape.span, inputs)
+        p_dynamic = mean_p_dynamic(shape.mesh, shape.frame, shape.span, returns.inputs)
         return shape if p_dynamic >= _MIN_P_DYNAMIC else None
     return None
 
@@ -123,14 +116,13 @@ def _best_track(
     tracks: Sequence[ObjectTrack],
     images: Sequence[Float],
     duration: float,
-    inputs: MeshInputs,
     returns: DynamicReturns,
 ) -> tuple[ObjectTrack, tuple[float, float]]:
     """The track that is observed best, and the interval in which it is."""
     found = []
     for one, shown in zip(tracks, images, strict=True):
         if len(one.returns):
-            scans = inputs.deskewed.scans_of(returns.beam[one.returns])
+            scans = returns.inputs.deskewed.scans_of(returns.beam[one.returns])
             seconds = returns.seconds[one.returns]
             found.append((one, find_best_interval(seconds, scans, duration, IMAGE_WINDOW, shown)))
     one, (first, last, _) = max(found, key=lambda each: each[1][2])
@@ -169,10 +161,10 @@ def mean_p_dynamic(
     low, high = fine.vertices.min(axis=0) - max_distance, fine.vertices.max(axis=0) + max_distance
     low[2] = max(low[2], _MIN_RETURN_HEIGHT)
     total, count = 0.0, 0
-    scans = scans_within(*span, inputs)
+    scans = inputs.scans_within(*span)
     for scan in range(scans.start, scans.stop):  # one by one, to save memory
         beams = np.arange(deskewed.offset[scan], deskewed.offset[scan + 1])
-        seconds = beam_seconds(beams, inputs)
+        seconds = inputs.seconds_of(beams)
         then = (seconds >= span[0]) & (seconds <= span[1]) & deskewed.hit[beams]
         beams, seconds = beams[then], seconds[then]
         at = frame.to_object(seconds, deskewed.end_points(beams, inputs.poses))
@@ -185,16 +177,11 @@ def mean_p_dynamic(
 
 
 def _merge_partial_scans(
-    one: ObjectTrack,
-    own: Index,
-    now: float,
-    fast: bool,
-    inputs: MeshInputs,
-    returns: DynamicReturns,
+    one: ObjectTrack, own: Index, now: float, fast: bool, returns: DynamicReturns
 ) -> ObjectShape | None:
     """The surface of a rigid object from the partial scans around a time; None: they do not fit."""
     frame = ObjectFrame.from_track(straighten_track(one.box, now, MERGE_WINDOW))
-    scans = _partial_scans(own, now, frame, fast, inputs, returns)
+    scans = _partial_scans(own, now, frame, fast, returns)
     surfaces = [_make_surface(scan, now) for scan in scans]
     if len(surfaces) < 2:
         return None
@@ -213,29 +200,25 @@ def _merge_partial_scans(
     if not _is_large_enough(mesh, min_area):
         return None
     times = np.array([surfaces[k].time_offset for k in kept])
-    offset = np.array([_planar_offset(*motion_transform(motion, t)) for t in times.tolist()])
+    corrections = [motion_transform(motion, at) for at in times.tolist()]
+    offset = np.array([[*t[:2], np.arctan2(R[1, 0], R[0, 0])] for R, t in corrections])
     span = min(scans[k].span[0] for k in kept), max(scans[k].span[1] for k in kept)
     corrected = ObjectFrame(frame.box, now + times, offset)
     return ObjectShape(one.object.id, mesh, corrected, True, now, span)
 
 
 def _partial_scans(
-    own: Index,
-    now: float,
-    frame: ObjectFrame,
-    fast: bool,
-    inputs: MeshInputs,
-    returns: DynamicReturns,
+    own: Index, now: float, frame: ObjectFrame, fast: bool, returns: DynamicReturns
 ) -> list[PartialScan]:
     """The partial scans of an object around a time, sorted by time."""
     near = within_time(own, returns.seconds, now - MERGE_WINDOW, now + MERGE_WINDOW)
-    scan = inputs.deskewed.scans_of(returns.beam[near])
+    scan = returns.inputs.deskewed.scans_of(returns.beam[near])
     out = []
     for part in np.split(near, np.flatnonzero(np.diff(scan)) + 1):
         if len(part):
             seconds = returns.seconds[part]
             span = float(seconds.min()), float(seconds.max())
-            found = extract_partial_scan(own, span, frame, fast, inputs, returns)
+            found = extract_partial_scan(own, span, frame, fast, returns)
             out += [found] if found is not None else []
     # scans of several sensors overlap in time
     return sorted(out, key=lambda one: one.span[0] + one.span[1])
@@ -244,11 +227,6 @@ def _partial_scans(
 def _make_surface(scan: PartialScan, now: float) -> PartialSurface:
     mesh = triangulate_partial_scan(scan, True, _MERGE_DEPTH)
     return PartialSurface.from_mesh(mesh, scan.own.origin.mean(axis=0), 0.5 * sum(scan.span) - now)
-
-
-def _planar_offset(R: Float, t: Float) -> list[float]:
-    """Metres ahead and to the left, rad to the left."""
-    return [float(t[0]), float(t[1]), float(np.arctan2(R[1, 0], R[0, 0]))]
 
 
 def _fuse_patches(patches: Sequence[Patch]) -> Mesh:

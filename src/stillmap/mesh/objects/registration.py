@@ -6,25 +6,24 @@ constrain them, as along a side without ends, the track's values hold.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from stillmap.mesh.inputs import MeshInputs
 from stillmap.mesh.marching_cubes import remove_small_components
-from stillmap.mesh.objects.frame import ObjectFrame
 from stillmap.mesh.objects.segmentation import (
     SPACING,
     DynamicReturns,
-    beam_seconds,
     beams_in_frame,
     grow_segment,
     in_viewing_cone,
-    scans_within,
 )
 from stillmap.mesh.objects.sweep_surface import ObjectBeams, triangulate_beams
 from stillmap.mesh.range_image import Patch
+from stillmap.mesh.tracked_boxes import ObjectFrame
 from stillmap.mesh.triangle_mesh import Mesh
 from stillmap.mesh.types import Float, Index
 
@@ -68,7 +67,8 @@ class PartialScan(NamedTuple):
     span: tuple[float, float]
 
 
-class PartialSurface(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class PartialSurface:
     """The surface of a partial scan, in the object's frame by its track.
 
     Attributes:
@@ -92,11 +92,22 @@ class PartialSurface(NamedTuple):
         length = np.linalg.norm(normals, axis=1, keepdims=True)
         return cls(mesh, normals / np.maximum(length, 1e-12), sensor, time_offset)
 
+    @cached_property
+    def tree(self) -> "cKDTree[None]":
+        """The vertices, for searches."""
+        return cKDTree(self.mesh.vertices)
+
+    def sample(self, most: int) -> "PartialSurface":
+        """About `most` of the vertices, without faces."""
+        every = max(1, len(self.mesh.vertices) // most)
+        points = Mesh(self.mesh.vertices[::every], self.mesh.faces[:0])
+        return replace(self, mesh=points, normals=self.normals[::every])
+
     def transform(self, motion: Float) -> "PartialSurface":
         """The surface corrected by a motion (6,) relative to the track."""
         R, t = motion_transform(motion, self.time_offset)
         mesh = Mesh(self.mesh.vertices @ R.T + t, self.mesh.faces)
-        return self._replace(mesh=mesh, normals=self.normals @ R.T, sensor=R @ self.sensor + t)
+        return replace(self, mesh=mesh, normals=self.normals @ R.T, sensor=R @ self.sensor + t)
 
     def to_patch(self) -> Patch:
         """The surface as input of TSDF integration."""
@@ -106,30 +117,8 @@ class PartialSurface(NamedTuple):
         return Patch(points, self.mesh.faces, np.arange(len(points)), origin, standoff)
 
 
-class _Points(NamedTuple):
-    """Some vertices (n, 3) of a partial surface, and their normals (n, 3)."""
-
-    at: Float
-    normals: Float
-    time_offset: float
-
-    @classmethod
-    def sample(cls, one: PartialSurface, most: int) -> "_Points":
-        every = max(1, len(one.mesh.vertices) // most)
-        return cls(one.mesh.vertices[::every], one.normals[::every], one.time_offset)
-
-    def transform(self, motion: Float) -> "_Points":
-        R, t = motion_transform(motion, self.time_offset)
-        return _Points(self.at @ R.T + t, self.normals @ R.T, self.time_offset)
-
-
 def extract_partial_scan(
-    own: Index,
-    span: tuple[float, float],
-    frame: ObjectFrame,
-    fast: bool,
-    inputs: MeshInputs,
-    returns: DynamicReturns,
+    own: Index, span: tuple[float, float], frame: ObjectFrame, fast: bool, returns: DynamicReturns
 ) -> PartialScan | None:
     """The beams on an object in an interval; None where most belong to another track.
 
@@ -138,13 +127,13 @@ def extract_partial_scan(
         span: s, start and end.
         frame: of the object.
         fast: whether all connected dynamic returns are its own.
-        inputs, returns: the beams, and the dynamic returns.
+        returns: the dynamic returns.
     """
-    around = _CONTEXT if fast else 0.0
+    inputs, around = returns.inputs, _CONTEXT if fast else 0.0
     first, last = span[0] - around, span[1] + around
-    scans, offset = scans_within(first, last, inputs), inputs.deskewed.offset
+    scans, offset = inputs.scans_within(first, last), inputs.deskewed.offset
     beams = np.arange(offset[scans.start], offset[scans.stop])
-    seconds = beam_seconds(beams, inputs)
+    seconds = inputs.seconds_of(beams)
     then = (seconds >= first) & (seconds <= last)
     beams, seconds = beams[then], seconds[then]
     mine = within_time(own, returns.seconds, first, last)
@@ -211,28 +200,23 @@ def register_surfaces(surfaces: Sequence[PartialSurface], best: int) -> Float:
     motion = np.zeros(6)
     if len(known.mesh.vertices) < _MIN_POINTS:
         return motion
-    tree = cKDTree(known.mesh.vertices)
-    some, few = ([_Points.sample(one, n) for one in surfaces] for n in (_POINTS, _SEARCH_POINTS))
+    some, few = ([one.sample(n) for one in surfaces] for n in (_POINTS, _SEARCH_POINTS))
     beside = [few[k] for k in (best - 1, best + 1) if 0 <= k < len(surfaces)]
-    motion = _search_speed(beside, known, tree, motion, _COARSE_SPEEDS, _SPEED_PENALTY)
+    motion = _search_speed(beside, known, motion, _COARSE_SPEEDS, _SPEED_PENALTY)
     prior = motion * np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])  # the rest is better from the track
     others = [k for k in range(len(surfaces)) if k != best]
     farthest = max(abs(one.time_offset) for one in surfaces)
     for part, radius in zip(_SPANS, _RADII, strict=True):
         near = [some[k] for k in others if abs(some[k].time_offset) <= part * farthest + 1e-9]
-        for _ in range(_ROUNDS):
-            motion = _gauss_newton_step(near, known, tree, motion, prior, _TRACK_STD, radius)
-    motion = prior = _search_speed([few[k] for k in others], known, tree, motion, _FINE_SPEEDS, 0.0)
+        motion = _refine(near, known, motion, prior, _TRACK_STD, radius, _ROUNDS)
+    motion = _search_speed([few[k] for k in others], known, motion, _FINE_SPEEDS, 0.0)
     far = [some[k] for k in others]
-    for _ in range(_ROUNDS):
-        motion = _gauss_newton_step(far, known, tree, motion, prior, _SEARCHED_STD, _RADII[-1])
-    return motion
+    return _refine(far, known, motion, motion, _SEARCHED_STD, _RADII[-1], _ROUNDS)
 
 
 def _search_speed(
-    surfaces: Sequence[_Points],
+    surfaces: Sequence[PartialSurface],
     known: PartialSurface,
-    tree: "cKDTree[None]",
     motion: Float,
     speeds: tuple[float, ...],
     penalty: float,
@@ -246,70 +230,60 @@ def _search_speed(
     Args:
         surfaces: the others.
         known: the best one.
-        tree: its vertices.
         motion: initial.
         speeds: m/s that are added, 0 the first of them.
         penalty: m per m/s added.
     """
     found, cost = list[Float](), list[float]()
     for speed in speeds:
-        tried = prior = motion + np.array([speed, 0.0, 0.0, 0.0, 0.0, 0.0])
-        for _ in range(_SEARCH_ROUNDS):
-            tried = _gauss_newton_step(
-                surfaces, known, tree, tried, prior, _SEARCHED_STD, _RADII[1]
-            )
+        prior = motion + np.array([speed, 0.0, 0.0, 0.0, 0.0, 0.0])
+        tried = _refine(surfaces, known, prior, prior, _SEARCHED_STD, _RADII[1], _SEARCH_ROUNDS)
         found.append(tried)
-        at = np.concatenate([np.zeros((0, 3)), *(one.transform(tried).at for one in surfaces)])
-        distance = np.asarray(tree.query(at, distance_upper_bound=_MAX_DISTANCE)[0])
+        moved = [one.transform(tried).mesh.vertices for one in surfaces]
+        at = np.concatenate([np.zeros((0, 3)), *moved])
+        distance = np.asarray(known.tree.query(at, distance_upper_bound=_MAX_DISTANCE)[0])
         distance = np.minimum(distance, _MAX_DISTANCE)
         cost.append((float(distance.mean()) if len(distance) else 0.0) + penalty * abs(speed))
     return found[int(np.argmin(cost))]
 
 
-def _gauss_newton_step(
-    surfaces: Sequence[_Points],
+def _refine(
+    surfaces: Sequence[PartialSurface],
     known: PartialSurface,
-    tree: "cKDTree[None]",
     motion: Float,
     prior: Float,
     prior_std: tuple[float, ...],
     radius: float,
+    rounds: int,
 ) -> Float:
-    """One Gauss-Newton step of `motion` with robust weights and a Gaussian prior."""
+    """The motion after Gauss-Newton steps with robust weights and a Gaussian prior."""
     information = np.diag(1.0 / np.square(prior_std))
-    H, g = information.copy(), information @ (motion - prior)
-    for one in surfaces:
-        at, n, residual = _correspondences(one.transform(motion), known, tree, radius)
-        if len(at) < _MIN_POINTS:
-            continue
-        T = one.time_offset
-        w = 1.0 / (1.0 + (residual / (3.0 * _POINT_STD)) ** 2) ** 2 / _POINT_STD**2
-        w *= min(1.0, _INDEPENDENT_POINTS / len(at))
-        around = at - motion_transform(motion, T)[1]
-        J = np.stack(
-            [
-                T * n[:, 0],
-                T * n[:, 1],
-                T * n[:, 2],
-                T * (n[:, 1] * around[:, 0] - n[:, 0] * around[:, 1]),
-                0.5 * T**2 * n[:, 0],
-                0.5 * T**2 * n[:, 1],
-            ],
-            axis=1,
-        )
-        H, g = H + J.T @ (w[:, None] * J), g + J.T @ (w * residual)
-    return np.asarray(motion - np.linalg.solve(H, g))
+    for _ in range(rounds):
+        H, g = information.copy(), information @ (motion - prior)
+        for one in surfaces:
+            at, n, residual = _correspondences(one.transform(motion), known, radius)
+            if len(at) < _MIN_POINTS:
+                continue
+            T = one.time_offset
+            w = 1.0 / (1.0 + (residual / (3.0 * _POINT_STD)) ** 2) ** 2 / _POINT_STD**2
+            w *= min(1.0, _INDEPENDENT_POINTS / len(at))
+            around = at - motion_transform(motion, T)[1]
+            turn = T * (n[:, 1] * around[:, 0] - n[:, 0] * around[:, 1])
+            J = np.column_stack([T * n, turn, 0.5 * T**2 * n[:, :2]])
+            H, g = H + J.T @ (w[:, None] * J), g + J.T @ (w * residual)
+        motion = motion - np.linalg.solve(H, g)
+    return motion
 
 
 def _correspondences(
-    one: _Points, known: PartialSurface, tree: "cKDTree[None]", radius: float
+    one: PartialSurface, known: PartialSurface, radius: float
 ) -> tuple[Float, Float, Float]:
     """(n, 3) points with a nearest vertex, (n, 3) its normals, (n,) point-to-plane residuals."""
-    at, facing, _ = one
-    away, nearest = map(np.asarray, tree.query(at, distance_upper_bound=radius))
+    at = one.mesh.vertices
+    away, nearest = map(np.asarray, known.tree.query(at, distance_upper_bound=radius))
     near = np.flatnonzero(np.isfinite(away))
     normals = known.normals[nearest[near]]
-    same = (facing[near] * normals).sum(axis=1) > _MIN_NORMAL_COSINE
+    same = (one.normals[near] * normals).sum(axis=1) > _MIN_NORMAL_COSINE
     near, normals = near[same], normals[same]
     residual = ((at[near] - known.mesh.vertices[nearest[near]]) * normals).sum(axis=1)
     return at[near], normals, residual
@@ -319,8 +293,7 @@ def surface_distance(one: PartialSurface, known: PartialSurface) -> float:
     """Metres, third quartile of a surface's distances from another; NaN: too little in common."""
     if not len(known.mesh.vertices):
         return float("nan")
-    some = _Points.sample(one, _POINTS)
-    residual = _correspondences(some, known, cKDTree(known.mesh.vertices), _RADII[0])[2]
+    residual = _correspondences(one.sample(_POINTS), known, _RADII[0])[2]
     if len(residual) < _MIN_POINTS:
         return float("nan")
     return float(np.quantile(np.abs(residual), 0.75))

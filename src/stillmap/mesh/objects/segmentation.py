@@ -3,33 +3,27 @@
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from stillmap.core import arrays
 from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.mesh.inputs import MeshInputs
-from stillmap.mesh.objects.frame import ObjectFrame
 from stillmap.mesh.objects.sweep_surface import ObjectBeams
 from stillmap.mesh.range_image import beam_directions, has_planar_scans
-from stillmap.mesh.texture.occluders import TrackedBox
+from stillmap.mesh.tracked_boxes import ObjectFrame, TrackedBox
+from stillmap.mesh.triangle_mesh import label_components
 from stillmap.mesh.types import Bool, Float, Float32, Index, Int32
 from stillmap.tracking import MovingObject
 
 NO_OWNER = -1
-BOX_MARGIN = 0.15  # m around an object's box within which returns are its own
-GROUND_CLEARANCE = 0.03  # m above the ground: lower returns are the ground's
-MIN_RIGID_SIZE = 1.2  # m: objects at least so long or wide are no people
-MIN_RIGID_SPEED = 2.0  # m/s: faster objects are no people
+_BOX_MARGIN = 0.15  # m around an object's box within which returns are its own
+_GROUND_CLEARANCE = 0.03  # m above the ground: lower returns are the ground's
 LINK = 0.5  # m between connected parts of a vehicle
 SPACING = 0.025  # rad between beams, at most
 HALF_CAR = 3.0  # m, from the center of a car to its ends
 _CAR_LENGTH = 6.0  # m
 _MAX_RANGE = 1000.0  # m, end of beams without a return
-_SPEED_QUANTILE = 0.9  # of an object's speeds that counts
 _CELL = 0.2  # m, in which one point is enough
-_SCANS_AROUND = 1  # before and after a time, whose beams may be of it
 _CONE_MARGIN = 0.05  # rad around an object, of beams that pass beside it
 
 
@@ -37,6 +31,7 @@ class DynamicReturns(NamedTuple):
     """The K returns of a recording on moving objects.
 
     Attributes:
+        inputs: the recording.
         beam: (K,) beam numbers, rising.
         seconds: (K,) times, by the clock of boxes.
         ends: (K, 3) metres in the map frame.
@@ -45,6 +40,7 @@ class DynamicReturns(NamedTuple):
         is_planar: whether scans are planar.
     """
 
+    inputs: MeshInputs
     beam: Index
     seconds: Float
     ends: Float
@@ -62,8 +58,8 @@ class DynamicReturns(NamedTuple):
         owner = np.full(len(beam), NO_OWNER, np.int32)
         owner[np.searchsorted(beam, owned)] = whose
         dynamic = deskewed.hit[beam] & (inputs.p_static[beam] < DYNAMIC_BELOW)
-        seconds, ends = beam_seconds(beam, inputs), deskewed.end_points(beam, inputs.poses)
-        return cls(beam, seconds, ends, owner, dynamic, has_planar_scans(deskewed))
+        seconds, ends = inputs.seconds_of(beam), deskewed.end_points(beam, inputs.poses)
+        return cls(inputs, beam, seconds, ends, owner, dynamic, has_planar_scans(deskewed))
 
     def in_beam_range(self, first: int, last: int) -> slice:
         """Returns of beams first:last."""
@@ -80,50 +76,19 @@ def _dynamic_beams(hit: Bool, p_static: Float32) -> Index:
     return np.concatenate(found)
 
 
-def beam_seconds(beams: Index, inputs: MeshInputs) -> Float:
-    """(n,) times of beams (n,), rising, by the clock of boxes."""
-    recording = inputs.recording
-    times = recording.stamp_ns[recording.scans_of(beams)]
-    if recording.beam_time is not None:
-        times = times + np.round(1e9 * recording.beam_time[beams].astype(np.float64)).astype(int)
-    return np.asarray(1e-9 * (times - inputs.start_ns), np.float64)
-
-
-def scans_within(first: float, last: float, inputs: MeshInputs) -> slice:
-    """Scans that may have beams between two times, and some around."""
-    stamps = 1e-9 * (inputs.deskewed.stamp_ns - inputs.start_ns)
-    slack = 1e-9 * inputs.max_scan_ns
-    a = int(np.searchsorted(stamps, first - slack)) - _SCANS_AROUND
-    b = int(np.searchsorted(stamps, last + slack, side="right")) + _SCANS_AROUND
-    return slice(max(a, 0), min(b, len(stamps)))
-
-
-def is_fast(box: TrackedBox) -> bool:
-    """Whether an object is faster than people."""
-    speed = np.linalg.norm(box.box.velocity, axis=1)
-    return bool(np.quantile(speed, _SPEED_QUANTILE) > MIN_RIGID_SPEED)
-
-
-def is_large(box: TrackedBox) -> bool:
-    """Whether an object is longer or wider than people."""
-    return 2.0 * max(box.box.half_size) >= MIN_RIGID_SIZE
-
-
-def segment_object(
-    one: MovingObject, tracked: TrackedBox, returns: DynamicReturns, inputs: MeshInputs
-) -> Index:
+def segment_object(one: MovingObject, tracked: TrackedBox, returns: DynamicReturns) -> Index:
     """(n,) returns of an object: rising numbers within `returns`.
 
     Dynamic returns in the box around it that belong to no other object, and its own not far beside.
     """
-    box, offset = tracked.box, inputs.deskewed.offset
+    box, inputs, offset = tracked.box, returns.inputs, returns.inputs.deskewed.offset
     stamps = 1e-9 * (inputs.deskewed.stamp_ns - inputs.start_ns)
     a = int(np.searchsorted(stamps, box.seconds[0] - box.hold))
     b = max(int(np.searchsorted(stamps, box.seconds[-1] + box.hold, side="right")), a)
     some = returns.in_beam_range(int(offset[a]), int(offset[b]))
-    half = np.array(box.half_size) + BOX_MARGIN
+    half = np.array(box.half_size) + _BOX_MARGIN
     # returns far from the whole track need no test against the box
-    reach = max(float(np.linalg.norm(half)) + BOX_MARGIN, HALF_CAR)
+    reach = max(float(np.linalg.norm(half)) + _BOX_MARGIN, HALF_CAR)
     way = box.center_at(np.concatenate([box.seconds, box.seconds[[0, -1]] + [-box.hold, box.hold]]))
     low, high = way.min(axis=0) - reach, way.max(axis=0) + reach
     x, y = returns.ends[some, 0], returns.ends[some, 1]
@@ -133,10 +98,10 @@ def segment_object(
     frame = ObjectFrame.from_track(tracked)
     at = frame.to_object(returns.seconds[number], returns.ends[number])
     inside = (np.abs(at[:, :2]) <= half).all(axis=1)
-    inside &= (at[:, 2] > GROUND_CLEARANCE) & (at[:, 2] <= tracked.height + BOX_MARGIN)
+    inside &= (at[:, 2] > _GROUND_CLEARANCE) & (at[:, 2] <= tracked.height + _BOX_MARGIN)
     # the track of one person may capture another beside
-    mine = (np.abs(at[:, :2]) <= half + BOX_MARGIN).all(axis=1)
-    if is_large(tracked) and not is_fast(tracked):
+    mine = (np.abs(at[:, :2]) <= half + _BOX_MARGIN).all(axis=1)
+    if tracked.is_large and not tracked.is_fast:
         # the center of the visible part moves about on a large object
         mine = np.linalg.norm(at[:, :2], axis=1) <= HALF_CAR
     kept = np.where(returns.owner[number] == one.id, mine, inside)
@@ -159,7 +124,7 @@ def grow_segment(
     """
     within = within[returns.is_dynamic[within]]
     at = frame.to_object(returns.seconds[within], returns.ends[within])
-    some = (at[:, 2] > GROUND_CLEARANCE) & (np.linalg.norm(at[:, :2], axis=1) <= _CAR_LENGTH)
+    some = (at[:, 2] > _GROUND_CLEARANCE) & (np.linalg.norm(at[:, :2], axis=1) <= _CAR_LENGTH)
     within, at = within[some], at[some]
     there = frame.to_object(returns.seconds[own], returns.ends[own])
     own = own[np.linalg.norm(there[:, :2], axis=1) <= _CAR_LENGTH]
@@ -175,9 +140,7 @@ def cluster_cells(points: Float, edge: float, link: float) -> Index:
     """(n,) cluster of points (n, 3) whose cells are connected by steps of at most `link` metres."""
     cells, of = unique_cells(points, edge)
     one, other = cKDTree(cells).query_pairs(link / edge, output_type="ndarray").T
-    n = len(cells)
-    graph = coo_matrix((np.ones(len(one), np.int8), (one, other)), (n, n))
-    return np.asarray(connected_components(graph, directed=False)[1][of], np.intp)
+    return label_components(one, other, len(cells))[of]
 
 
 def unique_cells(points: Float, edge: float) -> tuple[Float, Index]:
@@ -205,13 +168,10 @@ def beams_in_frame(
     """
     deskewed = inputs.deskewed
     ends = deskewed.end_points(beams, inputs.poses)
-    scan = deskewed.scans_of(beams)
-    T = inputs.poses[scan] @ deskewed.T_base_sensor[deskewed.sensor[scan]]
-    origin = T[:, :3, 3]
+    origin = inputs.T_map_sensor[deskewed.scans_of(beams), :3, 3]
+    along = ends - origin
     with np.errstate(invalid="ignore", divide="ignore"):
-        far = origin + (ends - origin) * (
-            _MAX_RANGE / np.linalg.norm(ends - origin, axis=1, keepdims=True)
-        )
+        far = origin + along * (_MAX_RANGE / np.linalg.norm(along, axis=1, keepdims=True))
     ends = np.where(deskewed.hit[beams][:, None], ends, far)
     return ObjectBeams.from_map(ends, origin, seconds, frame)
 
@@ -229,8 +189,7 @@ def _cosine_to(target: Float, beams: Index, inputs: MeshInputs) -> Float:
     """(n,) cosine of the angle between beams and the direction from the sensor to a point (3,)."""
     deskewed = inputs.deskewed
     first, last = deskewed.scans_of(beams[[0, -1]]) if len(beams) else (0, -1)
-    scans = np.arange(first, last + 1)
-    T = inputs.poses[scans] @ deskewed.T_base_sensor[deskewed.sensor[scans]]
+    T = inputs.T_map_sensor[first : last + 1]
     axis = np.einsum("nji,nj->ni", T[:, :3, :3], target - T[:, :3, 3])
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
     directions = beam_directions(deskewed.points[beams])

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay, QhullError
 
-from stillmap.mesh.objects.frame import ObjectFrame
+from stillmap.mesh.tracked_boxes import ObjectFrame
 from stillmap.mesh.triangle_mesh import Mesh
 from stillmap.mesh.types import Bool, Float, Index, Int32
 

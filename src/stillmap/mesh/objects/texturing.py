@@ -7,17 +7,24 @@ import numpy as np
 from scipy import ndimage
 
 from stillmap.core.camera import is_in_image, project
-from stillmap.mesh.background import Background, sample_buffer
 from stillmap.mesh.objects.reconstruction import IMAGE_WINDOW, ObjectShape
-from stillmap.mesh.place import CANDIDATES, ViewAssignment, resolve_assignment
+from stillmap.mesh.place import (
+    CANDIDATES,
+    Background,
+    ViewAssignment,
+    resolve_assignment,
+    sample_buffer,
+)
 from stillmap.mesh.simplification import subdivide
-from stillmap.mesh.texture.occluders import TrackedBox, boxes_at, occlusion_probability
 from stillmap.mesh.texture.view_selection import NONE, Candidates, view_utility
 from stillmap.mesh.texture.views import View
 from stillmap.mesh.texture.visibility import DEPTH_SCALE, find_visible_faces, render_depth
+from stillmap.mesh.tracked_boxes import TrackedBox, boxes_at, occlusion_probability
 from stillmap.mesh.triangle_mesh import Mesh
 from stillmap.mesh.types import Bool, Float, Index
 
+_OUTLINE_CELL = 0.01  # m
+_MAX_OUTLINE_CELLS = 1 << 10  # along an edge, beyond which cells are larger
 OUTLINE_DRIFT = 0.05  # of an object's motion since its observation: error of its outline
 _OUTLINE_INSET = 0.01  # m inside an object's outline, where an image may show the background
 _UNCERTAIN_INSET = 0.05  # m more where the background is unknown
@@ -53,7 +60,6 @@ def times_in_view(box: TrackedBox, views: Sequence[View], start_ns: int) -> Floa
 
 def assign_object_views(
     shape: ObjectShape,
-    views: Sequence[View],
     background: Background,
     boxes: Sequence[TrackedBox],
     start_ns: int,
@@ -67,8 +73,7 @@ def assign_object_views(
 
     Args:
         shape: the object.
-        views: images and their poses in the map frame.
-        background: the static surface in the same views.
+        background: the static surface in all views.
         boxes: of all objects, this one too.
         start_ns: stamp at which the seconds of the boxes begin.
     """
@@ -76,8 +81,8 @@ def assign_object_views(
     candidates = Candidates.empty(len(mesh), CANDIDATES)
     sharpest, own = Candidates.empty(len(mesh), 1), list[View]()
     others = [one for one in boxes if one.box.object_id != shape.id]
-    seconds = times_in_view(shape.frame.box, views, start_ns)
-    for number, (view, now) in enumerate(zip(views, seconds.tolist(), strict=True)):
+    seconds = times_in_view(shape.frame.box, background.views, start_ns)
+    for number, (view, now) in enumerate(zip(background.views, seconds.tolist(), strict=True)):
         away = max(shape.span[0] - now, now - shape.span[1], 0.0)
         if np.isnan(now) or (not shape.rigid and away > IMAGE_WINDOW):
             continue
@@ -137,3 +142,25 @@ def _depth_inside_outline(mesh: Mesh, faces: Index, view: View) -> Float:
     at = np.concatenate([points[mesh.faces[faces]], points[mesh.faces[faces]].mean(1)[:, None]], 1)
     metres = sample_buffer(far, buffer, at) * at[..., 2] / buffer.K[0, 0]
     return np.asarray(metres.min(axis=1))
+
+
+def outline_depth(points: Float, radius: float) -> Float:
+    """(n,) metres from points (n, 2) to the outline of the area that they cover; 0: on it.
+
+    The area is the union of discs around the points, holes filled, eroded by the same radius.
+
+    Args:
+        points: metres, in a plane.
+        radius: metres of the discs.
+    """
+    if not len(points):
+        return np.zeros(0)
+    cell = max(_OUTLINE_CELL, float(np.ptp(points, axis=0).max()) / _MAX_OUTLINE_CELLS)
+    at = np.floor(points / cell).astype(np.int64)
+    border = int(np.ceil(radius / cell)) + 2
+    at -= at.min(axis=0) - border
+    empty = np.ones(at.max(axis=0) + border + 1, np.bool_)
+    empty[at[:, 0], at[:, 1]] = False
+    covered = ndimage.distance_transform_edt(empty) * cell <= radius
+    away = ndimage.distance_transform_edt(ndimage.binary_fill_holes(covered)) * cell
+    return np.asarray(np.maximum(away[at[:, 0], at[:, 1]] - cell - radius, 0.0))

@@ -12,7 +12,7 @@ from stillmap.core import se2, se3
 from stillmap.core.camera import Camera, Images, calibration_error
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.mesh.types import Bool, Float, Image, Index, Int64, Tell
+from stillmap.mesh.types import Bool, Float, Image, Index, Int64, Tell, no_tell
 from stillmap.rig.trajectory import MAX_SCAN_GAP
 from stillmap.slam.deskew import MAX_SPEED, MAX_TURN_RATE
 
@@ -51,6 +51,10 @@ class View:
     def to_camera(self, points: Float) -> Float:
         """(n, 3) metres in the camera's frame, of points (n, 3) in the map frame."""
         return np.asarray(points @ self.T_camera_map[:3, :3].T + self.T_camera_map[:3, 3])
+
+    def to_map(self, points: Float) -> Float:
+        """(n, 3) metres in the map frame, of points (n, 3) in the camera's frame."""
+        return np.asarray((points - self.T_camera_map[:3, 3]) @ self.T_camera_map[:3, :3])
 
 
 def find_views(recording: Recording, poses: Float) -> tuple[list[View], dict[str, int]]:
@@ -96,25 +100,23 @@ def usable_images(recording: Recording) -> tuple[Bool, dict[str, int]]:
 
 
 def filter_readable(
-    images: Images | None, views: Sequence[View], tell: Tell | None = None
+    images: Images, views: Sequence[View], tell: Tell = no_tell
 ) -> tuple[list[View], list[str]]:
     """The views whose images can be read, and one line of explanation for each of the others.
 
     Args:
-        images: of the recording; None: there are none, and no views.
+        images: of the recording.
         views: to be read.
         tell: called with the number read and the total.
     """
     kept, unread = list[View](), list[str]()
     for number, view in enumerate(views):
-        assert images is not None
         try:
             as_color_image(images.read(view.image), view)
             kept.append(view)
         except InputError as error:
             unread.append(str(error))
-        if tell is not None:
-            tell(number + 1, len(views))
+        tell(number + 1, len(views))
     return kept, unread
 
 
