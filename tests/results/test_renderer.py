@@ -10,12 +10,11 @@ import pytest
 from stillmap.results.report.renderer import (
     BACKGROUND,
     camera_matrix,
-    covered_share,
     fit_camera,
     look_at,
     main_corners,
     render,
-    textured_share,
+    visible_share,
 )
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
@@ -85,9 +84,9 @@ def test_untextured_faces_are_grey_before_the_background():
     middle = seen[32, 48]
     assert len(set(middle.tolist())) == 1
     assert (seen[0, 0] == BACKGROUND).all()
-    assert textured_share(textured, ahead(), K, SIZE) == 0.0
+    assert visible_share(textured, ahead(), K, SIZE, textured_only=True) == 0.0
     painted = replace(textured, page=textured.page + 1, pages=(wall_page((1, 2, 3)),))
-    assert textured_share(painted, ahead(), exactly(2.0), SIZE) == 1.0
+    assert visible_share(painted, ahead(), exactly(2.0), SIZE, textured_only=True) == 1.0
 
 
 def test_without_back_faces_a_room_has_no_ceiling():
@@ -113,12 +112,12 @@ def test_result_does_not_depend_on_threads():
     assert np.array_equal(one, two)
 
 
-def test_covered_share():
+def test_visible_share():
     facing_it, K = together([facing(-1)], []), exactly(1.0)
     far = exactly(1.0, 1.5)  # looks as far as the quad's half
 
     def share(textured, K, **how):
-        return covered_share(textured, ahead(), K, SIZE, **how)
+        return visible_share(textured, ahead(), K, SIZE, **how)
 
     assert share(facing_it, K) == pytest.approx(0.25, abs=0.01)
     assert share(facing_it, far) == pytest.approx(1.0)

@@ -15,6 +15,7 @@ from stillmap.results.report.figures import (
     UNKNOWN,
     VEIL_ALPHA,
     VIOLET,
+    MapView,
     draw_map,
     draw_points,
     draw_snapshot,
@@ -145,7 +146,7 @@ def test_window_contains_every_occupied_cell_of_both_maps(result):
 
 def test_points_are_drawn_at_their_positions():
     points = np.array([[0.5, 0.5], [2.5, 1.5], [9.0, 9.0], [-0.1, 0.5]], np.float32)
-    dots = np.asarray(draw_points(points, (0, 0, 3, 2), (3, 2)))
+    dots = np.asarray(draw_points(points, MapView((0, 0, 3, 2), (3, 2), False)))
     np.testing.assert_array_equal(dots, [[0, 0, 1], [1, 0, 0]])
 
 

@@ -179,7 +179,7 @@ def _convert_to_cloud(
 ) -> str:
     from stillmap.core.files import require_new_file
     from stillmap.results.export import point_cloud, point_cloud_files
-    from stillmap.results.rig import FOLDER as TILTING
+    from stillmap.results.run_json import TILTING
 
     require_new_file(output, args.overwrite)
     point_cloud_files.require_extras(form, output)

@@ -1,7 +1,6 @@
 """`objects/`: tracked objects as JSON and point clouds; `traffic.npz`: crossings and speeds."""
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,27 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.arrays import write_npz
-from stillmap.core.recording import Recording
 from stillmap.pipeline.result import MappingResult
 from stillmap.results.points import ply_header
+from stillmap.rig.build import TiltingResult
 from stillmap.tracking import FlowMap, MovingObject
 
 _MILLIMETRES = 3  # digits: finer is noise, and makes the file twice as long
 
 
-def write_objects(folder: Path, result: MappingResult) -> None:
+def write_objects(folder: Path, result: MappingResult | TiltingResult) -> None:
     """Write `objects.json` and `NNNN.ply` of each object into a new folder."""
-    write_objects_of(folder, result.objects, result.deskewed, result.poses, result.p_static)
-
-
-def write_objects_of(
-    folder: Path,
-    objects: Sequence[MovingObject],
-    recording: Recording,
-    poses: NDArray[np.float64],
-    p_static: NDArray[np.float32],
-) -> None:
-    """The same of objects whose beams are of this recording, with poses and labels (M,)."""
+    objects, recording, p_static = result.objects, result.deskewed, result.p_static
     folder.mkdir()
     with (folder / "objects.json").open("w", encoding="utf-8", newline="\n") as file:
         file.write("[")
@@ -38,7 +27,7 @@ def write_objects_of(
             file.write(json.dumps(object_record(one), allow_nan=False))
         file.write("\n]\n" if objects else "]\n")
     for one in objects:
-        ends = recording.end_points(one.beams, poses)
+        ends = recording.end_points(one.beams, result.poses)
         stamps = recording.stamp_ns[recording.scans_of(one.beams)]
         seconds = 1e-9 * (stamps - one.stamp_ns[0])
         write_ply(folder / f"{one.id:04d}.ply", ends, seconds, 1.0 - p_static[one.beams])

@@ -13,6 +13,7 @@ from stillmap.mapping.beam_statistics import count_beams
 from stillmap.pipeline.estimate import IterationRecord
 from stillmap.pipeline.result import MappingResult
 from stillmap.results.map_npz import known_area
+from stillmap.rig.build import TiltingResult
 from stillmap.slam import LoopClosure
 
 FORMAT_VERSION = 1
@@ -67,6 +68,7 @@ def run_record(result: MappingResult, more: Mapping[str, Any] | None = None) -> 
 
 
 RECORD = "run.json"  # every result has it
+TILTING = "tilting"  # its entry, and the folder, of 3D data of a rig's tilting laser
 
 
 def write_run_json(
@@ -75,6 +77,24 @@ def write_run_json(
     """Write `run_record` to `path`."""
     text = json.dumps(run_record(result, more), indent=2, ensure_ascii=False, allow_nan=False)
     path.write_text(text + "\n", encoding="utf-8")
+
+
+def tilting_record(tilting: TiltingResult) -> dict[str, Any]:
+    """The `tilting` entry of `run.json`."""
+    counts = count_beams(tilting.deskewed, tilting.p_static)
+    return {
+        "input": tilting.recording.source,
+        "counts": {
+            "scans": tilting.recording.n_scans,
+            **{name: counts[name] for name in ("beams", "hits", "max_range", "unusable")},
+            "left_out": tilting.unposed_beams,
+            "skipped": count_skipped(tilting.recording.source),
+        },
+        "dynamic": counts["dynamic"],
+        "boxes": tilting.boxes_hit,
+        "objects": len(tilting.objects),
+        "learned": tilting.learned,
+    }
 
 
 def _loop(one: LoopClosure) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stillmap.core.files import atomic_folder
 from stillmap.core.parallel import resolve_threads
@@ -18,9 +19,7 @@ from stillmap.results.points import write_clouds
 from stillmap.results.pose_graph_g2o import write_g2o
 from stillmap.results.report.page import write_report
 from stillmap.results.report.previews import ModelPreviews, render_previews
-from stillmap.results.rig import FOLDER as TILTING
-from stillmap.results.rig import tilting_record, write_tilting
-from stillmap.results.run_json import RECORD, write_run_json
+from stillmap.results.run_json import RECORD, TILTING, tilting_record, write_run_json
 from stillmap.rig.build import TiltingResult
 
 
@@ -64,7 +63,7 @@ def save(
         write_report(folder / "report.html", result, tilting, previews)
         more = {}
         if tilting is not None:
-            write_tilting(folder, tilting, colors)
+            _write_tilting(folder, tilting, colors)
             more[TILTING] = tilting_record(tilting)
         if models is not None:
             images = (result if tilting is None else tilting).recording.images
@@ -72,6 +71,16 @@ def save(
             write_models(folder, models, count, result.options.mesh.texture_quality)
             more["models"] = models_record(models)
         write_run_json(folder / RECORD, result, more)
+
+
+def _write_tilting(folder: Path, tilting: TiltingResult, colors: NDArray[np.uint8] | None) -> None:
+    """Write `static.ply`, `dynamic.ply` and `tilting/`: labels, poses and objects in 3D."""
+    write_clouds(folder, tilting.deskewed, tilting.poses, tilting.p_static, colors)
+    inside = folder / TILTING
+    inside.mkdir()
+    write_labels(inside / "beams", tilting.recording, tilting.p_static, colors)
+    write_tum(inside / "trajectory.tum", tilting.recording.stamp_ns, tilting.poses)
+    write_objects(inside / "objects", tilting)
 
 
 def _previews(models: Models, threads: int) -> ModelPreviews:

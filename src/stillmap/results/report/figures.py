@@ -3,7 +3,7 @@
 import base64
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -16,6 +16,7 @@ from stillmap.pipeline.snapshots import Snapshot, Window, cut, cut_layer, extent
 from stillmap.results.map_server import OCCUPIED_THRESH
 from stillmap.results.report.curves import round_down
 
+Color = tuple[int, int, int]
 ORANGE, UNKNOWN, VIOLET = (240, 120, 0), (190, 196, 204), (140, 60, 220)  # RGB
 VEIL_ALPHA = 80  # of 255, of thinly observed cells: walls and free space show through
 _MAX_PIXELS = 1_500_000  # of a map: fills a large screen, a few hundred kB as PNG
@@ -57,9 +58,13 @@ class MapView:
         """Width in m."""
         return self.window[2] - self.window[0]
 
-    def to_pixels(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """See `map_to_pixels`."""
-        return map_to_pixels(points, self.window, self.size)
+    def to_pixels(self, points: NDArray[np.float32] | NDArray[np.float64]) -> NDArray[np.float64]:
+        """Column and row (K, 2) in pixels from the top left of map points (K, 2) in m."""
+        x0, y0, x1, y1 = self.window
+        width, height = self.size
+        column = (points[:, 0] - x0) * (width / (x1 - x0))
+        row = (y1 - points[:, 1]) * (height / (y1 - y0))
+        return np.stack([column, row], axis=1).astype(np.float64)
 
     def svg_points(self, points: NDArray[np.float64]) -> str:
         """The `points` attribute of a polyline through map points (K, 2)."""
@@ -97,22 +102,15 @@ def draw_thinly_observed(
     cells, _ = cut_layer(occupancy, thin, window, False)
     count = _sums(cells, factor)
     shown = (count > 0) & (2 * count >= _sums(known, factor))
-    image = Image.fromarray(np.ascontiguousarray(shown[::-1].astype(np.uint8)))
-    image.putpalette([*UNKNOWN, *VIOLET])
-    image.info["transparency"] = bytes([0, VEIL_ALPHA])
-    return image
+    return color_by_index(shown[::-1].astype(np.uint8), (UNKNOWN, VIOLET), bytes([0, VEIL_ALPHA]))
 
 
-def draw_points(points: NDArray[np.float32], window: Window, size: tuple[int, int]) -> Image.Image:
-    """Orange dots on a transparent layer of `size` (width, height) pixels over a `draw_map`."""
-    width, height = size
+def draw_points(points: NDArray[np.float32], view: MapView) -> Image.Image:
+    """Orange dots on a transparent layer over the `draw_map` of a view."""
+    width, height = view.size
     pixels = np.zeros((height, width), np.uint8)
-    column, row = map_to_pixels(points, window, size).T
-    _put_dots(pixels, column, row, 1, max(1, round(width / _DOT_WIDTH)))
-    image = Image.fromarray(pixels)
-    image.putpalette([*UNKNOWN, *ORANGE])
-    image.info["transparency"] = 0
-    return image
+    _put_dots(pixels, view.to_pixels(points), 1, max(1, round(width / _DOT_WIDTH)))
+    return color_by_index(pixels, (UNKNOWN, ORANGE), 0)
 
 
 def draw_snapshot(snapshot: Snapshot) -> Image.Image:
@@ -121,27 +119,28 @@ def draw_snapshot(snapshot: Snapshot) -> Image.Image:
     levels = _levels(snapshot.p_occupied, max(1, math.ceil(longest / _SNAPSHOT_PIXELS)))[::-1]
     larger = max(1, _SNAPSHOT_PIXELS // max(levels.shape))
     pixels = levels.repeat(larger, axis=0).repeat(larger, axis=1)
-    column, row = map_to_pixels(snapshot.dynamic_points, extent(snapshot), pixels.shape[::-1]).T
-    _put_dots(pixels, column, row, _ORANGE_INDEX, 3)
+    height, width = pixels.shape
+    view = MapView(extent(snapshot), (width, height), False)
+    _put_dots(pixels, view.to_pixels(snapshot.dynamic_points), _ORANGE_INDEX, 3)
     return _with_palette(pixels)
 
 
-def map_to_pixels(
-    points: NDArray[np.float32] | NDArray[np.float64], window: Window, size: tuple[int, ...]
-) -> NDArray[np.float64]:
-    """Column and row (K, 2) in pixels from the top left of map points (K, 2) in m."""
-    x0, y0, x1, y1 = window
-    width, height = size
-    column = (points[:, 0] - x0) * (width / (x1 - x0))
-    row = (y1 - points[:, 1]) * (height / (y1 - y0))
-    return np.stack([column, row], axis=1).astype(np.float64)
-
-
-def png_uri(image: Image.Image) -> str:
-    """The image as a `data:` URI."""
+def data_uri(image: Image.Image, format: str = "png", **options: int) -> str:
+    """The image as a `data:` URI; the options are those of Pillow for the format."""
     buffer = io.BytesIO()
-    image.save(buffer, "PNG")
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+    image.save(buffer, format, **options)
+    return f"data:image/{format};base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
+
+
+def color_by_index(
+    pixels: NDArray[np.uint8], colors: Iterable[Color], alpha: bytes | int | None = None
+) -> Image.Image:
+    """A palette image; `alpha` is the transparent index, or the opacity of each color."""
+    image = Image.fromarray(np.ascontiguousarray(pixels))
+    image.putpalette([value for color in colors for value in color])
+    if alpha is not None:
+        image.info["transparency"] = alpha
+    return image
 
 
 def _occupied(occupancy: GridMap) -> NDArray[np.bool_]:
@@ -210,21 +209,15 @@ def _levels(cells: NDArray[np.float32], factor: int) -> NDArray[np.uint8]:
 def _with_palette(levels: NDArray[np.uint8]) -> Image.Image:
     # gamma 0.6 makes the few percent visible that a walker leaves in the raw map
     shades = [round(255 * (1 - (percent / 100) ** 0.6)) for percent in range(101)]
-    greys = [grey for shade in shades for grey in (shade, shade, shade)]
-    image = Image.fromarray(np.ascontiguousarray(levels))
-    image.putpalette([*greys, *UNKNOWN, *ORANGE])
-    return image
+    return color_by_index(levels, (*((shade,) * 3 for shade in shades), UNKNOWN, ORANGE))
 
 
 def _put_dots(
-    pixels: NDArray[np.uint8],
-    column: NDArray[np.float64],
-    row: NDArray[np.float64],
-    value: int,
-    size: int,
+    pixels: NDArray[np.uint8], centers: NDArray[np.float64], value: int, size: int
 ) -> None:
+    """Squares of `size` pixels around (K, 2) columns and rows."""
     height, width = pixels.shape
-    i, j = np.floor(row).astype(np.int64), np.floor(column).astype(np.int64)
+    j, i = np.floor(centers).astype(np.int64).T
     for di in range(size):
         for dj in range(size):
             y, x = i + di - size // 2, j + dj - size // 2

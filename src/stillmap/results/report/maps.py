@@ -16,11 +16,12 @@ from stillmap.pipeline.snapshots import Snapshot, extent
 from stillmap.results.map_npz import CHANGED, changed_cells, known_area
 from stillmap.results.report.figures import (
     MapView,
+    color_by_index,
+    data_uri,
     draw_map,
     draw_points,
     draw_snapshot,
     draw_thinly_observed,
-    png_uri,
 )
 
 _MAX_PATH_POINTS = 3000
@@ -44,10 +45,10 @@ def map_data(result: MappingResult) -> dict[str, Any] | None:
         "view": view,
         "meters": (x1 - x0, y1 - y0),
         "cell": result.map.resolution,
-        "raw": png_uri(draw_map(result.raw_map, view.window)),
-        "filtered": png_uri(draw_map(result.map, view.window)),
-        "dynamic": png_uri(draw_points(ends, view.window, view.size)),
-        "thinly_observed": png_uri(
+        "raw": data_uri(draw_map(result.raw_map, view.window)),
+        "filtered": data_uri(draw_map(result.map, view.window)),
+        "dynamic": data_uri(draw_points(ends, view)),
+        "thinly_observed": data_uri(
             draw_thinly_observed(result.map, result.evidence.thinly_observed, view.window)
         ),
         "path": view.svg_points(poses[::every, :2, -1]),
@@ -69,8 +70,8 @@ def changes_data(result: MappingResult) -> dict[str, Any] | None:
     counts = Counter[str](one.kind for one in result.changes)
     return {
         "view": view,
-        "map": png_uri(draw_map(result.map, view.window)),
-        "marks": png_uri(draw_changes(result, view)),
+        "map": data_uri(draw_map(result.map, view.window)),
+        "marks": data_uri(draw_changes(result, view)),
         "numbers": view.to_pixels(corners).tolist(),
         "colors": _COLORS,
         "counts": [(kind, counts[kind]) for kind in CHANGED if counts[kind]],
@@ -110,10 +111,7 @@ def draw_changes(result: MappingResult, view: MapView) -> Image.Image:
             y = np.floor(top + (m + 0.5) / steps * (bottom - top)).astype(np.int64)
             inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
             pixels[y[inside], x[inside]] = changed[row[inside], column[inside]]
-    image = Image.fromarray(pixels)
-    image.putpalette([255, 255, 255, *(v for kind in CHANGED for v in _COLORS[kind])])
-    image.info["transparency"] = 0
-    return image
+    return color_by_index(pixels, ((255, 255, 255), *(_COLORS[kind] for kind in CHANGED)), 0)
 
 
 def evolution_data(result: MappingResult) -> dict[str, Any] | None:
@@ -128,7 +126,7 @@ def evolution_data(result: MappingResult) -> dict[str, Any] | None:
                 "number": one.number,
                 "dynamic": len(one.dynamic_points),
                 "view": MapView(extent(one), (image := draw_snapshot(one)).size, False),
-                "image": png_uri(image),
+                "image": data_uri(image),
             }
             for one in snapshots
         ],

@@ -8,8 +8,8 @@ from PIL import Image
 from stillmap.mapping.beam_statistics import sample_dynamic_points
 from stillmap.pipeline.result import MappingResult
 from stillmap.pipeline.snapshots import Window
-from stillmap.results.report.figures import MapView, draw_map, draw_points, png_uri
-from stillmap.results.rig import tilting_record
+from stillmap.results.report.figures import MapView, data_uri, draw_map, draw_points
+from stillmap.results.run_json import tilting_record
 from stillmap.rig.build import TiltingResult
 from stillmap.tracking import FlowMap, MovingObject
 
@@ -37,9 +37,9 @@ def objects_data(result: MappingResult) -> dict[str, Any] | None:
         "median_seconds": float(np.median([seconds for seconds, _ in rows])),
         "median_speed": float(np.median(speeds)),
         "view": view,
-        "map": png_uri(picture),
+        "map": data_uri(picture),
         "tracks": [view.svg_points(one.xy) for one in objects[:_MAX_TRACKS]],
-        "traffic": png_uri(draw_traffic(traffic, picture, view.window)),
+        "traffic": data_uri(draw_traffic(traffic, picture, view.window)),
         "traffic_cell": traffic.resolution,
         "max_crossings": int(traffic.crossings.max()),
         "listed": [
@@ -89,7 +89,7 @@ def rig_data(result: MappingResult, tilting: TiltingResult | None) -> dict[str, 
         ends = sample_dynamic_points(tilting.deskewed, tilting.poses, tilting.p_static)[:, :2]
         data |= {
             "view": view,
-            "map": png_uri(draw_map(result.map, view.window)),
-            "dynamic": png_uri(draw_points(ends, view.window, view.size)),
+            "map": data_uri(draw_map(result.map, view.window)),
+            "dynamic": data_uri(draw_points(ends, view)),
         }
     return data

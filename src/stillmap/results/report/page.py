@@ -4,11 +4,11 @@ import functools
 import itertools
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stillmap.core.config import to_dict
+from stillmap.core.config import iter_options
 from stillmap.core.json import count_skipped, to_jsonable
 from stillmap.core.version import package_version
 from stillmap.mapping.beam_statistics import count_beams
@@ -54,7 +54,7 @@ def render_report(
         "evolution": evolution_data(result),
         "source": _source_data(result),
         "stages": result.stages,
-        "options": list(_flatten(to_jsonable(to_dict(result.options)), "")),
+        "options": [(one.name, one.value) for one in iter_options(result.options)],
         "version": package_version(),
     }
     return environment().get_template("report.html.j2").render(data)
@@ -172,12 +172,3 @@ def _source_data(result: MappingResult) -> dict[str, Any]:
             for name, reasons in skipped.items()
         },
     }
-
-
-def _flatten(values: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
-    """Options by their dotted names."""
-    for name, value in values.items():
-        if isinstance(value, Mapping):
-            yield from _flatten(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value

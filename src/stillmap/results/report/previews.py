@@ -1,8 +1,6 @@
 """Rendered previews of the models: the place with and without moving objects (Fig. 11), and the
 objects (Fig. 13)."""
 
-import base64
-import io
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,15 +11,15 @@ from PIL import Image
 
 from stillmap.mesh.texture.atlas import TexturedMesh
 from stillmap.mesh.triangle_mesh import Mesh
+from stillmap.results.report.figures import data_uri
 from stillmap.results.report.renderer import (
     Float,
     Picture,
     camera_matrix,
-    covered_share,
     fit_camera,
     main_corners,
     render,
-    textured_share,
+    visible_share,
 )
 
 PLACE_SIZE, OBJECT_SIZE = (640, 400), (300, 225)  # pixels
@@ -31,10 +29,8 @@ _REDUCTION = 8  # of the image size while trying
 _MIN_DIFFERENCE = 60  # sum over RGB from which a pixel differs between the two textures
 _TEXTURED_WEIGHT = 0.1  # of textured pixels against differing ones
 _MIN_SEPARATION = 0.2  # of the two views, as a share of the camera poses
-_WIDE, _NARROW = (
-    math.radians(80.0),
-    math.radians(45.0),
-)  # field of view: place, overview and objects
+# field of view: place; overview and objects
+_WIDE, _NARROW = math.radians(80.0), math.radians(45.0)
 _OVERVIEW = np.array([-0.5, -0.75, 0.7])  # from the place to the camera
 _OUTLIERS = 0.02  # share of the visible area beyond each side of the overview
 # yaw of the camera around an object that looks along x
@@ -172,7 +168,9 @@ def _choose_views(
     score = dict[int, float]()
     for n in candidates:
         T = T_camera_map[n]
-        score[n] = _TEXTURED_WEIGHT * textured_share(filtered, T, K, size, threads)
+        score[n] = _TEXTURED_WEIGHT * visible_share(
+            filtered, T, K, size, textured_only=True, threads=threads
+        )
         if sharpest is not None:
             a, b = (render(one, T, K, size, threads=threads) for one in (filtered, sharpest))
             difference = np.abs(a.astype(np.int64) - b).sum(axis=2)
@@ -195,7 +193,7 @@ def render_object(number: int, textured: TexturedMesh, threads: int = 1) -> Obje
         direction = np.array([math.cos(yaw), math.sin(yaw), math.tan(_ELEVATION)])
         poses[side] = T = fit_camera(used, direction, K, OBJECT_SIZE)
         front[side], both = (
-            covered_share(textured, T, K, OBJECT_SIZE, back_faces=back_faces, threads=threads)
+            visible_share(textured, T, K, OBJECT_SIZE, back_faces=back_faces, threads=threads)
             for back_faces in (False, True)
         )
         if front[side] >= _MIN_FRONT_FACES * both:
@@ -245,7 +243,5 @@ def models_data(previews: ModelPreviews | None) -> dict[str, Any] | None:
 
 def _figure(title: str, caption: str, picture: Picture) -> tuple[str, str, str, tuple[int, ...]]:
     """Title, caption, JPEG as a `data:` URI, width and height."""
-    buffer = io.BytesIO()
-    Image.fromarray(picture).save(buffer, "JPEG", quality=_JPEG_QUALITY)
-    uri = "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+    uri = data_uri(Image.fromarray(picture), "jpeg", quality=_JPEG_QUALITY)
     return title, caption, uri, picture.shape[1::-1]

@@ -74,26 +74,23 @@ def render(
     return np.rint(small).astype(np.uint8)
 
 
-def textured_share(
-    textured: TexturedMesh, T_camera_map: Float, K: Float, size: tuple[int, int], threads: int = 1
-) -> float:
-    """Share of the pixels of the rendered image that show a texture; see `render`."""
-    face = _rasterize(textured, np.arange(len(textured)), T_camera_map, K, size, threads)
-    return float((textured.page[face[face >= 0]] >= 0).sum() / face.size)
-
-
-def covered_share(
+def visible_share(
     textured: TexturedMesh,
     T_camera_map: Float,
     K: Float,
     size: tuple[int, int],
     *,
     back_faces: bool = True,
+    textured_only: bool = False,
     threads: int = 1,
 ) -> float:
-    """Share of the pixels of the rendered image that show the model; see `render`."""
+    """Share of the pixels of the image that show the model, or its texture; see `render`."""
     drawn = _select_faces(textured, T_camera_map, back_faces)
-    return float((_rasterize(textured, drawn, T_camera_map, K, size, threads) >= 0).mean())
+    face = _rasterize(textured, drawn, T_camera_map, K, size, threads)
+    shown = face >= 0
+    if textured_only:
+        shown[shown] = textured.page[drawn[face[shown]]] >= 0
+    return float(shown.mean())
 
 
 def _select_faces(
