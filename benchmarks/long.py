@@ -29,7 +29,7 @@ from stillmap.core import se2
 from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.recording import Recording
 from stillmap.io import stillmap_folder
-from stillmap.sim import SCENES, laser, odometry, scene_by_name, sweep
+from stillmap.sim import SCENES, episode, laser, scene_by_name, simulator
 from stillmap.sim.dynamics import Motion, simulate_motion
 from stillmap.sim.scene import Scene
 
@@ -65,7 +65,7 @@ def simulated(world: str, scans: int, seed: int, work: Path) -> Recording:
     scene = scene_by_name(world, {"laser": LASER, "robot": {"scan_rate": RATE, "scans": scans}})
     *rngs, laser_rng, odometry_rng = np.random.default_rng(seed).spawn(6)
     motion = simulate_motion(scene, (rngs[0], rngs[1], rngs[2], rngs[3]), lambda _: None)
-    T_odom_base = odometry.simulate_odometry(
+    T_odom_base = episode.simulate_odometry(
         se2.matrix(*motion.robot.T), scene.odometry, odometry_rng
     )
     points, hit = ArrayBuilder(np.float32, (2,), work), ArrayBuilder(np.bool_, (), work)
@@ -109,10 +109,9 @@ def looked(
     """End points (m, 2) in the sensor's frame, and whether something reflected each beam (m,)."""
     o, T = scene.laser, len(motion.robot)
     walls = np.array([*scene.walls, *scene.glass, *motion.still], float)
-    exact = sweep.cast_sweeps(motion, walls, np.tile(se2.matrix(o.x, o.y, o.yaw), (T, 1, 1)), o)
-    is_glass = np.zeros(len(walls), bool)
-    is_glass[len(scene.walls) : len(scene.walls) + len(scene.glass)] = True
-    ranges, hit = laser.simulate_measurement(exact, is_glass, o, rng)
+    exact = simulator.cast_sweeps(motion, walls, np.tile(se2.matrix(o.x, o.y, o.yaw), (T, 1, 1)), o)
+    is_glass = laser.find_glass(exact.wall, scene)
+    ranges, hit = laser.simulate_measurement(exact.range, is_glass, o, rng)
     angles = laser.compute_beam_angles(o.beams, o.fov)
     points = ranges[..., None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     return points.reshape(-1, 2).astype(np.float32), hit.ravel()

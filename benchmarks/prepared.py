@@ -60,9 +60,8 @@ def without_people(
         np.empty((T, 0, 2)), np.empty((T, 0)), np.empty((0, 2)), np.empty(0, np.int32)
     )
     exact = laser.cast_beams(poses, angles, truth.walls, nobody, doors_and_things(sim))
-    is_glass = np.zeros(len(truth.walls), bool)
-    is_glass[len(scene.walls) : len(scene.walls) + len(scene.glass)] = True
-    ranges, hit = laser.simulate_measurement(exact, is_glass, o, rng)
+    is_glass = laser.find_glass(exact.wall, scene)
+    ranges, hit = laser.simulate_measurement(exact.range, is_glass, o, rng)
     points = ranges[..., None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     static = hit & (exact.mover < 0)
     return points.reshape(-1, 2).astype(np.float32), hit.ravel(), static.ravel()

@@ -10,7 +10,7 @@ from stillmap.core import se2
 from stillmap.core.config import override
 from stillmap.core.errors import InputError
 from stillmap.sim import OdometryOptions, Scene, Simulation, scene_by_name, simulate
-from stillmap.sim.odometry import add_faults, remove_jump
+from stillmap.sim.episode import add_faults, remove_jump
 from stillmap.sim.walls import box
 
 Float = NDArray[np.float64]

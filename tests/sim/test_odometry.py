@@ -7,7 +7,7 @@ import pytest
 
 from stillmap.core import se2
 from stillmap.sim import OdometryOptions, scene_by_name, simulate
-from stillmap.sim.odometry import simulate_odometry
+from stillmap.sim.episode import simulate_odometry
 
 PERFECT = OdometryOptions(0.0, 0.0, 0.4, 0.0, 0.0, 0.0)
 

@@ -20,7 +20,7 @@ from stillmap.sim import (
     simulate,
     write_simulation,
 )
-from stillmap.sim.objects import MovableObjects, place_faces
+from stillmap.sim.objects import faces_at_all_places, place_faces
 from stillmap.sim.planner import compute_segment_distance
 from stillmap.sim.walls import box
 
@@ -133,7 +133,7 @@ def test_everybody_keeps_clear_of_every_place() -> None:
     for things in ((later,), (short,)):
         run = simulate(override(Scene(**{**vars(scene), "things": things}), changes), 1)
         everybody = [run.truth.T_world_base[:, None, :2, 2], run.truth.movers[:, :8, :2]]
-        for face in MovableObjects(things).faces_at_all_places():
+        for face in faces_at_all_places(things):
             for xy in everybody:
                 assert compute_segment_distance(xy, face).min() > 0.2
 

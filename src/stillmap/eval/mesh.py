@@ -94,7 +94,7 @@ class TrueImages(NamedTuple):
         cameras: the cameras.
         camera: (N,) camera of each.
         T_world_camera: (N, 4, 4) true poses.
-        mask, distance: of an image, see `sim.truth_images`.
+        mask, distance: of an image, see `sim.ImageTruth`.
     """
 
     cameras: Sequence[Camera]

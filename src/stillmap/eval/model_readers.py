@@ -15,7 +15,7 @@ from stillmap.core.recording import Recording
 from stillmap.eval import mesh_distance, readers
 from stillmap.eval.mesh import SAMPLES, ColoredPoints, TextureRecord, TrueImages
 from stillmap.eval.object_models import Model, MoverHits, Track
-from stillmap.sim.truth_images import ImageTruth, load_image_truth
+from stillmap.sim.truth import ImageTruth, load_image_truth
 from stillmap.slam.deskew import deskew_recording
 from stillmap.slam.options import SlamOptions
 

@@ -13,8 +13,9 @@ from stillmap.sim.appearance import SurfacePoints
 from stillmap.sim.episode import Episode
 from stillmap.sim.geometry import Solids
 from stillmap.sim.options import CameraOptions
-from stillmap.sim.recorder import World
+from stillmap.sim.recorder import World, collect_surfaces
 from stillmap.sim.renderer import NOTHING, Lens, RenderedImage
+from stillmap.sim.truth import ImageTruth
 from stillmap.sim.truth_surfaces import to_local
 
 Float = NDArray[np.float64]
@@ -190,6 +191,16 @@ class CameraSimulator:
 
     def __len__(self) -> int:
         return len(self.images)
+
+    def truth(self) -> ImageTruth:
+        """The truth about the images and the surfaces that they show."""
+        return ImageTruth(
+            self.colour_seed,
+            *collect_surfaces(self._world),
+            self.T_world_camera,
+            lambda image: self.render(image).mask,
+            lambda image: self.render(image).distance,
+        )
 
     def render(self, image: int) -> TrueImage:
         """Render an image with its truth.

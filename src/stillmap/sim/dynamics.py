@@ -3,14 +3,19 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.errors import InputError
 from stillmap.sim.laser import Movers, Outlines
-from stillmap.sim.objects import DOOR_RANGE, Doors, MovableObjects, split_into_segments
+from stillmap.sim.objects import (
+    DOOR_RANGE,
+    Doors,
+    faces_at_all_places,
+    place_objects,
+    split_into_segments,
+)
 from stillmap.sim.people import BODY_RADIUS, Crowd, Figures
 from stillmap.sim.planner import FreeSpace, Planner
 from stillmap.sim.robot import Robot, plan_route
@@ -27,6 +32,7 @@ _PERSON_MARGIN = 0.1  # m
 _MAX_DELAY = 5.0  # times the nominal time of the route, after which the robot is stuck
 _MIN_MOTION = 1e-6  # m
 _CARRY_TIME = 20.0  # s without scans while the robot is carried
+MAX_SPEED = 40.0  # m/s; anything faster has restarted its lane
 _MAX_SIMULATED_PAUSE = 30.0  # s; the rest of a pause is not simulated
 
 
@@ -81,36 +87,23 @@ def simulate_motion(scene: Scene, rngs: Rngs, tell: Progress) -> Motion:
     steps = max(1, math.ceil(1.0 / (rate * _MAX_STEP) - 1e-9))
     dt = 1.0 / (rate * steps)
     expected = o.scans or world.robot.nominal_time() * rate
-    carried = None if o.carried_at is None else max(1, round(o.carried_at * expected))
-    paused = None if o.pause_at is None else max(1, round(o.pause_at * rate))
-    log = _Log()
-    while not _is_done(scene, world.robot, len(log.robot), expected):
-        if len(log.robot) == carried:
+    carried = math.inf if o.carried_at is None else max(1, round(o.carried_at * expected))
+    paused = math.inf if o.pause_at is None else max(1, round(o.pause_at * rate))
+    log: list[tuple[Float, ...]] = []
+    while not _is_done(scene, world.robot, len(log), expected):
+        if len(log) == carried:
             world.carry_robot(dt, rngs[3])
-        if len(log.robot) == paused:
+        if len(log) == paused:
             world.rest_robot(min(o.pause, _MAX_SIMULATED_PAUSE), dt)
-        log.note(world)
-        if len(log.robot) % 50 == 0:
-            tell(min(len(log.robot) / expected, 1.0))
+        log.append(world.snapshot())
+        if len(log) % 50 == 0:
+            tell(min(len(log) / expected, 1.0))
         for _ in range(steps):
             world.step(dt)
-    return log.motion(world, _clock(len(log.robot), 1.0 / rate, carried, paused, o.pause))
-
-
-class _Clock(NamedTuple):
-    """Times of T scans; fields as in `Motion`."""
-
-    period: float
-    seconds: Float
-    carried: int
-    paused: int
-
-
-def _clock(T: int, period: float, carried: int | None, paused: int | None, pause: float) -> _Clock:
-    scan = np.arange(T)
-    first = [T if one is None else min(one, T) for one in (carried, paused)]
-    seconds = scan * period + _CARRY_TIME * (scan >= first[0]) + pause * (scan >= first[1])
-    return _Clock(period, seconds, *first)
+    scan = np.arange(len(log))
+    seconds = scan * (1.0 / rate) + _CARRY_TIME * (scan >= carried) + o.pause * (scan >= paused)
+    gaps = [int(min(first, len(log))) for first in (carried, paused)]
+    return world.collect_motion(log, 1.0 / rate, seconds, *gaps)
 
 
 class _World:
@@ -120,14 +113,9 @@ class _World:
         start, o = np.array(scene.route[0], float), scene.robot
         # an open leaf is an obstacle, a closed one opens
         leaves = [door.leaf(door.opened) for door in scene.leaves]
-        self.things = MovableObjects(scene.things)
-        solid = [
-            *scene.walls,
-            *scene.glass,
-            *scene.kerbs,
-            *leaves,
-            *self.things.faces_at_all_places(),
-        ]
+        self._things = scene.things
+        things = faces_at_all_places(scene.things)
+        solid = [*scene.walls, *scene.glass, *scene.kerbs, *leaves, *things]
         space = FreeSpace(np.array(solid, float))
         planner = Planner(space, start, o.radius + _ROBOT_MARGIN)
         closed = o.scans is not None
@@ -171,12 +159,49 @@ class _World:
         if len(self.doors.share):
             standing = np.concatenate([crowd.xy, robot.pose[None, :2]])
             way = robot.route_ahead(DOOR_RANGE)[None]
-            ways = np.concatenate(
-                [split_into_segments(crowd.next_corners(DOOR_RANGE)), split_into_segments(way)]
-            )
-            self.doors.step(dt, standing, ways)
+            ways = [split_into_segments(one) for one in (crowd.next_corners(DOOR_RANGE), way)]
+            self.doors.step(dt, standing, np.concatenate(ways))
         if self.traffic.kinds:
             self.traffic.step(dt, robot.pose[:2], self._radius)
+
+    def snapshot(self) -> tuple[Float, ...]:
+        """Robot, other movers, parts of people and their headings, faces of doors and vehicles."""
+        crowd, doors, traffic = self.crowd, self.doors, self.traffic
+        people = np.column_stack([crowd.xy, crowd.heading])
+        movers = np.concatenate([people, doors.poses(), traffic.poses()])
+        faces = np.concatenate([doors.faces(), traffic.faces()])
+        return self.robot.pose, movers, *self.figures.parts(crowd), faces
+
+    def collect_motion(
+        self, log: list[tuple[Float, ...]], period: float, seconds: Float, carried: int, paused: int
+    ) -> Motion:
+        """The motion of T snapshots; the other arguments as in `Motion`."""
+        robot, poses, xy, heading, faces = map(np.stack, zip(*log, strict=True))
+        persons, doors = len(self.crowd.xy), len(self.doors.share)
+        kinds = ["person"] * persons + ["door"] * doors + self.traffic.kinds
+        placed = place_objects(self._things, seconds, first=len(kinds))
+        moved = np.any(np.ptp(poses, axis=0) > _MIN_MOTION, axis=1)
+        others = np.arange(persons, len(kinds), dtype=np.int32)
+        mover = np.concatenate([others[:doors], np.repeat(others[doors:], 4)])
+        moving = moved[mover]
+        sizes = np.full((len(kinds) + len(placed.moved), 2), np.nan)
+        sizes[persons : persons + doors] = np.column_stack([self.doors.width, np.zeros(doors)])
+        sizes[persons + doors : len(kinds)] = self.traffic.size
+        return Motion(
+            period,
+            seconds,
+            carried,
+            paused,
+            robot,
+            poses=np.concatenate([poses, placed.poses], axis=1),
+            kinds=kinds + ["thing"] * len(placed.moved),
+            people=Movers(xy, heading, self.figures.semi_axes, self.figures.mover),
+            outlines=Outlines(faces[:, moving], mover[moving]),
+            things=placed.outlines,
+            still=np.concatenate([faces[0, ~moving], placed.still]),
+            sizes=sizes,
+            moved=np.concatenate([moved, placed.moved]),
+        )
 
 
 def _is_done(scene: Scene, robot: Robot, scans: int, expected: float) -> bool:
@@ -191,51 +216,39 @@ def _is_done(scene: Scene, robot: Robot, scans: int, expected: float) -> bool:
     return robot.arrived
 
 
-class _Log:
-    def __init__(self) -> None:
-        self.robot: list[Float] = []
-        self._poses: list[Float] = []
-        self._xy: list[Float] = []
-        self._heading: list[Float] = []
-        self._faces: list[Float] = []
+class Moment:
+    """N times, `seconds` (N,) after the stamps of `scans` (N,), for interpolation of the motion.
 
-    def note(self, world: _World) -> None:
-        crowd, doors, traffic = world.crowd, world.doors, world.traffic
-        xy, heading = world.figures.parts(crowd)
-        people = np.column_stack([crowd.xy, crowd.heading])
-        self.robot.append(world.robot.pose)
-        self._poses.append(np.concatenate([people, doors.poses(), traffic.poses()]))
-        self._xy.append(xy)
-        self._heading.append(heading)
-        self._faces.append(np.concatenate([doors.faces(), traffic.faces()]))
+    Motion is linear between scans, and extrapolated after the last one.
+    """
 
-    def motion(self, world: _World, clock: _Clock) -> Motion:
-        figures, doors = world.figures, len(world.doors.share)
-        persons = len(world.crowd.xy)
-        kinds = ["person"] * persons + ["door"] * doors + world.traffic.kinds
-        placed = world.things.place(clock.seconds, first=len(kinds))
-        people = Movers(
-            np.stack(self._xy), np.stack(self._heading), figures.semi_axes, figures.mover
+    def __init__(self, motion: Motion, scans: NDArray[np.int64], seconds: Float) -> None:
+        self._motion = motion
+        later = seconds / motion.period
+        # no interpolation across the gaps where the robot is carried or pauses
+        breaks = np.unique([0, motion.carried, motion.paused, len(motion.robot)])
+        piece = np.searchsorted(breaks, scans, side="right")
+        self._last = breaks[piece] - 1
+        first, last = breaks[piece - 1], self._last - (later > 0)
+        self._scan, self._leap = scans, MAX_SPEED * motion.period
+        self._before = np.maximum(np.minimum(scans + later.astype(np.int64), last), first)
+        self._share = scans + later - self._before
+
+    def interpolate_movers(self) -> tuple[Movers, Outlines]:
+        """Cross sections and faces of the movers."""
+        people, outlines, things = self._motion.people, self._motion.outlines, self._motion.things
+        xy, heading = self.interpolate(people.xy), self.interpolate(people.heading)
+        # movable objects jump from place to place
+        faces = np.concatenate([self.interpolate(outlines.faces), things.faces[self._scan]], axis=1)
+        return (
+            Movers(xy, heading, people.semi_axes, people.mover),
+            Outlines(faces, np.concatenate([outlines.mover, things.mover])),
         )
-        poses, faces = np.stack(self._poses), np.stack(self._faces)
-        moved = np.any(np.ptp(poses, axis=0) > _MIN_MOTION, axis=1)
-        others = np.arange(persons, len(kinds), dtype=np.int32)
-        mover = np.concatenate([others[:doors], np.repeat(others[doors:], 4)])
-        moving = moved[mover]
-        outlines = Outlines(faces[:, moving], mover[moving])
-        poses = np.concatenate([poses, placed.poses], axis=1)
-        sizes = np.full((poses.shape[1], 2), np.nan)
-        sizes[persons : persons + doors] = np.column_stack([world.doors.width, np.zeros(doors)])
-        sizes[persons + doors : len(kinds)] = world.traffic.size
-        return Motion(
-            **clock._asdict(),
-            robot=np.stack(self.robot),
-            poses=poses,
-            kinds=kinds + ["thing"] * placed.poses.shape[1],
-            people=people,
-            outlines=outlines,
-            things=placed.outlines,
-            still=np.concatenate([faces[0, ~moving], placed.still]),
-            sizes=sizes,
-            moved=np.concatenate([moved, placed.moved]),
-        )
+
+    def interpolate(self, values: Float) -> Float:
+        """(N, ...) values interpolated from those of all scans (T, ...)."""
+        before = values[self._before]
+        change = values[np.minimum(self._before + 1, self._last)] - before
+        share = self._share.reshape(-1, *[1] * (values.ndim - 1))
+        leaps = np.abs(change) > self._leap
+        return np.where(leaps, values[self._scan], before + share * change)

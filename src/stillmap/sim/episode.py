@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
-from stillmap.sim import odometry
 from stillmap.sim.dynamics import Motion, Progress, simulate_motion
+from stillmap.sim.options import OdometryOptions
 from stillmap.sim.scene import Scene
 from stillmap.sim.truth import Truth
 
@@ -97,9 +97,9 @@ def simulate_episode(scene: Scene, rng: np.random.Generator, tell: Progress) -> 
     crowd_rng, sensor_rng, odometry_rng, door_rng, traffic_rng, *mishap_rngs = rng.spawn(7)
     motion = simulate_motion(scene, (crowd_rng, door_rng, traffic_rng, mishap_rngs[0]), tell)
     walls = np.array([*scene.walls, *scene.glass, *motion.still], float)
-    driven = odometry.remove_jump(se2.matrix(*motion.robot.T), motion.carried)
-    T_odom_base = odometry.simulate_odometry(driven, scene.odometry, odometry_rng)
-    T_odom_base = odometry.add_faults(T_odom_base, motion.seconds, scene.odometry, mishap_rngs[1])
+    driven = remove_jump(se2.matrix(*motion.robot.T), motion.carried)
+    T_odom_base = simulate_odometry(driven, scene.odometry, odometry_rng)
+    T_odom_base = add_faults(T_odom_base, motion.seconds, scene.odometry, mishap_rngs[1])
     body_rng = rng.spawn(1)[0]
     # spawned last, so that a camera changes nothing else
     seed_of_colours = int(rng.spawn(1)[0].integers(1 << 31)) if scene.camera.enabled else None
@@ -116,3 +116,104 @@ def describe_scene(scene: Scene, seed: Any) -> dict[str, Any]:
     for name in unused:
         del parameters[name]
     return {"name": parameters.pop("name"), "seed": seed, **parameters}
+
+
+def simulate_odometry(
+    T_world_base: Float, options: OdometryOptions, rng: np.random.Generator
+) -> Float:
+    """(T, 3, 3) T_odom_base for true poses (T, 3, 3); the first one is the identity.
+
+    Between two scans the left and right wheel roll d -+ b theta / 2. They are misread by their
+    own relative errors, turned back into d and theta with a wrong base b, and noise is added
+    whose variance grows with the distance and angle, independent of the scan rate (Thrun, Burgard,
+    Fox, Probabilistic Robotics, 5.4, with random-walk scaling). A slipping wheel rolls farther than
+    the robot moves, on short parts of the path.
+    """
+    x, y, turn = se2.parameters(se2.inverse(T_world_base[:-1]) @ T_world_base[1:]).T
+    # an arc as chord at half its angle
+    along = x * np.cos(turn / 2) + y * np.sin(turn / 2)
+    distance = along / np.maximum(np.sinc(turn / (2 * np.pi)), 1e-3)
+    left, right = 1.0 + options.wheel_radius_error * rng.standard_normal(2)
+    base = 1.0 + options.wheel_base_error * rng.standard_normal()
+    roll_left = left * (distance - options.wheel_base * turn / 2)
+    roll_right = right * (distance + options.wheel_base * turn / 2)
+    d = (roll_left + roll_right) / 2
+    theta = (roll_right - roll_left) / (options.wheel_base * base)
+    way, turned = np.abs(distance), np.abs(turn)
+    noise = rng.standard_normal((2, len(d)))
+    d = d + noise[0] * options.translation_noise * np.sqrt(way)
+    variance = options.rotation_noise**2 * turned + options.drift_noise**2 * way
+    theta = theta + noise[1] * np.sqrt(variance)
+    if options.slip_rate > 0:
+        slipped = _slips(way, options, rng) * way
+        d = d + slipped.sum(axis=0) / 2
+        theta = theta + (slipped[1] - slipped[0]) / (options.wheel_base * base)
+    heading = np.concatenate([[0.0], np.cumsum(theta)])
+    middle = heading[:-1] + theta / 2
+    chord = d * np.sinc(theta / (2 * np.pi))
+    position = np.zeros((len(heading), 2))
+    position[1:] = np.cumsum(chord[:, None] * np.stack([np.cos(middle), np.sin(middle)], -1), 0)
+    return se2.matrix(position[:, 0], position[:, 1], heading)
+
+
+def add_faults(
+    T_odom_base: Float, seconds: Float, options: OdometryOptions, rng: np.random.Generator
+) -> Float:
+    """Add stalls and resets to odometry (T, 3, 3).
+
+    Motion during a stall is lost for good. At a reset the pose returns to the identity.
+
+    Args:
+        T_odom_base: odometry without faults.
+        seconds: (T,) times of the scans.
+        options: rates.
+        rng: of the times.
+    """
+    if options.stall_rate > 0:
+        moves = se2.parameters(se2.inverse(T_odom_base[:-1]) @ T_odom_base[1:])
+        moves[_stalls(seconds, options, rng)] = 0.0
+        T_odom_base = _chain(moves)
+    count = min(options.resets, len(T_odom_base) - 1)
+    for scan in np.sort(rng.choice(np.arange(1, len(seconds)), count, replace=False)).tolist():
+        again = se2.inverse(T_odom_base[scan]) @ T_odom_base[scan:]
+        T_odom_base = np.concatenate([T_odom_base[:scan], again])
+    return T_odom_base
+
+
+def remove_jump(T_world_base: Float, scan: int) -> Float:
+    """Poses (T, 3, 3) without the jump before `scan`, if there is such a scan."""
+    if scan >= len(T_world_base):
+        return T_world_base
+    back = T_world_base[scan - 1] @ se2.inverse(T_world_base[scan])
+    return np.concatenate([T_world_base[:scan], back @ T_world_base[scan:]])
+
+
+def _stalls(
+    seconds: Float, options: OdometryOptions, rng: np.random.Generator
+) -> NDArray[np.bool_]:
+    """(T - 1,) whether odometry misses the motion between two scans."""
+    often = rng.poisson(options.stall_rate / 60 * (seconds[-1] - seconds[0]))
+    stalls = np.zeros(len(seconds) - 1, bool)
+    for begin in rng.uniform(seconds[0], seconds[-1], often).tolist():
+        stalls |= (seconds[:-1] >= begin) & (seconds[:-1] < begin + options.stall_time)
+    return stalls
+
+
+def _chain(moves: Float) -> Float:
+    """(T, 3, 3) poses from the identity on, for relative moves (T - 1, 3)."""
+    heading = np.concatenate([[0.0], np.cumsum(moves[:, 2])])
+    c, s = np.cos(heading[:-1]), np.sin(heading[:-1])
+    x, y = moves[:, 0], moves[:, 1]
+    steps = np.stack([c * x - s * y, s * x + c * y], axis=-1)
+    position = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
+    return se2.matrix(position[:, 0], position[:, 1], heading)
+
+
+def _slips(way: Float, options: OdometryOptions, rng: np.random.Generator) -> Float:
+    """(2, T - 1) excess roll of each wheel, relative to the distance (T - 1,)."""
+    extra = np.zeros((2, len(way)))
+    ends = np.cumsum(way)
+    for begin in np.flatnonzero(rng.random(len(way)) < options.slip_rate * way).tolist():
+        last = np.searchsorted(ends, ends[begin] + options.slip_length)
+        extra[rng.integers(2), begin:last] += options.slip * rng.uniform(0.5, 1.5)
+    return extra

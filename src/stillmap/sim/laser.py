@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.sim.options import LaserOptions, LidarOptions
+from stillmap.sim.scene import Scene
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -185,6 +186,12 @@ def _cast_movers(
         rest = B**2 - A * (ox**2 + oy**2 - 1)
         r = np.where(rest >= 0, (-B - np.sqrt(np.maximum(rest, 0))) / A, np.inf)
         which[_keep_nearer(r, beam, ranges)] = movers.mover[q]
+
+
+def find_glass(walls: NDArray[np.int32], scene: Scene) -> NDArray[np.bool_]:
+    """Whether walls, by number, are glass, which comes after the scene's other walls."""
+    first = len(scene.walls)
+    return (walls >= first) & (walls < first + len(scene.glass))
 
 
 def simulate_measurement(

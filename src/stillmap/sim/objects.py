@@ -29,43 +29,39 @@ class PlacedObjects(NamedTuple):
     moved: NDArray[np.bool_]
 
 
-class MovableObjects:
-    """P movable objects and all their places."""
+def faces_at_all_places(things: tuple[Thing, ...]) -> Float:
+    """(K, 4) faces of all objects at all their places."""
+    faces = [place_faces(thing, stay) for thing in things for stay in thing.stays]
+    return np.concatenate([np.empty((0, 4)), *faces])
 
-    def __init__(self, things: tuple[Thing, ...]) -> None:
-        self._things = things
 
-    def faces_at_all_places(self) -> Float:
-        """(K, 4) faces of all objects at all their places."""
-        faces = [place_faces(thing, stay) for thing in self._things for stay in thing.stays]
-        return np.concatenate([np.empty((0, 4)), *faces])
+def place_objects(things: tuple[Thing, ...], seconds: Float, first: int) -> PlacedObjects:
+    """Poses and faces of P movable objects at each scan.
 
-    def place(self, seconds: Float, first: int) -> PlacedObjects:
-        """Poses and faces at each scan.
-
-        Args:
-            seconds: (T,) since the beginning of the recording.
-            first: mover number of the first object.
-        """
-        T, poses, still = len(seconds), [], [np.empty((0, 4))]
-        moving, mover = [np.empty((T, 0, 4))], [np.empty(0, np.int32)]
-        moved: list[bool] = []
-        for number, thing in enumerate(self._things, start=first):
-            at = np.full((T, 3), np.nan)
-            for stay in thing.stays:
-                end = np.inf if stay.until is None else stay.until
-                at[(seconds >= stay.since) & (seconds < end)] = (stay.x, stay.y, stay.yaw)
-            faces = transform_faces(thing, at)
-            poses.append(at)
-            moved.append(not np.array_equal(at, np.broadcast_to(at[0], at.shape)))
-            if not moved[-1]:
-                still.append(faces[0])
-            else:
-                moving.append(faces)
-                mover.append(np.full(len(thing.faces), number, np.int32))
-        outlines = Outlines(np.concatenate(moving, axis=1), np.concatenate(mover))
-        by_scan = np.reshape(poses, (-1, T, 3)).swapaxes(0, 1)
-        return PlacedObjects(by_scan, outlines, np.concatenate(still), np.array(moved, bool))
+    Args:
+        things: the objects.
+        seconds: (T,) since the beginning of the recording.
+        first: mover number of the first object.
+    """
+    T, poses, still = len(seconds), [], [np.empty((0, 4))]
+    moving, mover = [np.empty((T, 0, 4))], [np.empty(0, np.int32)]
+    moved: list[bool] = []
+    for number, thing in enumerate(things, start=first):
+        at = np.full((T, 3), np.nan)
+        for stay in thing.stays:
+            end = np.inf if stay.until is None else stay.until
+            at[(seconds >= stay.since) & (seconds < end)] = (stay.x, stay.y, stay.yaw)
+        faces = transform_faces(thing, at)
+        poses.append(at)
+        moved.append(not np.array_equal(at, np.broadcast_to(at[0], at.shape)))
+        if not moved[-1]:
+            still.append(faces[0])
+        else:
+            moving.append(faces)
+            mover.append(np.full(len(thing.faces), number, np.int32))
+    outlines = Outlines(np.concatenate(moving, axis=1), np.concatenate(mover))
+    by_scan = np.reshape(poses, (-1, T, 3)).swapaxes(0, 1)
+    return PlacedObjects(by_scan, outlines, np.concatenate(still), np.array(moved, bool))
 
 
 def place_faces(thing: Thing, stay: Stay) -> Float:

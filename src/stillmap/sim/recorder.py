@@ -1,7 +1,7 @@
 """Recording of a 3D sensor, scan by scan, in bounded memory."""
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,15 +10,14 @@ from stillmap.core import se2
 from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.recording import Recording
 from stillmap.sim import lidar, ray_casting
-from stillmap.sim.dynamics import Progress
+from stillmap.sim.dynamics import Moment, Progress
 from stillmap.sim.episode import Episode
 from stillmap.sim.geometry import Ground
 from stillmap.sim.laser import simulate_measurement
 from stillmap.sim.lidar import Pattern, Sensor
 from stillmap.sim.ray_casting import RayReturns
-from stillmap.sim.sweep import Moment
 from stillmap.sim.truth import Truth
-from stillmap.sim.truth_surfaces import StaticSurfaces
+from stillmap.sim.truth_surfaces import MovingSurfaces, StaticSurfaces
 from stillmap.sim.world_3d import MoverSolids, make_static_world
 
 Float = NDArray[np.float64]
@@ -65,8 +64,23 @@ class World(NamedTuple):
         exact = ray_casting.cast_rays(rays, self.static, self.carried.at(moment, scan))
         if sensor.own is None:
             return exact
-        nearer, both = sensor.own.range < exact.range, zip(sensor.own, exact, strict=True)
+        nearer = sensor.own.range < exact.range
+        both: Any = zip(sensor.own, exact, strict=True)
         return RayReturns._make(np.where(nearer, *pair) for pair in both)
+
+
+def collect_surfaces(world: World) -> tuple[StaticSurfaces, MovingSurfaces]:
+    """The surfaces of a world; movers that never moved are static."""
+    poses = []
+    for scan in range(len(world.ridden)):
+        moment = world.moment(np.array([scan]), np.zeros(1))
+        carried = world.carried.at(moment, scan)
+        poses.append(carried.pose[0])
+    carried = carried._replace(pose=np.stack(poses))
+    moves = carried.mover >= 0
+    never = carried._replace(pose=carried.pose[:1]).select(~moves)
+    standing = world.static._replace(solids=world.static.solids.concatenate(never))
+    return standing, MovingSurfaces(world.happening.exact_ns, carried.select(moves))
 
 
 def record(

@@ -1,5 +1,6 @@
 """Simulation of a recording: motion, odometry, sensors and cameras."""
 
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,21 +11,23 @@ from numpy.typing import NDArray
 from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.sim import laser, lidar, recorder, sweep
+from stillmap.sim import laser, lidar, recorder
 from stillmap.sim.camera import CameraSimulator
-from stillmap.sim.dynamics import Progress
+from stillmap.sim.dynamics import Moment, Motion, Progress
 from stillmap.sim.episode import Episode, simulate_episode
+from stillmap.sim.laser import Returns
 from stillmap.sim.options import LaserOptions
 from stillmap.sim.recorder import World
 from stillmap.sim.scene import Scene
-from stillmap.sim.sweep import Sweep
-from stillmap.sim.truth import Truth
-from stillmap.sim.truth_images import ImageTruth, make_image_truth
+from stillmap.sim.truth import ImageTruth, Truth
 
 Float = NDArray[np.float64]
 
 _MOTION_SHARE = 0.7  # of the computing time, for progress
 _MOTION_SHARE_3D = 0.05  # the same with a lidar
+_MAX_GROUPS = 64  # of simultaneous beams per scan
+_BLOCK = 1000  # groups of beams processed at once
+_MAX_SIGMAS = 10.0  # of a range
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +140,7 @@ def _with_images(world: World, recording: Recording, truth: Truth) -> Simulation
         return Simulation(scene, recording, truth)
     photographs = CameraSimulator(world)
     recording = replace(recording, images=photographs.images)
-    return Simulation(scene, recording, truth, photographs, make_image_truth(world, photographs))
+    return Simulation(scene, recording, truth, photographs, photographs.truth())
 
 
 def _record(happening: Episode) -> tuple[Recording, NDArray[np.int32]]:
@@ -145,10 +148,8 @@ def _record(happening: Episode) -> tuple[Recording, NDArray[np.int32]]:
     scene, motion, walls = happening.scene, happening.motion, happening.walls
     o, T = scene.laser, len(motion.robot)
     T_base_sensor, sensor = _sensors(o), np.arange(T, dtype=np.int32) % o.count
-    exact = sweep.cast_sweeps(motion, walls, T_base_sensor[sensor], o)
-    # glass comes after the other walls of the scene
-    pane = exact.wall - len(scene.walls)
-    on_glass = (pane >= 0) & (pane < len(scene.glass))
+    exact = cast_sweeps(motion, walls, T_base_sensor[sensor], o)
+    on_glass = laser.find_glass(exact.wall, scene)
     ranges, hit = laser.simulate_measurement(exact.range, on_glass, o, happening.sensor_rng)
     angles = laser.compute_beam_angles(o.beams, o.fov)
     if o.upside_down == "known":
@@ -166,6 +167,72 @@ def _record(happening: Episode) -> tuple[Recording, NDArray[np.int32]]:
         beam_time=np.tile(Sweep.of(o).beam_times(o.beams), T) if o.sweep_time > 0 else None,
     )
     return recording, np.where(hit, exact.mover, np.int32(-1)).ravel()
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """Times of the beams of a scan.
+
+    Attributes:
+        group: number of simultaneous beams; the last group may be smaller.
+        seconds: (G,) after the scan's stamp, of each group.
+    """
+
+    group: int
+    seconds: Float
+
+    @classmethod
+    def of(cls, options: LaserOptions) -> "Sweep":
+        """The sweep of a laser: times proportional to the beam angles."""
+        n = options.beams
+        if options.sweep_time == 0:
+            return cls(n, np.zeros(1))
+        group = max(2, math.ceil(n / _MAX_GROUPS))
+        first = np.arange(0, n, group)
+        middle = (first + np.minimum(first + group, n) - 1) / 2
+        angles = laser.compute_beam_angles(n, options.fov)
+        share = middle * (angles[1] - angles[0]) / options.fov
+        return cls(group, options.sweep_time * share)
+
+    def beam_times(self, beams: int) -> NDArray[np.float32]:
+        """(n,) seconds after the stamp, of each beam of a scan."""
+        return np.repeat(self.seconds, self.group)[:beams].astype(np.float32)
+
+
+def cast_sweeps(motion: Motion, walls: Float, T_base_sensor: Float, o: LaserOptions) -> Returns:
+    """The nearest surface on every beam of every scan.
+
+    Args:
+        motion: of T scans.
+        walls: (W, 4) segments in metres.
+        T_base_sensor: (T, 3, 3) pose of the laser of each scan.
+        o: the lasers.
+
+    Returns:
+        Beams in the order of the scan: from the last angle to the first if the laser is mounted
+        upside down.
+    """
+    sweep, angles = Sweep.of(o), laser.compute_beam_angles(o.beams, o.fov)
+    T, G = len(motion.robot), len(sweep.seconds)
+    reach = o.max_range + _MAX_SIGMAS * o.range_noise
+    # a group of beams is cast as a scan of its own, rotated to the angles of the first group
+    turned, group = np.arange(G) * sweep.group * (angles[1] - angles[0]), angles[: sweep.group]
+    order = slice(None)
+    if o.upside_down != "no":
+        turned, group, order = -turned, -group[::-1], slice(None, None, -1)
+    block = max(1, _BLOCK // G)
+    parts = []
+    for first in range(0, T, block):
+        scans = np.arange(first, min(first + block, T))
+        now = Moment(motion, np.repeat(scans, G), np.tile(sweep.seconds, len(scans)))
+        T_robot_sensor = np.repeat(T_base_sensor[scans], G, axis=0)
+        poses = se2.parameters(se2.matrix(*now.interpolate(motion.robot).T) @ T_robot_sensor)
+        poses[:, 2] += np.tile(turned, len(scans))
+        part = laser.cast_beams(poses, group, walls, *now.interpolate_movers(), reach)
+        parts.append(
+            [values[:, order].reshape(-1, G * sweep.group)[:, : o.beams] for values in part]
+        )
+    return Returns(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
 
 def _sensors(o: LaserOptions) -> Float:

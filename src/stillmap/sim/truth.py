@@ -1,18 +1,28 @@
 """The truth of a simulation: read by the scores, never by the mapping."""
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.arrays import open_npy, write_npy
+from stillmap.core.arrays import open_npy, write_npy, write_npz
 from stillmap.core.errors import InputError
+from stillmap.io.images import read_image
 from stillmap.io.trajectory import write_tum
+from stillmap.sim.geometry import Faces, Ground, Solids
+from stillmap.sim.truth_surfaces import MovingSurfaces, StaticSurfaces
+
+Float = NDArray[np.float64]
 
 FOLDER = "truth"
+IMAGES = "images"  # in it
+_STANDING, _MOVING, _POSE = "standing.npz", "moving.npz", "moving_pose.npy"
+_CAMERAS = "T_world_camera.npy"
 _SCENE = "scene.json"
 _ARRAYS = ("static", "mover", "T_world_base", "walls", "movers")
 _PER_BEAM = ("static", "mover")
@@ -64,18 +74,106 @@ def load_truth(path: str | Path) -> Truth:
     Raises:
         InputError: there is none, or it is damaged.
     """
-    folder = Path(path)
-    if (folder / FOLDER).is_dir():
-        folder = folder / FOLDER
-    if not (folder / _SCENE).is_file():
-        raise InputError(
-            "holds no truth", where=str(path), hint="a folder that 'stillmap simulate' wrote"
-        )
+    folder = _find_folder(path, _SCENE, "truth", "")
+    names = (*_ARRAYS, *([_LASTING] if (folder / f"{_LASTING}.npy").exists() else []))
     try:
-        arrays = {
-            name: np.array(open_npy(folder / f"{name}.npy"))
-            for name in (*_ARRAYS, *([_LASTING] if (folder / f"{_LASTING}.npy").exists() else []))
-        }
+        arrays = {name: np.array(open_npy(folder / f"{name}.npy")) for name in names}
         return Truth(**arrays, scene=json.loads((folder / _SCENE).read_text(encoding="utf-8")))
     except (OSError, ValueError, EOFError) as error:
         raise InputError(f"is damaged: {error}", where=str(folder)) from error
+
+
+@dataclass(frozen=True, eq=False)
+class ImageTruth:
+    """Truth about N images and the surfaces that they show.
+
+    Attributes:
+        colour_seed: of `appearance.compute_static_color`.
+        standing, moving: the true surfaces.
+        T_world_camera: (N, 4, 4) pose of each image.
+        mask: of an image, (h, w) uint16; 0: static, k + 1: mover k, 65535: nothing.
+        distance: of an image, (h, w) float32 metres along each pixel's ray; inf: nothing, or too
+            far.
+    """
+
+    colour_seed: int
+    standing: StaticSurfaces
+    moving: MovingSurfaces
+    T_world_camera: Float
+    mask: Callable[[int], NDArray[np.uint16]]
+    distance: Callable[[int], NDArray[np.float32]]
+
+
+def write_image_truth(truth: ImageTruth, folder: Path) -> None:
+    """Write all but masks and distances into an existing folder."""
+    faces, solids, ground, ceiling = truth.standing
+    standing: dict[str, NDArray[Any]] = {
+        "faces_ends": faces.ends,
+        "faces_z": faces.z,
+        "faces_glass": faces.is_glass,
+        **{f"solids_{name}": value for name, value in solids._asdict().items()},
+        **{f"ground_{name}": np.asarray(value) for name, value in ground._asdict().items()},
+        "ceiling": np.array(np.nan if ceiling is None else ceiling),
+        "colour_seed": np.array(truth.colour_seed),
+    }
+    write_npz(folder / _STANDING, standing)
+    moving = truth.moving.solids._asdict()
+    write_npy(folder / _POSE, moving.pop("pose"))
+    write_npz(folder / _MOVING, {"stamp_ns": truth.moving.stamp_ns, **moving})
+    np.save(folder / _CAMERAS, truth.T_world_camera)
+
+
+def load_image_truth(path: str | Path) -> ImageTruth:
+    """Load the truth about images, given the folder of a simulation or the `truth` inside.
+
+    Raises:
+        InputError: there is none, or it is damaged.
+    """
+    folder = _find_folder(path, _STANDING, "truth about images", " ... --camera")
+    try:
+        of, moves = _arrays(folder / _STANDING), _arrays(folder / _MOVING)
+        faces = Faces(of["faces_ends"], of["faces_z"], of["faces_glass"])
+        solids = Solids(*(of[f"solids_{name}"] for name in Solids._fields))
+        kerb = float(of["ground_kerb"])
+        ground = Ground(of["ground_slope"], of["ground_bend"], of["ground_pavements"], kerb)
+        ceiling, seed = float(of["ceiling"]), int(of["colour_seed"])
+        parts = Solids(open_npy(folder / _POSE), *(moves[name] for name in Solids._fields[1:]))
+        moving = MovingSurfaces(moves["stamp_ns"], parts)
+        T_world_camera = np.array(open_npy(folder / _CAMERAS))
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+        raise InputError(f"is damaged: {error}", where=str(folder)) from error
+    standing = StaticSurfaces(faces, solids, ground, None if np.isnan(ceiling) else ceiling)
+
+    def mask(image: int) -> NDArray[np.uint16]:
+        return read_image(image_files(folder, image)[0])
+
+    def distance(image: int) -> NDArray[np.float32]:
+        metres = read_image(image_files(folder, image)[1]).astype(np.float32) / 1e3
+        return np.where(metres > 0.0, metres, np.float32(np.inf))
+
+    return ImageTruth(seed, standing, moving, T_world_camera, mask, distance)
+
+
+def _find_folder(path: str | Path, mark: str, what: str, arguments: str) -> Path:
+    """The truth folder, given itself or the folder around it; `mark`: a file that it has.
+
+    Raises:
+        InputError: there is none.
+    """
+    folder = Path(path)
+    if (folder / FOLDER).is_dir():
+        folder = folder / FOLDER
+    if not (folder / mark).is_file():
+        hint = f"a folder that 'stillmap simulate{arguments}' wrote"
+        raise InputError(f"holds no {what}", where=str(path), hint=hint)
+    return folder
+
+
+def image_files(folder: Path, image: int) -> tuple[Path, Path]:
+    """Mask and distances of an image, in a truth folder."""
+    return folder / IMAGES / f"{image:06d}.png", folder / IMAGES / f"{image:06d}-distance.png"
+
+
+def _arrays(path: Path) -> dict[str, NDArray[Any]]:
+    with np.load(path, allow_pickle=False) as archive:
+        return dict(archive)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.sim.dynamics import MAX_SPEED
 from stillmap.sim.geometry import BOX, CYLINDER, Faces, Ground, Solids
 
 Float = NDArray[np.float64]
@@ -195,7 +196,6 @@ def _on_ellipsoid(p: Float, half: Float) -> Float:
     return np.asarray(np.copysign(found, p))
 
 
-_MAX_SPEED = 40.0  # m/s; anything faster has restarted its lane
 _MIN_DEPTH = 1e-6  # m, of a point inside another part
 
 
@@ -225,7 +225,7 @@ class MovingSurfaces(NamedTuple):
         change = self.solids.pose[after[:, None], parts] - before
         change[..., 2] = (change[..., 2] + np.pi) % (2 * np.pi) - np.pi
         way = np.hypot(change[..., 0], change[..., 1])
-        goes_on = way < _MAX_SPEED * 1e-9 * np.maximum(span, 1)[:, None]
+        goes_on = way < MAX_SPEED * 1e-9 * np.maximum(span, 1)[:, None]
         # a jump between scans is not interpolated
         stays = np.where(share < 1.0, before, before + change)
         pose = np.where(goes_on[..., None], before + share * change, stays)

@@ -8,11 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.sim import geometry
-from stillmap.sim.dynamics import Motion
+from stillmap.sim.dynamics import Moment, Motion
 from stillmap.sim.geometry import BOX, Faces, Ground, Part, Solids, assemble
 from stillmap.sim.options import HeightOptions
 from stillmap.sim.scene import Scene, Segment
-from stillmap.sim.sweep import Moment
 from stillmap.sim.truth_surfaces import StaticSurfaces
 
 Float = NDArray[np.float64]

@@ -5,22 +5,28 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from stillmap.core.arrays import write_npy
+from stillmap.core.camera import Images
 from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_folder
 from stillmap.io import stillmap_folder
 from stillmap.io.carmen import writer
+from stillmap.io.images import write_png
 from stillmap.io.registry import RIG_FOLDERS
+from stillmap.sim.camera import CameraSimulator
 from stillmap.sim.scene import Scene
 from stillmap.sim.simulator import RigSimulation, Simulation
-from stillmap.sim.truth import FOLDER, write_truth
-from stillmap.sim.truth_images import write_image_truth, write_truth_on_read
+from stillmap.sim.truth import FOLDER, IMAGES, image_files, write_image_truth, write_truth
 
 Format = Literal["stillmap", "carmen"]
 
 CARMEN_LOG = "recording.log"
 MARK = "truth"  # every simulation has it
 RIG_MARK = "tilting/truth"  # every one of two lasers has it
+_MAX_DISTANCE = 65.535  # m, of a 16-bit image in millimetres
 
 
 def write_simulation(
@@ -75,9 +81,25 @@ def _write_folder(one: Simulation, work: Path) -> None:
     write_truth(one.truth, recording.stamp_ns, work)
     if one.photographs is not None and one.surfaces is not None:
         write_image_truth(one.surfaces, work / FOLDER)
-        images = write_truth_on_read(one.photographs, work / FOLDER)
+        images = _write_truth_on_read(one.photographs, work / FOLDER)
         recording = replace(recording, images=images)
     stillmap_folder.write_into(recording, work)
+
+
+def _write_truth_on_read(photographs: CameraSimulator, folder: Path) -> Images:
+    """The images; reading one writes its truth, so that each is rendered once only."""
+    (folder / IMAGES).mkdir()
+
+    def load(image: int) -> NDArray[np.uint8]:
+        one = photographs.render(image)
+        mask, distance = image_files(folder, image)
+        write_png(one.mask, mask)
+        near = np.where(one.distance < _MAX_DISTANCE, one.distance, 0.0)
+        write_png(np.rint(1e3 * near).astype(np.uint16), distance)
+        return one.color
+
+    images = photographs.images
+    return Images(images.stamp_ns, images.camera, images.cameras, load)
 
 
 def require_carmen(scene: Scene) -> None:
