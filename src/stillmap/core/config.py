@@ -48,28 +48,15 @@ class Limits(NamedTuple):
         )
 
 
-def option(
-    default: Any,
-    doc: str,
-    *,
-    ge: float | None = None,
-    gt: float | None = None,
-    le: float | None = None,
-    lt: float | None = None,
-) -> Any:
+def option(default: Any, doc: str, **limits: float) -> Any:
     """A dataclass field with the meaning, unit and range that `stillmap config` prints.
 
     Args:
         default: the default value; None where the option may be unset.
         doc: meaning and unit.
-        ge: smallest value allowed.
-        gt: the value must be greater.
-        le: largest value allowed.
-        lt: the value must be less.
+        limits: `ge`, `gt`, `le`, `lt`; see Limits.
     """
-    return dataclasses.field(
-        default=default, metadata={"doc": doc, "limits": Limits(ge, gt, le, lt)}
-    )
+    return dataclasses.field(default=default, metadata={"doc": doc, "limits": Limits(**limits)})
 
 
 class Section:

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from stillmap.core.config import Section, option
 from stillmap.core.errors import InputError
@@ -13,6 +13,11 @@ MAX_PLAUSIBLE_RANGE = 1000.0
 MAX_POINT_DISTANCE = 1e5  # m: beyond the reach of any sensor; damaged files hold such numbers
 
 _FULL_TURN = 2.0 * math.pi + 1e-6  # rad
+
+
+def _coordinate(doc: str) -> Any:
+    """An option of a laser's pose, in m or rad."""
+    return option(None, doc, gt=-1e3, lt=1e3)
 
 
 class LaserOptions(NamedTuple):
@@ -69,25 +74,16 @@ class ReadOptions(Section, section="read"):
         "Direction, seen from above, in which a spinning lidar without per-point times turns; "
         "none: all points share the stamp; auto: clockwise for raw KITTI drives, else none.",
     )
-    laser_x: float | None = option(
-        None,
+    laser_x: float | None = _coordinate(
         "Position of the first laser ahead of the robot's centre, in metres; unset: taken from "
-        "the recording.",
-        gt=-1e3,
-        lt=1e3,
+        "the recording."
     )
-    laser_y: float | None = option(
-        None,
+    laser_y: float | None = _coordinate(
         "Position of the first laser left of the robot's centre, in metres; unset: taken from "
-        "the recording.",
-        gt=-1e3,
-        lt=1e3,
+        "the recording."
     )
-    laser_theta: float | None = option(
-        None,
-        "Yaw of the first laser on the robot, in radians; unset: taken from the recording.",
-        gt=-1e3,
-        lt=1e3,
+    laser_theta: float | None = _coordinate(
+        "Yaw of the first laser on the robot, in radians; unset: taken from the recording."
     )
     laser_upside_down: bool | None = option(
         None,
@@ -100,18 +96,13 @@ class ReadOptions(Section, section="read"):
         gt=0.0,
         lt=_FULL_TURN,
     )
-    laser2_x: float | None = option(
-        None,
-        "Position of the second laser ahead of the robot's centre, in metres.",
-        gt=-1e3,
-        lt=1e3,
+    laser2_x: float | None = _coordinate(
+        "Position of the second laser ahead of the robot's centre, in metres."
     )
-    laser2_y: float | None = option(
-        None, "Position of the second laser left of the robot's centre, in metres.", gt=-1e3, lt=1e3
+    laser2_y: float | None = _coordinate(
+        "Position of the second laser left of the robot's centre, in metres."
     )
-    laser2_theta: float | None = option(
-        None, "Yaw of the second laser on the robot, in radians.", gt=-1e3, lt=1e3
-    )
+    laser2_theta: float | None = _coordinate("Yaw of the second laser on the robot, in radians.")
     laser2_upside_down: bool | None = option(
         None, "Whether the second laser hangs upside down (beams in reverse order)."
     )

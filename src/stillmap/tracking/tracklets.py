@@ -33,13 +33,11 @@ class Centroids(NamedTuple):
         track: (L,) track numbers.
         scan: (L,) of the recording.
         xy: (L, 2) mean of the end points, in the map frame.
-        n_points: (L,) number of end points.
     """
 
     track: Index
     scan: Index
     xy: Float
-    n_points: Index
 
 
 def compute_centroids(points: DynamicPoints, owner: Index, here: slice | Index) -> Centroids:
@@ -51,14 +49,14 @@ def compute_centroids(points: DynamicPoints, owner: Index, here: slice | Index) 
     begins = np.flatnonzero(np.diff(track, prepend=-1) | np.diff(scan, prepend=-1))
     count = np.diff(begins, append=len(order))
     sums = np.add.reduceat(xy[order], begins) if len(begins) else np.zeros((0, 2))
-    return Centroids(track[begins], scan[begins], sums / count[:, None], count)
+    return Centroids(track[begins], scan[begins], sums / count[:, None])
 
 
 def iterate_tracks(points: DynamicPoints, owner: Index) -> Iterator[tuple[int, Index]]:
     """Yield each track number, rising, with its points, rising; in bounded memory."""
-    count = np.zeros(0, np.intp)
+    count = np.zeros(_count_tracks(owner), np.intp)
     for block in arrays.iter_blocks(owner):
-        count = _add_counts(count, np.bincount(owner[block][owner[block] >= 0]))
+        count += np.bincount(owner[block][owner[block] >= 0], minlength=len(count))
     first = np.cumsum(count) - count
     order = arrays.empty((int(count.sum()),), np.intp, points.scratch)
     free = first.copy()
@@ -78,6 +76,11 @@ def iterate_tracks(points: DynamicPoints, owner: Index) -> Iterator[tuple[int, I
         if read > arrays.BLOCK:
             points.release(owner, order)
             read = 0
+
+
+def _count_tracks(owner: Index) -> int:
+    """The largest track number + 1."""
+    return max((int(owner[b].max()) for b in arrays.iter_blocks(owner)), default=-1) + 1
 
 
 def _scan_blocks(points: DynamicPoints, *beside: Index) -> Iterator[slice]:
@@ -116,7 +119,7 @@ def _merge_pairs(points: DynamicPoints, owner: Index) -> Index:
     """Merge tracks that always move together, nearer than people do: legs tracked apart."""
     from scipy.spatial import KDTree  # takes long to load
 
-    parts, scans = list[tuple[Index, Index]](), np.zeros(0, np.intp)
+    parts, scans = list[tuple[Index, Index]](), np.zeros(_count_tracks(owner), np.intp)
     for here in _scan_blocks(points, owner):
         found = compute_centroids(points, owner, here)
         # one more axis keeps scans apart
@@ -124,7 +127,7 @@ def _merge_pairs(points: DynamicPoints, owner: Index) -> Index:
         pairs = KDTree(separated).query_pairs(_PAIR_DISTANCE, output_type="ndarray")
         pairs = np.sort(found.track[pairs], axis=1)
         parts.append(np.unique(pairs, axis=0, return_counts=True))
-        scans = _add_counts(scans, np.bincount(found.track))
+        scans += np.bincount(found.track, minlength=len(scans))
     tracks, which = np.unique(
         np.concatenate([pairs for pairs, _ in parts]), axis=0, return_inverse=True
     )
@@ -137,14 +140,6 @@ def _merge_pairs(points: DynamicPoints, owner: Index) -> Index:
     _, first, which = np.unique(label, return_index=True, return_inverse=True)
     merged = first[which]
     return _renumber(points, owner, lambda old: merged[old])
-
-
-def _add_counts(one: Index, other: Index) -> Index:
-    """Sum of counts of different lengths; missing ones are 0."""
-    out = np.zeros(max(len(one), len(other)), np.intp)
-    out[: len(one)] += one
-    out[: len(other)] += other
-    return out
 
 
 def _join_across_gaps(points: DynamicPoints, owner: Index) -> Index:
@@ -238,18 +233,15 @@ def _gate(ends: _Ends, before: Index, after: Index) -> tuple[Index, Index, Float
 
 def _confirm(points: DynamicPoints, owner: Index) -> Index:
     """Set the points of tracks that are too short to -1."""
-    scans = np.zeros(0, np.intp)
-    first, last = np.full(0, np.inf), np.full(0, -np.inf)
+    n = _count_tracks(owner)
+    if n == 0:
+        return owner
+    scans, first, last = np.zeros(n, np.intp), np.full(n, np.inf), np.full(n, -np.inf)
     for here in _scan_blocks(points, owner):
         found = compute_centroids(points, owner, here)
-        scans = _add_counts(scans, np.bincount(found.track))
-        more = len(scans) - len(first)
-        first = np.concatenate([first, np.full(more, np.inf)])
-        last = np.concatenate([last, np.full(more, -np.inf)])
+        scans += np.bincount(found.track, minlength=n)
         np.minimum.at(first, found.track, points.seconds[found.scan])
         np.maximum.at(last, found.track, points.seconds[found.scan])
-    if len(scans) == 0:
-        return owner
-    duration = np.subtract(last, first, out=np.zeros(len(scans)), where=scans > 0)
+    duration = np.subtract(last, first, out=np.zeros(n), where=scans > 0)
     confirmed = (scans >= MIN_TRACK_SCANS) & (duration >= _MIN_DURATION)
     return _renumber(points, owner, lambda old: np.where((old >= 0) & confirmed[old], old, -1))
