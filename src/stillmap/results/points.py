@@ -1,21 +1,20 @@
 """`static.ply` and `dynamic.ply`: the end points of a 3D recording in the map frame."""
 
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.arrays import iter_blocks
-from stillmap.core.chunks import iter_chunks
 from stillmap.core.recording import Recording
 from stillmap.em.types import DYNAMIC_BELOW
+from stillmap.results.export.point_cloud import Block, cloud_from_recording
 
-FIELDS = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("p_static", "<f4")]
+Fields = list[tuple[str, str]]  # names and types
 
-COLOURS = [("red", "u1"), ("green", "u1"), ("blue", "u1")]
-
+FIELDS: Fields = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("p_static", "<f4")]
+COLOURS: Fields = [("red", "u1"), ("green", "u1"), ("blue", "u1")]
+PACKED_COLOUR: Fields = [("rgb", "<u4")]  # 0x00RRGGBB, of PCD
 _TYPES = {"<f4": "float", "u1": "uchar"}
 
 
@@ -35,27 +34,26 @@ def write_clouds(
         p_static: (M,) P(c = 1); below one half it is dynamic.
         colours: (M, 3), None: without.
     """
-    hits = dynamic = 0
-    for block in iter_blocks(seen.hit, p_static):
-        hit = seen.hit[block]
-        hits += int(np.count_nonzero(hit))
-        dynamic += int(np.count_nonzero(hit & (p_static[block] < DYNAMIC_BELOW)))
-    counts = {"static": hits - dynamic, "dynamic": dynamic}
-    files = {name: (folder / f"{name}.ply").open("wb") for name in counts}
-    try:
-        for name, file in files.items():
-            fields = FIELDS if colours is None else FIELDS + COLOURS
-            file.write(ply_header(fields, counts[name]))
-        for vertices in _vertices(seen, poses, p_static, colours):
+    dynamic = sum(
+        int(np.count_nonzero(seen.hit[block] & (p_static[block] < DYNAMIC_BELOW)))
+        for block in iter_blocks(seen.hit, p_static)
+    )
+    cloud = cloud_from_recording(seen, seen, poses, p_static, colors=colours)
+    fields = FIELDS if colours is None else FIELDS + COLOURS
+    with (
+        (folder / "static.ply").open("wb") as static,
+        (folder / "dynamic.ply").open("wb") as moving,
+    ):
+        static.write(ply_header(fields, cloud.count - dynamic))
+        moving.write(ply_header(fields, dynamic))
+        for block in cloud.iter_blocks():
+            vertices = make_vertices(block, fields)
             moves = vertices["p_static"] < DYNAMIC_BELOW
-            files["static"].write(vertices[~moves].tobytes())
-            files["dynamic"].write(vertices[moves].tobytes())
-    finally:
-        for file in files.values():
-            file.close()
+            static.write(vertices[~moves].tobytes())
+            moving.write(vertices[moves].tobytes())
 
 
-def ply_header(fields: list[tuple[str, str]], count: int) -> bytes:
+def ply_header(fields: Fields, count: int) -> bytes:
     """Of a little-endian PLY whose vertices have these fields, float32 or uint8."""
     properties = "".join(f"property {_TYPES[kind]} {name}\n" for name, kind in fields)
     head = f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}"
@@ -68,26 +66,14 @@ def put_colours(vertices: NDArray[np.void], colours: NDArray[np.uint8]) -> None:
         vertices[name] = column
 
 
-def _vertices(
-    seen: Recording,
-    poses: NDArray[np.float64],
-    p_static: NDArray[np.float32],
-    colours: NDArray[np.uint8] | None,
-) -> Iterator[NDArray[np.void]]:
-    T_map_sensor = seen.T_map_sensor(poses)
-    fields = FIELDS if colours is None else FIELDS + COLOURS
-    beside: list[NDArray[Any]] = [p_static] if colours is None else [p_static, colours]
-    for scans, beams, offset in iter_chunks(seen, release=beside):
-        for t, first, last in zip(
-            range(scans.start, scans.stop), offset[:-1], offset[1:], strict=True
-        ):
-            at = slice(beams.start + int(first), beams.start + int(last))
-            hit = seen.hit[at]
-            T = T_map_sensor[t]
-            ends = seen.points[at][hit].astype(np.float64) @ T[:3, :3].T + T[:3, 3]
-            vertices = np.empty(len(ends), fields)
-            vertices["x"], vertices["y"], vertices["z"] = ends.T
-            vertices["p_static"] = p_static[at][hit]
-            if colours is not None:
-                put_colours(vertices, colours[at][hit])
-            yield vertices
+def make_vertices(block: Block, fields: Fields) -> NDArray[np.void]:
+    """(n,) points with FIELDS and, for colours, COLOURS or PACKED_COLOUR."""
+    vertices = np.empty(len(block.points), fields)
+    vertices["x"], vertices["y"], vertices["z"] = block.points.T
+    vertices["p_static"] = block.p_static
+    if block.colors is not None and fields[-1:] == PACKED_COLOUR:
+        red, green, blue = block.colors.T.astype(np.uint32)
+        vertices["rgb"] = red << 16 | green << 8 | blue
+    elif block.colors is not None:
+        put_colours(vertices, block.colors)
+    return vertices

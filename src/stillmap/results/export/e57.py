@@ -69,10 +69,14 @@ def _write_scan(
     scan.set("name", library.StringNode(file, "points in the map frame"))
     text = "intensity is the probability that the point is static"
     scan.set("description", library.StringNode(file, f"stillmap: {text}"))
-    limits = {"intensityMinimum": 0.0, "intensityMaximum": 1.0}
-    scan.set("intensityLimits", _float_nodes(library, file, limits))
+    shares = {"intensityMinimum": 0.0, "intensityMaximum": 1.0}
+    scan.set("intensityLimits", _float_nodes(library, file, shares))
     if cloud.has_colors:
-        scan.set("colorLimits", _color_limits(library, file))
+        limits = library.StructureNode(file)
+        for name in _COLORS:
+            limits.set(f"{name}Minimum", library.IntegerNode(file, 0, 0, 255))
+            limits.set(f"{name}Maximum", library.IntegerNode(file, 255, 0, 255))
+        scan.set("colorLimits", limits)
     if cloud.start_ns is not None and cloud.start_ns >= GPS_EPOCH_S * 10**9:
         start = {"dateTimeValue": 1e-9 * cloud.start_ns - GPS_EPOCH_S}
         scan.set("acquisitionStart", _float_nodes(library, file, start))
@@ -94,14 +98,6 @@ def _float_nodes(library: Any, file: Any, values: dict[str, float]) -> Any:
     node = library.StructureNode(file)
     for name, value in values.items():
         node.set(name, library.FloatNode(file, float(value)))
-    return node
-
-
-def _color_limits(library: Any, file: Any) -> Any:
-    node = library.StructureNode(file)
-    for name in _COLORS:
-        node.set(f"{name}Minimum", library.IntegerNode(file, 0, 0, 255))
-        node.set(f"{name}Maximum", library.IntegerNode(file, 255, 0, 255))
     return node
 
 

@@ -18,7 +18,6 @@ from stillmap.io.point_cloud import ply
 from stillmap.io.point_cloud.binary_table import read_columns
 
 Part = Literal["static", "dynamic"]
-PARTS: tuple[Part, ...] = ("static", "dynamic")
 
 _FIELDS = ("x", "y", "z", "p_static")
 _COLORS = ("red", "green", "blue")
@@ -58,7 +57,7 @@ class Cloud:
     make_blocks: Callable[[], Iterator[Block]]
     has_colors: bool = False
 
-    def iter_blocks(self, progress: Callable[[float], None] | None) -> Iterator[Block]:
+    def iter_blocks(self, progress: Callable[[float], None] | None = None) -> Iterator[Block]:
         """The blocks; `progress` is called with the share of the points that is done."""
         done = 0
         for block in self.make_blocks():
@@ -88,8 +87,9 @@ def cloud_from_recording(
     """
     times = recording.beam_time
     earliest = 0.0
-    for block in () if times is None else arrays.iter_blocks(times):
-        earliest = min(earliest, float(times[block].min()) if times is not None else 0.0)
+    if times is not None:
+        for block in arrays.iter_blocks(times):
+            earliest = min(earliest, float(times[block].min()))
     T_map_sensor = deskewed.T_map_sensor(poses)
 
     def make_blocks() -> Iterator[Block]:
@@ -119,7 +119,11 @@ def cloud_from_folder(folder: Path, only: Part | None = None) -> Cloud:
     Raises:
         InputError: one of them is missing or damaged.
     """
-    layouts = [ply.read_layout(folder / f"{part}.ply") for part in PARTS if only in (part, None)]
+    layouts = [
+        ply.read_layout(folder / f"{part}.ply")
+        for part in ("static", "dynamic")
+        if only in (part, None)
+    ]
     has_colors = all(set(_COLORS) <= {one.name for one in layout.fields} for layout in layouts)
     wanted = (*_FIELDS, *(_COLORS if has_colors else ()))
 

@@ -13,14 +13,20 @@ from stillmap.core.files import atomic_file
 from stillmap.io.point_cloud.las import open_las_writer
 from stillmap.results.export import e57
 from stillmap.results.export.point_cloud import Block, Cloud
-from stillmap.results.points import COLOURS, FIELDS, ply_header, put_colours
+from stillmap.results.points import (
+    COLOURS,
+    FIELDS,
+    PACKED_COLOUR,
+    Fields,
+    make_vertices,
+    ply_header,
+)
 
 Progress = Callable[[float], None]
 
 _SCALE = 0.0001  # m, of coordinates in LAS
 _POINT_FORMAT, _COLOR_POINT_FORMAT = 6, 7  # of LAS: with time, and with color too
 _COLOR_SCALE = 256  # LAS has 16-bit colors
-_PACKED = [("rgb", "<u4")]  # 0x00RRGGBB; by convention of PCL its type is F, float
 _MAX_INTEGER = 2**31 - 1  # of a coordinate in LAS
 _LINES = 1 << 14  # of text formatted at a time
 
@@ -90,14 +96,14 @@ def _write_ply(cloud: Cloud, path: Path, _: bool, progress: Progress | None) -> 
 
 
 def _write_pcd(cloud: Cloud, path: Path, _: bool, progress: Progress | None) -> None:
-    fields = FIELDS + _PACKED if cloud.has_colors else FIELDS
+    fields = FIELDS + PACKED_COLOUR if cloud.has_colors else FIELDS
     names = [name for name, _ in fields]
     lines = (
         "# .PCD v0.7 - Point Cloud Data file format",
         "VERSION 0.7",
         f"FIELDS {' '.join(names)}",
         f"SIZE {' '.join('4' for _ in names)}",
-        f"TYPE {' '.join('F' for _ in names)}",
+        f"TYPE {' '.join('F' for _ in names)}",  # of packed colours too, by convention of PCL
         f"COUNT {' '.join('1' for _ in names)}",
         f"WIDTH {cloud.count}",
         "HEIGHT 1",
@@ -113,25 +119,13 @@ def _write_records(
     cloud: Cloud,
     path: Path,
     header: bytes,
-    fields: list[tuple[str, str]],
+    fields: Fields,
     progress: Progress | None,
 ) -> None:
     with path.open("wb") as file:
         file.write(header)
         for block in cloud.iter_blocks(progress):
-            file.write(_records(block, fields).tobytes())
-
-
-def _records(block: Block, fields: list[tuple[str, str]]) -> NDArray[np.void]:
-    out = np.empty(len(block.points), fields)
-    out["x"], out["y"], out["z"] = block.points.T
-    out["p_static"] = block.p_static
-    if block.colors is not None and fields[-1:] == _PACKED:
-        red, green, blue = block.colors.T.astype(np.uint32)
-        out["rgb"] = red << 16 | green << 8 | blue
-    elif block.colors is not None:
-        put_colours(out, block.colors)
-    return out
+            file.write(make_vertices(block, fields).tobytes())
 
 
 def _write_text(cloud: Cloud, path: Path, _: bool, progress: Progress | None) -> None:

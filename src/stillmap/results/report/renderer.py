@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.mesh.texture.atlas import TexturedMesh
-from stillmap.mesh.texture.sampling import sample_bilinear
+from stillmap.mesh.texture.baking import sample_bilinear
 from stillmap.mesh.triangle_mesh import Mesh
 
 Float = NDArray[np.float64]
