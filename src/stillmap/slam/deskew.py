@@ -116,25 +116,20 @@ def _select_scan_pairs(
     T = len(stamp_ns)
     here = np.arange(T)
 
-    def following(seconds: float) -> Index:
-        return np.searchsorted(stamp_ns, stamp_ns + _min_span_ns(seconds))
+    def neighbors(seconds: float) -> tuple[Index, Index]:
+        span = max(round(_MIN_SPAN * seconds * 1e9), 1)
+        preceding = np.searchsorted(stamp_ns, stamp_ns - span, side="right") - 1
+        return np.searchsorted(stamp_ns, stamp_ns + span), preceding
 
-    def preceding(seconds: float) -> Index:
-        return np.searchsorted(stamp_ns, stamp_ns - _min_span_ns(seconds), side="right") - 1
-
-    next_, last = following(latest), preceding(latest)
+    next_, last = neighbors(latest)
     ahead = next_ < T
     after = (np.where(ahead, here, np.maximum(last, 0)), np.where(ahead, next_, here))
     if earliest <= 0.0:
         return after, after
-    next_, last = following(earliest), preceding(earliest)
+    next_, last = neighbors(earliest)
     behind = last >= 0
     before = (np.where(behind, last, here), np.where(behind, here, np.minimum(next_, T - 1)))
     return after, before
-
-
-def _min_span_ns(seconds: float) -> int:
-    return max(round(_MIN_SPAN * seconds * 1e9), 1)
 
 
 def _sensor_twists(recording: Recording, poses: Float, first: Index, second: Index) -> Float:
@@ -154,9 +149,8 @@ def _sensor_twists(recording: Recording, poses: Float, first: Index, second: Ind
 
 def _has_leap(poses: Float, first: Index, second: Index) -> NDArray[np.bool_]:
     """(T,) whether an implausible step lies between two scans."""
-    steps = motion_model.compute_odometry_steps(poses)
-    implausible = np.zeros(0, np.bool_) if steps is None else ~steps.plausible
-    count = np.concatenate([[0], np.cumsum(implausible)])
+    plausible = motion_model.compute_odometry_steps(poses).plausible
+    count = np.concatenate([[0], np.cumsum(~plausible)])
     return np.asarray(count[second] > count[first])
 
 

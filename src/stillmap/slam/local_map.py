@@ -41,6 +41,11 @@ class LocalMap:
             add_scan(self.grid, self._recording, self._e, t, T_map_base)
             self._kept.append((t, T_map_base, travelled))
 
+    def clear(self) -> None:
+        """Begins anew with an empty map."""
+        self.grid = type(self.grid)(self.grid.resolution, self.grid.approach)
+        self._kept.clear()
+
     def has_sensor(self, sensor: int) -> bool:
         """Whether it holds a scan of a sensor."""
         return self._last_of(sensor) is not None
@@ -48,14 +53,14 @@ class LocalMap:
     def remove_before(self, travelled: float) -> None:
         """Removes the scans taken before that many metres of travel."""
         while self._kept and self._kept[0][2] < travelled:
-            self._remove(*self._kept.popleft()[:2])
+            self._remove(*self._kept.popleft())
 
     def remove_since(self, t: int) -> None:
         """Removes scan t and later ones."""
         while self._kept and self._kept[-1][0] >= t:
-            self._remove(*self._kept.pop()[:2])
+            self._remove(*self._kept.pop())
 
-    def _remove(self, t: int, T_map_base: Float) -> None:
+    def _remove(self, t: int, T_map_base: Float, _: float) -> None:
         add_scan(self.grid, self._recording, self._e, t, T_map_base, remove=True)
 
     def _is_spaced(self, t: int, T_map_base: Float) -> bool:

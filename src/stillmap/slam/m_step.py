@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -55,19 +56,14 @@ def m_step(
             printed has 0.
     """
     D, T = recording.dimension, recording.n_scans
+    grid = em.make_grid(D, options.resolution, free_space_margin)
     if poses is not None:
         dof = D * (D + 1) // 2
-        empty = em.make_grid(D, options.resolution)
-        found = MStepResult(poses, np.zeros((T, dof, dof)), empty, np.full(T, np.nan))
-    elif D == 3:
-        found = _estimate_poses_3d(recording, e, options, progress, threads)
+        found = MStepResult(poses, np.zeros((T, dof, dof)), grid, np.full(T, np.nan))
     else:
-        found = _estimate_poses_2d(
-            recording, e, options, progress, initial, earlier_poses, free_space_margin
-        )
-    if poses is None:
+        step = _PoseStep(recording, e, options, threads, progress, free_space_margin)
+        found = step.estimate_3d() if D == 3 else step.estimate_2d(initial, earlier_poses)
         progress("counting beams", 0, 0)
-    grid = em.make_grid(D, options.resolution, free_space_margin)
     if with_grid:
         deskewed = deskew_recording(recording, found.poses, options, threads)
         em.add_recording(grid, deskewed, found.poses, e, threads)
@@ -76,68 +72,64 @@ def m_step(
     return dataclasses.replace(found, grid=grid)
 
 
-def _estimate_poses_3d(
-    recording: Recording,
-    e: NDArray[np.float32],
-    options: SlamOptions,
-    progress: StepProgress,
-    threads: int,
-) -> MStepResult:
-    """Lidar odometry and loop closure; the grid is empty."""
-    odometry = register_sweeps(
-        recording, e, options.odometry, partial(progress, "matching scans"), threads
-    )
-    empty = em.make_grid(3, options.resolution)
-    found = MStepResult(odometry.poses, odometry.covariance, empty, odometry.explained)
-    if not options.loop_closure:
-        return found
-    closing = partial(progress, "closing loops")
-    poses, loops, graph = close_loops_3d(recording, e, options, odometry, closing, threads)
-    return dataclasses.replace(found, poses=poses, loops=loops, graph=graph)
+@dataclass(frozen=True, eq=False)
+class _PoseStep:
+    """The M-step over poses; arguments as of `m_step`. Grids of results are empty."""
 
+    recording: Recording
+    e: NDArray[np.float32]
+    options: SlamOptions
+    threads: int
+    progress: StepProgress
+    free_space_margin: float
 
-def _estimate_poses_2d(
-    recording: Recording,
-    e: NDArray[np.float32],
-    options: SlamOptions,
-    progress: StepProgress,
-    initial: MStepResult | None,
-    earlier_poses: Float | None,
-    free_space_margin: float,
-) -> MStepResult:
-    """Scan matching, loop closure and refinement; the grid is empty."""
-    mapping = partial(progress, "matching scans")
-    if initial is None or not options.loop_closure:
-        found = _match_scans(recording, e, options, mapping, earlier_poses, free_space_margin)
+    def estimate_3d(self) -> MStepResult:
+        """Lidar odometry and loop closure."""
+        recording, e, options, threads = self.recording, self.e, self.options, self.threads
+        matching, closing = self._progress("matching scans"), self._progress("closing loops")
+        odometry = register_sweeps(recording, e, options.odometry, matching, threads)
+        empty = em.make_grid(3, options.resolution)
+        found = MStepResult(odometry.poses, odometry.covariance, empty, odometry.explained)
         if not options.loop_closure:
             return found
-        deskewed = deskew_recording(recording, found.poses, options)
-        closing = partial(progress, "closing loops")
-        initial = close_loops(deskewed, e, options, found, closing)
-        mapping = partial(progress, "refining poses")
-    refined = initial
-    for _ in range(_REFINEMENT_PASSES):
-        deskewed = deskew_recording(recording, refined.poses, options)
-        refined = refine_poses(deskewed, e, options, refined, mapping)
-    # a misregistered scan agrees with a map that contains it: keep the share from the local map
-    return dataclasses.replace(refined, explained=initial.explained)
+        poses, loops, graph = close_loops_3d(recording, e, options, odometry, closing, threads)
+        return dataclasses.replace(found, poses=poses, loops=loops, graph=graph)
 
+    def estimate_2d(self, initial: MStepResult | None, earlier_poses: Float | None) -> MStepResult:
+        """Scan matching, loop closure and refinement."""
+        refining = self._progress("matching scans")
+        if initial is None or not self.options.loop_closure:
+            found = self._match_scans(earlier_poses)
+            if not self.options.loop_closure:
+                return found
+            closing = self._progress("closing loops")
+            initial = close_loops(self._deskew(found.poses), self.e, self.options, found, closing)
+            refining = self._progress("refining poses")
+        refined = initial
+        for _ in range(_REFINEMENT_PASSES):
+            deskewed = self._deskew(refined.poses)
+            refined = refine_poses(deskewed, self.e, self.options, refined, refining)
+        # a misregistered scan agrees with a map that contains it: keep the share from the local map
+        return dataclasses.replace(refined, explained=initial.explained)
 
-def _match_scans(
-    recording: Recording,
-    e: NDArray[np.float32],
-    options: SlamOptions,
-    progress: ScanProgress,
-    earlier_poses: Float | None,
-    free_space_margin: float,
-) -> MStepResult:
-    """Incremental scan matching; scans are deskewed by the best motion estimate so far."""
-    max_travel = _LOCAL_MAP_TRAVEL if options.loop_closure else np.inf
+    def _match_scans(self, earlier_poses: Float | None) -> MStepResult:
+        """Incremental scan matching; scans are deskewed by the best motion estimate so far."""
+        recording, options = self.recording, self.options
+        max_travel = _LOCAL_MAP_TRAVEL if options.loop_closure else np.inf
+        progress = self._progress("matching scans")
 
-    def match(scans: Recording) -> MStepResult:
-        return register_scans(scans, e, options, progress, max_travel, free_space_margin)
+        def match(scans: Recording) -> MStepResult:
+            return register_scans(
+                scans, self.e, options, progress, max_travel, self.free_space_margin
+            )
 
-    motion = recording.T_odom_base if earlier_poses is None else earlier_poses
-    if motion is None and options.deskew and recording.beam_time is not None:
-        motion = match(recording).poses  # skewed scans are good enough to estimate the motion
-    return match(deskew_recording(recording, motion, options))
+        motion = recording.T_odom_base if earlier_poses is None else earlier_poses
+        if motion is None and options.deskew and recording.beam_time is not None:
+            motion = match(recording).poses  # skewed scans are good enough to estimate the motion
+        return match(self._deskew(motion))
+
+    def _deskew(self, poses: Float | None) -> Recording:
+        return deskew_recording(self.recording, poses, self.options)
+
+    def _progress(self, step: str) -> ScanProgress:
+        return partial(self.progress, step)

@@ -93,10 +93,8 @@ def _unannounced_motion(acceleration: float, seconds: float) -> float:
     return min(max(0.5 * acceleration * seconds**2, _TRANSLATION_FLOOR), _MAX_UNANNOUNCED)
 
 
-def compute_odometry_steps(T_odom_base: Float | None) -> OdometrySteps | None:
-    """The steps between poses (T, 3, 3); None without odometry."""
-    if T_odom_base is None:
-        return None
+def compute_odometry_steps(T_odom_base: Float) -> OdometrySteps:
+    """The steps between poses (T, 3, 3)."""
     increments = se2.inverse(T_odom_base[:-1]) @ T_odom_base[1:]
     metres = np.linalg.norm(increments[:, :2, 2], axis=1)
     usual = float(np.quantile(metres, 0.95)) if len(metres) else 0.0

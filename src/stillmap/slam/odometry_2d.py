@@ -50,7 +50,8 @@ def register_scans(
         free_space_margin: m before its end in which a beam is not used as free space.
     """
     T = recording.n_scans
-    odometry = _ScanOdometry(recording, e, options, max_travel, free_space_margin)
+    grid = _core.OccupancyGrid2D(options.resolution, free_space_margin)
+    odometry = _ScanOdometry(recording, e, options, max_travel, LocalMap(grid, recording, e))
     progress(1, T)
     for t in recording.iter_scans(range(1, T), e):
         odometry.register(t)
@@ -59,7 +60,7 @@ def register_scans(
 
 
 class _ScanOdometry:
-    """State of incremental scan matching; arguments as of `register_scans`."""
+    """State of incremental scan matching; arguments as of `register_scans`, and an empty map."""
 
     def __init__(
         self,
@@ -67,16 +68,16 @@ class _ScanOdometry:
         e: NDArray[np.float32],
         options: SlamOptions,
         max_travel: float,
-        free_space_margin: float,
+        local_map: LocalMap,
     ) -> None:
-        T = recording.n_scans
+        T, odometry = recording.n_scans, recording.T_odom_base
         self.recording, self.e, self.options = recording, e, options
-        self.max_travel, self.free_space_margin = max_travel, free_space_margin
+        self.max_travel, self.local_map = max_travel, local_map
         self.poses = np.tile(np.eye(3), (T, 1, 1))
         self.covariance, self.explained = np.zeros((T, 3, 3)), np.ones(T)
         self.widened, self.odometry_faults = np.zeros((2, T), np.bool_)
         self.breaks, self.unconnected = list[int](), list[int]()
-        self.steps = motion_model.compute_odometry_steps(recording.T_odom_base)
+        self.steps = None if odometry is None else motion_model.compute_odometry_steps(odometry)
         self.slip = SlipDetector(None if self.steps is None else self.steps.increments)
         self.noise = VelocityNoise()
         self.seconds = 1e-9 * float(np.median(np.diff(recording.stamp_ns))) if T > 1 else 0.0
@@ -84,12 +85,7 @@ class _ScanOdometry:
         # running average of the explained share, per sensor: each sees its own side
         self.usual = np.zeros(len(recording.T_base_sensor))
         self.usual[recording.sensor[0]] = 1.0
-        self.local_map = self._empty_map()
         self.local_map.add(0, self.poses[0], 0.0)
-
-    def _empty_map(self) -> LocalMap:
-        grid = _core.OccupancyGrid2D(self.options.resolution, self.free_space_margin)
-        return LocalMap(grid, self.recording, self.e)
 
     def register(self, t: int) -> None:
         """Matches scan t and adds it to the local map."""
@@ -155,7 +151,8 @@ class _ScanOdometry:
         self.breaks.append(t)
         if fits_nowhere:
             self.unconnected.append(t)
-        self.local_map, self.usual[:] = self._empty_map(), 0.0
+        self.usual[:] = 0.0
+        self.local_map.clear()
         self.slip.reset()
 
     def _is_unexplained(self, t: int, scan: Scan, match: ScanMatch) -> bool:

@@ -118,14 +118,12 @@ def _build_problem(poses: Float, chain: list[Constraint]) -> tuple[Any, Any]:
     import gtsam
 
     start, graph = gtsam.Values(), gtsam.NonlinearFactorGraph()
-    for k, pose in enumerate(_to_gtsam(poses)):
+    objects, is_2d = _to_gtsam(poses), poses.shape[-1] == 3
+    for k, pose in enumerate(objects):
         start.insert(k, pose)
-    if poses.shape[-1] == 3:
-        fixed = gtsam.noiseModel.Isotropic.Sigma(3, _PRIOR_STD)
-        graph.add(gtsam.PriorFactorPose2(0, start.atPose2(0), fixed))
-    else:
-        fixed = gtsam.noiseModel.Isotropic.Sigma(6, _PRIOR_STD)
-        graph.add(gtsam.PriorFactorPose3(0, start.atPose3(0), fixed))
+    fixed = gtsam.noiseModel.Isotropic.Sigma(3 if is_2d else 6, _PRIOR_STD)
+    prior_factor = gtsam.PriorFactorPose2 if is_2d else gtsam.PriorFactorPose3
+    graph.add(prior_factor(0, objects[0], fixed))
     for constraint in chain:
         graph.add(_factor(constraint, 1.0))
     return graph, start

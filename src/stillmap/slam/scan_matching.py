@@ -6,6 +6,7 @@ Likelihood field around end points, correlative search, Newton refinement; what 
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -229,23 +230,19 @@ def search_pose(
     grid: _core.OccupancyGrid2D, scan: Scan, prior: MotionPrior, translation: float, rotation: float
 ) -> ScanMatch:
     """The best pose in a window of half widths `translation` (m) and `rotation` (rad)."""
-    return _register(grid, scan, prior, translation, min(rotation, float(np.pi)), None)
+    rotation = min(rotation, float(np.pi))
+    return _register(grid, scan, prior, window_translation=translation, window_rotation=rotation)
 
 
 def refine_pose(
     grid: _core.OccupancyGrid2D, scan: Scan, prior: MotionPrior, start: Float
 ) -> ScanMatch:
     """The optimum that Newton steps from a pose (3, 3) reach."""
-    return _register(grid, scan, prior, 0.0, 0.0, start)
+    return _register(grid, scan, prior, window_translation=0.0, window_rotation=0.0, T_start=start)
 
 
 def _register(
-    grid: _core.OccupancyGrid2D,
-    scan: Scan,
-    prior: MotionPrior,
-    translation: float,
-    rotation: float,
-    start: Float | None,
+    grid: _core.OccupancyGrid2D, scan: Scan, prior: MotionPrior, **search: Any
 ) -> ScanMatch:
     T, covariance, cost, explained, _, _, alternatives = _core.register_scan(
         grid,
@@ -253,17 +250,12 @@ def _register(
         scan.weights,
         prior.T_map_base,
         prior.information,
-        sigma=_FIELD_STD,
-        radius=_field_radius(grid.resolution),
-        floor=_FLOOR,
-        unknown=_UNKNOWN,
+        **_likelihood_field(grid),
         information_scale=_INFORMATION_SCALE,
         max_iterations=_MAX_ITERATIONS,
-        window_translation=translation,
-        window_rotation=rotation,
         search_range=_MAX_SEARCH_RANGE,
         max_candidates=_MAX_CANDIDATES,
-        T_start=start,
+        **search,
     )
     return ScanMatch(T, covariance, explained, cost - prior.cost(T), alternatives)
 
@@ -271,15 +263,13 @@ def _register(
 def registration_cost(grid: _core.OccupancyGrid2D, scan: Scan, T_map_base: Float) -> float:
     """Cost of the beams at a pose (3, 3), nats."""
     return _INFORMATION_SCALE * _core.registration_cost(
-        grid,
-        scan.points,
-        scan.weights,
-        T_map_base,
-        sigma=_FIELD_STD,
-        radius=_field_radius(grid.resolution),
-        floor=_FLOOR,
-        unknown=_UNKNOWN,
+        grid, scan.points, scan.weights, T_map_base, **_likelihood_field(grid)
     )
+
+
+def _likelihood_field(grid: _core.OccupancyGrid2D) -> dict[str, Any]:
+    radius = max(1, round(2.0 * _FIELD_STD / grid.resolution))  # cells around an end point
+    return {"sigma": _FIELD_STD, "radius": radius, "floor": _FLOOR, "unknown": _UNKNOWN}
 
 
 def occluded_share(grid: _core.OccupancyGrid2D, scan: Scan, T_map_base: Float) -> float:
@@ -293,8 +283,3 @@ def occluded_share(grid: _core.OccupancyGrid2D, scan: Scan, T_map_base: Float) -
         margin=_WALL_MARGIN,
         min_occupancy=WALL_OCCUPANCY,
     )
-
-
-def _field_radius(resolution: float) -> int:
-    """Cells around an end point over which the field is summed."""
-    return max(1, round(2.0 * _FIELD_STD / resolution))
