@@ -172,7 +172,7 @@ def test_what_happens_while_reading(log, monkeypatch, error):
     def fails(*_):
         raise error
 
-    monkeypatch.setattr(registry.reader, "read", fails)
+    monkeypatch.setattr(registry.reader, "read_log", fails)
     with pytest.raises(InputError, match=r"cannot be read: gone|does not fit into memory"):
         read(log([FLASER]))
 

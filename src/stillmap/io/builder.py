@@ -107,21 +107,20 @@ class RecordingBuilder:
         selection = np.arange(len(stamp_ns)) if selection is None else np.sort(selection)
         order = selection[np.argsort(stamp_ns[selection], kind="stable")]
         start = np.cumsum(length) - length
-        columns = [
-            _reorder(column.finish(), start, length, order, self._folder)
-            for column in (self._points, self._hit, self._times)
-            if column is not None
-        ]
+
+        def reorder(column: ArrayBuilder) -> NDArray[Any]:
+            return _reorder(column.finish(), start, length, order, self._folder)
+
         return Recording(
             stamp_ns=stamp_ns[order],
             offset=np.concatenate([[0], np.cumsum(length[order])]).astype(np.int64),
-            points=columns[0],
-            hit=columns[1],
+            points=reorder(self._points),
+            hit=reorder(self._hit),
             T_base_sensor=T_base_sensor,
             sensor=np.asarray(self.sensor, np.int32)[order],
             T_odom_base=None if T_odom_base is None else T_odom_base[order],
             source=source,
-            beam_time=columns[2] if self._times is not None else None,
+            beam_time=None if self._times is None else reorder(self._times),
             T_recorded_base=None if T_recorded_base is None else T_recorded_base[order],
             **more,
         )

@@ -138,7 +138,7 @@ def _parse_K(table: Mapping[str, Any]) -> Float | None:
         missing = [key for key in _FOCAL if key not in table]
         if missing:
             raise ValueError(f"'{given[0]}' wants '{missing[0]}' beside it")
-        fx, fy, cx, cy = (_parse_number(table, key) for key in _FOCAL)
+        fx, fy, cx, cy = (float(_parse_numbers(table, key, ())) for key in _FOCAL)  # type: ignore[arg-type]
         K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     elif given:
         raise ValueError(f"'K' and '{given[0]}' exclude each other")
@@ -194,10 +194,6 @@ def _parse_pose(table: Mapping[str, Any]) -> Float | None:
     if not abs(np.linalg.norm(q) - 1.0) < 0.02:
         raise ValueError("'quaternion' (x, y, z, w) is not of length one")
     return rigid_transform(rotation.from_quat(q).as_matrix(), t)
-
-
-def _parse_number(table: Mapping[str, Any], key: str) -> float:
-    return float(_parse_numbers(table, key, ()))  # type: ignore[arg-type]
 
 
 def _parse_size(table: Mapping[str, Any], key: str) -> int | None:

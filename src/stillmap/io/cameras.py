@@ -2,12 +2,10 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
@@ -92,7 +90,7 @@ def images_from_files(files: Sequence[tuple[int, Path]], camera: Camera) -> Imag
         stamp_ns=np.array([stamp for stamp, _ in ordered], np.int64),
         camera=np.zeros(len(ordered), np.int32),
         cameras=(camera,),
-        load=partial(_load, [file for _, file in ordered]),
+        load=lambda image: read_image(ordered[image][1]),
     )
 
 
@@ -106,14 +104,13 @@ def merge_images(parts: Sequence[Images]) -> Images:
     part_of = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
     number = np.concatenate([np.arange(len(part)) for part in parts])
     order = np.argsort(stamp_ns, kind="stable")
-    part_of, number = part_of[order], number[order]
-
-    def load(image: int) -> NDArray[Any]:
-        pixels: NDArray[Any] = parts[part_of[image]].read(int(number[image]))
-        return pixels
-
-    cameras = tuple(one for part in parts for one in part.cameras)
-    return Images(stamp_ns[order], camera[order].astype(np.int32), cameras, load)
+    part_of, number = part_of[order].tolist(), number[order].tolist()
+    return Images(
+        stamp_ns[order],
+        camera[order].astype(np.int32),
+        tuple(one for part in parts for one in part.cameras),
+        lambda image: parts[part_of[image]].read(number[image]),
+    )
 
 
 def _apply_overrides(images: Images, overrides: dict[str, CameraOverride]) -> Images:
@@ -125,11 +122,12 @@ def _apply_overrides(images: Images, overrides: dict[str, CameraOverride]) -> Im
             cameras[number] = one.apply_to(camera)
             stamp_ns[images.camera == number] += one.time_offset_ns
     order = np.argsort(stamp_ns, kind="stable")
-
-    def load(image: int) -> NDArray[Any]:
-        return images.read(int(order[image]))
-
-    return Images(stamp_ns[order], images.camera[order], tuple(cameras), load)
+    return Images(
+        stamp_ns[order],
+        images.camera[order],
+        tuple(cameras),
+        lambda image: images.read(int(order[image])),
+    )
 
 
 def _read_folder(name: str, override: CameraOverride, folder: Path, where: str) -> Images:
@@ -156,7 +154,3 @@ def _read_folder(name: str, override: CameraOverride, folder: Path, where: str) 
     return images_from_files(
         [(stamp + override.time_offset_ns, file) for stamp, file in used], camera
     )
-
-
-def _load(files: list[Path], image: int) -> NDArray[Any]:
-    return read_image(files[image])

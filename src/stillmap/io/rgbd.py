@@ -4,6 +4,7 @@ Every depth image becomes a scan: a grid of beams, row by row from the upper lef
 included. The base frame of the robot is the depth camera, rotated to x ahead, y left, z up.
 """
 
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -117,7 +118,10 @@ def read_depth_camera(
     Raises:
         InputError: none can be read, or the calibration does not fit.
     """
-    width, height = _first_image_size(frames)
+    size = _first_image_size(frames.depth)
+    if size is None:
+        raise InputError("is no image, nor is any other", where=str(frames.depth[0][1]))
+    width, height = size
     recorded = Camera(DEPTH, width, height, frames.K, "", np.zeros(0), T_BASE_CAMERA)
     # depth is mostly registered to color: one camera for both
     override = overrides.get(DEPTH, overrides.get(COLOR, CameraOverride()))
@@ -140,13 +144,11 @@ def read_depth_camera(
     return camera
 
 
-def _first_image_size(frames: Frames) -> tuple[int, int]:
-    for _, file in frames.depth:
-        try:
+def _first_image_size(images: list[tuple[int, Path]]) -> tuple[int, int] | None:
+    for _, file in images:
+        with suppress(InputError):
             return read_image_size(file)
-        except InputError:
-            continue
-    raise InputError("is no image, nor is any other", where=str(frames.depth[0][1]))
+    return None
 
 
 def _make_grid(camera: Camera, options: ReadOptions, scale: float) -> _Grid:
@@ -184,23 +186,21 @@ def _read_color_images(
             depth; None: it is the depth camera.
         warnings: more are added.
     """
-    for _, file in frames.color:
-        try:
-            width, height = read_image_size(file)
-        except InputError:
-            continue
-        camera = replace(depth, name=COLOR, width=width, height=height)
-        if (width, height) != (depth.width, depth.height):
-            warnings.append(
-                f"color images have {width} x {height} pixels, depth images {depth.width} x "
-                f"{depth.height}: the color camera is not calibrated; --cameras FILE calibrates it"
-            )
-            camera = replace(camera, K=None, model="", distortion=np.zeros(0))
-        elif scale is not None:
-            color = dict(frames.color)
-            pairs = [(file, color[stamp]) for stamp, file in frames.depth if stamp in color]
-            calibrated, warning = calibrate_color_camera(depth, scale, pairs)
-            camera = replace(calibrated, name=COLOR)
-            warnings += [warning] if warning else []
-        return cameras.images_from_files(frames.color, camera)
-    return None
+    size = _first_image_size(frames.color)
+    if size is None:
+        return None
+    width, height = size
+    camera = replace(depth, name=COLOR, width=width, height=height)
+    if size != (depth.width, depth.height):
+        warnings.append(
+            f"color images have {width} x {height} pixels, depth images {depth.width} x "
+            f"{depth.height}: the color camera is not calibrated; --cameras FILE calibrates it"
+        )
+        camera = replace(camera, K=None, model="", distortion=np.zeros(0))
+    elif scale is not None:
+        color = dict(frames.color)
+        pairs = [(file, color[stamp]) for stamp, file in frames.depth if stamp in color]
+        calibrated, warning = calibrate_color_camera(depth, scale, pairs)
+        camera = replace(calibrated, name=COLOR)
+        warnings += [warning] if warning else []
+    return cameras.images_from_files(frames.color, camera)

@@ -163,23 +163,14 @@ def _read_list(path: Path, warnings: list[str]) -> list[tuple[int, Path]]:
             continue
         try:
             stamp, name = words
-            out.append((parse_ns(stamp), _resolve_inside(path.parent, name)))
+            if Path(name).is_absolute() or ".." in Path(name).parts or "\0" in name:
+                raise ValueError("leads out of the folder")
+            out.append((parse_ns(stamp), path.parent / name))
         except ValueError:
             bad += 1
     if bad:
         warnings.append(f"{path.name}: {bad} lines are not a stamp and a file of the folder")
     return sorted(out, key=lambda one: one[0])
-
-
-def _resolve_inside(folder: Path, name: str) -> Path:
-    """The path of a file of the folder.
-
-    Raises:
-        ValueError: the name leads out of the folder.
-    """
-    if Path(name).is_absolute() or ".." in Path(name).parts or "\0" in name:
-        raise ValueError("leads out of the folder")
-    return folder / name
 
 
 def _interpolate_tum_poses(

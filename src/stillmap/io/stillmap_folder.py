@@ -22,7 +22,7 @@ from stillmap.preprocessing.options import MAX_POINT_DISTANCE
 _IMAGES = "images"
 
 
-def write_images(images: Images, folder: Path) -> tuple[dict[str, Any], list[str]]:
+def _write_images(images: Images, folder: Path) -> tuple[dict[str, Any], list[str]]:
     """Write images, stamps and cameras into an existing folder.
 
     Returns:
@@ -37,54 +37,37 @@ def write_images(images: Images, folder: Path) -> tuple[dict[str, Any], list[str
         except InputError as error:
             lost.append(str(error))
             continue
-        _write_image(pixels, folder / _IMAGES / f"{len(kept):06d}")
+        path = folder / _IMAGES / f"{len(kept):06d}"
+        if pixels.dtype.kind == "f":
+            np.save(path.with_suffix(".npy"), pixels.astype(np.float32), allow_pickle=False)
+        else:
+            write_png(pixels, path.with_suffix(".png"))
         kept.append(image)
     np.save(folder / "image_stamp_ns.npy", images.stamp_ns[kept], allow_pickle=False)
     np.save(folder / "image_camera.npy", images.camera[kept], allow_pickle=False)
-    header = {
-        "images": len(kept),
-        "cameras": [_camera_to_dict(camera) for camera in images.cameras],
-    }
-    return header, [f"{len(lost)} images left out: {lost[0]}"] if lost else []
+    cameras = [
+        {
+            name: value.tolist() if isinstance(value, np.ndarray) else value
+            for name, value in vars(camera).items()
+        }
+        for camera in images.cameras
+    ]
+    warnings = [f"{len(lost)} images left out: {lost[0]}"] if lost else []
+    return {"images": len(kept), "cameras": cameras}, warnings
 
 
-def _write_image(image: NDArray[Any], path: Path) -> None:
-    if image.dtype.kind == "f":
-        np.save(path.with_suffix(".npy"), image.astype(np.float32), allow_pickle=False)
-    else:
-        write_png(image, path.with_suffix(".png"))
-
-
-def _camera_to_dict(camera: Camera) -> dict[str, Any]:
-    return {
-        "name": camera.name,
-        "width": camera.width,
-        "height": camera.height,
-        "K": None if camera.K is None else camera.K.tolist(),
-        "model": camera.model,
-        "distortion": camera.distortion.tolist(),
-        "T_base_camera": None if camera.T_base_camera is None else camera.T_base_camera.tolist(),
-    }
-
-
-def read_images(
-    folder: Path, cameras: Any, stamp_ns: NDArray[np.int64], camera: NDArray[np.int32]
-) -> Images:
-    """The images of a recording folder, each read on demand.
-
-    Args:
-        folder: the recording.
-        cameras: the header's "cameras".
-        stamp_ns, camera: (N,) stamp and camera of each image.
-
-    Raises:
-        InputError: the header's cameras are invalid.
-    """
+def _read_images(path: Path, header: dict[str, Any]) -> Images | None:
+    """The images of a recording folder, each read on demand."""
+    if "images" not in header:
+        return None
+    N = _read_count(path, header, "images")
+    stamp_ns = np.array(_open_array(path, "image_stamp_ns", (N,), np.int64))
+    camera = np.array(_open_array(path, "image_camera", (N,), np.int32))
     try:
-        parsed = tuple(_camera_from_dict(one) for one in cameras)
-        return Images(stamp_ns, camera, parsed, partial(_load_image, folder / _IMAGES))
+        cameras = tuple(_camera_from_dict(one) for one in header.get("cameras"))  # type: ignore[union-attr]
+        return Images(stamp_ns, camera, cameras, partial(_load_image, path / _IMAGES))
     except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"is damaged: its cameras: {error}", where=str(folder)) from error
+        raise InputError(f"is damaged: its cameras: {error}", where=str(path)) from error
 
 
 def _camera_from_dict(one: dict[str, Any]) -> Camera:
@@ -115,11 +98,12 @@ def _load_image(folder: Path, image: int) -> NDArray[Any]:
 
 
 HEADER = "recording.json"
-
 FORMAT = "stillmap-recording"
-
 FORMAT_VERSION = 1
-
+_ARRAYS = (
+    *("stamp_ns", "offset", "points", "hit", "T_base_sensor", "sensor"),
+    *("T_odom_base", "beam_time", "T_recorded_base"),
+)
 _MAX_HEADER = 16 << 20  # bytes: parsed JSON of empty lists takes thirty times as many
 
 
@@ -136,9 +120,11 @@ def write(recording: Recording, path: str | Path, *, overwrite: bool = False) ->
 def write_into(recording: Recording, folder: Path) -> None:
     """Write the files of a recording into an existing folder."""
     image_header: dict[str, Any] = {}
-    warnings: list[str] = []
+    source = recording.source
     if recording.images is not None:
-        image_header, warnings = write_images(recording.images, folder)
+        image_header, warnings = _write_images(recording.images, folder)
+        if warnings:
+            source = {**source, "warnings": [*source.get("warnings", []), *warnings]}
     header = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -150,19 +136,13 @@ def write_into(recording: Recording, folder: Path) -> None:
         "beam_times": recording.beam_time is not None,
         "recorded_poses": recording.T_recorded_base is not None,
         **image_header,
-        "source": _with_warnings(recording.source, warnings),
+        "source": source,
     }
     text = json.dumps(header, indent=1, allow_nan=False)
-    for name in ("stamp_ns", "offset", "points", "hit", "T_base_sensor", "sensor"):
-        write_npy(folder / f"{name}.npy", getattr(recording, name))
-    for name in ("T_odom_base", "beam_time", "T_recorded_base"):
+    for name in _ARRAYS:
         if getattr(recording, name) is not None:
             write_npy(folder / f"{name}.npy", getattr(recording, name))
     (folder / HEADER).write_text(text + "\n", encoding="utf-8")
-
-
-def _with_warnings(source: dict[str, Any], warnings: list[str]) -> dict[str, Any]:
-    return {**source, "warnings": [*source.get("warnings", []), *warnings]} if warnings else source
 
 
 def read(path: Path) -> Recording:
@@ -188,9 +168,11 @@ def read(path: Path) -> Recording:
     points = _open_array(path, "points", (M, D), np.float32)
     hit = _open_array(path, "hit", (M,), np.bool_)
     sensor = np.array(_open_array(path, "sensor", (T,), np.int32))
-    if np.any(stamp_ns[1:] < stamp_ns[:-1]):  # np.diff could overflow
+    # np.diff could overflow
+    if np.any(stamp_ns[1:] < stamp_ns[:-1]):
         raise _damaged_error(path, "stamp_ns", "stamps decrease")
-    _check_offsets(path, offset, M)
+    if offset[0] != 0 or offset[-1] != M or np.any(offset[1:] < offset[:-1]):
+        raise _damaged_error(path, "offset", f"must rise from 0 to {M}")
     _check_points(path, points, hit)
     source = header.get("source", {})
     try:
@@ -205,19 +187,10 @@ def read(path: Path) -> Recording:
             source=source if isinstance(source, dict) else {},
             beam_time=beam_time,
             T_recorded_base=T_recorded_base,
-            images=_read_image_index(path, header),
+            images=_read_images(path, header),
         )
     except ValueError as error:
         raise InputError(f"is damaged: {error}", where=str(path)) from error
-
-
-def _read_image_index(path: Path, header: dict[str, Any]) -> Images | None:
-    if "images" not in header:
-        return None
-    N = _read_count(path, header, "images")
-    stamp_ns = np.array(_open_array(path, "image_stamp_ns", (N,), np.int64))
-    camera = np.array(_open_array(path, "image_camera", (N,), np.int32))
-    return read_images(path, header.get("cameras"), stamp_ns, camera)
 
 
 def _refuse_constant(text: str) -> float:
@@ -233,11 +206,8 @@ def _read_header(path: Path) -> dict[str, Any]:
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise InputError(f"is not the header of a {FORMAT}", where=str(path))
     if header.get("format_version") != FORMAT_VERSION:
-        raise InputError(
-            f"format_version {header.get('format_version')!r} is unknown here",
-            where=str(path),
-            hint=f"this version reads {FORMAT_VERSION}",
-        )
+        what = f"format_version {header.get('format_version')!r} is unknown here"
+        raise InputError(what, where=str(path), hint=f"this version reads {FORMAT_VERSION}")
     return header
 
 
@@ -252,31 +222,21 @@ def _open_array(path: Path, name: str, shape: tuple[int, ...], dtype: type) -> N
     """Memory-map one `.npy` file of exactly this shape and type."""
     loaded = open_npy(path / f"{name}.npy")
     if loaded.shape != shape or loaded.dtype != np.dtype(dtype):
-        raise _damaged_error(
-            path,
-            name,
-            f"expected {shape} {np.dtype(dtype)}, got {loaded.shape} {loaded.dtype}",
-        )
+        what = f"expected {shape} {np.dtype(dtype)}, got {loaded.shape} {loaded.dtype}"
+        raise _damaged_error(path, name, what)
     return np.ascontiguousarray(loaded)
 
 
 def _read_poses(path: Path, name: str, count: int, D: int) -> NDArray[np.float64]:
     T = np.array(_open_array(path, name, (count, D + 1, D + 1), np.float64))
     R = T[:, :D, :D]
-    last_row = np.eye(D + 1)[D]
     if not (
         np.all(np.abs(T) < 1e12)
-        and np.all(T[:, D] == last_row)
+        and np.all(T[:, D] == np.eye(D + 1)[D])
         and np.allclose(R @ R.transpose(0, 2, 1), np.eye(D), atol=1e-6)
     ):
         raise _damaged_error(path, name, "not rigid transforms")
     return T
-
-
-def _check_offsets(path: Path, offset: NDArray[np.int64], M: int) -> None:
-    # np.diff could overflow
-    if offset[0] != 0 or offset[-1] != M or np.any(offset[1:] < offset[:-1]):
-        raise _damaged_error(path, "offset", f"must rise from 0 to {M}")
 
 
 def _check_points(path: Path, points: NDArray[np.float32], hit: NDArray[np.bool_]) -> None:
@@ -286,9 +246,8 @@ def _check_points(path: Path, points: NDArray[np.float32], hit: NDArray[np.bool_
         if np.any(hit[block] & ~usable) or np.any(np.isinf(chunk)):
             raise _damaged_error(path, "points", "a hit or a maximum-range beam is not finite")
         if np.any(np.abs(chunk) > MAX_POINT_DISTANCE):
-            raise _damaged_error(
-                path, "points", f"a beam ends farther than {MAX_POINT_DISTANCE:.0f} m away"
-            )
+            what = f"a beam ends farther than {MAX_POINT_DISTANCE:.0f} m away"
+            raise _damaged_error(path, "points", what)
 
 
 def _damaged_error(path: Path, name: str, what: str) -> InputError:

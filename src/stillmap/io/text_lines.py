@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import IO, NamedTuple
 
 from stillmap.core.errors import InputError
+from stillmap.core.files import atomic_file
 
 MAX_LINE = 1 << 20  # bytes: a scan of 3600 readings with remissions has a tenth of it
 _MAX_RATIO, _MIN_LIMIT = 100, 64 << 20  # size of a decompressed text: ratio (logs have 20), bytes
@@ -39,16 +40,14 @@ def is_gzip(path: Path) -> bool:
         return file.read(2) == _GZIP_MAGIC
 
 
-def is_gzip_name(path: Path) -> bool:
-    """Whether a file of this name is written as gzip."""
-    return path.name.lower().endswith(".gz")
-
-
 @contextmanager
-def open_for_writing(path: Path, *, compress: bool) -> Iterator[IO[bytes] | gzip.GzipFile]:
-    """Open a new file, optionally gzip; equal texts give equal bytes."""
-    with path.open("wb") as file:
-        if not compress:
+def write_atomically(path: Path) -> Iterator[IO[bytes] | gzip.GzipFile]:
+    """A new file, gzip by its name, which appears complete or not at all.
+
+    Equal texts give equal bytes.
+    """
+    with atomic_file(path) as work, work.open("wb") as file:
+        if not path.name.lower().endswith(".gz"):
             yield file
             return
         # neither name nor time; level 6 is far faster than 9 for a tenth more bytes

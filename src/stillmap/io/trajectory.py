@@ -53,7 +53,11 @@ def read_tum(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """
     stamps: list[int] = []
     rows: list[list[float]] = []
-    for number, line in enumerate(_read_lines(path), start=1):
+    try:
+        text = read_text(path, MAX_BYTES)
+    except UnicodeDecodeError as error:
+        raise InputError("is not a text file", where=str(path)) from error
+    for number, line in enumerate(text.splitlines(), start=1):
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
@@ -81,13 +85,6 @@ def _pose_rows(poses: NDArray[np.float64]) -> NDArray[np.float64]:
         quaternion = scipy.spatial.transform.Rotation.from_matrix(poses[:, :3, :3]).as_quat()
         rows[:, 3:] = np.where(quaternion[:, 3:] < 0, -quaternion, quaternion)
     return rows
-
-
-def _read_lines(path: Path) -> list[str]:
-    try:
-        return read_text(path, MAX_BYTES).splitlines()
-    except UnicodeDecodeError as error:
-        raise InputError("is not a text file", where=str(path)) from error
 
 
 def _parse_pose(words: list[str], where: str) -> tuple[int, list[float]]:
@@ -124,8 +121,8 @@ def interpolate(
     """
     order = np.argsort(stamp_ns, kind="stable")
     stamp_ns, poses = stamp_ns[order], poses[order]
-    after = np.clip(np.searchsorted(stamp_ns, at_ns, side="right"), 1, max(len(stamp_ns) - 1, 1))
-    after = np.minimum(after, len(stamp_ns) - 1)
+    last = len(stamp_ns) - 1
+    after = np.clip(np.searchsorted(stamp_ns, at_ns, side="right"), min(last, 1), last)
     before = np.maximum(after - 1, 0)
     span = (stamp_ns[after] - stamp_ns[before]).astype(float)
     share = (at_ns - stamp_ns[before]) / np.where(span > 0, span, 1.0)
@@ -157,18 +154,17 @@ def poses_from_tum(path: Path, recording: Recording) -> NDArray[np.float64]:
     nearest = order[_nearest_index(stamp_ns[order], recording.stamp_ns)]
     missing = np.flatnonzero(np.abs(stamp_ns[nearest] - recording.stamp_ns) > _TOLERANCE_NS)
     if len(missing):
+        first = f"the first is scan {missing[0]} at {recording.stamp_ns[missing[0]] / 1e9:.3f} s"
+        of = f"{len(missing)} of {recording.n_scans} scans"
         raise InputError(
-            f"no pose within {_TOLERANCE_NS / 1e9:g} s of {len(missing)} of "
-            f"{recording.n_scans} scans, the first is scan {missing[0]} at "
-            f"{recording.stamp_ns[missing[0]] / 1e9:.3f} s",
-            where=str(path),
+            f"no pose within {_TOLERANCE_NS / 1e9:g} s of {of}, {first}", where=str(path)
         )
     return poses[nearest]
 
 
 def _nearest_index(sorted_ns: NDArray[np.int64], wanted_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    right = np.clip(np.searchsorted(sorted_ns, wanted_ns), 1, max(len(sorted_ns) - 1, 1))
-    right = np.minimum(right, len(sorted_ns) - 1)
+    last = len(sorted_ns) - 1
+    right = np.clip(np.searchsorted(sorted_ns, wanted_ns), min(last, 1), last)
     left = np.maximum(right - 1, 0)
     closer_left = wanted_ns - sorted_ns[left] <= sorted_ns[right] - wanted_ns
     return np.where(closer_left, left, right)

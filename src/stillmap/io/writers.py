@@ -16,11 +16,10 @@ from stillmap.core.recording import Recording
 from stillmap.io import stillmap_folder
 from stillmap.io.carmen.writer import write_log
 from stillmap.io.point_cloud import kitti, las, pcd, ply
-from stillmap.io.ros.bag_types import BagKind
-from stillmap.io.ros.recording_writer import write_recording
+from stillmap.io.ros.recording_writer import write_recording as write_bag
 
-# (recording, path, overwrite) -> what could not be written, a sentence each
-Write = Callable[[Recording, Path, bool], list[str]]
+# (recording, path, overwrite=...) -> what could not be written, a sentence each
+Write = Callable[..., list[str]]
 
 # optional fields of a recording that most formats cannot hold, in words
 _OPTIONAL_FIELDS = {
@@ -58,14 +57,6 @@ def _write_stillmap(recording: Recording, path: Path, overwrite: bool) -> list[s
     return []
 
 
-def _write_carmen(recording: Recording, path: Path, overwrite: bool) -> list[str]:  # noqa: ARG001
-    return write_log(recording, path)
-
-
-def _write_bag(kind: BagKind, recording: Recording, path: Path, overwrite: bool) -> list[str]:
-    return write_recording(recording, path, kind, overwrite=overwrite)
-
-
 def _write_scans(
     write: Callable[..., None], recording: Recording, path: Path, overwrite: bool
 ) -> list[str]:
@@ -78,11 +69,9 @@ def _write_kitti(recording: Recording, path: Path, overwrite: bool) -> list[str]
     losses = _write_scans(kitti.write, recording, path, overwrite)
     if recording.T_odom_base is None:
         return losses
-    has_poses = recording.T_recorded_base is not None
-    return [
-        "its odometry readings are left out" if has_poses else "its odometry is written as poses",
-        *losses,
-    ]
+    if recording.T_recorded_base is None:
+        return ["its odometry is written as poses", *losses]
+    return ["its odometry readings are left out", *losses]
 
 
 def _write_cloud(
@@ -115,19 +104,24 @@ WRITERS = (
         tuple(_OPTIONAL_FIELDS),
     ),
     Writer(
-        "ros2", "a ROS 2 bag folder", (), "metadata.yaml", partial(_write_bag, "ros2"), _ODOMETRY
+        "ros2",
+        "a ROS 2 bag folder",
+        (),
+        "metadata.yaml",
+        partial(write_bag, kind="ros2"),
+        _ODOMETRY,
     ),
     Writer(
         "carmen",
         "a CARMEN log",
         (".log", ".clf", ".txt", ".log.gz", ".clf.gz", ".txt.gz"),
         "",
-        _write_carmen,
+        lambda recording, path, overwrite: write_log(recording, path),  # noqa: ARG005
         _ODOMETRY,
     ),
-    Writer("bag", "a ROS 1 bag", (".bag",), "", partial(_write_bag, "bag"), _ODOMETRY),
-    Writer("db3", "a ROS 2 bag file", (".db3",), "", partial(_write_bag, "db3"), _ODOMETRY),
-    Writer("mcap", "an MCAP file", (".mcap",), "", partial(_write_bag, "mcap"), _ODOMETRY),
+    Writer("bag", "a ROS 1 bag", (".bag",), "", partial(write_bag, kind="bag"), _ODOMETRY),
+    Writer("db3", "a ROS 2 bag file", (".db3",), "", partial(write_bag, kind="db3"), _ODOMETRY),
+    Writer("mcap", "an MCAP file", (".mcap",), "", partial(write_bag, kind="mcap"), _ODOMETRY),
     Writer("kitti", "a KITTI folder", (), kitti.MARKER, _write_kitti, _POSES + _ODOMETRY),
     Writer(
         "pcd", "a folder of PCD files", (), pcd.MARKER, partial(_write_scans, pcd.write), _POSES
@@ -164,11 +158,9 @@ def find_writer(path: Path, name: str | None = None) -> Writer:
             return writer
     if name or path.suffix:
         known = ", ".join(end for writer in WRITERS for end in writer.endings)
-        raise InputError(
-            f"no format is called or ends in {name or path.suffix!r}",
-            where=str(path),
-            hint=f"{known}, or a folder without an ending",
-        )
+        what = f"no format is called or ends in {name or path.suffix!r}"
+        hint = f"{known}, or a folder without an ending"
+        raise InputError(what, where=str(path), hint=hint)
     return WRITERS[0]
 
 
@@ -194,8 +186,13 @@ def write(
     require_free(path, writer, overwrite)
     if not recording.n_scans:
         raise InputError("holds no scan: there is nothing to write")
+    lost = [
+        f"its {words} are left out"
+        for field, words in _OPTIONAL_FIELDS.items()
+        if getattr(recording, field) is not None and field not in writer.fields
+    ]
     try:
-        return [*_unsupported_fields(recording, writer), *writer.write(recording, path, overwrite)]
+        return [*lost, *writer.write(recording, path, overwrite=overwrite)]
     except InputError as error:
         raise InputError(error.what, where=error.where or str(path), hint=error.hint) from error
 
@@ -210,11 +207,3 @@ def require_free(path: Path, writer: Writer, overwrite: bool) -> None:
         require_new(path, writer.marker, overwrite)
     else:
         require_new_file(path, overwrite)
-
-
-def _unsupported_fields(recording: Recording, writer: Writer) -> list[str]:
-    return [
-        f"its {words} are left out"
-        for field, words in _OPTIONAL_FIELDS.items()
-        if getattr(recording, field) is not None and field not in writer.fields
-    ]

@@ -1,7 +1,7 @@
 """Finds the extrinsics, mounting and declared ranges of the lasers of a CARMEN log."""
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,9 +28,6 @@ class Extrinsics(NamedTuple):
     def matrix(self) -> NDArray[np.float64]:
         """(3, 3) T_base_sensor."""
         return se2.matrix(self.x, self.y, self.theta)
-
-    def to_dict(self) -> dict[str, Any]:
-        return self._asdict()
 
 
 def find_extrinsics(

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.errors import InputError
-from stillmap.core.files import atomic_file
 from stillmap.core.recording import Recording
 from stillmap.io.carmen.log import (
     BYTE_ORDER_MARK,
@@ -19,7 +18,7 @@ from stillmap.io.carmen.log import (
     select_scans,
 )
 from stillmap.io.carmen.messages import SCAN_PARSERS
-from stillmap.io.text_lines import is_gzip_name, open_for_writing, read_lines
+from stillmap.io.text_lines import read_lines, write_atomically
 from stillmap.preprocessing.max_range import find_max_range
 from stillmap.preprocessing.options import MAX_PLAUSIBLE_RANGE
 
@@ -66,7 +65,7 @@ def write_filtered_log(
         for sensor, notes in zip(sensors, recording.source["sensors"], strict=True)
     ]
     scans = omitted = 0
-    with atomic_file(out) as work, open_for_writing(work, compress=is_gzip_name(out)) as file:
+    with write_atomically(out) as file:
         for line in read_lines(source):
             t = scan_of.get(line.number)
             if t is not None:

@@ -54,9 +54,9 @@ class LaserLog:
         self.host_is_number.append(scan.host_is_number)
         self.ranges.extend(scan.ranges)
         self.config.append(self.configs.setdefault(scan.config, len(self.configs)))
-        if scan.laser_pose is not None and scan.robot_pose is not None:
+        if scan.poses is not None:
             self.has_poses = True
-            self.poses.extend(scan.laser_pose + scan.robot_pose)
+            self.poses.extend(scan.poses)
 
     def typical_count(self) -> int:
         """The most frequent number of readings per scan, the larger of equally frequent ones."""

@@ -17,6 +17,7 @@ Source: the header that CARMEN's logger writes, and logs: the header omits ROBOT
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 from stillmap.core.timestamps import parse_ns
@@ -47,20 +48,19 @@ class ScanConfig(NamedTuple):
 
 
 class ScanLine(NamedTuple):
-    """A laser line. Poses are (x, y, theta), None for kinds of lines without them."""
+    """A laser line. `poses` are x, y, theta of laser and robot, None for kinds without them."""
 
     stamp_ns: int
     ranges: list[float]
     config: ScanConfig
-    laser_pose: tuple[float, float, float] | None
-    robot_pose: tuple[float, float, float] | None
+    poses: tuple[float, ...] | None
     stamp_fields: int  # 1 to 3: how many of `ipc_timestamp hostname logger_timestamp` are present
     host_is_number: bool  # in a log with named hosts a sign of shifted fields
 
 
 class OdometryLine(NamedTuple):
     stamp_ns: int
-    pose: tuple[float, float, float]
+    pose: tuple[float, ...]
     stamp_fields: int
 
 
@@ -86,30 +86,22 @@ def parse_flaser(fields: list[bytes]) -> ScanLine:
         raise BadRecord(WRONG_COUNT)
     ranges = _parse_numbers(fields[1 : 1 + n])
     stamp_ns = _parse_stamp(tail[6])
-    poses = _parse_pose(tail[0:3]), _parse_pose(tail[3:6])
-    return ScanLine(stamp_ns, ranges, flaser_config(n), *poses, *_stamp_form(tail[6:]))
+    poses = _parse_pose(tail[0:3]) + _parse_pose(tail[3:6])
+    return ScanLine(stamp_ns, ranges, flaser_config(n), poses, *_stamp_form(tail[6:]))
 
 
-def parse_rawlaser(fields: list[bytes]) -> ScanLine:
-    """Parse RAWLASER1-4, see `parse_flaser`."""
-    ranges, config, tail = _parse_scan(fields, 0)
-    return ScanLine(_parse_stamp(tail[0]), ranges, config, None, None, *_stamp_form(tail))
+def parse_with_header(fields: list[bytes], n_fixed: int) -> ScanLine:
+    """Parse RAWLASER1-4 and ROBOTLASER1-2, see `parse_flaser`.
 
-
-def parse_robotlaser(fields: list[bytes]) -> ScanLine:
-    """Parse ROBOTLASER1-2, see `parse_flaser`."""
-    ranges, config, tail = _parse_scan(fields, 11)
-    stamp_ns = _parse_stamp(tail[11])
-    poses = _parse_pose(tail[0:3]), _parse_pose(tail[3:6])
-    return ScanLine(stamp_ns, ranges, config, *poses, *_stamp_form(tail[11:]))
-
-
-def _parse_scan(fields: list[bytes], n_fixed: int) -> tuple[list[float], ScanConfig, list[bytes]]:
-    """Header and readings of RAWLASER and ROBOTLASER, and `n_fixed` fields with the stamp."""
+    `n_fixed` fields, none or those from the poses on, stand between readings and stamp.
+    """
     n = _parse_count(fields, _HEADER_FIELDS)
     tail = _skip_remissions(fields[_HEADER_FIELDS + 1 + n :], n_fixed)
     config = _parse_header(fields[:_HEADER_FIELDS], n)
-    return _parse_numbers(fields[_HEADER_FIELDS + 1 : _HEADER_FIELDS + 1 + n]), config, tail
+    ranges = _parse_numbers(fields[_HEADER_FIELDS + 1 : _HEADER_FIELDS + 1 + n])
+    stamp_ns = _parse_stamp(tail[n_fixed])
+    poses = _parse_pose(tail[0:3]) + _parse_pose(tail[3:6]) if n_fixed else None
+    return ScanLine(stamp_ns, ranges, config, poses, *_stamp_form(tail[n_fixed:]))
 
 
 def parse_odom(fields: list[bytes]) -> OdometryLine:
@@ -127,12 +119,8 @@ def parse_odom(fields: list[bytes]) -> OdometryLine:
 SCAN_PARSERS: dict[bytes, Callable[[list[bytes]], ScanLine]] = {
     b"FLASER": parse_flaser,
     b"RLASER": parse_flaser,
-    b"RAWLASER1": parse_rawlaser,
-    b"RAWLASER2": parse_rawlaser,
-    b"RAWLASER3": parse_rawlaser,
-    b"RAWLASER4": parse_rawlaser,
-    b"ROBOTLASER1": parse_robotlaser,
-    b"ROBOTLASER2": parse_robotlaser,
+    **{b"RAWLASER%d" % number: partial(parse_with_header, n_fixed=0) for number in (1, 2, 3, 4)},
+    **{b"ROBOTLASER%d" % number: partial(parse_with_header, n_fixed=11) for number in (1, 2)},
 }
 
 
@@ -196,12 +184,12 @@ def _parse_numbers(fields: list[bytes]) -> list[float]:
     return values
 
 
-def _parse_pose(fields: list[bytes]) -> tuple[float, float, float]:
-    x, y, theta = _parse_numbers(fields)
+def _parse_pose(fields: list[bytes]) -> tuple[float, ...]:
+    pose = tuple(_parse_numbers(fields))
     # written so that NaN fails too
-    if not (abs(x) < _MAX_POSE and abs(y) < _MAX_POSE and abs(theta) < _MAX_POSE):
+    if not all(abs(value) < _MAX_POSE for value in pose):
         raise BadRecord(BAD_POSE)
-    return x, y, theta
+    return pose
 
 
 def _parse_stamp(field: bytes) -> int:

@@ -19,6 +19,8 @@ from stillmap.io.text_lines import is_gzip
 from stillmap.preprocessing import max_range
 from stillmap.preprocessing.options import LaserOptions, ReadOptions
 
+_Beams = tuple[NDArray[np.float32], NDArray[np.bool_]]  # points (..., 2) in the sensor frame, hits
+
 
 def read(path: Path, context: ReadContext) -> Recording:
     """Read a CARMEN log.
@@ -56,18 +58,11 @@ def _build_recording(sensors: list[Sensor], log: CarmenLog, options: ReadOptions
     warnings = skipped.loss_warnings(sum(len(s.stamp_ns) for s in sensors))
     parts, poses, infos = [], [], []
     for number, sensor in enumerate(sensors):
-        pose, more = extrinsics.find_extrinsics(sensor.laser, sensor.poses, log.params)
-        given = options.laser(number)
-        pose = extrinsics.override(pose, given)
-        upside_down = extrinsics.find_upside_down(sensor.laser.kind, log.params, given)
-        angles = _find_angles(sensor, log, given, upside_down[0], more)
-        points, hit, rule = _convert_readings(sensor, angles, log, options, more)
-        parts.append((points, hit))
-        poses.append(pose)
-        infos.append(_sensor_info(sensor, pose, angles, upside_down, rule))
-        warnings += more
-    odometry, odometry_info = _find_odometry(sensors, log)
-    warnings += odometry_info.pop("warnings")
+        part, pose, info = _convert_sensor(sensor, log, options, options.laser(number), warnings)
+        parts.append(part)
+        poses.append(pose.matrix())
+        infos.append(info)
+    odometry, odometry_info = _find_odometry(sensors, log, warnings)
     sensor_of = np.repeat(np.arange(len(sensors)), [len(s.stamp_ns) for s in sensors])
     stamp_ns = np.concatenate([s.stamp_ns for s in sensors])
     order = scan_order(sensors)
@@ -80,7 +75,7 @@ def _build_recording(sensors: list[Sensor], log: CarmenLog, options: ReadOptions
         offset=offset,
         points=points,
         hit=hit,
-        T_base_sensor=np.stack([pose.matrix() for pose in poses]),
+        T_base_sensor=np.stack(poses),
         sensor=sensor_of[order].astype(np.int32),
         T_odom_base=None if odometry is None else se2.matrix(*odometry[order].T),
         source={
@@ -97,10 +92,49 @@ def _build_recording(sensors: list[Sensor], log: CarmenLog, options: ReadOptions
     )
 
 
+def _convert_sensor(
+    sensor: Sensor,
+    log: CarmenLog,
+    options: ReadOptions,
+    given: LaserOptions,
+    warnings: list[str],
+) -> tuple[_Beams, Extrinsics, dict[str, Any]]:
+    """End points and hits of a laser, its pose on the robot, and notes for `source`."""
+    kind = sensor.laser.kind
+    pose, more = extrinsics.find_extrinsics(sensor.laser, sensor.poses, log.params)
+    pose = extrinsics.override(pose, given)
+    warnings += more
+    upside_down, upside_down_how = extrinsics.find_upside_down(kind, log.params, given)
+    angles = _find_angles(sensor, log, given, warnings)
+    if upside_down:
+        angles = -angles
+    declared = extrinsics.find_max_range(sensor.laser, log.params)
+    rule, more = max_range.infer_range_rule(sensor.ranges, declared, options)
+    warnings += [f"{kind}: {text}" for text in more + _angle_warning(sensor)]
+    length, hit = max_range.apply_range_rule(sensor.ranges, rule)
+    angle = angles[:, :1] + angles[:, 1:] * np.arange(length.shape[1])
+    points = np.empty((*length.shape, 2), np.float32)
+    points[..., 0] = length * np.cos(angle)[sensor.config]
+    points[..., 1] = length * np.sin(angle)[sensor.config]
+    first, step = angles[int(np.bincount(sensor.config).argmax())]
+    info = {
+        "name": kind,
+        "scans": len(sensor.stamp_ns),
+        "beams_per_scan": sensor.ranges.shape[1],
+        "start_angle": float(first),
+        "angle_step": float(step),
+        "upside_down": upside_down,
+        "upside_down_how": upside_down_how,
+        "extrinsics": pose._asdict(),
+        "ranges": rule.to_dict(),
+    }
+    return (points, hit), pose, info
+
+
 def _find_angles(
-    sensor: Sensor, log: CarmenLog, given: LaserOptions, upside_down: bool, warnings: list[str]
+    sensor: Sensor, log: CarmenLog, given: LaserOptions, warnings: list[str]
 ) -> NDArray[np.float64]:
-    """(C, 2) first angle and step in radians, counterclockwise, of each of the laser's configs."""
+    """(C, 2) first angle and step in radians of each of the laser's configs, as declared."""
     angles = np.array([config[:2] for config in sensor.laser.configs])
     fov = extrinsics.find_field_of_view(sensor.laser.kind, log.params, given)
     if sensor.laser.kind in ("FLASER", "RLASER"):
@@ -109,27 +143,7 @@ def _find_angles(
     elif given.fov is not None:
         text = "its lines declare their angles: the given field of view is not used"
         warnings.append(f"{sensor.laser.kind}: {text}")
-    return -angles if upside_down else angles
-
-
-def _convert_readings(
-    sensor: Sensor,
-    angles: NDArray[np.float64],
-    log: CarmenLog,
-    options: ReadOptions,
-    warnings: list[str],
-) -> tuple[NDArray[np.float32], NDArray[np.bool_], max_range.RangeRule]:
-    """End points (T, n, 2) in the sensor frame, hits (T, n), and the range rule."""
-    declared = extrinsics.find_max_range(sensor.laser, log.params)
-    rule, more = max_range.infer_range_rule(sensor.ranges, declared, options)
-    more += _angle_warning(sensor)
-    warnings += [f"{sensor.laser.kind}: {text}" for text in more]
-    length, hit = max_range.apply_range_rule(sensor.ranges, rule)
-    angle = angles[:, :1] + angles[:, 1:] * np.arange(length.shape[1])
-    points = np.empty((*length.shape, 2), np.float32)
-    points[..., 0] = length * np.cos(angle)[sensor.config]
-    points[..., 1] = length * np.sin(angle)[sensor.config]
-    return points, hit, rule
+    return angles
 
 
 def _angle_warning(sensor: Sensor) -> list[str]:
@@ -145,10 +159,8 @@ def _angle_warning(sensor: Sensor) -> list[str]:
 
 
 def _interleave(
-    parts: list[tuple[NDArray[np.float32], NDArray[np.bool_]]],
-    sensor_of: NDArray[np.intp],
-    offset: NDArray[np.int64],
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    parts: list[_Beams], sensor_of: NDArray[np.intp], offset: NDArray[np.int64]
+) -> _Beams:
     """Points (M, 2) and hits (M,) of all sensors, in the order of the scans."""
     if len(parts) == 1:
         return parts[0][0].reshape(-1, 2), parts[0][1].reshape(-1)
@@ -161,7 +173,7 @@ def _interleave(
 
 
 def _find_odometry(
-    sensors: list[Sensor], log: CarmenLog
+    sensors: list[Sensor], log: CarmenLog, warnings: list[str]
 ) -> tuple[NDArray[np.float64] | None, dict[str, Any]]:
     """Robot poses (T, 3) at the scans of all sensors, one sensor after the other.
 
@@ -177,7 +189,7 @@ def _find_odometry(
         odom_ns = np.concatenate([sensors[i].stamp_ns for i in own])
         odom = np.concatenate(list(own.values()))
     if not len(odom):
-        return None, {"from": None, "outside": 0, "warnings": []}
+        return None, {"from": None, "outside": 0}
     poses, outside = [], 0
     for i, sensor in enumerate(sensors):
         if i in own:
@@ -189,34 +201,12 @@ def _find_odometry(
     out = np.concatenate(poses)
     interpolated = "ODOM lines" if len(log.odom_stamp_ns) else "other lasers' scan lines"
     kinds = (["scan lines"] if own else []) + ([interpolated] if len(own) < len(sensors) else [])
-    warnings = (
-        [f"{outside} scans outside the time of the odometry: nearest pose"] if outside else []
-    )
+    if outside:
+        warnings.append(f"{outside} scans outside the time of the odometry: nearest pose")
     if len(out) > 1 and not _moves(out):
         warnings.append("the odometry never moves")
-    return out, {"from": " and ".join(kinds), "outside": outside, "warnings": warnings}
+    return out, {"from": " and ".join(kinds), "outside": outside}
 
 
 def _moves(poses: NDArray[np.float64]) -> bool:
     return bool(np.any(poses != poses[0]))
-
-
-def _sensor_info(
-    sensor: Sensor,
-    pose: Extrinsics,
-    angles: NDArray[np.float64],
-    upside_down: tuple[bool, str],
-    rule: max_range.RangeRule,
-) -> dict[str, Any]:
-    first, step = angles[int(np.bincount(sensor.config).argmax())]
-    return {
-        "name": sensor.laser.kind,
-        "scans": len(sensor.stamp_ns),
-        "beams_per_scan": sensor.ranges.shape[1],
-        "start_angle": float(first),
-        "angle_step": float(step),
-        "upside_down": upside_down[0],
-        "upside_down_how": upside_down[1],
-        "extrinsics": pose.to_dict(),
-        "ranges": rule.to_dict(),
-    }

@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.errors import InputError
-from stillmap.core.files import atomic_file
 from stillmap.core.recording import Recording
 from stillmap.core.timestamps import format_seconds
 from stillmap.io.carmen.extrinsics import is_stated_by_lines
 from stillmap.io.carmen.messages import flaser_config
-from stillmap.io.text_lines import is_gzip_name, open_for_writing
+from stillmap.io.text_lines import write_atomically
 from stillmap.preprocessing import laser_scan
 from stillmap.preprocessing.max_range import MIN_ZERO_SHARE
 
@@ -85,7 +84,7 @@ def write_log(recording: Recording, path: Path) -> list[str]:
         InputError: such a log cannot hold the recording, or cannot be written.
     """
     form = _choose_format(recording)
-    with atomic_file(path) as work, open_for_writing(work, compress=is_gzip_name(path)) as file:
+    with write_atomically(path) as file:
         for line in format_lines(recording, form):
             file.write(line.encode("ascii"))
     if recording.beam_time is None:
@@ -209,11 +208,10 @@ def _declared_max_range(limit: laser_scan.RangeLimits) -> float:
 
 def _unusable_reading(recording: Recording, number: int) -> float:
     """Zero, as lasers report it; NaN where frequent zeros would mean maximum range."""
-    n_beams = n_unusable = 0
-    for t in recording.iter_scans(np.flatnonzero(recording.sensor == number).tolist()):
-        points = recording.points[recording.beams_of(t)]
-        n_beams += len(points)
-        n_unusable += int(np.count_nonzero(np.isnan(points[:, 0])))
+    scans, n_unusable = np.flatnonzero(recording.sensor == number), 0
+    n_beams = int(np.diff(recording.offset)[scans].sum())
+    for t in recording.iter_scans(scans.tolist()):
+        n_unusable += int(np.count_nonzero(np.isnan(recording.points[recording.beams_of(t), 0])))
     return 0.0 if n_unusable <= MIN_ZERO_SHARE * n_beams else math.nan
 
 

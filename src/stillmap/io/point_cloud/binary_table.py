@@ -3,7 +3,7 @@
 Counts in a header are checked against the size of the file before memory is allocated.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -95,6 +95,25 @@ def check_record_size(layout: TableLayout) -> None:
 def truncated_error(path: Path, found: int, expected: int) -> InputError:
     """The error for a file with fewer points than its header states."""
     return InputError(f"is truncated: {found} of {expected} points are there", where=str(path))
+
+
+def split_header(
+    path: Path, head: bytes, is_end: Callable[[list[str]], bool]
+) -> tuple[list[list[str]], int]:
+    """The words of each line of a header up to its last, and the byte offset of its end.
+
+    Raises:
+        InputError: `head`, the first bytes of the file, holds no last line.
+    """
+    lines: list[list[str]] = []
+    start = 0
+    while not (lines and is_end(lines[-1])):
+        end = head.find(b"\n", start)
+        if end < 0:
+            raise InputError("is truncated: its header does not end", where=str(path))
+        lines.append(head[start:end].decode("ascii", "replace").split())
+        start = end + 1
+    return lines, start
 
 
 def _read_records(layout: TableLayout, wanted: Sequence[str]) -> Iterator[list[NDArray[Any]]]:

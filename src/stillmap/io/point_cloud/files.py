@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 import scipy  # its parts load when they are first used
@@ -248,8 +248,6 @@ def embed_in_3d(T: NDArray[np.float64]) -> NDArray[np.float64]:
     return out
 
 
-_Number = TypeVar("_Number", np.float32, np.float64)
-
 _BLOCK = 1 << 20  # beams transformed at once
 
 
@@ -296,7 +294,7 @@ def iter_map_points(
         yield _to_3d(recording.end_points(hit, T_map_base))
 
 
-def _to_3d(points: NDArray[_Number]) -> NDArray[_Number]:
+def _to_3d(points: NDArray[Any]) -> NDArray[Any]:
     if points.shape[1] == 3:
         return points
     return np.column_stack([points, np.zeros(len(points), points.dtype)])

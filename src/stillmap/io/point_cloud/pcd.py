@@ -22,6 +22,7 @@ from stillmap.io.point_cloud.binary_table import (
     TableLayout,
     check_record_size,
     read_columns,
+    split_header,
     truncated_error,
 )
 from stillmap.io.point_cloud.files import (
@@ -63,7 +64,7 @@ def is_pcd(head: bytes) -> bool:
     """Whether the first bytes of a file are a PCD header."""
     for line in head[:_MAX_HEADER].splitlines():
         words = line.split()
-        if words and words[0] != b"#" and not words[0].startswith(b"#"):
+        if words and not words[0].startswith(b"#"):
             return words[0] in (b"VERSION", b"FIELDS")
         if words[1:2] == [b".PCD"] or words[:1] == [b"#.PCD"]:
             return True
@@ -81,18 +82,10 @@ def read_header(path: Path) -> PcdHeader:
         head = file.read(_MAX_HEADER)
     if not is_pcd(head):
         raise InputError("is no PCD file", where=str(path))
-    entries: dict[str, list[str]] = {}
-    at = lines = 0
-    while "DATA" not in entries:
-        end = head.find(b"\n", at)
-        if end < 0:
-            raise InputError("is truncated: its header does not end", where=str(path))
-        words = head[at:end].decode("ascii", "replace").split()
-        at, lines = end + 1, lines + 1
-        if words and not words[0].startswith("#"):
-            entries[words[0]] = words[1:]
+    lines, start = split_header(path, head, lambda words: words[:1] == ["DATA"])
+    entries = {words[0]: words[1:] for words in lines if words and not words[0].startswith("#")}
     try:
-        return _parse_header(path, entries, at, lines)
+        return _parse_header(path, entries, start, len(lines))
     except (ValueError, KeyError, IndexError) as error:
         raise InputError(f"is damaged: its header: {error}", where=str(path)) from error
 
@@ -111,9 +104,8 @@ def _parse_header(path: Path, entries: dict[str, list[str]], start: int, lines: 
     if kind not in ("ascii", "binary", "binary_compressed"):
         raise ValueError(f"DATA {kind[:20]}")
     layout = TableLayout(path, fields, rows, start, lines, kind == "ascii")
-    return PcdHeader(
-        layout, _parse_viewpoint(entries.get("VIEWPOINT")), kind == "binary_compressed"
-    )
+    T = _parse_viewpoint(entries.get("VIEWPOINT"))
+    return PcdHeader(layout, T, kind == "binary_compressed")
 
 
 def _parse_viewpoint(words: list[str] | None) -> NDArray[np.float64] | None:

@@ -13,7 +13,7 @@ from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_file, require_new_file
 from stillmap.core.recording import Recording
 from stillmap.io.builder import ReadContext
-from stillmap.io.point_cloud.binary_table import Field, TableLayout, read_columns
+from stillmap.io.point_cloud.binary_table import Field, TableLayout, read_columns, split_header
 from stillmap.io.point_cloud.files import iter_map_points, require_nonempty_file
 from stillmap.io.point_cloud.scans import Cloud, Origin, read_clouds
 
@@ -53,26 +53,13 @@ def read_layout(path: Path) -> TableLayout:
     require_nonempty_file(path)
     with path.open("rb") as file:
         head = file.read(_MAX_HEADER)
-    lines, start = _split_header(head, path)
+    lines, start = split_header(path, head, lambda words: words == ["end_header"])
+    if lines[0] != ["ply"]:
+        raise InputError("is no PLY file", where=str(path))
     try:
         return _parse_header(path, lines, start)
     except (ValueError, KeyError, IndexError) as error:
         raise InputError(f"is damaged: its header: {error}", where=str(path)) from error
-
-
-def _split_header(head: bytes, path: Path) -> tuple[list[list[str]], int]:
-    """The header's lines as words, and the byte offset of its end."""
-    lines: list[list[str]] = []
-    at = 0
-    while lines[-1:] != [["end_header"]]:
-        end = head.find(b"\n", at)
-        if end < 0:
-            raise InputError("is truncated: its header does not end", where=str(path))
-        lines.append(head[at:end].decode("ascii", "replace").split())
-        at = end + 1
-    if lines[0] != ["ply"]:
-        raise InputError("is no PLY file", where=str(path))
-    return lines, at
 
 
 def _parse_header(path: Path, lines: list[list[str]], start: int) -> TableLayout:

@@ -155,7 +155,11 @@ class _ScanBuilder:
     def add(self, number: int, stamp_ns: int | None, cloud: Cloud) -> None:
         points = cloud.points
         if self._gathered is None:
-            self._clock = self._detect_clock(cloud)
+            if cloud.times is not None:
+                self._clock = detect_clock(cloud.times[_usable_mask(points)], self._period)
+                if self._clock is None:
+                    text = "the time field is ignored: no unit gives a plausible duration of a scan"
+                    self._info.warnings.append(text)
             timed = self._clock is not None
             self._gathered = RecordingBuilder(3, self._context, beam_times=timed)
         stamp_ns = cloud.stamp_ns if stamp_ns is None else stamp_ns
@@ -169,15 +173,6 @@ class _ScanBuilder:
             self._without_stamp += 1
         self._gathered.add_scan(stamp_ns, points, beam_time=beam_time)
         self._poses.append(cloud.T)
-
-    def _detect_clock(self, cloud: Cloud) -> Clock | None:
-        if cloud.times is None:
-            return None
-        clock = detect_clock(cloud.times[_usable_mask(cloud.points)], self._period)
-        if clock is None:
-            what = "the time field is ignored: no unit gives a plausible duration of a scan"
-            self._info.warnings.append(what)
-        return clock
 
     def recording(self, skipped: SkippedRecords, **more: Any) -> Recording:
         assert self._gathered is not None

@@ -109,11 +109,9 @@ def _list_files(folder: Path) -> list[Path]:
         return present
     missing = [path.name for path in paths if path not in present]
     if missing:
-        raise InputError(
-            f"lacks the file {missing[0]!r} that its metadata.yaml names",
-            where=str(folder),
-            hint="without metadata.yaml the files that are there are read",
-        )
+        what = f"lacks the file {missing[0]!r} that its metadata.yaml names"
+        hint = "without metadata.yaml the files that are there are read"
+        raise InputError(what, where=str(folder), hint=hint)
     return paths or present
 
 

@@ -147,11 +147,13 @@ def new_bag(
             with _sqlite_errors(path), rosbag1.Writer(work) as writer1:
                 yield BagWriter(kind, writer1)
             return
-        # the ROS 2 writer of rosbags creates a folder, and names its files after it
-        scratch = stack.enter_context(_scratch_folder(path))
+        # the ROS 2 writer of rosbags creates a folder, and names its files after it: on this disk
+        beside = tempfile.TemporaryDirectory(
+            prefix=f".{path.name}.", suffix=".part", dir=path.absolute().parent
+        )
         mcap |= kind == "mcap"
         plugin = rosbag2.StoragePlugin.MCAP if mcap else rosbag2.StoragePlugin.SQLITE3
-        folder = scratch / (path.stem if kind != "ros2" else path.name)
+        folder = Path(stack.enter_context(beside), path.stem if kind != "ros2" else path.name)
         writer2 = rosbag2.Writer(folder, version=_VERSION, storage_plugin=plugin)
         if mcap:
             compression = rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD
@@ -172,18 +174,9 @@ def require_stamps(first_ns: int, last_ns: int, kind: BagKind) -> None:
         InputError: they are negative or too late.
     """
     if first_ns < 0 or last_ns >= _MAX_SECONDS[kind] * 10**9:
-        raise InputError(
-            f"stamps from {first_ns / 1e9:.0f} to {last_ns / 1e9:.0f} s do not fit into a ROS bag",
-            hint=f"0 to {_MAX_SECONDS[kind]} s",
-        )
-
-
-@contextmanager
-def _scratch_folder(path: Path) -> Iterator[Path]:
-    """A temporary folder beside `path`, on the same disk."""
-    where = path.absolute().parent
-    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", suffix=".part", dir=where) as name:
-        yield Path(name)
+        span = f"stamps from {first_ns / 1e9:.0f} to {last_ns / 1e9:.0f} s"
+        hint = f"0 to {_MAX_SECONDS[kind]} s"
+        raise InputError(f"{span} do not fit into a ROS bag", hint=hint)
 
 
 @contextmanager

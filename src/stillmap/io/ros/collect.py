@@ -34,21 +34,14 @@ class TopicSelection(NamedTuple):
     """Topics by their use.
 
     Attributes:
-        lasers, clouds: topics of scans; one of the two is empty.
-        tf, odometry, images: further topics.
+        uses: "scans", "images", "transforms" or "odometry", by topic.
+        has_clouds: whether scans are point clouds.
         notes: type, number of messages and use of every topic of the bag.
     """
 
-    lasers: set[str]
-    clouds: set[str]
-    tf: set[str]
-    odometry: set[str]
-    images: set[str]
+    uses: dict[str, str]
+    has_clouds: bool
     notes: list[dict[str, Any]]
-
-    @property
-    def all(self) -> set[str]:
-        return self.lasers | self.clouds | self.tf | self.odometry | self.images
 
 
 def select_topics(bag: Bag, options: ReadOptions) -> TopicSelection:
@@ -64,22 +57,14 @@ def select_topics(bag: Bag, options: ReadOptions) -> TopicSelection:
     scans = [c for c in scans if c.topic not in tilting]
     if not scans:
         raise InputError(_describe_lack_of_scans(bag.channels), hint=_list_topics(bag.channels))
-
-    def topics(*types: str) -> set[str]:
-        return {c.topic for c in usable if c.type in types}
-
-    lasers = {c.topic for c in scans if c.type != POINT_CLOUD}
-    clouds = set() if lasers else {c.topic for c in scans}
-    selection = TopicSelection(
-        lasers=lasers,
-        clouds=clouds,
-        tf=topics(TF, ROS1_TF),
-        odometry=topics(ODOMETRY),
-        images=topics(IMAGE, COMPRESSED_IMAGE, CAMERA_INFO) if clouds else set(),
-        notes=[],
-    )
-    selection.notes.extend(_describe_topic(c, selection, tilting) for c in bag.channels)
-    return selection
+    lasers = [c for c in scans if c.type != POINT_CLOUD]
+    further = {"odometry": (ODOMETRY,), "transforms": (TF, ROS1_TF)}
+    if not lasers:
+        further["images"] = (IMAGE, COMPRESSED_IMAGE, CAMERA_INFO)
+    uses = {c.topic: use for use, types in further.items() for c in usable if c.type in types}
+    uses |= dict.fromkeys((c.topic for c in lasers or scans), "scans")
+    notes = [_describe_topic(c, uses.get(c.topic), tilting) for c in bag.channels]
+    return TopicSelection(uses, not lasers, notes)
 
 
 def _find_named(usable: list[Channel], bag: Bag, options: ReadOptions) -> list[Channel]:
@@ -118,16 +103,7 @@ def _list_topics(channels: list[Channel]) -> str:
     return f"topics with scans: {listed}" if of_scans else f"it has {listed}"
 
 
-def _describe_topic(
-    channel: Channel, selection: TopicSelection, tilting: set[str]
-) -> dict[str, Any]:
-    uses = {
-        "scans": selection.lasers | selection.clouds,
-        "transforms": selection.tf,
-        "odometry": selection.odometry,
-        "images": selection.images,
-    }
-    use = next((use for use, topics in uses.items() if channel.topic in topics), None)
+def _describe_topic(channel: Channel, use: str | None, tilting: set[str]) -> dict[str, Any]:
     is_relevant = channel.type in (*_SCAN_TYPES, ODOMETRY, TF, ROS1_TF)
     fault = find_fault(channel) if is_relevant else None
     if channel.n_messages == 0:
@@ -184,29 +160,26 @@ def collect_messages(bag: Bag, selection: TopicSelection, context: ReadContext) 
         DamagedBagError: an indexed bag is damaged.
     """
     content = BagContent(LaserCollector(context.scratch), CloudCollector(context), ImageCollector())
-    total = sum(c.n_messages for c in bag.channels if c.topic in selection.all)
-    for number, message in enumerate(bag.messages(selection.all), start=1):
-        topic = message.channel.topic
+    scans = content.clouds if selection.has_clouds else content.lasers
+    total = sum(c.n_messages for c in bag.channels if c.topic in selection.uses)
+    for number, message in enumerate(bag.messages(set(selection.uses)), start=1):
+        use = selection.uses[message.channel.topic]
         count_output(len(message.raw))
-        if topic in selection.lasers:
-            content.lasers.add_message(message)
-        elif topic in selection.clouds:
-            content.clouds.add_message(message)
-        elif topic in selection.images:
+        if use == "scans":
+            scans.add_message(message)
+        elif use == "images":
             content.images.add_message(message)
         else:
-            _add_pose(content, message, selection, number)
+            _add_pose(content, message, use, number)
         if context.progress is not None and number % _PROGRESS_INTERVAL == 0:
             context.progress(min(number / max(total, 1), 1.0))
     return content
 
 
-def _add_pose(
-    content: BagContent, message: Message, selection: TopicSelection, number: int
-) -> None:
+def _add_pose(content: BagContent, message: Message, use: str, number: int) -> None:
     topic = message.channel.topic
     try:
-        if topic in selection.tf:
+        if use == "transforms":
             static = topic.rpartition("/")[2] == "tf_static"
             content.transforms.add_message(decode(message), static=static)
         else:

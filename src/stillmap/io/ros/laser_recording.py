@@ -116,7 +116,7 @@ def _find_mountings(
             "angle_step": sign * shape.angle_increment,
             "upside_down": upside_down,
             "upside_down_how": upside_down_how,
-            "extrinsics": pose.to_dict(),
+            "extrinsics": pose._asdict(),
             "places": len(flat),
         }
         out.append(_Mounting(flat, upside_down, notes))
@@ -154,10 +154,9 @@ def build_tilting_recording(content: BagContent, context: ReadContext) -> Record
     if len(lasers.scans) > 1:
         raise InputError(f"{scans.topic}: scans of several lasers: only one can tilt")
     if _largest_rotation(T_base_sensor) < _MIN_TILT:
-        raise InputError(
-            f"{scans.topic}: {scans.frame!r} does not tilt in {poses.base!r}",
-            hint="transforms must say how the joint moves, as robot_state_publisher does",
-        )
+        hint = "transforms must say how the joint moves, as robot_state_publisher does"
+        what = f"{scans.topic}: {scans.frame!r} does not tilt in {poses.base!r}"
+        raise InputError(what, hint=hint)
     rule, more = scan_beams.find_range_rule(scans, context.options)
     beams = scan_beams.convert_to_beams([scans], [rule], [False], scratch)
     points, n_lost = _convert_to_3d(content, poses.base, scans, beams, T_base_sensor, scratch)

@@ -25,7 +25,6 @@ REPEATED = "scan that was recorded twice"
 
 _TURN = 2.0 * math.pi
 _MAX_READINGS = 1 << 20
-_BUFFER = 256  # scans
 
 
 class ScanShape(NamedTuple):
@@ -72,7 +71,6 @@ class _ScanBuffer:
         self.shape = array("i")
         self.shapes: dict[ScanShape, int] = {}
         self._ranges = ArrayBuilder(np.float32, (), scratch)
-        self._pending: list[NDArray[np.float32]] = []
 
     def add(
         self, message: Any, ranges: NDArray[np.float32], log_ns: int, number: int
@@ -86,27 +84,17 @@ class _ScanBuffer:
             message.range_max,
             message.time_increment,
         )
-        if shape not in self.shapes:
-            fault = shape.find_fault()
-            if fault is not None:
-                return fault
+        if shape not in self.shapes and (fault := shape.find_fault()) is not None:
+            return fault
         self.shape.append(self.shapes.setdefault(shape, len(self.shapes)))
         self.stamp_ns.append(stamp_ns(message.header))
         self.log_ns.append(log_ns)
         self.number.append(number)
-        self._pending.append(ranges)
-        if len(self._pending) >= _BUFFER:
-            self._flush()
+        self._ranges.append(ranges)
         return None
-
-    def _flush(self) -> None:
-        if self._pending:
-            self._ranges.append(np.concatenate(self._pending))
-            self._pending = []
 
     def finish(self, skipped: SkippedRecords) -> "LaserScans":
         """The scans with non-decreasing stamps, without repeated ones; others are counted."""
-        self._flush()
         ranges = self._ranges.finish()
         shapes = list(self.shapes)
         shape = np.asarray(self.shape, np.int32)

@@ -94,10 +94,8 @@ def decompress(compression: str, data: bytes) -> bytes:
     out = bytes(_DECOMPRESSORS[compression]().decompress(data, MAX_CHUNK + 1))
     count_output(len(out))
     if len(out) > MAX_CHUNK:
-        raise InputError(
-            f"a compressed part is larger than {MAX_CHUNK >> 20} MiB",
-            hint="a recording compressed in smaller chunks can be read",
-        )
+        what = f"a compressed part is larger than {MAX_CHUNK >> 20} MiB"
+        raise InputError(what, hint="a recording compressed in smaller chunks can be read")
     return out
 
 

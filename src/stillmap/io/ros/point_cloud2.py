@@ -36,10 +36,10 @@ def parse_cloud(message: Any) -> Cloud | str:
         return WRONG_SIZE
     time = time_field.find_time_column(fields)
     kept = [name for name in ("x", "y", "z", time) if name in fields]
-    layout = {name: _layout(fields[name], bool(message.is_bigendian), step) for name in kept}
-    if any(layout.get(name) is None for name in "xyz"):
+    order = ">" if message.is_bigendian else "<"
+    known = {name: at for name in kept if (at := _layout(fields[name], order, step)) is not None}
+    if not known.keys() >= set("xyz"):
         return NO_COORDINATES
-    known = {name: where for name, where in layout.items() if where is not None}
     dtype = np.dtype(
         {
             "names": list(known),
@@ -66,11 +66,11 @@ def _times(
     return time_field.convert_times(values, usable, clock, stamp)[1]
 
 
-def _layout(field: Any, bigendian: bool, step: int) -> tuple[str, int] | None:
+def _layout(field: Any, order: str, step: int) -> tuple[str, int] | None:
     kind = _TYPES.get(int(field.datatype))
     if kind is None or int(field.offset) + int(kind[1]) > step:
         return None
-    return f"{'>' if bigendian else '<'}{kind}", int(field.offset)
+    return f"{order}{kind}", int(field.offset)
 
 
 class CloudCollector:

@@ -85,7 +85,7 @@ def list_scan_messages(bag: Bag, context: ReadContext) -> list[tuple[str, int]]:
         InputError: it holds no usable scan, or point clouds.
     """
     topics = select_topics(bag, context.options)
-    if topics.clouds:
+    if topics.has_clouds:
         raise InputError("holds point clouds: only beams of laser scans can be blanked")
     content = collect_messages(bag, topics, context)
     lasers = base_frame.select_lasers(content, context.options).scans
@@ -99,7 +99,7 @@ def _build_recording(
 ) -> Recording:
     topics = select_topics(bag, context.options)
     content = collect_messages(bag, topics, context)
-    if topics.clouds:
+    if topics.has_clouds:
         recording = _build_cloud_recording(content, context.options, reopen)
     else:
         recording = build(content, context)
