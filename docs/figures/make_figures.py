@@ -155,7 +155,7 @@ def draw_timeline(result: stillmap.Result) -> None:
         sharex="col",
         gridspec_kw={"height_ratios": (0.6, 1, 1)},
     )
-    titles = ("a cell of a wall", "a cell of the floor, in which somebody stopped")
+    titles = ("a cell of a wall", "a free cell, occupied by a person for a while")
     for column, centre, title in zip(axes.T, choose_cells(result), titles, strict=True):
         times, hits = observe(result, centre)
         _draw_cell(column, times, hits)
