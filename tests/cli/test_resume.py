@@ -14,7 +14,7 @@ import time
 import numpy as np
 import pytest
 
-from stillmap.pipeline import checkpoint, em_loop
+from stillmap.pipeline import checkpoint, result
 from stillmap.pipeline.em_loop import iterate
 from stillmap.results import labels
 
@@ -59,7 +59,7 @@ def stop_after(monkeypatch):
                     raise KeyboardInterrupt
                 yield iteration
 
-        monkeypatch.setattr(em_loop, "iterate", stopped if number < ALL else iterate)
+        monkeypatch.setattr(result, "iterate", stopped if number < ALL else iterate)
 
     return stop
 

@@ -9,7 +9,6 @@ import stillmap
 from stillmap import _core, em, slam
 from stillmap.core import se2
 from stillmap.core.config import override
-from stillmap.pipeline import em_loop
 from stillmap.pipeline import result as results
 from stillmap.pipeline.estimate import Estimate, Iteration, IterationRecord
 from stillmap.pipeline.options import Options
@@ -44,7 +43,7 @@ def build(monkeypatch, short):
                 share = changed[number - 1] if changed else 0.5 / number
                 yield made_up(recording, number, bound * recording.n_beams, share)
 
-        monkeypatch.setattr(em_loop, "iterate", fake)
+        monkeypatch.setattr(results, "iterate", fake)
         monkeypatch.setattr(results, "final_estimate", lambda scans, best, _: (scans, best, []))
         return stillmap.build(recording, chosen), len(asked)
 

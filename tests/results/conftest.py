@@ -267,7 +267,7 @@ def result():
     world = points @ np.swapaxes(poses[:, :2, :2], 1, 2) + poses[:, None, :2, 2]
     world = np.where(hit[..., None], world, np.nan).reshape(-1, 2)
     labels = {number: v.reshape(-1).astype(np.float32) for number, v in ((1, first), (3, e))}
-    window = choose_window(extent(maps[3]), maps[3].resolution, world, labels[3], 8.0)
+    window = choose_window(extent(maps[3]), maps[3].resolution, world[labels[3] < 0.5], 8.0)
     objects = made_up_objects(recording, e.reshape(-1), np.repeat(np.arange(T), N))
     return FakeResult(
         objects=objects,
@@ -281,7 +281,8 @@ def result():
             FakeIteration(4, -30950.0, float("nan"), 0.002, 1.7),
         ],
         snapshots=[
-            snapshot(n, maps[k], world, labels[k], window) for n, k in ((1, 1), (2, 1), (3, 3))
+            snapshot(n, maps[k], world[labels[k] < 0.5], window)
+            for n, k in ((1, 1), (2, 1), (3, 3))
         ],
         poses=poses,
         p_static=labels[3],

@@ -218,8 +218,14 @@ def write_npy(path: Path, array: NDArray[Any]) -> None:
     header = np.lib.format.header_data_from_array_1_0(np.empty((0, *array.shape[1:]), array.dtype))
     with path.open("wb") as file:
         np.lib.format.write_array_header_1_0(file, {**header, "shape": array.shape})
-        for block in iter_blocks(array):
-            file.write(np.ascontiguousarray(array[block]).reshape(-1).view(np.uint8).data)
+        for part in iter_bytes(array):
+            file.write(part)
+
+
+def iter_bytes(array: NDArray[Any]) -> Iterator[memoryview]:
+    """Yield the bytes of an array in C order, block by block."""
+    for block in iter_blocks(array):
+        yield np.ascontiguousarray(array[block]).reshape(-1).view(np.uint8).data
 
 
 def finite_rows(points: NDArray[Any]) -> NDArray[np.bool_]:

@@ -19,7 +19,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.arrays import iter_blocks, write_npy
+from stillmap.core.arrays import iter_bytes, write_npy
 from stillmap.core.errors import InputError
 from stillmap.core.profiling import StageTimer
 from stillmap.pipeline.checkpoint_files import pack_state, require_same_run, unpack_state
@@ -248,9 +248,8 @@ def _array(path: Path, about: Mapping[str, Any]) -> NDArray[Any]:
 
 def _checksum(array: NDArray[Any]) -> int:
     found = 0
-    for block in iter_blocks(array):
-        part = np.ascontiguousarray(array[block]).reshape(-1)
-        found = zlib.crc32(part.view(np.uint8).data, found)
+    for part in iter_bytes(array):
+        found = zlib.crc32(part, found)
     return found
 
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap import em
-from stillmap.core.arrays import iter_blocks
-from stillmap.core.config import to_dict
+from stillmap.core.arrays import iter_bytes
+from stillmap.core.config import iter_options
 from stillmap.core.errors import InputError
 from stillmap.core.json import to_jsonable
 from stillmap.core.recording import Recording
@@ -24,7 +24,6 @@ from stillmap.pipeline.options import Options
 Arrays = dict[str, NDArray[Any]]
 Float = NDArray[np.float64]
 
-_GRIDS = {2: _core.OccupancyGrid2D, 3: _core.OccupancyGrid3D}
 _NO_MATTER = ("threads",)  # options on which no byte of the result depends
 
 
@@ -59,7 +58,7 @@ def _pack(value: Any, name: str, arrays: Arrays, labels: Mapping[int, str]) -> A
         name = labels.get(id(value), name)
         arrays[name] = value
         return name
-    if isinstance(value, _core.OccupancyGrid2D | _core.OccupancyGrid3D):  # always empty here
+    if isinstance(value, em.Grid):  # always empty here
         return [2 if isinstance(value, _core.OccupancyGrid2D) else 3, value.resolution]
     if dataclasses.is_dataclass(value):
         return {
@@ -81,11 +80,6 @@ def _pack(value: Any, name: str, arrays: Arrays, labels: Mapping[int, str]) -> A
         }
     if isinstance(value, dict) and any(map(dataclasses.is_dataclass, value.values())):
         return {key: _pack(one, f"{name}.{key}", arrays, labels) for key, one in value.items()}
-    return to_plain(value)
-
-
-def to_plain(value: Any) -> Any:
-    """NumPy scalars as Python's own."""
     return value.item() if isinstance(value, np.generic) else value
 
 
@@ -94,10 +88,9 @@ def _unpack(hint: Any, value: Any, arrays: Mapping[str, Any]) -> Any:
     if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union:
         if value is None:
             return None
-        choices = [one for one in typing.get_args(hint) if one is not type(None)]
-        if choices[0] in _GRIDS.values():
-            return _GRIDS[value[0]](value[1])
-        [hint] = choices
+        if hint == em.Grid:
+            return em.make_grid(*value)
+        [hint] = (one for one in typing.get_args(hint) if one is not type(None))
     origin, parameters = typing.get_origin(hint), typing.get_args(hint)
     if origin is np.ndarray:
         return arrays[value]
@@ -148,10 +141,13 @@ def identify_run(recording: Recording, options: Options, poses: Float | None) ->
         "odometry": recording.T_odom_base,
         "given poses": poses,
     }
-    chosen = {name: value for name, value in to_dict(options).items() if name not in _NO_MATTER}
     return {
         "version": package_version(),
-        "options": to_jsonable(chosen),
+        "options": {
+            one.name: to_jsonable(one.value)
+            for one in iter_options(options)
+            if one.name not in _NO_MATTER
+        },
         "arrays": {name: None if a is None else _hash(a) for name, a in arrays.items()},
     }
 
@@ -167,7 +163,7 @@ def require_same_run(before: dict[str, Any], now: dict[str, Any], where: str) ->
     differ = []
     if before["version"] != now["version"]:
         differ.append(f"version {before['version']} made it, this is {now['version']}")
-    old, new = _flatten(before["options"]), _flatten(now["options"])
+    old, new = before["options"], now["options"]
     for name in sorted(old.keys() | new.keys()):
         if old.get(name) != new.get(name):
             differ.append(f"{name} was {old.get(name)!r}, is {new.get(name)!r}")
@@ -183,16 +179,6 @@ def require_same_run(before: dict[str, Any], now: dict[str, Any], where: str) ->
 
 def _hash(array: NDArray[Any]) -> str:
     found = hashlib.blake2b(f"{array.dtype.str} {array.shape}".encode(), digest_size=16)
-    for block in iter_blocks(array):
-        found.update(np.ascontiguousarray(array[block]).reshape(-1).view(np.uint8).data)
+    for part in iter_bytes(array):
+        found.update(part)
     return found.hexdigest()
-
-
-def _flatten(options: dict[str, Any], section: str = "") -> dict[str, Any]:
-    out: dict[str, Any] = {}
-    for key, value in options.items():
-        if isinstance(value, dict):
-            out |= _flatten(value, f"{section}{key}.")
-        else:
-            out[f"{section}{key}"] = value
-    return out

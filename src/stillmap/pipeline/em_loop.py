@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,42 +12,10 @@ from stillmap import em, slam
 from stillmap.core.parallel import limit_blas_threads, resolve_threads
 from stillmap.core.profiling import Progress, StageTimer, no_progress
 from stillmap.core.recording import Recording
-from stillmap.pipeline.estimate import EmState, Estimate, Iteration, IterationRecord
+from stillmap.pipeline.estimate import Estimate, Iteration, IterationRecord
 from stillmap.pipeline.options import DEFAULTS, Options, resolve_options
 
 Float = NDArray[np.float64]
-
-
-def run_em(
-    recording: Recording,
-    state: EmState,
-    *,
-    poses: Float | None = None,
-    progress: Progress = no_progress,
-    stages: StageTimer | None = None,
-    checkpoint: Callable[[EmState], None] | None = None,
-) -> EmState:
-    """Iterates until the bound stops improving; `state` keeps the best estimate.
-
-    Args:
-        recording, poses, progress, stages: see `iterate`.
-        state: of a new run, or of an interrupted one; updated in place.
-        checkpoint: called with the state after every iteration.
-    """
-    steps = iterate(
-        recording,
-        state.options,
-        poses=poses,
-        progress=progress,
-        stages=stages,
-        previous=state.latest,
-    )
-    while not state.converged and (iteration := next(steps, None)) is not None:
-        state.update(iteration)
-        del iteration  # its grid is large
-        if checkpoint is not None:
-            checkpoint(state)
-    return state
 
 
 def iterate(
@@ -89,14 +57,13 @@ def iterate(
     first = 1 if previous is None else previous.number + 1
     for number in range(first, em.max_iterations(options.estimator, options.em) + 1):
         started = time.perf_counter()
-        if previous is None:
-            e = em.initial_p_static(recording, options.estimator, options.em)  # e := p(c = 1)
-        else:
-            e = previous.p_static
+        e = (  # e := p(c = 1)
+            em.initial_p_static(recording, options.estimator, options.em)
+            if previous is None
+            else previous.p_static
+        )
         with stages.measure("m_step"), limit_blas_threads():  # (9)-(15)
-            m_step = _m_step(
-                recording, e, previous, options, poses, _with_iteration(progress, number)
-            )
+            m_step = _m_step(recording, e, previous, options, poses, progress)
             deskewed = slam.deskew_recording(recording, m_step.poses, options.slam, threads)
         progress("labelling beams", number, 0, 0)
         with stages.measure("e_step"):  # (6), and (8) or the occupancy HMM; the bound
@@ -133,16 +100,17 @@ def _m_step(
     before: Estimate | None,
     options: Options,
     poses: Float | None,
-    progress: slam.StepProgress,
+    progress: Progress,
 ) -> slam.MStepResult:
     """The most likely poses given e (9), and the sums of the map (10)-(15)."""
+    number = 1 if before is None else before.number + 1
     return slam.m_step(
         recording,
         e,
         options.slam,
         poses,
         resolve_threads(options.threads),
-        progress,
+        lambda stage, done, total: progress(stage, number, done, total),
         # labels change most in the first iteration; after the second, poses only need refinement
         initial=before.m_step if before is not None and before.number > 1 else None,
         earlier_poses=None if before is None else before.poses,
@@ -150,8 +118,3 @@ def _m_step(
         # (10) as printed counts beams up to their end
         free_space_margin=0.0 if options.estimator == "paper" else slam.FREE_SPACE_MARGIN,
     )
-
-
-def _with_iteration(progress: Progress, number: int) -> slam.StepProgress:
-    """The progress of one iteration's M-step."""
-    return lambda stage, done, total: progress(stage, number, done, total)

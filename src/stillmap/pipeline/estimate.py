@@ -104,11 +104,6 @@ class Iteration:
         """The map of this iteration, computed at every call; every beam counts. 2D only."""
         return em.make_occupancy_map(self.estimate.m_step.grid, self.estimate.e_step.occupied)
 
-    def crop_occupancy(self, box: em.GridWindow) -> em.OccupancyMap:
-        """The cells of a box of that map."""
-        e_step = self.estimate.e_step
-        return em.make_occupancy_map(self.estimate.m_step.grid, e_step.occupied, window=box)
-
 
 @dataclass
 class EmState:
@@ -171,15 +166,13 @@ class EmState:
         if not isinstance(grid, _core.OccupancyGrid2D):
             return
         points = sample_dynamic_points(iteration.deskewed, estimate.poses, estimate.p_static)
-        dynamic = np.zeros(len(points), dtype=np.float32)
         if self.window is None:
-            self.window = choose_window(_extent(grid), grid.resolution, points, dynamic)
+            self.window = choose_window(_extent(grid), grid.resolution, points)
         shown = {1, 2, self.require_best().number}  # and the last, whichever that will be
         self.snapshots = {n: s for n, s in self.snapshots.items() if n in shown}
-        part = iteration.crop_occupancy(_cells(self.window, grid.resolution))
-        self.snapshots[estimate.number] = snapshot(
-            estimate.number, part, points, dynamic, self.window
-        )
+        cells = _cells(self.window, grid.resolution)
+        part = em.make_occupancy_map(grid, estimate.e_step.occupied, window=cells)
+        self.snapshots[estimate.number] = snapshot(estimate.number, part, points, self.window)
 
 
 def _extent(grid: _core.OccupancyGrid2D) -> Window:

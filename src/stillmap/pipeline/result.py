@@ -15,7 +15,7 @@ from stillmap.core.profiling import Progress, StageTimer, no_progress
 from stillmap.core.recording import Recording
 from stillmap.mapping import Change
 from stillmap.pipeline.diagnostics import find_warnings
-from stillmap.pipeline.em_loop import run_em
+from stillmap.pipeline.em_loop import iterate
 from stillmap.pipeline.estimate import EmState, Estimate, IterationRecord
 from stillmap.pipeline.final_map import Maps, final_estimate, find_objects, make_maps
 from stillmap.pipeline.options import DEFAULTS, Options, resolve_options
@@ -150,7 +150,14 @@ def map_recording(
     state.single_pass = (
         recording.dimension == 3 and poses is not None and options.estimator == "stillmap"
     )
-    run_em(recording, state, poses=poses, progress=progress, stages=stages, checkpoint=checkpoint)
+    steps = iterate(
+        recording, options, poses=poses, progress=progress, stages=stages, previous=state.latest
+    )
+    while not state.converged and (iteration := next(steps, None)) is not None:
+        state.update(iteration)
+        del iteration  # its grid is large
+        if checkpoint is not None:
+            checkpoint(state)
     return _finish(state, recording, progress, stages)
 
 

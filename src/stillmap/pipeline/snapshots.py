@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.em.occupancy_grid import GridMap
-from stillmap.em.types import DYNAMIC_BELOW
 
 Window = tuple[float, float, float, float]
 Value = TypeVar("Value", np.float32, np.bool_)
@@ -39,26 +38,24 @@ def extent(occupancy: GridMap) -> Window:
 def choose_window(
     whole: Window,
     resolution: float,
-    points_world: NDArray[np.float64] | NDArray[np.float32],
-    p_static: NDArray[np.float32],
+    points: NDArray[np.float64] | NDArray[np.float32],
     size_m: float = 12.0,
 ) -> Window:
-    """The square of edge `size_m` that holds most dynamic end points, within the map's bounds.
+    """The square of edge `size_m` that holds most points, within the map's bounds.
 
     Args:
         whole: x0, y0, x1, y1 of the map in metres.
         resolution: edge of its cells in metres.
-        points_world: (M, 2) end points in the map frame; rows that are no hits are NaN.
-        p_static: (M,) their probabilities of being static.
+        points: (K, 2) end points of dynamic beams in the map frame.
         size_m: edge in metres; smaller where the map is smaller.
 
     Returns:
-        x0, y0, x1, y1 in metres. Without dynamic beams: the middle of the map.
+        x0, y0, x1, y1 in metres. Without points: the middle of the map.
     """
     x0, y0, x1, y1 = whole
     size = np.minimum(size_m, [x1 - x0, y1 - y0])
     low, high = np.array([x0, y0]), np.array([x1, y1]) - size
-    points = points_world[_dynamic_within(points_world, p_static, (x0, y0, x1, y1))]
+    points = points[_within(points, whole)]
     corner = (low + high) / 2
     if len(points):
         corner = np.clip(_densest(points, low, size_m) - size_m / 2, low, high)
@@ -71,13 +68,12 @@ def choose_window(
 def snapshot(
     number: int,
     occupancy: GridMap,
-    points_world: NDArray[np.float64] | NDArray[np.float32],
-    p_static: NDArray[np.float32],
+    points: NDArray[np.float64] | NDArray[np.float32],
     window: Window,
 ) -> Snapshot:
     """The part of iteration `number`'s map that lies in `window`; points as `choose_window`."""
     p_occupied, origin = cut(occupancy, window)
-    inside = np.flatnonzero(_dynamic_within(points_world, p_static, window))
+    inside = np.flatnonzero(_within(points, window))
     if len(inside) > _MOST_POINTS:
         inside = inside[np.arange(_MOST_POINTS) * len(inside) // _MOST_POINTS]
     return Snapshot(
@@ -85,7 +81,7 @@ def snapshot(
         p_occupied=p_occupied.copy(),
         origin=origin,
         resolution=float(occupancy.resolution),
-        dynamic_points=points_world[inside].astype(np.float32),
+        dynamic_points=points[inside].astype(np.float32),
     )
 
 
@@ -115,14 +111,10 @@ def cut_layer(
     return cells, origin
 
 
-def _dynamic_within(
-    points: NDArray[np.float64] | NDArray[np.float32],
-    p_static: NDArray[np.float32],
-    window: Window,
-) -> NDArray[np.bool_]:
+def _within(points: NDArray[np.float64] | NDArray[np.float32], window: Window) -> NDArray[np.bool_]:
     x0, y0, x1, y1 = window
-    inside = (points[:, 0] >= x0) & (points[:, 0] < x1) & (points[:, 1] >= y0)
-    return inside & (points[:, 1] < y1) & (p_static < DYNAMIC_BELOW)
+    x, y = points.T
+    return np.asarray((x >= x0) & (x < x1) & (y >= y0) & (y < y1))
 
 
 def _densest(
