@@ -69,10 +69,8 @@ def place_cameras(o: CameraOptions) -> tuple[Camera, ...]:
     out = []
     for k in range(o.count):
         turn = 2 * math.pi * k / o.count
-        sits = np.array([o.x, o.y, o.z])
-        T = lidar.make_pose(np.zeros(3), *np.array([0.0, 0.0, turn])) @ lidar.make_pose(
-            sits, *np.array([0.0, o.pitch, o.yaw])
-        )
+        sits = (o.x, o.y, o.z)
+        T = lidar.make_pose((0, 0, 0), 0, 0, turn) @ lidar.make_pose(sits, 0, o.pitch, o.yaw)
         T[:3, :3] = T[:3, :3] @ _AHEAD
         name = f"simulated camera {k}" if o.count > 1 else "simulated camera"
         distortion = np.array(o.distortion, np.float64)
@@ -89,12 +87,8 @@ def compute_pixel_rays(camera: Camera, right: float = 0.0, down: float = 0.0) ->
     """
     assert camera.K is not None
     u, v = np.arange(camera.width) + right, np.arange(camera.height) + down
-    bent = np.stack(
-        np.broadcast_arrays(
-            (u[None] - camera.K[0, 2]) / camera.K[0, 0],
-            (v[:, None] - camera.K[1, 2]) / camera.K[1, 1],
-        )
-    )
+    x, y = (u - camera.K[0, 2]) / camera.K[0, 0], (v - camera.K[1, 2]) / camera.K[1, 1]
+    bent = np.stack(np.meshgrid(x, y))
     xy = undistort(bent, camera.distortion) if len(camera.distortion) else bent
     rays = np.concatenate([xy, np.ones((1, *xy.shape[1:]))])
     return np.asarray(rays / np.linalg.norm(rays, axis=0))
@@ -110,12 +104,8 @@ def distort(xy: Float, distortion: Float) -> Float:
     x, y = xy
     rr = x * x + y * y
     radial = 1.0 + rr * (k1 + rr * (k2 + rr * k3))
-    return np.stack(
-        [
-            x * radial + 2.0 * p1 * x * y + p2 * (rr + 2.0 * x * x),
-            y * radial + p1 * (rr + 2.0 * y * y) + 2.0 * p2 * x * y,
-        ]
-    )
+    bent_x = x * radial + 2.0 * p1 * x * y + p2 * (rr + 2.0 * x * x)
+    return np.stack([bent_x, y * radial + p1 * (rr + 2.0 * y * y) + 2.0 * p2 * x * y])
 
 
 def undistort(shown: Float, distortion: Float) -> Float:
@@ -137,11 +127,8 @@ def undistort(shown: Float, distortion: Float) -> Float:
         if np.abs(left).max() < _TOLERANCE:
             break
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            xy = (
-                xy
-                + np.stack([yy * left[0] - across * left[1], xx * left[1] - across * left[0]])
-                / size
-            )
+            step = np.stack([yy * left[0] - across * left[1], xx * left[1] - across * left[0]])
+            xy = xy + step / size
     if not (np.abs(left).max() < _TOLERANCE and (size > 0).all() and (xx > 0).all()):
         hint = "a smaller camera.fov, or a larger camera.k2"
         raise InputError("the camera's lens does not reach the corners of its images", hint=hint)
@@ -182,7 +169,8 @@ class CameraSimulator:
         self._shots = ImageTimes.of(happening, o)
         cameras = place_cameras(o)
         # identical cameras
-        self._lenses = [_lens(cameras[0], *offset) for offset in _subpixel_offsets(o.antialias)]
+        steps = ((np.arange(o.antialias) + 0.5) / o.antialias - 0.5).tolist()
+        self._lenses = [_make_lens(cameras[0], right, down) for down in steps for right in steps]
         T_base_camera = np.stack([c.T_base_camera for c in cameras if c.T_base_camera is not None])
         moment = world.moment(self._shots.scan, self._shots.seconds)
         self.T_world_camera = world.T_world_base(moment) @ T_base_camera[self._shots.camera]
@@ -208,10 +196,10 @@ class CameraSimulator:
         With several rays per pixel, the mask shows a mover that any of them hits, and the distance
         is the least one.
         """
-        moving = self._moving(image)
-        parts = [
-            self._render_once(lens, self.T_world_camera[image], moving) for lens in self._lenses
-        ]
+        T, scan = self.T_world_camera[image], int(self._shots.scan[image])
+        moment = self._world.moment(np.array([scan]), self._shots.seconds[image : image + 1])
+        moving = self._world.carried.at(moment, scan)
+        parts = [self._render_once(lens, T, moving) for lens in self._lenses]
         mask, distance = parts[0].mask, parts[0].distance
         total = parts[0].color.astype(np.float64)
         for one in parts[1:]:
@@ -220,11 +208,6 @@ class CameraSimulator:
             distance = np.minimum(distance, one.distance)
             total += one.color
         return TrueImage(self._expose(total / len(parts), image), mask, distance)
-
-    def _moving(self, image: int) -> Solids:
-        scan = int(self._shots.scan[image])
-        moment = self._world.moment(np.array([scan]), self._shots.seconds[image : image + 1])
-        return self._world.carried.at(moment, scan)
 
     def _render_once(self, lens: Lens, T_world_camera: Float, moving: Solids) -> TrueImage:
         world, R = self._world, T_world_camera[:3, :3]
@@ -235,9 +218,8 @@ class CameraSimulator:
         colour[sky] = appearance.compute_sky_color(direction[sky])
         range = seen.range[static]
         places = T_world_camera[:3, 3] + range[:, None] * direction[static]
-        colour[static] = appearance.compute_static_color(
-            places, self.colour_seed, range / lens.K[0, 0]
-        )
+        blur = range / lens.K[0, 0]
+        colour[static] = appearance.compute_static_color(places, self.colour_seed, blur)
         self._paint_movers(colour, seen, T_world_camera[:3, 3], direction, moving)
         mask = np.zeros(seen.part.shape, np.uint16)
         mask[sky] = SKY
@@ -266,12 +248,10 @@ class CameraSimulator:
         return out
 
 
-def _lens(one: Camera, right: float, down: float) -> Lens:
-    assert one.K is not None
-    return Lens.of(compute_pixel_rays(one, right, down), one.K)
-
-
-def _subpixel_offsets(n: int) -> list[tuple[float, float]]:
-    """Offsets from the pixel center, in pixels, of n x n rays."""
-    steps = ((np.arange(n) + 0.5) / n - 0.5).tolist()
-    return [(right, down) for down in steps for right in steps]
+def _make_lens(camera: Camera, right: float, down: float) -> Lens:
+    direction, K = compute_pixel_rays(camera, right, down), camera.K
+    assert K is not None
+    x, y = direction[:2] / direction[2]
+    off_x = np.abs(K[0, 0] * x + K[0, 2] - np.arange(camera.width)).max()
+    off_y = np.abs(K[1, 1] * y + K[1, 2] - np.arange(camera.height)[:, None]).max()
+    return Lens(direction, K, float(max(off_x, off_y)))

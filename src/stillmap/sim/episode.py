@@ -67,12 +67,8 @@ class Episode:
         more: dict[str, Any] | None = None,
     ) -> Truth:
         """The truth about beams; `more` is added to the scene after `mover_kinds`."""
-        motion = self.motion
-        about = {
-            **describe_scene(self.scene, self.seed),
-            "mover_kinds": motion.kinds,
-            **(more or {}),
-        }
+        motion, scene = self.motion, self._describe_scene()
+        about = {**scene, "mover_kinds": motion.kinds, **(more or {})}
         if self.colour_seed is not None:
             about["colour_seed"] = self.colour_seed
         for name, scan in (("carried_at_scan", motion.carried), ("paused_at_scan", motion.paused)):
@@ -80,6 +76,16 @@ class Episode:
         faces = motion.things.faces[-1]
         lasting = faces[np.any(faces[:, :2] != faces[:, 2:], axis=1)]
         return Truth(static, mover, T_world_base, self.walls, motion.poses, about, lasting)
+
+    def _describe_scene(self) -> dict[str, Any]:
+        """Name, seed and all parameters of the scene as JSON; walls are written as an array."""
+        parameters = dataclasses.asdict(self.scene)
+        unused = ["walls", "kerbs"] if self.scene.camera.enabled else ["walls", "kerbs", "camera"]
+        if not self.scene.in_3d:
+            unused += ["lidar", "rig", "ground", "heights", "pavements"]
+        for name in unused:
+            del parameters[name]
+        return {"name": parameters.pop("name"), "seed": self.seed, **parameters}
 
 
 def simulate_episode(scene: Scene, rng: np.random.Generator, tell: Progress) -> Episode:
@@ -104,18 +110,6 @@ def simulate_episode(scene: Scene, rng: np.random.Generator, tell: Progress) -> 
     # spawned last, so that a camera changes nothing else
     seed_of_colours = int(rng.spawn(1)[0].integers(1 << 31)) if scene.camera.enabled else None
     return Episode(scene, seed, motion, walls, T_odom_base, sensor_rng, body_rng, seed_of_colours)
-
-
-def describe_scene(scene: Scene, seed: Any) -> dict[str, Any]:
-    """Name, seed and all parameters of a scene as JSON; walls are written as an array."""
-    parameters = dataclasses.asdict(scene)
-    del parameters["walls"], parameters["kerbs"]
-    unused: tuple[str, ...]
-    unused = () if scene.in_3d else ("lidar", "rig", "ground", "heights", "pavements")
-    unused += () if scene.camera.enabled else ("camera",)
-    for name in unused:
-        del parameters[name]
-    return {"name": parameters.pop("name"), "seed": seed, **parameters}
 
 
 def simulate_odometry(
@@ -188,14 +182,12 @@ def remove_jump(T_world_base: Float, scan: int) -> Float:
     return np.concatenate([T_world_base[:scan], back @ T_world_base[scan:]])
 
 
-def _stalls(
-    seconds: Float, options: OdometryOptions, rng: np.random.Generator
-) -> NDArray[np.bool_]:
+def _stalls(seconds: Float, o: OdometryOptions, rng: np.random.Generator) -> NDArray[np.bool_]:
     """(T - 1,) whether odometry misses the motion between two scans."""
-    often = rng.poisson(options.stall_rate / 60 * (seconds[-1] - seconds[0]))
+    often = rng.poisson(o.stall_rate / 60 * (seconds[-1] - seconds[0]))
     stalls = np.zeros(len(seconds) - 1, bool)
     for begin in rng.uniform(seconds[0], seconds[-1], often).tolist():
-        stalls |= (seconds[:-1] >= begin) & (seconds[:-1] < begin + options.stall_time)
+        stalls |= (seconds[:-1] >= begin) & (seconds[:-1] < begin + o.stall_time)
     return stalls
 
 

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from stillmap.core import se2
 from stillmap.sim import laser, ray_casting
@@ -43,13 +43,8 @@ class Pattern(NamedTuple):
         azimuth = -np.pi + 2 * np.pi * share
         elevation = np.linspace(*o.field, o.channels)
         flat, up = np.cos(elevation), np.sin(elevation)
-        direction = np.stack(
-            [
-                np.cos(azimuth)[:, None] * flat,
-                np.sin(azimuth)[:, None] * flat,
-                np.broadcast_to(up, (o.columns, o.channels)),
-            ]
-        )
+        x, y = np.cos(azimuth)[:, None] * flat, np.sin(azimuth)[:, None] * flat
+        direction = np.stack([x, y, np.broadcast_to(up, x.shape)])
         seconds = share / o.rate if o.sweep else np.zeros(o.columns)
         return cls(azimuth, elevation, direction, seconds)
 
@@ -91,7 +86,7 @@ class Sensor(NamedTuple):
 def make_spinning_lidar(scene: Scene) -> Sensor:
     """The lidar of a scene."""
     o, pattern = scene.lidar, Pattern.of(scene.lidar)
-    T = make_pose(np.array([o.x, o.y, o.z]), *np.array([0.0, o.pitch, o.yaw]))
+    T = make_pose((o.x, o.y, o.z), 0, o.pitch, o.yaw)
     own = cast_robot_body(scene, pattern, T) if o.sees_robot else None
     leaves_out = o.no_returns == "left out"
     return Sensor("simulated lidar", 3, T, o, lambda _: pattern, o.sweep, leaves_out, own)
@@ -105,12 +100,11 @@ def make_rig_lasers(scene: Scene) -> tuple[Sensor, Sensor]:
     flat = Pattern.tilted(o, np.zeros(o.beams), seconds)
 
     def tilted(scan: int) -> Pattern:
-        return Pattern.tilted(
-            o, compute_joint_angle(scan / scene.scan_rate + seconds, rig), seconds
-        )
+        joint = compute_joint_angle(scan / scene.scan_rate + seconds, rig)
+        return Pattern.tilted(o, joint, seconds)
 
-    low = make_pose(np.array([o.x, o.y, rig.low_z]), *np.array([0.0, 0.0, o.yaw]))
-    pivot = make_pose(np.array([rig.pivot_x, 0.0, rig.pivot_z]), *np.zeros(3))
+    low = make_pose((o.x, o.y, rig.low_z), 0, 0, o.yaw)
+    pivot = make_pose((rig.pivot_x, 0, rig.pivot_z), 0, 0, 0)
     takes_time = o.sweep_time > 0
     return (
         Sensor("simulated laser", 2, low, o, lambda _: flat, takes_time),
@@ -124,14 +118,15 @@ def compute_joint_angle(seconds: Float, rig: RigOptions) -> Float:
     return np.asarray(rig.middle + rig.amplitude * (1.0 - 4.0 * np.abs(share - 0.5)))
 
 
-def make_pose(xyz: Float, roll: Float, pitch: Float, yaw: Float) -> Float:
+def make_pose(xyz: ArrayLike, roll: ArrayLike, pitch: ArrayLike, yaw: ArrayLike) -> Float:
     """(..., 4, 4) poses, rotated by roll about x, then pitch about y, then yaw about z.
 
     Args:
         xyz: (..., 3) metres.
         roll, pitch, yaw: (...) rad; a positive pitch is nose down.
     """
-    (a, b, c), (u, v, w) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
+    angles = np.array([roll, pitch, yaw], float)
+    (a, b, c), (u, v, w) = np.cos(angles), np.sin(angles)
     T = np.zeros((*np.shape(yaw), 4, 4))
     T[..., 0, :3] = np.stack([c * b, c * v * u - w * a, c * v * a + w * u], axis=-1)
     T[..., 1, :3] = np.stack([w * b, w * v * u + c * a, w * v * a - c * u], axis=-1)
@@ -175,8 +170,7 @@ def transform_rays(pattern: Pattern, T_world_sensor: Float) -> Rays:
     steepest = np.arcsin(np.minimum(np.abs(pattern.direction[2]).max(initial=0.0), 1.0))
     off = np.tan(upright) * np.tan(steepest) * 1.1 + upright**2 if upright > 1e-9 else 0.0
     # the column's azimuth is that of a beam in it without elevation
-    a, b = R[:, 0, 0], R[:, 1, 0]
-    heading = np.unwrap(np.arctan2(b, a))
+    heading = np.unwrap(np.arctan2(R[:, 1, 0], R[:, 0, 0]))
     azimuth = np.maximum.accumulate(pattern.azimuth + heading)
     origin = np.broadcast_to(T_world_sensor[:, :3, 3].T[:, :, None], (3, n, 1))
     tilt = float(upright) + pattern.off + 1e-9

@@ -138,7 +138,9 @@ class Crowd:
         way /= np.maximum(np.hypot(*way.T), 1e-6)[:, None]
         stands = self._stop_left > 0
         wanted = way * (self._wanted_speed * ~stands)[:, None]
-        push = self._repulsion_of_others(way) + self._repulsion_of_walls()
+        clear, gradient = self._space.clearance_at(self.xy)
+        walls = gradient * np.exp((BODY_RADIUS - clear) / 0.08)[:, None]
+        push = self._repulsion_of_others(way) + walls
         # who stands gives way only at close distance
         push[stands & (np.hypot(*push.T) < 0.5)] = 0.0
         push += _repulsion_of_robot(robot, from_robot, distance, contact)
@@ -160,13 +162,12 @@ class Crowd:
         push += right * (facing * strength).sum(axis=1)[:, None]
         return np.asarray(push)
 
-    def _repulsion_of_walls(self) -> Float:
-        clear, gradient = self._space.clearance_at(self.xy)
-        return gradient * np.exp((BODY_RADIUS - clear) / 0.08)[:, None]
-
     def _move(self, dt: float, robot: Float, contact: float) -> None:
         xy = self.xy + self._velocity * dt
-        xy = self._push_out_of_walls(xy)
+        clear, gradient = self._space.clearance_at(xy)
+        missing = np.maximum(1.02 * BODY_RADIUS - clear, 0.0)
+        length = np.maximum(np.hypot(*gradient.T), 0.3)
+        xy = xy + gradient * (missing / length)[:, None]
         delta = xy - robot
         distance = np.hypot(*delta.T)
         touching = distance < contact
@@ -177,12 +178,6 @@ class Crowd:
         xy[blocked] = self.xy[blocked]
         self._velocity = (xy - self.xy) / dt
         self.xy = xy
-
-    def _push_out_of_walls(self, xy: Float) -> Float:
-        clear, gradient = self._space.clearance_at(xy)
-        missing = np.maximum(1.02 * BODY_RADIUS - clear, 0.0)
-        length = np.maximum(np.hypot(*gradient.T), 0.3)
-        return np.asarray(xy + gradient * (missing / length)[:, None])
 
     def _turn(self, dt: float) -> None:
         walks = self.speed > 0.15

@@ -107,19 +107,18 @@ class Planner:
 
     @cached_property
     def _nearest(self) -> NDArray[Any]:
-        part = (self._part >= 0).reshape(self._shape)
-        _, nearest = scipy.ndimage.distance_transform_edt(~part, return_indices=True)
+        outside = (self._part < 0).reshape(self._shape)
+        _, nearest = scipy.ndimage.distance_transform_edt(outside, return_indices=True)
         return np.asarray(nearest[0] * self._shape[1] + nearest[1])
 
     def _label_at(self, parts: NDArray[Any], xy: Float, clearance: float) -> int:
-        at = np.round((xy - self._space.origin) / (_SPACING * _STRIDE)).astype(int)
-        column, row = np.clip(at, 0, (self._shape[1] - 1, self._shape[0] - 1))
-        if not parts[row, column]:
+        part = int(parts.flat[self._grid_node(xy)])
+        if not part:
             raise InputError(
                 f"no room for a robot or a person at ({xy[0]:g}, {xy[1]:g})",
                 hint=f"points of a route lie at least {clearance:g} m from any wall",
             )
-        return int(parts[row, column])
+        return part
 
     def part_of(self, node: int | NDArray[np.int64]) -> NDArray[np.int64]:
         """Part of the nodes, numbered as the points `inside`."""
@@ -130,12 +129,15 @@ class Planner:
         grid = np.stack([node % self._shape[1], node // self._shape[1]], axis=-1)
         return np.asarray(self._space.origin + grid * (_SPACING * _STRIDE))
 
-    def node(self, xy: Float) -> int:
-        """The reachable node nearest to a point (2,)."""
+    def _grid_node(self, xy: Float) -> int:
         at = np.round((xy - self._space.origin) / (_SPACING * _STRIDE)).astype(int)
         column, row = np.clip(at, 0, (self._shape[1] - 1, self._shape[0] - 1))
-        here = int(row) * self._shape[1] + int(column)
-        return here if self._part[here] >= 0 else int(self._nearest[row, column])
+        return int(row) * int(self._shape[1]) + int(column)
+
+    def node(self, xy: Float) -> int:
+        """The reachable node nearest to a point (2,)."""
+        here = self._grid_node(xy)
+        return here if self._part[here] >= 0 else int(self._nearest.flat[here])
 
     def path(self, start: Float, goal: int) -> Float:
         """(K, 2) corners of a short path from a point (2,) to a node, without the start."""

@@ -109,11 +109,12 @@ def record(
         beams.add(world.cast_rays(sensor, pattern, scan), pattern, rng)
         if scan % 10 == 0:
             tell(scan / T)
-    T_world_base = lidar.make_pose(world.ridden[:, :3], *world.ridden[:, 3:].T)
-    T_base_sensor, T_odom_base = sensor.T_base_sensor, lidar.lift_poses(happening.T_odom_base)
     if sensor.dimension == 2:
         T_world_base, T_odom_base = se2.matrix(*happening.motion.robot.T), happening.T_odom_base
-        T_base_sensor = T_base_sensor[np.ix_([0, 1, 3], [0, 1, 3])]
+        T_base_sensor = sensor.T_base_sensor[np.ix_([0, 1, 3], [0, 1, 3])]
+    else:
+        T_world_base = lidar.make_pose(world.ridden[:, :3], *world.ridden[:, 3:].T)
+        T_base_sensor, T_odom_base = sensor.T_base_sensor, lidar.lift_poses(happening.T_odom_base)
     recording = Recording(
         stamp_ns=happening.stamp_ns,
         offset=np.array(beams.offset, np.int64),

@@ -38,15 +38,6 @@ class Lens(NamedTuple):
     K: Float
     bends: float
 
-    @classmethod
-    def of(cls, direction: Float, K: Float) -> "Lens":
-        """The lens of rays (3, h, w) in the camera frame."""
-        _, h, w = direction.shape
-        x, y = direction[:2] / direction[2]
-        right = np.abs(K[0, 0] * x + K[0, 2] - np.arange(w)).max()
-        down = np.abs(K[1, 1] * y + K[1, 2] - np.arange(h)[:, None]).max()
-        return cls(direction, K, float(max(right, down)))
-
 
 class RenderedImage(NamedTuple):
     """The surface at each pixel (h, w).

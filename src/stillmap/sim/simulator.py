@@ -1,5 +1,6 @@
 """Simulation of a recording: motion, odometry, sensors and cameras."""
 
+import itertools
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -91,19 +92,18 @@ def simulate(
     """
     if scene.rig.tilts:
         raise InputError("a rig of two lasers makes two recordings", hint="simulate_rig")
-    tell, share = progress or _silent, _MOTION_SHARE_3D if scene.in_3d else _MOTION_SHARE
-    happening = simulate_episode(
-        scene, np.random.default_rng(rng), _partial_progress(0.0, share, tell)
-    )
+    share = _MOTION_SHARE_3D if scene.in_3d else _MOTION_SHARE
+    first, rest = _partial_progress(0.0, share, progress), _partial_progress(share, 1.0, progress)
+    happening = simulate_episode(scene, np.random.default_rng(rng), first)
     if scene.in_3d:
         world, sensor = World.of(happening), lidar.make_spinning_lidar(scene)
-        rest, own_rng = _partial_progress(share, 1.0, tell), happening.sensor_rng
-        made = _with_images(world, *recorder.record(world, sensor, own_rng, rest, scratch))
+        recorded = recorder.record(world, sensor, happening.sensor_rng, rest, scratch)
+        made = _with_images(world, *recorded)
     else:
         recording, mover = _record(happening)
         static, T_world_base = recording.hit & (mover < 0), se2.matrix(*happening.motion.robot.T)
         made = Simulation(scene, recording, happening.truth(static, mover, T_world_base))
-    tell(1.0)
+    rest(1.0)
     return made
 
 
@@ -119,16 +119,15 @@ def simulate_rig(
     """
     if not scene.rig.tilts:
         raise InputError("no laser of the scene tilts", hint="rig.tilts=true")
-    tell, share = progress or _silent, _MOTION_SHARE_3D
-    rng = np.random.default_rng(rng)
-    happening = simulate_episode(scene, rng, _partial_progress(0.0, share, tell))
-    world, (flat, tilted), half = World.of(happening), lidar.make_rig_lasers(scene), (1 + share) / 2
-    first, second = _partial_progress(share, half, tell), _partial_progress(half, 1.0, tell)
-    below = recorder.record(world, flat, happening.sensor_rng, first, scratch)
-    above = recorder.record(world, tilted, happening.body_rng, second, scratch)
+    ends = (0.0, _MOTION_SHARE_3D, (1 + _MOTION_SHARE_3D) / 2, 1.0)
+    first, second, third = (_partial_progress(*part, progress) for part in itertools.pairwise(ends))
+    happening = simulate_episode(scene, np.random.default_rng(rng), first)
+    world, (flat, tilted) = World.of(happening), lidar.make_rig_lasers(scene)
+    below = recorder.record(world, flat, happening.sensor_rng, second, scratch)
+    above = recorder.record(world, tilted, happening.body_rng, third, scratch)
     # images belong to the 3D recording
     horizontal, tilting = Simulation(scene, *below), _with_images(world, *above)
-    tell(1.0)
+    third(1.0)
     stamps = np.arange(len(happening.motion.robot)) / scene.scan_rate
     return RigSimulation(horizontal, tilting, lidar.compute_joint_angle(stamps, scene.rig))
 
@@ -147,7 +146,9 @@ def _record(happening: Episode) -> tuple[Recording, NDArray[np.int32]]:
     """The recording of a planar laser, and the mover (M,) that reflected each beam."""
     scene, motion, walls = happening.scene, happening.motion, happening.walls
     o, T = scene.laser, len(motion.robot)
-    T_base_sensor, sensor = _sensors(o), np.arange(T, dtype=np.int32) % o.count
+    front = se2.matrix(o.x, o.y, o.yaw)
+    T_base_sensor = np.stack([front, se2.matrix(0.0, 0.0, np.pi) @ front][: o.count])
+    sensor = np.arange(T, dtype=np.int32) % o.count
     exact = cast_sweeps(motion, walls, T_base_sensor[sensor], o)
     on_glass = laser.find_glass(exact.wall, scene)
     ranges, hit = laser.simulate_measurement(exact.range, on_glass, o, happening.sensor_rng)
@@ -229,16 +230,9 @@ def cast_sweeps(motion: Motion, walls: Float, T_base_sensor: Float, o: LaserOpti
         poses = se2.parameters(se2.matrix(*now.interpolate(motion.robot).T) @ T_robot_sensor)
         poses[:, 2] += np.tile(turned, len(scans))
         part = laser.cast_beams(poses, group, walls, *now.interpolate_movers(), reach)
-        parts.append(
-            [values[:, order].reshape(-1, G * sweep.group)[:, : o.beams] for values in part]
-        )
+        in_order = (values[:, order].reshape(-1, G * sweep.group) for values in part)
+        parts.append([values[:, : o.beams] for values in in_order])
     return Returns(*(np.concatenate(values) for values in zip(*parts, strict=True)))
-
-
-def _sensors(o: LaserOptions) -> Float:
-    """(S, 3, 3) T_base_sensor."""
-    front = se2.matrix(o.x, o.y, o.yaw)
-    return np.stack([front, se2.matrix(0.0, 0.0, np.pi) @ front][: o.count])
 
 
 def _described(o: LaserOptions, angles: Float) -> list[dict[str, Any]]:
@@ -253,10 +247,6 @@ def _described(o: LaserOptions, angles: Float) -> list[dict[str, Any]]:
     ]
 
 
-def _partial_progress(first: float, last: float, tell: Progress) -> Progress:
+def _partial_progress(first: float, last: float, tell: Progress | None) -> Progress:
     """Progress of a part of the whole."""
-    return lambda share: tell(first + (last - first) * share)
-
-
-def _silent(share: float) -> None:
-    pass
+    return lambda share: tell(first + (last - first) * share) if tell else None

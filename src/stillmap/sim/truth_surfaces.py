@@ -1,7 +1,6 @@
 """True surfaces of a simulated world: projection of points to static ones, samples of movers."""
 
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -11,10 +10,6 @@ from stillmap.sim.dynamics import MAX_SPEED
 from stillmap.sim.geometry import BOX, CYLINDER, Faces, Ground, Solids
 
 Float = NDArray[np.float64]
-
-Nearest = Callable[[Float], Float]
-
-_Surface = tuple[Float, Float, Nearest]
 
 _SQUARE = 4.0  # m, points within one share their candidate surfaces
 _BISECTIONS = 80  # of the root for the nearest point of an ellipse, to the last digit
@@ -48,27 +43,29 @@ class StaticSurfaces(NamedTuple):
         """
         places = _on_ground(points, self.ground, self.ceiling)
         distance = np.linalg.norm(places - points, axis=1)
-        things = list(self._surfaces())
-        lowest = np.array([low for low, _, _ in things]).reshape(-1, 2)
-        highest = np.array([high for _, high, _ in things]).reshape(-1, 2)
+        a, b, center = self.faces.ends[:, :2], self.faces.ends[:, 2:], self.solids.pose[0, :, :2]
+        reach = np.hypot(*self.solids.half.T)[:, None]
+        lowest = np.concatenate([np.minimum(a, b), center - reach])
+        highest = np.concatenate([np.maximum(a, b), center + reach])
         for part in _in_squares(points):
             some, d, at = points[part], distance[part], places[part]
-            low, high = some[:, :2].min(axis=0), some[:, :2].max(axis=0)
-            off = np.maximum(np.maximum(lowest - high, low - highest), 0.0)
-            for k in np.flatnonzero((off * off).sum(axis=1) < d.max() ** 2).tolist():
-                _replace_nearer(some, d, at, things[k])
+            off = _gap(some[:, :2].min(axis=0), some[:, :2].max(axis=0), lowest, highest)
+            for k in np.flatnonzero(off < d.max() ** 2).tolist():
+                near = np.flatnonzero(_gap(some[:, :2], some[:, :2], lowest[k], highest[k]) < d * d)
+                if len(near):
+                    found = self._project_to(k, some[near])
+                    off_found = np.linalg.norm(found - some[near], axis=1)
+                    better = off_found < d[near]
+                    d[near[better]], at[near[better]] = off_found[better], found[better]
             distance[part], places[part] = d, at
         return distance, places
 
-    def _surfaces(self) -> Iterator[_Surface]:
-        """Minimum and maximum x and y of each surface, and its projection."""
-        for ends, z in zip(self.faces.ends, self.faces.z, strict=True):
-            low, high = np.minimum(ends[:2], ends[2:]), np.maximum(ends[:2], ends[2:])
-            yield low, high, partial(_on_face, ends=ends, z=z, ground=self.ground)
-        for k, pose in enumerate(self.solids.pose[0]):
-            reach = float(np.hypot(*self.solids.half[k]))
-            nearest = partial(project_to_solid, solids=self.solids, k=k)
-            yield pose[:2] - reach, pose[:2] + reach, nearest
+    def _project_to(self, k: int, points: Float) -> Float:
+        """Project points to face k or, counted after the faces, a solid."""
+        first = len(self.faces.ends)
+        if k >= first:
+            return project_to_solid(points, self.solids, k - first)
+        return _on_face(points, self.faces.ends[k], self.faces.z[k], self.ground)
 
 
 def _in_squares(points: Float) -> Iterator[NDArray[np.intp]]:
@@ -82,17 +79,10 @@ def _in_squares(points: Float) -> Iterator[NDArray[np.intp]]:
     yield from np.split(order, np.flatnonzero(np.diff(key[order])) + 1)
 
 
-def _replace_nearer(points: Float, distance: Float, places: Float, thing: _Surface) -> None:
-    """Replace projections (n, 3) and distances by those of a surface where it is nearer."""
-    low, high, nearest = thing
-    off = np.maximum(np.maximum(low - points[:, :2], points[:, :2] - high), 0.0)
-    near = np.flatnonzero((off * off).sum(axis=1) < distance * distance)
-    if not len(near):
-        return
-    found = nearest(points[near])
-    d = np.linalg.norm(found - points[near], axis=1)
-    better = d < distance[near]
-    distance[near[better]], places[near[better]] = d[better], found[better]
+def _gap(low: Float, high: Float, lowest: Float, highest: Float) -> Float:
+    """(n,) squared distance between rectangles low to high and lowest to highest."""
+    off = np.maximum(np.maximum(lowest - high, low - highest), 0.0)
+    return np.asarray((off * off).sum(axis=1))
 
 
 def to_world(local: Float, pose: Float) -> Float:
@@ -113,17 +103,15 @@ def to_local(points: Float, pose: Float) -> Float:
 
 def project_to_solid(points: Float, solids: Solids, k: int) -> Float:
     """(n, 3) projection of points (n, 3) to the surface of solid k, at n times or at one."""
-    (a, b), (z0, z1) = solids.half[k], solids.z[k]
-    pose, form = solids.pose[:, k], solids.form[k]
-    middle, h = np.array([0.0, 0.0, (z0 + z1) / 2]), (z1 - z0) / 2
-    p = to_local(points, pose) - middle
-    if form == BOX:
-        found = _on_box(p, np.array([a, b, h]))
-    elif form == CYLINDER:
-        found = _on_cylinder(p, np.array([a, b]), h)
-    else:
-        found = _on_ellipsoid(p, np.array([a, b, h]))
-    return to_world(found + middle, pose)
+    pose, (middle, half) = solids.pose[:, k], _middle_and_half(solids, k)
+    on_form = {BOX: _on_box, CYLINDER: _on_cylinder}.get(solids.form[k], _on_ellipsoid)
+    return to_world(on_form(to_local(points, pose) - middle, half) + middle, pose)
+
+
+def _middle_and_half(solids: Solids, k: int) -> tuple[Float, Float]:
+    """(3,) center of solid k in its frame, and (3,) half extents along its axes."""
+    z0, z1 = solids.z[k]
+    return np.array([0.0, 0.0, (z0 + z1) / 2]), np.array([*solids.half[k], (z1 - z0) / 2])
 
 
 def _on_ground(points: Float, ground: Ground, ceiling: float | None) -> Float:
@@ -161,9 +149,9 @@ def _on_box(p: Float, half: Float) -> Float:
     return out
 
 
-def _on_cylinder(p: Float, half: Float, h: float) -> Float:
-    rim = _on_ellipsoid(p[:, :2], half)
-    within = (p[:, :2] ** 2 / half**2).sum(axis=1) <= 1.0
+def _on_cylinder(p: Float, half: Float) -> Float:
+    h, rim = half[2], _on_ellipsoid(p[:, :2], half[:2])
+    within = (p[:, :2] ** 2 / half[:2] ** 2).sum(axis=1) <= 1.0
     z = np.clip(p[:, 2], -h, h)
     out = np.column_stack([np.where(within[:, None], p[:, :2], rim), z])
     inside = within & (np.abs(p[:, 2]) < h)
@@ -274,23 +262,18 @@ def _is_within(points: Float, solids: Solids, k: int) -> NDArray[np.bool_]:
 
 def _samples(solids: Solids, k: int, spacing: float) -> Float:
     """(n, 3) points on the surface of solid k, in its frame."""
-    (a, b), (z0, z1) = solids.half[k], solids.z[k]
-    h, middle = (z1 - z0) / 2, np.array([0.0, 0.0, (z0 + z1) / 2])
-    if solids.form[k] == BOX:
-        found = _box_samples(np.array([a, b, h]), spacing)
-    elif solids.form[k] == CYLINDER:
-        found = _cylinder_samples(np.array([a, b]), h, spacing)
-    else:
-        found = _ellipsoid_samples(np.array([a, b, h]), spacing)
-    return np.asarray(found + middle)
+    middle, half = _middle_and_half(solids, k)
+    samples = {BOX: _box_samples, CYLINDER: _cylinder_samples}
+    return np.asarray(samples.get(solids.form[k], _ellipsoid_samples)(half, spacing) + middle)
 
 
-def _cylinder_samples(half: Float, h: float, spacing: float) -> Float:
-    around = _even(2 * np.pi * half.max(), spacing) * 2 * np.pi
+def _cylinder_samples(half: Float, spacing: float) -> Float:
+    flat, h = half[:2], half[2]
+    around = _even(2 * np.pi * flat.max(), spacing) * 2 * np.pi
     angle, up = np.meshgrid(around, _along(h, spacing))
     rim = [half[0] * np.cos(angle), half[1] * np.sin(angle), up]
-    disc = np.stack(np.meshgrid(*(_along(one, spacing) for one in half)), axis=-1).reshape(-1, 2)
-    disc = disc[((disc / half) ** 2).sum(axis=1) <= 1.0]
+    disc = np.stack(np.meshgrid(*(_along(one, spacing) for one in flat)), axis=-1).reshape(-1, 2)
+    disc = disc[((disc / flat) ** 2).sum(axis=1) <= 1.0]
     caps = [np.column_stack([disc, np.full(len(disc), end)]) for end in (-h, h)]
     return np.concatenate([np.stack(rim, axis=-1).reshape(-1, 3), *caps])
 

@@ -48,13 +48,14 @@ class Traffic:
         self._options, self._rng = options, rng
         self._lane = np.array(_spread(lanes, options.vehicles), np.int64)
         V = len(self._lane)
-        self.kinds = [lanes[k].kind for k in self._lane.tolist()]
+        own = [lanes[k] for k in self._lane.tolist()]
+        self.kinds = [lane.kind for lane in own]
         self.size = _sizes(self.kinds, rng)
         self._wanted = rng.uniform(options.min_speed, options.max_speed, V)
         self._stops = rng.random(V) < options.stopping_share
         self._way_left = rng.uniform(*_STOP_DISTANCE, V)
         self._stop_left = np.zeros(V)
-        self._waits = np.array([lanes[k].waiting > 0 for k in self._lane.tolist()], bool)
+        self._waits = np.array([lane.waiting > 0 for lane in own], bool)
         self._at = self._first_places(rng.uniform(0.0, 0.5, V))
         self.speed = np.where(self._waits, 0.0, self._wanted)
 
@@ -129,10 +130,8 @@ class Traffic:
                 between = (self._at[ahead] - self._at[on]) % track.length
                 gaps[on] = between - (self.size[on, 0] + self.size[ahead, 0]) / 2
             gaps[on] = np.minimum(gaps[on], self._to_red_light(track, on))
-            if (
-                track.distance(robot)
-                < radius + _SIDE_MARGIN + self.size[on, 1].max(initial=0.0) / 2
-            ):
+            width = self.size[on, 1].max(initial=0.0)
+            if track.distance(robot) < radius + _SIDE_MARGIN + width / 2:
                 between = (track.nearest(robot) - self._at[on]) % track.length
                 gaps[on] = np.minimum(gaps[on], between - self.size[on, 0] / 2 - radius)
         return gaps
@@ -268,7 +267,5 @@ class SpeedProfile:
         gain = 2 * self._acceleration * self._spacing * np.arange(len(squares))
         squares = np.minimum.accumulate((squares + gain)[::-1])[::-1] - gain
         # rounding must not make a straight way slower
-        speed = np.where(
-            squares > fastest**2 * (1 - 1e-9), fastest, np.sqrt(np.maximum(squares, 0))
-        )
-        return np.asarray(speed[: len(way)])
+        is_free, limit = squares > fastest**2 * (1 - 1e-9), np.sqrt(np.maximum(squares, 0))
+        return np.asarray(np.where(is_free, fastest, limit)[: len(way)])

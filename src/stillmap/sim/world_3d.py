@@ -13,6 +13,7 @@ from stillmap.sim.geometry import BOX, Faces, Ground, Part, Solids, assemble
 from stillmap.sim.options import HeightOptions
 from stillmap.sim.scene import Scene, Segment
 from stillmap.sim.truth_surfaces import StaticSurfaces
+from stillmap.sim.walls import polyline
 
 Float = NDArray[np.float64]
 
@@ -37,7 +38,8 @@ def make_static_world(scene: Scene, ground: Ground) -> StaticSurfaces:
     loops, lines = trace_loops(scene.walls)
     top = scene.heights.top
     lintels = [door.leaf(door.closed) for door in scene.leaves if scene.heights.doors < top]
-    kerbs = [side for x0, y0, x1, y1 in scene.pavements for side in _sides(x0, y0, x1, y1)]
+    corners = [((x0, y0), (x1, y0), (x1, y1), (x0, y1)) for x0, y0, x1, y1 in scene.pavements]
+    kerbs = [side for pavement in corners for side in polyline(pavement, closed=True)]
     z = [(_WALL_BOTTOM, top)] * (len(lines) + len(scene.glass))
     z += [(scene.heights.doors, top)] * len(lintels) + [(_WALL_BOTTOM, ground.kerb)] * len(kerbs)
     ends = [*lines, *scene.glass, *lintels, *kerbs]
@@ -59,15 +61,9 @@ def make_parts(loop: Loop, heights: HeightOptions) -> list[Part]:
 
 def trace_loops(walls: Sequence[Segment]) -> tuple[list[Loop], list[Segment]]:
     """The closed outlines of objects in a plan, and the remaining lines."""
-    loops: list[Loop] = []
-    lines: list[Segment] = []
-    for chain in _chains(walls):
-        loop = _loop(chain)
-        if loop is None:
-            lines += chain
-        else:
-            loops.append(loop)
-    return loops, lines
+    traced = [(chain, _loop(chain)) for chain in _chains(walls)]
+    lines = [segment for chain, loop in traced if loop is None for segment in chain]
+    return [loop for _, loop in traced if loop is not None], lines
 
 
 def _chains(walls: Sequence[Segment]) -> Iterator[list[Segment]]:
@@ -105,10 +101,6 @@ def _loop(chain: list[Segment]) -> Loop | None:
     return Loop(x, y, heading, float(length), float(width), len(chain))
 
 
-def _sides(x0: float, y0: float, x1: float, y1: float) -> list[Segment]:
-    return [(x0, y0, x1, y0), (x1, y0, x1, y1), (x1, y1, x0, y1), (x0, y1, x0, y0)]
-
-
 _TALL = (1.7, 0.09)  # m, mean and standard deviation of the height of people
 _MAX_TALL = 2.0  # m
 _THIN = 0.02  # m, thickness of faces that are not closed outlines
@@ -141,9 +133,8 @@ class MoverSolids:
         self._others, self._is_thing = others, ~solid
         parts: list[tuple[int, int, Part]] = []
         self.tall = np.zeros(len(motion.kinds))
-        self.tall[:persons] = np.minimum(
-            _TALL[0] + _TALL[1] * rng.standard_normal(persons), _MAX_TALL
-        )
+        tall = _TALL[0] + _TALL[1] * rng.standard_normal(persons)
+        self.tall[:persons] = np.minimum(tall, _MAX_TALL)
         for q, person in enumerate(motion.people.mover.tolist()):
             half = tuple(motion.people.semi_axes[q].tolist())
             figure = geometry.make_leg if q < 2 * Q // 3 else geometry.make_torso_and_head
@@ -160,9 +151,8 @@ class MoverSolids:
         people, others = self._motion.people, moment.interpolate(self._others)
         # movable objects jump from place to place
         others[:, self._is_thing] = self._others[scan, self._is_thing]
-        walking = np.concatenate(
-            [moment.interpolate(people.xy), moment.interpolate(people.heading)[..., None]], axis=-1
-        )
+        xy, heading = moment.interpolate(people.xy), moment.interpolate(people.heading)
+        walking = np.concatenate([xy, heading[..., None]], axis=-1)
         poses = np.concatenate([walking, others], axis=1)
         foot = self._ground.height(poses[..., 0], poses[..., 1])
         return self._assembly.at(poses, foot)
