@@ -103,7 +103,7 @@ def _free(
             continue
         camera = images.cameras[images.camera[image]]
         view = View(image, int(images.stamp_ns[image]), camera, T)
-        some = np.flatnonzero(~out & find_visible_faces(mesh, view).visible[at.face])
+        some = np.flatnonzero(~out & (find_visible_faces(mesh, view)[at.face] > 0.0))
         column, row = np.rint(camera_module.project(camera, view.to_camera(at.points[some]))[0].T)
         out[some] = ~people[image][row.astype(np.intp), column.astype(np.intp)]
     return out

@@ -23,7 +23,7 @@ def model():
     uv = np.array([[0.25, 0.75], [0.25, 0.25], [0.75, 0.25], [0, 0], [0, 0], [0, 0]])
     page = np.random.default_rng(0).integers(0, 255, (32, 48, 3)).astype(np.uint8)
     of_face = np.array([0, -1], np.int32)
-    return TexturedMesh(vertices, faces, uv, of_face, (page,), of_face, np.full(6, -1, np.int32))
+    return TexturedMesh(vertices, faces, uv, of_face, (page,), of_face)
 
 
 @pytest.fixture

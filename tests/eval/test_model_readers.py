@@ -29,7 +29,6 @@ def test_colours_stay_where_they_are(tmp_path):
         np.array([0, 0, -1], np.int32),
         (page,),
         np.array([0, 0, -1], np.int32),
-        np.arange(5, dtype=np.int32),
     )
     write_glb(tmp_path / "mesh.glb", model)
     found = read_glb(tmp_path / "mesh.glb", n=2000)

@@ -25,7 +25,6 @@ def together(quads, pages):
         page=page,
         pages=tuple(pages),
         view=page,
-        vertex=np.arange(4 * n, dtype=np.int32),
     )
 
 

@@ -24,8 +24,8 @@ def textured():
     faces = np.array([[0, 1, 2], [4, 5, 3]], np.int32)
     uv = np.array([[0.25, 0.75], [0.75, 0.75], [0.75, 0.25], [0, 0], [0, 0], [0, 0]])
     page = np.random.default_rng(0).integers(0, 255, (32, 48, 3)).astype(np.uint8)
-    of_face, vertex = np.array([0, -1], np.int32), np.array([0, 1, 2, 3, 0, 2], np.int32)
-    return TexturedMesh(vertices, faces, uv, of_face, (page,), of_face, vertex)
+    of_face = np.array([0, -1], np.int32)
+    return TexturedMesh(vertices, faces, uv, of_face, (page,), of_face)
 
 
 def write_obj(folder, mesh):

@@ -123,7 +123,6 @@ def tiled(path, tones):
         page=page,
         pages=tuple(np.full((16, 16, 3), tone, np.uint8) for tone in tones),
         view=page,
-        vertex=np.arange(4 * len(tones), dtype=np.int32),
     )
     write_glb(path, textured, quality=0)
 

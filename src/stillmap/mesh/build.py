@@ -19,7 +19,7 @@ from stillmap.mesh.place import Background, ViewAssignment, assign_views
 from stillmap.mesh.point_colors import PointColors, color_points
 from stillmap.mesh.texture.atlas import TexturedMesh, replace_faces
 from stillmap.mesh.texture.baking import bake_texture
-from stillmap.mesh.texture.exposure import apply_gains
+from stillmap.mesh.texture.view_selection import apply_gains
 from stillmap.mesh.texture.views import (
     UNREADABLE,
     View,

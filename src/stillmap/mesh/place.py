@@ -12,11 +12,11 @@ from stillmap.core.camera import is_in_image, project, unproject
 from stillmap.core.parallel import map_ordered
 from stillmap.mesh.inputs import LidarReturns, MeshInputs
 from stillmap.mesh.simplification import subdivide
-from stillmap.mesh.texture.exposure import estimate_gains
+from stillmap.mesh.texture.baking import sample_bilinear
 from stillmap.mesh.texture.occlusion import build_occlusion_mask
-from stillmap.mesh.texture.sampling import sample_bilinear
 from stillmap.mesh.texture.view_selection import (
     Candidates,
+    estimate_gains,
     reject_inconsistent_views,
     sample_face_colors,
     select_views,
@@ -97,10 +97,10 @@ def assign_views(
     sharpest = Candidates.empty(len(mesh), 1)
 
     def evaluate(view: View) -> tuple[Index, Float, Float]:
-        found = find_visible_faces(mesh, view)
-        faces = np.flatnonzero(found.visible)
+        pixels = find_visible_faces(mesh, view)
+        faces = np.flatnonzero(pixels)
         p = p_unoccluded(mesh, faces, view, returns) if len(faces) else np.zeros(0)
-        return faces, found.pixels[faces].astype(np.float64), p
+        return faces, pixels[faces].astype(np.float64), p
 
     for number, (faces, pixels, p) in enumerate(map_ordered(evaluate, views, threads)):
         candidates.add(number, faces, view_utility(p, pixels, areas[faces], use_occlusion), p)

@@ -18,7 +18,7 @@ from stillmap.mesh.objects.segmentation import NO_OWNER, DynamicReturns
 from stillmap.mesh.objects.texturing import OUTLINE_DRIFT, outline_depth
 from stillmap.mesh.place import Background
 from stillmap.mesh.texture.atlas import GRAY, TexturedMesh
-from stillmap.mesh.texture.sampling import TextureSampler, avoid_gray, sample_bilinear
+from stillmap.mesh.texture.baking import TextureSampler, avoid_gray, sample_bilinear
 from stillmap.mesh.texture.view_selection import MIN_P_VISIBLE
 from stillmap.mesh.texture.views import View
 from stillmap.mesh.texture.visibility import IMAGE_MARGIN, NEAR

@@ -224,11 +224,11 @@ def _make_patch(
         if key not in row_lengths:
             row_lengths[key] = find_row_length(directions)
         faces = _triangulate_image(points, use, directions, row_lengths[key], layout.stride)
-    kept = filter_faces(points, origin, faces)
+    faces, standoff = filter_faces(points, origin, faces)
     used = np.zeros(len(points), np.bool_)
-    used[kept.faces] = True
+    used[faces] = True
     number = np.cumsum(used, dtype=np.int32) - np.int32(1)
-    return Patch(points[used], number[kept.faces], beam[used], origin[used], kept.standoff[used])
+    return Patch(points[used], number[faces], beam[used], origin[used], standoff[used])
 
 
 def _triangulate_rows(points: Float, use: Bool, number: Int32, directions: Float) -> Int32:

@@ -1,5 +1,6 @@
-"""The resolution of a surface: voxel size from beam spacing, range noise and memory."""
+"""Which scans become a surface, and its voxel size: from beam spacing, range noise and memory."""
 
+from itertools import chain, product
 from typing import NamedTuple
 
 import numpy as np
@@ -8,7 +9,7 @@ from scipy.spatial import cKDTree
 from stillmap.core.recording import Recording
 from stillmap.mesh.range_image import Patch, ScanLayout, triangulate_scans
 from stillmap.mesh.triangulation import range_std
-from stillmap.mesh.types import Bool, Float, Int64
+from stillmap.mesh.types import Bool, Float, Index, Int32, Int64
 
 _TILE_RADIUS = 2.9  # tile edges from a tile's center to the farthest corner around, and some slack
 _SAMPLED_PATCHES = 8
@@ -21,6 +22,14 @@ _SAMPLED_BEAMS = 200_000
 _SAMPLED_POSITIONS = 32  # of the sensor
 _LAYERS = 2.5  # blocks across a surface
 _BLOCK_EDGE, _BLOCK_BYTES = 8, 4200  # voxels along a block, and its size
+
+
+_MIN_TRAVEL_SHARE = 0.2  # of the median range, between viewpoints
+_MIN_TURN = 0.1  # rad, likewise
+_SCANS_PER_PLACE = 2  # scans used from each viewpoint: one may be occluded by a mover
+_SAMPLED_SCANS = 64  # of which the ranges are taken
+_MIN_CELL = 1e-3  # m, of the cells by which viewpoints nearby are found
+_AROUND = list(product((-1, 0, 1), repeat=3))
 
 
 class PatchExtents(NamedTuple):
@@ -47,6 +56,42 @@ class PatchExtents(NamedTuple):
         middle = (tiles + 0.5) * edge
         away = np.asarray(cKDTree(self.position[done:]).query(middle)[0], np.float64)
         return np.asarray(away > self.range[done:].max() + _TILE_RADIUS * edge)
+
+
+def median_range(recording: Recording) -> float:
+    """Median range in metres of the hits of some scans; 0 where there are none."""
+    n = recording.n_scans
+    sampled = np.unique(np.linspace(0, n - 1, min(n, _SAMPLED_SCANS)).astype(np.intp))
+    parts = [recording.points[b][recording.hit[b]] for b in map(recording.beams_of, sampled)]
+    ranges = np.concatenate([np.zeros(0), *(np.linalg.norm(part, axis=1) for part in parts)])
+    ranges = ranges[np.isfinite(ranges)]
+    return float(np.median(ranges)) if len(ranges) else 0.0
+
+
+def select_scans(T_map_sensor: Float, sensor: Int32, range: float) -> Index:
+    """The first `_SCANS_PER_PLACE` scans from each viewpoint.
+
+    Args:
+        T_map_sensor: (T, 4, 4).
+        sensor: (T,) sensor of each scan.
+        range: metres, median.
+    """
+    position, R = T_map_sensor[:, :3, 3], T_map_sensor[:, :3, :3]
+    travel = _MIN_TRAVEL_SHARE * range
+    # by cells, so that each scan is compared only with those around
+    cells = np.floor(position / max(travel, _MIN_CELL)).astype(np.int64).tolist()
+    known: dict[tuple[int, ...], list[int]] = {}
+    chosen = list[int]()
+    for t, (x, y, z) in enumerate(cells):
+        mine = int(sensor[t])
+        around = [known.get((mine, x + i, y + j, z + k), ()) for i, j, k in _AROUND]
+        before = np.fromiter(chain.from_iterable(around), np.intp)
+        near = before[np.linalg.norm(position[before] - position[t], axis=1) < travel]
+        cosine = 0.5 * (np.einsum("nij,ij->n", R[near], R[t]) - 1.0)
+        if np.count_nonzero(cosine > np.cos(_MIN_TURN)) < _SCANS_PER_PLACE:
+            chosen.append(t)
+            known.setdefault((mine, x, y, z), []).append(t)
+    return np.array(chosen, np.intp)
 
 
 def patch_extents(recording: Recording, poses: Float, layout: ScanLayout) -> PatchExtents:
@@ -99,7 +144,9 @@ def choose_resolution(
     if not patches:
         return voxel_size or _MAX_VOXEL, 1
     spacing = float(np.median([beam_spacing(one) for one in patches]))
-    noise = float(np.median([patch_range_std(one) for one in patches]))
+    ranges = [np.linalg.norm(one.points - one.origin, axis=1) for one in patches]
+    noises = [range_std(away, one.faces) for away, one in zip(ranges, patches, strict=True)]
+    noise = float(np.median(noises))
     wanted = float(np.clip(max(spacing, _NOISE_RATIO * noise), _MIN_VOXEL, _MAX_VOXEL))
     voxel = voxel_size or max(wanted, min_voxel_size(recording, poses, extents))
     return voxel, max(int(_MAX_SPACING * voxel / spacing), 1) if spacing > 0.0 else 1
@@ -111,11 +158,6 @@ def beam_spacing(patch: Patch) -> float:
     sight = patch.origin[patch.faces[:, 0]] - a
     across = np.einsum("ni,ni->n", np.cross(b - a, c - a), sight) / np.linalg.norm(sight, axis=1)
     return float(np.median(np.sqrt(np.maximum(across, 0.0))))
-
-
-def patch_range_std(patch: Patch) -> float:
-    """m, standard deviation of the noise of its ranges."""
-    return range_std(np.linalg.norm(patch.points - patch.origin, axis=1), patch.faces)
 
 
 def min_voxel_size(recording: Recording, poses: Float, extents: PatchExtents) -> float:

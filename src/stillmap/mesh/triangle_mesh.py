@@ -1,13 +1,10 @@
 """Triangle meshes."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
+from stillmap.core.components import component_labels
 from stillmap.mesh.types import Bool, Float, Index, Int32
 
 
@@ -108,12 +105,27 @@ def concatenate_meshes(meshes: list[Mesh]) -> Mesh:
     )
 
 
-def label_components(one: NDArray[Any], other: NDArray[Any], n: int) -> Index:
-    """(n,) number of the connected component of each of n nodes; edges join `one` and `other`."""
-    if not n:
-        return np.zeros(0, np.intp)
-    graph = coo_array((np.ones(len(one), np.bool_), (one, other)), shape=(n, n))
-    return np.asarray(connected_components(graph, directed=False)[1], np.intp)
+def weld(mesh: Mesh) -> Mesh:
+    """Merges vertices at exactly the same position and drops faces that collapse."""
+    # + 0.0: zero has one sign
+    rows = np.ascontiguousarray(mesh.vertices + 0.0).view(np.dtype((np.void, 24))).ravel()
+    _, first, number = np.unique(rows, return_index=True, return_inverse=True)
+    order = np.sort(first)
+    place = np.searchsorted(order, first)
+    faces = place[number][mesh.faces]
+    a, b, c = faces.T
+    faces = faces[(a != b) & (b != c) & (c != a)]
+    return Mesh(mesh.vertices[order], faces.astype(np.int32))
+
+
+def remove_small_components(mesh: Mesh, min_area: float) -> Mesh:
+    """Drops connected components with less than `min_area` square metres."""
+    if not len(mesh):
+        return mesh
+    pairs = mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2).astype(np.intp)
+    component = component_labels(pairs, len(mesh.vertices))
+    of_face = component[mesh.faces[:, 0]]
+    return mesh.select(np.bincount(of_face, mesh.areas())[of_face] >= min_area)
 
 
 def cross_columns(a: Float, b: Float) -> Float:

@@ -31,18 +31,6 @@ _MAX_STEP = 0.05  # rad, median step within a row
 _MAX_OPENING = 0.2  # rad that a full turn may lack
 
 
-class SurfaceFaces(NamedTuple):
-    """Triangles that are surface.
-
-    Attributes:
-        faces: (m, 3) int32, counter-clockwise as seen from the sensor.
-        standoff: (n,) metres from the sensor to the tangent plane at each point; 0: no triangle.
-    """
-
-    faces: Int32
-    standoff: Float
-
-
 class Rows(NamedTuple):
     """R rows of beams.
 
@@ -95,7 +83,7 @@ def _squared_distances(columns: Float, a: Int32, b: Int32) -> Float:
     return np.asarray(sum((x[a] - x[b]) ** 2 for x in columns))
 
 
-def filter_faces(points: Float, origin: Float, faces: Int32) -> SurfaceFaces:
+def filter_faces(points: Float, origin: Float, faces: Int32) -> tuple[Int32, Float]:
     """The triangles that do not span holes or depth discontinuities.
 
     A triangle at grazing incidence is either part of such a surface, as distant floor, and then
@@ -106,21 +94,21 @@ def filter_faces(points: Float, origin: Float, faces: Int32) -> SurfaceFaces:
         points: (n, 3) metres.
         origin: (n, 3) sensor position of each.
         faces: (m, 3).
+
+    Returns:
+        (m, 3) counter-clockwise as seen from the sensor; (n,) metres from the sensor to the tangent
+        plane at each point, 0 where there is no triangle.
     """
     columns, corners = _columns(points), [np.ascontiguousarray(k) for k in faces.T]
     a, b, c = (columns[:, k] for k in corners)
     ab, bc, ca = b - a, c - b, a - c
     cross, sight = cross_columns(ca, ab), _columns(origin)[:, corners[0]] - (a + b + c) / 3.0
     area, range = np.sqrt(dot_columns(cross, cross)), np.sqrt(dot_columns(sight, sight))
-    longest = np.sqrt(
-        np.maximum(np.maximum(dot_columns(ab, ab), dot_columns(bc, bc)), dot_columns(ca, ca))
-    )
+    longest = np.sqrt(np.max([dot_columns(edge, edge) for edge in (ab, bc, ca)], axis=0))
     facing = dot_columns(cross, sight)
     # counter-clockwise as seen from the sensor
     away = facing < 0.0
-    faces = np.column_stack(
-        [np.where(away, corners[2], corners[0]), corners[1], np.where(away, *corners[::2])]
-    )
+    faces = np.where(away[:, None], faces[:, ::-1], faces)
     cosine = np.abs(facing) / np.maximum(area * range, 1e-300)
     level = has_equal_ranges(row_lengths(origin - points), faces)
     limit = np.minimum(_MAX_EDGE, _MAX_EDGE_SHARE * range)
@@ -132,15 +120,11 @@ def filter_faces(points: Float, origin: Float, faces: Int32) -> SurfaceFaces:
     along = [dot_columns(at_points[:, faces[steep, k]], normals[:, steep]) for k in (0, 1, 2)]
     fits = np.ones(len(faces), np.bool_)
     # at two corners: the third may lie in the corner of a room
-    fits[steep] = _median_of_three(*along) >= np.cos(_MAX_BEND)
+    fits[steep] = np.sort(along, axis=0)[1] >= np.cos(_MAX_BEND)
     faces, normals = faces[fits], normals[:, fits]
     smooth = vertex_normals(normals, faces, len(points), _SMOOTHING_ROUNDS)
     standoff = dot_columns(smooth, _columns(origin - points))
-    return SurfaceFaces(faces.astype(np.int32), np.where(np.isfinite(standoff), standoff, 0.0))
-
-
-def _median_of_three(a: Float, b: Float, c: Float) -> Float:
-    return np.asarray(np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c)))
+    return faces.astype(np.int32), np.where(np.isfinite(standoff), standoff, 0.0)
 
 
 def has_equal_ranges(range: Float, faces: Int32) -> Bool:
@@ -150,8 +134,7 @@ def has_equal_ranges(range: Float, faces: Int32) -> Bool:
         range: (n,) metres.
         faces: (m, 3).
     """
-    a, b, c = (range[faces[:, k]] for k in (0, 1, 2))
-    between = np.maximum(np.maximum(a, b), c) - np.minimum(np.minimum(a, b), c)
+    between = np.ptp(range[faces.T], axis=0)
     return np.asarray(between <= _MAX_NOISE_RATIO * range_std(range, faces))
 
 

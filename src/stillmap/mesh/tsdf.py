@@ -6,37 +6,38 @@ the sensor, and of as many triangles as are asked for.
 """
 
 from collections.abc import Callable, Iterable
-from functools import partial
-from itertools import chain, product
-from typing import NamedTuple
+from itertools import product
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 import stillmap._core as _core
+from stillmap.core.errors import import_extra
 from stillmap.core.parallel import map_ordered
 from stillmap.core.recording import Recording
-from stillmap.mesh import marching_cubes
-from stillmap.mesh.marching_cubes import remove_small_components, weld_meshes
 from stillmap.mesh.options import MeshOptions
 from stillmap.mesh.range_image import Patch, find_scan_layout, triangulate_scans
-from stillmap.mesh.resolution import PatchExtents, choose_resolution, patch_extents
+from stillmap.mesh.resolution import (
+    PatchExtents,
+    choose_resolution,
+    median_range,
+    patch_extents,
+    select_scans,
+)
 from stillmap.mesh.simplification import simplification_error, simplify, simplify_to_budget
-from stillmap.mesh.triangle_mesh import Mesh
-from stillmap.mesh.types import Float, Float32, Index, Int32, Int64, Tell
+from stillmap.mesh.triangle_mesh import Mesh, concatenate_meshes, remove_small_components, weld
+from stillmap.mesh.types import Float, Float32, Int64, Tell, no_tell
 
-Tile = tuple[int, int, int]
+Tile = tuple[int, ...]
 
 _MIN_P_STATIC = 0.5  # product over a triangle's beams below which it is left out
-_MIN_TRAVEL_SHARE = 0.2  # of the median range, between viewpoints
-_MIN_TURN = 0.1  # rad, likewise
-_SCANS_PER_PLACE = 2  # scans used from each viewpoint: one may be occluded by a mover
-_SAMPLED_SCANS = 64  # of which the ranges are taken
-_MIN_CELL = 1e-3  # m, of the cells by which viewpoints nearby are found
+TILE = 64  # voxels along a tile, whole blocks
+_MAX_STEP = 2.5  # voxels between distances within a cube: more, and two surfaces meet there
 _EXTRACT_BYTES = 48e6  # of new voxels after which complete tiles are extracted
 _MERGE_FACES = 250_000  # triangles that wait to be merged
 _SPARE = 2  # times the triangle budget, while the surface grows
 
-_AROUND = list(product((-1, 0, 1), repeat=3))
 _BELOW = [way for way in product((-1, 0), repeat=3) if any(way)]
 
 
@@ -79,37 +80,41 @@ class StreamingSurface:
 
     def extract_complete(self, extents: PatchExtents, done: int) -> None:
         """Extracts tiles that patches from number `done` on do not reach; frees their voxels."""
-        tiles = marching_cubes.occupied_tiles(self.volume)
-        edge = marching_cubes.TILE * self.volume.voxel
+        tiles = self._occupied_tiles()
+        edge = TILE * self.volume.voxel
         self._extract(tiles[extents.is_complete(tiles, edge, done)])
         self._free_voxels()
         self._held = self.volume.memory_bytes
 
-    def finish(self, tell: Tell | None = None) -> Mesh:
+    def finish(self, tell: Tell = no_tell) -> Mesh:
         """The whole mesh within the budget; `tell` is called with the tiles done and the total."""
         o = self._parameters
-        self._extract(marching_cubes.occupied_tiles(self.volume), tell)
+        self._extract(self._occupied_tiles(), tell)
         self._merge()
         whole = remove_small_components(self._mesh, o.min_component_area)
         return simplify_to_budget(simplify(whole, self._error), self._error, o.max_faces)
 
-    def _extract(self, tiles: Int64, tell: Tell | None = None) -> None:
+    def _occupied_tiles(self) -> Int64:
+        """(N, 3) tiles with observed voxels, sorted."""
+        return np.unique(self.volume.blocks() // (TILE // self.volume.block_edge), axis=0)
+
+    def _extract(self, tiles: Int64, tell: Tell = no_tell) -> None:
         for done, tile in enumerate(tiles, start=1):
-            key = _key(tile)
+            key = tuple(tile.tolist())
             if key not in self._extracted:
                 self._extracted.add(key)
-                part = marching_cubes.extract_tile(self.volume, tile, self._parameters.min_weight)
+                part = extract_tile(self.volume, tile, self._parameters.min_weight)
                 if len(part):
                     self._waiting.append(simplify(part, self._error))
             if sum(map(len, self._waiting)) > max(_MERGE_FACES, len(self._mesh)):
                 self._merge()
-            if tell:
-                tell(done, len(tiles))
+            tell(done, len(tiles))
 
     def _free_voxels(self) -> None:
         """Frees extracted tiles but those that tiles below, not yet extracted, border on."""
         blocks = self.volume.blocks()
-        of_block = [_key(tile) for tile in blocks // marching_cubes.blocks_per_tile(self.volume)]
+        tiles = blocks // (TILE // self.volume.block_edge)
+        of_block = [tuple(tile) for tile in tiles.tolist()]
         there = set(of_block)
         gone = {
             (x, y, z)
@@ -120,7 +125,7 @@ class StreamingSurface:
 
     def _merge(self) -> None:
         """Welds waiting tiles to the mesh; its border stays, as more tiles may join it."""
-        whole = weld_meshes([self._mesh, *self._waiting])
+        whole = weld(concatenate_meshes([self._mesh, *self._waiting]))
         self._waiting = []
         if len(whole) > _MERGE_FACES:
             whole = simplify(whole, self._error)
@@ -129,18 +134,13 @@ class StreamingSurface:
         self._mesh = whole
 
 
-def _key(tile: Int64) -> Tile:
-    x, y, z = tile.tolist()
-    return x, y, z
-
-
 def build_surface(
     recording: Recording,
     poses: Float,
     p_static: Float32,
     options: MeshOptions | None = None,
     threads: int = 1,
-    tell: Tell | None = None,
+    tell: Tell = no_tell,
 ) -> Mesh:
     """The static surface in the map frame.
 
@@ -159,27 +159,23 @@ def build_surface(
     extents = patch_extents(recording, poses, layout)
     voxel, stride = choose_resolution(recording, poses, layout, extents, options.voxel_size)
     layout = layout._replace(stride=stride)
-    n, done = len(layout.groups), 0
+    n = len(layout.groups)
 
     def weighted(make: Callable[[], Patch]) -> tuple[Patch, Float32]:
         patch = make()
         return patch, static_weights(patch, p_static)
 
     def patches() -> Iterable[tuple[Patch, Float32]]:
-        nonlocal done
-        for one in map_ordered(weighted, triangulate_scans(recording, poses, layout), threads):
+        made = map_ordered(weighted, triangulate_scans(recording, poses, layout), threads)
+        for done, one in enumerate(made, start=1):
             yield one
-            done += 1
-            if tell:
-                tell(done, 2 * n)
+            tell(done, 2 * n)
 
-    later = partial(_tell_second_half, tell, n) if tell else None
+    def tell_later(done: int, total: int) -> None:
+        tell(n + n * done // total, 2 * n)
+
     parameters = TsdfParameters(max_faces=options.max_faces)
-    return integrate_patches(patches(), voxel, parameters, threads, later, extents)
-
-
-def _tell_second_half(tell: Tell, n: int, done: int, total: int) -> None:
-    tell(n + n * done // total, 2 * n)
+    return integrate_patches(patches(), voxel, parameters, threads, tell_later, extents)
 
 
 def integrate_patches(
@@ -187,7 +183,7 @@ def integrate_patches(
     voxel: float,
     parameters: TsdfParameters,
     threads: int = 1,
-    tell: Tell | None = None,
+    tell: Tell = no_tell,
     extents: PatchExtents | None = None,
 ) -> Mesh:
     """One surface of many patches, in the frame of their points.
@@ -223,37 +219,45 @@ def static_weights(patch: Patch, p_static: Float32) -> Float32:
     return np.where(weight >= _MIN_P_STATIC, weight, 0.0).astype(np.float32)
 
 
-def median_range(recording: Recording) -> float:
-    """Median range in metres of the hits of some scans; 0 where there are none."""
-    n = recording.n_scans
-    sampled = np.unique(np.linspace(0, n - 1, min(n, _SAMPLED_SCANS)).astype(np.intp))
-    parts = [recording.points[b][recording.hit[b]] for b in map(recording.beams_of, sampled)]
-    ranges = np.concatenate([np.zeros(0), *(np.linalg.norm(part, axis=1) for part in parts)])
-    ranges = ranges[np.isfinite(ranges)]
-    return float(np.median(ranges)) if len(ranges) else 0.0
+def extract_tile(volume: _core.TsdfVolume, tile: Int64, min_weight: float) -> Mesh:
+    """The surface within one tile, in metres; border vertices equal those of adjacent tiles.
 
-
-def select_scans(T_map_sensor: Float, sensor: Int32, range: float) -> Index:
-    """The first `_SCANS_PER_PLACE` scans from each viewpoint.
+    Cubes with an unobserved corner are skipped, and cubes in which distances step: there the back
+    of one surface meets the front of another.
 
     Args:
-        T_map_sensor: (T, 4, 4).
-        sensor: (T,) sensor of each scan.
-        range: metres, median.
+        volume: signed distances and weights.
+        tile: (3,) in tiles.
+        min_weight: voxels need more weight than this.
     """
-    position, R = T_map_sensor[:, :3, 3], T_map_sensor[:, :3, :3]
-    travel = _MIN_TRAVEL_SHARE * range
-    # by cells, so that each scan is compared only with those around
-    cells = np.floor(position / max(travel, _MIN_CELL)).astype(np.int64).tolist()
-    known: dict[tuple[int, ...], list[int]] = {}
-    chosen = list[int]()
-    for t, (x, y, z) in enumerate(cells):
-        mine = int(sensor[t])
-        around = [known.get((mine, x + i, y + j, z + k), ()) for i, j, k in _AROUND]
-        before = np.fromiter(chain.from_iterable(around), np.intp)
-        near = before[np.linalg.norm(position[before] - position[t], axis=1) < travel]
-        cosine = 0.5 * (np.einsum("nij,ij->n", R[near], R[t]) - 1.0)
-        if np.count_nonzero(cosine > np.cos(_MIN_TURN)) < _SCANS_PER_PLACE:
-            chosen.append(t)
-            known.setdefault((mine, x, y, z), []).append(t)
-    return np.array(chosen, np.intp)
+    measure: Any = import_extra("skimage.measure", "mesh.glb", "made", group="mesh")
+    first = [int(c) * TILE for c in tile]
+    metres, weight = volume.dense(first, [TILE + 1] * 3)
+    known = weight > min_weight
+    cubes = _reduce_cubes(np.logical_and, known)
+    low = _reduce_cubes(np.minimum, np.where(known, metres, np.inf))
+    high = _reduce_cubes(np.maximum, np.where(known, metres, -np.inf))
+    cubes &= (low < 0.0) & (high >= 0.0) & (high - low <= _MAX_STEP * volume.voxel)
+    if not cubes.any():
+        return Mesh.empty()
+    # scikit-image tests the mask at the last corner of a cube
+    mask = np.zeros(metres.shape, np.bool_)
+    mask[1:, 1:, 1:] = cubes
+    found, faces, _, _ = measure.marching_cubes(
+        np.where(known, metres, np.float32(1.0)), 0.0, mask=mask, gradient_direction="ascent"
+    )
+    vertices = found[:, ::-1].astype(np.float64) + first
+    mesh = weld(Mesh(vertices, np.ascontiguousarray(faces, np.int32)))
+    # vertices are counted from the center of voxel 0
+    return Mesh((mesh.vertices + 0.5) * volume.voxel, mesh.faces)
+
+
+def _reduce_cubes(
+    ufunc: Callable[[NDArray[Any], NDArray[Any]], NDArray[Any]], values: NDArray[Any]
+) -> NDArray[Any]:
+    """Reduces the eight corners of each cube."""
+    for axis in range(3):
+        low = tuple(slice(None, -1) if d == axis else slice(None) for d in range(3))
+        high = tuple(slice(1, None) if d == axis else slice(None) for d in range(3))
+        values = ufunc(values[low], values[high])
+    return values

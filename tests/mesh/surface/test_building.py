@@ -4,17 +4,15 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from stillmap.mesh import triangulation, tsdf
-from stillmap.mesh.marching_cubes import remove_small_components
+from stillmap.mesh import resolution, triangulation, tsdf
 from stillmap.mesh.options import MeshOptions
 from stillmap.mesh.range_image import Patch, find_scan_layout, triangulate_scans
-from stillmap.mesh.resolution import choose_resolution, patch_extents
-from stillmap.mesh.triangle_mesh import Mesh
+from stillmap.mesh.resolution import choose_resolution, patch_extents, select_scans
+from stillmap.mesh.triangle_mesh import Mesh, remove_small_components
 from stillmap.mesh.tsdf import (
     TsdfParameters,
     build_surface,
     integrate_patches,
-    select_scans,
     static_weights,
 )
 
@@ -118,7 +116,7 @@ def test_tiles_join_without_a_crack(walked, monkeypatch):
         raw.setattr(tsdf, "simplification_error", lambda _: 0.0)
         raw.setattr(tsdf, "remove_small_components", lambda mesh, _: mesh)
         whole = build_surface(walked[0], walked[1], static(walked[0]), OPTIONS)
-        monkeypatch.setattr("stillmap.mesh.marching_cubes.TILE", 16)
+        monkeypatch.setattr("stillmap.mesh.tsdf.TILE", 16)
         tiled = build_surface(walked[0], walked[1], static(walked[0]), OPTIONS)
     assert len(whole) == len(tiled)
     assert len(borders(whole)) == len(borders(tiled))
@@ -184,8 +182,8 @@ def test_scans_from_known_viewpoints_are_left_out(monkeypatch):
     T = np.tile(np.eye(4), (30, 1, 1))
     T[20:, 0, 3] = np.arange(10)
     sensor = np.zeros(30, np.int32)
-    monkeypatch.setattr(tsdf, "_MIN_TRAVEL_SHARE", 0.1)
-    monkeypatch.setattr(tsdf, "_MIN_TURN", 0.2)
+    monkeypatch.setattr(resolution, "_MIN_TRAVEL_SHARE", 0.1)
+    monkeypatch.setattr(resolution, "_MIN_TURN", 0.2)
     assert select_scans(T, sensor, 5.0).tolist() == [0, 1, *range(21, 30)]
     T[5, :2, :2] = [[0, -1], [1, 0]]
     assert 5 in select_scans(T, sensor, 5.0)

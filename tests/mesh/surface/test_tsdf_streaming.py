@@ -15,7 +15,7 @@ VOXEL, SIZE = 0.1, 1.6  # m, with tiles of 16 voxels
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
-    monkeypatch.setattr("stillmap.mesh.marching_cubes.TILE", 16)
+    monkeypatch.setattr("stillmap.mesh.tsdf.TILE", 16)
     monkeypatch.setattr(tsdf, "_EXTRACT_BYTES", 0.0)
 
 

@@ -122,6 +122,6 @@ def sharpest(mesh, views):
     best, most = np.full(len(mesh), -1, np.int32), np.zeros(len(mesh))
     for number, view in enumerate(views):
         seen = find_visible_faces(mesh, view)
-        better = seen.visible & (seen.pixels > most)
-        best[better], most[better] = number, seen.pixels[better]
+        better = seen > most
+        best[better], most[better] = number, seen[better]
     return best

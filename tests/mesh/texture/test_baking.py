@@ -9,8 +9,7 @@ from stillmap import _core
 from stillmap.core.errors import InputError
 from stillmap.mesh.texture import atlas
 from stillmap.mesh.texture.atlas import GRAY
-from stillmap.mesh.texture.baking import bake_texture, fill_gutters
-from stillmap.mesh.texture.sampling import downsample, sample_bilinear
+from stillmap.mesh.texture.baking import bake_texture, downsample, fill_gutters, sample_bilinear
 from stillmap.mesh.triangle_mesh import Mesh
 
 pytest.importorskip("xatlas")
@@ -20,6 +19,17 @@ LENSES = {
     "barrel": {"model": "plumb_bob", "distortion": (-0.2, 0.04, 0.002, -0.001)},
     "fisheye": {"model": "equidistant", "distortion": (0.02, -0.01, 0.0, 0.0)},
 }
+
+
+def face_of_texel(textured):
+    """(h, w) the face of each texel of the only page; -1: gutter or unused."""
+    (page,) = textured.pages
+    h, w = page.shape[:2]
+    out = np.full(h * w, -1)
+    mine = np.flatnonzero(textured.page == 0)
+    texel, of, _ = _core.rasterise_texels(textured.uv[textured.faces[mine]] * [w, h], w, h)
+    out[texel] = mine[of]
+    return out.reshape(h, w)
 
 
 def errors(textured):
@@ -67,7 +77,7 @@ def test_coarse_texels_are_means_of_pixels(monkeypatch):
     picture = np.zeros((300, 400, 3), np.uint8)
     picture[:, ::2] = 200
     textured = bake_texture(wall, np.zeros(32, np.int32), views, lambda _: picture)
-    face = textured.face_of_texel(0)
+    face = face_of_texel(textured)
     assert 2000 < np.sum(face >= 0) < 3000
     np.testing.assert_allclose(textured.pages[0][face >= 0], 100, atol=1)
 
@@ -79,7 +89,7 @@ def test_coarse_texels_lie_where_fine_ones_do(monkeypatch):
     ramp = np.clip((np.arange(400) - 149.5) * 2.5, 0, 255).round().astype(np.uint8)
     picture = np.broadcast_to(ramp[None, :, None], (300, 400, 3))
     textured = bake_texture(wall, np.zeros(32, np.int32), views, lambda _: picture)
-    face = textured.face_of_texel(0)
+    face = face_of_texel(textured)
     row, column = np.nonzero(face >= 0)
     # 0.8 m are 80 pixels, and 20 texels
     left = textured.uv[:, 0].min() * face.shape[1]
@@ -101,7 +111,7 @@ def test_a_picture_that_cannot_be_read_leaves_grey():
     assert "2.png" in textured.unread[0]
     assert "image 4: expected 300 x 400 of 8 bits, got (3, 3) uint16" in textured.unread[1]
     np.testing.assert_array_equal(textured.view, np.where((view == 2) | (view == 4), -1, view))
-    of_texel = textured.face_of_texel(0)
+    of_texel = face_of_texel(textured)
     lost = (of_texel >= 0) & (view[of_texel] == 2)
     assert lost.sum() > 1000
     assert (textured.pages[0][lost] == GRAY).all()
@@ -121,13 +131,6 @@ def test_without_pictures_all_is_grey():
     textured = bake_texture(wall, np.full(2, -1, np.int32), [], lambda _: None)
     assert textured.pages == ()
     assert (textured.page == -1).all()
-
-
-def test_what_is_refused():
-    wall = rectangle([-1.0, 3.0, -1.0], [2, 0, 0], [0, 0, 2])
-    for of_face in (np.zeros(3, np.int32), np.zeros(2), np.full(2, 1, np.int32)):
-        with pytest.raises(ValueError, match="view_of_face"):
-            bake_texture(wall, of_face, [looking([0, 0, 0], [0, 1, 0])], lambda _: None)
 
 
 def test_gutters_have_the_colours_beside_them():

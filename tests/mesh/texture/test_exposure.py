@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stillmap.core.camera import Camera, Images
-from stillmap.mesh.texture.exposure import apply_gains, estimate_gains
+from stillmap.mesh.texture.view_selection import apply_gains, estimate_gains
 from stillmap.mesh.texture.views import View
 
 CAMERA = Camera("front", 4, 3, np.eye(3), "", np.zeros(0), np.eye(4))

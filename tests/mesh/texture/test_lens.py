@@ -132,7 +132,7 @@ def test_no_two_directions_share_a_pixel(model, distortion):
 @pytest.mark.parametrize(("model", "distortion"), FOLDING)
 def test_the_limit_is_no_narrower_than_needed(model, distortion):
     # just outside of it, in some direction, a step out leads back in the picture
-    limit = camera_module._limit(*camera_module._lens(camera(model, distortion)))
+    limit = camera_module._limit(camera_module._lens(camera(model, distortion)))
     r, around = np.tan(limit + np.radians([0.1, 0.12])), np.linspace(0.0, 2.0 * np.pi, 64)
     u = np.column_stack([np.cos(around), np.sin(around)])
     a, b = (

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stillmap.mesh.texture.atlas import GRAY, TexturedMesh
-from stillmap.mesh.texture.sampling import TextureSampler, avoid_gray
+from stillmap.mesh.texture.baking import TextureSampler, avoid_gray
 
 ABOVE = np.array([0.5, 0.5, 9.0])
 
@@ -21,7 +21,6 @@ def square(page: np.ndarray, view: int = 0, z: float = 0.0) -> TexturedMesh:
         where,
         (page,),
         np.full(2, view, np.int32),
-        np.arange(4, dtype=np.int32),
     )
 
 
@@ -66,7 +65,6 @@ def test_the_side_that_was_seen_counts_though_the_other_one_is_nearer():
         np.array([0, 0, 1, 1], np.int32),
         (red, green),
         np.zeros(4, np.int32),
-        np.arange(8, dtype=np.int32),
     )
     points = np.array([[0.5, 0.3, 0.0], [0.5, 0.3, 0.02]])
     painted = TextureSampler(whole, 0.05)
@@ -99,7 +97,6 @@ def test_nothing_is_not_painted():
         np.zeros((0, 2)),
         np.zeros(0, np.int32),
         (),
-        np.zeros(0, np.int32),
         np.zeros(0, np.int32),
     )
     points = np.zeros((4, 3))

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from stillmap.core.components import component_labels
 from stillmap.mesh.objects.segmentation import (
     LINK,
     SPACING,
@@ -18,7 +19,6 @@ from stillmap.mesh.objects.segmentation import (
     segment_object,
 )
 from stillmap.mesh.tracked_boxes import TrackedBox
-from stillmap.mesh.triangle_mesh import label_components
 from stillmap.mesh.types import Bool, Float, Index
 from stillmap.tracking import MovingObject
 
@@ -216,7 +216,7 @@ def cluster_points(points: Float, sensor: Float, link: float) -> Index:
         link: metres.
     """
     n, away = len(points), np.linalg.norm(points - sensor, axis=1)
-    rows, columns, first = [np.zeros(0, np.intp)], [np.zeros(0, np.intp)], n
+    links, first = [np.zeros((0, 2), np.intp)], n
     near, far = 0.0, _FIRST_SHELL
     while near <= away.max(initial=0.0):
         length = link + SPACING * far
@@ -228,11 +228,10 @@ def cluster_points(points: Float, sensor: Float, link: float) -> Index:
             factor /= np.maximum(away[some], 1e-9)
             squeezed = sensor + (points[some] - sensor) * factor[:, None]
             cluster = cluster_cells(squeezed, length / _CELLS_PER_LINK, length)
-            rows.append(some)
-            columns.append(first + cluster)
+            links.append(np.column_stack([some, first + cluster]))
             first += int(cluster.max()) + 1
         near, far = far, 2.0 * far
-    return label_components(np.concatenate(rows), np.concatenate(columns), first)[:n]
+    return component_labels(np.concatenate(links), first)[:n]
 
 
 def _same_velocity(one: ObjectTrack, other: ObjectTrack) -> bool:

@@ -13,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from stillmap.mesh.marching_cubes import remove_small_components
 from stillmap.mesh.objects.segmentation import (
     SPACING,
     DynamicReturns,
@@ -24,7 +23,7 @@ from stillmap.mesh.objects.segmentation import (
 from stillmap.mesh.objects.sweep_surface import ObjectBeams, triangulate_beams
 from stillmap.mesh.range_image import Patch
 from stillmap.mesh.tracked_boxes import ObjectFrame
-from stillmap.mesh.triangle_mesh import Mesh
+from stillmap.mesh.triangle_mesh import Mesh, remove_small_components
 from stillmap.mesh.types import Float, Index
 
 MIN_COMPONENT_AREA = 0.005  # m2: smaller components of an object's surface are dropped

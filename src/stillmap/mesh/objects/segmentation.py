@@ -6,12 +6,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from stillmap.core import arrays
+from stillmap.core.components import component_labels
 from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.mesh.inputs import MeshInputs
 from stillmap.mesh.objects.sweep_surface import ObjectBeams
 from stillmap.mesh.range_image import beam_directions, has_planar_scans
 from stillmap.mesh.tracked_boxes import ObjectFrame, TrackedBox
-from stillmap.mesh.triangle_mesh import label_components
 from stillmap.mesh.types import Bool, Float, Float32, Index, Int32
 from stillmap.tracking import MovingObject
 
@@ -139,8 +139,8 @@ def grow_segment(
 def cluster_cells(points: Float, edge: float, link: float) -> Index:
     """(n,) cluster of points (n, 3) whose cells are connected by steps of at most `link` metres."""
     cells, of = unique_cells(points, edge)
-    one, other = cKDTree(cells).query_pairs(link / edge, output_type="ndarray").T
-    return label_components(one, other, len(cells))[of]
+    pairs = cKDTree(cells).query_pairs(link / edge, output_type="ndarray")
+    return component_labels(pairs, len(cells))[of]
 
 
 def unique_cells(points: Float, edge: float) -> tuple[Float, Index]:

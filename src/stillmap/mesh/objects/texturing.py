@@ -88,8 +88,8 @@ def assign_object_views(
             continue
         T_map_object = shape.frame.T_map_object(now)
         moved = replace(view, T_camera_map=view.T_camera_map @ T_map_object)
-        found = find_visible_faces(mesh, moved)
-        faces = np.flatnonzero(found.visible)
+        all_pixels = find_visible_faces(mesh, moved)
+        faces = np.flatnonzero(all_pixels)
         inset = _OUTLINE_INSET + OUTLINE_DRIFT * (0.0 if shape.rigid else _travel(shape, now))
         depth = _depth_inside_outline(mesh, faces, moved) - inset
         points = mesh.centers[faces] @ T_map_object[:3, :3].T + T_map_object[:3, 3]
@@ -98,7 +98,7 @@ def assign_object_views(
         if not len(faces):
             continue
         p_free = 1.0 - occlusion_probability(boxes_at(others, now), view.position, points)
-        pixels = found.pixels[faces].astype(np.float64)
+        pixels = all_pixels[faces].astype(np.float64)
         utility = view_utility(p_free, pixels, mesh.areas()[faces])
         if not shape.rigid:  # people change their shape
             utility -= away / IMAGE_WINDOW

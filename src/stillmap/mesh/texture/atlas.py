@@ -9,11 +9,9 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
-import stillmap._core as _core
 from stillmap.core.camera import project
+from stillmap.core.components import component_labels
 from stillmap.core.errors import import_extra
 from stillmap.mesh.texture.views import View
 from stillmap.mesh.triangle_mesh import Mesh
@@ -64,7 +62,6 @@ class TexturedMesh:
         page: (F,) int32, -1: gray.
         pages: P images (h, w, 3) uint8, sRGB.
         view: (F,) int32, number of the view on each face, -1: none.
-        vertex: (U,) int32, vertex of the mesh it was made from; -1: none.
         unread: one line for each image that could not be read; its faces are gray.
     """
 
@@ -74,27 +71,14 @@ class TexturedMesh:
     page: Int32
     pages: tuple[Image, ...]
     view: Int32
-    vertex: Int32
     unread: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.faces)
 
-    def face_of_texel(self, page: int) -> Int32:
-        """(h, w) int32, the face of each texel of a page; -1: gutter or unused."""
-        h, w = self.pages[page].shape[:2]
-        out = np.full(h * w, -1, np.int32)
-        mine = np.flatnonzero(self.page == page)
-        corners = self.uv[self.faces[mine]] * np.array([w, h], float)
-        texel, of, _ = _core.rasterise_texels(corners, w, h)
-        out[texel] = mine[of]
-        return out.reshape(h, w)
-
 
 def replace_faces(whole: TexturedMesh, of: Bool, part: TexturedMesh) -> TexturedMesh:
     """A mesh with the faces marked in `of` (F,) textured as in `part`, which has them in order."""
-    if of.shape != (len(whole),) or np.count_nonzero(of) != len(part):
-        raise ValueError(f"of: expected ({len(whole)},) with {len(part)} faces")
     faces, page, view = whole.faces.copy(), whole.page.copy(), whole.view.copy()
     faces[of] = part.faces + np.int32(len(whole.vertices))
     page[of] = np.where(part.page >= 0, part.page + np.int32(len(whole.pages)), part.page)
@@ -106,7 +90,6 @@ def replace_faces(whole: TexturedMesh, of: Bool, part: TexturedMesh) -> Textured
         page,
         (*whole.pages, *part.pages),
         view,
-        np.concatenate([whole.vertex, np.full(len(part.vertices), -1, np.int32)]),
         (*whole.unread, *part.unread),
     )
 
@@ -145,15 +128,11 @@ def build_layout(
 
 def find_charts(mesh: Mesh, view: Int32) -> Int64:
     """(F,) int64 number of each face's chart: adjacent faces with one view; -1 without one."""
-    F = len(mesh)
     pairs = mesh.adjacent_faces()
     pairs = pairs[(view[pairs[:, 0]] == view[pairs[:, 1]]) & (view[pairs[:, 0]] >= 0)]
-    graph = coo_array((np.ones(len(pairs), np.bool_), (pairs[:, 0], pairs[:, 1])), shape=(F, F))
-    chart = connected_components(graph, directed=False)[1].astype(np.int64) if F else view
-    chart = np.where(view >= 0, chart, -1)
-    _, number = np.unique(chart[chart >= 0], return_inverse=True)
-    out = np.full(F, -1, np.int64)
-    out[chart >= 0] = number
+    out = np.full(len(mesh), -1, np.int64)
+    chart = component_labels(pairs, len(mesh))[view >= 0]
+    out[view >= 0] = np.unique(chart, return_inverse=True)[1]
     return out
 
 

@@ -6,7 +6,6 @@ what lies within the image.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
@@ -31,21 +30,6 @@ _CORNER_INSET = 0.2  # share of the way to the center by which samples at corner
 _SEARCH_MARGIN = 1.05  # times the field of view in which points are projected
 _BORDER_SAMPLES = 33  # along each edge of an image, for its field of view
 _MAX_SUBDIVISION = 32  # sample intervals along the edge of a large face
-
-
-class VisibleFaces(NamedTuple):
-    """Visibility of F faces in an image.
-
-    Attributes:
-        visible: (F,) whether the whole face is in the image, front-facing and unoccluded.
-        pixels: (F,) float32, its area in the image; 0 where not visible.
-        cosine: (F,) float32, of the angle between its normal and the line of sight to its center;
-            below 0 from behind; 0 where it is not all in the image.
-    """
-
-    visible: Bool
-    pixels: Float32
-    cosine: Float32
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,43 +58,36 @@ def scale_intrinsics(K: Float, scale: float) -> Float:
     return out
 
 
-def find_visible_faces(mesh: Mesh, view: View, threads: int = 1) -> VisibleFaces:
-    """Faces that an image shows whole.
+def find_visible_faces(mesh: Mesh, view: View) -> Float32:
+    """(F,) square pixels of the faces that an image shows whole, unoccluded and from in front.
+
+    0 for all others.
 
     Args:
         mesh: V vertices, F faces.
         view: with a calibration that `calibration_error` accepts.
-        threads: the result does not depend on them.
     """
     points = view.to_camera(mesh.vertices)
-    uv, inside = _project_near(view, points, IMAGE_MARGIN)
+    uv, inside = _project_near(view, points)
     a, b, c = mesh.faces.T
-    candidates = np.flatnonzero(inside[a] & inside[b] & inside[c])
-    corners = _face_corners(points, mesh.faces[candidates])
-    cosine = np.zeros(len(mesh), np.float32)
-    cosine[candidates] = facing = _view_cosines(corners)
-    pixels = _pixel_areas(uv, mesh.faces[candidates])
-    kept = (facing > _MIN_COSINE) & (pixels >= _MIN_AREA)
-    candidates, pixels, corners = candidates[kept], pixels[kept], corners[..., kept]
-    visible, area = np.zeros(len(mesh), np.bool_), np.zeros(len(mesh), np.float32)
-    if len(candidates):
-        used = np.zeros(len(points), np.bool_)
-        used[mesh.faces[candidates]] = True
-        buffer = render_depth(mesh, view, points[used], DEPTH_SCALE, threads)
-        free = _is_unoccluded(buffer, corners)
-        visible[candidates[free]], area[candidates[free]] = True, pixels[free]
-    return VisibleFaces(visible, area, cosine)
-
-
-def _face_corners(points: Float, faces: Int32) -> Float:
-    """(3, 3, n) corners of faces (n, 3), by corner and coordinate: long rows are fast."""
+    faces = np.flatnonzero(inside[a] & inside[b] & inside[c])
     columns = np.ascontiguousarray(points.T)
-    return np.stack([columns[:, faces[:, k]] for k in range(3)])
+    # (3, 3, n) by corner and coordinate: long rows are fast
+    corners = np.stack([columns[:, mesh.faces[faces, k]] for k in range(3)])
+    pixels = _pixel_areas(uv, mesh.faces[faces])
+    kept = (_view_cosines(corners) > _MIN_COSINE) & (pixels >= _MIN_AREA)
+    faces, pixels, corners = faces[kept], pixels[kept], corners[..., kept]
+    out = np.zeros(len(mesh), np.float32)
+    if len(faces):
+        used = np.zeros(len(points), np.bool_)
+        used[mesh.faces[faces]] = True
+        buffer = render_depth(mesh, view, points[used], DEPTH_SCALE)
+        free = _is_unoccluded(buffer, corners)
+        out[faces[free]] = pixels[free]
+    return out
 
 
-def render_depth(
-    mesh: Mesh, view: View, shown: Float, scale: float, threads: int = 1
-) -> DepthBuffer:
+def render_depth(mesh: Mesh, view: View, shown: Float, scale: float) -> DepthBuffer:
     """The z-buffer of an ideal image that is just large enough.
 
     Args:
@@ -118,10 +95,10 @@ def render_depth(
         view: camera and pose.
         shown: (n, 3) metres in the camera's frame, in front of it: points to be in the image.
         scale: pixels along an edge, per pixel of the recorded image.
-        threads: the result does not depend on them.
     """
     assert view.camera.K is not None
-    K = scale_intrinsics(_affine_calibration(view.camera.K), scale)
+    K = scale_intrinsics(view.camera.K, scale)
+    K[1, 0], K[2] = 0.0, (0.0, 0.0, 1.0)  # which may be anything in files
     at = np.column_stack(project_pinhole(K, shown.T))
     # wide lenses: 80 degrees off axis is six times as far out as 45 degrees
     most = 2.0 * scale * np.array([view.camera.width, view.camera.height])
@@ -139,7 +116,6 @@ def render_depth(
         width,
         height,
         near=NEAR,
-        threads=threads,
     )
     number = np.append(near_by, -1).astype(np.int32)
     return DepthBuffer(K, depth, number[face])
@@ -158,18 +134,13 @@ def _faces_in_frustum(mesh: Mesh, view: View, K: Float, width: int, height: int)
     return np.flatnonzero((beyond[a] & beyond[b] & beyond[c]) == 0)
 
 
-def _affine_calibration(K: Float) -> Float:
-    """The calibration with the third row (0, 0, 1), which may be anything in files."""
-    return np.array([[K[0, 0], K[0, 1], K[0, 2]], [0.0, K[1, 1], K[1, 2]], [0.0, 0.0, 1.0]])
-
-
 def project_pinhole(K: Float, points: Float) -> tuple[Float, Float]:
     """(n,) columns and rows of points (3, n) in front of an ideal camera."""
     x, y = points[0] / points[2], points[1] / points[2]
     return K[0, 0] * x + K[0, 1] * y + K[0, 2], K[1, 1] * y + K[1, 2]
 
 
-def _project_near(view: View, points: Float, margin: float) -> tuple[Float, Bool]:
+def _project_near(view: View, points: Float) -> tuple[Float, Bool]:
     """(V, 2) pixels of points (V, 3) in the camera's frame, and whether they are in the image.
 
     NaN far outside of the field of view, where lens models do not hold.
@@ -180,9 +151,10 @@ def _project_near(view: View, points: Float, margin: float) -> tuple[Float, Bool
     near = np.flatnonzero((z > 0.0) & (x * x + y * y <= (tangent * z) ** 2))
     uv[near], ok[near] = project(view.camera, points[near])
     u, v = uv.T
-    width, height = view.camera.width - 1.0 - margin, view.camera.height - 1.0 - margin
+    width, height = view.camera.width - 1.0 - IMAGE_MARGIN, view.camera.height - 1.0 - IMAGE_MARGIN
     with np.errstate(invalid="ignore"):  # NaN: not in the image
-        return uv, ok & (u >= margin) & (u <= width) & (v >= margin) & (v <= height)
+        ok &= (u >= IMAGE_MARGIN) & (u <= width) & (v >= IMAGE_MARGIN) & (v <= height)
+    return uv, ok
 
 
 def _max_view_tangent(camera: Camera) -> float:
@@ -220,7 +192,8 @@ def _is_unoccluded(buffer: DepthBuffer, corners: Float) -> Bool:
     """(n,) whether nothing lies in front of triangles (3, 3, n) in the camera's frame."""
     free = np.ones(corners.shape[2], np.bool_)
     normal = _face_normals(corners)
-    around = _min_depth_around(buffer.depth, _DILATION)
+    # (h, w) minimum depth within some pixels along rows and columns
+    around = ndimage.minimum_filter(buffer.depth, 2 * _DILATION + 1, mode="nearest")
     for chosen, weights in _sample_faces(buffer, corners):
         left, of, normals = chosen, corners[..., chosen], normal[:, chosen]
         for weight in weights:
@@ -230,11 +203,6 @@ def _is_unoccluded(buffer: DepthBuffer, corners: Float) -> Bool:
                 free[left[~passes]] = False
                 left, of, normals = left[passes], of[..., passes], normals[:, passes]
     return free
-
-
-def _min_depth_around(depth: Float32, radius: int) -> Float32:
-    """(h, w) minimum depth within `radius` pixels along rows and columns."""
-    return np.asarray(ndimage.minimum_filter(depth, 2 * radius + 1, mode="nearest"))
 
 
 def _sample_faces(buffer: DepthBuffer, corners: Float) -> Iterator[tuple[Index, Float]]:

@@ -66,9 +66,9 @@ def _mesh_from_scene(scene: Any) -> TexturedMesh | Mesh:
         raise ValueError("a vertex that is not finite")
     if not pages:
         return Mesh(points, corners)
-    none = np.full(len(corners), -1, np.int32), np.full(count, -1, np.int32)
+    view = np.full(len(corners), -1, np.int32)
     return TexturedMesh(
-        points, corners, np.concatenate(uv), np.concatenate(page), tuple(pages), *none
+        points, corners, np.concatenate(uv), np.concatenate(page), tuple(pages), view
     )
 
 
