@@ -6,6 +6,7 @@ from made_up import Ball, Wall, watch
 
 from stillmap import _core, em
 from stillmap.core.recording import Recording
+from stillmap.em import beam_counting
 from stillmap.em.beam_counting import hit_ratio_e_step
 
 
@@ -25,19 +26,19 @@ def lane(hits, passes):
     )
 
 
-def counted(recording, threshold):
+def counted(recording):
     poses = np.tile(np.eye(3), (recording.n_scans, 1, 1))
     poses[:, :2, 2] = 0.5
     grid = _core.OccupancyGrid2D(1.0)
     em.add_recording(grid, recording, poses, None)
-    return grid, hit_ratio_e_step(recording, poses, grid, threshold)
+    return grid, hit_ratio_e_step(recording, poses, grid)
 
 
 @pytest.mark.parametrize(("hits", "passes"), [(1, 3), (2, 3), (5, 5), (1, 0), (1, 19)])
 @pytest.mark.parametrize("threshold", [0.1, 0.25, 0.4, 0.6])
-def test_half_at_the_threshold(hits, passes, threshold):
-    recording = lane(hits, passes)
-    grid, found = counted(recording, threshold)
+def test_half_at_the_threshold(hits, passes, threshold, monkeypatch):
+    monkeypatch.setattr(beam_counting, "MIN_HIT_RATIO", threshold)
+    grid, found = counted(lane(hits, passes))
     ratio = hits / (hits + passes)
     odds = ratio / max(1 - ratio, 1e-300) * (1 - threshold) / threshold
     expected = odds / (1 + odds)
@@ -53,7 +54,7 @@ def test_half_at_the_threshold(hits, passes, threshold):
 
 
 def test_passed_cells_are_free():
-    grid, found = counted(lane(1, 1), 0.25)
+    grid, found = counted(lane(1, 1))
     m = em.make_occupancy_map(grid, found.occupied)
     known = m.alpha + m.beta > 0
     assert (m.p_occupied[known & (m.alpha == 0)] == 0).all()

@@ -137,7 +137,7 @@ def project(camera: Camera, points: Float) -> tuple[Float, Mask]:
     ahead = z > 0.0
     safe = np.where(ahead, z, np.inf)
     x = points[:, :2] / safe[:, None]
-    ok: Mask = ahead & (_square(x) < float(np.tan(_limit(*lens))) ** 2)
+    ok: Mask = ahead & (_square(x) < float(np.tan(_limit(lens))) ** 2)
     distorted = _distort(lens, np.where(ok[:, None], x, 0.0))
     assert camera.K is not None
     uv = distorted @ camera.K[:2, :2].T + camera.K[:2, 2]
@@ -199,7 +199,7 @@ def _undistort(lens: Lens, wanted: Float) -> Float:
     """
     if lens[0] == "":
         return wanted.copy()
-    radius = np.tan(_limit(*lens))
+    radius = np.tan(_limit(lens))
     r = np.sqrt(_square(wanted))
     x: Float = wanted * np.minimum(1.0, 0.5 * radius / np.maximum(r, 1e-300))[:, None]
     open_ = np.flatnonzero(np.isfinite(wanted).all(axis=1))
@@ -224,12 +224,11 @@ def _undistort(lens: Lens, wanted: Float) -> Float:
 
 def _newton_step(lens: Lens, x: Float, wanted: Float) -> Float:
     """(n, 2) Newton steps, with the Jacobian in radial and tangential coordinates."""
-    model, k = lens
     r = np.sqrt(_square(x))
     u = np.divide(x, r[:, None], out=np.zeros_like(x), where=r[:, None] > 0.0)
     u[r == 0.0] = (1.0, 0.0)
-    v = np.column_stack([-u[:, 1], u[:, 0]])
-    along, across, mixed = _jacobian(model, k, r, *_tangential_along(k, u, v, model))
+    v = _turn_left(u)
+    along, across, mixed = _jacobian(lens, r, u)
     residual = _distort(lens, x) - wanted
     a, b = np.sum(residual * u, axis=1), np.sum(residual * v, axis=1)
     det = along * across - mixed * mixed
@@ -237,24 +236,22 @@ def _newton_step(lens: Lens, x: Float, wanted: Float) -> Float:
     return np.asarray(radial[:, None] * u + tangential[:, None] * v)
 
 
-def _tangential_along(k: tuple[float, ...], u: Float, v: Float, model: str) -> tuple[Float, Float]:
-    """(n,) components of q along directions u and v (n, 2)."""
-    q = np.zeros(2) if model == "equidistant" else np.array([k[3], k[2]])
-    return np.asarray(u @ q), np.asarray(v @ q)
-
-
-def _jacobian(
-    model: str, k: tuple[float, ...], r: Float, q_along: Float, q_across: Float
-) -> tuple[Float, Float, Float]:
-    """Radial, tangential and mixed entries of the Jacobian at radius r."""
+def _jacobian(lens: Lens, r: Float, u: Float) -> tuple[Float, Float, Float]:
+    """Radial, tangential and mixed entries of the Jacobian at radii r, in directions u (n, 2)."""
+    model, k = lens
     if model == "equidistant":
-        angle = np.arctan(r)
-        shown, slope = _distort_angle(k, angle)
+        shown, slope = _distort_angle(k, np.arctan(r))
         across = np.divide(shown, r, out=np.ones_like(r), where=r > 0.0)
         return slope / (1.0 + r * r), across, np.zeros_like(r)
+    q = np.array([k[3], k[2]])
+    q_along, q_across = u @ q, _turn_left(u) @ q
     g, slope = _radial(k, r * r)
     along = g + 2.0 * r * r * slope + 6.0 * r * q_along
     return along, g + 2.0 * r * q_along, 2.0 * r * q_across
+
+
+def _turn_left(u: Float) -> Float:
+    return np.column_stack([-u[:, 1], u[:, 0]])
 
 
 def _radial(k: tuple[float, ...], s: Float) -> tuple[Float, Float]:
@@ -276,18 +273,16 @@ def _distort_angle(k: tuple[float, ...], angle: Float) -> tuple[Float, Float]:
 
 
 @lru_cache(maxsize=64)
-def _limit(model: str, k: tuple[float, ...]) -> float:
+def _limit(lens: Lens) -> float:
     """Angle from the axis up to which the model is injective: its Jacobian is positive definite."""
-    if model == "":
+    if lens[0] == "":
         return float(_MAX_ANGLE)
     angle = np.linspace(0.0, _MAX_ANGLE, _SAMPLES)
     around = np.linspace(0.0, 2.0 * np.pi, _DIRECTIONS, endpoint=False)
     u = np.column_stack([np.cos(around), np.sin(around)])
-    v = np.column_stack([-u[:, 1], u[:, 0]])
-    q_parts = (q[:, None] for q in _tangential_along(k, u, v, model))
-    along, across, mixed = _jacobian(model, k, np.tan(angle)[None], *q_parts)
+    along, across, mixed = _jacobian(lens, np.tan(angle)[:, None], u)
     # NaN beyond a pole counts as a fold
-    is_injective = ((along > 0.0) & (across > 0.0) & (along * across > mixed * mixed)).all(axis=0)
+    is_injective = ((along > 0.0) & (across > 0.0) & (along * across > mixed * mixed)).all(axis=1)
     folds = np.flatnonzero(~is_injective)
     return float(angle[max(folds[0] - 1, 0)] if len(folds) else _MAX_ANGLE)
 

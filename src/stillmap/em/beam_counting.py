@@ -51,38 +51,34 @@ def log_likelihood(
 
 
 def hit_ratio_e_step(
-    recording: Recording,
-    poses: Float,
-    grid: _core.OccupancyGrid2D,
-    threshold: float,
-    threads: int = 1,
+    recording: Recording, poses: Float, grid: _core.OccupancyGrid2D, threads: int = 1
 ) -> EStepResult:
-    """P(static) by the hit ratio r of the end cell, 1/2 at the threshold.
+    """P(static) by the hit ratio r of the end cell, 1/2 at the threshold MIN_HIT_RATIO.
 
     Args:
         recording: 2D.
         poses: (T, 3, 3) T_map_base.
         grid: counts with e = 1, so that r = alpha / (alpha + beta).
-        threshold: ratio below which a cell is dropped.
         threads: does not change the result.
 
     The odds are those of r relative to those of the threshold: monotone in r, and above one half
     exactly where such mappers keep the cell.
     """
     # (8) with prior 1 - threshold is exactly r (1 - threshold) / (r (1 - threshold) + ...)
-    found = paper_e_step(recording, poses, grid, 1.0 - threshold, threads)
+    prior = 1.0 - MIN_HIT_RATIO
+    found = paper_e_step(recording, poses, grid, prior, threads)
     p = found.p_static
     for _, beams, _ in iter_chunks(recording, release=[p]):
         points, hit = recording.points[beams], recording.hit[beams]
-        p[beams] = fill_beams(points, hit, p[beams], 1.0 - threshold)
-    return EStepResult(p, found.likelihood, threshold_hit_ratio(grid, threshold))
+        p[beams] = fill_beams(points, hit, p[beams], prior)
+    return EStepResult(p, found.likelihood, threshold_hit_ratio(grid))
 
 
-def threshold_hit_ratio(grid: _core.OccupancyGrid2D, threshold: float) -> CellProbabilities:
-    """Occupancy 1 where alpha / (alpha + beta) reaches the threshold, else 0."""
+def threshold_hit_ratio(grid: _core.OccupancyGrid2D) -> CellProbabilities:
+    """Occupancy 1 where alpha / (alpha + beta) reaches the threshold MIN_HIT_RATIO, else 0."""
     first, alpha, beta = grid.dense()
     ratio = np.divide(alpha, alpha + beta, out=np.zeros_like(alpha), where=alpha + beta > 0.0)
     rows = np.argwhere(alpha > 0.0)
     cells = np.ascontiguousarray(rows[:, ::-1] + first)
-    kept = ratio[tuple(rows.T)] >= threshold
+    kept = ratio[tuple(rows.T)] >= MIN_HIT_RATIO
     return CellProbabilities(cells, kept.astype(np.float32), 0.0)

@@ -89,9 +89,7 @@ def e_step(
     if not isinstance(grid, _core.OccupancyGrid2D):
         raise ValueError(f"estimator: {estimator} knows 2D recordings only")
     if estimator == "hit-ratio":
-        return beam_counting.hit_ratio_e_step(
-            recording, poses, grid, beam_counting.MIN_HIT_RATIO, threads
-        )
+        return beam_counting.hit_ratio_e_step(recording, poses, grid, threads)
     return _tracker_e_step(recording, poses, grid.resolution, options, threads)
 
 
@@ -106,7 +104,7 @@ def _tracker_e_step(
     grid = _core.OccupancyGrid2D(resolution)
     add_recording(grid, recording, poses, e, threads)
     likelihood = beam_counting.log_likelihood(recording, poses, grid, e, options.prior, threads)
-    occupied = beam_counting.threshold_hit_ratio(grid, beam_counting.MIN_HIT_RATIO)
+    occupied = beam_counting.threshold_hit_ratio(grid)
     return EStepResult(e, likelihood, occupied)
 
 

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+import stillmap._core as _core
 from stillmap.core.chunks import iter_beams
 from stillmap.core.recording import Recording
 from stillmap.em import spatial_coupling
@@ -97,6 +98,7 @@ def e_step_3d(
         recording, poses, resolution, options, threads, _CLASSES_3D, changes
     )
     surfel_map, mixture = observations.surfel_map, ChangeMixture(observations, options)
+    assert isinstance(surfel_map, _core.SurfelMap3D)
     own_p_static, change = mixture.label_surfels()
     p_static = spatial_coupling.smooth_mean_field(own_p_static, surfel_map, threads)
     ground = ground_from_surfels(surfel_map, p_static, recording.T_map_sensor(poses)[:, :3, 3])

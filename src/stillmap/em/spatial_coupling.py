@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 import stillmap._core as _core
 from stillmap.core.chunks import ScanBeams, iter_beams
 from stillmap.core.recording import Recording
-from stillmap.em.observations import SurfelMap, iter_surfel_rows
+from stillmap.em.observations import iter_surfel_rows
 from stillmap.em.types import MIN_PROBABILITY, Float, GroundMap
 
 _MEAN_FIELD = {
@@ -38,13 +38,13 @@ _CLEARANCE_STD = 2.5  # the same in noise_std; the larger of the two counts
 
 
 def smooth_mean_field(
-    p_static: NDArray[np.float32], surfel_map: SurfelMap, threads: int = 1
+    p_static: NDArray[np.float32], surfel_map: _core.SurfelMap3D, threads: int = 1
 ) -> NDArray[np.float32]:
     """(E,) P(static) of each surfel given its own observations and its neighbours.
 
     Args:
         p_static: (E,) given each surfel's own observations.
-        surfel_map: E surfels in 3D, with the time bins of their end points.
+        surfel_map: E surfels, with the time bins of their end points.
         threads: does not change the result.
 
     Mean field of a Potts model:
@@ -53,17 +53,11 @@ def smooth_mean_field(
     p = np.clip(p_static, MIN_PROBABILITY, 1.0 - MIN_PROBABILITY)
     log_odds = np.log(p / (1.0 - p)).astype(np.float32)
     return _core.smooth_mean_field(
-        _require_3d(surfel_map),
+        surfel_map,
         log_odds,
         **_MEAN_FIELD,  # type: ignore[arg-type]
         threads=threads,
     )
-
-
-def _require_3d(surfel_map: SurfelMap) -> _core.SurfelMap3D:
-    if not isinstance(surfel_map, _core.SurfelMap3D):
-        raise TypeError("surfel_map: expected a 3D one")
-    return surfel_map
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,11 +110,10 @@ class ObstacleSurfels:
         )
 
 
-def select_obstacles(ground: GroundMap, surfel_map: SurfelMap) -> ObstacleSurfels | None:
+def select_obstacles(ground: GroundMap, surfels: _core.SurfelMap3D) -> ObstacleSurfels | None:
     """The surfels of obstacles on the ground; None where no ground was observed."""
     if not ground.observed:
         return None
-    surfels = _require_3d(surfel_map)
     is_obstacle = np.empty(surfels.size, np.bool_)
     ground_height = np.empty(surfels.size, np.float32)
     for rows in iter_surfel_rows(surfels):

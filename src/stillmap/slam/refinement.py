@@ -1,6 +1,8 @@
 """Refinement pass: each scan is matched against the map of all other scans."""
 
 import dataclasses
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +39,12 @@ def refine_poses(
     poses = initial.poses.copy()
     T = len(poses)
     covariance, explained = np.zeros((T, 3, 3)), np.ones(T)
-    prior = _NeighborPrior(recording, poses, initial.diagnostics.breaks, options)
+    odometry, breaks = recording.T_odom_base, initial.diagnostics.breaks
+    source = poses if odometry is None else odometry
+    increments = se2.inverse(source[:-1]) @ source[1:]
+    step_prior: Callable[[Float, Float], MotionPrior] = motion_model.increment_prior
+    if odometry is not None:
+        step_prior = partial(motion_model.odometry_prior, options=options.odometry)
     grid = _core.OccupancyGrid2D(options.resolution, scan_matching.FREE_SPACE_MARGIN)
     kept = select_keyframes_per_sensor(poses, recording.sensor, SCAN_SPACING, SCAN_SPACING)
     for t in recording.iter_scans(kept, e):
@@ -48,7 +55,8 @@ def refine_poses(
         if is_in_map[t]:
             add_scan(grid, recording, e, t, poses[t], remove=True)
         scan = select_hits(recording, e, t)
-        match = scan_matching.refine_pose(grid, scan, prior.at(t), poses[t])
+        prior = _neighbor_prior(t, poses, increments, breaks, step_prior)
+        match = scan_matching.refine_pose(grid, scan, prior, poses[t])
         poses[t] = se2.normalize(match.T_map_base)
         covariance[t], explained[t] = match.covariance, match.explained
         if is_in_map[t]:
@@ -57,38 +65,27 @@ def refine_poses(
     return dataclasses.replace(initial, poses=poses, covariance=covariance, explained=explained)
 
 
-class _NeighborPrior:
-    """Prior of a pose from the motion since the scan before and until the scan after.
+def _neighbor_prior(
+    t: int,
+    poses: Float,
+    increments: Float,
+    breaks: list[int],
+    step_prior: Callable[[Float, Float], MotionPrior],
+) -> MotionPrior:
+    """Prior of scan t from the motion since the scan before and until the scan after.
 
     Args:
-        recording: its odometry, if there is one, gives the increments.
-        poses: (T, 3, 3) current poses, which the caller refines in place.
+        t: the scan.
+        poses: (T, 3, 3).
+        increments: (T - 1, 3, 3) between scans.
         breaks: scans before which the motion is unknown.
-        options: see SlamOptions.
+        step_prior: the prior after an increment from a pose.
     """
-
-    def __init__(
-        self, recording: Recording, poses: Float, breaks: list[int], options: SlamOptions
-    ) -> None:
-        odometry = recording.T_odom_base
-        source = poses if odometry is None else odometry
-        self._increments = se2.inverse(source[:-1]) @ source[1:]
-        self._is_odometry = odometry is not None
-        self._poses, self._breaks, self._options = poses, breaks, options.odometry
-
-    def at(self, t: int) -> MotionPrior:
-        """The prior of scan t."""
-        poses, increments = self._poses, self._increments
-        if t in self._breaks:
-            prior = motion_model.increment_prior(poses[t], np.eye(3))
-        else:
-            prior = self._from(poses[t - 1], increments[t - 1])
-        if t + 1 == len(poses) or t + 1 in self._breaks:
-            return prior
-        after = self._from(poses[t + 1], se2.inverse(increments[t]))
-        return motion_model.fuse_priors(prior, after)
-
-    def _from(self, T_map_base: Float, increment: Float) -> MotionPrior:
-        if self._is_odometry:
-            return motion_model.odometry_prior(T_map_base, increment, self._options)
-        return motion_model.increment_prior(T_map_base, increment)
+    if t in breaks:
+        prior = motion_model.increment_prior(poses[t], np.eye(3))
+    else:
+        prior = step_prior(poses[t - 1], increments[t - 1])
+    if t + 1 == len(poses) or t + 1 in breaks:
+        return prior
+    after = step_prior(poses[t + 1], se2.inverse(increments[t]))
+    return motion_model.fuse_priors(prior, after)

@@ -93,21 +93,25 @@ def _segment_scans(
     min_p_dynamic: float,
     threads: int,
 ) -> _Segments:
-    T_map_sensor, T = recording.T_map_sensor(poses), recording.n_scans
-    scratch, offset, segments = recording.scratch, np.zeros(T + 1, np.int64), 0
+    T_map_sensor, n = recording.T_map_sensor(poses), recording.n_scans
+    scratch, offset, segments = recording.scratch, np.zeros(n + 1, np.int64), 0
     points, nearest = ArrayBuilder(np.float32, (2,), scratch), ArrayBuilder(np.intp, (), scratch)
     segment_of, beam = ArrayBuilder(np.int64, (), scratch), ArrayBuilder(np.intp, (), scratch)
 
     def process(t: int) -> tuple[Index, Index, Float, Index]:
         beams = recording.beams_of(t)
         dynamic = recording.hit[beams] & (p_static[beams] <= 1.0 - min_p_dynamic)
-        number, end = _select_above_ground(beams, dynamic, recording, T_map_sensor[t], ground)
+        number, T = beams.start + np.flatnonzero(dynamic), T_map_sensor[t]
+        end = recording.points[number].astype(np.float64) @ T[:3, :3].T + T[:3, 3]
+        above = end[:, 2] - ground.height_at(end[:, :2])
+        kept = (above > _MIN_HEIGHT) & (above < _MAX_HEIGHT)
+        number, end = number[kept], end[kept]
         segment = _connect_columns(end[:, :2])
         kept = np.bincount(segment, minlength=1)[segment] >= _MIN_POINTS
         local = (end[kept, :2] - planar_poses[t, :2, 2]) @ planar_poses[t, :2, :2]
         return number[kept], segment[kept], local, _nearest_per_direction(local)
 
-    scans = recording.iter_scans(range(T), p_static)
+    scans = recording.iter_scans(range(n), p_static)
     for t, (number, segment, local, near) in enumerate(map_ordered(process, scans, threads)):
         points.append(local[near].astype(np.float32))
         nearest.append(number[near])
@@ -116,17 +120,6 @@ def _segment_scans(
         segments += int(segment.max()) + 1 if len(segment) else 0
         offset[t + 1] = offset[t] + len(near)
     return _Segments(points.finish(), nearest.finish(), offset, segment_of.finish(), beam.finish())
-
-
-def _select_above_ground(
-    beams: slice, dynamic: NDArray[np.bool_], recording: Recording, T: Float, ground: GroundMap
-) -> tuple[Index, Float]:
-    """Numbers and end points (n, 3), in the map frame, of the dynamic beams above the ground."""
-    number = beams.start + np.flatnonzero(dynamic)
-    end = recording.points[number].astype(np.float64) @ T[:3, :3].T + T[:3, 3]
-    above = end[:, 2] - ground.height_at(end[:, :2])
-    kept = (above > _MIN_HEIGHT) & (above < _MAX_HEIGHT)
-    return number[kept], end[kept]
 
 
 def _connect_columns(xy: Float) -> Index:
