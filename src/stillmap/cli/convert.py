@@ -134,13 +134,12 @@ def _convert_result(args: argparse.Namespace, source: Path, output: Path) -> tup
 
 def _convert_to_table(args: argparse.Namespace, result: "ResultFolder", output: Path) -> str:
     from stillmap.core.files import require_new_file
-    from stillmap.results import reader
     from stillmap.results.export import parquet
     from stillmap.slam import deskew_recording
 
     require_new_file(output, args.overwrite)
     parquet.require_pyarrow()
-    exported = reader.read(result)
+    exported = result.export()
     deskewed = deskew_recording(exported.recording, exported.poses, result.slam_options)
     parquet.write(exported, deskewed, output)
     return f"{exported.recording.n_beams} beams"
@@ -151,7 +150,6 @@ def _convert_to_bag(
 ) -> tuple[list[str], str]:
     from stillmap.io import writers
     from stillmap.io.ros.bag_types import BagKind
-    from stillmap.results import reader
     from stillmap.results.export import bag, obj
 
     hint = f"a bag, .mcap for Foxglove, {_PARQUET}, or in 3D {', '.join(CLOUDS)}, {obj.ENDING}"
@@ -165,7 +163,7 @@ def _convert_to_bag(
         hint += "; `stillmap filter` writes its recording"
         raise InputError(text, where=str(output), hint=hint)
     writers.require_free(output, writer, args.overwrite)
-    exported = reader.read(result)
+    exported = result.export()
     losses = bag.write(exported, output, kind, overwrite=args.overwrite)
     scans, objects = exported.recording.n_scans, len(exported.tracks)
     return losses, f"{scans} scans, map, trajectory and {objects} objects"

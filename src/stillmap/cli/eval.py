@@ -28,27 +28,62 @@ EPILOG = """examples:
 """
 
 
+# help, description and arguments of examples
+_SCORES = {
+    "relations": (
+        "known displacements between pairs of poses",
+        "Errors of known displacements between pairs of poses (Kuemmerle et al. 2009).",
+        "out/trajectory.tum log.relations",
+        "out/trajectory.tum log.relations --odom log.clf.gz --json",
+    ),
+    "trajectory": (
+        "absolute and relative errors against a reference",
+        "Absolute and relative errors of a trajectory against a reference (ATE, RPE).",
+        "out/trajectory.tum sim/truth/trajectory.tum",
+        "out/trajectory.tum truth.tum --delta 10 --delta-unit frames",
+    ),
+    "labels": (
+        "P(static) of the beams, against a simulation's truth",
+        "Classification of beams against a simulation's truth; dynamic is the positive class.",
+        "out sim",
+        "out sim --json",
+    ),
+    "map": (
+        "ghost cells and walls kept, against a simulation's truth",
+        "Occupied cells where nothing static is, and the share of wall cells that the map shows, "
+        "against a simulation's truth.",
+        "out sim",
+        "out sim --reference out-empty --reference-truth sim-empty",
+    ),
+    "model": (
+        "surface, texture and object models, against a simulation's truth",
+        "Distance of the mesh from the true surface, and its completeness; colour errors of the "
+        "texture, and its share that shows movers; shapes and textures of object models. The "
+        "simulation needs cameras.",
+        "out sim",
+        "out sim --within 20 --json",
+    ),
+}
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the five scores."""
     scores = parser.add_subparsers(title="scores", dest="score", required=True, metavar="SCORE")
-    _add_relations(scores)
-    _add_trajectory(scores)
-    _add_labels(scores)
-    _add_map(scores)
-    _add_model(scores)
-    for score in scores.choices.values():
+    for name, (about, description, *examples) in _SCORES.items():
+        epilog = "\n".join(
+            ["examples:", *(f"  stillmap eval {name} {one}" for one in examples), ""]
+        )
+        score = scores.add_parser(name, help=about, description=description, epilog=epilog)
+        if name == "relations":
+            _add_relations(score)
+        elif name == "trajectory":
+            _add_trajectory(score)
+        else:
+            _add_simulation(score, name)
         score.add_argument("--json", action="store_true", help="one JSON object on stdout")
 
 
-def _add_relations(scores: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    parser = scores.add_parser(
-        "relations",
-        help="known displacements between pairs of poses",
-        description="Errors of known displacements between pairs of poses (Kuemmerle et al. 2009).",
-        epilog="examples:\n"
-        "  stillmap eval relations out/trajectory.tum log.relations\n"
-        "  stillmap eval relations out/trajectory.tum log.relations --odom log.clf.gz --json\n",
-    )
+def _add_relations(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("trajectory", type=Path, metavar="TRAJ", help=_TRAJECTORY)
     parser.add_argument(
         "relations", type=Path, metavar="RELATIONS", help="rows 't1 t2 x y z roll pitch yaw'"
@@ -73,15 +108,7 @@ def _add_relations(scores: "argparse._SubParsersAction[argparse.ArgumentParser]"
     )
 
 
-def _add_trajectory(scores: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    parser = scores.add_parser(
-        "trajectory",
-        help="absolute and relative errors against a reference",
-        description="Absolute and relative errors of a trajectory against a reference (ATE, RPE).",
-        epilog="examples:\n"
-        "  stillmap eval trajectory out/trajectory.tum sim/truth/trajectory.tum\n"
-        "  stillmap eval trajectory out/trajectory.tum truth.tum --delta 10 --delta-unit frames\n",
-    )
+def _add_trajectory(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("trajectory", type=Path, metavar="TRAJ", help=_TRAJECTORY)
     parser.add_argument("reference", type=Path, metavar="REFERENCE", help=_TRAJECTORY)
     parser.add_argument(
@@ -106,71 +133,36 @@ def _add_trajectory(scores: "argparse._SubParsersAction[argparse.ArgumentParser]
     )
 
 
-def _add_labels(scores: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    parser = scores.add_parser(
-        "labels",
-        help="P(static) of the beams, against a simulation's truth",
-        description="Classification of beams against a simulation's truth; dynamic is the positive "
-        "class.",
-        epilog="examples:\n  stillmap eval labels out sim\n  stillmap eval labels out sim --json\n",
-    )
-    _add_result_and_truth(parser)
-
-
-def _add_map(scores: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    parser = scores.add_parser(
-        "map",
-        help="ghost cells and walls kept, against a simulation's truth",
-        description="Occupied cells where nothing static is, and the share of wall cells that the "
-        "map shows, against a simulation's truth.",
-        epilog="examples:\n"
-        "  stillmap eval map out sim\n"
-        "  stillmap eval map out sim --reference out-empty --reference-truth sim-empty\n",
-    )
-    _add_result_and_truth(parser)
-    parser.add_argument(
-        "--reference",
-        type=Path,
-        metavar="OTHER_RESULT_DIR",
-        help="take the walls from this map, say of the same run without people "
-        "(default: from true static hits)",
-    )
-    parser.add_argument(
-        "--reference-truth",
-        type=Path,
-        metavar="DIR",
-        help="truth of that other run (default: TRUTH_DIR)",
-    )
-
-
-def _add_model(scores: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    parser = scores.add_parser(
-        "model",
-        help="surface, texture and object models, against a simulation's truth",
-        description="Distance of the mesh from the true surface, and its completeness; colour "
-        "errors of the texture, and its share that shows movers; shapes and textures of object "
-        "models. The simulation needs cameras.",
-        epilog="examples:\n"
-        "  stillmap eval model out sim\n"
-        "  stillmap eval model out sim --within 20 --json\n",
-    )
-    _add_result_and_truth(parser)
-    parser.add_argument(
-        "--within",
-        type=_positive,
-        default=float("inf"),
-        metavar="M",
-        help="expect only what beams and images saw from at most M metres (default: all)",
-    )
-
-
-def _add_result_and_truth(parser: argparse.ArgumentParser) -> None:
+def _add_simulation(parser: argparse.ArgumentParser, score: str) -> None:
+    """The arguments of scores against a simulation."""
     parser.add_argument(
         "result", type=Path, metavar="RESULT_DIR", help="folder that `stillmap map` wrote"
     )
     parser.add_argument(
         "truth", type=Path, metavar="TRUTH_DIR", help="folder that `stillmap simulate` wrote"
     )
+    if score == "map":
+        parser.add_argument(
+            "--reference",
+            type=Path,
+            metavar="OTHER_RESULT_DIR",
+            help="take the walls from this map, say of the same run without people "
+            "(default: from true static hits)",
+        )
+        parser.add_argument(
+            "--reference-truth",
+            type=Path,
+            metavar="DIR",
+            help="truth of that other run (default: TRUTH_DIR)",
+        )
+    if score == "model":
+        parser.add_argument(
+            "--within",
+            type=_positive,
+            default=float("inf"),
+            metavar="M",
+            help="expect only what beams and images saw from at most M metres (default: all)",
+        )
 
 
 def run(args: argparse.Namespace) -> int:

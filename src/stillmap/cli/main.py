@@ -6,7 +6,6 @@ import logging
 import os
 import sys
 from pathlib import Path
-from typing import NoReturn
 
 from stillmap.cli.console import EXIT_INTERRUPTED, EXIT_TERMINATED, fail, handle_signals, say
 from stillmap.cli.parser import COMMANDS, EXIT_INPUT, parser
@@ -24,12 +23,15 @@ def main(argv: list[str] | None = None) -> int:
     args = argparse.Namespace()
     try:
         if "_ARGCOMPLETE" in os.environ:
-            _complete()
+            from stillmap.cli.completion import answer_shell
+
+            answer_shell(parser(os.environ.get("COMP_LINE", "").split()))
         args = _parse(sys.argv[1:] if argv is None else argv)
         _set_up_logging(args)
         handle_signals(main.__code__)
         status: int = args.run(args)
-        _flush_stdout()
+        if sys.stdout is not None:  # None: closed before the start
+            sys.stdout.flush()
         return status
     except InputError as error:
         fail(str(_with_similar_name(error, args)))
@@ -61,22 +63,10 @@ def _parse(words: list[str]) -> argparse.Namespace:
     top = parser([command])
     args = top.parse_args(words)
     if args.command is None:
-        _show_commands(top)
+        listed = "".join(f"  {name:<12} {about}\n" for name, about in COMMANDS.items())
+        usage = f"{top.format_usage()}\ncommands:\n{listed}\nsee stillmap --help\n"
+        top.exit(EXIT_INPUT, usage)
     return args
-
-
-def _show_commands(top: argparse.ArgumentParser) -> NoReturn:
-    """List the commands and exit, for a call without one."""
-    listed = "".join(f"  {name:<12} {about}\n" for name, about in COMMANDS.items())
-    usage = f"{top.format_usage()}\ncommands:\n{listed}\nsee stillmap --help\n"
-    top.exit(EXIT_INPUT, usage)
-
-
-def _complete() -> NoReturn:
-    """Answer the completion request of a shell."""
-    from stillmap.cli.completion import answer_shell
-
-    answer_shell(parser(os.environ.get("COMP_LINE", "").split()))
 
 
 class _Handler(logging.Handler):
@@ -132,11 +122,6 @@ def _find_interrupt(error: BaseException | None) -> BaseException | None:
 def _report_interrupt() -> int:
     say("interrupted, nothing was half-written")
     return EXIT_INTERRUPTED
-
-
-def _flush_stdout() -> None:
-    if sys.stdout is not None:  # None: closed before the start
-        sys.stdout.flush()
 
 
 def _drop_stdout() -> None:

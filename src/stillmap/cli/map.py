@@ -15,6 +15,10 @@ from stillmap.cli.console import list_files, print_json, say, show_progress
 from stillmap.core.errors import InputError
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from stillmap.core.recording import Recording
     from stillmap.pipeline.checkpoint import CheckpointFolder
     from stillmap.results.result import Result
     from stillmap.rig.build import TiltingResult
@@ -201,13 +205,9 @@ def _summarize(output: Path) -> dict[str, Any]:
 
 
 def _print_summary(result: "Result", tilting: "TiltingResult | None", output: Path) -> None:
-    from stillmap.mapping.beam_statistics import count_beams
-
     n = len(result.iterations)
-    counts = count_beams(result.recording, result.p_static)
     lines = [
-        f"{result.recording.n_scans} scans, {counts['hits']} beams that hit something, "
-        f"{100.0 * counts['dynamic'] / max(counts['hits'], 1):.1f} % of them dynamic",
+        f"{result.recording.n_scans} scans, {_describe_hits(result.recording, result.p_static)}",
         f"{n} iteration{'s' * (n > 1)}, {'' if result.converged else 'not '}converged, "
         f"the best is {result.best_iteration}",
         *_describe_changes(result),
@@ -227,14 +227,16 @@ def _describe_changes(result: "Result") -> list[str]:
     return [f"{n} place{'s' * (n > 1)} changed, the map shows {'it' if n == 1 else 'each'} {state}"]
 
 
-def _describe_tilting(tilting: "TiltingResult") -> str:
+def _describe_hits(recording: "Recording", p_static: "NDArray[np.float32]") -> str:
     from stillmap.mapping.beam_statistics import count_beams
 
-    counts = count_beams(tilting.deskewed, tilting.p_static)
-    out = (
-        f"in 3D {counts['hits']} beams that hit something, "
-        f"{100.0 * counts['dynamic'] / max(counts['hits'], 1):.1f} % of them dynamic"
-    )
+    counts = count_beams(recording, p_static)
+    share = 100.0 * counts["dynamic"] / max(counts["hits"], 1)
+    return f"{counts['hits']} beams that hit something, {share:.1f} % of them dynamic"
+
+
+def _describe_tilting(tilting: "TiltingResult") -> str:
+    out = f"in 3D {_describe_hits(tilting.deskewed, tilting.p_static)}"
     if tilting.unposed_beams:
         out += f"; {tilting.unposed_beams} left out: the robot's pose is not known there"
     return out

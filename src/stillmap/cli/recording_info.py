@@ -105,11 +105,8 @@ def _count_beams(recording: Recording) -> dict[str, Any]:
     for block in arrays.iter_blocks(recording.points, recording.hit):
         hits += int(np.count_nonzero(recording.hit[block]))
         unusable += int(np.count_nonzero(np.isnan(recording.points[block]).any(axis=1)))
-    counts = {
-        "hits": hits,
-        "max_range": recording.n_beams - hits - unusable,
-        "unusable": unusable,
-    }
+    max_range = recording.n_beams - hits - unusable
+    counts = {"hits": hits, "max_range": max_range, "unusable": unusable}
     total = max(recording.n_beams, 1)
     return {**counts, "shares": {name: count / total for name, count in counts.items()}}
 

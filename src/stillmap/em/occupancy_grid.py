@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
+from stillmap.core.grid_map import GridMap
 from stillmap.em.types import CellProbabilities, Float, Grid
 
 _TILE = 2000  # cells, edge of the tiles that are read at once: maps are large, and mostly unknown
@@ -36,21 +37,6 @@ class GridWindow(NamedTuple):
 
     first_cell: NDArray[np.int64]
     shape: tuple[int, int]
-
-
-@dataclass(frozen=True, eq=False)
-class GridMap:
-    """Occupancy of a rectangle of cells.
-
-    Attributes:
-        p_occupied: (H, W) float32; NaN where unobserved, which is not free. Row 0 has the lowest y.
-        origin: x, y (metres) and yaw of the lower-left corner of the lower-left cell.
-        resolution: metres.
-    """
-
-    p_occupied: NDArray[np.float32]
-    origin: tuple[float, float, float]
-    resolution: float
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.em.occupancy_grid import GridMap
+from stillmap.core.grid_map import GridMap
 
 Window = tuple[float, float, float, float]
 Value = TypeVar("Value", np.float32, np.bool_)

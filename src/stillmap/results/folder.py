@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stillmap.core import arrays, config
 from stillmap.core.errors import InputError
@@ -13,15 +14,36 @@ from stillmap.core.files import read_text, require_regular
 from stillmap.core.recording import Recording
 from stillmap.io import read
 from stillmap.io.text_lines import Progress
+from stillmap.io.trajectory import poses_from_tum
 from stillmap.mesh.options import MeshOptions
 from stillmap.preprocessing.options import ReadOptions
 from stillmap.results.labels import Labels, read_labels
+from stillmap.results.reader import Grid, Track, read_grid, read_tracks
 from stillmap.results.run_json import RECORD
 from stillmap.slam import SlamOptions
 
 T = TypeVar("T")
 
 _MAX_RUN = 32 << 20  # bytes of a run.json
+
+
+@dataclass(frozen=True, eq=False)
+class Exported:
+    """A 2D result for export: recording, poses, labels, map and tracks.
+
+    Attributes:
+        recording: T scans with M beams.
+        poses: (T, 3, 3) T_map_base.
+        p_static: (M,) float32, NaN for unusable beams.
+        map: occupancy of the static cells.
+        tracks: of the moving objects.
+    """
+
+    recording: Recording
+    poses: NDArray[np.float64]
+    p_static: NDArray[np.float32]
+    map: Grid
+    tracks: list[Track]
 
 
 @dataclass(frozen=True)
@@ -109,6 +131,25 @@ class ResultFolder:
             what = f"is not the recording that was mapped: other {other}"
             raise InputError(what, where=str(self.source), hint="name it with --input")
         return recording, labels
+
+    def export(self) -> Exported:
+        """The content of a 2D result.
+
+        Raises:
+            InputError: a file is missing or damaged, or the recording is 3D.
+        """
+        recording, labels = self.read()
+        if recording.dimension != 2:
+            what = "is of a 3D recording: its points can be written, as a cloud"
+            hint = ".las, .laz, .e57, .pcd, .ply or .xyz; .obj writes its model, if there is one"
+            raise InputError(what, where=str(self.folder), hint=hint)
+        return Exported(
+            recording,
+            poses_from_tum(self.folder / "trajectory.tum", recording),
+            labels.p_static,
+            read_grid(self.folder),
+            read_tracks(self.folder / "objects" / "objects.json"),
+        )
 
 
 def is_result(path: Path) -> bool:

@@ -9,14 +9,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from stillmap.pipeline.options import MapMode
+from stillmap.results.reader import FREE_THRESH, OCCUPIED_THRESH
 
 if TYPE_CHECKING:
     from stillmap.em import OccupancyMap
-
-OCCUPIED_THRESH = 0.65
-
-# map_server reads pixel 205 as p = 50 / 255 = 0.19608: any larger threshold turns unknown into free
-FREE_THRESH = 0.196
 
 _OCCUPIED, _UNKNOWN, _FREE = 0, 205, 254
 

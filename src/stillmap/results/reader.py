@@ -11,20 +11,21 @@ from numpy.typing import NDArray
 from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.core.files import require_regular
-from stillmap.core.recording import Recording
-from stillmap.em.occupancy_grid import GridMap
-from stillmap.io.trajectory import poses_from_tum
-from stillmap.results.folder import ResultFolder
+from stillmap.core.grid_map import GridMap
 from stillmap.results.labels import shape_text
-from stillmap.results.map_server import FREE_THRESH, OCCUPIED_THRESH
 
 Float = NDArray[np.float64]
+
+
+# of map_server and nav2: what reads the map sees it as they load it
+OCCUPIED_THRESH = 0.65
+# map_server reads pixel 205 as p = 50 / 255 = 0.19608: any larger threshold turns unknown into free
+FREE_THRESH = 0.196
 
 
 class Grid(GridMap):
     """An occupancy map as stored in `map.npz`."""
 
-    # map_server's thresholds, so that the scores speak of the map as others load it
     @property
     def occupied(self) -> NDArray[np.bool_]:
         return self.p_occupied > OCCUPIED_THRESH
@@ -131,46 +132,6 @@ class Track:
     xy: NDArray[np.float64]
     velocity: NDArray[np.float64]
     z: NDArray[np.float64] | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Exported:
-    """A 2D result for export: recording, poses, labels, map and tracks.
-
-    Attributes:
-        recording: T scans with M beams.
-        poses: (T, 3, 3) T_map_base.
-        p_static: (M,) float32, NaN for unusable beams.
-        map: occupancy of the static cells.
-        tracks: of the moving objects.
-    """
-
-    recording: Recording
-    poses: NDArray[np.float64]
-    p_static: NDArray[np.float32]
-    map: Grid
-    tracks: list[Track]
-
-
-def read(result: ResultFolder) -> Exported:
-    """A 2D result with its recording and labels.
-
-    Raises:
-        InputError: a file is missing or damaged, or the recording is 3D.
-    """
-    recording, labels = result.read()
-    folder = result.folder
-    if recording.dimension != 2:
-        what = "is of a 3D recording: its points can be written, as a cloud"
-        hint = ".las, .laz, .e57, .pcd, .ply or .xyz; .obj writes its model, if there is one"
-        raise InputError(what, where=str(folder), hint=hint)
-    return Exported(
-        recording,
-        poses_from_tum(folder / "trajectory.tum", recording),
-        labels.p_static,
-        read_grid(folder),
-        read_tracks(folder / "objects" / "objects.json"),
-    )
 
 
 def read_tracks(path: Path) -> list[Track]:

@@ -15,7 +15,8 @@ from stillmap.io.ros.bag_writer import BagWriter, new_bag, require_stamps
 from stillmap.io.ros.message_writer import BASE, MAP
 from stillmap.io.ros.messages import LASER_SCAN, TF
 from stillmap.io.ros.recording_writer import LaserScanEncoder, number_names, write_sensor_frames
-from stillmap.results.reader import Exported, Track
+from stillmap.results.folder import Exported
+from stillmap.results.reader import Track
 
 _COLOR = (0.9, 0.4, 0.0, 0.8)  # RGBA, the orange of the report
 _HEIGHT, _MIN_SIZE = 0.5, 0.1  # m, of the boxes

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_file
 from stillmap.core.recording import Recording
-from stillmap.results.reader import Exported
+from stillmap.results.folder import Exported
 
 _ROW_GROUP = 1 << 20  # rows, approximately
 

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from stillmap.em.occupancy_grid import GridMap
+from stillmap.core.grid_map import GridMap
 from stillmap.pipeline.snapshots import Snapshot, Window, cut, cut_layer, extent
-from stillmap.results.map_server import OCCUPIED_THRESH
+from stillmap.results.reader import OCCUPIED_THRESH
 from stillmap.results.report.curves import round_down
 
 Color = tuple[int, int, int]

@@ -1,0 +1,21 @@
+"""Occupancy of a rectangle of cells."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class GridMap:
+    """Occupancy of a rectangle of cells.
+
+    Attributes:
+        p_occupied: (H, W) float32; NaN where unobserved, which is not free. Row 0 has the lowest y.
+        origin: x, y (metres) and yaw of the lower-left corner of the lower-left cell.
+        resolution: metres.
+    """
+
+    p_occupied: NDArray[np.float32]
+    origin: tuple[float, float, float]
+    resolution: float
