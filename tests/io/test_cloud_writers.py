@@ -7,7 +7,7 @@ import pytest
 
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.io import read
+from stillmap.io import read, writers
 from stillmap.io import write as write_folder
 from stillmap.io.point_cloud import kitti, las, pcd, ply
 from stillmap.preprocessing.options import ReadOptions
@@ -137,8 +137,8 @@ def test_one_cloud_of_all_hits(space, tmp_path, module, ending, tolerance):
     assert found.n_scans == 1
     before = path.read_bytes()
     with pytest.raises(InputError, match="is there already"):
-        module.write(some, path, some.T_recorded_base)
-    module.write(some, path, some.T_recorded_base, overwrite=True)
+        writers.write(some, path)
+    writers.write(some, path, overwrite=True)
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
 

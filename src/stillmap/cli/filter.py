@@ -160,7 +160,6 @@ def _write(
         stillmap_folder.write(dataclasses.replace(recording, hit=hit), output, overwrite=overwrite)
         return 0, []
     if form == "CARMEN log":
-        log = filtered_log.write_filtered_log(source, output, recording, blank)
-        return log.omitted, []
+        return filtered_log.write_filtered_log(source, output, recording, blank), []
     hint = "`stillmap convert` writes it in a format that can be"
     raise InputError(f"a {form} cannot be written again", where=str(source), hint=hint)

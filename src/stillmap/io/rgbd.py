@@ -29,7 +29,7 @@ from stillmap.io.point_cloud.scans import (
     CloudSource,
     DatasetInfo,
     build_recording,
-    refuse,
+    reject,
 )
 from stillmap.io.rgbd_folders import Frames
 from stillmap.preprocessing.options import ReadOptions
@@ -105,7 +105,7 @@ def _list_sources(frames: Frames, depth: Camera, grid: _Grid) -> list[CloudSourc
     for (stamp_ns, file), T in zip(frames.depth, frames.T_world_camera, strict=True):
         read_cloud = partial(_read_cloud, file, None if T is None else T @ T_camera_base, grid)
         if T is None and 2 * pose_count >= len(frames.depth):
-            read_cloud = partial(refuse, file, "has no pose, as most others have")
+            read_cloud = partial(reject, file, "has no pose, as most others have")
         sources.append(CloudSource(file.name, read_cloud, stamp_ns))
     return sources
 

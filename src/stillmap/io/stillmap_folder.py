@@ -193,14 +193,14 @@ def read(path: Path) -> Recording:
         raise InputError(f"is damaged: {error}", where=str(path)) from error
 
 
-def _refuse_constant(text: str) -> float:
+def _reject_constant(text: str) -> float:
     raise ValueError(f"{text} is no number of JSON")
 
 
 def _read_header(path: Path) -> dict[str, Any]:
     try:
         require_regular(path)
-        header = json.loads(read_text(path, _MAX_HEADER), parse_constant=_refuse_constant)
+        header = json.loads(read_text(path, _MAX_HEADER), parse_constant=_reject_constant)
     except (ValueError, RecursionError) as error:
         raise InputError(f"is not JSON: {error}", where=str(path)) from error
     if not isinstance(header, dict) or header.get("format") != FORMAT:

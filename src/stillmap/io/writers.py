@@ -75,7 +75,10 @@ def _write_kitti(recording: Recording, path: Path, overwrite: bool) -> list[str]
 
 
 def _write_cloud(
-    write: Callable[..., None], recording: Recording, path: Path, overwrite: bool
+    write: Callable[..., None],
+    recording: Recording,
+    path: Path,
+    overwrite: bool,  # noqa: ARG001
 ) -> list[str]:
     """Write all scans as one point cloud, by the poses that the recording has."""
     T, losses = recording.T_recorded_base, []
@@ -85,7 +88,7 @@ def _write_cloud(
         D = recording.dimension
         T = np.tile(np.eye(D + 1), (recording.n_scans, 1, 1))
         losses = ["there are no poses: all scans lie at one place"] if len(T) > 1 else []
-    write(recording, path, T, overwrite=overwrite)
+    write(recording, path, T)
     return [*losses, *_describe_non_returns(recording)]
 
 

@@ -1,7 +1,6 @@
 """Writes filtered copies of CARMEN logs: with some beams blanked, all other bytes unchanged."""
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,25 +27,9 @@ _FIRST_READING_AFTER_HEADER = 9
 _FIELD = re.compile(rb"\S+")
 
 
-@dataclass(frozen=True)
-class FilteredLog:
-    """Counts of a filtered copy.
-
-    Attributes:
-        scans: number of scan lines copied, with readings blanked.
-        beams: number of blanked readings.
-        omitted: number of scan lines that the recording lacks, so that their labels are unknown,
-            and of lines too long to be read.
-    """
-
-    scans: int
-    beams: int
-    omitted: int
-
-
 def write_filtered_log(
     source: Path, out: Path, recording: Recording, blank: NDArray[np.bool_]
-) -> FilteredLog:
+) -> int:
     """Copy a log with some readings replaced by "no return".
 
     Args:
@@ -54,6 +37,10 @@ def write_filtered_log(
         out: gzip by its name; it appears complete or not at all.
         recording: as it was read from `source`.
         blank: (M,) beams to blank.
+
+    Returns:
+        Number of scan lines omitted: the recording lacks them, so that their labels are unknown, or
+        they are too long to be read.
 
     Raises:
         InputError: `source` is not the log that was read, or `out` cannot be written.
@@ -64,19 +51,18 @@ def write_filtered_log(
         find_no_return_code(sensor.ranges, notes["ranges"])
         for sensor, notes in zip(sensors, recording.source["sensors"], strict=True)
     ]
-    scans = omitted = 0
+    omitted = 0
     with write_atomically(out) as file:
         for line in read_lines(source):
             t = scan_of.get(line.number)
             if t is not None:
                 code = codes[recording.sensor[t]]
                 file.write(_blank_readings(line.text, blank[recording.beams_of(t)], code))
-                scans += 1
             elif line.damaged or line.too_long or _is_scan(line.text):
                 omitted += 1
             else:
                 file.write(line.text)
-    return FilteredLog(scans, int(np.count_nonzero(blank)), omitted)
+    return omitted
 
 
 def find_no_return_code(readings: NDArray[np.float32], rule: dict[str, Any]) -> bytes:

@@ -3,14 +3,14 @@
 Counts in a header are checked against the size of the file before memory is allocated.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from stillmap.core.errors import InputError
 from stillmap.io.text_lines import read_lines
@@ -116,21 +116,22 @@ def split_header(
     return lines, start
 
 
+def record_dtype(columns: Mapping[str, tuple[DTypeLike, int]], size: int) -> np.dtype[Any]:
+    """The type of records of `size` bytes, with (type, byte offset) of columns by name."""
+    kinds, offsets = zip(*columns.values(), strict=True)
+    return np.dtype(
+        {"names": list(columns), "formats": kinds, "offsets": offsets, "itemsize": size}
+    )
+
+
 def _read_records(layout: TableLayout, wanted: Sequence[str]) -> Iterator[list[NDArray[Any]]]:
     check_record_size(layout)
     columns = [layout.find_column(name) for name in wanted]
     available = (layout.path.stat().st_size - layout.start) // layout.record
     if available < layout.rows:
         raise truncated_error(layout.path, max(available, 0), layout.rows)
-    names = [str(i) for i in range(len(columns))]
-    dtype = np.dtype(
-        {
-            "names": names,
-            "formats": [field.dtype for field, _, _ in columns],
-            "offsets": [byte for _, byte, _ in columns],
-            "itemsize": layout.record,
-        }
-    )
+    by_name = {str(i): (field.dtype, byte) for i, (field, byte, _) in enumerate(columns)}
+    dtype = record_dtype(by_name, layout.record)
     with layout.path.open("rb") as file:
         file.seek(layout.start)
         for first in range(0, layout.rows, _BLOCK):
@@ -138,7 +139,7 @@ def _read_records(layout: TableLayout, wanted: Sequence[str]) -> Iterator[list[N
             rows = np.frombuffer(file.read(n * layout.record), np.uint8)
             if len(rows) < n * layout.record:
                 raise truncated_error(layout.path, first + len(rows) // layout.record, layout.rows)
-            yield [rows.view(dtype)[name] for name in names]
+            yield [rows.view(dtype)[name] for name in by_name]
 
 
 def _read_text(layout: TableLayout, wanted: Sequence[str]) -> Iterator[list[NDArray[Any]]]:

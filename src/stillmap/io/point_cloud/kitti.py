@@ -33,7 +33,7 @@ from stillmap.io.point_cloud.scans import (
     CloudSource,
     DatasetInfo,
     build_recording,
-    refuse,
+    reject,
 )
 from stillmap.preprocessing.scan_timing import add_beam_times
 
@@ -169,7 +169,7 @@ def read(path: Path, context: ReadContext) -> Recording:
         T = None if index is None else poses.get(index)
         read_cloud = partial(_read_scan, file, T)
         if stamp_ns is None:
-            read_cloud = partial(refuse, file, "has no stamp")
+            read_cloud = partial(reject, file, "has no stamp")
         sources.append(CloudSource(file.name, read_cloud, stamp_ns))
     recording = build_recording(sources, info, context, images=images)
     spin = context.options.spin

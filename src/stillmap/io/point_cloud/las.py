@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.errors import InputError, import_extra
-from stillmap.core.files import atomic_file, require_new_file
+from stillmap.core.files import atomic_file
 from stillmap.core.recording import Recording
 from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud.binary_table import truncated_error
@@ -97,24 +97,19 @@ def _count_chunks(file: IO[bytes], start: int, size: int) -> int:
     return int.from_bytes(file.read(4), "little")
 
 
-def write(
-    recording: Recording, path: str | Path, poses: NDArray[np.float64], *, overwrite: bool = False
-) -> None:
+def write(recording: Recording, path: Path, poses: NDArray[np.float64]) -> None:
     """Write all hits in the map frame as one LAS or (by extension) LAZ cloud, atomically.
 
     Coordinates are rounded to 0.1 mm.
 
     Args:
         recording: T scans.
-        path: the file.
+        path: the file; it is replaced.
         poses: (T, D+1, D+1) T_map_base.
-        overwrite: replace a file.
 
     Raises:
-        InputError: `path` is taken or cannot be written, or laspy is missing.
+        InputError: `path` cannot be written, or laspy is missing.
     """
-    path = Path(path)
-    require_new_file(path, overwrite)
     laspy = import_extra("laspy", path, "written")
     header, compressed = _make_header(laspy, poses), path.name.lower().endswith(".laz")
     with atomic_file(path) as work, open_las_writer(work, laspy, header, compressed) as writer:

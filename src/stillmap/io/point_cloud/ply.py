@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.errors import InputError
-from stillmap.core.files import atomic_file, require_new_file
+from stillmap.core.files import atomic_file
 from stillmap.core.recording import Recording
 from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud.binary_table import Field, TableLayout, read_columns, split_header
@@ -90,22 +90,17 @@ def _parse_header(path: Path, lines: list[list[str]], start: int) -> TableLayout
     raise ValueError("no vertices")
 
 
-def write(
-    recording: Recording, path: str | Path, poses: NDArray[np.float64], *, overwrite: bool = False
-) -> None:
+def write(recording: Recording, path: Path, poses: NDArray[np.float64]) -> None:
     """Write all hits in the map frame as one binary cloud, atomically.
 
     Args:
         recording: T scans.
-        path: the file.
+        path: the file; it is replaced.
         poses: (T, D+1, D+1) T_map_base.
-        overwrite: replace a file.
 
     Raises:
-        InputError: `path` is taken or cannot be written.
+        InputError: `path` cannot be written.
     """
-    path = Path(path)
-    require_new_file(path, overwrite)
     n = int(np.count_nonzero(recording.hit))
     with atomic_file(path) as work, work.open("wb") as file:
         names = "".join(f"property double {name}\n" for name in "xyz")

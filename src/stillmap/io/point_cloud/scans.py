@@ -114,7 +114,7 @@ def _reject_laser_poses(options: ReadOptions) -> None:
         raise InputError("the laser's place on the robot can be given for 2D recordings only")
 
 
-def refuse(file: Path, what: str) -> Cloud:
+def reject(file: Path, what: str) -> Cloud:
     """The reader of a file that is known to be unusable."""
     raise InputError(what, where=str(file))
 

@@ -10,7 +10,7 @@ from stillmap.core.errors import InputError
 from stillmap.io.builder import SkippedRecords
 from stillmap.io.ros.collect import BagContent
 from stillmap.io.ros.laser_scan import LaserScans
-from stillmap.io.ros.tf import Odometry, TransformTree
+from stillmap.io.ros.tf import Lookup, Odometry, TransformTree
 from stillmap.preprocessing.options import ReadOptions
 
 Float = NDArray[np.float64]
@@ -168,9 +168,13 @@ def project_to_plane(T: Float) -> tuple[Float, bool, bool]:
 
 
 def find_odometry(
-    content: BagContent, base: str, at_ns: NDArray[np.int64], options: ReadOptions
-) -> tuple[Float | None, dict[str, Any], list[str]]:
-    """Odometry (T, 4, 4) at the scans, its origin (for `source`), and warnings.
+    content: BagContent,
+    base: str,
+    at_ns: NDArray[np.int64],
+    options: ReadOptions,
+    warnings: list[str],
+) -> tuple[Float | None, dict[str, Any]]:
+    """Odometry (T, 4, 4) at the scans, and its origin (for `source`); adds warnings.
 
     Transforms to a frame in which the base moves come first, then Odometry topics.
 
@@ -184,27 +188,20 @@ def find_odometry(
     if odom in tree.frames:
         found = tree.lookup(odom, base, at_ns)
         if found is not None and found.moves:
-            gap = _largest_gap(tree.stamps_between(odom, base), at_ns)
-            return found.T, *_describe_odometry(f"TF from {odom} to {base}", found.outside, gap)
+            warnings += _coverage_warnings(found, tree.stamps_between(odom, base), at_ns)
+            return found.T, {"from": f"TF from {odom} to {base}", "outside": found.outside}
     for one in sorted(odometry, key=lambda o: -len(o.stamp_ns)):
         if frame in (None, one.frame):
-            return _odometry_from_topic(one, tree, base, at_ns)
-    return None, {"from": None, "outside": 0}, []
-
-
-def _odometry_from_topic(
-    one: Odometry, tree: TransformTree, base: str, at_ns: NDArray[np.int64]
-) -> tuple[Float, dict[str, Any], list[str]]:
-    found = one.poses_at(at_ns)
-    T, warnings = found.T, []
-    T_child_base = tree.lookup(one.child, base, at_ns) if one.child != base else None
-    if T_child_base is not None:
-        T = T @ T_child_base.T
-    elif one.child not in ("", base):
-        warnings = [f"{one.topic}: used as the pose of {base}, although it is of {one.child}"]
-    gap = _largest_gap(np.asarray(one.stamp_ns), at_ns)
-    origin, more = _describe_odometry(one.topic, found.outside, gap)
-    return T, origin, warnings + more
+            found, T_child_base = one.poses_at(at_ns), None
+            if one.child != base:
+                T_child_base = tree.lookup(one.child, base, at_ns)
+            if T_child_base is None and one.child not in ("", base):
+                text = f"used as the pose of {base}, although it is of {one.child}"
+                warnings.append(f"{one.topic}: {text}")
+            warnings += _coverage_warnings(found, np.asarray(one.stamp_ns), at_ns)
+            T = found.T if T_child_base is None else found.T @ T_child_base.T
+            return T, {"from": one.topic, "outside": found.outside}
+    return None, {"from": None, "outside": 0}
 
 
 def _find_odom_frame(tree: TransformTree, base: str) -> str:
@@ -225,10 +222,14 @@ def _largest_gap(stamps: NDArray[np.int64], at_ns: NDArray[np.int64]) -> float:
     return float(np.diff(stamps).max(initial=0)) / 1e9
 
 
-def _describe_odometry(origin: str, outside: int, gap: float) -> tuple[dict[str, Any], list[str]]:
+def _coverage_warnings(
+    found: Lookup, stamps: NDArray[np.int64], at_ns: NDArray[np.int64]
+) -> list[str]:
+    """Warnings on scans at times (T,) outside odometry of these stamps, or in a gap of it."""
     warnings = []
-    if outside:
-        warnings.append(f"{outside} scans outside the time of the odometry: nearest pose")
+    if found.outside:
+        warnings.append(f"{found.outside} scans outside the time of the odometry: nearest pose")
+    gap = _largest_gap(stamps, at_ns)
     if gap > _MAX_GAP:
         warnings.append(f"no odometry for {gap:.1f} s: interpolated over the gap")
-    return {"from": origin, "outside": outside}, warnings
+    return warnings

@@ -47,9 +47,9 @@ def build_laser_recording(content: BagContent, context: ReadContext) -> Recordin
     mirrored = [mounting.upside_down for mounting in mountings]
     beams = scan_beams.convert_to_beams(used, rules, mirrored, context.scratch)
     stamp_ns = np.concatenate([s.stamp_ns for s in used])[beams.scan]
-    odom, origin, more = base_frame.find_odometry(content, poses.base, stamp_ns, options)
+    odom, origin = base_frame.find_odometry(content, poses.base, stamp_ns, options, warnings)
     skipped = SkippedRecords().merge(*(lasers.skipped[topic] for topic in {s.topic for s in used}))
-    warnings += more + skipped.loss_warnings(sum(s.n_scans for s in used), "message")
+    warnings += skipped.loss_warnings(sum(s.n_scans for s in used), "message")
     return Recording(
         stamp_ns=stamp_ns,
         offset=beams.offset,

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from stillmap.io.builder import ReadContext, RecordingBuilder, SkippedRecords
 from stillmap.io.point_cloud import time_field
+from stillmap.io.point_cloud.binary_table import record_dtype
 from stillmap.io.point_cloud.scans import Cloud
 from stillmap.io.ros.bag_types import Message
 from stillmap.io.ros.laser_scan import UNREADABLE
@@ -40,16 +41,9 @@ def parse_cloud(message: Any) -> Cloud | str:
     known = {name: at for name in kept if (at := _layout(fields[name], order, step)) is not None}
     if not known.keys() >= set("xyz"):
         return NO_COORDINATES
-    dtype = np.dtype(
-        {
-            "names": list(known),
-            "formats": [kind for kind, _ in known.values()],
-            "offsets": [offset for _, offset in known.values()],
-            "itemsize": step,
-        }
-    )
     if end == 0:
         return Cloud(np.empty((0, 3), np.float32))
+    dtype = record_dtype(known, step)
     values = np.ndarray((height, width), dtype, message.data, strides=(row, step)).reshape(-1)
     points = np.stack([values[name].astype(np.float32) for name in "xyz"], axis=1)
     times = _times(values[time], points, stamp_ns(message.header)) if time in known else None

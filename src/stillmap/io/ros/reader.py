@@ -13,10 +13,11 @@ from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.core.timestamps import longest_non_decreasing
 from stillmap.io.builder import ReadContext, SkippedRecords
-from stillmap.io.ros import base_frame, laser_recording
+from stillmap.io.ros import base_frame
 from stillmap.io.ros.bag import bag_size, open_bag
 from stillmap.io.ros.bag_types import Bag, DamagedBagError
 from stillmap.io.ros.collect import BagContent, collect_messages, select_topics
+from stillmap.io.ros.laser_recording import build_laser_recording, build_tilting_recording
 from stillmap.io.ros.laser_scan import TIME_BACKWARDS
 from stillmap.io.ros.limits import limit_output
 from stillmap.io.ros.point_cloud2 import CloudCollector
@@ -27,33 +28,22 @@ _BuildFromLasers = Callable[[BagContent, ReadContext], Recording]
 _STILL = 1e-3  # m and entries of a rotation matrix: a sensor that moves less is fixed
 
 
-def read(path: Path, context: ReadContext) -> Recording:
+def read(
+    path: Path, context: ReadContext, build: _BuildFromLasers = build_laser_recording
+) -> Recording:
     """Read a bag: ROS 1, or a file or folder of ROS 2.
 
     Bad messages are skipped and counted. A bag that is cut, damaged or without an index is read
     from the front as far as it goes.
 
+    Args:
+        path: of the bag.
+        context: see ReadContext.
+        build: builds the recording of laser scans.
+
     Raises:
         InputError: it cannot be read, or holds no usable scan.
     """
-    return _read(path, context, laser_recording.build_laser_recording)
-
-
-def read_tilting(path: Path, context: ReadContext) -> Recording:
-    """Read the scans of a laser that tilts or pans as 3D points, by the bag's transform tree.
-
-    Args:
-        path: of the bag.
-        context: the option `topic` names the scans, or clouds made from them; `base_frame` the
-            robot.
-
-    Raises:
-        InputError: it cannot be read, or transforms do not say how the laser moves.
-    """
-    return _read(path, context, laser_recording.build_tilting_recording)
-
-
-def _read(path: Path, context: ReadContext, build: _BuildFromLasers) -> Recording:
     damage, size = "", bag_size(path)
     for trusted in (True, False):
         reopen = partial(open_bag, path, context.scratch, trusted=trusted)
@@ -75,6 +65,20 @@ def _read(path: Path, context: ReadContext, build: _BuildFromLasers) -> Recordin
                 recording.source["warnings"].insert(0, text)
             return recording
     raise InputError(f"is damaged: {damage}", where=str(path))
+
+
+def read_tilting(path: Path, context: ReadContext) -> Recording:
+    """Read the scans of a laser that tilts or pans as 3D points, by the bag's transform tree.
+
+    Args:
+        path: of the bag.
+        context: the option `topic` names the scans, or clouds made from them; `base_frame` the
+            robot.
+
+    Raises:
+        InputError: it cannot be read, or transforms do not say how the laser moves.
+    """
+    return read(path, context, build_tilting_recording)
 
 
 def list_scan_messages(bag: Bag, context: ReadContext) -> list[tuple[str, int]]:
@@ -132,7 +136,7 @@ def _build_cloud_recording(
     frames = [(names[k][1], stamps[rows]) for k, rows in zip(used, scans, strict=True)]
     poses = base_frame.find_sensor_poses(content, frames, options)
     T, selection, warnings = _place_sensors(poses, names, used, scans, options, omitted)
-    odom, origin, more = base_frame.find_odometry(content, poses.base, stamps, options)
+    odom, origin = base_frame.find_odometry(content, poses.base, stamps, options, warnings)
     skipped = SkippedRecords().merge(*clouds.skipped.values())
     sensors = [
         {"name": topic, "frame": frame, "scans": n}
@@ -150,7 +154,7 @@ def _build_cloud_recording(
             "odometry": origin,
             "skipped": skipped.to_dict(),
             "duplicates": omitted,
-            "warnings": poses.warnings + warnings + more,
+            "warnings": poses.warnings + warnings,
         },
     )
     timed = clouds.timed.intersection(used)

@@ -168,16 +168,14 @@ def _describe_cloud_losses(recording: Recording) -> list[str]:
 
 @dataclass(frozen=True)
 class FilteredBag:
-    """Counts and omissions of a filtered copy.
+    """Omissions of a filtered copy.
 
     Attributes:
-        scans: number of scan messages copied, with readings blanked.
         omitted: number of scan messages that the recording lacks, so that their labels are unknown.
         omitted_topics: topics whose message definition is unknown.
         unfiltered_topics: topics of scans that were not mapped, copied unchanged.
     """
 
-    scans: int
     omitted: int
     omitted_topics: list[str]
     unfiltered_topics: list[str]
@@ -234,7 +232,7 @@ def _copy(
     scan_topics = {topic for topic, _ in scan_of}
     no_return = _no_return_codes(recording)
     count = dict.fromkeys(scan_topics, 0)
-    scans = omitted = 0
+    omitted = 0
     with new_bag(out, kind, overwrite=overwrite, mcap=mcap) as copy:
         sends = {c.id: copy.copy_topic(c) for c in bag.channels}
         for message in bag.messages({c.topic for c in bag.channels}):
@@ -246,7 +244,6 @@ def _copy(
                 if t is None:
                     omitted += 1
                     continue
-                scans += 1
                 beams = blank[recording.beams_of(t)]
             if beams is not None and beams.any():
                 raw = _blank_readings(message, beams, no_return, copy)
@@ -257,7 +254,7 @@ def _copy(
     omitted_topics = {c.topic for c in bag.channels if sends[c.id] is None and c.n_messages}
     types = LASER_SCAN, MULTI_ECHO, POINT_CLOUD
     unfiltered = {c.topic for c in bag.channels if c.type in types} - scan_topics
-    return FilteredBag(scans, omitted, sorted(omitted_topics), sorted(unfiltered))
+    return FilteredBag(omitted, sorted(omitted_topics), sorted(unfiltered))
 
 
 def _no_return_codes(recording: Recording) -> dict[tuple[str, str], float]:

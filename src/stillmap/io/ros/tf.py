@@ -87,7 +87,6 @@ class TransformTree:
     def add_message(self, message: Any, *, static: bool) -> None:
         """Add the transforms of a TFMessage."""
         for transform in message.transforms:
-            self._number += 1
             t, q = transform.transform.translation, transform.transform.rotation
             values = (t.x, t.y, t.z, q.x, q.y, q.z, q.w)
             parent = frame_name(transform.header.frame_id)
@@ -96,11 +95,12 @@ class TransformTree:
 
     def add_transform(
         self, parent: str, child: str, stamp: int, values: tuple[float, ...], *, static: bool
-    ) -> None:
-        """Add a transform: x y z in metres and a quaternion x y z w."""
+    ) -> bool:
+        """Add a transform: x y z in metres and a quaternion x y z w; an invalid one is counted."""
+        self._number += 1
         if not (_is_pose(values) and child and parent and child != parent):
             self.skipped.add(BAD_TRANSFORM, self._number)
-            return
+            return False
         edge = self._edges.setdefault(child, {}).setdefault(parent, _Edge(parent))
         if static:
             edge.constant = True
@@ -109,6 +109,7 @@ class TransformTree:
             edge.stamp_ns.append(stamp)
             edge.values.extend(values)
         self._resolved = {}
+        return True
 
     @property
     def frames(self) -> set[str]:
@@ -178,30 +179,22 @@ class Odometry:
         self.topic = topic
         self.frame, self.child = "", ""
         self.stamp_ns = array("q")
-        self.values = array("d")  # x y z, quaternion x y z w
-        self.skipped = SkippedRecords()
-        self._number = 0
+        self._tree = TransformTree()
+        self.skipped = self._tree.skipped
 
     def add_message(self, message: Any) -> None:
         """Add the pose of a message; an invalid one is counted."""
-        self._number += 1
         p, q = message.pose.pose.position, message.pose.pose.orientation
         values = (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
-        if not _is_pose(values):
-            self.skipped.add(BAD_TRANSFORM, self._number)
-            return
-        self.frame = frame_name(message.header.frame_id)
-        self.child = frame_name(message.child_frame_id)
-        self.stamp_ns.append(stamp_ns(message.header))
-        self.values.extend(values)
+        stamp = stamp_ns(message.header)
+        if self._tree.add_transform("odometry", "robot", stamp, values, static=False):
+            self.frame = frame_name(message.header.frame_id)
+            self.child = frame_name(message.child_frame_id)
+            self.stamp_ns.append(stamp)
 
     def poses_at(self, at_ns: NDArray[np.int64]) -> Lookup:
         """T_frame_child at times (N,)."""
-        tree = TransformTree()
-        rows = np.asarray(self.values).reshape(-1, 7).tolist()
-        for stamp, values in zip(self.stamp_ns, rows, strict=True):
-            tree.add_transform("odometry", "robot", stamp, tuple(values), static=False)
-        found = tree.lookup("odometry", "robot", at_ns)
+        found = self._tree.lookup("odometry", "robot", at_ns)
         assert found is not None
         return found
 
