@@ -37,9 +37,9 @@ class Parser(argparse.ArgumentParser):
         if any(re.fullmatch(r"(--[^=]+=)?", word) for word in words):
             self.error("an argument is empty", "a variable that is not set?")
         if self.subcommands() is None:
-            self._refuse([word for word in _flags(words) if not self._knows(word)])
+            self._reject([word for word in _flags(words) if not self._knows(word)])
         found, unknown = super().parse_known_args(words, namespace)
-        self._refuse(unknown)
+        self._reject(unknown)
         return found, unknown
 
     def subcommands(self) -> dict[str, "Parser"] | None:
@@ -75,7 +75,7 @@ class Parser(argparse.ArgumentParser):
         what = f"argument {name}: invalid choice: '{value}' (choose from {', '.join(choices)})"
         self.error(what, _suggest(str(value), choices))
 
-    def _refuse(self, unknown: list[str]) -> None:
+    def _reject(self, unknown: list[str]) -> None:
         if unknown:
             flag = unknown[0].partition("=")[0]
             hint = _suggest(flag, self.flags()) if flag.startswith("-") else ""

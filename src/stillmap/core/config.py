@@ -65,7 +65,7 @@ class Section:
     `class EmOptions(Section, section="em")` names the section in messages.
 
     Raises:
-        ValueError: a value is outside its range, or `check` refuses it.
+        ValueError: a value is outside its range, or `check` rejects it.
     """
 
     _section: ClassVar[str] = ""

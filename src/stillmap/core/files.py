@@ -11,7 +11,7 @@ from stillmap.core.errors import InputError
 
 
 def require_new(path: Path, marker: str, overwrite: bool = False) -> None:
-    """Refuse an output folder that is not empty.
+    """Reject an output folder that is not empty.
 
     Args:
         path: the output folder.
@@ -37,7 +37,7 @@ def require_new(path: Path, marker: str, overwrite: bool = False) -> None:
 
 
 def require_new_file(path: Path, overwrite: bool = False) -> None:
-    """Refuse an output file that exists already.
+    """Reject an output file that exists already.
 
     Raises:
         InputError: the path exists and may not be replaced, or its folder does not exist.
@@ -147,7 +147,7 @@ def read_text(path: Path, max_bytes: int) -> str:
 
 
 def require_regular(path: Path) -> None:
-    """Refuse pipes and devices, on which reading may block for ever.
+    """Reject pipes and devices, on which reading may block for ever.
 
     Folders and missing paths pass: opening them fails.
 

@@ -154,7 +154,7 @@ class ReadOptions(Section, section="read"):
         return LaserOptions(*(getattr(self, f"{prefix}_{name}") for name in LaserOptions._fields))
 
     def check_laser_count(self, count: int) -> None:
-        """Refuse options of a second laser where the recording has fewer than two.
+        """Reject options of a second laser where the recording has fewer than two.
 
         Raises:
             InputError: `count` is below 2 and a `laser2_...` option is set.
