@@ -62,12 +62,12 @@ class Points:
     """A subsampled point cloud.
 
     Attributes:
-        points: (n, 3) float64 m in the map frame.
+        points: (n, 3) m in the map frame.
         colors: (n, 3) uint8; None where the file has none.
         total: number of points in the file.
     """
 
-    points: NDArray[np.float64]
+    points: NDArray[np.floating]
     colors: NDArray[np.uint8] | None
     total: int
 

@@ -25,6 +25,7 @@ _LAYER_STEP = 0.02  # m between the map and what is drawn on it in 2D
 _MAP_DEPTH = 0.15  # m of the map below the surface, which is uneven
 _BEAMS_NOTE = "Beams: orange dynamic, blue static"
 _RAY_COLOR = (240, 170, 60)
+_NO_SHADOWS: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
 # sizes as shares of the height of the view: cloud points, beam ends, axes of the robot
 _POINT_SIZE, _END_SIZE, _AXES_SIZE = 0.0007, 0.002, 0.03
 
@@ -61,18 +62,14 @@ class Layers:
     def _definitions(self) -> list[tuple[str, bool, bool, Callable[[], None]]]:
         """Name, default visibility, whether there is data, and the function that creates it."""
         scene, beams = self._scene, self._beams is not None
-        static, bare = "static" in scene.clouds, scene.surface is None
+        static, dynamic = "static" in scene.clouds, "dynamic" in scene.clouds
+        bare = scene.surface is None
         return [
             # hidden by default where a surface would cover them or be covered
             ("Map", bare, scene.map_image is not None, self._make_map),
             ("Surface", True, not bare, self._make_surface),
             ("Static points", bare, static, lambda: self._make_cloud("static")),
-            (
-                "Dynamic points",
-                False,
-                "dynamic" in scene.clouds,
-                lambda: self._make_cloud("dynamic"),
-            ),
+            ("Dynamic points", False, dynamic, lambda: self._make_cloud("dynamic")),
             ("Robot", True, True, self._make_trajectory),
             ("Beams", bare, beams, self._make_beams),
             ("Rays", False, beams, self._make_rays),
@@ -113,6 +110,11 @@ class Layers:
     def _is_shown(self, name: str) -> bool:
         return name in self._nodes and bool(self._nodes[name].visible)
 
+    def _origin(self, level: int) -> Float:
+        """(3,) m; relative to it a layer of a 2D scene lies so many steps above the map."""
+        lift = level * _LAYER_STEP if self._scene.is_2d else 0.0
+        return np.asarray(self._scene.origin - np.array([0.0, 0.0, lift]))
+
     def _make_map(self) -> None:
         plan = self._scene.map_image
         assert plan is not None
@@ -125,8 +127,7 @@ class Layers:
             x1 - x0,
             y1 - y0,
             format="png",
-            cast_shadow=False,
-            receive_shadow=False,
+            **_NO_SHADOWS,
             # viser's images face -z
             wxyz=(0.0, 1.0, 0.0, 0.0),
             position=middle - self._scene.origin,
@@ -136,21 +137,19 @@ class Layers:
         assert self._scene.surface is not None
         # light grey, so that white walls are visible
         self._server.scene.set_background_image(np.array([[BACKGROUND]], np.uint8), format="png")
-        node = self._server.scene.add_glb(
-            _path("Surface", "mesh"), self._scene.surface, cast_shadow=False, receive_shadow=False
-        )
+        path = _path("Surface", "mesh")
+        node = self._server.scene.add_glb(path, self._scene.surface, **_NO_SHADOWS)
         _place(node, gltf.MAP_FROM_GLTF, self._scene.origin)
 
     def _make_cloud(self, name: str) -> None:
         cloud, layer = self._scene.clouds[name], f"{name.capitalize()} points"
+        assert cloud.colors is not None
         self._cloud(layer, cloud.points, cloud.colors)
         if len(cloud.points) < cloud.total:
             self.notes[layer] = f"{len(cloud.points):,} of {cloud.total:,} {name} points are shown"
 
     def _make_trajectory(self) -> None:
-        positions = self._scene.poses[:, :3, 3] - self._scene.origin
-        if self._scene.is_2d:
-            positions = positions + np.array([0.0, 0.0, 2 * _LAYER_STEP])
+        positions = self._scene.poses[:, :3, 3] - self._origin(2)
         use = positions[sample_indices(len(positions), _MAX_TRAJECTORY_POINTS)]
         segments = np.stack([use[:-1], use[1:]], axis=1)
         self._lines("Robot", segments, np.array(display.BLUE, np.uint8), 2.5)
@@ -168,9 +167,7 @@ class Layers:
     def _draw_beams(self, scan: int) -> None:
         assert self._beams is not None
         view = self._beams.scan_view(scan)
-        ends = view.ends - self._scene.origin
-        if self._scene.is_2d:
-            ends[:, 2] = 3 * _LAYER_STEP
+        ends = view.ends - self._origin(3)
         with self._server.atomic():
             self._ends.points = ends.astype(np.float32)
             self._ends.colors = display.color_by_p_static(view.p_static)
@@ -183,9 +180,7 @@ class Layers:
         self._box = self._lines("Objects", pieces, np.zeros((1, 2, 3), np.uint8), 2.0)
 
     def _draw_boxes(self, objects: tracks.ObjectPoses) -> None:
-        lines = tracks.box_edges(objects) - self._scene.origin
-        if self._scene.is_2d:
-            lines = lines + np.array([0.0, 0.0, 2 * _LAYER_STEP])
+        lines = tracks.box_edges(objects) - self._origin(2)
         color = display.color_by_id([self._scene.tracks[n].id for n in objects.track])
         colors = np.broadcast_to(color[:, None, None], lines.shape)
         with self._server.atomic():
@@ -196,8 +191,7 @@ class Layers:
         segments, index = tracks.track_segments(self._scene.tracks)
         use = sample_indices(len(segments), _MAX_TRACK_SEGMENTS)
         color = display.color_by_id([self._scene.tracks[n].id for n in index[use]])
-        offset = np.array([0.0, 0.0, _LAYER_STEP if self._scene.is_2d else 0.0])
-        lines = segments[use] - self._scene.origin + offset
+        lines = segments[use] - self._origin(1)
         self._lines("Object tracks", lines, np.repeat(color[:, None], 2, axis=1), 1.5)
 
     def _make_models(self) -> None:
@@ -206,8 +200,7 @@ class Layers:
                 _path("Object models", f"{model.track.id:04d}"),
                 model.data,
                 visible=False,
-                cast_shadow=False,
-                receive_shadow=False,
+                **_NO_SHADOWS,
             )
             for model in self._scene.models
         ]
@@ -226,7 +219,7 @@ class Layers:
                 top = np.array([0.0, 0.0, 0.5 * float(objects.size[n, 2])])
                 label.position = objects.T_map_object[n, :3, 3] - self._scene.origin + top
 
-    def _cloud(self, name: str, points: NDArray[np.float32], color: NDArray[np.uint8]) -> Any:
+    def _cloud(self, name: str, points: NDArray[np.floating], color: NDArray[np.uint8]) -> Any:
         size = self._height * (_END_SIZE if name == "Beams" else _POINT_SIZE)
         node = self._server.scene.add_point_cloud(
             _path(name, "points"),

@@ -50,16 +50,6 @@ class MapImage:
 
 
 @dataclass(frozen=True, eq=False)
-class Cloud:
-    """Points (n, 3) float32 m relative to the scene's origin, colors (n, 3) uint8, and their number
-    before subsampling."""
-
-    points: NDArray[np.float32]
-    colors: NDArray[np.uint8]
-    total: int
-
-
-@dataclass(frozen=True, eq=False)
 class Model:
     """The mesh of a moving object.
 
@@ -76,10 +66,8 @@ class Model:
 
     def pose_at(self, stamp_ns: int) -> Float:
         """T_map_gltf (4, 4) at another time, along the track."""
-        motion = interpolate_pose(self.track, stamp_ns) @ inverse(
-            interpolate_pose(self.track, self.stamp_ns)
-        )
-        return np.asarray(motion @ self.T_map_gltf)
+        now, then = (interpolate_pose(self.track, at) for at in (stamp_ns, self.stamp_ns))
+        return np.asarray(now @ inverse(then) @ self.T_map_gltf)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +79,7 @@ class Scene:
         stamp_ns: (T,).
         poses: (T, 4, 4) T_map_base.
         map_image: None for an empty map.
-        clouds: by name: `static`, `dynamic`.
+        clouds: by name: `static`, `dynamic`; float32, relative to `origin`, all with colors.
         tracks: moving objects.
         surface: mesh.glb; None where there is none.
         models: of the tracks that have one.
@@ -104,7 +92,7 @@ class Scene:
     stamp_ns: NDArray[np.int64]
     poses: Float
     map_image: MapImage | None
-    clouds: dict[str, Cloud]
+    clouds: dict[str, Points]
     tracks: list[Track]
     surface: bytes | None
     models: list[Model]
@@ -132,7 +120,9 @@ def read_scene(folder: Path) -> Scene:
         if (folder / f"{name}.ply").exists()
     }
     tracks, notes = read_tracks(folder / "objects" / "objects.json"), list[str]()
-    surface = _read_or_note(notes, _surface, folder / "mesh.glb")
+    surface = None
+    if (folder / "mesh.glb").exists():
+        surface = _read_or_note(notes, gltf.read_glb, folder / "mesh.glb", _MAX_MESH)
     models = _models(folder / "objects", tracks, notes)
     return Scene(
         name=folder.resolve().name,
@@ -168,34 +158,26 @@ def _map_image(folder: Path, transparent: bool) -> MapImage | None:
     return MapImage(picture.repeat(scale, axis=0).repeat(scale, axis=1), window)
 
 
-def _cloud(name: str, raw: Points, origin: Float) -> Cloud:
+def _cloud(name: str, raw: Points, origin: Float) -> Points:
     colors = raw.colors
     if colors is None:
-        colors = np.empty((len(raw.points), 3), np.uint8)
-        colors[:] = ORANGE
+        colors = np.full((len(raw.points), 3), ORANGE, np.uint8)
         if name == "static" and len(raw.points):
             z = raw.points[:, 2]
             colors = display.color_by_height(z, *np.quantile(z, [0.02, 0.98]).tolist())
     elif name == "dynamic":  # uncolored points; grey would look static
         colors[(colors == GRAY).all(axis=1)] = ORANGE
-    return Cloud((raw.points - origin).astype(np.float32), colors, raw.total)
+    return Points((raw.points - origin).astype(np.float32), colors, raw.total)
 
 
 def _ground(static: Points | None, poses: Float) -> float:
     """Height of the floor in m, from the static points around the trajectory."""
     if static is None or not len(static.points):
         return 0.0
-    low, high = (f(poses[:, :2, 3], axis=0) for f in (np.min, np.max))
-    near = (
-        (static.points[:, :2] > low - _GROUND_RADIUS)
-        & (static.points[:, :2] < high + _GROUND_RADIUS)
-    ).all(axis=1)
-    z = static.points[near, 2]
+    xy, way = static.points[:, :2], poses[:, :2, 3]
+    low, high = way.min(axis=0) - _GROUND_RADIUS, way.max(axis=0) + _GROUND_RADIUS
+    z = static.points[((xy > low) & (xy < high)).all(axis=1), 2]
     return float(np.quantile(z, _GROUND_QUANTILE)) if len(z) else 0.0
-
-
-def _surface(path: Path) -> bytes | None:
-    return gltf.read_glb(path, _MAX_MESH) if path.exists() else None
 
 
 def _models(folder: Path, tracks: list[Track], notes: list[str]) -> list[Model]:

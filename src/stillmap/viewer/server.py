@@ -29,9 +29,7 @@ _LOCAL_HOST = re.compile(r"(127\.0\.0\.1|localhost)(:\d{1,5})?")
 def is_local_request(headers: Mapping[str, str]) -> bool:
     """Whether a request addresses this machine and comes from its own page or from no page."""
     host, origin = headers.get("Host", ""), headers.get("Origin")
-    if not _LOCAL_HOST.fullmatch(host):
-        return False
-    return origin is None or origin == f"http://{host}"
+    return bool(_LOCAL_HOST.fullmatch(host)) and origin in (None, f"http://{host}")
 
 
 def content_security_policy(host: str) -> str:
@@ -87,22 +85,19 @@ class Server(viser.ViserServer):
         return None
 
 
-def start_server(port: int, label: str) -> Server:
+def start_server(port: int) -> Server:
     """Start a server at a port of 127.0.0.1; 0: any free one.
 
     Raises:
         InputError: the port is taken.
     """
-    console = rich.get_console()
-    quiet, console.quiet = console.quiet, True  # viser prints its address
     # websockets logs malformed requests with a traceback
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     port_override = os.environ.pop(_PORT_VARIABLE, None)
     try:
-        with _guard_servers() as ports:
-            server = Server(HOST, port, label=label, verbose=False)
+        with _quiet_console(), _guard_servers() as ports:
+            server = Server(HOST, port, label="stillmap", verbose=False)
     finally:
-        console.quiet = quiet
         if port_override is not None:
             os.environ[_PORT_VARIABLE] = port_override
     if not ports:
@@ -117,10 +112,17 @@ def start_server(port: int, label: str) -> Server:
 
 def stop_server(server: Server) -> None:
     """Stop a server, its connections and threads."""
+    with _quiet_console():
+        server.stop()
+
+
+@contextmanager
+def _quiet_console() -> Iterator[None]:
+    """Within the context viser prints nothing, as its address."""
     console = rich.get_console()
     quiet, console.quiet = console.quiet, True
     try:
-        server.stop()
+        yield
     finally:
         console.quiet = quiet
 

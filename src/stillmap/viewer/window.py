@@ -69,7 +69,11 @@ def _bounds(scene: Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 class Window:
-    """A scene on a page; the caller calls `step` in a loop."""
+    """A scene on a page; the caller calls `step` in a loop.
+
+    Attributes:
+        scan: index of the scan that is shown.
+    """
 
     def __init__(self, scene: Scene, beams: Beams | None, port: int = 0) -> None:
         """Serve the page at a port of 127.0.0.1; 0: any free one.
@@ -79,8 +83,8 @@ class Window:
         """
         self._scene = scene
         self._seconds = 1e-9 * (scene.stamp_ns - scene.stamp_ns[0])
-        self._scan, self._at, self._playing, self._ticked = 0, 0.0, False, time.monotonic()
-        self._server = start_server(port, "stillmap")
+        self.scan, self._at, self._playing, self._ticked = 0, 0.0, False, time.monotonic()
+        self._server = start_server(port)
         try:
             self._layers = Layers(self._server, scene, beams, self._set_default_view())
             self._controls()
@@ -94,18 +98,13 @@ class Window:
         """Address of the page."""
         return f"http://{self._server.get_host()}:{self._server.get_port()}"
 
-    @property
-    def scan(self) -> int:
-        """Index of the scan that is shown."""
-        return self._scan
-
     def close(self) -> None:
         """Stop the server."""
         stop_server(self._server)
 
     def show(self, scan: int) -> None:
         """Show a scan."""
-        self._scan = scan
+        self.scan = scan
         with self._server.atomic():
             self._slider.value = scan
             self._clock.value = f"{self._seconds[scan]:.1f} of {self._seconds[-1]:.1f} s"
@@ -126,7 +125,7 @@ class Window:
         now = time.monotonic()
         passed, self._ticked = now - self._ticked, now
         wanted = int(self._slider.value)
-        if wanted != self._scan:  # the slider was moved
+        if wanted != self.scan:  # the slider was moved
             self._at = float(self._seconds[wanted])
         elif self._playing:
             wanted = self._advance(passed)
@@ -135,7 +134,7 @@ class Window:
         if any(changed):
             for name, note in self._notes.items():
                 note.visible = self._boxes[name].value
-        if wanted != self._scan or any(changed):
+        if wanted != self.scan or any(changed):
             self.show(wanted)
 
     def _advance(self, passed: float) -> int:
@@ -160,24 +159,17 @@ class Window:
         self._clock: Any = gui.add_text("Time", "", disabled=True)
         self._speed = gui.add_dropdown("Speed", tuple(_SPEEDS))
         self._button = gui.add_button("Play", disabled=not last)
-        self._button.on_click(self._toggle_playback)
+        self._button.on_click(lambda _event: self.play(not self._playing))
+        visible = self._layers.default_visibility
         with gui.add_folder("Show"):
-            self._boxes = {
-                name: gui.add_checkbox(name, shown)
-                for name, shown in self._layers.default_visibility.items()
-            }
+            self._boxes = {name: gui.add_checkbox(name, shown) for name, shown in visible.items()}
             self._size = gui.add_slider("Point size", 0.5, 5.0, 0.5, 1.0)
         self._notes = {
-            name: gui.add_markdown(
-                _escape_markdown(note), visible=self._layers.default_visibility[name]
-            )
+            name: gui.add_markdown(_escape_markdown(note), visible=visible[name])
             for name, note in self._layers.notes.items()
         }
         for note in self._scene.notes:
             gui.add_markdown(_escape_markdown(note))
-
-    def _toggle_playback(self, _event: Any) -> None:
-        self.play(not self._playing)
 
 
 def _escape_markdown(text: str) -> str:
