@@ -37,7 +37,7 @@ ECE_BINS = 15
 
 UNSURE = (0.05, 0.95)  # P(dynamic) strictly between counts as unsure
 
-_NAN = float("nan")
+NAN = float("nan")
 
 
 @dataclass(frozen=True)
@@ -99,14 +99,14 @@ def score_labels(p_static: NDArray[np.floating], static: Bool, hit: Bool) -> Lab
         precision=precision,
         recall=recall,
         f1=f1,
-        brier=_mean((q - y) ** 2),
+        brier=mean((q - y) ** 2),
         log_loss=compute_log_loss(q, y),
         ece=compute_calibration_error(q, y, assign_equal_width_bins(q)),
         unsure=int(unsure.sum()),
         ece_unsure=compute_calibration_error(
             q[unsure], y[unsure], assign_equal_mass_bins(q[unsure])
         ),
-        share_called_dynamic=_mean((p < 0.5).astype(np.float64)),
+        share_called_dynamic=mean((p < 0.5).astype(np.float64)),
     )
 
 
@@ -117,7 +117,7 @@ def compute_average_precision(score: Float, positive: Bool) -> float:
     """
     n_positive = int(positive.sum())
     if not n_positive:
-        return _NAN
+        return NAN
     order = np.argsort(-score, kind="stable")
     last_of_ties = np.append(np.flatnonzero(np.diff(score[order])), len(score) - 1)
     true_positives = np.cumsum(positive[order])[last_of_ties]
@@ -131,16 +131,16 @@ def compute_precision_recall_f1(called: Bool, positive: Bool) -> tuple[float, fl
         int(np.count_nonzero(mask)) for mask in (called & positive, called, positive)
     )
     return (
-        both / n_called if n_called else _NAN,
-        both / n_positive if n_positive else _NAN,
-        2 * both / (n_called + n_positive) if n_called + n_positive else _NAN,
+        both / n_called if n_called else NAN,
+        both / n_positive if n_positive else NAN,
+        2 * both / (n_called + n_positive) if n_called + n_positive else NAN,
     )
 
 
 def compute_log_loss(p: Float, positive: Bool, eps: float = LOG_LOSS_EPS) -> float:
     """Mean of -ln P(truth), in nats, P clipped to [eps, 1 - eps]."""
     p = np.clip(p, eps, 1.0 - eps)
-    return _mean(-np.log(np.where(positive, p, 1.0 - p)))
+    return mean(-np.log(np.where(positive, p, 1.0 - p)))
 
 
 def assign_equal_width_bins(p: Float, bins: int = ECE_BINS) -> NDArray[np.intp]:
@@ -158,10 +158,11 @@ def assign_equal_mass_bins(p: Float, bins: int = ECE_BINS) -> NDArray[np.intp]:
 def compute_calibration_error(p: Float, positive: Bool, bin_of: NDArray[np.intp]) -> float:
     """Mean over all beams of |share of positives - mean p| of their bin (Naeini et al. 2015)."""
     if not len(p):
-        return _NAN
+        return NAN
     surplus = np.bincount(bin_of, weights=positive - p)
     return float(np.abs(surplus).sum() / len(p))
 
 
-def _mean(values: Float) -> float:
-    return float(values.mean()) if len(values) else _NAN
+def mean(values: NDArray[Any]) -> float:
+    """Mean of (n,) numbers; NaN of none."""
+    return float(values.mean()) if len(values) else NAN

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from stillmap.core.camera import Camera, is_in_image, project
 from stillmap.core.errors import import_extra
 from stillmap.eval import mesh_distance
-from stillmap.eval.labels import Scores
+from stillmap.eval.labels import NAN, Scores, mean
 from stillmap.sim.appearance import compute_static_color
 from stillmap.sim.camera import SKY
 from stillmap.sim.truth_surfaces import StaticSurfaces
@@ -27,7 +27,6 @@ COMPLETE = 0.05  # m
 GREY, STATIC, NOTHING = -3, -1, -2  # source of a sample without texture, no mover, or the sky
 _MIN_COSINE = 0.17  # of the viewing angle: 80 degrees
 _TOLERANCE, _MAX_TOLERANCE = 0.05, 0.5  # m between a surface and the depth of its pixel
-_NAN = float("nan")
 
 
 @dataclass(frozen=True)
@@ -122,19 +121,16 @@ def score_surface(
         places: (n, 3) observed points on them, in the world.
         T_world_map: (4, 4).
     """
-    on_mesh = transform_points(
-        T_world_map, mesh_distance.sample_surface(vertices, faces, SAMPLES).points
-    )
-    distance, _ = standing.project(on_mesh)
-    gaps = mesh_distance.distance_to_mesh(
-        places, transform_points(T_world_map, vertices), faces, COMPLETE
-    )
+    on_mesh = mesh_distance.sample_surface(vertices, faces, SAMPLES).points
+    distance, _ = standing.project(transform_points(T_world_map, on_mesh))
+    in_world = transform_points(T_world_map, vertices)
+    gaps = mesh_distance.distance_to_mesh(places, in_world, faces, COMPLETE)
     return SurfaceScores(
         faces=len(faces),
         area=float(mesh_distance.triangle_areas(vertices, faces).sum()),
-        mean=_mean(distance),
-        p95=float(np.percentile(distance, 95)) if len(distance) else _NAN,
-        complete=_mean(gaps <= COMPLETE),
+        mean=mean(distance),
+        p95=float(np.percentile(distance, 95)) if len(distance) else NAN,
+        complete=mean(gaps <= COMPLETE),
         places=len(places),
     )
 
@@ -164,13 +160,13 @@ def score_texture(
     textured = source != GREY
     error = compute_color_errors(coloured, standing, colour_seed, T_world_map)
     return TextureScores(
-        textured=_mean(textured),
-        mover=_mean(source[textured] >= 0),
-        nothing=_mean(source[textured] == NOTHING),
-        in_view=_mean(in_view),
-        covered=_mean(textured[in_view]),
-        colour_median=float(np.median(error)) if len(error) else _NAN,
-        colour_p95=float(np.percentile(error, 95)) if len(error) else _NAN,
+        textured=mean(textured),
+        mover=mean(source[textured] >= 0),
+        nothing=mean(source[textured] == NOTHING),
+        in_view=mean(in_view),
+        covered=mean(textured[in_view]),
+        colour_median=float(np.median(error)) if len(error) else NAN,
+        colour_p95=float(np.percentile(error, 95)) if len(error) else NAN,
     )
 
 
@@ -188,8 +184,7 @@ def look_up_texture_source(
         pixel, inside = _pixels(pictures.cameras[pictures.camera[number]], points)
         column, row = pixel[inside].T
         value = pictures.mask(number)[row, column].astype(np.int64)
-        what = np.where(value == SKY, NOTHING, value - 1)
-        out[some[inside]] = what
+        out[some[inside]] = np.where(value == SKY, NOTHING, value - 1)
     return out
 
 
@@ -206,9 +201,8 @@ def find_visible_samples(
     agrees with the true depth of the pixel to 5 cm and a pixel.
     """
     points = transform_points(T_world_map, samples.points)
-    normals = mesh_distance.triangle_normals(
-        transform_points(T_world_map, record.vertices), record.faces
-    )[samples.face]
+    vertices = transform_points(T_world_map, record.vertices)
+    normals = mesh_distance.triangle_normals(vertices, record.faces)[samples.face]
     out = np.zeros(len(points), bool)
     for number, T_world_camera in enumerate(pictures.T_world_camera):
         camera, center = pictures.cameras[pictures.camera[number]], T_world_camera[:3, 3]
@@ -219,9 +213,8 @@ def find_visible_samples(
         cosine = (towards * normals[left]).sum(axis=1) / np.maximum(away, 1e-9)
         use = (cosine >= _MIN_COSINE) & (away <= max_distance)
         left, away, cosine = left[use], away[use], cosine[use]
-        pixel, inside = _pixels(
-            camera, transform_points(np.linalg.inv(T_world_camera), points[left])
-        )
+        in_camera = transform_points(np.linalg.inv(T_world_camera), points[left])
+        pixel, inside = _pixels(camera, in_camera)
         column, row = pixel[inside].T
         left, away, cosine = left[inside], away[inside], cosine[inside]
         off = np.abs(pictures.distance(number)[row, column] - away)
@@ -259,7 +252,3 @@ def _pixels(camera: Camera, points: Float) -> tuple[NDArray[np.int64], Bool]:
     uv, ahead = project(camera, points)
     inside = ahead & is_in_image(camera, uv)
     return np.rint(np.where(inside[:, None], uv, 0.0)).astype(np.int64), inside
-
-
-def _mean(values: NDArray[np.generic]) -> float:
-    return float(np.mean(values)) if len(values) else _NAN  # type: ignore[arg-type]

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from stillmap.core.errors import InputError, import_extra
 from stillmap.core.files import read_text, require_regular
-from stillmap.core.recording import Recording
 from stillmap.eval import mesh_distance, readers
 from stillmap.eval.mesh import SAMPLES, ColoredPoints, TextureRecord, TrueImages
 from stillmap.eval.object_models import Model, MoverHits, Track
@@ -83,12 +82,10 @@ def read_camera_simulation(path: Path) -> CameraSimulation:
         picture_truth.mask,
         picture_truth.distance,
     )
-    return CameraSimulation(truth, pictures, picture_truth, _ends(recording, truth.poses()))
-
-
-def _ends(recording: Recording, T_world_base: Float) -> Float:
+    T_world_base = truth.poses()
     at_once = deskew_recording(recording, T_world_base, SlamOptions())
-    return at_once.end_points(np.arange(recording.n_beams), T_world_base)
+    ends = at_once.end_points(np.arange(recording.n_beams), T_world_base)
+    return CameraSimulation(truth, pictures, picture_truth, ends)
 
 
 class GlbContent(NamedTuple):
@@ -152,9 +149,8 @@ def _concatenate(parts: list[_Part], n: int) -> GlbContent:
         faces.append(one.faces + np.int32(first))
         first += len(one.vertices)
         if one.uv is not None and one.picture is not None and a > 0.0:
-            some = mesh_distance.sample_surface(
-                one.vertices, one.faces, max(1, round(n * a / total))
-            )
+            count = max(1, round(n * a / total))
+            some = mesh_distance.sample_surface(one.vertices, one.faces, count)
             uv = np.einsum("nk,nkd->nd", some.weight, one.uv[one.faces[some.face]])
             points.append(some.points)
             colour.append(_texels(one.picture, uv))

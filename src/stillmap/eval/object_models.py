@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.eval import mesh_distance
-from stillmap.eval.labels import Scores
+from stillmap.eval.labels import NAN, Scores, mean
 from stillmap.eval.mesh import (
     GREY,
     TextureRecord,
@@ -28,7 +28,6 @@ _SPACING = 0.03  # m, of the lattice of a model
 _MAX_OFFSET = 0.75  # m from a track to its mover's center, plus half the mover's length
 GOOD = 0.05  # m, chamfer distance
 _MIN_BEAMS = 100  # within a second, of a well observed mover
-_NAN = float("nan")
 
 
 class Track(NamedTuple):
@@ -177,12 +176,12 @@ def score_object_models(
     chamfer = _known([one.chamfer for one in scores])
     return MoverScores(
         tracked=len(movers),
-        modelled=len(have & movers) / len(movers) if movers else _NAN,
+        modelled=len(have & movers) / len(movers) if movers else NAN,
         seen_well=len(well),
-        modelled_well=len(have & well) / len(well) if well else _NAN,
-        chamfer=_mean(chamfer),
-        good=_mean(chamfer <= GOOD),
-        background=_mean(_known([one.background for one in scores])),
+        modelled_well=len(have & well) / len(well) if well else NAN,
+        chamfer=mean(chamfer),
+        good=mean(chamfer <= GOOD),
+        background=mean(_known([one.background for one in scores])),
         nothing=len(models) - len(scores),
         models=scores,
     )
@@ -208,23 +207,17 @@ def score_model(
     """Score one model; for arguments see `score_object_models`."""
     solids = moving.at(moving.parts(mover), model.stamp_ns)
     T = T_world_map @ model.T_map_object
-    on_model = transform_points(
-        T, mesh_distance.sample_surface(model.vertices, model.faces, _SAMPLES).points
-    )
-    accuracy = _mean(distance_to_solids(on_model, solids))
+    on_model = mesh_distance.sample_surface(model.vertices, model.faces, _SAMPLES).points
+    accuracy = mean(distance_to_solids(transform_points(T, on_model), solids))
     places = collect_observed_points(moving, mover, model.stamp_ns, model.span_ns, sighted)
-    gaps = mesh_distance.distance_to_mesh(
-        places, transform_points(T, model.vertices), model.faces, _SPACING
-    )
-    completeness = _mean(gaps)
-    textured = background = _NAN
-    if model.record is not None:
-        of_record = mesh_distance.sample_surface(
-            model.record.vertices, model.record.faces, _SAMPLES
-        )
-        source = look_up_texture_source(model.record, of_record, pictures)
-        textured = _mean(source != GREY)
-        background = _mean(source[source != GREY] != mover)
+    vertices = transform_points(T, model.vertices)
+    completeness = mean(mesh_distance.distance_to_mesh(places, vertices, model.faces, _SPACING))
+    textured = background = NAN
+    if (record := model.record) is not None:
+        of_record = mesh_distance.sample_surface(record.vertices, record.faces, _SAMPLES)
+        source = look_up_texture_source(record, of_record, pictures)
+        textured = mean(source != GREY)
+        background = mean(source[source != GREY] != mover)
     chamfer = (accuracy + completeness) / 2
     return ModelScores(id, mover, kind, accuracy, completeness, chamfer, textured, background)
 
@@ -269,7 +262,3 @@ def collect_observed_points(
 def _known(values: Sequence[float]) -> Float:
     array = np.array(values, np.float64)
     return np.asarray(array[~np.isnan(array)])
-
-
-def _mean(values: NDArray[np.generic]) -> float:
-    return float(np.mean(values)) if len(values) else _NAN  # type: ignore[arg-type]

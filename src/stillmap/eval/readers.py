@@ -110,24 +110,19 @@ def require_same_beams(labels: Labels, truth: Truth, result: Path) -> None:
     Raises:
         InputError: scans, beams or stamps differ.
     """
+    where, hint = str(result / "beams"), "is it the result of another recording?"
     for name, got, wanted in (
         ("scans", len(labels.stamp_ns), truth.recording.n_scans),
         ("beams", len(labels.p_static), truth.recording.n_beams),
     ):
         if got != wanted:
-            raise InputError(
-                f"has {got} {name}, the truth in {truth.folder} has {wanted}",
-                where=str(result / "beams"),
-                hint="is it the result of another recording?",
-            )
+            what = f"has {got} {name}, the truth in {truth.folder} has {wanted}"
+            raise InputError(what, where=where, hint=hint)
     differ = labels.stamp_ns != truth.recording.stamp_ns
     differ |= labels.offset[1:] != truth.recording.offset[1:]
     if differ.any():
-        raise InputError(
-            f"scan {int(np.argmax(differ))} differs from that in {truth.folder}",
-            where=str(result / "beams"),
-            hint="is it the result of another recording?",
-        )
+        what = f"scan {int(np.argmax(differ))} differs from that in {truth.folder}"
+        raise InputError(what, where=where, hint=hint)
 
 
 def _finite(path: Path, array: NDArray[Any]) -> Float:
@@ -159,11 +154,11 @@ def read_trajectory(path: Path) -> Trajectory:
     Raises:
         InputError: the file cannot be read, or a line is not a pose.
     """
-    if _first_row(path, _POSE).count == 4:
+    columns, _ = _first_row(path, _POSE)
+    if columns == 4:
         rows = _rows(path, 4, "t x y theta")
         poses = np.tile(np.eye(4), (len(rows), 1, 1))
-        T = se2.matrix(*rows[:, 1:].T)
-        poses[:, :2, :2], poses[:, :2, 3] = T[:, :2, :2], T[:, :2, 2]
+        poses[:, [[0], [1], [3]], [0, 1, 3]] = se2.matrix(*rows[:, 1:].T)
         stamps = rows[:, 0]
     else:
         stamp_ns, poses = read_tum(path)
@@ -197,7 +192,8 @@ def read_odometry(path: Path) -> Float:
     Raises:
         InputError: the file cannot be read or holds no odometry.
     """
-    if not _first_row(path, f"a CARMEN log or {_POSE}").is_log:
+    _, is_log = _first_row(path, f"a CARMEN log or {_POSE}")
+    if not is_log:
         return read_planar_trajectory(path)
     log = read_log(path)
     if log.skipped_odometry.total:
@@ -227,20 +223,14 @@ def _log_rows(log: CarmenLog) -> Float:
     return np.zeros((0, 4))
 
 
-@dataclass(frozen=True)
-class _FirstRow:
-    count: int
-    is_log: bool
-
-
-def _first_row(path: Path, wanted: str) -> _FirstRow:
+def _first_row(path: Path, wanted: str) -> tuple[int, bool]:
     """Number of columns of the first row, and whether it starts with a word."""
     require_regular(path)
     text = read_head(path, _HEAD).decode("utf-8", "replace")
     for line in text.splitlines():
         words = line.split("#")[0].split()
         if words:
-            return _FirstRow(len(words), not _is_number(words[0]))
+            return len(words), not _is_number(words[0])
     raise InputError("holds no rows", where=str(path), hint=f"rows of {wanted}")
 
 

@@ -99,18 +99,14 @@ def _look_up_poses(
         return poses, ~far, 0
     start, _ = nearest_index(odometry[:, 0], trajectory[index[far], 0])
     end, _ = nearest_index(odometry[:, 0], times[far])
-    poses[far] = _apply(poses[far], _displacement(odometry[start, 1:], odometry[end, 1:]))
+    step = _displacement(odometry[start, 1:], odometry[end, 1:])
+    poses[far] = se2.parameters(se2.matrix(*poses[far].T) @ se2.matrix(*step.T))
     return poses, np.ones(len(times), bool), int(far.sum())
 
 
 def _displacement(a: Float, b: Float) -> Float:
     """a^-1 b for (N, 3) poses."""
     return se2.parameters(se2.inverse(se2.matrix(*a.T)) @ se2.matrix(*b.T))
-
-
-def _apply(a: Float, step: Float) -> Float:
-    """a step for (N, 3) poses."""
-    return se2.parameters(se2.matrix(*a.T) @ se2.matrix(*step.T))
 
 
 def _summarize(error: Float) -> Spread:
