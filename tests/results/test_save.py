@@ -96,7 +96,7 @@ def test_a_save_that_fails_keeps_what_was_there(tmp_path, result, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(save_module, "write_report", full)
+    monkeypatch.setattr(save_module, "render_report", full)
     with pytest.raises(InputError, match="No space left"):
         save(result, tmp_path / "out", overwrite=True)
     assert contents(tmp_path / "out") == before

@@ -101,20 +101,15 @@ def show_share(quiet: bool, what: str) -> "Iterator[Callable[[float], None] | No
         finally:
             bar.stop()
     else:
-        yield _ShareLines(what)
+        last = time.monotonic()
 
+        def print_line(share: float) -> None:
+            nonlocal last
+            if time.monotonic() - last >= _LINE_PERIOD:
+                last = time.monotonic()
+                say(f"{what}: {100.0 * share:.0f} %")
 
-class _ShareLines:
-    """Print the share done every `_LINE_PERIOD` seconds."""
-
-    def __init__(self, what: str) -> None:
-        self._what, self._last = what, time.monotonic()
-
-    def __call__(self, share: float) -> None:
-        now = time.monotonic()
-        if now - self._last >= _LINE_PERIOD:
-            self._last = now
-            say(f"{self._what}: {100.0 * share:.0f} %")
+        yield print_line
 
 
 @contextmanager
@@ -135,7 +130,7 @@ def _bar(iterations: int) -> "Iterator[Progress]":
 
         def progress(what: str, iteration: int, done: int, total: int) -> None:
             nonlocal shown, task
-            if shown is None or not shown.is_same(what, iteration):
+            if shown is None or shown.key != (what, iteration):
                 shown = _Step(what, iteration, iterations)
                 bar.remove_task(task)
                 task = bar.add_task(shown.name, total=total or None, counted="")
@@ -153,12 +148,9 @@ class _Step:
     """The current step and its start; only iterations count scans."""
 
     def __init__(self, what: str, iteration: int, iterations: int) -> None:
+        self.key = what, iteration
         self.name = f"{what}, iteration {iteration} of at most {iterations}" if iteration else what
-        self.of_scans = iteration > 0
-        self._which, self._started = (what, iteration), time.monotonic()
-
-    def is_same(self, what: str, iteration: int) -> bool:
-        return self._which == (what, iteration)
+        self.of_scans, self._started = iteration > 0, time.monotonic()
 
     def seconds(self) -> float:
         return time.monotonic() - self._started
@@ -187,7 +179,7 @@ class _Lines:
 
     def __call__(self, what: str, iteration: int, done: int, total: int) -> None:
         step = self._now[0]
-        if not step.is_same(what, iteration):
+        if step.key != (what, iteration):
             step = _Step(what, iteration, self._iterations)
         self._now = step, done, total
         if 0 < total == done and iteration > self._reported:

@@ -42,7 +42,7 @@ class CheckpointFolder:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._whole: dict[str, int] = {}  # checksums of the arrays in the present checkpoint
+        self._arrays: dict[str, dict[str, Any]] = {}  # those of the present checkpoint
 
     @property
     def newest(self) -> Path | None:
@@ -80,7 +80,7 @@ class CheckpointFolder:
             run = unpack_state(state["state"], arrays, options)
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise DamagedCheckpoint(f"{self.newest / _STATE}: {error!r}") from error
-        self._whole = {name: about["crc32"] for name, about in state["arrays"].items()}
+        self._arrays = state["arrays"]
         stages.add(state["stages"])
         return run
 
@@ -96,11 +96,7 @@ class CheckpointFolder:
             self._clear(work)
             work.mkdir()
             values, arrays = pack_state(run)
-            checksums = {n: self._put(work, before, n, array) for n, array in arrays.items()}
-            about = {
-                name: {"crc32": checksums[name], "shape": a.shape, "dtype": a.dtype.str}
-                for name, a in arrays.items()
-            }
+            about = {name: self._put(work, before, name, a) for name, a in arrays.items()}
             state = {"identity": dict(identity), "arrays": about, "state": values}
             _write_state(work / _STATE, {**state, "stages": stages.to_dict()})
             _sync(work)
@@ -110,19 +106,21 @@ class CheckpointFolder:
             self._clear(work)
             what = f"no checkpoint can be written: {error.strerror or error}"
             raise InputError(what, where=str(self.folder)) from error
-        self._whole = checksums
+        self._arrays = about
         self._clear(
             *(path for path in self.folder.iterdir() if path.name not in (_LOCK, final.name))
         )
 
-    def _put(self, work: Path, before: Path | None, name: str, array: NDArray[Any]) -> int:
-        """Writes an array, unless the checkpoint before has it; its checksum."""
-        if before is not None and name in self._whole and name.startswith("e-"):
+    def _put(
+        self, work: Path, before: Path | None, name: str, array: NDArray[Any]
+    ) -> dict[str, Any]:
+        """Writes an array, unless the checkpoint before has it; its checksum, shape and dtype."""
+        if before is not None and name in self._arrays and name.startswith("e-"):
             os.link(before / f"{name}.npy", work / f"{name}.npy")
-            return self._whole[name]
+            return self._arrays[name]
         write_npy(work / f"{name}.npy", array)
         _sync(work / f"{name}.npy")
-        return _checksum(array)
+        return {"crc32": _checksum(array), "shape": array.shape, "dtype": array.dtype.str}
 
     def clear(self) -> None:
         """Removes what earlier runs left."""

@@ -17,7 +17,7 @@ from stillmap.results.object_models import models_record, write_models
 from stillmap.results.objects import write_objects, write_traffic
 from stillmap.results.points import write_clouds
 from stillmap.results.pose_graph_g2o import write_g2o
-from stillmap.results.report.page import write_report
+from stillmap.results.report.page import render_report
 from stillmap.results.report.previews import ModelPreviews, render_previews
 from stillmap.results.run_json import RECORD, TILTING, tilting_record, write_run_json
 from stillmap.rig.build import TiltingResult
@@ -60,7 +60,8 @@ def save(
             write_objects(folder / "objects", result)
             write_traffic(folder / "traffic.npz", result.traffic)
         previews = None if models is None else _previews(models, result.options.threads)
-        write_report(folder / "report.html", result, tilting, previews)
+        page = render_report(result, tilting, previews)
+        (folder / "report.html").write_text(page, encoding="utf-8")
         more = {}
         if tilting is not None:
             _write_tilting(folder, tilting, colors)

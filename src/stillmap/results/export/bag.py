@@ -139,17 +139,13 @@ def _marker(
         "mesh_use_embedded_materials": False,
     }
     if not bag.is_ros1:
-        fields |= _ros2_fields(bag, stamp)
+        empty = np.empty(0, np.uint8)
+        image = {"header": bag.header(stamp, ""), "format": "", "data": empty}
+        mesh = {"filename": "", "data": empty}
+        fields |= {
+            "texture_resource": "",
+            "texture": bag.make("sensor_msgs/msg/CompressedImage", **image),
+            "uv_coordinates": [],
+            "mesh_file": bag.make("visualization_msgs/msg/MeshFile", **mesh),
+        }
     return bag.make("visualization_msgs/msg/Marker", **fields)
-
-
-def _ros2_fields(bag: BagWriter, stamp: int) -> dict[str, Any]:
-    empty = np.empty(0, np.uint8)
-    image = {"header": bag.header(stamp, ""), "format": "", "data": empty}
-    mesh = {"filename": "", "data": empty}
-    return {
-        "texture_resource": "",
-        "texture": bag.make("sensor_msgs/msg/CompressedImage", **image),
-        "uv_coordinates": [],
-        "mesh_file": bag.make("visualization_msgs/msg/MeshFile", **mesh),
-    }

@@ -26,22 +26,12 @@ if TYPE_CHECKING:
 _MIN_DYNAMIC = 100  # dynamic returns below which the weights of dynamic classes mean little
 
 
-def write_report(
-    path: Path,
-    result: MappingResult,
-    tilting: TiltingResult | None = None,
-    previews: ModelPreviews | None = None,
-) -> None:
-    """Write the report as one HTML page of at most a few megabytes."""
-    path.write_text(render_report(result, tilting, previews), encoding="utf-8")
-
-
 def render_report(
     result: MappingResult,
     tilting: TiltingResult | None = None,
     previews: ModelPreviews | None = None,
 ) -> str:
-    """The page: no script, no outside request; all images are inline."""
+    """The page, of a few megabytes at most: no script, no outside request, all images inline."""
     data = {
         "run": _run_data(result),
         "maps": map_data(result),
