@@ -143,14 +143,15 @@ def test_empty_sweeps(room):
     assert np.abs(nothing.poses - np.eye(4)).max() < 1e-9
 
 
-def test_memory_is_bounded_by_the_radius():
+def test_memory_is_bounded_by_the_radius(monkeypatch):
+    monkeypatch.setattr(lidar_odometry, "_MAX_RANGE", 20.0)
     street = Boxes.of([[0.0, 0.0, 1.0, 4000.0, 12.0, 5.0, 0, 0, 0]])
     recording, _, e = recorded(street, SPARSE, wobbling(40, speed=30.0, turn=0.0), 40, seed=4)
     local = _core.NdtMap3D(0.4, 4, 60.0)
     sizes = []
     for t, x in enumerate(np.arange(0.0, 120.0, 3.0)):
         T = se3.exp(np.array([x, 0, 0, 0, 0, 0]))
-        sweep = lidar_odometry.select_sweep(recording, e, t, 20.0, 0.2)
+        sweep = lidar_odometry.select_sweep(recording, e, t)
         local.add(sweep.points, sweep.weights, T)
         local.crop(T, 20.0)
         sizes.append(len(local))

@@ -25,7 +25,6 @@ from stillmap.em.ground import ground_from_surfels
 from stillmap.em.mixture import fit_weights, posterior_static
 from stillmap.em.observations import (
     HALF_TIME_RHO,
-    LOOP_CLASSES,
     MAX_RANGE_MARGIN,
     HmmClasses,
     Observations,
@@ -61,12 +60,7 @@ _FINAL_CLASSES = HmmClasses(
 
 
 def e_step(
-    recording: Recording,
-    poses: Float,
-    resolution: float,
-    options: EmOptions,
-    threads: int = 1,
-    classes: HmmClasses = LOOP_CLASSES,
+    recording: Recording, poses: Float, resolution: float, options: EmOptions, threads: int = 1
 ) -> EStepResult:
     """P(c = 1) of every beam: the probability that the surface in its end cell is static.
 
@@ -76,9 +70,8 @@ def e_step(
         resolution: edge of a cell, metres.
         options: see EmOptions.
         threads: does not change the result.
-        classes: of the HMM.
     """
-    observations = collect_observations(recording, poses, resolution, options, threads, classes)
+    observations = collect_observations(recording, poses, resolution, options, threads)
     return label_beams(observations, None, recording, poses, options)
 
 

@@ -82,28 +82,17 @@ class LidarOdometry:
     explained: Float
 
 
-def select_sweep(
-    recording: Recording,
-    e: NDArray[np.float32],
-    t: int,
-    max_range: float = _MAX_RANGE,
-    spacing: float = _MAP_SPACING,
-) -> Sweep:
-    """Sweep t within `max_range` m, the first of its hits in each voxel of `spacing` m.
+def select_sweep(recording: Recording, e: NDArray[np.float32], t: int) -> Sweep:
+    """Sweep t of a 3D recording within the range of the map: the first hit in each voxel.
 
-    Args:
-        recording: 3D.
-        e: (M,) P(static) of every beam.
-        t: the sweep.
-        max_range: m.
-        spacing: m.
+    e: (M,) P(static) of every beam.
     """
     beams = recording.beams_of(t)
     points = np.asarray(recording.points[beams])
     with np.errstate(invalid="ignore"):
-        near = np.einsum("ni,ni->n", points, points) <= max_range * max_range
+        near = np.einsum("ni,ni->n", points, points) <= _MAX_RANGE * _MAX_RANGE
     weights = np.where(recording.hit[beams] & near, e[beams], np.float32(0.0))
-    kept = _core.voxel_downsample(points, weights, spacing)
+    kept = _core.voxel_downsample(points, weights, _MAP_SPACING)
     T = recording.T_base_sensor[recording.sensor[t]]
     in_base = (points[kept] @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
     times = recording.beam_time

@@ -111,14 +111,14 @@ class _LoopCloser:
 
     def odometry_constraints(self) -> list[Constraint]:
         """Constraints between successive keyframes: a random walk."""
-        out = []
         poses = self.odometry.poses[self.keyframes]
         steps = se2.inverse(poses[:-1]) @ poses[1:]
         metres = np.diff(self.travelled[self.keyframes]) + 0.05  # standing still has errors too
-        std = [_STEP_TRANSLATION] * 3 + [_STEP_ROTATION] * 3
-        for k, (T, length) in enumerate(zip(steps, metres, strict=True)):
-            out.append(Constraint(k, k + 1, T, length * np.diag(np.square(std))))
-        return out
+        covariance = np.diag(np.square([_STEP_TRANSLATION] * 3 + [_STEP_ROTATION] * 3))
+        return [
+            Constraint(k, k + 1, T, length * covariance)
+            for k, (T, length) in enumerate(zip(steps, metres, strict=True))
+        ]
 
     def search_loops(self, progress: ScanProgress) -> list[LoopClosure]:
         """Each keyframe with the nearest one of much earlier travel, if near enough.
