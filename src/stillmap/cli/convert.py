@@ -170,10 +170,7 @@ def _convert_to_bag(
 
 
 def _convert_to_cloud(
-    args: argparse.Namespace,
-    result: "ResultFolder",
-    output: Path,
-    form: "point_cloud_files.Format",
+    args: argparse.Namespace, result: "ResultFolder", output: Path, form: "point_cloud_files.Format"
 ) -> str:
     from stillmap.core.files import require_new_file
     from stillmap.results.export import point_cloud, point_cloud_files

@@ -102,9 +102,7 @@ def _add_map_flags(p: argparse._ArgumentGroup) -> None:
         help="pixels of map.pgm (default: trinary)",
     )
     p.add_argument(
-        "--map-state",
-        choices=("last", "majority"),
-        help="state of changed places (default: last)",
+        "--map-state", choices=("last", "majority"), help="state of changed places (default: last)"
     )
 
 

@@ -156,11 +156,7 @@ def _occupancy_maps(
 
 
 def find_objects(
-    deskewed: Recording,
-    estimate: Estimate,
-    maps: Maps,
-    changes: list[Change],
-    options: Options,
+    deskewed: Recording, estimate: Estimate, maps: Maps, changes: list[Change], options: Options
 ) -> list[MovingObject]:
     """Moving objects; in 2D without those whose beams ended on what is listed as a change."""
     poses, p_static = estimate.poses, estimate.p_static

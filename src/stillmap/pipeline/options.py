@@ -53,10 +53,7 @@ class Options(Section):
     """All options of a run."""
 
     threads: int = option(
-        0,
-        "Number of threads; 0 uses every core. The result does not depend on it.",
-        ge=0,
-        le=1024,
+        0, "Number of threads; 0 uses every core. The result does not depend on it.", ge=0, le=1024
     )
     # spelled out: ruff takes the default for mutable under an alias
     estimator: Literal["stillmap", "paper", "hit-ratio", "tracker"] = option(

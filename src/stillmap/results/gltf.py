@@ -78,10 +78,7 @@ def write_glb(path: Path, mesh: TexturedMesh | Mesh, quality: int = 90) -> None:
         _finish(tree)
 
     data = trimesh.exchange.gltf.export_glb(
-        scene,
-        include_normals=False,
-        buffer_postprocessor=put_pages,
-        tree_postprocessor=finish,
+        scene, include_normals=False, buffer_postprocessor=put_pages, tree_postprocessor=finish
     )
     with atomic_file(path) as work:
         work.write_bytes(data)

@@ -116,11 +116,7 @@ def _write_pcd(cloud: Cloud, path: Path, _: bool, progress: Progress | None) -> 
 
 
 def _write_records(
-    cloud: Cloud,
-    path: Path,
-    header: bytes,
-    fields: Fields,
-    progress: Progress | None,
+    cloud: Cloud, path: Path, header: bytes, fields: Fields, progress: Progress | None
 ) -> None:
     with path.open("wb") as file:
         file.write(header)
