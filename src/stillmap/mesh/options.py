@@ -11,10 +11,7 @@ class MeshOptions(Section, section="mesh"):
 
     enabled: bool = option(True, "Build meshes of 3D recordings.")
     voxel_size: float | None = option(
-        None,
-        "Edge of a TSDF voxel, in metres; unset: from the point spacing.",
-        ge=0.001,
-        le=10.0,
+        None, "Edge of a TSDF voxel, in metres; unset: from the point spacing.", ge=0.001, le=10.0
     )
     max_faces: int = option(
         200_000, "Maximum number of triangles of the mesh of the place.", ge=4, le=1_000_000_000

@@ -13,8 +13,8 @@ from stillmap.core.chunks import Chunk, iter_chunks
 from stillmap.core.parallel import map_ordered
 from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.mesh.inputs import MeshInputs
-from stillmap.mesh.objects.reconstruction import IMAGE_WINDOW
 from stillmap.mesh.objects.segmentation import NO_OWNER, DynamicReturns
+from stillmap.mesh.objects.sweep_surface import IMAGE_WINDOW
 from stillmap.mesh.objects.texturing import OUTLINE_DRIFT, outline_depth
 from stillmap.mesh.place import Background
 from stillmap.mesh.texture.atlas import GRAY, TexturedMesh
@@ -22,12 +22,7 @@ from stillmap.mesh.texture.baking import TextureSampler, avoid_gray, sample_bili
 from stillmap.mesh.texture.view_selection import MIN_P_VISIBLE
 from stillmap.mesh.texture.views import View
 from stillmap.mesh.texture.visibility import IMAGE_MARGIN, NEAR
-from stillmap.mesh.tracked_boxes import (
-    OUTLINE_MARGIN,
-    TrackedBox,
-    boxes_at,
-    occlusion_probability,
-)
+from stillmap.mesh.tracked_boxes import OUTLINE_MARGIN, TrackedBox, boxes_at, occlusion_probability
 from stillmap.mesh.types import Bool, Float, Float32, Image, Index, Tell, no_tell
 
 _MAX_SURFACE_DISTANCE = 0.1  # m of a static point from the surface

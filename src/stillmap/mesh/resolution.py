@@ -22,8 +22,6 @@ _SAMPLED_BEAMS = 200_000
 _SAMPLED_POSITIONS = 32  # of the sensor
 _LAYERS = 2.5  # blocks across a surface
 _BLOCK_EDGE, _BLOCK_BYTES = 8, 4200  # voxels along a block, and its size
-
-
 _MIN_TRAVEL_SHARE = 0.2  # of the median range, between viewpoints
 _MIN_TURN = 0.1  # rad, likewise
 _SCANS_PER_PLACE = 2  # scans used from each viewpoint: one may be occluded by a mover

@@ -150,14 +150,12 @@ def boxes_at(boxes: Sequence[TrackedBox], seconds: float) -> list[OrientedBox]:
     """The boxes that exist at a time, in seconds of their tracks."""
     out = []
     for box, bottom, height in boxes:
-        early = min(seconds - box.seconds[0], 0.0)
-        late = max(seconds - box.seconds[-1], 0.0)
-        if max(-early, late) > box.hold:
+        if max(box.seconds[0] - seconds, seconds - box.seconds[-1]) > box.hold:
             continue
         xy = box.center_at(np.array([seconds]))[0]
         at = max(int(np.searchsorted(box.seconds, seconds, side="right")) - 1, 0)
         low = float(np.interp(seconds, box.seconds, bottom))
-        center = np.array([xy[0], xy[1], low + 0.5 * height])
+        center = np.array([*xy, low + 0.5 * height])
         out.append(OrientedBox(center, box.heading[at], np.array([*box.half_size, 0.5 * height])))
     return out
 

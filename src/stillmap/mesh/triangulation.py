@@ -5,12 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stillmap.mesh.triangle_mesh import (
-    cross_columns,
-    dot_columns,
-    normalize_columns,
-    row_lengths,
-)
+from stillmap.mesh.triangle_mesh import cross_columns, dot_columns, normalize_columns, row_lengths
 from stillmap.mesh.types import Bool, Float, Index, Int32
 
 _MAX_EDGE = 1.5  # m: longer edges span holes

@@ -24,10 +24,7 @@ from stillmap.mesh.objects.registration import (
     triangulate_partial_scan,
     within_time,
 )
-from stillmap.mesh.objects.segmentation import (
-    HALF_CAR,
-    DynamicReturns,
-)
+from stillmap.mesh.objects.segmentation import HALF_CAR, DynamicReturns
 from stillmap.mesh.objects.sweep_surface import find_best_interval
 from stillmap.mesh.range_image import Patch
 from stillmap.mesh.simplification import subdivide
@@ -36,7 +33,6 @@ from stillmap.mesh.triangle_mesh import Mesh
 from stillmap.mesh.tsdf import TsdfParameters, integrate_patches
 from stillmap.mesh.types import Float, Index
 
-IMAGE_WINDOW = 0.5  # s between an observation and an image of an object that is not rigid
 MERGE_WINDOW = 0.5  # s before and after the best partial scan, of those registered to it
 _MAX_VIEW_OFFSET = 0.05  # m of a partial surface from the best one: else it is left out
 _SWEEP_WINDOW = 0.4  # s for which people are taken to keep their shape under a tilting laser
@@ -113,10 +109,7 @@ def reconstruct_object(
 
 
 def _best_track(
-    tracks: Sequence[ObjectTrack],
-    images: Sequence[Float],
-    duration: float,
-    returns: DynamicReturns,
+    tracks: Sequence[ObjectTrack], images: Sequence[Float], duration: float, returns: DynamicReturns
 ) -> tuple[ObjectTrack, tuple[float, float]]:
     """The track that is observed best, and the interval in which it is."""
     found = []
@@ -124,7 +117,7 @@ def _best_track(
         if len(one.returns):
             scans = returns.inputs.deskewed.scans_of(returns.beam[one.returns])
             seconds = returns.seconds[one.returns]
-            found.append((one, find_best_interval(seconds, scans, duration, IMAGE_WINDOW, shown)))
+            found.append((one, find_best_interval(seconds, scans, duration, shown)))
     one, (first, last, _) = max(found, key=lambda each: each[1][2])
     return one, (first, last)
 

@@ -173,7 +173,7 @@ def beams_in_frame(
     with np.errstate(invalid="ignore", divide="ignore"):
         far = origin + along * (_MAX_RANGE / np.linalg.norm(along, axis=1, keepdims=True))
     ends = np.where(deskewed.hit[beams][:, None], ends, far)
-    return ObjectBeams.from_map(ends, origin, seconds, frame)
+    return ObjectBeams(frame.to_object(seconds, ends), frame.to_object(seconds, origin))
 
 
 def in_viewing_cone(mine: Index, beams: Index, inputs: MeshInputs) -> Bool:

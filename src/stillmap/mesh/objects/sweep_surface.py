@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay, QhullError
 
-from stillmap.mesh.tracked_boxes import ObjectFrame
 from stillmap.mesh.triangle_mesh import Mesh
 from stillmap.mesh.types import Bool, Float, Index, Int32
 
+IMAGE_WINDOW = 0.5  # s between an observation and an image of an object that is not rigid
 _MIN_COSINE = 0.2  # from an object's center, up to which points are in one perspective image
 _PASS_MARGIN = 0.25  # m behind a triangle from which on a beam has passed it
 _MAX_STEEPNESS = 8.0  # length along the line of sight over length across
@@ -34,16 +34,9 @@ class ObjectBeams(NamedTuple):
     points: Float
     origin: Float
 
-    @classmethod
-    def from_map(
-        cls, points: Float, origin: Float, seconds: Float, frame: ObjectFrame
-    ) -> "ObjectBeams":
-        """Beams in the map frame at times (n,), transformed."""
-        return cls(frame.to_object(seconds, points), frame.to_object(seconds, origin))
-
 
 def find_best_interval(
-    seconds: Float, scan: Index, duration: float, window: float, images: Float
+    seconds: Float, scan: Index, duration: float, images: Float
 ) -> tuple[float, float, float]:
     """The interval with most returns on an object, preferably near an image; start, end, score.
 
@@ -51,8 +44,8 @@ def find_best_interval(
         seconds: (n,) times of returns on it, n > 0.
         scan: (n,) number of the scan, rising.
         duration: s; 0: one scan.
-        window: s from the interval's center to an image at which it counts one fifth.
-        images: (N,) s, when images show the object.
+        images: (N,) s, when images show the object; an interval `IMAGE_WINDOW` away from all
+            counts one fifth.
     """
     if duration == 0.0:
         ends = np.flatnonzero(np.diff(scan)) + 1
@@ -65,7 +58,7 @@ def find_best_interval(
         last, score = first[at - 1], (at - np.arange(len(first))).astype(np.float64)
     if len(images):
         away = np.abs(0.5 * (first + last)[:, None] - images).min(axis=1)
-        penalty = np.minimum(_FAR_IMAGE_PENALTY * away / max(window, 1e-9), _FAR_IMAGE_PENALTY)
+        penalty = np.minimum(_FAR_IMAGE_PENALTY * away / IMAGE_WINDOW, _FAR_IMAGE_PENALTY)
         score = score / (1.0 + penalty)
     best = int(np.argmax(score))
     return float(first[best]), float(last[best]), float(score[best])

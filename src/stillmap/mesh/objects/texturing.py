@@ -7,7 +7,8 @@ import numpy as np
 from scipy import ndimage
 
 from stillmap.core.camera import is_in_image, project
-from stillmap.mesh.objects.reconstruction import IMAGE_WINDOW, ObjectShape
+from stillmap.mesh.objects.reconstruction import ObjectShape
+from stillmap.mesh.objects.sweep_surface import IMAGE_WINDOW
 from stillmap.mesh.place import (
     CANDIDATES,
     Background,
@@ -59,10 +60,7 @@ def times_in_view(box: TrackedBox, views: Sequence[View], start_ns: int) -> Floa
 
 
 def assign_object_views(
-    shape: ObjectShape,
-    background: Background,
-    boxes: Sequence[TrackedBox],
-    start_ns: int,
+    shape: ObjectShape, background: Background, boxes: Sequence[TrackedBox], start_ns: int
 ) -> TexturedViews:
     """Chooses for each face of a moving object the view that shows it best.
 

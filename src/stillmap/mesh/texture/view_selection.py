@@ -27,8 +27,6 @@ _DAMPING = 0.5  # share of a message that is kept per iteration, against oscilla
 _MIN_POSITIVE = 1e-6  # keeps logarithms finite
 _PAIRS_PER_BLOCK = 1 << 17
 _MIN_IMAGES = 3  # of a face: of two images neither is the outlier
-
-
 _DARK, _BRIGHT = 16.0, 240.0  # of 255: beyond these a value may be clipped
 _MIN_FACES = 30  # that two images must share
 _HALF_WEIGHT_FACES = 100.0  # at which a pair has half of its full weight
@@ -146,10 +144,7 @@ def _update_messages(
 
 
 def sample_face_colors(
-    mesh: Mesh,
-    candidates: Candidates,
-    views: Sequence[View],
-    read: Callable[[View], Image | None],
+    mesh: Mesh, candidates: Candidates, views: Sequence[View], read: Callable[[View], Image | None]
 ) -> Float32:
     """(F, K, 3) colors of the candidates at the centers of faces, 0 to 255; NaN: unknown.
 
