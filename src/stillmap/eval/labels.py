@@ -89,6 +89,7 @@ def score_labels(p_static: NDArray[np.floating], static: Bool, hit: Bool) -> Lab
     y = ~static[labelled]
     q = 1.0 - p
     unsure = (q > UNSURE[0]) & (q < UNSURE[1])
+    bins_unsure = assign_equal_mass_bins(q[unsure])
     precision, recall, f1 = compute_precision_recall_f1(p < 0.5, y)
     return LabelScores(
         hits=len(p),
@@ -103,9 +104,7 @@ def score_labels(p_static: NDArray[np.floating], static: Bool, hit: Bool) -> Lab
         log_loss=compute_log_loss(q, y),
         ece=compute_calibration_error(q, y, assign_equal_width_bins(q)),
         unsure=int(unsure.sum()),
-        ece_unsure=compute_calibration_error(
-            q[unsure], y[unsure], assign_equal_mass_bins(q[unsure])
-        ),
+        ece_unsure=compute_calibration_error(q[unsure], y[unsure], bins_unsure),
         share_called_dynamic=mean((p < 0.5).astype(np.float64)),
     )
 

@@ -84,9 +84,8 @@ def extract_wall_cells_from_hits(
         grid: the map, for its lattice.
         T_world_map: (3, 3).
     """
-    cells, count = np.unique(
-        grid.cells(moved(se2.inverse(T_world_map), hits)), axis=0, return_counts=True
-    )
+    hit_cells = grid.cells(moved(se2.inverse(T_world_map), hits))
+    cells, count = np.unique(hit_cells, axis=0, return_counts=True)
     centres = moved(T_world_map, grid.centres(cells[count >= MIN_HITS]))
     return centres[distance_to_walls(centres, walls) <= WALL_DISTANCE * grid.resolution]
 

@@ -13,14 +13,12 @@ from numpy.typing import NDArray
 from stillmap.core.camera import Camera, is_in_image, project
 from stillmap.core.errors import import_extra
 from stillmap.eval import mesh_distance
-from stillmap.eval.labels import NAN, Scores, mean
+from stillmap.eval.labels import NAN, Bool, Float, Scores, mean
 from stillmap.sim.appearance import compute_static_color
 from stillmap.sim.camera import SKY
 from stillmap.sim.truth_surfaces import StaticSurfaces
 
-Float = NDArray[np.float64]
 Index = NDArray[np.int32]
-Bool = NDArray[np.bool_]
 
 SAMPLES = 200_000
 COMPLETE = 0.05  # m

@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.eval import mesh_distance
-from stillmap.eval.labels import NAN, Scores, mean
+from stillmap.eval.labels import NAN, Float, Scores, mean
 from stillmap.eval.mesh import (
     GREY,
+    Index,
     TextureRecord,
     TrueImages,
     look_up_texture_source,
@@ -18,9 +19,6 @@ from stillmap.eval.mesh import (
 )
 from stillmap.sim.geometry import Solids
 from stillmap.sim.truth_surfaces import MovingSurfaces, project_to_solid, to_local, to_world
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int32]
 
 _SAMPLES = 20_000
 _VOXEL = 0.02  # m, for thinning the observed points

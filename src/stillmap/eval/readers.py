@@ -81,9 +81,8 @@ def read_truth(path: Path, labels: Labels | None = None) -> Truth:
         return _truth(folder)
     inside = [path / name for name in RIG_FOLDERS]
     if not all((one / "truth").is_dir() for one in inside):
-        raise InputError(
-            "holds no truth", where=str(path), hint="a folder that 'stillmap simulate' wrote"
-        )
+        hint = "a folder that 'stillmap simulate' wrote"
+        raise InputError("holds no truth", where=str(path), hint=hint)
     if labels is None:
         return _truth(inside[0])
     # both lasers may have equal stamps and numbers of beams; their hits differ

@@ -12,10 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
-from stillmap.eval.labels import Scores
+from stillmap.eval.labels import Float, Scores
 from stillmap.eval.trajectory import nearest_index
-
-Float = NDArray[np.float64]
 
 MAX_DT = 0.1  # seconds, as in the authors' program
 

@@ -16,10 +16,8 @@ from numpy.typing import NDArray
 from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.eval import readers
-from stillmap.eval.labels import Scores
+from stillmap.eval.labels import Float, Scores
 from stillmap.eval.readers import Truth
-
-Float = NDArray[np.float64]
 
 Unit = Literal["m", "frames"]
 
@@ -82,10 +80,8 @@ def associate_trajectories(
     partner, distance = nearest_index(many, few)
     near = np.flatnonzero(distance <= max_dt)
     if not len(near):
-        raise InputError(
-            f"no two stamps lie within {max_dt:g} s of each other",
-            hint="other clocks? see --max-dt",
-        )
+        what = f"no two stamps lie within {max_dt:g} s of each other"
+        raise InputError(what, hint="other clocks? see --max-dt")
     return (partner[near], near) if swap else (near, partner[near])
 
 

@@ -10,10 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.sim.geometry import BOX, ELLIPSOID
+from stillmap.sim.geometry import BOX, ELLIPSOID, Float
 from stillmap.sim.lidar import make_pose
 
-Float = NDArray[np.float64]
 Color = NDArray[np.uint8]
 
 # rotation of the lattices

@@ -9,18 +9,14 @@ from numpy.typing import NDArray
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
 from stillmap.sim import appearance, lidar, renderer
-from stillmap.sim.appearance import SurfacePoints
+from stillmap.sim.appearance import Color, SurfacePoints
 from stillmap.sim.episode import Episode
-from stillmap.sim.geometry import Solids
+from stillmap.sim.geometry import Float, Solids
 from stillmap.sim.options import CameraOptions
 from stillmap.sim.recorder import World, collect_surfaces
 from stillmap.sim.renderer import NOTHING, Lens, RenderedImage
 from stillmap.sim.truth import ImageTruth
 from stillmap.sim.truth_surfaces import to_local
-
-Float = NDArray[np.float64]
-
-Color = NDArray[np.uint8]
 
 _OFFSET = 0.31  # of the scan period, from a scan's stamp to the first image
 _MAX_ITERATIONS = 50  # of Newton's method, to undistort

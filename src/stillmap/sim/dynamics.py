@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.errors import InputError
-from stillmap.sim.laser import Movers, Outlines
+from stillmap.sim.laser import Float, Movers, Outlines
 from stillmap.sim.objects import (
     DOOR_RANGE,
     Doors,
@@ -22,7 +22,6 @@ from stillmap.sim.robot import Robot, plan_route
 from stillmap.sim.scene import Scene
 from stillmap.sim.vehicles import Traffic
 
-Float = NDArray[np.float64]
 Progress = Callable[[float], None]
 Rngs = tuple[np.random.Generator, np.random.Generator, np.random.Generator, np.random.Generator]
 
@@ -209,10 +208,8 @@ def _is_done(scene: Scene, robot: Robot, scans: int, expected: float) -> bool:
         return scans >= scene.robot.scans
     if scans > _MAX_DELAY * expected + 100:
         x, y, _ = robot.pose
-        raise InputError(
-            f"the robot gets stuck at ({x:.1f}, {y:.1f})",
-            hint="fewer people, or a number of scans",
-        )
+        what = f"the robot gets stuck at ({x:.1f}, {y:.1f})"
+        raise InputError(what, hint="fewer people, or a number of scans")
     return robot.arrived
 
 
@@ -240,10 +237,8 @@ class Moment:
         xy, heading = self.interpolate(people.xy), self.interpolate(people.heading)
         # movable objects jump from place to place
         faces = np.concatenate([self.interpolate(outlines.faces), things.faces[self._scan]], axis=1)
-        return (
-            Movers(xy, heading, people.semi_axes, people.mover),
-            Outlines(faces, np.concatenate([outlines.mover, things.mover])),
-        )
+        mover = np.concatenate([outlines.mover, things.mover])
+        return Movers(xy, heading, people.semi_axes, people.mover), Outlines(faces, mover)
 
     def interpolate(self, values: Float) -> Float:
         """(N, ...) values interpolated from those of all scans (T, ...)."""

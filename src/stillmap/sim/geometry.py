@@ -208,6 +208,7 @@ _SEAT = 0.45  # m
 _LAMP, _LAMP_RADIUS = 6.0, 0.1  # m, height and maximum radius of lamp posts
 _CROWN = 9.0  # ratio of the radii of crown and trunk
 _MAX_CROWN = 7.0  # m, radius
+_CORNERS = ((-1, -1), (-1, 1), (1, -1), (1, 1))
 _BRANCHES = 2.3  # m, lower end of crowns
 
 
@@ -217,9 +218,7 @@ def make_vehicle(length: float, width: float, kind: str) -> list[Part]:
         return _forklift(length, width)
     half = width / 2
     wheels = [
-        Part(BOX, i * 0.31 * length, j * (half - 0.12), (0.3, 0.1), (0.0, 0.6))
-        for i in (-1, 1)
-        for j in (-1, 1)
+        Part(BOX, i * 0.31 * length, j * (half - 0.12), (0.3, 0.1), (0.0, 0.6)) for i, j in _CORNERS
     ]
     if length > VAN:
         body = Part(BOX, 0.0, 0.0, (length / 2, half), (0.3, 1.1))
@@ -236,8 +235,7 @@ def _forklift(length: float, width: float) -> list[Part]:
     roof = Part(BOX, rear, 0.0, (0.2 * length, 0.85 * half), (2.05, 2.12))
     posts = [
         Part(CYLINDER, rear + i * 0.18 * length, j * 0.75 * half, (0.03, 0.03), (1.1, 2.05))
-        for i in (-1, 1)
-        for j in (-1, 1)
+        for i, j in _CORNERS
     ]
     body = Part(BOX, rear, 0.0, (0.33 * length, half), (0.1, 1.1))
     return [body, mast, roof, *forks, *posts]

@@ -96,9 +96,8 @@ def cast_beams(
         reach: metres, walls farther away than this may be left out.
     """
     shape = (len(poses), len(angles))
-    out = Returns(
-        np.full(shape, np.inf), np.full(shape, -1, np.int32), np.full(shape, -1, np.int32)
-    )
+    none = np.full(shape, -1, np.int32)
+    out = Returns(np.full(shape, np.inf), none, none.copy())
     for first in range(0, len(poses), _CHUNK):
         part = slice(first, first + _CHUNK)
         scans = _Scans(poses[part], angles)

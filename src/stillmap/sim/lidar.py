@@ -4,17 +4,15 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from stillmap.core import se2
 from stillmap.sim import laser, ray_casting
-from stillmap.sim.geometry import BOX, Faces, Ground, Part, assemble
+from stillmap.sim.geometry import BOX, Faces, Float, Ground, Part, assemble
 from stillmap.sim.options import GroundOptions, LaserOptions, LidarOptions, RigOptions
 from stillmap.sim.ray_casting import RayReturns, Rays
 from stillmap.sim.scene import Scene
 from stillmap.sim.truth_surfaces import StaticSurfaces
-
-Float = NDArray[np.float64]
 
 ROBOT = -2  # the mover's number of the robot itself
 
@@ -52,9 +50,8 @@ class Pattern(NamedTuple):
     def tilted(cls, o: LaserOptions, joint: Float, seconds: Float) -> "Pattern":
         """Pattern of a planar laser tilted by (n,) rad, nose down, at its beams."""
         angle = laser.compute_beam_angles(o.beams, o.fov)
-        direction = np.stack(
-            [np.cos(angle) * np.cos(joint), np.sin(angle), -np.cos(angle) * np.sin(joint)]
-        )
+        ahead, left = np.cos(angle), np.sin(angle)
+        direction = np.stack([ahead * np.cos(joint), left, -ahead * np.sin(joint)])
         azimuth = np.unwrap(np.arctan2(direction[1], direction[0]))
         return cls(azimuth, np.zeros(1), direction[..., None], seconds, np.pi)
 

@@ -6,11 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
-from stillmap.sim.laser import Outlines
+from stillmap.sim.laser import Float, Outlines
 from stillmap.sim.options import DoorOptions
 from stillmap.sim.scene import Door, Stay, Thing
-
-Float = NDArray[np.float64]
 
 
 class PlacedObjects(NamedTuple):

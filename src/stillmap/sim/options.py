@@ -113,9 +113,7 @@ class RobotOptions(Section, section="robot"):
 
     speed: float = option(0.5, "Speed on a free way, m/s.", gt=0)
     acceleration: float | None = option(
-        None,
-        "Maximum acceleration, longitudinal and lateral, m/s^2; unset: unlimited.",
-        gt=0,
+        None, "Maximum acceleration, longitudinal and lateral, m/s^2; unset: unlimited.", gt=0
     )
     turn_rate: float = option(0.8, "Maximum turn rate, rad/s.", gt=0)
     radius: float = option(0.22, "Radius of the circular footprint, m.")

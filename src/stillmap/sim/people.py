@@ -7,9 +7,7 @@ from numpy.typing import NDArray
 
 from stillmap.core.errors import InputError
 from stillmap.sim.options import CrowdOptions, Shape
-from stillmap.sim.planner import FreeSpace, Planner
-
-Float = NDArray[np.float64]
+from stillmap.sim.planner import Float, FreeSpace, Planner
 
 BODY_RADIUS = 0.26  # m, minimum distance from walls
 

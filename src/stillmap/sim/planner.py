@@ -114,10 +114,9 @@ class Planner:
     def _label_at(self, parts: NDArray[Any], xy: Float, clearance: float) -> int:
         part = int(parts.flat[self._grid_node(xy)])
         if not part:
-            raise InputError(
-                f"no room for a robot or a person at ({xy[0]:g}, {xy[1]:g})",
-                hint=f"points of a route lie at least {clearance:g} m from any wall",
-            )
+            what = f"no room for a robot or a person at ({xy[0]:g}, {xy[1]:g})"
+            hint = f"points of a route lie at least {clearance:g} m from any wall"
+            raise InputError(what, hint=hint)
         return part
 
     def part_of(self, node: int | NDArray[np.int64]) -> NDArray[np.int64]:

@@ -10,10 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.sim.geometry import BOX, CYLINDER, Faces, Ground, Solids
+from stillmap.sim.geometry import BOX, CYLINDER, Faces, Float, Ground, Solids
 from stillmap.sim.truth_surfaces import StaticSurfaces
 
-Float = NDArray[np.float64]
 Window = tuple[int, slice, slice]
 
 MIN_RANGE = 1e-3  # m

@@ -12,15 +12,13 @@ from stillmap.core.recording import Recording
 from stillmap.sim import lidar, ray_casting
 from stillmap.sim.dynamics import Moment, Progress
 from stillmap.sim.episode import Episode
-from stillmap.sim.geometry import Ground
+from stillmap.sim.geometry import Float, Ground
 from stillmap.sim.laser import simulate_measurement
 from stillmap.sim.lidar import Pattern, Sensor
 from stillmap.sim.ray_casting import RayReturns
 from stillmap.sim.truth import Truth
 from stillmap.sim.truth_surfaces import MovingSurfaces, StaticSurfaces
 from stillmap.sim.world_3d import MoverSolids, make_static_world
-
-Float = NDArray[np.float64]
 
 
 class World(NamedTuple):

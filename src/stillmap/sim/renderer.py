@@ -11,10 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.sim import ray_casting
-from stillmap.sim.geometry import Faces, Ground, Solids
+from stillmap.sim.geometry import Faces, Float, Ground, Solids
 from stillmap.sim.truth_surfaces import StaticSurfaces
-
-Float = NDArray[np.float64]
 
 STATIC, NOTHING = -1, -2
 

@@ -4,11 +4,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.sim.options import RobotOptions
-from stillmap.sim.planner import FreeSpace, Planner
+from stillmap.sim.planner import Float, FreeSpace, Planner
 from stillmap.sim.scene import Light, Point
 from stillmap.sim.vehicles import SpeedProfile
-
-Float = NDArray[np.float64]
 
 _SPACING = 0.05  # m between points of the route
 _PATIENCE = 3.0  # s of waiting, after which it creeps on

@@ -123,10 +123,8 @@ class Thing:
     def __post_init__(self) -> None:
         require(len(self.faces) > 0 and len(self.stays) > 0, "a thing needs faces and stays")
         for one, other in itertools.pairwise(self.stays):
-            require(
-                one.until is not None and one.until <= other.since,
-                "stays of a thing must come one after the other",
-            )
+            in_order = one.until is not None and one.until <= other.since
+            require(in_order, "stays of a thing must come one after the other")
 
 
 @dataclass(frozen=True)
@@ -180,10 +178,8 @@ class Scene:
             require(not self.lidar.channels, "a rig of two lasers has no lidar")
             usual = not self.laser.second_laser and self.laser.upside_down == "no"
             require(usual, "a rig has one upright horizontal laser")
-        require(
-            self.in_3d or not self.camera.enabled,
-            "cameras need a 3D world: a lidar, or a tilting laser",
-        )
+        can_see = self.in_3d or not self.camera.enabled
+        require(can_see, "cameras need a 3D world: a lidar, or a tilting laser")
 
     @property
     def in_3d(self) -> bool:

@@ -16,13 +16,11 @@ from stillmap.sim import laser, lidar, recorder
 from stillmap.sim.camera import CameraSimulator
 from stillmap.sim.dynamics import Moment, Motion, Progress
 from stillmap.sim.episode import Episode, simulate_episode
-from stillmap.sim.laser import Returns
+from stillmap.sim.laser import Float, Returns
 from stillmap.sim.options import LaserOptions
 from stillmap.sim.recorder import World
 from stillmap.sim.scene import Scene
 from stillmap.sim.truth import ImageTruth, Truth
-
-Float = NDArray[np.float64]
 
 _MOTION_SHARE = 0.7  # of the computing time, for progress
 _MOTION_SHARE_3D = 0.05  # the same with a lidar

@@ -14,10 +14,8 @@ from stillmap.core.arrays import open_npy, write_npy, write_npz
 from stillmap.core.errors import InputError
 from stillmap.io.images import read_image
 from stillmap.io.trajectory import write_tum
-from stillmap.sim.geometry import Faces, Ground, Solids
+from stillmap.sim.geometry import Faces, Float, Ground, Solids
 from stillmap.sim.truth_surfaces import MovingSurfaces, StaticSurfaces
-
-Float = NDArray[np.float64]
 
 FOLDER = "truth"
 IMAGES = "images"  # in it

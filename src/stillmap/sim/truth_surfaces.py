@@ -7,9 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.sim.dynamics import MAX_SPEED
-from stillmap.sim.geometry import BOX, CYLINDER, Faces, Ground, Solids
-
-Float = NDArray[np.float64]
+from stillmap.sim.geometry import BOX, CYLINDER, Faces, Float, Ground, Solids
 
 _SQUARE = 4.0  # m, points within one share their candidate surfaces
 _BISECTIONS = 80  # of the root for the nearest point of an ellipse, to the last digit

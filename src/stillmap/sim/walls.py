@@ -89,11 +89,7 @@ def wall(
 
 
 def room(
-    start: Point,
-    side: Side,
-    along: tuple[float, float],
-    depth: float,
-    door: Opening,
+    start: Point, side: Side, along: tuple[float, float], depth: float, door: Opening
 ) -> list[Segment]:
     """A room behind the open `door` of a wall that begins at `start`.
 

@@ -5,7 +5,6 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.sim import geometry
 from stillmap.sim.dynamics import Moment, Motion
@@ -14,8 +13,6 @@ from stillmap.sim.options import HeightOptions
 from stillmap.sim.scene import Scene, Segment
 from stillmap.sim.truth_surfaces import StaticSurfaces
 from stillmap.sim.walls import polyline
-
-Float = NDArray[np.float64]
 
 _MAX_SIZE = 6.0  # m, of a loop that is not a room or a house
 _MAX_SIDES = 16

@@ -114,10 +114,8 @@ def require_carmen(scene: Scene) -> None:
     if abs(laser.fov - math.pi) > 1e-9:
         raise InputError("FLASER lines hold half a circle", hint="a field of view of 180 degrees")
     if laser.upside_down == "known":
-        raise InputError(
-            "FLASER lines cannot say that the laser hangs upside down",
-            hint="laser.upside_down=unknown",
-        )
+        what = "FLASER lines cannot say that the laser hangs upside down"
+        raise InputError(what, hint="laser.upside_down=unknown")
     if laser.max_range > writer.NO_RETURN:
         what = f"CARMEN logs hold ranges up to {writer.NO_RETURN} m"
         raise InputError(what, hint="a lower max_range")
