@@ -201,18 +201,10 @@ class Sensor:
 
 
 def select_scans(log: CarmenLog) -> tuple[list[Sensor], list[str]]:
-    """The usable scans of each laser, and sentences on dropped kinds of lines."""
-    lasers, notes = _select_lasers(log)
-    return [_select_usable_scans(laser, log) for laser in lasers], notes
+    """The usable scans of each laser, and sentences on dropped kinds of lines.
 
-
-def scan_order(sensors: list[Sensor]) -> NDArray[np.intp]:
-    """(T,) indices that sort the concatenated scans of all sensors by stamp."""
-    return np.argsort(np.concatenate([s.stamp_ns for s in sensors]), kind="stable")
-
-
-def _select_lasers(log: CarmenLog) -> tuple[list[LaserLog], list[str]]:
-    """One kind of line per laser: newer logs hold each scan raw and with the robot's pose."""
+    One kind of line per laser is used: newer logs hold each scan raw and with the robot's pose.
+    """
     by_position: dict[str, list[LaserLog]] = {}
     for laser in log.lasers.values():
         position = laser_position(laser.kind, log.params)
@@ -229,7 +221,13 @@ def _select_lasers(log: CarmenLog) -> tuple[list[LaserLog], list[str]]:
             for laser in same
             if laser is not best
         ]
-    return sorted(used, key=lambda laser: list(SCAN_PARSERS).index(laser.kind.encode())), notes
+    used.sort(key=lambda laser: list(SCAN_PARSERS).index(laser.kind.encode()))
+    return [_select_usable_scans(laser, log) for laser in used], notes
+
+
+def scan_order(sensors: list[Sensor]) -> NDArray[np.intp]:
+    """(T,) indices that sort the concatenated scans of all sensors by stamp."""
+    return np.argsort(np.concatenate([s.stamp_ns for s in sensors]), kind="stable")
 
 
 def _select_usable_scans(laser: LaserLog, log: CarmenLog) -> Sensor:

@@ -93,11 +93,7 @@ def _build_recording(sensors: list[Sensor], log: CarmenLog, options: ReadOptions
 
 
 def _convert_sensor(
-    sensor: Sensor,
-    log: CarmenLog,
-    options: ReadOptions,
-    given: LaserOptions,
-    warnings: list[str],
+    sensor: Sensor, log: CarmenLog, options: ReadOptions, given: LaserOptions, warnings: list[str]
 ) -> tuple[_Beams, Extrinsics, dict[str, Any]]:
     """End points and hits of a laser, its pose on the robot, and notes for `source`."""
     kind = sensor.laser.kind

@@ -171,11 +171,9 @@ def _choose_format(recording: Recording) -> LogFormat:
 def _require_one_count(counts: NDArray[np.int64]) -> None:
     found = np.unique(counts)
     if len(found) > 1 or np.any(found == 0):
-        raise InputError(
-            f"scans of {found.min()} to {found.max()} beams: in a CARMEN log all scans of a laser "
-            "have the same number",
-            hint=_ALTERNATIVE,
-        )
+        what = "in a CARMEN log all scans of a laser have the same number"
+        text = f"scans of {found.min()} to {found.max()} beams: {what}"
+        raise InputError(text, hint=_ALTERNATIVE)
 
 
 def _is_upside_down(angles: Float) -> bool:

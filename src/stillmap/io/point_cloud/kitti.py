@@ -28,13 +28,7 @@ from stillmap.io.point_cloud.files import (
     sensor_poses,
 )
 from stillmap.io.point_cloud.kitti_cameras import Calibration, find_images
-from stillmap.io.point_cloud.scans import (
-    Cloud,
-    CloudSource,
-    DatasetInfo,
-    build_recording,
-    reject,
-)
+from stillmap.io.point_cloud.scans import Cloud, CloudSource, DatasetInfo, build_recording, reject
 from stillmap.preprocessing.scan_timing import add_beam_times
 
 Poses = list[NDArray[np.float64]]

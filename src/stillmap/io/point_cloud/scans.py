@@ -60,10 +60,7 @@ class DatasetInfo(NamedTuple):
 
 
 def build_recording(
-    sources: Sequence[CloudSource],
-    info: DatasetInfo,
-    context: ReadContext,
-    **more: Any,
+    sources: Sequence[CloudSource], info: DatasetInfo, context: ReadContext, **more: Any
 ) -> Recording:
     """Build a recording from clouds; unreadable ones are skipped and counted in `source`.
 

@@ -17,13 +17,7 @@ from stillmap.core.recording import Recording
 from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud.binary_table import iter_text_lines, parse_numbers
 from stillmap.io.point_cloud.files import require_nonempty_file, rigid_transform, strip_extension
-from stillmap.io.point_cloud.scans import (
-    Cloud,
-    CloudSource,
-    DatasetInfo,
-    build_recording,
-    files_of,
-)
+from stillmap.io.point_cloud.scans import Cloud, CloudSource, DatasetInfo, build_recording, files_of
 
 EXTENSIONS = (".3d", ".3d.gz")
 

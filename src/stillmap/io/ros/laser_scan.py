@@ -100,7 +100,10 @@ class _ScanBuffer:
         shape = np.asarray(self.shape, np.int32)
         n = np.array([s.n for s in shapes], np.int64)[shape]
         start = np.cumsum(n) - n
-        stamps, warnings = self._stamps()
+        stamps, warnings = np.asarray(self.stamp_ns, np.int64), []
+        if np.mean(stamps == 0) > 0.5:
+            stamps = np.asarray(self.log_ns, np.int64)
+            warnings.append(f"{self.topic}: headers have no stamps: log times are used")
         keep = longest_non_decreasing(stamps.tolist())
         number = np.asarray(self.number)
         skipped.add_all(TIME_BACKWARDS, np.delete(number, keep))
@@ -118,12 +121,6 @@ class _ScanBuffer:
             ranges,
             warnings,
         )
-
-    def _stamps(self) -> tuple[NDArray[np.int64], list[str]]:
-        stamps, log = np.asarray(self.stamp_ns, np.int64), np.asarray(self.log_ns, np.int64)
-        if np.mean(stamps == 0) <= 0.5:
-            return stamps, []
-        return log, [f"{self.topic}: headers have no stamps: log times are used"]
 
 
 class LaserScans(NamedTuple):
