@@ -28,7 +28,6 @@ from tables import Column, Row, grouped, markdown
 import stillmap
 from stillmap import em, slam
 from stillmap.eval.relations import compute_relation_errors
-from stillmap.pipeline import em_loop
 from stillmap.sim import simulate
 
 Float = NDArray[np.float64]
@@ -160,8 +159,8 @@ def poses_with(recording: stillmap.Recording, options: stillmap.Options, e: Weig
     return mapped.poses
 
 
-def _silent(what: str, done: int, total: int) -> None:
-    em_loop.silent(what, 0, done, total)
+def _silent(_what: str, _done: int, _total: int) -> None:
+    """Discards progress."""
 
 
 def table(rows: Sequence[Row]) -> str:
