@@ -270,6 +270,8 @@ def apply_gains(images: Images, views: Sequence[View], gains: Float) -> Images:
         tables = np.rint(np.arange(256)[:, None] * of[number]).clip(0, 255).astype(np.uint8)
         if image.ndim == 2:
             return np.asarray(tables[image, 0])
-        return np.asarray(tables[image[..., :3], np.arange(3)])
+        out = image.copy()
+        out[..., :3] = tables[image[..., :3], np.arange(3)]
+        return out
 
     return replace(images, load=load)
