@@ -78,8 +78,9 @@ demo: $(VENV)/installed
 # files side by side: what a file makes once for all its tests is made once
 SIDE_BY_SIDE := --numprocesses=auto --maxprocesses=4 --dist=loadfile
 
+# one thread of BLAS each: more would wait busily for the cores that the others use
 test: $(VENV)/tested
-	$(BIN)/python -m pytest -m "not slow" $(SIDE_BY_SIDE)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m "not slow" $(SIDE_BY_SIDE)
 
 test-slow: $(VENV)/tested
 	$(BIN)/python -m pytest -m slow

@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 import reference
+from marks import slow_params
 
 from stillmap import _core
 
@@ -38,7 +39,7 @@ def order(surface):
     return np.lexsort(surface.surfels()[0].T)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, *slow_params(1, 2)])
 @pytest.mark.parametrize(("column", "fewest"), [(1, 1), (2, 5), (3, 12)])
 def test_agreement(seed, column, fewest):
     beams = scattered(seed)
@@ -80,7 +81,7 @@ def test_threads_and_chunks_change_nothing():
     np.testing.assert_array_equal(found[0], found[2])
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, *slow_params(1, 2)])
 @pytest.mark.parametrize(("column", "least"), [(2, 0.02), (3, 0.0)])
 def test_ground_contact_agreement(seed, column, least):
     rng = np.random.default_rng(seed + 40)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import reference
+from marks import slow_params
 from reference.likelihood_field import retract
 
 from stillmap import _core
@@ -112,12 +113,12 @@ def assert_finds_the_best(world, kind, window):
     ("dimension", "window"), [(D, window) for D, windows in WINDOWS.items() for window in windows]
 )
 def test_best_lattice_pose(a_room, dimension, window, kind):
-    for seed in range(3 if dimension == 2 else 1):
+    for seed in range(2 if dimension == 2 else 1):
         assert_finds_the_best(World(a_room, seed, dimension), kind, window)
 
 
 @pytest.mark.parametrize(("dimension", "window"), [(2, (3.0, np.pi)), (3, (1.7, 0.5))])
-@pytest.mark.parametrize("kind", ["even", "correlated"])
+@pytest.mark.parametrize("kind", ["even", *slow_params("correlated")])
 def test_branch_and_bound_prunes(a_room, dimension, window, kind):
     lattice, tried = assert_finds_the_best(World(a_room, 4, dimension, 40), kind, window)
     assert lattice.scores.size > 4e4

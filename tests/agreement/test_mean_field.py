@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import reference
+from marks import slow_params
 
 from stillmap import _core
 from stillmap.em.spatial_coupling import _MEAN_FIELD as MEAN_FIELD
@@ -31,9 +32,7 @@ def order(surface):
     return np.lexsort(surface.surfels()[0].T)
 
 
-@pytest.mark.parametrize(
-    "seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))]
-)
+@pytest.mark.parametrize("seed", [0, *slow_params(1, 2)])
 @pytest.mark.parametrize("changes", [{}, {"radius": 1.0, "tolerance": 0.0}, {"max_iterations": 1}])
 def test_agreement(seed, changes):
     core, plain = surfaces(seed)

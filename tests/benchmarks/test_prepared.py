@@ -5,6 +5,7 @@ import pytest
 from calibration import looks_of
 from cases import Case
 from common import scores
+from marks import slow_params
 from prepared import Prepared, counts, prepare, without_people
 
 from stillmap import em
@@ -35,9 +36,7 @@ def moved() -> Prepared:
     return prepare(Case("street", "", "street-moved", {"robot": {"scans": 570}}), 3)
 
 
-@pytest.mark.parametrize(
-    ("which", "kind"), [("run", "door"), pytest.param("moved", "thing", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("which", "kind"), [("run", "door"), *slow_params(("moved", "thing"))])
 def test_what_ended_on_doors_and_things_is_left_out_of_the_scores_without_them(
     which: str, kind: str, request: pytest.FixtureRequest
 ) -> None:

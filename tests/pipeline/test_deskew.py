@@ -7,6 +7,7 @@ import sys
 import numpy as np
 import pytest
 from choices import RESOLUTION, options
+from marks import slow_params
 
 import stillmap
 from stillmap import _core, em, slam
@@ -112,7 +113,7 @@ def test_what_tells_of_the_motion(swept, monkeypatch, odometry):
 
 
 @pytest.mark.parametrize("odometry", [True, False])
-@pytest.mark.parametrize("world", ["street", pytest.param("office", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("world", ["street", *slow_params("office")])
 def test_poses_at_speed(world, odometry):
     """Seeds 100 to 102: 4 to 26 mm instead of 20 to 45, and 9 to 10 instead of 198 to 362."""
     simulation = fast(world)

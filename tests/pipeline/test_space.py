@@ -8,6 +8,7 @@ import pytest
 import trimesh
 import yaml
 from choices import options
+from marks import slow_params
 from PIL import Image
 
 import stillmap
@@ -105,7 +106,7 @@ def test_what_was_learned_is_of_all_classes(street, mapped):
     assert "put down" not in render_report(dataclasses.replace(mapped, estimate=estimate))
 
 
-@pytest.mark.parametrize("threads", [2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("threads", [2, *slow_params(3)])
 def test_any_number_of_threads_gives_the_same_bytes(street, mapped, threads):
     other = stillmap.build(
         street.recording, Options(threads=threads), poses=street.truth.T_world_base

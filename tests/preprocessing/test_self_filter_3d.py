@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from marks import slow_params
 
 from stillmap.cli.main import main
 from stillmap.cli.recording_info import summarize_recording
@@ -72,7 +73,7 @@ def test_the_order_of_beams_means_nothing(drive):
     assert found[own].mean() > 0.99
 
 
-@pytest.mark.parametrize("world", ["hall", pytest.param("corridor", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("world", ["hall", *slow_params("corridor")])
 def test_a_small_robot_indoors(world):
     sim = run(world, 300, **SMALL)
     own, lost = sim.truth.mover == -2, gone(sim.recording)
@@ -84,10 +85,9 @@ def test_a_small_robot_indoors(world):
     ("world", "scans", "lidar"),
     [
         ("street", 90, {}),
-        ("street-jam", 90, {"channels": 16}),
         ("hall", 300, LOW),
-        pytest.param("corridor", 300, {"channels": 16}, marks=pytest.mark.slow),
-        pytest.param("office", 300, {"channels": 16}, marks=pytest.mark.slow),
+        *slow_params(*((name, 300, {"channels": 16}) for name in ("corridor", "office"))),
+        *slow_params(("street-jam", 90, {"channels": 16})),
     ],
 )
 def test_where_nothing_of_the_robot_shows_nothing_is_lost(world, scans, lidar):

@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from marks import slow_params
 from numpy.typing import NDArray
 
 from stillmap.sim import Simulation, scene_by_name, simulate
@@ -51,7 +52,7 @@ def any_run(request: pytest.FixtureRequest) -> Simulation:
     return _run(request.param)
 
 
-@pytest.fixture(params=list(WORLDS))
+@pytest.fixture(params=[name for name in WORLDS if name != "drive"] + slow_params("drive"))
 def world(request: pytest.FixtureRequest) -> Simulation:
     """The worlds in which not only people move, seen without noise."""
     return _run(request.param)

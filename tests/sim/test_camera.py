@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from marks import slow_params
 from numpy.typing import NDArray
 
 from stillmap import io as recordings
@@ -66,7 +67,7 @@ def _seen(one: Simulation, image: int) -> tuple[Float, NDArray[np.uint16]]:
         return T[:3, 3] + shot.distance[..., None] * rays, shot.mask
 
 
-@pytest.mark.parametrize("which", ["street", "rig"])
+@pytest.mark.parametrize("which", [*slow_params("street"), "rig"])
 def test_pixels_show_the_true_surfaces_in_their_colours(
     which: str, request: pytest.FixtureRequest
 ) -> None:

@@ -4,6 +4,7 @@ import functools
 
 import numpy as np
 import pytest
+from marks import slow_params
 
 from stillmap.sim import Simulation, scene_by_name, simulate
 from stillmap.sim.geometry import BOX, CYLINDER, ELLIPSOID, Ground
@@ -17,7 +18,7 @@ def run(name: str) -> Simulation:
     return simulate(scene_by_name(name, {"laser": laser}), 3)
 
 
-@pytest.mark.parametrize("name", ["street-jam", "crossing"])
+@pytest.mark.parametrize("name", [*slow_params("street-jam"), "crossing"])
 def test_the_robot_waits_at_a_light(name: str) -> None:
     x = run(name).truth.T_world_base[:, 0, 2]
     stands = np.abs(np.diff(x)) < 1e-3

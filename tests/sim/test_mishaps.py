@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from marks import slow_params
 from numpy.typing import NDArray
 
 from stillmap.core import se2
@@ -99,7 +100,7 @@ def test_without_the_jump_the_robot_never_left() -> None:
     assert remove_jump(T, len(T)) is T
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, *slow_params(1, 2, 3)])
 def test_a_carried_robot_goes_on_elsewhere_and_odometry_knows_nothing(seed: int) -> None:
     perfect = {"wheel_radius_error": 0.0, "wheel_base_error": 0.0, "translation_noise": 0.0,
                "rotation_noise": 0.0, "drift_noise": 0.0}  # fmt: skip

@@ -4,6 +4,7 @@ import functools
 
 import numpy as np
 import pytest
+from marks import slow_params
 
 from stillmap.sim import SCENES, Simulation, Stay, scene_by_name, simulate
 from stillmap.sim.objects import place_faces
@@ -17,7 +18,7 @@ def run_of(name: str) -> Simulation:
     return simulate(scene_by_name(name), 3)
 
 
-@pytest.fixture(params=MOVED)
+@pytest.fixture(params=["office-moved", "street-moved", *slow_params("warehouse-moved")])
 def moved(request: pytest.FixtureRequest) -> Simulation:
     return run_of(request.param)
 

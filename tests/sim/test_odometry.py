@@ -50,6 +50,7 @@ def test_noise_does_not_depend_on_the_scan_rate(steps: int) -> None:
     assert np.std(headings) == pytest.approx(0.01 * np.sqrt(50), rel=0.12)
 
 
+@pytest.mark.slow
 def test_raw_odometry_drifts_as_real_logs_do() -> None:
     scene = scene_by_name("hall-empty")
     metres, degrees = [], []

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from marks import slow_params
 from numpy.typing import NDArray
 
 from stillmap.core import se2
@@ -18,7 +19,8 @@ from stillmap.sim.walls import box
 
 Float = NDArray[np.float64]
 # a scene of each kind: people, doors, things that are moved, cars, lights; the others are slow
-QUICK = {"hall", "office", "warehouse-moved", "street", "crossing"}
+QUICK = ["hall", "office", "warehouse-moved", "street", "crossing"]
+OTHERS = {n for n in SCENES if not n.endswith(("-crowd", "-empty"))} - set(QUICK)
 
 Distance = Callable[[Float, Float], Float]
 EndPoints = Callable[[Simulation], tuple[Float, NDArray[np.int64]]]
@@ -37,14 +39,7 @@ def short(name: str, **crowd: object) -> Scene:
     return scene_by_name(name, changes)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=[] if name in QUICK else [pytest.mark.slow])
-        for name in SCENES
-        if not name.endswith(("-crowd", "-empty"))
-    ],
-)
+@pytest.mark.parametrize("name", [*QUICK, *slow_params(*sorted(OTHERS))])
 def test_one_seed_one_recording(name: str) -> None:
     first, again = simulate(short(name), 11), simulate(short(name), 11)
     for a, b in zip(arrays(first), arrays(again), strict=True):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from marks import slow_params
 
 from stillmap.sim.geometry import BOX, CYLINDER, ELLIPSOID, Faces, Ground, Solids
 from stillmap.sim.truth_surfaces import (
@@ -28,7 +29,7 @@ def _solid(form: int, half: tuple[float, float], z: tuple[float, float]) -> Soli
         (BOX, (1.0, 0.4), (0.1, 0.9)),
         (CYLINDER, (0.5, 0.5), (0.0, 2.0)),
         (CYLINDER, (0.15, 0.25), (0.8, 1.4)),
-        (ELLIPSOID, (1.5, 1.5), (2.0, 4.0)),
+        *slow_params((ELLIPSOID, (1.5, 1.5), (2.0, 4.0))),
         (ELLIPSOID, (0.1, 0.08), (1.4, 1.7)),
     ],
 )

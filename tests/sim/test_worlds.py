@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from marks import slow_params
 from numpy.typing import NDArray
 
 from stillmap.sim import SCENES, Simulation, scene_by_name, simulate
@@ -14,6 +15,13 @@ Distance = Callable[[Float, Float], Float]
 EndPoints = Callable[[Simulation], tuple[Float, NDArray[np.int64]]]
 
 BARE = [name for name in SCENES if name.endswith("-empty")]
+POPULATED = [name for name in SCENES if not name.endswith(("-empty", "-crowd"))]
+
+
+def largest_slow(names: list[str]) -> list[object]:
+    """The names; the kilometre of the drive is slow."""
+    large = [name for name in names if name.startswith("drive")]
+    return [*(name for name in names if name not in large), *slow_params(*large)]
 
 
 def kinds(simulation: Simulation) -> NDArray[np.str_]:
@@ -26,7 +34,7 @@ def test_there_is_an_empty_version_of_every_world() -> None:
     assert {name.removesuffix("-crowd") for name in SCENES if "-crowd" in name} < worlds
 
 
-@pytest.mark.parametrize("name", BARE)
+@pytest.mark.parametrize("name", largest_slow(BARE))
 def test_empty_worlds_have_no_movers_but_things_whose_time_comes_later(name: str) -> None:
     changes = {"robot": {"scans": 60}, "laser": {"beams": 90}}
     run = simulate(scene_by_name(name, changes), 1)
@@ -44,7 +52,7 @@ def test_crowds_are_crowds() -> None:
     assert scene_by_name("hall-crowd").walls == scene_by_name("hall").walls
 
 
-@pytest.mark.parametrize("name", [n for n in SCENES if not n.endswith(("-empty", "-crowd"))])
+@pytest.mark.parametrize("name", largest_slow(POPULATED))
 @pytest.mark.parametrize(
     ("beams", "degrees", "noise", "max_range"), [(1440, 360, 0.05, 5.0), (181, 90, 0.01, 80.0)]
 )

@@ -320,6 +320,7 @@ def test_drift_is_bounded(monkeypatch):
     assert lost == pytest.approx((500 * 0.006, 500 * 0.0003), rel=0.03)
 
 
+@pytest.mark.slow
 def test_many_stages_are_as_good_as_few(monkeypatch):
     # the poses of a stage are carried on to the next: what is off a rotation must not add up
     monkeypatch.setattr(loop_candidates, "_STAGE_SHARE", 0.0)

@@ -95,6 +95,7 @@ def test_false_candidates_are_rejected(drive, monkeypatch):
     assert np.isfinite(poses).all()
 
 
+@pytest.mark.slow
 def test_similar_streets_are_rejected():
     """Two streets of the same width: the ground and the rows of houses meet, their ends do not."""
     rng = np.random.default_rng(7)

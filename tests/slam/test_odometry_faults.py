@@ -6,6 +6,7 @@ from itertools import accumulate
 
 import numpy as np
 import pytest
+from marks import slow_params
 
 from stillmap.core import se2
 from stillmap.eval.trajectory import compute_absolute_errors
@@ -15,11 +16,6 @@ from stillmap.sim.walls import box
 from stillmap.slam import SlamOptions, m_step, odometry_2d
 
 OPTIONS = SlamOptions()
-
-
-def seeds(n):
-    """0 to n - 1; all but the first are slow tests."""
-    return [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, n))]
 
 
 def silent(*_):
@@ -97,7 +93,7 @@ def test_slip_while_driving():
     assert set(disagreeing) <= set(range(16, 41))
 
 
-@pytest.mark.parametrize("seed", seeds(3))
+@pytest.mark.parametrize("seed", [0, *slow_params(1, 2)])
 def test_slip_in_office_corridors(seed):
     options = {"robot": {"scans": 500}, "odometry": {"stall_rate": 2.0}}
     simulation = simulate(scene_by_name("office", options), seed)
@@ -188,7 +184,7 @@ def office(seed):
     return simulate(scene_by_name("office", {"robot": {"scans": 500}}), seed)
 
 
-@pytest.mark.parametrize("seed", seeds(2))
+@pytest.mark.parametrize("seed", [0, *slow_params(1)])
 @pytest.mark.parametrize("n", [1, 3])
 def test_without_odometry(seed, n):
     # a third of the scans: 0.3 m and up to 28 degrees from one to the next
@@ -209,12 +205,12 @@ def two_lasers(seed, both):
     return error(simulation.recording, simulation.truth.T_world_base)
 
 
-@pytest.mark.parametrize("seed", seeds(2))
+@pytest.mark.parametrize("seed", [0, *slow_params(1)])
 def test_two_lasers_without_odometry(seed):
     assert two_lasers(seed, both=True) < 1.2 * two_lasers(seed, both=False)
 
 
-@pytest.mark.parametrize("seed", seeds(2))
+@pytest.mark.parametrize("seed", [0, *slow_params(1)])
 def test_two_lasers_without_overlap_or_odometry(seed):
     options = {"robot": {"scans": 800}, "laser": {"second_laser": True}}
     simulation = simulate(scene_by_name("office", options), seed)

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from marks import slow_params
 
 from stillmap.core import se2
 from stillmap.eval.trajectory import compute_absolute_errors
@@ -33,7 +34,7 @@ def assert_noticed_and_placed(simulation):
     assert compute_absolute_errors(found.poses, simulation.truth.T_world_base).rmse < 0.1
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seed", [0, *slow_params(1)])
 def test_kidnapped_robot_is_relocalized(seed):
     simulation = carried("office", seed, 90, scans=500, speed=1.5, carried_at=0.7)
     truth = simulation.truth

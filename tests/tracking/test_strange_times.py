@@ -32,6 +32,7 @@ def test_a_gap_of_hours_is_no_trouble():
     assert len(np.unique(owner)) == 2
 
 
+@pytest.mark.slow
 def test_large_crowds_take_a_while_and_little_memory():
     rng = np.random.default_rng(1)
     scans, n = 12, 2000

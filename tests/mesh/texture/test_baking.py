@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from made_up_rooms import all_round, camera, colour, furnished, looking, photograph, rectangle
 from made_up_rooms import sharpest as best_of
+from marks import slow_params
 
 from stillmap import _core
 from stillmap.core.errors import InputError
@@ -47,7 +48,7 @@ def errors(textured):
     return np.concatenate(worst)
 
 
-@pytest.mark.parametrize("kind", LENSES)
+@pytest.mark.parametrize("kind", ["pinhole", "fisheye", *slow_params("barrel")])
 def test_every_texel_has_the_colour_of_its_place(kind, monkeypatch):
     monkeypatch.setattr(atlas, "_MIN_TEXEL", 1e-5)
     mesh, views = furnished(), all_round(camera(280, 210, SMALL, **LENSES[kind]))
