@@ -130,7 +130,7 @@ def test_the_clearance_follows_from_the_noise_of_end_points(monkeypatch):
     obstacles = select_obstacles(FLAT, surface)
     assert obstacles.column_cells == 2  # of 0.15 m
     for clearance, expected in ((0.06, 0.06), (0.0, 2.5 * surface.noise_std)):
-        monkeypatch.setattr(spatial_coupling, "_GROUND_CLEARANCE", clearance)
+        monkeypatch.setattr(spatial_coupling, "GROUND_CLEARANCE", clearance)
         assert obstacles.min_end_height == expected
 
 

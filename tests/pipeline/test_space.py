@@ -49,7 +49,7 @@ def test_what_moves_is_told_from_what_stands(street, mapped):
 
 
 def test_ground_contact_goes_with_the_mover_above(street, mapped, monkeypatch):
-    monkeypatch.setattr("stillmap.em.spatial_coupling._GROUND_CLEARANCE", 100.0)
+    monkeypatch.setattr("stillmap.em.spatial_coupling.GROUND_CLEARANCE", 100.0)
     other = stillmap.build(street.recording, poses=street.truth.T_world_base)
     mine = near(street) & ~street.truth.static
     found = [np.mean(one.p_static[mine] < 0.5) for one in (mapped, other)]

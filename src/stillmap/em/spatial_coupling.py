@@ -33,7 +33,7 @@ _POOLED_P_DYNAMIC = 0.3  # mean P(dynamic) above which a whole cluster is dynami
 _POOLED_CHANGE = 1.0  # nats, mean evidence of a change above which it is dynamic
 _POOLING_SLOPE = 20.0  # nats per unit above these two
 _MAX_POOLED = 4.0  # nats
-_GROUND_CLEARANCE = 0.05  # m; end points closer to the ground belong to it
+GROUND_CLEARANCE = 0.05  # m; end points closer to the ground belong to it
 _CLEARANCE_STD = 2.5  # the same in noise_std; the larger of the two counts
 
 
@@ -79,7 +79,7 @@ class ObstacleSurfels:
     @property
     def min_end_height(self) -> float:
         """Metres above the ground; a beam that ends lower ended on the ground."""
-        return max(_GROUND_CLEARANCE, _CLEARANCE_STD * self.surfel_map.noise_std)
+        return max(GROUND_CLEARANCE, _CLEARANCE_STD * self.surfel_map.noise_std)
 
     def label_ground_contact(
         self,

@@ -13,7 +13,7 @@ _MAX_EDGE_SHARE = 0.15  # of the range, likewise
 _MAX_INCIDENCE = 1.5  # rad between line of sight and normal
 _STEEP = 1.22  # rad of incidence from which on a triangle must be coplanar with those around
 _MAX_BEND = 0.35  # rad between the normals of such a triangle and those around
-_SMOOTHING_ROUNDS = 2  # in which vertex normals are averaged with their neighbors'
+SMOOTHING_ROUNDS = 2  # in which vertex normals are averaged with their neighbors'
 _FULL_FAN = 6  # triangles around a vertex with neighbors on all sides
 # median of |x - mean of six neighbors| over the noise's standard deviation: 0.6745 sqrt(7 / 6)
 _MEDIAN_DEVIATION = 0.73
@@ -117,7 +117,7 @@ def filter_faces(points: Float, origin: Float, faces: Int32) -> tuple[Int32, Flo
     # at two corners: the third may lie in the corner of a room
     fits[steep] = np.sort(along, axis=0)[1] >= np.cos(_MAX_BEND)
     faces, normals = faces[fits], normals[:, fits]
-    smooth = vertex_normals(normals, faces, len(points), _SMOOTHING_ROUNDS)
+    smooth = vertex_normals(normals, faces, len(points), SMOOTHING_ROUNDS)
     standoff = dot_columns(smooth, _columns(origin - points))
     return faces.astype(np.int32), np.where(np.isfinite(standoff), standoff, 0.0)
 

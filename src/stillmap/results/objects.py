@@ -13,7 +13,7 @@ from stillmap.results.points import ply_header
 from stillmap.rig.build import TiltingResult
 from stillmap.tracking import FlowMap, MovingObject
 
-_MILLIMETRES = 3  # digits: finer is noise, and makes the file twice as long
+MILLIMETRES = 3  # digits: finer is noise, and makes the file twice as long
 
 
 def write_objects(folder: Path, result: MappingResult | TiltingResult) -> None:
@@ -44,12 +44,12 @@ def object_record(one: MovingObject) -> dict[str, Any]:
         "id": one.id,
         "first_stamp_ns": int(one.stamp_ns[0]),
         "last_stamp_ns": int(one.stamp_ns[-1]),
-        "size": [round(metres, _MILLIMETRES) for metres in one.size],
+        "size": [round(metres, MILLIMETRES) for metres in one.size],
         "beams": len(one.beams),
         "p_dynamic": round(one.p_dynamic, 6),
         "track": {
             "stamp_ns": one.stamp_ns.tolist(),
-            **{name: np.round(values, _MILLIMETRES).tolist() for name, values in columns.items()},
+            **{name: np.round(values, MILLIMETRES).tolist() for name, values in columns.items()},
         },
     }
 

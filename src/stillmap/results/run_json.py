@@ -13,12 +13,11 @@ from stillmap.mapping.beam_statistics import count_beams
 from stillmap.pipeline.estimate import IterationRecord
 from stillmap.pipeline.result import MappingResult
 from stillmap.results.map_npz import known_area
+from stillmap.results.objects import MILLIMETRES
 from stillmap.rig.build import TiltingResult
 from stillmap.slam import LoopClosure
 
 FORMAT_VERSION = 1
-
-_MILLIMETRES = 3  # digits
 
 
 def run_record(result: MappingResult, more: Mapping[str, Any] | None = None) -> dict[str, Any]:
@@ -104,10 +103,10 @@ def _loop(one: LoopClosure) -> dict[str, Any]:
 def _change(one: Change) -> dict[str, Any]:
     return {
         "kind": one.kind,
-        "x": round(one.x, _MILLIMETRES),
-        "y": round(one.y, _MILLIMETRES),
-        **({} if one.z is None else {"z": round(one.z, _MILLIMETRES)}),
-        "size": [round(metres, _MILLIMETRES) for metres in one.size],
+        "x": round(one.x, MILLIMETRES),
+        "y": round(one.y, MILLIMETRES),
+        **({} if one.z is None else {"z": round(one.z, MILLIMETRES)}),
+        "size": [round(metres, MILLIMETRES) for metres in one.size],
         "cells": len(one.cells),
         "before_ns": one.before_ns,
         "stamp_ns": one.stamp_ns,

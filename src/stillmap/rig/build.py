@@ -17,12 +17,14 @@ from stillmap.core.arrays import copy, iter_blocks
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.em import EmOptions, EStepResult, GroundMap, estimate_ground, occupancy_hmm
+from stillmap.em.spatial_coupling import GROUND_CLEARANCE
 from stillmap.em.types import DYNAMIC_BELOW, MIN_PROBABILITY
 from stillmap.rig.options import RigOptions
-from stillmap.rig.removal import GROUND_CLEARANCE, BoxBeams, select_box_beams
+from stillmap.rig.removal import BoxBeams, select_box_beams
 from stillmap.rig.trajectory import PosedRecording, pose_recording
 from stillmap.tracking import MovingObject, ObjectOptions
 from stillmap.tracking.boxes import Box, fit_boxes
+from stillmap.tracking.objects_3d import MIN_POINTS
 
 Float = NDArray[np.float64]
 
@@ -30,7 +32,6 @@ HOLD = 0.5  # s for which an object persists before its first and after its last
 _VOXEL = 0.1  # m, edge of the voxels of the occupancy evidence
 _P_INSIDE, _P_AROUND = 0.99, 0.9  # P(dynamic) of end points in a box and in its margin
 _TOP_PERCENTILE = 98.0  # of an object's end points, which gives its height
-_MIN_POINTS = 3  # end points of an object in 3D; fewer are noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,7 +216,7 @@ def _extend_objects(
     out = []
     for box, within in zip(boxes, in_boxes, strict=True):
         beams = within.beams[p_static[within.beams] < DYNAMIC_BELOW]
-        if box.object_id < 0 or len(beams) < _MIN_POINTS:
+        if box.object_id < 0 or len(beams) < MIN_POINTS:
             continue
         xyz = posed.deskewed.end_points(beams, posed.poses)
         above = xyz[:, 2] - ground.height_at(xyz[:, :2])

@@ -10,13 +10,13 @@ from stillmap.core.arrays import iter_blocks
 from stillmap.core.recording import Recording
 from stillmap.core.timestamps import beam_stamps_ns
 from stillmap.em import GroundMap
+from stillmap.em.spatial_coupling import GROUND_CLEARANCE
 from stillmap.rig.trajectory import PosedRecording
 from stillmap.tracking.boxes import Box
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-GROUND_CLEARANCE = 0.05  # m above the ground below which points are ground
 MAX_OBJECT_HEIGHT = 2.0  # m above the ground
 MIN_VEHICLE_LENGTH, _MAX_VEHICLE_HEIGHT = 1.5, 4.0  # m; objects of this length may be higher
 _MAX_VERTICAL_GAP = 0.5  # m without any point, above which points belong to something else

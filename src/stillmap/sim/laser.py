@@ -18,7 +18,7 @@ Index = NDArray[np.int64]
 
 _CHUNK = 1000  # scans processed at once
 _SLACK = 1e-9  # beams, so that no ray passes between two walls that share a corner
-_MIN_RANGE = 1e-3  # m
+MIN_RANGE = 1e-3  # m
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +163,7 @@ def _lower_ranges(scans: _Scans, face: Float, ranges: Float) -> Index:
 
 def _keep_nearer(r: Float, beam: Index, ranges: Float) -> Index:
     """Lower the flat ranges of beams to `r` where it is less; returns the beams that changed."""
-    nearer = (r > _MIN_RANGE) & (r < ranges[beam])
+    nearer = (r > MIN_RANGE) & (r < ranges[beam])
     ranges[beam[nearer]] = r[nearer]
     return np.asarray(beam[nearer])
 
@@ -210,4 +210,4 @@ def simulate_measurement(
     lost = rng.random(exact.shape)
     noisy = exact + o.range_noise * rng.standard_normal(exact.shape)
     hit = (noisy < o.max_range) & (lost >= o.no_return_share + on_glass * o.glass_no_return_share)
-    return np.where(hit, np.maximum(noisy, _MIN_RANGE), o.max_range), hit
+    return np.where(hit, np.maximum(noisy, MIN_RANGE), o.max_range), hit

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.sim.geometry import BOX, CYLINDER, Faces, Float, Ground, Solids
+from stillmap.sim.laser import MIN_RANGE
 from stillmap.sim.truth_surfaces import StaticSurfaces
 
 Window = tuple[int, slice, slice]
 
-MIN_RANGE = 1e-3  # m
 
 _SLACK = 1e-9  # rad, so that no beam passes between two faces that share an edge
 _ABSENT = 1e9  # m, position of absent solids

@@ -24,7 +24,7 @@ Index = NDArray[np.intp]
 
 _MIN_HEIGHT, _MAX_HEIGHT = 0.2, 3.0  # m above the ground
 _COLUMN = 0.3  # m, edge of the columns whose connected components are segments
-_MIN_POINTS = 3  # of a segment: fewer are noise
+MIN_POINTS = 3  # of a segment: fewer are noise
 _OUTLIERS = 2.0  # percent of the end points below the box, and above
 
 
@@ -107,7 +107,7 @@ def _segment_scans(
         kept = (above > _MIN_HEIGHT) & (above < _MAX_HEIGHT)
         number, end = number[kept], end[kept]
         segment = _connect_columns(end[:, :2])
-        kept = np.bincount(segment, minlength=1)[segment] >= _MIN_POINTS
+        kept = np.bincount(segment, minlength=1)[segment] >= MIN_POINTS
         local = (end[kept, :2] - planar_poses[t, :2, 2]) @ planar_poses[t, :2, :2]
         return number[kept], segment[kept], local, _nearest_per_direction(local)
 

@@ -186,7 +186,7 @@ def _natural_key(name: str) -> list[tuple[int, int | str]]:
 
 _TOLERANCE = 0.02  # rotations printed with three decimals deviate less
 
-_MAX_TRANSLATION = 1e9  # m
+MAX_TRANSLATION = 1e9  # m
 
 
 def rigid_transform(R: ArrayLike, t: ArrayLike) -> NDArray[np.float64]:
@@ -196,7 +196,7 @@ def rigid_transform(R: ArrayLike, t: ArrayLike) -> NDArray[np.float64]:
         ValueError: R is no rotation within the tolerance, or a number is not finite.
     """
     R, t = np.asarray(R, np.float64).reshape(3, 3), np.asarray(t, np.float64).reshape(3)
-    if not (np.isfinite(R).all() and np.all(np.abs(t) < _MAX_TRANSLATION)):
+    if not (np.isfinite(R).all() and np.all(np.abs(t) < MAX_TRANSLATION)):
         raise ValueError("a pose is not finite")
     if np.abs(R @ R.T - np.eye(3)).max() > _TOLERANCE or np.linalg.det(R) < 0:
         raise ValueError("a pose has no rotation matrix")

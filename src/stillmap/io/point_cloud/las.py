@@ -30,6 +30,7 @@ _VLR = 54  # bytes of the smallest variable length record
 _COMPRESSED = 0xC0  # bits of the point format
 _MIN_CHUNK = 20  # bytes: the first point of a chunk is not compressed
 SCALE = 0.0001  # m, coordinate step of written files
+MAX_INTEGER = 2**31 - 1  # of a coordinate in steps
 
 
 def read(path: Path, context: ReadContext) -> Recording:

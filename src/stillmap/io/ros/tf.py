@@ -11,12 +11,12 @@ from scipy.spatial.transform import Rotation
 from stillmap.core import se2
 from stillmap.core.arrays import iter_blocks
 from stillmap.io.builder import SkippedRecords
+from stillmap.io.point_cloud.files import MAX_TRANSLATION
 from stillmap.io.ros.messages import frame_name, stamp_ns
 
 BAD_TRANSFORM = "transform that is none"
 
 _NORM_TOLERANCE = 0.05  # of a quaternion
-_MAX_TRANSLATION = 1e9  # m
 _BLOCK = 1 << 14  # poses interpolated at a time
 
 
@@ -202,7 +202,7 @@ class Odometry:
 def _is_pose(values: tuple[float, ...]) -> bool:
     """Whether x y z in metres and a quaternion x y z w are plausible."""
     # each by itself: max() of several, NaN among them, may return any of them
-    near = all(abs(value) < _MAX_TRANSLATION for value in values[:3])
+    near = all(abs(value) < MAX_TRANSLATION for value in values[:3])
     return near and abs(math.hypot(*values[3:]) - 1.0) < _NORM_TOLERANCE
 
 

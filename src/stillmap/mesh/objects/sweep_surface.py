@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from scipy.spatial import Delaunay, QhullError
 
 from stillmap.mesh.triangle_mesh import Mesh
+from stillmap.mesh.triangulation import SMOOTHING_ROUNDS
 from stillmap.mesh.types import Bool, Float, Index, Int32
 
 IMAGE_WINDOW = 0.5  # s between an observation and an image of an object that is not rigid
 _MIN_COSINE = 0.2  # from an object's center, up to which points are in one perspective image
 _PASS_MARGIN = 0.25  # m behind a triangle from which on a beam has passed it
 _MAX_STEEPNESS = 8.0  # length along the line of sight over length across
-_SMOOTHING_ROUNDS = 2
 _SMOOTHING_KEPT = 0.5  # share of its range that a beam keeps in a round
 _MAX_RANGE_STEP = 0.08  # m between neighbors that are smoothed together
 _FAR_IMAGE_PENALTY = 4.0  # an interval far from all images counts 1 / (1 + this)
@@ -160,7 +160,7 @@ def _smooth_ranges(points: Float, faces: Int32, sensor: Float) -> Float:
     sight = off / length[:, None]
     pairs = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     one, other = np.unique(pairs, axis=0).T
-    for _ in range(_SMOOTHING_ROUNDS):
+    for _ in range(SMOOTHING_ROUNDS):
         step = length[other] - length[one]
         near = np.abs(step) <= _MAX_RANGE_STEP
         total = np.bincount(one[near], step[near], len(points))

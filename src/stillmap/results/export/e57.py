@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 
 from stillmap.core.errors import InputError, import_extra
 from stillmap.io.point_cloud.e57 import GPS_EPOCH_S
+from stillmap.io.point_cloud.las import MAX_INTEGER, SCALE
 from stillmap.results.export.point_cloud import Block, Cloud
 
 _BLOCK = 1 << 16  # points written at a time
-_SCALE = 0.0001  # m
-_MAX_INTEGER = 2**31 - 1  # of a coordinate
 _AXES = ("cartesianX", "cartesianY", "cartesianZ")
 _COLORS = ("colorRed", "colorGreen", "colorBlue")
 
@@ -111,7 +110,7 @@ class _Columns:
         self.prototype = library.StructureNode(file)
         nodes = {
             name: library.ScaledIntegerNode(
-                file, 0, -_MAX_INTEGER, _MAX_INTEGER, _SCALE, float(center)
+                file, 0, -MAX_INTEGER, MAX_INTEGER, SCALE, float(center)
             )
             for name, center in zip(_AXES, cloud.origin, strict=True)
         }
@@ -132,7 +131,7 @@ class _Columns:
         for first in range(0, len(block.points), _BLOCK):
             part = slice(first, min(first + _BLOCK, len(block.points)))
             n, points = part.stop - part.start, block.points[part]
-            if np.abs(points - self._origin).max() >= _MAX_INTEGER * _SCALE:
+            if np.abs(points - self._origin).max() >= MAX_INTEGER * SCALE:
                 raise InputError(
                     "cannot be written: a point is beyond the range of E57 coordinates"
                 )

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from stillmap.core.errors import InputError, import_extra
 from stillmap.core.files import atomic_file
-from stillmap.io.point_cloud.las import open_las_writer
+from stillmap.io.point_cloud.las import MAX_INTEGER, SCALE, open_las_writer
 from stillmap.results.export import e57
 from stillmap.results.export.point_cloud import Block, Cloud
 from stillmap.results.points import (
@@ -24,10 +24,8 @@ from stillmap.results.points import (
 
 Progress = Callable[[float], None]
 
-_SCALE = 0.0001  # m, of coordinates in LAS
 _POINT_FORMAT, _COLOR_POINT_FORMAT = 6, 7  # of LAS: with time, and with color too
 _COLOR_SCALE = 256  # LAS has 16-bit colors
-_MAX_INTEGER = 2**31 - 1  # of a coordinate in LAS
 _LINES = 1 << 14  # of text formatted at a time
 
 
@@ -146,7 +144,7 @@ def _write_las(cloud: Cloud, path: Path, compressed: bool, progress: Progress | 
     laspy = import_extra("laspy", path, "written")
     kind = _COLOR_POINT_FORMAT if cloud.has_colors else _POINT_FORMAT
     header = laspy.LasHeader(point_format=kind, version="1.4")
-    header.scales, header.offsets = np.full(3, _SCALE), cloud.origin
+    header.scales, header.offsets = np.full(3, SCALE), cloud.origin
     header.add_extra_dim(laspy.ExtraBytesParams("p_static", "float32", "probability to be static"))
     header.global_encoding.wkt = True  # required by LAS 1.4, even without a coordinate system
     header.generating_software = "stillmap"
@@ -158,7 +156,7 @@ def _write_las(cloud: Cloud, path: Path, compressed: bool, progress: Progress | 
 
 
 def _las_points(laspy: Any, header: Any, block: Block) -> Any:
-    if np.abs(block.points - header.offsets).max(initial=0.0) >= _MAX_INTEGER * _SCALE:
+    if np.abs(block.points - header.offsets).max(initial=0.0) >= MAX_INTEGER * SCALE:
         raise InputError("cannot be written: a point is beyond the range of LAS coordinates")
     out = laspy.ScaleAwarePointRecord.zeros(len(block.points), header=header)
     out.x, out.y, out.z = block.points.T
