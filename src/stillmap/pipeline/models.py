@@ -35,7 +35,8 @@ def build_models(
         raise ValueError("result: expected one in 3D")
     build.require_extras()
     threads = resolve_threads(result.options.threads)
-    start_ns, seen = int(result.deskewed.stamp_ns[0]), result if tilting is None else tilting
+    start_ns = int(result.recording.stamp_ns[0])
+    seen = result if tilting is None else tilting
     if tilting is None:
         boxes = box_objects(result.objects, start_ns)
     else:  # the flat laser gives the tracks, the tilting laser the 3D data

@@ -158,6 +158,7 @@ def map_recording(
         del iteration  # its grid is large
         if checkpoint is not None:
             checkpoint(state)
+    del steps  # holds labels and poses of the last iteration
     return _finish(state, recording, progress, stages)
 
 
