@@ -16,6 +16,7 @@ FIELDS: Fields = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("p_static", "<f4")]
 COLOURS: Fields = [("red", "u1"), ("green", "u1"), ("blue", "u1")]
 PACKED_COLOUR: Fields = [("rgb", "<u4")]  # 0x00RRGGBB, of PCD
 _TYPES = {"<f4": "float", "u1": "uchar"}
+_BLOCK = 1 << 16  # vertices in memory
 
 
 def write_clouds(
@@ -47,10 +48,11 @@ def write_clouds(
         static.write(ply_header(fields, cloud.count - dynamic))
         moving.write(ply_header(fields, dynamic))
         for block in cloud.iter_blocks():
-            vertices = make_vertices(block, fields)
-            moves = vertices["p_static"] < DYNAMIC_BELOW
-            static.write(vertices[~moves].tobytes())
-            moving.write(vertices[moves].tobytes())
+            for part in block.split(_BLOCK):
+                vertices = make_vertices(part, fields)
+                moves = vertices["p_static"] < DYNAMIC_BELOW
+                static.write(vertices[~moves].tobytes())
+                moving.write(vertices[moves].tobytes())
 
 
 def ply_header(fields: Fields, count: int) -> bytes:

@@ -38,6 +38,12 @@ class Block(NamedTuple):
     stamp_ns: NDArray[np.int64] | None
     colors: NDArray[np.uint8] | None = None
 
+    def split(self, size: int) -> "Iterator[Block]":
+        """Blocks of at most `size` points."""
+        for first in range(0, len(self.points), size):
+            part = slice(first, first + size)
+            yield Block(*(None if values is None else values[part] for values in self))  # type: ignore[arg-type]
+
 
 @dataclass(frozen=True, eq=False)
 class Cloud:

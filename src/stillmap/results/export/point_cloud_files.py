@@ -128,14 +128,13 @@ def _write_text(cloud: Cloud, path: Path, _: bool, progress: Progress | None) ->
     with path.open("w", encoding="ascii", newline="\n") as file:
         file.write(" ".join(names) + "\n")
         for block in cloud.iter_blocks(progress):
-            for first in range(0, len(block.points), _LINES):
-                part = slice(first, first + _LINES)
+            for part in block.split(_LINES):
                 values: list[NDArray[Any]] = [
-                    block.points[part],
-                    block.p_static[part, None].astype(np.float64),
+                    part.points,
+                    part.p_static[:, None].astype(np.float64),
                 ]
-                if block.colors is not None:
-                    values.append(block.colors[part])
+                if part.colors is not None:
+                    values.append(part.colors)
                 rows = np.concatenate(values, axis=1)
                 file.write(line * len(rows) % tuple(rows.ravel().tolist()))
 
