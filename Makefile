@@ -1,6 +1,6 @@
 # Everything works in a fresh clone and lives in .venv:
 #   make demo    simulate a populated hall, map it, say where the result lies
-#   make test    build and test (about 7 minutes on 2 cores)
+#   make test    build and test (about 6 minutes on 2 cores)
 #   make lint    style, types, formatting
 #   make fuzz    files changed for every reader, a minute each (FUZZ_SECONDS)
 #   make check   lint and test, then what takes longer: slow tests, real recordings, packages,
