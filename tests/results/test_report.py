@@ -15,12 +15,6 @@ from stillmap.results.report.figures import (
     UNKNOWN,
     VEIL_ALPHA,
     VIOLET,
-    MapView,
-    draw_map,
-    draw_points,
-    draw_snapshot,
-    draw_thinly_observed,
-    map_window,
 )
 from stillmap.results.report.page import render_report
 
@@ -119,63 +113,6 @@ def test_images_have_alt_texts_and_show_the_maps(page, result):
     assert len(page.named("polyline")[0]["points"].split()) == result.recording.n_scans
 
 
-def small_map(result, p):
-    return dataclasses.replace(result.map, p_occupied=p, origin=(0.0, 0.0, 0.0), resolution=1.0)
-
-
-def test_map_colours(result):
-    p = np.array([[0, 1, np.nan], [np.nan, 0, 0]], np.float32)
-    pixels = np.asarray(draw_map(small_map(result, p), (0, 0, 3, 2)).convert("RGB"))
-    white, black = (255, 255, 255), (0, 0, 0)
-    np.testing.assert_array_equal(pixels, [[UNKNOWN, white, white], [white, black, UNKNOWN]])
-
-
-def test_window_contains_every_occupied_cell_of_both_maps(result):
-    p = np.zeros((100, 300), np.float32)
-    p[40, 50] = p[60, 90] = 0.7
-    other = np.zeros((50, 100), np.float32)
-    other[10, 20] = 0.7
-    b = dataclasses.replace(small_map(result, other), origin=(100.0, 30.0, 0.0))
-    assert map_window([small_map(result, p), b]) == (44.0, 34.0, 125.0, 67.0)
-    # none occupied: the known cells; none known: the whole map
-    p[:] = np.nan
-    assert map_window([small_map(result, p)]) == (0.0, 0.0, 300.0, 100.0)
-    p[5, 6] = 0.1
-    assert map_window([small_map(result, p)]) == (2.0, 1.0, 11.0, 10.0)
-
-
-def test_points_are_drawn_at_their_positions():
-    points = np.array([[0.5, 0.5], [2.5, 1.5], [9.0, 9.0], [-0.1, 0.5]], np.float32)
-    dots = np.asarray(draw_points(points, MapView((0, 0, 3, 2), (3, 2), False)))
-    np.testing.assert_array_equal(dots, [[0, 0, 1], [1, 0, 0]])
-
-
-def test_layer_covers_thinly_observed_cells(result):
-    p = np.array([[0, 1, np.nan], [np.nan, 0, 0]], np.float32)
-    thin = np.array([[0, 1, 0], [0, 0, 1]], bool)
-    layer = np.asarray(draw_thinly_observed(small_map(result, p), thin, (-1, 0, 3, 2)))
-    np.testing.assert_array_equal(layer, [[0, 0, 0, 1], [0, 0, 1, 0]])
-
-
-def test_layer_of_thinly_observed_cells_is_reduced_as_the_map_is(result):
-    p, thin = np.zeros((4000, 4000), np.float32), np.zeros((4000, 4000), bool)
-    p[:2000] = np.nan  # only known cells of a square count
-    p[:2000, ::7] = 0.0
-    thin[:2000, 0:1000:7] = thin[2000:, 1000:2000] = True
-    thin[3000, 3000] = True
-    occupancy, window = small_map(result, p), (0, 0, 4000, 4000)
-    image = draw_thinly_observed(occupancy, thin, window)
-    assert image.size == draw_map(occupancy, window).size
-    layer = np.asarray(image)
-    middle = image.height // 2
-    quarter = image.width // 4
-    assert layer[: middle - 1, quarter + 1 : 2 * quarter - 1].all()
-    assert not layer[: middle - 1, 2 * quarter + 1 :].any()
-    columns = np.flatnonzero(layer[middle + 1 :].all(axis=0))
-    assert 0 < columns.max() <= quarter
-    assert not layer[middle + 1 :, :quarter][:, columns.max() + 1 :].any()
-
-
 def test_thinly_observed_area(page, result):
     text = " ".join("".join(page.text).split())
     thin, known = (
@@ -189,29 +126,6 @@ def test_thinly_observed_area(page, result):
     )
     text = render_report(dataclasses.replace(result, evidence=nothing))
     assert "All of the known area is well observed." in text
-
-
-def test_snapshot_shows_map_and_dots(result):
-    shown = np.asarray(draw_snapshot(result.snapshots[-1]).convert("RGB"))
-    colours = set(map(tuple, shown.reshape(-1, 3).tolist()))
-    assert {(255, 255, 255), UNKNOWN, ORANGE} <= colours
-    assert min(colours)[0] < 50  # a wall
-
-
-def test_large_maps_are_reduced_but_keep_thin_walls(result):
-    p = np.zeros((4000, 4000), np.float32)
-    p[:, 1777] = 1.0
-    p[3000:] = np.nan
-    image = draw_map(small_map(result, p), (0, 0, 4000, 4000))
-    assert image.width * image.height <= 1_500_000
-    pixels = np.asarray(image.convert("L")).astype(int)
-    wall = 1777 * image.width // 4000
-    assert (pixels[image.height // 4 + 2 :, wall] == 0).all()
-    assert (
-        pixels[: image.height // 4 - 2]
-        == np.asarray(Image.new("RGB", (1, 1), UNKNOWN).convert("L"))
-    ).all()
-    assert (pixels[image.height // 4 + 2 :, : wall - 2] == 255).all()
 
 
 def test_report_of_a_large_map_stays_small(result):
@@ -362,7 +276,9 @@ def test_report_of_an_incomplete_result(result, change):
 
 def test_maps_without_known_cells_and_without_cells(result):
     for p in (np.full((5, 5), np.nan, np.float32), np.zeros((0, 0), np.float32)):
-        empty = small_map(result, p)
+        empty = dataclasses.replace(
+            result.map, p_occupied=p, origin=(0.0, 0.0, 0.0), resolution=1.0
+        )
         none = dataclasses.replace(result.evidence, thinly_observed=np.zeros(p.shape, bool))
         Page(render_report(dataclasses.replace(result, map=empty, raw_map=empty, evidence=none)))
 
