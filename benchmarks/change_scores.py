@@ -26,7 +26,7 @@ class Stay:
 
     Attributes:
         mover: its number.
-        middle: (2,) metres.
+        center: (2,) metres.
         faces: (K, 4) segments x0, y0, x1, y1 in metres.
         since_ns: arrival; None: before the recording.
         until_ns: departure; None: never.
@@ -114,7 +114,7 @@ class TrueChange:
         stay: the stay that began or ended.
         appeared: it began.
         stamp_ns: when.
-        look_ns: the first scan afterwards that looked there; None: none did, or none before, so
+        observed_ns: the first scan afterwards that looked there; None: none did, or none before, so
             nobody could know of the change.
     """
 
@@ -186,8 +186,8 @@ def list_true_changes(stays: Iterable[Stay], beams: Beams) -> list[TrueChange]:
             if stamp is not None and first < stamp <= last:
                 later = after[after >= stamp]
                 seen = bool(np.any(before < stamp)) and len(later) > 0
-                look = int(later[0]) if seen else None
-                changes.append(TrueChange(stay, after is on, stamp, look))
+                observed = int(later[0]) if seen else None
+                changes.append(TrueChange(stay, after is on, stamp, observed))
     return changes
 
 

@@ -19,7 +19,7 @@ _STYLES = {"error": "1;31", "warning": "33"}  # bold red, yellow
 
 
 def uses_color(stream: IO[str]) -> bool:
-    """Whether to use colors, by NO_COLOR, FORCE_COLOR, CLICOLOR_FORCE and TERM."""
+    """Whether output is colored; NO_COLOR, FORCE_COLOR, CLICOLOR_FORCE and TERM decide."""
     if os.environ.get("NO_COLOR"):
         return False
     if os.environ.get("FORCE_COLOR") or os.environ.get("CLICOLOR_FORCE", "0") not in ("", "0"):
@@ -28,7 +28,7 @@ def uses_color(stream: IO[str]) -> bool:
 
 
 def is_terminal(stream: IO[str] | None) -> bool:
-    """Whether a stream is a terminal with control sequences."""
+    """Whether a stream is a terminal that supports control sequences."""
     return stream is not None and stream.isatty() and os.environ.get("TERM") != "dumb"
 
 

@@ -242,7 +242,7 @@ def _is_triple(noted: Any) -> bool:
 
 
 def _is_box(noted: Any) -> bool:
-    """Whether a note is the box of a robot's own returns in a 3D recording."""
+    """Whether a note of the reader is a valid self-filter box of a 3D recording."""
     return (
         isinstance(noted, dict)
         and all(isinstance(noted.get(key), int) for key in ("sensor", "beams"))

@@ -227,7 +227,7 @@ def _newton_step(lens: Lens, x: Float, wanted: Float) -> Float:
     r = np.sqrt(_square(x))
     u = np.divide(x, r[:, None], out=np.zeros_like(x), where=r[:, None] > 0.0)
     u[r == 0.0] = (1.0, 0.0)
-    v = _turn_left(u)
+    v = _rotate_90_degrees(u)
     along, across, mixed = _jacobian(lens, r, u)
     residual = _distort(lens, x) - wanted
     a, b = np.sum(residual * u, axis=1), np.sum(residual * v, axis=1)
@@ -244,13 +244,13 @@ def _jacobian(lens: Lens, r: Float, u: Float) -> tuple[Float, Float, Float]:
         across = np.divide(shown, r, out=np.ones_like(r), where=r > 0.0)
         return slope / (1.0 + r * r), across, np.zeros_like(r)
     q = np.array([k[3], k[2]])
-    q_along, q_across = u @ q, _turn_left(u) @ q
+    q_along, q_across = u @ q, _rotate_90_degrees(u) @ q
     g, slope = _radial(k, r * r)
     along = g + 2.0 * r * r * slope + 6.0 * r * q_along
     return along, g + 2.0 * r * q_along, 2.0 * r * q_across
 
 
-def _turn_left(u: Float) -> Float:
+def _rotate_90_degrees(u: Float) -> Float:
     return np.column_stack([-u[:, 1], u[:, 0]])
 
 

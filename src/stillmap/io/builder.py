@@ -18,7 +18,7 @@ _BLOCK = 1 << 20  # points of a scan at a time
 
 
 class ReadContext(NamedTuple):
-    """What every reader is given besides the path.
+    """Options, progress callback and scratch folder of a reader.
 
     Attributes:
         options: see ReadOptions.

@@ -79,10 +79,10 @@ def color_points(
         color_moving(out, delay, tracked, number, background)
         inputs.deskewed.release_pages(inputs.p_static, out, delay)
         tell(scans + number + 1, n)
-    return PointColors(out, _count_colored(out, inputs))
+    return PointColors(out, _count_colored_returns(out, inputs))
 
 
-def _count_colored(colors: Image, inputs: MeshInputs) -> dict[str, int]:
+def _count_colored_returns(colors: Image, inputs: MeshInputs) -> dict[str, int]:
     hit, p_static = inputs.deskewed.hit, inputs.p_static
     out = dict.fromkeys(("static", "static_coloured", "dynamic", "dynamic_coloured"), 0)
     for block in arrays.iter_blocks(hit, p_static, colors):

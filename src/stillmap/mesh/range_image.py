@@ -255,7 +255,7 @@ def _triangulate_image(
 ) -> Int32:
     """Triangles of one scan; a row length of 0 means that it is no grid."""
     if not row_length:
-        return _triangulate_unordered(use, directions)
+        return _triangulate_without_grid(use, directions)
     number = np.arange(len(points), dtype=np.int32).reshape(-1, row_length)
     along = median_angle(directions[:-1], directions[1:])
     across = median_angle(directions[:-row_length], directions[row_length:])
@@ -268,8 +268,8 @@ def _triangulate_image(
     return triangulate_grid(points, use, number[::stride, ::stride])
 
 
-def _triangulate_unordered(use: Bool, directions: Float) -> Int32:
-    """Triangles between valid beams in strips or in no order; without those that span holes."""
+def _triangulate_without_grid(use: Bool, directions: Float) -> Int32:
+    """Triangles between valid beams that form strips or no grid; long triangles are left out."""
     beams = np.flatnonzero(use)
     if len(beams) < 3:
         return np.zeros((0, 3), np.int32)

@@ -188,7 +188,7 @@ def _cast_movers(
 
 
 def find_glass(walls: NDArray[np.int32], scene: Scene) -> NDArray[np.bool_]:
-    """Whether walls, by number, are glass, which comes after the scene's other walls."""
+    """Mask of the wall indices that are glass; indices of glass follow those of opaque walls."""
     first = len(scene.walls)
     return (walls >= first) & (walls < first + len(scene.glass))
 

@@ -129,7 +129,7 @@ _LAYOUTS = (  # scans and their stamps
 
 
 def is_kitti_folder(path: Path, head: bytes | None) -> bool:
-    """Whether a path is a folder (no `head`) with a layout of KITTI."""
+    """Whether a folder has one of the KITTI layouts; `head` is None for folders."""
     return head is None and any((path / scans).is_dir() for scans, _ in _LAYOUTS)
 
 

@@ -42,7 +42,9 @@ class Block(NamedTuple):
         """Blocks of at most `size` points."""
         for first in range(0, len(self.points), size):
             part = slice(first, first + size)
-            yield Block(*(None if values is None else values[part] for values in self))  # type: ignore[arg-type]
+            stamp_ns = None if self.stamp_ns is None else self.stamp_ns[part]
+            colors = None if self.colors is None else self.colors[part]
+            yield Block(self.points[part], self.p_static[part], stamp_ns, colors)
 
 
 @dataclass(frozen=True, eq=False)
