@@ -2,7 +2,7 @@
 
 import logging
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -62,8 +62,13 @@ class Truth:
 
     def static_hits(self) -> Float:
         """(N, D) end points in the world frame, at true poses, of the static beams that hit."""
-        use = np.flatnonzero(self.recording.hit & self.static())
-        return self.recording.end_points(use, self.poses())
+        use, recording = np.flatnonzero(self.recording.hit & self.static()), self.recording
+        path = self.folder / "truth/T_base_sensor.npy"
+        if path.exists():  # the recorder was wrong about its mount
+            shape = recording.T_base_sensor.shape
+            T_base_sensor = _finite(path, read_array(path, shape, "f"))
+            recording = replace(recording, T_base_sensor=T_base_sensor)
+        return recording.end_points(use, self.poses())
 
 
 def read_truth(path: Path, labels: Labels | None = None) -> Truth:

@@ -30,7 +30,6 @@ _ROBOT_MARGIN = 0.15  # m between the robot's footprint and walls along its rout
 _PERSON_MARGIN = 0.1  # m
 _MAX_DELAY = 5.0  # times the nominal time of the route, after which the robot is stuck
 _MIN_MOTION = 1e-6  # m
-_CARRY_TIME = 20.0  # s without scans while the robot is carried
 MAX_SPEED = 40.0  # m/s; anything faster has restarted its lane
 _MAX_SIMULATED_PAUSE = 30.0  # s; the rest of a pause is not simulated
 
@@ -91,7 +90,7 @@ def simulate_motion(scene: Scene, rngs: Rngs, tell: Progress) -> Motion:
     log: list[tuple[Float, ...]] = []
     while not _is_done(scene, world.robot, len(log), expected):
         if len(log) == carried:
-            world.carry_robot(dt, rngs[3])
+            world.carry_robot(o.carried_time, dt, rngs[3])
         if len(log) == paused:
             world.rest_robot(min(o.pause, _MAX_SIMULATED_PAUSE), dt)
         log.append(world.snapshot())
@@ -100,7 +99,7 @@ def simulate_motion(scene: Scene, rngs: Rngs, tell: Progress) -> Motion:
         for _ in range(steps):
             world.step(dt)
     scan = np.arange(len(log))
-    seconds = scan * (1.0 / rate) + _CARRY_TIME * (scan >= carried) + o.pause * (scan >= paused)
+    seconds = scan * (1.0 / rate) + o.carried_time * (scan >= carried) + o.pause * (scan >= paused)
     gaps = [int(min(first, len(log))) for first in (carried, paused)]
     return world.collect_motion(log, 1.0 / rate, seconds, *gaps)
 
@@ -129,10 +128,10 @@ class _World:
         self.traffic = Traffic(scene.lanes, scene.traffic, rngs[2])
         self._radius = o.radius
 
-    def carry_robot(self, dt: float, rng: np.random.Generator) -> None:
+    def carry_robot(self, seconds: float, dt: float, rng: np.random.Generator) -> None:
         """Carry the robot to another place, while everything else moves in steps of dt seconds."""
         self.robot.put_down(rng, self._obstacles())
-        self.rest_robot(_CARRY_TIME, dt)
+        self.rest_robot(seconds, dt)
 
     def rest_robot(self, seconds: float, dt: float) -> None:
         """Stop the robot, while everything else moves in steps of dt seconds."""

@@ -16,6 +16,7 @@ from stillmap.sim.truth import Truth
 Float = NDArray[np.float64]
 
 _FIRST_STAMP_NS = 1_000_000_000 * 10**9
+_SAME_POSE = 1e-12  # m and elements of rotations
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +31,7 @@ class Episode:
         T_odom_base: (T, 3, 3) odometry.
         sensor_rng: generator of a planar laser, or of the first 3D sensor.
         body_rng: generator of body heights, vibration, and a second 3D sensor.
+        mishap_rng: generator of the mishaps of a planar laser.
         colour_seed: of the appearance; None without cameras.
     """
 
@@ -40,6 +42,7 @@ class Episode:
     T_odom_base: Float
     sensor_rng: np.random.Generator
     body_rng: np.random.Generator
+    mishap_rng: np.random.Generator
     colour_seed: int | None = None
 
     @property
@@ -65,6 +68,7 @@ class Episode:
         mover: NDArray[np.int32],
         T_world_base: Float,
         more: dict[str, Any] | None = None,
+        T_base_sensor: Float | None = None,
     ) -> Truth:
         """The truth about beams; `more` is added to the scene after `mover_kinds`."""
         motion, scene = self.motion, self._describe_scene()
@@ -75,7 +79,8 @@ class Episode:
             about[name] = scan if scan < len(T_world_base) else None
         faces = motion.things.faces[-1]
         lasting = faces[np.any(faces[:, :2] != faces[:, 2:], axis=1)]
-        return Truth(static, mover, T_world_base, self.walls, motion.poses, about, lasting)
+        arrays = (static, mover, T_world_base, self.walls, motion.poses)
+        return Truth(*arrays, about, lasting, T_base_sensor)
 
     def _describe_scene(self) -> dict[str, Any]:
         """Name, seed and all parameters of the scene as JSON; walls are written as an array."""
@@ -106,10 +111,12 @@ def simulate_episode(scene: Scene, rng: np.random.Generator, tell: Progress) -> 
     driven = remove_jump(se2.matrix(*motion.robot.T), motion.carried)
     T_odom_base = simulate_odometry(driven, scene.odometry, odometry_rng)
     T_odom_base = add_faults(T_odom_base, motion.seconds, scene.odometry, mishap_rngs[1])
-    body_rng = rng.spawn(1)[0]
+    T_odom_base = delay_odometry(T_odom_base, motion.seconds, scene.odometry.latency)
+    body_rng, mishap_rng = rng.spawn(1)[0], mishap_rngs[1].spawn(1)[0]
     # spawned last, so that a camera changes nothing else
     seed_of_colours = int(rng.spawn(1)[0].integers(1 << 31)) if scene.camera.enabled else None
-    return Episode(scene, seed, motion, walls, T_odom_base, sensor_rng, body_rng, seed_of_colours)
+    rngs = (sensor_rng, body_rng, mishap_rng)
+    return Episode(scene, seed, motion, walls, T_odom_base, *rngs, seed_of_colours)
 
 
 def simulate_odometry(
@@ -121,7 +128,7 @@ def simulate_odometry(
     own relative errors, turned back into d and theta with a wrong base b, and noise is added
     whose variance grows with the distance and angle, independent of the scan rate (Thrun, Burgard,
     Fox, Probabilistic Robotics, 5.4, with random-walk scaling). A slipping wheel rolls farther than
-    the robot moves, on short parts of the path.
+    the robot moves, on short parts of the path. At last come the factors on distance and rotation.
     """
     x, y, turn = se2.parameters(se2.inverse(T_world_base[:-1]) @ T_world_base[1:]).T
     # an arc as chord at half its angle
@@ -142,6 +149,7 @@ def simulate_odometry(
         slipped = _slips(way, options, rng) * way
         d = d + slipped.sum(axis=0) / 2
         theta = theta + (slipped[1] - slipped[0]) / (options.wheel_base * base)
+    d, theta = options.scale * d, options.rotation_gain * theta
     heading = np.concatenate([[0.0], np.cumsum(theta)])
     middle = heading[:-1] + theta / 2
     chord = d * np.sinc(theta / (2 * np.pi))
@@ -172,6 +180,28 @@ def add_faults(
         again = se2.inverse(T_odom_base[scan]) @ T_odom_base[scan:]
         T_odom_base = np.concatenate([T_odom_base[:scan], again])
     return T_odom_base
+
+
+def delay_odometry(T_odom_base: Float, seconds: Float, latency: float) -> Float:
+    """Odometry (T, 3, 3) that is recorded `latency` s late: at each stamp the pose of then.
+
+    Between two scans the robot moves evenly on a chord; before the first one it stands. Over a
+    reset nothing is interpolated: the pose is that before it.
+
+    Args:
+        T_odom_base: odometry at the scans.
+        seconds: (T,) times of the scans, rising.
+        latency: s.
+    """
+    if latency == 0 or len(seconds) < 2:
+        return T_odom_base
+    when = np.maximum(seconds - latency, seconds[0])
+    before = np.clip(np.searchsorted(seconds, when, side="right") - 1, 0, len(seconds) - 2)
+    share = (when - seconds[before]) / (seconds[before + 1] - seconds[before])
+    moves = se2.parameters(se2.inverse(T_odom_base[before]) @ T_odom_base[before + 1])
+    again = np.abs(T_odom_base[before + 1] - np.eye(3)).max(axis=(1, 2)) < _SAME_POSE
+    share = np.where(again & (share < 1), 0.0, share)
+    return np.asarray(T_odom_base[before] @ se2.matrix(*(share[:, None] * moves).T))
 
 
 def remove_jump(T_world_base: Float, scan: int) -> Float:

@@ -100,6 +100,27 @@ class LaserOptions(Section, section="laser"):
     second_laser: bool = option(
         False, "Add a laser that looks backwards from the opposite side of the base."
     )
+    recorded_x: float | None = option(None, "x as the recorder has it, m; unset: the true one.")
+    recorded_y: float | None = option(None, "y as the recorder has it, m; unset: the true one.")
+    recorded_yaw: float | None = option(
+        None, "yaw as the recorder has it, rad; unset: the true one."
+    )
+    height: float = option(0.3, "Height above the floor, m.", gt=0)
+    blind_stretches: int = option(0, "Number of stretches without returns, at random times.", ge=0)
+    blind_at: float | None = option(
+        None, "Share of the recording at which one more such stretch begins.", ge=0, lt=1
+    )
+    blind_time: float = option(30.0, "Duration of a stretch without returns, s.", gt=0)
+
+    @property
+    def recorded_mount(self) -> tuple[float, float, float]:
+        """x, y, yaw as the recorder has them."""
+        told = (self.recorded_x, self.recorded_y, self.recorded_yaw)
+        x, y, yaw = (
+            true if value is None else value
+            for value, true in zip(told, (self.x, self.y, self.yaw), strict=True)
+        )
+        return x, y, yaw
 
     @property
     def count(self) -> int:
@@ -128,6 +149,23 @@ class RobotOptions(Section, section="robot"):
         gt=0,
         lt=1,
     )
+    carried_by: float | None = option(
+        None,
+        "Distance along its route by which the robot is then carried, m; negative: back; unset: to "
+        "any distant place.",
+    )
+    carried_turn: float | None = option(
+        None, "Heading against the route where it is set down, rad; unset: any."
+    )
+    carried_time: float = option(20.0, "Time without scans while it is carried, s.", ge=0)
+    bump_rate: float = option(0.0, "Bumps per metre driven, which tilt a planar laser.", ge=0)
+    bump_pitch: float = option(
+        0.05, "Pitch at the peak of a bump, up or down, rad, times 0.5 to 1.5.", ge=0, le=0.5
+    )
+    bump_roll: float = option(
+        0.0, "Standard deviation of the roll at the peak of a bump, rad.", ge=0, le=0.1
+    )
+    bump_time: float = option(0.6, "Duration of a bump, s, times 0.5 to 1.5.", gt=0)
     pause_at: float | None = option(
         None, "Recording time at which the robot stops for a pause, s; unset: never.", gt=0
     )
@@ -165,6 +203,11 @@ class OdometryOptions(Section, section="odometry"):
     stall_rate: float = option(0.0, "Odometry stalls per minute: motion is missed.", ge=0)
     stall_time: float = option(5.0, "Duration of a stall, s.", gt=0)
     resets: int = option(0, "Number of resets to the origin, at random times.", ge=0)
+    scale: float = option(1.0, "Factor on all distances.", gt=0)
+    rotation_gain: float = option(1.0, "Factor on all rotations.", gt=0)
+    latency: float = option(
+        0.0, "Age of the odometry at the stamp that it is recorded with, s.", ge=0
+    )
 
 
 @dataclass(frozen=True)

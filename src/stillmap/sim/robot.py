@@ -79,23 +79,37 @@ class Robot:
         self._seconds, self._speed = self._seconds + dt, 0.0
 
     def put_down(self, rng: np.random.Generator, others: Float) -> None:
-        """Set the robot down on a distant point of its route with a random heading.
+        """Set the robot down on a point of its route: a distant one with a random heading, or that
+        which the options name, or the next one with room around it.
 
         Args:
             rng: generator.
             others: (N, 2) positions of people and corners of vehicles, metres.
         """
-        away = np.hypot(*(self._way - self.pose[:2]).T)
-        places = np.flatnonzero(away > _MIN_CARRY * away.max())
-        if not self._closed:  # or the recording would soon be over
-            places = places[places < (1.0 - _MIN_CARRY) * len(self._way)]
-        for at in rng.permutation(places).tolist():
+        for at in self._places_to_put_down(rng).tolist():
             near = np.hypot(*(others - self._way[at]).T).min(initial=np.inf)
             if near > _MIN_ROOM:
                 self._at = at
                 break
-        self.pose = np.array([*self._way[self._at], rng.uniform(-np.pi, np.pi)])
+        heading = rng.uniform(-np.pi, np.pi)
+        if self._options.carried_turn is not None:
+            to = self._way[self._ahead(self._look_ahead())[-1]] - self._way[self._at]
+            heading = np.arctan2(to[1], to[0]) + self._options.carried_turn
+        self.pose = np.array([*self._way[self._at], heading])
         self._speed, self._waited = 0.0, 0.0
+
+    def _places_to_put_down(self, rng: np.random.Generator) -> NDArray[np.int64]:
+        """Points of the route where the robot may be put down, in the order of preference."""
+        by = self._options.carried_by
+        if by is not None:
+            ahead = self._at + round(by / _SPACING) + np.arange(len(self._way))
+            on_route = (ahead >= 0) & (ahead < len(self._way))
+            return ahead % len(self._way) if self._closed else ahead[on_route]
+        away = np.hypot(*(self._way - self.pose[:2]).T)
+        places = np.flatnonzero(away > _MIN_CARRY * away.max())
+        if not self._closed:  # or the recording would soon be over
+            places = places[places < (1.0 - _MIN_CARRY) * len(self._way)]
+        return rng.permutation(places)
 
     def nominal_time(self) -> float:
         """Seconds of one lap at full speed."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.sim import laser, lidar, recorder
+from stillmap.sim import laser, lidar, mishaps, recorder
 from stillmap.sim.camera import CameraSimulator
 from stillmap.sim.dynamics import Moment, Motion, Progress
 from stillmap.sim.episode import Episode, simulate_episode
@@ -99,8 +99,11 @@ def simulate(
         made = _with_images(world, *recorded)
     else:
         recording, mover = _record(happening)
-        static, T_world_base = recording.hit & (mover < 0), se2.matrix(*happening.motion.robot.T)
-        made = Simulation(scene, recording, happening.truth(static, mover, T_world_base))
+        static, T_world_base = recording.hit & (mover == -1), se2.matrix(*happening.motion.robot.T)
+        mount = _mounts(scene.laser, (scene.laser.x, scene.laser.y, scene.laser.yaw))
+        wrong = None if np.array_equal(mount, recording.T_base_sensor) else mount
+        truth = happening.truth(static, mover, T_world_base, T_base_sensor=wrong)
+        made = Simulation(scene, recording, truth)
     rest(1.0)
     return made
 
@@ -144,12 +147,14 @@ def _record(happening: Episode) -> tuple[Recording, NDArray[np.int32]]:
     """The recording of a planar laser, and the mover (M,) that reflected each beam."""
     scene, motion, walls = happening.scene, happening.motion, happening.walls
     o, T = scene.laser, len(motion.robot)
-    front = se2.matrix(o.x, o.y, o.yaw)
-    T_base_sensor = np.stack([front, se2.matrix(0.0, 0.0, np.pi) @ front][: o.count])
     sensor = np.arange(T, dtype=np.int32) % o.count
-    exact = cast_sweeps(motion, walls, T_base_sensor[sensor], o)
+    T_base_sensor = _mounts(o, (o.x, o.y, o.yaw))[sensor]
+    exact = cast_sweeps(motion, walls, T_base_sensor, o)
+    exact = _add_bumps(exact, happening, se2.parameters(T_base_sensor)[:, 2])
     on_glass = laser.find_glass(exact.wall, scene)
     ranges, hit = laser.simulate_measurement(exact.range, on_glass, o, happening.sensor_rng)
+    blind = mishaps.find_blind_scans(motion.seconds, o, happening.mishap_rng)
+    ranges[blind], hit[blind] = o.max_range, False
     angles = laser.compute_beam_angles(o.beams, o.fov)
     if o.upside_down == "known":
         angles = -angles
@@ -159,13 +164,32 @@ def _record(happening: Episode) -> tuple[Recording, NDArray[np.int32]]:
         offset=np.arange(T + 1, dtype=np.int64) * o.beams,
         points=points.reshape(-1, 2).astype(np.float32),
         hit=hit.ravel(),
-        T_base_sensor=T_base_sensor,
+        T_base_sensor=_mounts(o, o.recorded_mount),
         sensor=sensor,
         T_odom_base=happening.T_odom_base,
         source=happening.source(_described(o, angles)),
         beam_time=np.tile(Sweep.of(o).beam_times(o.beams), T) if o.sweep_time > 0 else None,
     )
     return recording, np.where(hit, exact.mover, np.int32(-1)).ravel()
+
+
+def _mounts(o: LaserOptions, pose: tuple[float, float, float]) -> Float:
+    """(S, 3, 3) T_base_sensor of the lasers, the first of which is at x, y, yaw."""
+    front = se2.matrix(*pose)
+    return np.stack([front, se2.matrix(0.0, 0.0, np.pi) @ front][: o.count])
+
+
+def _add_bumps(exact: Returns, happening: Episode, yaw: Float) -> Returns:
+    """Returns (T, n) with the floor where bumps show it, of lasers at yaw (T,) on the base."""
+    o, motion, rng = happening.scene.laser, happening.motion, happening.mishap_rng
+    bumps = mishaps.simulate_bumps(motion.robot, motion.seconds, happening.scene.robot, rng)
+    if not len(bumps.start):
+        return exact
+    angles, sweep = laser.compute_beam_angles(o.beams, o.fov), Sweep.of(o)
+    tilt = bumps.tilt(motion.seconds[:, None] + sweep.seconds)
+    tilt = np.repeat(tilt, sweep.group, axis=1)[:, : o.beams]
+    bearing = yaw[:, None] + (angles if o.upside_down == "no" else -angles)
+    return mishaps.add_floor(exact, bearing, tilt, o.height)
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,6 +25,7 @@ _SCENE = "scene.json"
 _ARRAYS = ("static", "mover", "T_world_base", "walls", "movers")
 _PER_BEAM = ("static", "mover")
 _LASTING = "lasting"  # only where there are any
+_MOUNT = "T_base_sensor"  # only where the recorder is wrong about it
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +34,8 @@ class Truth:
 
     Attributes:
         static: (M,) bool, whether a static surface reflected the beam.
-        mover: (M,) int32, id of the mover that reflected the beam; -1: none, -2: the robot itself.
+        mover: (M,) int32, id of the mover that reflected the beam; -1: none, -2: the robot itself,
+            -3: the floor, seen by a planar laser that a bump tilted.
         T_world_base: (T, D+1, D+1) float64 true poses.
         walls: (W, 4) float64 segments x0, y0, x1, y1 in metres.
         movers: (T, P, 3) float64, pose of each mover at each scan: x, y of its center in metres,
@@ -43,6 +45,7 @@ class Truth:
             "door", "car", "forklift" or "thing"); with a lidar `mover_sizes`: length, width and
             height of each in metres, null where undefined.
         lasting: (K, 4) faces of moved or added objects, at the end.
+        T_base_sensor: (S, 3, 3) true poses of the sensors where the recording has others.
     """
 
     static: NDArray[np.bool_]
@@ -52,13 +55,16 @@ class Truth:
     movers: NDArray[np.float64]
     scene: dict[str, Any]
     lasting: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 4)))
+    T_base_sensor: NDArray[np.float64] | None = None
 
 
 def write_truth(truth: Truth, stamp_ns: NDArray[np.int64], folder: Path) -> None:
     """Write the `truth` folder into an existing folder."""
     inside = folder / FOLDER
     inside.mkdir()
-    for name in (*_ARRAYS, *([_LASTING] if len(truth.lasting) else [])):
+    optional = [_LASTING] if len(truth.lasting) else []
+    optional += [] if truth.T_base_sensor is None else [_MOUNT]
+    for name in (*_ARRAYS, *optional):
         # per-beam arrays may be larger than memory
         write = write_npy if name in _PER_BEAM else np.save
         write(inside / f"{name}.npy", getattr(truth, name))
@@ -73,7 +79,8 @@ def load_truth(path: str | Path) -> Truth:
         InputError: there is none, or it is damaged.
     """
     folder = _find_folder(path, _SCENE, "truth", "")
-    names = (*_ARRAYS, *([_LASTING] if (folder / f"{_LASTING}.npy").exists() else []))
+    optional = [name for name in (_LASTING, _MOUNT) if (folder / f"{name}.npy").exists()]
+    names = (*_ARRAYS, *optional)
     try:
         arrays = {name: np.array(open_npy(folder / f"{name}.npy")) for name in names}
         return Truth(**arrays, scene=json.loads((folder / _SCENE).read_text(encoding="utf-8")))
