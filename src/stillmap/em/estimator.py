@@ -14,6 +14,7 @@ from stillmap.em.occupancy_grid import ObservedCells
 from stillmap.em.options import EmOptions
 from stillmap.em.people_tracker import label_people
 from stillmap.em.types import EStepResult, Float, Grid, NoReturnModel, fill_beams
+from stillmap.preprocessing.floor_detection import find_floor_returns
 
 Estimator = Literal["stillmap", "paper", "hit-ratio", "tracker"]
 
@@ -23,17 +24,26 @@ ESTIMATORS_3D: tuple[Estimator, ...] = ("stillmap", "paper")
 # once to register without people, and once more on those better poses.
 _FIXED_ITERATIONS: dict[Estimator, int] = {"hit-ratio": 1, "tracker": 2}
 
+_FLOOR_PRIOR = 0.02  # times the prior, for what is taken for floor: wrong in fewer beams than that
+
 _LABEL_CHANGE = 0.1  # change of P(static) that counts in `changed_share`
 
 
 def initial_p_static(
     recording: Recording, estimator: Estimator, options: EmOptions
 ) -> NDArray[np.float32]:
-    """(M,) e := p(c = 1) for every beam (start of Fig. 2); 1 for estimators that count."""
+    """(M,) e := p(c = 1) for every beam (start of Fig. 2); 1 for estimators that count.
+
+    In 2D the default estimator begins with a lower prior for what is floor by odometry: with floor
+    in it the first map would bend, and later labels with it.
+    """
     prior = 1.0 if estimator in _FIXED_ITERATIONS else options.prior
     e = recording.allocate_per_beam(np.float32)
     for block in iter_blocks(e):
         e[block] = prior
+    odometry = recording.T_odom_base
+    if estimator == "stillmap" and recording.dimension == 2 and odometry is not None:
+        e[find_floor_returns(recording, odometry)] *= _FLOOR_PRIOR
     return e
 
 

@@ -1,0 +1,171 @@
+"""Floor that bumps show is found by what scans before and after see; walls are not floor."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from marks import slow_params
+from numpy.typing import NDArray
+
+from stillmap import em
+from stillmap.core import se2
+from stillmap.core.config import override
+from stillmap.core.recording import Recording
+from stillmap.em.options import EmOptions
+from stillmap.preprocessing.floor_detection import find_floor_returns
+from stillmap.sim import Scene, Simulation, scene_by_name, simulate
+from stillmap.sim.mishaps import FLOOR
+from stillmap.sim.walls import box
+
+Bool = NDArray[np.bool_]
+
+
+def drive(name: str, seed: int = 0, **changes: dict[str, object]) -> Simulation:
+    usual: dict[str, dict[str, object]] = {"robot": {"scans": 250}, "crowd": {"people": 8}}
+    sections = {**usual, **{k: {**usual.get(k, {}), **v} for k, v in changes.items()}}
+    return simulate(scene_by_name(name, sections), seed)
+
+
+def find(run: Simulation) -> Bool:
+    odometry = run.recording.T_odom_base
+    assert odometry is not None
+    return find_floor_returns(run.recording, odometry)
+
+
+ROUGH = {"bump_rate": 2.5, "bump_pitch": 0.06}
+POOR = {"translation_noise": 0.03, "rotation_noise": 0.06, "drift_noise": 0.024}
+
+
+@pytest.mark.parametrize(
+    ("seed", "laser", "robot"),
+    [
+        (0, {"beams": 180}, {}),
+        (1, {"beams": 121, "fov": math.pi / 2, "max_range": 12.0}, {"bump_pitch": 0.09}),
+        (2, {"beams": 361, "max_range": 8.0}, {"bump_pitch": 0.08, "bump_time": 0.9}),
+        (3, {"beams": 360, "fov": 2 * math.pi, "yaw": 2.0}, {"bump_roll": 0.02}),
+        (4, {"beams": 90, "second_laser": True}, {"scan_rate": 12.0, "scans": 600}),
+        *slow_params(*((seed, {"beams": 181}, {}) for seed in range(5, 9))),
+    ],
+)
+def test_most_floor_is_found_and_little_else(
+    seed: int, laser: dict[str, object], robot: dict[str, object]
+) -> None:
+    run = drive("hall", seed, laser=laser, robot={**ROUGH, **robot}, odometry=POOR)
+    found, floor = find(run), run.truth.mover == FLOOR
+    assert floor.sum() > 300
+    assert found[floor].mean() > 0.55
+    # at the ends of the line floor meets the foot of the wall
+    assert run.truth.static[found].mean() < 0.03
+
+
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("hall", {"crowd": {"people": 60}}),
+        ("corridor", {"odometry": {**POOR, "slip_rate": 0.3, "stall_rate": 4.0}}),
+        ("office", {"odometry": POOR}),
+        ("warehouse", {"laser": {"fov": 2 * math.pi, "beams": 360}}),
+        ("street", {}),
+        ("hall-empty", {"laser": {"fov": 1.2, "max_range": 5.0}, "odometry": POOR}),
+    ],
+)
+@pytest.mark.parametrize("seed", [1, *slow_params(2, 3)])
+def test_level_robots_see_none(name: str, changes: dict[str, dict[str, object]], seed: int) -> None:
+    run = drive(name, seed, **changes)
+    # who stands around a narrow view may look like floor, but walls do not
+    assert np.count_nonzero(find(run) & run.truth.static) <= 1e-4 * run.recording.n_beams
+
+
+def to_and_fro(speed: float, seed: int, **changes: dict[str, object]) -> Simulation:
+    """A robot that drives at the walls of a bare room."""
+    route = ((-8.0, 0.0), (8.5, 0.0), (-8.5, 0.3), (8.5, 0.5), (0.0, 3.5), (0.0, -3.5))
+    scene = Scene(name="room", walls=tuple(box(0, 0, 20, 10)), route=route)
+    usual = {"crowd": {"people": 0}, "laser": {"fov": 1.5}, "odometry": POOR}
+    robot = {"scans": 300, "speed": speed, "scan_rate": 8.0, "turn_rate": 2.0}
+    return simulate(override(scene, {**usual, "robot": robot, **changes}), seed)
+
+
+@pytest.mark.parametrize("speed", [0.3, 1.0, 2.5])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_wall_that_the_robot_approaches_is_not_floor(speed: float, seed: int) -> None:
+    assert not find(to_and_fro(speed, seed)).any()
+
+
+def test_wrong_odometry_makes_no_floor_of_walls() -> None:
+    run, rng = to_and_fro(1.0, 0), np.random.default_rng(0)
+    odometry = run.recording.T_odom_base
+    assert odometry is not None
+    n_found = 0
+    for scan in rng.choice(300, 40, replace=False):
+        off = se2.matrix(*rng.normal(0.0, (0.4, 0.4, 0.15)))
+        jump = odometry[scan] @ off @ se2.inverse(odometry[scan])
+        from_then_on, once = odometry.copy(), odometry.copy()
+        from_then_on[scan:] = jump @ odometry[scan:]
+        n_found += find_floor_returns(run.recording, from_then_on).sum()
+        once[scan] = jump @ odometry[scan]
+        found = find_floor_returns(run.recording, once).reshape(300, -1)
+        n_found += np.delete(found, scan, axis=0).sum()
+    assert n_found <= 1e-4 * 40 * run.recording.n_beams
+
+
+def test_order_and_number_of_beams_do_not_matter() -> None:
+    run = drive("hall", laser={"beams": 120}, robot=ROUGH)
+    recording, odometry = run.recording, run.recording.T_odom_base
+    assert odometry is not None
+    found = find(run)
+    rng, T = np.random.default_rng(1), recording.n_scans
+    order = np.concatenate([120 * t + rng.permutation(120) for t in range(T)])
+    keep = rng.random(len(order)) > 0.1
+    offset = np.concatenate([[0], np.cumsum(keep.reshape(T, -1).sum(axis=1))])
+    points = recording.points[order][keep]
+    other = dataclasses.replace(
+        recording, points=points, hit=recording.hit[order][keep], offset=offset
+    )
+    differ = find_floor_returns(other, odometry) != found[order][keep]
+    assert differ.mean() < 0.01
+
+
+def test_unusable_beams_and_short_recordings() -> None:
+    run = drive("hall", laser={"beams": 60}, robot={**ROUGH, "scans": 120})
+    recording, odometry = run.recording, run.recording.T_odom_base
+    assert odometry is not None
+    points, hit = recording.points.copy(), recording.hit.copy()
+    points[::7], hit[::7] = np.nan, False
+    found = find_floor_returns(dataclasses.replace(recording, points=points, hit=hit), odometry)
+    assert found.any()
+    assert not found[::7].any()
+    for T in (0, 1, 2):
+        assert not find_floor_returns(first_scans(recording, T), odometry[:T]).any()
+    none = dataclasses.replace(
+        recording, points=points[:0], hit=hit[:0], offset=np.zeros_like(recording.offset)
+    )
+    assert len(find_floor_returns(none, odometry)) == 0
+
+
+def first_scans(recording: Recording, T: int) -> Recording:
+    odometry, M = recording.T_odom_base, int(recording.offset[T])
+    assert odometry is not None
+    return dataclasses.replace(
+        recording,
+        stamp_ns=recording.stamp_ns[:T],
+        offset=recording.offset[: T + 1],
+        points=recording.points[:M],
+        hit=recording.hit[:M],
+        sensor=recording.sensor[:T],
+        T_odom_base=odometry[:T],
+    )
+
+
+def test_floor_starts_with_a_low_p_static() -> None:
+    run = drive("hall", robot=ROUGH)
+    floor = run.truth.mover == FLOOR
+    options = EmOptions()
+    e = em.initial_p_static(run.recording, "stillmap", options)
+    assert (e[floor] < 0.05).mean() > 0.75
+    assert (e[run.truth.static] == np.float32(options.prior)).mean() > 0.995
+    for estimator, usual in (("paper", options.prior), ("hit-ratio", 1.0)):
+        e = em.initial_p_static(run.recording, estimator, options)
+        assert (e == np.float32(usual)).all()
+    e = em.initial_p_static(run.recording.without_odometry(), "stillmap", options)
+    assert (e == np.float32(options.prior)).all()
