@@ -22,6 +22,7 @@ _SCENES = {
     "office-moved": "things are moved between two visits",
     "warehouse": "50 x 30 m, 12 people, 2 forklifts",
     "warehouse-moved": "racks are emptied and filled overnight",
+    "gallery": "28 x 18 m, mirrors and glass, 8 people",
     "street": "180 m, there and back, 14 cars, 16 pedestrians",
     "street-moved": "parked cars drive off, others park",
     "street-turn": "185 m, one way, waiting and driving cars",

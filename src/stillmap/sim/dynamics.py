@@ -113,7 +113,7 @@ class _World:
         leaves = [door.leaf(door.opened) for door in scene.leaves]
         self._things = scene.things
         things = faces_at_all_places(scene.things)
-        solid = [*scene.walls, *scene.glass, *scene.kerbs, *leaves, *things]
+        solid = [*scene.walls, *scene.glass, *scene.mirrors, *scene.kerbs, *leaves, *things]
         space = FreeSpace(np.array(solid, float))
         planner = Planner(space, start, o.radius + _ROBOT_MARGIN)
         closed = o.scans is not None

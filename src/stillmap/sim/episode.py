@@ -27,7 +27,7 @@ class Episode:
         scene: the world and all parameters.
         seed: of the generator; None where it is unknown.
         motion: poses of everything at each of T scans.
-        walls: (W, 4) static segments: walls, glass, and everything that never moved.
+        walls: (W, 4) static segments: walls, glass, everything that never moved, and mirrors.
         T_odom_base: (T, 3, 3) odometry.
         sensor_rng: generator of a planar laser, or of the first 3D sensor.
         body_rng: generator of body heights, vibration, and a second 3D sensor.
@@ -86,6 +86,8 @@ class Episode:
         """Name, seed and all parameters of the scene as JSON; walls are written as an array."""
         parameters = dataclasses.asdict(self.scene)
         unused = ["walls", "kerbs"] if self.scene.camera.enabled else ["walls", "kerbs", "camera"]
+        if not self.scene.mirrors:
+            unused.append("mirrors")
         if not self.scene.in_3d:
             unused += ["lidar", "rig", "ground", "heights", "pavements"]
         for name in unused:
@@ -107,7 +109,7 @@ def simulate_episode(scene: Scene, rng: np.random.Generator, tell: Progress) -> 
     seed = getattr(rng.bit_generator.seed_seq, "entropy", None)
     crowd_rng, sensor_rng, odometry_rng, door_rng, traffic_rng, *mishap_rngs = rng.spawn(7)
     motion = simulate_motion(scene, (crowd_rng, door_rng, traffic_rng, mishap_rngs[0]), tell)
-    walls = np.array([*scene.walls, *scene.glass, *motion.still], float)
+    walls = np.array([*scene.walls, *scene.glass, *motion.still, *scene.mirrors], float)
     driven = remove_jump(se2.matrix(*motion.robot.T), motion.carried)
     T_odom_base = simulate_odometry(driven, scene.odometry, odometry_rng)
     T_odom_base = add_faults(T_odom_base, motion.seconds, scene.odometry, mishap_rngs[1])

@@ -89,6 +89,9 @@ class LaserOptions(Section, section="laser"):
     range_noise: float = option(0.02, "Standard deviation of ranges, m.", ge=0)
     no_return_share: float = option(0.002, "Share of beams lost anywhere.", ge=0, le=1)
     glass_no_return_share: float = option(0.3, "Share of beams lost on glass.", ge=0, le=1)
+    mirror_return_share: float = option(
+        0.05, "Share of beams that mirrors return instead of reflecting them.", ge=0, le=1
+    )
     sweep_time: float = option(0.0, "Duration of a scan, s; 0: all beams at once.", ge=0)
     x: float = option(0.08, "Sensor ahead of the base, m.")
     y: float = option(0.0, "Sensor to the left of the base, m.")

@@ -144,6 +144,7 @@ class Scene:
         things: movable objects. People and the robot keep clear of all their places.
         lights: where the robot stops while they are red.
         pavements: rectangles x0, y0, x1, y1, a kerb higher than the street, visible to lidars only.
+        mirrors: further segments, which reflect most beams of a planar laser; walls in 3D.
     """
 
     name: str
@@ -168,6 +169,7 @@ class Scene:
     rig: RigOptions = field(default_factory=RigOptions)
     camera: CameraOptions = field(default_factory=CameraOptions)
     pavements: tuple[Segment, ...] = ()
+    mirrors: tuple[Segment, ...] = ()
 
     def __post_init__(self) -> None:
         require(len(self.walls) + len(self.glass) > 0, "a scene needs walls")

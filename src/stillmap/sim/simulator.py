@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.sim import laser, lidar, mishaps, recorder
+from stillmap.sim import laser, lidar, mirrors, mishaps, recorder
 from stillmap.sim.camera import CameraSimulator
 from stillmap.sim.dynamics import Moment, Motion, Progress
 from stillmap.sim.episode import Episode, simulate_episode
@@ -150,12 +150,15 @@ def _record(happening: Episode) -> tuple[Recording, NDArray[np.int32]]:
     sensor = np.arange(T, dtype=np.int32) % o.count
     T_base_sensor = _mounts(o, (o.x, o.y, o.yaw))[sensor]
     exact = cast_sweeps(motion, walls, T_base_sensor, o)
-    exact = _add_bumps(exact, happening, se2.parameters(T_base_sensor)[:, 2])
+    angles = laser.compute_beam_angles(o.beams, o.fov)
+    bearing = se2.parameters(T_base_sensor)[:, 2:]
+    bearing = bearing + (angles if o.upside_down == "no" else -angles)
+    exact = _add_mirrors(exact, happening, T_base_sensor, bearing)
+    exact = _add_bumps(exact, happening, bearing)
     on_glass = laser.find_glass(exact.wall, scene)
     ranges, hit = laser.simulate_measurement(exact.range, on_glass, o, happening.sensor_rng)
     blind = mishaps.find_blind_scans(motion.seconds, o, happening.mishap_rng)
     ranges[blind], hit[blind] = o.max_range, False
-    angles = laser.compute_beam_angles(o.beams, o.fov)
     if o.upside_down == "known":
         angles = -angles
     points = ranges[..., None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
@@ -179,16 +182,30 @@ def _mounts(o: LaserOptions, pose: tuple[float, float, float]) -> Float:
     return np.stack([front, se2.matrix(0.0, 0.0, np.pi) @ front][: o.count])
 
 
-def _add_bumps(exact: Returns, happening: Episode, yaw: Float) -> Returns:
-    """Returns (T, n) with the floor where bumps show it, of lasers at yaw (T,) on the base."""
+def _add_mirrors(
+    exact: Returns, happening: Episode, T_base_sensor: Float, bearing: Float
+) -> Returns:
+    """Returns (T, n) with what mirrors show, of beams at bearings (T, n) in the base frame."""
+    scene, motion, walls = happening.scene, happening.motion, happening.walls
+    if not scene.mirrors:
+        return exact
+    o, rng = scene.laser, happening.mishap_rng
+    by = exact.wall >= len(walls) - len(scene.mirrors)
+    by &= rng.random(by.shape) >= o.mirror_return_share
+    seconds = Sweep.of(o).beam_times(o.beams).astype(np.float64)
+    geometry = (walls, T_base_sensor, bearing, seconds, scene.robot.radius)
+    return mirrors.reflect_beams(exact, by, motion, *geometry)
+
+
+def _add_bumps(exact: Returns, happening: Episode, bearing: Float) -> Returns:
+    """Returns (T, n) with the floor where bumps show it, at bearings (T, n) in the base frame."""
     o, motion, rng = happening.scene.laser, happening.motion, happening.mishap_rng
     bumps = mishaps.simulate_bumps(motion.robot, motion.seconds, happening.scene.robot, rng)
     if not len(bumps.start):
         return exact
-    angles, sweep = laser.compute_beam_angles(o.beams, o.fov), Sweep.of(o)
+    sweep = Sweep.of(o)
     tilt = bumps.tilt(motion.seconds[:, None] + sweep.seconds)
     tilt = np.repeat(tilt, sweep.group, axis=1)[:, : o.beams]
-    bearing = yaw[:, None] + (angles if o.upside_down == "no" else -angles)
     return mishaps.add_floor(exact, bearing, tilt, o.height)
 
 

@@ -35,7 +35,7 @@ class Truth:
     Attributes:
         static: (M,) bool, whether a static surface reflected the beam.
         mover: (M,) int32, id of the mover that reflected the beam; -1: none, -2: the robot itself,
-            -3: the floor, seen by a planar laser that a bump tilted.
+            -3: the floor, seen by a planar laser that a bump tilted, -4: anything in a mirror.
         T_world_base: (T, D+1, D+1) float64 true poses.
         walls: (W, 4) float64 segments x0, y0, x1, y1 in metres.
         movers: (T, P, 3) float64, pose of each mover at each scan: x, y of its center in metres,

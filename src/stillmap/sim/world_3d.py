@@ -32,7 +32,7 @@ class Loop(NamedTuple):
 
 def make_static_world(scene: Scene, ground: Ground) -> StaticSurfaces:
     """Walls, lintels and kerbs as faces; columns, furniture, trees and parked cars as solids."""
-    loops, lines = trace_loops(scene.walls)
+    loops, lines = trace_loops((*scene.walls, *scene.mirrors))
     top = scene.heights.top
     lintels = [door.leaf(door.closed) for door in scene.leaves if scene.heights.doors < top]
     corners = [((x0, y0), (x1, y0), (x1, y1), (x0, y1)) for x0, y0, x1, y1 in scene.pavements]

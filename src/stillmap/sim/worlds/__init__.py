@@ -9,6 +9,7 @@ from stillmap.core.config import override
 from stillmap.core.errors import InputError, closest_match
 from stillmap.sim.scene import Scene
 from stillmap.sim.worlds.drive import drive, street_turn
+from stillmap.sim.worlds.gallery import gallery
 from stillmap.sim.worlds.indoor import corridor, hall, warehouse, warehouse_moved
 from stillmap.sim.worlds.large import building
 from stillmap.sim.worlds.loops import rounds, ten_corridors
@@ -22,6 +23,7 @@ _WORLDS: dict[str, Callable[[], Scene]] = {
     "corridor": corridor,
     "office": office,
     "warehouse": warehouse,
+    "gallery": gallery,
     "street": street,
     "street-turn": street_turn,
     "street-jam": street_jam,

@@ -1,0 +1,104 @@
+"""A mirror shows what lies before it as far behind it."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.config import override
+from stillmap.sim import Scene, Simulation, load_truth, scene_by_name, simulate, write_simulation
+from stillmap.sim.mirrors import MIRRORED
+from stillmap.sim.walls import box, polyline
+
+Float = NDArray[np.float64]
+EXACT = {"range_noise": 0.0, "no_return_share": 0.0, "glass_no_return_share": 0.0}
+
+
+def room(share: float = 0.0, **changes: dict[str, object]) -> Simulation:
+    """A room of 10 x 6 m with a box in it, whose west wall is a mirror, at x = 0."""
+    walls = (*polyline([(0, 0), (10, 0), (10, 6), (0, 6)]), *box(6.0, 4.2, 1.0, 0.6, 0.3))
+    route = ((2.0, 2.0), (8.0, 2.0), (8.5, 5.0), (3.0, 5.0))
+    scene = Scene(name="room", walls=walls, mirrors=((0, 0, 0, 6),), route=route)
+    laser = {**EXACT, "beams": 180, "fov": 2 * math.pi, "mirror_return_share": share}
+    usual = {"laser": laser, "crowd": {"people": 0}, "robot": {"scans": 100}}
+    sections = {k: {**usual.get(k, {}), **changes.get(k, {})} for k in {*usual, *changes}}
+    return simulate(override(scene, sections), 3)
+
+
+def world_points(run: Simulation) -> Float:
+    recording = run.recording
+    return recording.end_points(np.arange(recording.n_beams), run.truth.T_world_base)
+
+
+def seen_in_mirror(run: Simulation) -> NDArray[np.bool_]:
+    return run.truth.mover == MIRRORED
+
+
+def test_what_is_in_the_mirror_lies_on_mirrored_walls(wall_distance) -> None:
+    run = room(robot={"scans": 100, "radius": 1e-3})
+    mirrored, xy = seen_in_mirror(run), world_points(run)
+    assert 0.05 < mirrored.mean() < 0.5
+    assert (xy[mirrored, 0] < 0).all()
+    assert (xy[~mirrored, 0] > -1e-6).all()
+    back = xy[mirrored] * [-1.0, 1.0]
+    scan = run.recording.scans_of(np.flatnonzero(mirrored))
+    is_robot = np.hypot(*(back - run.truth.T_world_base[scan, :2, 2]).T) < 0.01
+    assert wall_distance(back[~is_robot], run.truth.walls).max() < 1e-4
+    assert not run.truth.static[mirrored].any()
+    assert run.truth.static[run.recording.hit & ~mirrored].all()
+
+
+def test_the_robot_sees_itself() -> None:
+    run = room(robot={"scans": 100, "radius": 0.22})
+    mirrored, xy = seen_in_mirror(run), world_points(run)
+    robot = run.truth.T_world_base[run.recording.scans_of(np.arange(run.recording.n_beams)), :2, 2]
+    off = np.hypot(*(xy * [-1.0, 1.0] - robot).T)
+    assert (mirrored & (np.abs(off - 0.22) < 1e-4)).sum() > 10
+
+
+def test_some_beams_return_from_the_mirror_itself() -> None:
+    run = room(0.3)
+    on_mirror = np.abs(world_points(run)[:, 0]) < 1e-4
+    on_mirror &= run.truth.static
+    share = on_mirror.sum() / (on_mirror.sum() + seen_in_mirror(run).sum())
+    assert 0.25 < share < 0.35
+
+
+def test_mirrored_people_are_no_people() -> None:
+    run = room(crowd={"people": 4}, robot={"scans": 100, "radius": 1e-3})
+    mirrored, xy = seen_in_mirror(run), world_points(run)
+    scan = run.recording.scans_of(np.arange(run.recording.n_beams))
+    person = run.truth.movers[scan, :, :2]
+    off = np.hypot(*np.moveaxis((xy * [-1.0, 1.0])[:, None] - person, -1, 0)).min(axis=1)
+    assert (mirrored & (off < 0.45)).sum() > 50
+    assert (xy[run.truth.mover >= 0, 0] > 0).all()
+
+
+def test_ranges_end_at_the_maximum_range() -> None:
+    run = room(laser={"max_range": 5.0})
+    mirrored = seen_in_mirror(run)
+    length = np.hypot(*run.recording.points.T)
+    assert mirrored.any()
+    assert length[mirrored].max() < 5.0
+    assert not run.recording.hit.all()
+
+
+def test_a_sweep_and_a_turned_laser_see_the_same_mirror() -> None:
+    for laser in ({"sweep_time": 0.2}, {"yaw": 1.0, "upside_down": "known"}):
+        run = room(laser=laser, robot={"scans": 60, "turn_rate": 1e-6, "radius": 1e-3})
+        xy = world_points(run)[seen_in_mirror(run)]
+        # the farthest wall in the mirror is the east one
+        assert xy[:, 0].min() < -9.5
+        assert xy[:, 0].min() > -10.3
+
+
+def test_a_gallery_has_truth_in_its_files(tmp_path) -> None:
+    scene = scene_by_name("gallery", {"robot": {"scans": 60}, "laser": {"beams": 90}})
+    run = simulate(scene, 1)
+    write_simulation(run, tmp_path / "sim")
+    truth = load_truth(tmp_path / "sim")
+    assert (truth.mover == MIRRORED).any()
+    np.testing.assert_array_equal(truth.walls[-5:], np.array(scene.mirrors))
+    assert len(truth.scene["mirrors"]) == 5
+    plain = simulate(scene_by_name("hall", {"robot": {"scans": 5}}), 1)
+    assert "mirrors" not in plain.truth.scene
