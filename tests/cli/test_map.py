@@ -11,6 +11,7 @@ import yaml
 from maps import FILES, QUICK, list_files
 from refusals import refused
 
+from stillmap.core.recording import Recording
 from stillmap.io import read, write
 from stillmap.io.trajectory import read_tum
 
@@ -171,6 +172,24 @@ def test_recorded_poses_are_missing(call, room, tmp_path):
     done = call("map", room, "-o", tmp_path / "out", "--poses", "recording")
     refused(done, room, "states no poses", "--poses FILE.tum")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_depth_images_need_poses(call, tmp_path, nothing_left, stated):
+    recording = Recording(
+        stamp_ns=np.arange(2, dtype=np.int64),
+        offset=np.array([0, 4, 8]),
+        points=np.ones((8, 3), np.float32),
+        hit=np.ones(8, np.bool_),
+        T_base_sensor=np.eye(4)[None],
+        sensor=np.zeros(2, np.int32),
+        T_odom_base=None,
+        source={"sensors": [{"name": "depth", "grid": [2, 2]}]},
+        T_recorded_base=np.tile(np.eye(4), (2, 1, 1)) if stated else None,
+    )
+    write(recording, tmp_path / "depth")
+    done = call("map", tmp_path / "depth", "-o", nothing_left)
+    refused(done, "depth images", "--poses recording" if stated else "--poses FILE.tum")
 
 
 def test_poses_may_be_unsorted_more_and_rounded(call, room, tmp_path):

@@ -100,7 +100,12 @@ def test_off_centre_by_options(mapped, good):
 
 
 def test_it_matters_where_it_sits(mapped, good):
-    assert mapped({"FLASER": seen(**FRONT)}) > 2 * good
+    wrong = dict.fromkeys(FRONT_OPTIONS, 0.0)
+    assert mapped({"FLASER": seen(**FRONT)}, **wrong) > 2 * good
+
+
+def test_untold_it_is_found(mapped, good):
+    assert mapped({"FLASER": seen(**FRONT)}) < good
 
 
 def test_backwards(mapped, good):
@@ -116,8 +121,13 @@ def test_upside_down_and_off_centre_by_params(mapped, good):
     assert mapped({"FLASER": seen(**FRONT)}, params, ["FLASER"]) < good
 
 
+def test_upside_down_said_wrongly(mapped, good):
+    wrong = {"flipped": ["FLASER"], "laser_upside_down": False}
+    assert mapped({"FLASER": seen()}, **wrong) > 10 * good
+
+
 def test_upside_down_and_nobody_says_so(mapped, good):
-    assert mapped({"FLASER": seen()}, flipped=["FLASER"]) > 10 * good
+    assert mapped({"FLASER": seen()}, flipped=["FLASER"]) < good
 
 
 @pytest.mark.parametrize(("degrees", "beams"), [(90, 91), (270, 271), (360, 361)])

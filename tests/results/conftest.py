@@ -12,6 +12,7 @@ from stillmap.em import Coverage
 from stillmap.pipeline.options import OutputOptions
 from stillmap.pipeline.snapshots import choose_window, extent, snapshot
 from stillmap.slam import Diagnostics
+from stillmap.slam.mount_calibration import Calibration
 from stillmap.slam.pose_graph import Constraint, PoseGraph
 from stillmap.tracking import FlowMap, MovingObject, ObjectOptions, compute_flow_map
 
@@ -97,6 +98,7 @@ class FakeResult:
     changes: list = field(default_factory=list)
     graph: PoseGraph | None = None
     doubts: Diagnostics = field(default_factory=Diagnostics)
+    calibration: Calibration = field(default_factory=Calibration)
 
     @property
     def deskewed(self) -> Recording:

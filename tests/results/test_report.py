@@ -17,6 +17,7 @@ from stillmap.results.report.figures import (
     VIOLET,
 )
 from stillmap.results.report.page import render_report
+from stillmap.slam.mount_calibration import Calibration, Parameter
 
 VOID = {"meta", "img", "input", "br", "link", "hr"}
 
@@ -311,6 +312,15 @@ def test_likelihoods_that_are_not_finite(result):
 )
 def test_numbers_as_text(function, value, text):
     assert getattr(formatting, function)(value) == text
+
+
+def test_calibration(result):
+    yaw, latency = Parameter(0.0, np.pi, 0.002, True), Parameter(0.0, 0.012, 0.008, False)
+    found = Calibration([{"theta": yaw}], [False], {"latency": latency}, 35)
+    text = " ".join(Page(render_report(dataclasses.replace(result, calibration=found))).text)
+    assert re.search(r"laser, theta\s+0\.0°\s+180\.0 ± 0\.1°\s+estimated", text)
+    assert re.search(r"odometry, latency\s+0\.000 s\s+0\.012 ± 0\.008 s\s+recorded", text)
+    assert "upside down" not in text
 
 
 def test_details_of_the_recording(page):

@@ -6,6 +6,7 @@ import numpy as np
 
 from stillmap.core.json import count_skipped, to_jsonable
 from stillmap.results.run_json import write_run_json
+from stillmap.slam.mount_calibration import Calibration, Parameter
 
 
 def no_constant(name):
@@ -35,6 +36,7 @@ def test_the_keys_that_scripts_rely_on(tmp_path, result):
         "area",
         "warnings",
         "learned",
+        "calibration",
         "doubts",
         "changes",
         "loops",
@@ -73,6 +75,21 @@ def test_iterations(tmp_path, result):
         "seconds": 1.8,
     }
     assert iterations[3]["bound"] is None  # not a number there
+
+
+def test_calibration(tmp_path, result):
+    yaw, scale = Parameter(0.0, 3.14, 0.01, True), Parameter(1.0, 1.02, 0.004, False)
+    found = Calibration([{"theta": yaw}], [True], {"scale": scale}, 35)
+    run = written(tmp_path, dataclasses.replace(result, calibration=found))["calibration"]
+    assert run["windows"] == 35
+    turned = {"recorded": 0.0, "estimated": 3.14, "std": 0.01, "applied": True}
+    assert run["lasers"] == [{"theta": turned, "upside_down": True}]
+    assert run["odometry"]["scale"] == {
+        "recorded": 1.0,
+        "estimated": 1.02,
+        "std": 0.004,
+        "applied": False,
+    }
 
 
 def test_doubts(tmp_path, result):

@@ -15,6 +15,7 @@ from stillmap.core.parallel import limit_blas_threads, resolve_threads
 from stillmap.core.profiling import Progress, StageTimer
 from stillmap.core.recording import Recording
 from stillmap.io import read
+from stillmap.io.cameras import depth_camera_names
 from stillmap.io.registry import detect_format
 from stillmap.io.text_lines import Progress as ReadProgress
 from stillmap.io.trajectory import poses_from_tum
@@ -52,6 +53,7 @@ def read_inputs(
         if args.no_odometry:
             recording = recording.without_odometry()
         poses = _read_poses(args, recording)
+        _require_depth_poses(recording, poses, args.input)
         with show_share(args.quiet, "reading") as progress:
             tilting = _read_tilting_laser(
                 args.input, args.tilting, recording, options, progress, scratch
@@ -91,6 +93,21 @@ def _read_poses(args: argparse.Namespace, recording: Recording) -> NDArray[np.fl
             hint="--poses FILE.tum gives them; a file of the name `recording` is ./recording",
         )
     return recording.T_recorded_base
+
+
+def _require_depth_poses(
+    recording: Recording, poses: NDArray[np.float64] | None, path: str
+) -> None:
+    """Refuse depth images without poses: their narrow view is not registered."""
+    if poses is not None or recording.T_odom_base is not None:
+        return
+    if depth_camera_names(recording.source):
+        stated = recording.T_recorded_base is not None
+        raise InputError(
+            "holds depth images, whose poses have to be given",
+            where=path,
+            hint="--poses recording" if stated else "--poses FILE.tum",
+        )
 
 
 def _read_tilting_laser(

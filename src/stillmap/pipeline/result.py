@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +14,14 @@ from stillmap.core.parallel import limit_blas_threads
 from stillmap.core.profiling import Progress, StageTimer, no_progress
 from stillmap.core.recording import Recording
 from stillmap.mapping import Change
+from stillmap.pipeline.calibration import calibrate_recording
 from stillmap.pipeline.diagnostics import find_warnings
 from stillmap.pipeline.em_loop import iterate
 from stillmap.pipeline.estimate import EmState, Estimate, IterationRecord
 from stillmap.pipeline.final_map import Maps, final_estimate, find_objects, make_maps
 from stillmap.pipeline.options import DEFAULTS, Options, resolve_options
 from stillmap.pipeline.snapshots import Snapshot
+from stillmap.slam.mount_calibration import Calibration
 from stillmap.tracking import FlowMap, MovingObject, compute_flow_map
 
 Float = NDArray[np.float64]
@@ -30,7 +32,7 @@ class MappingResult:
     """A mapped recording of T scans with M beams; `stillmap.Result` adds saving.
 
     Attributes:
-        recording: the input.
+        recording: the input, calibrated.
         options: every option as resolved.
         iterations: the numbers of every iteration.
         snapshots: a part of the map at the first, second, best and last iteration (Fig. 8).
@@ -42,6 +44,7 @@ class MappingResult:
         traffic: how often objects crossed each square of the floor.
         changes: places where something appeared, disappeared, or comes and goes.
         stages: seconds and peak memory.
+        calibration: poses of the lasers and errors of odometry, as the motion shows them.
     """
 
     recording: Recording
@@ -56,6 +59,7 @@ class MappingResult:
     traffic: FlowMap
     changes: list[Change]
     stages: Mapping[str, Mapping[str, Any]]
+    calibration: Calibration = field(default_factory=Calibration)
 
     @property
     def poses(self) -> Float:
@@ -130,6 +134,8 @@ def map_recording(
 ) -> MappingResult:
     """Maps a recording: EM until the bound stops improving, then maps, changes and objects.
 
+    Without given poses, mounts of the lasers and errors of odometry are calibrated first.
+
     Args:
         recording, options, poses, progress, stages, scratch: see `stillmap.iterate`.
         resume: state of an interrupted run with the same arguments.
@@ -145,6 +151,10 @@ def map_recording(
         recording = dataclasses.replace(recording, scratch=scratch)
     stages = stages or StageTimer()
     options = resolve_options(options, recording)
+    found, notes = Calibration(), list[str]()
+    if poses is None:
+        with stages.measure("calibration"):
+            recording, found, notes = calibrate_recording(recording, options)
     state = resume or EmState(options)
     # given poses leave nothing to iterate on in 3D, where the E-step does not depend on the labels
     state.single_pass = (
@@ -159,7 +169,9 @@ def map_recording(
         if checkpoint is not None:
             checkpoint(state)
     del steps  # holds labels and poses of the last iteration
-    return _finish(state, recording, progress, stages)
+    result = _finish(state, recording, progress, stages)
+    warnings = [*result.warnings, *notes]
+    return dataclasses.replace(result, calibration=found, warnings=warnings)
 
 
 def _finish(

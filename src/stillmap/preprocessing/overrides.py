@@ -69,10 +69,10 @@ def _apply_laser_options(recording: Recording, number: int, laser: LaserOptions)
     pose = (r if g is None else g for r, g in zip(recorded, laser.pose, strict=True))
     T[number] = se2.matrix(*pose)
     changed = replace(recording, T_base_sensor=T)
-    return _mirror_beams(changed, number) if laser.upside_down else changed
+    return mirror_beams(changed, number) if laser.upside_down else changed
 
 
-def _mirror_beams(recording: Recording, number: int) -> Recording:
+def mirror_beams(recording: Recording, number: int) -> Recording:
     """Negate the y coordinate of all points of one laser."""
     points = arrays.copy(recording.points, recording.scratch)
     scans = np.flatnonzero(recording.sensor == number).tolist()

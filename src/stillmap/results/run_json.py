@@ -16,6 +16,7 @@ from stillmap.results.map_npz import known_area
 from stillmap.results.objects import MILLIMETRES
 from stillmap.rig.build import TiltingResult
 from stillmap.slam import LoopClosure
+from stillmap.slam.mount_calibration import Calibration, Parameter
 
 FORMAT_VERSION = 1
 
@@ -49,6 +50,7 @@ def run_record(result: MappingResult, more: Mapping[str, Any] | None = None) -> 
         "area": known_area(result),
         "warnings": list(result.warnings),
         "learned": result.learned,
+        "calibration": _calibration(result.calibration),
         "doubts": {
             "odometry_disagrees": result.doubts.odometry_faults,
             "found_by_wider_search": result.doubts.widened,
@@ -93,6 +95,26 @@ def tilting_record(tilting: TiltingResult) -> dict[str, Any]:
         "boxes": tilting.boxes_hit,
         "objects": len(tilting.objects),
         "learned": tilting.learned,
+    }
+
+
+def _calibration(found: Calibration) -> dict[str, Any]:
+    return {
+        "windows": found.windows,
+        "lasers": [
+            {**{name: _parameter(one) for name, one in laser.items()}, "upside_down": mirrored}
+            for laser, mirrored in zip(found.lasers, found.upside_down, strict=True)
+        ],
+        "odometry": {name: _parameter(one) for name, one in found.odometry.items()},
+    }
+
+
+def _parameter(one: Parameter) -> dict[str, Any]:
+    return {
+        "recorded": one.nominal,
+        "estimated": one.value,
+        "std": one.std,
+        "applied": one.significant,
     }
 
 

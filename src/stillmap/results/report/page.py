@@ -19,10 +19,20 @@ from stillmap.results.report.maps import changes_data, evolution_data, map_data
 from stillmap.results.report.objects import objects_data, rig_data
 from stillmap.results.report.previews import ModelPreviews, models_data
 from stillmap.rig.build import TiltingResult
+from stillmap.slam.mount_calibration import Parameter
 
 if TYPE_CHECKING:
     from jinja2 import Environment
 
+# factor, unit and digits of what is calibrated
+_CALIBRATION_UNITS = {
+    "theta": (180.0 / math.pi, "°", 1),
+    "x": (1.0, " m", 3),
+    "y": (1.0, " m", 3),
+    "scale": (1.0, "", 3),
+    "rotation_gain": (1.0, "", 3),
+    "latency": (1.0, " s", 3),
+}
 _MIN_DYNAMIC = 100  # dynamic returns below which the weights of dynamic classes mean little
 
 
@@ -40,6 +50,7 @@ def render_report(
         "rig": rig_data(result, tilting),
         "models": models_data(previews),
         "fitted": fitted_data(result),
+        "calibration": calibration_data(result),
         "convergence": convergence_data(result),
         "evolution": evolution_data(result),
         "source": _source_data(result),
@@ -149,6 +160,28 @@ def fitted_data(result: MappingResult) -> dict[str, Any] | None:
             for name in ("static_occupied", "mover_seconds", "mover_occupied")
         },
     }
+
+
+def calibration_data(result: MappingResult) -> list[tuple[str, str, str, str]]:
+    """Rows of what the motion shows of mounts and odometry: what, recorded, estimated, used."""
+    found, rows = result.calibration, []
+    for k, laser in enumerate(found.lasers):
+        which = "laser" if len(found.lasers) == 1 else f"laser {k + 1}"
+        if found.upside_down[k]:
+            rows.append((f"{which}, mounting", "upright", "upside down", "estimated"))
+        rows += [_calibration_row(f"{which}, {name}", name, one) for name, one in laser.items()]
+    return rows + [
+        _calibration_row(f"odometry, {name.replace('_', ' ')}", name, one)
+        for name, one in found.odometry.items()
+    ]
+
+
+def _calibration_row(what: str, name: str, one: Parameter) -> tuple[str, str, str, str]:
+    factor, unit, digits = _CALIBRATION_UNITS[name]
+    nominal, value, std = (factor * v for v in (one.nominal, one.value, one.std))
+    estimated = f"{value:.{digits}f} ± {std:.{digits}f}{unit}"
+    used = "estimated" if one.significant else "recorded"
+    return what, f"{nominal:.{digits}f}{unit}", estimated, used
 
 
 def _source_data(result: MappingResult) -> dict[str, Any]:

@@ -1,0 +1,142 @@
+"""Calibration of a recording before it is mapped: what nobody told is estimated and put right."""
+
+import dataclasses
+import math
+
+import numpy as np
+
+from stillmap.core import se2
+from stillmap.core.recording import Recording
+from stillmap.pipeline.options import Options
+from stillmap.preprocessing.overrides import mirror_beams
+from stillmap.slam.hand_eye import GAIN, SCALE, correct_odometry
+from stillmap.slam.mount_calibration import (
+    LATENCY,
+    POSITION,
+    UPSIDE_DOWN,
+    YAW,
+    Calibration,
+    Parameter,
+    calibrate_mounts,
+)
+
+
+def calibrate_recording(
+    recording: Recording, options: Options
+) -> tuple[Recording, Calibration, list[str]]:
+    """The recording with the poses of its lasers and its odometry as its own motion shows them.
+
+    Args:
+        recording: as read.
+        options: what `options.read` gives, and what transforms or PARAMs of the recording state,
+            stays.
+
+    Returns:
+        The recording, itself where nothing is significantly wrong; the calibration; and a sentence
+        for everything that was changed.
+    """
+    told = [_told(recording, options, k) for k in range(len(recording.T_base_sensor))]
+    found = calibrate_mounts(recording, options.slam.resolution, told)
+    sentences: list[str] = []
+    for k, laser in enumerate(found.lasers):
+        if found.upside_down[k]:
+            recording = mirror_beams(recording, k)
+        if any(one.significant for one in laser.values()):
+            recording = _place_laser(recording, k, laser)
+        which = "the laser" if len(found.lasers) == 1 else f"laser {k + 1}"
+        sentences += _laser_sentences(which, laser, found.upside_down[k])
+    if any(one.significant for one in found.odometry.values()):
+        recording = _correct(recording, found)
+        sentences += _odometry_sentences(found.odometry)
+    return recording, found, sentences
+
+
+def _told(recording: Recording, options: Options, laser: int) -> set[str]:
+    """What is known of a laser: given by the user, by transforms or by PARAMs of the log."""
+    given = options.read.laser(laser)
+    told = {
+        name for name, value in zip((*POSITION, YAW), given.pose, strict=True) if value is not None
+    }
+    if given.upside_down is not None:
+        told.add(UPSIDE_DOWN)
+    sensors = recording.source.get("sensors")
+    notes = sensors[laser] if isinstance(sensors, list) and laser < len(sensors) else {}
+    notes = notes if isinstance(notes, dict) else {}
+    extrinsics = notes.get("extrinsics")
+    how = str(extrinsics.get("how")) if isinstance(extrinsics, dict) else ""
+    if how.startswith(("TF", "PARAM", "given")):
+        told |= {YAW, *POSITION}
+    if how.startswith("TF") or notes.get("upside_down_how") in ("given", "PARAM"):
+        told.add(UPSIDE_DOWN)
+    return told
+
+
+def _place_laser(recording: Recording, k: int, laser: dict[str, Parameter]) -> Recording:
+    x, y, theta = se2.parameters(recording.T_base_sensor[k]).tolist()
+    known = {"x": x, "y": y, YAW: theta, **{name: one.applied for name, one in laser.items()}}
+    T_base_sensor = np.array(recording.T_base_sensor)
+    T_base_sensor[k] = se2.matrix(known["x"], known["y"], known[YAW])
+    return dataclasses.replace(recording, T_base_sensor=T_base_sensor)
+
+
+def _correct(recording: Recording, found: Calibration) -> Recording:
+    assert recording.T_odom_base is not None
+    seconds = 1e-9 * (recording.stamp_ns - recording.stamp_ns[0])
+    latency = found.odometry.get(LATENCY)
+    odometry = correct_odometry(
+        seconds,
+        recording.T_odom_base,
+        scale=found.odometry[SCALE].applied,
+        rotation_gain=found.odometry[GAIN].applied,
+        latency=0.0 if latency is None else latency.applied,
+    )
+    return dataclasses.replace(recording, T_odom_base=odometry)
+
+
+def _laser_sentences(which: str, laser: dict[str, Parameter], upside_down: bool) -> list[str]:
+    out = []
+    if upside_down:
+        out.append(f"{which} hangs upside down, as its motion shows: its scans are mirrored")
+    yaw = laser.get(YAW)
+    if yaw is not None and yaw.significant:
+        value, std, nominal = (math.degrees(v) for v in (yaw.value, yaw.std, yaw.nominal))
+        out.append(
+            f"{which} is turned by {value:.1f} +- {std:.1f} degrees on the robot, as its motion "
+            f"shows, not by {nominal:.1f} as recorded: used"
+        )
+    place = [laser[name] for name in POSITION if name in laser]
+    if any(one.significant for one in place):
+        here, recorded = (
+            " and ".join(
+                f"{getattr(laser[name], what):.2f} m {side}"
+                for name, side in zip(POSITION, ("ahead", "left"), strict=True)
+                if name in laser
+            )
+            for what in ("value", "nominal")
+        )
+        out.append(
+            f"{which} is {here} of the robot's centre (+- {max(one.std for one in place):.3f} m), "
+            f"as its motion shows, not {recorded} as recorded: used"
+        )
+    return out
+
+
+def _odometry_sentences(odometry: dict[str, Parameter]) -> list[str]:
+    out = []
+    for name, what in ((SCALE, "distance"), (GAIN, "rotation")):
+        one = odometry[name]
+        if one.significant:
+            percent, std = 100.0 * (one.value - 1.0), 100.0 * one.std
+            more = "more" if percent > 0 else "less"
+            out.append(
+                f"odometry counts {abs(percent):.1f} +- {std:.1f} % {more} {what} than the scans "
+                "show: corrected"
+            )
+    latency = odometry.get(LATENCY)
+    if latency is not None and latency.significant:
+        when = "late" if latency.value > 0 else "early"
+        out.append(
+            f"odometry is {abs(latency.value):.2f} +- {latency.std:.2f} s {when} against the "
+            "scans: corrected"
+        )
+    return out

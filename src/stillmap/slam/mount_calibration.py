@@ -1,0 +1,283 @@
+"""What is wrong with the poses of lasers on the robot and with odometry, from the motion itself.
+
+A few short stretches are followed by their scans alone. Where odometry and the scans then disagree
+by more than the motion model forgives, more stretches are followed, and what is significant there
+is the calibration; all else keeps its nominal value.
+"""
+
+import dataclasses
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core import se2
+from stillmap.core.recording import Recording
+from stillmap.slam.hand_eye import (
+    GAIN,
+    SCALE,
+    Fit,
+    HandEye,
+    Values,
+    correct_odometry,
+    laser_names,
+)
+from stillmap.slam.scan_motion import MotionWindows, measure_motion, select_segments
+from stillmap.slam.turn_rates import fit_latency
+
+Float = NDArray[np.float64]
+
+YAW, POSITION, UPSIDE_DOWN, LATENCY = "theta", ("x", "y"), "upside_down", "latency"
+
+# what matters: less is within the motion model's own uncertainty, or, of a laser's position, makes
+# less of a difference than whether poses are said of the laser or of the robot's centre. rad, m
+# (both coordinates together), shares, s
+_MATTERS = {"theta": 0.05, "x": 0.15, "y": 0.15, SCALE: 0.05, GAIN: 0.06, LATENCY: 0.1}
+_STDS = 5.0  # standard deviations that are significant
+_FIRST_WINDOWS, _MORE_WINDOWS = 40, 100  # of each laser, at first and where something is found
+_MIN_WINDOWS = 12  # less motion says nothing
+_SUSPICIOUS = 0.8  # of what matters: more windows are measured
+_MIN_GAIN = 20.0  # nats by which a calibration, or mirrored scans, must agree better in all
+# segments in which a calibration must gain so many nats, and the sum of all gains over all losses
+_MIN_SEGMENTS, _CLEAR_GAIN, _MIN_RATIO = 3, 1.0, 3.0
+_MAX_INTERVAL = 0.3  # s between scans; slower ones do not show how late odometry is
+_MIN_EXPLAINED = 0.5  # share of odometry's turns that the scans' explain
+_HALVES = 0.35  # share of the latency by which either half of the segments may differ
+_MAX_LASERS = 4  # more: a laser that moves on its robot has a pose for each scan
+_LIMITS = {SCALE: (0.4, 2.5), GAIN: (0.4, 2.5)}  # beyond, odometry says nothing of this robot
+_MAX_POSITION = 3.0  # m on a robot
+_P_STATIC = 0.7  # of every beam: nobody knows yet who moves
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One quantity that was calibrated.
+
+    Attributes:
+        nominal: as recorded.
+        value: as estimated.
+        std: standard deviation.
+        significant: whether the difference is certain and large enough to matter.
+    """
+
+    nominal: float
+    value: float
+    std: float
+    significant: bool
+
+    @property
+    def applied(self) -> float:
+        """The value to use."""
+        return self.value if self.significant else self.nominal
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Poses of lasers and errors of odometry.
+
+    Attributes:
+        lasers: of each laser its `theta` (rad), `x`, `y` (m).
+        upside_down: of each laser whether its scans have to be mirrored.
+        odometry: `scale` and `rotation_gain`, recorded over true, and `latency` in s; what the
+            recording does not show is missing, here and in `lasers`.
+        windows: motions that were compared.
+    """
+
+    lasers: list[dict[str, Parameter]] = field(default_factory=list)
+    upside_down: list[bool] = field(default_factory=list)
+    odometry: dict[str, Parameter] = field(default_factory=dict)
+    windows: int = 0
+
+
+def calibrate_mounts(
+    recording: Recording, resolution: float, told: Sequence[Collection[str]] = ()
+) -> Calibration:
+    """Compares the motions of the lasers with odometry's.
+
+    Args:
+        recording: 2D; without odometry, or of a laser that moves on its robot, nothing is found.
+        resolution: m, edge of a map cell.
+        told: of each laser what is known, of "theta", "x", "y" and "upside_down".
+    """
+    lasers = len(recording.T_base_sensor)
+    if recording.dimension != 2 or recording.T_odom_base is None or lasers > _MAX_LASERS:
+        return Calibration()
+    told = list(told) or [()] * lasers
+    found = _Calibrator(recording, resolution, told, _FIRST_WINDOWS).calibrate()
+    if not _is_suspicious(found):
+        return found
+    return _Calibrator(recording, resolution, told, _MORE_WINDOWS).calibrate()
+
+
+def _is_suspicious(found: Calibration) -> bool:
+    if any(found.upside_down):
+        return True
+    named = [*found.odometry.items()] + [item for one in found.lasers for item in one.items()]
+    return any(_excess(name, one) > _SUSPICIOUS for name, one in named)
+
+
+def _excess(name: str, one: Parameter) -> float:
+    """Difference over what matters; 0 where it may be chance."""
+    difference = _difference(name, one.value, one.nominal)
+    return abs(difference) / _MATTERS[name] if abs(difference) > 2.0 * one.std else 0.0
+
+
+def _kind(name: str) -> str:
+    """The name of a parameter without the number of its laser."""
+    return name.rstrip("0123456789")
+
+
+def _difference(name: str, value: float, nominal: float) -> float:
+    d = value - nominal
+    return float(se2.wrap(d)) if name.startswith("theta") else d
+
+
+class _Calibrator:
+    """One calibration from about so many motion windows of each laser."""
+
+    def __init__(
+        self,
+        recording: Recording,
+        resolution: float,
+        told: Sequence[Collection[str]],
+        windows: int,
+    ) -> None:
+        assert recording.T_odom_base is not None
+        self.told, self.odometry = told, recording.T_odom_base
+        self.seconds = 1e-9 * (recording.stamp_ns - recording.stamp_ns[0])
+        lasers = len(recording.T_base_sensor)
+        centred = dataclasses.replace(recording, T_base_sensor=np.tile(np.eye(3), (lasers, 1, 1)))
+        e = recording.allocate_per_beam(np.float32)
+        e[:] = _P_STATIC
+        self.windows = [
+            measure_motion(centred, e, select_segments(recording, k, windows), resolution)
+            for k in range(lasers)
+        ]
+        self.nominal: Values = {SCALE: 1.0, GAIN: 1.0}
+        for k, pose in enumerate(se2.parameters(recording.T_base_sensor)):
+            x, y, theta = pose.tolist()
+            self.nominal.update(zip(laser_names(k), (theta, x, y), strict=True))
+        self.count = sum(len(one.first) for one in self.windows)
+
+    def calibrate(self) -> Calibration:
+        """Latency, then which way up, then all else; what is not significant stays nominal."""
+        if min(len(one.first) for one in self.windows) < _MIN_WINDOWS:
+            return Calibration(windows=self.count)
+        latency = self._latency()
+        T = self.odometry
+        if latency is not None and latency.significant:
+            T = correct_odometry(
+                self.seconds, T, scale=1.0, rotation_gain=1.0, latency=latency.value
+            )
+        upside_down = [self._is_upside_down(k, T) for k in range(len(self.windows))]
+        problem = HandEye(self.windows, upside_down, self.seconds, T, self.nominal)
+        free = [name for k in range(len(self.windows)) for name in self._free_names(k)]
+        everything = problem.fit_globally([*free, SCALE, GAIN])
+        kept, final = self._select(problem, everything)
+        parameters = {}
+        for name in everything.std:
+            fit = final if name in kept else everything
+            parameters[name] = Parameter(
+                self.nominal[name], fit.values[name], fit.std[name], name in kept
+            )
+        odometry = {name: parameters[name] for name in (SCALE, GAIN)}
+        if latency is not None:
+            odometry[LATENCY] = latency
+        lasers = [
+            {_kind(name): parameters[name] for name in self._free_names(k)}
+            for k in range(len(self.windows))
+        ]
+        return Calibration(lasers, upside_down, odometry, self.count)
+
+    def _free_names(self, laser: int) -> list[str]:
+        return [name for name in laser_names(laser) if _kind(name) not in self.told[laser]]
+
+    def _latency(self) -> Parameter | None:
+        """By the laser that shows it best; None where none does."""
+        fits = []
+        for one in self.windows:
+            steps = np.diff(self.seconds[one.steps], axis=1)
+            if float(np.median(steps)) <= _MAX_INTERVAL:
+                fits.append((fit_latency(one, self.seconds, self.odometry), one))
+        fits = [(fit, one) for fit, one in fits if fit.explained > _MIN_EXPLAINED]
+        if not fits:
+            return None
+        fit, one = min(fits, key=lambda pair: pair[0].std)
+        is_certain = abs(fit.latency) > max(_MATTERS[LATENCY], _STDS * fit.std)
+        return Parameter(
+            0.0, fit.latency, fit.std, is_certain and self._halves_agree(one, fit.latency)
+        )
+
+    def _halves_agree(self, one: MotionWindows, latency: float) -> bool:
+        """Whether every second segment alone shows about the same latency."""
+        segment = np.arange(int(one.segment.max()) + 1)
+        halves = (
+            fit_latency(one, self.seconds, self.odometry, segment % 2 == side) for side in (0, 1)
+        )
+        return all(abs(half.latency - latency) < _HALVES * abs(latency) for half in halves)
+
+    def _is_upside_down(self, k: int, T: Float) -> bool:
+        """Whether a laser's motion agrees with odometry's only if its scans are mirrored."""
+        if UPSIDE_DOWN in self.told[k]:
+            return False
+        one, costs = self.windows[k], []
+        nominal = {SCALE: 1.0, GAIN: 1.0}
+        for name, of_laser in zip(laser_names(0), laser_names(k), strict=True):
+            nominal[name] = self.nominal[of_laser]
+        free = [name for name in laser_names(0) if _kind(name) not in self.told[k]]
+        for mirrored in (False, True):
+            problem = HandEye([one], [mirrored], self.seconds, T, nominal)
+            fit = problem.fit_globally([*free, SCALE, GAIN])
+            costs.append(np.bincount(one.segment, fit.cost))
+        return _is_clear(costs[0] - costs[1])
+
+    def _select(self, problem: HandEye, everything: Fit) -> tuple[list[str], Fit]:
+        """The significant parameters, fitted with all others at their nominal values."""
+        kept, fit = list(everything.std), everything
+        while (significant := self._significant(fit, kept)) != kept:
+            kept = significant
+            start = {n: fit.values[n] if n in kept else v for n, v in self.nominal.items()}
+            fit = problem.fit(start, kept)
+        return (kept, fit) if self._is_better(problem, fit, kept) else ([], fit)
+
+    def _significant(self, fit: Fit, names: Sequence[str]) -> list[str]:
+        out = []
+        for name in names:
+            pair = [name]
+            if _kind(name) in POSITION:  # one vector
+                pair = [n for n in (f"x{name[1:]}", f"y{name[1:]}") if n in names]
+            d = np.array([_difference(n, fit.values[n], self.nominal[n]) for n in pair])
+            std = np.array([fit.std[n] for n in pair])
+            matters = _MATTERS[_kind(name)]
+            if (
+                float(np.linalg.norm(d)) > matters > float(std.max())
+                and float(np.linalg.norm(d / std)) > _STDS
+            ):
+                out.append(name)
+        return out
+
+    def _is_better(self, problem: HandEye, fit: Fit, kept: Sequence[str]) -> bool:
+        """Whether it is plausible, and segments agree better that it was not fitted to."""
+        for name, (low, high) in _LIMITS.items():
+            if not low < fit.values[name] < high:
+                return False
+        if any(abs(fit.values[n]) > _MAX_POSITION for n in kept if _kind(n) in POSITION):
+            return False
+        nominal, gain = problem.fit(self.nominal, []), np.zeros(int(problem.segment.max()) + 1)
+        for side in (0, 1):
+            use = problem.segment % 2 == side
+            half = problem.fit(fit.values, kept, use)
+            gain += np.bincount(problem.segment, (nominal.cost - half.cost) * ~use)
+        return _is_clear(gain)
+
+
+def _is_clear(gain: NDArray[Any]) -> bool:
+    """Whether gains (S,) of segments, in nats, are evidence: in sum, in several, against few."""
+    loss = -float(gain.sum(where=gain < 0.0))
+    return bool(
+        gain.sum() > _MIN_GAIN
+        and np.count_nonzero(gain > _CLEAR_GAIN) >= _MIN_SEGMENTS
+        and gain.sum() + loss > _MIN_RATIO * loss
+    )
