@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from stillmap.core import components
 from stillmap.core.components import connected_components, neighbor_pairs
 
 
@@ -27,6 +28,22 @@ def test_no_cells_no_pairs(n):
     pairs = neighbor_pairs(np.empty((n, 2), np.int64), 3.0)
     assert pairs.shape == (0, 2)
     assert [one.tolist() for one in connected_components(pairs, n)] == [[0]] * n
+
+
+def test_many_cells_are_paired_as_few_are(monkeypatch):
+    rng = np.random.default_rng(0)
+    for dimension, radius in ((2, 2.0), (3, 3.0)):
+        cells = rng.integers(0, 30, (250, dimension))
+        few = neighbor_pairs(cells, radius)
+        few_labels = components.component_labels(few, 250)
+        with monkeypatch.context() as patch:
+            patch.setattr(components, "_FEW", 0)
+            many = neighbor_pairs(cells, radius)
+            assert held(few) == held(many)
+            assert len(few) == len(many) > 50
+            many_labels = components.component_labels(many, 250)
+        np.testing.assert_array_equal(few_labels, many_labels)
+        assert 5 < few_labels.max() < 245
 
 
 def test_components():

@@ -16,7 +16,7 @@ import pytest
 from stillmap.core.config import load_toml, override, parse_assignment
 from stillmap.core.errors import InputError
 from stillmap.eval import readers
-from stillmap.io import read, registry, stillmap_folder, text_lines, writers
+from stillmap.io import read, stillmap_folder, text_lines, writers
 from stillmap.io.carmen import log as log_module
 from stillmap.io.trajectory import read_tum
 from stillmap.preprocessing.options import ReadOptions
@@ -172,7 +172,7 @@ def test_what_happens_while_reading(log, monkeypatch, error):
     def fails(*_):
         raise error
 
-    monkeypatch.setattr(registry.reader, "read_log", fails)
+    monkeypatch.setattr("stillmap.io.carmen.reader.read_log", fails)
     with pytest.raises(InputError, match=r"cannot be read: gone|does not fit into memory"):
         read(log([FLASER]))
 

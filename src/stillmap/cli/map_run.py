@@ -22,14 +22,13 @@ from stillmap.io.trajectory import poses_from_tum
 from stillmap.pipeline.checkpoint import CheckpointFolder, DamagedCheckpoint
 from stillmap.pipeline.checkpoint_files import identify_run
 from stillmap.pipeline.estimate import EmState
-from stillmap.pipeline.models import build_models
 from stillmap.pipeline.options import Options, resolve_options
 from stillmap.preprocessing.options import ReadOptions
 from stillmap.results.result import Result, build
-from stillmap.rig.build import PlanarResult, TiltingResult, build_tilting, check_rig
 
 if TYPE_CHECKING:
     from stillmap.mesh.build import Models
+    from stillmap.rig.build import TiltingResult
 
 
 class Inputs(NamedTuple):
@@ -144,6 +143,8 @@ def _read_tilting_laser(
         # a topic chosen for INPUT is not in the other recording
         read_as = dataclasses.replace(options.read, topic=None)
         tilting = read(Path(str(tilting_path)), read_as, progress=progress, scratch=scratch)
+    from stillmap.rig.build import check_rig  # only a rig needs it
+
     path = tilting_path or planar_path
     check_rig(planar, tilting, path)
     return dataclasses.replace(tilting, source={**tilting.source, "path": path})
@@ -194,11 +195,13 @@ def build_all(
 
 
 def _build_models(
-    result: Result, tilting: TiltingResult | None, progress: Progress, stages: StageTimer
+    result: Result, tilting: "TiltingResult | None", progress: Progress, stages: StageTimer
 ) -> "tuple[Models | None, list[str]]":
     """Build the meshes of a 3D recording where they are enabled; return them and warnings."""
     if not result.options.mesh.enabled or (tilting is None and result.recording.dimension == 2):
         return None, []
+    from stillmap.pipeline.models import build_models  # meshes take long to load
+
     try:
         models = build_models(result, tilting=tilting, progress=progress, stages=stages)
     except MissingExtra as error:
@@ -239,8 +242,10 @@ def _load_checkpoint(
 
 
 @limit_blas_threads()
-def _map_tilting_laser(result: Result, tilting: Recording, options: Options) -> TiltingResult:
+def _map_tilting_laser(result: Result, tilting: Recording, options: Options) -> "TiltingResult":
     """Map the tilting laser in 3D, given the labels and objects of the planar one."""
+    from stillmap.rig.build import PlanarResult, build_tilting
+
     planar = PlanarResult(result.deskewed, result.poses, result.p_static, result.objects)
     threads = resolve_threads(options.threads)
     return build_tilting(planar, tilting, options.rig, options.objects, options.em, threads)

@@ -1,16 +1,23 @@
 """Thread counts and ordered parallel map; results do not depend on the number of threads."""
 
 import os
+import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import TypeVar
 
-from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
+from threadpoolctl import ThreadpoolController  # type: ignore[import-untyped]
 
 _Item = TypeVar("_Item")
 _Outcome = TypeVar("_Outcome")
+
+# read by a BLAS when it is loaded
+_BLAS_VARIABLES = (
+    *("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"),
+    *("BLIS_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"),
+)
 
 
 def resolve_threads(requested: int) -> int:
@@ -28,11 +35,33 @@ def limit_blas_threads() -> Iterator[None]:
 
     Matrices are small, kernels have threads of their own, and the busy waiting of BLAS threads
     costs more than the work on a loaded machine. It also makes sums independent of the processors.
+    SciPy, whose BLAS is another one than NumPy's, may be loaded within: its BLAS then begins with
+    one thread, and gets as many as there are processors afterwards.
     """
-    import scipy.linalg  # noqa: F401  (SciPy has a BLAS of its own; slow to load)
-
-    with threadpool_limits(limits=1, user_api="blas"):
+    had_scipy = "scipy.linalg" in sys.modules
+    limited = ThreadpoolController()
+    with limited.limit(limits=1, user_api="blas"), _set_variables(_BLAS_VARIABLES, "1"):
         yield
+    if not had_scipy and "scipy.linalg" in sys.modules:
+        known = {library.filepath for library in limited.lib_controllers}
+        for library in ThreadpoolController().select(user_api="blas").lib_controllers:
+            if library.filepath not in known:
+                library.set_num_threads(resolve_threads(0))
+
+
+@contextmanager
+def _set_variables(names: Iterable[str], value: str) -> Iterator[None]:
+    """Set environment variables within the block."""
+    before = {name: os.environ.get(name) for name in names}
+    os.environ.update(dict.fromkeys(before, value))
+    try:
+        yield
+    finally:
+        for name, old in before.items():
+            if old is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = old
 
 
 def map_ordered(

@@ -5,6 +5,7 @@ The table of formats that are written is in `writers.py`.
 
 from collections.abc import Callable
 from dataclasses import replace
+from importlib import import_module
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -13,19 +14,14 @@ import numpy as np
 
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.io import cameras, rgbd, stillmap_folder
+from stillmap.io import stillmap_folder
 from stillmap.io.builder import ReadContext
-from stillmap.io.carmen import reader
 from stillmap.io.carmen.messages import SCAN_PARSERS
-from stillmap.io.point_cloud import e57, kitti, las, pcd, ply, threedtk
-from stillmap.io.point_cloud.files import contains_files, has_extension
-from stillmap.io.point_cloud.pcd import is_pcd
+from stillmap.io.point_cloud import signatures
 from stillmap.io.ros import bag_types
 from stillmap.io.text_lines import Progress, read_head
-from stillmap.preprocessing import self_filter
 from stillmap.preprocessing.options import ReadOptions
 from stillmap.preprocessing.overrides import apply_options
-from stillmap.preprocessing.scan_timing import add_beam_times
 
 RIG_FOLDERS = ("horizontal", "tilting")  # of the two recordings of a simulated robot
 
@@ -68,47 +64,69 @@ def _read_stillmap_folder(path: Path, context: ReadContext) -> Recording:
     return apply_options(stillmap_folder.read(folder), context.options)
 
 
-def _read_bag(path: Path, context: ReadContext) -> Recording:
-    # loading the message types takes a moment
-    from stillmap.io.ros.reader import read as read_bag
+def _is_kitti_folder(path: Path, start: bytes | None) -> bool:
+    if start is not None:
+        return False
+    from stillmap.io.point_cloud.kitti import is_kitti_folder
 
-    return read_bag(path, context)
+    return is_kitti_folder(path)
+
+
+def _is_rgbd_folder(path: Path, start: bytes | None) -> bool:
+    if start is not None:
+        return False
+    from stillmap.io.rgbd_folders import detect_layout
+
+    return detect_layout(path) is not None
+
+
+def _reader(module: str) -> Reader:
+    """`read` of a module of this room, which is loaded for a recording of its format alone."""
+
+    def read(path: Path, context: ReadContext) -> Recording:
+        recording: Recording = import_module(f"stillmap.io.{module}").read(path, context)
+        return recording
+
+    return read
 
 
 def _point_cloud_format(
-    name: str, endings: tuple[str, ...], has_magic: Callable[[bytes], bool] | None, read: Reader
+    name: str, endings: tuple[str, ...], has_magic: Callable[[bytes], bool] | None, module: str
 ) -> Format:
     """A format of files, detected by first bytes or by name, and of folders of such files."""
 
     def matches(path: Path, start: bytes | None) -> bool:
         if start is None:
-            return contains_files(path, endings)
+            return signatures.contains_files(path, endings)
         if has_magic is None:
-            return has_extension(path, endings) and len(start) > 0
+            return signatures.has_extension(path, endings) and len(start) > 0
         return has_magic(start)
 
-    return Format(name, endings, matches, read)
+    return Format(name, endings, matches, _reader(f"point_cloud.{module}"))
 
 
 FORMATS = (
     Format(
         "stillmap recording", (stillmap_folder.HEADER,), _is_stillmap_folder, _read_stillmap_folder
     ),
-    Format("ROS bag", bag_types.ENDINGS, bag_types.is_bag, _read_bag),
-    Format("KITTI folder", ("velodyne/", "velodyne_points/"), kitti.is_kitti_folder, kitti.read),
-    Format("RGB-D folder", ("frame-*.depth.png", "depth.txt"), rgbd.is_rgbd_folder, rgbd.read),
-    _point_cloud_format("PCD", pcd.EXTENSIONS, is_pcd, pcd.read),
-    _point_cloud_format("3DTK", threedtk.EXTENSIONS, None, threedtk.read),
-    _point_cloud_format("E57", e57.EXTENSIONS, lambda start: start.startswith(e57.MAGIC), e57.read),
-    _point_cloud_format("LAS", las.EXTENSIONS, lambda start: start.startswith(las.MAGIC), las.read),
-    _point_cloud_format(
-        "PLY", ply.EXTENSIONS, lambda start: start.startswith((b"ply\n", b"ply\r")), ply.read
+    Format("ROS bag", bag_types.ENDINGS, bag_types.is_bag, _reader("ros.reader")),
+    Format(
+        "KITTI folder",
+        ("velodyne/", "velodyne_points/"),
+        _is_kitti_folder,
+        _reader("point_cloud.kitti"),
     ),
+    Format("RGB-D folder", ("frame-*.depth.png", "depth.txt"), _is_rgbd_folder, _reader("rgbd")),
+    _point_cloud_format("PCD", signatures.PCD_EXTENSIONS, signatures.is_pcd, "pcd"),
+    _point_cloud_format("3DTK", signatures.THREEDTK_EXTENSIONS, None, "threedtk"),
+    _point_cloud_format("E57", signatures.E57_EXTENSIONS, signatures.is_e57, "e57"),
+    _point_cloud_format("LAS", signatures.LAS_EXTENSIONS, signatures.is_las, "las"),
+    _point_cloud_format("PLY", signatures.PLY_EXTENSIONS, signatures.is_ply, "ply"),
     Format(
         "CARMEN log",
         (".log", ".clf", ".txt", ".log.gz", ".clf.gz", ".txt.gz", ".gz"),
         _is_carmen,
-        reader.read,
+        _reader("carmen.reader"),
     ),
 )
 
@@ -158,6 +176,10 @@ def read(
 
 def _prepare_3d(recording: Recording, options: ReadOptions, scratch: Path | None) -> Recording:
     """Add beam times and cameras, and remove returns from the robot itself."""
+    from stillmap.io import cameras  # nothing that a 2D recording needs
+    from stillmap.preprocessing import self_filter
+    from stillmap.preprocessing.scan_timing import add_beam_times
+
     recording = add_beam_times(replace(recording, scratch=scratch), options.spin)
     if options.cameras is not None:
         recording = cameras.apply_camera_file(recording, Path(options.cameras))

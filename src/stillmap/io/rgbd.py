@@ -57,11 +57,6 @@ class _Grid(NamedTuple):
     scale: float
 
 
-def is_rgbd_folder(path: Path, head: bytes | None) -> bool:
-    """Whether a path is a folder of an RGB-D camera."""
-    return head is None and rgbd_folders.detect_layout(path) is not None
-
-
 def read(path: Path, context: ReadContext) -> Recording:
     """Read a folder of depth images, with the color images and poses that it holds.
 

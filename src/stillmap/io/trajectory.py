@@ -2,9 +2,9 @@
 
 import decimal
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
 
 from stillmap.core import se2
@@ -13,6 +13,9 @@ from stillmap.core.errors import InputError
 from stillmap.core.files import read_text
 from stillmap.core.recording import Recording
 from stillmap.core.timestamps import format_seconds
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 MAX_BYTES = 128 << 20  # of a file: four hours at 100 Hz
 
@@ -69,8 +72,14 @@ def read_tum(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     values = np.array(rows)
     poses = np.tile(np.eye(4), (len(values), 1, 1))
     poses[:, :3, 3] = values[:, :3]
-    poses[:, :3, :3] = scipy.spatial.transform.Rotation.from_quat(values[:, 3:]).as_matrix()
+    poses[:, :3, :3] = _rotations().from_quat(values[:, 3:]).as_matrix()
     return np.array(stamps, np.int64), poses
+
+
+def _rotations() -> "type[Rotation]":
+    from scipy.spatial.transform import Rotation  # slow to load, and no need of 2D trajectories
+
+    return Rotation
 
 
 def _pose_rows(poses: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -82,7 +91,7 @@ def _pose_rows(poses: NDArray[np.float64]) -> NDArray[np.float64]:
         half = np.arctan2(poses[:, 1, 0], poses[:, 0, 0]) / 2
         rows[:, 5], rows[:, 6] = np.sin(half), np.cos(half)
     elif len(poses):
-        quaternion = scipy.spatial.transform.Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+        quaternion = _rotations().from_matrix(poses[:, :3, :3]).as_quat()
         rows[:, 3:] = np.where(quaternion[:, 3:] < 0, -quaternion, quaternion)
     return rows
 

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
-import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
 
 from stillmap.core.components import connected_components, neighbor_pairs
@@ -210,7 +209,7 @@ def _absorb_small_parts(changes: list[Change], resolution: float, radius: float)
     for one in sorted(changes, key=lambda change: -len(change.cells)):
         for k, larger in enumerate(out):
             small = one.kind == larger.kind and 2 * len(one.cells) <= len(larger.cells)
-            if small and _distance(larger.cells, one.cells) <= radius:
+            if small and _within(larger.cells, one.cells, radius):
                 out[k] = _make_change(
                     one.kind,
                     np.unique(np.concatenate([larger.cells, one.cells]), axis=0),
@@ -226,16 +225,24 @@ def _absorb_small_parts(changes: list[Change], resolution: float, radius: float)
     return out
 
 
-def _distance(cells: Cells, others: Cells) -> float:
-    distances, _ = scipy.spatial.cKDTree(cells).query(others)
-    return float(np.min(distances))
+def _within(cells: Cells, others: Cells, radius: float) -> bool:
+    """Whether any two cells of two sets are within a radius of each other."""
+    gap = np.maximum(cells.min(axis=0) - others.max(axis=0), others.min(axis=0) - cells.max(axis=0))
+    if np.linalg.norm(np.maximum(gap, 0)) > radius:  # of the boxes around them
+        return False
+    from scipy.spatial import cKDTree  # slow to load
+
+    distances, _ = cKDTree(cells).query(others)
+    return bool(np.min(distances) <= radius)
 
 
 def _remove_noise(changes: list[Change], unchanged: Cells) -> list[Change]:
     """Drop changes too near to unchanged cells: noise of poses and ranges moves surfaces."""
-    if not len(unchanged):
+    if not changes or not len(unchanged):
         return changes
-    tree = scipy.spatial.cKDTree(unchanged)
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(unchanged)
     out = []
     for one in changes:
         distance, _ = tree.query(one.cells, distance_upper_bound=_NOISE + 1.0)

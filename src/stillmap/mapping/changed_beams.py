@@ -1,10 +1,10 @@
 """Beams of changed places: their labels, and those that ended on objects which came or left."""
 
 import dataclasses
+import itertools
 from typing import NamedTuple
 
 import numpy as np
-import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
 
 from stillmap import em
@@ -102,9 +102,9 @@ class _Stay(NamedTuple):
     def from_change(cls, change: Change, changes: list[Change]) -> "_Stay":
         low, high = change.cells.min(axis=0) - 1, change.cells.max(axis=0) + 2
         mask = np.zeros(tuple((high - low).tolist()), bool)
-        mask[tuple((change.cells - low).T)] = True
-        grown = scipy.ndimage.binary_dilation(mask, np.ones((3, 3), bool))
-        return cls(*_stay_span(change, changes), low, grown)
+        for i, j in itertools.product((-1, 0, 1), repeat=2):  # and the cells around them
+            mask[tuple((change.cells - low + (i, j)).T)] = True
+        return cls(*_stay_span(change, changes), low, mask)
 
     def bounds(self, cells: NDArray[np.int64], stamp: NDArray[np.int64]) -> NDArray[np.bool_]:
         """(n,) whether cells (n, 2) at stamps (n,) lie within the mask's box during the stay."""
@@ -133,5 +133,4 @@ def _overlap(one: Change, other: Change) -> bool:
     if np.any(distance > np.array(one.size) + np.array(other.size)):
         return False
     smaller, larger = sorted((one.cells, other.cells), key=len)
-    distances, _ = scipy.spatial.cKDTree(larger).query(smaller)
-    return bool(np.mean(distances < 0.5) > 0.5)
+    return bool(np.mean(np.isin(_keys(smaller), _keys(larger))) > 0.5)

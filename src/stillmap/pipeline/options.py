@@ -8,7 +8,6 @@ from stillmap.core.config import Section, option
 from stillmap.core.recording import Recording
 from stillmap.em import EmOptions
 from stillmap.em.options import MapState
-from stillmap.io.cameras import depth_camera_names
 from stillmap.mesh.options import MeshOptions
 from stillmap.preprocessing.options import ReadOptions
 from stillmap.rig.options import RigOptions
@@ -83,6 +82,8 @@ def resolve_options(options: Options, recording: Recording) -> Options:
     scan, and does not deskew.
     """
     if recording.dimension == 3:
+        from stillmap.io.cameras import depth_camera_names  # 2D recordings need no camera
+
         default = _DEPTH_VOXEL_SIZE if depth_camera_names(recording.source) else _VOXEL_SIZE
         voxel = options.slam.voxel_size or default
         slam = dataclasses.replace(options.slam, voxel_size=voxel, resolution=voxel)

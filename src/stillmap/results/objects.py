@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,13 +10,15 @@ from numpy.typing import NDArray
 from stillmap.core.arrays import write_npz
 from stillmap.pipeline.result import MappingResult
 from stillmap.results.points import ply_header
-from stillmap.rig.build import TiltingResult
 from stillmap.tracking import FlowMap, MovingObject
+
+if TYPE_CHECKING:
+    from stillmap.rig.build import TiltingResult
 
 MILLIMETRES = 3  # digits: finer is noise, and makes the file twice as long
 
 
-def write_objects(folder: Path, result: MappingResult | TiltingResult) -> None:
+def write_objects(folder: Path, result: "MappingResult | TiltingResult") -> None:
     """Write `objects.json` and `NNNN.ply` of each object into a new folder."""
     objects, recording, p_static = result.objects, result.deskewed, result.p_static
     folder.mkdir()

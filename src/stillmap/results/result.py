@@ -3,17 +3,20 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.profiling import Progress, StageTimer, no_progress
 from stillmap.core.recording import Recording
-from stillmap.mesh.build import Models
 from stillmap.pipeline.estimate import EmState
 from stillmap.pipeline.options import DEFAULTS, Options
 from stillmap.pipeline.result import MappingResult, map_recording
 from stillmap.results.save import save
+
+if TYPE_CHECKING:
+    from stillmap.mesh.build import Models
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,7 +24,7 @@ class Result(MappingResult):
     """A mapped recording; the fields are those of `MappingResult`."""
 
     def save(
-        self, path: str | Path, *, overwrite: bool = False, models: Models | None = None
+        self, path: str | Path, *, overwrite: bool = False, models: "Models | None" = None
     ) -> None:
         """Writes the result folder, complete or not at all.
 

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from stillmap.core.config import to_dict
 from stillmap.core.json import count_skipped, to_jsonable
@@ -14,9 +14,11 @@ from stillmap.pipeline.estimate import IterationRecord
 from stillmap.pipeline.result import MappingResult
 from stillmap.results.map_npz import known_area
 from stillmap.results.objects import MILLIMETRES
-from stillmap.rig.build import TiltingResult
 from stillmap.slam import LoopClosure
 from stillmap.slam.mount_calibration import Calibration, Parameter
+
+if TYPE_CHECKING:
+    from stillmap.rig.build import TiltingResult
 
 FORMAT_VERSION = 1
 
@@ -80,7 +82,7 @@ def write_run_json(
     path.write_text(text + "\n", encoding="utf-8")
 
 
-def tilting_record(tilting: TiltingResult) -> dict[str, Any]:
+def tilting_record(tilting: "TiltingResult") -> dict[str, Any]:
     """The `tilting` entry of `run.json`."""
     counts = count_beams(tilting.deskewed, tilting.p_static)
     return {

@@ -1,6 +1,7 @@
 """The result folder: every file of a run, appearing together or not at all."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,19 +9,20 @@ from numpy.typing import NDArray
 from stillmap.core.files import atomic_folder
 from stillmap.core.parallel import resolve_threads
 from stillmap.io.trajectory import write_tum
-from stillmap.mesh.build import Models
 from stillmap.pipeline.result import MappingResult
 from stillmap.results.labels import write_labels
 from stillmap.results.map_npz import write_map_npz
 from stillmap.results.map_server import write_map_server
-from stillmap.results.object_models import models_record, write_models
 from stillmap.results.objects import write_objects, write_traffic
 from stillmap.results.points import write_clouds
 from stillmap.results.pose_graph_g2o import write_g2o
 from stillmap.results.report.page import render_report
-from stillmap.results.report.previews import ModelPreviews, render_previews
 from stillmap.results.run_json import RECORD, TILTING, tilting_record, write_run_json
-from stillmap.rig.build import TiltingResult
+
+if TYPE_CHECKING:
+    from stillmap.mesh.build import Models
+    from stillmap.results.report.previews import ModelPreviews
+    from stillmap.rig.build import TiltingResult
 
 
 def save(
@@ -29,8 +31,8 @@ def save(
     overwrite: bool = False,
     *,
     staging_folder: Path | None = None,
-    tilting: TiltingResult | None = None,
-    models: Models | None = None,
+    tilting: "TiltingResult | None" = None,
+    models: "Models | None" = None,
 ) -> None:
     """Writes the folder `path`: map, trajectory, pose graph, labels, objects, report, meshes.
 
@@ -67,6 +69,8 @@ def save(
             _write_tilting(folder, tilting, colors)
             more[TILTING] = tilting_record(tilting)
         if models is not None:
+            from stillmap.results.object_models import models_record, write_models
+
             images = (result if tilting is None else tilting).recording.images
             count = 0 if images is None else len(images)
             write_models(folder, models, count, result.options.mesh.texture_quality)
@@ -74,7 +78,9 @@ def save(
         write_run_json(folder / RECORD, result, more)
 
 
-def _write_tilting(folder: Path, tilting: TiltingResult, colors: NDArray[np.uint8] | None) -> None:
+def _write_tilting(
+    folder: Path, tilting: "TiltingResult", colors: NDArray[np.uint8] | None
+) -> None:
     """Write `static.ply`, `dynamic.ply` and `tilting/`: labels, poses and objects in 3D."""
     write_clouds(folder, tilting.deskewed, tilting.poses, tilting.p_static, colors)
     inside = folder / TILTING
@@ -84,8 +90,10 @@ def _write_tilting(folder: Path, tilting: TiltingResult, colors: NDArray[np.uint
     write_objects(inside / "objects", tilting)
 
 
-def _previews(models: Models, threads: int) -> ModelPreviews:
+def _previews(models: "Models", threads: int) -> "ModelPreviews":
     """Previews of the meshes for the report."""
+    from stillmap.results.report.previews import render_previews
+
     return render_previews(
         models.textured,
         models.unfiltered,

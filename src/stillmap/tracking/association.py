@@ -290,16 +290,20 @@ def find_splits(
 
 def _connect(parts: list[Float], max_distance: float) -> tuple[list[int], list[int]]:
     """Parts connected with the largest one by gaps below `max_distance`, and the others."""
-    from scipy.spatial import KDTree  # takes long to load
-
     kept = [max(range(len(parts)), key=lambda i: len(parts[i]))]
     gone = [i for i in range(len(parts)) if i not in kept]
     for i in kept:  # grows as it goes
         for j in list(gone):
-            if np.min(KDTree(parts[i]).query(parts[j])[0]) < max_distance:
+            if _distance(parts[i], parts[j]) < max_distance:
                 kept.append(j)
                 gone.remove(j)
     return kept, gone
+
+
+def _distance(one: Float, other: Float) -> float:
+    """Between the nearest points of two sets (n, 2) and (m, 2): few, as of one cluster."""
+    squared = sum((one[:, None, d] - other[None, :, d]) ** 2 for d in (0, 1))
+    return float(np.sqrt(np.min(squared)))
 
 
 def _argmin_allowed(cost: Float, allowed: NDArray[np.bool_]) -> Index:

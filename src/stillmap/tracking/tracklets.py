@@ -117,15 +117,10 @@ def stitch_tracklets(points: DynamicPoints, owner: Index) -> Index:
 
 def _merge_pairs(points: DynamicPoints, owner: Index) -> Index:
     """Merge tracks that always move together, nearer than people do: legs tracked apart."""
-    from scipy.spatial import KDTree  # takes long to load
-
     parts, scans = list[tuple[Index, Index]](), np.zeros(_count_tracks(owner), np.intp)
     for here in _scan_blocks(points, owner):
         found = compute_centroids(points, owner, here)
-        # one more axis keeps scans apart
-        separated = np.column_stack([found.xy, 100.0 * found.scan])
-        pairs = KDTree(separated).query_pairs(_PAIR_DISTANCE, output_type="ndarray")
-        pairs = np.sort(found.track[pairs], axis=1)
+        pairs = np.sort(found.track[_near_pairs(found.scan, found.xy, _PAIR_DISTANCE)], axis=1)
         parts.append(np.unique(pairs, axis=0, return_counts=True))
         scans += np.bincount(found.track, minlength=len(scans))
     tracks, which = np.unique(
@@ -142,10 +137,24 @@ def _merge_pairs(points: DynamicPoints, owner: Index) -> Index:
     return _renumber(points, owner, lambda old: merged[old])
 
 
+def _near_pairs(scan: Index, xy: Float, max_distance: float) -> Index:
+    """(P, 2) pairs of positions (K, 2) of the same scan within a distance of each other.
+
+    The k-th and the (k + shift)-th position by scan are compared for every shift, of which there
+    are as many as positions in one scan.
+    """
+    order = np.argsort(scan, kind="stable")
+    scan, xy = scan[order], xy[order]
+    parts, shift = [np.empty((0, 2), np.intp)], 1
+    while (first := np.flatnonzero(scan[shift:] == scan[:-shift])).size:
+        near = ((xy[first + shift] - xy[first]) ** 2).sum(axis=1) <= max_distance**2
+        parts.append(np.column_stack([first, first + shift])[near])
+        shift += 1
+    return order[np.concatenate(parts)]
+
+
 def _join_across_gaps(points: DynamicPoints, owner: Index) -> Index:
     """Join tracks that end with tracks that begin later, by least total cost."""
-    from scipy.optimize import linear_sum_assignment  # takes long to load
-
     tracks, ends = _track_ends(points, owner)
     before, after, cost = _candidates(ends)
     if len(before) == 0:
@@ -157,7 +166,7 @@ def _join_across_gaps(points: DynamicPoints, owner: Index) -> Index:
         columns, j = np.unique(after[group], return_inverse=True)
         costs = np.full((len(rows), len(columns)), _NO_MATCH)
         costs[i, j] = cost[group]
-        for r, c in zip(*linear_sum_assignment(costs), strict=True):
+        for r, c in zip(*_assign(costs), strict=True):
             if costs[r, c] < _NO_MATCH:
                 follows[columns[c]] = rows[r]
     for k in np.argsort(ends.first, kind="stable").tolist():
@@ -167,6 +176,22 @@ def _join_across_gaps(points: DynamicPoints, owner: Index) -> Index:
         owner,
         lambda old: np.where(old >= 0, tracks[follows[np.searchsorted(tracks, old)]], -1),
     )
+
+
+def _assign(costs: Float) -> tuple[Index, Index]:
+    """Rows and columns of a matching (n, m) of least total cost, of min(n, m) pairs.
+
+    Where the cheapest columns of all rows differ, they are the solution; else SciPy finds it.
+    """
+    if costs.shape[0] > costs.shape[1]:
+        columns, rows = _assign(costs.T)
+        return rows, columns
+    cheapest = costs.argmin(axis=1)
+    if len(np.unique(cheapest)) == len(cheapest):
+        return np.arange(len(cheapest)), cheapest
+    from scipy.optimize import linear_sum_assignment  # takes long to load
+
+    return linear_sum_assignment(costs)
 
 
 class _Ends(NamedTuple):

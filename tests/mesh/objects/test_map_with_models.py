@@ -250,7 +250,7 @@ def test_interrupted_on_full_disks_and_gone_on_with(room, result, tmp_path, monk
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr("stillmap.cli.map_run.build_models", interrupted)
+        patch.setattr("stillmap.pipeline.models.build_models", interrupted)
         assert main(words) == 130
     assert [path.name for path in tmp_path.iterdir()] == [".out.resume"]
     with monkeypatch.context() as patch:

@@ -32,9 +32,7 @@ from stillmap.io.point_cloud.scans import (
     build_recording,
     files_of,
 )
-
-EXTENSIONS = (".e57",)
-MAGIC = b"ASTM-E57"
+from stillmap.io.point_cloud.signatures import E57_EXTENSIONS, E57_MAGIC
 
 _BLOCK = 1 << 14  # points read at once; libe57 keeps the buffers where packets are damaged
 _PAGE, _CHECKSUM = 1024, 4  # bytes
@@ -54,7 +52,7 @@ def read(path: Path, context: ReadContext) -> Recording:
     """
     import_extra("pye57.libe57", path)
     origin, sources = Origin(), []
-    for file in files_of(path, EXTENSIONS):
+    for file in files_of(path, E57_EXTENSIONS):
         try:
             count = _count_scans(file)
         except InputError:
@@ -96,7 +94,7 @@ def _check_xml(path: Path) -> None:
     with path.open("rb") as file:
         head = file.read(48)
         start, length = (int.from_bytes(head[at : at + 8], "little") for at in (24, 32))
-        if len(head) < 48 or head[:8] != MAGIC:
+        if len(head) < 48 or head[:8] != E57_MAGIC:
             raise InputError("is no E57 file", where=str(path))
         if length > _MAX_XML or start > path.stat().st_size:
             raise InputError("is damaged: its XML section", where=str(path))

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy  # its parts load when they are first used
 from numpy.typing import ArrayLike, NDArray
 
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.core.timestamps import parse_ns
+from stillmap.io.point_cloud.signatures import iter_files
 from stillmap.io.text_lines import read_lines
 
 _NUMBER = re.compile(r"(?:^-)?\d+(?:\.\d+)?$")
@@ -32,27 +32,10 @@ def list_files(folder: Path, extensions: tuple[str, ...]) -> list[Path]:
         InputError: the folder cannot be read.
     """
     try:
-        entries = list(_iter_files(folder, extensions))
+        entries = list(iter_files(folder, extensions))
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", where=str(folder)) from error
     return sorted(entries, key=lambda entry: (_natural_key(entry.name), entry.name))
-
-
-def has_extension(path: Path, extensions: tuple[str, ...]) -> bool:
-    """Whether a file has one of the extensions, in any case, and is not hidden."""
-    return path.name.lower().endswith(extensions) and not path.name.startswith(".")
-
-
-def contains_files(folder: Path, extensions: tuple[str, ...]) -> bool:
-    """Whether a folder has files of these extensions; False where it cannot be read."""
-    try:
-        return any(_iter_files(folder, extensions))
-    except OSError:
-        return False
-
-
-def _iter_files(folder: Path, extensions: tuple[str, ...]) -> Iterator[Path]:
-    return (e for e in folder.iterdir() if has_extension(e, extensions) and not e.is_dir())
 
 
 def require_nonempty_file(path: Path) -> None:
@@ -227,14 +210,16 @@ def pose_from_quaternion(wxyz: ArrayLike, t: ArrayLike) -> NDArray[np.float64]:
     q = np.asarray(wxyz, np.float64)
     if not abs(np.linalg.norm(q) - 1.0) < _TOLERANCE:
         raise ValueError("a quaternion is not of norm one")
-    return rigid_transform(
-        scipy.spatial.transform.Rotation.from_quat(q[[1, 2, 3, 0]]).as_matrix(), t
-    )
+    from scipy.spatial.transform import Rotation  # slow to load
+
+    return rigid_transform(Rotation.from_quat(q[[1, 2, 3, 0]]).as_matrix(), t)
 
 
 def quaternion_from_pose(T: NDArray[np.float64]) -> NDArray[np.float64]:
     """(..., 4) quaternions w x y z, w >= 0, of transforms (..., 4, 4)."""
-    xyzw = scipy.spatial.transform.Rotation.from_matrix(T[..., :3, :3]).as_quat(canonical=True)
+    from scipy.spatial.transform import Rotation
+
+    xyzw = Rotation.from_matrix(T[..., :3, :3]).as_quat(canonical=True)
     return np.asarray(xyzw)[..., [3, 0, 1, 2]]
 
 

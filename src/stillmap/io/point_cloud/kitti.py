@@ -128,9 +128,9 @@ _LAYOUTS = (  # scans and their stamps
 )
 
 
-def is_kitti_folder(path: Path, head: bytes | None) -> bool:
-    """Whether a folder has one of the KITTI layouts; `head` is None for folders."""
-    return head is None and any((path / scans).is_dir() for scans, _ in _LAYOUTS)
+def is_kitti_folder(path: Path) -> bool:
+    """Whether a folder has one of the KITTI layouts."""
+    return any((path / scans).is_dir() for scans, _ in _LAYOUTS)
 
 
 def read(path: Path, context: ReadContext) -> Recording:

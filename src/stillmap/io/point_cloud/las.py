@@ -19,9 +19,7 @@ from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud.binary_table import truncated_error
 from stillmap.io.point_cloud.files import iter_map_points, library_errors, require_nonempty_file
 from stillmap.io.point_cloud.scans import Cloud, Origin, read_clouds
-
-EXTENSIONS = (".las", ".laz")
-MAGIC = b"LASF"
+from stillmap.io.point_cloud.signatures import LAS_EXTENSIONS, LAS_MAGIC
 
 _BLOCK, _BLOCK_BYTES = 1 << 16, 8 << 20  # points and bytes read at once
 _MAX_POINTS_PER_BYTE, _MIN_POINT_LIMIT = 20, 10_000_000  # compressed points take a byte or more
@@ -40,7 +38,7 @@ def read(path: Path, context: ReadContext) -> Recording:
         InputError: no cloud can be read, or laspy is missing.
     """
     import_extra("laspy", path)
-    return read_clouds(path, "LAS", EXTENSIONS, _read_cloud, context)
+    return read_clouds(path, "LAS", LAS_EXTENSIONS, _read_cloud, context)
 
 
 def _read_cloud(path: Path, origin: Origin, scratch: Path | None) -> Cloud:
@@ -74,7 +72,7 @@ def _check_header(path: Path) -> None:
     size = path.stat().st_size
     with path.open("rb") as file:
         head = file.read(_HEADER)
-        if len(head) < _HEADER or head[:4] != MAGIC:
+        if len(head) < _HEADER or head[:4] != LAS_MAGIC:
             raise InputError("is no LAS file", where=str(path))
         header_size, start, extras, kind = struct.unpack_from("<HIIB", head, 94)
         if not header_size + _VLR * extras <= start <= size:

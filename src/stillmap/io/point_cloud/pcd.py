@@ -41,9 +41,8 @@ from stillmap.io.point_cloud.scans import (
     files_of,
     sources_of,
 )
+from stillmap.io.point_cloud.signatures import MAX_PCD_HEADER, PCD_EXTENSIONS, is_pcd
 from stillmap.io.point_cloud.time_field import find_time_column
-
-_MAX_HEADER = 1 << 14  # bytes
 
 _SIZES = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
 
@@ -60,17 +59,6 @@ class PcdHeader(NamedTuple):
     compressed: bool
 
 
-def is_pcd(head: bytes) -> bool:
-    """Whether the first bytes of a file are a PCD header."""
-    for line in head[:_MAX_HEADER].splitlines():
-        words = line.split()
-        if words and not words[0].startswith(b"#"):
-            return words[0] in (b"VERSION", b"FIELDS")
-        if words[1:2] == [b".PCD"] or words[:1] == [b"#.PCD"]:
-            return True
-    return False
-
-
 def read_header(path: Path) -> PcdHeader:
     """Read the header.
 
@@ -79,7 +67,7 @@ def read_header(path: Path) -> PcdHeader:
     """
     require_nonempty_file(path)
     with path.open("rb") as file:
-        head = file.read(_MAX_HEADER)
+        head = file.read(MAX_PCD_HEADER)
     if not is_pcd(head):
         raise InputError("is no PCD file", where=str(path))
     lines, start = split_header(path, head, lambda words: words[:1] == ["DATA"])
@@ -174,8 +162,6 @@ def _read_compressed(layout: TableLayout, wanted: list[str]) -> list[NDArray[Any
     return out
 
 
-EXTENSIONS = (".pcd",)
-
 MARKER = "*.pcd"  # only folders with such a file are overwritten
 
 _MIN_VIEWPOINT_DISTANCE = 5.0  # m from the origin, to detect the frame of the points
@@ -190,14 +176,14 @@ def read(path: Path, context: ReadContext) -> Recording:
     Raises:
         InputError: no scan can be read.
     """
-    files, origin = files_of(path, EXTENSIONS), Origin()
+    files, origin = files_of(path, PCD_EXTENSIONS), Origin()
     info = DatasetInfo(path, "PCD", [], single=path.is_file())
     in_map_frame = _detect_map_frame(files)
     if in_map_frame:
         text = "points are in the map frame: transformed to the sensor frame by VIEWPOINT"
         info.warnings.append(text)
     read_cloud = partial(_read_cloud, in_map_frame=in_map_frame, origin=origin)
-    recording = build_recording(sources_of(files, EXTENSIONS, read_cloud), info, context)
+    recording = build_recording(sources_of(files, PCD_EXTENSIONS, read_cloud), info, context)
     origin.add_notes(recording, in_sensor_frame=True)
     return recording
 

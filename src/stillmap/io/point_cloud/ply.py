@@ -16,8 +16,7 @@ from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud.binary_table import Field, TableLayout, read_columns, split_header
 from stillmap.io.point_cloud.files import iter_map_points, require_nonempty_file
 from stillmap.io.point_cloud.scans import Cloud, Origin, read_clouds
-
-EXTENSIONS = (".ply",)
+from stillmap.io.point_cloud.signatures import PLY_EXTENSIONS
 
 _MAX_HEADER = 1 << 16  # bytes
 _ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
@@ -34,7 +33,7 @@ def read(path: Path, context: ReadContext) -> Recording:
     Raises:
         InputError: no cloud can be read.
     """
-    return read_clouds(path, "PLY", EXTENSIONS, _read_cloud, context)
+    return read_clouds(path, "PLY", PLY_EXTENSIONS, _read_cloud, context)
 
 
 def _read_cloud(path: Path, origin: Origin, scratch: Path | None) -> Cloud:

@@ -18,8 +18,7 @@ from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud.binary_table import iter_text_lines, parse_numbers
 from stillmap.io.point_cloud.files import require_nonempty_file, rigid_transform, strip_extension
 from stillmap.io.point_cloud.scans import Cloud, CloudSource, DatasetInfo, build_recording, files_of
-
-EXTENSIONS = (".3d", ".3d.gz")
+from stillmap.io.point_cloud.signatures import THREEDTK_EXTENSIONS
 
 _MAX_UNPACKED = 1 << 30  # bytes
 _MAX_POSE = 1 << 12  # bytes
@@ -37,7 +36,7 @@ def read(path: Path, context: ReadContext) -> Recording:
     Raises:
         InputError: no scan can be read.
     """
-    files, options = files_of(path, EXTENSIONS), context.options
+    files, options = files_of(path, THREEDTK_EXTENSIONS), context.options
     info = DatasetInfo(path, "3DTK", [], single=path.is_file())
     code = _find_max_range_code(files) if options.max_range is None else None
     if code is not None:
@@ -83,7 +82,7 @@ def _read_cloud(path: Path) -> Cloud:
 
 def _read_pose(path: Path) -> NDArray[np.float64] | None:
     """(4, 4) pose in the file beside a scan; None where there is no valid one."""
-    file = path.with_name(strip_extension(path.name, EXTENSIONS) + ".pose")
+    file = path.with_name(strip_extension(path.name, THREEDTK_EXTENSIONS) + ".pose")
     try:
         if not file.is_file():
             return None
