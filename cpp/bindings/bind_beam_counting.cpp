@@ -43,17 +43,19 @@ void fill(OccupancyGrid<D>& grid, const Points<D>& points, const Flat<bool>& hit
 }
 
 template <int D>
-void add_no_return(OccupancyGrid<D>& grid, OccupancyGrid<D>& rest, const Points<D>& points,
+void add_no_return(OccupancyGrid<D>* grid, OccupancyGrid<D>* rest, const Points<D>& points,
                    const Flat<bool>& hit, const Flat<int64_t>& offset, const Poses<D>& poses,
                    const Cells<D>& stop_cells, double end_margin, int threads) {
-  require(&grid != &rest && grid.resolution() == rest.resolution(),
+  require(grid || rest, "grid, rest: expected at least one of them");
+  require(!grid || !rest || (grid != rest && grid->resolution() == rest->resolution()),
           "rest: expected another grid of the same resolution");
   require(end_margin >= 0.0, "end_margin: expected a length in metres that is not negative");
   const auto scans = scans_from<D>(points, hit, offset, poses);
   std::vector<Cell<D>> cells;
   for (size_t k = 0; k < stop_cells.shape(0); ++k) cells.push_back(cell_from<D>(stop_cells, k));
   nb::gil_scoped_release released;
-  add_no_return_beams<D>(grid, rest, scans, {cells, end_margin / grid.resolution()}, threads);
+  const double cells_to_end = end_margin / (grid ? grid : rest)->resolution();
+  add_no_return_beams<D>(grid, rest, scans, {cells, cells_to_end}, threads);
 }
 
 template <int D>
@@ -111,12 +113,13 @@ void bind(nb::module_& m) {
         "metres apart that are collinear with a third one within `tolerance` metres; the gap is at "
         "most `max_gap_ratio` times that to the third one. They take the smaller e of the two and "
         "add nothing to crossed cells. With remove it subtracts the same sums exactly.");
-  m.def("add_no_return_beams", &add_no_return<D>, nb::arg("grid"), nb::arg("rest"),
+  m.def("add_no_return_beams", &add_no_return<D>, nb::arg("grid").none(),
+        nb::arg("rest").none(),
         nb::arg("points").noconvert(), nb::arg("hit").noconvert(), nb::arg("offset").noconvert(),
         nb::arg("T_map_sensor").noconvert(), nb::arg("stop_cells").noconvert(),
         nb::arg("end_margin"), nb::arg("threads") = 1,
         "Adds the beams without a return as `add_beams` does, split over two grids: the trusted "
-        "part to grid, the remainder to rest. Runs of fewer than three such beams are not trusted; "
+        "part to grid, the remainder to rest; None leaves a part out. Runs of fewer than three such beams are not trusted; "
         "the others are trusted up to the first of stop_cells (S, D) int64 and not within "
         "`end_margin` metres (may be infinite) of their end.");
   m.def("e_step", &expected_labels<D>, nb::arg("grid"), nb::arg("points").noconvert(),

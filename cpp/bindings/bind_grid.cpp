@@ -33,21 +33,18 @@ nb::ndarray<nb::numpy, double> alpha_beta(const OccupancyGrid<D>& grid, const Ce
   return to_numpy(std::move(out), {n, 2});
 }
 
-// Calls visit(cell, counts) for the observed cells of the blocks that pass in_range(block).
-template <int D, class Wanted, class Visit>
-void for_each_observed(const OccupancyGrid<D>& grid, Wanted&& in_range, Visit&& visit) {
-  for (const auto& block : grid.blocks()) {
-    if (!in_range(block->origin)) continue;
-    for (int i = 0; i < BlockLayout<D>::kCells; ++i) {
-      const CellCounts& c = block->values[static_cast<size_t>(i)];
-      if (c.alpha + c.beta != 0) visit(BlockLayout<D>::cell_at(block->origin, i), c);
-    }
+// Calls visit(cell, counts) for the observed cells of a block.
+template <int D, class Visit>
+void for_each_observed_in(const typename OccupancyGrid<D>::Block& block, Visit&& visit) {
+  for (int i = 0; i < BlockLayout<D>::kCells; ++i) {
+    const CellCounts& c = block.values[static_cast<size_t>(i)];
+    if (c.alpha + c.beta != 0) visit(BlockLayout<D>::cell_at(block.origin, i), c);
   }
 }
 
 template <int D, class Visit>
 void for_each_observed(const OccupancyGrid<D>& grid, Visit&& visit) {
-  for_each_observed(grid, [](const Cell<D>&) { return true; }, visit);
+  for (const auto& block : grid.blocks()) for_each_observed_in<D>(*block, visit);
 }
 
 // Bounding box of the observed cells.
@@ -82,34 +79,26 @@ auto dense(const OccupancyGrid<D>& grid, const OptionalCell<D>& first_cell,
     throw std::invalid_argument("first_cell, shape: expected both or neither");
   const Box<D> box = shape ? Box<D>(*first_cell, *shape) : box_around(grid);
   std::vector<double> alpha(box.total(), 0.0), beta(box.total(), 0.0);
-  const auto overlaps = [&](const Cell<D>& block) {
-    return box.overlaps(BlockLayout<D>::cell_at(block, 0), BlockLayout<D>::kEdge);
-  };
-  for_each_observed(grid, overlaps, [&](const Cell<D>& cell, const CellCounts& c) {
-    if (!box.contains(cell)) return;
-    alpha[box.index(cell)] = from_fixed(c.alpha);
-    beta[box.index(cell)] = from_fixed(c.beta);
+  box.for_each_block(grid, [&](const auto& block) {
+    for_each_observed_in<D>(block, [&](const Cell<D>& cell, const CellCounts& c) {
+      if (!box.contains(cell)) return;
+      alpha[box.index(cell)] = from_fixed(c.alpha);
+      beta[box.index(cell)] = from_fixed(c.beta);
+    });
   });
   return std::make_tuple(box.first_cell(), box.shaped(std::move(alpha)),
                          box.shaped(std::move(beta)));
 }
 
 template <int D>
-auto observed_mask(const OccupancyGrid<D>& grid) {
-  const Box<D> box = box_around(grid);
-  std::vector<uint8_t> cells(box.total(), 0);
-  for_each_observed(grid,
-                    [&](const Cell<D>& cell, const CellCounts&) { cells[box.index(cell)] = 1; });
-  return std::make_tuple(box.first_cell(), box.shaped(std::move(cells)));
-}
-
-template <int D>
 void bind(nb::module_& m, const char* name) {
   using G = OccupancyGrid<D>;
   nb::class_<G>(m, name, "Block-sparse counts alpha, beta of (10); cell = floor(x / resolution).")
-      .def(nb::init<double, double>(), nb::arg("resolution"), nb::arg("approach") = 0.0,
+      .def(nb::init<double, double, bool>(), nb::arg("resolution"), nb::arg("approach") = 0.0,
+           nb::arg("moments") = true,
            "approach: length in metres before the end of a beam whose crossings are ignored in the "
-           "likelihood field of registration; alpha, beta do not depend on it.")
+           "likelihood field of registration; alpha, beta do not depend on it. moments: False "
+           "leaves out what registration alone needs, most of the memory of cells with returns.")
       .def_prop_ro("resolution", &G::resolution, "metres")
       .def_prop_ro("approach", &G::approach, "metres")
       .def_prop_ro("dimension", [](const G&) { return D; })
@@ -124,8 +113,9 @@ void bind(nb::module_& m, const char* name) {
            "first_cell (D,) int64 and alpha, beta float64 over a box of cells, by default the "
            "bounding box of the observed ones; axes in reverse order: a 2D array is [row = y, "
            "column = x].")
-      .def("observed_mask", &observed_mask<D>,
-           "first_cell and uint8 over the bounding box: 1 where alpha + beta > 0.");
+      .def_prop_ro("block_cells", &lowest_cells<OccupancyGrid<D>>, nb::rv_policy::move,
+                   "(B, D) int64: lowest cell of each block; blocks have 32 cells along each axis "
+                   "in 2D and 8 in 3D, and cells outside them are unobserved.");
 }
 
 // Visitor that records the cells and chord lengths of a traversal.

@@ -43,16 +43,15 @@ auto dense(const ObservationCounts<D>& counts, const std::array<int64_t, D>& fir
            const std::array<int64_t, D>& shape) {
   const Box<D> box(first_cell, shape);
   std::vector<uint16_t> observed(box.total(), 0), clear(box.total(), 0);
-  for (const auto& block : counts.blocks()) {
-    if (!box.overlaps(BlockLayout<D>::cell_at(block->origin, 0), BlockLayout<D>::kEdge)) continue;
+  box.for_each_block(counts, [&](const auto& block) {
     for (int i = 0; i < BlockLayout<D>::kCells; ++i) {
-      const Cell<D> cell = BlockLayout<D>::cell_at(block->origin, i);
+      const Cell<D> cell = BlockLayout<D>::cell_at(block.origin, i);
       if (!box.contains(cell)) continue;
-      const CellVisits& visits = block->values[static_cast<size_t>(i)];
+      const CellVisits& visits = block.values[static_cast<size_t>(i)];
       observed[box.index(cell)] = visits.observed;
       clear[box.index(cell)] = visits.clear;
     }
-  }
+  });
   return std::make_tuple(box.shaped(std::move(observed)), box.shaped(std::move(clear)));
 }
 
@@ -84,6 +83,8 @@ void bind(nb::module_& m, const char* name) {
            nb::arg("threads") = 1,
            "Adds scans; is_dynamic (M,) bool marks the returns from moving objects. time_bin (T,) "
            "int64 must not decrease and must exceed those of earlier calls.")
+      .def_prop_ro("block_cells", &lowest_cells<L>, nb::rv_policy::move,
+                   "(B, D) int64: lowest cell of each block, see `OccupancyGrid2D.block_cells`.")
       .def("dense", &dense<D>, nb::arg("first_cell"), nb::arg("shape"),
            "observed and clear counts, uint16 saturating at 65535, over a box of cells, axes in "
            "reverse order as in `OccupancyGrid2D.dense`.");

@@ -113,6 +113,16 @@ void bind(nb::module_& m, const char* name) {
 }  // namespace
 
 void bind_surfel_map(nb::module_& m) {
+  m.def(
+      "normal_cdf",
+      [](const Flat<double>& x) {
+        std::vector<double> out(x.shape(0));
+        for (size_t i = 0; i < out.size(); ++i)
+          out[i] = 0.5 * std::erfc(-x.data()[i] / std::sqrt(2.0));
+        const size_t n = out.size();
+        return to_numpy(std::move(out), {n});
+      },
+      nb::arg("x").noconvert(), "Standard normal distribution function of (n,) float64.");
   bind<2>(m, "SurfelMap2D");
   bind<3>(m, "SurfelMap3D");
 }

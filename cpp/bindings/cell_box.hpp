@@ -17,6 +17,19 @@ namespace stillmap::bindings {
 template <int D>
 using OptionalCell = std::optional<std::array<int64_t, D>>;
 
+// Lowest cells (B, D) int64 of the blocks of a block-sparse map, in order of insertion.
+template <class Map>
+auto lowest_cells(const Map& map) {
+  constexpr int D = Map::kDimension;
+  std::vector<int64_t> cells;
+  cells.reserve(map.blocks().size() * D);
+  for (const auto& block : map.blocks()) {
+    const Cell<D> cell = BlockLayout<D>::cell_at(block->origin, 0);
+    cells.insert(cells.end(), cell.data(), cell.data() + D);
+  }
+  return to_numpy(std::move(cells), {map.blocks().size(), static_cast<size_t>(D)});
+}
+
 // Box of cells with the array layout [(z,) y, x].
 template <int D>
 struct Box {
@@ -63,6 +76,29 @@ struct Box {
     for (int d = D - 1; d >= 0; --d)
       i = i * size[static_cast<size_t>(d)] + static_cast<size_t>(cell[d] - first[d]);
     return i;
+  }
+
+  // Calls visit(block) for the blocks of a block-sparse map that overlap the box.
+  template <class Map, class Visit>
+  void for_each_block(const Map& map, Visit&& visit) const {
+    size_t blocks = 1;
+    Cell<D> low, high;
+    for (int d = 0; d < D; ++d) {
+      const auto n = static_cast<int32_t>(size[static_cast<size_t>(d)]);
+      if (n == 0) return;
+      low[d] = first[d] >> BlockLayout<D>::kShift;
+      high[d] = (first[d] + n - 1) >> BlockLayout<D>::kShift;
+      blocks *= static_cast<size_t>(high[d] - low[d] + 1);
+    }
+    if (blocks < map.blocks().size()) {
+      for_each_in_box<D>(low, high, [&](const Cell<D>& origin) {
+        if (const auto* block = map.find(origin)) visit(*block);
+      });
+      return;
+    }
+    for (const auto& block : map.blocks())
+      if (overlaps(BlockLayout<D>::cell_at(block->origin, 0), BlockLayout<D>::kEdge))
+        visit(*block);
   }
 
   auto first_cell() const {

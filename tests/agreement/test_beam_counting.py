@@ -82,9 +82,6 @@ def test_dense_of_an_empty_grid(beams):
         first, alpha, beta = grid.dense()
         assert first.tolist() == [0] * beams.dimension
         assert alpha.shape == beta.shape == (0,) * beams.dimension
-        first, seen = grid.observed_mask()
-        assert first.tolist() == [0] * beams.dimension
-        assert seen.shape == alpha.shape
 
 
 def test_dense_of_a_box(beams):
@@ -123,15 +120,31 @@ def test_invalid_boxes(first, shape):
         _core.OccupancyGrid2D(0.1).dense(first, shape)
 
 
-def test_observed_mask(beams):
-    for kernels in (_core, reference):
-        grid = beams.grid(kernels)
-        first, alpha, beta = grid.dense()
-        first_seen, seen = grid.observed_mask()
-        assert first_seen.tolist() == first.tolist()
-        assert seen.dtype == np.uint8
-        np.testing.assert_array_equal(seen, alpha + beta > 0)
-        assert 0 < seen.mean() < 1
+def test_block_cells(beams):
+    # every observed cell lies in a block
+    grid = beams.grid(_core)
+    edge, lowest = (32 if beams.dimension == 2 else 8), grid.block_cells
+    assert (lowest % edge == 0).all()
+    first, alpha, beta = grid.dense()
+    cells = np.argwhere(alpha + beta > 0)[:, ::-1] + first
+    observed = np.unique(cells // edge * edge, axis=0)
+    known = set(map(tuple, lowest.tolist()))
+    assert set(map(tuple, observed.tolist())) <= known
+    assert len(known) == len(lowest) < 1.5 * len(observed)
+    assert beams.empty_grid(_core).block_cells.shape == (0, beams.dimension)
+
+
+def test_counts_without_moments(beams):
+    with_moments = beams.grid(_core)
+    kind = type(with_moments)
+    for threads in (1, 2):
+        grid = kind(beams.resolution, moments=False)
+        _core.add_beams(grid, *beams.arguments[:2], beams.e, *beams.arguments[2:], threads)
+        for one, other in zip(grid.dense(), with_moments.dense(), strict=True):
+            np.testing.assert_array_equal(one, other)
+        assert grid.memory_bytes < with_moments.memory_bytes
+    with pytest.raises(ValueError, match="moments"):
+        kind(beams.resolution, 0.5, moments=False)
 
 
 @pytest.mark.parametrize("prior", [0.05, 0.5, 0.9, 0.0, 1.0])

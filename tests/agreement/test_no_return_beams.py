@@ -94,6 +94,21 @@ def test_parts_sum_up_exactly(lossy, threads):
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.parametrize("threads", [1, 3])
+def test_one_part_alone(lossy, threads):
+    room, beams = lossy
+    stops = room.hmm(_core, room.surface(_core), [0.5], [1.0]).solid_cells()
+    both = parts(_core, beams, stops, 0.3)
+    for k, expected in enumerate(both):
+        grids = [None, None]
+        grids[k] = beams.empty_grid(_core)
+        _core.add_no_return_beams(*grids, *beams.arguments, stops, 0.3, threads)
+        for a, b in zip(grids[k].dense(), expected.dense(), strict=True):
+            np.testing.assert_array_equal(a, b)
+    with pytest.raises(ValueError, match="at least one"):
+        _core.add_no_return_beams(None, None, *beams.arguments, stops, 0.3)
+
+
 def test_short_runs_are_not_trusted():
     # runs of two and four, and of three cut by the end of a scan
     T = np.tile(np.eye(3), (4, 1, 1))

@@ -86,11 +86,6 @@ class OccupancyGrid:
                 alpha[index], beta[index] = self.alpha[cell], self.beta[cell]
         return first, alpha, beta
 
-    def observed_mask(self) -> tuple[Int, NDArray[np.uint8]]:
-        """first_cell, and over the same box 1 where alpha + beta are not zero."""
-        first, alpha, beta = self.dense()
-        return first, (alpha + beta > 0).astype(np.uint8)
-
 
 OccupancyGrid2D = partial(OccupancyGrid, dimension=2)
 OccupancyGrid3D = partial(OccupancyGrid, dimension=3)

@@ -14,7 +14,7 @@ from PIL import Image
 from stillmap.mapping import Change
 from stillmap.results.map_npz import changed_cells, write_map_npz
 from stillmap.results.report import maps
-from stillmap.results.report.maps import changes_data
+from stillmap.results.report.maps import changes_data, draw_filtered_map
 from stillmap.results.report.page import render_report
 from stillmap.results.run_json import run_record
 
@@ -158,10 +158,11 @@ class Section(HTMLParser):
 
 
 def test_without_changes_there_is_no_section(result, changed):
-    assert changes_data(result) is None
+    assert changes_data(result, draw_filtered_map(result)) is None
     assert "Changed places" not in render_report(result)
     empty = dataclasses.replace(changed.map, p_occupied=np.zeros((0, 0), np.float32))
-    assert changes_data(dataclasses.replace(changed, map=empty, raw_map=empty)) is None
+    without_map = dataclasses.replace(changed, map=empty, raw_map=empty)
+    assert changes_data(without_map, draw_filtered_map(without_map)) is None
 
 
 @pytest.fixture

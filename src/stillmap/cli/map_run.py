@@ -15,7 +15,6 @@ from stillmap.core.parallel import limit_blas_threads, resolve_threads
 from stillmap.core.profiling import Progress, StageTimer
 from stillmap.core.recording import Recording
 from stillmap.io import read
-from stillmap.io.cameras import depth_camera_names
 from stillmap.io.registry import detect_format
 from stillmap.io.text_lines import Progress as ReadProgress
 from stillmap.io.trajectory import poses_from_tum
@@ -98,8 +97,10 @@ def _require_depth_poses(
     recording: Recording, poses: NDArray[np.float64] | None, path: str
 ) -> None:
     """Refuse depth images without poses: their narrow view is not registered."""
-    if poses is not None or recording.T_odom_base is not None:
+    if recording.dimension == 2 or poses is not None or recording.T_odom_base is not None:
         return
+    from stillmap.io.cameras import depth_camera_names  # 2D recordings need no camera
+
     if depth_camera_names(recording.source):
         stated = recording.T_recorded_base is not None
         raise InputError(

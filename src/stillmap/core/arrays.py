@@ -10,10 +10,10 @@ import os
 import tempfile
 import warnings
 import zipfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -22,7 +22,7 @@ from stillmap.core.errors import InputError
 from stillmap.core.files import require_regular
 
 
-def write_npz(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
+def write_npz(path: Path, arrays: Mapping[str, "Writable"]) -> None:
     """Write named arrays. Equal arrays give equal files: dates in the archive are fixed."""
     # maps compress to a tenth; levels above 1 take three times as long for a few percent
     with path.open("wb") as whole:
@@ -30,13 +30,38 @@ def write_npz(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
         try:
             for name, array in arrays.items():
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
-                    np.lib.format.write_array(file, array, allow_pickle=False)
+                    _write_array(file, array)
         except BaseException:
             # close() would fail on the half-written array and hide the error
             archive.fp = None
             raise
         archive.close()
 
+
+def _write_array(file: Any, array: "Writable") -> None:
+    """Write a `.npy` file; an array that is stored in parts, part by part."""
+    if isinstance(array, np.ndarray):
+        np.lib.format.write_array(file, array, allow_pickle=False)
+        return
+    header = np.lib.format.header_data_from_array_1_0(np.empty((0, 0), array.dtype))
+    np.lib.format.write_array_header_1_0(file, {**header, "shape": array.shape})
+    for rows in array.iter_rows():
+        file.write(rows.reshape(-1).view(np.uint8).data)
+
+
+class RowSource(Protocol):
+    """An array that yields its elements as strips of rows."""
+
+    @property
+    def shape(self) -> tuple[int, ...]: ...
+
+    @property
+    def dtype(self) -> np.dtype[Any]: ...
+
+    def iter_rows(self) -> Iterator[NDArray[Any]]: ...
+
+
+Writable = NDArray[Any] | RowSource
 
 MAX_BYTES_IN_MEMORY = 32 << 20  # of one array; larger ones lie in a file
 BLOCK = 1 << 20  # rows processed at once

@@ -10,7 +10,7 @@ from stillmap.core.arrays import iter_blocks
 from stillmap.core.chunks import iter_beams, iter_chunks
 from stillmap.core.recording import Recording
 from stillmap.em import beam_counting, occupancy_hmm
-from stillmap.em.occupancy_grid import ObservedCells
+from stillmap.em.occupancy_grid import ObservedCells, observed_cells
 from stillmap.em.options import EmOptions
 from stillmap.em.people_tracker import label_people
 from stillmap.em.types import EStepResult, Float, Grid, NoReturnModel, fill_beams
@@ -171,14 +171,14 @@ def add_trusted_beams(
         add_recording(grid, recording, poses, e, threads)
         return None
     add_recording(grid, recording, poses, e, threads, hits_only=True)
-    rest = _core.OccupancyGrid2D(grid.resolution, grid.approach)
+    trust = no_return.stop_cells, no_return.end_margin, threads
     for *_, data in iter_beams(recording, poses):
-        _core.add_no_return_beams(
-            grid, rest, *data, no_return.stop_cells, no_return.end_margin, threads
-        )
-    first_cell, mask = grid.observed_mask()
-    grid.merge(rest)
-    return ObservedCells(first_cell, mask.view(np.bool_))
+        _core.add_no_return_beams(grid, None, *data, *trust)
+    observed = observed_cells(grid, recording.scratch)
+    # beams once more rather than another grid, as large as this one
+    for *_, data in iter_beams(recording, poses):
+        _core.add_no_return_beams(None, grid, *data, *trust)
+    return observed
 
 
 def changed_share(

@@ -240,14 +240,12 @@ def _estimate_trust(recording: Recording, poses: Float, hmm: OccupancyHmm, threa
 
 def probability_in_cell(surfel_map: SurfelMap) -> NDArray[np.float32]:
     """(E,) probability that the surface runs through the cell: noise also fills cells beside it."""
-    from scipy.special import ndtr  # slow import
-
     out = np.empty(surfel_map.size, np.float32)
     for rows in iter_surfel_rows(surfel_map):
         _, _, normals, off_plane, prominence, _ = surfel_map.surfels(rows)
         # half the cell's extent along the normal; a wall on a border belongs to both cells
         half = 0.5 * np.abs(normals).sum(axis=1) + _EDGE
-        in_plane = ndtr((half - np.abs(off_plane / surfel_map.resolution)) / _EDGE)
+        in_plane = _core.normal_cdf((half - np.abs(off_plane / surfel_map.resolution)) / _EDGE)
         without_plane = np.minimum(prominence / _MIN_PROMINENCE, 1.0)
         out[slice(*rows)] = np.where(normals.any(axis=1), in_plane, without_plane)
     return out

@@ -1,8 +1,8 @@
 """The occupancy map: (15), or the probabilities of an estimator."""
 
-import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core.grid_map import GridMap
+from stillmap.core.tiles import TILE, TILES_PER_RELEASE, TiledArray, compact, crop, tiles_around
 from stillmap.em.types import CellProbabilities, Float, Grid
 
-_TILE = 2000  # cells, edge of the tiles that are read at once: maps are large, and mostly unknown
+BLOCK_CELLS = 32  # edge of the blocks of the grid
 
 
 class ObservedCells(NamedTuple):
@@ -24,7 +25,7 @@ class ObservedCells(NamedTuple):
     """
 
     first_cell: NDArray[np.int64]
-    mask: NDArray[np.bool_]
+    mask: TiledArray
 
 
 class GridWindow(NamedTuple):
@@ -64,8 +65,9 @@ def make_occupancy_map(
     occupied: CellProbabilities | None = None,
     observed: ObservedCells | None = None,
     window: GridWindow | None = None,
+    scratch: Path | None = None,
 ) -> OccupancyMap:
-    """Makes the map of a grid.
+    """Makes the map of a grid. Large layers are `TiledArray`s, which NumPy takes for arrays.
 
     Args:
         grid: 2D counts (10).
@@ -73,6 +75,7 @@ def make_occupancy_map(
             the free prior, lowered by e for every cell length passed. None: (15) everywhere.
         observed: the observed cells, which give the size of the map; None: all that beams crossed.
         window: cells to return instead.
+        scratch: folder of temporary files for layers larger than memory; None: the system's.
 
     Raises:
         ValueError: the grid is 3D.
@@ -84,28 +87,45 @@ def make_occupancy_map(
     if window is None:
         first_cell, (height, width) = grid.bounding_box()
         window = GridWindow(first_cell, (height, width))
-    p_occupied = np.full(window.shape, np.nan, np.float32)
-    a, b = np.zeros(window.shape, np.float32), np.zeros(window.shape, np.float32)
-    for at, alpha, beta in _iter_tiles(grid, window):
-        p_occupied[at], a[at], b[at] = _probabilities(alpha, beta, occupied), alpha, beta
+    p_occupied = TiledArray(window.shape, np.float32, np.nan, scratch)
+    a, b = (TiledArray(window.shape, np.float32, 0.0, scratch) for _ in range(2))
+    for k, ((i, j), alpha, beta) in enumerate(_iter_tiles(grid, window)):
+        if k % TILES_PER_RELEASE == 0:
+            for layer in (p_occupied, a, b):
+                layer.release()
+        p_occupied.set_tile(i, j, _probabilities(alpha, beta, occupied))
+        a.set_tile(i, j, alpha)
+        b.set_tile(i, j, beta)
     if occupied is not None:
         _overlay(p_occupied, occupied, window.first_cell)
     if observed is not None:
-        p_occupied[~observed.mask] = np.nan
+        for block, p in p_occupied.tiles():
+            p[~crop(observed.mask, block)] = np.nan
     x, y = (float(c) * grid.resolution for c in window.first_cell)
-    return OccupancyMap(p_occupied, (x, y, 0.0), grid.resolution, a, b)
+    layers = compact(p_occupied), compact(a), compact(b)
+    return OccupancyMap(layers[0], (x, y, 0.0), grid.resolution, *layers[1:])
+
+
+def observed_cells(grid: _core.OccupancyGrid2D, scratch: Path | None = None) -> ObservedCells:
+    """The cells that any beam of a grid crossed or ended in."""
+    first_cell, (height, width) = grid.bounding_box()
+    mask = TiledArray((height, width), np.bool_, False, scratch)
+    for (i, j), alpha, beta in _iter_tiles(grid, GridWindow(first_cell, (height, width))):
+        mask.set_tile(i, j, alpha + beta > 0.0)
+    return ObservedCells(first_cell, mask)
 
 
 def _iter_tiles(
     grid: _core.OccupancyGrid2D, window: GridWindow
-) -> Iterator[tuple[tuple[slice, slice], Float, Float]]:
-    """Tiles with counts: rows and columns in the window, alpha, beta."""
+) -> Iterator[tuple[tuple[int, int], Float, Float]]:
+    """Tiles with counts: row and column of the tile in the window, alpha, beta."""
     height, width = window.shape
-    for row, column in itertools.product(range(0, height, _TILE), range(0, width, _TILE)):
-        shape = min(_TILE, height - row), min(_TILE, width - column)
-        _, alpha, beta = grid.dense((window.first_cell + np.array([column, row])).tolist(), shape)
+    for i, j in tiles_around(grid.block_cells - window.first_cell, BLOCK_CELLS, window.shape):
+        shape = min(TILE, height - i * TILE), min(TILE, width - j * TILE)
+        first = window.first_cell + TILE * np.array([j, i])
+        _, alpha, beta = grid.dense(first.tolist(), shape)
         if beta.any() or alpha.any():
-            yield (slice(row, row + shape[0]), slice(column, column + shape[1])), alpha, beta
+            yield (i, j), alpha, beta
 
 
 def _probabilities(
@@ -123,11 +143,11 @@ def _probabilities(
 
 
 def _overlay(
-    p_occupied: NDArray[np.float32], occupied: CellProbabilities, first_cell: NDArray[np.int64]
+    p_occupied: TiledArray, occupied: CellProbabilities, first_cell: NDArray[np.int64]
 ) -> None:
     """Adds surfaces to a map of passed cells, in place: p + (1 - p) * p_passed."""
     at = (occupied.cells - first_cell)[:, ::-1]
     inside = ((at >= 0) & (at < p_occupied.shape)).all(axis=1)
     row, column = at[inside].T
-    passed, p = p_occupied[row, column], occupied.p_occupied[inside]
-    p_occupied[row, column] = p + (1.0 - p) * passed
+    passed, p = p_occupied.take(row, column), occupied.p_occupied[inside]
+    p_occupied.put(row, column, p + (1.0 - p) * passed)

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
 
 from stillmap.core.camera import Camera
@@ -187,13 +186,14 @@ def _parse_pose(table: Mapping[str, Any]) -> Float | None:
     q, rpy = _parse_numbers(table, "quaternion", (4,)), _parse_numbers(table, "rpy", (3,))
     if t is None or (q is None) == (rpy is None):
         raise ValueError("a pose wants 'translation', and one of 'quaternion' and 'rpy'")
-    rotation = scipy.spatial.transform.Rotation
+    from scipy.spatial.transform import Rotation  # slow to load
+
     if rpy is not None:
-        return rigid_transform(rotation.from_euler("xyz", rpy).as_matrix(), t)
+        return rigid_transform(Rotation.from_euler("xyz", rpy).as_matrix(), t)
     assert q is not None
     if not abs(np.linalg.norm(q) - 1.0) < 0.02:
         raise ValueError("'quaternion' (x, y, z, w) is not of length one")
-    return rigid_transform(rotation.from_quat(q).as_matrix(), t)
+    return rigid_transform(Rotation.from_quat(q).as_matrix(), t)
 
 
 def _parse_size(table: Mapping[str, Any], key: str) -> int | None:

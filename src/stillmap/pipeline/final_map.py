@@ -148,11 +148,12 @@ def _occupancy_maps(
     e_step = estimate.e_step
     labels_make_sums = options.estimator in ("stillmap", "tracker")
     weights = estimate.p_static if labels_make_sums else estimate.weights
-    grid = _core.OccupancyGrid2D(options.slam.resolution)
+    grid = _core.OccupancyGrid2D(options.slam.resolution, moments=False)
     seen = em.add_trusted_beams(grid, planar, estimate.poses, weights, e_step.no_return, threads)
-    filtered = em.make_occupancy_map(grid, e_step.occupied, seen)
+    scratch = planar.scratch
+    filtered = em.make_occupancy_map(grid, e_step.occupied, seen, scratch=scratch)
     em.recount_as_static(grid, planar, estimate.poses, weights)
-    return filtered, em.make_occupancy_map(grid, window=filtered.window)
+    return filtered, em.make_occupancy_map(grid, window=filtered.window, scratch=scratch)
 
 
 def find_objects(

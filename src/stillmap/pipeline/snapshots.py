@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.grid_map import GridMap
+from stillmap.core.tiles import crop
 
 Window = tuple[float, float, float, float]
 Value = TypeVar("Value", np.float32, np.bool_)
@@ -103,11 +104,12 @@ def cut_layer(
     height, width = layer.shape
     origin = (x + left * step, y + bottom * step, 0.0)
     if left >= 0 and bottom >= 0 and left + w <= width and bottom + h <= height:
-        return layer[bottom : bottom + h, left : left + w], origin
+        return crop(layer, (slice(bottom, bottom + h), slice(left, left + w))), origin
     cells = np.full((h, w), outside, layer.dtype)
     i0, i1 = np.clip([bottom, bottom + h], 0, height)
     j0, j1 = np.clip([left, left + w], 0, width)
-    cells[i0 - bottom : i1 - bottom, j0 - left : j1 - left] = layer[i0:i1, j0:j1]
+    inside = slice(int(i0), int(i1)), slice(int(j0), int(j1))
+    cells[i0 - bottom : i1 - bottom, j0 - left : j1 - left] = crop(layer, inside)
     return cells, origin
 
 

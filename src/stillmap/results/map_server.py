@@ -1,5 +1,6 @@
 """`map.pgm` or `map.png` with `map.yaml`, as map_server and nav2 read them."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -8,11 +9,14 @@ import yaml
 from numpy.typing import NDArray
 from PIL import Image
 
+from stillmap.core.tiles import Layer, rows_of
 from stillmap.pipeline.options import MapMode
 from stillmap.results.reader import FREE_THRESH, OCCUPIED_THRESH
 
 if TYPE_CHECKING:
     from stillmap.em import OccupancyMap
+
+ToPixels = Callable[[NDArray[np.float32]], NDArray[np.uint8]]
 
 _OCCUPIED, _UNKNOWN, _FREE = 0, 205, 254
 
@@ -56,14 +60,13 @@ def write_map_server(folder: Path, occupancy: "OccupancyMap", mode: MapMode = "t
     The picture's top row is the map's highest y; the origin is the lower-left pixel's pose.
     """
     name = "map.png" if mode == "scale" else "map.pgm"
-    # the map's row 0 is its lowest y, the picture's row 0 its top
-    upright = occupancy.p_occupied[::-1]
-    if not upright.size:
-        upright = np.full((1, 1), np.nan, np.float32)  # readers refuse a picture without pixels
+    p_occupied: Layer = occupancy.p_occupied
+    if not p_occupied.size:
+        p_occupied = np.full((1, 1), np.nan, np.float32)  # readers refuse a picture without pixels
     if mode == "scale":
-        Image.fromarray(scale_pixels(upright)).save(folder / name)
+        Image.fromarray(scale_pixels(np.asarray(p_occupied)[::-1])).save(folder / name)
     else:
-        _write_pgm(folder / name, (trinary_pixels if mode == "trinary" else raw_pixels)(upright))
+        _write_pgm(folder / name, p_occupied, trinary_pixels if mode == "trinary" else raw_pixels)
     described = {
         "image": name,
         "mode": mode,
@@ -77,8 +80,13 @@ def write_map_server(folder: Path, occupancy: "OccupancyMap", mode: MapMode = "t
     (folder / "map.yaml").write_text(text, encoding="utf-8")
 
 
-def _write_pgm(path: Path, pixels: NDArray[np.uint8]) -> None:
-    height, width = pixels.shape
+def _write_pgm(path: Path, p_occupied: Layer, to_pixels: ToPixels) -> None:
+    """Write a picture strip by strip: the map's row 0 is its lowest y, the picture's its top."""
+    height, width = p_occupied.shape
     with path.open("wb") as file:
         file.write(b"P5\n%d %d\n255\n" % (width, height))
-        file.write(pixels.tobytes())
+        end = file.tell() + height * width
+        for rows in rows_of(p_occupied):  # from the bottom up
+            end -= rows.size
+            file.seek(end)
+            file.write(to_pixels(rows[::-1]).tobytes())

@@ -52,14 +52,20 @@ class OccupancyGrid : public BlockLayout<D> {
   };
 
   // approach: length in metres before an end point whose traversal registration ignores; the counts
-  // of (10) include it.
-  explicit OccupancyGrid(double resolution, double approach = 0.0)
-      : resolution_(resolution), approach_(approach) {
+  // of (10) include it. with_moments: false saves most of the memory of blocks with end points,
+  // but only the counts are there then.
+  explicit OccupancyGrid(double resolution, double approach = 0.0, bool with_moments = true)
+      : resolution_(resolution), approach_(approach), with_moments_(with_moments) {
     if (!(resolution > 0.0) || !std::isfinite(resolution))
       throw std::invalid_argument("resolution: expected a positive length in metres");
     if (!(approach >= 0.0) || !std::isfinite(approach))
       throw std::invalid_argument("approach: expected a length in metres that is not negative");
+    if (approach > 0.0 && !with_moments)
+      throw std::invalid_argument("moments: needed for the crossings before an end point");
   }
+
+  // An empty grid of the same kind.
+  OccupancyGrid sibling() const { return OccupancyGrid(resolution_, approach_, with_moments_); }
 
   OccupancyGrid(OccupancyGrid&&) noexcept = default;
   OccupancyGrid& operator=(OccupancyGrid&&) noexcept = default;
@@ -68,6 +74,7 @@ class OccupancyGrid : public BlockLayout<D> {
 
   double resolution() const { return resolution_; }
   double approach() const { return approach_; }
+  bool with_moments() const { return with_moments_; }
   const std::vector<std::unique_ptr<Block>>& blocks() const { return blocks_; }
 
   const Block* find(const Cell<D>& block) const {
@@ -125,6 +132,7 @@ class OccupancyGrid : public BlockLayout<D> {
  private:
   double resolution_;
   double approach_;
+  bool with_moments_;
   std::vector<std::unique_ptr<Block>> blocks_;
   std::unordered_map<uint64_t, size_t, typename BlockLayout<D>::Hash> index_;
 };

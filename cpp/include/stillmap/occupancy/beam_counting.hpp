@@ -54,10 +54,11 @@ class ApproachAccumulator {
 // Adds a return with P(static) = p_static to its end cell.
 template <int D>
 inline void add_end_point(typename OccupancyGrid<D>::Block& block, const Cell<D>& cell,
-                          const Vec<D>& end, double p_static, Fixed sign) {
+                          const Vec<D>& end, double p_static, Fixed sign, bool with_moments) {
   const auto local = static_cast<size_t>(BlockLayout<D>::local_of(cell));
   block.values[local].alpha += sign * to_fixed(p_static);       // alpha_j
   block.values[local].beta += sign * to_fixed(1.0 - p_static);  // first sum of beta_j
+  if (!with_moments) return;
   auto& moment = OccupancyGrid<D>::moments_of(block)[local];
   for (int d = 0; d < D; ++d)
     moment[static_cast<size_t>(d)] += sign * to_fixed(p_static * (end[d] - cell[d]));
@@ -79,7 +80,8 @@ inline void add_scans(OccupancyGrid<D>& grid, const Scans<D>& scans, const float
     if (!scans.hit[n])
       return;  // (1 - zeta) = 0: the end cell of a maximum-range beam is not observed
     approach.add(beam);
-    add_end_point<D>(*walker.block(), walker.cell(), beam.end, checked_probability(e[n]), sign);
+    add_end_point<D>(*walker.block(), walker.cell(), beam.end, checked_probability(e[n]), sign,
+                     grid.with_moments());
   });
 }
 
@@ -92,7 +94,8 @@ inline void add_end_points(OccupancyGrid<D>& grid, const Scans<D>& scans, const 
     if (!scans.hit[n]) return;
     const BeamSegment<D> beam(pose, scans.points + n * D, grid.resolution());
     const Cell<D> end = cell_of<D>(beam.end);
-    add_end_point<D>(*cursor.block(end), end, beam.end, checked_probability(e[n]), sign);
+    add_end_point<D>(*cursor.block(end), end, beam.end, checked_probability(e[n]), sign,
+                     grid.with_moments());
   });
 }
 
@@ -102,7 +105,7 @@ inline void add_beams(OccupancyGrid<D>& grid, const Scans<D>& scans, const float
   const auto bounds = split_by_beams(scans.offset, scans.n_scans, threads);
   std::vector<OccupancyGrid<D>> others;
   for (size_t i = 2; i < bounds.size(); ++i)
-    others.emplace_back(grid.resolution(), grid.approach());
+    others.push_back(grid.sibling());
   parallel_for_ranges(bounds, [&](size_t i, size_t first, size_t last) {
     add_scans<D>(i == 0 ? grid : others[i - 1], scans, e, sign, first, last);
   });

@@ -38,7 +38,7 @@ struct NoReturnLimits {
 };
 
 // Adds the lengths travelled by beams without a return, as add_scans does: the trusted part to one
-// grid, the rest to another. The two grids sum to (10), to the bit.
+// grid, the rest to another; a part without a grid is left out. The two sum to (10), to the bit.
 template <int D>
 class NoReturnBeams : private CellIndex<D> {
  public:
@@ -46,16 +46,18 @@ class NoReturnBeams : private CellIndex<D> {
     for (const Cell<D>& cell : limits.stop_cells) this->index_of(cell) = 0;
   }
 
-  void add(OccupancyGrid<D>& grid, OccupancyGrid<D>& rest, const Scans<D>& scans, size_t first,
+  void add(OccupancyGrid<D>* grid, OccupancyGrid<D>* rest, const Scans<D>& scans, size_t first,
            size_t last) const {
-    BlockCursor<OccupancyGrid<D>> trusted_cursor(grid), rest_cursor(rest);
+    OccupancyGrid<D>& any = grid ? *grid : *rest;
+    BlockCursor<OccupancyGrid<D>> trusted_cursor(any), rest_cursor(rest ? *rest : any);
     BeamWalk walk(*this, [&](const Cell<D>& cell, double length, bool trusted) {
+      if (!(trusted ? grid : rest)) return;
       auto* block = (trusted ? trusted_cursor : rest_cursor).block(cell);
       block->values[static_cast<size_t>(BlockLayout<D>::local_of(cell))].beta += to_fixed(length);
     });
     for_each_beam<D>(scans, first, last, [&](size_t t, int64_t n, const Pose<D>& pose) {
       if (scans.hit[n]) return;
-      const BeamSegment<D> beam(pose, scans.points + n * D, grid.resolution());
+      const BeamSegment<D> beam(pose, scans.points + n * D, any.resolution());
       walk.traverse_beam(beam, in_no_return_run(scans, t, n));
     });
   }
@@ -105,22 +107,24 @@ class NoReturnBeams : private CellIndex<D> {
 };
 
 template <int D>
-inline void add_no_return_beams(OccupancyGrid<D>& grid, OccupancyGrid<D>& rest,
+inline void add_no_return_beams(OccupancyGrid<D>* grid, OccupancyGrid<D>* rest,
                                 const Scans<D>& scans, const NoReturnLimits<D>& limits,
                                 int threads) {
   const NoReturnBeams<D> beams(limits);
   const auto bounds = split_by_beams(scans.offset, scans.n_scans, threads);
   std::vector<OccupancyGrid<D>> thread_grids, thread_rests;  // of the other threads
   for (size_t i = 2; i < bounds.size(); ++i) {
-    thread_grids.emplace_back(grid.resolution(), grid.approach());
-    thread_rests.emplace_back(rest.resolution(), rest.approach());
+    if (grid) thread_grids.push_back(grid->sibling());
+    if (rest) thread_rests.push_back(rest->sibling());
   }
   parallel_for_ranges(bounds, [&](size_t i, size_t first, size_t last) {
-    beams.add(i == 0 ? grid : thread_grids[i - 1], i == 0 ? rest : thread_rests[i - 1], scans,
-              first, last);
+    const auto of_thread = [i](OccupancyGrid<D>* target, auto& others) {
+      return i == 0 || !target ? target : &others[i - 1];
+    };
+    beams.add(of_thread(grid, thread_grids), of_thread(rest, thread_rests), scans, first, last);
   });
-  for (const auto& other : thread_grids) grid.merge(other);
-  for (const auto& other : thread_rests) rest.merge(other);
+  for (const auto& other : thread_grids) grid->merge(other);
+  for (const auto& other : thread_rests) rest->merge(other);
 }
 
 }  // namespace stillmap

@@ -3,7 +3,7 @@
 import base64
 import io
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -11,16 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+import stillmap._core as _core
 from stillmap.core.grid_map import GridMap
-from stillmap.pipeline.snapshots import Snapshot, Window, cut, cut_layer, extent
+from stillmap.core.tiles import release, tiles_of
+from stillmap.pipeline.snapshots import Snapshot, Value, Window, cut_layer, extent
 from stillmap.results.reader import OCCUPIED_THRESH
 from stillmap.results.report.curves import round_down
 
 Color = tuple[int, int, int]
+Mask = NDArray[np.bool_]
 ORANGE, UNKNOWN, VIOLET = (240, 120, 0), (190, 196, 204), (140, 60, 220)  # RGB
 VEIL_ALPHA = 80  # of 255, of thinly observed cells: walls and free space show through
 _MAX_PIXELS = 1_500_000  # of a map: fills a large screen, a few hundred kB as PNG
 _SNAPSHOT_PIXELS = 480  # longest edge of a snapshot
+_STRIP = 1 << 22  # cells drawn at once
 _DOT_WIDTH = 600  # pixels of image width per pixel of dot size
 
 _UNKNOWN_INDEX, _ORANGE_INDEX = 101, 102
@@ -45,7 +49,8 @@ class MapView:
         """The view of `draw_map` of any of `maps` in the window that contains them all."""
         window, resolution = map_window(maps), maps[0].resolution
         factor = _reduction(window, resolution)
-        height, width = (-(-n // factor) for n in cut(maps[0], window)[0].shape)
+        x0, y0, x1, y1 = window
+        width, height = (-(-round(d / resolution) // factor) for d in (x1 - x0, y1 - y0))
         return cls(window, (width, height), factor > 1)
 
     @property
@@ -77,7 +82,7 @@ def map_window(maps: Sequence[GridMap]) -> Window:
     Without occupied cells: every known cell; without known cells: the whole first map.
     """
     for select in (_occupied, _known):
-        boxes = [box for box in (_box(one, select(one)) for one in maps) if box is not None]
+        boxes = [box for box in (_box(one, select) for one in maps) if box is not None]
         if boxes:
             corners = np.array(boxes)
             x0, y0 = corners[:, :2].min(axis=0).tolist()
@@ -88,9 +93,9 @@ def map_window(maps: Sequence[GridMap]) -> Window:
 
 def draw_map(occupancy: GridMap, window: Window) -> Image.Image:
     """White free, grey unknown, black occupied; large maps are reduced to `_MAX_PIXELS`."""
-    cells, _ = cut(occupancy, window)
     factor = _reduction(window, occupancy.resolution)
-    return _with_palette(_levels(cells, factor)[::-1])
+    strips = _iter_strips(occupancy, occupancy.p_occupied, window, np.nan, factor)
+    return _with_palette(np.concatenate([_levels(cells, factor) for cells in strips])[::-1])
 
 
 def draw_thinly_observed(
@@ -98,10 +103,16 @@ def draw_thinly_observed(
 ) -> Image.Image:
     """Thinly observed cells (H, W) in violet, as a layer over the `draw_map` of the window."""
     factor = _reduction(window, occupancy.resolution)
-    known, _ = cut_layer(occupancy, _known(occupancy), window, False)
-    cells, _ = cut_layer(occupancy, thin, window, False)
-    count = _sums(cells, factor)
-    shown = (count > 0) & (2 * count >= _sums(known, factor))
+    shown = np.concatenate(
+        [
+            _mostly(cells, ~np.isnan(p), factor)
+            for cells, p in zip(
+                _iter_strips(occupancy, thin, window, False, factor),
+                _iter_strips(occupancy, occupancy.p_occupied, window, np.nan, factor),
+                strict=True,
+            )
+        ]
+    )
     return color_by_index(shown[::-1].astype(np.uint8), (UNKNOWN, VIOLET), bytes([0, VEIL_ALPHA]))
 
 
@@ -143,21 +154,27 @@ def color_by_index(
     return image
 
 
-def _occupied(occupancy: GridMap) -> NDArray[np.bool_]:
-    return np.asarray(occupancy.p_occupied > OCCUPIED_THRESH)
+def _occupied(p_occupied: NDArray[np.float32]) -> NDArray[np.bool_]:
+    return np.asarray(p_occupied > OCCUPIED_THRESH)
 
 
-def _known(occupancy: GridMap) -> NDArray[np.bool_]:
-    return np.asarray(~np.isnan(occupancy.p_occupied))
+def _known(p_occupied: NDArray[np.float32]) -> NDArray[np.bool_]:
+    return np.asarray(~np.isnan(p_occupied))
 
 
-def _box(occupancy: GridMap, cells: NDArray[np.bool_]) -> Window | None:
-    """The window around the given cells, with a margin of 4 cells and 1/20 of its length."""
-    rows, columns = np.flatnonzero(cells.any(axis=1)), np.flatnonzero(cells.any(axis=0))
-    if not len(rows):
+def _box(occupancy: GridMap, select: Callable[[NDArray[np.float32]], Mask]) -> Window | None:
+    """The window around the selected cells, with a margin of 4 cells and 1/20 of its length."""
+    rows, columns = (np.zeros(n, bool) for n in occupancy.p_occupied.shape)
+    for (at_rows, at_columns), p_occupied in tiles_of(occupancy.p_occupied):
+        cells = select(p_occupied)
+        rows[at_rows] |= cells.any(axis=1)
+        columns[at_columns] |= cells.any(axis=0)
+    if not rows.any():
         return None
     x, y, _, _ = extent(occupancy)
-    left, right, bottom, top = (int(n) for n in (*columns[[0, -1]], *rows[[0, -1]]))
+    left, right, bottom, top = (
+        int(n) for some in (columns, rows) for n in np.flatnonzero(some)[[0, -1]]
+    )
     margin = 4 + max(right - left, top - bottom) // 20
     return (
         x + (left - margin) * occupancy.resolution,
@@ -174,11 +191,25 @@ def _reduction(window: Window, resolution: float) -> int:
     return max(1, math.ceil(math.sqrt(cells / _MAX_PIXELS)))
 
 
-def _sums(cells: NDArray[np.bool_], factor: int) -> NDArray[np.int64]:
-    """Number of true cells in squares of `factor` x `factor` cells."""
-    height, width = cells.shape
-    rows = np.add.reduceat(cells, np.arange(0, height, factor), axis=0, dtype=np.int64)
-    return np.asarray(np.add.reduceat(rows, np.arange(0, width, factor), axis=1))
+def _iter_strips(
+    occupancy: GridMap, layer: NDArray[Value], window: Window, outside: float, factor: int
+) -> Iterator[NDArray[Value]]:
+    """The cells of a window in strips of whole squares from the bottom: a map may be large."""
+    x0, y0, x1, y1 = window
+    rows = round((y1 - y0) / occupancy.resolution)
+    step = factor * max(1, _STRIP // (factor * max(1, round((x1 - x0) / occupancy.resolution))))
+    for first in range(0, rows, step):
+        bottom = y0 + first * occupancy.resolution
+        top = y0 + min(first + step, rows) * occupancy.resolution
+        cells, _ = cut_layer(occupancy, layer, (x0, bottom, x1, top), outside)
+        yield np.ascontiguousarray(cells)
+        release(layer)
+
+
+def _mostly(cells: Mask, among: Mask, factor: int) -> Mask:
+    """Squares of `factor` x `factor` cells of which half or more of the cells `among` are true."""
+    count = _core.count_in_squares(cells, factor)
+    return np.asarray((count > 0) & (2 * count >= _core.count_in_squares(among, factor)))
 
 
 def _levels(cells: NDArray[np.float32], factor: int) -> NDArray[np.uint8]:
@@ -187,23 +218,9 @@ def _levels(cells: NDArray[np.float32], factor: int) -> NDArray[np.uint8]:
     The maximum where a cell is occupied, so that thin walls stay visible; else the mean of the
     known cells.
     """
-    height, width = (-(-n // factor) for n in cells.shape)
-    levels = np.empty((height, width), np.uint8)
-    # in strips: the intermediate arrays are many times the size of their map
-    strip = max(1, (1 << 20) // (width * factor * factor))
-    for top in range(0, height, strip):
-        part = cells[top * factor : (top + strip) * factor]
-        rows = -(-len(part) // factor)
-        padded = np.full((rows * factor, width * factor), np.nan, np.float32)
-        padded[: len(part), : part.shape[1]] = part
-        squares = padded.reshape(rows, factor, width, factor)
-        known = ~np.isnan(squares)
-        count = known.sum(axis=(1, 3))
-        mean = np.where(known, squares, 0).sum(axis=(1, 3)) / np.maximum(count, 1)
-        most = np.where(known, squares, 0).max(axis=(1, 3))
-        p = np.where(most > OCCUPIED_THRESH, most, mean)
-        levels[top : top + strip] = np.where(count, np.rint(100 * p), _UNKNOWN_INDEX)
-    return levels
+    return _core.reduce_occupancy(
+        np.ascontiguousarray(cells), factor, OCCUPIED_THRESH, _UNKNOWN_INDEX
+    )
 
 
 def _with_palette(levels: NDArray[np.uint8]) -> Image.Image:

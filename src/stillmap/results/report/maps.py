@@ -3,12 +3,14 @@
 import math
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
 from stillmap.core import se2
+from stillmap.core.tiles import tiles_of
 from stillmap.mapping import Change
 from stillmap.mapping.beam_statistics import sample_dynamic_points
 from stillmap.pipeline.result import MappingResult
@@ -29,11 +31,28 @@ _MAX_ROWS = 50
 _COLORS = {"came": (20, 120, 60), "left": (190, 40, 120), "comes and goes": (40, 90, 200)}
 
 
-def map_data(result: MappingResult) -> dict[str, Any] | None:
-    """The raw map beside the filtered one (Figs. 4, 6, 7); None for a map without cells."""
+class MapFigure(NamedTuple):
+    """The filtered map as several sections show it: its view, picture and `data:` URI."""
+
+    view: MapView
+    picture: Image.Image
+    uri: str
+
+
+def draw_filtered_map(result: MappingResult) -> MapFigure | None:
+    """The filtered map in the window that also holds the raw one; None for a map without cells."""
     if not result.map.p_occupied.size:
         return None
     view = MapView.of([result.raw_map, result.map])
+    picture = draw_map(result.map, view.window)
+    return MapFigure(view, picture, data_uri(picture))
+
+
+def map_data(result: MappingResult, filtered: MapFigure | None) -> dict[str, Any] | None:
+    """The raw map beside the filtered one (Figs. 4, 6, 7); None for a map without cells."""
+    if filtered is None:
+        return None
+    view = filtered.view
     ends = sample_dynamic_points(result.deskewed, result.poses, result.p_static)[:, :2]
     poses = result.poses
     if result.recording.dimension == 3:
@@ -46,7 +65,7 @@ def map_data(result: MappingResult) -> dict[str, Any] | None:
         "meters": (x1 - x0, y1 - y0),
         "cell": result.map.resolution,
         "raw": data_uri(draw_map(result.raw_map, view.window)),
-        "filtered": data_uri(draw_map(result.map, view.window)),
+        "filtered": filtered.uri,
         "dynamic": data_uri(draw_points(ends, view)),
         "thinly_observed": data_uri(
             draw_thinly_observed(result.map, result.evidence.thinly_observed, view.window)
@@ -59,18 +78,18 @@ def map_data(result: MappingResult) -> dict[str, Any] | None:
     }
 
 
-def changes_data(result: MappingResult) -> dict[str, Any] | None:
+def changes_data(result: MappingResult, filtered: MapFigure | None) -> dict[str, Any] | None:
     """Changed places on the map and in a table; None where there are none."""
-    if not result.changes or not result.map.p_occupied.size:
+    if not result.changes or filtered is None:
         return None
-    view = MapView.of([result.raw_map, result.map])
+    view = filtered.view
     largest = sorted(range(len(result.changes)), key=lambda k: -len(result.changes[k].cells))
     listed = [result.changes[k] for k in sorted(largest[:_MAX_ROWS])]
     corners = np.array([(one.x + one.size[0] / 2, one.y) for one in listed])
     counts = Counter[str](one.kind for one in result.changes)
     return {
         "view": view,
-        "map": data_uri(draw_map(result.map, view.window)),
+        "map": filtered.uri,
         "marks": data_uri(draw_changes(result, view)),
         "numbers": view.to_pixels(corners).tolist(),
         "colors": _COLORS,
@@ -97,8 +116,7 @@ def draw_changes(result: MappingResult, view: MapView) -> Image.Image:
     """The changed cells in the colors of their kinds, transparent elsewhere."""
     width, height = view.size
     pixels = np.zeros((height, width), np.uint8)
-    changed = changed_cells(result.map, result.changes)
-    row, column = np.nonzero(changed)
+    row, column, kind = _changed_cells(result)
     cell = result.map.resolution
     low = np.stack([column, row], axis=1) * cell + np.array(result.map.origin[:2])
     left, bottom = view.to_pixels(low).T
@@ -110,8 +128,19 @@ def draw_changes(result: MappingResult, view: MapView) -> Image.Image:
             x = np.floor(left + (k + 0.5) / steps * (right - left)).astype(np.int64)
             y = np.floor(top + (m + 0.5) / steps * (bottom - top)).astype(np.int64)
             inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
-            pixels[y[inside], x[inside]] = changed[row[inside], column[inside]]
+            pixels[y[inside], x[inside]] = kind[inside]
     return color_by_index(pixels, ((255, 255, 255), *(_COLORS[kind] for kind in CHANGED)), 0)
+
+
+def _changed_cells(result: MappingResult) -> tuple[NDArray[np.intp], ...]:
+    """Row, column and code of each changed cell."""
+    parts = []
+    for (rows, columns), codes in tiles_of(changed_cells(result.map, result.changes)):
+        row, column = np.nonzero(codes)
+        parts.append((row + rows.start, column + columns.start, codes[row, column]))
+    if not parts:
+        return tuple(np.zeros(0, np.intp) for _ in range(3))
+    return tuple(np.concatenate(some) for some in zip(*parts, strict=True))
 
 
 def evolution_data(result: MappingResult) -> dict[str, Any] | None:

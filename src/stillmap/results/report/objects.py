@@ -1,6 +1,6 @@
 """The report on moving objects (tracks, traffic, table) and on a second laser."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from PIL import Image
@@ -8,10 +8,13 @@ from PIL import Image
 from stillmap.mapping.beam_statistics import sample_dynamic_points
 from stillmap.pipeline.result import MappingResult
 from stillmap.pipeline.snapshots import Window
-from stillmap.results.report.figures import MapView, data_uri, draw_map, draw_points
+from stillmap.results.report.figures import data_uri, draw_points
+from stillmap.results.report.maps import MapFigure
 from stillmap.results.run_json import tilting_record
-from stillmap.rig.build import TiltingResult
 from stillmap.tracking import FlowMap, MovingObject
+
+if TYPE_CHECKING:
+    from stillmap.rig.build import TiltingResult
 
 _MAX_TRACKS, _MAX_ROWS = 500, 25
 _PALETTE = 64  # colors of the traffic map
@@ -20,15 +23,14 @@ _PALE, _DARK = np.array([255.0, 226.0, 178.0]), np.array([150.0, 20.0, 10.0])
 _WALL = 90  # grey level up to which a pixel stays visible as a wall
 
 
-def objects_data(result: MappingResult) -> dict[str, Any] | None:
+def objects_data(result: MappingResult, filtered: MapFigure | None) -> dict[str, Any] | None:
     """Tracks and traffic on the map; None where objects were not tracked or the map is empty."""
-    if not result.options.objects.enabled or not result.map.p_occupied.size:
+    if not result.options.objects.enabled or filtered is None:
         return None
     objects = sorted(result.objects, key=_seconds, reverse=True)
     if not objects:
         return {"total": 0}
-    view = MapView.of([result.map])
-    picture, traffic = draw_map(result.map, view.window), result.traffic
+    view, traffic = filtered.view, result.traffic
     speeds = [float(np.median(np.linalg.norm(one.velocity, axis=1))) for one in objects]
     rows = [(_seconds(one), speed) for one, speed in zip(objects, speeds, strict=True)]
     return {
@@ -37,9 +39,9 @@ def objects_data(result: MappingResult) -> dict[str, Any] | None:
         "median_seconds": float(np.median([seconds for seconds, _ in rows])),
         "median_speed": float(np.median(speeds)),
         "view": view,
-        "map": data_uri(picture),
+        "map": filtered.uri,
         "tracks": [view.svg_points(one.xy) for one in objects[:_MAX_TRACKS]],
-        "traffic": data_uri(draw_traffic(traffic, picture, view.window)),
+        "traffic": data_uri(draw_traffic(traffic, filtered.picture, view.window)),
         "traffic_cell": traffic.resolution,
         "max_crossings": int(traffic.crossings.max()),
         "listed": [
@@ -79,17 +81,17 @@ def _seconds(one: MovingObject) -> float:
     return 1e-9 * float(one.stamp_ns[-1] - one.stamp_ns[0])
 
 
-def rig_data(result: MappingResult, tilting: TiltingResult | None) -> dict[str, Any] | None:
+def rig_data(tilting: "TiltingResult | None", filtered: MapFigure | None) -> dict[str, Any] | None:
     """Counts of the second laser and its dynamic returns on the map of the first."""
     if tilting is None:
         return None
     data: dict[str, Any] = {"record": tilting_record(tilting), "view": None}
-    if result.map.p_occupied.size:
-        view = MapView.of([result.map])
+    if filtered is not None:
+        view = filtered.view
         ends = sample_dynamic_points(tilting.deskewed, tilting.poses, tilting.p_static)[:, :2]
         data |= {
             "view": view,
-            "map": data_uri(draw_map(result.map, view.window)),
+            "map": filtered.uri,
             "dynamic": data_uri(draw_points(ends, view)),
         }
     return data

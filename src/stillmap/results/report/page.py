@@ -3,8 +3,11 @@
 import functools
 import itertools
 import math
+import os
+import sys
 from collections import Counter
 from collections.abc import Mapping
+from importlib.util import cache_from_source
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,15 +18,22 @@ from stillmap.mapping.beam_statistics import count_beams
 from stillmap.pipeline.result import MappingResult
 from stillmap.results.report.curves import curve_of
 from stillmap.results.report.formatting import FILTERS
-from stillmap.results.report.maps import changes_data, evolution_data, map_data
+from stillmap.results.report.maps import (
+    changes_data,
+    draw_filtered_map,
+    evolution_data,
+    map_data,
+)
 from stillmap.results.report.objects import objects_data, rig_data
-from stillmap.results.report.previews import ModelPreviews, models_data
-from stillmap.rig.build import TiltingResult
 from stillmap.slam.mount_calibration import Parameter
 
 if TYPE_CHECKING:
-    from jinja2 import Environment
+    from jinja2 import BytecodeCache, Environment
 
+    from stillmap.results.report.previews import ModelPreviews
+    from stillmap.rig.build import TiltingResult
+
+_TEMPLATES = Path(__file__).parent / "templates"
 # factor, unit and digits of what is calibrated
 _CALIBRATION_UNITS = {
     "theta": (180.0 / math.pi, "°", 1),
@@ -38,17 +48,18 @@ _MIN_DYNAMIC = 100  # dynamic returns below which the weights of dynamic classes
 
 def render_report(
     result: MappingResult,
-    tilting: TiltingResult | None = None,
-    previews: ModelPreviews | None = None,
+    tilting: "TiltingResult | None" = None,
+    previews: "ModelPreviews | None" = None,
 ) -> str:
     """The page, of a few megabytes at most: no script, no outside request, all images inline."""
+    filtered = draw_filtered_map(result)
     data = {
         "run": _run_data(result),
-        "maps": map_data(result),
-        "changes": changes_data(result),
-        "objects": objects_data(result),
-        "rig": rig_data(result, tilting),
-        "models": models_data(previews),
+        "maps": map_data(result, filtered),
+        "changes": changes_data(result, filtered),
+        "objects": objects_data(result, filtered),
+        "rig": rig_data(tilting, filtered),
+        "models": _models_data(previews),
         "fitted": fitted_data(result),
         "calibration": calibration_data(result),
         "convergence": convergence_data(result),
@@ -61,6 +72,15 @@ def render_report(
     return environment().get_template("report.html.j2").render(data)
 
 
+def _models_data(previews: "ModelPreviews | None") -> dict[str, Any] | None:
+    """See `previews.models_data`, whose renderer is loaded only where there are models."""
+    if previews is None:
+        return None
+    from stillmap.results.report.previews import models_data
+
+    return models_data(previews)
+
+
 @functools.cache
 def environment() -> "Environment":
     """The templates with the filters of `formatting`; HTML in data is escaped."""
@@ -68,7 +88,8 @@ def environment() -> "Environment":
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     found = Environment(
-        loader=FileSystemLoader(Path(__file__).parent / "templates"),
+        bytecode_cache=_bytecode_cache(),
+        loader=FileSystemLoader(_TEMPLATES),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -76,6 +97,23 @@ def environment() -> "Environment":
     )
     found.filters.update(FILTERS)
     return found
+
+
+def _bytecode_cache() -> "BytecodeCache | None":
+    """Compiled templates, kept where Python keeps its modules; None: Python keeps none either.
+
+    Compiling takes longer than rendering.
+    """
+    if sys.dont_write_bytecode:
+        return None
+    from jinja2 import FileSystemBytecodeCache
+
+    folder = Path(cache_from_source(str(_TEMPLATES / "report.py"))).parent
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return None
+    return FileSystemBytecodeCache(str(folder)) if os.access(folder, os.W_OK) else None
 
 
 def _run_data(result: MappingResult) -> dict[str, Any]:
