@@ -47,9 +47,7 @@ def windows_of(poses, mount, rng, spacing=8):
 def test_pose_of_a_laser_wherever_it_is(mount, upside_down):
     poses, rng = true_path(), np.random.default_rng(0)
     seen = windows_of(poses, mount, rng)
-    problem = HandEye(
-        [mirror(seen) if upside_down else seen], [upside_down], SECONDS, poses, NOMINAL
-    )
+    problem = HandEye([mirror(seen) if upside_down else seen], [upside_down], poses, NOMINAL)
     fit = problem.fit_globally(list(NOMINAL))
     for name, true in zip(("theta0", "x0", "y0"), mount, strict=True):
         off = fit.values[name] - true
@@ -61,7 +59,7 @@ def test_pose_of_a_laser_wherever_it_is(mount, upside_down):
 def test_scale_and_gain_are_recorded_over_true():
     poses, rng = true_path(), np.random.default_rng(1)
     recorded = correct_odometry(SECONDS, poses, scale=1 / 1.1, rotation_gain=1 / 0.9)
-    problem = HandEye([windows_of(poses, (0, 0, 0), rng)], [False], SECONDS, recorded, NOMINAL)
+    problem = HandEye([windows_of(poses, (0, 0, 0), rng)], [False], recorded, NOMINAL)
     fit = problem.fit(NOMINAL, ["scale", "rotation_gain"])
     assert fit.values["scale"] == pytest.approx(1.1, abs=0.01)
     assert fit.values["rotation_gain"] == pytest.approx(0.9, abs=0.01)
@@ -73,7 +71,7 @@ def test_outliers_do_not_count():
     poses, rng = true_path(), np.random.default_rng(2)
     windows = windows_of(poses, MOUNTS["ahead"], rng, spacing=4)
     windows.motion[::5] += [0.5, -0.4, 0.6]
-    problem = HandEye([windows], [False], SECONDS, poses, NOMINAL)
+    problem = HandEye([windows], [False], poses, NOMINAL)
     fit = problem.fit_globally(list(NOMINAL))
     assert fit.values["x0"] == pytest.approx(0.35, abs=0.02)
     assert fit.values["y0"] == pytest.approx(0.0, abs=0.02)
@@ -81,7 +79,7 @@ def test_outliers_do_not_count():
 
 def test_without_turns_the_position_is_unknown():
     poses, rng = true_path(turns=False), np.random.default_rng(3)
-    problem = HandEye([windows_of(poses, MOUNTS["ahead"], rng)], [False], SECONDS, poses, NOMINAL)
+    problem = HandEye([windows_of(poses, MOUNTS["ahead"], rng)], [False], poses, NOMINAL)
     fit = problem.fit_globally(list(NOMINAL))
     assert fit.std["x0"] > 0.2
     assert fit.std["theta0"] < 0.01

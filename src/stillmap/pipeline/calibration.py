@@ -5,7 +5,9 @@ import math
 
 import numpy as np
 
+from stillmap import em, slam
 from stillmap.core import se2
+from stillmap.core.parallel import resolve_threads
 from stillmap.core.recording import Recording
 from stillmap.pipeline.options import Options
 from stillmap.preprocessing.overrides import mirror_beams
@@ -19,6 +21,7 @@ from stillmap.slam.mount_calibration import (
     Parameter,
     calibrate_mounts,
 )
+from stillmap.slam.mount_refinement import refine_positions
 
 
 def calibrate_recording(
@@ -37,18 +40,33 @@ def calibrate_recording(
     """
     told = [_told(recording, options, k) for k in range(len(recording.T_base_sensor))]
     found = calibrate_mounts(recording, options.slam.resolution, told)
+    applied = _apply(recording, found)
+    if any(
+        one.significant for laser in found.lasers for name, one in laser.items() if name in POSITION
+    ):
+        e = em.initial_p_static(applied, options.estimator, options.em)
+        threads = resolve_threads(options.threads)
+        step = slam.m_step(
+            applied, e, options.slam, None, threads, lambda *_: None, with_grid=False
+        )
+        found = refine_positions(applied, step.poses, found)
+        applied = _place_lasers(applied, found)
     sentences: list[str] = []
     for k, laser in enumerate(found.lasers):
-        if found.upside_down[k]:
-            recording = mirror_beams(recording, k)
-        if any(one.significant for one in laser.values()):
-            recording = _place_laser(recording, k, laser)
         which = "the laser" if len(found.lasers) == 1 else f"laser {k + 1}"
         sentences += _laser_sentences(which, laser, found.upside_down[k])
+    return applied, found, sentences + _odometry_sentences(found.odometry)
+
+
+def _apply(recording: Recording, found: Calibration) -> Recording:
+    for k, upside_down in enumerate(found.upside_down):
+        if upside_down:
+            recording = mirror_beams(recording, k)
+    if any(one.significant for laser in found.lasers for one in laser.values()):
+        recording = _place_lasers(recording, found)
     if any(one.significant for one in found.odometry.values()):
-        recording = _correct(recording, found)
-        sentences += _odometry_sentences(found.odometry)
-    return recording, found, sentences
+        recording = _correct_odometry(recording, found)
+    return recording
 
 
 def _told(recording: Recording, options: Options, laser: int) -> set[str]:
@@ -71,15 +89,18 @@ def _told(recording: Recording, options: Options, laser: int) -> set[str]:
     return told
 
 
-def _place_laser(recording: Recording, k: int, laser: dict[str, Parameter]) -> Recording:
-    x, y, theta = se2.parameters(recording.T_base_sensor[k]).tolist()
-    known = {"x": x, "y": y, YAW: theta, **{name: one.applied for name, one in laser.items()}}
+def _place_lasers(recording: Recording, found: Calibration) -> Recording:
     T_base_sensor = np.array(recording.T_base_sensor)
-    T_base_sensor[k] = se2.matrix(known["x"], known["y"], known[YAW])
+    for k, laser in enumerate(found.lasers):
+        x, y, theta = se2.parameters(T_base_sensor[k]).tolist()
+        known = {"x": x, "y": y, YAW: theta}
+        known |= {name: one.value for name, one in laser.items() if one.significant}
+        if any(one.significant for one in laser.values()):
+            T_base_sensor[k] = se2.matrix(known["x"], known["y"], known[YAW])
     return dataclasses.replace(recording, T_base_sensor=T_base_sensor)
 
 
-def _correct(recording: Recording, found: Calibration) -> Recording:
+def _correct_odometry(recording: Recording, found: Calibration) -> Recording:
     assert recording.T_odom_base is not None
     seconds = 1e-9 * (recording.stamp_ns - recording.stamp_ns[0])
     latency = found.odometry.get(LATENCY)
@@ -122,7 +143,9 @@ def _laser_sentences(which: str, laser: dict[str, Parameter], upside_down: bool)
 
 
 def _odometry_sentences(odometry: dict[str, Parameter]) -> list[str]:
-    out = []
+    out: list[str] = []
+    if not odometry:
+        return out
     for name, what in ((SCALE, "distance"), (GAIN, "rotation")):
         one = odometry[name]
         if one.significant:

@@ -32,6 +32,7 @@ _DEGREES_OF_FREEDOM = 4.0  # of Student's t distribution, which the residuals ar
 _MEDIAN_CHI2, _MEDIAN_CHI2_2D = 2.37, 1.39  # of three and of two degrees of freedom
 _MIN_SCALE = 1e-2  # of the variances
 _ITERATIONS = 30
+_CACHED = 8  # odometry motions at different scales and gains
 _MAX_STEP = 0.3  # m, rad or 1, of one iteration
 _DIFFERENCE = 1e-4  # m, rad or 1, of numeric derivatives
 
@@ -62,8 +63,13 @@ def correct_odometry(
     if scale == 1.0 and rotation_gain == 1.0:
         return T
     twists = se2.log(se2.inverse(T[:-1]) @ T[1:]) / [scale, scale, rotation_gain]
+    return _chain(T[0], twists)
+
+
+def _chain(first: Float, twists: Float) -> Float:
+    """(T, 3, 3) poses from the first one (3, 3) along twists (T - 1, 3)."""
     steps = se2.parameters(se2.exp(twists))
-    x, y, theta = se2.parameters(T[0])
+    x, y, theta = se2.parameters(first)
     heading = theta + np.append(0.0, steps[:, 2].cumsum())
     c, s = np.cos(heading[:-1]), np.sin(heading[:-1])
     dx, dy = c * steps[:, 0] - s * steps[:, 1], s * steps[:, 0] + c * steps[:, 1]
@@ -102,7 +108,6 @@ class HandEye:
     Args:
         windows: motions of each laser.
         upside_down: for each laser whether its scans are mirrored.
-        seconds: (T,) stamps.
         T_odom_base: (T, 3, 3) odometry, not late.
         nominal: values of all parameters that the priors lie around.
     """
@@ -111,32 +116,39 @@ class HandEye:
         self,
         windows: Sequence[MotionWindows],
         upside_down: Sequence[bool],
-        seconds: Float,
         T_odom_base: Float,
         nominal: Values,
     ) -> None:
         both = zip(windows, upside_down, strict=True)
         self.windows = [mirror(one) if mirrored else one for one, mirrored in both]
-        self.seconds, self.T_odom_base, self.nominal = seconds, T_odom_base, nominal
+        self.nominal = nominal
         counts = [int(one.segment.max(initial=-1)) + 1 for one in windows]
-        first = np.cumsum([0, *counts[:-1]])
+        before = np.cumsum([0, *counts[:-1]])
         self.segment = np.concatenate(
-            [one.segment + k for one, k in zip(windows, first, strict=True)]
+            [one.segment + k for one, k in zip(windows, before, strict=True)]
         )
-        self.information = np.linalg.inv(
-            np.concatenate([one.covariance + self._odometry_noise(one) for one in self.windows])
-        )
+        # only the scans in windows; the steps between segments are in none
+        spans = [np.arange(a, b + 1) for w in windows for a, b in zip(w.first, w.last, strict=True)]
+        scans = np.unique(np.concatenate(spans))
+        self._ends = [np.searchsorted(scans, np.stack([one.first, one.last])) for one in windows]
+        self._twists = se2.log(se2.inverse(T_odom_base[scans[:-1]]) @ T_odom_base[scans[1:]])
+        self._cache: dict[tuple[float, float], list[Float]] = {}
+        covariances = [
+            one.covariance + _odometry_noise(motion)
+            for one, motion in zip(self.windows, self._motions(1.0, 1.0), strict=True)
+        ]
+        self.information = np.linalg.inv(np.concatenate(covariances))
 
-    def _odometry_noise(self, one: MotionWindows) -> Float:
-        """(W, 3, 3) covariances of odometry."""
-        x, y, turn = se2.parameters(self._motion(one, self.T_odom_base)).T
-        variance = np.square([_ODOMETRY_STD[0], _ODOMETRY_STD[0], _ODOMETRY_STD[1]])
-        noise: Float = (np.hypot(x, y) + np.abs(turn))[:, None, None] * np.diag(variance)
-        return noise
-
-    @staticmethod
-    def _motion(one: MotionWindows, T: Float) -> Float:
-        return se2.inverse(T[one.first]) @ T[one.last]
+    def _motions(self, scale: float, gain: float) -> list[Float]:
+        """Of each laser (W, 3) x, y, heading of the base by odometry so corrected."""
+        if (scale, gain) not in self._cache:
+            if len(self._cache) > _CACHED:
+                self._cache.clear()
+            T = _chain(np.eye(3), self._twists / [scale, scale, gain])
+            self._cache[scale, gain] = [
+                se2.parameters(se2.inverse(T[first]) @ T[last]) for first, last in self._ends
+            ]
+        return self._cache[scale, gain]
 
     def fit_globally(self, free: Sequence[str]) -> Fit:
         """The better of the fits from the closed form and from the nominal values."""
@@ -151,34 +163,17 @@ class HandEye:
         J the rotation by 90 degrees: linear in a, b and u. Weighted again and again for outliers.
         """
         values = dict(self.nominal)
+        motions = self._motions(1.0, 1.0)
         for k, one in enumerate(self.windows):
             names = laser_names(k)
             if not all(name in free for name in names) or len(one.first) < 4:
                 continue
-            a, b, *u = self._solve_linear(one)
+            a, b, *u = _solve_linear(one, motions[k][:, :2])
             size = float(np.hypot(a, b))
             if size > 0.1:  # else the laser hardly moved
                 found = (float(np.arctan2(b, a)), float(u[0]) / size, float(u[1]) / size)
                 values.update(zip(names, found, strict=True))
         return values
-
-    def _solve_linear(self, one: MotionWindows) -> Float:
-        p = se2.parameters(self._motion(one, self.T_odom_base))[:, :2]
-        (tx, ty), phi = one.motion[:, :2].T, one.motion[:, 2]
-        c, s = 1.0 - np.cos(phi), np.sin(phi)
-        A = np.stack([np.stack([tx, -ty, c, s], -1), np.stack([ty, tx, -s, c], -1)], axis=1)
-        variance = 0.5 * np.trace(one.covariance[:, :2, :2], axis1=1, axis2=2)
-        variance += _ODOMETRY_STD[0] ** 2 * (np.hypot(*p.T) + np.abs(phi))
-        prior = np.diag([1e-6, 1e-6, _PRIOR_STD["x"] ** -2, _PRIOR_STD["y"] ** -2])
-        weights, solution = 1.0 / variance, np.zeros(4)
-        for _ in range(_ITERATIONS // 2):
-            H = np.einsum("w,wia,wib->ab", weights, A, A) + prior
-            solution = np.linalg.solve(H, np.einsum("w,wia,wi->a", weights, A, p))
-            squares = ((p - A @ solution) ** 2).sum(axis=1) / variance
-            scale = max(float(np.median(squares)) / _MEDIAN_CHI2_2D, _MIN_SCALE)
-            weights = (_DEGREES_OF_FREEDOM + 2.0) / (_DEGREES_OF_FREEDOM + squares / scale)
-            weights /= scale * variance
-        return solution
 
     def residuals(self, values: Values) -> Float:
         """(W, 3) differences in x, y, heading of the first scan's frame, as odometry counts.
@@ -186,13 +181,9 @@ class HandEye:
         Odometry's errors are the larger ones: counted in the laser's measure they would draw scale
         and gain towards less.
         """
-        T = correct_odometry(
-            self.seconds, self.T_odom_base, scale=values[SCALE], rotation_gain=values[GAIN]
-        )
-        out = []
-        for k, one in enumerate(self.windows):
+        out, motions = [], self._motions(values[SCALE], values[GAIN])
+        for k, (one, base) in enumerate(zip(self.windows, motions, strict=True)):
             theta, x, y = (values[name] for name in laser_names(k))
-            base = se2.parameters(self._motion(one, T))
             phi = one.motion[:, 2]
             c, s = np.cos(phi) - 1.0, np.sin(phi)  # the scans know the rotation of the lever better
             px, py = base[:, 0] + c * x - s * y, base[:, 1] + s * x + c * y
@@ -246,6 +237,33 @@ class HandEye:
     def _from_nominal(self, values: Values, name: str) -> float:
         difference = values[name] - self.nominal[name]
         return float(se2.wrap(difference)) if name.startswith("theta") else difference
+
+
+def _odometry_noise(motion: Float) -> Float:
+    """(W, 3, 3) covariances of odometry's motions (W, 3)."""
+    x, y, turn = motion.T
+    variance = np.square([_ODOMETRY_STD[0], _ODOMETRY_STD[0], _ODOMETRY_STD[1]])
+    noise: Float = (np.hypot(x, y) + np.abs(turn))[:, None, None] * np.diag(variance)
+    return noise
+
+
+def _solve_linear(one: MotionWindows, p: Float) -> Float:
+    """(4,) a, b and u of `HandEye.start`, given odometry's displacements (W, 2)."""
+    (tx, ty), phi = one.motion[:, :2].T, one.motion[:, 2]
+    c, s = 1.0 - np.cos(phi), np.sin(phi)
+    A = np.stack([np.stack([tx, -ty, c, s], -1), np.stack([ty, tx, -s, c], -1)], axis=1)
+    variance = 0.5 * np.trace(one.covariance[:, :2, :2], axis1=1, axis2=2)
+    variance += _ODOMETRY_STD[0] ** 2 * (np.hypot(*p.T) + np.abs(phi))
+    prior = np.diag([1e-6, 1e-6, _PRIOR_STD["x"] ** -2, _PRIOR_STD["y"] ** -2])
+    weights, solution = 1.0 / variance, np.zeros(4)
+    for _ in range(_ITERATIONS // 2):
+        H = np.einsum("w,wia,wib->ab", weights, A, A) + prior
+        solution = np.linalg.solve(H, np.einsum("w,wia,wi->a", weights, A, p))
+        squares = ((p - A @ solution) ** 2).sum(axis=1) / variance
+        scale = max(float(np.median(squares)) / _MEDIAN_CHI2_2D, _MIN_SCALE)
+        weights = (_DEGREES_OF_FREEDOM + 2.0) / (_DEGREES_OF_FREEDOM + squares / scale)
+        weights /= scale * variance
+    return solution
 
 
 def _standard_deviations(A: Float, scores: Float) -> list[float]:

@@ -36,7 +36,9 @@ YAW, POSITION, UPSIDE_DOWN, LATENCY = "theta", ("x", "y"), "upside_down", "laten
 # (both coordinates together), shares, s
 _MATTERS = {"theta": 0.05, "x": 0.15, "y": 0.15, SCALE: 0.05, GAIN: 0.06, LATENCY: 0.1}
 _STDS = 5.0  # standard deviations that are significant
-_FIRST_WINDOWS, _MORE_WINDOWS = 40, 100  # of each laser, at first and where something is found
+# of each laser: at first, of short recordings less, and where something is found
+_FIRST_WINDOWS, _LEAST_WINDOWS, _MORE_WINDOWS = 40, 24, 100
+_SCANS_PER_WINDOW = 20  # of the recording, from which on fewer are measured at first
 _MIN_WINDOWS = 12  # less motion says nothing
 _SUSPICIOUS = 0.8  # of what matters: more windows are measured
 _MIN_GAIN = 20.0  # nats by which a calibration, or mirrored scans, must agree better in all
@@ -45,6 +47,7 @@ _MIN_SEGMENTS, _CLEAR_GAIN, _MIN_RATIO = 3, 1.0, 3.0
 _MAX_INTERVAL = 0.3  # s between scans; slower ones do not show how late odometry is
 _MIN_EXPLAINED = 0.5  # share of odometry's turns that the scans' explain
 _HALVES = 0.35  # share of the latency by which either half of the segments may differ
+_SAME_SENSE = 0.5  # correlation of the turns of laser and odometry: the right way up
 _MAX_LASERS = 4  # more: a laser that moves on its robot has a pose for each scan
 _LIMITS = {SCALE: (0.4, 2.5), GAIN: (0.4, 2.5)}  # beyond, odometry says nothing of this robot
 _MAX_POSITION = 3.0  # m on a robot
@@ -105,7 +108,8 @@ def calibrate_mounts(
     if recording.dimension != 2 or recording.T_odom_base is None or lasers > _MAX_LASERS:
         return Calibration()
     told = list(told) or [()] * lasers
-    found = _Calibrator(recording, resolution, told, _FIRST_WINDOWS).calibrate()
+    windows = max(_LEAST_WINDOWS, min(_FIRST_WINDOWS, recording.n_scans // _SCANS_PER_WINDOW))
+    found = _Calibrator(recording, resolution, told, windows).calibrate()
     if not _is_suspicious(found):
         return found
     return _Calibrator(recording, resolution, told, _MORE_WINDOWS).calibrate()
@@ -172,7 +176,7 @@ class _Calibrator:
                 self.seconds, T, scale=1.0, rotation_gain=1.0, latency=latency.value
             )
         upside_down = [self._is_upside_down(k, T) for k in range(len(self.windows))]
-        problem = HandEye(self.windows, upside_down, self.seconds, T, self.nominal)
+        problem = HandEye(self.windows, upside_down, T, self.nominal)
         free = [name for k in range(len(self.windows)) for name in self._free_names(k)]
         everything = problem.fit_globally([*free, SCALE, GAIN])
         kept, final = self._select(problem, everything)
@@ -223,12 +227,15 @@ class _Calibrator:
         if UPSIDE_DOWN in self.told[k]:
             return False
         one, costs = self.windows[k], []
+        turns = se2.parameters(se2.inverse(T[one.first]) @ T[one.last])[:, 2], one.motion[:, 2]
+        if turns[0] @ turns[1] > _SAME_SENSE * np.linalg.norm(turns[0]) * np.linalg.norm(turns[1]):
+            return False  # spares two fits
         nominal = {SCALE: 1.0, GAIN: 1.0}
         for name, of_laser in zip(laser_names(0), laser_names(k), strict=True):
             nominal[name] = self.nominal[of_laser]
         free = [name for name in laser_names(0) if _kind(name) not in self.told[k]]
         for mirrored in (False, True):
-            problem = HandEye([one], [mirrored], self.seconds, T, nominal)
+            problem = HandEye([one], [mirrored], T, nominal)
             fit = problem.fit_globally([*free, SCALE, GAIN])
             costs.append(np.bincount(one.segment, fit.cost))
         return _is_clear(costs[0] - costs[1])
