@@ -20,6 +20,7 @@ from stillmap.mapping import (
     relabel_changes,
 )
 from stillmap.mapping.projection import project_cells, project_to_plane
+from stillmap.mapping.reflections import P_REFLECTED, remove_reflections
 from stillmap.pipeline.estimate import Estimate
 from stillmap.pipeline.options import Options
 from stillmap.tracking import MovingObject, track_objects
@@ -60,7 +61,12 @@ def final_estimate(
         return deskewed, best, changes
     if recording.dimension == 3 or options.estimator != "stillmap":
         return deskewed, best, []
+    deskewed, reflected = remove_reflections(deskewed, best.poses, best.p_static, cell)
     found, courses = em.final_e_step(deskewed, best.poses, cell, options.em, threads)
+    if reflected is not None:  # unusable beams have no label
+        found.p_static[reflected] = np.where(
+            recording.hit[reflected], P_REFLECTED, options.em.prior
+        )
     best = best.with_labels(p_static=found.p_static, occupied=found.occupied, learned=found.learned)
     if courses is None:
         return deskewed, best, []
