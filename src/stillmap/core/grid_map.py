@@ -12,6 +12,7 @@ class GridMap:
 
     Attributes:
         p_occupied: (H, W) float32; NaN where unobserved, which is not free. Row 0 has the lowest y.
+            Layers of large maps are a `core.tiles.TiledArray`, which NumPy takes for an array.
         origin: x, y (metres) and yaw of the lower-left corner of the lower-left cell.
         resolution: metres.
     """

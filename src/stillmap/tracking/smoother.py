@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
 
+_FEW = 100  # knots up to which a full matrix is solved: SciPy takes 0.2 s to load
 _MIN_INTERVAL = 1e-3  # s: over less, differences of positions say nothing of speeds
 
 
@@ -47,8 +48,6 @@ def _solve(h: Float, y: Float, weight: Float) -> tuple[Float, Float]:
     (R + Q^T W Q) second = Q^T y, and the spline is y - W Q second: Q takes second differences, R
     has the integrals of hat functions.
     """
-    from scipy.linalg import solveh_banded  # takes long to load
-
     a, c = 1.0 / h[:-1], 1.0 / h[1:]
     b = -a - c
     before, here, after = weight[:-2], weight[1:-1], weight[2:]
@@ -56,9 +55,23 @@ def _solve(h: Float, y: Float, weight: Float) -> tuple[Float, Float]:
     banded[0] = (h[:-1] + h[1:]) / 3.0 + before * a**2 + here * b**2 + after * c**2
     banded[1, :-1] = h[1:-1] / 6.0 + here[:-1] * b[:-1] * a[1:] + after[:-1] * c[:-1] * b[1:]
     banded[2, :-2] = after[:-2] * c[:-2] * a[2:]
-    second = solveh_banded(banded, np.diff(np.diff(y, axis=0) / h[:, None], axis=0), lower=True)
+    second = _solve_banded(banded, np.diff(np.diff(y, axis=0) / h[:, None], axis=0))
     residual = np.zeros_like(y)
     residual[:-2] += a[:, None] * second
     residual[1:-1] += b[:, None] * second
     residual[2:] += c[:, None] * second
     return second, weight[:, None] * residual
+
+
+def _solve_banded(banded: Float, right: Float) -> Float:
+    """x (n, 2) of A x = right, A symmetric with the diagonals `banded` (3, n) from the main one."""
+    n = len(right)
+    if n <= _FEW:
+        A = np.diag(banded[0])
+        for k in (1, 2):
+            row = np.arange(k, n)
+            A[row, row - k] = A[row - k, row] = banded[k, : max(n - k, 0)]
+        return np.linalg.solve(A, right)
+    from scipy.linalg import solveh_banded
+
+    return np.asarray(solveh_banded(banded, right, lower=True))
