@@ -71,7 +71,8 @@ def _solve_banded(banded: Float, right: Float) -> Float:
         for k in (1, 2):
             row = np.arange(k, n)
             A[row, row - k] = A[row - k, row] = banded[k, : max(n - k, 0)]
-        return np.linalg.solve(A, right)
+        x: Float = np.linalg.solve(A, right).astype(np.float64, copy=False)
+        return x
     from scipy.linalg import solveh_banded
 
     return np.asarray(solveh_banded(banded, right, lower=True))
