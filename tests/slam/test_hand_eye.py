@@ -67,6 +67,15 @@ def test_scale_and_gain_are_recorded_over_true():
     np.testing.assert_allclose(again, poses, atol=1e-9)
 
 
+def test_half_a_turn_is_no_negative_scale():
+    poses, rng = true_path(), np.random.default_rng(5)
+    problem = HandEye([windows_of(poses, MOUNTS["turned"], rng)], [False], poses, NOMINAL)
+    assert problem.fit(NOMINAL, list(NOMINAL)).values["scale"] < 0.0
+    fit = problem.fit_globally(list(NOMINAL))
+    assert fit.values["scale"] == pytest.approx(1.0, abs=0.01)
+    assert abs(se2.wrap(fit.values["theta0"] - np.pi)) < 0.01
+
+
 def test_outliers_do_not_count():
     poses, rng = true_path(), np.random.default_rng(2)
     windows = windows_of(poses, MOUNTS["ahead"], rng, spacing=4)

@@ -151,9 +151,13 @@ class HandEye:
         return self._cache[scale, gain]
 
     def fit_globally(self, free: Sequence[str]) -> Fit:
-        """The better of the fits from the closed form and from the nominal values."""
-        fits = [self.fit(start, free) for start in (self.nominal, self.start(free))]
-        return min(fits, key=lambda fit: float(fit.cost.sum()))
+        """The better of the fits from the closed form and from the nominal values.
+
+        A negative scale is the solution of a laser half a turn away.
+        """
+        fits = [self.fit(start, free) for start in (self.start(free), self.nominal)]
+        proper = [fit for fit in fits if fit.values[SCALE] > 0.0]
+        return min(proper or fits, key=lambda fit: float(fit.cost.sum()))
 
     def start(self, free: Sequence[str]) -> Values:
         """Values of the free parameters of the lasers from a closed form, whatever the yaw.
