@@ -24,7 +24,7 @@ ESTIMATORS_3D: tuple[Estimator, ...] = ("stillmap", "paper")
 # once to register without people, and once more on those better poses.
 _FIXED_ITERATIONS: dict[Estimator, int] = {"hit-ratio": 1, "tracker": 2}
 
-_FLOOR_PRIOR = 0.02  # times the prior, for what is taken for floor: wrong in fewer beams than that
+_P_FLOOR = 0.0  # a scan of nothing but floor has no weight, and follows odometry
 
 _LABEL_CHANGE = 0.1  # change of P(static) that counts in `changed_share`
 
@@ -43,7 +43,7 @@ def initial_p_static(
         e[block] = prior
     odometry = recording.T_odom_base
     if estimator == "stillmap" and recording.dimension == 2 and odometry is not None:
-        e[find_floor_returns(recording, odometry)] *= _FLOOR_PRIOR
+        e[find_floor_returns(recording, odometry)] = _P_FLOOR
     return e
 
 

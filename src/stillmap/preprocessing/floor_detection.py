@@ -31,11 +31,13 @@ _COARSE_BEAMS = 48  # beams per scan that are compared first
 _MIN_COARSE, _MIN_BEAMS = 3, 6  # beams that others looked past
 _MIN_SPAN, _MIN_LENGTH = 0.2, 1.0  # rad, m of the line: longer than a person
 _MIN_DISTANCE = 1.0  # m from sensor to line; a laser .1 m high would pitch by 6 degrees
-_MIN_PAST = 0.8  # share of the line's beams that a scan before and one after looked past
+# share of the line's beams that others looked past, at the rest is wall: less if many other beams
+# show that the poses are right
+_MIN_PAST, _MIN_PAST_AMONG_OTHERS = 0.8, 0.6
 _MIN_VOTES = 0.5  # share of the scans compared: odometry that jumps misleads only some
 _MIN_KNOWN = 0.4  # share of the line's beams of which these scans must know
-_MIN_AGREEMENT = 0.4  # share of the other beams that agree with these scans
-_MIN_OTHERS = 10  # other beams from which on their agreement counts
+_MIN_AGREEMENT = 0.7  # share of the other beams that agree with these scans
+_MIN_OTHERS, _MANY_OTHERS = 10, 40  # other beams from which on their agreement counts, and is proof
 _MIN_FILLED = 0.5  # share of the returns between the ends of the line that are on it
 _MAX_BEYOND = 0.05  # share of the returns that lie behind the line or its extension
 _MAX_FLOOR_RANGE = 60.0  # m; farther away even a level scan plane may meet the floor
@@ -252,15 +254,17 @@ def _came_and_went(relation: NDArray[np.int8], on: Bool) -> bool:
     n_others = (others > 0).sum(axis=1)
     agreement = (others == AGREED).sum(axis=1) >= _MIN_AGREEMENT * n_others
     fit = agreement | (n_others < _MIN_OTHERS)
+    is_proven = np.median(n_others[n_others > 0]) >= _MANY_OTHERS if n_others.any() else False
+    min_past = _MIN_PAST_AMONG_OTHERS if is_proven else _MIN_PAST
     for side in np.split(np.where(fit[:, None], line, 0), 2):
         passed = (side == PASSED).any(axis=0)
         known = passed | (side == AGREED).any(axis=0)
         n_passed, n_known = np.count_nonzero(passed), np.count_nonzero(known)
-        if n_known < max(_MIN_BEAMS - 1, _MIN_KNOWN * len(known)) or n_passed < _MIN_PAST * n_known:
+        if n_known < max(_MIN_BEAMS - 1, _MIN_KNOWN * len(known)) or n_passed < min_past * n_known:
             return False
     n_passed, n_agreed = (line == PASSED).sum(axis=1), (line == AGREED).sum(axis=1)
     known = fit & (n_passed + n_agreed >= _MIN_KNOWN * line.shape[1])
-    votes = n_passed[known] >= _MIN_PAST * (n_passed + n_agreed)[known]
+    votes = n_passed[known] > min_past * (n_passed + n_agreed)[known]
     return bool(np.count_nonzero(votes) >= _MIN_VOTES * len(votes))
 
 
