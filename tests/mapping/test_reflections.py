@@ -63,7 +63,7 @@ def test_most_reflections_are_found_and_nothing_else(
 @pytest.mark.parametrize(
     "name", ["hall", "office", "corridor", "warehouse", "ten-corridors", "street", "rounds"]
 )
-@pytest.mark.parametrize("fov", [3.1416, *slow_params(6.2832)])
+@pytest.mark.parametrize("fov", [3.1416, *slow_params(6.283)])
 def test_places_without_mirrors_have_none(name: str, fov: float) -> None:
     assert not reflected(drive(name, 1, laser={"beams": 270, "fov": fov})).any()
 
