@@ -32,13 +32,52 @@ WeightedBeams<D> beams_from(const Points<D>& points, const Flat<float>& weights)
   return beams;
 }
 
+// Normals of the beams that `beams_from` kept.
+template <int D>
+void add_normals(WeightedBeams<D>& beams, const Points<D>& points, const Flat<float>& weights,
+                 const Points<D>& normals, const std::optional<Flat<float>>& isotropy) {
+  const size_t n_beams = points.shape(0);
+  require(normals.shape(0) == n_beams, "normals: expected as many rows as points has");
+  require(isotropy.has_value(), "isotropy: expected along with normals");
+  const float* s = per_beam(*isotropy, n_beams, "isotropy");
+  for (size_t n = 0; n < n_beams; ++n) {
+    if (!usable<D>(points.data() + n * D) || !(weights.data()[n] > 0.0f)) continue;
+    const Vec<D> normal = point_at<D>(normals.data() + n * D);
+    require(normal.allFinite() && s[n] >= 0.0f && s[n] <= 1.0f,
+            "normals: expected finite vectors and isotropy in [0, 1]");
+    beams.normals.push_back({normal, static_cast<double>(s[n])});
+  }
+}
+
+auto normals_of(const Points<2>& points, double radius, double max_gap, double flat_below,
+                double round_from) {
+  require(radius > 0.0 && max_gap > 0.0, "radius, max_gap: expected positive lengths");
+  require(flat_below >= 0.0 && round_from > flat_below,
+          "round_from: expected more than flat_below, which must not be negative");
+  std::vector<Vec<2>> ends;
+  for (size_t n = 0; n < points.shape(0); ++n) ends.push_back(point_at<2>(points.data() + n * 2));
+  const auto found = estimate_normals(ends, {radius, max_gap, flat_below, round_from});
+  std::vector<float> normals, isotropy;
+  for (const auto& surface : found) {
+    for (const double x : {surface.normal[0], surface.normal[1]})
+      normals.push_back(std::isfinite(x) ? static_cast<float>(x) : 0.0f);
+    isotropy.push_back(std::isfinite(surface.isotropy) ? static_cast<float>(surface.isotropy)
+                                                       : 0.0f);
+  }
+  const size_t n = found.size();
+  return std::make_tuple(to_numpy(std::move(normals), {n, size_t{2}}),
+                         to_numpy(std::move(isotropy), {n}));
+}
+
 template <int D>
 auto register_scan(const OccupancyGrid<D>& grid, const Points<D>& points,
                    const Flat<float>& weights, const OnePose<D>& T_prior,
                    const Square<D>& information, double sigma, int radius, double floor,
                    double unknown, double information_scale, int max_iterations,
                    double window_translation, double window_rotation, double search_range,
-                   int max_candidates, const std::optional<OnePose<D>>& T_start) {
+                   int max_candidates, const std::optional<OnePose<D>>& T_start,
+                   const std::optional<Points<D>>& normals,
+                   const std::optional<Flat<float>>& isotropy) {
   require(max_candidates >= 1, "max_candidates: expected at least one");
   const ScanRegistrationOptions options{
       {sigma, radius, floor, unknown}, information_scale, max_iterations};
@@ -46,6 +85,7 @@ auto register_scan(const OccupancyGrid<D>& grid, const Points<D>& points,
   require(window_translation >= 0.0 && window_rotation >= 0.0 && window_rotation <= 3.2,
           "window: expected half widths, rotation at most pi");
   auto beams = beams_from<D>(points, weights);
+  if (normals) add_normals<D>(beams, points, weights, *normals, isotropy);
   PosePrior<D> prior{checked_pose<D>(T_prior, "T_prior"), {}};
   for (int r = 0; r < Lie<D>::kDof; ++r)
     for (int c = 0; c < Lie<D>::kDof; ++c) prior.information(r, c) = information(r, c);
@@ -68,6 +108,9 @@ auto register_scan(const OccupancyGrid<D>& grid, const Points<D>& points,
       if (found.back().cost < best.cost) best = found.back();
     }
     candidates = search.poses_tried();
+    if (normals)
+      best.information =
+          prior.information + surface_information<D>(field, beams, best.pose, options);
   }
   constexpr size_t n = Lie<D>::kDof;
   std::vector<double> alternatives;
@@ -130,13 +173,15 @@ void bind(nb::module_& m) {
         nb::arg("floor"), nb::arg("unknown"), nb::arg("information_scale"),
         nb::arg("max_iterations"), nb::arg("window_translation"), nb::arg("window_rotation"),
         nb::arg("search_range"), nb::arg("max_candidates"), nb::arg("T_start") = nb::none(),
+        nb::arg("normals").noconvert() = nb::none(), nb::arg("isotropy").noconvert() = nb::none(),
         "Equation (9): scan-to-map registration. points (N, D) float32: end points of returns in "
         "the moving frame; weights (N,) float32 = e; T_prior (D+1, D+1) and information (dof, dof) "
         "of (translation, rotation about the origin of the moving frame). A correlative search "
         "yields up to max_candidates poses, each refined by Newton steps; with T_start the search "
         "is skipped. Returns pose, covariance, cost, inlier share, number of Newton steps, number "
         "of scored lattice poses, and (R, dof + 1) offset and additional cost of each refined "
-        "candidate against the best.");
+        "candidate against the best. With normals (N, D) and isotropy (N,) of `estimate_normals`, "
+        "the covariance is that of the surfaces' directions, and wide along a bare wall.");
   m.def("occluded_share", &occluded_share_at<D>, nb::arg("grid"), nb::arg("points").noconvert(),
         nb::arg("weights").noconvert(), nb::arg("T").noconvert(), nb::arg("T_sensor").noconvert(),
         nb::kw_only(), nb::arg("margin"), nb::arg("min_occupancy"),
@@ -157,6 +202,13 @@ void bind(nb::module_& m) {
 }  // namespace
 
 void bind_scan_registration(nb::module_& m) {
+  m.def("estimate_normals", &normals_of, nb::arg("points").noconvert(), nb::kw_only(),
+        nb::arg("radius"), nb::arg("max_gap"), nb::arg("flat_below"), nb::arg("round_from"),
+        "Normals (N, 2) float32 and isotropy (N,) float32 of the surfaces at the end points (N, 2) "
+        "of a planar scan in the order of its beams. Neighbours are the successive end points "
+        "within `radius` metres, each at most `max_gap` from the one before. Isotropy rises from 0 "
+        "to 1 as the ratio of the variances across and along rises from flat_below to round_from. "
+        "With fewer than two neighbours the normal is zero.");
   bind<2>(m);
   bind<3>(m);
 }

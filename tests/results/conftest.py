@@ -66,6 +66,7 @@ class FakeIteration:
     changed_share: float
     seconds: float
     held_out_log_likelihood: float | None = None
+    touched_share: float = 0.3
 
 
 @dataclass(frozen=True)
@@ -302,7 +303,7 @@ def result():
             FakeLoop(6, 46, 0.25, "explains too little"),
         ],
         graph=_graph(poses),
-        doubts=Diagnostics(widened=[7], odometry_faults=[7, 9], breaks=[20], unconnected=[20]),
+        doubts=Diagnostics([7], [7, 9], breaks=[20], unconnected=[20], ambiguous=[31]),
         stages={
             "read": {"seconds": 0.21, "cpu_seconds": 0.2, "peak_memory_bytes": 41_000_000},
             "em": {"seconds": 7.1, "cpu_seconds": 13.5, "peak_memory_bytes": 96_000_000},

@@ -72,6 +72,7 @@ def test_iterations(tmp_path, result):
         "expected_log_likelihood": -32100.25,
         "held_out_log_likelihood": None,
         "changed_share": 0.08,
+        "touched_share": 0.3,
         "seconds": 1.8,
     }
     assert iterations[3]["bound"] is None  # not a number there
@@ -98,6 +99,7 @@ def test_doubts(tmp_path, result):
         "found_by_wider_search": [7],
         "carried_before": [20],
         "beside_the_map_from": [20],
+        "ambiguous": [31],
     }
 
 

@@ -33,4 +33,5 @@ def driven(walls, route, laser, speed=1.0):
         0.05,
         1.0,
         6.0,
+        np.zeros((len(poses), 3, 3)),
     )

@@ -60,6 +60,7 @@ def make_context(poses):
         0.05,
         1.0,
         6.0,
+        np.zeros((n, 3, 3)),
     )
 
 

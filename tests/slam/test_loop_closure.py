@@ -162,7 +162,8 @@ def test_rejections_carry_reasons(monkeypatch):
 def make_context(recording, poses, travelled, frames):
     """What loops are looked for in; all of it is explained, and no beam is believed."""
     e, explained = np.zeros(recording.n_beams, np.float32), np.ones(len(poses))
-    return LoopContext(recording, e, poses, travelled, explained, frames, 0.05, 1.0, 6.0)
+    drift = np.zeros((len(poses), 3, 3))
+    return LoopContext(recording, e, poses, travelled, explained, frames, 0.05, 1.0, 6.0, drift)
 
 
 def straight_context():

@@ -18,7 +18,7 @@ from stillmap.slam.loop_verification import (
     verify_candidate,
     verify_candidates,
 )
-from stillmap.slam.scan_matching import Scan
+from stillmap.slam.scan_matching import make_scan
 from stillmap.slam.types import LoopCandidate
 
 
@@ -119,7 +119,7 @@ def test_comparable_beams_were_observed_from_the_same_side():
     _core.add_beams(grid, end, one[0], one[1], one[2], T, remove=False)
     ends = np.array([[5.05, 0.05], [5.05, 0.05], [5.05, 3.0]], np.float32)
     weights = np.array([0.5, 0.3, 0.2], np.float32)
-    view = Scan(ends, weights, np.eye(3))
+    view = make_scan(ends, weights, np.eye(3))
     # from the left, from the right, and where nobody looked
     before = ends + np.array([[-1, 0], [1, 0], [-1, 0]], np.float32)
     part, share = _select_comparable(grid, view, before, np.eye(3))
@@ -129,7 +129,7 @@ def test_comparable_beams_were_observed_from_the_same_side():
 
 
 def test_points_before_ends_by_hand():
-    scan = Scan(
+    scan = make_scan(
         np.array([[5.0, 1.0], [1.0, 4.0], [1.0, 2.0]], np.float32),
         np.ones(3, np.float32),
         se2.matrix(1.0, 1.0, 0.3),

@@ -14,6 +14,7 @@ from stillmap.em.estimator import (
     max_iterations,
     needs_sums,
     recount_as_static,
+    touched_share,
 )
 from stillmap.em.ground import estimate_ground
 from stillmap.em.observations import time_bin_index
@@ -64,4 +65,5 @@ __all__ = [
     "recount_as_static",
     "score_held_out_scans",
     "time_bin_index",
+    "touched_share",
 ]

@@ -27,6 +27,7 @@ _FIXED_ITERATIONS: dict[Estimator, int] = {"hit-ratio": 1, "tracker": 2}
 _P_FLOOR = 0.0  # a scan of nothing but floor has no weight, and follows odometry
 
 _LABEL_CHANGE = 0.1  # change of P(static) that counts in `changed_share`
+_TOUCHED = 0.2  # of the hits of a scan, whose change may change its pose
 
 
 def initial_p_static(
@@ -191,3 +192,23 @@ def changed_share(
         n_changed += int(np.count_nonzero(changed))
         n_hits += int(np.count_nonzero(hit[block]))
     return n_changed / max(n_hits, 1)
+
+
+def touched_share(
+    recording: Recording, before: NDArray[np.float32], after: NDArray[np.float32]
+) -> float:
+    """Share of the scans of whose hits a fifth or more changed P(static) between two iterations.
+
+    Only these can be matched differently in the next M-step.
+
+    Args:
+        recording: 2D or 3D.
+        before, after: (M,) P(c = 1) of every beam.
+    """
+    n_touched = 0
+    for t in recording.iter_scans(range(recording.n_scans), before, after):
+        beams = recording.beams_of(t)
+        hit = recording.hit[beams]
+        changed = np.abs(after[beams] - before[beams])[hit] > _LABEL_CHANGE
+        n_touched += bool(changed.sum() >= _TOUCHED * max(hit.sum(), 1))
+    return n_touched / max(recording.n_scans, 1)

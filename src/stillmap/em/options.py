@@ -16,16 +16,19 @@ class EmOptions(Section, section="em"):
     prior: float = option(0.9, "Prior probability p(c = 1) that a beam is static.", gt=0.0, lt=1.0)
     max_iterations: int = option(6, "Maximum number of EM iterations.", ge=1)
     tolerance: float = option(
-        1e-3, "Stop when the bound gains less than this per iteration, in nats per beam.", ge=0.0
+        1e-3,
+        "Stop when the held-out likelihood (without one, the bound) gains less than this per "
+        "iteration, in nats per beam.",
+        ge=0.0,
     )
     label_tolerance: float = option(
         0.005,
-        "Stop when P(static) of fewer than this share of the hits changes by more than 0.1 "
-        "(estimator stillmap).",
+        "Stop when P(static) of fewer than this share of the hits changes by more than 0.1, or no "
+        "scan is affected (estimator stillmap); 0: never.",
         ge=0.0,
         le=1.0,
     )
-    patience: int = option(2, "Stop after this many iterations without a better bound.", ge=1)
+    patience: int = option(1, "Stop after this many iterations without a gain.", ge=1)
     held_out: int = option(
         20, "Leave every n-th scan out of the map and score the map with it; 0: none.", ge=0
     )

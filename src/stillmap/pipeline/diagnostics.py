@@ -1,42 +1,25 @@
 """Warnings of a run: what limits the trust in its result."""
 
-import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from stillmap import em, slam
+from stillmap import slam
 from stillmap.core.json import count_skipped
 from stillmap.core.recording import Recording
-from stillmap.pipeline.estimate import Estimate, IterationRecord
-from stillmap.pipeline.options import Options
+from stillmap.pipeline.estimate import Estimate
 
 
-def find_warnings(
-    records: Sequence[IterationRecord], best: Estimate, recording: Recording, options: Options
-) -> list[str]:
+def find_warnings(best: Estimate, recording: Recording) -> list[str]:
     """One sentence per warning, those of the reader first.
 
     Args:
-        records: the numbers of every iteration.
         best: the estimate that was kept.
         recording: the input.
-        options: as resolved.
     """
     explained = best.m_step.explained  # NaN: poses were given
     out = _reader_warnings(recording.source)
-    noise = options.em.tolerance * recording.n_beams
-    dips = [
-        after.number
-        for before, after in itertools.pairwise(records)
-        if after.bound < before.bound - noise
-    ]
-    if dips and not em.fixed_iterations(options.estimator):
-        out.append(
-            f"the likelihood dipped at iteration {', '.join(map(str, dips))}: poses are estimated "
-            f"by matching, not by it; iteration {best.number} is the best and was kept"
-        )
     given = len(explained) > 0 and bool(np.isnan(explained).all())
     if recording.T_odom_base is None and not given:
         out.append("no odometry: a constant velocity was assumed between scans")
@@ -73,9 +56,14 @@ def _pose_warnings(diagnostics: slam.Diagnostics) -> list[str]:
             f"{len(widened)} scans lay outside the odometry's uncertainty and were found by a "
             f"wider search, the first is scan {widened[0]}"
         )
+    for scan in diagnostics.ambiguous:
+        out.append(
+            f"from scan {scan} on, another place fits about as well as the one that odometry leads "
+            "to: odometry's was kept"
+        )
     for scan in diagnostics.breaks:
         out.append(
-            f"before scan {scan} the robot lost its way or was carried elsewhere: "
+            f"before scan {scan} the robot was carried elsewhere: "
             + (
                 "no place seen after it is known from before, so it is not connected to the rest"
                 if scan in diagnostics.unconnected

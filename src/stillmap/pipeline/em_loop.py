@@ -86,6 +86,7 @@ def iterate(
             changed_share=em.changed_share(e, e_step.p_static, recording.hit),
             seconds=time.perf_counter() - started,
             held_out_log_likelihood=held_out,
+            touched_share=em.touched_share(recording, e, e_step.p_static),
         )
         iteration = Iteration(Estimate(number, e, m_step, e_step), record, deskewed)
         previous = iteration.estimate.for_next_iteration()

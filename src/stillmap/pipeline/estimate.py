@@ -17,6 +17,9 @@ from stillmap.pipeline.snapshots import Snapshot, Window, choose_window, snapsho
 Float = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
+# of the scans: if fewer are touched by a change of labels, the next M-step finds the same poses
+_TOUCHED_SCANS = 0.02
+
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
@@ -75,6 +78,7 @@ class IterationRecord:
         changed_share: share of the hits whose e changed by more than 0.1.
         seconds: wall clock.
         held_out_log_likelihood: nats per beam of scans left out of the map; None: not computed.
+        touched_share: share of the scans that the next M-step may match differently.
     """
 
     number: int
@@ -83,6 +87,7 @@ class IterationRecord:
     changed_share: float
     seconds: float
     held_out_log_likelihood: float | None = None
+    touched_share: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +119,7 @@ class EmState:
         records: one per iteration.
         snapshots: a part of the map at the first, second, best and last iteration (Fig. 8).
         window: the part of the map that snapshots show, metres.
-        best: estimate with the highest bound so far, without its grid.
+        best: estimate with the highest score so far, without its grid.
         latest: what the next iteration starts from.
         converged: whether a stopping rule holds.
         single_pass: stop after the first iteration: given poses leave nothing to iterate on.
@@ -132,15 +137,20 @@ class EmState:
     def update(self, iteration: Iteration) -> None:
         """Records an iteration, keeps its estimate if it is the best, checks convergence."""
         estimate, record, options = iteration.estimate, iteration.record, self.options.em
+        n_beams, fixed = iteration.deskewed.n_beams, em.fixed_iterations(self.options.estimator)
         self.records.append(record)
-        gain = np.inf if self.best is None else estimate.bound - self.best.bound
-        fixed = em.fixed_iterations(self.options.estimator)
+        gain = np.inf
+        if self.best is not None:
+            gain = self._score(record, n_beams) - self._score(
+                self.records[self.best.number - 1], n_beams
+            )
         if gain > 0.0 or fixed:
             self.best = estimate.without_grid()
         self._take_snapshot(iteration)
         self.latest = estimate.for_next_iteration()
-        converged = 0.0 <= gain < options.tolerance * iteration.deskewed.n_beams
+        converged = 0.0 <= gain < options.tolerance
         if self.options.estimator == "stillmap":  # the labels of (8) keep changing slightly
+            converged |= record.touched_share < _TOUCHED_SCANS and options.label_tolerance > 0.0
             converged |= record.number > 1 and record.changed_share < options.label_tolerance
         out_of_patience = record.number - self.require_best().number >= options.patience
         self.converged = (
@@ -152,6 +162,16 @@ class EmState:
             record.bound,
             100.0 * record.changed_share,
         )
+
+    def _score(self, record: IterationRecord, n_beams: int) -> float:
+        """Nats per beam by which iterations are compared.
+
+        The held-out likelihood, which means the same whatever the poses are; the bound without it,
+        and for the printed method.
+        """
+        if self.options.estimator == "stillmap" and record.held_out_log_likelihood is not None:
+            return record.held_out_log_likelihood
+        return record.bound / max(n_beams, 1)
 
     def require_best(self) -> Estimate:
         """The best estimate; RuntimeError before the first iteration."""

@@ -196,7 +196,7 @@ def _finish(
         estimate=estimate,
         maps=maps,
         converged=state.converged,
-        warnings=find_warnings(state.records, estimate, recording, options),
+        warnings=find_warnings(estimate, recording),
         objects=objects,
         traffic=crossings,
         changes=changes,

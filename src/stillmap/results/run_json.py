@@ -58,6 +58,7 @@ def run_record(result: MappingResult, more: Mapping[str, Any] | None = None) -> 
             "found_by_wider_search": result.doubts.widened,
             "carried_before": result.doubts.breaks,
             "beside_the_map_from": result.doubts.unconnected,
+            "ambiguous": result.doubts.ambiguous,
         },
         "changes": [_change(one) for one in result.changes],
         "loops": {
@@ -146,5 +147,6 @@ def _iteration(it: IterationRecord) -> dict[str, Any]:
         "expected_log_likelihood": it.expected_log_likelihood,
         "held_out_log_likelihood": it.held_out_log_likelihood,
         "changed_share": it.changed_share,
+        "touched_share": it.touched_share,
         "seconds": it.seconds,
     }

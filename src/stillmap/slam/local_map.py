@@ -15,7 +15,7 @@ Float = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 SCAN_SPACING = 0.2  # m or rad between scans that are added to a map; 5 s count as 1 m
-_SPACING_PER_SECOND = 0.2
+SPACING_PER_SECOND = 0.2
 KEYFRAME_ANGLE = 0.5  # rad between keyframes
 
 
@@ -70,7 +70,7 @@ class LocalMap:
         last, T_last, _ = kept
         x, y, theta = se2.parameters(se2.inverse(T_last) @ T_map_base)
         seconds = 1e-9 * float(self._recording.stamp_ns[t] - self._recording.stamp_ns[last])
-        spacing = float(np.hypot(x, y) + abs(theta) + _SPACING_PER_SECOND * seconds)
+        spacing = float(np.hypot(x, y) + abs(theta) + SPACING_PER_SECOND * seconds)
         return spacing >= SCAN_SPACING
 
     def _last_of(self, sensor: int) -> tuple[int, Float, float] | None:

@@ -58,25 +58,58 @@ def graph_distances(context: LoopContext, k: int, closures: list[LoopClosure]) -
     The shortest path through the graph: along the chain, or through closures, each of which counts
     as the travel whose drift equals its standard deviation.
     """
+    steps = np.diff(context.travelled[context.keyframes[: k + 1]])
+    covariance = np.array([closure.covariance[:2, :2] for closure in closures]).reshape(-1, 2, 2)
+    std: Float = np.sqrt(np.linalg.eigvalsh(covariance)[:, 1])
+    return _shortest_paths(context, k, steps, closures, std / max(_DRIFT_TRANSLATION, 1e-9))
+
+
+def _shortest_paths(
+    context: LoopContext, k: int, steps: Float, closures: list[LoopClosure], lengths: Float
+) -> Float:
+    """(k + 1,) lengths of the shortest paths through the graph from keyframe k.
+
+    Args:
+        context: the trajectory.
+        k: index into the keyframes.
+        steps: (k,) lengths between successive keyframes.
+        closures: further edges.
+        lengths: of them.
+    """
+    is_before = np.array([closure.later <= context.keyframes[k] for closure in closures], np.bool_)
+    if not is_before.any():
+        return np.append(steps[::-1].cumsum()[::-1], 0.0)
     from scipy import sparse
     from scipy.sparse import csgraph  # loading it takes long
 
-    travelled = context.travelled[context.keyframes[: k + 1]]
-    closures = [closure for closure in closures if closure.later <= context.keyframes[k]]
-    if not closures:
-        along: Float = travelled[k] - travelled
-        return along
-    scans = np.array([[closure.earlier, closure.later] for closure in closures])
+    scans = np.array([[closure.earlier, closure.later] for closure in closures])[is_before]
     first, second = np.searchsorted(context.keyframes, scans).T
-    covariance = np.array([closure.covariance[:2, :2] for closure in closures])
-    std: Float = np.sqrt(np.linalg.eigvalsh(covariance)[:, 1])
-    lengths = std / max(_DRIFT_TRANSLATION, 1e-9)
     # an edge of weight zero would be no edge
-    weights = np.concatenate([np.diff(travelled), lengths]).clip(1e-9)
+    weights = np.concatenate([steps, lengths[is_before]]).clip(1e-9)
     ends = np.append(np.arange(k), first), np.append(np.arange(1, k + 1), second)
     graph = sparse.csr_array((weights, ends), shape=(k + 1, k + 1))
-    metres: Float = csgraph.dijkstra(graph, directed=False, indices=[k])[0]
-    return metres
+    found: Float = csgraph.dijkstra(graph, directed=False, indices=[k])[0]
+    return found
+
+
+def blind_stds(context: LoopContext, k: int, closures: list[LoopClosure]) -> tuple[Float, Float]:
+    """(k + 1,) standard deviations, m and rad, that blind steps add between keyframes and k.
+
+    Of the path through chain and closures with the least variance of the heading. An error of the
+    heading moves all that follows.
+    """
+    keyframes = context.keyframes[: k + 1]
+    blind = np.diff(context.drift.cumsum(axis=0)[keyframes], axis=0)
+    covariance = np.array([closure.covariance for closure in closures]).reshape(-1, 3, 3)
+    steps = np.linalg.eigvalsh(blind[:, :2, :2])[:, 1], blind[:, 2, 2]
+    lengths = np.linalg.eigvalsh(covariance[:, :2, :2])[:, 1], covariance[:, 2, 2]
+    variances = [
+        _shortest_paths(context, k, *pair)
+        for pair in ((steps[0], closures, lengths[0]), (steps[1], closures, lengths[1]))
+    ]
+    spread = context.poses[keyframes][:, :2, 2].std(axis=0)
+    lever2 = float(spread @ spread)
+    return np.sqrt(variances[0] + lever2 * variances[1]), np.sqrt(variances[1])
 
 
 def view_centers(context: LoopContext) -> Float:
@@ -113,6 +146,7 @@ def propose_candidates(
     keyframes, travelled = context.keyframes, context.travelled[context.keyframes]
     x = se2.parameters(poses)
     metres = graph_distances(context, first, closures)
+    blind_xy, blind_heading = blind_stds(context, first, closures)
     in_map = np.einsum("kij,kj->ki", poses[:, :2, :2], centers) + poses[:, :2, 2]
     for k in range(first, last):
         n = int(np.searchsorted(travelled, travelled[k] - MIN_LOOP_TRAVEL))
@@ -127,9 +161,10 @@ def propose_candidates(
             drift = travelled[k] - travelled[i]
             if i < first:
                 drift = min(drift, travelled[k] - travelled[first] + metres[i])
-            if off[i] < context.search_distance + drift_std(drift)[0]:
+            blind = float(blind_xy[min(i, first)]), float(blind_heading[min(i, first)])
+            if off[i] < context.search_distance + np.hypot(drift_std(drift)[0], blind[0]):
                 T = se2.inverse(poses[i]) @ poses[k]
-                yield LoopCandidate(int(keyframes[i]), int(keyframes[k]), T, float(drift))
+                yield LoopCandidate(int(keyframes[i]), int(keyframes[k]), T, float(drift), blind)
                 break
 
 
@@ -152,6 +187,8 @@ def odometry_constraints(
             if leaps[t].any():
                 to_j = se2.inverse(poses[j]) @ poses[t]
                 covariance += se2.rotate_covariance(np.outer(leaps[t], leaps[t]), to_j)
+        back = se2.inverse(poses[j])
+        covariance += se2.rotate_covariance(context.drift[i + 1 : j + 1].sum(axis=0), back)
         if j in breaks:
             covariance = np.diag(np.square(_NO_ODOMETRY))
         chain.append(Constraint(k, k + 1, T, covariance))

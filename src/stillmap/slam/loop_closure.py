@@ -11,6 +11,7 @@ from stillmap.core.recording import Recording
 from stillmap.slam import local_map, loop_candidates, loop_verification, pose_graph, relocalization
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.pose_graph import Constraint, PoseGraph
+from stillmap.slam.relocalization import Relocalization
 from stillmap.slam.types import Index, LoopClosure, LoopContext, MStepResult, ScanProgress
 
 Float = NDArray[np.float64]
@@ -35,9 +36,9 @@ def close_loops(
         odometry: result of incremental scan matching; its grid is not used.
         progress: called with the number of scans done and their total.
     """
-    context, ties, unconnected = _make_context(recording, e, options, odometry)
-    breaks = odometry.diagnostics.breaks
-    chain = loop_candidates.odometry_constraints(context, options.odometry, breaks)
+    relocalized = _relocalize(recording, e, options, odometry)
+    context, ties = relocalized.context, relocalized.closures
+    chain = loop_candidates.odometry_constraints(context, options.odometry, relocalized.breaks)
     poses, found = context.poses[context.keyframes], ties
     attempted, fitting = list[LoopClosure](), ties
     centers = loop_candidates.view_centers(context)
@@ -62,14 +63,19 @@ def close_loops(
         poses=local_map.propagate_corrections(context.poses, context.keyframes, poses),
         loops=found,
         graph=PoseGraph(context.keyframes, poses, [*chain, *accepted]),
-        diagnostics=dataclasses.replace(odometry.diagnostics, unconnected=unconnected),
+        diagnostics=dataclasses.replace(
+            odometry.diagnostics,
+            breaks=relocalized.breaks,
+            unconnected=relocalized.unconnected,
+            ambiguous=relocalized.ambiguous,
+        ),
     )
 
 
-def _make_context(
+def _relocalize(
     recording: Recording, e: NDArray[np.float32], options: SlamOptions, odometry: MStepResult
-) -> tuple[LoopContext, list[LoopClosure], list[int]]:
-    """The trajectory with all segments relocalized; see `relocalize_segments`."""
+) -> Relocalization:
+    """The trajectory with all segments relocalized."""
     poses, breaks = odometry.poses, odometry.diagnostics.breaks
     keyframe_distance = options.keyframe_distance or _KEYFRAME_DISTANCE
     search = options.loop_search_distance
@@ -84,8 +90,9 @@ def _make_context(
         options.resolution,
         keyframe_distance,
         _SEARCH_DISTANCE if search is None else search,
+        np.zeros((len(poses), 3, 3)) if odometry.drift is None else odometry.drift,
     )
-    return relocalization.relocalize_segments(context, breaks, odometry.diagnostics.unconnected)
+    return relocalization.relocalize_segments(context, breaks)
 
 
 def _correct_stage(

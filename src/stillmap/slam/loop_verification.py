@@ -18,14 +18,18 @@ Float = NDArray[np.float64]
 
 SUBMAP_TRAVEL = 8.0  # m of travel to either side that forms a submap
 _SUBMAP_SPACING = 0.25  # of that between keyframes; denser takes longer without being better
-_VIEW_TRAVEL = 1.0  # m of travel to a scan on either side that is matched along with a keyframe
+# m of travel to either side whose scans are matched along with a keyframe, between these scans, and
+# the least isotropy of the information that a view should have
+_VIEW_TRAVEL, _VIEW_SPACING, _MIN_ISOTROPY = (1.0, 2.0, 4.0), 1.0, 0.15
 SEARCH_STDS = 2.0  # half width of the search window in standard deviations of the drift
 # a beam is comparable if the submap was observed so many m before its end; share of beams that must
 # be comparable
-_OBSERVED_MARGIN, _MIN_COMPARABLE = 1.0, 0.4
+_OBSERVED_MARGIN, _MIN_COMPARABLE = 1.0, 0.3
 # share of the comparable beams that the submap must explain, and of the share that the local map
 # explained
-MIN_EXPLAINED, _MIN_EXPLAINED_RATIO = 0.5, 0.8
+MIN_EXPLAINED, _MIN_EXPLAINED_RATIO = 0.5, 0.65
+# the first of them in wide windows; std, m, from which a window is wider and at which it is wide
+_MIN_EXPLAINED_WIDE, _WIDE_WINDOW = 0.85, (0.3, 1.0)
 CLOSURE_TRANSLATION, _CLOSURE_ROTATION = 0.03, 0.006  # m, rad: min std of a closure
 # a view is matched again while the comparable beams change by more than this share, at most
 _MAX_ROUNDS, _MAX_CHANGE = 3, 0.05
@@ -44,11 +48,24 @@ def verify_candidates(
     for stretch, of_stretch in sorted(by_stretch.items()):
         submap = build_submap(context, stretch * SUBMAP_TRAVEL)
         found += [
-            verify_candidate(context, submap, one, *drift_std(one.drift_distance))
+            verify_candidate(context, submap, one, *_total_std(one.drift_distance, one.blind_std))
             for one in of_stretch
         ]
         context.recording.release_pages(context.e)
     return sorted(found, key=lambda closure: closure.later)
+
+
+def _total_std(metres: float, blind_std: tuple[float, float]) -> tuple[float, float]:
+    """m and rad, of the drift over that much travel and of blind steps."""
+    translation, rotation = drift_std(metres)
+    return float(np.hypot(translation, blind_std[0])), float(np.hypot(rotation, blind_std[1]))
+
+
+def _min_explained(translation_std: float) -> float:
+    """Share that a submap must explain: in a wide window, more places fit by chance."""
+    low, high = _WIDE_WINDOW
+    width = min(max((translation_std - low) / (high - low), 0.0), 1.0)
+    return MIN_EXPLAINED + width * (_MIN_EXPLAINED_WIDE - MIN_EXPLAINED)
 
 
 def build_submap(context: LoopContext, center: float) -> _core.OccupancyGrid2D:
@@ -92,11 +109,12 @@ def verify_candidate(
     floor = [CLOSURE_TRANSLATION] * 2 + [_CLOSURE_ROTATION]
     covariance = match.covariance + np.diag(np.square(floor))
     too_little = share < _MIN_COMPARABLE or match.explained < max(
-        MIN_EXPLAINED, _MIN_EXPLAINED_RATIO * context.explained[later]
+        _min_explained(translation_std), _MIN_EXPLAINED_RATIO * context.explained[later]
     )
     if not too_little:
         # bounded by the drift over the whole way: the graph is no independent measurement
-        free = drift_std(context.travelled[later] - context.travelled[earlier])[0]
+        way = context.travelled[later] - context.travelled[earlier]
+        free = _total_std(way, candidate.blind_std)[0]
         covariance += _sliding_covariance(submap, part, match.T_map_base, covariance, free)
         covariance += _ambiguity_covariance(match.alternatives)
     return LoopClosure(
@@ -110,26 +128,55 @@ def verify_candidate(
 
 
 def _collect_view(context: LoopContext, t: int) -> tuple[Scan, Points]:
-    """Hits of a keyframe and of a scan to either side, in its frame; and points before their ends.
+    """Hits of a keyframe and of scans to either side, in its frame; and points before their ends.
 
-    The latter are (N, 2), see `_points_before_ends`.
+    A view of a single wall could slide along it: it grows until surfaces of other directions are in
+    it. The points are (N, 2), see `_points_before_ends`.
     """
-    here = context.travelled[t]
-    first, last = np.searchsorted(
-        context.travelled, [here - _VIEW_TRAVEL, here + _VIEW_TRAVEL], side="right"
-    )
-    last = max(last - 1, t)
-    scans = sorted({min(first, t), t, last})
-    seen = [context.hits(s) for s in scans]
-    to_t = se2.inverse(context.poses[t]) @ context.poses[scans]
-    points = [transform_points(scan.points, T) for scan, T in zip(seen, to_t, strict=True)]
+    for metres in _VIEW_TRAVEL:
+        scans = _select_around(context, t, metres)
+        seen = [context.hits(s) for s in scans]
+        to_t = se2.inverse(context.poses[t]) @ context.poses[scans]
+        view = _merge_scans(context, seen, to_t)
+        if _isotropy(view) >= _MIN_ISOTROPY:
+            break
     before = [
         transform_points(_points_before_ends(scan, _OBSERVED_MARGIN), T)
         for scan, T in zip(seen, to_t, strict=True)
     ]
-    weights = np.concatenate([scan.weights for scan in seen])
-    view = Scan(np.concatenate(points), weights, context.recording.T_base_sensor[0])
     return view, np.concatenate(before)
+
+
+def _select_around(context: LoopContext, t: int, metres: float) -> list[int]:
+    """Scan t, and one per `_VIEW_SPACING` m of travel up to `metres` to either side."""
+    here, count = context.travelled[t], round(metres / _VIEW_SPACING)
+    at = here + _VIEW_SPACING * np.arange(-count, count + 1)
+    after = np.searchsorted(context.travelled, at, side="right")
+    scans = np.where(at < here, np.minimum(after, t), np.maximum(after - 1, t))
+    # no farther than asked: travel may leap
+    near = np.abs(context.travelled[scans] - here) <= metres
+    return sorted({t, *scans[near].tolist()})
+
+
+def _merge_scans(context: LoopContext, scans: list[Scan], to_t: Float) -> Scan:
+    """Scans moved by (S, 3, 3) into one frame."""
+    pairs = list(zip(scans, to_t, strict=True))
+    return Scan(
+        np.concatenate([transform_points(scan.points, T) for scan, T in pairs]),
+        np.concatenate([scan.weights for scan in scans]),
+        context.recording.T_base_sensor[0],
+        np.concatenate([np.float32(scan.normals @ T[:2, :2].T) for scan, T in pairs]),
+        np.concatenate([scan.isotropy for scan in scans]),
+    )
+
+
+def _isotropy(view: Scan) -> float:
+    """Information about the least known direction as a share of that about the best known one."""
+    weight = view.weights * (1.0 - view.isotropy)
+    information = np.einsum("n,ni,nj->ij", weight, view.normals, view.normals)
+    information += float((view.weights * view.isotropy).sum()) * np.eye(2)
+    least, most = np.linalg.eigvalsh(information)
+    return float(least / max(most, 1e-9))
 
 
 def _points_before_ends(scan: Scan, metres: float) -> Points:

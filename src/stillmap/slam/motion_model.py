@@ -5,6 +5,7 @@ Probabilistic Robotics, ch. 5). Without, a constant-velocity model with a runnin
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +18,15 @@ Float = NDArray[np.float64]
 _TRANSLATION_FLOOR, _ROTATION_FLOOR = 0.02, 0.02  # m, rad: std of an increment without motion
 # odometry that restarts elsewhere leaps: beyond this many m and times the usual step
 _MIN_LEAP, _LEAP_RATIO = 1.0, 5.0
+_FAULT_STDS = 3.0  # of the options, beyond which an increment is at fault
 # constant-velocity model: std before any residual is known (m, rad), weight of the last residual
 _INITIAL_TRANSLATION, _INITIAL_ROTATION, _FORGETTING = 0.5, 0.5, 0.1
 _ACCELERATION, _ANGULAR_ACCELERATION = 2.0, 4.0  # m/s^2, rad/s^2 that may occur between two scans
+# odometry noise learned from innovations: weight of the last one, share of the options' std that
+# it has at least, Kalman gain from which a direction counts, std beyond which an innovation is cut
+# odometry's information is discounted as much as that of the beams: they share their errors
+_INFLATION = 2.2
+_NOISE_RATE, _MIN_NOISE_SHARE, _MIN_GAIN, _MAX_INNOVATION = 0.05, 0.1, 0.1, 3.0
 _MAX_UNANNOUNCED = 0.15  # m and rad, upper limit of the motion that these explain
 
 
@@ -89,6 +96,75 @@ class VelocityNoise:
         )
 
 
+@dataclass(frozen=True)
+class OdometryNoise:
+    """Standard deviation of odometry increments, learned from scan matching.
+
+    A running estimate from the innovations, the differences between odometry and what the scans
+    alone say, which are those of the posterior divided by the Kalman gain. Directions count by
+    their gain: along a bare wall nothing is learned.
+
+    Attributes:
+        translation, rotation: standard deviations as shares of those of the options.
+    """
+
+    translation: float = 1.0
+    rotation: float = 1.0
+
+    def update(self, prior: MotionPrior, T_map_base: Float, covariance: Float) -> "OdometryNoise":
+        """After a scan with that prior and posterior: pose (3, 3), covariance (3, 3)."""
+        std = np.sqrt(1.0 / np.diag(prior.information))
+        information = np.linalg.inv(covariance / np.outer(std, std))  # 1 + that of the scan
+        eigenvalues, vectors = np.linalg.eigh(information)
+        gain = (1.0 - 1.0 / eigenvalues).clip(0.0)
+        residual = vectors.T @ (prior.residual(T_map_base) / std)
+        innovation = np.abs(residual / gain.clip(_MIN_GAIN)).clip(max=_MAX_INNOVATION)
+        excess = (vectors**2 * gain) @ (np.square(_INFLATION * innovation) - 1.0)
+        return OdometryNoise(
+            _learn_share(self.translation, 0.5 * float(excess[0] + excess[1])),
+            _learn_share(self.rotation, float(excess[2])),
+        )
+
+
+def blind_drift(prior: MotionPrior, covariance: Float) -> Float:
+    """Covariance (3, 3) that a step adds to the pose in the map, x, y (map axes) and heading.
+
+    The noise of the step times the square of the Kalman filter's 1 - gain: all of it where the scan
+    says nothing, almost none where it fixes the pose.
+
+    Args:
+        prior: of the step.
+        covariance: (3, 3) of the posterior.
+    """
+    out: Float = covariance @ prior.information @ covariance
+    return out / _INFLATION**2 if prior.is_odometry else out
+
+
+def fit_odometry_noise(
+    increments: Float, motion: Float, options: OdometryOptions
+) -> tuple[OdometryNoise, NDArray[np.bool_]]:
+    """Noise of odometry increments (T, 3, 3) about a motion (T, 3, 3), and which are at fault.
+
+    From medians of the residuals, on which faults have no influence.
+    """
+    d = se2.parameters(se2.inverse(increments) @ motion)
+    x = se2.parameters(increments)
+    std = odometry_std(np.hypot(x[:, 0], x[:, 1]), np.abs(x[:, 2]), options)
+    translation, rotation = np.hypot(d[:, 0], d[:, 1]) / std[0], np.abs(d[:, 2]) / std[1]
+    is_fault = np.maximum(translation, rotation) > _FAULT_STDS
+    if len(d) == 0:
+        return OdometryNoise(), is_fault
+    # medians of a Rayleigh and of a half-normal distribution of unit scale: 1.18 and 0.67
+    shares = float(np.median(translation)) / 1.18, float(np.median(rotation)) / 0.67
+    noise = OdometryNoise(*(min(max(share, _MIN_NOISE_SHARE), 1.0) for share in shares))
+    return noise, is_fault
+
+
+def _learn_share(share: float, excess: float) -> float:
+    share *= float(np.sqrt(1.0 + _NOISE_RATE * excess))
+    return min(max(share, _MIN_NOISE_SHARE), 1.0)
+
+
 def _unannounced_motion(acceleration: float, seconds: float) -> float:
     return min(max(0.5 * acceleration * seconds**2, _TRANSLATION_FLOOR), _MAX_UNANNOUNCED)
 
@@ -101,8 +177,8 @@ def compute_odometry_steps(T_odom_base: Float) -> OdometrySteps:
     return OdometrySteps(increments, metres <= max(_MIN_LEAP, _LEAP_RATIO * usual))
 
 
-def odometry_std(distance: float, turn: float, options: OdometryOptions) -> tuple[float, float]:
-    """Standard deviations in m and rad of an increment of `distance` m and `turn` rad."""
+def odometry_std(distance: Any, turn: Any, options: OdometryOptions) -> tuple[Any, Any]:
+    """Standard deviations in m and rad of increments of `distance` m and `turn` rad."""
     translation = (
         _TRANSLATION_FLOOR
         + options.translation_per_metre * distance
@@ -114,11 +190,18 @@ def odometry_std(distance: float, turn: float, options: OdometryOptions) -> tupl
     return translation, rotation
 
 
-def odometry_prior(T_map_base: Float, increment: Float, options: OdometryOptions) -> MotionPrior:
+def odometry_prior(
+    T_map_base: Float,
+    increment: Float,
+    options: OdometryOptions,
+    noise: OdometryNoise = OdometryNoise(),
+) -> MotionPrior:
     """The prior after an odometry increment (3, 3) from a pose (3, 3)."""
     x, y, theta = se2.parameters(increment)
-    std = odometry_std(float(np.hypot(x, y)), abs(float(theta)), options)
-    return gaussian_prior(T_map_base @ increment, *std, is_odometry=True)
+    translation, rotation = odometry_std(float(np.hypot(x, y)), abs(float(theta)), options)
+    translation *= min(_INFLATION * noise.translation, 1.0)
+    rotation *= min(_INFLATION * noise.rotation, 1.0)
+    return gaussian_prior(T_map_base @ increment, translation, rotation, is_odometry=True)
 
 
 def constant_velocity_prior(

@@ -1,32 +1,43 @@
 """Incremental scan matching in 2D: each scan is matched (9), then added to the local map (10)."""
 
+import functools
+
 import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
+from stillmap.core import se2
 from stillmap.core.recording import Recording
-from stillmap.slam import motion_model
+from stillmap.slam import kidnapping, motion_model
+from stillmap.slam.kidnapping import Evidence
 from stillmap.slam.local_map import LocalMap
 from stillmap.slam.motion_model import MotionPrior, VelocityNoise
 from stillmap.slam.odometry_faults import SlipDetector, SlipHypothesis
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.scan_matching import (
+    FAULT_GAIN,
     FREE_SPACE_MARGIN,
-    MAX_OCCLUDED,
+    MIN_GAIN,
+    ODOMETRY_FAULT,
     Scan,
     ScanMatch,
     accept_prior,
     is_inconsistent,
+    is_poor,
     match_scan,
-    occluded_share,
     select_hits,
+    widen_match,
 )
 from stillmap.slam.types import Diagnostics, MStepResult, ScanProgress
 
 Float = NDArray[np.float64]
 
 _EXPLAINED_RATE = 0.1  # weight of one scan in the running average of the explained share
-_KIDNAPPED_BELOW = 0.3  # of that average: the robot may have been carried elsewhere
+# s without a scan, and times the usual ones, in which the robot may have been carried elsewhere
+_GAP, _GAP_RATIO = 5.0, 20.0
+_MAX_SPEED, _MAX_TURN_RATE, _MIN_REACH = 3.0, 4.0, 0.5  # m/s, rad/s of robots; m and rad
+_SURE_GAIN = 40.0  # nats of a pose outside the prior, from which one scan is enough
+_MAX_LATE_SCANS = 4  # after which odometry is not late, but at fault
 
 
 def register_scans(
@@ -75,13 +86,17 @@ class _ScanOdometry:
         self.max_travel, self.local_map = max_travel, local_map
         self.poses = np.tile(np.eye(3), (T, 1, 1))
         self.covariance, self.explained = np.zeros((T, 3, 3)), np.ones(T)
+        self.drift = np.zeros((T, 3, 3))
         self.widened, self.odometry_faults = np.zeros((2, T), np.bool_)
-        self.breaks, self.unconnected = list[int](), list[int]()
+        self.breaks = list[int]()
         self.steps = None if odometry is None else motion_model.compute_odometry_steps(odometry)
         self.slip = SlipDetector(None if self.steps is None else self.steps.increments)
         self.noise = VelocityNoise()
+        self.odometry_noise = motion_model.OdometryNoise()
+        self.seconds_before = np.append(0.0, 1e-9 * np.diff(recording.stamp_ns))
         self.seconds = 1e-9 * float(np.median(np.diff(recording.stamp_ns))) if T > 1 else 0.0
         self.travelled = 0.0
+        self.compared_until, self.before_fault = 0, -_MAX_LATE_SCANS - 1
         # running average of the explained share, per sensor: each sees its own side
         self.usual = np.zeros(len(recording.T_base_sensor))
         self.usual[recording.sensor[0]] = 1.0
@@ -94,25 +109,43 @@ class _ScanOdometry:
         scan, s = select_hits(self.recording, self.e, t), self.recording.sensor[t]
         # without odometry, the first scan of a sensor with another view has nothing to match
         has_map = prior.is_odometry or self.local_map.has_sensor(s)
+        learned = self._learned_prior(t, prior, guess)
         if has_map:
-            match = match_scan(self.local_map.grid, scan, prior, other, self.usual[s])
+            match = match_scan(self.local_map.grid, scan, prior, self.usual[s], learned)
         else:
             match = accept_prior(prior)
+        match, contradicts = self._resolve_doubt(t, scan, match, prior, other)
         slip = self.slip.detect(t, last, guess, self.local_map.grid, scan, match)
         if slip is not None:
             match = self._accept_slip(t, slip)
             guess = self._predict(t)
-        self._detect_break(t, scan, match, (prior, other or guess))
         rejected = None if prior.is_odometry else other
         is_fault = rejected is not None and is_inconsistent(rejected, match.T_map_base)
         self._record(t, match, is_fault=is_fault)
+        self.drift[t] = motion_model.blind_drift(learned or prior, match.covariance)
         if has_map:
+            if learned is not None and not is_poor(match, self.usual[s]):
+                self.odometry_noise = self.odometry_noise.update(
+                    learned, match.T_map_base, match.covariance
+                )
             rate = _EXPLAINED_RATE if self.usual[s] > 0.0 else 1.0  # 0: the first scan of a map
             self.usual[s] += rate * (match.explained - self.usual[s])
             self.noise = self.noise.update(guess.residual(match.T_map_base), self.seconds)
         self.travelled += _length(self.poses[t - 1 : t + 1])
-        self.local_map.add(t, match.T_map_base, self.travelled)
+        if not contradicts:
+            self.local_map.add(t, match.T_map_base, self.travelled)
         self.local_map.remove_before(self.travelled - self.max_travel)
+
+    def _learned_prior(self, t: int, prior: MotionPrior, guess: MotionPrior) -> MotionPrior | None:
+        """The odometry prior of scan t with the noise learned so far; None: use `prior`."""
+        last = self.poses[t - 1]
+        # odometry that stops at once may have stalled
+        has_stopped = self.slip.stands_still(t, last, guess.T_map_base)
+        if self.steps is None or not prior.is_odometry or has_stopped:
+            return None
+        return motion_model.odometry_prior(
+            last, self.steps.increments[t - 1], self.options.odometry, self.odometry_noise
+        )
 
     def _predict(self, t: int) -> MotionPrior:
         """Constant velocity; no motion where it is unknown, after a break."""
@@ -141,43 +174,85 @@ class _ScanOdometry:
         self.travelled += _length(self.poses[slip.first - 1 : t])
         return slip.matches[-1]
 
-    def _detect_break(
-        self, t: int, scan: Scan, match: ScanMatch, priors: tuple[MotionPrior, MotionPrior]
-    ) -> None:
-        """Starts a new local map if the robot was carried elsewhere before scan t."""
-        fits_nowhere = self._is_unexplained(t, scan, match)
-        if not fits_nowhere and not (self.steps is not None and self._is_leap(scan, match, priors)):
-            return
+    def _resolve_doubt(
+        self, t: int, scan: Scan, match: ScanMatch, prior: MotionPrior, other: MotionPrior | None
+    ) -> tuple[ScanMatch, bool]:
+        """The match of scan t after a wider search, and whether it contradicts the local map.
+
+        Starts a new segment if the robot may have been carried elsewhere before it.
+        """
+        grid, usual = self.local_map.grid, self.usual[self.recording.sensor[t]]
+        if len(scan.points) == 0 or usual == 0.0:
+            return match, False
+        if self.seconds_before[t] > max(_GAP, _GAP_RATIO * self.seconds):
+            return self._start_segment(t, prior), False
+        if is_poor(match, usual):
+            match = self._skip_fault(t, scan, match, usual)
+        if is_poor(match, usual):
+            # odometry that stands still may have stalled
+            min_gain = ODOMETRY_FAULT if self.slip.has_stopped(t) else FAULT_GAIN
+            wider = widen_match(grid, scan, prior, other, match, usual, min_gain)
+            is_sure = match.cost - wider.cost > _SURE_GAIN
+            if wider.widened and not self._is_reachable(t, wider):
+                return self._start_segment(t, prior), False
+            if wider.widened and (is_sure or self._may_go_on(t, wider, usual)):
+                self.before_fault = t - 1
+                return wider, False
+        if not is_poor(match, usual):
+            return match, False
+        contradicts = kidnapping.judge_scan(grid, scan, match, usual) is Evidence.CONTRADICTS
+        if not contradicts or t <= self.compared_until or self._may_go_on(t, match, usual):
+            return match, contradicts
+        return self._start_segment(t, prior), False
+
+    def _skip_fault(self, t: int, scan: Scan, match: ScanMatch, usual: float) -> ScanMatch:
+        """The match by odometry since before the last fault, if that is better.
+
+        Odometry that comes late is wrong at one scan and right again at the next.
+        """
+        if self.steps is None or t - self.before_fault > _MAX_LATE_SCANS:
+            return match
+        first = self.before_fault
+        increment = functools.reduce(np.matmul, self.steps.increments[first:t])
+        prior = motion_model.odometry_prior(self.poses[first], increment, self.options.odometry)
+        late = match_scan(self.local_map.grid, scan, prior, usual)
+        return late if late.cost < match.cost - MIN_GAIN else match
+
+    def _start_segment(self, t: int, prior: MotionPrior) -> ScanMatch:
+        """Starts a new local map where the prior leads: loop closure decides where it belongs."""
         self.breaks.append(t)
-        if fits_nowhere:
-            self.unconnected.append(t)
         self.usual[:] = 0.0
         self.local_map.clear()
         self.slip.reset()
+        return accept_prior(prior)
 
-    def _is_unexplained(self, t: int, scan: Scan, match: ScanMatch) -> bool:
-        """Whether a scan contradicts the map wherever the robot may have moved by itself.
+    def _is_reachable(self, t: int, match: ScanMatch) -> bool:
+        """Whether a robot can move to a match since the scan before."""
+        x, y, theta = se2.parameters(se2.inverse(self.poses[t - 1]) @ match.T_map_base)
+        seconds = self.seconds_before[t]
+        metres, radians = (max(_MIN_REACH, rate * seconds) for rate in (_MAX_SPEED, _MAX_TURN_RATE))
+        return bool(np.hypot(x, y) <= metres and abs(theta) <= radians)
 
-        A scan of a new place is explained as little, but its beams do not pass through walls.
-        """
-        usual = self.usual[self.recording.sensor[t]]
-        if match.explained >= _KIDNAPPED_BELOW * usual or len(scan.points) == 0:
-            return False
-        return occluded_share(self.local_map.grid, scan, match.T_map_base) > MAX_OCCLUDED
+    def _may_go_on(self, t: int, match: ScanMatch, usual: float) -> bool:
+        """Whether the scans after t do not contradict the map if the robot goes on from a match."""
+        outlook = kidnapping.look_ahead(
+            self.recording,
+            self.e,
+            self.local_map.grid,
+            self._increments(),
+            t,
+            match.T_map_base,
+            usual,
+        )
+        if not outlook.contradicts:
+            self.compared_until = outlook.last
+        return not outlook.contradicts
 
-    def _is_leap(
-        self, scan: Scan, match: ScanMatch, priors: tuple[MotionPrior, MotionPrior]
-    ) -> bool:
-        """Whether a scan fits only where neither odometry nor the prediction lead.
-
-        It may look alike there. Unless the robot was carried, the scan at the pose of odometry
-        does not pass through walls.
-        """
-        if match.all_headings or not match.widened:
-            return match.all_headings
-        if not all(is_inconsistent(prior, match.T_map_base) for prior in priors):
-            return False
-        return occluded_share(self.local_map.grid, scan, priors[0].T_map_base) > MAX_OCCLUDED
+    def _increments(self) -> Float:
+        """(T - 1, 3, 3) increments of odometry; without it, the robot stands still."""
+        if self.steps is not None:
+            return self.steps.increments
+        return np.tile(np.eye(3), (self.recording.n_scans - 1, 1, 1))
 
     def _record(self, t: int, match: ScanMatch, *, is_fault: bool) -> None:
         self.poses[t], self.covariance[t] = match.T_map_base, match.covariance
@@ -190,10 +265,11 @@ class _ScanOdometry:
             np.flatnonzero(self.widened).tolist(),
             np.flatnonzero(self.odometry_faults).tolist(),
             self.breaks,
-            self.unconnected,
         )
         grid = _core.OccupancyGrid2D(self.options.resolution)
-        return MStepResult(self.poses, self.covariance, grid, self.explained, diagnostics)
+        return MStepResult(
+            self.poses, self.covariance, grid, self.explained, self.drift, diagnostics
+        )
 
 
 def _length(poses: Float) -> float:

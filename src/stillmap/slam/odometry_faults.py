@@ -99,7 +99,7 @@ class SlipDetector:
             confirmed, self._hypothesis, self._is_slipping = self._hypothesis, None, True
             return confirmed
         # rotation shows at once
-        self._is_slipping = match.contradicts_odometry and self._stands_still(
+        self._is_slipping = match.contradicts_odometry and self.stands_still(
             t, last, match.T_map_base
         )
         if self._is_slipping:
@@ -118,7 +118,7 @@ class SlipDetector:
             guess = motion_model.gaussian_prior(ahead, guess.translation_std, guess.rotation_std)
         elif guess.translation_std > _step_size(se2.inverse(last) @ guess.T_map_base):
             return None
-        return guess if self._stands_still(t, last, guess.T_map_base) else None
+        return guess if self.stands_still(t, last, guess.T_map_base) else None
 
     def _extend(self, t: int, last: Float, moved: ScanMatch, gain: float) -> None:
         """Adds the match of scan t to the hypothesis, or rejects it where the robot stopped."""
@@ -128,10 +128,14 @@ class SlipDetector:
         has_stopped = gain < -ODOMETRY_FAULT
         self._hypothesis = None if has_stopped else dataclasses.replace(hypothesis, gain=gain)
 
-    def _stands_still(self, t: int, last: Float, T_map_base: Float) -> bool:
+    def stands_still(self, t: int, last: Float, T_map_base: Float) -> bool:
         """Whether odometry stands still on the way to scan t at a pose (3, 3) that moved."""
         step = _step_size(se2.inverse(last) @ T_map_base)
         return step > _MIN_STEP and self._odometry_step(t) < _STILL_RATIO * step
+
+    def has_stopped(self, t: int) -> bool:
+        """Whether odometry stands still on the way to scan t."""
+        return self._odometry_step(t) < _STILL_RATIO * _MIN_STEP
 
     def _odometry_step(self, t: int) -> float:
         """Size of the odometry step to scan t."""

@@ -39,12 +39,8 @@ def refine_poses(
     poses = initial.poses.copy()
     T = len(poses)
     covariance, explained = np.zeros((T, 3, 3)), np.ones(T)
-    odometry, breaks = recording.T_odom_base, initial.diagnostics.breaks
-    source = poses if odometry is None else odometry
-    increments = se2.inverse(source[:-1]) @ source[1:]
-    step_prior: Callable[[Float, Float], MotionPrior] = motion_model.increment_prior
-    if odometry is not None:
-        step_prior = partial(motion_model.odometry_prior, options=options.odometry)
+    breaks = initial.diagnostics.breaks
+    increments, step_prior = _model_steps(recording, poses, options)
     grid = _core.OccupancyGrid2D(options.resolution, scan_matching.FREE_SPACE_MARGIN)
     kept = select_keyframes_per_sensor(poses, recording.sensor, SCAN_SPACING, SCAN_SPACING)
     for t in recording.iter_scans(kept, e):
@@ -63,6 +59,23 @@ def refine_poses(
             add_scan(grid, recording, e, t, poses[t])
         progress(t + 1, T)
     return dataclasses.replace(initial, poses=poses, covariance=covariance, explained=explained)
+
+
+def _model_steps(
+    recording: Recording, poses: Float, options: SlamOptions
+) -> tuple[Float, Callable[[Float, Float], MotionPrior]]:
+    """Increments (T - 1, 3, 3) between scans, and the prior after one from a pose (3, 3).
+
+    Those of odometry with the noise that it has about the poses; of the poses where odometry is
+    missing or at fault.
+    """
+    motion = se2.inverse(poses[:-1]) @ poses[1:]
+    if recording.T_odom_base is None:
+        return motion, motion_model.increment_prior
+    measured = se2.inverse(recording.T_odom_base[:-1]) @ recording.T_odom_base[1:]
+    noise, is_fault = motion_model.fit_odometry_noise(measured, motion, options.odometry)
+    increments = np.where(is_fault[:, None, None], motion, measured)
+    return increments, partial(motion_model.odometry_prior, options=options.odometry, noise=noise)
 
 
 def _neighbor_prior(

@@ -8,6 +8,7 @@ match is put beside the others.
 import dataclasses
 import itertools
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +24,10 @@ _MAX_QUERIES = 20  # keyframes of a segment that are matched
 _MAX_PLACES = 8  # places that each of them is matched with
 _RANGE_BINS = np.geomspace(0.3, 30.0, 25)  # m, of the range histogram that compares scans
 _MAX_TESTED = 60  # keyframes of a segment that test a hypothesis
-# keyframes that must fit, in all and for each one that contradicts
-_MIN_SUPPORT, _MIN_SUPPORT_RATIO = 3, 4
+# keyframes that must fit, how many one that contradicts outweighs, and by how many a place among
+# the many that are tried must be better than that of odometry
+_MIN_SUPPORT, _CONTRADICTION_WEIGHT, _MARGIN = 3, 4, 8
+_MIN_CONTRADICTING = 5  # keyframes without which odometry is believed
 _SAME_DISTANCE, _SAME_ANGLE = 0.5, 0.1  # m, rad within which two hypotheses are one
 _SEGMENT_SPACING = 10.0  # m between unconnected segments
 
@@ -37,29 +40,86 @@ def separate_segments(travelled: Float, breaks: list[int], metres: float) -> Flo
     return out
 
 
-def relocalize_segments(
-    context: LoopContext, breaks: list[int], unexplained: list[int]
-) -> tuple[LoopContext, list[LoopClosure], list[int]]:
-    """Segments at their places, the closures that connect them, and the unconnected breaks.
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """A hypothesis of where a segment lies.
+
+    Attributes:
+        C: (3, 3) motion of the segment from where odometry has it.
+        fitting, contradicting: keyframes that fit the map before it, and that contradict it.
+        closures: that lead there.
+    """
+
+    C: Float
+    fitting: int
+    contradicting: int
+    closures: list[LoopClosure] = field(default_factory=list)
+
+    @property
+    def score(self) -> float:
+        """Keyframes in favour; each one that contradicts outweighs several."""
+        return self.fitting - _CONTRADICTION_WEIGHT * self.contradicting
+
+    @property
+    def is_supported(self) -> bool:
+        """Whether enough keyframes fit."""
+        return self.fitting >= _MIN_SUPPORT and self.score >= 0
+
+    @property
+    def is_contradicted(self) -> bool:
+        """Whether enough keyframes contradict it."""
+        return self.contradicting >= max(_MIN_CONTRADICTING, _CONTRADICTION_WEIGHT * self.fitting)
+
+
+@dataclass(frozen=True, eq=False)
+class Relocalization:
+    """Result of `relocalize_segments`.
+
+    Attributes:
+        context: the trajectory with all segments in place.
+        closures: that connect them.
+        breaks: first scans of segments that do not follow by odometry.
+        unconnected: those of them without a known place.
+        ambiguous: first scans of segments that would fit elsewhere about as well.
+    """
+
+    context: LoopContext
+    closures: list[LoopClosure]
+    breaks: list[int]
+    unconnected: list[int]
+    ambiguous: list[int]
+
+
+def relocalize_segments(context: LoopContext, candidates: list[int]) -> Relocalization:
+    """Decides for each segment whether odometry leads there, or the robot was carried elsewhere.
+
+    Odometry is believed unless the segment contradicts the map before it there, or fits much better
+    elsewhere.
 
     Args:
         context: the trajectory.
-        breaks: first scans of all segments but the first.
-        unexplained: those whose scan fits nowhere nearby; without a match the other segments stay.
+        candidates: first scans of all segments but the first.
     """
-    closures, unconnected = list[LoopClosure](), list[int]()
+    out = Relocalization(context, [], [], [], [])
     poses = context.poses.copy()
-    for first, last in itertools.pairwise([*breaks, len(poses)]):
+    for first, last in itertools.pairwise([*candidates, len(poses)]):
         context = dataclasses.replace(context, poses=poses)
-        attempts = list(_match_segment(context, first, last))
-        consistent = _select_consistent(context, attempts, first, last)
-        if consistent:
-            poses[first:last] = _correction(context, consistent[0]) @ poses[first:last]
-            closures += consistent
-        elif first in unexplained:
+        before = _build_map_before(context, first)
+        here = Placement(np.eye(3), *_count_support(context, before, np.eye(3), first, last))
+        if here.is_supported:
+            continue
+        there = _find_placement(context, before, first, last)
+        if there is not None and there.score >= max(here.score, 0) + _MARGIN:
+            poses[first:last] = there.C @ poses[first:last]
+            out.closures.extend(there.closures)
+            out.breaks.append(first)
+        elif here.is_contradicted:
             poses[first:last] = _offset_beside(context, first) @ poses[first:last]
-            unconnected.append(first)
-    return dataclasses.replace(context, poses=poses), closures, unconnected
+            out.breaks.append(first)
+            out.unconnected.append(first)
+        elif there is not None:
+            out.ambiguous.append(first)
+    return dataclasses.replace(out, context=dataclasses.replace(context, poses=poses))
 
 
 def _match_segment(context: LoopContext, first: int, last: int) -> Iterator[LoopClosure]:
@@ -107,21 +167,23 @@ def _correction(context: LoopContext, closure: LoopClosure) -> Float:
     return C
 
 
-def _select_consistent(
-    context: LoopContext, closures: list[LoopClosure], first: int, last: int
-) -> list[LoopClosure]:
-    """The closures of the hypothesis at which most keyframes of the segment fit; or none.
+def _find_placement(
+    context: LoopContext, before: _core.OccupancyGrid2D, first: int, last: int
+) -> Placement | None:
+    """The place at which most keyframes of the segment fit.
 
-    Rooms look alike: a hypothesis counts only if the rest of the segment does not contradict it.
+    Rooms look alike: a place counts only if the rest of the segment does not contradict it.
     """
-    best, most = list[LoopClosure](), 0
-    before = _build_map_before(context, first)
+    best: Placement | None = None
+    closures = list(_match_segment(context, first, last))
     for closure in _deduplicate(context, closures):
         C = _correction(context, closure)
-        fitting, contradicting = _count_support(context, before, C, first, last)
-        if fitting >= max(_MIN_SUPPORT, _MIN_SUPPORT_RATIO * contradicting) and fitting > most:
-            best, most = [c for c in closures if _is_same(context, C, c)], fitting
-    return best
+        placement = Placement(C, *_count_support(context, before, C, first, last))
+        if placement.is_supported and (best is None or placement.score > best.score):
+            best = placement
+    if best is None:
+        return None
+    return dataclasses.replace(best, closures=[c for c in closures if _is_same(context, best.C, c)])
 
 
 def _deduplicate(context: LoopContext, closures: list[LoopClosure]) -> list[LoopClosure]:

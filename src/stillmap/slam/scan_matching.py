@@ -26,6 +26,9 @@ _MAX_GAP, _STRAIGHTNESS, _MAX_GAP_RATIO = 1.5, 0.1, 3.0
 # likelihood field: m, std around end points; value of an unexplained end point; value added in
 # unknown space, which is not free; weight of one beam against the motion prior
 _FIELD_STD, _FLOOR, _UNKNOWN, _INFORMATION_SCALE = 0.04, 0.05, 0.2, 0.2
+# normals of a scan: m to either side that belong to one surface, m between its end points; ratio of
+# the variances across and along up to which it is flat, and from which it is a corner
+_NORMALS = {"radius": 0.3, "max_gap": 1.0, "flat_below": 0.1, "round_from": 0.4}
 _MAX_ITERATIONS = 20  # Newton
 _MAX_SEARCH_RANGE = 20.0  # m; longer beams are left out of the correlative search
 _MAX_CANDIDATES = 3  # poses of the correlative search that are refined
@@ -35,6 +38,8 @@ _SEARCH_STDS = 3.0  # half width of the search window in standard deviations of 
 _LOCAL_SHARE, _WIDEN_BELOW = 0.9, 0.7
 _WIDE_TRANSLATION, _WIDE_ROTATION = 0.5, 0.5  # m, rad: min half width of the wider search
 _LOST_TRANSLATION = 1.5  # m, half width of the last search, over all headings
+# nats that a pose must gain outside the learned noise, and outside that of the options
+MIN_GAIN, FAULT_GAIN = 7.0, 15.0
 ODOMETRY_FAULT = 10.0  # nats of gain from which odometry is rejected
 _INCONSISTENT_STDS = 3.0  # standard deviations from a prior's mean: it no longer holds
 MAX_OCCLUDED = 0.2  # share of a scan's beams that may seem to pass through walls
@@ -50,11 +55,15 @@ class Scan:
         points: (N, 2) float32, end points in the base frame.
         weights: (N,) float32, e.
         T_base_sensor: (3, 3) origin of the beams.
+        normals: (N, 2) float32, of the surfaces.
+        isotropy: (N,) float32, 0 on a flat surface, 1 where an end point fixes both directions.
     """
 
     points: Points
     weights: NDArray[np.float32]
     T_base_sensor: Float
+    normals: Points
+    isotropy: NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -69,7 +78,6 @@ class ScanMatch:
         alternatives: (R, 4) optima of the other candidates: x, y, heading from the pose, and their
             additional cost in nats.
         widened: found only by a wider search than the prior's window.
-        all_headings: found only by the search over all headings.
         contradicts_odometry: odometry was rejected.
     """
 
@@ -79,7 +87,6 @@ class ScanMatch:
     cost: float
     alternatives: Float
     widened: bool = False
-    all_headings: bool = False
     contradicts_odometry: bool = False
 
 
@@ -94,7 +101,15 @@ def select_hits(recording: Recording, e: NDArray[np.float32], t: int) -> Scan:
     hit = recording.hit[beams]
     T_base_sensor = recording.T_base_sensor[recording.sensor[t]]
     points = transform_points(recording.points[beams][hit], T_base_sensor)
-    return Scan(points, e[beams][hit], T_base_sensor)
+    return make_scan(points, e[beams][hit], T_base_sensor)
+
+
+def make_scan(points: Points, weights: NDArray[np.float32], T_base_sensor: Float) -> Scan:
+    """A scan of end points (N, 2) in the order of the beams, with the normals of its surfaces."""
+    normals, isotropy = np.zeros_like(points), np.zeros_like(weights)
+    counts = weights > 0.0
+    normals[counts], isotropy[counts] = _core.estimate_normals(points[counts], **_NORMALS)
+    return Scan(points, weights, T_base_sensor, normals, isotropy)
 
 
 def add_scan(
@@ -133,8 +148,8 @@ def match_scan(
     grid: _core.OccupancyGrid2D,
     scan: Scan,
     prior: MotionPrior,
-    other: MotionPrior | None,
     usual: float,
+    learned: MotionPrior | None = None,
 ) -> ScanMatch:
     """The most likely pose of a scan given the map so far and the motion prior, (9).
 
@@ -142,33 +157,63 @@ def match_scan(
         grid: the map so far.
         scan: its hits.
         prior: from odometry, else from the constant-velocity model.
-        other: a second prior, tried where the scan fits badly by the first.
         usual: recent average of the explained share.
+        learned: the same with the odometry noise learned so far. A pose outside it must fit better
+            by as much as it is less likely.
     """
-    match = _match_within_prior(grid, scan, prior, usual)
-    if len(scan.points) == 0:
-        return match
+    match = _match_within_prior(grid, scan, prior if learned is None else learned, usual)
+    if learned is not None and len(scan.points) and is_poor(match, usual):
+        wider = _match_within_prior(grid, scan, prior, usual)
+        match = wider if wider.cost < match.cost - MIN_GAIN else match
+    return _loosen_prior(grid, scan, prior, match)
+
+
+def is_poor(match: ScanMatch, usual: float) -> bool:
+    """Whether a map explains much less of a scan than usual."""
+    return match.explained < _WIDEN_BELOW * usual
+
+
+def widen_match(
+    grid: _core.OccupancyGrid2D,
+    scan: Scan,
+    prior: MotionPrior,
+    other: MotionPrior | None,
+    match: ScanMatch,
+    usual: float,
+    min_gain: float = FAULT_GAIN,
+) -> ScanMatch:
+    """A pose outside the prior that fits a scan much better, or the same match.
+
+    Args:
+        grid: the map so far.
+        scan: its hits, at least one.
+        prior: as of `match_scan`.
+        other: a second prior.
+        match: a poor match within the prior.
+        usual: recent average of the explained share.
+        min_gain: nats by which that pose must fit better.
+    """
     threshold = _WIDEN_BELOW * usual
-    windows = [(_WIDE_TRANSLATION, _WIDE_ROTATION)]
-    if match.explained < threshold and (
-        # correct odometry may lead to new places, but not through walls
-        not prior.is_odometry or occluded_share(grid, scan, match.T_map_base) > MAX_OCCLUDED
-    ):
-        windows.append((_LOST_TRANSLATION, np.pi))
+    windows = [(_WIDE_TRANSLATION, _WIDE_ROTATION), (_LOST_TRANSLATION, np.pi)]
     for mean in (prior, other):
         if mean is not None and match.explained < threshold:
-            match = _widen_search(grid, scan, mean, match, threshold, windows)
-    if prior.is_odometry and is_inconsistent(prior, match.T_map_base):
-        # a mean that far off would only pull the pose towards itself
-        looser = motion_model.widen_prior(prior, *_distance(prior, match.T_map_base))
-        again = refine_pose(grid, scan, looser, match.T_map_base)
-        if again.cost <= match.cost:
-            match = dataclasses.replace(
-                again, widened=match.widened, all_headings=match.all_headings
-            )
-        contradicts = is_inconsistent(prior, match.T_map_base)
-        match = dataclasses.replace(match, contradicts_odometry=contradicts)
-    return match
+            match = _widen_search(grid, scan, mean, match, min_gain, threshold, windows)
+    return _loosen_prior(grid, scan, prior, match)
+
+
+def _loosen_prior(
+    grid: _core.OccupancyGrid2D, scan: Scan, prior: MotionPrior, match: ScanMatch
+) -> ScanMatch:
+    """The match again with a wider prior, where odometry no longer holds."""
+    if not prior.is_odometry or not is_inconsistent(prior, match.T_map_base):
+        return match
+    # a mean that far off would only pull the pose towards itself
+    looser = motion_model.widen_prior(prior, *_distance(prior, match.T_map_base))
+    again = refine_pose(grid, scan, looser, match.T_map_base)
+    if again.cost <= match.cost:
+        match = dataclasses.replace(again, widened=match.widened)
+    contradicts = is_inconsistent(prior, match.T_map_base)
+    return dataclasses.replace(match, contradicts_odometry=contradicts)
 
 
 def accept_prior(prior: MotionPrior) -> ScanMatch:
@@ -195,6 +240,7 @@ def _widen_search(
     scan: Scan,
     prior: MotionPrior,
     match: ScanMatch,
+    min_gain: float,
     threshold: float,
     windows: list[tuple[float, float]],
 ) -> ScanMatch:
@@ -206,9 +252,9 @@ def _widen_search(
         wide = motion_model.widen_prior(prior, translation / 3.0, rotation / 3.0)
         window = _SEARCH_STDS * wide.translation_std, _SEARCH_STDS * wide.rotation_std
         wider = search_pose(grid, scan, wide, *window)
-        fits = wider.cost < match.cost - ODOMETRY_FAULT
+        fits = wider.cost < match.cost - min_gain
         if fits and occluded_share(grid, scan, wider.T_map_base) <= MAX_OCCLUDED:
-            match = dataclasses.replace(wider, widened=True, all_headings=rotation == np.pi)
+            match = dataclasses.replace(wider, widened=True)
         if match.explained >= threshold:
             break
     return match
@@ -255,6 +301,8 @@ def _register(
         max_iterations=_MAX_ITERATIONS,
         search_range=_MAX_SEARCH_RANGE,
         max_candidates=_MAX_CANDIDATES,
+        normals=scan.normals,
+        isotropy=scan.isotropy,
         **search,
     )
     return ScanMatch(T, covariance, explained, cost - prior.cost(T), alternatives)

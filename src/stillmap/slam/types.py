@@ -26,12 +26,14 @@ class LoopCandidate:
         earlier, later: scans.
         T: (3, 3) pose of the later scan in the frame of the earlier one, by the current graph.
         drift_distance: m of travel whose drift equals the uncertainty of T.
+        blind_std: m and rad, standard deviations of the drift where scans said nothing.
     """
 
     earlier: int
     later: int
     T: Float
     drift_distance: float
+    blind_std: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,15 +67,18 @@ class Diagnostics:
     Attributes:
         widened: matched only by a wider search.
         odometry_faults: odometry was rejected.
-        breaks: first scans after the robot got lost or was carried elsewhere.
-        unconnected: those breaks after which no known place was recognized; before loop closure,
-            those whose scan fits nowhere nearby.
+        breaks: first scans after the robot was carried elsewhere; before loop closure, those
+            before which it may have been.
+        unconnected: those breaks after which no known place was recognized.
+        ambiguous: first scans of segments that would fit another place about as well as the one
+            that odometry leads to.
     """
 
     widened: list[int] = field(default_factory=list)
     odometry_faults: list[int] = field(default_factory=list)
     breaks: list[int] = field(default_factory=list)
     unconnected: list[int] = field(default_factory=list)
+    ambiguous: list[int] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -86,6 +91,8 @@ class MStepResult:
             map of all other scans; (T, 6, 6) in 3D.
         grid: the sums alpha, beta of (10) over all scans.
         explained: (T,) share of each scan's beams that the local map explained; NaN: poses given.
+        drift: (T, 3, 3) covariance of x, y, heading (map axes) that the step to each scan adds
+            where the scan says nothing, as along a bare wall; None: not known.
         diagnostics: scans at which odometry and scan matching disagree.
         loops: attempted loop closures, accepted or rejected.
         graph: the pose graph; None without loop closure.
@@ -95,6 +102,7 @@ class MStepResult:
     covariance: Float
     grid: _core.OccupancyGrid2D | _core.OccupancyGrid3D
     explained: Float
+    drift: Float | None = None
     diagnostics: Diagnostics = field(default_factory=Diagnostics)
     loops: list[LoopClosure] = field(default_factory=list)
     graph: PoseGraph | None = None
@@ -117,6 +125,7 @@ class LoopContext:
         resolution: m, edge of a map cell.
         keyframe_distance: m of travel between keyframes.
         search_distance: m between a keyframe and an earlier one for a loop candidate.
+        drift: (T, 3, 3) as of MStepResult.
     """
 
     recording: Recording
@@ -128,6 +137,7 @@ class LoopContext:
     resolution: float
     keyframe_distance: float
     search_distance: float
+    drift: Float
 
     def hits(self, t: int) -> Scan:
         """The hits of scan t."""

@@ -12,6 +12,7 @@
 
 #include "stillmap/grid/cell.hpp"
 #include "stillmap/registration/likelihood_field.hpp"
+#include "stillmap/registration/surface_information.hpp"
 #include "stillmap/util/lie.hpp"
 
 namespace stillmap {
@@ -20,6 +21,7 @@ template <int D>
 struct WeightedBeams {
   std::vector<Vec<D>> points;  // metres, moving frame
   std::vector<double> weights;
+  std::vector<SurfaceNormal<D>> normals;   // moving frame; empty: unknown
   std::vector<GaussianWindow<D>> windows;  // cache, one per beam
 };
 
@@ -38,7 +40,8 @@ struct PosePrior {
 template <int D>
 struct ScanRegistrationResult {
   Pose<D> pose;
-  Eigen::Matrix<double, Lie<D>::kDof, Lie<D>::kDof> information;  // of the posterior
+  // of the posterior, by the normals of the surfaces where they are known
+  Eigen::Matrix<double, Lie<D>::kDof, Lie<D>::kDof> information;
   double cost = 0.0;
   double inliers = 0.0;  // weighted share of beams that the map explains
   int iterations = 0;
@@ -103,6 +106,27 @@ inline QuadraticModel<D> linearise(LikelihoodField<D>& field, WeightedBeams<D>& 
   }
   if (total > 0.0) model.inliers /= total;
   return model;
+}
+
+// Information of the beams about the pose by the normals of the surfaces that they see.
+template <int D>
+inline Eigen::Matrix<double, Lie<D>::kDof, Lie<D>::kDof> surface_information(
+    LikelihoodField<D>& field, WeightedBeams<D>& beams, const Pose<D>& pose,
+    const ScanRegistrationOptions& options) {
+  Eigen::Matrix<double, Lie<D>::kDof, Lie<D>::kDof> information =
+      Eigen::Matrix<double, Lie<D>::kDof, Lie<D>::kDof>::Zero();
+  const double per_beam = options.information_scale / (options.field.sigma * options.field.sigma);
+  for (size_t n = 0; n < beams.points.size(); ++n) {
+    const Vec<D> lever = pose.R * beams.points[n];
+    const FieldSample<D> sample = field.evaluate(pose.t + lever, beams.windows[n]);
+    if (sample.value <= 0.0) continue;
+    const double p_explained = sample.value / (sample.baseline + sample.value);
+    const auto& surface = beams.normals[n];
+    information.noalias() +=
+        per_beam * beams.weights[n] * p_explained *
+        endpoint_information<D>(lever, pose.R * surface.normal, surface.isotropy);
+  }
+  return information;
 }
 
 // Levenberg-Marquardt from `start`; never returns a higher cost than that of `start`.
