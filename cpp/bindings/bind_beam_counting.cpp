@@ -113,13 +113,13 @@ void bind(nb::module_& m) {
         "metres apart that are collinear with a third one within `tolerance` metres; the gap is at "
         "most `max_gap_ratio` times that to the third one. They take the smaller e of the two and "
         "add nothing to crossed cells. With remove it subtracts the same sums exactly.");
-  m.def("add_no_return_beams", &add_no_return<D>, nb::arg("grid").none(),
-        nb::arg("rest").none(),
+  m.def("add_no_return_beams", &add_no_return<D>, nb::arg("grid").none(), nb::arg("rest").none(),
         nb::arg("points").noconvert(), nb::arg("hit").noconvert(), nb::arg("offset").noconvert(),
         nb::arg("T_map_sensor").noconvert(), nb::arg("stop_cells").noconvert(),
         nb::arg("end_margin"), nb::arg("threads") = 1,
         "Adds the beams without a return as `add_beams` does, split over two grids: the trusted "
-        "part to grid, the remainder to rest; None leaves a part out. Runs of fewer than three such beams are not trusted; "
+        "part to grid, the remainder to rest; None leaves a part out. Runs of fewer than three "
+        "such beams are not trusted; "
         "the others are trusted up to the first of stop_cells (S, D) int64 and not within "
         "`end_margin` metres (may be infinite) of their end.");
   m.def("e_step", &expected_labels<D>, nb::arg("grid"), nb::arg("points").noconvert(),

@@ -97,8 +97,7 @@ struct Box {
       return;
     }
     for (const auto& block : map.blocks())
-      if (overlaps(BlockLayout<D>::cell_at(block->origin, 0), BlockLayout<D>::kEdge))
-        visit(*block);
+      if (overlaps(BlockLayout<D>::cell_at(block->origin, 0), BlockLayout<D>::kEdge)) visit(*block);
   }
 
   auto first_cell() const {

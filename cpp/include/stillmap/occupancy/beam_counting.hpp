@@ -104,8 +104,7 @@ inline void add_beams(OccupancyGrid<D>& grid, const Scans<D>& scans, const float
                       int threads) {
   const auto bounds = split_by_beams(scans.offset, scans.n_scans, threads);
   std::vector<OccupancyGrid<D>> others;
-  for (size_t i = 2; i < bounds.size(); ++i)
-    others.push_back(grid.sibling());
+  for (size_t i = 2; i < bounds.size(); ++i) others.push_back(grid.sibling());
   parallel_for_ranges(bounds, [&](size_t i, size_t first, size_t last) {
     add_scans<D>(i == 0 ? grid : others[i - 1], scans, e, sign, first, last);
   });
