@@ -5,7 +5,7 @@ from pathlib import Path
 QUICK = ("--set", "em.max_iterations=1")
 # goes on for long
 ENDLESS = ("--set", "em.max_iterations=100000", "--set", "em.patience=100000")
-ENDLESS += ("--set", "em.tolerance=0")
+ENDLESS += ("--set", "em.tolerance=0", "--set", "em.label_tolerance=0")
 FILES = {
     "map.pgm",
     "map.yaml",

@@ -18,7 +18,6 @@ from stillmap.core.camera import project
 from stillmap.io import stillmap_folder
 from stillmap.io.trajectory import poses_from_tum
 from stillmap.mesh.place import assign_views
-from stillmap.results import save
 from stillmap.sim import load_image_truth
 
 QUICK = ("--quiet", "--threads", "1", "--set", "em.max_iterations=1")
@@ -254,7 +253,7 @@ def test_interrupted_on_full_disks_and_gone_on_with(room, result, tmp_path, monk
         assert main(words) == 130
     assert [path.name for path in tmp_path.iterdir()] == [".out.resume"]
     with monkeypatch.context() as patch:
-        patch.setattr(save, "write_models", full)
+        patch.setattr("stillmap.results.object_models.write_models", full)
         assert main([*words, "--resume"]) == 2
     assert "No space left" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == [".out.resume"]
