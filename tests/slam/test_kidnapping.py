@@ -69,11 +69,12 @@ def test_a_scan_of_an_unknown_place_says_nothing():
 
 
 @pytest.mark.parametrize(
-    ("fitting", "contradicting", "supported", "contradicted"),
-    [(3, 0, True, False), (2, 0, False, False), (8, 2, True, False), (8, 3, False, False),
-     (0, 5, False, True), (2, 8, False, True), (3, 8, False, False), (0, 4, False, False)],
+    ("fitting", "contradicting", "tested", "supported", "contradicted"),
+    [(3, 0, 9, True, False), (2, 0, 9, False, False), (8, 2, 15, True, False),
+     (8, 3, 15, False, False), (0, 5, 15, False, True), (2, 8, 15, False, True),
+     (3, 8, 15, False, False), (0, 4, 4, False, False), (0, 5, 16, False, False)],
 )  # fmt: skip
-def test_support_of_a_placement(fitting, contradicting, supported, contradicted):
-    placement = Placement(np.eye(3), fitting, contradicting)
+def test_support_of_a_placement(fitting, contradicting, tested, supported, contradicted):
+    placement = Placement(np.eye(3), fitting, contradicting, tested)
     assert placement.is_supported == supported
     assert placement.is_contradicted == contradicted

@@ -27,8 +27,10 @@ _MAX_TESTED = 60  # keyframes of a segment that test a hypothesis
 # keyframes that must fit, how many one that contradicts outweighs, and by how many a place among
 # the many that are tried must be better than that of odometry
 _MIN_SUPPORT, _CONTRADICTION_WEIGHT, _MARGIN = 3, 4, 8
-_MIN_CONTRADICTING = 5  # keyframes without which odometry is believed
+# keyframes that must contradict the place of odometry, in all and as a share, or it is believed
+_MIN_CONTRADICTING, _MIN_CONTRADICTING_SHARE = 5, 0.33
 _SAME_DISTANCE, _SAME_ANGLE = 0.5, 0.1  # m, rad within which two hypotheses are one
+_DRIFT_DISTANCE, _DRIFT_ANGLE = 1.5, 0.3  # m, rad by which nobody carries a robot
 _SEGMENT_SPACING = 10.0  # m between unconnected segments
 
 
@@ -47,12 +49,14 @@ class Placement:
     Attributes:
         C: (3, 3) motion of the segment from where odometry has it.
         fitting, contradicting: keyframes that fit the map before it, and that contradict it.
+        tested: keyframes, those that see other places included.
         closures: that lead there.
     """
 
     C: Float
     fitting: int
     contradicting: int
+    tested: int
     closures: list[LoopClosure] = field(default_factory=list)
 
     @property
@@ -68,7 +72,8 @@ class Placement:
     @property
     def is_contradicted(self) -> bool:
         """Whether enough keyframes contradict it."""
-        return self.contradicting >= max(_MIN_CONTRADICTING, _CONTRADICTION_WEIGHT * self.fitting)
+        least = max(_MIN_CONTRADICTING, _MIN_CONTRADICTING_SHARE * self.tested)
+        return self.contradicting >= max(least, _CONTRADICTION_WEIGHT * self.fitting)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,14 +115,17 @@ def relocalize_segments(context: LoopContext, candidates: list[int]) -> Relocali
             continue
         there = _find_placement(context, before, first, last)
         if there is not None and there.score >= max(here.score, 0) + _MARGIN:
+            moved = se2.parameters(se2.inverse(poses[first]) @ there.C @ poses[first])
             poses[first:last] = there.C @ poses[first:last]
             out.closures.extend(there.closures)
-            out.breaks.append(first)
+            # so little is drift of odometry, after a blind stretch for example
+            if np.hypot(moved[0], moved[1]) > _DRIFT_DISTANCE or abs(moved[2]) > _DRIFT_ANGLE:
+                out.breaks.append(first)
         elif here.is_contradicted:
             poses[first:last] = _offset_beside(context, first) @ poses[first:last]
             out.breaks.append(first)
             out.unconnected.append(first)
-        elif there is not None:
+        elif there is not None or here.contradicting > here.fitting:
             out.ambiguous.append(first)
     return dataclasses.replace(out, context=dataclasses.replace(context, poses=poses))
 
@@ -203,11 +211,12 @@ def _build_map_before(context: LoopContext, first: int) -> _core.OccupancyGrid2D
 
 def _count_support(
     context: LoopContext, before: _core.OccupancyGrid2D, C: Float, first: int, last: int
-) -> tuple[int, int]:
-    """Keyframes of a segment moved by C (3, 3) that fit a map, and that contradict it."""
+) -> tuple[int, int, int]:
+    """Keyframes of a segment moved by C (3, 3) that fit a map, that contradict it, and all."""
     keyframes = context.keyframes[(context.keyframes >= first) & (context.keyframes < last)]
     fitting = contradicting = 0
-    for t in _select_evenly(keyframes, _MAX_TESTED):
+    tested = _select_evenly(keyframes, _MAX_TESTED)
+    for t in tested:
         scan = context.hits(t)
         prior = motion_model.gaussian_prior(C @ context.poses[t], _SAME_DISTANCE, _SAME_ANGLE)
         match = scan_matching.refine_pose(before, scan, prior, prior.T_map_base)
@@ -216,7 +225,7 @@ def _count_support(
             contradicting += 1
         elif match.explained >= loop_verification.MIN_EXPLAINED:
             fitting += 1
-    return fitting, contradicting
+    return fitting, contradicting, len(tested)
 
 
 def _select_evenly(keyframes: Index, max_count: int) -> list[int]:

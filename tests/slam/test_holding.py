@@ -1,0 +1,53 @@
+"""Worlds in which scans say little: poses stay with odometry, and nobody was carried."""
+
+import math
+
+import numpy as np
+import pytest
+from marks import slow_params
+
+from stillmap.eval.trajectory import compute_absolute_errors
+from stillmap.sim import scene_by_name, simulate
+from stillmap.slam import SlamOptions, m_step
+
+SHORT_180 = {"max_range": 6.0}
+NARROW = {"beams": 121, "fov": math.pi / 2, "max_range": 8.0, "range_noise": 0.03}
+SHORTEST = {"max_range": 4.0}
+
+
+def mapped(simulation):
+    recording = simulation.recording
+    e = np.full(recording.n_beams, 0.9, np.float32)
+    return m_step(recording, e, SlamOptions(), None, 1, lambda *_: None, with_grid=False)
+
+
+def assert_held(simulation, ratio):
+    """No break, and no worse than that ratio to odometry alone."""
+    truth = simulation.truth.T_world_base
+    found = mapped(simulation)
+    assert found.diagnostics.breaks == []
+    of_odometry = compute_absolute_errors(simulation.recording.T_odom_base, truth).rmse
+    assert compute_absolute_errors(found.poses, truth).rmse < ratio * of_odometry
+
+
+def hall(laser, people, seed, scans=900, **more):
+    changes = {"laser": laser, "crowd": {"people": people}, "robot": {"scans": scans}, **more}
+    return simulate(scene_by_name("hall", changes), seed)
+
+
+@pytest.mark.parametrize("seed", [0, *slow_params(1, 2)])
+@pytest.mark.parametrize(("laser", "people"), [(SHORT_180, 20), (NARROW, 30)])
+def test_short_and_narrow_views_in_a_crowd(laser, people, seed):
+    assert_held(hall(laser, people, seed), 1.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_hardly_a_wall_in_reach(seed):
+    assert_held(hall(SHORTEST, 20, seed, scans=2000), 1.2)
+
+
+@pytest.mark.parametrize("seed", [0, *slow_params(1, 2)])
+def test_half_a_minute_without_a_return(seed):
+    blind = {"max_range": 12.0, "blind_at": 0.5, "blind_time": 30.0}
+    assert_held(hall(blind, 10, seed, scans=600), 1.0)
