@@ -14,7 +14,6 @@ times that of odometry alone.
 
 import argparse
 import math
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,8 +22,7 @@ from typing import Any
 import numpy as np
 from cases import Case, scaled_odometry
 from common import Scores, add_arguments, add_seed_arguments, built, options_of, outcomes, seeds_of
-from poses import Variant, loop_scores, write
-from sweep import in_fresh_process
+from poses import Variant, loop_scores, rows_by_variant
 from tables import Row, grouped, markdown
 
 import stillmap
@@ -41,7 +39,7 @@ MIN_HITS = 20
 ABLATION = (
     Variant("defaults"),
     Variant("odometry noise is not learned", constants={"motion_model._MIN_NOISE_SHARE": 1.0}),
-    Variant("one contradicting scan is a break", constants={"kidnapping._MIN_LOOKS": 1}),
+    Variant("one contradicting scan is a break", constants={"kidnapping._MIN_CONTRADICTING": 1}),
     Variant("the first place that fits is taken", constants={"relocalization._MARGIN": 0}),
     Variant("views of single walls do not grow", constants={"loop_verification._MIN_ISOTROPY": 0}),
     Variant("no loops", ("slam.loop_closure=false",)),
@@ -134,14 +132,7 @@ def _carried(rng: np.random.Generator, number: int) -> tuple[Case, tuple[tuple[s
 
 def rows_of(job: Job) -> list[Row]:
     """A row of scores per variant."""
-    with tempfile.TemporaryDirectory() as work:
-        folder = Path(work, "recording")
-        in_fresh_process(write, folder, job.case, job.seed)
-        about = {"case": job.case.name, "seed": job.seed, **dict(job.about)}
-        return [
-            {**about, "variant": variant.name, **in_fresh_process(scored, folder, variant, job)}
-            for variant in job.variants
-        ]
+    return rows_by_variant(job, scored, **dict(job.about))
 
 
 def scored(folder: Path, variant: Variant, job: Job) -> Scores:

@@ -99,7 +99,7 @@ class Variant:
     name: str
     settings: tuple[str, ...] = ()
     odometry: bool = True
-    constants: dict[str, float] = field(default_factory=dict)
+    constants: dict[str, Any] = field(default_factory=dict)
 
     @contextlib.contextmanager
     def patched(self) -> Iterator[None]:
@@ -122,7 +122,7 @@ ABLATION = (
     Variant("no annealing", constants={"pose_graph._ANNEALING_STEPS": 1}),
     Variant("no refinement pass", constants={"m_step._REFINEMENT_PASSES": 0}),
     Variant("surfaces are not filled", constants={"scan_matching._MAX_GAP": 0.0}),
-    Variant("loops from single scans", constants={"loop_verification._VIEW_TRAVEL": 0.0}),
+    Variant("loops from single scans", constants={"loop_verification._VIEW_TRAVEL": (0.0,)}),
     Variant(
         "beams count up to their end",
         constants={"FREE_SPACE_MARGIN": 0.0, "scan_matching.FREE_SPACE_MARGIN": 0.0},
@@ -165,10 +165,15 @@ def variants(ablation: bool, no_odometry: bool) -> tuple[Variant, ...]:
 
 def rows_of(job: Job) -> list[Row]:
     """A row of scores per variant."""
+    return rows_by_variant(job, scored)
+
+
+def rows_by_variant(job: Any, scored: Callable[..., Scores], **about: Any) -> list[Row]:
+    """Simulates the world of a job once; a row of `scored(folder, variant, job)` per variant."""
     with tempfile.TemporaryDirectory() as work:
         folder = Path(work, "recording")
         in_fresh_process(write, folder, job.case, job.seed)
-        about = {"case": job.case.name, "seed": job.seed}
+        about |= {"case": job.case.name, "seed": job.seed}
         return [
             {**about, "variant": variant.name, **in_fresh_process(scored, folder, variant, job)}
             for variant in job.variants

@@ -24,3 +24,12 @@ def test_script(name, monkeypatch, capsys):
             module.main()
         assert stopped.value.code == 0
         assert "usage:" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["poses", "holding"])
+def test_constants_that_variants_replace_are_there(name):
+    for variant in importlib.import_module(name).ABLATION:
+        for path, value in variant.constants.items():
+            module, _, constant = f"stillmap.slam.{path}".rpartition(".")
+            stands = getattr(importlib.import_module(module), constant)
+            assert isinstance(stands, tuple) == isinstance(value, tuple), path

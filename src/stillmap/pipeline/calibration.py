@@ -1,4 +1,4 @@
-"""Calibration of a recording before it is mapped: what nobody told is estimated and put right."""
+"""Calibration of a recording before mapping: mounts that are not given, and odometry errors."""
 
 import dataclasses
 import math
@@ -38,8 +38,8 @@ def calibrate_recording(
         The recording, itself where nothing is significantly wrong; the calibration; and a sentence
         for everything that was changed.
     """
-    told = [_told(recording, options, k) for k in range(len(recording.T_base_sensor))]
-    found = calibrate_mounts(recording, options.slam.resolution, told)
+    given = [_given_parameters(recording, options, k) for k in range(len(recording.T_base_sensor))]
+    found = calibrate_mounts(recording, options.slam.resolution, given)
     applied = _apply(recording, found)
     if any(
         one.significant for laser in found.lasers for name, one in laser.items() if name in POSITION
@@ -69,24 +69,24 @@ def _apply(recording: Recording, found: Calibration) -> Recording:
     return recording
 
 
-def _told(recording: Recording, options: Options, laser: int) -> set[str]:
-    """What is known of a laser: given by the user, by transforms or by PARAMs of the log."""
-    given = options.read.laser(laser)
-    told = {
-        name for name, value in zip((*POSITION, YAW), given.pose, strict=True) if value is not None
+def _given_parameters(recording: Recording, options: Options, laser: int) -> set[str]:
+    """Mount parameters of a laser that the user, transforms or PARAMs of the log give."""
+    chosen = options.read.laser(laser)
+    given = {
+        name for name, value in zip((*POSITION, YAW), chosen.pose, strict=True) if value is not None
     }
-    if given.upside_down is not None:
-        told.add(UPSIDE_DOWN)
+    if chosen.upside_down is not None:
+        given.add(UPSIDE_DOWN)
     sensors = recording.source.get("sensors")
     notes = sensors[laser] if isinstance(sensors, list) and laser < len(sensors) else {}
     notes = notes if isinstance(notes, dict) else {}
     extrinsics = notes.get("extrinsics")
     how = str(extrinsics.get("how")) if isinstance(extrinsics, dict) else ""
     if how.startswith(("TF", "PARAM", "given")):
-        told |= {YAW, *POSITION}
+        given |= {YAW, *POSITION}
     if how.startswith("TF") or notes.get("upside_down_how") in ("given", "PARAM"):
-        told.add(UPSIDE_DOWN)
-    return told
+        given.add(UPSIDE_DOWN)
+    return given
 
 
 def _place_lasers(recording: Recording, found: Calibration) -> Recording:

@@ -228,7 +228,7 @@ def _lines_through_pairs(points: Float) -> Float:
 
 
 def _is_like_floor(ends: _EndPoints, line: Float, on: Bool) -> bool:
-    """Whether a line is long, not too near, closed, and nothing lies behind it."""
+    """Whether a line is long and gapless, far enough away, and no end point lies behind it."""
     if np.count_nonzero(on) < _MIN_BEAMS or float(np.linalg.norm(line)) * _MIN_DISTANCE > 1.0:
         return False
     # directions seen from the foot of the perpendicular: no jump within half a turn

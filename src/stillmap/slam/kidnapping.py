@@ -22,14 +22,14 @@ Float = NDArray[np.float64]
 _MAX_SCANS = 300  # ahead
 # a decision needs so many contradicting scans; so many that agree or contradict over so many m of
 # travel are enough
-_MIN_LOOKS, _ENOUGH_LOOKS, _MIN_TRAVEL = 6, 20, 3.0
+_MIN_CONTRADICTING, _ENOUGH_DECISIVE, _MIN_TRAVEL = 6, 20, 3.0
 _CONTRADICTION_RATIO = 4.0  # contradicting scans for each one that agrees
 _AGREE_SHARE, _CONTRADICT_SHARE = 0.6, 0.4  # explained, of the usual share
 _DRIFT, _MIN_STD = 0.04, 0.05  # m and rad of odometry error per m or rad, and at least
 
 
 class Evidence(Enum):
-    """What scans ahead say of the map."""
+    """Relation of a matched scan to the map."""
 
     AGREES = "agrees"
     CONTRADICTS = "contradicts"
@@ -37,7 +37,7 @@ class Evidence(Enum):
 
 
 @dataclass(frozen=True)
-class Outlook:
+class LookAhead:
     """Result of `look_ahead`.
 
     Attributes:
@@ -71,8 +71,8 @@ def look_ahead(
     t: int,
     T_map_base: Float,
     usual: float,
-) -> Outlook:
-    """Whether the robot was carried elsewhere before scan t.
+) -> LookAhead:
+    """Compares spaced scans from t on with the map, at poses by odometry.
 
     Args:
         recording: 2D.
@@ -83,7 +83,7 @@ def look_ahead(
         T_map_base: (3, 3) its pose by odometry.
         usual: explained share of scans that fit.
     """
-    looks = dict.fromkeys(Evidence, 0)
+    counts = dict.fromkeys(Evidence, 0)
     pose, since, travelled, metres, k = T_map_base, np.inf, 0.0, 0.0, t
     for k in range(t, min(t + _MAX_SCANS, recording.n_scans)):
         if k > t:
@@ -99,12 +99,12 @@ def look_ahead(
         match = scan_matching.refine_pose(grid, scan, prior, pose)
         if k > t and match.explained < _AGREE_SHARE * usual:
             match = scan_matching.search_pose(grid, scan, prior, 2.0 * std, 2.0 * std)
-        looks[judge_scan(grid, scan, match, usual)] += 1
-        n_decisive = looks[Evidence.AGREES] + looks[Evidence.CONTRADICTS]
-        if n_decisive >= _ENOUGH_LOOKS and metres >= _MIN_TRAVEL:
+        counts[judge_scan(grid, scan, match, usual)] += 1
+        n_decisive = counts[Evidence.AGREES] + counts[Evidence.CONTRADICTS]
+        if n_decisive >= _ENOUGH_DECISIVE and metres >= _MIN_TRAVEL:
             break
-    least = max(_MIN_LOOKS, _CONTRADICTION_RATIO * looks[Evidence.AGREES])
-    return Outlook(looks[Evidence.CONTRADICTS] >= least, k)
+    least = max(_MIN_CONTRADICTING, _CONTRADICTION_RATIO * counts[Evidence.AGREES])
+    return LookAhead(counts[Evidence.CONTRADICTS] >= least, k)
 
 
 def _size(increment: Float) -> tuple[float, float]:

@@ -21,6 +21,7 @@ _SUBMAP_SPACING = 0.25  # of that between keyframes; denser takes longer without
 # m of travel to either side whose scans are matched along with a keyframe, between these scans, and
 # the least isotropy of the information that a view should have
 _VIEW_TRAVEL, _VIEW_SPACING, _MIN_ISOTROPY = (1.0, 2.0, 4.0), 1.0, 0.15
+_INDEPENDENT_SCANS = 3  # of a view: further ones add no certainty
 SEARCH_STDS = 2.0  # half width of the search window in standard deviations of the drift
 # a beam is comparable if the submap was observed so many m before its end; share of beams that must
 # be comparable
@@ -159,11 +160,15 @@ def _select_around(context: LoopContext, t: int, metres: float) -> list[int]:
 
 
 def _merge_scans(context: LoopContext, scans: list[Scan], to_t: Float) -> Scan:
-    """Scans moved by (S, 3, 3) into one frame."""
+    """Scans moved by (S, 3, 3) into one frame.
+
+    Neighboring scans share their errors: more of them say where, not more certainly.
+    """
     pairs = list(zip(scans, to_t, strict=True))
+    share = np.float32(min(1.0, _INDEPENDENT_SCANS / len(scans)))
     return Scan(
         np.concatenate([transform_points(scan.points, T) for scan, T in pairs]),
-        np.concatenate([scan.weights for scan in scans]),
+        share * np.concatenate([scan.weights for scan in scans]),
         context.recording.T_base_sensor[0],
         np.concatenate([np.float32(scan.normals @ T[:2, :2].T) for scan, T in pairs]),
         np.concatenate([scan.isotropy for scan in scans]),

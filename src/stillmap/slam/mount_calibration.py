@@ -1,8 +1,8 @@
-"""What is wrong with the poses of lasers on the robot and with odometry, from the motion itself.
+"""Hand-eye calibration of laser mounts and odometry errors from the motion of the recording.
 
-A few short stretches are followed by their scans alone. Where odometry and the scans then disagree
-by more than the motion model forgives, more stretches are followed, and what is significant there
-is the calibration; all else keeps its nominal value.
+Scan matching without odometry estimates the motion in a few short segments. Where it differs from
+odometry by more than the motion model allows, more segments are matched. Parameters that differ
+significantly there are calibrated; the others keep their nominal values.
 """
 
 import dataclasses
@@ -31,16 +31,16 @@ Float = NDArray[np.float64]
 
 YAW, POSITION, UPSIDE_DOWN, LATENCY = "theta", ("x", "y"), "upside_down", "latency"
 
-# what matters: less is within the motion model's own uncertainty, or, of a laser's position, makes
-# less of a difference than whether poses are said of the laser or of the robot's centre. rad, m
-# (both coordinates together), shares, s
-_MATTERS = {"theta": 0.05, "x": 0.15, "y": 0.15, SCALE: 0.05, GAIN: 0.06, LATENCY: 0.1}
+# least differences that are applied: less is within the motion model's own uncertainty; less of a
+# laser's position matters no more than whether poses are those of the laser or of the robot's
+# centre. rad, m (both coordinates together), shares, s
+_MIN_DIFFERENCE = {"theta": 0.05, "x": 0.15, "y": 0.15, SCALE: 0.05, GAIN: 0.06, LATENCY: 0.1}
 _STDS = 5.0  # standard deviations that are significant
 # of each laser: at first, of short recordings less, and where something is found
 _FIRST_WINDOWS, _LEAST_WINDOWS, _MORE_WINDOWS = 40, 24, 100
 _SCANS_PER_WINDOW = 20  # of the recording, from which on fewer are measured at first
 _MIN_WINDOWS = 12  # less motion says nothing
-_SUSPICIOUS = 0.8  # of what matters: more windows are measured
+_SUSPICIOUS = 0.8  # of these differences: more windows are measured
 _MIN_GAIN = 20.0  # nats by which a calibration, or mirrored scans, must agree better in all
 # segments in which a calibration must gain so many nats, and the sum of all gains over all losses
 _MIN_SEGMENTS, _CLEAR_GAIN, _MIN_RATIO = 3, 1.0, 3.0
@@ -51,7 +51,7 @@ _SAME_SENSE = 0.5  # correlation of the turns of laser and odometry: the right w
 _MAX_LASERS = 4  # more: a laser that moves on its robot has a pose for each scan
 _LIMITS = {SCALE: (0.4, 2.5), GAIN: (0.4, 2.5)}  # beyond, odometry says nothing of this robot
 _MAX_POSITION = 3.0  # m on a robot
-_P_STATIC = 0.7  # of every beam: nobody knows yet who moves
+_P_STATIC = 0.7  # of every beam: labels are not known yet
 
 
 @dataclass(frozen=True)
@@ -95,24 +95,24 @@ class Calibration:
 
 
 def calibrate_mounts(
-    recording: Recording, resolution: float, told: Sequence[Collection[str]] = ()
+    recording: Recording, resolution: float, given: Sequence[Collection[str]] = ()
 ) -> Calibration:
     """Compares the motions of the lasers with odometry's.
 
     Args:
         recording: 2D; without odometry, or of a laser that moves on its robot, nothing is found.
         resolution: m, edge of a map cell.
-        told: of each laser what is known, of "theta", "x", "y" and "upside_down".
+        given: of each laser the parameters that are given, of "theta", "x", "y" and "upside_down".
     """
     lasers = len(recording.T_base_sensor)
     if recording.dimension != 2 or recording.T_odom_base is None or lasers > _MAX_LASERS:
         return Calibration()
-    told = list(told) or [()] * lasers
+    given = list(given) or [()] * lasers
     windows = max(_LEAST_WINDOWS, min(_FIRST_WINDOWS, recording.n_scans // _SCANS_PER_WINDOW))
-    found = _Calibrator(recording, resolution, told, windows).calibrate()
+    found = _Calibrator(recording, resolution, given, windows).calibrate()
     if not _is_suspicious(found):
         return found
-    return _Calibrator(recording, resolution, told, _MORE_WINDOWS).calibrate()
+    return _Calibrator(recording, resolution, given, _MORE_WINDOWS).calibrate()
 
 
 def _is_suspicious(found: Calibration) -> bool:
@@ -123,9 +123,9 @@ def _is_suspicious(found: Calibration) -> bool:
 
 
 def _excess(name: str, one: Parameter) -> float:
-    """Difference over what matters; 0 where it may be chance."""
+    """Difference over the least one that is applied; 0 within two standard deviations."""
     difference = _difference(name, one.value, one.nominal)
-    return abs(difference) / _MATTERS[name] if abs(difference) > 2.0 * one.std else 0.0
+    return abs(difference) / _MIN_DIFFERENCE[name] if abs(difference) > 2.0 * one.std else 0.0
 
 
 def _kind(name: str) -> str:
@@ -145,11 +145,11 @@ class _Calibrator:
         self,
         recording: Recording,
         resolution: float,
-        told: Sequence[Collection[str]],
+        given: Sequence[Collection[str]],
         windows: int,
     ) -> None:
         assert recording.T_odom_base is not None
-        self.told, self.odometry = told, recording.T_odom_base
+        self.given, self.odometry = given, recording.T_odom_base
         self.seconds = 1e-9 * (recording.stamp_ns - recording.stamp_ns[0])
         lasers = len(recording.T_base_sensor)
         centred = dataclasses.replace(recording, T_base_sensor=np.tile(np.eye(3), (lasers, 1, 1)))
@@ -196,7 +196,7 @@ class _Calibrator:
         return Calibration(lasers, upside_down, odometry, self.count)
 
     def _free_names(self, laser: int) -> list[str]:
-        return [name for name in laser_names(laser) if _kind(name) not in self.told[laser]]
+        return [name for name in laser_names(laser) if _kind(name) not in self.given[laser]]
 
     def _latency(self) -> Parameter | None:
         """By the laser that shows it best; None where none does."""
@@ -209,7 +209,7 @@ class _Calibrator:
         if not fits:
             return None
         fit, one = min(fits, key=lambda pair: pair[0].std)
-        is_certain = abs(fit.latency) > max(_MATTERS[LATENCY], _STDS * fit.std)
+        is_certain = abs(fit.latency) > max(_MIN_DIFFERENCE[LATENCY], _STDS * fit.std)
         return Parameter(
             0.0, fit.latency, fit.std, is_certain and self._halves_agree(one, fit.latency)
         )
@@ -224,7 +224,7 @@ class _Calibrator:
 
     def _is_upside_down(self, k: int, T: Float) -> bool:
         """Whether a laser's motion agrees with odometry's only if its scans are mirrored."""
-        if UPSIDE_DOWN in self.told[k]:
+        if UPSIDE_DOWN in self.given[k]:
             return False
         one, costs = self.windows[k], []
         turns = se2.parameters(se2.inverse(T[one.first]) @ T[one.last])[:, 2], one.motion[:, 2]
@@ -233,7 +233,7 @@ class _Calibrator:
         nominal = {SCALE: 1.0, GAIN: 1.0}
         for name, of_laser in zip(laser_names(0), laser_names(k), strict=True):
             nominal[name] = self.nominal[of_laser]
-        free = [name for name in laser_names(0) if _kind(name) not in self.told[k]]
+        free = [name for name in laser_names(0) if _kind(name) not in self.given[k]]
         for mirrored in (False, True):
             problem = HandEye([one], [mirrored], T, nominal)
             fit = problem.fit_globally([*free, SCALE, GAIN])
@@ -257,9 +257,9 @@ class _Calibrator:
                 pair = [n for n in (f"x{name[1:]}", f"y{name[1:]}") if n in names]
             d = np.array([_difference(n, fit.values[n], self.nominal[n]) for n in pair])
             std = np.array([fit.std[n] for n in pair])
-            matters = _MATTERS[_kind(name)]
+            least = _MIN_DIFFERENCE[_kind(name)]
             if (
-                float(np.linalg.norm(d)) > matters > float(std.max())
+                float(np.linalg.norm(d)) > least > float(std.max())
                 and float(np.linalg.norm(d / std)) > _STDS
             ):
                 out.append(name)

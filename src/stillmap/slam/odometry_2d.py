@@ -114,7 +114,7 @@ class _ScanOdometry:
             match = match_scan(self.local_map.grid, scan, prior, self.usual[s], learned)
         else:
             match = accept_prior(prior)
-        match, contradicts = self._resolve_doubt(t, scan, match, prior, other)
+        match, contradicts = self._resolve_poor_match(t, scan, match, prior, other)
         slip = self.slip.detect(t, last, guess, self.local_map.grid, scan, match)
         if slip is not None:
             match = self._accept_slip(t, slip)
@@ -174,7 +174,7 @@ class _ScanOdometry:
         self.travelled += _length(self.poses[slip.first - 1 : t])
         return slip.matches[-1]
 
-    def _resolve_doubt(
+    def _resolve_poor_match(
         self, t: int, scan: Scan, match: ScanMatch, prior: MotionPrior, other: MotionPrior | None
     ) -> tuple[ScanMatch, bool]:
         """The match of scan t after a wider search, and whether it contradicts the local map.
@@ -187,7 +187,7 @@ class _ScanOdometry:
         if self.seconds_before[t] > max(_GAP, _GAP_RATIO * self.seconds):
             return self._start_segment(t, prior), False
         if is_poor(match, usual):
-            match = self._skip_fault(t, scan, match, usual)
+            match = self._match_late_odometry(t, scan, match, usual)
         if is_poor(match, usual):
             # odometry that stands still may have stalled
             min_gain = ODOMETRY_FAULT if self.slip.has_stopped(t) else FAULT_GAIN
@@ -195,17 +195,21 @@ class _ScanOdometry:
             is_sure = match.cost - wider.cost > _SURE_GAIN
             if wider.widened and not self._is_reachable(t, wider):
                 return self._start_segment(t, prior), False
-            if wider.widened and (is_sure or self._may_go_on(t, wider, usual)):
+            if wider.widened and (is_sure or self._is_consistent_ahead(t, wider, usual)):
                 self.before_fault = t - 1
                 return wider, False
         if not is_poor(match, usual):
             return match, False
         contradicts = kidnapping.judge_scan(grid, scan, match, usual) is Evidence.CONTRADICTS
-        if not contradicts or t <= self.compared_until or self._may_go_on(t, match, usual):
+        if (
+            not contradicts
+            or t <= self.compared_until
+            or self._is_consistent_ahead(t, match, usual)
+        ):
             return match, contradicts
         return self._start_segment(t, prior), False
 
-    def _skip_fault(self, t: int, scan: Scan, match: ScanMatch, usual: float) -> ScanMatch:
+    def _match_late_odometry(self, t: int, scan: Scan, match: ScanMatch, usual: float) -> ScanMatch:
         """The match by odometry since before the last fault, if that is better.
 
         Odometry that comes late is wrong at one scan and right again at the next.
@@ -233,9 +237,9 @@ class _ScanOdometry:
         metres, radians = (max(_MIN_REACH, rate * seconds) for rate in (_MAX_SPEED, _MAX_TURN_RATE))
         return bool(np.hypot(x, y) <= metres and abs(theta) <= radians)
 
-    def _may_go_on(self, t: int, match: ScanMatch, usual: float) -> bool:
+    def _is_consistent_ahead(self, t: int, match: ScanMatch, usual: float) -> bool:
         """Whether the scans after t do not contradict the map if the robot goes on from a match."""
-        outlook = kidnapping.look_ahead(
+        ahead = kidnapping.look_ahead(
             self.recording,
             self.e,
             self.local_map.grid,
@@ -244,15 +248,15 @@ class _ScanOdometry:
             match.T_map_base,
             usual,
         )
-        if not outlook.contradicts:
-            self.compared_until = outlook.last
-        return not outlook.contradicts
+        if not ahead.contradicts:
+            self.compared_until = ahead.last
+        return not ahead.contradicts
 
     def _increments(self) -> Float:
         """(T - 1, 3, 3) increments of odometry; without it, the robot stands still."""
         if self.steps is not None:
             return self.steps.increments
-        return np.tile(np.eye(3), (self.recording.n_scans - 1, 1, 1))
+        return np.broadcast_to(np.eye(3), (self.recording.n_scans - 1, 3, 3))
 
     def _record(self, t: int, match: ScanMatch, *, is_fault: bool) -> None:
         self.poses[t], self.covariance[t] = match.T_map_base, match.covariance

@@ -1,8 +1,8 @@
 """Relocalization after the robot was carried elsewhere (kidnapped robot).
 
-The trajectory breaks into segments. Keyframes of a segment are matched, over all headings, with the
-earlier places that look most alike; then the whole segment must fit there. A segment without a
-match is put beside the others.
+The trajectory is cut into segments where the robot may have been carried. A segment stays where
+odometry leads if its keyframes fit there. Otherwise they are matched, over all headings, with the
+most similar earlier places. It is placed beside the others only if it contradicts odometry.
 """
 
 import dataclasses
@@ -30,7 +30,7 @@ _MIN_SUPPORT, _CONTRADICTION_WEIGHT, _MARGIN = 3, 4, 8
 # keyframes that must contradict the place of odometry, in all and as a share, or it is believed
 _MIN_CONTRADICTING, _MIN_CONTRADICTING_SHARE = 5, 0.33
 _SAME_DISTANCE, _SAME_ANGLE = 0.5, 0.1  # m, rad within which two hypotheses are one
-_DRIFT_DISTANCE, _DRIFT_ANGLE = 1.5, 0.3  # m, rad by which nobody carries a robot
+_DRIFT_DISTANCE, _DRIFT_ANGLE = 1.5, 0.3  # m, rad: smaller displacements are drift of odometry
 _SEGMENT_SPACING = 10.0  # m between unconnected segments
 
 

@@ -53,6 +53,6 @@ def gallery() -> Scene:
 
 
 def _gaps(parts: tuple[tuple[float, float], ...], length: float) -> list[tuple[float, float]]:
-    """What is left of a wall of some length between its parts, in ascending order."""
+    """Intervals, m, of a wall of that length which no part covers, ascending."""
     ends = [0.0, *(end for part in parts for end in part), length]
     return list(zip(ends[::2], ends[1::2], strict=True))
