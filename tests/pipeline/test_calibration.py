@@ -70,7 +70,7 @@ def test_notes_of_other_programs(simulation):
     for sensors in (None, [], [None], [{"extrinsics": 3}], {"a": 1}):
         source = {**simulation.recording.source, "sensors": sensors}
         recording = dataclasses.replace(simulation.recording, source=source)
-        assert calibration._told(recording, OPTIONS, 0) == set()
+        assert calibration._given_parameters(recording, OPTIONS, 0) == set()
 
 
 def test_the_result_is_that_of_the_corrected_recording(simulation):
