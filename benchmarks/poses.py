@@ -46,6 +46,7 @@ from stillmap.core import se2
 from stillmap.core.profiling import peak_memory_bytes
 from stillmap.eval.trajectory import compute_absolute_errors
 from stillmap.sim import load_truth, simulate, write_simulation
+from stillmap.slam import scan_matching
 from stillmap.slam.local_map import travelled_distance
 
 Float = NDArray[np.float64]
@@ -117,11 +118,16 @@ ABLATION = (
     DEFAULTS,
     Variant("no loops", ("slam.loop_closure=false",)),
     Variant("no e: the first M-step", ("em.max_iterations=1",)),
-    Variant("loops need no others that agree", constants={"loop_candidates._MIN_AGREEING": 0}),
+    Variant("loops need no others that agree", constants={"loop_consistency._MIN_AGREEING": 0}),
     Variant("every loop is believed", constants={"loop_closure._MAX_CHI2": 1e9}),
     Variant("no annealing", constants={"pose_graph._ANNEALING_STEPS": 1}),
     Variant("no refinement pass", constants={"m_step._REFINEMENT_PASSES": 0}),
-    Variant("surfaces are not filled", constants={"scan_matching._MAX_GAP": 0.0}),
+    Variant(
+        "surfaces are not filled",
+        constants={
+            "scan_matching._INTERPOLATION": {**scan_matching._INTERPOLATION, "max_gap": 0.0}
+        },
+    ),
     Variant("loops from single scans", constants={"loop_verification._VIEW_TRAVEL": (0.0,)}),
     Variant(
         "beams count up to their end",

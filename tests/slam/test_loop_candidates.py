@@ -24,12 +24,11 @@ from stillmap.slam.loop_candidates import (
     graph_distances,
     odometry_constraints,
     propose_candidates,
-    reject_inconsistent,
-    reject_inconsistent_since,
     split_stages,
     view_centers,
 )
 from stillmap.slam.loop_closure import close_loops
+from stillmap.slam.loop_consistency import reject_inconsistent, reject_inconsistent_since
 from stillmap.slam.types import LoopCandidate, LoopClosure, LoopContext, MStepResult
 
 OPTIONS = SlamOptions()

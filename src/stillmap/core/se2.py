@@ -26,16 +26,15 @@ def parameters(T: Float) -> Float:
 
 def normalize(T: Float) -> Float:
     """(..., 3, 3) poses with exact rotations; products accumulate rounding errors."""
-    return matrix(*np.moveaxis(parameters(T), -1, 0))
+    x = parameters(T)
+    return matrix(x[..., 0], x[..., 1], x[..., 2])
 
 
 def inverse(T: Float) -> Float:
     """Inverses of rigid transforms (..., D+1, D+1), any D."""
-    R_t = np.swapaxes(T[..., :-1, :-1], -1, -2)
-    out = np.zeros_like(T)
-    out[..., :-1, :-1] = R_t
-    out[..., :-1, -1] = -(R_t @ T[..., :-1, -1:])[..., 0]
-    out[..., -1, -1] = 1.0
+    out = T.swapaxes(-1, -2).copy()
+    out[..., :-1, -1:] = -(out[..., :-1, :-1] @ T[..., :-1, -1:])
+    out[..., -1, :-1] = 0.0
     return out
 
 

@@ -12,7 +12,7 @@ from stillmap.em.estimator import (
     initial_p_static,
     make_grid,
     max_iterations,
-    needs_sums,
+    needs_counts,
     recount_as_static,
     touched_share,
 )
@@ -31,6 +31,7 @@ from stillmap.em.types import (
     Likelihood,
     NoReturnModel,
 )
+from stillmap.em.window_counts import beam_boxes, count_in_window
 
 __all__ = [
     "ESTIMATORS_3D",
@@ -51,7 +52,9 @@ __all__ = [
     "OccupancyMap",
     "add_recording",
     "add_trusted_beams",
+    "beam_boxes",
     "changed_share",
+    "count_in_window",
     "count_observations",
     "e_step",
     "estimate_ground",
@@ -61,7 +64,7 @@ __all__ = [
     "make_grid",
     "make_occupancy_map",
     "max_iterations",
-    "needs_sums",
+    "needs_counts",
     "recount_as_static",
     "score_held_out_scans",
     "time_bin_index",

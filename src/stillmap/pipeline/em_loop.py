@@ -115,7 +115,7 @@ def _m_step(
         # labels change most in the first iteration; after the second, poses only need refinement
         initial=before.m_step if before is not None and before.number > 1 else None,
         earlier_poses=None if before is None else before.poses,
-        with_grid=em.needs_sums(recording.dimension, options.estimator),
+        with_grid=em.needs_counts(options.estimator),
         # (10) as printed counts beams up to their end
         free_space_margin=0.0 if options.estimator == "paper" else slam.FREE_SPACE_MARGIN,
     )

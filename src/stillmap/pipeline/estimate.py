@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-import stillmap._core as _core
 from stillmap import em, slam
 from stillmap.core.recording import Recording
 from stillmap.mapping.beam_statistics import sample_dynamic_points
@@ -95,7 +94,7 @@ class Iteration:
     """One M-step and one E-step.
 
     Attributes:
-        estimate: see Estimate; its grid is filled.
+        estimate: see Estimate; its grid is filled where the estimator uses it.
         record: its numbers.
         deskewed: the recording without the motion during its scans, at these poses.
     """
@@ -107,7 +106,10 @@ class Iteration:
     @property
     def occupancy(self) -> em.OccupancyMap:
         """The map of this iteration, computed at every call; every beam counts. 2D only."""
-        return em.make_occupancy_map(self.estimate.m_step.grid, self.estimate.e_step.occupied)
+        estimate = self.estimate
+        grid = em.make_grid(self.deskewed.dimension, estimate.m_step.grid.resolution)
+        em.add_recording(grid, self.deskewed, estimate.poses, estimate.weights)
+        return em.make_occupancy_map(grid, estimate.e_step.occupied)
 
 
 @dataclass
@@ -181,25 +183,27 @@ class EmState:
 
     def _take_snapshot(self, iteration: Iteration) -> None:
         """Crops the map of Fig. 8 where the first iteration labelled most beams dynamic."""
-        estimate = iteration.estimate
-        grid = estimate.m_step.grid
-        if not isinstance(grid, _core.OccupancyGrid2D):
+        estimate, deskewed = iteration.estimate, iteration.deskewed
+        if deskewed.dimension != 2:
             return
-        points = sample_dynamic_points(iteration.deskewed, estimate.poses, estimate.p_static)
+        resolution, poses = self.options.slam.resolution, estimate.poses
+        boxes = em.beam_boxes(deskewed, poses)
+        points = sample_dynamic_points(deskewed, poses, estimate.p_static)
         if self.window is None:
-            self.window = choose_window(_extent(grid), grid.resolution, points)
+            self.window = choose_window(_extent(boxes, resolution), resolution, points)
         shown = {1, 2, self.require_best().number}  # and the last, whichever that will be
         self.snapshots = {n: s for n, s in self.snapshots.items() if n in shown}
-        cells = _cells(self.window, grid.resolution)
+        grid = em.count_in_window(deskewed, poses, estimate.weights, boxes, self.window, resolution)
+        cells = _cells(self.window, resolution)
         part = em.make_occupancy_map(grid, estimate.e_step.occupied, window=cells)
         self.snapshots[estimate.number] = snapshot(estimate.number, part, points, self.window)
 
 
-def _extent(grid: _core.OccupancyGrid2D) -> Window:
-    """x0, y0, x1, y1 in metres of all cells that beams crossed."""
-    first_cell, (height, width) = grid.bounding_box()
-    last = first_cell + np.array([width, height])
-    x0, y0, x1, y1 = (np.concatenate([first_cell, last]) * grid.resolution).tolist()
+def _extent(boxes: Float, resolution: float) -> Window:
+    """x0, y0, x1, y1 in metres of all cells that beams crossed; `boxes` (T, 4) around them."""
+    low, high = boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)
+    cells = np.concatenate([np.floor(low / resolution), np.floor(high / resolution) + 1.0])
+    x0, y0, x1, y1 = (cells * resolution).tolist()
     return x0, y0, x1, y1
 
 

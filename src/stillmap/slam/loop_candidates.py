@@ -1,4 +1,4 @@
-"""Loop candidates, odometry constraints between keyframes, and consistency of loop closures."""
+"""Loop candidates, and odometry constraints between keyframes."""
 
 import itertools
 from collections.abc import Iterator
@@ -25,10 +25,6 @@ _MIN_DRIFT, _MAX_DRIFT_TRAVEL = (0.1, 0.02), 1000.0
 _STEP_TRANSLATION, _STEP_ROTATION = 0.03, 0.004  # random walk, m and rad per root of a metre
 _NO_ODOMETRY = [1e3, 1e3, 10.0]  # m, m, rad: std of a step across a break
 _LEAP_STDS = 3.0  # standard deviations of the motion prior beyond which an increment is a leap
-# consistency: keyframe distances on the earlier and the later side that count as nearby, closures
-# nearby that must agree, chi-square up to which two agree
-_NEARBY = np.array([8.0, 4.0])
-_MIN_AGREEING, _MAX_AGREEMENT_CHI2 = 2, 9.0
 
 
 def drift_std(metres: float) -> tuple[float, float]:
@@ -210,80 +206,7 @@ def _find_leaps(recording: Recording, poses: Float, options: OdometryOptions) ->
     increments = se2.inverse(recording.T_odom_base[:-1]) @ recording.T_odom_base[1:]
     found = se2.inverse(poses[:-1]) @ poses[1:]
     difference = se2.parameters(se2.inverse(increments) @ found)
-    for t, (increment, d) in enumerate(zip(increments, difference, strict=True), start=1):
-        prior = motion_model.odometry_prior(np.eye(3), increment, options)
-        std = np.array([prior.translation_std] * 2 + [prior.rotation_std])
-        if np.linalg.norm(d / std) > _LEAP_STDS:
-            leaps[t] = d
+    std = motion_model.learned_odometry_std(increments, options)[:, [0, 0, 1]]
+    is_leap = np.linalg.norm(difference / std, axis=1) > _LEAP_STDS
+    leaps[1:][is_leap] = difference[is_leap]
     return leaps
-
-
-def reject_inconsistent(
-    context: LoopContext, chain: list[Constraint], closures: list[LoopClosure]
-) -> list[LoopClosure]:
-    """Rejects closures whose correction those nearby do not share.
-
-    At least `_MIN_AGREEING` closures nearby and half of them all must agree.
-    """
-    travelled = context.travelled
-    accepted = [closure for closure in closures if not closure.rejected]
-    at = np.array([[travelled[c.earlier], travelled[c.later]] for c in accepted]).reshape(-1, 2)
-    nearby = _NEARBY * context.keyframe_distance
-    accumulated = _accumulate_covariance(context, chain)
-    out = []
-    for closure in closures:
-        if not closure.rejected:
-            off = np.abs(at - [travelled[closure.earlier], travelled[closure.later]])
-            others = [accepted[n] for n in np.flatnonzero((off < nearby).all(axis=1))]
-            votes = [_agree(context, accumulated, closure, c) for c in others if c is not closure]
-            if sum(votes) < max(_MIN_AGREEING, len(votes) / 2):
-                closure = closure.reject("nearby closures disagree")
-        out.append(closure)
-    return out
-
-
-def reject_inconsistent_since(
-    context: LoopContext,
-    chain: list[Constraint],
-    attempted: list[LoopClosure],
-    decided: list[LoopClosure],
-    k: int,
-) -> list[LoopClosure]:
-    """`reject_inconsistent` of all attempts, when those from keyframe k on are new.
-
-    Args:
-        context, chain: as of `reject_inconsistent`.
-        attempted: all attempts, by the later scan.
-        decided: the result of those before keyframe k.
-        k: index into the keyframes.
-    """
-    later = [context.travelled[closure.later] for closure in attempted]
-    near = _NEARBY[1] * context.keyframe_distance
-    # new votes reach back one neighborhood, whose closures depend on one more
-    here = context.travelled[context.keyframes[k]]
-    changed, relevant = np.searchsorted(later, here - [near, 2 * near])
-    again = reject_inconsistent(context, chain, attempted[relevant:])
-    return decided[:changed] + again[changed - relevant :]
-
-
-def _accumulate_covariance(context: LoopContext, chain: list[Constraint]) -> Float:
-    """(K, 3, 3) sum of the covariances of the steps to each keyframe, along the map's axes."""
-    poses = context.poses[context.keyframes[1:]]
-    steps = np.array([constraint.covariance for constraint in chain]).reshape(-1, 3, 3)
-    out = np.zeros((len(context.keyframes), 3, 3))
-    np.cumsum(se2.rotate_covariance(steps, poses), axis=0, out=out[1:])
-    return out
-
-
-def _agree(context: LoopContext, accumulated: Float, a: LoopClosure, b: LoopClosure) -> bool:
-    """Whether two closures are consistent with the motion between their later scans."""
-    a, b = (a, b) if a.later <= b.later else (b, a)
-    P = context.poses
-    here = P[a.earlier] @ a.T
-    predicted = here @ se2.inverse(P[a.later]) @ P[b.later]
-    d = se2.parameters(se2.inverse(predicted) @ P[b.earlier] @ b.T)
-    back = se2.inverse(P[b.later])
-    i, j = np.searchsorted(context.keyframes, [a.later, b.later])
-    between = se2.rotate_covariance(a.covariance, P[a.later]) + accumulated[j] - accumulated[i]
-    covariance = b.covariance + se2.rotate_covariance(between, back)
-    return float(d @ np.linalg.solve(covariance, d)) < _MAX_AGREEMENT_CHI2

@@ -8,7 +8,14 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.recording import Recording
-from stillmap.slam import local_map, loop_candidates, loop_verification, pose_graph, relocalization
+from stillmap.slam import (
+    local_map,
+    loop_candidates,
+    loop_consistency,
+    loop_verification,
+    pose_graph,
+    relocalization,
+)
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.pose_graph import Constraint, PoseGraph
 from stillmap.slam.relocalization import Relocalization
@@ -52,7 +59,7 @@ def close_loops(
         if all(closure.rejected for closure in new):
             found = found + new
             continue
-        found = ties + loop_candidates.reject_inconsistent_since(
+        found = ties + loop_consistency.reject_inconsistent_since(
             context, chain, attempted, found[len(ties) :], first
         )
         poses, fitting = _correct_stage(context, chain, poses, last, found)

@@ -15,7 +15,8 @@ from stillmap.slam.options import OdometryOptions
 
 Float = NDArray[np.float64]
 
-_TRANSLATION_FLOOR, _ROTATION_FLOOR = 0.02, 0.02  # m, rad: std of an increment without motion
+INCREMENT_STD = 0.02, 0.02  # m, rad: std of an increment without motion
+_TRANSLATION_FLOOR, _ROTATION_FLOOR = INCREMENT_STD
 # odometry that restarts elsewhere leaps: beyond this many m and times the usual step
 _MIN_LEAP, _LEAP_RATIO = 1.0, 5.0
 _FAULT_STDS = 3.0  # of the options, beyond which an increment is at fault
@@ -190,6 +191,16 @@ def odometry_std(distance: Any, turn: Any, options: OdometryOptions) -> tuple[An
     return translation, rotation
 
 
+def learned_odometry_std(
+    increments: Float, options: OdometryOptions, noise: OdometryNoise = OdometryNoise()
+) -> Float:
+    """(T, 2) m and rad, standard deviations of increments (T, 3, 3) with the noise learned."""
+    x = se2.parameters(increments)
+    std = odometry_std(np.hypot(x[:, 0], x[:, 1]), np.abs(x[:, 2]), options)
+    shares = (min(_INFLATION * share, 1.0) for share in (noise.translation, noise.rotation))
+    return np.stack([one * share for one, share in zip(std, shares, strict=True)], axis=1)
+
+
 def odometry_prior(
     T_map_base: Float,
     increment: Float,
@@ -197,10 +208,7 @@ def odometry_prior(
     noise: OdometryNoise = OdometryNoise(),
 ) -> MotionPrior:
     """The prior after an odometry increment (3, 3) from a pose (3, 3)."""
-    x, y, theta = se2.parameters(increment)
-    translation, rotation = odometry_std(float(np.hypot(x, y)), abs(float(theta)), options)
-    translation *= min(_INFLATION * noise.translation, 1.0)
-    rotation *= min(_INFLATION * noise.rotation, 1.0)
+    translation, rotation = learned_odometry_std(increment[None], options, noise)[0].tolist()
     return gaussian_prior(T_map_base @ increment, translation, rotation, is_odometry=True)
 
 
@@ -213,22 +221,6 @@ def constant_velocity_prior(
     increment = np.einsum("ij,jk->ik", se2.inverse(T_before), T_map_base)
     mean = np.einsum("ij,jk->ik", T_map_base, increment)
     return gaussian_prior(mean, noise.translation, noise.rotation)
-
-
-def increment_prior(T_map_base: Float, increment: Float) -> MotionPrior:
-    """The prior after an estimated increment (3, 3) from a pose (3, 3)."""
-    return gaussian_prior(T_map_base @ increment, _TRANSLATION_FLOOR, _ROTATION_FLOOR)
-
-
-def fuse_priors(a: MotionPrior, b: MotionPrior) -> MotionPrior:
-    """The product of two Gaussians on one pose."""
-    information = a.information + b.information
-    difference = se2.parameters(b.T_map_base) - se2.parameters(a.T_map_base)
-    difference[2] = se2.wrap(difference[2])
-    shift = np.linalg.solve(information, b.information @ difference)
-    std = np.sqrt(1.0 / np.diag(information))
-    mean = se2.matrix(*(se2.parameters(a.T_map_base) + shift))
-    return MotionPrior(mean, information, float(std[:2].max()), float(std[2]))
 
 
 def widen_prior(prior: MotionPrior, translation_std: float, rotation_std: float) -> MotionPrior:

@@ -1,8 +1,6 @@
 """Refinement pass: each scan is matched against the map of all other scans."""
 
 import dataclasses
-from collections.abc import Callable
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +10,13 @@ from stillmap.core import se2
 from stillmap.core.recording import Recording
 from stillmap.slam import motion_model, scan_matching
 from stillmap.slam.local_map import SCAN_SPACING, select_keyframes_per_sensor
-from stillmap.slam.motion_model import MotionPrior
 from stillmap.slam.options import SlamOptions
-from stillmap.slam.scan_matching import add_scan, select_hits
+from stillmap.slam.scan_matching import add_scan
 from stillmap.slam.types import MStepResult, ScanProgress
 
 Float = NDArray[np.float64]
+
+_SCANS_PER_CALL = 200  # of the kernel, between which an interrupt is noticed
 
 
 def refine_poses(
@@ -39,66 +38,52 @@ def refine_poses(
     poses = initial.poses.copy()
     T = len(poses)
     covariance, explained = np.zeros((T, 3, 3)), np.ones(T)
-    breaks = initial.diagnostics.breaks
-    increments, step_prior = _model_steps(recording, poses, options)
+    steps = _model_steps(recording, poses, options, initial.diagnostics.breaks)
     grid = _core.OccupancyGrid2D(options.resolution, scan_matching.FREE_SPACE_MARGIN)
     kept = select_keyframes_per_sensor(poses, recording.sensor, SCAN_SPACING, SCAN_SPACING)
     for t in recording.iter_scans(kept, e):
         add_scan(grid, recording, e, t, poses[t])
     is_in_map = np.zeros(T, np.bool_)
     is_in_map[kept] = True
-    for t in recording.iter_scans(range(1, T), e):
-        if is_in_map[t]:
-            add_scan(grid, recording, e, t, poses[t], remove=True)
-        scan = select_hits(recording, e, t)
-        prior = _neighbor_prior(t, poses, increments, breaks, step_prior)
-        match = scan_matching.refine_pose(grid, scan, prior, poses[t])
-        poses[t] = se2.normalize(match.T_map_base)
-        covariance[t], explained[t] = match.covariance, match.explained
-        if is_in_map[t]:
-            add_scan(grid, recording, e, t, poses[t])
-        progress(t + 1, T)
+    for first in recording.iter_scans(range(1, T, _SCANS_PER_CALL), e):
+        scans = slice(first, min(first + _SCANS_PER_CALL, T))
+        beams = slice(int(recording.offset[first]), int(recording.offset[scans.stop]))
+        # the step beyond the last scan is none
+        around = np.concatenate([poses[first - 1 : scans.stop + 1], poses[-1:]])
+        poses[scans], covariance[scans], explained[scans] = _core.refine_scans(
+            grid,
+            recording.points[beams],
+            recording.hit[beams],
+            e[beams],
+            recording.offset[first : scans.stop + 1] - beams.start,
+            recording.T_base_sensor[recording.sensor[scans]],
+            is_in_map[scans],
+            around[: scans.stop - first + 2],
+            *(each[first - 1 : scans.stop] for each in steps),
+            np.array(motion_model.INCREMENT_STD),
+            **scan_matching.refinement_options(grid),
+        )
+        progress(scans.stop, T)
     return dataclasses.replace(initial, poses=poses, covariance=covariance, explained=explained)
 
 
 def _model_steps(
-    recording: Recording, poses: Float, options: SlamOptions
-) -> tuple[Float, Callable[[Float, Float], MotionPrior]]:
-    """Increments (T - 1, 3, 3) between scans, and the prior after one from a pose (3, 3).
+    recording: Recording, poses: Float, options: SlamOptions, breaks: list[int]
+) -> tuple[Float, Float, NDArray[np.bool_]]:
+    """Increments (T, 3, 3) from each scan to the next, their standard deviations (T, 2), and which
+    are known (T,).
 
     Those of odometry with the noise that it has about the poses; of the poses where odometry is
-    missing or at fault.
+    missing or at fault. The last one is none, and neither are those across breaks.
     """
     motion = se2.inverse(poses[:-1]) @ poses[1:]
-    if recording.T_odom_base is None:
-        return motion, motion_model.increment_prior
-    measured = se2.inverse(recording.T_odom_base[:-1]) @ recording.T_odom_base[1:]
-    noise, is_fault = motion_model.fit_odometry_noise(measured, motion, options.odometry)
-    increments = np.where(is_fault[:, None, None], motion, measured)
-    return increments, partial(motion_model.odometry_prior, options=options.odometry, noise=noise)
-
-
-def _neighbor_prior(
-    t: int,
-    poses: Float,
-    increments: Float,
-    breaks: list[int],
-    step_prior: Callable[[Float, Float], MotionPrior],
-) -> MotionPrior:
-    """Prior of scan t from the motion since the scan before and until the scan after.
-
-    Args:
-        t: the scan.
-        poses: (T, 3, 3).
-        increments: (T - 1, 3, 3) between scans.
-        breaks: scans before which the motion is unknown.
-        step_prior: the prior after an increment from a pose.
-    """
-    if t in breaks:
-        prior = motion_model.increment_prior(poses[t], np.eye(3))
-    else:
-        prior = step_prior(poses[t - 1], increments[t - 1])
-    if t + 1 == len(poses) or t + 1 in breaks:
-        return prior
-    after = step_prior(poses[t + 1], se2.inverse(increments[t]))
-    return motion_model.fuse_priors(prior, after)
+    increments, std = motion, np.tile(motion_model.INCREMENT_STD, (len(motion), 1))
+    if recording.T_odom_base is not None:
+        measured = se2.inverse(recording.T_odom_base[:-1]) @ recording.T_odom_base[1:]
+        noise, is_fault = motion_model.fit_odometry_noise(measured, motion, options.odometry)
+        increments = np.where(is_fault[:, None, None], motion, measured)
+        std = motion_model.learned_odometry_std(increments, options.odometry, noise)
+    is_known = np.append(np.ones(len(motion), np.bool_), False)
+    is_known[np.array(breaks, np.intp) - 1] = False
+    none = np.eye(3)[None], np.array([motion_model.INCREMENT_STD])
+    return np.concatenate([increments, none[0]]), np.concatenate([std, none[1]]), is_known

@@ -22,7 +22,7 @@ Points = NDArray[np.float32]
 FREE_SPACE_MARGIN = 0.5  # m before its end in which a beam is not used as free space
 # gaps between neighboring end points on a surface that are filled: at most m wide, m that three of
 # them may be off a straight line, times the gap beside it
-_MAX_GAP, _STRAIGHTNESS, _MAX_GAP_RATIO = 1.5, 0.1, 3.0
+_INTERPOLATION = {"max_gap": 1.5, "tolerance": 0.1, "max_gap_ratio": 3.0}
 # likelihood field: m, std around end points; value of an unexplained end point; value added in
 # unknown space, which is not free; weight of one beam against the motion prior
 _FIELD_STD, _FLOOR, _UNKNOWN, _INFORMATION_SCALE = 0.04, 0.05, 0.2, 0.2
@@ -137,9 +137,7 @@ def add_scan(
         weights,
         np.array([0, len(hit)]),
         T_map_sensor,
-        max_gap=_MAX_GAP,
-        tolerance=_STRAIGHTNESS,
-        max_gap_ratio=_MAX_GAP_RATIO,
+        **_INTERPOLATION,
         remove=remove,
     )
 
@@ -296,9 +294,7 @@ def _register(
         scan.weights,
         prior.T_map_base,
         prior.information,
-        **_likelihood_field(grid),
-        information_scale=_INFORMATION_SCALE,
-        max_iterations=_MAX_ITERATIONS,
+        **_newton_options(grid),
         search_range=_MAX_SEARCH_RANGE,
         max_candidates=_MAX_CANDIDATES,
         normals=scan.normals,
@@ -313,6 +309,18 @@ def registration_cost(grid: _core.OccupancyGrid2D, scan: Scan, T_map_base: Float
     return _INFORMATION_SCALE * _core.registration_cost(
         grid, scan.points, scan.weights, T_map_base, **_likelihood_field(grid)
     )
+
+
+def refinement_options(grid: _core.OccupancyGrid2D) -> dict[str, Any]:
+    """Options of the kernel that refines one scan after another."""
+    normals = {"normal_radius": _NORMALS["radius"], "normal_max_gap": _NORMALS["max_gap"]}
+    flat = {name: _NORMALS[name] for name in ("flat_below", "round_from")}
+    return {**_newton_options(grid), **_INTERPOLATION, **normals, **flat}
+
+
+def _newton_options(grid: _core.OccupancyGrid2D) -> dict[str, Any]:
+    scale = {"information_scale": _INFORMATION_SCALE, "max_iterations": _MAX_ITERATIONS}
+    return {**_likelihood_field(grid), **scale}
 
 
 def _likelihood_field(grid: _core.OccupancyGrid2D) -> dict[str, Any]:

@@ -89,7 +89,7 @@ class MStepResult:
         poses: (T, D+1, D+1) T_map_base; the map frame is the base of the first scan.
         covariance: (T, 3, 3) of x, y, heading against the local map, after refinement against the
             map of all other scans; (T, 6, 6) in 3D.
-        grid: the sums alpha, beta of (10) over all scans.
+        grid: the sums alpha, beta of (10) over all scans; empty if they were not asked for.
         explained: (T,) share of each scan's beams that the local map explained; NaN: poses given.
         drift: (T, 3, 3) covariance of x, y, heading (map axes) that the step to each scan adds
             where the scan says nothing, as along a bare wall; None: not known.
