@@ -38,7 +38,8 @@ def refine_poses(
     poses = initial.poses.copy()
     T = len(poses)
     covariance, explained = np.zeros((T, 3, 3)), np.ones(T)
-    steps = _model_steps(recording, poses, options, initial.diagnostics.breaks)
+    breaks = initial.diagnostics.breaks
+    increments, step_std, has_step = _model_steps(recording, poses, options, breaks)
     grid = _core.OccupancyGrid2D(options.resolution, scan_matching.FREE_SPACE_MARGIN)
     kept = select_keyframes_per_sensor(poses, recording.sensor, SCAN_SPACING, SCAN_SPACING)
     for t in recording.iter_scans(kept, e):
@@ -59,7 +60,9 @@ def refine_poses(
             recording.T_base_sensor[recording.sensor[scans]],
             is_in_map[scans],
             around[: scans.stop - first + 2],
-            *(each[first - 1 : scans.stop] for each in steps),
+            increments[first - 1 : scans.stop],
+            step_std[first - 1 : scans.stop],
+            has_step[first - 1 : scans.stop],
             np.array(motion_model.INCREMENT_STD),
             **scan_matching.refinement_options(grid),
         )
