@@ -1,6 +1,6 @@
 """Warnings of a run: what limits the trust in its result."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -8,21 +8,25 @@ import numpy as np
 from stillmap import slam
 from stillmap.core.json import count_skipped
 from stillmap.core.recording import Recording
-from stillmap.pipeline.estimate import Estimate
+from stillmap.pipeline.estimate import Estimate, IterationRecord
 
 
-def find_warnings(best: Estimate, recording: Recording) -> list[str]:
+def find_warnings(
+    best: Estimate, recording: Recording, records: Sequence[IterationRecord] = ()
+) -> list[str]:
     """One sentence per warning, those of the reader first.
 
     Args:
         best: the estimate that was kept.
         recording: the input.
+        records: of all iterations.
     """
     explained = best.m_step.explained  # NaN: poses were given
     out = _reader_warnings(recording.source)
     given = len(explained) > 0 and bool(np.isnan(explained).all())
     if recording.T_odom_base is None and not given:
         out.append("no odometry: a constant velocity was assumed between scans")
+    out += _source_warnings(records, best.number)
     out += _pose_warnings(best.m_step.diagnostics)
     lost = np.flatnonzero(explained < 0.2)
     if len(lost):
@@ -40,6 +44,20 @@ def _reader_warnings(source: Mapping[str, Any]) -> list[str]:
     skipped = count_skipped(source)
     if skipped:
         out.append(f"scans left out while reading: {skipped} (`stillmap info` says why)")
+    return out
+
+
+def _source_warnings(records: Sequence[IterationRecord], best: int) -> list[str]:
+    """That odometry alone, or scans alone, explain the recording better than iterations did."""
+    out = []
+    for record in records:
+        if record.source:
+            kept = "its poses were kept" if record.number == best else "EM went on from its poses"
+            name = {"odometry": "odometry alone", "scans": "scan matching without odometry"}
+            out.append(
+                f"{name[record.source]} predicts left-out scans better than iterations 1 to "
+                f"{record.number - 1} did: {kept}"
+            )
     return out
 
 

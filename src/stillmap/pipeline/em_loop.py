@@ -17,6 +17,8 @@ from stillmap.pipeline.options import DEFAULTS, Options, resolve_options
 
 Float = NDArray[np.float64]
 
+_SETTLED_SHARE = 0.2  # of the scans that changed labels may touch while poses count as settled
+
 
 def iterate(
     recording: Recording,
@@ -53,7 +55,6 @@ def iterate(
     if scratch is not None:
         recording = dataclasses.replace(recording, scratch=scratch)
     stages, options = stages or StageTimer(), resolve_options(options, recording)
-    threads = resolve_threads(options.threads)
     first = 1 if previous is None else previous.number + 1
     for number in range(first, em.max_iterations(options.estimator, options.em) + 1):
         started = time.perf_counter()
@@ -64,35 +65,59 @@ def iterate(
         )
         with stages.measure("m_step"), limit_blas_threads():  # (9)-(15)
             m_step = _m_step(recording, e, previous, options, poses, progress)
-            deskewed = slam.deskew_recording(recording, m_step.poses, options.slam, threads)
         progress("labelling beams", number, 0, 0)
-        with stages.measure("e_step"):  # (6), and (8) or the occupancy HMM; the bound
-            e_step = em.e_step(
-                deskewed, m_step.poses, m_step.grid, options.estimator, options.em, threads
-            )
-        with stages.measure("held_out"):
-            held_out = em.score_held_out_scans(
-                deskewed,
-                m_step.poses,
-                e_step.p_static,
-                options.slam.resolution,
-                options.em.held_out if D == 2 else 0,  # path lengths in 3D need too much memory
-                threads,
-            )
-        record = IterationRecord(
-            number=number,
-            expected_log_likelihood=e_step.likelihood.expected,  # (5)
-            bound=e_step.likelihood.bound,
-            changed_share=em.changed_share(e, e_step.p_static, recording.hit),
-            seconds=time.perf_counter() - started,
-            held_out_log_likelihood=held_out,
-            touched_share=em.touched_share(recording, e, e_step.p_static),
-        )
-        iteration = Iteration(Estimate(number, e, m_step, e_step), record, deskewed)
+        iteration = label_poses(recording, options, number, e, m_step, stages, started)
         previous = iteration.estimate.for_next_iteration()
-        del m_step, e_step, deskewed  # grids are large: only the caller decides how long one lives
+        del m_step  # grids are large: only the caller decides how long one lives
         yield iteration
         del iteration
+
+
+def label_poses(
+    recording: Recording,
+    options: Options,
+    number: int,
+    e: NDArray[np.float32],
+    m_step: slam.MStepResult,
+    stages: StageTimer,
+    started: float,
+) -> Iteration:
+    """The E-step at the poses of an M-step, and the numbers of the iteration.
+
+    Args:
+        recording: as recorded.
+        options: resolved.
+        number: of the iteration, from 1.
+        e: (M,) weights of the beams in the M-step.
+        m_step: its result.
+        stages: where time and memory per stage are noted.
+        started: `time.perf_counter()` before the M-step.
+    """
+    threads = resolve_threads(options.threads)
+    deskewed = slam.deskew_recording(recording, m_step.poses, options.slam, threads)
+    with stages.measure("e_step"):  # (6), and (8) or the occupancy HMM; the bound
+        e_step = em.e_step(
+            deskewed, m_step.poses, m_step.grid, options.estimator, options.em, threads
+        )
+    with stages.measure("held_out"):
+        held_out = em.score_held_out_scans(
+            deskewed,
+            m_step.poses,
+            e_step.p_static,
+            options.slam.resolution,
+            options.em.held_out if recording.dimension == 2 else 0,  # in 3D too much memory
+            threads,
+        )
+    record = IterationRecord(
+        number=number,
+        expected_log_likelihood=e_step.likelihood.expected,  # (5)
+        bound=e_step.likelihood.bound,
+        changed_share=em.changed_share(e, e_step.p_static, recording.hit),
+        seconds=time.perf_counter() - started,
+        held_out_log_likelihood=held_out,
+        touched_share=em.touched_share(recording, e, e_step.p_static),
+    )
+    return Iteration(Estimate(number, e, m_step, e_step), record, deskewed)
 
 
 def _m_step(
@@ -113,9 +138,17 @@ def _m_step(
         resolve_threads(options.threads),
         lambda stage, done, total: progress(stage, number, done, total),
         # labels change most in the first iteration; after the second, poses only need refinement
-        initial=before.m_step if before is not None and before.number > 1 else None,
+        initial=before.m_step if before and _has_settled(recording, before) else None,
         earlier_poses=None if before is None else before.poses,
         with_grid=em.needs_counts(options.estimator),
         # (10) as printed counts beams up to their end
         free_space_margin=0.0 if options.estimator == "paper" else slam.FREE_SPACE_MARGIN,
+    )
+
+
+def _has_settled(recording: Recording, before: Estimate) -> bool:
+    """Whether poses only need refinement: matched twice, with labels that did not change much."""
+    is_matched = before.number > 1 and before.m_step.graph is not None
+    return is_matched and (
+        em.touched_share(recording, before.weights, before.p_static) < _SETTLED_SHARE
     )

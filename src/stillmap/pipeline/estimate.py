@@ -78,6 +78,8 @@ class IterationRecord:
         seconds: wall clock.
         held_out_log_likelihood: nats per beam of scans left out of the map; None: not computed.
         touched_share: share of the scans that the next M-step may match differently.
+        source: "odometry" or "scans" if the poses are those of that source alone; empty if they are
+            those of an M-step.
     """
 
     number: int
@@ -87,6 +89,7 @@ class IterationRecord:
     seconds: float
     held_out_log_likelihood: float | None = None
     touched_share: float = 1.0
+    source: str = ""
 
 
 @dataclass(frozen=True, eq=False)

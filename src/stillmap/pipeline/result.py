@@ -20,6 +20,7 @@ from stillmap.pipeline.em_loop import iterate
 from stillmap.pipeline.estimate import EmState, Estimate, IterationRecord
 from stillmap.pipeline.final_map import Maps, final_estimate, find_objects, make_maps
 from stillmap.pipeline.options import DEFAULTS, Options, resolve_options
+from stillmap.pipeline.pose_sources import better_source
 from stillmap.pipeline.snapshots import Snapshot
 from stillmap.slam.mount_calibration import Calibration
 from stillmap.tracking import FlowMap, MovingObject, compute_flow_map
@@ -160,18 +161,40 @@ def map_recording(
     state.single_pass = (
         recording.dimension == 3 and poses is not None and options.estimator == "stillmap"
     )
+    _run_em(recording, state, poses, progress, stages, checkpoint)
+    if poses is None and not any(record.source for record in state.records):
+        source = better_source(recording, state, progress, stages)
+        if source is not None:
+            state.update(source)
+            state.converged = False
+            _run_em(recording, state, None, progress, stages, checkpoint)
+    result = _finish(state, recording, progress, stages)
+    warnings = [*result.warnings, *notes]
+    return dataclasses.replace(result, calibration=found, warnings=warnings)
+
+
+def _run_em(
+    recording: Recording,
+    state: EmState,
+    poses: Float | None,
+    progress: Progress,
+    stages: StageTimer,
+    checkpoint: Callable[[EmState], None] | None,
+) -> None:
+    """Iterates until a stopping rule holds; arguments as of `map_recording`."""
     steps = iterate(
-        recording, options, poses=poses, progress=progress, stages=stages, previous=state.latest
+        recording,
+        state.options,
+        poses=poses,
+        progress=progress,
+        stages=stages,
+        previous=state.latest,
     )
     while not state.converged and (iteration := next(steps, None)) is not None:
         state.update(iteration)
         del iteration  # its grid is large
         if checkpoint is not None:
             checkpoint(state)
-    del steps  # holds labels and poses of the last iteration
-    result = _finish(state, recording, progress, stages)
-    warnings = [*result.warnings, *notes]
-    return dataclasses.replace(result, calibration=found, warnings=warnings)
 
 
 def _finish(
@@ -196,7 +219,7 @@ def _finish(
         estimate=estimate,
         maps=maps,
         converged=state.converged,
-        warnings=find_warnings(estimate, recording),
+        warnings=find_warnings(estimate, recording, state.records),
         objects=objects,
         traffic=crossings,
         changes=changes,

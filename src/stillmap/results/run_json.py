@@ -149,4 +149,5 @@ def _iteration(it: IterationRecord) -> dict[str, Any]:
         "changed_share": it.changed_share,
         "touched_share": it.touched_share,
         "seconds": it.seconds,
+        **({"source": it.source} if it.source else {}),
     }
