@@ -10,6 +10,7 @@ from stillmap.core import se2
 from stillmap.core.parallel import resolve_threads
 from stillmap.core.recording import Recording
 from stillmap.pipeline.options import Options
+from stillmap.preprocessing.late_odometry import interpolate_late_odometry
 from stillmap.preprocessing.overrides import mirror_beams
 from stillmap.slam.hand_eye import GAIN, SCALE, correct_odometry
 from stillmap.slam.mount_calibration import (
@@ -38,6 +39,7 @@ def calibrate_recording(
         The recording, itself where nothing is significantly wrong; the calibration; and a sentence
         for everything that was changed.
     """
+    recording, sentences = _repair_odometry(recording)
     given = [_given_parameters(recording, options, k) for k in range(len(recording.T_base_sensor))]
     found = calibrate_mounts(recording, options.slam.resolution, given)
     applied = _apply(recording, found)
@@ -51,11 +53,24 @@ def calibrate_recording(
         )
         found = refine_positions(applied, step.poses, found)
         applied = _place_lasers(applied, found)
-    sentences: list[str] = []
     for k, laser in enumerate(found.lasers):
         which = "the laser" if len(found.lasers) == 1 else f"laser {k + 1}"
         sentences += _laser_sentences(which, laser, found.upside_down[k])
     return applied, found, sentences + _odometry_sentences(found.odometry)
+
+
+def _repair_odometry(recording: Recording) -> tuple[Recording, list[str]]:
+    """The recording with late odometry interpolated, and a sentence about it; 2D only."""
+    if recording.T_odom_base is None or recording.dimension != 2:
+        return recording, []
+    T_odom_base, late = interpolate_late_odometry(recording.stamp_ns, recording.T_odom_base)
+    if len(late) == 0:
+        return recording, []
+    sentence = (
+        f"odometry came late at {len(late)} scan{'s' * (len(late) > 1)}, first at scan {late[0]}: "
+        "it was interpolated there"
+    )
+    return dataclasses.replace(recording, T_odom_base=T_odom_base), [sentence]
 
 
 def _apply(recording: Recording, found: Calibration) -> Recording:

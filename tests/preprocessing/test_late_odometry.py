@@ -1,0 +1,96 @@
+"""Late odometry: what is interpolated, and what is left."""
+
+import numpy as np
+import pytest
+
+from stillmap.core import se2
+from stillmap.preprocessing.late_odometry import interpolate_late_odometry
+
+STEP = 0.2  # s
+
+
+def driven(speed=1.0, turn_rate=0.0, n=40, stamps=None):
+    """Stamps in ns and odometry poses of a robot at constant speed, with 2 mm and 2 mrad noise."""
+    seconds = STEP * np.arange(n) if stamps is None else np.asarray(stamps, float)
+    motion = np.stack([speed * seconds, 0 * seconds, turn_rate * seconds], axis=1)
+    noise = 0.002 * np.random.default_rng(0).standard_normal((len(seconds), 3))
+    poses = se2.exp(motion) @ se2.matrix(*noise.T)
+    return (1e9 * seconds).astype(np.int64), poses
+
+
+def late(poses, scans, by):
+    """Poses of which some show where the robot was so many seconds before."""
+    out = poses.copy()
+    step = se2.log(se2.inverse(poses[:-1]) @ poses[1:]) / STEP
+    for t in scans:
+        out[t] = poses[t] @ se2.exp(-by * step[t - 1])
+    return out
+
+
+def off(found, poses):
+    d = se2.parameters(se2.inverse(poses) @ found)
+    return np.hypot(d[:, 0], d[:, 1]).max(), np.abs(d[:, 2]).max()
+
+
+@pytest.mark.parametrize(("speed", "turn_rate"), [(2.0, 0.0), (0.0, 2.0), (2.0, 1.0)])
+def test_one_late_reading(speed, turn_rate):
+    stamps, poses = driven(speed, turn_rate)
+    given = late(poses, [20], 0.18)
+    assert max(off(given, poses)) > 0.3
+    found, scans = interpolate_late_odometry(stamps, given)
+    assert scans.tolist() == [20]
+    assert max(off(found, poses)) < 0.03
+
+
+def test_readings_late_one_after_another():
+    stamps, poses = driven(2.0, n=200)
+    given = late(poses, [60, 61], 0.19)
+    given[61] = given[60]
+    found, scans = interpolate_late_odometry(stamps, given)
+    assert scans.tolist() == [60, 61]
+    assert max(off(found, poses)) < 0.03
+
+
+def test_a_stall_is_none():
+    """Odometry that stood still never catches up."""
+    stamps, poses = driven(2.0)
+    given = poses.copy()
+    given[20:] = given[19] @ se2.inverse(poses[20]) @ poses[20:]
+    found, scans = interpolate_late_odometry(stamps, given)
+    assert scans.tolist() == []
+    assert found is given or np.array_equal(found, given)
+
+
+def test_stopping_starting_and_turning_are_none():
+    seconds = STEP * np.arange(60)
+    speed = np.where((seconds > 3) & (seconds < 5), 0.0, 1.0)
+    rate = np.where(seconds > 8, 1.5, 0.0)
+    steps = se2.exp(STEP * np.stack([speed, 0 * speed, rate], axis=1))
+    poses = [np.eye(3)]
+    for step in steps[:-1]:
+        poses.append(poses[-1] @ step)
+    _, scans = interpolate_late_odometry((1e9 * seconds).astype(np.int64), np.array(poses))
+    assert scans.tolist() == []
+
+
+def test_uneven_stamps_are_left():
+    """Where many readings seem late, it is the stamps."""
+    stamps, poses = driven(3.0, n=100)
+    stamps[::3] += int(0.15e9)
+    _, scans = interpolate_late_odometry(stamps, poses)
+    assert scans.tolist() == []
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 3, 4, 5])
+def test_few_scans(n):
+    stamps, poses = driven(n=n)
+    found, scans = interpolate_late_odometry(stamps, poses)
+    assert found.shape == poses.shape
+    assert scans.tolist() == []
+
+
+def test_scans_at_the_same_time():
+    stamps, poses = driven(2.0, stamps=np.repeat(STEP * np.arange(20), 2))
+    found, scans = interpolate_late_odometry(stamps, poses)
+    assert scans.tolist() == []
+    np.testing.assert_array_equal(found, poses)
