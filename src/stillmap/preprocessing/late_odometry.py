@@ -31,7 +31,7 @@ def interpolate_late_odometry(
         T_odom_base: (T, 3, 3).
     """
     out, late = T_odom_base.copy(), set[int]()
-    seconds = 1e-9 * (stamp_ns - stamp_ns[:1])
+    seconds: Float = 1e-9 * (stamp_ns - stamp_ns[:1]).astype(np.float64)
     for n in range(2, _MAX_STEPS + 1):
         for first in _late_ways(seconds, out, n).tolist():
             between = range(first + 1, first + n)
@@ -80,4 +80,5 @@ def _interpolate(seconds: Float, T_odom_base: Float, first: int, n: int) -> Floa
     here, there = T_odom_base[first], T_odom_base[first + n]
     since = seconds[first + 1 : first + n] - seconds[first]
     share = since / (seconds[first + n] - seconds[first])
-    return here @ se2.exp(share[:, None] * se2.log(se2.inverse(here) @ there))
+    out: Float = here @ se2.exp(share[:, None] * se2.log(se2.inverse(here) @ there))
+    return out
