@@ -103,11 +103,13 @@ def rows_of(
 
 def add_seed_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--seeds", choices=["tuning", "reporting"], default="tuning")
-    p.add_argument("--n-seeds", type=int, default=len(TUNING), help="only the first so many")
+    p.add_argument("--n-seeds", type=int, default=len(TUNING), help="only so many")
+    p.add_argument("--skip-seeds", type=int, default=0, help="leave out the first so many")
 
 
 def seeds_of(args: argparse.Namespace) -> tuple[int, ...]:
-    return (REPORTING if args.seeds == "reporting" else TUNING)[: args.n_seeds]
+    seeds = REPORTING if args.seeds == "reporting" else TUNING
+    return seeds[args.skip_seeds :][: args.n_seeds]
 
 
 def options_of(method: str, settings: Iterable[str]) -> stillmap.Options:
