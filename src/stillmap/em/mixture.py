@@ -16,6 +16,7 @@ def fit_weights(
     initial_static: float,
     max_iterations: int = 100,
     tolerance: float = 1e-6,
+    rare: NDArray[np.bool_] | None = None,
 ) -> Float:
     """(C,) weights w, which sum to one: EM maximises sum_k ln sum_c w_c L_kc, up to a pseudo-count.
 
@@ -25,6 +26,7 @@ def fit_weights(
         initial_static: total weight of the static classes to start from.
         max_iterations: of EM.
         tolerance: nats per row; stops when an iteration gains less.
+        rare: (C,) dynamic classes with a total weight of at most 1 - initial_static; None: none.
 
     Sums use NumPy's own loops, not a linear algebra library that would split them among threads:
     the result does not depend on the number of processors.
@@ -40,6 +42,8 @@ def fit_weights(
         log_likelihood = float(np.sum(np.log(evidence))) / max(len(rows), 1)
         counts = weights * np.einsum("kc,k->c", rows, 1.0 / evidence)  # expected rows per class
         weights = _normalize(counts, n_static, initial_static)
+        if rare is not None:
+            weights = _limit(weights, rare, 1.0 - initial_static)
         if log_likelihood - last < tolerance:
             break
         last = log_likelihood
@@ -54,6 +58,14 @@ def _normalize(counts: Float, n_static: int, initial_static: float) -> Float:
     return np.concatenate(
         [weight * static / static.sum(), (1.0 - weight) * dynamic / dynamic.sum()]
     )
+
+
+def _limit(weights: Float, rare: NDArray[np.bool_], max_weight: float) -> Float:
+    """The weights nearest to the expected counts under an upper bound of some classes' total."""
+    total = float(weights[rare].sum())
+    if total <= max_weight:
+        return weights
+    return weights * np.where(rare, max_weight / total, (1.0 - max_weight) / (1.0 - total))
 
 
 def posterior_static(

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
-from stillmap.core.chunks import iter_beams
+from stillmap.core.chunks import ScanBeams, iter_beams
 from stillmap.core.recording import Recording
 from stillmap.em.mixture import MAX_FIT_ROWS
 from stillmap.em.options import EmOptions
@@ -31,6 +31,7 @@ _MARGIN = 3.0  # a beam has passed a surface if it ends at least this far behind
 _HIT_RADIUS = 4.0  # distance from a surfel's mean within which end points are hits
 _MIN_LATERAL = 0.3  # cells
 
+MIN_TRUST = 0.5  # in beams without a return, above which they clear free space
 _TRUST_SLOPE = 4.0  # trust reaches 0 where one in four beams without a return crosses solid cells
 _SURFELS_PER_BLOCK = 1 << 14
 _BINS_PER_THREAD = 2  # minimum, for load balance: a time bin is processed by one thread
@@ -140,11 +141,11 @@ def collect_observations(
     time_bin = time_bin_index(recording, options.time_bin) if recording.dimension == 3 else None
     surfel_map = build_surfel_map(recording, poses, resolution, threads, time_bin)
     hmm = make_hmm(surfel_map, options, classes, threads)
-    trust = _estimate_trust(recording, poses, hmm, threads)
-    hmm.set_trust_beyond_solid(trust)
+    trust, blind, trust_of_seeing = _estimate_trust(recording, poses, hmm, threads)
+    hmm.set_trust_beyond_solid(trust_of_seeing if blind else trust)
     if changes is not None:
         hmm.track_changes(**changes)
-    add_observations(recording, poses, hmm, options.time_bin, threads)
+    add_observations(recording, poses, hmm, options.time_bin, threads, without_blank=blind)
     hmm.release_buffers()
     rho, tau, view_angle = (np.array(values) for values in classes.grid())
     return Observations(surfel_map, hmm, trust, rho, tau, view_angle, classes.n_static, threads)
@@ -191,14 +192,24 @@ def time_bin_index(recording: Recording, seconds: float) -> NDArray[np.int64]:
 
 
 def add_observations(
-    recording: Recording, poses: Float, hmm: OccupancyHmm, seconds: float, threads: int
+    recording: Recording,
+    poses: Float,
+    hmm: OccupancyHmm,
+    seconds: float,
+    threads: int,
+    *,
+    without_blank: bool = False,
 ) -> None:
-    """Adds the observations of all time bins to the filters, in order."""
+    """Adds the observations of all time bins to the filters, in order.
+
+    without_blank: leave out the scans without a single return.
+    """
     time_bin, D = time_bin_index(recording, seconds), recording.dimension
     positions = np.ascontiguousarray(poses[:, :D, D])
     min_groups = _BINS_PER_THREAD * threads
     for scans, _, data in iter_beams(recording, poses, time_bin, min_groups=min_groups):
-        hmm.add(*data, time_bin[scans], threads, positions[scans])
+        used = _without_blank_scans(data) if without_blank else data
+        hmm.add(*used, time_bin[scans], threads, positions[scans])
 
 
 def make_hmm(
@@ -226,16 +237,41 @@ def make_hmm(
     return hmm
 
 
-def _estimate_trust(recording: Recording, poses: Float, hmm: OccupancyHmm, threads: int) -> float:
-    """Trust max(0, 1 - 4 nu) in beams without a return, nu the share that crosses solid cells.
+def _estimate_trust(
+    recording: Recording, poses: Float, hmm: OccupancyHmm, threads: int
+) -> tuple[float, bool, float]:
+    """Trust in beams without a return.
 
-    In open space nu is small; where glass or black surfaces swallow beams it is large.
+    In the open few of them cross solid cells; where glass or black surfaces swallow beams many do.
+    So do those of a sensor that is blind for a while, in scans without a single return.
+
+    Returns:
+        trust in all; whether the scans without a return are not trusted; trust in all others.
     """
-    n_beams = n_crossing = 0
+    counts, seeing = np.zeros(2), np.zeros(2)  # beams, and those that cross solid cells
     for *_, data in iter_beams(recording, poses):
-        counts = hmm.count_no_return_beams(*data, threads)
-        n_beams, n_crossing = n_beams + counts[0], n_crossing + counts[1]
+        some = np.array(hmm.count_no_return_beams(*data, threads))
+        counts += some
+        if (others := _without_blank_scans(data)) is not data:
+            some = np.array(hmm.count_no_return_beams(*others, threads))
+        seeing += some
+    blank = counts - seeing
+    return _trust(counts), bool(blank[0] and _trust(blank) < MIN_TRUST), _trust(seeing)
+
+
+def _trust(counts: Float) -> float:
+    """max(0, 1 - 4 nu), nu the share of some beams without a return that crosses solid cells."""
+    n_beams, n_crossing = counts.tolist()
     return max(0.0, 1.0 - _TRUST_SLOPE * n_crossing / n_beams) if n_beams else 0.0
+
+
+def _without_blank_scans(data: ScanBeams) -> ScanBeams:
+    """The same scans; those without a single return have no usable beams."""
+    n_hits = np.diff(np.append(0, np.cumsum(data.hit))[data.offset])
+    if n_hits.all():
+        return data
+    blank = np.repeat(n_hits == 0, np.diff(data.offset))
+    return data._replace(points=np.where(blank[:, None], np.float32(np.nan), data.points))
 
 
 def probability_in_cell(surfel_map: SurfelMap) -> NDArray[np.float32]:

@@ -26,6 +26,7 @@ from stillmap.em.mixture import fit_weights, posterior_static
 from stillmap.em.observations import (
     HALF_TIME_RHO,
     MAX_RANGE_MARGIN,
+    MIN_TRUST,
     HmmClasses,
     Observations,
     collect_observations,
@@ -45,7 +46,7 @@ from stillmap.em.types import (
 )
 
 _FREE_PRIOR = 0.2  # occupancy probability of a cell in which no beam ended and none passed
-_MIN_TRUST = 0.5  # in beams without a return, above which they clear free space
+_LONG_TAU = 12.0  # s, from which on a mover resembles a wall that two visits put in two places
 
 _CLASSES_3D = HmmClasses(dynamic_tau=(0.5, 3.0, 6.0, 12.0), half_time_tau=(8.0, 24.0))
 
@@ -159,7 +160,8 @@ def label_beams(
         obstacles: relabel beams that end on the ground below something that moves.
     """
     sample, _ = observations.likelihood(classes, observations.sample_rows())
-    weights = fit_weights(sample, observations.n_static, options.prior)
+    long = _long_movers(observations, classes)
+    weights = fit_weights(sample, observations.n_static, options.prior, rare=long)
     posterior, likelihood = _surfel_posterior(observations, classes, weights)
     prior = float(weights[: observations.n_static].sum())
     if p_static is None:
@@ -177,7 +179,7 @@ def label_beams(
             labels = np.where(np.isnan(above), labels, above)
         e[beams] = labels
     p_occupied = p_static * probability_in_cell(surfel_map)
-    end_margin = MAX_RANGE_MARGIN if observations.trust >= _MIN_TRUST else float("inf")
+    end_margin = MAX_RANGE_MARGIN if observations.trust >= MIN_TRUST else float("inf")
     return EStepResult(
         p_static=e,
         likelihood=likelihood,
@@ -185,6 +187,21 @@ def label_beams(
         learned=_learned(observations, classes, weights, prior),
         no_return=NoReturnModel(observations.hmm.solid_cells(), end_margin),
     )
+
+
+def _long_movers(
+    observations: Observations, classes: NDArray[np.bool_] | None
+) -> NDArray[np.bool_]:
+    """Which of the used classes are movers that stay for long.
+
+    Poses that disagree by decimetres let a wall appear in two places, each hit during one visit and
+    missed during another, which is what these classes describe. Without a bound on their weight
+    they would take over the mixture, and all cells that say little, which follow the weights.
+    """
+    of = slice(None) if classes is None else classes
+    long = observations.tau >= _LONG_TAU
+    long[: observations.n_static] = False
+    return np.asarray(long[of])
 
 
 def _surfel_posterior(
