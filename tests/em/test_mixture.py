@@ -86,3 +86,21 @@ def test_rows_of_one_class(sure):
 def test_uninformative_row_keeps_the_initial_weight():
     found = fit_weights(np.ones((1, 4), np.float32), N_STATIC, 0.3)
     assert found[:N_STATIC].sum() == pytest.approx(0.3, abs=1e-9)
+
+
+@pytest.mark.parametrize("share", [0.02, 0.5, 0.9])
+def test_rare_classes_keep_their_bound(share):
+    """Without it, a class that describes badly aligned walls takes over."""
+    shares = np.array([0.6, 0.4, 0.0, 0.0]) * (1.0 - share) + np.array([0, 0, 0, share])
+    likelihood, _ = members(np.random.default_rng(5), shares, 4000)
+    rare = np.array([False, False, False, True])
+    free = fit_weights(likelihood, N_STATIC, 0.9)
+    bounded = fit_weights(likelihood, N_STATIC, 0.9, rare=rare)
+    assert bounded.sum() == pytest.approx(1.0)
+    assert bounded[3] <= 0.1 + 1e-9
+    if share < 0.1:  # not reached
+        np.testing.assert_allclose(bounded, free)
+    else:
+        assert free[3] > 0.3
+        assert bounded[3] == pytest.approx(0.1)
+        assert bounded[:N_STATIC].sum() > free[:N_STATIC].sum()

@@ -8,6 +8,7 @@ from made_up import FAR, RESOLUTION, Wall, fan, watch
 
 from stillmap import _core, em
 from stillmap.core import chunks
+from stillmap.em import observations
 
 
 def with_lost(seen, lost, length=FAR):
@@ -112,3 +113,32 @@ def test_other_estimators_count_every_beam(estimator):
     e = found.p_static
     assert em.add_trusted_beams(grid, seen.recording, seen.poses, e, None) is None
     np.testing.assert_array_equal(grid.dense()[2], seen.grid(e).dense()[2])
+
+
+def blinded(seen, every=2):
+    """The same with scans without a single return, one in so many."""
+    return with_lost(seen, (np.arange(len(seen.what)) // 181) % every == 0)
+
+
+def test_scans_without_a_single_return_say_nothing_of_walls():
+    """A sensor that is blind for a while neither clears walls nor spoils the trust in the rest."""
+    seen = room_with()
+    clear, blind = seen.e_step(), blinded(seen).e_step()
+    hit = blinded(seen).recording.hit
+    assert (clear.p_static[hit] > 0.9).mean() > 0.98
+    assert (blind.p_static[hit] > 0.9).mean() > 0.98
+
+
+def test_blank_scans_in_the_open_count():
+    """Where no surface is, nothing contradicts scans without a return."""
+    in_the_open = watch([Wall((1, 0), 4.0)], 20, fan(181))
+    lost = with_lost(in_the_open, in_the_open.what == -1)
+    data = chunks.ScanBeams(
+        lost.recording.points,
+        lost.recording.hit,
+        lost.recording.offset,
+        lost.recording.T_map_sensor(lost.poses),
+    )
+    assert observations._without_blank_scans(data) is data
+    blank = data._replace(hit=np.zeros_like(data.hit))
+    assert np.isnan(observations._without_blank_scans(blank).points).all()
