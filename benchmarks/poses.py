@@ -46,7 +46,7 @@ from stillmap.core import se2
 from stillmap.core.profiling import peak_memory_bytes
 from stillmap.eval.trajectory import compute_absolute_errors
 from stillmap.sim import load_truth, simulate, write_simulation
-from stillmap.slam import scan_matching
+from stillmap.slam import scan_hits
 from stillmap.slam.local_map import travelled_distance
 
 Float = NDArray[np.float64]
@@ -124,14 +124,12 @@ ABLATION = (
     Variant("no refinement pass", constants={"m_step._REFINEMENT_PASSES": 0}),
     Variant(
         "surfaces are not filled",
-        constants={
-            "scan_matching._INTERPOLATION": {**scan_matching._INTERPOLATION, "max_gap": 0.0}
-        },
+        constants={"scan_hits.INTERPOLATION": {**scan_hits.INTERPOLATION, "max_gap": 0.0}},
     ),
     Variant("loops from single scans", constants={"loop_verification._VIEW_TRAVEL": (0.0,)}),
     Variant(
         "beams count up to their end",
-        constants={"FREE_SPACE_MARGIN": 0.0, "scan_matching.FREE_SPACE_MARGIN": 0.0},
+        constants={"FREE_SPACE_MARGIN": 0.0, "scan_hits.FREE_SPACE_MARGIN": 0.0},
     ),
 )
 

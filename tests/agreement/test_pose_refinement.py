@@ -9,7 +9,7 @@ from stillmap.core import se2
 from stillmap.sim import RobotOptions, Scene, simulate
 from stillmap.sim.options import CrowdOptions, LaserOptions
 from stillmap.sim.walls import box
-from stillmap.slam import scan_matching
+from stillmap.slam import scan_hits, scan_matching
 
 REST = np.array([0.02, 0.02])
 
@@ -44,9 +44,9 @@ def arguments(recording, e, poses, has_step=None, kept=None):
 
 
 def grid_of(recording, e, kept, poses):
-    grid = _core.OccupancyGrid2D(0.05, scan_matching.FREE_SPACE_MARGIN)
+    grid = _core.OccupancyGrid2D(0.05, scan_hits.FREE_SPACE_MARGIN)
     for t in np.flatnonzero(kept):
-        scan_matching.add_scan(grid, recording, e, t, poses[t])
+        scan_hits.add_scan(grid, recording, e, t, poses[t])
     return grid
 
 

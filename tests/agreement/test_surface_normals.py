@@ -5,7 +5,7 @@ import pytest
 from reference import surface_normals
 
 from stillmap import _core
-from stillmap.slam.scan_matching import make_scan
+from stillmap.slam.scan_hits import make_scan
 
 OPTIONS = {"radius": 0.3, "max_gap": 1.0, "flat_below": 0.1, "round_from": 0.4}
 FIELD = {"sigma": 0.04, "radius": 2, "floor": 0.05, "unknown": 0.2}

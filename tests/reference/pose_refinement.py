@@ -3,7 +3,7 @@
 import numpy as np
 
 from stillmap.core import se2
-from stillmap.slam import scan_matching
+from stillmap.slam import scan_hits, scan_matching
 from stillmap.slam.motion_model import MotionPrior
 
 
@@ -16,18 +16,18 @@ def refine_scans(grid, recording, e, is_in_map, poses, increments, std, has_step
     covariance, explained = np.zeros((len(poses), 3, 3)), np.ones(len(poses))
     for t in range(1, len(poses)):
         if is_in_map[t]:
-            scan_matching.add_scan(grid, recording, e, t, poses[t], remove=True)
+            scan_hits.add_scan(grid, recording, e, t, poses[t], remove=True)
         gaussians = []
         if has_step[t - 1]:
             gaussians.append((poses[t - 1] @ increments[t - 1], std[t - 1]))
         if has_step[t]:
             gaussians.append((poses[t + 1] @ np.linalg.inv(increments[t]), std[t]))
         prior = product(gaussians or [(poses[t], rest_std)])
-        scan = scan_matching.select_hits(recording, e, t)
+        scan = scan_hits.select_hits(recording, e, t)
         match = scan_matching.refine_pose(grid, scan, prior, poses[t])
         poses[t], covariance[t], explained[t] = match.T_map_base, match.covariance, match.explained
         if is_in_map[t]:
-            scan_matching.add_scan(grid, recording, e, t, poses[t])
+            scan_hits.add_scan(grid, recording, e, t, poses[t])
     return poses, covariance, explained
 
 

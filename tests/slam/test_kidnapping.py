@@ -13,7 +13,8 @@ from stillmap.slam import kidnapping
 from stillmap.slam.kidnapping import Evidence
 from stillmap.slam.motion_model import gaussian_prior
 from stillmap.slam.relocalization import Placement
-from stillmap.slam.scan_matching import accept_prior, add_scan, make_scan, select_hits
+from stillmap.slam.scan_hits import add_scan, make_scan, select_hits
+from stillmap.slam.scan_matching import accept_prior
 
 
 @functools.cache

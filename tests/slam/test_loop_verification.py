@@ -18,7 +18,7 @@ from stillmap.slam.loop_verification import (
     verify_candidate,
     verify_candidates,
 )
-from stillmap.slam.scan_matching import make_scan
+from stillmap.slam.scan_hits import make_scan
 from stillmap.slam.types import LoopCandidate
 
 

@@ -9,13 +9,8 @@ from stillmap import _core
 from stillmap.core import se2
 from stillmap.slam import scan_matching
 from stillmap.slam.motion_model import MotionPrior
-from stillmap.slam.scan_matching import (
-    is_poor,
-    make_scan,
-    match_scan,
-    search_pose,
-    widen_match,
-)
+from stillmap.slam.scan_hits import make_scan
+from stillmap.slam.scan_matching import is_poor, match_scan, search_pose, widen_match
 
 
 def prior_at(pose, translation=0.1, rotation=0.1):

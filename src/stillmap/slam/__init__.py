@@ -4,7 +4,7 @@ from stillmap.slam.deskew import deskew_recording
 from stillmap.slam.m_step import StepProgress, m_step
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.pose_graph import PoseGraph
-from stillmap.slam.scan_matching import FREE_SPACE_MARGIN
+from stillmap.slam.scan_hits import FREE_SPACE_MARGIN
 from stillmap.slam.types import Diagnostics, LoopClosure, MStepResult
 
 __all__ = [

@@ -15,7 +15,8 @@ from stillmap.core import se2
 from stillmap.core.recording import Recording
 from stillmap.slam import motion_model, scan_matching
 from stillmap.slam.local_map import SCAN_SPACING, SPACING_PER_SECOND
-from stillmap.slam.scan_matching import MAX_OCCLUDED, Scan, ScanMatch, select_hits
+from stillmap.slam.scan_hits import Scan, select_hits
+from stillmap.slam.scan_matching import MAX_OCCLUDED, ScanMatch
 
 Float = NDArray[np.float64]
 

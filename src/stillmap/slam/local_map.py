@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 import stillmap._core as _core
 from stillmap.core import se2, se3
 from stillmap.core.recording import Recording
-from stillmap.slam.scan_matching import add_scan
+from stillmap.slam.scan_hits import add_scan
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]

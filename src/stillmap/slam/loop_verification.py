@@ -11,7 +11,7 @@ from stillmap.core import se2
 from stillmap.slam import motion_model, scan_matching
 from stillmap.slam.local_map import KEYFRAME_ANGLE, select_keyframes_per_sensor
 from stillmap.slam.loop_candidates import drift_std
-from stillmap.slam.scan_matching import Points, Scan, transform_points
+from stillmap.slam.scan_hits import Points, Scan, transform_points
 from stillmap.slam.types import LoopCandidate, LoopClosure, LoopContext
 
 Float = NDArray[np.float64]

@@ -17,7 +17,7 @@ from stillmap.slam.loop_closure_3d import close_loops_3d
 from stillmap.slam.odometry_2d import register_scans
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.refinement import refine_poses
-from stillmap.slam.scan_matching import FREE_SPACE_MARGIN
+from stillmap.slam.scan_hits import FREE_SPACE_MARGIN
 from stillmap.slam.types import MStepResult, ScanProgress
 
 Float = NDArray[np.float64]

@@ -14,18 +14,16 @@ from stillmap.slam.local_map import LocalMap
 from stillmap.slam.motion_model import MotionPrior, VelocityNoise
 from stillmap.slam.odometry_faults import SlipDetector, SlipHypothesis
 from stillmap.slam.options import SlamOptions
+from stillmap.slam.scan_hits import FREE_SPACE_MARGIN, Scan, select_hits
 from stillmap.slam.scan_matching import (
     FAULT_GAIN,
-    FREE_SPACE_MARGIN,
     MIN_GAIN,
     ODOMETRY_FAULT,
-    Scan,
     ScanMatch,
     accept_prior,
     is_inconsistent,
     is_poor,
     match_scan,
-    select_hits,
     widen_match,
 )
 from stillmap.slam.types import Diagnostics, MStepResult, ScanProgress

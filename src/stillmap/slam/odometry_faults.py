@@ -15,7 +15,8 @@ import stillmap._core as _core
 from stillmap.core import se2
 from stillmap.slam import motion_model, scan_matching
 from stillmap.slam.motion_model import MotionPrior
-from stillmap.slam.scan_matching import ODOMETRY_FAULT, Scan, ScanMatch
+from stillmap.slam.scan_hits import Scan
+from stillmap.slam.scan_matching import ODOMETRY_FAULT, ScanMatch
 
 Float = NDArray[np.float64]
 

@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 import stillmap._core as _core
 from stillmap.core import se2
 from stillmap.core.recording import Recording
-from stillmap.slam import motion_model, scan_matching
+from stillmap.slam import motion_model, scan_hits, scan_matching
 from stillmap.slam.local_map import SCAN_SPACING, select_keyframes_per_sensor
 from stillmap.slam.options import SlamOptions
-from stillmap.slam.scan_matching import add_scan
+from stillmap.slam.scan_hits import add_scan
 from stillmap.slam.types import MStepResult, ScanProgress
 
 Float = NDArray[np.float64]
@@ -40,7 +40,7 @@ def refine_poses(
     covariance, explained = np.zeros((T, 3, 3)), np.ones(T)
     breaks = initial.diagnostics.breaks
     increments, step_std, has_step = _model_steps(recording, poses, options, breaks)
-    grid = _core.OccupancyGrid2D(options.resolution, scan_matching.FREE_SPACE_MARGIN)
+    grid = _core.OccupancyGrid2D(options.resolution, scan_hits.FREE_SPACE_MARGIN)
     kept = select_keyframes_per_sensor(poses, recording.sensor, SCAN_SPACING, SCAN_SPACING)
     for t in recording.iter_scans(kept, e):
         add_scan(grid, recording, e, t, poses[t])

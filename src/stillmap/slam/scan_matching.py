@@ -1,7 +1,7 @@
 """Scan matching in 2D, (9): the pose of one scan given the map so far and the motion prior.
 
 Likelihood field around end points, correlative search, Newton refinement; what is maximized is in
-`docs/registration.md`. Also adds single scans to such maps and removes them again.
+`docs/registration.md`.
 """
 
 import dataclasses
@@ -12,23 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
-from stillmap.core.recording import Recording
-from stillmap.slam import motion_model
+from stillmap.slam import motion_model, scan_hits
 from stillmap.slam.motion_model import MotionPrior
+from stillmap.slam.scan_hits import NORMALS, Scan
 
 Float = NDArray[np.float64]
-Points = NDArray[np.float32]
 
-FREE_SPACE_MARGIN = 0.5  # m before its end in which a beam is not used as free space
-# gaps between neighboring end points on a surface that are filled: at most m wide, m that three of
-# them may be off a straight line, times the gap beside it
-_INTERPOLATION = {"max_gap": 1.5, "tolerance": 0.1, "max_gap_ratio": 3.0}
 # likelihood field: m, std around end points; value of an unexplained end point; value added in
 # unknown space, which is not free; weight of one beam against the motion prior
 _FIELD_STD, _FLOOR, _UNKNOWN, _INFORMATION_SCALE = 0.04, 0.05, 0.2, 0.2
-# normals of a scan: m to either side that belong to one surface, m between its end points; ratio of
-# the variances across and along up to which it is flat, and from which it is a corner
-_NORMALS = {"radius": 0.3, "max_gap": 1.0, "flat_below": 0.1, "round_from": 0.4}
 _MAX_ITERATIONS = 20  # Newton
 _MAX_SEARCH_RANGE = 20.0  # m; longer beams are left out of the correlative search
 _MAX_CANDIDATES = 3  # poses of the correlative search that are refined
@@ -45,25 +37,6 @@ _INCONSISTENT_STDS = 3.0  # standard deviations from a prior's mean: it no longe
 MAX_OCCLUDED = 0.2  # share of a scan's beams that may seem to pass through walls
 # a wall: occupancy, m before the end of the beam
 WALL_OCCUPANCY, _WALL_MARGIN = 0.4, 0.5
-
-
-@dataclass(frozen=True, eq=False)
-class Scan:
-    """The hits of one scan, or of several.
-
-    Attributes:
-        points: (N, 2) float32, end points in the base frame.
-        weights: (N,) float32, e.
-        T_base_sensor: (3, 3) origin of the beams.
-        normals: (N, 2) float32, of the surfaces.
-        isotropy: (N,) float32, 0 on a flat surface, 1 where an end point fixes both directions.
-    """
-
-    points: Points
-    weights: NDArray[np.float32]
-    T_base_sensor: Float
-    normals: Points
-    isotropy: NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -88,58 +61,6 @@ class ScanMatch:
     alternatives: Float
     widened: bool = False
     contradicts_odometry: bool = False
-
-
-def transform_points(points: Points, T: Float) -> Points:
-    """Points (N, D) float32 transformed by (D+1, D+1)."""
-    return np.ascontiguousarray(points @ T[:-1, :-1].T + T[:-1, -1], dtype=np.float32)
-
-
-def select_hits(recording: Recording, e: NDArray[np.float32], t: int) -> Scan:
-    """The hits of scan t."""
-    beams = recording.beams_of(t)
-    hit = recording.hit[beams]
-    T_base_sensor = recording.T_base_sensor[recording.sensor[t]]
-    points = transform_points(recording.points[beams][hit], T_base_sensor)
-    return make_scan(points, e[beams][hit], T_base_sensor)
-
-
-def make_scan(points: Points, weights: NDArray[np.float32], T_base_sensor: Float) -> Scan:
-    """A scan of end points (N, 2) in the order of the beams, with the normals of its surfaces."""
-    normals, isotropy = np.zeros_like(points), np.zeros_like(weights)
-    counts = weights > 0.0
-    normals[counts], isotropy[counts] = _core.estimate_normals(points[counts], **_NORMALS)
-    return Scan(points, weights, T_base_sensor, normals, isotropy)
-
-
-def add_scan(
-    grid: _core.OccupancyGrid2D,
-    recording: Recording,
-    e: NDArray[np.float32],
-    t: int,
-    T_map_base: Float,
-    *,
-    remove: bool = False,
-) -> None:
-    """Adds the hits of scan t at a pose (3, 3) to a map for registration, or removes them.
-
-    Beams without a return may have met glass: they are no evidence against a surface.
-    """
-    beams = recording.beams_of(t)
-    points, hit, weights = recording.points[beams], recording.hit[beams], e[beams]
-    T_map_sensor = (T_map_base @ recording.T_base_sensor[recording.sensor[t]])[None]
-    all_hit, offset = hit[hit], np.array([0, np.count_nonzero(hit)])
-    _core.add_beams(grid, points[hit], all_hit, weights[hit], offset, T_map_sensor, remove=remove)
-    _core.interpolate_end_points(
-        grid,
-        points,
-        hit,
-        weights,
-        np.array([0, len(hit)]),
-        T_map_sensor,
-        **_INTERPOLATION,
-        remove=remove,
-    )
 
 
 def match_scan(
@@ -313,9 +234,9 @@ def registration_cost(grid: _core.OccupancyGrid2D, scan: Scan, T_map_base: Float
 
 def refinement_options(grid: _core.OccupancyGrid2D) -> dict[str, Any]:
     """Options of the kernel that refines one scan after another."""
-    normals = {"normal_radius": _NORMALS["radius"], "normal_max_gap": _NORMALS["max_gap"]}
-    flat = {name: _NORMALS[name] for name in ("flat_below", "round_from")}
-    return {**_newton_options(grid), **_INTERPOLATION, **normals, **flat}
+    normals = {"normal_radius": NORMALS["radius"], "normal_max_gap": NORMALS["max_gap"]}
+    flat = {name: NORMALS[name] for name in ("flat_below", "round_from")}
+    return {**_newton_options(grid), **scan_hits.INTERPOLATION, **normals, **flat}
 
 
 def _newton_options(grid: _core.OccupancyGrid2D) -> dict[str, Any]:

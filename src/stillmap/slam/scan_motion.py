@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 import stillmap._core as _core
 from stillmap.core import se2
 from stillmap.core.recording import Recording
-from stillmap.slam import scan_matching
+from stillmap.slam import scan_hits, scan_matching
 from stillmap.slam.local_map import LocalMap
 from stillmap.slam.motion_model import compute_odometry_steps, gaussian_prior
-from stillmap.slam.scan_matching import FREE_SPACE_MARGIN, Scan, ScanMatch
+from stillmap.slam.scan_hits import FREE_SPACE_MARGIN, Scan
+from stillmap.slam.scan_matching import ScanMatch
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -181,7 +182,7 @@ class _Tracker:
         ends, covariances, since, usual = [0], [np.zeros((3, 3))], 0.0, 0.0
         kept = len(self.scans)
         for k in range(1, len(self.scans)):
-            scan = scan_matching.select_hits(self.recording, self.e, int(self.scans[k]))
+            scan = scan_hits.select_hits(self.recording, self.e, int(self.scans[k]))
             match = self._match(k, scan, usual)
             if match.explained < _MIN_EXPLAINED:
                 kept = k  # lost: what follows is worth nothing

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core.recording import Recording
-from stillmap.slam import scan_matching
+from stillmap.slam import scan_hits
 from stillmap.slam.pose_graph import PoseGraph
-from stillmap.slam.scan_matching import Scan
+from stillmap.slam.scan_hits import Scan
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -141,11 +141,11 @@ class LoopContext:
 
     def hits(self, t: int) -> Scan:
         """The hits of scan t."""
-        return scan_matching.select_hits(self.recording, self.e, t)
+        return scan_hits.select_hits(self.recording, self.e, t)
 
     def build_map(self, scans: Iterable[int]) -> _core.OccupancyGrid2D:
         """A map for registration of some of the scans."""
-        grid = _core.OccupancyGrid2D(self.resolution, scan_matching.FREE_SPACE_MARGIN)
+        grid = _core.OccupancyGrid2D(self.resolution, scan_hits.FREE_SPACE_MARGIN)
         for t in scans:
-            scan_matching.add_scan(grid, self.recording, self.e, t, self.poses[t])
+            scan_hits.add_scan(grid, self.recording, self.e, t, self.poses[t])
         return grid
