@@ -42,6 +42,14 @@ ABLATION = (
     Variant("one contradicting scan is a break", constants={"kidnapping._MIN_CONTRADICTING": 1}),
     Variant("the first place that fits is taken", constants={"relocalization._MARGIN": 0}),
     Variant("views of single walls do not grow", constants={"loop_verification._MIN_ISOTROPY": 0}),
+    Variant(
+        "not compared with odometry alone",
+        constants={"stillmap.pipeline.pose_sources._PROMISING": math.inf},
+    ),
+    Variant(
+        "movers that stay long are not rare",
+        constants={"stillmap.em.occupancy_hmm._LONG_TAU": math.inf},
+    ),
     Variant("no loops", ("slam.loop_closure=false",)),
     Variant("one iteration", ("em.max_iterations=1",)),
 )

@@ -107,9 +107,14 @@ class Variant:
         """Sets the constants."""
         with contextlib.ExitStack() as stack:
             for path, value in self.constants.items():
-                module, _, name = f"stillmap.slam.{path}".rpartition(".")
+                module, _, name = full_path(path).rpartition(".")
                 stack.enter_context(patch.object(import_module(module), name, value))
             yield
+
+
+def full_path(constant: str) -> str:
+    """The path of a constant of `stillmap.slam`, or of another package if it is named in full."""
+    return constant if constant.startswith("stillmap.") else f"stillmap.slam.{constant}"
 
 
 DEFAULTS = Variant("defaults")
