@@ -28,8 +28,9 @@ def test_script(name, monkeypatch, capsys):
 
 @pytest.mark.parametrize("name", ["poses", "holding"])
 def test_constants_that_variants_replace_are_there(name):
+    full_path = importlib.import_module("poses").full_path
     for variant in importlib.import_module(name).ABLATION:
         for path, value in variant.constants.items():
-            module, _, constant = f"stillmap.slam.{path}".rpartition(".")
+            module, _, constant = full_path(path).rpartition(".")
             stands = getattr(importlib.import_module(module), constant)
             assert isinstance(stands, tuple) == isinstance(value, tuple), path
