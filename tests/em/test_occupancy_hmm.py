@@ -255,3 +255,20 @@ def test_labels_are_calibrated(crowd):
     assert compute_calibration_error(p, static, assign_equal_width_bins(p)) < 0.01
     assert p[static].mean() > 0.97
     assert p[~static].mean() < 0.15
+
+
+def test_walls_that_poses_put_in_several_places_do_not_make_all_else_dynamic():
+    # a narrow view turns three times about eight walls, each time 0.4 m from where it was
+    def turning(t):
+        a = np.radians(6.0 * t)
+        return fan(41, 60.0) @ np.array([[np.cos(a), np.sin(a)], [-np.sin(a), np.cos(a)]])
+
+    walls = [Wall((np.cos(a), np.sin(a)), 4.0) for a in np.radians(np.arange(0, 360, 45))]
+    seen = watch(walls, 180, turning)
+    turn = 2.0 * (np.arange(seen.recording.n_scans) // 60)
+    poses = seen.poses
+    poses[:, :2, 2] = 0.4 * np.column_stack([np.cos(turn), np.sin(turn)])
+    found = occupancy_hmm.e_step(seen.recording, poses, RESOLUTION, em.EmOptions())
+    e = seen.of(found.p_static, *range(len(walls)))
+    assert (e < 0.5).mean() < 0.5
+    assert found.learned["p_static"] > 0.8

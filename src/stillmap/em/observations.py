@@ -89,7 +89,7 @@ class Observations:
     Attributes:
         surfel_map: the surfels.
         hmm: the forward filters.
-        trust: weight of misses by beams without a return beyond a solid cell, 0 to 1.
+        trust: in beams without a return, 0 to 1.
         rho, tau, view_angle: (C,) of the classes; the first `n_static` are static.
         threads: does not change the result.
     """
@@ -141,8 +141,8 @@ def collect_observations(
     time_bin = time_bin_index(recording, options.time_bin) if recording.dimension == 3 else None
     surfel_map = build_surfel_map(recording, poses, resolution, threads, time_bin)
     hmm = make_hmm(surfel_map, options, classes, threads)
-    trust, blind, trust_of_seeing = _estimate_trust(recording, poses, hmm, threads)
-    hmm.set_trust_beyond_solid(trust_of_seeing if blind else trust)
+    trust, used_trust, blind = _estimate_trust(recording, poses, hmm, threads)
+    hmm.set_trust_beyond_solid(used_trust)
     if changes is not None:
         hmm.track_changes(**changes)
     add_observations(recording, poses, hmm, options.time_bin, threads, without_blank=blind)
@@ -239,14 +239,15 @@ def make_hmm(
 
 def _estimate_trust(
     recording: Recording, poses: Float, hmm: OccupancyHmm, threads: int
-) -> tuple[float, bool, float]:
-    """Trust in beams without a return.
+) -> tuple[float, float, bool]:
+    """Trust in beams without a return, and whether the sensor was blind.
 
     In the open few of them cross solid cells; where glass or black surfaces swallow beams many do.
     So do those of a sensor that is blind for a while, in scans without a single return.
 
     Returns:
-        trust in all; whether the scans without a return are not trusted; trust in all others.
+        trust in all; the weight of their misses beyond a solid cell; whether scans without a return
+        are to be left out, in which case the weight is that of the other scans.
     """
     counts, seeing = np.zeros(2), np.zeros(2)  # beams, and those that cross solid cells
     for *_, data in iter_beams(recording, poses):
@@ -256,7 +257,8 @@ def _estimate_trust(
             some = np.array(hmm.count_no_return_beams(*others, threads))
         seeing += some
     blank = counts - seeing
-    return _trust(counts), bool(blank[0] and _trust(blank) < MIN_TRUST), _trust(seeing)
+    blind = bool(blank[0] > 0 and _trust(blank) < MIN_TRUST)
+    return _trust(counts), _trust(seeing if blind else counts), blind
 
 
 def _trust(counts: Float) -> float:
@@ -267,10 +269,10 @@ def _trust(counts: Float) -> float:
 
 def _without_blank_scans(data: ScanBeams) -> ScanBeams:
     """The same scans; those without a single return have no usable beams."""
-    n_hits = np.diff(np.append(0, np.cumsum(data.hit))[data.offset])
-    if n_hits.all():
+    n_hits, n_beams = np.diff(np.append(0, np.cumsum(data.hit))[data.offset]), np.diff(data.offset)
+    blank = np.repeat(n_hits == 0, n_beams)
+    if not blank.any():
         return data
-    blank = np.repeat(n_hits == 0, np.diff(data.offset))
     return data._replace(points=np.where(blank[:, None], np.float32(np.nan), data.points))
 
 
