@@ -67,6 +67,7 @@ class FakeIteration:
     seconds: float
     held_out_log_likelihood: float | None = None
     touched_share: float = 0.3
+    source: str = ""
 
 
 @dataclass(frozen=True)
