@@ -82,14 +82,8 @@ Pose<D> checked_pose(const OnePose<D>& T, const char* name) {
 
 template <int D>
 auto matrix_of(const Pose<D>& pose) {
-  std::vector<double> T((D + 1) * (D + 1), 0.0);
-  for (size_t r = 0; r < D; ++r) {
-    for (size_t c = 0; c < D; ++c)
-      T[r * (D + 1) + c] = pose.R(static_cast<int>(r), static_cast<int>(c));
-    T[r * (D + 1) + D] = pose.t[static_cast<int>(r)];
-  }
-  T.back() = 1.0;
-  return to_numpy(std::move(T), {D + 1, D + 1});
+  const auto T = row_major(pose);
+  return to_numpy(std::vector<double>(T.begin(), T.end()), {D + 1, D + 1});
 }
 
 inline const float* per_beam(const Flat<float>& values, size_t n_beams, const char* name) {

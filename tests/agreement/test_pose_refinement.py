@@ -11,7 +11,7 @@ from stillmap.sim.options import CrowdOptions, LaserOptions
 from stillmap.sim.walls import box
 from stillmap.slam import scan_hits, scan_matching
 
-REST = np.array([0.02, 0.02])
+OWN_POSE_STD = np.array([0.02, 0.02])
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,7 @@ def arguments(recording, e, poses, has_step=None, kept=None):
     steps[-1] = False
     std = np.random.default_rng(2).uniform(0.01, 0.05, (len(poses), 2))
     kept = np.arange(len(poses)) % 3 == 0 if kept is None else kept
-    return recording, e, kept, poses, increments @ shift, std, steps, REST
+    return recording, e, kept, poses, increments @ shift, std, steps, OWN_POSE_STD
 
 
 def grid_of(recording, e, kept, poses):
@@ -50,7 +50,7 @@ def grid_of(recording, e, kept, poses):
     return grid
 
 
-def kernel(grid, recording, e, kept, poses, increments, std, has_step, rest, changed=()):
+def kernel(grid, recording, e, kept, poses, increments, std, has_step, own_pose_std, changed=()):
     """All scans but the first one in one call."""
     first = recording.offset[1]
     given = {
@@ -64,7 +64,7 @@ def kernel(grid, recording, e, kept, poses, increments, std, has_step, rest, cha
         "increments": increments,
         "step_std": std,
         "has_step": has_step,
-        "rest_std": rest,
+        "own_pose_std": own_pose_std,
     }
     return _core.refine_scans(
         grid, **{**given, **dict(changed)}, **scan_matching.refinement_options(grid)
@@ -121,7 +121,7 @@ def test_in_parts_it_is_the_same(watched):
         ("step_std", np.ones((3, 2))),
         ("step_std", np.zeros((30, 2))),
         ("has_step", np.ones(3, bool)),
-        ("rest_std", np.ones(3)),
+        ("own_pose_std", np.ones(3)),
         ("offset", np.arange(3)),
         ("hit", np.ones(3, bool)),
         ("e", np.ones(3, np.float32)),

@@ -4,11 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_up import FAR, RESOLUTION, Wall, fan, watch
+from made_up import FAR, RESOLUTION, Ball, Wall, fan, watch
 
 from stillmap import _core, em
 from stillmap.core import chunks
-from stillmap.em import observations
 
 
 def with_lost(seen, lost, length=FAR):
@@ -129,16 +128,27 @@ def test_scans_without_a_single_return_say_nothing_of_walls():
     assert (blind.p_static[hit] > 0.9).mean() > 0.98
 
 
-def test_blank_scans_in_the_open_count():
-    """Where no surface is, nothing contradicts scans without a return."""
-    in_the_open = watch([Wall((1, 0), 4.0)], 20, fan(181))
-    lost = with_lost(in_the_open, in_the_open.what == -1)
-    data = chunks.ScanBeams(
-        lost.recording.points,
-        lost.recording.hit,
-        lost.recording.offset,
-        lost.recording.T_map_sensor(lost.poses),
+def test_a_blind_sensor_says_nothing():
+    """Labels are those of the recording without the scans in which nothing returned."""
+    seen = watch([Wall((1, 0), 4.0, width=1.5), Ball(2.0, -1.0, 10, 25)], 90)
+    scan = np.arange(len(seen.what)) // 181
+    blind = (scan >= 30) & (scan < 60)
+    found = with_lost(seen, blind).e_step()
+    r, kept = seen.recording, np.r_[0:30, 60:90]
+    without = replace(
+        r,
+        stamp_ns=r.stamp_ns[kept],
+        offset=np.arange(61) * 181,
+        points=r.points[~blind],
+        hit=r.hit[~blind],
+        sensor=r.sensor[kept],
     )
-    assert observations._without_blank_scans(data) is data
-    blank = data._replace(hit=np.zeros_like(data.hit))
-    assert np.isnan(observations._without_blank_scans(blank).points).all()
+    other = replace(seen, recording=without, what=seen.what[~blind]).e_step()
+    np.testing.assert_array_equal(found.p_static[~blind], other.p_static)
+
+
+def test_scans_without_a_return_count_in_the_open():
+    """Objects that pass one after another are dynamic, since scans without a return miss them."""
+    passing = [Ball(3.0, 0.2 * k, 10 + k, 11 + k) for k in range(8)]
+    seen = watch([*passing, Ball(4.0, -2.0, 40, 60)], 90)
+    assert seen.of(seen.e_step().p_static, *range(len(passing) + 1)).max() < 0.5

@@ -16,8 +16,6 @@ from stillmap.pipeline.estimate import EmState
 from stillmap.pipeline.options import DEFAULTS, resolve_options
 from stillmap.results.save import save
 
-pytestmark = pytest.mark.usefixtures("room")
-
 
 @pytest.fixture
 def recording(room):
@@ -57,6 +55,18 @@ def test_odometry_is_taken_where_poses_are_worse(recording):
     errors = compute_absolute_errors(found.estimate.poses, recording.T_odom_base)
     assert errors.rmse < 1e-9
     np.testing.assert_array_equal(found.estimate.poses[0], np.eye(3))
+
+
+def test_scores_below_zero(recording, monkeypatch):
+    """Where the map predicts worse than none, odometry is compared as elsewhere."""
+    state = state_after(recording, bent(recording.T_odom_base, 5.0))
+    assert compare(recording, state).record.source == "odometry"
+    [record] = state.records
+    state.records = [dataclasses.replace(record, held_out_log_likelihood=-0.5)]
+    monkeypatch.setattr(pose_sources, "_held_out", lambda *_: -0.4)
+    assert compare(recording, state).record.source == "odometry"
+    monkeypatch.setattr(pose_sources, "_held_out", lambda *_: -0.8)
+    assert compare(recording, state) is None
 
 
 def test_good_poses_are_kept(recording):

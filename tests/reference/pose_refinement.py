@@ -7,7 +7,7 @@ from stillmap.slam import scan_hits, scan_matching
 from stillmap.slam.motion_model import MotionPrior
 
 
-def refine_scans(grid, recording, e, is_in_map, poses, increments, std, has_step, rest_std):
+def refine_scans(grid, recording, e, is_in_map, poses, increments, std, has_step, own_pose_std):
     """Poses (T, 3, 3), covariances and explained shares of all scans; the first one is fixed.
 
     increments (T, 3, 3), std (T, 2), has_step (T,): from each scan to the next.
@@ -22,7 +22,7 @@ def refine_scans(grid, recording, e, is_in_map, poses, increments, std, has_step
             gaussians.append((poses[t - 1] @ increments[t - 1], std[t - 1]))
         if has_step[t]:
             gaussians.append((poses[t + 1] @ np.linalg.inv(increments[t]), std[t]))
-        prior = product(gaussians or [(poses[t], rest_std)])
+        prior = product(gaussians or [(poses[t], own_pose_std)])
         scan = scan_hits.select_hits(recording, e, t)
         match = scan_matching.refine_pose(grid, scan, prior, poses[t])
         poses[t], covariance[t], explained[t] = match.T_map_base, match.covariance, match.explained

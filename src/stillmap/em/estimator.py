@@ -26,7 +26,8 @@ _FIXED_ITERATIONS: dict[Estimator, int] = {"hit-ratio": 1, "tracker": 2}
 
 _P_FLOOR = 0.0  # a scan of nothing but floor has no weight, and follows odometry
 
-# change of P(static) that counts in `changed_share`: not that of the default prior, 0.9, to 1
+# change of P(static) that counts in `changed_share`; the margin is for rounding, since the labels
+# of walls change from the default prior, 0.9, to 1
 _LABEL_CHANGE = 0.1 + 1e-6
 _TOUCHED = 0.2  # of the hits of a scan, whose change may change its pose
 
@@ -66,7 +67,7 @@ def make_grid(dimension: int, resolution: float, approach: float = 0.0) -> Grid:
 
 
 def needs_counts(estimator: Estimator) -> bool:
-    """Whether the E-step uses the counts (10) of the M-step, which take much memory."""
+    """Whether an estimator computes its labels from the counts (10) of the M-step."""
     return estimator in ("paper", "hit-ratio")
 
 

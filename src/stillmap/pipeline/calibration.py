@@ -39,7 +39,7 @@ def calibrate_recording(
         The recording, itself where nothing is significantly wrong; the calibration; and a sentence
         for everything that was changed.
     """
-    recording, sentences = _repair_odometry(recording)
+    recording, sentences = _interpolate_late_odometry(recording)
     given = [_given_parameters(recording, options, k) for k in range(len(recording.T_base_sensor))]
     found = calibrate_mounts(recording, options.slam.resolution, given)
     applied = _apply(recording, found)
@@ -59,7 +59,7 @@ def calibrate_recording(
     return applied, found, sentences + _odometry_sentences(found.odometry)
 
 
-def _repair_odometry(recording: Recording) -> tuple[Recording, list[str]]:
+def _interpolate_late_odometry(recording: Recording) -> tuple[Recording, list[str]]:
     """The recording with late odometry interpolated, and a sentence about it; 2D only."""
     if recording.T_odom_base is None or recording.dimension != 2:
         return recording, []
@@ -67,7 +67,7 @@ def _repair_odometry(recording: Recording) -> tuple[Recording, list[str]]:
     if len(late) == 0:
         return recording, []
     sentence = (
-        f"odometry came late at {len(late)} scan{'s' * (len(late) > 1)}, first at scan {late[0]}: "
+        f"odometry was late at {len(late)} scan{'s' * (len(late) > 1)}, first at scan {late[0]}: "
         "it was interpolated there"
     )
     return dataclasses.replace(recording, T_odom_base=T_odom_base), [sentence]

@@ -55,7 +55,7 @@ def _source_warnings(records: Sequence[IterationRecord], best: int) -> list[str]
             kept = "its poses were kept" if record.number == best else "EM went on from its poses"
             name = {"odometry": "odometry alone", "scans": "scan matching without odometry"}
             out.append(
-                f"{name[record.source]} predicts left-out scans better than iterations 1 to "
+                f"{name[record.source]} predicts held-out scans better than iterations 1 to "
                 f"{record.number - 1} did: {kept}"
             )
     return out

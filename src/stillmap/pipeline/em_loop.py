@@ -17,7 +17,7 @@ from stillmap.pipeline.options import DEFAULTS, Options, resolve_options
 
 Float = NDArray[np.float64]
 
-_SETTLED_SHARE = 0.2  # of the scans that changed labels may touch while poses count as settled
+_MAX_REFINED_SHARE = 0.2  # of the scans with changed labels: if more, all are matched anew
 
 
 def iterate(
@@ -137,8 +137,7 @@ def _m_step(
         poses,
         resolve_threads(options.threads),
         lambda stage, done, total: progress(stage, number, done, total),
-        # labels change most in the first iteration; after the second, poses only need refinement
-        initial=before.m_step if before and _has_settled(recording, before) else None,
+        initial=before.m_step if before and _needs_refinement_only(recording, before) else None,
         earlier_poses=None if before is None else before.poses,
         with_grid=em.needs_counts(options.estimator),
         # (10) as printed counts beams up to their end
@@ -146,9 +145,12 @@ def _m_step(
     )
 
 
-def _has_settled(recording: Recording, before: Estimate) -> bool:
-    """Whether poses only need refinement: matched twice, with labels that did not change much."""
-    is_matched = before.number > 1 and before.m_step.graph is not None
-    return is_matched and (
-        em.touched_share(recording, before.weights, before.p_static) < _SETTLED_SHARE
-    )
+def _needs_refinement_only(recording: Recording, before: Estimate) -> bool:
+    """Whether the next M-step refines the poses of an iteration instead of matching all scans anew.
+
+    So it does after two M-steps, if the labels of few scans changed since.
+    """
+    if before.number < 2 or before.m_step.graph is None:
+        return False
+    touched = em.touched_share(recording, before.weights, before.p_static)
+    return touched < _MAX_REFINED_SHARE

@@ -22,8 +22,9 @@ from stillmap.pipeline.options import Options
 
 Float = NDArray[np.float64]
 
-# odometry is labelled, too, if with the labels so far its poses reach this share of the best score
-_PROMISING = 0.6
+# odometry gets an E-step of its own if its score with the labels so far falls short of the best
+# one by less than this share of it; labels of its own raise it
+_MAX_SHORTFALL = 0.4
 _MIN_FAULT_SHARE = 0.05  # of the scans at which odometry is at fault: scans alone are worth a try
 
 
@@ -76,7 +77,7 @@ def _sources(
     with stages.measure("held_out"):
         odometry = _poses_by_odometry(recording)
         alone = _held_out(recording, odometry, best.p_static, options)
-    if alone is not None and alone > _PROMISING * score:
+    if alone is not None and alone > score - _MAX_SHORTFALL * abs(score):
         empty = em.make_grid(2, options.slam.resolution)
         T = recording.n_scans
         m_step = slam.MStepResult(odometry, np.zeros((T, 3, 3)), empty, np.ones(T))

@@ -1,8 +1,8 @@
-"""Late odometry: readings that were still old when a scan was taken.
+"""Late odometry: readings older than the scans that they are attached to.
 
-A scan whose odometry is late seems to come after a short step, and the scans after it after long
-ones, until odometry has caught up. The whole way in the whole time is that of the usual speed.
-Scans that see the robot move correct such readings; those of a bare corridor do not.
+The step to a scan with a late reading is too short and the next ones are too long, until odometry
+has caught up; the average speed over the whole interval is the usual one. Where scans show the
+motion they correct such readings. Along a bare corridor they do not.
 """
 
 import numpy as np
@@ -12,19 +12,20 @@ from stillmap.core import se2
 
 Float = NDArray[np.float64]
 
-_MAX_STEPS = 4  # from the last reading in time to the next one in time
-# m/s^2 and rad/s^2 that robots reach; m and rad from which a reading is late
-_ACCELERATION, _ANGULAR_ACCELERATION = 2.0, 4.0
-_MIN_OFF = 0.15
-_MAX_SPEED_CHANGE = 0.5  # of the speed in between, from before to after the way
-_SHORT = 1e-3  # s: scans at the same time do not show a speed
-_MAX_LATE_SHARE = 0.02  # of the scans: where more seem late, their stamps are uneven
+_MAX_STEPS = 4  # of an interval from one timely reading to the next
+_ACCELERATION, _ANGULAR_ACCELERATION = 2.0, 4.0  # m/s^2, rad/s^2 that robots reach
+_MIN_LAG = 0.15  # m and rad behind constant speed from which a reading is late
+# difference between the speeds before and after an interval, and twice that between their mean and
+# the interval's, as shares of their mean
+_MAX_SPEED_CHANGE = 0.5
+_MIN_DURATION = 1e-3  # s: scans at the same time show no speed
+_MAX_LATE_SHARE = 0.02  # of the scans: if more seem late, their stamps are uneven
 
 
 def interpolate_late_odometry(
     stamp_ns: NDArray[np.int64], T_odom_base: Float
 ) -> tuple[Float, NDArray[np.intp]]:
-    """Odometry poses (T, 3, 3) with late ones interpolated between those around, and the late ones.
+    """Odometry (T, 3, 3) with late readings interpolated, and the scans (K,) that they belong to.
 
     Args:
         stamp_ns: (T,) of the scans.
@@ -33,45 +34,42 @@ def interpolate_late_odometry(
     out, late = T_odom_base.copy(), set[int]()
     seconds: Float = 1e-9 * (stamp_ns - stamp_ns[:1]).astype(np.float64)
     for n in range(2, _MAX_STEPS + 1):
-        for first in _late_ways(seconds, out, n).tolist():
-            between = range(first + 1, first + n)
-            if not late.intersection(between):
-                out[between] = _interpolate(seconds, out, first, n)
-                late.update(between)
+        for first in _find_late_intervals(seconds, out, n).tolist():
+            inside = range(first + 1, first + n)
+            if not late.intersection(inside):
+                out[inside] = _interpolate(seconds, out, first, n)
+                late.update(inside)
     if len(late) > max(_MAX_LATE_SHARE * len(out), 1.0):
         return T_odom_base, np.zeros(0, np.intp)
     return out, np.array(sorted(late), np.intp)
 
 
-def _late_ways(seconds: Float, T_odom_base: Float, n: int) -> NDArray[np.intp]:
-    """First scans of the ways of n steps within which odometry was late."""
-    T = len(seconds)
-    first = np.arange(1, T - n - 1)
+def _find_late_intervals(seconds: Float, T_odom_base: Float, n: int) -> NDArray[np.intp]:
+    """First scans of the intervals of n steps within which odometry is late."""
+    first = np.arange(1, len(seconds) - n - 1)
     if len(first) == 0:
         return first
-    dt = np.diff(seconds).clip(_SHORT)
-    steps = se2.log(se2.inverse(T_odom_base[:-1]) @ T_odom_base[1:])
-    before, after = (steps[at] / dt[at, None] for at in (first - 1, first + n))
-    whole = se2.log(se2.inverse(T_odom_base[first]) @ T_odom_base[first + n])
-    duration = (seconds[first + n] - seconds[first]).clip(_SHORT)
-    speed = whole / duration[:, None]
+    dt = np.diff(seconds).clip(_MIN_DURATION)
+    velocity = se2.log(se2.inverse(T_odom_base[:-1]) @ T_odom_base[1:]) / dt[:, None]
+    before, after = velocity[first - 1], velocity[first + n]
     usual = 0.5 * (before + after)
+    duration = (seconds[first + n] - seconds[first]).clip(_MIN_DURATION)
+    motion = se2.log(se2.inverse(T_odom_base[first]) @ T_odom_base[first + n])
+    excess = motion / duration[:, None] - usual
     is_late = np.zeros(len(first), np.bool_)
-    for axes, acceleration in (((0, 1), _ACCELERATION), ((2,), _ANGULAR_ACCELERATION)):
-        some = list(axes)
-        size = np.linalg.norm(usual[:, some], axis=1)
-        is_steady = np.linalg.norm((before - after)[:, some], axis=1) < _MAX_SPEED_CHANGE * size
-        is_steady &= (
-            np.linalg.norm((speed - usual)[:, some], axis=1) < 0.5 * _MAX_SPEED_CHANGE * size
+    for axes, acceleration in (([0, 1], _ACCELERATION), ([2], _ANGULAR_ACCELERATION)):
+        speed, change, deviation = (
+            np.linalg.norm(each[:, axes], axis=1) for each in (usual, after - before, 2.0 * excess)
         )
+        is_steady = np.maximum(change, deviation) < _MAX_SPEED_CHANGE * speed
         for k in range(1, n):
             since = (seconds[first + k] - seconds[first]).clip(0.0, duration)
-            there = T_odom_base[first] @ se2.exp((since / duration)[:, None] * whole)
-            off = se2.parameters(se2.inverse(there) @ T_odom_base[first + k])[:, some]
-            allowed = np.maximum(_MIN_OFF, 0.5 * acceleration * since * (duration - since))
-            # late, not early: behind on the way
-            behind = -(off * usual[:, some]).sum(axis=1) > allowed * size
-            is_late |= is_steady & behind
+            expected = T_odom_base[first] @ se2.exp((since / duration)[:, None] * motion)
+            off = se2.parameters(se2.inverse(expected) @ T_odom_base[first + k])[:, axes]
+            lag = -(off * usual[:, axes]).sum(axis=1) / speed.clip(1e-9)
+            is_late |= is_steady & (
+                lag > np.maximum(_MIN_LAG, 0.5 * acceleration * since * (duration - since))
+            )
     return first[is_late]
 
 

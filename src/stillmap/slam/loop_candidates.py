@@ -206,7 +206,7 @@ def _find_leaps(recording: Recording, poses: Float, options: OdometryOptions) ->
     increments = se2.inverse(recording.T_odom_base[:-1]) @ recording.T_odom_base[1:]
     found = se2.inverse(poses[:-1]) @ poses[1:]
     difference = se2.parameters(se2.inverse(increments) @ found)
-    std = motion_model.learned_odometry_std(increments, options)[:, [0, 0, 1]]
+    std = motion_model.increment_std(increments, options)[:, [0, 0, 1]]
     is_leap = np.linalg.norm(difference / std, axis=1) > _LEAP_STDS
     leaps[1:][is_leap] = difference[is_leap]
     return leaps

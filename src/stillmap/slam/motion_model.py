@@ -15,8 +15,8 @@ from stillmap.slam.options import OdometryOptions
 
 Float = NDArray[np.float64]
 
-INCREMENT_STD = 0.02, 0.02  # m, rad: std of an increment without motion
-_TRANSLATION_FLOOR, _ROTATION_FLOOR = INCREMENT_STD
+MIN_INCREMENT_STD = 0.02, 0.02  # m, rad: of an increment without motion
+_TRANSLATION_FLOOR, _ROTATION_FLOOR = MIN_INCREMENT_STD
 # odometry that restarts elsewhere leaps: beyond this many m and times the usual step
 _MIN_LEAP, _LEAP_RATIO = 1.0, 5.0
 _FAULT_STDS = 3.0  # of the options, beyond which an increment is at fault
@@ -191,10 +191,10 @@ def odometry_std(distance: Any, turn: Any, options: OdometryOptions) -> tuple[An
     return translation, rotation
 
 
-def learned_odometry_std(
+def increment_std(
     increments: Float, options: OdometryOptions, noise: OdometryNoise = OdometryNoise()
 ) -> Float:
-    """(T, 2) m and rad, standard deviations of increments (T, 3, 3) with the noise learned."""
+    """(T, 2) m and rad, standard deviations of odometry increments (T, 3, 3)."""
     x = se2.parameters(increments)
     std = odometry_std(np.hypot(x[:, 0], x[:, 1]), np.abs(x[:, 2]), options)
     shares = (min(_INFLATION * share, 1.0) for share in (noise.translation, noise.rotation))
@@ -208,7 +208,7 @@ def odometry_prior(
     noise: OdometryNoise = OdometryNoise(),
 ) -> MotionPrior:
     """The prior after an odometry increment (3, 3) from a pose (3, 3)."""
-    translation, rotation = learned_odometry_std(increment[None], options, noise)[0].tolist()
+    translation, rotation = increment_std(increment[None], options, noise)[0].tolist()
     return gaussian_prior(T_map_base @ increment, translation, rotation, is_odometry=True)
 
 

@@ -4,6 +4,7 @@
 #pragma once
 
 #include <Eigen/Dense>
+#include <array>
 #include <cmath>
 
 namespace stillmap {
@@ -65,6 +66,20 @@ struct Pose {
     return R * p + t;
   }
 
+  Pose operator*(const Pose& other) const {
+    Pose out;
+    out.R = R * other.R;
+    out.t = R * other.t + t;
+    return out;
+  }
+
+  Pose inverse() const {
+    Pose out;
+    out.R = R.transpose();
+    out.t = -(out.R * t);
+    return out;
+  }
+
   Pose boxplus(const typename Lie<D>::Tangent& delta) const {
     Pose out;
     out.R = Lie<D>::exp_rotation(delta.template tail<Lie<D>::kRotation>()) * R;
@@ -90,6 +105,18 @@ inline Pose<D> pose_from(const double* m) {
     pose.t[r] = m[r * (D + 1) + D];
   }
   return pose;
+}
+
+// The row-major homogeneous matrix of a pose.
+template <int D>
+inline std::array<double, (D + 1) * (D + 1)> row_major(const Pose<D>& pose) {
+  std::array<double, (D + 1) * (D + 1)> m{};
+  for (int r = 0; r < D; ++r) {
+    for (int c = 0; c < D; ++c) m[static_cast<size_t>(r * (D + 1) + c)] = pose.R(r, c);
+    m[static_cast<size_t>(r * (D + 1) + D)] = pose.t[r];
+  }
+  m.back() = 1.0;
+  return m;
 }
 
 }  // namespace stillmap
