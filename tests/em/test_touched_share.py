@@ -36,3 +36,12 @@ def test_beams_without_a_return_do_not_count(recording):
     assert em.touched_share(recording, before, after) == 0.0
     blind = dataclasses.replace(recording, hit=np.zeros_like(recording.hit))
     assert em.touched_share(blind, before, after) == 0.0
+
+
+def test_from_the_default_prior_to_certainty_is_no_change(recording):
+    """In single precision 1 - 0.9 exceeds 0.1."""
+    before = np.full(recording.n_beams, em.EmOptions().prior, np.float32)
+    certain = np.ones(recording.n_beams, np.float32)
+    assert (certain - before > 0.1).all()
+    assert em.touched_share(recording, before, certain) == 0.0
+    assert em.changed_share(before, certain, recording.hit) == 0.0

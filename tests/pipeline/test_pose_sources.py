@@ -121,3 +121,22 @@ def test_em_goes_on_from_the_source_and_says_so(recording, monkeypatch, tmp_path
     run = json.loads((tmp_path / "map" / "run.json").read_text())
     assert run["iterations"][at]["source"] == "odometry"
     assert "source" not in run["iterations"][0]
+
+
+@pytest.mark.parametrize(("share", "is_refined"), [(0.1, True), (0.5, False)])
+def test_all_scans_are_matched_anew_where_many_labels_changed(
+    recording, monkeypatch, share, is_refined
+):
+    """From the third iteration on; before, they always are."""
+    real, initial = slam.m_step, []
+
+    def recorded(*args, **kwargs):
+        initial.append(kwargs["initial"])
+        return real(*args, **kwargs)
+
+    monkeypatch.setattr("stillmap.pipeline.em_loop.slam.m_step", recorded)
+    monkeypatch.setattr("stillmap.pipeline.em_loop.em.touched_share", lambda *_: share)
+    iterations = stillmap.iterate(recording)
+    for _ in range(3):
+        next(iterations)
+    assert [one is not None for one in initial] == [False, False, is_refined]
