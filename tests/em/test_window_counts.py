@@ -51,6 +51,26 @@ def test_counts_in_a_window_are_those_of_the_whole_map(seen, whole, window):
     assert whole.dense(*cells)[2].any() == (window[0] < 10)
 
 
+def test_every_kth_scan_counts_where_many_are_near(seen):
+    recording, poses, e = seen
+    boxes, window = em.beam_boxes(recording, poses), (-3.0, -2.0, 3.0, 2.0)
+    T = recording.n_scans
+    part = em.count_in_window(recording, poses, e, boxes, window, RESOLUTION, max_scans=15)
+    near = [t for t in range(T) if (boxes[t, :2] <= window[2:]).all()
+            and (boxes[t, 2:] >= window[:2]).all()]  # fmt: skip
+    every = -(-len(near) // 15)
+    assert every > 1
+    expected = _core.OccupancyGrid2D(RESOLUTION)
+    for t in near[::every]:
+        beams, T_map_sensor = recording.beams_of(t), recording.T_map_sensor(poses)[t : t + 1]
+        offset = np.array([0, beams.stop - beams.start])
+        points, hit = recording.points[beams], recording.hit[beams]
+        _core.add_beams(expected, points, hit, e[beams], offset, T_map_sensor)
+    cells = [-30, -20], (40, 60)
+    for ours, theirs in zip(part.dense(*cells), expected.dense(*cells), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
 def test_boxes_hold_all_beams(seen, whole):
     recording, poses, _ = seen
     boxes = em.beam_boxes(recording, poses)

@@ -150,11 +150,11 @@ def test_a_held_out_gain_below_the_tolerance_ends_it(build):
 
 def test_scans_that_no_label_touches_end_it(build):
     chosen, bounds = options(label_tolerance=1e-6), [-5.0, -4.0, -3.0]
-    result, asked = build(bounds, chosen, touched_share=[0.5, 0.019, 0.5])
+    result, asked = build(bounds, chosen, touched_share=[0.5, 0.099, 0.5])
     assert (asked, result.converged) == (2, True)
     result, asked = build(bounds, chosen, touched_share=[0.01, 0.5, 0.5])
     assert (asked, result.converged) == (1, True)
-    for share, other in ((0.02, chosen), (0.0, options(label_tolerance=0.0))):
+    for share, other in ((0.1, chosen), (0.0, options(label_tolerance=0.0))):
         result, asked = build(bounds, other, touched_share=[share] * 3)
         assert (asked, result.converged) == (3, False)
 

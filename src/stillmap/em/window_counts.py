@@ -40,6 +40,7 @@ def count_in_window(
     boxes: Float,
     window: Box,
     resolution: float,
+    max_scans: int | None = None,
 ) -> _core.OccupancyGrid2D:
     """A grid whose counts (10) within a window are those of all beams.
 
@@ -50,12 +51,17 @@ def count_in_window(
         boxes: (T, 4) of `beam_boxes`.
         window: x0, y0, x1, y1 in metres.
         resolution: edge of a cell in metres.
+        max_scans: if the beams of more scans come near the window, every k-th of them counts;
+            None: all count.
     """
     grid = _core.OccupancyGrid2D(resolution, moments=False)
     x0, y0, x1, y1 = boxes.T
     is_near = (x0 <= window[2]) & (y0 <= window[3]) & (x1 >= window[0]) & (y1 >= window[1])
+    near = np.flatnonzero(is_near)
+    if max_scans is not None:
+        near = near[:: max(-(-len(near) // max_scans), 1)]
     T_map_sensor = recording.T_map_sensor(poses)
-    for t in recording.iter_scans(np.flatnonzero(is_near).tolist(), e):
+    for t in recording.iter_scans(near.tolist(), e):
         beams = recording.beams_of(t)
         offset = np.array([0, beams.stop - beams.start])
         points, hit = recording.points[beams], recording.hit[beams]

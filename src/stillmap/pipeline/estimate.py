@@ -17,7 +17,8 @@ Float = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
 # of the scans: if fewer are touched by a change of labels, the next M-step finds the same poses
-_TOUCHED_SCANS = 0.02
+_TOUCHED_SCANS = 0.1
+_MAX_SNAPSHOT_SCANS = 500  # whose beams show free space; what is occupied the E-step has found
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,9 +197,13 @@ class EmState:
             self.window = choose_window(_extent(boxes, resolution), resolution, points)
         shown = {1, 2, self.require_best().number}  # and the last, whichever that will be
         self.snapshots = {n: s for n, s in self.snapshots.items() if n in shown}
-        grid = em.count_in_window(deskewed, poses, estimate.weights, boxes, self.window, resolution)
+        occupied = estimate.e_step.occupied
+        max_scans = None if occupied is None else _MAX_SNAPSHOT_SCANS
+        grid = em.count_in_window(
+            deskewed, poses, estimate.weights, boxes, self.window, resolution, max_scans
+        )
         cells = _cells(self.window, resolution)
-        part = em.make_occupancy_map(grid, estimate.e_step.occupied, window=cells)
+        part = em.make_occupancy_map(grid, occupied, window=cells)
         self.snapshots[estimate.number] = snapshot(estimate.number, part, points, self.window)
 
 
