@@ -73,17 +73,18 @@ def iter_lines(cells: Cells, resolution: float) -> Iterator[tuple[Float, float]]
     normals = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     bins = np.floor(centers @ normals.T / (0.5 * _LINE_WIDTH)).astype(np.int64)
     first = int(bins.min())
-    width = int(bins.max()) - first + 2
+    width = int(bins.max()) - first + 2  # at least one pair
     bins += np.arange(_ANGLES) * width - first
     votes = np.bincount(bins.ravel(), minlength=_ANGLES * width)
     left = np.ones(len(centers), np.bool_)
     needed = max(_MIN_LINE_CELLS, _MIN_LINE / resolution * min(1.0, _MAX_CELLS / len(cells)))
     for _ in range(_MAX_LINES):
-        pairs = votes[:-1] + votes[1:]  # a line of _LINE_WIDTH
-        best = int(np.argmax(pairs))
-        if pairs[best] < needed:
+        of_angle = votes.reshape(_ANGLES, width)
+        pairs = of_angle[:, :-1] + of_angle[:, 1:]  # lines of _LINE_WIDTH
+        k, low = divmod(int(np.argmax(pairs)), width - 1)
+        if pairs[k, low] < needed:
             return
-        k = best // width
+        best = k * width + low
         on = left & ((bins[:, k] == best) | (bins[:, k] == best + 1))
         votes -= np.bincount(bins[on].ravel(), minlength=len(votes))
         left &= ~on
