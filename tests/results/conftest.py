@@ -11,7 +11,7 @@ from stillmap.core.se2 import inverse, matrix
 from stillmap.em import Coverage
 from stillmap.pipeline.options import OutputOptions
 from stillmap.pipeline.snapshots import choose_window, extent, snapshot
-from stillmap.slam import Diagnostics
+from stillmap.slam import BareStretch, Diagnostics
 from stillmap.slam.mount_calibration import Calibration
 from stillmap.slam.pose_graph import Constraint, PoseGraph
 from stillmap.tracking import FlowMap, MovingObject, ObjectOptions, compute_flow_map
@@ -304,7 +304,14 @@ def result():
             FakeLoop(6, 46, 0.25, "explains too little"),
         ],
         graph=_graph(poses),
-        doubts=Diagnostics([7], [7, 9], breaks=[20], unconnected=[20], ambiguous=[31]),
+        doubts=Diagnostics(
+            [7],
+            [7, 9],
+            breaks=[20],
+            unconnected=[20],
+            ambiguous=[31],
+            bare_stretches=[BareStretch(12, 19, 3.25, 0.4)],
+        ),
         stages={
             "read": {"seconds": 0.21, "cpu_seconds": 0.2, "peak_memory_bytes": 41_000_000},
             "em": {"seconds": 7.1, "cpu_seconds": 13.5, "peak_memory_bytes": 96_000_000},

@@ -100,6 +100,7 @@ def test_doubts(tmp_path, result):
         "carried_before": [20],
         "beside_the_map_from": [20],
         "ambiguous": [31],
+        "length_unknown": [{"first": 12, "last": 19, "metres": 3.25, "std": 0.4}],
     }
 
 

@@ -74,6 +74,14 @@ def _pose_warnings(diagnostics: slam.Diagnostics) -> list[str]:
             f"{len(widened)} scans lay outside the odometry's uncertainty and were found by a "
             f"wider search, the first is scan {widened[0]}"
         )
+    if bare := diagnostics.bare_stretches:
+        worst = max(bare, key=lambda stretch: stretch.std)
+        others = f"; {len(bare) - 1} more in doubts.length_unknown of run.json" * (len(bare) > 1)
+        out.append(
+            f"from scan {worst.first} to scan {worst.last} the scans hardly show how far the robot "
+            f"went (bare walls, or few returns): the length of that way, {worst.metres:.1f} m, has "
+            f"a standard deviation of about {worst.std:.1f} m{others}"
+        )
     for scan in diagnostics.ambiguous:
         out.append(
             f"from scan {scan} on, another place fits about as well as the one that odometry leads "

@@ -14,7 +14,7 @@ from stillmap.pipeline.estimate import IterationRecord
 from stillmap.pipeline.result import MappingResult
 from stillmap.results.map_npz import known_area
 from stillmap.results.objects import MILLIMETRES
-from stillmap.slam import LoopClosure
+from stillmap.slam import BareStretch, LoopClosure
 from stillmap.slam.mount_calibration import Calibration, Parameter
 
 if TYPE_CHECKING:
@@ -59,6 +59,7 @@ def run_record(result: MappingResult, more: Mapping[str, Any] | None = None) -> 
             "carried_before": result.doubts.breaks,
             "beside_the_map_from": result.doubts.unconnected,
             "ambiguous": result.doubts.ambiguous,
+            "length_unknown": [_stretch(one) for one in result.doubts.bare_stretches],
         },
         "changes": [_change(one) for one in result.changes],
         "loops": {
@@ -123,6 +124,15 @@ def _parameter(one: Parameter) -> dict[str, Any]:
 
 def _loop(one: LoopClosure) -> dict[str, Any]:
     return {"earlier": one.earlier, "later": one.later, "explained": one.explained}
+
+
+def _stretch(one: BareStretch) -> dict[str, Any]:
+    return {
+        "first": one.first,
+        "last": one.last,
+        "metres": round(one.metres, MILLIMETRES),
+        "std": round(one.std, MILLIMETRES),
+    }
 
 
 def _change(one: Change) -> dict[str, Any]:

@@ -5,10 +5,11 @@ from stillmap.slam.m_step import StepProgress, m_step
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.pose_graph import PoseGraph
 from stillmap.slam.scan_hits import FREE_SPACE_MARGIN
-from stillmap.slam.types import Diagnostics, LoopClosure, MStepResult
+from stillmap.slam.types import BareStretch, Diagnostics, LoopClosure, MStepResult
 
 __all__ = [
     "FREE_SPACE_MARGIN",
+    "BareStretch",
     "Diagnostics",
     "LoopClosure",
     "MStepResult",

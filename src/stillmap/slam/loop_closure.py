@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from stillmap.core import se2
 from stillmap.core.recording import Recording
 from stillmap.slam import (
+    bare_stretches,
     local_map,
     loop_candidates,
     loop_consistency,
@@ -75,6 +76,7 @@ def close_loops(
             breaks=relocalized.breaks,
             unconnected=relocalized.unconnected,
             ambiguous=relocalized.ambiguous,
+            bare_stretches=bare_stretches.without_loops(odometry.diagnostics.bare_stretches, found),
         ),
     )
 

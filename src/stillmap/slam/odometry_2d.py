@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 import stillmap._core as _core
 from stillmap.core import se2
 from stillmap.core.recording import Recording
-from stillmap.slam import kidnapping, motion_model
+from stillmap.slam import bare_stretches, kidnapping, motion_model
 from stillmap.slam.kidnapping import Evidence
 from stillmap.slam.local_map import LocalMap
 from stillmap.slam.motion_model import MotionPrior, VelocityNoise
@@ -84,7 +84,7 @@ class _ScanOdometry:
         self.max_travel, self.local_map = max_travel, local_map
         self.poses = np.tile(np.eye(3), (T, 1, 1))
         self.covariance, self.explained = np.zeros((T, 3, 3)), np.ones(T)
-        self.drift = np.zeros((T, 3, 3))
+        self.drift, self.unmeasured = np.zeros((T, 3, 3)), np.zeros(T)
         self.widened, self.odometry_faults = np.zeros((2, T), np.bool_)
         self.breaks = list[int]()
         self.steps = None if odometry is None else motion_model.compute_odometry_steps(odometry)
@@ -121,6 +121,9 @@ class _ScanOdometry:
         is_fault = rejected is not None and is_inconsistent(rejected, match.T_map_base)
         self._record(t, match, is_fault=is_fault)
         self.drift[t] = motion_model.blind_drift(learned or prior, match.covariance)
+        self.unmeasured[t] = bare_stretches.unmeasured_variance(
+            learned or prior, match.covariance, float(self.seconds_before[t])
+        )
         if has_map:
             if learned is not None and not is_poor(match, self.usual[s]):
                 self.odometry_noise = self.odometry_noise.update(
@@ -267,6 +270,9 @@ class _ScanOdometry:
             np.flatnonzero(self.widened).tolist(),
             np.flatnonzero(self.odometry_faults).tolist(),
             self.breaks,
+            bare_stretches=bare_stretches.find_bare_stretches(
+                self.unmeasured, self.poses, self.breaks
+            ),
         )
         grid = _core.OccupancyGrid2D(self.options.resolution)
         return MStepResult(

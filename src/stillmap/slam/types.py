@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,6 +61,21 @@ class LoopClosure:
         return dataclasses.replace(self, rejected=reason)
 
 
+class BareStretch(NamedTuple):
+    """A stretch whose length the scans do not show.
+
+    Attributes:
+        first, last: its scans.
+        metres: of travel, as estimated.
+        std: of that length, m.
+    """
+
+    first: int
+    last: int
+    metres: float
+    std: float
+
+
 @dataclass(frozen=True)
 class Diagnostics:
     """Scans at which odometry and scan matching disagree.
@@ -72,6 +88,7 @@ class Diagnostics:
         unconnected: those breaks after which no known place was recognized.
         ambiguous: first scans of segments that would fit another place about as well as the one
             that odometry leads to.
+        bare_stretches: whose length the scans do not show, and no accepted loop measures.
     """
 
     widened: list[int] = field(default_factory=list)
@@ -79,6 +96,7 @@ class Diagnostics:
     breaks: list[int] = field(default_factory=list)
     unconnected: list[int] = field(default_factory=list)
     ambiguous: list[int] = field(default_factory=list)
+    bare_stretches: list[BareStretch] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
