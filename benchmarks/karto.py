@@ -76,7 +76,7 @@ def main() -> None:
         found = mapped(recording, args.karto_python)
     except KartoError as error:
         raise SystemExit(f"Karto: {error}") from error
-    with atomic_folder(args.output, args.overwrite) as folder:
+    with atomic_folder(args.output, "trajectory.tum", args.overwrite) as folder:
         write_tum(folder / "trajectory.tum", recording.stamp_ns, found.poses)
     print(
         f"{recording.n_scans} scans, {found.taken} taken, loops closed after {found.closed}; "
