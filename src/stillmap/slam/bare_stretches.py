@@ -4,6 +4,7 @@ There a pose is where the motion model predicts it. Without odometry that is con
 the velocity inherits the error of every pose, so that the errors of the steps add up.
 """
 
+import math
 from collections.abc import Iterable
 
 import numpy as np
@@ -33,10 +34,11 @@ def unmeasured_variance(prior: MotionPrior, covariance: Float, seconds: float) -
         covariance: (3, 3) of the posterior.
         seconds: of the step.
     """
-    least_known = float(np.linalg.eigvalsh(covariance[:2, :2])[-1])
+    (xx, xy), (_, yy) = covariance[:2, :2].tolist()
+    least_known = 0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy)  # the larger eigenvalue
     r = min(least_known / prior.translation_std**2, 1.0)
     if not prior.is_odometry:
-        r /= 1.0 - np.exp(-max(seconds, 1e-3) / _VELOCITY_TIME) * r
+        r /= 1.0 - math.exp(-max(seconds, 1e-3) / _VELOCITY_TIME) * r
     return float((prior.translation_std * r) ** 2)
 
 

@@ -4,6 +4,7 @@ With odometry, a Gaussian whose standard deviation grows with travel and rotatio
 Probabilistic Robotics, ch. 5). Without, a constant-velocity model with a running variance.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -112,12 +113,16 @@ class OdometryNoise:
     translation: float = 1.0
     rotation: float = 1.0
 
+    def inflated_shares(self) -> tuple[float, float]:
+        """The shares that priors have, of translation and rotation."""
+        translation, rotation = _INFLATION * self.translation, _INFLATION * self.rotation
+        return min(translation, 1.0), min(rotation, 1.0)
+
     def update(self, prior: MotionPrior, T_map_base: Float, covariance: Float) -> "OdometryNoise":
         """After a scan with that prior and posterior: pose (3, 3), covariance (3, 3)."""
-        std = np.sqrt(1.0 / np.diag(prior.information))
-        information = np.linalg.inv(covariance / np.outer(std, std))  # 1 + that of the scan
-        eigenvalues, vectors = np.linalg.eigh(information)
-        gain = (1.0 - 1.0 / eigenvalues).clip(0.0)
+        std = np.array([prior.translation_std, prior.translation_std, prior.rotation_std])
+        left, vectors = np.linalg.eigh(covariance / (std[:, None] * std))  # 1 - gain
+        gain = (1.0 - left).clip(0.0)
         residual = vectors.T @ (prior.residual(T_map_base) / std)
         innovation = np.abs(residual / gain.clip(_MIN_GAIN)).clip(max=_MAX_INNOVATION)
         excess = (vectors**2 * gain) @ (np.square(_INFLATION * innovation) - 1.0)
@@ -197,7 +202,7 @@ def increment_std(
     """(T, 2) m and rad, standard deviations of odometry increments (T, 3, 3)."""
     x = se2.parameters(increments)
     std = odometry_std(np.hypot(x[:, 0], x[:, 1]), np.abs(x[:, 2]), options)
-    shares = (min(_INFLATION * share, 1.0) for share in (noise.translation, noise.rotation))
+    shares = noise.inflated_shares()
     return np.stack([one * share for one, share in zip(std, shares, strict=True)], axis=1)
 
 
@@ -208,7 +213,11 @@ def odometry_prior(
     noise: OdometryNoise = OdometryNoise(),
 ) -> MotionPrior:
     """The prior after an odometry increment (3, 3) from a pose (3, 3)."""
-    translation, rotation = increment_std(increment[None], options, noise)[0].tolist()
+    x, y, theta = se2.parameters(increment).tolist()
+    std = odometry_std(math.hypot(x, y), abs(theta), options)
+    translation, rotation = (
+        one * share for one, share in zip(std, noise.inflated_shares(), strict=True)
+    )
     return gaussian_prior(T_map_base @ increment, translation, rotation, is_odometry=True)
 
 
