@@ -141,26 +141,39 @@ double occluded_share_at(const OccupancyGrid<D>& grid, const Points<D>& points,
 
 // Data term without the constant ln(floor + 1) per beam, as in the reference implementation.
 template <int D>
-QuadraticModel<D> data_term(const OccupancyGrid<D>& grid, WeightedBeams<D> beams,
-                            const OnePose<D>& T, const LikelihoodFieldOptions& field_options) {
+QuadraticModel<D> data_term(const OccupancyGrid<D>& grid, const Points<D>& points,
+                            const Flat<float>& weights, const OnePose<D>& T,
+                            const LikelihoodFieldOptions& field_options,
+                            const std::optional<Points<D>>& normals,
+                            const std::optional<Flat<float>>& isotropy) {
+  auto beams = beams_from<D>(points, weights);
+  const Pose<D> pose = checked_pose<D>(T, "T");
   LikelihoodField<D> field(grid, field_options);
-  auto q = linearise<D>(field, beams, checked_pose<D>(T, "T"), {field_options, 1.0, 0});
+  if (normals) {
+    add_normals<D>(beams, points, weights, *normals, isotropy);
+    mark_beyond_map<D>(field, beams, pose);
+  }
+  auto q = linearise<D>(field, beams, pose, {field_options, 1.0, 0});
   for (const double w : beams.weights) q.cost -= w * std::log(field_options.floor + 1.0);
   return q;
 }
 
 template <int D>
 double cost_at(const OccupancyGrid<D>& grid, const Points<D>& points, const Flat<float>& weights,
-               const OnePose<D>& T, double sigma, int radius, double floor, double unknown) {
-  return data_term<D>(grid, beams_from<D>(points, weights), T, {sigma, radius, floor, unknown})
-      .cost;
+               const OnePose<D>& T, double sigma, int radius, double floor, double unknown,
+               const std::optional<Points<D>>& normals,
+               const std::optional<Flat<float>>& isotropy) {
+  const LikelihoodFieldOptions options{sigma, radius, floor, unknown};
+  return data_term<D>(grid, points, weights, T, options, normals, isotropy).cost;
 }
 
 template <int D>
 auto gradient_at(const OccupancyGrid<D>& grid, const Points<D>& points, const Flat<float>& weights,
-                 const OnePose<D>& T, double sigma, int radius, double floor, double unknown) {
-  const auto q =
-      data_term<D>(grid, beams_from<D>(points, weights), T, {sigma, radius, floor, unknown});
+                 const OnePose<D>& T, double sigma, int radius, double floor, double unknown,
+                 const std::optional<Points<D>>& normals,
+                 const std::optional<Flat<float>>& isotropy) {
+  const LikelihoodFieldOptions options{sigma, radius, floor, unknown};
+  const auto q = data_term<D>(grid, points, weights, T, options, normals, isotropy);
   const size_t n = Lie<D>::kDof;
   return to_numpy(std::vector<double>(q.gradient.data(), q.gradient.data() + n), {n});
 }
@@ -190,11 +203,14 @@ void bind(nb::module_& m) {
   m.def("registration_cost", &cost_at<D>, nb::arg("grid"), nb::arg("points").noconvert(),
         nb::arg("weights").noconvert(), nb::arg("T").noconvert(), nb::arg("sigma"),
         nb::arg("radius"), nb::arg("floor"), nb::arg("unknown"),
+        nb::arg("normals").noconvert() = nb::none(), nb::arg("isotropy").noconvert() = nb::none(),
         "Cost -sum w ln(floor + unknown U + F) at one pose, with the likelihood field F and U = 1 "
-        "in unobserved cells.");
+        "in unobserved cells. With normals (N, D) and isotropy (N,), in 2D, F of an end point "
+        "where the mapped part of a flat surface ends depends on the distance from it only.");
   m.def("registration_gradient", &gradient_at<D>, nb::arg("grid"), nb::arg("points").noconvert(),
         nb::arg("weights").noconvert(), nb::arg("T").noconvert(), nb::arg("sigma"),
         nb::arg("radius"), nb::arg("floor"), nb::arg("unknown"),
+        nb::arg("normals").noconvert() = nb::none(), nb::arg("isotropy").noconvert() = nb::none(),
         "Gradient (dof,) of `registration_cost` with respect to translation and rotation about the "
         "sensor.");
 }

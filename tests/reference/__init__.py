@@ -22,6 +22,7 @@ from reference.held_out_likelihood import (
     score_held_out,
 )
 from reference.likelihood_field import (
+    ends_of_surfaces,
     registration_cost,
     registration_curvature,
     registration_gradient,
@@ -78,6 +79,7 @@ __all__ = [
     "cell_of",
     "e_step",
     "em_fixed_poses",
+    "ends_of_surfaces",
     "interpolate_end_points",
     "linearise_sweep",
     "log_likelihood",

@@ -65,6 +65,47 @@ def _plane(means: Float, m: Float) -> tuple[Float, Float, bool]:
     return mean, axes[:, 0], bool(is_flat)
 
 
+def ends_of_surfaces(
+    grid: OccupancyGrid,
+    points: ArrayLike,
+    normals: ArrayLike,
+    isotropy: ArrayLike,
+    T: ArrayLike,
+    radius: int,
+) -> Float:
+    """(N, 2) normals in the map of the flat surfaces whose mapped part ends at a point; else 0.
+
+    It ends where no mean within `radius` cells lies half a cell or more to one side along the
+    surface, and the cell radius + 1 cells to that side is unobserved.
+    """
+    pose, out = np.asarray(T, float), np.zeros((len(np.asarray(points)), 2))
+    surfaces = zip(*(np.asarray(x, float) for x in (points, normals, isotropy)), strict=True)
+    for k, (p, n, s) in enumerate(surfaces):
+        if s > 0.5 or not n.any() or not np.isfinite(p).all():
+            continue
+        y, normal = pose[:2, :2] @ p + pose[:2, 2], pose[:2, :2] @ n
+        means, _ = _around(grid, cell_of(y, grid.resolution), radius)
+        for tangent in ([-normal[1], normal[0]], [normal[1], -normal[0]]):
+            there = y + np.array(tangent) * (radius + 1) * grid.resolution
+            known = (means - y) @ tangent >= 0.5 * grid.resolution
+            unseen = isnan(grid.occupancy_of(tuple(cell_of(there, grid.resolution).tolist())))
+            if unseen and not known.any():
+                out[k] = normal
+    return out
+
+
+def _field_at_end(grid: OccupancyGrid, y: Float, normal: Float, sigma: float, radius: int) -> float:
+    """F where the mapped part of a surface ends: the mean of the m_k times exp(-d^2 / 2 sigma^2).
+
+    d is the distance along the normal from the mean of the mu_k.
+    """
+    means, m = _around(grid, cell_of(y, grid.resolution), radius)
+    if not len(m):
+        return 0.0
+    distance = normal @ (m @ means / m.sum() - y)
+    return float(m.mean() * exp(-(distance**2) / (2 * sigma**2)))
+
+
 def registration_cost(
     grid: OccupancyGrid,
     points: ArrayLike,
@@ -74,6 +115,7 @@ def registration_cost(
     radius: int,
     floor: float,
     unknown: float,
+    ends: Float | None = None,
 ) -> float:
     """- sum of w_n ln(floor + unknown U(T p_n) + F(T p_n)) over the points that are finite.
 
@@ -88,15 +130,19 @@ def registration_cost(
         radius: cells.
         floor: value of an end point in free space, where a wall has 1.
         unknown: added to floor in unobserved cells.
+        ends: (N, 2) of `ends_of_surfaces`; None: no surface ends.
     """
     pose, D = np.asarray(T, float), grid.dimension
     cost = 0.0
-    for p, w in zip(np.asarray(points, float), np.asarray(weights, float), strict=True):
+    beams = zip(np.asarray(points, float), np.asarray(weights, float), strict=True)
+    for k, (p, w) in enumerate(beams):
         if np.isfinite(p).all():
             y = pose[:D, :D] @ p + pose[:D, D]
-            cost -= w * log(
-                _base(grid, y, floor, unknown) + smoothed_occupancy(grid, y, sigma, radius)
-            )
+            if ends is not None and ends[k].any():
+                F = _field_at_end(grid, y, ends[k], sigma, radius)
+            else:
+                F = smoothed_occupancy(grid, y, sigma, radius)
+            cost -= w * log(_base(grid, y, floor, unknown) + F)
     return float(cost)
 
 
@@ -114,6 +160,7 @@ def registration_gradient(
     radius: int,
     floor: float,
     unknown: float,
+    ends: Float | None = None,
     step: float = 1e-6,
 ) -> Float:
     """Gradient of `registration_cost` by central differences.
@@ -129,7 +176,7 @@ def registration_gradient(
         delta[i] = step
         above, below = (
             registration_cost(
-                grid, points, weights, retract(pose, d), sigma, radius, floor, unknown
+                grid, points, weights, retract(pose, d), sigma, radius, floor, unknown, ends
             )
             for d in (delta, -delta)
         )

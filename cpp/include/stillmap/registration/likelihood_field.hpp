@@ -102,18 +102,56 @@ class LikelihoodField {
     return sample;
   }
 
+  // Whether the map knows a surface at a point, but neither in the direction of a unit tangent from
+  // there nor what else there is.
+  bool ends_at(const Vec<D>& point, const Vec<D>& tangent, GaussianWindow<D>& window) {
+    const Vec<D> y = point / resolution_;
+    if (!all_below<D>(y, BlockLayout<D>::kMaxCell - 64)) return false;
+    gather_gaussians(cell_of<D>(y), window);
+    constexpr double kReach = 0.5;  // cells
+    for (const auto& gaussian : window.gaussians)
+      if (tangent.dot(gaussian.mean - y) >= kReach) return false;
+    return !cursor_.find_observed(cell_of<D>(y + tangent * (options_.radius + 1.0)));
+  }
+
+  // The field where a flat surface (unit normal) goes on at the end of its mapped part: the map
+  // says where the surface is, not where on it the point is.
+  FieldSample<D> evaluate_beyond_map(const Vec<D>& point, const Vec<D>& normal,
+                                     GaussianWindow<D>& window) {
+    FieldSample<D> sample;
+    sample.baseline = options_.floor;
+    const Vec<D> y = point / resolution_;
+    if (!all_below<D>(y, BlockLayout<D>::kMaxCell - 64)) return sample;
+    gather_gaussians(cell_of<D>(y), window);
+    sample.baseline = window.baseline;
+    double total = 0.0;
+    Vec<D> mean = Vec<D>::Zero();
+    for (const auto& gaussian : window.gaussians) {
+      total += gaussian.weight;
+      mean += gaussian.weight * gaussian.mean;
+    }
+    if (!(total > 0.0)) return sample;
+    const double occupancy = total / static_cast<double>(window.gaussians.size());
+    return on_plane(y, normal, mean / total, occupancy, sample.baseline);
+  }
+
  private:
   // Extends a surface into unobserved space: the end of the mapped part must not pull scans along
   // it.
   FieldSample<D> extrapolate(const Vec<D>& y, const GaussianWindow<D>& window) const {
+    return on_plane(y, window.normal, window.plane_point, window.mean_occupancy, window.baseline);
+  }
+
+  FieldSample<D> on_plane(const Vec<D>& y, const Vec<D>& normal, const Vec<D>& plane_point,
+                          double occupancy, double baseline) const {
     FieldSample<D> sample;
-    sample.baseline = window.baseline;
-    const double distance = window.normal.dot(window.plane_point - y);
+    sample.baseline = baseline;
+    const double distance = normal.dot(plane_point - y);
     const double per_metre2 = 1.0 / (options_.sigma * options_.sigma);
-    sample.value = window.mean_occupancy * std::exp(exponent_ * distance * distance);
-    sample.log_gradient = window.normal * (distance * resolution_ * per_metre2);
+    sample.value = occupancy * std::exp(exponent_ * distance * distance);
+    sample.log_gradient = normal * (distance * resolution_ * per_metre2);
     sample.pull_covariance.setIdentity();
-    sample.pull_covariance -= window.normal * window.normal.transpose();
+    sample.pull_covariance -= normal * normal.transpose();
     sample.pull_covariance *= per_metre2;
     return sample;
   }

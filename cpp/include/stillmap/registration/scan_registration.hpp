@@ -23,6 +23,7 @@ struct WeightedBeams {
   std::vector<double> weights;
   std::vector<SurfaceNormal<D>> normals;   // moving frame; empty: unknown
   std::vector<GaussianWindow<D>> windows;  // cache, one per beam
+  std::vector<bool> beyond_map;            // see mark_beyond_map; empty: none is
 };
 
 struct ScanRegistrationOptions {
@@ -93,7 +94,11 @@ inline QuadraticModel<D> linearise(LikelihoodField<D>& field, WeightedBeams<D>& 
   for (size_t n = 0; n < beams.points.size(); ++n) {
     const double weight = options.information_scale * beams.weights[n];
     const Vec<D> lever = pose.R * beams.points[n];
-    const FieldSample<D> sample = field.evaluate(pose.t + lever, beams.windows[n]);
+    const Vec<D> point = pose.t + lever;
+    const FieldSample<D> sample =
+        n < beams.beyond_map.size() && beams.beyond_map[n]
+            ? field.evaluate_beyond_map(point, pose.R * beams.normals[n].normal, beams.windows[n])
+            : field.evaluate(point, beams.windows[n]);
     total += beams.weights[n];
     model.cost -= weight * std::log((sample.baseline + sample.value) / (options.field.floor + 1.0));
     if (sample.value <= 0.0) continue;
@@ -129,11 +134,34 @@ inline Eigen::Matrix<double, Lie<D>::kDof, Lie<D>::kDof> surface_information(
   return information;
 }
 
-// Levenberg-Marquardt from `start`; never returns a higher cost than that of `start`.
+// Finds the end points at `pose` that lie where the mapped part of a flat surface ends.
+template <int D>
+inline void mark_beyond_map(LikelihoodField<D>& field, WeightedBeams<D>& beams,
+                            const Pose<D>& pose) {
+  constexpr double kFlat = 0.5;  // isotropy, up to which a surface has a direction
+  beams.windows.resize(beams.points.size());
+  beams.beyond_map.assign(beams.points.size(), false);
+  if constexpr (D == 2) {
+    for (size_t n = 0; n < beams.normals.size(); ++n) {
+      const auto& surface = beams.normals[n];
+      if (surface.isotropy > kFlat || surface.normal.isZero(0.0)) continue;
+      const Vec<D> point = pose * beams.points[n], normal = pose.R * surface.normal;
+      const Vec<D> tangent(-normal[1], normal[0]);
+      beams.beyond_map[n] = field.ends_at(point, tangent, beams.windows[n]) ||
+                            field.ends_at(point, -tangent, beams.windows[n]);
+    }
+  }
+}
+
+// Levenberg-Marquardt from `start`. End points where the mapped part of a surface ends are found at
+// `start` and say nothing along it: the newly seen piece of a wall would be pulled to the end of
+// the mapped one, and the robot with it. Cost, inliers and information of the result take the field
+// as it is for all beams, so that results from several starts compare.
 template <int D>
 inline ScanRegistrationResult<D> minimise_levenberg_marquardt(
     LikelihoodField<D>& field, WeightedBeams<D>& beams, const PosePrior<D>& prior,
     const Pose<D>& start, const ScanRegistrationOptions& options) {
+  mark_beyond_map<D>(field, beams, start);
   auto with_prior = [&](const Pose<D>& pose, double cost) {
     const typename Lie<D>::Tangent difference = pose.boxminus(prior.pose);
     return cost + 0.5 * difference.dot(prior.information * difference);
@@ -165,6 +193,9 @@ inline ScanRegistrationResult<D> minimise_levenberg_marquardt(
     }
     if (converged || damping > 1e6) break;
   }
+  beams.beyond_map.clear();
+  model = linearise<D>(field, beams, result.pose, options);
+  result.cost = with_prior(result.pose, model.cost);
   result.information = model.hessian + prior.information;
   result.inliers = model.inliers;
   return result;
