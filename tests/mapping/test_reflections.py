@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 import stillmap
 from stillmap.core.config import override
-from stillmap.mapping import reflections
+from stillmap.mapping.mirrors import Mirror
 from stillmap.mapping.reflections import find_mirrors, find_reflections, remove_reflections
 from stillmap.sim import Scene, Simulation, scene_by_name, simulate
 from stillmap.sim.mirrors import MIRRORED
@@ -106,7 +106,7 @@ def test_mirrors_are_where_they_are() -> None:
     )
 
 
-def find(run: Simulation, mirror: reflections.Mirror) -> NDArray[np.bool_]:
+def find(run: Simulation, mirror: Mirror) -> NDArray[np.bool_]:
     recording, beams = run.recording, np.arange(run.recording.n_beams)
     T = recording.T_map_sensor(run.truth.T_world_base)[recording.scans_of(beams)]
     ends = recording.end_points(beams, run.truth.T_world_base)
@@ -114,7 +114,7 @@ def find(run: Simulation, mirror: reflections.Mirror) -> NDArray[np.bool_]:
 
 
 def test_a_crossing_beam_comes_from_the_front_and_ends_behind() -> None:
-    mirror = reflections.Mirror(np.array([0.0, 1.0]), 2.0, -3.0, -1.0)  # y = 2, x from 1 to 3
+    mirror = Mirror(np.array([0.0, 1.0]), 2.0, -3.0, -1.0)  # y = 2, x from 1 to 3
     origins = np.array([[2.0, 5.0], [2.0, 5.0], [2.0, 5.0], [2.0, -1.0], [0.0, 5.0]])
     ends = np.array([[2.0, -1.0], [2.0, 1.95], [8.0, -1.0], [2.0, 5.0], [0.0, -1.0]])
     crossing = mirror.find_crossing(origins, ends)

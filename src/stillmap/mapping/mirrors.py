@@ -1,0 +1,241 @@
+"""Mirrors: pieces of wall lines behind which beams see images of what is before them.
+
+A mirror on the line n . x = d shows an end point x' = x - 2 (n . x - d) n of a surface at x. Its
+evidence: what is seen through it lies, folded back, on surfaces; the beams, folded back, reach them
+through free space; and wall at its back or around it says that there is no opening.
+"""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.mapping.surface_cells import SurfaceCells, cell_keys, contains
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+MIN_BEHIND = 0.3  # m behind the line: nearer end points are noise of the line's own wall
+BIN = 0.1  # m along a line
+_FRAME = 0.4  # m beside a mirror where there is wall in its plane
+MIN_BEAMS = 60
+_MAX_WIDENING = 0.4  # m at each end of a mirror
+_ON_LINE, _MAX_THICKNESS = 0.07, 0.35  # m from the line to its wall, and to that wall's back
+_MIN_FRAME_HITS, _MIN_FILLED = 3, 0.7  # returns in a bin of the frame; share of such bins
+_MAX_BESIDE = 0.25  # share of the beams per metre of mirror that see something else beside it
+_MAX_SEEN = 0.3  # share of what it shows that beams also end on which do not cross it
+# share of the beams, folded back, that end on surfaces (others show people), and the same of those
+# that hardly fit beside, as walls along n do anywhere; less where wall behind proves the rest
+_MIN_SHARES, _MIN_SHARES_IF_BACKED = (0.7, 0.6), (0.55, 0.4)
+_CONTROL = (0.25, -0.25, 0.4, -0.4)  # m from the mirror, where as many must not fit
+_MAX_BLOCKED = 0.2  # share of the folded beams that would pass through surfaces
+_MIN_TRAVEL = 0.7  # m between places from which the mirror was seen
+
+
+@dataclass(frozen=True)
+class Mirror:
+    """A mirror n . x = d, from first to last metre along (-n_y, n_x), seen from one side.
+
+    Attributes:
+        normal: (2,) unit vector towards the side from which it was seen.
+        distance: m, d.
+        first, last: m.
+    """
+
+    normal: Float
+    distance: float
+    first: float
+    last: float
+
+    def find_crossing(self, origins: Float, ends: Float) -> Bool:
+        """(N,) which beams from origins (N, 2) to ends (N, 2) meet it from its front."""
+        front, behind = origins @ self.normal - self.distance, self.distance - ends @ self.normal
+        crosses = (front > 0.0) & (behind > 0.5 * MIN_BEHIND)
+        share = np.divide(front, front + behind, out=np.zeros(len(front)), where=crosses)
+        met = origins + share[:, None] * (ends - origins)
+        along = met @ tangent_of(self.normal)
+        return np.asarray(crosses & (along >= self.first) & (along <= self.last))
+
+
+class Beams(NamedTuple):
+    """N beams with a return, in the map frame.
+
+    Attributes:
+        origins, ends: (N, 2) m.
+        is_static: (N,) P(c = 1) > 1/2.
+        path: (K, 2) positions of the sensors, in order.
+    """
+
+    origins: Float
+    ends: Float
+    is_static: Bool
+    path: Float
+
+    def without(self, left_out: Bool) -> "Beams":
+        """The others."""
+        kept = ~left_out
+        return Beams(self.origins[kept], self.ends[kept], self.is_static[kept], self.path)
+
+
+class Crossing(NamedTuple):
+    """N beams that cross a line from its front.
+
+    Attributes:
+        origins, ends: (N, 2) m.
+        along: (N,) m along the line, where they cross it.
+        fit: (N,) whether the end point, reflected at the line, lies on a surface.
+    """
+
+    origins: Float
+    ends: Float
+    along: Float
+    fit: Bool
+
+
+def tangent_of(normal: Float) -> Float:
+    """(2,) unit vector along a line of unit normal (2,)."""
+    return np.array([-normal[1], normal[0]])
+
+
+def fold(points: Float, normal: Float, distance: float) -> Float:
+    """Points (..., 2) reflected at the line normal . x = distance."""
+    return np.asarray(points - 2.0 * (points @ normal - distance)[..., None] * normal)
+
+
+def check_mirror(
+    mirror: Mirror, crossing: Crossing, beams: Beams, surfaces: SurfaceCells
+) -> Mirror | None:
+    """A piece of a line, as wide as its wall or its frame shows, or None where it is no mirror.
+
+    Args:
+        mirror: the piece.
+        crossing: all beams that cross its line.
+        beams: all beams.
+        surfaces: what is static.
+    """
+    within = (crossing.along >= mirror.first) & (crossing.along <= mirror.last)
+    origins, ends = crossing.origins[within], crossing.ends[within]
+    is_backed = _is_backed(mirror, beams)
+    needed = _MIN_SHARES_IF_BACKED if is_backed else _MIN_SHARES
+    if not _is_reflecting(mirror, origins, ends, beams.path, surfaces, needed):
+        return None
+    if is_backed:
+        return _widen_to_back(mirror, beams)
+    is_mirror = (
+        _has_edges(crossing.along[within], crossing.along[~within & ~crossing.fit], mirror)
+        and _is_framed(mirror, beams.ends)
+        and not _is_seen_otherwise(mirror, beams, ends, surfaces.resolution)
+    )
+    if not is_mirror:
+        return None
+    # the frame is wall: nothing else crosses there
+    return replace(mirror, first=mirror.first - _FRAME, last=mirror.last + _FRAME)
+
+
+def _is_backed(mirror: Mirror, beams: Beams) -> bool:
+    """Whether beams from behind end right behind a mirror: others cannot have passed there."""
+    hits = _back_hits(mirror, beams, mirror.first, mirror.last)
+    return bool(np.count_nonzero(hits >= _MIN_FRAME_HITS) >= _MIN_FILLED * len(hits))
+
+
+def _widen_to_back(mirror: Mirror, beams: Beams) -> Mirror:
+    """The mirror as wide as the wall at its back."""
+
+    def is_wall(start: float) -> bool:
+        return bool(_back_hits(mirror, beams, start, start + BIN)[0] >= _MIN_FRAME_HITS)
+
+    first, last = mirror.first, mirror.last
+    while last - mirror.last < _MAX_WIDENING and is_wall(last):
+        last += BIN
+    while mirror.first - first < _MAX_WIDENING and is_wall(first - BIN):
+        first -= BIN
+    return replace(mirror, first=first, last=last)
+
+
+def _back_hits(mirror: Mirror, beams: Beams, first: float, last: float) -> NDArray[np.intp]:
+    """(B,) returns from the back of a mirror's wall, in bins from first to last metre."""
+    front = beams.ends @ mirror.normal - mirror.distance
+    on = (front < 0.5 * _ON_LINE) & (front > -_MAX_THICKNESS)
+    on &= beams.origins @ mirror.normal < mirror.distance - _MAX_THICKNESS
+    at = beams.ends[on] @ tangent_of(mirror.normal)
+    return np.histogram(at, max(1, round((last - first) / BIN)), (first, last))[0]
+
+
+def _is_framed(mirror: Mirror, ends: Float) -> bool:
+    """Whether there is wall beside a mirror on both sides; else a room is its halves' image."""
+    on = ends[np.abs(ends @ mirror.normal - mirror.distance) < _ON_LINE] @ tangent_of(mirror.normal)
+    for low, high in (
+        (mirror.first - _FRAME, mirror.first),
+        (mirror.last, mirror.last + _FRAME),
+    ):
+        hits = np.histogram(on, round(_FRAME / BIN), (low, high))[0]
+        if np.count_nonzero(hits >= _MIN_FRAME_HITS) < _MIN_FILLED * len(hits):
+            return False
+    return True
+
+
+def _has_edges(through: Float, beside: Float, mirror: Mirror) -> bool:
+    """Whether few beams see something else right beside a piece of a line.
+
+    Args:
+        through: (N,) metres along the line where beams cross the piece.
+        beside: (K,) the same of beams beside it that no mirror explains.
+        mirror: the piece.
+    """
+    first, last = mirror.first, mirror.last
+    allowed = _MAX_BESIDE * _FRAME * len(through) / (last - first)
+    before = np.count_nonzero((beside >= first - _FRAME) & (beside < first))
+    after = np.count_nonzero((beside > last) & (beside <= last + _FRAME))
+    return bool(max(before, after) <= allowed)
+
+
+def _is_seen_otherwise(mirror: Mirror, beams: Beams, ends: Float, resolution: float) -> bool:
+    """Whether beams that do not cross a mirror end where those do that cross it."""
+    others = beams.ends[~mirror.find_crossing(beams.origins, beams.ends)]
+    behind = mirror.distance - others @ mirror.normal > MIN_BEHIND
+    keys = np.unique(cell_keys(np.floor(others[behind] / resolution).astype(np.int64)))
+    return float(np.mean(contains(keys, ends, resolution))) > _MAX_SEEN
+
+
+def _is_reflecting(
+    mirror: Mirror,
+    origins: Float,
+    ends: Float,
+    path: Float,
+    surfaces: SurfaceCells,
+    min_shares: tuple[float, float],
+) -> bool:
+    """Whether beams that cross a piece of a line show what a mirror there would."""
+    normal, distance = mirror.normal, mirror.distance
+    if len(ends) < MIN_BEAMS or np.linalg.norm(np.ptp(origins, axis=0)) < _MIN_TRAVEL:
+        return False
+    before = path @ normal - distance  # a robot drives through openings, not through mirrors
+    passing = np.flatnonzero(before[:-1] * before[1:] < 0.0)
+    gone = path[passing] @ tangent_of(normal)
+    if np.any((gone >= mirror.first) & (gone <= mirror.last)):
+        return False
+    fit = surfaces.are_near(fold(ends, normal, distance))
+    beside = [surfaces.are_near(fold(ends, normal, distance + o)) for o in _CONTROL]
+    telling = np.sum(beside, axis=0) <= 1
+    if np.count_nonzero(fit) < min_shares[0] * len(fit) or np.count_nonzero(telling) < MIN_BEAMS:
+        return False
+    if np.count_nonzero(fit & telling) < min_shares[1] * np.count_nonzero(telling):
+        return False
+    return _blocked_share(mirror, origins, ends, surfaces) <= _MAX_BLOCKED
+
+
+def _blocked_share(mirror: Mirror, origins: Float, ends: Float, surfaces: SurfaceCells) -> float:
+    """Share of the beams that would pass through surfaces if the mirror reflected them."""
+    folded = fold(ends, mirror.normal, mirror.distance)
+    front, behind = origins @ mirror.normal, mirror.distance - ends @ mirror.normal
+    share = (front - mirror.distance) / (front - mirror.distance + behind)
+    met = origins + share[:, None] * (ends - origins)
+    length = np.linalg.norm(folded - met, axis=1)
+    some = np.flatnonzero(length > 1.0)[:: max(1, len(ends) // 500)]
+    blocked = np.zeros(len(some), np.bool_)
+    for at in np.linspace(0.0, 1.0, 40):
+        metres = 0.4 + at * (length[some] - 0.8)
+        points = met[some] + (metres / length[some])[:, None] * (folded[some] - met[some])
+        blocked |= surfaces.are_in(points)
+    return float(np.mean(blocked)) if len(some) else 0.0
