@@ -71,13 +71,13 @@ def test_gradient(beams, grids):
 def test_surface_that_goes_on_beyond_the_map():
     """A wall of which the map knows a part, and a scan that sees more of it, a little off."""
     rng = np.random.default_rng(0)
-    wall = np.stack([np.arange(-2.0, 2.0, 0.03), np.full(134, 1.5)], axis=-1)
+    wall = np.stack([np.arange(-3.5, 0.5, 0.03), np.full(134, 1.5)], axis=-1)
     wall += rng.normal(scale=0.01, size=wall.shape)
     T = np.eye(3)[None].copy()
     grids = []
     for kernels in (_core, reference):
         grid = kernels.OccupancyGrid2D(0.05)
-        known = wall[wall[:, 0] < 0.4].astype(np.float32)
+        known = wall[wall[:, 0] < -1.1].astype(np.float32)
         n = len(known)
         kernels.add_beams(
             grid, known, np.ones(n, bool), np.ones(n, np.float32), np.array([0, n]), T
@@ -90,6 +90,8 @@ def test_surface_that_goes_on_beyond_the_map():
     pose = se2.matrix(0.01, 0.02, 0.005)
     ends = reference.ends_of_surfaces(grids[1], points, normals, isotropy, pose, 2)
     assert 3 <= np.count_nonzero(ends.any(axis=1)) < 70
+    ahead = points * np.float32([-1.0, 1.0])
+    assert not reference.ends_of_surfaces(grids[1], ahead, normals, isotropy, pose, 2).any()
     options = 0.04, 2, 0.05, 0.2
     plain = reference.registration_cost(grids[1], points, weights, pose, *options, ends)
     core = _core.registration_cost(grids[0], points, weights, pose, *options, normals, isotropy)

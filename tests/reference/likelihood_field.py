@@ -75,10 +75,16 @@ def ends_of_surfaces(
 ) -> Float:
     """(N, 2) normals in the map of the flat surfaces whose mapped part ends at a point; else 0.
 
+    0 too where the scan looks ahead: the mean cosine of the bearings, which weigh the same here, is
+    -0.2 or more.
+
     It ends where no mean within `radius` cells lies half a cell or more to one side along the
     surface, and the cell radius + 1 cells to that side is unobserved.
     """
     pose, out = np.asarray(T, float), np.zeros((len(np.asarray(points)), 2))
+    bearings = np.asarray(points, float)[:, 0] / np.linalg.norm(points, axis=1)
+    if bearings.mean() >= -0.2:
+        return out
     surfaces = zip(*(np.asarray(x, float) for x in (points, normals, isotropy)), strict=True)
     for k, (p, n, s) in enumerate(surfaces):
         if s > 0.5 or not n.any() or not np.isfinite(p).all():

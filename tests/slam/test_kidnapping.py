@@ -78,4 +78,21 @@ def test_a_scan_of_an_unknown_place_says_nothing():
 def test_support_of_a_placement(fitting, contradicting, tested, supported, contradicted):
     placement = Placement(np.eye(3), fitting, contradicting, tested)
     assert placement.is_supported == supported
-    assert placement.is_contradicted == contradicted
+    assert placement.is_contradicted(0.33) == contradicted
+    assert not placement.is_contradicted(1.0)
+
+
+def test_one_of_many_places_has_to_be_much_better():
+    here = Placement(np.eye(3), 4, 4, 60)
+    for fitting, contradicting, is_better in ((18, 0, True), (17, 0, False), (30, 4, False)):
+        there = Placement(np.eye(3), fitting, contradicting, 60)
+        assert there.is_better(here) == is_better
+    # few keyframes
+    assert Placement(np.eye(3), 8, 0, 10).is_better(Placement(np.eye(3), 0, 6, 10))
+    assert not Placement(np.eye(3), 7, 0, 10).is_better(Placement(np.eye(3), 0, 6, 10))
+
+
+def test_time_to_carry_the_robot():
+    assert not kidnapping.is_gap(5.0, 0.1)
+    assert kidnapping.is_gap(5.1, 0.1)
+    assert not kidnapping.is_gap(15.0, 1.0)  # a sparse recording

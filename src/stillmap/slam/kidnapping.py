@@ -26,6 +26,8 @@ _MAX_SCANS = 300  # ahead
 _MIN_CONTRADICTING, _ENOUGH_DECISIVE, _MIN_TRAVEL = 6, 20, 3.0
 _CONTRADICTION_RATIO = 4.0  # contradicting scans for each one that agrees
 _AGREE_SHARE, _CONTRADICT_SHARE = 0.6, 0.4  # explained, of the usual share
+# s without a scan, and times the usual ones, in which the robot may have been carried elsewhere
+_GAP, _GAP_RATIO = 5.0, 20.0
 _DRIFT, _MIN_STD = 0.04, 0.05  # m and rad of odometry error per m or rad, and at least
 
 
@@ -48,6 +50,16 @@ class LookAhead:
 
     contradicts: bool
     last: int
+
+
+def is_gap(seconds: float, usual: float) -> bool:
+    """Whether somebody may have carried the robot far in the time between two scans.
+
+    Args:
+        seconds: between them.
+        usual: s between scans.
+    """
+    return seconds > max(_GAP, _GAP_RATIO * usual)
 
 
 def judge_scan(grid: _core.OccupancyGrid2D, scan: Scan, match: ScanMatch, usual: float) -> Evidence:

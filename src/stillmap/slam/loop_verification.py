@@ -86,6 +86,7 @@ def verify_candidate(
     candidate: LoopCandidate,
     translation_std: float,
     rotation_std: float,
+    min_explained: float | None = None,
 ) -> LoopClosure:
     """The view of the later scan matched with a submap, within its drift.
 
@@ -94,7 +95,10 @@ def verify_candidate(
         submap: map around the earlier scan.
         candidate: the scans and their relative pose.
         translation_std, rotation_std: of that pose, m and rad.
+        min_explained: share of the comparable beams; None: the wider the window, the more.
     """
+    if min_explained is None:
+        min_explained = _min_explained(translation_std)
     earlier, later = candidate.earlier, candidate.later
     mean = context.poses[earlier] @ candidate.T
     prior = motion_model.gaussian_prior(mean, translation_std, rotation_std)
@@ -110,7 +114,7 @@ def verify_candidate(
     floor = [CLOSURE_TRANSLATION] * 2 + [_CLOSURE_ROTATION]
     covariance = match.covariance + np.diag(np.square(floor))
     too_little = share < _MIN_COMPARABLE or match.explained < max(
-        _min_explained(translation_std), _MIN_EXPLAINED_RATIO * context.explained[later]
+        min_explained, _MIN_EXPLAINED_RATIO * context.explained[later]
     )
     if not too_little:
         # bounded by the drift over the whole way: the graph is no independent measurement

@@ -31,8 +31,6 @@ from stillmap.slam.types import Diagnostics, MStepResult, ScanProgress
 Float = NDArray[np.float64]
 
 _EXPLAINED_RATE = 0.1  # weight of one scan in the running average of the explained share
-# s without a scan, and times the usual ones, in which the robot may have been carried elsewhere
-_GAP, _GAP_RATIO = 5.0, 20.0
 _MAX_SPEED, _MAX_TURN_RATE, _MIN_REACH = 3.0, 4.0, 0.5  # m/s, rad/s of robots; m and rad
 _SURE_GAIN = 40.0  # nats of a pose outside the prior, from which one scan is enough
 _MAX_LATE_SCANS = 4  # after which odometry is not late, but at fault
@@ -185,7 +183,7 @@ class _ScanOdometry:
         grid, usual = self.local_map.grid, self.usual[self.recording.sensor[t]]
         if len(scan.points) == 0 or usual == 0.0:
             return match, False
-        if self.seconds_before[t] > max(_GAP, _GAP_RATIO * self.seconds):
+        if kidnapping.is_gap(float(self.seconds_before[t]), self.seconds):
             return self._start_segment(t, prior), False
         if is_poor(match, usual):
             match = self._match_late_odometry(t, scan, match, usual)

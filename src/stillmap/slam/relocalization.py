@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core import se2
-from stillmap.slam import loop_verification, motion_model, scan_matching
+from stillmap.slam import kidnapping, local_map, loop_verification, motion_model, scan_matching
 from stillmap.slam.types import Index, LoopCandidate, LoopClosure, LoopContext
 
 Float = NDArray[np.float64]
@@ -26,11 +26,14 @@ _RANGE_BINS = np.geomspace(0.3, 30.0, 25)  # m, of the range histogram that comp
 _MAX_TESTED = 60  # keyframes of a segment that test a hypothesis
 # keyframes that must fit, how many one that contradicts outweighs, and by how many a place among
 # the many that are tried must be better than that of odometry
-_MIN_SUPPORT, _CONTRADICTION_WEIGHT, _MARGIN = 3, 4, 8
-# keyframes that must contradict the place of odometry, in all and as a share, or it is believed
-_MIN_CONTRADICTING, _MIN_CONTRADICTING_SHARE = 5, 0.33
+_MIN_SUPPORT, _CONTRADICTION_WEIGHT, _MARGIN, _MARGIN_SHARE = 3, 4, 8, 0.3
+_MAX_HYPOTHESES = 12  # that are tested by all keyframes, those that explain most
+# keyframes that must contradict the place of odometry, in all and as a share, or it is believed;
+# the share where scans follow each other without a gap, in which nobody carries a robot far
+_MIN_CONTRADICTING, _MIN_CONTRADICTING_SHARE, _MIN_SHARE_WITHOUT_GAP = 5, 0.33, 0.5
 _SAME_DISTANCE, _SAME_ANGLE = 0.5, 0.1  # m, rad within which two hypotheses are one
 _DRIFT_DISTANCE, _DRIFT_ANGLE = 1.5, 0.3  # m, rad: smaller displacements are drift of odometry
+_STALL_TIME = 5.0  # s for which odometry may stand still unnoticed while the robot drives on
 _SEGMENT_SPACING = 10.0  # m between unconnected segments
 
 
@@ -69,11 +72,15 @@ class Placement:
         """Whether enough keyframes fit."""
         return self.fitting >= _MIN_SUPPORT and self.score >= 0
 
-    @property
-    def is_contradicted(self) -> bool:
-        """Whether enough keyframes contradict it."""
-        least = max(_MIN_CONTRADICTING, _MIN_CONTRADICTING_SHARE * self.tested)
+    def is_contradicted(self, min_share: float) -> bool:
+        """Whether enough keyframes contradict it, and at least a share of them."""
+        least = max(_MIN_CONTRADICTING, min_share * self.tested)
         return self.contradicting >= max(least, _CONTRADICTION_WEIGHT * self.fitting)
+
+    def is_better(self, other: "Placement") -> bool:
+        """Whether it is better by more than the best of many places is by chance."""
+        margin = max(_MARGIN, _MARGIN_SHARE * self.tested)
+        return self.score >= max(other.score, 0) + margin
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,20 +121,40 @@ def relocalize_segments(context: LoopContext, candidates: list[int]) -> Relocali
         if here.is_supported:
             continue
         there = _find_placement(context, before, first, last)
-        if there is not None and there.score >= max(here.score, 0) + _MARGIN:
-            moved = se2.parameters(se2.inverse(poses[first]) @ there.C @ poses[first])
+        has_gap = _has_gap_before(context, first)
+        min_share = _MIN_CONTRADICTING_SHARE if has_gap else _MIN_SHARE_WITHOUT_GAP
+        if there is not None and there.is_better(here):
+            if _is_carried(context, there.C, first, has_gap=has_gap):
+                out.breaks.append(first)
             poses[first:last] = there.C @ poses[first:last]
             out.closures.extend(there.closures)
-            # so little is drift of odometry, after a blind stretch for example
-            if np.hypot(moved[0], moved[1]) > _DRIFT_DISTANCE or abs(moved[2]) > _DRIFT_ANGLE:
-                out.breaks.append(first)
-        elif here.is_contradicted:
+        elif here.is_contradicted(min_share):
             poses[first:last] = _offset_beside(context, first) @ poses[first:last]
             out.breaks.append(first)
             out.unconnected.append(first)
         elif there is not None or here.contradicting > here.fitting:
             out.ambiguous.append(first)
     return dataclasses.replace(out, context=dataclasses.replace(context, poses=poses))
+
+
+def _has_gap_before(context: LoopContext, first: int) -> bool:
+    """Whether there was time before scan `first` to carry the robot elsewhere."""
+    seconds = 1e-9 * np.diff(context.recording.stamp_ns)
+    return kidnapping.is_gap(float(seconds[first - 1]), float(np.median(seconds)))
+
+
+def _is_carried(context: LoopContext, C: Float, first: int, *, has_gap: bool) -> bool:
+    """Whether a motion C (3, 3) of a segment says more than that odometry was wrong before it.
+
+    It drifts, in a blind stretch for example, and without a gap in time it may have stalled.
+    """
+    x, y, theta = se2.parameters(se2.inverse(context.poses[first]) @ C @ context.poses[first])
+    metres = float(np.hypot(x, y))
+    if has_gap:
+        return metres > _DRIFT_DISTANCE or abs(theta) > _DRIFT_ANGLE
+    seconds = 1e-9 * float(context.recording.stamp_ns[-1] - context.recording.stamp_ns[0])
+    speed = float(local_map.travelled_distance(context.poses)[-1]) / max(seconds, 1e-9)
+    return metres > max(_DRIFT_DISTANCE, _STALL_TIME * speed)
 
 
 def _match_segment(context: LoopContext, first: int, last: int) -> Iterator[LoopClosure]:
@@ -137,7 +164,7 @@ def _match_segment(context: LoopContext, first: int, last: int) -> Iterator[Loop
     before = keyframes[keyframes < first]
     signatures = np.array([_range_signature(context, t) for t in before])
     window = context.search_distance, np.pi
-    std = [half / loop_verification.SEARCH_STDS for half in window]
+    std = (window[0] / loop_verification.SEARCH_STDS, window[1] / loop_verification.SEARCH_STDS)
     submaps = {}
     for later in _select_evenly(segment, _MAX_QUERIES):
         distance = np.abs(signatures - _range_signature(context, later)).sum(axis=1)
@@ -148,7 +175,13 @@ def _match_segment(context: LoopContext, first: int, last: int) -> Iterator[Loop
             same = np.flatnonzero(stretches == stretch)
             earlier = int(before[same[np.argmin(distance[same])]])
             candidate = LoopCandidate(earlier, later, np.eye(3), 0.0)
-            closure = loop_verification.verify_candidate(context, submaps[stretch], candidate, *std)
+            closure = loop_verification.verify_candidate(
+                context,
+                submaps[stretch],
+                candidate,
+                *std,
+                min_explained=loop_verification.MIN_EXPLAINED,
+            )
             if not closure.rejected:
                 yield closure
 
@@ -195,9 +228,11 @@ def _find_placement(
 
 
 def _deduplicate(context: LoopContext, closures: list[LoopClosure]) -> list[LoopClosure]:
-    """One closure per hypothesis."""
+    """One closure per hypothesis, those that explain most."""
     kept = list[LoopClosure]()
-    for closure in closures:
+    for closure in sorted(closures, key=lambda closure: -closure.explained):
+        if len(kept) == _MAX_HYPOTHESES:
+            break
         if not any(_is_same(context, _correction(context, other), closure) for other in kept):
             kept.append(closure)
     return kept

@@ -274,8 +274,10 @@ def find_splits(
         largest cluster, and of the largest one of the others.
     """
     cluster = points.cluster[here]
-    pairs = np.unique(np.column_stack([claims, cluster])[claims >= 0], axis=0)
-    repeated = np.unique(pairs[1:, 0][np.diff(pairs[:, 0]) == 0])
+    within_scan = cluster - cluster.min()
+    n_clusters = int(within_scan.max()) + 1
+    tracks = np.unique((claims * n_clusters + within_scan)[claims >= 0]) // n_clusters
+    repeated = np.unique(tracks[1:][np.diff(tracks) == 0])
     out = []
     for track in repeated.tolist():
         own = np.flatnonzero(claims == track)

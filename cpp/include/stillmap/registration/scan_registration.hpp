@@ -134,13 +134,30 @@ inline Eigen::Matrix<double, Lie<D>::kDof, Lie<D>::kDof> surface_information(
   return information;
 }
 
-// Finds the end points at `pose` that lie where the mapped part of a flat surface ends.
+// Mean cosine of the bearings of the end points, weighted; 1 straight ahead.
+template <int D>
+inline double mean_bearing_cosine(const WeightedBeams<D>& beams) {
+  double total = 0.0, sum = 0.0;
+  for (size_t n = 0; n < beams.points.size(); ++n) {
+    const double range = beams.points[n].norm();
+    if (!(range > 0.0)) continue;
+    total += beams.weights[n];
+    sum += beams.weights[n] * beams.points[n][0] / range;
+  }
+  return total > 0.0 ? sum / total : 0.0;
+}
+
+// Finds the end points at `pose` that lie where the mapped part of a flat surface ends, of scans
+// that look back. A scan that looks ahead sees new pieces of walls far away; beside them are ends
+// of walls too, with unknown space behind, and these tell where it is.
 template <int D>
 inline void mark_beyond_map(LikelihoodField<D>& field, WeightedBeams<D>& beams,
                             const Pose<D>& pose) {
-  constexpr double kFlat = 0.5;  // isotropy, up to which a surface has a direction
+  constexpr double kFlat = 0.5;   // isotropy, up to which a surface has a direction
+  constexpr double kBack = -0.2;  // mean cosine of the bearings, below which a scan looks back
   beams.windows.resize(beams.points.size());
   beams.beyond_map.assign(beams.points.size(), false);
+  if (mean_bearing_cosine(beams) >= kBack) return;
   if constexpr (D == 2) {
     for (size_t n = 0; n < beams.normals.size(); ++n) {
       const auto& surface = beams.normals[n];
@@ -153,10 +170,10 @@ inline void mark_beyond_map(LikelihoodField<D>& field, WeightedBeams<D>& beams,
   }
 }
 
-// Levenberg-Marquardt from `start`. End points where the mapped part of a surface ends are found at
-// `start` and say nothing along it: the newly seen piece of a wall would be pulled to the end of
-// the mapped one, and the robot with it. Cost, inliers and information of the result take the field
-// as it is for all beams, so that results from several starts compare.
+// Levenberg-Marquardt from `start`. Of scans that look back, end points where the mapped part of a
+// surface ends are found at `start` and say nothing along it: the newly seen piece of a wall would
+// be pulled to the end of the mapped one, and the robot with it. Cost, inliers and information of
+// the result take the field as it is for all beams, so that results from several starts compare.
 template <int D>
 inline ScanRegistrationResult<D> minimise_levenberg_marquardt(
     LikelihoodField<D>& field, WeightedBeams<D>& beams, const PosePrior<D>& prior,
@@ -193,9 +210,11 @@ inline ScanRegistrationResult<D> minimise_levenberg_marquardt(
     }
     if (converged || damping > 1e6) break;
   }
-  beams.beyond_map.clear();
-  model = linearise<D>(field, beams, result.pose, options);
-  result.cost = with_prior(result.pose, model.cost);
+  if (std::find(beams.beyond_map.begin(), beams.beyond_map.end(), true) != beams.beyond_map.end()) {
+    beams.beyond_map.clear();
+    model = linearise<D>(field, beams, result.pose, options);
+    result.cost = with_prior(result.pose, model.cost);
+  }
   result.information = model.hessian + prior.information;
   result.inliers = model.inliers;
   return result;
