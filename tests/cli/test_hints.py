@@ -82,7 +82,9 @@ def test_similar_file_name_is_suggested(capsys, tmp_path):
         assert meant in refusal(capsys, *words, tmp_path / "walk.lgo")
     config = refusal(capsys, "config", "--config", tmp_path / "option.toml")
     assert f"did you mean '{tmp_path / 'options.toml'}'?" in config
-    assert "recording.json" in refusal(capsys, "info", tmp_path / "quite-another")
+    # who mistypes a path does not ask what else could be read
+    message = refusal(capsys, "info", tmp_path / "quite-another")
+    assert message.strip().endswith("quite-another: does not exist")
     assert "did you mean" not in refusal(capsys, "info", tmp_path / "no/such/walk.log")
     # names that stillmap gives are no slips of the pen
     (tmp_path / "ran.json").write_text("")

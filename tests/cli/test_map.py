@@ -80,7 +80,9 @@ def test_progress_lines_without_terminal(mapped):
     assert re.search(r"40 of 40 scans, \d+/s", done.stderr)
     assert "\x1b" not in done.stderr
     assert "\r" not in done.stderr
-    assert str(mapped[0] / "report.html") in lines[-1]
+    assert re.search(r": kept iteration [12] of [12]\b", done.stderr)
+    assert str(mapped[0] / "report.html") in lines[-2]
+    assert lines[-1] == f"stillmap: see it over time: stillmap view {mapped[0]}"
 
 
 def test_quiet(call, room, tmp_path, nothing_left):

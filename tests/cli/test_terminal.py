@@ -112,7 +112,7 @@ def test_bar_is_removed_at_the_end(on_a_terminal, room, tmp_path):
     assert written.count("\x1b[?25l") == written.count("\x1b[?25h") > 0  # the cursor came back
     lines = left_on_screen(written)
     assert all(line.startswith("stillmap: ") for line in lines), lines
-    assert "report.html" in lines[-1]
+    assert "report.html" in lines[-2]
 
 
 def test_ctrl_c_restores_the_cursor(on_a_terminal, hall, tmp_path, nothing_left):

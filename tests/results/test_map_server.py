@@ -78,6 +78,13 @@ def test_trinary_reads_as_meant(tmp_path, small):
     assert set(np.unique(read_pgm(tmp_path / "map.pgm"))) == {0, 205, 254}
 
 
+def test_origin_is_written_without_rounding_errors(tmp_path, small):
+    off = -509 * 0.05
+    assert str(off) != "-25.45"
+    write_map_server(tmp_path, dataclasses.replace(small, origin=(off, 0.1 + 0.2, 0.0)))
+    assert "origin: [-25.45, 0.3, 0.0]" in (tmp_path / "map.yaml").read_text()
+
+
 def test_top_row_of_the_picture_is_the_highest_y(tmp_path, small):
     p = np.full((2, 3), np.nan, np.float32)
     p[1, 0] = 1.0

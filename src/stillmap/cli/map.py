@@ -4,6 +4,7 @@ import argparse
 import errno
 import json
 import os
+import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -206,12 +207,13 @@ def _print_summary(result: "Result", tilting: "TiltingResult | None", output: Pa
     n = len(result.iterations)
     lines = [
         f"{result.recording.n_scans} scans, {_describe_hits(result.recording, result.p_static)}",
-        f"{n} iteration{'s' * (n > 1)}, {'' if result.converged else 'not '}converged, "
-        f"the best is {result.best_iteration}",
+        f"kept iteration {result.best_iteration} of {n}"
+        + ("" if result.converged else ", which had not converged"),
         *_describe_changes(result),
         *([] if tilting is None else [_describe_tilting(tilting)]),
         *(f"warning: {warning}" for warning in result.warnings),
         f"wrote {output}: open {output / 'report.html'}",
+        f"see it over time: stillmap view {shlex.quote(str(output))}",
     ]
     for line in lines:
         say(line)

@@ -198,8 +198,9 @@ def detect_format(path: Path) -> Format:
     except (OSError, ValueError) as error:
         raise InputError(f"is no usable path: {error}", where=repr(str(path))) from error
     if not is_folder and not is_file:
-        what = "is no regular file" if path.exists() else "does not exist"
-        raise InputError(what, where=str(path), hint=_list_formats())
+        if path.exists():
+            raise InputError("is no regular file", where=str(path), hint=_list_formats())
+        raise InputError("does not exist", where=str(path))
     start = read_head(path, _HEAD) if is_file else None
     for known in FORMATS:
         if known.matches(path, start):

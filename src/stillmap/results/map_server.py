@@ -71,7 +71,8 @@ def write_map_server(folder: Path, occupancy: "OccupancyMap", mode: MapMode = "t
         "image": name,
         "mode": mode,
         "resolution": float(occupancy.resolution),
-        "origin": [float(value) for value in occupancy.origin],
+        # a multiple of the cell's edge is written as one
+        "origin": [round(float(value), 9) for value in occupancy.origin],
         "negate": 0,
         "occupied_thresh": OCCUPIED_THRESH,
         "free_thresh": FREE_THRESH,
