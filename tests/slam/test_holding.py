@@ -38,8 +38,11 @@ def hall(laser, people, seed, scans=900, **more):
 
 @pytest.mark.parametrize(
     ("laser", "people", "seed"),
-    [(SHORT_180, 20, 0), (NARROW, 30, 0)]
-    + slow_params((SHORT_180, 20, 1), (NARROW, 30, 1), (NARROW, 30, 2)),
+    [
+        (SHORT_180, 20, 0),
+        (NARROW, 30, 0),
+        *slow_params((SHORT_180, 20, 1), (NARROW, 30, 1), (NARROW, 30, 2)),
+    ],
 )
 def test_short_and_narrow_views_in_a_crowd(laser, people, seed):
     assert_held(hall(laser, people, seed), 1.0)
