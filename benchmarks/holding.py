@@ -40,7 +40,10 @@ ABLATION = (
     Variant("defaults"),
     Variant("odometry noise is not learned", constants={"motion_model._MIN_NOISE_SHARE": 1.0}),
     Variant("one contradicting scan is a break", constants={"kidnapping._MIN_CONTRADICTING": 1}),
-    Variant("the first place that fits is taken", constants={"relocalization._MARGIN": 0}),
+    Variant(
+        "the first place that fits is taken",
+        constants={"relocalization._MARGIN": 0, "relocalization._MARGIN_SHARE": 0.0},
+    ),
     Variant("views of single walls do not grow", constants={"loop_verification._MIN_ISOTROPY": 0}),
     Variant(
         "not compared with odometry alone",
