@@ -36,12 +36,22 @@ def hall(laser, people, seed, scans=900, **more):
     return simulate(scene_by_name("hall", changes), seed)
 
 
+# people who walk along carry the first M-step away: they raise the learned noise of odometry
+DRAGGED = pytest.param(
+    SHORT_180,
+    20,
+    2,
+    marks=[pytest.mark.slow, pytest.mark.xfail(raises=AssertionError, strict=True)],
+)
+
+
 @pytest.mark.parametrize(
     ("laser", "people", "seed"),
     [
         (SHORT_180, 20, 0),
         (NARROW, 30, 0),
         *slow_params((SHORT_180, 20, 1), (NARROW, 30, 1), (NARROW, 30, 2)),
+        DRAGGED,
     ],
 )
 def test_short_and_narrow_views_in_a_crowd(laser, people, seed):
@@ -50,7 +60,7 @@ def test_short_and_narrow_views_in_a_crowd(laser, people, seed):
 
 @pytest.mark.slow
 def test_people_who_walk_along():
-    # they carry the first M-step away, whose learned odometry noise they raise; labels mend that
+    # later iterations mend what the first M-step loses here
     simulation = hall(SHORT_180, 20, 2)
     truth = simulation.truth.T_world_base
     result = stillmap.build(simulation.recording)

@@ -1,8 +1,8 @@
 """Mirrors: pieces of wall lines behind which beams see images of what is before them.
 
 A mirror on the line n . x = d shows an end point x' = x - 2 (n . x - d) n of a surface at x. Its
-evidence: what is seen through it lies, folded back, on surfaces; the beams, folded back, reach them
-through free space; and wall at its back or around it says that there is no opening.
+evidence: what is seen through it lies on surfaces once it is reflected back, the reflected beams
+reach them through free space, and wall at its back or around it shows that there is no opening.
 """
 
 from dataclasses import dataclass, replace
@@ -25,11 +25,11 @@ _ON_LINE, _MAX_THICKNESS = 0.07, 0.35  # m from the line to its wall, and to tha
 _MIN_FRAME_HITS, _MIN_FILLED = 3, 0.7  # returns in a bin of the frame; share of such bins
 _MAX_BESIDE = 0.25  # share of the beams per metre of mirror that see something else beside it
 _MAX_SEEN = 0.3  # share of what it shows that beams also end on which do not cross it
-# share of the beams, folded back, that end on surfaces (others show people), and the same of those
+# share of the reflected beams that end on surfaces (others show people), and the same of those
 # that hardly fit beside, as walls along n do anywhere; less where wall behind proves the rest
 _MIN_SHARES, _MIN_SHARES_IF_BACKED = (0.7, 0.6), (0.55, 0.4)
 _CONTROL = (0.25, -0.25, 0.4, -0.4)  # m from the mirror, where as many must not fit
-_MAX_BLOCKED = 0.2  # share of the folded beams that would pass through surfaces
+_MAX_BLOCKED = 0.2  # share of the reflected beams that would pass through surfaces
 _MIN_TRAVEL = 0.7  # m between places from which the mirror was seen
 
 
@@ -78,7 +78,7 @@ class Beams(NamedTuple):
         return Beams(self.origins[kept], self.ends[kept], self.is_static[kept], self.path)
 
 
-class Crossing(NamedTuple):
+class CrossingBeams(NamedTuple):
     """N beams that cross a line from its front.
 
     Attributes:
@@ -98,13 +98,13 @@ def tangent_of(normal: Float) -> Float:
     return np.array([-normal[1], normal[0]])
 
 
-def fold(points: Float, normal: Float, distance: float) -> Float:
+def reflect(points: Float, normal: Float, distance: float) -> Float:
     """Points (..., 2) reflected at the line normal . x = distance."""
     return np.asarray(points - 2.0 * (points @ normal - distance)[..., None] * normal)
 
 
 def check_mirror(
-    mirror: Mirror, crossing: Crossing, beams: Beams, surfaces: SurfaceCells
+    mirror: Mirror, crossing: CrossingBeams, beams: Beams, surfaces: SurfaceCells
 ) -> Mirror | None:
     """A piece of a line, as wide as its wall or its frame shows, or None where it is no mirror.
 
@@ -116,16 +116,16 @@ def check_mirror(
     """
     within = (crossing.along >= mirror.first) & (crossing.along <= mirror.last)
     origins, ends = crossing.origins[within], crossing.ends[within]
-    is_backed = _is_backed(mirror, beams)
-    needed = _MIN_SHARES_IF_BACKED if is_backed else _MIN_SHARES
-    if not _is_reflecting(mirror, origins, ends, beams.path, surfaces, needed):
+    has_wall_behind = _has_wall_behind(mirror, beams)
+    needed = _MIN_SHARES_IF_BACKED if has_wall_behind else _MIN_SHARES
+    if not _shows_reflections(mirror, origins, ends, beams.path, surfaces, needed):
         return None
-    if is_backed:
+    if has_wall_behind:
         return _widen_to_back(mirror, beams)
     is_mirror = (
         _has_edges(crossing.along[within], crossing.along[~within & ~crossing.fit], mirror)
-        and _is_framed(mirror, beams.ends)
-        and not _is_seen_otherwise(mirror, beams, ends, surfaces.resolution)
+        and _has_frame(mirror, beams.ends)
+        and not _is_seen_without_mirror(mirror, beams, ends, surfaces.resolution)
     )
     if not is_mirror:
         return None
@@ -133,8 +133,8 @@ def check_mirror(
     return replace(mirror, first=mirror.first - _FRAME, last=mirror.last + _FRAME)
 
 
-def _is_backed(mirror: Mirror, beams: Beams) -> bool:
-    """Whether beams from behind end right behind a mirror: others cannot have passed there."""
+def _has_wall_behind(mirror: Mirror, beams: Beams) -> bool:
+    """Whether scans from the other side see a wall right behind the mirror, all along it."""
     hits = _back_hits(mirror, beams, mirror.first, mirror.last)
     return bool(np.count_nonzero(hits >= _MIN_FRAME_HITS) >= _MIN_FILLED * len(hits))
 
@@ -162,8 +162,8 @@ def _back_hits(mirror: Mirror, beams: Beams, first: float, last: float) -> NDArr
     return np.histogram(at, max(1, round((last - first) / BIN)), (first, last))[0]
 
 
-def _is_framed(mirror: Mirror, ends: Float) -> bool:
-    """Whether there is wall beside a mirror on both sides; else a room is its halves' image."""
+def _has_frame(mirror: Mirror, ends: Float) -> bool:
+    """Whether there is wall on both sides; else it may be the axis of a symmetric room."""
     on = ends[np.abs(ends @ mirror.normal - mirror.distance) < _ON_LINE] @ tangent_of(mirror.normal)
     for low, high in (
         (mirror.first - _FRAME, mirror.first),
@@ -176,7 +176,7 @@ def _is_framed(mirror: Mirror, ends: Float) -> bool:
 
 
 def _has_edges(through: Float, beside: Float, mirror: Mirror) -> bool:
-    """Whether few beams see something else right beside a piece of a line.
+    """Whether few beams that no mirror explains cross the line right beside the mirror.
 
     Args:
         through: (N,) metres along the line where beams cross the piece.
@@ -190,15 +190,15 @@ def _has_edges(through: Float, beside: Float, mirror: Mirror) -> bool:
     return bool(max(before, after) <= allowed)
 
 
-def _is_seen_otherwise(mirror: Mirror, beams: Beams, ends: Float, resolution: float) -> bool:
-    """Whether beams that do not cross a mirror end where those do that cross it."""
+def _is_seen_without_mirror(mirror: Mirror, beams: Beams, ends: Float, resolution: float) -> bool:
+    """Whether beams that do not cross the mirror see what is behind it as well."""
     others = beams.ends[~mirror.find_crossing(beams.origins, beams.ends)]
     behind = mirror.distance - others @ mirror.normal > MIN_BEHIND
     keys = np.unique(cell_keys(np.floor(others[behind] / resolution).astype(np.int64)))
     return float(np.mean(contains(keys, ends, resolution))) > _MAX_SEEN
 
 
-def _is_reflecting(
+def _shows_reflections(
     mirror: Mirror,
     origins: Float,
     ends: Float,
@@ -206,7 +206,7 @@ def _is_reflecting(
     surfaces: SurfaceCells,
     min_shares: tuple[float, float],
 ) -> bool:
-    """Whether beams that cross a piece of a line show what a mirror there would."""
+    """Whether the end points behind the line, reflected at it, lie on surfaces in free view."""
     normal, distance = mirror.normal, mirror.distance
     if len(ends) < MIN_BEAMS or np.linalg.norm(np.ptp(origins, axis=0)) < _MIN_TRAVEL:
         return False
@@ -215,8 +215,8 @@ def _is_reflecting(
     gone = path[passing] @ tangent_of(normal)
     if np.any((gone >= mirror.first) & (gone <= mirror.last)):
         return False
-    fit = surfaces.are_near(fold(ends, normal, distance))
-    beside = [surfaces.are_near(fold(ends, normal, distance + o)) for o in _CONTROL]
+    fit = surfaces.are_near(reflect(ends, normal, distance))
+    beside = [surfaces.are_near(reflect(ends, normal, distance + o)) for o in _CONTROL]
     telling = np.sum(beside, axis=0) <= 1
     if np.count_nonzero(fit) < min_shares[0] * len(fit) or np.count_nonzero(telling) < MIN_BEAMS:
         return False
@@ -227,15 +227,15 @@ def _is_reflecting(
 
 def _blocked_share(mirror: Mirror, origins: Float, ends: Float, surfaces: SurfaceCells) -> float:
     """Share of the beams that would pass through surfaces if the mirror reflected them."""
-    folded = fold(ends, mirror.normal, mirror.distance)
+    reflected = reflect(ends, mirror.normal, mirror.distance)
     front, behind = origins @ mirror.normal, mirror.distance - ends @ mirror.normal
     share = (front - mirror.distance) / (front - mirror.distance + behind)
     met = origins + share[:, None] * (ends - origins)
-    length = np.linalg.norm(folded - met, axis=1)
+    length = np.linalg.norm(reflected - met, axis=1)
     some = np.flatnonzero(length > 1.0)[:: max(1, len(ends) // 500)]
     blocked = np.zeros(len(some), np.bool_)
     for at in np.linspace(0.0, 1.0, 40):
         metres = 0.4 + at * (length[some] - 0.8)
-        points = met[some] + (metres / length[some])[:, None] * (folded[some] - met[some])
+        points = met[some] + (metres / length[some])[:, None] * (reflected[some] - met[some])
         blocked |= surfaces.are_in(points)
     return float(np.mean(blocked)) if len(some) else 0.0

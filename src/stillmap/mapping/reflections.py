@@ -1,6 +1,6 @@
 """Reflections: beams that a mirror sent elsewhere, so that a room seems to lie behind it.
 
-Lines along walls are searched for pieces behind which what is seen, folded back, fits what is
+Lines along walls are searched for pieces behind which what is seen, reflected back, fits what is
 before them (`mirrors`); all beams that cross such a piece from its front are reflections.
 """
 
@@ -18,10 +18,10 @@ from stillmap.mapping.mirrors import (
     MIN_BEAMS,
     MIN_BEHIND,
     Beams,
-    Crossing,
+    CrossingBeams,
     Mirror,
     check_mirror,
-    fold,
+    reflect,
     tangent_of,
 )
 from stillmap.mapping.surface_cells import SurfaceCells, iter_lines
@@ -127,10 +127,10 @@ def _find_on_line(
     share = front[met] / (front + behind)[met]
     along = (origins + share[:, None] * (ends - origins)) @ tangent_of(normal)
     some = ends[:: max(1, len(ends) // _MAX_TRIED)]
-    counts = [surfaces.are_in(fold(some, normal, distance + o)).sum() for o in _OFFSETS]
+    counts = [surfaces.are_in(reflect(some, normal, distance + o)).sum() for o in _OFFSETS]
     distance += _OFFSETS[int(np.argmax(counts))]
-    fit = surfaces.are_near(fold(ends, normal, distance))
-    crossing = Crossing(origins, ends, along, fit)
+    fit = surfaces.are_near(reflect(ends, normal, distance))
+    crossing = CrossingBeams(origins, ends, along, fit)
     for first, last in _find_runs(along, fit):
         mirror = check_mirror(Mirror(normal, distance, first, last), crossing, beams, surfaces)
         if mirror is not None:

@@ -73,12 +73,12 @@ class Placement:
         return self.fitting >= _MIN_SUPPORT and self.score >= 0
 
     def is_contradicted(self, min_share: float) -> bool:
-        """Whether enough keyframes contradict it, and at least a share of them."""
+        """Whether enough keyframes contradict it: in number, as a share, against those that fit."""
         least = max(_MIN_CONTRADICTING, min_share * self.tested)
         return self.contradicting >= max(least, _CONTRADICTION_WEIGHT * self.fitting)
 
     def is_better(self, other: "Placement") -> bool:
-        """Whether it is better by more than the best of many places is by chance."""
+        """Whether its score exceeds another's by the margin for testing many places."""
         margin = max(_MARGIN, _MARGIN_SHARE * self.tested)
         return self.score >= max(other.score, 0) + margin
 
@@ -124,7 +124,7 @@ def relocalize_segments(context: LoopContext, candidates: list[int]) -> Relocali
         has_gap = _has_gap_before(context, first)
         min_share = _MIN_CONTRADICTING_SHARE if has_gap else _MIN_SHARE_WITHOUT_GAP
         if there is not None and there.is_better(here):
-            if _is_carried(context, there.C, first, has_gap=has_gap):
+            if _exceeds_odometry_error(context, there.C, first, has_gap=has_gap):
                 out.breaks.append(first)
             poses[first:last] = there.C @ poses[first:last]
             out.closures.extend(there.closures)
@@ -138,15 +138,15 @@ def relocalize_segments(context: LoopContext, candidates: list[int]) -> Relocali
 
 
 def _has_gap_before(context: LoopContext, first: int) -> bool:
-    """Whether there was time before scan `first` to carry the robot elsewhere."""
+    """Whether a gap in time precedes scan `first`, in which the robot may have been carried."""
     seconds = 1e-9 * np.diff(context.recording.stamp_ns)
     return kidnapping.is_gap(float(seconds[first - 1]), float(np.median(seconds)))
 
 
-def _is_carried(context: LoopContext, C: Float, first: int, *, has_gap: bool) -> bool:
-    """Whether a motion C (3, 3) of a segment says more than that odometry was wrong before it.
+def _exceeds_odometry_error(context: LoopContext, C: Float, first: int, *, has_gap: bool) -> bool:
+    """Whether a segment is displaced by C (3, 3) farther than odometry drifts or a stall hides.
 
-    It drifts, in a blind stretch for example, and without a gap in time it may have stalled.
+    Drift: in a blind stretch for example. A stall: where no gap in time precedes the segment.
     """
     x, y, theta = se2.parameters(se2.inverse(context.poses[first]) @ C @ context.poses[first])
     metres = float(np.hypot(x, y))

@@ -77,8 +77,7 @@ class LikelihoodField {
     FieldSample<D> sample;
     sample.baseline = options_.floor;
     const Vec<D> y = point / resolution_;
-    if (!all_below<D>(y, BlockLayout<D>::kMaxCell - 64)) return sample;
-    gather_gaussians(cell_of<D>(y), window);
+    if (!gather_around(y, window)) return sample;
     sample.baseline = window.baseline;
     if (!window.observed && window.is_planar) return extrapolate(y, window);
     double sum = 0.0;
@@ -102,27 +101,26 @@ class LikelihoodField {
     return sample;
   }
 
-  // Whether the map knows a surface at a point, but neither in the direction of a unit tangent from
-  // there nor what else there is.
-  bool ends_at(const Vec<D>& point, const Vec<D>& tangent, GaussianWindow<D>& window) {
+  // Whether the mapped part of a surface ends at a point: in the direction of a unit tangent there
+  // are no occupied cells, and the cell beyond the radius is unobserved.
+  bool is_end_of_mapped_surface(const Vec<D>& point, const Vec<D>& tangent,
+                                GaussianWindow<D>& window) {
     const Vec<D> y = point / resolution_;
-    if (!all_below<D>(y, BlockLayout<D>::kMaxCell - 64)) return false;
-    gather_gaussians(cell_of<D>(y), window);
+    if (!gather_around(y, window)) return false;
     constexpr double kReach = 0.5;  // cells
     for (const auto& gaussian : window.gaussians)
       if (tangent.dot(gaussian.mean - y) >= kReach) return false;
     return !cursor_.find_observed(cell_of<D>(y + tangent * (options_.radius + 1.0)));
   }
 
-  // The field where a flat surface (unit normal) goes on at the end of its mapped part: the map
-  // says where the surface is, not where on it the point is.
+  // The field at the end of the mapped part of a flat surface (unit normal): it depends on the
+  // distance from the surface only, not on the position along it.
   FieldSample<D> evaluate_beyond_map(const Vec<D>& point, const Vec<D>& normal,
                                      GaussianWindow<D>& window) {
     FieldSample<D> sample;
     sample.baseline = options_.floor;
     const Vec<D> y = point / resolution_;
-    if (!all_below<D>(y, BlockLayout<D>::kMaxCell - 64)) return sample;
-    gather_gaussians(cell_of<D>(y), window);
+    if (!gather_around(y, window)) return sample;
     sample.baseline = window.baseline;
     double total = 0.0;
     Vec<D> mean = Vec<D>::Zero();
@@ -136,6 +134,13 @@ class LikelihoodField {
   }
 
  private:
+  // Fills the window of a point in cells; false where the point is out of range.
+  bool gather_around(const Vec<D>& y, GaussianWindow<D>& window) {
+    if (!all_below<D>(y, BlockLayout<D>::kMaxCell - 64)) return false;
+    gather_gaussians(cell_of<D>(y), window);
+    return true;
+  }
+
   // Extends a surface into unobserved space: the end of the mapped part must not pull scans along
   // it.
   FieldSample<D> extrapolate(const Vec<D>& y, const GaussianWindow<D>& window) const {

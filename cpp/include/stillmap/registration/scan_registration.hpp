@@ -96,7 +96,7 @@ inline QuadraticModel<D> linearise(LikelihoodField<D>& field, WeightedBeams<D>& 
     const Vec<D> lever = pose.R * beams.points[n];
     const Vec<D> point = pose.t + lever;
     const FieldSample<D> sample =
-        n < beams.beyond_map.size() && beams.beyond_map[n]
+        !beams.beyond_map.empty() && beams.beyond_map[n]
             ? field.evaluate_beyond_map(point, pose.R * beams.normals[n].normal, beams.windows[n])
             : field.evaluate(point, beams.windows[n]);
     total += beams.weights[n];
@@ -147,33 +147,35 @@ inline double mean_bearing_cosine(const WeightedBeams<D>& beams) {
   return total > 0.0 ? sum / total : 0.0;
 }
 
-// Finds the end points at `pose` that lie where the mapped part of a flat surface ends, of scans
-// that look back. A scan that looks ahead sees new pieces of walls far away; beside them are ends
-// of walls too, with unknown space behind, and these tell where it is.
+// Marks the end points at `pose` that lie at the end of the mapped part of a flat surface. Only in
+// 2D, and for scans that look backwards: ahead of the robot, walls that end at unknown space fix
+// its position along them.
 template <int D>
 inline void mark_beyond_map(LikelihoodField<D>& field, WeightedBeams<D>& beams,
                             const Pose<D>& pose) {
-  constexpr double kFlat = 0.5;   // isotropy, up to which a surface has a direction
-  constexpr double kBack = -0.2;  // mean cosine of the bearings, below which a scan looks back
-  beams.windows.resize(beams.points.size());
-  beams.beyond_map.assign(beams.points.size(), false);
-  if (mean_bearing_cosine(beams) >= kBack) return;
+  constexpr double kFlat = 0.5;       // isotropy, up to which a surface has a direction
+  constexpr double kBackward = -0.2;  // mean cosine of the bearings of a backward scan, at most
+  beams.beyond_map.clear();
   if constexpr (D == 2) {
+    if (mean_bearing_cosine(beams) >= kBackward) return;
+    beams.windows.resize(beams.points.size());
+    beams.beyond_map.assign(beams.points.size(), false);
     for (size_t n = 0; n < beams.normals.size(); ++n) {
       const auto& surface = beams.normals[n];
       if (surface.isotropy > kFlat || surface.normal.isZero(0.0)) continue;
       const Vec<D> point = pose * beams.points[n], normal = pose.R * surface.normal;
       const Vec<D> tangent(-normal[1], normal[0]);
-      beams.beyond_map[n] = field.ends_at(point, tangent, beams.windows[n]) ||
-                            field.ends_at(point, -tangent, beams.windows[n]);
+      beams.beyond_map[n] = field.is_end_of_mapped_surface(point, tangent, beams.windows[n]) ||
+                            field.is_end_of_mapped_surface(point, -tangent, beams.windows[n]);
     }
   }
 }
 
-// Levenberg-Marquardt from `start`. Of scans that look back, end points where the mapped part of a
-// surface ends are found at `start` and say nothing along it: the newly seen piece of a wall would
-// be pulled to the end of the mapped one, and the robot with it. Cost, inliers and information of
-// the result take the field as it is for all beams, so that results from several starts compare.
+// Levenberg-Marquardt from `start`. Of backward scans, end points at the end of the mapped part of
+// a surface (found at `start`) do not constrain the position along it: the newly seen piece of a
+// wall would be pulled to the end of the mapped one, and the robot with it. Cost, inliers and
+// information of the result are those of the unmodified field, so that results from several starts
+// compare.
 template <int D>
 inline ScanRegistrationResult<D> minimise_levenberg_marquardt(
     LikelihoodField<D>& field, WeightedBeams<D>& beams, const PosePrior<D>& prior,
@@ -210,7 +212,7 @@ inline ScanRegistrationResult<D> minimise_levenberg_marquardt(
     }
     if (converged || damping > 1e6) break;
   }
-  if (std::find(beams.beyond_map.begin(), beams.beyond_map.end(), true) != beams.beyond_map.end()) {
+  if (!beams.beyond_map.empty()) {
     beams.beyond_map.clear();
     model = linearise<D>(field, beams, result.pose, options);
     result.cost = with_prior(result.pose, model.cost);
