@@ -10,6 +10,7 @@ from refusals import refused
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
+from stillmap.core.extras import install_command
 from stillmap.io import read, stillmap_folder
 from stillmap.io.trajectory import read_tum
 
@@ -176,7 +177,7 @@ def test_result_as_table(call, room, mapped, tmp_path):
 def test_table_needs_pyarrow(call, mapped, tmp_path, monkeypatch, nothing_left):
     monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
     done = call("convert", mapped, "-o", tmp_path / "a.parquet")
-    refused(done, "needs the package pyarrow", "pip install 'stillmap[io]'")
+    refused(done, "needs the package pyarrow", install_command("io"))
     nothing_left()
 
 
@@ -221,7 +222,7 @@ def test_clouds_need_their_libraries(
     pytest.importorskip("laspy")  # it looks for lazrs once, and remembers what it found
     monkeypatch.setitem(sys.modules, module, None)
     done = call("convert", mapped, "-o", tmp_path / name)
-    refused(done, f"needs {package} to be written", "pip install 'stillmap[io]'")
+    refused(done, f"needs {package} to be written", install_command("io"))
     nothing_left()
 
 

@@ -13,6 +13,7 @@ from PIL import Image
 
 from stillmap.cli.main import main
 from stillmap.core import se2
+from stillmap.core.extras import install_command
 from stillmap.eval import mesh as mesh_module
 from stillmap.io import read
 from stillmap.io.trajectory import write_tum
@@ -222,7 +223,7 @@ def test_result_without_mesh_is_refused(result, simulated, capsys) -> None:
     assert main(["eval", "model", str(result), str(simulated)]) == 2
     err = capsys.readouterr().err
     assert f"{result}: holds no model" in err
-    assert "pip install 'stillmap[mesh]'" in err
+    assert install_command("mesh") in err
 
 
 def test_result_of_another_recording_is_refused(result, simulated, tmp_path, capsys) -> None:

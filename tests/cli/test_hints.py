@@ -1,13 +1,19 @@
 """Suggestions for bad calls; reports of defects."""
 
+import json
 import logging
+import os
+import shlex
 import subprocess
+import sys
+from importlib.metadata import PackageNotFoundError
 
 import pytest
 
 from stillmap.cli.main import main
 from stillmap.cli.parser import COMMANDS
-from stillmap.core.errors import InputError, closest_match
+from stillmap.core.errors import InputError, MissingExtra, closest_match, import_extra
+from stillmap.core.extras import install_command
 
 
 def refusal(capsys, *words: object) -> str:
@@ -219,3 +225,92 @@ def test_ctrl_c_in_any_command(monkeypatch, capsys, words):
 
 def test_every_command_has_a_call():
     assert {words[0] for words in CALLS} == set(COMMANDS)
+
+
+class Origin:
+    """A distribution of which only its direct_url.json is read."""
+
+    def __init__(self, text):
+        self.text = text
+
+    def read_text(self, name):
+        assert name == "direct_url.json"
+        return self.text
+
+
+@pytest.fixture
+def installed_from(monkeypatch):
+    """Pretend that the package was installed from a URL (None: an index), beside no pip."""
+    monkeypatch.setenv("PATH", "/nowhere")
+
+    def pretend(record):
+        text = None if record is None else json.dumps(record)
+        monkeypatch.setattr("importlib.metadata.distribution", lambda _name: Origin(text))
+
+    return pretend
+
+
+def wanted(command):
+    """What a pip command installs; it runs in this interpreter."""
+    *pip, install, requirement = shlex.split(command)
+    assert (pip, install) == ([sys.executable, "-m", "pip"], "install")
+    return requirement
+
+
+@pytest.mark.parametrize("group", ["io", "mesh", "viewer"])
+def test_missing_extra_names_the_clone_it_was_installed_from(installed_from, tmp_path, group):
+    clone = tmp_path / "a clone"
+    clone.mkdir()
+    installed_from({"url": clone.as_uri(), "dir_info": {}})
+    with pytest.raises(MissingExtra, match="needs absent_library to be read") as caught:
+        import_extra("absent_library.part", "some.file", group=group)
+    assert wanted(caught.value.hint) == f"{clone}[{group}]"
+
+
+def test_extra_of_a_wheel_is_installed_from_the_wheel(installed_from, tmp_path):
+    wheel = tmp_path / "stillmap-0.1.0-py3-none-any.whl"
+    installed_from({"url": wheel.as_uri(), "archive_info": {}})
+    # a wheel that is gone cannot be installed from
+    assert wanted(install_command("io")) == "stillmap[io]"
+    wheel.write_bytes(b"")
+    assert wanted(install_command("io")) == f"stillmap[io] @ {wheel.as_uri()}"
+
+
+def test_extra_from_index_and_repository(installed_from):
+    installed_from(None)
+    assert wanted(install_command("mesh")) == "stillmap[mesh]"
+    url = "https://example.org/stillmap.git"
+    installed_from({"url": url, "vcs_info": {"vcs": "git", "commit_id": "abc"}})
+    assert wanted(install_command("mesh")) == f"stillmap[mesh] @ git+{url}@abc"
+
+
+def test_extra_of_sources_that_are_not_installed(monkeypatch, tmp_path):
+    def missing(name):
+        raise PackageNotFoundError(name)
+
+    monkeypatch.setattr("importlib.metadata.distribution", missing)
+    module = tmp_path / "src/stillmap/core/extras.py"
+    monkeypatch.setattr("stillmap.core.extras.__file__", str(module))
+    assert shlex.split(install_command("viewer"))[-1] == "stillmap[viewer]"
+    (tmp_path / "pyproject.toml").write_text("")
+    assert shlex.split(install_command("viewer"))[-1] == f"{tmp_path}[viewer]"
+
+
+def test_pip_of_the_environment_is_named_briefly(monkeypatch, tmp_path):
+    pip = tmp_path / "pip"
+    pip.write_text("#!/bin/sh\n")
+    pip.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert install_command("io").startswith(f"{shlex.quote(sys.executable)} -m pip install ")
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
+    assert install_command("io").startswith("pip install ")
+
+
+@pytest.mark.slow
+def test_command_for_the_viewer_works_here():
+    """Nothing is fetched: pip resolves this installation's own origin, without dependencies."""
+    flags = ["--dry-run", "--no-deps", "--no-index", "--no-build-isolation", "--quiet"]
+    words = [*shlex.split(install_command("viewer")), *flags]
+    environment = {**os.environ, "PIP_DISABLE_PIP_VERSION_CHECK": "1"}
+    done = subprocess.run(words, capture_output=True, text=True, env=environment, timeout=300)
+    assert done.returncode == 0, done.stderr

@@ -12,6 +12,7 @@ import urllib.request
 import pytest
 
 from stillmap.core import errors
+from stillmap.core.extras import install_command
 
 SCREENS = ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")
 
@@ -176,7 +177,7 @@ def test_report_without_the_extra(call, report):
     done = call("view", report)
     assert (done.returncode, done.stdout) == (0, "")
     first, second = done.stderr.splitlines()
-    assert "pip install 'stillmap[viewer]'" in first
+    assert install_command("viewer") in first
     assert str(report / "report.html") in second
 
 

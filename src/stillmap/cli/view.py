@@ -23,8 +23,8 @@ _LAST_PORT = 65_535
 DESCRIPTION = (
     "Show a result in the browser, scan by scan: map, beams, points, surface, "
     "trajectory and moving objects. The page is served to this machine only, until Ctrl-C, and "
-    "requests nothing from outside. It needs `pip install 'stillmap[viewer]'`; without it the "
-    "report is opened. Without a screen, the address is printed."
+    "requests nothing from outside. It needs the extra `viewer`; without it, the command that "
+    "installs it is printed and the report is opened. Without a screen, the address is printed."
 )
 EPILOG = """examples:
   stillmap view out                     map, beams, points, models and objects over time

@@ -5,6 +5,8 @@ from collections.abc import Iterable
 from importlib import import_module
 from typing import Any
 
+from stillmap.core.extras import install_command
+
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f]")
 
 _MAX_LENGTH = 1000  # characters of a message: damaged files may hold long words
@@ -72,5 +74,6 @@ def import_extra(module: str, path: object, action: str = "read", *, group: str 
         return import_module(module)
     except ImportError as error:
         package = module.partition(".")[0]
-        hint = f"pip install 'stillmap[{group}]'"
-        raise MissingExtra(f"needs {package} to be {action}", where=str(path), hint=hint) from error
+        raise MissingExtra(
+            f"needs {package} to be {action}", where=str(path), hint=install_command(group)
+        ) from error

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.errors import InputError
+from stillmap.core.extras import install_command
 from stillmap.core.files import require_regular
 from stillmap.core.grid_map import GridMap
 from stillmap.results.labels import shape_text
@@ -67,7 +68,7 @@ def require_model(result: Path) -> Path:
     """
     path = result / "mesh.glb"
     if not path.is_file():
-        hint = "`stillmap map` makes them of 3D recordings, with pip install 'stillmap[mesh]'"
+        hint = f"`stillmap map` makes them of 3D recordings, with {install_command('mesh')}"
         raise InputError("holds no model", where=str(result), hint=hint)
     return path
 

@@ -15,6 +15,7 @@ import stillmap
 from stillmap.cli.main import main
 from stillmap.core import se2
 from stillmap.core.camera import project
+from stillmap.core.extras import install_command
 from stillmap.io import stillmap_folder
 from stillmap.io.trajectory import poses_from_tum
 from stillmap.mesh.place import assign_views
@@ -202,7 +203,7 @@ def test_without_the_libraries_all_the_rest_is_written(mapped, monkeypatch):
     said = [one for one in record["warnings"] if one.startswith("no models: ")]
     assert len(said) == 1
     assert "needs pyfqmr" in said[0]
-    assert "pip install 'stillmap[mesh]'" in said[0]
+    assert install_command("mesh") in said[0]
     assert (out / "static.ply").exists()
     assert not list(out.glob("**/*.glb"))
 

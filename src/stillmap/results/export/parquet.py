@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.errors import InputError
+from stillmap.core.extras import install_command
 from stillmap.core.files import atomic_file
 from stillmap.core.recording import Recording
 from stillmap.results.folder import Exported
@@ -25,7 +26,7 @@ def require_pyarrow() -> Any:
     try:
         return importlib.import_module("pyarrow.parquet")
     except ImportError as error:
-        hint = "pip install 'stillmap[io]'"
+        hint = install_command("io")
         raise InputError("Parquet needs the package pyarrow", hint=hint) from error
 
 
