@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from stillmap.core.arrays import sample_indices
 from stillmap.core.errors import InputError
 from stillmap.results.points import ply_header
-from stillmap.viewer.display import sample_indices, sample_ply
+from stillmap.viewer.display import sample_ply
 
 
 def test_few_points_are_all_taken():

@@ -3,15 +3,14 @@
 import numpy as np
 import pytest
 
-from stillmap.results.reader import Track
-from stillmap.viewer.tracks import (
-    box_edges,
+from stillmap.results.object_poses import (
     headings,
     interpolate_pose,
     is_present,
     object_poses_at,
-    track_segments,
 )
+from stillmap.results.reader import Track
+from stillmap.viewer.tracks import box_edges, track_segments
 
 NOW = 1_700_000_000_000_000_000
 

@@ -65,6 +65,7 @@ Writable = NDArray[Any] | RowSource
 
 MAX_BYTES_IN_MEMORY = 32 << 20  # of one array; larger ones lie in a file
 BLOCK = 1 << 20  # rows processed at once
+_SAMPLE_SEED = 1
 ITEMS_PER_RELEASE = 500  # items of the size of a 2D scan between two releases of pages
 
 _Item = TypeVar("_Item")
@@ -262,6 +263,17 @@ def finite_rows(points: NDArray[Any]) -> NDArray[np.bool_]:
     for column in points.T[1:]:
         out &= np.isfinite(column)
     return out
+
+
+def sample_indices(count: int, max_count: int) -> NDArray[np.int64]:
+    """Sorted indices (min(count, max_count),) below `count`: a stratified random sample.
+
+    Regular steps would show only some rings of a lidar that fires them in turn. Deterministic.
+    """
+    if count <= max_count:
+        return np.arange(count)
+    at = np.arange(max_count) + np.random.default_rng(_SAMPLE_SEED).random(max_count)
+    return np.minimum((at * (count / max_count)).astype(np.int64), count - 1)
 
 
 def first_index_per_group(group: NDArray[np.int64]) -> NDArray[np.int64]:

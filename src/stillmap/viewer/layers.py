@@ -7,10 +7,11 @@ import numpy as np
 import scipy  # submodules load on first use
 from numpy.typing import NDArray
 
-from stillmap.results import gltf
+from stillmap.core.arrays import sample_indices
+from stillmap.results import gltf, object_poses
+from stillmap.results.colors import BLUE, color_by_id, color_by_p_static
 from stillmap.results.report.renderer import BACKGROUND
-from stillmap.viewer import display, tracks
-from stillmap.viewer.display import sample_indices
+from stillmap.viewer import tracks
 from stillmap.viewer.scene import Scene
 from stillmap.viewer.server import Server
 from stillmap.viewer.tracks import Beams
@@ -99,11 +100,11 @@ class Layers:
             self._draw_beams(scan)
         if self._is_shown("Object models"):
             for node, model in zip(self._models, scene.models, strict=True):
-                node.visible = tracks.is_present(model.track, stamp_ns)
+                node.visible = object_poses.is_present(model.track, stamp_ns)
                 if node.visible:
                     _place(node, model.pose_at(stamp_ns), scene.origin)
         if self._is_shown("Objects") or self._is_shown("Object numbers"):
-            objects = tracks.object_poses_at(scene.tracks, stamp_ns)
+            objects = object_poses.object_poses_at(scene.tracks, stamp_ns)
             self._draw_boxes(objects)
             self._draw_numbers(objects)
 
@@ -152,7 +153,7 @@ class Layers:
         positions = self._scene.poses[:, :3, 3] - self._origin(2)
         use = positions[sample_indices(len(positions), _MAX_TRAJECTORY_POINTS)]
         segments = np.stack([use[:-1], use[1:]], axis=1)
-        self._lines("Robot", segments, np.array(display.BLUE, np.uint8), 2.5)
+        self._lines("Robot", segments, np.array(BLUE, np.uint8), 2.5)
         length = _AXES_SIZE * self._height
         self._robot = self._server.scene.add_frame(
             _path("Robot", "robot"), axes_length=length, axes_radius=0.06 * length
@@ -170,7 +171,7 @@ class Layers:
         ends = view.ends - self._origin(3)
         with self._server.atomic():
             self._ends.points = ends.astype(np.float32)
-            self._ends.colors = display.color_by_p_static(view.p_static)
+            self._ends.colors = color_by_p_static(view.p_static)
         some = ends[sample_indices(len(ends), _MAX_RAYS)]
         begin = np.broadcast_to(view.origin - self._scene.origin, some.shape)
         self._ray.points = np.stack([begin, some], axis=1).astype(np.float32)
@@ -179,9 +180,9 @@ class Layers:
         pieces = np.zeros((1, 2, 3))
         self._box = self._lines("Objects", pieces, np.zeros((1, 2, 3), np.uint8), 2.0)
 
-    def _draw_boxes(self, objects: tracks.ObjectPoses) -> None:
+    def _draw_boxes(self, objects: object_poses.ObjectPoses) -> None:
         lines = tracks.box_edges(objects) - self._origin(2)
-        color = display.color_by_id([self._scene.tracks[n].id for n in objects.track])
+        color = color_by_id([self._scene.tracks[n].id for n in objects.track])
         colors = np.broadcast_to(color[:, None, None], lines.shape)
         with self._server.atomic():
             self._box.points = lines.reshape(-1, 2, 3).astype(np.float32)
@@ -190,7 +191,7 @@ class Layers:
     def _make_tracks(self) -> None:
         segments, index = tracks.track_segments(self._scene.tracks)
         use = sample_indices(len(segments), _MAX_TRACK_SEGMENTS)
-        color = display.color_by_id([self._scene.tracks[n].id for n in index[use]])
+        color = color_by_id([self._scene.tracks[n].id for n in index[use]])
         lines = segments[use] - self._origin(1)
         self._lines("Object tracks", lines, np.repeat(color[:, None], 2, axis=1), 1.5)
 
@@ -205,7 +206,7 @@ class Layers:
             for model in self._scene.models
         ]
 
-    def _draw_numbers(self, objects: tracks.ObjectPoses) -> None:
+    def _draw_numbers(self, objects: object_poses.ObjectPoses) -> None:
         """Show ids as labels; labels are created on demand and reused."""
         count = _MAX_NUMBERS if self._is_shown("Object numbers") else 0
         use = objects.track[:count]

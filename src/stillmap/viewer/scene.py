@@ -17,11 +17,11 @@ from stillmap.io.trajectory import read_tum
 from stillmap.mesh.texture.atlas import GRAY
 from stillmap.pipeline.snapshots import Window
 from stillmap.results import gltf
+from stillmap.results.colors import color_by_height
+from stillmap.results.object_poses import interpolate_pose
 from stillmap.results.reader import Track, read_grid, read_tracks
 from stillmap.results.report.figures import ORANGE, UNKNOWN, draw_map, map_window
-from stillmap.viewer import display
 from stillmap.viewer.display import Points, sample_ply
-from stillmap.viewer.tracks import interpolate_pose
 
 MAX_POINTS = {"static": 500_000, "dynamic": 200_000}
 _MAX_MESH = 512 << 20  # bytes of mesh.glb
@@ -164,7 +164,7 @@ def _cloud(name: str, raw: Points, origin: Float) -> Points:
         colors = np.full((len(raw.points), 3), ORANGE, np.uint8)
         if name == "static" and len(raw.points):
             z = raw.points[:, 2]
-            colors = display.color_by_height(z, *np.quantile(z, [0.02, 0.98]).tolist())
+            colors = color_by_height(z, *np.quantile(z, [0.02, 0.98]).tolist())
     elif name == "dynamic":  # uncolored points; grey would look static
         colors[(colors == GRAY).all(axis=1)] = ORANGE
     return Points((raw.points - origin).astype(np.float32), colors, raw.total)

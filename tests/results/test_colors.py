@@ -1,28 +1,28 @@
-"""Color maps of the viewer."""
+"""Color maps of P(static), heights and ids."""
 
 import numpy as np
 
+from stillmap.results import colors
 from stillmap.results.report.figures import ORANGE
-from stillmap.viewer import display
 
 
 def test_color_by_p_static():
-    shown = display.color_by_p_static(np.array([0.0, 0.5, 1.0], np.float32))
+    shown = colors.color_by_p_static(np.array([0.0, 0.5, 1.0], np.float32))
     assert shown.dtype == np.uint8
     assert shown[0].tolist() == list(ORANGE)
-    assert shown[2].tolist() == list(display.BLUE)
+    assert shown[2].tolist() == list(colors.BLUE)
     assert len(set(shown[1].tolist())) == 1  # grey
 
 
 def test_heights_beyond_the_limits_are_clamped():
-    shown = display.color_by_height(np.array([-9.0, 0.0, 1.0, 2.0, 9.0]), 0.0, 2.0)
+    shown = colors.color_by_height(np.array([-9.0, 0.0, 1.0, 2.0, 9.0]), 0.0, 2.0)
     assert (shown[0] == shown[1]).all()
     assert (shown[3] == shown[4]).all()
     assert len(np.unique(shown, axis=0)) == 3
-    assert (display.color_by_height(np.zeros(2), 0.0, 0.0) == shown[1]).all()
+    assert (colors.color_by_height(np.zeros(2), 0.0, 0.0) == shown[1]).all()
 
 
 def test_colors_of_successive_ids_differ():
-    shown = display.color_by_id(range(40)).astype(int)
+    shown = colors.color_by_id(range(40)).astype(int)
     assert np.abs(np.diff(shown, axis=0)).sum(axis=1).min() > 100
-    assert display.color_by_id([]).shape == (0, 3)
+    assert colors.color_by_id([]).shape == (0, 3)

@@ -1,0 +1,49 @@
+"""Color maps: (n, 3) uint8 RGB of P(static), heights and ids."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.results.report.figures import ORANGE
+
+Colors = NDArray[np.uint8]
+
+BLUE = (36, 99, 168)  # static, and the robot's trajectory; ORANGE is dynamic
+
+# at P(static) = 0, 0.5, 1; distinguishable to color-blind readers
+_P_STATIC_COLORS = (ORANGE, (205, 205, 205), BLUE)
+
+_HEIGHT_COLORS = ((40, 53, 90), (45, 96, 130), (60, 140, 132), (122, 178, 106), (214, 196, 96))
+
+_HUE_STEP = 0.618034  # of the circle, from one id to the next, so that neighbors differ
+
+
+def color_by_p_static(p_static: NDArray[np.float32]) -> Colors:
+    """Orange (dynamic) over grey to blue (static) for P(static) (n,)."""
+    return _interpolate_colors(_P_STATIC_COLORS, np.asarray(p_static, np.float64))
+
+
+def color_by_height(z: NDArray[np.floating], low: float, high: float) -> Colors:
+    """Dark blue at `low` to yellow at `high`, for heights z (n,) in m."""
+    return _interpolate_colors(
+        _HEIGHT_COLORS, (np.asarray(z, np.float64) - low) / max(high - low, 1e-9)
+    )
+
+
+def color_by_id(number: NDArray[np.intp] | Sequence[int]) -> Colors:
+    """A color for each id (n,)."""
+    hue = np.mod(np.asarray(number, np.float64) * _HUE_STEP + 0.05, 1.0)
+    # a cosine per channel, a third of the circle apart
+    level = np.cos(2.0 * np.pi * (hue[:, None] - np.array([0.0, 1.0, 2.0]) / 3.0))
+    return np.rint(120.0 + 105.0 * level).astype(np.uint8)
+
+
+def _interpolate_colors(
+    stops: Sequence[tuple[int, int, int]], share: NDArray[np.float64]
+) -> Colors:
+    """Linear interpolation between evenly spaced colors over 0 to 1."""
+    at = np.linspace(0.0, 1.0, len(stops))
+    columns = [np.interp(share, at, column) for column in np.array(stops, np.float64).T]
+    colors: NDArray[np.float64] = np.stack(columns, axis=-1)
+    return np.rint(colors).astype(np.uint8)
