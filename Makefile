@@ -2,6 +2,8 @@
 #   make demo    simulate a populated hall, map it, say where the result lies
 #   make test    build and test (about 6 minutes on 2 cores)
 #   make lint    style, types, formatting
+#   make docs    the documentation site, into build/site; warnings are errors
+#   make pictures  the pictures of README.md and of the documentation, from simulated data
 #   make fuzz    files changed for every reader, a minute each (FUZZ_SECONDS)
 #   make check   lint and test, then what takes longer: slow tests, real recordings, packages,
 #                the kernels under sanitizers, fuzzing
@@ -25,10 +27,10 @@ export PYTHONNOUSERSITE := 1
 unexport PYTHONPATH PYTHONHOME
 
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-slow test-models lint stub sanitize fuzz check format clean
+.PHONY: help demo test test-slow test-models lint docs pictures stub sanitize fuzz check format clean
 
 help:
-	@sed -n 's/^#  *//p' Makefile | sed -n '1,9p'
+	@sed -n 's/^#  *//p' Makefile | sed -n '1,11p'
 
 # The user's way: an isolated build. `make test` installs over it.
 $(VENV)/installed: $(VENV)/created $(SOURCES)
@@ -98,6 +100,21 @@ lint: $(VENV)/tested
 	$(BIN)/python -m ruff format --check .
 	$(BIN)/python -m mypy
 	find cpp -name '*.[ch]pp' -print0 | xargs -0 $(BIN)/clang-format --dry-run --Werror
+
+$(VENV)/site: $(VENV)/tested
+	@echo "installing what builds the documentation into $(VENV)"
+	@$(BIN)/python tools/requirements.py docs | $(PIP) install -r /dev/stdin
+	@touch $@
+
+# the tests then look for anything that the pages would fetch from outside
+docs: $(VENV)/site
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+	$(BIN)/python -m pytest tests/packaging/test_site.py
+	@echo "documentation  build/site/index.html"
+
+pictures: $(VENV)/tested
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python docs/figures/make_pictures.py
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python docs/figures/make_figures.py
 
 format: $(VENV)/tools
 	$(BIN)/python -m ruff check --fix .

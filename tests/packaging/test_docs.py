@@ -3,6 +3,7 @@
 import ast
 import importlib
 import re
+import runpy
 from pathlib import Path
 
 import pytest
@@ -49,3 +50,9 @@ def test_options_exist(page):
 def test_options_are_found():
     text = (ROOT / "README.md").read_text()
     assert "em.prior" in re.findall(rf"{SECTIONS}\.[a-z_]+", text)
+
+
+def test_table_of_options_is_the_present_one():
+    script = runpy.run_path(str(ROOT / "docs" / "site" / "options_page.py"))
+    page = (ROOT / "docs" / "options.md").read_text()
+    assert page == script["render_page"](), "run: python docs/site/options_page.py"

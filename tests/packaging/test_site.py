@@ -1,0 +1,72 @@
+"""The documentation site, where `make docs` has built it: it asks for nothing from outside."""
+
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+SITE = Path(__file__).resolve().parents[2] / "build" / "site"
+pytestmark = pytest.mark.skipif(not SITE.is_dir(), reason="`make docs` has not built the site")
+OUTSIDE = re.compile(r"\s*(?:[a-z]+:)?//", re.IGNORECASE)
+
+
+class Resources(HTMLParser):
+    """Addresses that a browser fetches by itself: scripts, styles, images, fonts, frames."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.addresses: list[str] = []
+
+    def handle_starttag(self, tag, attrs):
+        named = dict(attrs)
+        if tag == "link" and named.get("rel") in ("canonical", "next", "prev"):
+            return
+        names = ("href",) if tag == "link" else ("src", "srcset", "data", "poster")
+        if tag != "a":
+            self.addresses += [named[name] for name in names if named.get(name)]
+        self.addresses += styles_of(named.get("style") or "")
+
+
+def styles_of(css):
+    return re.findall(r"(?:url\(|@import)\s*['\"]?([^'\")]+)", css)
+
+
+def resources_of(html):
+    parser = Resources()
+    parser.feed(html)
+    return [*parser.addresses, *styles_of(" ".join(re.findall(r"<style.*?</style>", html, re.S)))]
+
+
+def test_parser_finds_every_kind():
+    html = """<link rel=stylesheet href=//a/x.css><script src="https://b/x.js"></script>
+    <img srcset='http://c/x.png'><p style="background: url(http://d/x.png)">
+    <style>@import 'http://e/x.css';</style><a href="http://f">kept</a>"""
+    found = [address for address in resources_of(html) if OUTSIDE.match(address)]
+    assert len(found) == 5
+
+
+def test_pages_load_nothing_from_outside():
+    pages = sorted(SITE.rglob("*.html"))
+    assert len(pages) > 50
+    outside = {
+        f"{page.relative_to(SITE)}: {address}"
+        for page in pages
+        for address in resources_of(page.read_text("utf-8"))
+        if OUTSIDE.match(address)
+    }
+    assert outside == set()
+
+
+def test_styles_load_nothing_from_outside():
+    sheets = sorted(SITE.rglob("*.css"))
+    assert sheets
+    for sheet in sheets:
+        outside = [a for a in styles_of(sheet.read_text("utf-8")) if OUTSIDE.match(a)]
+        assert outside == [], sheet
+
+
+def test_api_pages_show_docstrings():
+    api = (SITE / "api" / "recordings.html").read_text("utf-8")
+    assert 'id="stillmap.Recording"' in api
+    assert "end points in the sensor frame" in api
