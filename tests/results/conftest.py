@@ -10,6 +10,7 @@ from stillmap.core.recording import Recording
 from stillmap.core.se2 import inverse, matrix
 from stillmap.em import Coverage
 from stillmap.pipeline.options import OutputOptions
+from stillmap.pipeline.quality import Quality
 from stillmap.pipeline.snapshots import choose_window, extent, snapshot
 from stillmap.slam import BareStretch, Diagnostics
 from stillmap.slam.mount_calibration import Calibration
@@ -101,6 +102,7 @@ class FakeResult:
     graph: PoseGraph | None = None
     doubts: Diagnostics = field(default_factory=Diagnostics)
     calibration: Calibration = field(default_factory=Calibration)
+    quality: Quality = field(default_factory=Quality)
 
     @property
     def deskewed(self) -> Recording:

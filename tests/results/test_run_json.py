@@ -35,6 +35,7 @@ def test_the_keys_that_scripts_rely_on(tmp_path, result):
         "counts",
         "area",
         "warnings",
+        "quality",
         "learned",
         "calibration",
         "doubts",

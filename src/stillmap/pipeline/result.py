@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import em, slam
-from stillmap.core.parallel import limit_blas_threads
+from stillmap.core.parallel import limit_blas_threads, resolve_threads
 from stillmap.core.profiling import Progress, StageTimer, no_progress
 from stillmap.core.recording import Recording
 from stillmap.mapping import Change
@@ -21,6 +21,7 @@ from stillmap.pipeline.estimate import EmState, Estimate, IterationRecord
 from stillmap.pipeline.final_map import Maps, final_estimate, find_objects, make_maps
 from stillmap.pipeline.options import DEFAULTS, Options, resolve_options
 from stillmap.pipeline.pose_sources import better_source
+from stillmap.pipeline.quality import Quality, rate_quality
 from stillmap.pipeline.snapshots import Snapshot
 from stillmap.slam.mount_calibration import Calibration
 from stillmap.tracking import FlowMap, MovingObject, compute_flow_map
@@ -46,6 +47,7 @@ class MappingResult:
         changes: places where something appeared, disappeared, or comes and goes.
         stages: seconds and peak memory.
         calibration: poses of the lasers and errors of odometry, as the motion shows them.
+        quality: of labels and geometry, from 0 to 100.
     """
 
     recording: Recording
@@ -61,6 +63,7 @@ class MappingResult:
     changes: list[Change]
     stages: Mapping[str, Mapping[str, Any]]
     calibration: Calibration = field(default_factory=Calibration)
+    quality: Quality = field(default_factory=Quality)
 
     @property
     def poses(self) -> Float:
@@ -210,6 +213,10 @@ def _finish(
     with stages.measure("objects"):
         objects = find_objects(deskewed, estimate, maps, changes, options)
         crossings = compute_flow_map(objects)
+    progress("rating the map", 0, 0, 0)
+    with stages.measure("quality"):
+        threads = resolve_threads(options.threads)
+        quality = rate_quality(deskewed, estimate.poses, estimate.p_static, threads)
         del deskewed
     return MappingResult(
         recording=recording,
@@ -224,4 +231,5 @@ def _finish(
         traffic=crossings,
         changes=changes,
         stages=stages.to_dict(),
+        quality=quality,
     )

@@ -1,5 +1,6 @@
 """A result folder opened again: its `run.json`, its recording and its labels."""
 
+import dataclasses
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ from stillmap.io import read
 from stillmap.io.text_lines import Progress
 from stillmap.io.trajectory import poses_from_tum
 from stillmap.mesh.options import MeshOptions
+from stillmap.pipeline.quality import Quality
 from stillmap.preprocessing.options import ReadOptions
 from stillmap.results.labels import Labels, read_labels
 from stillmap.results.reader import Grid, Track, read_grid, read_tracks
@@ -85,6 +87,19 @@ class ResultFolder:
         """JPEG quality of the texture pages; the default where the record does not have it."""
         quality = (self._section("mesh") or {}).get("texture_quality")
         return self._override(MeshOptions(), {"texture_quality": quality}).texture_quality
+
+    @property
+    def quality(self) -> Quality:
+        """How good the result is; unknown where the record does not say so."""
+        told = self.record.get("quality")
+        parts = told if isinstance(told, dict) else {}
+        return Quality(
+            **{
+                part.name: float(value)
+                for part in dataclasses.fields(Quality)
+                if isinstance(value := parts.get(part.name), int | float)
+            }
+        )
 
     def _section(self, name: str) -> dict[str, Any] | None:
         """A section of the options in the record; None where there is none."""

@@ -1,5 +1,6 @@
 """`run.json`: the input, the resolved options, the iterations, counts, times and warnings."""
 
+import dataclasses
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -51,6 +52,7 @@ def run_record(result: MappingResult, more: Mapping[str, Any] | None = None) -> 
         "counts": counts,
         "area": known_area(result),
         "warnings": list(result.warnings),
+        "quality": dataclasses.asdict(result.quality),
         "learned": result.learned,
         "calibration": _calibration(result.calibration),
         "doubts": {

@@ -1,0 +1,123 @@
+"""Agreement of the surfaces that one place shows on different visits, without truth.
+
+Returns are grouped by cube of a fixed size in metres and by stretch of travel. Where two stretches
+show a plane (in 2D a line) in the same cube, its displacement across the surface is what the poses
+of the two stretches contradict each other by. `docs/quality.md` has the definition.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.chunks import iter_beams
+from stillmap.core.recording import Recording
+from stillmap.slam.local_map import travelled_distance
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+CELL = 0.5  # m, edge of a cube: smaller than rooms, larger than the noise of any sensor
+STRETCH = 4.0  # m of travel that count as one visit
+_MIN_RETURNS = 6  # of one visit on a surface
+_MIN_EXTENT = 0.06  # m, standard deviation of them along the surface
+_MAX_FLATNESS = 0.1  # ratio of the variances across and along, up to which it is flat
+_MIN_COSINE = 0.8  # of the angle between two surfaces that are held for the same one
+_MAX_RETURNS = 2_000_000  # of all scans; of longer recordings, every so many scans are used
+
+
+class Displacements(NamedTuple):
+    """Displacements of K pairs of surface patches.
+
+    Attributes:
+        across: (K,) metres across the surface.
+        stretches: (K,) stretches of travel between the two visits, at least 1.
+        weight: (K,) returns of the patch with fewer.
+        scan: (K, 2) a scan of either visit.
+    """
+
+    across: Float
+    stretches: Index
+    weight: Index
+    scan: Index
+
+
+class _Patches(NamedTuple):
+    """Planar patches, sorted by cube and then by stretch of travel."""
+
+    cube: Index
+    stretch: Index
+    returns: Index
+    mean: Float
+    normal: Float
+    scan: Index
+
+
+def measure_displacements(recording: Recording, poses: Float) -> Displacements:
+    """Displacements of all pairs of successive visits of a surface.
+
+    Args:
+        recording: 2D or 3D, deskewed.
+        poses: (T, D+1, D+1) T_map_base.
+    """
+    patches = _fit_patches(*_collect_returns(recording, poses))
+    first = np.flatnonzero(patches.cube[:-1] == patches.cube[1:])
+    second = first + 1
+    cosine = np.abs(np.sum(patches.normal[first] * patches.normal[second], axis=1))
+    first, second = first[cosine > _MIN_COSINE], second[cosine > _MIN_COSINE]
+    step = patches.mean[second] - patches.mean[first]
+    return Displacements(
+        np.abs(np.sum(step * patches.normal[first], axis=1)),
+        patches.stretch[second] - patches.stretch[first],
+        np.minimum(patches.returns[first], patches.returns[second]),
+        np.stack([patches.scan[first], patches.scan[second]], axis=1),
+    )
+
+
+def _collect_returns(recording: Recording, poses: Float) -> tuple[Float, Index, Index]:
+    """End points (N, D) in the map, their stretches of travel and their scans (N,)."""
+    stretch = (travelled_distance(poses) / STRETCH).astype(np.int64)
+    every = max(1, -(-recording.n_beams // _MAX_RETURNS))
+    points, scans = [], []
+    for some, _, (ends, hit, offset, T) in iter_beams(recording, poses):
+        scan = np.repeat(np.arange(some.start, some.stop), np.diff(offset))
+        used = hit & (scan % every == 0)
+        scan, T_used = scan[used], T[scan[used] - some.start]
+        local = ends[used].astype(np.float64)
+        points.append(np.einsum("nij,nj->ni", T_used[:, :-1, :-1], local) + T_used[:, :-1, -1])
+        scans.append(scan)
+    scan = np.concatenate(scans)
+    return np.concatenate(points), stretch[scan], scan
+
+
+def _fit_patches(points: Float, stretch: Index, scan: Index) -> _Patches:
+    """The planar patches among the returns of each cube and stretch."""
+    D = points.shape[1]
+    cubes = np.floor(points / CELL).astype(np.int64)
+    keys = np.column_stack([cubes, stretch])
+    order = np.lexsort(keys.T[::-1])
+    keys, points, scan = keys[order], points[order], scan[order]
+    is_first = np.ones(len(keys), np.bool_)
+    is_first[1:] = np.any(keys[1:] != keys[:-1], axis=1)
+    start = np.flatnonzero(is_first)
+    if not len(start):
+        none, flat = np.empty(0, np.int64), np.empty((0, D))
+        return _Patches(none, none, none, flat, flat, none)
+    count = np.diff(np.append(start, len(keys)))
+    local = points - (keys[:, :D] + 0.5) * CELL  # small numbers: squares lose no digits
+    mean = np.add.reduceat(local, start) / count[:, None]
+    products = local[:, :, None] * local[:, None, :]
+    covariance = np.add.reduceat(products, start) / count[:, None, None]
+    covariance -= mean[:, :, None] * mean[:, None, :]
+    variance, axes = np.linalg.eigh(covariance)
+    is_flat = (count >= _MIN_RETURNS) & (variance[:, 1] > _MIN_EXTENT**2)
+    is_flat &= variance[:, 0] < _MAX_FLATNESS * variance[:, 1]
+    cube = np.cumsum(np.any(np.diff(keys[start, :D], axis=0, prepend=keys[:1, :D]) != 0, axis=1))
+    return _Patches(
+        cube[is_flat],
+        keys[start, D][is_flat],
+        count[is_flat],
+        (mean + (keys[start, :D] + 0.5) * CELL)[is_flat],
+        axes[is_flat, :, 0],
+        scan[start][is_flat],
+    )

@@ -1,0 +1,104 @@
+"""Quality of a result without truth: it falls with bent poses and with wrong labels."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+import stillmap
+from stillmap.core import se2
+from stillmap.core.config import override
+from stillmap.pipeline.options import Options
+from stillmap.pipeline.quality import Quality, describe_quality, rate_quality
+from stillmap.results.folder import open_result
+from stillmap.sim import scene_by_name, simulate
+
+
+@pytest.fixture(scope="module")
+def run():
+    """An office with true poses and labels."""
+    scene = scene_by_name("office", {"robot": {"scans": 300, "scan_rate": 1.0}})
+    return simulate(scene, 0)
+
+
+def rated(run, poses=None, p_static=None, threads=1):
+    truth = run.truth
+    poses = truth.T_world_base if poses is None else poses
+    p_static = truth.static.astype(np.float32) if p_static is None else p_static
+    return rate_quality(run.recording, poses, p_static, threads)
+
+
+def test_true_poses_and_labels_are_good(run):
+    quality = rated(run)
+    assert quality.geometry > 70.0
+    assert quality.labels > 40.0
+    assert min(quality.labels, quality.geometry) <= quality.overall
+    assert quality.overall <= max(quality.labels, quality.geometry)
+
+
+def test_bent_poses_lower_geometry(run):
+    truth = run.truth.T_world_base
+    figures = [rated(run).geometry]
+    for drift in (0.002, 0.01):  # rad for each scan
+        bend = se2.matrix(*np.zeros((2, len(truth))), drift * np.arange(len(truth)))
+        figures.append(rated(run, bend @ truth).geometry)
+    assert figures[0] > figures[1] + 10.0 > figures[2] + 15.0
+
+
+def test_wrong_labels_lower_labels_and_leave_geometry(run):
+    rng = np.random.default_rng(0)
+    static = run.truth.static
+    figures = [rated(run)]
+    for share in (0.1, 0.5):
+        wrong = static ^ (rng.random(len(static)) < share)
+        figures.append(rated(run, p_static=wrong.astype(np.float32)))
+    labels = [quality.labels for quality in figures]
+    assert labels[0] > labels[1] + 10.0 > labels[2] + 15.0
+    assert len({quality.geometry for quality in figures}) == 1
+
+
+def test_does_not_depend_on_the_number_of_threads(run):
+    assert rated(run, threads=1) == rated(run, threads=4)
+
+
+def test_of_one_scan_nothing_can_be_told(run):
+    recording = dataclasses.replace(
+        run.recording,
+        stamp_ns=run.recording.stamp_ns[:1],
+        offset=run.recording.offset[:2],
+        points=run.recording.points[run.recording.beams_of(0)],
+        hit=run.recording.hit[run.recording.beams_of(0)],
+        sensor=run.recording.sensor[:1],
+        T_odom_base=None,
+    )
+    quality = rate_quality(recording, np.eye(3)[None], np.ones(recording.n_beams, np.float32))
+    assert quality.geometry is None
+    assert quality.overall is None
+    assert describe_quality(quality).geometry == "geometry: cannot be told from this recording"
+
+
+@pytest.mark.parametrize("estimator", ["stillmap", "hit-ratio"])
+def test_run_json_has_it_and_it_is_read_again(room, tmp_path, estimator):
+    options = override(Options(), {"estimator": estimator, "threads": 1})
+    result = stillmap.build(room.recording, options)
+    assert 0.0 <= result.quality.labels <= 100.0
+    result.save(tmp_path / "out")
+    written = json.loads((tmp_path / "out" / "run.json").read_text())["quality"]
+    assert written == dataclasses.asdict(result.quality)
+    assert open_result(tmp_path / "out", "elsewhere").quality == result.quality
+
+
+@pytest.mark.parametrize("value", [100.0, 85.0, 61.0, 42.0, 3.0, 0.0])
+def test_every_figure_has_words(value):
+    text = describe_quality(Quality(value, value, value))
+    lines = [text.overall, text.labels, text.geometry]
+    assert [line.split(": ")[0] for line in lines] == [
+        f"{name} {value:.0f} of 100" for name in ("overall", "labels", "geometry")
+    ]
+
+
+def test_words_differ_between_good_and_bad():
+    good, bad = describe_quality(Quality(90.0, 90.0, 90.0)), describe_quality(Quality(9, 9, 9))
+    assert good.geometry.split(": ")[1] != bad.geometry.split(": ")[1]
+    assert good.labels.split(": ")[1] != bad.labels.split(": ")[1]
