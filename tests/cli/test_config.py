@@ -171,7 +171,7 @@ def test_unknown_option_suggests_the_nearest(capsys, tmp_path, key, nearest):
         (("--set", "em.prior=high"), ("--set: ", "em.prior", "'high'")),
         (("--set", "em.time_bin=0"), ("--set: ", "'em.time_bin' must be 0.01 to 3600, got 0")),
         (("--set", "em.time_bin=nan"), ("--set: ", "em.time_bin", "finite")),
-        (("--set", "em.p_detection=1"), ("--set: ", "em.p_detection", "0.5 to 0.9999")),
+        (("--set", "em.label_tolerance=2"), ("--set: ", "em.label_tolerance", "0 to 1")),
         (("--set", "em.held_out=1"), ("--set: ", "em.held_out", "0, or at least 2")),
         (("--set", "em.change_detection=perhaps"), ("--set: ", "em.change_detection", "bool")),
         (("--set", "output.map_state=first"), ("--set: ", "output.map_state", "majority")),

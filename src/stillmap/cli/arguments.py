@@ -15,15 +15,17 @@ if TYPE_CHECKING:
     from stillmap.preprocessing.options import ReadOptions
 
 _FLAGS = (
-    *("min_range", "max_range", "zero_means", "spin", "cameras"),
+    *("min_range", "max_range", "zero_means", "spin", "cameras", "start", "end"),
     *("base_frame", "odom_frame"),
 )
 
 _LASERS = {"laser": "first", "laser2": "second"}  # flags and options begin with the name
 
 
-def add_read_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags for reading a recording to a command."""
+def add_read_flags(
+    parser: argparse.ArgumentParser, end_flags: tuple[str, ...] = ("--to", "--until")
+) -> None:
+    """Add the flags for reading a recording to a command; `end_flags` name the end of its part."""
     group = parser.add_argument_group("reading the recording")
     group.add_argument(
         "--min-range",
@@ -64,6 +66,7 @@ def add_read_flags(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--odom-frame", metavar="FRAME", help="odometry frame of a bag (default: detected)"
     )
+    _add_time_flags(group, end_flags)
     for laser, which in _LASERS.items():
         group.add_argument(
             f"--{laser}-offset",
@@ -83,6 +86,33 @@ def add_read_flags(parser: argparse.ArgumentParser) -> None:
             metavar="DEG",
             help=f"field of view of the {which} laser in FLASER and RLASER lines (default: 180)",
         )
+
+
+def _add_time_flags(group: argparse._ArgumentGroup, end_flags: tuple[str, ...]) -> None:
+    group.add_argument(
+        "--from",
+        dest="start",
+        type=_parse_seconds,
+        metavar="S",
+        help="leave out scans before S: seconds from the first scan, from 1e8 on a stamp",
+    )
+    group.add_argument(
+        *end_flags,
+        dest="end",
+        type=_parse_seconds,
+        metavar="S",
+        help="leave out scans after S, likewise",
+    )
+
+
+def _parse_seconds(text: str) -> float:
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not 0.0 <= seconds < math.inf:
+        raise argparse.ArgumentTypeError(f"wants seconds from 0 on, got '{text}'")
+    return seconds
 
 
 def read_changes(args: argparse.Namespace) -> dict[str, Any]:

@@ -35,6 +35,7 @@ DESCRIPTION = (
 EPILOG = """examples:
   stillmap convert log.clf.gz -o log.bag      for ROS 1
   stillmap convert log.bag -o log --to ros2   a folder for ROS 2
+  stillmap convert log.bag -o part.bag --from 60 --until 120    a minute of it
   stillmap convert out -o out.mcap            a 2D result for Foxglove
   stillmap convert out -o beams.parquet       every beam of a 2D result with its label
   stillmap convert out -o static.laz --only static    static points of a 3D result
@@ -57,7 +58,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     )
     p.add_argument("--overwrite", action="store_true", help="replace what is there")
     p.add_argument("--quiet", action="store_true", help="no summary")
-    add_read_flags(p)
+    add_read_flags(p, end_flags=("--until",))  # --to is the format
 
 
 _PARQUET = ".parquet"

@@ -160,6 +160,8 @@ def _write(
         stillmap_folder.write(dataclasses.replace(recording, hit=hit), output, overwrite=overwrite)
         return 0, []
     if form == "CARMEN log":
-        return filtered_log.write_filtered_log(source, output, recording, blank), []
+        return filtered_log.write_filtered_log(
+            source, output, recording, blank, result.read_options
+        ), []
     hint = "`stillmap convert` writes it in a format that can be"
     raise InputError(f"a {form} cannot be written again", where=str(source), hint=hint)

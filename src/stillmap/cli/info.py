@@ -71,6 +71,8 @@ def _format_summary(found: dict[str, Any]) -> Iterator[str]:
             "min {min:.2f}, median {median:.2f}, 99 % {p99:.2f}, max {max:.2f} m".format(**spread),
         )
     yield from _format_time(found["time"])
+    if found["part"]:
+        yield _row("part", _format_part(found["part"]))
     if found["beam_times_s"] is not None:
         first, last = found["beam_times_s"]
         how = f", as it turns {found['spin']}" if found["spin"] else ""
@@ -94,6 +96,17 @@ def _format_time(time: dict[str, Any]) -> Iterator[str]:
     gap = f", largest gap {time['largest_gap_s']:.2f} s" if time["largest_gap_s"] else ""
     yield _row("duration", f"{time['duration_s']:.2f} s{rate}{gap}")
     yield _row("stamps", f"{first} to {last}")
+
+
+def _format_part(part: dict[str, Any]) -> str:
+    """What the time window leaves out of a recording."""
+    from stillmap.core.timestamps import format_seconds
+
+    first, last = part.get("first_stamp_ns"), part.get("last_stamp_ns")
+    if not isinstance(first, int) or not isinstance(last, int):
+        return "of a longer recording"
+    stamps = f"stamps {format_seconds(first)} to {format_seconds(last)}"
+    return f"of {(last - first) / 1e9:.2f} s, {stamps}; {part.get('omitted')} scans left out"
 
 
 def _format_odometry(odometry: dict[str, Any] | None) -> Iterator[str]:

@@ -23,6 +23,8 @@ from stillmap.pipeline.checkpoint_files import identify_run
 from stillmap.pipeline.estimate import EmState
 from stillmap.pipeline.options import Options, resolve_options
 from stillmap.preprocessing.options import ReadOptions
+from stillmap.preprocessing.overrides import select_time
+from stillmap.preprocessing.time_window import TimeWindow
 from stillmap.results.result import Result, build
 
 if TYPE_CHECKING:
@@ -134,19 +136,22 @@ def _read_tilting_laser(
     if planar.dimension != 2:
         what = "the planar laser decides which objects move, but this recording is 3D"
         raise InputError(what, where=planar_path)
+    # the part to be mapped counts from the start of the planar recording
+    whole = dataclasses.replace(options.read, start=None, end=None)
     if topic is not None:
         base_frame = planar.source.get("base_frame") or None
-        read_as = dataclasses.replace(
-            options.read, topic=topic, tilting_topic=None, base_frame=base_frame
-        )
+        read_as = dataclasses.replace(whole, topic=topic, tilting_topic=None, base_frame=base_frame)
         tilting = _read_topic(Path(planar_path), read_as, progress, scratch)
     else:
         # a topic chosen for INPUT is not in the other recording
-        read_as = dataclasses.replace(options.read, topic=None)
+        read_as = dataclasses.replace(whole, topic=None)
         tilting = read(Path(str(tilting_path)), read_as, progress=progress, scratch=scratch)
     from stillmap.rig.build import check_rig  # only a rig needs it
 
     path = tilting_path or planar_path
+    if "part" in planar.source:
+        origin_ns = planar.source["part"]["first_stamp_ns"]
+        tilting = select_time(tilting, TimeWindow(options.read, origin_ns), path)
     check_rig(planar, tilting, path)
     return dataclasses.replace(tilting, source={**tilting.source, "path": path})
 
@@ -249,4 +254,4 @@ def _map_tilting_laser(result: Result, tilting: Recording, options: Options) -> 
 
     planar = PlanarResult(result.deskewed, result.poses, result.p_static, result.objects)
     threads = resolve_threads(options.threads)
-    return build_tilting(planar, tilting, options.rig, options.objects, options.em, threads)
+    return build_tilting(planar, tilting, options.rig, options.em, threads)

@@ -38,6 +38,7 @@ def summarize_recording(recording: Recording) -> dict[str, Any]:
         "counts": _count_beams(recording),
         "hit_ranges_m": _quantiles(_sample_hit_ranges(recording), ("min", "median", "p99", "max")),
         "time": _summarize_time(recording.stamp_ns),
+        "part": source["part"],
         "beam_times_s": _beam_time_range(recording.beam_time),
         "spin": source["spin"].get("direction"),
         "odometry": _summarize_odometry(recording, source["odometry"]),
@@ -51,7 +52,7 @@ def summarize_recording(recording: Recording) -> dict[str, Any]:
 
 def _read_notes(source: dict[str, Any]) -> dict[str, Any]:
     """Notes of the reader by key; those of unexpected type (other writers) are dropped."""
-    tables = {key: source.get(key) for key in (*_DAMAGE, *_TABLES, "odometry", "spin")}
+    tables = {key: source.get(key) for key in (*_DAMAGE, *_TABLES, "odometry", "spin", "part")}
     notes: dict[str, Any] = {k: v if isinstance(v, dict) else {} for k, v in tables.items()}
     lists = {key: source.get(key) for key in (*_LISTS, "sensors", "self_filter")}
     notes.update({k: v if isinstance(v, list) else [] for k, v in lists.items()})

@@ -16,6 +16,7 @@ from stillmap.core.recording import Recording
 from stillmap.em.mixture import fit_weights, posterior
 from stillmap.em.observations import (
     HALF_TIME_RHO,
+    P_DETECTION,
     Observations,
     Rows,
     SurfelMap,
@@ -87,9 +88,7 @@ class CellHistories(ChangedCells):
         return np.asarray(np.minimum(p, 1.0), np.float32)
 
 
-def change_parameters(
-    recording: Recording, options: EmOptions, with_paths: bool = True
-) -> dict[str, Any]:
+def change_parameters(recording: Recording, with_paths: bool = True) -> dict[str, Any]:
     """Parameters of the change HMM; see `collect_observations`.
 
     Without paths only its likelihood is computed, which `label_surfels` needs.
@@ -100,7 +99,7 @@ def change_parameters(
         "tau": 0.5 * duration,  # the mean duration of a state is 2 tau
         "passer_by_rho": _PASSER_BY_RHO,
         "passer_by_tau": _PASSER_BY_TAU,
-        "p_detection": options.p_detection,
+        "p_detection": P_DETECTION,
         "with_paths": with_paths,
     }
 

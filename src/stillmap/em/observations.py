@@ -23,6 +23,9 @@ OccupancyHmm = _core.OccupancyHmm2D | _core.OccupancyHmm3D
 Rows = tuple[int, int, int]  # first, last + 1 and step of some surfels
 
 HALF_TIME_RHO = 0.5  # of classes for what comes and goes, as doors do
+# P(observed as occupied | occupied): lower values forgive more misses, and keep what has left; with
+# higher ones a few grazing beams open a wall
+P_DETECTION = 0.97
 MAX_RANGE_MARGIN = 0.3  # m, end of a maximum-range beam that is not used as free space
 
 # multiples of the noise of end points, to which a part of the cell is added
@@ -225,7 +228,7 @@ def make_hmm(
         rho=rho,
         tau=tau,
         view_angle=view_angle,
-        p_detection=options.p_detection,
+        p_detection=P_DETECTION,
         bin_seconds=options.time_bin,
         lateral_std=max(_LATERAL * noise_std, _MIN_LATERAL * cell),
         margin=_MARGIN * noise_std + 0.5 * cell,

@@ -87,7 +87,7 @@ def e_step_3d(
     if not options.change_detection:
         return e_step(recording, poses, resolution, options, threads)
 
-    changes = change_parameters(recording, options, with_paths=options.change_detection_3d)
+    changes = change_parameters(recording, with_paths=options.change_detection_3d)
     observations = collect_observations(
         recording, poses, resolution, options, threads, _CLASSES_3D, changes
     )
@@ -123,7 +123,7 @@ def final_e_step(
     Returns:
         labels; histories of the same cells, None without `change_detection`.
     """
-    changes = change_parameters(recording, options) if options.change_detection else None
+    changes = change_parameters(recording) if options.change_detection else None
     observations = collect_observations(
         recording, poses, resolution, options, threads, _FINAL_CLASSES, changes
     )

@@ -39,9 +39,6 @@ class EmOptions(Section, section="em"):
         ge=0.01,
         le=3600.0,
     )
-    p_detection: float = option(
-        0.97, "Probability that an occupied cell is observed as occupied.", ge=0.5, le=0.9999
-    )
     change_detection: bool = option(
         True,
         "Detect places where something was put down, taken away or moved, and show one of their "

@@ -61,7 +61,12 @@ def _is_stillmap_folder(path: Path, start: bytes | None) -> bool:
 
 def _read_stillmap_folder(path: Path, context: ReadContext) -> Recording:
     folder = path if path.is_dir() else path.parent
-    return apply_options(stillmap_folder.read(folder), context.options)
+    recording = stillmap_folder.read(folder)
+    try:
+        return apply_options(recording, context.options)
+    except InputError as error:
+        where = error.where or str(path)
+        raise InputError(error.what, where=where, hint=error.hint) from error
 
 
 def _is_kitti_folder(path: Path, start: bytes | None) -> bool:

@@ -12,6 +12,8 @@ MAX_PLAUSIBLE_RANGE = 1000.0
 
 MAX_POINT_DISTANCE = 1e5  # m: beyond the reach of any sensor; damaged files hold such numbers
 
+MAX_TIME = 9e9  # s: int64 holds 9.22e9 s in nanoseconds
+
 _FULL_TURN = 2.0 * math.pi + 1e-6  # rad
 
 
@@ -108,6 +110,16 @@ class ReadOptions(Section, section="read"):
     )
     laser2_fov: float | None = option(
         None, "Field of view of the second laser, in radians.", gt=0.0, lt=_FULL_TURN
+    )
+    start: float | None = option(
+        None,
+        "Leave out scans before this time, in seconds from the first scan; from 1e8 on a stamp in "
+        "seconds; unset: none.",
+        ge=0.0,
+        le=MAX_TIME,
+    )
+    end: float | None = option(
+        None, "Leave out scans after this time, likewise; unset: none.", ge=0.0, le=MAX_TIME
     )
     cameras: str | None = option(
         None, "TOML file with camera calibrations that the recording lacks, and further images."

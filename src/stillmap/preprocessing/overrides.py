@@ -9,18 +9,19 @@ from stillmap.core import arrays, se2
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.preprocessing.options import LaserOptions, ReadOptions
+from stillmap.preprocessing.time_window import TimeWindow
 
 
 def apply_options(recording: Recording, options: ReadOptions) -> Recording:
-    """Apply range limits and laser poses to a recording; itself where all options are defaults.
+    """Apply time and range limits and laser poses; the recording itself where nothing is set.
 
     Hits nearer than `min_range` become unusable; hits from `max_range` on become maximum-range
     beams of that length; maximum-range beams are cut to `free_range`; the beams of an upside-down
     laser are mirrored. `zero_means`, `self_filter` and fields of view do not apply here.
 
     Raises:
-        InputError: a laser pose is given for a 3D recording or a laser that does not exist, or a
-            topic or frame is named.
+        InputError: a laser pose is given for a 3D recording or a laser that does not exist, a
+            topic or frame is named, or no scan lies in the time window.
     """
     defaults = ReadOptions(zero_means=options.zero_means, self_filter=options.self_filter)
     if options == defaults:
@@ -31,12 +32,44 @@ def apply_options(recording: Recording, options: ReadOptions) -> Recording:
     if named is not None:
         raise InputError(f"read.{named} is for bags: this recording has no topics and frames")
     changed = replace(recording, source={**recording.source, "read_options": given})
+    if window := TimeWindow(options):
+        changed = select_time(changed, window)
     if options.min_range > 0 or options.max_range is not None or options.free_range is not None:
         changed = _limit_ranges(changed, options)
     options.check_laser_count(len(recording.T_base_sensor))
     for number in range(min(len(recording.T_base_sensor), 2)):
         changed = _apply_laser_options(changed, number, options.laser(number))
     return changed
+
+
+def select_time(recording: Recording, window: TimeWindow, where: str = "") -> Recording:
+    """The scans and images of a recording in a window; `where` is its path, for messages.
+
+    Raises:
+        InputError: there is no such scan.
+    """
+    inside = window.select_all(recording.stamp_ns)
+    window.require_scans(where)
+    scans = np.flatnonzero(inside)
+    if not len(scans):
+        return recording
+    rows = slice(int(scans[0]), int(scans[-1]) + 1)  # stamps do not decrease
+    beams = slice(int(recording.offset[rows.start]), int(recording.offset[rows.stop]))
+    return replace(
+        recording,
+        stamp_ns=recording.stamp_ns[rows],
+        offset=recording.offset[rows.start : rows.stop + 1] - recording.offset[rows.start],
+        points=recording.points[beams],
+        hit=recording.hit[beams],
+        sensor=recording.sensor[rows],
+        T_odom_base=None if recording.T_odom_base is None else recording.T_odom_base[rows],
+        T_recorded_base=(
+            None if recording.T_recorded_base is None else recording.T_recorded_base[rows]
+        ),
+        beam_time=None if recording.beam_time is None else recording.beam_time[beams],
+        images=window.select_images(recording.images),
+        source={**recording.source, **window.notes()},
+    )
 
 
 def _limit_ranges(recording: Recording, options: ReadOptions) -> Recording:

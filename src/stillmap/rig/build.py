@@ -22,8 +22,9 @@ from stillmap.em.types import DYNAMIC_BELOW, MIN_PROBABILITY
 from stillmap.rig.options import RigOptions
 from stillmap.rig.removal import BoxBeams, select_box_beams
 from stillmap.rig.trajectory import PosedRecording, pose_recording
-from stillmap.tracking import MovingObject, ObjectOptions
+from stillmap.tracking import MovingObject
 from stillmap.tracking.boxes import Box, fit_boxes
+from stillmap.tracking.clustering import MIN_P_DYNAMIC
 from stillmap.tracking.objects_3d import MIN_POINTS
 
 Float = NDArray[np.float64]
@@ -103,7 +104,6 @@ def build_tilting(
     planar: PlanarResult,
     recording: Recording,
     options: RigOptions,
-    object_options: ObjectOptions,
     em_options: EmOptions,
     threads: int = 1,
     *,
@@ -115,7 +115,6 @@ def build_tilting(
         planar: result of the planar laser.
         recording: 3D, of the same robot by the same clock.
         options: margin of the boxes.
-        object_options: threshold of dynamic beams.
         em_options: of the occupancy evidence.
         threads: the result does not depend on it.
         use_evidence: whether the tilting laser's own occupancy evidence counts.
@@ -136,7 +135,7 @@ def build_tilting(
         planar.poses,
         planar.p_static,
         planar.objects,
-        object_options.min_p_dynamic,
+        MIN_P_DYNAMIC,
         HOLD,
     )
     start_ns = int(planar.deskewed.stamp_ns[0])

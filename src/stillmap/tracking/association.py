@@ -16,6 +16,7 @@ Float = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 NO_TRACK = -1
+MAX_GAP = 2.0  # s without points after which a track ends: a person is hidden for about as long
 HORIZON = 1.0  # s: points that determine a velocity
 SPLIT_WINDOW = 6.0  # s: how far back in time a track is split
 ACCELERATION = 1.0  # m2/s3: spectral density of the random acceleration

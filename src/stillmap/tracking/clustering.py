@@ -14,6 +14,9 @@ from stillmap.core.recording import Recording
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
 
+# P(dynamic) from which a beam may belong to a moving object: 1 - p_static of what is known to move
+# lies near 1, of what is not known at the prior
+MIN_P_DYNAMIC = 0.7
 _LINK = 0.35  # m: distance between neighbours of one cluster
 LINK_PER_METRE = 0.02  # m more per metre of range
 

@@ -10,8 +10,12 @@ from numpy.typing import NDArray
 
 from stillmap.core import arrays
 from stillmap.core.recording import Recording
-from stillmap.tracking.association import ACCELERATION, assign_tracks
-from stillmap.tracking.clustering import DynamicPoints, extract_dynamic_points
+from stillmap.tracking.association import ACCELERATION, MAX_GAP, assign_tracks
+from stillmap.tracking.clustering import (
+    MIN_P_DYNAMIC,
+    DynamicPoints,
+    extract_dynamic_points,
+)
 from stillmap.tracking.options import ObjectOptions
 from stillmap.tracking.smoother import smooth_track
 from stillmap.tracking.tracklets import compute_centroids, iterate_tracks, stitch_tracklets
@@ -81,10 +85,10 @@ def track_objects(
         )
     if not options.enabled:
         return []
-    points = extract_dynamic_points(recording, poses, p_static, options.min_p_dynamic)
+    points = extract_dynamic_points(recording, poses, p_static, MIN_P_DYNAMIC)
     if len(points.scan) == 0:
         return []
-    owner = stitch_tracklets(points, assign_tracks(points, options.max_gap))
+    owner = stitch_tracklets(points, assign_tracks(points, MAX_GAP))
     kept = _ObjectStore(recording.scratch)
     for _, here in iterate_tracks(points, owner):
         found = compute_centroids(points, owner, here)

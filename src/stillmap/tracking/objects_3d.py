@@ -18,6 +18,7 @@ from stillmap.core.recording import Recording
 from stillmap.em import GroundMap
 from stillmap.mapping.projection import DIRECTIONS, make_planar_recording
 from stillmap.tracking import MovingObject, ObjectOptions, track_objects
+from stillmap.tracking.clustering import MIN_P_DYNAMIC
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -53,9 +54,7 @@ def track_objects_3d(
     if not options.enabled:
         return []
     planar_poses = se2.project_to_plane(recording.T_map_sensor(poses))
-    found = _segment_scans(
-        recording, poses, planar_poses, p_static, ground, options.min_p_dynamic, threads
-    )
+    found = _segment_scans(recording, poses, planar_poses, p_static, ground, MIN_P_DYNAMIC, threads)
     hit = np.ones(len(found.nearest), np.bool_)
     planar = make_planar_recording(recording, found.points, hit, found.offset)
     objects = track_objects(planar, planar_poses, p_static[found.nearest], options)

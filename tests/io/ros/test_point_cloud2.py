@@ -11,6 +11,7 @@ from stillmap.cli.recording_info import summarize_recording
 from stillmap.core.errors import InputError
 from stillmap.io import read
 from stillmap.io.ros import point_cloud2
+from stillmap.preprocessing.options import ReadOptions
 
 START = 1_700_000_000_000_000_000
 SECOND = 10**9
@@ -172,6 +173,30 @@ def test_extrinsics_and_odometry(bag, messages, rng):
     places = recording.T_base_sensor[recording.sensor]
     assert sorted(places[:2, 0, 3]) == [-1.0, 1.0]
     np.testing.assert_allclose(recording.T_odom_base[::2, 2, 3], 0.1 * np.arange(4), atol=1e-9)
+
+
+def test_named_topics_are_used_together_or_refused(bag, messages, rng):
+    x, y, z = xyz(rng)
+    columns = [("x", FLOAT, x), ("y", FLOAT, y), ("z", FLOAT, z)]
+    mount = messages.transform(0, "base_link", "front", (1, 0, 0.5))
+    rear = messages.transform(0, "base_link", "rear", (-1, 0, 0.5))
+    topics = {"/front": "front", "/rear": "rear", "/copy": "front", "/lost": "nowhere"}
+    content = [("/tf_static", START, messages.tf(mount, rear))]
+    for k in range(3):
+        stamp = START + k * SECOND
+        for topic, frame in topics.items():
+            cloud = cloud_message(messages, stamp, columns, frame=frame)
+            content.append((topic, stamp, cloud))
+    path = bag(content)
+    both = read(path, ReadOptions(topic="/front,rear"))
+    assert both.n_scans == 6
+    assert sorted(both.T_base_sensor[np.unique(both.sensor), 0, 3]) == [-1.0, 1.0]
+    assert read(path, ReadOptions(topic="/lost")).n_scans == 3
+    for topic, why in (("/lost", "no transform connects 'nowhere'"), ("/front", "same sensor")):
+        named = f"/copy,{topic}" if topic == "/front" else f"/front,{topic}"
+        with pytest.raises(InputError, match=f"topic '{topic}' cannot be used with .*{why}"):
+            read(path, ReadOptions(topic=named))
+    assert read(path).n_scans == 6  # what nobody named is left out with a note
 
 
 def test_laser_scans_are_preferred(bag, messages, rng):

@@ -13,7 +13,8 @@ from stillmap.io.carmen.log import BYTE_ORDER_MARK, Sensor, read_log, scan_order
 from stillmap.io.carmen.messages import SCAN_PARSERS
 from stillmap.io.text_lines import read_lines, write_atomically
 from stillmap.preprocessing.max_range import find_max_range
-from stillmap.preprocessing.options import MAX_PLAUSIBLE_RANGE
+from stillmap.preprocessing.options import MAX_PLAUSIBLE_RANGE, ReadOptions
+from stillmap.preprocessing.time_window import TimeWindow
 
 _OVERFLOW = 81.91  # m: a value that SICK lasers report for no return
 _FIRST_READING = {b"FLASER": 2, b"RLASER": 2}  # index of its field; the name is field 0
@@ -22,7 +23,11 @@ _FIELD = re.compile(rb"\S+")
 
 
 def write_filtered_log(
-    source: Path, out: Path, recording: Recording, blank: NDArray[np.bool_]
+    source: Path,
+    out: Path,
+    recording: Recording,
+    blank: NDArray[np.bool_],
+    options: ReadOptions | None = None,
 ) -> int:
     """Copy a log with some readings replaced by "no return".
 
@@ -31,6 +36,7 @@ def write_filtered_log(
         out: gzip by its name; it appears complete or not at all.
         recording: as it was read from `source`.
         blank: (M,) beams to blank.
+        options: with which it was read; None: the defaults.
 
     Returns:
         Number of scan lines omitted: the recording lacks them, so that their labels are unknown, or
@@ -39,7 +45,8 @@ def write_filtered_log(
     Raises:
         InputError: `source` is not the log that was read, or `out` cannot be written.
     """
-    sensors, _ = select_scans(read_log(source))
+    window = TimeWindow(options or ReadOptions())
+    sensors, _ = select_scans(read_log(source, window=window))
     scan_of = _number_lines(source, sensors, recording)
     codes = [
         find_no_return_code(sensor.ranges, notes["ranges"])

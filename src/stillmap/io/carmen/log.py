@@ -20,6 +20,8 @@ from stillmap.io.carmen.messages import (
     parse_odom,
 )
 from stillmap.io.text_lines import Line, Progress, read_lines
+from stillmap.preprocessing.options import ReadOptions
+from stillmap.preprocessing.time_window import TimeWindow
 
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 CUT_LINE = "cut last line"
@@ -76,7 +78,8 @@ class LaserLog:
 class CarmenLog:
     """The records of a CARMEN log."""
 
-    def __init__(self) -> None:
+    def __init__(self, window: TimeWindow) -> None:
+        self._window = window
         self.lasers: dict[str, LaserLog] = {}
         self.odom_stamp_ns = array("q")
         self.odom_poses = array("d")
@@ -131,6 +134,8 @@ class CarmenLog:
         if not line.ended and record.stamp_fields < self._stamp_fields.get(name, 1):
             raise BadRecord(CUT_LINE)
         if isinstance(record, ScanLine):
+            if not self._window.select(record.stamp_ns):
+                return record.stamp_fields
             kind = _text(name)
             self.lasers.setdefault(kind, LaserLog(kind)).add(line.number, record)
         else:
@@ -147,13 +152,22 @@ class CarmenLog:
         self.ignored[kind if known else "others"] += 1
 
 
-def read_log(path: Path, progress: Progress | None = None) -> CarmenLog:
+def read_log(
+    path: Path, progress: Progress | None = None, window: TimeWindow | None = None
+) -> CarmenLog:
     """Read a CARMEN log, plain or gzip.
 
+    Args:
+        path: the file.
+        progress: called with the share of the file that is read, 0 to 1.
+        window: selects the scans; None: all.
+
     Raises:
-        InputError: the file cannot be read, or has millions of lines in a row without a record.
+        InputError: the file cannot be read, has millions of lines in a row without a record, or no
+            scan in the window.
     """
-    log = CarmenLog()
+    window = window or TimeWindow(ReadOptions())
+    log = CarmenLog(window)
     known = 0
     for line in read_lines(path, progress):
         log.add(line)
@@ -162,6 +176,7 @@ def read_log(path: Path, progress: Progress | None = None) -> CarmenLog:
             if known == before:
                 what = f"has {_MAX_UNKNOWN_LINES} lines in a row that are no records"
                 raise InputError(what, where=f"{path}:{line.number}")
+    window.require_scans(str(path))
     return log
 
 

@@ -18,6 +18,7 @@ from stillmap.io.carmen.messages import SCAN_PARSERS, flaser_config
 from stillmap.io.text_lines import is_gzip
 from stillmap.preprocessing import max_range
 from stillmap.preprocessing.options import LaserOptions, ReadOptions
+from stillmap.preprocessing.time_window import TimeWindow
 
 _Beams = tuple[NDArray[np.float32], NDArray[np.bool_]]  # points (..., 2) in the sensor frame, hits
 
@@ -31,13 +32,14 @@ def read(path: Path, context: ReadContext) -> Recording:
     Raises:
         InputError: the file cannot be read or holds no usable scan.
     """
-    log = read_log(path, context.progress)
+    window = TimeWindow(context.options)
+    log = read_log(path, context.progress, window)
     sensors, notes = select_scans(log)
     if not sensors:
         raise _no_scan_error(path, log)
     recording = _build_recording(sensors, log, context.options)
     recording.source.update(path=str(path), format="carmen", gzip=is_gzip(path))
-    recording.source["duplicates"] = notes
+    recording.source.update(duplicates=notes, **window.notes())
     return recording
 
 

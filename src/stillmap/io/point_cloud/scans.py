@@ -15,6 +15,7 @@ from stillmap.io.builder import ReadContext, RecordingBuilder, SkippedRecords
 from stillmap.io.point_cloud.files import list_files, stamps_from_names, strip_extension
 from stillmap.io.point_cloud.time_field import Clock, convert_times, detect_clock
 from stillmap.preprocessing.options import MAX_POINT_DISTANCE, ReadOptions
+from stillmap.preprocessing.time_window import TimeWindow
 
 _MAX_NAMES = 5  # of skipped files in a warning
 
@@ -74,9 +75,14 @@ def build_recording(
         InputError: no cloud can be read, or a library is missing.
     """
     _reject_laser_poses(context.options)
-    skipped, scans = SkippedRecords(), _ScanBuilder(sources, info, context)
+    window = TimeWindow(context.options)
+    skipped, scans = SkippedRecords(), _ScanBuilder(sources, info, context, window)
     lost: list[str] = []
+    known = [source.stamp_ns for source in sources if source.stamp_ns is not None]
+    wanted = dict(zip(known, window.select_all(np.array(known, np.int64)).tolist(), strict=True))
     for number, source in enumerate(sources):
+        if source.stamp_ns is not None and not wanted[source.stamp_ns]:
+            continue
         try:
             cloud = _read_source(source)
             if info.single and not len(cloud.points):
@@ -90,12 +96,15 @@ def build_recording(
             scans.add(number, source.stamp_ns, cloud)
         if context.progress is not None:
             context.progress((number + 1) / len(sources))
+    window.require_scans(str(info.path))
     if not len(scans):
         reasons = f"usable scan: {skipped.summary('file')}" if skipped.total else "scan"
         raise InputError(f"holds no {reasons}", where=str(info.path))
     if lost:
         shown = ", ".join(lost[:_MAX_NAMES]) + (", ..." if len(lost) > _MAX_NAMES else "")
         info.warnings.append(f"skipped {len(lost)} of {len(sources)}: {shown}")
+    if "images" in more:
+        more["images"] = window.select_images(more["images"])
     return scans.recording(skipped, **more)
 
 
@@ -137,9 +146,13 @@ class _ScanBuilder:
     """Collects clouds; the first one decides whether points have times."""
 
     def __init__(
-        self, sources: Sequence[CloudSource], info: DatasetInfo, context: ReadContext
+        self,
+        sources: Sequence[CloudSource],
+        info: DatasetInfo,
+        context: ReadContext,
+        window: TimeWindow,
     ) -> None:
-        self._info, self._context = info, context
+        self._info, self._context, self._window = info, context, window
         self._period = _median_period(sources)
         self._gathered: RecordingBuilder | None = None
         self._clock: Clock | None = None
@@ -151,6 +164,7 @@ class _ScanBuilder:
 
     def add(self, number: int, stamp_ns: int | None, cloud: Cloud) -> None:
         points = cloud.points
+        is_selected = stamp_ns is not None  # else its stamp is known from now on
         if self._gathered is None:
             if cloud.times is not None:
                 self._clock = detect_clock(cloud.times[_usable_mask(points)], self._period)
@@ -168,6 +182,8 @@ class _ScanBuilder:
         if stamp_ns is None:
             stamp_ns = number * 10**9
             self._without_stamp += 1
+        if not is_selected and not self._window.select(stamp_ns):
+            return
         self._gathered.add_scan(stamp_ns, points, beam_time=beam_time)
         self._poses.append(cloud.T)
 
@@ -185,6 +201,7 @@ class _ScanBuilder:
             "skipped_unit": "file",
             "warnings": warnings,
             **_range_options_note(self._context.options),
+            **self._window.notes(),
         }
         return self._gathered.build(
             np.eye(4)[None], source=source, **{"T_recorded_base": T, **more}

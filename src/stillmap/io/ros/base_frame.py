@@ -129,7 +129,28 @@ def select_lasers(content: BagContent, options: ReadOptions) -> LaserSelection:
             continue
         used.append(scans)
         T.append(np.tile(np.eye(4), (scans.n_scans, 1, 1)) if found is None else found)
+    require_named_topics([s.topic for s in used], omitted, options)
     return LaserSelection(used, T, poses, skipped, omitted)
+
+
+def require_named_topics(used: list[str], omitted: list[str], options: ReadOptions) -> None:
+    """Refuse to leave out a topic that the user named.
+
+    Args:
+        used: topics of the sensors that are used.
+        omitted: sentences on the others, which begin with the topic.
+        options: names the topics.
+
+    Raises:
+        InputError: one of them is not used.
+    """
+    named = {name.strip().removeprefix("/") for name in (options.topic or "").split(",")}
+    for name in sorted(named - {topic.removeprefix("/") for topic in used}):
+        for text in omitted:
+            topic, _, why = text.partition(": ")
+            if topic.removeprefix("/") == name:
+                others = " and ".join(used)
+                raise InputError(f"topic {topic!r} cannot be used with {others}: {why}")
 
 
 def drop_duplicates(

@@ -21,10 +21,12 @@ from stillmap.io.ros.messages import (
     TF,
     decode,
     find_fault,
+    peek_stamp_ns,
 )
 from stillmap.io.ros.point_cloud2 import CloudCollector
 from stillmap.io.ros.tf import Odometry, TransformTree
 from stillmap.preprocessing.options import ReadOptions
+from stillmap.preprocessing.time_window import TimeWindow
 
 _SCAN_TYPES = (LASER_SCAN, MULTI_ECHO, POINT_CLOUD)
 _PROGRESS_INTERVAL = 2000  # messages
@@ -136,6 +138,7 @@ class BagContent:
     lasers: LaserCollector
     clouds: CloudCollector
     images: ImageCollector
+    window: TimeWindow
     transforms: TransformTree = field(default_factory=TransformTree)
     odometry_by_topic: dict[str, Odometry] = field(default_factory=dict)
     unreadable: SkippedRecords = field(default_factory=SkippedRecords)
@@ -154,26 +157,43 @@ class BagContent:
 
 
 def collect_messages(bag: Bag, selection: TopicSelection, context: ReadContext) -> BagContent:
-    """Read the selected topics.
+    """Read the selected topics; scans and images outside the time window are not decoded.
 
     Raises:
         DamagedBagError: an indexed bag is damaged.
+        InputError: no scan lies in the window.
     """
-    content = BagContent(LaserCollector(context.scratch), CloudCollector(context), ImageCollector())
+    window = TimeWindow(context.options)
+    lasers, clouds = LaserCollector(context.scratch), CloudCollector(context)
+    content = BagContent(lasers, clouds, ImageCollector(), window)
     scans = content.clouds if selection.has_clouds else content.lasers
     total = sum(c.n_messages for c in bag.channels if c.topic in selection.uses)
     for number, message in enumerate(bag.messages(set(selection.uses)), start=1):
         use = selection.uses[message.channel.topic]
         count_output(len(message.raw))
         if use == "scans":
-            scans.add_message(message)
+            scans.add_message(message, skip=bool(window) and not _is_in_window(message, window))
         elif use == "images":
-            content.images.add_message(message)
+            if not window or _is_image_in_window(message, window):
+                content.images.add_message(message)
         else:
             _add_pose(content, message, use, number)
         if context.progress is not None and number % _PROGRESS_INTERVAL == 0:
             context.progress(min(number / max(total, 1), 1.0))
+    window.require_scans()
     return content
+
+
+def _is_in_window(message: Message, window: TimeWindow) -> bool:
+    stamp = peek_stamp_ns(message)
+    return stamp is None or window.select(stamp)  # what cannot be decoded is counted as damage
+
+
+def _is_image_in_window(message: Message, window: TimeWindow) -> bool:
+    if message.channel.type == CAMERA_INFO:  # one holds for all images
+        return True
+    stamp = peek_stamp_ns(message)
+    return stamp is None or window.contains(stamp)
 
 
 def _add_pose(content: BagContent, message: Message, use: str, number: int) -> None:

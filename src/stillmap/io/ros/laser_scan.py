@@ -177,10 +177,12 @@ class LaserCollector:
         self._skipped: dict[str, SkippedRecords] = {}
         self._count: Counter[str] = Counter()  # messages by topic
 
-    def add_message(self, message: Message) -> None:
-        """Add a message; one that cannot be used is counted."""
+    def add_message(self, message: Message, *, skip: bool = False) -> None:
+        """Add a message, or `skip` it undecoded; one that cannot be used is counted."""
         topic = message.channel.topic
         self._count[topic] += 1
+        if skip:
+            return
         try:
             scan = decode(message)
             frame = frame_name(scan.header.frame_id)

@@ -86,10 +86,12 @@ class CloudCollector:
         self.number = array("q")
         self.scans = RecordingBuilder(3, context, beam_times=True)
 
-    def add_message(self, message: Message) -> None:
-        """Add a message; one that cannot be used is counted."""
+    def add_message(self, message: Message, *, skip: bool = False) -> None:
+        """Add a message, or `skip` it undecoded; one that cannot be used is counted."""
         topic = message.channel.topic
         self._count[topic] += 1
+        if skip:
+            return
         frame, stamp = "", 0
         cloud: Cloud | str
         try:

@@ -112,6 +112,7 @@ def _build_recording(
         skipped_unit="message",
         damage=bag.damage.to_dict(),
         skipped_odometry=content.skipped_odometry.to_dict(),
+        **content.window.notes(),
     )
     return recording
 
@@ -146,7 +147,9 @@ def _build_cloud_recording(
         T,
         selection=selection,
         T_odom_base=odom,
-        images=content.images.build_images(content.transforms, poses.base, reopen),
+        images=content.window.select_images(
+            content.images.build_images(content.transforms, poses.base, reopen)
+        ),
         source={
             "sensors": sensors,
             "base_frame": poses.base,
@@ -188,6 +191,7 @@ def _place_sensors(
     """
     T = np.tile(np.eye(4), (len(names), 1, 1))
     kept: list[NDArray[np.intp]] = []
+    topics: list[str] = []
     warnings = []
     for k, rows, found in zip(used, scans, poses.T_base_sensor, strict=True):
         topic, frame = names[k]
@@ -198,10 +202,12 @@ def _place_sensors(
             omitted.append(f"{topic}: {len(rows)} clouds, {text}")
             continue
         kept.append(rows)
+        topics.append(topic)
         if found is not None:
             T[k] = found[0]
             if np.abs(found - found[0]).max() > _STILL:
                 warnings.append(f"{topic}: the sensor moves on the robot: its first pose is used")
+    base_frame.require_named_topics(topics, omitted, options)
     return T, np.sort(np.concatenate(kept)), warnings
 
 

@@ -1,0 +1,112 @@
+"""Restriction of a recording to a part of its time: the options `read.start` and `read.end`."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.camera import Images
+from stillmap.core.errors import InputError
+from stillmap.core.timestamps import format_seconds
+from stillmap.preprocessing.options import ReadOptions
+
+ABSOLUTE = 1e8  # s: times from here on are stamps; no recording lasts three years
+
+_ROUNDING = 1000  # ns: a stamp of today in seconds, as float64, is off by a quarter of that
+
+
+class TimeWindow:
+    """Selects scans by their stamps, in the order in which they are read.
+
+    Times below `ABSOLUTE` count from the first scan that is read; a start of 0 is no limit, so that
+    a second sensor's slightly earlier scan stays.
+
+    Args:
+        options: `start` and `end` apply.
+        origin_ns: stamp from which times count; None: that of the first scan.
+
+    Attributes:
+        first_ns, last_ns: smallest and largest stamp of all scans so far; None: there was none.
+        omitted: number of scans outside the window.
+    """
+
+    def __init__(self, options: ReadOptions, origin_ns: int | None = None) -> None:
+        self._start, self._end = options.start or None, options.end
+        self._origin_ns = origin_ns
+        self.first_ns: int | None = None
+        self.last_ns: int | None = None
+        self.selected = self.omitted = 0
+
+    def __bool__(self) -> bool:
+        """Whether there is a limit."""
+        return self._start is not None or self._end is not None
+
+    def select(self, stamp_ns: int) -> bool:
+        """Whether a scan is to be read; counts it."""
+        if self._origin_ns is None:
+            self._origin_ns = stamp_ns
+        self.first_ns = stamp_ns if self.first_ns is None else min(self.first_ns, stamp_ns)
+        self.last_ns = stamp_ns if self.last_ns is None else max(self.last_ns, stamp_ns)
+        inside = self.contains(stamp_ns)
+        self.selected += inside
+        self.omitted += not inside
+        return inside
+
+    def select_all(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """(T,) whether scans with stamps (T,) are to be read; times count from the smallest."""
+        if len(stamp_ns) and self._origin_ns is None:
+            self._origin_ns = int(stamp_ns.min())
+        return np.array([self.select(stamp) for stamp in stamp_ns.tolist()], np.bool_)
+
+    def contains(self, stamp_ns: int) -> bool:
+        """Whether something with a stamp, an image say, lies inside; not counted."""
+        start, end = self._limit_ns(self._start), self._limit_ns(self._end)
+        return (start is None or stamp_ns >= start - _ROUNDING) and (
+            end is None or stamp_ns <= end + _ROUNDING
+        )
+
+    def select_images(self, images: Images | None) -> Images | None:
+        """The images inside the window; None where there are none."""
+        if images is None or not self:
+            return images
+        inside = [k for k, stamp in enumerate(images.stamp_ns.tolist()) if self.contains(stamp)]
+        if not inside:
+            return None
+        return Images(
+            images.stamp_ns[inside],
+            images.camera[inside],
+            images.cameras,
+            lambda image: images.load(inside[image]),
+        )
+
+    def _limit_ns(self, seconds: float | None) -> int | None:
+        if seconds is None:
+            return None
+        if seconds >= ABSOLUTE:
+            return round(seconds * 1e9)
+        return None if self._origin_ns is None else self._origin_ns + round(seconds * 1e9)
+
+    def require_scans(self, where: str = "") -> None:
+        """Refuse a window that leaves nothing of a recording.
+
+        Raises:
+            InputError: there were scans, all of them outside.
+        """
+        if not self.omitted or self.selected:
+            return
+        assert self.first_ns is not None
+        assert self.last_ns is not None
+        wanted = ([] if self._start is None else [f"from {self._start:.10g} s"]) + (
+            [] if self._end is None else [f"to {self._end:.10g} s"]
+        )
+        first, last = format_seconds(self.first_ns), format_seconds(self.last_ns)
+        span = (self.last_ns - self.first_ns) / 1e9
+        hint = f"the recording spans 0 to {span:.2f} s, stamps {first} to {last}"
+        raise InputError(f"has no scan {' '.join(wanted)}", where=where, hint=hint)
+
+    def notes(self) -> dict[str, Any]:
+        """The entry `part` of `Recording.source`; empty without limits."""
+        if not self or self.first_ns is None or self.last_ns is None:
+            return {}
+        span = {"first_stamp_ns": self.first_ns, "last_stamp_ns": self.last_ns}
+        return {"part": {"start": self._start, "end": self._end, "omitted": self.omitted, **span}}
