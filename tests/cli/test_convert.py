@@ -145,7 +145,7 @@ def test_result_as_bag(call, mapped, tmp_path, nothing_left, name):
     moved = found.pop("/objects")
     assert moved > 0
     assert found == {
-        **dict.fromkeys(("/scan", "/scan_dynamic", "/tf"), 40),
+        **dict.fromkeys(("/scan", "/scan_dynamic", "/tf", "/odom"), 40),
         **dict.fromkeys(("/map", "/trajectory", "/tf_static"), 1),
     }
     nothing_left(name)

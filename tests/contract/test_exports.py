@@ -1,4 +1,4 @@
-"""Exports of results: MCAP, read by the library of its authors, and Parquet."""
+"""Exports of 2D results: MCAP, read by the library of its authors, and Parquet."""
 
 from collections import defaultdict
 
@@ -56,6 +56,7 @@ def test_schemas_are_complete(decoded):
         "/map": "nav_msgs/msg/OccupancyGrid",
         "/trajectory": "nav_msgs/msg/Path",
         "/objects": "visualization_msgs/msg/MarkerArray",
+        "/odom": "nav_msgs/msg/Odometry",
         "/tf": "tf2_msgs/msg/TFMessage",
         "/tf_static": "tf2_msgs/msg/TFMessage",
     }
@@ -72,13 +73,15 @@ def test_frames_form_a_tree(decoded):
         for _, message in topics[topic]:
             for one in message.transforms:
                 parents[one.child_frame_id].add(one.header.frame_id)
-    assert parents == {"base_link": {"map"}, "laser": {"base_link"}, "laser2": {"base_link"}}
+    lasers = {"laser": {"base_link"}, "laser2": {"base_link"}}
+    assert parents == {"odom": {"map"}, "base_link": {"odom"}, **lasers}
     for topic, messages in topics.items():
         for time, message in messages:
             parts = getattr(message, "transforms", getattr(message, "markers", [message]))
             for part in parts:
                 assert part.header.frame_id in {"map", *parents}, topic
                 assert nanoseconds(part.header) == time
+                assert getattr(part, "child_frame_id", "odom") in parents
 
 
 def test_each_beam_is_in_one_scan_topic(decoded, result, recording):
@@ -111,11 +114,27 @@ def test_trajectory_topic(decoded, result, recording):
     found = [matrix(p.pose.position, p.pose.orientation) for p in path.poses]
     np.testing.assert_allclose(found, poses, atol=1e-12)
     assert [nanoseconds(p.header) for p in path.poses] == recording.stamp_ns.tolist()
-    for (time, tf), stamp, T in zip(topics["/tf"], recording.stamp_ns, poses, strict=True):
-        [one] = tf.transforms
-        assert time == stamp
-        moved = matrix(one.transform.translation, one.transform.rotation)
-        np.testing.assert_allclose(moved, T, atol=1e-12)
+    for t, (time, tf) in enumerate(topics["/tf"]):
+        assert time == recording.stamp_ns[t]
+        names = [(one.header.frame_id, one.child_frame_id) for one in tf.transforms]
+        assert names == [("map", "odom"), ("odom", "base_link")]
+        T_map_odom, T_odom_base = (
+            matrix(one.transform.translation, one.transform.rotation) for one in tf.transforms
+        )
+        np.testing.assert_allclose(T_map_odom @ T_odom_base, poses[t], atol=1e-12)
+        np.testing.assert_allclose(T_odom_base, recording.T_odom_base[t], atol=1e-12)
+    assert len(topics["/tf"]) == recording.n_scans
+
+
+def test_odometry_topic(decoded, recording):
+    _, topics = decoded
+    assert len(topics["/odom"]) == recording.n_scans
+    for (time, odometry), T, stamp in zip(
+        topics["/odom"], recording.T_odom_base, recording.stamp_ns, strict=True
+    ):
+        assert (time, odometry.child_frame_id) == (stamp, "base_link")
+        pose = odometry.pose.pose
+        np.testing.assert_allclose(matrix(pose.position, pose.orientation), T, atol=1e-12)
 
 
 def test_map_topic(decoded, result):
@@ -138,9 +157,13 @@ def test_object_markers(decoded, result):
     objects = {o["id"]: o for o in json.loads((result / "objects/objects.json").read_text())}
     shown = defaultdict(list)
     for time, message in topics["/objects"]:
-        first, *boxes = message.markers
+        first, *rest = message.markers
         assert first.action == 3  # what was there before goes
-        for box in boxes:
+        boxes, numbers = rest[::2], rest[1::2]
+        for box, number in zip(boxes, numbers, strict=True):
+            assert (box.ns, box.type, number.ns, number.type) == ("objects", 1, "ids", 9)
+            assert number.text == str(box.id) == str(number.id)
+            assert number.pose.position.z > box.pose.position.z + box.scale.z / 2
             shown[box.id].append((time, box))
     assert set(shown) == set(objects)
     for number, boxes in shown.items():

@@ -16,7 +16,7 @@ from stillmap.core.errors import InputError
 
 if TYPE_CHECKING:
     from stillmap.results.export import point_cloud, point_cloud_files
-    from stillmap.results.folder import ResultFolder
+    from stillmap.results.folder import Exported, ResultFolder
 
 # copies for the help: the modules that define them take long to load
 ENDINGS = (
@@ -28,15 +28,15 @@ NAMES = ("stillmap", "ros2", "carmen", "bag", "db3", "mcap", "kitti", "pcd", "pl
 
 DESCRIPTION = (
     "Write a recording in another format, by the ending of FILE: "
-    f"{', '.join(ENDINGS)}; else a folder. A 2D result of `stillmap map` becomes a bag (.mcap "
-    "for Foxglove) or a table of its beams (.parquet), a 3D one a point cloud with p_static "
-    f"and colours ({', '.join(CLOUDS)}) or the model of the place (.obj)."
+    f"{', '.join(ENDINGS)}; else a folder. A result of `stillmap map` becomes a bag (.mcap for "
+    "Foxglove), in 2D a table of its beams (.parquet), in 3D a point cloud with p_static and "
+    f"colours ({', '.join(CLOUDS)}) or the model of the place (.obj)."
 )
 EPILOG = """examples:
   stillmap convert log.clf.gz -o log.bag      for ROS 1
   stillmap convert log.bag -o log --to ros2   a folder for ROS 2
   stillmap convert log.bag -o part.bag --from 60 --until 120    a minute of it
-  stillmap convert out -o out.mcap            a 2D result for Foxglove
+  stillmap convert out -o out.mcap            a result for Foxglove
   stillmap convert out -o beams.parquet       every beam of a 2D result with its label
   stillmap convert out -o static.laz --only static    static points of a 3D result
   stillmap convert out -o model.obj           model of the place with its textures
@@ -136,13 +136,17 @@ def _convert_result(args: argparse.Namespace, source: Path, output: Path) -> tup
 def _convert_to_table(args: argparse.Namespace, result: "ResultFolder", output: Path) -> str:
     from stillmap.core.files import require_new_file
     from stillmap.results.export import parquet
-    from stillmap.slam import deskew_recording
 
     require_new_file(output, args.overwrite)
     parquet.require_pyarrow()
-    exported = result.export()
-    deskewed = deskew_recording(exported.recording, exported.poses, result.slam_options)
-    parquet.write(exported, deskewed, output)
+    exported = _read_result(args, result, output)
+    if exported.recording.dimension != 2:
+        raise InputError(
+            "is of a 3D recording: its points can be written, as a cloud",
+            where=str(result.folder),
+            hint=", ".join(CLOUDS),
+        )
+    parquet.write(exported, exported.deskew(), output)
     return f"{exported.recording.n_beams} beams"
 
 
@@ -164,10 +168,16 @@ def _convert_to_bag(
         hint += "; `stillmap filter` writes its recording"
         raise InputError(text, where=str(output), hint=hint)
     writers.require_free(output, writer, args.overwrite)
-    exported = result.export()
-    losses = bag.write(exported, output, kind, overwrite=args.overwrite)
+    exported = _read_result(args, result, output)
+    with show_share(args.quiet, "writing") as progress:
+        losses = bag.write(exported, output, kind, overwrite=args.overwrite, progress=progress)
     scans, objects = exported.recording.n_scans, len(exported.tracks)
     return losses, f"{scans} scans, map, trajectory and {objects} objects"
+
+
+def _read_result(args: argparse.Namespace, result: "ResultFolder", output: Path) -> "Exported":
+    with show_share(args.quiet, "reading") as progress:
+        return result.export(progress, output.absolute().parent)
 
 
 def _convert_to_cloud(

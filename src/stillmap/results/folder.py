@@ -19,10 +19,10 @@ from stillmap.io.trajectory import poses_from_tum
 from stillmap.mesh.options import MeshOptions
 from stillmap.pipeline.quality import Quality
 from stillmap.preprocessing.options import ReadOptions
-from stillmap.results.labels import Labels, read_labels
+from stillmap.results.labels import Labels, read_colors, read_labels
 from stillmap.results.reader import Grid, Track, read_grid, read_tracks
 from stillmap.results.run_json import RECORD
-from stillmap.slam import SlamOptions
+from stillmap.slam import SlamOptions, deskew_recording
 
 T = TypeVar("T")
 
@@ -31,14 +31,16 @@ _MAX_RUN = 32 << 20  # bytes of a run.json
 
 @dataclass(frozen=True, eq=False)
 class Exported:
-    """A 2D result for export: recording, poses, labels, map and tracks.
+    """A result for export: recording, poses, labels, map and tracks.
 
     Attributes:
         recording: T scans with M beams.
-        poses: (T, 3, 3) T_map_base.
+        poses: (T, D+1, D+1) T_map_base.
         p_static: (M,) float32, NaN for unusable beams.
-        map: occupancy of the static cells.
+        map: occupancy of the static cells; in 3D of those in a robot's way.
         tracks: of the moving objects.
+        slam: the options of deskewing.
+        colors: (M, 3) uint8 of the end points; None: without.
     """
 
     recording: Recording
@@ -46,6 +48,12 @@ class Exported:
     p_static: NDArray[np.float32]
     map: Grid
     tracks: list[Track]
+    slam: SlamOptions
+    colors: NDArray[np.uint8] | None = None
+
+    def deskew(self) -> Recording:
+        """The recording without the motion during its scans."""
+        return deskew_recording(self.recording, self.poses, self.slam)
 
 
 @dataclass(frozen=True)
@@ -147,23 +155,21 @@ class ResultFolder:
             raise InputError(what, where=str(self.source), hint="name it with --input")
         return recording, labels
 
-    def export(self) -> Exported:
-        """The content of a 2D result.
+    def export(self, progress: Progress | None = None, scratch: Path | None = None) -> Exported:
+        """The content of a result; arguments are those of `read`.
 
         Raises:
-            InputError: a file is missing or damaged, or the recording is 3D.
+            InputError: a file is missing or damaged.
         """
-        recording, labels = self.read()
-        if recording.dimension != 2:
-            what = "is of a 3D recording: its points can be written, as a cloud"
-            hint = ".las, .laz, .e57, .pcd, .ply or .xyz; .obj writes its model, if there is one"
-            raise InputError(what, where=str(self.folder), hint=hint)
+        recording, labels = self.read(progress, scratch)
         return Exported(
             recording,
             poses_from_tum(self.folder / "trajectory.tum", recording),
             labels.p_static,
             read_grid(self.folder),
             read_tracks(self.folder / "objects" / "objects.json"),
+            self.slam_options,
+            read_colors(self.folder, recording.n_beams) if recording.dimension == 3 else None,
         )
 
 

@@ -18,33 +18,30 @@ MARKERS = "visualization_msgs/msg/MarkerArray"
 _FLOAT32 = 7  # of sensor_msgs/PointField
 
 
-def make_point_cloud(
-    bag: BagWriter,
-    stamp_ns: int,
-    frame: str,
-    points: NDArray[np.float32],
-    times: NDArray[np.float32] | None,
-) -> Any:
-    """A PointCloud2 of points (n, 3) in metres, with field `t` where times (n,), in seconds after
-    the stamp, are given."""
-    columns = points if times is None else np.column_stack([points, times])
-    names = "xyz" if times is None else "xyzt"
+def make_point_cloud(bag: BagWriter, stamp_ns: int, frame: str, vertices: NDArray[np.void]) -> Any:
+    """A PointCloud2 of vertices (n,), whose fields are 4 bytes each; x, y and z in metres.
+
+    All are called FLOAT32, as PCL does with the packed colour of `rgb`, 0x00RRGGBB.
+    """
+    names = vertices.dtype.names or ()
     fields = [
         bag.make("sensor_msgs/msg/PointField", name=name, offset=4 * k, datatype=_FLOAT32, count=1)
         for k, name in enumerate(names)
     ]
-    data = np.ascontiguousarray(columns, "<f4").view(np.uint8).ravel()
+    step = vertices.dtype.itemsize
+    if step != 4 * len(names):
+        raise ValueError(f"vertices: {vertices.dtype} has other fields than of 4 bytes")
     return bag.make(
         POINT_CLOUD,
         header=bag.header(stamp_ns, frame),
         height=1,
-        width=len(points),
+        width=len(vertices),
         fields=fields,
         is_bigendian=False,
-        point_step=4 * len(names),
-        row_step=4 * len(names) * len(points),
-        data=data,
-        is_dense=bool(np.isfinite(points).all()),
+        point_step=step,
+        row_step=step * len(vertices),
+        data=np.ascontiguousarray(vertices).view(np.uint8).ravel(),
+        is_dense=all(bool(np.isfinite(vertices[axis]).all()) for axis in "xyz"),
     )
 
 

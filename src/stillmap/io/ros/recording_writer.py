@@ -148,11 +148,17 @@ def _odometry_sender(bag: BagWriter, recording: Recording) -> Callable[[int], No
 
 
 def _make_cloud(bag: BagWriter, recording: Recording, t: int, frame: str) -> Any:
-    beams = recording.beams_of(t)
+    """A PointCloud2 with field `t`, in seconds after the stamp, where beams have times."""
+    beams, times = recording.beams_of(t), recording.beam_time
+    vertices = np.empty(
+        beams.stop - beams.start, [(name, "<f4") for name in ("xyz" if times is None else "xyzt")]
+    )
     # readers would take a point at maximum range for a return
     points = np.where(recording.hit[beams, None], recording.points[beams], np.float32(np.nan))
-    times = None if recording.beam_time is None else recording.beam_time[beams]
-    return message_writer.make_point_cloud(bag, int(recording.stamp_ns[t]), frame, points, times)
+    vertices["x"], vertices["y"], vertices["z"] = points.T
+    if times is not None:
+        vertices["t"] = times[beams]
+    return message_writer.make_point_cloud(bag, int(recording.stamp_ns[t]), frame, vertices)
 
 
 def _describe_cloud_losses(recording: Recording) -> list[str]:

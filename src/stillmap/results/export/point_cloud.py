@@ -74,6 +74,21 @@ class Cloud:
             if progress is not None:
                 progress(done / max(self.count, 1))
 
+    def sample(self, max_count: int) -> Block:
+        """At most `max_count` of the points, evenly over their order, without times."""
+        use, first = arrays.sample_indices(self.count, max_count), 0
+        points, p_static = np.empty((len(use), 3)), np.empty(len(use), np.float32)
+        colors = np.empty((len(use), 3), np.uint8) if self.has_colors else None
+        for block in self.make_blocks():
+            end = first + len(block.points)
+            into = slice(*np.searchsorted(use, [first, end]).tolist())
+            points[into] = block.points[use[into] - first]
+            p_static[into] = block.p_static[use[into] - first]
+            if colors is not None and block.colors is not None:
+                colors[into] = block.colors[use[into] - first]
+            first = end
+        return Block(points, p_static, None, colors)
+
 
 def cloud_from_recording(
     recording: Recording,
