@@ -4,6 +4,7 @@
 #   make lint    style, types, formatting
 #   make docs    the documentation site, into build/site; warnings are errors
 #   make pictures  the pictures of README.md and of the documentation, from simulated data
+#   make wheel   a wheel that needs no compiler, for this Python, into dist/
 #   make fuzz    files changed for every reader, a minute each (FUZZ_SECONDS)
 #   make check   lint and test, then what takes longer: slow tests, real recordings, packages,
 #                the kernels under sanitizers, fuzzing
@@ -27,10 +28,10 @@ export PYTHONNOUSERSITE := 1
 unexport PYTHONPATH PYTHONHOME
 
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-slow test-models lint docs pictures stub sanitize fuzz check format clean
+.PHONY: help demo test test-slow test-models wheel lint docs pictures stub sanitize fuzz check format clean
 
 help:
-	@sed -n 's/^#  *//p' Makefile | sed -n '1,11p'
+	@sed -n 's/^#  *//p' Makefile | sed -n '1,12p'
 
 # The user's way: an isolated build. `make test` installs over it.
 $(VENV)/installed: $(VENV)/created $(SOURCES)
@@ -86,6 +87,12 @@ test: $(VENV)/tested
 
 test-slow: $(VENV)/tested
 	$(BIN)/python -m pytest -m slow
+
+# the wheel of a release, for this Python
+wheel: $(VENV)/dependencies
+	@rm -rf dist
+	tools/build_wheel.sh $(BIN)/python dist
+	@ls -l dist
 
 # what others open models with; they are fetched once
 build/readers: tools/model_readers.sh

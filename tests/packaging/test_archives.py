@@ -27,11 +27,15 @@ for module in pkgutil.walk_packages(stillmap.__path__, "stillmap."):
 """
 JUNK = re.compile(r"\.(so|pyc|egg-info)$|__pycache__|/(build|dist|demo|\.venv|\.ci|\.git\w*)(/|$)")
 
+MAX_BASE_MB = 350  # of stillmap and its base dependencies, without compiled bytecode
+
 TEMPLATES = [str(path.relative_to(ROOT / "src")) for path in (ROOT / "src").rglob("*.j2")]
 
 
-def run(*command, cwd):
+def run(*command, cwd, path=None):
     environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
+    if path is not None:
+        environment["PATH"] = path
     done = subprocess.run(
         [str(part) for part in command],
         cwd=cwd,
@@ -44,20 +48,29 @@ def run(*command, cwd):
     return done.stdout
 
 
+def size_mb(folder):
+    """Bytes of the files below a folder, in MB, without bytecode that Python makes when it runs."""
+    files = (path for path in folder.rglob("*") if path.is_file() and path.suffix != ".pyc")
+    return sum(path.stat().st_size for path in files) / 1e6
+
+
 @pytest.fixture(scope="module")
-def sdist(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("sdist")
-    run(sys.executable, "-m", "build", "--sdist", "--outdir", folder, ROOT, cwd=folder)
-    (archive,) = folder.iterdir()
+def archives(tmp_path_factory):
+    """What `make wheel` writes: a source archive, and a wheel built from it in isolation."""
+    folder = tmp_path_factory.mktemp("archives")
+    run(ROOT / "tools" / "build_wheel.sh", sys.executable, folder, cwd=folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def sdist(archives):
+    (archive,) = archives.glob("*.tar.gz")
     return archive
 
 
 @pytest.fixture(scope="module")
-def wheel(sdist, tmp_path_factory):
-    """Built in isolation from the archive, as pip does for a user."""
-    folder = tmp_path_factory.mktemp("wheel")
-    run(sys.executable, "-m", "pip", "wheel", "--no-deps", "-w", folder, sdist, cwd=folder)
-    (archive,) = folder.iterdir()
+def wheel(archives):
+    (archive,) = archives.glob("*.whl")
     return archive
 
 
@@ -84,11 +97,21 @@ def test_wheel_holds_only_the_package(wheel):
     assert f"{info}/licenses/LICENSE" in names
 
 
-def test_wheel_maps_in_a_fresh_environment(wheel, tmp_path):
+@pytest.mark.skipif(sys.platform != "linux", reason="manylinux is of Linux")
+def test_wheel_is_for_every_linux_of_its_tag(wheel):
+    assert re.search(r"-manylinux_2_\d+_\w+\.whl$", wheel.name)
+
+
+def test_wheel_maps_in_a_bare_environment(wheel, tmp_path):
+    """Without a compiler on the path, and with nothing but wheels of the base dependencies."""
     run(sys.executable, "-m", "venv", "venv", cwd=tmp_path)
-    run("venv/bin/python", "-m", "pip", "install", wheel, cwd=tmp_path)
-    assert run("venv/bin/python", "-c", IMPORT_ALL, cwd=tmp_path).split() == []
+    bare = str(tmp_path / "venv" / "bin")
+    pip = ("venv/bin/python", "-m", "pip", "install", "--no-compile", "--only-binary=:all:")
+    before = size_mb(tmp_path / "venv")
+    run(*pip, wheel, cwd=tmp_path, path=bare)
+    assert size_mb(tmp_path / "venv") - before <= MAX_BASE_MB
+    assert run("venv/bin/python", "-c", IMPORT_ALL, cwd=tmp_path, path=bare).split() == []
     simulate = ("simulate", "hall", "-o", "sim", "--scans", "60")
-    run("venv/bin/stillmap", *simulate, cwd=tmp_path)
-    run("venv/bin/stillmap", "map", "sim", "-o", "map", "--quiet", cwd=tmp_path)
+    run("venv/bin/stillmap", *simulate, cwd=tmp_path, path=bare)
+    run("venv/bin/stillmap", "map", "sim", "-o", "map", "--quiet", cwd=tmp_path, path=bare)
     assert (tmp_path / "map" / "map.pgm").stat().st_size > 0
