@@ -140,7 +140,7 @@ def _rows(job: Job, folder: Path) -> Scores:
     result = folder / "result-0"
     flags = [part for one in job.settings for part in ("--set", one)]
     started = time.monotonic()
-    _stillmap("map", *inputs, "-o", result, "--overwrite", "--quiet", *flags)
+    _stillmap("map", *inputs, "-o", result, "--mesh", "--overwrite", "--quiet", *flags)
     seconds = time.monotonic() - started
     found = json.loads(_stillmap("eval", "model", result, sim, "--json"))
     near = json.loads(_stillmap("eval", "model", result, sim, "--json", "--within", _NEAR))

@@ -54,6 +54,6 @@ def mapped_street(street: Path) -> Path:
     """Its result folder."""
     out = street.parent / "mapped"
     words = ["map", street, "-o", out, "--quiet", "--poses", street / "truth/trajectory.tum"]
-    words += ["--set", "mesh.enabled=false"]
+    words += ["--no-mesh"]
     assert main([*map(str, words)]) == 0
     return out

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from stillmap.core.recording import Recording
+    from stillmap.mesh.build import Models
     from stillmap.pipeline.checkpoint import CheckpointFolder
     from stillmap.results.result import Result
     from stillmap.rig.build import TiltingResult
@@ -91,6 +92,11 @@ def _add_method_flags(p: argparse._ArgumentGroup) -> None:
 
 def _add_map_flags(p: argparse._ArgumentGroup) -> None:
     p.add_argument(
+        "--mesh",
+        action=argparse.BooleanOptionalAction,
+        help="surface and models of 3D recordings (default: where there are pictures)",
+    )
+    p.add_argument(
         "--resolution",
         metavar="M",
         type=float,
@@ -136,7 +142,7 @@ def run(args: argparse.Namespace) -> int:
             )
         checkpoints.clear()
     if not args.quiet:
-        _print_summary(result, tilting, output)
+        _print_summary(result, tilting, models, output)
     if args.json:
         print_json(_summarize(output))
     return 0
@@ -153,6 +159,8 @@ def _option_changes(args: argparse.Namespace) -> dict[str, Any]:
         changes["threads"] = args.threads
     if args.resolution is not None:
         changes["slam"] = {"resolution": args.resolution, "voxel_size": args.resolution}
+    if args.mesh is not None:
+        changes["mesh"] = {"enabled": args.mesh}
     if args.tilting_topic is not None:
         changes["read"] = {"tilting_topic": args.tilting_topic}
     output = {"map_mode": args.map_mode, "map_state": args.map_state}
@@ -203,7 +211,9 @@ def _summarize(output: Path) -> dict[str, Any]:
     }
 
 
-def _print_summary(result: "Result", tilting: "TiltingResult | None", output: Path) -> None:
+def _print_summary(
+    result: "Result", tilting: "TiltingResult | None", models: "Models | None", output: Path
+) -> None:
     n = len(result.iterations)
     lines = [
         f"{result.recording.n_scans} scans, {_describe_hits(result.recording, result.p_static)}",
@@ -212,11 +222,22 @@ def _print_summary(result: "Result", tilting: "TiltingResult | None", output: Pa
         *_describe_changes(result),
         *([] if tilting is None else [_describe_tilting(tilting)]),
         *(f"warning: {warning}" for warning in result.warnings),
+        *_describe_lack_of_models(result, tilting, models),
         f"wrote {output}: open {output / 'report.html'}",
         f"see it over time: stillmap view {shlex.quote(str(output))}",
     ]
     for line in lines:
         say(line)
+
+
+def _describe_lack_of_models(
+    result: "Result", tilting: "TiltingResult | None", models: "Models | None"
+) -> list[str]:
+    """How to get models of a 3D recording that has no pictures."""
+    is_2d = tilting is None and result.recording.dimension == 2
+    if is_2d or models is not None or result.options.mesh.enabled is not None:
+        return []
+    return ["no surface and models without pictures: --mesh makes grey ones"]
 
 
 def _describe_changes(result: "Result") -> list[str]:

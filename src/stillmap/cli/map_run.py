@@ -203,8 +203,8 @@ def build_all(
 def _build_models(
     result: Result, tilting: "TiltingResult | None", progress: Progress, stages: StageTimer
 ) -> "tuple[Models | None, list[str]]":
-    """Build the meshes of a 3D recording where they are enabled; return them and warnings."""
-    if not result.options.mesh.enabled or (tilting is None and result.recording.dimension == 2):
+    """Build the meshes of a 3D recording where they are wanted; return them and warnings."""
+    if not _wants_models(result, tilting):
         return None, []
     from stillmap.pipeline.models import build_models  # meshes take long to load
 
@@ -219,6 +219,19 @@ def _build_models(
         what = "an image is not used" if count == 1 else f"{count} images are not used, the first"
         warnings.append(f"{what}: {models.unread[0]}")
     return models, warnings
+
+
+def _wants_models(result: Result, tilting: "TiltingResult | None") -> bool:
+    """Whether models are enabled, or could be textured where nothing is said about them."""
+    enabled = result.options.mesh.enabled
+    recording = result.recording if tilting is None else tilting.recording
+    if recording.dimension == 2 or enabled is False:
+        return False
+    if enabled or recording.images is None:
+        return bool(enabled)
+    from stillmap.mesh.texture.views import usable_images  # takes long to load
+
+    return bool(usable_images(recording)[0].any())
 
 
 def _load_checkpoint(

@@ -9,7 +9,11 @@ from stillmap.core.config import Section, option
 class MeshOptions(Section, section="mesh"):
     """Meshes of 3D recordings: the static surface and the moving objects; see docs/mesh.md."""
 
-    enabled: bool = option(True, "Build meshes of 3D recordings.")
+    enabled: bool | None = option(
+        None,
+        "Build meshes of 3D recordings, with --mesh and --no-mesh; unset: where there are usable "
+        "pictures to texture them with.",
+    )
     voxel_size: float | None = option(
         None, "Edge of a TSDF voxel, in metres; unset: from the point spacing.", ge=0.001, le=10.0
     )

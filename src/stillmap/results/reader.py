@@ -68,7 +68,7 @@ def require_model(result: Path) -> Path:
     """
     path = result / "mesh.glb"
     if not path.is_file():
-        hint = f"`stillmap map` makes them of 3D recordings, with {install_command('mesh')}"
+        hint = f"`stillmap map --mesh` makes them of 3D recordings, with {install_command('mesh')}"
         raise InputError("holds no model", where=str(result), hint=hint)
     return path
 

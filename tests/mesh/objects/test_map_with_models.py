@@ -154,7 +154,7 @@ def test_the_same_from_python(room, result, tmp_path):
 def test_without_pictures_the_surface_is_grey_and_lit(room, result, mapped, tmp_path):
     bare = tmp_path / "bare"
     stillmap_folder.write(dataclasses.replace(stillmap_folder.read(room), images=None), bare)
-    out = mapped("bare", source=bare)
+    out = mapped("bare", "--mesh", source=bare)
     scene = trimesh.load(out / "mesh.glb")
     assert set(scene.geometry) == {"grey"}
     assert b"KHR_materials_unlit" not in (out / "mesh.glb").read_bytes()
@@ -208,8 +208,23 @@ def test_without_the_libraries_all_the_rest_is_written(mapped, monkeypatch):
     assert not list(out.glob("**/*.glb"))
 
 
-def test_none_where_they_are_not_wanted(mapped):
-    out = mapped("unwanted", "--set", "mesh.enabled=false")
+def test_without_pictures_there_are_models_by_request_alone(room, tmp_path, capsys):
+    bare = tmp_path / "bare"
+    stillmap_folder.write(dataclasses.replace(stillmap_folder.read(room), images=None), bare)
+    words = ("map", bare, "-o", tmp_path / "out", "--poses", room / "truth/trajectory.tum")
+    words += ("--threads", "1", "--set", "em.max_iterations=1")
+    assert main([*map(str, words)]) == 0
+    told = [line for line in capsys.readouterr().err.splitlines() if "--mesh" in line]
+    assert told == ["stillmap: no surface and models without pictures: --mesh makes grey ones"]
+    assert not list(tmp_path.glob("out/**/*.glb"))
+    record = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert "models" not in record
+    assert not any("models" in one for one in record["warnings"])
+
+
+@pytest.mark.parametrize("words", [("--no-mesh",), ("--set", "mesh.enabled=false")])
+def test_none_where_they_are_not_wanted(mapped, words):
+    out = mapped(f"unwanted{len(words)}", *words)
     assert not list(out.glob("**/*.glb"))
     assert not (out / "mesh_faces.npz").exists()
     assert "models" not in json.loads((out / "run.json").read_text())

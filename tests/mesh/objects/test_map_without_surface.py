@@ -15,7 +15,7 @@ def test_a_few_lonely_points(room, tmp_path):
     hit[:: len(hit) // 20] = recording.hit[:: len(hit) // 20]
     stillmap_folder.write(dataclasses.replace(recording, hit=hit, images=None), tmp_path / "sim")
     out, truth = tmp_path / "out", room / "truth/trajectory.tum"
-    words = ["map", tmp_path / "sim", "-o", out, "--poses", truth, "--quiet", "--threads", "1"]
+    words = ["map", tmp_path / "sim", "-o", out, "--mesh", "--poses", truth, "--threads", "1"]
     assert main([str(word) for word in words]) == 0
     record = json.loads((out / "run.json").read_text())
     assert record["models"]["faces"] == record["models"]["area"] == 0
