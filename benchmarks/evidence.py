@@ -19,11 +19,11 @@ from prepared import Prepared, grid_of, prepare
 from scipy.ndimage import binary_dilation
 from tables import Row, grouped, markdown
 
-import stillmap
 from stillmap.core import se2
 from stillmap.core.profiling import StageTimer
 from stillmap.eval.map import GHOST_DISTANCE, distance_to_walls
 from stillmap.eval.trajectory import align
+from stillmap.pipeline.result import MappingResult, map_recording
 
 CASES = ["hall-15", "corridor-40", "office-10", "street-16", "warehouse-12"]
 _EDGES = (0, 1, 2, 3, 4, 5, 7, 10, 20, 50)  # of classes of clear looks
@@ -92,13 +92,13 @@ def _scored(run: Run) -> Scores:
     simulation, stages = prepared.simulation, StageTimer()
     poses = simulation.truth.T_world_base if run.true_poses else None
     options = options_of("stillmap", run.settings)
-    result = stillmap.build(simulation.recording, options, poses=poses, stages=stages)
+    result = map_recording(simulation.recording, options, poses=poses, stages=stages)
     spent = {name: float(stage["cpu_seconds"]) for name, stage in stages.to_dict().items()}
     cost = 100.0 * spent["evidence"] / sum(spent.values())
     return {**scores_of(result, prepared), "cost": cost}
 
 
-def scores_of(result: stillmap.Result, prepared: Prepared) -> Scores:
+def scores_of(result: MappingResult, prepared: Prepared) -> Scores:
     """Numbers of cells: known, thin, wrong, and what of these is thin; the same by clear looks."""
     evidence, ghosts = result.evidence, _ghosts(result, prepared)
     walls, missed = _walls(result, prepared)
@@ -120,7 +120,7 @@ def scores_of(result: stillmap.Result, prepared: Prepared) -> Scores:
     return scores
 
 
-def _ghosts(result: stillmap.Result, prepared: Prepared) -> Bool:
+def _ghosts(result: MappingResult, prepared: Prepared) -> Bool:
     grid, truth = grid_of(result.map), prepared.simulation.truth
     T = align(result.poses, truth.T_world_base)
     cells = np.argwhere(grid.occupied)
@@ -131,7 +131,7 @@ def _ghosts(result: stillmap.Result, prepared: Prepared) -> Bool:
     return out
 
 
-def _walls(result: stillmap.Result, prepared: Prepared) -> tuple[Bool, Bool]:
+def _walls(result: MappingResult, prepared: Prepared) -> tuple[Bool, Bool]:
     """Known cells that should be wall, and those of them that are missed."""
     grid, truth = grid_of(result.map), prepared.simulation.truth
     T = se2.inverse(align(result.poses, truth.T_world_base))

@@ -26,10 +26,10 @@ from object_scores import (
 from prepared import grid_of
 from tables import Column, means_and_worst
 
-import stillmap
 from stillmap.core import se2
 from stillmap.core.profiling import StageTimer
 from stillmap.eval.trajectory import align
+from stillmap.pipeline.result import MappingResult, map_recording
 from stillmap.sim import Simulation, simulate
 from stillmap.tracking import compute_flow_map
 
@@ -61,12 +61,12 @@ def _scored(run: Run) -> Scores:
     stages = StageTimer()
     poses = simulation.truth.T_world_base if run.true_poses else None
     options = options_of("stillmap", run.settings)
-    result = stillmap.build(simulation.recording, options, poses=poses, stages=stages)
+    result = map_recording(simulation.recording, options, poses=poses, stages=stages)
     spent = {name: float(stage["cpu_seconds"]) for name, stage in stages.to_dict().items()}
     return {**scores_of(result, simulation), "cost": 100.0 * spent["objects"] / sum(spent.values())}
 
 
-def scores_of(result: stillmap.Result, simulation: Simulation) -> Scores:
+def scores_of(result: MappingResult, simulation: Simulation) -> Scores:
     """Scores of the objects and the traffic of one result."""
     truth, recording = simulation.truth, simulation.recording
     seconds = 1e-9 * (recording.stamp_ns - recording.stamp_ns[0])
@@ -87,7 +87,7 @@ def scores_of(result: stillmap.Result, simulation: Simulation) -> Scores:
 
 
 def _of_traffic(
-    result: stillmap.Result, simulation: Simulation, seconds: NDArray[np.float64], size: float
+    result: MappingResult, simulation: Simulation, seconds: NDArray[np.float64], size: float
 ) -> float:
     truth, recording = simulation.truth, simulation.recording
     T_map_world = se2.inverse(align(result.poses, truth.T_world_base))

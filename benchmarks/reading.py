@@ -17,7 +17,6 @@ from pathlib import Path
 import numpy as np
 from tables import markdown
 
-from stillmap import build
 from stillmap.core.profiling import StageTimer
 from stillmap.core.recording import Recording
 from stillmap.io import read, writers
@@ -25,6 +24,7 @@ from stillmap.io.builder import ReadContext
 from stillmap.io.ros.bag import open_bag
 from stillmap.io.ros.bag_types import ENDINGS
 from stillmap.io.ros.collect import collect_messages, select_topics
+from stillmap.pipeline.result import map_recording
 from stillmap.preprocessing.options import ReadOptions
 from stillmap.sim import scene_by_name, simulate
 
@@ -102,7 +102,7 @@ def _shares(paths: list[Path]) -> str:
         stages = StageTimer()
         with stages.measure("read"):
             recording = read(path)
-        build(recording, stages=stages)
+        map_recording(recording, stages=stages)
         cpu = {name: stage["cpu_seconds"] for name, stage in stages.to_dict().items()}
         share = cpu["read"] / sum(cpu.values())
         rows.append([path.name, f"{cpu['read']:.2f}", f"{100.0 * share:.1f} %"])

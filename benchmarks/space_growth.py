@@ -33,6 +33,7 @@ import stillmap
 from stillmap.core import config
 from stillmap.core.profiling import StageTimer, peak_memory_bytes
 from stillmap.io import stillmap_folder
+from stillmap.pipeline.result import map_recording
 from stillmap.sim import SCENES, load_truth, scene_by_name, simulate, write_simulation
 
 Float = NDArray[np.float64]
@@ -126,7 +127,7 @@ def cost_of(
     sweeps = recording.n_scans
     stages, wall, cpu = StageTimer(), time.perf_counter(), time.process_time()
     loaded = peak_memory_bytes()
-    result = stillmap.build(recording, chosen, poses=poses, stages=stages)
+    result = map_recording(recording, chosen, poses=poses, stages=stages)
     models = stillmap.build_models(result, stages=stages) if with_models else None
     with stages.measure("writing"):
         result.save(out, models=models)

@@ -18,6 +18,7 @@ from common import Scores
 import stillmap
 from stillmap.core import config
 from stillmap.core.profiling import StageTimer, peak_memory_bytes
+from stillmap.pipeline.result import map_recording
 
 OURS: dict[str, dict[str, Any]] = {
     "stillmap": {},
@@ -45,7 +46,7 @@ def of_ours(work: Path, method: str, settings: tuple[str, ...], threads: int, ou
     poses = None if method == ESTIMATED else np.load(work / "poses.npy")
     recording = stillmap.read(json.loads((work / "case.json").read_text())["source"], chosen.read)
     stages, wall, cpu = StageTimer(), time.perf_counter(), time.process_time()
-    result = stillmap.build(recording, chosen, poses=poses, stages=stages)
+    result = map_recording(recording, chosen, poses=poses, stages=stages)
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     peak = peak_memory_bytes()  # before the labels are picked out for whoever scores them
     np.save(out, result.p_static[np.load(work / "beam.npy")])

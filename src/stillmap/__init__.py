@@ -10,44 +10,57 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from stillmap.core.errors import InputError
+    from stillmap.core.errors import InputError, MissingExtra
     from stillmap.core.recording import Recording
-    from stillmap.io import read
     from stillmap.mesh.build import Models
     from stillmap.pipeline.em_loop import iterate
     from stillmap.pipeline.estimate import Iteration
+    from stillmap.pipeline.inputs import read
     from stillmap.pipeline.models import build_models
     from stillmap.pipeline.options import Options
-    from stillmap.results.result import Result, build
+    from stillmap.preprocessing.options import ReadOptions
+    from stillmap.results.build import build
+    from stillmap.results.result import BuiltResult, Result
+    from stillmap.results.saved import SavedResult, load
 
     __version__: str
 
 __all__ = [
+    "BuiltResult",
     "InputError",
     "Iteration",
+    "MissingExtra",
     "Models",
     "Options",
+    "ReadOptions",
     "Recording",
     "Result",
+    "SavedResult",
     "__version__",
     "build",
     "build_models",
     "iterate",
+    "load",
     "read",
 ]
 
 # loaded when they are first used: `stillmap --help` has no use for them, and they take long
 _MODULES = {
+    "BuiltResult": "results.result",
     "InputError": "core.errors",
     "Iteration": "pipeline.estimate",
+    "MissingExtra": "core.errors",
     "Models": "mesh.build",
     "Options": "pipeline.options",
+    "ReadOptions": "preprocessing.options",
     "Recording": "core.recording",
     "Result": "results.result",
-    "build": "results.result",
-    "iterate": "pipeline.em_loop",
+    "SavedResult": "results.saved",
+    "build": "results.build",
     "build_models": "pipeline.models",
-    "read": "io",
+    "iterate": "pipeline.em_loop",
+    "load": "results.saved",
+    "read": "pipeline.inputs",
 }
 _ROOMS = (
     "core",

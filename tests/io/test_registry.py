@@ -64,7 +64,7 @@ def test_recordings_in_a_folder_are_listed(tmp_path):
     both = said("horizontal")
     assert both.startswith(f"{outer}: is no recording but holds several recordings: ")
     assert f"{outer / 'horizontal'}, {outer / 'tilting'} (both: " in both
-    assert f"map {outer / 'horizontal'} --tilting {outer / 'tilting'} -o DIR" in both
+    assert f"{outer / 'horizontal'} with tilting={outer / 'tilting'}" in both
     (outer / "run.json").write_text("")
     assert "is a folder without a recording" in said()  # a result folder: its clouds are objects
     (outer / "run.json").unlink()

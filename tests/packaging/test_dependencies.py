@@ -13,7 +13,11 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "src" / "stillmap"
 # modules that are imported only where their extra is in use
-NEEDS_EXTRA = {"viewer/server.py": "viewer"}
+NEEDS_EXTRA = {
+    "viewer/server.py": "viewer",
+    # for type checkers alone
+    **{f"results/{name}.py": "notebook" for name in ("plot", "result", "tables")},
+}
 SINCE_PYTHON_3_14 = {"compression"}  # the standard library's zstd; before, backports.zstd
 
 

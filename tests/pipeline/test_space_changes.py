@@ -10,6 +10,8 @@ import stillmap
 from stillmap.core.config import override
 from stillmap.pipeline.checkpoint_files import pack_state, unpack_state
 from stillmap.pipeline.options import Options
+from stillmap.pipeline.result import map_recording
+from stillmap.results.save import save
 from stillmap.sim import CrowdOptions, LidarOptions, RobotOptions, Scene, simulate
 from stillmap.sim.scene import Stay, Thing
 from stillmap.sim.walls import box
@@ -41,7 +43,7 @@ def hall():
 def built(hall):
     """The result, and the state of the run after its only iteration."""
     states = []
-    result = stillmap.build(
+    result = map_recording(
         hall.recording, LISTED, poses=hall.truth.T_world_base, checkpoint=states.append
     )
     return result, states[-1]
@@ -61,7 +63,7 @@ def test_both_are_listed_and_nothing_else(built):
 
 def test_the_files_say_so(built, tmp_path):
     result, _ = built
-    result.save(tmp_path / "out")
+    save(result, tmp_path / "out")
     changes = json.loads((tmp_path / "out/run.json").read_text())["changes"]
     for one, known in zip(changes, result.changes, strict=True):
         assert (one["kind"], one["cells"]) == (known.kind, len(known.cells))
@@ -85,7 +87,7 @@ def test_a_run_that_goes_on_knows_them(built, hall):
     result, state = built
     values, arrays = pack_state(state)
     again = unpack_state(json.loads(json.dumps(values)), arrays, state.options)
-    resumed = stillmap.build(hall.recording, LISTED, poses=hall.truth.T_world_base, resume=again)
+    resumed = map_recording(hall.recording, LISTED, poses=hall.truth.T_world_base, resume=again)
     kept, known = again.best.e_step.ground, state.best.e_step.ground
     np.testing.assert_array_equal(kept.height, known.height)
     np.testing.assert_array_equal(kept.corner, known.corner)

@@ -11,6 +11,8 @@ from pathlib import Path
 from types import CodeType, FrameType
 from typing import IO, TYPE_CHECKING, Any
 
+from stillmap.core.progress_bar import Step, terminal_bar
+
 if TYPE_CHECKING:
     from stillmap.core.profiling import Progress
 
@@ -73,7 +75,7 @@ def show_progress(quiet: bool, iterations: int) -> "Iterator[Progress]":
 
         yield no_progress
     elif is_terminal(sys.stderr):
-        with _bar(iterations) as progress:
+        with terminal_bar(iterations) as progress:
             yield progress
     else:
         with _Lines(iterations) as lines:
@@ -112,60 +114,12 @@ def show_share(quiet: bool, what: str) -> "Iterator[Callable[[float], None] | No
         yield print_line
 
 
-@contextmanager
-def _bar(iterations: int) -> "Iterator[Progress]":
-    from rich.console import Console
-    from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
-    from rich.progress import Progress as Bar
-
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.fields[counted]}"),
-        TimeRemainingColumn(),
-    )
-    with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
-        shown: _Step | None = None
-        task = bar.add_task("", total=None, counted="")
-
-        def progress(what: str, iteration: int, done: int, total: int) -> None:
-            nonlocal shown, task
-            if shown is None or shown.key != (what, iteration):
-                shown = _Step(what, iteration, iterations)
-                bar.remove_task(task)
-                task = bar.add_task(shown.name, total=total or None, counted="")
-            if total:
-                counted = f"{done}/{total}"
-                if shown.of_scans:
-                    counted += f" scans {shown.rate(done):.0f}/s"
-                # a finished step is shown even if it was short
-                bar.update(task, completed=done, counted=counted, refresh=done == total)
-
-        yield progress
-
-
-class _Step:
-    """The current step and its start; only iterations count scans."""
-
-    def __init__(self, what: str, iteration: int, iterations: int) -> None:
-        self.key = what, iteration
-        self.name = f"{what}, iteration {iteration} of at most {iterations}" if iteration else what
-        self.of_scans, self._started = iteration > 0, time.monotonic()
-
-    def seconds(self) -> float:
-        return time.monotonic() - self._started
-
-    def rate(self, done: int) -> float:
-        """Items per second."""
-        return done / max(self.seconds(), 1e-3)
-
-
 class _Lines:
     """Print progress every `_LINE_PERIOD` seconds, and at the end of each iteration."""
 
     def __init__(self, iterations: int) -> None:
         self._iterations, self._reported = iterations, 0
-        self._now = _Step("preparing", 0, iterations), 0, 0
+        self._now = Step("preparing", 0, iterations), 0, 0
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
@@ -180,7 +134,7 @@ class _Lines:
     def __call__(self, what: str, iteration: int, done: int, total: int) -> None:
         step = self._now[0]
         if step.key != (what, iteration):
-            step = _Step(what, iteration, self._iterations)
+            step = Step(what, iteration, self._iterations)
         self._now = step, done, total
         if 0 < total == done and iteration > self._reported:
             self._reported = iteration

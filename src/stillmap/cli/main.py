@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 from stillmap.cli.console import EXIT_INTERRUPTED, EXIT_TERMINATED, fail, handle_signals, say
+from stillmap.cli.flags import in_flags
 from stillmap.cli.parser import COMMANDS, EXIT_INPUT, parser
 from stillmap.core.errors import InputError, closest_match
 
@@ -34,7 +35,7 @@ def main(argv: list[str] | None = None) -> int:
             sys.stdout.flush()
         return status
     except InputError as error:
-        fail(str(_with_similar_name(error, args)))
+        fail(str(in_flags(_with_similar_name(error, args))))
         return EXIT_INPUT
     except KeyboardInterrupt:
         return _report_interrupt()

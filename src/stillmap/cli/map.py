@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from stillmap.core.recording import Recording
     from stillmap.mesh.build import Models
     from stillmap.pipeline.checkpoint import CheckpointFolder
-    from stillmap.results.result import Result
+    from stillmap.pipeline.result import MappingResult
     from stillmap.rig.build import TiltingResult
 
 DESCRIPTION = (
@@ -212,7 +212,7 @@ def _summarize(output: Path) -> dict[str, Any]:
 
 
 def _print_summary(
-    result: "Result", tilting: "TiltingResult | None", models: "Models | None", output: Path
+    result: "MappingResult", tilting: "TiltingResult | None", models: "Models | None", output: Path
 ) -> None:
     n = len(result.iterations)
     lines = [
@@ -231,7 +231,7 @@ def _print_summary(
 
 
 def _describe_lack_of_models(
-    result: "Result", tilting: "TiltingResult | None", models: "Models | None"
+    result: "MappingResult", tilting: "TiltingResult | None", models: "Models | None"
 ) -> list[str]:
     """How to get models of a 3D recording that has no pictures."""
     is_2d = tilting is None and result.recording.dimension == 2
@@ -240,7 +240,7 @@ def _describe_lack_of_models(
     return ["no surface and models without pictures: --mesh makes grey ones"]
 
 
-def _describe_changes(result: "Result") -> list[str]:
+def _describe_changes(result: "MappingResult") -> list[str]:
     n, last = len(result.changes), result.options.output.map_state == "last"
     if not n:
         return []

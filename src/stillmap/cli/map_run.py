@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap import em
 from stillmap.cli.console import say, show_share
 from stillmap.core.errors import InputError, MissingExtra
 from stillmap.core.parallel import limit_blas_threads, resolve_threads
@@ -17,15 +16,15 @@ from stillmap.core.recording import Recording
 from stillmap.io import read
 from stillmap.io.registry import detect_format
 from stillmap.io.text_lines import Progress as ReadProgress
-from stillmap.io.trajectory import poses_from_tum
+from stillmap.pipeline import inputs
 from stillmap.pipeline.checkpoint import CheckpointFolder, DamagedCheckpoint
 from stillmap.pipeline.checkpoint_files import identify_run
 from stillmap.pipeline.estimate import EmState
 from stillmap.pipeline.options import Options, resolve_options
+from stillmap.pipeline.result import MappingResult, map_recording
 from stillmap.preprocessing.options import ReadOptions
 from stillmap.preprocessing.overrides import select_time
 from stillmap.preprocessing.time_window import TimeWindow
-from stillmap.results.result import Result, build
 
 if TYPE_CHECKING:
     from stillmap.mesh.build import Models
@@ -47,69 +46,16 @@ def read_inputs(
     """Read the inputs, and resolve the options for them."""
     with stages.measure("read"):
         with show_share(args.quiet, "reading") as progress:
-            recording = read(Path(args.input), options.read, progress=progress, scratch=scratch)
-        _require_mappable(recording, options, args.input)
-        recording = _note_path(recording, args.input)
+            recording = inputs.read(args.input, options.read, progress=progress, scratch=scratch)
         if args.no_odometry:
             recording = recording.without_odometry()
-        poses = _read_poses(args, recording)
-        _require_depth_poses(recording, poses, args.input)
+        poses = inputs.read_poses(args.poses or None, recording)
+        inputs.require_mappable(recording, options, poses)
         with show_share(args.quiet, "reading") as progress:
             tilting = _read_tilting_laser(
                 args.input, args.tilting, recording, options, progress, scratch
             )
         return Inputs(recording, resolve_options(options, recording), poses, tilting)
-
-
-def _require_mappable(recording: Recording, options: Options, path: str) -> None:
-    if recording.n_scans == 0:
-        raise InputError("holds no scan that can be used", where=path)
-    if recording.dimension == 3 and options.estimator not in em.ESTIMATORS_3D:
-        raise InputError(
-            f"is 3D: estimator '{options.estimator}' is for 2D recordings",
-            where=path,
-            hint=f"--estimator {' or '.join(em.ESTIMATORS_3D)}",
-        )
-
-
-def _note_path(recording: Recording, path: str) -> Recording:
-    """Note where the recording lies, and what it was made from where that is noted."""
-    original = recording.source.get("path", path)
-    source = {**recording.source, "path": path}
-    if original != path:
-        source["made_from"] = original
-    return dataclasses.replace(recording, source=source)
-
-
-def _read_poses(args: argparse.Namespace, recording: Recording) -> NDArray[np.float64] | None:
-    if not args.poses:
-        return None
-    if args.poses != "recording":
-        return poses_from_tum(Path(args.poses), recording)
-    if recording.T_recorded_base is None:
-        raise InputError(
-            "states no poses",
-            where=args.input,
-            hint="--poses FILE.tum gives them; a file of the name `recording` is ./recording",
-        )
-    return recording.T_recorded_base
-
-
-def _require_depth_poses(
-    recording: Recording, poses: NDArray[np.float64] | None, path: str
-) -> None:
-    """Refuse depth images without poses: their narrow view is not registered."""
-    if recording.dimension == 2 or poses is not None or recording.T_odom_base is not None:
-        return
-    from stillmap.io.cameras import depth_camera_names  # 2D recordings need no camera
-
-    if depth_camera_names(recording.source):
-        stated = recording.T_recorded_base is not None
-        raise InputError(
-            "holds depth images, whose poses have to be given",
-            where=path,
-            hint="--poses recording" if stated else "--poses FILE.tum",
-        )
 
 
 def _read_tilting_laser(
@@ -170,19 +116,19 @@ def _read_topic(
 
 def build_all(
     args: argparse.Namespace,
-    inputs: Inputs,
+    found: Inputs,
     checkpoints: CheckpointFolder,
     progress: Progress,
     stages: StageTimer,
-) -> "tuple[Result, TiltingResult | None, Models | None]":
+) -> "tuple[MappingResult, TiltingResult | None, Models | None]":
     """EM with a checkpoint per iteration, then the tilting laser and the meshes."""
-    options = inputs.options
+    options = found.options
     with stages.measure("read"):
-        run_id = identify_run(inputs.recording, options, inputs.poses)
-    result = build(
-        inputs.recording,
+        run_id = identify_run(found.recording, options, found.poses)
+    result = map_recording(
+        found.recording,
         options,
-        poses=inputs.poses,
+        poses=found.poses,
         progress=progress,
         stages=stages,
         scratch=checkpoints.folder,
@@ -190,10 +136,10 @@ def build_all(
         checkpoint=lambda state: checkpoints.save(state, run_id, stages),
     )
     tilting = None
-    if inputs.tilting is not None:
+    if found.tilting is not None:
         progress("removing moving objects", 0, 0, 0)
         with stages.measure("tilting"):
-            tilting = _map_tilting_laser(result, inputs.tilting, options)
+            tilting = _map_tilting_laser(result, found.tilting, options)
     models, warnings = _build_models(result, tilting, progress, stages)
     warnings = [*result.warnings, *warnings]
     result = dataclasses.replace(result, warnings=warnings, stages=stages.to_dict())
@@ -201,7 +147,7 @@ def build_all(
 
 
 def _build_models(
-    result: Result, tilting: "TiltingResult | None", progress: Progress, stages: StageTimer
+    result: MappingResult, tilting: "TiltingResult | None", progress: Progress, stages: StageTimer
 ) -> "tuple[Models | None, list[str]]":
     """Build the meshes of a 3D recording where they are wanted; return them and warnings."""
     if not _wants_models(result, tilting):
@@ -221,7 +167,7 @@ def _build_models(
     return models, warnings
 
 
-def _wants_models(result: Result, tilting: "TiltingResult | None") -> bool:
+def _wants_models(result: MappingResult, tilting: "TiltingResult | None") -> bool:
     """Whether models are enabled, or could be textured where nothing is said about them."""
     enabled = result.options.mesh.enabled
     recording = result.recording if tilting is None else tilting.recording
@@ -261,7 +207,9 @@ def _load_checkpoint(
 
 
 @limit_blas_threads()
-def _map_tilting_laser(result: Result, tilting: Recording, options: Options) -> "TiltingResult":
+def _map_tilting_laser(
+    result: MappingResult, tilting: Recording, options: Options
+) -> "TiltingResult":
     """Map the tilting laser in 3D, given the labels and objects of the planar one."""
     from stillmap.rig.build import PlanarResult, build_tilting
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stillmap.cli.console import say, show_share
+from stillmap.cli.flags import in_flags
 from stillmap.core.errors import InputError, MissingExtra, import_extra
 
 if TYPE_CHECKING:
@@ -119,6 +120,7 @@ def _serve(args: argparse.Namespace, folder: Path) -> None:
     except InputError as error:
         if args.input:
             raise
+        error = in_flags(error)
         say(f"without beams: {error}")
         scene = replace(scene, notes=[f"Without beams: {error}", *scene.notes])
     window = Window(scene, beams, args.port)

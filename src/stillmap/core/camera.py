@@ -21,6 +21,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.short_repr import ShortRepr
+
 Float = NDArray[np.float64]
 
 Mask = NDArray[np.bool_]
@@ -29,7 +31,7 @@ Lens = tuple[str, tuple[float, ...]]
 
 
 @dataclass(frozen=True, eq=False)
-class Camera:
+class Camera(ShortRepr):
     """One camera on the robot.
 
     Attributes:
@@ -51,7 +53,7 @@ class Camera:
 
 
 @dataclass(frozen=True, eq=False)
-class Images:
+class Images(ShortRepr):
     """N images ordered by stamp, read from disk on demand.
 
     Attributes:

@@ -188,16 +188,26 @@ def parse_assignment(text: str) -> dict[str, Any]:
     """
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
-        raise InputError(f"--set wants section.key=value, got '{text}'")
+        raise InputError(f"an option is set by section.key=value, got '{text}'")
     try:
         found = tomllib.loads(f"value = {value}")
     except (ValueError, RecursionError):
         found = {}
     # more than one key: the value had several lines, and only looked like TOML
-    nested: Any = found["value"] if len(found) == 1 else _number_or_text(value.strip())
-    for name in reversed(key.strip().split(".")):
-        nested = {name: nested}
-    return dict(nested)
+    return nest(
+        {key.strip(): found["value"] if len(found) == 1 else _number_or_text(value.strip())}
+    )
+
+
+def nest(changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested dictionaries of dotted keys: `{"em": {"prior": 0.9}}` of `{"em.prior": 0.9}`."""
+    out: dict[str, Any] = {}
+    for key, value in changes.items():
+        nested = value
+        for name in reversed(key.split(".")):
+            nested = {name: nested}
+        out = merge_nested(out, nested)
+    return out
 
 
 def _number_or_text(value: str) -> float | str:

@@ -29,7 +29,7 @@ def require_new(path: Path, marker: str, overwrite: bool = False) -> None:
         return
     if not overwrite:
         raise InputError(
-            "already holds something", where=str(path), hint="choose another or give --overwrite"
+            "already holds something", where=str(path), hint="choose another or give overwrite=True"
         )
     if not any(path.glob(marker)):
         what = f"holds other things: only a folder with {marker} is replaced"
@@ -48,7 +48,7 @@ def require_new_file(path: Path, overwrite: bool = False) -> None:
         raise InputError("is in the way: no regular file", where=str(path))
     if path.exists() and not overwrite:
         raise InputError(
-            "is there already", where=str(path), hint="choose another or give --overwrite"
+            "is there already", where=str(path), hint="choose another or give overwrite=True"
         )
     if not path.absolute().parent.is_dir():
         raise InputError("cannot be written: no such folder", where=str(path.parent))

@@ -5,9 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.short_repr import ShortRepr
+
 
 @dataclass(frozen=True, eq=False)
-class GridMap:
+class GridMap(ShortRepr):
     """Occupancy of a rectangle of cells.
 
     Attributes:
@@ -20,3 +22,10 @@ class GridMap:
     p_occupied: NDArray[np.float32]
     origin: tuple[float, float, float]
     resolution: float
+
+    def __repr__(self) -> str:
+        height, width = self.p_occupied.shape
+        return (
+            f"<{type(self).__name__}: {width} x {height} cells of {self.resolution:g} m, "
+            f"{width * self.resolution:.1f} m x {height * self.resolution:.1f} m>"
+        )

@@ -1,21 +1,22 @@
 """Recording: flat arrays of scans and beams, 2D and 3D alike."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from stillmap.core import arrays
 from stillmap.core.camera import Images
+from stillmap.core.short_repr import ShortRepr
 
 _BLOCK = 1 << 14  # end points transformed at once
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
+class Recording(ShortRepr):
     """T scans with M beams in all, in D dimensions, taken by S sensors on one robot.
 
     Attributes:
@@ -76,6 +77,111 @@ class Recording:
             raise ValueError(f"offset: must not decrease, from 0 to {M}")
         if T and (self.sensor.min() < 0 or self.sensor.max() >= S):
             raise ValueError(f"sensor: indices must lie in [0, {S})")
+
+    @classmethod
+    def from_scans(
+        cls,
+        stamps: ArrayLike,
+        ranges: ArrayLike,
+        angles: ArrayLike,
+        odometry: ArrayLike | None = None,
+        *,
+        min_range: float = 0.0,
+        max_range: float | None = None,
+        sensor_pose: ArrayLike | None = None,
+        time_increment: float = 0.0,
+    ) -> "Recording":
+        """A 2D recording from the arrays of a laser scanner.
+
+        Readings mean what they mean in a ROS LaserScan: NaN, negative and near zero: unusable;
+        +inf and readings from `max_range` on: nothing within reach, the beam shows free space.
+        As when a file is read, values that repeat at the top of the readings are recognised as
+        codes of the maximum range, and returns from the robot itself are removed.
+
+        Args:
+            stamps: (T,) not decreasing; floats are seconds, integers nanoseconds, or datetime64.
+            ranges: (T, N) metres, one row per scan.
+            angles: (N,) radians in the sensor frame, counter-clockwise, in any order.
+            odometry: (T, 3) x, y (m), theta (rad), or (T, 3, 3) T_odom_base; None: no odometry.
+            min_range: metres; shorter readings are unusable.
+            max_range: metres; readings from it on are maximum range; None: found in the readings.
+            sensor_pose: of the laser on the robot, (3,) x, y, theta or (3, 3); None: at the
+                robot's centre, unless the motion shows another place when the map is built.
+            time_increment: seconds from beam to beam; the stamp is that of the first beam.
+
+        Raises:
+            ValueError: names the argument, what was expected, and what it was.
+
+        Example:
+            >>> recording = stillmap.Recording.from_scans(stamps, ranges, angles, odometry)
+            >>> result = stillmap.build(recording)
+        """
+        # the one import upwards: a constructor belongs to its class, what readings mean to `io`
+        from stillmap.io.from_arrays import recording_from_scans
+
+        return recording_from_scans(
+            stamps,
+            ranges,
+            angles,
+            odometry,
+            min_range=min_range,
+            max_range=max_range,
+            sensor_pose=sensor_pose,
+            time_increment=time_increment,
+        )
+
+    @classmethod
+    def from_clouds(
+        cls,
+        stamps: ArrayLike,
+        clouds: Iterable[ArrayLike],
+        odometry: ArrayLike | None = None,
+        *,
+        min_range: float = 0.0,
+        max_range: float | None = None,
+        sensor_pose: ArrayLike | None = None,
+        beam_times: Sequence[ArrayLike] | None = None,
+    ) -> "Recording":
+        """A 3D recording from point clouds, one per sweep of a lidar.
+
+        Args:
+            stamps: (T,) not decreasing; floats are seconds, integers nanoseconds, or datetime64.
+            clouds: T arrays (N_t, 3) in the sensor frame, metres; a generator will do. Points that
+                are not finite, at the origin or implausibly far are unusable.
+            odometry: (T, 4, 4) T_odom_base; None: no odometry.
+            min_range: metres; nearer points are unusable.
+            max_range: metres; points from it on are maximum range; None: every point is a hit.
+            sensor_pose: (4, 4) of the lidar on the robot; None: at the robot's centre.
+            beam_times: T arrays (N_t,) of seconds after the stamp; None: all points of a cloud
+                have its stamp.
+
+        Raises:
+            ValueError: names the argument, what was expected, and what it was.
+
+        Example:
+            >>> sweeps = (numpy.load(file) for file in files)
+            >>> recording = stillmap.Recording.from_clouds(stamps, sweeps)
+        """
+        from stillmap.io.from_arrays import recording_from_clouds
+
+        return recording_from_clouds(
+            stamps,
+            clouds,
+            odometry,
+            min_range=min_range,
+            max_range=max_range,
+            sensor_pose=sensor_pose,
+            beam_times=beam_times,
+        )
+
+    def __repr__(self) -> str:
+        seconds = float(self.stamp_ns[-1] - self.stamp_ns[0]) * 1e-9 if self.n_scans else 0.0
+        odometry = "no odometry" if self.T_odom_base is None else "odometry"
+        images = "" if self.images is None else f", {len(self.images)} images"
+        return (
+            f"<Recording: {self.n_scans} scans with {self.n_beams} beams in {self.dimension}D, "
+            f"{seconds:.1f} s, {odometry}{images}>"
+        )
 
     @property
     def n_scans(self) -> int:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 import stillmap._core as _core
 from stillmap.core.chunks import iter_beams
 from stillmap.core.recording import Recording
+from stillmap.core.short_repr import ShortRepr
 from stillmap.core.tiles import (
     TILE,
     TILES_PER_RELEASE,
@@ -42,7 +43,7 @@ BEAM_MODEL = {
 
 
 @dataclass(frozen=True, eq=False)
-class Coverage:
+class Coverage(ShortRepr):
     """Observation counts, laid out as the map.
 
     Attributes:

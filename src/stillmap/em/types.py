@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core.arrays import finite_rows
+from stillmap.core.short_repr import ShortRepr
 
 Float = NDArray[np.float64]
 
@@ -33,7 +34,7 @@ class Likelihood:
 
 
 @dataclass(frozen=True, eq=False)
-class CellProbabilities:
+class CellProbabilities(ShortRepr):
     """Occupancy probabilities of single cells.
 
     Attributes:
@@ -48,7 +49,7 @@ class CellProbabilities:
 
 
 @dataclass(frozen=True, eq=False)
-class NoReturnModel:
+class NoReturnModel(ShortRepr):
     """Free space shown by beams without a return; fewer than three neighbours show none.
 
     Attributes:
@@ -61,7 +62,7 @@ class NoReturnModel:
 
 
 @dataclass(frozen=True, eq=False)
-class ChangedCells:
+class ChangedCells(ShortRepr):
     """K cells in which objects may have arrived or left; only groups of them are significant.
 
     Attributes:
@@ -85,7 +86,7 @@ class ChangedCells:
 
 
 @dataclass(frozen=True, eq=False)
-class GroundMap:
+class GroundMap(ShortRepr):
     """Height of the ground in squares of one metre.
 
     Attributes:
@@ -112,7 +113,7 @@ class GroundMap:
 
 
 @dataclass(frozen=True, eq=False)
-class EStepResult:
+class EStepResult(ShortRepr):
     """Result of an E-step.
 
     Attributes:

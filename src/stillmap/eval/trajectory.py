@@ -81,7 +81,7 @@ def associate_trajectories(
     near = np.flatnonzero(distance <= max_dt)
     if not len(near):
         what = f"no two stamps lie within {max_dt:g} s of each other"
-        raise InputError(what, hint="other clocks? see --max-dt")
+        raise InputError(what, hint="other clocks? see max_dt=SECONDS")
     return (partner[near], near) if swap else (near, partner[near])
 
 

@@ -73,7 +73,7 @@ def calibrate_color_camera(
     warning = (
         "depth is not registered to color: calibrated from edges, the color camera sits "
         f"{1e3 * np.hypot(tx, ty):.0f} mm beside the depth camera and has a focal length of "
-        f"{f:.0f} pixels; --cameras FILE overrides this"
+        f"{f:.0f} pixels; read.cameras overrides this"
     )
     return camera, warning
 

@@ -233,7 +233,7 @@ def _no_recording_error(path: Path) -> InputError:
     shown = ", ".join(map(str, inside[:_MAX_LISTED])) + more
     if tuple(one.name for one in inside) == RIG_FOLDERS:
         flat, tilting = inside
-        hint = f"both: stillmap map {flat} --tilting {tilting} -o DIR"
+        hint = f"both: {flat} with tilting={tilting}"
     else:
         hint = "name it" if len(inside) == 1 else "name one of them"
     what = "a recording" if len(inside) == 1 else "several recordings"

@@ -124,7 +124,7 @@ def read_depth_camera(
         warnings.append(
             f"no calibration of the depth camera: a focal length of {fx:g} pixels and the centre "
             f"at {cx:g}, {cy:g} are assumed, the default of {frames.format}; set others by "
-            "--cameras FILE"
+            "read.cameras"
         )
     error = camera_module.calibration_error(camera)
     if error:
@@ -183,7 +183,7 @@ def _read_color_images(
     if size != (depth.width, depth.height):
         warnings.append(
             f"color images have {width} x {height} pixels, depth images {depth.width} x "
-            f"{depth.height}: the color camera is not calibrated; --cameras FILE calibrates it"
+            f"{depth.height}: the color camera is not calibrated; read.cameras calibrates it"
         )
         camera = replace(camera, K=None, model="", distortion=np.zeros(0))
     elif scale is not None:

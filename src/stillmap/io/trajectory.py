@@ -40,7 +40,7 @@ def write_tum(path: Path, stamp_ns: NDArray[np.int64], poses: NDArray[np.float64
     with path.open("w", encoding="ascii", newline="\n") as file:
         for part in iter_blocks(poses, rows=_BLOCK):
             # + 0.0 turns negative zeros into zeros
-            rows = np.round(_pose_rows(poses[part]), 9) + 0.0
+            rows = np.round(pose_rows(poses[part]), 9) + 0.0
             for stamp, row in zip(stamp_ns[part].tolist(), rows.tolist(), strict=True):
                 file.write(f"{format_seconds(stamp)} {' '.join(f'{value:.9f}' for value in row)}\n")
 
@@ -82,7 +82,7 @@ def _rotations() -> "type[Rotation]":
     return Rotation
 
 
-def _pose_rows(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+def pose_rows(poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """(T, 7) x y z qx qy qz qw with qw >= 0."""
     rows = np.zeros((len(poses), 7))
     dimension = poses.shape[-1] - 1

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from stillmap.core.components import connected_components, neighbor_pairs
 from stillmap.core.recording import Recording
+from stillmap.core.short_repr import ShortRepr
 from stillmap.em import CellHistories, ChangedCells, time_bin_index
 from stillmap.em.change_hmm import MIN_RECURRING_CHANGES
 from stillmap.mapping.doors import compute_swept_cells
@@ -24,7 +25,7 @@ _NOISE = 2.0  # cells by which noise of poses and ranges moves surfaces
 
 
 @dataclass(frozen=True, eq=False)
-class Change:
+class Change(ShortRepr):
     """A changed place.
 
     Attributes:

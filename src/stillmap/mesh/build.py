@@ -9,6 +9,7 @@ import numpy as np
 
 from stillmap.core.errors import import_extra
 from stillmap.core.profiling import Progress, StageTimer, no_progress
+from stillmap.core.short_repr import ShortRepr
 from stillmap.mesh.inputs import MeshInputs
 from stillmap.mesh.objects.merging import ObjectTrack, collect_tracks, merge_tracks
 from stillmap.mesh.objects.reconstruction import ObjectShape, reconstruct_object
@@ -38,7 +39,7 @@ _MAX_P_SPOILED = 0.5  # that an image shows static surface only: below, a mover 
 
 
 @dataclass(frozen=True, eq=False)
-class ObjectModel:
+class ObjectModel(ShortRepr):
     """A moving object as a model in its own frame: x ahead, y left, z up, on the ground.
 
     Attributes:
@@ -59,7 +60,7 @@ class ObjectModel:
 
 
 @dataclass(frozen=True, eq=False)
-class Models:
+class Models(ShortRepr):
     """The static surface without movers, and the moving objects.
 
     Attributes:

@@ -11,7 +11,7 @@ class MeshOptions(Section, section="mesh"):
 
     enabled: bool | None = option(
         None,
-        "Build meshes of 3D recordings, with --mesh and --no-mesh; unset: where there are usable "
+        "Build meshes of 3D recordings; unset: where there are usable "
         "pictures to texture them with.",
     )
     voxel_size: float | None = option(

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from stillmap.core.camera import is_in_image, project, unproject
 from stillmap.core.parallel import map_ordered
+from stillmap.core.short_repr import ShortRepr
 from stillmap.mesh.inputs import LidarReturns, MeshInputs
 from stillmap.mesh.simplification import subdivide
 from stillmap.mesh.texture.baking import sample_bilinear
@@ -49,7 +50,7 @@ _SHIFTS = [(x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0)]  # pixels
 
 
 @dataclass(frozen=True, eq=False)
-class ViewAssignment:
+class ViewAssignment(ShortRepr):
     """A surface of F faces, and which of N views textures each.
 
     Attributes:

@@ -11,6 +11,7 @@ from stillmap.core import arrays
 from stillmap.core.camera import project
 from stillmap.core.chunks import Chunk, iter_chunks
 from stillmap.core.parallel import map_ordered
+from stillmap.core.short_repr import ShortRepr
 from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.mesh.inputs import MeshInputs
 from stillmap.mesh.objects.segmentation import NO_OWNER, DynamicReturns
@@ -32,7 +33,7 @@ _POINTS_PER_BLOCK = 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
-class PointColors:
+class PointColors(ShortRepr):
     """Colors of the end points of M beams.
 
     Attributes:

@@ -5,11 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from stillmap.core.components import component_labels
+from stillmap.core.short_repr import ShortRepr
 from stillmap.mesh.types import Bool, Float, Index, Int32
 
 
 @dataclass(frozen=True, eq=False)
-class Mesh:
+class Mesh(ShortRepr):
     """F triangles over V vertices.
 
     Attributes:

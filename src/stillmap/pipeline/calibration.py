@@ -42,7 +42,7 @@ def calibrate_recording(
     recording, sentences = _interpolate_late_odometry(recording)
     given = [_given_parameters(recording, options, k) for k in range(len(recording.T_base_sensor))]
     found = calibrate_mounts(recording, options.slam.resolution, given)
-    applied = _apply(recording, found)
+    applied = apply_calibration(recording, found)
     if any(
         one.significant for laser in found.lasers for name, one in laser.items() if name in POSITION
     ):
@@ -73,7 +73,8 @@ def _interpolate_late_odometry(recording: Recording) -> tuple[Recording, list[st
     return dataclasses.replace(recording, T_odom_base=T_odom_base), [sentence]
 
 
-def _apply(recording: Recording, found: Calibration) -> Recording:
+def apply_calibration(recording: Recording, found: Calibration) -> Recording:
+    """The recording with what a calibration found to be significant; 2D."""
     for k, upside_down in enumerate(found.upside_down):
         if upside_down:
             recording = mirror_beams(recording, k)

@@ -173,7 +173,7 @@ def require_same_run(before: dict[str, Any], now: dict[str, Any], where: str) ->
     raise InputError(
         f"cannot be resumed: {'; '.join(differ) or 'its description differs'}",
         where=where,
-        hint="give the same as before, or start anew without --resume",
+        hint="give the same as before, or start anew without resume=True",
     )
 
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from stillmap import em, slam
 from stillmap.core.recording import Recording
+from stillmap.core.short_repr import ShortRepr
 from stillmap.mapping.beam_statistics import sample_dynamic_points
 from stillmap.pipeline.options import Options
 from stillmap.pipeline.snapshots import Snapshot, Window, choose_window, snapshot
@@ -22,7 +23,7 @@ _MAX_SNAPSHOT_SCANS = 500  # whose beams show free space; what is occupied the E
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class Estimate(ShortRepr):
     """Estimate of one EM iteration: the results of its M-step and of its E-step.
 
     Attributes:
@@ -94,7 +95,7 @@ class IterationRecord:
 
 
 @dataclass(frozen=True, eq=False)
-class Iteration:
+class Iteration(ShortRepr):
     """One M-step and one E-step.
 
     Attributes:
@@ -117,7 +118,7 @@ class Iteration:
 
 
 @dataclass
-class EmState:
+class EmState(ShortRepr):
     """The history of a run: the numbers of all iterations, the arrays of the best and the last.
 
     Attributes:

@@ -11,6 +11,7 @@ from stillmap import em, slam
 from stillmap.core.parallel import resolve_threads
 from stillmap.core.profiling import Progress, StageTimer
 from stillmap.core.recording import Recording
+from stillmap.core.short_repr import ShortRepr
 from stillmap.em import GroundMap, estimate_ground
 from stillmap.mapping import (
     Change,
@@ -28,7 +29,7 @@ from stillmap.tracking.objects_3d import track_objects_3d
 
 
 @dataclass(frozen=True, eq=False)
-class Maps:
+class Maps(ShortRepr):
     """Maps of the same cells.
 
     Attributes:

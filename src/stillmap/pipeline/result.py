@@ -13,6 +13,7 @@ from stillmap import em, slam
 from stillmap.core.parallel import limit_blas_threads, resolve_threads
 from stillmap.core.profiling import Progress, StageTimer, no_progress
 from stillmap.core.recording import Recording
+from stillmap.core.short_repr import ShortRepr
 from stillmap.mapping import Change
 from stillmap.pipeline.calibration import calibrate_recording
 from stillmap.pipeline.diagnostics import find_warnings
@@ -30,7 +31,7 @@ Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class MappingResult:
+class MappingResult(ShortRepr):
     """A mapped recording of T scans with M beams; `stillmap.Result` adds saving.
 
     Attributes:

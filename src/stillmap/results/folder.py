@@ -13,15 +13,18 @@ from stillmap.core import arrays, config
 from stillmap.core.errors import InputError
 from stillmap.core.files import read_text, require_regular
 from stillmap.core.recording import Recording
+from stillmap.core.short_repr import ShortRepr
 from stillmap.io import read
 from stillmap.io.text_lines import Progress
 from stillmap.io.trajectory import poses_from_tum
 from stillmap.mesh.options import MeshOptions
+from stillmap.pipeline.calibration import apply_calibration
+from stillmap.pipeline.options import Options
 from stillmap.pipeline.quality import Quality
 from stillmap.preprocessing.options import ReadOptions
 from stillmap.results.labels import Labels, read_colors, read_labels
 from stillmap.results.reader import Grid, Track, read_grid, read_tracks
-from stillmap.results.run_json import RECORD
+from stillmap.results.run_json import RECORD, read_calibration
 from stillmap.slam import SlamOptions, deskew_recording
 
 T = TypeVar("T")
@@ -30,7 +33,7 @@ _MAX_RUN = 32 << 20  # bytes of a run.json
 
 
 @dataclass(frozen=True, eq=False)
-class Exported:
+class Exported(ShortRepr):
     """A result for export: recording, poses, labels, map and tracks.
 
     Attributes:
@@ -57,7 +60,7 @@ class Exported:
 
 
 @dataclass(frozen=True)
-class ResultFolder:
+class ResultFolder(ShortRepr):
     """A result folder.
 
     Attributes:
@@ -71,6 +74,16 @@ class ResultFolder:
     record: dict[str, Any]
     source: Path
     source_given: bool
+
+    @property
+    def options(self) -> Options:
+        """Every option as it was resolved for the map.
+
+        Raises:
+            InputError: the record has options that this version does not know.
+        """
+        sections = self.record.get("options")
+        return self._override(Options(), sections if isinstance(sections, dict) else {})
 
     @property
     def read_options(self) -> ReadOptions:
@@ -118,7 +131,7 @@ class ResultFolder:
     def _override(self, options: T, changes: dict[str, Any]) -> T:
         """The options with those of the record that are set."""
         try:
-            return config.override(options, {k: v for k, v in changes.items() if v is not None})
+            return config.override(options, _drop_unset(changes))
         except InputError as error:
             where = str(self.folder)
             raise InputError(f"has options that cannot be: {error}", where=where) from error
@@ -137,23 +150,27 @@ class ResultFolder:
         """
         read_as = self.read_options
         if not self.source_given and not self.source.exists():
-            hint = "that is where it was when it was mapped: name it with --input"
+            hint = "that is where it was when it was mapped: name it with recording=PATH"
             raise InputError("does not exist", where=str(self.source), hint=hint)
         recording = read(self.source, read_as, progress=progress, scratch=scratch)
-        labels, other = read_labels(self.folder), ""
-        if not np.array_equal(recording.stamp_ns, labels.stamp_ns) or not np.array_equal(
-            recording.offset, labels.offset
-        ):
-            other = "scans or beams"
-        elif any(
-            (recording.hit[b] != labels.hit[b]).any()
-            for b in arrays.iter_blocks(recording.hit, labels.hit)
-        ):
-            other = "beams hit something"
-        if other:
-            what = f"is not the recording that was mapped: other {other}"
-            raise InputError(what, where=str(self.source), hint="name it with --input")
+        labels = read_labels(self.folder)
+        require_labelled(recording, labels, str(self.source))
         return recording, labels
+
+    def calibrate(self, recording: Recording) -> Recording:
+        """The recording with mounts and odometry as they were calibrated for the map.
+
+        Raises:
+            InputError: the record of the calibration is damaged.
+        """
+        try:
+            found = read_calibration(self.record.get("calibration"))
+        except (TypeError, ValueError, KeyError, AttributeError) as error:
+            where = str(self.folder / RECORD)
+            raise InputError(f"has a damaged calibration: {error!r}", where=where) from error
+        if recording.dimension != 2 or len(found.lasers) != len(recording.T_base_sensor):
+            return recording
+        return apply_calibration(recording, found)
 
     def export(self, progress: Progress | None = None, scratch: Path | None = None) -> Exported:
         """The content of a result; arguments are those of `read`.
@@ -163,7 +180,7 @@ class ResultFolder:
         """
         recording, labels = self.read(progress, scratch)
         return Exported(
-            recording,
+            self.calibrate(recording),
             poses_from_tum(self.folder / "trajectory.tum", recording),
             labels.p_static,
             read_grid(self.folder),
@@ -171,6 +188,36 @@ class ResultFolder:
             self.slam_options,
             read_colors(self.folder, recording.n_beams) if recording.dimension == 3 else None,
         )
+
+
+def _drop_unset(changes: dict[str, Any]) -> dict[str, Any]:
+    """Nested options without those that are None."""
+    return {
+        key: _drop_unset(value) if isinstance(value, dict) else value
+        for key, value in changes.items()
+        if value is not None
+    }
+
+
+def require_labelled(recording: Recording, labels: Labels, where: str) -> None:
+    """Refuse a recording other than the one that was mapped.
+
+    Raises:
+        InputError: scans, beams or hits are others than those of the labels.
+    """
+    other = ""
+    if not np.array_equal(recording.stamp_ns, labels.stamp_ns) or not np.array_equal(
+        recording.offset, labels.offset
+    ):
+        other = "scans or beams"
+    elif any(
+        (recording.hit[b] != labels.hit[b]).any()
+        for b in arrays.iter_blocks(recording.hit, labels.hit)
+    ):
+        other = "beams hit something"
+    if other:
+        what = f"is not the recording that was mapped: other {other}"
+        raise InputError(what, where=where, hint="name it with recording=PATH")
 
 
 def is_result(path: Path) -> bool:
@@ -184,20 +231,26 @@ def open_result(result: Path, recording: str | None = None) -> ResultFolder:
     Raises:
         InputError: it is none, or names no recording.
     """
-    record = _run_record(result / RECORD)
+    record = read_record(result)
     path = recording or record["input"].get("path")
     if not isinstance(path, str) or not path:
-        where, hint = str(result / RECORD), "name it with --input"
+        where, hint = str(result / RECORD), "name it with recording=PATH"
         raise InputError("names no recording", where=where, hint=hint)
     return ResultFolder(result, record, Path(path), bool(recording))
 
 
-def _run_record(path: Path) -> dict[str, Any]:
+def read_record(result: Path) -> dict[str, Any]:
+    """The `run.json` of a result folder.
+
+    Raises:
+        InputError: it is missing or damaged.
+    """
+    path = result / RECORD
     try:
         require_regular(path)
         record = json.loads(read_text(path, _MAX_RUN))
     except InputError as error:
-        hint = "DIR is what `stillmap map` wrote"
+        hint = "a result is what `stillmap map` wrote"
         raise InputError(error.what, where=error.where, hint=hint) from error
     except (ValueError, RecursionError) as error:
         raise InputError(f"is not JSON: {error}", where=str(path)) from error

@@ -11,10 +11,11 @@ from stillmap.core import arrays
 from stillmap.core.arrays import open_npy, write_npy
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
+from stillmap.core.short_repr import ShortRepr
 
 
 @dataclass(frozen=True, eq=False)
-class Labels:
+class Labels(ShortRepr):
     """`beams/` of a result of T scans with M beams.
 
     Attributes:

@@ -13,6 +13,7 @@ from stillmap.core.errors import InputError
 from stillmap.core.extras import install_command
 from stillmap.core.files import require_regular
 from stillmap.core.grid_map import GridMap
+from stillmap.core.short_repr import ShortRepr
 from stillmap.results.labels import shape_text
 
 Float = NDArray[np.float64]
@@ -68,7 +69,7 @@ def require_model(result: Path) -> Path:
     """
     path = result / "mesh.glb"
     if not path.is_file():
-        hint = f"`stillmap map --mesh` makes them of 3D recordings, with {install_command('mesh')}"
+        hint = f"mesh.enabled=true makes them of 3D recordings, with {install_command('mesh')}"
         raise InputError("holds no model", where=str(result), hint=hint)
     return path
 
@@ -115,7 +116,7 @@ _MAX_OBJECTS = 256 << 20  # bytes of an objects.json
 
 
 @dataclass(frozen=True, eq=False)
-class Track:
+class Track(ShortRepr):
     """Something that moved.
 
     Attributes:
@@ -125,6 +126,8 @@ class Track:
         xy: (K, 2) metres in the map frame.
         velocity: (K, 2) metres per second.
         z: (K,) metres, how high its middle is; None in the plane.
+        beams: how many fell on it; None where the file does not say.
+        p_dynamic: their mean P(dynamic); None likewise.
     """
 
     id: int
@@ -133,6 +136,8 @@ class Track:
     xy: NDArray[np.float64]
     velocity: NDArray[np.float64]
     z: NDArray[np.float64] | None = None
+    beams: int | None = None
+    p_dynamic: float | None = None
 
 
 def read_tracks(path: Path) -> list[Track]:
@@ -167,4 +172,8 @@ def _track(one: dict[str, Any]) -> Track:
         raise ValueError("columns of unequal length")
     if not np.isfinite([*numbers.ravel(), *size, *([] if z is None else z)]).all():
         raise ValueError("a number is not finite")
-    return Track(int(one["id"]), size, stamp_ns, numbers[:, :2], numbers[:, 2:], z)
+    beams = None if one.get("beams") is None else int(one["beams"])
+    p_dynamic = None if one.get("p_dynamic") is None else float(one["p_dynamic"])
+    return Track(
+        int(one["id"]), size, stamp_ns, numbers[:, :2], numbers[:, 2:], z, beams, p_dynamic
+    )

@@ -1,32 +1,189 @@
-"""The public result: a mapped recording that can be saved."""
+"""The public result of mapping: what it has, whether just built or loaded from its folder."""
 
-from collections.abc import Callable
+import os
+from abc import abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.profiling import Progress, StageTimer, no_progress
+from stillmap.core.grid_map import GridMap
 from stillmap.core.recording import Recording
-from stillmap.pipeline.estimate import EmState
-from stillmap.pipeline.options import DEFAULTS, Options
-from stillmap.pipeline.result import MappingResult, map_recording
+from stillmap.pipeline.options import Options
+from stillmap.pipeline.result import MappingResult
+from stillmap.results.reader import Track
+from stillmap.results.run_json import run_record
 from stillmap.results.save import save
+from stillmap.results.tables import TableName
+from stillmap.tracking import MovingObject
 
 if TYPE_CHECKING:
+    import pandas
+    import pyarrow
+    from matplotlib.axes import Axes
+
     from stillmap.mesh.build import Models
 
+Float = NDArray[np.float64]
 
-@dataclass(frozen=True, eq=False)
-class Result(MappingResult):
-    """A mapped recording; the fields are those of `MappingResult`."""
+
+class Result:
+    """A mapped recording of T scans with M beams in D dimensions.
+
+    `stillmap.build` makes a `BuiltResult`, `stillmap.load` opens a `SavedResult`; both have what
+    stands here.
+    """
+
+    if TYPE_CHECKING:  # fields of one subclass are properties of the other
+
+        @property
+        @abstractmethod
+        def recording(self) -> Recording:
+            """The recording as it was mapped; a saved result reads it when it is first used."""
+
+        @property
+        @abstractmethod
+        def map(self) -> GridMap:
+            """The map of what is static: `p_occupied` (H, W), `origin`, `resolution` in m."""
+
+        @property
+        @abstractmethod
+        def poses(self) -> Float:
+            """(T, D+1, D+1) T_map_base."""
+
+        @property
+        @abstractmethod
+        def stamp_ns(self) -> NDArray[np.int64]:
+            """(T,) stamps of the scans in nanoseconds."""
+
+        @property
+        @abstractmethod
+        def p_static(self) -> NDArray[np.float32]:
+            """(M,) P(c = 1); NaN: unusable, the prior at maximum range."""
+
+        @property
+        @abstractmethod
+        def hit(self) -> NDArray[np.bool_]:
+            """(M,) whether a beam ended on something."""
+
+        @property
+        @abstractmethod
+        def objects(self) -> Sequence[MovingObject | Track]:
+            """What moved: `id`, `stamp_ns` (L,), `xy`, `velocity` (L, 2), `size`, `p_dynamic`."""
+
+        @property
+        @abstractmethod
+        def warnings(self) -> Sequence[str]:
+            """One sentence each."""
+
+        @property
+        @abstractmethod
+        def options(self) -> Options:
+            """Every option as resolved."""
+
+        @property
+        @abstractmethod
+        def run(self) -> dict[str, Any]:
+            """The content of `run.json`."""
+
+        @property
+        @abstractmethod
+        def deskewed(self) -> Recording:
+            """The recording without the motion during its scans, computed at every call."""
+
+    def plot(
+        self, ax: "Axes | None" = None, *, trajectory: bool = True, dynamic: bool = False
+    ) -> "Axes":
+        """Draw the map with matplotlib, in metres.
+
+        Args:
+            ax: axes to draw into; None: new ones.
+            trajectory: draw the way of the robot.
+            dynamic: draw returns from what moves; a saved result reads its recording for it.
+
+        Returns:
+            The axes.
+
+        Raises:
+            MissingExtra: matplotlib is not installed.
+        """
+        from stillmap.results.plot import plot_result
+
+        return plot_result(self, ax, trajectory=trajectory, dynamic=dynamic)
+
+    def to_arrow(self, table: TableName = "beams") -> "pyarrow.Table":
+        """One of the result's tables.
+
+        Args:
+            table: "beams" (a row each: scan, stamp_ns, beam, x, y, z, range, hit, p_static),
+                "poses" (a row per scan), "objects" (a row per moving object) or "tracks" (a row
+                per position of one). Metres in the map frame, metres per second, radians.
+
+        Raises:
+            MissingExtra: pyarrow is not installed.
+            ValueError: there is no such table.
+        """
+        from stillmap.results.tables import make_table
+
+        return make_table(self, table)
+
+    def to_dataframe(self, table: TableName = "beams") -> "pandas.DataFrame":
+        """A table of `to_arrow` as a pandas DataFrame.
+
+        Raises:
+            MissingExtra: pandas or pyarrow is not installed.
+            ValueError: there is no such table.
+        """
+        from stillmap.core.errors import import_extra
+
+        import_extra("pandas", "a DataFrame", "made", group="notebook")
+        return self.to_arrow(table).to_pandas()
+
+    def __repr__(self) -> str:
+        n, notes = len(self.objects), len(self.warnings)
+        return (
+            f"<{type(self).__name__}: {len(self.stamp_ns)} scans with {len(self.p_static)} beams, "
+            f"{n} moving object{'s' * (n != 1)}, {notes} warning{'s' * (notes != 1)}, {self.map}>"
+        )
+
+    def _repr_html_(self) -> str:
+        from stillmap.results.plot import summarize_as_html
+
+        return summarize_as_html(self)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class BuiltResult(MappingResult, Result):
+    """A recording that was just mapped; further fields are those of `MappingResult`."""
+
+    __repr__ = Result.__repr__
+
+    @property
+    def stamp_ns(self) -> NDArray[np.int64]:
+        """(T,) stamps of the scans in nanoseconds."""
+        return self.recording.stamp_ns
+
+    @property
+    def hit(self) -> NDArray[np.bool_]:
+        """(M,) whether a beam ended on something."""
+        return self.recording.hit
+
+    @property
+    def run(self) -> dict[str, Any]:
+        """The content of `run.json`, computed at every call."""
+        return run_record(self)
 
     def save(
-        self, path: str | Path, *, overwrite: bool = False, models: "Models | None" = None
+        self,
+        path: str | os.PathLike[str],
+        *,
+        overwrite: bool = False,
+        models: "Models | None" = None,
     ) -> None:
-        """Writes the result folder, complete or not at all.
+        """Write the result folder, complete or not at all; `stillmap.load` opens it.
 
         Args:
             path: the folder; must not exist or be empty unless `overwrite`.
@@ -37,28 +194,3 @@ class Result(MappingResult):
             InputError: the folder is taken or cannot be written.
         """
         save(self, Path(path), overwrite, models=models)
-
-
-def build(
-    recording: Recording,
-    options: Options = DEFAULTS,
-    *,
-    poses: NDArray[np.float64] | None = None,
-    progress: Progress = no_progress,
-    stages: StageTimer | None = None,
-    scratch: Path | None = None,
-    resume: EmState | None = None,
-    checkpoint: Callable[[EmState], None] | None = None,
-) -> Result:
-    """Maps a recording; arguments and errors are those of `map_recording`."""
-    result = map_recording(
-        recording,
-        options,
-        poses=poses,
-        progress=progress,
-        stages=stages,
-        scratch=scratch,
-        resume=resume,
-        checkpoint=checkpoint,
-    )
-    return Result(**vars(result))

@@ -16,7 +16,7 @@ from stillmap.pipeline.result import MappingResult
 from stillmap.results.map_npz import known_area
 from stillmap.results.objects import MILLIMETRES
 from stillmap.slam import BareStretch, LoopClosure
-from stillmap.slam.mount_calibration import Calibration, Parameter
+from stillmap.slam.mount_calibration import UPSIDE_DOWN, Calibration, Parameter
 
 if TYPE_CHECKING:
     from stillmap.rig.build import TiltingResult
@@ -108,7 +108,7 @@ def _calibration(found: Calibration) -> dict[str, Any]:
     return {
         "windows": found.windows,
         "lasers": [
-            {**{name: _parameter(one) for name, one in laser.items()}, "upside_down": mirrored}
+            {**{name: _parameter(one) for name, one in laser.items()}, UPSIDE_DOWN: mirrored}
             for laser, mirrored in zip(found.lasers, found.upside_down, strict=True)
         ],
         "odometry": {name: _parameter(one) for name, one in found.odometry.items()},
@@ -122,6 +122,34 @@ def _parameter(one: Parameter) -> dict[str, Any]:
         "std": one.std,
         "applied": one.significant,
     }
+
+
+def read_calibration(record: Any) -> Calibration:
+    """The `calibration` entry of a `run.json`; empty where there is none.
+
+    Raises:
+        TypeError, ValueError, KeyError, AttributeError: it is damaged.
+    """
+    if record is None:
+        return Calibration()
+    lasers = record["lasers"]
+    return Calibration(
+        [
+            {name: _read_parameter(one) for name, one in laser.items() if name != UPSIDE_DOWN}
+            for laser in lasers
+        ],
+        [bool(laser.get(UPSIDE_DOWN)) for laser in lasers],
+        {name: _read_parameter(one) for name, one in record["odometry"].items()},
+        int(record["windows"]),
+    )
+
+
+def _read_parameter(one: Mapping[str, Any]) -> Parameter:
+    # a number that is not finite is written as None, and not applied
+    recorded, estimated, std = (
+        float("nan" if one[key] is None else one[key]) for key in ("recorded", "estimated", "std")
+    )
+    return Parameter(recorded, estimated, std, bool(one["applied"]))
 
 
 def _loop(one: LoopClosure) -> dict[str, Any]:

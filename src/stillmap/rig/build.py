@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from stillmap.core.arrays import copy, iter_blocks
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
+from stillmap.core.short_repr import ShortRepr
 from stillmap.em import EmOptions, EStepResult, GroundMap, estimate_ground, occupancy_hmm
 from stillmap.em.spatial_coupling import GROUND_CLEARANCE
 from stillmap.em.types import DYNAMIC_BELOW, MIN_PROBABILITY
@@ -36,7 +37,7 @@ _TOP_PERCENTILE = 98.0  # of an object's end points, which gives its height
 
 
 @dataclass(frozen=True, eq=False)
-class TiltingResult:
+class TiltingResult(ShortRepr):
     """Labels of the recording that builds in 3D, T scans with M beams.
 
     Attributes:

@@ -134,7 +134,7 @@ def load_image_truth(path: str | Path) -> ImageTruth:
     Raises:
         InputError: there is none, or it is damaged.
     """
-    folder = _find_folder(path, _STANDING, "truth about images", " ... --camera")
+    folder = _find_folder(path, _STANDING, "truth about images", " with cameras")
     try:
         of, moves = _arrays(folder / _STANDING), _arrays(folder / _MOVING)
         faces = Faces(of["faces_ends"], of["faces_z"], of["faces_glass"])
@@ -159,7 +159,7 @@ def load_image_truth(path: str | Path) -> ImageTruth:
     return ImageTruth(seed, standing, moving, T_world_camera, mask, distance)
 
 
-def _find_folder(path: str | Path, mark: str, what: str, arguments: str) -> Path:
+def _find_folder(path: str | Path, mark: str, what: str, how: str) -> Path:
     """The truth folder, given itself or the folder around it; `mark`: a file that it has.
 
     Raises:
@@ -169,7 +169,7 @@ def _find_folder(path: str | Path, mark: str, what: str, arguments: str) -> Path
     if (folder / FOLDER).is_dir():
         folder = folder / FOLDER
     if not (folder / mark).is_file():
-        hint = f"a folder that 'stillmap simulate{arguments}' wrote"
+        hint = f"a folder that 'stillmap simulate' wrote{how}"
         raise InputError(f"holds no {what}", where=str(path), hint=hint)
     return folder
 

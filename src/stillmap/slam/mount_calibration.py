@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.recording import Recording
+from stillmap.core.short_repr import ShortRepr
 from stillmap.slam.hand_eye import (
     GAIN,
     SCALE,
@@ -77,7 +78,7 @@ class Parameter:
 
 
 @dataclass(frozen=True)
-class Calibration:
+class Calibration(ShortRepr):
     """Poses of lasers and errors of odometry.
 
     Attributes:

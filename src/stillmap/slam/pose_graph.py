@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2, se3
+from stillmap.core.short_repr import ShortRepr
 
 Float = NDArray[np.float64]
 
@@ -20,7 +21,7 @@ _PRIOR_STD = 1e-6  # of the first pose, which is fixed
 
 
 @dataclass(frozen=True, eq=False)
-class Constraint:
+class Constraint(ShortRepr):
     """A measured relative pose T_first_second (a between factor).
 
     Attributes:
@@ -37,7 +38,7 @@ class Constraint:
 
 
 @dataclass(frozen=True, eq=False)
-class PoseGraph:
+class PoseGraph(ShortRepr):
     """Keyframes and the constraints between them.
 
     Attributes:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core.recording import Recording
+from stillmap.core.short_repr import ShortRepr
 from stillmap.slam import scan_hits
 from stillmap.slam.pose_graph import PoseGraph
 from stillmap.slam.scan_hits import Scan
@@ -20,7 +21,7 @@ ScanProgress = Callable[[int, int], None]  # scans done, total
 
 
 @dataclass(frozen=True, eq=False)
-class LoopCandidate:
+class LoopCandidate(ShortRepr):
     """Two scans that may see the same place.
 
     Attributes:
@@ -38,7 +39,7 @@ class LoopCandidate:
 
 
 @dataclass(frozen=True, eq=False)
-class LoopClosure:
+class LoopClosure(ShortRepr):
     """One attempt to close a loop.
 
     Attributes:
@@ -77,7 +78,7 @@ class BareStretch(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Diagnostics:
+class Diagnostics(ShortRepr):
     """Scans at which odometry and scan matching disagree.
 
     Attributes:
@@ -100,7 +101,7 @@ class Diagnostics:
 
 
 @dataclass(frozen=True)
-class MStepResult:
+class MStepResult(ShortRepr):
     """Result of one M-step.
 
     Attributes:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.short_repr import ShortRepr
 from stillmap.tracking.objects import MovingObject
 
 Float = NDArray[np.float64]
@@ -15,7 +16,7 @@ _MIN_ABSENCE = 5.0  # s after which a return to a square is another crossing
 
 
 @dataclass(frozen=True, eq=False)
-class FlowMap:
+class FlowMap(ShortRepr):
     """Squares of the floor.
 
     Attributes:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import arrays
 from stillmap.core.recording import Recording
+from stillmap.core.short_repr import ShortRepr
 from stillmap.tracking.association import ACCELERATION, MAX_GAP, assign_tracks
 from stillmap.tracking.clustering import (
     MIN_P_DYNAMIC,
@@ -32,7 +33,7 @@ _OUTLIERS = 5.0  # percent of the points on either side outside the box: legs sw
 
 
 @dataclass(frozen=True, eq=False)
-class MovingObject:
+class MovingObject(ShortRepr):
     """A moving object.
 
     Attributes:

@@ -105,7 +105,7 @@ def start_server(port: int) -> Server:
         raise RuntimeError("this version of viser does not use websockets.asyncio.server.serve")
     if port not in (0, server.get_port()):  # viser has taken the next free one
         stop_server(server)
-        raise InputError(f"--port {port} is taken", hint="without --port any free one is used")
+        raise InputError(f"port {port} is taken", hint="port=0 takes any free one")
     server.gui.configure_theme(show_logo=False, show_share_button=False)
     return server
 

@@ -124,7 +124,7 @@ def select_lasers(content: BagContent, options: ReadOptions) -> LaserSelection:
         if found is None and used:
             omitted.append(
                 f"{scans.topic}: {scans.n_scans} scans, no transform connects {scans.frame!r} with "
-                f"{used[0].frame!r} (--topic {scans.topic} takes it instead)"
+                f"{used[0].frame!r} (read.topic = {scans.topic!r} takes it instead)"
             )
             continue
         used.append(scans)

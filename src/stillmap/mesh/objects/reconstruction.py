@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from stillmap.core.short_repr import ShortRepr
 from stillmap.mesh.inputs import MeshInputs
 from stillmap.mesh.objects.merging import ObjectTrack
 from stillmap.mesh.objects.registration import (
@@ -53,7 +54,7 @@ _MIN_KEPT_SHARE = 0.5  # of the partial surfaces, and of the best one's area
 
 
 @dataclass(frozen=True, eq=False)
-class ObjectShape:
+class ObjectShape(ShortRepr):
     """The surface of a moving object.
 
     Attributes:

@@ -13,6 +13,7 @@ import numpy as np
 from stillmap.core.camera import project
 from stillmap.core.components import component_labels
 from stillmap.core.errors import import_extra
+from stillmap.core.short_repr import ShortRepr
 from stillmap.mesh.texture.views import View
 from stillmap.mesh.triangle_mesh import Mesh
 from stillmap.mesh.types import Bool, Float, Image, Index, Int32, Int64
@@ -49,7 +50,7 @@ class AtlasLayout(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class TexturedMesh:
+class TexturedMesh(ShortRepr):
     """F faces over U vertices, and P texture pages.
 
     Vertices shared by several charts are repeated for each.

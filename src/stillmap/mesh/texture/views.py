@@ -12,6 +12,7 @@ from stillmap.core import se2, se3
 from stillmap.core.camera import Camera, Images, calibration_error
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
+from stillmap.core.short_repr import ShortRepr
 from stillmap.mesh.types import Bool, Float, Image, Index, Int64, Tell, no_tell
 from stillmap.rig.trajectory import MAX_SCAN_GAP
 from stillmap.slam.deskew import MAX_SPEED, MAX_TURN_RATE
@@ -27,7 +28,7 @@ _AT_JUMP = "taken where the trajectory jumps"
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class View(ShortRepr):
     """An image with a calibrated camera and a known pose.
 
     Attributes:

@@ -1,0 +1,109 @@
+"""The inputs of the main job: a recording to be mapped, and poses to keep."""
+
+import dataclasses
+import os
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stillmap import em
+from stillmap import io as formats
+from stillmap.core.errors import InputError
+from stillmap.core.recording import Recording
+from stillmap.io.array_checks import poses_to_matrices
+from stillmap.io.text_lines import Progress
+from stillmap.io.trajectory import poses_from_tum
+from stillmap.pipeline.options import Options
+from stillmap.preprocessing.options import ReadOptions
+
+RECORDED = "recording"  # poses: those that the recording states
+
+
+def read(
+    path: str | os.PathLike[str],
+    options: ReadOptions | None = None,
+    *,
+    progress: Progress | None = None,
+    scratch: Path | None = None,
+) -> Recording:
+    """Read a recording of any format, to be mapped.
+
+    `stillmap.load` finds it again by the path, which `source["path"]` notes.
+
+    Args:
+        path: a CARMEN log, a ROS bag, a folder of clouds, ...: see docs/input.md.
+        options: what readings mean, topics of a bag, ...; None: the defaults.
+        progress: called with the share that is read, 0 to 1.
+        scratch: folder for memory-mapped buffers; None: the system's temporary folder.
+
+    Raises:
+        InputError: there is no readable recording.
+
+    Example:
+        >>> recording = stillmap.read("log.bag", stillmap.ReadOptions(min_range=0.3))
+    """
+    recording = formats.read(Path(path), options, progress=progress, scratch=scratch)
+    here = os.fspath(path)
+    original = recording.source.get("path", here)
+    source = {**recording.source, "path": here}
+    if original != here:
+        source["made_from"] = original
+    return dataclasses.replace(recording, source=source)
+
+
+def read_poses(
+    poses: ArrayLike | str | os.PathLike[str] | None, recording: Recording
+) -> NDArray[np.float64] | None:
+    """Poses to keep, (T, D+1, D+1) T_map_base; None: none.
+
+    Args:
+        poses: an array of them, in 2D also (T, 3) x, y (m), theta (rad); the path of a TUM
+            trajectory; or "recording": those that the recording states.
+        recording: T scans.
+
+    Raises:
+        InputError: the file is no trajectory, a scan has no pose, or the recording states none.
+        ValueError: an array of another shape, or of no poses.
+    """
+    if poses is None:
+        return None
+    if isinstance(poses, str) and poses == RECORDED:
+        if recording.T_recorded_base is None:
+            hint = 'poses="FILE.tum" gives them; a file of the name `recording` is ./recording'
+            where = str(recording.source.get("path", "the recording"))
+            raise InputError("states no poses", where=where, hint=hint)
+        return recording.T_recorded_base
+    if isinstance(poses, str | os.PathLike):
+        return poses_from_tum(Path(poses), recording)
+    return poses_to_matrices("poses", poses, recording.n_scans, recording.dimension, "recording")
+
+
+def require_mappable(
+    recording: Recording, options: Options, poses: NDArray[np.float64] | None
+) -> None:
+    """Refuse what cannot be mapped.
+
+    Raises:
+        InputError: a recording without scans, an estimator that is for 2D alone, or depth images
+            without poses: their narrow view is not registered.
+    """
+    where = str(recording.source.get("path", "the recording"))
+    if recording.n_scans == 0:
+        raise InputError("holds no scan that can be used", where=where)
+    if recording.dimension == 3 and options.estimator not in em.ESTIMATORS_3D:
+        raise InputError(
+            f"is 3D: estimator '{options.estimator}' is for 2D recordings",
+            where=where,
+            hint=f"estimator={' or '.join(em.ESTIMATORS_3D)}",
+        )
+    if recording.dimension == 2 or poses is not None or recording.T_odom_base is not None:
+        return
+    from stillmap.io.cameras import depth_camera_names  # 2D recordings need no camera
+
+    if depth_camera_names(recording.source):
+        raise InputError(
+            "holds depth images, whose poses have to be given",
+            where=where,
+            hint=f'poses="{"FILE.tum" if recording.T_recorded_base is None else RECORDED}"',
+        )

@@ -1,0 +1,123 @@
+"""Pictures of a result: matplotlib axes, and the summary that notebooks show by themselves."""
+
+import html
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+
+from stillmap.core.arrays import iter_blocks
+from stillmap.core.errors import import_extra
+from stillmap.em.types import DYNAMIC_BELOW
+from stillmap.mapping.beam_statistics import sample_dynamic_points
+from stillmap.results.report.figures import MapView, data_uri, draw_map, map_window
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from stillmap.results.result import Result
+
+_BLUE, _ORANGE = "#1f6feb", "#f07800"
+_MAX_POINTS = 50_000  # dynamic returns in a figure
+_PREVIEW_PIXELS = 420  # longest edge in a notebook
+
+
+def plot_result(result: "Result", ax: "Axes | None", *, trajectory: bool, dynamic: bool) -> "Axes":
+    """See `Result.plot`."""
+    pyplot = import_extra("matplotlib.pyplot", "a plot", "drawn", group="notebook")
+    if ax is None:
+        _, ax = pyplot.subplots(layout="constrained")
+    assert ax is not None
+    window = map_window([result.map])
+    image = draw_map(result.map, window).convert("RGB")
+    ax.imshow(np.asarray(image), extent=_extent(result, image), interpolation="nearest")
+    if dynamic:
+        points = sample_dynamic_points(
+            result.deskewed, result.poses, result.p_static, limit=_MAX_POINTS
+        )
+        ax.plot(
+            points[:, 0], points[:, 1], ".", color=_ORANGE, markersize=1.5, label="dynamic returns"
+        )
+    if trajectory:
+        x, y = _track(result).T
+        ax.plot(x, y, color=_BLUE, linewidth=1.0, label="trajectory")
+    ax.set_aspect("equal")
+    ax.set_xlim(window[0], window[2])
+    ax.set_ylim(window[1], window[3])
+    ax.set_xlabel("x (m)")
+    ax.set_ylabel("y (m)")
+    return ax
+
+
+def _extent(result: "Result", image: Image.Image) -> tuple[float, float, float, float]:
+    """Left, right, bottom and top of the picture of a map, in metres.
+
+    Pixels are whole squares of cells: the last ones may reach beyond the window.
+    """
+    (x0, y0, x1, y1), cell = map_window([result.map]), result.map.resolution
+    columns, rows = round((x1 - x0) / cell), round((y1 - y0) / cell)
+    edge = cell * max(math.ceil(columns / image.width), math.ceil(rows / image.height))
+    return x0, x0 + image.width * edge, y0, y0 + image.height * edge
+
+
+def summarize_as_html(result: "Result") -> str:
+    """A small picture of the map and the key facts; needs neither matplotlib nor a network."""
+    rows = "".join(
+        f"<tr><th style='text-align:left'>{html.escape(name)}</th>"
+        f"<td style='text-align:left'>{html.escape(text)}</td></tr>"
+        for name, text in key_facts(result).items()
+    )
+    warnings = "".join(f"<li>{html.escape(one)}</li>" for one in result.warnings)
+    picture = data_uri(_preview(result))
+    return (
+        "<div style='display:flex;flex-wrap:wrap;gap:1em;align-items:flex-start'>"
+        f"<img alt='map with trajectory' src='{picture}'><div><table>{rows}</table>"
+        + (f"<p>Warnings:</p><ul>{warnings}</ul>" if warnings else "")
+        + "</div></div>"
+    )
+
+
+def key_facts(result: "Result") -> dict[str, str]:
+    """What a result is about, in words and numbers."""
+    stamps, grid = result.stamp_ns, result.map
+    height, width = (n * grid.resolution for n in grid.p_occupied.shape)
+    seconds = float(stamps[-1] - stamps[0]) * 1e-9 if len(stamps) else 0.0
+    hits, dynamic = _count_hits(result.hit, result.p_static)
+    steps = np.diff(_track(result), axis=0)
+    return {
+        "scans": f"{len(stamps)} in {seconds:.1f} s",
+        "distance": f"{np.linalg.norm(steps, axis=1).sum():.1f} m",
+        "beams": f"{len(result.p_static)}, {hits} of them hits",
+        "dynamic": f"{100.0 * dynamic / max(hits, 1):.1f} % of the hits",
+        "moving objects": str(len(result.objects)),
+        "map": f"{width:.1f} m x {height:.1f} m, cells of {grid.resolution:g} m",
+    }
+
+
+def _count_hits(hit: NDArray[np.bool_], p_static: NDArray[np.float32]) -> tuple[int, int]:
+    """Numbers of hits, and of dynamic ones."""
+    hits = dynamic = 0
+    for block in iter_blocks(hit, p_static):
+        hits += int(np.count_nonzero(hit[block]))
+        dynamic += int(np.count_nonzero(hit[block] & (p_static[block] < DYNAMIC_BELOW)))
+    return hits, dynamic
+
+
+def _preview(result: "Result") -> Image.Image:
+    """The map with the trajectory, small."""
+    window = map_window([result.map])
+    image = draw_map(result.map, window).convert("RGB")
+    factor = _PREVIEW_PIXELS / max(image.size)
+    width, height = (max(1, round(n * factor)) for n in image.size)
+    how = Image.Resampling.BOX if factor < 1.0 else Image.Resampling.NEAREST
+    image = image.resize((width, height), how)
+    pixels = MapView(window, (width, height), False).to_pixels(_track(result))
+    ImageDraw.Draw(image).line([(x, y) for x, y in pixels.tolist()], fill=_BLUE)
+    return image.quantize(64)
+
+
+def _track(result: "Result") -> NDArray[np.float64]:
+    """(T, 2) positions of the robot in metres."""
+    return result.poses[:, :2, -1]
