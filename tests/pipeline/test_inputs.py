@@ -98,8 +98,14 @@ def test_progress_is_told(short):
     assert list(dict.fromkeys(first)) == steps
     assert all(done <= total for _, _, done, total in told)
     after = [at for at in told if at[1] == 0]
-    steps = ["labelling beams", "making the map", "counting observations", "tracking objects"]
-    assert after == [(step, 0, 0, 0) for step in steps] == told[-4:]
+    steps = [
+        "labelling beams",
+        "making the map",
+        "counting observations",
+        "tracking objects",
+        "rating the map",
+    ]
+    assert after == [(step, 0, 0, 0) for step in steps] == told[-5:]
 
 
 @pytest.mark.parametrize(

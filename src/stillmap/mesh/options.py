@@ -11,8 +11,8 @@ class MeshOptions(Section, section="mesh"):
 
     enabled: bool | None = option(
         None,
-        "Build meshes of 3D recordings; unset: where there are usable "
-        "pictures to texture them with.",
+        "Build meshes of 3D recordings; unset: where there are usable pictures to texture them "
+        "with.",
     )
     voxel_size: float | None = option(
         None, "Edge of a TSDF voxel, in metres; unset: from the point spacing.", ge=0.001, le=10.0
