@@ -86,14 +86,18 @@ class Links(HTMLParser):
 
     def __init__(self):
         super().__init__()
-        self.fetched, self.open, self.wrong = [], [], []
+        self.fetched, self.links, self.open, self.wrong = [], [], [], []
 
     def handle_starttag(self, tag, attributes):
         if tag not in self.VOID:
             self.open.append(tag)
         names = ("src", "href", "srcset", "data", "action", "poster", "xlink:href")
-        self.fetched += [value for name, value in attributes if name in names]
-        self.fetched += ["script"] * (tag in ("script", "iframe", "object", "embed"))
+        addresses = [value for name, value in attributes if name in names]
+        if tag == "a":
+            self.links += addresses
+        else:
+            self.fetched += addresses
+        self.fetched += [tag] * (tag in ("iframe", "object", "embed"))
 
     def handle_endtag(self, tag):
         if not self.open or self.open.pop() != tag:
@@ -107,6 +111,8 @@ def test_report_is_complete_and_fetches_nothing(result):
     assert page.fetched
     inside = ("data:image/png;base64,", "#")
     assert [value for value in page.fetched if not value.startswith(inside)] == []
+    assert page.links
+    assert [link for link in page.links if not (result / link).is_file()] == []
     assert re.findall(r"url\((?!#)", text) == []
     assert "@import" not in text
 

@@ -111,7 +111,7 @@ def test_progress_is_told(short):
 @pytest.mark.parametrize(
     ("leap", "said"),
     [
-        ((0.0, 0.0, np.radians(170)), "found by a wider search, the first is scan 30"),
+        ((0.0, 0.0, np.radians(170)), "found by a wider search, first at scan 30 (x "),
         ((30.0, 0.0, 0.0), "odometry and scans disagree at 1 scan ("),
     ],
 )

@@ -239,11 +239,18 @@ def made_up_evidence(occupancy):
 
 @pytest.fixture(scope="session")
 def section():
-    """A function: the section of a report with a heading; empty where there is none."""
+    """A function: the section of a report with a heading; empty where there is none.
+
+    Sections for experts are closed details.
+    """
 
     def cut(html, heading):
-        found = re.search(f"<section><h2>{heading}</h2>.*?</section>", html, re.DOTALL)
-        return found[0] if found else ""
+        ends = {"h2": "section", "h3": "details"}
+        for level, end in ends.items():
+            found = re.search(f"<{level}[^>]*>{heading}</{level}>.*?</{end}>", html, re.DOTALL)
+            if found:
+                return f"<{end}>{'<summary>' * (end == 'details')}{found[0]}"
+        return ""
 
     return cut
 

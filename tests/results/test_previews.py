@@ -204,7 +204,7 @@ def test_best_textured_objects_come_first(thing):
 
 def test_previews_are_inline(result, previews):
     page = render_report(result, previews=previews)
-    assert "<h2>Models</h2>" in page
+    assert ">Models</h2>" in page
     found = re.findall(r'class="preview" src="data:image/jpeg;base64,([^"]+)"', page)
     assert len(found) == 2 * len(previews.place) + 2
     sizes = [Image.open(io.BytesIO(base64.b64decode(one))).size for one in found]

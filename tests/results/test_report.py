@@ -1,6 +1,8 @@
 import base64
 import dataclasses
+import hashlib
 import io
+import itertools
 import re
 from html.parser import HTMLParser
 
@@ -8,6 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from stillmap.pipeline.quality import Quality, describe_quality
+from stillmap.results.map_server import write_map_server
 from stillmap.results.report import formatting
 from stillmap.results.report.curves import curve_of, round_down
 from stillmap.results.report.figures import (
@@ -20,6 +24,8 @@ from stillmap.results.report.page import render_report
 from stillmap.slam.mount_calibration import Calibration, Parameter
 
 VOID = {"meta", "img", "input", "br", "link", "hr"}
+# what a reader finds in no dictionary, or only in the code
+JARGON = r"\bnats?\b|\blooks\b|\b[em]_step\b|\brad\b|HMM|posterior|responsibilit"
 
 
 class Page(HTMLParser):
@@ -68,13 +74,33 @@ def picture(attrs):
 
 def test_page_makes_no_request(html, page):
     for tag, attrs in page.tags:
-        assert tag not in {"script", "link", "iframe", "object", "embed", "base"}
+        assert tag not in {"link", "iframe", "object", "embed", "base"}
+        assert tag != "script" or attrs == {}  # inline
         for name in ("src", "href", "xlink:href", "srcset", "action", "poster"):
             value = attrs.get(name, "#")
             assert value.startswith(("data:", "#")), (tag, name)
     assert "//" not in re.sub(r"base64,[A-Za-z0-9+/=]*", "", html)
     assert "@import" not in html
     assert set(re.findall(r"url\(([^)])", html)) <= {"#"}
+
+
+def test_browsers_run_no_script_but_the_own_one(html, page):
+    scripts = re.findall(r"<script>(.*?)</script>", html, re.DOTALL)
+    assert len(scripts) == 1
+    policy = next(
+        meta["content"]
+        for meta in page.named("meta")
+        if meta.get("http-equiv") == "Content-Security-Policy"
+    )
+    digest = base64.b64encode(hashlib.sha256(scripts[0].encode()).digest()).decode()
+    assert f"script-src 'sha256-{digest}'" in policy
+    assert "default-src 'none'" in policy
+    handlers = [name for _, attrs in page.tags for name in attrs if name.startswith("on")]
+    assert handlers == []
+
+
+def test_same_result_gives_the_same_page(result, html):
+    assert render_report(result) == html
 
 
 def test_text_from_files_is_escaped(page):
@@ -90,28 +116,91 @@ def test_text_from_files_is_escaped(page):
 
 def test_headline_figures(page):
     text = "|".join(page.text)
-    for value in ("60", "10,860", "12.4 %", "7.3 s", "97 MB", "12 s"):
+    for value in ("60", "12.4 %", "7.3 s", "2"):
         assert f"|{value}|" in text
-    assert "iteration 3 kept, converged" in text
+    text = "".join(page.text)
+    assert "from 60 scans over 12 s" in text
+    assert "97 MB of memory" in text
+    assert "Of 10,860 beams" in text
     assert "lines 203, 204," in text
     assert "15 more" in text
 
 
+def test_words_are_plain(html):
+    text = re.sub(r"<(style|script)>.*?</\1>", "", html, flags=re.DOTALL)
+    text = " ".join(Page(text).text)
+    assert re.findall(JARGON, text, re.IGNORECASE) == []
+
+
+def test_headings_are_in_order(page):
+    levels = [int(tag[1]) for tag, _ in page.tags if re.fullmatch(r"h[1-6]", tag)]
+    assert levels[0] == 1
+    assert levels.count(1) == 1
+    assert all(after <= before + 1 for before, after in itertools.pairwise(levels))
+
+
 def test_images_have_alt_texts_and_show_the_maps(page, result):
     images = page.named("img")
-    # raw, filtered with two layers over it, tracks, traffic, three iterations
-    assert [bool(image["alt"]) for image in images] == [True, True, False, False] + [True] * 5
+    # the map with two layers over it, raw, clean, tracks, traffic, three iterations
+    assert [bool(image["alt"]) for image in images] == [True, False, False] + [True] * 7
     for image in images:
         assert picture(image).size == (int(image["width"]), int(image["height"]))
-    raw, filtered = (np.asarray(picture(image).convert("RGB")) for image in images[:2])
-    assert raw.shape == filtered.shape
+    raw, clean = (np.asarray(picture(image).convert("RGB")) for image in images[3:5])
+    assert raw.shape == clean.shape
     # the traces of the walkers are in the raw map only
-    assert (raw.astype(int) + 20 < filtered).all(axis=2).sum() > 500
-    layer = np.asarray(picture(images[2]).convert("RGBA"))
+    assert (raw.astype(int) + 20 < clean).all(axis=2).sum() > 500
+    layer = np.asarray(picture(images[1]).convert("RGBA"))
     assert set(map(tuple, layer.reshape(-1, 4))) == {(*VIOLET, VEIL_ALPHA), (*UNKNOWN, 0)}
-    dots = np.asarray(picture(images[3]).convert("RGBA"))
+    dots = np.asarray(picture(images[2]).convert("RGBA"))
     assert set(map(tuple, dots.reshape(-1, 4))) == {(*ORANGE, 255), (*UNKNOWN, 0)}
     assert len(page.named("polyline")[0]["points"].split()) == result.recording.n_scans
+
+
+def test_map_comes_first_as_it_was_written(page, result, tmp_path):
+    write_map_server(tmp_path, result.map)
+    written = np.asarray(Image.open(tmp_path / "map.pgm"))
+    first = picture(page.named("img")[0])
+    np.testing.assert_array_equal(np.asarray(first.convert("L")), written)
+    boxes = {one["id"]: "checked" in one for one in page.named("input") if "id" in one}
+    assert boxes == {
+        "show-dynamic": False,
+        "show-thin": False,
+        "show-path": False,
+        "show-grid": True,
+    }
+
+
+def test_files_beside_the_report_are_linked(result, tmp_path):
+    (tmp_path / "objects").mkdir()
+    for name in ("map.pgm", "run.json", "objects/objects.json", "unknown.txt"):
+        (tmp_path / name).touch()
+    links = [one["href"] for one in Page(render_report(result, folder=tmp_path)).named("a")]
+    assert links == ["map.pgm", "objects/objects.json", "run.json"]
+    assert Page(render_report(result)).named("a") == []
+
+
+def test_only_warnings_with_advice_are_at_the_top(result, section):
+    warnings = ["walls are <bent>; what to do: record it again", "odometry was late"]
+    html = render_report(dataclasses.replace(result, warnings=warnings))
+    box = section(html, "One thing to check")
+    assert "walls are &lt;bent&gt;." in box
+    assert "<b>What to do:</b> record it again." in box
+    assert "odometry was late." in section(html, "Notes")
+    assert "odometry was late." not in box
+    assert "to check" not in render_report(result)
+
+
+def test_quality_in_figures_and_words(result, section):
+    rated = dataclasses.replace(result, quality=Quality(71.3, 91.2, 55.7))
+    text = " ".join(Page(section(render_report(rated), "Quality")).text)
+    text = re.sub(r"\s+", " ", text)
+    words = describe_quality(rated.quality)
+    for name, figure in (("Overall", 71), ("Labels", 91), ("Geometry", 56)):
+        line = getattr(words, name.lower()).partition(": ")[2]
+        assert f"{name} {figure} of 100 {line}." in text
+    text = " ".join(Page(section(render_report(result), "Quality")).text)
+    assert text.count("cannot be told from this recording.") == 3
+    assert "of 100" not in text
 
 
 def test_thinly_observed_area(page, result):
@@ -119,14 +208,14 @@ def test_thinly_observed_area(page, result):
     thin, known = (
         np.count_nonzero(one) for one in (result.evidence.thinly_observed, result.map.beta > 0)
     )
-    assert f"{0.01 * thin:,.1f} m² of the filtered map" in text
-    assert f"{100 * thin / known:.1f} % of the known area" in text
-    assert "fewer than 3 observations" in text
+    assert (
+        f"Thin evidence{100 * thin / known:.1f} %{0.01 * thin:,.1f} m² seen fewer than 3 times"
+    ) in text
     nothing = dataclasses.replace(
         result.evidence, thinly_observed=np.zeros_like(result.evidence.thinly_observed)
     )
     text = render_report(dataclasses.replace(result, evidence=nothing))
-    assert "All of the known area is well observed." in text
+    assert "all of the area is well observed" in text
 
 
 def test_report_of_a_large_map_stays_small(result):
@@ -185,7 +274,7 @@ def with_likelihoods(result, values):
 def test_report_names_iterations_where_the_bound_decreased(result, section):
     def text(values):
         html = render_report(with_likelihoods(result, values))
-        return " ".join(section(html, "Convergence").split())
+        return " ".join(section(html, "Likelihood over the iterations").split())
 
     assert "never decreased" in text([-100, -90, -90])
     assert "decreased at iteration 3 (by 2.2 %)" in text([-100, -90, -92, -80])
@@ -203,25 +292,25 @@ def estimated_by(result, estimator):
 
 def test_curve_titles_depend_on_the_estimator(result):
     default = render_report(result)
-    assert "Bound: log likelihood of the cells" in default
+    assert "Log likelihood of the observations" in default
     assert "(5)" not in default
     for estimator in ("paper", "hit-ratio", "tracker"):
         printed = render_report(estimated_by(result, estimator))
         assert "Expected log likelihood, (5)" in printed
-        assert "log likelihood of the cells" not in printed
+        assert "Log likelihood of the ranges" in printed
 
 
 def test_one_iteration_makes_no_curve(result):
     one = render_report(dataclasses.replace(result, iterations=result.iterations[:1]))
     assert 'class="curve"' not in one
-    assert "Table of iterations" in one
+    assert "There was one iteration." in one
     assert render_report(result).count('class="curve"') == 2
 
 
 def test_loop_closures(result, section):
     def text(loops):
         html = render_report(dataclasses.replace(result, loops=loops))
-        return section(html, "Convergence")
+        return section(html, "Likelihood over the iterations")
 
     assert (
         "Loop closure: 1 of 4 candidates accepted; "
@@ -242,7 +331,9 @@ def test_one_snapshot_shows_no_evolution(result):
 def fitted(section):
     """A function: the words of the section on fitted parameters."""
     return lambda result: re.sub(
-        r"\s+", " ", " ".join(Page(section(render_report(result), "Fitted parameters")).text)
+        r"\s+",
+        " ",
+        " ".join(Page(section(render_report(result), "What was fitted to this recording")).text),
     )
 
 
@@ -306,6 +397,8 @@ def test_likelihoods_that_are_not_finite(result):
         ("format_bytes", 0, "unknown"),
         ("format_number", None, "-"),
         ("format_clock", 3_723_400_000_000, "1:02:03.4"),
+        ("format_sentence", "a wall, bent", "a wall, bent."),
+        ("format_sentence", "is it?", "is it?"),
         ("format_scalar", True, "yes"),
         ("format_scalar", None, "not set"),
     ],
@@ -318,14 +411,14 @@ def test_calibration(result):
     yaw, latency = Parameter(0.0, np.pi, 0.002, True), Parameter(0.0, 0.012, 0.008, False)
     found = Calibration([{"theta": yaw}], [False], {"latency": latency}, 35)
     text = " ".join(Page(render_report(dataclasses.replace(result, calibration=found))).text)
-    assert re.search(r"laser, theta\s+0\.0°\s+180\.0 ± 0\.1°\s+estimated", text)
-    assert re.search(r"odometry, latency\s+0\.000 s\s+0\.012 ± 0\.008 s\s+recorded", text)
+    assert re.search(r"laser, direction\s+0\.0°\s+180\.0 ± 0\.1°\s+estimated", text)
+    assert re.search(r"odometry, delay\s+0\.000 s\s+0\.012 ± 0\.008 s\s+recorded", text)
     assert "upside down" not in text
 
 
 def test_details_of_the_recording(page):
     text = "".join(page.text)
     assert "threshold how: 12 m repeats (919 x)" in text
-    assert "bearings: -1.5708, 1.5708" in text
+    assert "bearings: -90°, 90°" in text
     assert "stamp goes back, 2 times: lines 88, 91" in text
     assert "ignored" not in text

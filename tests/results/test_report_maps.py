@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 from PIL import Image
 
+from stillmap.results.map_server import write_map_server
 from stillmap.results.report.figures import (
     ORANGE,
     UNKNOWN,
@@ -15,6 +16,7 @@ from stillmap.results.report.figures import (
     draw_thinly_observed,
     map_window,
 )
+from stillmap.results.report.written_map import draw_written_map
 
 
 def small_map(result, p):
@@ -72,6 +74,41 @@ def test_layer_of_thinly_observed_cells_is_reduced_as_the_map_is(result):
     columns = np.flatnonzero(layer[middle + 1 :].all(axis=0))
     assert 0 < columns.max() <= quarter
     assert not layer[middle + 1 :, :quarter][:, columns.max() + 1 :].any()
+
+
+def test_written_map_has_the_pixels_of_each_mode(result, tmp_path):
+    p = np.array([[0, 0.1, 0.3, 0.66], [0.8, 1, np.nan, 0.5]], np.float32)
+    for mode in ("trinary", "scale"):
+        write_map_server(tmp_path, small_map(result, p), mode)
+    greys, alpha = np.moveaxis(np.asarray(Image.open(tmp_path / "map.png")), -1, 0)
+    drawn = draw_written_map(small_map(result, p), "scale").picture.convert("L")
+    assert np.abs(np.asarray(drawn).astype(int) - np.where(alpha, greys, 205)).max() <= 1
+    written = np.asarray(Image.open(tmp_path / "map.pgm"))
+    for mode in ("trinary", "raw"):
+        drawn = draw_written_map(small_map(result, p), mode).picture.convert("L")
+        known = np.asarray(drawn)[written != 205]
+        np.testing.assert_array_equal(known < 128, written[written != 205] == 0)
+    drawn = draw_written_map(small_map(result, p), "trinary")
+    np.testing.assert_array_equal(np.asarray(drawn.picture.convert("L")), written)
+    assert drawn.window == (0.0, 0.0, 4.0, 2.0)
+
+
+def test_large_written_maps_keep_every_occupied_pixel(result):
+    p = np.zeros((4001, 9000), np.float32)
+    p[:, 4000:] = np.nan
+    p[:, 1777] = p[2000, 5000] = 1.0
+    p[:, 4000] = 0.0
+    drawn = draw_written_map(small_map(result, p), "trinary")
+    assert drawn.factor == 3
+    assert drawn.picture.size == (3000, 1334)
+    assert drawn.window == (0.0, 0.0, 9000.0, 4002.0)
+    pixels = np.asarray(drawn.picture.convert("L"))[::-1]
+    assert (pixels[:, 1777 // 3] == 0).all()
+    assert pixels[2000 // 3, 5000 // 3] == 0
+    assert (pixels == 0).sum() == 1334 + 1
+    # the only known cells of a square are free
+    assert (pixels[:, 4000 // 3] == 254).all()
+    assert (pixels[:, 1334:] == 205).sum() == pixels[:, 1334:].size - 1
 
 
 def test_snapshot_shows_map_and_dots(result):

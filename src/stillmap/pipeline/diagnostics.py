@@ -1,20 +1,22 @@
-"""Warnings of a run: what limits the trust in its result."""
+"""Warnings of a run: what limits the trust in its result, where, and what to do about it."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from stillmap import slam
+from stillmap.core.advice import advise
 from stillmap.core.json import count_skipped
 from stillmap.core.recording import Recording
 from stillmap.pipeline.estimate import Estimate, IterationRecord
+
+_LOST = 0.2  # explained share of a scan's beams below which its pose cannot be trusted
 
 
 def find_warnings(
     best: Estimate, recording: Recording, records: Sequence[IterationRecord] = ()
 ) -> list[str]:
-    """One sentence per warning, those of the reader first.
+    """One sentence per warning, those of the reader first; see `core.advice`.
 
     Args:
         best: the estimate that was kept.
@@ -25,14 +27,22 @@ def find_warnings(
     out = _reader_warnings(recording.source)
     given = len(explained) > 0 and bool(np.isnan(explained).all())
     if recording.T_odom_base is None and not given:
-        out.append("no odometry: a constant velocity was assumed between scans")
+        out.append(
+            "no odometry: the robot was assumed to keep its velocity from one scan to the next"
+        )
     out += _source_warnings(records, best.number)
-    out += _pose_warnings(best.m_step.diagnostics)
-    lost = np.flatnonzero(explained < 0.2)
+    out += _odometry_warnings(best)
+    out += _length_warnings(best)
+    out += _place_warnings(best)
+    lost = np.flatnonzero(explained < _LOST)
     if len(lost):
         out.append(
-            f"{len(lost)} scans fit the map badly (less than a fifth of their beams), the first "
-            f"is scan {lost[0]}: the map may be bent there"
+            advise(
+                f"{_count_scans(len(lost))} fit{'s' * (len(lost) == 1)} the map badly (less than a "
+                f"fifth of the beams), first at {_place(best, lost[0])}",
+                "look for bent or doubled walls there; if there are any, record that part again, "
+                "slower or with odometry",
+            )
         )
     return out
 
@@ -43,7 +53,10 @@ def _reader_warnings(source: Mapping[str, Any]) -> list[str]:
     out = [text for text in noted if isinstance(text, str)] if isinstance(noted, list) else []
     skipped = count_skipped(source)
     if skipped:
-        out.append(f"scans left out while reading: {skipped} (`stillmap info` says why)")
+        out.append(
+            f"{_count_scans(skipped)} {'were' if skipped > 1 else 'was'} left out while reading "
+            "(`stillmap info` says why)"
+        )
     return out
 
 
@@ -52,48 +65,84 @@ def _source_warnings(records: Sequence[IterationRecord], best: int) -> list[str]
     out = []
     for record in records:
         if record.source:
-            kept = "its poses were kept" if record.number == best else "EM went on from its poses"
+            kept = "were kept" if record.number == best else "were the start of further iterations"
             name = {"odometry": "odometry alone", "scans": "scan matching without odometry"}
             out.append(
-                f"{name[record.source]} predicts held-out scans better than iterations 1 to "
-                f"{record.number - 1} did: {kept}"
+                f"poses by {name[record.source]} predict scans left out of the map better than "
+                f"those of iterations 1 to {record.number - 1}: they {kept}"
             )
     return out
 
 
-def _pose_warnings(diagnostics: slam.Diagnostics) -> list[str]:
-    out, faults, widened = [], diagnostics.odometry_faults, diagnostics.widened
-    if faults:
+def _odometry_warnings(best: Estimate) -> list[str]:
+    """Scans that contradict odometry: their poses follow the scans, so nothing has to be done."""
+    out, found = [], best.m_step.diagnostics
+    if faults := found.odometry_faults:
         out.append(
-            f"odometry and scans disagree at {len(faults)} scan{'s' * (len(faults) > 1)} (wheel "
-            f"slip or stall, odometry that starts again), first at scan {faults[0]}: poses follow "
-            "the scans there"
+            f"odometry and scans disagree at {_count_scans(len(faults))} (wheel slip or stall, "
+            f"odometry that starts again), first at {_place(best, faults[0])}: poses follow the "
+            "scans there"
         )
-    if widened:
+    if widened := found.widened:
         out.append(
-            f"{len(widened)} scans lay outside the odometry's uncertainty and were found by a "
-            f"wider search, the first is scan {widened[0]}"
-        )
-    if bare := diagnostics.bare_stretches:
-        worst = max(bare, key=lambda stretch: stretch.std)
-        others = f"; {len(bare) - 1} more in doubts.length_unknown of run.json" * (len(bare) > 1)
-        out.append(
-            f"from scan {worst.first} to scan {worst.last} the scans hardly show how far the robot "
-            f"went (bare walls, or few returns): the length of that way, {worst.metres:.1f} m, has "
-            f"a standard deviation of about {worst.std:.1f} m{others}"
-        )
-    for scan in diagnostics.ambiguous:
-        out.append(
-            f"from scan {scan} on, another place fits about as well as the one that odometry leads "
-            "to: odometry's was kept"
-        )
-    for scan in diagnostics.breaks:
-        out.append(
-            f"before scan {scan} the robot was carried elsewhere: "
-            + (
-                "no place seen after it is known from before, so it is not connected to the rest"
-                if scan in diagnostics.unconnected
-                else "it was relocalized among the places known from before"
-            )
+            f"{_count_scans(len(widened))} lay outside the uncertainty of odometry and "
+            f"{'were' if len(widened) > 1 else 'was'} found by a wider search, first at "
+            f"{_place(best, widened[0])}"
         )
     return out
+
+
+def _length_warnings(best: Estimate) -> list[str]:
+    """That scans do not show how far the robot went."""
+    bare = best.m_step.diagnostics.bare_stretches
+    if not bare:
+        return []
+    worst = max(bare, key=lambda stretch: stretch.std)
+    others = f" ({len(bare) - 1} more in doubts.length_unknown of run.json)" * (len(bare) > 1)
+    return [
+        advise(
+            f"from {_place(best, worst.first)} to {_place(best, worst.last)} the scans hardly show "
+            f"how far the robot went (bare walls, or few returns): the {worst.metres:.1f} m "
+            f"between are uncertain by about {worst.std:.1f} m{others}",
+            "measure that length in the map; if it is wrong, record with wheel odometry or a "
+            "longer range, or drive back to a place seen before",
+        )
+    ]
+
+
+def _place_warnings(best: Estimate) -> list[str]:
+    """That the robot was carried elsewhere, or may be at another place."""
+    out, found = [], best.m_step.diagnostics
+    out += [
+        advise(
+            f"from {_place(best, scan)} on, another place fits about as well as the one that "
+            "odometry leads to: odometry's was kept",
+            "look whether walls are doubled there; if so, record again with more of the way "
+            "between the two places",
+        )
+        for scan in found.ambiguous
+    ]
+    for scan in found.breaks:
+        what = f"before {_place(best, scan)} the robot was carried elsewhere"
+        if scan in found.unconnected:
+            out.append(
+                advise(
+                    f"{what}: no place after it is known from before, so that this part of the map "
+                    "lies at an arbitrary pose",
+                    "record again so that the robot ends where it was before, or map the part "
+                    "before and the part after on their own",
+                )
+            )
+        else:
+            out.append(f"{what}: it was relocalized among the places known from before")
+    return out
+
+
+def _place(best: Estimate, scan: int) -> str:
+    """A scan and its position, to be found in the map."""
+    x, y = best.poses[scan, :2, -1]
+    return f"scan {scan} (x {x:.1f} m, y {y:.1f} m)"
+
+
+def _count_scans(n: int) -> str:
+    return f"{n:,} scan{'s' * (n != 1)}"

@@ -61,9 +61,6 @@ def save(
         if result.options.objects.enabled:
             write_objects(folder / "objects", result)
             write_traffic(folder / "traffic.npz", result.traffic)
-        previews = None if models is None else _previews(models, result.options.threads)
-        page = render_report(result, tilting, previews)
-        (folder / "report.html").write_text(page, encoding="utf-8")
         more = {}
         if tilting is not None:
             _write_tilting(folder, tilting, colors)
@@ -76,6 +73,9 @@ def save(
             write_models(folder, models, count, result.options.mesh.texture_quality)
             more["models"] = models_record(models)
         write_run_json(folder / RECORD, result, more)
+        previews = None if models is None else _previews(models, result.options.threads)
+        page = render_report(result, tilting, previews, folder)
+        (folder / "report.html").write_text(page, encoding="utf-8")
 
 
 def _write_tilting(

@@ -27,7 +27,7 @@ _SNAPSHOT_PIXELS = 480  # longest edge of a snapshot
 _STRIP = 1 << 22  # cells drawn at once
 _DOT_WIDTH = 600  # pixels of image width per pixel of dot size
 
-_UNKNOWN_INDEX, _ORANGE_INDEX = 101, 102
+UNKNOWN_LEVEL, _ORANGE_INDEX = 101, 102
 
 
 @dataclass(frozen=True)
@@ -63,6 +63,17 @@ class MapView:
         """Width in m."""
         return self.window[2] - self.window[0]
 
+    @property
+    def grid_path(self) -> str:
+        """The `d` attribute of the lines at whole multiples of the scale bar's length."""
+        step, (x0, y0, x1, y1), (width, height) = self.scale_bar, self.window, self.size
+        columns = [k * step for k in range(math.ceil(x0 / step), math.floor(x1 / step) + 1)]
+        rows = [k * step for k in range(math.ceil(y0 / step), math.floor(y1 / step) + 1)]
+        return "".join(
+            [f"M{(x - x0) * width / (x1 - x0):.1f} 0v{height}" for x in columns]
+            + [f"M0 {(y1 - y) * height / (y1 - y0):.1f}h{width}" for y in rows]
+        )
+
     def to_pixels(self, points: NDArray[np.float32] | NDArray[np.float64]) -> NDArray[np.float64]:
         """Column and row (K, 2) in pixels from the top left of map points (K, 2) in m."""
         x0, y0, x1, y1 = self.window
@@ -94,8 +105,8 @@ def map_window(maps: Sequence[GridMap]) -> Window:
 def draw_map(occupancy: GridMap, window: Window) -> Image.Image:
     """White free, grey unknown, black occupied; large maps are reduced to `_MAX_PIXELS`."""
     factor = _reduction(window, occupancy.resolution)
-    strips = _iter_strips(occupancy, occupancy.p_occupied, window, np.nan, factor)
-    return _with_palette(np.concatenate([_levels(cells, factor) for cells in strips])[::-1])
+    strips = iter_strips(occupancy, occupancy.p_occupied, window, np.nan, factor)
+    return _with_palette(np.concatenate([reduce_levels(cells, factor) for cells in strips])[::-1])
 
 
 def draw_thinly_observed(
@@ -107,8 +118,8 @@ def draw_thinly_observed(
         [
             _mostly(cells, ~np.isnan(p), factor)
             for cells, p in zip(
-                _iter_strips(occupancy, thin, window, False, factor),
-                _iter_strips(occupancy, occupancy.p_occupied, window, np.nan, factor),
+                iter_strips(occupancy, thin, window, False, factor),
+                iter_strips(occupancy, occupancy.p_occupied, window, np.nan, factor),
                 strict=True,
             )
         ]
@@ -127,7 +138,7 @@ def draw_points(points: NDArray[np.float32], view: MapView) -> Image.Image:
 def draw_snapshot(snapshot: Snapshot) -> Image.Image:
     """The snapshot's map with its dynamic returns in orange."""
     longest = max(snapshot.p_occupied.shape)
-    levels = _levels(snapshot.p_occupied, max(1, math.ceil(longest / _SNAPSHOT_PIXELS)))[::-1]
+    levels = reduce_levels(snapshot.p_occupied, max(1, math.ceil(longest / _SNAPSHOT_PIXELS)))[::-1]
     larger = max(1, _SNAPSHOT_PIXELS // max(levels.shape))
     pixels = levels.repeat(larger, axis=0).repeat(larger, axis=1)
     height, width = pixels.shape
@@ -191,7 +202,7 @@ def _reduction(window: Window, resolution: float) -> int:
     return max(1, math.ceil(math.sqrt(cells / _MAX_PIXELS)))
 
 
-def _iter_strips(
+def iter_strips(
     occupancy: GridMap, layer: NDArray[Value], window: Window, outside: float, factor: int
 ) -> Iterator[NDArray[Value]]:
     """The cells of a window in strips of whole squares from the bottom: a map may be large."""
@@ -212,14 +223,14 @@ def _mostly(cells: Mask, among: Mask, factor: int) -> Mask:
     return np.asarray((count > 0) & (2 * count >= _core.count_in_squares(among, factor)))
 
 
-def _levels(cells: NDArray[np.float32], factor: int) -> NDArray[np.uint8]:
+def reduce_levels(cells: NDArray[np.float32], factor: int) -> NDArray[np.uint8]:
     """Occupancy in percent of squares of `factor` x `factor` cells, 101 where unknown.
 
     The maximum where a cell is occupied, so that thin walls stay visible; else the mean of the
     known cells.
     """
     return _core.reduce_occupancy(
-        np.ascontiguousarray(cells), factor, OCCUPIED_THRESH, _UNKNOWN_INDEX
+        np.ascontiguousarray(cells), factor, OCCUPIED_THRESH, UNKNOWN_LEVEL
     )
 
 

@@ -2,6 +2,9 @@
 
 import math
 
+# entries of a recording's notes that are angles in rad
+_ANGLES = {"angle_step", "bearings", "pitch", "roll", "start_angle", "theta", "yaw"}
+
 
 def format_share(share: float) -> str:
     """A share in percent, with one decimal or two significant digits."""
@@ -60,6 +63,17 @@ def format_scalar(value: object) -> str:
     return f"{value:.7g}" if isinstance(value, float) else str(value)
 
 
+def format_quantity(value: object, name: str) -> str:
+    """A JSON scalar of that name; angles, in rad, become degrees."""
+    is_angle = isinstance(value, int | float) and name in _ANGLES
+    return f"{math.degrees(float(str(value))):.4g}°" if is_angle else format_scalar(value)
+
+
+def format_sentence(text: str) -> str:
+    """A text with a full stop; the style sheet shows its first letter as a capital."""
+    return text + "." * (text[-1:] not in ".?!")
+
+
 FILTERS = {
     "share": format_share,
     "duration": format_duration,
@@ -68,5 +82,7 @@ FILTERS = {
     "number": format_number,
     "clock": format_clock,
     "scalar": format_scalar,
+    "quantity": format_quantity,
+    "sentence": format_sentence,
     "comma": "{:,}".format,
 }

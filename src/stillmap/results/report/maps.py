@@ -25,6 +25,7 @@ from stillmap.results.report.figures import (
     draw_snapshot,
     draw_thinly_observed,
 )
+from stillmap.results.report.written_map import draw_written_map
 
 _MAX_PATH_POINTS = 3000
 _MAX_ROWS = 50
@@ -49,7 +50,10 @@ def draw_filtered_map(result: MappingResult) -> MapFigure | None:
 
 
 def map_data(result: MappingResult, filtered: MapFigure | None) -> dict[str, Any] | None:
-    """The raw map beside the filtered one (Figs. 4, 6, 7); None for a map without cells."""
+    """The map as written, and the raw one beside the filtered one (Figs. 4, 6, 7).
+
+    None for a map without cells.
+    """
     if filtered is None:
         return None
     view = filtered.view
@@ -64,6 +68,7 @@ def map_data(result: MappingResult, filtered: MapFigure | None) -> dict[str, Any
         "view": view,
         "meters": (x1 - x0, y1 - y0),
         "cell": result.map.resolution,
+        "written": _written_data(result, view),
         "raw": data_uri(draw_map(result.raw_map, view.window)),
         "filtered": filtered.uri,
         "dynamic": data_uri(draw_points(ends, view)),
@@ -75,6 +80,26 @@ def map_data(result: MappingResult, filtered: MapFigure | None) -> dict[str, Any
         "thinly_observed_area": area["thin"],
         "min_observations": result.evidence.min_observations,
         "radius": result.evidence.mover_radius,
+    }
+
+
+def _written_data(result: MappingResult, view: MapView) -> dict[str, Any]:
+    """The picture of the whole map, placed in percent of the view, and the bounds of both in m."""
+    written = draw_written_map(result.map, result.options.output.map_mode)
+    x0, y0, x1, y1 = view.window
+    left, bottom, right, top = written.window
+    width, height = x1 - x0, y1 - y0
+    return {
+        "image": data_uri(written.picture, optimize=True),
+        "size": written.picture.size,
+        "factor": written.factor,
+        "place": {
+            "left": 100 * (left - x0) / width,
+            "bottom": 100 * (bottom - y0) / height,
+            "width": 100 * (right - left) / width,
+            "height": 100 * (top - bottom) / height,
+        },
+        "bounds": (min(x0, left), min(y0, bottom), max(x1, right), max(y1, top)),
     }
 
 

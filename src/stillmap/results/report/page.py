@@ -1,22 +1,25 @@
 """`report.html`: one self-contained page about a run, rendered from the Jinja2 templates beside."""
 
+import base64
 import functools
-import itertools
-import math
+import hashlib
 import os
 import sys
-from collections import Counter
-from collections.abc import Mapping
 from importlib.util import cache_from_source
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stillmap.core.config import iter_options
-from stillmap.core.json import count_skipped, to_jsonable
 from stillmap.core.version import package_version
-from stillmap.mapping.beam_statistics import count_beams
 from stillmap.pipeline.result import MappingResult
-from stillmap.results.report.curves import curve_of
+from stillmap.results.report.estimation import calibration_data, convergence_data, fitted_data
+from stillmap.results.report.facts import (
+    files_data,
+    quality_data,
+    run_data,
+    source_data,
+    stages_data,
+)
 from stillmap.results.report.formatting import FILTERS
 from stillmap.results.report.maps import (
     changes_data,
@@ -25,7 +28,6 @@ from stillmap.results.report.maps import (
     map_data,
 )
 from stillmap.results.report.objects import objects_data, rig_data
-from stillmap.slam.mount_calibration import Parameter
 
 if TYPE_CHECKING:
     from jinja2 import BytecodeCache, Environment
@@ -34,28 +36,28 @@ if TYPE_CHECKING:
     from stillmap.rig.build import TiltingResult
 
 _TEMPLATES = Path(__file__).parent / "templates"
-# factor, unit and digits of what is calibrated
-_CALIBRATION_UNITS = {
-    "theta": (180.0 / math.pi, "°", 1),
-    "x": (1.0, " m", 3),
-    "y": (1.0, " m", 3),
-    "scale": (1.0, "", 3),
-    "rotation_gain": (1.0, "", 3),
-    "latency": (1.0, " s", 3),
-}
-_MIN_DYNAMIC = 100  # dynamic returns below which the weights of dynamic classes mean little
 
 
 def render_report(
     result: MappingResult,
     tilting: "TiltingResult | None" = None,
     previews: "ModelPreviews | None" = None,
+    folder: Path | None = None,
 ) -> str:
-    """The page, of a few megabytes at most: no script, no outside request, all images inline."""
+    """The page, of a few megabytes at most: no outside request, images and script inline.
+
+    Args:
+        result: the mapped recording.
+        tilting: 3D data of a rig's second laser.
+        previews: renders of the models.
+        folder: the result folder, to whose files the page links; None: no links.
+    """
     filtered = draw_filtered_map(result)
     data = {
-        "run": _run_data(result),
+        "run": run_data(result),
         "maps": map_data(result, filtered),
+        "quality": quality_data(result),
+        "files": files_data(folder),
         "changes": changes_data(result, filtered),
         "objects": objects_data(result, filtered),
         "rig": rig_data(tilting, filtered),
@@ -64,10 +66,11 @@ def render_report(
         "calibration": calibration_data(result),
         "convergence": convergence_data(result),
         "evolution": evolution_data(result),
-        "source": _source_data(result),
-        "stages": result.stages,
+        "source": source_data(result),
+        "stages": stages_data(result),
         "options": [(one.name, one.value) for one in iter_options(result.options)],
         "version": package_version(),
+        **_script_data(),
     }
     return environment().get_template("report.html.j2").render(data)
 
@@ -79,6 +82,14 @@ def _models_data(previews: "ModelPreviews | None") -> dict[str, Any] | None:
     from stillmap.results.report.previews import models_data
 
     return models_data(previews)
+
+
+@functools.cache
+def _script_data() -> dict[str, str]:
+    """The page's script, and its hash, without which browsers run no script of the page."""
+    script = (_TEMPLATES / "map_view.js").read_text(encoding="utf-8")
+    digest = hashlib.sha256(script.encode()).digest()
+    return {"script": script, "script_hash": base64.b64encode(digest).decode("ascii")}
 
 
 @functools.cache
@@ -114,122 +125,3 @@ def _bytecode_cache() -> "BytecodeCache | None":
     except OSError:
         return None
     return FileSystemBytecodeCache(str(folder)) if os.access(folder, os.W_OK) else None
-
-
-def _run_data(result: MappingResult) -> dict[str, Any]:
-    """Title, headline figures and warnings."""
-    source, stamps, stages = result.recording.source, result.recording.stamp_ns, result.stages
-    path = str(source.get("path", ""))
-    return {
-        "name": Path(path).name or "recording",
-        "path": path,
-        "format": str(source.get("format", "")),
-        "scans": result.recording.n_scans,
-        "skipped": count_skipped(source),
-        "beams": count_beams(result.recording, result.p_static),
-        "duration": float(stamps[-1] - stamps[0]) / 1e9 if len(stamps) else 0.0,
-        "seconds": sum(float(stage.get("seconds") or 0) for stage in stages.values()),
-        "memory": max(
-            (stage.get("peak_memory_bytes") or 0 for stage in stages.values()), default=0
-        ),
-        "iterations": len(result.iterations),
-        "best": result.best_iteration,
-        "converged": result.converged,
-        "warnings": result.warnings,
-        "estimator": result.options.estimator,
-        "dimension": result.recording.dimension,
-        "map_state": result.options.output.map_state,
-    }
-
-
-def convergence_data(result: MappingResult) -> dict[str, Any] | None:
-    """Iterations, where the bound decreased, held-out score, loop closures."""
-    iterations = result.iterations
-    if not iterations:
-        return None
-    finite = [it for it in iterations if math.isfinite(it.bound)]
-    held_out = {it.number: it.held_out_log_likelihood for it in iterations}
-    kept = held_out.get(result.best_iteration)
-    numbers = [it.number for it in iterations]
-    curves = [
-        curve_of(numbers, values, result.best_iteration)
-        for values in (
-            [it.expected_log_likelihood for it in iterations],
-            [it.bound for it in iterations],
-        )
-    ]
-    return {
-        "iterations": [
-            {
-                "number": it.number,
-                "likelihoods": (it.expected_log_likelihood, it.bound, it.held_out_log_likelihood),
-                "changed": it.changed_share,
-                "seconds": it.seconds,
-            }
-            for it in iterations
-        ],
-        # (iteration, relative decrease)
-        "falls": [
-            (after.number, (before.bound - after.bound) / max(abs(before.bound), 1e-300))
-            for before, after in itertools.pairwise(finite)
-            if after.bound < before.bound
-        ],
-        "held_out": kept if kept is not None and math.isfinite(kept) else None,
-        "loops": len(result.loops),
-        "rejected": Counter(one.rejected for one in result.loops if one.rejected).most_common(),
-        "curves": curves if len(iterations) > 1 else [],
-    }
-
-
-def fitted_data(result: MappingResult) -> dict[str, Any] | None:
-    """Parameters that the estimator fitted to the recording; None where it fits none."""
-    learned: Mapping[str, Any] = result.learned
-    if not learned:
-        return None
-    dynamic = count_beams(result.recording, result.p_static)["dynamic"]
-    return {
-        "p_static": float(learned["p_static"]),
-        "noise": float(learned["scatter"]),
-        "changing": learned.get("changing") if result.recording.dimension == 3 else None,
-        "dynamic": dynamic,
-        "few": dynamic < _MIN_DYNAMIC,
-        **{
-            name: sorted((float(row["value"]), float(row["share"])) for row in learned[name])
-            for name in ("static_occupied", "mover_seconds", "mover_occupied")
-        },
-    }
-
-
-def calibration_data(result: MappingResult) -> list[tuple[str, str, str, str]]:
-    """Rows of what the motion shows of mounts and odometry: what, recorded, estimated, used."""
-    found, rows = result.calibration, []
-    for k, laser in enumerate(found.lasers):
-        which = "laser" if len(found.lasers) == 1 else f"laser {k + 1}"
-        if found.upside_down[k]:
-            rows.append((f"{which}, mounting", "upright", "upside down", "estimated"))
-        rows += [_calibration_row(f"{which}, {name}", name, one) for name, one in laser.items()]
-    return rows + [
-        _calibration_row(f"odometry, {name.replace('_', ' ')}", name, one)
-        for name, one in found.odometry.items()
-    ]
-
-
-def _calibration_row(what: str, name: str, one: Parameter) -> tuple[str, str, str, str]:
-    factor, unit, digits = _CALIBRATION_UNITS[name]
-    nominal, value, std = (factor * v for v in (one.nominal, one.value, one.std))
-    estimated = f"{value:.{digits}f} ± {std:.{digits}f}{unit}"
-    used = "estimated" if one.significant else "recorded"
-    return what, f"{nominal:.{digits}f}{unit}", estimated, used
-
-
-def _source_data(result: MappingResult) -> dict[str, Any]:
-    """The reader's notes on the recording, without empty entries."""
-    source = to_jsonable(result.recording.source)
-    skipped = {name: source.pop(name, None) or {} for name in ("skipped", "skipped_odometry")}
-    return {
-        "entries": {k: v for k, v in source.items() if v not in ({}, [], None)},
-        **{
-            name: sorted(reasons.items(), key=lambda item: -int(item[1]["count"]))
-            for name, reasons in skipped.items()
-        },
-    }

@@ -1,0 +1,122 @@
+"""What the report says of a run: headline figures, warnings, files, the recording, stages."""
+
+from pathlib import Path
+from typing import Any
+
+from stillmap.core.advice import split_advice
+from stillmap.core.json import count_skipped, to_jsonable
+from stillmap.mapping.beam_statistics import count_beams
+from stillmap.pipeline.quality import describe_quality
+from stillmap.pipeline.result import MappingResult
+
+# files beside the report that are linked where they exist, with their content
+_FILES = {
+    "map.pgm": "the map, for map_server and nav2",
+    "map.png": "the map, for map_server and nav2",
+    "map.yaml": "its resolution and origin",
+    "map.npz": "probability of every cell, for NumPy",
+    "trajectory.tum": "where the robot was at every scan",
+    "graph.g2o": "pose graph, for g2o and GTSAM",
+    "static.ply": "points that stand still, in 3D",
+    "dynamic.ply": "points that moved, in 3D",
+    "mesh.glb": "surface of the place, in 3D",
+    "objects/objects.json": "moving objects and their tracks",
+    "traffic.npz": "how often each square was crossed",
+    "beams/p_static.npy": "probability of every beam to be static",
+    "run.json": "record of this run",
+}
+# what the stages of a run do
+_STAGES = {
+    "read": "reading the recording",
+    "calibration": "calibrating mounts and odometry",
+    "m_step": "estimating poses",
+    "e_step": "labelling beams",
+    "held_out": "testing on scans left out of the map",
+    "quality": "rating the quality",
+    "changes": "finding changed places",
+    "maps": "making the maps",
+    "evidence": "counting observations",
+    "objects": "tracking moving objects",
+    "tilting": "labelling the second laser",
+    "surface": "making the surface",
+    "painting": "choosing pictures for the surface",
+    "texture": "making textures",
+    "movers": "modelling moving objects",
+    "points": "coloring points",
+}
+
+
+def run_data(result: MappingResult) -> dict[str, Any]:
+    """Title, headline figures and warnings."""
+    source, stamps, stages = result.recording.source, result.recording.stamp_ns, result.stages
+    path = str(source.get("path", ""))
+    findings = [split_advice(text) for text in result.warnings]
+    return {
+        "name": Path(path).name or "recording",
+        "path": path,
+        "format": str(source.get("format", "")),
+        "scans": result.recording.n_scans,
+        "skipped": count_skipped(source),
+        "beams": count_beams(result.recording, result.p_static),
+        "duration": float(stamps[-1] - stamps[0]) / 1e9 if len(stamps) else 0.0,
+        "seconds": sum(float(stage.get("seconds") or 0) for stage in stages.values()),
+        "memory": max(
+            (stage.get("peak_memory_bytes") or 0 for stage in stages.values()), default=0
+        ),
+        "iterations": len(result.iterations),
+        "best": result.best_iteration,
+        "converged": result.converged,
+        "warnings": [(what, todo) for what, todo in findings if todo],
+        "notes": [what for what, todo in findings if not todo],
+        "estimator": result.options.estimator,
+        "dimension": result.recording.dimension,
+        "map_state": result.options.output.map_state,
+    }
+
+
+def quality_data(result: MappingResult) -> list[tuple[str, float | None, str]]:
+    """Each part of the quality: its name, from 0 to 100 or None where it cannot be told, words."""
+    quality, words = result.quality, describe_quality(result.quality)
+    return [
+        ("Overall", quality.overall, _sentence_of(words.overall)),
+        ("Labels", quality.labels, _sentence_of(words.labels)),
+        ("Geometry", quality.geometry, _sentence_of(words.geometry)),
+    ]
+
+
+def _sentence_of(line: str) -> str:
+    """What follows the name and the figure of a part."""
+    return line.partition(": ")[2]
+
+
+def files_data(folder: Path | None) -> list[tuple[str, str]]:
+    """Names, relative to the report, and content of the files that a result folder has."""
+    if folder is None:
+        return []
+    return [(name, what) for name, what in _FILES.items() if (folder / name).is_file()]
+
+
+def stages_data(result: MappingResult) -> list[tuple[str, float, int]]:
+    """What each stage did, its seconds and its peak memory in bytes."""
+    return [
+        (
+            _STAGES.get(name, name.replace("_", " ")),
+            float(stage.get("seconds") or 0),
+            int(stage.get("peak_memory_bytes") or 0),
+        )
+        for name, stage in result.stages.items()
+    ]
+
+
+def source_data(result: MappingResult) -> dict[str, Any]:
+    """The reader's notes on the recording, without empty entries."""
+    source = to_jsonable(result.recording.source)
+    skipped = {name: source.pop(name, None) or {} for name in ("skipped", "skipped_odometry")}
+    source.pop("warnings", None)  # shown at the top
+    return {
+        "entries": {k: v for k, v in source.items() if v not in ({}, [], None)},
+        **{
+            name: sorted(reasons.items(), key=lambda item: -int(item[1]["count"]))
+            for name, reasons in skipped.items()
+        },
+    }
