@@ -94,13 +94,13 @@ wheel: $(VENV)/dependencies
 	tools/build_wheel.sh $(BIN)/python dist
 	@ls -l dist
 
-# what others open models with; they are fetched once
+# what others open models and reports with; it is fetched once
 build/readers: tools/model_readers.sh
-	@echo "fetching what opens models into build/readers"
+	@echo "fetching what opens models and reports into build/readers"
 	@tools/model_readers.sh build/readers
 
 test-models: $(VENV)/tested build/readers
-	$(BIN)/python -m pytest tests/contract/test_models.py
+	$(BIN)/python -m pytest tests/contract/test_models.py tests/contract/test_report_in_browser.py
 
 lint: $(VENV)/tested
 	$(BIN)/python -m ruff check .
