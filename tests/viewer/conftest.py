@@ -10,9 +10,12 @@ import pytest
 from stillmap import io as recordings
 from stillmap.core import se2
 from stillmap.core.arrays import write_npz
-from stillmap.io.trajectory import write_tum
+from stillmap.io.trajectory import poses_from_tum, write_tum
 from stillmap.results.labels import write_labels
 from stillmap.results.points import write_clouds
+from stillmap.slam import SlamOptions
+from stillmap.viewer.beams import Beams
+from stillmap.viewer.scene import read_scene
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))  # for what the tests share
 
@@ -67,6 +70,42 @@ def result_of(tmp_path):
     return made
 
 
+@pytest.fixture
+def beams_of():
+    """Gives the beams of a result that `result_of` made."""
+
+    def beams(out):
+        recording = recordings.read(out.parent / out.name.replace("out", "log"))
+        poses = poses_from_tum(out / "trajectory.tum", recording)
+        return Beams(recording, np.load(out / "beams/p_static.npy"), poses, SlamOptions())
+
+    return beams
+
+
+@pytest.fixture
+def opened():
+    """Opens windows, which are closed after the test."""
+    pytest.importorskip("viser", reason="the extra `viewer` is not installed")
+    from stillmap.viewer.window import Window
+
+    windows = []
+
+    def window(*words):
+        windows.append(Window(*words))
+        return windows[-1]
+
+    yield window
+    for one in windows:
+        one.close()
+
+
+@pytest.fixture
+def window(result_of, beams_of, opened):
+    """One of a 3D result with surface and models."""
+    out = result_of(3, with_models=True)
+    return opened(read_scene(out, "walk.bag"), beams_of(out))
+
+
 def _written(out, recording, poses, p_static, log):
     write_tum(out / "trajectory.tum", recording.stamp_ns, poses)
     write_labels(out / "beams", recording, p_static)
@@ -88,7 +127,7 @@ def _written(out, recording, poses, p_static, log):
     size = [0.8, 0.4]
     if recording.dimension == 3:
         track["z"], size = [0.9, 0.9, 0.9], [0.8, 0.4, 1.8]
-    objects = [{"id": 7, "size": size, "track": track}]
+    objects = [{"id": 7, "size": size, "beams": 1234, "p_dynamic": 0.98765, "track": track}]
     (out / "objects/objects.json").write_text(json.dumps(objects))
     (out / "report.html").write_text("<!doctype html>")
     record = {"input": {"path": str(log)}, "options": {"read": {}, "slam": {"deskew": True}}}

@@ -8,7 +8,8 @@ import pytest
 from stillmap.io import read
 from stillmap.io.trajectory import poses_from_tum
 from stillmap.slam import SlamOptions, deskew_recording
-from stillmap.viewer.tracks import Beams, slice_scans
+from stillmap.viewer import beams as module
+from stillmap.viewer.beams import Beams, slice_scans
 
 
 @pytest.fixture(params=[(2, False), (2, True), (3, False), (3, True)])
@@ -48,8 +49,26 @@ def test_slice_scans(beams):
     assert some.offset.tolist() == [0, 40, 80]
 
 
+def test_dynamic_ends(beams, monkeypatch):
+    """Whatever the blocks, they are the dynamic end points of all scans."""
+    D = beams.recording.dimension
+    views = [beams.scan_view(scan) for scan in range(beams.recording.n_scans)]
+    ends = np.concatenate([view.ends[view.p_static < 0.5] for view in views])[:, :D]
+    assert beams.dynamic_ends(1000) == pytest.approx(ends, abs=1e-5)
+    some = beams.dynamic_ends(5)
+    assert len(some) == 5
+    assert all((np.abs(ends - one).max(axis=1) < 1e-5).any() for one in some)
+    if beams.recording.beam_time is None:  # deskewing looks at the neighbours of a scan
+        monkeypatch.setattr(module, "_BLOCK_SCANS", 2)
+        assert beams.dynamic_ends(1000) == pytest.approx(ends, abs=1e-5)
+        monkeypatch.setattr(module, "_MAX_READ", 80)  # one block of three
+        assert 0 < len(beams.dynamic_ends(1000)) < len(ends)
+
+
 def test_scan_without_beams(beams):
     recording = beams.recording
     nothing = replace(recording, hit=np.zeros(recording.n_beams, bool))
     seen = replace(beams, recording=nothing).scan_view(0)
     assert (seen.ends.shape, seen.p_static.shape) == ((0, 3), (0,))
+    nothing = replace(beams, recording=nothing).dynamic_ends(9)
+    assert nothing.shape == (0, recording.dimension)

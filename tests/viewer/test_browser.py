@@ -1,81 +1,29 @@
 """The page in a headless Chromium."""
 
-import base64
-import io
-import json
 import re
-import shutil
-import subprocess
 import time
-import urllib.request
 
 import numpy as np
 import pytest
-from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from stillmap.mesh.texture.atlas import TexturedMesh
+from stillmap.results.colors import TEAL
 from stillmap.results.gltf import write_glb
 from stillmap.results.report.renderer import BACKGROUND
 from stillmap.viewer.scene import read_scene
 
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
-sockets = pytest.importorskip("websockets.sync.client")
+pytest.importorskip("websockets.sync.client")
 
-from stillmap.viewer.window import Window  # noqa: E402
+from browser_tab import BROWSER, HEIGHT, WIDTH, Tab
 
-BROWSER = shutil.which("chromium") or shutil.which("chromium-browser")
+from stillmap.viewer.window import Window
 
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(BROWSER is None, reason="there is no Chromium here"),
 ]
-
-
-class Tab:
-    """A tab of a headless Chromium, and what it says happened."""
-
-    def __init__(self, folder):
-        flags = ["--headless", "--no-sandbox", "--enable-unsafe-swiftshader"]
-        flags += ["--remote-debugging-port=0", f"--user-data-dir={folder}"]
-        self.process = subprocess.Popen(
-            [BROWSER, *flags, "--window-size=1000,700", "about:blank"],
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        port = next(
-            found[1]
-            for line in self.process.stderr
-            if (found := re.search(r"DevTools listening on ws://[^:]+:(\d+)/", line))
-        )
-        with urllib.request.urlopen(f"http://127.0.0.1:{port}/json", timeout=10) as answer:
-            pages = json.load(answer)
-        address = next(page for page in pages if page["type"] == "page")["webSocketDebuggerUrl"]
-        self.socket = sockets.connect(address, max_size=None)
-        self.sent, self.events = 0, []
-        for part in ("Page", "Network", "Runtime", "Log"):
-            self.call(f"{part}.enable")
-
-    def call(self, method, **words):
-        self.sent += 1
-        self.socket.send(json.dumps({"id": self.sent, "method": method, "params": words}))
-        while True:
-            answer = json.loads(self.socket.recv(timeout=30))
-            if answer.get("id") == self.sent:
-                return answer["result"]
-            self.events.append(answer)
-
-    def of(self, *methods):
-        return [one["params"] for one in self.events if one.get("method") in methods]
-
-    def picture(self):
-        data = self.call("Page.captureScreenshot", format="png")["data"]
-        return np.array(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB")).astype(int)
-
-    def close(self):
-        self.socket.close()
-        self.process.terminate()
-        self.process.wait()
-        self.process.stderr.close()
 
 
 @pytest.fixture
@@ -128,9 +76,7 @@ def tiled(path, tones):
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_page_shows_the_result_without_foreign_requests(result_of, tab, dimension):
-    from test_window import beams_of
-
+def test_page_shows_the_result_without_foreign_requests(result_of, beams_of, tab, dimension):
     out = result_of(dimension, with_models=dimension == 3)
     window = Window(read_scene(out), beams_of(out))
     try:
@@ -158,6 +104,8 @@ def test_texture_colors_are_shown_unchanged(result_of, tab):
     tones = [(118, 13, 41), (250, 248, 240), (230, 60, 40), (60, 200, 60)]
     tiled(out / "mesh.glb", tones)
     window = Window(read_scene(out), None)
+    for name, box in window._boxes.items():
+        box.value = name == "Surface"
 
     def counted(picture):
         wanted = [*tones, BACKGROUND]
@@ -168,3 +116,167 @@ def test_texture_colors_are_shown_unchanged(result_of, tab):
     finally:
         window.close()
     assert min(counts.values()) > 100, counts
+
+
+def until(window, seen, seconds=60.0):
+    """Run the window until something is seen."""
+    end = time.monotonic() + seconds
+    while not seen():
+        assert time.monotonic() < end, "not seen in time"
+        for _ in range(5):
+            window.step()
+
+
+@pytest.fixture
+def shown(result_of, beams_of, opened, tab):
+    """Opens a page of a result with D dimensions and waits until it shows the scene."""
+
+    def page(dimension):
+        out = result_of(dimension)
+        window = opened(read_scene(out, "walk.bag"), beams_of(out))
+        counts = shown_in(tab, window, hues, ("orange", "blue"))
+        assert min(counts["orange"], counts["blue"]) > 20, counts
+        # what covers the page without a graphics card
+        tab.value("document.querySelector('.mantine-Notification-closeButton')?.click()")
+        until(window, lambda: "Legend" in tab.value("document.body.innerText"))
+        return window
+
+    return page
+
+
+def field_of(tab):
+    """The number that the page shows for the scan."""
+    return int(tab.value("document.querySelector('[role=slider]').ariaValueNow"))
+
+
+def button_of(tab, text):
+    """Center of a button, in pixels."""
+    words = f"e => e.textContent.trim() == '{text}'"
+    find = f"[...document.querySelectorAll('button')].find({words}).getBoundingClientRect()"
+    return tab.value(
+        f"(() => {{ const r = {find}; return [r.x + r.width/2, r.y + r.height/2] }})()"
+    )
+
+
+def pixel_of(window, point):
+    """Where a point (3,) of the scene is on the page."""
+    (client,) = window._server.get_clients().values()
+    w, x, y, z = client.camera.wxyz
+    seen = Rotation.from_quat([x, y, z, w]).inv().apply(point - client.camera.position)
+    focal_length = 0.5 * HEIGHT / np.tan(0.5 * client.camera.fov)
+    return np.array([WIDTH, HEIGHT]) / 2 + focal_length * seen[:2] / seen[2]
+
+
+def test_title_names_recording_and_program(shown, tab):
+    shown(2)
+    assert tab.value("document.title") == "walk.bag - stillmap"
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_space_plays_and_pauses(shown, tab, dimension):
+    window = shown(dimension)
+    before = tab.picture()[:, :650]
+
+    def changed():
+        """Number of pixels of the scene that are others than before."""
+        return int((np.abs(tab.picture()[:, :650] - before).max(axis=2) > 60).sum())
+
+    tab.press(" ", "Space")
+    until(window, lambda: field_of(tab) >= 2)
+    until(window, lambda: changed() > 50)
+    tab.press(" ", "Space")
+    until(window, lambda: "Play" in tab.value("document.body.innerText").split("\n"))
+    scan = window.scan
+    for _ in range(20):
+        window.step()
+    assert window.scan == scan == field_of(tab)
+
+
+def test_space_after_a_click_on_play_pauses(shown, tab):
+    """The button does not keep the focus, or Space would press it once more."""
+    window = shown(2)
+    tab.click(*button_of(tab, "Play"))
+    until(window, lambda: window._playing)
+    tab.press(" ", "Space")
+    until(window, lambda: not window._playing)
+    for _ in range(10):
+        window.step()
+    assert not window._playing
+
+
+def test_arrows_step_and_leave_the_camera(shown, tab):
+    window = shown(2)
+    (client,) = window._server.get_clients().values()
+    before = client.camera.position.copy()
+    for scan in (1, 2):
+        tab.press("ArrowRight", "ArrowRight")
+        until(window, lambda wanted=scan: field_of(tab) == wanted)
+    tab.press("ArrowLeft", "ArrowLeft")
+    until(window, lambda: field_of(tab) == 1)
+    assert client.camera.position == pytest.approx(before)
+
+
+def test_keys_and_check_boxes_show_and_hide_layers(shown, tab):
+    window = shown(3)
+
+    def rays():
+        """Pixels in the color of rays."""
+        picture = tab.picture()[:, 250:650]
+        return int((np.abs(picture - TEAL).max(axis=2) < 25).sum())
+
+    assert rays() < 20
+    tab.press("7", "Digit7")
+    until(window, lambda: rays() > 200)
+    assert "rays from the sensor" in tab.value("document.body.innerText")
+    tab.click(
+        *tab.value(
+            "(() => { const l = [...document.querySelectorAll('label')].find(e => e.textContent == "
+            "'Rays'); const r = l.closest('div').parentElement.querySelector('[type=checkbox]')"
+            ".getBoundingClientRect(); return [r.x + r.width/2, r.y + r.height/2] })()"
+        )
+    )
+    until(window, lambda: rays() < 20)
+    # the check box does not keep the keys for itself
+    tab.press("7", "Digit7")
+    until(window, lambda: rays() > 200)
+
+
+def test_distance_between_two_clicks(shown, tab):
+    window = shown(2)
+    tab.press("m", "KeyM")
+    until(window, lambda: "Click on the first point" in tab.value("document.body.innerText"))
+    ends = np.array([[-1.5, -1.0, 0.0], [0.9, 0.8, 0.0]])
+    for count, end in enumerate(ends):
+        tab.click(*pixel_of(window, end))
+        until(window, lambda wanted=count + 1: len(window._ruler.points) == wanted)
+    until(window, lambda: re.search(r"\d\.\d\d m\n", tab.value("document.body.innerText")))
+    length = re.search(r"(\d\.\d\d) m\n", tab.value("document.body.innerText"))[1]
+    assert float(length) == pytest.approx(3.0, abs=0.05)  # pixels are whole
+    tab.press("Escape", "Escape")
+    until(window, lambda: f"{length} m\n" not in tab.value("document.body.innerText"))
+
+
+def test_click_on_an_object_shows_its_facts(shown, tab):
+    window = shown(3)
+    for _ in range(2):
+        tab.press("ArrowRight", "ArrowRight")
+    until(window, lambda: field_of(tab) == 2)
+    tab.press("3", "Digit3")
+    time.sleep(0.5)  # the page moves the box
+    tab.click(*pixel_of(window, np.array([1.0, 0.0, 0.9])))
+    until(window, lambda: "Object 7" in tab.value("document.body.innerText"))
+    text = tab.value("document.body.innerText")
+    for fact in ("0.5 s to 1.5 s", "1,234", "0.988", "0.80 x 0.40 x 1.80 m", "1.0 m/s"):
+        assert fact in text
+
+
+def test_scale_bar_has_the_scale_of_the_view(shown, tab):
+    window = shown(2)
+    (client,) = window._server.get_clients().values()
+    bar = "document.querySelector('[title=\"at the center of the view\"]')"
+    until(window, lambda: tab.value(f"{bar} != null"))
+    width = tab.value(f"{bar}.firstChild.getBoundingClientRect().width")
+    length = float(tab.value(f"{bar}.textContent").removesuffix(" m"))
+    center = client.camera.look_at
+    a, b = (pixel_of(window, center + np.array([side * length / 2, 0, 0])) for side in (-1, 1))
+    assert width == pytest.approx(np.linalg.norm(b - a), abs=6)  # with its border of 2 x 2 pixels

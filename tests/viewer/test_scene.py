@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from stillmap.core.errors import InputError
-from stillmap.results.points import COLOURS, FIELDS, ply_header, put_colours
-from stillmap.results.report.figures import ORANGE, UNKNOWN
+from stillmap.results.report.figures import UNKNOWN
 from stillmap.viewer import scene as module
 from stillmap.viewer.scene import read_scene
-from stillmap.viewer.window import default_view
+from stillmap.viewer.view import default_view
 
 
 def test_2d_result(result_of):
     scene = read_scene(result_of(2))
     assert scene.is_2d
+    assert (scene.name, scene.folder) == ("out2", "out2")
     assert (scene.clouds, scene.surface, scene.models, scene.notes) == ({}, None, [], [])
     assert scene.poses.shape == (6, 4, 4)
     assert scene.tracks[0].z is None
@@ -50,21 +50,10 @@ def test_3d_result(result_of):
     assert z.min() <= scene.ground <= np.median(z)
 
 
-def test_points_keep_colors_and_uncolored_dynamic_points_are_orange(result_of):
-    out, (grey, red) = result_of(3), ((128, 128, 128), (200, 0, 0))
-    for part in ("static", "dynamic"):
-        rows = np.zeros(2, FIELDS + COLOURS)
-        put_colours(rows, np.array([grey, red], np.uint8))
-        (out / f"{part}.ply").write_bytes(ply_header(FIELDS + COLOURS, 2) + rows.tobytes())
-    clouds = read_scene(out).clouds
-    assert clouds["static"].colors.tolist() == [[*grey], [*red]]
-    assert clouds["dynamic"].colors.tolist() == [[*ORANGE], [*red]]
-
-
 def test_number_of_points_is_limited(result_of, monkeypatch):
     monkeypatch.setitem(module.MAX_POINTS, "static", 11)
     static = read_scene(result_of(3)).clouds["static"]
-    assert len(static.points) == len(static.colors) == 11
+    assert len(static.points) == 11
     assert static.total > 11
 
 

@@ -1,170 +1,25 @@
-"""The viewer's page, its layers and controls."""
+"""The viewer's layers and controls."""
 
-import gzip
-import socket
-import urllib.error
-import urllib.request
-from pathlib import Path
+from functools import partial
 
 import numpy as np
 import pytest
 
-from stillmap.core.errors import InputError
-from stillmap.io import read
-from stillmap.io.trajectory import poses_from_tum
-from stillmap.slam import SlamOptions
+from stillmap.results.points import COLOURS, FIELDS, ply_header, put_colours
+from stillmap.results.report.figures import ORANGE
 from stillmap.viewer import scene as scenes
+from stillmap.viewer import shortcuts
+from stillmap.viewer.picking import Ray
 from stillmap.viewer.scene import read_scene
-from stillmap.viewer.tracks import Beams
 
-viser = pytest.importorskip("viser", reason="the extra `viewer` is not installed")
-sockets = pytest.importorskip("websockets.sync.client")
+pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 
-from stillmap.viewer import server as module  # noqa: E402
-from stillmap.viewer.window import Window, _escape_markdown  # noqa: E402
+from stillmap.viewer.window import _escape_markdown
 
 
-def beams_of(out):
-    recording = read(out.parent / out.name.replace("out", "log"))
-    poses = poses_from_tum(out / "trajectory.tum", recording)
-    return Beams(recording, np.load(out / "beams/p_static.npy"), poses, SlamOptions())
-
-
-@pytest.fixture
-def opened():
-    windows = []
-
-    def window(*words):
-        windows.append(Window(*words))
-        return windows[-1]
-
-    yield window
-    for one in windows:
-        one.close()
-
-
-@pytest.fixture
-def window(result_of, opened):
-    out = result_of(3, with_models=True)
-    return opened(read_scene(out), beams_of(out))
-
-
-def port_of(window):
-    return int(window.url.rpartition(":")[2])
-
-
-def get(window, path="/", **headers):
-    request = urllib.request.Request(window.url + path, headers=headers)
-    return urllib.request.urlopen(request, timeout=10)
-
-
-def test_page_is_served_with_its_policy(window):
-    with get(window) as page:
-        assert page.status == 200
-        assert b"<html" in page.read()
-        policy = page.headers["Content-Security-Policy"]
-    assert f"connect-src 'self' data: blob: ws://127.0.0.1:{port_of(window)};" in policy
-
-
-@pytest.mark.parametrize(
-    "headers", [{"Host": "example.org"}, {"Origin": "https://example.org"}, {"Origin": "null"}]
-)
-def test_foreign_page_is_refused(window, headers):
-    with pytest.raises(urllib.error.HTTPError) as caught:
-        get(window, **headers)
-    with caught.value:
-        assert caught.value.code == 403
-
-
-@pytest.mark.parametrize("packed", ["gzip", "identity"])
-def test_page_disables_tone_mapping(window, packed):
-    """It is what viser has, and before all of its own scripts the one that does so."""
-    with get(window, **{"Accept-Encoding": packed}) as answer:
-        page, headers = answer.read(), answer.headers
-    assert int(headers["Content-Length"]) == len(page)
-    assert headers["Content-Encoding"] == packed
-    page = gzip.decompress(page) if packed == "gzip" else page
-    first = page[page.index(b"<script") : page.index(b"</script>")]
-    assert b"TONE_MAPPING" in first
-    plain = (Path(viser.__file__).parent / "client/build/index.html").read_bytes()
-    assert page.replace(first + b"</script>", b"") == plain
-
-
-def test_socket_answers_only_its_page(window):
-    address, protocol = f"ws://127.0.0.1:{port_of(window)}", [f"viser-v{viser.__version__}"]
-    with sockets.connect(address, subprotocols=protocol, origin=window.url) as socket_:
-        assert len(socket_.recv(timeout=10)) > 0
-    with pytest.raises(Exception, match="403"):
-        sockets.connect(address, subprotocols=protocol, origin="https://example.org")
-
-
-def test_only_loopback_answers(window):
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as one:
-        # another address of loopback, which stands for those of the network
-        assert one.connect_ex(("127.0.0.2", port_of(window))) != 0
-    for family, *_, address in socket.getaddrinfo(socket.gethostname(), port_of(window)):
-        if family == socket.AF_INET and not address[0].startswith("127."):
-            with socket.socket(family, socket.SOCK_STREAM) as one:
-                one.settimeout(2)
-                assert one.connect_ex(address) != 0
-
-
-def test_no_share_url_is_requested(window, monkeypatch):
-    def refused(*_words, **_more):
-        raise AssertionError("a tunnel")
-
-    monkeypatch.setattr("viser._viser.ViserTunnel", refused)
-    assert window._server.request_share_url() is None
-
-
-def test_close_stops_the_server(result_of):
-    window = Window(read_scene(result_of(2)), None)
-    window.close()
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as one:
-        assert one.connect_ex(("127.0.0.1", port_of(window))) != 0
-
-
-def test_nothing_is_printed(result_of, capfd):
-    window = Window(read_scene(result_of(2)), None)
-    window.close()
-    assert capfd.readouterr() == ("", "")
-
-
-def test_malformed_requests_are_not_logged(window, capfd):
-    for what in (b"nonsense\r\n\r\n", b"GET / HTTP/1.1\r\n\r\n", b""):
-        with socket.create_connection(("127.0.0.1", port_of(window)), timeout=10) as one:
-            one.sendall(what)
-            one.shutdown(socket.SHUT_WR)
-            while one.recv(4096):
-                pass
-    with get(window) as page:
-        assert page.status == 200
-    assert capfd.readouterr() == ("", "")
-
-
-def test_taken_port_is_refused(window, result_of):
-    with pytest.raises(InputError, match="is taken"):
-        Window(read_scene(result_of(2)), None, port_of(window))
-
-
-def test_free_port_is_used(result_of, opened):
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as one:
-        one.bind(("127.0.0.1", 0))
-        port = one.getsockname()[1]
-    assert port_of(opened(read_scene(result_of(2)), None, port)) == port
-
-
-def test_unknown_viser_is_refused(result_of, monkeypatch):
-    """Where its server starts otherwise than we know, it would answer anybody."""
-    from contextlib import contextmanager
-
-    @contextmanager
-    def nothing():
-        yield []
-
-    monkeypatch.setattr(module, "_guard_servers", nothing)
-    with pytest.raises(RuntimeError, match="viser"):
-        Window(read_scene(result_of(2)), None)
+def node(window, path):
+    """A node of viser."""
+    return window._server.scene.get_handle_by_name(path)
 
 
 def test_layers_without_data_are_left_out(result_of, opened, window):
@@ -178,21 +33,22 @@ def test_layers_without_data_are_left_out(result_of, opened, window):
     ]
 
 
-def test_show_scan(window):
-    layers, scene = window._layers, window._scene
-    window._boxes["Beams"].value = True
-    window.step()
+def test_show_scan(result_of, beams_of, opened):
+    out = result_of(3, with_models=True)
+    scene, beams = read_scene(out), beams_of(out)
+    window = opened(scene, beams)
     for scan in (2, 5, 0):
         window.show(scan)
         assert window._slider.value == scan
         assert window._clock.value == f"{0.5 * scan:.1f} of 2.5 s"
-        beams = layers._beams.scan_view(scan)
-        assert layers._ends.points == pytest.approx(beams.ends, abs=1e-5)
-        assert layers._ends.colors.shape == beams.ends.shape
-        assert layers._robot.position == pytest.approx(scene.poses[scan, :3, 3])
+        view, ends = beams.scan_view(scan), node(window, "/beams/points")
+        assert ends.points == pytest.approx(view.ends, abs=1e-5)
+        assert ends.colors.shape == view.ends.shape
+        assert node(window, "/robot/robot").position == pytest.approx(scene.poses[scan, :3, 3])
         there = 1 <= scan <= 3
-        assert layers._models[0].visible is there
-        assert len(layers._box.points) == (12 if there else 0)
+        assert node(window, "/object_models/0007").visible is there
+        assert node(window, "/objects/sides").visible is there
+        assert len(node(window, "/objects/lines").points) == (12 if there else 0)
 
 
 def test_slider(window):
@@ -203,28 +59,70 @@ def test_slider(window):
 
 def test_default_layers_with_a_surface(window):
     shown = {name for name, box in window._boxes.items() if box.value}
-    assert shown == {"Surface", "Robot", "Objects", "Object models"}
-    assert all(node.visible is (name in shown) for name, node in window._layers._nodes.items())
+    assert shown == {
+        *("Map", "Static points", "Dynamic points", "Robot", "Beams", "Objects", "Object models")
+    }
+    for name in window._boxes:
+        path = "/" + name.lower().replace(" ", "_")
+        assert node(window, path).visible is window._layers.is_shown(name) is (name in shown)
 
 
-def test_default_layers_without_a_surface(result_of, opened):
-    out = result_of(3)
-    bare = opened(read_scene(out), beams_of(out))
-    shown = {name for name, box in bare._boxes.items() if box.value}
-    assert shown == {"Map", "Static points", "Robot", "Beams", "Objects"}
+def test_default_layers_in_2d(result_of, beams_of, opened):
+    """Dynamic points come from the recording, above the map."""
+    out = result_of(2)
+    flat, beams = opened(read_scene(out), beams_of(out)), beams_of(out)
+    shown = {name for name, box in flat._boxes.items() if box.value}
+    assert shown == {"Map", "Dynamic points", "Robot", "Beams", "Objects"}
+    points = node(flat, "/dynamic_points/points")
+    views = [beams.scan_view(scan) for scan in range(beams.recording.n_scans)]
+    ends = np.concatenate([view.ends[view.p_static < 0.5] for view in views])
+    assert points.points[:, :2] == pytest.approx(ends[:, :2], abs=1e-5)
+    assert (points.points[:, 2] > 0.0).all()
+    assert (points.colors == ORANGE).all()
+
+
+def test_points_are_colored_by_label_or_height(window):
+    static, dynamic = (node(window, f"/{name}_points/points") for name in ("static", "dynamic"))
+    assert window._coloring.options == ("label", "height")
+    assert np.ptp(static.colors.astype(int), axis=1).max() < 15  # shades of grey
+    assert (dynamic.colors == ORANGE).all()
+    labels = static.colors.copy()
+    window._coloring.value = "height"
+    window.step()
+    order = np.argsort(static.points[:, 2])
+    assert np.ptp(static.colors.astype(int), axis=1).max() > 50
+    assert (np.diff(static.colors[order, 1].astype(int)) >= 0).all()
+    assert (dynamic.colors == ORANGE).all()
+    window._coloring.value = "label"
+    window.step()
+    assert (static.colors == labels).all()
+
+
+def test_points_are_colored_by_pictures(result_of, opened):
+    out, (grey, red) = result_of(3), ((128, 128, 128), (200, 0, 0))
+    for part in ("static", "dynamic"):
+        rows = np.zeros(2, FIELDS + COLOURS)
+        put_colours(rows, np.array([grey, red], np.uint8))
+        (out / f"{part}.ply").write_bytes(ply_header(FIELDS + COLOURS, 2) + rows.tobytes())
+    window = opened(read_scene(out), None)
+    assert window._coloring.options == ("label", "height", "pictures")
+    window._coloring.value = "pictures"
+    window.step()
+    assert node(window, "/static_points/points").colors.tolist() == [[*grey], [*red]]
+    # grey is what no picture shows
+    assert node(window, "/dynamic_points/points").colors.tolist() == [[*ORANGE], [*red]]
 
 
 def test_map_lies_below_the_surface(result_of, opened, window):
     def height(of):
-        plan = of._server.scene.get_handle_by_name("/map/plan")
-        return float(plan.position[2]) + of._scene.origin[2]
+        return float(node(of, "/map/plan").position[2]) + of._scene.origin[2]
 
     assert -0.3 < height(window) - window._scene.ground < -0.05
     flat = opened(read_scene(result_of(2)), None)
     assert height(flat) == flat._scene.ground
 
 
-def test_notes_are_shown_with_their_layers(result_of, opened, monkeypatch):
+def test_notes_are_shown_with_their_layers(result_of, beams_of, opened, monkeypatch):
     monkeypatch.setitem(scenes.MAX_POINTS, "static", 11)
     out = result_of(3, with_models=True)
     window = opened(read_scene(out), beams_of(out))
@@ -232,32 +130,31 @@ def test_notes_are_shown_with_their_layers(result_of, opened, monkeypatch):
     def told():
         return [note.content for note in window._notes.values() if note.visible]
 
-    assert told() == []
-    window._boxes["Beams"].value = True
-    window.step()
-    assert [text.split(":")[0] for text in told()] == ["Beams\\"]
-    window._boxes["Beams"].value = False
-    window._boxes["Static points"].value = True
-    window.step()
     (text,) = told()
     assert text.startswith("11 of ")
+    window._boxes["Static points"].value = False
+    window.step()
+    assert told() == []
 
 
 def test_check_boxes_show_and_hide(window):
     window.show(2)
-    assert window._layers._nodes["Surface"].visible
-    window._boxes["Surface"].value = False
+    window._boxes["Surface"].value = True
     window._boxes["Object numbers"].value = True
     window.step()
-    assert not window._layers._nodes["Surface"].visible
-    assert [label.text for label in window._layers._label] == ["7"]
+    assert node(window, "/surface").visible
+    assert node(window, "/object_numbers/0").text == "7"
+    window._boxes["Surface"].value = False
+    window.step()
+    assert not node(window, "/surface").visible
 
 
 def test_point_size(window):
-    before = window._layers._ends.point_size
+    ends = node(window, "/beams/points")
+    before = ends.point_size
     window._size.value = 2.0
     window.step()
-    assert window._layers._ends.point_size == pytest.approx(2 * before)
+    assert ends.point_size == pytest.approx(2 * before)
 
 
 def test_playback_starts_again_at_the_end(window):
@@ -290,3 +187,106 @@ def test_result_of_one_scan(result_of, opened):
 
 def test_markdown_is_escaped():
     assert _escape_markdown("a_b <img src=x>") == r"a\_b \<img src=x\>"
+
+
+def test_actions_of_keys_step_and_pause(window):
+    act, last = window._actions(), len(window._scene.stamp_ns) - 1
+
+    def after(name):
+        act[name]()
+        window.step()
+        return window.scan
+
+    assert [after("Next scan"), after("Next scan"), after("Previous scan")] == [1, 2, 1]
+    assert [after("Last scan"), after("Next scan"), after("First scan")] == [last, last, 0]
+    assert after("Previous scan") == 0
+    act["Next scan"]()  # two before one is shown
+    assert after("Next scan") == 2
+    after("Play or pause")
+    assert window._playing
+    after("Next scan")
+    assert not window._playing
+
+
+def test_actions_of_keys_show_and_hide_every_layer(window):
+    act = window._actions()
+    for name, box in window._boxes.items():
+        before = box.value
+        act[name]()
+        window.step()
+        assert box.value is window._layers.is_shown(name) is not before
+
+
+def test_keys_are_distinct_and_not_those_of_the_camera(window):
+    keys = [*shortcuts.LAYER_KEYS.values(), *shortcuts._ACTION_KEYS.values()]
+    assert len(set(keys)) == len(keys)
+    assert not set(keys) & {*"WASDQE", "arrowup", "arrowdown"}
+    names = {*shortcuts.LAYER_KEYS, *shortcuts._ACTION_KEYS}
+    assert set(window._actions()) == names
+
+
+def test_selected_object_shows_its_facts(window):
+    window.show(2)
+    window._click_object(7)
+    window.step()
+    assert window._facts_folder.visible
+    assert window._facts_folder.label == "Object 7"
+    for fact in ("0.5 s to 1.5 s", "0.80 x 0.40 x 1.80 m", "1,234", "0.988", "1.0 m/s"):
+        assert fact in window._facts.content
+    assert node(window, "/selected_object/lines").visible
+    window.show(0)
+    assert "not seen" in window._facts.content
+    assert not node(window, "/selected_object/lines").visible
+    window._actions()["Clear"]()
+    window.step()
+    assert not window._facts_folder.visible
+
+
+def test_measured_distances_are_shown_and_cleared(window):
+    act = window._actions()
+    act["Measure"]()
+    window.step()
+    assert window._distances.content == r"Click on the first point\."
+    eye = np.array([0.0, 0.0, 50.0])
+    z = window._scene.ground - 0.15  # of the map, beside all points
+    for goal in ([30.0, 40.0, z], [30.0, 43.0, z]):
+        way = np.array(goal) - eye
+        window._events.put(partial(window._add_point, Ray(eye, way / np.linalg.norm(way)), 0.001))
+        window.step()
+    assert window._ruler.distances == pytest.approx([3.0])
+    assert node(window, "/measured_2/distance").text == "3.00 m"
+    assert window._distances.content.startswith(r"3\.00 m")
+    # an object is not selected meanwhile
+    window._click_object(7)
+    window.step()
+    assert not window._facts_folder.visible
+    act["Clear"]()
+    window.step()
+    assert window._ruler.points == []
+    assert node(window, "/measured_2/distance") is None
+    assert not window._distances.visible
+
+
+def test_click_beside_everything_measures_nothing(window):
+    window._actions()["Measure"]()
+    up = Ray(np.array([0.0, 0.0, 50.0]), np.array([0.0, 0.0, 1.0]))
+    window._events.put(partial(window._add_point, up, 0.01))
+    window.step()
+    assert window._ruler.points == []
+    assert "no point there" in window._distances.content
+
+
+def test_clicked_point_is_one_of_what_is_visible(window):
+    cloud = window._layers.clouds["Static points"].points.astype(float)
+    point = cloud[np.argmax(cloud[:, 2])]  # nothing is above it
+    ray = Ray(point + np.array([0.0, 0.0, 9.0]), np.array([0.0, 0.0, -1.0]))
+    window._boxes["Dynamic points"].value = False
+    window.step()
+    assert window._layers.pick(ray, 1e-4) == pytest.approx(point)
+    window._boxes["Static points"].value = False
+    window.step()
+    depth = window._scene.ground - 0.15
+    assert window._layers.pick(ray, 1e-4) == pytest.approx([*point[:2], depth])
+    window._boxes["Map"].value = False
+    window.step()
+    assert window._layers.pick(ray, 1e-4) is None

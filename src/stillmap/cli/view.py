@@ -14,7 +14,7 @@ from stillmap.core.errors import InputError, MissingExtra, import_extra
 
 if TYPE_CHECKING:
     from stillmap.results.folder import ResultFolder
-    from stillmap.viewer.tracks import Beams
+    from stillmap.viewer.beams import Beams
 
 
 _REPORT = "report.html"
@@ -113,7 +113,7 @@ def _serve(args: argparse.Namespace, folder: Path) -> None:
     from stillmap.viewer.window import Window
 
     result = open_result(folder, args.input)
-    scene, beams = read_scene(folder), None
+    scene, beams = read_scene(folder, result.source.name), None
     try:
         if not args.no_beams:
             beams = _read_beams(result, args.quiet)
@@ -139,7 +139,7 @@ def _serve(args: argparse.Namespace, folder: Path) -> None:
 
 def _read_beams(result: "ResultFolder", quiet: bool) -> "Beams":
     from stillmap.io.trajectory import poses_from_tum
-    from stillmap.viewer.tracks import Beams
+    from stillmap.viewer.beams import Beams
 
     with show_share(quiet, "reading") as progress:
         recording, labels = result.read(progress)

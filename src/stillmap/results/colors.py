@@ -9,12 +9,19 @@ from stillmap.results.report.figures import ORANGE
 
 Colors = NDArray[np.uint8]
 
+Rgb = tuple[int, int, int]
+
 BLUE = (36, 99, 168)  # static, and the robot's trajectory; ORANGE is dynamic
+GREY = (205, 205, 205)  # undecided
+TEAL = (0, 150, 136)  # rays
 
 # at P(static) = 0, 0.5, 1; distinguishable to color-blind readers
-_P_STATIC_COLORS = (ORANGE, (205, 205, 205), BLUE)
+_P_STATIC_COLORS = (ORANGE, GREY, BLUE)
 
-_HEIGHT_COLORS = ((40, 53, 90), (45, 96, 130), (60, 140, 132), (122, 178, 106), (214, 196, 96))
+# of static points, from low to high: without any shade their shapes could not be told apart
+STATIC_COLORS = ((70, 74, 80), (168, 172, 178))
+
+HEIGHT_COLORS = ((40, 53, 90), (45, 96, 130), (60, 140, 132), (122, 178, 106), (214, 196, 96))
 
 _HUE_STEP = 0.618034  # of the circle, from one id to the next, so that neighbors differ
 
@@ -26,9 +33,12 @@ def color_by_p_static(p_static: NDArray[np.float32]) -> Colors:
 
 def color_by_height(z: NDArray[np.floating], low: float, high: float) -> Colors:
     """Dark blue at `low` to yellow at `high`, for heights z (n,) in m."""
-    return _interpolate_colors(
-        _HEIGHT_COLORS, (np.asarray(z, np.float64) - low) / max(high - low, 1e-9)
-    )
+    return _shade(HEIGHT_COLORS, z, low, high)
+
+
+def color_static(z: NDArray[np.floating], low: float, high: float) -> Colors:
+    """Dark grey at `low` to light grey at `high`, for heights z (n,) in m."""
+    return _shade(STATIC_COLORS, z, low, high)
 
 
 def color_by_id(number: NDArray[np.intp] | Sequence[int]) -> Colors:
@@ -39,9 +49,11 @@ def color_by_id(number: NDArray[np.intp] | Sequence[int]) -> Colors:
     return np.rint(120.0 + 105.0 * level).astype(np.uint8)
 
 
-def _interpolate_colors(
-    stops: Sequence[tuple[int, int, int]], share: NDArray[np.float64]
-) -> Colors:
+def _shade(stops: Sequence[Rgb], z: NDArray[np.floating], low: float, high: float) -> Colors:
+    return _interpolate_colors(stops, (np.asarray(z, np.float64) - low) / max(high - low, 1e-9))
+
+
+def _interpolate_colors(stops: Sequence[Rgb], share: NDArray[np.float64]) -> Colors:
     """Linear interpolation between evenly spaced colors over 0 to 1."""
     at = np.linspace(0.0, 1.0, len(stops))
     columns = [np.interp(share, at, column) for column in np.array(stops, np.float64).T]

@@ -14,13 +14,11 @@ from stillmap.core.errors import InputError
 from stillmap.core.files import read_text
 from stillmap.core.se2 import inverse
 from stillmap.io.trajectory import read_tum
-from stillmap.mesh.texture.atlas import GRAY
 from stillmap.pipeline.snapshots import Window
 from stillmap.results import gltf
-from stillmap.results.colors import color_by_height
 from stillmap.results.object_poses import interpolate_pose
 from stillmap.results.reader import Track, read_grid, read_tracks
-from stillmap.results.report.figures import ORANGE, UNKNOWN, draw_map, map_window
+from stillmap.results.report.figures import UNKNOWN, draw_map, map_window
 from stillmap.viewer.display import Points, sample_ply
 
 MAX_POINTS = {"static": 500_000, "dynamic": 200_000}
@@ -75,11 +73,13 @@ class Scene:
     """A result of T scans.
 
     Attributes:
-        name: name of the folder.
+        name: name of the recording.
+        folder: name of the folder.
         stamp_ns: (T,).
         poses: (T, 4, 4) T_map_base.
         map_image: None for an empty map.
-        clouds: by name: `static`, `dynamic`; float32, relative to `origin`, all with colors.
+        clouds: by name: `static`, `dynamic`; float32, relative to `origin`. Colors are those of
+            pictures; None where there are none.
         tracks: moving objects.
         surface: mesh.glb; None where there is none.
         models: of the tracks that have one.
@@ -89,6 +89,7 @@ class Scene:
     """
 
     name: str
+    folder: str
     stamp_ns: NDArray[np.int64]
     poses: Float
     map_image: MapImage | None
@@ -106,8 +107,12 @@ class Scene:
         return not self.clouds and self.surface is None
 
 
-def read_scene(folder: Path) -> Scene:
+def read_scene(folder: Path, recording: str = "") -> Scene:
     """Read a result folder; optional files may be missing, unusable models are noted.
+
+    Args:
+        folder: the result.
+        recording: name of its recording; that of the folder where it is empty.
 
     Raises:
         InputError: map or trajectory are missing, or a file is damaged.
@@ -125,11 +130,15 @@ def read_scene(folder: Path) -> Scene:
         surface = _read_or_note(notes, gltf.read_glb, folder / "mesh.glb", _MAX_MESH)
     models = _models(folder / "objects", tracks, notes)
     return Scene(
-        name=folder.resolve().name,
+        name=recording or folder.resolve().name,
+        folder=folder.resolve().name,
         stamp_ns=stamp_ns,
         poses=poses,
         map_image=_map_image(folder, transparent=bool(raw)),
-        clouds={name: _cloud(name, one, origin) for name, one in raw.items()},
+        clouds={
+            name: Points((one.points - origin).astype(np.float32), one.colors, one.total)
+            for name, one in raw.items()
+        },
         tracks=tracks,
         surface=surface,
         models=models,
@@ -156,18 +165,6 @@ def _map_image(folder: Path, transparent: bool) -> MapImage | None:
         picture[(picture[..., :3] == UNKNOWN).all(axis=2), 3] = 0
     scale = max(1, _MIN_IMAGE_SIZE // max(picture.shape))
     return MapImage(picture.repeat(scale, axis=0).repeat(scale, axis=1), window)
-
-
-def _cloud(name: str, raw: Points, origin: Float) -> Points:
-    colors = raw.colors
-    if colors is None:
-        colors = np.full((len(raw.points), 3), ORANGE, np.uint8)
-        if name == "static" and len(raw.points):
-            z = raw.points[:, 2]
-            colors = color_by_height(z, *np.quantile(z, [0.02, 0.98]).tolist())
-    elif name == "dynamic":  # uncolored points; grey would look static
-        colors[(colors == GRAY).all(axis=1)] = ORANGE
-    return Points((raw.points - origin).astype(np.float32), colors, raw.total)
 
 
 def _ground(static: Points | None, poses: Float) -> float:

@@ -6,6 +6,7 @@ itself from requests to elsewhere.
 """
 
 import gzip
+import html
 import logging
 import os
 import re
@@ -50,25 +51,41 @@ def content_security_policy(host: str) -> str:
 
 # viser applies ACES filmic tone mapping to meshes, which darkens photographs, and has no option for
 # it; three.js switches it on by a macro in each shader
-_DISABLE_TONE_MAPPING = b"""<script>{
+_DISABLE_TONE_MAPPING = """
   const drawing = WebGL2RenderingContext.prototype, plain = drawing.shaderSource;
   drawing.shaderSource = function (shader, text) {
     plain.call(this, shader, text.replace("#define TONE_MAPPING", ""));
-  };
-}</script>"""
+  };"""
+
+# viser's hotkeys listen at the root element; its camera listens above, turns at the arrow keys, and
+# has no option for it. A control that keeps the focus after a click would take the keys: Space
+# would press it once more.
+_FREE_KEYS = """
+  document.documentElement.addEventListener("keydown", event => {
+    if (["ArrowLeft", "ArrowRight"].includes(event.code)) event.stopPropagation();
+  });
+  addEventListener("click", event => {
+    const control = document.activeElement;
+    if (event.detail && control.matches("button, [type=checkbox], [role=slider]")) control.blur();
+  });"""
+
+_SCRIPT = f"<script>{{{_DISABLE_TONE_MAPPING}{_FREE_KEYS}\n}}</script>".encode()
+_TITLE = b"<title>Viser</title>"
 
 
-def disable_tone_mapping(response: Any) -> None:
-    """Insert the script into viser's page, in place; other responses stay unchanged.
+def adapt_page(response: Any, title: str) -> None:
+    """Insert the script and the title into viser's page, in place; other responses stay unchanged.
 
     Args:
         response: of `websockets`, with `headers` and `body`.
+        title: plain text.
     """
     if not response.headers.get("Content-Type", "").startswith("text/html"):
         return
     packed = response.headers.get("Content-Encoding") == "gzip"
     body = gzip.decompress(response.body) if packed else response.body
-    body = body.replace(b"<head>", b"<head>" + _DISABLE_TONE_MAPPING, 1)
+    body = body.replace(b"<head>", b"<head>" + _SCRIPT, 1)
+    body = body.replace(_TITLE, f"<title>{html.escape(title)}</title>".encode(), 1)
     response.body = gzip.compress(body, 6) if packed else body
     del response.headers["Content-Length"]
     response.headers["Content-Length"] = str(len(response.body))
@@ -85,8 +102,12 @@ class Server(viser.ViserServer):
         return None
 
 
-def start_server(port: int) -> Server:
-    """Start a server at a port of 127.0.0.1; 0: any free one.
+def start_server(port: int, title: str) -> Server:
+    """Start a server at a port of 127.0.0.1.
+
+    Args:
+        port: 0: any free one.
+        title: of the page, plain text.
 
     Raises:
         InputError: the port is taken.
@@ -95,7 +116,7 @@ def start_server(port: int) -> Server:
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     port_override = os.environ.pop(_PORT_VARIABLE, None)
     try:
-        with _quiet_console(), _guard_servers() as ports:
+        with _quiet_console(), _guard_servers(title) as ports:
             server = Server(HOST, port, label="stillmap", verbose=False)
     finally:
         if port_override is not None:
@@ -128,7 +149,7 @@ def _quiet_console() -> Iterator[None]:
 
 
 @contextmanager
-def _guard_servers() -> Iterator[list[int]]:
+def _guard_servers(title: str) -> Iterator[list[int]]:
     """Within the context, new servers check requests and send the policy; yields their ports."""
     module, ports = websockets.asyncio.server, list[int]()
     original = module.serve
@@ -141,7 +162,7 @@ def _guard_servers() -> Iterator[list[int]]:
                 return connection.respond(HTTPStatus.FORBIDDEN, "not from this page\n")
             response = process_request(connection, request)
             if response is not None:
-                disable_tone_mapping(response)
+                adapt_page(response, title)
                 response.headers["Content-Security-Policy"] = content_security_policy(
                     request.headers["Host"]
                 )

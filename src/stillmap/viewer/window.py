@@ -1,75 +1,41 @@
-"""The page of a result: default view, controls and playback."""
+"""The page of a result: its controls, and what happens when they are used."""
 
 import math
 import re
 import time
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from functools import partial
+from queue import Empty, SimpleQueue
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillmap.viewer.beams import Beams
 from stillmap.viewer.layers import Layers
+from stillmap.viewer.legend import help_html, legend_html, table_html
+from stillmap.viewer.legend_panels import LegendPanels
+from stillmap.viewer.nodes import Nodes
+from stillmap.viewer.objects import ObjectNodes
+from stillmap.viewer.picking import Ray
+from stillmap.viewer.ruler import Ruler, format_length
 from stillmap.viewer.scene import Scene
 from stillmap.viewer.server import start_server, stop_server
-from stillmap.viewer.tracks import Beams
+from stillmap.viewer.shortcuts import LAYER_KEYS, add_shortcuts
+from stillmap.viewer.tracks import describe_object
+from stillmap.viewer.view import FIELD_OF_VIEW, MIN_ASPECT, default_view
 
-FIELD_OF_VIEW = math.radians(60.0)  # vertical
-_MIN_ASPECT = 1.1  # width / height of the window beside the controls
-_MARGIN = 1.1
-_EXTENT_QUANTILES = (0.03, 0.97)  # of the points, without far outliers
-_DIRECTION_3D = np.array([-0.45, -0.7, 0.62])  # from the scene to the camera
-_SCALE_3D = 0.95  # of the height: what lies behind the center appears smaller
-_MIN_EXTENT = 5.0  # m
 _FRAME_TIME = 0.1  # s between updates while playing
 _IDLE_TIME = 0.05  # s between polls of the controls
 _SPEEDS = {"1 x": 1.0, "3 x": 3.0, "10 x": 10.0, "30 x": 30.0, "100 x": 100.0}
+_CLICK_RADIUS = 0.01  # of a click on a point, as a share of the height of the view
 _MARKDOWN = re.compile(r"([\\`*_{}\[\]()<>#+\-.!|~&$:])")  # special characters
-
-
-class DefaultView(NamedTuple):
-    """The initial camera.
-
-    Attributes:
-        position, look_at: (3,) m relative to the scene's origin.
-        height: height of the view in m at `look_at`.
-        far: distance of the far plane in m.
-    """
-
-    position: NDArray[np.float64]
-    look_at: NDArray[np.float64]
-    height: float
-    far: float
-
-
-def default_view(scene: Scene) -> DefaultView:
-    """The camera that shows the whole scene: 2D from above, north up; 3D at a slant."""
-    low, high = _bounds(scene)
-    center, (width, height) = 0.5 * (low + high), np.maximum(high - low, _MIN_EXTENT)[:2]
-    shown = _MARGIN * max(height, width / _MIN_ASPECT) * (1.0 if scene.is_2d else _SCALE_3D)
-    distance = 0.5 * shown / math.tan(0.5 * FIELD_OF_VIEW)
-    if scene.is_2d:
-        # not exactly vertical, which would leave the direction of north undefined
-        offset = np.array([0.0, -0.01, 1.0]) * distance
-    else:
-        offset = _DIRECTION_3D / np.linalg.norm(_DIRECTION_3D) * distance
-    return DefaultView(center + offset, center, shown, 20.0 * distance)
-
-
-def _bounds(scene: Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lower and upper corner (3,) of the visible content in m, relative to the scene's origin."""
-    static = scene.clouds.get("static")
-    if static is not None and len(static.points):
-        low, high = np.quantile(static.points.astype(np.float64), _EXTENT_QUANTILES, axis=0)
-        return low, high
-    positions = scene.poses[:, :3, 3] - scene.origin
-    if scene.map_image is None:
-        return np.asarray(positions.min(axis=0)), np.asarray(positions.max(axis=0))
-    x0, y0, x1, y1 = scene.map_image.window
-    return np.array([x0, y0, 0.0]) - scene.origin, np.array([x1, y1, 0.0]) - scene.origin
+_MEASURE, _STOP = "Measure", "Stop measuring"
 
 
 class Window:
     """A scene on a page; the caller calls `step` in a loop.
+
+    Callbacks of viser run in its threads: they only queue what `step` then does.
 
     Attributes:
         scan: index of the scan that is shown.
@@ -81,13 +47,22 @@ class Window:
         Raises:
             InputError: the port is taken.
         """
-        self._scene = scene
+        self._scene, self._view = scene, default_view(scene)
         self._seconds = 1e-9 * (scene.stamp_ns - scene.stamp_ns[0])
         self.scan, self._at, self._playing, self._ticked = 0, 0.0, False, time.monotonic()
-        self._server = start_server(port)
+        self._measuring = False
+        self._events: SimpleQueue[Callable[[], None]] = SimpleQueue()
+        self._server = start_server(port, f"{scene.name} - stillmap")
         try:
-            self._layers = Layers(self._server, scene, beams, self._set_default_view())
-            self._controls()
+            camera = self._server.initial_camera
+            camera.fov, camera.far, camera.near = FIELD_OF_VIEW, self._view.far, self._view.near
+            camera.position, camera.look_at = self._view.position, self._view.look_at
+            nodes = Nodes(self._server, scene, self._view.height)
+            self._objects = ObjectNodes(nodes, self._click_object)
+            self._layers, self._ruler = Layers(nodes, beams, self._objects), Ruler(nodes)
+            self._legends = LegendPanels(self._server)
+            self._add_controls()
+            add_shortcuts(self._server.gui, self._actions())
             self.show(0)
         except BaseException:
             self.close()
@@ -109,11 +84,12 @@ class Window:
             self._slider.value = scan
             self._clock.value = f"{self._seconds[scan]:.1f} of {self._seconds[-1]:.1f} s"
             self._layers.update(scan)
+            self._show_facts()
 
     def play(self, playing: bool) -> None:
         """Start or pause the playback."""
-        self._playing = playing
-        self._button.label = "Pause" if playing else "Play"
+        self._playing, self._ticked = playing and len(self._seconds) > 1, time.monotonic()
+        self._button.label = "Pause" if self._playing else "Play"
 
     def step(self) -> None:
         """Wait for a moment, then apply the controls and advance the playback.
@@ -122,6 +98,7 @@ class Window:
             InputError: the recording can no longer be read.
         """
         time.sleep(_FRAME_TIME if self._playing else _IDLE_TIME)
+        self._handle_events()
         now = time.monotonic()
         passed, self._ticked = now - self._ticked, now
         wanted = int(self._slider.value)
@@ -136,6 +113,10 @@ class Window:
                 note.visible = self._boxes[name].value
         if wanted != self.scan or any(changed):
             self.show(wanted)
+        legend = legend_html(self._layers, self._coloring.value, self._scene.is_2d)
+        for client in self._legends.update(legend):
+            if client.camera.aspect < MIN_ASPECT:  # on a phone
+                self._set_camera(client)
 
     def _advance(self, passed: float) -> int:
         """The scan after `passed` s of playback; the first one after the last."""
@@ -144,32 +125,157 @@ class Window:
             self._at = 0.0
         return int(np.searchsorted(self._seconds, self._at, side="right")) - 1
 
-    def _set_default_view(self) -> float:
-        """Place the camera; returns the height of the view in m."""
-        view, camera = default_view(self._scene), self._server.initial_camera
-        camera.fov, camera.far, camera.near = FIELD_OF_VIEW, view.far, 1e-4 * view.far
-        camera.position, camera.look_at = view.position, view.look_at
-        return view.height
+    def _handle_events(self) -> None:
+        while True:
+            try:
+                event = self._events.get_nowait()
+            except Empty:
+                return
+            event()
 
-    def _controls(self) -> None:
-        gui, last = self._server.gui, len(self._seconds) - 1
-        gui.add_markdown(f"**{_escape_markdown(self._scene.name)}**")
+    def _queued(self, act: Callable[[], None]) -> Callable[..., None]:
+        """A callback for viser that lets `step` act."""
+        return lambda *_event: self._events.put(act)
+
+    def _actions(self) -> dict[str, Callable[[], None]]:
+        """What keys do, by name of the action or layer."""
+        last = len(self._seconds) - 1
+        actions: dict[str, Callable[[], None]] = {
+            "Play or pause": lambda: self.play(not self._playing),
+            # not from `scan`: keys may be pressed faster than scans are shown
+            "Next scan": lambda: self._go_to(int(self._slider.value) + 1),
+            "Previous scan": lambda: self._go_to(int(self._slider.value) - 1),
+            "First scan": lambda: self._go_to(0),
+            "Last scan": lambda: self._go_to(last),
+            "Measure": lambda: self._measure(not self._measuring),
+            "Clear": self._clear,
+            "Default view": self._reset_cameras,
+            "Legend": self._legends.toggle,
+        }
+        for name, box in self._boxes.items():
+            actions[name] = partial(_toggle, box)
+        return {name: self._queued(act) for name, act in actions.items()}
+
+    def _go_to(self, scan: int) -> None:
+        """Pause at the scan that is nearest to an index."""
+        self.play(False)
+        self._slider.value = min(max(scan, 0), len(self._seconds) - 1)
+
+    def _reset_cameras(self) -> None:
+        for client in self._server.get_clients().values():
+            self._set_camera(client)
+
+    def _set_camera(self, client: Any) -> None:
+        """Show a page the default view."""
+        with client.atomic():
+            client.camera.up_direction = np.array([0.0, 0.0, 1.0])
+            client.camera.position = self._view.position_for(client.camera.aspect)
+            client.camera.look_at = self._view.look_at
+
+    def _measure(self, measuring: bool) -> None:
+        """Start or stop measuring: while it lasts, clicks are points, not objects."""
+        if measuring and not self._measuring:
+            self._server.scene.on_click()(self._click_point)
+        elif self._measuring and not measuring:
+            self._server.scene.remove_click_callback(self._click_point)
+        self._measuring = measuring
+        self._measure_button.label = _STOP if measuring else _MEASURE
+        self._show_distances()
+
+    def _click_point(self, event: Any) -> None:
+        """Called by viser."""
+        ray = Ray(np.array(event.ray_origin), np.array(event.ray_direction))
+        tangent = _CLICK_RADIUS * 2.0 * math.tan(0.5 * float(event.client.camera.fov))
+        self._events.put(lambda: self._add_point(ray, tangent))
+
+    def _add_point(self, ray: Ray, tangent: float) -> None:
+        point = self._layers.pick(ray, tangent)
+        if point is None:
+            self._show_distances("There is no point there.")
+        elif self._measuring:
+            self._ruler.add(point)
+            self._show_distances()
+
+    def _show_distances(self, message: str = "") -> None:
+        lines = [format_length(length) for length in self._ruler.distances]
+        if self._measuring:
+            wanted = ("first", "second")[len(self._ruler.points) % 2]
+            message = f"{message} Click on the {wanted} point.".strip()
+        lines += [message] if message else []
+        self._distances.content = "  \n".join(_escape_markdown(line) for line in lines)
+        self._distances.visible = bool(lines)
+        self._clear_button.visible = bool(self._ruler.points)
+
+    def _click_object(self, number: int) -> None:
+        """Called by viser."""
+        self._events.put(lambda: self._select(number))
+
+    def _select(self, number: int | None) -> None:
+        """Show the facts of an object; None: of none."""
+        if not self._measuring:
+            self._objects.selected = number
+            self.show(self.scan)
+
+    def _show_facts(self) -> None:
+        found = [one for one in self._scene.tracks if one.id == self._objects.selected]
+        self._facts_folder.visible = bool(found)
+        for track in found:
+            now, start = (int(self._scene.stamp_ns[n]) for n in (self.scan, 0))
+            self._facts_folder.label = f"Object {track.id}"
+            self._facts.content = table_html(describe_object(track, now, start))
+
+    def _clear(self) -> None:
+        """Remove what was measured and selected."""
+        self._ruler.clear()
+        self._measure(False)
+        self._select(None)
+
+    def _add_controls(self) -> None:
+        gui, last, scene = self._server.gui, len(self._seconds) - 1, self._scene
+        gui.set_panel_label("stillmap")
+        name, folder = _escape_markdown(scene.name), _escape_markdown(scene.folder)
+        gui.add_markdown(f"**{name}**" if name == folder else f"**{name}**, result {folder}")
         # Any: viser's types do not allow setting values
         self._slider: Any = gui.add_slider("Scan", 0, max(last, 1), 1, 0, disabled=not last)
         self._clock: Any = gui.add_text("Time", "", disabled=True)
         self._speed = gui.add_dropdown("Speed", tuple(_SPEEDS))
         self._button = gui.add_button("Play", disabled=not last)
-        self._button.on_click(lambda _event: self.play(not self._playing))
-        visible = self._layers.default_visibility
+        self._button.on_click(self._queued(lambda: self.play(not self._playing)))
+        self._measure_button = gui.add_button(_MEASURE)
+        self._measure_button.on_click(self._queued(lambda: self._measure(not self._measuring)))
+        self._distances: Any = gui.add_markdown("", visible=False)
+        self._clear_button = gui.add_button("Clear", visible=False)
+        self._clear_button.on_click(self._queued(self._clear))
+        self._facts_folder: Any = gui.add_folder("Object", visible=False)
+        with self._facts_folder:
+            self._facts: Any = gui.add_html("")
+            gui.add_button("Close").on_click(self._queued(lambda: self._select(None)))
+        self._add_layer_controls()
+        for note in scene.notes:
+            gui.add_markdown(_escape_markdown(note))
+        gui.add_html(help_html())
+
+    def _add_layer_controls(self) -> None:
+        gui, visible = self._server.gui, self._layers.default_visibility
         with gui.add_folder("Show"):
-            self._boxes = {name: gui.add_checkbox(name, shown) for name, shown in visible.items()}
+            self._boxes: dict[str, Any] = {
+                name: gui.add_checkbox(name, shown, hint=f"key {LAYER_KEYS[name]}")
+                for name, shown in visible.items()
+            }
+            colorings = self._layers.colorings
+            self._coloring = gui.add_dropdown("Points by", colorings, visible=len(colorings) > 1)
+            self._coloring.on_update(
+                self._queued(lambda: self._layers.color_points(self._coloring.value))
+            )
             self._size = gui.add_slider("Point size", 0.5, 5.0, 0.5, 1.0)
         self._notes = {
             name: gui.add_markdown(_escape_markdown(note), visible=visible[name])
             for name, note in self._layers.notes.items()
         }
-        for note in self._scene.notes:
-            gui.add_markdown(_escape_markdown(note))
+
+
+def _toggle(box: Any) -> None:
+    box.value = not box.value
 
 
 def _escape_markdown(text: str) -> str:

@@ -1,0 +1,57 @@
+"""Keyboard shortcuts, as commands of viser's palette, and the line that lists them."""
+
+from collections.abc import Callable
+from typing import Any
+
+# W, A, S, D, Q, E and the vertical arrows move viser's camera
+LAYER_KEYS = {
+    "Map": "1",
+    "Surface": "2",
+    "Static points": "3",
+    "Dynamic points": "4",
+    "Robot": "5",
+    "Beams": "6",
+    "Rays": "7",
+    "Objects": "8",
+    "Object tracks": "9",
+    "Object models": "0",
+    "Object numbers": "N",
+}
+_ACTION_KEYS = {
+    "Play or pause": "space",
+    "Next scan": "arrowright",
+    "Previous scan": "arrowleft",
+    "First scan": "home",
+    "Last scan": "end",
+    "Measure": "M",
+    "Clear": "escape",
+    "Default view": "V",
+    "Legend": "L",
+}
+# for the line that lists them
+KEYS = (
+    ("Space", "play or pause"),
+    ("← →", "one scan"),
+    ("Home End", "first, last scan"),
+    ("1 to 0, N", "layers in this order"),
+    ("M", "measure"),
+    ("Esc", "clear"),
+    ("V", "default view"),
+    ("L", "legend"),
+    ("W A S D Q E, ↑ ↓", "move the camera"),
+    ("Ctrl K", "all commands"),
+)
+
+
+def add_shortcuts(gui: Any, actions: dict[str, Callable[[], None]]) -> None:
+    """Register what keys do.
+
+    Args:
+        gui: of the server.
+        actions: by name of the action or layer; called in a thread of viser.
+    """
+    keys = {**_ACTION_KEYS, **LAYER_KEYS}
+    for name, act in actions.items():
+        label = name if name in _ACTION_KEYS else f"Show or hide: {name.lower()}"
+        command = gui.add_command(label, hotkey=keys[name])
+        command.on_trigger(lambda _event, act=act: act())

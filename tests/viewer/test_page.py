@@ -1,0 +1,147 @@
+"""The page that the viewer serves, and to whom."""
+
+import gzip
+import re
+import socket
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+from stillmap.core.errors import InputError
+from stillmap.viewer.scene import read_scene
+
+viser = pytest.importorskip("viser", reason="the extra `viewer` is not installed")
+sockets = pytest.importorskip("websockets.sync.client")
+
+from stillmap.viewer import server as module  # noqa: E402
+from stillmap.viewer.window import Window  # noqa: E402
+
+
+def port_of(window):
+    return int(window.url.rpartition(":")[2])
+
+
+def get(window, path="/", **headers):
+    request = urllib.request.Request(window.url + path, headers=headers)
+    return urllib.request.urlopen(request, timeout=10)
+
+
+def test_page_is_served_with_its_policy(window):
+    with get(window) as page:
+        assert page.status == 200
+        assert b"<html" in page.read()
+        policy = page.headers["Content-Security-Policy"]
+    assert f"connect-src 'self' data: blob: ws://127.0.0.1:{port_of(window)};" in policy
+
+
+@pytest.mark.parametrize(
+    "headers", [{"Host": "example.org"}, {"Origin": "https://example.org"}, {"Origin": "null"}]
+)
+def test_foreign_page_is_refused(window, headers):
+    with pytest.raises(urllib.error.HTTPError) as caught:
+        get(window, **headers)
+    with caught.value:
+        assert caught.value.code == 403
+
+
+@pytest.mark.parametrize("packed", ["gzip", "identity"])
+def test_page_has_its_script_and_its_title(window, packed):
+    """It is what viser has otherwise; the script comes before all of viser's."""
+    with get(window, **{"Accept-Encoding": packed}) as answer:
+        page, headers = answer.read(), answer.headers
+    assert int(headers["Content-Length"]) == len(page)
+    assert headers["Content-Encoding"] == packed
+    page = gzip.decompress(page) if packed == "gzip" else page
+    first = page[page.index(b"<script") : page.index(b"</script>")]
+    assert b"TONE_MAPPING" in first
+    title = b"<title>walk.bag - stillmap</title>"
+    assert page.count(b"<title>") == page.count(title) == 1
+    plain = (Path(viser.__file__).parent / "client/build/index.html").read_bytes()
+    same = page.replace(first + b"</script>", b"").replace(title, b"<title>Viser</title>")
+    assert same == plain
+
+
+def test_title_is_escaped(result_of, opened):
+    window = opened(read_scene(result_of(2), "a<b>&.log"), None)
+    with get(window) as answer:
+        found = re.search(rb"<title>(.*?)</title>", answer.read())
+    assert found[1] == b"a&lt;b&gt;&amp;.log - stillmap"
+
+
+def test_socket_answers_only_its_page(window):
+    address, protocol = f"ws://127.0.0.1:{port_of(window)}", [f"viser-v{viser.__version__}"]
+    with sockets.connect(address, subprotocols=protocol, origin=window.url) as socket_:
+        assert len(socket_.recv(timeout=10)) > 0
+    with pytest.raises(Exception, match="403"):
+        sockets.connect(address, subprotocols=protocol, origin="https://example.org")
+
+
+def test_only_loopback_answers(window):
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as one:
+        # another address of loopback, which stands for those of the network
+        assert one.connect_ex(("127.0.0.2", port_of(window))) != 0
+    for family, *_, address in socket.getaddrinfo(socket.gethostname(), port_of(window)):
+        if family == socket.AF_INET and not address[0].startswith("127."):
+            with socket.socket(family, socket.SOCK_STREAM) as one:
+                one.settimeout(2)
+                assert one.connect_ex(address) != 0
+
+
+def test_no_share_url_is_requested(window, monkeypatch):
+    def refused(*_words, **_more):
+        raise AssertionError("a tunnel")
+
+    monkeypatch.setattr("viser._viser.ViserTunnel", refused)
+    assert window._server.request_share_url() is None
+
+
+def test_close_stops_the_server(result_of):
+    window = Window(read_scene(result_of(2)), None)
+    window.close()
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as one:
+        assert one.connect_ex(("127.0.0.1", port_of(window))) != 0
+
+
+def test_nothing_is_printed(result_of, capfd):
+    window = Window(read_scene(result_of(2)), None)
+    window.close()
+    assert capfd.readouterr() == ("", "")
+
+
+def test_malformed_requests_are_not_logged(window, capfd):
+    for what in (b"nonsense\r\n\r\n", b"GET / HTTP/1.1\r\n\r\n", b""):
+        with socket.create_connection(("127.0.0.1", port_of(window)), timeout=10) as one:
+            one.sendall(what)
+            one.shutdown(socket.SHUT_WR)
+            while one.recv(4096):
+                pass
+    with get(window) as page:
+        assert page.status == 200
+    assert capfd.readouterr() == ("", "")
+
+
+def test_taken_port_is_refused(window, result_of):
+    with pytest.raises(InputError, match="is taken"):
+        Window(read_scene(result_of(2)), None, port_of(window))
+
+
+def test_free_port_is_used(result_of, opened):
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as one:
+        one.bind(("127.0.0.1", 0))
+        port = one.getsockname()[1]
+    assert port_of(opened(read_scene(result_of(2)), None, port)) == port
+
+
+def test_unknown_viser_is_refused(result_of, monkeypatch):
+    """Where its server starts otherwise than we know, it would answer anybody."""
+    from contextlib import contextmanager
+
+    @contextmanager
+    def nothing(_title):
+        yield []
+
+    monkeypatch.setattr(module, "_guard_servers", nothing)
+    with pytest.raises(RuntimeError, match="viser"):
+        Window(read_scene(result_of(2)), None)
