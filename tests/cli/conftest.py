@@ -127,6 +127,15 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def mapped(stillmap: Run, room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The result of mapping the room."""
+    out = tmp_path_factory.mktemp("mapped") / "out"
+    done = stillmap("map", room, "-o", out, "--set", "em.max_iterations=2", "--quiet")
+    assert done.returncode == 0, done.stderr
+    return out
+
+
+@pytest.fixture(scope="session")
 def hall(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same with 1000 scans of 360 beams: an iteration takes long enough to be stopped in."""
     path = tmp_path_factory.mktemp("recording") / "hall"

@@ -15,15 +15,6 @@ from stillmap.io import read, stillmap_folder
 from stillmap.io.trajectory import read_tum
 
 
-@pytest.fixture(scope="module")
-def mapped(stillmap, room, tmp_path_factory):
-    """The result of mapping the room."""
-    out = tmp_path_factory.mktemp("converted") / "out"
-    done = stillmap("map", room, "-o", out, "--set", "em.max_iterations=2", "--quiet")
-    assert done.returncode == 0, done.stderr
-    return out
-
-
 def topics_of(path):
     with AnyReader([path], default_typestore=get_typestore(Stores.EMPTY)) as reader:
         return {c.topic: c.msgcount for c in reader.connections}

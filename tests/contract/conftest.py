@@ -10,7 +10,7 @@ from stillmap.core.recording import Recording
 from stillmap.io import stillmap_folder
 from stillmap.sim import scene_by_name, simulate, write_simulation
 
-# for opening_models.py here, and made_up_rooms.py
+# for opening_models.py and map_server_rules.py here, and made_up_rooms.py
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1] / "mesh" / "texture")]
 
 

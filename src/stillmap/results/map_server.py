@@ -1,22 +1,20 @@
-"""`map.pgm` or `map.png` with `map.yaml`, as map_server and nav2 read them."""
+"""Maps and masks of costmap filters, as map_server and nav2 read them: image and YAML file."""
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 import yaml
 from numpy.typing import NDArray
 from PIL import Image
 
+from stillmap.core.grid_map import GridMap
 from stillmap.core.tiles import Layer, rows_of
 from stillmap.pipeline.options import MapMode
 from stillmap.results.reader import FREE_THRESH, OCCUPIED_THRESH
 
-if TYPE_CHECKING:
-    from stillmap.em import OccupancyMap
-
-ToPixels = Callable[[NDArray[np.float32]], NDArray[np.uint8]]
+ToPixels = Callable[[NDArray[Any]], NDArray[np.uint8]]
 
 _OCCUPIED, _UNKNOWN, _FREE = 0, 205, 254
 
@@ -54,7 +52,7 @@ def raw_pixels(p_occupied: NDArray[np.float32]) -> NDArray[np.uint8]:
     return np.where(known, np.rint(100 * np.where(known, p_occupied, 0)), 255).astype(np.uint8)
 
 
-def write_map_server(folder: Path, occupancy: "OccupancyMap", mode: MapMode = "trinary") -> None:
+def write_map_server(folder: Path, occupancy: GridMap, mode: MapMode = "trinary") -> None:
     """Write `map.pgm` (`map.png` in scale mode) and `map.yaml` into `folder`.
 
     The picture's top row is the map's highest y; the origin is the lower-left pixel's pose.
@@ -67,27 +65,67 @@ def write_map_server(folder: Path, occupancy: "OccupancyMap", mode: MapMode = "t
         Image.fromarray(scale_pixels(np.asarray(p_occupied)[::-1])).save(folder / name)
     else:
         _write_pgm(folder / name, p_occupied, trinary_pixels if mode == "trinary" else raw_pixels)
+    _write_yaml(folder / "map.yaml", name, mode, occupancy, (FREE_THRESH, OCCUPIED_THRESH))
+
+
+def write_keepout_mask(folder: Path, keepout: NDArray[np.bool_], occupancy: GridMap) -> None:
+    """Write `keepout.pgm` and `keepout.yaml`, a mask for nav2's KeepoutFilter.
+
+    A map server reads 100 where `keepout` (H, W) is true. Elsewhere it reads 0 where the map knows
+    the cell and -1 where it does not: 0 would make unknown cells of a costmap free.
+    """
+    known = ~np.isnan(np.asarray(occupancy.p_occupied))
+    pixels = np.where(keepout, _OCCUPIED, np.where(known, _FREE, _UNKNOWN)).astype(np.uint8)
+    _write_pgm(folder / "keepout.pgm", pixels, _unchanged)
+    thresholds = FREE_THRESH, OCCUPIED_THRESH
+    _write_yaml(folder / "keepout.yaml", "keepout.pgm", "trinary", occupancy, thresholds)
+
+
+def write_speed_mask(folder: Path, values: NDArray[np.uint8], occupancy: GridMap) -> None:
+    """Write `speed.pgm` and `speed.yaml`, a mask for nav2's SpeedFilter.
+
+    A map server reads the values (H, W), 0 (no limit) to 100: in scale mode without thresholds,
+    darker is larger, and a grey level is finer than a step of the values.
+    """
+    pixels = np.rint(255 * (1 - np.arange(101) / 100)).astype(np.uint8)[values]
+    _write_pgm(folder / "speed.pgm", pixels, _unchanged)
+    _write_yaml(folder / "speed.yaml", "speed.pgm", "scale", occupancy, (0.0, 1.0))
+
+
+def _unchanged(pixels: NDArray[Any]) -> NDArray[np.uint8]:
+    return pixels
+
+
+def _write_yaml(
+    path: Path, image: str, mode: MapMode, occupancy: GridMap, thresholds: tuple[float, float]
+) -> None:
+    """Write the description of an image of a map; thresholds: of free and of occupied cells."""
+    free, occupied = thresholds
     described = {
-        "image": name,
+        "image": image,
         "mode": mode,
-        "resolution": float(occupancy.resolution),
-        # a multiple of the cell's edge is written as one
-        "origin": [round(float(value), 9) for value in occupancy.origin],
+        "resolution": _clean(occupancy.resolution),
+        "origin": [_clean(value) for value in occupancy.origin],
         "negate": 0,
-        "occupied_thresh": OCCUPIED_THRESH,
-        "free_thresh": FREE_THRESH,
+        "occupied_thresh": occupied,
+        "free_thresh": free,
     }
     text = yaml.safe_dump(described, sort_keys=False, default_flow_style=None)
-    (folder / "map.yaml").write_text(text, encoding="utf-8")
+    path.write_text(text, encoding="utf-8")
 
 
-def _write_pgm(path: Path, p_occupied: Layer, to_pixels: ToPixels) -> None:
+def _clean(value: float) -> float:
+    """Without rounding errors: a multiple of the cell's edge is written as one, and never -0."""
+    return round(float(value), 9) + 0.0
+
+
+def _write_pgm(path: Path, layer: Layer, to_pixels: ToPixels) -> None:
     """Write a picture strip by strip: the map's row 0 is its lowest y, the picture's its top."""
-    height, width = p_occupied.shape
+    height, width = layer.shape
     with path.open("wb") as file:
         file.write(b"P5\n%d %d\n255\n" % (width, height))
         end = file.tell() + height * width
-        for rows in rows_of(p_occupied):  # from the bottom up
+        for rows in rows_of(layer):  # from the bottom up
             end -= rows.size
             file.seek(end)
             file.write(to_pixels(rows[::-1]).tobytes())

@@ -3,7 +3,7 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from stillmap.core.short_repr import ShortRepr
 from stillmap.results.labels import shape_text
 
 Float = NDArray[np.float64]
+Origin = tuple[float, float, float]
 
 
 # of map_server and nav2: what reads the map sees it as they load it
@@ -81,14 +82,57 @@ def read_grid(result: Path) -> Grid:
         InputError: it is missing or damaged.
     """
     path = result / "map.npz"
+    p_occupied, origin, resolution = _read_layer(path, "p_occupied")
+    if p_occupied.ndim != 2 or p_occupied.dtype.kind != "f":
+        raise InputError(
+            f"p_occupied is {shape_text(p_occupied.shape)} {p_occupied.dtype}",
+            where=str(path),
+            hint="scores are for maps in the plane",
+        )
+    return Grid(p_occupied, origin, resolution)
+
+
+class Crossings(NamedTuple):
+    """How often each square of the floor was crossed.
+
+    Attributes:
+        number: (H, W) integers; row 0 has the lowest y.
+        origin: x, y (m) and yaw of the lower-left corner of the lower-left square.
+        resolution: m, edge of a square.
+    """
+
+    number: NDArray[np.integer[Any]]
+    origin: Origin
+    resolution: float
+
+
+def read_crossings(result: Path) -> Crossings:
+    """The crossings in `traffic.npz` of a result folder.
+
+    Raises:
+        InputError: it is missing or damaged.
+    """
+    path = result / "traffic.npz"
+    if not path.exists():
+        hint = "`stillmap map` writes it with objects.enabled=true"
+        raise InputError("does not exist: no crossings were counted", where=str(path), hint=hint)
+    crossings = Crossings(*_read_layer(path, "crossings"))
+    number = crossings.number
+    if number.ndim != 2 or number.dtype.kind not in "iu":
+        raise InputError(f"crossings is {shape_text(number.shape)} {number.dtype}", where=str(path))
+    return crossings
+
+
+def _read_layer(path: Path, name: str) -> tuple[NDArray[Any], Origin, float]:
+    """A layer of a map, the origin (x, y, yaw) of its lower-left corner, and its resolution."""
     require_regular(path)
     try:
         # opened here: given a path, np.load leaves a damaged archive open
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            size = archive.zip.getinfo("p_occupied.npy").file_size
+            size = archive.zip.getinfo(f"{name}.npy").file_size
             if size > _MAX_MAP:
                 raise InputError(f"is too large: {size >> 20} MiB when unpacked", where=str(path))
-            p_occupied = np.asarray(archive["p_occupied"])
+            layer = np.asarray(archive[name])
             x, y, yaw = (float(value) for value in archive["origin"])
             resolution = float(archive["resolution"])
     except InputError:
@@ -97,15 +141,9 @@ def read_grid(result: Path) -> Grid:
         raise InputError(f"cannot be read: {error.strerror or error}", where=str(path)) from error
     except Exception as error:  # whatever NumPy, zip and zlib make of damaged bytes
         raise InputError(f"is damaged: {error}", where=str(path)) from error
-    if p_occupied.ndim != 2 or p_occupied.dtype.kind != "f":
-        raise InputError(
-            f"p_occupied is {shape_text(p_occupied.shape)} {p_occupied.dtype}",
-            where=str(path),
-            hint="scores are for maps in the plane",
-        )
     if not (np.isfinite((x, y, yaw)).all() and 0 < resolution < np.inf):
         raise InputError("origin or resolution is no usable number", where=str(path))
-    return Grid(p_occupied, (x, y, yaw), resolution)
+    return layer, (x, y, yaw), resolution
 
 
 def moved(T: Float, points: Float) -> Float:

@@ -1,0 +1,209 @@
+"""Results for other programs: bags, tables, point clouds, models, maps and masks for nav2."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, get_args
+
+from stillmap.cli.arguments import read_changes, require_apart
+from stillmap.cli.console import show_share
+from stillmap.core.errors import InputError
+
+if TYPE_CHECKING:
+    from stillmap.results.export import nav2, point_cloud, point_cloud_files
+    from stillmap.results.folder import Exported, ResultFolder
+
+# a copy for the help: the module that defines them takes long to load
+CLOUDS = (".las", ".laz", ".e57", ".pcd", ".ply", ".xyz")
+NAV2 = "nav2"  # the format of maps and masks
+_PARQUET = ".parquet"
+
+
+def add_zone_flags(p: argparse.ArgumentParser) -> None:
+    """Add the flags for maps and masks."""
+    group = p.add_argument_group(
+        "maps and masks of a result for nav2, in a folder (docs/how-to/nav2-masks.md)"
+    )
+    group.add_argument(
+        "--mask",
+        metavar="FILE.geojson",
+        help="polygons in metres in the map frame, each with an action: erase, block, keepout, "
+        "or speed",
+    )
+    group.add_argument(
+        "--keepout-crossings",
+        type=int,
+        metavar="N",
+        help="keep out of the squares of the floor that were crossed N times or more",
+    )
+    group.add_argument(
+        "--slow-crossings",
+        type=int,
+        metavar="N",
+        help="limit the speed in the squares that were crossed N times or more",
+    )
+    group.add_argument(
+        "--slow-to",
+        metavar="LIMIT",
+        help="to LIMIT in m/s, or in per cent of the robot's maximum (default: 50%%)",
+    )
+
+
+def given_zone_flags(args: argparse.Namespace) -> dict[str, object]:
+    """The flags for maps and masks that were given, with their values."""
+    names = ("mask", "keepout_crossings", "slow_crossings", "slow_to")
+    given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
+    return {f"--{name.replace('_', '-')}": value for name, value in given.items()}
+
+
+def convert_result(args: argparse.Namespace, source: Path, output: Path) -> tuple[list[str], str]:
+    """Write a result for other programs; return what was lost, and what was written."""
+    from stillmap.results.export import obj, point_cloud_files
+    from stillmap.results.folder import open_result
+
+    if read_changes(args):
+        text = "a result's recording is read as it was for the map: no flags for reading it"
+        raise InputError(text, where=str(source))
+    result = open_result(source, args.recording)
+    require_apart(output, result.source, source)
+    if args.to == NAV2 or given_zone_flags(args):
+        return _convert_to_nav2(args, result, output)
+    if (form := point_cloud_files.format_for(output, args.to)) is not None:
+        return [], _convert_to_cloud(args, result, output, form)
+    if args.only:
+        hint = ", ".join(CLOUDS)
+        raise InputError("--only is for clouds of points", where=str(output), hint=hint)
+    ending = output.suffix.lower() if args.to is None else None
+    if ending == obj.ENDING:
+        faces, pages = obj.write_obj(source, output, result.texture_quality, args.overwrite)
+        return [], f"{faces} faces and {pages} page{'s' * (pages != 1)} of texture"
+    if ending == _PARQUET:
+        return [], _convert_to_table(args, result, output)
+    return _convert_to_bag(args, result, output)
+
+
+def _convert_to_nav2(
+    args: argparse.Namespace, result: "ResultFolder", output: Path
+) -> tuple[list[str], str]:
+    from stillmap.core.files import require_new
+    from stillmap.results.export import nav2, zones
+    from stillmap.results.export.nav2_parameters import PARAMETERS
+    from stillmap.results.reader import read_crossings, read_grid
+
+    if args.to != NAV2 and (args.to or output.suffix):
+        flag = next(iter(given_zone_flags(args)))
+        hint = f"FILE is a folder; if it shall be called so, give --to {NAV2}"
+        raise InputError(f"{flag} is for maps and masks of nav2", where=str(output), hint=hint)
+    require_new(output, PARAMETERS, args.overwrite)
+    rule = _traffic_rule(args)
+    drawn = zones.read_zones(Path(args.mask)) if args.mask is not None else []
+    is_traffic = rule.keepout is not None or rule.slow is not None
+    crossings = read_crossings(result.folder) if is_traffic else None
+    maps = nav2.make_maps(read_grid(result.folder), drawn, rule, crossings)
+    nav2.write(maps, output, result.map_mode, overwrite=args.overwrite)
+    written = ["map"]
+    if maps.keepout is not None:
+        written.append(f"keep-out zones of {maps.keepout_area:.1f} m2")
+    if maps.speed is not None:
+        written.append(f"speed limits on {maps.slow_area:.1f} m2")
+    return maps.warnings, ", ".join(written)
+
+
+def _traffic_rule(args: argparse.Namespace) -> "nav2.TrafficRule":
+    from stillmap.results.export import nav2, zones
+
+    for flag, value in given_zone_flags(args).items():
+        if isinstance(value, int) and value < 1:
+            raise InputError(f"{flag} is a number of crossings, from 1 on, not {value}")
+    if args.slow_to is not None and args.slow_crossings is None:
+        raise InputError("--slow-to needs --slow-crossings")
+    limit = zones.parse_speed_limit("50%" if args.slow_to is None else args.slow_to, "--slow-to")
+    return nav2.TrafficRule(args.keepout_crossings, args.slow_crossings, limit)
+
+
+def _convert_to_table(args: argparse.Namespace, result: "ResultFolder", output: Path) -> str:
+    from stillmap.core.files import require_new_file
+    from stillmap.results.export import parquet
+
+    require_new_file(output, args.overwrite)
+    parquet.require_pyarrow()
+    exported = _read_result(args, result, output)
+    if exported.recording.dimension != 2:
+        raise InputError(
+            "is of a 3D recording: its points can be written, as a cloud",
+            where=str(result.folder),
+            hint=", ".join(CLOUDS),
+        )
+    parquet.write(exported, exported.deskew(), output)
+    return f"{exported.recording.n_beams} beams"
+
+
+def _convert_to_bag(
+    args: argparse.Namespace, result: "ResultFolder", output: Path
+) -> tuple[list[str], str]:
+    from stillmap.io import writers
+    from stillmap.io.ros.bag_types import BagKind
+    from stillmap.results.export import bag, obj
+
+    hint = f"a bag, .mcap for Foxglove, {_PARQUET}, or in 3D {', '.join(CLOUDS)}, {obj.ENDING}"
+    try:
+        writer = writers.find_writer(output, args.to)
+    except InputError as error:
+        raise InputError(error.what, where=str(output), hint=hint) from error
+    kind = next((kind for kind in get_args(BagKind) if kind == writer.name), None)
+    if kind is None:
+        text = f"a result cannot be written as {writer.description}"
+        hint += "; `stillmap filter` writes its recording"
+        raise InputError(text, where=str(output), hint=hint)
+    writers.require_free(output, writer, args.overwrite)
+    exported = _read_result(args, result, output)
+    with show_share(args.quiet, "writing") as progress:
+        losses = bag.write(exported, output, kind, overwrite=args.overwrite, progress=progress)
+    scans, objects = exported.recording.n_scans, len(exported.tracks)
+    return losses, f"{scans} scans, map, trajectory and {objects} objects"
+
+
+def _read_result(args: argparse.Namespace, result: "ResultFolder", output: Path) -> "Exported":
+    with show_share(args.quiet, "reading") as progress:
+        return result.export(progress, output.absolute().parent)
+
+
+def _convert_to_cloud(
+    args: argparse.Namespace, result: "ResultFolder", output: Path, form: "point_cloud_files.Format"
+) -> str:
+    from stillmap.core.files import require_new_file
+    from stillmap.results.export import point_cloud, point_cloud_files
+    from stillmap.results.run_json import TILTING
+
+    require_new_file(output, args.overwrite)
+    point_cloud_files.require_extras(form, output)
+    if isinstance(result.record.get(TILTING), dict):
+        points = point_cloud.cloud_from_folder(result.folder, args.only)
+    else:
+        points = _build_cloud(args, result, output.absolute().parent)
+    with show_share(args.quiet, "writing") as progress:
+        point_cloud_files.write(points, output, form, progress)
+    return f"{points.count} points as {form.description}"
+
+
+def _build_cloud(
+    args: argparse.Namespace, result: "ResultFolder", scratch: Path
+) -> "point_cloud.Cloud":
+    from stillmap.io.trajectory import poses_from_tum
+    from stillmap.results.export import point_cloud
+    from stillmap.results.labels import read_colors
+    from stillmap.slam import deskew_recording
+
+    with show_share(args.quiet, "reading") as progress:
+        recording, labels = result.read(progress, scratch)
+    if recording.dimension != 3:
+        raise InputError(
+            "is a 2D result: it has no point cloud",
+            where=str(result.folder),
+            hint=f"{_PARQUET} holds the end points of its beams",
+        )
+    poses = poses_from_tum(result.folder / "trajectory.tum", recording)
+    deskewed = deskew_recording(recording, poses, result.slam_options)
+    colors = read_colors(result.folder, recording.n_beams)
+    return point_cloud.cloud_from_recording(
+        recording, deskewed, poses, labels.p_static, args.only, colors
+    )
