@@ -206,5 +206,5 @@ def test_many_corners_on_many_rows_stay_in_memory():
     _, inside = cells_inside([ring], grid)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert peak < 100 << 20
+    assert peak < 64 << 20
     assert 0.3 < inside.mean() < 0.7

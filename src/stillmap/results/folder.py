@@ -19,7 +19,7 @@ from stillmap.io.text_lines import Progress
 from stillmap.io.trajectory import poses_from_tum
 from stillmap.mesh.options import MeshOptions
 from stillmap.pipeline.calibration import apply_calibration
-from stillmap.pipeline.options import MapMode, Options, OutputOptions
+from stillmap.pipeline.options import Options
 from stillmap.pipeline.quality import Quality
 from stillmap.preprocessing.options import ReadOptions
 from stillmap.results.labels import Labels, read_colors, read_labels
@@ -121,12 +121,6 @@ class ResultFolder(ShortRepr):
                 if isinstance(value := parts.get(part.name), int | float)
             }
         )
-
-    @property
-    def map_mode(self) -> MapMode:
-        """How its map image is written; the default where the record does not say."""
-        mode = (self._section("output") or {}).get("map_mode")
-        return self._override(OutputOptions(), {"map_mode": mode}).map_mode
 
     def _section(self, name: str) -> dict[str, Any] | None:
         """A section of the options in the record; None where there is none."""

@@ -11,7 +11,7 @@ Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Window = tuple[slice, slice]  # rows and columns of a map
 
-_BLOCK = 1 << 20  # crossings of edges with rows of cells in memory
+_BLOCK = 1 << 18  # crossings of edges with rows of cells in memory
 
 
 def cells_inside(polygon: Sequence[Float], grid: GridMap) -> tuple[Window, Mask]:
