@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stillmap.core import arrays, tiles
+from stillmap.core import tiles
 from stillmap.core.arrays import write_npz
 from stillmap.core.tiles import TILE, TiledArray
 
@@ -78,7 +78,7 @@ def test_written_as_plain_arrays_are(pair, tmp_path):
 
 
 def test_large_ones_lie_in_files(monkeypatch, tmp_path):
-    monkeypatch.setattr(arrays, "MAX_BYTES_IN_MEMORY", 3 * 4 * TILE**2)
+    monkeypatch.setattr(tiles, "MAX_DENSE_BYTES", 3 * 4 * TILE**2)
     tiled = TiledArray((9 * TILE, TILE), np.float32, 0.0, tmp_path)
     for i in range(9):
         tiled.set_tile(i, 0, np.full((TILE, TILE), i + 1.0))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import stillmap
-from stillmap.core import arrays, chunks
+from stillmap.core import arrays, chunks, tiles
 from stillmap.core.config import override
 from stillmap.results.save import save
 
@@ -41,6 +41,7 @@ def files_of(recording, estimator: str, out: Path) -> dict[str, bytes]:
 def test_arrays_in_files_give_the_same_bytes(swept, estimator, tmp_path, monkeypatch):
     in_memory = files_of(swept, estimator, tmp_path / "in memory")
     monkeypatch.setattr(arrays, "MAX_BYTES_IN_MEMORY", 0)
+    monkeypatch.setattr(tiles, "MAX_DENSE_BYTES", 0)
     assert files_of(swept, estimator, tmp_path / "in files") == in_memory
     assert {path.name for path in tmp_path.iterdir()} == {"in memory", "in files"}
 
@@ -49,6 +50,7 @@ def test_arrays_in_files_give_the_same_bytes(swept, estimator, tmp_path, monkeyp
 def test_pieces_of_any_size_give_the_same_bytes(swept, estimator, tmp_path, monkeypatch):
     whole = files_of(swept, estimator, tmp_path / "whole")
     monkeypatch.setattr(arrays, "MAX_BYTES_IN_MEMORY", 0)
+    monkeypatch.setattr(tiles, "MAX_DENSE_BYTES", 0)
     monkeypatch.setattr(arrays, "BLOCK", 1000)
     monkeypatch.setattr(chunks, "CHUNK_BEAMS", 700)
     monkeypatch.setattr(arrays, "ITEMS_PER_RELEASE", 3)

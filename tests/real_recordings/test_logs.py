@@ -1,5 +1,9 @@
 """Real logs with references: does the method work where nobody has made the world for it?"""
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -48,6 +52,20 @@ def laser2d(shared_data):
     if not folder.is_dir():
         pytest.skip("no logs in ../shared/data/laser2d")
     return folder
+
+
+@slow
+@pytest.mark.skipif(sys.platform != "linux", reason="glibc and kilobytes are assumed")
+@pytest.mark.parametrize("threads", [1, 16])
+def test_a_small_job_takes_little_memory(laser2d, tmp_path, threads):
+    """61 200 beams; a map of 135 m, mostly empty, with as many threads as a large machine has."""
+    words = ["map", laser2d / "edmonton.clf.gz", "-o", tmp_path / "out", "--quiet"]
+    command = [sys.executable, "-m", "stillmap", *map(str, words), "--threads", str(threads)]
+    process = subprocess.Popen(command)
+    _, status, used = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)  # else it is taken for running
+    assert process.returncode == 0
+    assert used.ru_maxrss < 300e3  # kilobytes
 
 
 @pytest.mark.parametrize(

@@ -29,6 +29,17 @@ def resolve_threads(requested: int) -> int:
     return max(1, os.cpu_count() or 1)
 
 
+_BEAMS_PER_THREAD = 1 << 15  # traced in some ten milliseconds
+
+
+def counting_threads(n_beams: int, threads: int) -> int:
+    """How many threads are worth a grid each, for counting beams in cells.
+
+    Every thread fills a grid of its own, which covers most of the place, before they are summed.
+    """
+    return max(1, min(threads, n_beams // _BEAMS_PER_THREAD))
+
+
 @contextmanager
 def limit_blas_threads() -> Iterator[None]:
     """Limit BLAS to one thread in the whole process.

@@ -15,6 +15,8 @@ from numpy.typing import DTypeLike, NDArray
 from stillmap.core import arrays
 
 TILE = 256  # cells, edge of a tile
+# of a layer: a map has ten of them, and buildings leave most of the box around them empty
+MAX_DENSE_BYTES = 8 << 20
 _BYTES_IN_MEMORY = 4 << 20  # of the tiles of a layer that as a whole is too large for memory
 TILES_PER_RELEASE = 16  # that are used between two releases of pages
 _TILES_PER_FILE = 256  # that share a memory-mapped file: 64 MB of float32
@@ -28,7 +30,7 @@ class TiledArray(NDArrayOperatorsMixin):
 
     To NumPy it is an array like any other: operators, functions and indexing make the whole array.
     What has to run on large maps goes by `tiles`, `crop` or `iter_rows` instead. Where the whole
-    array exceeds `arrays.MAX_BYTES_IN_MEMORY`, tiles are memory-mapped, and `release` frees their
+    array exceeds `MAX_DENSE_BYTES`, tiles are memory-mapped, and `release` frees their
     pages.
 
     Args:
@@ -160,7 +162,7 @@ class TiledArray(NDArrayOperatorsMixin):
     def _new_tile(self) -> NDArray[Any]:
         """A (TILE, TILE) array, of a file where there are many already."""
         itemsize = self.dtype.itemsize
-        small = self.size * itemsize <= arrays.MAX_BYTES_IN_MEMORY
+        small = self.size * itemsize <= MAX_DENSE_BYTES
         if small or len(self._tiles) * TILE**2 * itemsize < _BYTES_IN_MEMORY:
             return np.empty((TILE, TILE), self.dtype)
         if not self._free:
@@ -180,7 +182,7 @@ _Element = TypeVar("_Element", bound=np.generic)
 
 def compact(layer: TiledArray) -> Any:
     """A plain array where the whole is small, else the layer itself."""
-    if layer.size * layer.dtype.itemsize <= arrays.MAX_BYTES_IN_MEMORY:
+    if layer.size * layer.dtype.itemsize <= MAX_DENSE_BYTES:
         return np.asarray(layer)
     return layer
 

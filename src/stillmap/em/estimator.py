@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 import stillmap._core as _core
 from stillmap.core.arrays import iter_blocks
 from stillmap.core.chunks import iter_beams, iter_chunks
+from stillmap.core.parallel import counting_threads
 from stillmap.core.recording import Recording
 from stillmap.em import beam_counting, occupancy_hmm
 from stillmap.em.occupancy_grid import ObservedCells, observed_cells
@@ -145,7 +146,8 @@ def add_recording(
         if hits_only:
             points = np.where(hit[:, None], points, np.float32(np.nan))
         weights = np.ones(len(hit), np.float32) if e is None else e[beams]
-        _core.add_beams(grid, points, hit, weights, offset, T, threads)
+        used = counting_threads(len(hit), threads)
+        _core.add_beams(grid, points, hit, weights, offset, T, used)
 
 
 def recount_as_static(
@@ -174,13 +176,15 @@ def add_trusted_beams(
         add_recording(grid, recording, poses, e, threads)
         return None
     add_recording(grid, recording, poses, e, threads, hits_only=True)
-    trust = no_return.stop_cells, no_return.end_margin, threads
+    trust = no_return.stop_cells, no_return.end_margin
     for *_, data in iter_beams(recording, poses):
-        _core.add_no_return_beams(grid, None, *data, *trust)
+        used = counting_threads(len(data.hit), threads)
+        _core.add_no_return_beams(grid, None, *data, *trust, used)
     observed = observed_cells(grid, recording.scratch)
     # beams once more rather than another grid, as large as this one
     for *_, data in iter_beams(recording, poses):
-        _core.add_no_return_beams(None, grid, *data, *trust)
+        used = counting_threads(len(data.hit), threads)
+        _core.add_no_return_beams(None, grid, *data, *trust, used)
     return observed
 
 

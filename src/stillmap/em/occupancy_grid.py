@@ -10,7 +10,15 @@ from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core.grid_map import GridMap
-from stillmap.core.tiles import TILE, TILES_PER_RELEASE, TiledArray, compact, crop, tiles_around
+from stillmap.core.tiles import (
+    TILE,
+    TILES_PER_RELEASE,
+    TiledArray,
+    compact,
+    crop,
+    release,
+    tiles_around,
+)
 from stillmap.em.types import CellProbabilities, Float, Grid
 
 BLOCK_CELLS = 32  # edge of the blocks of the grid
@@ -103,6 +111,8 @@ def make_occupancy_map(
             p[~crop(observed.mask, block)] = np.nan
     x, y = (float(c) * grid.resolution for c in window.first_cell)
     layers = compact(p_occupied), compact(a), compact(b)
+    for layer in layers:
+        release(layer)
     return OccupancyMap(layers[0], (x, y, 0.0), grid.resolution, *layers[1:])
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core.chunks import iter_beams
+from stillmap.core.parallel import counting_threads
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.core.tiles import (
@@ -93,7 +94,8 @@ def count_observations(
     chunks = iter_beams(recording, poses, time_bin, release=[p_static])
     for scans, beams, (points, hit, offset, T) in chunks:
         is_dynamic = p_static[beams] < DYNAMIC_BELOW
-        counts.add(points, hit, is_dynamic, offset, T, time_bin[scans], threads)
+        used = counting_threads(len(hit), threads)
+        counts.add(points, hit, is_dynamic, offset, T, time_bin[scans], used)
     layers = _dense_counts(counts, occupancy, recording.scratch)
     observations, unobstructed, thin = map(compact, layers)
     return Coverage(observations, unobstructed, thin, MIN_OBSERVATIONS, MOVER_RADIUS)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap import em, slam
+from stillmap.core.heap import trim_heap
 from stillmap.core.parallel import resolve_threads
 from stillmap.core.profiling import Progress, StageTimer
 from stillmap.core.recording import Recording
@@ -110,6 +111,7 @@ def make_maps(
             )
             planar, estimate = _project(deskewed, estimate, ground, options, threads)
         filtered, raw = _occupancy_maps(planar, estimate, options, threads)
+    trim_heap()
     progress("counting observations", 0, 0, 0)
     with stages.measure("evidence"):
         evidence = em.count_observations(

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import em, slam
+from stillmap.core.heap import trim_heap
 from stillmap.core.parallel import limit_blas_threads, resolve_threads
 from stillmap.core.profiling import Progress, StageTimer, no_progress
 from stillmap.core.recording import Recording
@@ -197,6 +198,7 @@ def _run_em(
     while not state.converged and (iteration := next(steps, None)) is not None:
         state.update(iteration)
         del iteration  # its grid is large
+        trim_heap()
         if checkpoint is not None:
             checkpoint(state)
 
@@ -209,7 +211,9 @@ def _finish(
     progress("labelling beams", 0, 0, 0)
     with stages.measure("changes"):
         deskewed, estimate, changes = final_estimate(recording, state.require_best(), options)
+    trim_heap()
     maps = make_maps(deskewed, estimate, options, progress, stages)
+    trim_heap()
     progress("tracking objects", 0, 0, 0)
     with stages.measure("objects"):
         objects = find_objects(deskewed, estimate, maps, changes, options)
@@ -219,6 +223,7 @@ def _finish(
         threads = resolve_threads(options.threads)
         quality = rate_quality(deskewed, estimate.poses, estimate.p_static, threads)
         del deskewed
+    trim_heap()
     return MappingResult(
         recording=recording,
         options=options,

@@ -24,7 +24,7 @@ ORANGE, UNKNOWN, VIOLET = (240, 120, 0), (190, 196, 204), (140, 60, 220)  # RGB
 VEIL_ALPHA = 80  # of 255, of thinly observed cells: walls and free space show through
 _MAX_PIXELS = 1_500_000  # of a map: fills a large screen, a few hundred kB as PNG
 _SNAPSHOT_PIXELS = 480  # longest edge of a snapshot
-_STRIP = 1 << 22  # cells drawn at once
+_STRIP = 1 << 20  # cells drawn at once
 _DOT_WIDTH = 600  # pixels of image width per pixel of dot size
 
 UNKNOWN_LEVEL, _ORANGE_INDEX = 101, 102
