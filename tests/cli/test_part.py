@@ -54,3 +54,61 @@ def test_limits_that_cannot_be(call, room, tmp_path):
         with pytest.raises(SystemExit, match="2"):
             call("map", room, "-o", tmp_path / "out", *words)
     assert not (tmp_path / "out").exists()
+
+
+REGION = (-2.0, -2.0, 3.0, 2.5)  # a corner of the room
+
+
+def cells_of(folder):
+    with np.load(folder / "map.npz") as archive:
+        found = {name: archive[name] for name in archive}
+    x, y, _ = found["origin"]
+    row, column = np.indices(found["p_occupied"].shape)
+    size = float(found["resolution"])
+    return found, np.stack([x + size * (column + 0.5), y + size * (row + 0.5)], axis=-1)
+
+
+def in_region(xy):
+    x0, y0, x1, y1 = REGION
+    return (xy[..., 0] >= x0) & (xy[..., 0] <= x1) & (xy[..., 1] >= y0) & (xy[..., 1] <= y1)
+
+
+def test_a_region_limits_the_map_and_neither_poses_nor_labels(call, room, tmp_path):
+    whole, part = tmp_path / "whole", tmp_path / "part"
+    assert call("map", room, "-o", whole, *QUICK).returncode == 0
+    assert call("map", room, "-o", part, "--region", *REGION, *QUICK).returncode == 0
+    for name in ("trajectory.tum", "beams/p_static.npy", "beams/hit.npy"):
+        assert (whole / name).read_bytes() == (part / name).read_bytes()
+    (a, at_a), (b, at_b) = cells_of(whole), cells_of(part)
+    assert in_region(at_b).all()
+    shown = in_region(at_a)
+    assert shown.sum() == in_region(at_b).sum() < shown.size
+    for name in ("p_occupied", "alpha", "beta", "looks", "clear_looks", "thin", "changed"):
+        np.testing.assert_array_equal(b[name].ravel(), a[name][shown])
+    tracks = json.loads((part / "objects/objects.json").read_text())
+    assert all(
+        in_region(np.stack([one["track"]["x"], one["track"]["y"]], axis=-1)).any() for one in tracks
+    )
+    assert len(tracks) <= len(json.loads((whole / "objects/objects.json").read_text()))
+    record = json.loads((part / "run.json").read_text())
+    assert record["options"]["output"]["region"] == list(REGION)
+    assert call("filter", part, "-o", tmp_path / "clean", "--quiet").returncode == 0
+    walls = [json.loads(call("eval", "map", out, room, "--json").stdout) for out in (whole, part)]
+    assert walls[1]["reference_wall_cells"] < 0.8 * walls[0]["reference_wall_cells"]
+    assert walls[1]["walls_kept"] > 0.9  # those outside are not missed
+
+
+def test_regions_that_cannot_be(call, room, tmp_path, nothing_left):
+    for words, said in (
+        ((2, 0, 1, 1), "x0 < x1 and y0 < y1, got 2 0 1 1"),
+        ((0, 0, "nan", 1), "must be a finite number, got nan"),
+    ):
+        done = call("map", room, "-o", tmp_path / "out", "--region", *words)
+        refused(done, "output.region", said)
+    nothing_left()
+    done = call("map", room, "-o", tmp_path / "out", "--region", 50, 50, 60, 60, *QUICK)
+    refused(done, "50 50 60 60 lies outside the map", "the map spans 0.05 to 6.55 m in x")
+    # nothing has to be computed again
+    done = call("map", room, "-o", tmp_path / "out", "--resume", "--region", 0, 0, 1, 1, *QUICK[:2])
+    assert done.returncode == 0, done.stderr
+    assert "continues after iteration 1" in done.stderr

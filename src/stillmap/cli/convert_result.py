@@ -188,6 +188,7 @@ def _convert_to_cloud(
 def _build_cloud(
     args: argparse.Namespace, result: "ResultFolder", scratch: Path
 ) -> "point_cloud.Cloud":
+    from stillmap.core.region import limit_hits
     from stillmap.io.trajectory import poses_from_tum
     from stillmap.results.export import point_cloud
     from stillmap.results.labels import read_colors
@@ -204,6 +205,7 @@ def _build_cloud(
     poses = poses_from_tum(result.folder / "trajectory.tum", recording)
     deskewed = deskew_recording(recording, poses, result.slam_options)
     colors = read_colors(result.folder, recording.n_beams)
+    deskewed = limit_hits(deskewed, poses, result.region)
     return point_cloud.cloud_from_recording(
         recording, deskewed, poses, labels.p_static, args.only, colors
     )

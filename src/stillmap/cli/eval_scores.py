@@ -7,15 +7,18 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core import se2
 from stillmap.core.errors import InputError
+from stillmap.core.region import is_inside
 from stillmap.eval import readers, trajectory
 from stillmap.eval.labels import LabelScores, score_labels
 from stillmap.eval.map import MapScores, extract_wall_cells, extract_wall_cells_from_hits, score_map
 from stillmap.eval.readers import Truth, read_truth, require_same_beams
 from stillmap.eval.relations import RelationErrors, compute_relation_errors
 from stillmap.eval.trajectory import read_paired_poses
+from stillmap.results.folder import read_region
 from stillmap.results.labels import read_labels
-from stillmap.results.reader import read_grid, require_there
+from stillmap.results.reader import moved, read_grid, require_there
 
 Scores = tuple[dict[str, Any], Iterable[str]]  # as JSON, as lines of text
 
@@ -126,6 +129,9 @@ def score_grid(
     else:
         other = read_truth(reference_truth) if reference_truth else truth
         wanted = extract_wall_cells(read_grid(reference), walls, _align(reference, other))
+    region = read_region(result)
+    if region is not None:
+        wanted = wanted[is_inside(moved(se2.inverse(T_world_map), wanted), region)]
     # things brought in that stay are not ghosts
     solid = np.concatenate([walls, truth.lasting()])
     scores = score_map(grid, solid, wanted, T_world_map)

@@ -109,6 +109,13 @@ def _add_map_flags(p: argparse._ArgumentGroup) -> None:
         help="pixels of map.pgm (default: trinary)",
     )
     p.add_argument(
+        "--region",
+        type=float,
+        nargs=4,
+        metavar=("X0", "Y0", "X1", "Y1"),
+        help="write this part of the map frame alone, in metres; poses are of all scans",
+    )
+    p.add_argument(
         "--map-state", choices=("last", "majority"), help="state of changed places (default: last)"
     )
 
@@ -163,7 +170,7 @@ def _option_changes(args: argparse.Namespace) -> dict[str, Any]:
         changes["mesh"] = {"enabled": args.mesh}
     if args.tilting_topic is not None:
         changes["read"] = {"tilting_topic": args.tilting_topic}
-    output = {"map_mode": args.map_mode, "map_state": args.map_state}
+    output = {"map_mode": args.map_mode, "map_state": args.map_state, "region": args.region}
     if chosen := {name: value for name, value in output.items() if value}:
         changes["output"] = chosen
     return changes

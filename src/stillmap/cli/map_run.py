@@ -25,6 +25,7 @@ from stillmap.pipeline.result import MappingResult, map_recording
 from stillmap.preprocessing.options import ReadOptions
 from stillmap.preprocessing.overrides import select_time
 from stillmap.preprocessing.time_window import TimeWindow
+from stillmap.results.region import crop_result, require_overlap
 
 if TYPE_CHECKING:
     from stillmap.mesh.build import Models
@@ -135,6 +136,7 @@ def build_all(
         resume=_load_checkpoint(args, checkpoints, run_id, options, stages),
         checkpoint=lambda state: checkpoints.save(state, run_id, stages),
     )
+    require_overlap(result.map, options.output.region)
     tilting = None
     if found.tilting is not None:
         progress("removing moving objects", 0, 0, 0)
@@ -143,7 +145,7 @@ def build_all(
     models, warnings = _build_models(result, tilting, progress, stages)
     warnings = [*result.warnings, *warnings]
     result = dataclasses.replace(result, warnings=warnings, stages=stages.to_dict())
-    return result, tilting, models
+    return crop_result(result), tilting, models
 
 
 def _build_models(

@@ -131,6 +131,12 @@ def _convert(value: Any, hint: Any, name: str, where: str) -> Any:
     for kind in _alternatives(hint):
         if value in _choices(kind) or (kind is type(None) and value is None):
             return value
+        if typing.get_origin(kind) is tuple and isinstance(value, list | tuple):
+            parts = typing.get_args(kind)
+            if len(value) == len(parts):
+                return tuple(
+                    _convert(one, part, name, where) for one, part in zip(value, parts, strict=True)
+                )
         if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
             if not abs(value) <= sys.float_info.max:  # nan, inf, and integers beyond them
                 what = f"'{name}' must be a finite number, got {_format(value)}"
@@ -161,6 +167,8 @@ def _choices(hint: Any) -> tuple[Any, ...]:
 def _type_name(hint: Any) -> str:
     if isinstance(hint, types.UnionType):
         return " or ".join(map(_type_name, _alternatives(hint)))
+    if typing.get_origin(hint) is tuple:
+        return f"a list of {len(typing.get_args(hint))} numbers"
     if choices := _choices(hint):
         return " | ".join(map(repr, choices))
     return "unset" if hint is type(None) else str(getattr(hint, "__name__", hint))

@@ -216,6 +216,26 @@ def crop(layer: Layer, block: Block) -> NDArray[Any]:
     return layer.crop(block) if isinstance(layer, TiledArray) else layer[block]
 
 
+def cut(layer: Layer, block: Block, scratch: Path | None) -> Any:
+    """A copy of the elements of a block, as a layer of its own."""
+    if not isinstance(layer, TiledArray):
+        return np.array(layer[block])
+    rows, columns = block
+    shape = rows.stop - rows.start, columns.stop - columns.start
+    out = TiledArray(shape, layer.dtype, layer.fill, scratch)
+    for i, j in tile_numbers(np.empty(shape, np.bool_)):
+        r, c = out._block(i, j)
+        part = layer.crop(
+            (
+                slice(rows.start + r.start, rows.start + r.stop),
+                slice(columns.start + c.start, columns.start + c.stop),
+            )
+        )
+        if not np.array_equal(part, np.full_like(part, layer.fill), equal_nan=True):
+            out.set_tile(i, j, part)
+    return compact(out)
+
+
 def tile_numbers(layer: Layer) -> set[tuple[int, int]]:
     """Rows and columns of the tiles of a layer that may differ from its fill value."""
     if isinstance(layer, TiledArray):

@@ -9,6 +9,7 @@ import numpy as np
 
 from stillmap.core.errors import import_extra
 from stillmap.core.profiling import Progress, StageTimer, no_progress
+from stillmap.core.region import Region, is_inside
 from stillmap.core.short_repr import ShortRepr
 from stillmap.mesh.inputs import MeshInputs
 from stillmap.mesh.objects.merging import ObjectTrack, collect_tracks, merge_tracks
@@ -103,6 +104,7 @@ def build_models(
     threads: int = 1,
     progress: Progress = no_progress,
     stages: StageTimer | None = None,
+    region: Region | None = None,
 ) -> Models:
     """Builds the static surface, textures it, and models the moving objects.
 
@@ -112,6 +114,8 @@ def build_models(
         threads: same result with any number.
         progress: called with the stage, 0, the work done and the total.
         stages: records time and memory per stage.
+        region: of which the static surface is textured and returned; the rest hides what lies
+            behind it. None: everything.
 
     Raises:
         MissingExtra: a library of the extra `mesh` is not installed.
@@ -134,8 +138,9 @@ def build_models(
     progress("baking textures", 0, 0, 0)
     with stages.measure("texture"):
         bake = partial(bake_texture, read=images.read, texture_size=options.texture_size)
-        textured = bake(place.mesh, place.view, views)
-        unfiltered = _bake_unfiltered(textured, place, views, bake)
+        shown = place if region is None else place.select(is_inside(place.mesh.centers, region))
+        textured = bake(shown.mesh, shown.view, views)
+        unfiltered = _bake_unfiltered(textured, shown, views, bake)
     background = Background(place, views, partial(read_color_image, images))
     with stages.measure("movers"):
         models, returns = [], DynamicReturns.collect(inputs)
@@ -146,7 +151,7 @@ def build_models(
         with stages.measure("points"):
             colors = color_points(textured, background, returns, threads, tell("coloring points"))
     return Models(
-        place, textured, unfiltered, views, left_out, unread, models, len(inputs.objects), colors
+        shown, textured, unfiltered, views, left_out, unread, models, len(inputs.objects), colors
     )
 
 

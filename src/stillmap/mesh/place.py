@@ -69,6 +69,17 @@ class ViewAssignment(ShortRepr):
     sharpest: Int32
     p_sharpest: Float32
 
+    def select(self, kept: Bool) -> "ViewAssignment":
+        """That of the faces marked in `kept` (F,)."""
+        return ViewAssignment(
+            self.mesh.select(kept),
+            self.view[kept],
+            self.p_static[kept],
+            self.visible[kept],
+            self.sharpest[kept],
+            self.p_sharpest[kept],
+        )
+
 
 def assign_views(
     mesh: Mesh,

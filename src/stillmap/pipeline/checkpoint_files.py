@@ -24,7 +24,7 @@ from stillmap.pipeline.options import Options
 Arrays = dict[str, NDArray[Any]]
 Float = NDArray[np.float64]
 
-_NO_MATTER = ("threads",)  # options on which no byte of the result depends
+_NO_MATTER = ("threads", "output.region")  # options on which no byte of a checkpoint depends
 
 
 def pack_state(state: EmState) -> tuple[dict[str, Any], Arrays]:

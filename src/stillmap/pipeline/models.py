@@ -2,6 +2,7 @@
 
 from stillmap.core.parallel import limit_blas_threads, resolve_threads
 from stillmap.core.profiling import Progress, StageTimer, no_progress
+from stillmap.core.region import is_inside
 from stillmap.em import estimate_ground
 from stillmap.mesh import build
 from stillmap.mesh.build import Models
@@ -42,7 +43,11 @@ def build_models(
     else:  # the flat laser gives the tracks, the tilting laser the 3D data
         ground = estimate_ground(tilting.deskewed, tilting.poses, tilting.p_static, threads)
         boxes = extrude_boxes(tilting.boxes, tilting.objects, ground)
+    region = result.options.output.region
+    objects = seen.objects
+    if region is not None:
+        objects = [one for one in objects if is_inside(one.xy, region).any()]
     inputs = MeshInputs(
-        seen.recording, seen.deskewed, seen.poses, seen.p_static, seen.objects, boxes, start_ns
+        seen.recording, seen.deskewed, seen.poses, seen.p_static, objects, boxes, start_ns
     )
-    return build.build_models(inputs, result.options.mesh, threads, progress, stages)
+    return build.build_models(inputs, result.options.mesh, threads, progress, stages, region)

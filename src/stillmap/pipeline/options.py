@@ -39,8 +39,21 @@ class OutputOptions(Section, section="output"):
         1.8, "Greatest height above the ground, in metres, that counts as an obstacle.", le=100.0
     )
 
+    region: tuple[float, float, float, float] | None = option(
+        None,
+        "Part of the map frame that is written: x0, y0, x1, y1 in metres. Poses and labels are of "
+        "all scans; unset: everything.",
+    )
+
     def check(self) -> None:
-        """Refuses an empty band of heights."""
+        """Refuses an empty band of heights, and an empty region."""
+        if self.region is not None:
+            x0, y0, x1, y1 = self.region
+            if not (x0 < x1 and y0 < y1):
+                raise ValueError(
+                    "'output.region' must be x0 y0 x1 y1 with x0 < x1 and y0 < y1, got "
+                    + " ".join(f"{value:g}" for value in self.region)
+                )
         if not self.min_obstacle_height < self.max_obstacle_height:
             raise ValueError(
                 "'output.min_obstacle_height' must be less than 'output.max_obstacle_height'"

@@ -13,13 +13,14 @@ from stillmap.core import arrays, config
 from stillmap.core.errors import InputError
 from stillmap.core.files import read_text, require_regular
 from stillmap.core.recording import Recording
+from stillmap.core.region import Region
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io import read
 from stillmap.io.text_lines import Progress
 from stillmap.io.trajectory import poses_from_tum
 from stillmap.mesh.options import MeshOptions
 from stillmap.pipeline.calibration import apply_calibration
-from stillmap.pipeline.options import Options
+from stillmap.pipeline.options import Options, OutputOptions
 from stillmap.pipeline.quality import Quality
 from stillmap.preprocessing.options import ReadOptions
 from stillmap.results.labels import Labels, read_colors, read_labels
@@ -44,6 +45,7 @@ class Exported(ShortRepr):
         tracks: of the moving objects.
         slam: the options of deskewing.
         colors: (M, 3) uint8 of the end points; None: without.
+        region: the part of the map frame that is shown; None: everything.
     """
 
     recording: Recording
@@ -53,6 +55,7 @@ class Exported(ShortRepr):
     tracks: list[Track]
     slam: SlamOptions
     colors: NDArray[np.uint8] | None = None
+    region: Region | None = None
 
     def deskew(self) -> Recording:
         """The recording without the motion during its scans."""
@@ -122,6 +125,12 @@ class ResultFolder(ShortRepr):
             }
         )
 
+    @property
+    def region(self) -> Region | None:
+        """The part of the map frame that it shows; None: everything."""
+        section = self._section("output") or {}
+        return self._override(OutputOptions(), {"region": section.get("region")}).region
+
     def _section(self, name: str) -> dict[str, Any] | None:
         """A section of the options in the record; None where there is none."""
         options = self.record.get("options")
@@ -187,6 +196,7 @@ class ResultFolder(ShortRepr):
             read_tracks(self.folder / "objects" / "objects.json"),
             self.slam_options,
             read_colors(self.folder, recording.n_beams) if recording.dimension == 3 else None,
+            self.region,
         )
 
 
@@ -223,6 +233,17 @@ def require_labelled(recording: Recording, labels: Labels, where: str) -> None:
 def is_result(path: Path) -> bool:
     """Whether a folder is a result."""
     return (path / RECORD).is_file()
+
+
+def read_region(result: Path) -> Region | None:
+    """The part of the map frame that a result shows; None: everything, or the record is missing.
+
+    Raises:
+        InputError: the record is damaged.
+    """
+    if not is_result(result):
+        return None
+    return ResultFolder(result, read_record(result), Path(), False).region
 
 
 def open_result(result: Path, recording: str | None = None) -> ResultFolder:

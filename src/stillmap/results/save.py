@@ -1,5 +1,6 @@
 """The result folder: every file of a run, appearing together or not at all."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -8,6 +9,7 @@ from numpy.typing import NDArray
 
 from stillmap.core.files import atomic_folder
 from stillmap.core.parallel import resolve_threads
+from stillmap.core.region import Region, limit_hits
 from stillmap.io.trajectory import write_tum
 from stillmap.pipeline.result import MappingResult
 from stillmap.results.labels import write_labels
@@ -16,6 +18,7 @@ from stillmap.results.map_server import write_map_server
 from stillmap.results.objects import write_objects, write_traffic
 from stillmap.results.points import write_clouds
 from stillmap.results.pose_graph_g2o import write_g2o
+from stillmap.results.region import crop_result, passes
 from stillmap.results.report.page import render_report
 from stillmap.results.run_json import RECORD, TILTING, tilting_record, write_run_json
 
@@ -45,8 +48,10 @@ def save(
         models: meshes of the place and of the moving objects.
 
     Raises:
-        InputError: `path` is taken or cannot be written to.
+        InputError: `path` is taken or cannot be written to, or the region of the options lies
+            outside the map.
     """
+    result, region = crop_result(result), result.options.output.region
     colors = None if models is None or models.point_colors is None else models.point_colors.colors
     with atomic_folder(path, RECORD, overwrite, staging_folder=staging_folder) as folder:
         write_map_server(folder, result.map, result.options.output.map_mode)
@@ -57,13 +62,14 @@ def save(
         is_3d = result.recording.dimension == 3
         write_labels(folder / "beams", result.recording, result.p_static, colors if is_3d else None)
         if is_3d:
-            write_clouds(folder, result.deskewed, result.poses, result.p_static, colors)
+            seen = limit_hits(result.deskewed, result.poses, region)
+            write_clouds(folder, seen, result.poses, result.p_static, colors)
         if result.options.objects.enabled:
             write_objects(folder / "objects", result)
             write_traffic(folder / "traffic.npz", result.traffic)
         more = {}
         if tilting is not None:
-            _write_tilting(folder, tilting, colors)
+            _write_tilting(folder, tilting, colors, region)
             more[TILTING] = tilting_record(tilting)
         if models is not None:
             from stillmap.results.object_models import models_record, write_models
@@ -79,10 +85,16 @@ def save(
 
 
 def _write_tilting(
-    folder: Path, tilting: "TiltingResult", colors: NDArray[np.uint8] | None
+    folder: Path,
+    tilting: "TiltingResult",
+    colors: NDArray[np.uint8] | None,
+    region: Region | None,
 ) -> None:
     """Write `static.ply`, `dynamic.ply` and `tilting/`: labels, poses and objects in 3D."""
-    write_clouds(folder, tilting.deskewed, tilting.poses, tilting.p_static, colors)
+    seen = limit_hits(tilting.deskewed, tilting.poses, region)
+    write_clouds(folder, seen, tilting.poses, tilting.p_static, colors)
+    objects = [one for one in tilting.objects if passes(one, region)]
+    tilting = replace(tilting, objects=objects)
     inside = folder / TILTING
     inside.mkdir()
     write_labels(inside / "beams", tilting.recording, tilting.p_static, colors)

@@ -222,6 +222,30 @@ def test_without_pictures_there_are_models_by_request_alone(room, tmp_path, caps
     assert not any("models" in one for one in record["warnings"])
 
 
+def test_a_region_limits_clouds_and_models(room, result, mapped, tmp_path):
+    region = (-1.0, -2.0, 2.0, 1.0)
+    low, high = np.array(region[:2]), np.array(region[2:])
+    out = mapped("region", "--region", *region)
+    for name in ("static.ply", "dynamic.ply"):
+        points, whole = (trimesh.load(one / name).vertices for one in (out, result))
+        inside = ((whole[:, :2] >= low) & (whole[:, :2] <= high)).all(axis=1)
+        assert 0 < inside.sum() < len(whole)
+        np.testing.assert_array_equal(points, whole[inside])
+    faces, of_all = (np.load(one / "mesh_faces.npz") for one in (out, result))
+    centers = faces["vertices"][faces["faces"]].mean(axis=1)[:, :2]
+    assert ((centers >= low) & (centers <= high)).all()
+    assert 0 < len(faces["faces"]) < len(of_all["faces"])
+    # the rest of the place hides what it hid: each face is painted from the same picture
+    part, whole = ((f["vertices"][f["faces"]].mean(axis=1), f["image"]) for f in (faces, of_all))
+    same = {tuple(place): image for place, image in zip(*whole, strict=True)}
+    assert [same[tuple(place)] for place in part[0]] == part[1].tolist()
+    assert spoiled(out, room) < 0.03
+    cloud = tmp_path / "cloud.ply"
+    assert main(["convert", str(out), "-o", str(cloud), "--quiet"]) == 0
+    count = sum(len(trimesh.load(out / f"{name}.ply").vertices) for name in ("static", "dynamic"))
+    assert len(trimesh.load(cloud).vertices) == count
+
+
 @pytest.mark.parametrize("words", [("--no-mesh",), ("--set", "mesh.enabled=false")])
 def test_none_where_they_are_not_wanted(mapped, words):
     out = mapped(f"unwanted{len(words)}", *words)

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from stillmap.core import se2
+from stillmap.core.region import limit_hits
 from stillmap.io.ros import message_writer
 from stillmap.io.ros.bag_types import BagKind
 from stillmap.io.ros.bag_writer import BagWriter, new_bag, require_stamps
@@ -87,8 +88,9 @@ def _write_latched_topics(bag: BagWriter, result: Exported) -> None:
 
 def _write_static_points(bag: BagWriter, result: Exported, scans: LidarWriter) -> None:
     """At most `_MAX_POINTS` static points in the map frame, as one latched message."""
+    seen = limit_hits(scans.deskewed, result.poses, result.region)
     cloud = cloud_from_recording(
-        result.recording, scans.deskewed, result.poses, result.p_static, "static", result.colors
+        result.recording, seen, result.poses, result.p_static, "static", result.colors
     )
     first = int(result.recording.stamp_ns[0])
     send = bag.add_topic("/static_points", POINT_CLOUD, latched=True)

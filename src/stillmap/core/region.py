@@ -1,0 +1,33 @@
+"""A rectangle of the map frame, along its axes: the option `output.region`."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core import arrays
+from stillmap.core.recording import Recording
+
+Region = tuple[float, float, float, float]  # x0, y0, x1, y1 in metres
+
+
+def is_inside(points: NDArray[Any], region: Region) -> NDArray[np.bool_]:
+    """(...) whether points (..., D), of which x and y count, lie in a region."""
+    x0, y0, x1, y1 = region
+    x, y = points[..., 0], points[..., 1]
+    return np.asarray((x >= x0) & (x <= x1) & (y >= y0) & (y <= y1))
+
+
+def limit_hits(
+    recording: Recording, T_map_base: NDArray[np.float64], region: Region | None
+) -> Recording:
+    """The recording with the hits in a region alone; itself where there is no region."""
+    if region is None:
+        return recording
+    inside = recording.allocate_per_beam(np.bool_)
+    for block in arrays.iter_blocks(recording.hit, inside):
+        inside[block] = False
+        beams = block.start + np.flatnonzero(recording.hit[block])
+        inside[beams] = is_inside(recording.end_points(beams, T_map_base), region)
+    return replace(recording, hit=inside)
