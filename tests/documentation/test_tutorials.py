@@ -1,0 +1,49 @@
+"""Commands of the quickstart and the tutorials do what their pages say: each page is run, block by
+block, in an empty folder. `console` and `text` blocks are for reading."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+PAGES = [DOCS / "quickstart.md", *sorted((DOCS / "tutorials").glob("*.md"))]
+SLOW = {"rgbd-to-model", "two-lasers"}
+BLOCK = re.compile(r"^```(sh|python)\n(.*?)^```", re.DOTALL | re.MULTILINE)
+RUN = {"sh": ["bash", "-euo", "pipefail", "-c"], "python": [sys.executable, "-W", "error", "-c"]}
+
+
+def blocks_of(page):
+    return BLOCK.findall(page.read_text("utf-8"))
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, id=page.stem, marks=[pytest.mark.slow] if page.stem in SLOW else [])
+        for page in PAGES
+    ],
+)
+def test_page_runs(page, tmp_path):
+    beside = Path(sys.executable).parent
+    environment = {**os.environ, "PATH": f"{beside}{os.pathsep}{os.environ['PATH']}"}
+    blocks = blocks_of(page)
+    assert blocks
+    for language, text in blocks:
+        done = subprocess.run(
+            [*RUN[language], text],
+            cwd=tmp_path,
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, f"{text}\n{done.stdout}\n{done.stderr}"
+
+
+def test_pages_have_commands_of_both_kinds():
+    languages = {language for page in PAGES for language, _ in blocks_of(page)}
+    assert languages == {"sh", "python"}
