@@ -48,7 +48,7 @@ def test_options_exist(page):
 
 
 def test_options_are_found():
-    text = (ROOT / "README.md").read_text()
+    text = (ROOT / "docs" / "command-line.md").read_text()
     assert "em.prior" in re.findall(rf"{SECTIONS}\.[a-z_]+", text)
 
 
