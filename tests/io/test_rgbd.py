@@ -185,7 +185,7 @@ def test_colour_of_another_size_is_not_calibrated(scenes):
         Image.fromarray(np.zeros((2 * H, 2 * W, 3), np.uint8)).save(file)
     found = read(scenes)
     assert found.images.cameras[0].K is None
-    assert any("read.cameras calibrates it" in warning for warning in found.source["warnings"])
+    assert any("calibration by read.cameras" in warning for warning in found.source["warnings"])
 
 
 @pytest.mark.parametrize("place", ["seq-01/camera.txt", "camera-intrinsics.txt", None])

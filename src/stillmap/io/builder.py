@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.advice import advise
 from stillmap.core.arrays import ArrayBuilder, empty
 from stillmap.core.recording import Recording
 from stillmap.io.text_lines import Progress
@@ -216,8 +217,11 @@ class SkippedRecords:
         if self.total <= _MAX_LOSS * (kept + self.total):
             return []
         return [
-            f"{self.total} of {kept + self.total} scans are damaged and were skipped: "
-            f"{self.summary(unit)}"
+            advise(
+                f"{self.total} of {kept + self.total} scans are damaged and were skipped: "
+                f"{self.summary(unit)}",
+                "copy the recording again; if it was recorded so, look whether the map has gaps",
+            )
         ]
 
     def to_dict(self) -> dict[str, Any]:

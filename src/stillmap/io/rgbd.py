@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import camera as camera_module
 from stillmap.core import se2
+from stillmap.core.advice import advise
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
@@ -122,9 +123,11 @@ def read_depth_camera(
         camera = replace(camera, K=frames.default_K)
         fx, cx, cy = frames.default_K[[0, 0, 1], [0, 2, 2]]
         warnings.append(
-            f"no calibration of the depth camera: a focal length of {fx:g} pixels and the centre "
-            f"at {cx:g}, {cy:g} are assumed, the default of {frames.format}; set others by "
-            "read.cameras"
+            advise(
+                f"no calibration of the depth camera: a focal length of {fx:g} pixels and the "
+                f"centre at {cx:g}, {cy:g} are assumed, the default of {frames.format}",
+                "give that of your camera by read.cameras",
+            )
         )
     error = camera_module.calibration_error(camera)
     if error:
@@ -182,8 +185,11 @@ def _read_color_images(
     camera = replace(depth, name=COLOR, width=width, height=height)
     if size != (depth.width, depth.height):
         warnings.append(
-            f"color images have {width} x {height} pixels, depth images {depth.width} x "
-            f"{depth.height}: the color camera is not calibrated; read.cameras calibrates it"
+            advise(
+                f"color images have {width} x {height} pixels, depth images {depth.width} x "
+                f"{depth.height}: the color camera is not calibrated",
+                "give its calibration by read.cameras",
+            )
         )
         camera = replace(camera, K=None, model="", distortion=np.zeros(0))
     elif scale is not None:

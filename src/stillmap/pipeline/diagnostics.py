@@ -140,7 +140,7 @@ def _place_warnings(best: Estimate) -> list[str]:
 
 def _place(best: Estimate, scan: int) -> str:
     """A scan and its position, to be found in the map."""
-    x, y = best.poses[scan, :2, -1]
+    x, y = np.round(best.poses[scan, :2, -1], 1) + 0.0  # no negative zero
     return f"scan {scan} (x {x:.1f} m, y {y:.1f} m)"
 
 

@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.advice import advise
 from stillmap.preprocessing import self_filter
 from stillmap.preprocessing.options import MAX_PLAUSIBLE_RANGE, ReadOptions
 from stillmap.preprocessing.self_filter import SelfSector
@@ -164,7 +165,10 @@ def infer_range_rule(
     )
     if free is None:
         warnings.append(
-            "the maximum range of the laser is unknown: maximum-range beams are unusable"
+            advise(
+                "the maximum range of the laser is unknown: maximum-range beams are unusable",
+                "give it by read.max_range, so that they show free space",
+            )
         )
     return rule, warnings
 

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.advice import advise
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.io import trajectory
@@ -202,7 +203,9 @@ def _find_odometry(
     if outside:
         warnings.append(f"{outside} scans outside the time of the odometry: nearest pose")
     if len(out) > 1 and not _moves(out):
-        warnings.append("the odometry never moves")
+        warnings.append(
+            advise("the odometry never moves", "if the robot did, ignore it (--no-odometry)")
+        )
     return out, {"from": " and ".join(kinds), "outside": outside}
 
 

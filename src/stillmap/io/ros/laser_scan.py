@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.advice import advise
 from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.timestamps import longest_non_decreasing
 from stillmap.io.builder import SkippedRecords
@@ -103,7 +104,12 @@ class _ScanBuffer:
         stamps, warnings = np.asarray(self.stamp_ns, np.int64), []
         if np.mean(stamps == 0) > 0.5:
             stamps = np.asarray(self.log_ns, np.int64)
-            warnings.append(f"{self.topic}: headers have no stamps: log times are used")
+            warnings.append(
+                advise(
+                    f"{self.topic}: headers have no stamps: log times are used",
+                    "let the driver stamp its scans: log times come later and jitter",
+                )
+            )
         keep = longest_non_decreasing(stamps.tolist())
         number = np.asarray(self.number)
         skipped.add_all(TIME_BACKWARDS, np.delete(number, keep))

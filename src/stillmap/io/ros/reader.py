@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.advice import advise
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.core.timestamps import longest_non_decreasing
@@ -61,7 +62,10 @@ def read(
             recording.source.update(path=str(path), format=bag.kind)
             if damage:
                 reason = damage.rstrip(".")
-                text = f"the bag is cut or damaged ({reason}): what could be read is used"
+                text = advise(
+                    f"the bag is cut or damaged ({reason}): what could be read is used",
+                    "copy it again; if it was recorded so, the map ends where the bag does",
+                )
                 recording.source["warnings"].insert(0, text)
             return recording
     raise InputError(f"is damaged: {damage}", where=str(path))
