@@ -248,7 +248,7 @@ def test_distance_between_two_clicks(shown, tab):
     ends = np.array([[-1.5, -1.0, 0.0], [0.9, 0.8, 0.0]])
     for count, end in enumerate(ends):
         tab.click(*pixel_of(window, end))
-        until(window, lambda wanted=count + 1: len(window._ruler.points) == wanted)
+        until(window, lambda wanted=count + 1: len(window._measuring.ruler.points) == wanted)
     until(window, lambda: re.search(r"\d\.\d\d m\n", tab.value("document.body.innerText")))
     length = re.search(r"(\d\.\d\d) m\n", tab.value("document.body.innerText"))[1]
     assert float(length) == pytest.approx(3.0, abs=0.05)  # pixels are whole

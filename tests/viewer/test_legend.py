@@ -14,9 +14,9 @@ from stillmap.viewer.legend import (
     legend_html,
     scale_html,
     scale_length,
-    table_html,
 )
 from stillmap.viewer.scene import read_scene
+from stillmap.viewer.text import table_html
 
 
 def colors(html):

@@ -1,7 +1,5 @@
 """The viewer's layers and controls."""
 
-from functools import partial
-
 import numpy as np
 import pytest
 
@@ -9,12 +7,11 @@ from stillmap.results.points import COLOURS, FIELDS, ply_header, put_colours
 from stillmap.results.report.figures import ORANGE
 from stillmap.viewer import scene as scenes
 from stillmap.viewer import shortcuts
-from stillmap.viewer.picking import Ray
 from stillmap.viewer.scene import read_scene
 
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 
-from stillmap.viewer.window import _escape_markdown
+from stillmap.viewer.text import escape_markdown
 
 
 def node(window, path):
@@ -186,7 +183,7 @@ def test_result_of_one_scan(result_of, opened):
 
 
 def test_markdown_is_escaped():
-    assert _escape_markdown("a_b <img src=x>") == r"a\_b \<img src=x\>"
+    assert escape_markdown("a_b <img src=x>") == r"a\_b \<img src=x\>"
 
 
 def test_actions_of_keys_step_and_pause(window):
@@ -240,53 +237,3 @@ def test_selected_object_shows_its_facts(window):
     window._actions()["Clear"]()
     window.step()
     assert not window._facts_folder.visible
-
-
-def test_measured_distances_are_shown_and_cleared(window):
-    act = window._actions()
-    act["Measure"]()
-    window.step()
-    assert window._distances.content == r"Click on the first point\."
-    eye = np.array([0.0, 0.0, 50.0])
-    z = window._scene.ground - 0.15  # of the map, beside all points
-    for goal in ([30.0, 40.0, z], [30.0, 43.0, z]):
-        way = np.array(goal) - eye
-        window._events.put(partial(window._add_point, Ray(eye, way / np.linalg.norm(way)), 0.001))
-        window.step()
-    assert window._ruler.distances == pytest.approx([3.0])
-    assert node(window, "/measured_2/distance").text == "3.00 m"
-    assert window._distances.content.startswith(r"3\.00 m")
-    # an object is not selected meanwhile
-    window._click_object(7)
-    window.step()
-    assert not window._facts_folder.visible
-    act["Clear"]()
-    window.step()
-    assert window._ruler.points == []
-    assert node(window, "/measured_2/distance") is None
-    assert not window._distances.visible
-
-
-def test_click_beside_everything_measures_nothing(window):
-    window._actions()["Measure"]()
-    up = Ray(np.array([0.0, 0.0, 50.0]), np.array([0.0, 0.0, 1.0]))
-    window._events.put(partial(window._add_point, up, 0.01))
-    window.step()
-    assert window._ruler.points == []
-    assert "no point there" in window._distances.content
-
-
-def test_clicked_point_is_one_of_what_is_visible(window):
-    cloud = window._layers.clouds["Static points"].points.astype(float)
-    point = cloud[np.argmax(cloud[:, 2])]  # nothing is above it
-    ray = Ray(point + np.array([0.0, 0.0, 9.0]), np.array([0.0, 0.0, -1.0]))
-    window._boxes["Dynamic points"].value = False
-    window.step()
-    assert window._layers.pick(ray, 1e-4) == pytest.approx(point)
-    window._boxes["Static points"].value = False
-    window.step()
-    depth = window._scene.ground - 0.15
-    assert window._layers.pick(ray, 1e-4) == pytest.approx([*point[:2], depth])
-    window._boxes["Map"].value = False
-    window.step()
-    assert window._layers.pick(ray, 1e-4) is None

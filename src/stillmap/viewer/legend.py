@@ -16,11 +16,11 @@ from stillmap.results.colors import (
 from stillmap.results.report.figures import ORANGE, UNKNOWN
 from stillmap.viewer.layers import HEIGHT, PICTURES, Layers
 from stillmap.viewer.shortcuts import KEYS
+from stillmap.viewer.text import TEXT_STYLE
 
 _MAX_BAR = 0.25  # longest scale bar, as a share of the height of the view
 _LENGTHS = (1.0, 2.0, 5.0)  # times a power of 10
 
-_TEXT = "font-size:.8em;line-height:1.5;padding:0 .9em"
 _SPACE = "padding-top:.4em;padding-bottom:.3em"
 _DOT = "border-radius:50%;width:.7em;height:.7em;margin:0 .1em"
 _LINE = "width:1.4em;height:.2em"
@@ -52,7 +52,7 @@ def legend_html(layers: Layers, coloring: str, is_2d: bool) -> str:
     if layers.is_shown("Rays"):
         rows.append(_row(_swatch(_LINE, TEAL), "rays from the sensor"))
     content = "".join(rows + _object_rows(layers))
-    return f'<div style="{_TEXT};padding-top:.6em">{content}</div>'
+    return f'<div style="{TEXT_STYLE};padding-top:.6em">{content}</div>'
 
 
 def scale_html(distance: float, field_of_view: float) -> str:
@@ -67,7 +67,7 @@ def scale_html(distance: float, field_of_view: float) -> str:
     bar = f"width:{100.0 * length / height:.3f}vh;height:.5em;border:2px solid;border-top:0"
     text = f"{length:g} m" if length >= 1.0 else f"{100.0 * length:g} cm"
     return (
-        f'<div style="{_TEXT};{_SPACE}" title="at the center of the view">'
+        f'<div style="{TEXT_STYLE};{_SPACE}" title="at the center of the view">'
         f'<div style="{bar}"></div>{text}</div>'
     )
 
@@ -78,20 +78,10 @@ def scale_length(longest: float) -> float:
     return max(power * n for n in _LENGTHS if power * n <= longest * (1.0 + 1e-9))
 
 
-def table_html(rows: Sequence[tuple[str, str]]) -> str:
-    """A table of names and values."""
-    cells = "".join(
-        f'<tr><td style="padding-right:1em;opacity:.7">{html.escape(name)}</td>'
-        f"<td>{html.escape(value)}</td></tr>"
-        for name, value in rows
-    )
-    return f'<table style="{_TEXT}">{cells}</table>'
-
-
 def help_html() -> str:
     """The line that lists the keys."""
     keys = "; ".join(f"<b>{html.escape(key)}</b> {html.escape(what)}" for key, what in KEYS)
-    return f'<div style="{_TEXT};padding-bottom:.6em">Keys: {keys}.</div>'
+    return f'<div style="{TEXT_STYLE};padding-bottom:.6em">Keys: {keys}.</div>'
 
 
 def _map_row(is_2d: bool) -> str:

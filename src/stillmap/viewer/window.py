@@ -1,7 +1,5 @@
 """The page of a result: its controls, and what happens when they are used."""
 
-import math
-import re
 import time
 from collections.abc import Callable
 from functools import partial
@@ -12,24 +10,22 @@ import numpy as np
 
 from stillmap.viewer.beams import Beams
 from stillmap.viewer.layers import Layers
-from stillmap.viewer.legend import help_html, legend_html, table_html
+from stillmap.viewer.legend import help_html, legend_html
 from stillmap.viewer.legend_panels import LegendPanels
+from stillmap.viewer.measuring import Measuring
 from stillmap.viewer.nodes import Nodes
 from stillmap.viewer.objects import ObjectNodes
-from stillmap.viewer.picking import Ray
-from stillmap.viewer.ruler import Ruler, format_length
+from stillmap.viewer.ruler import Ruler
 from stillmap.viewer.scene import Scene
 from stillmap.viewer.server import start_server, stop_server
 from stillmap.viewer.shortcuts import LAYER_KEYS, add_shortcuts
+from stillmap.viewer.text import escape_markdown, table_html
 from stillmap.viewer.tracks import describe_object
 from stillmap.viewer.view import FIELD_OF_VIEW, MIN_ASPECT, default_view
 
 _FRAME_TIME = 0.1  # s between updates while playing
 _IDLE_TIME = 0.05  # s between polls of the controls
 _SPEEDS = {"1 x": 1.0, "3 x": 3.0, "10 x": 10.0, "30 x": 30.0, "100 x": 100.0}
-_CLICK_RADIUS = 0.01  # of a click on a point, as a share of the height of the view
-_MARKDOWN = re.compile(r"([\\`*_{}\[\]()<>#+\-.!|~&$:])")  # special characters
-_MEASURE, _STOP = "Measure", "Stop measuring"
 
 
 class Window:
@@ -50,7 +46,6 @@ class Window:
         self._scene, self._view = scene, default_view(scene)
         self._seconds = 1e-9 * (scene.stamp_ns - scene.stamp_ns[0])
         self.scan, self._at, self._playing, self._ticked = 0, 0.0, False, time.monotonic()
-        self._measuring = False
         self._events: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._server = start_server(port, f"{scene.name} - stillmap")
         try:
@@ -59,9 +54,9 @@ class Window:
             camera.position, camera.look_at = self._view.position, self._view.look_at
             nodes = Nodes(self._server, scene, self._view.height)
             self._objects = ObjectNodes(nodes, self._click_object)
-            self._layers, self._ruler = Layers(nodes, beams, self._objects), Ruler(nodes)
+            self._layers = Layers(nodes, beams, self._objects)
             self._legends = LegendPanels(self._server)
-            self._add_controls()
+            self._add_controls(Ruler(nodes))
             add_shortcuts(self._server.gui, self._actions())
             self.show(0)
         except BaseException:
@@ -147,7 +142,7 @@ class Window:
             "Previous scan": lambda: self._go_to(int(self._slider.value) - 1),
             "First scan": lambda: self._go_to(0),
             "Last scan": lambda: self._go_to(last),
-            "Measure": lambda: self._measure(not self._measuring),
+            "Measure": self._measuring.toggle,
             "Clear": self._clear,
             "Default view": self._reset_cameras,
             "Legend": self._legends.toggle,
@@ -172,47 +167,13 @@ class Window:
             client.camera.position = self._view.position_for(client.camera.aspect)
             client.camera.look_at = self._view.look_at
 
-    def _measure(self, measuring: bool) -> None:
-        """Start or stop measuring: while it lasts, clicks are points, not objects."""
-        if measuring and not self._measuring:
-            self._server.scene.on_click()(self._click_point)
-        elif self._measuring and not measuring:
-            self._server.scene.remove_click_callback(self._click_point)
-        self._measuring = measuring
-        self._measure_button.label = _STOP if measuring else _MEASURE
-        self._show_distances()
-
-    def _click_point(self, event: Any) -> None:
-        """Called by viser."""
-        ray = Ray(np.array(event.ray_origin), np.array(event.ray_direction))
-        tangent = _CLICK_RADIUS * 2.0 * math.tan(0.5 * float(event.client.camera.fov))
-        self._events.put(lambda: self._add_point(ray, tangent))
-
-    def _add_point(self, ray: Ray, tangent: float) -> None:
-        point = self._layers.pick(ray, tangent)
-        if point is None:
-            self._show_distances("There is no point there.")
-        elif self._measuring:
-            self._ruler.add(point)
-            self._show_distances()
-
-    def _show_distances(self, message: str = "") -> None:
-        lines = [format_length(length) for length in self._ruler.distances]
-        if self._measuring:
-            wanted = ("first", "second")[len(self._ruler.points) % 2]
-            message = f"{message} Click on the {wanted} point.".strip()
-        lines += [message] if message else []
-        self._distances.content = "  \n".join(_escape_markdown(line) for line in lines)
-        self._distances.visible = bool(lines)
-        self._clear_button.visible = bool(self._ruler.points)
-
     def _click_object(self, number: int) -> None:
         """Called by viser."""
         self._events.put(lambda: self._select(number))
 
     def _select(self, number: int | None) -> None:
         """Show the facts of an object; None: of none."""
-        if not self._measuring:
+        if not self._measuring.active:
             self._objects.selected = number
             self.show(self.scan)
 
@@ -225,15 +186,16 @@ class Window:
             self._facts.content = table_html(describe_object(track, now, start))
 
     def _clear(self) -> None:
-        """Remove what was measured and selected."""
-        self._ruler.clear()
-        self._measure(False)
+        """Stop measuring, remove what was measured and selected."""
+        if self._measuring.active:
+            self._measuring.toggle()
+        self._measuring.clear()
         self._select(None)
 
-    def _add_controls(self) -> None:
+    def _add_controls(self, ruler: Ruler) -> None:
         gui, last, scene = self._server.gui, len(self._seconds) - 1, self._scene
         gui.set_panel_label("stillmap")
-        name, folder = _escape_markdown(scene.name), _escape_markdown(scene.folder)
+        name, folder = escape_markdown(scene.name), escape_markdown(scene.folder)
         gui.add_markdown(f"**{name}**" if name == folder else f"**{name}**, result {folder}")
         # Any: viser's types do not allow setting values
         self._slider: Any = gui.add_slider("Scan", 0, max(last, 1), 1, 0, disabled=not last)
@@ -241,18 +203,14 @@ class Window:
         self._speed = gui.add_dropdown("Speed", tuple(_SPEEDS))
         self._button = gui.add_button("Play", disabled=not last)
         self._button.on_click(self._queued(lambda: self.play(not self._playing)))
-        self._measure_button = gui.add_button(_MEASURE)
-        self._measure_button.on_click(self._queued(lambda: self._measure(not self._measuring)))
-        self._distances: Any = gui.add_markdown("", visible=False)
-        self._clear_button = gui.add_button("Clear", visible=False)
-        self._clear_button.on_click(self._queued(self._clear))
+        self._measuring = Measuring(self._server, self._layers, ruler, self._events)
         self._facts_folder: Any = gui.add_folder("Object", visible=False)
         with self._facts_folder:
             self._facts: Any = gui.add_html("")
             gui.add_button("Close").on_click(self._queued(lambda: self._select(None)))
         self._add_layer_controls()
         for note in scene.notes:
-            gui.add_markdown(_escape_markdown(note))
+            gui.add_markdown(escape_markdown(note))
         gui.add_html(help_html())
 
     def _add_layer_controls(self) -> None:
@@ -269,15 +227,10 @@ class Window:
             )
             self._size = gui.add_slider("Point size", 0.5, 5.0, 0.5, 1.0)
         self._notes = {
-            name: gui.add_markdown(_escape_markdown(note), visible=visible[name])
+            name: gui.add_markdown(escape_markdown(note), visible=visible[name])
             for name, note in self._layers.notes.items()
         }
 
 
 def _toggle(box: Any) -> None:
     box.value = not box.value
-
-
-def _escape_markdown(text: str) -> str:
-    """Text escaped for Markdown."""
-    return _MARKDOWN.sub(r"\\\1", text)
