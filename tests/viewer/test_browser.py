@@ -274,9 +274,18 @@ def test_scale_bar_has_the_scale_of_the_view(shown, tab):
     window = shown(2)
     (client,) = window._server.get_clients().values()
     bar = "document.querySelector('[title=\"at the center of the view\"]')"
+
+    def widths():
+        """Of the bar, and of as many meters at the center of the view, in pixels."""
+        length = float(tab.value(f"{bar}.textContent").removesuffix(" m"))
+        ends = [client.camera.look_at + np.array([side * length / 2, 0, 0]) for side in (-1, 1)]
+        a, b = (pixel_of(window, end) for end in ends)
+        return tab.value(f"{bar}.firstChild.getBoundingClientRect().width"), np.linalg.norm(b - a)
+
     until(window, lambda: tab.value(f"{bar} != null"))
-    width = tab.value(f"{bar}.firstChild.getBoundingClientRect().width")
-    length = float(tab.value(f"{bar}.textContent").removesuffix(" m"))
-    center = client.camera.look_at
-    a, b = (pixel_of(window, center + np.array([side * length / 2, 0, 0])) for side in (-1, 1))
-    assert width == pytest.approx(np.linalg.norm(b - a), abs=6)  # with its border of 2 x 2 pixels
+    # it follows the camera, which the page sets in steps; its border has 2 pixels on either side
+    until(window, lambda: abs(np.subtract(*widths())) < 6)
+    tab.call("Input.dispatchMouseEvent", type="mouseWheel", x=400, y=350, deltaX=0, deltaY=300)
+    before = client.camera.position.copy()
+    until(window, lambda: np.linalg.norm(client.camera.position - before) > 1.0)
+    until(window, lambda: abs(np.subtract(*widths())) < 6)
