@@ -1,5 +1,6 @@
 """Results in Python: built, saved, loaded, shown, as tables."""
 
+import dataclasses
 import json
 import re
 
@@ -7,6 +8,9 @@ import numpy as np
 import pytest
 
 import stillmap
+from stillmap.cli.main import main
+from stillmap.core import se2
+from stillmap.io import write
 
 SHORT = 400  # characters of a `repr`
 
@@ -173,3 +177,24 @@ def test_tables(built, saved):
         ValueError, match=r"table: expected one of 'beams', 'poses', .* got 'scans'"
     ):
         built.to_arrow("scans")
+
+
+def test_calibrated_mounts_are_those_of_the_map_again(tmp_path):
+    """The laser is recorded as turned by 0.4 rad, and looks straight ahead."""
+    scene = ["simulate", "hall", "-o", str(tmp_path / "hall"), "--scans", "200", "--quiet"]
+    assert main(scene) == 0
+    recording = stillmap.read(tmp_path / "hall")
+    turned = dataclasses.replace(recording, T_base_sensor=se2.matrix([0.0], [0.0], [0.4]))
+    write(turned, tmp_path / "turned")
+    options = {"threads": 1, "em.max_iterations": 1}
+    built = stillmap.build(tmp_path / "turned", options, resolution=0.2)
+    assert abs(se2.parameters(built.recording.T_base_sensor[0])[2]) < 0.02
+    built.save(tmp_path / "out")
+    loaded = stillmap.load(tmp_path / "out")
+    np.testing.assert_array_equal(loaded.recording.T_base_sensor, built.recording.T_base_sensor)
+    np.testing.assert_array_equal(loaded.recording.T_odom_base, built.recording.T_odom_base)
+    # exports put the beams where the map has them, too
+    table = tmp_path / "beams.parquet"
+    assert main(["convert", str(tmp_path / "out"), "-o", str(table), "--quiet"]) == 0
+    x = pytest.importorskip("pyarrow.parquet").read_table(table)["x"].to_numpy()
+    np.testing.assert_allclose(x, built.to_arrow()["x"].to_numpy(), atol=1e-4)

@@ -3,7 +3,7 @@
 from stillmap.core.errors import InputError
 
 # argument, as hints name it -> flag
-_FLAGS = {
+FLAGS = {
     "overwrite=True": "--overwrite",
     "resume=True": "--resume",
     "recording=PATH": "--input",
@@ -19,7 +19,7 @@ _FLAGS = {
 def in_flags(error: InputError) -> InputError:
     """The error with flags in its hint instead of arguments; itself where it names none."""
     hint = error.hint
-    for argument, flag in _FLAGS.items():
+    for argument, flag in FLAGS.items():
         hint = hint.replace(argument, flag)
     if hint == error.hint:
         return error

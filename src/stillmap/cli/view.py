@@ -143,5 +143,6 @@ def _read_beams(result: "ResultFolder", quiet: bool) -> "Beams":
 
     with show_share(quiet, "reading") as progress:
         recording, labels = result.read(progress)
+    recording = result.calibrate(recording)
     poses = poses_from_tum(result.folder / "trajectory.tum", recording)
     return Beams(recording, labels.p_static, poses, result.slam_options)

@@ -102,8 +102,9 @@ def require_mappable(
     from stillmap.io.cameras import depth_camera_names  # 2D recordings need no camera
 
     if depth_camera_names(recording.source):
+        stated = recording.T_recorded_base is not None
         raise InputError(
             "holds depth images, whose poses have to be given",
             where=where,
-            hint=f'poses="{"FILE.tum" if recording.T_recorded_base is None else RECORDED}"',
+            hint='poses="recording"' if stated else 'poses="FILE.tum"',
         )

@@ -12,6 +12,7 @@ from stillmap.core.arrays import iter_blocks
 from stillmap.core.errors import import_extra
 from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.mapping.beam_statistics import sample_dynamic_points
+from stillmap.pipeline.quality import Quality
 from stillmap.results.report.figures import MapView, data_uri, draw_map, map_window
 
 if TYPE_CHECKING:
@@ -92,8 +93,18 @@ def key_facts(result: "Result") -> dict[str, str]:
         "beams": f"{len(result.p_static)}, {hits} of them hits",
         "dynamic": f"{100.0 * dynamic / max(hits, 1):.1f} % of the hits",
         "moving objects": str(len(result.objects)),
+        "quality": _describe_quality(result.quality),
         "map": f"{width:.1f} m x {height:.1f} m, cells of {grid.resolution:g} m",
     }
+
+
+def _describe_quality(quality: Quality) -> str:
+    """Overall, of labels and of geometry, 0 to 100."""
+    overall, labels, geometry = (
+        "unknown" if value is None else f"{value:.0f}"
+        for value in (quality.overall, quality.labels, quality.geometry)
+    )
+    return f"{overall} of 100 (labels {labels}, geometry {geometry})"
 
 
 def _count_hits(hit: NDArray[np.bool_], p_static: NDArray[np.float32]) -> tuple[int, int]:

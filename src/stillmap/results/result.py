@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from stillmap.core.grid_map import GridMap
 from stillmap.core.recording import Recording
 from stillmap.pipeline.options import Options
+from stillmap.pipeline.quality import Quality
 from stillmap.pipeline.result import MappingResult
 from stillmap.results.reader import Track
 from stillmap.results.run_json import run_record
@@ -73,6 +74,11 @@ class Result:
         @abstractmethod
         def objects(self) -> Sequence[MovingObject | Track]:
             """What moved: `id`, `stamp_ns` (L,), `xy`, `velocity` (L, 2), `size`, `p_dynamic`."""
+
+        @property
+        @abstractmethod
+        def quality(self) -> Quality:
+            """Of labels and geometry, from 0 to 100; None where it cannot be told."""
 
         @property
         @abstractmethod

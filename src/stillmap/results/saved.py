@@ -16,6 +16,7 @@ from stillmap.core.files import atomic_folder
 from stillmap.core.recording import Recording
 from stillmap.io.trajectory import read_tum
 from stillmap.pipeline.options import Options
+from stillmap.pipeline.quality import Quality
 from stillmap.results.folder import ResultFolder, open_result, read_record, require_labelled
 from stillmap.results.labels import Labels, read_labels
 from stillmap.results.reader import Grid, Track, read_grid, read_tracks
@@ -71,6 +72,11 @@ class SavedResult(Result):
         return self.folder.record
 
     @property
+    def quality(self) -> Quality:
+        """Of labels and geometry, from 0 to 100; None where it cannot be told."""
+        return self.folder.quality
+
+    @property
     def warnings(self) -> list[str]:
         """One sentence each."""
         noted = self.run.get("warnings")
@@ -97,6 +103,9 @@ class SavedResult(Result):
             require_labelled(recording, self.labels, "recording")
         else:
             recording, _ = open_result(self.path, self.source).read()
+        if recording.dimension != self.poses.shape[-1] - 1:
+            what = f"is in {recording.dimension}D, another dimension than the result"
+            raise InputError(what, where="recording")
         return self.folder.calibrate(recording)
 
     @property

@@ -1,0 +1,95 @@
+"""Progress for those who ask for it, and what an interruption leaves behind."""
+
+import signal
+
+import numpy as np
+import pytest
+import threadpoolctl
+
+import stillmap
+
+FAST = {"threads": 2, "em.max_iterations": 2}
+
+
+def test_nothing_is_printed_unasked(folder, tmp_path, capfd):
+    stillmap.build(folder, FAST, resolution=0.2).save(tmp_path / "out")
+    stillmap.load(tmp_path / "out").to_arrow("poses")
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_bar_on_stderr(folder, capfd, monkeypatch):
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    stillmap.build(folder, FAST, resolution=0.2, progress=True)
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert "iteration 1 of at most 2" in err
+
+
+def test_a_function_is_told(folder):
+    told = []
+    stillmap.build(folder, FAST, resolution=0.2, progress=lambda *at: told.append(at))
+    assert ("matching scans", 1, 60, 60) in told
+    assert told[-1][0] != "matching scans"
+
+
+@pytest.mark.parametrize("stage", ["matching scans", "labelling beams", "tracking objects"])
+def test_ctrl_c_leaves_the_session_usable(folder, built, stage):
+    def press(what, *_):
+        if what == stage:
+            signal.raise_signal(signal.SIGINT)
+
+    before = threadpoolctl.threadpool_info()
+    handler = signal.getsignal(signal.SIGINT)
+    try:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        with pytest.raises(KeyboardInterrupt):
+            stillmap.build(folder, FAST, progress=press)
+    finally:
+        signal.signal(signal.SIGINT, handler)
+    assert threadpoolctl.threadpool_info() == before
+    again = stillmap.build(folder, {"threads": 2, "em.max_iterations": 2}, resolution=0.1)
+    np.testing.assert_array_equal(again.p_static, built.p_static)
+
+
+@pytest.mark.parametrize("earlier", [False, True])
+def test_ctrl_c_while_saving_leaves_no_half_result(built, tmp_path, monkeypatch, earlier):
+    out = tmp_path / "out"
+    if earlier:
+        built.save(out)
+    files = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+
+    def press(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("stillmap.results.save.write_run_json", press)
+    with pytest.raises(KeyboardInterrupt):
+        built.save(out, overwrite=earlier)
+    assert sorted(tmp_path.iterdir()) == ([out] if earlier else [])
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == files
+
+
+@pytest.mark.slow  # starts a kernel of Jupyter
+def test_a_bar_in_a_notebook(folder, tmp_path):
+    nbclient = pytest.importorskip("nbclient")
+    nbformat = pytest.importorskip("nbformat")
+    pytest.importorskip("ipykernel")
+    cells = [
+        f"import stillmap\nresult = stillmap.build({str(folder)!r}, {FAST}, progress=True)",
+        "result",
+    ]
+    book = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(cell) for cell in cells])
+    shown = []
+
+    class Client(nbclient.NotebookClient):
+        def process_message(self, message, cell, index):
+            if message["msg_type"] in ("display_data", "update_display_data"):
+                shown.append(message["content"]["data"].get("text/html", ""))
+            return super().process_message(message, cell, index)
+
+    Client(book, timeout=120, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    assert any("<progress" in page and "matching scans, iteration 1" in page for page in shown)
+    first, second = (cell["outputs"] for cell in book["cells"])
+    # the bar is gone, and nothing was printed
+    assert [one["data"].get("text/html") for one in first] == [""]
+    assert "data:image/png;base64" in second[0]["data"]["text/html"]
+    assert second[0]["data"]["text/plain"].startswith("<BuiltResult: 60 scans")
