@@ -20,7 +20,7 @@ from stillmap.results.reader import Crossings, Grid
 
 Mask = NDArray[np.bool_]
 
-_TRAFFIC = "--slow-to"  # where the limit of the slow squares comes from
+_TRAFFIC = "traffic"  # where the limit of the slow squares comes from
 
 
 class TrafficRule(NamedTuple):
