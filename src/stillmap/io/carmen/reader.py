@@ -204,7 +204,7 @@ def _find_odometry(
         warnings.append(f"{outside} scans outside the time of the odometry: nearest pose")
     if len(out) > 1 and not _moves(out):
         warnings.append(
-            advise("the odometry never moves", "if the robot did, ignore it (--no-odometry)")
+            advise("the odometry never moves", "if the robot did, map without odometry")
         )
     return out, {"from": " and ".join(kinds), "outside": outside}
 
