@@ -26,7 +26,8 @@ def run_notebook(path: Path) -> Any:
         CellExecutionError: a cell fails.
     """
     notebook = nbformat.read(path, as_version=4)
-    return NotebookClient(notebook, timeout=TIMEOUT).execute()
+    quiet = ["--IPKernelApp.log_level=40"]  # of the transport, which is of this machine alone
+    return NotebookClient(notebook, timeout=TIMEOUT, extra_arguments=quiet).execute()
 
 
 def _render_cell(cell: Any) -> str:

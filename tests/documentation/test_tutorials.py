@@ -1,5 +1,8 @@
-"""Commands of the quickstart and the tutorials do what their pages say: each page is run, block by
-block, in an empty folder. `console` and `text` blocks are for reading."""
+"""Commands of the quickstart and the tutorials work: each page is run in an empty folder.
+
+Blocks marked `sh` and `python` are run one after the other. Those marked `bash` or `text` are for
+reading: they need a robot, or its files.
+"""
 
 import os
 import re

@@ -112,7 +112,7 @@ class Recording(ShortRepr):
         Raises:
             ValueError: names the argument, what was expected, and what it was.
 
-        Example:
+        Examples:
             >>> recording = stillmap.Recording.from_scans(stamps, ranges, angles, odometry)
             >>> result = stillmap.build(recording)
         """
@@ -158,7 +158,7 @@ class Recording(ShortRepr):
         Raises:
             ValueError: names the argument, what was expected, and what it was.
 
-        Example:
+        Examples:
             >>> sweeps = (numpy.load(file) for file in files)
             >>> recording = stillmap.Recording.from_clouds(stamps, sweeps)
         """

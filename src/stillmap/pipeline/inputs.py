@@ -40,7 +40,7 @@ def read(
     Raises:
         InputError: there is no readable recording.
 
-    Example:
+    Examples:
         >>> recording = stillmap.read("log.bag", stillmap.ReadOptions(min_range=0.3))
     """
     recording = formats.read(Path(path), options, progress=progress, scratch=scratch)

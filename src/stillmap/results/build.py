@@ -51,7 +51,7 @@ def build(
         ValueError: a recording without scans, poses of another shape.
         OSError: the disk of `scratch` is full.
 
-    Example:
+    Examples:
         >>> result = stillmap.build("log.bag", resolution=0.1)
         >>> result.save("out")
     """

@@ -145,7 +145,7 @@ def load(
     Raises:
         InputError: there is no result, or a file of it is missing or damaged.
 
-    Example:
+    Examples:
         >>> result = stillmap.load("out")
         >>> result.plot()
     """
