@@ -60,13 +60,10 @@ def test_filtered_log(call, tmp_path):
 
 
 def test_filtered_bag(call, room, tmp_path):
-    """Its ending has to say so; scans that were not mapped are named."""
+    """Another recording than the one that was mapped is refused."""
     assert call("convert", room, "-o", tmp_path / "a.bag", "--quiet").returncode == 0
     done = call("map", tmp_path / "a.bag", "-o", tmp_path / "out", *QUICK)
     assert done.returncode == 0, done.stderr
-    for name in ("clean.clf.gz", "clean.log", "clean.mcap"):
-        done = call("filter", tmp_path / "out", "-o", tmp_path / name)
-        refused(done, name, "a.bag", "stillmap convert")
     done = call("filter", tmp_path / "out", "-o", tmp_path / "clean.bag")
     assert done.returncode == 0, done.stderr
     # what was filtered is another recording than what was mapped
@@ -85,7 +82,38 @@ def test_logs_of_any_name(call, room, tmp_path):
         done = call("filter", tmp_path / "out", "-o", tmp_path / name)
         assert done.returncode == 0, done.stderr
         assert read(tmp_path / name).n_scans == read(room).n_scans
-    refused(call("filter", tmp_path / "out", "-o", tmp_path / "clean.ply"), "clean.ply")
+
+
+@pytest.mark.parametrize("output", ["c.bag", "c.mcap", "c.db3", "c.log", "c.clf.gz", "c:ros2"])
+def test_other_formats_by_name(call, room, mapped, tmp_path, output):
+    """Blanked beams become misses."""
+    name, _, form = output.partition(":")
+    more = ("--to", form) if form else ()
+    done = call("filter", mapped, "-o", tmp_path / name, *more)
+    assert done.returncode == 0, done.stderr
+    before, after = stillmap_folder.read(room), read(tmp_path / name)
+    blank = before.hit & (np.load(mapped / "beams/p_static.npy") < 0.5)
+    np.testing.assert_array_equal(after.hit, before.hit & ~blank)
+    np.testing.assert_allclose(after.points[after.hit], before.points[after.hit], atol=1e-3)
+    assert f"{blank.sum()} beams blanked" in done.stderr
+
+
+@pytest.mark.parametrize("form", ["kitti", "pcd"])
+def test_other_formats_of_points(call, room, mapped, tmp_path, form):
+    """They hold hits alone; what they lose is said."""
+    done = call("filter", mapped, "-o", tmp_path / "clean", "--to", form)
+    assert done.returncode == 0, done.stderr
+    before, after = stillmap_folder.read(room), read(tmp_path / "clean")
+    kept = before.hit & ~(np.load(mapped / "beams/p_static.npy") < 0.5)
+    np.testing.assert_array_equal(after.points[:, :2], before.points[kept])
+    misses = np.count_nonzero(~before.hit)
+    assert f"warning: {misses} beams without a return are left out" in done.stderr
+
+
+def test_formats_that_are_not_written(call, mapped, tmp_path):
+    for name in ("clean.pcd", "clean.e57", "clean.3d"):
+        refused(call("filter", mapped, "-o", tmp_path / name), name, "other formats", "--to")
+    assert not list(tmp_path.iterdir())
 
 
 def test_moved_recording(call, room, mapped, tmp_path):

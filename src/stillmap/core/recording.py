@@ -34,6 +34,8 @@ class Recording(ShortRepr):
         T_recorded_base: (T, D+1, D+1) float64, poses stored in the recording, of a survey or other
             programs; used only on request. None: no poses.
         images: camera images; None: no images.
+        record: (T,) int64, number of the record that each scan was read from: the message of its
+            topic from 1, or the file (scan of a file) of a folder from 0; None: unknown.
         scratch: folder of memory-mapped per-beam arrays; None: the system's temporary folder.
     """
 
@@ -48,6 +50,7 @@ class Recording(ShortRepr):
     beam_time: NDArray[np.float32] | None = None
     T_recorded_base: NDArray[np.float64] | None = None
     images: Images | None = None
+    record: NDArray[np.int64] | None = None
     scratch: Path | None = None
 
     def __post_init__(self) -> None:
@@ -64,6 +67,8 @@ class Recording(ShortRepr):
         for name in ("T_odom_base", "T_recorded_base"):
             if getattr(self, name) is not None:
                 _check(name, getattr(self, name), (T, D + 1, D + 1), np.float64)
+        if self.record is not None:
+            _check("record", self.record, (T,), np.int64)
         if self.beam_time is not None:
             _check("beam_time", self.beam_time, (M,), np.float32)
             for block in arrays.iter_blocks(self.beam_time):

@@ -91,6 +91,7 @@ class RecordingBuilder:
         source: dict[str, Any],
         T_odom_base: NDArray[np.float64] | None = None,
         T_recorded_base: NDArray[np.float64] | None = None,
+        record: NDArray[np.int64] | None = None,
         selection: NDArray[np.intp] | None = None,
         **more: Any,
     ) -> Recording:
@@ -100,6 +101,7 @@ class RecordingBuilder:
             T_base_sensor: (S, D+1, D+1).
             source: see Recording.
             T_odom_base, T_recorded_base: (T, D+1, D+1) in the order in which scans were added.
+            record: (T,) likewise; see Recording.
             selection: indices of the scans to use; None: all.
             more: other fields of the Recording.
         """
@@ -123,6 +125,7 @@ class RecordingBuilder:
             source=source,
             beam_time=None if self._times is None else reorder(self._times),
             T_recorded_base=None if T_recorded_base is None else T_recorded_base[order],
+            record=None if record is None else record[order],
             **more,
         )
 

@@ -1,5 +1,7 @@
 """Image files, read and written with Pillow."""
 
+import io
+import struct
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -47,6 +49,49 @@ def write_png(image: NDArray[Any], path: Path) -> None:
     """Write an integer image as PNG; see `read_image` for its shape and type."""
     # higher levels take ten times as long
     Image.fromarray(image).save(path, format="PNG", compress_level=1)
+
+
+_PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
+_PNG_PIXELS = (b"IHDR", b"IDAT", b"IEND")  # chunks that follow from the pixels
+
+
+def is_png(path: Path) -> bool:
+    """Whether a file begins as a PNG image."""
+    with path.open("rb") as file:
+        return file.read(len(_PNG_MAGIC)) == _PNG_MAGIC
+
+
+def rewrite_png(path: Path, image: NDArray[Any]) -> bytes:
+    """A PNG file of an image of integers with the other content (text, scale) of an existing one.
+
+    Raises:
+        InputError: the existing file is damaged.
+    """
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, format="PNG")
+    new = list(_iter_png_chunks(buffer.getvalue(), path))
+    old = list(_iter_png_chunks(path.read_bytes(), path))
+    first_pixels = next((k for k, (kind, _) in enumerate(old) if kind == b"IDAT"), len(old))
+    before, after = (
+        [data for kind, data in part if kind not in _PNG_PIXELS]
+        for part in (old[:first_pixels], old[first_pixels:])
+    )
+    head, *body, end = (data for kind, data in new if kind in _PNG_PIXELS)
+    return b"".join([_PNG_MAGIC, head, *before, *body, *after, end])
+
+
+def _iter_png_chunks(content: bytes, path: Path) -> Iterator[tuple[bytes, bytes]]:
+    """Name and bytes of each chunk of a PNG file."""
+    at, kind = len(_PNG_MAGIC), b""
+    while kind != b"IEND":
+        if at + 12 > len(content):
+            raise InputError("is a damaged PNG image", where=str(path))
+        size, kind = struct.unpack_from(">I4s", content, at)
+        chunk = content[at : at + 12 + size]
+        if len(chunk) < 12 + size:
+            raise InputError("is a damaged PNG image", where=str(path))
+        yield kind, chunk
+        at += len(chunk)
 
 
 @contextmanager

@@ -108,7 +108,7 @@ def read_depth_camera(
     Raises:
         InputError: none can be read, or the calibration does not fit.
     """
-    size = _first_image_size(frames.depth)
+    size = first_image_size(frames.depth)
     if size is None:
         raise InputError("is no image, nor is any other", where=str(frames.depth[0][1]))
     width, height = size
@@ -136,7 +136,8 @@ def read_depth_camera(
     return camera
 
 
-def _first_image_size(images: list[tuple[int, Path]]) -> tuple[int, int] | None:
+def first_image_size(images: list[tuple[int, Path]]) -> tuple[int, int] | None:
+    """Width and height of the first image that can be read; None: none can."""
     for _, file in images:
         with suppress(InputError):
             return read_image_size(file)
@@ -159,11 +160,16 @@ def _read_cloud(file: Path, T: Float | None, grid: _Grid) -> Cloud:
     if image.shape != (grid.height, grid.width):
         raise InputError("is of another size than the first", where=str(file))
     depth = image[:: grid.step, :: grid.step]
-    usable = (depth > 0) & (depth < _MAX_UNITS)
+    usable = is_depth(depth)
     if not usable.any():
         raise InputError("holds no depth", where=str(file))
     metres = np.where(usable, depth / np.float32(grid.scale), np.float32(np.nan))
     return Cloud((grid.rays * metres[..., None]).reshape(-1, 3), T)
+
+
+def is_depth(units: NDArray[np.uint16]) -> NDArray[np.bool_]:
+    """Whether pixels of a depth image hold a depth."""
+    return np.asarray((units > 0) & (units < _MAX_UNITS))
 
 
 def _read_color_images(
@@ -178,7 +184,7 @@ def _read_color_images(
             depth; None: it is the depth camera.
         warnings: more are added.
     """
-    size = _first_image_size(frames.color)
+    size = first_image_size(frames.color)
     if size is None:
         return None
     width, height = size

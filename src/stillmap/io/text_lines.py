@@ -46,8 +46,16 @@ def write_atomically(path: Path) -> Iterator[IO[bytes] | gzip.GzipFile]:
 
     Equal texts give equal bytes.
     """
-    with atomic_file(path) as work, work.open("wb") as file:
-        if not path.name.lower().endswith(".gz"):
+    compressed = path.name.lower().endswith(".gz")
+    with atomic_file(path) as work, open_new_text(work, compressed) as file:
+        yield file
+
+
+@contextmanager
+def open_new_text(path: Path, compressed: bool) -> Iterator[IO[bytes] | gzip.GzipFile]:
+    """A new file, gzip where `compressed`. Equal texts give equal bytes."""
+    with path.open("wb") as file:
+        if not compressed:
             yield file
             return
         # neither name nor time; level 6 is far faster than 9 for a tenth more bytes

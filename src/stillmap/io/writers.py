@@ -42,6 +42,7 @@ class Writer(NamedTuple):
         marker: name, or pattern of names, of a file that every such folder holds; "" for files.
         write: writes a recording, which appears complete or not at all.
         fields: those of `_OPTIONAL_FIELDS` that it writes.
+        max_dimension, max_sensors: of recordings that it holds.
     """
 
     name: str
@@ -50,6 +51,8 @@ class Writer(NamedTuple):
     marker: str
     write: Write
     fields: tuple[str, ...] = ()
+    max_dimension: int = 3
+    max_sensors: int | None = None
 
 
 def _write_stillmap(recording: Recording, path: Path, overwrite: bool) -> list[str]:
@@ -121,13 +124,29 @@ WRITERS = (
         "",
         lambda recording, path, overwrite: write_log(recording, path),  # noqa: ARG005
         _ODOMETRY,
+        max_dimension=2,
+        max_sensors=2,
     ),
     Writer("bag", "a ROS 1 bag", (".bag",), "", partial(write_bag, kind="bag"), _ODOMETRY),
     Writer("db3", "a ROS 2 bag file", (".db3",), "", partial(write_bag, kind="db3"), _ODOMETRY),
     Writer("mcap", "an MCAP file", (".mcap",), "", partial(write_bag, kind="mcap"), _ODOMETRY),
-    Writer("kitti", "a KITTI folder", (), kitti.MARKER, _write_kitti, _POSES + _ODOMETRY),
     Writer(
-        "pcd", "a folder of PCD files", (), pcd.MARKER, partial(_write_scans, pcd.write), _POSES
+        "kitti",
+        "a KITTI folder",
+        (),
+        kitti.MARKER,
+        _write_kitti,
+        _POSES + _ODOMETRY,
+        max_sensors=1,
+    ),
+    Writer(
+        "pcd",
+        "a folder of PCD files",
+        (),
+        pcd.MARKER,
+        partial(_write_scans, pcd.write),
+        _POSES,
+        max_sensors=1,
     ),
     Writer(
         "ply", "a PLY file", (".ply",), "", partial(_write_cloud, ply.write), _POSES + _ODOMETRY
@@ -165,6 +184,21 @@ def find_writer(path: Path, name: str | None = None) -> Writer:
         hint = f"{known}, or a folder without an ending"
         raise InputError(what, where=str(path), hint=hint)
     return WRITERS[0]
+
+
+def require_fit(path: Path, writer: Writer, dimension: int, sensors: int) -> None:
+    """Refuse recordings that a format cannot hold, before they are read.
+
+    Raises:
+        InputError: it has too many dimensions or sensors.
+    """
+    what = f"{writer.description} cannot hold this recording"
+    if dimension > writer.max_dimension:
+        fault = f"{writer.max_dimension}D at most, it is {dimension}D"
+        raise InputError(f"{what}: {fault}", where=str(path))
+    if writer.max_sensors is not None and sensors > writer.max_sensors:
+        fault = f"at most {writer.max_sensors} sensors, it has {sensors}"
+        raise InputError(f"{what}: {fault}", where=str(path))
 
 
 def write(

@@ -30,6 +30,7 @@ from stillmap.slam import SlamOptions, deskew_recording
 
 T = TypeVar("T")
 
+_STATIC_CLOUD = "static.ply"  # results of 3D recordings have it
 _MAX_RUN = 32 << 20  # bytes of a run.json
 
 
@@ -145,6 +146,28 @@ class ResultFolder(ShortRepr):
             where = str(self.folder)
             raise InputError(f"has options that cannot be: {error}", where=where) from error
 
+    @property
+    def dimension(self) -> int:
+        """Dimension of its recording, 2 or 3."""
+        return 3 if (self.folder / _STATIC_CLOUD).is_file() else 2
+
+    @property
+    def n_sensors(self) -> int:
+        """Number of sensors of its recording that the record lists, at least 1."""
+        sensors = self.record["input"].get("sensors")
+        return max(len(sensors), 1) if isinstance(sensors, list) else 1
+
+    def require_source(self) -> Path:
+        """Where the recording is.
+
+        Raises:
+            InputError: it is not there any more.
+        """
+        if not self.source_given and not self.source.exists():
+            hint = "that is where it was when it was mapped: name it with recording=PATH"
+            raise InputError("does not exist", where=str(self.source), hint=hint)
+        return self.source
+
     def read(
         self, progress: Progress | None = None, scratch: Path | None = None
     ) -> tuple[Recording, Labels]:
@@ -157,13 +180,10 @@ class ResultFolder(ShortRepr):
         Raises:
             InputError: one of them is not there, or they do not belong together.
         """
-        read_as = self.read_options
-        if not self.source_given and not self.source.exists():
-            hint = "that is where it was when it was mapped: name it with recording=PATH"
-            raise InputError("does not exist", where=str(self.source), hint=hint)
-        recording = read(self.source, read_as, progress=progress, scratch=scratch)
-        labels = read_labels(self.folder)
-        require_labelled(recording, labels, str(self.source))
+        read_as, labels = self.read_options, read_labels(self.folder)
+        source = self.require_source()
+        recording = read(source, read_as, progress=progress, scratch=scratch)
+        require_labelled(recording, labels, str(source))
         return recording, labels
 
     def calibrate(self, recording: Recording) -> Recording:

@@ -105,4 +105,5 @@ def slice_scans(recording: Recording, first: int, end: int) -> Recording:
         T_recorded_base=None,
         beam_time=None if times is None else times[beams],
         images=None,
+        record=None,
     )

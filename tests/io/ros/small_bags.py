@@ -12,6 +12,8 @@ from rosbags.rosbag2 import Writer as Writer2
 from stillmap.io.ros.messages import load_typestore
 
 KINDS = ("bag", "db3", "mcap", "folder")
+FLOAT, DOUBLE, UINT32, UINT16 = 7, 8, 6, 4
+_KINDS = {FLOAT: "f4", DOUBLE: "f8", UINT32: "u4", UINT16: "u2"}
 
 
 class Messages:
@@ -133,3 +135,53 @@ def write_bag(
         shutil.move(path / single.name, single)
         return single
     return path
+
+
+def cloud_message(
+    messages: Messages,
+    stamp: int,
+    columns: list[tuple[str, int, Any]],
+    *,
+    frame: str = "lidar",
+    height: int = 1,
+    step: int | None = None,
+    padding: int = 0,
+    big: bool = False,
+    **changes: Any,
+) -> tuple[str, Any]:
+    """A cloud of named columns (name, type, values), in this order; rows may be padded."""
+    n = len(columns[0][2])
+    offsets, at = [], 0
+    for _, kind, _ in columns:
+        offsets.append(at)
+        at += np.dtype(_KINDS[kind]).itemsize
+    step = step or at
+    order = ">" if big else "<"
+    dtype = np.dtype(
+        {
+            "names": [name for name, _, _ in columns],
+            "formats": [order + _KINDS[kind] for _, kind, _ in columns],
+            "offsets": offsets,
+            "itemsize": step,
+        }
+    )
+    values = np.zeros(n, dtype)
+    for name, _, column in columns:
+        values[name] = column
+    width = n // height
+    rows = values.view(np.uint8).reshape(height, width * step)
+    data = np.concatenate([rows, np.full((height, padding), 0xAB, np.uint8)], axis=1)
+    field = messages.store.types["sensor_msgs/msg/PointField"]
+    fields = [field(name, o, kind, 1) for (name, kind, _), o in zip(columns, offsets, strict=True)]
+    stated = {
+        "height": height,
+        "width": width,
+        "fields": fields,
+        "is_bigendian": big,
+        "point_step": step,
+        "row_step": width * step + padding,
+        "data": data.ravel(),
+        "is_dense": True,
+    } | changes
+    kind = "sensor_msgs/msg/PointCloud2"
+    return kind, messages.make(kind, messages.header(stamp, frame), **stated)

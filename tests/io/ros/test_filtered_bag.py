@@ -3,15 +3,21 @@
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
-from small_bags import write_bag
+from small_bags import FLOAT, UINT16, UINT32, cloud_message, write_bag
 
+from stillmap.core.errors import InputError
 from stillmap.io import read
-from stillmap.io.ros import recording_writer
+from stillmap.io.filtered_copy import FilterJob, Omissions
+from stillmap.io.ros.filtered_bag import write_filtered
 from stillmap.io.ros.messages import load_typestore
 from stillmap.preprocessing.options import ReadOptions
 
 START = 1_700_000_000_000_000_000
 SECOND = 10**9
+
+
+def filtered(source, out, recording, blank):
+    return write_filtered(FilterJob(source, out, recording, blank, ReadOptions()))
 
 
 def scans(messages, n=6):
@@ -40,8 +46,8 @@ def test_other_messages_are_copied(bag, messages, tmp_path):
     blank = np.zeros(recording.n_beams, np.bool_)
     blank[[1, 7, 8]] = True  # of the first and the second scan
     out = tmp_path / f"out{source.suffix}"
-    done = recording_writer.write_filtered_bag(source, out, recording, blank, ReadOptions())
-    assert (done.omitted, done.omitted_topics) == (1, [])
+    done = filtered(source, out, recording, blank)
+    assert done == Omissions(scans=1)
     before, after = contents(source, messages), contents(out, messages)
     damaged = [one for one in before if one[0] == "/scan"][2]
     before.remove(damaged)
@@ -69,7 +75,7 @@ def test_the_no_return_code_of_the_laser_is_used(bag, messages, tmp_path, zeros)
     recording = read(source)
     blank = recording.hit & (rng.random(recording.n_beams) < 0.3)
     out = tmp_path / f"out{source.suffix}"
-    recording_writer.write_filtered_bag(source, out, recording, blank, ReadOptions())
+    filtered(source, out, recording, blank)
     got = np.concatenate([m.ranges for _, _, m in contents(out, messages)])
     assert (got[blank] == (0.0 if zeros else np.inf)).all()
     again = read(out)
@@ -93,8 +99,8 @@ def test_two_lasers_and_an_unused_one(bag, messages, tmp_path):
     blank = np.zeros(recording.n_beams, np.bool_)
     blank[recording.beams_of(3)] = True  # of the second laser
     out = tmp_path / f"out{source.suffix}"
-    done = recording_writer.write_filtered_bag(source, out, recording, blank, ReadOptions())
-    assert done.unfiltered_topics == ["/elsewhere"]
+    done = filtered(source, out, recording, blank)
+    assert done.notes == ("/elsewhere is as it was: it was not mapped",)
     infinite = [
         (topic, log_ns)
         for topic, log_ns, m in contents(out, messages)
@@ -119,12 +125,7 @@ def test_unknown_types_are_copied(tmp_path, kind, messages):
         recording = read(source)
         out = tmp_path / f"out{source.suffix}"
         blank = np.zeros(recording.n_beams, np.bool_)
-        assert (
-            recording_writer.write_filtered_bag(
-                source, out, recording, blank, ReadOptions()
-            ).omitted_topics
-            == []
-        )
+        assert filtered(source, out, recording, blank).notes == ()
         things = [m for topic, _, m in contents(out, messages) if topic == "/thing"]
         assert [(m.number, m.words) for m in things] == [(7, "seven")]
     finally:
@@ -141,5 +142,133 @@ def test_cut_bag(bag, messages, kind, tmp_path):
     out = tmp_path / f"out{source.suffix}"
     blank = np.zeros(recording.n_beams, np.bool_)
     blank[3] = True
-    recording_writer.write_filtered_bag(source, out, recording, blank, ReadOptions())
+    filtered(source, out, recording, blank)
     np.testing.assert_array_equal(read(out).hit, recording.hit & ~blank)
+
+
+def cloud(messages, k, n=24, **changes):
+    rng = np.random.default_rng(k + 1)
+    x, y, z = rng.normal(size=(3, n)).astype(np.float32) * 5.0
+    x[2], y[5] = np.nan, np.inf
+    x[7] = y[7] = z[7] = 0.0
+    columns = [
+        ("intensity", FLOAT, rng.random(n)),
+        *(("x", FLOAT, x), ("y", FLOAT, y), ("z", FLOAT, z)),
+        ("ring", UINT16, np.arange(n) % 16),
+        ("t", UINT32, np.linspace(0.0, 9e7, n).astype(np.uint32)),
+    ]
+    stamp = START + k * SECOND
+    return "/points", stamp, cloud_message(messages, stamp, columns, step=32, **changes)
+
+
+def decode_cloud(messages, raw):
+    store, kind = load_typestore(messages.encoding), "sensor_msgs/msg/PointCloud2"
+    if messages.encoding == "ros1":
+        return store.deserialize_ros1(raw, kind)
+    return store.deserialize_cdr(raw, kind)
+
+
+def raw_contents(path, messages):
+    with AnyReader([path], default_typestore=load_typestore(messages.encoding)) as reader:
+        return [(c.topic, log_ns, bytes(raw)) for c, log_ns, raw in reader.messages()]
+
+
+@pytest.mark.parametrize(
+    ("height", "changes"),
+    [
+        (1, {}),
+        (1, {"padding": 8}),
+        (1, {"row_step": 0}),
+        (1, {"big": True}),
+        (4, {"padding": 8}),
+        (4, {"big": True}),
+    ],
+)
+def test_points_of_clouds(bag, kind, messages, tmp_path, height, changes):
+    """Points go, or in organised clouds their coordinates; each other byte stays."""
+    if changes and kind in ("db3", "folder"):
+        pytest.skip("messages are those of MCAP files")
+    content = [cloud(messages, k, height=height, **changes) for k in range(6)]
+    content[2] = (*content[2][:2], (content[2][2][0], b"no cloud"))
+    back = cloud(messages, -1, height=height, **changes)[2]
+    content[3] = (*content[3][:2], back)  # its stamp goes back
+    for k in range(4):
+        stamp = START + k * SECOND
+        content.append(("/odom", stamp, messages.odometry(stamp, (k, 0, 0), (0, 0, 0, 1))))
+        other = cloud_message(messages, stamp, [(a, FLOAT, np.ones(3)) for a in "xyz"], frame="b")
+        content.append(("/other", stamp, other))
+    source = bag(sorted(content, key=lambda one: one[1]))
+    recording = read(source, ReadOptions(topic="/points"))
+    rng = np.random.default_rng(0)
+    blank = recording.hit & (rng.random(recording.n_beams) < 0.4)
+    blank[recording.beams_of(1)] = False
+    out = tmp_path / f"out{source.suffix}"
+    done = filtered(source, out, recording, blank)
+    assert done == Omissions(2, ("/other is as it was: it was not mapped",))
+    before, after = raw_contents(source, messages), raw_contents(out, messages)
+    others = [one for one in before if one[0] != "/points"]
+    assert [one for one in after if one[0] != "/points"] == others
+    clouds, old_clouds = (
+        [decode_cloud(messages, raw) for topic, _, raw in part if topic == "/points"]
+        for part in (after, [one for one in before if one[2] != b"no cloud"])
+    )
+    del old_clouds[2]  # before its time
+    assert [t for n, t, _ in after if n == "/points"] == [START + k * SECOND for k in (0, 1, 4, 5)]
+    assert len(clouds) == recording.n_scans == 4
+    for scan, (old, new) in enumerate(zip(old_clouds, clouds, strict=True)):
+        gone = blank[recording.beams_of(scan)]
+        assert new.header == old.header
+        assert [vars(f) for f in new.fields] == [vars(f) for f in old.fields]
+        assert (new.point_step, new.is_bigendian) == (old.point_step, old.is_bigendian)
+        assert new.height == height
+        if height == 1:
+            padding = changes.get("padding", 0)
+            assert new.width == 24 - gone.sum()
+            assert new.row_step == (old.row_step - 32 * gone.sum() if old.row_step else 0)
+            rows = np.array(old.data[: 24 * 32]).reshape(24, 32)
+            expected = np.append(rows[~gone].ravel(), np.full(padding, 0xAB, np.uint8))
+            np.testing.assert_array_equal(new.data, expected)
+            assert new.is_dense
+        else:
+            assert (new.width, new.row_step) == (old.width, old.row_step)
+            assert new.is_dense == (not gone.any())
+            rows = [np.array(one.data).reshape(height, -1) for one in (old, new)]
+            np.testing.assert_array_equal(rows[0][:, 6 * 32 :], rows[1][:, 6 * 32 :])
+            old_points, new_points = (one[:, : 6 * 32].reshape(24, 32) for one in rows)
+            np.testing.assert_array_equal(old_points[~gone], new_points[~gone])
+            fields = [*range(4), *range(16, 32)]
+            np.testing.assert_array_equal(old_points[:, fields], new_points[:, fields])
+            order = ">" if changes.get("big") else "<"
+            assert np.isnan(new_points[gone][:, 4:16].copy().view(f"{order}f4")).all()
+    again = read(out, ReadOptions(topic="/points"))
+    np.testing.assert_array_equal(again.points[again.hit], recording.points[recording.hit & ~blank])
+    np.testing.assert_array_equal(
+        again.beam_time[again.hit], recording.beam_time[recording.hit & ~blank]
+    )
+
+
+def test_clouds_in_another_kind_of_ros2_bag(bag, messages, kind, tmp_path):
+    """Every message of every topic moves over."""
+    if kind == "bag":
+        pytest.skip("messages of ROS 1 are others")
+    source = bag([cloud(messages, k) for k in range(3)])
+    recording = read(source)
+    blank = np.zeros(recording.n_beams, np.bool_)
+    for target in ("db3", "mcap", "ros2"):
+        out = tmp_path / f"out.{target}"
+        write_filtered(FilterJob(source, out, recording, blank, ReadOptions(), kind=target))
+        assert read(out).n_scans == 3
+        assert out.is_dir() == (target == "ros2")
+        if target == "ros2":
+            assert raw_contents(out, messages) == raw_contents(source, messages)
+
+
+def test_a_bag_that_has_changed_is_refused(bag, messages, tmp_path):
+    source = bag([cloud(messages, k) for k in range(3)])
+    recording = read(source)
+    blank = recording.hit.copy()
+    for k, content in enumerate(([0, 1], [0, 1, 2])):
+        other = bag([cloud(messages, j, n=20 + 4 * (1 - k)) for j in content], f"other{k}")
+        with pytest.raises(InputError, match=r"was mapped"):
+            filtered(other, tmp_path / f"out{source.suffix}", recording, blank)
+    assert not list(tmp_path.glob("out*"))

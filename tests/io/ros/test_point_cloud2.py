@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
+from small_bags import DOUBLE, FLOAT, UINT16, UINT32, cloud_message
 
 from stillmap.cli.recording_info import summarize_recording
 from stillmap.core.errors import InputError
@@ -15,49 +16,6 @@ from stillmap.preprocessing.options import ReadOptions
 
 START = 1_700_000_000_000_000_000
 SECOND = 10**9
-FLOAT, DOUBLE, UINT32, UINT16 = 7, 8, 6, 4
-_KINDS = {FLOAT: "f4", DOUBLE: "f8", UINT32: "u4", UINT16: "u2"}
-
-
-def cloud_message(
-    messages, stamp, columns, *, frame="lidar", height=1, step=None, padding=0, big=False, **changes
-):
-    """A cloud of named columns (name, type, values), in this order; rows may be padded."""
-    n = len(columns[0][2])
-    offsets, at = [], 0
-    for _, kind, _ in columns:
-        offsets.append(at)
-        at += np.dtype(_KINDS[kind]).itemsize
-    step = step or at
-    order = ">" if big else "<"
-    dtype = np.dtype(
-        {
-            "names": [name for name, _, _ in columns],
-            "formats": [order + _KINDS[kind] for _, kind, _ in columns],
-            "offsets": offsets,
-            "itemsize": step,
-        }
-    )
-    values = np.zeros(n, dtype)
-    for name, _, column in columns:
-        values[name] = column
-    width = n // height
-    rows = values.view(np.uint8).reshape(height, width * step)
-    data = np.concatenate([rows, np.full((height, padding), 0xAB, np.uint8)], axis=1)
-    field = messages.store.types["sensor_msgs/msg/PointField"]
-    fields = [field(name, o, kind, 1) for (name, kind, _), o in zip(columns, offsets, strict=True)]
-    stated = {
-        "height": height,
-        "width": width,
-        "fields": fields,
-        "is_bigendian": big,
-        "point_step": step,
-        "row_step": width * step + padding,
-        "data": data.ravel(),
-        "is_dense": True,
-    } | changes
-    kind = "sensor_msgs/msg/PointCloud2"
-    return kind, messages.make(kind, messages.header(stamp, frame), **stated)
 
 
 def xyz(rng, n=12):

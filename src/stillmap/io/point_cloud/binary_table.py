@@ -40,6 +40,7 @@ class TableLayout:
     Attributes:
         path: the file.
         fields: the columns in order.
+        header: bytes of the header.
         rows: point count of the header.
         start: byte offset of the first point.
         lines: line count before the first point, of text.
@@ -48,6 +49,7 @@ class TableLayout:
 
     path: Path
     fields: tuple[Field, ...]
+    header: int
     rows: int
     start: int
     lines: int
@@ -177,9 +179,13 @@ def iter_text_lines(path: Path, skip: int = 0, limit: int | None = None) -> Iter
         if limit is not None and size > limit:
             what = f"is too large: more than {limit >> 20} MiB when unpacked"
             raise InputError(what, where=str(path))
-        # np.loadtxt skips lines of any whitespace of Latin-1
-        if line.number > skip and not line.text.decode("latin1").isspace():
+        if line.number > skip and not is_blank(line.text):
             yield line.text
+
+
+def is_blank(line: bytes) -> bool:
+    """Whether a line of a table is skipped: it has nothing but whitespace of Latin-1."""
+    return line.decode("latin1").isspace()  # as np.loadtxt does
 
 
 def parse_numbers(

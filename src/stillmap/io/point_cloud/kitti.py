@@ -118,7 +118,7 @@ def _read_oxts(folder: Path) -> Poses:
 
 MARKER = "times.txt"  # only folders with this file are overwritten
 
-_RECORD = 16  # bytes of a point: float32 x y z reflectance
+RECORD = 16  # bytes of a point: float32 x y z reflectance
 
 _RAW = Path("velodyne_points/data")
 
@@ -133,6 +133,19 @@ def is_kitti_folder(path: Path) -> bool:
     return any((path / scans).is_dir() for scans, _ in _LAYOUTS)
 
 
+def list_scans(path: Path) -> list[Path]:
+    """The files of scans in the folder of a recording, by number.
+
+    Raises:
+        InputError: the folder cannot be read.
+    """
+    return list_files(path / _find_layout(path)[0], (".bin",))
+
+
+def _find_layout(path: Path) -> tuple[Path, Path]:
+    return next(one for one in _LAYOUTS if (path / one[0]).is_dir())
+
+
 def read(path: Path, context: ReadContext) -> Recording:
     """Read an odometry sequence or a raw drive; the laser is the base of the robot.
 
@@ -142,8 +155,8 @@ def read(path: Path, context: ReadContext) -> Recording:
     Raises:
         InputError: there are no stamps, or no scan can be read.
     """
-    scans, times_file = next(one for one in _LAYOUTS if (path / one[0]).is_dir())
-    files = list_files(path / scans, (".bin",))
+    scans, times_file = _find_layout(path)
+    files = list_scans(path)
     if not files:
         raise InputError("holds no scan (*.bin)", where=str(path / scans))
     if not (path / times_file).is_file():
@@ -174,8 +187,8 @@ def read(path: Path, context: ReadContext) -> Recording:
 def _read_scan(path: Path, T: NDArray[np.float64] | None) -> Cloud:
     require_nonempty_file(path)
     size = path.stat().st_size
-    if size % _RECORD:
-        raise truncated_error(path, size // _RECORD, size // _RECORD + 1)
+    if size % RECORD:
+        raise truncated_error(path, size // RECORD, size // RECORD + 1)
     return Cloud(np.fromfile(path, "<f4").reshape(-1, 4)[:, :3], T)
 
 

@@ -3,7 +3,7 @@
 import io
 import struct
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from datetime import date
 from pathlib import Path
 from typing import IO, Any
@@ -42,25 +42,49 @@ def read(path: Path, context: ReadContext) -> Recording:
 
 
 def _read_cloud(path: Path, origin: Origin, scratch: Path | None) -> Cloud:
+    points = ArrayBuilder(np.float32, (3,), scratch)
+    with open_las_reader(path) as reader:
+        for block in iter_blocks(reader, path):
+            points.append(origin.shift(np.stack([block.x, block.y, block.z], axis=1)))
+    return Cloud(points.finish())
+
+
+@contextmanager
+def open_las_reader(path: Path) -> Iterator[Any]:
+    """Open a laspy reader of a file whose header is plausible.
+
+    Raises:
+        InputError: it is no LAS file, damaged, or laspy or lazrs is missing.
+    """
     require_nonempty_file(path)
     _check_header(path)
     laspy = import_extra("laspy", path)
-    points, expected, found = ArrayBuilder(np.float32, (3,), scratch), 0, 0
     # single-threaded: the parallel backend trusts chunk sizes
     backend = laspy.LazBackend.Lazrs
-    with library_errors(path), laspy.open(path, read_evlrs=False, laz_backend=backend) as reader:
-        expected = reader.header.point_count
-        if expected > max(_MAX_POINTS_PER_BYTE * path.stat().st_size, _MIN_POINT_LIMIT):
-            raise truncated_error(path, 0, expected)
-        rows = max(1, min(_BLOCK, _BLOCK_BYTES // reader.header.point_format.size))
+    with library_errors(path):
+        reader = laspy.open(path, read_evlrs=False, laz_backend=backend)
+    with closing(reader):
+        yield reader
+
+
+def iter_blocks(reader: Any, path: Path) -> Iterator[Any]:
+    """Yield the points of an open file in blocks.
+
+    Raises:
+        InputError: the file is truncated.
+    """
+    expected, found = reader.header.point_count, 0
+    if expected > max(_MAX_POINTS_PER_BYTE * path.stat().st_size, _MIN_POINT_LIMIT):
+        raise truncated_error(path, 0, expected)
+    rows = max(1, min(_BLOCK, _BLOCK_BYTES // reader.header.point_format.size))
+    with library_errors(path):
         for block in reader.chunk_iterator(rows):
             if len(block) > rows:
                 raise InputError("is damaged: the size of its points", where=str(path))
-            points.append(origin.shift(np.stack([block.x, block.y, block.z], axis=1)))
             found += len(block)
+            yield block
     if found < expected:
         raise truncated_error(path, found, expected)
-    return Cloud(points.finish())
 
 
 def _check_header(path: Path) -> None:

@@ -52,11 +52,13 @@ _MAX_EXPANSION = 100  # unpacked over packed bytes: LZF reaches a little less
 
 
 class PcdHeader(NamedTuple):
-    """Layout, VIEWPOINT `T` (4, 4; None: invalid), and whether columns are compressed."""
+    """Layout, VIEWPOINT `T` (4, 4; None: invalid), whether columns are compressed, and whether
+    points are organised in rows (HEIGHT above 1)."""
 
     layout: TableLayout
     T: NDArray[np.float64] | None
     compressed: bool
+    organised: bool
 
 
 def read_header(path: Path) -> PcdHeader:
@@ -91,9 +93,10 @@ def _parse_header(path: Path, entries: dict[str, list[str]], start: int, lines: 
     kind = entries["DATA"][0].lower()
     if kind not in ("ascii", "binary", "binary_compressed"):
         raise ValueError(f"DATA {kind[:20]}")
-    layout = TableLayout(path, fields, rows, start, lines, kind == "ascii")
+    layout = TableLayout(path, fields, start, rows, start, lines, kind == "ascii")
     T = _parse_viewpoint(entries.get("VIEWPOINT"))
-    return PcdHeader(layout, T, kind == "binary_compressed")
+    organised = entries.get("HEIGHT", ["1"])[:1] != ["1"]
+    return PcdHeader(layout, T, kind == "binary_compressed", organised)
 
 
 def _parse_viewpoint(words: list[str] | None) -> NDArray[np.float64] | None:
@@ -128,12 +131,25 @@ def read_values(head: PcdHeader, wanted: list[str]) -> list[NDArray[Any]]:
 
 def _read_compressed(layout: TableLayout, wanted: list[str]) -> list[NDArray[Any]]:
     """Read columns that are stored one after the other in one LZF block."""
-    check_record_size(layout)
     columns = [layout.find_column(name) for name in wanted]
-    size = layout.rows * layout.record
-    path = layout.path
+    data = unpack_columns(layout)
+    out = []
+    for field, byte, _ in columns:
+        column = np.frombuffer(data, field.dtype, layout.rows * field.count, byte * layout.rows)
+        out.append(column.reshape(layout.rows, field.count)[:, 0])
+    return out
+
+
+def unpack_columns(layout: TableLayout) -> bytes:
+    """The columns of a compressed file, one after the other.
+
+    Raises:
+        InputError: the compressed part is damaged or too large.
+    """
+    check_record_size(layout)
+    size, path = layout.rows * layout.record, layout.path
     if size == 0:
-        return [np.empty(0, field.dtype) for field, _, _ in columns]
+        return b""
     if size > _MAX_UNPACKED:
         what = f"is too large: more than {_MAX_UNPACKED >> 20} MiB when unpacked"
         raise InputError(what, where=str(path))
@@ -155,11 +171,7 @@ def _read_compressed(layout: TableLayout, wanted: list[str]) -> list[NDArray[Any
         data = None
     if data is None or len(data) != size:
         raise InputError("is damaged: its compressed part", where=str(path))
-    out = []
-    for field, byte, _ in columns:
-        column = np.frombuffer(data, field.dtype, layout.rows * field.count, byte * layout.rows)
-        out.append(column.reshape(layout.rows, field.count)[:, 0])
-    return out
+    return bytes(data)
 
 
 MARKER = "*.pcd"  # only folders with such a file are overwritten

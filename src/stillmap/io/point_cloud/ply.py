@@ -4,6 +4,7 @@ The reason is in CONTRIBUTING.md.
 """
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,8 +44,20 @@ def _read_cloud(path: Path, origin: Origin, scratch: Path | None) -> Cloud:
     return Cloud(points.finish())
 
 
+class PlyHeader(NamedTuple):
+    """Layout of the vertices, and whether other elements may refer to them by their number."""
+
+    layout: TableLayout
+    indexed: bool
+
+
 def read_layout(path: Path) -> TableLayout:
-    """Read the header: the layout of the vertices.
+    """Read the header: the layout of the vertices. Errors as `read_header`."""
+    return read_header(path).layout
+
+
+def read_header(path: Path) -> PlyHeader:
+    """Read the header.
 
     Raises:
         InputError: it is no PLY file, or its vertices cannot be located.
@@ -61,8 +74,8 @@ def read_layout(path: Path) -> TableLayout:
         raise InputError(f"is damaged: its header: {error}", where=str(path)) from error
 
 
-def _parse_header(path: Path, lines: list[list[str]], start: int) -> TableLayout:
-    encoding, order = "", ""
+def _parse_header(path: Path, lines: list[list[str]], start: int) -> PlyHeader:
+    encoding, order, header = "", "", start
     elements: list[tuple[str, int, list[Field | None]]] = []  # None: a list property
     for words in lines[1:-1]:
         if words[:1] == ["format"]:
@@ -81,7 +94,8 @@ def _parse_header(path: Path, lines: list[list[str]], start: int) -> TableLayout
         if name == "vertex":
             if len(plain) < len(fields):
                 raise ValueError("its vertices have list properties")
-            return TableLayout(path, plain, rows, start, before, text)
+            indexed = any(count > 0 for other, count, _ in elements if other != name)
+            return PlyHeader(TableLayout(path, plain, header, rows, start, before, text), indexed)
         if len(plain) < len(fields) and not text:
             raise ValueError("list properties precede its vertices")
         start += rows * sum(field.size for field in plain)

@@ -157,6 +157,7 @@ class _ScanBuilder:
         self._gathered: RecordingBuilder | None = None
         self._clock: Clock | None = None
         self._poses: list[NDArray[np.float64] | None] = []
+        self._numbers: list[int] = []
         self._without_stamp = 0
 
     def __len__(self) -> int:
@@ -186,6 +187,7 @@ class _ScanBuilder:
             return
         self._gathered.add_scan(stamp_ns, points, beam_time=beam_time)
         self._poses.append(cloud.T)
+        self._numbers.append(number)
 
     def recording(self, skipped: SkippedRecords, **more: Any) -> Recording:
         assert self._gathered is not None
@@ -204,7 +206,10 @@ class _ScanBuilder:
             **self._window.notes(),
         }
         return self._gathered.build(
-            np.eye(4)[None], source=source, **{"T_recorded_base": T, **more}
+            np.eye(4)[None],
+            source=source,
+            record=np.array(self._numbers, np.int64),
+            **{"T_recorded_base": T, **more},
         )
 
     def _stack_poses(self) -> NDArray[np.float64] | None:

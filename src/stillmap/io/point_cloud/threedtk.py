@@ -72,7 +72,7 @@ def _read_cloud(path: Path) -> Cloud:
     blocks = []
     # the first line may be a size or a heading
     first = next(lines, b"")
-    if len(first.split()) >= 3 and not first.lstrip().startswith(b"#"):
+    if is_point(first):
         blocks.append(parse_numbers(iter([first]), 1, (0, 1, 2), path))
     while len(block := parse_numbers(lines, _BLOCK, (0, 1, 2), path)):
         blocks.append(block)
@@ -80,9 +80,19 @@ def _read_cloud(path: Path) -> Cloud:
     return Cloud(_METRES * points @ _AXES.T, _read_pose(path))
 
 
+def is_point(first_line: bytes) -> bool:
+    """Whether the first line of a scan is a point."""
+    return len(first_line.split()) >= 3 and not first_line.lstrip().startswith(b"#")
+
+
+def pose_file(path: Path) -> Path:
+    """The file beside a scan that holds its pose."""
+    return path.with_name(strip_extension(path.name, THREEDTK_EXTENSIONS) + ".pose")
+
+
 def _read_pose(path: Path) -> NDArray[np.float64] | None:
     """(4, 4) pose in the file beside a scan; None where there is no valid one."""
-    file = path.with_name(strip_extension(path.name, THREEDTK_EXTENSIONS) + ".pose")
+    file = pose_file(path)
     try:
         if not file.is_file():
             return None

@@ -59,6 +59,7 @@ def build_laser_recording(content: BagContent, context: ReadContext) -> Recordin
         sensor=_number_sensors(used, mountings)[beams.scan],
         T_odom_base=None if odom is None else base_frame.project_to_plane(odom)[0],
         beam_time=beams.beam_time,
+        record=np.concatenate([s.number for s in used])[beams.scan],
         source={
             "sensors": [mounting.notes for mounting in mountings],
             "base_frame": poses.base,

@@ -2,7 +2,7 @@
 
 from array import array
 from collections import Counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,11 +22,34 @@ _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"
 _MAX_STEP = 1 << 16  # bytes of one point
 
 
-def parse_cloud(message: Any) -> Cloud | str:
-    """The cloud of a PointCloud2 message with fields in any order, or why it cannot be used.
+class CloudLayout(NamedTuple):
+    """Where the points of a message lie in its data.
 
-    Its times are in seconds after the stamp; points are not finite for no return.
+    Attributes:
+        columns: type and byte offset of the fields that are read, by name in lower case.
+        time: name of the time field; None: there is none.
+        shape: rows and columns of points.
+        strides: bytes from row to row, and from point to point.
     """
+
+    columns: dict[str, tuple[str, int]]
+    time: str | None
+    shape: tuple[int, int]
+    strides: tuple[int, int]
+
+    @property
+    def n_points(self) -> int:
+        """Number of points of the message."""
+        return self.shape[0] * self.shape[1]
+
+    def view(self, data: NDArray[np.uint8]) -> NDArray[Any]:
+        """The fields that are read, (rows, columns), as a view of the data of a message."""
+        dtype = record_dtype(self.columns, self.strides[1])
+        return np.ndarray(self.shape, dtype, data, strides=self.strides)
+
+
+def find_layout(message: Any) -> CloudLayout | str:
+    """The layout of a PointCloud2 message with fields in any order, or why it cannot be used."""
     fields = {str(f.name).lower(): f for f in message.fields}
     step, width, height = int(message.point_step), int(message.width), int(message.height)
     row = int(message.row_step) or width * step
@@ -38,15 +61,26 @@ def parse_cloud(message: Any) -> Cloud | str:
     time = time_field.find_time_column(fields)
     kept = [name for name in ("x", "y", "z", time) if name in fields]
     order = ">" if message.is_bigendian else "<"
-    known = {name: at for name in kept if (at := _layout(fields[name], order, step)) is not None}
+    known = {name: at for name in kept if (at := _column(fields[name], order, step)) is not None}
     if not known.keys() >= set("xyz"):
         return NO_COORDINATES
-    if end == 0:
+    return CloudLayout(known, time if time in known else None, (height, width), (row, step))
+
+
+def parse_cloud(message: Any) -> Cloud | str:
+    """The cloud of a PointCloud2 message, or why it cannot be used.
+
+    Its times are in seconds after the stamp; points are not finite for no return.
+    """
+    layout = find_layout(message)
+    if isinstance(layout, str):
+        return layout
+    if layout.n_points == 0:
         return Cloud(np.empty((0, 3), np.float32))
-    dtype = record_dtype(known, step)
-    values = np.ndarray((height, width), dtype, message.data, strides=(row, step)).reshape(-1)
+    values = layout.view(message.data).reshape(-1)
     points = np.stack([values[name].astype(np.float32) for name in "xyz"], axis=1)
-    times = _times(values[time], points, stamp_ns(message.header)) if time in known else None
+    time = layout.time
+    times = None if time is None else _times(values[time], points, stamp_ns(message.header))
     return Cloud(points, times=times)
 
 
@@ -60,7 +94,7 @@ def _times(
     return time_field.convert_times(values, usable, clock, stamp)[1]
 
 
-def _layout(field: Any, order: str, step: int) -> tuple[str, int] | None:
+def _column(field: Any, order: str, step: int) -> tuple[str, int] | None:
     kind = _TYPES.get(int(field.datatype))
     if kind is None or int(field.offset) + int(kind[1]) > step:
         return None

@@ -85,23 +85,6 @@ def read_tilting(path: Path, context: ReadContext) -> Recording:
     return read(path, context, build_tilting_recording)
 
 
-def list_scan_messages(bag: Bag, context: ReadContext) -> list[tuple[str, int]]:
-    """(T,) topic and number of the message, from 1, of each scan that is read from a bag.
-
-    Raises:
-        DamagedBagError: an indexed bag is damaged.
-        InputError: it holds no usable scan, or point clouds.
-    """
-    topics = select_topics(bag, context.options)
-    if topics.has_clouds:
-        raise InputError("holds point clouds: only beams of laser scans can be blanked")
-    content = collect_messages(bag, topics, context)
-    lasers = base_frame.select_lasers(content, context.options).scans
-    stamps = np.concatenate([scans.stamp_ns for scans in lasers])
-    keys = [(scans.topic, int(number)) for scans in lasers for number in scans.number]
-    return [keys[scan] for scan in np.argsort(stamps, kind="stable")]
-
-
 def _build_recording(
     bag: Bag, context: ReadContext, reopen: Callable[[], Bag], build: _BuildFromLasers
 ) -> Recording:
@@ -154,6 +137,7 @@ def _build_cloud_recording(
         images=content.window.select_images(
             content.images.build_images(content.transforms, poses.base, reopen)
         ),
+        record=np.asarray(clouds.number, np.int64),
         source={
             "sensors": sensors,
             "base_frame": poses.base,

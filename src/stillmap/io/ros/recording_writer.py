@@ -1,36 +1,24 @@
-"""Writes recordings as ROS bags, and filtered copies of bags."""
+"""Writes recordings as ROS bags."""
 
-import math
 from collections.abc import Callable
-from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.io.builder import ReadContext
 from stillmap.io.ros import message_writer
-from stillmap.io.ros.bag import open_bag
-from stillmap.io.ros.bag_types import Bag, BagKind, DamagedBagError, Message, detect_kind
+from stillmap.io.ros.bag_types import BagKind
 from stillmap.io.ros.bag_writer import BagWriter, new_bag, require_stamps
 from stillmap.io.ros.message_writer import BASE, ODOM
 from stillmap.io.ros.messages import (
     LASER_SCAN,
-    MULTI_ECHO,
     ODOMETRY,
     POINT_CLOUD,
     TF,
-    decode,
-    decompress,
-    frame_name,
 )
-from stillmap.io.ros.reader import list_scan_messages
 from stillmap.preprocessing import laser_scan
-from stillmap.preprocessing.options import ReadOptions
 
 
 def write_recording(
@@ -170,121 +158,3 @@ def _describe_cloud_losses(recording: Recording) -> list[str]:
     if not n_free:
         return []
     return [f"{n_free} beams at maximum range are left out: they have no points"]
-
-
-@dataclass(frozen=True)
-class FilteredBag:
-    """Omissions of a filtered copy.
-
-    Attributes:
-        omitted: number of scan messages that the recording lacks, so that their labels are unknown.
-        omitted_topics: topics whose message definition is unknown.
-        unfiltered_topics: topics of scans that were not mapped, copied unchanged.
-    """
-
-    omitted: int
-    omitted_topics: list[str]
-    unfiltered_topics: list[str]
-
-
-def write_filtered_bag(
-    source: Path,
-    out: Path,
-    recording: Recording,
-    blank: NDArray[np.bool_],
-    options: ReadOptions,
-    *,
-    overwrite: bool = False,
-) -> FilteredBag:
-    """Copy a bag with some readings replaced by "no return".
-
-    That is +inf (REP 117), or zero for lasers that use zero: further infinities would make readers
-    take the zeros for unusable.
-
-    Args:
-        source: the bag.
-        out: a bag of the same kind; it appears complete or not at all.
-        recording: as it was read from `source`.
-        blank: (M,) beams to blank.
-        options: the read options.
-        overwrite: replace an existing bag.
-
-    Raises:
-        InputError: `source` is not the bag that was read, or `out` cannot be written.
-    """
-    for trusted in (True, False):
-        try:
-            with closing(open_bag(source, out.absolute().parent, trusted=trusted)) as bag:
-                return _copy(bag, source, out, recording, blank, options, overwrite)
-        except DamagedBagError:
-            continue
-    raise InputError("is damaged", where=str(source))
-
-
-def _copy(
-    bag: Bag,
-    source: Path,
-    out: Path,
-    recording: Recording,
-    blank: NDArray[np.bool_],
-    options: ReadOptions,
-    overwrite: bool,
-) -> FilteredBag:
-    kind, mcap = detect_kind(source)
-    keys = list_scan_messages(bag, ReadContext(options, scratch=out.absolute().parent))
-    scan_of = {key: t for t, key in enumerate(keys)}
-    if len(scan_of) != recording.n_scans:
-        raise InputError("is not the bag that was mapped: other scans", where=str(source))
-    scan_topics = {topic for topic, _ in scan_of}
-    no_return = _no_return_codes(recording)
-    count = dict.fromkeys(scan_topics, 0)
-    omitted = 0
-    with new_bag(out, kind, overwrite=overwrite, mcap=mcap) as copy:
-        sends = {c.id: copy.copy_topic(c) for c in bag.channels}
-        for message in bag.messages({c.topic for c in bag.channels}):
-            topic, send = message.channel.topic, sends[message.channel.id]
-            beams = None
-            if topic in scan_topics:
-                count[topic] += 1
-                t = scan_of.get((topic, count[topic]))
-                if t is None:
-                    omitted += 1
-                    continue
-                beams = blank[recording.beams_of(t)]
-            if beams is not None and beams.any():
-                raw = _blank_readings(message, beams, no_return, copy)
-            else:
-                raw = decompress(message)
-            if send is not None:
-                send(message.log_ns, raw)
-    omitted_topics = {c.topic for c in bag.channels if sends[c.id] is None and c.n_messages}
-    types = LASER_SCAN, MULTI_ECHO, POINT_CLOUD
-    unfiltered = {c.topic for c in bag.channels if c.type in types} - scan_topics
-    return FilteredBag(omitted, sorted(omitted_topics), sorted(unfiltered))
-
-
-def _no_return_codes(recording: Recording) -> dict[tuple[str, str], float]:
-    """The reading that means "no return", by topic and frame of each laser."""
-    return {
-        (laser["name"], laser["frame"]): (
-            0.0 if laser["ranges"]["zero_means"] == "max-range" else math.inf
-        )
-        for laser in recording.source["sensors"]
-    }
-
-
-def _blank_readings(
-    message: Message,
-    blank: NDArray[np.bool_],
-    no_return: dict[tuple[str, str], float],
-    copy: BagWriter,
-) -> bytes:
-    """The content of a scan message with the readings `blank` (n,) replaced."""
-    scan: Any = decode(message)
-    code = np.float32(no_return[message.channel.topic, frame_name(scan.header.frame_id)])
-    if message.channel.type == MULTI_ECHO:
-        for k in np.flatnonzero(blank):
-            scan.ranges[k].echoes = np.array([code])
-    else:
-        scan.ranges = np.where(blank, code, scan.ranges)
-    return copy.serialize(scan, message.channel.type)

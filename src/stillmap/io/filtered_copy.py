@@ -1,0 +1,174 @@
+"""Filtered copies of recordings: what a writer of one gets and returns, and copies of folders."""
+
+import os
+import shutil
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.arrays import release_pages
+from stillmap.core.errors import InputError
+from stillmap.core.files import atomic_file, atomic_folder
+from stillmap.core.recording import Recording
+from stillmap.io.text_lines import Progress
+from stillmap.preprocessing.options import ReadOptions
+
+Mask = NDArray[np.bool_]
+# (file, its new copy, (n,) beams to blank of each of its scans; None: the scan was not read)
+FilterFile = Callable[[Path, Path, list[Mask | None]], None]
+
+
+@dataclass(frozen=True, eq=False)
+class FilterJob:
+    """A recording to be written again, in its own format, with some beams blanked.
+
+    Attributes:
+        source: the file or folder that was read.
+        output: the copy; it appears complete or not at all.
+        recording: as it was read from `source`.
+        blank: (M,) beams to blank.
+        options: with which it was read.
+        kind: of the bag to write, as `writers.py` names it; "": that of the source, or no bag.
+        marker: pattern of a file that every folder of the format holds; "": unused, for files.
+        overwrite: replace what is there.
+        omit: folders inside `source` that are not copied.
+        progress: called with the share of the copy that is written, 0 to 1.
+    """
+
+    source: Path
+    output: Path
+    recording: Recording
+    blank: Mask
+    options: ReadOptions
+    marker: str = ""
+    overwrite: bool = False
+    omit: tuple[Path, ...] = ()
+    progress: Progress | None = None
+    kind: str = ""
+
+    def scan_masks(self, count: int) -> list[Mask | None]:
+        """(n,) beams to blank of the scan of each of `count` records; None: it was not read.
+
+        Raises:
+            InputError: `source` has other records than were read.
+        """
+        record = self.recording.record
+        if record is None or not ((record >= 0) & (record < count)).all():
+            raise other_recording_error(self.source)
+        masks: list[Mask | None] = [None] * count
+        for scan, number in enumerate(record.tolist()):
+            masks[number] = self.blank[self.recording.beams_of(scan)]
+        return masks
+
+    def report(self, share: float) -> None:
+        """Report progress, and release the pages of labels on the way."""
+        release_pages(self.blank)
+        if self.progress is not None:
+            self.progress(share)
+
+
+class Omissions(NamedTuple):
+    """What a filtered copy lacks.
+
+    Attributes:
+        scans: number of scans left out, since nothing is known of their beams.
+        notes: on what else is left out or not filtered, a sentence each.
+    """
+
+    scans: int = 0
+    notes: tuple[str, ...] = ()
+
+
+def other_recording_error(path: Path) -> InputError:
+    """The error for a file or folder that has changed since it was read."""
+    return InputError("is not the recording that was mapped: other scans", where=str(path))
+
+
+def require_rows(mask: Mask, rows: int, path: Path) -> None:
+    """Refuse a file with another number of points than were read.
+
+    Raises:
+        InputError: it has `rows` points, and `mask` is of another length.
+    """
+    if len(mask) != rows:
+        raise other_recording_error(path)
+
+
+def write_files(
+    job: FilterJob,
+    files: Sequence[Path],
+    filter_file: FilterFile,
+    scans_of: Sequence[int] | None = None,
+    write_unread: Callable[[Path, Path], None] | None = None,
+) -> Omissions:
+    """Write a folder, or one file, with every file of scans filtered and all others copied.
+
+    Args:
+        job: see FilterJob.
+        files: those of scans, in the order of the reader.
+        filter_file: writes the copy of a file with scans that were read.
+        scans_of: count of scans of each file; None: one each.
+        write_unread: writes the copy of a file without any; None: it is left out.
+    """
+    counts = [1] * len(files) if scans_of is None else list(scans_of)
+    masks = job.scan_masks(sum(counts))
+    starts = np.cumsum([0, *counts]).tolist()
+    omissions = Omissions(sum(mask is None for mask in masks))
+    if job.source.is_file():
+        with atomic_file(job.output) as work:
+            _filter_file(filter_file, files[0], work, masks, job.output.suffix)
+        return omissions
+    with atomic_folder(job.output, job.marker, job.overwrite) as folder:
+        copy_others(job.source, folder, set(files), job.omit)
+        for number, file in enumerate(files):
+            new = folder / file.relative_to(job.source)
+            of_file = masks[starts[number] : starts[number + 1]]
+            if any(mask is not None for mask in of_file):
+                _filter_file(filter_file, file, new, of_file, file.suffix)
+            elif write_unread is not None:
+                write_unread(file, new)
+            job.report((number + 1) / len(files))
+    return omissions
+
+
+def _filter_file(
+    filter_file: FilterFile, file: Path, new: Path, masks: list[Mask | None], suffix: str
+) -> None:
+    """Write the copy of a file; the file itself where no beam is blanked and `suffix` is its."""
+    is_whole = not any(mask is None or mask.any() for mask in masks)
+    try:
+        if is_whole and file.suffix.lower() == suffix.lower():
+            shutil.copy2(file, new)
+        else:
+            filter_file(file, new, masks)
+    except MemoryError as error:
+        raise InputError("does not fit into memory", where=str(file)) from error
+
+
+def copy_others(
+    source: Path, target: Path, files: Collection[Path], omit: Collection[Path] = ()
+) -> None:
+    """Copy what a folder holds, but not `files` (their folders are made) nor folders `omit`.
+
+    Symbolic links to other places stay links.
+
+    Raises:
+        OSError: something cannot be read or written.
+    """
+    left_out = {path.resolve() for path in omit}
+    folders = {parent for file in files for parent in file.parents}
+    for entry in sorted(source.iterdir()):
+        new = target / entry.name
+        if entry in files or entry.resolve() in left_out:
+            continue
+        if entry.is_symlink() and entry not in folders:
+            new.symlink_to(os.path.abspath(entry.resolve()))
+        elif entry.is_dir():
+            new.mkdir()
+            copy_others(entry, new, files, omit)
+        elif entry.is_file():
+            shutil.copy2(entry, new)

@@ -1,0 +1,1 @@
+"""Filtered copies of point clouds: points removed, all other bytes unchanged."""
