@@ -90,6 +90,12 @@ def _check_depth(source: Path, output: Path) -> None:  # noqa: ARG001
     filtered_depth.check(source)
 
 
+def _check_e57(source: Path, output: Path) -> None:  # noqa: ARG001
+    from stillmap.io.point_cloud.filtered import e57
+
+    e57.check(source)
+
+
 def _check_las(source: Path, output: Path) -> None:
     ending = source.suffix.lower()
     if source.is_file() and output.suffix.lower() not in (ending, ""):
@@ -112,6 +118,9 @@ FILTER_WRITERS = {
     "PCD": FilterWriter(_writer("point_cloud.filtered.pcd"), _patterns(signatures.PCD_EXTENSIONS)),
     "3DTK": FilterWriter(
         _writer("point_cloud.filtered.threedtk"), _patterns(signatures.THREEDTK_EXTENSIONS)
+    ),
+    "E57": FilterWriter(
+        _writer("point_cloud.filtered.e57"), _patterns(signatures.E57_EXTENSIONS), _check_e57
     ),
     "LAS": FilterWriter(
         _writer("point_cloud.filtered.las"), _patterns(signatures.LAS_EXTENSIONS), _check_las

@@ -4,7 +4,7 @@ Read by libe57 (through pye57). Counts are checked against the size of the file.
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.arrays import ArrayBuilder
-from stillmap.core.errors import InputError, import_extra
+from stillmap.core.errors import InputError, MissingExtra, import_extra
 from stillmap.core.recording import Recording
 from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud.binary_table import truncated_error
@@ -51,14 +51,8 @@ def read(path: Path, context: ReadContext) -> Recording:
         InputError: no scan can be read, or pye57 is missing.
     """
     import_extra("pye57.libe57", path)
-    origin, sources = Origin(), []
-    for file in files_of(path, E57_EXTENSIONS):
-        try:
-            count = _count_scans(file)
-        except InputError:
-            if path.is_file():
-                raise
-            count = 1  # reading it fails again, and is counted as skipped
+    origin, sources, files = Origin(), [], files_of(path, E57_EXTENSIONS)
+    for file, count in zip(files, count_scans(files, path.is_file()), strict=True):
         for scan in range(count):
             name = file.name if count == 1 else f"{file.name} scan {scan + 1}"
             read_cloud = partial(_read_cloud, file, scan, origin, context.scratch)
@@ -70,8 +64,27 @@ def read(path: Path, context: ReadContext) -> Recording:
     return recording
 
 
+def count_scans(files: Sequence[Path], single: bool) -> list[int]:
+    """Number of scans of each file; 1 of a damaged file, which counts as skipped when it is read.
+
+    Raises:
+        InputError: a `single` file is damaged, or pye57 is missing.
+    """
+    counts = []
+    for file in files:
+        try:
+            counts.append(_count_scans(file))
+        except MissingExtra:
+            raise
+        except InputError:
+            if single:
+                raise
+            counts.append(1)
+    return counts
+
+
 @contextmanager
-def _open(path: Path) -> Iterator[tuple[Any, Any]]:
+def open_e57(path: Path) -> Iterator[tuple[Any, Any]]:
     """The library and an open file; errors of the library become InputError."""
     library = import_extra("pye57.libe57", path)
     require_nonempty_file(path)
@@ -125,13 +138,13 @@ def _nesting_depth(xml: bytes) -> int:
 
 
 def _count_scans(path: Path) -> int:
-    with _open(path) as (_, file):
+    with open_e57(path) as (_, file):
         root = file.root()
         return len(root["data3D"]) if root.isDefined("data3D") else 0
 
 
 def _read_cloud(path: Path, scan: int, origin: Origin, scratch: Path | None) -> Cloud:
-    with _open(path) as (library, file):
+    with open_e57(path) as (library, file):
         node = file.root()["data3D"][scan]
         T = _read_pose(node)
         if T is not None and not np.array_equal(T, np.eye(4)):
