@@ -57,6 +57,9 @@ def kitti(folder, layout="velodyne", times="times.txt"):
     (folder / times).write_text("".join(f"{0.1 * k}\n" for k in range(4)))
     (folder / "image_2").mkdir()
     (folder / "image_2/000000.txt").write_text("no picture")
+    (folder / "labels").mkdir()
+    np.arange(N, dtype="<u4").tofile(folder / "labels/000001.label")
+    (folder / "labels/000003.label").write_bytes(b"of other points")
     (folder / "calib.txt").write_text("Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n")
     identity = "1 0 0 {} 0 1 0 0 0 0 1 0\n"
     (folder / "poses.txt").write_text("".join(identity.format(k) for k in range(4)))
@@ -81,6 +84,8 @@ def test_kitti_folder(call, tmp_path, layout, times):
         rows = np.frombuffer(before.pop(name), "V16")
         assert after.pop(name) == rows[~blank[recording.beams_of(scan)]].tobytes()
     assert after.pop(f"{layout}/000002.bin") == b""
+    labels = np.flatnonzero(~blank[recording.beams_of(1)]).astype("<u4")
+    assert after.pop("labels/000001.label") == labels.tobytes()
     assert all(before[name] == data for name, data in after.items())
     assert check_same_but(recording, tmp_path / "clean", blank).n_scans == 3
 
