@@ -1,4 +1,4 @@
-"""Commands of the quickstart and the tutorials work: each page is run in an empty folder.
+"""Commands of README, quickstart and tutorials work: each page is run in an empty folder.
 
 Blocks marked `sh` and `python` are run one after the other. Those marked `bash` or `text` are for
 reading: they need a robot, or its files.
@@ -12,8 +12,9 @@ from pathlib import Path
 
 import pytest
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
-PAGES = [DOCS / "quickstart.md", *sorted((DOCS / "tutorials").glob("*.md"))]
+ROOT = Path(__file__).resolve().parents[2]
+TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
+PAGES = [ROOT / "docs" / "quickstart.md", *TUTORIALS, ROOT / "README.md"]
 SLOW = {"rgbd-to-model", "two-lasers"}
 BLOCK = re.compile(r"^```(sh|python)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 RUN = {"sh": ["bash", "-euo", "pipefail", "-c"], "python": [sys.executable, "-W", "error", "-c"]}
@@ -32,7 +33,11 @@ def blocks_of(page):
 )
 def test_page_runs(page, tmp_path):
     beside = Path(sys.executable).parent
-    environment = {**os.environ, "PATH": f"{beside}{os.pathsep}{os.environ['PATH']}"}
+    environment = {
+        **os.environ,
+        "MPLBACKEND": "Agg",
+        "PATH": f"{beside}{os.pathsep}{os.environ['PATH']}",
+    }
     blocks = blocks_of(page)
     assert blocks
     for language, text in blocks:
