@@ -90,7 +90,7 @@ def key_facts(result: "Result") -> dict[str, str]:
     return {
         "scans": f"{len(stamps)} in {seconds:.1f} s",
         "distance": f"{np.linalg.norm(steps, axis=1).sum():.1f} m",
-        "beams": f"{len(result.p_static)}, {hits} of them hits",
+        "beams": f"{_spaced(len(result.p_static))}, {_spaced(hits)} of them hits",
         "dynamic": f"{100.0 * dynamic / max(hits, 1):.1f} % of the hits",
         "moving objects": str(len(result.objects)),
         "quality": _describe_quality(result.quality),
@@ -98,13 +98,18 @@ def key_facts(result: "Result") -> dict[str, str]:
     }
 
 
+def _spaced(count: int) -> str:
+    """A number with its thousands set apart."""
+    return f"{count:,}".replace(",", "\N{NO-BREAK SPACE}")
+
+
 def _describe_quality(quality: Quality) -> str:
-    """Overall, of labels and of geometry, 0 to 100."""
-    overall, labels, geometry = (
-        "unknown" if value is None else f"{value:.0f}"
-        for value in (quality.overall, quality.labels, quality.geometry)
-    )
-    return f"{overall} of 100 (labels {labels}, geometry {geometry})"
+    """Overall, of labels and of geometry, 0 to 100, as far as known."""
+    parts = {"labels": quality.labels, "geometry": quality.geometry}
+    known = ", ".join(f"{name} {value:.0f}" for name, value in parts.items() if value is not None)
+    if quality.overall is None:
+        return f"{known} of 100" if known else "unknown"
+    return f"{quality.overall:.0f} of 100 ({known})"
 
 
 def _count_hits(hit: NDArray[np.bool_], p_static: NDArray[np.float32]) -> tuple[int, int]:
@@ -125,7 +130,7 @@ def _preview(result: "Result") -> Image.Image:
     how = Image.Resampling.BOX if factor < 1.0 else Image.Resampling.NEAREST
     image = image.resize((width, height), how)
     pixels = MapView(window, (width, height), False).to_pixels(_track(result))
-    ImageDraw.Draw(image).line([(x, y) for x, y in pixels.tolist()], fill=_BLUE)
+    ImageDraw.Draw(image).line([(x, y) for x, y in pixels.tolist()], fill=_BLUE, width=2)
     return image.quantize(64)
 
 
