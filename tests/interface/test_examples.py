@@ -76,6 +76,7 @@ def test_examples_have_the_right_types(tmp_path):
 def write_inputs(folder, where):
     """The files that the examples read, in the present folder."""
     assert main(["convert", str(folder), "-o", "log.bag", "--quiet"]) == 0
+    (where / "hall").symlink_to(folder)
     read = stillmap.read(folder)
     n = read.n_beams // read.n_scans
     points = read.points.reshape(read.n_scans, n, 2)
@@ -101,7 +102,7 @@ def test_examples_of_the_main_job_run(page, folder, tmp_path, monkeypatch, capsy
     values = {}
     for block in blocks(ROOT / page):
         exec(compile(block, page, "exec"), values)
-    assert (tmp_path / "out" / "map.pgm").is_file()
+    assert len(list(tmp_path.glob("*/map.pgm"))) == 1
     if page == "docs/python.md":
         assert (tmp_path / "map.png").is_file()
         assert values["clouds"].n_beams == 120

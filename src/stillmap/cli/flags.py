@@ -9,6 +9,7 @@ FLAGS = {
     "recording=PATH": "--input",
     "max_dt=SECONDS": "--max-dt",
     "port=0 takes any free one": "without --port any free one is used",
+    "name=FORMAT": "--to",
     "tilting=": "--tilting ",
     "estimator=": "--estimator ",
     'poses="FILE.tum"': "--poses FILE.tum",

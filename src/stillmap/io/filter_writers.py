@@ -162,7 +162,7 @@ def find_target(source: Path, output: Path, name: str | None = None) -> FilterTa
 def _own_target(source: Path, output: Path, form: str, is_folder: bool, kind: str) -> FilterTarget:
     entry = FILTER_WRITERS.get(form)
     if entry is None:
-        hint = f"other formats by --to: {', '.join(w.name for w in writers.WRITERS)}"
+        hint = f"other formats by name=FORMAT: {', '.join(w.name for w in writers.WRITERS)}"
         raise InputError(f"a {form} cannot be written again", where=str(source), hint=hint)
     entry.check(source, output)
     marker = ""
@@ -202,7 +202,9 @@ def _require_own_ending(output: Path, source: Path, form: str, is_folder: bool) 
         return
     what = f"would be a {form}{' folder' * is_folder} like {source.name}, but has another ending"
     others = "; ".join(", ".join(w.endings) for w in writers.WRITERS if w.endings)
-    raise InputError(what, where=str(output), hint=f"other formats by name: {others}; or by --to")
+    raise InputError(
+        what, where=str(output), hint=f"other formats by name: {others}; or by name=FORMAT"
+    )
 
 
 def _file_endings(form: Format) -> tuple[str, ...]:

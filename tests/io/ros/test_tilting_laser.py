@@ -140,7 +140,7 @@ def test_beams_without_transforms_are_unusable(rig, tmp_path):
 
 def test_map_command(rig, path, tmp_path):
     out = tmp_path / "out"
-    words = ("map", path, "--tilting-topic", "/tilt_scan", "-o", out, *QUICK)
+    words = ("map", path, "--tilting-topic", "/tilt_scan", "-o", out, "--mesh", *QUICK)
     assert main([str(word) for word in words]) == 0
     write_rig(rig, tmp_path / "sim")
     p_static = np.load(out / "tilting/beams/p_static.npy")

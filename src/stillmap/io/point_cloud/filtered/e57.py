@@ -220,7 +220,7 @@ def _list_fields(library: Any, prototype: Any, path: Path) -> list[_Field]:
     for node in _iter_leaves(library, prototype):
         kind, name = node.type().name.removeprefix("E57_"), node.pathName().removeprefix("/")
         if kind == "STRING":
-            hint = "--to writes its points in another format"
+            hint = "name=FORMAT writes its points in another format"
             raise InputError(
                 "cannot be written again: its points have texts", where=str(path), hint=hint
             )
