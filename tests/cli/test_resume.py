@@ -31,8 +31,8 @@ def contents(folder) -> dict[str, bytes]:
         del run[name]
     for iteration in run["iterations"]:
         del iteration["seconds"]
-    report = re.sub(rb"Run time and memory.*?</section>", b"", out["report.html"], flags=re.S)
-    report = re.sub(rb"<div><dt>(Run time|Peak memory)</dt>.*?</div>", b"", report)
+    report = re.sub(rb"<h3>Time and memory</h3>.*?</details>", b"", out["report.html"], flags=re.S)
+    report = re.sub(rb"<div><dt>Computed in</dt>.*?</div>", b"", report)
     report = re.sub(rb"<td[^<>]*>[0-9.,]+ (ms|s|min)</td>", b"", report)
     return {**out, "run.json": json.dumps(run).encode(), "report.html": report}
 

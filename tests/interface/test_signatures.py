@@ -10,6 +10,7 @@ import pytest
 
 import stillmap
 
+CONSTRUCTORS = [stillmap.Recording.from_scans, stillmap.Recording.from_clouds]
 CALLABLE = [name for name in stillmap.__all__ if name != "__version__"]
 
 
@@ -30,6 +31,15 @@ def test_signature_and_help(name):
     assert name in page.splitlines()[0] or name in page
     assert inspect.getdoc(value)
     assert "**kwargs" not in page.splitlines()[2]
+
+
+@pytest.mark.parametrize(
+    "function",
+    [stillmap.build, stillmap.load, stillmap.read, *CONSTRUCTORS],
+    ids=lambda function: function.__name__,
+)
+def test_a_signature_can_be_read(function):
+    assert len(str(inspect.signature(function))) < 600
 
 
 def test_build_says_what_it_takes():

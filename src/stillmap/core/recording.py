@@ -1,5 +1,8 @@
 """Recording: flat arrays of scans and beams, 2D and 3D alike."""
 
+# signatures name ArrayLike instead of spelling it out
+from __future__ import annotations
+
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -95,7 +98,7 @@ class Recording(ShortRepr):
         max_range: float | None = None,
         sensor_pose: ArrayLike | None = None,
         time_increment: float = 0.0,
-    ) -> "Recording":
+    ) -> Recording:
         """A 2D recording from the arrays of a laser scanner.
 
         Readings mean what they mean in a ROS LaserScan: NaN, negative and near zero: unusable;
@@ -146,7 +149,7 @@ class Recording(ShortRepr):
         max_range: float | None = None,
         sensor_pose: ArrayLike | None = None,
         beam_times: Sequence[ArrayLike] | None = None,
-    ) -> "Recording":
+    ) -> Recording:
         """A 3D recording from point clouds, one per sweep of a lidar.
 
         Args:
@@ -246,7 +249,7 @@ class Recording(ShortRepr):
             self.release_pages()
         return ends
 
-    def without_odometry(self) -> "Recording":
+    def without_odometry(self) -> Recording:
         """The recording without odometry."""
         return replace(self, T_odom_base=None)
 

@@ -1,5 +1,8 @@
 """`stillmap.build`: the main job, called from Python."""
 
+# signatures name ArrayLike instead of spelling it out
+from __future__ import annotations
+
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
