@@ -166,7 +166,7 @@ def test_labels_in_space_are_scored_and_plans_are_not(street, mapped, tmp_path, 
 
 
 def test_other_estimators_of_the_plane_are_refused(street):
-    with pytest.raises(ValueError, match="2D recordings only"):
+    with pytest.raises(stillmap.InputError, match="for 2D recordings"):
         stillmap.build(
             street.recording,
             options(estimator="tracker"),
