@@ -43,12 +43,30 @@ def sample_dynamic_points(
     Returns:
         (K, D) float32 in metres, in the recording's order, K <= limit.
     """
+    return _sample_points(recording, poses, p_static, limit, True)
+
+
+def sample_static_points(
+    recording: Recording, poses: NDArray[np.float64], p_static: NDArray[np.float32], limit: int
+) -> NDArray[np.float32]:
+    """Those of the hits with p_static >= 0.5; arguments as of `sample_dynamic_points`."""
+    return _sample_points(recording, poses, p_static, limit, False)
+
+
+def _sample_points(
+    recording: Recording,
+    poses: NDArray[np.float64],
+    p_static: NDArray[np.float32],
+    limit: int,
+    dynamic: bool,
+) -> NDArray[np.float32]:
     arrays = recording.hit, p_static
 
-    def is_dynamic(block: slice) -> NDArray[np.bool_]:
-        return recording.hit[block] & (p_static[block] < DYNAMIC_BELOW)
+    def is_chosen(block: slice) -> NDArray[np.bool_]:
+        moves = p_static[block] < DYNAMIC_BELOW
+        return recording.hit[block] & (moves if dynamic else ~moves)
 
-    counts = [int(np.count_nonzero(is_dynamic(block))) for block in iter_blocks(*arrays)]
+    counts = [int(np.count_nonzero(is_chosen(block))) for block in iter_blocks(*arrays)]
     total = sum(counts)
     kept = min(total, limit)
     chosen = np.arange(kept, dtype=np.int64) * total // max(kept, 1)
@@ -56,6 +74,6 @@ def sample_dynamic_points(
     parts = [np.zeros(0, np.int64)]
     for block, start, end in zip(iter_blocks(*arrays), before[:-1], before[1:], strict=True):
         low, high = np.searchsorted(chosen, [start, end])
-        found = np.flatnonzero(is_dynamic(block))
+        found = np.flatnonzero(is_chosen(block))
         parts.append(block.start + found[chosen[low:high] - start])
     return recording.end_points(np.concatenate(parts), poses).astype(np.float32)

@@ -60,6 +60,7 @@ def render_report(
         "files": files_data(folder),
         "changes": changes_data(result, filtered),
         "objects": objects_data(result, filtered),
+        "points": _points_data(result, tilting),
         "rig": rig_data(tilting, filtered),
         "models": _models_data(previews),
         "fitted": fitted_data(result),
@@ -73,6 +74,15 @@ def render_report(
         **_script_data(),
     }
     return environment().get_template("report.html.j2").render(data)
+
+
+def _points_data(result: MappingResult, tilting: "TiltingResult | None") -> dict[str, Any] | None:
+    """See `point_view.points_data`, whose renderer is loaded only for results in 3D."""
+    if tilting is None and result.recording.dimension == 2:
+        return None
+    from stillmap.results.report.point_view import points_data
+
+    return points_data(result, tilting)
 
 
 def _models_data(previews: "ModelPreviews | None") -> dict[str, Any] | None:

@@ -1,0 +1,122 @@
+"""The points of a 3D result in perspective: static ones by height, dynamic ones in orange."""
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from stillmap.mapping.beam_statistics import sample_dynamic_points, sample_static_points
+from stillmap.pipeline.result import MappingResult
+from stillmap.results.colors import color_by_height
+from stillmap.results.report.figures import ORANGE, data_uri
+from stillmap.results.report.renderer import Float, camera_matrix, fit_camera
+
+if TYPE_CHECKING:
+    from stillmap.rig.build import TiltingResult
+
+Points = NDArray[np.float32]
+
+_SIZE = (1280, 720)  # pixels
+_FIELD_OF_VIEW = math.radians(45.0)
+_MAX_STATIC, _MAX_DYNAMIC = 1_000_000, 200_000  # points drawn
+_MAX_FITTED = 50_000  # points that choose the view
+_POINT_SIZE = 0.05  # m, nearer than where this is a pixel points cover 2 x 2 pixels
+_ELEVATION, _TURN = math.radians(35.0), math.radians(25.0)  # of the view, from the side of the map
+_OUTLIERS = 0.01  # share of the points beyond each side of what the view shows
+_OVERHEAD = 0.5  # m above the robot's base from which on walls and a ceiling are looked at
+_CEILING = 0.3  # m below the highest points that a ceiling takes, and that are left out with it
+_CEILING_DENSITY = 2.0  # times as many points as at the same thickness of wall below
+_WALL_BANDS = 3  # of that thickness, below the ceiling
+_BACKGROUND = (16, 20, 26)
+_JPEG_QUALITY = 88
+
+
+def points_data(
+    result: MappingResult, tilting: "TiltingResult | None" = None
+) -> dict[str, Any] | None:
+    """The static points, and the same with dynamic ones, as seen from above and aside.
+
+    Where there is a ceiling, it is left out. None without points in 3D.
+    """
+    seen = result if tilting is None else tilting
+    if seen.recording.dimension == 2:
+        return None
+    deskewed, poses = seen.deskewed, seen.poses
+    static = sample_static_points(deskewed, poses, seen.p_static, _MAX_STATIC)
+    dynamic = sample_dynamic_points(deskewed, poses, seen.p_static, _MAX_DYNAMIC)
+    ceiling = find_ceiling(static[:, 2], float(poses[:, 2, 3].mean()))
+    static, dynamic = (points[points[:, 2] < ceiling] for points in (static, dynamic))
+    if not len(static):
+        return None
+    heights_shown = np.quantile(static[:, 2], [_OUTLIERS, 1.0 - _OUTLIERS]).round(1) + 0.0
+    low, high = heights_shown.tolist()
+    heights = color_by_height(static[:, 2], low, high)
+    orange = np.broadcast_to(np.array(ORANGE, np.uint8), (len(dynamic), 3))
+    T = _choose_view(static)
+    pictures = [
+        draw_points_3d(static, heights, T),
+        draw_points_3d(np.concatenate([static, dynamic]), np.concatenate([heights, orange]), T),
+    ]
+    return {
+        "size": _SIZE,
+        "images": [data_uri(one, "jpeg", quality=_JPEG_QUALITY) for one in pictures],
+        "heights": (low, high),
+        "has_ceiling": math.isfinite(ceiling),
+    }
+
+
+def find_ceiling(z: NDArray[np.float32], base: float) -> float:
+    """Lowest height of the ceiling in m; inf: there is none.
+
+    Walls have no more points at their top than below, a ceiling has many.
+
+    Args:
+        z: (n,) heights of points in m.
+        base: height of the robot in m.
+    """
+    overhead = z[z > base + _OVERHEAD]
+    if not len(overhead):
+        return math.inf
+    top = float(np.quantile(overhead, 1.0 - _OUTLIERS / 2))
+    edges = top - _CEILING * np.array([1 + _WALL_BANDS, 1])
+    below, above = (int(np.count_nonzero(overhead > edge)) for edge in edges)
+    walls = (below - above) / _WALL_BANDS
+    return float(edges[1]) if above > _CEILING_DENSITY * walls else math.inf
+
+
+def draw_points_3d(points: Points, colors: NDArray[np.uint8], T_camera_map: Float) -> Image.Image:
+    """Points (n, 3) in colors (n, 3) over a dark background; nearer ones hide those behind."""
+    width, height = _SIZE
+    K = camera_matrix(_SIZE, _FIELD_OF_VIEW)
+    local = points @ T_camera_map[:3, :3].T + T_camera_map[:3, 3]
+    ahead = np.flatnonzero(local[:, 2] > 0.0)
+    # far ones first, so that near ones are painted over them
+    order = ahead[np.argsort(-local[ahead, 2], kind="stable")]
+    z = local[order, 2]
+    column, row = (
+        np.floor(local[order, k] / z * K[k, k] + K[k, 2] + 0.5).astype(np.int64) for k in (0, 1)
+    )
+    large = z < _POINT_SIZE * K[0, 0]
+    pixels = np.empty((height, width, 3), np.uint8)
+    pixels[:] = _BACKGROUND
+    for down, right in ((1, 1), (1, 0), (0, 1), (0, 0)):
+        y, x = row + down, column + right
+        shown = (y >= 0) & (y < height) & (x >= 0) & (x < width)
+        if down or right:
+            shown &= large
+        pixels[y[shown], x[shown]] = colors[order[shown]]
+    return Image.fromarray(pixels)
+
+
+def _choose_view(points: Points) -> Float:
+    """T_camera_map (4, 4) from above and aside of the longer side of the place."""
+    some = points[:: -(-len(points) // _MAX_FITTED)].astype(np.float64)
+    low, high = np.quantile(some, [_OUTLIERS, 1.0 - _OUTLIERS], axis=0)
+    inside = some[((some >= low) & (some <= high)).all(axis=1)]
+    x, y = (high - low)[:2].tolist()
+    yaw = _TURN - (math.pi / 2 if x >= y else 0.0)
+    direction = np.array([math.cos(yaw), math.sin(yaw), math.tan(_ELEVATION)])
+    K = camera_matrix(_SIZE, _FIELD_OF_VIEW)
+    return fit_camera(inside if len(inside) else some, direction, K, _SIZE)
