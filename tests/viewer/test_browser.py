@@ -16,7 +16,7 @@ from stillmap.viewer.scene import read_scene
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 pytest.importorskip("websockets.sync.client")
 
-from browser_tab import BROWSER, HEIGHT, WIDTH, Tab
+from browser_tab import BROWSER, HEIGHT, Tab
 
 from stillmap.viewer.window import Window
 
@@ -158,13 +158,14 @@ def button_of(tab, text):
     )
 
 
-def pixel_of(window, point):
-    """Where a point (3,) of the scene is on the page."""
+def pixel_of(tab, window, point):
+    """Where a point (3,) of the scene is on the page, whose controls are beside the scene."""
     (client,) = window._server.get_clients().values()
     w, x, y, z = client.camera.wxyz
     seen = Rotation.from_quat([x, y, z, w]).inv().apply(point - client.camera.position)
     focal_length = 0.5 * HEIGHT / np.tan(0.5 * client.camera.fov)
-    return np.array([WIDTH, HEIGHT]) / 2 + focal_length * seen[:2] / seen[2]
+    width = tab.value("document.querySelector('canvas').getBoundingClientRect().width")
+    return np.array([width, HEIGHT]) / 2 + focal_length * seen[:2] / seen[2]
 
 
 def test_title_names_recording_and_program(shown, tab):
@@ -231,7 +232,7 @@ def test_keys_and_check_boxes_show_and_hide_layers(shown, tab):
     tab.click(
         *tab.value(
             "(() => { const l = [...document.querySelectorAll('label')].find(e => e.textContent == "
-            "'Rays'); const r = l.closest('div').parentElement.querySelector('[type=checkbox]')"
+            "'7 Rays'); const r = l.closest('div').parentElement.querySelector('[type=checkbox]')"
             ".getBoundingClientRect(); return [r.x + r.width/2, r.y + r.height/2] })()"
         )
     )
@@ -245,9 +246,9 @@ def test_distance_between_two_clicks(shown, tab):
     window = shown(2)
     tab.press("m", "KeyM")
     until(window, lambda: "Click on the first point" in tab.value("document.body.innerText"))
-    ends = np.array([[-1.5, -1.0, 0.0], [0.9, 0.8, 0.0]])
+    ends = np.array([[-1.0, 0.2, 0.0], [1.4, 2.0, 0.0]])
     for count, end in enumerate(ends):
-        tab.click(*pixel_of(window, end))
+        tab.click(*pixel_of(tab, window, end))
         until(window, lambda wanted=count + 1: len(window._measuring.ruler.points) == wanted)
     until(window, lambda: re.search(r"\d\.\d\d m\n", tab.value("document.body.innerText")))
     length = re.search(r"(\d\.\d\d) m\n", tab.value("document.body.innerText"))[1]
@@ -263,7 +264,7 @@ def test_click_on_an_object_shows_its_facts(shown, tab):
     until(window, lambda: field_of(tab) == 2)
     tab.press("3", "Digit3")
     time.sleep(0.5)  # the page moves the box
-    tab.click(*pixel_of(window, np.array([1.0, 0.0, 0.9])))
+    tab.click(*pixel_of(tab, window, np.array([1.0, 0.0, 0.9])))
     until(window, lambda: "Object 7" in tab.value("document.body.innerText"))
     text = tab.value("document.body.innerText")
     for fact in ("0.5 s to 1.5 s", "1,234", "0.988", "0.80 x 0.40 x 1.80 m", "1.0 m/s"):
@@ -279,7 +280,7 @@ def test_scale_bar_has_the_scale_of_the_view(shown, tab):
         """Of the bar, and of as many meters at the center of the view, in pixels."""
         length = float(tab.value(f"{bar}.textContent").removesuffix(" m"))
         ends = [client.camera.look_at + np.array([side * length / 2, 0, 0]) for side in (-1, 1)]
-        a, b = (pixel_of(window, end) for end in ends)
+        a, b = (pixel_of(tab, window, end) for end in ends)
         return tab.value(f"{bar}.firstChild.getBoundingClientRect().width"), np.linalg.norm(b - a)
 
     until(window, lambda: tab.value(f"{bar} != null"))

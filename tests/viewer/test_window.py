@@ -1,5 +1,7 @@
 """The viewer's layers and controls."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -21,12 +23,12 @@ def node(window, path):
 
 def test_layers_without_data_are_left_out(result_of, opened, window):
     flat = opened(read_scene(result_of(2)), None)
-    objects = ["Objects", "Object tracks", "Object numbers"]
+    objects = ["Objects", "Object tracks", "Object ids"]
     assert list(flat._boxes) == ["Map", "Robot", *objects]
     clouds = ["Static points", "Dynamic points"]
     assert list(window._boxes) == [
         *("Map", "Surface", *clouds, "Robot", "Beams", "Rays"),
-        *("Objects", "Object tracks", "Object models", "Object numbers"),
+        *("Objects", "Object tracks", "Object models", "Object ids"),
     ]
 
 
@@ -137,10 +139,10 @@ def test_notes_are_shown_with_their_layers(result_of, beams_of, opened, monkeypa
 def test_check_boxes_show_and_hide(window):
     window.show(2)
     window._boxes["Surface"].value = True
-    window._boxes["Object numbers"].value = True
+    window._boxes["Object ids"].value = True
     window.step()
     assert node(window, "/surface").visible
-    assert node(window, "/object_numbers/0").text == "7"
+    assert node(window, "/object_ids/0").text == "7"
     window._boxes["Surface"].value = False
     window.step()
     assert not node(window, "/surface").visible
@@ -220,6 +222,16 @@ def test_keys_are_distinct_and_not_those_of_the_camera(window):
     assert not set(keys) & {*"WASDQE", "arrowup", "arrowdown"}
     names = {*shortcuts.LAYER_KEYS, *shortcuts._ACTION_KEYS}
     assert set(window._actions()) == names
+
+
+def test_click_on_a_box_that_is_gone_selects_nothing(window):
+    window.show(2)
+    window._objects._click_box(SimpleNamespace(instance_index=1))
+    window.step()
+    assert window._objects.selected is None
+    window._objects._click_box(SimpleNamespace(instance_index=0))
+    window.step()
+    assert window._objects.selected == 7
 
 
 def test_selected_object_shows_its_facts(window):

@@ -85,7 +85,7 @@ class Layers:
             ("Objects", True, moving, self._objects.make_boxes),
             ("Object tracks", False, moving, self._objects.make_tracks),
             ("Object models", True, bool(scene.models), self._objects.make_models),
-            ("Object numbers", False, moving, lambda: None),
+            ("Object ids", False, moving, lambda: None),
         ]
 
     def is_shown(self, name: str) -> bool:

@@ -70,8 +70,10 @@ class ObjectNodes:
         self._mark_label = self._nodes.label(node_path("Selected object", "number"))
 
     def _click_box(self, event: Any) -> None:
-        """Called by viser."""
-        self._on_click(self._drawn[event.instance_index])
+        """Called by viser; since the click there may be other boxes."""
+        drawn = self._drawn
+        if event.instance_index < len(drawn):
+            self._on_click(drawn[event.instance_index])
 
     def _click_model(self, number: int, _event: Any) -> None:
         """Called by viser."""
@@ -110,7 +112,7 @@ class ObjectNodes:
         if shown("Objects"):
             self._draw_boxes(objects)
         if self._tracks:
-            self._draw_numbers(objects, _MAX_NUMBERS if shown("Object numbers") else 0)
+            self._draw_numbers(objects, _MAX_NUMBERS if shown("Object ids") else 0)
             self._draw_mark(objects)
 
     def _colors(self, index: NDArray[np.intp]) -> NDArray[np.uint8]:
@@ -138,7 +140,7 @@ class ObjectNodes:
         """Show ids as labels; labels are created on demand and reused."""
         use = objects.track[:count]
         while len(self._labels) < len(use):
-            path = node_path("Object numbers", f"{len(self._labels)}")
+            path = node_path("Object ids", f"{len(self._labels)}")
             self._labels.append(self._nodes.label(path))
         for n, label in enumerate(self._labels):
             label.visible = n < len(use)

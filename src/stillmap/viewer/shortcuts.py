@@ -15,7 +15,7 @@ LAYER_KEYS = {
     "Objects": "8",
     "Object tracks": "9",
     "Object models": "0",
-    "Object numbers": "N",
+    "Object ids": "N",
 }
 _ACTION_KEYS = {
     "Play or pause": "space",
@@ -33,7 +33,7 @@ KEYS = (
     ("Space", "play or pause"),
     ("← →", "one scan"),
     ("Home End", "first, last scan"),
-    ("1 to 0, N", "layers in this order"),
+    ("1 to 0, N", "layers"),
     ("M", "measure"),
     ("Esc", "clear"),
     ("V", "default view"),

@@ -195,6 +195,7 @@ class Window:
     def _add_controls(self, ruler: Ruler) -> None:
         gui, last, scene = self._server.gui, len(self._seconds) - 1, self._scene
         gui.set_panel_label("stillmap")
+        gui.main_panel.dock_right()  # beside the scene, not over it
         name, folder = escape_markdown(scene.name), escape_markdown(scene.folder)
         gui.add_markdown(f"**{name}**" if name == folder else f"**{name}**, result {folder}")
         # Any: viser's types do not allow setting values
@@ -217,7 +218,7 @@ class Window:
         gui, visible = self._server.gui, self._layers.default_visibility
         with gui.add_folder("Show"):
             self._boxes: dict[str, Any] = {
-                name: gui.add_checkbox(name, shown, hint=f"key {LAYER_KEYS[name]}")
+                name: gui.add_checkbox(f"{LAYER_KEYS[name]} {name}", shown)
                 for name, shown in visible.items()
             }
             colorings = self._layers.colorings
