@@ -6,6 +6,7 @@ import json
 import os
 import random
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -62,6 +63,18 @@ def stop_after(monkeypatch):
         monkeypatch.setattr(result, "iterate", stopped if number < ALL else iterate)
 
     return stop
+
+
+def test_the_command_that_is_told_continues(call, room, tmp_path, stop_after):
+    stop_after(2)
+    out = tmp_path / "the map"
+    stopped = call("map", room, "-o", out, "--overwrite", *WORDS)
+    told = stopped.stderr.splitlines()[0].partition("continue after iteration 2: stillmap ")[2]
+    assert "--overwrite" not in told
+    stop_after(ALL)
+    done = call(*shlex.split(told))
+    assert done.returncode == 0, done.stderr
+    assert "continues after iteration 2" in done.stderr
 
 
 @pytest.fixture

@@ -6,7 +6,13 @@ import re
 import pytest
 from maps import ENDLESS
 
-from stillmap.cli.console import colorize, is_terminal, uses_color
+from stillmap.cli.console import (
+    colorize,
+    is_terminal,
+    show_progress,
+    show_share,
+    uses_color,
+)
 
 VARIABLES = ("NO_COLOR", "FORCE_COLOR", "CLICOLOR_FORCE", "TERM")
 RED, PLAIN = "\x1b[1;31m", "\x1b[0m"
@@ -115,6 +121,39 @@ def test_bar_is_removed_at_the_end(on_a_terminal, room, tmp_path):
     assert "report.html" in lines[-2]
 
 
+@pytest.mark.parametrize("columns", [50, 80, 100, 120])
+def test_progress_fits_the_terminal(monkeypatch, columns):
+    written = Terminal()
+    monkeypatch.setattr("sys.stderr", written)
+    monkeypatch.setenv("COLUMNS", str(columns))
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    steps = (("matching scans", 2), ("modelling moving objects", 0), ("removing moving objects", 0))
+    with show_share(False, "reading") as share:
+        assert share is not None
+        share(0.5)
+    with show_progress(False, 6) as progress:
+        for what, iteration in steps:
+            for done in (1, 654321, 987654):
+                progress(what, iteration, done, 987654)
+    shown = re.sub(r"\x1b\[[?\d;]*[A-Za-z]", "", written.getvalue())
+    assert max(len(line) for line in re.split(r"[\r\n]", shown)) <= columns
+    assert "…" not in shown  # of texts that are cut off
+    for text in ("reading", "50 %", "matching scans", "modelling moving objects", "987654/987654"):
+        assert text in shown
+
+
+def test_ctrl_c_before_anything_is_finished(call, room, tmp_path, nothing_left, monkeypatch):
+    def stop(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("stillmap.cli.map_run.map_recording", stop)
+    done = call("map", room, "-o", tmp_path / "out")
+    assert done.returncode == 130
+    assert "nothing was written, and there is nothing to resume" in done.stderr
+    nothing_left()
+
+
 def test_ctrl_c_restores_the_cursor(on_a_terminal, hall, tmp_path, nothing_left):
     status, written = on_a_terminal(
         "map", hall, "-o", tmp_path / "out", *ENDLESS, send_at=b"iteration 2 of"
@@ -123,6 +162,7 @@ def test_ctrl_c_restores_the_cursor(on_a_terminal, hall, tmp_path, nothing_left)
     assert written.count("\x1b[?25l") == written.count("\x1b[?25h") > 0
     lines = left_on_screen(written)
     assert len(lines) == 2
-    assert "--resume" in lines[0]
+    assert lines[0].startswith("stillmap: continue after iteration ")
+    assert lines[0].endswith(" --resume")
     assert lines[1].startswith("stillmap: interrupted")
     nothing_left(".out.resume")

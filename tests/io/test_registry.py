@@ -5,8 +5,10 @@ import os
 
 import pytest
 
+from stillmap.cli.main import main
 from stillmap.core.errors import InputError
 from stillmap.io import read
+from stillmap.io.registry import FORMATS, detect_format
 
 
 @pytest.mark.parametrize(
@@ -60,16 +62,58 @@ def test_recordings_in_a_folder_are_listed(tmp_path):
         return str(caught.value)
 
     assert "is a folder without a recording" in said()
-    assert said("tilting").endswith(f"holds a recording: {outer / 'tilting'} (name it)")
+    alone = said("tilting")
+    assert f"holds a recording: {outer / 'tilting'} (name it: " in alone
+    assert alone.endswith(f"stillmap map {outer / 'tilting'} -o DIR)")
     both = said("horizontal")
     assert both.startswith(f"{outer}: is no recording but holds several recordings: ")
     assert f"{outer / 'horizontal'}, {outer / 'tilting'} (both: " in both
     assert f"{outer / 'horizontal'} with tilting={outer / 'tilting'}" in both
     (outer / "run.json").write_text("")
-    assert "is a folder without a recording" in said()  # a result folder: its clouds are objects
+    assert "is a result, no recording" in said()  # its clouds are objects
     (outer / "run.json").unlink()
     many = said("a", "b", "c")
-    assert f"{outer / 'a'}, {outer / 'b'}, {outer / 'c'} and 2 more (name one of them)" in many
+    assert f"{outer / 'a'}, {outer / 'b'}, {outer / 'c'} and 2 more (name one of them: " in many
+    assert many.endswith(f"stillmap map {outer / 'a'} -o DIR)")
+
+
+def test_bags_and_logs_in_a_folder_are_listed_with_their_sizes(tmp_path):
+    day = tmp_path / "the day"
+    day.mkdir()
+    (day / "b.bag").write_bytes(b"#ROSBAG V2.0\n" + bytes(2_345_000))
+    (day / "a.log").write_text("FLASER 1 2.0 0 0 0 0 0 0 1 host 1\n")
+    (day / "notes.log").write_text("no record of anything\n")  # another log
+    with pytest.raises(InputError) as caught:
+        read(day)
+    listed = f"several recordings: {day / 'a.log'} (34 bytes), {day / 'b.bag'} (2.35 MB) ("
+    assert listed in str(caught.value)
+    assert str(caught.value).endswith(f"stillmap map '{day / 'a.log'}' -o DIR)")
+
+
+def test_unrelated_bags_in_a_folder_are_not_joined(tmp_path):
+    """Recorders split one recording into X_0, X_1, ...; other names are other recordings."""
+    day = tmp_path / "day"
+    day.mkdir()
+    for name in ("morning_0.mcap", "evening_0.mcap"):
+        (day / name).write_bytes(b"\x89MCAP0\r\n")
+    with pytest.raises(
+        InputError, match=r"several recordings: .*evening_0[.]mcap .*morning_0[.]mcap"
+    ):
+        read(day)
+    (day / "evening_0.mcap").rename(day / "morning_1.mcap")
+    assert detect_format(day).name == "ROS bag"
+
+
+def test_formats_are_listed_where_errors_say(tmp_path, capsys):
+    (tmp_path / "picture.jpg").write_bytes(b"\xff\xd8\xff\xe0")
+    with pytest.raises(InputError, match="is no recording") as caught:
+        read(tmp_path / "picture.jpg")
+    assert len(str(caught.value)) < 200
+    assert "`stillmap info -h` lists the formats" in str(caught.value)
+    with pytest.raises(SystemExit):
+        main(["info", "--help"])
+    told = capsys.readouterr().out
+    assert [one.name for one in FORMATS if one.name.partition(" ")[0] not in told] == []
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes here")

@@ -36,7 +36,7 @@ def test_every_module_is_installed_and_nothing_else(installed):
     own = {file for file in installed if ".dist-info/" not in file}
     extra = sorted(own - modules)
     assert modules <= own
-    templates = [file for file in extra if re.search(r"/report/templates/\w+\.\w+\.j2$", file)]
+    templates = [file for file in extra if re.search(r"/report/templates/\w+\.(\w+\.j2|js)$", file)]
     extra = [file for file in extra if file not in templates]
     assert "stillmap/results/report/templates/report.html.j2" in templates
     assert len(extra) == 4

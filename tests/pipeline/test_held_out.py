@@ -1,6 +1,7 @@
 """The figure of quality in every iteration, in run.json and in the report."""
 
 import json
+import math
 
 import pytest
 
@@ -39,7 +40,8 @@ def test_every_iteration_has_its_figure(room, tmp_path, estimator):
     result.save(tmp_path / "out")
     run = json.loads((tmp_path / "out" / "run.json").read_text())
     assert [it["held_out_log_likelihood"] for it in run["iterations"]] == figures
-    assert f"predicted {expected:.3f} nats" in (tmp_path / "out" / "report.html").read_text()
+    gain = f"a beam is {math.exp(expected):.3g} times as likely with the map as without one"
+    assert gain in (tmp_path / "out" / "report.html").read_text()
 
 
 @pytest.mark.parametrize("every", [0, 61])
@@ -47,7 +49,7 @@ def test_without_held_out_scans_there_is_none(room, tmp_path, every):
     result = stillmap.build(room.recording, options("stillmap", held_out=every, max_iterations=1))
     assert [it.held_out_log_likelihood for it in result.iterations] == [None]
     result.save(tmp_path / "out")
-    assert "are predicted" not in (tmp_path / "out" / "report.html").read_text()
+    assert "times as likely" not in (tmp_path / "out" / "report.html").read_text()
 
 
 def test_what_is_mapped_does_not_depend_on_it(room):

@@ -47,7 +47,7 @@ def test_the_keys_that_scripts_rely_on(tmp_path, result):
     assert run["input"]["path"] == "logs/hall <1>.clf"
     assert run["options"]["em"] == {"prior": 0.9, "note": result.options.em.note, "seed": None}
     heights = {"min_obstacle_height": 0.2, "max_obstacle_height": 1.8}
-    shown = {"map_mode": "trinary", "map_state": "last", **heights}
+    shown = {"map_mode": "trinary", "map_state": "last", "region": None, **heights}
     assert run["options"]["output"] == shown
     assert (run["converged"], run["best_iteration"]) == (True, 3)
     assert run["seconds"] == {"read": 0.21, "em": 7.1, "map": 0.02}

@@ -11,7 +11,7 @@ from pathlib import Path
 from types import CodeType, FrameType
 from typing import IO, TYPE_CHECKING, Any
 
-from stillmap.core.progress_bar import Step, terminal_bar
+from stillmap.core.progress_bar import Step, make_bar, terminal_bar
 
 if TYPE_CHECKING:
     from stillmap.core.profiling import Progress
@@ -88,15 +88,12 @@ def show_share(quiet: bool, what: str) -> "Iterator[Callable[[float], None] | No
     if quiet or sys.stderr is None:
         yield None
     elif is_terminal(sys.stderr):
-        from rich.console import Console
-        from rich.progress import Progress as Bar
-
-        bar = Bar(console=Console(stderr=True), transient=True)
-        task = bar.add_task(what, total=1.0)
+        bar = make_bar()
+        task = bar.add_task(what, total=1.0, counted="")
 
         def update(share: float) -> None:
             bar.start()  # not before the first progress
-            bar.update(task, completed=share)
+            bar.update(task, completed=share, counted=f"{100.0 * share:.0f} %")
 
         try:
             yield update

@@ -129,9 +129,10 @@ def _convert_to_table(args: argparse.Namespace, result: "ResultFolder", output: 
     exported = _read_result(args, result, output)
     if exported.recording.dimension != 2:
         raise InputError(
-            "is of a 3D recording: its points can be written, as a cloud",
+            "is of a 3D recording: no table",
             where=str(result.folder),
-            hint=", ".join(CLOUDS),
+            hint=f"its points as a cloud ({', '.join(CLOUDS)}), all of it as a bag (.mcap, .bag), "
+            "its model (.obj)",
         )
     parquet.write(exported, exported.deskew(), output)
     return f"{exported.recording.n_beams} beams"

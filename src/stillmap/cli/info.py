@@ -18,6 +18,15 @@ EPILOG = """examples:
   stillmap info log.clf.gz
   stillmap info sim --json
   stillmap info log.log --max-range 30 --laser-offset 0.2 0 0
+
+formats:
+  CARMEN log          .log .clf .txt, plain or .gz
+  ROS bag             .bag .db3 .mcap, a folder of ROS 2
+  stillmap recording  a folder with recording.json
+  KITTI folder        with velodyne/ or velodyne_points/
+  RGB-D folder        7-Scenes, 3DMatch, TUM RGB-D
+  PCD, PLY            a file, or a folder of them
+  LAS, E57, 3DTK      likewise
 """
 
 

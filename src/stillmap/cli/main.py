@@ -63,6 +63,7 @@ def _parse(words: list[str]) -> argparse.Namespace:
     command = next((word for word in words if not word.startswith("-")), "")
     top = parser([command])
     args = top.parse_args(words)
+    args.words = words
     if args.command is None:
         listed = "".join(f"  {name:<12} {about}\n" for name, about in COMMANDS.items())
         usage = f"{top.format_usage()}\ncommands:\n{listed}\nsee stillmap --help\n"

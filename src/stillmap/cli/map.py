@@ -134,7 +134,7 @@ def run(args: argparse.Namespace) -> int:
     options = options_from_args(args, read_changes(args), _option_changes(args))
     output, stages = Path(args.output), StageTimer()
     _require_usable_output(args, output)
-    with lock_checkpoints(output) as checkpoints, _explain_failure(args.quiet, checkpoints):
+    with lock_checkpoints(output) as checkpoints, _explain_failure(args, checkpoints):
         inputs = read_inputs(args, options, checkpoints.folder, stages)
         with show_progress(args.quiet, options.em.max_iterations) as progress:
             result, tilting, models = build_all(args, inputs, checkpoints, progress, stages)
@@ -192,8 +192,8 @@ def _require_usable_output(args: argparse.Namespace, output: Path) -> None:
 
 
 @contextmanager
-def _explain_failure(quiet: bool, checkpoints: "CheckpointFolder") -> Iterator[None]:
-    """Report a full disk in one line, and after an interruption the checkpoint to resume from."""
+def _explain_failure(args: argparse.Namespace, checkpoints: "CheckpointFolder") -> Iterator[None]:
+    """Report a full disk in one line, and after an interruption how to go on."""
     try:
         yield
     except OSError as error:
@@ -202,9 +202,19 @@ def _explain_failure(quiet: bool, checkpoints: "CheckpointFolder") -> Iterator[N
         where = str(checkpoints.folder)
         raise InputError(f"cannot continue: {error.strerror}", where=where) from error
     except (KeyboardInterrupt, SystemExit):
-        if checkpoints.newest is not None and not quiet:
-            say(f"{checkpoints.folder} has the last checkpoint: --resume continues there")
+        if not args.quiet:
+            say(_describe_interruption(args.words, checkpoints))
         raise
+
+
+def _describe_interruption(words: list[str], checkpoints: "CheckpointFolder") -> str:
+    """How to continue an interrupted run with these words on its command line."""
+    if checkpoints.newest is None:
+        return "no iteration was finished: nothing was written, and there is nothing to resume"
+    given = [word for word in words if word not in ("--resume", "--overwrite")]
+    number = checkpoints.newest.name.rpartition("-")[2]
+    command = shlex.join(["stillmap", *given, "--resume"])
+    return f"continue after iteration {number}: {command}"
 
 
 def _summarize(output: Path) -> dict[str, Any]:

@@ -6,10 +6,15 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from stillmap.core.profiling import Progress
 
+if TYPE_CHECKING:
+    from rich.progress import Progress as Bar
+
+_WIDE, _ROOMY = 100, 120  # columns of a terminal: from there on with longer texts
+_BAR_WIDTH = 40  # columns; on narrower terminals the bar takes what is left
 _PERIOD = 0.2  # s between two changes of a bar in a notebook
 
 
@@ -19,6 +24,7 @@ class Step:
     def __init__(self, what: str, iteration: int, iterations: int) -> None:
         self.key = what, iteration
         self.name = f"{what}, iteration {iteration} of at most {iterations}" if iteration else what
+        self.short_name = f"{what} {iteration}/{iterations}" if iteration else what
         self.of_scans, self._started = iteration > 0, time.monotonic()
 
     def seconds(self) -> float:
@@ -40,20 +46,29 @@ def show_bar(iterations: int) -> Iterator[Progress]:
         yield progress
 
 
-@contextmanager
-def terminal_bar(iterations: int) -> Iterator[Progress]:
-    """A Progress that shows step, iteration, scans, rate and time left on stderr."""
+def make_bar() -> "Bar":
+    """A bar on stderr in one line of a terminal of any width, for tasks with a field `counted`."""
     from rich.console import Console
     from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
     from rich.progress import Progress as Bar
+    from rich.table import Column
 
+    console = Console(stderr=True)
+    is_roomy = console.width >= _ROOMY
     columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.fields[counted]}"),
-        TimeRemainingColumn(),
+        TextColumn("{task.description}", table_column=Column(no_wrap=True)),
+        BarColumn(bar_width=_BAR_WIDTH if is_roomy else None),
+        TextColumn("{task.fields[counted]}", table_column=Column(no_wrap=True)),
+        TimeRemainingColumn(table_column=Column(no_wrap=True)),
     )
-    with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
+    return Bar(*columns, console=console, transient=True, expand=not is_roomy)
+
+
+@contextmanager
+def terminal_bar(iterations: int) -> Iterator[Progress]:
+    """A Progress that shows step, iteration, scans, rate and time left on stderr."""
+    with make_bar() as bar:
+        width = bar.console.width
         shown: Step | None = None
         task = bar.add_task("", total=None, counted="")
 
@@ -62,10 +77,11 @@ def terminal_bar(iterations: int) -> Iterator[Progress]:
             if shown is None or shown.key != (what, iteration):
                 shown = Step(what, iteration, iterations)
                 bar.remove_task(task)
-                task = bar.add_task(shown.name, total=total or None, counted="")
+                name = shown.name if width >= _WIDE else shown.short_name
+                task = bar.add_task(name, total=total or None, counted="")
             if total:
                 counted = f"{done}/{total}"
-                if shown.of_scans:
+                if shown.of_scans and width >= _ROOMY:
                     counted += f" scans {shown.rate(done):.0f}/s"
                 # a finished step is shown even if it was short
                 bar.update(task, completed=done, counted=counted, refresh=done == total)

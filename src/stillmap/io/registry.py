@@ -3,6 +3,7 @@
 The table of formats that are written is in `writers.py`.
 """
 
+import shlex
 from collections.abc import Callable
 from dataclasses import replace
 from importlib import import_module
@@ -28,6 +29,7 @@ RIG_FOLDERS = ("horizontal", "tilting")  # of the two recordings of a simulated 
 _HEAD = 1 << 16  # bytes from which a format is detected
 _MAX_ENTRIES = 1000  # of a folder, searched for recordings
 _MAX_LISTED = 3  # recordings in a message
+_FORMATS_HINT = "`stillmap info -h` lists the formats"
 
 Reader = Callable[[Path, ReadContext], Recording]
 
@@ -204,7 +206,7 @@ def detect_format(path: Path) -> Format:
         raise InputError(f"is no usable path: {error}", where=repr(str(path))) from error
     if not is_folder and not is_file:
         if path.exists():
-            raise InputError("is no regular file", where=str(path), hint=_list_formats())
+            raise InputError("is no regular file", where=str(path), hint=_FORMATS_HINT)
         raise InputError("does not exist", where=str(path))
     start = read_head(path, _HEAD) if is_file else None
     for known in FORMATS:
@@ -221,35 +223,55 @@ def detect_format(path: Path) -> Format:
         for known in FORMATS:
             if path.name.lower().endswith(known.endings):
                 return known
-    raise InputError(what, where=str(path), hint=_list_formats())
+    raise InputError(what, where=str(path), hint=_FORMATS_HINT)
 
 
 def _no_recording_error(path: Path) -> InputError:
-    """The error for a folder without a format, naming the recordings inside."""
+    """The error for a folder without a format, naming the recordings inside and the next step."""
+    if (path / "run.json").is_file():
+        return InputError("is a result, no recording", where=str(path))
     inside = _find_recordings(path)
     if not inside:
-        return InputError("is a folder without a recording", where=str(path), hint=_list_formats())
+        return InputError("is a folder without a recording", where=str(path), hint=_FORMATS_HINT)
     more = f" and {len(inside) - _MAX_LISTED} more" if len(inside) > _MAX_LISTED else ""
-    shown = ", ".join(map(str, inside[:_MAX_LISTED])) + more
+    shown = ", ".join(map(_describe_entry, inside[:_MAX_LISTED])) + more
     if tuple(one.name for one in inside) == RIG_FOLDERS:
         flat, tilting = inside
         hint = f"both: {flat} with tilting={tilting}"
     else:
-        hint = "name it" if len(inside) == 1 else "name one of them"
+        which = "it" if len(inside) == 1 else "one of them"
+        hint = f"name {which}: stillmap map {shlex.quote(str(inside[0]))} -o DIR"
     what = "a recording" if len(inside) == 1 else "several recordings"
     return InputError(f"is no recording but holds {what}: {shown}", where=str(path), hint=hint)
 
 
 def _find_recordings(path: Path) -> list[Path]:
-    """The subfolders that are recordings, by name; none in a result folder."""
+    """The entries of a folder that are recordings, by name."""
     try:
-        if (path / "run.json").exists():  # its objects are point clouds
-            return []
-        folders = [one for one in islice(path.iterdir(), _MAX_ENTRIES) if one.is_dir()]
+        return [one for one in sorted(islice(path.iterdir(), _MAX_ENTRIES)) if _is_recording(one)]
     except OSError:
         return []
-    return [one for one in sorted(folders) if any(known.matches(one, None) for known in FORMATS)]
 
 
-def _list_formats() -> str:
-    return "stillmap reads: " + "; ".join(f"{f.name} ({', '.join(f.endings)})" for f in FORMATS)
+def _is_recording(path: Path) -> bool:
+    try:
+        if path.is_dir():
+            return any(known.matches(path, None) for known in FORMATS)
+        name = path.name.lower()
+        named = [one for one in FORMATS if name.endswith(one.endings) and path.is_file()]
+        start = read_head(path, _HEAD) if named else b""
+    except (OSError, InputError):
+        return False
+    return any(known.matches(path, start) for known in named)
+
+
+def _describe_entry(path: Path) -> str:
+    """An entry of a folder, with the size of a file."""
+    if path.is_dir():
+        return str(path)
+    size = float(path.stat().st_size)
+    for unit in ("bytes", "kB", "MB"):
+        if size < 1000:
+            return f"{path} ({size:.3g} {unit})"
+        size /= 1000
+    return f"{path} ({size:.3g} GB)"

@@ -1,5 +1,6 @@
 """Types shared by all bag formats (channels, raw messages), and format detection."""
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal, NamedTuple, Protocol
@@ -82,8 +83,16 @@ class Bag(Protocol):
 def is_bag(path: Path, start: bytes | None) -> bool:
     """Whether a file with these first bytes, or a folder (None), is a bag."""
     if start is None:
-        return bool(storage_files(path))
+        return _is_bag_folder(path)
     return start.startswith((BAG1_MAGIC, MCAP_MAGIC, DB3_MAGIC)) or is_compressed(path, start)
+
+
+def _is_bag_folder(path: Path) -> bool:
+    """Whether the files of a folder are one recording, which recorders split into X_0, X_1, ..."""
+    files = storage_files(path)
+    if (path / "metadata.yaml").is_file():
+        return bool(files)
+    return len({re.sub(r"_\d+$", "", file.name.partition(".")[0]) for file in files}) == 1
 
 
 def is_compressed(path: Path, start: bytes) -> bool:
