@@ -22,7 +22,7 @@ EPILOG = """examples:
 formats:
   CARMEN log          .log .clf .txt, plain or .gz
   ROS bag             .bag .db3 .mcap, a folder of ROS 2
-  stillmap recording  a folder with recording.json
+  recording folder    with recording.json, of stillmap
   KITTI folder        with velodyne/ or velodyne_points/
   RGB-D folder        7-Scenes, 3DMatch, TUM RGB-D
   PCD, PLY            a file, or a folder of them
