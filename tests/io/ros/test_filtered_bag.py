@@ -272,3 +272,51 @@ def test_a_bag_that_has_changed_is_refused(bag, messages, tmp_path):
         with pytest.raises(InputError, match=r"was mapped"):
             filtered(other, tmp_path / f"out{source.suffix}", recording, blank)
     assert not list(tmp_path.glob("out*"))
+
+
+def test_publishers_and_quality_of_service_stay(tmp_path, kind, messages):
+    from rosbags.interfaces import (
+        Qos,
+        QosDurability,
+        QosHistory,
+        QosLiveliness,
+        QosReliability,
+        QosTime,
+    )
+    from rosbags.rosbag1 import Writer as Writer1
+    from rosbags.rosbag2 import StoragePlugin
+    from rosbags.rosbag2 import Writer as Writer2
+
+    from stillmap.io.ros.bag import open_bag
+
+    never = QosTime(1, 2)
+    qos = Qos(
+        QosHistory.KEEP_LAST,
+        5,
+        QosReliability.BEST_EFFORT,
+        QosDurability.VOLATILE,
+        never,
+        never,
+        QosLiveliness.AUTOMATIC,
+        never,
+        False,
+    )
+    if kind == "bag":
+        source, more = tmp_path / "a.bag", {"callerid": "/lidar"}
+        writer = Writer1(source)
+    else:
+        source, more = tmp_path / "a", {"offered_qos_profiles": [qos]}
+        plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
+        writer = Writer2(source, version=9, storage_plugin=plugin)
+    with writer:
+        topic, stamp, (type, message) = cloud(messages, 0)
+        connection = writer.add_connection(topic, type, typestore=messages.store, **more)
+        writer.write(connection, stamp, messages.raw(type, message))
+    recording = read(source)
+    out = tmp_path / f"out{source.suffix}"
+    filtered(source, out, recording, recording.hit)
+    bag = open_bag(out, None, trusted=True)
+    assert [(c.publisher, c.qos) for c in bag.channels] == [
+        ("/lidar", ()) if kind == "bag" else ("", (qos,))
+    ]
+    bag.close()

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 from stillmap.core.errors import InputError
 from stillmap.io.builder import SkippedRecords
@@ -34,6 +34,8 @@ class Channel(NamedTuple):
         digest: hash of the type definition, "" where the bag has none.
         definition: text of the type definition, "" where the bag has none.
         latched: late subscribers still get the last message.
+        publisher: name of the ROS 1 node that wrote it, "" where it is not known.
+        qos: profiles that ROS 2 publishers offered, as rosbags has them.
     """
 
     id: int
@@ -44,6 +46,8 @@ class Channel(NamedTuple):
     digest: str
     definition: str = ""
     latched: bool = False
+    publisher: str = ""
+    qos: tuple[Any, ...] = ()
 
 
 class Message(NamedTuple):

@@ -78,6 +78,10 @@ class BagWriter:
         elif channel.type not in self._store.fielddefs:
             return None
         writer = self._writer
+        if self.is_ros1 and channel.publisher:
+            definition["callerid"] = channel.publisher
+        if not self.is_ros1 and channel.qos:
+            definition["offered_qos_profiles"] = list(channel.qos)
         connection = self._add_connection(
             channel.topic, channel.type, channel.latched, **definition
         )
@@ -104,9 +108,9 @@ class BagWriter:
 
     def _add_connection(self, topic: str, type: str, latched: bool, **options: Any) -> Any:
         if self.is_ros1:
-            options |= {"callerid": "/stillmap", "latching": int(latched)}
+            options = {"callerid": "/stillmap", "latching": int(latched), **options}
         else:
-            options |= {"offered_qos_profiles": [_TRANSIENT_LOCAL] if latched else []}
+            options = {"offered_qos_profiles": [_TRANSIENT_LOCAL] if latched else [], **options}
         return self._writer.add_connection(topic, type, **options)
 
 

@@ -113,13 +113,15 @@ def open_db3(path: Path) -> Any:
 
 def _channel(connection: Any) -> Channel:
     ext = connection.ext
+    publisher = ""
+    qos: tuple[Qos, ...] = ()
     if isinstance(ext, ConnectionExtRosbag2):
+        qos = tuple(ext.offered_qos_profiles)
         encoding = ext.serialization_format
-        latched = any(
-            q.durability == QosDurability.TRANSIENT_LOCAL for q in ext.offered_qos_profiles
-        )
+        latched = any(q.durability == QosDurability.TRANSIENT_LOCAL for q in qos)
     else:
         encoding, latched = "ros1", bool(ext.latching)
+        publisher = ext.callerid or ""
     names = connection.topic, connection.msgtype, encoding, connection.digest
     if not all(isinstance(name, str) for name in names):
         raise DamagedBagError("a topic whose name or type is no text")
@@ -133,4 +135,6 @@ def _channel(connection: Any) -> Channel:
         connection.digest,
         connection.msgdef.data if is_text else "",
         latched,
+        publisher,
+        qos,
     )

@@ -1,0 +1,141 @@
+"""`stillmap filter` of folders, into other formats, and what is refused."""
+
+import signal
+import time
+
+import numpy as np
+import pytest
+from labelled import N, check_same_but, files, kitti, label, run
+from refusals import refused
+
+from stillmap.io import read
+
+
+@pytest.mark.parametrize(
+    ("layout", "times"),
+    [("velodyne", "times.txt"), ("velodyne_points/data", "velodyne_points/timestamps.txt")],
+)
+def test_kitti_folder(call, tmp_path, layout, times):
+    """Rows go, bit for bit; the damaged scan becomes an empty file, so that numbers stay."""
+    source = kitti(tmp_path / "drive", layout, times)
+    recording, blank = label(source, tmp_path / "drive/out")
+    summary = run(call, source / "out", tmp_path / "clean")
+    assert summary["blanked"] == blank.sum() > 20
+    assert summary["scans_left_out"] == 1
+    before, after = files(source), files(tmp_path / "clean")
+    assert set(after) == {name for name in before if not name.startswith("out/")}
+    for scan, number in enumerate((0, 1, 3)):
+        name = f"{layout}/{number:06d}.bin"
+        rows = np.frombuffer(before.pop(name), "V16")
+        assert after.pop(name) == rows[~blank[recording.beams_of(scan)]].tobytes()
+    assert after.pop(f"{layout}/000002.bin") == b""
+    labels = np.flatnonzero(~blank[recording.beams_of(1)]).astype("<u4")
+    assert after.pop("labels/000001.label") == labels.tobytes()
+    assert all(before[name] == data for name, data in after.items())
+    assert check_same_but(recording, tmp_path / "clean", blank).n_scans == 3
+
+
+@pytest.mark.parametrize(
+    "output", ["clean.mcap", "clean.bag", "clean:pcd", "clean:stillmap", "clean.ply"]
+)
+def test_other_formats_by_name(call, tmp_path, output):
+    source = kitti(tmp_path / "drive")
+    recording, blank = label(source, tmp_path / "out")
+    name, _, form = output.partition(":")
+    out = tmp_path / name
+    done = call("filter", tmp_path / "out", "-o", out, *(("--to", form) if form else ()))
+    assert done.returncode == 0, done.stderr
+    assert f"{blank.sum()} beams blanked" in done.stderr
+    assert "1 scans left out that were not mapped" in done.stderr
+    assert ("recorded poses are left out" in done.stderr) == output.endswith(("mcap", "bag"))
+    again = read(out)
+    hits = again.points[again.hit]
+    kept = recording.points[recording.hit & ~blank]
+    if output == "clean.ply":
+        assert len(hits) == len(kept)  # as one cloud
+    else:
+        np.testing.assert_array_equal(hits, kept)
+        np.testing.assert_array_equal(again.stamp_ns, recording.stamp_ns)
+
+
+def test_refusals_come_before_anything_is_read(call, tmp_path):
+    source = kitti(tmp_path / "drive")
+    label(source, tmp_path / "out")
+    (source / "times.txt").unlink()  # reading it would fail
+    for output, words in (
+        ("clean.log", ("clean.log", "2D at most", "3D")),
+        ("clean.pcd", ("clean.pcd", "KITTI folder", "another ending")),
+        ("drive/clean", ("lies in the folder of the recording",)),
+        (".", ("holds the recording",)),
+    ):
+        refused(call("filter", tmp_path / "out", "-o", tmp_path / output), *words)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full/other").write_text("")
+    for more, words in (((), "already holds"), (("--overwrite",), "holds other things")):
+        refused(call("filter", tmp_path / "out", "-o", tmp_path / "full", *more), words)
+    (tmp_path / "out/beams/hit.npy").unlink()
+    refused(call("filter", tmp_path / "out", "-o", tmp_path / "clean"), "hit.npy")
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["drive", "full", "out"]
+
+
+def test_folders_are_overwritten(call, tmp_path):
+    source = kitti(tmp_path / "drive")
+    label(source, tmp_path / "out")
+    run(call, tmp_path / "out", tmp_path / "clean")
+    (tmp_path / "clean/velodyne/000009.bin").write_bytes(b"")
+    run(call, tmp_path / "out", tmp_path / "clean", "--overwrite")
+    assert not (tmp_path / "clean/velodyne/000009.bin").exists()
+
+
+def test_links_to_other_places_stay_links(call, tmp_path):
+    """Linked folders of scans are written, others are not copied."""
+    real = kitti(tmp_path / "real")
+    (tmp_path / "drive").mkdir()
+    for name in ("velodyne", "image_2"):
+        (tmp_path / "drive" / name).symlink_to(f"../real/{name}")
+    (tmp_path / "drive/times.txt").write_text((real / "times.txt").read_text())
+    _, blank = label(tmp_path / "drive", tmp_path / "out")
+    run(call, tmp_path / "out", tmp_path / "far/away/clean")
+    clean = tmp_path / "far/away/clean"
+    assert (clean / "image_2").resolve() == real / "image_2"
+    assert not (clean / "velodyne").is_symlink()
+    sizes = [path.stat().st_size for path in (clean / "velodyne").iterdir()]
+    assert sum(sizes) == 16 * (3 * N - blank.sum())
+    assert (real / "velodyne/000000.bin").stat().st_size == 16 * N
+
+
+@pytest.mark.parametrize(
+    "options", [{"start": 0.05, "end": 0.15}, {"min_range": 3.0, "max_range": 7.0, "spin": "none"}]
+)
+def test_options_of_reading_do_not_move_rows(call, tmp_path, options):
+    """Sweeps outside a part of the recording become empty; beams at maximum range stay."""
+    source = kitti(tmp_path / "drive")
+    recording, blank = label(source, tmp_path / "out", options=options)
+    summary = run(call, tmp_path / "out", tmp_path / "clean")
+    used = [1] if "start" in options else [0, 1, 3]
+    assert (summary["blanked"], summary["scans_left_out"]) == (blank.sum(), 4 - len(used))
+    for k in range(4):
+        rows = np.fromfile(source / f"velodyne/{k:06d}.bin", "u1")
+        expected = b""
+        if k in used:
+            gone = blank[recording.beams_of(used.index(k))]
+            expected = rows.reshape(-1, 16)[~gone].tobytes()
+        assert (tmp_path / f"clean/velodyne/{k:06d}.bin").read_bytes() == expected
+
+
+def test_interrupted_copies_leave_nothing(start, tmp_path):
+    (tmp_path / "pcd").mkdir()
+    head = "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {0}\n"
+    head += "HEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {0}\nDATA ascii\n"
+    lines = 20000 * "1.5 2.25 0.125\n"
+    for k in range(20):
+        (tmp_path / f"pcd/{k}.pcd").write_text(head.format(20000) + lines)
+    label(tmp_path / "pcd", tmp_path / "out")
+    (tmp_path / "there").mkdir()
+    process = start("filter", tmp_path / "out", "-o", tmp_path / "there/clean", "--quiet")
+    while process.poll() is None and not list((tmp_path / "there").glob(".*.part")):
+        time.sleep(0.001)
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 130, said
+    assert not list((tmp_path / "there").iterdir())
