@@ -128,7 +128,7 @@ def test_interrupted_copies_leave_nothing(start, tmp_path):
     head = "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {0}\n"
     head += "HEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {0}\nDATA ascii\n"
     lines = 20000 * "1.5 2.25 0.125\n"
-    for k in range(20):
+    for k in range(60):  # a second of writing
         (tmp_path / f"pcd/{k}.pcd").write_text(head.format(20000) + lines)
     label(tmp_path / "pcd", tmp_path / "out")
     (tmp_path / "there").mkdir()
