@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 # a copy for the help: the module that defines them takes long to load
 CLOUDS = (".las", ".laz", ".e57", ".pcd", ".ply", ".xyz")
 NAV2 = "nav2"  # the format of maps and masks
-_PARQUET = ".parquet"
+_PARQUET, _RRD = ".parquet", ".rrd"
 
 
 def add_zone_flags(p: argparse.ArgumentParser) -> None:
@@ -76,6 +76,8 @@ def convert_result(args: argparse.Namespace, source: Path, output: Path) -> tupl
     if ending == obj.ENDING:
         faces, pages = obj.write_obj(source, output, result.texture_quality, args.overwrite)
         return [], f"{faces} faces and {pages} page{'s' * (pages != 1)} of texture"
+    if ending == _RRD:
+        return [], _convert_to_rrd(args, result, output)
     if ending == _PARQUET:
         return [], _convert_to_table(args, result, output)
     return _convert_to_bag(args, result, output)
@@ -138,6 +140,23 @@ def _convert_to_table(args: argparse.Namespace, result: "ResultFolder", output: 
     return f"{exported.recording.n_beams} beams"
 
 
+def _convert_to_rrd(args: argparse.Namespace, result: "ResultFolder", output: Path) -> str:
+    from stillmap.core.files import require_new_file
+    from stillmap.results.export import rrd
+
+    require_new_file(output, args.overwrite)
+    rrd.require_rerun(output)
+    exported = _read_result(args, result, output)
+    with show_share(args.quiet, "writing") as progress:
+        rrd.write(exported, output, progress)
+    return _describe(exported)
+
+
+def _describe(exported: "Exported") -> str:
+    scans, objects = exported.recording.n_scans, len(exported.tracks)
+    return f"{scans} scans, map, trajectory and {objects} objects"
+
+
 def _convert_to_bag(
     args: argparse.Namespace, result: "ResultFolder", output: Path
 ) -> tuple[list[str], str]:
@@ -145,7 +164,8 @@ def _convert_to_bag(
     from stillmap.io.ros.bag_types import BagKind
     from stillmap.results.export import bag, obj
 
-    hint = f"a bag, .mcap for Foxglove, {_PARQUET}, or in 3D {', '.join(CLOUDS)}, {obj.ENDING}"
+    clouds = f"{', '.join(CLOUDS)}, {obj.ENDING}"
+    hint = f"a bag, .mcap for Foxglove, {_RRD}, {_PARQUET}, or in 3D {clouds}"
     try:
         writer = writers.find_writer(output, args.to)
     except InputError as error:
@@ -159,8 +179,7 @@ def _convert_to_bag(
     exported = _read_result(args, result, output)
     with show_share(args.quiet, "writing") as progress:
         losses = bag.write(exported, output, kind, overwrite=args.overwrite, progress=progress)
-    scans, objects = exported.recording.n_scans, len(exported.tracks)
-    return losses, f"{scans} scans, map, trajectory and {objects} objects"
+    return losses, _describe(exported)
 
 
 def _read_result(args: argparse.Namespace, result: "ResultFolder", output: Path) -> "Exported":
