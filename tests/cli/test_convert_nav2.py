@@ -166,6 +166,20 @@ def test_the_recording_is_not_needed(call, mapped, tmp_path):
     assert call("convert", result, "-o", tmp_path / "a", "--to", "nav2").returncode == 0
 
 
+def test_results_of_other_versions(call, mapped, tmp_path):
+    """They may have options that are no longer, or not yet, known."""
+    result = tmp_path / "result"
+    shutil.copytree(mapped, result)
+    record = json.loads((result / "run.json").read_text())
+    record["options"]["em"]["of_another_version"] = 1.0
+    (result / "run.json").write_text(json.dumps(record))
+    assert call("convert", result, "-o", tmp_path / "a", "--to", "nav2").returncode == 0
+    record["options"]["output"]["map_mode"] = "raw"
+    (result / "run.json").write_text(json.dumps(record))
+    assert call("convert", result, "-o", tmp_path / "b", "--to", "nav2").returncode == 0
+    assert "mode: raw" in (tmp_path / "b/map.yaml").read_text()
+
+
 def test_no_traffic(call, mapped, tmp_path):
     done = call("convert", mapped, "-o", tmp_path / "a", "--keepout-crossings", 1000)
     assert done.returncode == 0

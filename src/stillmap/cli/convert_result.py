@@ -101,7 +101,7 @@ def _convert_to_nav2(
     is_traffic = rule.keepout is not None or rule.slow is not None
     crossings = read_crossings(result.folder) if is_traffic else None
     maps = nav2.make_maps(read_grid(result.folder), drawn, rule, crossings)
-    nav2.write(maps, output, result.options.output.map_mode, overwrite=args.overwrite)
+    nav2.write(maps, output, result.map_mode, overwrite=args.overwrite)
     written = ["map"]
     if maps.keepout is not None:
         written.append(f"keep-out zones of {maps.keepout_area:.1f} m2")

@@ -20,7 +20,7 @@ from stillmap.io.text_lines import Progress
 from stillmap.io.trajectory import poses_from_tum
 from stillmap.mesh.options import MeshOptions
 from stillmap.pipeline.calibration import apply_calibration
-from stillmap.pipeline.options import Options, OutputOptions
+from stillmap.pipeline.options import MapMode, Options, OutputOptions
 from stillmap.pipeline.quality import Quality
 from stillmap.preprocessing.options import ReadOptions
 from stillmap.results.labels import Labels, read_colors, read_labels
@@ -131,6 +131,12 @@ class ResultFolder(ShortRepr):
         """The part of the map frame that it shows; None: everything."""
         section = self._section("output") or {}
         return self._override(OutputOptions(), {"region": section.get("region")}).region
+
+    @property
+    def map_mode(self) -> MapMode:
+        """How its map image is written; the default where the record does not say."""
+        mode = (self._section("output") or {}).get("map_mode")
+        return self._override(OutputOptions(), {"map_mode": mode}).map_mode
 
     def _section(self, name: str) -> dict[str, Any] | None:
         """A section of the options in the record; None where there is none."""
