@@ -246,7 +246,9 @@ def test_distance_between_two_clicks(shown, tab):
     window = shown(2)
     tab.press("m", "KeyM")
     until(window, lambda: "Click on the first point" in tab.value("document.body.innerText"))
-    ends = np.array([[-1.0, 0.2, 0.0], [1.4, 2.0, 0.0]])
+    (client,) = window._server.get_clients().values()
+    # about the center of the view, beside the legend
+    ends = client.camera.look_at + np.array([[-0.8, -0.6, 0.0], [1.6, 1.2, 0.0]])
     for count, end in enumerate(ends):
         tab.click(*pixel_of(tab, window, end))
         until(window, lambda wanted=count + 1: len(window._measuring.ruler.points) == wanted)
