@@ -193,7 +193,7 @@ def test_recursive_metadata(tmp_path):
     (path / "metadata.yaml").unlink()
     os.mkfifo(path / "metadata.yaml")
     assert read(path).n_scans == 3
-    os.mkfifo(path / "more.db3")
+    os.mkfifo(path / "tiny_1.db3")
     with pytest.raises(InputError, match="is no regular file"):
         read(path)
 
