@@ -1,18 +1,52 @@
-"""Quality of labels and of geometry from 0 to 100, without truth; `docs/quality.md` defines it."""
+"""Quality of labels and of geometry from 0 to 100, without truth; `docs/quality.md` defines it.
 
-from dataclasses import dataclass
+Every figure comes from the same evidence, in metres and shares, whatever estimator, resolution or
+sensor made the result.
+"""
+
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.recording import Recording
-from stillmap.em import label_quality
-from stillmap.slam import surface_agreement
+from stillmap.em import OccupancyMap, label_quality
+from stillmap.mapping.fragments import count_small_pieces
+from stillmap.slam import rematching, surface_agreement
 
 Float = NDArray[np.float64]
 
-_HALF_MARK = 0.05  # m of root mean square displacement at which geometry is 50
-_MIN_PAIRS = 10  # of surface patches that two visits show: with fewer nothing can be told
+# values at which a part of geometry is 50
+_HALF_DISAGREEMENT = 0.2  # m, between poses and scans matched anew
+_HALF_DISPLACEMENT = 0.03  # m, of surfaces seen again
+_HALF_SMALL_PIECES = 30.0  # small pieces of the map per 100 m2
+# displacement that counts where no place is seen again, so that nothing confirms the map
+_UNSEEN_DISPLACEMENT = 0.06
+# what the best of simulated results reach: it is 100
+_BEST_F1, _BEST_GEOMETRY = 0.85, 0.8
+_JUDGED_SCANS = 120  # at a time: longer and the poses matched anew have drifted
+_GEOMETRY_WEIGHT = 0.75  # of overall: poses, walls and ghosts are three of four things to get right
+
+
+@dataclass(frozen=True)
+class QualityEvidence:
+    """What `Quality` was computed from; None where it cannot be told.
+
+    Attributes:
+        expected_f1: of the label dynamic, from 0 to 1.
+        disagreement: metres between the poses and scans matched anew.
+        displacement: metres, mean of surfaces seen again.
+        worst_scans: first scans of the two visits whose surfaces are displaced most.
+        worst_place: where, metres in the map.
+        small_pieces: of the map, per 100 m2.
+    """
+
+    expected_f1: float | None = None
+    disagreement: float | None = None
+    displacement: float | None = None
+    worst_scans: tuple[int, int] | None = None
+    worst_place: tuple[float, ...] | None = None
+    small_pieces: float | None = None
 
 
 @dataclass(frozen=True)
@@ -20,14 +54,84 @@ class Quality:
     """How good a result is, each from 0 (useless) to 100; None where it cannot be told.
 
     Attributes:
-        overall: geometric mean of both parts.
+        overall: geometric mean of both parts, geometry with three quarters of the weight.
         labels: of P(static).
         geometry: of poses and map.
+        evidence: see QualityEvidence; unknown of results that were read from a folder.
     """
 
     overall: float | None = None
     labels: float | None = None
     geometry: float | None = None
+    evidence: QualityEvidence = field(default_factory=QualityEvidence, compare=False, repr=False)
+
+
+def rate_quality(
+    deskewed: Recording,
+    poses: Float,
+    p_static: NDArray[np.float32],
+    occupancy: OccupancyMap,
+    threads: int = 1,
+) -> Quality:
+    """Rates labels, poses and map of any estimator by the same evidence.
+
+    Args:
+        deskewed: 2D or 3D.
+        poses: (T, D+1, D+1) T_map_base.
+        p_static: (M,) P(c = 1).
+        occupancy: the map of what is static.
+        threads: does not change the result.
+    """
+    counts, apart = [], []
+    for window in rematching.rematch_windows(deskewed, poses, threads):
+        apart.append(window.disagreement())
+        for part in window.split(_JUDGED_SCANS):
+            of_part = np.concatenate([p_static[deskewed.beams_of(t)] for t in part.scans.tolist()])
+            candidates = part.poses, part.rematched
+            counts.append(
+                label_quality.count_expected(part.recording, candidates, of_part, threads)
+            )
+    pairs = surface_agreement.measure_displacements(deskewed, poses).of_later_visits()
+    displacement, worst = pairs.mean(), None
+    if displacement is not None:
+        worst = pairs.worst()
+    evidence = QualityEvidence(
+        expected_f1=label_quality.expected_f1(counts),
+        disagreement=float(np.median(apart)) if deskewed.n_scans > 1 else None,
+        displacement=displacement,
+        worst_scans=None
+        if worst is None
+        else (int(pairs.scan[worst, 0]), int(pairs.scan[worst, 1])),
+        worst_place=None if worst is None else tuple(pairs.place[worst].tolist()),
+        small_pieces=count_small_pieces(occupancy),
+    )
+    return grade(evidence)
+
+
+def grade(evidence: QualityEvidence) -> Quality:
+    """The figures that follow from the evidence, rounded to a tenth."""
+    geometry = overall = None
+    labels = None if evidence.expected_f1 is None else _to_percent(evidence.expected_f1, _BEST_F1)
+    if evidence.disagreement is not None and evidence.small_pieces is not None:
+        displacement = evidence.displacement
+        parts = (
+            evidence.disagreement / _HALF_DISAGREEMENT,
+            (_UNSEEN_DISPLACEMENT if displacement is None else displacement) / _HALF_DISPLACEMENT,
+            evidence.small_pieces / _HALF_SMALL_PIECES,
+        )
+        mean = float(np.prod([1.0 / (1.0 + part) for part in parts])) ** (1.0 / 3.0)
+        geometry = _to_percent(mean, _BEST_GEOMETRY)
+    if labels is not None and geometry is not None:
+        overall = labels ** (1.0 - _GEOMETRY_WEIGHT) * geometry**_GEOMETRY_WEIGHT
+    return Quality(_round(overall), _round(labels), _round(geometry), evidence)
+
+
+def _to_percent(share: float, best: float) -> float:
+    return 100.0 * min(share / best, 1.0)
+
+
+def _round(value: float | None) -> float | None:
+    return None if value is None else round(value, 1)
 
 
 @dataclass(frozen=True)
@@ -37,30 +141,6 @@ class QualityText:
     overall: str
     labels: str
     geometry: str
-
-
-def rate_quality(
-    deskewed: Recording, poses: Float, p_static: NDArray[np.float32], threads: int = 1
-) -> Quality:
-    """Rates labels and poses of any estimator by the same evidence.
-
-    Args:
-        deskewed: 2D or 3D.
-        poses: (T, D+1, D+1) T_map_base.
-        p_static: (M,) P(c = 1).
-        threads: does not change the result.
-    """
-    f1 = label_quality.expected_f1(deskewed, poses, p_static, threads)
-    labels = None if f1 is None else 100.0 * f1
-    found = surface_agreement.measure_displacements(deskewed, poses)
-    geometry = None
-    if len(found.across) >= _MIN_PAIRS:
-        rms = float(np.sqrt(np.average(found.across**2, weights=found.weight)))
-        geometry = 100.0 / (1.0 + rms / _HALF_MARK)
-    overall = None if labels is None or geometry is None else float(np.sqrt(labels * geometry))
-    return Quality(
-        *(None if part is None else round(part, 1) for part in (overall, labels, geometry))
-    )
 
 
 def describe_quality(quality: Quality) -> QualityText:
@@ -76,20 +156,20 @@ def describe_quality(quality: Quality) -> QualityText:
 _OVERALL = (
     (80.0, "good"),
     (60.0, "usable; see which part is lower"),
-    (40.0, "check the map before it is used"),
-    (0.0, "do not rely on this map"),
+    (40.0, "look at the map before it is used, first where the lower part points to"),
+    (0.0, "doubtful; see which part is low, the other one may be good"),
 )
 _LABELS = (
-    (80.0, "what moved is told from what stands still almost everywhere"),
-    (60.0, "most of what moved is labelled so, some of it may be missing or some walls lost"),
-    (40.0, "many labels are doubtful: moving objects remain, or static ones were removed"),
-    (0.0, "the labels do not fit what was observed"),
+    (80.0, "a second estimate agrees about nearly all that moved"),
+    (60.0, "a second estimate agrees about most of what moved"),
+    (40.0, "a second estimate disagrees about much of what moved"),
+    (0.0, "a second estimate confirms little of what moved; usual where hardly anything moves"),
 )
 _GEOMETRY = (
-    (80.0, "surfaces observed again lie where they were mapped first"),
-    (60.0, "surfaces observed again are displaced by a few centimetres in places"),
-    (40.0, "parts of the map do not agree: walls observed again lie beside those mapped first"),
-    (0.0, "the map is bent or double: walls observed again lie elsewhere"),
+    (80.0, "scans matched anew and surfaces observed again agree with the map"),
+    (60.0, "scans matched anew or surfaces observed again are off by centimetres in places"),
+    (40.0, "scans or surfaces are off in places, or the map has many small pieces"),
+    (0.0, "the map may be bent or double: scans or walls observed again lie elsewhere"),
 )
 
 

@@ -221,7 +221,7 @@ def _finish(
     progress("rating the map", 0, 0, 0)
     with stages.measure("quality"):
         threads = resolve_threads(options.threads)
-        quality = rate_quality(deskewed, estimate.poses, estimate.p_static, threads)
+        quality = rate_quality(deskewed, estimate.poses, estimate.p_static, maps.filtered, threads)
         del deskewed
     trim_heap()
     return MappingResult(

@@ -1,6 +1,5 @@
 """A result folder opened again: its `run.json`, its recording and its labels."""
 
-import dataclasses
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -118,13 +117,11 @@ class ResultFolder(ShortRepr):
         """How good the result is; unknown where the record does not say so."""
         told = self.record.get("quality")
         parts = told if isinstance(told, dict) else {}
-        return Quality(
-            **{
-                part.name: float(value)
-                for part in dataclasses.fields(Quality)
-                if isinstance(value := parts.get(part.name), int | float)
-            }
+        overall, labels, geometry = (
+            float(value) if isinstance(value := parts.get(name), int | float) else None
+            for name in ("overall", "labels", "geometry")
         )
+        return Quality(overall, labels, geometry)
 
     @property
     def region(self) -> Region | None:

@@ -1,6 +1,5 @@
 """`run.json`: the input, the resolved options, the iterations, counts, times and warnings."""
 
-import dataclasses
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -52,7 +51,9 @@ def run_record(result: MappingResult, more: Mapping[str, Any] | None = None) -> 
         "counts": counts,
         "area": known_area(result),
         "warnings": list(result.warnings),
-        "quality": dataclasses.asdict(result.quality),
+        "quality": {
+            name: getattr(result.quality, name) for name in ("overall", "labels", "geometry")
+        },
         "learned": result.learned,
         "calibration": _calibration(result.calibration),
         "doubts": {

@@ -23,6 +23,9 @@ _MIN_RETURNS = 6  # of one visit on a surface
 _MIN_EXTENT = 0.06  # m, standard deviation of them along the surface
 _MAX_FLATNESS = 0.1  # ratio of the variances across and along, up to which it is flat
 _MIN_COSINE = 0.8  # of the angle between two surfaces that are held for the same one
+_ADJACENT = 2  # stretches, up to which two visits are one after the other
+_MIN_PAIRS = 10  # of surfaces: with fewer nothing can be told
+_MAX_DISPLACEMENT = 0.2  # m, that more counts as: it may be another surface
 _MAX_RETURNS = 2_000_000  # of all scans; of longer recordings, every so many scans are used
 
 
@@ -33,13 +36,36 @@ class Displacements(NamedTuple):
         across: (K,) metres across the surface.
         stretches: (K,) stretches of travel between the two visits, at least 1.
         weight: (K,) returns of the patch with fewer.
-        scan: (K, 2) a scan of either visit.
+        scan: (K, 2) the first scan of either visit that shows it.
+        place: (K, D) metres in the map.
     """
 
     across: Float
     stretches: Index
     weight: Index
     scan: Index
+    place: Float
+
+    def of_later_visits(self) -> "Displacements":
+        """Those between visits far apart: in between, the poses had the time to drift."""
+        later = self.stretches > _ADJACENT
+        return Displacements(
+            self.across[later],
+            self.stretches[later],
+            self.weight[later],
+            self.scan[later],
+            self.place[later],
+        )
+
+    def mean(self) -> float | None:
+        """Weighted mean in metres; None of fewer than _MIN_PAIRS."""
+        if len(self.across) < _MIN_PAIRS:
+            return None
+        return float(np.average(np.minimum(self.across, _MAX_DISPLACEMENT), weights=self.weight))
+
+    def worst(self) -> int:
+        """Index of the pair with the largest displacement, among those with most returns."""
+        return int(np.argmax(self.weight * np.minimum(self.across, _MAX_DISPLACEMENT)))
 
 
 class _Patches(NamedTuple):
@@ -71,6 +97,7 @@ def measure_displacements(recording: Recording, poses: Float) -> Displacements:
         patches.stretch[second] - patches.stretch[first],
         np.minimum(patches.returns[first], patches.returns[second]),
         np.stack([patches.scan[first], patches.scan[second]], axis=1),
+        patches.mean[second],
     )
 
 

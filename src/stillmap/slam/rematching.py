@@ -1,0 +1,160 @@
+"""Scans matched anew within short windows: a second opinion on poses, whoever estimated them."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+import stillmap._core as _core
+from stillmap.core import se2, se3
+from stillmap.core.recording import Recording
+from stillmap.slam.lidar_odometry import register_sweeps
+from stillmap.slam.local_map import LocalMap
+from stillmap.slam.motion_model import compute_odometry_steps, odometry_prior
+from stillmap.slam.options import SlamOptions
+from stillmap.slam.scan_hits import FREE_SPACE_MARGIN, select_hits
+from stillmap.slam.scan_matching import refine_pose, search_pose
+
+Float = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+_RESOLUTION = 0.1  # m, of the map that scans are matched against, whatever that of the result
+_EXPLAINED_RATE = 0.1  # weight of one scan in the running average of the explained share
+_POOR_SHARE = 0.8  # of the usual explained share, below which other poses are searched
+_SEARCH_TRANSLATION, _SEARCH_ROTATION = 1.0, 0.3  # m and rad around the given motion
+_P_STATIC = 0.9  # of every return: labels are not asked
+_WINDOW = {2: 360, 3: 60}  # scans of a window, by dimension
+_MAX_SPACING, _MAX_STEP = 0.5, 0.5  # s and m between the scans of a window
+_SCANS_PER_WINDOW = {2: 1500, 3: 600}  # of the recording, at that spacing
+_MAX_WINDOWS = 4  # with the line above, the cost is a small share of the whole job's
+
+
+class Window(NamedTuple):
+    """Some scans of a recording.
+
+    Attributes:
+        scans: (n,) of the whole recording, rising.
+        recording: these scans.
+        poses: (n, D+1, D+1) T_map_base as given.
+        rematched: (n, D+1, D+1) matched anew; the first one is that given.
+    """
+
+    scans: Index
+    recording: Recording
+    poses: Float
+    rematched: Float
+
+    def disagreement(self) -> float:
+        """Median distance in metres between given and new poses after half of the window."""
+        lag = len(self.poses) // 2
+        given, new = (
+            se2.inverse(T[: len(T) - lag]) @ T[lag:] for T in (self.poses, self.rematched)
+        )
+        apart = (se2.inverse(given) @ new)[:, :-1, -1]
+        return float(np.median(np.linalg.norm(apart, axis=1)))
+
+    def split(self, length: int) -> Iterator["Window"]:
+        """Parts of about `length` scans each."""
+        n = len(self.scans)
+        for part in np.array_split(np.arange(n), max(1, round(n / length))):
+            yield Window(
+                self.scans[part],
+                select_scans(self.recording, part, self.poses[part]),
+                self.poses[part],
+                self.rematched[part],
+            )
+
+
+def rematch_windows(recording: Recording, poses: Float, threads: int = 1) -> Iterator[Window]:
+    """Yields windows spread over a recording.
+
+    Each scan is matched to the map of those before it in its window; the poses given take the part
+    of odometry.
+
+    Args:
+        recording: 2D or 3D, deskewed.
+        poses: (T, D+1, D+1) T_map_base.
+        threads: does not change the result.
+    """
+    for scans in select_windows(recording, poses):
+        window = select_scans(recording, scans, poses[scans])
+        yield Window(scans, window, poses[scans], _rematch(window, poses[scans], threads))
+
+
+def select_windows(recording: Recording, poses: Float) -> list[Index]:
+    """The scans of each window, evenly spread over the recording."""
+    T, D = recording.n_scans, recording.dimension
+    every = _spacing(recording, poses)
+    span = min(_WINDOW[D] * every, T)
+    count = min(max(1, T // (every * _SCANS_PER_WINDOW[D])), _MAX_WINDOWS)
+    first = np.linspace(0, T - span, count).astype(np.int64)
+    return [np.arange(a, a + span, every) for a in first.tolist()]
+
+
+def _spacing(recording: Recording, poses: Float) -> int:
+    """Every so many scans are used: close ones show nothing new."""
+    if recording.n_scans < 2:
+        return 1
+    seconds = 1e-9 * float(np.median(np.diff(recording.stamp_ns)))
+    step = float(np.mean(np.linalg.norm(np.diff(poses[:, :-1, -1], axis=0), axis=1)))
+    every = min(_MAX_SPACING / max(seconds, 1e-3), _MAX_STEP / max(step, 1e-3))
+    return max(1, min(int(every), recording.n_scans // _WINDOW[recording.dimension]))
+
+
+def select_scans(recording: Recording, scans: Index, poses: Float) -> Recording:
+    """Some scans of a recording, with poses (n, D+1, D+1) for odometry."""
+    beams = [recording.beams_of(t) for t in scans.tolist()]
+    lengths = [of.stop - of.start for of in beams]
+    return replace(
+        recording,
+        stamp_ns=recording.stamp_ns[scans],
+        offset=np.concatenate([[0], np.cumsum(lengths, dtype=np.int64)]),
+        points=np.concatenate([recording.points[of] for of in beams]),
+        hit=np.concatenate([recording.hit[of] for of in beams]),
+        sensor=recording.sensor[scans],
+        T_odom_base=np.ascontiguousarray(poses),
+        T_recorded_base=None,
+        beam_time=None,
+        images=None,
+    )
+
+
+def _rematch(window: Recording, poses: Float, threads: int) -> Float:
+    e = np.full(window.n_beams, _P_STATIC, np.float32)
+    options = SlamOptions(resolution=_RESOLUTION)
+    if window.dimension == 2:
+        found, normalize = _match_scans(window, e, options), se2.normalize
+    else:
+        found = register_sweeps(window, e, options.odometry, _no_progress, threads).poses
+        normalize = se3.normalize
+    return normalize(poses[0] @ se2.inverse(found[0]) @ found)
+
+
+def _match_scans(window: Recording, e: NDArray[np.float32], options: SlamOptions) -> Float:
+    """Poses (n, 3, 3) of 2D scans, each matched within the prior of odometry.
+
+    Without the wide searches of `register_scans`: given poses that jump disagree with these anyway.
+    """
+    assert window.T_odom_base is not None
+    increments = compute_odometry_steps(window.T_odom_base).increments
+    grid = _core.OccupancyGrid2D(options.resolution, FREE_SPACE_MARGIN)
+    local_map = LocalMap(grid, window, e)
+    found = np.tile(np.eye(3), (window.n_scans, 1, 1))
+    local_map.add(0, found[0], 0.0)
+    usual = 1.0
+    for t in range(1, window.n_scans):
+        prior = odometry_prior(found[t - 1], increments[t - 1], options.odometry)
+        scan = select_hits(window, e, t)
+        match = refine_pose(grid, scan, prior, prior.T_map_base)
+        if match.explained < _POOR_SHARE * usual:
+            match = search_pose(grid, scan, prior, _SEARCH_TRANSLATION, _SEARCH_ROTATION)
+        usual += _EXPLAINED_RATE * (match.explained - usual)
+        found[t] = match.T_map_base
+        local_map.add(t, found[t], 0.0)
+    return found
+
+
+def _no_progress(done: int, total: int) -> None:
+    """Nobody waits for the scans of a window."""
