@@ -81,6 +81,7 @@ def test_progress_lines_without_terminal(mapped):
     assert "\x1b" not in done.stderr
     assert "\r" not in done.stderr
     assert re.search(r": kept iteration [12] of [12]\b", done.stderr)
+    assert re.search(r": quality \d+ of 100: labels \d+, geometry \d+\n", done.stderr)
     assert str(mapped[0] / "report.html") in lines[-2]
     assert lines[-1] == f"stillmap: see it over time: stillmap view {mapped[0]}"
 

@@ -228,6 +228,16 @@ def _summarize(output: Path) -> dict[str, Any]:
     }
 
 
+def _describe_quality(result: "MappingResult") -> list[str]:
+    """One line; none where quality cannot be told."""
+    quality = result.quality
+    parts = {"labels": quality.labels, "geometry": quality.geometry}
+    told = [f"{name} {value:.0f}" for name, value in parts.items() if value is not None]
+    if quality.overall is None:
+        return []
+    return [f"quality {quality.overall:.0f} of 100: {', '.join(told)}"]
+
+
 def _print_summary(
     result: "MappingResult", tilting: "TiltingResult | None", models: "Models | None", output: Path
 ) -> None:
@@ -236,6 +246,7 @@ def _print_summary(
         f"{result.recording.n_scans} scans, {_describe_hits(result.recording, result.p_static)}",
         f"kept iteration {result.best_iteration} of {n}"
         + ("" if result.converged else ", which had not converged"),
+        *_describe_quality(result),
         *_describe_changes(result),
         *([] if tilting is None else [_describe_tilting(tilting)]),
         *(f"warning: {warning}" for warning in result.warnings),
