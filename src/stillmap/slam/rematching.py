@@ -118,6 +118,7 @@ def select_scans(recording: Recording, scans: Index, poses: Float) -> Recording:
         T_recorded_base=None,
         beam_time=None,
         images=None,
+        record=None,
     )
 
 
