@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stillmap.core import components
-from stillmap.core.components import connected_components, neighbor_pairs
+from stillmap.core.components import adjacent_pairs, connected_components, neighbor_pairs
 
 
 def held(pairs):
@@ -37,7 +37,8 @@ def test_many_cells_are_paired_as_few_are(monkeypatch):
         few = neighbor_pairs(cells, radius)
         few_labels = components.component_labels(few, 250)
         with monkeypatch.context() as patch:
-            patch.setattr(components, "_FEW", 0)
+            patch.setattr(components, "_FEW_CELLS", 0)
+            patch.setattr(components, "_FEW_NODES", 0)
             many = neighbor_pairs(cells, radius)
             assert held(few) == held(many)
             assert len(few) == len(many) > 50
@@ -67,3 +68,13 @@ def test_components_partition_the_nodes():
         assert (np.diff(one) > 0).all()
     assert (number[pairs[:, 0]] == number[pairs[:, 1]]).all()
     assert len(sets) >= 40  # a pair connects two at most
+
+
+@pytest.mark.parametrize("share", [0.05, 0.4, 0.8])
+def test_adjacent_pairs_are_those_within_one_row_and_column(share):
+    cells = np.argwhere(np.random.default_rng(3).random((14, 17)) < share) - 5
+    assert held(adjacent_pairs(cells)) == held(neighbor_pairs(cells, 1.5))
+
+
+def test_no_cells_have_no_adjacent_pairs():
+    assert adjacent_pairs(np.empty((0, 2), np.int64)).shape == (0, 2)

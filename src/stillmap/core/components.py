@@ -6,13 +6,13 @@ from numpy.typing import NDArray
 Index = NDArray[np.intp]
 
 
-# up to so many nodes NumPy alone is faster than loading SciPy, which takes 0.3 s
-_FEW = 300
+# up to so many cells or nodes NumPy alone is faster than loading SciPy, which takes 0.3 s
+_FEW_CELLS, _FEW_NODES = 300, 10_000
 
 
 def neighbor_pairs(cells: NDArray[np.int64], max_distance: float) -> Index:
     """(P, 2) pairs of cells (K, D) within a distance of each other, in cells."""
-    if len(cells) <= _FEW:
+    if len(cells) <= _FEW_CELLS:
         squared = ((cells[:, None] - cells) ** 2).sum(axis=2)
         return np.argwhere(np.triu(squared <= max_distance**2, 1))
     from scipy.spatial import cKDTree
@@ -20,11 +20,28 @@ def neighbor_pairs(cells: NDArray[np.int64], max_distance: float) -> Index:
     return np.asarray(cKDTree(cells).query_pairs(max_distance, output_type="ndarray"), np.intp)
 
 
+def adjacent_pairs(cells: NDArray[np.int64]) -> Index:
+    """(P, 2) pairs of cells (K, 2) that share an edge or a corner; no cell may come twice."""
+    if not len(cells):
+        return np.empty((0, 2), np.intp)
+    row, column = (cells - cells.min(axis=0)).T
+    width = int(column.max()) + 2  # the last column stays empty: rows do not touch
+    key = row * width + column
+    order = np.argsort(key)
+    key = key[order]
+    pairs = []
+    for step in (1, width - 1, width, width + 1):
+        at = np.minimum(np.searchsorted(key, key + step), len(key) - 1)
+        is_cell = key[at] == key + step
+        pairs.append(np.column_stack([order[is_cell], order[at[is_cell]]]))
+    return np.concatenate(pairs)
+
+
 def component_labels(pairs: Index, n: int) -> Index:
     """(n,) number of the connected component of each of n nodes, given edges (P, 2)."""
     if not len(pairs):
         return np.arange(n)
-    if n <= _FEW:
+    if n <= _FEW_NODES:
         return _label_few(pairs, n)
     from scipy.sparse import coo_array, csgraph
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stillmap.core.components import component_labels, neighbor_pairs
+from stillmap.core.components import adjacent_pairs, component_labels
 from stillmap.core.tiles import tiles_of
 from stillmap.em import OccupancyMap
 
@@ -24,7 +24,7 @@ def count_small_pieces(occupancy: OccupancyMap) -> float | None:
     cells = np.concatenate(found)
     if not len(cells):
         return None
-    piece = component_labels(neighbor_pairs(cells, 1.5), len(cells))
+    piece = component_labels(adjacent_pairs(cells), len(cells))
     low = np.full((piece.max() + 1, 2), np.iinfo(np.int64).max)
     high = np.full_like(low, np.iinfo(np.int64).min)
     np.minimum.at(low, piece, cells)
