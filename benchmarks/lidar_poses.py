@@ -73,7 +73,7 @@ def case_of(path: Path, odometry: bool, azimuth: bool) -> Case:
     if not odometry:
         recording = recording.without_odometry()
     if azimuth:
-        recording = add_beam_times(recording, "clockwise", stamp_azimuth=0.0)
+        recording = add_beam_times(recording, "clockwise")
     return Case(path.name, recording, truth, e)
 
 

@@ -12,6 +12,7 @@ from stillmap.core.recording import Recording
 from stillmap.pipeline.options import Options
 from stillmap.preprocessing.late_odometry import interpolate_late_odometry
 from stillmap.preprocessing.overrides import mirror_beams
+from stillmap.preprocessing.scan_timing import add_beam_times
 from stillmap.slam.hand_eye import GAIN, SCALE, correct_odometry
 from stillmap.slam.mount_calibration import (
     LATENCY,
@@ -23,6 +24,7 @@ from stillmap.slam.mount_calibration import (
     calibrate_mounts,
 )
 from stillmap.slam.mount_refinement import refine_positions
+from stillmap.slam.spin_estimation import estimate_spin
 
 
 def calibrate_recording(
@@ -57,6 +59,31 @@ def calibrate_recording(
         which = "the laser" if len(found.lasers) == 1 else f"laser {k + 1}"
         sentences += _laser_sentences(which, laser, found.upside_down[k])
     return applied, found, sentences + _odometry_sentences(found.odometry)
+
+
+def time_sweeps(recording: Recording, options: Options) -> tuple[Recording, Options, list[str]]:
+    """The recording with beam times where its sweeps turn out to be distorted by the motion.
+
+    Args:
+        recording: as read; unchanged unless it is 3D, without beam times.
+        options: with a `read.spin` other than `auto`, nothing is estimated.
+
+    Returns:
+        The recording; the options with the direction that was found; and a sentence about it.
+    """
+    is_open = recording.dimension == 3 and recording.beam_time is None
+    if not is_open or options.read.spin != "auto":
+        return recording, options, []
+    spin = estimate_spin(recording, options.slam, resolve_threads(options.threads))
+    if spin is None:
+        return recording, options, []
+    read = dataclasses.replace(options.read, spin=spin)
+    sentence = (
+        f"points have no times of their own, but the lidar turns {spin}, as sweeps show: the "
+        f"motion during each sweep was removed (read.spin={spin})"
+    )
+    timed = add_beam_times(recording, spin)
+    return timed, dataclasses.replace(options, read=read), [sentence]
 
 
 def _interpolate_late_odometry(recording: Recording) -> tuple[Recording, list[str]]:

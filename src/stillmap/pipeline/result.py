@@ -16,7 +16,7 @@ from stillmap.core.profiling import Progress, StageTimer, no_progress
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.mapping import Change
-from stillmap.pipeline.calibration import calibrate_recording
+from stillmap.pipeline.calibration import calibrate_recording, time_sweeps
 from stillmap.pipeline.diagnostics import find_warnings
 from stillmap.pipeline.em_loop import iterate
 from stillmap.pipeline.estimate import EmState, Estimate, IterationRecord
@@ -140,7 +140,8 @@ def map_recording(
 ) -> MappingResult:
     """Maps a recording: EM until the bound stops improving, then maps, changes and objects.
 
-    Without given poses, mounts of the lasers and errors of odometry are calibrated first.
+    First, sweeps without beam times get some where they are distorted, and without given poses,
+    mounts of the lasers and errors of odometry are calibrated.
 
     Args:
         recording, options, poses, progress, stages, scratch: see `stillmap.iterate`.
@@ -157,10 +158,12 @@ def map_recording(
         recording = dataclasses.replace(recording, scratch=scratch)
     stages = stages or StageTimer()
     options = resolve_options(options, recording)
-    found, notes = Calibration(), list[str]()
-    if poses is None:
-        with stages.measure("calibration"):
-            recording, found, notes = calibrate_recording(recording, options)
+    found = Calibration()
+    with stages.measure("calibration"):
+        recording, options, notes = time_sweeps(recording, options)
+        if poses is None:
+            recording, found, more = calibrate_recording(recording, options)
+            notes += more
     state = resume or EmState(options)
     # given poses leave nothing to iterate on in 3D, where the E-step does not depend on the labels
     state.single_pass = (

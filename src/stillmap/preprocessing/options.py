@@ -74,7 +74,8 @@ class ReadOptions(Section, section="read"):
     spin: Literal["auto", "none", "clockwise", "counter-clockwise"] = option(
         "auto",
         "Direction, seen from above, in which a spinning lidar without per-point times turns; "
-        "none: all points share the stamp; auto: clockwise for raw KITTI drives, else none.",
+        "none: all points share the stamp; auto: clockwise for raw KITTI drives, else estimated "
+        "from the sweeps while mapping.",
     )
     laser_x: float | None = _coordinate(
         "Position of the first laser ahead of the robot's centre, in metres; unset: taken from "

@@ -10,7 +10,8 @@ from stillmap.core.recording import Recording
 
 Float = NDArray[np.float64]
 
-SPIN_KEY = "spin"  # in Recording.source: beam times were computed here
+# in Recording.source: beam times were computed here; rad, azimuth at the stamp where it is known
+SPIN_KEY, STAMP_AZIMUTH_KEY = "spin", "stamp_azimuth"
 
 _SIGN = {"clockwise": -1.0, "counter-clockwise": 1.0}
 _TURN = 2.0 * math.pi
@@ -18,16 +19,15 @@ _SPIN_START = math.pi  # rad, azimuth at which a revolution begins: behind the r
 _RATES = (0.5, 200.0)  # 1/s, revolutions of lidars; stamps farther apart miss scans
 
 
-def add_beam_times(
-    recording: Recording, direction: str, stamp_azimuth: float = _SPIN_START
-) -> Recording:
+def add_beam_times(recording: Recording, direction: str) -> Recording:
     """Add `beam_time` from the azimuth of each point; one revolution lasts from stamp to stamp.
+
+    The stamp is that of the beam at `source["stamp_azimuth"]` (rad), else of the first one, behind.
 
     Args:
         recording: 3D. Returned unchanged, with a warning, where it has beam times or its stamps
             give no rate.
         direction: `clockwise` or `counter-clockwise` seen from above; any other: no change.
-        stamp_azimuth: rad, azimuth of the beam that is measured at the stamp.
     """
     if direction not in _SIGN or SPIN_KEY in recording.source:
         return recording
@@ -37,6 +37,8 @@ def add_beam_times(
     if not all(rates):
         return _with_warning(recording, "read.spin is ignored: the stamps give no rate of turns")
     per_second = np.array(rates, np.float64)
+    noted = recording.source.get(STAMP_AZIMUTH_KEY)  # a foreign folder may hold anything there
+    stamp_azimuth = float(noted) if isinstance(noted, int | float) else _SPIN_START
     beam_time = recording.allocate_per_beam(np.float32)
     for t in recording.iter_scans(range(recording.n_scans), beam_time):
         beams = recording.beams_of(t)

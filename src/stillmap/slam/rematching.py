@@ -1,7 +1,6 @@
 """Scans matched anew within short windows: a second opinion on poses, whoever estimated them."""
 
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +15,7 @@ from stillmap.slam.motion_model import compute_odometry_steps, odometry_prior
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.scan_hits import FREE_SPACE_MARGIN, select_hits
 from stillmap.slam.scan_matching import refine_pose, search_pose
+from stillmap.slam.scan_subset import beams_of_scans, select_beams
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -25,10 +25,11 @@ _EXPLAINED_RATE = 0.1  # weight of one scan in the running average of the explai
 _POOR_SHARE = 0.8  # of the usual explained share, below which other poses are searched
 _SEARCH_TRANSLATION, _SEARCH_ROTATION = 1.0, 0.3  # m and rad around the given motion
 _P_STATIC = 0.9  # of every return: labels are not asked
-_WINDOW = {2: 360, 3: 60}  # scans of a window, by dimension
+_WINDOW = {2: 360, 3: 48}  # scans of a window, by dimension
 _MAX_SPACING, _MAX_STEP = 0.5, 0.5  # s and m between the scans of a window
-_SCANS_PER_WINDOW = {2: 1500, 3: 600}  # of the recording, at that spacing
-_MAX_WINDOWS = 4  # with the line above, the cost is a small share of the whole job's
+_SCANS_PER_WINDOW = {2: 1500, 3: 480}  # of the recording, at that spacing
+_MAX_WINDOWS = 4
+_MAX_BEAMS = 20_000  # of a scan; of larger ones every so many beams are used
 
 
 class Window(NamedTuple):
@@ -36,12 +37,14 @@ class Window(NamedTuple):
 
     Attributes:
         scans: (n,) of the whole recording, rising.
-        recording: these scans.
+        beams: (m,) of the whole recording, rising: all of these scans, or every so many.
+        recording: these.
         poses: (n, D+1, D+1) T_map_base as given.
         rematched: (n, D+1, D+1) matched anew; the first one is that given.
     """
 
     scans: Index
+    beams: Index
     recording: Recording
     poses: Float
     rematched: Float
@@ -59,9 +62,11 @@ class Window(NamedTuple):
         """Parts of about `length` scans each."""
         n = len(self.scans)
         for part in np.array_split(np.arange(n), max(1, round(n / length))):
+            beams = beams_of_scans(self.recording, part, _MAX_BEAMS)
             yield Window(
                 self.scans[part],
-                select_scans(self.recording, part, self.poses[part]),
+                self.beams[np.concatenate(beams)],
+                select_beams(self.recording, part, beams, self.poses[part]),
                 self.poses[part],
                 self.rematched[part],
             )
@@ -79,8 +84,10 @@ def rematch_windows(recording: Recording, poses: Float, threads: int = 1) -> Ite
         threads: does not change the result.
     """
     for scans in select_windows(recording, poses):
-        window = select_scans(recording, scans, poses[scans])
-        yield Window(scans, window, poses[scans], _rematch(window, poses[scans], threads))
+        beams = beams_of_scans(recording, scans, _MAX_BEAMS)
+        window = select_beams(recording, scans, beams, np.ascontiguousarray(poses[scans]))
+        rematched = _rematch(window, poses[scans], threads)
+        yield Window(scans, np.concatenate(beams), window, poses[scans], rematched)
 
 
 def select_windows(recording: Recording, poses: Float) -> list[Index]:
@@ -101,25 +108,6 @@ def _spacing(recording: Recording, poses: Float) -> int:
     step = float(np.mean(np.linalg.norm(np.diff(poses[:, :-1, -1], axis=0), axis=1)))
     every = min(_MAX_SPACING / max(seconds, 1e-3), _MAX_STEP / max(step, 1e-3))
     return max(1, min(int(every), recording.n_scans // _WINDOW[recording.dimension]))
-
-
-def select_scans(recording: Recording, scans: Index, poses: Float) -> Recording:
-    """Some scans of a recording, with poses (n, D+1, D+1) for odometry."""
-    beams = [recording.beams_of(t) for t in scans.tolist()]
-    lengths = [of.stop - of.start for of in beams]
-    return replace(
-        recording,
-        stamp_ns=recording.stamp_ns[scans],
-        offset=np.concatenate([[0], np.cumsum(lengths, dtype=np.int64)]),
-        points=np.concatenate([recording.points[of] for of in beams]),
-        hit=np.concatenate([recording.hit[of] for of in beams]),
-        sensor=recording.sensor[scans],
-        T_odom_base=np.ascontiguousarray(poses),
-        T_recorded_base=None,
-        beam_time=None,
-        images=None,
-        record=None,
-    )
 
 
 def _rematch(window: Recording, poses: Float, threads: int) -> Float:

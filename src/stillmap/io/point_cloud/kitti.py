@@ -1,6 +1,7 @@
 """KITTI folders: odometry sequences (`velodyne/`, `times.txt`), raw drives, and their poses."""
 
 import math
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -29,7 +30,7 @@ from stillmap.io.point_cloud.files import (
 )
 from stillmap.io.point_cloud.kitti_cameras import Calibration, find_images
 from stillmap.io.point_cloud.scans import Cloud, CloudSource, DatasetInfo, build_recording, reject
-from stillmap.preprocessing.scan_timing import add_beam_times
+from stillmap.preprocessing.scan_timing import STAMP_AZIMUTH_KEY, add_beam_times
 
 Poses = list[NDArray[np.float64]]
 
@@ -181,7 +182,8 @@ def read(path: Path, context: ReadContext) -> Recording:
     recording = build_recording(sources, info, context, images=images)
     spin = context.options.spin
     direction = "clockwise" if spin == "auto" and scans == _RAW else spin
-    return add_beam_times(recording, direction, _STAMP_AZIMUTH)
+    source = {**recording.source, STAMP_AZIMUTH_KEY: _STAMP_AZIMUTH}
+    return add_beam_times(replace(recording, source=source), direction)
 
 
 def _read_scan(path: Path, T: NDArray[np.float64] | None) -> Cloud:

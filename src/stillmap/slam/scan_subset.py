@@ -1,0 +1,45 @@
+"""Some scans of a recording, as a small recording of their own."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.recording import Recording
+
+Float = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+
+def beams_of_scans(recording: Recording, scans: Index, max_beams: int) -> list[Index]:
+    """Beams of each of some scans, rising: of more than max_beams every so many."""
+    spans = [recording.beams_of(t) for t in scans.tolist()]
+    return [
+        np.arange(of.start, of.stop, max(1, -(-(of.stop - of.start) // max_beams))) for of in spans
+    ]
+
+
+def select_beams(
+    recording: Recording, scans: Index, beams: list[Index], T_odom_base: Float | None
+) -> Recording:
+    """These beams of these scans, without beam times, pictures and recorded poses.
+
+    Args:
+        recording: 2D or 3D.
+        scans: (n,) rising.
+        beams: of each of these scans.
+        T_odom_base: (n, D+1, D+1) odometry of the result.
+    """
+    return replace(
+        recording,
+        stamp_ns=recording.stamp_ns[scans],
+        offset=np.concatenate([[0], np.cumsum([len(of) for of in beams], dtype=np.int64)]),
+        points=np.concatenate([recording.points[of] for of in beams]),
+        hit=np.concatenate([recording.hit[of] for of in beams]),
+        sensor=recording.sensor[scans],
+        T_odom_base=T_odom_base,
+        T_recorded_base=None,
+        beam_time=None,
+        images=None,
+        record=None,
+    )
