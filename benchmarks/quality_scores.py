@@ -1,17 +1,19 @@
 """Does quality from 0 to 100 rank mixed runs as the truth does?
 
-python benchmarks/quality_scores.py --seeds 230 293 [--processes 2] [--json ROWS]
+python benchmarks/quality_scores.py --seeds 230 293 [--lidar] [--processes 2] [--json ROWS]
 
-Each seed draws a world, laser, crowd, resolution, estimator and odometry (`mixed_runs.py`). Printed
-are Spearman's rank correlation of each part with its scores, and the runs that are judged worst.
+Each seed draws a world, laser, crowd, resolution, estimator and odometry (`mixed_runs.py`), with
+--lidar a world, lidar, voxels, method and poses in 3D (`mixed_sweeps.py`). Printed are Spearman's
+rank correlation of each part with its scores, and the runs that are judged worst.
 """
 
 import argparse
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import mixed_sweeps
 import numpy as np
 from common import built, finite, outcomes, result_scores
 from mixed_runs import draw
@@ -19,6 +21,8 @@ from numpy.typing import NDArray
 from prepared import prepare
 from scipy.stats import rankdata, spearmanr
 from tables import Row, markdown
+
+import stillmap
 
 Float = NDArray[np.float64]
 
@@ -31,12 +35,17 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     p.add_argument("--seeds", type=int, nargs=2, default=(230, 293), metavar=("FIRST", "LAST"))
+    p.add_argument("--lidar", action="store_true", help="runs in 3D")
     p.add_argument("--processes", type=int, default=2)
     p.add_argument("--json", type=Path, help="append rows to this file, one a line")
     args = p.parse_args()
     seeds = list(range(args.seeds[0], args.seeds[1] + 1))
     rows = sorted(
-        (row for _, row in outcomes(_row_of, seeds, args.processes)), key=lambda row: row["seed"]
+        (
+            row
+            for _, row in outcomes(_row_of_sweeps if args.lidar else _row_of, seeds, args.processes)
+        ),
+        key=lambda row: row["seed"],
     )
     if args.json:
         with args.json.open("a") as file:
@@ -49,6 +58,20 @@ def _row_of(seed: int) -> dict[str, Any]:
     run = prepare(drawn.case(), seed)
     recording, poses = drawn.inputs(run.simulation)
     result, cpu_ms = built(recording, drawn.options(), poses)
+    return _row(drawn, result, result_scores(result, cpu_ms, run))
+
+
+def _row_of_sweeps(seed: int) -> dict[str, Any]:
+    drawn = mixed_sweeps.draw(seed)
+    simulation = drawn.simulate()
+    recording, poses = drawn.inputs(simulation)
+    result, _ = built(recording, drawn.options(), poses)
+    scored = {"held_out": None, **mixed_sweeps.scores_of(result, simulation)}
+    return _row(drawn, result, scored)
+
+
+def _row(drawn: object, result: stillmap.BuiltResult, scored: Mapping[str, Any]) -> dict[str, Any]:
+    """What was drawn, the quality, its share of the CPU time, and the scores."""
     quality = result.quality
     seconds = [float(stage.get("cpu_seconds") or 0) for stage in result.stages.values()]
     about = {
@@ -58,7 +81,7 @@ def _row_of(seed: int) -> dict[str, Any]:
         "overall": quality.overall,
         "cost": float(result.stages["quality"]["cpu_seconds"]) / sum(seconds),
     }
-    return finite({**about, **result_scores(result, cpu_ms, run)})
+    return finite({**about, **scored})
 
 
 def report(rows: Sequence[Row]) -> str:
@@ -73,8 +96,9 @@ def report(rows: Sequence[Row]) -> str:
         [part, str(len(rows)), f"{spearman(column(rows, part), truth):.3f}"]
         for part, truth in truths.items()
     ]
-    held_out = spearman(column(rows, "held_out"), truths["overall"])
-    lines.append(["held-out likelihood, as overall", str(len(rows)), f"{held_out:.3f}"])
+    if np.isfinite(column(rows, "held_out")).any():
+        held_out = spearman(column(rows, "held_out"), truths["overall"])
+        lines.append(["held-out likelihood, as overall", str(len(rows)), f"{held_out:.3f}"])
     cost = np.median(column(rows, "cost"))
     return "\n".join(
         [

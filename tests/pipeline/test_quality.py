@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 
 import stillmap
+from stillmap import slam
 from stillmap.core import se2
 from stillmap.core.config import override
 from stillmap.pipeline.options import Options
 from stillmap.pipeline.quality import Quality, describe_quality, rate_quality
 from stillmap.results.folder import open_result
 from stillmap.sim import scene_by_name, simulate
+from stillmap.slam.options import SlamOptions
 
 
 @pytest.fixture(scope="module")
@@ -83,6 +85,28 @@ def test_an_empty_map_has_no_geometry(rated):
     assert rated(p_occupied=np.zeros_like).geometry is None
 
 
+def test_in_3d_drift_lowers_geometry_and_wrong_labels_lower_labels():
+    lidar = {"channels": 16, "columns": 450}
+    run = simulate(scene_by_name("street", {"lidar": lidar, "robot": {"scans": 48}}), 0)
+    truth, hit = run.truth.T_world_base, run.recording.hit
+    recording = slam.deskew_recording(run.recording, truth, SlamOptions())
+    occupancy = stillmap.build(run.recording, {"threads": 1}, poses=truth).map
+    drift = np.tile(np.eye(4), (48, 1, 1))
+    drift[:, 1, 3] = 0.01 * np.arange(48)
+    wrong = run.truth.static ^ (np.random.default_rng(0).random(len(hit)) < 0.1)
+    true, drifted, mislabelled = (
+        rate_quality(recording, poses, labels.astype(np.float32), occupancy)
+        for poses, labels in (
+            (truth, run.truth.static),
+            (drift @ truth, run.truth.static),
+            (truth, wrong),
+        )
+    )
+    assert true.geometry > drifted.geometry + 20.0
+    assert true.labels > mislabelled.labels + 20.0
+    assert mislabelled.geometry == true.geometry
+
+
 def test_does_not_depend_on_the_number_of_threads(rated):
     assert rated(threads=1) == rated(threads=4)
 
@@ -124,6 +148,12 @@ def test_every_figure_has_words(value):
     assert [line.split(": ")[0] for line in lines] == [
         f"{name} {value:.0f} of 100" for name in ("overall", "labels", "geometry")
     ]
+
+
+def test_no_result_is_good_whose_labels_are_poor():
+    good, poor = (describe_quality(Quality(82.0, labels, 96.0)) for labels in (75.0, 49.0))
+    assert good.overall == "overall 82 of 100: good"
+    assert poor.overall == "overall 82 of 100: usable; see which part is lower"
 
 
 def test_words_differ_between_good_and_bad():

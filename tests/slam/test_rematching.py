@@ -7,6 +7,7 @@ import pytest
 
 from stillmap.core import se2
 from stillmap.sim import scene_by_name, simulate
+from stillmap.slam import rematching
 from stillmap.slam.rematching import rematch_windows, select_windows
 
 
@@ -68,3 +69,14 @@ def test_parts_hold_the_beams_of_their_scans(hall):
         t = int(part.scans[-1])
         last = part.recording.beams_of(len(part.scans) - 1)
         assert np.array_equal(part.recording.points[last], recording.points[recording.beams_of(t)])
+
+
+def test_of_large_scans_every_so_many_beams_are_used(hall, monkeypatch):
+    recording, truth = hall
+    monkeypatch.setattr(rematching, "_MAX_BEAMS", 50)
+    (window,) = rematch_windows(recording, truth)
+    beams = recording.beams_of(int(window.scans[-1]))
+    used = window.recording.beams_of(len(window.scans) - 1)
+    assert np.array_equal(window.beams[used], np.arange(beams.start, beams.stop, 4))  # of 181
+    for part in window.split(100):
+        assert np.array_equal(part.recording.points, recording.points[part.beams])

@@ -12,7 +12,7 @@ from stillmap.em import occupancy_hmm
 from stillmap.em.options import EmOptions
 from stillmap.em.types import DYNAMIC_BELOW, Float
 
-_CELL = {2: 0.2, 3: 0.4}  # m, by dimension: the same for every recording, whatever its resolution
+_CELL = {2: 0.2, 3: 0.15}  # m, by dimension: the same for every recording, whatever its resolution
 _OPTIONS = replace(EmOptions(), change_detection=False)
 
 

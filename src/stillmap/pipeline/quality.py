@@ -5,6 +5,7 @@ sensor made the result.
 """
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +17,24 @@ from stillmap.slam import rematching, surface_agreement
 
 Float = NDArray[np.float64]
 
-# values at which a part of geometry is 50
-_HALF_DISAGREEMENT = 0.2  # m, between poses and scans matched anew
-_HALF_DISPLACEMENT = 0.03  # m, of surfaces seen again
-_HALF_SMALL_PIECES = 30.0  # small pieces of the map per 100 m2
-# displacement that counts where no place is seen again, so that nothing confirms the map
-_UNSEEN_DISPLACEMENT = 0.06
+
+class _Scale(NamedTuple):
+    """Values at which a part of geometry is 50, and the displacement where nothing is seen again.
+
+    Attributes:
+        disagreement: m, between poses and scans matched anew; these err less in 3D.
+        displacement: m, of surfaces seen again.
+        unseen: m, that counts where no place is seen again, so that nothing confirms the map.
+        small_pieces: of the map, per 100 m2.
+    """
+
+    disagreement: float
+    displacement: float
+    unseen: float
+    small_pieces: float
+
+
+_SCALE = {2: _Scale(0.2, 0.03, 0.06, 30.0), 3: _Scale(0.03, 0.06, 0.03, 10.0)}  # by dimension
 # what the best of simulated results reach: it is 100
 _BEST_F1, _BEST_GEOMETRY = 0.85, 0.8
 _JUDGED_SCANS = 120  # at a time: longer and the poses matched anew have drifted
@@ -86,8 +99,9 @@ def rate_quality(
     for window in rematching.rematch_windows(deskewed, poses, threads):
         apart.append(window.disagreement())
         for part in window.split(_JUDGED_SCANS):
-            of_part = np.concatenate([p_static[deskewed.beams_of(t)] for t in part.scans.tolist()])
-            candidates = part.poses, part.rematched
+            # in 3D the given poses add nothing to the new ones, which are accurate
+            candidates = (part.poses, part.rematched)[part.recording.dimension - 2 :]
+            of_part = p_static[part.beams]
             counts.append(
                 label_quality.count_expected(part.recording, candidates, of_part, threads)
             )
@@ -105,19 +119,19 @@ def rate_quality(
         worst_place=None if worst is None else tuple(pairs.place[worst].tolist()),
         small_pieces=count_small_pieces(occupancy),
     )
-    return grade(evidence)
+    return _grade(evidence, deskewed.dimension)
 
 
-def grade(evidence: QualityEvidence) -> Quality:
+def _grade(evidence: QualityEvidence, dimension: int) -> Quality:
     """The figures that follow from the evidence, rounded to a tenth."""
     geometry = overall = None
     labels = None if evidence.expected_f1 is None else _to_percent(evidence.expected_f1, _BEST_F1)
     if evidence.disagreement is not None and evidence.small_pieces is not None:
-        displacement = evidence.displacement
+        scale, displacement = _SCALE[dimension], evidence.displacement
         parts = (
-            evidence.disagreement / _HALF_DISAGREEMENT,
-            (_UNSEEN_DISPLACEMENT if displacement is None else displacement) / _HALF_DISPLACEMENT,
-            evidence.small_pieces / _HALF_SMALL_PIECES,
+            evidence.disagreement / scale.disagreement,
+            (scale.unseen if displacement is None else displacement) / scale.displacement,
+            evidence.small_pieces / scale.small_pieces,
         )
         mean = float(np.prod([1.0 / (1.0 + part) for part in parts])) ** (1.0 / 3.0)
         geometry = _to_percent(mean, _BEST_GEOMETRY)
@@ -145,12 +159,16 @@ class QualityText:
 
 def describe_quality(quality: Quality) -> QualityText:
     """One line for each part, for readers who do not know how it is computed."""
+    lower = min((v for v in (quality.labels, quality.geometry) if v is not None), default=0.0)
     return QualityText(
-        overall=_line("overall", quality.overall, _OVERALL),
+        overall=_line("overall", quality.overall, _OVERALL, lower + _MAX_CONTRAST),
         labels=_line("labels", quality.labels, _LABELS),
         geometry=_line("geometry", quality.geometry, _GEOMETRY),
     )
 
+
+# the sentence on overall is at most that of the lower part plus this: no good map with poor labels
+_MAX_CONTRAST = 25.0
 
 # lowest figure of each sentence, best first
 _OVERALL = (
@@ -173,8 +191,11 @@ _GEOMETRY = (
 )
 
 
-def _line(name: str, value: float | None, sentences: tuple[tuple[float, str], ...]) -> str:
+def _line(
+    name: str, value: float | None, sentences: tuple[tuple[float, str], ...], most: float = 100.0
+) -> str:
+    """The sentence of a value, or of `most` where the value is larger."""
     if value is None:
         return f"{name}: cannot be told from this recording"
-    sentence = next(text for lowest, text in sentences if value >= lowest)
+    sentence = next(text for lowest, text in sentences if min(value, most) >= lowest)
     return f"{name} {value:.0f} of 100: {sentence}"

@@ -26,7 +26,7 @@ _MIN_COSINE = 0.8  # of the angle between two surfaces that are held for the sam
 _ADJACENT = 2  # stretches, up to which two visits are one after the other
 _MIN_PAIRS = 10  # of surfaces: with fewer nothing can be told
 _MAX_DISPLACEMENT = 0.2  # m, that more counts as: it may be another surface
-_MAX_RETURNS = 2_000_000  # of all scans; of longer recordings, every so many scans are used
+_MAX_RETURNS = 500_000  # of all scans; of longer recordings, every so many scans are used
 
 
 class Displacements(NamedTuple):
