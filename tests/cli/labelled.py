@@ -7,6 +7,7 @@ import numpy as np
 
 from stillmap.core.recording import Recording
 from stillmap.io import read
+from stillmap.io.trajectory import write_tum
 
 N = 40  # points of a scan
 RNG = np.random.default_rng(2)
@@ -35,6 +36,9 @@ def label(
         ("p_static", np.where(usable, p_static, np.float32(np.nan))),
     ):
         np.save(folder / "beams" / f"{name}.npy", array)
+    poses = np.tile(np.eye(recording.dimension + 1), (recording.n_scans, 1, 1))
+    poses[:, 0, -1] = np.arange(recording.n_scans)  # a metre ahead at each scan
+    write_tum(folder / "trajectory.tum", recording.stamp_ns, poses)
     if recording.dimension == 3:
         (folder / "static.ply").write_text("")
     record = {"input": {"path": str(source)}, "options": {"read": options or {}}}

@@ -35,6 +35,27 @@ def test_kitti_folder(call, tmp_path, layout, times):
     assert check_same_but(recording, tmp_path / "clean", blank).n_scans == 3
 
 
+@pytest.mark.parametrize("output", ["clean.ply", "clean:pcd"])
+def test_clouds_without_poses_get_those_of_the_map(call, tmp_path, output):
+    source = kitti(tmp_path / "drive")
+    (source / "poses.txt").unlink()
+    recording, blank = label(source, tmp_path / "out")
+    assert recording.T_recorded_base is None
+    name, _, form = output.partition(":")
+    done = call("filter", tmp_path / "out", "-o", tmp_path / name, "--to", form or "ply")
+    assert done.returncode == 0, done.stderr
+    assert "no poses" not in done.stderr
+    again = read(tmp_path / name)
+    kept = recording.hit & ~blank
+    ahead = recording.scans_of(np.flatnonzero(kept)).astype(np.float32)
+    if form:
+        np.testing.assert_array_equal(again.points[again.hit], recording.points[kept])
+        np.testing.assert_array_equal(again.T_recorded_base[:, 0, 3], [0.0, 1.0, 2.0])
+    else:
+        moved = recording.points[kept] + ahead[:, None] * np.float32([1.0, 0.0, 0.0])
+        np.testing.assert_allclose(again.points[again.hit], moved, atol=1e-5)
+
+
 @pytest.mark.parametrize(
     "output", ["clean.mcap", "clean.bag", "clean:pcd", "clean:stillmap", "clean.ply"]
 )

@@ -80,7 +80,7 @@ def test_progress_lines_without_terminal(mapped):
     assert re.search(r"40 of 40 scans, \d+/s", done.stderr)
     assert "\x1b" not in done.stderr
     assert "\r" not in done.stderr
-    assert re.search(r": kept iteration [12] of [12]\b", done.stderr)
+    assert re.search(r": (kept iteration [12] of 2|converged after one iteration)\b", done.stderr)
     assert re.search(r": quality \d+ of 100: labels \d+, geometry \d+\n", done.stderr)
     assert str(mapped[0] / "report.html") in lines[-2]
     assert lines[-1] == f"stillmap: see it over time: stillmap view {mapped[0]}"
@@ -145,7 +145,7 @@ def test_no_odometry(call, room, tmp_path):
     assert done.returncode == 0
     run = json.loads((tmp_path / "out/run.json").read_text())
     assert any("no odometry" in warning for warning in run["warnings"])
-    assert "warning: no odometry" in done.stderr
+    assert "note: no odometry" in done.stderr
     _, T = read_tum(tmp_path / "out/trajectory.tum")
     truth = np.load(room / "truth/T_world_base.npy")
     way = np.linalg.norm(truth[-1, :2, 2] - truth[0, :2, 2])

@@ -76,7 +76,7 @@ def test_dumb_terminal_gets_lines(on_a_terminal, room, tmp_path):
     assert "stillmap: \x1b[33mwarning:\x1b[0m no odometry" in written
     _, written = on_a_terminal(*words, "-o", tmp_path / "b", TERM="dumb")
     assert "\x1b" not in written
-    assert "stillmap: warning: no odometry" in written
+    assert "stillmap: note: no odometry" in written
     assert "stillmap: matching scans, iteration 1" in written
 
 

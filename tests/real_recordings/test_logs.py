@@ -68,7 +68,7 @@ def test_a_small_job_takes_little_memory(laser2d, tmp_path, threads):
     """61 200 beams; a map of 135 m, mostly empty, with as many threads as a large machine has."""
     words = ["map", laser2d / "edmonton.clf.gz", "-o", tmp_path / "out", "--quiet"]
     command = [sys.executable, "-m", "stillmap", *map(str, words), "--threads", str(threads)]
-    # a process starts with the peak of the one that started it, which is large for that of the tests
+    # a process starts with the peak of the one that started it: that of the tests is large
     done = subprocess.run(
         [sys.executable, "-c", _PRINT_PEAK, *command], stdout=subprocess.PIPE, text=True, check=True
     )

@@ -86,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
     if not args.quiet:
         for loss in losses:
             say(f"warning: {loss}")
-        say(f"{written}; in {args.output}")
+        say(f"wrote {args.output}: {written}")
     return 0
 
 

@@ -1,6 +1,7 @@
 """`stillmap filter`: write a result's recording again with its dynamic beams blanked."""
 
 import argparse
+import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -73,6 +74,9 @@ def run(args: argparse.Namespace) -> int:
         scratch = output.absolute().parent
         with show_share(args.quiet, "reading") as progress:
             recording, labels = result.read(progress, scratch)
+        if target.takes_poses and recording.T_recorded_base is None:
+            poses = result.read_poses(recording)
+            recording = dataclasses.replace(recording, T_recorded_base=poses)
         blank, hits, blanked = _select_beams(recording, labels.p_static, args.below, scratch)
         with show_share(args.quiet, "writing") as progress:
             job = FilterJob(
@@ -92,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
         print_json({"output": str(output), "input": str(result.source), **counts})
     if not args.quiet:
         share = 100.0 * blanked / max(hits, 1)
-        say(f"{blanked} beams blanked, {share:.1f} % of the hits; in {output}")
+        say(f"wrote {output}: {blanked} beams blanked, {share:.1f} % of the hits")
         if omitted:
             say(f"{omitted} scans left out that were not mapped")
         for note in notes:

@@ -66,10 +66,11 @@ def _format_summary(found: dict[str, Any]) -> Iterator[str]:
     if beams is None:
         yield _row("scans", "none")
         return
-    per_scan = f"{beams['median']:g}"
+    per_scan = f"{beams['median']:.0f}"
     if beams["min"] != beams["max"]:
-        per_scan += f" ({beams['min']:g} to {beams['max']:g})"
-    yield _row("scans", f"{found['scans']} with {per_scan} beams each, {found['beams']} beams")
+        per_scan += f" ({beams['min']:.0f} to {beams['max']:.0f})"
+    scans = f"{found['scans']} with {per_scan} beams each, {found['beams']} beams"
+    yield _row("scans", f"1 with {found['beams']} beams" if found["scans"] == 1 else scans)
     shares = found["counts"]["shares"]
     words = (("hits", "hits"), ("max_range", "maximum range"), ("unusable", "unusable"))
     yield _row("beams", ", ".join(f"{100 * shares[key]:.2f} % {word}" for key, word in words))
@@ -86,6 +87,8 @@ def _format_summary(found: dict[str, Any]) -> Iterator[str]:
         first, last = found["beam_times_s"]
         how = f", as it turns {found['spin']}" if found["spin"] else ""
         yield _row("beam times", f"{first:g} to {last:g} s after a scan's stamp{how}")
+    elif found["dimension"] == 3 and found["scans"] > 1:
+        yield _row("beam times", "none; `map` finds out whether motion distorts the sweeps")
     yield from _format_odometry(found["odometry"])
     yield from _format_poses_and_images(found)
     if found["base_frame"] is not None:

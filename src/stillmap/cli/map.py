@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from stillmap.cli.arguments import add_read_flags, read_changes, require_apart
 from stillmap.cli.config import add_option_flags, options_from_args
 from stillmap.cli.console import list_files, print_json, say, show_progress
+from stillmap.core.advice import split_advice
 from stillmap.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -241,15 +242,13 @@ def _describe_quality(result: "MappingResult") -> list[str]:
 def _print_summary(
     result: "MappingResult", tilting: "TiltingResult | None", models: "Models | None", output: Path
 ) -> None:
-    n = len(result.iterations)
     lines = [
         f"{result.recording.n_scans} scans, {_describe_hits(result.recording, result.p_static)}",
-        f"kept iteration {result.best_iteration} of {n}"
-        + ("" if result.converged else ", which had not converged"),
+        _describe_iterations(result),
         *_describe_quality(result),
         *_describe_changes(result),
         *([] if tilting is None else [_describe_tilting(tilting)]),
-        *(f"warning: {warning}" for warning in result.warnings),
+        *(f"{_kind_of(warning)}: {warning}" for warning in result.warnings),
         *_describe_lack_of_models(result, tilting, models),
         f"wrote {output}: open {output / 'report.html'}",
         f"see it over time: stillmap view {shlex.quote(str(output))}",
@@ -265,7 +264,21 @@ def _describe_lack_of_models(
     is_2d = tilting is None and result.recording.dimension == 2
     if is_2d or models is not None or result.options.mesh.enabled is not None:
         return []
-    return ["no surface and models without pictures: --mesh makes grey ones"]
+    return ["no surface model: the recording has no pictures, --mesh makes a grey one"]
+
+
+def _describe_iterations(result: "MappingResult") -> str:
+    """Which iteration was kept, and whether the loop stopped by itself."""
+    n = len(result.iterations)
+    if n == 1 and result.converged:
+        return "converged after one iteration"
+    ending = "" if result.converged else ", which had not converged"
+    return f"kept iteration {result.best_iteration} of {n}{ending}"
+
+
+def _kind_of(warning: str) -> str:
+    """What nobody can do anything about is a note."""
+    return "warning" if split_advice(warning)[1] else "note"
 
 
 def _describe_changes(result: "MappingResult") -> list[str]:

@@ -256,6 +256,6 @@ def _summarize(simulations: "list[Simulation]", output: Path) -> dict[str, Any]:
 def _print_summary(summary: dict[str, Any]) -> None:
     share = 100 * summary["dynamic"] / max(summary["hits"], 1)
     say(
-        f"{summary['scene']}: {summary['scans']} scans, {summary['beams']} beams, "
-        f"{share:.1f} % of the hits on movers; in {summary['output']}"
+        f"wrote {summary['output']}: {summary['scene']}, {summary['scans']} scans, "
+        f"{summary['beams']} beams, {share:.1f} % of the hits on movers"
     )

@@ -61,6 +61,13 @@ class FilterTarget(NamedTuple):
     write: Write
     writer: writers.Writer | None
 
+    @property
+    def takes_poses(self) -> bool:
+        """Whether it is of clouds that poses place: those of the map, where none are recorded."""
+        if self.writer is None or self.writer.name == "stillmap":
+            return False
+        return "T_recorded_base" in self.writer.fields
+
 
 def _writer(module: str, function: str = "write_filtered") -> Write:
     """A function of a module of this room, which is loaded when it is called."""

@@ -204,6 +204,14 @@ class ResultFolder(ShortRepr):
             return recording
         return apply_calibration(recording, found)
 
+    def read_poses(self, recording: Recording) -> NDArray[np.float64]:
+        """The estimated poses (T, D+1, D+1) T_map_base of a recording that was read by `read`.
+
+        Raises:
+            InputError: the trajectory is missing or damaged.
+        """
+        return poses_from_tum(self.folder / "trajectory.tum", recording)
+
     def export(self, progress: Progress | None = None, scratch: Path | None = None) -> Exported:
         """The content of a result; arguments are those of `read`.
 
@@ -213,7 +221,7 @@ class ResultFolder(ShortRepr):
         recording, labels = self.read(progress, scratch)
         return Exported(
             self.calibrate(recording),
-            poses_from_tum(self.folder / "trajectory.tum", recording),
+            self.read_poses(recording),
             labels.p_static,
             read_grid(self.folder),
             read_tracks(self.folder / "objects" / "objects.json"),

@@ -127,8 +127,8 @@ def _object_columns(result: "Result") -> dict[str, Any]:
             side: np.array([one.size[k] for one in objects], np.float64)
             for k, side in enumerate(sides)
         },
-        "distance": np.array([_distance(one) for one in objects], np.float64),
-        "speed": np.array([_mean_speed(one) for one in objects], np.float64),
+        "distance": np.array([travelled_distance(one) for one in objects], np.float64),
+        "speed": np.array([mean_speed(one) for one in objects], np.float64),
         "beams": np.array([_count_beams(one) for one in objects], np.int64),
         "p_dynamic": np.array([one.p_dynamic for one in objects], np.float64),
     }
@@ -154,11 +154,13 @@ def _track_columns(result: "Result") -> dict[str, NDArray[Any]]:
     }
 
 
-def _distance(one: MovingObject | Track) -> float:
+def travelled_distance(one: MovingObject | Track) -> float:
+    """Metres along the track of an object."""
     return float(np.linalg.norm(np.diff(one.xy, axis=0), axis=1).sum())
 
 
-def _mean_speed(one: MovingObject | Track) -> float:
+def mean_speed(one: MovingObject | Track) -> float:
+    """m/s, mean along the track of an object."""
     return float(np.linalg.norm(one.velocity, axis=1).mean())
 
 

@@ -215,7 +215,9 @@ def test_without_pictures_there_are_models_by_request_alone(room, tmp_path, caps
     words += ("--threads", "1", "--set", "em.max_iterations=1")
     assert main([*map(str, words)]) == 0
     told = [line for line in capsys.readouterr().err.splitlines() if "--mesh" in line]
-    assert told == ["stillmap: no surface and models without pictures: --mesh makes grey ones"]
+    assert told == [
+        "stillmap: no surface model: the recording has no pictures, --mesh makes a grey one"
+    ]
     assert not list(tmp_path.glob("out/**/*.glb"))
     record = json.loads((tmp_path / "out" / "run.json").read_text())
     assert "models" not in record

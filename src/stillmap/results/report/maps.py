@@ -62,11 +62,10 @@ def map_data(result: MappingResult, filtered: MapFigure | None) -> dict[str, Any
     if result.recording.dimension == 3:
         poses = se2.project_to_plane(poses)
     every = max(1, math.ceil(len(poses) / _MAX_PATH_POINTS))
-    x0, y0, x1, y1 = view.window
     area = known_area(result)
     return {
         "view": view,
-        "meters": (x1 - x0, y1 - y0),
+        "meters": tuple(n * result.map.resolution for n in result.map.p_occupied.shape[::-1]),
         "cell": result.map.resolution,
         "written": _written_data(result, view),
         "raw": data_uri(draw_map(result.raw_map, view.window)),
