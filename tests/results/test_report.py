@@ -208,9 +208,8 @@ def test_thinly_observed_area(page, result):
     thin, known = (
         np.count_nonzero(one) for one in (result.evidence.thinly_observed, result.map.beta > 0)
     )
-    assert (
-        f"Thin evidence{100 * thin / known:.1f} %{0.01 * thin:,.1f} m² were observed fewer than 3 times"
-    ) in text
+    share, area = f"{100 * thin / known:.1f} %", f"{0.01 * thin:,.1f} m²"
+    assert f"Thin evidence{share}{area} were observed fewer than 3 times" in text
     nothing = dataclasses.replace(
         result.evidence, thinly_observed=np.zeros_like(result.evidence.thinly_observed)
     )
