@@ -277,7 +277,7 @@ def _describe_iterations(result: "MappingResult") -> str:
 
 
 def _kind_of(warning: str) -> str:
-    """What nobody can do anything about is a note."""
+    """`warning` where the user can do something, else `note`."""
     return "warning" if split_advice(warning)[1] else "note"
 
 

@@ -63,7 +63,7 @@ class FilterTarget(NamedTuple):
 
     @property
     def takes_poses(self) -> bool:
-        """Whether it is of clouds that poses place: those of the map, where none are recorded."""
+        """Whether poses are written with the points; where none are recorded, those of the map."""
         if self.writer is None or self.writer.name == "stillmap":
             return False
         return "T_recorded_base" in self.writer.fields

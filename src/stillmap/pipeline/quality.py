@@ -43,7 +43,7 @@ _GEOMETRY_WEIGHT = 0.75  # of overall: poses, walls and ghosts are three of four
 
 @dataclass(frozen=True)
 class QualityEvidence:
-    """What `Quality` was computed from; None where it cannot be told.
+    """Measurements from which `Quality` is computed; None where there are too few data.
 
     Attributes:
         expected_f1: of the label dynamic, from 0 to 1.

@@ -13,6 +13,7 @@ from stillmap.core.recording import Recording
 from stillmap.io.trajectory import pose_rows
 from stillmap.results.reader import Track
 from stillmap.tracking import MovingObject
+from stillmap.tracking.objects import mean_speed, track_length
 
 if TYPE_CHECKING:
     import pyarrow
@@ -127,8 +128,8 @@ def _object_columns(result: "Result") -> dict[str, Any]:
             side: np.array([one.size[k] for one in objects], np.float64)
             for k, side in enumerate(sides)
         },
-        "distance": np.array([travelled_distance(one) for one in objects], np.float64),
-        "speed": np.array([mean_speed(one) for one in objects], np.float64),
+        "distance": np.array([track_length(one.xy) for one in objects], np.float64),
+        "speed": np.array([mean_speed(one.velocity) for one in objects], np.float64),
         "beams": np.array([_count_beams(one) for one in objects], np.int64),
         "p_dynamic": np.array([one.p_dynamic for one in objects], np.float64),
     }
@@ -152,16 +153,6 @@ def _track_columns(result: "Result") -> dict[str, NDArray[Any]]:
         name: np.concatenate([np.zeros(0, empty.get(name, np.float64)), *parts])
         for name, parts in columns.items()
     }
-
-
-def travelled_distance(one: MovingObject | Track) -> float:
-    """Metres along the track of an object."""
-    return float(np.linalg.norm(np.diff(one.xy, axis=0), axis=1).sum())
-
-
-def mean_speed(one: MovingObject | Track) -> float:
-    """m/s, mean along the track of an object."""
-    return float(np.linalg.norm(one.velocity, axis=1).mean())
 
 
 def _count_beams(one: MovingObject | Track) -> int:

@@ -69,7 +69,7 @@ def estimate_spin(recording: Recording, options: SlamOptions, threads: int = 1) 
 
 
 def _looks_around(recording: Recording) -> bool:
-    """Whether a sweep in the middle of the recording shows all sides: others do not spin."""
+    """True if the sweep in the middle of the recording covers nearly all azimuths."""
     beams = recording.beams_of(recording.n_scans // 2)
     points = recording.points[beams][recording.hit[beams]]
     azimuth = np.arctan2(points[:, 1], points[:, 0])

@@ -60,6 +60,16 @@ class MovingObject(ShortRepr):
     z: Float | None = None
 
 
+def track_length(xy: Float) -> float:
+    """Metres along a track (L, 2)."""
+    return float(np.linalg.norm(np.diff(xy, axis=0), axis=1).sum())
+
+
+def mean_speed(velocity: Float) -> float:
+    """Mean of the speeds along a track, m/s, of its velocities (L, 2)."""
+    return float(np.linalg.norm(velocity, axis=1).mean())
+
+
 def track_objects(
     recording: Recording,
     poses: Float,

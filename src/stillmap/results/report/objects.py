@@ -11,8 +11,8 @@ from stillmap.pipeline.snapshots import Window
 from stillmap.results.report.figures import data_uri, draw_points
 from stillmap.results.report.maps import MapFigure
 from stillmap.results.run_json import tilting_record
-from stillmap.results.tables import mean_speed, travelled_distance
 from stillmap.tracking import FlowMap, MovingObject
+from stillmap.tracking.objects import mean_speed, track_length
 
 if TYPE_CHECKING:
     from stillmap.rig.build import TiltingResult
@@ -28,11 +28,11 @@ def objects_data(result: MappingResult, filtered: MapFigure | None) -> dict[str,
     """Tracks and traffic on the map; None where objects were not tracked or the map is empty."""
     if not result.options.objects.enabled or filtered is None:
         return None
-    objects = sorted(result.objects, key=travelled_distance, reverse=True)
+    objects = sorted(result.objects, key=lambda one: track_length(one.xy), reverse=True)
     if not objects:
         return {"total": 0}
     view, traffic = filtered.view, result.traffic
-    speeds = [mean_speed(one) for one in objects]
+    speeds = [mean_speed(one.velocity) for one in objects]
     rows = [(_seconds(one), speed) for one, speed in zip(objects, speeds, strict=True)]
     return {
         "total": len(objects),
@@ -48,7 +48,7 @@ def objects_data(result: MappingResult, filtered: MapFigure | None) -> dict[str,
         "listed": [
             {
                 "id": one.id,
-                "distance": travelled_distance(one),
+                "distance": track_length(one.xy),
                 "seconds": seconds,
                 "scans": len(one.scan),
                 "returns": len(one.beams),
