@@ -39,8 +39,11 @@ _WORKER = Path(__file__).with_name("space_peer_worker.py")
 
 def of_ours(work: Path, method: str, settings: tuple[str, ...], threads: int, out: Path) -> Scores:
     """What stillmap takes from the recording on the disk to the whole result, nothing written."""
+    # sweeps without times stay as they are: others cannot take the motion out either
     changes = config.merge_nested(
-        OURS.get(method, {}), *(config.parse_assignment(text) for text in settings)
+        {"read": {"spin": "none"}},
+        OURS.get(method, {}),
+        *(config.parse_assignment(text) for text in settings),
     )
     chosen = config.override(stillmap.Options(), {"threads": threads, **changes})
     poses = None if method == ESTIMATED else np.load(work / "poses.npy")
