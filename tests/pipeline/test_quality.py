@@ -15,6 +15,7 @@ from stillmap.pipeline.quality import Quality, describe_quality, rate_quality
 from stillmap.results.folder import open_result
 from stillmap.sim import scene_by_name, simulate
 from stillmap.slam.options import SlamOptions
+from stillmap.slam.rematching import rematch_windows
 
 
 @pytest.fixture(scope="module")
@@ -109,6 +110,28 @@ def test_in_3d_drift_lowers_geometry_and_wrong_labels_lower_labels():
 
 def test_does_not_depend_on_the_number_of_threads(rated):
     assert rated(threads=1) == rated(threads=4)
+
+
+def test_labels_of_a_place_where_nothing_moves_cannot_be_told():
+    run = simulate(scene_by_name("corridor-empty", {"robot": {"scans": 60}}), 0)
+    quality = stillmap.build(run.recording, {"threads": 1}).quality
+    assert quality.labels is None
+    assert quality.overall == quality.geometry > 50.0
+
+
+def test_views_to_one_side_are_not_matched_anew():
+    """As of a depth camera: lidar odometry would find wrong poses, and labels that suit them."""
+    lidar = {"channels": 16, "columns": 450, "sweep": False}
+    run = simulate(scene_by_name("street", {"lidar": lidar, "robot": {"scans": 20}}), 0)
+    ahead = run.recording.points[:, 0] > np.abs(run.recording.points[:, 1])
+    recording = dataclasses.replace(run.recording, hit=run.recording.hit & ahead)
+    poses = run.truth.T_world_base
+    (window,) = rematch_windows(recording, poses)
+    assert window.rematched is None
+    assert window.disagreement() is None
+    quality = stillmap.build(recording, {"threads": 1}, poses=poses).quality
+    assert quality.evidence.disagreement is None
+    assert quality.geometry > 50.0
 
 
 def test_of_one_scan_nothing_can_be_told(run):

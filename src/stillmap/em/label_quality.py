@@ -13,6 +13,7 @@ from stillmap.em.options import EmOptions
 from stillmap.em.types import DYNAMIC_BELOW, Float
 
 _CELL = {2: 0.2, 3: 0.15}  # m, by dimension: the same for every recording, whatever its resolution
+_MIN_DYNAMIC = 0.002  # share of the returns: with less, F1 is that of a few returns by chance
 _OPTIONS = replace(EmOptions(), change_detection=False)
 
 
@@ -20,11 +21,15 @@ class ExpectedCounts(NamedTuple):
     """Expected numbers of returns.
 
     Attributes:
+        returns: all.
+        likely: more likely dynamic than static.
         both: dynamic and labelled dynamic.
         dynamic: dynamic.
         labelled: labelled dynamic.
     """
 
+    returns: float
+    likely: float
     both: float
     dynamic: float
     labelled: float
@@ -53,10 +58,13 @@ def count_expected(
         judged, _ = occupancy_hmm.final_e_step(recording, poses, cell, _OPTIONS, threads)
         q = np.minimum(q, 1.0 - judged.p_static[hits].astype(np.float64))
     dynamic = p_static[hits] < DYNAMIC_BELOW
-    return ExpectedCounts(float(q[dynamic].sum()), float(q.sum()), float(dynamic.sum()))
+    sums = (float(q[dynamic].sum()), float(q.sum()), float(dynamic.sum()))
+    return ExpectedCounts(float(len(q)), float(np.count_nonzero(q > 0.5)), *sums)
 
 
 def expected_f1(counts: Iterable[ExpectedCounts]) -> float | None:
-    """2 sum both / (sum dynamic + sum labelled); None where nothing is dynamic."""
-    both, dynamic, labelled = np.sum([ExpectedCounts(0.0, 0.0, 0.0), *counts], axis=0).tolist()
-    return 2.0 * both / (dynamic + labelled) if dynamic + labelled > 0.0 else None
+    """2 sum both / (sum dynamic + sum labelled); None where hardly anything is dynamic."""
+    none = ExpectedCounts(*np.zeros(5))
+    returns, likely, both, dynamic, labelled = np.sum([none, *counts], axis=0).tolist()
+    is_rare = likely + labelled <= 2.0 * _MIN_DYNAMIC * returns
+    return None if is_rare else 2.0 * both / (dynamic + labelled)

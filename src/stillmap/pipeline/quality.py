@@ -67,8 +67,9 @@ class Quality:
     """How good a result is, each from 0 (useless) to 100; None where it cannot be told.
 
     Attributes:
-        overall: geometric mean of both parts, geometry with three quarters of the weight.
-        labels: of P(static).
+        overall: geometric mean of both parts, geometry with three quarters of the weight; geometry
+            alone where labels cannot be told.
+        labels: of P(static); None where hardly anything moves.
         geometry: of poses and map.
         evidence: see QualityEvidence; unknown of results that were read from a folder.
     """
@@ -95,15 +96,16 @@ def rate_quality(
         occupancy: the map of what is static.
         threads: does not change the result.
     """
-    counts, apart = [], []
+    if deskewed.n_scans < 2:
+        return Quality()
+    counts, apart = [], list[float]()
     for window in rematching.rematch_windows(deskewed, poses, threads):
-        apart.append(window.disagreement())
+        disagreement = window.disagreement()
+        apart += [] if disagreement is None else [disagreement]
         for part in window.split(_JUDGED_SCANS):
-            # in 3D the given poses add nothing to the new ones, which are accurate
-            candidates = (part.poses, part.rematched)[part.recording.dimension - 2 :]
             of_part = p_static[part.beams]
             counts.append(
-                label_quality.count_expected(part.recording, candidates, of_part, threads)
+                label_quality.count_expected(part.recording, _candidates(part), of_part, threads)
             )
     pairs = surface_agreement.measure_displacements(deskewed, poses).of_later_visits()
     displacement, worst = pairs.mean(), None
@@ -111,7 +113,7 @@ def rate_quality(
         worst = pairs.worst()
     evidence = QualityEvidence(
         expected_f1=label_quality.expected_f1(counts),
-        disagreement=float(np.median(apart)) if deskewed.n_scans > 1 else None,
+        disagreement=float(np.median(apart)) if apart else None,
         displacement=displacement,
         worst_scans=None
         if worst is None
@@ -122,20 +124,31 @@ def rate_quality(
     return _grade(evidence, deskewed.dimension)
 
 
+def _candidates(part: rematching.Window) -> list[Float]:
+    """Poses of a window at which labels are judged."""
+    if part.rematched is None:
+        return [part.poses]
+    # in 3D the given poses add nothing to the new ones, which are accurate
+    return [part.rematched] if part.recording.dimension == 3 else [part.poses, part.rematched]
+
+
 def _grade(evidence: QualityEvidence, dimension: int) -> Quality:
     """The figures that follow from the evidence, rounded to a tenth."""
     geometry = overall = None
     labels = None if evidence.expected_f1 is None else _to_percent(evidence.expected_f1, _BEST_F1)
-    if evidence.disagreement is not None and evidence.small_pieces is not None:
+    if evidence.small_pieces is not None:
         scale, displacement = _SCALE[dimension], evidence.displacement
-        parts = (
-            evidence.disagreement / scale.disagreement,
+        parts = [
             (scale.unseen if displacement is None else displacement) / scale.displacement,
             evidence.small_pieces / scale.small_pieces,
-        )
-        mean = float(np.prod([1.0 / (1.0 + part) for part in parts])) ** (1.0 / 3.0)
+        ]
+        if evidence.disagreement is not None:
+            parts.append(evidence.disagreement / scale.disagreement)
+        mean = float(np.prod([1.0 / (1.0 + part) for part in parts])) ** (1.0 / len(parts))
         geometry = _to_percent(mean, _BEST_GEOMETRY)
-    if labels is not None and geometry is not None:
+    if labels is None:
+        overall = geometry
+    elif geometry is not None:
         overall = labels ** (1.0 - _GEOMETRY_WEIGHT) * geometry**_GEOMETRY_WEIGHT
     return Quality(_round(overall), _round(labels), _round(geometry), evidence)
 

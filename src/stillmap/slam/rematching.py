@@ -15,7 +15,7 @@ from stillmap.slam.motion_model import compute_odometry_steps, odometry_prior
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.scan_hits import FREE_SPACE_MARGIN, select_hits
 from stillmap.slam.scan_matching import refine_pose, search_pose
-from stillmap.slam.scan_subset import beams_of_scans, select_beams
+from stillmap.slam.scan_subset import beams_of_scans, sees_all_round, select_beams
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -40,17 +40,20 @@ class Window(NamedTuple):
         beams: (m,) of the whole recording, rising: all of these scans, or every so many.
         recording: these.
         poses: (n, D+1, D+1) T_map_base as given.
-        rematched: (n, D+1, D+1) matched anew; the first one is that given.
+        rematched: (n, D+1, D+1) matched anew; the first one is that given. None of cameras and
+            lidars in 3D that do not see all round: lidar odometry is not made for these.
     """
 
     scans: Index
     beams: Index
     recording: Recording
     poses: Float
-    rematched: Float
+    rematched: Float | None
 
-    def disagreement(self) -> float:
+    def disagreement(self) -> float | None:
         """Median distance in metres between given and new poses after half of the window."""
+        if self.rematched is None:
+            return None
         lag = len(self.poses) // 2
         given, new = (
             se2.inverse(T[: len(T) - lag]) @ T[lag:] for T in (self.poses, self.rematched)
@@ -68,7 +71,7 @@ class Window(NamedTuple):
                 self.beams[np.concatenate(beams)],
                 select_beams(self.recording, part, beams, self.poses[part]),
                 self.poses[part],
-                self.rematched[part],
+                None if self.rematched is None else self.rematched[part],
             )
 
 
@@ -83,10 +86,11 @@ def rematch_windows(recording: Recording, poses: Float, threads: int = 1) -> Ite
         poses: (T, D+1, D+1) T_map_base.
         threads: does not change the result.
     """
+    can_match = recording.dimension == 2 or sees_all_round(recording)
     for scans in select_windows(recording, poses):
         beams = beams_of_scans(recording, scans, _MAX_BEAMS)
         window = select_beams(recording, scans, beams, np.ascontiguousarray(poses[scans]))
-        rematched = _rematch(window, poses[scans], threads)
+        rematched = _rematch(window, poses[scans], threads) if can_match else None
         yield Window(scans, np.concatenate(beams), window, poses[scans], rematched)
 
 

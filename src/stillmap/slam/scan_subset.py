@@ -1,5 +1,6 @@
 """Some scans of a recording, as a small recording of their own."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,9 @@ from stillmap.core.recording import Recording
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
+
+# of an all-round view: sectors, and the share of them that a sweep must show
+_SECTORS, _MIN_SECTORS = 36, 0.8
 
 
 def beams_of_scans(recording: Recording, scans: Index, max_beams: int) -> list[Index]:
@@ -43,3 +47,12 @@ def select_beams(
         images=None,
         record=None,
     )
+
+
+def sees_all_round(recording: Recording) -> bool:
+    """True if the scan in the middle of a recording covers nearly all azimuths."""
+    beams = recording.beams_of(recording.n_scans // 2)
+    points = recording.points[beams][recording.hit[beams]]
+    azimuth = np.arctan2(points[:, 1], points[:, 0])
+    sector = np.floor((azimuth[np.isfinite(azimuth)] / math.tau + 0.5) * _SECTORS)
+    return len(np.unique(sector % _SECTORS)) >= _MIN_SECTORS * _SECTORS

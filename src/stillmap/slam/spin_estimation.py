@@ -18,7 +18,7 @@ from stillmap.preprocessing.scan_timing import add_beam_times
 from stillmap.slam.deskew import deskew_recording
 from stillmap.slam.lidar_odometry import register_sweeps
 from stillmap.slam.options import SlamOptions
-from stillmap.slam.scan_subset import beams_of_scans, select_beams
+from stillmap.slam.scan_subset import beams_of_scans, sees_all_round, select_beams
 
 Float = NDArray[np.float64]
 
@@ -35,8 +35,6 @@ _MIN_DISTORTION, _LEVER_ARM = 0.1, 10.0
 # contrast: logarithm of the ratio of the cells that the two directions occupy, mean of the windows,
 # and in standard errors; docs/registration/deskewing.md has what simulated drives show
 _MIN_CONTRAST, _MIN_SCORE = 0.012, 4.0
-# of an all-round view: sectors, and the share of them that a sweep must show
-_SECTORS, _MIN_SECTORS = 36, 0.8
 
 
 def estimate_spin(recording: Recording, options: SlamOptions, threads: int = 1) -> Spin | None:
@@ -52,7 +50,7 @@ def estimate_spin(recording: Recording, options: SlamOptions, threads: int = 1) 
     """
     T = recording.n_scans
     count = min(T // _SCANS_PER_WINDOW, _MAX_WINDOWS)
-    if not options.deskew or count < _MIN_WINDOWS or not _looks_around(recording):
+    if not options.deskew or count < _MIN_WINDOWS or not sees_all_round(recording):
         return None
     found = []
     for first in np.linspace(0, T - _WINDOW, count).astype(np.int64).tolist():
@@ -66,15 +64,6 @@ def estimate_spin(recording: Recording, options: SlamOptions, threads: int = 1) 
     mean, error = float(np.mean(found)), float(np.std(found, ddof=1)) / math.sqrt(len(found))
     is_clear = abs(mean) > max(_MIN_CONTRAST, _MIN_SCORE * error)
     return _DIRECTIONS[int(mean < 0.0)] if is_clear else None
-
-
-def _looks_around(recording: Recording) -> bool:
-    """True if the sweep in the middle of the recording covers nearly all azimuths."""
-    beams = recording.beams_of(recording.n_scans // 2)
-    points = recording.points[beams][recording.hit[beams]]
-    azimuth = np.arctan2(points[:, 1], points[:, 0])
-    sector = np.floor((azimuth[np.isfinite(azimuth)] / math.tau + 0.5) * _SECTORS)
-    return len(np.unique(sector % _SECTORS)) >= _MIN_SECTORS * _SECTORS
 
 
 def _contrast_of_directions(window: Recording, options: SlamOptions, threads: int) -> float | None:
