@@ -121,6 +121,26 @@ const driveLayers = async (page) => {
   return out;
 };
 
+// a zoomed map as it is printed: the page gets another size after the script has drawn
+const print = async (page) => {
+  const shown = () => page.evaluate(() => {
+    const stage = document.querySelector(".main-map .stage"), scale = stage.querySelector(".scale");
+    return {window: stage.dataset.window.split(" ").map(Number), text: scale.textContent,
+      bar: scale.getBoundingClientRect().width,
+      sheet: stage.querySelector(".sheet").getBoundingClientRect().width};
+  });
+  await page.click(".main-map [data-do=in]");
+  const before = await shown();
+  await page.evaluate(() => dispatchEvent(new Event("beforeprint")));
+  await page.emulateMediaType("print");
+  await page.setViewport({width: 700, height: 900});
+  const printed = await shown();
+  await page.emulateMediaType("screen");
+  await page.setViewport({width: 1440, height: 900});
+  await page.evaluate(() => dispatchEvent(new Event("afterprint")));
+  return {before, printed, after: await shown()};
+};
+
 const withoutScripts = (page) => page.evaluate(() => {
   const seen = (selector) => [...document.querySelectorAll(selector)].map(
     (one) => one.checkVisibility() && one.getBoundingClientRect().width > 100);
@@ -140,6 +160,7 @@ const withoutScripts = (page) => page.evaluate(() => {
     out.layers = await driveLayers(page);
     out.map = await driveMap(page);
     out.slider = await driveSlider(page);
+    out.print = await print(await open(browser));
     const plain = await open(browser, {scripts: false});
     out.plain = await withoutScripts(plain);
     out.plain.layers = await driveLayers(plain);

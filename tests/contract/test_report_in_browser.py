@@ -111,6 +111,19 @@ def test_coordinates_are_those_of_the_map(found):
     assert words[5:] == ["m:", "occupied"]
 
 
+def test_printed_map_is_whole_and_has_a_scale(found):
+    seen = found[2]["print"]
+    before, printed, after = seen["before"], seen["printed"], seen["after"]
+    metres, unit = printed["text"].split()
+    assert unit == "m"
+    x0, _, x1, _ = printed["window"]
+    # the border of the bar lies outside of its length
+    assert printed["bar"] / printed["sheet"] * (x1 - x0) == pytest.approx(float(metres), rel=0.05)
+    assert printed["sheet"] < 700 < before["sheet"]
+    assert after["sheet"] == pytest.approx(before["sheet"])
+    assert after["text"] == before["text"]
+
+
 def test_slider_divides_raw_and_clean(found):
     seen = found[2]["slider"]
     assert seen["start"] == {

@@ -209,6 +209,7 @@ def _line(
 ) -> str:
     """The sentence of a value, or of `most` where the value is larger."""
     if value is None:
-        return f"{name}: cannot be told from this recording"
+        why = ": hardly anything moves" if name == "labels" else " from this recording"
+        return f"{name}: cannot be told{why}"
     sentence = next(text for lowest, text in sentences if min(value, most) >= lowest)
     return f"{name} {value:.0f} of 100: {sentence}"

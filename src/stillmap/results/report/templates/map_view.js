@@ -26,6 +26,10 @@ class MapView {
     this.cell = Number(stage.dataset.cell);
     this.pixel = document.createElement("canvas").getContext("2d", {willReadFrequently: true});
     this.pointers = new Map();
+    this.bar = this.port.querySelector(".scale");
+    this.lines = this.port.querySelector(".grid svg");
+    this.still = {bar: this.bar.textContent, lines: this.lines.innerHTML,
+      box: this.lines.getAttribute("viewBox")};
     stage.classList.add("live");
     for (const hidden of stage.querySelectorAll("[hidden]")) hidden.hidden = false;
     this.port.tabIndex = 0;
@@ -33,6 +37,8 @@ class MapView {
       + "arrow keys move it, plus and minus zoom, 0 shows all");
     this.showAll();
     this.listen();
+    window.addEventListener("beforeprint", () => this.freeze());
+    window.addEventListener("afterprint", () => this.resume());
     new ResizeObserver(() => this.draw()).observe(this.port);
   }
 
@@ -84,7 +90,23 @@ class MapView {
     this.draw();
   }
 
+  /* Paper has another width, which no script hears of: the whole map, in shares of it. */
+  freeze() {
+    this.stage.classList.remove("live", "zoomed");
+    for (const sheet of this.sheets) sheet.style.transform = "";
+    this.bar.style.width = "";
+    this.bar.textContent = this.still.bar;
+    this.lines.setAttribute("viewBox", this.still.box);
+    this.lines.innerHTML = this.still.lines;
+  }
+
+  resume() {
+    this.stage.classList.add("live");
+    this.draw();
+  }
+
   draw() {
+    if (!this.stage.classList.contains("live")) return;
     const layout = this.layout, m = this.metresPerPixel(layout);
     if (!layout.w) return;
     const dx = layout.width / 2 - layout.left - (this.x - this.x0) / m;
@@ -94,9 +116,8 @@ class MapView {
     }
     this.stage.classList.toggle("zoomed", this.k > 1.01);
     const length = roundDown(m * Math.min(180, layout.width / 4));
-    const bar = this.port.querySelector(".scale");
-    bar.style.width = `${length / m}px`;
-    bar.textContent = length < 1 ? `${label(100 * length)} cm` : `${label(length)} m`;
+    this.bar.style.width = `${length / m}px`;
+    this.bar.textContent = length < 1 ? `${label(100 * length)} cm` : `${label(length)} m`;
     this.drawGrid(layout, m);
   }
 
@@ -114,9 +135,8 @@ class MapView {
       if (n) lines += line; else axes += line;
       if (py < height - 24) texts += `<text x="6" y="${Number(py) + 4}">${label(n * step)}</text>`;
     }
-    const svg = this.port.querySelector(".grid svg");
-    svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
-    svg.innerHTML = `<path d="${lines}"/><path class="axis" d="${axes}"/>${texts}`;
+    this.lines.setAttribute("viewBox", `0 0 ${width} ${height}`);
+    this.lines.innerHTML = `<path d="${lines}"/><path class="axis" d="${axes}"/>${texts}`;
   }
 
   /* Coordinates at a point of the viewport, and the state of the cell there. */
