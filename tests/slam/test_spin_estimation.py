@@ -9,7 +9,8 @@ import stillmap
 from stillmap.core import se3
 from stillmap.core.config import override
 from stillmap.pipeline.calibration import time_sweeps
-from stillmap.pipeline.options import Options
+from stillmap.pipeline.options import Options, resolve_options
+from stillmap.pipeline.result import map_recording
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.spin_estimation import estimate_spin
 
@@ -74,15 +75,21 @@ def test_sensors_that_look_one_way_do_not_spin():
 
 
 def test_mapping_uses_the_direction_and_says_so():
-    recording = drive("clockwise")
-    result = stillmap.build(recording, {"em.max_iterations": 1, "threads": 1})
+    recording, states = drive("clockwise"), []
+    options = override(Options(), {"threads": 1, "em": {"max_iterations": 1}})
+    result = map_recording(recording, options, checkpoint=states.append)
     assert result.options.read.spin == "clockwise"
     assert result.recording.beam_time is not None
     assert any("turns clockwise" in warning for warning in result.warnings)
-    again = stillmap.build(recording, {"em.max_iterations": 1, "threads": 1, "read.spin": "none"})
-    assert again.recording.beam_time is None
-    dynamic, before = (np.mean(one.p_static < 0.5) for one in (result, again))
-    assert dynamic < 0.3 * before  # nothing moves in the yard
+    as_is = override(options, {"read": {"spin": "none"}})
+    before = map_recording(recording, as_is)
+    assert before.recording.beam_time is None
+    assert np.mean(result.p_static < 0.5) < 0.3 * np.mean(before.p_static < 0.5)  # nothing moves
+    # a checkpoint is read with the options that were given
+    interrupted = dataclasses.replace(states[0], options=resolve_options(options, recording))
+    resumed = map_recording(recording, options, resume=interrupted)
+    assert resumed.options == result.options
+    np.testing.assert_array_equal(resumed.p_static, result.p_static)
 
 
 @pytest.mark.parametrize("spin", ["none", "clockwise"])

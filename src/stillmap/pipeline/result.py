@@ -165,6 +165,7 @@ def map_recording(
             recording, found, more = calibrate_recording(recording, options)
             notes += more
     state = resume or EmState(options)
+    state.options = options  # a checkpoint has those from before the direction of spin was found
     # given poses leave nothing to iterate on in 3D, where the E-step does not depend on the labels
     state.single_pass = (
         recording.dimension == 3 and poses is not None and options.estimator == "stillmap"
