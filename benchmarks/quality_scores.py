@@ -93,7 +93,7 @@ def report(rows: Sequence[Row]) -> str:
         "overall": np.nanmean([*ranks, _ranks(column(rows, "f1"))], axis=0),
     }
     lines = [
-        [part, str(len(rows)), f"{spearman(column(rows, part), truth):.3f}"]
+        [part, str(_count(rows, part)), f"{spearman(column(rows, part), truth):.3f}"]
         for part, truth in truths.items()
     ]
     if np.isfinite(column(rows, "held_out")).any():
@@ -116,7 +116,10 @@ def _worst(rows: Sequence[Row], truths: dict[str, Float]) -> str:
         for k in np.argsort(-np.abs(np.nan_to_num(off)))[:_SHOWN]:
             row = rows[int(k)]
             about = (row[key] for key in ("world", "laser", "method", "odometry"))
-            scores = [f"{row[key]:.3g}" for key in (part, "f1", "ate", "walls", "ghosts")]
+            scores = [
+                "-" if row[key] is None else f"{row[key]:.3g}"
+                for key in (part, "f1", "ate", "walls", "ghosts")
+            ]
             lines.append([part, str(row["seed"]), ", ".join(map(str, about)), *scores])
     return markdown(["part", "seed", "run", "figure", "F1", "ATE", "walls", "ghosts"], lines)
 
@@ -124,6 +127,11 @@ def _worst(rows: Sequence[Row], truths: dict[str, Float]) -> str:
 def column(rows: Sequence[Row], name: str) -> Float:
     """(n,) of a score; NaN where a run has none."""
     return np.array([np.nan if row[name] is None else row[name] for row in rows], dtype=np.float64)
+
+
+def _count(rows: Sequence[Row], name: str) -> int:
+    """Runs that have a score."""
+    return int(np.count_nonzero(np.isfinite(column(rows, name))))
 
 
 def spearman(a: Float, b: Float) -> float:

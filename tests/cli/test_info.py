@@ -289,3 +289,11 @@ def test_cameras_from_a_file(tmp_path, capsys):
     file.write_text("[image_3]\n")
     with pytest.raises(InputError, match="nearest: 'image_2'"):
         run(folder, "--cameras", str(file))
+
+
+def test_clouds_made_in_python(tmp_path, capsys):
+    """Their sensor's place on the robot has no coordinates in the plane."""
+    clouds = [np.ones((3, 3)), 2.0 * np.ones((2, 3))]
+    write(Recording.from_clouds([0.0, 0.1], clouds), tmp_path / "clouds")
+    assert run(tmp_path / "clouds") == 0
+    assert "2 with 2 (2 to 3) beams each, 5 beams" in capsys.readouterr().out

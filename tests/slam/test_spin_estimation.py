@@ -1,20 +1,23 @@
 """The direction in which a lidar spins, found from sweeps that its motion distorts."""
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
 
 import stillmap
+from stillmap.cli.main import main
 from stillmap.core import se3
 from stillmap.core.config import override
+from stillmap.io import stillmap_folder, writers
 from stillmap.pipeline.calibration import time_sweeps
 from stillmap.pipeline.options import Options, resolve_options
 from stillmap.pipeline.result import map_recording
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.spin_estimation import estimate_spin
 
-SWEEPS, PERIOD = 40, 0.1
+SWEEPS, PERIOD = 64, 0.1
 TWIST = np.array([4.0, 0.0, 0.0, 0.0, 0.0, 0.6])  # m/s and rad/s of the base: a wide curve
 SIGN = {"clockwise": -1.0, "counter-clockwise": 1.0, "none": 0.0}
 
@@ -45,14 +48,19 @@ def sweep(world, t, direction, pace):
     return local
 
 
-def drive(direction, pace=1.0):
-    """A recording without beam times; direction `none`: each sweep is taken at once."""
+@functools.cache
+def drive(direction, pace=1.0, every=1):
+    """A recording without beam times, of every so many sweeps.
+
+    Direction `none`: each sweep is taken at once.
+    """
     rng = np.random.default_rng(0)
     world = surfaces(rng)
-    seen = [world[rng.random(len(world)) < 0.6] for _ in range(SWEEPS)]
-    exact = [sweep(points, t, direction, pace) for t, points in enumerate(seen)]
+    turns = every * np.arange(SWEEPS)
+    seen = [world[rng.random(len(world)) < 0.6] for _ in turns]
+    exact = [sweep(points, t, direction, pace) for t, points in zip(turns, seen, strict=True)]
     scans = [(points + rng.normal(0.0, 0.01, points.shape)).astype("f4") for points in exact]
-    return stillmap.Recording.from_clouds(PERIOD * np.arange(SWEEPS), scans)
+    return stillmap.Recording.from_clouds(PERIOD * turns, scans)
 
 
 @pytest.mark.parametrize("direction", ["clockwise", "counter-clockwise"])
@@ -62,6 +70,18 @@ def test_the_direction_is_found(direction):
 
 def test_corrected_sweeps_stay_as_they_are():
     assert estimate_spin(drive("none"), SlamOptions()) is None
+
+
+def test_thinned_sweeps_stay_as_they_are():
+    """A turn seems to take five times as long, so that beam times would add distortion."""
+    assert estimate_spin(drive("clockwise", pace=0.3, every=5), SlamOptions()) is None
+
+
+def test_scans_without_points_do_not_matter():
+    recording = drive("clockwise")
+    hit = recording.hit.copy()
+    hit[recording.beams_of(recording.n_scans // 2)] = False
+    assert estimate_spin(dataclasses.replace(recording, hit=hit), SlamOptions()) == "clockwise"
 
 
 def test_slow_motion_shows_no_direction():
@@ -74,13 +94,12 @@ def test_sensors_that_look_one_way_do_not_spin():
     assert estimate_spin(ahead, SlamOptions()) is None
 
 
-def test_mapping_uses_the_direction_and_says_so():
+@pytest.mark.slow
+def test_interrupted_mapping_with_the_direction():
     recording, states = drive("clockwise"), []
     options = override(Options(), {"threads": 1, "em": {"max_iterations": 1}})
     result = map_recording(recording, options, checkpoint=states.append)
     assert result.options.read.spin == "clockwise"
-    assert result.recording.beam_time is not None
-    assert any("turns clockwise" in warning for warning in result.warnings)
     as_is = override(options, {"read": {"spin": "none"}})
     before = map_recording(recording, as_is)
     assert before.recording.beam_time is None
@@ -90,6 +109,37 @@ def test_mapping_uses_the_direction_and_says_so():
     resumed = map_recording(recording, options, resume=interrupted)
     assert resumed.options == result.options
     np.testing.assert_array_equal(resumed.p_static, result.p_static)
+
+
+def test_saved_results_have_the_beam_times_again(tmp_path):
+    recording = drive("counter-clockwise")
+    built = stillmap.build(recording, {"threads": 1, "em.max_iterations": 1})
+    assert any("turns counter-clockwise" in warning for warning in built.warnings)
+    built.save(tmp_path / "out")
+    loaded = stillmap.load(tmp_path / "out", recording=recording)
+    np.testing.assert_array_equal(loaded.recording.beam_time, built.recording.beam_time)
+    # poses are rounded to the digits of the file
+    np.testing.assert_allclose(loaded.deskewed.points, built.deskewed.points, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_filtered_copies(tmp_path):
+    """In its own format nothing is added; one cloud is deskewed as that of `convert`."""
+    stillmap_folder.write(drive("clockwise"), tmp_path / "drive")
+    out, copy = tmp_path / "out", tmp_path / "copy"
+    main(["map", str(tmp_path / "drive"), "-o", str(out), "--quiet", "--set", "threads=1"])
+    main(["filter", str(out), "-o", str(copy), "--below", "0", "--quiet"])
+    assert stillmap_folder.read(copy).beam_time is None
+    main(["filter", str(out), "-o", str(tmp_path / "a.ply"), "--below", "0", "--quiet"])
+    main(["convert", str(out), "-o", str(tmp_path / "b.ply"), "--quiet"])
+    a, b = (stillmap.read(tmp_path / name) for name in ("a.ply", "b.ply"))
+    np.testing.assert_allclose(a.points[a.hit], b.points[b.hit], atol=1e-4)
+
+
+def test_a_reader_that_was_told_of_no_spin_is_believed(tmp_path):
+    writers.write(drive("clockwise"), tmp_path / "drive", name="kitti")
+    recording = stillmap.read(tmp_path / "drive", stillmap.ReadOptions(spin="none"))
+    assert time_sweeps(recording, Options())[0] is recording
 
 
 @pytest.mark.parametrize("spin", ["none", "clockwise"])

@@ -75,8 +75,7 @@ def run(args: argparse.Namespace) -> int:
         with show_share(args.quiet, "reading") as progress:
             recording, labels = result.read(progress, scratch)
         if target.takes_poses and recording.T_recorded_base is None:
-            poses = result.read_poses(recording)
-            recording = dataclasses.replace(recording, T_recorded_base=poses)
+            recording = _place(recording, result, target)
         blank, hits, blanked = _select_beams(recording, labels.p_static, args.below, scratch)
         with show_share(args.quiet, "writing") as progress:
             job = FilterJob(
@@ -102,6 +101,16 @@ def run(args: argparse.Namespace) -> int:
         for note in notes:
             say(f"warning: {note}")
     return 0
+
+
+def _place(recording: "Recording", result: "ResultFolder", target: "FilterTarget") -> "Recording":
+    """The recording at the poses of the map; in one cloud, without the motion during its scans."""
+    from stillmap.slam import deskew_recording
+
+    poses, recording = result.read_poses(recording), result.calibrate(recording)
+    if not target.is_folder:
+        recording = deskew_recording(recording, poses, result.slam_options)
+    return dataclasses.replace(recording, T_recorded_base=poses)
 
 
 def _find_target(result: "ResultFolder", output: Path, args: argparse.Namespace) -> "FilterTarget":

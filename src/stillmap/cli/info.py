@@ -88,7 +88,7 @@ def _format_summary(found: dict[str, Any]) -> Iterator[str]:
         how = f", as it turns {found['spin']}" if found["spin"] else ""
         yield _row("beam times", f"{first:g} to {last:g} s after a scan's stamp{how}")
     elif found["dimension"] == 3 and found["scans"] > 1:
-        yield _row("beam times", "none; `map` finds out whether motion distorts the sweeps")
+        yield _row("beam times", "none")
     yield from _format_odometry(found["odometry"])
     yield from _format_poses_and_images(found)
     if found["base_frame"] is not None:
@@ -167,7 +167,7 @@ def _format_sensor(sensor: dict[str, Any]) -> Iterator[str]:
         steps = f", {math.degrees(abs(step)):g} deg apart" if isinstance(step, float) else ""
         yield _row("  field of view", f"{view[0]:.2f} to {view[1]:.2f} deg{steps}")
     place = sensor.get("extrinsics")
-    if place is not None:
+    if place is not None and "x" in place:
         yield _row(
             "  on the robot",
             f"x {place['x']:.3f} m, y {place['y']:.3f} m, turned {place['theta_deg']:.2f} deg "

@@ -23,6 +23,7 @@ from stillmap.io.filtered_copy import FilterJob, Mask, Omissions
 from stillmap.io.point_cloud import signatures
 from stillmap.io.registry import FORMATS, Format, detect_format
 from stillmap.io.ros.bag_types import detect_kind
+from stillmap.preprocessing.scan_timing import SPIN_KEY
 
 Write = Callable[[FilterJob], Omissions]
 
@@ -80,7 +81,11 @@ def _writer(module: str, function: str = "write_filtered") -> Write:
 
 
 def _write_stillmap(job: FilterJob) -> Omissions:
-    stillmap_folder.write(_to_misses(job), job.output, overwrite=job.overwrite)
+    recording = _to_misses(job)
+    if stillmap_folder.read(job.source).beam_time is None:  # times that were estimated stay out
+        source = {key: value for key, value in recording.source.items() if key != SPIN_KEY}
+        recording = replace(recording, beam_time=None, source=source)
+    stillmap_folder.write(recording, job.output, overwrite=job.overwrite)
     return Omissions()
 
 

@@ -185,9 +185,12 @@ def _prepare_3d(recording: Recording, options: ReadOptions, scratch: Path | None
     """Add beam times and cameras, and remove returns from the robot itself."""
     from stillmap.io import cameras  # nothing that a 2D recording needs
     from stillmap.preprocessing import self_filter
-    from stillmap.preprocessing.scan_timing import add_beam_times
+    from stillmap.preprocessing.scan_timing import SPIN_KEY, add_beam_times
 
     recording = add_beam_times(replace(recording, scratch=scratch), options.spin)
+    if options.spin == "none" and recording.beam_time is None:
+        source = {**recording.source, SPIN_KEY: {"direction": "none"}}
+        recording = replace(recording, source=source)
     if options.cameras is not None:
         recording = cameras.apply_camera_file(recording, Path(options.cameras))
     recording = cameras.add_calibration_warnings(recording)

@@ -12,7 +12,7 @@ from stillmap.core.recording import Recording
 from stillmap.pipeline.options import Options
 from stillmap.preprocessing.late_odometry import interpolate_late_odometry
 from stillmap.preprocessing.overrides import mirror_beams
-from stillmap.preprocessing.scan_timing import add_beam_times
+from stillmap.preprocessing.scan_timing import SPIN_KEY, add_beam_times
 from stillmap.slam.hand_eye import GAIN, SCALE, correct_odometry
 from stillmap.slam.mount_calibration import (
     LATENCY,
@@ -72,6 +72,7 @@ def time_sweeps(recording: Recording, options: Options) -> tuple[Recording, Opti
         The recording; the options with the direction that was found; and a sentence about it.
     """
     is_open = recording.dimension == 3 and recording.beam_time is None
+    is_open &= SPIN_KEY not in recording.source  # the reader was told that there is none
     if not is_open or options.read.spin != "auto":
         return recording, options, []
     spin = estimate_spin(recording, options.slam, resolve_threads(options.threads))

@@ -172,12 +172,16 @@ class QualityText:
 
 def describe_quality(quality: Quality) -> QualityText:
     """One line for each part, for readers who do not know how it is computed."""
-    lower = min((v for v in (quality.labels, quality.geometry) if v is not None), default=0.0)
-    return QualityText(
-        overall=_line("overall", quality.overall, _OVERALL, lower + _MAX_CONTRAST),
-        labels=_line("labels", quality.labels, _LABELS),
-        geometry=_line("geometry", quality.geometry, _GEOMETRY),
-    )
+    geometry = _line("geometry", quality.geometry, _GEOMETRY)
+    if quality.labels is None or quality.geometry is None:
+        labels = _line("labels", quality.labels, _LABELS)
+        overall = _line("overall", quality.overall, _GEOMETRY)
+        if quality.geometry is not None:
+            labels = "labels: cannot be told, as hardly anything moves"
+        return QualityText(overall, labels, geometry)
+    most = min(quality.labels, quality.geometry) + _MAX_CONTRAST
+    overall = _line("overall", quality.overall, _OVERALL, most)
+    return QualityText(overall, _line("labels", quality.labels, _LABELS), geometry)
 
 
 # the sentence on overall is at most that of the lower part plus this: no good map with poor labels
@@ -194,7 +198,7 @@ _LABELS = (
     (80.0, "a second estimate agrees about nearly all that moved"),
     (60.0, "a second estimate agrees about most of what moved"),
     (40.0, "a second estimate disagrees about much of what moved"),
-    (0.0, "a second estimate confirms little of what moved; usual where hardly anything moves"),
+    (0.0, "a second estimate confirms little of what moved; usual where little moves"),
 )
 _GEOMETRY = (
     (80.0, "scans matched anew and surfaces observed again agree with the map"),
@@ -209,7 +213,6 @@ def _line(
 ) -> str:
     """The sentence of a value, or of `most` where the value is larger."""
     if value is None:
-        why = ": hardly anything moves" if name == "labels" else " from this recording"
-        return f"{name}: cannot be told{why}"
+        return f"{name}: cannot be told from this recording"
     sentence = next(text for lowest, text in sentences if min(value, most) >= lowest)
     return f"{name} {value:.0f} of 100: {sentence}"

@@ -17,6 +17,7 @@ from stillmap.core.recording import Recording
 from stillmap.io.trajectory import read_tum
 from stillmap.pipeline.options import Options
 from stillmap.pipeline.quality import Quality
+from stillmap.preprocessing.scan_timing import add_beam_times
 from stillmap.results.folder import ResultFolder, open_result, read_record, require_labelled
 from stillmap.results.labels import Labels, read_labels
 from stillmap.results.reader import Grid, Track, read_grid, read_tracks
@@ -99,8 +100,9 @@ class SavedResult(Result):
             InputError: it is not there, or is not the one that was mapped.
         """
         if isinstance(self.source, Recording):
-            recording = self.source
-            require_labelled(recording, self.labels, "recording")
+            require_labelled(self.source, self.labels, "recording")
+            # read from a file, it would have them already
+            recording = add_beam_times(self.source, self.folder.read_options.spin)
         else:
             recording, _ = open_result(self.path, self.source).read()
         if recording.dimension != self.poses.shape[-1] - 1:

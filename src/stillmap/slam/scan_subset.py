@@ -11,8 +11,8 @@ from stillmap.core.recording import Recording
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-# of an all-round view: sectors, and the share of them that a sweep must show
-_SECTORS, _MIN_SECTORS = 36, 0.8
+# of an all-round view: sectors, the share of them that is seen, and scans that are looked at
+_SECTORS, _MIN_SECTORS, _SAMPLED = 36, 0.8, 9
 
 
 def beams_of_scans(recording: Recording, scans: Index, max_beams: int) -> list[Index]:
@@ -50,9 +50,10 @@ def select_beams(
 
 
 def sees_all_round(recording: Recording) -> bool:
-    """True if the scan in the middle of a recording covers nearly all azimuths."""
-    beams = recording.beams_of(recording.n_scans // 2)
-    points = recording.points[beams][recording.hit[beams]]
+    """True if scans cover nearly all azimuths of the sensor."""
+    scans = np.unique(np.linspace(0, recording.n_scans - 1, _SAMPLED).astype(np.int64))
+    beams = [recording.beams_of(t) for t in scans.tolist()]
+    points = np.concatenate([recording.points[of][recording.hit[of]] for of in beams])
     azimuth = np.arctan2(points[:, 1], points[:, 0])
     sector = np.floor((azimuth[np.isfinite(azimuth)] / math.tau + 0.5) * _SECTORS)
     return len(np.unique(sector % _SECTORS)) >= _MIN_SECTORS * _SECTORS

@@ -7,6 +7,7 @@ before they were recorded become worse by either direction alike.
 """
 
 import math
+from collections.abc import Iterator
 from typing import Literal
 
 import numpy as np
@@ -16,7 +17,7 @@ import stillmap._core as _core
 from stillmap.core.recording import Recording
 from stillmap.preprocessing.scan_timing import add_beam_times
 from stillmap.slam.deskew import deskew_recording
-from stillmap.slam.lidar_odometry import register_sweeps
+from stillmap.slam.lidar_odometry import LidarOdometry, register_sweeps
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.scan_subset import beams_of_scans, sees_all_round, select_beams
 
@@ -25,8 +26,7 @@ Float = NDArray[np.float64]
 Spin = Literal["clockwise", "counter-clockwise"]
 
 _DIRECTIONS: tuple[Spin, Spin] = ("clockwise", "counter-clockwise")
-_WINDOW, _SCANS_PER_WINDOW, _MAX_WINDOWS = 16, 12, 5  # sweeps of one; of the recording for each
-_MIN_WINDOWS = 3  # with fewer the noise is not known
+_WINDOW, _MIN_WINDOWS, _MAX_WINDOWS = 16, 4, 5  # sweeps; with fewer windows noise is not known
 _MAX_BEAMS = 30_000  # of a sweep; of larger ones every so many beams are used
 _CELL, _MAX_RANGE = 0.2, 50.0  # m, of the map whose cells are counted
 _P_STATIC = 0.9  # of every return: labels are not known yet
@@ -41,49 +41,70 @@ def estimate_spin(recording: Recording, options: SlamOptions, threads: int = 1) 
     """`clockwise` or `counter-clockwise` seen from above; None: sweeps are best taken as they are.
 
     The sweeps of up to five windows are registered as they are. At these poses both directions are
-    compared: errors of the poses are the same for both.
+    compared: errors of the poses are the same for both. The better one must also improve on the
+    sweeps as they are, each registered on its own.
 
     Args:
         recording: 3D, without beam times.
         options: noise of odometry; without `deskew` nothing is estimated.
         threads: does not change the result.
     """
-    T = recording.n_scans
-    count = min(T // _SCANS_PER_WINDOW, _MAX_WINDOWS)
+    count = min(recording.n_scans // _WINDOW, _MAX_WINDOWS)
     if not options.deskew or count < _MIN_WINDOWS or not sees_all_round(recording):
         return None
-    found = []
-    for first in np.linspace(0, T - _WINDOW, count).astype(np.int64).tolist():
-        scans = np.arange(first, first + _WINDOW)
-        beams = beams_of_scans(recording, scans, _MAX_BEAMS)
-        window = select_beams(recording, scans, beams, None)
-        contrast = _contrast_of_directions(window, options, threads)
-        found += [] if contrast is None else [contrast]
-    if len(found) < _MIN_WINDOWS:
+    windows, contrasts = [], []
+    for window in _select_windows(recording, count):
+        registered = _register(window, options, threads)
+        contrast = _contrast_of_directions(window, registered, options)
+        if contrast is not None:
+            windows.append((window, registered.poses))
+            contrasts.append(contrast)
+    if len(contrasts) < _MIN_WINDOWS:
         return None
-    mean, error = float(np.mean(found)), float(np.std(found, ddof=1)) / math.sqrt(len(found))
-    is_clear = abs(mean) > max(_MIN_CONTRAST, _MIN_SCORE * error)
-    return _DIRECTIONS[int(mean < 0.0)] if is_clear else None
+    mean = float(np.mean(contrasts))
+    error = float(np.std(contrasts, ddof=1)) / math.sqrt(len(contrasts))
+    if abs(mean) <= max(_MIN_CONTRAST, _MIN_SCORE * error):
+        return None
+    direction = _DIRECTIONS[int(mean < 0.0)]
+    gains = []
+    for window, poses in windows:
+        timed = add_beam_times(window, direction)
+        cells = _count_cells(timed, _register(timed, options, threads).poses, options)
+        gains.append(math.log(_count_cells(window, poses, options) / cells))
+    return direction if float(np.mean(gains)) > 0.0 else None
 
 
-def _contrast_of_directions(window: Recording, options: SlamOptions, threads: int) -> float | None:
-    """How much fewer cells clockwise sweeps occupy, as logarithm; None: too slow to tell."""
+def _select_windows(recording: Recording, count: int) -> Iterator[Recording]:
+    """Windows of successive sweeps, evenly spread over the recording."""
+    for first in np.linspace(0, recording.n_scans - _WINDOW, count).astype(np.int64).tolist():
+        scans = np.arange(first, first + _WINDOW)
+        yield select_beams(recording, scans, beams_of_scans(recording, scans, _MAX_BEAMS), None)
+
+
+def _register(window: Recording, options: SlamOptions, threads: int) -> LidarOdometry:
     e = np.full(window.n_beams, _P_STATIC, np.float32)
-    found = register_sweeps(window, e, options.odometry, lambda *_: None, threads)
-    if _distortion(window, found.twists) < _MIN_DISTORTION:
+    return register_sweeps(window, e, options.odometry, lambda *_: None, threads)
+
+
+def _contrast_of_directions(
+    window: Recording, registered: LidarOdometry, options: SlamOptions
+) -> float | None:
+    """How much fewer cells clockwise sweeps occupy, as logarithm; None: too slow to tell."""
+    if _distortion(window, registered.twists) < _MIN_DISTORTION:
         return None
     cells = []
     for direction in _DIRECTIONS:
         timed = add_beam_times(window, direction)
         if timed.beam_time is None:
             return None
-        cells.append(_count_cells(timed, found.poses, options))
+        cells.append(_count_cells(timed, registered.poses, options))
     return math.log(cells[1] / cells[0])
 
 
 def _distortion(window: Recording, twists: Float) -> float:
     """Metres that the motion during a sweep moves a point at _LEVER_ARM, on average."""
-    seconds = 1e-9 * float(np.median(np.diff(window.stamp_ns)))
+    stamps = [window.stamp_ns[window.sensor == k] for k in np.unique(window.sensor)]
+    seconds = 1e-9 * max(float(np.median(np.diff(of))) for of in stamps if len(of) > 1)
     speed, turn_rate = (np.linalg.norm(part, axis=1) for part in (twists[:, :3], twists[:, 3:]))
     return seconds * float(np.mean(speed + _LEVER_ARM * turn_rate))
 
