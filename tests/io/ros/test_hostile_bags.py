@@ -12,8 +12,12 @@ from small_bags import Messages, write_bag
 
 from stillmap.core.errors import InputError
 from stillmap.io import read
+from stillmap.io.builder import ReadContext
 from stillmap.io.ros import limits, scan_beams
+from stillmap.io.ros.bag_types import Channel, Message
+from stillmap.io.ros.collect import TopicSelection, collect_messages
 from stillmap.io.ros.laser_scan import LaserScans, ScanShape
+from stillmap.preprocessing.options import ReadOptions
 
 START = 1_700_000_000_000_000_000
 ENDLESS = "WITH RECURSIVE r(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM r) SELECT x AS id"
@@ -208,3 +212,19 @@ def test_long_scan_among_many_short_ones(monkeypatch):
     start = np.cumsum(n) - n
     scans = LaserScans("/scan", "", stamps, stamps, start, shape, shapes, ranges, [])
     assert scan_beams._sample_readings(scans).size <= 5 * 1000
+
+
+def test_messages_of_a_topic_that_nobody_wanted():
+    """As of a damaged bag in which a connection takes the number of another one."""
+    transforms = Channel(1, "/tf", "tf2_msgs/msg/TFMessage", "ros1", 1, "")
+
+    class Damaged:
+        channels = (transforms,)
+
+        def messages(self, topics):
+            assert topics == {"/scan"}
+            yield Message(transforms, START, b"")
+
+    selection = TopicSelection({"/scan": "scans"}, False, [])
+    content = collect_messages(Damaged(), selection, ReadContext(ReadOptions()))
+    assert content.unreadable.total == 1

@@ -169,9 +169,11 @@ def collect_messages(bag: Bag, selection: TopicSelection, context: ReadContext) 
     scans = content.clouds if selection.has_clouds else content.lasers
     total = sum(c.n_messages for c in bag.channels if c.topic in selection.uses)
     for number, message in enumerate(bag.messages(set(selection.uses)), start=1):
-        use = selection.uses[message.channel.topic]
+        use = selection.uses.get(message.channel.topic)
         count_output(len(message.raw))
-        if use == "scans":
+        if use is None:  # of a damaged bag whose connections have the number of others
+            content.unreadable.add(f"{UNREADABLE} ({message.channel.topic})", number)
+        elif use == "scans":
             scans.add_message(message, skip=bool(window) and not _is_in_window(message, window))
         elif use == "images":
             if not window or _is_image_in_window(message, window):
