@@ -1,8 +1,8 @@
 """Atomic output of files and folders; bounded reading of text files."""
 
 import os
+import secrets
 import shutil
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -71,16 +71,11 @@ def atomic_folder(
     """
     path = Path(os.path.abspath(path))
     require_new(path, marker, overwrite)
+    # named before it is made: an interruption right after that finds it
+    work = (staging_folder or path.parent) / f".{path.name}.{secrets.token_hex(8)}.part"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        work = Path(
-            tempfile.mkdtemp(
-                prefix=f".{path.name}.", suffix=".part", dir=staging_folder or path.parent
-            )
-        )
-    except OSError as error:
-        raise InputError(f"cannot be written: {error.strerror}", where=str(path)) from error
-    try:
+        work.mkdir(mode=0o700)
         yield work
         work.chmod(0o777 & ~_umask())
         require_new(path, marker, overwrite)  # it may have appeared meanwhile
