@@ -117,7 +117,7 @@ def scores_of(result: stillmap.BuiltResult, simulation: Simulation) -> Scores:
     truth = simulation.truth
     labels = score_labels(result.p_static, truth.static, simulation.recording.hit)
     of_truth, grid = grid_of(_map_of_truth(result, simulation)), grid_of(result.map)
-    T_world_map = se2_of(align(result.poses, truth.T_world_base))
+    T_world_map = se2.project_to_plane(align(result.poses, truth.T_world_base)[None])[0]
     walls = of_truth.centres(np.argwhere(of_truth.occupied))
     kept = is_near_occupied(grid, moved(se2.inverse(T_world_map), walls))
     return {
@@ -148,9 +148,3 @@ def _ghosts_per_100_m2(grid: Grid, walls: Float, T_world_map: Float) -> float:
     distance, _ = scipy.spatial.cKDTree(walls).query(occupied)
     ghosts = np.count_nonzero(distance > GHOST_DISTANCE * grid.resolution)
     return 100.0 * float(ghosts) / free
-
-
-def se2_of(T: Float) -> Float:
-    """(3, 3) the motion in the plane of a motion (4, 4) that hardly tilts."""
-    heading = np.arctan2(T[1, 0], T[0, 0])
-    return np.asarray(se2.matrix(T[0, 3], T[1, 3], heading), np.float64)

@@ -40,13 +40,9 @@ def main() -> None:
     p.add_argument("--json", type=Path, help="append rows to this file, one a line")
     args = p.parse_args()
     seeds = list(range(args.seeds[0], args.seeds[1] + 1))
-    rows = sorted(
-        (
-            row
-            for _, row in outcomes(_row_of_sweeps if args.lidar else _row_of, seeds, args.processes)
-        ),
-        key=lambda row: row["seed"],
-    )
+    row_of = _row_of_sweeps if args.lidar else _row_of
+    rows = [row for _, row in outcomes(row_of, seeds, args.processes)]
+    rows.sort(key=lambda row: row["seed"])
     if args.json:
         with args.json.open("a") as file:
             file.writelines(json.dumps(row) + "\n" for row in rows)

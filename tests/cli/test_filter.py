@@ -36,6 +36,14 @@ def test_dynamic_beams_become_misses(call, room, mapped, tmp_path, below):
     assert f"{np.count_nonzero(blank)} beams blanked" in done.stderr
 
 
+def test_a_recording_named_by_its_header(call, room, tmp_path):
+    done = call("map", room / "recording.json", "-o", tmp_path / "out", *QUICK)
+    assert done.returncode == 0, done.stderr
+    done = call("filter", tmp_path / "out", "-o", tmp_path / "clean")
+    assert done.returncode == 0, done.stderr
+    assert stillmap_folder.read(tmp_path / "clean").n_beams == stillmap_folder.read(room).n_beams
+
+
 def test_filtered_log(call, tmp_path):
     """A walker in front of a wall, as a log: the same log comes out, without him."""
     rng = np.random.default_rng(0)

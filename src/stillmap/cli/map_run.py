@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.cli.console import say, show_share
+from stillmap.core.advice import advise
 from stillmap.core.errors import InputError, MissingExtra
 from stillmap.core.parallel import limit_blas_threads, resolve_threads
 from stillmap.core.profiling import Progress, StageTimer
@@ -159,7 +160,7 @@ def _build_models(
     try:
         models = build_models(result, tilting=tilting, progress=progress, stages=stages)
     except MissingExtra as error:
-        return None, [f"no models: {error}"]
+        return None, [advise(f"no models: {error}", "install what is missing, and map again")]
     warnings = []
     if not len(models.assignment.mesh):
         warnings.append("no mesh of the place: hardly any beams are neighbours on a surface")

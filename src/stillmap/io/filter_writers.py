@@ -64,7 +64,7 @@ class FilterTarget(NamedTuple):
 
     @property
     def takes_poses(self) -> bool:
-        """Whether poses are written with the points; where none are recorded, those of the map."""
+        """True of formats of points at poses: those of the map, where none are recorded."""
         if self.writer is None or self.writer.name == "stillmap":
             return False
         return "T_recorded_base" in self.writer.fields
@@ -82,7 +82,8 @@ def _writer(module: str, function: str = "write_filtered") -> Write:
 
 def _write_stillmap(job: FilterJob) -> Omissions:
     recording = _to_misses(job)
-    if stillmap_folder.read(job.source).beam_time is None:  # times that were estimated stay out
+    folder = job.source if job.source.is_dir() else job.source.parent
+    if stillmap_folder.read(folder).beam_time is None:  # times that were estimated stay out
         source = {key: value for key, value in recording.source.items() if key != SPIN_KEY}
         recording = replace(recording, beam_time=None, source=source)
     stillmap_folder.write(recording, job.output, overwrite=job.overwrite)

@@ -7,8 +7,8 @@ before they were recorded become worse by either direction alike.
 """
 
 import math
-from collections.abc import Iterator
-from typing import Literal
+from collections.abc import Iterator, Sequence
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,41 +37,71 @@ _MIN_DISTORTION, _LEVER_ARM = 0.1, 10.0
 _MIN_CONTRAST, _MIN_SCORE = 0.012, 4.0
 
 
+class WindowContrast(NamedTuple):
+    """A window of sweeps, registered as they are.
+
+    Attributes:
+        window: successive sweeps.
+        poses: (n, 4, 4) T_map_base of these sweeps.
+        contrast: logarithm of the ratio of the cells that counter-clockwise and clockwise beam
+            times occupy at these poses.
+    """
+
+    window: Recording
+    poses: Float
+    contrast: float
+
+
 def estimate_spin(recording: Recording, options: SlamOptions, threads: int = 1) -> Spin | None:
     """`clockwise` or `counter-clockwise` seen from above; None: sweeps are best taken as they are.
 
-    The sweeps of up to five windows are registered as they are. At these poses both directions are
-    compared: errors of the poses are the same for both. The better one must also improve on the
-    sweeps as they are, each registered on its own.
+    The better of both directions must also improve on the sweeps as they are, each registered on
+    its own.
 
     Args:
         recording: 3D, without beam times.
         options: noise of odometry; without `deskew` nothing is estimated.
         threads: does not change the result.
     """
-    count = min(recording.n_scans // _WINDOW, _MAX_WINDOWS)
-    if not options.deskew or count < _MIN_WINDOWS or not sees_all_round(recording):
+    if not options.deskew or not sees_all_round(recording):
         return None
-    windows, contrasts = [], []
-    for window in _select_windows(recording, count):
-        registered = _register(window, options, threads)
-        contrast = _contrast_of_directions(window, registered, options)
-        if contrast is not None:
-            windows.append((window, registered.poses))
-            contrasts.append(contrast)
-    if len(contrasts) < _MIN_WINDOWS:
+    windows = measure_contrasts(recording, options, threads)
+    if len(windows) < _MIN_WINDOWS:
         return None
-    mean = float(np.mean(contrasts))
-    error = float(np.std(contrasts, ddof=1)) / math.sqrt(len(contrasts))
+    mean, error = summarize_contrasts(windows)
     if abs(mean) <= max(_MIN_CONTRAST, _MIN_SCORE * error):
         return None
     direction = _DIRECTIONS[int(mean < 0.0)]
-    gains = []
-    for window, poses in windows:
-        timed = add_beam_times(window, direction)
-        cells = _count_cells(timed, _register(timed, options, threads).poses, options)
-        gains.append(math.log(_count_cells(window, poses, options) / cells))
+    gains = [_measure_gain(one, direction, options, threads) for one in windows]
     return direction if float(np.mean(gains)) > 0.0 else None
+
+
+def measure_contrasts(
+    recording: Recording, options: SlamOptions, threads: int = 1
+) -> list[WindowContrast]:
+    """Compares both directions in up to five windows, at the poses of the sweeps as they are.
+
+    Errors of the poses are the same for both. Windows without enough motion are left out; of fewer
+    than 64 sweeps there are none.
+    """
+    count = min(recording.n_scans // _WINDOW, _MAX_WINDOWS)
+    found = []
+    if count >= _MIN_WINDOWS:
+        for window in _select_windows(recording, count):
+            odometry = _register(window, options, threads)
+            if _distortion(window, odometry.twists) < _MIN_DISTORTION:
+                continue
+            cells = _count_both(window, odometry.poses, options)
+            if cells is not None:
+                contrast = math.log(cells[1] / cells[0])
+                found.append(WindowContrast(window, odometry.poses, contrast))
+    return found
+
+
+def summarize_contrasts(windows: Sequence[WindowContrast]) -> tuple[float, float]:
+    """Mean contrast of two windows or more, and its standard error."""
+    contrasts = [one.contrast for one in windows]
+    return float(np.mean(contrasts)), float(np.std(contrasts, ddof=1)) / math.sqrt(len(contrasts))
 
 
 def _select_windows(recording: Recording, count: int) -> Iterator[Recording]:
@@ -86,25 +116,28 @@ def _register(window: Recording, options: SlamOptions, threads: int) -> LidarOdo
     return register_sweeps(window, e, options.odometry, lambda *_: None, threads)
 
 
-def _contrast_of_directions(
-    window: Recording, registered: LidarOdometry, options: SlamOptions
-) -> float | None:
-    """How much fewer cells clockwise sweeps occupy, as logarithm; None: too slow to tell."""
-    if _distortion(window, registered.twists) < _MIN_DISTORTION:
+def _count_both(window: Recording, poses: Float, options: SlamOptions) -> list[int] | None:
+    """Cells occupied with each direction's beam times; None: the stamps give no rate of turns."""
+    timed = [add_beam_times(window, direction) for direction in _DIRECTIONS]
+    if any(one.beam_time is None for one in timed):
         return None
-    cells = []
-    for direction in _DIRECTIONS:
-        timed = add_beam_times(window, direction)
-        if timed.beam_time is None:
-            return None
-        cells.append(_count_cells(timed, registered.poses, options))
-    return math.log(cells[1] / cells[0])
+    return [_count_cells(one, poses, options) for one in timed]
+
+
+def _measure_gain(
+    one: WindowContrast, direction: Spin, options: SlamOptions, threads: int
+) -> float:
+    """Logarithm of how much fewer cells a window occupies once it has beam times."""
+    timed = add_beam_times(one.window, direction)
+    cells = _count_cells(timed, _register(timed, options, threads).poses, options)
+    return math.log(_count_cells(one.window, one.poses, options) / cells)
 
 
 def _distortion(window: Recording, twists: Float) -> float:
     """Metres that the motion during a sweep moves a point at _LEVER_ARM, on average."""
     stamps = [window.stamp_ns[window.sensor == k] for k in np.unique(window.sensor)]
-    seconds = 1e-9 * max(float(np.median(np.diff(of))) for of in stamps if len(of) > 1)
+    periods = [float(np.median(np.diff(of))) for of in stamps if len(of) > 1]
+    seconds = 1e-9 * max(periods, default=0.0)
     speed, turn_rate = (np.linalg.norm(part, axis=1) for part in (twists[:, :3], twists[:, 3:]))
     return seconds * float(np.mean(speed + _LEVER_ARM * turn_rate))
 
