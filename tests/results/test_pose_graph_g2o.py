@@ -6,8 +6,9 @@ from collections import defaultdict
 import numpy as np
 import pytest
 
-from stillmap.core import se2
-from stillmap.results.pose_graph_g2o import write_g2o
+from stillmap.core import se2, se3
+from stillmap.core.errors import InputError
+from stillmap.results.pose_graph_g2o import read_g2o, write_g2o
 from stillmap.slam.pose_graph import Constraint, PoseGraph, optimize_poses, squared_mahalanobis
 
 gtsam = pytest.importorskip("gtsam")
@@ -131,3 +132,62 @@ def test_one_scan_is_a_graph_without_edges(tmp_path):
     alone = PoseGraph(np.array([0]), np.eye(3)[None], [])
     write_g2o(tmp_path / "graph.g2o", alone, alone.poses)
     assert (tmp_path / "graph.g2o").read_text() == "VERTEX_SE2 0 0.0 0.0 0.0\nFIX 0\n"
+
+
+def way_3d(rng):
+    """Six poses in space with a loop."""
+    poses = se3.exp(np.cumsum(rng.normal([1, 0, 0, 0, 0, 0.2], 0.1, (6, 6)), axis=0))
+    constraints = []
+    for i, j in [*((k, k + 1) for k in range(5)), (0, 5)]:
+        root = rng.normal(size=(6, 6)) * 0.02
+        T = se2.inverse(poses[i]) @ poses[j] @ se3.exp(rng.normal(size=6) * 0.01)
+        constraints.append(Constraint(i, j, T, root @ root.T + 1e-4 * np.eye(6)))
+    return PoseGraph(np.array([0, 2, 5, 6, 7, 9]), poses, constraints)
+
+
+def assert_same(found, graph):
+    np.testing.assert_array_equal(found.keyframes, graph.keyframes)
+    np.testing.assert_allclose(found.poses, graph.poses, atol=1e-12)
+    for one, other in zip(found.constraints, graph.constraints, strict=True):
+        assert (one.first, one.second) == (other.first, other.second)
+        np.testing.assert_allclose(one.T, other.T, atol=1e-12)
+        np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-7)
+
+
+def test_what_is_written_is_read_again(tmp_path, graph):
+    write_g2o(tmp_path / "graph.g2o", graph, all_poses(graph))
+    assert_same(read_g2o(tmp_path / "graph.g2o"), graph)
+
+
+def test_a_graph_in_3d_is_read_again_by_us_and_by_gtsam(tmp_path):
+    graph = way_3d(np.random.default_rng(5))
+    poses = np.tile(np.eye(4), (10, 1, 1))
+    poses[graph.keyframes] = graph.poses
+    write_g2o(tmp_path / "graph.g2o", graph, poses)
+    assert_same(read_g2o(tmp_path / "graph.g2o"), graph)
+    factors, values = gtsam.readG2o(str(tmp_path / "graph.g2o"), True)
+    for scan, pose in zip(graph.keyframes.tolist(), graph.poses, strict=True):
+        np.testing.assert_allclose(values.atPose3(scan).matrix(), pose, atol=1e-9)
+    error = sum(factors.at(k).error(values) for k in range(len(graph.constraints)))
+    expected = 0.5 * squared_mahalanobis(graph.poses, graph.constraints).sum()
+    np.testing.assert_allclose(error, expected, rtol=0.05)  # of second order in small rotations
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("VERTEX_SE2 x 0 0 0", "line 12"),
+        ("VERTEX_SE2 99 0 nan 0", "line 12"),
+        ("EDGE_SE2 0 77 1 0 0 1 0 0 1 0 1", "no vertex"),
+        ("EDGE_SE2 0 3 1 0 0 1 0 0 -1 0 1", "positive definite"),
+        ("EDGE_SE3:QUAT 0 3 1", "among vertices"),
+    ],
+)
+def test_damage_is_named(tmp_path, graph, line, words):
+    path = tmp_path / "graph.g2o"
+    write_g2o(path, graph, all_poses(graph))
+    lines = path.read_text().splitlines()
+    lines.insert(11 if line.startswith("VERTEX") else len(lines), line)
+    path.write_text("\n".join(lines))
+    with pytest.raises(InputError, match=words):
+        read_g2o(path)

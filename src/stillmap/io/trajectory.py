@@ -69,11 +69,19 @@ def read_tum(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         rows.append(row)
     if not stamps:
         raise InputError("holds no poses", where=str(path), hint=f"lines of '{_COLUMNS}'")
-    values = np.array(rows)
-    poses = np.tile(np.eye(4), (len(values), 1, 1))
-    poses[:, :3, 3] = values[:, :3]
-    poses[:, :3, :3] = _rotations().from_quat(values[:, 3:]).as_matrix()
-    return np.array(stamps, np.int64), poses
+    return np.array(stamps, np.int64), poses_from_rows(np.array(rows))
+
+
+def poses_from_rows(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(T, 4, 4) of rows (T, 7) x y z qx qy qz qw.
+
+    Raises:
+        ValueError: a quaternion of length zero.
+    """
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, 3] = rows[:, :3]
+    poses[:, :3, :3] = _rotations().from_quat(rows[:, 3:]).as_matrix()
+    return poses
 
 
 def _rotations() -> "type[Rotation]":
