@@ -75,13 +75,14 @@ auto register_scan(const OccupancyGrid<D>& grid, const Points<D>& points,
                    const Square<D>& information, double sigma, int radius, double floor,
                    double unknown, double information_scale, int max_iterations,
                    double window_translation, double window_rotation, double search_range,
-                   int max_candidates, const std::optional<OnePose<D>>& T_start,
+                   int max_candidates, double min_score, const std::optional<OnePose<D>>& T_start,
                    const std::optional<Points<D>>& normals,
                    const std::optional<Flat<float>>& isotropy) {
   require(max_candidates >= 1, "max_candidates: expected at least one");
   const ScanRegistrationOptions options{
       {sigma, radius, floor, unknown}, information_scale, max_iterations};
   require(information_scale > 0.0, "information_scale: expected a positive number");
+  require_probability(min_score, "min_score");
   require(window_translation >= 0.0 && window_rotation >= 0.0 && window_rotation <= 3.2,
           "window: expected half widths, rotation at most pi");
   auto beams = beams_from<D>(points, weights);
@@ -99,7 +100,7 @@ auto register_scan(const OccupancyGrid<D>& grid, const Points<D>& points,
   {
     nb::gil_scoped_release released;
     LikelihoodField<D> field(grid, options.field);
-    const SearchWindow window{window_translation, window_rotation, search_range};
+    const SearchWindow window{window_translation, window_rotation, search_range, min_score};
     CorrelativeSearch<D> search(grid, beams, prior, window, options);
     const auto starting_poses = given ? std::vector<Candidate<D>>{{*given, 0.0}}
                                       : search.best(static_cast<size_t>(max_candidates));
@@ -185,14 +186,17 @@ void bind(nb::module_& m) {
         nb::arg("information").noconvert(), nb::kw_only(), nb::arg("sigma"), nb::arg("radius"),
         nb::arg("floor"), nb::arg("unknown"), nb::arg("information_scale"),
         nb::arg("max_iterations"), nb::arg("window_translation"), nb::arg("window_rotation"),
-        nb::arg("search_range"), nb::arg("max_candidates"), nb::arg("T_start") = nb::none(),
-        nb::arg("normals").noconvert() = nb::none(), nb::arg("isotropy").noconvert() = nb::none(),
+        nb::arg("search_range"), nb::arg("max_candidates"), nb::arg("min_score") = 0.0,
+        nb::arg("T_start") = nb::none(), nb::arg("normals").noconvert() = nb::none(),
+        nb::arg("isotropy").noconvert() = nb::none(),
         "Equation (9): scan-to-map registration. points (N, D) float32: end points of returns in "
         "the moving frame; weights (N,) float32 = e; T_prior (D+1, D+1) and information (dof, dof) "
         "of (translation, rotation about the origin of the moving frame). A correlative search "
-        "yields up to max_candidates poses, each refined by Newton steps; with T_start the search "
-        "is skipped. Returns pose, covariance, cost, inlier share, number of Newton steps, number "
-        "of scored lattice poses, and (R, dof + 1) offset and additional cost of each refined "
+        "yields up to max_candidates poses, each refined by Newton steps; none that scores less "
+        "than min_score of the highest possible score, in which case T_prior is refined. With "
+        "T_start the search is skipped. Returns pose, covariance, cost, inlier share, number of "
+        "Newton steps, number of scored lattice poses, and (R, dof + 1) offset and additional cost "
+        "of each refined "
         "candidate against the best. With normals (N, D) and isotropy (N,) of `estimate_normals`, "
         "the covariance is that of the surfaces' directions, and wide along a bare wall.");
   m.def("occluded_share", &occluded_share_at<D>, nb::arg("grid"), nb::arg("points").noconvert(),

@@ -133,7 +133,7 @@ def _to_constraint(edge: list[str], ids: list[int], D: int) -> Constraint:
     information = np.zeros((dof, dof))
     information[np.triu_indices(dof)] = values[n_pose:]
     information += np.triu(information, 1).T
-    covariance = np.linalg.inv(information)
+    covariance = np.asarray(np.linalg.inv(information), np.float64)
     if np.linalg.eigvalsh(covariance)[0] <= 0.0:
         raise ValueError(f"the information of {one} to {other} is not positive definite")
     return Constraint(first, second, _to_poses(values[None, :n_pose])[0], covariance)

@@ -65,7 +65,7 @@ def close_loops_3d(
     keyframes = local_map.select_keyframes(poses, distance, KEYFRAME_ANGLE)
     travelled = local_map.travelled_distance(poses)
     search = options.loop_search_distance
-    closer = _LoopCloser(
+    closer = SweepLoopCloser(
         recording,
         e,
         odometry,
@@ -92,7 +92,7 @@ def _drift_std(metres: float) -> tuple[float, float]:
 
 
 @dataclass(frozen=True, eq=False)
-class _LoopCloser:
+class SweepLoopCloser:
     """A 3D trajectory in which loops are searched.
 
     Attributes:

@@ -25,7 +25,7 @@ _INDEPENDENT_SCANS = 3  # of a view: further ones add no certainty
 SEARCH_STDS = 2.0  # half width of the search window in standard deviations of the drift
 # a beam is comparable if the submap was observed so many m before its end; share of beams that must
 # be comparable
-_OBSERVED_MARGIN, _MIN_COMPARABLE = 1.0, 0.3
+_OBSERVED_MARGIN, MIN_COMPARABLE = 1.0, 0.3
 # share of the comparable beams that the submap must explain, and of the share that the local map
 # explained
 MIN_EXPLAINED, _MIN_EXPLAINED_RATIO = 0.5, 0.65
@@ -113,7 +113,7 @@ def verify_candidate(
         part = here
     floor = [CLOSURE_TRANSLATION] * 2 + [_CLOSURE_ROTATION]
     covariance = match.covariance + np.diag(np.square(floor))
-    too_little = share < _MIN_COMPARABLE or match.explained < max(
+    too_little = share < MIN_COMPARABLE or match.explained < max(
         min_explained, _MIN_EXPLAINED_RATIO * context.explained[later]
     )
     if not too_little:
@@ -129,6 +129,7 @@ def verify_candidate(
         se2.rotate_covariance(covariance, se2.inverse(match.T_map_base)),
         match.explained,
         "explains too little" if too_little else "",
+        share,
     )
 
 
@@ -142,7 +143,7 @@ def _collect_view(context: LoopContext, t: int) -> tuple[Scan, Points]:
         scans = _select_around(context, t, metres)
         seen = [context.hits(s) for s in scans]
         to_t = se2.inverse(context.poses[t]) @ context.poses[scans]
-        view = _merge_scans(context, seen, to_t)
+        view = _merge_scans(seen, to_t)
         if _isotropy(view) >= _MIN_ISOTROPY:
             break
     before = [
@@ -163,7 +164,7 @@ def _select_around(context: LoopContext, t: int, metres: float) -> list[int]:
     return sorted({t, *scans[near].tolist()})
 
 
-def _merge_scans(context: LoopContext, scans: list[Scan], to_t: Float) -> Scan:
+def _merge_scans(scans: list[Scan], to_t: Float) -> Scan:
     """Scans moved by (S, 3, 3) into one frame.
 
     Neighboring scans share their errors: more of them say where, not more certainly.
@@ -173,7 +174,7 @@ def _merge_scans(context: LoopContext, scans: list[Scan], to_t: Float) -> Scan:
     return Scan(
         np.concatenate([transform_points(scan.points, T) for scan, T in pairs]),
         share * np.concatenate([scan.weights for scan in scans]),
-        context.recording.T_base_sensor[0],
+        scans[0].T_base_sensor,
         np.concatenate([np.float32(scan.normals @ T[:2, :2].T) for scan, T in pairs]),
         np.concatenate([scan.isotropy for scan in scans]),
     )

@@ -48,6 +48,7 @@ class LoopClosure(ShortRepr):
         covariance: (3, 3) of x, y, heading in the frame of the later scan; in 3D (6, 6).
         explained: share of the comparable beams of the later scan that the earlier map explains.
         rejected: reason of the rejection; empty if accepted.
+        comparable: share of the later scan that the earlier map observed from the same side.
     """
 
     earlier: int
@@ -56,6 +57,7 @@ class LoopClosure(ShortRepr):
     covariance: Float
     explained: float
     rejected: str = ""
+    comparable: float = 1.0
 
     def reject(self, reason: str) -> "LoopClosure":
         """The same closure, rejected."""

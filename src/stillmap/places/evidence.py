@@ -1,0 +1,107 @@
+"""Evidence of a session in the frame of its place: sums of hits and passes of its keyframes, (10).
+
+Stored in blocks of cells, in 2D and 3D alike: one byte for the expected number of static hits of a
+cell, and one for the length by which beams passed through it, in cells.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+import stillmap._core as _core
+from stillmap import em
+from stillmap.core.short_repr import ShortRepr
+from stillmap.places.keyframes import Keyframes
+
+Float = NDArray[np.float64]
+
+BLOCK = {2: 32, 3: 8}  # cells, edge of a block
+_APPROACH = 0.2  # m before its end in which a beam is not used as free space
+_UNITS = 4.0  # of a byte in a hit or a cell passed: sums end at 63
+_MAX_BYTE = 255
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence(ShortRepr):
+    """Sums of a session over B blocks of cells.
+
+    Attributes:
+        corner: (B, D) int32, lowest cell of each block, a multiple of its edge, sorted.
+        hits: (B, edge, ..., edge) uint8, expected number of static hits; axes as of `corner`.
+        passes: (B, edge, ..., edge) uint8, cells that beams passed, and dynamic hits.
+        resolution: m, edge of a cell.
+    """
+
+    corner: NDArray[np.int32]
+    hits: NDArray[np.uint8]
+    passes: NDArray[np.uint8]
+    resolution: float
+
+    @property
+    def dimension(self) -> int:
+        """2 or 3."""
+        return int(self.corner.shape[1])
+
+    @property
+    def edge(self) -> int:
+        """Cells along the edge of a block."""
+        return BLOCK[self.dimension]
+
+    def crop(
+        self, low: NDArray[np.int64], shape: tuple[int, ...]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Hits and passes in a box of cells from `low` (D,) on; 0 where nothing was observed."""
+        out = np.zeros((2, *shape), np.float32)
+        high = low + shape
+        inside = ((self.corner + self.edge > low) & (self.corner < high)).all(axis=1)
+        for b in np.flatnonzero(inside).tolist():
+            first = self.corner[b] - low
+            there = tuple(
+                slice(max(f, 0), min(f + self.edge, n)) for f, n in zip(first, shape, strict=True)
+            )
+            here = tuple(slice(t.start - f, t.stop - f) for t, f in zip(there, first, strict=True))
+            out[0][there] = self.hits[b][here]
+            out[1][there] = self.passes[b][here]
+        out /= np.float32(_UNITS)
+        return out[0], out[1]
+
+
+def measure_evidence(
+    keyframes: Keyframes, poses: Float, resolution: float, threads: int
+) -> Evidence:
+    """The sums (10) of keyframes at poses (K, D+1, D+1) in the place.
+
+    Beams without a return are left out: they may have met glass.
+    """
+    D = keyframes.dimension
+    kind = _core.OccupancyGrid2D if D == 2 else _core.OccupancyGrid3D
+    grid = kind(resolution, _APPROACH)
+    em.add_recording(grid, keyframes.recording, poses, keyframes.e, threads, hits_only=True)
+    return _export(grid, D, resolution)
+
+
+def _export(grid: em.Grid, D: int, resolution: float) -> Evidence:
+    """The blocks of a grid that hold something."""
+    edge = BLOCK[D]
+    lowest = np.unique(np.asarray(grid.block_cells) // edge * edge, axis=0)
+    corner, hits, passes = [], [], []
+    for first in lowest.tolist():
+        _, alpha, beta = grid.dense(first, (edge,) * D)
+        if alpha.any() or beta.any():
+            corner.append(first)
+            # the grid's arrays have the last axis first
+            hits.append(_to_bytes(alpha.transpose()))
+            passes.append(_to_bytes(beta.transpose()))
+    shape = (len(corner), *(edge,) * D)
+    return Evidence(
+        np.array(corner, np.int32).reshape(-1, D),
+        np.array(hits, np.uint8).reshape(shape),
+        np.array(passes, np.uint8).reshape(shape),
+        resolution,
+    )
+
+
+def _to_bytes(sums: Float) -> NDArray[np.uint8]:
+    # never 0 where there is something
+    return np.minimum(np.ceil(_UNITS * sums), _MAX_BYTE).astype(np.uint8)

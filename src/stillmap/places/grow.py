@@ -1,0 +1,185 @@
+"""Growth of a place by one session: alignment, then EM over sessions.
+
+M-step: constraints between keyframes given P(static), and the pose graph of all sessions. E-step:
+the evidence of each session, and the chain over sessions for each cell.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.short_repr import ShortRepr
+from stillmap.places import matching, matching_3d
+from stillmap.places.keyframes import Keyframes
+from stillmap.places.lifting import lift_alignment
+from stillmap.places.matching import KeyframeMatch, Verdict
+from stillmap.places.place import Place, PlacedSession, update_evidence
+from stillmap.places.place_graph import Tie, optimize_nodes
+from stillmap.places.place_states import (
+    PlaceStates,
+    estimate_place,
+    measure_overlap,
+)
+from stillmap.places.placement import (
+    CORRECTED_STD,
+    PREDICTION_STD,
+    estimate_covariance,
+    find_placement,
+    select_references,
+)
+from stillmap.places.session import Session
+
+Float = NDArray[np.float64]
+Matches = dict[int, list[KeyframeMatch]]  # by the index of the reference in the place
+
+_EM_ROUNDS = 2
+_MAX_CHANGED = 0.25  # share of the cells seen by it and others that nobody saw as it did
+_MIN_TIES, _MIN_AGREEING = 4, 0.6  # constraints, and the share of them that the graph must keep
+
+
+@dataclass(frozen=True, eq=False)
+class Growth(ShortRepr):
+    """Result of `add_session`.
+
+    Attributes:
+        place: with the session, or as it was.
+        refused: why the session is not in it; empty if it is.
+    """
+
+    place: Place
+    refused: str = ""
+
+
+def start_place(session: Session, resolution: float, voxel_size: float, threads: int) -> Place:
+    """A place of one session, in its frame."""
+    place = Place([PlacedSession(session, session.node_poses)], [], resolution, voxel_size)
+    return update_evidence(place, threads)
+
+
+def add_session(
+    place: Place, session: Session, threads: int, report: Callable[[str], None] = lambda _: None
+) -> Growth:
+    """Add a session to a place, if the evidence is clear about where it lies.
+
+    Args:
+        place: at least one session, with evidence.
+        session: of the same dimension.
+        threads: the result does not depend on it.
+        report: called with the step that begins.
+    """
+    report("aligning")
+    found = find_placement(place.sessions, session)
+    if found.refused:
+        return Growth(place, found.refused)
+    placed = PlacedSession(session, lift_alignment(place, session, found))
+    matches, states = found.matches, None
+    if place.dimension == 3:
+        matches = match_session(place, placed, PREDICTION_STD, None, threads)
+    for _ in range(_EM_ROUNDS):
+        if states is not None:
+            matches = match_session(place, placed, CORRECTED_STD, states, threads)
+        report("optimizing poses")
+        ties = make_ties(matches, len(place.sessions))
+        if len(ties) < _MIN_TIES:
+            return Growth(place, "too few of its keyframes can be registered to the place")
+        grown, agreeing = _optimize(place, placed, ties)  # M-step
+        if agreeing < _MIN_AGREEING:
+            return Growth(place, "constraints to the place contradict each other")
+        report("comparing sessions")
+        grown = update_evidence(grown, threads)
+        states = estimate_planar(grown)  # E-step
+        placed = grown.sessions[-1]
+        changed = states.disagreement_of(grown.in_time().index(len(grown.sessions) - 1))
+        if changed > _MAX_CHANGED:
+            why = f"{100 * changed:.0f} % of what both saw would have changed"
+            return Growth(place, f"it contradicts the place: {why}")
+    return Growth(_describe(grown, ties))
+
+
+def estimate_planar(place: Place) -> PlaceStates:
+    """The states of the cells in the plane, over the sessions in the order of time."""
+    return estimate_place([place.sessions[k].require_evidence()[1] for k in place.in_time()])
+
+
+def match_session(
+    place: Place,
+    placed: PlacedSession,
+    std: tuple[float, float],
+    states: PlaceStates | None,
+    threads: int,
+) -> Matches:
+    """The nodes of a session matched with its references at its poses in the place.
+
+    Args:
+        place: without the session.
+        placed: the session.
+        std: m and rad, of its poses.
+        states: of the place with the session: what changed has no weight; None: not known.
+        threads: the result does not depend on it.
+    """
+    session, planar_poses = placed.session, placed.planar_poses
+    nodes = list(range(len(session.keyframes.nodes)))
+    out = {}
+    for index in select_references(place.sessions, session.planar, planar_poses):
+        other = place.sessions[index]
+        if place.dimension == 3:
+            out[index] = matching_3d.match_sessions(other, placed, std, nodes, threads)
+            continue
+        out[index] = matching.match_sessions(
+            _weigh(other.session.planar, other.planar_poses, states),
+            other.planar_poses,
+            _weigh(session.planar, planar_poses, states),
+            planar_poses,
+            std,
+            nodes,
+        )
+    return out
+
+
+def _weigh(keyframes: Keyframes, poses: Float, states: PlaceStates | None) -> Keyframes:
+    """Keyframes whose beams that ended on what changes between sessions have no weight."""
+    if states is None:
+        return keyframes
+    recording = keyframes.recording
+    beams = np.flatnonzero(recording.hit)
+    p_changing = states.look_up(recording.end_points(beams, poses), states.states.p_changing)
+    e = np.array(keyframes.e)
+    e[beams] *= (1.0 - p_changing).astype(np.float32)
+    return replace(keyframes, e=e)
+
+
+def make_ties(matches: Matches, index: int) -> list[Tie]:
+    """The constraints of keyframes that fit, between references and session `index`."""
+    return [
+        Tie(reference, match.other, index, match.node, match.T, match.covariance)
+        for reference, of in matches.items()
+        for match in of
+        if match.verdict is Verdict.FITS
+    ]
+
+
+def _optimize(place: Place, placed: PlacedSession, ties: list[Tie]) -> tuple[Place, float]:
+    """The place with a further session after pose graph optimization, and the share of the new
+    ties that agree with it."""
+    sessions = [*place.sessions, placed]
+    all_ties = [*place.ties, *ties]
+    nodes, agree = optimize_nodes(
+        [one.session for one in sessions], [one.nodes for one in sessions], all_ties
+    )
+    kept = [tie for tie, agrees in zip(all_ties, agree.tolist(), strict=True) if agrees]
+    grown = replace(place, sessions=sessions, ties=kept).with_nodes(nodes)
+    return grown, float(agree[len(place.ties) :].mean())
+
+
+def _describe(place: Place, ties: list[Tie]) -> Place:
+    """The place with covariance and overlap of its last session."""
+    *before, placed = place.sessions
+    planar = [one.require_evidence()[1] for one in place.sessions]
+    last = replace(
+        placed,
+        covariance=estimate_covariance(placed, ties),
+        overlap=measure_overlap(planar, len(before)),
+    )
+    return replace(place, sessions=[*before, last])

@@ -1,0 +1,113 @@
+"""Keyframes of a session: the spaced scans that a place keeps for alignment and for its map."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core import se2, se3
+from stillmap.core.recording import Recording
+from stillmap.core.short_repr import ShortRepr
+from stillmap.slam.scan_subset import beams_of_scans, select_beams
+
+Float = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+# between keyframes: m of travel, rad, s of standing still; in 3D sweeps see farther
+_SPACING = {2: (0.25, 0.2, 4.0), 3: (1.0, 0.5, 4.0)}
+_MAX_BEAMS = 24_000  # of a keyframe: denser sweeps are thinned evenly, which registration allows
+
+
+@dataclass(frozen=True, eq=False)
+class Keyframes(ShortRepr):
+    """K spaced scans of a session with M beams, without motion during the scans.
+
+    Attributes:
+        recording: the scans, deskewed, without odometry and images.
+        scans: (K,) their numbers in the session's recording.
+        poses: (K, D+1, D+1) T_session_base.
+        e: (M,) float32, P(static) of every beam; 0: unusable.
+        nodes: (N,) indices of those that are nodes of the pose graph, rising.
+    """
+
+    recording: Recording
+    scans: Index
+    poses: Float
+    e: NDArray[np.float32]
+    nodes: Index
+
+    @property
+    def dimension(self) -> int:
+        """2 or 3."""
+        return self.recording.dimension
+
+    def __len__(self) -> int:
+        return len(self.scans)
+
+
+def select_keyframes(
+    deskewed: Recording, poses: Float, p_static: NDArray[np.float32], nodes: Index
+) -> Keyframes:
+    """The keyframes of a session.
+
+    Args:
+        deskewed: T scans with M beams.
+        poses: (T, D+1, D+1) T_session_base.
+        p_static: (M,) P(static) of every beam.
+        nodes: (N,) scans that are nodes of the pose graph, rising.
+    """
+    scans = np.union1d(space_scans(deskewed, poses), nodes)
+    beams = beams_of_scans(deskewed, scans, _MAX_BEAMS)
+    recording = select_beams(deskewed, scans, beams, None)
+    e = np.nan_to_num(p_static[np.concatenate(beams)], nan=0.0).astype(np.float32)
+    return Keyframes(recording, scans, poses[scans], e, np.searchsorted(scans, nodes))
+
+
+def space_scans(recording: Recording, poses: Float) -> Index:
+    """(K,) scans of each sensor, spaced by travel, turn and time; always the first of each."""
+    metres, radians, seconds = _SPACING[recording.dimension]
+    progress = _progress(recording.stamp_ns, poses, metres, radians, seconds)
+    kept = []
+    for sensor in np.unique(recording.sensor):
+        scans = np.flatnonzero(recording.sensor == sensor)
+        # the first scan past each whole unit of progress
+        kept.append(scans[np.unique(np.floor(progress[scans]), return_index=True)[1]])
+    return np.sort(np.concatenate(kept))
+
+
+def _progress(
+    stamp_ns: NDArray[np.int64], poses: Float, metres: float, radians: float, seconds: float
+) -> Float:
+    """(T,) sum of travel, turn and time up to each scan, in units of the spacing."""
+    steps = se2.inverse(poses[:-1]) @ poses[1:]
+    travel = np.linalg.norm(steps[:, :-1, -1], axis=1)
+    if poses.shape[-1] == 3:
+        turn = np.abs(se2.parameters(steps)[:, 2])
+    else:
+        turn = np.linalg.norm(se3.log_rotation(steps[:, :3, :3]), axis=-1)
+    gaps = np.minimum(1e-9 * np.diff(stamp_ns), seconds)  # a pause adds one keyframe at most
+    units = travel / metres + turn / radians + gaps / seconds
+    return np.concatenate([[0.0], units.cumsum()])
+
+
+def join_keyframes(one: Keyframes, other: Keyframes) -> Keyframes:
+    """The keyframes of two sessions as those of one; poses are still each in its own frame."""
+    first, second = one.recording, other.recording
+    recording = replace(
+        first,
+        stamp_ns=np.concatenate([first.stamp_ns, second.stamp_ns]),
+        offset=np.concatenate([first.offset, first.n_beams + second.offset[1:]]),
+        points=np.concatenate([first.points, second.points]),
+        hit=np.concatenate([first.hit, second.hit]),
+        T_base_sensor=np.concatenate([first.T_base_sensor, second.T_base_sensor]),
+        sensor=np.concatenate(
+            [first.sensor, np.int32(len(first.T_base_sensor)) + second.sensor], dtype=np.int32
+        ),
+    )
+    return Keyframes(
+        recording,
+        np.concatenate([one.scans, other.scans]),
+        np.concatenate([one.poses, other.poses]),
+        np.concatenate([one.e, other.e]),
+        np.concatenate([one.nodes, len(one) + other.nodes]),
+    )

@@ -1,0 +1,168 @@
+"""Constraints between two sessions in the plane: keyframes of one matched with submaps of the
+other, by the evidence that also verifies loops."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core import se2
+from stillmap.places.keyframes import Keyframes, join_keyframes
+from stillmap.slam import loop_candidates, loop_verification, scan_matching
+from stillmap.slam.local_map import travelled_distance
+from stillmap.slam.types import LoopCandidate, LoopClosure, LoopContext
+
+Float = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+# m between a keyframe, or its view, and the one of the other session that it is matched with
+REACH, _VIEW_REACH = 6.0, 10.0
+SESSION_GAP = 100.0  # m of travel put between two sessions, so that no submap reaches across
+_USUAL_EXPLAINED = 0.9  # share of a scan that its own session's map explains
+# explained share of the comparable beams from which on a keyframe fits, and below which it
+# contradicts; comparable is what the other session observed from the same side
+_FITS, _CONTRADICTS = 0.6, 0.4
+_RESOLUTION, _KEYFRAME_DISTANCE = 0.05, 1.0  # m, of submaps
+
+
+class Verdict(Enum):
+    """What a keyframe says about an alignment."""
+
+    FITS = "fits"
+    CONTRADICTS = "contradicts"
+    UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True, eq=False)
+class KeyframeMatch:
+    """A keyframe matched with a submap of another session.
+
+    Attributes:
+        node, other: indices into the nodes of the two sessions.
+        T: (D+1, D+1) pose of the keyframe in the frame of the other node.
+        covariance: see `LoopClosure`.
+        explained: share of its comparable beams that the submap explains.
+        comparable: share of its beams that the other session observed from the same side.
+        occluded: share of its beams that pass through surfaces of the other session.
+        verdict: see Verdict.
+    """
+
+    node: int
+    other: int
+    T: Float
+    covariance: Float
+    explained: float
+    comparable: float
+    occluded: float
+    verdict: Verdict
+
+
+def match_sessions(
+    reference: Keyframes,
+    T_place_reference: Float,
+    session: Keyframes,
+    T_place_session: Float,
+    std: tuple[float, float],
+    nodes: list[int],
+) -> list[KeyframeMatch]:
+    """Matches nodes of a session with the nearest submaps of a reference session.
+
+    Args:
+        reference: 2D keyframes of a session of the place.
+        T_place_reference: (K, 3, 3) their poses in the place.
+        session: 2D keyframes.
+        T_place_session: (L, 3, 3) their predicted poses in the place.
+        std: m and rad, of the prediction.
+        nodes: indices into the nodes of the session.
+    """
+    context = _make_context(reference, T_place_reference, session, T_place_session)
+    K = len(reference)
+    pairs = list(_pair_nodes(context, len(reference.nodes), nodes))
+    by_stretch: dict[int, list[tuple[int, int]]] = {}
+    for node, other in pairs:
+        at = context.travelled[reference.nodes[other]]
+        by_stretch.setdefault(round(at / loop_verification.SUBMAP_TRAVEL), []).append((node, other))
+    out = []
+    for stretch, members in sorted(by_stretch.items()):
+        submap = loop_verification.build_submap(context, stretch * loop_verification.SUBMAP_TRAVEL)
+        for node, other in members:
+            earlier, later = int(reference.nodes[other]), K + int(session.nodes[node])
+            T = se2.inverse(context.poses[earlier]) @ context.poses[later]
+            closure = loop_verification.verify_candidate(
+                context, submap, LoopCandidate(earlier, later, T, 0.0), *std, _FITS
+            )
+            occluded = scan_matching.occluded_share(
+                submap, context.hits(later), context.poses[earlier] @ closure.T
+            )
+            out.append(_judge(node, other, closure, occluded))
+    return sorted(out, key=lambda match: match.node)
+
+
+def _make_context(
+    reference: Keyframes, T_place_reference: Float, session: Keyframes, T_place_session: Float
+) -> LoopContext:
+    """Both sessions as one trajectory, the reference first."""
+    both = join_keyframes(reference, session)
+    poses = np.concatenate([T_place_reference, T_place_session])
+    travelled = travelled_distance(poses)
+    travelled[len(reference) :] += SESSION_GAP
+    return LoopContext(
+        both.recording,
+        both.e,
+        poses,
+        travelled,
+        np.full(len(poses), _USUAL_EXPLAINED),
+        both.nodes,
+        _RESOLUTION,
+        _KEYFRAME_DISTANCE,
+        REACH,
+        np.zeros((len(poses), 3, 3)),
+    )
+
+
+def _pair_nodes(
+    context: LoopContext, n_reference: int, nodes: list[int]
+) -> Iterator[tuple[int, int]]:
+    """Each node of the session with the nearest one of the reference, if near enough.
+
+    Where there is a choice, with one of about the same heading. Otherwise with the one whose view
+    is nearest: robots that pass on two sides of a hall see the same walls.
+    """
+    poses = context.poses[context.keyframes]
+    x = se2.parameters(poses)
+    centers = loop_candidates.view_centers(context)
+    in_place = np.einsum("kij,kj->ki", poses[:, :2, :2], centers) + poses[:, :2, 2]
+    for node in nodes:
+        k = n_reference + node
+        distance = np.linalg.norm(x[:n_reference, :2] - x[k, :2], axis=1)
+        turn = np.abs(se2.wrap(x[:n_reference, 2] - x[k, 2]))
+        view_distance = np.linalg.norm(in_place[:n_reference] - in_place[k], axis=1)
+        for cost, off, reach in (
+            (distance + turn, distance, REACH),
+            (view_distance, view_distance, _VIEW_REACH),
+        ):
+            other = int(np.argmin(cost))
+            if off[other] <= reach:
+                yield node, other
+                break
+
+
+def _judge(node: int, other: int, closure: LoopClosure, occluded: float) -> KeyframeMatch:
+    verdict = Verdict.UNKNOWN
+    if closure.comparable >= loop_verification.MIN_COMPARABLE:
+        if occluded > scan_matching.MAX_OCCLUDED or closure.explained < _CONTRADICTS:
+            verdict = Verdict.CONTRADICTS
+        elif not closure.rejected:
+            verdict = Verdict.FITS
+    return KeyframeMatch(
+        node,
+        other,
+        closure.T,
+        closure.covariance,
+        closure.explained,
+        closure.comparable,
+        occluded,
+        verdict,
+    )

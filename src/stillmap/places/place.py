@@ -1,0 +1,141 @@
+"""A place: sessions in one frame, the constraints between them, and what stands where when."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core import se2
+from stillmap.core.short_repr import ShortRepr
+from stillmap.places.evidence import Evidence, measure_evidence
+from stillmap.places.place_graph import Tie, fit_alignment, place_scans
+from stillmap.places.session import Session
+
+Float = NDArray[np.float64]
+
+# of a cell, by which keyframes may move before the evidence of their session is measured again
+_MAX_MOTION = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedSession(ShortRepr):
+    """A session with its poses in the place.
+
+    Attributes:
+        session: T scans, K keyframes, N nodes.
+        nodes: (N, D+1, D+1) T_place_base of the nodes of its pose graph.
+        covariance: of its alignment: x, y, heading at the session's origin; 0 of the first.
+        overlap: share of its hits in area that the sessions before it knew; 1 of the first.
+        evidence: in D dimensions; None: not measured yet.
+        planar_evidence: in the plane; in 2D the same.
+        measured_at: (K, D+1, D+1) poses of the keyframes at which evidence was measured.
+    """
+
+    session: Session
+    nodes: Float
+    covariance: Float = field(default_factory=lambda: np.zeros((3, 3)))
+    overlap: float = 1.0
+    evidence: Evidence | None = None
+    planar_evidence: Evidence | None = None
+    measured_at: Float | None = None
+
+    @property
+    def T(self) -> Float:
+        """(D+1, D+1) T_place_session, where the first scan is."""
+        out: Float = self.nodes[0] @ se2.inverse(self.session.node_poses[0])
+        return out
+
+    @property
+    def poses(self) -> Float:
+        """(T, D+1, D+1) T_place_base of all scans."""
+        T = fit_alignment(self.session.node_poses, self.nodes)
+        return place_scans(self.session, T, self.nodes)
+
+    @property
+    def keyframe_poses(self) -> Float:
+        """(K, D+1, D+1) T_place_base of the keyframes."""
+        return self.poses[self.session.keyframes.scans]
+
+    @property
+    def planar_poses(self) -> Float:
+        """(K, 3, 3) poses of the planar keyframes."""
+        return to_planar(self.session, self.keyframe_poses)
+
+    def require_evidence(self) -> tuple[Evidence, Evidence]:
+        """The evidence in D dimensions and in the plane.
+
+        Raises:
+            RuntimeError: it has not been measured.
+        """
+        if self.evidence is None or self.planar_evidence is None:
+            raise RuntimeError("evidence has not been measured")
+        return self.evidence, self.planar_evidence
+
+
+def to_planar(session: Session, keyframe_poses: Float) -> Float:
+    """(K, 3, 3) poses of the planar keyframes at poses (K, D+1, D+1) of the keyframes."""
+    if session.dimension == 2:
+        return keyframe_poses
+    return se2.project_to_plane(session.keyframes.recording.T_map_sensor(keyframe_poses))
+
+
+@dataclass(frozen=True, eq=False)
+class Refusal(ShortRepr):
+    """A session that is not in the place, and why."""
+
+    name: str
+    source: dict[str, object]
+    why: str
+
+
+@dataclass(frozen=True, eq=False)
+class Place(ShortRepr):
+    """Sessions in the frame of the first one.
+
+    Attributes:
+        sessions: in the order in which they were merged.
+        ties: constraints between them.
+        resolution: m, edge of a cell of the map; in 3D `voxel_size` is that of a voxel.
+        voxel_size: m, edge of a cell of the evidence in D dimensions.
+    """
+
+    sessions: list[PlacedSession]
+    ties: list[Tie]
+    resolution: float
+    voxel_size: float
+
+    @property
+    def dimension(self) -> int:
+        """2 or 3."""
+        return self.sessions[0].session.dimension
+
+    def in_time(self) -> list[int]:
+        """Indices of the sessions in the order of their first stamps; ties as they were merged."""
+        first = [int(one.session.stamp_ns[0]) for one in self.sessions]
+        return sorted(range(len(first)), key=lambda k: first[k])
+
+    def with_nodes(self, nodes: Sequence[Float]) -> "Place":
+        """The place with other poses of the nodes of every session."""
+        moved = [replace(one, nodes=of) for one, of in zip(self.sessions, nodes, strict=True)]
+        return replace(self, sessions=moved)
+
+
+def update_evidence(place: Place, threads: int) -> Place:
+    """The place with the evidence of sessions whose keyframes moved measured again."""
+    return replace(place, sessions=[_measure(one, place, threads) for one in place.sessions])
+
+
+def _measure(one: PlacedSession, place: Place, threads: int) -> PlacedSession:
+    poses = one.keyframe_poses
+    limit = _MAX_MOTION * min(place.resolution, place.voxel_size)
+    if one.measured_at is not None:
+        moved = np.linalg.norm((poses - one.measured_at)[:, :-1, -1], axis=1)
+        if moved.max() <= limit:
+            return one
+    session = one.session
+    planar = measure_evidence(session.planar, to_planar(session, poses), place.resolution, threads)
+    evidence = planar
+    if session.dimension == 3:
+        evidence = measure_evidence(session.keyframes, poses, place.voxel_size, threads)
+    return replace(one, evidence=evidence, planar_evidence=planar, measured_at=poses)

@@ -1,0 +1,136 @@
+"""The E-step over sessions: the cells of a place in which anything stood, and their states."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.short_repr import ShortRepr
+from stillmap.places import session_hmm
+from stillmap.places.beam_cells import cell_keys
+from stillmap.places.evidence import BLOCK, Evidence
+from stillmap.places.session_hmm import CellStates
+
+Float = NDArray[np.float64]
+Cells = NDArray[np.int64]
+
+_BLOCKS_PER_TILE = 8  # along each axis
+# cells: within so many of each other two surfaces are the same; around a cell that must be passed
+TOLERANCE, _FREE_RADIUS = {2: 2, 3: 1}, 1
+_MIN_HITS = 0.75  # expected static hits of a session that make a cell a candidate
+_CLEAR = 1.0  # nats from which on a session says something about a cell
+_MAX_FIT_ROWS = 50_000  # cells that the weights are fitted to
+
+
+class Tile(NamedTuple):
+    """A box of cells: its lowest cell (D,) and its shape."""
+
+    low: Cells
+    shape: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class PlaceStates(ShortRepr):
+    """Cells of a place in which something stood in some session.
+
+    Attributes:
+        cells: (K, D) int64, sorted by tile.
+        evidence: (K, S) float32, nats, see `session_hmm`; sessions in the order of time.
+        states: of each cell over the sessions.
+        resolution: m, edge of a cell.
+        weights: (3,) of static, free and changing cells.
+    """
+
+    cells: Cells
+    evidence: NDArray[np.float32]
+    states: CellStates
+    resolution: float
+    weights: Float
+
+    def look_up(self, points: Float, values: Float) -> Float:
+        """(n,) values (K,) of the cells that hold points (n, D); 0 where nothing ever stood."""
+        key, order = self._index()
+        wanted = cell_keys(np.floor(points / self.resolution).astype(np.int64))
+        at = np.minimum(np.searchsorted(key, wanted), max(len(key) - 1, 0))
+        if not len(key):
+            return np.zeros(len(points))
+        return np.where(key[at] == wanted, values[order[at]], 0.0)
+
+    def _index(self) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
+        key = cell_keys(self.cells)
+        order = np.argsort(key)
+        return key[order], order
+
+    def disagreement_of(self, index: int) -> float:
+        """Share of the cells observed by a session and by others that no other saw as it did."""
+        observed = np.abs(self.evidence) > _CLEAR
+        occupied = self.evidence > 0.0
+        others = np.delete(observed, index, axis=1)
+        agree = others & (np.delete(occupied, index, axis=1) == occupied[:, [index]])
+        both = observed[:, index] & others.any(axis=1)
+        return float((both & ~agree.any(axis=1)).sum() / max(int(both.sum()), 1))
+
+
+def measure_overlap(sessions: Sequence[Evidence], index: int) -> float:
+    """Share of the hits of a session in cells that another one observed."""
+    known = total = 0.0
+    for tile in iter_tiles([sessions[index]]):
+        hits, _ = sessions[index].crop(*tile)
+        total += float(hits.sum())
+        seen = np.zeros(tile.shape, np.bool_)
+        for k, other in enumerate(sessions):
+            if k != index:
+                seen |= sum(other.crop(*tile)) > 0.0
+        known += float(hits[seen].sum())
+    return known / max(total, 1e-9)
+
+
+def estimate_place(sessions: Sequence[Evidence]) -> PlaceStates:
+    """The states of all cells over the sessions.
+
+    Args:
+        sessions: evidence of each in the frame of the place, in the order of time.
+    """
+    D = sessions[0].dimension
+    cells, evidence = [np.zeros((0, D), np.int64)], [np.zeros((0, len(sessions)), np.float32)]
+    for tile in iter_tiles(sessions):
+        of_tile, nats = _observe_tile(sessions, tile)
+        cells.append(of_tile)
+        evidence.append(nats)
+    table = np.concatenate(evidence)
+    step = max(-(-len(table) // _MAX_FIT_ROWS), 1)
+    weights = session_hmm.fit_weights(table[::step].astype(np.float64))
+    states = session_hmm.estimate_states(table.astype(np.float64), weights)
+    return PlaceStates(np.concatenate(cells), table, states, sessions[0].resolution, weights)
+
+
+def iter_tiles(sessions: Sequence[Evidence]) -> Iterator[Tile]:
+    """The tiles in which sessions observed anything, in order."""
+    D = sessions[0].dimension
+    size = BLOCK[D] * _BLOCKS_PER_TILE
+    lows = np.concatenate([one.corner // size * size for one in sessions])
+    for low in np.unique(lows, axis=0).astype(np.int64):
+        yield Tile(low, (size,) * D)
+
+
+def _observe_tile(sessions: Sequence[Evidence], tile: Tile) -> tuple[Cells, NDArray[np.float32]]:
+    """Candidate cells (k, D) of a tile, and the evidence (k, S) of every session."""
+    from scipy import ndimage  # slow to load
+
+    D = len(tile.shape)
+    halo = TOLERANCE[D]
+    low, shape = tile.low - halo, tuple(n + 2 * halo for n in tile.shape)
+    inner = (slice(halo, -halo),) * D
+    sums = [one.crop(low, shape) for one in sessions]
+    is_candidate = np.zeros(tile.shape, np.bool_)
+    for hits, _ in sums:
+        is_candidate |= hits[inner] >= _MIN_HITS
+    at = np.nonzero(is_candidate)
+    nats = np.empty((len(at[0]), len(sessions)), np.float32)
+    for s, (hits, passes) in enumerate(sums):
+        near = ndimage.maximum_filter(hits, 2 * TOLERANCE[D] + 1, mode="constant")
+        around = ndimage.minimum_filter(passes, 2 * _FREE_RADIUS + 1, mode="constant")
+        nats[:, s] = session_hmm.weigh_evidence(near[inner][at], around[inner][at])
+    return np.stack(at, axis=1) + tile.low, nats

@@ -1,0 +1,193 @@
+"""Placement of a session in a place: accepted where the evidence is clear, else refused."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core import se2, se3
+from stillmap.core.short_repr import ShortRepr
+from stillmap.places.alignment import Hypothesis, propose_alignments, spread_evenly
+from stillmap.places.evidence import measure_evidence
+from stillmap.places.keyframes import Keyframes
+from stillmap.places.matching import REACH, KeyframeMatch, Verdict, match_sessions
+from stillmap.places.place import PlacedSession
+from stillmap.places.place_graph import Tie
+from stillmap.places.session import Session
+from stillmap.places.surface_map import make_surface_map
+
+Float = NDArray[np.float64]
+
+_MAX_REFERENCES = 3  # sessions of the place that a new one is matched with
+_MAX_TESTED = 60  # nodes that test a hypothesis, per reference
+# std (m, rad) of poses by a hypothesis, before the pose graph; after it
+PREDICTION_STD, CORRECTED_STD = (0.25, 0.04), (0.1, 0.015)
+# squares (0.1 m) of surface that must agree
+_MIN_AGREEING = 200
+# share of the squares seen by both that may differ where no other alignment fits at all, and score
+# of another one, relative to the best, at which none may: things move between sessions, but
+# look-alike places fit in several ways (docs/sessions.md has the distributions)
+_MAX_CONFLICT, _MAX_RIVAL = 0.15, 0.6
+_MIN_FITTING = 5  # nodes
+# std along the least known direction (m), and of the heading (rad), up to which a session is placed
+_MAX_STD, _MAX_HEADING_STD = 0.05, math.radians(0.5)
+_INDEPENDENT = 0.3  # share of a match that is evidence of its own: neighbours share their errors
+
+
+@dataclass(frozen=True, eq=False)
+class Placement(ShortRepr):
+    """Where a session lies in a place, or why that is not known.
+
+    Attributes:
+        T: (3, 3) T_place_session in the plane.
+        matches: of each reference, by its index in the place.
+        refused: the reason; empty if accepted.
+    """
+
+    T: Float
+    matches: dict[int, list[KeyframeMatch]] = field(default_factory=dict)
+    refused: str = ""
+
+    def count(self, verdict: Verdict) -> int:
+        """Number of matches with a verdict."""
+        return sum(match.verdict is verdict for of in self.matches.values() for match in of)
+
+
+def find_placement(place: Sequence[PlacedSession], session: Session) -> Placement:
+    """Where a session lies in a place.
+
+    Args:
+        place: its sessions, at least one, with evidence.
+        session: a further one, with the evidence of its planar keyframes in its own frame.
+    """
+    known = make_surface_map([one.require_evidence()[1] for one in place])
+    own = make_surface_map(
+        [measure_evidence(session.planar, session.planar.poses, known.edge / 2, 1)]
+    )
+    proposed = propose_alignments(known, own, session.planar)
+    if refused := _doubt(proposed):
+        return Placement(np.eye(3), refused=refused)
+    best = test_alignment(place, session, proposed[0].T)
+    return replace(best, refused=_uncertainty(best, session))
+
+
+def _doubt(proposed: list[Hypothesis]) -> str:
+    """Why the best alignment is not certain by the comparison of the maps; empty if it is."""
+    if not proposed or proposed[0].comparison.agree < _MIN_AGREEING:
+        return "no part of it looks like the place"
+    best, others = proposed[0].comparison, proposed[1:]
+    share = best.conflict / (best.agree + best.conflict)
+    if share > _MAX_CONFLICT:
+        return f"it contradicts the place: {100 * share:.0f} % of the surfaces that both saw differ"
+    rival = max((other.comparison.score for other in others), default=0.0) / best.score
+    if share > _MAX_CONFLICT * (1.0 - rival / _MAX_RIVAL):
+        return (
+            f"it may lie in another place: {100 * share:.0f} % of the surfaces that both saw "
+            f"differ, and another alignment has {100 * rival:.0f} % of the evidence for the best"
+        )
+    return ""
+
+
+def test_alignment(place: Sequence[PlacedSession], session: Session, T: Float) -> Placement:
+    """The matches of a session's nodes with its references, at an alignment T (3, 3)."""
+    planar = session.planar
+    poses = T @ planar.poses
+    matches = {}
+    for index in select_references(place, planar, poses):
+        other = place[index]
+        nodes = spread_evenly(len(planar.nodes), _MAX_TESTED)
+        matches[index] = match_sessions(
+            other.session.planar, other.planar_poses, planar, poses, PREDICTION_STD, nodes
+        )
+    return Placement(T, matches)
+
+
+def select_references(place: Sequence[PlacedSession], planar: Keyframes, poses: Float) -> list[int]:
+    """The sessions of a place that together were near most nodes at poses (K, 3, 3).
+
+    Of equally good ones the latest, which has changed least since.
+    """
+    xy = poses[planar.nodes, :2, 2]
+    near = []
+    for other in place:
+        theirs = other.planar_poses[other.session.planar.nodes, :2, 2]
+        distance = np.linalg.norm(xy[:, None] - theirs[None], axis=2).min(axis=1)
+        near.append(distance <= 0.5 * REACH)
+    chosen, missing = list[int](), np.ones(len(xy), np.bool_)
+    while len(chosen) < min(_MAX_REFERENCES, len(place)):
+        gains = [
+            int((mask & missing).sum()) if k not in chosen else -1 for k, mask in enumerate(near)
+        ]
+        best = max(range(len(place)), key=lambda k: (gains[k], k))
+        if gains[best] <= 0 and chosen:
+            break
+        chosen.append(best)
+        missing &= ~near[best]
+    return chosen
+
+
+def _uncertainty(best: Placement, session: Session) -> str:
+    """Why the matches do not determine where a session lies; empty if they do."""
+    fitting, against = best.count(Verdict.FITS), best.count(Verdict.CONTRADICTS)
+    if fitting < _MIN_FITTING:
+        return f"too little of it fits the place: {fitting} keyframes"
+    if against > fitting:
+        return f"it contradicts the place: {against} keyframes, against {fitting} that fit"
+    std, heading = placement_std(best, session)
+    if std > _MAX_STD or heading > _MAX_HEADING_STD:
+        return (
+            f"the overlap does not determine where it lies: standard deviation {std:.2f} m, "
+            f"{math.degrees(heading):.1f} degrees"
+        )
+    return ""
+
+
+def placement_std(placement: Placement, session: Session) -> tuple[float, float]:
+    """Standard deviations of the position (m) along the least known direction, and heading (rad).
+
+    Of the session as a whole, at the middle of the keyframes that fit.
+    """
+    fits = [m for of in placement.matches.values() for m in of if m.verdict is Verdict.FITS]
+    poses = session.planar.poses[session.planar.nodes[[m.node for m in fits]]]
+    origin = _translation(poses[:, :2, 2].mean(axis=0))
+    covariance = _combine(se2.inverse(origin) @ poses, [match.covariance for match in fits])
+    return (
+        float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[1])),
+        float(np.sqrt(covariance[2, 2])),
+    )
+
+
+def estimate_covariance(placed: PlacedSession, ties: Sequence[Tie]) -> Float:
+    """Covariance of the alignment of a session, at its first scan and in its frame.
+
+    (3, 3) of x, y, heading; (6, 6) of translation and rotation vector in 3D.
+    """
+    poses = se2.inverse(placed.session.node_poses[0]) @ placed.session.node_poses
+    return _combine(poses[[tie.second_node for tie in ties]], [tie.covariance for tie in ties])
+
+
+def _combine(poses: Float, covariances: Sequence[Float]) -> Float:
+    """Covariance of the frame of poses (N, D+1, D+1), each measured with a covariance."""
+    D = poses.shape[-1] - 1
+    information: Float = 1e-9 * np.eye(3 * (D - 1))
+    for pose, covariance in zip(poses, covariances, strict=True):
+        J = _alignment_jacobian(pose)
+        information = information + _INDEPENDENT * J.T @ np.linalg.solve(covariance, J)
+    out: Float = np.linalg.inv(information).astype(np.float64)
+    return out
+
+
+def _alignment_jacobian(pose: Float) -> Float:
+    """Of the error of a pose, in its own frame, by that of the frame it is given in."""
+    if pose.shape[-1] == 4:
+        return se3.adjoint(se2.inverse(pose))
+    R, (x, y) = pose[:2, :2].T, pose[:2, 2]
+    J = np.eye(3)
+    J[:2, :2], J[:2, 2] = R, R @ [-y, x]
+    return J
+
+
+def _translation(xy: Float) -> Float:
+    return se2.matrix(float(xy[0]), float(xy[1]), 0.0)

@@ -1,0 +1,154 @@
+"""The chain over sessions: whether something static stands in a cell, session by session.
+
+A cell is of one of three classes: static (occupied in every session), free (in none), or changing,
+a two-state Markov chain over the sessions. Evidence of a session is the log likelihood ratio of
+occupied to free; sessions that did not observe the cell say nothing. Forward-backward and Viterbi
+as in Thrun, Burgard, Fox, Probabilistic Robotics, and Meyer-Delius et al. 2012, with a session as
+the time step.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.short_repr import ShortRepr
+
+Float = NDArray[np.float64]
+
+# nats: of a static hit within the tolerance, of a pass through all cells around; of one session at
+# most, since its beams share the session's errors
+_NATS_PER_HIT, _NATS_PER_PASS, MAX_NATS = 1.5, 1.0, 7.0
+_SWITCH = 0.25  # probability that a changing cell is otherwise in the next session
+_WEIGHTS = (0.8, 0.1, 0.1)  # prior of static, free, changing
+_MIN_WEIGHT, _ROUNDS = 0.01, 20  # of a class while the weights are fitted; rounds of EM
+
+
+@dataclass(frozen=True, eq=False)
+class CellStates(ShortRepr):
+    """States of K cells over S sessions.
+
+    Attributes:
+        p_static: (K,) P(occupied in every session).
+        p_changing: (K,) P(otherwise in some session).
+        p_occupied: (K, S) P(occupied in a session), of all classes together.
+        path: (K, S) bool, occupied by the most probable path of a changing cell.
+        observed: (K, S) bool, sessions that observed the cell.
+    """
+
+    p_static: Float
+    p_changing: Float
+    p_occupied: Float
+    path: NDArray[np.bool_]
+    observed: NDArray[np.bool_]
+
+
+def weigh_evidence(hits: NDArray[np.float32], passes: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Log likelihood ratio (nats) of occupied to free.
+
+    Args:
+        hits: of any shape, largest number of static hits within the tolerance.
+        passes: of the same shape, smallest number of passes through the cells around.
+    """
+    occupied = np.minimum(_NATS_PER_HIT * hits, MAX_NATS)
+    # where something stands beams still graze the cells beside it
+    free = np.minimum(_NATS_PER_PASS * passes, MAX_NATS) * np.maximum(1.0 - hits, 0.0)
+    return np.asarray(occupied - free)
+
+
+def fit_weights(evidence: Float, rare: tuple[float, float, float] = _WEIGHTS) -> Float:
+    """(3,) weights of static, free and changing cells, by EM over cells (K, S)."""
+    weights = np.array(rare)
+    if not len(evidence):
+        return weights
+    likelihood = np.exp(_log_likelihoods(evidence))
+    for _ in range(_ROUNDS):
+        joint = likelihood * weights
+        weights = (joint / joint.sum(axis=1, keepdims=True)).mean(axis=0)
+        weights = np.maximum(weights, _MIN_WEIGHT)
+        weights /= weights.sum()
+    return weights
+
+
+def estimate_states(evidence: Float, weights: Float) -> CellStates:
+    """States of cells over sessions.
+
+    Args:
+        evidence: (K, S) nats, sessions in the order of time; 0: not observed.
+        weights: (3,) of static, free and changing.
+    """
+    joint = np.exp(_log_likelihoods(evidence)) * weights
+    posterior = joint / joint.sum(axis=1, keepdims=True)
+    in_chain = _smooth(evidence)
+    p_occupied = posterior[:, :1] + posterior[:, 2:] * in_chain
+    return CellStates(
+        posterior[:, 0], posterior[:, 2], p_occupied, _decode(evidence), evidence != 0.0
+    )
+
+
+def _log_likelihoods(evidence: Float) -> Float:
+    """(K, 3) log likelihood of each class, relative to the largest."""
+    log = np.stack(
+        [evidence.sum(axis=1), np.zeros(len(evidence)), _chain_log_likelihood(evidence)], axis=1
+    )
+    out: Float = log - log.max(axis=1, keepdims=True)
+    return out
+
+
+def _chain_log_likelihood(evidence: Float) -> Float:
+    """(K,) log likelihood of the changing class, by the forward filter.
+
+    Relative to all sessions being free, as that of the other classes.
+    """
+    return _forward(evidence)[1]
+
+
+def _forward(evidence: Float) -> tuple[Float, Float]:
+    """(K, S) filtered P(occupied) of the chain, and its log likelihood (K,)."""
+    K, S = evidence.shape
+    p, log = np.empty((K, S)), np.zeros(K)
+    prior = np.full(K, 0.5)
+    ratio = np.exp(evidence)
+    for s in range(S):
+        total = prior * ratio[:, s] + 1.0 - prior
+        p[:, s] = prior * ratio[:, s] / total
+        log += np.log(total)
+        prior = p[:, s] * (1.0 - _SWITCH) + (1.0 - p[:, s]) * _SWITCH
+    return p, log
+
+
+def _smooth(evidence: Float) -> Float:
+    """(K, S) P(occupied) of the chain given all sessions (forward-backward)."""
+    p, _ = _forward(evidence)
+    out = p.copy()
+    ratio = np.exp(evidence)
+    occupied, free = np.ones(len(evidence)), np.ones(len(evidence))  # backward messages
+    for s in range(evidence.shape[1] - 1, 0, -1):
+        by_occupied, by_free = occupied * ratio[:, s], free
+        occupied = (1.0 - _SWITCH) * by_occupied + _SWITCH * by_free
+        free = _SWITCH * by_occupied + (1.0 - _SWITCH) * by_free
+        scale = occupied + free
+        occupied, free = occupied / scale, free / scale
+        joint = p[:, s - 1] * occupied
+        out[:, s - 1] = joint / (joint + (1.0 - p[:, s - 1]) * free)
+    return out
+
+
+def _decode(evidence: Float) -> NDArray[np.bool_]:
+    """(K, S) most probable path of the chain (Viterbi); True: occupied."""
+    K, S = evidence.shape
+    stay, switch = np.log(1.0 - _SWITCH), np.log(_SWITCH)
+    occupied, free = evidence[:, 0].copy(), np.zeros(K)
+    from_occupied, from_free = np.zeros((2, K, S), np.bool_)
+    for s in range(1, S):
+        keeps, leaves = occupied + stay, occupied + switch
+        comes, stays_free = free + switch, free + stay
+        from_occupied[:, s] = keeps >= comes  # to occupied
+        from_free[:, s] = leaves > stays_free  # to free, coming from occupied
+        occupied = np.maximum(keeps, comes) + evidence[:, s]
+        free = np.maximum(leaves, stays_free)
+    path = np.zeros((K, S), np.bool_)
+    path[:, -1] = occupied > free
+    for s in range(S - 1, 0, -1):
+        path[:, s - 1] = np.where(path[:, s], from_occupied[:, s], from_free[:, s])
+    return path

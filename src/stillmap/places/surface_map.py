@@ -1,0 +1,117 @@
+"""Comparison of two maps under an alignment: surfaces that both show, and that one contradicts."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core import se2
+from stillmap.core.short_repr import ShortRepr
+from stillmap.places.evidence import Evidence
+from stillmap.places.place_states import iter_tiles
+
+Float = NDArray[np.float64]
+
+_STEP = 2  # cells of the evidence along the edge of a square
+_MIN_HITS, _MIN_PASSES = 0.75, 2.0  # of a surface; of a cell known to be free
+
+
+_CONFLICT_WEIGHT = 5.0
+
+
+class Comparison(NamedTuple):
+    """Squares of surface of two maps where they overlap.
+
+    Attributes:
+        agree: that are surface in both.
+        conflict: of one map where the other one observed free space.
+    """
+
+    agree: int
+    conflict: int
+
+    @property
+    def score(self) -> float:
+        """Squares in favour; one in conflict outweighs several: most places agree in part."""
+        return self.agree - _CONFLICT_WEIGHT * self.conflict
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceMap(ShortRepr):
+    """Surfaces and free space on squares.
+
+    Attributes:
+        surface: (N, 2) float32, centres of the squares with surface, metres.
+        low: (2,) int64, lowest square.
+        near: (X, Y) bool, squares with surface and their neighbours.
+        free: (X, Y) bool, squares known to be free, as all around them are.
+        edge: m, of a square.
+    """
+
+    surface: NDArray[np.float32]
+    low: NDArray[np.int64]
+    near: NDArray[np.bool_]
+    free: NDArray[np.bool_]
+    edge: float
+
+    def look_up(self, points: Float) -> Comparison:
+        """How many of points (n, 2) in metres lie near surface, and in free space."""
+        at = np.floor(points / self.edge).astype(np.int64) - self.low
+        inside = ((at >= 0) & (at < self.near.shape)).all(axis=1)
+        x, y = at[inside].T
+        return Comparison(int(self.near[x, y].sum()), int(self.free[x, y].sum()))
+
+
+def make_surface_map(sessions: Sequence[Evidence]) -> SurfaceMap:
+    """The surfaces of some sessions, in the frame of their evidence.
+
+    Free is what none of them saw occupied: where sessions differ, neither is known.
+    """
+    from scipy import ndimage  # slow to load
+
+    corners = np.concatenate([one.corner for one in sessions]).astype(np.int64)
+    edge = sessions[0].edge
+    low = corners.min(axis=0) // edge * edge
+    shape = tuple((corners.max(axis=0) + edge - low).tolist())
+    hits, passes = np.zeros((2, *(n // _STEP for n in shape)), np.float32)
+    for tile in iter_tiles(sessions):
+        first = np.maximum(tile.low, low)
+        high = np.minimum(tile.low + tile.shape, low + shape)
+        part = tuple((high - first).tolist())
+        where = tuple(
+            slice(int(f) // _STEP, int(f + n) // _STEP)
+            for f, n in zip(first - low, part, strict=True)
+        )
+        for one in sessions:
+            of_hits, of_passes = one.crop(first, part)
+            hits[where] = np.maximum(hits[where], _pool(of_hits, np.max))
+            passes[where] = np.maximum(passes[where], _pool(of_passes, np.min))
+    surface = hits >= _MIN_HITS
+    near = ndimage.binary_dilation(surface, np.ones((3, 3), np.bool_))
+    free = ndimage.binary_erosion(passes >= _MIN_PASSES, np.ones((3, 3), np.bool_)) & ~near
+    square = _STEP * sessions[0].resolution
+    squares = low // _STEP
+    points = (np.argwhere(surface) + squares + 0.5) * square
+    return SurfaceMap(points.astype(np.float32), squares, near, free, square)
+
+
+def _pool(cells: NDArray[np.float32], reduce: "np.ufunc | object") -> NDArray[np.float32]:
+    """Reduces squares of cells (X, Y) to one number each."""
+    X, Y = cells.shape
+    blocks = cells.reshape(X // _STEP, _STEP, Y // _STEP, _STEP)
+    out: NDArray[np.float32] = reduce(blocks, axis=(1, 3))  # type: ignore[operator]
+    return out
+
+
+def compare_maps(place: SurfaceMap, session: SurfaceMap, T_place_session: Float) -> Comparison:
+    """Squares of both maps that agree, and that are in conflict, under an alignment (3, 3)."""
+    forth = place.look_up(_transform(T_place_session, session.surface))
+    back = session.look_up(_transform(se2.inverse(T_place_session), place.surface))
+    return Comparison(forth.agree + back.agree, forth.conflict + back.conflict)
+
+
+def _transform(T: Float, points: NDArray[np.float32]) -> Float:
+    out: Float = points @ T[:2, :2].T + T[:2, 2]
+    return out
