@@ -19,7 +19,7 @@ Cells = NDArray[np.int64]
 _BLOCKS_PER_TILE = 8  # along each axis
 # cells: within so many of each other two surfaces are the same; around a cell that must be passed
 TOLERANCE, _FREE_RADIUS = {2: 2, 3: 1}, 1
-_MIN_HITS = 0.75  # expected static hits of a session that make a cell a candidate
+MIN_HITS = 0.75  # expected static hits of a session that make a cell a candidate
 _CLEAR = 1.0  # nats from which on a session says something about a cell
 _MAX_FIT_ROWS = 50_000  # cells that the weights are fitted to
 
@@ -126,7 +126,7 @@ def _observe_tile(sessions: Sequence[Evidence], tile: Tile) -> tuple[Cells, NDAr
     sums = [one.crop(low, shape) for one in sessions]
     is_candidate = np.zeros(tile.shape, np.bool_)
     for hits, _ in sums:
-        is_candidate |= hits[inner] >= _MIN_HITS
+        is_candidate |= hits[inner] >= MIN_HITS
     at = np.nonzero(is_candidate)
     nats = np.empty((len(at[0]), len(sessions)), np.float32)
     for s, (hits, passes) in enumerate(sums):

@@ -1,0 +1,231 @@
+"""Changes between sessions: cells that are otherwise from a session on, grouped to objects."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.components import connected_components, neighbor_pairs
+from stillmap.core.short_repr import ShortRepr
+from stillmap.mapping.doors import compute_swept_cells
+from stillmap.places.place_states import PlaceStates
+
+Float = NDArray[np.float64]
+Cells = NDArray[np.int64]
+Index = NDArray[np.intp]
+Kind = Literal["appeared", "gone", "moved", "door"]
+
+_MIN_PROBABILITY = 0.5  # that a cell changed
+_LINK_DISTANCE = 0.3  # m within which changed cells form one object
+_MIN_CELLS = {2: 5, 3: 8}  # of a listed change
+_NOISE = 2.5  # cells: surfaces of the same class nearer to a static one are noise of poses
+# of an object that moved: greatest distance in m, ratio of its sides and of its cells before and
+# after, m by which a side may be seen shorter
+_MAX_MOTION, _MAX_RATIO, _SIDE_SLACK = 10.0, 1.6, 0.3
+_DOOR_DISTANCE = 0.5  # m between the leaf of a door in its two positions
+
+
+@dataclass(frozen=True, eq=False)
+class PlaceChange(ShortRepr):
+    """Something that is otherwise from one session to the next that looked.
+
+    Attributes:
+        kind: it appeared, is gone, moved, or is a door in another position.
+        low, high: (D,) m, corners of its box: where it is now, or was.
+        from_low, from_high: (D,) of where it was before it moved; None otherwise.
+        before, after: indices of the sessions, in the order of time.
+        probability: that it changed.
+        cells: (K,) indices of its cells in `PlaceStates`, of both positions.
+    """
+
+    kind: Kind
+    low: Float
+    high: Float
+    before: int
+    after: int
+    probability: float
+    cells: Index
+    from_low: Float | None = None
+    from_high: Float | None = None
+
+
+class _Events(NamedTuple):
+    """N changes of single cells: the cell, came or left, last session before and first after."""
+
+    cell: Index
+    came: NDArray[np.bool_]
+    before: Index
+    after: Index
+
+    def select(self, chosen: Index) -> "_Events":
+        return _Events._make(column[chosen] for column in self)
+
+
+def detect_place_changes(place: PlaceStates) -> list[PlaceChange]:
+    """The changes between sessions, in the order of time."""
+    D = place.cells.shape[1]
+    events = _find_events(place)
+    near = _near_static(place, place.cells[events.cell])
+    events = events.select(np.flatnonzero(~near))
+    out = list[PlaceChange]()
+    for group in _group_events(events, place):
+        for part in _split_by_time(group, _MIN_CELLS[D]):
+            out.append(_make_change(part, place))
+    out = _pair_positions(out, place)
+    return sorted(out, key=lambda one: (one.after, one.before, *one.low.tolist()))
+
+
+def _find_events(place: PlaceStates) -> _Events:
+    """The changes of all cells that are more probably changing than not."""
+    states = place.states
+    changed = np.flatnonzero(states.p_changing > _MIN_PROBABILITY)
+    path, observed = states.path[changed], states.observed[changed]
+    S = path.shape[1]
+    columns: list[tuple[Index, NDArray[np.bool_], Index, Index]] = []
+    last = np.full(len(changed), -1)  # the last session that observed each cell
+    for s in range(S):
+        at = np.maximum(last, 0)
+        differs = observed[:, s] & (last >= 0) & (path[np.arange(len(path)), at] != path[:, s])
+        k = np.flatnonzero(differs)
+        columns.append((changed[k], path[k, s], last[k], np.full(len(k), s)))
+        last = np.where(observed[:, s], s, last)
+    cell, came, before, after = (np.concatenate(column) for column in zip(*columns, strict=True))
+    return _Events(cell.astype(np.intp), came.astype(np.bool_), before, after)
+
+
+def _near_static(place: PlaceStates, cells: Cells) -> NDArray[np.bool_]:
+    """(n,) whether cells (n, D) lie so near to static surface that noise explains them."""
+    static = place.cells[place.states.p_static > _MIN_PROBABILITY]
+    if not len(static) or not len(cells):
+        return np.zeros(len(cells), np.bool_)
+    from scipy.spatial import cKDTree  # slow to load
+
+    distance, _ = cKDTree(static).query(cells, distance_upper_bound=_NOISE + 1.0)
+    return np.asarray(distance <= _NOISE)
+
+
+def _group_events(events: _Events, place: PlaceStates) -> list[_Events]:
+    """Connected events of one kind whose time spans overlap."""
+    pairs = neighbor_pairs(place.cells[events.cell], _LINK_DISTANCE / place.resolution)
+    i, j = pairs.T
+    begin = np.maximum(events.before[i], events.before[j])
+    end = np.minimum(events.after[i], events.after[j])
+    fits = (events.came[i] == events.came[j]) & (begin < end)
+    return [events.select(one) for one in connected_components(pairs[fits], len(events.cell))]
+
+
+def _split_by_time(events: _Events, min_cells: int) -> list[_Events]:
+    """Groups of events that share a span of time: each the span that fits most cells left."""
+    out = []
+    while len(events.cell) >= min_cells:
+        spans = [
+            np.flatnonzero((events.before <= s) & (events.after > s))
+            for s in range(int(events.before.min()), int(events.after.max()))
+        ]
+        best = max(spans, key=len)
+        if len(best) >= min_cells:
+            out.append(events.select(best))
+        events = events.select(np.setdiff1d(np.arange(len(events.cell)), best))
+    return out
+
+
+def _make_change(events: _Events, place: PlaceStates) -> PlaceChange:
+    cells = np.unique(events.cell)
+    low, high = _box(place, cells)
+    return PlaceChange(
+        "appeared" if events.came[0] else "gone",
+        low,
+        high,
+        int(events.before.max()),
+        int(events.after.min()),
+        float(place.states.p_changing[cells].mean()),
+        cells,
+    )
+
+
+def _box(place: PlaceStates, cells: Index) -> tuple[Float, Float]:
+    """Corners (D,) of the box around cells, metres."""
+    of = place.cells[cells]
+    return of.min(axis=0) * place.resolution, (of.max(axis=0) + 1.0) * place.resolution
+
+
+def _pair_positions(changes: list[PlaceChange], place: PlaceStates) -> list[PlaceChange]:
+    """Objects that are gone in one place and appeared in another at the same time are one."""
+    gone = [one for one in changes if one.kind == "gone"]
+    came = [one for one in changes if one.kind == "appeared"]
+    pairs = []
+    for i, one in enumerate(gone):
+        for j, other in enumerate(came):
+            if (one.before, one.after) == (other.before, other.after):
+                kind, cost = _compare_positions(one, other, place)
+                if kind:
+                    pairs.append((cost, i, j, kind))
+    used_gone, used_came, out = set[int](), set[int](), list[PlaceChange]()
+    for _, i, j, kind in sorted(pairs):
+        if i not in used_gone and j not in used_came:
+            used_gone.add(i)
+            used_came.add(j)
+            out.append(_join(gone[i], came[j], kind, place))
+    out += [one for i, one in enumerate(gone) if i not in used_gone]
+    return out + [one for j, one in enumerate(came) if j not in used_came]
+
+
+def _compare_positions(
+    gone: PlaceChange, came: PlaceChange, place: PlaceStates
+) -> tuple[Kind | None, float]:
+    """What two positions are: a door, one object that moved, or nothing; the less cost the surer."""
+    gap = np.maximum(np.maximum(gone.low - came.high, came.low - gone.high), 0.0)
+    union = np.union1d(gone.cells, came.cells)
+    if np.linalg.norm(gap) <= _DOOR_DISTANCE:
+        cells = np.unique(place.cells[union][:, :2], axis=0)
+        if len(compute_swept_cells(cells, place.resolution)) > len(cells):
+            return "door", -1.0
+    distance = float(np.linalg.norm(0.5 * (gone.low + gone.high - came.low - came.high)))
+    sides = np.sort(gone.high - gone.low), np.sort(came.high - came.low)
+    shorter, longer = np.minimum(*sides), np.maximum(*sides)
+    count = sorted((len(gone.cells), len(came.cells)))
+    alike = bool((longer <= _MAX_RATIO * shorter + _SIDE_SLACK).all())
+    if alike and count[1] <= 2.0 * _MAX_RATIO * count[0] and distance <= _MAX_MOTION:
+        return "moved", distance + float(np.linalg.norm(longer - shorter))
+    return None, 0.0
+
+
+def _join(gone: PlaceChange, came: PlaceChange, kind: Kind, place: PlaceStates) -> PlaceChange:
+    cells = np.union1d(gone.cells, came.cells)
+    joined = replace(
+        came, kind=kind, cells=cells, probability=min(gone.probability, came.probability)
+    )
+    if kind == "door":
+        low, high = _box(place, cells)
+        return replace(joined, low=low, high=high)
+    return replace(joined, from_low=gone.low, from_high=gone.high)
+
+
+def change_records(changes: Sequence[PlaceChange], names: Sequence[str]) -> list[dict[str, object]]:
+    """The entries of `changes.json`.
+
+    Args:
+        changes: in the order of time.
+        names: of the sessions, in the order of time.
+    """
+    out = []
+    for number, one in enumerate(changes):
+        record: dict[str, object] = {
+            "id": number,
+            "kind": one.kind,
+            "box": _corners(one.low, one.high),
+        }
+        if one.from_low is not None and one.from_high is not None:
+            record["from_box"] = _corners(one.from_low, one.from_high)
+        record["between"] = [names[one.before], names[one.after]]
+        record["probability"] = round(one.probability, 4)
+        out.append(record)
+    return out
+
+
+def _corners(low: Float, high: Float) -> list[float]:
+    """x0, y0, x1, y1, and in 3D z0, z1."""
+    plane = [*low[:2], *high[:2]]
+    return [round(float(x), 3) for x in (*plane, *(v for z in (low[2:], high[2:]) for v in z))]

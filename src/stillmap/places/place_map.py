@@ -1,0 +1,95 @@
+"""The map of a place in the plane: what stands in the shown state, and what beams passed."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.tiles import TILE, Layer, TiledArray, compact, crop
+from stillmap.em import OccupancyMap
+from stillmap.places.evidence import Evidence
+from stillmap.places.place_states import MIN_HITS, Tile, iter_tiles
+from stillmap.places.shown_state import ShownState
+
+Float = NDArray[np.float64]
+Image = NDArray[np.float32]
+
+_FREE_PRIOR = 0.2  # occupancy of a cell that no beam passed; as of single recordings
+_MIN_PROMINENCE = 0.25  # share of the most-hit neighbour's hits below which a surface is its noise
+
+
+def make_place_map(sessions: Sequence[Evidence], shown: ShownState) -> OccupancyMap:
+    """The map of a place, in the plane.
+
+    Args:
+        sessions: evidence of each in the plane.
+        shown: the state that the map shows, of planar cells.
+    """
+    corners = np.concatenate([one.corner for one in sessions]).astype(np.int64)
+    low = corners.min(axis=0) // TILE * TILE
+    width, height = ((corners.max(axis=0) - low) // TILE * TILE + TILE).tolist()
+    layers = [TiledArray((height, width), np.float32, fill) for fill in (np.nan, 0.0, 0.0)]
+    order, starts = _split_by_tile(shown)
+    for tile in iter_tiles(sessions):
+        cells = order[starts.get(tuple((tile.low // TILE).tolist()), slice(0, 0))]
+        j, i = ((tile.low - low) // TILE).tolist()
+        for layer, part in zip(layers, _draw_tile(sessions, tile, shown, cells), strict=True):
+            layer.set_tile(i, j, part.T)
+    first = corners.min(axis=0) - low
+    last = corners.max(axis=0) + sessions[0].edge - low
+    block = slice(int(first[1]), int(last[1])), slice(int(first[0]), int(last[0]))
+    resolution = sessions[0].resolution
+    x, y = ((low + first) * resolution).tolist()
+    p_occupied, alpha, beta = (_crop(layer, block) for layer in layers)
+    return OccupancyMap(p_occupied, (x, y, 0.0), resolution, alpha, beta)
+
+
+def _crop(layer: TiledArray, block: tuple[slice, slice]) -> Layer:
+    """The part of a layer as an array; the whole layer where it is too large for one."""
+    small = compact(layer)
+    # the origin of a large layer would not fit its crop: keep it whole
+    return crop(small, block)
+
+
+def _split_by_tile(
+    shown: ShownState,
+) -> tuple[NDArray[np.intp], dict[tuple[int, ...], slice]]:
+    """Indices of the cells sorted by tile, and the slice of each tile."""
+    tiles = shown.place.cells // TILE
+    order = np.lexsort(tiles.T[::-1])
+    keys, first = np.unique(tiles[order], axis=0, return_index=True)
+    ends = np.append(first[1:], len(order))
+    return order, {
+        tuple(key): slice(int(a), int(b))
+        for key, a, b in zip(keys.tolist(), first, ends, strict=True)
+    }
+
+
+def _draw_tile(
+    sessions: Sequence[Evidence], tile: Tile, shown: ShownState, cells: NDArray[np.intp]
+) -> tuple[Image, Image, Image]:
+    """p_occupied, alpha and beta of a tile, x along the first axis."""
+    from scipy import ndimage  # slow to load
+
+    low, shape = tile.low - 1, tuple(n + 2 for n in tile.shape)
+    hits, passes = np.zeros((2, *shape), np.float32)
+    for one in sessions:
+        of_hits, of_passes = one.crop(low, shape)
+        hits += of_hits
+        passes += of_passes
+    at = tuple((shown.place.cells[cells] - low).T)
+    stands = np.zeros(shape, np.float32)
+    stands[at] = shown.p_shown[cells]
+    candidate = np.zeros(shape, np.bool_)
+    candidate[at] = True
+    # hits below the limit of a candidate may still be all that was seen of a far wall
+    stands = np.where(candidate, stands, hits / (hits + passes + MIN_HITS))
+    strongest = ndimage.maximum_filter(hits * stands, 3, mode="constant")
+    prominence = hits / np.maximum(_MIN_PROMINENCE * strongest, 1e-6)
+    surface = stands * np.minimum(prominence, 1.0)
+    odds = _FREE_PRIOR / (1.0 - _FREE_PRIOR) * np.exp(-passes)
+    p_passed = odds / (1.0 + odds)
+    p = np.where(hits + passes > 0.0, surface + (1.0 - surface) * p_passed, np.float32(np.nan))
+    inner = (slice(1, -1), slice(1, -1))
+    alpha = hits * stands
+    return p[inner].astype(np.float32), alpha[inner], (passes + hits - alpha)[inner]
