@@ -78,7 +78,9 @@ def _summarize_group(group: "InputGroup", args: argparse.Namespace) -> dict[str,
 
 
 def _to_json(groups: "list[InputGroup]", found: list[dict[str, Any]]) -> dict[str, Any]:
-    """One recording: its summary; several: one summary each."""
+    """One input: its summary; several: also which belong together; sessions: one summary each."""
+    if len(groups) == len(groups[0].paths) == 1:
+        return found[0]
     together = [
         {"inputs": list(group.paths), "kind": group.kind, "why": group.why} for group in groups
     ]

@@ -16,6 +16,7 @@ from stillmap.io.carmen.messages import (
     SCAN_PARSERS,
     WRONG_COUNT,
     BadRecord,
+    OdometryLine,
     ScanConfig,
     ScanLine,
     parse_odom,
@@ -139,8 +140,7 @@ class CarmenLog:
         # a line without an end may have lost fields, or digits of its stamp, unnoticed
         if not line.ended and record.stamp_fields < self._stamp_fields.get(name, 1):
             raise BadRecord(CUT_LINE)
-        content = line.text.rstrip()
-        if self.repeats is not None and self.repeats.is_repeated(record.stamp_ns, content):
+        if self.repeats is not None and _is_repeated(self.repeats, name, record):
             self.n_repeated += 1
             return record.stamp_fields
         if isinstance(record, ScanLine):
@@ -206,6 +206,13 @@ def _add_file(log: CarmenLog, path: Path, progress: Progress | None) -> None:
             if known == before:
                 what = f"has {_MAX_UNKNOWN_LINES} lines in a row that are no records"
                 raise InputError(what, where=f"{path}:{line.number}")
+
+
+def _is_repeated(repeats: RepeatFilter, name: bytes, record: ScanLine | OdometryLine) -> bool:
+    """Whether an earlier part has the measurement; the time of logging may be another."""
+    values = record.ranges if isinstance(record, ScanLine) else record.pose
+    stamp = str(record.stamp_ns).encode()
+    return repeats.is_repeated(record.stamp_ns, name, stamp, array("d", values).tobytes())
 
 
 def param_number(params: dict[str, str], name: str) -> float | None:

@@ -90,7 +90,12 @@ def _open(
     return lend_transforms(bag, others, scratch) if others else bag
 
 
-def read_tilting(paths: Sequence[Path], context: ReadContext) -> Recording:
+def read_tilting(path: Path, context: ReadContext) -> Recording:
+    """Read the scans of a tilting laser; see `read_tilting_parts`."""
+    return read_tilting_parts([path], context)
+
+
+def read_tilting_parts(paths: Sequence[Path], context: ReadContext) -> Recording:
     """Read the scans of a laser that tilts or pans as 3D points, by the bag's transform tree.
 
     Args:
