@@ -66,12 +66,33 @@ def test_a_pause_as_long_as_those_within_is_bridged(drive):
     assert members([replace(one, T_odom_base=None) for one in again]) == [(0, 1)]
 
 
+@pytest.mark.parametrize("pause", [30.0, 90.0])
+def test_odometry_bridges_a_pause_of_sparse_scans(drive, pause):
+    stamp_ns = drive.stamp_ns[0] + 2 * 10**9 * np.arange(60)
+    later = np.arange(60) >= 30
+    sparse = replace(drive, stamp_ns=stamp_ns + int(1e9 * (pause - 2.0)) * later)
+    first, second = cut(sparse, 0.0, 59.0), cut(sparse, 60.0, 999.0)
+    both = [measure_facts(one, name) for one, name in ((first, "a"), (second, "b"))]
+    assert (len(members(both)) == 1) == (pause < 60.0)
+    assert len(members([replace(one, T_odom_base=None) for one in both])) == 2
+    far = replace(both[1], T_odom_base=se2.matrix(20.0, 0.0, 0.0) @ both[1].T_odom_base)
+    assert len(members([both[0], far])) == 2
+
+
 def test_odometry_that_starts_anew_begins_a_session(drive):
     first, second = cut(drive, 0.0, 2.9), cut(drive, 3.0, 5.9)
     anew = replace(second, T_odom_base=se2.inverse(second.T_odom_base[:1]) @ second.T_odom_base)
     facts = [measure_facts(one, name) for one, name in ((first, "a"), (anew, "b"))]
     assert members(facts) == [(0,), (1,)]
     assert group_parts(facts)[1].why.startswith("b has odometry that begins 1.4")
+    facts = facts_of(drive, (0.0, 0.3), (0.4, 5.9))  # the robot could have come back
+    assert members(facts) == [(0, 1)]
+    zero = se2.inverse(facts[1].T_odom_base[:1]) @ facts[1].T_odom_base
+    anew = replace(facts[1], T_odom_base=zero)
+    assert members([facts[0], anew]) == [(0,), (1,)]
+    still = replace(facts[0], T_odom_base=np.tile(np.eye(3), (4, 1, 1)))
+    assert members([still, anew]) == [(0, 1)]
+    facts = [measure_facts(first, "a"), facts[1]]
     turned = replace(second, T_odom_base=second.T_odom_base @ se2.matrix(0.0, 0.0, 2.0))
     facts[1] = measure_facts(turned, "b")
     assert group_parts(facts)[1].why == "b has odometry turned by 115 degrees against the end of a"

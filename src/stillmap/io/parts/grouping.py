@@ -17,9 +17,9 @@ from stillmap.io.parts.facts import RecordingFacts
 Float = NDArray[np.float64]
 
 # a pause between parts: as long as pauses within them or some scans, but no longer than recorders
-# take for a new file
+# take for a new file; odometry that goes on shows that it is the same run
 _MAX_PAUSE_SCANS = 20
-_MIN_PAUSE, _MAX_PAUSE = 1.0, 10.0  # s
+_MIN_PAUSE, _MAX_PAUSE, _MAX_PAUSE_WITH_ODOMETRY = 1.0, 10.0, 60.0  # s
 _MAX_STRAY_SCANS = 3  # of an overlap that are in one part only: recorders lose some at the seam
 _MAX_STRAY_SHARE = 0.1
 _MIN_EQUAL_RANGES = 0.9  # share of the ranges that equal scans have in common
@@ -31,6 +31,7 @@ _SPEED_SPAN = 0.5  # s over which speed is measured
 _USUAL_SHARE = 0.98  # quantile of speeds: odometry has single jumps
 _SLACK = 0.3  # s: readings of odometry lie before or after the scans
 _ROUNDING = 0.05  # m, rad
+_ZERO = 1e-3  # m, rad: where odometry begins when it is switched on
 
 
 @dataclass(frozen=True)
@@ -137,7 +138,9 @@ def _longest_pause(*facts: RecordingFacts) -> float:
     steps = np.concatenate([np.diff(one.stamp_ns) for one in facts]) / 1e9
     interval = _usual_interval(*facts)
     usual = max(_MAX_PAUSE_SCANS * interval, float(steps.max(initial=0.0)))
-    return max(float(np.clip(usual, _MIN_PAUSE, _MAX_PAUSE)), 2.0 * interval)
+    has_odometry = all(one.T_odom_base is not None for one in facts)
+    longest = _MAX_PAUSE_WITH_ODOMETRY if has_odometry else _MAX_PAUSE
+    return max(float(np.clip(usual, _MIN_PAUSE, longest)), 2.0 * interval)
 
 
 def _usual_interval(*facts: RecordingFacts) -> float:
@@ -199,14 +202,20 @@ def _compare_odometry(
         seconds = 0.0
     else:
         metres, radians = _measure_motion(A[-1], B[0])
-        seconds = abs(gap)
+        seconds = min(abs(gap), _MAX_PAUSE)
     reach, turn = _reach(earlier, later, seconds)
+    if not len(pairs) and _is_at_zero(B[0]) and max(metres, radians) > _ROUNDING:
+        reach = turn = 0.0  # it starts anew, not by chance where the robot could have come
     if metres > reach:
         return f"has odometry that begins {metres:.2f} m from where that of {earlier.path} ends"
     if radians > turn:
         degrees = np.degrees(radians)
         return f"has odometry turned by {degrees:.0f} degrees against the end of {earlier.path}"
     return metres
+
+
+def _is_at_zero(T: Float) -> bool:
+    return max(_measure_motion(np.eye(len(T)), T)) < _ZERO
 
 
 def _reach(earlier: RecordingFacts, later: RecordingFacts, seconds: float) -> tuple[float, float]:
