@@ -162,11 +162,12 @@ def test_an_interrupted_run_of_parts_continues(call, room, tmp_path, monkeypatch
     assert done.returncode == 130
     told = done.stderr.partition("continue after iteration 1: stillmap ")[2].partition("\n")[0]
     assert all(str(part) in told for part in parts)
-    fewer = call("map", *parts[1:], "-o", tmp_path / "b", *words, "--resume")
+    fewer = call("map", *parts[1:], "-o", tmp_path / "b", *words, "--resume", "--quiet")
     refused(fewer, "cannot be resumed", "another recording")
     done = call(*shlex.split(told))
     assert done.returncode == 0, done.stderr
     assert "continues after iteration 1" in done.stderr
+    assert f"parts of one run: {parts[2]} begins" in done.stderr
     assert contents(tmp_path / "a") == contents(tmp_path / "b")
 
 
@@ -192,10 +193,10 @@ def test_info_says_what_belongs_together(call, room, day_after, tmp_path):
     assert done.returncode == 0, done.stderr
     first, rest = done.stdout.split("\n", 1)
     in_order = ", ".join(str(parts[k]) for k in (1, 2, 0))
-    assert first.startswith(f"{in_order}: parts of one run, {parts[2]} begins 0.")
+    assert first.startswith(f"{in_order}: parts of one run: {parts[2]} begins 0.")
     assert "odometry 0." in first
     assert rest.count("after " + str(parts[0]) + " ends") == 1
-    assert f"{day_after}: a session of its own, " in rest
+    assert f"{day_after}: a session of its own: " in rest
     assert "scans             40 with 120 beams each" in rest
     found = json.loads(call("info", *parts, day_after, "--json").stdout)
     assert [group["kind"] for group in found["groups"]] == ["parts", "recording"]

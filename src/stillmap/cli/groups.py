@@ -52,5 +52,5 @@ def describe_sessions(groups: list[InputGroup]) -> str:
 def describe_group(group: InputGroup) -> str:
     """The inputs of a group and why they belong together, or why one stands alone."""
     if group.kind == "parts":
-        return f"{', '.join(group.paths)}: parts of one run, {group.why}"
-    return f"{group.paths[0]}: a session of its own, {group.why}"
+        return f"{', '.join(group.paths)}: parts of one run: {group.why}"
+    return f"{group.paths[0]}: a session of its own: {group.why}"

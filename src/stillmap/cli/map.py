@@ -169,8 +169,8 @@ def run(args: argparse.Namespace) -> int:
 def _find_groups(
     args: argparse.Namespace, options: "Options", output: Path, stages: "StageTimer"
 ) -> "list[InputGroup]":
-    """Group the inputs; what is large lies beside the output meanwhile."""
-    from stillmap.cli.groups import find_groups
+    """Group the inputs and tell how; what is large lies beside the output meanwhile."""
+    from stillmap.cli.groups import describe_group, find_groups
     from stillmap.pipeline.checkpoint import lock_checkpoints
 
     if len(args.input) == 1:
@@ -180,7 +180,11 @@ def _find_groups(
         _explain_failure(args, checkpoints),
         stages.measure("read"),
     ):
-        return find_groups(args, options.read, checkpoints.folder)
+        groups = find_groups(args, options.read, checkpoints.folder)
+    if not args.quiet:
+        for group in groups:
+            say(describe_group(group))
+    return groups
 
 
 def _option_changes(args: argparse.Namespace) -> dict[str, Any]:

@@ -8,7 +8,8 @@ from conftest import START, cut, make_recording
 
 from stillmap.core import se2
 from stillmap.io.parts.facts import measure_facts
-from stillmap.io.parts.grouping import compare, group_parts
+from stillmap.io.parts.grouping import group_parts
+from stillmap.io.parts.seams import compare
 
 
 def facts_of(recording, *spans):

@@ -14,8 +14,8 @@ from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.io.builder import MAX_LINE_NUMBERS, reorder_scans
 from stillmap.io.parts.facts import measure_facts
-from stillmap.io.parts.grouping import Seam, compare
 from stillmap.io.parts.images import join_images
+from stillmap.io.parts.seams import Seam, compare
 
 Float = NDArray[np.float64]
 
