@@ -8,8 +8,11 @@ import pytest
 import trimesh
 
 from stillmap.cli.main import main
-from stillmap.io import stillmap_folder
+from stillmap.io import read, stillmap_folder
 from stillmap.io.trajectory import read_tum
+from stillmap.preprocessing.options import ReadOptions
+from stillmap.preprocessing.overrides import select_time
+from stillmap.preprocessing.time_window import TimeWindow
 from stillmap.sim import load_truth, scene_by_name, simulate_rig, write_rig
 
 QUICK = ("--quiet", "--threads", "1", "--set", "em.max_iterations=1")
@@ -65,6 +68,19 @@ def test_the_files_belong_together(rig, mapped):
     stamps, poses = read_tum(mapped / "tilting/trajectory.tum")
     np.testing.assert_array_equal(stamps, read_tum(mapped / "trajectory.tum")[0])
     np.testing.assert_allclose(poses, read_tum(mapped / "trajectory.tum")[1], atol=1e-6)
+
+
+def test_the_planar_laser_may_come_in_parts(rig, mapped, tmp_path):
+    whole, parts = read(rig / "horizontal"), []
+    seconds = (whole.stamp_ns - whole.stamp_ns[0]) / 1e9
+    for number, (first, last) in enumerate(((0, 149), (150, 299))):
+        window = TimeWindow(ReadOptions(start=seconds[first] or None, end=seconds[last]))
+        parts.append(tmp_path / str(number))
+        stillmap_folder.write(select_time(whole, window), parts[-1])
+    words = ("map", *parts[::-1], "--tilting", rig / "tilting", "-o", tmp_path / "out", *QUICK)
+    assert main([str(word) for word in words]) == 0
+    for name in ("beams/p_static.npy", "tilting/beams/p_static.npy", "static.ply"):
+        assert (tmp_path / "out" / name).read_bytes() == (mapped / name).read_bytes()
 
 
 @pytest.mark.parametrize("only", ["static", "dynamic", None])

@@ -64,7 +64,8 @@ def convert_result(args: argparse.Namespace, source: Path, output: Path) -> tupl
         text = "a result's recording is read as it was for the map: no flags for reading it"
         raise InputError(text, where=str(source))
     result = open_result(source, args.recording)
-    require_apart(output, result.source, source)
+    for path in result.sources:
+        require_apart(output, path, source)
     if args.to == NAV2 or given_zone_flags(args):
         return _convert_to_nav2(args, result, output)
     if (form := point_cloud_files.format_for(output, args.to)) is not None:

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 DESCRIPTION = (
     "Write the recording again with dynamic beams blanked, 2D or 3D: for mapping and localization "
     "programs that assume a static world. It keeps its own format, in which nothing else changes, "
-    "unless FILE has the ending of another one or --to names it."
+    "unless FILE has the ending of another one or --to names it. Parts of one run become one "
+    "recording."
 )
 EPILOG = """examples:
   stillmap filter out -o clean.clf.gz
@@ -92,7 +93,8 @@ def run(args: argparse.Namespace) -> int:
             omitted, notes = target.write(job)
     if args.json:
         counts = {"hits": hits, "blanked": blanked, "scans_left_out": omitted}
-        print_json({"output": str(output), "input": str(result.source), **counts})
+        parts = {"parts": list(map(str, result.parts))} if result.parts else {}
+        print_json({"output": str(output), "input": str(result.source), **parts, **counts})
     if not args.quiet:
         share = 100.0 * blanked / max(hits, 1)
         say(f"wrote {output}: {blanked} beams blanked, {share:.1f} % of the hits")
@@ -122,8 +124,12 @@ def _find_target(result: "ResultFolder", output: Path, args: argparse.Namespace)
     from stillmap.io import filter_writers, writers
 
     source = result.require_source()
-    require_apart(output, source, result.folder)
-    target = filter_writers.find_target(source, output, args.to)
+    for path in result.sources:
+        require_apart(output, path, result.folder)
+    if result.parts:
+        target = filter_writers.find_joined_target(output, args.to)
+    else:
+        target = filter_writers.find_target(source, output, args.to)
     filter_writers.require_free(target, output, source, args.overwrite)
     if target.writer is not None:
         writers.require_fit(output, target.writer, result.dimension, result.n_sensors)

@@ -1,22 +1,27 @@
-"""`stillmap info INPUT`: print a summary of a recording."""
+"""`stillmap info INPUT...`: print summaries of recordings, and which belong together."""
 
 import argparse
 import json
 import math
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from stillmap.cli.arguments import add_read_flags, read_options
 from stillmap.cli.console import show_share
 
+if TYPE_CHECKING:
+    from stillmap.io.parts.reading import InputGroup
+
 _LINES_SHOWN = 10
 DESCRIPTION = (
     "Show what is in a recording: scans, beams, field of view, ranges, duration, "
-    "odometry and damage; values estimated from the readings are marked."
+    "odometry and damage; values estimated from the readings are marked. Several inputs: which are "
+    "parts of one run, and why."
 )
 EPILOG = """examples:
   stillmap info log.clf.gz
   stillmap info sim --json
+  stillmap info run_0.bag run_1.bag
   stillmap info log.log --max-range 30 --laser-offset 0.2 0 0
 
 formats:
@@ -32,7 +37,9 @@ formats:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the flags and arguments."""
-    parser.add_argument("input", metavar="INPUT", help="a file or folder with a recording")
+    parser.add_argument(
+        "input", metavar="INPUT", nargs="+", help="a file or folder with a recording, or its parts"
+    )
     parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
     parser.add_argument("--quiet", action="store_true", help="no progress")
     add_read_flags(parser)
@@ -44,22 +51,60 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         InputError: the recording cannot be read.
     """
+    from stillmap.cli.groups import find_groups
+
+    groups = find_groups(args, read_options(args), None)
+    found = [_summarize_group(group, args) for group in groups]
+    if args.json:
+        print(json.dumps(_to_json(groups, found), indent=2, allow_nan=False))
+    else:
+        print("\n".join(_format_groups(groups, found)))
+    return 0
+
+
+def _summarize_group(group: "InputGroup", args: argparse.Namespace) -> dict[str, Any]:
+    """The summary of a recording, or of the parts of one."""
     from stillmap.cli.recording_info import summarize_recording
     from stillmap.io import read
+    from stillmap.io.parts.reading import read_parts
 
-    options = read_options(args)
+    options, paths = read_options(args), group.paths
     with show_share(args.quiet, "reading") as progress:
-        recording = read(args.input, options, progress=progress)
-    found = {"input": args.input, **summarize_recording(recording)}
-    if args.json:
-        print(json.dumps(found, indent=2, allow_nan=False))
-    else:
-        print("\n".join(_format_summary(found)))
-    return 0
+        if len(paths) == 1:
+            recording = read(paths[0], options, progress=progress)
+        else:
+            recording = read_parts(paths, options, progress=progress)
+    return {"input": paths[0], **summarize_recording(recording), "parts": list(group.parts)}
+
+
+def _to_json(groups: "list[InputGroup]", found: list[dict[str, Any]]) -> dict[str, Any]:
+    """One input: its summary; several: also which belong together; sessions: one summary each."""
+    if len(groups) == len(groups[0].paths) == 1:
+        return found[0]
+    together = [
+        {"inputs": list(group.paths), "kind": group.kind, "why": group.why} for group in groups
+    ]
+    if len(groups) == 1:
+        return {**found[0], "groups": together}
+    return {"groups": together, "recordings": found}
+
+
+def _format_groups(groups: "list[InputGroup]", found: list[dict[str, Any]]) -> Iterator[str]:
+    from stillmap.cli.groups import describe_group
+
+    several = sum(len(group.paths) for group in groups) > 1
+    for number, (group, summary) in enumerate(zip(groups, found, strict=True)):
+        if number:
+            yield ""
+        if several:
+            yield describe_group(group)
+        yield from _format_summary(summary)
 
 
 def _format_summary(found: dict[str, Any]) -> Iterator[str]:
     yield f"{found['input']}: {found['format'] or 'stillmap recording'}, {found['dimension']}D"
+    for part in found["parts"]:
+        yield _row("part", _format_span(part))
     if found["path"] not in (None, found["input"]):
         yield _row("made from", str(found["path"]))
     beams = found["beams_per_scan"]
@@ -108,6 +153,14 @@ def _format_time(time: dict[str, Any]) -> Iterator[str]:
     gap = f", largest gap {time['largest_gap_s']:.2f} s" if time["largest_gap_s"] else ""
     yield _row("duration", f"{time['duration_s']:.2f} s{rate}{gap}")
     yield _row("stamps", f"{first} to {last}")
+
+
+def _format_span(part: dict[str, Any]) -> str:
+    """A part of a run."""
+    from stillmap.core.timestamps import format_seconds
+
+    first, last = (format_seconds(part[key]) for key in ("first_stamp_ns", "last_stamp_ns"))
+    return f"{part['path']}: {part['scans']} scans, stamps {first} to {last}"
 
 
 def _format_part(part: dict[str, Any]) -> str:

@@ -20,16 +20,19 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from stillmap.core.profiling import StageTimer
     from stillmap.core.recording import Recording
+    from stillmap.io.parts.reading import InputGroup
     from stillmap.mesh.build import Models
     from stillmap.pipeline.checkpoint import CheckpointFolder
+    from stillmap.pipeline.options import Options
     from stillmap.pipeline.result import MappingResult
     from stillmap.rig.build import TiltingResult
 
 DESCRIPTION = (
     "Map a recording: estimate the pose of every scan, the probability of every "
     "beam to have hit something static, and the map of what is static. The result is a folder; "
-    "open it with `stillmap view`."
+    "open it with `stillmap view`. Several inputs are joined where they are parts of one run."
 )
 EPILOG = """examples:
   stillmap map log.clf.gz -o out
@@ -37,6 +40,7 @@ EPILOG = """examples:
   stillmap map log.clf.gz -o out --min-range 0.3 --set em.max_iterations=3
   stillmap map log.clf.gz -o out --poses poses.tum --config options.toml
   stillmap map log.bag -o out --resume
+  stillmap map run_0.bag run_1.bag run_2.bag -o out
   stillmap map sim/horizontal -o out --tilting sim/tilting
   stillmap map log.clf.gz -o out --quiet --json
 """
@@ -47,7 +51,9 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument(
         "input",
         metavar="INPUT",
-        help="a CARMEN log, a ROS bag, a stillmap recording folder, ...: see docs/input.md",
+        nargs="+",
+        help="a CARMEN log, a ROS bag, a stillmap recording folder, ...: see docs/input.md; "
+        "several: the parts of one run, in any order (docs/input/parts.md)",
     )
     p.add_argument(
         "--tilting",
@@ -127,6 +133,7 @@ _IN_SUMMARY = ("version", "converged", "best_iteration", "counts", "area", "seco
 
 def run(args: argparse.Namespace) -> int:
     """Map a recording into a folder."""
+    from stillmap.cli.groups import merge_sessions
     from stillmap.cli.map_run import build_all, read_inputs
     from stillmap.core.profiling import StageTimer
     from stillmap.pipeline.checkpoint import lock_checkpoints
@@ -135,8 +142,11 @@ def run(args: argparse.Namespace) -> int:
     options = options_from_args(args, read_changes(args), _option_changes(args))
     output, stages = Path(args.output), StageTimer()
     _require_usable_output(args, output)
+    groups = _find_groups(args, options, output, stages)
+    if len(groups) > 1:
+        return merge_sessions(args, groups)
     with lock_checkpoints(output) as checkpoints, _explain_failure(args, checkpoints):
-        inputs = read_inputs(args, options, checkpoints.folder, stages)
+        inputs = read_inputs(args, groups[0], options, checkpoints.folder, stages)
         with show_progress(args.quiet, options.em.max_iterations) as progress:
             result, tilting, models = build_all(args, inputs, checkpoints, progress, stages)
             progress("writing", 0, 0, 0)
@@ -154,6 +164,27 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json(_summarize(output))
     return 0
+
+
+def _find_groups(
+    args: argparse.Namespace, options: "Options", output: Path, stages: "StageTimer"
+) -> "list[InputGroup]":
+    """Group the inputs and tell how; what is large lies beside the output meanwhile."""
+    from stillmap.cli.groups import describe_group, find_groups
+    from stillmap.pipeline.checkpoint import lock_checkpoints
+
+    if len(args.input) == 1:
+        return find_groups(args, options.read, None)
+    with (
+        lock_checkpoints(output) as checkpoints,
+        _explain_failure(args, checkpoints),
+        stages.measure("read"),
+    ):
+        groups = find_groups(args, options.read, checkpoints.folder)
+    if not args.quiet:
+        for group in groups:
+            say(describe_group(group))
+    return groups
 
 
 def _option_changes(args: argparse.Namespace) -> dict[str, Any]:
@@ -183,7 +214,7 @@ def _require_usable_output(args: argparse.Namespace, output: Path) -> None:
     from stillmap.results.run_json import RECORD
 
     require_new(output, RECORD, args.overwrite or args.resume)
-    for source in filter(None, (args.input, args.tilting)):
+    for source in filter(None, (*args.input, args.tilting)):
         require_apart(output, Path(source))
     parent = Path(os.path.abspath(output)).parent
     while not parent.exists():

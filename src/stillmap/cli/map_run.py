@@ -15,6 +15,7 @@ from stillmap.core.parallel import limit_blas_threads, resolve_threads
 from stillmap.core.profiling import Progress, StageTimer
 from stillmap.core.recording import Recording
 from stillmap.io import read
+from stillmap.io.parts.reading import InputGroup
 from stillmap.io.registry import detect_format
 from stillmap.io.text_lines import Progress as ReadProgress
 from stillmap.pipeline import inputs
@@ -43,25 +44,29 @@ class Inputs(NamedTuple):
 
 
 def read_inputs(
-    args: argparse.Namespace, options: Options, scratch: Path, stages: StageTimer
+    args: argparse.Namespace,
+    group: InputGroup,
+    options: Options,
+    scratch: Path,
+    stages: StageTimer,
 ) -> Inputs:
-    """Read the inputs, and resolve the options for them."""
+    """Read the inputs, one recording or its parts, and resolve the options for them."""
     with stages.measure("read"):
         with show_share(args.quiet, "reading") as progress:
-            recording = inputs.read(args.input, options.read, progress=progress, scratch=scratch)
+            recording = inputs.read_group(group, options.read, progress=progress, scratch=scratch)
         if args.no_odometry:
             recording = recording.without_odometry()
         poses = inputs.read_poses(args.poses or None, recording)
         inputs.require_mappable(recording, options, poses)
         with show_share(args.quiet, "reading") as progress:
             tilting = _read_tilting_laser(
-                args.input, args.tilting, recording, options, progress, scratch
+                group.paths, args.tilting, recording, options, progress, scratch
             )
         return Inputs(recording, resolve_options(options, recording), poses, tilting)
 
 
 def _read_tilting_laser(
-    planar_path: str,
+    planar_paths: tuple[str, ...],
     tilting_path: str | None,
     planar: Recording,
     options: Options,
@@ -83,20 +88,20 @@ def _read_tilting_laser(
         return None
     if planar.dimension != 2:
         what = "the planar laser decides which objects move, but this recording is 3D"
-        raise InputError(what, where=planar_path)
+        raise InputError(what, where=planar_paths[0])
     # the part to be mapped counts from the start of the planar recording
     whole = dataclasses.replace(options.read, start=None, end=None)
     if topic is not None:
         base_frame = planar.source.get("base_frame") or None
         read_as = dataclasses.replace(whole, topic=topic, tilting_topic=None, base_frame=base_frame)
-        tilting = _read_topic(Path(planar_path), read_as, progress, scratch)
+        tilting = _read_topic(planar_paths, read_as, progress, scratch)
     else:
         # a topic chosen for INPUT is not in the other recording
         read_as = dataclasses.replace(whole, topic=None)
         tilting = read(Path(str(tilting_path)), read_as, progress=progress, scratch=scratch)
     from stillmap.rig.build import check_rig  # only a rig needs it
 
-    path = tilting_path or planar_path
+    path = tilting_path or planar_paths[0]
     if "part" in planar.source:
         origin_ns = planar.source["part"]["first_stamp_ns"]
         tilting = select_time(tilting, TimeWindow(options.read, origin_ns), path)
@@ -105,15 +110,17 @@ def _read_tilting_laser(
 
 
 def _read_topic(
-    path: Path, options: ReadOptions, progress: ReadProgress | None, scratch: Path
+    paths: tuple[str, ...], options: ReadOptions, progress: ReadProgress | None, scratch: Path
 ) -> Recording:
     from stillmap.io.builder import ReadContext
-    from stillmap.io.ros.reader import read_tilting  # message types take long to load
+    from stillmap.io.ros.reader import read_tilting_parts  # message types take long to load
 
-    if detect_format(path).name != "ROS bag":
-        raise InputError("--tilting-topic is for bags", where=str(path))
+    bags = [Path(path) for path in paths]
+    for path in bags:
+        if detect_format(path).name != "ROS bag":
+            raise InputError("--tilting-topic is for bags", where=str(path))
     with np.errstate(over="ignore", invalid="ignore"):
-        return read_tilting(path, ReadContext(options, progress, scratch))
+        return read_tilting_parts(bags, ReadContext(options, progress, scratch))
 
 
 def build_all(

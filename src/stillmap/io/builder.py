@@ -3,6 +3,7 @@
 from array import array
 from collections import Counter
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from stillmap.core.advice import advise
 from stillmap.core.arrays import ArrayBuilder, empty
 from stillmap.core.recording import Recording
-from stillmap.io.text_lines import Progress
+from stillmap.io.text_lines import Progress, share_progress
 from stillmap.preprocessing.options import MAX_POINT_DISTANCE, ReadOptions
 
 _BLOCK = 1 << 20  # points of a scan at a time
@@ -30,6 +31,16 @@ class ReadContext(NamedTuple):
     options: ReadOptions
     progress: Progress | None = None
     scratch: Path | None = None
+
+
+def part_context(context: ReadContext, number: int, count: int) -> ReadContext:
+    """The context of one of `count` parts of a run, which is read as a whole.
+
+    The time window counts from the start of the run: it applies to the joined recording.
+    """
+    options = replace(context.options, start=None, end=None)
+    progress = share_progress(context.progress, number, count)
+    return ReadContext(options, progress, context.scratch)
 
 
 class RecordingBuilder:
@@ -109,10 +120,9 @@ class RecordingBuilder:
         length = np.asarray(self.length, np.int64)
         selection = np.arange(len(stamp_ns)) if selection is None else np.sort(selection)
         order = selection[np.argsort(stamp_ns[selection], kind="stable")]
-        start = np.cumsum(length) - length
 
         def reorder(column: ArrayBuilder) -> NDArray[Any]:
-            return _reorder(column.finish(), start, length, order, self._folder)
+            return reorder_scans(column.finish(), length, order, self._folder)
 
         return Recording(
             stamp_ns=stamp_ns[order],
@@ -148,16 +158,20 @@ def _apply_range_limits(
     return out, usable & ~far
 
 
-def _reorder(
-    values: NDArray[Any],
-    start: NDArray[np.int64],
-    length: NDArray[np.int64],
-    order: NDArray[np.intp],
-    folder: Path | None,
+def reorder_scans(
+    values: NDArray[Any], length: NDArray[np.int64], order: NDArray[np.intp], folder: Path | None
 ) -> NDArray[Any]:
-    """Rearrange values per beam into the order of scans."""
-    if np.array_equal(order, np.arange(len(start))):
+    """Values per beam (M, ...) of scans with these numbers of beams, in another order of scans.
+
+    Args:
+        values: scan after scan.
+        length: (T,) beams of each scan.
+        order: (t,) indices of the scans to keep.
+        folder: of a memory-mapped array; None: the system's temporary folder.
+    """
+    if np.array_equal(order, np.arange(len(length))):
         return values
+    start = np.cumsum(length) - length
     out = empty((int(length[order].sum()), *values.shape[1:]), values.dtype, folder)
     at = 0
     for scan in order:

@@ -172,6 +172,21 @@ def find_target(source: Path, output: Path, name: str | None = None) -> FilterTa
     return _own_target(source, output, form, is_folder, own)
 
 
+def find_joined_target(output: Path, name: str | None = None) -> FilterTarget:
+    """Find how a filtered recording is written whose parts are several inputs: as one recording.
+
+    Args:
+        output: the recording; a recording folder where it has no ending.
+        name: of the format, as in `writers.py`; None: by the output's ending.
+
+    Raises:
+        InputError: there is no such format.
+    """
+    writer = writers.find_writer(output, name)
+    write, is_folder = partial(_convert, writer=writer), bool(writer.marker)
+    return FilterTarget(writer.description, writer.marker, is_folder, write, writer)
+
+
 def _own_target(source: Path, output: Path, form: str, is_folder: bool, kind: str) -> FilterTarget:
     entry = FILTER_WRITERS.get(form)
     if entry is None:

@@ -4,7 +4,8 @@ The table of formats that are written is in `writers.py`.
 """
 
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from importlib import import_module
 from itertools import islice
@@ -32,6 +33,8 @@ _MAX_LISTED = 3  # recordings in a message
 _FORMATS_HINT = "`stillmap info -h` lists the formats"
 
 Reader = Callable[[Path, ReadContext], Recording]
+# reads parts of a run, in order of time, as one recording; others may be further parts
+PartsReader = Callable[[Sequence[Path], ReadContext, Sequence[Path]], Recording]
 
 
 class Format(NamedTuple):
@@ -42,12 +45,15 @@ class Format(NamedTuple):
         endings: of names of its files or folders; they decide where the content does not.
         matches: whether a file with these first bytes, or a folder (None), has the format.
         read: reader of a path.
+        read_parts: reader of parts of one run, where that needs more than joining recordings: the
+            beams are then those of the whole recording, to the bit. None: it does not.
     """
 
     name: str
     endings: tuple[str, ...]
     matches: Callable[[Path, bytes | None], bool]
     read: Reader
+    read_parts: PartsReader | None = None
 
 
 def _is_carmen(path: Path, start: bytes | None) -> bool:  # noqa: ARG001
@@ -97,6 +103,19 @@ def _reader(module: str) -> Reader:
     return read
 
 
+def _parts_reader(module: str) -> PartsReader:
+    """`read_parts` of a module of this room, likewise."""
+
+    def read_parts(
+        paths: Sequence[Path], context: ReadContext, others: Sequence[Path]
+    ) -> Recording:
+        read = import_module(f"stillmap.io.{module}").read_parts
+        recording: Recording = read(paths, context, others)
+        return recording
+
+    return read_parts
+
+
 def _point_cloud_format(
     name: str, endings: tuple[str, ...], has_magic: Callable[[bytes], bool] | None, module: str
 ) -> Format:
@@ -116,12 +135,19 @@ FORMATS = (
     Format(
         "stillmap recording", (stillmap_folder.HEADER,), _is_stillmap_folder, _read_stillmap_folder
     ),
-    Format("ROS bag", bag_types.ENDINGS, bag_types.is_bag, _reader("ros.reader")),
+    Format(
+        "ROS bag",
+        bag_types.ENDINGS,
+        bag_types.is_bag,
+        _reader("ros.reader"),
+        _parts_reader("ros.reader"),
+    ),
     Format(
         "KITTI folder",
         ("velodyne/", "velodyne_points/"),
         _is_kitti_folder,
         _reader("point_cloud.kitti"),
+        _parts_reader("point_cloud.kitti"),
     ),
     Format("RGB-D folder", ("frame-*.depth.png", "depth.txt"), _is_rgbd_folder, _reader("rgbd")),
     _point_cloud_format("PCD", signatures.PCD_EXTENSIONS, signatures.is_pcd, "pcd"),
@@ -134,6 +160,7 @@ FORMATS = (
         (".log", ".clf", ".txt", ".log.gz", ".clf.gz", ".txt.gz", ".gz"),
         _is_carmen,
         _reader("carmen.reader"),
+        _parts_reader("carmen.reader"),
     ),
 )
 
@@ -157,22 +184,43 @@ def read(
     Raises:
         InputError: there is no readable recording.
     """
-    path = Path(path)
+    path, options = Path(path), options or ReadOptions()
+    with explain_failure(path):
+        recording = detect_format(path).read(path, ReadContext(options, progress, scratch))
+        return prepare(recording, options, scratch, str(path))
+
+
+def prepare(
+    recording: Recording, options: ReadOptions, scratch: Path | None, where: str
+) -> Recording:
+    """A recording as its reader made it, with what follows from all of its scans.
+
+    Raises:
+        InputError: options are for recordings of another dimension.
+    """
+    if recording.dimension == 3:
+        return _prepare_3d(recording, options, scratch)
+    for name, given in (
+        ("spin", options.spin not in ("auto", "none")),
+        ("cameras", options.cameras),
+    ):
+        if given:
+            what = f"read.{name} is for 3D recordings, this one is in 2D"
+            raise InputError(what, where=where)
+    return recording
+
+
+@contextmanager
+def explain_failure(path: Path) -> Iterator[None]:
+    """Within this context, files that vanish and full disks are errors of the input.
+
+    Raises:
+        InputError: it names the file.
+    """
     try:
-        # damaged numbers are handled below: no warnings of NumPy
+        # damaged numbers are handled by the readers: no warnings of NumPy
         with np.errstate(over="ignore", invalid="ignore"):
-            options = options or ReadOptions()
-            recording = detect_format(path).read(path, ReadContext(options, progress, scratch))
-            if recording.dimension == 3:
-                return _prepare_3d(recording, options, scratch)
-        for name, given in (
-            ("spin", options.spin not in ("auto", "none")),
-            ("cameras", options.cameras),
-        ):
-            if given:
-                what = f"read.{name} is for 3D recordings, this one is in 2D"
-                raise InputError(what, where=str(path))
-        return recording
+            yield
     except OSError as error:
         # files may vanish and disks fill up at any moment
         what = f"cannot be read: {error.strerror or error}"

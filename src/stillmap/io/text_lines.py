@@ -20,6 +20,13 @@ _DAMAGED = (EOFError, zlib.error, gzip.BadGzipFile)
 Progress = Callable[[float], None]
 
 
+def share_progress(progress: Progress | None, number: int, count: int) -> Progress | None:
+    """Progress within one of `count` inputs that are read one after the other."""
+    if progress is None:
+        return None
+    return lambda share: progress((number + share) / count)
+
+
 class Line(NamedTuple):
     """One line: its number from 1, and its bytes up to `MAX_LINE`.
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,8 @@ from stillmap import io as formats
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.io.array_checks import poses_to_matrices
-from stillmap.io.text_lines import Progress
+from stillmap.io.parts.reading import InputGroup, group_inputs, read_parts
+from stillmap.io.text_lines import Progress, share_progress
 from stillmap.io.trajectory import poses_from_tum
 from stillmap.pipeline.options import Options
 from stillmap.preprocessing.options import ReadOptions
@@ -21,7 +23,7 @@ RECORDED = "recording"  # poses: those that the recording states
 
 
 def read(
-    path: str | os.PathLike[str],
+    path: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     options: ReadOptions | None = None,
     *,
     progress: Progress | None = None,
@@ -29,20 +31,24 @@ def read(
 ) -> Recording:
     """Read a recording of any format, to be mapped.
 
-    `stillmap.load` finds it again by the path, which `source["path"]` notes.
+    `stillmap.load` finds it again by the path, which `source["path"]` notes, or those of its parts.
 
     Args:
-        path: a CARMEN log, a ROS bag, a folder of clouds, ...: see docs/input.md.
+        path: a CARMEN log, a ROS bag, a folder of clouds, ...: see docs/input.md; or the parts of
+            one run, in any order.
         options: what readings mean, topics of a bag, ...; None: the defaults.
         progress: called with the share that is read, 0 to 1.
         scratch: folder for memory-mapped buffers; None: the system's temporary folder.
 
     Raises:
-        InputError: there is no readable recording.
+        InputError: there is no readable recording, or several are not parts of one run.
 
     Examples:
         >>> recording = stillmap.read("log.bag", stillmap.ReadOptions(min_range=0.3))
+        >>> recording = stillmap.read(["log_0.bag", "log_1.bag"])
     """
+    if not isinstance(path, str | os.PathLike):
+        return _read_run([os.fspath(one) for one in path], options, progress, scratch)
     recording = formats.read(Path(path), options, progress=progress, scratch=scratch)
     here = os.fspath(path)
     original = recording.source.get("path", here)
@@ -50,6 +56,41 @@ def read(
     if original != here:
         source["made_from"] = original
     return dataclasses.replace(recording, source=source)
+
+
+def read_group(
+    group: InputGroup,
+    options: ReadOptions | None = None,
+    *,
+    progress: Progress | None = None,
+    scratch: Path | None = None,
+) -> Recording:
+    """Read inputs that belong together as one recording; arguments as of `read`."""
+    if len(group.paths) == 1:
+        return read(group.paths[0], options, progress=progress, scratch=scratch)
+    recording = read_parts(group.paths, options, progress=progress, scratch=scratch)
+    source = {**recording.source, "path": group.paths[0], "parts": list(group.parts)}
+    return dataclasses.replace(recording, source=source)
+
+
+def _read_run(
+    paths: list[str], options: ReadOptions | None, progress: Progress | None, scratch: Path | None
+) -> Recording:
+    """Read the parts of one run.
+
+    Raises:
+        InputError: they are none, or parts of several.
+    """
+    if not paths:
+        raise InputError("no recording is named")
+    share = share_progress(progress, 0, 2)  # each part is read twice
+    groups = group_inputs(paths, options, progress=share, scratch=scratch)
+    if len(groups) > 1:
+        what = f"is no part of the same run as {groups[0].paths[0]}: {groups[1].why}"
+        hint = "sessions are read one by one"
+        raise InputError(what, where=groups[1].paths[0], hint=hint)
+    share = share_progress(progress, 1, 2) if len(paths) > 1 else progress
+    return read_group(groups[0], options, progress=share, scratch=scratch)
 
 
 def read_poses(

@@ -68,6 +68,7 @@ def select_time(recording: Recording, window: TimeWindow, where: str = "") -> Re
         ),
         beam_time=None if recording.beam_time is None else recording.beam_time[beams],
         images=window.select_images(recording.images),
+        record=None if recording.record is None else recording.record[rows],
         source={**recording.source, **window.notes()},
     )
 

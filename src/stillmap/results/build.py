@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from stillmap.results.result import BuiltResult
 
 
 def build(
-    recording: Recording | str | os.PathLike[str],
+    recording: Recording | str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     options: Options | Mapping[str, Any] | None = None,
     *,
     resolution: float | None = None,
@@ -36,7 +36,8 @@ def build(
     Models of a 3D recording are made by `stillmap.build_models`.
 
     Args:
-        recording: a `Recording`, or the path of one in any format that `stillmap.read` reads.
+        recording: a `Recording`, or the path of one in any format that `stillmap.read` reads, or
+            the paths of the parts of one run.
         options: `Options`, or the options to change, as in `{"em.prior": 0.8, "threads": 1}`;
             `stillmap config` prints all of them. None: the defaults.
         resolution: metres, edge of a map cell, in 3D of a voxel; None: as the options say.

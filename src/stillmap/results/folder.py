@@ -1,6 +1,8 @@
 """A result folder opened again: its `run.json`, its recording and its labels."""
 
 import json
+import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,6 +17,7 @@ from stillmap.core.recording import Recording
 from stillmap.core.region import Region
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io import read
+from stillmap.io.parts.reading import read_parts
 from stillmap.io.text_lines import Progress
 from stillmap.io.trajectory import poses_from_tum
 from stillmap.mesh.options import MeshOptions
@@ -69,14 +72,21 @@ class ResultFolder(ShortRepr):
     Attributes:
         folder: where it lies.
         record: its run.json.
-        source: where its recording is.
+        source: where its recording is; of one in parts, where the first is.
         source_given: whether the user named the recording.
+        parts: where the parts of its recording are, in order of time; empty: it is whole.
     """
 
     folder: Path
     record: dict[str, Any]
     source: Path
     source_given: bool
+    parts: tuple[Path, ...] = ()
+
+    @property
+    def sources(self) -> tuple[Path, ...]:
+        """Where its recording is, or all parts of it."""
+        return self.parts or (self.source,)
 
     @property
     def options(self) -> Options:
@@ -166,9 +176,10 @@ class ResultFolder(ShortRepr):
         Raises:
             InputError: it is not there any more.
         """
-        if not self.source_given and not self.source.exists():
-            hint = "that is where it was when it was mapped: name it with recording=PATH"
-            raise InputError("does not exist", where=str(self.source), hint=hint)
+        for path in self.sources:
+            if not self.source_given and not path.exists():
+                hint = "that is where it was when it was mapped: name it with recording=PATH"
+                raise InputError("does not exist", where=str(path), hint=hint)
         return self.source
 
     def read(
@@ -185,7 +196,10 @@ class ResultFolder(ShortRepr):
         """
         read_as, labels = self.read_options, read_labels(self.folder)
         source = self.require_source()
-        recording = read(source, read_as, progress=progress, scratch=scratch)
+        if self.parts:
+            recording = read_parts(self.parts, read_as, progress=progress, scratch=scratch)
+        else:
+            recording = read(source, read_as, progress=progress, scratch=scratch)
         require_labelled(recording, labels, str(source))
         return recording, labels
 
@@ -277,18 +291,42 @@ def read_region(result: Path) -> Region | None:
     return ResultFolder(result, read_record(result), Path(), False).region
 
 
-def open_result(result: Path, recording: str | None = None) -> ResultFolder:
+def open_result(
+    result: Path, recording: str | Sequence[str | os.PathLike[str]] | None = None
+) -> ResultFolder:
     """A result folder; its recording is where `run.json` says, or at the path `recording`.
+
+    Args:
+        result: the folder.
+        recording: path, or those of all parts in order of time.
 
     Raises:
         InputError: it is none, or names no recording.
     """
     record = read_record(result)
-    path = recording or record["input"].get("path")
-    if not isinstance(path, str) or not path:
-        where, hint = str(result / RECORD), "name it with recording=PATH"
-        raise InputError("names no recording", where=where, hint=hint)
-    return ResultFolder(result, record, Path(path), bool(recording))
+    if recording:
+        paths = [recording] if isinstance(recording, str) else [os.fspath(one) for one in recording]
+    else:
+        paths = _find_paths(record["input"], str(result / RECORD))
+    parts = tuple(map(Path, paths)) if len(paths) > 1 else ()
+    return ResultFolder(result, record, Path(paths[0]), bool(recording), parts)
+
+
+def _find_paths(noted: dict[str, Any], where: str) -> list[str]:
+    """The paths of the recording in a record, or of its parts.
+
+    Raises:
+        InputError: there are none.
+    """
+    parts = noted.get("parts")
+    if isinstance(parts, list) and parts:
+        paths = [one.get("path") if isinstance(one, dict) else None for one in parts]
+    else:
+        paths = [noted.get("path")]
+    found = [path for path in paths if isinstance(path, str) and path]
+    if len(found) < len(paths):
+        raise InputError("names no recording", where=where, hint="name it with recording=PATH")
+    return found
 
 
 def read_record(result: Path) -> dict[str, Any]:

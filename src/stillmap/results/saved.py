@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -39,7 +40,8 @@ class SavedResult(Result):
         objects: tracks of what moved.
         labels: stamps, hits and P(static), memory-mapped.
         folder: its record.
-        source: the recording or its path, where it was given; None: as the record says.
+        source: the recording, its path or those of its parts, where it was given; None: as the
+            record says.
     """
 
     path: Path
@@ -48,7 +50,7 @@ class SavedResult(Result):
     objects: list[Track]
     labels: Labels
     folder: ResultFolder
-    source: Recording | str | None = None
+    source: Recording | str | Sequence[str | os.PathLike[str]] | None = None
 
     __repr__ = Result.__repr__
 
@@ -135,14 +137,14 @@ class SavedResult(Result):
 def load(
     path: str | os.PathLike[str],
     *,
-    recording: Recording | str | os.PathLike[str] | None = None,
+    recording: Recording | str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | None = None,
 ) -> SavedResult:
     """Open a result folder that `stillmap map` or `save` wrote.
 
     Args:
         path: the folder.
-        recording: what was mapped, or where it lies now; None: where it was then. It is read when
-            it is first used, say for `deskewed` or the table of beams.
+        recording: what was mapped, or where it lies now, all parts in order of time; None: where
+            it was then. It is read when it is first used, say for `deskewed` or the table of beams.
 
     Raises:
         InputError: there is no result, or a file of it is missing or damaged.

@@ -1,6 +1,7 @@
 """A tilting laser in the same bag as a level one."""
 
 import json
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.io import read, writers
 from stillmap.io.builder import ReadContext
-from stillmap.io.ros.reader import read_tilting
+from stillmap.io.ros.bag import open_bag
+from stillmap.io.ros.reader import read_tilting, read_tilting_parts
 from stillmap.preprocessing.options import ReadOptions
 from stillmap.sim import RigOptions, load_truth, scene_by_name, simulate_rig, write_rig
 from stillmap.sim.laser import compute_beam_angles
@@ -122,6 +124,24 @@ def test_not_used_for_the_map(rig, path):
     assert flat.n_scans == rig.horizontal.recording.n_scans
     (why,) = (t["why"] for t in flat.source["topics"] if t["topic"] == "/tilt_scan")
     assert "tilts" in why
+
+
+def test_a_bag_in_parts(path, tmp_path):
+    messages = Messages("cdr")
+    with closing(open_bag(path, None, trusted=True)) as whole:
+        content = [
+            (message.channel.topic, message.log_ns, (message.channel.type, message.raw))
+            for message in whole.messages({channel.topic for channel in whole.channels})
+        ]
+    half = len(content) // 2
+    parts = [
+        write_bag(tmp_path, "mcap", messages, part, name)
+        for name, part in (("a", content[:half]), ("b", content[half:]))
+    ]
+    found, wanted = read_tilting_parts(parts, TILT), read_tilting(path, TILT)
+    np.testing.assert_array_equal(found.stamp_ns, wanted.stamp_ns)
+    np.testing.assert_array_equal(found.points, wanted.points)
+    np.testing.assert_array_equal(found.T_base_sensor, wanted.T_base_sensor)
 
 
 def test_beams_without_transforms_are_unusable(rig, tmp_path):

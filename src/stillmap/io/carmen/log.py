@@ -2,6 +2,7 @@
 
 from array import array
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,11 +16,13 @@ from stillmap.io.carmen.messages import (
     SCAN_PARSERS,
     WRONG_COUNT,
     BadRecord,
+    OdometryLine,
     ScanConfig,
     ScanLine,
     parse_odom,
 )
-from stillmap.io.text_lines import Line, Progress, read_lines
+from stillmap.io.parts.repeats import RepeatFilter
+from stillmap.io.text_lines import Line, Progress, read_lines, share_progress
 from stillmap.preprocessing.options import ReadOptions
 from stillmap.preprocessing.time_window import TimeWindow
 
@@ -76,7 +79,11 @@ class LaserLog:
 
 
 class CarmenLog:
-    """The records of a CARMEN log."""
+    """The records of a CARMEN log, or of the parts of one.
+
+    Attributes:
+        repeats: recognises measurements that earlier parts hold already; None: there is one part.
+    """
 
     def __init__(self, window: TimeWindow) -> None:
         self._window = window
@@ -89,7 +96,8 @@ class CarmenLog:
         self.skipped = SkippedRecords()  # lines of unknown kind
         self.skipped_scans: dict[str, SkippedRecords] = {}  # by kind of line
         self.skipped_odometry = SkippedRecords()
-        self.n_lines = 0
+        self.n_lines = self.n_repeated = 0
+        self.repeats: RepeatFilter | None = None
         self._stamp_fields: dict[bytes, int] = {}
 
     def add(self, line: Line) -> None:
@@ -98,12 +106,11 @@ class CarmenLog:
         if line.damaged:
             self.skipped.add(DAMAGED_STREAM, line.number)
             return
-        text = line.text.removeprefix(BYTE_ORDER_MARK) if line.number == 1 else line.text
         if line.too_long:
             self.skipped.add(LONG_LINE, line.number)
-        elif text.lstrip().startswith(_COMMENT):
+        elif line.text.lstrip().startswith(_COMMENT):
             self.ignored["comments"] += 1
-        elif fields := text.split():
+        elif fields := line.text.split():
             self._add_record(line, fields[0], fields[1:])
 
     def _add_record(self, line: Line, name: bytes, fields: list[bytes]) -> None:
@@ -133,6 +140,9 @@ class CarmenLog:
         # a line without an end may have lost fields, or digits of its stamp, unnoticed
         if not line.ended and record.stamp_fields < self._stamp_fields.get(name, 1):
             raise BadRecord(CUT_LINE)
+        if self.repeats is not None and _is_repeated(self.repeats, name, record):
+            self.n_repeated += 1
+            return record.stamp_fields
         if isinstance(record, ScanLine):
             if not self._window.select(record.stamp_ns):
                 return record.stamp_fields
@@ -155,29 +165,54 @@ class CarmenLog:
 def read_log(
     path: Path, progress: Progress | None = None, window: TimeWindow | None = None
 ) -> CarmenLog:
-    """Read a CARMEN log, plain or gzip.
+    """Read a CARMEN log, plain or gzip; see `read_logs`."""
+    return read_logs([path], progress, window)
+
+
+def read_logs(
+    paths: Sequence[Path], progress: Progress | None = None, window: TimeWindow | None = None
+) -> CarmenLog:
+    """Read the parts of a CARMEN log, plain or gzip. Lines are counted through all parts.
 
     Args:
-        path: the file.
-        progress: called with the share of the file that is read, 0 to 1.
+        paths: the files, in order of time.
+        progress: called with the share of the files that is read, 0 to 1.
         window: selects the scans; None: all.
 
     Raises:
-        InputError: the file cannot be read, has millions of lines in a row without a record, or no
+        InputError: a file cannot be read, has millions of lines in a row without a record, or no
             scan in the window.
     """
     window = window or TimeWindow(ReadOptions())
     log = CarmenLog(window)
-    known = 0
+    if len(paths) > 1:
+        log.repeats = RepeatFilter()
+    for number, path in enumerate(paths):
+        if log.repeats is not None:
+            log.repeats.begin_part()
+        _add_file(log, path, share_progress(progress, number, len(paths)))
+    window.require_scans(str(paths[0]))
+    return log
+
+
+def _add_file(log: CarmenLog, path: Path, progress: Progress | None) -> None:
+    first, known = log.n_lines, log.records.total()
     for line in read_lines(path, progress):
-        log.add(line)
+        if line.number == 1:
+            line = line._replace(text=line.text.removeprefix(BYTE_ORDER_MARK))
+        log.add(line._replace(number=first + line.number))
         if line.number % _MAX_UNKNOWN_LINES == 0:
             before, known = known, log.records.total()
             if known == before:
                 what = f"has {_MAX_UNKNOWN_LINES} lines in a row that are no records"
                 raise InputError(what, where=f"{path}:{line.number}")
-    window.require_scans(str(path))
-    return log
+
+
+def _is_repeated(repeats: RepeatFilter, name: bytes, record: ScanLine | OdometryLine) -> bool:
+    """Whether an earlier part has the measurement; the time of logging may be another."""
+    values = record.ranges if isinstance(record, ScanLine) else record.pose
+    stamp = str(record.stamp_ns).encode()
+    return repeats.is_repeated(record.stamp_ns, name, stamp, array("d", values).tobytes())
 
 
 def param_number(params: dict[str, str], name: str) -> float | None:

@@ -1,5 +1,6 @@
 """Reads CARMEN logs (`.log`, `.clf`, plain or gzip) as recordings."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,34 +15,66 @@ from stillmap.io import trajectory
 from stillmap.io.builder import ReadContext
 from stillmap.io.carmen import extrinsics
 from stillmap.io.carmen.extrinsics import Extrinsics
-from stillmap.io.carmen.log import CarmenLog, Sensor, read_log, scan_order, select_scans
+from stillmap.io.carmen.log import CarmenLog, Sensor, read_logs, scan_order, select_scans
 from stillmap.io.carmen.messages import SCAN_PARSERS, flaser_config
-from stillmap.io.text_lines import is_gzip
+from stillmap.io.text_lines import Line, is_gzip, read_head
 from stillmap.preprocessing import max_range
 from stillmap.preprocessing.options import LaserOptions, ReadOptions
 from stillmap.preprocessing.time_window import TimeWindow
+
+_HEAD = 1 << 18  # bytes with the PARAM lines of a log
 
 _Beams = tuple[NDArray[np.float32], NDArray[np.bool_]]  # points (..., 2) in the sensor frame, hits
 
 
 def read(path: Path, context: ReadContext) -> Recording:
-    """Read a CARMEN log.
+    """Read a CARMEN log; see `read_parts`."""
+    return read_parts([path], context)
+
+
+def read_parts(
+    paths: Sequence[Path], context: ReadContext, others: Sequence[Path] = ()
+) -> Recording:
+    """Read the parts of a CARMEN log as one.
 
     Bad records are counted in `source["skipped"]` (scans) and `source["skipped_odometry"]`, by
-    reason and with line numbers.
+    reason and with line numbers, which count through all parts.
+
+    Args:
+        paths: the files, in order of time.
+        context: see ReadContext.
+        others: files that may be further parts: PARAM lines are in the first part alone, so that
+            one without any takes those of another.
 
     Raises:
-        InputError: the file cannot be read or holds no usable scan.
+        InputError: a file cannot be read, or they hold no usable scan.
     """
+    path = paths[0]
     window = TimeWindow(context.options)
-    log = read_log(path, context.progress, window)
+    log = read_logs(paths, context.progress, window)
+    if others and not log.params:
+        log.params = _find_params(others)
     sensors, notes = select_scans(log)
     if not sensors:
         raise _no_scan_error(path, log)
     recording = _build_recording(sensors, log, context.options)
     recording.source.update(path=str(path), format="carmen", gzip=is_gzip(path))
+    if log.n_repeated:
+        notes.append(f"{log.n_repeated} lines that earlier parts hold already")
     recording.source.update(duplicates=notes, **window.notes())
     return recording
+
+
+def _find_params(paths: Sequence[Path]) -> dict[str, str]:
+    """The PARAMs at the beginning of the first file that has any."""
+    for path in paths:
+        log = CarmenLog(TimeWindow(ReadOptions()))
+        for text in read_head(path, _HEAD).splitlines():
+            if text.startswith(b"PARAM"):
+                log.add(Line(1, text))
+        if log.params:
+            return log.params
+    return {}
 
 
 def _no_scan_error(path: Path, log: CarmenLog) -> InputError:

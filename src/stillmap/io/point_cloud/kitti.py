@@ -1,6 +1,7 @@
 """KITTI folders: odometry sequences (`velodyne/`, `times.txt`), raw drives, and their poses."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -14,7 +15,8 @@ from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_folder
 from stillmap.core.recording import Recording
 from stillmap.core.timestamps import format_seconds
-from stillmap.io.builder import ReadContext
+from stillmap.io.builder import ReadContext, part_context
+from stillmap.io.parts.joining import join_recordings
 from stillmap.io.point_cloud import kitti_cameras
 from stillmap.io.point_cloud.binary_table import iter_text_lines, parse_numbers, truncated_error
 from stillmap.io.point_cloud.files import (
@@ -30,7 +32,9 @@ from stillmap.io.point_cloud.files import (
 )
 from stillmap.io.point_cloud.kitti_cameras import Calibration, find_images
 from stillmap.io.point_cloud.scans import Cloud, CloudSource, DatasetInfo, build_recording, reject
+from stillmap.preprocessing.overrides import select_time
 from stillmap.preprocessing.scan_timing import STAMP_AZIMUTH_KEY, add_beam_times
+from stillmap.preprocessing.time_window import TimeWindow
 
 Poses = list[NDArray[np.float64]]
 
@@ -156,6 +160,34 @@ def read(path: Path, context: ReadContext) -> Recording:
     Raises:
         InputError: there are no stamps, or no scan can be read.
     """
+    return _add_times(_read_untimed(path, context), path, context)
+
+
+def read_parts(
+    paths: Sequence[Path],
+    context: ReadContext,
+    others: Sequence[Path] = (),  # noqa: ARG001
+) -> Recording:
+    """Read pieces of a drive, in order of time, as one; see `read`."""
+    parts = (
+        _read_untimed(path, part_context(context, number, len(paths)))
+        for number, path in enumerate(paths)
+    )
+    joined = join_recordings(parts, [str(path) for path in paths], context.scratch)
+    window = TimeWindow(context.options)
+    recording = select_time(joined, window, str(paths[0])) if window else joined
+    return _add_times(recording, paths[0], context)
+
+
+def _add_times(recording: Recording, path: Path, context: ReadContext) -> Recording:
+    """Add times of beams, by the rate of all scans."""
+    spin = context.options.spin
+    direction = "clockwise" if spin == "auto" and _find_layout(path)[0] == _RAW else spin
+    source = {**recording.source, STAMP_AZIMUTH_KEY: _STAMP_AZIMUTH}
+    return add_beam_times(replace(recording, source=source), direction)
+
+
+def _read_untimed(path: Path, context: ReadContext) -> Recording:
     scans, times_file = _find_layout(path)
     files = list_scans(path)
     if not files:
@@ -179,11 +211,7 @@ def read(path: Path, context: ReadContext) -> Recording:
         if stamp_ns is None:
             read_cloud = partial(reject, file, "has no stamp")
         sources.append(CloudSource(file.name, read_cloud, stamp_ns))
-    recording = build_recording(sources, info, context, images=images)
-    spin = context.options.spin
-    direction = "clockwise" if spin == "auto" and scans == _RAW else spin
-    source = {**recording.source, STAMP_AZIMUTH_KEY: _STAMP_AZIMUTH}
-    return add_beam_times(replace(recording, source=source), direction)
+    return build_recording(sources, info, context, images=images)
 
 
 def _read_scan(path: Path, T: NDArray[np.float64] | None) -> Cloud:

@@ -1,7 +1,7 @@
 """Opens bags of every kind, detected by their first bytes."""
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -10,6 +10,7 @@ import yaml
 from stillmap.core.errors import InputError
 from stillmap.core.files import require_regular
 from stillmap.io.builder import SkippedRecords
+from stillmap.io.parts.repeats import RepeatFilter
 from stillmap.io.ros import damaged_bag, indexed_bag
 from stillmap.io.ros.bag_types import (
     BAG1_MAGIC,
@@ -50,15 +51,35 @@ def open_bag(path: Path, scratch: Path | None, *, trusted: bool) -> Bag:
     """
     if not path.is_dir():
         return _open_file(path, scratch, trusted)
+    bags = _open_all(_list_files(path), partial(_open_file, scratch=scratch, trusted=trusted))
+    return JoinedBag(bags, f"ROS 2 folder ({bags[0].kind})")
+
+
+def open_parts(paths: Sequence[Path], scratch: Path | None, *, trusted: bool) -> Bag:
+    """Open the parts of one run as one bag, in which no message comes twice.
+
+    Args:
+        paths: in order of time; see `open_bag` for the rest.
+
+    Raises:
+        DamagedBagError, InputError: see `open_bag`.
+    """
+    if len(paths) == 1:
+        return open_bag(paths[0], scratch, trusted=trusted)
+    bags = _open_all(paths, partial(open_bag, scratch=scratch, trusted=trusted))
+    return JoinedBag(bags, ", ".join(dict.fromkeys(bag.kind for bag in bags)), repeats=True)
+
+
+def _open_all(paths: Sequence[Path], open_one: Callable[[Path], Bag]) -> list[Bag]:
     bags: list[Bag] = []
     try:
-        for file in _list_files(path):
-            bags.append(_open_file(file, scratch, trusted))
+        for path in paths:
+            bags.append(open_one(path))
     except BaseException:
         for bag in bags:
             bag.close()
         raise
-    return _JoinedBag(bags)
+    return bags
 
 
 def bag_size(path: Path) -> int:
@@ -115,13 +136,23 @@ def _list_files(folder: Path) -> list[Path]:
     return paths or present
 
 
-class _JoinedBag:
-    """The files of a folder as one bag; equal channels become one."""
+class JoinedBag:
+    """Several bags as one; equal channels become one.
 
-    def __init__(self, bags: list[Bag]) -> None:
-        self._bags = bags
+    Args:
+        bags: in order of time.
+        kind: readable name.
+        repeats: whether a bag may begin with messages of the one before, which are left out.
+
+    Attributes:
+        repeated: number of messages that `messages` has left out so far.
+    """
+
+    def __init__(self, bags: list[Bag], kind: str, *, repeats: bool = False) -> None:
+        self._bags, self._repeats = bags, repeats
         self.damage = SkippedRecords().merge(*(bag.damage for bag in bags))
-        self.kind = f"ROS 2 folder ({bags[0].kind})"
+        self.kind = kind
+        self.repeated = 0
         self._channels: dict[tuple[str, str, str, str], Channel] = {}
         for bag in bags:
             for channel in bag.channels:
@@ -133,11 +164,20 @@ class _JoinedBag:
         self.channels = list(self._channels.values())
 
     def messages(self, topics: set[str], since_ns: int | None = None) -> Iterator[Message]:
+        """See `Bag`."""
+        known = RepeatFilter()
         for bag in self._bags:
+            known.begin_part()
             for message in bag.messages(topics, since_ns):
-                yield message._replace(channel=self._channels[_identity(message.channel)])
+                channel = self._channels[_identity(message.channel)]
+                content = channel.topic.encode(), b"\0", message.raw
+                if self._repeats and known.is_repeated(message.log_ns, *content):
+                    self.repeated += 1
+                    continue
+                yield message._replace(channel=channel)
 
     def close(self) -> None:
+        """See `Bag`."""
         for bag in self._bags:
             bag.close()
 

@@ -1,7 +1,7 @@
 """Reads ROS bags as recordings, without ROS."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -15,11 +15,12 @@ from stillmap.core.recording import Recording
 from stillmap.core.timestamps import longest_non_decreasing
 from stillmap.io.builder import ReadContext, SkippedRecords
 from stillmap.io.ros import base_frame
-from stillmap.io.ros.bag import bag_size, open_bag
+from stillmap.io.ros.bag import JoinedBag, bag_size, open_parts
 from stillmap.io.ros.bag_types import Bag, DamagedBagError
 from stillmap.io.ros.collect import BagContent, collect_messages, select_topics
 from stillmap.io.ros.laser_recording import build_laser_recording, build_tilting_recording
 from stillmap.io.ros.laser_scan import TIME_BACKWARDS
+from stillmap.io.ros.lent_transforms import lend_transforms
 from stillmap.io.ros.limits import limit_output
 from stillmap.io.ros.point_cloud2 import CloudCollector
 from stillmap.preprocessing.options import ReadOptions
@@ -29,25 +30,36 @@ _BuildFromLasers = Callable[[BagContent, ReadContext], Recording]
 _STILL = 1e-3  # m and entries of a rotation matrix: a sensor that moves less is fixed
 
 
-def read(
-    path: Path, context: ReadContext, build: _BuildFromLasers = build_laser_recording
+def read(path: Path, context: ReadContext) -> Recording:
+    """Read a bag: ROS 1, or a file or folder of ROS 2; see `read_parts`."""
+    return read_parts([path], context)
+
+
+def read_parts(
+    paths: Sequence[Path],
+    context: ReadContext,
+    others: Sequence[Path] = (),
+    build: _BuildFromLasers = build_laser_recording,
 ) -> Recording:
-    """Read a bag: ROS 1, or a file or folder of ROS 2.
+    """Read bags that are parts of one run as one.
 
     Bad messages are skipped and counted. A bag that is cut, damaged or without an index is read
     from the front as far as it goes.
 
     Args:
-        path: of the bag.
+        paths: of the bags, in order of time.
         context: see ReadContext.
+        others: bags that may be further parts: recorders write static transforms into the first
+            part alone, so that one without any takes those of the part before.
         build: builds the recording of laser scans.
 
     Raises:
-        InputError: it cannot be read, or holds no usable scan.
+        InputError: one cannot be read, or they hold no usable scan.
     """
-    damage, size = "", bag_size(path)
+    path = paths[0]
+    damage, size = "", sum(bag_size(one) for one in (*paths, *others))
     for trusted in (True, False):
-        reopen = partial(open_bag, path, context.scratch, trusted=trusted)
+        reopen = partial(_open, paths, others, context.scratch, trusted=trusted)
         try:
             with limit_output(size), closing(reopen()) as bag:
                 recording = _build_recording(bag, context, reopen, build)
@@ -71,18 +83,30 @@ def read(
     raise InputError(f"is damaged: {damage}", where=str(path))
 
 
+def _open(
+    paths: Sequence[Path], others: Sequence[Path], scratch: Path | None, *, trusted: bool
+) -> Bag:
+    bag = open_parts(paths, scratch, trusted=trusted)
+    return lend_transforms(bag, others, scratch) if others else bag
+
+
 def read_tilting(path: Path, context: ReadContext) -> Recording:
+    """Read the scans of a tilting laser; see `read_tilting_parts`."""
+    return read_tilting_parts([path], context)
+
+
+def read_tilting_parts(paths: Sequence[Path], context: ReadContext) -> Recording:
     """Read the scans of a laser that tilts or pans as 3D points, by the bag's transform tree.
 
     Args:
-        path: of the bag.
+        paths: of the bag, or of its parts in order of time.
         context: the option `topic` names the scans, or clouds made from them; `base_frame` the
             robot.
 
     Raises:
         InputError: it cannot be read, or transforms do not say how the laser moves.
     """
-    return read(path, context, build_tilting_recording)
+    return read_parts(paths, context, build=build_tilting_recording)
 
 
 def _build_recording(
@@ -101,6 +125,9 @@ def _build_recording(
         skipped_odometry=content.skipped_odometry.to_dict(),
         **content.window.notes(),
     )
+    if isinstance(bag, JoinedBag) and bag.repeated:
+        text = f"{bag.repeated} messages that earlier parts hold already"
+        recording.source["duplicates"].append(text)
     return recording
 
 

@@ -1,0 +1,56 @@
+"""Which inputs of a command are parts of one run, and what is done with sessions."""
+
+import argparse
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+
+from stillmap.cli.console import show_share
+from stillmap.core.errors import InputError
+from stillmap.io.parts.reading import InputGroup, group_inputs
+from stillmap.preprocessing.options import ReadOptions
+
+_MERGE = "stillmap.cli.merge"
+_FOR_ONE_RUN = ("tilting", "tilting_topic", "poses")  # flags of `map` that need one recording
+
+
+def find_groups(
+    args: argparse.Namespace, options: ReadOptions, scratch: Path | None
+) -> list[InputGroup]:
+    """Group the inputs of a command; a single one is not read.
+
+    Raises:
+        InputError: one of several cannot be read.
+    """
+    with show_share(args.quiet, "comparing the inputs") as progress:
+        return group_inputs(args.input, options, progress=progress, scratch=scratch)
+
+
+def merge_sessions(args: argparse.Namespace, groups: list[InputGroup]) -> int:
+    """Map sessions and merge them, each a recording or the parts of one.
+
+    Raises:
+        InputError: a flag is for one recording, or sessions cannot be merged.
+    """
+    for name in _FOR_ONE_RUN:
+        if getattr(args, name) is not None:
+            what = f"--{name.replace('_', '-')} is for one recording: {describe_sessions(groups)}"
+            raise InputError(what)
+    if find_spec(_MERGE) is None:
+        hint = "map them one by one"
+        raise InputError(f"cannot merge sessions: {describe_sessions(groups)}", hint=hint)
+    merge = import_module(_MERGE)
+    status: int = merge.merge_groups(args, [list(group.paths) for group in groups])
+    return status
+
+
+def describe_sessions(groups: list[InputGroup]) -> str:
+    """Why the groups are sessions, in one sentence."""
+    return f"these are {len(groups)} sessions, {groups[1].why}"
+
+
+def describe_group(group: InputGroup) -> str:
+    """The inputs of a group and why they belong together, or why one stands alone."""
+    if group.kind == "parts":
+        return f"{', '.join(group.paths)}: parts of one run: {group.why}"
+    return f"{group.paths[0]}: a session of its own: {group.why}"

@@ -1,0 +1,247 @@
+"""Several inputs of one command: parts of one run are joined, sessions are told apart."""
+
+import json
+import shlex
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from refusals import refused
+
+import stillmap
+from stillmap.core.errors import InputError
+from stillmap.io import read, writers
+from stillmap.pipeline import result
+from stillmap.pipeline.checkpoint_files import identify_run
+from stillmap.pipeline.em_loop import iterate
+from stillmap.pipeline.inputs import read as read_run
+from stillmap.preprocessing.options import ReadOptions
+from stillmap.preprocessing.overrides import select_time
+from stillmap.preprocessing.time_window import TimeWindow
+
+QUICK = ("--set", "em.max_iterations=1", "--quiet")
+CUTS = ((0, 13), (14, 24), (25, 39))  # scans of the room
+
+
+def cut_folder(room, folder):
+    """The room in three recording folders, a little out of order."""
+    whole = read(room)
+    seconds = (whole.stamp_ns - whole.stamp_ns[0]) / 1e9
+    out = []
+    for number, (first, last) in enumerate(CUTS):
+        window = TimeWindow(ReadOptions(start=seconds[first] or None, end=seconds[last]))
+        path = folder / f"part_{number}"
+        part = select_time(whole, window)
+        source = {key: value for key, value in part.source.items() if key != "part"}
+        writers.write(replace(part, source=source), path)
+        out.append(path)
+    return [out[k] for k in (2, 0, 1)]
+
+
+def cut_log(room, folder):
+    """The room as a CARMEN log, and its lines in two files, as a recorder splits them."""
+    whole = folder / "whole.log"
+    writers.write(read(room), whole)
+    lines = whole.read_text().splitlines(keepends=True)
+    half = len(lines) // 2
+    (folder / "log_0.log").write_text("".join(lines[:half]))
+    (folder / "log_1.log").write_text("".join(lines[half:]))
+    return whole, [folder / "log_1.log", folder / "log_0.log"]
+
+
+@pytest.fixture
+def day_after(room, tmp_path):
+    """Another recording of the room, a day later."""
+    recording = read(room)
+    path = tmp_path / "tuesday"
+    later = recording.stamp_ns + 86400 * 10**9
+    writers.write(replace(recording, stamp_ns=later), path)
+    return path
+
+
+def contents(folder):
+    """All files but the record and the report, which name the inputs and times."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.name not in ("run.json", "report.html")
+    }
+
+
+@pytest.mark.parametrize("form", ["folder", "log"])
+def test_the_map_of_parts_is_that_of_the_whole(call, room, tmp_path, form):
+    if form == "folder":
+        whole, parts = room, cut_folder(room, tmp_path)
+    else:
+        whole, parts = cut_log(room, tmp_path)
+    assert call("map", whole, "-o", tmp_path / "a", *QUICK).returncode == 0
+    done = call("map", *parts, "-o", tmp_path / "b", *QUICK)
+    assert done.returncode == 0, done.stderr
+    assert contents(tmp_path / "a") == contents(tmp_path / "b")
+    one, other = (json.loads((tmp_path / name / "run.json").read_text())["input"] for name in "ab")
+    assert "parts" not in one
+    assert sum(part["scans"] for part in other["parts"]) == 40
+    starts = [part["first_stamp_ns"] for part in other["parts"]]
+    assert starts == sorted(starts)
+    assert other["path"] == other["parts"][0]["path"]
+
+
+@pytest.fixture
+def mapped_parts(call, room, tmp_path):
+    parts = cut_folder(room, tmp_path)
+    done = call("map", *parts, "-o", tmp_path / "out", *QUICK)
+    assert done.returncode == 0, done.stderr
+    return tmp_path / "out", parts
+
+
+def test_a_result_of_parts_finds_them_again(call, room, mapped_parts, tmp_path):
+    out, parts = mapped_parts
+    whole, loaded = read(room), stillmap.load(out)
+    np.testing.assert_array_equal(loaded.recording.points, whole.points)
+    kept = loaded.hit & ~(loaded.p_static < 0.5)
+    for name in ("clean", "clean.clf", "clean.mcap"):
+        done = call("filter", out, "-o", tmp_path / name, "--json", "--quiet")
+        assert done.returncode == 0, done.stderr
+        assert len(json.loads(done.stdout)["parts"]) == 3
+        filtered = read(tmp_path / name)
+        np.testing.assert_array_equal(filtered.stamp_ns, whole.stamp_ns)
+        assert filtered.hit.sum() == kept.sum()
+    assert call("convert", out, "-o", tmp_path / "out.mcap", "--quiet").returncode == 0
+    in_order = [parts[k] for k in (1, 2, 0)]
+    moved = [path.rename(path.with_name(f"moved_{path.name}")) for path in in_order]
+    refused(call("filter", out, "-o", tmp_path / "again"), parts[1], "does not exist", "--input")
+    again = stillmap.load(out, recording=moved)
+    np.testing.assert_array_equal(again.recording.points, whole.points)
+    done = call("filter", out, "-o", tmp_path / "again", "--input", room, "--quiet")
+    assert done.returncode == 0, done.stderr
+    with pytest.raises(InputError, match="is not the recording that was mapped"):
+        _ = stillmap.load(out, recording=moved[:1]).recording
+
+
+def test_filter_refuses_to_write_into_a_part(call, mapped_parts):
+    out, parts = mapped_parts
+    for part in parts:
+        done = call("filter", out, "-o", part, "--overwrite")
+        refused(done, part, "is the recording itself")
+
+
+def test_the_window_counts_from_the_start_of_the_whole(call, room, tmp_path):
+    window = ("--from", "1.5", "--to", "4")
+    parts = cut_folder(room, tmp_path)
+    assert call("map", room, "-o", tmp_path / "a", *window, *QUICK).returncode == 0
+    done = call("map", *parts, "-o", tmp_path / "b", *window, *QUICK)
+    assert done.returncode == 0, done.stderr
+    assert contents(tmp_path / "a") == contents(tmp_path / "b")
+    np.testing.assert_array_equal(
+        stillmap.load(tmp_path / "b").recording.points,
+        stillmap.load(tmp_path / "a").recording.points,
+    )
+
+
+def test_given_poses_are_those_of_all_parts(call, room, tmp_path):
+    parts = cut_folder(room, tmp_path)
+    assert call("map", room, "-o", tmp_path / "a", *QUICK).returncode == 0
+    poses = tmp_path / "a" / "trajectory.tum"
+    done = call("map", *parts, "-o", tmp_path / "b", "--poses", poses, *QUICK)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "b" / "trajectory.tum").read_bytes() == poses.read_bytes()
+
+
+def test_an_interrupted_run_of_parts_continues(call, room, tmp_path, monkeypatch):
+    def stopped(*args, **how):
+        yield next(iterate(*args, **how))
+        raise KeyboardInterrupt
+
+    words = ("--set", "em.max_iterations=2", "--set", "em.tolerance=0", "--set", "em.patience=9")
+    words += ("--set", "em.label_tolerance=0")
+    parts = cut_folder(room, tmp_path)
+    assert call("map", room, "-o", tmp_path / "a", *words).returncode == 0
+    with monkeypatch.context() as patch:
+        patch.setattr(result, "iterate", stopped)
+        done = call("map", *parts, "-o", tmp_path / "b", *words)
+    assert done.returncode == 130
+    told = done.stderr.partition("continue after iteration 1: stillmap ")[2].partition("\n")[0]
+    assert all(str(part) in told for part in parts)
+    fewer = call("map", *parts[1:], "-o", tmp_path / "b", *words, "--resume", "--quiet")
+    refused(fewer, "cannot be resumed", "another recording")
+    done = call(*shlex.split(told))
+    assert done.returncode == 0, done.stderr
+    assert "continues after iteration 1" in done.stderr
+    assert f"parts of one run: {parts[2]} begins" in done.stderr
+    assert contents(tmp_path / "a") == contents(tmp_path / "b")
+
+
+def test_a_run_is_identified_by_all_its_parts(room, tmp_path):
+    parts = cut_folder(room, tmp_path)
+    options = stillmap.Options()
+    whole, joined, fewer = (
+        identify_run(read_run(paths), options, None) for paths in (room, parts, parts[:0:-1])
+    )
+    assert whole == joined != fewer
+
+
+def test_python_takes_a_list(room, tmp_path):
+    parts = cut_folder(room, tmp_path)
+    built = stillmap.build(parts, {"em.max_iterations": 1}, resolution=0.2)
+    assert built.recording.n_scans == 40
+    assert repr(stillmap.read([room])) == repr(stillmap.read(room))
+
+
+def test_info_says_what_belongs_together(call, room, day_after, tmp_path):
+    parts = cut_folder(room, tmp_path)
+    done = call("info", *parts, day_after)
+    assert done.returncode == 0, done.stderr
+    first, rest = done.stdout.split("\n", 1)
+    in_order = ", ".join(str(parts[k]) for k in (1, 2, 0))
+    assert first.startswith(f"{in_order}: parts of one run: {parts[2]} begins 0.")
+    assert "odometry 0." in first
+    assert rest.count("after " + str(parts[0]) + " ends") == 1
+    assert f"{day_after}: a session of its own: " in rest
+    assert "scans             40 with 120 beams each" in rest
+    found = json.loads(call("info", *parts, day_after, "--json").stdout)
+    assert [group["kind"] for group in found["groups"]] == ["parts", "recording"]
+    assert found["groups"][0]["inputs"] == [str(parts[k]) for k in (1, 2, 0)]
+    assert found["groups"][1]["why"].endswith("24.0 h after " + str(parts[0]) + " ends")
+    assert [one["scans"] for one in found["recordings"]] == [40, 40]
+    one = json.loads(call("info", *parts, "--json").stdout)
+    assert one["scans"] == 40
+    assert [part["scans"] for part in one["parts"]] == [14, 11, 15]
+    assert len(one["groups"]) == 1
+
+
+def test_sessions_are_not_joined(call, room, day_after, tmp_path, nothing_left, monkeypatch):
+    monkeypatch.setattr("stillmap.cli.groups.find_spec", lambda name: None)  # noqa: ARG005
+    done = call("map", room, day_after, "-o", tmp_path / "out", *QUICK)
+    refused(done, "these are 2 sessions", f"{day_after} begins 24.0 h after")
+    done = call("map", room, day_after, "-o", tmp_path / "out", "--poses", "a.tum", *QUICK)
+    refused(done, "--poses is for one recording")
+    nothing_left("tuesday")
+
+
+def test_sessions_and_their_parts_are_merged(call, room, day_after, tmp_path, monkeypatch):
+    taken = []
+
+    class Merge:
+        @staticmethod
+        def merge_groups(args, groups):
+            taken.append((args.output, groups))
+            return 0
+
+    monkeypatch.setattr("stillmap.cli.groups.find_spec", lambda name: name)
+    monkeypatch.setattr("stillmap.cli.groups.import_module", lambda name: Merge)  # noqa: ARG005
+    parts = cut_folder(room, tmp_path)
+    done = call("map", parts[0], day_after, *parts[1:], "-o", tmp_path / "out", *QUICK)
+    assert done.returncode == 0, done.stderr
+    in_order = [str(parts[k]) for k in (1, 2, 0)]
+    assert taken == [(str(tmp_path / "out"), [in_order, [str(day_after)]])]
+
+
+def test_inputs_that_cannot_be_read(call, room, tmp_path, nothing_left):
+    done = call("map", room, tmp_path / "gone.bag", "-o", tmp_path / "out")
+    refused(done, tmp_path / "gone.bag", "does not exist")
+    (tmp_path / "notes.txt").write_text("no recording")
+    done = call("info", room, tmp_path / "notes.txt")
+    refused(done, tmp_path / "notes.txt")
+    done = call("map", room, room.parent, "-o", room.parent, "--overwrite")
+    refused(done)
+    nothing_left("notes.txt")
