@@ -100,6 +100,7 @@ def _suggest(word: str, known: Iterable[str]) -> str:
 
 COMMANDS = {
     "map": "the main job: recording in, folder out",
+    "merge": "sessions of one place into one map with dated changes",
     "info": "what is in a recording",
     "view": "look at a result",
     "filter": "the recording without dynamic beams, for other mapping programs",
@@ -113,6 +114,7 @@ COMMANDS = {
 _COMMANDS_EPILOG = """examples:
   stillmap info log.clf.gz              what is in a recording
   stillmap map log.clf.gz -o out        map it
+  stillmap merge mon tue -o place       sessions of one place into one map
   stillmap view out                     look at the map and the report
   stillmap filter out -o clean.clf      the recording without dynamic beams
   stillmap convert log.bag -o log.mcap  one format to another

@@ -171,7 +171,7 @@ def _search_view(
 ) -> list[tuple[Float, float]]:
     """Poses (3, 3) of a view in the map, and the share of it that the map explains at each."""
     few = points[spread_evenly(len(points), _SEARCHED_POINTS)]
-    best, _, alternatives = _register(grid, few, se2.matrix(float(centre[0]), float(centre[1]), 0.0), half)
+    best, _, alternatives = _register(grid, few, se2.matrix(centre[0], centre[1], 0.0), half)
     x = se2.parameters(best)
     dx, dy, turn = (x + alternatives[:, :3]).T
     starts = se2.matrix(dx, dy, turn)

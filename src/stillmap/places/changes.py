@@ -175,7 +175,7 @@ def _pair_positions(changes: list[PlaceChange], place: PlaceStates) -> list[Plac
 def _compare_positions(
     gone: PlaceChange, came: PlaceChange, place: PlaceStates
 ) -> tuple[Kind | None, float]:
-    """What two positions are: a door, one object that moved, or nothing; the less cost the surer."""
+    """What two positions are: a door, one object that moved, or nothing; and the cost of that."""
     gap = np.maximum(np.maximum(gone.low - came.high, came.low - gone.high), 0.0)
     union = np.union1d(gone.cells, came.cells)
     if np.linalg.norm(gap) <= _DOOR_DISTANCE:

@@ -1,11 +1,12 @@
 """The map of a place in the plane: what stands in the shown state, and what beams passed."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.tiles import TILE, Layer, TiledArray, compact, crop
+from stillmap.core.tiles import TILE, TiledArray, compact, crop
 from stillmap.em import OccupancyMap
 from stillmap.places.evidence import Evidence
 from stillmap.places.place_states import MIN_HITS, Tile, iter_tiles
@@ -44,11 +45,9 @@ def make_place_map(sessions: Sequence[Evidence], shown: ShownState) -> Occupancy
     return OccupancyMap(p_occupied, (x, y, 0.0), resolution, alpha, beta)
 
 
-def _crop(layer: TiledArray, block: tuple[slice, slice]) -> Layer:
-    """The part of a layer as an array; the whole layer where it is too large for one."""
-    small = compact(layer)
-    # the origin of a large layer would not fit its crop: keep it whole
-    return crop(small, block)
+def _crop(layer: TiledArray, block: tuple[slice, slice]) -> Any:
+    """The part of a layer as an array."""
+    return crop(compact(layer), block)
 
 
 def _split_by_tile(

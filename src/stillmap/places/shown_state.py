@@ -34,9 +34,7 @@ class ShownState(ShortRepr):
     support: NDArray[np.float32]
 
 
-def show_state(
-    place: PlaceStates, changes: list[PlaceChange], limit: int | None
-) -> ShownState:
+def show_state(place: PlaceStates, changes: list[PlaceChange], limit: int | None) -> ShownState:
     """The state of a place as of a session.
 
     Args:
@@ -55,17 +53,18 @@ def show_state(
     p_shown = np.where(unchanged, np.maximum(p_shown, states.p_static), p_shown)
     p_shown[_noise_of_static(place, changes)] = 1.0
     total = place.evidence.sum(axis=1, keepdims=True) - place.evidence
-    support = np.where(states.p_static[:, None] > _MIN_P_STATIC, np.clip(total, 0.0, _MAX_SUPPORT), 0.0)
+    support = np.where(
+        states.p_static[:, None] > _MIN_P_STATIC, np.clip(total, 0.0, _MAX_SUPPORT), 0.0
+    )
     return ShownState(place, p_shown, support.astype(np.float32))
 
 
 def _last_observed(observed: NDArray[np.bool_], limit: int) -> Index:
     """(K,) the last session up to `limit` that observed each cell, else the first one after."""
-    K, S = observed.shape
     before = observed[:, : limit + 1]
     last = limit - np.argmax(before[:, ::-1], axis=1)
     first_after = np.argmax(observed, axis=1)
-    return np.where(before.any(axis=1), last, first_after)
+    return np.asarray(np.where(before.any(axis=1), last, first_after), np.intp)
 
 
 def _noise_of_static(place: PlaceStates, changes: list[PlaceChange]) -> Index:
@@ -134,5 +133,3 @@ def changed_cell_table(shown: ShownState) -> dict[str, NDArray[np.generic]]:
         "observed": states.observed[changed],
         "resolution": np.array(shown.place.resolution),
     }
-
-

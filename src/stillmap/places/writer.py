@@ -67,7 +67,9 @@ def write_sessions(folder: Path, result: PlaceResult) -> None:
         hit = read_array(home / "beams" / "hit.npy", (None,), "b")
         beams = read_beam_cells(home, len(hit), place.voxel_size)
         centres = beams.place_centres(one.session.node_poses, one.nodes)
-        write_npy(home / "beams" / "p_static.npy", label_session(result.shown, beams, centres, time))
+        write_npy(
+            home / "beams" / "p_static.npy", label_session(result.shown, beams, centres, time)
+        )
         _write_state(home / STATE, one)
 
 

@@ -2,17 +2,28 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.short_repr import ShortRepr
-from stillmap.tracking.objects import MovingObject
 
 Float = NDArray[np.float64]
 
 _STEP = 0.25  # of a square: spacing of the samples along a track
 _MIN_ABSENCE = 5.0  # s after which a return to a square is another crossing
+
+
+class MovingTrack(Protocol):
+    """Anything with stamps (L,), positions and velocities (L, 2) in the plane."""
+
+    @property
+    def stamp_ns(self) -> NDArray[np.int64]: ...
+    @property
+    def xy(self) -> Float: ...
+    @property
+    def velocity(self) -> Float: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +43,7 @@ class FlowMap(ShortRepr):
     resolution: float
 
 
-def compute_flow_map(objects: Sequence[MovingObject], resolution: float = 0.5) -> FlowMap:
+def compute_flow_map(objects: Sequence[MovingTrack], resolution: float = 0.5) -> FlowMap:
     """Count the crossings of each square.
 
     An object that stays in a square, or returns to it within a few seconds, crosses it once.
@@ -63,7 +74,7 @@ def compute_flow_map(objects: Sequence[MovingObject], resolution: float = 0.5) -
     )
 
 
-def _crossings(one: MovingObject, resolution: float) -> tuple[NDArray[np.int64], Float]:
+def _crossings(one: MovingTrack, resolution: float) -> tuple[NDArray[np.int64], Float]:
     """Squares (V, 2) that an object crosses, column and row, and its mean speed (V,) there."""
     seconds = 1e-9 * (one.stamp_ns - one.stamp_ns[0])
     xy, t = _resample(one.xy, seconds, _STEP * resolution)

@@ -1,0 +1,189 @@
+"""`stillmap merge`: sessions of one place into one map with dated changes."""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from stillmap.cli.arguments import add_read_flags, read_changes, require_apart
+from stillmap.cli.config import add_option_flags, options_from_args
+from stillmap.cli.console import list_files, print_json, say, show_progress
+from stillmap.core.errors import InputError
+
+if TYPE_CHECKING:
+    from stillmap.pipeline.options import Options
+    from stillmap.places.merge import MergeJob
+    from stillmap.places.writer import PlaceResult
+
+DESCRIPTION = (
+    "Merge sessions of one place, hours or months apart and from any start, into one map. Each "
+    "SESSION is a recording, which is mapped first, or a folder that `stillmap map` wrote; a place "
+    "that an earlier merge wrote may go first and grows. What changed between sessions is listed "
+    "with the sessions between which it changed. A session that cannot be placed for certain is "
+    "left out, and named with the reason."
+)
+EPILOG = """examples:
+  stillmap merge monday.bag tuesday.bag -o place
+  stillmap merge out1 out2 out3 -o place --map-state majority
+  stillmap merge place wednesday.bag -o place2
+  stillmap merge out1 out2 -o place --frame out2
+
+exit status 2 where fewer than two sessions could be placed
+"""
+
+
+def add_arguments(p: argparse.ArgumentParser) -> None:
+    """Add the flags and arguments."""
+    p.add_argument(
+        "input",
+        metavar="SESSION",
+        nargs="+",
+        help="a recording, a result folder, or first a place",
+    )
+    p.add_argument("-o", "--output", metavar="PLACE", required=True, help="folder of the place")
+    p.add_argument("--overwrite", action="store_true", help="replace what is in PLACE")
+    p.add_argument(
+        "--frame",
+        metavar="NAME",
+        help="session whose frame the place has (default: the first one, or as it was)",
+    )
+    p.add_argument(
+        "--map-state",
+        metavar="STATE",
+        default="last",
+        help="state of what changed that the map shows: last, majority, the name of a session, "
+        "or a date such as 2026-05-31 (default: last)",
+    )
+    p.add_argument(
+        "--map-mode",
+        choices=("trinary", "scale", "raw"),
+        help="pixels of map.pgm (default: trinary)",
+    )
+    p.add_argument(
+        "--resolution", metavar="M", type=float, help="edge of a map cell in metres (default: 0.05)"
+    )
+    p.add_argument("--no-odometry", action="store_true", help="ignore odometry in recordings")
+    p.add_argument(
+        "--threads", metavar="N", type=int, help="0: one per processor; same result (default: 0)"
+    )
+    p.add_argument("--json", action="store_true", help="a summary as one JSON object on stdout")
+    p.add_argument("--quiet", action="store_true", help="no progress, no summary")
+    add_read_flags(p)
+    add_option_flags(p)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Merge sessions into a folder.
+
+    Raises:
+        InputError: an input or the output is at fault, or fewer than two sessions could be placed.
+    """
+    from stillmap.places.inputs import is_place
+
+    options = options_from_args(args, read_changes(args), _option_changes(args))
+    base = Path(args.input[0]) if is_place(Path(args.input[0])) else None
+    paths = args.input if base is None else args.input[1:]
+    if not paths:
+        raise InputError("names no session to add", where=args.input[0])
+    return _merge(args, base, _group(args, paths, options), options)
+
+
+def merge_groups(args: argparse.Namespace, groups: Sequence[Sequence[str]]) -> int:
+    """Merge the sessions that `stillmap map` was given, with its flags.
+
+    Args:
+        args: of `stillmap map`.
+        groups: paths of each session, several where it was recorded in parts.
+    """
+    options = options_from_args(args, read_changes(args), _option_changes(args))
+    args.frame, args.map_state = None, args.map_state or "last"
+    return _merge(args, None, groups, options)
+
+
+def _option_changes(args: argparse.Namespace) -> dict[str, Any]:
+    """The options that flags of this command set."""
+    changes: dict[str, Any] = {}
+    if args.threads is not None:
+        changes["threads"] = args.threads
+    if args.resolution is not None:
+        changes["slam"] = {"resolution": args.resolution, "voxel_size": args.resolution}
+    if args.map_mode is not None:
+        changes["output"] = {"map_mode": args.map_mode}
+    return changes
+
+
+def _group(
+    args: argparse.Namespace, paths: list[str], options: "Options"
+) -> Sequence[Sequence[str]]:
+    """Recordings that are parts of one run belong together; results stand alone."""
+    from stillmap.cli.groups import find_groups
+    from stillmap.results.folder import is_result
+
+    results = [[path] for path in paths if is_result(Path(path))]
+    recordings = [path for path in paths if not is_result(Path(path))]
+    if len(recordings) < 2:
+        return [[path] for path in paths]
+    found = find_groups(
+        argparse.Namespace(**{**vars(args), "input": recordings}), options.read, None
+    )
+    groups = [list(group.paths) for group in found] + results
+    return sorted(groups, key=lambda group: min(paths.index(path) for path in group))
+
+
+def _merge(
+    args: argparse.Namespace,
+    base: Path | None,
+    groups: Sequence[Sequence[str]],
+    options: "Options",
+) -> int:
+    from stillmap.core.files import require_new
+    from stillmap.places.inputs import list_sessions
+    from stillmap.places.merge import MergeJob, merge_sessions
+    from stillmap.places.reader import read_sessions
+    from stillmap.results.run_json import RECORD
+
+    output = Path(args.output)
+    require_new(output, RECORD, args.overwrite)
+    for path in [*([] if base is None else [base]), *(Path(p) for group in groups for p in group)]:
+        require_apart(output, path)
+    taken = [] if base is None else [record["name"] for record in read_sessions(base)]
+    sessions = list_sessions(groups, taken)
+    job = MergeJob(base, sessions, options, args.frame, args.map_state, not args.no_odometry)
+    with show_progress(args.quiet, options.em.max_iterations) as progress:
+        result = merge_sessions(job, output, args.overwrite, progress)
+    if not args.quiet:
+        _print_summary(job, result, output)
+    if args.json:
+        print_json(_summarize(result, output))
+    return 0
+
+
+def _print_summary(job: "MergeJob", result: "PlaceResult", output: Path) -> None:
+    """Which sessions were placed, what changed, and where the result lies."""
+    placed = result.place.sessions
+    say(f"{len(placed)} sessions in one map, {len(result.place.ties)} constraints between them")
+    for one in result.refusals:
+        say(f"warning: {one.name} is not in the place: {one.why}")
+    say(_describe_changes(result, job.map_state))
+    say(f"wrote {output}")
+
+
+def _describe_changes(result: "PlaceResult", map_state: str) -> str:
+    count = len(result.changes)
+    if not count:
+        return "nothing changed between sessions"
+    kinds = [change.kind for change in result.changes]
+    words = {"appeared": "appeared", "gone": "are gone", "moved": "moved", "door": "are doors"}
+    told = [f"{kinds.count(kind)} {text}" for kind, text in words.items() if kind in kinds]
+    return f"{count} changes between sessions: {', '.join(told)}; the map shows {map_state}"
+
+
+def _summarize(result: "PlaceResult", output: Path) -> dict[str, Any]:
+    from stillmap.places.writer import session_records
+
+    return {
+        "output": str(output),
+        "files": list_files(output),
+        "sessions": session_records(result),
+        "changes": len(result.changes),
+    }

@@ -1,0 +1,127 @@
+"""Moving objects of sessions in the frame of their place."""
+
+import json
+import shutil
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.errors import InputError
+from stillmap.core.files import read_text
+from stillmap.places.place import PlacedSession
+from stillmap.places.place_graph import fit_alignment
+from stillmap.results.objects import MILLIMETRES, write_traffic
+from stillmap.results.points import ply_header
+from stillmap.results.reader import read_tracks
+from stillmap.tracking import compute_flow_map
+
+Float = NDArray[np.float64]
+
+_OBJECTS, _LIST, _ORIGINAL = "objects", "objects.json", "objects"
+_MAX_BYTES = 256 << 20
+_FIELDS = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("seconds", "<f4"), ("p_dynamic", "<f4")]
+
+
+def copy_objects(result: Path, state: Path) -> None:
+    """Keep the objects of a session in its own frame: the list, and clouds of points.
+
+    Textured models stay with the result.
+    """
+    source = result / _OBJECTS
+    if not (source / _LIST).is_file():
+        return
+    target = state / _ORIGINAL
+    target.mkdir()
+    for path in sorted(source.iterdir()):
+        if path.name == _LIST or path.suffix == ".ply":
+            shutil.copyfile(path, target / path.name)
+
+
+def place_objects(home: Path, one: PlacedSession) -> None:
+    """Write `objects/` of a session in the frame of the place.
+
+    Args:
+        home: `sessions/NAME`, with the objects in the session's frame in its state.
+        one: the session in the place.
+    """
+    source, target = home / "state" / _ORIGINAL, home / _OBJECTS
+    shutil.rmtree(target, ignore_errors=True)
+    if not source.is_dir():
+        return
+    target.mkdir()
+    T = fit_alignment(one.session.node_poses, one.nodes)
+    records = [_transform_record(record, T) for record in _read_records(source / _LIST)]
+    _write_records(target / _LIST, records)
+    for path in sorted(source.glob("*.ply")):
+        _transform_cloud(path, target / path.name, T)
+
+
+def join_objects(folder: Path, homes: Sequence[Path]) -> None:
+    """Write `objects/` and `traffic.npz` of a place: those of all sessions, numbered anew."""
+    target = folder / _OBJECTS
+    target.mkdir()
+    records = list[dict[str, Any]]()
+    for home in homes:
+        for record in _read_records(home / _OBJECTS / _LIST):
+            number = len(records)
+            cloud = home / _OBJECTS / f"{record['id']:04d}.ply"
+            if cloud.is_file():
+                shutil.copyfile(cloud, target / f"{number:04d}.ply")
+            records.append({**record, "id": number, "session": home.name})
+    _write_records(target / _LIST, records)
+    write_traffic(folder / "traffic.npz", compute_flow_map(read_tracks(target / _LIST)))
+
+
+def _read_records(path: Path) -> Iterator[dict[str, Any]]:
+    """The entries of an `objects.json`; none where there is no file.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    tracks = read_tracks(path)  # which checks it
+    if not tracks:
+        return
+    yield from json.loads(read_text(path, _MAX_BYTES))
+
+
+def _write_records(path: Path, records: list[dict[str, Any]]) -> None:
+    lines = ",\n".join(json.dumps(record, allow_nan=False) for record in records)
+    path.write_text(f"[\n{lines}\n]\n" if records else "[]\n", encoding="utf-8")
+
+
+def _transform_record(record: dict[str, Any], T: Float) -> dict[str, Any]:
+    """An entry whose track lies in another frame."""
+    track = record["track"]
+    D = T.shape[-1] - 1
+    names = "xyz"[:D]
+    points = np.array([track[name] for name in names], np.float64)
+    moved = T[:D, :D] @ points + T[:D, D:]
+    velocity = np.zeros((D, points.shape[1]))
+    velocity[:2] = [track["vx"], track["vy"]]
+    turned = T[:D, :D] @ velocity
+    columns = [*zip(names, moved, strict=True), ("vx", turned[0]), ("vy", turned[1])]
+    changed = {name: np.round(values, MILLIMETRES).tolist() for name, values in columns}
+    return {**record, "track": {**track, **changed}}
+
+
+def _transform_cloud(source: Path, target: Path, T: Float) -> None:
+    """A cloud of an object in another frame.
+
+    Raises:
+        InputError: it is not as it was written.
+    """
+    content = source.read_bytes()
+    end = content.find(b"end_header\n") + len(b"end_header\n")
+    dtype = np.dtype(_FIELDS)
+    count, rest = divmod(len(content) - end, dtype.itemsize)
+    if rest or content[:end] != ply_header(_FIELDS, count):
+        raise InputError("is no cloud of an object as stillmap writes it", where=str(source))
+    vertices = np.frombuffer(content, dtype, offset=end).copy()
+    D = T.shape[-1] - 1
+    points = np.stack([vertices[name] for name in "xyz"[:D]]).astype(np.float64)
+    for name, values in zip("xyz", T[:D, :D] @ points + T[:D, D:], strict=False):
+        vertices[name] = values
+    target.write_bytes(content[:end] + vertices.tobytes())
