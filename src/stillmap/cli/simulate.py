@@ -32,6 +32,9 @@ _SCENES = {
     "building": "grows with --scans, wing by wing",
     "ten-corridors": "56 x 37 m, corridors of the same shape",
     "rounds": "197 x 82 m, corridors around six courtyards, 40 people",
+    "lookalike-1": "a corridor of 40 m, 4 people",
+    "lookalike-2": "another one of the same shape with other rooms",
+    "two-wings": "two such corridors that share a door, 6 people",
 }
 
 _LISTED = "".join(f"  {name:<16} {what}\n" for name, what in _SCENES.items())

@@ -16,6 +16,7 @@ _CANDIDATES = 24  # random points, the farthest of which from all visited ones c
 _MAX_LEG = 18.0  # m between one point of a tour and the next, as the crow flies
 _MAX_DETOUR = 3.0  # times as long as the crow flies
 _MAX_POINTS = 400  # of a tour
+_ANCHORS = 12  # random points of a region, the largest part around which it explores
 _VIA = 8.0  # m between the points of a piece of a street
 _MAX_ASIDE = 0.5  # m, by which a car drives beside the route
 
@@ -63,23 +64,28 @@ def _next_goal(at: Float, visited: Float, nodes: Float, rng: np.random.Generator
 
 
 def _planner(scene: Scene, rng: np.random.Generator, region: Region | None) -> Planner:
-    """The planner of the largest part of free space that a point of the route lies in."""
-    solid = [
-        *scene.walls,
-        *scene.glass,
-        *scene.mirrors,
-        *scene.kerbs,
-        *faces_at_all_places(scene.things),
-    ]
-    space, best = FreeSpace(np.array(solid, float)), None
-    anchors = np.array(scene.route, float)
-    if region is not None:
-        low, high = np.array(region[:2]), np.array(region[2:])
-        anchors = np.concatenate([anchors, rng.uniform(low, high, (60, 2))])
-        anchors = anchors[is_within(anchors, region)]
+    """The planner of the largest part of free space that the world's route leads into."""
+    things = faces_at_all_places(scene.things)
+    solid = np.array([*scene.walls, *scene.glass, *scene.mirrors, *scene.kerbs, *things], float)
+    radius = scene.robot.radius + _MARGIN
+    space = FreeSpace(solid)
+    whole = _largest_part(space, np.array(scene.route, float), radius)
+    if region is None:
+        return whole
+    inside = whole.point(whole.nodes)
+    inside = inside[is_within(inside, region)]
+    if not len(inside):
+        raise InputError("the robot finds no room in its region", hint="another seed or region")
+    some = inside[rng.integers(len(inside), size=_ANCHORS)]
+    return _largest_part(space.with_walls(np.array(fence(region), float)), some, radius)
+
+
+def _largest_part(space: FreeSpace, anchors: Float, radius: float) -> Planner:
+    """The planner of the part with most room, among those that points (K, 2) lie in."""
+    best = None
     for anchor in anchors:
         try:
-            planner = Planner(space, anchor, scene.robot.radius + _MARGIN)
+            planner = Planner(space, anchor, radius)
         except InputError:
             continue
         if best is None or len(planner.nodes) > len(best.nodes):
@@ -87,6 +93,14 @@ def _planner(scene: Scene, rng: np.random.Generator, region: Region | None) -> P
     if best is None:
         raise InputError("the robot finds no room for a tour", hint="another seed or region")
     return best
+
+
+def clip_region(region: Region, walls: tuple[Segment, ...]) -> Region:
+    """The part of a region that lies within the extent of walls."""
+    ends = np.reshape(walls, (-1, 2)).astype(float)
+    low = np.maximum(region[:2], ends.min(axis=0)).tolist()
+    high = np.minimum(region[2:], ends.max(axis=0)).tolist()
+    return (low[0], low[1], high[0], high[1])
 
 
 def fence(region: Region) -> tuple[Segment, ...]:

@@ -11,7 +11,7 @@ from stillmap.core.errors import InputError
 from stillmap.sim.furniture import StandingObject
 from stillmap.sim.scene import Scene
 from stillmap.sim.session_layout import Layout
-from stillmap.sim.session_routes import Region, draw_piece, draw_tour, fence
+from stillmap.sim.session_routes import Region, clip_region, draw_piece, draw_tour, fence
 from stillmap.sim.simulator import Simulation, simulate
 
 _SECONDS = 150.0  # of a session, unless the number of scans is given
@@ -84,13 +84,13 @@ def plan_sessions(scene: Scene, options: SessionOptions, seed: int = 0) -> Sessi
     scenes, stamps = [], []
     for session, rng in enumerate(rngs):
         region = options.regions[session] if options.regions else None
+        region = None if region is None else clip_region(region, scene.walls)
         base = dataclasses.replace(
             scene,
             walls=layout.walls,
             leaves=(),
             lights=(),
             things=tuple(t for one in objects if (t := one.thing(session)) is not None),
-            kerbs=scene.kerbs if region is None else (*scene.kerbs, *fence(region)),
         )
         scenes.append(_vary(base, options, session == odd, region, rng))
         stamps.append((session * _DAY + int(rng.integers(0, _DAY // 3))) * 10**9)
@@ -163,6 +163,7 @@ def _vary(
         scene,
         route=route,
         people_at=scene.people_at or route[:1],
+        kerbs=scene.kerbs if region is None else (*scene.kerbs, *fence(region)),
         robot=dataclasses.replace(scene.robot, speed=speed, scans=scans),
     )
     x, y, yaw = rng.uniform((-0.1, -0.1, -0.4), (0.2, 0.1, 0.4)).tolist()
