@@ -147,6 +147,10 @@ class Planner:
         column, row = np.clip(at, 0, (self._shape[1] - 1, self._shape[0] - 1))
         return int(row) * int(self._shape[1]) + int(column)
 
+    def contains(self, xy: Float) -> bool:
+        """Whether the node next to a point (2,) is reachable."""
+        return bool(self._part[self._grid_node(xy)] >= 0)
+
     def node(self, xy: Float) -> int:
         """The reachable node nearest to a point (2,)."""
         here = self._grid_node(xy)

@@ -66,7 +66,7 @@ def _passed_cells(start: Float, end: Float, cell: float) -> NDArray[np.int64]:
         longer = np.searchsorted(-steps, -n, side="right")
         at = start[:longer] + (n / np.maximum(steps[:longer], 1))[:, None] * along[:longer]
         seen[tuple((np.floor(at / cell).astype(np.int64) - low).T)] = True
-    return np.argwhere(seen) + low
+    return np.asarray(np.argwhere(seen) + low)
 
 
 def compute_overlap(sights: Sequence[Sight], places: Sequence[int]) -> Float:

@@ -12,9 +12,10 @@ from stillmap.sim.session_routes import Region
 from stillmap.sim.sessions import SessionOptions, SessionPlan, plan_sessions, simulate_sessions
 from stillmap.sim.worlds import scene_by_name
 
-_TRIES = 40  # of two regions, until what they have in common is as wanted
+_STARTS, _HALVINGS = 8, 7  # of two regions, and of what they share until it is as wanted
+_APART = -0.6  # of the shorter one's length, when they share least
 _MARGIN = 6.0  # m around the route that belong to the world
-_SMALLEST = 0.3  # of the world's length, each region
+_LENGTHS = (0.35, 0.75)  # of the world's, of each region
 _SLACK = 0.02  # of the share, for what people hide
 _FAR = 1e3  # m, beyond any world
 
@@ -41,24 +42,30 @@ def plan_pair(scene: Scene, overlap: OverlapClass, seed: int = 0) -> SessionPlan
         InputError: no two parts of the world do.
     """
     rng = np.random.default_rng([seed, 7])
-    for trial in range(_TRIES):
-        regions = _draw_regions(scene, overlap, rng)
-        options = SessionOptions(2, regions, odd_sensor=seed % 4 == 0)
-        try:
-            plan = plan_sessions(scene, options, int(rng.integers(1 << 31)) + trial)
-            share = measure_overlap(plan)
-        except InputError:  # no room in such a region
-            continue
-        if overlap.low + _SLACK <= share < overlap.high - _SLACK:
-            return plan
+    for _ in range(_STARTS):
+        strips = _Strips.draw(scene, rng)
+        own = int(rng.integers(1 << 31))
+        low, high = _APART, 1.0
+        for _ in range(_HALVINGS):
+            shared = rng.uniform(0.3, 0.7) * (high - low) + low
+            options = SessionOptions(2, strips.regions(shared), odd_sensor=seed % 4 == 0)
+            try:
+                plan = plan_sessions(scene, options, own)
+                share = measure_overlap(plan)
+            except InputError:  # no room in such a region
+                break
+            fits = overlap.low + _SLACK <= share < overlap.high - _SLACK
+            if fits and overlap.low <= measure_overlap(plan, with_people=True) < overlap.high:
+                return plan
+            low, high = (shared, high) if share < overlap.low + _SLACK else (low, shared)
     what = f"no two parts of '{scene.name}' overlap by {overlap.name} %"
     raise InputError(what, hint="another seed, or a larger world")
 
 
-def measure_overlap(plan: SessionPlan) -> float:
+def measure_overlap(plan: SessionPlan, with_people: bool = False) -> float:
     """Share of the hits of the second session that lie where the first one looked.
 
-    Measured without people, who hide some of it.
+    Without people, who hide some of it, it takes half the time.
     """
     empty = tuple(
         dataclasses.replace(
@@ -67,7 +74,8 @@ def measure_overlap(plan: SessionPlan) -> float:
         )
         for scene in plan.scenes
     )
-    sights = [observe(one) for one in simulate_sessions(plan._replace(scenes=empty))]
+    scenes = plan.scenes if with_people else empty
+    sights = [observe(one) for one in simulate_sessions(plan._replace(scenes=scenes))]
     return float(compute_overlap(sights, [0] * len(sights))[0, 1])
 
 
@@ -88,26 +96,31 @@ def plan_strangers(one: Scene, other: Scene, seed: int = 0) -> tuple[SessionPlan
     return plan_sessions(one, options, 2 * seed), plan_sessions(other, options, 2 * seed + 1)
 
 
-def _draw_regions(
-    scene: Scene, overlap: OverlapClass, rng: np.random.Generator
-) -> tuple[Region | None, Region | None]:
-    """Two parts of the world along its longer side, or along either, the farther apart the less
-    they shall overlap; everything where they shall overlap most."""
-    line = np.array(scene.route, float)
-    (x0, y0), (x1, y1) = line.min(axis=0) - _MARGIN, line.max(axis=0) + _MARGIN
-    size, low = np.array([x1 - x0, y1 - y0]), np.array([x0, y0])
-    if overlap.high > 0.9 and rng.random() < 0.5:
-        return None, None
-    axis = int(size.argmax()) if rng.random() < 0.7 else int(rng.integers(2))
-    length = rng.uniform(_SMALLEST, 0.7, 2) * size[axis]
-    shared = rng.uniform(-0.1, 0.6) * length.min()
-    middle = low[axis] + size[axis] / 2 + rng.uniform(-0.1, 0.1) * size[axis]
-    first = (middle + shared / 2 - length[0], middle + shared / 2)
-    second = (middle - shared / 2, middle - shared / 2 + length[1])
-    pair = [_strip(axis, *first), _strip(axis, *second)]
-    if rng.random() < 0.5:
-        pair.reverse()
-    return pair[0], pair[1]
+class _Strips(NamedTuple):
+    """Two parts of a world side by side along an axis: its middle, their lengths, their order."""
+
+    axis: int
+    middle: float
+    lengths: tuple[float, float]
+    reverse: bool
+
+    @classmethod
+    def draw(cls, scene: Scene, rng: np.random.Generator) -> "_Strips":
+        """Most often along the longer side of the world."""
+        line = np.array(scene.route, float)
+        low, size = line.min(axis=0) - _MARGIN, np.ptp(line, axis=0) + 2 * _MARGIN
+        axis = int(size.argmax()) if rng.random() < 0.7 else int(rng.integers(2))
+        lengths = rng.uniform(*_LENGTHS, 2) * size[axis]
+        middle = low[axis] + size[axis] * rng.uniform(0.4, 0.6)
+        return cls(axis, float(middle), (lengths[0], lengths[1]), bool(rng.random() < 0.5))
+
+    def regions(self, shared: float) -> tuple[Region, Region]:
+        """The two parts, when they share so much of the shorter one; negative: they are apart."""
+        half = shared * min(self.lengths) / 2
+        first = (self.middle + half - self.lengths[0], self.middle + half)
+        second = (self.middle - half, self.middle - half + self.lengths[1])
+        pair = (_strip(self.axis, *first), _strip(self.axis, *second))
+        return (pair[1], pair[0]) if self.reverse else pair
 
 
 def _strip(axis: int, low: float, high: float) -> Region:

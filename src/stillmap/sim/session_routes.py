@@ -69,10 +69,10 @@ def _planner(scene: Scene, rng: np.random.Generator, region: Region | None) -> P
     solid = np.array([*scene.walls, *scene.glass, *scene.mirrors, *scene.kerbs, *things], float)
     radius = scene.robot.radius + _MARGIN
     space = FreeSpace(solid)
-    whole = _largest_part(space, np.array(scene.route, float), radius)
     if region is None:
-        return whole
-    inside = whole.point(whole.nodes)
+        return _largest_part(space, np.array(scene.route, float), radius)
+    parts = _parts(space, np.array(scene.route, float), radius)
+    inside = np.concatenate([part.point(part.nodes) for part in parts])
     inside = inside[is_within(inside, region)]
     if not len(inside):
         raise InputError("the robot finds no room in its region", hint="another seed or region")
@@ -82,17 +82,22 @@ def _planner(scene: Scene, rng: np.random.Generator, region: Region | None) -> P
 
 def _largest_part(space: FreeSpace, anchors: Float, radius: float) -> Planner:
     """The planner of the part with most room, among those that points (K, 2) lie in."""
-    best = None
+    parts = _parts(space, anchors, radius)
+    if not parts:
+        raise InputError("the robot finds no room for a tour", hint="another seed or region")
+    return max(parts, key=lambda part: len(part.nodes))
+
+
+def _parts(space: FreeSpace, anchors: Float, radius: float) -> list[Planner]:
+    """Planners of the parts of free space that points (K, 2) lie in."""
+    parts: list[Planner] = []
     for anchor in anchors:
         try:
-            planner = Planner(space, anchor, radius)
-        except InputError:
+            if not any(part.contains(anchor) for part in parts):
+                parts.append(Planner(space, anchor, radius))
+        except InputError:  # something stands there
             continue
-        if best is None or len(planner.nodes) > len(best.nodes):
-            best = planner
-    if best is None:
-        raise InputError("the robot finds no room for a tour", hint="another seed or region")
-    return best
+    return parts
 
 
 def clip_region(region: Region, walls: tuple[Segment, ...]) -> Region:
