@@ -16,10 +16,10 @@ from stillmap.sim.objects import place_faces
 from stillmap.sim.planner import Float
 from stillmap.sim.scene import Door, Scene, Segment, Stay, Thing
 
-_CHANGES = (3, 7)  # fewest and most objects that change between two sessions
+_CHANGES = (4, 9)  # fewest and most objects that change between two sessions
 _KINDS = ("moved", "gone", "appeared")  # alike often
 _SHORT_MOVES = 0.4  # share of moves within the same room
-_NEW = (3, 7)  # objects brought into a world beforehand
+_NEW = (4, 9)  # objects brought into a world beforehand
 _DOOR_CHANGES = 0.25  # share of doors that are found at another angle
 _CLOSED_DOORS = 0.3  # share of doors that are closed
 _MIN_OPEN = 0.4  # of the full swing, of doors that are open

@@ -14,7 +14,7 @@ from stillmap.sim.session_layout import Layout
 from stillmap.sim.session_routes import Region, clip_region, draw_piece, draw_tour, fence
 from stillmap.sim.simulator import Simulation, simulate
 
-_SECONDS = 150.0  # of a session, unless the number of scans is given
+_SECONDS = 200.0  # of a session, unless the number of scans is given
 _SECONDS_3D = 12.0  # the same with a lidar
 _MIN_SPEED = 0.8  # m/s, of the robot indoors, so that a session shows much of the place
 _DAY = 86_400  # s
