@@ -11,15 +11,14 @@ from numpy.typing import NDArray
 from stillmap.core.errors import InputError
 from stillmap.eval.labels import Scores
 from stillmap.eval.session_cells import CELL, MIN_BEAMS, CellTruth, Seen, widen
+from stillmap.eval.session_events import Event, list_events
 from stillmap.eval.session_poses import PlacedSession, read_json
 from stillmap.results.reader import moved
-from stillmap.sim.objects import place_faces
 from stillmap.sim.session_truth import SessionTruth
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
-_MIN_CELLS = 5  # of an object's surface, seen before and after: its change could be found
 _COVERED = 0.5  # share of these that a change that was found must hold
 _KINDS = ("appeared", "gone", "moved", "door")
 
@@ -42,7 +41,7 @@ class ChangeScores(Scores):
         found: those that were called changed.
         precision, recall, f1: of these.
         events: objects that came to a place, left it, or doors that turned there, with at least
-            `_MIN_CELLS` cells seen before and after.
+            MIN_CELLS cells seen before and after.
         events_found: of these, half of whose cells one change holds.
         dates_right: share of these that begin with the last session before that saw the place, or
             a later one before, and end likewise.
@@ -192,7 +191,7 @@ def score_changes(
         true, called = true + int(changed.sum()), called + int(mask.sum())
         right, recalled = right + int((mask & near).sum()), recalled + _hit(changed, mask)
     precision, recall = _ratio(right, called), _ratio(recalled, true)
-    events = list(_events(cells, truth, sessions))
+    events = list(list_events(cells, truth, sessions))
     dates = [_match(event, found) for event in events]
     dated = sum(
         any(event.is_dated(*date) for date in own) for event, own in zip(events, dates, strict=True)
@@ -243,63 +242,10 @@ def _flips(one: Seen, other: Seen) -> Bool:
     """(H, W) cells with hits in one session, and none nearby and beams through in the other."""
     hit = [seen.on_surface for seen in (one, other)]
     free = [(seen.hits == 0) & (seen.passes >= MIN_BEAMS) for seen in (one, other)]
-    return (hit[0] & free[1]) | (hit[1] & free[0])
+    return np.asarray((hit[0] & free[1]) | (hit[1] & free[0]))
 
 
-class _Event(NamedTuple):
-    """An object that came to a place or left it.
-
-    Attributes:
-        came: to it.
-        seen: the last session that saw the place before, and the first one after.
-        true: the last session before and the first one after, whether they saw it or not.
-        cells: (H, W) of its surface, that both of `seen` saw.
-    """
-
-    came: bool
-    seen: tuple[int, int]
-    true: tuple[int, int]
-    cells: Bool
-
-    def is_dated(self, before: int, after: int) -> bool:
-        """Whether a change between two sessions has the right date."""
-        early = self.seen[0] <= before <= self.true[0]
-        return early and self.true[1] <= after <= self.seen[1]
-
-
-def _events(cells: CellTruth, truth: SessionTruth, sessions: list[int]) -> Iterator[_Event]:
-    """What came or left between the sessions, and could be seen to."""
-    for change in truth.changes:
-        one = truth.objects[change.object]
-        for came, at in ((True, change.between[1]), (False, change.between[0])):
-            thing = one.thing(at)
-            if thing is None:
-                continue
-            surface = cells.lattice.draw(place_faces(thing, thing.stays[0])) & ~cells.fixed
-            looked = [
-                surface & _looked(cells, k, one.places[s] == one.places[at])
-                for k, s in enumerate(sessions)
-            ]
-            enough = [int(mask.sum()) >= _MIN_CELLS for mask in looked]
-            before = [k for k, s in enumerate(sessions) if s <= change.between[0]]
-            after = [k for k, s in enumerate(sessions) if s >= change.between[1]]
-            seen = ([k for k in before if enough[k]][-1:], [k for k in after if enough[k]][:1])
-            if not seen[0] or not seen[1]:
-                continue
-            first, last = seen[0][0], seen[1][0]
-            states = [one.places[sessions[k]] == one.places[at] for k in (first, last)]
-            both = looked[first] & looked[last]
-            if states == [not came, came] and both.sum() >= _MIN_CELLS:
-                yield _Event(came, (first, last), (before[-1], after[0]), both)
-
-
-def _looked(cells: CellTruth, session: int, is_there: bool) -> Bool:
-    """(H, W) cells in which a session saw that a surface is there, or is not."""
-    seen = cells.seen[session]
-    return widen(seen.hits >= MIN_BEAMS) if is_there else seen.passes >= MIN_BEAMS
-
-
-def _match(event: _Event, found: list[FoundChange]) -> list[tuple[int, int]]:
+def _match(event: Event, found: list[FoundChange]) -> list[tuple[int, int]]:
     """When the changes that hold most of an event's cells took place."""
     dates = []
     for one in found:
