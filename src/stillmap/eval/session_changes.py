@@ -180,12 +180,10 @@ def score_changes(
         changed, either = _true_changes(cells, i, j)
         changed &= both
         flips = _flips(cells.seen[i], cells.seen[j]) if source == "boxes" else both
-        mask = np.zeros(cells.lattice.shape, bool)
-        for k, one in enumerate(found):
-            if one.before < j and one.after > i:
-                mask |= one.cells & flips
-                real[k] |= one.cells & changed
-        mask &= both
+        meanwhile = [k for k, one in enumerate(found) if one.before < j and one.after > i]
+        for k in meanwhile:
+            real[k] |= found[k].cells & changed
+        mask = _net_cells([found[k] for k in meanwhile], cells) & flips & both
         near = widen(changed)
         mask &= near | ~widen(either)
         true, called = true + int(changed.sum()), called + int(mask.sum())
@@ -210,6 +208,19 @@ def score_changes(
         changes=len(found),
         spurious=sum(not one.any() for one in real),
     )
+
+
+def _net_cells(changes: list[FoundChange], cells: CellTruth) -> Bool:
+    """(H, W) cells of changes, but those to which something came before it left again, or it left
+    before something came."""
+    mask, undone = (np.zeros(cells.lattice.shape, bool) for _ in range(2))
+    for one in changes:
+        mask |= one.cells
+        earlier = [other for other in changes if other.after <= one.before]
+        for other in earlier if one.kind != "door" else ():
+            if other.kind != "door":
+                undone |= (one.left & other.came) | (one.came & other.left)
+    return mask & ~undone
 
 
 def _hit(changed: Bool, mask: Bool) -> int:
