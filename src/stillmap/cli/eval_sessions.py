@@ -51,6 +51,6 @@ def _format_changes(s: ChangeScores) -> Iterable[str]:
 def _format_map(s: SessionMapScores) -> str:
     return (
         f"map {s.name}: {s.ghost_cells} ghost cells of {s.occupied_cells} occupied "
-        f"({s.ghosts_per_100_m2:.3f} per 100 m2 free), {s.ghost_cells_seen} where the last "
-        f"session looked; walls kept {100 * s.walls_kept:.2f} % of {s.wall_cells} cells"
+        f"({s.ghosts_per_100_m2:.3f} per 100 m2 free), {s.avoidable_ghosts} avoidable; "
+        f"walls kept {100 * s.walls_kept:.2f} % of {s.wall_cells} cells"
     )

@@ -11,7 +11,7 @@ from stillmap.core.errors import InputError
 from stillmap.eval.labels import Scores
 from stillmap.eval.map import GHOST_DISTANCE, distance_to_walls, is_near_occupied
 from stillmap.eval.readers import read_trajectory
-from stillmap.eval.session_cells import MIN_BEAMS, CellTruth
+from stillmap.eval.session_cells import MIN_BEAMS, CellTruth, widen
 from stillmap.eval.session_poses import FRAME_DT
 from stillmap.eval.trajectory import align, associate_trajectories, planar
 from stillmap.results.reader import Grid, moved, read_grid
@@ -29,8 +29,8 @@ class SessionMapScores(Scores):
         occupied_cells: of the map.
         ghost_cells: those more than two cells from every surface of the last session.
         ghosts_per_100_m2: these per 100 m2 of free area.
-        ghost_cells_seen: those of them where the last session looked: it ended or passed
-            MIN_BEAMS beams there.
+        avoidable_ghosts: those of them that are not within two cells of an object that stood there
+            when a session last looked: since then fewer than MIN_BEAMS beams of each passed.
         wall_cells: cells of 5 cm of surfaces that are the same in all sessions, in which
             MIN_BEAMS beams of the map's sessions ended.
         walls_kept: share of these whose cell in the map, or one of its 8 neighbours, is occupied.
@@ -40,7 +40,7 @@ class SessionMapScores(Scores):
     occupied_cells: int
     ghost_cells: int
     ghosts_per_100_m2: float
-    ghost_cells_seen: int
+    avoidable_ghosts: int
     wall_cells: int
     walls_kept: float
 
@@ -66,12 +66,11 @@ def score_place_map(
         own: index in `sessions` of those that the map was made from; the last one's surfaces
             count.
     """
-    last = cells.seen[own[-1]]
     walls = truth.beams(sessions[own[-1]]).walls
     occupied = moved(T_world_map, grid.centres(np.argwhere(grid.occupied)))
     ghosts = occupied[distance_to_walls(occupied, walls) > GHOST_DISTANCE * grid.resolution]
     inside = ghosts[cells.lattice.holds(ghosts)]
-    looked = last.seen.ravel()[cells.lattice.cells(inside)]
+    excused = _find_last_seen(cells, own).ravel()[cells.lattice.cells(inside)]
     hit = np.any([cells.seen[k].hits >= MIN_BEAMS for k in own], axis=0)
     wanted = cells.lattice.centres()[cells.fixed & hit]
     kept = is_near_occupied(grid, moved(se2.inverse(T_world_map), wanted))
@@ -81,10 +80,19 @@ def score_place_map(
         occupied_cells=len(occupied),
         ghost_cells=len(ghosts),
         ghosts_per_100_m2=100.0 * len(ghosts) / free_area if free_area else float("nan"),
-        ghost_cells_seen=int(looked.sum()),
+        avoidable_ghosts=len(ghosts) - int(excused.sum()),
         wall_cells=len(wanted),
         walls_kept=float(kept.mean()) if len(kept) else float("nan"),
     )
+
+
+def _find_last_seen(cells: CellTruth, own: list[int]) -> NDArray[np.bool_]:
+    """(H, W) cells within two of a surface that stood there when a session last looked."""
+    stands = np.zeros(cells.lattice.shape, bool)
+    for k in own:
+        stands &= cells.seen[k].passes < MIN_BEAMS
+        stands |= widen(widen(cells.surfaces[k]))
+    return stands
 
 
 def score_single(
