@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from made_up_place import write_place
 
+from stillmap.cli.main import main
 from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.eval.session_cells import CELL, Lattice, collect_cells, count_beams, widen
@@ -20,7 +21,7 @@ from stillmap.sim.session_truth import SessionTruth, load_session_truth
 from stillmap.sim.session_writer import write_sessions
 from stillmap.sim.sessions import SessionOptions, plan_sessions
 
-QUICK = {"laser": {"beams": 180}, "robot": {"scans": 400}, "crowd": {"people": 2}}
+QUICK = {"laser": {"beams": 180}, "robot": {"scans": 300}, "crowd": {"people": 2}}
 
 
 @pytest.fixture(scope="module")
@@ -220,6 +221,20 @@ def test_single_sessions_are_scored_beside(perfect: Path, truth: SessionTruth, t
     (single / "trajectory.tum").write_text(text)
     with pytest.raises(InputError, match="no result of these sessions"):
         score_place(perfect, truth.folder, [single])
+
+
+def test_scores_as_text_and_as_json(perfect: Path, truth: SessionTruth, capsys) -> None:
+    words = ["eval", "sessions", str(perfect), str(truth.folder)]
+    assert main(words) == 0
+    text = capsys.readouterr().out
+    assert "3: 3 right, 0 coarse, 0 wrong, 0 refused" in text
+    assert "dates right 100.0 %" in text
+    assert main([*words, "--json"]) == 0
+    scores = json.loads(capsys.readouterr().out)
+    assert [one["verdict"] for one in scores["sessions"]] == ["right"] * 3
+    assert scores["maps"][0]["walls_kept"] == 1.0
+    assert main(["eval", "sessions", str(truth.folder), str(perfect)]) == 2
+    assert "is damaged" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

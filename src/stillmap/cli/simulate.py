@@ -207,7 +207,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _run_sessions(scene: "Scene", args: argparse.Namespace, output: Path) -> int:
     from stillmap.core.files import require_new
-    from stillmap.sim.session_truth import FILE
+    from stillmap.sim.session_truth import MARK
     from stillmap.sim.session_writer import write_sessions
     from stillmap.sim.sessions import SessionOptions, plan_sessions
 
@@ -215,7 +215,7 @@ def _run_sessions(scene: "Scene", args: argparse.Namespace, output: Path) -> int
         raise InputError("sessions are written as recording folders", hint="no --format carmen")
     if args.sessions < 1:
         raise InputError(f"--sessions wants 1 or more, got {args.sessions}")
-    require_new(output, FILE, args.overwrite)
+    require_new(output, MARK, args.overwrite)
     plan = plan_sessions(scene, SessionOptions(args.sessions), args.seed)
     with show_share(args.quiet, "simulating") as progress:
         sessions = write_sessions(

@@ -17,6 +17,7 @@ from stillmap.sim.truth import Truth, load_truth
 from stillmap.sim.world_3d import make_parts, trace_loops
 
 FILE = "sessions.json"
+MARK = "session-1/truth"  # every folder of simulated sessions has it, no place does
 _VERSION = 1
 _MAX_BYTES = 64 << 20
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from stillmap.core.files import atomic_folder
 from stillmap.sim.session_overlap import Sight, compute_overlap, observe
-from stillmap.sim.session_truth import FILE, describe_object, list_changes
+from stillmap.sim.session_truth import FILE, MARK, describe_object, list_changes
 from stillmap.sim.sessions import SessionPlan, simulate_sessions
 from stillmap.sim.simulator import Simulation
 from stillmap.sim.writer import write_folder
@@ -42,7 +42,7 @@ def write_sessions(
     about: list[dict[str, Any]] = []
     sights: list[Sight] = []
     counts: list[dict[str, Any]] = []
-    with atomic_folder(Path(path), FILE, overwrite) as work:
+    with atomic_folder(Path(path), MARK, overwrite) as work:
         for place, plan in enumerate(plans):
             for one in simulate_sessions(plan):
                 name = f"session-{len(about) + 1}"
