@@ -1,5 +1,6 @@
 """Sets of sessions for benchmarks: simulated once, kept in a folder, and read from there after."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,8 @@ from stillmap.sim.session_pairs import OVERLAPS, plan_pair, plan_strangers, plan
 from stillmap.sim.session_writer import write_sessions
 from stillmap.sim.sessions import SessionOptions, SessionPlan, plan_sessions
 
+# most robots see to their sides: beams, rad
+LASER = {"laser": {"beams": 270, "fov": math.radians(270)}}
 NEGATIVES = ("wings", "lookalike")
 WORLDS = ("office", "corridor", "warehouse", "hall")
 
@@ -44,7 +47,7 @@ def prepare_pairs(data: Path, seeds: range) -> list[PairSet]:
                 folder = data / f"pair-{world}-{overlap.name}-{seed}"
 
                 def plan(world=world, overlap=overlap, seed=seed):
-                    return (plan_pair(scene_by_name(world), overlap, seed),)
+                    return (plan_pair(scene_by_name(world, LASER), overlap, seed),)
 
                 try:
                     prepare(folder, plan, seed)
@@ -59,8 +62,8 @@ def prepare_pairs(data: Path, seeds: range) -> list[PairSet]:
 
 def _negative(kind: str, seed: int) -> Plan:
     if kind == "wings":
-        return lambda: (plan_wings(seed),)
-    scenes = [scene_by_name(f"lookalike-{k}") for k in (1, 2)]
+        return lambda: (plan_wings(seed, LASER),)
+    scenes = [scene_by_name(f"lookalike-{k}", LASER) for k in (1, 2)]
     return lambda: plan_strangers(*scenes, seed)
 
 
@@ -73,8 +76,8 @@ def prepare_days(
     people: int | None = None,
 ) -> Path:
     """`count` sessions of a world."""
-    changes = {} if scans is None else {"robot": {"scans": scans}}
-    changes |= {} if people is None else {"crowd": {"people": people}}
+    changes = LASER if scans is None else {**LASER, "robot": {"scans": scans}}
+    changes = changes if people is None else {**changes, "crowd": {"people": people}}
 
     def plan():
         return (plan_sessions(scene_by_name(world, changes), SessionOptions(count), seed),)

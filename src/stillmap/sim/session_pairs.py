@@ -1,7 +1,8 @@
 """Pairs of sessions made on purpose: with a given overlap, in two wings, in two buildings."""
 
 import dataclasses
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -79,9 +80,9 @@ def measure_overlap(plan: SessionPlan, with_people: bool = False) -> float:
     return float(compute_overlap(sights, [0] * len(sights))[0, 1])
 
 
-def plan_wings(seed: int = 0) -> SessionPlan:
-    """Two sessions in two wings between which a door is shut."""
-    scene = scene_by_name("two-wings")
+def plan_wings(seed: int = 0, changes: Mapping[str, Any] | None = None) -> SessionPlan:
+    """Two sessions in two wings between which a door is shut; `changes` as of `scene_by_name`."""
+    scene = scene_by_name("two-wings", changes)
     shut = tuple(door.leaf(door.closed) for door in scene.leaves)
     scene = dataclasses.replace(scene, walls=(*scene.walls, *shut), leaves=())
     regions = ((0.0, -_FAR, _FAR, _FAR), (-_FAR, -_FAR, -0.15, _FAR))

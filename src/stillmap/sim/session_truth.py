@@ -157,7 +157,7 @@ def load_session_truth(folder: str | Path) -> SessionTruth:
     """
     path = Path(folder) / FILE
     if not path.is_file():
-        hint = "a folder that 'stillmap simulate --sessions' wrote"
+        hint = "a folder of sessions that 'stillmap simulate' wrote"
         raise InputError("holds no truth about sessions", where=str(folder), hint=hint)
     if path.stat().st_size > _MAX_BYTES:
         raise InputError("is too large for a truth about sessions", where=str(path))
