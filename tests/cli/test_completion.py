@@ -93,7 +93,7 @@ def test_bash(ask):
         "stillmap view ": {"out/"},
         "stillmap simulate office-m": {"office-moved", "office-moved-empty"},
         "stillmap simulate hall --set crowd.peo": {"crowd.people="},
-        "stillmap eval ": {"relations", "trajectory", "labels", "map", "model"},
+        "stillmap eval ": {"relations", "trajectory", "labels", "map", "model", "sessions"},
         "stillmap eval trajectory a b --delta-unit f": {"frames"},
         "stillmap config em.time": {"em.time_bin"},
         "stillmap completion ": {"bash", "zsh", "fish"},
