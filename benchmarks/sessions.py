@@ -98,7 +98,7 @@ def align_pairs(args: argparse.Namespace) -> str:
         merged = merging.merge(args.program, logs, args.data / "places/strangers")
         rows.setdefault("other buildings", []).append((merged, None))
     titles = ["overlap", "pairs", "right", "coarse", "wrong", "refused"]
-    titles += ["median m (max)", "median deg (max)", "s (max)"]
+    titles += ["median m (max)", "median deg (max)", "seam m (max)", "s (max)"]
     return markdown(titles, [_alignment_row(kind, done) for kind, done in rows.items()])
 
 
@@ -123,6 +123,7 @@ def _alignment_row(
         *counts,
         _median_and_max([s.translation for s in placed], ".3f"),
         _median_and_max([s.rotation for s in placed], ".3f"),
+        _median_and_max([s.median_seam for s in placed if np.isfinite(s.median_seam)], ".3f"),
         _median_and_max([merged.seconds for merged, _ in done], ".1f"),
     ]
 

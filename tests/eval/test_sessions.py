@@ -61,6 +61,7 @@ def test_a_perfect_place_is_perfect(perfect: Path, truth: SessionTruth) -> None:
     assert (scores.right, scores.wrong, scores.refused) == (3, 0, 0)
     for one in scores.sessions:
         assert one.max_distance < 1e-6
+        assert one.max_seam < 1e-6
         assert one.rotation < 1e-4
         assert one.start_translation < 1e-6
         assert one.overlap > 0.3
@@ -115,6 +116,7 @@ def test_a_shifted_session_is_found(truth, perfect, tmp_path, shift, verdict) ->
     if shift[2] == 0.0:
         assert one.translation == pytest.approx(np.hypot(*shift[:2]), abs=1e-5)
         assert one.max_distance == pytest.approx(np.hypot(*shift[:2]), abs=1e-5)
+        assert one.median_seam == pytest.approx(np.hypot(*shift[:2]), abs=1e-5)
 
 
 def test_sessions_of_another_place_must_be_refused(tmp_path: Path) -> None:

@@ -33,7 +33,8 @@ def _format_session(s: PoseScores) -> str:
     return (
         f"  {s.name:14} {s.verdict}: off by {s.translation:.3f} m, {s.rotation:.3f} deg, "
         f"at its start {s.start_translation:.3f} m, {s.start_rotation:.3f} deg, "
-        f"poses mean {s.mean_distance:.3f} m, max {s.max_distance:.3f} m"
+        f"poses mean {s.mean_distance:.3f} m, max {s.max_distance:.3f} m, "
+        f"seams median {s.median_seam:.3f} m, max {s.max_seam:.3f} m"
     )
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
 
 from stillmap.core import se2
@@ -21,6 +22,7 @@ Verdict = Literal["right", "coarse", "wrong", "refused", "refused rightly"]
 
 RIGHT = (0.05, 0.5)  # m, degrees: at most, of a session that is placed rightly
 WRONG = (0.5, 5.0)  # m, degrees: more is a wrong place
+_SEAM = 5.0  # m between poses of two sessions that are compared
 _MAX_BYTES = 64 << 20  # of a JSON file of a place
 FRAME_DT = 1e-3  # s: a place carries the stamps of its recordings
 
@@ -65,6 +67,9 @@ class PoseScores(Scores):
             from that of the first accepted session, in the middle of its path.
         start_translation, start_rotation: m, degrees; errors of `T_place_session`.
         mean_distance, max_distance: m, between its estimated and true positions.
+        median_seam, max_seam: m, errors of displacements between each of its poses and the nearest
+            one of another accepted session, where that is truly within 5 m: how well the sessions
+            fit together, however the whole is bent.
     """
 
     name: str
@@ -76,6 +81,8 @@ class PoseScores(Scores):
     start_rotation: float
     mean_distance: float
     max_distance: float
+    median_seam: float
+    max_seam: float
 
 
 def read_json(path: Path) -> Any:
@@ -159,17 +166,28 @@ def score_poses(sessions: list[PlacedSession], truth: SessionTruth) -> list[Pose
         InputError: none was accepted.
     """
     T_world_place, home = align_place(sessions, truth)
-    return [_score(one, truth, T_world_place, home) for one in sessions]
+    at_home = [one for one in sessions if one.accepted and truth.place[one.number] == home]
+    scores = []
+    for one in sessions:
+        others = [other for other in at_home if other is not one]
+        scores.append(_score(one, others, truth, T_world_place, home))
+    return scores
 
 
-def _score(one: PlacedSession, truth: SessionTruth, T_world_place: Float, home: int) -> PoseScores:
+def _score(
+    one: PlacedSession,
+    at_home: list[PlacedSession],
+    truth: SessionTruth,
+    T_world_place: Float,
+    home: int,
+) -> PoseScores:
     k, nan = one.number, float("nan")
     others = np.delete(truth.overlap[:, k], k)
     overlap = float(others.max()) if len(others) else nan
     elsewhere = truth.place[k] != home
     if one.T_place_session is None or elsewhere:
         verdict: Verdict = "refused rightly" if elsewhere else "refused"
-        return PoseScores(one.name, "wrong" if one.accepted else verdict, overlap, *[nan] * 6)
+        return PoseScores(one.name, "wrong" if one.accepted else verdict, overlap, *[nan] * 8)
     D = truth.dimension
     off = np.linalg.norm((T_world_place @ one.poses - one.true_poses)[:, :D, D], axis=1)
     start = np.linalg.inv(truth.T_world_session[k]) @ T_world_place @ one.T_place_session
@@ -192,7 +210,27 @@ def _score(one: PlacedSession, truth: SessionTruth, T_world_place: Float, home: 
         _degrees(start),
         float(off.mean()),
         float(off.max()),
+        *_measure_seam(one, at_home),
     )
+
+
+def _measure_seam(one: PlacedSession, others: list[PlacedSession]) -> tuple[float, float]:
+    """Median and largest error, m, of displacements to the nearest poses of other sessions."""
+    if not others:
+        return float("nan"), float("nan")
+    poses = np.concatenate([other.poses for other in others])
+    true_poses = np.concatenate([other.true_poses for other in others])
+    D = poses.shape[-1] - 1
+    tree = scipy.spatial.cKDTree(true_poses[:, :D, D])
+    away, nearest = tree.query(one.true_poses[:, :D, D], distance_upper_bound=_SEAM)
+    near = np.flatnonzero(np.isfinite(away))
+    if not len(near):
+        return float("nan"), float("nan")
+    there = np.asarray(nearest)[near]
+    found = np.linalg.inv(poses[there]) @ one.poses[near]
+    true = np.linalg.inv(true_poses[there]) @ one.true_poses[near]
+    error = np.linalg.norm((found - true)[:, :D, D], axis=1)
+    return float(np.median(error)), float(error.max())
 
 
 def _degrees(T: Float) -> float:
