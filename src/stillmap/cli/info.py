@@ -4,10 +4,14 @@ import argparse
 import json
 import math
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from stillmap.cli.arguments import add_read_flags, read_options
+from stillmap.cli.arguments import add_read_flags, read_changes, read_options
+from stillmap.cli.config import add_option_flags, options_from_args
 from stillmap.cli.console import show_share
+
+if TYPE_CHECKING:
+    from stillmap.preprocessing.options import ReadOptions
 
 _LINES_SHOWN = 10
 DESCRIPTION = (
@@ -36,6 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
     parser.add_argument("--quiet", action="store_true", help="no progress")
     add_read_flags(parser)
+    add_option_flags(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -47,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
     from stillmap.cli.recording_info import summarize_recording
     from stillmap.io import read
 
-    options = read_options(args)
+    options = _read_options(args)
     with show_share(args.quiet, "reading") as progress:
         recording = read(args.input, options, progress=progress)
     found = {"input": args.input, **summarize_recording(recording)}
@@ -56,6 +61,13 @@ def run(args: argparse.Namespace) -> int:
     else:
         print("\n".join(_format_summary(found)))
     return 0
+
+
+def _read_options(args: argparse.Namespace) -> "ReadOptions":
+    """The options of reading; those of --config and --set, too, where they are given."""
+    if not args.config and not args.assignments:
+        return read_options(args)  # without all other options, which take long to load
+    return options_from_args(args, read_changes(args)).read
 
 
 def _format_summary(found: dict[str, Any]) -> Iterator[str]:

@@ -102,6 +102,7 @@ COMMANDS = {
     "map": "the main job: recording in, folder out",
     "info": "what is in a recording",
     "view": "look at a result",
+    "fleet": "many recordings mapped, and merged per place",
     "filter": "the recording without dynamic beams, for other mapping programs",
     "convert": "one recording format to another; results for other programs",
     "simulate": "a recording with truth, for tests and demos",
@@ -114,6 +115,7 @@ _COMMANDS_EPILOG = """examples:
   stillmap info log.clf.gz              what is in a recording
   stillmap map log.clf.gz -o out        map it
   stillmap view out                     look at the map and the report
+  stillmap fleet recordings -o all      map every recording of a folder
   stillmap filter out -o clean.clf      the recording without dynamic beams
   stillmap convert log.bag -o log.mcap  one format to another
   stillmap simulate hall -o sim         a recording with truth
@@ -123,6 +125,7 @@ exit status:
   0    done
   1    a defect of stillmap
   2    the input or the call is at fault; one line says what to do
+  3    fleet: some recordings failed, all others are done
   130  interrupted; nothing is half-written
 """
 

@@ -1,0 +1,6 @@
+"""Many recordings mapped, and merged per place: `stillmap fleet`."""
+
+from stillmap.fleet.jobs import Fleet, Reporter, Request
+from stillmap.fleet.run import run_fleet
+
+__all__ = ["Fleet", "Reporter", "Request", "run_fleet"]

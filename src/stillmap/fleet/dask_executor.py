@@ -1,0 +1,89 @@
+"""The same tasks on the workers of a Dask cluster; needs the extra `fleet`."""
+
+import logging
+from typing import Any
+
+from stillmap.core.errors import InputError, import_extra
+from stillmap.fleet.local_executor import EndedTask
+from stillmap.fleet.outcomes import Outcome
+from stillmap.fleet.tasks import Task, run_task
+
+_TIMEOUT = 15  # s for the scheduler to answer
+_LOGGERS = ("distributed", "tornado", "asyncio")  # what they report ends up in an outcome here
+
+
+class DaskExecutor:
+    """Workers of a scheduler.
+
+    A task of the same recording, options and version has the same key there: one that an
+    interrupted caller left running is taken over, not run twice. When a worker dies, the scheduler
+    runs its task elsewhere, as often as `distributed.scheduler.allowed-failures` says (3).
+
+    Args:
+        address: of the scheduler, as `tcp://HOST:8786`.
+
+    Raises:
+        InputError: none answers there, or it has no worker.
+        MissingExtra: dask.distributed is not installed.
+    """
+
+    def __init__(self, address: str) -> None:
+        self._dask = import_extra("distributed", address, "used", group="fleet")
+        for name in _LOGGERS:
+            logging.getLogger(name).setLevel(logging.CRITICAL)
+        self._address = address
+        try:
+            self._client = self._dask.Client(address, timeout=_TIMEOUT, set_as_default=False)
+        except (OSError, TimeoutError, ValueError, TypeError) as error:
+            what = f"no Dask scheduler answers: {error}"
+            raise InputError(what, where=address, hint="as in tcp://HOST:8786") from error
+        if not self.workers():
+            self._client.close()
+            hint = f"start some: dask worker {address} --nthreads 1"
+            raise InputError("this scheduler has no worker", where=address, hint=hint)
+        self._waiting = self._dask.as_completed()
+        self._tasks: dict[str, tuple[Any, Task, int]] = {}
+
+    def workers(self) -> list[str]:
+        """The addresses of the workers that are there now."""
+        return [str(address) for address in self._client.nthreads()]
+
+    def submit(self, task: Task, attempt: int = 1, avoid: str = "") -> None:
+        others = [address for address in self.workers() if address != avoid] if avoid else []
+        key = task.identity if attempt == 1 else f"{task.identity}-{attempt}"
+        future = self._client.submit(
+            run_on_worker, task, key=key, workers=others or None, allow_other_workers=True
+        )
+        self._tasks[future.key] = future, task, attempt
+        self._waiting.add(future)
+
+    def wait(self) -> EndedTask:
+        future = next(self._waiting)
+        _, task, attempt = self._tasks.pop(future.key)
+        try:
+            return EndedTask(task, future.result(), attempt)
+        except self._dask.KilledWorker as error:
+            return EndedTask(task, Outcome("failed", f"its workers died: {error}"), attempt)
+        except ImportError as error:
+            hint = "install the same version on the scheduler and on every worker"
+            raise InputError(f"lacks stillmap: {error}", where=self._address, hint=hint) from error
+        except (self._dask.CancelledError, OSError) as error:
+            what = "the Dask scheduler is gone"
+            hint = "start it, then continue with the same command"
+            raise InputError(what, where=self._address, hint=hint) from error
+
+    def limit(self, jobs: int) -> None:
+        pass  # the workers decide
+
+    def close(self) -> None:
+        for future, _, _ in self._tasks.values():
+            future.release()
+        self._client.close()
+
+
+def run_on_worker(task: Task) -> Outcome:
+    """Run a task on a worker, and say on which."""
+    from dataclasses import replace
+
+    distributed = import_extra("distributed", "a worker", "used", group="fleet")
+    return replace(run_task(task), worker=str(distributed.get_worker().address))
