@@ -14,7 +14,7 @@ from stillmap.core.version import package_version
 from stillmap.fleet.storage import RECORD, STATE, Storage
 
 RESULTS, PLACES = "results", "places"  # folders of the fleet
-_NO_MATTER = ("threads=",)  # options on which no label or map depends
+_NO_MATTER = ("--set=threads=",)  # options on which no label or map depends
 
 
 def key_of(task: str, content: Sequence[str], words: Sequence[str]) -> str:
@@ -33,7 +33,7 @@ def key_of(task: str, content: Sequence[str], words: Sequence[str]) -> str:
 def write_label(
     storage: Storage, name: str, key: str, record: bytes, content: dict[str, Any]
 ) -> None:
-    """Label a result that has been published.
+    """Label a result that is about to be published.
 
     Args:
         storage: where the result lies.

@@ -206,6 +206,7 @@ def explain(url: str, action: str) -> Iterator[None]:
         if not _is_of_s3(error):
             raise
         what = re.sub(r"\s+", " ", str(error)) or type(error).__name__
+        what = re.sub(r"\?[^\s\"]*", "", what)  # the query of a URL
         raise InputError(f"cannot be {action}: {what}", where=url) from error
 
 

@@ -60,7 +60,8 @@ def _read_csv(path: Path, text: str) -> Iterator[tuple[dict[str, Any], str]]:
                 raise InputError("has another number of columns than the heading", where=where)
             yield row, where
     except csv.Error as error:
-        raise InputError(f"is not CSV: {error}", where=f"{path}:{reader.line_num}") from error
+        where = f"{path}:{reader.reader.line_num}"
+        raise InputError(f"is not CSV: {error}", where=where) from error
 
 
 def _read_json(path: Path, text: str) -> Iterator[tuple[dict[str, Any], str]]:

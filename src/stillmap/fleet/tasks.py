@@ -1,8 +1,8 @@
 """The tasks of a fleet: inspect a recording, map it, merge the results of a place.
 
 A task is a few strings, so that it can be sent to another machine, where `run_task` runs it. The
-work is done by `stillmap` itself in a child process. Nothing of a task that was killed counts: a
-result appears whole, and its label after it.
+work is done by `stillmap` itself in a child process. Nothing of a task that was killed counts: its
+result appears whole or not at all.
 """
 
 import html
@@ -185,15 +185,15 @@ def outcome_of_label(label: dict[str, Any]) -> Outcome:
 def _publish(
     storage: Storage, name: str, key: str, folder: Path, summary: dict[str, Any], outcome: Outcome
 ) -> Outcome:
-    """Put a finished result in its place, then its label."""
+    """Put a finished result with its label in its place."""
     label = {
         "summary": summary,
         "cpu_seconds": outcome.cpu_seconds,
         "peak_memory_bytes": outcome.peak_memory_bytes,
     }
-    record = (folder / RECORD).read_bytes()
+    # the label fits the record of this result alone: until the result is there, it says nothing
+    write_label(storage, name, key, (folder / RECORD).read_bytes(), label)
     storage.publish(folder, name)
-    write_label(storage, name, key, record, label)
     return outcome_of_label(label)
 
 
