@@ -1,13 +1,10 @@
 """Fixtures: small recordings, results made by hand, a stand-in for stillmap, S3, Dask."""
 
-import json
 import os
-import re
 import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -21,8 +18,9 @@ from stillmap.sim.walls import box
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))  # for what the tests share
 
+from fleets import NAMES, contents, wait_until  # noqa: E402
+
 COMMAND = [sys.executable, "-m", "stillmap"]
-NAMES = ("hall", "office", "yard")
 
 
 @pytest.fixture
@@ -84,40 +82,6 @@ def by_hand(
     return {name: contents(folder / name) for name in NAMES}
 
 
-def contents(folder: Path) -> dict[str, bytes]:
-    """All files of a result, without what tells of time and memory in them."""
-    out = {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
-    run = json.loads(out["run.json"])
-    for name in ("seconds", "cpu_seconds", "peak_memory_bytes"):
-        del run[name]
-    for iteration in run["iterations"]:
-        del iteration["seconds"]
-    report = re.sub(rb"<h3>Time and memory</h3>.*?</details>", b"", out["report.html"], flags=re.S)
-    report = re.sub(rb"<div><dt>Computed in</dt>.*?</div>", b"", report)
-    report = re.sub(rb"<td[^<>]*>[0-9.,]+ (ms|s|min)</td>", b"", report)
-    return {**out, "run.json": json.dumps(run).encode(), "report.html": report}
-
-
-def files_of(folder: Path) -> set[str]:
-    """Relative paths of all files and empty folders below a folder."""
-    found = (p for p in folder.rglob("*") if p.is_file() or not any(p.iterdir()))
-    return {str(p.relative_to(folder)) for p in found}
-
-
-def unfinished(folder: Path) -> set[str]:
-    """What a finished fleet should not have."""
-    kept = ("results/", "places/", ".fleet/labels/")
-    own = {"fleet.json", "fleet.html", ".fleet/lock", ".fleet/journal.jsonl"}
-    return {one for one in files_of(folder) if not one.startswith(kept)} - own
-
-
-def wait_until(condition: Callable[[], object], seconds: float = 60.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "waited for too long"
-        time.sleep(0.01)
-
-
 @pytest.fixture
 def stand_in(monkeypatch: pytest.MonkeyPatch) -> None:
     """Tasks run `stand_in.py` instead of stillmap: what it does is written in the recordings."""
@@ -173,13 +137,16 @@ def dask_cluster(tmp_path: Path) -> Iterator[tuple[str, list[int]]]:
     pytest.importorskip("distributed")
     port, processes = free_port(), []
     address = f"tcp://127.0.0.1:{port}"
-    environment = {**os.environ, "DASK_DISTRIBUTED__WORKER__MEMORY__TERMINATE": "False"}
+    # found from any working directory, where stillmap is not installed
+    environment = {**os.environ, "PYTHONPATH": str(Path(child.__file__).parents[2])}
 
     def run(*words: str) -> None:
         command = [sys.executable, "-m", "distributed.cli." + words[0], *words[1:]]
         quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
         processes.append(
-            subprocess.Popen(command, cwd=tmp_path, env=environment, start_new_session=True, **quiet)
+            subprocess.Popen(
+                command, cwd=tmp_path, env=environment, start_new_session=True, **quiet
+            )
         )
 
     try:

@@ -9,20 +9,12 @@ import time
 from pathlib import Path
 
 import pytest
-from conftest import wait_until
+from fleets import is_alive, wait_until
 
 from stillmap.fleet import child
 from stillmap.fleet.child import Stopped, run_stillmap
 
 BUSY = "import time; end = time.process_time() + 0.3\nwhile time.process_time() < end: pass"
-
-
-def is_alive(pid: int) -> bool:
-    try:
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except OSError:
-        return False
-    return state != "Z"  # nobody has waited for it yet
 
 
 @pytest.fixture

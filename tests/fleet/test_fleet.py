@@ -6,7 +6,7 @@ import json
 import os
 
 import pytest
-from conftest import unfinished
+from fleets import unfinished
 
 from stillmap.fleet import phases, storage
 

@@ -5,10 +5,9 @@ import os
 import re
 import signal
 from html.parser import HTMLParser
-from pathlib import Path
 
 import pytest
-from conftest import NAMES, contents, unfinished, wait_until
+from fleets import NAMES, children_of, contents, is_alive, unfinished, wait_until
 from marks import slow_params
 
 from stillmap.cli.parser import COMMANDS
@@ -83,24 +82,6 @@ def test_page_is_self_contained(fleet):
     assert "prefers-color-scheme: dark" in text
 
 
-def children_of(pid: int) -> set[int]:
-    found, waiting = set(), [pid]
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            fields = path.read_text().rpartition(")")[2].split()
-        except OSError:
-            continue
-        if fields[0] != "Z":
-            found.add((int(path.parent.name), int(fields[1])))
-    below = set()
-    while waiting:
-        one = waiting.pop()
-        new = {child for child, parent in found if parent == one}
-        below |= new
-        waiting += new
-    return below
-
-
 def begin(start, inputs, out):
     """A fleet of which one recording is mapped, and its processes."""
     process = start("fleet", *inputs, "-o", out, "--jobs", 1)
@@ -122,7 +103,7 @@ def test_stopped_and_continued(start, recordings, by_hand, tmp_path, number, sta
     if number != "SIGKILL":
         assert "continue with the same command: stillmap fleet" in err
         assert unfinished(out) == set()
-    wait_until(lambda: not any(map(_is_alive, children)), 10)
+    wait_until(lambda: not any(map(is_alive, children)), 10)
     done = {one.name: one.stat().st_ino for one in (out / "results").iterdir()}
     assert all((out / "results" / name / "run.json").is_file() for name in done)
     again = start("fleet", *inputs, "-o", out, "--quiet")
@@ -133,13 +114,6 @@ def test_stopped_and_continued(start, recordings, by_hand, tmp_path, number, sta
     for name, inode in done.items():
         assert (out / "results" / name).stat().st_ino == inode  # not mapped again
     assert unfinished(out) == set()
-
-
-def _is_alive(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
 
 
 @pytest.mark.skipif("merge" not in COMMANDS, reason="stillmap merge is no command here")

@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 
 from stillmap.core.errors import InputError, import_extra
 from stillmap.fleet.scratch import remove_stale, scratch_folder
+from stillmap.fleet.storage import RECORD, STATE
 
-_RECORD = "run.json"  # uploaded last, removed first: a result without it is absent
 _RETRIES = {"max_attempts": 5, "mode": "standard"}
 _TIMEOUT = 10  # s for a connection
 _lock = threading.Lock()
@@ -71,7 +71,10 @@ class BucketStorage:
 
     def is_taken(self) -> bool:
         with explain(self.root, "read"):
-            return bool(self._s3.exists(self.root)) and bool(self._s3.ls(self.root))
+            if not self._s3.exists(self.root):
+                return False
+            found = [str(path).rstrip("/") for path in self._s3.ls(self.root, detail=False)]
+            return any(not path.endswith(f"/{STATE}") for path in found)
 
     @contextmanager
     def attempt(self) -> Iterator[Path]:
@@ -82,7 +85,7 @@ class BucketStorage:
         url = self._url(name)
         self._remove(url)
         paths = sorted(path for path in folder.rglob("*") if path.is_file())
-        paths.sort(key=lambda path: path == folder / _RECORD)
+        paths.sort(key=lambda path: path == folder / RECORD)
         with explain(url, "written"):
             first, last = paths[:-1], paths[-1]
             names = [path.relative_to(folder).as_posix() for path in first]
@@ -99,10 +102,10 @@ class BucketStorage:
         """Remove a result, its record first, and what interrupted uploads left of it."""
         names = [one.name for one in list_files(url)]
         with explain(url, "written"):
-            if _RECORD in names:
-                self._s3.rm_file(f"{url}/{_RECORD}")
+            if RECORD in names:
+                self._s3.rm_file(f"{url}/{RECORD}")
             if names:
-                self._s3.rm([f"{url}/{name}" for name in names if name != _RECORD])
+                self._s3.rm([f"{url}/{name}" for name in names if name != RECORD])
             bucket, _, prefix = url.removeprefix("s3://").partition("/")
             found = self._s3.call_s3("list_multipart_uploads", Bucket=bucket, Prefix=f"{prefix}/")
             for one in found.get("Uploads", ()):
@@ -123,9 +126,10 @@ def list_files(url: str) -> list[RemoteFile]:
     with explain(url, "read"):
         try:
             found = s3.find(url, detail=True)
-        except FileNotFoundError:
-            if not s3.exists(url.split("/", 3)[2]):
-                raise
+        except FileNotFoundError as error:
+            bucket = url.split("/", 3)[2]
+            if not s3.exists(bucket):
+                raise InputError("there is no such bucket", where=f"s3://{bucket}") from error
             return []
     root = url.removeprefix("s3://").rstrip("/")
     files = (

@@ -41,7 +41,7 @@ class DaskExecutor:
             self._client.close()
             hint = f"start some: dask worker {address} --nthreads 1"
             raise InputError("this scheduler has no worker", where=address, hint=hint)
-        self._waiting = self._dask.as_completed()
+        self._waiting = self._dask.as_completed(loop=self._client.loop)
         self._tasks: dict[str, tuple[Any, Task, int]] = {}
 
     def workers(self) -> list[str]:
@@ -51,9 +51,8 @@ class DaskExecutor:
     def submit(self, task: Task, attempt: int = 1, avoid: str = "") -> None:
         others = [address for address in self.workers() if address != avoid] if avoid else []
         key = task.identity if attempt == 1 else f"{task.identity}-{attempt}"
-        future = self._client.submit(
-            run_on_worker, task, key=key, workers=others or None, allow_other_workers=True
-        )
+        elsewhere = {"workers": others, "allow_other_workers": True} if others else {}
+        future = self._client.submit(run_on_worker, task, key=key, **elsewhere)
         self._tasks[future.key] = future, task, attempt
         self._waiting.add(future)
 
@@ -64,9 +63,12 @@ class DaskExecutor:
             return EndedTask(task, future.result(), attempt)
         except self._dask.KilledWorker as error:
             return EndedTask(task, Outcome("failed", f"its workers died: {error}"), attempt)
-        except ImportError as error:
-            hint = "install the same version on the scheduler and on every worker"
-            raise InputError(f"lacks stillmap: {error}", where=self._address, hint=hint) from error
+        except (ImportError, RuntimeError) as error:
+            if not isinstance(error, ImportError) and "deserialization" not in str(error):
+                raise
+            what = "the scheduler or a worker does not know stillmap"
+            hint = "install this version, and what else the client has, on all of them"
+            raise InputError(what, where=self._address, hint=hint) from error
         except (self._dask.CancelledError, OSError) as error:
             what = "the Dask scheduler is gone"
             hint = "start it, then continue with the same command"

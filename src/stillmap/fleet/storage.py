@@ -13,7 +13,7 @@ from stillmap.fleet.scratch import remove_stale, scratch_folder
 from stillmap.fleet.urls import is_url
 
 STATE = ".fleet"  # folder of the journal, of the labels of results, and of unfinished results
-RECORD = "run.json"  # every result has it, and it appears last
+RECORD = "run.json"  # every result has it; in a bucket it appears last, and goes first
 
 
 class Storage(Protocol):
@@ -37,7 +37,7 @@ class Storage(Protocol):
         """Append a line, without its line feed, to a journal; it is kept when this returns."""
 
     def is_taken(self) -> bool:
-        """Whether something lies at the root."""
+        """Whether something lies at the root beside the folder `STATE`."""
 
     def attempt(self) -> AbstractContextManager[Path]:
         """A local folder for unfinished results and copies."""
@@ -104,7 +104,7 @@ class FolderStorage:
     def is_taken(self) -> bool:
         if self._path.exists() and not self._path.is_dir():
             raise InputError("is in the way: not a folder", where=self.root)
-        return self._path.is_dir() and any(self._path.iterdir())
+        return self._path.is_dir() and any(one.name != STATE for one in self._path.iterdir())
 
     @contextmanager
     def attempt(self) -> Iterator[Path]:

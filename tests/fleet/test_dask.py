@@ -1,0 +1,52 @@
+"""The same tasks on a real Dask cluster of two worker processes."""
+
+import json
+import os
+import signal
+
+import pytest
+from fleets import NAMES, children_of, contents, is_alive, unfinished, wait_until
+
+from stillmap.core.errors import InputError
+from stillmap.fleet.dask_executor import DaskExecutor
+
+pytest.importorskip("distributed")
+
+
+def test_worker_killed_and_client_interrupted(dask_cluster, recordings, by_hand, start, tmp_path):
+    address, workers = dask_cluster
+    out = tmp_path / "out"
+    words = ("fleet", recordings, "-o", out, "--scheduler", address)
+    # the client is interrupted while its first recordings are mapped
+    first = start(*words)
+    wait_until(lambda: list(out.glob(".fleet/work/*/.result.resume")))
+    first.send_signal(signal.SIGINT)
+    _, err = first.communicate(timeout=30)
+    assert first.returncode == 130, err
+    assert "continue with the same command" in err
+    assert "Traceback" not in err
+    # the same command goes on; one worker is killed in the midst
+    again = start(*words, "--json")
+    wait_until(lambda: list(out.glob("results/*/run.json")) and children_of(workers[0]))
+    children = children_of(workers[0])
+    os.kill(workers[0], signal.SIGKILL)
+    wait_until(lambda: not any(map(is_alive, children)), 5)
+    printed, err = again.communicate(timeout=120)
+    assert again.returncode == 0, err
+    assert "Traceback" not in err
+    assert {one["status"] for one in json.loads(printed)} == {"done"}
+    for name in NAMES:
+        assert contents(out / "results" / name) == by_hand[name], name
+    assert unfinished(out) == set()
+
+
+def test_no_scheduler_answers(monkeypatch):
+    monkeypatch.setattr("stillmap.fleet.dask_executor._TIMEOUT", 1)
+    with pytest.raises(InputError, match=r"tcp://127.0.0.1:9: no Dask scheduler answers"):
+        DaskExecutor("tcp://127.0.0.1:9")
+
+
+def test_missing_library(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "distributed", None)
+    with pytest.raises(InputError, match=r"tcp://a:1: needs distributed.*\[fleet\]"):
+        DaskExecutor("tcp://a:1")
