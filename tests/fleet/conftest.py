@@ -18,7 +18,7 @@ from stillmap.sim.walls import box
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))  # for what the tests share
 
-from fleets import NAMES, contents, wait_until  # noqa: E402
+from fleets import NAMES, contents, wait_until
 
 COMMAND = [sys.executable, "-m", "stillmap"]
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import sys
 import urllib.request
 
 import pytest
@@ -9,6 +10,7 @@ from fleets import NAMES, contents
 
 from stillmap.cli.main import main
 from stillmap.core.errors import InputError
+from stillmap.fleet.storage import open_storage
 
 s3fs = pytest.importorskip("s3fs")
 pytestmark = [
@@ -19,7 +21,7 @@ pytestmark = [
 
 
 @pytest.fixture
-def s3(s3_server, s3_environment):
+def s3(s3_server):
     """An empty bucket `robots`, and a client of its own for looking at it."""
     client = s3fs.S3FileSystem(
         key="robot", secret="secret", endpoint_url=s3_server, use_listings_cache=False
@@ -151,14 +153,16 @@ def one_line(done):
     return line
 
 
-def test_bucket_that_is_not_there(call, s3, recordings):
+@pytest.mark.usefixtures("s3")
+def test_bucket_that_is_not_there(call, recordings):
     line = one_line(call("fleet", recordings / "hall", "-o", "s3://nowhere/out"))
     assert line == "stillmap: s3://nowhere: there is no such bucket"
     line = one_line(call("fleet", "s3://nowhere/day", "-o", "s3://robots/out"))
     assert line == "stillmap: s3://nowhere: there is no such bucket"
 
 
-def test_bucket_without_access(call, s3, s3_server, recordings, tmp_path):
+@pytest.mark.usefixtures("s3")
+def test_bucket_without_access(call, s3_server, recordings, tmp_path):
     with urllib.request.urlopen(_post(s3_server, b"0")):  # from now on keys are checked
         pass
     try:
@@ -185,9 +189,7 @@ def test_no_server_answers(recordings, monkeypatch, capsys):
     assert "s3://robots/out/.fleet/journal: cannot be read: Could not connect" in line
 
 
-def test_missing_library(monkeypatch, recordings):
-    from stillmap.fleet.storage import open_storage
-
-    monkeypatch.setitem(__import__("sys").modules, "s3fs", None)
+def test_missing_library(monkeypatch):
+    monkeypatch.setitem(sys.modules, "s3fs", None)
     with pytest.raises(InputError, match=r"needs s3fs.*install.*\[s3\]"):
         open_storage("s3://robots/out")

@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import sys
 
 import pytest
 from fleets import NAMES, children_of, contents, is_alive, unfinished, wait_until
@@ -47,6 +48,6 @@ def test_no_scheduler_answers(monkeypatch):
 
 
 def test_missing_library(monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "distributed", None)
+    monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match=r"tcp://a:1: needs distributed.*\[fleet\]"):
         DaskExecutor("tcp://a:1")

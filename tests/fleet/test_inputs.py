@@ -36,7 +36,7 @@ def test_folder_that_is_a_recording_is_one(recordings):
     assert names(entries_of([str(recordings)], None)) == ["hall", "office", "yard"]
 
 
-def test_result_is_no_recording(logs, tmp_path):
+def test_result_is_no_recording(logs):
     result = logs / "result"
     result.mkdir()
     (result / "static.ply").write_text("ply\n")
@@ -54,10 +54,11 @@ def test_file_whose_name_looks_like_a_pattern(tmp_path):
     assert names(entries_of([str(tmp_path / "a[1].log")], None)) == ["a_1_"]
 
 
+@pytest.mark.usefixtures("logs")
 @pytest.mark.parametrize("what", ["logs/*.bag", "empty"])
-def test_nothing_inside(logs, tmp_path, what):
+def test_nothing_inside(tmp_path, what):
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match="no recording|matches no file"):
+    with pytest.raises(InputError, match=r"no recording|matches no file"):
         find_sources(entries_of([str(tmp_path / what)], None), {})
 
 
@@ -145,7 +146,8 @@ def test_bad_manifests(tmp_path, name, text, message):
         read_manifest(write(tmp_path, name, text))
 
 
-def test_two_places_for_one_recording(tmp_path, logs):
+@pytest.mark.usefixtures("logs")
+def test_two_places_for_one_recording(tmp_path):
     text = "input,place\nlogs/a.clf,hall\nlogs,yard\n"
     entries = read_manifest(write(tmp_path, "m.csv", text))
     with pytest.raises(InputError, match=r"m.csv:3: .*a.clf is in two places: hall and yard"):

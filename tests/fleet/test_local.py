@@ -14,7 +14,7 @@ from stillmap.cli.parser import COMMANDS
 
 
 @pytest.fixture(scope="module")
-def fleet(recordings, by_hand, start, tmp_path_factory):
+def fleet(recordings, start, tmp_path_factory):
     """The folder of a fleet of the recordings and of a damaged one, and what was printed."""
     out = tmp_path_factory.mktemp("fleet") / "out"
     damaged = out.parent / "damaged.bag"
@@ -62,7 +62,7 @@ class _Page(HTMLParser):
         super().__init__()
         self.sources, self.links = [], []
 
-    def handle_starttag(self, tag, attributes):
+    def handle_starttag(self, _tag, attributes):
         about = dict(attributes)
         self.sources += [about[key] for key in ("src", "data", "srcset") if key in about]
         self.links += [about["href"]] if "href" in about else []

@@ -69,7 +69,7 @@ def test_published_result_replaces_the_one_before(storage, tmp_path):
     assert storage.read("results/a/run.json") == b"two"
 
 
-def test_result_fits_its_label(storage, tmp_path):
+def test_result_fits_its_label(storage):
     make_result(storage, "one")
     write_label(storage, "results/a", "key", b"one", {"summary": {"map": None}})
     assert find_result(storage, "results/a", "key")["summary"] == {"map": None}
@@ -97,7 +97,7 @@ def test_changed_label_is_none(storage):
 def test_write_leaves_the_old_file_when_the_disk_is_full(storage, tmp_path, monkeypatch):
     storage.write("fleet.json", b"old")
 
-    def refuse(handle):
+    def refuse(_handle):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "fsync", refuse)
