@@ -4,6 +4,7 @@ import json
 import os
 import signal
 import sys
+from pathlib import Path
 
 import pytest
 from fleets import NAMES, children_of, contents, is_alive, unfinished, wait_until
@@ -12,6 +13,20 @@ from stillmap.core.errors import InputError
 from stillmap.fleet.dask_executor import DaskExecutor
 
 pytest.importorskip("distributed")
+
+
+def busy_with_maps(workers):
+    """The workers that run `stillmap map`."""
+    return [
+        one for one in workers if any(b"\0map\0" in command_of(child) for child in children_of(one))
+    ]
+
+
+def command_of(pid):
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes()
+    except OSError:
+        return b""
 
 
 def test_worker_killed_and_client_interrupted(dask_cluster, recordings, by_hand, start, tmp_path):
@@ -28,9 +43,10 @@ def test_worker_killed_and_client_interrupted(dask_cluster, recordings, by_hand,
     assert "Traceback" not in err
     # the same command goes on; one worker is killed in the midst
     again = start(*words, "--json")
-    wait_until(lambda: list(out.glob("results/*/run.json")) and children_of(workers[0]))
-    children = children_of(workers[0])
-    os.kill(workers[0], signal.SIGKILL)
+    wait_until(lambda: busy_with_maps(workers) or again.poll() is not None)
+    (worker, *_) = busy_with_maps(workers)
+    children = children_of(worker)
+    os.kill(worker, signal.SIGKILL)
     wait_until(lambda: not any(map(is_alive, children)), 5)
     printed, err = again.communicate(timeout=120)
     assert again.returncode == 0, err

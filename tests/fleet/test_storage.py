@@ -13,6 +13,7 @@ from stillmap.fleet.artifacts import find_result, key_of, write_label
 from stillmap.fleet.content import fingerprint, hash_content
 from stillmap.fleet.journal import Journal
 from stillmap.fleet.scratch import remove_stale, scratch_folder
+from stillmap.fleet.settings import Settings
 from stillmap.fleet.storage import FolderStorage
 
 
@@ -158,7 +159,9 @@ def test_fingerprint_sees_a_change(tmp_path):
 
 
 def test_threads_do_not_change_the_key():
-    words = ["--set=em.prior=0.8"]
-    assert key_of("map", ["x"], words) == key_of("map", ["x"], [*words, "--set=threads=2"])
-    assert key_of("map", ["x"], words) != key_of("map", ["x"], [])
-    assert key_of("map", ["x"], words) != key_of("map", ["y"], words)
+    one = Settings((("em.prior", "0.8"),))
+    two = Settings((("em.prior", "0.8"), ("threads", "2")))
+    assert key_of("map", ["x"], one) == key_of("map", ["x"], two)
+    others = [Settings(), Settings((("em.prior", "0.7"),)), Settings(one.options, False)]
+    assert len({key_of("map", ["x"], other) for other in (one, *others)}) == 4
+    assert key_of("map", ["x"], one) != key_of("map", ["y"], one)

@@ -97,7 +97,7 @@ def _ignore(line: str) -> None:
 
 def _read_request(args: argparse.Namespace) -> "Request":
     from stillmap.core.parallel import resolve_threads
-    from stillmap.fleet import Request
+    from stillmap.fleet import Request, Settings
 
     if args.poses not in (None, "recording"):
         raise InputError("--poses FILE is for one recording", hint="--poses recording is possible")
@@ -107,14 +107,10 @@ def _read_request(args: argparse.Namespace) -> "Request":
         raise InputError("--jobs and --scheduler exclude each other")
     args.tilting_topic = None  # a flag of `map` alone
     options = options_from_args(args, read_changes(args), option_changes(args))
-    words = _option_words(options)
-    method = ["--no-odometry"] * args.no_odometry + ["--poses", "recording"] * bool(args.poses)
-    read_words = [word for word in words if word.startswith("--set=read.")]
     return Request(
         entries=_read_entries(args),
         output=args.output,
-        info_words=tuple(read_words),
-        map_words=(*words, *method),
+        settings=Settings(_changed_options(options), not args.no_odometry, bool(args.poses)),
         resolution=options.slam.resolution,
         jobs=args.jobs or resolve_threads(0),
         scheduler=args.scheduler,
@@ -134,18 +130,18 @@ def _read_entries(args: argparse.Namespace) -> "list[Entry]":
     return [*entries, *entries_of(args.inputs, _ALL if args.merge else None)]
 
 
-def _option_words(options: "Options") -> list[str]:
-    """Every option that is not the default, as `--set=...` of `stillmap map`."""
+def _changed_options(options: "Options") -> tuple[tuple[str, str], ...]:
+    """Name and JSON value of every option that is not the default."""
     from stillmap.core.config import iter_options
 
-    words = []
+    changed = []
     for one in iter_options(options):
         value = one.value
         if one.name == "read.cameras" and value is not None:
             value = os.path.abspath(value)
         if value != one.default:
-            words.append(f"--set={one.name}={json.dumps(value, ensure_ascii=False)}")
-    return words
+            changed.append((one.name, json.dumps(value, ensure_ascii=False)))
+    return tuple(changed)
 
 
 @contextmanager

@@ -2,5 +2,6 @@
 
 from stillmap.fleet.jobs import Fleet, Reporter, Request
 from stillmap.fleet.run import run_fleet
+from stillmap.fleet.settings import Settings
 
-__all__ = ["Fleet", "Reporter", "Request", "run_fleet"]
+__all__ = ["Fleet", "Reporter", "Request", "Settings", "run_fleet"]

@@ -11,22 +11,21 @@ from collections.abc import Sequence
 from typing import Any
 
 from stillmap.core.version import package_version
+from stillmap.fleet.settings import Settings
 from stillmap.fleet.storage import RECORD, STATE, Storage
 
 RESULTS, PLACES = "results", "places"  # folders of the fleet
-_NO_MATTER = ("--set=threads=",)  # options on which no label or map depends
 
 
-def key_of(task: str, content: Sequence[str], words: Sequence[str]) -> str:
+def key_of(task: str, content: Sequence[str], settings: Settings) -> str:
     """The key of a result.
 
     Args:
         task: "map" or "merge".
         content: digests of the recordings, or the keys of the results that are merged.
-        words: the options on the command line of the task.
+        settings: of the task.
     """
-    relevant = [word for word in words if not word.startswith(_NO_MATTER)]
-    text = json.dumps([task, list(content), relevant, package_version()])
+    text = json.dumps([task, list(content), settings.describe(), package_version()])
     return hashlib.sha256(text.encode()).hexdigest()
 
 

@@ -39,7 +39,7 @@ class DaskExecutor:
             raise InputError(what, where=address, hint="as in tcp://HOST:8786") from error
         if not self.workers():
             self._client.close()
-            hint = f"start some: dask worker {address} --nthreads 1"
+            hint = f"start some: dask worker {address}"
             raise InputError("this scheduler has no worker", where=address, hint=hint)
         self._waiting = self._dask.as_completed(loop=self._client.loop)
         self._tasks: dict[str, tuple[Any, Task, int]] = {}

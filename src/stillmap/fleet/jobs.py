@@ -8,6 +8,7 @@ from stillmap.fleet.artifacts import PLACES, RESULTS
 from stillmap.fleet.inputs import Source
 from stillmap.fleet.manifest import Entry
 from stillmap.fleet.outcomes import Outcome
+from stillmap.fleet.settings import Settings
 
 
 class Request(NamedTuple):
@@ -16,8 +17,7 @@ class Request(NamedTuple):
     Attributes:
         entries: recordings, folders and patterns of them, with their places.
         output: folder or URL of the fleet.
-        info_words: options on the command line of `stillmap info`.
-        map_words: options on the command line of `stillmap map`.
+        settings: how the recordings are mapped.
         resolution: edge of a cell in metres.
         jobs: local processes at once.
         scheduler: address of a Dask scheduler; empty: local processes.
@@ -25,8 +25,7 @@ class Request(NamedTuple):
 
     entries: Sequence[Entry]
     output: str
-    info_words: tuple[str, ...]
-    map_words: tuple[str, ...]
+    settings: Settings
     resolution: float
     jobs: int
     scheduler: str = ""

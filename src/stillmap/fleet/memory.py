@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 # an upper figure: of 13 recordings of 60 to 100 000 scans none needed more (docs/fleet.md)
-_BASE = 150 << 20  # bytes: interpreter, libraries, arrays that do not grow
+_BASE = {2: 200 << 20, 3: 300 << 20}  # bytes: interpreter, libraries, arrays that do not grow
 _PER_SCAN = 30_000  # bytes: poses, covariances, the map that a scan adds
 _PER_BEAM = 60  # bytes: arrays, and pages of files that are mapped
 _PER_CELL = 70  # bytes of a cell of the plane within range
@@ -27,7 +27,7 @@ def estimate_memory(info: Mapping[str, Any], resolution: float) -> int:
     reach = float(ranges["p99"]) if ranges and info.get("dimension") == 2 else 0.0
     cells = math.pi * (reach / resolution) ** 2
     by_size = _PER_SCAN * int(info["scans"]) + _PER_BEAM * int(info["beams"])
-    return round(_BASE + by_size + _PER_CELL * cells)
+    return round(_BASE[int(info["dimension"])] + by_size + _PER_CELL * cells)
 
 
 def machine_memory() -> int:

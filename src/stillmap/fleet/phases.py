@@ -12,6 +12,7 @@ from stillmap.fleet.journal import Journal
 from stillmap.fleet.local_executor import Executor
 from stillmap.fleet.memory import estimate_memory, fitting_jobs, machine_memory
 from stillmap.fleet.outcomes import MAKE_ROOM, Outcome, outcome_of_error
+from stillmap.fleet.settings import Settings
 from stillmap.fleet.storage import Storage
 from stillmap.fleet.tasks import Inspect, Map, Merge, Task, outcome_of_label
 
@@ -26,7 +27,7 @@ def inspect(
 
     What the journal knows of an unchanged recording is not found out again.
     """
-    known = _known_recordings(journal)
+    known, settings = _known_recordings(journal), request.settings.for_reading()
     tasks: dict[str, Inspect] = {}
     for job in jobs:
         try:
@@ -35,7 +36,7 @@ def inspect(
             job.outcome = outcome_of_error(error)
             _fail(job.source.name, job.outcome, journal, report)
             continue
-        task = Inspect(job.source.name, job.source.input, job.fingerprint, request.info_words)
+        task = Inspect(job.source.name, job.source.input, job.fingerprint, settings)
         job.info = known.get(_identify(task), {})
         if not job.info:
             tasks[job.source.name] = task
@@ -49,7 +50,7 @@ def inspect(
             job.outcome = outcome
     for job in jobs:
         if job.info:
-            job.key = key_of("map", [job.info["digest"]], request.map_words)
+            job.key = key_of("map", [job.info["digest"]], request.settings)
 
 
 def plan(
@@ -92,7 +93,7 @@ def map_recordings(
             job.source.name,
             job.source.input,
             job.fingerprint,
-            request.map_words,
+            request.settings,
             job.key,
             storage.root,
         )
@@ -116,7 +117,7 @@ def merge_places(
         done = [job for job in of_place if job.is_done]
         if len(done) < 2:
             continue
-        key = key_of("merge", [f"{job.source.name}:{job.key}" for job in done], ())
+        key = key_of("merge", [f"{job.source.name}:{job.key}" for job in done], Settings())
         label = find_result(storage, f"{PLACES}/{name}", key)
         if label is not None:
             outcomes[name] = outcome_of_label(label)
@@ -209,7 +210,7 @@ def _is_summary(info: Any) -> bool:
 
 def _identify(task: Inspect) -> str:
     """What the summary of a recording depends on."""
-    return repr((task.fingerprint, task.words, package_version()))
+    return repr((task.fingerprint, task.settings.describe(), package_version()))
 
 
 _FACTS = ("scans", "beams", "dimension", "hit_ranges_m", "time", "digest", "bytes")

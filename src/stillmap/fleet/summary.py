@@ -4,8 +4,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-from PIL import Image
-
 from stillmap.core.advice import split_advice
 from stillmap.core.errors import InputError
 from stillmap.core.files import read_text
@@ -13,8 +11,8 @@ from stillmap.results.folder import read_record
 from stillmap.results.reader import read_grid
 from stillmap.results.report.figures import data_uri, draw_map, map_window
 
-_SIZE = (360, 220)  # pixels of a small map, at most
-_GREYS = 16  # a small map takes a few kB
+_PIXELS = 90_000  # of a small map, at most
+_GREYS = 16  # so that it takes a few kB
 _MAX_SESSIONS = 64 << 20  # bytes of a sessions.json
 
 
@@ -63,7 +61,5 @@ def _draw_small(folder: Path) -> str | None:
     grid = read_grid(folder)
     if not grid.p_occupied.size:
         return None
-    picture = draw_map(grid, map_window([grid])).convert("RGB")
-    # not enlarged: a small place keeps sharp cells
-    picture.thumbnail(_SIZE, Image.Resampling.BOX)
+    picture = draw_map(grid, map_window([grid]), _PIXELS).convert("L")
     return data_uri(picture.quantize(_GREYS), optimize=True)

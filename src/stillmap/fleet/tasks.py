@@ -20,6 +20,7 @@ from stillmap.fleet.artifacts import PLACES, RESULTS, find_result, write_label
 from stillmap.fleet.child import Stopped, run_stillmap
 from stillmap.fleet.content import fingerprint, hash_content
 from stillmap.fleet.outcomes import Outcome, outcome_of, outcome_of_error
+from stillmap.fleet.settings import Settings, info_command, map_command, merge_command
 from stillmap.fleet.storage import RECORD, Storage, open_storage
 from stillmap.fleet.summary import summarize_result, summarize_sessions
 from stillmap.fleet.urls import is_url
@@ -35,14 +36,14 @@ class Inspect:
         name: of the recording in the fleet.
         source: its absolute path, or URL.
         fingerprint: see `content.fingerprint`.
-        words: options on the command line of `stillmap info`.
+        settings: how it is read.
         version: of stillmap on the machine that asks.
     """
 
     name: str
     source: str
     fingerprint: str
-    words: tuple[str, ...]
+    settings: Settings
     version: str = package_version()
 
     @property
@@ -53,7 +54,7 @@ class Inspect:
     def run(self, stop: Stop) -> Outcome:
         with _local_source(self.source) as path:
             content = hash_content(path)
-            ended = run_stillmap(["info", str(path), "--json", "--quiet", *self.words], stop)
+            ended = run_stillmap(info_command(path, self.settings), stop)
             outcome = _with_urls(outcome_of(ended), self.source, path)
         if outcome.status != "done":
             return outcome
@@ -68,7 +69,7 @@ class Map:
     Attributes:
         name: of the result.
         source, fingerprint: see `Inspect`.
-        words: options on the command line of `stillmap map`.
+        settings: how it is mapped.
         key: see `artifacts.key_of`.
         root: folder or URL of the fleet.
         version: of stillmap on the machine that asks.
@@ -77,7 +78,7 @@ class Map:
     name: str
     source: str
     fingerprint: str
-    words: tuple[str, ...]
+    settings: Settings
     key: str
     root: str
     version: str = package_version()
@@ -96,8 +97,8 @@ class Map:
             raise InputError("has changed while the fleet ran", where=self.source, hint=hint)
         with storage.attempt() as work, _local_source(self.source) as path:
             result = work / "result"
-            words = ["map", str(path), "-o", str(result), "--quiet", *self.words]
-            outcome = _with_urls(outcome_of(run_stillmap(words, stop)), self.source, path)
+            ended = run_stillmap(map_command(path, result, self.settings), stop)
+            outcome = _with_urls(outcome_of(ended), self.source, path)
             if outcome.status != "done":
                 return outcome
             _replace_in_texts(result, {str(path): self.source})
@@ -132,7 +133,7 @@ class Merge:
         if label := find_result(storage, name, self.key):
             return outcome_of_label(label)
         with storage.attempt() as work, ExitStack() as copies:
-            place, texts, folders = work / "result", dict[str, str](), list[str]()
+            place, texts, folders = work / "result", dict[str, str](), list[Path]()
             for result, source in zip(self.results, self.sources, strict=True):
                 folder = storage.local_folder(f"{RESULTS}/{result}", work)
                 if is_url(source):
@@ -140,8 +141,8 @@ class Merge:
                     folder = _point_to_copy(folder, work / "sessions" / result, source, path)
                     texts[str(path)] = source
                 texts[str(folder)] = f"{storage.root}/{RESULTS}/{result}"
-                folders.append(str(folder))
-            ended = run_stillmap(["merge", *folders, "-o", str(place), "--quiet"], stop)
+                folders.append(folder)
+            ended = run_stillmap(merge_command(folders, place), stop)
             outcome = outcome_of(ended)
             if outcome.status != "done":
                 return replace(outcome, why=_replace_all(outcome.why, texts))
