@@ -241,13 +241,13 @@ def test_place_that_cannot_be_merged(call, logs, tmp_path, monkeypatch):
 
 def test_fewer_at_once_where_memory_is_short(call, logs, tmp_path, monkeypatch):
     folder, out = logs(a="fine", b="fine"), tmp_path / "out"
-    monkeypatch.setattr(phases, "machine_memory", lambda: 200 << 20)
+    monkeypatch.setattr(phases, "machine_memory", lambda: 300 << 20)
     done = call("fleet", folder, "-o", out, "--jobs", 2)
     assert done.returncode == 0
     lines = done.stderr.splitlines()
-    assert "stillmap: 1 at once, each with at most 0.16 GB of memory, for a" in lines
+    assert "stillmap: 1 at once, each with at most 0.21 GB of memory, for a" in lines
     (warning,) = [line for line in lines if line.startswith("stillmap: warning")]
-    assert "not 2 at once: they may need more than the 0.21 GB of this machine" in warning
+    assert "not 2 at once: they may need more than the 0.315 GB of this machine" in warning
 
 
 def test_lines_without_a_terminal(call, logs, tmp_path):
