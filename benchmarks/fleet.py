@@ -140,6 +140,7 @@ def disturb(work: Path, out: Path, cluster: Cluster) -> float:
     """A fleet whose client is interrupted and whose worker is killed; the seconds of both runs."""
     words = ("fleet", str(work / "in"), "-o", str(out), "--scheduler", cluster.address, "--quiet")
     begun = time.monotonic()
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # a child inherits it when ignored
     client = subprocess.Popen([sys.executable, "-m", "stillmap", *words])
     wait_for_results(out, 2)
     client.send_signal(signal.SIGINT)

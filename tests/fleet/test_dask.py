@@ -4,6 +4,7 @@ import json
 import os
 import signal
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,8 @@ from fleets import NAMES, children_of, contents, is_alive, unfinished, wait_unti
 
 from stillmap.core.errors import InputError
 from stillmap.fleet.dask_executor import DaskExecutor
+from stillmap.fleet.settings import Settings
+from stillmap.fleet.tasks import Map, identify
 
 pytest.importorskip("distributed")
 
@@ -67,3 +70,11 @@ def test_missing_library(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match=r"tcp://a:1: needs distributed.*\[fleet\]"):
         DaskExecutor("tcp://a:1")
+
+
+def test_equal_tasks_alone_have_one_key():
+    task = Map("a", "/in/a.bag", "f", Settings(), "key", "/out")
+    others = [replace(task, root="/elsewhere"), replace(task, key="k"), replace(task, source="/b")]
+    others += [replace(task, settings=Settings((("em.prior", "0.7"),)))]
+    assert identify(task) == identify(replace(task))
+    assert len({identify(one) for one in (task, *others)}) == 5

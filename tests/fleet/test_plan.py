@@ -15,9 +15,8 @@ from stillmap.fleet.page import render_page
         ([1, 1, 1, 1], 3, 100, 3),
         ([5, 1, 1, 1], 4, 7, 3),  # 5 + 1 + 1
         ([5, 5, 1, 1], 4, 9, 1),  # the two largest may meet
-        ([50], 4, 7, 4),  # one alone always runs
+        ([50], 4, 7, 1),  # one alone always runs
         ([50, 1], 4, 7, 1),
-        ([], 4, 7, 4),
         ([2] * 100, 8, 11, 5),
     ],
 )

@@ -6,7 +6,7 @@ from typing import Any
 from stillmap.core.errors import InputError, import_extra
 from stillmap.fleet.local_executor import EndedTask
 from stillmap.fleet.outcomes import Outcome
-from stillmap.fleet.tasks import Task, run_task
+from stillmap.fleet.tasks import Task, identify, run_task
 
 _TIMEOUT = 15  # s for the scheduler to answer
 _LOGGERS = ("distributed", "tornado", "asyncio")  # what they report ends up in an outcome here
@@ -15,8 +15,8 @@ _LOGGERS = ("distributed", "tornado", "asyncio")  # what they report ends up in 
 class DaskExecutor:
     """Workers of a scheduler.
 
-    A task of the same recording, options and version has the same key there: one that an
-    interrupted caller left running is taken over, not run twice. When a worker dies, the scheduler
+    An equal task of the same fleet has the same key there: one that an interrupted caller left
+    running is taken over, not run twice. When a worker dies, the scheduler
     runs its task elsewhere, as often as `distributed.scheduler.allowed-failures` says (3).
 
     Args:
@@ -50,7 +50,7 @@ class DaskExecutor:
 
     def submit(self, task: Task, attempt: int = 1, avoid: str = "") -> None:
         others = [address for address in self.workers() if address != avoid] if avoid else []
-        key = task.identity if attempt == 1 else f"{task.identity}-{attempt}"
+        key = identify(task) if attempt == 1 else f"{identify(task)}-{attempt}"
         elsewhere = {"workers": others, "allow_other_workers": True} if others else {}
         future = self._client.submit(run_on_worker, task, key=key, **elsewhere)
         self._tasks[future.key] = future, task, attempt

@@ -39,8 +39,11 @@ def machine_memory() -> int:
 
 
 def fitting_jobs(estimates: Iterable[int], jobs: int, memory: int) -> int:
-    """How many tasks may run at once so that the largest fit into `memory`; 1 at least."""
+    """How many of the tasks, at most `jobs`, may run at once so that any of them fit into `memory`.
+
+    One may always run.
+    """
     largest = sorted(estimates, reverse=True)[:jobs]
     while len(largest) > 1 and sum(largest) > memory:
         largest.pop()
-    return min(jobs, max(1, len(largest))) if largest else jobs
+    return len(largest)

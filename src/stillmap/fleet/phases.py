@@ -178,11 +178,12 @@ def _limit_memory(
         report.say(f"at most {most:.2g} GB of memory per worker and thread, for {name}")
         return
     memory = machine_memory()
-    jobs = fitting_jobs(estimates, request.jobs, memory)
+    wanted = min(request.jobs, len(waiting))
+    jobs = fitting_jobs(estimates, wanted, memory)
     report.say(f"{jobs} at once, each with at most {most:.2g} GB of memory, for {name}")
-    if jobs < request.jobs:
+    if jobs < wanted:
         report.say(
-            f"warning: not {request.jobs} at once: they may need more than the "
+            f"warning: not {wanted} at once: they may need more than the "
             f"{memory / _GIGABYTE:.3g} GB of this machine"
         )
     executor.limit(jobs)

@@ -5,6 +5,7 @@ work is done by `stillmap` itself in a child process. Nothing of a task that was
 result appears whole or not at all.
 """
 
+import hashlib
 import html
 import json
 import threading
@@ -46,11 +47,6 @@ class Inspect:
     settings: Settings
     version: str = package_version()
 
-    @property
-    def identity(self) -> str:
-        """Equal for equal tasks, for schedulers."""
-        return f"inspect-{self.name}-{self.fingerprint[:16]}"
-
     def run(self, stop: Stop) -> Outcome:
         with _local_source(self.source) as path:
             content = hash_content(path)
@@ -82,11 +78,6 @@ class Map:
     key: str
     root: str
     version: str = package_version()
-
-    @property
-    def identity(self) -> str:
-        """Equal for equal tasks, for schedulers."""
-        return f"map-{self.name}-{self.key[:16]}"
 
     def run(self, stop: Stop) -> Outcome:
         storage, name = open_storage(self.root), f"{RESULTS}/{self.name}"
@@ -123,11 +114,6 @@ class Merge:
     root: str
     version: str = package_version()
 
-    @property
-    def identity(self) -> str:
-        """Equal for equal tasks, for schedulers."""
-        return f"merge-{self.name}-{self.key[:16]}"
-
     def run(self, stop: Stop) -> Outcome:
         storage, name = open_storage(self.root), f"{PLACES}/{self.name}"
         if label := find_result(storage, name, self.key):
@@ -152,6 +138,12 @@ class Merge:
 
 
 Task = Inspect | Map | Merge
+
+
+def identify(task: Task) -> str:
+    """A text that is equal for equal tasks alone."""
+    digest = hashlib.sha256(repr(task).encode()).hexdigest()
+    return f"{type(task).__name__.lower()}-{task.name}-{digest[:32]}"
 
 
 def run_task(task: Task, stop: Stop = None) -> Outcome:
