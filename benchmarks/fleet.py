@@ -1,17 +1,21 @@
 """Does a fleet give the same bytes as maps made one by one, and how much faster is it?
 
-python benchmarks/fleet.py [--recordings 12] [--scans 600] [--seed 100] [--chaos-only]
+python benchmarks/fleet.py [--recordings 12] [--scans 600] [--seed 100]
+    [--only local dask disturbed]
 
 Simulated halls are mapped one by one with `stillmap map --threads 1`, then as fleets: by one and by
 two local processes, and by two workers of a Dask cluster. The last fleet is disturbed: its client
 is interrupted in the midst and given the same command again, then one worker is killed (SIGKILL).
 Every result is compared, file by file, with the one made by hand; what tells of time and memory is
-left out. CPU time is that of all tasks; the speed-up counts from the fleet of one process.
+left out. CPU time is that of all tasks; the speed-up counts from the fleet of one process. "Others"
+are what else the machine was busy with meanwhile, in cores on average (Linux).
 """
 
 import argparse
 import json
+import math
 import os
+import resource
 import signal
 import socket
 import subprocess
@@ -27,6 +31,7 @@ from interrupted import contents
 from tables import markdown
 
 _OWN = {"fleet.json", "fleet.html", ".fleet/lock", ".fleet/journal.jsonl"}
+_KINDS = ("local", "dask", "disturbed")
 _QUIET = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
 
 
@@ -44,7 +49,7 @@ def main() -> None:
     p.add_argument("--recordings", type=int, default=12)
     p.add_argument("--scans", type=int, default=600)
     p.add_argument("--seed", type=int, default=100)
-    p.add_argument("--chaos-only", action="store_true", help="the disturbed fleet alone")
+    p.add_argument("--only", nargs="+", choices=_KINDS, default=_KINDS)
     args = p.parse_args()
     with tempfile.TemporaryDirectory() as name:
         work = Path(name)
@@ -54,22 +59,35 @@ def main() -> None:
             words = ("-o", str(work / "in" / one), "--scans", scans, "--seed", seed, "--quiet")
             call("simulate", "hall", *words)
         seconds, by_hand = map_by_hand(work, names)
-        rows = [["one by one", f"{seconds:.1f}", "", "", ""]]
-        local = [] if args.chaos_only else [("local, 1 process", ("--jobs", "1"))]
-        local += [] if args.chaos_only else [("local, 2 processes", ("--jobs", "2"))]
+        rows = [["one by one", f"{seconds:.1f}", "", "", "", ""]]
         alone = 0.0
-        for what, words in local:
-            seconds = run_fleet(work, work / what, *words)
-            alone = alone or seconds
-            rows.append(describe(what, work / what, seconds, alone, by_hand))
-        with start_cluster(work) as cluster:
-            if not args.chaos_only:
-                seconds = run_fleet(work, work / "dask", "--scheduler", cluster.address)
-                rows.append(describe("Dask, 2 workers", work / "dask", seconds, alone, by_hand))
-            seconds = disturb(work, work / "chaos", cluster)
+        for jobs, what in enumerate(("local, 1 process", "local, 2 processes"), 1):
+            if "local" in args.only:
+                measured = run_fleet(work, work / what, "--jobs", str(jobs))
+                alone = alone or measured[0]
+                rows.append(describe(what, work / what, measured, alone, by_hand))
+        if {"dask", "disturbed"} & set(args.only):
+            rows += run_on_dask(work, args.only, alone, by_hand)
+    titles = ["how", "s", "CPU s of all tasks", "others", "speed-up", "results that are equal"]
+    print(markdown(titles, rows))
+
+
+def run_on_dask(
+    work: Path, only: list[str], alone: float, by_hand: dict[str, dict[str, bytes]]
+) -> list[list[str]]:
+    """The rows of the fleets on a cluster."""
+    rows = []
+    with start_cluster(work) as cluster:
+        if "dask" in only:
+            # the workers are no children of the client: their time cannot be told from others'
+            seconds, _ = run_fleet(work, work / "dask", "--scheduler", cluster.address)
+            measured = seconds, math.nan
+            rows.append(describe("Dask, 2 workers", work / "dask", measured, alone, by_hand))
+        if "disturbed" in only:
+            measured = disturb(work, work / "disturbed", cluster), math.nan
             what = "Dask, client interrupted, 1 of 2 workers killed"
-            rows.append(describe(what, work / "chaos", seconds, 0.0, by_hand))
-    print(markdown(["how", "s", "CPU s of all tasks", "speed-up", "results that are equal"], rows))
+            rows.append(describe(what, work / "disturbed", measured, 0.0, by_hand))
+    return rows
 
 
 def call(*words: str) -> None:
@@ -85,14 +103,33 @@ def map_by_hand(work: Path, names: list[str]) -> tuple[float, dict[str, dict[str
     return seconds, {one: contents(work / "hand" / one) for one in names}
 
 
-def run_fleet(work: Path, out: Path, *words: str) -> float:
-    begun = time.monotonic()
+def run_fleet(work: Path, out: Path, *words: str) -> tuple[float, float]:
+    """Seconds, and the cores that others kept busy meanwhile."""
+    begun, busy, own = time.monotonic(), busy_seconds(), own_seconds()
     call("fleet", str(work / "in"), "-o", str(out), "--quiet", *words)
-    return time.monotonic() - begun
+    seconds = time.monotonic() - begun
+    others = busy_seconds() - busy - (own_seconds() - own)
+    return seconds, max(0.0, others) / seconds
+
+
+def busy_seconds() -> float:
+    """CPU time of all processes of the machine since it was started."""
+    user, nice, system = Path("/proc/stat").read_text().split()[1:4]
+    return (int(user) + int(nice) + int(system)) / os.sysconf("SC_CLK_TCK")
+
+
+def own_seconds() -> float:
+    """CPU time of the children that have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def describe(
-    what: str, out: Path, seconds: float, alone: float, by_hand: dict[str, dict[str, bytes]]
+    what: str,
+    out: Path,
+    measured: tuple[float, float],
+    alone: float,
+    by_hand: dict[str, dict[str, bytes]],
 ) -> list[str]:
     """A row of the table.
 
@@ -106,8 +143,11 @@ def describe(
     same = sum(contents(out / "results" / one) == by_hand[one] for one in by_hand)
     listed = json.loads((out / "fleet.json").read_text())
     cpu = sum(one["cpu_seconds"] + one["inspect_cpu_seconds"] for one in listed)
+    seconds, others = measured
     faster = f"{alone / seconds:.2f}" if alone else ""
-    return [what, f"{seconds:.1f}", f"{cpu:.1f}", faster, f"{same} of {len(by_hand)}"]
+    shown = "" if math.isnan(others) else f"{others:.2f}"
+    equal = f"{same} of {len(by_hand)}"
+    return [what, f"{seconds:.1f}", f"{cpu:.1f}", shown, faster, equal]
 
 
 @contextmanager
