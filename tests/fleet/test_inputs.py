@@ -72,6 +72,10 @@ def test_names_are_unique_and_stay(tmp_path):
     assert names(entries_of(paths, None)) == ["drive", "drive-2", "drive-3"]
     known = {paths[1]: "drive", paths[2]: "drive-2"}
     assert names(entries_of(paths, None), known) == ["drive-3", "drive", "drive-2"]
+    # what is not asked for now keeps its name, too
+    assert names(entries_of(paths[:1], None), known) == ["drive-3"]
+    damaged = {paths[0]: "a", paths[1]: "a"}  # a journal that was changed by hand
+    assert names(entries_of(paths[:2], None), damaged) == ["a", "drive"]
 
 
 @pytest.mark.parametrize(

@@ -61,11 +61,16 @@ def find_sources(entries: Iterable[Entry], names: dict[str, str]) -> list[Source
                 what = f"{found} is in two places: {places[found]} and {entry.place}"
                 raise InputError(what, where=entry.where)
             places[found] = entry.place
-    taken = {names[one].casefold() for one in places if one in names}
-    return [
-        Source(one, names[one] if one in names else make_unique(short_name(one), taken), place)
-        for one, place in places.items()
-    ]
+    # a result of an earlier run keeps its name even if it is not asked for now
+    taken, given = {name.casefold() for name in names.values()}, set[str]()
+    sources = []
+    for one, place in places.items():
+        name = names.get(one, "")
+        if not name or name.casefold() in given:
+            name = make_unique(short_name(one), taken)
+        given.add(name.casefold())
+        sources.append(Source(one, name, place))
+    return sources
 
 
 def _expand(entry: Entry) -> list[str]:
@@ -127,7 +132,7 @@ def _expand_url(url: str) -> list[str]:
     for match in matches:
         files = [one.name for one in bucket.list_files(match)]
         if files in ([], [""]):  # nothing, which fails later, or a file
-            found.append(match)
+            found += [match] if match == url or _has_name_of_file(match) else []
         else:
             found += _recordings_below(match, files)
     return _require_some(url, found)
@@ -159,4 +164,9 @@ def _is_named_so(path: Path) -> bool:
     """Whether an empty file or folder has the name, or the inside, of a recording."""
     if path.is_dir():
         return any(known.matches(path, None) for known in FORMATS)
-    return path.name.lower().endswith((*_SURE_ENDINGS, *_USUAL_ENDINGS))
+    return _has_name_of_file(path.name)
+
+
+def _has_name_of_file(text: str) -> bool:
+    """Whether a path or URL ends as files of recordings do."""
+    return text.lower().endswith((*_SURE_ENDINGS, *_USUAL_ENDINGS))
