@@ -1,6 +1,7 @@
 """The same tasks on the workers of a Dask cluster; needs the extra `fleet`."""
 
 import logging
+import queue
 from typing import Any
 
 from stillmap.core.errors import InputError, import_extra
@@ -8,8 +9,11 @@ from stillmap.fleet.local_executor import EndedTask
 from stillmap.fleet.outcomes import Outcome
 from stillmap.fleet.tasks import Task, identify, run_task
 
+_log = logging.getLogger(__name__)
+
 _TIMEOUT = 15  # s for the scheduler to answer
-_LOGGERS = ("distributed", "tornado", "asyncio")  # what they report ends up in an outcome here
+_PERIOD = 10.0  # s between two looks at whether there are workers
+_LOGGERS = ("distributed", "distributed.client", "tornado", "asyncio")  # what they report ends up in an outcome here
 
 
 class DaskExecutor:
@@ -41,7 +45,7 @@ class DaskExecutor:
             self._client.close()
             hint = f"start some: dask worker {address}"
             raise InputError("this scheduler has no worker", where=address, hint=hint)
-        self._waiting = self._dask.as_completed(loop=self._client.loop)
+        self._ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._tasks: dict[str, tuple[Any, Task, int]] = {}
 
     def workers(self) -> list[str]:
@@ -54,10 +58,10 @@ class DaskExecutor:
         elsewhere = {"workers": others, "allow_other_workers": True} if others else {}
         future = self._client.submit(run_on_worker, task, key=key, **elsewhere)
         self._tasks[future.key] = future, task, attempt
-        self._waiting.add(future)
+        future.add_done_callback(self._ended.put)
 
     def wait(self) -> EndedTask:
-        future = next(self._waiting)
+        future = self._next_future()
         _, task, attempt = self._tasks.pop(future.key)
         try:
             return EndedTask(task, future.result(), attempt)
@@ -70,9 +74,25 @@ class DaskExecutor:
             hint = "install this version, and what else the client has, on all of them"
             raise InputError(what, where=self._address, hint=hint) from error
         except (self._dask.CancelledError, OSError) as error:
-            what = "the Dask scheduler is gone"
-            hint = "start it, then continue with the same command"
-            raise InputError(what, where=self._address, hint=hint) from error
+            raise self._is_gone() from error
+
+    def _next_future(self) -> Any:
+        """The next future that is done; warns when no worker is left."""
+        warned = False
+        while True:
+            try:
+                return self._ended.get(timeout=_PERIOD)
+            except queue.Empty:
+                pass
+            if self._client.status != "running":
+                raise self._is_gone()
+            if not self.workers() and not warned:
+                _log.warning("warning: %s has no worker left: waiting for one", self._address)
+                warned = True
+
+    def _is_gone(self) -> InputError:
+        hint = "start it, then continue with the same command"
+        return InputError("the Dask scheduler is gone", where=self._address, hint=hint)
 
     def limit(self, jobs: int) -> None:
         pass  # the workers decide
