@@ -13,7 +13,8 @@ _log = logging.getLogger(__name__)
 
 _TIMEOUT = 15  # s for the scheduler to answer
 _PERIOD = 10.0  # s between two looks at whether there are workers
-_LOGGERS = ("distributed", "distributed.client", "tornado", "asyncio")  # what they report ends up in an outcome here
+# what they report ends up in an outcome here
+_LOGGERS = ("distributed", "distributed.client", "tornado", "asyncio")
 
 
 class DaskExecutor:
