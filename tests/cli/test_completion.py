@@ -76,7 +76,8 @@ def ask(tmp_path, place):
 
 
 def test_bash(ask):
-    names = {"map", "info", "view", "filter", "convert", "simulate", "eval", "config", "completion"}
+    names = {"map", "info", "view", "fleet", "filter", "convert", "simulate", "eval", "config"}
+    names |= {"completion"}
     wanted = {
         "stillmap ": names,
         "stillmap ma": {"map"},

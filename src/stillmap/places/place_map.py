@@ -16,7 +16,7 @@ Float = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 _FREE_PRIOR = 0.2  # occupancy of a cell that no beam passed; as of single recordings
-# share of the hits of the most-hit cell, one and two cells around, below which a surface is its noise
+# share of the hits of the most-hit cell, one and two cells around, below which it is its noise
 _MIN_PROMINENCE, _MIN_FAR_PROMINENCE, _REACH = 0.25, 0.08, 2
 
 
