@@ -13,6 +13,7 @@ from stillmap.core.version import package_version
 from stillmap.em import OccupancyMap
 from stillmap.pipeline.options import Options
 from stillmap.places.changes import detect_place_changes
+from stillmap.places.clouds import write_place_clouds
 from stillmap.places.grow import estimate_planar
 from stillmap.places.objects import join_objects, place_objects
 from stillmap.places.place import Place, Refusal
@@ -104,6 +105,8 @@ def write_place(folder: Path, result: PlaceResult, options: Options, map_state: 
         place_objects(home, one)
     write_place_files(folder, result)
     join_objects(folder, homes)
+    if place.dimension == 3:
+        write_place_clouds(folder, result)
     planar = [place.sessions[k].require_evidence()[1] for k in place.in_time()]
     occupancy = make_place_map(planar, result.planar)
     write_map_server(folder, occupancy, options.output.map_mode)

@@ -51,7 +51,8 @@ def show_state(place: PlaceStates, changes: list[PlaceChange], limit: int | None
         p_shown = occupied[np.arange(len(occupied)), _last_observed(observed, limit)]
     unchanged = states.p_changing <= 0.5
     p_shown = np.where(unchanged, np.maximum(p_shown, states.p_static), p_shown)
-    p_shown[_noise_of_static(place, changes)] = 1.0
+    stands, gone = _settle_unlisted(place, changes)
+    p_shown[stands], p_shown[gone] = 1.0, 0.0
     total = place.evidence.sum(axis=1, keepdims=True) - place.evidence
     support = np.where(
         states.p_static[:, None] > _MIN_P_STATIC, np.clip(total, 0.0, _MAX_SUPPORT), 0.0
@@ -67,20 +68,23 @@ def _last_observed(observed: NDArray[np.bool_], limit: int) -> Index:
     return np.asarray(np.where(before.any(axis=1), last, first_after), np.intp)
 
 
-def _noise_of_static(place: PlaceStates, changes: list[PlaceChange]) -> Index:
-    """Cells that change by themselves, unlisted, beside static surface."""
+def _settle_unlisted(place: PlaceStates, changes: list[PlaceChange]) -> tuple[Index, Index]:
+    """Cells that change by themselves, unlisted: those that stand, and those that do not.
+
+    Beside static surface they are noise of its poses, elsewhere what movers left.
+    """
     listed = np.zeros(len(place.cells), np.bool_)
     for change in changes:
         listed[change.cells] = True
     alone = np.flatnonzero((place.states.p_changing > 0.5) & ~listed)
     static = place.cells[place.states.p_static > 0.5]
     if not len(alone) or not len(static):
-        return np.zeros(0, np.intp)
+        return np.zeros(0, np.intp), alone
     from scipy.spatial import cKDTree  # slow to load
 
     limit = _STATIC_DISTANCE
     distance, _ = cKDTree(static).query(place.cells[alone], distance_upper_bound=limit + 1.0)
-    return alone[distance <= limit]
+    return alone[distance <= limit], alone[distance > limit]
 
 
 def label_session(
