@@ -1,5 +1,6 @@
 """The state of changed cells that a map shows, and with it the labels of beams."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,11 +28,13 @@ class ShownState(ShortRepr):
         place: K cells.
         p_shown: (K,) probability that the map shows something in the cell.
         support: (K, S) nats by which the other sessions make a label of each session static.
+        noise: cells that change by themselves beside static surface, which the map shows as static.
     """
 
     place: PlaceStates
     p_shown: Float
     support: NDArray[np.float32]
+    noise: Index
 
 
 def show_state(place: PlaceStates, changes: list[PlaceChange], limit: int | None) -> ShownState:
@@ -51,12 +54,13 @@ def show_state(place: PlaceStates, changes: list[PlaceChange], limit: int | None
         p_shown = occupied[np.arange(len(occupied)), _last_observed(observed, limit)]
     unchanged = states.p_changing <= 0.5
     p_shown = np.where(unchanged, np.maximum(p_shown, states.p_static), p_shown)
-    p_shown[_noise_of_static(place, changes)] = 1.0
+    noise = _noise_of_static(place, changes)
+    p_shown[noise] = 1.0
     total = place.evidence.sum(axis=1, keepdims=True) - place.evidence
     support = np.where(
         states.p_static[:, None] > _MIN_P_STATIC, np.clip(total, 0.0, _MAX_SUPPORT), 0.0
     )
-    return ShownState(place, p_shown, support.astype(np.float32))
+    return ShownState(place, p_shown, support.astype(np.float32), noise)
 
 
 def _last_observed(observed: NDArray[np.bool_], limit: int) -> Index:
@@ -123,13 +127,20 @@ def _find_cells(place: PlaceStates, centres: Float) -> Index:
     return np.where(np.isfinite(distance), at, -1).astype(np.intp)
 
 
-def changed_cell_table(shown: ShownState) -> dict[str, NDArray[np.generic]]:
-    """The changed cells in the plane and their states in every session, for the viewer."""
+def changed_cell_table(shown: ShownState, names: Sequence[str]) -> dict[str, NDArray[np.generic]]:
+    """The changed cells in the plane and their states in every session, for report and viewer.
+
+    Args:
+        shown: the state of the place in the plane.
+        names: of the sessions, in the order of time.
+    """
     states = shown.place.states
-    changed = np.flatnonzero(states.p_changing > 0.5)
+    changed = np.setdiff1d(np.flatnonzero(states.p_changing > 0.5), shown.noise)
     return {
         "cells": shown.place.cells[changed].astype(np.int32),
         "occupied": states.path[changed],
         "observed": states.observed[changed],
+        "shown": shown.p_shown[changed] > 0.5,
         "resolution": np.array(shown.place.resolution),
+        "sessions": np.array(names, np.str_),
     }
