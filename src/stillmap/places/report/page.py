@@ -37,6 +37,7 @@ _WORDS = {"appeared": "appeared", "gone": "gone", "moved": "moved", "door": "doo
 _FILES = {
     "sessions.json": "the sessions, and where each lies in the place",
     "changes.json": "what changed between which sessions",
+    "changes.npz": "the cells of every change",
     "states.npz": "changed cells and their states in every session",
 }
 

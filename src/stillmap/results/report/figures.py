@@ -102,9 +102,9 @@ def map_window(maps: Sequence[GridMap]) -> Window:
     return extent(maps[0])
 
 
-def draw_map(occupancy: GridMap, window: Window) -> Image.Image:
-    """White free, grey unknown, black occupied; large maps are reduced to `MAX_PIXELS`."""
-    return color_levels(map_levels(occupancy, window))
+def draw_map(occupancy: GridMap, window: Window, max_pixels: int = MAX_PIXELS) -> Image.Image:
+    """White free, grey unknown, black occupied; larger maps are reduced to `max_pixels`."""
+    return color_levels(map_levels(occupancy, window, max_pixels=max_pixels))
 
 
 def map_levels(
