@@ -70,7 +70,7 @@ def read_sessions(folder: Path) -> list[dict[str, Any]]:
         records = json.loads(read_text(path, _MAX_JSON))
         for record in records:
             name = record["name"]
-            if not isinstance(name, str) or name in ("", ".", "..") or {"/", "\0"} & {*name}:
+            if not isinstance(name, str) or not name or "/" in name or name in (".", ".."):
                 raise ValueError(f"a session cannot have the name {name!r}")
             if not isinstance(record["accepted"], bool):
                 raise ValueError(f"'accepted' of {name} is neither true nor false")

@@ -121,6 +121,8 @@ def _damage(error: Exception) -> str:
 def _session_of(record: dict[str, Any]) -> SessionRecord:
     first, last = (_whole(record[f"{name}_stamp_ns"]) for name in ("first", "last"))
     overlap, T = _number(record["overlap"]), np.array(record["T_place_session"], np.float64)
+    if "\0" in record["name"]:
+        raise ValueError(f"a session cannot have the name {record['name']!r}")
     if not 0.0 <= overlap <= 1.0:
         raise ValueError(f"the overlap of {record['name']} is {overlap}")
     if T.shape not in ((3, 3), (4, 4)) or not np.isfinite(T).all():

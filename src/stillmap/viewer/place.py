@@ -1,4 +1,4 @@
-"""The sessions of a place for the viewer: scans, trajectories, and the map as of each."""
+"""A place for the viewer: the scans of its sessions, and the map as of each."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,8 +17,8 @@ Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class PlaceSessions:
-    """S sessions in the order of time.
+class ViewedPlace:
+    """A place of S sessions in the order of time.
 
     Attributes:
         timeline: what changed between them.
@@ -46,9 +46,7 @@ class PlaceSessions:
         return None if self.pictures is None else self.pictures.draw(session)
 
 
-def read_place_sessions(
-    folder: Path, grid: GridMap
-) -> tuple[PlaceSessions, NDArray[np.int64], Float]:
+def read_viewed_place(folder: Path, grid: GridMap) -> tuple[ViewedPlace, NDArray[np.int64], Float]:
     """The sessions of a place, and stamps (T,) and poses (T, 4, 4) of all their scans.
 
     Args:
@@ -64,4 +62,4 @@ def read_place_sessions(
     stamp_ns, poses = (np.concatenate(part) for part in zip(*trajectories, strict=True))
     first_scan = np.cumsum([0, *(len(stamps) for stamps, _ in trajectories)])
     pictures = PlacePictures(grid, timeline) if grid.p_occupied.size else None
-    return PlaceSessions(timeline, first_scan, pictures), stamp_ns, poses
+    return ViewedPlace(timeline, first_scan, pictures), stamp_ns, poses

@@ -22,7 +22,7 @@ from stillmap.results.object_poses import interpolate_pose
 from stillmap.results.reader import Grid, Track, read_grid, read_tracks
 from stillmap.results.report.figures import UNKNOWN, draw_map, map_window
 from stillmap.viewer.display import Points, sample_ply
-from stillmap.viewer.place import PlaceSessions, read_place_sessions
+from stillmap.viewer.place import ViewedPlace, read_viewed_place
 
 MAX_POINTS = {"static": 500_000, "dynamic": 200_000}
 _MAX_MESH = 512 << 20  # bytes of mesh.glb
@@ -104,7 +104,7 @@ class Scene:
     origin: Float
     ground: float
     notes: list[str] = field(default_factory=list)
-    place: PlaceSessions | None = None
+    place: ViewedPlace | None = None
 
     @property
     def is_2d(self) -> bool:
@@ -124,7 +124,7 @@ def read_scene(folder: Path, recording: str = "") -> Scene:
     """
     place, grid = None, read_grid(folder)
     if is_place(folder):
-        place, stamp_ns, poses = read_place_sessions(folder, grid)
+        place, stamp_ns, poses = read_viewed_place(folder, grid)
     else:
         stamp_ns, poses = read_tum(folder / "trajectory.tum")
     origin = _origin(poses)
@@ -165,7 +165,7 @@ def _origin(poses: Float) -> Float:
     return np.asarray(np.round(0.5 * (positions.min(axis=0) + positions.max(axis=0))))
 
 
-def _map_image(grid: Grid, place: PlaceSessions | None, transparent: bool) -> MapImage | None:
+def _map_image(grid: Grid, place: ViewedPlace | None, transparent: bool) -> MapImage | None:
     if not grid.p_occupied.size:
         return None
     if place is not None and place.pictures is not None:

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from stillmap.viewer.place import PlaceSessions
+from stillmap.viewer.place import ViewedPlace
 from stillmap.viewer.sessions import SessionNodes
 from stillmap.viewer.text import escape_markdown, table_html
 
@@ -12,7 +12,7 @@ _MAX_ROWS = 25
 class SessionControls:
     """A slider over the sessions of a place."""
 
-    def __init__(self, gui: Any, place: PlaceSessions, nodes: SessionNodes) -> None:
+    def __init__(self, gui: Any, place: ViewedPlace, nodes: SessionNodes) -> None:
         """Add the controls to the page.
 
         Args:

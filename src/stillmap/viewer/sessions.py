@@ -11,7 +11,7 @@ from stillmap.places.timeline import ChangeRecord
 from stillmap.results.colors import color_by_id
 from stillmap.results.object_poses import ObjectPoses
 from stillmap.viewer.nodes import Nodes, node_path
-from stillmap.viewer.place import PlaceSessions
+from stillmap.viewer.place import ViewedPlace
 from stillmap.viewer.tracks import box_edges
 
 Float = NDArray[np.float64]
@@ -38,7 +38,7 @@ class SessionNodes:
         session: index of the session that is shown.
     """
 
-    def __init__(self, nodes: Nodes, place: PlaceSessions) -> None:
+    def __init__(self, nodes: Nodes, place: ViewedPlace) -> None:
         """Create nothing yet.
 
         Args:

@@ -33,7 +33,13 @@ _MAX_PATH_POINTS = 1000  # of a session
 _THUMBNAIL_PIXELS = 60_000  # 300 x 200, about 5 kB as PNG
 _MAX_ROWS = 100  # changes listed and marked between two sessions
 _KINDS: tuple[Kind, ...] = get_args(Kind)
-_WORDS = {"appeared": "appeared", "gone": "gone", "moved": "moved", "door": "doors otherwise"}
+# of one change and of several
+_WORDS = {
+    "appeared": ("appeared", "appeared"),
+    "gone": ("gone", "gone"),
+    "moved": ("moved", "moved"),
+    "door": ("door otherwise", "doors otherwise"),
+}
 _FILES = {
     "sessions.json": "the sessions, and where each lies in the place",
     "changes.json": "what changed between which sessions",
@@ -65,7 +71,7 @@ def render_place_report(
         "refused": timeline.refused,
         "thumbnails": _thumbnails_data(occupancy, timeline),
         "steps": [_step_data(timeline, k, pictures) for k in range(1, len(timeline.sessions))],
-        "kinds": [(kind, _WORDS[kind], KIND_COLORS[kind]) for kind in _KINDS],
+        "kinds": [(kind, _WORDS[kind][0], KIND_COLORS[kind]) for kind in _KINDS],
         "files": files_data(folder, _FILES),
         "version": package_version(),
         **script_data(),
@@ -108,7 +114,7 @@ def _place_data(timeline: Timeline, record: Mapping[str, Any]) -> dict[str, Any]
 def _count_kinds(changes: list[ChangeRecord]) -> list[tuple[str, int]]:
     """Words and number of each kind of which there are changes."""
     counts = Counter(one.kind for one in changes)
-    return [(_WORDS[kind], counts[kind]) for kind in _KINDS if counts[kind]]
+    return [(_WORDS[kind][counts[kind] > 1], counts[kind]) for kind in _KINDS if counts[kind]]
 
 
 def _map_data(
