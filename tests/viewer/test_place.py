@@ -167,6 +167,13 @@ def test_playback_stays_in_the_session(window):
     assert len(seen) > 1
 
 
+def test_scan_of_a_longer_session_becomes_the_last_one(window):
+    window.show_session(1)
+    window._slider.value = 4000
+    window.step()
+    assert window.scan == window._slider.value == 4
+
+
 def test_keys_step_through_sessions(window):
     act = window._actions()
 

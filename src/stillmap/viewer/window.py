@@ -129,7 +129,8 @@ class Window:
         controls = self._session_controls
         if controls and self._sessions and controls.wanted != self._sessions.session:
             self.show_session(controls.wanted)
-        wanted = int(self._slider.value)
+        # a page may still name a scan of a longer session
+        wanted = min(int(self._slider.value), len(self._scans) - 1)
         if wanted != self.scan:  # the slider was moved
             self._at = float(self._seconds[wanted])
         elif self._playing:

@@ -166,7 +166,8 @@ def _session_data(timeline: Timeline, number: int) -> dict[str, Any]:
         "seconds": 1e-9 * (one.last_ns - one.first_ns),
         "overlap": one.overlap,
         "position": position,
-        "heading": math.degrees(math.atan2(one.T[1, 0], one.T[0, 0])),
+        # + 0.0 turns a negative zero into zero
+        "heading": round(math.degrees(math.atan2(one.T[1, 0], one.T[0, 0])), 1) + 0.0,
     }
 
 
