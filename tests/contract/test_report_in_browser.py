@@ -11,9 +11,9 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "places"))
 
-from made_up_place import RECORD, make_place
 from opening_models import HERE, MODULES, require
 from PIL import Image
+from small_place import RECORD, make_place
 
 from stillmap.cli.main import main
 from stillmap.places.report.page import render_place_report

@@ -9,7 +9,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-from made_up_place import BOX, CELL, CHAIR, DOOR, OPEN, ORIGIN, SIZE, make_place
+from small_place import BOX, CELL, CHAIR, DOOR, OPEN, ORIGIN, SIZE, make_place
 
 from stillmap.places.pictures import KIND_COLORS, PlacePictures
 from stillmap.places.timeline_reader import read_timeline

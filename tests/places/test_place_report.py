@@ -16,7 +16,7 @@ from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-from made_up_place import RECORD, make_place
+from small_place import RECORD, make_place
 
 from stillmap.cli.main import main
 from stillmap.places.report.marks import place_marks

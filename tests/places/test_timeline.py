@@ -9,7 +9,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-from made_up_place import CELL, CHAIR, NAMES, SIZE, box_of, make_changes, make_place, write_states
+from small_place import CELL, CHAIR, NAMES, SIZE, box_of, make_changes, make_place, write_states
 
 from stillmap.core.errors import InputError
 from stillmap.places.timeline import format_date, format_date_time

@@ -21,7 +21,7 @@ pytest.importorskip("websockets.sync.client")
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "places"))
 
 from browser_tab import BROWSER, HEIGHT, Tab
-from made_up_place import make_place
+from small_place import make_place
 
 from stillmap.viewer.window import Window
 

@@ -8,7 +8,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "places"))
 
-from made_up_place import CHAIR, DAY, NAMES, START, make_place
+from small_place import CHAIR, DAY, NAMES, START, make_place
 
 from stillmap.cli.main import main
 from stillmap.core.errors import InputError
