@@ -100,12 +100,14 @@ def test_growing_gives_the_same_files_as_merging_at_once(days, place, tmp_path):
         assert (tmp_path / "two" / name).read_bytes() == content
 
 
+@pytest.mark.slow
 def test_the_number_of_threads_does_not_matter(days, place, tmp_path):
     results = [str(days / f"out-{k}") for k in (1, 2, 3)]
     assert main(["merge", *results, "-o", str(tmp_path / "x"), "--quiet", "--threads", "2"]) == 0
     assert differing_files(place, tmp_path / "x") == {"run.json"}  # its options
 
 
+@pytest.mark.slow
 def test_the_frame_of_another_session(days, place, tmp_path):
     results = [days / f"out-{k}" for k in (1, 2, 3)]
     assert merge(*results, "-o", tmp_path / "x", "--frame", "out-2") == 0
@@ -124,16 +126,16 @@ def test_the_map_shows_the_state_that_is_asked_for(days, place, tmp_path):
     changes = json.loads((place / "changes.json").read_text())
     assert changes
     assert json.loads((tmp_path / "x" / "changes.json").read_text()) == changes
-    came = [one for one in changes if one["kind"] == "appeared"]
-    gone = [one for one in changes if one["kind"] == "gone"]
-    for one in came + gone:
-        x0, y0, x1, y1 = one["box"]
-        counts = []
-        for grid in (first, last):
-            centres = grid.centres(np.argwhere(grid.occupied))
-            inside = (centres >= [x0, y0]) & (centres <= [x1, y1])
-            counts.append(int(inside.all(axis=1).sum()))
-        assert (counts[1] > counts[0]) == (one["kind"] == "appeared")
+    differ = first.occupied != last.occupied
+    assert differ.any()
+    centres = first.centres(np.argwhere(differ))
+    inside = np.zeros(len(centres), bool)
+    margin = 2 * first.resolution
+    for one in changes:
+        for x0, y0, x1, y1 in (one["box"], one.get("from_box", one["box"])):
+            low, high = np.array([x0, y0]) - margin, np.array([x1, y1]) + margin
+            inside |= ((centres >= low) & (centres <= high)).all(axis=1)
+    assert inside.mean() > 0.8
 
 
 @pytest.mark.parametrize("state", ["yesterday", "1970-01-01"])
@@ -153,7 +155,8 @@ def test_sessions_of_unrelated_places_are_refused(days, tmp_path, capsys):
     assert not (tmp_path / "x").exists()
 
 
-def test_one_that_does_not_belong_does_not_change_the_others(days, place, tmp_path, capsys):
+@pytest.mark.slow
+def test_one_that_does_not_belong_does_not_change_the_others(days, place, tmp_path):
     words = ["simulate", "office", "-o", str(tmp_path / "sim"), "--scans", "260", "--quiet"]
     assert main(words) == 0
     results = [days / "out-1", days / "out-2", tmp_path / "sim", days / "out-3"]
@@ -162,12 +165,7 @@ def test_one_that_does_not_belong_does_not_change_the_others(days, place, tmp_pa
     assert not found["sim"]["accepted"]
     assert found["sim"]["why"]
     assert not (tmp_path / "x" / "sessions" / "sim").exists()
-    same = differing_files_but(place, tmp_path / "x", {"run.json", "sessions.json"})
-    assert same == set()
-
-
-def differing_files_but(one, other, ignored):
-    return differing_files(one, other) - ignored
+    assert differing_files(place, tmp_path / "x") <= {"run.json", "sessions.json", "report.html"}
 
 
 def test_a_place_that_was_changed_by_hand_is_refused(place, tmp_path):

@@ -19,6 +19,7 @@ from stillmap.places.objects import join_objects, place_objects
 from stillmap.places.place import Place, Refusal
 from stillmap.places.place_map import make_place_map
 from stillmap.places.place_states import estimate_place
+from stillmap.places.report.page import render_place_report
 from stillmap.places.shown_state import show_state
 from stillmap.places.writer import PlaceResult, write_json, write_place_files, write_sessions
 from stillmap.results.labels import read_array
@@ -112,6 +113,8 @@ def write_place(folder: Path, result: PlaceResult, options: Options, map_state: 
     write_map_server(folder, occupancy, options.output.map_mode)
     write_map_npz(folder / "map.npz", occupancy)
     record = place_record(folder, result, options, map_state, occupancy)
+    page = render_place_report(folder, occupancy, options.output.map_mode, record)
+    (folder / "report.html").write_text(page, encoding="utf-8")
     write_json(folder / RECORD, record)
 
 

@@ -109,7 +109,7 @@ def _read_poses(path: Path, count: int, D: int) -> Float:
 
 
 def _read_evidence(path: Path, D: int) -> Evidence:
-    arrays = _read_archive(path, ("corner", "hits", "passes", "resolution"))
+    arrays = read_archive(path, ("corner", "hits", "passes", "resolution"))
     corner, hits, passes, resolution = arrays
     shape = (len(corner), *(BLOCK[D],) * D)
     fits = corner.shape == (len(corner), D) and hits.shape == shape and passes.shape == shape
@@ -122,7 +122,7 @@ def _read_evidence(path: Path, D: int) -> Evidence:
 def _read_ties(path: Path, sessions: list[PlacedSession]) -> list[Tie]:
     D = sessions[0].session.dimension
     dof = 3 * (D - 1)
-    first, first_node, second, second_node, T, covariance = _read_archive(
+    first, first_node, second, second_node, T, covariance = read_archive(
         path, ("first", "first_node", "second", "second_node", "T", "covariance")
     )
     L, counts = len(first), np.array([len(one.nodes) for one in sessions])
@@ -142,7 +142,7 @@ def _read_ties(path: Path, sessions: list[PlacedSession]) -> list[Tie]:
     ]
 
 
-def _read_archive(path: Path, names: tuple[str, ...]) -> list[NDArray[Any]]:
+def read_archive(path: Path, names: tuple[str, ...]) -> list[NDArray[Any]]:
     """Arrays of an `.npz` file.
 
     Raises:

@@ -1,5 +1,6 @@
 """The state of changed cells that a map shows, and with it the labels of beams."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,11 +28,14 @@ class ShownState(ShortRepr):
         place: K cells.
         p_shown: (K,) probability that the map shows something in the cell.
         support: (K, S) nats by which the other sessions make a label of each session static.
+        noise: cells that change by themselves, unlisted: beside static surface the map shows them
+            as static, elsewhere not at all.
     """
 
     place: PlaceStates
     p_shown: Float
     support: NDArray[np.float32]
+    noise: Index
 
 
 def show_state(place: PlaceStates, changes: list[PlaceChange], limit: int | None) -> ShownState:
@@ -57,7 +61,7 @@ def show_state(place: PlaceStates, changes: list[PlaceChange], limit: int | None
     support = np.where(
         states.p_static[:, None] > _MIN_P_STATIC, np.clip(total, 0.0, _MAX_SUPPORT), 0.0
     )
-    return ShownState(place, p_shown, support.astype(np.float32))
+    return ShownState(place, p_shown, support.astype(np.float32), np.concatenate([stands, gone]))
 
 
 def _last_observed(observed: NDArray[np.bool_], limit: int) -> Index:
@@ -127,13 +131,20 @@ def _find_cells(place: PlaceStates, centres: Float) -> Index:
     return np.where(np.isfinite(distance), at, -1).astype(np.intp)
 
 
-def changed_cell_table(shown: ShownState) -> dict[str, NDArray[np.generic]]:
-    """The changed cells in the plane and their states in every session, for the viewer."""
+def changed_cell_table(shown: ShownState, names: Sequence[str]) -> dict[str, NDArray[np.generic]]:
+    """The changed cells in the plane and their states in every session, for report and viewer.
+
+    Args:
+        shown: the state of the place in the plane.
+        names: of the sessions, in the order of time.
+    """
     states = shown.place.states
-    changed = np.flatnonzero(states.p_changing > 0.5)
+    changed = np.setdiff1d(np.flatnonzero(states.p_changing > 0.5), shown.noise)
     return {
         "cells": shown.place.cells[changed].astype(np.int32),
         "occupied": states.path[changed],
         "observed": states.observed[changed],
+        "shown": shown.p_shown[changed] > 0.5,
         "resolution": np.array(shown.place.resolution),
+        "sessions": np.array(names, np.str_),
     }
