@@ -57,12 +57,15 @@ def given_zone_flags(args: argparse.Namespace) -> dict[str, object]:
 
 def convert_result(args: argparse.Namespace, source: Path, output: Path) -> tuple[list[str], str]:
     """Write a result for other programs; return what was lost, and what was written."""
+    from stillmap.places.inputs import is_place
     from stillmap.results.export import obj, point_cloud_files
     from stillmap.results.folder import open_result
 
     if read_changes(args):
         text = "a result's recording is read as it was for the map: no flags for reading it"
         raise InputError(text, where=str(source))
+    if is_place(source):
+        return _convert_place(args, source, output)
     result = open_result(source, args.recording)
     for path in result.sources:
         require_apart(output, path, source)
@@ -82,6 +85,24 @@ def convert_result(args: argparse.Namespace, source: Path, output: Path) -> tupl
     if ending == _PARQUET:
         return [], _convert_to_table(args, result, output)
     return _convert_to_bag(args, result, output)
+
+
+def _convert_place(args: argparse.Namespace, place: Path, output: Path) -> tuple[list[str], str]:
+    """Write maps and masks of a place, which need none of its recordings.
+
+    Raises:
+        InputError: another format is wanted.
+    """
+    from stillmap.results.folder import ResultFolder, read_record
+
+    require_apart(output, place)
+    if args.to == NAV2 or given_zone_flags(args):
+        return _convert_to_nav2(
+            args, ResultFolder(place, read_record(place), Path(), False), output
+        )
+    hint = f"session by session: stillmap convert {place}/sessions/NAME -o FILE"
+    what = f"is a place of several recordings, which becomes maps and masks alone (--to {NAV2})"
+    raise InputError(what, where=str(place), hint=hint)
 
 
 def _convert_to_nav2(

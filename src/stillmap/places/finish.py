@@ -1,6 +1,7 @@
 """After the last session: states, changes, labels, map, and all files of the place."""
 
 import datetime
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from stillmap.results.map_server import write_map_server
 from stillmap.results.run_json import FORMAT_VERSION, RECORD
 
 LAST, MAJORITY = "last", "majority"
+_STATES_HINT = "map_state=last, majority, the name of a session, or a date such as 2026-05-31"
 _DAY_NS = 86_400 * 10**9
 
 
@@ -54,6 +56,16 @@ def finish_place(
     return PlaceResult(place, refusals, order, changes, show_state(states, changes, limit), planar)
 
 
+def require_map_state(map_state: str, names: Sequence[str]) -> None:
+    """Refuse what is no state of a map that shows sessions of these names.
+
+    Raises:
+        InputError: it is none.
+    """
+    if map_state not in (LAST, MAJORITY, *names):
+        _parse_date(map_state)
+
+
 def _find_limit(place: Place, map_state: str) -> int | None:
     """Index of the session, in the order of time, as of which the map is shown; None: majority."""
     in_time = [place.sessions[k].session for k in place.in_time()]
@@ -67,7 +79,7 @@ def _find_limit(place: Place, map_state: str) -> int | None:
     until = _parse_date(map_state)
     before = [k for k, one in enumerate(in_time) if int(one.stamp_ns[0]) <= until]
     if not before:
-        raise InputError(f"--map-state {map_state}: no session is as old")
+        raise InputError(f"no session is as old as the state that the map shall show: {map_state}")
     return before[-1]
 
 
@@ -80,8 +92,7 @@ def _parse_date(text: str) -> int:
     try:
         date = datetime.datetime.fromisoformat(text)
     except ValueError as error:
-        hint = "last, majority, the name of a session, or a date such as 2026-05-31"
-        raise InputError(f"--map-state {text}: is no state of a map", hint=hint) from error
+        raise InputError(f"is no state of a map: {text}", hint=_STATES_HINT) from error
     if date.tzinfo is None:
         date = date.replace(tzinfo=datetime.UTC)
     nanoseconds = round(date.timestamp() * 1e6) * 1000
@@ -130,6 +141,7 @@ def place_record(
             "path": None,
             "sessions": [one.session.name for one in place.sessions],
         },
+        "dimension": place.dimension,
         "options": to_dict(options),
         "iterations": [],
         "counts": _count(folder),

@@ -1,7 +1,7 @@
 """The inputs of a merge: recordings, result folders, or a place."""
 
+import json
 import os
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,15 +9,17 @@ from pathlib import Path
 import numpy as np
 
 from stillmap.core.errors import InputError
+from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io.registry import detect_format
 from stillmap.places.prepare import MappedRecording
-from stillmap.results.folder import is_result
+from stillmap.results.folder import is_result, read_record
 from stillmap.results.pose_graph_g2o import read_g2o
+from stillmap.results.reader import SESSIONS
+from stillmap.results.result import BuiltResult
 from stillmap.results.run_json import RECORD, TILTING
 from stillmap.results.saved import SavedResult, load
-
-SESSIONS = "sessions.json"  # every place has it
+from stillmap.slam import deskew_recording
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,12 +29,14 @@ class SessionInput(ShortRepr):
     Attributes:
         name: unique in its place.
         parts: paths of its recording, several where it was recorded in parts; or of one result.
-        is_result: whether it was mapped already.
+        is_result: whether `parts` is a result folder.
+        given: the recording or the result itself, without a path; None: read from `parts`.
     """
 
     name: str
-    parts: tuple[Path, ...]
-    is_result: bool
+    parts: tuple[Path, ...] = ()
+    is_result: bool = False
+    given: Recording | BuiltResult | None = None
 
 
 def is_place(path: Path) -> bool:
@@ -41,12 +45,13 @@ def is_place(path: Path) -> bool:
 
 
 def list_sessions(
-    groups: Sequence[Sequence[str | os.PathLike[str]]], taken: Sequence[str] = ()
+    groups: Sequence[Sequence[str | os.PathLike[str]] | Recording | BuiltResult],
+    taken: Sequence[str] = (),
 ) -> list[SessionInput]:
     """The sessions of inputs, each a group of paths that belong together.
 
     Args:
-        groups: of recordings, or single result folders.
+        groups: of recordings, or single result folders; or recordings and results themselves.
         taken: names that are in use.
 
     Raises:
@@ -54,18 +59,32 @@ def list_sessions(
     """
     out, names = list[SessionInput](), set(taken)
     for group in groups:
-        paths = tuple(Path(one) for one in group)
-        for path in paths:
-            if is_place(path):
-                hint = "a place goes first: stillmap merge PLACE SESSION... -o PLACE"
-                raise InputError("is a place, among sessions", where=str(path), hint=hint)
-            if not is_result(path):
-                detect_format(path)  # refuses what nobody can read, before any work
-        mapped = len(paths) == 1 and is_result(paths[0])
-        name = _unique(_stem(paths[0]), names)
-        names.add(name)
-        out.append(SessionInput(name, paths, mapped))
+        if isinstance(group, Recording | BuiltResult):
+            one = SessionInput(_unique(_name_given(group), names), given=group)
+        else:
+            one = _find_session(tuple(Path(path) for path in group), names)
+        names.add(one.name)
+        out.append(one)
     return out
+
+
+def _find_session(paths: tuple[Path, ...], names: set[str]) -> SessionInput:
+    for path in paths:
+        if is_place(path):
+            hint = "a place to which sessions are added is the first of all"
+            raise InputError("is a place, among sessions", where=str(path), hint=hint)
+        if not is_result(path):
+            detect_format(path)  # refuses what nobody can read, before any work
+    return SessionInput(
+        _unique(_stem(paths[0]), names), paths, len(paths) == 1 and is_result(paths[0])
+    )
+
+
+def _name_given(given: Recording | BuiltResult) -> str:
+    """The stem of where a recording was read from, else `session`."""
+    recording = given if isinstance(given, Recording) else given.recording
+    path = recording.source.get("path")
+    return _stem(Path(path)) if isinstance(path, str) and path else "session"
 
 
 def _stem(path: Path) -> str:
@@ -81,8 +100,16 @@ def _unique(stem: str, names: set[str]) -> str:
     return next(name for k in range(2, len(names) + 3) if (name := f"{stem}-{k}") not in names)
 
 
-def load_mapped(name: str, folder: Path, threads: int) -> tuple[MappedRecording, SavedResult]:
+def load_mapped(
+    name: str, folder: Path, threads: int, recording: Recording | None = None
+) -> tuple[MappedRecording, SavedResult]:
     """A result folder as a session.
+
+    Args:
+        name: of the session.
+        folder: the result.
+        threads: number of threads.
+        recording: as it was mapped; None: read again.
 
     Raises:
         InputError: a file is missing or damaged, or the recording is not there any more.
@@ -92,9 +119,13 @@ def load_mapped(name: str, folder: Path, threads: int) -> tuple[MappedRecording,
     result = load(folder)
     graph = folder / "graph.g2o"
     output = result.options.output
+    if recording is None:
+        deskewed = result.deskewed
+    else:
+        deskewed = deskew_recording(recording, result.poses, result.folder.slam_options)
     mapped = MappedRecording(
         name,
-        result.deskewed,
+        deskewed,
         result.poses,
         np.asarray(result.p_static),
         read_g2o(graph) if graph.is_file() else None,
@@ -104,6 +135,8 @@ def load_mapped(name: str, folder: Path, threads: int) -> tuple[MappedRecording,
     return mapped, result
 
 
-def copy_record(result: Path, folder: Path) -> None:
-    """Copy what describes how a session was read and mapped."""
-    shutil.copyfile(result / RECORD, folder / RECORD)
+def copy_record(result: Path, folder: Path, dimension: int) -> None:
+    """Copy what describes how a session of a dimension was read and mapped."""
+    record = {**read_record(result), "dimension": dimension}
+    text = json.dumps(record, indent=2, ensure_ascii=False)
+    (folder / RECORD).write_text(text + "\n", encoding="utf-8")

@@ -14,10 +14,11 @@ from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_folder
 from stillmap.core.parallel import limit_blas_threads, resolve_threads
 from stillmap.core.profiling import Progress, no_progress
+from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.pipeline.options import Options
 from stillmap.places.beam_cells import find_beam_cells
-from stillmap.places.finish import finish_place, write_place
+from stillmap.places.finish import finish_place, require_map_state, write_place
 from stillmap.places.grow import add_session, start_place
 from stillmap.places.inputs import SessionInput, copy_record, load_mapped
 from stillmap.places.objects import copy_objects
@@ -28,6 +29,7 @@ from stillmap.places.session import Session
 from stillmap.places.store import STATE, read_session, write_session
 from stillmap.places.writer import PlaceResult
 from stillmap.results.build import build
+from stillmap.results.result import BuiltResult
 from stillmap.results.run_json import RECORD
 
 _VOXEL_SIZE = 0.15  # m, of the evidence of 3D sessions, unless the options say another
@@ -77,6 +79,7 @@ def merge_sessions(
     with atomic_folder(output, RECORD, overwrite) as folder:
         (folder / "sessions").mkdir()
         place, refusals, order = _open_base(job, folder)
+        _check_choices(job, [*order, *(one.name for one in job.sessions)])
         sessions = _prepare_sessions(job, folder, progress)
         order += [one.name for one in sessions]
         place, refused = _grow(place, sessions, job, threads, progress)
@@ -117,36 +120,51 @@ def _prepare_sessions(job: MergeJob, folder: Path, progress: Progress) -> list[S
             out.append(_keep_session(one.name, one.parts[0], home, job.options))
             continue
         with tempfile.TemporaryDirectory(prefix=".mapped-", dir=folder) as scratch:
-            parts = [str(path) for path in one.parts]
-            result = build(
-                parts[0] if len(parts) == 1 else parts,
-                job.options,
-                odometry=job.odometry,
-                progress=report,
-                scratch=scratch,
-            )
-            mapped = Path(scratch) / "result"
+            result, mapped = _map_session(one, job, scratch, report), Path(scratch) / "result"
             result.save(mapped)
+            recording = result.recording
             del result
-            out.append(_keep_session(one.name, mapped, home, job.options))
+            out.append(_keep_session(one.name, mapped, home, job.options, recording))
     return out
 
 
-def _keep_session(name: str, mapped: Path, home: Path, options: Options) -> Session:
-    """Write what the place keeps of a mapped session, and open it again from there."""
-    recording, result = load_mapped(name, mapped, resolve_threads(options.threads))
-    session = make_session(recording)
-    cell = _cell_size(options, session.dimension)
-    beams = find_beam_cells(
-        recording.deskewed, recording.poses, recording.p_static, session.graph, cell
+def _map_session(one: SessionInput, job: MergeJob, scratch: str, report: Progress) -> BuiltResult:
+    if isinstance(one.given, BuiltResult):
+        return one.given
+    parts = [str(path) for path in one.parts]
+    source = parts[0] if len(parts) == 1 else parts
+    return build(
+        source if one.given is None else one.given,
+        job.options,
+        odometry=job.odometry,
+        progress=report,
+        scratch=scratch,
     )
+
+
+def _keep_session(
+    name: str, folder: Path, home: Path, options: Options, recording: Recording | None = None
+) -> Session:
+    """Write what the place keeps of a mapped session, and open it again from there.
+
+    Args:
+        name: of the session.
+        folder: its result.
+        home: `sessions/NAME` of the place; it is made.
+        options: of mapping, and of the map.
+        recording: as it was mapped; None: read again.
+    """
+    mapped, result = load_mapped(name, folder, resolve_threads(options.threads), recording)
+    session = make_session(mapped)
+    cell = _cell_size(options, session.dimension)
+    beams = find_beam_cells(mapped.deskewed, mapped.poses, mapped.p_static, session.graph, cell)
     home.mkdir()
-    copy_record(mapped, home)
+    copy_record(folder, home, session.dimension)
     (home / "beams").mkdir()
     for array in ("stamp_ns", "offset", "hit"):
         write_npy(home / "beams" / f"{array}.npy", np.asarray(getattr(result.labels, array)))
     write_session(home, session, beams)
-    copy_objects(mapped, home / STATE)
+    copy_objects(folder, home / STATE)
     return read_session(home, session.source, np.array(session.stamp_ns))
 
 
@@ -224,8 +242,23 @@ def _reframe(place: Place, name: str) -> Place:
         if one.session.name == name:
             back = se2.inverse(one.T)
             return place.with_nodes([back @ other.nodes for other in place.sessions])
-    known = ", ".join(one.session.name for one in place.sessions)
-    raise InputError(f"--frame {name}: no such session in the place", hint=f"there are {known}")
+    raise _no_frame(name, [one.session.name for one in place.sessions])
+
+
+def _check_choices(job: MergeJob, names: Sequence[str]) -> None:
+    """Refuse a frame or a state of the map of no session, before any work.
+
+    Raises:
+        InputError: it is such a one.
+    """
+    if job.frame is not None and job.frame not in names:
+        raise _no_frame(job.frame, names)
+    require_map_state(job.map_state, names)
+
+
+def _no_frame(name: str, known: Sequence[str]) -> InputError:
+    hint = f"frame=NAME wants one of {', '.join(known)}"
+    return InputError(f"cannot have the frame of {name}: no such session in the place", hint=hint)
 
 
 def _describe_failure(refusals: Sequence[Refusal]) -> str:

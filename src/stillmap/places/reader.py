@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from stillmap.core.errors import InputError
 from stillmap.core.files import read_text, require_regular
 from stillmap.places.evidence import BLOCK, Evidence
-from stillmap.places.inputs import SESSIONS
 from stillmap.places.place import Place, PlacedSession, Refusal
 from stillmap.places.place_graph import Tie
 from stillmap.places.store import STATE, read_session
 from stillmap.results.folder import read_record
 from stillmap.results.labels import read_array
+from stillmap.results.reader import SESSIONS
 
 Float = NDArray[np.float64]
 

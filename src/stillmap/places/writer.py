@@ -15,13 +15,13 @@ from stillmap.core.short_repr import ShortRepr
 from stillmap.io.trajectory import write_tum
 from stillmap.places.changes import PlaceChange, change_records
 from stillmap.places.evidence import Evidence
-from stillmap.places.inputs import SESSIONS
 from stillmap.places.place import Place, PlacedSession, Refusal
 from stillmap.places.place_graph import Tie
 from stillmap.places.shown_state import ShownState, changed_cell_table, label_session
 from stillmap.places.store import STATE, read_beam_cells
 from stillmap.results.labels import read_array
 from stillmap.results.pose_graph_g2o import write_g2o
+from stillmap.results.reader import SESSIONS
 from stillmap.slam import PoseGraph
 from stillmap.slam.pose_graph import Constraint
 
