@@ -5,6 +5,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
@@ -21,6 +22,8 @@ from stillmap.results.run_json import RECORD, TILTING
 from stillmap.results.saved import SavedResult, load
 from stillmap.slam import deskew_recording
 
+Given: TypeAlias = Sequence[str | os.PathLike[str]] | Recording | BuiltResult | SavedResult
+
 
 @dataclass(frozen=True, eq=False)
 class SessionInput(ShortRepr):
@@ -36,7 +39,14 @@ class SessionInput(ShortRepr):
     name: str
     parts: tuple[Path, ...] = ()
     is_result: bool = False
-    given: Recording | BuiltResult | None = None
+    given: Recording | BuiltResult | SavedResult | None = None
+
+    @property
+    def path(self) -> str | None:
+        """Its path, of several parts the first; None: it has none."""
+        if isinstance(self.given, SavedResult):
+            return str(self.given.path)
+        return str(self.parts[0]) if self.parts else None
 
 
 def is_place(path: Path) -> bool:
@@ -45,7 +55,7 @@ def is_place(path: Path) -> bool:
 
 
 def list_sessions(
-    groups: Sequence[Sequence[str | os.PathLike[str]] | Recording | BuiltResult],
+    groups: Sequence[Given],
     taken: Sequence[str] = (),
 ) -> list[SessionInput]:
     """The sessions of inputs, each a group of paths that belong together.
@@ -59,7 +69,7 @@ def list_sessions(
     """
     out, names = list[SessionInput](), set(taken)
     for group in groups:
-        if isinstance(group, Recording | BuiltResult):
+        if isinstance(group, Recording | BuiltResult | SavedResult):
             one = SessionInput(_unique(_name_given(group), names), given=group)
         else:
             one = _find_session(tuple(Path(path) for path in group), names)
@@ -80,8 +90,10 @@ def _find_session(paths: tuple[Path, ...], names: set[str]) -> SessionInput:
     )
 
 
-def _name_given(given: Recording | BuiltResult) -> str:
-    """The stem of where a recording was read from, else `session`."""
+def _name_given(given: Recording | BuiltResult | SavedResult) -> str:
+    """The stem of a result's folder or of where a recording was read from, else `session`."""
+    if isinstance(given, SavedResult):
+        return _stem(given.path)
     recording = given if isinstance(given, Recording) else given.recording
     path = recording.source.get("path")
     return _stem(Path(path)) if isinstance(path, str) and path else "session"

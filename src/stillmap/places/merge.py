@@ -1,38 +1,27 @@
 """Merge sessions to a place: map each, add one after the other, then write what all of them say."""
 
 import shutil
-import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from stillmap.core import se2
-from stillmap.core.arrays import write_npy
+from stillmap.core.config import override
 from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_folder
 from stillmap.core.parallel import limit_blas_threads, resolve_threads
 from stillmap.core.profiling import Progress, no_progress
-from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
-from stillmap.pipeline.options import Options
-from stillmap.places.beam_cells import find_beam_cells
+from stillmap.pipeline.options import DEFAULTS, Options
 from stillmap.places.finish import finish_place, require_map_state, write_place
 from stillmap.places.grow import add_session, start_place
-from stillmap.places.inputs import SessionInput, copy_record, load_mapped
-from stillmap.places.objects import copy_objects
+from stillmap.places.inputs import SessionInput
+from stillmap.places.map_sessions import cell_size, prepare_sessions
 from stillmap.places.place import Place, Refusal, update_evidence
-from stillmap.places.prepare import make_session
 from stillmap.places.reader import read_place
 from stillmap.places.session import Session
-from stillmap.places.store import STATE, read_session, write_session
 from stillmap.places.writer import PlaceResult
-from stillmap.results.build import build
-from stillmap.results.result import BuiltResult
 from stillmap.results.run_json import RECORD
-
-_VOXEL_SIZE = 0.15  # m, of the evidence of 3D sessions, unless the options say another
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,8 +68,10 @@ def merge_sessions(
     with atomic_folder(output, RECORD, overwrite) as folder:
         (folder / "sessions").mkdir()
         place, refusals, order = _open_base(job, folder)
-        _check_choices(job, [*order, *(one.name for one in job.sessions)])
-        sessions = _prepare_sessions(job, folder, progress)
+        if place is not None:
+            job = replace(job, options=_adopt_cells(job.options, place))
+        _check_job(job, [*order, *(one.name for one in job.sessions)])
+        sessions = prepare_sessions(job.sessions, job.options, job.odometry, folder, progress)
         order += [one.name for one in sessions]
         place, refused = _grow(place, sessions, job, threads, progress)
         refusals += refused
@@ -107,72 +98,20 @@ def _open_base(job: MergeJob, folder: Path) -> tuple[Place | None, list[Refusal]
     return place, refusals, order
 
 
-def _prepare_sessions(job: MergeJob, folder: Path, progress: Progress) -> list[Session]:
-    """The sessions, each mapped where it was not, with what the place keeps of it written."""
-    out = []
-    for number, one in enumerate(job.sessions, start=1):
+def _adopt_cells(options: Options, place: Place) -> Options:
+    """The options with the edges of the cells of a place that grows.
 
-        def report(stage: str, iteration: int, done: int, total: int, number: int = number) -> None:
-            progress(f"session {number}: {stage}", iteration, done, total)
-
-        home = folder / "sessions" / one.name
-        if one.is_result:
-            out.append(_keep_session(one.name, one.parts[0], home, job.options))
-            continue
-        with tempfile.TemporaryDirectory(prefix=".mapped-", dir=folder) as scratch:
-            result, mapped = _map_session(one, job, scratch, report), Path(scratch) / "result"
-            result.save(mapped)
-            recording = result.recording
-            del result
-            out.append(_keep_session(one.name, mapped, home, job.options, recording))
-    return out
-
-
-def _map_session(one: SessionInput, job: MergeJob, scratch: str, report: Progress) -> BuiltResult:
-    if isinstance(one.given, BuiltResult):
-        return one.given
-    parts = [str(path) for path in one.parts]
-    source = parts[0] if len(parts) == 1 else parts
-    return build(
-        source if one.given is None else one.given,
-        job.options,
-        odometry=job.odometry,
-        progress=report,
-        scratch=scratch,
-    )
-
-
-def _keep_session(
-    name: str, folder: Path, home: Path, options: Options, recording: Recording | None = None
-) -> Session:
-    """Write what the place keeps of a mapped session, and open it again from there.
-
-    Args:
-        name: of the session.
-        folder: its result.
-        home: `sessions/NAME` of the place; it is made.
-        options: of mapping, and of the map.
-        recording: as it was mapped; None: read again.
+    Raises:
+        InputError: they ask for others.
     """
-    mapped, result = load_mapped(name, folder, resolve_threads(options.threads), recording)
-    session = make_session(mapped)
-    cell = _cell_size(options, session.dimension)
-    beams = find_beam_cells(mapped.deskewed, mapped.poses, mapped.p_static, session.graph, cell)
-    home.mkdir()
-    copy_record(folder, home, session.dimension)
-    (home / "beams").mkdir()
-    for array in ("stamp_ns", "offset", "hit"):
-        write_npy(home / "beams" / f"{array}.npy", np.asarray(getattr(result.labels, array)))
-    write_session(home, session, beams)
-    copy_objects(folder, home / STATE)
-    return read_session(home, session.source, np.array(session.stamp_ns))
-
-
-def _cell_size(options: Options, dimension: int) -> float:
-    """m, edge of a cell of the evidence."""
-    if dimension == 2:
-        return options.slam.resolution
-    return options.slam.voxel_size or _VOXEL_SIZE
+    edges = {"resolution": place.resolution}
+    if place.dimension == 3:
+        edges["voxel_size"] = place.voxel_size
+    for name, edge in edges.items():
+        if getattr(options.slam, name) not in (edge, getattr(DEFAULTS.slam, name)):
+            hint = f"it grows with slam.{name}={edge:g}"
+            raise InputError(f"the place has cells of {edge:g} m", hint=hint)
+    return override(options, {"slam": edges})
 
 
 def _grow(
@@ -191,7 +130,7 @@ def _grow(
     seeds = sorted(sessions, key=lambda one: one.name != job.frame)  # the frame's session first
     best: tuple[Place, list[Refusal]] | None = None
     for number, seed in enumerate(seeds):
-        cell = _cell_size(job.options, seed.dimension)
+        cell = cell_size(job.options, seed.dimension)
         start = start_place(seed, job.options.slam.resolution, cell, threads)
         others = [one for one in sessions if one is not seed]
         found = _add_all(start, others, threads, progress)
@@ -220,7 +159,7 @@ def _add_all(
                 growth = add_session(place, session, threads, _step(progress, session))
                 place, why = growth.place, growth.refused
             if why:
-                refusals[session.name] = Refusal(session.name, session.source, why)
+                refusals[session.name] = Refusal(session.name, session.input, why)
             else:
                 pending.remove(session)
                 refusals.pop(session.name, None)
@@ -245,12 +184,16 @@ def _reframe(place: Place, name: str) -> Place:
     raise _no_frame(name, [one.session.name for one in place.sessions])
 
 
-def _check_choices(job: MergeJob, names: Sequence[str]) -> None:
-    """Refuse a frame or a state of the map of no session, before any work.
+def _check_job(job: MergeJob, names: Sequence[str]) -> None:
+    """Refuse, before any work, too few sessions, and a frame or a state of the map of none.
 
     Raises:
-        InputError: it is such a one.
+        InputError: it is such a job.
     """
+    if not job.sessions:
+        raise InputError("no session is named that is to be merged")
+    if len(names) < 2:
+        raise InputError("one session alone is no place", hint="merge it with others, or map it")
     if job.frame is not None and job.frame not in names:
         raise _no_frame(job.frame, names)
     require_map_state(job.map_state, names)

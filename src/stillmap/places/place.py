@@ -85,7 +85,7 @@ class Refusal(ShortRepr):
     """A session that is not in the place, and why."""
 
     name: str
-    source: dict[str, object]
+    input: str | None
     why: str
 
 

@@ -19,7 +19,7 @@ from stillmap.results.reader import SESSIONS
 
 Float = NDArray[np.float64]
 
-_MAX_JSON = 64 << 20  # bytes
+MAX_JSON = 64 << 20  # bytes
 _MAX_ARRAY = 1 << 31  # bytes of an array in an archive when it is unpacked
 _HINT = "merge the sessions anew"
 
@@ -35,9 +35,7 @@ def read_place(folder: Path) -> tuple[Place, list[Refusal], list[str]]:
     """
     run = read_record(folder)
     records = read_sessions(folder)
-    accepted = [record for record in records if record["accepted"]]
-    if not accepted:
-        raise InputError("holds no session", where=str(folder / SESSIONS), hint=_HINT)
+    accepted = _order_accepted(folder, records, run["input"].get("sessions"))
     settings = run.get("place")
     try:
         resolution, voxel_size = (float(settings[name]) for name in ("resolution", "voxel_size"))  # type: ignore[index]
@@ -50,12 +48,29 @@ def read_place(folder: Path) -> tuple[Place, list[Refusal], list[str]]:
         raise InputError("has sessions in 2D and in 3D", where=str(folder), hint=_HINT)
     ties = _read_ties(folder / "ties.npz", sessions)
     refusals = [
-        Refusal(record["name"], {"path": record.get("input")}, str(record.get("why", "")))
+        Refusal(record["name"], record.get("input"), str(record.get("why", "")))
         for record in records
         if not record["accepted"]
     ]
     place = Place(sessions, ties, resolution, voxel_size)
     return place, refusals, [record["name"] for record in records]
+
+
+def _order_accepted(
+    folder: Path, records: list[dict[str, Any]], order: Any
+) -> list[dict[str, Any]]:
+    """The entries of accepted sessions in the order in which they were merged.
+
+    Raises:
+        InputError: there are none, or `run.json` names others.
+    """
+    accepted = {record["name"]: record for record in records if record["accepted"]}
+    if not accepted:
+        raise InputError("holds no session", where=str(folder / SESSIONS), hint=_HINT)
+    if not isinstance(order, list) or sorted(map(str, order)) != sorted(accepted):
+        what = "names other sessions than run.json: one of them was changed by hand"
+        raise InputError(what, where=str(folder / SESSIONS), hint=_HINT)
+    return [accepted[name] for name in order]
 
 
 def read_sessions(folder: Path) -> list[dict[str, Any]]:
@@ -67,11 +82,13 @@ def read_sessions(folder: Path) -> list[dict[str, Any]]:
     path = folder / SESSIONS
     require_regular(path)
     try:
-        records = json.loads(read_text(path, _MAX_JSON))
+        records = json.loads(read_text(path, MAX_JSON))
         for record in records:
             name = record["name"]
             if not isinstance(name, str) or not name or "/" in name or name in (".", ".."):
                 raise ValueError(f"a session cannot have the name {name!r}")
+            if not isinstance(record.get("input"), str | None):
+                raise ValueError(f"the input of {name} is no path")
             if not isinstance(record["accepted"], bool):
                 raise ValueError(f"'accepted' of {name} is neither true nor false")
         if len({record["name"] for record in records}) != len(records):
@@ -85,8 +102,7 @@ def read_sessions(folder: Path) -> list[dict[str, Any]]:
 
 def _read_placed(home: Path, record: dict[str, Any]) -> PlacedSession:
     stamp_ns = np.array(read_array(home / "beams" / "stamp_ns.npy", (None,), "i"), np.int64)
-    source = read_record(home)["input"]
-    session, state = read_session(home, source, stamp_ns), home / STATE
+    session, state = read_session(home, record.get("input"), stamp_ns), home / STATE
     D, N, K = session.dimension, len(session.graph.keyframes), len(session.keyframes)
     nodes = _read_poses(state / "nodes.npy", N, D)
     measured_at = _read_poses(state / "measured_at.npy", K, D)

@@ -53,12 +53,12 @@ def _write_keyframes(folder: Path, keyframes: Keyframes) -> None:
     write_npy(folder / "nodes.npy", keyframes.nodes.astype(np.int64))
 
 
-def read_session(folder: Path, source: dict[str, object], stamp_ns: NDArray[np.int64]) -> Session:
+def read_session(folder: Path, path: str | None, stamp_ns: NDArray[np.int64]) -> Session:
     """The session that `write_session` wrote; arrays are memory-mapped.
 
     Args:
         folder: `sessions/NAME` of a place.
-        source: the input as `run.json` describes it.
+        path: of its input, as it was given; None: it had none.
         stamp_ns: (T,) stamps of its scans.
 
     Raises:
@@ -77,7 +77,7 @@ def read_session(folder: Path, source: dict[str, object], stamp_ns: NDArray[np.i
         raise _inconsistent(state)
     clearance = read_array(state / "clearance.npy", (K,), "f")
     return Session(
-        folder.name, source, stamp_ns, np.array(poses), graph, keyframes, planar, clearance
+        folder.name, path, stamp_ns, np.array(poses), graph, keyframes, planar, clearance
     )
 
 

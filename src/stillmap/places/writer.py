@@ -1,7 +1,7 @@
 """The folder of a place: everything that the result of one recording has, and its sessions."""
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -190,25 +190,34 @@ def session_records(result: PlaceResult) -> list[dict[str, Any]]:
     """The entries of `sessions.json`, in the order in which the inputs were given."""
     placed = {one.session.name: one for one in result.place.sessions}
     refused = {one.name: one for one in result.refusals}
-    return list(_iter_records(result.order, placed, refused))
+    counts = [len(one.session.stamp_ns) for one in result.place.sessions]
+    first_scan = dict(zip(placed, np.cumsum([0, *counts]).tolist(), strict=False))
+    return [
+        _placed_record(placed[name], first_scan[name])
+        if name in placed
+        else {
+            "name": name,
+            "input": refused[name].input,
+            "accepted": False,
+            "why": refused[name].why,
+        }
+        for name in result.order
+        if name in placed or name in refused
+    ]
 
 
-def _iter_records(
-    order: list[str], placed: dict[str, PlacedSession], refused: dict[str, Refusal]
-) -> Iterator[dict[str, Any]]:
-    for name in order:
-        if name in placed:
-            one = placed[name]
-            yield {
-                "name": name,
-                "input": one.session.source.get("path"),
-                "accepted": True,
-                "T_place_session": one.T.tolist(),
-                "covariance": one.covariance.tolist(),
-                "overlap": round(one.overlap, 4),
-                "first_stamp_ns": int(one.session.stamp_ns[0]),
-                "last_stamp_ns": int(one.session.stamp_ns[-1]),
-            }
-        elif name in refused:
-            source = refused[name].source.get("path")
-            yield {"name": name, "input": source, "accepted": False, "why": refused[name].why}
+def _placed_record(one: PlacedSession, first_scan: int) -> dict[str, Any]:
+    """The entry of a session whose scans begin at `first_scan` of those of the place."""
+    stamp_ns = one.session.stamp_ns
+    return {
+        "name": one.session.name,
+        "input": one.session.input,
+        "accepted": True,
+        "T_place_session": one.T.tolist(),
+        "covariance": one.covariance.tolist(),
+        "overlap": round(one.overlap, 4),
+        "first_stamp_ns": int(stamp_ns[0]),
+        "last_stamp_ns": int(stamp_ns[-1]),
+        "first_scan": first_scan,
+        "scans": len(stamp_ns),
+    }

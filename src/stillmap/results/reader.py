@@ -116,12 +116,12 @@ class Crossings(NamedTuple):
 
 
 def read_crossings(result: Path) -> Crossings:
-    """The crossings in `traffic.npz` of a result folder.
+    """The crossings in `traffic.npz` of a result folder; of a session of a place, all of the place.
 
     Raises:
         InputError: it is missing or damaged.
     """
-    path = result / "traffic.npz"
+    path = _find_map(result) / "traffic.npz"
     if not path.exists():
         hint = "`stillmap map` writes it with objects.enabled=true"
         raise InputError("does not exist: no crossings were counted", where=str(path), hint=hint)
