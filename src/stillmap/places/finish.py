@@ -14,6 +14,7 @@ from stillmap.core.version import package_version
 from stillmap.em import OccupancyMap
 from stillmap.pipeline.options import Options
 from stillmap.places.changes import detect_place_changes
+from stillmap.places.checksums import write_checksums
 from stillmap.places.grow import estimate_planar
 from stillmap.places.objects import join_objects, place_objects
 from stillmap.places.place import Place, Refusal
@@ -113,6 +114,7 @@ def write_place(folder: Path, result: PlaceResult, options: Options, map_state: 
     homes = [folder / "sessions" / one.session.name for one in place.sessions]
     for home, one in zip(homes, place.sessions, strict=True):
         place_objects(home, one)
+        write_checksums(home)
     write_place_files(folder, result)
     join_objects(folder, homes)
     planar = [place.sessions[k].require_evidence()[1] for k in place.in_time()]

@@ -14,7 +14,7 @@ from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io.registry import detect_format
 from stillmap.places.prepare import MappedRecording
-from stillmap.results.folder import is_result, read_record
+from stillmap.results.folder import is_result, open_result, read_record
 from stillmap.results.pose_graph_g2o import read_g2o
 from stillmap.results.reader import SESSIONS
 from stillmap.results.result import BuiltResult
@@ -85,9 +85,25 @@ def _find_session(paths: tuple[Path, ...], names: set[str]) -> SessionInput:
             raise InputError("is a place, among sessions", where=str(path), hint=hint)
         if not is_result(path):
             detect_format(path)  # refuses what nobody can read, before any work
-    return SessionInput(
-        _unique(_stem(paths[0]), names), paths, len(paths) == 1 and is_result(paths[0])
-    )
+    mapped = len(paths) == 1 and is_result(paths[0])
+    if mapped:
+        _require_recording(paths[0])
+    return SessionInput(_unique(_stem(paths[0]), names), paths, mapped)
+
+
+def _require_recording(result: Path) -> None:
+    """Refuse a result whose recording cannot be read again.
+
+    Raises:
+        InputError: it has gone, or is of a rig.
+    """
+    if (result / TILTING).is_dir():
+        raise InputError("is a rig with a tilting laser, which is not merged", where=str(result))
+    try:
+        open_result(result).require_source()
+    except InputError as error:
+        hint = f"{result} was made from it: merge the recording itself from where it is now"
+        raise InputError(error.what, where=error.where, hint=hint) from error
 
 
 def _name_given(given: Recording | BuiltResult | SavedResult) -> str:
@@ -126,8 +142,6 @@ def load_mapped(
     Raises:
         InputError: a file is missing or damaged, or the recording is not there any more.
     """
-    if (folder / TILTING).is_dir():
-        raise InputError("is a rig with a tilting laser, which is not merged", where=str(folder))
     result = load(folder)
     graph = folder / "graph.g2o"
     output = result.options.output

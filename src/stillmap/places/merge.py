@@ -8,7 +8,7 @@ from pathlib import Path
 from stillmap.core import se2
 from stillmap.core.config import override
 from stillmap.core.errors import InputError
-from stillmap.core.files import atomic_folder
+from stillmap.core.files import atomic_folder, require_regular
 from stillmap.core.parallel import limit_blas_threads, resolve_threads
 from stillmap.core.profiling import Progress, no_progress
 from stillmap.core.short_repr import ShortRepr
@@ -94,8 +94,28 @@ def _open_base(job: MergeJob, folder: Path) -> tuple[Place | None, list[Refusal]
     place, refusals, order = read_place(job.base)
     for one in place.sessions:
         name = one.session.name
-        shutil.copytree(job.base / "sessions" / name, folder / "sessions" / name)
+        _copy_session(job.base / "sessions" / name, folder / "sessions" / name)
     return place, refusals, order
+
+
+def _copy_session(source: Path, target: Path) -> None:
+    """Copy the folder of a session, with permissions as of new files.
+
+    Raises:
+        InputError: a file cannot be read.
+    """
+    target.mkdir()
+    for path in sorted(source.iterdir()):
+        if path.is_dir():
+            _copy_session(path, target / path.name)
+            continue
+        require_regular(path)
+        try:
+            file = path.open("rb")
+        except OSError as error:
+            raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
+        with file, (target / path.name).open("wb") as copy:
+            shutil.copyfileobj(file, copy)
 
 
 def _adopt_cells(options: Options, place: Place) -> Options:
