@@ -78,9 +78,7 @@ def contents(folder: Path) -> dict[str, bytes]:
         del record[name]
     for iteration in record["iterations"]:
         del iteration["seconds"]
-    report = re.sub(
-        rb"Where time and memory went.*?</section>", b"", out["report.html"], flags=re.S
-    )
+    report = re.sub(rb"<h3>Time and memory</h3>.*?</details>", b"", out["report.html"], flags=re.S)
     report = re.sub(rb"<div><dt>(Computed in|Peak memory)</dt>.*?</div>", b"", report)
     report = re.sub(rb"<td[^<>]*>[0-9.,]+ (ms|s|min)</td>", b"", report)
     return {**out, "run.json": json.dumps(record).encode(), "report.html": report}

@@ -36,7 +36,9 @@ def unpack(pack: Path, out: Path, sweeps: int | None = None) -> Path:
     name = pack.name.partition("_")[0]
     with np.load(pack) as arrays:
         offset, poses = arrays["offset"], arrays["pose"][:sweeps]
-        points, intensity = arrays["xyz_2p5mm"], arrays["intensity"]
+        points = arrays["xyz_2p5mm"]
+        # packs may have none
+        intensity = arrays.get("intensity", np.zeros(len(points), np.uint8))
     for k in range(len(poses)):
         its = slice(offset[k], offset[k + 1])
         rows = np.empty((offset[k + 1] - offset[k], 4), "<f4")

@@ -23,7 +23,8 @@ class Room(NamedTuple):
 ROOMS = (
     Room("cli", 0, 0, 12, "commands: parse, read, build, save"),
     Room("eval", 1, 0, 4, "scores against truth"),
-    Room("viewer", 1, 4.5, 8, "results in the browser"),
+    Room("viewer", 1, 4.5, 6.15, "in the browser"),
+    Room("fleet", 1, 6.35, 8, "many recordings"),
     Room("results", 2, 0, 8, "writers and readers of the result folder, exports, report"),
     Room("pipeline", 3, 0, 8, "the EM loop, its options, result and checkpoint"),
     Room("mesh", 4, 0, 4, "surface, textures, object models"),
@@ -39,11 +40,13 @@ ROOMS = (
 )
 ARROWS = (  # from, to, column
     ("cli", "eval", 2),
-    ("cli", "viewer", 6.25),
+    ("cli", "viewer", 5.3),
+    ("cli", "fleet", 7.2),
     ("cli", "io", 8.85),
     ("cli", "sim", 10.6),
     ("eval", "results", 2),
-    ("viewer", "results", 6.25),
+    ("viewer", "results", 5.3),
+    ("fleet", "results", 7.2),
     ("results", "pipeline", 4),
     ("pipeline", "mesh", 2),
     ("pipeline", "slam", 6.25),

@@ -76,7 +76,8 @@ def ask(tmp_path, place):
 
 
 def test_bash(ask):
-    names = {"map", "info", "view", "filter", "convert", "simulate", "eval", "config", "completion"}
+    names = {"map", "info", "view", "fleet", "filter", "convert", "simulate", "eval", "config"}
+    names |= {"completion"}
     wanted = {
         "stillmap ": names,
         "stillmap ma": {"map"},
@@ -93,7 +94,7 @@ def test_bash(ask):
         "stillmap view ": {"out/"},
         "stillmap simulate office-m": {"office-moved", "office-moved-empty"},
         "stillmap simulate hall --set crowd.peo": {"crowd.people="},
-        "stillmap eval ": {"relations", "trajectory", "labels", "map", "model"},
+        "stillmap eval ": {"relations", "trajectory", "labels", "map", "model", "sessions"},
         "stillmap eval trajectory a b --delta-unit f": {"frames"},
         "stillmap config em.time": {"em.time_bin"},
         "stillmap completion ": {"bash", "zsh", "fish"},

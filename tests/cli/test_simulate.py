@@ -12,6 +12,7 @@ from stillmap import io
 from stillmap.cli import simulate
 from stillmap.core.errors import InputError
 from stillmap.sim import load_truth
+from stillmap.sim.session_truth import load_session_truth
 
 QUICK = ("--scans", "20", "--beams", "90", "--people", "3")
 
@@ -44,6 +45,33 @@ def test_files_of_the_folder(tmp_path: Path) -> None:
         *(f"sim/{name}.npy" for name in arrays),
         *(f"sim/truth/{name}" for name in truth.split()),
     }
+
+
+def test_sessions_are_recordings_with_truth_in_common(tmp_path: Path, capsys) -> None:
+    out = tmp_path / "days"
+    assert call("lookalike-1", "-o", str(out), *QUICK, "--sessions", "2", "--json") == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert [one["name"] for one in summary["sessions"]] == ["session-1", "session-2"]
+    assert summary["scans"] == 40
+    truth = load_session_truth(out)
+    assert truth.names == ("session-1", "session-2")
+    assert io.read(out / "session-2").n_scans == 20
+    with pytest.raises(InputError, match="already holds something"):
+        call("lookalike-1", "-o", str(out), *QUICK, "--sessions", "2")
+
+
+@pytest.mark.parametrize(
+    ("flags", "error"),
+    [
+        (("--sessions", "0"), "--sessions wants 1 or more"),
+        (("--sessions", "2", "--format", "carmen"), "sessions are written as recording folders"),
+        (("--sessions", "2", "--lidar", "tilting"), "one laser or lidar"),
+    ],
+)
+def test_refused_sessions(tmp_path: Path, flags: tuple[str, ...], error: str) -> None:
+    with pytest.raises(InputError, match=error):
+        call("hall", "-o", str(tmp_path / "days"), *flags)
+    assert not (tmp_path / "days").exists()
 
 
 def test_flags_reach_the_scene(tmp_path: Path) -> None:

@@ -15,7 +15,10 @@ from stillmap.cli.main import main
 from stillmap.cli.parser import COMMANDS, parser
 
 PACKAGE = Path(stillmap.__file__).parent
-LIBRARY = [path for path in PACKAGE.rglob("*.py") if path.parent.name != "cli"]
+COMMAND_LINES = PACKAGE / "fleet" / "settings.py"  # of child processes
+LIBRARY = [
+    path for path in PACKAGE.rglob("*.py") if path.parent.name != "cli" and path != COMMAND_LINES
+]
 
 
 def texts(path):

@@ -122,6 +122,7 @@ def standing_before(faces: Float) -> Motion:
         outlines=Outlines(faces, np.zeros(1, np.int32)),
         things=Outlines(np.empty((2, 0, 4)), np.empty(0, np.int32)),
         still=np.empty((0, 4)),
+        still_thing=np.empty(0, np.int32),
         sizes=np.array([[4.4, 1.8]]),
         moved=np.ones(1, bool),
     )

@@ -111,6 +111,31 @@ def show_share(quiet: bool, what: str) -> "Iterator[Callable[[float], None] | No
         yield print_line
 
 
+@contextmanager
+def show_tasks(quiet: bool) -> "Iterator[Callable[[str, int, int, str], None]]":
+    """A function that shows what is done, how many of how many tasks, and the last one's name."""
+    if quiet or sys.stderr is None:
+        yield lambda *_: None
+    elif is_terminal(sys.stderr):
+        bar = make_bar()
+        tasks: dict[str, Any] = {}
+
+        def update(what: str, done: int, total: int, name: str) -> None:  # noqa: ARG001
+            bar.start()  # not before the first progress
+            if what not in tasks:
+                for finished in tasks.values():
+                    bar.update(finished, visible=False)
+                tasks[what] = bar.add_task(what, total=total, counted="")
+            bar.update(tasks[what], completed=done, counted=f"{done} of {total}", refresh=True)
+
+        try:
+            yield update
+        finally:
+            bar.stop()
+    else:
+        yield lambda what, done, total, name: say(f"{what}: {done} of {total}, {name}")
+
+
 class _Lines:
     """Print progress every `_LINE_PERIOD` seconds, and at the end of each iteration."""
 
@@ -156,8 +181,8 @@ class _Lines:
         say(text)
 
 
-def print_json(content: dict[str, Any]) -> None:
-    """Print one JSON object to stdout; non-finite numbers become null."""
+def print_json(content: dict[str, Any] | list[dict[str, Any]]) -> None:
+    """Print one JSON object, or a list of them, to stdout; non-finite numbers become null."""
     import json
 
     from stillmap.core.json import to_jsonable

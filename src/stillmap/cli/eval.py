@@ -25,6 +25,7 @@ EPILOG = """examples:
   stillmap eval labels out sim
   stillmap eval map out sim
   stillmap eval model out sim
+  stillmap eval sessions place days
 """
 
 
@@ -63,11 +64,18 @@ _SCORES = {
         "out sim",
         "out sim --within 20 --json",
     ),
+    "sessions": (
+        "alignment, changes and map of a place, against simulated sessions",
+        "Errors of the poses of each session, cells and objects that changed between sessions, and "
+        "the map of what stands there last, against the truth of `stillmap simulate --sessions`.",
+        "place days",
+        "place days --single out-1 --single out-2 --json",
+    ),
 }
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the five scores."""
+    """Add the six scores."""
     scores = parser.add_subparsers(title="scores", dest="score", required=True, metavar="SCORE")
     for name, (about, description, *examples) in _SCORES.items():
         epilog = "\n".join(
@@ -78,6 +86,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             _add_relations(score)
         elif name == "trajectory":
             _add_trajectory(score)
+        elif name == "sessions":
+            _add_sessions(score)
         else:
             _add_simulation(score, name)
         score.add_argument("--json", action="store_true", help="one JSON object on stdout")
@@ -165,6 +175,23 @@ def _add_simulation(parser: argparse.ArgumentParser, score: str) -> None:
         )
 
 
+def _add_sessions(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "place", type=Path, metavar="PLACE", help="folder that `stillmap merge` wrote"
+    )
+    parser.add_argument(
+        "truth", type=Path, metavar="TRUTH_DIR", help="folder that `simulate --sessions` wrote"
+    )
+    parser.add_argument(
+        "--single",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="RESULT_DIR",
+        help="result of one of the sessions, whose map is scored too; can be given again",
+    )
+
+
 def run(args: argparse.Namespace) -> int:
     """Compute and print one score.
 
@@ -184,6 +211,10 @@ def _compute_scores(args: argparse.Namespace) -> "Scores":
         from stillmap.cli.eval_model import score_model
 
         return score_model(args.result, args.truth, args.within)
+    if args.score == "sessions":
+        from stillmap.cli.eval_sessions import score_sessions
+
+        return score_sessions(args.place, args.truth, args.single)
     from stillmap.cli import eval_scores
 
     if args.score == "relations":

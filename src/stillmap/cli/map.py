@@ -76,13 +76,14 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     )
     p.add_argument("--json", action="store_true", help="a summary as one JSON object on stdout")
     p.add_argument("--quiet", action="store_true", help="no progress, no summary")
-    _add_method_flags(p.add_argument_group("method"))
-    _add_map_flags(p.add_argument_group("map"))
+    add_method_flags(p.add_argument_group("method"))
+    add_map_flags(p.add_argument_group("map"))
     add_read_flags(p)
     add_option_flags(p)
 
 
-def _add_method_flags(p: argparse._ArgumentGroup) -> None:
+def add_method_flags(p: argparse._ArgumentGroup) -> None:
+    """Add the flags that choose how poses and labels are estimated."""
     p.add_argument("--paper", action="store_true", help="the method exactly as printed")
     p.add_argument(
         "--estimator",
@@ -97,7 +98,8 @@ def _add_method_flags(p: argparse._ArgumentGroup) -> None:
     p.add_argument("--no-odometry", action="store_true", help="ignore odometry in the recording")
 
 
-def _add_map_flags(p: argparse._ArgumentGroup) -> None:
+def add_map_flags(p: argparse._ArgumentGroup) -> None:
+    """Add the flags of the map that is written."""
     p.add_argument(
         "--mesh",
         action=argparse.BooleanOptionalAction,
@@ -139,7 +141,7 @@ def run(args: argparse.Namespace) -> int:
     from stillmap.pipeline.checkpoint import lock_checkpoints
     from stillmap.results.save import save
 
-    options = options_from_args(args, read_changes(args), _option_changes(args))
+    options = options_from_args(args, read_changes(args), option_changes(args))
     output, stages = Path(args.output), StageTimer()
     _require_usable_output(args, output)
     groups = _find_groups(args, options, output, stages)
@@ -187,7 +189,7 @@ def _find_groups(
     return groups
 
 
-def _option_changes(args: argparse.Namespace) -> dict[str, Any]:
+def option_changes(args: argparse.Namespace) -> dict[str, Any]:
     """The options that flags of this command set."""
     changes: dict[str, Any] = {}
     if args.paper and args.estimator not in (None, "paper"):

@@ -103,6 +103,7 @@ COMMANDS = {
     "merge": "sessions of one place into one map with dated changes",
     "info": "what is in a recording",
     "view": "look at a result",
+    "fleet": "many recordings mapped, and merged per place",
     "filter": "the recording without dynamic beams, for other mapping programs",
     "convert": "one recording format to another; results for other programs",
     "simulate": "a recording with truth, for tests and demos",
@@ -116,6 +117,7 @@ _COMMANDS_EPILOG = """examples:
   stillmap map log.clf.gz -o out        map it
   stillmap merge mon tue -o place       sessions of one place into one map
   stillmap view out                     look at the map and the report
+  stillmap fleet recordings -o all      map every recording of a folder
   stillmap filter out -o clean.clf      the recording without dynamic beams
   stillmap convert log.bag -o log.mcap  one format to another
   stillmap simulate hall -o sim         a recording with truth
@@ -125,6 +127,7 @@ exit status:
   0    done
   1    a defect of stillmap
   2    the input or the call is at fault; one line says what to do
+  3    fleet: some recordings failed, all others are done
   130  interrupted; nothing is half-written
 """
 

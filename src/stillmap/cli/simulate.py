@@ -11,7 +11,7 @@ from stillmap.cli.console import list_files, print_json, say, show_share
 from stillmap.core.errors import InputError
 
 if TYPE_CHECKING:
-    from stillmap.sim import Simulation
+    from stillmap.sim import Scene, Simulation
 
 _SCENES = {
     "hall": "45 x 30 m, 15 people",
@@ -32,6 +32,9 @@ _SCENES = {
     "building": "grows with --scans, wing by wing",
     "ten-corridors": "56 x 37 m, corridors of the same shape",
     "rounds": "197 x 82 m, corridors around six courtyards, 40 people",
+    "lookalike-1": "a corridor of 40 m, 4 people",
+    "lookalike-2": "another one of the same shape with other rooms",
+    "two-wings": "two such corridors that share a door, 6 people",
 }
 
 _LISTED = "".join(f"  {name:<16} {what}\n" for name, what in _SCENES.items())
@@ -50,6 +53,7 @@ examples:
   stillmap simulate street -o sim --set traffic.vehicles=3 --json
   stillmap simulate street -o sim --lidar 64 --scans 300 --set lidar.vibration_pitch=0.005
   stillmap simulate hall -o sim --lidar tilting --rate 37.5 --scans 900 --camera
+  stillmap simulate office -o days --sessions 5 --seed 3
 """
 
 # flag, metavar, type, section and key of the option it sets, help
@@ -128,6 +132,13 @@ def _add_output_flags(p: argparse.ArgumentParser) -> None:
     )
     p.add_argument("--overwrite", action="store_true", help="replace what is in DIR")
     p.add_argument(
+        "--sessions",
+        metavar="N",
+        type=int,
+        help="N recordings of the place on as many days: things are moved, brought and taken in "
+        "between, routes, starts and mounts differ",
+    )
+    p.add_argument(
         "--format",
         choices=("stillmap", "carmen"),
         default="stillmap",
@@ -171,6 +182,8 @@ def run(args: argparse.Namespace) -> int:
     if args.format == "carmen":
         require_carmen(scene)
     output = Path(args.output)
+    if args.sessions is not None:
+        return _run_sessions(scene, args, output)
     require_new(output, RIG_MARK if scene.rig.tilts else MARK, args.overwrite)
     with show_share(args.quiet, "simulating") as progress:
         rng, parent = np.random.default_rng(args.seed), output.absolute().parent
@@ -185,6 +198,33 @@ def run(args: argparse.Namespace) -> int:
     else:
         write_simulation(simulations[0], output, format=args.format, overwrite=args.overwrite)
     summary = _summarize(simulations, output)
+    if not args.quiet:
+        _print_summary(summary)
+    if args.json:
+        print_json(summary)
+    return 0
+
+
+def _run_sessions(scene: "Scene", args: argparse.Namespace, output: Path) -> int:
+    from stillmap.core.files import require_new
+    from stillmap.sim.session_truth import MARK
+    from stillmap.sim.session_writer import write_sessions
+    from stillmap.sim.sessions import SessionOptions, plan_sessions
+
+    if args.format == "carmen":
+        raise InputError("sessions are written as recording folders", hint="no --format carmen")
+    if args.sessions < 1:
+        raise InputError(f"--sessions wants 1 or more, got {args.sessions}")
+    require_new(output, MARK, args.overwrite)
+    plan = plan_sessions(scene, SessionOptions(args.sessions), args.seed)
+    with show_share(args.quiet, "simulating") as progress:
+        sessions = write_sessions(
+            [plan], output, seed=args.seed, overwrite=args.overwrite, tell=progress
+        )
+    totals = {key: sum(one[key] for one in sessions) for key in ("scans", "beams", "hits")}
+    totals["dynamic"] = sum(one["dynamic"] for one in sessions)
+    summary = {"output": str(output), "files": list_files(output), "scene": scene.name, **totals}
+    summary["sessions"] = sessions
     if not args.quiet:
         _print_summary(summary)
     if args.json:

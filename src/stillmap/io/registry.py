@@ -299,12 +299,13 @@ def _no_recording_error(path: Path) -> InputError:
 def _find_recordings(path: Path) -> list[Path]:
     """The entries of a folder that are recordings, by name."""
     try:
-        return [one for one in sorted(islice(path.iterdir(), _MAX_ENTRIES)) if _is_recording(one)]
+        return [one for one in sorted(islice(path.iterdir(), _MAX_ENTRIES)) if is_recording(one)]
     except OSError:
         return []
 
 
-def _is_recording(path: Path) -> bool:
+def is_recording(path: Path) -> bool:
+    """Whether a file or folder is a recording by its content; False where it cannot be read."""
     try:
         if path.is_dir():
             return any(known.matches(path, None) for known in FORMATS)

@@ -24,6 +24,8 @@ _NOISE = 2.5  # cells: surfaces of the same class nearer to a static one are noi
 # of an object that moved: greatest distance in m, ratio of its sides and of its cells before and
 # after, m by which a side may be seen shorter
 _MAX_MOTION, _MAX_RATIO, _SIDE_SLACK = 10.0, 1.6, 0.3
+_BESIDE = 3.0  # cells between a change and a cell that belongs to it
+_CLEAR, _SHARE = 2.0, 0.7  # nats of a clear observation; share of them that a cell beside takes
 _DOOR_DISTANCE = 0.5  # m between the leaf of a door in its two positions
 
 
@@ -63,18 +65,76 @@ class _Events(NamedTuple):
         return _Events._make(column[chosen] for column in self)
 
 
-def detect_place_changes(place: PlaceStates) -> list[PlaceChange]:
-    """The changes between sessions, in the order of time."""
-    D = place.cells.shape[1]
-    events = _find_events(place)
-    near = _near_static(place, place.cells[events.cell])
-    events = events.select(np.flatnonzero(~near))
-    out = list[PlaceChange]()
-    for group in _group_events(events, place):
-        for part in _split_by_time(group, _MIN_CELLS[D]):
-            out.append(_make_change(part, place))
+def detect_place_changes(place: PlaceStates) -> tuple[PlaceStates, list[PlaceChange]]:
+    """The changes between sessions, in the order of time.
+
+    Cells beside a change of which a session says little take the evidence of the change.
+
+    Returns:
+        the place with the states of these cells, and the changes.
+    """
+    groups = _find_groups(place)
+    place = _share_evidence(place, groups)
+    out = [_make_change(group, place) for group in _find_groups(place)]
     out = _pair_positions(out, place)
-    return sorted(out, key=lambda one: (one.after, one.before, *one.low.tolist()))
+    return place, sorted(out, key=lambda one: (one.after, one.before, *one.low.tolist()))
+
+
+def _find_groups(place: PlaceStates) -> list[_Events]:
+    """Events of cells, grouped to objects that came or left between two sessions."""
+    events, min_cells = _find_events(place), _MIN_CELLS[place.cells.shape[1]]
+    near = _near_static(place, place.cells[events.cell])
+    apart, beside = (events.select(np.flatnonzero(mask)) for mask in (~near, near))
+    out = []
+    for group in _group_events(apart, place):
+        out += _split_by_time(group, min_cells)
+    return [_attach(group, beside, place) for group in out]
+
+
+def _attach(group: _Events, beside: _Events, place: PlaceStates) -> _Events:
+    """A group with the like events right beside it that are also near static surface."""
+    before, after = int(group.before.max()), int(group.after.min())
+    like = (beside.came == group.came[0]) & (beside.before < after) & (beside.after > before)
+    at = np.flatnonzero(like)
+    at = at[_within(place.cells[beside.cell[at]], place.cells[group.cell])]
+    return _Events._make(
+        np.concatenate([one, other[at]]) for one, other in zip(group, beside, strict=True)
+    )
+
+
+def _within(cells: Cells, others: Cells) -> NDArray[np.bool_]:
+    """(n,) whether cells (n, D) lie right beside any of the others."""
+    if not len(cells) or not len(others):
+        return np.zeros(len(cells), np.bool_)
+    from scipy.spatial import cKDTree  # slow to load
+
+    distance, _ = cKDTree(others).query(cells, distance_upper_bound=_BESIDE + 1.0)
+    return np.asarray(distance <= _BESIDE)
+
+
+def _share_evidence(place: PlaceStates, groups: list[_Events]) -> PlaceStates:
+    """The place with the evidence of each group in cells beside it that were not seen as clearly.
+
+    Those that stood when the object did, of which a session did not see that they are otherwise.
+    """
+    evidence = place.evidence.copy()
+    for group in groups:
+        of = np.unique(group.cell)
+        usual = np.median(place.evidence[of], axis=0)
+        there = usual > _CLEAR
+        gone = usual < -_CLEAR
+        if not there.any() or not gone.any():
+            continue
+        low, high = place.cells[of].min(axis=0) - 3, place.cells[of].max(axis=0) + 3
+        inside = np.flatnonzero(((place.cells >= low) & (place.cells <= high)).all(axis=1))
+        inside = inside[_within(place.cells[inside], place.cells[of])]
+        stood = (place.evidence[inside][:, there] > _CLEAR).any(axis=1)
+        seen_since = (place.evidence[inside][:, gone] > _CLEAR).any(axis=1)
+        for k in inside[stood & ~seen_since].tolist():
+            unclear = np.abs(evidence[k]) < _CLEAR
+            evidence[k, unclear] = _SHARE * usual[unclear]
+    changed = np.flatnonzero((evidence != place.evidence).any(axis=1))
+    return place.with_evidence(evidence, changed)
 
 
 def _find_events(place: PlaceStates) -> _Events:
@@ -229,3 +289,15 @@ def _corners(low: Float, high: Float) -> list[float]:
     """x0, y0, x1, y1, and in 3D z0, z1."""
     plane = [*low[:2], *high[:2]]
     return [round(float(x), 3) for x in (*plane, *(v for z in (low[2:], high[2:]) for v in z))]
+
+
+def change_cells(
+    changes: Sequence[PlaceChange], place: PlaceStates
+) -> dict[str, NDArray[np.generic]]:
+    """The cells of all changes: `change` (K,) the entry of `changes.json`, and `xy` (K, 2) or `xyz`
+    (K, 3), the centres of the cells in metres."""
+    cells = [one.cells for one in changes]
+    number = np.repeat(np.arange(len(changes), dtype=np.int32), [len(of) for of in cells])
+    of = np.concatenate([np.zeros(0, np.intp), *cells])
+    D = place.cells.shape[1]
+    return {"change": number, "xyz"[:D]: (place.cells[of] + 0.5) * place.resolution}

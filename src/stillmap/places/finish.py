@@ -48,12 +48,12 @@ def finish_place(
     """
     limit = _find_limit(place, map_state)
     planar_states = estimate_planar(place)
-    planar_changes = detect_place_changes(planar_states)
+    planar_states, planar_changes = detect_place_changes(planar_states)
     planar = show_state(planar_states, planar_changes, limit)
     if place.dimension == 2:
         return PlaceResult(place, refusals, order, planar_changes, planar, planar)
     states = estimate_place([place.sessions[k].require_evidence()[0] for k in place.in_time()])
-    changes = detect_place_changes(states)
+    states, changes = detect_place_changes(states)
     return PlaceResult(place, refusals, order, changes, show_state(states, changes, limit), planar)
 
 

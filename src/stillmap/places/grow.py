@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core import se2
 from stillmap.core.short_repr import ShortRepr
 from stillmap.places import matching, matching_3d
 from stillmap.places.keyframes import Keyframes
@@ -36,7 +37,10 @@ Matches = dict[int, list[KeyframeMatch]]  # by the index of the reference in the
 
 _EM_ROUNDS = 2
 _MAX_CHANGED = 0.25  # share of the cells seen by it and others that nobody saw as it did
-_MIN_TIES, _MIN_AGREEING = 4, 0.6  # constraints, and the share of them that the graph must keep
+# constraints between keyframes, and the share of them that the graph must keep; in 3D the maps
+# themselves are one: lidars see far beyond where robots drove
+_MIN_TIES, _MIN_AGREEING = {2: 4, 3: 1}, 0.6
+_MAP_STD = (0.05, 0.05, 0.1, 0.01, 0.01, 0.004)  # m and rad, of an alignment of maps in 3D
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +77,7 @@ def add_session(
     found = find_placement(place.sessions, session)
     if found.refused:
         return Growth(place, found.refused)
-    placed = PlacedSession(session, lift_alignment(place, session, found))
+    start = placed = PlacedSession(session, lift_alignment(place, session, found))
     matches, states = found.matches, None
     if place.dimension == 3:
         matches = match_session(place, placed, PREDICTION_STD, None, threads)
@@ -82,7 +86,9 @@ def add_session(
             matches = match_session(place, placed, CORRECTED_STD, states, threads)
         report("optimizing poses")
         ties = make_ties(matches, len(place.sessions))
-        if len(ties) < _MIN_TIES:
+        if place.dimension == 3:
+            ties.append(_tie_maps(place, start))
+        if len(ties) < _MIN_TIES[place.dimension]:
             return Growth(place, "too few of its keyframes can be registered to the place")
         grown, agreeing = _optimize(place, placed, ties)  # M-step
         if agreeing < _MIN_AGREEING:
@@ -92,7 +98,7 @@ def add_session(
         states = estimate_planar(grown)  # E-step
         placed = grown.sessions[-1]
         changed = states.disagreement_of(grown.in_time().index(len(grown.sessions) - 1))
-        if changed > _MAX_CHANGED:
+        if place.dimension == 2 and changed > _MAX_CHANGED:
             why = f"{100 * changed:.0f} % of what both saw would have changed"
             return Growth(place, f"it contradicts the place: {why}")
     return Growth(_describe(grown, ties))
@@ -158,6 +164,17 @@ def make_ties(matches: Matches, index: int) -> list[Tie]:
         for match in of
         if match.verdict is Verdict.FITS
     ]
+
+
+def _tie_maps(place: Place, start: PlacedSession) -> Tie:
+    """The alignment of the maps as a constraint between the nearest nodes."""
+    index = select_references(place.sessions, start.session.planar, start.planar_poses)[0]
+    ours, theirs = start.nodes[:, :3, 3], place.sessions[index].nodes[:, :3, 3]
+    distance = np.linalg.norm(ours[:, None] - theirs[None], axis=2)
+    node, other = np.unravel_index(int(distance.argmin()), distance.shape)
+    T = se2.inverse(place.sessions[index].nodes[other]) @ start.nodes[node]
+    covariance = np.diag(np.square(_MAP_STD))
+    return Tie(index, int(other), len(place.sessions), int(node), T, covariance)
 
 
 def _optimize(place: Place, placed: PlacedSession, ties: list[Tie]) -> tuple[Place, float]:

@@ -13,7 +13,7 @@ from stillmap.slam.loop_closure_3d import SweepLoopCloser
 
 Float = NDArray[np.float64]
 
-_REACH = 8.0  # m between a node and the one of the other session whose submap it is matched with
+_REACH = 20.0  # m between a node and the one of the other session whose submap it is matched with
 _USUAL_EXPLAINED = 0.8  # share of a sweep that the map of its own session explains
 _MAX_NODES = 40  # that are registered: each takes long, and neighbours say the same
 

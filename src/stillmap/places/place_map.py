@@ -16,7 +16,8 @@ Float = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 _FREE_PRIOR = 0.2  # occupancy of a cell that no beam passed; as of single recordings
-_MIN_PROMINENCE = 0.25  # share of the most-hit neighbour's hits below which a surface is its noise
+# share of the hits of the most-hit cell, one and two cells around, below which it is its noise
+_MIN_PROMINENCE, _MIN_FAR_PROMINENCE, _REACH = 0.25, 0.08, 2
 
 
 def make_place_map(sessions: Sequence[Evidence], shown: ShownState) -> OccupancyMap:
@@ -70,7 +71,7 @@ def _draw_tile(
     """p_occupied, alpha and beta of a tile, x along the first axis."""
     from scipy import ndimage  # slow to load
 
-    low, shape = tile.low - 1, tuple(n + 2 for n in tile.shape)
+    low, shape = tile.low - _REACH, tuple(n + 2 * _REACH for n in tile.shape)
     hits, passes = np.zeros((2, *shape), np.float32)
     for one in sessions:
         of_hits, of_passes = one.crop(low, shape)
@@ -83,12 +84,15 @@ def _draw_tile(
     candidate[at] = True
     # hits below the limit of a candidate may still be all that was seen of a far wall
     stands = np.where(candidate, stands, hits / (hits + passes + MIN_HITS))
-    strongest = ndimage.maximum_filter(hits * stands, 3, mode="constant")
-    prominence = hits / np.maximum(_MIN_PROMINENCE * strongest, 1e-6)
+    limit = np.full(shape, 1e-6, np.float32)
+    for share, radius in ((_MIN_PROMINENCE, 1), (_MIN_FAR_PROMINENCE, _REACH)):
+        strongest = ndimage.maximum_filter(hits * stands, 2 * radius + 1, mode="constant")
+        limit = np.maximum(limit, share * strongest)
+    prominence = hits / limit
     surface = stands * np.minimum(prominence, 1.0)
     odds = _FREE_PRIOR / (1.0 - _FREE_PRIOR) * np.exp(-passes)
     p_passed = odds / (1.0 + odds)
     p = np.where(hits + passes > 0.0, surface + (1.0 - surface) * p_passed, np.float32(np.nan))
-    inner = (slice(1, -1), slice(1, -1))
+    inner = (slice(_REACH, -_REACH),) * 2
     alpha = hits * stands
     return p[inner].astype(np.float32), alpha[inner], (passes + hits - alpha)[inner]

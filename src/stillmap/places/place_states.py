@@ -1,12 +1,13 @@
 """The E-step over sessions: the cells of a place in which anything stood, and their states."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.components import neighbor_pairs
 from stillmap.core.short_repr import ShortRepr
 from stillmap.places import session_hmm
 from stillmap.places.beam_cells import cell_keys
@@ -20,6 +21,8 @@ _BLOCKS_PER_TILE = 8  # along each axis
 # cells: within so many of each other two surfaces are the same; around a cell that must be passed
 TOLERANCE, _FREE_RADIUS = {2: 2, 3: 1}, 1
 MIN_HITS = 0.75  # expected static hits of a session that make a cell a candidate
+_MIN_PROMINENCE = 0.2  # share of the hits of the most-hit cell within the tolerance
+_POOL_RADIUS = 3.0  # cells within which those of one history decide together
 _CLEAR = 1.0  # nats from which on a session says something about a cell
 _MAX_FIT_ROWS = 50_000  # cells that the weights are fitted to
 
@@ -63,6 +66,16 @@ class PlaceStates(ShortRepr):
         order = np.argsort(key)
         return key[order], order
 
+    def with_evidence(
+        self, evidence: NDArray[np.float32], changed: NDArray[np.intp]
+    ) -> "PlaceStates":
+        """The same with other evidence (K, S) of the cells `changed` (n,)."""
+        states = session_hmm.estimate_states(evidence[changed].astype(np.float64), self.weights)
+        columns = {name: np.array(getattr(self.states, name)) for name in vars(states)}
+        for name, column in columns.items():
+            column[changed] = getattr(states, name)
+        return replace(self, evidence=evidence, states=CellStates(**columns))
+
     def disagreement_of(self, index: int) -> float:
         """Share of the cells observed by a session and by others that no other saw as it did."""
         observed = np.abs(self.evidence) > _CLEAR
@@ -102,8 +115,10 @@ def estimate_place(sessions: Sequence[Evidence]) -> PlaceStates:
     table = np.concatenate(evidence)
     step = max(-(-len(table) // _MAX_FIT_ROWS), 1)
     weights = session_hmm.fit_weights(table[::step].astype(np.float64))
-    states = session_hmm.estimate_states(table.astype(np.float64), weights)
-    return PlaceStates(np.concatenate(cells), table, states, sessions[0].resolution, weights)
+    all_cells = np.concatenate(cells)
+    pairs = neighbor_pairs(all_cells, _POOL_RADIUS)
+    states = session_hmm.estimate_states(table.astype(np.float64), weights, pairs)
+    return PlaceStates(all_cells, table, states, sessions[0].resolution, weights)
 
 
 def iter_tiles(sessions: Sequence[Evidence]) -> Iterator[Tile]:
@@ -126,7 +141,8 @@ def _observe_tile(sessions: Sequence[Evidence], tile: Tile) -> tuple[Cells, NDAr
     sums = [one.crop(low, shape) for one in sessions]
     is_candidate = np.zeros(tile.shape, np.bool_)
     for hits, _ in sums:
-        is_candidate |= hits[inner] >= MIN_HITS
+        strongest = ndimage.maximum_filter(hits, 2 * halo + 1, mode="constant")
+        is_candidate |= (hits >= np.maximum(MIN_HITS, _MIN_PROMINENCE * strongest))[inner]
     at = np.nonzero(is_candidate)
     nats = np.empty((len(at[0]), len(sessions)), np.float32)
     for s, (hits, passes) in enumerate(sums):

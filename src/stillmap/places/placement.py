@@ -62,13 +62,16 @@ def find_placement(place: Sequence[PlacedSession], session: Session) -> Placemen
         place: its sessions, at least one, with evidence.
         session: a further one, with the evidence of its planar keyframes in its own frame.
     """
-    known = make_surface_map([one.require_evidence()[1] for one in place])
-    own = make_surface_map(
-        [measure_evidence(session.planar, session.planar.poses, known.edge / 2, 1)]
-    )
+    D = session.dimension
+    known = make_surface_map([one.require_evidence()[1] for one in place], D)
+    cell = place[0].require_evidence()[1].resolution
+    evidence = measure_evidence(session.planar, session.planar.poses, cell, 1)
+    own = make_surface_map([evidence], D)
     proposed = propose_alignments(known, own, session.planar)
     if refused := _doubt(proposed):
         return Placement(np.eye(3), refused=refused)
+    if D == 3:  # sweeps are registered in space, which tells more than their planar views
+        return Placement(proposed[0].T)
     best = test_alignment(place, session, proposed[0].T)
     return replace(best, refused=_uncertainty(best, session))
 

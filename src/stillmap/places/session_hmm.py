@@ -18,9 +18,12 @@ Float = NDArray[np.float64]
 
 # nats: of a static hit within the tolerance, of a pass through all cells around; of one session at
 # most, since its beams share the session's errors
-_NATS_PER_HIT, _NATS_PER_PASS, MAX_NATS = 1.5, 1.0, 7.0
+_NATS_PER_HIT, _NATS_PER_PASS = 1.0, 1.5
+_MAX_OCCUPIED, _MAX_FREE = 7.0, 9.0
 _SWITCH = 0.25  # probability that a changing cell is otherwise in the next session
 _WEIGHTS = (0.8, 0.1, 0.1)  # prior of static, free, changing
+# independent observations that neighbouring cells of one history amount to; nats of a cell at most
+_INDEPENDENT_CELLS, _MAX_POOLED = 4.0, 20.0
 _MIN_WEIGHT, _ROUNDS = 0.01, 20  # of a class while the weights are fitted; rounds of EM
 
 
@@ -50,9 +53,9 @@ def weigh_evidence(hits: NDArray[np.float32], passes: NDArray[np.float32]) -> ND
         hits: of any shape, largest number of static hits within the tolerance.
         passes: of the same shape, smallest number of passes through the cells around.
     """
-    occupied = np.minimum(_NATS_PER_HIT * hits, MAX_NATS)
+    occupied = np.minimum(_NATS_PER_HIT * hits, _MAX_OCCUPIED)
     # where something stands beams still graze the cells beside it
-    free = np.minimum(_NATS_PER_PASS * passes, MAX_NATS) * np.maximum(1.0 - hits, 0.0)
+    free = np.minimum(_NATS_PER_PASS * passes, _MAX_FREE) * np.maximum(1.0 - hits, 0.0)
     return np.asarray(occupied - free)
 
 
@@ -70,20 +73,43 @@ def fit_weights(evidence: Float, rare: tuple[float, float, float] = _WEIGHTS) ->
     return weights
 
 
-def estimate_states(evidence: Float, weights: Float) -> CellStates:
+def estimate_states(
+    evidence: Float, weights: Float, pairs: NDArray[np.intp] | None = None
+) -> CellStates:
     """States of cells over sessions.
 
     Args:
         evidence: (K, S) nats, sessions in the order of time; 0: not observed.
         weights: (3,) of static, free and changing.
+        pairs: (P, 2) cells beside each other: those with one history decide together on their
+            class; None: each cell for itself.
     """
-    joint = np.exp(_log_likelihoods(evidence)) * weights
+    log, path, observed = _log_likelihoods(evidence), _decode(evidence), evidence != 0.0
+    if pairs is not None and len(pairs):
+        log = _pool(log, path, observed, pairs)
+    joint = np.exp(log - log.max(axis=1, keepdims=True)) * weights
     posterior = joint / joint.sum(axis=1, keepdims=True)
-    in_chain = _smooth(evidence)
-    p_occupied = posterior[:, :1] + posterior[:, 2:] * in_chain
-    return CellStates(
-        posterior[:, 0], posterior[:, 2], p_occupied, _decode(evidence), evidence != 0.0
+    p_occupied = posterior[:, :1] + posterior[:, 2:] * _smooth(evidence)
+    return CellStates(posterior[:, 0], posterior[:, 2], p_occupied, path, observed)
+
+
+def _pool(
+    log: Float, path: NDArray[np.bool_], observed: NDArray[np.bool_], pairs: NDArray[np.intp]
+) -> Float:
+    """(K, 3) log likelihoods of cells together with their neighbours of the same history.
+
+    The mean over the neighbours, times their number up to a limit: they share their errors.
+    """
+    i, j = pairs.T
+    same = ((path[i] == path[j]) | ~(observed[i] & observed[j])).all(axis=1)
+    i, j = np.concatenate([i[same], j[same]]), np.concatenate([j[same], i[same]])
+    count = 1.0 + np.bincount(i, minlength=len(log))
+    total = np.stack(
+        [of + np.bincount(i, of[j], minlength=len(log)) for of in np.maximum(log, -_MAX_POOLED).T],
+        axis=1,
     )
+    out: Float = total * (np.minimum(count, _INDEPENDENT_CELLS) / count)[:, None]
+    return out
 
 
 def _log_likelihoods(evidence: Float) -> Float:

@@ -15,7 +15,9 @@ from stillmap.places.place_states import iter_tiles
 Float = NDArray[np.float64]
 
 _STEP = 2  # cells of the evidence along the edge of a square
-_MIN_HITS, _MIN_PASSES = 0.75, 2.0  # of a surface; of a cell known to be free
+# hits of a surface, passes of a cell known to be free, by the dimension of the sessions: what 3D
+# sessions see of a bush or a fence at several heights is both at once
+_LIMITS = {2: (0.75, 2.0), 3: (3.0, 6.0)}
 
 
 _CONFLICT_WEIGHT = 5.0
@@ -64,10 +66,14 @@ class SurfaceMap(ShortRepr):
         return Comparison(int(self.near[x, y].sum()), int(self.free[x, y].sum()))
 
 
-def make_surface_map(sessions: Sequence[Evidence]) -> SurfaceMap:
+def make_surface_map(sessions: Sequence[Evidence], dimension: int = 2) -> SurfaceMap:
     """The surfaces of some sessions, in the frame of their evidence.
 
     Free is what none of them saw occupied: where sessions differ, neither is known.
+
+    Args:
+        sessions: evidence of each in the plane.
+        dimension: of the sessions before they were projected to the plane, 2 or 3.
     """
     from scipy import ndimage  # slow to load
 
@@ -88,9 +94,10 @@ def make_surface_map(sessions: Sequence[Evidence]) -> SurfaceMap:
             of_hits, of_passes = one.crop(first, part)
             hits[where] = np.maximum(hits[where], _pool(of_hits, np.max))
             passes[where] = np.maximum(passes[where], _pool(of_passes, np.min))
-    surface = hits >= _MIN_HITS
+    min_hits, min_passes = _LIMITS[dimension]
+    surface = hits >= min_hits
     near = ndimage.binary_dilation(surface, np.ones((3, 3), np.bool_))
-    free = ndimage.binary_erosion(passes >= _MIN_PASSES, np.ones((3, 3), np.bool_)) & ~near
+    free = ndimage.binary_erosion(passes >= min_passes, np.ones((3, 3), np.bool_)) & ~near
     square = _STEP * sessions[0].resolution
     squares = low // _STEP
     points = (np.argwhere(surface) + squares + 0.5) * square

@@ -13,7 +13,7 @@ from stillmap.core.arrays import write_npy, write_npz
 from stillmap.core.json import to_jsonable
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io.trajectory import write_tum
-from stillmap.places.changes import PlaceChange, change_records
+from stillmap.places.changes import PlaceChange, change_cells, change_records
 from stillmap.places.evidence import Evidence
 from stillmap.places.place import Place, PlacedSession, Refusal
 from stillmap.places.place_graph import Tie
@@ -27,7 +27,7 @@ from stillmap.slam.pose_graph import Constraint
 
 Float = NDArray[np.float64]
 
-CHANGES, STATES = "changes.json", "states.npz"
+CHANGES, CELLS, STATES = "changes.json", "changes.npz", "states.npz"
 _TIES = ("first", "first_node", "second", "second_node")
 
 
@@ -122,6 +122,7 @@ def write_place_files(folder: Path, result: PlaceResult) -> None:
     write_g2o(folder / "graph.g2o", _join_graphs(place), poses)
     write_json(folder / SESSIONS, session_records(result))
     write_json(folder / CHANGES, change_records(result.changes, result.names_in_time))
+    write_npz(folder / CELLS, change_cells(result.changes, result.shown.place))
     write_npz(folder / STATES, changed_cell_table(result.planar))
     dof = 3 if place.dimension == 2 else 6
     write_ties(folder / "ties.npz", place.ties, dof)

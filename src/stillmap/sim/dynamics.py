@@ -50,6 +50,8 @@ class Motion:
         outlines: faces of doors and vehicles.
         things: faces of movable objects, which change between scans.
         still: (K, 4) faces of movers that never moved.
+        still_thing: (K,) index of the movable object that each of these belongs to; -1: of another
+            mover.
         sizes: (P, 2) metres, length and width of doors and vehicles; NaN of people and things.
         moved: (P,) whether each mover ever moved.
     """
@@ -65,6 +67,7 @@ class Motion:
     outlines: Outlines
     things: Outlines
     still: Float
+    still_thing: NDArray[np.int32]
     sizes: Float
     moved: NDArray[np.bool_]
 
@@ -185,6 +188,7 @@ class _World:
         sizes = np.full((len(kinds) + len(placed.moved), 2), np.nan)
         sizes[persons : persons + doors] = np.column_stack([self.doors.width, np.zeros(doors)])
         sizes[persons + doors : len(kinds)] = self.traffic.size
+        never = faces[0, ~moving]
         return Motion(
             period,
             seconds,
@@ -196,7 +200,8 @@ class _World:
             people=Movers(xy, heading, self.figures.semi_axes, self.figures.mover),
             outlines=Outlines(faces[:, moving], mover[moving]),
             things=placed.outlines,
-            still=np.concatenate([faces[0, ~moving], placed.still]),
+            still=np.concatenate([never, placed.still]),
+            still_thing=np.concatenate([np.full(len(never), -1, np.int32), placed.still_thing]),
             sizes=sizes,
             moved=np.concatenate([moved, placed.moved]),
         )

@@ -46,6 +46,11 @@ class Episode:
     colour_seed: int | None = None
 
     @property
+    def has_standing_things(self) -> bool:
+        """Whether a movable object stands still throughout."""
+        return bool((self.motion.still_thing >= 0).any())
+
+    @property
     def stamp_ns(self) -> NDArray[np.int64]:
         """(T,) recorded stamps in ns, rounded."""
         o, exact = self.scene.robot, self.exact_ns
@@ -69,6 +74,7 @@ class Episode:
         T_world_base: Float,
         more: dict[str, Any] | None = None,
         T_base_sensor: Float | None = None,
+        thing: NDArray[np.int32] | None = None,
     ) -> Truth:
         """The truth about beams; `more` is added to the scene after `mover_kinds`."""
         motion, scene = self.motion, self._describe_scene()
@@ -80,7 +86,7 @@ class Episode:
         faces = motion.things.faces[-1]
         lasting = faces[np.any(faces[:, :2] != faces[:, 2:], axis=1)]
         arrays = (static, mover, T_world_base, self.walls, motion.poses)
-        return Truth(*arrays, about, lasting, T_base_sensor)
+        return Truth(*arrays, about, lasting, T_base_sensor, thing)
 
     def _describe_scene(self) -> dict[str, Any]:
         """Name, seed and all parameters of the scene as JSON; walls are written as an array."""

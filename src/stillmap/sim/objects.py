@@ -18,12 +18,14 @@ class PlacedObjects(NamedTuple):
         poses: (T, P, 3) x, y in metres, yaw in rad; NaN where absent.
         outlines: faces of those that move; of length 0 while absent.
         still: (K, 4) faces of those that never move.
+        still_thing: (K,) index of the object that each of these faces belongs to.
         moved: (P,) whether each ever moves.
     """
 
     poses: Float
     outlines: Outlines
     still: Float
+    still_thing: NDArray[np.int32]
     moved: NDArray[np.bool_]
 
 
@@ -43,6 +45,7 @@ def place_objects(things: tuple[Thing, ...], seconds: Float, first: int) -> Plac
     """
     T, poses, still = len(seconds), [], [np.empty((0, 4))]
     moving, mover = [np.empty((T, 0, 4))], [np.empty(0, np.int32)]
+    still_thing = [np.empty(0, np.int32)]
     moved: list[bool] = []
     for number, thing in enumerate(things, start=first):
         at = np.full((T, 3), np.nan)
@@ -54,12 +57,19 @@ def place_objects(things: tuple[Thing, ...], seconds: Float, first: int) -> Plac
         moved.append(not np.array_equal(at, np.broadcast_to(at[0], at.shape)))
         if not moved[-1]:
             still.append(faces[0])
+            still_thing.append(np.full(len(thing.faces), number - first, np.int32))
         else:
             moving.append(faces)
             mover.append(np.full(len(thing.faces), number, np.int32))
     outlines = Outlines(np.concatenate(moving, axis=1), np.concatenate(mover))
     by_scan = np.reshape(poses, (-1, T, 3)).swapaxes(0, 1)
-    return PlacedObjects(by_scan, outlines, np.concatenate(still), np.array(moved, bool))
+    return PlacedObjects(
+        by_scan,
+        outlines,
+        np.concatenate(still),
+        np.concatenate(still_thing),
+        np.array(moved, bool),
+    )
 
 
 def place_faces(thing: Thing, stay: Stay) -> Float:

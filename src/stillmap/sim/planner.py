@@ -1,5 +1,6 @@
 """Clearance grid of free space, and shortest paths through it."""
 
+import copy
 from functools import cached_property
 from typing import Any
 
@@ -42,6 +43,19 @@ class FreeSpace:
         self.clearance: Float = np.full((size[1], size[0]), _MAX_CLEARANCE)
         for wall in walls:
             self._add_wall(wall)
+
+    @property
+    def spacing(self) -> float:
+        """m between nodes."""
+        return _SPACING
+
+    def with_walls(self, walls: Float) -> "FreeSpace":
+        """The free space between these walls (W, 4), within the same bounds, and its own."""
+        more = copy.copy(self)
+        more.clearance = self.clearance.copy()
+        for wall in walls:
+            more._add_wall(wall)
+        return more
 
     def _add_wall(self, wall: Float) -> None:
         ends = wall.reshape(2, 2)
@@ -132,6 +146,10 @@ class Planner:
         at = np.round((xy - self._space.origin) / (_SPACING * _STRIDE)).astype(int)
         column, row = np.clip(at, 0, (self._shape[1] - 1, self._shape[0] - 1))
         return int(row) * int(self._shape[1]) + int(column)
+
+    def contains(self, xy: Float) -> bool:
+        """Whether the node next to a point (2,) is reachable."""
+        return bool(self._part[self._grid_node(xy)] >= 0)
 
     def node(self, xy: Float) -> int:
         """The reachable node nearest to a point (2,)."""

@@ -18,7 +18,7 @@ from stillmap.sim.lidar import Pattern, Sensor
 from stillmap.sim.ray_casting import RayReturns
 from stillmap.sim.truth import Truth
 from stillmap.sim.truth_surfaces import MovingSurfaces, StaticSurfaces
-from stillmap.sim.world_3d import MoverSolids, make_static_world
+from stillmap.sim.world_3d import STANDING, MoverSolids, make_static_world
 
 
 class World(NamedTuple):
@@ -101,7 +101,7 @@ def record(
         OSError: the disk is full.
     """
     happening, T = world.happening, len(world.ridden)
-    beams = _Beams(sensor, scratch)
+    beams = _Beams(sensor, scratch, happening.has_standing_things)
     for scan in range(T):
         pattern = sensor.pattern(scan)
         beams.add(world.cast_rays(sensor, pattern, scan), pattern, rng)
@@ -128,17 +128,19 @@ def record(
     sizes = np.column_stack([happening.motion.sizes, world.carried.tall])
     more = {"mover_sizes": np.where(np.isnan(sizes), np.array(None), sizes).tolist()}
     static, mover = beams.static.finish(), beams.mover.finish()
-    return recording, happening.truth(static, mover, T_world_base, more)
+    thing = None if beams.thing is None else beams.thing.finish()
+    return recording, happening.truth(static, mover, T_world_base, more, thing=thing)
 
 
 class _Beams:
     """Builders of the per-beam arrays of Recording and Truth."""
 
-    def __init__(self, sensor: Sensor, folder: Path | None) -> None:
+    def __init__(self, sensor: Sensor, folder: Path | None, has_things: bool) -> None:
         self._sensor = sensor
         self.points = ArrayBuilder(np.float32, (sensor.dimension,), folder)
         self.hit, self.static = (ArrayBuilder(np.bool_, (), folder) for _ in range(2))
         self.mover = ArrayBuilder(np.int32, (), folder)
+        self.thing = ArrayBuilder(np.int32, (), folder) if has_things else None
         self.time = ArrayBuilder(np.float32, (), folder) if sensor.takes_time else None
         self.offset = [0]
 
@@ -146,13 +148,17 @@ class _Beams:
         """Append a scan, given its exact returns."""
         range, hit = simulate_measurement(exact.range, exact.on_glass, self._sensor.options, rng)
         points = (range * pattern.direction[: self._sensor.dimension]).astype(np.float32)
-        mover = np.where(hit, exact.mover, np.int32(-1))
+        stands = exact.mover <= STANDING
+        thing = np.where(hit & stands, STANDING - exact.mover, np.int32(-1)).astype(np.int32)
+        mover = np.where(hit & ~stands, exact.mover, np.int32(-1))
         time = np.repeat(pattern.seconds, hit.shape[1]).reshape(hit.shape)
         use = hit if self._sensor.leaves_out else np.ones_like(hit)
         self.points.append(np.moveaxis(points, 0, -1)[use])
         self.hit.append(hit[use])
         self.static.append((hit & (mover == -1))[use])
         self.mover.append(mover[use])
+        if self.thing is not None:
+            self.thing.append(thing[use])
         if self.time is not None:
             self.time.append(time[use])
         self.offset.append(len(self.hit))

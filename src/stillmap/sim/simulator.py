@@ -98,11 +98,11 @@ def simulate(
         recorded = recorder.record(world, sensor, happening.sensor_rng, rest, scratch)
         made = _with_images(world, *recorded)
     else:
-        recording, mover = _record(happening)
+        recording, mover, thing = _record(happening)
         static, T_world_base = recording.hit & (mover == -1), se2.matrix(*happening.motion.robot.T)
         mount = _mounts(scene.laser, (scene.laser.x, scene.laser.y, scene.laser.yaw))
         wrong = None if np.array_equal(mount, recording.T_base_sensor) else mount
-        truth = happening.truth(static, mover, T_world_base, T_base_sensor=wrong)
+        truth = happening.truth(static, mover, T_world_base, T_base_sensor=wrong, thing=thing)
         made = Simulation(scene, recording, truth)
     rest(1.0)
     return made
@@ -143,8 +143,10 @@ def _with_images(world: World, recording: Recording, truth: Truth) -> Simulation
     return Simulation(scene, recording, truth, photographs, photographs.truth())
 
 
-def _record(happening: Episode) -> tuple[Recording, NDArray[np.int32]]:
-    """The recording of a planar laser, and the mover (M,) that reflected each beam."""
+def _record(
+    happening: Episode,
+) -> tuple[Recording, NDArray[np.int32], NDArray[np.int32] | None]:
+    """The recording of a planar laser, and the mover and thing (M,) that reflected each beam."""
     scene, motion, walls = happening.scene, happening.motion, happening.walls
     o, T = scene.laser, len(motion.robot)
     sensor = np.arange(T, dtype=np.int32) % o.count
@@ -173,7 +175,22 @@ def _record(happening: Episode) -> tuple[Recording, NDArray[np.int32]]:
         source=happening.source(_described(o, angles)),
         beam_time=np.tile(Sweep.of(o).beam_times(o.beams), T) if o.sweep_time > 0 else None,
     )
-    return recording, np.where(hit, exact.mover, np.int32(-1)).ravel()
+    mover = np.where(hit, exact.mover, np.int32(-1)).ravel()
+    return recording, mover, _find_standing_things(exact, hit, happening)
+
+
+def _find_standing_things(
+    exact: Returns, hit: NDArray[np.bool_], happening: Episode
+) -> NDArray[np.int32] | None:
+    """(M,) index of the movable object, standing still, that each beam (T, n) hit; -1: none."""
+    if not happening.has_standing_things:
+        return None
+    scene, still_thing = happening.scene, happening.motion.still_thing
+    first = len(scene.walls) + len(scene.glass)
+    of_wall = np.full(len(happening.walls), -1, np.int32)
+    of_wall[first : first + len(still_thing)] = still_thing
+    stands = hit & (exact.mover == -1) & (exact.wall >= 0)
+    return np.where(stands, of_wall[exact.wall], np.int32(-1)).ravel()
 
 
 def _mounts(o: LaserOptions, pose: tuple[float, float, float]) -> Float:

@@ -23,9 +23,10 @@ _STANDING, _MOVING, _POSE = "standing.npz", "moving.npz", "moving_pose.npy"
 _CAMERAS = "T_world_camera.npy"
 _SCENE = "scene.json"
 _ARRAYS = ("static", "mover", "T_world_base", "walls", "movers")
-_PER_BEAM = ("static", "mover")
+_PER_BEAM = ("static", "mover", "thing")
 _LASTING = "lasting"  # only where there are any
 _MOUNT = "T_base_sensor"  # only where the recorder is wrong about it
+_THING = "thing"  # only where movable objects stand still
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +47,8 @@ class Truth:
             height of each in metres, null where undefined.
         lasting: (K, 4) faces of moved or added objects, at the end.
         T_base_sensor: (S, 3, 3) true poses of the sensors where the recording has others.
+        thing: (M,) int32, index of the movable object that reflected the beam while it stands still
+            throughout; -1: none. None where there is no such object.
     """
 
     static: NDArray[np.bool_]
@@ -56,6 +59,7 @@ class Truth:
     scene: dict[str, Any]
     lasting: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 4)))
     T_base_sensor: NDArray[np.float64] | None = None
+    thing: NDArray[np.int32] | None = None
 
 
 def write_truth(truth: Truth, stamp_ns: NDArray[np.int64], folder: Path) -> None:
@@ -63,7 +67,7 @@ def write_truth(truth: Truth, stamp_ns: NDArray[np.int64], folder: Path) -> None
     inside = folder / FOLDER
     inside.mkdir()
     optional = [_LASTING] if len(truth.lasting) else []
-    optional += [] if truth.T_base_sensor is None else [_MOUNT]
+    optional += [name for name in (_MOUNT, _THING) if getattr(truth, name) is not None]
     for name in (*_ARRAYS, *optional):
         # per-beam arrays may be larger than memory
         write = write_npy if name in _PER_BEAM else np.save
@@ -79,7 +83,7 @@ def load_truth(path: str | Path) -> Truth:
         InputError: there is none, or it is damaged.
     """
     folder = _find_folder(path, _SCENE, "truth", "")
-    optional = [name for name in (_LASTING, _MOUNT) if (folder / f"{name}.npy").exists()]
+    optional = [name for name in (_LASTING, _MOUNT, _THING) if (folder / f"{name}.npy").exists()]
     names = (*_ARRAYS, *optional)
     try:
         arrays = {name: np.array(open_npy(folder / f"{name}.npy")) for name in names}

@@ -58,9 +58,14 @@ def make_parts(loop: Loop, heights: HeightOptions) -> list[Part]:
 
 def trace_loops(walls: Sequence[Segment]) -> tuple[list[Loop], list[Segment]]:
     """The closed outlines of objects in a plan, and the remaining lines."""
-    traced = [(chain, _loop(chain)) for chain in _chains(walls)]
+    traced = list(trace_chains(walls))
     lines = [segment for chain, loop in traced if loop is None for segment in chain]
     return [loop for _, loop in traced if loop is not None], lines
+
+
+def trace_chains(walls: Sequence[Segment]) -> Iterator[tuple[list[Segment], Loop | None]]:
+    """The chains of a plan in order, each with the outline that it closes, if it closes one."""
+    return ((chain, _loop(chain)) for chain in _chains(walls))
 
 
 def _chains(walls: Sequence[Segment]) -> Iterator[list[Segment]]:
@@ -100,13 +105,15 @@ def _loop(chain: list[Segment]) -> Loop | None:
 
 _TALL = (1.7, 0.09)  # m, mean and standard deviation of the height of people
 _MAX_TALL = 2.0  # m
+STANDING = -10  # and below: in place of a mover's number, that of an object that never moves
 _THIN = 0.02  # m, thickness of faces that are not closed outlines
 
 
 class MoverSolids:
     """Solids of the people, doors, vehicles and movable objects of a scene.
 
-    Those that never moved have no mover number.
+    Those that never moved have no mover number: -1, or `STANDING` less the index of the movable
+    object.
 
     Args:
         scene: the world.
@@ -138,6 +145,8 @@ class MoverSolids:
             parts += [(q, person, part) for part in figure(half, self.tall[person])]
         for number, kind in enumerate(motion.kinds[persons:], start=persons):
             mover = number if motion.moved[number] else -1
+            if mover < 0 and kind == "thing":
+                mover = STANDING - (number - motion.kinds.index("thing"))
             own = _parts_of(scene, motion, number, kind)
             parts += [(Q + number - persons, mover, part) for part in own]
             self.tall[number] = max(part.z[1] for part in own)

@@ -56,7 +56,7 @@ def write_simulation(
             _write_carmen(simulation, work / CARMEN_LOG)
             write_truth(simulation.truth, simulation.recording.stamp_ns, work)
         else:
-            _write_folder(simulation, work)
+            write_folder(simulation, work)
 
 
 def write_rig(rig: RigSimulation, path: str | Path, *, overwrite: bool = False) -> None:
@@ -71,11 +71,11 @@ def write_rig(rig: RigSimulation, path: str | Path, *, overwrite: bool = False) 
     with atomic_folder(Path(path), RIG_MARK, overwrite) as work:
         for name, one in zip(RIG_FOLDERS, (rig.horizontal, rig.tilting), strict=True):
             (work / name).mkdir()
-            _write_folder(one, work / name)
+            write_folder(one, work / name)
         write_npy(work / "joint_angle.npy", rig.joint_angle)
 
 
-def _write_folder(one: Simulation, work: Path) -> None:
+def write_folder(one: Simulation, work: Path) -> None:
     """A recording folder with its truth, and pictures with theirs, into an existing folder."""
     recording = one.recording
     write_truth(one.truth, recording.stamp_ns, work)

@@ -102,9 +102,9 @@ def map_window(maps: Sequence[GridMap]) -> Window:
     return extent(maps[0])
 
 
-def draw_map(occupancy: GridMap, window: Window) -> Image.Image:
-    """White free, grey unknown, black occupied; large maps are reduced to `_MAX_PIXELS`."""
-    factor = _reduction(window, occupancy.resolution)
+def draw_map(occupancy: GridMap, window: Window, max_pixels: int = _MAX_PIXELS) -> Image.Image:
+    """White free, grey unknown, black occupied; larger maps are reduced to `max_pixels`."""
+    factor = _reduction(window, occupancy.resolution, max_pixels)
     strips = iter_strips(occupancy, occupancy.p_occupied, window, np.nan, factor)
     return _with_palette(np.concatenate([reduce_levels(cells, factor) for cells in strips])[::-1])
 
@@ -195,11 +195,11 @@ def _box(occupancy: GridMap, select: Callable[[NDArray[np.float32]], Mask]) -> W
     )
 
 
-def _reduction(window: Window, resolution: float) -> int:
+def _reduction(window: Window, resolution: float, max_pixels: int = _MAX_PIXELS) -> int:
     """Number of cells along each axis that share a pixel."""
     x0, y0, x1, y1 = window
     cells = round((x1 - x0) / resolution) * round((y1 - y0) / resolution)
-    return max(1, math.ceil(math.sqrt(cells / _MAX_PIXELS)))
+    return max(1, math.ceil(math.sqrt(cells / max_pixels)))
 
 
 def iter_strips(

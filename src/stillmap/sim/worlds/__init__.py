@@ -15,6 +15,7 @@ from stillmap.sim.worlds.large import building
 from stillmap.sim.worlds.loops import rounds, ten_corridors
 from stillmap.sim.worlds.office import office, office_moved
 from stillmap.sim.worlds.street import crossing, street, street_jam, street_moved
+from stillmap.sim.worlds.wings import lookalike, two_wings
 
 _EMPTY = "-empty"
 
@@ -32,6 +33,9 @@ _WORLDS: dict[str, Callable[[], Scene]] = {
     "building": building,
     "ten-corridors": ten_corridors,
     "rounds": rounds,
+    "lookalike-1": partial(lookalike, 1),
+    "lookalike-2": partial(lookalike, 2),
+    "two-wings": two_wings,
     "office-moved": office_moved,
     "street-moved": street_moved,
     "warehouse-moved": warehouse_moved,

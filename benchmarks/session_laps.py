@@ -1,0 +1,113 @@
+"""Real recordings cut into sessions: a log into laps, a drive into pieces."""
+
+import itertools
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from unpacked import unpack
+
+import stillmap
+from stillmap.core import se2
+from stillmap.core.recording import Recording
+from stillmap.io import stillmap_folder
+from stillmap.io.trajectory import write_tum
+
+_AWAY, _BACK = 15.0, 8.0  # m from the start: a lap has been there, and ends near it
+_FAR = 200.0  # m, within which each lap is shifted
+_DAY_NS = 86_400 * 10**9
+
+
+def select_scans(recording: Recording, scans: NDArray[np.intp]) -> Recording:
+    """A recording of some scans, in order, without the poses that lie in it."""
+    beams = np.concatenate([np.arange(*_range(recording, k)) for k in scans.tolist()])
+    counts = np.diff(recording.offset)[scans]
+    time = recording.beam_time
+    return replace(
+        recording,
+        stamp_ns=recording.stamp_ns[scans],
+        offset=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        points=np.asarray(recording.points)[beams],
+        hit=np.asarray(recording.hit)[beams],
+        sensor=recording.sensor[scans],
+        T_recorded_base=None,
+        record=None,
+        T_odom_base=None if recording.T_odom_base is None else recording.T_odom_base[scans],
+        beam_time=None if time is None else np.asarray(time)[beams],
+    )
+
+
+def _range(recording: Recording, scan: int) -> tuple[int, int]:
+    part = recording.beams_of(scan)
+    return part.start, part.stop
+
+
+def find_laps(reference: NDArray[np.float64]) -> list[float]:
+    """Times at which a lap ends and the next begins: nearest to the start, after having been away.
+
+    Args:
+        reference: (N, 4) t, x, y, theta.
+    """
+    far = np.hypot(*(reference[:, 1:3] - reference[0, 1:3]).T)
+    cuts, is_away, best = [], False, -1
+    for k, d in enumerate(far.tolist()):
+        if d > _AWAY:
+            if best >= 0:
+                cuts.append(float(reference[best, 0]))
+            is_away, best = True, -1
+        elif is_away and d < _BACK and (best < 0 or d < far[best]):
+            best = k
+    return cuts
+
+
+def write_laps(log: Path, reference: Path, folder: Path, rng: np.random.Generator) -> list[Path]:
+    """Cut a log into laps, each with odometry that is turned and shifted at random.
+
+    Stamps stay as they are, by which known relations name poses.
+    """
+    recording = stillmap.read(log)
+    cuts = find_laps(np.loadtxt(reference))
+    seconds = recording.stamp_ns / 1e9
+    which = np.searchsorted(cuts, seconds, side="right")
+    laps = []
+    for lap in range(len(cuts) + 1):
+        part = select_scans(recording, np.flatnonzero(which == lap))
+        T = se2.matrix(*rng.uniform(-_FAR, _FAR, 2), rng.uniform(-np.pi, np.pi))
+        if part.T_odom_base is not None:
+            part = replace(part, T_odom_base=T @ part.T_odom_base)
+        laps.append(folder / f"lap-{lap + 1}")
+        stillmap_folder.write(part, laps[-1])
+    return laps
+
+
+def write_pieces(pack: Path, folder: Path, count: int) -> list[Path]:
+    """Cut a packed drive into pieces without a common sweep, a day apart, without poses.
+
+    Beside the pieces lies the truth about them, as of simulated sessions: the poses of the pack.
+    """
+    whole = stillmap.read(unpack(pack, folder / "whole")).without_odometry()
+    with np.load(pack) as arrays:
+        poses = np.asarray(arrays["pose"], np.float64)
+    bounds = np.linspace(0, whole.n_scans, count + 1).astype(int)
+    pieces, about = [], []
+    for k, (first, last) in enumerate(itertools.pairwise(bounds.tolist())):
+        part = select_scans(whole, np.arange(first, last))
+        part = replace(part, stamp_ns=part.stamp_ns + k * _DAY_NS)
+        pieces.append(folder / f"piece-{k + 1}")
+        stillmap_folder.write(part, pieces[-1])
+        (pieces[-1] / "truth").mkdir()
+        own = poses[first:last]
+        write_tum(pieces[-1] / "truth/trajectory.tum", part.stamp_ns, own)
+        about.append({"name": pieces[-1].name, "place": 0, "T_world_session": own[0].tolist()})
+    _write_truth(folder, about)
+    return pieces
+
+
+def _write_truth(folder: Path, sessions: Sequence[dict]) -> None:
+    n = len(sessions)
+    unknown = [[1.0] * n] * n  # how much they overlap is not known
+    tree = {"sessions": sessions, "objects": [], "changes": [], "overlap": unknown}
+    (folder / "sessions.json").write_text(json.dumps(tree) + "\n", encoding="utf-8")

@@ -1,0 +1,123 @@
+"""`stillmap merge` and `stillmap map` as users call them, timed, and what became of sessions."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from stillmap.core.errors import InputError
+from stillmap.core.se2 import inverse
+from stillmap.eval.session_poses import PoseScores, read_sessions, score_poses
+from stillmap.results.reader import read_grid
+from stillmap.sim.session_truth import load_session_truth
+
+REFUSED = 2  # exit status: fewer than two sessions could be placed
+
+
+@dataclass(frozen=True)
+class Merged:
+    """A merge: its folder, exit status, wall-clock and CPU seconds, and its last words."""
+
+    place: Path
+    status: int
+    seconds: float
+    cpu: float
+    words: str
+
+
+def call(program: Sequence[str], *words: object) -> Merged:
+    """Run a command with -o as its last word but one.
+
+    Raises:
+        RuntimeError: a defect: a status other than 0 and 2.
+    """
+    place = Path(str(words[-1]))
+    place.parent.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(place, ignore_errors=True)
+    before, started = os.times(), time.perf_counter()
+    done = subprocess.run(
+        [*program, *map(str, words)], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
+    seconds, after = time.perf_counter() - started, os.times()
+    cpu = after.children_user + after.children_system
+    cpu -= before.children_user + before.children_system
+    last = done.stderr.strip().splitlines()[-1:] or [""]
+    if done.returncode not in (0, REFUSED):
+        raise RuntimeError(f"{' '.join(map(str, words))}: {done.returncode}\n{done.stderr}")
+    return Merged(place, done.returncode, seconds, cpu, last[0])
+
+
+def merge(program: Sequence[str], sessions: Sequence[Path], place: Path) -> Merged:
+    """`stillmap merge SESSION... -o PLACE`."""
+    return call(program, "merge", *sessions, "-o", place)
+
+
+def build_map(program: Sequence[str], session: Path, result: Path) -> Merged:
+    """`stillmap map SESSION -o RESULT`."""
+    return call(program, "map", session, "-o", result)
+
+
+def default_program() -> list[str]:
+    return [sys.executable, "-m", "stillmap"]
+
+
+def poses_of(merged: Merged, truth_folder: Path) -> list[PoseScores]:
+    """The scores of the poses of all sessions; none where the whole merge was refused."""
+    if merged.status == REFUSED:
+        return []
+    truth = load_session_truth(truth_folder)
+    try:
+        return score_poses(read_sessions(merged.place, truth), truth)
+    except InputError:
+        return []
+
+
+def folder_bytes(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+def known_m2(place: Path) -> float:
+    """The area of the map of which anything is known."""
+    grid = read_grid(place)
+    return float(np.count_nonzero(~np.isnan(grid.p_occupied))) * grid.resolution**2
+
+
+def largest_difference(one: Path, other: Path) -> float:
+    """m, between the poses of two places, in the frame of the first session of each."""
+    ours, theirs = (_poses(place) for place in (one, other))
+    common = [name for name in ours if name in theirs]
+    a, b = (inverse(poses[common[0]][0]) for poses in (ours, theirs))
+    return max(
+        float(np.linalg.norm((a @ ours[name] - b @ theirs[name])[:, :2, 2], axis=1).max())
+        for name in common
+    )
+
+
+def _poses(place: Path) -> dict[str, np.ndarray]:
+    from stillmap.eval.readers import read_trajectory
+
+    names = [o["name"] for o in json.loads((place / "sessions.json").read_text()) if o["accepted"]]
+    keep = np.array([0, 1, 3])
+    read = {name: read_trajectory(place / f"sessions/{name}/trajectory.tum") for name in names}
+    return {name: one.poses[:, keep[:, None], keep] for name, one in read.items()}
+
+
+def labels_f1(one: Path, other: Path) -> float:
+    """F1 of "dynamic" of the labels of one place against those of another."""
+    both = both_or_either = 0
+    names = [o["name"] for o in json.loads((one / "sessions.json").read_text()) if o["accepted"]]
+    for name in names:
+        files = [place / f"sessions/{name}/beams/p_static.npy" for place in (one, other)]
+        if not files[1].exists():
+            continue
+        a, b = (np.load(file, mmap_mode="r") < 0.5 for file in files)
+        both += 2 * int((a & b).sum())
+        both_or_either += int(a.sum()) + int(b.sum())
+    return both / both_or_either if both_or_either else float("nan")

@@ -1,0 +1,296 @@
+"""`stillmap merge` on sessions of one place: alignment, changes, growth, laps and pieces.
+
+python benchmarks/sessions.py alignment --data DIR [--seeds 3] [--lasers FOLDER]
+python benchmarks/sessions.py labels --data DIR [--worlds office hall] [--seeds 3]
+    [--people N]
+python benchmarks/sessions.py growth --data DIR [--world office] [--sessions 32]
+python benchmarks/sessions.py laps LOG.clf.gz --data DIR
+python benchmarks/sessions.py drive PACK.npz --data DIR [--pieces 3]
+
+alignment: pairs of simulated sessions from random starts, by how much of the second one's hits lie
+in what the first one saw, and pairs that have nothing in common; --lasers: also two logs of
+different buildings, NAME.clf.gz, in pairs.
+labels: five sessions of a place: cells that changed, dates, ghosts and walls; the single sessions
+beside it.
+growth: one session after the other is added to the place; at 2, 4, 8 ... also all at once.
+laps: a log with NAME.reference.txt and NAME.relations beside it, cut into laps that are turned and
+shifted at random, against the uncut run.
+drive: packed sweeps of a street, cut into pieces without a common sweep.
+
+Simulated sessions are kept in DIR and used again; so is nothing else. Times are wall-clock.
+"""
+
+import argparse
+import itertools
+import json
+import os
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import session_merging as merging
+from session_laps import write_laps, write_pieces
+from session_sets import PairSet, prepare_days, prepare_pairs
+from tables import markdown
+
+from stillmap.eval.readers import read_planar_trajectory, read_relations
+from stillmap.eval.relations import compute_relation_errors
+from stillmap.eval.session_poses import PoseScores
+from stillmap.eval.sessions import score_place
+
+_STRANGERS = (("aces", "fr101"), ("fr101", "edmonton"), ("aces", "seattle"))
+_LAP_SEED = 4
+
+Done = tuple[merging.Merged, PoseScores | None]  # a pair
+
+
+def main() -> None:
+    args = _parser().parse_args()
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    args.data.mkdir(parents=True, exist_ok=True)
+    print(args.run(args), flush=True)
+
+
+def _parser() -> argparse.ArgumentParser:
+    p = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    commands = p.add_subparsers(required=True)
+    for name, run in (
+        ("alignment", align_pairs),
+        ("labels", score_labels),
+        ("growth", grow),
+        ("laps", merge_laps),
+        ("drive", merge_drive),
+    ):
+        one = commands.add_parser(name)
+        one.set_defaults(run=run)
+        one.add_argument("--data", type=Path, required=True, help="folder for sessions and places")
+        one.add_argument("--program", nargs="+", default=merging.default_program())
+        if name in ("alignment", "labels"):
+            one.add_argument("--seeds", type=int, default=3)
+        if name == "alignment":
+            one.add_argument("--lasers", type=Path)
+        if name == "labels":
+            one.add_argument("--worlds", nargs="+", default=["office", "hall"])
+            one.add_argument("--sessions", type=int, default=5)
+            one.add_argument("--people", type=int, help="in each session (default: the world's)")
+        if name == "growth":
+            one.add_argument("--world", default="office")
+            one.add_argument("--sessions", type=int, default=32)
+            one.add_argument("--scans", type=int)
+        if name == "laps":
+            one.add_argument("log", type=Path)
+        if name == "drive":
+            one.add_argument("pack", type=Path)
+            one.add_argument("--pieces", type=int, default=3)
+    return p
+
+
+def align_pairs(args: argparse.Namespace) -> str:
+    """A line per class of overlap and per negative."""
+    rows: dict[str, list[Done]] = {}
+    for pair in prepare_pairs(args.data, range(args.seeds)):
+        rows.setdefault(pair.kind, []).append(_align(pair, args))
+    for one, other in _STRANGERS if args.lasers else ():
+        logs = [args.lasers / f"{name}.clf.gz" for name in (one, other)]
+        merged = merging.merge(args.program, logs, args.data / "places/strangers")
+        rows.setdefault("other buildings", []).append((merged, None))
+    titles = ["overlap", "pairs", "right", "coarse", "wrong", "refused"]
+    titles += ["median m (max)", "median deg (max)", "seam m (max)", "s (max)"]
+    return markdown(titles, [_alignment_row(kind, done) for kind, done in rows.items()])
+
+
+def _align(pair: PairSet, args: argparse.Namespace) -> Done:
+    sessions = [pair.folder / f"session-{k}" for k in (1, 2)]
+    place = args.data / "places" / pair.folder.name
+    merged = merging.merge(args.program, sessions, place)
+    scores = merging.poses_of(merged, pair.folder)
+    shutil.rmtree(place, ignore_errors=True)
+    return merged, scores[1] if len(scores) > 1 else None
+
+
+def _alignment_row(
+    kind: str, done: Sequence[tuple[merging.Merged, PoseScores | None]]
+) -> list[str]:
+    verdicts = [_verdict(merged, scores) for merged, scores in done]
+    placed = [s for _, s in done if s is not None and np.isfinite(s.translation)]
+    counts = [str(verdicts.count(v)) for v in ("right", "coarse", "wrong", "refused")]
+    return [
+        kind,
+        str(len(done)),
+        *counts,
+        _median_and_max([s.translation for s in placed], ".3f"),
+        _median_and_max([s.rotation for s in placed], ".3f"),
+        _median_and_max([s.median_seam for s in placed if np.isfinite(s.median_seam)], ".3f"),
+        _median_and_max([merged.seconds for merged, _ in done], ".1f"),
+    ]
+
+
+def _verdict(merged: merging.Merged, scores: PoseScores | None) -> str:
+    """What became of the second session; without scores: of a pair of strangers."""
+    if scores is None:
+        return "refused" if merged.status == merging.REFUSED else "wrong"
+    return "refused" if scores.verdict.startswith("refused") else scores.verdict
+
+
+def _median_and_max(values: Sequence[float], form: str) -> str:
+    if not values:
+        return "-"
+    return f"{np.median(values):{form}} ({max(values):{form}})"
+
+
+def score_labels(args: argparse.Namespace) -> str:
+    """A line per world and seed."""
+    lines = []
+    for world, seed in itertools.product(args.worlds, range(1, args.seeds + 1)):
+        days = prepare_days(args.data, world, args.sessions, seed, people=args.people)
+        sessions = [days / f"session-{k + 1}" for k in range(args.sessions)]
+        singles = []
+        for session in sessions:
+            result = args.data / "singles" / days.name / session.name
+            if not (result / "map.npz").exists():
+                merging.build_map(args.program, session, result)
+            singles.append(result)
+        merged = merging.merge(args.program, sessions, args.data / "places" / days.name)
+        if merged.status == merging.REFUSED:
+            lines.append([world, str(seed), "refused", *["-"] * 9])
+            continue
+        lines.append(_labels_row(world, seed, merged, days, singles))
+    titles = ["world", "seed", "right / all", "max m", "F1 changed", "precision", "recall"]
+    titles += ["dates right", "spurious", "walls kept", "ghosts (best single)", "s"]
+    return markdown(titles, lines)
+
+
+def _labels_row(
+    world: str, seed: int, merged: merging.Merged, days: Path, singles: Sequence[Path]
+) -> list[str]:
+    s = score_place(merged.place, days, singles)
+    own, *others = s.maps
+    return [
+        world,
+        str(seed),
+        f"{s.right} / {len(s.sessions)}",
+        f"{np.nanmax([one.max_distance for one in s.sessions]):.3f}",
+        *(f"{v:.4f}" for v in (s.changes.f1, s.changes.precision, s.changes.recall)),
+        f"{s.changes.dates_right:.3f} of {s.changes.events_found}/{s.changes.events}",
+        f"{s.changes.spurious} of {s.changes.changes}",
+        f"{own.walls_kept:.4f}",
+        f"{own.avoidable_ghosts} ({min(one.avoidable_ghosts for one in others)})",
+        f"{merged.seconds:.1f}",
+    ]
+
+
+def grow(args: argparse.Namespace) -> str:
+    """A line per session that is added; times, bytes, and how it agrees with all at once."""
+    days = prepare_days(args.data, args.world, args.sessions, 1, args.scans)
+    sessions = [days / f"session-{k + 1}" for k in range(args.sessions)]
+    work = args.data / "places" / f"growth-{days.name}"
+    shutil.rmtree(work, ignore_errors=True)
+    hours, lines, place = _hours(sessions[0]), [], sessions[0]
+    for k in range(1, args.sessions):
+        hours += _hours(sessions[k])
+        merged = merging.merge(args.program, [place, sessions[k]], work / f"place-{k + 1}")
+        if merged.status == merging.REFUSED:
+            lines.append([str(k + 1), "refused: " + merged.words, *["-"] * 7])
+            continue
+        lines.append(_growth_row(k + 1, merged, hours, sessions, work, args))
+        if place.parent == work:
+            shutil.rmtree(place)
+        place = merged.place
+    titles = ["sessions", "s", "CPU s", "MB", "kB per m2", "MB per session hour", "at once, s"]
+    return markdown([*titles, "poses differ, m", "labels F1"], lines)
+
+
+def _growth_row(
+    count: int,
+    merged: merging.Merged,
+    hours: float,
+    sessions: Sequence[Path],
+    work: Path,
+    args: argparse.Namespace,
+) -> list[str]:
+    size = merging.folder_bytes(merged.place)
+    line = [str(count), f"{merged.seconds:.1f}", f"{merged.cpu:.1f}", f"{size / 1e6:.2f}"]
+    line += [f"{size / 1e3 / merging.known_m2(merged.place):.2f}", f"{size / 1e6 / hours:.1f}"]
+    if count & (count - 1):
+        return [*line, "", "", ""]
+    at_once = merging.merge(args.program, sessions[:count], work / "at-once")
+    if at_once.status == merging.REFUSED:
+        return [*line, "refused", "-", "-"]
+    differ = merging.largest_difference(merged.place, at_once.place)
+    f1 = merging.labels_f1(merged.place, at_once.place)
+    return [*line, f"{at_once.seconds:.1f}", f"{differ:.4f}", f"{f1:.4f}"]
+
+
+def _hours(session: Path) -> float:
+    stamps = np.load(session / "stamp_ns.npy", mmap_mode="r")
+    return float(stamps[-1] - stamps[0]) / 3.6e12
+
+
+def merge_laps(args: argparse.Namespace) -> str:
+    """The uncut run and the merged laps, by their errors against known relations."""
+    name = args.log.name.removesuffix(".clf.gz")
+    folder = args.data / f"laps-{name}"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    reference = args.log.with_name(f"{name}.reference.txt")
+    laps = write_laps(args.log, reference, folder, np.random.default_rng(_LAP_SEED))
+    uncut = merging.build_map(args.program, args.log, folder / "uncut")
+    merged = merging.merge(args.program, laps, folder / "place")
+    lines = []
+    for what, done in (("uncut", uncut), (f"{len(laps)} laps merged", merged)):
+        if done.status == merging.REFUSED:
+            lines.append([what, "refused", *["-"] * 6])
+            continue
+        placed = f"{_accepted(done.place)} of {len(laps)}" if done is merged else "-"
+        for relations in (f"{name}.exact.relations", f"{name}.relations"):
+            if (path := args.log.with_name(relations)).exists():
+                row = _relation_row(done.place / "trajectory.tum", path)
+                lines.append([what, relations, placed, *row, f"{done.seconds:.0f}"])
+    titles = ["run", "relations", "laps placed", "used", "trans m (median)", "rot deg"]
+    return markdown([*titles, "squared m2", "s"], lines)
+
+
+def _accepted(place: Path) -> int:
+    return sum(one["accepted"] for one in json.loads((place / "sessions.json").read_text()))
+
+
+def _relation_row(trajectory: Path, relations: Path) -> list[str]:
+    errors = compute_relation_errors(
+        read_planar_trajectory(trajectory), read_relations(relations), None, 0.1, False
+    )
+    t = errors.translation
+    return [
+        f"{errors.used} of {errors.relations}",
+        f"{t.mean:.4f} ({t.median:.4f})",
+        f"{errors.rotation.mean:.3f}",
+        f"{t.squared_mean:.4f}",
+    ]
+
+
+def merge_drive(args: argparse.Namespace) -> str:
+    """A line per piece of a drive."""
+    folder = args.data / f"pieces-{args.pack.stem}-{args.pieces}"
+    shutil.rmtree(folder, ignore_errors=True)
+    pieces = write_pieces(args.pack, folder, args.pieces)
+    merged = merging.merge(args.program, pieces, folder / "place")
+    scores = merging.poses_of(merged, folder)
+    if not scores:
+        return f"refused: {merged.words}"
+    lines = [
+        [
+            one.name,
+            one.verdict,
+            *(f"{v:.3f}" for v in (one.translation, one.rotation, one.mean_distance)),
+            f"{one.max_distance:.3f}",
+        ]
+        for one in scores
+    ]
+    titles = ["piece", "verdict", "off by m", "deg", "poses mean m", "max m"]
+    return markdown(titles, lines) + f"\n{merged.seconds:.0f} s"
+
+
+if __name__ == "__main__":
+    main()

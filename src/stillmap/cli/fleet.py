@@ -1,0 +1,166 @@
+"""`stillmap fleet`: many recordings mapped, and merged per place."""
+
+import argparse
+import json
+import os
+import shlex
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from stillmap.cli.arguments import add_read_flags, read_changes
+from stillmap.cli.config import add_option_flags, options_from_args
+from stillmap.cli.console import fail, print_json, say, show_tasks
+from stillmap.cli.map import add_map_flags, add_method_flags, option_changes
+from stillmap.core.errors import InputError
+
+if TYPE_CHECKING:
+    from stillmap.fleet import Fleet, Request
+    from stillmap.fleet.manifest import Entry
+    from stillmap.pipeline.options import Options
+
+EXIT_SOME_FAILED = 3
+_ALL = "all"  # the place of --merge
+
+DESCRIPTION = (
+    "Map many recordings, and merge those of one place. The results lie in DIR, with a page about "
+    "all of them, fleet.html. The same command goes on after an interruption, and maps only what "
+    "is new or has changed."
+)
+EPILOG = """examples:
+  stillmap fleet monday.bag tuesday.bag -o out --merge
+  stillmap fleet recordings -o out --jobs 4
+  stillmap fleet 'logs/*.clf.gz' -o out --resolution 0.1
+  stillmap fleet --manifest robots.csv -o out --json
+  stillmap fleet --manifest robots.csv -o s3://maps/today --scheduler tcp://head:8786
+
+manifest: CSV with the heading input,place, or JSON: [{"input": ..., "place": ...}, ...]
+
+exit status: 0 all were mapped; 3 some failed, each is named; 2 the call is at fault
+"""
+
+
+def add_arguments(p: argparse.ArgumentParser) -> None:
+    """Add the flags and arguments."""
+    p.add_argument(
+        "inputs",
+        metavar="INPUT",
+        nargs="*",
+        help="a recording, a folder of recordings, a pattern in quotes; s3://BUCKET/... likewise",
+    )
+    p.add_argument(
+        "-o", "--output", metavar="DIR", required=True, help="folder or s3:// URL of all results"
+    )
+    p.add_argument(
+        "--manifest", metavar="FILE", help="list of recordings, each with its place: CSV or JSON"
+    )
+    p.add_argument("--merge", action="store_true", help="all INPUTs are of one place: merge them")
+    p.add_argument(
+        "--jobs", metavar="N", type=int, help="recordings at once (default: one per processor)"
+    )
+    p.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        default="",
+        help="run on the workers of this Dask scheduler, which share DIR, instead of here",
+    )
+    p.add_argument(
+        "--threads", metavar="N", type=int, default=1, help="of each recording (default: 1)"
+    )
+    p.add_argument("--json", action="store_true", help="the content of fleet.json on stdout")
+    p.add_argument("--quiet", action="store_true", help="no progress, no summary")
+    add_method_flags(p.add_argument_group("method"))
+    add_map_flags(p.add_argument_group("map"))
+    add_read_flags(p)
+    add_option_flags(p)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Map the recordings."""
+    from stillmap.fleet import Reporter, run_fleet
+
+    request = _read_request(args)
+    with _explain_interruption(args), show_tasks(args.quiet) as progress:
+        report = Reporter(_ignore if args.quiet else say, fail, progress)
+        fleet = run_fleet(request, report)
+    if not args.quiet:
+        _print_summary(fleet, args.output)
+    if args.json:
+        print_json(fleet.to_list())
+    return EXIT_SOME_FAILED if fleet.failed else 0
+
+
+def _ignore(line: str) -> None:
+    """Drop a line."""
+
+
+def _read_request(args: argparse.Namespace) -> "Request":
+    from stillmap.core.parallel import resolve_threads
+    from stillmap.fleet import Request, Settings
+
+    if args.poses not in (None, "recording"):
+        raise InputError("--poses FILE is for one recording", hint="--poses recording is possible")
+    if args.jobs is not None and not 1 <= args.jobs <= 1024:
+        raise InputError(f"--jobs must be 1 to 1024, got {args.jobs}")
+    if args.jobs is not None and args.scheduler:
+        raise InputError("--jobs and --scheduler exclude each other")
+    args.tilting_topic = None  # a flag of `map` alone
+    options = options_from_args(args, read_changes(args), option_changes(args))
+    return Request(
+        entries=_read_entries(args),
+        output=args.output,
+        settings=Settings(_changed_options(options), not args.no_odometry, bool(args.poses)),
+        resolution=options.slam.resolution,
+        jobs=args.jobs or resolve_threads(0),
+        scheduler=args.scheduler,
+    )
+
+
+def _read_entries(args: argparse.Namespace) -> "list[Entry]":
+    """What was named on the command line and in the manifest."""
+    from stillmap.fleet.inputs import entries_of
+    from stillmap.fleet.manifest import read_manifest
+
+    if not args.inputs and not args.manifest:
+        raise InputError("names no recording", hint="give INPUTs or --manifest FILE")
+    if args.merge and args.manifest:
+        raise InputError("--merge is for INPUTs", hint="the manifest names the place of each")
+    entries = [] if args.manifest is None else read_manifest(Path(args.manifest))
+    return [*entries, *entries_of(args.inputs, _ALL if args.merge else None)]
+
+
+def _changed_options(options: "Options") -> tuple[tuple[str, str], ...]:
+    """Name and JSON value of every option that is not the default."""
+    from stillmap.core.config import iter_options
+
+    changed = []
+    for one in iter_options(options):
+        value = one.value
+        if one.name == "read.cameras" and value is not None:
+            value = os.path.abspath(value)
+        if value != one.default:
+            changed.append((one.name, json.dumps(value, ensure_ascii=False)))
+    return tuple(changed)
+
+
+@contextmanager
+def _explain_interruption(args: argparse.Namespace) -> Iterator[None]:
+    """Say after an interruption how to go on."""
+    try:
+        yield
+    except (KeyboardInterrupt, SystemExit):
+        if not args.quiet:
+            say(f"continue with the same command: {shlex.join(['stillmap', *args.words])}")
+        raise
+
+
+def _print_summary(fleet: "Fleet", output: str) -> None:
+    done = sum(job.is_done for job in fleet.jobs)
+    lines = [f"mapped {done} of {len(fleet.jobs)} recordings"]
+    if fleet.places:
+        merged = sum(place.is_done for place in fleet.places)
+        lines.append(f"merged {merged} of {len(fleet.places)} places")
+    lines.append(f"wrote {output}: open {output.rstrip('/')}/fleet.html")
+    for line in lines:
+        say(line)

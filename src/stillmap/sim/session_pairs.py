@@ -1,0 +1,131 @@
+"""Pairs of sessions made on purpose: with a given overlap, in two wings, in two buildings."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from stillmap.core.errors import InputError
+from stillmap.sim.scene import Scene
+from stillmap.sim.session_overlap import compute_overlap, observe
+from stillmap.sim.session_routes import Region
+from stillmap.sim.sessions import SessionOptions, SessionPlan, plan_sessions, simulate_sessions
+from stillmap.sim.worlds import scene_by_name
+
+_STARTS, _HALVINGS = 8, 7  # of two regions, and of what they share until it is as wanted
+_APART = -0.6  # of the shorter one's length, when they share least
+_MARGIN = 6.0  # m around the route that belong to the world
+_LENGTHS = (0.35, 0.75)  # of the world's, of each region
+_SLACK = 0.02  # of the share, for what people hide
+_FAR = 1e3  # m, beyond any world
+
+
+class OverlapClass(NamedTuple):
+    """How much of the second session's hits lie in the area that the first one observed."""
+
+    name: str
+    low: float
+    high: float
+
+
+OVERLAPS = (
+    OverlapClass("10-30", 0.10, 0.30),
+    OverlapClass("30-60", 0.30, 0.60),
+    OverlapClass("60-100", 0.60, 1.00),
+)
+
+
+def plan_pair(scene: Scene, overlap: OverlapClass, seed: int = 0) -> SessionPlan:
+    """Two sessions in parts of a world, or all of it, which overlap as wanted.
+
+    Raises:
+        InputError: no two parts of the world do.
+    """
+    rng = np.random.default_rng([seed, 7])
+    for _ in range(_STARTS):
+        strips = _Strips.draw(scene, rng)
+        own = int(rng.integers(1 << 31))
+        low, high = _APART, 1.0
+        for _ in range(_HALVINGS):
+            shared = rng.uniform(0.3, 0.7) * (high - low) + low
+            options = SessionOptions(2, strips.regions(shared), odd_sensor=seed % 4 == 0)
+            try:
+                plan = plan_sessions(scene, options, own)
+                share = measure_overlap(plan)
+            except InputError:  # no room in such a region
+                break
+            fits = overlap.low + _SLACK <= share < overlap.high - _SLACK
+            if fits and overlap.low <= measure_overlap(plan, with_people=True) < overlap.high:
+                return plan
+            low, high = (shared, high) if share < overlap.low + _SLACK else (low, shared)
+    what = f"no two parts of '{scene.name}' overlap by {overlap.name} %"
+    raise InputError(what, hint="another seed, or a larger world")
+
+
+def measure_overlap(plan: SessionPlan, with_people: bool = False) -> float:
+    """Share of the hits of the second session that lie where the first one looked.
+
+    Without people, who hide some of it, it takes half the time.
+    """
+    empty = tuple(
+        dataclasses.replace(
+            scene,
+            crowd=dataclasses.replace(scene.crowd, people=0),
+        )
+        for scene in plan.scenes
+    )
+    scenes = plan.scenes if with_people else empty
+    sights = [observe(one) for one in simulate_sessions(plan._replace(scenes=scenes))]
+    return float(compute_overlap(sights, [0] * len(sights))[0, 1])
+
+
+def plan_wings(seed: int = 0, changes: Mapping[str, Any] | None = None) -> SessionPlan:
+    """Two sessions in two wings between which a door is shut; `changes` as of `scene_by_name`."""
+    scene = scene_by_name("two-wings", changes)
+    shut = tuple(door.leaf(door.closed) for door in scene.leaves)
+    scene = dataclasses.replace(scene, walls=(*scene.walls, *shut), leaves=())
+    regions = ((0.0, -_FAR, _FAR, _FAR), (-_FAR, -_FAR, -0.15, _FAR))
+    if seed % 2:
+        regions = regions[::-1]
+    return plan_sessions(scene, SessionOptions(2, regions, odd_sensor=False), seed)
+
+
+def plan_strangers(one: Scene, other: Scene, seed: int = 0) -> tuple[SessionPlan, SessionPlan]:
+    """A session each in two places that have nothing in common."""
+    options = SessionOptions(1, has_changes=False)
+    return plan_sessions(one, options, 2 * seed), plan_sessions(other, options, 2 * seed + 1)
+
+
+class _Strips(NamedTuple):
+    """Two parts of a world side by side along an axis: its middle, their lengths, their order."""
+
+    axis: int
+    middle: float
+    lengths: tuple[float, float]
+    reverse: bool
+
+    @classmethod
+    def draw(cls, scene: Scene, rng: np.random.Generator) -> "_Strips":
+        """Most often along the longer side of the world."""
+        line = np.array(scene.route, float)
+        low, size = line.min(axis=0) - _MARGIN, np.ptp(line, axis=0) + 2 * _MARGIN
+        axis = int(size.argmax()) if rng.random() < 0.7 else int(rng.integers(2))
+        lengths = rng.uniform(*_LENGTHS, 2) * size[axis]
+        middle = low[axis] + size[axis] * rng.uniform(0.4, 0.6)
+        return cls(axis, float(middle), (lengths[0], lengths[1]), bool(rng.random() < 0.5))
+
+    def regions(self, shared: float) -> tuple[Region, Region]:
+        """The two parts, when they share so much of the shorter one; negative: they are apart."""
+        half = shared * min(self.lengths) / 2
+        first = (self.middle + half - self.lengths[0], self.middle + half)
+        second = (self.middle - half, self.middle - half + self.lengths[1])
+        pair = (_strip(self.axis, *first), _strip(self.axis, *second))
+        return (pair[1], pair[0]) if self.reverse else pair
+
+
+def _strip(axis: int, low: float, high: float) -> Region:
+    """Everything between two coordinates along an axis."""
+    if axis == 0:
+        return (float(low), -_FAR, float(high), _FAR)
+    return (-_FAR, float(low), _FAR, float(high))

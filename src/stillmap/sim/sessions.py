@@ -1,0 +1,182 @@
+"""Sessions: recordings of one world on different days, between which things change."""
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from stillmap.core.errors import InputError
+from stillmap.sim.furniture import StandingObject
+from stillmap.sim.scene import Scene
+from stillmap.sim.session_layout import Layout
+from stillmap.sim.session_routes import Region, clip_region, draw_piece, draw_tour, fence
+from stillmap.sim.simulator import Simulation, simulate
+
+_SECONDS = 200.0  # of a session, unless the number of scans is given
+_SECONDS_3D = 12.0  # the same with a lidar
+_MIN_SPEED = 0.8  # m/s, of the robot indoors, so that a session shows much of the place
+_DAY = 86_400  # s
+
+
+@dataclass(frozen=True)
+class SessionOptions:
+    """What sessions have in common, and in what they differ.
+
+    Attributes:
+        count: number of sessions.
+        regions: of each session, where the robot stays, metres; None: anywhere.
+        has_changes: whether things are moved between sessions.
+        other_mounts: whether each session has the sensor mounted otherwise.
+        odd_sensor: whether one session has half the beams or a narrower field of view.
+    """
+
+    count: int
+    regions: tuple[Region | None, ...] = ()
+    has_changes: bool = True
+    other_mounts: bool = True
+    odd_sensor: bool = True
+
+
+class SessionPlan(NamedTuple):
+    """The scenes of S sessions.
+
+    Attributes:
+        name: of the world.
+        scenes: one of each session; its things are the objects that are there, in order.
+        objects: everything that may change; a scene's things are those present, in this order.
+        first_stamp_ns: (S,) when each begins.
+        seeds: (S,) of each simulation.
+    """
+
+    name: str
+    scenes: tuple[Scene, ...]
+    objects: tuple[StandingObject, ...]
+    first_stamp_ns: tuple[int, ...]
+    seeds: tuple[int, ...]
+
+    def present(self, session: int) -> list[int]:
+        """Index of the object of each thing of a session's scene."""
+        return [k for k, one in enumerate(self.objects) if one.places[session] is not None]
+
+
+def plan_sessions(scene: Scene, options: SessionOptions, seed: int = 0) -> SessionPlan:
+    """Plan the sessions of a world: what stands where, routes, sensors, times.
+
+    With one more session, the former ones stay as they are, but for the odd sensor.
+
+    Args:
+        scene: the world; its doors get a constant angle in each session.
+        options: number of sessions, and in what they differ.
+        seed: of everything, the simulations too.
+
+    Raises:
+        InputError: the world cannot be recorded in sessions, or the robot finds no room.
+    """
+    _require_plain(scene, options)
+    layout_rng, *rngs = np.random.default_rng(seed).spawn(1 + options.count)
+    odd = _draw_odd(options, seed)
+    layout = Layout(scene, layout_rng)
+    for _ in range(1, options.count):
+        layout.go_on(options.has_changes)
+    objects = layout.objects()
+    scenes, stamps = [], []
+    for session, rng in enumerate(rngs):
+        region = options.regions[session] if options.regions else None
+        region = None if region is None else clip_region(region, scene.walls)
+        base = dataclasses.replace(
+            scene,
+            walls=layout.walls,
+            leaves=(),
+            lights=(),
+            things=tuple(t for one in objects if (t := one.thing(session)) is not None),
+        )
+        scenes.append(_vary(base, options, session == odd, region, rng))
+        stamps.append((session * _DAY + int(rng.integers(0, _DAY // 3))) * 10**9)
+    seeds = tuple(int(rng.integers(1 << 31)) for rng in rngs)
+    return SessionPlan(scene.name, tuple(scenes), objects, tuple(stamps), seeds)
+
+
+def simulate_sessions(plan: SessionPlan) -> Iterator[Simulation]:
+    """Simulate one session after the other.
+
+    Each truth has `thing`: the index of the object of the plan that each beam hit, or -1.
+
+    Raises:
+        InputError: no room for the robot or the people.
+    """
+    for session, (scene, seed) in enumerate(zip(plan.scenes, plan.seeds, strict=True)):
+        made = simulate(scene, seed)
+        recording, truth = made.recording, made.truth
+        later = recording.stamp_ns + plan.first_stamp_ns[session]
+        thing = np.full(len(truth.mover), -1, np.int32) if truth.thing is None else truth.thing
+        which = np.array([*plan.present(session), -1], np.int32)  # -1 stays -1
+        yield dataclasses.replace(
+            made,
+            recording=dataclasses.replace(recording, stamp_ns=later),
+            truth=dataclasses.replace(truth, thing=which[thing]),
+        )
+
+
+def _require_plain(scene: Scene, options: SessionOptions) -> None:
+    """Refuse worlds whose things change during a recording, and what sessions do not have.
+
+    Raises:
+        InputError: such a world.
+    """
+    if options.count < 1:
+        raise InputError(f"the number of sessions must be 1 or more, got {options.count}")
+    if options.regions and len(options.regions) != options.count:
+        raise InputError("as many regions as sessions")
+    if scene.things:
+        hint = "the same world without '-moved'"
+        raise InputError(f"the things of '{scene.name}' move within a recording", hint=hint)
+    if scene.rig.tilts or scene.camera.enabled or scene.robot.pause_at is not None:
+        raise InputError("sessions have one laser or lidar, no camera and no pause")
+
+
+def _draw_odd(options: SessionOptions, seed: int) -> int | None:
+    """The session, not the first one, with another sensor."""
+    if not options.odd_sensor or options.count < 2:
+        return None
+    return int(np.random.default_rng([seed, options.count]).integers(1, options.count))
+
+
+def _vary(
+    scene: Scene,
+    options: SessionOptions,
+    odd: bool,
+    region: Region | None,
+    rng: np.random.Generator,
+) -> Scene:
+    """The scene with a route, a number of scans and a sensor of its own."""
+    is_drive = scene.robot.radius > 0.5  # a car keeps to the street
+    speed = scene.robot.speed if is_drive else max(_MIN_SPEED, scene.robot.speed)
+    seconds = _SECONDS_3D if scene.in_3d else _SECONDS
+    scans = scene.robot.scans or round(seconds * scene.scan_rate)
+    length = speed * scans / scene.scan_rate
+    route = (
+        draw_piece(scene.route, length, rng) if is_drive else draw_tour(scene, length, rng, region)
+    )
+    scene = dataclasses.replace(
+        scene,
+        route=route,
+        people_at=scene.people_at or route[:1],
+        kerbs=scene.kerbs if region is None else (*scene.kerbs, *fence(region)),
+        robot=dataclasses.replace(scene.robot, speed=speed, scans=scans),
+    )
+    x, y, yaw = rng.uniform((-0.1, -0.1, -0.4), (0.2, 0.1, 0.4)).tolist()
+    narrow = rng.random() < 0.5
+    laser, lidar = scene.laser, scene.lidar
+    if options.other_mounts:
+        laser = dataclasses.replace(laser, x=laser.x + x, y=laser.y + y, yaw=laser.yaw + yaw)
+        lidar = dataclasses.replace(lidar, x=lidar.x + x, y=lidar.y + y, yaw=lidar.yaw + yaw)
+    if odd:
+        laser = dataclasses.replace(
+            laser,
+            fov=laser.fov * (0.75 if narrow else 1.0),
+            beams=max(2, round(laser.beams * (0.75 if narrow else 0.5))),
+        )
+        lidar = dataclasses.replace(lidar, columns=max(4, lidar.columns // 2))
+    return dataclasses.replace(scene, laser=laser, lidar=lidar)

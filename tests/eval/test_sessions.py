@@ -1,0 +1,267 @@
+"""Scores of places: a perfect one is perfect, and each error shows where it belongs."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_up_place import write_place
+
+from stillmap.cli.main import main
+from stillmap.core import se2
+from stillmap.core.errors import InputError
+from stillmap.eval.session_cells import CELL, Lattice, collect_cells, count_beams, widen
+from stillmap.eval.session_changes import ChangeScores
+from stillmap.eval.sessions import PlaceScores, score_place
+from stillmap.io.stillmap_folder import read
+from stillmap.sim import scene_by_name
+from stillmap.sim.session_pairs import plan_strangers
+from stillmap.sim.session_truth import SessionTruth, load_session_truth
+from stillmap.sim.session_writer import write_sessions
+from stillmap.sim.sessions import SessionOptions, plan_sessions
+
+QUICK = {"laser": {"beams": 180}, "robot": {"scans": 300}, "crowd": {"people": 2}}
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory: pytest.TempPathFactory) -> SessionTruth:
+    """Three sessions of a corridor with six rooms."""
+    folder = tmp_path_factory.mktemp("sessions") / "days"
+    plan = plan_sessions(scene_by_name("lookalike-1", QUICK), SessionOptions(3), 5)
+    write_sessions([plan], folder)
+    return load_session_truth(folder)
+
+
+@pytest.fixture(scope="module")
+def perfect(truth: SessionTruth, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("place") / "perfect"
+    write_place(folder, truth)
+    return folder
+
+
+@pytest.fixture
+def place(perfect: Path, tmp_path: Path) -> Path:
+    """A perfect one, to be spoilt."""
+    return Path(shutil.copytree(perfect, tmp_path / "place"))
+
+
+def changes_of(scores: PlaceScores) -> ChangeScores:
+    assert scores.changes is not None
+    return scores.changes
+
+
+def edit_changes(place: Path, edit) -> None:
+    path = place / "changes.json"
+    path.write_text(json.dumps(edit(json.loads(path.read_text()))))
+
+
+def test_a_perfect_place_is_perfect(perfect: Path, truth: SessionTruth) -> None:
+    scores = score_place(perfect, truth.folder)
+    assert (scores.right, scores.wrong, scores.refused) == (3, 0, 0)
+    for one in scores.sessions:
+        assert one.max_distance < 1e-6
+        assert one.max_seam < 1e-6
+        assert one.rotation < 1e-4
+        assert one.start_translation < 1e-6
+        assert one.overlap > 0.3
+    changes = changes_of(scores)
+    assert changes.source == "boxes"
+    assert changes.cells > 100
+    assert changes.events > 5
+    assert changes.f1 > 0.98
+    assert changes.events_found == changes.events
+    assert changes.dates_right == 1.0
+    (own,) = scores.maps
+    assert own.walls_kept == 1.0
+    assert own.ghost_cells == 0
+    assert own.wall_cells > 500
+
+
+def test_the_frame_is_that_of_the_first_accepted_session(
+    truth: SessionTruth, tmp_path: Path
+) -> None:
+    write_place(tmp_path / "place", truth, refused=(0,), made_up=False)
+    (tmp_path / "place/changes.json").write_text("[]")
+    shutil.copy(_map_of(truth, tmp_path), tmp_path / "place/map.npz")
+    scores = score_place(tmp_path / "place", truth.folder)
+    assert [one.verdict for one in scores.sessions] == ["refused", "right", "right"]
+
+
+def _map_of(truth: SessionTruth, folder: Path) -> Path:
+    write_place(folder / "other", truth)
+    return folder / "other/map.npz"
+
+
+@pytest.mark.parametrize(
+    ("shift", "verdict"),
+    [
+        ((0.03, 0.0, 0.0), "right"),
+        ((0.0, 0.2, 0.0), "coarse"),
+        ((0.0, 0.0, 0.02), "coarse"),
+        ((3.0, 0.0, 0.0), "wrong"),
+        ((0.0, 0.0, np.pi), "wrong"),
+    ],
+)
+def test_a_shifted_session_is_found(truth, perfect, tmp_path, shift, verdict) -> None:
+    write_place(tmp_path / "place", truth, {1: se2.matrix(*shift)}, made_up=False)
+    for name in ("changes.json", "map.npz"):
+        shutil.copy(perfect / name, tmp_path / "place" / name)
+    scores = score_place(tmp_path / "place", truth.folder)
+    assert [one.verdict for one in scores.sessions] == ["right", verdict, "right"]
+    one = scores.sessions[1]
+    assert one.start_translation == pytest.approx(np.hypot(*shift[:2]), abs=1e-5)
+    assert one.start_rotation == pytest.approx(np.degrees(shift[2]), abs=1e-3)
+    assert one.rotation == pytest.approx(np.degrees(shift[2]), abs=1e-3)
+    if shift[2] == 0.0:
+        assert one.translation == pytest.approx(np.hypot(*shift[:2]), abs=1e-5)
+        assert one.max_distance == pytest.approx(np.hypot(*shift[:2]), abs=1e-5)
+        assert one.median_seam == pytest.approx(np.hypot(*shift[:2]), abs=1e-5)
+
+
+def test_sessions_of_another_place_must_be_refused(tmp_path: Path) -> None:
+    scenes = [scene_by_name(f"lookalike-{k}", QUICK) for k in (1, 2)]
+    write_sessions(plan_strangers(*scenes), tmp_path / "days")
+    truth = load_session_truth(tmp_path / "days")
+    write_place(tmp_path / "merged", truth)
+    write_place(tmp_path / "refused", truth, refused=(1,))
+    merged = score_place(tmp_path / "merged", truth.folder)
+    assert [one.verdict for one in merged.sessions] == ["right", "wrong"]
+    refused = score_place(tmp_path / "refused", truth.folder)
+    assert [one.verdict for one in refused.sessions] == ["right", "refused rightly"]
+
+
+def test_changes_that_were_not_found_cost_recall(place: Path, truth: SessionTruth) -> None:
+    edit_changes(place, lambda changes: changes[:0])
+    changes = changes_of(score_place(place, truth.folder))
+    assert changes.recall == 0.0
+    assert np.isnan(changes.precision)
+    assert (changes.found, changes.events_found, changes.changes) == (0, 0, 0)
+
+
+def test_changes_of_another_date_are_neither_found_nor_right(place, truth) -> None:
+    names = list(truth.names)
+
+    def later(changes):
+        for one in changes:
+            one["between"] = names[1:] if one["between"] == names[:2] else names[:2]
+        return changes
+
+    edit_changes(place, later)
+    changes = changes_of(score_place(place, truth.folder))
+    assert changes.events_found > 0
+    assert changes.dates_right < 0.3
+    assert changes.f1 < 0.8
+
+
+def test_boxes_where_nothing_changed_are_spurious(place: Path, truth: SessionTruth) -> None:
+    extra = {"kind": "gone", "box": [400.0, 400.0, 401.0, 401.0], "between": list(truth.names[:2])}
+    before = changes_of(score_place(place, truth.folder))
+    edit_changes(place, lambda changes: [*changes, {"id": 999, **extra}])
+    after = changes_of(score_place(place, truth.folder))
+    assert after.spurious == before.spurious + 1
+    assert after.f1 == before.f1
+
+
+def test_cells_of_changes_take_the_place_of_boxes(place: Path, truth: SessionTruth) -> None:
+    cells = collect_cells(truth, [0, 1, 2])
+    T = np.linalg.inv(truth.T_world_session[0])
+    ids, points = [], []
+    for number, change in enumerate(truth.changes):
+        differ = cells.surfaces[change.between[0]] != cells.surfaces[change.between[1]]
+        xy = cells.lattice.centres()[differ]
+        points.append(xy @ T[:2, :2].T + T[:2, 2])
+        ids.append(np.full(len(xy), number))
+    ids, points = np.concatenate(ids), np.concatenate(points)
+    np.savez(place / "changes.npz", change=ids, xy=points)
+    changes = changes_of(score_place(place, truth.folder))
+    assert changes.source == "cells"
+    assert changes.f1 == 1.0
+    np.savez(place / "changes.npz", change=ids, xy=points + 0.3)
+    assert changes_of(score_place(place, truth.folder)).f1 < 0.5
+
+
+def test_ghosts_and_missing_walls_show_in_the_map(place: Path, truth: SessionTruth) -> None:
+    with np.load(place / "map.npz") as file:
+        arrays = dict(file)
+    p = arrays["p_occupied"]
+    rows, columns = np.nonzero(p > 0.65)
+    middle = np.median(columns)
+    p[rows[columns < middle], columns[columns < middle]] = 0.1
+    p[5, 5] = 0.9
+    np.savez_compressed(place / "map.npz", **arrays)
+    (own,) = score_place(place, truth.folder).maps
+    assert 0.3 < own.walls_kept < 0.7
+    assert (own.ghost_cells, own.avoidable_ghosts) == (1, 1)
+
+
+def test_gone_objects_in_the_map_are_ghosts_avoidable_where_a_later_session_looked(
+    place, truth
+) -> None:
+    cells = collect_cells(truth, [0, 1, 2])
+    gone = cells.surfaces[0] & ~cells.surfaces[2] & ~widen(widen(widen(cells.surfaces[2])))
+    looked = gone & ((cells.seen[1].passes > 30) | (cells.seen[2].passes > 30))
+    with np.load(place / "map.npz") as file:
+        arrays = dict(file)
+    arrays["p_occupied"][gone] = 0.9
+    np.savez_compressed(place / "map.npz", **arrays)
+    (own,) = score_place(place, truth.folder).maps
+    assert 0 < looked.sum() <= own.avoidable_ghosts < own.ghost_cells <= gone.sum()
+
+
+def test_single_sessions_are_scored_beside(perfect: Path, truth: SessionTruth, tmp_path) -> None:
+    single = tmp_path / "out-2"
+    single.mkdir()
+    shutil.copy(perfect / "sessions/session-2/trajectory.tum", single)
+    shutil.copy(perfect / "map.npz", single)
+    own, other = score_place(perfect, truth.folder, [single]).maps
+    assert (own.name, other.name) == ("perfect", "out-2")
+    assert other.wall_cells < own.wall_cells
+    assert other.ghost_cells >= own.ghost_cells
+    shutil.copy(truth.folder / "session-1/truth/trajectory.tum", single)
+    text = (single / "trajectory.tum").read_text().replace("10000", "20000")
+    (single / "trajectory.tum").write_text(text)
+    with pytest.raises(InputError, match="no result of these sessions"):
+        score_place(perfect, truth.folder, [single])
+
+
+def test_scores_as_text_and_as_json(perfect: Path, truth: SessionTruth, capsys) -> None:
+    words = ["eval", "sessions", str(perfect), str(truth.folder)]
+    assert main(words) == 0
+    text = capsys.readouterr().out
+    assert "3: 3 right, 0 coarse, 0 wrong, 0 refused" in text
+    assert "dates right 100.0 %" in text
+    assert main([*words, "--json"]) == 0
+    scores = json.loads(capsys.readouterr().out)
+    assert [one["verdict"] for one in scores["sessions"]] == ["right"] * 3
+    assert scores["maps"][0]["walls_kept"] == 1.0
+    assert main(["eval", "sessions", str(truth.folder), str(perfect)]) == 2
+    assert "is damaged" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "error"),
+    [
+        ("sessions.json", "[", "is no JSON"),
+        ("sessions.json", '[{"name": "../x", "accepted": true}]', "is damaged"),
+        ("sessions.json", '[{"name": "monday", "accepted": true}]', "is not in"),
+        ("changes.json", '[{"kind": "gone"}]', "is damaged"),
+        ("changes.json", '{"kind": "gone"}', "is damaged"),
+    ],
+)
+def test_damaged_places_are_refused(place, truth, file, text, error) -> None:
+    (place / file).write_text(text)
+    with pytest.raises(InputError, match=error):
+        score_place(place, truth.folder)
+
+
+def test_cells_that_beams_pass_and_hit(truth: SessionTruth) -> None:
+    recording = read(truth.folder / "session-1")
+    beams = truth.beams(0)
+    lattice = Lattice.around(beams.walls.reshape(-1, 2))
+    seen = count_beams(recording, beams.T_world_base, beams.static, lattice)
+    assert seen.hits.sum() == beams.static.sum()
+    at = lattice.cells(beams.T_world_base[:, :2, 2])
+    assert (seen.passes.ravel()[at] > 0).mean() > 0.9
+    ranges = np.linalg.norm(recording.points[recording.hit], axis=1)
+    assert seen.passes.sum() == pytest.approx((ranges / CELL - 1.5).sum(), rel=0.02)

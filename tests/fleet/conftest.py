@@ -1,0 +1,161 @@
+"""Fixtures: small recordings, results made by hand, a stand-in for stillmap, S3, Dask."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stillmap.cli.main import main
+from stillmap.fleet import child
+from stillmap.sim import CrowdOptions, LaserOptions, RobotOptions, Scene, simulate, write_simulation
+from stillmap.sim.walls import box
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))  # for what the tests share
+
+from fleets import NAMES, contents, wait_until
+
+COMMAND = [sys.executable, "-m", "stillmap"]
+
+
+@pytest.fixture
+def call(capsys: pytest.CaptureFixture[str]) -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Calls stillmap within this process."""
+
+    def run(*words: object) -> subprocess.CompletedProcess[str]:
+        arguments = [str(word) for word in words]
+        return subprocess.CompletedProcess(arguments, main(arguments), *capsys.readouterr())
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def start() -> Callable[..., subprocess.Popen[str]]:
+    """Starts stillmap, which hears Ctrl-C even where the tests themselves do not."""
+
+    def popen(*words: object, **options: object) -> subprocess.Popen[str]:
+        before = signal.signal(signal.SIGINT, signal.SIG_DFL)  # a child inherits it when ignored
+        try:
+            defaults = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+            return subprocess.Popen([*COMMAND, *map(str, words)], **(defaults | options))
+        finally:
+            signal.signal(signal.SIGINT, before)
+
+    return popen
+
+
+def _record(path: Path, seed: int, scans: int) -> None:
+    scene = Scene(
+        path.name,
+        walls=(*box(0, 0, 8, 6), *box(1.5, 1.5, 0.8, 0.6), *box(-2.0, 1.8, 1.0, 0.4)),
+        route=((-2.5, -1.5), (2.5, -1.5), (2.5, 1.5)),
+        crowd=CrowdOptions(people=2),
+        laser=LaserOptions(beams=120, range_noise=0.01, max_range=7.0),
+        robot=RobotOptions(scans=scans),
+    )
+    write_simulation(simulate(scene, np.random.default_rng(seed)), path)
+
+
+@pytest.fixture(scope="session")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of three recordings: a room of 8 x 6 m, 40 scans of 120 beams each."""
+    folder = tmp_path_factory.mktemp("recordings")
+    for seed, name in enumerate(NAMES):
+        _record(folder / name, seed, 40)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def by_hand(
+    recordings: Path, tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, dict[str, bytes]]:
+    """What `stillmap map` writes for each of the recordings."""
+    folder = tmp_path_factory.mktemp("by-hand")
+    for name in NAMES:
+        words = ["map", recordings / name, "-o", folder / name, "--quiet", "--threads", "1"]
+        assert main([*map(str, words)]) == 0
+    return {name: contents(folder / name) for name in NAMES}
+
+
+@pytest.fixture
+def stand_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tasks run `stand_in.py` instead of stillmap: what it does is written in the recordings."""
+    script = Path(__file__).with_name("stand_in.py")
+    monkeypatch.setattr(child, "_STILLMAP", (sys.executable, str(script)))
+
+
+def free_port() -> int:
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return int(one.getsockname()[1])
+
+
+@pytest.fixture(scope="session")
+def s3_server() -> Iterator[str]:
+    """A real S3 server of this machine; its address."""
+    pytest.importorskip("moto")
+    pytest.importorskip("s3fs")
+    port = free_port()
+    words = [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)]
+    process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        wait_until(lambda: _answers(port))
+        yield f"http://127.0.0.1:{port}"
+    finally:
+        process.kill()
+        process.wait()
+
+
+@pytest.fixture
+def s3_environment(s3_server: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The usual variables, for the server of this machine; temporary files in `tmp_path/tmp`."""
+    (tmp_path / "tmp").mkdir()
+    for name, value in {
+        "AWS_ENDPOINT_URL": s3_server,
+        "AWS_ACCESS_KEY_ID": "robot",
+        "AWS_SECRET_ACCESS_KEY": "secret",
+        "AWS_DEFAULT_REGION": "us-east-1",
+        "AWS_EC2_METADATA_DISABLED": "true",
+        "TMPDIR": str(tmp_path / "tmp"),
+    }.items():
+        monkeypatch.setenv(name, value)
+
+
+def _answers(port: int) -> bool:
+    with socket.socket() as one:
+        return one.connect_ex(("127.0.0.1", port)) == 0
+
+
+@pytest.fixture
+def dask_cluster(tmp_path: Path) -> Iterator[tuple[str, list[int]]]:
+    """A scheduler and two workers as processes; its address and the ids of the workers."""
+    pytest.importorskip("distributed")
+    port, processes = free_port(), []
+    address = f"tcp://127.0.0.1:{port}"
+    # found from any working directory, where stillmap is not installed
+    environment = {**os.environ, "PYTHONPATH": str(Path(child.__file__).parents[2])}
+
+    def run(*words: str) -> None:
+        command = [sys.executable, "-m", "distributed.cli." + words[0], *words[1:]]
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        processes.append(
+            subprocess.Popen(
+                command, cwd=tmp_path, env=environment, start_new_session=True, **quiet
+            )
+        )
+
+    try:
+        run("dask_scheduler", "--port", str(port), "--no-dashboard", "--host", "127.0.0.1")
+        wait_until(lambda: _answers(port))
+        for _ in range(2):
+            run("dask_worker", address, "--nthreads", "1", "--no-dashboard", "--no-nanny")
+        yield address, [process.pid for process in processes[1:]]
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()

@@ -1,0 +1,165 @@
+"""From inputs and manifests to recordings with names and places."""
+
+import json
+
+import pytest
+
+from stillmap.core.errors import InputError
+from stillmap.fleet.inputs import entries_of, find_sources
+from stillmap.fleet.manifest import read_manifest
+from stillmap.fleet.urls import is_url, make_unique, short_name
+
+FLASER = "FLASER 2 1.0 1.0 0 0 0 0 0 0 1.0 host 1.0\n"
+
+
+@pytest.fixture
+def logs(tmp_path):
+    for name in ("b.log", "a.clf", "notes.txt", "sub/deep.log"):
+        path = tmp_path / "logs" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("no recording\n" if name == "notes.txt" else FLASER)
+    return tmp_path / "logs"
+
+
+def names(entries, known=None):
+    return [one.name for one in find_sources(entries, known or {})]
+
+
+def test_folder_is_expanded_one_level(logs):
+    (logs / "damaged.bag").write_text("no bag")  # is listed, and fails later, by name
+    (logs / ".hidden.log").write_text(FLASER)
+    assert names(entries_of([str(logs)], None)) == ["a", "b", "damaged"]
+
+
+def test_folder_that_is_a_recording_is_one(recordings):
+    assert names(entries_of([str(recordings / "hall")], None)) == ["hall"]
+    assert names(entries_of([str(recordings)], None)) == ["hall", "office", "yard"]
+
+
+def test_result_is_no_recording(logs):
+    result = logs / "result"
+    result.mkdir()
+    (result / "static.ply").write_text("ply\n")
+    (result / "run.json").write_text("{}")
+    assert names(entries_of([str(logs)], None)) == ["a", "b"]
+
+
+def test_pattern(logs):
+    assert names(entries_of([f"{logs}/*"], None)) == ["a", "b", "deep"]
+    assert names(entries_of([f"{logs}/?.log"], None)) == ["b"]
+
+
+def test_file_whose_name_looks_like_a_pattern(tmp_path):
+    (tmp_path / "a[1].log").write_text(FLASER)
+    assert names(entries_of([str(tmp_path / "a[1].log")], None)) == ["a_1_"]
+
+
+@pytest.mark.usefixtures("logs")
+@pytest.mark.parametrize("what", ["logs/*.bag", "empty"])
+def test_nothing_inside(tmp_path, what):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match=r"no recording|matches no file"):
+        find_sources(entries_of([str(tmp_path / what)], None), {})
+
+
+def test_each_recording_once(logs):
+    entries = entries_of([str(logs), str(logs / "a.clf"), f"{logs}/*.log"], None)
+    assert names(entries) == ["a", "b"]
+
+
+def test_names_are_unique_and_stay(tmp_path):
+    paths = [str(tmp_path / folder / "drive.clf.gz") for folder in ("x", "y", "z")]
+    assert names(entries_of(paths, None)) == ["drive", "drive-2", "drive-3"]
+    known = {paths[1]: "drive", paths[2]: "drive-2"}
+    assert names(entries_of(paths, None), known) == ["drive-3", "drive", "drive-2"]
+    # what is not asked for now keeps its name, too
+    assert names(entries_of(paths[:1], None), known) == ["drive-3"]
+    damaged = {paths[0]: "a", paths[1]: "a"}  # a journal that was changed by hand
+    assert names(entries_of(paths[:2], None), damaged) == ["a", "drive"]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("/data/intel.clf.gz", "intel"),
+        ("s3://robots/day 1/run.2.db3/", "run.2"),
+        ("/data/.bag", "bag"),
+        ("/data/../..", "recording"),
+        ("/data/größe.mcap", "größe"),
+    ],
+)
+def test_short_name(text, expected):
+    assert short_name(text) == expected
+
+
+def test_make_unique_ignores_case():
+    taken = set()
+    assert [make_unique(name, taken) for name in ("a", "A", "a-2")] == ["a", "A-2", "a-2-2"]
+
+
+@pytest.mark.parametrize("text", ["gs://a/b", "http://a", "s3:///x", "s3://a/b::simplecache"])
+def test_other_urls_are_refused(text):
+    with pytest.raises(InputError, match="only paths and s3"):
+        is_url(text)
+
+
+def write(tmp_path, name, text):
+    path = tmp_path / name
+    path.write_text(text)
+    return path
+
+
+def test_csv_manifest(tmp_path, logs):
+    text = '\ufeffinput,place\nlogs/a.clf,hall\n"logs/b.log",\ns3://robots/x.bag,"yard"\n'
+    found = read_manifest(write(tmp_path, "m.csv", text))
+    expected = [(str(logs / "a.clf"), "hall"), (str(logs / "b.log"), None)]
+    assert [(one.input, one.place) for one in found[:2]] == expected
+    assert (found[2].input, found[2].place) == ("s3://robots/x.bag", "yard")
+    assert found[1].where == f"{tmp_path / 'm.csv'}:3"
+
+
+def test_json_manifest(tmp_path):
+    rows = [{"input": "a.bag", "place": "hall"}, {"input": "/b.bag"}]
+    found = read_manifest(write(tmp_path, "m.json", json.dumps(rows)))
+    assert [one.input for one in found] == [str(tmp_path / "a.bag"), "/b.bag"]
+    assert [one.place for one in found] == ["hall", None]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("m.csv", "", r"m.csv:1: has no column `input`"),
+        ("m.csv", "input,plaec\na,b\n", r"m.csv:1: unknown column 'plaec'.*'place'"),
+        ("m.csv", "input,place\n", "m.csv: names no recording"),
+        ("m.csv", "input,place\na,b\n,c\n", "m.csv:3: names no recording"),
+        ("m.csv", "input,place\na,b,c\n", "m.csv:2: has another number of columns"),
+        ("m.csv", "input,place\na\n", "m.csv:2: has another number of columns"),
+        ("m.csv", "input,place\na,../up\n", "m.csv:2: place '../up' is no name of a folder"),
+        ("m.csv", "input,place\na, \n", "m.csv:2: place ' '"),
+        ("m.csv", 'input,place\n"a,b\n', "m.csv:2: is not CSV"),
+        ("m.json", "{", "m.json: is not JSON"),
+        ("m.json", "{}", "m.json: is no list"),
+        ("m.json", '[{"input": "a"}, 3]', "m.json: entry 2: is no object"),
+        ("m.json", '[{"input": 3}]', "m.json: entry 1: names no recording"),
+        ("m.json", '[{"input": "a", "place": 3}]', "m.json: entry 1: place 3"),
+        ("m.json", "[" * 100_000, "m.json: is not JSON"),
+    ],
+)
+def test_bad_manifests(tmp_path, name, text, message):
+    with pytest.raises(InputError, match=message):
+        read_manifest(write(tmp_path, name, text))
+
+
+@pytest.mark.usefixtures("logs")
+def test_two_places_for_one_recording(tmp_path):
+    text = "input,place\nlogs/a.clf,hall\nlogs,yard\n"
+    entries = read_manifest(write(tmp_path, "m.csv", text))
+    with pytest.raises(InputError, match=r"m.csv:3: .*a.clf is in two places: hall and yard"):
+        find_sources(entries, {})
+
+
+def test_manifest_names_the_line_of_an_empty_folder(tmp_path):
+    (tmp_path / "empty").mkdir()
+    entries = read_manifest(write(tmp_path, "m.csv", "input,place\nempty,hall\n"))
+    with pytest.raises(InputError, match=r"m.csv:2: .*empty: holds no recording"):
+        find_sources(entries, {})

@@ -1,0 +1,254 @@
+"""Sessions: one world on several days, what stands where, and what each beam hit."""
+
+import dataclasses
+import functools
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from stillmap.core.errors import InputError
+from stillmap.eval.map import distance_to_walls
+from stillmap.io.stillmap_folder import read
+from stillmap.sim import Scene, scene_by_name
+from stillmap.sim.furniture import Floor, Place, cross_rectangle, split_movable
+from stillmap.sim.objects import place_faces
+from stillmap.sim.session_overlap import compute_overlap, observe
+from stillmap.sim.session_pairs import (
+    OVERLAPS,
+    measure_overlap,
+    plan_pair,
+    plan_strangers,
+    plan_wings,
+)
+from stillmap.sim.session_truth import list_changes, load_session_truth
+from stillmap.sim.session_writer import write_sessions
+from stillmap.sim.sessions import SessionOptions, SessionPlan, plan_sessions, simulate_sessions
+
+Float = NDArray[np.float64]
+
+QUICK = {"laser": {"beams": 90}, "robot": {"scans": 150}, "crowd": {"people": 3}}
+
+
+def quick_scene(name: str = "office") -> Scene:
+    return scene_by_name(name, QUICK)
+
+
+@functools.cache
+def quick_plan(count: int = 3, seed: int = 2) -> SessionPlan:
+    return plan_sessions(quick_scene(), SessionOptions(count), seed)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("sessions") / "days"
+    write_sessions([quick_plan()], folder, seed=2)
+    return folder
+
+
+def test_more_sessions_leave_the_first_ones_as_they_are() -> None:
+    few, more = quick_plan(2), plan_sessions(quick_scene(), SessionOptions(4, odd_sensor=False), 2)
+    assert few.first_stamp_ns == more.first_stamp_ns[:2]
+    assert few.seeds == more.seeds[:2]
+    for one, other in zip(few.scenes, more.scenes, strict=False):
+        assert one.route == other.route
+        assert one.things == other.things
+
+
+def test_a_plan_follows_from_its_seed() -> None:
+    again = plan_sessions(quick_scene(), SessionOptions(3), 2)
+    assert again == quick_plan()
+    assert plan_sessions(quick_scene(), SessionOptions(3), 3) != again
+
+
+def test_sessions_differ_in_start_mount_sensor_and_day() -> None:
+    plan = quick_plan(4)
+    starts = np.array([scene.route[0] for scene in plan.scenes])
+    apart = np.hypot(*(starts[:, None] - starts).transpose(2, 0, 1))[np.triu_indices(4, 1)]
+    assert apart.min() > 0.5
+    assert len({(s.laser.x, s.laser.y, s.laser.yaw) for s in plan.scenes}) == 4
+    assert sorted(s.laser.beams < 90 for s in plan.scenes) == [False, False, False, True]
+    days = np.diff(plan.first_stamp_ns) / 86_400e9
+    assert (days > 0.6).all()
+    assert (days < 1.4).all()
+
+
+def test_furniture_and_doors_change_and_something_stays() -> None:
+    plan = quick_plan()
+    kinds = {change.kind for change in list_changes(plan.objects, None)}
+    assert {"moved", "door"} < kinds
+    assert kinds & {"appeared", "gone"}
+    assert 0.1 < np.mean([one.is_changed for one in plan.objects]) < 0.9
+
+
+def test_without_changes_nothing_differs() -> None:
+    plan = plan_sessions(quick_scene(), SessionOptions(3, has_changes=False), 2)
+    assert not list_changes(plan.objects, None)
+
+
+def test_furniture_stands_in_nothing() -> None:
+    plan = quick_plan(4)
+    for session, scene in enumerate(plan.scenes):
+        solid = np.array([*scene.walls, *scene.glass], float)
+        for one in plan.objects:
+            place = one.places[session]
+            if place is None or one.kind == "door" or one.places[0] == place:
+                continue  # as the world had it, or as in the first session
+            half = np.abs(np.array(one.faces)[:, :2]).max(axis=0)
+            assert not meets(place, half, solid), (session, one)
+
+
+def meets(place: Place, half: Float, solid: Float) -> bool:
+    """Whether surfaces (K, 4) run through a box."""
+    c, s = np.cos(place.yaw), np.sin(place.yaw)
+    local = (solid.reshape(-1, 2, 2) - (place.x, place.y)) @ np.array([[c, -s], [s, c]])
+    return bool(cross_rectangle(local[:, 0], local[:, 1], half).any())
+
+
+def test_segments_meet_rectangles() -> None:
+    start = np.array([[-2.0, 0.0], [-2.0, 2.0], [0.0, 0.0], [-2.0, 0.5], [1.5, -2.0]])
+    end = np.array([[2.0, 0.0], [2.0, 2.0], [0.1, 0.1], [-1.1, 0.5], [1.5, 2.0]])
+    met = cross_rectangle(start, end, np.array([1.0, 1.0]))
+    np.testing.assert_array_equal(met, [True, False, True, False, False])
+
+
+def test_a_new_cupboard_closes_no_way() -> None:
+    # two rooms joined by a passage of 1 m: no box of 0.8 m may stand in it
+    walls = ((0.0, 0.0, 10.0, 0.0), (10.0, 0.0, 10.0, 4.0), (10.0, 4.0, 0.0, 4.0))
+    walls = (*walls, (0.0, 4.0, 0.0, 0.0), (5.0, 0.0, 5.0, 1.5), (5.0, 2.5, 5.0, 4.0))
+    scene = Scene(name="two rooms", walls=walls, route=((2.0, 2.0), (8.0, 2.0)))
+    floor = Floor(scene, walls, np.empty((0, 3)))
+    rng = np.random.default_rng(0)
+    places = [floor.find_place((0.8, 0.8), np.empty((0, 4)), rng) for _ in range(60)]
+    found = np.array([(p.x, p.y) for p in places if p is not None])
+    assert len(found) > 40
+    assert not (np.hypot(*(found - (5.0, 2.0)).T) < 0.7).any()
+
+
+def test_boxes_of_a_world_can_be_moved_its_rooms_cannot() -> None:
+    walls, boxes = split_movable(scene_by_name("office").walls)
+    assert len(boxes) > 30
+    assert {one.kind for one in boxes} == {"furniture"}
+    assert len(walls) + 4 * len(boxes) == len(scene_by_name("office").walls)
+    assert {one.kind for one in split_movable(scene_by_name("street").walls)[1]} == {"car"}
+
+
+def test_beams_know_the_object_they_hit(written: Path) -> None:
+    truth = load_session_truth(written)
+    for session, name in enumerate(truth.names):
+        recording, beams = read(written / name), truth.beams(session)
+        assert beams.thing is not None
+        ends = recording.end_points(np.arange(recording.n_beams), beams.T_world_base)
+        numbers = np.unique(beams.thing)
+        assert len(numbers) > 5
+        for number in numbers[numbers >= 0].tolist():
+            thing = truth.objects[number].thing(session)
+            assert thing is not None
+            own = beams.thing == number
+            assert beams.static[own].all()
+            faces = place_faces(thing, thing.stays[0])
+            assert distance_to_walls(ends[own], faces).max() < 0.1
+        others = beams.static & (beams.thing < 0)
+        faces = truth.faces(session)
+        assert np.mean(distance_to_walls(ends[others], faces) < 0.02) < 0.02
+        changed = truth.changed_beams(session)
+        is_changed = np.array([one.is_changed for one in truth.objects])
+        assert is_changed[changed[changed >= 0]].all()
+        assert 0 < np.count_nonzero(changed >= 0) < np.count_nonzero(beams.thing >= 0)
+
+
+def test_truth_is_read_as_it_was_planned(written: Path) -> None:
+    truth, plan = load_session_truth(written), quick_plan()
+    assert truth.objects == plan.objects
+    assert list(truth.changes) == list_changes(plan.objects, None)
+    for k, name in enumerate(truth.names):
+        beams = truth.beams(k)
+        np.testing.assert_allclose(beams.T_world_base[0], truth.T_world_session[k])
+        assert read(written / name).stamp_ns[0] == 10**18 + plan.first_stamp_ns[k]
+    assert np.all(np.diag(truth.overlap) > 0.95)
+
+
+def test_the_same_seed_gives_the_same_files(written: Path, tmp_path: Path) -> None:
+    write_sessions([quick_plan()], tmp_path / "again", seed=2)
+    files = [path.relative_to(written) for path in written.rglob("*") if path.is_file()]
+    assert len(files) > 30
+    for file in files:
+        assert (written / file).read_bytes() == (tmp_path / "again" / file).read_bytes(), file
+
+
+def test_damaged_truth_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="holds no truth about sessions"):
+        load_session_truth(tmp_path)
+    for text in ("{", "[]", json.dumps({"sessions": [{"name": "../x"}], "objects": []})):
+        (tmp_path / "sessions.json").write_text(text)
+        with pytest.raises(InputError, match="is damaged"):
+            load_session_truth(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["office-moved", "street-moved"])
+def test_worlds_that_change_meanwhile_are_refused(name: str) -> None:
+    with pytest.raises(InputError, match="move within a recording"):
+        plan_sessions(scene_by_name(name), SessionOptions(2))
+
+
+def test_robots_stay_in_their_regions() -> None:
+    regions = ((0.0, 0.0, 18.0, 25.0), (22.0, 0.0, 40.0, 25.0))
+    plan = plan_sessions(quick_scene(), SessionOptions(2, regions), 4)
+    for region, one in zip(regions, simulate_sessions(plan), strict=True):
+        x = one.truth.T_world_base[:, 0, 2]
+        assert x.min() > region[0]
+        assert x.max() < region[2]
+
+
+def test_wings_share_a_door_only() -> None:
+    plan = plan_wings(1)
+    scenes = [dataclasses.replace(s, crowd=quick_scene().crowd) for s in plan.scenes]
+    sights = [observe(one) for one in simulate_sessions(plan._replace(scenes=tuple(scenes)))]
+    assert compute_overlap(sights, [0, 0])[0, 1] < 0.1
+    assert compute_overlap(sights, [0, 0])[0, 0] > 0.98
+
+
+def test_places_have_nothing_in_common(tmp_path: Path) -> None:
+    plans = plan_strangers(quick_scene("lookalike-1"), quick_scene("lookalike-2"))
+    write_sessions(plans, tmp_path / "days")
+    truth = load_session_truth(tmp_path / "days")
+    np.testing.assert_array_equal(truth.place, [0, 1])
+    assert truth.overlap[0, 1] == truth.overlap[1, 0] == 0.0
+
+
+def test_lookalikes_look_alike_but_are_not_the_same() -> None:
+    first, second = (scene_by_name(f"lookalike-{k}") for k in (1, 2))
+    same = len(set(first.walls) & set(second.walls)) / len(first.walls)
+    assert 0.2 < same < 0.8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("overlap", OVERLAPS, ids=lambda overlap: overlap.name)
+def test_pairs_overlap_as_wanted(overlap) -> None:
+    plan = plan_pair(scene_by_name("office"), overlap, 3)
+    assert overlap.low <= measure_overlap(plan, with_people=True) < overlap.high
+
+
+def test_parked_cars_change_in_a_street_in_3d() -> None:
+    lidar = {"channels": 16, "columns": 300}
+    robot = {"scans": 6, "speed": 0.2, "turn_rate": 0.01}  # or a sweep would be bent
+    scene = scene_by_name("street-empty", {"lidar": lidar, "robot": robot})
+    plan = plan_sessions(scene, SessionOptions(2), 1)
+    kinds = {change.kind for change in list_changes(plan.objects, scene.heights)}
+    assert kinds <= {"moved", "gone", "appeared"}
+    assert kinds
+    for session, one in enumerate(simulate_sessions(plan)):
+        thing = one.truth.thing
+        assert thing is not None
+        assert one.truth.static[thing >= 0].all()
+        ends = one.recording.end_points(np.arange(one.recording.n_beams), one.truth.T_world_base)
+        for number in np.unique(thing[thing >= 0]).tolist():
+            x0, y0, x1, y1 = plan.objects[number].extent(session)
+            x, y, z = ends[thing == number].T
+            assert x.min() > x0 - 0.3
+            assert x.max() < x1 + 0.3
+            assert y.min() > y0 - 0.3
+            assert y.max() < y1 + 0.3
+            assert z.max() < 2.5
