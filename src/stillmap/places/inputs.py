@@ -16,11 +16,13 @@ from stillmap.io.registry import detect_format
 from stillmap.places.prepare import MappedRecording
 from stillmap.results.folder import is_result, open_result, read_record
 from stillmap.results.pose_graph_g2o import read_g2o
-from stillmap.results.reader import SESSIONS
+from stillmap.results.reader import SESSIONS as SESSIONS  # of places, found there as well
 from stillmap.results.result import BuiltResult
 from stillmap.results.run_json import RECORD, TILTING
 from stillmap.results.saved import SavedResult, load
 from stillmap.slam import deskew_recording
+
+TIES = "ties.npz"  # constraints between the sessions of a place
 
 Given: TypeAlias = Sequence[str | os.PathLike[str]] | Recording | BuiltResult | SavedResult
 
@@ -50,8 +52,8 @@ class SessionInput(ShortRepr):
 
 
 def is_place(path: Path) -> bool:
-    """Whether a folder is a place."""
-    return (path / SESSIONS).is_file() and (path / RECORD).is_file()
+    """Whether a folder is a place, also one from which a file was taken."""
+    return (path / "sessions").is_dir() and any((path / one).is_file() for one in (SESSIONS, TIES))
 
 
 def list_sessions(

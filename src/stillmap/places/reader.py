@@ -12,6 +12,7 @@ from stillmap.core.errors import InputError
 from stillmap.core.files import read_text, require_regular
 from stillmap.places.checksums import check_checksums
 from stillmap.places.evidence import BLOCK, Evidence
+from stillmap.places.inputs import TIES
 from stillmap.places.keyframes import Keyframes
 from stillmap.places.objects import check_objects
 from stillmap.places.place import Place, PlacedSession, Refusal, to_planar
@@ -60,7 +61,7 @@ def read_place(folder: Path) -> tuple[Place, list[Refusal], list[str]]:
     ]
     if len({one.session.dimension for one in sessions}) != 1:
         raise InputError("has sessions in 2D and in 3D", where=str(folder), hint=HINT)
-    ties = _read_ties(folder / "ties.npz", sessions)
+    ties = _read_ties(folder / TIES, sessions)
     refusals = [
         Refusal(record["name"], record.get("input"), str(record.get("why", "")))
         for record in records
@@ -158,7 +159,7 @@ def _read_beams(folder: Path) -> tuple[NDArray[np.int64], int]:
 def _read_evidence(path: Path, keyframes: Keyframes, poses: Float) -> Evidence:
     """The evidence of keyframes that lay at poses (K, D+1, D+1) when it was measured."""
     D = poses.shape[-1] - 1
-    corner, hits, passes, resolution = _read_archive(
+    corner, hits, passes, resolution = read_archive(
         path, ("corner", "hits", "passes", "resolution")
     )
     shape = (len(corner), *(BLOCK[D],) * D)
@@ -187,7 +188,7 @@ def _end_within(keyframes: Keyframes, poses: Float, low: Float, high: Float) -> 
 def _read_ties(path: Path, sessions: list[PlacedSession]) -> list[Tie]:
     D = sessions[0].session.dimension
     dof = 3 * (D - 1)
-    first, first_node, second, second_node, T, covariance = _read_archive(
+    first, first_node, second, second_node, T, covariance = read_archive(
         path, ("first", "first_node", "second", "second_node", "T", "covariance")
     )
     L, counts = len(first), np.array([len(one.nodes) for one in sessions])
@@ -211,7 +212,7 @@ def _read_ties(path: Path, sessions: list[PlacedSession]) -> list[Tie]:
     ]
 
 
-def _read_archive(path: Path, names: tuple[str, ...]) -> list[NDArray[Any]]:
+def read_archive(path: Path, names: tuple[str, ...]) -> list[NDArray[Any]]:
     """Arrays of an `.npz` file.
 
     Raises:

@@ -15,6 +15,7 @@ from stillmap.core.short_repr import ShortRepr
 from stillmap.io.trajectory import write_tum
 from stillmap.places.changes import PlaceChange, change_cells, change_records
 from stillmap.places.evidence import Evidence
+from stillmap.places.inputs import TIES
 from stillmap.places.place import Place, PlacedSession, Refusal
 from stillmap.places.place_graph import Tie
 from stillmap.places.shown_state import ShownState, changed_cell_table, label_session
@@ -125,7 +126,7 @@ def write_place_files(folder: Path, result: PlaceResult) -> None:
     write_npz(folder / CELLS, change_cells(result.changes, result.shown.place))
     write_npz(folder / STATES, changed_cell_table(result.planar))
     dof = 3 if place.dimension == 2 else 6
-    write_ties(folder / "ties.npz", place.ties, dof)
+    write_ties(folder / TIES, place.ties, dof)
 
 
 def write_json(path: Path, content: Any) -> None:
