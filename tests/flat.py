@@ -1,5 +1,6 @@
 """A flat that a robot records on several days, small enough to be merged in a second."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ ROUTES = {
     "day2": ((5.0, 0.0), (2.0, 0.3), (-1.0, -0.2), (-5.0, -0.5)),
     "day3": ((-5.0, 0.5), (0.0, 0.5), (5.0, 0.0)),
 }
+_DAY_NS = 86_400 * 10**9
 _WALLS = (
     *box(0, 0, 12, 8),
     *box(-3, 1.5, 1.0, 1.4),
@@ -43,7 +45,10 @@ def record_days(folder: Path) -> None:
             laser=LaserOptions(beams=180, range_noise=0.01, max_range=12.0),
             robot=RobotOptions(scans=100),
         )
-        write_simulation(simulate(scene, np.random.default_rng(seed)), folder / day)
+        made = simulate(scene, np.random.default_rng(seed))
+        later = made.recording.stamp_ns + seed * _DAY_NS
+        recording = dataclasses.replace(made.recording, stamp_ns=later)
+        write_simulation(dataclasses.replace(made, recording=recording), folder / day)
 
 
 def record_elsewhere(path: Path) -> None:
@@ -54,7 +59,7 @@ def record_elsewhere(path: Path) -> None:
         route=((-13.0, -0.5), (13.0, -0.5)),
         crowd=CrowdOptions(people=0),
         laser=LaserOptions(beams=180, range_noise=0.01, max_range=12.0),
-        robot=RobotOptions(scans=80),
+        robot=RobotOptions(scans=40),
     )
     write_simulation(simulate(scene, np.random.default_rng(9)), path)
 

@@ -152,7 +152,7 @@ def test_a_session_whose_folder_is_gone(flat_place: Path, flat_days: Path, tmp_p
     copy = tmp_path / "place"
     shutil.copytree(flat_place, copy)
     shutil.rmtree(copy / "sessions" / "map2")
-    with pytest.raises(InputError, match="map2.*cannot be read"):
+    with pytest.raises(InputError, match=r"map2.*cannot be read"):
         stillmap.merge([copy, flat_days / "map3"], options=OPTIONS, output=tmp_path / "out")
     assert sorted(os.listdir(tmp_path)) == ["place"]
 

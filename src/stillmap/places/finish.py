@@ -154,6 +154,7 @@ def place_record(
             "resolution": place.resolution,
             "voxel_size": place.voxel_size,
             "map_state": map_state,
+            "frame": place.frame or place.sessions[0].session.name,
             "sessions": len(place.sessions),
             "constraints": len(place.ties),
             "changes": len(result.changes),

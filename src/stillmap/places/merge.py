@@ -69,7 +69,8 @@ def merge_sessions(
         (folder / "sessions").mkdir()
         place, refusals, order = _open_base(job, folder)
         if place is not None:
-            job = replace(job, options=_adopt_cells(job.options, place))
+            frame, options = job.frame or place.frame, _adopt_cells(job.options, place)
+            job = replace(job, frame=frame, options=options)
         _check_job(job, [*order, *(one.name for one in job.sessions)])
         sessions = prepare_sessions(job.sessions, job.options, job.odometry, folder, progress)
         order += [one.name for one in sessions]
@@ -147,9 +148,8 @@ def _grow(
     """
     if place is not None:
         return _add_all(place, sessions, threads, progress)
-    seeds = sorted(sessions, key=lambda one: one.name != job.frame)  # the frame's session first
     best: tuple[Place, list[Refusal]] | None = None
-    for number, seed in enumerate(seeds):
+    for number, seed in enumerate(sessions):
         cell = cell_size(job.options, seed.dimension)
         start = start_place(seed, job.options.slam.resolution, cell, threads)
         others = [one for one in sessions if one is not seed]
@@ -157,7 +157,7 @@ def _grow(
         if best is None or len(found[0].sessions) > len(best[0].sessions):
             best = found
         # what is left cannot be more than what was found
-        if len(best[0].sessions) >= len(seeds) - number - 1 or job.frame is not None:
+        if len(best[0].sessions) >= len(sessions) - number - 1:
             break
     if best is None:
         raise InputError("no session is named")
@@ -200,7 +200,8 @@ def _reframe(place: Place, name: str) -> Place:
     for one in place.sessions:
         if one.session.name == name:
             back = se2.inverse(one.T)
-            return place.with_nodes([back @ other.nodes for other in place.sessions])
+            moved = place.with_nodes([back @ other.nodes for other in place.sessions])
+            return replace(moved, frame=name)
     raise _no_frame(name, [one.session.name for one in place.sessions])
 
 

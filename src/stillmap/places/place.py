@@ -91,19 +91,21 @@ class Refusal(ShortRepr):
 
 @dataclass(frozen=True, eq=False)
 class Place(ShortRepr):
-    """Sessions in the frame of the first one.
+    """Sessions in one frame.
 
     Attributes:
         sessions: in the order in which they were merged.
         ties: constraints between them.
         resolution: m, edge of a cell of the map; in 3D `voxel_size` is that of a voxel.
         voxel_size: m, edge of a cell of the evidence in D dimensions.
+        frame: name of the session that has its frame; None: the first one.
     """
 
     sessions: list[PlacedSession]
     ties: list[Tie]
     resolution: float
     voxel_size: float
+    frame: str | None = None
 
     @property
     def dimension(self) -> int:

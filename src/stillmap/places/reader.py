@@ -53,6 +53,9 @@ def read_place(folder: Path) -> tuple[Place, list[Refusal], list[str]]:
         resolution, voxel_size = (float(settings[name]) for name in ("resolution", "voxel_size"))  # type: ignore[index]
         if not (0.0 < resolution < 100.0 and 0.0 < voxel_size < 100.0):
             raise ValueError("edges of cells")
+        frame = str(settings["frame"])  # type: ignore[index]
+        if frame not in {record["name"] for record in accepted}:
+            raise ValueError("the frame of no session")
     except (TypeError, KeyError, ValueError) as error:
         raise InputError("is no record of a place", where=str(folder / "run.json")) from error
     sessions = [
@@ -67,7 +70,7 @@ def read_place(folder: Path) -> tuple[Place, list[Refusal], list[str]]:
         for record in records
         if not record["accepted"]
     ]
-    place = Place(sessions, ties, resolution, voxel_size)
+    place = Place(sessions, ties, resolution, voxel_size, frame)
     return place, refusals, [record["name"] for record in records]
 
 
