@@ -76,7 +76,7 @@ def write_sessions(folder: Path, result: PlaceResult) -> None:
 
 def _write_state(state: Path, one: PlacedSession) -> None:
     write_npy(state / "nodes.npy", one.nodes)
-    write_npy(state / "covariance.npy", one.covariance)
+    write_npy(state / "covariance.npy", one.known_covariance)
     evidence, planar = one.require_evidence()
     write_evidence(state / "evidence.npz", evidence)
     if planar is not evidence:
@@ -216,7 +216,7 @@ def _placed_record(one: PlacedSession, first_scan: int) -> dict[str, Any]:
         "input": one.session.input,
         "accepted": True,
         "T_place_session": one.T.tolist(),
-        "covariance": one.covariance.tolist(),
+        "covariance": one.known_covariance.tolist(),
         "overlap": round(one.overlap, 4),
         "first_stamp_ns": int(stamp_ns[0]),
         "last_stamp_ns": int(stamp_ns[-1]),
