@@ -110,11 +110,12 @@ const driveSlider = async (page) => {
 };
 
 const driveLayers = async (page) => {
-  const shown = () => page.evaluate(() => Object.fromEntries(
-    ["dynamic", "thin", "path", "grid"].map((name) => [name,
-      getComputedStyle(document.querySelector(`.main-map .${name}`)).display !== "none"])));
+  const names = await page.evaluate(() => ["dynamic", "thin", "path", "grid"].filter(
+    (name) => document.querySelector(`#show-${name}`)));
+  const shown = () => page.evaluate((names) => Object.fromEntries(names.map((name) => [name,
+    getComputedStyle(document.querySelector(`.main-map .${name}`)).display !== "none"])), names);
   const out = {start: await shown()};
-  for (const name of ["dynamic", "thin", "path", "grid"]) {
+  for (const name of names) {
     await page.click(`label[for=show-${name}]`);
   }
   out.toggled = await shown();
@@ -159,7 +160,7 @@ const withoutScripts = (page) => page.evaluate(() => {
     const page = await open(browser);
     out.layers = await driveLayers(page);
     out.map = await driveMap(page);
-    out.slider = await driveSlider(page);
+    if (await page.$(".compare")) out.slider = await driveSlider(page);
     out.print = await print(await open(browser));
     const plain = await open(browser, {scripts: false});
     out.plain = await withoutScripts(plain);

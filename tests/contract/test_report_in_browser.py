@@ -3,14 +3,22 @@
 import json
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "places"))
+
 from opening_models import HERE, MODULES, require
 from PIL import Image
+from small_place import RECORD, make_place
 
 from stillmap.cli.main import main
+from stillmap.places.report.page import render_place_report
+from stillmap.results.map_server import write_map_server
+from stillmap.results.reader import read_grid
 from stillmap.sim import scene_by_name, simulate, write_simulation
 
 pytestmark = pytest.mark.slow
@@ -158,3 +166,35 @@ def test_links_lead_to_files(found):
     assert {"map.pgm", "map.yaml", "trajectory.tum", "run.json"} <= set(links)
     assert all((result / Path(link)).is_file() for link in links)
     assert ("mesh.glb" in links) == (result / "mesh.glb").exists()
+
+
+@pytest.fixture(scope="module")
+def merged(tmp_path_factory):
+    """What the browser finds in the report of a made-up place."""
+    folder = make_place(tmp_path_factory.mktemp("merged") / "place")
+    grid = read_grid(folder)
+    write_map_server(folder, grid)
+    page = render_place_report(folder, grid, "trinary", RECORD)
+    (folder / "report.html").write_text(page, encoding="utf-8")
+    return folder, opened(folder, occupied_pixel(folder), tmp_path_factory.mktemp("profile"))
+
+
+def test_report_of_a_place_is_accessible_and_asks_for_nothing(merged):
+    folder, seen = merged
+    for look in ("light", "dark", "phone"):
+        assert seen[look] == {"violations": [], "overflow": 0}, look
+    page = (folder / "report.html").as_uri()[:80]
+    assert {one for one in seen["requests"] if not one.startswith("data:")} == {page}
+    assert seen["errors"] == []
+
+
+def test_map_of_a_place_zooms_and_shows_trajectories(merged):
+    _, seen = merged
+    start, button = seen["map"]["start"], seen["map"]["button"]
+    assert button["width"] == pytest.approx(1.5 * start["width"])
+    assert seen["map"]["hover"]["readout"].endswith("occupied")
+    for layers in (seen["layers"], seen["plain"]["layers"]):
+        assert layers == {
+            "start": {"path": False, "grid": True},
+            "toggled": {"path": True, "grid": False},
+        }

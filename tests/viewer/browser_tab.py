@@ -17,7 +17,7 @@ sockets = pytest.importorskip("websockets.sync.client")
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser")
 WIDTH, HEIGHT = 1000, 700  # of the page
 _FLAGS = ("--headless", "--no-sandbox", "--enable-unsafe-swiftshader", "--remote-debugging-port=0")
-_KEY_NUMBERS = {"Space": 32, "Escape": 27, "ArrowLeft": 37, "ArrowRight": 39}
+_KEY_NUMBERS = {"Space": 32, "PageUp": 33, "Escape": 27, "ArrowLeft": 37, "ArrowRight": 39}
 
 
 class Tab:

@@ -1,13 +1,16 @@
 """The page in a headless Chromium."""
 
 import re
+import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from stillmap.mesh.texture.atlas import TexturedMesh
+from stillmap.places.pictures import KIND_COLORS
 from stillmap.results.colors import TEAL
 from stillmap.results.gltf import write_glb
 from stillmap.results.report.renderer import BACKGROUND
@@ -15,8 +18,10 @@ from stillmap.viewer.scene import read_scene
 
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 pytest.importorskip("websockets.sync.client")
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "places"))
 
 from browser_tab import BROWSER, HEIGHT, Tab
+from small_place import make_place
 
 from stillmap.viewer.window import Window
 
@@ -292,3 +297,33 @@ def test_scale_bar_has_the_scale_of_the_view(shown, tab):
     before = client.camera.position.copy()
     until(window, lambda: np.linalg.norm(client.camera.position - before) > 1.0)
     until(window, lambda: abs(np.subtract(*widths())) < 6)
+
+
+@pytest.fixture
+def place_shown(tmp_path, opened, tab):
+    """A page of a place that shows the scene."""
+    window = opened(read_scene(make_place(tmp_path / "place")), None)
+    shown_in(tab, window, hues, ("blue", "dark"))
+    tab.value("document.querySelector('.mantine-Notification-closeButton')?.click()")
+    until(window, lambda: "Legend" in tab.value("document.body.innerText"))
+    return window
+
+
+def colored(tab, color):
+    """Pixels of the scene in a color."""
+    return int((np.abs(tab.picture()[:, 250:650] - color).max(axis=2) < 25).sum())
+
+
+def test_keys_step_through_the_sessions_of_a_place(place_shown, tab):
+    window, body = place_shown, "document.body.innerText"
+    assert "session 4 of 4: thursday" in tab.value(body)
+    until(window, lambda: colored(tab, KIND_COLORS["gone"]) > 50)
+    tab.press("PageUp", "PageUp")
+    until(window, lambda: "session 3 of 4: wednesday, 2026-05-30" in tab.value(body))
+    tab.press("PageUp", "PageUp")
+    until(window, lambda: "session 2 of 4: tuesday" in tab.value(body))
+    until(window, lambda: colored(tab, KIND_COLORS["appeared"]) > 50)
+    until(window, lambda: colored(tab, KIND_COLORS["gone"]) < 5)
+    tab.press("c", "KeyC")
+    until(window, lambda: "A: appeared" not in tab.value(body))
+    assert tab.of("Runtime.exceptionThrown") == []

@@ -15,6 +15,7 @@ from stillmap.core.errors import InputError, MissingExtra, import_extra
 if TYPE_CHECKING:
     from stillmap.results.folder import ResultFolder
     from stillmap.viewer.beams import Beams
+    from stillmap.viewer.scene import Scene
 
 
 _REPORT = "report.html"
@@ -23,13 +24,15 @@ _LAST_PORT = 65_535
 
 DESCRIPTION = (
     "Show a result in the browser, scan by scan: map, beams, points, surface, "
-    "trajectory and moving objects. The page is served to this machine only, until Ctrl-C, and "
+    "trajectory and moving objects; a place session by session, with what changed. The page is "
+    "served to this machine only, until Ctrl-C, and "
     "requests nothing from outside. It needs the extra `viewer`; without it, the command that "
     "installs it is printed and the report is opened. Without a screen, the address is printed."
 )
 EPILOG = """examples:
   stillmap view out                     map, beams, points, models and objects over time
   stillmap view out --report            the report
+  stillmap view place                   a place of several sessions, and what changed
   firefox "$(stillmap view out --print)"
   ssh -L 8080:127.0.0.1:8080 robot stillmap view out --port 8080
 """
@@ -37,7 +40,7 @@ EPILOG = """examples:
 
 def add_arguments(p: argparse.ArgumentParser) -> None:
     """Add the flags and arguments."""
-    p.add_argument("result", metavar="DIR", help="folder that `stillmap map` wrote")
+    p.add_argument("result", metavar="DIR", help="folder that `stillmap map` or `merge` wrote")
     p.add_argument("--report", action="store_true", help="open the report instead")
     p.add_argument("--print", action="store_true", help="print the path of the report")
     p.add_argument(
@@ -108,21 +111,17 @@ def _serve(args: argparse.Namespace, folder: Path) -> None:
     Raises:
         InputError: a file of the result is damaged, or the recording that was named is another.
     """
-    from stillmap.results.folder import open_result
+    from stillmap.places.inputs import is_place
     from stillmap.viewer.scene import read_scene
     from stillmap.viewer.window import Window
 
-    result = open_result(folder, args.input)
-    scene, beams = read_scene(folder, result.source.name), None
-    try:
-        if not args.no_beams:
-            beams = _read_beams(result, args.quiet)
-    except InputError as error:
+    if is_place(folder):
         if args.input:
-            raise
-        error = in_flags(error)
-        say(f"without beams: {error}")
-        scene = replace(scene, notes=[f"Without beams: {error}", *scene.notes])
+            what = "is a place, which has many recordings"
+            raise InputError(what, where=str(folder), hint="--input is for single results")
+        scene, beams = read_scene(folder), None
+    else:
+        scene, beams = _read_result(args, folder)
     window = Window(scene, beams, args.port)
     try:
         # some browsers block until they are closed
@@ -135,6 +134,25 @@ def _serve(args: argparse.Namespace, folder: Path) -> None:
         pass
     finally:
         window.close()
+
+
+def _read_result(args: argparse.Namespace, folder: Path) -> tuple["Scene", "Beams | None"]:
+    """The result of one recording; without beams where that cannot be read and is not named."""
+    from stillmap.results.folder import open_result
+    from stillmap.viewer.scene import read_scene
+
+    result = open_result(folder, args.input)
+    scene = read_scene(folder, result.source.name)
+    if args.no_beams:
+        return scene, None
+    try:
+        return scene, _read_beams(result, args.quiet)
+    except InputError as error:
+        if args.input:
+            raise
+        error = in_flags(error)
+        say(f"without beams: {error}")
+        return replace(scene, notes=[f"Without beams: {error}", *scene.notes]), None
 
 
 def _read_beams(result: "ResultFolder", quiet: bool) -> "Beams":

@@ -15,11 +15,13 @@ from stillmap.em import OccupancyMap
 from stillmap.pipeline.options import Options
 from stillmap.places.changes import detect_place_changes
 from stillmap.places.checksums import write_checksums
+from stillmap.places.clouds import write_place_clouds
 from stillmap.places.grow import estimate_planar
 from stillmap.places.objects import join_objects, place_objects
 from stillmap.places.place import Place, Refusal
 from stillmap.places.place_map import make_place_map
 from stillmap.places.place_states import estimate_place
+from stillmap.places.report.page import render_place_report
 from stillmap.places.shown_state import show_state
 from stillmap.places.writer import PlaceResult, write_json, write_place_files, write_sessions
 from stillmap.results.labels import read_array
@@ -117,11 +119,15 @@ def write_place(folder: Path, result: PlaceResult, options: Options, map_state: 
         write_checksums(home)
     write_place_files(folder, result)
     join_objects(folder, homes)
+    if place.dimension == 3:
+        write_place_clouds(folder, result)
     planar = [place.sessions[k].require_evidence()[1] for k in place.in_time()]
     occupancy = make_place_map(planar, result.planar)
     write_map_server(folder, occupancy, options.output.map_mode)
     write_map_npz(folder / "map.npz", occupancy)
     record = place_record(folder, result, options, map_state, occupancy)
+    page = render_place_report(folder, occupancy, options.output.map_mode, record)
+    (folder / "report.html").write_text(page, encoding="utf-8")
     write_json(folder / RECORD, record)
 
 

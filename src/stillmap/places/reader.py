@@ -32,7 +32,7 @@ from stillmap.results.reader import SESSIONS
 
 Float = NDArray[np.float64]
 
-MAX_JSON = 64 << 20  # bytes
+_MAX_JSON = 64 << 20  # bytes
 _MAX_ARRAY = 1 << 31  # bytes of an array in an archive when it is unpacked
 
 
@@ -100,7 +100,7 @@ def read_sessions(folder: Path) -> list[dict[str, Any]]:
     path = folder / SESSIONS
     require_regular(path)
     try:
-        records = json.loads(read_text(path, MAX_JSON))
+        records = json.loads(read_text(path, _MAX_JSON))
         for record in records:
             name = record["name"]
             if not isinstance(name, str) or not name or "/" in name or name in (".", ".."):

@@ -1,6 +1,6 @@
 """What the JSON files of a place say: its sessions, and what changed between them."""
 
-import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.errors import InputError
-from stillmap.core.files import read_text, require_regular
 from stillmap.core.short_repr import ShortRepr
-from stillmap.places.reader import MAX_JSON, read_sessions
-from stillmap.places.writer import CHANGES
+from stillmap.places.reader import read_sessions
+from stillmap.places.timeline import ChangeRecord
+from stillmap.places.timeline_reader import read_changes, read_states
 from stillmap.results.reader import SESSIONS
 
 Float = NDArray[np.float64]
@@ -94,34 +94,22 @@ def _to_session(record: dict[str, Any]) -> PlaceSession:
     return PlaceSession(name, path, True, "", T, covariance, float(record["overlap"]), scans)
 
 
-def read_changes(folder: Path) -> list[SessionChange]:
+def read_session_changes(folder: Path) -> list[SessionChange]:
     """What changed between the sessions of a place, in the order of time.
 
     Raises:
-        InputError: `changes.json` is missing or damaged.
+        InputError: `changes.json` or `states.npz` is missing or damaged.
     """
-    path = folder / CHANGES
-    require_regular(path)
-    try:
-        return [_to_change(record) for record in json.loads(read_text(path, MAX_JSON))]
-    except (ValueError, TypeError, KeyError, RecursionError, OverflowError) as error:
-        raise InputError(f"is damaged: {error!r}", where=str(path)) from error
+    _, names = read_states(folder)
+    return [_to_change(one, names) for one in read_changes(folder, names)]
 
 
-def _to_change(record: dict[str, Any]) -> SessionChange:
-    before, after = record["between"]
-    return SessionChange(
-        int(record["id"]),
-        str(record["kind"]),
-        _to_box(record["box"]),
-        _to_box(record["from_box"]) if "from_box" in record else None,
-        (str(before), str(after)),
-        float(record["probability"]),
+def _to_change(one: ChangeRecord, names: Sequence[str]) -> SessionChange:
+    box, *before = (
+        (*low[:2].tolist(), *high[:2].tolist(), *low[2:].tolist(), *high[2:].tolist())
+        for low, high in one.boxes
     )
-
-
-def _to_box(corners: Any) -> tuple[float, ...]:
-    box = tuple(float(value) for value in corners)
-    if len(box) not in (4, 6) or not np.isfinite(box).all():
-        raise ValueError(f"a box of {corners}")
-    return box
+    between = names[one.before], names[one.after]
+    return SessionChange(
+        one.id, one.kind, box, before[0] if before else None, between, one.probability
+    )

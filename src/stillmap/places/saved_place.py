@@ -14,8 +14,8 @@ from stillmap.places.inputs import is_place
 from stillmap.places.records import (
     PlaceSession,
     SessionChange,
-    read_changes,
     read_place_sessions,
+    read_session_changes,
 )
 from stillmap.results import saved
 from stillmap.results.reader import SESSIONS
@@ -138,7 +138,7 @@ def load_place(folder: Path) -> SavedPlace:
     Raises:
         InputError: a file of it is missing or damaged.
     """
-    sessions, changes = read_place_sessions(folder), read_changes(folder)
+    sessions, changes = read_place_sessions(folder), read_session_changes(folder)
     place = SavedPlace(**vars(saved.load(folder)), sessions=sessions, changes=changes)
     placed = place._stretches()
     ends = [0, *(scans.stop for scans in placed)]

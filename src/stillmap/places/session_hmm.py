@@ -1,7 +1,8 @@
 """The chain over sessions: whether something static stands in a cell, session by session.
 
 A cell is of one of three classes: static (occupied in every session), free (in none), or changing,
-a two-state Markov chain over the sessions. Evidence of a session is the log likelihood ratio of
+a two-state Markov chain over the sessions
+that switches at least once. Evidence of a session is the log likelihood ratio of
 occupied to free; sessions that did not observe the cell say nothing. Forward-backward and Viterbi
 as in Thrun, Burgard, Fox, Probabilistic Robotics, and Meyer-Delius et al. 2012, with a session as
 the time step.
@@ -24,6 +25,9 @@ _SWITCH = 0.25  # probability that a changing cell is otherwise in the next sess
 _WEIGHTS = (0.8, 0.1, 0.1)  # prior of static, free, changing
 # independent observations that neighbouring cells of one history amount to; nats of a cell at most
 _INDEPENDENT_CELLS, _MAX_POOLED = 4.0, 20.0
+_MIN_SHARE = 1e-12  # of a probability that is divided by
+# free cells at least, for each changing one: those in which movers that paused left a few hits
+_RESIDUE_SHARE = 1.5
 _MIN_WEIGHT, _ROUNDS = 0.01, 20  # of a class while the weights are fitted; rounds of EM
 
 
@@ -64,11 +68,13 @@ def fit_weights(evidence: Float, rare: tuple[float, float, float] = _WEIGHTS) ->
     weights = np.array(rare)
     if not len(evidence):
         return weights
-    likelihood = np.exp(_log_likelihoods(evidence))
+    log = _log_likelihoods(evidence)
+    likelihood = np.exp(log - log.max(axis=1, keepdims=True))
     for _ in range(_ROUNDS):
         joint = likelihood * weights
         weights = (joint / joint.sum(axis=1, keepdims=True)).mean(axis=0)
         weights = np.maximum(weights, _MIN_WEIGHT)
+        weights[1] = max(weights[1], _RESIDUE_SHARE * weights[2])
         weights /= weights.sum()
     return weights
 
@@ -89,7 +95,7 @@ def estimate_states(
         log = _pool(log, path, observed, pairs)
     joint = np.exp(log - log.max(axis=1, keepdims=True)) * weights
     posterior = joint / joint.sum(axis=1, keepdims=True)
-    p_occupied = posterior[:, :1] + posterior[:, 2:] * _smooth(evidence)
+    p_occupied = posterior[:, :1] + posterior[:, 2:] * _chain(evidence)[1]
     return CellStates(posterior[:, 0], posterior[:, 2], p_occupied, path, observed)
 
 
@@ -113,20 +119,25 @@ def _pool(
 
 
 def _log_likelihoods(evidence: Float) -> Float:
-    """(K, 3) log likelihood of each class, relative to the largest."""
-    log = np.stack(
-        [evidence.sum(axis=1), np.zeros(len(evidence)), _chain_log_likelihood(evidence)], axis=1
-    )
-    out: Float = log - log.max(axis=1, keepdims=True)
-    return out
+    """(K, 3) log likelihood of each class, relative to that of a free cell."""
+    log_static = evidence.sum(axis=1)
+    log_chain, _ = _chain(evidence)
+    return np.stack([log_static, np.zeros(len(evidence)), log_chain], axis=1)
 
 
-def _chain_log_likelihood(evidence: Float) -> Float:
-    """(K,) log likelihood of the changing class, by the forward filter.
+def _chain(evidence: Float) -> tuple[Float, Float]:
+    """Log likelihood (K,) of the changing class, and P(occupied) (K, S) under it.
 
-    Relative to all sessions being free, as that of the other classes.
+    The histories of the chain without a switch belong to the other two classes.
     """
-    return _forward(evidence)[1]
+    log_all = _forward(evidence)[1]
+    log_static, stay = evidence.sum(axis=1), (1.0 - _SWITCH) ** (evidence.shape[1] - 1)
+    # shares of the histories without a switch in the likelihood of the chain
+    occupied, free = 0.5 * stay * np.exp(log_static - log_all), 0.5 * stay * np.exp(-log_all)
+    rest = np.maximum(1.0 - occupied - free, _MIN_SHARE)
+    log = log_all + np.log(rest / max(1.0 - stay, _MIN_SHARE))
+    p_occupied = (_smooth(evidence) - occupied[:, None]) / rest[:, None]
+    return (log if stay < 1.0 else np.full(len(log), -np.inf)), np.clip(p_occupied, 0.0, 1.0)
 
 
 def _forward(evidence: Float) -> tuple[Float, Float]:

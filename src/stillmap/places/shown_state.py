@@ -1,5 +1,6 @@
 """The state of changed cells that a map shows, and with it the labels of beams."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,11 +28,14 @@ class ShownState(ShortRepr):
         place: K cells.
         p_shown: (K,) probability that the map shows something in the cell.
         support: (K, S) nats by which the other sessions make a label of each session static.
+        noise: cells that change by themselves, unlisted: beside static surface the map shows them
+            as static, elsewhere not at all.
     """
 
     place: PlaceStates
     p_shown: Float
     support: NDArray[np.float32]
+    noise: Index
 
 
 def show_state(place: PlaceStates, changes: list[PlaceChange], limit: int | None) -> ShownState:
@@ -51,12 +55,13 @@ def show_state(place: PlaceStates, changes: list[PlaceChange], limit: int | None
         p_shown = occupied[np.arange(len(occupied)), _last_observed(observed, limit)]
     unchanged = states.p_changing <= 0.5
     p_shown = np.where(unchanged, np.maximum(p_shown, states.p_static), p_shown)
-    p_shown[_noise_of_static(place, changes)] = 1.0
+    stands, gone = _settle_unlisted(place, changes)
+    p_shown[stands], p_shown[gone] = 1.0, 0.0
     total = place.evidence.sum(axis=1, keepdims=True) - place.evidence
     support = np.where(
         states.p_static[:, None] > _MIN_P_STATIC, np.clip(total, 0.0, _MAX_SUPPORT), 0.0
     )
-    return ShownState(place, p_shown, support.astype(np.float32))
+    return ShownState(place, p_shown, support.astype(np.float32), np.concatenate([stands, gone]))
 
 
 def _last_observed(observed: NDArray[np.bool_], limit: int) -> Index:
@@ -67,20 +72,23 @@ def _last_observed(observed: NDArray[np.bool_], limit: int) -> Index:
     return np.asarray(np.where(before.any(axis=1), last, first_after), np.intp)
 
 
-def _noise_of_static(place: PlaceStates, changes: list[PlaceChange]) -> Index:
-    """Cells that change by themselves, unlisted, beside static surface."""
+def _settle_unlisted(place: PlaceStates, changes: list[PlaceChange]) -> tuple[Index, Index]:
+    """Cells that change by themselves, unlisted: those that stand, and those that do not.
+
+    Beside static surface they are noise of its poses, elsewhere what movers left.
+    """
     listed = np.zeros(len(place.cells), np.bool_)
     for change in changes:
         listed[change.cells] = True
     alone = np.flatnonzero((place.states.p_changing > 0.5) & ~listed)
     static = place.cells[place.states.p_static > 0.5]
     if not len(alone) or not len(static):
-        return np.zeros(0, np.intp)
+        return np.zeros(0, np.intp), alone
     from scipy.spatial import cKDTree  # slow to load
 
     limit = _STATIC_DISTANCE
     distance, _ = cKDTree(static).query(place.cells[alone], distance_upper_bound=limit + 1.0)
-    return alone[distance <= limit]
+    return alone[distance <= limit], alone[distance > limit]
 
 
 def label_session(
@@ -123,13 +131,20 @@ def _find_cells(place: PlaceStates, centres: Float) -> Index:
     return np.where(np.isfinite(distance), at, -1).astype(np.intp)
 
 
-def changed_cell_table(shown: ShownState) -> dict[str, NDArray[np.generic]]:
-    """The changed cells in the plane and their states in every session, for the viewer."""
+def changed_cell_table(shown: ShownState, names: Sequence[str]) -> dict[str, NDArray[np.generic]]:
+    """The changed cells in the plane and their states in every session, for report and viewer.
+
+    Args:
+        shown: the state of the place in the plane.
+        names: of the sessions, in the order of time.
+    """
     states = shown.place.states
-    changed = np.flatnonzero(states.p_changing > 0.5)
+    changed = np.setdiff1d(np.flatnonzero(states.p_changing > 0.5), shown.noise)
     return {
         "cells": shown.place.cells[changed].astype(np.int32),
         "occupied": states.path[changed],
         "observed": states.observed[changed],
+        "shown": shown.p_shown[changed] > 0.5,
         "resolution": np.array(shown.place.resolution),
+        "sessions": np.array(names, np.str_),
     }

@@ -124,7 +124,7 @@ def write_place_files(folder: Path, result: PlaceResult) -> None:
     write_json(folder / SESSIONS, session_records(result))
     write_json(folder / CHANGES, change_records(result.changes, result.names_in_time))
     write_npz(folder / CELLS, change_cells(result.changes, result.shown.place))
-    write_npz(folder / STATES, changed_cell_table(result.planar))
+    write_npz(folder / STATES, changed_cell_table(result.planar, result.names_in_time))
     dof = 3 if place.dimension == 2 else 6
     write_ties(folder / TIES, place.ties, dof)
 

@@ -175,6 +175,7 @@ class Track(ShortRepr):
         z: (K,) metres, how high its middle is; None in the plane.
         beams: how many fell on it; None where the file does not say.
         p_dynamic: their mean P(dynamic); None likewise.
+        session: of a place, in which it was seen; empty otherwise.
     """
 
     id: int
@@ -185,6 +186,7 @@ class Track(ShortRepr):
     z: NDArray[np.float64] | None = None
     beams: int | None = None
     p_dynamic: float | None = None
+    session: str = ""
 
 
 def read_tracks(path: Path) -> list[Track]:
@@ -221,6 +223,5 @@ def _track(one: dict[str, Any]) -> Track:
         raise ValueError("a number is not finite")
     beams = None if one.get("beams") is None else int(one["beams"])
     p_dynamic = None if one.get("p_dynamic") is None else float(one["p_dynamic"])
-    return Track(
-        int(one["id"]), size, stamp_ns, numbers[:, :2], numbers[:, 2:], z, beams, p_dynamic
-    )
+    xy, velocity, session = numbers[:, :2], numbers[:, 2:], str(one.get("session", ""))
+    return Track(int(one["id"]), size, stamp_ns, xy, velocity, z, beams, p_dynamic, session)

@@ -17,7 +17,8 @@ from stillmap.viewer.display import Points
 from stillmap.viewer.nodes import NO_SHADOWS, Nodes, node_path
 from stillmap.viewer.objects import ObjectNodes
 from stillmap.viewer.picking import Ray, pick_plane, pick_point
-from stillmap.viewer.scene import MAX_POINTS
+from stillmap.viewer.scene import MAX_POINTS, to_rgba
+from stillmap.viewer.sessions import SessionNodes
 
 _MAX_TRAJECTORY_POINTS = 5_000
 _MAX_RAYS = 1_500
@@ -40,15 +41,23 @@ class Layers:
         heights: lowest and highest of the color map of heights, in m in the map frame.
     """
 
-    def __init__(self, nodes: Nodes, beams: Beams | None, objects: ObjectNodes) -> None:
+    def __init__(
+        self,
+        nodes: Nodes,
+        beams: Beams | None,
+        objects: ObjectNodes,
+        sessions: SessionNodes | None = None,
+    ) -> None:
         """Create the nodes.
 
         Args:
             nodes: creates them.
             beams: None: without beams and rays.
             objects: creates those of moving objects.
+            sessions: creates those of a place; None: a single result.
         """
         self._nodes, self._scene, self._beams, self._objects = nodes, nodes.scene, beams, objects
+        self._sessions = sessions
         self._points: dict[str, tuple[Any, float]] = {}
         self._parents: dict[str, Any] = {}
         self.clouds = self._read_clouds()
@@ -86,6 +95,18 @@ class Layers:
             ("Object tracks", False, moving, self._objects.make_tracks),
             ("Object models", True, bool(scene.models), self._objects.make_models),
             ("Object ids", False, moving, lambda: None),
+            *self._place_definitions(),
+        ]
+
+    def _place_definitions(self) -> list[tuple[str, bool, bool, Callable[[], None]]]:
+        """Those that only a place has."""
+        if self._sessions is None or self._scene.place is None:
+            return []
+        several = len(self._scene.place) > 1
+        return [
+            ("Sessions", True, True, self._sessions.make_trajectories),
+            ("Changes", True, several, self._sessions.make_boxes),
+            ("Change labels", False, several, lambda: None),
         ]
 
     def is_shown(self, name: str) -> bool:
@@ -131,6 +152,18 @@ class Layers:
         if self.is_shown("Beams") or self.is_shown("Rays"):
             self._draw_beams(scan)
         self._objects.update(int(self._scene.stamp_ns[scan]), self.is_shown)
+        if self._sessions is not None:
+            self._sessions.update(self.is_shown("Changes"), self.is_shown("Change labels"))
+
+    def show_session(self, session: int) -> None:
+        """Show the map and the trajectory of a session of a place."""
+        place = self._scene.place
+        assert place is not None
+        drawn = place.draw_map(session)
+        if drawn is not None:
+            self._map.image = to_rgba(drawn, transparent=not self._scene.is_2d)
+        self._path.points = self._trajectory(place.scans_of(session)).astype(np.float32)
+        self._objects.session = place.name_of(session)
 
     def _read_clouds(self) -> dict[str, Points]:
         """Clouds by name of their layer; in 2D the dynamic points are those of the recording."""
@@ -177,7 +210,7 @@ class Layers:
         plan, scene = self._scene.map_image, self._scene
         assert plan is not None
         x0, y0, x1, y1 = plan.window
-        self._nodes.server.scene.add_image(
+        self._map: Any = self._nodes.server.scene.add_image(
             node_path("Map", "plan"),
             plan.picture,
             x1 - x0,
@@ -202,14 +235,18 @@ class Layers:
         self._points[name] = node, node.point_size
 
     def _make_trajectory(self) -> None:
-        positions = self._scene.poses[:, :3, 3] - self._nodes.origin(2)
-        use = positions[sample_indices(len(positions), _MAX_TRAJECTORY_POINTS)]
-        segments = np.stack([use[:-1], use[1:]], axis=1)
-        self._nodes.lines("Robot", segments, np.array(BLUE, np.uint8), 2.5)
+        segments = self._trajectory(range(len(self._scene.poses)))
+        self._path = self._nodes.lines("Robot", segments, np.array(BLUE, np.uint8), 2.5)
         length = _AXES_SIZE * self._nodes.height
         self._robot = self._nodes.server.scene.add_frame(
             node_path("Robot", "robot"), axes_length=length, axes_radius=0.06 * length
         )
+
+    def _trajectory(self, scans: range) -> NDArray[np.float64]:
+        """Line segments (n, 2, 3) between the poses of scans, relative to the scene's origin."""
+        positions = self._scene.poses[scans.start : scans.stop, :3, 3] - self._nodes.origin(2)
+        use = positions[sample_indices(len(positions), _MAX_TRAJECTORY_POINTS)]
+        return np.stack([use[:-1], use[1:]], axis=1)
 
     def _make_beams(self) -> None:
         points, colors = np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8)

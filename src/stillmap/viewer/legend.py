@@ -4,6 +4,7 @@ import html
 import math
 from collections.abc import Sequence
 
+from stillmap.places.pictures import KIND_COLORS
 from stillmap.results.colors import (
     BLUE,
     GREY,
@@ -15,7 +16,7 @@ from stillmap.results.colors import (
 )
 from stillmap.results.report.figures import ORANGE, UNKNOWN
 from stillmap.viewer.layers import HEIGHT, PICTURES, Layers
-from stillmap.viewer.shortcuts import KEYS
+from stillmap.viewer.shortcuts import KEYS, PLACE_KEYS
 from stillmap.viewer.text import TEXT_STYLE
 
 _MAX_BAR = 0.25  # longest scale bar, as a share of the height of the view
@@ -26,7 +27,15 @@ _DOT = "border-radius:50%;width:.7em;height:.7em;margin:0 .1em"
 _LINE = "width:1.4em;height:.2em"
 _AREA = "width:1.4em;height:.8em"
 _SQUARE = "width:.8em;height:.8em;margin:0 .05em"
-_FRAME = "width:1.1em;height:.6em;margin:0 .05em;border:.13em solid"
+_FRAME = "width:1.1em;height:.6em;margin:0 .05em;border:.13em"
+# of the boxes of changes
+_BORDERS = {"appeared": "solid", "gone": "dashed", "moved": "solid", "door": "dotted"}
+_MEANINGS = {
+    "appeared": "appeared",
+    "gone": "gone",
+    "moved": "moved, dotted where from",
+    "door": "door, otherwise than before",
+}
 
 
 def legend_html(layers: Layers, coloring: str, is_2d: bool) -> str:
@@ -51,7 +60,7 @@ def legend_html(layers: Layers, coloring: str, is_2d: bool) -> str:
         rows.append(_row(dots, "beams of this scan: dynamic, undecided, static"))
     if layers.is_shown("Rays"):
         rows.append(_row(_swatch(_LINE, TEAL), "rays from the sensor"))
-    content = "".join(rows + _object_rows(layers))
+    content = "".join(rows + _object_rows(layers) + _place_rows(layers))
     return f'<div style="{TEXT_STYLE};padding-top:.6em">{content}</div>'
 
 
@@ -78,9 +87,14 @@ def scale_length(longest: float) -> float:
     return max(power * n for n in _LENGTHS if power * n <= longest * (1.0 + 1e-9))
 
 
-def help_html() -> str:
-    """The line that lists the keys."""
-    keys = "; ".join(f"<b>{html.escape(key)}</b> {html.escape(what)}" for key, what in KEYS)
+def help_html(is_place: bool = False) -> str:
+    """The line that lists the keys.
+
+    Args:
+        is_place: whether there are sessions.
+    """
+    listed = (*KEYS, *PLACE_KEYS) if is_place else KEYS
+    keys = "; ".join(f"<b>{html.escape(key)}</b> {html.escape(what)}" for key, what in listed)
     return f'<div style="{TEXT_STYLE};padding-bottom:.6em">Keys: {keys}.</div>'
 
 
@@ -122,6 +136,21 @@ def _object_rows(layers: Layers) -> list[str]:
     return rows
 
 
+def _place_rows(layers: Layers) -> list[str]:
+    rows = list[str]()
+    if layers.is_shown("Sessions"):
+        lines = "".join(_swatch(_LINE, color) for color in color_by_id([0, 1, 2]).tolist())
+        rows.append(_row(lines, "trajectories of the sessions"))
+    if layers.is_shown("Changes"):
+        rows += [
+            _row(_outline(color, _BORDERS[kind]), f"{kind[0].upper()}: {_MEANINGS[kind]}")
+            for kind, color in KIND_COLORS.items()
+        ]
+        squares = "".join(_swatch(_SQUARE, KIND_COLORS[kind]) for kind in ("appeared", "gone"))
+        rows.append(_row(squares, "on the map: came, left since the session before"))
+    return rows
+
+
 def _row(swatch: str, text: str) -> str:
     return (
         '<div style="display:flex;align-items:center;gap:.5em">'
@@ -134,8 +163,8 @@ def _swatch(shape: str, color: Sequence[int]) -> str:
     return f'<span style="display:block;{shape};background:rgb{tuple(color)}"></span>'
 
 
-def _outline(color: Sequence[int]) -> str:
-    return f'<span style="display:block;{_FRAME} rgb{tuple(color)}"></span>'
+def _outline(color: Sequence[int], border: str = "solid") -> str:
+    return f'<span style="display:block;{_FRAME} {border} rgb{tuple(color)}"></span>'
 
 
 def _ramp(colors: Sequence[Rgb]) -> str:

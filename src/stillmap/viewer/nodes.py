@@ -53,10 +53,17 @@ class Nodes:
             precision="float32",
         )
 
-    def lines(self, layer: str, pieces: Float, colors: NDArray[np.uint8], pixels: float) -> Any:
+    def lines(
+        self,
+        layer: str,
+        pieces: Float,
+        colors: NDArray[np.uint8],
+        pixels: float,
+        part: str = "lines",
+    ) -> Any:
         """Line segments (n, 2, 3) in m, relative to the scene's origin; colors (3,) or alike."""
         return self.server.scene.add_line_segments(
-            node_path(layer, "lines"),
+            node_path(layer, part),
             pieces.astype(np.float32),
             colors,
             thickness=pixels,

@@ -31,6 +31,7 @@ class ObjectNodes:
 
     Attributes:
         selected: id of the selected object; None: none is.
+        session: name of the session of a place whose objects are shown; empty in other results.
     """
 
     def __init__(self, nodes: Nodes, on_click: Callable[[int], None]) -> None:
@@ -45,6 +46,7 @@ class ObjectNodes:
         self._labels: list[Any] = []
         self._models: list[Any] = []
         self.selected: int | None = None
+        self.session = ""
 
     def make_boxes(self) -> None:
         """Create edges and sides of the boxes, and what marks the selected one."""
@@ -108,12 +110,18 @@ class ObjectNodes:
                 node.visible = is_present(model.track, stamp_ns)
                 if node.visible:
                     self._nodes.place(node, model.pose_at(stamp_ns))
-        objects = object_poses_at(self._tracks, stamp_ns)
+        objects = self._objects_at(stamp_ns)
         if shown("Objects"):
             self._draw_boxes(objects)
         if self._tracks:
             self._draw_numbers(objects, _MAX_NUMBERS if shown("Object ids") else 0)
             self._draw_mark(objects)
+
+    def _objects_at(self, stamp_ns: int) -> ObjectPoses:
+        """Those of the session: clocks of robots may agree."""
+        found = object_poses_at(self._tracks, stamp_ns)
+        own = np.array([self._tracks[n].session == self.session for n in found.track], np.bool_)
+        return ObjectPoses(found.track[own], found.T_map_object[own], found.size[own])
 
     def _colors(self, index: NDArray[np.intp]) -> NDArray[np.uint8]:
         return color_by_id([self._tracks[n].id for n in index])

@@ -9,17 +9,20 @@ from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from stillmap.core.errors import InputError
 from stillmap.core.files import read_text
 from stillmap.core.se2 import inverse
 from stillmap.io.trajectory import read_tum
 from stillmap.pipeline.snapshots import Window
+from stillmap.places.inputs import is_place
 from stillmap.results import gltf
 from stillmap.results.object_poses import interpolate_pose
-from stillmap.results.reader import Track, read_grid, read_tracks
+from stillmap.results.reader import Grid, Track, read_grid, read_tracks
 from stillmap.results.report.figures import UNKNOWN, draw_map, map_window
 from stillmap.viewer.display import Points, sample_ply
+from stillmap.viewer.place import ViewedPlace, read_viewed_place
 
 MAX_POINTS = {"static": 500_000, "dynamic": 200_000}
 _MAX_MESH = 512 << 20  # bytes of mesh.glb
@@ -86,6 +89,7 @@ class Scene:
         origin: (3,) whole m in the map frame; everything is drawn relative to it.
         ground: height of the map image in m.
         notes: what cannot be shown, and why.
+        place: the sessions of a place, in whose order the scans are; None: a single result.
     """
 
     name: str
@@ -100,6 +104,7 @@ class Scene:
     origin: Float
     ground: float
     notes: list[str] = field(default_factory=list)
+    place: ViewedPlace | None = None
 
     @property
     def is_2d(self) -> bool:
@@ -108,16 +113,20 @@ class Scene:
 
 
 def read_scene(folder: Path, recording: str = "") -> Scene:
-    """Read a result folder; optional files may be missing, unusable models are noted.
+    """Read a result folder or a place; optional files may be missing, unusable models are noted.
 
     Args:
-        folder: the result.
+        folder: the result, or the place.
         recording: name of its recording; that of the folder where it is empty.
 
     Raises:
         InputError: map or trajectory are missing, or a file is damaged.
     """
-    stamp_ns, poses = read_tum(folder / "trajectory.tum")
+    place, grid = None, read_grid(folder)
+    if is_place(folder):
+        place, stamp_ns, poses = read_viewed_place(folder, grid)
+    else:
+        stamp_ns, poses = read_tum(folder / "trajectory.tum")
     origin = _origin(poses)
     raw = {
         name: sample_ply(folder / f"{name}.ply", most)
@@ -134,7 +143,7 @@ def read_scene(folder: Path, recording: str = "") -> Scene:
         folder=folder.resolve().name,
         stamp_ns=stamp_ns,
         poses=poses,
-        map_image=_map_image(folder, transparent=bool(raw)),
+        map_image=_map_image(grid, place, transparent=bool(raw)),
         clouds={
             name: Points((one.points - origin).astype(np.float32), one.colors, one.total)
             for name, one in raw.items()
@@ -145,6 +154,7 @@ def read_scene(folder: Path, recording: str = "") -> Scene:
         origin=origin,
         ground=_ground(raw.get("static"), poses),
         notes=notes,
+        place=place,
     )
 
 
@@ -155,16 +165,28 @@ def _origin(poses: Float) -> Float:
     return np.asarray(np.round(0.5 * (positions.min(axis=0) + positions.max(axis=0))))
 
 
-def _map_image(folder: Path, transparent: bool) -> MapImage | None:
-    grid = read_grid(folder)
+def _map_image(grid: Grid, place: ViewedPlace | None, transparent: bool) -> MapImage | None:
     if not grid.p_occupied.size:
         return None
+    if place is not None and place.pictures is not None:
+        last = place.pictures.draw(len(place) - 1)
+        return MapImage(to_rgba(last, transparent), place.pictures.view.window)
     window = map_window([grid])
-    picture = np.array(draw_map(grid, window).convert("RGBA"))
+    return MapImage(to_rgba(draw_map(grid, window), transparent), window)
+
+
+def to_rgba(drawn: Image.Image, transparent: bool) -> NDArray[np.uint8]:
+    """(h, w, 4) of a drawn map, large enough for browsers.
+
+    Args:
+        drawn: the map.
+        transparent: where it is unknown.
+    """
+    picture = np.array(drawn.convert("RGBA"))
     if transparent:
         picture[(picture[..., :3] == UNKNOWN).all(axis=2), 3] = 0
     scale = max(1, _MIN_IMAGE_SIZE // max(picture.shape))
-    return MapImage(picture.repeat(scale, axis=0).repeat(scale, axis=1), window)
+    return picture.repeat(scale, axis=0).repeat(scale, axis=1)
 
 
 def _ground(static: Points | None, poses: Float) -> float:

@@ -17,6 +17,7 @@ LAYER_KEYS = {
     "Object models": "0",
     "Object ids": "N",
 }
+PLACE_LAYER_KEYS = {"Sessions": "T", "Changes": "C", "Change labels": "B"}
 _ACTION_KEYS = {
     "Play or pause": "space",
     "Next scan": "arrowright",
@@ -28,7 +29,8 @@ _ACTION_KEYS = {
     "Default view": "V",
     "Legend": "L",
 }
-# for the line that lists them
+_PLACE_ACTION_KEYS = {"Next session": "pagedown", "Previous session": "pageup"}
+# for the lines that list them
 KEYS = (
     ("Space", "play or pause"),
     ("← →", "one scan"),
@@ -41,6 +43,10 @@ KEYS = (
     ("W A S D Q E, ↑ ↓", "move the camera"),
     ("Ctrl K", "all commands"),
 )
+PLACE_KEYS = (
+    ("Page ↑ Page ↓", "one session"),
+    ("T, C, B", "trajectories of sessions, changes, their labels"),
+)
 
 
 def add_shortcuts(gui: Any, actions: dict[str, Callable[[], None]]) -> None:
@@ -50,8 +56,9 @@ def add_shortcuts(gui: Any, actions: dict[str, Callable[[], None]]) -> None:
         gui: of the server.
         actions: by name of the action or layer; called in a thread of viser.
     """
-    keys = {**_ACTION_KEYS, **LAYER_KEYS}
+    acting = _ACTION_KEYS | _PLACE_ACTION_KEYS
+    keys = acting | LAYER_KEYS | PLACE_LAYER_KEYS
     for name, act in actions.items():
-        label = name if name in _ACTION_KEYS else f"Show or hide: {name.lower()}"
+        label = name if name in acting else f"Show or hide: {name.lower()}"
         command = gui.add_command(label, hotkey=keys[name])
         command.on_trigger(lambda _event, act=act: act())

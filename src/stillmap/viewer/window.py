@@ -7,6 +7,7 @@ from queue import Empty, SimpleQueue
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stillmap.viewer.beams import Beams
 from stillmap.viewer.layers import Layers
@@ -18,7 +19,9 @@ from stillmap.viewer.objects import ObjectNodes
 from stillmap.viewer.ruler import Ruler
 from stillmap.viewer.scene import Scene
 from stillmap.viewer.server import start_server, stop_server
-from stillmap.viewer.shortcuts import LAYER_KEYS, add_shortcuts
+from stillmap.viewer.session_controls import SessionControls
+from stillmap.viewer.sessions import SessionNodes
+from stillmap.viewer.shortcuts import LAYER_KEYS, PLACE_LAYER_KEYS, add_shortcuts
 from stillmap.viewer.text import escape_markdown, table_html
 from stillmap.viewer.tracks import describe_object
 from stillmap.viewer.view import FIELD_OF_VIEW, MIN_ASPECT, default_view
@@ -44,7 +47,8 @@ class Window:
             InputError: the port is taken.
         """
         self._scene, self._view = scene, default_view(scene)
-        self._seconds = 1e-9 * (scene.stamp_ns - scene.stamp_ns[0])
+        self._scans = range(len(scene.stamp_ns))  # of a place, those of the session that is shown
+        self._seconds = self._measure_seconds()
         self.scan, self._at, self._playing, self._ticked = 0, 0.0, False, time.monotonic()
         self._events: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._server = start_server(port, f"{scene.name} - stillmap")
@@ -54,11 +58,16 @@ class Window:
             camera.position, camera.look_at = self._view.position, self._view.look_at
             nodes = Nodes(self._server, scene, self._view.height)
             self._objects = ObjectNodes(nodes, self._click_object)
-            self._layers = Layers(nodes, beams, self._objects)
+            place, self._sessions = scene.place, None
+            if place is not None:
+                self._sessions = SessionNodes(nodes, place)
+            self._layers = Layers(nodes, beams, self._objects, self._sessions)
             self._legends = LegendPanels(self._server)
             self._add_controls(Ruler(nodes))
             add_shortcuts(self._server.gui, self._actions())
             self.show(0)
+            if place is not None:
+                self.show_session(len(place) - 1)
         except BaseException:
             self.close()
             raise
@@ -78,8 +87,29 @@ class Window:
         with self._server.atomic():
             self._slider.value = scan
             self._clock.value = f"{self._seconds[scan]:.1f} of {self._seconds[-1]:.1f} s"
-            self._layers.update(scan)
+            self._layers.update(self._scans[scan])
             self._show_facts()
+
+    def show_session(self, session: int) -> None:
+        """Show a session of a place from its first scan."""
+        place, nodes, controls = self._scene.place, self._sessions, self._session_controls
+        if place is None or nodes is None or controls is None:
+            return
+        nodes.session, self._scans = session, place.scans_of(session)
+        self._seconds = self._measure_seconds()
+        last = len(self._scans) - 1
+        with self._server.atomic():
+            self._slider.max, self._slider.disabled = max(last, 1), not last
+            self._button.disabled = not last
+            self._layers.show_session(session)
+            controls.show()
+            self._at = 0.0
+            self.show(0)
+
+    def _measure_seconds(self) -> NDArray[np.float64]:
+        """When each scan was taken, since the first one."""
+        stamps = self._scene.stamp_ns[self._scans.start : self._scans.stop]
+        return np.asarray(1e-9 * (stamps - stamps[0]))
 
     def play(self, playing: bool) -> None:
         """Start or pause the playback."""
@@ -96,7 +126,11 @@ class Window:
         self._handle_events()
         now = time.monotonic()
         passed, self._ticked = now - self._ticked, now
-        wanted = int(self._slider.value)
+        controls = self._session_controls
+        if controls and self._sessions and controls.wanted != self._sessions.session:
+            self.show_session(controls.wanted)
+        # a page may still name a scan of a longer session
+        wanted = min(int(self._slider.value), len(self._scans) - 1)
         if wanted != self.scan:  # the slider was moved
             self._at = float(self._seconds[wanted])
         elif self._playing:
@@ -147,6 +181,10 @@ class Window:
             "Default view": self._reset_cameras,
             "Legend": self._legends.toggle,
         }
+        controls = self._session_controls
+        if controls is not None:
+            actions["Next session"] = lambda: controls.go_to(controls.wanted + 1)
+            actions["Previous session"] = lambda: controls.go_to(controls.wanted - 1)
         for name, box in self._boxes.items():
             actions[name] = partial(_toggle, box)
         return {name: self._queued(act) for name, act in actions.items()}
@@ -181,7 +219,7 @@ class Window:
         found = [one for one in self._scene.tracks if one.id == self._objects.selected]
         self._facts_folder.visible = bool(found)
         for track in found:
-            now, start = (int(self._scene.stamp_ns[n]) for n in (self.scan, 0))
+            now, start = (int(self._scene.stamp_ns[self._scans[n]]) for n in (self.scan, 0))
             self._facts_folder.label = f"Object {track.id}"
             self._facts.content = table_html(describe_object(track, now, start))
 
@@ -198,6 +236,9 @@ class Window:
         gui.main_panel.dock_right()  # beside the scene, not over it
         name, folder = escape_markdown(scene.name), escape_markdown(scene.folder)
         gui.add_markdown(f"**{name}**" if name == folder else f"**{name}**, result {folder}")
+        self._session_controls: SessionControls | None = None
+        if scene.place is not None and self._sessions is not None:
+            self._session_controls = SessionControls(gui, scene.place, self._sessions)
         # Any: viser's types do not allow setting values
         self._slider: Any = gui.add_slider("Scan", 0, max(last, 1), 1, 0, disabled=not last)
         self._clock: Any = gui.add_text("Time", "", disabled=True)
@@ -212,13 +253,14 @@ class Window:
         self._add_layer_controls()
         for note in scene.notes:
             gui.add_markdown(escape_markdown(note))
-        gui.add_html(help_html())
+        gui.add_html(help_html(is_place=scene.place is not None))
 
     def _add_layer_controls(self) -> None:
         gui, visible = self._server.gui, self._layers.default_visibility
+        keys = LAYER_KEYS | PLACE_LAYER_KEYS
         with gui.add_folder("Show"):
             self._boxes: dict[str, Any] = {
-                name: gui.add_checkbox(f"{LAYER_KEYS[name]} {name}", shown)
+                name: gui.add_checkbox(f"{keys[name]} {name}", shown)
                 for name, shown in visible.items()
             }
             colorings = self._layers.colorings

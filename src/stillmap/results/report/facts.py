@@ -1,5 +1,6 @@
 """What the report says of a run: headline figures, warnings, files, the recording, stages."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ _FILES = {
     "beams/p_static.npy": "probability of every beam to be static",
     "run.json": "record of this run",
 }
+_NO_MORE: Mapping[str, str] = {}
 # what the stages of a run do
 _STAGES = {
     "read": "reading the recording",
@@ -89,11 +91,17 @@ def _sentence_of(line: str) -> str:
     return line.partition(": ")[2]
 
 
-def files_data(folder: Path | None) -> list[tuple[str, str]]:
-    """Names, relative to the report, and content of the files that a result folder has."""
+def files_data(folder: Path | None, more: Mapping[str, str] = _NO_MORE) -> list[tuple[str, str]]:
+    """Names, relative to the report, and content of the files that a result folder has.
+
+    Args:
+        folder: None: no files.
+        more: names and content of files that only some results have, which come first.
+    """
     if folder is None:
         return []
-    return [(name, what) for name, what in _FILES.items() if (folder / name).is_file()]
+    known = {**more, **_FILES, **more}
+    return [(name, what) for name, what in known.items() if (folder / name).is_file()]
 
 
 def stages_data(result: MappingResult) -> list[tuple[str, float, int]]:

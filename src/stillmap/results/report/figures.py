@@ -22,7 +22,7 @@ Color = tuple[int, int, int]
 Mask = NDArray[np.bool_]
 ORANGE, UNKNOWN, VIOLET = (240, 120, 0), (190, 196, 204), (140, 60, 220)  # RGB
 VEIL_ALPHA = 80  # of 255, of thinly observed cells: walls and free space show through
-_MAX_PIXELS = 1_500_000  # of a map: fills a large screen, a few hundred kB as PNG
+MAX_PIXELS = 1_500_000  # of a map: fills a large screen, a few hundred kB as PNG
 _SNAPSHOT_PIXELS = 480  # longest edge of a snapshot
 _STRIP = 1 << 20  # cells drawn at once
 _DOT_WIDTH = 600  # pixels of image width per pixel of dot size
@@ -45,10 +45,10 @@ class MapView:
     reduced: bool
 
     @classmethod
-    def of(cls, maps: Sequence[GridMap]) -> Self:
+    def of(cls, maps: Sequence[GridMap], max_pixels: int = MAX_PIXELS) -> Self:
         """The view of `draw_map` of any of `maps` in the window that contains them all."""
         window, resolution = map_window(maps), maps[0].resolution
-        factor = _reduction(window, resolution)
+        factor = reduction_factor(window, resolution, max_pixels)
         x0, y0, x1, y1 = window
         width, height = (-(-round(d / resolution) // factor) for d in (x1 - x0, y1 - y0))
         return cls(window, (width, height), factor > 1)
@@ -102,18 +102,43 @@ def map_window(maps: Sequence[GridMap]) -> Window:
     return extent(maps[0])
 
 
-def draw_map(occupancy: GridMap, window: Window, max_pixels: int = _MAX_PIXELS) -> Image.Image:
+def draw_map(occupancy: GridMap, window: Window, max_pixels: int = MAX_PIXELS) -> Image.Image:
     """White free, grey unknown, black occupied; larger maps are reduced to `max_pixels`."""
-    factor = _reduction(window, occupancy.resolution, max_pixels)
-    strips = iter_strips(occupancy, occupancy.p_occupied, window, np.nan, factor)
-    return _with_palette(np.concatenate([reduce_levels(cells, factor) for cells in strips])[::-1])
+    return color_levels(map_levels(occupancy, window, max_pixels=max_pixels))
+
+
+def map_levels(
+    occupancy: GridMap,
+    window: Window,
+    free: NDArray[np.integer] | None = None,
+    max_pixels: int = MAX_PIXELS,
+) -> NDArray[np.uint8]:
+    """(h, w) of `reduce_levels`, row 0 with the highest y.
+
+    Args:
+        occupancy: the map.
+        window: the part that is drawn.
+        free: (n, 2) column and row, from the window's lower left, of cells taken for free.
+        max_pixels: to which large maps are reduced.
+    """
+    factor, first = reduction_factor(window, occupancy.resolution, max_pixels), 0
+    levels = []
+    for cells in iter_strips(occupancy, occupancy.p_occupied, window, np.nan, factor):
+        if free is not None:
+            cells = cells.copy()
+            column, row = free[(free[:, 1] >= first) & (free[:, 1] < first + len(cells))].T
+            inside = (column >= 0) & (column < cells.shape[1])
+            cells[row[inside] - first, column[inside]] = 0.0
+            first += len(cells)
+        levels.append(reduce_levels(cells, factor))
+    return np.ascontiguousarray(np.concatenate(levels)[::-1])
 
 
 def draw_thinly_observed(
     occupancy: GridMap, thin: NDArray[np.bool_], window: Window
 ) -> Image.Image:
     """Thinly observed cells (H, W) in violet, as a layer over the `draw_map` of the window."""
-    factor = _reduction(window, occupancy.resolution)
+    factor = reduction_factor(window, occupancy.resolution)
     shown = np.concatenate(
         [
             _mostly(cells, ~np.isnan(p), factor)
@@ -144,7 +169,7 @@ def draw_snapshot(snapshot: Snapshot) -> Image.Image:
     height, width = pixels.shape
     view = MapView(extent(snapshot), (width, height), False)
     _put_dots(pixels, view.to_pixels(snapshot.dynamic_points), _ORANGE_INDEX, 3)
-    return _with_palette(pixels)
+    return color_levels(pixels)
 
 
 def data_uri(image: Image.Image, format: str = "png", **options: int) -> str:
@@ -195,7 +220,7 @@ def _box(occupancy: GridMap, select: Callable[[NDArray[np.float32]], Mask]) -> W
     )
 
 
-def _reduction(window: Window, resolution: float, max_pixels: int = _MAX_PIXELS) -> int:
+def reduction_factor(window: Window, resolution: float, max_pixels: int = MAX_PIXELS) -> int:
     """Number of cells along each axis that share a pixel."""
     x0, y0, x1, y1 = window
     cells = round((x1 - x0) / resolution) * round((y1 - y0) / resolution)
@@ -234,10 +259,11 @@ def reduce_levels(cells: NDArray[np.float32], factor: int) -> NDArray[np.uint8]:
     )
 
 
-def _with_palette(levels: NDArray[np.uint8]) -> Image.Image:
+def color_levels(levels: NDArray[np.uint8], *colors: Color) -> Image.Image:
+    """Shades of levels; `colors` follow those of `_ORANGE_INDEX`."""
     # gamma 0.6 makes the few percent visible that a walker leaves in the raw map
     shades = [round(255 * (1 - (percent / 100) ** 0.6)) for percent in range(101)]
-    return color_by_index(levels, (*((shade,) * 3 for shade in shades), UNKNOWN, ORANGE))
+    return color_by_index(levels, (*((shade,) * 3 for shade in shades), UNKNOWN, ORANGE, *colors))
 
 
 def _put_dots(

@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from stillmap.core import se2
+from stillmap.core.grid_map import GridMap
 from stillmap.core.tiles import tiles_of
 from stillmap.mapping import Change
 from stillmap.mapping.beam_statistics import sample_dynamic_points
+from stillmap.pipeline.options import MapMode
 from stillmap.pipeline.result import MappingResult
 from stillmap.pipeline.snapshots import Snapshot, extent
 from stillmap.results.map_npz import CHANGED, changed_cells, known_area
@@ -67,7 +69,7 @@ def map_data(result: MappingResult, filtered: MapFigure | None) -> dict[str, Any
         "view": view,
         "meters": tuple(n * result.map.resolution for n in result.map.p_occupied.shape[::-1]),
         "cell": result.map.resolution,
-        "written": _written_data(result, view),
+        "written": written_data(result.map, result.options.output.map_mode, view),
         "raw": data_uri(draw_map(result.raw_map, view.window)),
         "filtered": filtered.uri,
         "dynamic": data_uri(draw_points(ends, view)),
@@ -82,9 +84,9 @@ def map_data(result: MappingResult, filtered: MapFigure | None) -> dict[str, Any
     }
 
 
-def _written_data(result: MappingResult, view: MapView) -> dict[str, Any]:
+def written_data(occupancy: GridMap, mode: MapMode, view: MapView) -> dict[str, Any]:
     """The picture of the whole map, placed in percent of the view, and the bounds of both in m."""
-    written = draw_written_map(result.map, result.options.output.map_mode)
+    written = draw_written_map(occupancy, mode)
     x0, y0, x1, y1 = view.window
     left, bottom, right, top = written.window
     width, height = x1 - x0, y1 - y0

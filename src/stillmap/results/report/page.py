@@ -71,7 +71,7 @@ def render_report(
         "stages": stages_data(result),
         "options": [(one.name, one.value) for one in iter_options(result.options)],
         "version": package_version(),
-        **_script_data(),
+        **script_data(),
     }
     return environment().get_template("report.html.j2").render(data)
 
@@ -95,7 +95,7 @@ def _models_data(previews: "ModelPreviews | None") -> dict[str, Any] | None:
 
 
 @functools.cache
-def _script_data() -> dict[str, str]:
+def script_data() -> dict[str, str]:
     """The page's script, and its hash, without which browsers run no script of the page."""
     script = (_TEMPLATES / "map_view.js").read_text(encoding="utf-8")
     digest = hashlib.sha256(script.encode()).digest()

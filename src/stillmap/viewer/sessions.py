@@ -1,0 +1,164 @@
+"""The sessions of a place as viser nodes: trajectories, boxes of changes and their labels."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.arrays import sample_indices
+from stillmap.places.pictures import KIND_COLORS
+from stillmap.places.timeline import ChangeRecord
+from stillmap.results.colors import color_by_id
+from stillmap.results.object_poses import ObjectPoses
+from stillmap.viewer.nodes import Nodes, node_path
+from stillmap.viewer.place import ViewedPlace
+from stillmap.viewer.tracks import box_edges
+
+Float = NDArray[np.float64]
+
+_MAX_TRAJECTORY_POINTS = 20_000  # of all sessions together
+_MAX_LABELS = 100
+_MARGIN = 0.05  # m around what changed
+# of an arrow's head, as shares of its length at most, and of the height of the view
+_MAX_HEAD, _HEAD = 0.5, 0.02
+# lengths drawn and left out in turn, as shares of the height of the view; None: a whole line
+_DASHES: dict[str, tuple[float, ...] | None] = {
+    "appeared": None,
+    "gone": (0.006, 0.004),
+    "moved": None,
+    "from": (0.002, 0.003),
+    "door": (0.01, 0.003, 0.002, 0.003),
+}
+
+
+class SessionNodes:
+    """The nodes that only a place has.
+
+    Attributes:
+        session: index of the session that is shown.
+    """
+
+    def __init__(self, nodes: Nodes, place: ViewedPlace) -> None:
+        """Create nothing yet.
+
+        Args:
+            nodes: creates them.
+            place: the sessions.
+        """
+        self._nodes, self._place = nodes, place
+        self._labels: list[Any] = []
+        self._lines: dict[str, Any] = {}
+        self.session = len(place) - 1
+
+    @property
+    def changes(self) -> list[ChangeRecord]:
+        """What changed since the session before."""
+        return self._place.timeline.changes_at(self.session)
+
+    def make_trajectories(self) -> None:
+        """Create the lines of all sessions, each in its color."""
+        place, poses = self._place, self._nodes.scene.poses
+        most = max(_MAX_TRAJECTORY_POINTS // len(place), 2)
+        for k in range(len(place)):
+            scans = np.array(place.scans_of(k))
+            points = poses[scans[sample_indices(len(scans), most)], :3, 3] - self._nodes.origin(1)
+            if len(points) > 1:
+                pieces = np.stack([points[:-1], points[1:]], axis=1)
+                # one node each: viser draws colors of single lines paler than those of a whole node
+                self._nodes.lines("Sessions", pieces, color_by_id([k])[0], 1.5, str(k))
+
+    def make_boxes(self) -> None:
+        """Create the lines around what changed, a node for each kind."""
+        for kind, color in KIND_COLORS.items():
+            pieces = np.zeros((1, 2, 3))
+            self._lines[kind] = self._nodes.lines(
+                "Changes", pieces, np.array(color, np.uint8), 2.5, kind
+            )
+
+    def update(self, with_boxes: bool, with_labels: bool) -> None:
+        """Show what changed since the session before.
+
+        Args:
+            with_boxes: whether boxes are visible.
+            with_labels: whether labels are.
+        """
+        if with_boxes:
+            self._draw_boxes()
+        if len(self._place) > 1:
+            self._draw_labels(self.changes[:_MAX_LABELS] if with_labels else [])
+
+    def _draw_boxes(self) -> None:
+        for kind, node in self._lines.items():
+            outlines = [
+                _outline(one, self._nodes.height) for one in self.changes if one.kind == kind
+            ]
+            node.visible = bool(outlines)
+            if outlines:
+                drawn = np.concatenate(outlines) - self._nodes.origin(3)
+                node.points = drawn.astype(np.float32)
+
+    def _draw_labels(self, changes: list[ChangeRecord]) -> None:
+        """Labels are created on demand and reused."""
+        while len(self._labels) < len(changes):
+            path = node_path("Change labels", f"{len(self._labels)}")
+            self._labels.append(self._nodes.label(path))
+        for n, label in enumerate(self._labels):
+            label.visible = n < len(changes)
+            if label.visible:
+                label.text = f"{changes[n].label} {changes[n].kind}"
+                low, high = (_in_space(of) for of in (changes[n].low, changes[n].high))
+                middle = 0.5 * (low + high)
+                label.position = np.array([middle[0], high[1], high[2]]) - self._nodes.origin(4)
+
+
+def _outline(change: ChangeRecord, height: float) -> Float:
+    """Line segments (n, 2, 3) m of a change: its box; of what moved both boxes and an arrow."""
+    edges = _box_edges(change.low, change.high)
+    out = [_dashed(edges, _DASHES[change.kind], height)]
+    if change.from_low is not None and change.from_high is not None:
+        start = _box_edges(change.from_low, change.from_high)
+        out += [
+            _dashed(start, _DASHES["from"], height),
+            _arrow(start.mean((0, 1)), edges.mean((0, 1)), height),
+        ]
+    return np.concatenate(out)
+
+
+def _in_space(corner: Float) -> Float:
+    """(3,) of a corner (D,)."""
+    return np.array([*corner, 0.0][:3])
+
+
+def _box_edges(low: Float, high: Float) -> Float:
+    """(n, 2, 3) m, a little outside of the corners (D,)."""
+    low, high = _in_space(low), _in_space(high)
+    T = np.eye(4)[None].copy()
+    T[0, :3, 3] = 0.5 * (low + high)
+    size = high - low
+    size += 2.0 * _MARGIN * (size > 0.0)
+    return np.asarray(box_edges(ObjectPoses(np.zeros(1, np.intp), T, size[None]))[0])
+
+
+def _dashed(edges: Float, pattern: tuple[float, ...] | None, height: float) -> Float:
+    """The parts of edges (n, 2, 3) that are drawn."""
+    if pattern is None:
+        return edges
+    lengths = np.array(pattern) * height
+    out = []
+    for a, b in edges:
+        length = float(np.linalg.norm(b - a))
+        ends = np.cumsum(np.tile(lengths, int(length / lengths.sum()) + 1))
+        starts = np.concatenate([[0.0], ends[:-1]])[::2]
+        share = np.stack([starts, ends[::2]], axis=1)[starts < length] / max(length, 1e-9)
+        out.append(a + np.minimum(share, 1.0)[:, :, None] * (b - a))
+    return np.concatenate(out)
+
+
+def _arrow(start: Float, end: Float, height: float) -> Float:
+    """(3, 2, 3): a line and its head, which lies in the plane."""
+    length = max(float(np.linalg.norm(end - start)), 1e-9)
+    along = (end - start) / length
+    across = np.array([-along[1], along[0], 0.0])
+    head = min(_MAX_HEAD * length, _HEAD * height)
+    wings = [end - head * (along + side * 0.5 * across) for side in (1.0, -1.0)]
+    return np.array([[start, end], [wings[0], end], [wings[1], end]])

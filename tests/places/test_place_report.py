@@ -1,0 +1,303 @@
+"""`report.html` of a place."""
+
+import base64
+import hashlib
+import html
+import io
+import json
+import re
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+from small_place import RECORD, make_place
+
+from stillmap.cli.main import main
+from stillmap.places.report.marks import place_marks
+from stillmap.places.report.page import render_place_report
+from stillmap.places.timeline_reader import read_timeline
+from stillmap.results.reader import read_grid
+from stillmap.results.report.figures import MapView
+from stillmap.sim import (
+    CrowdOptions,
+    LaserOptions,
+    RobotOptions,
+    Scene,
+    simulate,
+    write_simulation,
+)
+from stillmap.sim.walls import box
+
+VOID = {"meta", "img", "input", "br", "link", "hr"}
+
+
+class Page(HTMLParser):
+    """Tags with their attributes, rows of tables, and text; tags must close in order."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.rows, self._open = [], [], []
+        self.feed(text)
+        self.close()
+        assert self._open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self._open.append(tag)
+        if tag == "tr":
+            self.rows.append([])
+        elif tag in ("td", "th"):
+            self.rows[-1].append("")
+
+    def handle_startendtag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag):
+        assert self._open.pop() == tag
+
+    def handle_data(self, data):
+        if {"td", "th"} & {*self._open}:
+            self.rows[-1][-1] += data
+
+    def named(self, tag):
+        return [attrs for name, attrs in self.tags if name == tag]
+
+
+def rendered(folder, record=RECORD):
+    return render_place_report(folder, read_grid(folder), "trinary", record)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    return make_place(tmp_path_factory.mktemp("made up") / "place")
+
+
+@pytest.fixture(scope="module")
+def text(place):
+    return rendered(place)
+
+
+@pytest.fixture(scope="module")
+def page(text):
+    return Page(text)
+
+
+def section_of(text, title):
+    return text.split(f">{title}</h2>")[1].split("</section>")[0]
+
+
+def test_page_asks_for_nothing_outside(text, page):
+    for tag, attrs in page.tags:
+        for name in ("src", "href"):
+            where = attrs.get(name, "")
+            if tag != "a" and not where.startswith("#"):
+                assert where == "" or where.startswith("data:image/"), (tag, where)
+    assert not re.search(r"url\((?!data:)", text)
+    policy = page.named("meta")[1]["content"]
+    script = re.search(r"<script>(.*)</script>", text, re.DOTALL)[1]
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    assert f"script-src 'sha256-{digest}'" in policy
+    assert "default-src 'none'" in policy
+
+
+def test_names_are_escaped(text):
+    assert "thursday <b>" not in text
+    assert "thursday &lt;b&gt;" in text
+    assert "no <i>overlap" not in text
+
+
+def test_every_session_has_a_row(page):
+    rows = {row[1]: row for row in page.rows if row[1:2] and row[0] in ("1", "2", "3", "4", "-")}
+    assert [*rows] == ["monday", "tuesday", "wednesday", "thursday <b>", "lost"]
+    tuesday = rows["tuesday"]
+    assert tuesday[2] == "2026-05-29 20:26"
+    assert tuesday[3:] == ["4 s", "yes", "75.0 %", "1.50, -2.25", "5.7°", "/logs/tuesday.bag"]
+    assert rows["lost"][4] == "no: no <i>overlap</i>"
+    assert rows["lost"][-1] == "/logs/lost.bag"
+
+
+def test_refused_sessions_stand_at_the_top(text):
+    warnings = section_of(text, "One session is not in the place")
+    assert "lost" in warnings
+    assert html.escape("no <i>overlap</i>") in warnings
+
+
+def test_changes_are_listed_between_their_sessions(text):
+    parts = section_of(text, "Changes between sessions").split("<h3>")[1:]
+    assert [html.unescape(part.split("</h3>")[0]) for part in parts] == [
+        "1 to 2: monday (2026-05-28) to tuesday (2026-05-29)",
+        "2 to 3: tuesday (2026-05-29) to wednesday (2026-05-30)",
+        "3 to 4: wednesday (2026-05-30) to thursday <b> (2026-05-31)",
+    ]
+    tables = [re.search(r"<table>.*</table>", one, re.DOTALL)[0] for one in parts]
+    rows = [Page(one).rows[1:] for one in tables]
+    assert rows[0] == [["A0", "appeared", "-0.60, 1.20", "0.40 x 0.40", "0.90", ""]]
+    assert rows[1] == [
+        ["M1", "moved", "2.80, 1.80", "0.40 x 0.40", "0.91", "from 2.20, 1.20"],
+        ["D2", "door", "2.20, 1.20", "0.40 x 0.40", "0.92", ""],
+    ]
+    assert rows[2][0][:2] == ["G3", "gone"]
+    assert rows[2][0][-1] == "last seen before by tuesday"
+
+
+def test_kinds_are_told_apart_without_colors(text):
+    step = section_of(text, "Changes between sessions").split("<h3>")[2]
+    figure = re.search(r"<svg role=\"img\".*?</svg>", step, re.DOTALL)[0]
+    assert re.findall(r">(\w\d)</text>", figure) == ["M1", "D2"]
+    assert figure.count('class="mark moved from"') == figure.count('class="mark arrow"') == 1
+    style = text.split("</style>")[0]
+    dashes = [
+        re.search(rf"\.mark\.{kind} {{ stroke-dasharray: ([^;]+);", style)[1]
+        for kind in ("gone", "from", "door")
+    ]
+    assert len({*dashes}) == 3
+
+
+def test_base_map_is_there_once_and_sessions_as_differences(text):
+    assert text.count('<image id="place-map"') == 1
+    assert text.count('<use href="#place-map"/>') == 3
+    patches = re.findall(
+        r'<image class="" href="data:image/png;base64,([^"]+)" x="(\d+)" y="(\d+)" width="(\d+)"',
+        text,
+    )
+    assert len(patches) == 3
+    for data, _, _, width in patches:
+        assert Image.open(io.BytesIO(base64.b64decode(data))).width == int(width)
+
+
+def test_small_pictures_are_palette_images(page):
+    small = [one for one in page.named("img") if one.get("class") == "preview"]
+    assert [one["alt"].split(":")[1].strip() for one in small] == [
+        "the first session",
+        "1 appeared",
+        "1 moved, 1 door otherwise",
+        "1 gone",
+    ]
+    for one in small:
+        data = base64.b64decode(one["src"].partition(",")[2])
+        assert Image.open(io.BytesIO(data)).mode == "P"
+
+
+def test_trajectory_of_every_session_is_on_the_map(text):
+    main_map = section_of(text, "Map")
+    assert main_map.count("<polyline") == 4
+    assert re.findall(r">(\d)</text>", main_map) == ["1", "2", "3", "4"]
+
+
+def test_state_of_the_map_is_named(place):
+    for state, words in (
+        ("majority", "as most sessions saw it"),
+        ("2026-05-30", "as of 2026-05-30"),
+    ):
+        record = {**RECORD, "place": {**RECORD["place"], "map_state": state}}
+        assert words in rendered(place, record)
+
+
+def test_place_without_changes(tmp_path):
+    folder = make_place(tmp_path / "place")
+    (folder / "changes.json").write_text("[]")
+    page = rendered(folder)
+    assert "Nothing changed between the sessions." in page
+    assert 'id="place-map"' not in page
+
+
+def test_links_lead_to_files(place, page):
+    links = [one["href"] for one in page.named("a")]
+    assert {"sessions.json", "changes.json", "states.npz", "map.npz"} <= {*links}
+    assert all((place / link).is_file() for link in links)
+
+
+def test_many_sessions_take_little_space(tmp_path):
+    names = [f"day {k}" for k in range(32)]
+    folder = make_place(tmp_path / "place", names=names)
+    (folder / "changes.json").write_text(json.dumps(_daily(names)))
+    page = rendered(folder)
+    assert page.count('class="preview"') == 32
+    assert len(page) < 500_000
+
+
+def _daily(names):
+    """40 changes from every session to the next."""
+    return [
+        {
+            "id": 40 * k + n,
+            "kind": "appeared",
+            "box": [-3 + 0.1 * n, -2, -2.7 + 0.1 * n, -1.5],
+            "between": names[k : k + 2],
+            "probability": 0.9,
+        }
+        for k in range(len(names) - 1)
+        for n in range(40)
+    ]
+
+
+def test_labels_do_not_cover_each_other(place):
+    timeline = read_timeline(place)
+    changes = [timeline.changes[k] for k in (0, 2, 3)]
+    marks = place_marks(changes, MapView((-4.0, -3.0, 4.0, 3.0), (800, 600), False))
+    low = np.array([(one.x, one.y - marks.font_size) for one in marks.marks])
+    high = low + np.array([2 * marks.font_size, marks.font_size])
+    for a in range(3):
+        for b in range(a):
+            apart = (high[a] <= low[b]) | (high[b] <= low[a])
+            assert apart.any()
+        assert (low[a] > 0).all()
+        assert (high[a] < [800, 600]).all()
+
+
+@pytest.fixture(scope="session")
+def merged(tmp_path_factory):
+    """A room simulated twice, a table otherwise, merged by the command."""
+    home = tmp_path_factory.mktemp("merged")
+    tables = {"monday": (-1.2, -0.4, 0.7, 0.5), "tuesday": (1.2, -0.2, 0.5, 0.8)}
+    for seed, (name, table) in enumerate(tables.items()):
+        write_simulation(simulate(_room(table), np.random.default_rng(seed)), home / name)
+    words = ["merge", *(home / name for name in tables), "-o", home / "place", "--quiet"]
+    assert main([*map(str, words), "--set", "em.max_iterations=2"]) == 0
+    return home / "place"
+
+
+def _room(table):
+    walls = (
+        *box(0, 0, 10, 7),
+        *box(-3.5, 2.2, 1.6, 0.6),
+        *box(3.9, -2, 0.8, 1.8),
+        *box(0.2, 2.6, 2.4, 0.5),
+        *box(*table),
+    )
+    return Scene(
+        "room",
+        walls=walls,
+        route=((-3.5, -2), (3, -2), (3, 1.2), (-3, 1.0)),
+        crowd=CrowdOptions(people=1),
+        laser=LaserOptions(beams=240, range_noise=0.01, max_range=9.0),
+        robot=RobotOptions(scans=90),
+    )
+
+
+def test_merge_writes_the_report(merged):
+    page = Page((merged / "report.html").read_text(encoding="utf-8"))
+    changes = json.loads((merged / "changes.json").read_text())
+    assert changes
+    listed = [row[1] for row in page.rows if re.fullmatch(r"[AGMD]\d+", row[0])]
+    assert listed == [one["kind"] for one in changes]
+
+
+def test_map_as_of_the_last_session_is_the_map(merged):
+    from stillmap.places.pictures import PlacePictures
+
+    timeline = read_timeline(merged)
+    pictures = PlacePictures(read_grid(merged), timeline)
+    shown, of_last = (
+        np.array(one.convert("RGB")) for one in (pictures.draw_map(), pictures.draw(1))
+    )
+    colored = np.ptp(of_last.astype(int), axis=2) > 30  # what changed since the first one
+    assert 0 < colored.sum() < 0.02 * colored.size
+    assert (shown == of_last)[~colored].all()

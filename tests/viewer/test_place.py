@@ -1,0 +1,222 @@
+"""A place in the viewer: a slider over its sessions."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "places"))
+
+from small_place import CHAIR, DAY, NAMES, START, make_place
+
+from stillmap.cli.main import main
+from stillmap.core.errors import InputError
+from stillmap.places.pictures import KIND_COLORS
+from stillmap.viewer.scene import read_scene
+
+pytest.importorskip("viser", reason="the extra `viewer` is not installed")
+
+from stillmap.viewer import shortcuts
+
+PLACE_LAYERS = ["Sessions", "Changes", "Change labels"]
+
+
+@pytest.fixture
+def place(tmp_path):
+    return make_place(tmp_path / "place")
+
+
+@pytest.fixture
+def window(place, opened):
+    return opened(read_scene(place), None)
+
+
+def node(window, path):
+    """A node of viser."""
+    return window._server.scene.get_handle_by_name(path)
+
+
+def chair_color(window):
+    """Of the map where the chair is from the second session on."""
+    scene, (column, row) = window._scene, CHAIR
+    x0, _, x1, y1 = scene.map_image.window
+    picture = node(window, "/map/plan").image
+    scale = picture.shape[1] / (x1 - x0)
+    x, y = -4.0 + 0.1 * (column + 0.5), -3.0 + 0.1 * (row + 0.5)
+    return tuple(picture[int((y1 - y) * scale), int((x - x0) * scale), :3].tolist())
+
+
+def test_scans_are_those_of_the_sessions(place):
+    scene = read_scene(place)
+    assert scene.name == "place"
+    assert len(scene.stamp_ns) == 20
+    assert [scene.place.scans_of(k) for k in (0, 3)] == [range(5), range(15, 20)]
+    assert scene.stamp_ns[[0, 5]].tolist() == [START, START + DAY]
+
+
+def test_last_session_is_shown_at_first(window):
+    assert window._sessions.session == 3
+    assert "session 4 of 4" in window._session_controls._title.content
+    assert window._clock.value == "0.0 of 4.0 s"
+    assert list(window._boxes)[-3:] == PLACE_LAYERS
+    assert [window._boxes[name].value for name in PLACE_LAYERS] == [True, True, False]
+
+
+def test_single_results_have_no_sessions(result_of, opened):
+    single = opened(read_scene(result_of(2)), None)
+    assert single._session_controls is None
+    assert not {*PLACE_LAYERS} & {*single._boxes}
+    assert "Next session" not in single._actions()
+
+
+def test_slider_shows_map_scans_and_changes_of_a_session(window):
+    window._session_controls._slider.value = 2
+    window.step()
+    assert window._sessions.session == 1
+    title = window._session_controls._title.content.replace("\\", "")
+    assert title == "**session 2 of 4: tuesday, 2026-05-29**"
+    assert "A0" in window._session_controls._table.content
+    assert chair_color(window) == KIND_COLORS["appeared"]
+    assert node(window, "/robot/robot").position == pytest.approx([-2.0, 0.2, 0.0])
+    path = node(window, "/robot/lines").points
+    assert (path[..., 1] == np.float32(0.2)).all()
+    window.show(4)
+    assert node(window, "/robot/robot").position == pytest.approx([2.0, 0.2, 0.0])
+
+
+def test_map_is_as_of_the_session(window):
+    seen = []
+    for session in range(4):
+        window.show_session(session)
+        seen.append(chair_color(window))
+    assert seen == [(255, 255, 255), KIND_COLORS["appeared"], (0, 0, 0), (0, 0, 0)]
+
+
+def test_boxes_are_those_of_what_changed_since_the_session_before(window):
+    shown = {}
+    for session in range(4):
+        window.show_session(session)
+        shown[session] = [k for k in KIND_COLORS if node(window, f"/changes/{k}").visible]
+    assert shown == {0: [], 1: ["appeared"], 2: ["moved", "door"], 3: ["gone"]}
+    window.show_session(2)
+    moved = node(window, "/changes/moved").points
+    # the four sides of the box, the dots of where it was, the arrow and its head
+    assert len(moved) > 4 + 4 + 3
+    assert moved[..., 0].min() == pytest.approx(1.95, abs=1e-3)
+    assert moved[..., 0].max() == pytest.approx(3.05, abs=1e-3)
+    window.show_session(3)
+    gone = node(window, "/changes/gone").points
+    assert len(gone) > 4  # dashes
+    lengths = np.linalg.norm(gone[:, 1] - gone[:, 0], axis=1)
+    assert 0.3 * 2.0 < lengths.sum() < 0.9 * 2.0
+
+
+def test_labels_are_shown_on_demand(window):
+    window.show_session(2)
+    assert node(window, "/change_labels/0") is None
+    window._boxes["Change labels"].value = True
+    window.step()
+    assert [node(window, f"/change_labels/{n}").text for n in (0, 1)] == ["M1 moved", "D2 door"]
+    window.show_session(3)
+    assert node(window, "/change_labels/0").text == "G3 gone"
+    assert not node(window, "/change_labels/1").visible
+    window._boxes["Change labels"].value = False
+    window.step()
+    assert not node(window, "/change_labels").visible
+
+
+def test_trajectories_have_a_line_for_every_session(window):
+    for k in range(4):
+        line = node(window, f"/sessions/{k}").points
+        assert line[..., 1] == pytest.approx(0.2 * k)
+
+
+def test_objects_are_those_of_the_session(window):
+    window.show_session(1)
+    window.show(2)
+    assert window._objects._drawn == [1]
+    window.show_session(0)
+    window.show(2)
+    assert window._objects._drawn == [0]
+
+
+def test_objects_of_another_session_at_the_same_time_are_not_shown(tmp_path, opened):
+    """Clocks of robots, or of simulations, may agree."""
+    window = opened(read_scene(make_place(tmp_path / "place", step=0)), None)
+    objects = [track.session for track in window._scene.tracks]
+    assert objects == [*NAMES[:2]]
+    for session in (0, 1):
+        window.show_session(session)
+        node_count = []
+        for scan in range(5):
+            window.show(scan)
+            node_count += window._objects._drawn
+        assert {*node_count} <= {session}
+
+
+def test_playback_stays_in_the_session(window):
+    window.show_session(1)
+    window._speed.value = "10 x"
+    window.play(True)
+    seen = set()
+    for _ in range(8):
+        window.step()
+        seen.add(window._scans[window.scan])
+    assert seen <= {*range(5, 10)}
+    assert len(seen) > 1
+
+
+def test_scan_of_a_longer_session_becomes_the_last_one(window):
+    window.show_session(1)
+    window._slider.value = 4000
+    window.step()
+    assert window.scan == window._slider.value == 4
+
+
+def test_keys_step_through_sessions(window):
+    act = window._actions()
+
+    def after(name):
+        act[name]()
+        window.step()
+        return window._sessions.session
+
+    assert [after("Previous session") for _ in range(4)] == [2, 1, 0, 0]
+    assert [after("Next session") for _ in range(4)] == [1, 2, 3, 3]
+    keys = [
+        *shortcuts.LAYER_KEYS.values(),
+        *shortcuts.PLACE_LAYER_KEYS.values(),
+        *shortcuts._ACTION_KEYS.values(),
+        *shortcuts._PLACE_ACTION_KEYS.values(),
+    ]
+    assert len({*keys}) == len(keys)
+    assert not {*keys} & {*"WASDQE", "arrowup", "arrowdown"}
+
+
+def test_legend_explains_colors_while_they_are_shown(window):
+    from stillmap.viewer.legend import legend_html
+
+    def told():
+        return legend_html(window._layers, "label", True)
+
+    assert "trajectories of the sessions" in told()
+    for words in ("A: appeared", "G: gone", "M: moved", "D: door"):
+        assert words in told()
+    for name in PLACE_LAYERS:
+        window._boxes[name].value = False
+    window.step()
+    assert "sessions" not in told()
+    assert "A: appeared" not in told()
+
+
+@pytest.mark.parametrize("name", ["changes.json", "states.npz", "sessions/monday/trajectory.tum"])
+def test_damaged_place_is_refused(place, name):
+    (place / name).write_bytes(b"{")
+    with pytest.raises(InputError, match=Path(name).name):
+        read_scene(place)
+
+
+def test_command_takes_no_recording_for_a_place(place, capsys):
+    assert main(["view", str(place), "--input", "a.bag"]) == 2
+    assert "is a place" in capsys.readouterr().err
