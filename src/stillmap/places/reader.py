@@ -70,7 +70,9 @@ def read_place(folder: Path) -> tuple[Place, list[Refusal], list[str]]:
         for record in records
         if not record["accepted"]
     ]
-    place = Place(sessions, ties, resolution, voxel_size, frame)
+    # that of the first one stays by itself: its first pose is what the pose graph holds
+    moved = None if frame == accepted[0]["name"] else frame
+    place = Place(sessions, ties, resolution, voxel_size, moved)
     return place, refusals, [record["name"] for record in records]
 
 
