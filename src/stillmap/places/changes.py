@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from stillmap.core.components import connected_components, neighbor_pairs
 from stillmap.core.short_repr import ShortRepr
-from stillmap.mapping.doors import compute_swept_cells
 from stillmap.places.place_states import PlaceStates
 
 Float = NDArray[np.float64]
@@ -26,7 +25,9 @@ _NOISE = 2.5  # cells: surfaces of the same class nearer to a static one are noi
 _MAX_MOTION, _MAX_RATIO, _SIDE_SLACK = 10.0, 1.6, 0.3
 _BESIDE = 3.0  # cells between a change and a cell that belongs to it
 _CLEAR, _SHARE = 2.0, 0.7  # nats of a clear observation; share of them that a cell beside takes
-_DOOR_DISTANCE = 0.5  # m between the leaf of a door in its two positions
+# m: length of what is seen of a leaf, half its thickness with noise, between the ends at the hinge;
+# rad between two positions
+_LEAF, _LEAF_THICKNESS, _HINGE_GAP, _MIN_TURN = (0.3, 1.6), 0.12, 0.45, 0.15
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,12 +237,8 @@ def _compare_positions(
     gone: PlaceChange, came: PlaceChange, place: PlaceStates
 ) -> tuple[Kind | None, float]:
     """What two positions are: a door, one object that moved, or nothing; and the cost of that."""
-    gap = np.maximum(np.maximum(gone.low - came.high, came.low - gone.high), 0.0)
-    union = np.union1d(gone.cells, came.cells)
-    if np.linalg.norm(gap) <= _DOOR_DISTANCE:
-        cells = np.unique(place.cells[union][:, :2], axis=0)
-        if len(compute_swept_cells(cells, place.resolution)) > len(cells):
-            return "door", -1.0
+    if _is_door(place.cells[gone.cells], place.cells[came.cells], place.resolution):
+        return "door", -1.0
     distance = float(np.linalg.norm(0.5 * (gone.low + gone.high - came.low - came.high)))
     sides = np.sort(gone.high - gone.low), np.sort(came.high - came.low)
     shorter, longer = np.minimum(*sides), np.maximum(*sides)
@@ -250,6 +247,40 @@ def _compare_positions(
     if alike and count[1] <= 2.0 * _MAX_RATIO * count[0] and distance <= _MAX_MOTION:
         return "moved", distance + float(np.linalg.norm(longer - shorter))
     return None, 0.0
+
+
+def _is_door(gone: Cells, came: Cells, resolution: float) -> bool:
+    """Whether cells (n, D) that are gone and others that came are a leaf about one hinge.
+
+    Both are straight, about as long as each other and a leaf, and end in one place; cells at the
+    hinge are missing, as they lie beside the wall.
+    """
+    one, other = (
+        _fit_leaf(np.asarray(np.unique(cells[:, :2], axis=0) * resolution, np.float64))
+        for cells in (gone, came)
+    )
+    if one is None or other is None:
+        return False
+    lengths = sorted(float(np.linalg.norm(ends[1] - ends[0])) for ends in (one, other))
+    apart = np.linalg.norm(one[:, None] - other[None], axis=2)
+    i, j = np.unravel_index(int(apart.argmin()), (2, 2))
+    u, v = one[1 - i] - one[i], other[1 - j] - other[j]
+    cosine = float(u @ v / (np.linalg.norm(u) * np.linalg.norm(v)))
+    turned = np.arccos(np.clip(cosine, -1.0, 1.0))
+    alike = lengths[1] <= _MAX_RATIO * lengths[0] + _HINGE_GAP
+    return bool(apart[i, j] <= _HINGE_GAP and alike and turned >= _MIN_TURN)
+
+
+def _fit_leaf(points: Float) -> Float | None:
+    """(2, 2) ends of a straight leaf through points (n, 2) in metres; None: they are none."""
+    offset = points - points.mean(axis=0)
+    axis = np.linalg.eigh(offset.T @ offset)[1][:, 1]
+    along, across = offset @ axis, offset @ [-axis[1], axis[0]]
+    length = float(np.ptp(along))
+    if not _LEAF[0] <= length <= _LEAF[1] or float(np.abs(across).max()) > _LEAF_THICKNESS:
+        return None
+    ends: Float = points.mean(axis=0) + np.outer([along.min(), along.max()], axis)
+    return ends
 
 
 def _join(gone: PlaceChange, came: PlaceChange, kind: Kind, place: PlaceStates) -> PlaceChange:
