@@ -5,14 +5,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from stillmap.core.errors import import_extra
+from stillmap.places.pictures import KIND_COLORS
 from stillmap.results.plot import draw_dynamic, plot_result
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from stillmap.places.saved_place import SavedPlace
-
-_COLORS = {"appeared": "#2a9d3a", "gone": "#d02f2f", "moved": "#8a4fd0", "door": "#b08000"}
 
 
 def plot_place(
@@ -36,7 +35,7 @@ def plot_place(
 def _draw_changes(place: "SavedPlace", ax: "Axes") -> None:
     patches = import_extra("matplotlib.patches", "a plot", "drawn", group="notebook")
     for one in place.changes:
-        color = _COLORS.get(one.kind, "#555555")
+        color = tuple(level / 255.0 for level in KIND_COLORS[one.kind])
         x0, y0, x1, y1 = one.box[:4]
         ax.add_patch(
             patches.Rectangle(
