@@ -18,3 +18,25 @@ def shared_data() -> Path:
     if not path.is_dir():
         pytest.skip("no folder of real recordings beside the checkout (../shared/data)")
     return path
+
+
+@pytest.fixture(scope="session")
+def flat_days(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A flat on three days: recordings `day1`, `day2`, `day3`, their results `map1`, ..."""
+    from flat import map_days
+
+    folder = tmp_path_factory.mktemp("flat")
+    map_days(folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def flat_place(flat_days: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The place of `map1` and `map2`; not to be changed."""
+    from flat import OPTIONS
+
+    import stillmap
+
+    out = tmp_path_factory.mktemp("flat-place") / "place"
+    stillmap.merge([flat_days / "map1", flat_days / "map2"], options=OPTIONS, output=out)
+    return out

@@ -18,10 +18,13 @@ if TYPE_CHECKING:
     from stillmap.pipeline.inputs import read
     from stillmap.pipeline.models import build_models
     from stillmap.pipeline.options import Options
+    from stillmap.places.build import merge
+    from stillmap.places.records import PlaceSession, SessionChange
+    from stillmap.places.saved_place import SavedPlace, load
     from stillmap.preprocessing.options import ReadOptions
     from stillmap.results.build import build
     from stillmap.results.result import BuiltResult, Result
-    from stillmap.results.saved import SavedResult, load
+    from stillmap.results.saved import SavedResult
 
     __version__: str
 
@@ -32,15 +35,19 @@ __all__ = [
     "MissingExtra",
     "Models",
     "Options",
+    "PlaceSession",
     "ReadOptions",
     "Recording",
     "Result",
+    "SavedPlace",
     "SavedResult",
+    "SessionChange",
     "__version__",
     "build",
     "build_models",
     "iterate",
     "load",
+    "merge",
     "read",
 ]
 
@@ -52,14 +59,18 @@ _MODULES = {
     "MissingExtra": "core.errors",
     "Models": "mesh.build",
     "Options": "pipeline.options",
+    "PlaceSession": "places.records",
     "ReadOptions": "preprocessing.options",
     "Recording": "core.recording",
     "Result": "results.result",
+    "SavedPlace": "places.saved_place",
     "SavedResult": "results.saved",
+    "SessionChange": "places.records",
     "build": "results.build",
     "build_models": "pipeline.models",
     "iterate": "pipeline.em_loop",
-    "load": "results.saved",
+    "load": "places.saved_place",
+    "merge": "places.build",
     "read": "pipeline.inputs",
 }
 _ROOMS = (
@@ -70,6 +81,7 @@ _ROOMS = (
     "mapping",
     "mesh",
     "pipeline",
+    "places",
     "preprocessing",
     "results",
     "rig",

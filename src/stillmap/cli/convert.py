@@ -31,7 +31,8 @@ DESCRIPTION = (
     f"{', '.join(ENDINGS)}; else a folder. A result of `stillmap map` becomes a bag (.mcap for "
     "Foxglove), a file for rerun (.rrd), in 2D a table of its beams (.parquet), in 3D a point "
     f"cloud with p_static and colours ({', '.join(CLOUDS)}) or the model of the place (.obj), "
-    "or maps and masks for nav2."
+    "or maps and masks for nav2. A place becomes maps and masks, in 3D also a "
+    "cloud; its sessions, PLACE/sessions/NAME, all of this."
 )
 EPILOG = """examples:
   stillmap convert log.clf.gz -o log.bag      for ROS 1
@@ -49,7 +50,9 @@ EPILOG = """examples:
 def add_arguments(p: argparse.ArgumentParser) -> None:
     """Add the flags and arguments."""
     p.add_argument(
-        "input", metavar="INPUT", help="a recording, or a folder that `stillmap map` wrote"
+        "input",
+        metavar="INPUT",
+        help="a recording, or a folder that `stillmap map` or `merge` wrote",
     )
     p.add_argument("-o", "--output", metavar="FILE", required=True, help="converted file or folder")
     names = (*NAMES, NAV2)

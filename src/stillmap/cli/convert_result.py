@@ -57,12 +57,15 @@ def given_zone_flags(args: argparse.Namespace) -> dict[str, object]:
 
 def convert_result(args: argparse.Namespace, source: Path, output: Path) -> tuple[list[str], str]:
     """Write a result for other programs; return what was lost, and what was written."""
+    from stillmap.places.inputs import is_place
     from stillmap.results.export import obj, point_cloud_files
     from stillmap.results.folder import open_result
 
     if read_changes(args):
         text = "a result's recording is read as it was for the map: no flags for reading it"
         raise InputError(text, where=str(source))
+    if is_place(source):
+        return _convert_place(args, source, output)
     result = open_result(source, args.recording)
     for path in result.sources:
         require_apart(output, path, source)
@@ -82,6 +85,29 @@ def convert_result(args: argparse.Namespace, source: Path, output: Path) -> tupl
     if ending == _PARQUET:
         return [], _convert_to_table(args, result, output)
     return _convert_to_bag(args, result, output)
+
+
+def _convert_place(args: argparse.Namespace, place: Path, output: Path) -> tuple[list[str], str]:
+    """Write what a place has as a whole, which needs none of its recordings.
+
+    Raises:
+        InputError: another format is wanted.
+    """
+    from stillmap.results.export import point_cloud_files
+    from stillmap.results.folder import ResultFolder, read_record
+
+    require_apart(output, place)
+    result = ResultFolder(place, read_record(place), Path(), False)
+    if args.to == NAV2 or given_zone_flags(args):
+        return _convert_to_nav2(args, result, output)
+    form = point_cloud_files.format_for(output, args.to)
+    if form is not None and result.dimension == 3:
+        return [], _convert_to_cloud(args, result, output, form)
+    what = f"is a place of several recordings: it becomes maps and masks (--to {NAV2})"
+    if result.dimension == 3:
+        what += f" or a cloud ({', '.join(CLOUDS)})"
+    hint = f"session by session: stillmap convert {place}/sessions/NAME -o FILE"
+    raise InputError(what, where=str(place), hint=hint)
 
 
 def _convert_to_nav2(
@@ -192,12 +218,13 @@ def _convert_to_cloud(
     args: argparse.Namespace, result: "ResultFolder", output: Path, form: "point_cloud_files.Format"
 ) -> str:
     from stillmap.core.files import require_new_file
+    from stillmap.places.inputs import is_place
     from stillmap.results.export import point_cloud, point_cloud_files
     from stillmap.results.run_json import TILTING
 
     require_new_file(output, args.overwrite)
     point_cloud_files.require_extras(form, output)
-    if isinstance(result.record.get(TILTING), dict):
+    if isinstance(result.record.get(TILTING), dict) or is_place(result.folder):
         points = point_cloud.cloud_from_folder(result.folder, args.only)
     else:
         points = _build_cloud(args, result, output.absolute().parent)

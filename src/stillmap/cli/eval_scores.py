@@ -16,6 +16,7 @@ from stillmap.eval.map import MapScores, extract_wall_cells, extract_wall_cells_
 from stillmap.eval.readers import Truth, read_truth, require_same_beams
 from stillmap.eval.relations import RelationErrors, compute_relation_errors
 from stillmap.eval.trajectory import read_paired_poses
+from stillmap.places.inputs import is_place
 from stillmap.results.folder import read_region
 from stillmap.results.labels import read_labels
 from stillmap.results.reader import moved, read_grid, require_there
@@ -98,6 +99,9 @@ def _format_stats(e: trajectory.ErrorStats, unit: str) -> str:
 def score_beam_labels(result: Path, truth_folder: Path) -> Scores:
     """Static or dynamic, per beam."""
     require_there(result, truth_folder)
+    if is_place(result):
+        hint = f"one of its sessions: stillmap eval labels {result}/sessions/NAME {truth_folder}"
+        raise InputError("is a place of several recordings", where=str(result), hint=hint)
     labels = read_labels(result)
     truth = read_truth(truth_folder, labels)
     require_same_beams(labels, truth, result)

@@ -3,7 +3,7 @@
 import argparse
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from stillmap.cli.arguments import make_parents, require_apart
 from stillmap.cli.console import print_json, say, show_share
@@ -22,7 +22,7 @@ DESCRIPTION = (
     "Write the recording again with dynamic beams blanked, 2D or 3D: for mapping and localization "
     "programs that assume a static world. It keeps its own format, in which nothing else changes, "
     "unless FILE has the ending of another one or --to names it. Parts of one run become one "
-    "recording."
+    "recording. Of a place FILE is a folder, with a recording for each of its sessions."
 )
 EPILOG = """examples:
   stillmap filter out -o clean.clf.gz
@@ -30,12 +30,14 @@ EPILOG = """examples:
   stillmap filter out -o clean            a KITTI folder, of a result of one
   stillmap filter out -o clean.mcap       a bag, of any result
   stillmap filter out -o clean --to pcd   a folder of PCD files
+  stillmap filter place -o clean          a folder with a recording of every session
+  stillmap filter place/sessions/monday -o monday.bag
 """
 
 
 def add_arguments(p: argparse.ArgumentParser) -> None:
     """Add the flags and arguments."""
-    p.add_argument("result", metavar="DIR", help="folder that `stillmap map` wrote")
+    p.add_argument("result", metavar="DIR", help="folder that `stillmap map` or `merge` wrote")
     p.add_argument("-o", "--output", metavar="FILE", required=True, help="filtered recording")
     p.add_argument(
         "--to",
@@ -56,53 +58,131 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--quiet", action="store_true", help="no summary")
 
 
+class Filtered(NamedTuple):
+    """What was done to a recording.
+
+    Attributes:
+        hits: beams that hit something.
+        blanked: how many of them were blanked.
+        left_out: scans that were not mapped.
+        notes: what the format cannot hold, a sentence each.
+    """
+
+    hits: int
+    blanked: int
+    left_out: int
+    notes: tuple[str, ...]
+
+    def describe(self) -> str:
+        """How many beams were blanked."""
+        share = 100.0 * self.blanked / max(self.hits, 1)
+        return f"{self.blanked} beams blanked, {share:.1f} % of the hits"
+
+
 def run(args: argparse.Namespace) -> int:
     """Read labels and recording, and write the recording without dynamic beams.
 
     Raises:
         InputError: the result or its recording is not there, or the output is taken.
     """
-    from stillmap.io.filtered_copy import FilterJob
-    from stillmap.results.folder import open_result
+    from stillmap.places.inputs import is_place
 
     if not 0.0 <= args.below <= 1.0:
         raise InputError(f"--below wants 0 to 1, got {args.below:g}")
     output = Path(args.output)
     with make_parents(output):
-        result = open_result(Path(args.result), args.input)
-        options = result.read_options
-        target = _find_target(result, output, args)
-        scratch = output.absolute().parent
-        with show_share(args.quiet, "reading") as progress:
-            recording, labels = result.read(progress, scratch)
-        if target.takes_poses and recording.T_recorded_base is None:
-            recording = _place(recording, result, target)
-        blank, hits, blanked = _select_beams(recording, labels.p_static, args.below, scratch)
-        with show_share(args.quiet, "writing") as progress:
-            job = FilterJob(
-                result.source,
-                output,
-                recording,
-                blank,
-                options,
-                target.marker,
-                args.overwrite,
-                (result.folder,),
-                progress,
-            )
-            omitted, notes = target.write(job)
-    if args.json:
-        counts = {"hits": hits, "blanked": blanked, "scans_left_out": omitted}
-        parts = {"parts": list(map(str, result.parts))} if result.parts else {}
-        print_json({"output": str(output), "input": str(result.source), **parts, **counts})
-    if not args.quiet:
-        share = 100.0 * blanked / max(hits, 1)
-        say(f"wrote {output}: {blanked} beams blanked, {share:.1f} % of the hits")
-        if omitted:
-            say(f"{omitted} scans left out that were not mapped")
-        for note in notes:
-            say(f"warning: {note}")
+        if is_place(Path(args.result)):
+            from stillmap.cli.filter_place import filter_place
+
+            filter_place(args, Path(args.result), output)
+        else:
+            _filter_result(args, output)
     return 0
+
+
+def _filter_result(args: argparse.Namespace, output: Path) -> None:
+    from stillmap.io import filter_writers
+    from stillmap.results.folder import open_result
+
+    result = open_result(Path(args.result), args.input)
+    target = find_target(result, output, args.to)
+    filter_writers.require_free(target, output, result.source, args.overwrite)
+    done = write_filtered(result, target, output, args)
+    if args.json:
+        parts = {"parts": list(map(str, result.parts))} if result.parts else {}
+        print_json(
+            {
+                "output": str(output),
+                "input": str(result.source),
+                **parts,
+                "hits": done.hits,
+                "blanked": done.blanked,
+                "scans_left_out": done.left_out,
+            }
+        )
+    if not args.quiet:
+        say(f"wrote {output}: {done.describe()}")
+        if done.left_out:
+            say(f"{done.left_out} scans left out that were not mapped")
+        for note in done.notes:
+            say(f"warning: {note}")
+
+
+def find_target(result: "ResultFolder", output: Path, to: str | None) -> "FilterTarget":
+    """Find how the filtered recording of a result is written.
+
+    Args:
+        result: of a recording.
+        output: the filtered recording.
+        to: name of a format; None: by the ending of the output, else the recording's own.
+
+    Raises:
+        InputError: it cannot be; before anything long is done.
+    """
+    from stillmap.io import filter_writers, writers
+
+    source = result.require_source()
+    for path in result.sources:
+        require_apart(output, path, result.folder)
+    if result.parts:
+        target = filter_writers.find_joined_target(output, to)
+    else:
+        target = filter_writers.find_target(source, output, to)
+    if target.writer is not None:
+        writers.require_fit(output, target.writer, result.dimension, result.n_sensors)
+    return target
+
+
+def write_filtered(
+    result: "ResultFolder", target: "FilterTarget", output: Path, args: argparse.Namespace
+) -> Filtered:
+    """Write the recording of a result without its dynamic beams.
+
+    Raises:
+        InputError: labels and recording cannot be read, or do not belong together.
+    """
+    from stillmap.io.filtered_copy import FilterJob
+
+    scratch = output.absolute().parent
+    with show_share(args.quiet, "reading") as progress:
+        recording, labels = result.read(progress, scratch)
+    if target.takes_poses and recording.T_recorded_base is None:
+        recording = _place(recording, result, target)
+    blank, hits, blanked = _select_beams(recording, labels.p_static, args.below, scratch)
+    with show_share(args.quiet, "writing") as progress:
+        job = FilterJob(
+            result.source,
+            output,
+            recording,
+            blank,
+            result.read_options,
+            target.marker,
+            args.overwrite,
+            (Path(args.result),),
+            progress,
+        )
+        left_out, notes = target.write(job)
+    return Filtered(hits, blanked, left_out, tuple(notes))
 
 
 def _place(recording: "Recording", result: "ResultFolder", target: "FilterTarget") -> "Recording":
@@ -113,27 +193,6 @@ def _place(recording: "Recording", result: "ResultFolder", target: "FilterTarget
     if not target.is_folder:
         recording = deskew_recording(recording, poses, result.slam_options)
     return dataclasses.replace(recording, T_recorded_base=poses)
-
-
-def _find_target(result: "ResultFolder", output: Path, args: argparse.Namespace) -> "FilterTarget":
-    """Find how the output is written.
-
-    Raises:
-        InputError: it cannot be, or is taken; before anything long is done.
-    """
-    from stillmap.io import filter_writers, writers
-
-    source = result.require_source()
-    for path in result.sources:
-        require_apart(output, path, result.folder)
-    if result.parts:
-        target = filter_writers.find_joined_target(output, args.to)
-    else:
-        target = filter_writers.find_target(source, output, args.to)
-    filter_writers.require_free(target, output, source, args.overwrite)
-    if target.writer is not None:
-        writers.require_fit(output, target.writer, result.dimension, result.n_sensors)
-    return target
 
 
 def _select_beams(

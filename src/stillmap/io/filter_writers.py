@@ -249,6 +249,15 @@ def require_free(target: FilterTarget, output: Path, source: Path, overwrite: bo
         require_new(output, target.marker, overwrite)
     else:
         require_new_file(output, overwrite)
+    require_outside(output, source)
+
+
+def require_outside(output: Path, source: Path) -> None:
+    """Refuse an output that lies in the folder of the recording.
+
+    Raises:
+        InputError: it does.
+    """
     if source.is_dir() and source.resolve() in output.resolve().parents:
         hint = "choose a place outside of it"
         raise InputError("lies in the folder of the recording", where=str(output), hint=hint)

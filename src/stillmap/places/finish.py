@@ -1,6 +1,7 @@
 """After the last session: states, changes, labels, map, and all files of the place."""
 
 import datetime
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from stillmap.core.version import package_version
 from stillmap.em import OccupancyMap
 from stillmap.pipeline.options import Options
 from stillmap.places.changes import detect_place_changes
+from stillmap.places.checksums import write_checksums
 from stillmap.places.clouds import write_place_clouds
 from stillmap.places.grow import estimate_planar
 from stillmap.places.objects import join_objects, place_objects
@@ -28,6 +30,7 @@ from stillmap.results.map_server import write_map_server
 from stillmap.results.run_json import FORMAT_VERSION, RECORD
 
 LAST, MAJORITY = "last", "majority"
+_STATES_HINT = "map_state=last, majority, the name of a session, or a date such as 2026-05-31"
 _DAY_NS = 86_400 * 10**9
 
 
@@ -56,6 +59,16 @@ def finish_place(
     return PlaceResult(place, refusals, order, changes, show_state(states, changes, limit), planar)
 
 
+def require_map_state(map_state: str, names: Sequence[str]) -> None:
+    """Refuse what is no state of a map that shows sessions of these names.
+
+    Raises:
+        InputError: it is none.
+    """
+    if map_state not in (LAST, MAJORITY, *names):
+        _parse_date(map_state)
+
+
 def _find_limit(place: Place, map_state: str) -> int | None:
     """Index of the session, in the order of time, as of which the map is shown; None: majority."""
     in_time = [place.sessions[k].session for k in place.in_time()]
@@ -69,7 +82,7 @@ def _find_limit(place: Place, map_state: str) -> int | None:
     until = _parse_date(map_state)
     before = [k for k, one in enumerate(in_time) if int(one.stamp_ns[0]) <= until]
     if not before:
-        raise InputError(f"--map-state {map_state}: no session is as old")
+        raise InputError(f"no session is as old as the state that the map shall show: {map_state}")
     return before[-1]
 
 
@@ -82,8 +95,7 @@ def _parse_date(text: str) -> int:
     try:
         date = datetime.datetime.fromisoformat(text)
     except ValueError as error:
-        hint = "last, majority, the name of a session, or a date such as 2026-05-31"
-        raise InputError(f"--map-state {text}: is no state of a map", hint=hint) from error
+        raise InputError(f"is no state of a map: {text}", hint=_STATES_HINT) from error
     if date.tzinfo is None:
         date = date.replace(tzinfo=datetime.UTC)
     nanoseconds = round(date.timestamp() * 1e6) * 1000
@@ -104,6 +116,7 @@ def write_place(folder: Path, result: PlaceResult, options: Options, map_state: 
     homes = [folder / "sessions" / one.session.name for one in place.sessions]
     for home, one in zip(homes, place.sessions, strict=True):
         place_objects(home, one)
+        write_checksums(home)
     write_place_files(folder, result)
     join_objects(folder, homes)
     if place.dimension == 3:
@@ -136,6 +149,7 @@ def place_record(
             "path": None,
             "sessions": [one.session.name for one in place.sessions],
         },
+        "dimension": place.dimension,
         "options": to_dict(options),
         "iterations": [],
         "counts": _count(folder),
@@ -146,6 +160,7 @@ def place_record(
             "resolution": place.resolution,
             "voxel_size": place.voxel_size,
             "map_state": map_state,
+            "frame": place.frame or place.sessions[0].session.name,
             "sessions": len(place.sessions),
             "constraints": len(place.ties),
             "changes": len(result.changes),

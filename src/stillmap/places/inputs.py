@@ -1,23 +1,30 @@
 """The inputs of a merge: recordings, result folders, or a place."""
 
+import json
 import os
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
 from stillmap.core.errors import InputError
+from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io.registry import detect_format
 from stillmap.places.prepare import MappedRecording
-from stillmap.results.folder import is_result
+from stillmap.results.folder import is_result, open_result, read_record
 from stillmap.results.pose_graph_g2o import read_g2o
+from stillmap.results.reader import SESSIONS as SESSIONS  # of places, found there as well
+from stillmap.results.result import BuiltResult
 from stillmap.results.run_json import RECORD, TILTING
 from stillmap.results.saved import SavedResult, load
+from stillmap.slam import deskew_recording
 
-SESSIONS = "sessions.json"  # every place has it
+TIES = "ties.npz"  # constraints between the sessions of a place
+
+Given: TypeAlias = Sequence[str | os.PathLike[str]] | Recording | BuiltResult | SavedResult
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,26 +34,36 @@ class SessionInput(ShortRepr):
     Attributes:
         name: unique in its place.
         parts: paths of its recording, several where it was recorded in parts; or of one result.
-        is_result: whether it was mapped already.
+        is_result: whether `parts` is a result folder.
+        given: the recording or the result itself, without a path; None: read from `parts`.
     """
 
     name: str
-    parts: tuple[Path, ...]
-    is_result: bool
+    parts: tuple[Path, ...] = ()
+    is_result: bool = False
+    given: Recording | BuiltResult | SavedResult | None = None
+
+    @property
+    def path(self) -> str | None:
+        """Its path, of several parts the first; None: it has none."""
+        if isinstance(self.given, SavedResult):
+            return str(self.given.path)
+        return str(self.parts[0]) if self.parts else None
 
 
 def is_place(path: Path) -> bool:
-    """Whether a folder is a place."""
-    return (path / SESSIONS).is_file() and (path / RECORD).is_file()
+    """Whether a folder is a place, also one from which a file was taken."""
+    return (path / "sessions").is_dir() and any((path / one).is_file() for one in (SESSIONS, TIES))
 
 
 def list_sessions(
-    groups: Sequence[Sequence[str | os.PathLike[str]]], taken: Sequence[str] = ()
+    groups: Sequence[Given],
+    taken: Sequence[str] = (),
 ) -> list[SessionInput]:
     """The sessions of inputs, each a group of paths that belong together.
 
     Args:
-        groups: of recordings, or single result folders.
+        groups: of recordings, or single result folders; or recordings and results themselves.
         taken: names that are in use.
 
     Raises:
@@ -54,18 +71,50 @@ def list_sessions(
     """
     out, names = list[SessionInput](), set(taken)
     for group in groups:
-        paths = tuple(Path(one) for one in group)
-        for path in paths:
-            if is_place(path):
-                hint = "a place goes first: stillmap merge PLACE SESSION... -o PLACE"
-                raise InputError("is a place, among sessions", where=str(path), hint=hint)
-            if not is_result(path):
-                detect_format(path)  # refuses what nobody can read, before any work
-        mapped = len(paths) == 1 and is_result(paths[0])
-        name = _unique(_stem(paths[0]), names)
-        names.add(name)
-        out.append(SessionInput(name, paths, mapped))
+        if isinstance(group, Recording | BuiltResult | SavedResult):
+            one = SessionInput(_unique(_name_given(group), names), given=group)
+        else:
+            one = _find_session(tuple(Path(path) for path in group), names)
+        names.add(one.name)
+        out.append(one)
     return out
+
+
+def _find_session(paths: tuple[Path, ...], names: set[str]) -> SessionInput:
+    for path in paths:
+        if is_place(path):
+            hint = "a place to which sessions are added is the first of all"
+            raise InputError("is a place, among sessions", where=str(path), hint=hint)
+        if not is_result(path):
+            detect_format(path)  # refuses what nobody can read, before any work
+    mapped = len(paths) == 1 and is_result(paths[0])
+    if mapped:
+        _require_recording(paths[0])
+    return SessionInput(_unique(_stem(paths[0]), names), paths, mapped)
+
+
+def _require_recording(result: Path) -> None:
+    """Refuse a result whose recording cannot be read again.
+
+    Raises:
+        InputError: it has gone, or is of a rig.
+    """
+    if (result / TILTING).is_dir():
+        raise InputError("is a rig with a tilting laser, which is not merged", where=str(result))
+    try:
+        open_result(result).require_source()
+    except InputError as error:
+        hint = f"{result} was made from it: merge the recording itself from where it is now"
+        raise InputError(error.what, where=error.where, hint=hint) from error
+
+
+def _name_given(given: Recording | BuiltResult | SavedResult) -> str:
+    """The stem of a result's folder or of where a recording was read from, else `session`."""
+    if isinstance(given, SavedResult):
+        return _stem(given.path)
+    recording = given if isinstance(given, Recording) else given.recording
+    path = recording.source.get("path")
+    return _stem(Path(path)) if isinstance(path, str) and path else "session"
 
 
 def _stem(path: Path) -> str:
@@ -81,20 +130,30 @@ def _unique(stem: str, names: set[str]) -> str:
     return next(name for k in range(2, len(names) + 3) if (name := f"{stem}-{k}") not in names)
 
 
-def load_mapped(name: str, folder: Path, threads: int) -> tuple[MappedRecording, SavedResult]:
+def load_mapped(
+    name: str, folder: Path, threads: int, recording: Recording | None = None
+) -> tuple[MappedRecording, SavedResult]:
     """A result folder as a session.
+
+    Args:
+        name: of the session.
+        folder: the result.
+        threads: number of threads.
+        recording: as it was mapped; None: read again.
 
     Raises:
         InputError: a file is missing or damaged, or the recording is not there any more.
     """
-    if (folder / TILTING).is_dir():
-        raise InputError("is a rig with a tilting laser, which is not merged", where=str(folder))
     result = load(folder)
     graph = folder / "graph.g2o"
     output = result.options.output
+    if recording is None:
+        deskewed = result.deskewed
+    else:
+        deskewed = deskew_recording(recording, result.poses, result.folder.slam_options)
     mapped = MappedRecording(
         name,
-        result.deskewed,
+        deskewed,
         result.poses,
         np.asarray(result.p_static),
         read_g2o(graph) if graph.is_file() else None,
@@ -104,6 +163,8 @@ def load_mapped(name: str, folder: Path, threads: int) -> tuple[MappedRecording,
     return mapped, result
 
 
-def copy_record(result: Path, folder: Path) -> None:
-    """Copy what describes how a session was read and mapped."""
-    shutil.copyfile(result / RECORD, folder / RECORD)
+def copy_record(result: Path, folder: Path, dimension: int) -> None:
+    """Copy what describes how a session of a dimension was read and mapped."""
+    record = {**read_record(result), "dimension": dimension}
+    text = json.dumps(record, indent=2, ensure_ascii=False)
+    (folder / RECORD).write_text(text + "\n", encoding="utf-8")

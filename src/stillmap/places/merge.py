@@ -1,36 +1,27 @@
 """Merge sessions to a place: map each, add one after the other, then write what all of them say."""
 
 import shutil
-import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from stillmap.core import se2
-from stillmap.core.arrays import write_npy
+from stillmap.core.config import override
 from stillmap.core.errors import InputError
-from stillmap.core.files import atomic_folder
+from stillmap.core.files import atomic_folder, require_regular
 from stillmap.core.parallel import limit_blas_threads, resolve_threads
 from stillmap.core.profiling import Progress, no_progress
 from stillmap.core.short_repr import ShortRepr
-from stillmap.pipeline.options import Options
-from stillmap.places.beam_cells import find_beam_cells
-from stillmap.places.finish import finish_place, write_place
+from stillmap.pipeline.options import DEFAULTS, Options
+from stillmap.places.finish import finish_place, require_map_state, write_place
 from stillmap.places.grow import add_session, start_place
-from stillmap.places.inputs import SessionInput, copy_record, load_mapped
-from stillmap.places.objects import copy_objects
+from stillmap.places.inputs import SessionInput
+from stillmap.places.map_sessions import cell_size, prepare_sessions
 from stillmap.places.place import Place, Refusal, update_evidence
-from stillmap.places.prepare import make_session
 from stillmap.places.reader import read_place
 from stillmap.places.session import Session
-from stillmap.places.store import STATE, read_session, write_session
 from stillmap.places.writer import PlaceResult
-from stillmap.results.build import build
 from stillmap.results.run_json import RECORD
-
-_VOXEL_SIZE = 0.15  # m, of the evidence of 3D sessions, unless the options say another
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +68,11 @@ def merge_sessions(
     with atomic_folder(output, RECORD, overwrite) as folder:
         (folder / "sessions").mkdir()
         place, refusals, order = _open_base(job, folder)
-        sessions = _prepare_sessions(job, folder, progress)
+        if place is not None:
+            frame, options = job.frame or place.frame, _adopt_cells(job.options, place)
+            job = replace(job, frame=frame, options=options)
+        _check_job(job, [*order, *(one.name for one in job.sessions)])
+        sessions = prepare_sessions(job.sessions, job.options, job.odometry, folder, progress)
         order += [one.name for one in sessions]
         place, refused = _grow(place, sessions, job, threads, progress)
         refusals += refused
@@ -100,61 +95,44 @@ def _open_base(job: MergeJob, folder: Path) -> tuple[Place | None, list[Refusal]
     place, refusals, order = read_place(job.base)
     for one in place.sessions:
         name = one.session.name
-        shutil.copytree(job.base / "sessions" / name, folder / "sessions" / name)
+        _copy_session(job.base / "sessions" / name, folder / "sessions" / name)
     return place, refusals, order
 
 
-def _prepare_sessions(job: MergeJob, folder: Path, progress: Progress) -> list[Session]:
-    """The sessions, each mapped where it was not, with what the place keeps of it written."""
-    out = []
-    for number, one in enumerate(job.sessions, start=1):
+def _copy_session(source: Path, target: Path) -> None:
+    """Copy the folder of a session, with permissions as of new files.
 
-        def report(stage: str, iteration: int, done: int, total: int, number: int = number) -> None:
-            progress(f"session {number}: {stage}", iteration, done, total)
-
-        home = folder / "sessions" / one.name
-        if one.is_result:
-            out.append(_keep_session(one.name, one.parts[0], home, job.options))
+    Raises:
+        InputError: a file cannot be read.
+    """
+    target.mkdir()
+    for path in sorted(source.iterdir()):
+        if path.is_dir():
+            _copy_session(path, target / path.name)
             continue
-        with tempfile.TemporaryDirectory(prefix=".mapped-", dir=folder) as scratch:
-            parts = [str(path) for path in one.parts]
-            result = build(
-                parts[0] if len(parts) == 1 else parts,
-                job.options,
-                odometry=job.odometry,
-                progress=report,
-                scratch=scratch,
-            )
-            mapped = Path(scratch) / "result"
-            result.save(mapped)
-            del result
-            out.append(_keep_session(one.name, mapped, home, job.options))
-    return out
+        require_regular(path)
+        try:
+            file = path.open("rb")
+        except OSError as error:
+            raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
+        with file, (target / path.name).open("wb") as copy:
+            shutil.copyfileobj(file, copy)
 
 
-def _keep_session(name: str, mapped: Path, home: Path, options: Options) -> Session:
-    """Write what the place keeps of a mapped session, and open it again from there."""
-    recording, result = load_mapped(name, mapped, resolve_threads(options.threads))
-    session = make_session(recording)
-    cell = _cell_size(options, session.dimension)
-    beams = find_beam_cells(
-        recording.deskewed, recording.poses, recording.p_static, session.graph, cell
-    )
-    home.mkdir()
-    copy_record(mapped, home)
-    (home / "beams").mkdir()
-    for array in ("stamp_ns", "offset", "hit"):
-        write_npy(home / "beams" / f"{array}.npy", np.asarray(getattr(result.labels, array)))
-    write_session(home, session, beams)
-    copy_objects(mapped, home / STATE)
-    return read_session(home, session.source, np.array(session.stamp_ns))
+def _adopt_cells(options: Options, place: Place) -> Options:
+    """The options with the edges of the cells of a place that grows.
 
-
-def _cell_size(options: Options, dimension: int) -> float:
-    """m, edge of a cell of the evidence."""
-    if dimension == 2:
-        return options.slam.resolution
-    return options.slam.voxel_size or _VOXEL_SIZE
+    Raises:
+        InputError: they ask for others.
+    """
+    edges = {"resolution": place.resolution}
+    if place.dimension == 3:
+        edges["voxel_size"] = place.voxel_size
+    for name, edge in edges.items():
+        if getattr(options.slam, name) not in (edge, getattr(DEFAULTS.slam, name)):
+            hint = f"it grows with slam.{name}={edge:g}"
+            raise InputError(f"the place has cells of {edge:g} m", hint=hint)
+    return override(options, {"slam": edges})
 
 
 def _grow(
@@ -170,17 +148,16 @@ def _grow(
     """
     if place is not None:
         return _add_all(place, sessions, threads, progress)
-    seeds = sorted(sessions, key=lambda one: one.name != job.frame)  # the frame's session first
     best: tuple[Place, list[Refusal]] | None = None
-    for number, seed in enumerate(seeds):
-        cell = _cell_size(job.options, seed.dimension)
+    for number, seed in enumerate(sessions):
+        cell = cell_size(job.options, seed.dimension)
         start = start_place(seed, job.options.slam.resolution, cell, threads)
         others = [one for one in sessions if one is not seed]
         found = _add_all(start, others, threads, progress)
         if best is None or len(found[0].sessions) > len(best[0].sessions):
             best = found
         # what is left cannot be more than what was found
-        if len(best[0].sessions) >= len(seeds) - number - 1 or job.frame is not None:
+        if len(best[0].sessions) >= len(sessions) - number - 1:
             break
     if best is None:
         raise InputError("no session is named")
@@ -202,7 +179,7 @@ def _add_all(
                 growth = add_session(place, session, threads, _step(progress, session))
                 place, why = growth.place, growth.refused
             if why:
-                refusals[session.name] = Refusal(session.name, session.source, why)
+                refusals[session.name] = Refusal(session.name, session.input, why)
             else:
                 pending.remove(session)
                 refusals.pop(session.name, None)
@@ -223,9 +200,29 @@ def _reframe(place: Place, name: str) -> Place:
     for one in place.sessions:
         if one.session.name == name:
             back = se2.inverse(one.T)
-            return place.with_nodes([back @ other.nodes for other in place.sessions])
-    known = ", ".join(one.session.name for one in place.sessions)
-    raise InputError(f"--frame {name}: no such session in the place", hint=f"there are {known}")
+            moved = place.with_nodes([back @ other.nodes for other in place.sessions])
+            return replace(moved, frame=name)
+    raise _no_frame(name, [one.session.name for one in place.sessions])
+
+
+def _check_job(job: MergeJob, names: Sequence[str]) -> None:
+    """Refuse, before any work, too few sessions, and a frame or a state of the map of none.
+
+    Raises:
+        InputError: it is such a job.
+    """
+    if not job.sessions:
+        raise InputError("no session is named that is to be merged")
+    if len(names) < 2:
+        raise InputError("one session alone is no place", hint="merge it with others, or map it")
+    if job.frame is not None and job.frame not in names:
+        raise _no_frame(job.frame, names)
+    require_map_state(job.map_state, names)
+
+
+def _no_frame(name: str, known: Sequence[str]) -> InputError:
+    hint = f"frame=NAME wants one of {', '.join(known)}"
+    return InputError(f"cannot have the frame of {name}: no such session in the place", hint=hint)
 
 
 def _describe_failure(refusals: Sequence[Refusal]) -> str:

@@ -40,6 +40,18 @@ def copy_objects(result: Path, state: Path) -> None:
             shutil.copyfile(path, target / path.name)
 
 
+def check_objects(state: Path) -> None:
+    """Refuse objects in the state of a session that cannot be put into a place.
+
+    Raises:
+        InputError: a file of them is damaged.
+    """
+    source = state / _ORIGINAL
+    read_tracks(source / _LIST)
+    for path in source.glob("*.ply"):
+        _split_cloud(path, path.read_bytes())
+
+
 def place_objects(home: Path, one: PlacedSession) -> None:
     """Write `objects/` of a session in the frame of the place.
 
@@ -114,14 +126,23 @@ def _transform_cloud(source: Path, target: Path, T: Float) -> None:
         InputError: it is not as it was written.
     """
     content = source.read_bytes()
-    end = content.find(b"end_header\n") + len(b"end_header\n")
-    dtype = np.dtype(_FIELDS)
-    count, rest = divmod(len(content) - end, dtype.itemsize)
-    if rest or content[:end] != ply_header(_FIELDS, count):
-        raise InputError("is no cloud of an object as stillmap writes it", where=str(source))
-    vertices = np.frombuffer(content, dtype, offset=end).copy()
+    end, vertices = _split_cloud(source, content)
     D = T.shape[-1] - 1
     points = np.stack([vertices[name] for name in "xyz"[:D]]).astype(np.float64)
     for name, values in zip("xyz", T[:D, :D] @ points + T[:D, D:], strict=False):
         vertices[name] = values
     target.write_bytes(content[:end] + vertices.tobytes())
+
+
+def _split_cloud(path: Path, content: bytes) -> tuple[int, NDArray[np.void]]:
+    """Where the header of a cloud of an object ends, and its points.
+
+    Raises:
+        InputError: it is not as it was written.
+    """
+    end = content.find(b"end_header\n") + len(b"end_header\n")
+    dtype = np.dtype(_FIELDS)
+    count, rest = divmod(len(content) - end, dtype.itemsize)
+    if rest or content[:end] != ply_header(_FIELDS, count):
+        raise InputError("is no cloud of an object as stillmap writes it", where=str(path))
+    return end, np.frombuffer(content, dtype, offset=end).copy()

@@ -1,7 +1,7 @@
 """A place: sessions in one frame, the constraints between them, and what stands where when."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,7 @@ class PlacedSession(ShortRepr):
     Attributes:
         session: T scans, K keyframes, N nodes.
         nodes: (N, D+1, D+1) T_place_base of the nodes of its pose graph.
-        covariance: of its alignment: x, y, heading at the session's origin; 0 of the first.
+        covariance: (3, 3), in 3D (6, 6), of its alignment at its first scan; None: it is the first.
         overlap: share of its hits in area that the sessions before it knew; 1 of the first.
         evidence: in D dimensions; None: not measured yet.
         planar_evidence: in the plane; in 2D the same.
@@ -34,7 +34,7 @@ class PlacedSession(ShortRepr):
 
     session: Session
     nodes: Float
-    covariance: Float = field(default_factory=lambda: np.zeros((3, 3)))
+    covariance: Float | None = None
     overlap: float = 1.0
     evidence: Evidence | None = None
     planar_evidence: Evidence | None = None
@@ -62,6 +62,14 @@ class PlacedSession(ShortRepr):
         """(K, 3, 3) poses of the planar keyframes."""
         return to_planar(self.session, self.keyframe_poses)
 
+    @property
+    def known_covariance(self) -> Float:
+        """(3, 3), in 3D (6, 6): `covariance`, or 0."""
+        if self.covariance is not None:
+            return self.covariance
+        dof = 3 * (self.session.dimension - 1)
+        return np.zeros((dof, dof))
+
     def require_evidence(self) -> tuple[Evidence, Evidence]:
         """The evidence in D dimensions and in the plane.
 
@@ -85,25 +93,27 @@ class Refusal(ShortRepr):
     """A session that is not in the place, and why."""
 
     name: str
-    source: dict[str, object]
+    input: str | None
     why: str
 
 
 @dataclass(frozen=True, eq=False)
 class Place(ShortRepr):
-    """Sessions in the frame of the first one.
+    """Sessions in one frame.
 
     Attributes:
         sessions: in the order in which they were merged.
         ties: constraints between them.
         resolution: m, edge of a cell of the map; in 3D `voxel_size` is that of a voxel.
         voxel_size: m, edge of a cell of the evidence in D dimensions.
+        frame: name of the session that has its frame; None: the first one.
     """
 
     sessions: list[PlacedSession]
     ties: list[Tie]
     resolution: float
     voxel_size: float
+    frame: str | None = None
 
     @property
     def dimension(self) -> int:

@@ -57,7 +57,7 @@ def make_session(mapped: MappedRecording) -> Session:
         planar, clearance = _project(keyframes, mapped.band, mapped.threads)
     return Session(
         mapped.name,
-        deskewed.source,
+        None,
         deskewed.stamp_ns,
         poses,
         graph,

@@ -1,7 +1,6 @@
 """A session: one mapped recording as a place keeps it."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +18,7 @@ class Session(ShortRepr):
 
     Attributes:
         name: unique in its place.
-        source: the input as `run.json` describes it.
+        input: its path, as it was given; None: it had none.
         stamp_ns: (T,) the recording's own stamps.
         poses: (T, D+1, D+1) T_session_base.
         graph: the session's own pose graph, in the session's frame.
@@ -29,7 +28,7 @@ class Session(ShortRepr):
     """
 
     name: str
-    source: dict[str, Any]
+    input: str | None
     stamp_ns: NDArray[np.int64]
     poses: Float
     graph: PoseGraph

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core import arrays
 from stillmap.core.arrays import write_npy
 from stillmap.core.errors import InputError
 from stillmap.io import stillmap_folder
@@ -19,6 +20,8 @@ from stillmap.results.pose_graph_g2o import read_g2o, write_g2o
 Float = NDArray[np.float64]
 
 STATE = "state"
+HINT = "merge the sessions anew"
+_MAX_DISTANCE = 1e6  # m: no place is larger
 _KEYFRAMES, _PLANAR, _GRAPH = "keyframes", "planar", "graph.g2o"
 
 
@@ -53,12 +56,12 @@ def _write_keyframes(folder: Path, keyframes: Keyframes) -> None:
     write_npy(folder / "nodes.npy", keyframes.nodes.astype(np.int64))
 
 
-def read_session(folder: Path, source: dict[str, object], stamp_ns: NDArray[np.int64]) -> Session:
+def read_session(folder: Path, path: str | None, stamp_ns: NDArray[np.int64]) -> Session:
     """The session that `write_session` wrote; arrays are memory-mapped.
 
     Args:
         folder: `sessions/NAME` of a place.
-        source: the input as `run.json` describes it.
+        path: of its input, as it was given; None: it had none.
         stamp_ns: (T,) stamps of its scans.
 
     Raises:
@@ -68,30 +71,60 @@ def read_session(folder: Path, source: dict[str, object], stamp_ns: NDArray[np.i
     keyframes = _read_keyframes(state / _KEYFRAMES)
     D, K = keyframes.dimension, len(keyframes)
     planar = _read_keyframes(state / _PLANAR) if D == 3 else keyframes
-    poses = read_array(state / "poses.npy", (len(stamp_ns), D + 1, D + 1), "f")
+    poses = read_poses(state / "poses.npy", len(stamp_ns), D)
     graph = read_g2o(state / _GRAPH)
-    nodes = keyframes.nodes
-    if not np.array_equal(keyframes.scans[nodes], graph.keyframes) or len(planar) != K:
+    clearance = np.array(read_array(state / "clearance.npy", (K,), "f"), np.float64)
+    if (
+        planar.dimension != 2
+        or len(planar) != K
+        or graph.poses.shape[-1] != D + 1
+        or not np.array_equal(keyframes.scans[keyframes.nodes], graph.keyframes)
+        or keyframes.scans[-1] >= len(poses)
+        or not np.array_equal(keyframes.poses, poses[keyframes.scans])
+        or not (np.abs(clearance) < _MAX_DISTANCE).all()
+    ):
         raise _inconsistent(state)
-    if graph.poses.shape[-1] != D + 1 or planar.dimension != 2 or graph.keyframes[-1] >= len(poses):
-        raise _inconsistent(state)
-    clearance = read_array(state / "clearance.npy", (K,), "f")
-    return Session(
-        folder.name, source, stamp_ns, np.array(poses), graph, keyframes, planar, clearance
+    return Session(folder.name, path, stamp_ns, poses, graph, keyframes, planar, clearance)
+
+
+def read_poses(path: Path, count: int, D: int) -> Float:
+    """(count, D+1, D+1) rigid transforms of an `.npy` file.
+
+    Raises:
+        InputError: it is missing or damaged, or holds something else.
+    """
+    poses = np.array(read_array(path, (count, D + 1, D + 1), "f"), np.float64)
+    if not is_rigid(poses):
+        raise InputError("holds no rigid transforms", where=str(path), hint=HINT)
+    return poses
+
+
+def is_rigid(poses: Float) -> bool:
+    """Whether all of (N, D+1, D+1) are rigid transforms within a possible distance."""
+    D = poses.shape[-1] - 1
+    R = poses[:, :D, :D]
+    return bool(
+        (np.abs(poses) < _MAX_DISTANCE).all()
+        and (poses[:, D] == np.eye(D + 1)[D]).all()
+        and np.allclose(R @ R.swapaxes(1, 2), np.eye(D), atol=1e-6)
     )
 
 
 def _read_keyframes(folder: Path) -> Keyframes:
     recording = read_recording(folder)
-    K, D = recording.n_scans, recording.dimension
+    K = recording.n_scans
     scans = np.array(read_array(folder / "scans.npy", (K,), "i"), np.intp)
-    poses = np.array(read_array(folder / "poses.npy", (K, D + 1, D + 1), "f"), np.float64)
+    poses = np.array(read_array(folder / "poses.npy", (K, None, None), "f"), np.float64)
     e = read_array(folder / "e.npy", (recording.n_beams,), "f")
     nodes = np.array(read_array(folder / "nodes.npy", (None,), "i"), np.intp)
     if not K or not len(nodes) or np.any(np.diff(scans) <= 0) or np.any(np.diff(nodes) <= 0):
         raise _inconsistent(folder)
-    if nodes[0] < 0 or nodes[-1] >= K or scans[0] < 0 or not np.isfinite(poses).all():
+    if nodes[0] < 0 or nodes[-1] >= K or scans[0] < 0 or poses.shape[1] not in (3, 4):
         raise _inconsistent(folder)
+    if poses.shape[1] != poses.shape[2] or not is_rigid(poses):
+        raise _inconsistent(folder)
+    if e.dtype != np.float32 or not ((e >= 0.0) & (e <= 1.0)).all():
+        raise InputError("holds no probabilities", where=str(folder / "e.npy"), hint=HINT)
     return Keyframes(recording, scans, poses, e, nodes)
 
 
@@ -108,15 +141,37 @@ def read_beam_cells(folder: Path, n_beams: int, resolution: float) -> BeamCells:
     """
     state = folder / STATE
     cells = read_array(state / "cells.npy", (None, None), "i")
+    node = read_array(state / "cell_node.npy", (len(cells),), "i")
+    of_beam = read_array(state / "beam_cell.npy", (n_beams,), "i")
     return BeamCells(
-        cells,
-        read_array(state / "cell_node.npy", (len(cells),), "i"),
-        read_array(state / "beam_cell.npy", (n_beams,), "i"),
-        read_array(state / "p_static.npy", (n_beams,), "f"),
-        resolution,
+        cells, node, of_beam, read_array(state / "p_static.npy", (n_beams,), "f"), resolution
     )
+
+
+def check_beam_cells(folder: Path, beams: BeamCells, session: Session) -> None:
+    """Refuse cells and labels of beams that cannot be those of a session.
+
+    Raises:
+        InputError: names the file.
+    """
+    count, state = len(beams.cells), folder / STATE
+    if beams.cells.shape[1:] != (session.dimension,):
+        raise _inconsistent(state)
+    for name, values, last in (
+        ("cell_node", beams.node, len(session.graph.keyframes) - 1),
+        ("beam_cell", beams.of_beam, count - 1),
+    ):
+        first = -1 if name == "beam_cell" else 0
+        for block in arrays.iter_blocks(values):
+            if ((values[block] < first) | (values[block] > last)).any():
+                what = "names what is not there"
+                raise InputError(what, where=str(state / f"{name}.npy"), hint=HINT)
+    for block in arrays.iter_blocks(beams.p_static):
+        if ((beams.p_static[block] < 0.0) | (beams.p_static[block] > 1.0)).any():
+            what = "holds no probabilities"
+            raise InputError(what, where=str(state / "p_static.npy"), hint=HINT)
 
 
 def _inconsistent(folder: Path) -> InputError:
     what = "is damaged or was changed by hand: its arrays do not belong together"
-    return InputError(what, where=str(folder), hint="merge the sessions anew")
+    return InputError(what, where=str(folder), hint=HINT)

@@ -1,7 +1,7 @@
 """The folder of a place: everything that the result of one recording has, and its sessions."""
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,13 +15,14 @@ from stillmap.core.short_repr import ShortRepr
 from stillmap.io.trajectory import write_tum
 from stillmap.places.changes import PlaceChange, change_cells, change_records
 from stillmap.places.evidence import Evidence
-from stillmap.places.inputs import SESSIONS
+from stillmap.places.inputs import TIES
 from stillmap.places.place import Place, PlacedSession, Refusal
 from stillmap.places.place_graph import Tie
 from stillmap.places.shown_state import ShownState, changed_cell_table, label_session
 from stillmap.places.store import STATE, read_beam_cells
 from stillmap.results.labels import read_array
 from stillmap.results.pose_graph_g2o import write_g2o
+from stillmap.results.reader import SESSIONS
 from stillmap.slam import PoseGraph
 from stillmap.slam.pose_graph import Constraint
 
@@ -75,7 +76,7 @@ def write_sessions(folder: Path, result: PlaceResult) -> None:
 
 def _write_state(state: Path, one: PlacedSession) -> None:
     write_npy(state / "nodes.npy", one.nodes)
-    write_npy(state / "covariance.npy", one.covariance)
+    write_npy(state / "covariance.npy", one.known_covariance)
     evidence, planar = one.require_evidence()
     write_evidence(state / "evidence.npz", evidence)
     if planar is not evidence:
@@ -125,7 +126,7 @@ def write_place_files(folder: Path, result: PlaceResult) -> None:
     write_npz(folder / CELLS, change_cells(result.changes, result.shown.place))
     write_npz(folder / STATES, changed_cell_table(result.planar, result.names_in_time))
     dof = 3 if place.dimension == 2 else 6
-    write_ties(folder / "ties.npz", place.ties, dof)
+    write_ties(folder / TIES, place.ties, dof)
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -191,25 +192,34 @@ def session_records(result: PlaceResult) -> list[dict[str, Any]]:
     """The entries of `sessions.json`, in the order in which the inputs were given."""
     placed = {one.session.name: one for one in result.place.sessions}
     refused = {one.name: one for one in result.refusals}
-    return list(_iter_records(result.order, placed, refused))
+    counts = [len(one.session.stamp_ns) for one in result.place.sessions]
+    first_scan = dict(zip(placed, np.cumsum([0, *counts]).tolist(), strict=False))
+    return [
+        _placed_record(placed[name], first_scan[name])
+        if name in placed
+        else {
+            "name": name,
+            "input": refused[name].input,
+            "accepted": False,
+            "why": refused[name].why,
+        }
+        for name in result.order
+        if name in placed or name in refused
+    ]
 
 
-def _iter_records(
-    order: list[str], placed: dict[str, PlacedSession], refused: dict[str, Refusal]
-) -> Iterator[dict[str, Any]]:
-    for name in order:
-        if name in placed:
-            one = placed[name]
-            yield {
-                "name": name,
-                "input": one.session.source.get("path"),
-                "accepted": True,
-                "T_place_session": one.T.tolist(),
-                "covariance": one.covariance.tolist(),
-                "overlap": round(one.overlap, 4),
-                "first_stamp_ns": int(one.session.stamp_ns[0]),
-                "last_stamp_ns": int(one.session.stamp_ns[-1]),
-            }
-        elif name in refused:
-            source = refused[name].source.get("path")
-            yield {"name": name, "input": source, "accepted": False, "why": refused[name].why}
+def _placed_record(one: PlacedSession, first_scan: int) -> dict[str, Any]:
+    """The entry of a session whose scans begin at `first_scan` of those of the place."""
+    stamp_ns = one.session.stamp_ns
+    return {
+        "name": one.session.name,
+        "input": one.session.input,
+        "accepted": True,
+        "T_place_session": one.T.tolist(),
+        "covariance": one.known_covariance.tolist(),
+        "overlap": round(one.overlap, 4),
+        "first_stamp_ns": int(stamp_ns[0]),
+        "last_stamp_ns": int(stamp_ns[-1]),
+        "first_scan": first_scan,
+        "scans": len(stamp_ns),
+    }

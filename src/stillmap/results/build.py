@@ -61,9 +61,9 @@ def build(
     """
     if resolution is not None:
         options = _with_resolution(options, resolution)
-    chosen = _to_options(options)
+    chosen = to_options(options)
     stages, folder = StageTimer(), None if scratch is None else Path(scratch)
-    with _shown(progress, chosen.em.max_iterations) as tell:
+    with report_to(progress, chosen.em.max_iterations) as tell:
         if not isinstance(recording, Recording):
             with stages.measure("read"):
                 recording = inputs.read(
@@ -81,7 +81,12 @@ def build(
     return BuiltResult(**vars(result))
 
 
-def _to_options(options: Options | Mapping[str, Any] | None) -> Options:
+def to_options(options: Options | Mapping[str, Any] | None) -> Options:
+    """The options that a caller gave: all of them, those to change, or none.
+
+    Raises:
+        InputError: there is no such option, or a value is out of range.
+    """
     if options is None:
         return DEFAULTS
     if isinstance(options, Options):
@@ -94,11 +99,12 @@ def _to_options(options: Options | Mapping[str, Any] | None) -> Options:
 def _with_resolution(options: Options | Mapping[str, Any] | None, resolution: float) -> Options:
     edge = float(resolution)
     changes = {"slam": {"resolution": edge, "voxel_size": edge}}
-    return config.override(_to_options(options), changes)
+    return config.override(to_options(options), changes)
 
 
 @contextmanager
-def _shown(progress: bool | Progress, iterations: int) -> Iterator[Progress]:
+def report_to(progress: bool | Progress, iterations: int) -> Iterator[Progress]:
+    """What a caller gave as `progress`, or a bar, or nothing."""
     if callable(progress):
         yield progress
     elif progress:

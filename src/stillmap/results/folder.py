@@ -162,6 +162,9 @@ class ResultFolder(ShortRepr):
     @property
     def dimension(self) -> int:
         """Dimension of its recording, 2 or 3."""
+        noted = self.record.get("dimension")  # of a session of a place
+        if noted in (2, 3):
+            return int(noted)
         return 3 if (self.folder / _STATIC_CLOUD).is_file() else 2
 
     @property

@@ -35,12 +35,7 @@ def plot_result(result: "Result", ax: "Axes | None", *, trajectory: bool, dynami
     image = draw_map(result.map, window).convert("RGB")
     ax.imshow(np.asarray(image), extent=_extent(result, image), interpolation="nearest")
     if dynamic:
-        points = sample_dynamic_points(
-            result.deskewed, result.poses, result.p_static, limit=_MAX_POINTS
-        )
-        ax.plot(
-            points[:, 0], points[:, 1], ".", color=_ORANGE, markersize=1.5, label="dynamic returns"
-        )
+        draw_dynamic(result, ax)
     if trajectory:
         x, y = _track(result).T
         ax.plot(x, y, color=_BLUE, linewidth=1.0, label="trajectory")
@@ -50,6 +45,14 @@ def plot_result(result: "Result", ax: "Axes | None", *, trajectory: bool, dynami
     ax.set_xlabel("x (m)")
     ax.set_ylabel("y (m)")
     return ax
+
+
+def draw_dynamic(result: "Result", ax: "Axes") -> None:
+    """Draw returns from what moves."""
+    points = sample_dynamic_points(
+        result.deskewed, result.poses, result.p_static, limit=_MAX_POINTS
+    )
+    ax.plot(points[:, 0], points[:, 1], ".", color=_ORANGE, markersize=1.5, label="dynamic returns")
 
 
 def _extent(result: "Result", image: Image.Image) -> tuple[float, float, float, float]:
@@ -84,12 +87,15 @@ def key_facts(result: "Result") -> dict[str, str]:
     """What a result is about, in words and numbers."""
     stamps, grid = result.stamp_ns, result.map
     height, width = (n * grid.resolution for n in grid.p_occupied.shape)
-    seconds = float(stamps[-1] - stamps[0]) * 1e-9 if len(stamps) else 0.0
+    seconds, distance = 0.0, 0.0
+    for scans in result._stretches() if len(stamps) else []:
+        span, steps = stamps[scans], np.diff(_track(result)[scans], axis=0)
+        seconds += float(span[-1] - span[0]) * 1e-9
+        distance += float(np.linalg.norm(steps, axis=1).sum())
     hits, dynamic = _count_hits(result.hit, result.p_static)
-    steps = np.diff(_track(result), axis=0)
     return {
         "scans": f"{len(stamps)} in {seconds:.1f} s",
-        "distance": f"{np.linalg.norm(steps, axis=1).sum():.1f} m",
+        "distance": f"{distance:.1f} m",
         "beams": f"{_spaced(len(result.p_static))}, {_spaced(hits)} of them hits",
         "dynamic": f"{100.0 * dynamic / max(hits, 1):.1f} % of the hits",
         "moving objects": str(len(result.objects)),
@@ -130,7 +136,9 @@ def _preview(result: "Result") -> Image.Image:
     how = Image.Resampling.BOX if factor < 1.0 else Image.Resampling.NEAREST
     image = image.resize((width, height), how)
     pixels = MapView(window, (width, height), False).to_pixels(_track(result))
-    ImageDraw.Draw(image).line([(x, y) for x, y in pixels.tolist()], fill=_BLUE, width=2)
+    for scans in result._stretches():
+        way = [(x, y) for x, y in pixels[scans].tolist()]
+        ImageDraw.Draw(image).line(way, fill=_BLUE, width=2)
     return image.quantize(64)
 
 

@@ -1,6 +1,7 @@
 """A result folder read again, beside the recording that it was made from."""
 
 import json
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -47,6 +48,7 @@ class Grid(GridMap):
         return moved(se2.matrix(*self.origin), (cells[:, ::-1] + np.float64(0.5)) * self.resolution)
 
 
+SESSIONS = "sessions.json"  # every place has it
 _MAX_MAP = 1 << 29  # bytes of a map when it is unpacked: a thousand times what they take packed
 
 
@@ -75,13 +77,20 @@ def require_model(result: Path) -> Path:
     return path
 
 
+def _find_map(result: Path) -> Path:
+    """The folder in which the map of a result lies: of a session of a place, that of the place."""
+    home = Path(os.path.abspath(result)).parent
+    is_session = home.name == "sessions" and (home.parent / SESSIONS).is_file()
+    return home.parent if is_session else result
+
+
 def read_grid(result: Path) -> Grid:
-    """`map.npz` of a result folder.
+    """`map.npz` of a result folder; of a session of a place, that of the place.
 
     Raises:
         InputError: it is missing or damaged.
     """
-    path = result / "map.npz"
+    path = _find_map(result) / "map.npz"
     p_occupied, origin, resolution = _read_layer(path, "p_occupied")
     if p_occupied.ndim != 2 or p_occupied.dtype.kind != "f":
         raise InputError(
@@ -107,12 +116,12 @@ class Crossings(NamedTuple):
 
 
 def read_crossings(result: Path) -> Crossings:
-    """The crossings in `traffic.npz` of a result folder.
+    """The crossings in `traffic.npz` of a result folder; of a session of a place, all of the place.
 
     Raises:
         InputError: it is missing or damaged.
     """
-    path = result / "traffic.npz"
+    path = _find_map(result) / "traffic.npz"
     if not path.exists():
         hint = "`stillmap map` writes it with objects.enabled=true"
         raise InputError("does not exist: no crossings were counted", where=str(path), hint=hint)

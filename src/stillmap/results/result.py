@@ -155,6 +155,10 @@ class Result:
             f"{n} moving object{'s' * (n != 1)}, {notes} warning{'s' * (notes != 1)}, {self.map}>"
         )
 
+    def _stretches(self) -> list[slice]:
+        """The scans of each recording that it was made from."""
+        return [slice(None)]
+
     def _repr_html_(self) -> str:
         from stillmap.results.plot import summarize_as_html
 

@@ -157,27 +157,26 @@ def load(
     labels = read_labels(folder)
     given = recording is not None
     source = os.fspath(recording) if isinstance(recording, os.PathLike) else recording
+    record = ResultFolder(folder, read_record(folder), Path(), given)
     return SavedResult(
         path=folder,
         map=read_grid(folder),
-        poses=_read_poses(folder, labels),
+        poses=_read_poses(record, labels),
         objects=read_tracks(folder / "objects" / "objects.json"),
         labels=labels,
-        folder=ResultFolder(folder, read_record(folder), Path(), given),
+        folder=record,
         source=source,
     )
 
 
-def _read_poses(folder: Path, labels: Labels) -> Float:
+def _read_poses(record: ResultFolder, labels: Labels) -> Float:
     """(T, D+1, D+1) T_map_base."""
+    folder = record.folder
     path = folder / "trajectory.tum"
     stamp_ns, poses = read_tum(path)
     if not np.array_equal(stamp_ns, labels.stamp_ns):
         what = f"has {len(stamp_ns)} poses, not one for each of {len(labels.stamp_ns)} scans"
         raise InputError(what, where=str(path))
-    return poses if _is_3d(folder) else se2.project_to_plane(poses)
-
-
-def _is_3d(folder: Path) -> bool:
     # a rig with a tilting laser writes clouds, but its map is that of the planar one
-    return (folder / "static.ply").exists() and not (folder / TILTING).is_dir()
+    is_3d = record.dimension == 3 and not (folder / TILTING).is_dir()
+    return poses if is_3d else se2.project_to_plane(poses)
