@@ -41,6 +41,9 @@ _MIN_EXPLAINED = 0.45  # share of a view's points; a view elsewhere reaches as m
 # m and rad between the alignments of two views of one hypothesis
 _SAME_DISTANCE, _SAME_ANGLE = 0.8, 0.1
 _RIVAL_DISTANCE, _RIVAL_ANGLE = 1.0, 0.1  # m, rad: alignments nearer to a better one are that one
+# views after which hypotheses are compared; the search ends when so many views agree on one, under
+# which so many squares agree, and no other has more than this share of its score
+_VIEWS_AT_ONCE, _CLEAR_VIEWS, _CLEAR_AGREEING, _CLEAR_RIVAL = 10, 6, 1000, 0.15
 _MAX_HYPOTHESES = 6
 
 
@@ -85,25 +88,64 @@ def propose_alignments(
     """
     if not len(place.surface):
         return []
-    grid, centre, half = _make_search_map(place.surface)
-    travelled = travelled_distance(keyframes.poses)
-    found = list[_ViewMatch]()
-    for k in spread_evenly(len(keyframes), MAX_VIEWS):
+    search = _Search(place, session, keyframes)
+    views = _spread_order(len(keyframes), MAX_VIEWS)
+    out = list[Hypothesis]()
+    for first in range(0, len(views), _VIEWS_AT_ONCE):
+        for k in views[first : first + _VIEWS_AT_ONCE]:
+            search.search_view(k)
+        out = _remove_duplicates(search.compare(), session)
+        if _is_clear(out):
+            break
+    return out[:_MAX_HYPOTHESES]
+
+
+class _Search:
+    """Views of a session searched in the map of a place."""
+
+    def __init__(self, place: SurfaceMap, session: SurfaceMap, keyframes: Keyframes) -> None:
+        self._place, self._session, self._keyframes = place, session, keyframes
+        self._grid, self._centre, self._half = _make_search_map(place.surface)
+        self._travelled = travelled_distance(keyframes.poses)
+        self._points = session.surface[spread_evenly(len(session.surface), _REFINED_POINTS)]
+        self._found = list[_ViewMatch]()
+
+    def search_view(self, k: int) -> None:
+        """Search the views around keyframe k."""
         for metres, radius in _VIEWS:
-            points = collect_view(keyframes, travelled, k, metres, radius)
+            points = collect_view(self._keyframes, self._travelled, k, metres, radius)
             if len(points) < _MIN_POINTS:
                 continue
-            pose = keyframes.poses[k]
-            for T, share in _search_view(grid, points, centre, half):
+            pose = self._keyframes.poses[k]
+            for T, share in _search_view(self._grid, points, self._centre, self._half):
                 if share >= _MIN_EXPLAINED:
-                    found.append(_ViewMatch(T @ se2.inverse(pose), share, pose))
-    points = session.surface[spread_evenly(len(session.surface), _REFINED_POINTS)]
-    out = []
-    for T, views in _group(found):
-        refined, *_ = _register(grid, points, T, 0.0)  # by the whole session
-        out.append(Hypothesis(refined, views, compare_maps(place, session, refined)))
-    out.sort(key=lambda one: -one.comparison.score)
-    return _remove_duplicates(out, session)[:_MAX_HYPOTHESES]
+                    self._found.append(_ViewMatch(T @ se2.inverse(pose), share, pose))
+
+    def compare(self) -> list[Hypothesis]:
+        """The alignments found so far, refined by the whole session, the best one first."""
+        out = []
+        for T, views in _group(self._found):
+            refined, *_ = _register(self._grid, self._points, T, 0.0)
+            comparison = compare_maps(self._place, self._session, refined)
+            out.append(Hypothesis(refined, views, comparison))
+        return sorted(out, key=lambda one: -one.comparison.score)
+
+
+def _spread_order(count: int, max_chosen: int) -> list[int]:
+    """At most so many of `count` indices, evenly spread, neighbours far apart in the order."""
+    chosen = spread_evenly(count, max_chosen)
+    steps = [step for step in (8, 4, 2, 1) if step <= len(chosen)]
+    order = [k for step in steps for k in range(0, len(chosen), step)]
+    return [chosen[k] for k in dict.fromkeys(order)]
+
+
+def _is_clear(hypotheses: list[Hypothesis]) -> bool:
+    """Whether further views would not change which alignment is the best."""
+    if not hypotheses or hypotheses[0].views < _CLEAR_VIEWS:
+        return False
+    best = hypotheses[0].comparison
+    rival = hypotheses[1].comparison.score if len(hypotheses) > 1 else 0.0
+    return best.agree >= _CLEAR_AGREEING and rival <= _CLEAR_RIVAL * best.score
 
 
 def _remove_duplicates(hypotheses: list[Hypothesis], session: SurfaceMap) -> list[Hypothesis]:

@@ -81,7 +81,7 @@ def add_session(
     matches, states = found.matches, None
     if place.dimension == 3:
         matches = match_session(place, placed, PREDICTION_STD, None, threads)
-    for _ in range(_EM_ROUNDS):
+    for number in range(_EM_ROUNDS):
         if states is not None:
             matches = match_session(place, placed, CORRECTED_STD, states, threads)
         report("optimizing poses")
@@ -93,15 +93,17 @@ def add_session(
         grown, agreeing = _optimize(place, placed, ties)  # M-step
         if agreeing < _MIN_AGREEING:
             return Growth(place, "constraints to the place contradict each other")
-        report("comparing sessions")
-        grown = update_evidence(grown, threads)
-        states = estimate_planar(grown)  # E-step
         placed = grown.sessions[-1]
+        if number + 1 == _EM_ROUNDS:
+            break
+        report("comparing sessions")
+        grown = update_evidence(grown, threads, last_only=True)
+        states = estimate_planar(grown)  # E-step
         changed = states.disagreement_of(grown.in_time().index(len(grown.sessions) - 1))
         if place.dimension == 2 and changed > _MAX_CHANGED:
             why = f"{100 * changed:.0f} % of what both saw would have changed"
             return Growth(place, f"it contradicts the place: {why}")
-    return Growth(_describe(grown, ties))
+    return Growth(_describe(update_evidence(grown, threads), ties))
 
 
 def estimate_planar(place: Place) -> PlaceStates:

@@ -15,7 +15,7 @@ from stillmap.places.session import Session
 Float = NDArray[np.float64]
 
 # of a cell, by which keyframes may move before the evidence of their session is measured again
-_MAX_MOTION = 0.25
+_MAX_MOTION = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,9 +131,15 @@ class Place(ShortRepr):
         return replace(self, sessions=moved)
 
 
-def update_evidence(place: Place, threads: int) -> Place:
-    """The place with the evidence of sessions whose keyframes moved measured again."""
-    return replace(place, sessions=[_measure(one, place, threads) for one in place.sessions])
+def update_evidence(place: Place, threads: int, *, last_only: bool = False) -> Place:
+    """The place with the evidence of sessions whose keyframes moved measured again.
+
+    last_only: only that of the last session.
+    """
+    before, last = place.sessions[:-1], place.sessions[-1]
+    if not last_only:
+        before = [_measure(one, place, threads) for one in before]
+    return replace(place, sessions=[*before, _measure(last, place, threads)])
 
 
 def _measure(one: PlacedSession, place: Place, threads: int) -> PlacedSession:
