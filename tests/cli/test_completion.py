@@ -76,7 +76,18 @@ def ask(tmp_path, place):
 
 
 def test_bash(ask):
-    names = {"map", "info", "view", "fleet", "filter", "convert", "simulate", "eval", "config"}
+    names = {
+        "map",
+        "info",
+        "view",
+        "merge",
+        "fleet",
+        "filter",
+        "convert",
+        "simulate",
+        "eval",
+        "config",
+    }
     names |= {"completion"}
     wanted = {
         "stillmap ": names,

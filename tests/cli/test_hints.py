@@ -204,6 +204,7 @@ CALLS = [
     ("map", "in", "-o", "out"),
     ("info", "in"),
     ("view", "out"),
+    ("merge", "in", "in2", "-o", "out"),
     ("fleet", "in", "-o", "out"),
     ("filter", "out", "-o", "clean"),
     ("convert", "in", "-o", "out"),

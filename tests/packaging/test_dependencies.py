@@ -17,6 +17,7 @@ NEEDS_EXTRA = {
     "viewer/server.py": "viewer",
     # for type checkers alone
     **{f"results/{name}.py": "notebook" for name in ("plot", "result", "tables")},
+    **{f"places/{name}.py": "notebook" for name in ("plot", "saved_place")},
 }
 SINCE_PYTHON_3_14 = {"compression"}  # the standard library's zstd; before, backports.zstd
 

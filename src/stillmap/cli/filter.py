@@ -105,6 +105,7 @@ def _filter_result(args: argparse.Namespace, output: Path) -> None:
     from stillmap.results.folder import open_result
 
     result = open_result(Path(args.result), args.input)
+    _ = result.read_options  # refused before the recording is looked for
     target = find_target(result, output, args.to)
     filter_writers.require_free(target, output, result.source, args.overwrite)
     done = write_filtered(result, target, output, args)

@@ -83,6 +83,7 @@ def _plan(place: Path, name: str, output: Path, to: str | None) -> _Session:
     require_apart(output, place)
     try:
         result = open_result(place / "sessions" / name)
+        _ = result.read_options
         result.require_source()
     except InputError as error:
         hint = f"stillmap filter {place}/sessions/{name} -o FILE --input FILE finds it elsewhere"
