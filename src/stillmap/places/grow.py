@@ -39,8 +39,9 @@ _EM_ROUNDS = 2
 _MAX_CHANGED = 0.25  # share of the cells seen by it and others that nobody saw as it did
 # constraints between keyframes, and the share of them that the graph must keep; in 3D the maps
 # themselves are one: lidars see far beyond where robots drove
-_MIN_TIES, _MIN_AGREEING = {2: 4, 3: 1}, 0.6
-_MAP_STD = (0.05, 0.05, 0.1, 0.01, 0.01, 0.004)  # m and rad, of an alignment of maps in 3D
+_MIN_TIES, _MIN_AGREEING = 4, 0.6
+# m and rad, of an alignment of maps
+_MAP_STD = {2: (0.04, 0.04, 0.003), 3: (0.05, 0.05, 0.1, 0.01, 0.01, 0.004)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,9 +87,9 @@ def add_session(
             matches = match_session(place, placed, CORRECTED_STD, states, threads)
         report("optimizing poses")
         ties = make_ties(matches, len(place.sessions))
-        if place.dimension == 3:
+        if place.dimension == 3 or not found.matches:
             ties.append(_tie_maps(place, start))
-        if len(ties) < _MIN_TIES[place.dimension]:
+        elif len(ties) < _MIN_TIES:
             return Growth(place, "too few of its keyframes can be registered to the place")
         grown, agreeing = _optimize(place, placed, ties)  # M-step
         if agreeing < _MIN_AGREEING:
@@ -171,11 +172,12 @@ def make_ties(matches: Matches, index: int) -> list[Tie]:
 def _tie_maps(place: Place, start: PlacedSession) -> Tie:
     """The alignment of the maps as a constraint between the nearest nodes."""
     index = select_references(place.sessions, start.session.planar, start.planar_poses)[0]
-    ours, theirs = start.nodes[:, :3, 3], place.sessions[index].nodes[:, :3, 3]
+    D = place.dimension
+    ours, theirs = start.nodes[:, :D, D], place.sessions[index].nodes[:, :D, D]
     distance = np.linalg.norm(ours[:, None] - theirs[None], axis=2)
     node, other = np.unravel_index(int(distance.argmin()), distance.shape)
     T = se2.inverse(place.sessions[index].nodes[other]) @ start.nodes[node]
-    covariance = np.diag(np.square(_MAP_STD))
+    covariance = np.diag(np.square(_MAP_STD[D]))
     return Tie(index, int(other), len(place.sessions), int(node), T, covariance)
 
 

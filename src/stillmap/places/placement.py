@@ -16,7 +16,7 @@ from stillmap.places.matching import REACH, KeyframeMatch, Verdict, match_sessio
 from stillmap.places.place import PlacedSession
 from stillmap.places.place_graph import Tie
 from stillmap.places.session import Session
-from stillmap.places.surface_map import make_surface_map
+from stillmap.places.surface_map import is_determined, make_surface_map
 
 Float = NDArray[np.float64]
 
@@ -30,6 +30,8 @@ _MIN_AGREEING = 200
 # of another one, relative to the best, at which none may: things move between sessions, but
 # look-alike places fit in several ways (docs/sessions.md has the distributions)
 _MAX_CONFLICT, _MAX_RIVAL = 0.15, 0.6
+# the same where no keyframes need to fit: squares that agree, share in conflict, score of a rival
+_STRONG_AGREEING, _STRONG_CONFLICT, _STRONG_RIVAL = 1500, 0.06, 0.2
 _MIN_FITTING = 5  # nodes
 # std along the least known direction (m), and of the heading (rad), up to which a session is placed
 _MAX_STD, _MAX_HEADING_STD = 0.05, math.radians(0.5)
@@ -73,7 +75,19 @@ def find_placement(place: Sequence[PlacedSession], session: Session) -> Placemen
     if D == 3:  # sweeps are registered in space, which tells more than their planar views
         return Placement(proposed[0].T)
     best = test_alignment(place, session, proposed[0].T)
-    return replace(best, refused=_uncertainty(best, session))
+    refused = _uncertainty(best, session)
+    against = best.count(Verdict.CONTRADICTS)
+    if refused and not against and _is_strong(proposed) and is_determined(known, own, best.T):
+        return Placement(best.T)  # seen from afar, as across a hall: the maps alone say where it is
+    return replace(best, refused=refused)
+
+
+def _is_strong(proposed: list[Hypothesis]) -> bool:
+    """Whether the comparison of the maps alone is enough."""
+    best = proposed[0].comparison
+    rival = max((other.comparison.score for other in proposed[1:]), default=0.0)
+    few = best.conflict <= _STRONG_CONFLICT * (best.agree + best.conflict)
+    return best.agree >= _STRONG_AGREEING and few and rival <= _STRONG_RIVAL * best.score
 
 
 def _doubt(proposed: list[Hypothesis]) -> str:

@@ -20,6 +20,7 @@ _STEP = 2  # cells of the evidence along the edge of a square
 _LIMITS = {2: (0.75, 2.0), 3: (3.0, 6.0)}
 
 
+_SHIFT, _MAX_SHIFTED = 0.4, 0.75  # m; share of the agreeing squares that may agree after it
 _CONFLICT_WEIGHT = 5.0
 
 
@@ -117,6 +118,19 @@ def compare_maps(place: SurfaceMap, session: SurfaceMap, T_place_session: Float)
     forth = place.look_up(_transform(T_place_session, session.surface))
     back = session.look_up(_transform(se2.inverse(T_place_session), place.surface))
     return Comparison(forth.agree + back.agree, forth.conflict + back.conflict)
+
+
+def is_determined(place: SurfaceMap, session: SurfaceMap, T_place_session: Float) -> bool:
+    """Whether fewer surfaces agree wherever else the session is shifted to by a few decimetres.
+
+    Along a bare corridor as many do.
+    """
+    agree = compare_maps(place, session, T_place_session).agree
+    for angle in np.arange(8) * (np.pi / 4.0):
+        shift = se2.matrix(_SHIFT * np.cos(angle), _SHIFT * np.sin(angle), 0.0)
+        if compare_maps(place, session, shift @ T_place_session).agree > _MAX_SHIFTED * agree:
+            return False
+    return True
 
 
 def _transform(T: Float, points: NDArray[np.float32]) -> Float:

@@ -1,0 +1,118 @@
+"""Placement of sessions of made-up rooms: found, ambiguous, undetermined, foreign."""
+
+import numpy as np
+import pytest
+
+from stillmap.core import se2
+from stillmap.core.recording import Recording
+from stillmap.places.evidence import measure_evidence
+from stillmap.places.grow import add_session, start_place
+from stillmap.places.prepare import MappedRecording, make_session
+from stillmap.places.surface_map import compare_maps, is_determined, make_surface_map
+
+# corners of rooms, in order; metres
+RECTANGLE = [(0, 0), (12, 0), (12, 7), (0, 7)]
+L_SHAPE = [(0, 0), (14, 0), (14, 5), (6, 5), (6, 11), (0, 11)]
+OTHER = [(0, 0), (9, 0), (9, 3), (16, 3), (16, 8), (0, 8)]
+
+
+def scan(corners, poses, n_beams=180, max_range=25.0):
+    """A recording of a room seen all round from poses (T, 3, 3), without noise."""
+    ends = np.array([*corners, corners[0]], float)
+    a, b = ends[:-1], ends[1:]
+    angles = np.linspace(-np.pi, np.pi, n_beams, endpoint=False)
+    points = []
+    for x, y, theta in se2.parameters(poses):
+        d = np.stack([np.cos(angles + theta), np.sin(angles + theta)], axis=1)[:, None]
+        e, to_a = (b - a)[None], (a - (x, y))[None]
+        cross = d[..., 0] * e[..., 1] - d[..., 1] * e[..., 0]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = (to_a[..., 0] * e[..., 1] - to_a[..., 1] * e[..., 0]) / cross
+            u = (to_a[..., 0] * d[..., 1] - to_a[..., 1] * d[..., 0]) / cross
+        t = np.where((t > 0) & (u >= 0) & (u <= 1), t, np.inf).min(axis=1)
+        points.append(np.stack([np.cos(angles), np.sin(angles)], axis=1) * t[:, None])
+    T = len(poses)
+    points = np.concatenate(points).astype(np.float32)
+    hit = np.linalg.norm(points, axis=1) < max_range
+    points[~hit] = np.nan
+    return Recording(
+        stamp_ns=np.arange(T) * 1_000_000_000,
+        offset=np.arange(T + 1) * n_beams,
+        points=points,
+        hit=hit,
+        T_base_sensor=np.eye(3)[None],
+        sensor=np.zeros(T, np.int32),
+        T_odom_base=None,
+    )
+
+
+def session(name, corners, way, n=40):
+    """A session that drove along a way through a room, in the frame of its own first pose."""
+    way = np.array(way, float)
+    at = np.linspace(0, len(way) - 1, n)
+    x, y = (np.interp(at, np.arange(len(way)), column) for column in way.T)
+    heading = np.arctan2(np.gradient(y), np.gradient(x))
+    world = se2.matrix(x, y, heading)
+    recording = scan(corners, world)
+    poses = se2.inverse(world[0]) @ world
+    p_static = np.where(recording.hit, np.float32(1.0), np.float32(np.nan))
+    mapped = MappedRecording(name, recording, poses, p_static, None, (0.2, 1.8))
+    return make_session(mapped), world[0]
+
+
+def grow(first, second):
+    return add_session(start_place(first, 0.05, 0.15, 1), second, 1)
+
+
+def test_a_session_from_another_start_is_found():
+    first, T_first = session("a", L_SHAPE, [(1, 1), (12, 2), (3, 3), (2, 9)])
+    second, T_second = session("b", L_SHAPE, [(4, 9), (2, 4), (10, 3), (12, 1)])
+    growth = grow(first, second)
+    assert not growth.refused
+    error = se2.parameters(
+        se2.inverse(se2.inverse(T_first) @ T_second) @ growth.place.sessions[1].T
+    )
+    assert np.hypot(*error[:2]) < 0.03
+    assert abs(error[2]) < 0.005
+    assert growth.place.sessions[1].overlap > 0.9
+
+
+def test_a_room_that_fits_both_ways_round_is_refused():
+    first, _ = session("a", RECTANGLE, [(2, 2), (10, 2), (10, 5), (2, 5)])
+    second, _ = session("b", RECTANGLE, [(9, 5), (3, 5), (3, 2), (8, 2)])
+    growth = grow(first, second)
+    assert "another" in growth.refused
+    assert len(growth.place.sessions) == 1
+
+
+def test_another_room_is_refused():
+    first, _ = session("a", L_SHAPE, [(1, 1), (12, 2), (3, 3), (2, 9)])
+    second, _ = session("b", OTHER, [(2, 1), (7, 2), (8, 6), (14, 5), (2, 6)])
+    assert grow(first, second).refused
+
+
+def test_maps_agree_where_they_belong_and_contradict_elsewhere():
+    first, _ = session("a", L_SHAPE, [(1, 1), (12, 2), (3, 3), (2, 9)])
+    own = make_surface_map([measure_evidence(first.planar, first.planar.poses, 0.05, 1)])
+    same, moved = (
+        compare_maps(own, own, np.eye(3)),
+        compare_maps(own, own, se2.matrix(1.0, 0.5, 0.1)),
+    )
+    assert same.conflict == 0
+    assert same.agree > 500
+    assert moved.conflict > moved.agree
+    assert moved.score < 0 < same.score
+
+
+@pytest.mark.parametrize(
+    ("corners", "way", "determined"),
+    [
+        (L_SHAPE, [(1, 1), (12, 2), (3, 3), (2, 9)], True),
+        ([(0, 0), (400, 0), (400, 2.5), (0, 2.5)], [(196, 1.2), (204, 1.3)], False),
+    ],
+    ids=["room", "corridor without ends"],
+)
+def test_whether_the_maps_alone_say_where_a_session_is(corners, way, determined):
+    one, _ = session("a", corners, way)
+    own = make_surface_map([measure_evidence(one.planar, one.planar.poses, 0.05, 1)])
+    assert is_determined(own, own, np.eye(3)) == determined
