@@ -1,4 +1,4 @@
-"""What sessions saw, cell by cell, and which cells truly changed between them."""
+"""Observations of sessions per cell, and the cells that truly changed between them."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -65,7 +65,7 @@ class Lattice(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What a session saw of a lattice.
+    """Observations of a session on a lattice.
 
     Attributes:
         hits, passes: (H, W) int32 beams that end in each cell, or pass it.
@@ -144,7 +144,7 @@ class CellTruth(NamedTuple):
 
 
 def collect_cells(truth: SessionTruth, sessions: list[int]) -> CellTruth:
-    """What these sessions saw, at true poses, and where surfaces truly are.
+    """Observations of these sessions at true poses, and true surfaces.
 
     Raises:
         InputError: a recording or its truth is missing or damaged.

@@ -1,4 +1,4 @@
-"""What truly came to a place, left it or turned there between sessions, and could be seen to."""
+"""True changes between sessions that could be observed: objects that came or left, and doors."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -37,7 +37,7 @@ class Event(NamedTuple):
 
 
 def list_events(cells: CellTruth, truth: SessionTruth, sessions: list[int]) -> Iterator[Event]:
-    """What came or left between the sessions, and could be seen to."""
+    """The true changes between the sessions that could be observed."""
     for change in truth.changes:
         one = truth.objects[change.object]
         for came, at in ((True, change.between[1]), (False, change.between[0])):

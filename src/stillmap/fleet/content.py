@@ -1,4 +1,4 @@
-"""What a recording is: a quick fingerprint, and the hash of its content."""
+"""Identity of a recording: a quick fingerprint, and the hash of its content."""
 
 import hashlib
 import os

@@ -1,4 +1,4 @@
-"""What a fleet is asked for, its recordings and places on their way, and what became of them."""
+"""The job of a fleet, the state of its recordings and places, and its result."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -12,7 +12,7 @@ from stillmap.fleet.settings import Settings
 
 
 class Request(NamedTuple):
-    """What a fleet is asked for.
+    """The job of a fleet.
 
     Attributes:
         entries: recordings, folders and patterns of them, with their places.
@@ -96,7 +96,7 @@ class Place(NamedTuple):
 
 
 class Fleet(NamedTuple):
-    """What became of a fleet."""
+    """Result of a fleet."""
 
     jobs: list[Job]
     places: list[Place]

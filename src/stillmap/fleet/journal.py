@@ -13,7 +13,7 @@ _NAME = f"{STATE}/journal"
 
 
 class Journal:
-    """What earlier runs of the fleet noted, and what this one notes.
+    """Append-only log of the tasks of a fleet, of earlier runs and of this one.
 
     Args:
         storage: where the results of the fleet lie.

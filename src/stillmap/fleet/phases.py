@@ -210,7 +210,7 @@ def _is_summary(info: Any) -> bool:
 
 
 def _identify(task: Inspect) -> str:
-    """What the summary of a recording depends on."""
+    """Key of the summary of a recording: all that it depends on."""
     return repr((task.fingerprint, task.settings.describe(), package_version()))
 
 

@@ -11,7 +11,7 @@ _NO_MATTER = ("threads",)  # options on which no label or map depends
 
 @dataclass(frozen=True)
 class Settings:
-    """What a task is told beside its inputs.
+    """Settings of a task beside its inputs.
 
     Attributes:
         options: name and JSON value of every option that is not the default.

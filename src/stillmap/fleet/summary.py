@@ -1,4 +1,4 @@
-"""What the page of a fleet shows of a result: a small map, figures and warnings."""
+"""Summary of a result for the page of a fleet: a small map, figures and warnings."""
 
 import json
 from pathlib import Path

@@ -236,7 +236,7 @@ def _pair_positions(changes: list[PlaceChange], place: PlaceStates) -> list[Plac
 def _compare_positions(
     gone: PlaceChange, came: PlaceChange, place: PlaceStates
 ) -> tuple[Kind | None, float]:
-    """What two positions are: a door, one object that moved, or nothing; and the cost of that."""
+    """Classify two positions as a door, a moved object, or unrelated (None), with a cost."""
     if _is_door(place.cells[gone.cells], place.cells[came.cells], place.resolution):
         return "door", -1.0
     distance = float(np.linalg.norm(0.5 * (gone.low + gone.high - came.low - came.high)))

@@ -28,7 +28,7 @@ _RESOLUTION, _KEYFRAME_DISTANCE = 0.05, 1.0  # m, of submaps
 
 
 class Verdict(Enum):
-    """What a keyframe says about an alignment."""
+    """Evidence of a keyframe for or against an alignment."""
 
     FITS = "fits"
     CONTRADICTS = "contradicts"

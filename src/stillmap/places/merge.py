@@ -26,7 +26,7 @@ from stillmap.results.run_json import RECORD
 
 @dataclass(frozen=True, eq=False)
 class MergeJob(ShortRepr):
-    """What is merged, and how.
+    """Sessions to be merged, and the settings.
 
     Attributes:
         base: folder of a place to which sessions are added; None: a new place.

@@ -78,7 +78,7 @@ class PlacePictures:
         return color_levels(self._levels_as_of(session), *colors)
 
     def draw_difference(self, session: int) -> Patch | None:
-        """What `draw` of a session has otherwise than `draw_map`, transparent elsewhere."""
+        """The difference of `draw` of a session from `draw_map`, transparent elsewhere."""
         levels = self._levels_as_of(session)
         differs = levels != self._levels
         if not differs.any():

@@ -1,4 +1,4 @@
-"""What the JSON files of a place say: its sessions, and what changed between them."""
+"""The JSON files of a place: its sessions, and the changes between them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -95,7 +95,7 @@ def _to_session(record: dict[str, Any]) -> PlaceSession:
 
 
 def read_session_changes(folder: Path) -> list[SessionChange]:
-    """What changed between the sessions of a place, in the order of time.
+    """The changes between the sessions of a place, in the order of time.
 
     Raises:
         InputError: `changes.json` or `states.npz` is missing or damaged.

@@ -1,4 +1,4 @@
-"""What a place keeps of a session, in `sessions/NAME/state/`: enough to merge further sessions
+"""The state of a session in its place, `sessions/NAME/state/`: enough to merge further sessions
 without its recording."""
 
 from pathlib import Path

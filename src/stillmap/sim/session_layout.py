@@ -1,4 +1,4 @@
-"""What stands where in a world, session after session: furniture, parked cars, doors."""
+"""Layouts of a world, session after session: furniture, parked cars, doors."""
 
 import math
 
@@ -29,7 +29,7 @@ _DOOR_ROOM = 0.1  # m around the sector that a door sweeps, without furniture
 
 
 class Layout:
-    """What stands where, session after session."""
+    """Places of all things, session after session."""
 
     def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
         self._rng, self._doors = rng, scene.leaves

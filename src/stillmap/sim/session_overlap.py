@@ -15,7 +15,7 @@ _BLOCK = 200  # scans at once
 
 
 class Sight(NamedTuple):
-    """What one session saw: cells (K, 2) that it observed, and of each static hit (H, 2)."""
+    """Observations of one session: cells (K, 2) that it observed, and of each static hit (H, 2)."""
 
     observed: NDArray[np.int64]
     hits: NDArray[np.int64]

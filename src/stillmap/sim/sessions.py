@@ -22,7 +22,7 @@ _DAY = 86_400  # s
 
 @dataclass(frozen=True)
 class SessionOptions:
-    """What sessions have in common, and in what they differ.
+    """Common settings of sessions, and their differences.
 
     Attributes:
         count: number of sessions.

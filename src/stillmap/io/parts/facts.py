@@ -1,4 +1,4 @@
-"""What decides whether recordings are parts of one run: stamps, odometry, sensors, some ranges."""
+"""Facts that decide whether recordings are parts of one run: stamps, odometry, sensors, ranges."""
 
 from dataclasses import dataclass
 from typing import Any

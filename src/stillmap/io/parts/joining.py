@@ -26,7 +26,7 @@ _POSES_LOST = "the recorded poses of the parts do not continue each other: not u
 
 
 class _Scans(NamedTuple):
-    """What is kept of the scans of a part: t scans in D dimensions."""
+    """The scans of a part that are kept: t scans in D dimensions."""
 
     stamp_ns: NDArray[np.int64]
     length: NDArray[np.int64]

@@ -171,7 +171,7 @@ def _is_at_zero(T: Float) -> bool:
 
 
 def _reach(earlier: RecordingFacts, later: RecordingFacts, seconds: float) -> tuple[float, float]:
-    """How far, m, and by which angle, rad, the robot may have moved in a time."""
+    """Greatest motion of the robot in a time: metres and radians."""
     speed, rate = _MIN_SPEED, _MIN_TURN_RATE
     for one in (earlier, later):
         fastest, turning = _usual_speed(one)

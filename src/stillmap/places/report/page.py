@@ -189,7 +189,7 @@ def _thumbnails_data(occupancy: GridMap, timeline: Timeline) -> list[dict[str, A
 
 
 def _step_data(timeline: Timeline, number: int, pictures: PlacePictures | None) -> dict[str, Any]:
-    """What changed from the session before to one, in a table and on the map."""
+    """The changes from the session before to one, in a table and on the map."""
     before, after = (timeline.sessions[k] for k in (number - 1, number))
     changes = timeline.changes_at(number)
     listed = changes[:_MAX_ROWS]
