@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import START, cut, make_recording
+from cut_recordings import START, cut, make_recording
 
 from stillmap.core import se2
 from stillmap.io.parts.facts import measure_facts

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import PERIOD, START, N, cut, make_recording, write_parts
+from cut_recordings import PERIOD, START, N, cut, make_recording, write_parts
 
 from stillmap.core import arrays, se2
 from stillmap.core.camera import Camera, Images
