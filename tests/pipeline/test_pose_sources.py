@@ -79,10 +79,43 @@ def test_scans_alone_are_tried_where_odometry_is_often_at_fault(recording):
     jumps = se2.matrix(*(rng.normal(size=(3, recording.n_scans)) * [[0.5], [0.5], [0.3]]))
     jumpy = dataclasses.replace(recording, T_odom_base=recording.T_odom_base @ jumps)
     poses = bent(recording.T_odom_base, 2.0)
-    assert compare(jumpy, state_after(jumpy, poses)) is None
+    found = compare(jumpy, state_after(jumpy, poses))
+    assert found is None or found.record.source != "scans"
     found = compare(jumpy, state_after(jumpy, poses, odometry_faults=list(range(1, 31))))
     assert found.record.source == "scans"
     assert compute_absolute_errors(found.estimate.poses, recording.T_odom_base).rmse < 0.03
+
+
+def lagging(poses, first, last, share=0.1):
+    """Poses that move by a share of the way only in some of the steps."""
+    steps = se2.inverse(poses[:-1]) @ poses[1:]
+    steps[first:last, :2, 2] *= share
+    out = [poses[0]]
+    for step in steps:
+        out.append(out[-1] @ step)
+    return np.array(out)
+
+
+def test_odometry_is_taken_in_a_stretch_where_poses_lag(recording):
+    """Odometry that drifts is worse than scan matching elsewhere."""
+    drifting = dataclasses.replace(recording, T_odom_base=bent(recording.T_odom_base, 0.7))
+    state = state_after(drifting, lagging(recording.T_odom_base, 20, 45))
+    found = compare(drifting, state)
+    assert found.record.source == "odometry_in_stretches"
+    assert found.record.bound > state.records[0].bound
+    assert compute_absolute_errors(found.estimate.poses, recording.T_odom_base).rmse < 0.03
+
+
+def test_a_stretch_is_kept_where_odometry_is_wrong(recording):
+    """Scan matching goes on as before after the labels of the other hypothesis."""
+    wrong = lagging(recording.T_odom_base, 20, 45)
+    found = compare(
+        dataclasses.replace(recording, T_odom_base=wrong),
+        state_after(recording, recording.T_odom_base),
+    )
+    if found is not None:
+        errors = compute_absolute_errors(found.estimate.poses, recording.T_odom_base)
+        assert errors.rmse < 0.03
 
 
 @pytest.mark.parametrize("missing", ["odometry", "estimator", "score"])

@@ -61,12 +61,16 @@ def _reader_warnings(source: Mapping[str, Any]) -> list[str]:
 
 
 def _source_warnings(records: Sequence[IterationRecord], best: int) -> list[str]:
-    """That odometry alone, or scans alone, explain the recording better than iterations did."""
+    """That odometry or scans alone explain the recording better than iterations did."""
     out = []
+    name = {
+        "odometry": "odometry alone",
+        "scans": "scan matching without odometry",
+        "odometry_in_stretches": "odometry where scan matching differed from it by most of the way",
+    }
     for record in records:
         if record.source:
             kept = "were kept" if record.number == best else "were the start of further iterations"
-            name = {"odometry": "odometry alone", "scans": "scan matching without odometry"}
             out.append(
                 f"poses by {name[record.source]} predict scans left out of the map better than "
                 f"those of iterations 1 to {record.number - 1}: they {kept}"

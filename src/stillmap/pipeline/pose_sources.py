@@ -1,4 +1,4 @@
-"""Poses compared with their sources: odometry alone, and scans alone.
+"""Poses compared with their sources: odometry alone, or in stretches, and scans alone.
 
 EM starts from odometry and improves on it scan by scan. Where most of what the robot sees is people
 it may end farther from the truth than odometry was, and odometry that is often at fault may do
@@ -7,6 +7,7 @@ harm. Held-out scans tell: they are predicted by the map of the other scans (`em
 
 import dataclasses
 import time
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,14 +18,16 @@ from stillmap.core.parallel import limit_blas_threads, resolve_threads
 from stillmap.core.profiling import Progress, StageTimer
 from stillmap.core.recording import Recording
 from stillmap.pipeline.em_loop import label_poses
-from stillmap.pipeline.estimate import EmState, Iteration
+from stillmap.pipeline.estimate import EmState, Iteration, IterationRecord
 from stillmap.pipeline.options import Options
+from stillmap.slam.odometry_agreement import replace_stretches
 
 Float = NDArray[np.float64]
 
 # odometry gets an E-step of its own if its score with the labels so far falls short of the best
 # one by less than this share of it; labels of its own raise it
 _MAX_SHORTFALL = 0.4
+_STRETCHES, _SAME_SCORE = "odometry_in_stretches", 0.01
 _MIN_FAULT_SHARE = 0.05  # of the scans at which odometry is at fault: scans alone are worth a try
 
 
@@ -36,6 +39,9 @@ def better_source(
 ) -> Iteration | None:
     """The source of poses that predicts held-out scans best, if better than the best iteration.
 
+    Sources are odometry alone, scans alone, and scan matching after labels were estimated with
+    the motion of odometry in the stretches in which both differ.
+
     Args:
         recording: as recorded.
         state: of an EM that has converged.
@@ -44,24 +50,38 @@ def better_source(
 
     Returns:
         An iteration at its poses, numbered after the last one; None where the best iteration is
-        better than odometry alone and scans alone, where there is no odometry, or where iterations
-        are not compared by held-out scans.
+        better than all of them, where there is no odometry, or where iterations are not compared
+        by held-out scans.
     """
     best, options = state.require_best(), state.options
-    score = state.records[best.number - 1].held_out_log_likelihood
+    record = state.records[best.number - 1]
+    score = record.held_out_log_likelihood
     is_compared = options.estimator == "stillmap" and recording.dimension == 2
     if not is_compared or recording.T_odom_base is None or score is None:
         return None
     number, found = len(state.records) + 1, None
-    for name, m_step in _sources(recording, state, score, progress, stages):
+    for name, e, m_step in _sources(recording, state, score, progress, stages):
         started = time.perf_counter()
         progress("comparing with odometry and scans alone", number, 0, 0)
-        tried = label_poses(recording, options, number, best.p_static, m_step, stages, started)
-        reached = tried.record.held_out_log_likelihood
-        if reached is not None and reached > score:
+        tried = label_poses(recording, options, number, e, m_step, stages, started)
+        if _is_better(tried.record, record, name):
             record = dataclasses.replace(tried.record, source=name)
-            found, score = dataclasses.replace(tried, record=record), reached
+            found = dataclasses.replace(tried, record=record)
     return found
+
+
+def _is_better(tried: IterationRecord, best: IterationRecord, source: str) -> bool:
+    """Whether a source is better than the best iteration.
+
+    A stretch is predicted by the scans between the ones that are held out, which lie wrong with
+    them. There, about the same prediction is enough if the bound, which is over all scans, rises.
+    """
+    reached, score = tried.held_out_log_likelihood, best.held_out_log_likelihood
+    if reached is None or score is None:
+        return False
+    if source == _STRETCHES:
+        return reached > score - _SAME_SCORE * abs(score) and tried.bound > best.bound
+    return reached > score
 
 
 def _sources(
@@ -70,34 +90,58 @@ def _sources(
     score: float,
     progress: Progress,
     stages: StageTimer,
-) -> list[tuple[str, slam.MStepResult]]:
-    """Names of sources that may be better, and their poses."""
+) -> Iterator[tuple[str, NDArray[np.float32], slam.MStepResult]]:
+    """Names of sources that may be better, the weights of their beams, and their poses."""
     best, options = state.require_best(), state.options
-    out = []
+    assert recording.T_odom_base is not None
     with stages.measure("held_out"):
         odometry = _poses_by_odometry(recording)
         alone = _held_out(recording, odometry, best.p_static, options)
     if alone is not None and alone > score - _MAX_SHORTFALL * abs(score):
-        empty = em.make_grid(2, options.slam.resolution)
-        T = recording.n_scans
-        m_step = slam.MStepResult(odometry, np.zeros((T, 3, 3)), empty, np.ones(T))
-        out.append(("odometry", m_step))
+        yield "odometry", best.p_static, _keep_poses(odometry, options)
     diagnostics = best.m_step.diagnostics
     n_faults = len(diagnostics.odometry_faults) + len(diagnostics.breaks)
     if n_faults > _MIN_FAULT_SHARE * recording.n_scans:
-        with stages.measure("m_step"), limit_blas_threads():
-            m_step = slam.m_step(
-                recording.without_odometry(),
-                best.p_static,
-                options.slam,
-                None,
-                resolve_threads(options.threads),
-                lambda stage, done, total: progress(stage, len(state.records) + 1, done, total),
-                earlier_poses=best.poses,
-                with_grid=False,
-            )
-        out.append(("scans", m_step))
-    return out
+        bare, e = recording.without_odometry(), best.p_static
+        yield "scans", e, _match_scans(bare, e, best.poses, state, progress, stages)
+    mixed = replace_stretches(best.poses, recording.T_odom_base, recording.stamp_ns, diagnostics)
+    if mixed is not None:
+        number, started = len(state.records) + 1, time.perf_counter()
+        m_step = _keep_poses(mixed, options)
+        tried = label_poses(recording, options, number, best.p_static, m_step, stages, started)
+        e = tried.estimate.p_static  # those who walked along with the robot are dynamic
+        m_step = _match_scans(recording, e, mixed, state, progress, stages)
+        yield _STRETCHES, e, m_step
+
+
+def _keep_poses(poses: Float, options: Options) -> slam.MStepResult:
+    """An M-step at given poses (T, 3, 3)."""
+    T = len(poses)
+    empty = em.make_grid(2, options.slam.resolution)
+    return slam.MStepResult(poses, np.zeros((T, 3, 3)), empty, np.ones(T))
+
+
+def _match_scans(
+    recording: Recording,
+    e: NDArray[np.float32],
+    earlier_poses: Float,
+    state: EmState,
+    progress: Progress,
+    stages: StageTimer,
+) -> slam.MStepResult:
+    """An M-step over all scans given e (M,)."""
+    options = state.options
+    with stages.measure("m_step"), limit_blas_threads():
+        return slam.m_step(
+            recording,
+            e,
+            options.slam,
+            None,
+            resolve_threads(options.threads),
+            lambda stage, done, total: progress(stage, len(state.records) + 1, done, total),
+            earlier_poses=earlier_poses,
+            with_grid=False,
+        )
 
 
 def _poses_by_odometry(recording: Recording) -> Float:

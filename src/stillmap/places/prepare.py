@@ -93,6 +93,3 @@ def _project(
     planar = Keyframes(plan.recording, keyframes.scans, plan.poses, e, keyframes.nodes)
     xy = np.ascontiguousarray(poses[:, :2, 3])
     return planar, poses[:, 2, 3] - ground.height_at(xy)
-
-
-_PLANAR_CELL = 0.1  # m, in which one planar hit per direction is kept
