@@ -1,4 +1,4 @@
-"""Real recordings cut into sessions: a log into laps, a drive into pieces."""
+"""Recordings cut into sessions: a log into laps, a drive into pieces, a simulated run evenly."""
 
 import itertools
 import json
@@ -74,13 +74,26 @@ def write_laps(log: Path, reference: Path, folder: Path, rng: np.random.Generato
     which = np.searchsorted(cuts, seconds, side="right")
     laps = []
     for lap in range(len(cuts) + 1):
-        part = select_scans(recording, np.flatnonzero(which == lap))
-        T = se2.matrix(*rng.uniform(-_FAR, _FAR, 2), rng.uniform(-np.pi, np.pi))
-        if part.T_odom_base is not None:
-            part = replace(part, T_odom_base=T @ part.T_odom_base)
+        part = _turn_odometry(select_scans(recording, np.flatnonzero(which == lap)), rng)
         laps.append(folder / f"lap-{lap + 1}")
         stillmap_folder.write(part, laps[-1])
     return laps
+
+
+def write_cuts(run: Path, folder: Path, count: int, rng: np.random.Generator) -> list[Path]:
+    """Cut a simulated run into equal sessions, each with odometry turned and shifted at random."""
+    whole = stillmap.read(run)
+    cuts = []
+    for k, scans in enumerate(np.array_split(np.arange(whole.n_scans), count)):
+        part = _turn_odometry(select_scans(whole, scans), rng)
+        cuts.append(folder / f"cut-{k + 1}")
+        stillmap_folder.write(part, cuts[-1])
+    return cuts
+
+
+def _turn_odometry(part: Recording, rng: np.random.Generator) -> Recording:
+    T = se2.matrix(*rng.uniform(-_FAR, _FAR, 2), rng.uniform(-np.pi, np.pi))
+    return part if part.T_odom_base is None else replace(part, T_odom_base=T @ part.T_odom_base)
 
 
 def write_pieces(pack: Path, folder: Path, count: int) -> list[Path]:

@@ -5,6 +5,7 @@ python benchmarks/sessions.py labels --data DIR [--worlds office hall] [--seeds 
     [--people N]
 python benchmarks/sessions.py growth --data DIR [--world office] [--sessions 32]
 python benchmarks/sessions.py laps LOG.clf.gz --data DIR
+python benchmarks/sessions.py cuts --data DIR [--worlds office hall] [--seeds 3] [--pieces 4]
 python benchmarks/sessions.py drive PACK.npz --data DIR [--pieces 3]
 
 alignment: pairs of simulated sessions from random starts, by how much of the second one's hits lie
@@ -15,6 +16,7 @@ beside it.
 growth: one session after the other is added to the place; at 2, 4, 8 ... also all at once.
 laps: a log with NAME.reference.txt and NAME.relations beside it, cut into laps that are turned and
 shifted at random, against the uncut run.
+cuts: long simulated runs, cut likewise into equal sessions, against the uncut run.
 drive: packed sweeps of a street, cut into pieces without a common sweep.
 
 Simulated sessions are kept in DIR and used again; so is nothing else. Times are wall-clock.
@@ -30,17 +32,19 @@ from pathlib import Path
 
 import numpy as np
 import session_merging as merging
-from session_laps import write_laps, write_pieces
-from session_sets import PairSet, prepare_days, prepare_pairs
+from session_laps import write_cuts, write_laps, write_pieces
+from session_sets import LASER, PairSet, prepare_days, prepare_pairs
 from tables import markdown
 
-from stillmap.eval.readers import read_planar_trajectory, read_relations
+from stillmap.eval.readers import read_planar_trajectory, read_relations, read_trajectory
 from stillmap.eval.relations import compute_relation_errors
-from stillmap.eval.session_poses import PoseScores
+from stillmap.eval.session_poses import FRAME_DT, PoseScores
 from stillmap.eval.sessions import score_place
+from stillmap.eval.trajectory import ErrorStats, associate_trajectories, compute_absolute_errors
+from stillmap.sim import scene_by_name, simulate, write_simulation
 
 _STRANGERS = (("aces", "fr101"), ("fr101", "edmonton"), ("aces", "seattle"))
-_LAP_SEED = 4
+_LAP_SEED, _SCANS_PER_CUT = 4, 1000
 
 Done = tuple[merging.Merged, PoseScores | None]  # a pair
 
@@ -62,18 +66,20 @@ def _parser() -> argparse.ArgumentParser:
         ("labels", score_labels),
         ("growth", grow),
         ("laps", merge_laps),
+        ("cuts", merge_cuts),
         ("drive", merge_drive),
     ):
         one = commands.add_parser(name)
         one.set_defaults(run=run)
         one.add_argument("--data", type=Path, required=True, help="folder for sessions and places")
         one.add_argument("--program", nargs="+", default=merging.default_program())
-        if name in ("alignment", "labels"):
+        if name in ("alignment", "labels", "cuts"):
             one.add_argument("--seeds", type=int, default=3)
         if name == "alignment":
             one.add_argument("--lasers", type=Path)
-        if name == "labels":
+        if name in ("labels", "cuts"):
             one.add_argument("--worlds", nargs="+", default=["office", "hall"])
+        if name == "labels":
             one.add_argument("--sessions", type=int, default=5)
             one.add_argument("--people", type=int, help="in each session (default: the world's)")
         if name == "growth":
@@ -84,6 +90,7 @@ def _parser() -> argparse.ArgumentParser:
             one.add_argument("log", type=Path)
         if name == "drive":
             one.add_argument("pack", type=Path)
+        if name in ("cuts", "drive"):
             one.add_argument("--pieces", type=int, default=3)
     return p
 
@@ -268,6 +275,37 @@ def _relation_row(trajectory: Path, relations: Path) -> list[str]:
         f"{errors.rotation.mean:.3f}",
         f"{t.squared_mean:.4f}",
     ]
+
+
+def merge_cuts(args: argparse.Namespace) -> str:
+    """A line per simulated run: errors of the uncut run and of the merged cuts."""
+    lines = []
+    for world, seed in itertools.product(args.worlds, range(1, args.seeds + 1)):
+        folder = args.data / f"cuts-{world}-{seed}"
+        shutil.rmtree(folder, ignore_errors=True)
+        changes = {**LASER, "robot": {"scans": _SCANS_PER_CUT * args.pieces}}
+        simulation = simulate(scene_by_name(world, changes), seed)
+        write_simulation(simulation, folder / "run")
+        rng = np.random.default_rng([_LAP_SEED, seed])
+        cuts = write_cuts(folder / "run", folder, args.pieces, rng)
+        uncut = merging.build_map(args.program, folder / "run", folder / "uncut")
+        merged = merging.merge(args.program, cuts, folder / "place")
+        if merged.status == merging.REFUSED:
+            lines.append([world, str(seed), "none", *["-"] * 5])
+            continue
+        errors = [_trajectory_errors(one.place, folder / "run") for one in (uncut, merged)]
+        placed = f"{_accepted(merged.place)} of {len(cuts)}"
+        line = [f"{v:.3f}" for one in errors for v in (one.rmse, one.max)]
+        lines.append([world, str(seed), placed, *line, f"{merged.seconds:.0f}"])
+    titles = ["world", "seed", "placed", "uncut ATE m", "max m", "merged ATE m", "max m", "s"]
+    return markdown(titles, lines)
+
+
+def _trajectory_errors(result: Path, run: Path) -> ErrorStats:
+    estimated = read_trajectory(result / "trajectory.tum")
+    true = read_trajectory(run / "truth/trajectory.tum")
+    i, j = associate_trajectories(estimated.stamp_s, true.stamp_s, FRAME_DT)
+    return compute_absolute_errors(estimated.poses[i], true.poses[j])
 
 
 def merge_drive(args: argparse.Namespace) -> str:
