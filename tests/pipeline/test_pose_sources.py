@@ -86,7 +86,7 @@ def test_scans_alone_are_tried_where_odometry_is_often_at_fault(recording):
     assert compute_absolute_errors(found.estimate.poses, recording.T_odom_base).rmse < 0.03
 
 
-def lagging(poses, first, last, share=0.1):
+def lagging(poses, first, last, share):
     """Poses that move by a share of the way only in some of the steps."""
     steps = se2.inverse(poses[:-1]) @ poses[1:]
     steps[first:last, :2, 2] *= share
@@ -99,7 +99,7 @@ def lagging(poses, first, last, share=0.1):
 def test_odometry_is_taken_in_a_stretch_where_poses_lag(recording):
     """Odometry that drifts is worse than scan matching elsewhere."""
     drifting = dataclasses.replace(recording, T_odom_base=bent(recording.T_odom_base, 0.7))
-    state = state_after(drifting, lagging(recording.T_odom_base, 20, 45))
+    state = state_after(drifting, lagging(recording.T_odom_base, 25, 40, 0.3))
     found = compare(drifting, state)
     assert found.record.source == "odometry_in_stretches"
     assert found.record.bound > state.records[0].bound
@@ -108,7 +108,7 @@ def test_odometry_is_taken_in_a_stretch_where_poses_lag(recording):
 
 def test_a_stretch_is_kept_where_odometry_is_wrong(recording):
     """Scan matching goes on as before after the labels of the other hypothesis."""
-    wrong = lagging(recording.T_odom_base, 20, 45)
+    wrong = lagging(recording.T_odom_base, 25, 40, 0.3)
     found = compare(
         dataclasses.replace(recording, T_odom_base=wrong),
         state_after(recording, recording.T_odom_base),

@@ -66,7 +66,7 @@ def _source_warnings(records: Sequence[IterationRecord], best: int) -> list[str]
     name = {
         "odometry": "odometry alone",
         "scans": "scan matching without odometry",
-        "odometry_in_stretches": "odometry where scan matching differed from it by most of the way",
+        "odometry_in_stretches": "odometry in stretches that scan matching measured otherwise",
     }
     for record in records:
         if record.source:

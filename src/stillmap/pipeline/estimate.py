@@ -80,8 +80,8 @@ class IterationRecord:
         seconds: wall clock.
         held_out_log_likelihood: nats per beam of scans left out of the map; None: not computed.
         touched_share: share of the scans that the next M-step may match differently.
-        source: "odometry" or "scans" if the poses are those of that source alone; empty if they are
-            those of an M-step.
+        source: "odometry" or "scans" if the poses are those of that source alone,
+            "odometry_in_stretches" if labels were estimated with it in stretches; else empty.
     """
 
     number: int
@@ -151,7 +151,8 @@ class EmState(ShortRepr):
             gain = self._score(record, n_beams) - self._score(
                 self.records[self.best.number - 1], n_beams
             )
-        if gain > 0.0 or fixed:
+        # a source was compared with the best iteration before it became an iteration
+        if gain > 0.0 or fixed or record.source:
             self.best = estimate.without_grid()
         self._take_snapshot(iteration)
         self.latest = estimate.for_next_iteration()

@@ -27,6 +27,8 @@ Float = NDArray[np.float64]
 # odometry gets an E-step of its own if its score with the labels so far falls short of the best
 # one by less than this share of it; labels of its own raise it
 _MAX_SHORTFALL = 0.4
+# likewise in stretches, before the scans are matched with the labels found there
+_MAX_STRETCH_SHORTFALL = 0.15
 _STRETCHES, _SAME_SCORE = "odometry_in_stretches", 0.01
 _MIN_FAULT_SHARE = 0.05  # of the scans at which odometry is at fault: scans alone are worth a try
 
@@ -104,14 +106,21 @@ def _sources(
     if n_faults > _MIN_FAULT_SHARE * recording.n_scans:
         bare, e = recording.without_odometry(), best.p_static
         yield "scans", e, _match_scans(bare, e, best.poses, state, progress, stages)
-    mixed = replace_stretches(best.poses, recording.T_odom_base, recording.stamp_ns, diagnostics)
+    mixed = replace_stretches(
+        best.poses,
+        recording.T_odom_base,
+        recording.stamp_ns,
+        diagnostics,
+        options.slam.odometry,
+    )
     if mixed is not None:
         number, started = len(state.records) + 1, time.perf_counter()
         m_step = _keep_poses(mixed, options)
         tried = label_poses(recording, options, number, best.p_static, m_step, stages, started)
-        e = tried.estimate.p_static  # those who walked along with the robot are dynamic
-        m_step = _match_scans(recording, e, mixed, state, progress, stages)
-        yield _STRETCHES, e, m_step
+        alone = tried.record.held_out_log_likelihood
+        if alone is not None and alone > score - _MAX_STRETCH_SHORTFALL * abs(score):
+            e = tried.estimate.p_static  # those who walked along with the robot are dynamic
+            yield _STRETCHES, e, _match_scans(recording, e, mixed, state, progress, stages)
 
 
 def _keep_poses(poses: Float, options: Options) -> slam.MStepResult:

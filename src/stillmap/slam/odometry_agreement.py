@@ -1,28 +1,37 @@
-"""Stretches in which scan matching and odometry differ over most of the way.
+"""Stretches in which scan matching and odometry differ by more than odometry's noise adds up to.
 
 Each scan may leave odometry by a little, and people who walk along with the robot look like walls
-at rest beside it: over a stretch the small differences add up. Which of the two is right is for the
-caller to decide.
+beside one that is slower: over a stretch the small differences add up. Which of the two is right is
+for the caller to decide.
 """
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.slam import motion_model
+from stillmap.slam.options import OdometryOptions
 from stillmap.slam.types import Diagnostics
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_SECONDS = 4.0  # of a window in which differences are summed
-# difference that counts: m, and share of the way in the window, by the longer of the two
-_MIN_DIFFERENCE, _MIN_SHARE = 0.3, 0.5
+_SECONDS = (1.0, 2.0, 4.0)  # of the windows in which differences are summed
+# a sum counts from so many standard deviations and m on; error of odometry per m that stays the
+# same over a window
+_MIN_STDS, _MIN_DIFFERENCE, _SCALE_ERROR = 6.0, 0.05, 0.02
 _MAX_FAULT_SHARE = 0.25  # of the scans of a stretch: scan matching has weighed these faults itself
+_MAX_SHARE = 0.5  # of the steps in such stretches: odometry that differs more often is no judge
 
 
 def replace_stretches(
-    poses: Float, T_odom_base: Float, stamp_ns: NDArray[np.int64], diagnostics: Diagnostics
+    poses: Float,
+    T_odom_base: Float,
+    stamp_ns: NDArray[np.int64],
+    diagnostics: Diagnostics,
+    options: OdometryOptions,
 ) -> Float | None:
     """Poses with the motion of odometry in the stretches in which both differ.
 
@@ -32,15 +41,16 @@ def replace_stretches(
         stamp_ns: (T,) stamps.
         diagnostics: of the estimate. Stretches with a break, a leap of odometry, or many scans
             at which scan matching rejected odometry stay as they are.
+        options: largest noise of odometry.
 
     Returns:
         (T, 3, 3) poses; None where there is no such stretch.
     """
     measured = motion_model.compute_odometry_steps(T_odom_base)
     motion = se2.inverse(poses[:-1]) @ poses[1:]
-    differs = find_differences(motion, measured.increments, stamp_ns)
+    differs = find_differences(motion, measured.increments, stamp_ns, options)
     by_odometry = _drop_decided(differs, measured.plausible, diagnostics)
-    if not by_odometry.any():
+    if not 0.0 < by_odometry.mean() <= _MAX_SHARE:
         return None
     out = np.array(poses)
     for t in range(int(np.argmax(by_odometry)) + 1, len(out)):
@@ -49,29 +59,48 @@ def replace_stretches(
     return se2.normalize(out)
 
 
-def find_differences(motion: Float, increments: Float, stamp_ns: NDArray[np.int64]) -> Mask:
-    """(T - 1,) steps in windows over which a motion and odometry differ by most of the way.
+def find_differences(
+    motion: Float, increments: Float, stamp_ns: NDArray[np.int64], options: OdometryOptions
+) -> Mask:
+    """(T - 1,) steps in windows over which a motion and odometry differ by more than noise.
+
+    The noise of odometry is learned from the differences of all steps.
 
     Args:
         motion, increments: (T - 1, 3, 3) steps by scan matching and by odometry. Differences are
             summed in the frame of the robot, where an error of the heading has no lever.
         stamp_ns: (T,) stamps.
+        options: largest noise of odometry.
     """
-    x, u = se2.parameters(motion), se2.parameters(increments)
-    difference = np.concatenate([np.zeros((1, 2)), np.cumsum(x[:, :2] - u[:, :2], axis=0)])
-    way = np.concatenate(
-        [np.zeros((1, 2)), np.cumsum(np.stack([_length(x), _length(u)], axis=1), axis=0)]
-    )
-    seconds = 1e-9 * (stamp_ns - stamp_ns[0])
-    first = np.arange(len(stamp_ns))
-    last = np.minimum(np.searchsorted(seconds, seconds + _SECONDS), len(stamp_ns) - 1)
-    summed = np.linalg.norm(difference[last] - difference[first], axis=1)
-    longest = (way[last] - way[first]).max(axis=1)
-    is_much = (summed > _MIN_DIFFERENCE) & (summed > _MIN_SHARE * longest)
-    marks = np.zeros(len(stamp_ns) + 1)
-    np.add.at(marks, first[is_much], 1.0)
-    np.add.at(marks, last[is_much], -1.0)
-    return np.asarray(np.cumsum(marks)[: len(motion)] > 0.0)
+    T = len(stamp_ns)
+    if T < 3:
+        return np.zeros(len(motion), np.bool_)
+    u = se2.parameters(increments)
+    noise, _ = motion_model.fit_odometry_noise(increments, motion, options)
+    way = np.hypot(u[:, 0], u[:, 1])
+    std, _ = motion_model.odometry_std(way, np.abs(u[:, 2]), options)
+    difference = _accumulate(se2.parameters(motion)[:, :2] - u[:, :2])
+    variance, way = _accumulate(np.square(noise.translation * std)), _accumulate(way)
+    seconds, first = 1e-9 * (stamp_ns - stamp_ns[0]), np.arange(T)
+    found = np.zeros(T - 1, np.bool_)
+    for length in _SECONDS:
+        last = np.minimum(np.searchsorted(seconds, seconds + length), T - 1)
+        summed = np.linalg.norm(difference[last] - difference[first], axis=1)
+        scale = _SCALE_ERROR * (way[last] - way[first])
+        stds = np.sqrt(variance[last] - variance[first] + np.square(scale))
+        is_much = (summed > _MIN_DIFFERENCE) & (summed > _MIN_STDS * stds)
+        known = _accumulate(found)  # a longer window counts where no shorter one in it does
+        is_much &= known[last] == known[first]
+        marks = np.zeros(T)
+        np.add.at(marks, first[is_much], 1.0)
+        np.add.at(marks, last[is_much], -1.0)
+        found |= np.cumsum(marks)[: T - 1] > 0.0
+    return found
+
+
+def _accumulate(steps: NDArray[Any]) -> Float:
+    """Sums (T, ...) of steps (T - 1, ...) from the first scan on."""
+    return np.concatenate([np.zeros((1, *steps.shape[1:])), np.cumsum(steps, axis=0)])
 
 
 def _drop_decided(differs: Mask, plausible: Mask, diagnostics: Diagnostics) -> Mask:
@@ -87,7 +116,3 @@ def _drop_decided(differs: Mask, plausible: Mask, diagnostics: Diagnostics) -> M
         if is_decided or not plausible[first:last].all():
             out[first:last] = False
     return out
-
-
-def _length(parameters: Float) -> Float:
-    return np.hypot(parameters[:, 0], parameters[:, 1])
