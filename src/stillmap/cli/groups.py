@@ -7,7 +7,7 @@ from pathlib import Path
 
 from stillmap.cli.console import show_share
 from stillmap.core.errors import InputError
-from stillmap.io.parts.reading import InputGroup, group_inputs
+from stillmap.io.input_groups import InputGroup, group_inputs
 from stillmap.preprocessing.options import ReadOptions
 
 _MERGE = "stillmap.cli.merge"

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from stillmap.core.profiling import StageTimer
     from stillmap.core.recording import Recording
-    from stillmap.io.parts.reading import InputGroup
+    from stillmap.io.input_groups import InputGroup
     from stillmap.mesh.build import Models
     from stillmap.pipeline.checkpoint import CheckpointFolder
     from stillmap.pipeline.options import Options

@@ -17,7 +17,7 @@ from stillmap.core.recording import Recording
 from stillmap.core.region import Region
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io import read
-from stillmap.io.parts.reading import read_parts
+from stillmap.io.input_groups import read_parts
 from stillmap.io.text_lines import Progress
 from stillmap.io.trajectory import poses_from_tum
 from stillmap.mesh.options import MeshOptions
