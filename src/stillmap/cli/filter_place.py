@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from stillmap.cli.arguments import require_apart
 from stillmap.cli.console import print_json, say
-from stillmap.cli.filter import Filtered, find_target, write_filtered
+from stillmap.cli.filter_recording import Filtered, find_target, write_filtered
 from stillmap.core.errors import InputError
 
 if TYPE_CHECKING:
