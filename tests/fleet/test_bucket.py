@@ -10,7 +10,7 @@ from fleets import NAMES, contents
 
 from stillmap.cli.main import main
 from stillmap.core.errors import InputError
-from stillmap.fleet.storage import open_storage
+from stillmap.fleet.backends import open_storage
 
 s3fs = pytest.importorskip("s3fs")
 pytestmark = [

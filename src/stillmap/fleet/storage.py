@@ -10,7 +10,6 @@ from typing import Protocol
 
 from stillmap.core.errors import InputError
 from stillmap.fleet.scratch import remove_stale, scratch_folder
-from stillmap.fleet.urls import is_url
 
 STATE = ".fleet"  # folder of the journal, of the labels of results, and of unfinished results
 RECORD = "run.json"  # every result has it; in a bucket it appears last, and goes first
@@ -50,20 +49,6 @@ class Storage(Protocol):
 
     def remove_unfinished(self) -> None:
         """Remove what killed processes left."""
-
-
-def open_storage(root: str) -> Storage:
-    """The storage at a path or URL; nothing is created yet.
-
-    Raises:
-        InputError: the URL is of a kind that is not supported.
-        MissingExtra: the library for it is not installed.
-    """
-    if not is_url(root):
-        return FolderStorage(root)
-    from stillmap.fleet.bucket import BucketStorage
-
-    return BucketStorage(root)
 
 
 class FolderStorage:
