@@ -21,6 +21,7 @@ from stillmap.io.builder import ReadContext
 from stillmap.io.carmen.messages import SCAN_PARSERS
 from stillmap.io.point_cloud import signatures
 from stillmap.io.ros import bag_types
+from stillmap.io.scan_files import contains_files, has_extension
 from stillmap.io.text_lines import Progress, read_head
 from stillmap.preprocessing.options import ReadOptions
 from stillmap.preprocessing.overrides import apply_options
@@ -123,9 +124,9 @@ def _point_cloud_format(
 
     def matches(path: Path, start: bytes | None) -> bool:
         if start is None:
-            return signatures.contains_files(path, endings)
+            return contains_files(path, endings)
         if has_magic is None:
-            return signatures.has_extension(path, endings) and len(start) > 0
+            return has_extension(path, endings) and len(start) > 0
         return has_magic(start)
 
     return Format(name, endings, matches, _reader(f"point_cloud.{module}"))

@@ -12,8 +12,8 @@ from stillmap.core.arrays import finite_rows
 from stillmap.core.errors import InputError, MissingExtra
 from stillmap.core.recording import Recording
 from stillmap.io.builder import ReadContext, RecordingBuilder, SkippedRecords
-from stillmap.io.point_cloud.files import list_files, stamps_from_names, strip_extension
 from stillmap.io.point_cloud.time_field import Clock, convert_times, detect_clock
+from stillmap.io.scan_files import list_files, stamps_from_names, strip_extension
 from stillmap.preprocessing.options import MAX_POINT_DISTANCE, ReadOptions
 from stillmap.preprocessing.time_window import TimeWindow
 

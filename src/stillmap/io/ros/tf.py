@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from stillmap.core import se2
 from stillmap.core.arrays import iter_blocks
 from stillmap.io.builder import SkippedRecords
-from stillmap.io.point_cloud.files import MAX_TRANSLATION
+from stillmap.io.rigid_transforms import MAX_TRANSLATION
 from stillmap.io.ros.messages import frame_name, stamp_ns
 
 BAD_TRANSFORM = "transform that is none"
