@@ -33,7 +33,7 @@ from tables import markdown
 from stillmap.core import config, se2, se3
 from stillmap.core.recording import Recording
 from stillmap.eval.trajectory import compute_absolute_errors, compute_relative_errors
-from stillmap.io.registry import read
+from stillmap.io.reader import read
 from stillmap.pipeline.options import Options
 from stillmap.preprocessing.options import ReadOptions
 from stillmap.preprocessing.scan_timing import add_beam_times
