@@ -94,7 +94,8 @@ def _convert_place(args: argparse.Namespace, place: Path, output: Path) -> tuple
         InputError: another format is wanted.
     """
     from stillmap.results.export import point_cloud_files
-    from stillmap.results.folder import ResultFolder, read_record
+    from stillmap.results.folder import ResultFolder
+    from stillmap.results.run_record import read_record
 
     require_apart(output, place)
     result = ResultFolder(place, read_record(place), Path(), False)

@@ -117,7 +117,7 @@ def _group(
 ) -> Sequence[Sequence[str]]:
     """Recordings that are parts of one run belong together; results stand alone."""
     from stillmap.cli.groups import find_groups
-    from stillmap.results.folder import is_result
+    from stillmap.results.run_record import is_result
 
     results = [[path] for path in paths if is_result(Path(path))]
     recordings = [path for path in paths if not is_result(Path(path))]

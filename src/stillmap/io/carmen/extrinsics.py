@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
-from stillmap.io.carmen.log import LaserLog, laser_position, param_number
+from stillmap.io.carmen.log import LaserLog
+from stillmap.io.carmen.scan_selection import laser_position, param_number
 from stillmap.preprocessing.options import LaserOptions
 
 # differences between laser and robot pose that agree: old logs round to cm. A corrected pose in
