@@ -11,8 +11,8 @@ from stillmap.io.ros import message_writer
 from stillmap.io.ros.bag_writer import BagWriter, Send
 from stillmap.io.ros.messages import LASER_SCAN, POINT_CLOUD
 from stillmap.io.ros.recording_writer import LaserScanEncoder, number_names
-from stillmap.results.export.point_cloud import Block
 from stillmap.results.folder import Exported
+from stillmap.results.point_cloud import Block
 from stillmap.results.points import FIELDS, PACKED_COLOUR, make_vertices
 
 

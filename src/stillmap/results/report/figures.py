@@ -15,12 +15,13 @@ import stillmap._core as _core
 from stillmap.core.grid_map import GridMap
 from stillmap.core.tiles import release, tiles_of
 from stillmap.pipeline.snapshots import Snapshot, Value, Window, cut_layer, extent
+from stillmap.results.colors import ORANGE
 from stillmap.results.reader import OCCUPIED_THRESH
 from stillmap.results.report.curves import round_down
 
 Color = tuple[int, int, int]
 Mask = NDArray[np.bool_]
-ORANGE, UNKNOWN, VIOLET = (240, 120, 0), (190, 196, 204), (140, 60, 220)  # RGB
+UNKNOWN, VIOLET = (190, 196, 204), (140, 60, 220)  # RGB
 VEIL_ALPHA = 80  # of 255, of thinly observed cells: walls and free space show through
 MAX_PIXELS = 1_500_000  # of a map: fills a large screen, a few hundred kB as PNG
 _SNAPSHOT_PIXELS = 480  # longest edge of a snapshot
