@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from stillmap.cli.arguments import add_read_flags, read_changes
 from stillmap.cli.config import add_option_flags, options_from_args
 from stillmap.cli.console import fail, print_json, say, show_tasks
-from stillmap.cli.map import add_map_flags, add_method_flags, option_changes
+from stillmap.cli.map_flags import add_map_flags, add_method_flags, option_changes
 from stillmap.core.errors import InputError
 
 if TYPE_CHECKING:
