@@ -81,7 +81,6 @@ _DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 def run(args: argparse.Namespace) -> int:
     """Map a recording into a folder."""
-    from stillmap.cli.groups import merge_sessions
     from stillmap.cli.map_run import build_all, read_inputs
     from stillmap.core.profiling import StageTimer
     from stillmap.pipeline.checkpoint import lock_checkpoints
@@ -92,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
     _require_usable_output(args, output)
     groups = _find_groups(args, options, output, stages)
     if len(groups) > 1:
-        return merge_sessions(args, groups)
+        return _merge_sessions(args, groups)
     with lock_checkpoints(output) as checkpoints, _explain_failure(args, checkpoints):
         inputs = read_inputs(args, groups[0], options, checkpoints.folder, stages)
         with show_progress(args.quiet, options.em.max_iterations) as progress:
@@ -133,6 +132,19 @@ def _find_groups(
         for group in groups:
             say(describe_group(group))
     return groups
+
+
+def _merge_sessions(args: argparse.Namespace, groups: "list[InputGroup]") -> int:
+    """Map sessions and merge them, each a recording or the parts of one.
+
+    Raises:
+        InputError: a flag is for one recording, or sessions cannot be merged.
+    """
+    from stillmap.cli.groups import require_for_sessions
+    from stillmap.cli.merge import merge_groups
+
+    require_for_sessions(args, groups)
+    return merge_groups(args, [list(group.paths) for group in groups])
 
 
 def _require_usable_output(args: argparse.Namespace, output: Path) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from stillmap.cli.arguments import add_read_flags, read_changes, require_apart
 from stillmap.cli.config import add_option_flags, options_from_args
 from stillmap.cli.console import list_files, print_json, say, show_progress
-from stillmap.cli.map_flags import add_map_mode_flag, add_run_flags, shared_changes
+from stillmap.cli.map_flags import add_map_mode_flag, add_run_flags, option_changes, shared_changes
 from stillmap.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -88,8 +88,9 @@ def merge_groups(args: argparse.Namespace, groups: Sequence[Sequence[str]]) -> i
         args: of `stillmap map`.
         groups: paths of each session, several where it was recorded in parts.
     """
-    options = options_from_args(args, read_changes(args), shared_changes(args))
-    args.frame, args.map_state = None, args.map_state or "last"
+    args.frame, state, args.map_state = None, args.map_state or "last", None
+    options = options_from_args(args, read_changes(args), option_changes(args))
+    args.map_state = state  # of the place, not of each session
     return _merge(args, None, groups, options)
 
 
