@@ -200,6 +200,12 @@ def test_state_of_the_map_is_named(place):
         assert words in rendered(place, record)
 
 
+def test_geometry_is_told_where_it_is_known(place):
+    assert "82 of 100" in rendered(place, RECORD)
+    unknown = {"overall": None, "labels": None, "geometry": None}
+    assert "of 100" not in rendered(place, {**RECORD, "quality": unknown})
+
+
 def test_place_without_changes(tmp_path):
     folder = make_place(tmp_path / "place")
     (folder / "changes.json").write_text("[]")
