@@ -178,7 +178,7 @@ def _build_models(
 
 
 def _wants_models(result: MappingResult, tilting: "TiltingResult | None") -> bool:
-    """Whether models are enabled, or could be textured where nothing is said about them."""
+    """True if models are enabled, or could be textured where nothing is said about them."""
     enabled = result.options.mesh.enabled
     recording = result.recording if tilting is None else tilting.recording
     if recording.dimension == 2 or enabled is False:

@@ -91,7 +91,7 @@ def _show_report(report: Path) -> None:
 
 
 def _has_screen() -> bool:
-    """Whether a graphical browser can open; without a screen it would be a text browser."""
+    """True if a graphical browser can open; without a screen it would be a text browser."""
     screens = ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")
     return sys.platform == "darwin" or any(os.environ.get(name) for name in screens)
 

@@ -29,7 +29,7 @@ class Limits(NamedTuple):
     lt: float | None = None
 
     def contain(self, value: float) -> bool:
-        """Whether a number lies within the range; NaN lies in no range that has a limit."""
+        """True if a number lies within the range; NaN lies in no range that has a limit."""
         return (
             (self.ge is None or value >= self.ge)
             and (self.gt is None or value > self.gt)
@@ -289,7 +289,7 @@ def iter_names(options: Any, prefix: str = "") -> Iterator[str]:
 
 
 def is_within(name: str, section: str) -> bool:
-    """Whether an option lies in a section, or has that name; "" holds all."""
+    """True if an option lies in a section, or has that name; "" holds all."""
     return not section or name == section or name.startswith(f"{section}.")
 
 

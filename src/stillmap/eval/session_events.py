@@ -31,7 +31,7 @@ class Event(NamedTuple):
     cells: Bool
 
     def is_dated(self, before: int, after: int) -> bool:
-        """Whether a change between two sessions has the right date."""
+        """True if a change between two sessions has the right date."""
         early = self.seen[0] <= before <= self.true[0]
         return early and self.true[1] <= after <= self.seen[1]
 

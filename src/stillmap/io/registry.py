@@ -221,7 +221,7 @@ def _find_recordings(path: Path) -> list[Path]:
 
 
 def is_recording(path: Path) -> bool:
-    """Whether a file or folder is a recording by its content; False where it cannot be read."""
+    """True if a file or folder is a recording by its content; False where it cannot be read."""
     try:
         if path.is_dir():
             return any(known.matches(path, None) for known in FORMATS)

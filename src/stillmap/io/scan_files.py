@@ -140,12 +140,12 @@ def _natural_key(name: str) -> list[tuple[int, int | str]]:
 
 
 def has_extension(path: Path, extensions: tuple[str, ...]) -> bool:
-    """Whether a file has one of the extensions, in any case, and is not hidden."""
+    """True if a file has one of the extensions, in any case, and is not hidden."""
     return path.name.lower().endswith(extensions) and not path.name.startswith(".")
 
 
 def contains_files(folder: Path, extensions: tuple[str, ...]) -> bool:
-    """Whether a folder has files of these extensions; False where it cannot be read."""
+    """True if a folder has files of these extensions; False where it cannot be read."""
     try:
         return any(iter_files(folder, extensions))
     except OSError:

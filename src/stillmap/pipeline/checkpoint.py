@@ -197,7 +197,7 @@ def _locked(folder: Path, output: Path) -> IO[bytes]:
 
 
 def _is_there(path: Path, file: IO[bytes]) -> bool:
-    """Whether an open file still has its name."""
+    """True if an open file still has its name."""
     try:
         return os.path.samestat(path.stat(), os.fstat(file.fileno()))
     except OSError:

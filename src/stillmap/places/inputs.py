@@ -53,7 +53,7 @@ class SessionInput(ShortRepr):
 
 
 def is_place(path: Path) -> bool:
-    """Whether a folder is a place, also one from which a file was taken."""
+    """True if a folder is a place, also one from which a file was taken."""
     return (path / "sessions").is_dir() and any((path / one).is_file() for one in (SESSIONS, TIES))
 
 

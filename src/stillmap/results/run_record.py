@@ -131,7 +131,7 @@ def _drop_unset(changes: dict[str, Any]) -> dict[str, Any]:
 
 
 def is_result(path: Path) -> bool:
-    """Whether a folder is a result."""
+    """True if a folder is a result."""
     return (path / RECORD).is_file()
 
 

@@ -53,7 +53,7 @@ class LookAhead:
 
 
 def is_gap(seconds: float, usual: float) -> bool:
-    """Whether the time between two scans is a gap, in which the robot may have been carried.
+    """True if the time between two scans is a gap, in which the robot may have been carried.
 
     Args:
         seconds: between them.

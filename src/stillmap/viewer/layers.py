@@ -116,7 +116,7 @@ class Layers:
         ]
 
     def is_shown(self, name: str) -> bool:
-        """Whether the layer exists and is visible."""
+        """True if the layer exists and is visible."""
         return name in self._parents and bool(self._parents[name].visible)
 
     def set_visible(self, name: str, shown: bool) -> bool:

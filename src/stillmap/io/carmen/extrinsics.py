@@ -66,7 +66,7 @@ def find_extrinsics(
 
 
 def is_stated_by_lines(x: float, y: float, theta: float) -> bool:
-    """Whether a pose from scan lines is plausible: on the robot, and not at its center."""
+    """True if a pose from scan lines is plausible: on the robot, and not at its center."""
     distance = math.hypot(x, y)
     return distance < _MAX_OFFSET and max(distance, abs(theta)) > _MIN_OFFSET
 

@@ -204,7 +204,7 @@ def _add_file(log: CarmenLog, path: Path, progress: Progress | None) -> None:
 
 
 def _is_repeated(repeats: RepeatFilter, name: bytes, record: ScanLine | OdometryLine) -> bool:
-    """Whether an earlier part has the measurement; the time of logging may be another."""
+    """True if an earlier part has the measurement; the time of logging may be another."""
     values = record.ranges if isinstance(record, ScanLine) else record.pose
     stamp = str(record.stamp_ns).encode()
     return repeats.is_repeated(record.stamp_ns, name, stamp, array("d", values).tobytes())

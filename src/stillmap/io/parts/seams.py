@@ -124,7 +124,7 @@ def _find_repeats(earlier: RecordingFacts, later: RecordingFacts) -> NDArray[np.
 
 
 def _are_equal(a: NDArray[np.float32], b: NDArray[np.float32]) -> bool:
-    """Whether ranges are those of the same scan: what is a hit may have been judged differently."""
+    """True if ranges are those of the same scan: what is a hit may have been judged differently."""
     known = ~np.isnan(a) & ~np.isnan(b)
     if not known.any():
         return bool(np.isnan(a).all() and np.isnan(b).all())
@@ -132,7 +132,7 @@ def _are_equal(a: NDArray[np.float32], b: NDArray[np.float32]) -> bool:
 
 
 def _is_overlap_of_parts(earlier: RecordingFacts, later: RecordingFacts, repeated: int) -> bool:
-    """Whether an overlap holds the same scans in both, or hardly any."""
+    """True if an overlap holds the same scans in both, or hardly any."""
     a, b = _overlap(earlier, later)
     n: int = max(a.stop - a.start, b.stop)
     stray = n - repeated

@@ -126,7 +126,7 @@ _LAYOUTS = (  # scans and their stamps
 
 
 def is_kitti_folder(path: Path) -> bool:
-    """Whether a folder has one of the KITTI layouts."""
+    """True if a folder has one of the KITTI layouts."""
     return any((path / scans).is_dir() for scans, _ in _LAYOUTS)
 
 

@@ -209,7 +209,7 @@ def _read_cloud(path: Path, in_map_frame: bool, origin: Origin) -> Cloud:
 
 
 def _detect_map_frame(files: list[Path]) -> bool:
-    """Whether points are in the map frame instead of the sensor frame.
+    """True if points are in the map frame instead of the sensor frame.
 
     Decided on the scan with the farthest viewpoint: its points surround the viewpoint, or the
     origin.

@@ -13,7 +13,7 @@ MAX_PCD_HEADER = 1 << 14  # bytes
 
 
 def is_pcd(head: bytes) -> bool:
-    """Whether the first bytes of a file are a PCD header."""
+    """True if the first bytes of a file are a PCD header."""
     for line in head[:MAX_PCD_HEADER].splitlines():
         words = line.split()
         if words and not words[0].startswith(b"#"):
@@ -24,15 +24,15 @@ def is_pcd(head: bytes) -> bool:
 
 
 def is_e57(head: bytes) -> bool:
-    """Whether a file with these first bytes is an E57 file."""
+    """True if a file with these first bytes is an E57 file."""
     return head.startswith(E57_MAGIC)
 
 
 def is_las(head: bytes) -> bool:
-    """Whether a file with these first bytes is a LAS or LAZ file."""
+    """True if a file with these first bytes is a LAS or LAZ file."""
     return head.startswith(LAS_MAGIC)
 
 
 def is_ply(head: bytes) -> bool:
-    """Whether a file with these first bytes is a PLY file."""
+    """True if a file with these first bytes is a PLY file."""
     return head.startswith((b"ply\n", b"ply\r"))

@@ -82,7 +82,7 @@ def _read_cloud(path: Path) -> Cloud:
 
 
 def is_point(first_line: bytes) -> bool:
-    """Whether the first line of a scan is a point."""
+    """True if the first line of a scan is a point."""
     return len(first_line.split()) >= 3 and not first_line.lstrip().startswith(b"#")
 
 
