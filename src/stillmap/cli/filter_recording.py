@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class Filtered(NamedTuple):
-    """What was done to a recording.
+    """Counts of a recording that was written without its dynamic beams.
 
     Attributes:
         hits: beams that hit something.
@@ -33,7 +33,7 @@ class Filtered(NamedTuple):
     notes: tuple[str, ...]
 
     def describe(self) -> str:
-        """How many beams were blanked."""
+        """The number of beams that were blanked, and their share."""
         share = 100.0 * self.blanked / max(self.hits, 1)
         return f"{self.blanked} beams blanked, {share:.1f} % of the hits"
 

@@ -118,7 +118,7 @@ def _read_request(args: argparse.Namespace) -> "Request":
 
 
 def _read_entries(args: argparse.Namespace) -> "list[Entry]":
-    """What was named on the command line and in the manifest."""
+    """The recordings that the command line and the manifest name."""
     from stillmap.fleet.inputs import entries_of
     from stillmap.fleet.manifest import read_manifest
 

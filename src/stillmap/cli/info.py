@@ -174,7 +174,7 @@ def _format_span(part: dict[str, Any]) -> str:
 
 
 def _format_part(part: dict[str, Any]) -> str:
-    """What the time window leaves out of a recording."""
+    """The scans that the time window leaves out of a recording."""
     from stillmap.core.timestamps import format_seconds
 
     first, last = part.get("first_stamp_ns"), part.get("last_stamp_ns")

@@ -179,7 +179,7 @@ def _explain_failure(args: argparse.Namespace, checkpoints: "CheckpointFolder") 
 
 
 def _describe_interruption(words: list[str], checkpoints: "CheckpointFolder") -> str:
-    """How to continue an interrupted run with these words on its command line."""
+    """The command that continues an interrupted run with these words on its command line."""
     if checkpoints.newest is None:
         return "no iteration was finished: nothing was written, and there is nothing to resume"
     given = [word for word in words if word not in ("--resume", "--overwrite")]

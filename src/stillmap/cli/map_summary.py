@@ -1,4 +1,4 @@
-"""What `stillmap map` prints when it is done."""
+"""The summary that `stillmap map` prints."""
 
 import json
 import shlex
@@ -62,7 +62,7 @@ def print_summary(
 def _describe_lack_of_models(
     result: "MappingResult", tilting: "TiltingResult | None", models: "Models | None"
 ) -> list[str]:
-    """How to get models of a 3D recording that has no pictures."""
+    """The flag that makes models of a 3D recording without pictures."""
     is_2d = tilting is None and result.recording.dimension == 2
     if is_2d or models is not None or result.options.mesh.enabled is not None:
         return []
@@ -70,7 +70,7 @@ def _describe_lack_of_models(
 
 
 def _describe_iterations(result: "MappingResult") -> str:
-    """Which iteration was kept, and whether the loop stopped by itself."""
+    """The iteration that was kept, and whether the loop stopped by itself."""
     n = len(result.iterations)
     if n == 1 and result.converged:
         return "converged after one iteration"

@@ -141,7 +141,7 @@ def _merge(
 
 
 def _print_summary(job: "MergeJob", result: "PlaceResult", output: Path) -> None:
-    """Which sessions were placed, what changed, and where the result lies."""
+    """Print which sessions were placed, what changed, and where the result lies."""
     placed = result.place.sessions
     say(f"{len(placed)} sessions in one map, {len(result.place.ties)} constraints between them")
     for one in result.refusals:

@@ -158,7 +158,7 @@ def lock_checkpoints(output: Path) -> Iterator[CheckpointFolder]:
     folder = output.parent / f".{output.name}.resume"
     made = [path for path in (*reversed(output.parents),) if not path.exists()]
     try:
-        file = _locked(folder, output)
+        file = _open_lock(folder, output)
     except OSError as error:
         raise InputError(f"cannot be written: {error.strerror}", where=str(output)) from error
     checkpoints = CheckpointFolder(folder)
@@ -174,7 +174,7 @@ def lock_checkpoints(output: Path) -> Iterator[CheckpointFolder]:
         file.close()
 
 
-def _locked(folder: Path, output: Path) -> IO[bytes]:
+def _open_lock(folder: Path, output: Path) -> IO[bytes]:
     """The open lock file, which the kernel unlocks when this process ends."""
     while True:
         folder.mkdir(parents=True, exist_ok=True)

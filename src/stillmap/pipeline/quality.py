@@ -64,7 +64,7 @@ class QualityEvidence:
 
 @dataclass(frozen=True)
 class Quality:
-    """How good a result is, each from 0 (useless) to 100; None where it cannot be told.
+    """Quality of a result, each from 0 (useless) to 100; None where it cannot be told.
 
     Attributes:
         overall: geometric mean of both parts, geometry with three quarters of the weight; geometry

@@ -1,4 +1,4 @@
-"""What a plot of a place shows beside its map: the way of the robot in each session, changes."""
+"""Layers of the plot of a place: the way of the robot in each session, and changes."""
 
 from collections.abc import Iterable
 from typing import TYPE_CHECKING

@@ -71,11 +71,11 @@ class ResultFolder(RunRecord):
 
     @property
     def sources(self) -> tuple[Path, ...]:
-        """Where its recording is, or all parts of it."""
+        """Path of its recording, or of all parts of it."""
         return self.parts or (self.source,)
 
     def require_source(self) -> Path:
-        """Where the recording is.
+        """Path of the recording.
 
         Raises:
             InputError: it is not there any more.

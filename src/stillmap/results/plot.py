@@ -85,7 +85,7 @@ def summarize_as_html(result: ResultData) -> str:
 
 
 def key_facts(result: ResultData) -> dict[str, str]:
-    """What a result is about, in words and numbers."""
+    """The key figures of a result, by their names."""
     stamps, grid = result.stamp_ns, result.map
     height, width = (n * grid.resolution for n in grid.p_occupied.shape)
     seconds, distance = 0.0, 0.0
@@ -97,7 +97,7 @@ def key_facts(result: ResultData) -> dict[str, str]:
     return {
         "scans": f"{len(stamps)} in {seconds:.1f} s",
         "distance": f"{distance:.1f} m",
-        "beams": f"{_spaced(len(result.p_static))}, {_spaced(hits)} of them hits",
+        "beams": f"{_group_digits(len(result.p_static))}, {_group_digits(hits)} of them hits",
         "dynamic": f"{100.0 * dynamic / max(hits, 1):.1f} % of the hits",
         "moving objects": str(len(result.objects)),
         "quality": _describe_quality(result.quality),
@@ -105,7 +105,7 @@ def key_facts(result: ResultData) -> dict[str, str]:
     }
 
 
-def _spaced(count: int) -> str:
+def _group_digits(count: int) -> str:
     """A number with its thousands set apart."""
     return f"{count:,}".replace(",", "\N{NO-BREAK SPACE}")
 

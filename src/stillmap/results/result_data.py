@@ -53,7 +53,7 @@ class ResultData:
         @property
         @abstractmethod
         def objects(self) -> Sequence[MovingObject | Track]:
-            """What moved: `id`, `stamp_ns` (L,), `xy`, `velocity` (L, 2), `size`, `p_dynamic`."""
+            """Movers: `id`, `stamp_ns` (L,), `xy`, `velocity` (L, 2), `size`, `p_dynamic`."""
 
         @property
         @abstractmethod

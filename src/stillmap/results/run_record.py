@@ -71,7 +71,7 @@ class RunRecord(ShortRepr):
 
     @property
     def quality(self) -> Quality:
-        """How good the result is; unknown where the record does not say so."""
+        """Quality of the result; unknown where the record does not say so."""
         told = self.record.get("quality")
         parts = told if isinstance(told, dict) else {}
         overall, labels, geometry = (
@@ -88,7 +88,7 @@ class RunRecord(ShortRepr):
 
     @property
     def map_mode(self) -> MapMode:
-        """How its map image is written; the default where the record does not say."""
+        """Mode of its map image; the default where the record does not say."""
         mode = (self._section("output") or {}).get("map_mode")
         return self._override(OutputOptions(), {"map_mode": mode}).map_mode
 

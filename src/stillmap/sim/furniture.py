@@ -112,7 +112,7 @@ def _kind_of(length: float, width: float) -> ObjectKind | None:
 
 
 class Floor:
-    """Where furniture can be put, so that the robot still gets everywhere.
+    """The free floor for furniture that leaves the robot a way everywhere.
 
     Args:
         scene: its walls, glass, mirrors and kerbs; doors are ignored.

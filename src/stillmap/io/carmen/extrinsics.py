@@ -80,7 +80,7 @@ def override(found: Extrinsics, given: LaserOptions) -> Extrinsics:
 
 
 def find_upside_down(kind: str, params: dict[str, str], given: LaserOptions) -> tuple[bool, str]:
-    """Whether a laser is mounted upside down, so that its beams turn clockwise, and the source.
+    """Find whether a laser is mounted upside down, its beams turning clockwise, and the source.
 
     CARMEN's own laser_..._flipped does not tell: its laser server reverses such readings before
     they are logged.

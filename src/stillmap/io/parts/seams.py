@@ -35,7 +35,7 @@ _ZERO = 1e-3  # m, rad: where odometry begins when it is switched on
 
 @dataclass(frozen=True)
 class Seam:
-    """Where a part goes on after another one.
+    """The seam at which a part goes on after another one.
 
     Attributes:
         gap: seconds from the end of one to the beginning of the other; negative: they overlap.
@@ -70,7 +70,7 @@ def compare(earlier: RecordingFacts, later: RecordingFacts) -> Seam | str:
 
 
 def _compare_sensors(earlier: RecordingFacts, later: RecordingFacts) -> str:
-    """How the sensors differ; "" where they may be the same."""
+    """The difference between the sensors; "" where they may be the same."""
     if len(earlier.sensors) != len(later.sensors):
         return f"has {len(later.sensors)} sensors, {earlier.path} has {len(earlier.sensors)}"
     for a, b in zip(earlier.sensors, later.sensors, strict=True):

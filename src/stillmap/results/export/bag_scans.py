@@ -50,7 +50,7 @@ class LaserWriter:
             sends[s](stamp, message)
 
     def describe_losses(self) -> list[str]:
-        """What LaserScan cannot represent, a sentence each."""
+        """Properties of a recording that LaserScan cannot represent, a sentence each."""
         return self._encoder.describe_losses()
 
 
@@ -84,7 +84,7 @@ class LidarWriter:
         self._sends[s](stamp, make_cloud_message(self._bag, stamp, self._frames[s], block))
 
     def describe_losses(self) -> list[str]:
-        """What PointCloud2 cannot represent, a sentence each."""
+        """Properties of a recording that PointCloud2 cannot represent, a sentence each."""
         return []
 
 

@@ -170,7 +170,7 @@ class _Writer:
             self._stream.set_time("stamp", duration=np.timedelta64(stamp, "ns"))
 
     def _write_fixed(self) -> None:
-        """What does not depend on the time."""
+        """Write everything that does not depend on the time."""
         rerun, result = self._rerun, self._result
 
         def log(entity: str, *what: Any) -> None:

@@ -93,7 +93,7 @@ def map_window(maps: Sequence[GridMap]) -> Window:
 
     Without occupied cells: every known cell; without known cells: the whole first map.
     """
-    for select in (_occupied, _known):
+    for select in (_is_occupied, _is_known):
         boxes = [box for box in (_box(one, select) for one in maps) if box is not None]
         if boxes:
             corners = np.array(boxes)
@@ -191,11 +191,11 @@ def color_by_index(
     return image
 
 
-def _occupied(p_occupied: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _is_occupied(p_occupied: NDArray[np.float32]) -> NDArray[np.bool_]:
     return np.asarray(p_occupied > OCCUPIED_THRESH)
 
 
-def _known(p_occupied: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _is_known(p_occupied: NDArray[np.float32]) -> NDArray[np.bool_]:
     return np.asarray(~np.isnan(p_occupied))
 
 
