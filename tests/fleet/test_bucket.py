@@ -6,7 +6,8 @@ import sys
 import urllib.request
 
 import pytest
-from fleets import NAMES, contents
+from fleets import NAMES
+from result_contents import contents
 
 from stillmap.cli.main import main
 from stillmap.core.errors import InputError
