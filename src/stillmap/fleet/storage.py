@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Protocol
 
 from stillmap.core.errors import InputError
+from stillmap.core.files import sync
 from stillmap.fleet.scratch import remove_stale, scratch_folder
 
 STATE = ".fleet"  # folder of the journal, of the labels of results, and of unfinished results
@@ -109,7 +110,7 @@ class FolderStorage:
             if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
                 raise
             # another attempt has published the same result in between
-        _sync_one(path.parent)
+        sync(path.parent)
         shutil.rmtree(old, ignore_errors=True)
 
     def local_folder(self, name: str, attempt: Path) -> Path:  # noqa: ARG002
@@ -126,12 +127,4 @@ class FolderStorage:
 def _sync(folder: Path) -> None:
     """Wait until every file of a folder is on the disk."""
     for path in [folder, *folder.rglob("*")]:
-        _sync_one(path)
-
-
-def _sync_one(path: Path) -> None:
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+        sync(path)
