@@ -52,6 +52,14 @@ def listed_rooms() -> list[str]:
     return re.findall(r"^\| `(\w+)` \|", table, flags=re.MULTILINE)
 
 
+def listed_modules(room: str) -> dict[str, int]:
+    """Modules and folders of a room, and their row in the table that lists them."""
+    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    rows = text.split(f"Modules of `{room}`")[1].split("\n\n")[1].split("\n")[2:]
+    names = {k: re.findall(r"`(\w+)/?`", row.split("|")[1]) for k, row in enumerate(rows)}
+    return {name: k for k, row in names.items() for name in row}
+
+
 def find_circle(graph: dict[str, set[str]]) -> list[str]:
     """Nodes that lead to each other; none where there is no circle."""
     rest = dict(graph)
@@ -96,6 +104,17 @@ def test_folders_in_a_room_do_not_import_each_other():
         if not module.endswith(f".{room_of(module)}"):  # what a room offers as a whole
             graph.setdefault(part_of(module), set()).update(parts - {part_of(module)})
     assert find_circle(graph) == []
+
+
+@pytest.mark.parametrize("room", ["places", "fleet"])
+def test_modules_of_a_room_are_listed_from_the_bottom_up(room):
+    row = listed_modules(room)
+    own = {name for name in MODULES if name.startswith(f"stillmap.{room}.")}
+    assert row.keys() == {part_of(name).split(".")[2] for name in own}
+    for module in own:
+        for other in IMPORTS[module] & own:
+            here, there = (part_of(name).split(".")[2] for name in (module, other))
+            assert row[there] <= row[here], f"{here} imports {there}"
 
 
 @pytest.mark.parametrize("graph", [{"a": {"b"}, "b": {"a"}}, {"a": {"b"}, "b": {"c"}, "c": {"b"}}])
