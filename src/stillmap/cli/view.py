@@ -88,7 +88,7 @@ def _find_report(folder: Path) -> Path:
         raise InputError("does not exist", where=str(folder), hint=hint)
     report = Path(os.path.abspath(folder)) / _REPORT
     place = report.parent.parent.parent  # of a session, in its folder `sessions`
-    if not report.is_file() and is_place(place):
+    if not report.is_file() and report.parent.parent.name == "sessions" and is_place(place):
         hint = f"stillmap view {place} shows all of them"
         raise InputError("is a session of a place", where=str(folder), hint=hint)
     if not report.is_file():
