@@ -19,7 +19,8 @@ from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud.binary_table import truncated_error
 from stillmap.io.point_cloud.hits import iter_map_points
 from stillmap.io.point_cloud.library_errors import library_errors
-from stillmap.io.point_cloud.scans import Cloud, Origin, read_clouds
+from stillmap.io.point_cloud.origin import Origin
+from stillmap.io.point_cloud.scans import Cloud, read_clouds
 from stillmap.io.point_cloud.signatures import LAS_EXTENSIONS, LAS_MAGIC
 from stillmap.io.scan_files import require_nonempty_file
 

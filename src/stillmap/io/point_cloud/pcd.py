@@ -26,14 +26,8 @@ from stillmap.io.point_cloud.binary_table import (
     truncated_error,
 )
 from stillmap.io.point_cloud.hits import require_single_sensor, scan_hits, sensor_poses
-from stillmap.io.point_cloud.scans import (
-    Cloud,
-    DatasetInfo,
-    Origin,
-    build_recording,
-    files_of,
-    sources_of,
-)
+from stillmap.io.point_cloud.origin import Origin
+from stillmap.io.point_cloud.scans import Cloud, DatasetInfo, build_recording, files_of, sources_of
 from stillmap.io.point_cloud.signatures import MAX_PCD_HEADER, PCD_EXTENSIONS, is_pcd
 from stillmap.io.point_cloud.time_field import find_time_column
 from stillmap.io.rigid_transforms import pose_from_quaternion, quaternion_from_pose
