@@ -174,43 +174,6 @@ def score_changes(
         truth: of all sessions.
         sessions: (S,) their numbers in it.
     """
-    counts, spurious = _count_cells(found, source, cells)
-    precision = _ratio(counts.right, counts.called)
-    recall = _ratio(counts.recalled, counts.true)
-    events = list(list_events(cells, truth, sessions))
-    dates = [_match(event, found) for event in events]
-    dated = sum(
-        any(event.is_dated(*date) for date in own) for event, own in zip(events, dates, strict=True)
-    )
-    matched = sum(len(own) > 0 for own in dates)
-    return ChangeScores(
-        source=source,
-        cells=counts.true,
-        found=counts.recalled,
-        precision=precision,
-        recall=recall,
-        f1=_ratio(2 * precision * recall, precision + recall),
-        events=len(events),
-        events_found=matched,
-        dates_right=_ratio(dated, matched),
-        changes=len(found),
-        spurious=spurious,
-    )
-
-
-class _CellCounts(NamedTuple):
-    """Pairs of sessions and cells: that truly changed, were called changed, rightly, were found."""
-
-    true: int
-    called: int
-    right: int
-    recalled: int
-
-
-def _count_cells(
-    found: list[FoundChange], source: str, cells: CellTruth
-) -> tuple[_CellCounts, int]:
-    """Count cells over all pairs of sessions, and the changes without one that truly changed."""
     true, called, right, recalled = 0, 0, 0, 0
     real = [np.zeros(cells.lattice.shape, bool) for _ in found]
     for i, j, both in _pairs(cells):
@@ -225,7 +188,26 @@ def _count_cells(
         mask &= near | ~widen(either)
         true, called = true + int(changed.sum()), called + int(mask.sum())
         right, recalled = right + int((mask & near).sum()), recalled + _hit(changed, mask)
-    return _CellCounts(true, called, right, recalled), sum(not one.any() for one in real)
+    precision, recall = _ratio(right, called), _ratio(recalled, true)
+    events = list(list_events(cells, truth, sessions))
+    dates = [_match(event, found) for event in events]
+    dated = sum(
+        any(event.is_dated(*date) for date in own) for event, own in zip(events, dates, strict=True)
+    )
+    matched = sum(len(own) > 0 for own in dates)
+    return ChangeScores(
+        source=source,
+        cells=true,
+        found=recalled,
+        precision=precision,
+        recall=recall,
+        f1=_ratio(2 * precision * recall, precision + recall),
+        events=len(events),
+        events_found=matched,
+        dates_right=_ratio(dated, matched),
+        changes=len(found),
+        spurious=sum(not one.any() for one in real),
+    )
 
 
 def _net_cells(changes: list[FoundChange], cells: CellTruth) -> Bool:

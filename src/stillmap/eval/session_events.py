@@ -31,7 +31,7 @@ class Event(NamedTuple):
     cells: Bool
 
     def is_dated(self, before: int, after: int) -> bool:
-        """True if a change between two sessions has the right date."""
+        """Whether a change between two sessions has the right date."""
         early = self.seen[0] <= before <= self.true[0]
         return early and self.true[1] <= after <= self.seen[1]
 
@@ -46,7 +46,7 @@ def list_events(cells: CellTruth, truth: SessionTruth, sessions: list[int]) -> I
                 continue
             surface = cells.lattice.draw(place_faces(thing, thing.stays[0])) & ~cells.fixed
             looked = [
-                surface & _find_observed(cells, k, one.places[s] == one.places[at])
+                surface & _looked(cells, k, one.places[s] == one.places[at])
                 for k, s in enumerate(sessions)
             ]
             enough = [int(mask.sum()) >= MIN_CELLS for mask in looked]
@@ -62,7 +62,7 @@ def list_events(cells: CellTruth, truth: SessionTruth, sessions: list[int]) -> I
                 yield Event(came, (first, last), (before[-1], after[0]), both)
 
 
-def _find_observed(cells: CellTruth, session: int, is_there: bool) -> Bool:
+def _looked(cells: CellTruth, session: int, is_there: bool) -> Bool:
     """(H, W) cells in which a session saw that a surface is there, or is not."""
     seen = cells.seen[session]
     return widen(seen.hits >= MIN_BEAMS) if is_there else seen.passes >= MIN_BEAMS
