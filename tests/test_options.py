@@ -14,14 +14,12 @@ from stillmap.core.config import (
     Limits,
     Section,
     iter_options,
-    load_toml,
     merge_nested,
     option,
     override,
-    parse_assignment,
     to_dict,
-    to_toml,
 )
+from stillmap.core.config_toml import load_toml, parse_assignment, to_toml
 from stillmap.core.errors import InputError
 from stillmap.pipeline.options import Options
 

@@ -209,31 +209,32 @@ def test_info_says_what_belongs_together(call, room, day_after, tmp_path):
     assert len(one["groups"]) == 1
 
 
-def test_sessions_are_not_joined(call, room, day_after, tmp_path, nothing_left, monkeypatch):
-    monkeypatch.setattr("stillmap.cli.groups.find_spec", lambda name: None)  # noqa: ARG005
-    done = call("map", room, day_after, "-o", tmp_path / "out", *QUICK)
-    refused(done, "these are 2 sessions", f"{day_after} begins 24.0 h after")
-    done = call("map", room, day_after, "-o", tmp_path / "out", "--poses", "a.tum", *QUICK)
-    refused(done, "--poses is for one recording")
+@pytest.mark.parametrize("flags", [("--poses", "a.tum"), ("--region", 0, 0, 4, 4)])
+def test_flags_for_one_recording(call, room, day_after, tmp_path, nothing_left, flags):
+    done = call("map", room, day_after, "-o", tmp_path / "out", *flags, *QUICK)
+    refused(
+        done,
+        f"{flags[0]} is for one recording: these are 2 sessions",
+        f"{day_after} begins 24.0 h after",
+    )
     nothing_left("tuesday")
 
 
 def test_sessions_and_their_parts_are_merged(call, room, day_after, tmp_path, monkeypatch):
     taken = []
 
-    class Merge:
-        @staticmethod
-        def merge_groups(args, groups):
-            taken.append((args.output, groups))
-            return 0
+    def merge(args, base, groups, options):  # noqa: ARG001
+        taken.append((args.output, groups, args.map_state, options.estimator))
+        assert options.output.map_state == "last"
+        return 0
 
-    monkeypatch.setattr("stillmap.cli.groups.find_spec", lambda name: name)
-    monkeypatch.setattr("stillmap.cli.groups.import_module", lambda name: Merge)  # noqa: ARG005
+    monkeypatch.setattr("stillmap.cli.merge._merge", merge)
     parts = cut_folder(room, tmp_path)
-    done = call("map", parts[0], day_after, *parts[1:], "-o", tmp_path / "out", *QUICK)
+    flags = ("-o", tmp_path / "out", "--estimator", "hit-ratio", "--map-state", "majority")
+    done = call("map", parts[0], day_after, *parts[1:], *flags, *QUICK)
     assert done.returncode == 0, done.stderr
     in_order = [str(parts[k]) for k in (1, 2, 0)]
-    assert taken == [(str(tmp_path / "out"), [in_order, [str(day_after)]])]
+    assert taken == [(str(tmp_path / "out"), [in_order, [str(day_after)]], "majority", "hit-ratio")]
 
 
 def test_inputs_that_cannot_be_read(call, room, tmp_path, nothing_left):

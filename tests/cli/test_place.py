@@ -54,6 +54,12 @@ def test_one_session_is_filtered_as_a_result(call, flat_place, flat_days, tmp_pa
     assert json.loads(done.stdout)["input"] == str(moved)
 
 
+def test_one_session_is_shown_with_its_place(call, flat_place):
+    home = flat_place / "sessions" / "map2"
+    done = call("view", home)
+    refused(done, f"{home}: is a session of a place", f"stillmap view {flat_place} shows all")
+
+
 def test_the_ending_is_that_of_the_format(call, flat_place, flat_days, tmp_path):
     done = call("filter", flat_place, "-o", tmp_path / "bags", "--to", "mcap", "--quiet")
     assert (done.returncode, done.stderr) == (0, "")

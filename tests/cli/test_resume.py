@@ -5,7 +5,6 @@ import fcntl
 import json
 import os
 import random
-import re
 import shlex
 import shutil
 import signal
@@ -14,6 +13,7 @@ import time
 
 import numpy as np
 import pytest
+from result_contents import contents
 
 from stillmap.pipeline import checkpoint, result
 from stillmap.pipeline.em_loop import iterate
@@ -22,20 +22,6 @@ from stillmap.results import labels
 WORDS = ("--set", "em.max_iterations=4", "--set", "em.patience=9", "--set", "em.tolerance=0")
 WORDS += ("--set", "em.label_tolerance=0", "--threads", "1")
 ALL = 4  # iterations
-
-
-def contents(folder) -> dict[str, bytes]:
-    """All files, without what tells of time and memory in them."""
-    out = {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
-    run = json.loads(out["run.json"])
-    for name in ("seconds", "cpu_seconds", "peak_memory_bytes"):
-        del run[name]
-    for iteration in run["iterations"]:
-        del iteration["seconds"]
-    report = re.sub(rb"<h3>Time and memory</h3>.*?</details>", b"", out["report.html"], flags=re.S)
-    report = re.sub(rb"<div><dt>Computed in</dt>.*?</div>", b"", report)
-    report = re.sub(rb"<td[^<>]*>[0-9.,]+ (ms|s|min)</td>", b"", report)
-    return {**out, "run.json": json.dumps(run).encode(), "report.html": report}
 
 
 @pytest.fixture(scope="module")

@@ -140,7 +140,8 @@ signal.signal(signal.SIGINT, signal.default_int_handler)  # it may be ignored wh
 from pathlib import Path
 import numpy as np
 from stillmap.cli.console import handle_signals
-from stillmap.results.export import point_cloud, point_cloud_files
+from stillmap.results import point_cloud
+from stillmap.results.export import point_cloud_files
 def command():
     handle_signals(command.__code__)
     points = np.random.default_rng(1).normal(size=(50_000, 3))

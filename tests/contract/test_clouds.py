@@ -15,7 +15,8 @@ from stillmap.core.errors import InputError
 from stillmap.io import read, stillmap_folder
 from stillmap.io.point_cloud import pcd, ply
 from stillmap.io.point_cloud.binary_table import read_columns
-from stillmap.results.export import point_cloud, point_cloud_files
+from stillmap.results import point_cloud
+from stillmap.results.export import point_cloud_files
 
 FIELDS = ("x", "y", "z", "p_static")
 ROUNDED = 0.5001e-4  # m
@@ -229,7 +230,8 @@ import resource, signal, sys
 from pathlib import Path
 import numpy as np
 from stillmap.core.errors import InputError
-from stillmap.results.export import point_cloud, point_cloud_files
+from stillmap.results import point_cloud
+from stillmap.results.export import point_cloud_files
 rng, n = np.random.default_rng(1), 200_000
 block = point_cloud.Block(rng.uniform(-50, 50, (n, 3)), rng.uniform(size=n).astype("f4"), None)
 path = Path("{name}")

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from stillmap.results.export import point_cloud, point_cloud_files
+from stillmap.results import point_cloud
+from stillmap.results.export import point_cloud_files
 from stillmap.results.points import COLOURS, FIELDS, ply_header, put_colours
 
 N = 70_000

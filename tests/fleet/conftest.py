@@ -18,7 +18,8 @@ from stillmap.sim.walls import box
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))  # for what the tests share
 
-from fleets import NAMES, contents, wait_until
+from fleets import NAMES, wait_until
+from result_contents import contents
 
 COMMAND = [sys.executable, "-m", "stillmap"]
 

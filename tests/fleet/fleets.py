@@ -1,27 +1,11 @@
-"""What the tests of fleets share: contents of results, what a fleet leaves, waiting."""
+"""What the tests of fleets share: what a fleet leaves, waiting."""
 
-import json
-import re
 import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
 NAMES = ("hall", "office", "yard")  # of the recordings
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    """All files of a result, without what tells of time and memory in them."""
-    out = {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
-    run = json.loads(out["run.json"])
-    for name in ("seconds", "cpu_seconds", "peak_memory_bytes"):
-        del run[name]
-    for iteration in run["iterations"]:
-        del iteration["seconds"]
-    report = re.sub(rb"<h3>Time and memory</h3>.*?</details>", b"", out["report.html"], flags=re.S)
-    report = re.sub(rb"<div><dt>Computed in</dt>.*?</div>", b"", report)
-    report = re.sub(rb"<td[^<>]*>[0-9.,]+ (ms|s|min)</td>", b"", report)
-    return {**out, "run.json": json.dumps(run).encode(), "report.html": report}
 
 
 def files_of(folder: Path) -> set[str]:

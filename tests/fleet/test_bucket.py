@@ -6,11 +6,12 @@ import sys
 import urllib.request
 
 import pytest
-from fleets import NAMES, contents
+from fleets import NAMES
+from result_contents import contents
 
 from stillmap.cli.main import main
 from stillmap.core.errors import InputError
-from stillmap.fleet.storage import open_storage
+from stillmap.fleet.backends import open_storage
 
 s3fs = pytest.importorskip("s3fs")
 pytestmark = [

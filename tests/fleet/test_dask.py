@@ -8,7 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from fleets import NAMES, children_of, contents, is_alive, unfinished, wait_until
+from fleets import NAMES, children_of, is_alive, unfinished, wait_until
+from result_contents import contents
 
 from stillmap.core.errors import InputError
 from stillmap.fleet.dask_executor import DaskExecutor

@@ -7,8 +7,9 @@ import signal
 from html.parser import HTMLParser
 
 import pytest
-from fleets import NAMES, children_of, contents, is_alive, unfinished, wait_until
+from fleets import NAMES, children_of, is_alive, unfinished, wait_until
 from marks import slow_params
+from result_contents import contents
 
 from stillmap.cli.parser import COMMANDS
 

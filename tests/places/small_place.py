@@ -93,6 +93,7 @@ RECORD = {
     "options": {},
     "counts": {"scans": 20, "beams": 2000, "hits": 1800, "dynamic": 90},
     "area": {"known": 24.0},
+    "quality": {"overall": 81.7, "labels": None, "geometry": 81.7},
     "place": {"map_state": "last", "constraints": 17, "resolution": CELL, "voxel_size": CELL},
 }
 

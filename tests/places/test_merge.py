@@ -61,6 +61,12 @@ def test_sessions_lie_where_they_truly_are(days, place):
         assert 0.0 <= one["overlap"] <= 1.0
 
 
+def test_the_place_is_rated_by_its_geometry(place):
+    quality = json.loads((place / "run.json").read_text())["quality"]
+    assert quality["labels"] is None
+    assert 50.0 < quality["geometry"] == quality["overall"] <= 100.0
+
+
 def test_the_trajectory_of_the_place_is_that_of_its_sessions(place):
     stamps, poses = read_tum(place / "trajectory.tum")
     parts = [read_tum(place / "sessions" / f"out-{k}" / "trajectory.tum") for k in (1, 2, 3)]

@@ -7,7 +7,6 @@ import io
 import json
 import re
 import sys
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,7 @@ from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
+from report_page import Page
 from small_place import RECORD, make_place
 
 from stillmap.cli.main import main
@@ -33,41 +33,6 @@ from stillmap.sim import (
     write_simulation,
 )
 from stillmap.sim.walls import box
-
-VOID = {"meta", "img", "input", "br", "link", "hr"}
-
-
-class Page(HTMLParser):
-    """Tags with their attributes, rows of tables, and text; tags must close in order."""
-
-    def __init__(self, text):
-        super().__init__()
-        self.tags, self.rows, self._open = [], [], []
-        self.feed(text)
-        self.close()
-        assert self._open == []
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append((tag, dict(attrs)))
-        if tag not in VOID:
-            self._open.append(tag)
-        if tag == "tr":
-            self.rows.append([])
-        elif tag in ("td", "th"):
-            self.rows[-1].append("")
-
-    def handle_startendtag(self, tag, attrs):
-        self.tags.append((tag, dict(attrs)))
-
-    def handle_endtag(self, tag):
-        assert self._open.pop() == tag
-
-    def handle_data(self, data):
-        if {"td", "th"} & {*self._open}:
-            self.rows[-1][-1] += data
-
-    def named(self, tag):
-        return [attrs for name, attrs in self.tags if name == tag]
 
 
 def rendered(folder, record=RECORD):
@@ -198,6 +163,12 @@ def test_state_of_the_map_is_named(place):
     ):
         record = {**RECORD, "place": {**RECORD["place"], "map_state": state}}
         assert words in rendered(place, record)
+
+
+def test_geometry_is_told_where_it_is_known(place):
+    assert "82 of 100" in rendered(place, RECORD)
+    unknown = {"overall": None, "labels": None, "geometry": None}
+    assert "of 100" not in rendered(place, {**RECORD, "quality": unknown})
 
 
 def test_place_without_changes(tmp_path):

@@ -3,7 +3,7 @@
 import numpy as np
 
 from stillmap.results import colors
-from stillmap.results.report.figures import ORANGE
+from stillmap.results.colors import ORANGE
 
 
 def test_color_by_p_static():

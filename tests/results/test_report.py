@@ -4,56 +4,23 @@ import hashlib
 import io
 import itertools
 import re
-from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 from PIL import Image
+from report_page import Page
 
 from stillmap.pipeline.quality import Quality, describe_quality
+from stillmap.results.colors import ORANGE
 from stillmap.results.map_server import write_map_server
 from stillmap.results.report import formatting
 from stillmap.results.report.curves import curve_of, round_down
-from stillmap.results.report.figures import (
-    ORANGE,
-    UNKNOWN,
-    VEIL_ALPHA,
-    VIOLET,
-)
+from stillmap.results.report.figures import UNKNOWN, VEIL_ALPHA, VIOLET
 from stillmap.results.report.page import render_report
 from stillmap.slam.mount_calibration import Calibration, Parameter
 
-VOID = {"meta", "img", "input", "br", "link", "hr"}
 # what a reader finds in no dictionary, or only in the code
 JARGON = r"\bnats?\b|\blooks\b|\b[em]_step\b|\brad\b|HMM|posterior|responsibilit"
-
-
-class Page(HTMLParser):
-    """Every tag with its attributes, and the text; tags must close in order."""
-
-    def __init__(self, text):
-        super().__init__()
-        self.tags, self.text, self._open = [], [], []
-        self.feed(text)
-        self.close()
-        assert self._open == []
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append((tag, dict(attrs)))
-        if tag not in VOID:
-            self._open.append(tag)
-
-    def handle_startendtag(self, tag, attrs):
-        self.tags.append((tag, dict(attrs)))
-
-    def handle_endtag(self, tag):
-        assert self._open.pop() == tag
-
-    def handle_data(self, data):
-        self.text.append(data)
-
-    def named(self, tag):
-        return [attrs for name, attrs in self.tags if name == tag]
 
 
 @pytest.fixture(scope="module")

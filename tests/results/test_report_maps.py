@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 from PIL import Image
 
+from stillmap.results.colors import ORANGE
 from stillmap.results.map_server import write_map_server
 from stillmap.results.report.figures import (
-    ORANGE,
     UNKNOWN,
     MapView,
     draw_map,

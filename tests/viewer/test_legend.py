@@ -7,8 +7,7 @@ import pytest
 
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 
-from stillmap.results.colors import BLUE, TEAL
-from stillmap.results.report.figures import ORANGE
+from stillmap.results.colors import BLUE, ORANGE, TEAL
 from stillmap.viewer.legend import (
     help_html,
     legend_html,

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from stillmap.results.colors import ORANGE
 from stillmap.results.points import COLOURS, FIELDS, ply_header, put_colours
-from stillmap.results.report.figures import ORANGE
 from stillmap.viewer import scene as scenes
 from stillmap.viewer import shortcuts
 from stillmap.viewer.scene import read_scene

@@ -67,6 +67,10 @@ def add_read_flags(
         "--odom-frame", metavar="FRAME", help="odometry frame of a bag (default: detected)"
     )
     _add_time_flags(group, end_flags)
+    _add_laser_flags(group)
+
+
+def _add_laser_flags(group: argparse._ArgumentGroup) -> None:
     for laser, which in _LASERS.items():
         group.add_argument(
             f"--{laser}-offset",

@@ -38,7 +38,8 @@ def options_from_args(args: argparse.Namespace, *flags: dict[str, Any]) -> "Opti
     Raises:
         InputError: an unknown key or a wrong value, and where it came from.
     """
-    from stillmap.core.config import load_toml, merge_nested, override, parse_assignment
+    from stillmap.core.config import merge_nested, override
+    from stillmap.core.config_toml import load_toml, parse_assignment
     from stillmap.pipeline.options import Options
 
     options = Options()
@@ -103,7 +104,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the options."""
-    from stillmap.core.config import to_toml
+    from stillmap.core.config_toml import to_toml
 
     options = options_from_args(args)
     text = to_toml(options, args.only)  # raises for unknown names

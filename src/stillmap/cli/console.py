@@ -21,7 +21,7 @@ _STYLES = {"error": "1;31", "warning": "33"}  # bold red, yellow
 
 
 def uses_color(stream: IO[str]) -> bool:
-    """Whether output is colored; NO_COLOR, FORCE_COLOR, CLICOLOR_FORCE and TERM decide."""
+    """True if output is colored; NO_COLOR, FORCE_COLOR, CLICOLOR_FORCE and TERM decide."""
     if os.environ.get("NO_COLOR"):
         return False
     if os.environ.get("FORCE_COLOR") or os.environ.get("CLICOLOR_FORCE", "0") not in ("", "0"):
@@ -30,7 +30,7 @@ def uses_color(stream: IO[str]) -> bool:
 
 
 def is_terminal(stream: IO[str] | None) -> bool:
-    """Whether a stream is a terminal that supports control sequences."""
+    """True if a stream is a terminal that supports control sequences."""
     return stream is not None and stream.isatty() and os.environ.get("TERM") != "dumb"
 
 

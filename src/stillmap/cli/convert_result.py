@@ -9,7 +9,8 @@ from stillmap.cli.console import show_share
 from stillmap.core.errors import InputError
 
 if TYPE_CHECKING:
-    from stillmap.results.export import nav2, point_cloud, point_cloud_files
+    from stillmap.results import point_cloud
+    from stillmap.results.export import nav2, point_cloud_files
     from stillmap.results.folder import Exported, ResultFolder
 
 # a copy for the help: the module that defines them takes long to load
@@ -94,7 +95,8 @@ def _convert_place(args: argparse.Namespace, place: Path, output: Path) -> tuple
         InputError: another format is wanted.
     """
     from stillmap.results.export import point_cloud_files
-    from stillmap.results.folder import ResultFolder, read_record
+    from stillmap.results.folder import ResultFolder
+    from stillmap.results.run_record import read_record
 
     require_apart(output, place)
     result = ResultFolder(place, read_record(place), Path(), False)
@@ -219,7 +221,8 @@ def _convert_to_cloud(
 ) -> str:
     from stillmap.core.files import require_new_file
     from stillmap.places.inputs import is_place
-    from stillmap.results.export import point_cloud, point_cloud_files
+    from stillmap.results import point_cloud
+    from stillmap.results.export import point_cloud_files
     from stillmap.results.run_json import TILTING
 
     require_new_file(output, args.overwrite)
@@ -238,7 +241,7 @@ def _build_cloud(
 ) -> "point_cloud.Cloud":
     from stillmap.core.region import limit_hits
     from stillmap.io.trajectory import poses_from_tum
-    from stillmap.results.export import point_cloud
+    from stillmap.results import point_cloud
     from stillmap.results.labels import read_colors
     from stillmap.slam import deskew_recording
 

@@ -17,9 +17,9 @@ from stillmap.eval.readers import Truth, read_truth, require_same_beams
 from stillmap.eval.relations import RelationErrors, compute_relation_errors
 from stillmap.eval.trajectory import read_paired_poses
 from stillmap.places.inputs import is_place
-from stillmap.results.folder import read_region
 from stillmap.results.labels import read_labels
 from stillmap.results.reader import moved, read_grid, require_there
+from stillmap.results.run_record import read_region
 
 Scores = tuple[dict[str, Any], Iterable[str]]  # as JSON, as lines of text
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from stillmap.cli.arguments import require_apart
 from stillmap.cli.console import print_json, say
-from stillmap.cli.filter import Filtered, find_target, write_filtered
+from stillmap.cli.filter_recording import Filtered, find_target, write_filtered
 from stillmap.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ def _list_names(place: Path) -> list[str]:
 
 
 def _plan(place: Path, name: str, output: Path, to: str | None) -> _Session:
-    """How a session is written, refused before any is read.
+    """Plan how a session is written; what cannot be is refused before any is read.
 
     Raises:
         InputError: its recording is not there, or cannot be written so.
@@ -108,7 +108,7 @@ def _find_ending(result: "ResultFolder", to: str | None) -> str:
 
 
 def _own_ending(source: Path) -> str:
-    """What the name of a file ends in by its format, such as `.log.gz`; none of a folder."""
+    """The ending of a file's name by its format, such as `.log.gz`; none of a folder."""
     from stillmap.io import registry, stillmap_folder
 
     name = source.name

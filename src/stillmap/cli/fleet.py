@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from stillmap.cli.arguments import add_read_flags, read_changes
 from stillmap.cli.config import add_option_flags, options_from_args
 from stillmap.cli.console import fail, print_json, say, show_tasks
-from stillmap.cli.map import add_map_flags, add_method_flags, option_changes
+from stillmap.cli.map_flags import add_map_flags, add_method_flags, option_changes
 from stillmap.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -118,7 +118,7 @@ def _read_request(args: argparse.Namespace) -> "Request":
 
 
 def _read_entries(args: argparse.Namespace) -> "list[Entry]":
-    """What was named on the command line and in the manifest."""
+    """The recordings that the command line and the manifest name."""
     from stillmap.fleet.inputs import entries_of
     from stillmap.fleet.manifest import read_manifest
 

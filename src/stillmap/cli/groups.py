@@ -1,17 +1,19 @@
-"""Which inputs of a command are parts of one run, and what is done with sessions."""
+"""Inputs of a command grouped to runs: parts of one, or sessions."""
 
 import argparse
-from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 
 from stillmap.cli.console import show_share
 from stillmap.core.errors import InputError
-from stillmap.io.parts.reading import InputGroup, group_inputs
+from stillmap.io.input_groups import InputGroup, group_inputs
 from stillmap.preprocessing.options import ReadOptions
 
-_MERGE = "stillmap.cli.merge"
-_FOR_ONE_RUN = ("tilting", "tilting_topic", "poses")  # flags of `map` that need one recording
+_FOR_ONE_RUN = (
+    "tilting",
+    "tilting_topic",
+    "poses",
+    "region",
+)  # flags of `map` that need one recording
 
 
 def find_groups(
@@ -26,22 +28,16 @@ def find_groups(
         return group_inputs(args.input, options, progress=progress, scratch=scratch)
 
 
-def merge_sessions(args: argparse.Namespace, groups: list[InputGroup]) -> int:
-    """Map sessions and merge them, each a recording or the parts of one.
+def require_for_sessions(args: argparse.Namespace, groups: list[InputGroup]) -> None:
+    """Refuse flags of `map` that are for one recording, where there are several sessions.
 
     Raises:
-        InputError: a flag is for one recording, or sessions cannot be merged.
+        InputError: one of them is given.
     """
     for name in _FOR_ONE_RUN:
         if getattr(args, name) is not None:
             what = f"--{name.replace('_', '-')} is for one recording: {describe_sessions(groups)}"
             raise InputError(what)
-    if find_spec(_MERGE) is None:
-        hint = "map them one by one"
-        raise InputError(f"cannot merge sessions: {describe_sessions(groups)}", hint=hint)
-    merge = import_module(_MERGE)
-    status: int = merge.merge_groups(args, [list(group.paths) for group in groups])
-    return status
 
 
 def describe_sessions(groups: list[InputGroup]) -> str:

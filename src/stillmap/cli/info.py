@@ -11,7 +11,7 @@ from stillmap.cli.config import add_option_flags, options_from_args
 from stillmap.cli.console import show_share
 
 if TYPE_CHECKING:
-    from stillmap.io.parts.reading import InputGroup
+    from stillmap.io.input_groups import InputGroup
     from stillmap.preprocessing.options import ReadOptions
 
 _LINES_SHOWN = 10
@@ -69,7 +69,7 @@ def _summarize_group(group: "InputGroup", args: argparse.Namespace) -> dict[str,
     """The summary of a recording, or of the parts of one."""
     from stillmap.cli.recording_info import summarize_recording
     from stillmap.io import read
-    from stillmap.io.parts.reading import read_parts
+    from stillmap.io.input_groups import read_parts
 
     options, paths = _read_options(args), group.paths
     with show_share(args.quiet, "reading") as progress:
@@ -174,7 +174,7 @@ def _format_span(part: dict[str, Any]) -> str:
 
 
 def _format_part(part: dict[str, Any]) -> str:
-    """What the time window leaves out of a recording."""
+    """The scans that the time window leaves out of a recording."""
     from stillmap.core.timestamps import format_seconds
 
     first, last = part.get("first_stamp_ns"), part.get("last_stamp_ns")

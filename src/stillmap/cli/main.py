@@ -88,7 +88,7 @@ def _set_up_logging(args: argparse.Namespace) -> None:
 def _with_similar_name(error: InputError, args: argparse.Namespace) -> InputError:
     """Add a hint to the error of a missing file: the file beside it with a similar name."""
     path = Path(error.where)
-    words = [word for value in vars(args).values() for word in _listed(value)]
+    words = [word for value in vars(args).values() for word in _as_list(value)]
     given = {Path(word) for word in words if isinstance(word, str | Path)}
     if not error.what.startswith(("does not exist", "cannot be read")) or path not in given:
         return error
@@ -106,7 +106,7 @@ def _with_similar_name(error: InputError, args: argparse.Namespace) -> InputErro
     return InputError(error.what, where=error.where, hint=hint)
 
 
-def _listed(value: object) -> list[object]:
+def _as_list(value: object) -> list[object]:
     """The values of an argument that takes several, or its only one."""
     return list(value) if isinstance(value, list) else [value]
 

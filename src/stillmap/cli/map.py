@@ -2,32 +2,30 @@
 
 import argparse
 import errno
-import json
 import os
 import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from stillmap.cli.arguments import add_read_flags, read_changes, require_apart
 from stillmap.cli.config import add_option_flags, options_from_args
-from stillmap.cli.console import list_files, print_json, say, show_progress
-from stillmap.core.advice import split_advice
+from stillmap.cli.console import print_json, say, show_progress
+from stillmap.cli.map_flags import (
+    add_map_flags,
+    add_method_flags,
+    add_run_flags,
+    option_changes,
+)
+from stillmap.cli.map_summary import print_summary, summarize
 from stillmap.core.errors import InputError
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from stillmap.core.profiling import StageTimer
-    from stillmap.core.recording import Recording
-    from stillmap.io.parts.reading import InputGroup
-    from stillmap.mesh.build import Models
+    from stillmap.io.input_groups import InputGroup
     from stillmap.pipeline.checkpoint import CheckpointFolder
     from stillmap.pipeline.options import Options
-    from stillmap.pipeline.result import MappingResult
-    from stillmap.rig.build import TiltingResult
 
 DESCRIPTION = (
     "Map a recording: estimate the pose of every scan, the probability of every "
@@ -71,71 +69,18 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument(
         "--resume", action="store_true", help="continue an interrupted run from its last checkpoint"
     )
-    p.add_argument(
-        "--threads", metavar="N", type=int, help="0: one per processor; same result (default: 0)"
-    )
-    p.add_argument("--json", action="store_true", help="a summary as one JSON object on stdout")
-    p.add_argument("--quiet", action="store_true", help="no progress, no summary")
+    add_run_flags(p)
     add_method_flags(p.add_argument_group("method"))
     add_map_flags(p.add_argument_group("map"))
     add_read_flags(p)
     add_option_flags(p)
 
 
-def add_method_flags(p: argparse._ArgumentGroup) -> None:
-    """Add the flags that choose how poses and labels are estimated."""
-    p.add_argument("--paper", action="store_true", help="the method exactly as printed")
-    p.add_argument(
-        "--estimator",
-        choices=("stillmap", "paper", "hit-ratio", "tracker"),
-        help="how beams are labelled (default: stillmap)",
-    )
-    p.add_argument(
-        "--poses",
-        metavar="FILE.tum",
-        help="keep these poses; `recording`: the poses stored in the recording",
-    )
-    p.add_argument("--no-odometry", action="store_true", help="ignore odometry in the recording")
-
-
-def add_map_flags(p: argparse._ArgumentGroup) -> None:
-    """Add the flags of the map that is written."""
-    p.add_argument(
-        "--mesh",
-        action=argparse.BooleanOptionalAction,
-        help="surface and models of 3D recordings (default: where there are pictures)",
-    )
-    p.add_argument(
-        "--resolution",
-        metavar="M",
-        type=float,
-        help="edge of a map cell in metres (default: 0.05); of a voxel in 3D (0.15, of depth "
-        "cameras 0.05)",
-    )
-    p.add_argument(
-        "--map-mode",
-        choices=("trinary", "scale", "raw"),
-        help="pixels of map.pgm (default: trinary)",
-    )
-    p.add_argument(
-        "--region",
-        type=float,
-        nargs=4,
-        metavar=("X0", "Y0", "X1", "Y1"),
-        help="write this part of the map frame alone, in metres; poses are of all scans",
-    )
-    p.add_argument(
-        "--map-state", choices=("last", "majority"), help="state of changed places (default: last)"
-    )
-
-
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-_IN_SUMMARY = ("version", "converged", "best_iteration", "counts", "area", "seconds", "warnings")
 
 
 def run(args: argparse.Namespace) -> int:
     """Map a recording into a folder."""
-    from stillmap.cli.groups import merge_sessions
     from stillmap.cli.map_run import build_all, read_inputs
     from stillmap.core.profiling import StageTimer
     from stillmap.pipeline.checkpoint import lock_checkpoints
@@ -146,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
     _require_usable_output(args, output)
     groups = _find_groups(args, options, output, stages)
     if len(groups) > 1:
-        return merge_sessions(args, groups)
+        return _merge_sessions(args, groups)
     with lock_checkpoints(output) as checkpoints, _explain_failure(args, checkpoints):
         inputs = read_inputs(args, groups[0], options, checkpoints.folder, stages)
         with show_progress(args.quiet, options.em.max_iterations) as progress:
@@ -162,9 +107,9 @@ def run(args: argparse.Namespace) -> int:
             )
         checkpoints.clear()
     if not args.quiet:
-        _print_summary(result, tilting, models, output)
+        print_summary(result, tilting, models, output)
     if args.json:
-        print_json(_summarize(output))
+        print_json(summarize(output))
     return 0
 
 
@@ -189,25 +134,17 @@ def _find_groups(
     return groups
 
 
-def option_changes(args: argparse.Namespace) -> dict[str, Any]:
-    """The options that flags of this command set."""
-    changes: dict[str, Any] = {}
-    if args.paper and args.estimator not in (None, "paper"):
-        raise InputError(f"--paper and --estimator {args.estimator} exclude each other")
-    if args.paper or args.estimator:
-        changes["estimator"] = "paper" if args.paper else args.estimator
-    if args.threads is not None:
-        changes["threads"] = args.threads
-    if args.resolution is not None:
-        changes["slam"] = {"resolution": args.resolution, "voxel_size": args.resolution}
-    if args.mesh is not None:
-        changes["mesh"] = {"enabled": args.mesh}
-    if args.tilting_topic is not None:
-        changes["read"] = {"tilting_topic": args.tilting_topic}
-    output = {"map_mode": args.map_mode, "map_state": args.map_state, "region": args.region}
-    if chosen := {name: value for name, value in output.items() if value}:
-        changes["output"] = chosen
-    return changes
+def _merge_sessions(args: argparse.Namespace, groups: "list[InputGroup]") -> int:
+    """Map sessions and merge them, each a recording or the parts of one.
+
+    Raises:
+        InputError: a flag is for one recording, or sessions cannot be merged.
+    """
+    from stillmap.cli.groups import require_for_sessions
+    from stillmap.cli.merge import merge_groups
+
+    require_for_sessions(args, groups)
+    return merge_groups(args, [list(group.paths) for group in groups])
 
 
 def _require_usable_output(args: argparse.Namespace, output: Path) -> None:
@@ -242,96 +179,10 @@ def _explain_failure(args: argparse.Namespace, checkpoints: "CheckpointFolder") 
 
 
 def _describe_interruption(words: list[str], checkpoints: "CheckpointFolder") -> str:
-    """How to continue an interrupted run with these words on its command line."""
+    """The command that continues an interrupted run with these words on its command line."""
     if checkpoints.newest is None:
         return "no iteration was finished: nothing was written, and there is nothing to resume"
     given = [word for word in words if word not in ("--resume", "--overwrite")]
     number = checkpoints.newest.name.rpartition("-")[2]
     command = shlex.join(["stillmap", *given, "--resume"])
     return f"continue after iteration {number}: {command}"
-
-
-def _summarize(output: Path) -> dict[str, Any]:
-    """The main entries of `run.json`, and the files of the result."""
-    record = json.loads((output / "run.json").read_text(encoding="utf-8"))
-    return {
-        "output": str(output),
-        "files": list_files(output),
-        "iterations": len(record["iterations"]),
-        **{key: record[key] for key in (*_IN_SUMMARY, "tilting") if key in record},
-    }
-
-
-def _describe_quality(result: "MappingResult") -> list[str]:
-    """One line; none where quality cannot be told."""
-    quality = result.quality
-    parts = {"labels": quality.labels, "geometry": quality.geometry}
-    told = [f"{name} {value:.0f}" for name, value in parts.items() if value is not None]
-    if quality.overall is None:
-        return []
-    return [f"quality {quality.overall:.0f} of 100: {', '.join(told)}"]
-
-
-def _print_summary(
-    result: "MappingResult", tilting: "TiltingResult | None", models: "Models | None", output: Path
-) -> None:
-    lines = [
-        f"{result.recording.n_scans} scans, {_describe_hits(result.recording, result.p_static)}",
-        _describe_iterations(result),
-        *_describe_quality(result),
-        *_describe_changes(result),
-        *([] if tilting is None else [_describe_tilting(tilting)]),
-        *(f"{_kind_of(warning)}: {warning}" for warning in result.warnings),
-        *_describe_lack_of_models(result, tilting, models),
-        f"wrote {output}: open {output / 'report.html'}",
-        f"see it over time: stillmap view {shlex.quote(str(output))}",
-    ]
-    for line in lines:
-        say(line)
-
-
-def _describe_lack_of_models(
-    result: "MappingResult", tilting: "TiltingResult | None", models: "Models | None"
-) -> list[str]:
-    """How to get models of a 3D recording that has no pictures."""
-    is_2d = tilting is None and result.recording.dimension == 2
-    if is_2d or models is not None or result.options.mesh.enabled is not None:
-        return []
-    return ["no surface model: the recording has no pictures, --mesh makes a grey one"]
-
-
-def _describe_iterations(result: "MappingResult") -> str:
-    """Which iteration was kept, and whether the loop stopped by itself."""
-    n = len(result.iterations)
-    if n == 1 and result.converged:
-        return "converged after one iteration"
-    ending = "" if result.converged else ", which had not converged"
-    return f"kept iteration {result.best_iteration} of {n}{ending}"
-
-
-def _kind_of(warning: str) -> str:
-    """`warning` where the user can do something, else `note`."""
-    return "warning" if split_advice(warning)[1] else "note"
-
-
-def _describe_changes(result: "MappingResult") -> list[str]:
-    n, last = len(result.changes), result.options.output.map_state == "last"
-    if not n:
-        return []
-    state = "in its last state" if last else "in the state that it was in for longest"
-    return [f"{n} place{'s' * (n > 1)} changed, the map shows {'it' if n == 1 else 'each'} {state}"]
-
-
-def _describe_hits(recording: "Recording", p_static: "NDArray[np.float32]") -> str:
-    from stillmap.mapping.beam_statistics import count_beams
-
-    counts = count_beams(recording, p_static)
-    share = 100.0 * counts["dynamic"] / max(counts["hits"], 1)
-    return f"{counts['hits']} beams that hit something, {share:.1f} % of them dynamic"
-
-
-def _describe_tilting(tilting: "TiltingResult") -> str:
-    out = f"in 3D {_describe_hits(tilting.deskewed, tilting.p_static)}"
-    if tilting.unposed_beams:
-        out += f"; {tilting.unposed_beams} left out: the robot's pose is not known there"
-    return out

@@ -15,7 +15,7 @@ from stillmap.core.parallel import limit_blas_threads, resolve_threads
 from stillmap.core.profiling import Progress, StageTimer
 from stillmap.core.recording import Recording
 from stillmap.io import read
-from stillmap.io.parts.reading import InputGroup
+from stillmap.io.input_groups import InputGroup
 from stillmap.io.registry import detect_format
 from stillmap.io.text_lines import Progress as ReadProgress
 from stillmap.pipeline import inputs
@@ -178,7 +178,7 @@ def _build_models(
 
 
 def _wants_models(result: MappingResult, tilting: "TiltingResult | None") -> bool:
-    """Whether models are enabled, or could be textured where nothing is said about them."""
+    """True if models are enabled, or could be textured where nothing is said about them."""
     enabled = result.options.mesh.enabled
     recording = result.recording if tilting is None else tilting.recording
     if recording.dimension == 2 or enabled is False:

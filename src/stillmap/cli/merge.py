@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from stillmap.cli.arguments import add_read_flags, read_changes, require_apart
 from stillmap.cli.config import add_option_flags, options_from_args
 from stillmap.cli.console import list_files, print_json, say, show_progress
+from stillmap.cli.map_flags import add_map_mode_flag, add_run_flags, option_changes, shared_changes
 from stillmap.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -54,20 +55,12 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
         help="state of what changed that the map shows: last, majority, the name of a session, "
         "or a date such as 2026-05-31 (default: last)",
     )
-    p.add_argument(
-        "--map-mode",
-        choices=("trinary", "scale", "raw"),
-        help="pixels of map.pgm (default: trinary)",
-    )
+    add_map_mode_flag(p)
     p.add_argument(
         "--resolution", metavar="M", type=float, help="edge of a map cell in metres (default: 0.05)"
     )
     p.add_argument("--no-odometry", action="store_true", help="ignore odometry in recordings")
-    p.add_argument(
-        "--threads", metavar="N", type=int, help="0: one per processor; same result (default: 0)"
-    )
-    p.add_argument("--json", action="store_true", help="a summary as one JSON object on stdout")
-    p.add_argument("--quiet", action="store_true", help="no progress, no summary")
+    add_run_flags(p)
     add_read_flags(p)
     add_option_flags(p)
 
@@ -80,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
     """
     from stillmap.places.inputs import is_place
 
-    options = options_from_args(args, read_changes(args), _option_changes(args))
+    options = options_from_args(args, read_changes(args), shared_changes(args))
     base = Path(args.input[0]) if is_place(Path(args.input[0])) else None
     paths = args.input if base is None else args.input[1:]
     if not paths:
@@ -95,21 +88,10 @@ def merge_groups(args: argparse.Namespace, groups: Sequence[Sequence[str]]) -> i
         args: of `stillmap map`.
         groups: paths of each session, several where it was recorded in parts.
     """
-    options = options_from_args(args, read_changes(args), _option_changes(args))
-    args.frame, args.map_state = None, args.map_state or "last"
+    args.frame, state, args.map_state = None, args.map_state or "last", None
+    options = options_from_args(args, read_changes(args), option_changes(args))
+    args.map_state = state  # of the place, not of each session
     return _merge(args, None, groups, options)
-
-
-def _option_changes(args: argparse.Namespace) -> dict[str, Any]:
-    """The options that flags of this command set."""
-    changes: dict[str, Any] = {}
-    if args.threads is not None:
-        changes["threads"] = args.threads
-    if args.resolution is not None:
-        changes["slam"] = {"resolution": args.resolution, "voxel_size": args.resolution}
-    if args.map_mode is not None:
-        changes["output"] = {"map_mode": args.map_mode}
-    return changes
 
 
 def _group(
@@ -117,7 +99,7 @@ def _group(
 ) -> Sequence[Sequence[str]]:
     """Recordings that are parts of one run belong together; results stand alone."""
     from stillmap.cli.groups import find_groups
-    from stillmap.results.folder import is_result
+    from stillmap.results.run_record import is_result
 
     results = [[path] for path in paths if is_result(Path(path))]
     recordings = [path for path in paths if not is_result(Path(path))]
@@ -159,7 +141,7 @@ def _merge(
 
 
 def _print_summary(job: "MergeJob", result: "PlaceResult", output: Path) -> None:
-    """Which sessions were placed, what changed, and where the result lies."""
+    """Print which sessions were placed, what changed, and where the result lies."""
     placed = result.place.sessions
     say(f"{len(placed)} sessions in one map, {len(result.place.ties)} constraints between them")
     for one in result.refusals:

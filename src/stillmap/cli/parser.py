@@ -82,7 +82,7 @@ class Parser(argparse.ArgumentParser):
             self.error(f"unrecognized arguments: {' '.join(unknown)}", hint)
 
     def _knows(self, word: str) -> bool:
-        """Whether a word begins a flag: argparse takes abbreviations too."""
+        """True if a word begins a flag: argparse takes abbreviations too."""
         flag = word.partition("=")[0]
         return any(known.startswith(flag) for known in self.flags())
 

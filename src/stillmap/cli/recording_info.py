@@ -243,7 +243,7 @@ def _is_triple(noted: Any) -> bool:
 
 
 def _is_box(noted: Any) -> bool:
-    """Whether a note of the reader is a valid self-filter box of a 3D recording."""
+    """True if a note of the reader is a valid self-filter box of a 3D recording."""
     return (
         isinstance(noted, dict)
         and all(isinstance(noted.get(key), int) for key in ("sensor", "beams"))

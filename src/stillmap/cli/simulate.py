@@ -233,7 +233,8 @@ def _run_sessions(scene: "Scene", args: argparse.Namespace, output: Path) -> int
 
 
 def _option_changes(args: argparse.Namespace) -> dict[str, Any]:
-    from stillmap.core.config import merge_nested, parse_assignment
+    from stillmap.core.config import merge_nested
+    from stillmap.core.config_toml import parse_assignment
     from stillmap.sim import scene_by_name
 
     changes: dict[str, dict[str, Any]] = {}

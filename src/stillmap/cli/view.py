@@ -76,10 +76,21 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _find_report(folder: Path) -> Path:
-    hint = "DIR is what `stillmap map` wrote"
+    """The report of a result.
+
+    Raises:
+        InputError: there is none.
+    """
+    from stillmap.places.inputs import is_place
+
+    hint = "DIR is what `stillmap map` or `merge` wrote"
     if not folder.exists():
         raise InputError("does not exist", where=str(folder), hint=hint)
     report = Path(os.path.abspath(folder)) / _REPORT
+    place = report.parent.parent.parent  # of a session, in its folder `sessions`
+    if not report.is_file() and report.parent.parent.name == "sessions" and is_place(place):
+        hint = f"stillmap view {place} shows all of them"
+        raise InputError("is a session of a place", where=str(folder), hint=hint)
     if not report.is_file():
         raise InputError(f"is no result: there is no {_REPORT} in it", where=str(folder), hint=hint)
     return report
@@ -91,7 +102,7 @@ def _show_report(report: Path) -> None:
 
 
 def _has_screen() -> bool:
-    """Whether a graphical browser can open; without a screen it would be a text browser."""
+    """True if a graphical browser can open; without a screen it would be a text browser."""
     screens = ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")
     return sys.platform == "darwin" or any(os.environ.get(name) for name in screens)
 

@@ -12,6 +12,6 @@ def advise(what: str, todo: str) -> str:
 
 
 def split_advice(warning: str) -> tuple[str, str]:
-    """What is wrong, and what to do about it: empty where nothing has to be done."""
+    """A warning split in its cause and its remedy, which is empty where nothing has to be done."""
     what, _, todo = warning.partition(_MARK)
     return what, todo

@@ -1,23 +1,17 @@
-"""Options as frozen dataclasses with ranges; overrides from TOML files and the command line."""
+"""Options as frozen dataclasses with ranges, and overrides of them."""
 
 import dataclasses
-import json
-import re
 import sys
-import tomllib
 import types
 import typing
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
 from stillmap.core.errors import InputError, closest_match
-from stillmap.core.files import read_text
 
 T = TypeVar("T")
 
 _MAX_INTEGER = 2**31 - 1  # the compiled core counts in 32 bits
-_MAX_FILE_SIZE = 64 << 10  # bytes; Python needs minutes for more of nested keys
 
 
 class Limits(NamedTuple):
@@ -29,7 +23,7 @@ class Limits(NamedTuple):
     lt: float | None = None
 
     def contain(self, value: float) -> bool:
-        """Whether a number lies within the range; NaN lies in no range that has a limit."""
+        """True if a number lies within the range; NaN lies in no range that has a limit."""
         return (
             (self.ge is None or value >= self.ge)
             and (self.gt is None or value > self.gt)
@@ -174,39 +168,6 @@ def _type_name(hint: Any) -> str:
     return "unset" if hint is type(None) else str(getattr(hint, "__name__", hint))
 
 
-def load_toml(path: Path) -> dict[str, Any]:
-    """Reads a TOML file.
-
-    Raises:
-        InputError: it cannot be read, is not TOML, or is too large for a file of options.
-    """
-    try:
-        return tomllib.loads(read_text(path, _MAX_FILE_SIZE))
-    except (ValueError, RecursionError) as error:  # ValueError: numbers of thousands of digits too
-        line = re.search(r" \(at line (\d+), column \d+\)$", str(error))
-        what = str(error)[: line.start()] if line else str(error)
-        where = f"{path}:{line[1]}" if line else str(path)
-        raise InputError(f"is not TOML: {what}", where=where) from error
-
-
-def parse_assignment(text: str) -> dict[str, Any]:
-    """Parses `section.key=value` to a nested dictionary; the value is TOML, else a string.
-
-    Numbers may lack a zero that TOML requires, as in `.5`.
-    """
-    key, equals, value = text.partition("=")
-    if not equals or not key.strip():
-        raise InputError(f"an option is set by section.key=value, got '{text}'")
-    try:
-        found = tomllib.loads(f"value = {value}")
-    except (ValueError, RecursionError):
-        found = {}
-    # more than one key: the value had several lines, and only looked like TOML
-    return nest(
-        {key.strip(): found["value"] if len(found) == 1 else _number_or_text(value.strip())}
-    )
-
-
 def nest(changes: Mapping[str, Any]) -> dict[str, Any]:
     """Nested dictionaries of dotted keys: `{"em": {"prior": 0.9}}` of `{"em.prior": 0.9}`."""
     out: dict[str, Any] = {}
@@ -216,10 +177,6 @@ def nest(changes: Mapping[str, Any]) -> dict[str, Any]:
             nested = {name: nested}
         out = merge_nested(out, nested)
     return out
-
-
-def _number_or_text(value: str) -> float | str:
-    return float(value) if re.fullmatch(r"[+-]?(\d+\.|\.\d+)(e[+-]?\d+)?", value, re.I) else value
 
 
 def merge_nested(*changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -289,7 +246,7 @@ def iter_names(options: Any, prefix: str = "") -> Iterator[str]:
 
 
 def is_within(name: str, section: str) -> bool:
-    """Whether an option lies in a section, or has that name; "" holds all."""
+    """True if an option lies in a section, or has that name; "" holds all."""
     return not section or name == section or name.startswith(f"{section}.")
 
 
@@ -298,56 +255,3 @@ def _split_fields(options: Any) -> tuple[list[Any], list[Any]]:
     fields = dataclasses.fields(options)
     sections = [f for f in fields if dataclasses.is_dataclass(getattr(options, f.name))]
     return [f for f in fields if f not in sections], sections
-
-
-def to_toml(options: Any, only: str = "") -> str:
-    """All options with value, meaning and range, as TOML that `--config` reads back.
-
-    Args:
-        options: see `override`.
-        only: name of a section or option; "": all.
-
-    Raises:
-        InputError: there is no section or option of that name.
-    """
-    if only and only not in (known := list(iter_names(options))):
-        raise InputError(
-            f"there is no option or section '{only}'",
-            hint=f"nearest: '{closest_match(only, known, min_similarity=0.0)}'",
-        )
-    return "\n".join(_toml_lines(options, only)).lstrip("\n") + "\n"
-
-
-def _toml_lines(options: Any, only: str) -> Iterator[str]:
-    section = ""
-    for one in iter_options(options):
-        if not is_within(one.name, only):
-            continue
-        before, (section, _, key) = section, one.name.rpartition(".")
-        if section != before:
-            yield from _heading(options, section)
-        # a doc that explains every choice lists them already
-        explained = all(str(choice) in one.doc for choice in one.choices)
-        allowed = str(one.limits) if explained else " | ".join(map(str, one.choices))
-        doc = one.doc + (f" ({allowed})" if allowed else "")
-        # TOML has no null: an option that is unset becomes a comment
-        yield (
-            f"# {key} is not set  # {doc}"
-            if one.value is None
-            else f"{key} = {_toml_value(one.value)}  # {doc}"
-        )
-
-
-def _toml_value(value: Any) -> str:
-    # TOML has neither JSON's pairs of escapes for one character nor a bare DEL
-    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-
-
-def _heading(options: Any, section: str) -> Iterator[str]:
-    for name in section.split("."):
-        options = getattr(options, name)
-    yield ""
-    summary = (type(options).__doc__ or "").partition("\n")[0]
-    if not summary.startswith(f"{type(options).__name__}("):  # written by dataclasses
-        yield f"# {summary}"
-    yield f"[{section}]"

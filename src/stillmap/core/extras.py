@@ -45,7 +45,7 @@ def _requirement(group: str) -> str:
 
 
 def _origin_url() -> str:
-    """Where the package was installed from; empty for an index."""
+    """The source that the package was installed from; empty for an index."""
     from importlib.metadata import PackageNotFoundError, distribution  # only for messages
 
     try:

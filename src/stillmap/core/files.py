@@ -103,6 +103,15 @@ def atomic_file(path: Path) -> Iterator[Path]:
             work.unlink()
 
 
+def sync(path: Path) -> None:
+    """Wait until a file or folder is on the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
 def _move_into_place(work: Path, path: Path) -> None:
     if not path.exists():
         os.rename(work, path)

@@ -33,7 +33,7 @@ _BEAMS_PER_THREAD = 1 << 15  # traced in some ten milliseconds
 
 
 def counting_threads(n_beams: int, threads: int) -> int:
-    """How many threads are worth a grid each, for counting beams in cells.
+    """The number of threads that are worth a grid each, for counting beams in cells.
 
     Every thread fills a grid of its own, which covers most of the place, before they are summed.
     """

@@ -90,7 +90,7 @@ def terminal_bar(iterations: int) -> Iterator[Progress]:
 
 
 def _in_notebook() -> bool:
-    """Whether a kernel of Jupyter runs this."""
+    """True if a kernel of Jupyter runs this."""
     shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
     return hasattr(shell, "kernel")
 

@@ -68,7 +68,7 @@ def make_grid(dimension: int, resolution: float, approach: float = 0.0) -> Grid:
 
 
 def needs_counts(estimator: Estimator) -> bool:
-    """Whether an estimator computes its labels from the counts (10) of the M-step."""
+    """True if an estimator computes its labels from the counts (10) of the M-step."""
     return estimator in ("paper", "hit-ratio")
 
 

@@ -184,7 +184,7 @@ def label_beams(
         p_static=e,
         likelihood=likelihood,
         occupied=CellProbabilities(surfel_cells(surfel_map), p_occupied, _FREE_PRIOR),
-        learned=_learned(observations, classes, weights, prior),
+        learned=_parameter_record(observations, classes, weights, prior),
         no_return=NoReturnModel(observations.hmm.solid_cells(), end_margin),
     )
 
@@ -192,7 +192,7 @@ def label_beams(
 def _long_movers(
     observations: Observations, classes: NDArray[np.bool_] | None
 ) -> NDArray[np.bool_]:
-    """Which of the used classes are movers that stay for long.
+    """Select those of the used classes that are movers that stay for long.
 
     Poses that disagree by decimetres let a wall appear in two places, each hit during one visit and
     missed during another, which is what these classes describe. Without a bound on their weight
@@ -220,7 +220,7 @@ def _surfel_posterior(
     return p_static, Likelihood(expected=bound - entropy, bound=bound)
 
 
-def _learned(
+def _parameter_record(
     observations: Observations, classes: NDArray[np.bool_] | None, weights: Float, p_static: float
 ) -> dict[str, object]:
     """The fitted parameters, as `run.json` lists them."""

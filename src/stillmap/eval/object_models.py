@@ -171,7 +171,7 @@ def score_object_models(
         for id, (mover, model) in sorted(models.items())
         if mover >= 0
     )
-    chamfer = _known([one.chamfer for one in scores])
+    chamfer = _drop_nan([one.chamfer for one in scores])
     return MoverScores(
         tracked=len(movers),
         modelled=len(have & movers) / len(movers) if movers else NAN,
@@ -179,7 +179,7 @@ def score_object_models(
         modelled_well=len(have & well) / len(well) if well else NAN,
         chamfer=mean(chamfer),
         good=mean(chamfer <= GOOD),
-        background=mean(_known([one.background for one in scores])),
+        background=mean(_drop_nan([one.background for one in scores])),
         nothing=len(models) - len(scores),
         models=scores,
     )
@@ -257,6 +257,6 @@ def collect_observed_points(
     return np.asarray(found[mesh_distance.first_per_voxel(found, _VOXEL)])
 
 
-def _known(values: Sequence[float]) -> Float:
+def _drop_nan(values: Sequence[float]) -> Float:
     array = np.array(values, np.float64)
     return np.asarray(array[~np.isnan(array)])

@@ -14,8 +14,8 @@ from stillmap.core.errors import InputError
 from stillmap.core.files import read_text, require_regular
 from stillmap.core.recording import Recording
 from stillmap.io.carmen.log import CarmenLog, read_log
+from stillmap.io.reader import read as recording_of
 from stillmap.io.registry import RIG_FOLDERS
-from stillmap.io.registry import read as recording_of
 from stillmap.io.stillmap_folder import read as read_folder
 from stillmap.io.text_lines import read_head
 from stillmap.io.trajectory import MAX_BYTES, read_tum

@@ -2,6 +2,7 @@
 
 import json
 
+from stillmap.fleet.backends import open_storage
 from stillmap.fleet.inputs import find_sources
 from stillmap.fleet.jobs import Fleet, Job, Reporter, Request
 from stillmap.fleet.journal import Journal
@@ -10,7 +11,7 @@ from stillmap.fleet.manifest import is_file_name
 from stillmap.fleet.output import explain_full_disk, lock_output, require_fleet
 from stillmap.fleet.page import render_page
 from stillmap.fleet.phases import inspect, map_recordings, merge_places, plan
-from stillmap.fleet.storage import Storage, open_storage
+from stillmap.fleet.storage import Storage
 
 LIST, PAGE = "fleet.json", "fleet.html"
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Protocol
 
 from stillmap.core.errors import InputError
+from stillmap.core.files import sync
 from stillmap.fleet.scratch import remove_stale, scratch_folder
-from stillmap.fleet.urls import is_url
 
 STATE = ".fleet"  # folder of the journal, of the labels of results, and of unfinished results
 RECORD = "run.json"  # every result has it; in a bucket it appears last, and goes first
@@ -50,20 +50,6 @@ class Storage(Protocol):
 
     def remove_unfinished(self) -> None:
         """Remove what killed processes left."""
-
-
-def open_storage(root: str) -> Storage:
-    """The storage at a path or URL; nothing is created yet.
-
-    Raises:
-        InputError: the URL is of a kind that is not supported.
-        MissingExtra: the library for it is not installed.
-    """
-    if not is_url(root):
-        return FolderStorage(root)
-    from stillmap.fleet.bucket import BucketStorage
-
-    return BucketStorage(root)
 
 
 class FolderStorage:
@@ -124,7 +110,7 @@ class FolderStorage:
             if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
                 raise
             # another attempt has published the same result in between
-        _sync_one(path.parent)
+        sync(path.parent)
         shutil.rmtree(old, ignore_errors=True)
 
     def local_folder(self, name: str, attempt: Path) -> Path:  # noqa: ARG002
@@ -141,12 +127,4 @@ class FolderStorage:
 def _sync(folder: Path) -> None:
     """Wait until every file of a folder is on the disk."""
     for path in [folder, *folder.rglob("*")]:
-        _sync_one(path)
-
-
-def _sync_one(path: Path) -> None:
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+        sync(path)

@@ -7,9 +7,9 @@ from typing import Any
 from stillmap.core.advice import split_advice
 from stillmap.core.errors import InputError
 from stillmap.core.files import read_text
-from stillmap.results.folder import read_record
 from stillmap.results.reader import read_grid
 from stillmap.results.report.figures import data_uri, draw_map, map_window
+from stillmap.results.run_record import read_record
 
 _PIXELS = 90_000  # of a small map, at most
 _GREYS = 16  # so that it takes a few kB

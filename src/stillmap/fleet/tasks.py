@@ -18,11 +18,12 @@ from typing import Any
 from stillmap.core.errors import InputError
 from stillmap.core.version import package_version
 from stillmap.fleet.artifacts import PLACES, RESULTS, find_result, write_label
+from stillmap.fleet.backends import open_storage
 from stillmap.fleet.child import Stopped, run_stillmap
 from stillmap.fleet.content import fingerprint, hash_content
 from stillmap.fleet.outcomes import Outcome, outcome_of, outcome_of_error
 from stillmap.fleet.settings import Settings, info_command, map_command, merge_command
-from stillmap.fleet.storage import RECORD, Storage, open_storage
+from stillmap.fleet.storage import RECORD, Storage
 from stillmap.fleet.summary import summarize_result, summarize_sessions
 from stillmap.fleet.urls import is_url
 

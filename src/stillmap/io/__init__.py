@@ -1,7 +1,7 @@
 """Readers and writers of recordings, one module per format."""
 
 from stillmap.core.recording import Recording
-from stillmap.io.registry import read
+from stillmap.io.reader import read
 from stillmap.io.stillmap_folder import write
 from stillmap.preprocessing.options import ReadOptions
 

@@ -14,7 +14,7 @@ from stillmap.core.recording import Recording
 from stillmap.io import camera_file
 from stillmap.io.camera_file import CameraOverride
 from stillmap.io.images import EXTENSIONS, read_image, read_image_size
-from stillmap.io.point_cloud.files import (
+from stillmap.io.scan_files import (
     assign_rows,
     list_files,
     read_times,

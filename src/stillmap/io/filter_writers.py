@@ -46,7 +46,7 @@ class FilterWriter(NamedTuple):
 
 
 class FilterTarget(NamedTuple):
-    """What `filter_recording` writes.
+    """Format and writer of a filtered recording.
 
     Attributes:
         description: of the format, in words.

@@ -72,7 +72,7 @@ class FilterJob:
 
 
 class Omissions(NamedTuple):
-    """What a filtered copy lacks.
+    """The parts of a recording that a filtered copy lacks.
 
     Attributes:
         scans: number of scans left out, since nothing is known of their beams.

@@ -56,7 +56,7 @@ _PNG_PIXELS = (b"IHDR", b"IDAT", b"IEND")  # chunks that follow from the pixels
 
 
 def is_png(path: Path) -> bool:
-    """Whether a file begins as a PNG image."""
+    """True if a file begins as a PNG image."""
     with path.open("rb") as file:
         return file.read(len(_PNG_MAGIC)) == _PNG_MAGIC
 

@@ -168,7 +168,7 @@ def _read_cloud(file: Path, T: Float | None, grid: _Grid) -> Cloud:
 
 
 def is_depth(units: NDArray[np.uint16]) -> NDArray[np.bool_]:
-    """Whether pixels of a depth image hold a depth."""
+    """Mask of the pixels of a depth image that hold a depth."""
     return np.asarray((units > 0) & (units < _MAX_UNITS))
 
 

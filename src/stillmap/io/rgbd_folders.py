@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from stillmap.core import se2, se3
 from stillmap.core.errors import InputError
 from stillmap.core.timestamps import parse_ns
-from stillmap.io.point_cloud.files import rigid_transform
+from stillmap.io.rigid_transforms import rigid_transform
 from stillmap.io.text_lines import read_lines
 from stillmap.io.trajectory import read_tum
 

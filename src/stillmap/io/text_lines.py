@@ -42,7 +42,7 @@ class Line(NamedTuple):
 
 
 def is_gzip(path: Path) -> bool:
-    """Whether the content of a file is gzip."""
+    """True if the content of a file is gzip."""
     with _open(path) as file:
         return file.read(2) == _GZIP_MAGIC
 

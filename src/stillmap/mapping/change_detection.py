@@ -63,7 +63,7 @@ class Change(ShortRepr):
 
     @property
     def appeared(self) -> bool:
-        """Whether an object is there now that was not there before."""
+        """True if an object is there now that was not there before."""
         return self.kind == "came"
 
 
@@ -227,7 +227,7 @@ def _absorb_small_parts(changes: list[Change], resolution: float, radius: float)
 
 
 def _within(cells: Cells, others: Cells, radius: float) -> bool:
-    """Whether any two cells of two sets are within a radius of each other."""
+    """True if any two cells of two sets are within a radius of each other."""
     gap = np.maximum(cells.min(axis=0) - others.max(axis=0), others.min(axis=0) - cells.max(axis=0))
     if np.linalg.norm(np.maximum(gap, 0)) > radius:  # of the boxes around them
         return False

@@ -128,7 +128,7 @@ def _stay_span(change: Change, changes: list[Change]) -> tuple[int, int]:
 
 
 def _overlap(one: Change, other: Change) -> bool:
-    """Whether the larger of two places holds more than half of the smaller."""
+    """True if the larger of two places holds more than half of the smaller."""
     distance = np.abs([one.x - other.x, one.y - other.y])
     if np.any(distance > np.array(one.size) + np.array(other.size)):
         return False

@@ -69,7 +69,7 @@ class _Sector:
         return float(np.mean(distance * np.sin(np.minimum(aside, math.pi / 2)) <= _TOLERANCE))
 
     def covers_both_ends(self, cells: Cells) -> bool:
-        """Whether cells cover more than half of the leaf in both end positions."""
+        """True if cells cover more than half of the leaf in both end positions."""
         distance, turned = self._relative_polar(cells)
         for end in (self._low, self._high):
             along = distance[distance * np.abs(np.sin(turned - end)) <= _TOLERANCE]

@@ -134,7 +134,7 @@ def check_mirror(
 
 
 def _has_wall_behind(mirror: Mirror, beams: Beams) -> bool:
-    """Whether scans from the other side see a wall right behind the mirror, all along it."""
+    """True if scans from the other side see a wall right behind the mirror, all along it."""
     hits = _back_hits(mirror, beams, mirror.first, mirror.last)
     return bool(np.count_nonzero(hits >= _MIN_FRAME_HITS) >= _MIN_FILLED * len(hits))
 
@@ -163,7 +163,7 @@ def _back_hits(mirror: Mirror, beams: Beams, first: float, last: float) -> NDArr
 
 
 def _has_frame(mirror: Mirror, ends: Float) -> bool:
-    """Whether there is wall on both sides; else it may be the axis of a symmetric room."""
+    """True if there is wall on both sides; else it may be the axis of a symmetric room."""
     on = ends[np.abs(ends @ mirror.normal - mirror.distance) < _ON_LINE] @ tangent_of(mirror.normal)
     for low, high in (
         (mirror.first - _FRAME, mirror.first),
@@ -176,7 +176,7 @@ def _has_frame(mirror: Mirror, ends: Float) -> bool:
 
 
 def _has_edges(through: Float, beside: Float, mirror: Mirror) -> bool:
-    """Whether few beams that no mirror explains cross the line right beside the mirror.
+    """True if few beams that no mirror explains cross the line right beside the mirror.
 
     Args:
         through: (N,) metres along the line where beams cross the piece.
@@ -191,7 +191,7 @@ def _has_edges(through: Float, beside: Float, mirror: Mirror) -> bool:
 
 
 def _is_seen_without_mirror(mirror: Mirror, beams: Beams, ends: Float, resolution: float) -> bool:
-    """Whether beams that do not cross the mirror see what is behind it as well."""
+    """True if beams that do not cross the mirror see what is behind it as well."""
     others = beams.ends[~mirror.find_crossing(beams.origins, beams.ends)]
     behind = mirror.distance - others @ mirror.normal > MIN_BEHIND
     keys = np.unique(cell_keys(np.floor(others[behind] / resolution).astype(np.int64)))
@@ -206,7 +206,7 @@ def _shows_reflections(
     surfaces: SurfaceCells,
     min_shares: tuple[float, float],
 ) -> bool:
-    """Whether the end points behind the line, reflected at it, lie on surfaces in free view."""
+    """True if the end points behind the line, reflected at it, lie on surfaces in free view."""
     normal, distance = mirror.normal, mirror.distance
     if len(ends) < MIN_BEAMS or np.linalg.norm(np.ptp(origins, axis=0)) < _MIN_TRAVEL:
         return False

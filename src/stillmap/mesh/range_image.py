@@ -120,7 +120,7 @@ def _is_row_length(directions: Float, length: int, step: int) -> bool:
 
 
 def is_planar(directions: Float) -> bool:
-    """Whether beams with directions (n, 3), NaN where unknown, lie in one plane."""
+    """True if beams with directions (n, 3), NaN where unknown, lie in one plane."""
     known = directions[np.isfinite(directions).all(axis=1)]
     if len(known) < _MIN_ROW_LENGTH:
         return False
@@ -129,7 +129,7 @@ def is_planar(directions: Float) -> bool:
 
 
 def has_planar_scans(recording: Recording) -> bool:
-    """Whether most scans of a 3D recording are planar, as those of a tilting laser."""
+    """True if most scans of a 3D recording are planar, as those of a tilting laser."""
     n = recording.n_scans
     tested = np.unique(np.linspace(0, n - 1, min(n, _TESTED_SCANS)).astype(np.intp))
     planar = [is_planar(beam_directions(recording.points[recording.beams_of(t)])) for t in tested]
@@ -137,7 +137,7 @@ def has_planar_scans(recording: Recording) -> bool:
 
 
 def is_row_scanner(recording: Recording) -> bool:
-    """Whether scans are planar and of one length, so that each is a row of a range image."""
+    """True if scans are planar and of one length, so that each is a row of a range image."""
     counts = np.diff(recording.offset)
     return has_planar_scans(recording) and len(np.unique(counts[counts > 0])) == 1
 

@@ -1,4 +1,4 @@
-"""Which scans become a surface, and its voxel size: from beam spacing, range noise and memory."""
+"""Choice of the scans of a surface and of its voxels: by beam spacing, range noise and memory."""
 
 from itertools import chain, product
 from typing import NamedTuple

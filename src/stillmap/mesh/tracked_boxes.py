@@ -36,13 +36,13 @@ class TrackedBox(NamedTuple):
 
     @property
     def is_fast(self) -> bool:
-        """Whether the speed of the object exceeds that of a pedestrian."""
+        """True if the speed of the object exceeds that of a pedestrian."""
         speed = np.linalg.norm(self.box.velocity, axis=1)
         return bool(np.quantile(speed, _SPEED_QUANTILE) > _MIN_RIGID_SPEED)
 
     @property
     def is_large(self) -> bool:
-        """Whether the footprint of the object is longer than that of a pedestrian."""
+        """True if the footprint of the object is longer than that of a pedestrian."""
         return 2.0 * max(self.box.half_size) >= _MIN_RIGID_SIZE
 
 

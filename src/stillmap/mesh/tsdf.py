@@ -75,7 +75,7 @@ class StreamingSurface:
         self._held = 0.0
 
     def is_large(self) -> bool:
-        """Whether enough voxels were added since the last extraction for another one."""
+        """True if enough voxels were added since the last extraction for another one."""
         return self.volume.memory_bytes > self._held + _EXTRACT_BYTES
 
     def extract_complete(self, extents: PatchExtents, done: int) -> None:

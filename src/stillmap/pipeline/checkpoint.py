@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from stillmap.core.arrays import iter_bytes, write_npy
 from stillmap.core.errors import InputError
+from stillmap.core.files import sync
 from stillmap.core.profiling import StageTimer
 from stillmap.pipeline.checkpoint_files import pack_state, require_same_run, unpack_state
 from stillmap.pipeline.estimate import EmState
@@ -99,9 +100,9 @@ class CheckpointFolder:
             about = {name: self._put(work, before, name, a) for name, a in arrays.items()}
             state = {"identity": dict(identity), "arrays": about, "state": values}
             _write_state(work / _STATE, {**state, "stages": stages.to_dict()})
-            _sync(work)
+            sync(work)
             os.rename(work, final)
-            _sync(self.folder)
+            sync(self.folder)
         except OSError as error:
             self._clear(work)
             what = f"no checkpoint can be written: {error.strerror or error}"
@@ -119,7 +120,7 @@ class CheckpointFolder:
             os.link(before / f"{name}.npy", work / f"{name}.npy")
             return self._arrays[name]
         write_npy(work / f"{name}.npy", array)
-        _sync(work / f"{name}.npy")
+        sync(work / f"{name}.npy")
         return {"crc32": _checksum(array), "shape": array.shape, "dtype": array.dtype.str}
 
     def clear(self) -> None:
@@ -158,7 +159,7 @@ def lock_checkpoints(output: Path) -> Iterator[CheckpointFolder]:
     folder = output.parent / f".{output.name}.resume"
     made = [path for path in (*reversed(output.parents),) if not path.exists()]
     try:
-        file = _locked(folder, output)
+        file = _open_lock(folder, output)
     except OSError as error:
         raise InputError(f"cannot be written: {error.strerror}", where=str(output)) from error
     checkpoints = CheckpointFolder(folder)
@@ -174,7 +175,7 @@ def lock_checkpoints(output: Path) -> Iterator[CheckpointFolder]:
         file.close()
 
 
-def _locked(folder: Path, output: Path) -> IO[bytes]:
+def _open_lock(folder: Path, output: Path) -> IO[bytes]:
     """The open lock file, which the kernel unlocks when this process ends."""
     while True:
         folder.mkdir(parents=True, exist_ok=True)
@@ -197,7 +198,7 @@ def _locked(folder: Path, output: Path) -> IO[bytes]:
 
 
 def _is_there(path: Path, file: IO[bytes]) -> bool:
-    """Whether an open file still has its name."""
+    """True if an open file still has its name."""
     try:
         return os.path.samestat(path.stat(), os.fstat(file.fileno()))
     except OSError:
@@ -208,7 +209,7 @@ def _write_state(path: Path, state: Mapping[str, Any]) -> None:
     text = json.dumps({"format_version": _FORMAT_VERSION, **state})
     whole = {"crc32": zlib.crc32(text.encode()), "text": text}
     path.write_text(json.dumps(whole), encoding="utf-8")
-    _sync(path)
+    sync(path)
 
 
 def _state(path: Path) -> dict[str, Any]:
@@ -249,12 +250,3 @@ def _checksum(array: NDArray[Any]) -> int:
     for part in iter_bytes(array):
         found = zlib.crc32(part, found)
     return found
-
-
-def _sync(path: Path) -> None:
-    """Waits until a file or folder is on the disk."""
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

@@ -146,7 +146,7 @@ def _m_step(
 
 
 def _needs_refinement_only(recording: Recording, before: Estimate) -> bool:
-    """Whether the next M-step refines the poses of an iteration instead of matching all scans anew.
+    """True if the next M-step refines the poses of an iteration instead of matching all scans anew.
 
     So it does after two M-steps, if the labels of few scans changed since.
     """

@@ -13,7 +13,7 @@ from stillmap import io as formats
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.io.array_checks import poses_to_matrices
-from stillmap.io.parts.reading import InputGroup, group_inputs, read_parts
+from stillmap.io.input_groups import InputGroup, group_inputs, read_parts
 from stillmap.io.text_lines import Progress, share_progress
 from stillmap.io.trajectory import poses_from_tum
 from stillmap.pipeline.options import Options

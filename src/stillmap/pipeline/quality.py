@@ -4,7 +4,7 @@ Every figure comes from the same evidence, in metres and shares, whatever estima
 sensor made the result.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -64,7 +64,7 @@ class QualityEvidence:
 
 @dataclass(frozen=True)
 class Quality:
-    """How good a result is, each from 0 (useless) to 100; None where it cannot be told.
+    """Quality of a result, each from 0 (useless) to 100; None where it cannot be told.
 
     Attributes:
         overall: geometric mean of both parts, geometry with three quarters of the weight; geometry
@@ -107,21 +107,38 @@ def rate_quality(
             counts.append(
                 label_quality.count_expected(part.recording, _candidates(part), of_part, threads)
             )
-    pairs = surface_agreement.measure_displacements(deskewed, poses).of_later_visits()
-    displacement, worst = pairs.mean(), None
-    if displacement is not None:
-        worst = pairs.worst()
-    evidence = QualityEvidence(
+    evidence = replace(
+        _measure_geometry(deskewed, poses, occupancy),
         expected_f1=label_quality.expected_f1(counts),
         disagreement=float(np.median(apart)) if apart else None,
-        displacement=displacement,
-        worst_scans=None
-        if worst is None
-        else (int(pairs.scan[worst, 0]), int(pairs.scan[worst, 1])),
-        worst_place=None if worst is None else tuple(pairs.place[worst].tolist()),
-        small_pieces=count_small_pieces(occupancy),
     )
     return _grade(evidence, deskewed.dimension)
+
+
+def rate_geometry(deskewed: Recording, poses: Float, occupancy: OccupancyMap) -> Quality:
+    """Rates poses and map alone, of scans too far apart to be matched anew or to judge labels by.
+
+    Args:
+        deskewed, poses, occupancy: see `rate_quality`.
+    """
+    return _grade(_measure_geometry(deskewed, poses, occupancy), deskewed.dimension)
+
+
+def _measure_geometry(
+    deskewed: Recording, poses: Float, occupancy: OccupancyMap
+) -> QualityEvidence:
+    """The evidence of surfaces seen again and of small pieces of the map."""
+    pairs = surface_agreement.measure_displacements(deskewed, poses).of_later_visits()
+    pieces, displacement = count_small_pieces(occupancy), pairs.mean()
+    if displacement is None:
+        return QualityEvidence(small_pieces=pieces)
+    worst = pairs.worst()
+    return QualityEvidence(
+        displacement=displacement,
+        worst_scans=(int(pairs.scan[worst, 0]), int(pairs.scan[worst, 1])),
+        worst_place=tuple(pairs.place[worst].tolist()),
+        small_pieces=pieces,
+    )
 
 
 def _candidates(part: rematching.Window) -> list[Float]:

@@ -21,13 +21,14 @@ from stillmap.places.objects import join_objects, place_objects
 from stillmap.places.place import Place, Refusal
 from stillmap.places.place_map import make_place_map
 from stillmap.places.place_states import estimate_place
+from stillmap.places.quality import rate_place
 from stillmap.places.report.page import render_place_report
 from stillmap.places.shown_state import show_state
 from stillmap.places.writer import PlaceResult, write_json, write_place_files, write_sessions
 from stillmap.results.labels import read_array
 from stillmap.results.map_npz import write_map_npz
 from stillmap.results.map_server import write_map_server
-from stillmap.results.run_json import FORMAT_VERSION, RECORD
+from stillmap.results.run_json import FORMAT_VERSION, RECORD, quality_record
 
 LAST, MAJORITY = "last", "majority"
 _STATES_HINT = "map_state=last, majority, the name of a session, or a date such as 2026-05-31"
@@ -155,7 +156,7 @@ def place_record(
         "counts": _count(folder),
         "area": {"known": round(known * place.resolution**2, 6)},
         "warnings": [f"{one.name} is not in the place: {one.why}" for one in result.refusals],
-        "quality": {"overall": None, "labels": None, "geometry": None},
+        "quality": quality_record(rate_place(place, occupancy)),
         "place": {
             "resolution": place.resolution,
             "voxel_size": place.voxel_size,

@@ -14,11 +14,12 @@ from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io.registry import detect_format
 from stillmap.places.prepare import MappedRecording
-from stillmap.results.folder import is_result, open_result, read_record
+from stillmap.results.folder import open_result
 from stillmap.results.pose_graph_g2o import read_g2o
 from stillmap.results.reader import SESSIONS as SESSIONS  # of places, found there as well
 from stillmap.results.result import BuiltResult
 from stillmap.results.run_json import RECORD, TILTING
+from stillmap.results.run_record import is_result, read_record
 from stillmap.results.saved import SavedResult, load
 from stillmap.slam import deskew_recording
 
@@ -52,7 +53,7 @@ class SessionInput(ShortRepr):
 
 
 def is_place(path: Path) -> bool:
-    """Whether a folder is a place, also one from which a file was taken."""
+    """True if a folder is a place, also one from which a file was taken."""
     return (path / "sessions").is_dir() and any((path / one).is_file() for one in (SESSIONS, TIES))
 
 

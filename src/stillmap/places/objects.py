@@ -135,7 +135,7 @@ def _transform_cloud(source: Path, target: Path, T: Float) -> None:
 
 
 def _split_cloud(path: Path, content: bytes) -> tuple[int, NDArray[np.void]]:
-    """Where the header of a cloud of an object ends, and its points.
+    """Find the end of the header of an object's cloud, and its points.
 
     Raises:
         InputError: it is not as it was written.

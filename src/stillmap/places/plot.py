@@ -1,40 +1,43 @@
-"""Pictures of a place: its map, the way of the robot in each session, what changed."""
+"""Layers of the plot of a place: the way of the robot in each session, and changes."""
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stillmap.core.errors import import_extra
 from stillmap.places.pictures import KIND_COLORS
-from stillmap.results.plot import draw_dynamic, plot_result
+from stillmap.places.records import PlaceSession, SessionChange
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from stillmap.places.saved_place import SavedPlace
 
+def draw_trajectories(
+    poses: NDArray[np.float64], sessions: Iterable[PlaceSession], ax: "Axes"
+) -> None:
+    """Draw the way of the robot in each accepted session.
 
-def plot_place(
-    place: "SavedPlace", ax: "Axes | None", *, trajectory: bool, dynamic: bool, changes: bool
-) -> "Axes":
-    """See `SavedPlace.plot`."""
-    ax = plot_result(place, ax, trajectory=False, dynamic=False)
-    placed = [one for one in place.sessions if one.accepted]
-    if dynamic:
-        for one in placed:
-            draw_dynamic(place.load_session(one.name), ax)
-    if trajectory:
-        for one in placed:
-            x, y = place.poses[one.scans, :2, -1].T
+    Args:
+        poses: (T, D+1, D+1) T_map_base of all scans of the place.
+        sessions: of the place.
+        ax: axes in metres.
+    """
+    for one in sessions:
+        if one.accepted:
+            x, y = poses[one.scans, :2, -1].T
             ax.plot(x, y, linewidth=1.0, label=one.name)
-    if changes:
-        _draw_changes(place, ax)
-    return ax
 
 
-def _draw_changes(place: "SavedPlace", ax: "Axes") -> None:
+def draw_changes(changes: Iterable[SessionChange], ax: "Axes") -> None:
+    """Draw a box around what changed, and an arrow from where it stood before.
+
+    Raises:
+        MissingExtra: matplotlib is not installed.
+    """
     patches = import_extra("matplotlib.patches", "a plot", "drawn", group="notebook")
-    for one in place.changes:
+    for one in changes:
         color = tuple(level / 255.0 for level in KIND_COLORS[one.kind])
         x0, y0, x1, y1 = one.box[:4]
         ax.add_patch(

@@ -26,9 +26,9 @@ from stillmap.places.store import (
     read_poses,
     read_session,
 )
-from stillmap.results.folder import read_record
 from stillmap.results.labels import read_array
 from stillmap.results.reader import SESSIONS
+from stillmap.results.run_record import read_record
 
 Float = NDArray[np.float64]
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, NoReturn
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.places.inputs import is_place
+from stillmap.places.plot import draw_changes, draw_trajectories
 from stillmap.places.records import (
     PlaceSession,
     SessionChange,
@@ -18,6 +19,7 @@ from stillmap.places.records import (
     read_session_changes,
 )
 from stillmap.results import saved
+from stillmap.results.plot import draw_dynamic
 from stillmap.results.reader import SESSIONS
 from stillmap.results.saved import SavedResult
 
@@ -97,9 +99,16 @@ class SavedPlace(SavedResult):
         Raises:
             MissingExtra: matplotlib is not installed.
         """
-        from stillmap.places.plot import plot_place
-
-        return plot_place(self, ax, trajectory=trajectory, dynamic=dynamic, changes=changes)
+        ax = super().plot(ax, trajectory=False, dynamic=False)
+        if dynamic:
+            for one in self.sessions:
+                if one.accepted:
+                    draw_dynamic(self.load_session(one.name), ax)
+        if trajectory:
+            draw_trajectories(self.poses, self.sessions, ax)
+        if changes:
+            draw_changes(self.changes, ax)
+        return ax
 
     def _stretches(self) -> list[slice]:
         placed = [one.scans for one in self.sessions if one.accepted]

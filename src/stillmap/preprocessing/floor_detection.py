@@ -228,7 +228,7 @@ def _lines_through_pairs(points: Float) -> Float:
 
 
 def _is_like_floor(ends: _EndPoints, line: Float, on: Bool) -> bool:
-    """Whether a line is long and gapless, far enough away, and no end point lies behind it."""
+    """True if a line is long and gapless, far enough away, and no end point lies behind it."""
     if np.count_nonzero(on) < _MIN_BEAMS or float(np.linalg.norm(line)) * _MIN_DISTANCE > 1.0:
         return False
     # directions seen from the foot of the perpendicular: no jump within half a turn
@@ -246,7 +246,7 @@ def _is_like_floor(ends: _EndPoints, line: Float, on: Bool) -> bool:
 
 
 def _came_and_went(relation: NDArray[np.int8], on: Bool) -> bool:
-    """Whether scans before and scans after looked past the line, and enough of them altogether.
+    """True if scans before and scans after looked past the line, and enough of them altogether.
 
     Only scans count that agree with the rest of this one.
     """
@@ -271,7 +271,7 @@ def _came_and_went(relation: NDArray[np.int8], on: Bool) -> bool:
 def _agree_with_one_another(
     views: ScanViews, before: NDArray[np.int64], after: NDArray[np.int64]
 ) -> bool:
-    """Whether one of the scans before agrees with one of those after: odometry did not jump."""
+    """True if one of the scans before agrees with one of those after: odometry did not jump."""
     before, beams = before[before >= 0], _coarse_beams(views)
     relation = views.compare(before, beams, np.tile(after, (len(before), 1)))
     relation[~np.broadcast_to(views.hit[before][:, None, beams], relation.shape)] = 0

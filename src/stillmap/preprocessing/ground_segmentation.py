@@ -45,7 +45,7 @@ def sample_hits(recording: Recording, scan: int, R: Float) -> ScanSample:
 
 
 def is_3d_sweep(points: NDArray[np.float32]) -> bool:
-    """Whether the directions of points (n, 3) do not lie in a plane through the sensor."""
+    """True if the directions of points (n, 3) do not lie in a plane through the sensor."""
     if len(points) < 3:
         return False
     directions = points / np.linalg.norm(points, axis=1)[:, None]
@@ -103,7 +103,7 @@ def select_distinct_scans(samples: list[ScanSample], planes: Planes) -> list[int
 
 
 def _is_other_position(before: Float, profile: Float) -> bool:
-    """Whether two range profiles differ by more than moving objects explain."""
+    """True if two range profiles differ by more than moving objects explain."""
     change = np.abs(profile - before)
     change = change[np.isfinite(change)]
     if len(change) < _MIN_DIRECTIONS:

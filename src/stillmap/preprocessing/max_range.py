@@ -117,7 +117,7 @@ def _is_code(
     counts: NDArray[np.intp],
     mode: int,
 ) -> bool:
-    """Whether values[mode] is a code (see `find_max_range`).
+    """True if values[mode] is a code (see `find_max_range`).
 
     With noise of 1 cm and readings rounded to cm, the second value has 60 % of the count of the
     mode; noisy codes (81.87, 81.89, 81.91) still repeat one value 5 times as often.

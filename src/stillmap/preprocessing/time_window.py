@@ -38,11 +38,11 @@ class TimeWindow:
         self.selected = self.omitted = 0
 
     def __bool__(self) -> bool:
-        """Whether there is a limit."""
+        """True if there is a limit."""
         return self._start is not None or self._end is not None
 
     def select(self, stamp_ns: int) -> bool:
-        """Whether a scan is to be read; counts it."""
+        """True if a scan is to be read; counts it."""
         if self._origin_ns is None:
             self._origin_ns = stamp_ns
         self.first_ns = stamp_ns if self.first_ns is None else min(self.first_ns, stamp_ns)
@@ -59,7 +59,7 @@ class TimeWindow:
         return np.array([self.select(stamp) for stamp in stamp_ns.tolist()], np.bool_)
 
     def contains(self, stamp_ns: int) -> bool:
-        """Whether something with a stamp, an image say, lies inside; not counted."""
+        """True if something with a stamp, an image say, lies inside; not counted."""
         start, end = self._limit_ns(self._start), self._limit_ns(self._end)
         return (start is None or stamp_ns >= start - _ROUNDING) and (
             end is None or stamp_ns <= end + _ROUNDING

@@ -104,7 +104,7 @@ def _with_resolution(options: Options | Mapping[str, Any] | None, resolution: fl
 
 @contextmanager
 def report_to(progress: bool | Progress, iterations: int) -> Iterator[Progress]:
-    """What a caller gave as `progress`, or a bar, or nothing."""
+    """The callback that was given as `progress`, a bar, or nothing."""
     if callable(progress):
         yield progress
     elif progress:

@@ -5,13 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.results.report.figures import ORANGE
-
 Colors = NDArray[np.uint8]
 
 Rgb = tuple[int, int, int]
 
-BLUE = (36, 99, 168)  # static, and the robot's trajectory; ORANGE is dynamic
+BLUE, ORANGE = (36, 99, 168), (240, 120, 0)  # static, and the robot's trajectory; dynamic
 GREY = (205, 205, 205)  # undecided
 TEAL = (0, 150, 136)  # rays
 

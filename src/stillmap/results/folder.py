@@ -1,39 +1,29 @@
-"""A result folder opened again: its `run.json`, its recording and its labels."""
+"""A result folder opened again: its recording, its labels and its poses."""
 
-import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core import arrays, config
+from stillmap.core import arrays
 from stillmap.core.errors import InputError
-from stillmap.core.files import read_text, require_regular
 from stillmap.core.recording import Recording
 from stillmap.core.region import Region
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io import read
-from stillmap.io.parts.reading import read_parts
+from stillmap.io.input_groups import read_parts
 from stillmap.io.text_lines import Progress
 from stillmap.io.trajectory import poses_from_tum
-from stillmap.mesh.options import MeshOptions
 from stillmap.pipeline.calibration import apply_calibration
-from stillmap.pipeline.options import MapMode, Options, OutputOptions
-from stillmap.pipeline.quality import Quality
-from stillmap.preprocessing.options import ReadOptions
 from stillmap.results.labels import Labels, read_colors, read_labels
 from stillmap.results.reader import Grid, Track, read_grid, read_tracks
 from stillmap.results.run_json import RECORD, read_calibration
+from stillmap.results.run_record import RunRecord, read_record
 from stillmap.slam import SlamOptions, deskew_recording
-
-T = TypeVar("T")
-
-_STATIC_CLOUD = "static.ply"  # results of 3D recordings have it
-_MAX_RUN = 32 << 20  # bytes of a run.json
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,115 +56,26 @@ class Exported(ShortRepr):
 
 
 @dataclass(frozen=True)
-class ResultFolder(ShortRepr):
+class ResultFolder(RunRecord):
     """A result folder.
 
     Attributes:
-        folder: where it lies.
-        record: its run.json.
         source: where its recording is; of one in parts, where the first is.
         source_given: whether the user named the recording.
         parts: where the parts of its recording are, in order of time; empty: it is whole.
     """
 
-    folder: Path
-    record: dict[str, Any]
     source: Path
     source_given: bool
     parts: tuple[Path, ...] = ()
 
     @property
     def sources(self) -> tuple[Path, ...]:
-        """Where its recording is, or all parts of it."""
+        """Path of its recording, or of all parts of it."""
         return self.parts or (self.source,)
 
-    @property
-    def options(self) -> Options:
-        """Every option as it was resolved for the map.
-
-        Raises:
-            InputError: the record has options that this version does not know.
-        """
-        sections = self.record.get("options")
-        return self._override(Options(), sections if isinstance(sections, dict) else {})
-
-    @property
-    def read_options(self) -> ReadOptions:
-        """The options with which its recording was read: the same beams have the same numbers.
-
-        Raises:
-            InputError: the record does not say so.
-        """
-        read_as = self._section("read")
-        if read_as is None:
-            raise InputError("names no options", where=str(self.folder / RECORD))
-        return self._override(ReadOptions(), read_as)
-
-    @property
-    def slam_options(self) -> SlamOptions:
-        """The options that deskew its recording as it was deskewed for the map."""
-        section = self._section("slam") or {}
-        return SlamOptions(deskew=section.get("deskew") is not False)
-
-    @property
-    def texture_quality(self) -> int:
-        """JPEG quality of the texture pages; the default where the record does not have it."""
-        quality = (self._section("mesh") or {}).get("texture_quality")
-        return self._override(MeshOptions(), {"texture_quality": quality}).texture_quality
-
-    @property
-    def quality(self) -> Quality:
-        """How good the result is; unknown where the record does not say so."""
-        told = self.record.get("quality")
-        parts = told if isinstance(told, dict) else {}
-        overall, labels, geometry = (
-            float(value) if isinstance(value := parts.get(name), int | float) else None
-            for name in ("overall", "labels", "geometry")
-        )
-        return Quality(overall, labels, geometry)
-
-    @property
-    def region(self) -> Region | None:
-        """The part of the map frame that it shows; None: everything."""
-        section = self._section("output") or {}
-        return self._override(OutputOptions(), {"region": section.get("region")}).region
-
-    @property
-    def map_mode(self) -> MapMode:
-        """How its map image is written; the default where the record does not say."""
-        mode = (self._section("output") or {}).get("map_mode")
-        return self._override(OutputOptions(), {"map_mode": mode}).map_mode
-
-    def _section(self, name: str) -> dict[str, Any] | None:
-        """A section of the options in the record; None where there is none."""
-        options = self.record.get("options")
-        section = options.get(name) if isinstance(options, dict) else None
-        return section if isinstance(section, dict) else None
-
-    def _override(self, options: T, changes: dict[str, Any]) -> T:
-        """The options with those of the record that are set."""
-        try:
-            return config.override(options, _drop_unset(changes))
-        except InputError as error:
-            where = str(self.folder)
-            raise InputError(f"has options that cannot be: {error}", where=where) from error
-
-    @property
-    def dimension(self) -> int:
-        """Dimension of its recording, 2 or 3."""
-        noted = self.record.get("dimension")  # of a session of a place
-        if noted in (2, 3):
-            return int(noted)
-        return 3 if (self.folder / _STATIC_CLOUD).is_file() else 2
-
-    @property
-    def n_sensors(self) -> int:
-        """Number of sensors of its recording that the record lists, at least 1."""
-        sensors = self.record["input"].get("sensors")
-        return max(len(sensors), 1) if isinstance(sensors, list) else 1
-
     def require_source(self) -> Path:
-        """Where the recording is.
+        """Path of the recording.
 
         Raises:
             InputError: it is not there any more.
@@ -248,15 +149,6 @@ class ResultFolder(ShortRepr):
         )
 
 
-def _drop_unset(changes: dict[str, Any]) -> dict[str, Any]:
-    """Nested options without those that are None."""
-    return {
-        key: _drop_unset(value) if isinstance(value, dict) else value
-        for key, value in changes.items()
-        if value is not None
-    }
-
-
 def require_labelled(recording: Recording, labels: Labels, where: str) -> None:
     """Refuse a recording other than the one that was mapped.
 
@@ -276,22 +168,6 @@ def require_labelled(recording: Recording, labels: Labels, where: str) -> None:
     if other:
         what = f"is not the recording that was mapped: other {other}"
         raise InputError(what, where=where, hint="name it with recording=PATH")
-
-
-def is_result(path: Path) -> bool:
-    """Whether a folder is a result."""
-    return (path / RECORD).is_file()
-
-
-def read_region(result: Path) -> Region | None:
-    """The part of the map frame that a result shows; None: everything, or the record is missing.
-
-    Raises:
-        InputError: the record is damaged.
-    """
-    if not is_result(result):
-        return None
-    return ResultFolder(result, read_record(result), Path(), False).region
 
 
 def open_result(
@@ -330,23 +206,3 @@ def _find_paths(noted: dict[str, Any], where: str) -> list[str]:
     if len(found) < len(paths):
         raise InputError("names no recording", where=where, hint="name it with recording=PATH")
     return found
-
-
-def read_record(result: Path) -> dict[str, Any]:
-    """The `run.json` of a result folder.
-
-    Raises:
-        InputError: it is missing or damaged.
-    """
-    path = result / RECORD
-    try:
-        require_regular(path)
-        record = json.loads(read_text(path, _MAX_RUN))
-    except InputError as error:
-        hint = "a result is what `stillmap map` wrote"
-        raise InputError(error.what, where=error.where, hint=hint) from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"is not JSON: {error}", where=str(path)) from error
-    if not isinstance(record, dict) or not isinstance(record.get("input"), dict):
-        raise InputError("is no record of a run: no input named", where=str(path))
-    return record

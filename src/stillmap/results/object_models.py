@@ -30,14 +30,14 @@ def write_models(folder: Path, models: Models, n_images: int, quality: int) -> N
         quality: JPEG quality of texture pages; 0: PNG.
     """
     if len(models.textured):
-        write_glb(folder / "mesh.glb", _lit_if_untextured(models.textured), quality)
+        write_glb(folder / "mesh.glb", _drop_empty_texture(models.textured), quality)
         write_faces(folder / "mesh_faces.npz", models.assignment, models.views, n_images, "map")
     objects = folder / "objects"
     if models.objects:
         objects.mkdir(exist_ok=True)
     for one in models.objects:
         name = f"{one.shape.id:04d}"
-        write_glb(objects / f"{name}.glb", _lit_if_untextured(one.textured), quality)
+        write_glb(objects / f"{name}.glb", _drop_empty_texture(one.textured), quality)
         found = one.face_views
         path = objects / f"{name}_faces.npz"
         write_faces(path, found.assignment, found.views, n_images, "object")
@@ -52,7 +52,7 @@ def write_models(folder: Path, models: Models, n_images: int, quality: int) -> N
         (objects / f"{name}.json").write_text(text + "\n", encoding="utf-8")
 
 
-def _lit_if_untextured(model: TexturedMesh) -> TexturedMesh | Mesh:
+def _drop_empty_texture(model: TexturedMesh) -> TexturedMesh | Mesh:
     """A mesh without pages loses its texture, so that viewers shade it."""
     return model if model.pages else Mesh(model.vertices, model.faces)
 

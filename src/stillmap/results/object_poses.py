@@ -58,7 +58,7 @@ def object_poses_at(tracks: Sequence[Track], stamp_ns: int) -> ObjectPoses:
 
 
 def is_present(track: Track, stamp_ns: int) -> bool:
-    """Whether the track spans a time."""
+    """True if the track spans a time."""
     return bool(track.stamp_ns[0] <= stamp_ns <= track.stamp_ns[-1])
 
 

@@ -14,18 +14,19 @@ from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.mapping.beam_statistics import sample_dynamic_points
 from stillmap.pipeline.quality import Quality
 from stillmap.results.report.figures import MapView, data_uri, draw_map, map_window
+from stillmap.results.result_data import ResultData
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-    from stillmap.results.result import Result
 
 _BLUE, _ORANGE = "#1f6feb", "#f07800"
 _MAX_POINTS = 50_000  # dynamic returns in a figure
 _PREVIEW_PIXELS = 420  # longest edge in a notebook
 
 
-def plot_result(result: "Result", ax: "Axes | None", *, trajectory: bool, dynamic: bool) -> "Axes":
+def plot_result(
+    result: ResultData, ax: "Axes | None", *, trajectory: bool, dynamic: bool
+) -> "Axes":
     """See `Result.plot`."""
     pyplot = import_extra("matplotlib.pyplot", "a plot", "drawn", group="notebook")
     if ax is None:
@@ -47,7 +48,7 @@ def plot_result(result: "Result", ax: "Axes | None", *, trajectory: bool, dynami
     return ax
 
 
-def draw_dynamic(result: "Result", ax: "Axes") -> None:
+def draw_dynamic(result: ResultData, ax: "Axes") -> None:
     """Draw returns from what moves."""
     points = sample_dynamic_points(
         result.deskewed, result.poses, result.p_static, limit=_MAX_POINTS
@@ -55,7 +56,7 @@ def draw_dynamic(result: "Result", ax: "Axes") -> None:
     ax.plot(points[:, 0], points[:, 1], ".", color=_ORANGE, markersize=1.5, label="dynamic returns")
 
 
-def _extent(result: "Result", image: Image.Image) -> tuple[float, float, float, float]:
+def _extent(result: ResultData, image: Image.Image) -> tuple[float, float, float, float]:
     """Left, right, bottom and top of the picture of a map, in metres.
 
     Pixels are whole squares of cells: the last ones may reach beyond the window.
@@ -66,7 +67,7 @@ def _extent(result: "Result", image: Image.Image) -> tuple[float, float, float, 
     return x0, x0 + image.width * edge, y0, y0 + image.height * edge
 
 
-def summarize_as_html(result: "Result") -> str:
+def summarize_as_html(result: ResultData) -> str:
     """A small picture of the map and the key facts; needs neither matplotlib nor a network."""
     rows = "".join(
         f"<tr><th style='text-align:left'>{html.escape(name)}</th>"
@@ -83,8 +84,8 @@ def summarize_as_html(result: "Result") -> str:
     )
 
 
-def key_facts(result: "Result") -> dict[str, str]:
-    """What a result is about, in words and numbers."""
+def key_facts(result: ResultData) -> dict[str, str]:
+    """The key figures of a result, by their names."""
     stamps, grid = result.stamp_ns, result.map
     height, width = (n * grid.resolution for n in grid.p_occupied.shape)
     seconds, distance = 0.0, 0.0
@@ -96,7 +97,7 @@ def key_facts(result: "Result") -> dict[str, str]:
     return {
         "scans": f"{len(stamps)} in {seconds:.1f} s",
         "distance": f"{distance:.1f} m",
-        "beams": f"{_spaced(len(result.p_static))}, {_spaced(hits)} of them hits",
+        "beams": f"{_group_digits(len(result.p_static))}, {_group_digits(hits)} of them hits",
         "dynamic": f"{100.0 * dynamic / max(hits, 1):.1f} % of the hits",
         "moving objects": str(len(result.objects)),
         "quality": _describe_quality(result.quality),
@@ -104,7 +105,7 @@ def key_facts(result: "Result") -> dict[str, str]:
     }
 
 
-def _spaced(count: int) -> str:
+def _group_digits(count: int) -> str:
     """A number with its thousands set apart."""
     return f"{count:,}".replace(",", "\N{NO-BREAK SPACE}")
 
@@ -127,7 +128,7 @@ def _count_hits(hit: NDArray[np.bool_], p_static: NDArray[np.float32]) -> tuple[
     return hits, dynamic
 
 
-def _preview(result: "Result") -> Image.Image:
+def _preview(result: ResultData) -> Image.Image:
     """The map with the trajectory, small."""
     window = map_window([result.map])
     image = draw_map(result.map, window).convert("RGB")
@@ -142,6 +143,6 @@ def _preview(result: "Result") -> Image.Image:
     return image.quantize(64)
 
 
-def _track(result: "Result") -> NDArray[np.float64]:
+def _track(result: ResultData) -> NDArray[np.float64]:
     """(T, 2) positions of the robot in metres."""
     return result.poses[:, :2, -1]

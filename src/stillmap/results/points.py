@@ -1,7 +1,6 @@
 """`static.ply` and `dynamic.ply`: the end points of a 3D recording in the map frame."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,9 +8,7 @@ from numpy.typing import NDArray
 from stillmap.core.arrays import iter_blocks
 from stillmap.core.recording import Recording
 from stillmap.em.types import DYNAMIC_BELOW
-
-if TYPE_CHECKING:
-    from stillmap.results.export.point_cloud import Block
+from stillmap.results.point_cloud import Block, cloud_from_recording
 
 Fields = list[tuple[str, str]]  # names and types
 
@@ -38,9 +35,6 @@ def write_clouds(
         p_static: (M,) P(c = 1); below one half it is dynamic.
         colours: (M, 3), None: without.
     """
-    # with readers of clouds, for which results in 2D have no use
-    from stillmap.results.export.point_cloud import cloud_from_recording
-
     dynamic = sum(
         int(np.count_nonzero(seen.hit[block] & (p_static[block] < DYNAMIC_BELOW)))
         for block in iter_blocks(seen.hit, p_static)
@@ -74,7 +68,7 @@ def put_colours(vertices: NDArray[np.void], colours: NDArray[np.uint8]) -> None:
         vertices[name] = column
 
 
-def make_vertices(block: "Block", fields: Fields) -> NDArray[np.void]:
+def make_vertices(block: Block, fields: Fields) -> NDArray[np.void]:
     """(n,) points with FIELDS and, for colours, COLOURS or PACKED_COLOUR."""
     vertices = np.empty(len(block.points), fields)
     vertices["x"], vertices["y"], vertices["z"] = block.points.T

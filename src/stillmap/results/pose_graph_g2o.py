@@ -85,7 +85,7 @@ def read_g2o(path: Path) -> PoseGraph:
             elif tag in _EDGE.values():
                 edges.append([tag, *words])
         except (ValueError, IndexError) as error:
-            raise _damaged(path, number, error) from error
+            raise _damage_error(path, number, error) from error
     if not ids or np.any(np.diff(ids) <= 0):
         raise InputError("is damaged: vertices are missing or out of order", where=str(path))
     try:
@@ -102,7 +102,7 @@ def _read_lines(path: Path) -> list[str]:
         raise InputError("is damaged: no text", where=str(path)) from error
 
 
-def _damaged(path: Path, number: int, error: Exception) -> InputError:
+def _damage_error(path: Path, number: int, error: Exception) -> InputError:
     return InputError(f"is damaged: {error}", where=f"{path}, line {number}")
 
 

@@ -102,7 +102,7 @@ def read_grid(result: Path) -> Grid:
 
 
 class Crossings(NamedTuple):
-    """How often each square of the floor was crossed.
+    """Number of crossings of each square of the floor.
 
     Attributes:
         number: (H, W) integers; row 0 has the lowest y.

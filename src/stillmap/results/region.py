@@ -32,7 +32,7 @@ def require_overlap(occupancy: GridMap, region: Region | None) -> None:
 
 
 def passes(one: MovingObject, region: Region | None) -> bool:
-    """Whether an object was in a region at any time; true without a region."""
+    """True if an object was in a region at any time; true without a region."""
     return region is None or bool(is_inside(one.xy, region).any())
 
 

@@ -1,8 +1,6 @@
-"""The public result of mapping: what it has, whether just built or loaded from its folder."""
+"""The public result of mapping: what it can do, whether just built or loaded from its folder."""
 
 import os
-from abc import abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,16 +8,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.grid_map import GridMap
-from stillmap.core.recording import Recording
-from stillmap.pipeline.options import Options
-from stillmap.pipeline.quality import Quality
+from stillmap.core.errors import import_extra
 from stillmap.pipeline.result import MappingResult
-from stillmap.results.reader import Track
+from stillmap.results.plot import plot_result, summarize_as_html
+from stillmap.results.result_data import ResultData
 from stillmap.results.run_json import run_record
 from stillmap.results.save import save
-from stillmap.results.tables import TableName
-from stillmap.tracking import MovingObject
+from stillmap.results.tables import TableName, make_table
 
 if TYPE_CHECKING:
     import pandas
@@ -28,77 +23,13 @@ if TYPE_CHECKING:
 
     from stillmap.mesh.build import Models
 
-Float = NDArray[np.float64]
 
-
-class Result:
+class Result(ResultData):
     """A mapped recording of T scans with M beams in D dimensions.
 
     `stillmap.build` makes a `BuiltResult`, `stillmap.load` opens a `SavedResult`; both have what
     stands here.
     """
-
-    if TYPE_CHECKING:  # fields of one subclass are properties of the other
-
-        @property
-        @abstractmethod
-        def recording(self) -> Recording:
-            """The recording as it was mapped; a saved result reads it when it is first used."""
-
-        @property
-        @abstractmethod
-        def map(self) -> GridMap:
-            """The map of what is static: `p_occupied` (H, W), `origin`, `resolution` in m."""
-
-        @property
-        @abstractmethod
-        def poses(self) -> Float:
-            """(T, D+1, D+1) T_map_base."""
-
-        @property
-        @abstractmethod
-        def stamp_ns(self) -> NDArray[np.int64]:
-            """(T,) stamps of the scans in nanoseconds."""
-
-        @property
-        @abstractmethod
-        def p_static(self) -> NDArray[np.float32]:
-            """(M,) P(c = 1); NaN: unusable, the prior at maximum range."""
-
-        @property
-        @abstractmethod
-        def hit(self) -> NDArray[np.bool_]:
-            """(M,) whether a beam ended on something."""
-
-        @property
-        @abstractmethod
-        def objects(self) -> Sequence[MovingObject | Track]:
-            """What moved: `id`, `stamp_ns` (L,), `xy`, `velocity` (L, 2), `size`, `p_dynamic`."""
-
-        @property
-        @abstractmethod
-        def quality(self) -> Quality:
-            """Of labels and geometry, from 0 to 100; None where it cannot be told."""
-
-        @property
-        @abstractmethod
-        def warnings(self) -> Sequence[str]:
-            """One sentence each."""
-
-        @property
-        @abstractmethod
-        def options(self) -> Options:
-            """Every option as resolved."""
-
-        @property
-        @abstractmethod
-        def run(self) -> dict[str, Any]:
-            """The content of `run.json`."""
-
-        @property
-        @abstractmethod
-        def deskewed(self) -> Recording:
-            """The recording without the motion during its scans, computed at every call."""
 
     def plot(
         self, ax: "Axes | None" = None, *, trajectory: bool = True, dynamic: bool = False
@@ -116,8 +47,6 @@ class Result:
         Raises:
             MissingExtra: matplotlib is not installed.
         """
-        from stillmap.results.plot import plot_result
-
         return plot_result(self, ax, trajectory=trajectory, dynamic=dynamic)
 
     def to_arrow(self, table: TableName = "beams") -> "pyarrow.Table":
@@ -132,8 +61,6 @@ class Result:
             MissingExtra: pyarrow is not installed.
             ValueError: there is no such table.
         """
-        from stillmap.results.tables import make_table
-
         return make_table(self, table)
 
     def to_dataframe(self, table: TableName = "beams") -> "pandas.DataFrame":
@@ -143,8 +70,6 @@ class Result:
             MissingExtra: pandas or pyarrow is not installed.
             ValueError: there is no such table.
         """
-        from stillmap.core.errors import import_extra
-
         import_extra("pandas", "a DataFrame", "made", group="notebook")
         return self.to_arrow(table).to_pandas()
 
@@ -155,13 +80,7 @@ class Result:
             f"{n} moving object{'s' * (n != 1)}, {notes} warning{'s' * (notes != 1)}, {self.map}>"
         )
 
-    def _stretches(self) -> list[slice]:
-        """The scans of each recording that it was made from."""
-        return [slice(None)]
-
     def _repr_html_(self) -> str:
-        from stillmap.results.plot import summarize_as_html
-
         return summarize_as_html(self)
 
 

@@ -11,6 +11,7 @@ from stillmap.core.version import package_version
 from stillmap.mapping import Change
 from stillmap.mapping.beam_statistics import count_beams
 from stillmap.pipeline.estimate import IterationRecord
+from stillmap.pipeline.quality import Quality
 from stillmap.pipeline.result import MappingResult
 from stillmap.results.map_npz import known_area
 from stillmap.results.objects import MILLIMETRES
@@ -51,9 +52,7 @@ def run_record(result: MappingResult, more: Mapping[str, Any] | None = None) -> 
         "counts": counts,
         "area": known_area(result),
         "warnings": list(result.warnings),
-        "quality": {
-            name: getattr(result.quality, name) for name in ("overall", "labels", "geometry")
-        },
+        "quality": quality_record(result.quality),
         "learned": result.learned,
         "calibration": _calibration(result.calibration),
         "doubts": {
@@ -73,6 +72,11 @@ def run_record(result: MappingResult, more: Mapping[str, Any] | None = None) -> 
     }
     plain: dict[str, Any] = to_jsonable(record)
     return plain
+
+
+def quality_record(quality: Quality) -> dict[str, float | None]:
+    """The `quality` entry of `run.json`."""
+    return {name: getattr(quality, name) for name in ("overall", "labels", "geometry")}
 
 
 RECORD = "run.json"  # every result has it

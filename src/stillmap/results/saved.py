@@ -19,11 +19,12 @@ from stillmap.io.trajectory import read_tum
 from stillmap.pipeline.options import Options
 from stillmap.pipeline.quality import Quality
 from stillmap.preprocessing.scan_timing import add_beam_times
-from stillmap.results.folder import ResultFolder, open_result, read_record, require_labelled
+from stillmap.results.folder import ResultFolder, open_result, require_labelled
 from stillmap.results.labels import Labels, read_labels
 from stillmap.results.reader import Grid, Track, read_grid, read_tracks
 from stillmap.results.result import Result
 from stillmap.results.run_json import RECORD, TILTING
+from stillmap.results.run_record import read_record
 from stillmap.slam import deskew_recording
 
 Float = NDArray[np.float64]

@@ -47,7 +47,7 @@ class Episode:
 
     @property
     def has_standing_things(self) -> bool:
-        """Whether a movable object stands still throughout."""
+        """True if a movable object stands still throughout."""
         return bool((self.motion.still_thing >= 0).any())
 
     @property

@@ -52,7 +52,7 @@ class StandingObject:
 
     @property
     def is_changed(self) -> bool:
-        """Whether it differs between any two sessions."""
+        """True if it differs between any two sessions."""
         return len(set(self.places)) > 1
 
     def thing(self, session: int) -> Thing | None:
@@ -112,7 +112,7 @@ def _kind_of(length: float, width: float) -> ObjectKind | None:
 
 
 class Floor:
-    """Where furniture can be put, so that the robot still gets everywhere.
+    """The free floor for furniture that leaves the robot a way everywhere.
 
     Args:
         scene: its walls, glass, mirrors and kerbs; doors are ignored.
@@ -186,7 +186,7 @@ class Floor:
         return Place(float(x), float(y), math.atan2(along[1], along[0]))
 
     def _is_free(self, place: Place, size: tuple[float, float], solid: Float) -> bool:
-        """Whether no surface (K, 4) is within the box at that place, nor in its frame."""
+        """True if no surface (K, 4) is within the box at that place, nor in its frame."""
         reach = math.hypot(*size) / 2
         gap = np.hypot(self._keep_clear[:, 0] - place.x, self._keep_clear[:, 1] - place.y)
         if np.any(gap < self._keep_clear[:, 2] + reach):
@@ -200,7 +200,7 @@ class Floor:
     def _leaves_ways(
         self, place: Place, size: tuple[float, float], space: FreeSpace, ways: NDArray[np.bool_]
     ) -> bool:
-        """Whether the robot still gets everywhere but to the room of the box itself."""
+        """True if the robot still gets everywhere but to the room of the box itself."""
         after = self._main_part(space.with_walls(np.array(box(place.x, place.y, *size, place.yaw))))
         rows, columns = np.nonzero(ways & ~after)
         lost = space.origin + np.column_stack([columns, rows]) * space.spacing
@@ -231,7 +231,7 @@ def cross_rectangle(start: Float, end: Float, half: Float) -> NDArray[np.bool_]:
 
 
 def _is_in_sight(place: Place, nodes: Float, solid: Float) -> bool:
-    """Whether no surface (K, 4) lies between a place and the nearest of the nodes (N, 2)."""
+    """True if no surface (K, 4) lies between a place and the nearest of the nodes (N, 2)."""
     at = np.array([place.x, place.y])
     nearest = nodes[np.hypot(*(nodes - at).T).argmin()]
     to = nearest - at

@@ -160,8 +160,8 @@ class Doors:
     def _crossed_by(self, ways: Float) -> NDArray[np.bool_]:
         """(D,) whether a path segment (K, 4) crosses the doorway."""
         start, end = ways[:, None, :2], ways[:, None, 2:]
-        aside = _turned(self._hinge, self._end, start) * _turned(self._hinge, self._end, end)
-        through = _turned(start, end, self._hinge) * _turned(start, end, self._end)
+        aside = _side_of(self._hinge, self._end, start) * _side_of(self._hinge, self._end, end)
+        through = _side_of(start, end, self._hinge) * _side_of(start, end, self._end)
         return np.asarray(np.any((aside < 0) & (through < 0), axis=0))
 
 
@@ -174,7 +174,7 @@ def _direction(angle: Float) -> Float:
     return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
-def _turned(a: Float, b: Float, c: Float) -> Float:
+def _side_of(a: Float, b: Float, c: Float) -> Float:
     """Positive where c lies to the left of the line from a to b."""
     along, across = b - a, c - a
     return np.asarray(along[..., 0] * across[..., 1] - along[..., 1] * across[..., 0])

@@ -148,7 +148,7 @@ class Planner:
         return int(row) * int(self._shape[1]) + int(column)
 
     def contains(self, xy: Float) -> bool:
-        """Whether the node next to a point (2,) is reachable."""
+        """True if the node next to a point (2,) is reachable."""
         return bool(self._part[self._grid_node(xy)] >= 0)
 
     def node(self, xy: Float) -> int:

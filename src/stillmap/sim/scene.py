@@ -62,7 +62,7 @@ class Light:
     cycle: float
 
     def is_red(self, seconds: float) -> bool:
-        """Whether it is red, in seconds since the beginning of the recording."""
+        """True if it is red, in seconds since the beginning of the recording."""
         return (seconds - self.red[0]) % self.cycle < self.red[1] - self.red[0]
 
 
@@ -185,7 +185,7 @@ class Scene:
 
     @property
     def in_3d(self) -> bool:
-        """Whether there is a lidar or a tilting laser."""
+        """True if there is a lidar or a tilting laser."""
         return self.lidar.channels > 0 or self.rig.tilts
 
     @property

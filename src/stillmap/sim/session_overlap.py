@@ -1,4 +1,4 @@
-"""How much of what one session saw another one saw too."""
+"""Overlap of sessions: the share of what one saw that another one saw too."""
 
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple

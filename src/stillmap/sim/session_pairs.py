@@ -22,7 +22,7 @@ _FAR = 1e3  # m, beyond any world
 
 
 class OverlapClass(NamedTuple):
-    """How much of the second session's hits lie in the area that the first one observed."""
+    """Share of the second session's hits in the area that the first one observed."""
 
     name: str
     low: float

@@ -172,7 +172,7 @@ def _record(
         T_base_sensor=_mounts(o, o.recorded_mount),
         sensor=sensor,
         T_odom_base=happening.T_odom_base,
-        source=happening.source(_described(o, angles)),
+        source=happening.source(_sensor_records(o, angles)),
         beam_time=np.tile(Sweep.of(o).beam_times(o.beams), T) if o.sweep_time > 0 else None,
     )
     mover = np.where(hit, exact.mover, np.int32(-1)).ravel()
@@ -291,7 +291,7 @@ def cast_sweeps(motion: Motion, walls: Float, T_base_sensor: Float, o: LaserOpti
     return Returns(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
 
-def _described(o: LaserOptions, angles: Float) -> list[dict[str, Any]]:
+def _sensor_records(o: LaserOptions, angles: Float) -> list[dict[str, Any]]:
     return [
         {
             "name": name,

@@ -172,7 +172,7 @@ def _parts_of(scene: Scene, motion: Motion, number: int, kind: str) -> list[Part
     if kind != "thing":
         return geometry.make_vehicle(length, width, kind)
     loops, lines = trace_loops(scene.things[number - motion.kinds.index("thing")].faces)
-    parts = [_placed(part, loop) for loop in loops for part in make_parts(loop, scene.heights)]
+    parts = [_place_part(part, loop) for loop in loops for part in make_parts(loop, scene.heights)]
     for x0, y0, x1, y1 in lines:
         long, turn = math.hypot(x1 - x0, y1 - y0), math.atan2(y1 - y0, x1 - x0)
         half, z = (long / 2, _THIN / 2), (0.0, scene.heights.furniture)
@@ -180,7 +180,7 @@ def _parts_of(scene: Scene, motion: Motion, number: int, kind: str) -> list[Part
     return parts
 
 
-def _placed(part: Part, loop: Loop) -> Part:
+def _place_part(part: Part, loop: Loop) -> Part:
     """A part of a loop, relative to the center of the whole object."""
     c, s = math.cos(loop.heading), math.sin(loop.heading)
     ahead = loop.x + c * part.ahead - s * part.aside

@@ -103,7 +103,7 @@ def _write_truth_on_read(photographs: CameraSimulator, folder: Path) -> Images:
 
 
 def require_carmen(scene: Scene) -> None:
-    """Whether FLASER lines can hold such scans: half a circle, ranges below the SICK's code.
+    """Refuse scans for FLASER lines, which hold half a circle and ranges below the SICK's code.
 
     Raises:
         InputError: they cannot.

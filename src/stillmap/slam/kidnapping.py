@@ -53,7 +53,7 @@ class LookAhead:
 
 
 def is_gap(seconds: float, usual: float) -> bool:
-    """Whether the time between two scans is a gap, in which the robot may have been carried.
+    """True if the time between two scans is a gap, in which the robot may have been carried.
 
     Args:
         seconds: between them.
@@ -63,7 +63,7 @@ def is_gap(seconds: float, usual: float) -> bool:
 
 
 def judge_scan(grid: _core.OccupancyGrid2D, scan: Scan, match: ScanMatch, usual: float) -> Evidence:
-    """Whether a matched scan agrees with a map, contradicts it, or sees another part of it.
+    """Compare a matched scan with a map: it agrees, contradicts it, or sees another part of it.
 
     A scan of a new place is explained as little as one elsewhere, but its beams do not pass
     through walls.

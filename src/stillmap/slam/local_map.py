@@ -47,7 +47,7 @@ class LocalMap:
         self._kept.clear()
 
     def has_sensor(self, sensor: int) -> bool:
-        """Whether it holds a scan of a sensor."""
+        """True if it holds a scan of a sensor."""
         return self._last_of(sensor) is not None
 
     def remove_before(self, travelled: float) -> None:

@@ -216,7 +216,7 @@ class _Calibrator:
         )
 
     def _halves_agree(self, one: MotionWindows, latency: float) -> bool:
-        """Whether every second segment alone shows about the same latency."""
+        """True if every second segment alone shows about the same latency."""
         segment = np.arange(int(one.segment.max()) + 1)
         halves = (
             fit_latency(one, self.seconds, self.odometry, segment % 2 == side) for side in (0, 1)
@@ -224,7 +224,7 @@ class _Calibrator:
         return all(abs(half.latency - latency) < _HALVES * abs(latency) for half in halves)
 
     def _is_upside_down(self, k: int, T: Float) -> bool:
-        """Whether a laser's motion agrees with odometry's only if its scans are mirrored."""
+        """True if a laser's motion agrees with odometry's only if its scans are mirrored."""
         if UPSIDE_DOWN in self.given[k]:
             return False
         one, costs = self.windows[k], []
@@ -267,7 +267,7 @@ class _Calibrator:
         return out
 
     def _is_better(self, problem: HandEye, fit: Fit, kept: Sequence[str]) -> bool:
-        """Whether it is plausible, and segments agree better that it was not fitted to."""
+        """True if it is plausible, and segments agree better that it was not fitted to."""
         for name, (low, high) in _LIMITS.items():
             if not low < fit.values[name] < high:
                 return False
@@ -282,7 +282,7 @@ class _Calibrator:
 
 
 def _is_clear(gain: NDArray[Any]) -> bool:
-    """Whether gains (S,) of segments, in nats, are evidence: in sum, in several, against few."""
+    """True if gains (S,) of segments, in nats, are evidence: in sum, in several, against few."""
     loss = -float(gain.sum(where=gain < 0.0))
     return bool(
         gain.sum() > _MIN_GAIN

@@ -230,14 +230,14 @@ class _ScanOdometry:
         return accept_prior(prior)
 
     def _is_reachable(self, t: int, match: ScanMatch) -> bool:
-        """Whether a robot can move to a match since the scan before."""
+        """True if a robot can move to a match since the scan before."""
         x, y, theta = se2.parameters(se2.inverse(self.poses[t - 1]) @ match.T_map_base)
         seconds = self.seconds_before[t]
         metres, radians = (max(_MIN_REACH, rate * seconds) for rate in (_MAX_SPEED, _MAX_TURN_RATE))
         return bool(np.hypot(x, y) <= metres and abs(theta) <= radians)
 
     def _is_consistent_ahead(self, t: int, match: ScanMatch, usual: float) -> bool:
-        """Whether the scans after t do not contradict the map if the robot goes on from a match."""
+        """True if the scans after t do not contradict the map if the robot goes on from a match."""
         ahead = kidnapping.look_ahead(
             self.recording,
             self.e,

@@ -59,7 +59,7 @@ class SlipDetector:
         self._hypothesis: SlipHypothesis | None = None
 
     def is_slipping(self, t: int, last: Float, guess: MotionPrior) -> bool:
-        """Whether a detected slip still holds on the way to scan t.
+        """True if a detected slip still holds on the way to scan t.
 
         Args:
             t: the scan.
@@ -130,12 +130,12 @@ class SlipDetector:
         self._hypothesis = None if has_stopped else dataclasses.replace(hypothesis, gain=gain)
 
     def stands_still(self, t: int, last: Float, T_map_base: Float) -> bool:
-        """Whether odometry stands still on the way to scan t at a pose (3, 3) that moved."""
+        """True if odometry stands still on the way to scan t at a pose (3, 3) that moved."""
         step = _step_size(se2.inverse(last) @ T_map_base)
         return step > _MIN_STEP and self._odometry_step(t) < _STILL_RATIO * step
 
     def has_stopped(self, t: int) -> bool:
-        """Whether odometry stands still on the way to scan t."""
+        """True if odometry stands still on the way to scan t."""
         return self._odometry_step(t) < _STILL_RATIO * _MIN_STEP
 
     def _odometry_step(self, t: int) -> float:

@@ -69,16 +69,16 @@ class Placement:
 
     @property
     def is_supported(self) -> bool:
-        """Whether enough keyframes fit."""
+        """True if enough keyframes fit."""
         return self.fitting >= _MIN_SUPPORT and self.score >= 0
 
     def is_contradicted(self, min_share: float) -> bool:
-        """Whether enough keyframes contradict it: in number, as a share, against those that fit."""
+        """True if enough keyframes contradict it: in number, as a share, against those that fit."""
         least = max(_MIN_CONTRADICTING, min_share * self.tested)
         return self.contradicting >= max(least, _CONTRADICTION_WEIGHT * self.fitting)
 
     def is_better(self, other: "Placement") -> bool:
-        """Whether its score exceeds another's by the margin for testing many places."""
+        """True if its score exceeds another's by the margin for testing many places."""
         margin = max(_MARGIN, _MARGIN_SHARE * self.tested)
         return self.score >= max(other.score, 0) + margin
 
@@ -138,13 +138,13 @@ def relocalize_segments(context: LoopContext, candidates: list[int]) -> Relocali
 
 
 def _has_gap_before(context: LoopContext, first: int) -> bool:
-    """Whether a gap in time precedes scan `first`, in which the robot may have been carried."""
+    """True if a gap in time precedes scan `first`, in which the robot may have been carried."""
     seconds = 1e-9 * np.diff(context.recording.stamp_ns)
     return kidnapping.is_gap(float(seconds[first - 1]), float(np.median(seconds)))
 
 
 def _exceeds_odometry_error(context: LoopContext, C: Float, first: int, *, has_gap: bool) -> bool:
-    """Whether a segment is displaced by C (3, 3) farther than odometry drifts or a stall hides.
+    """True if a segment is displaced by C (3, 3) farther than odometry drifts or a stall hides.
 
     Drift: in a blind stretch for example. A stall: where no gap in time precedes the segment.
     """
@@ -271,7 +271,7 @@ def _select_evenly(keyframes: Index, max_count: int) -> list[int]:
 
 
 def _is_same(context: LoopContext, correction: Float, closure: LoopClosure) -> bool:
-    """Whether a closure asks for that correction (3, 3) of its segment."""
+    """True if a closure asks for that correction (3, 3) of its segment."""
     there = context.poses[closure.earlier] @ closure.T
     d = se2.parameters(se2.inverse(correction @ context.poses[closure.later]) @ there)
     return bool(np.hypot(d[0], d[1]) < _SAME_DISTANCE and abs(d[2]) < _SAME_ANGLE)

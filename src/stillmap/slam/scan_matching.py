@@ -88,7 +88,7 @@ def match_scan(
 
 
 def is_poor(match: ScanMatch, usual: float) -> bool:
-    """Whether a map explains much less of a scan than usual."""
+    """True if a map explains much less of a scan than usual."""
     return match.explained < _WIDEN_BELOW * usual
 
 
@@ -185,7 +185,7 @@ def _distance(prior: MotionPrior, T_map_base: Float) -> tuple[float, float]:
 
 
 def is_inconsistent(prior: MotionPrior, T_map_base: Float) -> bool:
-    """Whether a pose (3, 3) is too far from a prior's mean for the prior to hold."""
+    """True if a pose (3, 3) is too far from a prior's mean for the prior to hold."""
     metres, radians = _distance(prior, T_map_base)
     off = max(metres / prior.translation_std, radians / prior.rotation_std)
     return off > _INCONSISTENT_STDS

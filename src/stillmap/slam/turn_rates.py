@@ -24,7 +24,7 @@ _DIFFERENCE = 0.01  # s, of numeric derivatives
 
 @dataclass(frozen=True)
 class LatencyFit:
-    """How late odometry is.
+    """The delay of odometry.
 
     Attributes:
         latency: s; negative: early.

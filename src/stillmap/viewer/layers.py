@@ -9,8 +9,14 @@ from numpy.typing import NDArray
 from stillmap.core.arrays import sample_indices
 from stillmap.mesh.texture.atlas import GRAY
 from stillmap.results import gltf
-from stillmap.results.colors import BLUE, TEAL, color_by_height, color_by_p_static, color_static
-from stillmap.results.report.figures import ORANGE
+from stillmap.results.colors import (
+    BLUE,
+    ORANGE,
+    TEAL,
+    color_by_height,
+    color_by_p_static,
+    color_static,
+)
 from stillmap.results.report.renderer import BACKGROUND
 from stillmap.viewer.beams import Beams
 from stillmap.viewer.display import Points
@@ -110,7 +116,7 @@ class Layers:
         ]
 
     def is_shown(self, name: str) -> bool:
-        """Whether the layer exists and is visible."""
+        """True if the layer exists and is visible."""
         return name in self._parents and bool(self._parents[name].visible)
 
     def set_visible(self, name: str, shown: bool) -> bool:

@@ -9,12 +9,13 @@ from stillmap.results.colors import (
     BLUE,
     GREY,
     HEIGHT_COLORS,
+    ORANGE,
     STATIC_COLORS,
     TEAL,
     Rgb,
     color_by_id,
 )
-from stillmap.results.report.figures import ORANGE, UNKNOWN
+from stillmap.results.report.figures import UNKNOWN
 from stillmap.viewer.layers import HEIGHT, PICTURES, Layers
 from stillmap.viewer.shortcuts import KEYS, PLACE_KEYS
 from stillmap.viewer.text import TEXT_STYLE

@@ -1,4 +1,4 @@
-"""Which point of the scene a click means."""
+"""The point of the scene that a click means."""
 
 from collections.abc import Iterable
 from typing import NamedTuple

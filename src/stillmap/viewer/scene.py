@@ -108,7 +108,7 @@ class Scene:
 
     @property
     def is_2d(self) -> bool:
-        """Whether there are neither clouds nor a mesh."""
+        """True if there are neither clouds nor a mesh."""
         return not self.clouds and self.surface is None
 
 

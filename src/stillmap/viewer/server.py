@@ -28,7 +28,7 @@ _LOCAL_HOST = re.compile(r"(127\.0\.0\.1|localhost)(:\d{1,5})?")
 
 
 def is_local_request(headers: Mapping[str, str]) -> bool:
-    """Whether a request addresses this machine and comes from its own page or from no page."""
+    """True if a request addresses this machine and comes from its own page or from no page."""
     host, origin = headers.get("Host", ""), headers.get("Origin")
     return bool(_LOCAL_HOST.fullmatch(host)) and origin in (None, f"http://{host}")
 

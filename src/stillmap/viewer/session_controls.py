@@ -51,6 +51,6 @@ class SessionControls:
 
 
 def _place_of(low: Any, high: Any) -> str:
-    """Where the middle of a box is."""
+    """The centre of a box."""
     x, y = 0.5 * (low[:2] + high[:2])
     return f"x {x:.1f} m, y {y:.1f} m"

@@ -52,7 +52,7 @@ class SessionNodes:
 
     @property
     def changes(self) -> list[ChangeRecord]:
-        """What changed since the session before."""
+        """The changes since the session before."""
         return self._place.timeline.changes_at(self.session)
 
     def make_trajectories(self) -> None:
@@ -114,11 +114,11 @@ class SessionNodes:
 def _outline(change: ChangeRecord, height: float) -> Float:
     """Line segments (n, 2, 3) m of a change: its box; of what moved both boxes and an arrow."""
     edges = _box_edges(change.low, change.high)
-    out = [_dashed(edges, _DASHES[change.kind], height)]
+    out = [_make_dashes(edges, _DASHES[change.kind], height)]
     if change.from_low is not None and change.from_high is not None:
         start = _box_edges(change.from_low, change.from_high)
         out += [
-            _dashed(start, _DASHES["from"], height),
+            _make_dashes(start, _DASHES["from"], height),
             _arrow(start.mean((0, 1)), edges.mean((0, 1)), height),
         ]
     return np.concatenate(out)
@@ -139,7 +139,7 @@ def _box_edges(low: Float, high: Float) -> Float:
     return np.asarray(box_edges(ObjectPoses(np.zeros(1, np.intp), T, size[None]))[0])
 
 
-def _dashed(edges: Float, pattern: tuple[float, ...] | None, height: float) -> Float:
+def _make_dashes(edges: Float, pattern: tuple[float, ...] | None, height: float) -> Float:
     """The parts of edges (n, 2, 3) that are drawn."""
     if pattern is None:
         return edges

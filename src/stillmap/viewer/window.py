@@ -162,12 +162,12 @@ class Window:
                 return
             event()
 
-    def _queued(self, act: Callable[[], None]) -> Callable[..., None]:
+    def _defer(self, act: Callable[[], None]) -> Callable[..., None]:
         """A callback for viser that lets `step` act."""
         return lambda *_event: self._events.put(act)
 
     def _actions(self) -> dict[str, Callable[[], None]]:
-        """What keys do, by name of the action or layer."""
+        """The actions of keys, by name of the action or layer."""
         last = len(self._seconds) - 1
         actions: dict[str, Callable[[], None]] = {
             "Play or pause": lambda: self.play(not self._playing),
@@ -187,7 +187,7 @@ class Window:
             actions["Previous session"] = lambda: controls.go_to(controls.wanted - 1)
         for name, box in self._boxes.items():
             actions[name] = partial(_toggle, box)
-        return {name: self._queued(act) for name, act in actions.items()}
+        return {name: self._defer(act) for name, act in actions.items()}
 
     def _go_to(self, scan: int) -> None:
         """Pause at the scan that is nearest to an index."""
@@ -244,12 +244,12 @@ class Window:
         self._clock: Any = gui.add_text("Time", "", disabled=True)
         self._speed = gui.add_dropdown("Speed", tuple(_SPEEDS))
         self._button = gui.add_button("Play", disabled=not last)
-        self._button.on_click(self._queued(lambda: self.play(not self._playing)))
+        self._button.on_click(self._defer(lambda: self.play(not self._playing)))
         self._measuring = Measuring(self._server, self._layers, ruler, self._events)
         self._facts_folder: Any = gui.add_folder("Object", visible=False)
         with self._facts_folder:
             self._facts: Any = gui.add_html("")
-            gui.add_button("Close").on_click(self._queued(lambda: self._select(None)))
+            gui.add_button("Close").on_click(self._defer(lambda: self._select(None)))
         self._add_layer_controls()
         for note in scene.notes:
             gui.add_markdown(escape_markdown(note))
@@ -266,7 +266,7 @@ class Window:
             colorings = self._layers.colorings
             self._coloring = gui.add_dropdown("Points by", colorings, visible=len(colorings) > 1)
             self._coloring.on_update(
-                self._queued(lambda: self._layers.color_points(self._coloring.value))
+                self._defer(lambda: self._layers.color_points(self._coloring.value))
             )
             self._size = gui.add_slider("Point size", 0.5, 5.0, 0.5, 1.0)
         self._notes = {

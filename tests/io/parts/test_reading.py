@@ -12,8 +12,8 @@ from stillmap.core import arrays, se2
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
 from stillmap.io import read, writers
+from stillmap.io.input_groups import group_inputs, read_parts
 from stillmap.io.parts.joining import join_recordings
-from stillmap.io.parts.reading import group_inputs, read_parts
 from stillmap.pipeline import inputs
 from stillmap.preprocessing.options import ReadOptions
 

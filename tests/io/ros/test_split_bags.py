@@ -5,7 +5,7 @@ import pytest
 from small_bags import FLOAT, cloud_message
 
 from stillmap.io import read
-from stillmap.io.parts.reading import group_inputs
+from stillmap.io.input_groups import group_inputs
 from stillmap.pipeline import inputs
 
 START, PERIOD, T = 1_600_000_000_000_000_000, 100_000_000, 40  # ns, ns, scans

@@ -19,7 +19,7 @@ from stillmap.io.trajectory import poses_from_tum
 from stillmap.mesh import build
 from stillmap.mesh.place import assign_views
 from stillmap.mesh.texture.atlas import GRAY
-from stillmap.results.export import point_cloud
+from stillmap.results import point_cloud
 from stillmap.results.points import COLOURS, FIELDS
 from stillmap.sim import load_image_truth
 from stillmap.sim.appearance import compute_static_color

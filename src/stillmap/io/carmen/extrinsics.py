@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
-from stillmap.io.carmen.log import LaserLog, laser_position, param_number
+from stillmap.io.carmen.log import LaserLog
+from stillmap.io.carmen.scan_selection import laser_position, param_number
 from stillmap.preprocessing.options import LaserOptions
 
 # differences between laser and robot pose that agree: old logs round to cm. A corrected pose in
@@ -65,7 +66,7 @@ def find_extrinsics(
 
 
 def is_stated_by_lines(x: float, y: float, theta: float) -> bool:
-    """Whether a pose from scan lines is plausible: on the robot, and not at its center."""
+    """True if a pose from scan lines is plausible: on the robot, and not at its center."""
     distance = math.hypot(x, y)
     return distance < _MAX_OFFSET and max(distance, abs(theta)) > _MIN_OFFSET
 
@@ -79,7 +80,7 @@ def override(found: Extrinsics, given: LaserOptions) -> Extrinsics:
 
 
 def find_upside_down(kind: str, params: dict[str, str], given: LaserOptions) -> tuple[bool, str]:
-    """Whether a laser is mounted upside down, so that its beams turn clockwise, and the source.
+    """Find whether a laser is mounted upside down, its beams turning clockwise, and the source.
 
     CARMEN's own laser_..._flipped does not tell: its laser server reverses such readings before
     they are logged.

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.io.carmen.log import BYTE_ORDER_MARK, Sensor, read_log, scan_order, select_scans
+from stillmap.io.carmen.log import BYTE_ORDER_MARK, read_log
 from stillmap.io.carmen.messages import SCAN_PARSERS
+from stillmap.io.carmen.scan_selection import Sensor, scan_order, select_scans
 from stillmap.io.text_lines import read_lines, write_atomically
 from stillmap.preprocessing.max_range import find_max_range
 from stillmap.preprocessing.options import MAX_PLAUSIBLE_RANGE, ReadOptions

@@ -146,7 +146,7 @@ def _skip_remissions(rest: list[bytes], n_fixed: int) -> list[bytes]:
 
 
 def _is_stamp(fields: list[bytes]) -> bool:
-    """Whether `fields` have the form `ipc_timestamp [hostname [logger_timestamp]]`.
+    """True if `fields` have the form `ipc_timestamp [hostname [logger_timestamp]]`.
 
     A host name is no number, or an integer followed by the logger's stamp: so a wrong number of
     readings is noticed even where stamps are missing.

@@ -15,8 +15,9 @@ from stillmap.io import trajectory
 from stillmap.io.builder import ReadContext
 from stillmap.io.carmen import extrinsics
 from stillmap.io.carmen.extrinsics import Extrinsics
-from stillmap.io.carmen.log import CarmenLog, Sensor, read_logs, scan_order, select_scans
+from stillmap.io.carmen.log import CarmenLog, read_logs
 from stillmap.io.carmen.messages import SCAN_PARSERS, flaser_config
+from stillmap.io.carmen.scan_selection import Sensor, scan_order, select_scans
 from stillmap.io.text_lines import Line, is_gzip, read_head
 from stillmap.preprocessing import max_range
 from stillmap.preprocessing.options import LaserOptions, ReadOptions

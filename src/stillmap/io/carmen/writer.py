@@ -177,7 +177,7 @@ def _require_one_count(counts: NDArray[np.int64]) -> None:
 
 
 def _is_upside_down(angles: Float) -> bool:
-    """Whether beam angles (first, step) (T, 2) decrease from beam to beam.
+    """True if beam angles (first, step) (T, 2) decrease from beam to beam.
 
     Raises:
         InputError: in some scans only.
@@ -190,7 +190,7 @@ def _is_upside_down(angles: Float) -> bool:
 
 
 def _are_half_circles(angles: Float, counts: NDArray[np.int64]) -> bool:
-    """Whether first and last beams have the directions of FLASER lines with as many readings."""
+    """True if first and last beams have the directions of FLASER lines with as many readings."""
     expected = {int(n): flaser_config(int(n))[:2] for n in np.unique(counts)}
     off = angles - np.array([expected[n] for n in counts.tolist()]).reshape(-1, 2)
     off[:, 1] = off[:, 0] + (counts - 1) * off[:, 1]

@@ -112,7 +112,7 @@ def _describe_sensors(recording: Recording) -> tuple[SensorFacts, ...]:
 
 
 def _is_pose_stated(notes: dict[str, Any]) -> bool:
-    """Whether the pose of a sensor comes from the recording or the user, not from a default."""
+    """True if the pose of a sensor comes from the recording or the user, not from a default."""
     place = notes.get("extrinsics")
     if not isinstance(place, dict):
         return True

@@ -184,7 +184,7 @@ def _find_repeated_scans(earlier: Recording, later: Recording) -> NDArray[np.boo
 
 
 def _has_same_beams(a: Recording, n: int, b: Recording, k: int) -> bool:
-    """Whether scan n of one recording is scan k of another.
+    """True if scan n of one recording is scan k of another.
 
     What is beyond the maximum range, or on the robot, may have been judged differently in each.
     """
@@ -198,7 +198,7 @@ def _has_same_beams(a: Recording, n: int, b: Recording, k: int) -> bool:
 
 
 def _continues_recorded_poses(earlier: Recording, later: Recording) -> bool:
-    """Whether the recorded poses of a part go on where those of the part before end."""
+    """True if the recorded poses of a part go on where those of the part before end."""
     if earlier.T_recorded_base is None or later.T_recorded_base is None:
         return False
     a, b = (

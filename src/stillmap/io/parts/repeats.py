@@ -22,7 +22,7 @@ class RepeatFilter:
         self._limit_ns = self._last_ns
 
     def is_repeated(self, time_ns: int, *content: bytes) -> bool:
-        """Whether an earlier part has a record with this content; remembers a new one."""
+        """True if an earlier part has a record with this content; remembers a new one."""
         found = hashlib.blake2b(digest_size=8)
         for part in content:
             found.update(part)

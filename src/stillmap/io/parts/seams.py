@@ -35,7 +35,7 @@ _ZERO = 1e-3  # m, rad: where odometry begins when it is switched on
 
 @dataclass(frozen=True)
 class Seam:
-    """Where a part goes on after another one.
+    """The seam at which a part goes on after another one.
 
     Attributes:
         gap: seconds from the end of one to the beginning of the other; negative: they overlap.
@@ -70,7 +70,7 @@ def compare(earlier: RecordingFacts, later: RecordingFacts) -> Seam | str:
 
 
 def _compare_sensors(earlier: RecordingFacts, later: RecordingFacts) -> str:
-    """How the sensors differ; "" where they may be the same."""
+    """The difference between the sensors; "" where they may be the same."""
     if len(earlier.sensors) != len(later.sensors):
         return f"has {len(later.sensors)} sensors, {earlier.path} has {len(earlier.sensors)}"
     for a, b in zip(earlier.sensors, later.sensors, strict=True):
@@ -124,7 +124,7 @@ def _find_repeats(earlier: RecordingFacts, later: RecordingFacts) -> NDArray[np.
 
 
 def _are_equal(a: NDArray[np.float32], b: NDArray[np.float32]) -> bool:
-    """Whether ranges are those of the same scan: what is a hit may have been judged differently."""
+    """True if ranges are those of the same scan: what is a hit may have been judged differently."""
     known = ~np.isnan(a) & ~np.isnan(b)
     if not known.any():
         return bool(np.isnan(a).all() and np.isnan(b).all())
@@ -132,7 +132,7 @@ def _are_equal(a: NDArray[np.float32], b: NDArray[np.float32]) -> bool:
 
 
 def _is_overlap_of_parts(earlier: RecordingFacts, later: RecordingFacts, repeated: int) -> bool:
-    """Whether an overlap holds the same scans in both, or hardly any."""
+    """True if an overlap holds the same scans in both, or hardly any."""
     a, b = _overlap(earlier, later)
     n: int = max(a.stop - a.start, b.stop)
     stray = n - repeated

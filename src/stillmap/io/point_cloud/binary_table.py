@@ -184,7 +184,7 @@ def iter_text_lines(path: Path, skip: int = 0, limit: int | None = None) -> Iter
 
 
 def is_blank(line: bytes) -> bool:
-    """Whether a line of a table is skipped: it has nothing but whitespace of Latin-1."""
+    """True if a line of a table is skipped: it has nothing but whitespace of Latin-1."""
     return line.decode("latin1").isspace()  # as np.loadtxt does
 
 

@@ -18,21 +18,12 @@ from stillmap.core.errors import InputError, MissingExtra, import_extra
 from stillmap.core.recording import Recording
 from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud.binary_table import truncated_error
-from stillmap.io.point_cloud.files import (
-    damaged_error,
-    library_errors,
-    pose_from_quaternion,
-    require_nonempty_file,
-)
-from stillmap.io.point_cloud.scans import (
-    Cloud,
-    CloudSource,
-    DatasetInfo,
-    Origin,
-    build_recording,
-    files_of,
-)
+from stillmap.io.point_cloud.library_errors import damaged_error, library_errors
+from stillmap.io.point_cloud.origin import Origin
+from stillmap.io.point_cloud.scans import Cloud, CloudSource, DatasetInfo, build_recording, files_of
 from stillmap.io.point_cloud.signatures import E57_EXTENSIONS, E57_MAGIC
+from stillmap.io.rigid_transforms import pose_from_quaternion
+from stillmap.io.scan_files import require_nonempty_file
 
 _BLOCK = 1 << 14  # points read at once; libe57 keeps the buffers where packets are damaged
 _PAGE, _CHECKSUM = 1024, 4  # bytes

@@ -19,19 +19,11 @@ from stillmap.io.builder import ReadContext, part_context
 from stillmap.io.parts.joining import join_recordings
 from stillmap.io.point_cloud import kitti_cameras
 from stillmap.io.point_cloud.binary_table import iter_text_lines, parse_numbers, truncated_error
-from stillmap.io.point_cloud.files import (
-    assign_rows,
-    list_files,
-    pose_from_row,
-    read_times,
-    require_nonempty_file,
-    require_single_sensor,
-    rigid_transform,
-    scan_hits,
-    sensor_poses,
-)
+from stillmap.io.point_cloud.hits import require_single_sensor, scan_hits, sensor_poses
 from stillmap.io.point_cloud.kitti_cameras import Calibration, find_images
 from stillmap.io.point_cloud.scans import Cloud, CloudSource, DatasetInfo, build_recording, reject
+from stillmap.io.rigid_transforms import pose_from_row, rigid_transform
+from stillmap.io.scan_files import assign_rows, list_files, read_times, require_nonempty_file
 from stillmap.preprocessing.overrides import select_time
 from stillmap.preprocessing.scan_timing import STAMP_AZIMUTH_KEY, add_beam_times
 from stillmap.preprocessing.time_window import TimeWindow
@@ -134,7 +126,7 @@ _LAYOUTS = (  # scans and their stamps
 
 
 def is_kitti_folder(path: Path) -> bool:
-    """Whether a folder has one of the KITTI layouts."""
+    """True if a folder has one of the KITTI layouts."""
     return any((path / scans).is_dir() for scans, _ in _LAYOUTS)
 
 

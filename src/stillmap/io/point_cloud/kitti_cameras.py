@@ -11,13 +11,8 @@ from stillmap.core import se2
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
 from stillmap.io import cameras, images
-from stillmap.io.point_cloud.files import (
-    assign_rows,
-    list_files,
-    pose_from_row,
-    read_times,
-    rigid_transform,
-)
+from stillmap.io.rigid_transforms import pose_from_row, rigid_transform
+from stillmap.io.scan_files import assign_rows, list_files, read_times
 
 _MAX_BYTES = 1 << 20  # bytes of a calibration file
 

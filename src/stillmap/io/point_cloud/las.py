@@ -17,9 +17,12 @@ from stillmap.core.files import atomic_file
 from stillmap.core.recording import Recording
 from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud.binary_table import truncated_error
-from stillmap.io.point_cloud.files import iter_map_points, library_errors, require_nonempty_file
-from stillmap.io.point_cloud.scans import Cloud, Origin, read_clouds
+from stillmap.io.point_cloud.hits import iter_map_points
+from stillmap.io.point_cloud.library_errors import library_errors
+from stillmap.io.point_cloud.origin import Origin
+from stillmap.io.point_cloud.scans import Cloud, read_clouds
 from stillmap.io.point_cloud.signatures import LAS_EXTENSIONS, LAS_MAGIC
+from stillmap.io.scan_files import require_nonempty_file
 
 _BLOCK, _BLOCK_BYTES = 1 << 16, 8 << 20  # points and bytes read at once
 _MAX_POINTS_PER_BYTE, _MIN_POINT_LIMIT = 20, 10_000_000  # compressed points take a byte or more

@@ -25,24 +25,13 @@ from stillmap.io.point_cloud.binary_table import (
     split_header,
     truncated_error,
 )
-from stillmap.io.point_cloud.files import (
-    pose_from_quaternion,
-    quaternion_from_pose,
-    require_nonempty_file,
-    require_single_sensor,
-    scan_hits,
-    sensor_poses,
-)
-from stillmap.io.point_cloud.scans import (
-    Cloud,
-    DatasetInfo,
-    Origin,
-    build_recording,
-    files_of,
-    sources_of,
-)
+from stillmap.io.point_cloud.hits import require_single_sensor, scan_hits, sensor_poses
+from stillmap.io.point_cloud.origin import Origin
+from stillmap.io.point_cloud.scans import Cloud, DatasetInfo, build_recording, files_of, sources_of
 from stillmap.io.point_cloud.signatures import MAX_PCD_HEADER, PCD_EXTENSIONS, is_pcd
 from stillmap.io.point_cloud.time_field import find_time_column
+from stillmap.io.rigid_transforms import pose_from_quaternion, quaternion_from_pose
+from stillmap.io.scan_files import require_nonempty_file
 
 _SIZES = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
 
@@ -214,7 +203,7 @@ def _read_cloud(path: Path, in_map_frame: bool, origin: Origin) -> Cloud:
 
 
 def _detect_map_frame(files: list[Path]) -> bool:
-    """Whether points are in the map frame instead of the sensor frame.
+    """True if points are in the map frame instead of the sensor frame.
 
     Decided on the scan with the farthest viewpoint: its points surround the viewpoint, or the
     origin.

@@ -15,9 +15,11 @@ from stillmap.core.files import atomic_file
 from stillmap.core.recording import Recording
 from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud.binary_table import Field, TableLayout, read_columns, split_header
-from stillmap.io.point_cloud.files import iter_map_points, require_nonempty_file
-from stillmap.io.point_cloud.scans import Cloud, Origin, read_clouds
+from stillmap.io.point_cloud.hits import iter_map_points
+from stillmap.io.point_cloud.origin import Origin
+from stillmap.io.point_cloud.scans import Cloud, read_clouds
 from stillmap.io.point_cloud.signatures import PLY_EXTENSIONS
+from stillmap.io.scan_files import require_nonempty_file
 
 _MAX_HEADER = 1 << 16  # bytes
 _ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}

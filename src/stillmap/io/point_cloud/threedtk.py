@@ -16,9 +16,10 @@ from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud.binary_table import iter_text_lines, parse_numbers
-from stillmap.io.point_cloud.files import require_nonempty_file, rigid_transform, strip_extension
 from stillmap.io.point_cloud.scans import Cloud, CloudSource, DatasetInfo, build_recording, files_of
 from stillmap.io.point_cloud.signatures import THREEDTK_EXTENSIONS
+from stillmap.io.rigid_transforms import rigid_transform
+from stillmap.io.scan_files import require_nonempty_file, strip_extension
 
 _MAX_UNPACKED = 1 << 30  # bytes
 _MAX_POSE = 1 << 12  # bytes
@@ -81,7 +82,7 @@ def _read_cloud(path: Path) -> Cloud:
 
 
 def is_point(first_line: bytes) -> bool:
-    """Whether the first line of a scan is a point."""
+    """True if the first line of a scan is a point."""
     return len(first_line.split()) >= 3 and not first_line.lstrip().startswith(b"#")
 
 

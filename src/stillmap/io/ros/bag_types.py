@@ -85,14 +85,14 @@ class Bag(Protocol):
 
 
 def is_bag(path: Path, start: bytes | None) -> bool:
-    """Whether a file with these first bytes, or a folder (None), is a bag."""
+    """True if a file with these first bytes, or a folder (None), is a bag."""
     if start is None:
         return _is_bag_folder(path)
     return start.startswith((BAG1_MAGIC, MCAP_MAGIC, DB3_MAGIC)) or is_compressed(path, start)
 
 
 def _is_bag_folder(path: Path) -> bool:
-    """Whether the files of a folder are one recording, which recorders split into X_0, X_1, ..."""
+    """True if the files of a folder are one recording, which recorders split into X_0, X_1, ..."""
     files = storage_files(path)
     if (path / "metadata.yaml").is_file():
         return bool(files)
@@ -100,7 +100,7 @@ def _is_bag_folder(path: Path) -> bool:
 
 
 def is_compressed(path: Path, start: bytes) -> bool:
-    """Whether a file of a ROS 2 folder is compressed as a whole."""
+    """True if a file of a ROS 2 folder is compressed as a whole."""
     return path.name.endswith((".db3.zstd", ".mcap.zstd")) and start.startswith(ZSTD_MAGIC)
 
 

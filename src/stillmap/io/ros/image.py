@@ -15,7 +15,7 @@ from PIL import Image
 from stillmap.core import se2
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
-from stillmap.io.point_cloud.files import rigid_transform
+from stillmap.io.rigid_transforms import rigid_transform
 from stillmap.io.ros.bag_types import Bag, Message
 from stillmap.io.ros.messages import CAMERA_INFO, COMPRESSED_IMAGE, decode, frame_name, stamp_ns
 from stillmap.io.ros.tf import TransformTree

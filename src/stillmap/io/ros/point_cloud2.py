@@ -23,7 +23,7 @@ _MAX_STEP = 1 << 16  # bytes of one point
 
 
 class CloudLayout(NamedTuple):
-    """Where the points of a message lie in its data.
+    """The layout of the points in the data of a message.
 
     Attributes:
         columns: type and byte offset of the fields that are read, by name in lower case.

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from stillmap.core import se2
 from stillmap.core.arrays import iter_blocks
 from stillmap.io.builder import SkippedRecords
-from stillmap.io.point_cloud.files import MAX_TRANSLATION
+from stillmap.io.rigid_transforms import MAX_TRANSLATION
 from stillmap.io.ros.messages import frame_name, stamp_ns
 
 BAD_TRANSFORM = "transform that is none"
@@ -122,7 +122,7 @@ class TransformTree:
         return None if edge is None else edge.parent
 
     def is_moving(self, child: str) -> bool:
-        """Whether a frame moves in its parent."""
+        """True if a frame moves in its parent."""
         edge = self._resolve().get(child)
         return edge is not None and not edge.constant
 
@@ -200,7 +200,7 @@ class Odometry:
 
 
 def _is_pose(values: tuple[float, ...]) -> bool:
-    """Whether x y z in metres and a quaternion x y z w are plausible."""
+    """True if x y z in metres and a quaternion x y z w are plausible."""
     # each by itself: max() of several, NaN among them, may return any of them
     near = all(abs(value) < MAX_TRANSLATION for value in values[:3])
     return near and abs(math.hypot(*values[3:]) - 1.0) < _NORM_TOLERANCE

@@ -235,7 +235,7 @@ def cluster_points(points: Float, sensor: Float, link: float) -> Index:
 
 
 def _same_velocity(one: ObjectTrack, other: ObjectTrack) -> bool:
-    """Whether two objects have one velocity while both are seen."""
+    """True if two objects have one velocity while both are seen."""
     a, b = one.box.box, other.box.box
     first, last = max(a.seconds[0], b.seconds[0]), min(a.seconds[-1], b.seconds[-1])
     if first > last:

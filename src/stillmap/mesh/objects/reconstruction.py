@@ -124,7 +124,7 @@ def _best_track(
 
 
 def _is_large_enough(mesh: Mesh, area: float) -> bool:
-    """Whether a surface has an area, and is higher than rough ground."""
+    """True if a surface has an area, and is higher than rough ground."""
     if not len(mesh) or mesh.areas().sum() < area:
         return False
     return bool(np.ptp(mesh.vertices[:, 2]) >= _MIN_HEIGHT)

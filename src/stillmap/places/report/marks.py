@@ -90,7 +90,7 @@ def _arrow_path(start: Box, end: Box, size: float) -> str:
 
 
 def _find_space(box: Box, size: tuple[float, float], taken: list[Box], view: MapView) -> Box:
-    """Where a label of a width and height beside a box covers least of what is there."""
+    """Find the place beside a box where a label of a width and height covers least."""
     width, height = size
     left, top, right, bottom = box
     gap = 0.2 * height

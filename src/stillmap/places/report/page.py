@@ -107,6 +107,7 @@ def _place_data(timeline: Timeline, record: Mapping[str, Any]) -> dict[str, Any]
         "dynamic": counts["dynamic"],
         "constraints": record["place"]["constraints"],
         "area": record["area"]["known"],
+        "geometry": record["quality"]["geometry"],
         "map_state": timeline.map_state,
     }
 

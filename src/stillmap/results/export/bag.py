@@ -15,8 +15,8 @@ from stillmap.io.ros.messages import ODOMETRY, POINT_CLOUD, TF
 from stillmap.io.ros.recording_writer import write_sensor_frames
 from stillmap.results.export.bag_objects import make_object_writer
 from stillmap.results.export.bag_scans import LaserWriter, LidarWriter, make_cloud_message
-from stillmap.results.export.point_cloud import cloud_from_recording
 from stillmap.results.folder import Exported
+from stillmap.results.point_cloud import cloud_from_recording
 
 Progress = Callable[[float], None]
 

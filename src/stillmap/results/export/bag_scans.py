@@ -11,8 +11,8 @@ from stillmap.io.ros import message_writer
 from stillmap.io.ros.bag_writer import BagWriter, Send
 from stillmap.io.ros.messages import LASER_SCAN, POINT_CLOUD
 from stillmap.io.ros.recording_writer import LaserScanEncoder, number_names
-from stillmap.results.export.point_cloud import Block
 from stillmap.results.folder import Exported
+from stillmap.results.point_cloud import Block
 from stillmap.results.points import FIELDS, PACKED_COLOUR, make_vertices
 
 
@@ -50,7 +50,7 @@ class LaserWriter:
             sends[s](stamp, message)
 
     def describe_losses(self) -> list[str]:
-        """What LaserScan cannot represent, a sentence each."""
+        """Properties of a recording that LaserScan cannot represent, a sentence each."""
         return self._encoder.describe_losses()
 
 
@@ -84,7 +84,7 @@ class LidarWriter:
         self._sends[s](stamp, make_cloud_message(self._bag, stamp, self._frames[s], block))
 
     def describe_losses(self) -> list[str]:
-        """What PointCloud2 cannot represent, a sentence each."""
+        """Properties of a recording that PointCloud2 cannot represent, a sentence each."""
         return []
 
 

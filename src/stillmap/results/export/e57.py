@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from stillmap.core.errors import InputError, import_extra
 from stillmap.io.point_cloud.e57 import GPS_EPOCH_S
 from stillmap.io.point_cloud.las import MAX_INTEGER, SCALE
-from stillmap.results.export.point_cloud import Block, Cloud
+from stillmap.results.point_cloud import Block, Cloud
 
 _BLOCK = 1 << 16  # points written at a time
 _AXES = ("cartesianX", "cartesianY", "cartesianZ")

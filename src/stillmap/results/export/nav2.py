@@ -108,13 +108,13 @@ def make_maps(
 def _add_traffic(maps: Maps, rule: TrafficRule, crossings: Crossings) -> None:
     """Keep out of, and limit the speed in, the squares that were crossed often."""
     if rule.keepout is not None and maps.keepout is not None:
-        maps.keepout |= _often_crossed(maps, crossings, rule.keepout, "keep-out")
+        maps.keepout |= _find_crossed_cells(maps, crossings, rule.keepout, "keep-out")
     if rule.slow is not None and maps.speed is not None:
-        cells = _often_crossed(maps, crossings, rule.slow, "slow")
+        cells = _find_crossed_cells(maps, crossings, rule.slow, "slow")
         maps.speed[cells] = maps.code.encode(rule.limit, _TRAFFIC)
 
 
-def _often_crossed(maps: Maps, crossings: Crossings, least: int, kind: str) -> Mask:
+def _find_crossed_cells(maps: Maps, crossings: Crossings, least: int, kind: str) -> Mask:
     """(H, W) cells in squares that were crossed at least so often; warns if there are none."""
     cells = _cells_of_squares(crossings.number >= least, crossings, maps.map)
     if not cells.any():

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from stillmap.core.errors import import_extra
 from stillmap.core.files import atomic_file
 from stillmap.results.colors import BLUE, color_by_height, color_by_id, color_by_p_static
-from stillmap.results.export.point_cloud import cloud_from_recording
 from stillmap.results.folder import Exported
 from stillmap.results.object_poses import interpolate_pose, iter_present_tracks
+from stillmap.results.point_cloud import cloud_from_recording
 from stillmap.results.report.figures import draw_map, map_window
 
 _MAX_POINTS = 1_000_000  # of the static cloud
@@ -170,7 +170,7 @@ class _Writer:
             self._stream.set_time("stamp", duration=np.timedelta64(stamp, "ns"))
 
     def _write_fixed(self) -> None:
-        """What does not depend on the time."""
+        """Write everything that does not depend on the time."""
         rerun, result = self._rerun, self._result
 
         def log(entity: str, *what: Any) -> None:

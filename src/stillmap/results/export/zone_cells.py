@@ -38,7 +38,7 @@ def cells_inside(polygon: Sequence[Float], grid: GridMap) -> tuple[Window, Mask]
 
 
 def is_within(polygon: Sequence[Float], grid: GridMap) -> bool:
-    """Whether no part of a polygon lies outside the map."""
+    """True if no part of a polygon lies outside the map."""
     height, width = grid.p_occupied.shape
     outline = (polygon[0] - np.array(grid.origin[:2])) / grid.resolution
     tolerance = 1e-6  # cells

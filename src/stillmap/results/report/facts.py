@@ -1,4 +1,4 @@
-"""What the report says of a run: headline figures, warnings, files, the recording, stages."""
+"""Facts of a run in the report: headline figures, warnings, files, the recording, stages."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -87,7 +87,7 @@ def quality_data(result: MappingResult) -> list[tuple[str, float | None, str]]:
 
 
 def _sentence_of(line: str) -> str:
-    """What follows the name and the figure of a part."""
+    """The words that follow the name and the figure of a part."""
     return line.partition(": ")[2]
 
 
@@ -105,7 +105,7 @@ def files_data(folder: Path | None, more: Mapping[str, str] = _NO_MORE) -> list[
 
 
 def stages_data(result: MappingResult) -> list[tuple[str, float, int]]:
-    """What each stage did, its seconds and its peak memory in bytes."""
+    """Name, seconds and peak memory in bytes of each stage."""
     return [
         (
             _STAGES.get(name, name.replace("_", " ")),

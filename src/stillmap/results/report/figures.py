@@ -15,12 +15,13 @@ import stillmap._core as _core
 from stillmap.core.grid_map import GridMap
 from stillmap.core.tiles import release, tiles_of
 from stillmap.pipeline.snapshots import Snapshot, Value, Window, cut_layer, extent
+from stillmap.results.colors import ORANGE
 from stillmap.results.reader import OCCUPIED_THRESH
 from stillmap.results.report.curves import round_down
 
 Color = tuple[int, int, int]
 Mask = NDArray[np.bool_]
-ORANGE, UNKNOWN, VIOLET = (240, 120, 0), (190, 196, 204), (140, 60, 220)  # RGB
+UNKNOWN, VIOLET = (190, 196, 204), (140, 60, 220)  # RGB
 VEIL_ALPHA = 80  # of 255, of thinly observed cells: walls and free space show through
 MAX_PIXELS = 1_500_000  # of a map: fills a large screen, a few hundred kB as PNG
 _SNAPSHOT_PIXELS = 480  # longest edge of a snapshot
@@ -92,7 +93,7 @@ def map_window(maps: Sequence[GridMap]) -> Window:
 
     Without occupied cells: every known cell; without known cells: the whole first map.
     """
-    for select in (_occupied, _known):
+    for select in (_is_occupied, _is_known):
         boxes = [box for box in (_box(one, select) for one in maps) if box is not None]
         if boxes:
             corners = np.array(boxes)
@@ -190,11 +191,11 @@ def color_by_index(
     return image
 
 
-def _occupied(p_occupied: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _is_occupied(p_occupied: NDArray[np.float32]) -> NDArray[np.bool_]:
     return np.asarray(p_occupied > OCCUPIED_THRESH)
 
 
-def _known(p_occupied: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _is_known(p_occupied: NDArray[np.float32]) -> NDArray[np.bool_]:
     return np.asarray(~np.isnan(p_occupied))
 
 

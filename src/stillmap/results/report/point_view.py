@@ -9,8 +9,8 @@ from PIL import Image
 
 from stillmap.mapping.beam_statistics import sample_dynamic_points, sample_static_points
 from stillmap.pipeline.result import MappingResult
-from stillmap.results.colors import color_by_height
-from stillmap.results.report.figures import ORANGE, data_uri
+from stillmap.results.colors import ORANGE, color_by_height
+from stillmap.results.report.figures import data_uri
 from stillmap.results.report.renderer import Float, camera_matrix, fit_camera
 
 if TYPE_CHECKING:

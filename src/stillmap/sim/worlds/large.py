@@ -115,14 +115,14 @@ def _rooms(row: _Row, rng: np.random.Generator) -> tuple[list[Segment], list[tup
     walls += wall(row.start, row.length, row.side, openings)
     for low, high, opening in behind:
         walls += room(row.start, row.side, (low, high), row.depth, opening)
-        walls += _furnished(row, low, high, rng)
+        walls += _place_furniture(row, low, high, rng)
         middle = opening.start + _DOOR / 2
         before = locate(row.start, row.side, middle, -_WIDTH / 2)
         looks.append((before, locate(row.start, row.side, middle, _THICK + _INSIDE)))
     return walls, looks
 
 
-def _furnished(row: _Row, low: float, high: float, rng: np.random.Generator) -> list[Segment]:
+def _place_furniture(row: _Row, low: float, high: float, rng: np.random.Generator) -> list[Segment]:
     """Desks and cupboards in the back of a room, out of the way of whoever looks in."""
     walls: list[Segment] = []
     at = low + 0.2
@@ -233,11 +233,11 @@ def _walls(wings: int) -> list[Segment]:
         walls += _floor(floor, wings)
     north = (floors - 1) * _PITCH + _HALF
     rng = np.random.default_rng([_LAYOUT_SEED, 1])
-    doors = [Opening(y, 1.2, 0.3) for y in _spaced(north + _HALF, rng)]
+    doors = [Opening(y, 1.2, 0.3) for y in _space_doors(north + _HALF, rng)]
     walls += wall((-2 * _HALF, -_HALF), north + _HALF, "west", doors)
     for floor in range(floors - 1):
         between = floor * _PITCH + _HALF
-        doors = [Opening(y, 0.95, 0.18) for y in _spaced(_PITCH - 2 * _HALF, rng)]
+        doors = [Opening(y, 0.95, 0.18) for y in _space_doors(_PITCH - 2 * _HALF, rng)]
         walls += wall((0.0, between), _PITCH - 2 * _HALF, "east", doors)
     return [*walls, (-2 * _HALF, -_HALF, 0.0, -_HALF), (-2 * _HALF, north, 0.0, north)]
 
@@ -263,7 +263,7 @@ def _floor(floor: int, wings: int) -> list[Segment]:
     return [*walls, (end, y - _HALF, end, y + _HALF)]
 
 
-def _spaced(length: float, rng: np.random.Generator) -> list[float]:
+def _space_doors(length: float, rng: np.random.Generator) -> list[float]:
     """Start positions of closed doors along a wall."""
     places, at = [], float(rng.uniform(3.0, 6.0))
     while at < length - 3.0:

@@ -105,7 +105,7 @@ def office() -> Scene:
         for r, door in zip(rooms, doors, strict=True):
             walls += room(start, side, (r.low, r.high), depth, door)
             leaves.append(leaf(start, side, door, r.swing, r.hinged_at_end))
-            walls += _furnished(start, side, r)
+            walls += _place_furniture(start, side, r)
     walls += wall((0, 6.6), 11.8, "west", [Opening(5.0, 1.6, 0.3)])
     walls += wall((40, 6.6), 2.8, "east") + wall((40, 15.6), 2.8, "east")
     walls += wall((2.2, 8.8), 7.4, "east", [Opening(3.2, 1.0, _THICK)])
@@ -128,7 +128,7 @@ def office() -> Scene:
     )
 
 
-def _furnished(start: Point, side: Side, r: _Room) -> list[Segment]:
+def _place_furniture(start: Point, side: Side, r: _Room) -> list[Segment]:
     """Desks as boxes, and the four thin legs of a chair on the side of each that has room."""
     into = 1.0 if side == "north" else -1.0
     walls: list[Segment] = []

@@ -80,7 +80,7 @@ def _filter_file(path: Path, new: Path, masks: list[Mask | None]) -> None:
 
 
 def _find_sections(reader: Any, path: Path) -> _Sections:
-    """Where points begin and where other data behind them do.
+    """The offsets of the points and of other data behind them.
 
     Raises:
         InputError: records of the file refer to places in it.

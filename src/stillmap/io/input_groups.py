@@ -11,7 +11,8 @@ from stillmap.io.builder import ReadContext, part_context
 from stillmap.io.parts.facts import RecordingFacts, measure_facts
 from stillmap.io.parts.grouping import group_parts
 from stillmap.io.parts.joining import join_recordings
-from stillmap.io.registry import Format, detect_format, explain_failure, prepare
+from stillmap.io.reader import explain_failure, prepare
+from stillmap.io.registry import Format, detect_format
 from stillmap.io.text_lines import Progress
 from stillmap.preprocessing.options import ReadOptions
 from stillmap.preprocessing.overrides import select_time

@@ -1,0 +1,52 @@
+"""The common origin of the clouds of a recording, whose coordinates may be those of a country."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.arrays import finite_rows
+from stillmap.core.recording import Recording
+
+_MAX_COORDINATE = 4096.0  # m: float32 resolves half a millimetre up to there
+
+
+class Origin:
+    """Common origin of all clouds of a recording, so that float32 coordinates stay precise.
+
+    Unless `position` (3,) is given: zero where the first block of points is near the origin, else
+    its median, rounded to metres.
+    """
+
+    def __init__(self, position: NDArray[np.float64] | None = None) -> None:
+        self.position = position
+
+    def shift(self, points: NDArray[Any]) -> NDArray[np.float32]:
+        """(n, 3) points relative to the origin, of recorded points (n, 3) in metres."""
+        points = np.asarray(points, np.float64)
+        if self.position is None:
+            self.position = _find_origin(points)
+        with np.errstate(over="ignore"):
+            return (points - (0.0 if self.position is None else self.position)).astype(np.float32)
+
+    def add_notes(self, recording: Recording, *, in_sensor_frame: bool = False) -> None:
+        """Note the origin in the source of a recording, and warn that the sensor is assumed there;
+        neither where points are `in_sensor_frame` and near its origin."""
+        if self.position is not None and np.any(self.position != 0.0):
+            recording.source["origin"] = self.position.tolist()
+            at = " ".join(f"{value:.0f}" for value in self.position)
+            at = f"{at}, the new origin"
+        elif in_sensor_frame:
+            return
+        else:
+            at = "the origin"
+        recording.source["warnings"].append(f"no sensor pose is recorded: beams start at {at}")
+
+
+def _find_origin(points: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    finite = points[finite_rows(points)]
+    if not len(finite):
+        return None
+    # column by column: np.median(axis=0) takes several times as long
+    middle = np.array([np.median(column) for column in finite.T])
+    return np.round(middle) if np.abs(middle).max() > _MAX_COORDINATE else np.zeros(3)

@@ -1,0 +1,95 @@
+"""Reads a recording of any format, and prepares it by what all of its scans show."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from stillmap.core.errors import InputError
+from stillmap.core.recording import Recording
+from stillmap.io.builder import ReadContext
+from stillmap.io.registry import detect_format
+from stillmap.io.text_lines import Progress
+from stillmap.preprocessing.options import ReadOptions
+
+
+def read(
+    path: str | Path,
+    options: ReadOptions | None = None,
+    *,
+    progress: Progress | None = None,
+    scratch: Path | None = None,
+) -> Recording:
+    """Read a recording of any format.
+
+    Args:
+        path: a file or a folder, see `registry.FORMATS`.
+        options: read options, None for the defaults. A recording folder, whose readings are already
+            interpreted, is narrowed by them.
+        progress: called with the share of the file that is read, 0 to 1.
+        scratch: folder for memory-mapped buffers; None: the system's temporary folder.
+
+    Raises:
+        InputError: there is no readable recording.
+    """
+    path, options = Path(path), options or ReadOptions()
+    with explain_failure(path):
+        recording = detect_format(path).read(path, ReadContext(options, progress, scratch))
+        return prepare(recording, options, scratch, str(path))
+
+
+def prepare(
+    recording: Recording, options: ReadOptions, scratch: Path | None, where: str
+) -> Recording:
+    """A recording as its reader made it, with what follows from all of its scans.
+
+    Raises:
+        InputError: options are for recordings of another dimension.
+    """
+    if recording.dimension == 3:
+        return _prepare_3d(recording, options, scratch)
+    for name, given in (
+        ("spin", options.spin not in ("auto", "none")),
+        ("cameras", options.cameras),
+    ):
+        if given:
+            what = f"read.{name} is for 3D recordings, this one is in 2D"
+            raise InputError(what, where=where)
+    return recording
+
+
+@contextmanager
+def explain_failure(path: Path) -> Iterator[None]:
+    """Within this context, files that vanish and full disks are errors of the input.
+
+    Raises:
+        InputError: it names the file.
+    """
+    try:
+        # damaged numbers are handled by the readers: no warnings of NumPy
+        with np.errstate(over="ignore", invalid="ignore"):
+            yield
+    except OSError as error:
+        # files may vanish and disks fill up at any moment
+        what = f"cannot be read: {error.strerror or error}"
+        raise InputError(what, where=str(error.filename or path)) from error
+    except MemoryError as error:
+        raise InputError("does not fit into memory", where=str(path)) from error
+
+
+def _prepare_3d(recording: Recording, options: ReadOptions, scratch: Path | None) -> Recording:
+    """Add beam times and cameras, and remove returns from the robot itself."""
+    from stillmap.io import cameras  # nothing that a 2D recording needs
+    from stillmap.preprocessing import self_filter
+    from stillmap.preprocessing.scan_timing import SPIN_KEY, add_beam_times
+
+    recording = add_beam_times(replace(recording, scratch=scratch), options.spin)
+    if options.spin == "none" and recording.beam_time is None:
+        source = {**recording.source, SPIN_KEY: {"direction": "none"}}
+        recording = replace(recording, source=source)
+    if options.cameras is not None:
+        recording = cameras.apply_camera_file(recording, Path(options.cameras))
+    recording = cameras.add_calibration_warnings(recording)
+    return self_filter.remove_self_returns(recording) if options.self_filter else recording
