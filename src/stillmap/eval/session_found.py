@@ -87,7 +87,8 @@ def read_changes(
     path = place / "changes.json"
     tree = read_json(path)
     index = {one.name: k for k, one in enumerate(sessions)}
-    at = _transform(np.linalg.inv(T_world_place), cells.centres())
+    T_place_world = np.asarray(np.linalg.inv(T_world_place), np.float64)
+    at = _transform(T_place_world, cells.centres())
     try:
         return [_read_change(one, index, at, cells, named) for one in tree]
     except (KeyError, TypeError, ValueError, IndexError) as error:
