@@ -1,6 +1,5 @@
 """Recordings cut into sessions: a log into laps, a drive into pieces, a simulated run evenly."""
 
-import itertools
 import json
 from collections.abc import Sequence
 from dataclasses import replace
@@ -96,23 +95,28 @@ def _turn_odometry(part: Recording, rng: np.random.Generator) -> Recording:
     return part if part.T_odom_base is None else replace(part, T_odom_base=T @ part.T_odom_base)
 
 
-def write_pieces(pack: Path, folder: Path, count: int) -> list[Path]:
+def write_pieces(pack: Path, folder: Path, count: int, interleaved: bool = False) -> list[Path]:
     """Cut a packed drive into pieces without a common sweep, a day apart, without poses.
+
+    One after the other, or interleaved: each has every `count`-th sweep of the whole way.
 
     Beside the pieces lies the truth about them, as of simulated sessions: the poses of the pack.
     """
     whole = stillmap.read(unpack(pack, folder / "whole")).without_odometry()
     with np.load(pack) as arrays:
         poses = np.asarray(arrays["pose"], np.float64)
-    bounds = np.linspace(0, whole.n_scans, count + 1).astype(int)
+    every = np.arange(whole.n_scans)
+    chosen = [every[k::count] for k in range(count)]
+    if not interleaved:
+        chosen = np.array_split(every, count)
     pieces, about = [], []
-    for k, (first, last) in enumerate(itertools.pairwise(bounds.tolist())):
-        part = select_scans(whole, np.arange(first, last))
+    for k, scans in enumerate(chosen):
+        part = select_scans(whole, scans)
         part = replace(part, stamp_ns=part.stamp_ns + k * _DAY_NS)
         pieces.append(folder / f"piece-{k + 1}")
         stillmap_folder.write(part, pieces[-1])
         (pieces[-1] / "truth").mkdir()
-        own = poses[first:last]
+        own = poses[scans]
         write_tum(pieces[-1] / "truth/trajectory.tum", part.stamp_ns, own)
         about.append({"name": pieces[-1].name, "place": 0, "T_world_session": own[0].tolist()})
     _write_truth(folder, about)

@@ -5,6 +5,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from stillmap.core.errors import InputError
 from stillmap.sim import scene_by_name
 from stillmap.sim.session_pairs import OVERLAPS, plan_pair, plan_strangers, plan_wings
@@ -15,6 +17,12 @@ from stillmap.sim.sessions import SessionOptions, SessionPlan, plan_sessions
 LASER = {"laser": {"beams": 270, "fov": math.radians(270)}}
 NEGATIVES = ("wings", "lookalike")
 WORLDS = ("office", "corridor", "warehouse", "hall")
+
+# of a street: ways of the sessions after the first one
+STRETCHES = ("same way", "25 m on", "opposite", "opposite, 25 m on")
+_STREET = {"lidar": {"channels": 16, "columns": 400}, "robot": {"scans": 100}}
+_DRIVEN, _ON = 50.0, 25.0  # m of a session, and by which one begins after another
+_TURN = 17.4  # m in which the routes of the streets turn back
 
 Plan = Callable[[], tuple[SessionPlan, ...]]
 
@@ -84,3 +92,19 @@ def prepare_days(
 
     what = f"{world}-{count}-{scans or 'all'}-{'usual' if people is None else people}-{seed}"
     return prepare(data / f"days-{what}", plan, seed)
+
+
+def prepare_street(data: Path, name: str, seed: int) -> Path:
+    """Five sessions of a street that the route follows there and back, see `STRETCHES`."""
+    scene = scene_by_name(name, _STREET)
+    steps = np.diff(np.array(scene.route, float), axis=0)
+    length = float(np.hypot(*steps.T).sum())
+    there = (length - _TURN) / 2
+    first = float(np.random.default_rng(seed).uniform(0.0, there - _DRIVEN - 30.0))
+    back = length + 2.0 - first - _DRIVEN  # the same stretch, on the way back
+    begins = (first, first, first + _ON, back, back - _ON)
+
+    def plan():
+        return (plan_sessions(scene, SessionOptions(5, begins=begins), seed),)
+
+    return prepare(data / f"{name}-{seed}", plan, seed)

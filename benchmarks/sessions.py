@@ -6,7 +6,7 @@ python benchmarks/sessions.py labels --data DIR [--worlds office hall] [--seeds 
 python benchmarks/sessions.py growth --data DIR [--world office] [--sessions 32]
 python benchmarks/sessions.py laps LOG.clf.gz --data DIR
 python benchmarks/sessions.py cuts --data DIR [--worlds office hall] [--seeds 3] [--pieces 4]
-python benchmarks/sessions.py drive PACK.npz --data DIR [--pieces 3]
+python benchmarks/sessions.py drive PACK.npz --data DIR [--pieces 3] [--interleaved]
 
 alignment: pairs of simulated sessions from random starts, by how much of the second one's hits lie
 in what the first one saw, and pairs that have nothing in common; --lasers: also two logs of
@@ -17,7 +17,8 @@ growth: one session after the other is added to the place; at 2, 4, 8 ... also a
 laps: a log with NAME.reference.txt and NAME.relations beside it, cut into laps that are turned and
 shifted at random, against the uncut run.
 cuts: long simulated runs, cut likewise into equal sessions, against the uncut run.
-drive: packed sweeps of a street, cut into pieces without a common sweep.
+drive: packed sweeps of a street, cut into pieces without a common sweep: one after the other, or
+interleaved, so that all drive the same way.
 
 Simulated sessions are kept in DIR and used again; so is nothing else. Times are wall-clock.
 """
@@ -88,10 +89,11 @@ def _parser() -> argparse.ArgumentParser:
             one.add_argument("--scans", type=int)
         if name == "laps":
             one.add_argument("log", type=Path)
-        if name == "drive":
-            one.add_argument("pack", type=Path)
         if name in ("cuts", "drive"):
             one.add_argument("--pieces", type=int, default=3)
+        if name == "drive":
+            one.add_argument("pack", type=Path)
+            one.add_argument("--interleaved", action="store_true")
     return p
 
 
@@ -261,7 +263,11 @@ def merge_laps(args: argparse.Namespace) -> str:
 
 
 def _accepted(place: Path) -> int:
-    return sum(one["accepted"] for one in json.loads((place / "sessions.json").read_text()))
+    return sum(one["accepted"] for one in _records(place))
+
+
+def _records(place: Path) -> list[dict]:
+    return json.loads((place / "sessions.json").read_text())
 
 
 def _relation_row(trajectory: Path, relations: Path) -> list[str]:
@@ -310,9 +316,10 @@ def _trajectory_errors(result: Path, run: Path) -> ErrorStats:
 
 def merge_drive(args: argparse.Namespace) -> str:
     """A line per piece of a drive."""
-    folder = args.data / f"pieces-{args.pack.stem}-{args.pieces}"
+    order = "interleaved" if args.interleaved else "pieces"
+    folder = args.data / f"{order}-{args.pack.stem}-{args.pieces}"
     shutil.rmtree(folder, ignore_errors=True)
-    pieces = write_pieces(args.pack, folder, args.pieces)
+    pieces = write_pieces(args.pack, folder, args.pieces, args.interleaved)
     merged = merging.merge(args.program, pieces, folder / "place")
     scores = merging.poses_of(merged, folder)
     if not scores:
@@ -327,7 +334,8 @@ def merge_drive(args: argparse.Namespace) -> str:
         for one in scores
     ]
     titles = ["piece", "verdict", "off by m", "deg", "poses mean m", "max m"]
-    return markdown(titles, lines) + f"\n{merged.seconds:.0f} s"
+    why = [f"{one['name']}: {one['why']}" for one in _records(merged.place) if "why" in one]
+    return "\n".join([markdown(titles, lines), *why, f"{merged.seconds:.0f} s"])
 
 
 if __name__ == "__main__":

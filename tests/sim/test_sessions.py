@@ -83,6 +83,17 @@ def test_furniture_and_doors_change_and_something_stays() -> None:
     assert 0.1 < np.mean([one.is_changed for one in plan.objects]) < 0.9
 
 
+def test_sessions_of_a_street_begin_where_they_are_told() -> None:
+    scene = scene_by_name("street", {"robot": {"scans": 100}})
+    plan = plan_sessions(scene, SessionOptions(3, begins=(0.0, 30.0, 1e6)), 2)
+    x = [one.route[0][0] for one in plan.scenes]
+    assert x[0] == pytest.approx(6.0, abs=0.6)
+    assert x[1] == pytest.approx(36.0, abs=0.6)
+    assert plan.scenes[2].route[-1][0] == pytest.approx(8.0, abs=0.6)  # the last piece there is
+    with pytest.raises(InputError, match="as many"):
+        plan_sessions(scene, SessionOptions(2, begins=(0.0,)), 2)
+
+
 def test_without_changes_nothing_differs() -> None:
     plan = plan_sessions(quick_scene(), SessionOptions(3, has_changes=False), 2)
     assert not list_changes(plan.objects, None)

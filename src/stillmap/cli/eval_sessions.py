@@ -5,6 +5,7 @@ from pathlib import Path
 
 from stillmap.cli.eval_scores import Scores
 from stillmap.eval.session_changes import ChangeScores
+from stillmap.eval.session_labels import PlaceLabelScores
 from stillmap.eval.session_maps import SessionMapScores
 from stillmap.eval.session_poses import PoseScores
 from stillmap.eval.sessions import PlaceScores, score_place
@@ -22,8 +23,9 @@ def _format(s: PlaceScores) -> Iterable[str]:
         f"{s.refused} refused, {s.refused_rightly} refused rightly"
     )
     yield from map(_format_session, s.sessions)
-    if s.changes is not None:
-        yield from _format_changes(s.changes)
+    yield from _format_changes(s.changes)
+    if s.labels is not None:
+        yield _format_labels(s.labels)
     yield from map(_format_map, s.maps)
 
 
@@ -46,6 +48,14 @@ def _format_changes(s: ChangeScores) -> Iterable[str]:
     yield (
         f"events       {s.events_found} of {s.events} found, dates right "
         f"{100 * s.dates_right:.1f} %; {s.spurious} of {s.changes} changes spurious"
+    )
+
+
+def _format_labels(s: PlaceLabelScores) -> str:
+    return (
+        f"labels       F1 {s.beams.f1:.4f}, precision {s.beams.precision:.4f}, recall "
+        f"{s.beams.recall:.4f} of {s.beams.dynamic} dynamic hits; {100 * s.gone_found:.2f} % of "
+        f"{s.gone} on what is gone found, {100 * s.stays_kept:.2f} % on what stays kept"
     )
 
 

@@ -1,13 +1,14 @@
 """Observations of sessions per cell, and the cells that truly changed between them."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
 
 from stillmap.core.recording import Recording
+from stillmap.sim.objects import place_faces
 from stillmap.sim.session_truth import SessionTruth
 
 Float = NDArray[np.float64]
@@ -15,7 +16,7 @@ Bool = NDArray[np.bool_]
 
 CELL = 0.05  # m
 MIN_BEAMS = 3  # that end in a cell or pass it: it was seen
-_SHORT = 2  # cells before its end, where a beam no longer counts as passing
+SHORT = 2  # cells before its end, where a beam no longer counts as passing
 _NOISE = 2  # cells, within which hits of one surface scatter
 _MIN_SHARE = 0.2  # of the hits in the fullest cell within them
 _BLOCK = 1 << 20  # beams
@@ -115,7 +116,7 @@ def _count_passes(start: Float, end: Float, lattice: Lattice) -> NDArray[np.int6
     """(H W,) how many beams pass each cell, by points a cell apart along them."""
     n = lattice.shape[0] * lattice.shape[1]
     long = np.hypot(*(end - start).T)
-    steps = np.floor(long / CELL).astype(np.int64) - _SHORT
+    steps = np.floor(long / CELL).astype(np.int64) - SHORT
     order = np.argsort(-steps)
     start, steps = start[order], steps[order]
     along = (end[order] - start) / np.maximum(long[order], 1e-9)[:, None] * CELL
@@ -127,8 +128,40 @@ def _count_passes(start: Float, end: Float, lattice: Lattice) -> NDArray[np.int6
     return out
 
 
+class ChangeTruth(Protocol):
+    """What scores of changes need to know about S sessions, on cells of any arrangement."""
+
+    @property
+    def seen(self) -> "tuple[Seen, ...]":
+        """Of each session."""
+
+    @property
+    def surfaces(self) -> Bool:
+        """(S, ...) whether a surface of what stands there runs through each cell."""
+
+    @property
+    def fixed(self) -> Bool:
+        """(...) the same of surfaces that are there in all sessions."""
+
+    @property
+    def edge(self) -> float:
+        """m, of a cell."""
+
+    def centres(self) -> Float:
+        """(..., D) metres, in the world."""
+
+    def mark(self, points: Float) -> Bool:
+        """(...) the cells that hold any of points (N, D)."""
+
+    def widen(self, cells: Bool) -> Bool:
+        """These cells (...) and their neighbours."""
+
+    def draw_object(self, truth: SessionTruth, number: int, session: int) -> Bool:
+        """(...) the cells that an object fills in a session of the truth, without fixed ones."""
+
+
 class CellTruth(NamedTuple):
-    """The truth about the cells of S sessions.
+    """The truth about the cells of S sessions in the plane.
 
     Attributes:
         lattice: the cells.
@@ -141,6 +174,32 @@ class CellTruth(NamedTuple):
     seen: tuple[Seen, ...]
     surfaces: Bool
     fixed: Bool
+
+    @property
+    def edge(self) -> float:
+        """m, of a cell."""
+        return CELL
+
+    def centres(self) -> Float:
+        """(H, W, 2) metres."""
+        return self.lattice.centres()
+
+    def mark(self, points: Float) -> Bool:
+        """(H, W) the cells that hold any of points (N, 2)."""
+        out = np.zeros(self.fixed.size, bool)
+        out[self.lattice.cells(points[self.lattice.holds(points)])] = True
+        return out.reshape(self.fixed.shape)
+
+    def widen(self, cells: Bool) -> Bool:
+        """(H, W) these cells and their 8 neighbours."""
+        return widen(cells)
+
+    def draw_object(self, truth: SessionTruth, number: int, session: int) -> Bool:
+        """(H, W) the cells that an object fills in a session of the truth, without fixed ones."""
+        thing = truth.objects[number].thing(session)
+        if thing is None:
+            return np.zeros_like(self.fixed)
+        return self.lattice.draw(place_faces(thing, thing.stays[0])) & ~self.fixed
 
 
 def collect_cells(truth: SessionTruth, sessions: list[int]) -> CellTruth:

@@ -2,37 +2,31 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.errors import InputError
 from stillmap.eval.labels import Scores
-from stillmap.eval.session_cells import CELL, MIN_BEAMS, CellTruth, Seen, widen
+from stillmap.eval.session_cells import MIN_BEAMS, ChangeTruth, Seen
 from stillmap.eval.session_events import Event, list_events
-from stillmap.eval.session_poses import PlacedSession, read_json
-from stillmap.results.reader import moved
+from stillmap.eval.session_found import FoundChange
 from stillmap.sim.session_truth import SessionTruth
 
-Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 _COVERED = 0.5  # share of these that a change that was found must hold
-_KINDS = ("appeared", "gone", "moved", "door")
 
 
 @dataclass(frozen=True)
 class ChangeScores(Scores):
     """NaN where a denominator is zero.
 
-    Cells are those of 5 cm that two sessions saw, and none between them: each with MIN_BEAMS beams
-    that end in it or pass it. A cell truly changed if a surface runs through it in one of the two
-    only, that at least MIN_BEAMS beams hit there or in a neighbouring cell, and MIN_BEAMS pass in
-    the other session. A cell that was found is right if it or one of its 8 neighbours truly
-    changed; a true one is found if it or a neighbour was found. Other cells in or beside which a
-    surface runs in one session only count neither way.
+    Cells are those of 5 cm, in 3D of 20 cm, that two sessions saw, and none between them: each with
+    MIN_BEAMS beams that end in it or pass it. A cell truly changed if a surface runs through it in
+    one of the two only, that at least MIN_BEAMS beams hit there or in a neighbouring cell, and
+    MIN_BEAMS pass in the other session. A cell that was found is right if it or one of its 8
+    neighbours (26 in 3D) truly changed; a true one is found if it or a neighbour was found. Other
+    cells in or beside which a surface runs in one session only count neither way.
 
     Attributes:
         source: "cells": `changes.npz` says which cells changed; "boxes": those
@@ -62,106 +56,10 @@ class ChangeScores(Scores):
     spurious: int
 
 
-class FoundChange(NamedTuple):
-    """A change of a place, on the lattice of the truth.
-
-    Attributes:
-        kind: as in `changes.json`.
-        before, after: index among the accepted sessions, by date.
-        came, left: (H, W) where something is now, and where something was; of doors both.
-    """
-
-    kind: str
-    before: int
-    after: int
-    came: Bool
-    left: Bool
-
-    @property
-    def cells(self) -> Bool:
-        """(H, W) all of them."""
-        return self.came | self.left
-
-
-def read_changes(
-    place: Path, sessions: list[PlacedSession], T_world_place: Float, cells: CellTruth
-) -> tuple[list[FoundChange], str]:
-    """The changes of a place and whether they come as "cells" or "boxes".
-
-    Args:
-        place: the folder.
-        sessions: the accepted ones, by date.
-        T_world_place: (3, 3).
-        cells: of the truth.
-
-    Raises:
-        InputError: a file is missing or damaged.
-    """
-    path = place / "changes.json"
-    tree = read_json(path)
-    index = {one.name: k for k, one in enumerate(sessions)}
-    own = place / "changes.npz"
-    centres = cells.lattice.centres()
-    T = np.linalg.inv(T_world_place)
-    at = centres @ T[:2, :2].T + T[:2, 2]
-    named = _read_cells(own, T_world_place, cells) if own.is_file() else None
-    try:
-        found = [_read_change(one, index, at, named) for one in tree]
-    except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise InputError(f"is damaged: {error!r}", where=str(path)) from error
-    return found, "boxes" if named is None else "cells"
-
-
-def _read_change(
-    one: dict[str, Any], index: dict[str, int], at: Float, named: dict[int, Bool] | None
-) -> FoundChange:
-    kind, (before, after) = str(one["kind"]), (index[name] for name in one["between"])
-    if kind not in _KINDS:
-        raise ValueError(f"kind '{kind}'")
-    box = _fill(one["box"], at)
-    was = _fill(one["from_box"], at) if one.get("from_box") else np.zeros_like(box)
-    if named is not None:
-        own = named.get(int(one["id"]), np.zeros_like(box))
-        box, was = box & own, was & own
-    if kind == "door":
-        box = was = box | was
-    elif kind == "gone":
-        box, was = np.zeros_like(box), box
-    return FoundChange(kind, before, after, box, was)
-
-
-def _fill(box: list[float], at: Float) -> Bool:
-    """(H, W) the cells, with centres at (H, W, 2), within a box grown by one cell."""
-    x0, y0, x1, y1 = map(float, box[:4])
-    x, y = at[..., 0], at[..., 1]
-    inside = (x >= x0 - CELL) & (x <= x1 + CELL)
-    return np.asarray(inside & (y >= y0 - CELL) & (y <= y1 + CELL))
-
-
-def _read_cells(path: Path, T_world_place: Float, cells: CellTruth) -> dict[int, Bool]:
-    """The cells of each change by its id: `change` (K,) and their centres `xy` (K, 2)."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            ids, xy = np.asarray(file["change"]), np.asarray(file["xy"], np.float64)
-        if xy.shape != (len(ids), 2):
-            raise ValueError(f"xy is {xy.shape}")
-    except (OSError, ValueError, KeyError, EOFError) as error:
-        raise InputError(f"is damaged: {error}", where=str(path)) from error
-    points = moved(T_world_place, xy)
-    inside = cells.lattice.holds(points)
-    ids, points = ids[inside], points[inside]
-    out = {}
-    for number in np.unique(ids).tolist():
-        flat = np.zeros(cells.lattice.shape[0] * cells.lattice.shape[1], bool)
-        flat[cells.lattice.cells(points[ids == number])] = True
-        out[int(number)] = flat.reshape(cells.lattice.shape)
-    return out
-
-
 def score_changes(
     found: list[FoundChange],
     source: str,
-    cells: CellTruth,
+    cells: ChangeTruth,
     truth: SessionTruth,
     sessions: list[int],
 ) -> ChangeScores:
@@ -169,13 +67,13 @@ def score_changes(
 
     Args:
         found: from `read_changes`.
-        source: the same.
+        source: "cells" or "boxes", see `ChangeScores`.
         cells: the truth about S sessions, by date.
         truth: of all sessions.
         sessions: (S,) their numbers in it.
     """
     true, called, right, recalled = 0, 0, 0, 0
-    real = [np.zeros(cells.lattice.shape, bool) for _ in found]
+    real = [np.zeros(cells.fixed.shape, bool) for _ in found]
     for i, j, both in _pairs(cells):
         changed, either = _true_changes(cells, i, j)
         changed &= both
@@ -184,10 +82,11 @@ def score_changes(
         for k in meanwhile:
             real[k] |= found[k].cells & changed
         mask = _net_cells([found[k] for k in meanwhile], cells) & flips & both
-        near = widen(changed)
-        mask &= near | ~widen(either)
+        near = cells.widen(changed)
+        mask &= near | ~cells.widen(either)
         true, called = true + int(changed.sum()), called + int(mask.sum())
-        right, recalled = right + int((mask & near).sum()), recalled + _hit(changed, mask)
+        right += int((mask & near).sum())
+        recalled += int((changed & cells.widen(mask)).sum())
     precision, recall = _ratio(right, called), _ratio(recalled, true)
     events = list(list_events(cells, truth, sessions))
     dates = [_match(event, found) for event in events]
@@ -210,10 +109,10 @@ def score_changes(
     )
 
 
-def _net_cells(changes: list[FoundChange], cells: CellTruth) -> Bool:
-    """(H, W) cells of changes, but those to which something came before it left again, or it left
+def _net_cells(changes: list[FoundChange], cells: ChangeTruth) -> Bool:
+    """Cells of changes, but those to which something came before it left again, or it left
     before something came."""
-    mask, undone = (np.zeros(cells.lattice.shape, bool) for _ in range(2))
+    mask, undone = (np.zeros(cells.fixed.shape, bool) for _ in range(2))
     for one in changes:
         mask |= one.cells
         earlier = [other for other in changes if other.after <= one.before]
@@ -223,16 +122,12 @@ def _net_cells(changes: list[FoundChange], cells: CellTruth) -> Bool:
     return mask & ~undone
 
 
-def _hit(changed: Bool, mask: Bool) -> int:
-    return int((changed & widen(mask)).sum())
-
-
 def _ratio(part: float, whole: float) -> float:
     return part / whole if whole else float("nan")
 
 
-def _pairs(cells: CellTruth) -> Iterator[tuple[int, int, Bool]]:
-    """Two sessions each, and the cells (H, W) that both saw, and none between them."""
+def _pairs(cells: ChangeTruth) -> Iterator[tuple[int, int, Bool]]:
+    """Two sessions each, and the cells that both saw, and none between them."""
     seen = [one.seen for one in cells.seen]
     for i in range(len(seen)):
         left = seen[i].copy()
@@ -241,10 +136,10 @@ def _pairs(cells: CellTruth) -> Iterator[tuple[int, int, Bool]]:
             left &= ~seen[j]
 
 
-def _true_changes(cells: CellTruth, i: int, j: int) -> tuple[Bool, Bool]:
-    """(H, W) cells that changed and were looked at, and all through which a surface ran once."""
+def _true_changes(cells: ChangeTruth, i: int, j: int) -> tuple[Bool, Bool]:
+    """Cells that changed and were looked at, and all through which a surface ran once."""
     a, b = cells.surfaces[i], cells.surfaces[j]
-    hit = [widen(one.hits >= MIN_BEAMS) for one in (cells.seen[i], cells.seen[j])]
+    hit = [cells.widen(one.hits >= MIN_BEAMS) for one in (cells.seen[i], cells.seen[j])]
     free = [one.passes >= MIN_BEAMS for one in (cells.seen[i], cells.seen[j])]
     return (a & ~b & hit[0] & free[1]) | (b & ~a & hit[1] & free[0]), a != b
 

@@ -6,8 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.eval.session_cells import MIN_BEAMS, CellTruth, widen
-from stillmap.sim.objects import place_faces
+from stillmap.eval.session_cells import MIN_BEAMS, ChangeTruth
 from stillmap.sim.session_truth import SessionTruth
 
 Bool = NDArray[np.bool_]
@@ -22,7 +21,7 @@ class Event(NamedTuple):
         came: to it.
         seen: the last session that saw the place before, and the first one after.
         true: the last session before and the first one after, whether they saw it or not.
-        cells: (H, W) of its surface, that both of `seen` saw.
+        cells: (H, W), in 3D (K,), of its surface, that both of `seen` saw.
     """
 
     came: bool
@@ -36,15 +35,14 @@ class Event(NamedTuple):
         return early and self.true[1] <= after <= self.seen[1]
 
 
-def list_events(cells: CellTruth, truth: SessionTruth, sessions: list[int]) -> Iterator[Event]:
+def list_events(cells: ChangeTruth, truth: SessionTruth, sessions: list[int]) -> Iterator[Event]:
     """The true changes between the sessions that could be observed."""
     for change in truth.changes:
         one = truth.objects[change.object]
         for came, at in ((True, change.between[1]), (False, change.between[0])):
-            thing = one.thing(at)
-            if thing is None:
+            surface = cells.draw_object(truth, change.object, at)
+            if not surface.any():
                 continue
-            surface = cells.lattice.draw(place_faces(thing, thing.stays[0])) & ~cells.fixed
             looked = [
                 surface & _looked(cells, k, one.places[s] == one.places[at])
                 for k, s in enumerate(sessions)
@@ -62,7 +60,7 @@ def list_events(cells: CellTruth, truth: SessionTruth, sessions: list[int]) -> I
                 yield Event(came, (first, last), (before[-1], after[0]), both)
 
 
-def _looked(cells: CellTruth, session: int, is_there: bool) -> Bool:
-    """(H, W) cells in which a session saw that a surface is there, or is not."""
+def _looked(cells: ChangeTruth, session: int, is_there: bool) -> Bool:
+    """Cells in which a session saw that a surface is there, or is not."""
     seen = cells.seen[session]
-    return widen(seen.hits >= MIN_BEAMS) if is_there else seen.passes >= MIN_BEAMS
+    return cells.widen(seen.hits >= MIN_BEAMS) if is_there else seen.passes >= MIN_BEAMS

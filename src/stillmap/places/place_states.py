@@ -11,7 +11,7 @@ from stillmap.core.components import neighbor_pairs
 from stillmap.core.short_repr import ShortRepr
 from stillmap.places import session_hmm
 from stillmap.places.beam_cells import cell_keys
-from stillmap.places.evidence import BLOCK, Evidence
+from stillmap.places.evidence import BLOCK, Evidence, crop_without_gaps
 from stillmap.places.session_hmm import CellStates
 
 Float = NDArray[np.float64]
@@ -138,7 +138,7 @@ def _observe_tile(sessions: Sequence[Evidence], tile: Tile) -> tuple[Cells, NDAr
     halo = TOLERANCE[D]
     low, shape = tile.low - halo, tuple(n + 2 * halo for n in tile.shape)
     inner = (slice(halo, -halo),) * D
-    sums = [one.crop(low, shape) for one in sessions]
+    sums = [crop_without_gaps(one, low, shape) for one in sessions]
     is_candidate = np.zeros(tile.shape, np.bool_)
     for hits, _ in sums:
         strongest = ndimage.maximum_filter(hits, 2 * halo + 1, mode="constant")

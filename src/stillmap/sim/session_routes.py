@@ -122,7 +122,7 @@ def is_within(points: Float, region: Region) -> NDArray[np.bool_]:
 
 
 def draw_piece(
-    route: tuple[Point, ...], length: float, rng: np.random.Generator, start: float | None = None
+    route: tuple[Point, ...], length: float, rng: np.random.Generator, begin: float | None = None
 ) -> tuple[Point, ...]:
     """A piece of a street's route of `length` metres, or all of it, a little to the side.
 
@@ -130,12 +130,12 @@ def draw_piece(
         route: points in metres.
         length: metres.
         rng: generator.
-        start: share of the possible begins, 0 to 1; None: random.
+        begin: metres along the route; None: random.
     """
     line = np.array(route, float)
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
     room = max(0.0, along[-1] - length)
-    begin = room * (rng.random() if start is None else start)
+    begin = room * rng.random() if begin is None else min(max(begin, 0.0), room)
     end = min(begin + length, along[-1])
     aside = rng.uniform(-_MAX_ASIDE, _MAX_ASIDE)
     corners = along[(along > begin + 1.0) & (along < end - 1.0)]

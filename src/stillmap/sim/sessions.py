@@ -30,6 +30,7 @@ class SessionOptions:
         has_changes: whether things are moved between sessions.
         other_mounts: whether each session has the sensor mounted otherwise.
         odd_sensor: whether one session has half the beams or a narrower field of view.
+        begins: of each session in a street, metres along its route; empty: random.
     """
 
     count: int
@@ -37,6 +38,7 @@ class SessionOptions:
     has_changes: bool = True
     other_mounts: bool = True
     odd_sensor: bool = True
+    begins: tuple[float, ...] = ()
 
 
 class SessionPlan(NamedTuple):
@@ -92,7 +94,8 @@ def plan_sessions(scene: Scene, options: SessionOptions, seed: int = 0) -> Sessi
             lights=(),
             things=tuple(t for one in objects if (t := one.thing(session)) is not None),
         )
-        scenes.append(_vary(base, options, session == odd, region, rng))
+        begin = options.begins[session] if options.begins else None
+        scenes.append(_vary(base, options, session == odd, (region, begin), rng))
         stamps.append((session * _DAY + int(rng.integers(0, _DAY // 3))) * 10**9)
     seeds = tuple(int(rng.integers(1 << 31)) for rng in rngs)
     return SessionPlan(scene.name, tuple(scenes), objects, tuple(stamps), seeds)
@@ -127,8 +130,9 @@ def _require_plain(scene: Scene, options: SessionOptions) -> None:
     """
     if options.count < 1:
         raise InputError(f"the number of sessions must be 1 or more, got {options.count}")
-    if options.regions and len(options.regions) != options.count:
-        raise InputError("as many regions as sessions")
+    for of_sessions in (options.regions, options.begins):
+        if of_sessions and len(of_sessions) != options.count:
+            raise InputError("as many regions and begins as sessions")
     if scene.things:
         hint = "the same world without '-moved'"
         raise InputError(f"the things of '{scene.name}' move within a recording", hint=hint)
@@ -147,17 +151,23 @@ def _vary(
     scene: Scene,
     options: SessionOptions,
     odd: bool,
-    region: Region | None,
+    where: tuple[Region | None, float | None],
     rng: np.random.Generator,
 ) -> Scene:
-    """The scene with a route, a number of scans and a sensor of its own."""
+    """The scene with a route, a number of scans and a sensor of its own.
+
+    where: the region in which the robot stays, or where along a street it begins.
+    """
+    region, begin = where
     is_drive = scene.robot.radius > 0.5  # a car keeps to the street
     speed = scene.robot.speed if is_drive else max(_MIN_SPEED, scene.robot.speed)
     seconds = _SECONDS_3D if scene.in_3d else _SECONDS
     scans = scene.robot.scans or round(seconds * scene.scan_rate)
     length = speed * scans / scene.scan_rate
     route = (
-        draw_piece(scene.route, length, rng) if is_drive else draw_tour(scene, length, rng, region)
+        draw_piece(scene.route, length, rng, begin)
+        if is_drive
+        else draw_tour(scene, length, rng, region)
     )
     scene = dataclasses.replace(
         scene,

@@ -1,0 +1,77 @@
+"""Changes of places in 3D: right ones are found, wrong dates and places are not."""
+
+import numpy as np
+import pytest
+
+from stillmap.eval.session_changes import ChangeScores, score_changes
+from stillmap.eval.session_found import FoundChange
+from stillmap.eval.session_voxels import VOXEL, Voxels, VoxelTruth, collect_voxels
+from stillmap.sim import scene_by_name
+from stillmap.sim.session_truth import SessionTruth, load_session_truth
+from stillmap.sim.session_writer import write_sessions
+from stillmap.sim.sessions import SessionOptions, plan_sessions
+
+SWEEPS = {"lidar": {"channels": 12, "columns": 120}, "robot": {"scans": 12}}
+SESSIONS = [0, 1, 2]
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory: pytest.TempPathFactory) -> SessionTruth:
+    """Three sessions of a piece of a street."""
+    folder = tmp_path_factory.mktemp("sessions") / "days"
+    options = SessionOptions(3, begins=(40.0, 40.0, 42.0), odd_sensor=False)
+    write_sessions([plan_sessions(scene_by_name("street-empty", SWEEPS), options, 3)], folder)
+    return load_session_truth(folder)
+
+
+@pytest.fixture(scope="module")
+def cells(truth: SessionTruth) -> VoxelTruth:
+    return collect_voxels(truth, SESSIONS, np.empty((0, 3)))
+
+
+def true_changes(truth: SessionTruth, cells: VoxelTruth) -> list[FoundChange]:
+    found = []
+    for change in truth.changes:
+        left, came = (cells.draw_object(truth, change.object, k) for k in change.between)
+        found.append(FoundChange(change.kind, *change.between, came & ~left, left & ~came))
+    return found
+
+
+def score(found: list[FoundChange], truth: SessionTruth, cells: VoxelTruth) -> ChangeScores:
+    return score_changes(found, "cells", cells, truth, SESSIONS)
+
+
+def test_true_changes_score_perfectly(truth: SessionTruth, cells: VoxelTruth) -> None:
+    scores = score(true_changes(truth, cells), truth, cells)
+    assert scores.cells > 30
+    assert scores.f1 > 0.98
+    assert scores.events > 1
+    assert scores.events_found == scores.events
+    assert scores.dates_right == 1.0
+
+
+def test_nothing_found_is_no_recall(truth: SessionTruth, cells: VoxelTruth) -> None:
+    scores = score([], truth, cells)
+    assert scores.recall == 0.0
+    assert scores.events_found == 0
+
+
+def test_changes_of_another_place_are_spurious(truth: SessionTruth, cells: VoxelTruth) -> None:
+    wrong = [
+        one._replace(came=one.left & False, left=cells.fixed) for one in true_changes(truth, cells)
+    ]
+    scores = score(wrong, truth, cells)
+    assert scores.recall < 0.2
+    assert scores.spurious > 0
+
+
+def test_voxels_are_found_by_their_points_and_have_26_neighbours() -> None:
+    steps = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3), axis=-1).reshape(-1, 3)
+    centre = np.array([-3.1, 5.3, -0.1])
+    voxels = Voxels(centre + VOXEL * steps)
+    assert len(voxels.key) == 27
+    middle = np.zeros(27, bool)
+    middle[voxels.find(centre[None])] = True
+    assert voxels.widen(middle).all()
+    np.testing.assert_allclose(voxels.centres()[middle][0], centre, atol=0.5 * VOXEL)
+    assert voxels.find(centre[None] + 1.0) == [-1]
