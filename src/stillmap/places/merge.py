@@ -77,7 +77,9 @@ def merge_sessions(
         place, refused = _grow(place, sessions, job, threads, progress)
         refusals += refused
         if len(place.sessions) < 2:
-            raise InputError(_describe_failure(refusals), hint="add a session whose route overlaps both")
+            raise InputError(
+                _describe_failure(refusals), hint="add a session whose route overlaps both"
+            )
         if job.frame is not None:
             place = update_evidence(_reframe(place, job.frame), threads)
         for one in refused:
