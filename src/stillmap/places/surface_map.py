@@ -21,7 +21,7 @@ _LIMITS = {2: (0.75, 2.0), 3: (3.0, 6.0)}
 
 
 _SHIFT, _MAX_SHIFTED = 0.4, 0.75  # m; share of the agreeing squares that may agree after it
-_CONFLICT_WEIGHT = 5.0
+CONFLICT_WEIGHT = 5.0
 
 
 class Comparison(NamedTuple):
@@ -38,7 +38,7 @@ class Comparison(NamedTuple):
     @property
     def score(self) -> float:
         """Squares in favour; one in conflict outweighs several: most places agree in part."""
-        return self.agree - _CONFLICT_WEIGHT * self.conflict
+        return self.agree - CONFLICT_WEIGHT * self.conflict
 
 
 @dataclass(frozen=True, eq=False)
