@@ -20,7 +20,7 @@ _STEP = 2  # cells of the evidence along the edge of a square
 _LIMITS = {2: (0.75, 2.0), 3: (3.0, 6.0)}
 
 
-_SHIFT, _MAX_SHIFTED = 0.4, 0.75  # m; share of the agreeing squares that may agree after it
+_SHIFT, _MAX_SHIFTED = 0.4, 0.75  # m; share of the score that may be left after it
 CONFLICT_WEIGHT = 5.0
 
 
@@ -121,14 +121,14 @@ def compare_maps(place: SurfaceMap, session: SurfaceMap, T_place_session: Float)
 
 
 def is_determined(place: SurfaceMap, session: SurfaceMap, T_place_session: Float) -> bool:
-    """Whether fewer surfaces agree wherever else the session is shifted to by a few decimetres.
+    """Whether the maps agree less wherever else the session is shifted to by a few decimetres.
 
-    Along a bare corridor as many do.
+    Along a bare corridor they agree as much.
     """
-    agree = compare_maps(place, session, T_place_session).agree
+    score = compare_maps(place, session, T_place_session).score
     for angle in np.arange(8) * (np.pi / 4.0):
         shift = se2.matrix(_SHIFT * np.cos(angle), _SHIFT * np.sin(angle), 0.0)
-        if compare_maps(place, session, shift @ T_place_session).agree > _MAX_SHIFTED * agree:
+        if compare_maps(place, session, shift @ T_place_session).score > _MAX_SHIFTED * score:
             return False
     return True
 
