@@ -1,6 +1,7 @@
 """`stillmap merge` on sessions of one place: alignment, changes, growth, laps and pieces.
 
-python benchmarks/sessions.py alignment --data DIR [--seeds 3] [--lasers FOLDER]
+python benchmarks/sessions.py alignment --data DIR [--first-seed 0] [--seeds 3]
+    [--lasers FOLDER]
 python benchmarks/sessions.py labels --data DIR [--worlds office hall] [--seeds 3]
     [--people N]
 python benchmarks/sessions.py growth --data DIR [--world office] [--sessions 32]
@@ -77,6 +78,7 @@ def _parser() -> argparse.ArgumentParser:
         if name in ("alignment", "labels", "cuts"):
             one.add_argument("--seeds", type=int, default=3)
         if name == "alignment":
+            one.add_argument("--first-seed", type=int, default=0)
             one.add_argument("--lasers", type=Path)
         if name in ("labels", "cuts"):
             one.add_argument("--worlds", nargs="+", default=["office", "hall"])
@@ -100,7 +102,8 @@ def _parser() -> argparse.ArgumentParser:
 def align_pairs(args: argparse.Namespace) -> str:
     """A line per class of overlap and per negative."""
     rows: dict[str, list[Done]] = {}
-    for pair in prepare_pairs(args.data, range(args.seeds)):
+    seeds = range(args.first_seed, args.first_seed + args.seeds)
+    for pair in prepare_pairs(args.data, seeds):
         rows.setdefault(pair.kind, []).append(_align(pair, args))
     for one, other in _STRANGERS if args.lasers else ():
         logs = [args.lasers / f"{name}.clf.gz" for name in (one, other)]

@@ -30,8 +30,9 @@ _MIN_AGREEING = 200
 # of another one, relative to the best, at which none may: things move between sessions, but
 # look-alike places fit in several ways (docs/sessions.md has the distributions)
 _MAX_CONFLICT, _MAX_RIVAL = 0.15, 0.6
-# the same where no keyframes need to fit: squares that agree, share in conflict, score of a rival
-_STRONG_AGREEING, _STRONG_CONFLICT, _STRONG_RIVAL = 1500, 0.06, 0.2
+# squares that must agree, and score of a rival, where the keyframes that fit do not say where a
+# session lies: the maps alone do
+_STRONG_AGREEING, _STRONG_RIVAL = 1000, 0.3
 _MIN_FITTING = 5  # nodes
 # std along the least known direction (m), and of the heading (rad), up to which a session is placed
 _MAX_STD, _MAX_HEADING_STD = 0.05, math.radians(0.5)
@@ -69,15 +70,15 @@ def find_placement(place: Sequence[PlacedSession], session: Session) -> Placemen
     cell = place[0].require_evidence()[1].resolution
     evidence = measure_evidence(session.planar, session.planar.poses, cell, 1)
     own = make_surface_map([evidence], D)
-    proposed = propose_alignments(known, own, session.planar)
+    proposed = propose_alignments(known, own)
     if refused := _doubt(proposed):
         return Placement(np.eye(3), refused=refused)
     if D == 3:  # sweeps are registered in space, which tells more than their planar views
         return Placement(proposed[0].T)
     best = test_alignment(place, session, proposed[0].T)
     refused = _uncertainty(best, session)
-    against = best.count(Verdict.CONTRADICTS)
-    if refused and not against and _is_strong(proposed) and is_determined(known, own, best.T):
+    contradicted = best.count(Verdict.CONTRADICTS) > best.count(Verdict.FITS)
+    if refused and not contradicted and _is_strong(proposed) and is_determined(known, own, best.T):
         return Placement(best.T)  # seen from afar, as across a hall: the maps alone say where it is
     return replace(best, refused=refused)
 
@@ -86,8 +87,7 @@ def _is_strong(proposed: list[Hypothesis]) -> bool:
     """Whether the comparison of the maps alone is enough."""
     best = proposed[0].comparison
     rival = max((other.comparison.score for other in proposed[1:]), default=0.0)
-    few = best.conflict <= _STRONG_CONFLICT * (best.agree + best.conflict)
-    return best.agree >= _STRONG_AGREEING and few and rival <= _STRONG_RIVAL * best.score
+    return best.agree >= _STRONG_AGREEING and rival <= _STRONG_RIVAL * best.score
 
 
 def _doubt(proposed: list[Hypothesis]) -> str:

@@ -20,8 +20,8 @@ _STEP = 2  # cells of the evidence along the edge of a square
 _LIMITS = {2: (0.75, 2.0), 3: (3.0, 6.0)}
 
 
-_SHIFT, _MAX_SHIFTED = 0.4, 0.75  # m; share of the agreeing squares that may agree after it
-_CONFLICT_WEIGHT = 5.0
+_SHIFT, _MAX_SHIFTED = 0.4, 0.75  # m; share of the score that may be left after it
+CONFLICT_WEIGHT = 5.0
 
 
 class Comparison(NamedTuple):
@@ -38,7 +38,7 @@ class Comparison(NamedTuple):
     @property
     def score(self) -> float:
         """Squares in favour; one in conflict outweighs several: most places agree in part."""
-        return self.agree - _CONFLICT_WEIGHT * self.conflict
+        return self.agree - CONFLICT_WEIGHT * self.conflict
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,14 +121,14 @@ def compare_maps(place: SurfaceMap, session: SurfaceMap, T_place_session: Float)
 
 
 def is_determined(place: SurfaceMap, session: SurfaceMap, T_place_session: Float) -> bool:
-    """Whether fewer surfaces agree wherever else the session is shifted to by a few decimetres.
+    """Whether the maps agree less wherever else the session is shifted to by a few decimetres.
 
-    Along a bare corridor as many do.
+    Along a bare corridor they agree as much.
     """
-    agree = compare_maps(place, session, T_place_session).agree
+    score = compare_maps(place, session, T_place_session).score
     for angle in np.arange(8) * (np.pi / 4.0):
         shift = se2.matrix(_SHIFT * np.cos(angle), _SHIFT * np.sin(angle), 0.0)
-        if compare_maps(place, session, shift @ T_place_session).agree > _MAX_SHIFTED * agree:
+        if compare_maps(place, session, shift @ T_place_session).score > _MAX_SHIFTED * score:
             return False
     return True
 
