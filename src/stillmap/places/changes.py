@@ -1,21 +1,19 @@
 """Changes between sessions: cells that are otherwise from a session on, grouped to objects."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.components import connected_components, neighbor_pairs
-from stillmap.core.short_repr import ShortRepr
 from stillmap.places.leaves import Leaf, fit_leaf, is_hinged, turn_about_hinge
+from stillmap.places.place_change import Kind, PlaceChange
 from stillmap.places.place_states import PlaceStates
 
 Float = NDArray[np.float64]
 Cells = NDArray[np.int64]
 Index = NDArray[np.intp]
-Kind = Literal["appeared", "gone", "moved", "door"]
 
 _MIN_PROBABILITY = 0.5  # that a cell changed
 _LINK_DISTANCE = 0.3  # m within which changed cells form one object
@@ -28,30 +26,6 @@ _MAX_MOTION, _MAX_RATIO, _SIDE_SLACK = 10.0, 1.6, 0.3
 _BESIDE = 3.0  # cells between a change and a cell that belongs to it
 _CLEAR, _SHARE = 2.0, 0.7  # nats of a clear observation; share of them that a cell beside takes
 _WALL_MARGIN = 2.0  # m around a leaf in which its gap is looked for
-
-
-@dataclass(frozen=True, eq=False)
-class PlaceChange(ShortRepr):
-    """Something that is otherwise from one session to the next that looked.
-
-    Attributes:
-        kind: it appeared, is gone, moved, or is a door in another position.
-        low, high: (D,) m, corners of its box: where it is now, or was.
-        from_low, from_high: (D,) of where it was before it moved; None otherwise.
-        before, after: indices of the sessions, in the order of time.
-        probability: that it changed.
-        cells: (K,) indices of its cells in `PlaceStates`, of both positions.
-    """
-
-    kind: Kind
-    low: Float
-    high: Float
-    before: int
-    after: int
-    probability: float
-    cells: Index
-    from_low: Float | None = None
-    from_high: Float | None = None
 
 
 class _Events(NamedTuple):
@@ -303,43 +277,3 @@ def _join(gone: PlaceChange, came: PlaceChange, kind: Kind, place: PlaceStates) 
         low, high = _box(place, cells)
         return replace(joined, low=low, high=high)
     return replace(joined, from_low=gone.low, from_high=gone.high)
-
-
-def change_records(changes: Sequence[PlaceChange], names: Sequence[str]) -> list[dict[str, object]]:
-    """The entries of `changes.json`.
-
-    Args:
-        changes: in the order of time.
-        names: of the sessions, in the order of time.
-    """
-    out = []
-    for number, one in enumerate(changes):
-        record: dict[str, object] = {
-            "id": number,
-            "kind": one.kind,
-            "box": _corners(one.low, one.high),
-        }
-        if one.from_low is not None and one.from_high is not None:
-            record["from_box"] = _corners(one.from_low, one.from_high)
-        record["between"] = [names[one.before], names[one.after]]
-        record["probability"] = round(one.probability, 4)
-        out.append(record)
-    return out
-
-
-def _corners(low: Float, high: Float) -> list[float]:
-    """x0, y0, x1, y1, and in 3D z0, z1."""
-    plane = [*low[:2], *high[:2]]
-    return [round(float(x), 3) for x in (*plane, *(v for z in (low[2:], high[2:]) for v in z))]
-
-
-def change_cells(
-    changes: Sequence[PlaceChange], place: PlaceStates
-) -> dict[str, NDArray[np.generic]]:
-    """The cells of all changes: `change` (K,) the entry of `changes.json`, and `xy` (K, 2) or `xyz`
-    (K, 3), the centres of the cells in metres."""
-    cells = [one.cells for one in changes]
-    number = np.repeat(np.arange(len(changes), dtype=np.int32), [len(of) for of in cells])
-    of = np.concatenate([np.zeros(0, np.intp), *cells])
-    D = place.cells.shape[1]
-    return {"change": number, "xyz"[:D]: (place.cells[of] + 0.5) * place.resolution}
