@@ -101,10 +101,18 @@ def test_neighbours_of_one_history_decide_together():
 
 
 def test_evidence_grows_with_hits_and_passes_to_a_limit():
-    nats = weigh_evidence(
-        np.array([0, 1, 3, 60, 0, 0, 60], np.float32), np.array([0, 0, 0, 0, 1, 60, 60], np.float32)
-    )
+    hits = np.array([0, 1, 3, 60, 0, 0, 60], np.float32)
+    passes = np.array([0, 0, 0, 0, 1, 60, 20], np.float32)
+    nats = weigh_evidence(hits, passes, hits / np.maximum(hits + passes, 1.0))
     assert nats[0] == 0.0
     assert 0.0 < nats[1] < nats[2] < nats[3]
     assert nats[5] < nats[4] < 0.0
     assert nats[6] == nats[3]  # beams graze the cells beside a surface
+
+
+def test_who_paused_in_a_session_leaves_no_surface():
+    # twelve beams ended on somebody, and forty went through before and after
+    one = np.array([12.0], np.float32), np.array([40.0], np.float32)
+    paused = weigh_evidence(*one, np.array([12.0 / 52.0], np.float32))
+    stood = weigh_evidence(*one, np.array([0.9], np.float32))
+    assert paused[0] < 0.0 < stood[0]

@@ -1,56 +1,31 @@
 """Changes between sessions: cells that are otherwise from a session on, grouped to objects."""
 
-from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.components import connected_components, neighbor_pairs
-from stillmap.core.short_repr import ShortRepr
+from stillmap.places.leaves import Leaf, fit_leaf, is_hinged, turn_about_hinge
+from stillmap.places.place_change import Kind, PlaceChange
 from stillmap.places.place_states import PlaceStates
 
 Float = NDArray[np.float64]
 Cells = NDArray[np.int64]
 Index = NDArray[np.intp]
-Kind = Literal["appeared", "gone", "moved", "door"]
 
 _MIN_PROBABILITY = 0.5  # that a cell changed
 _LINK_DISTANCE = 0.3  # m within which changed cells form one object
-_MIN_CELLS = {2: 5, 3: 8}  # of a listed change
+# of an object away from static surface, and with what lies beside it: fewer are feet of who stood
+_MIN_CELLS, _MIN_LISTED = {2: 5, 3: 8}, {2: 8, 3: 8}
 _NOISE = 2.5  # cells: surfaces of the same class nearer to a static one are noise of poses
 # of an object that moved: greatest distance in m, ratio of its sides and of its cells before and
 # after, m by which a side may be seen shorter
 _MAX_MOTION, _MAX_RATIO, _SIDE_SLACK = 10.0, 1.6, 0.3
 _BESIDE = 3.0  # cells between a change and a cell that belongs to it
 _CLEAR, _SHARE = 2.0, 0.7  # nats of a clear observation; share of them that a cell beside takes
-# m: length of what is seen of a leaf, half its thickness with noise, between the ends at the hinge;
-# rad between two positions
-_LEAF, _LEAF_THICKNESS, _HINGE_GAP, _MIN_TURN = (0.3, 1.6), 0.12, 0.45, 0.15
-
-
-@dataclass(frozen=True, eq=False)
-class PlaceChange(ShortRepr):
-    """Something that is otherwise from one session to the next that looked.
-
-    Attributes:
-        kind: it appeared, is gone, moved, or is a door in another position.
-        low, high: (D,) m, corners of its box: where it is now, or was.
-        from_low, from_high: (D,) of where it was before it moved; None otherwise.
-        before, after: indices of the sessions, in the order of time.
-        probability: that it changed.
-        cells: (K,) indices of its cells in `PlaceStates`, of both positions.
-    """
-
-    kind: Kind
-    low: Float
-    high: Float
-    before: int
-    after: int
-    probability: float
-    cells: Index
-    from_low: Float | None = None
-    from_high: Float | None = None
+_WALL_MARGIN = 2.0  # m around a leaf in which its gap is looked for
 
 
 class _Events(NamedTuple):
@@ -88,7 +63,10 @@ def _find_groups(place: PlaceStates) -> list[_Events]:
     out = []
     for group in _group_events(apart, place):
         out += _split_by_time(group, min_cells)
-    return [_attach(group, beside, place) for group in out]
+    out = [_attach(group, beside, place) for group in out]
+    return [
+        group for group in out if len(np.unique(group.cell)) >= _MIN_LISTED[place.cells.shape[1]]
+    ]
 
 
 def _attach(group: _Events, beside: _Events, place: PlaceStates) -> _Events:
@@ -116,8 +94,11 @@ def _share_evidence(place: PlaceStates, groups: list[_Events]) -> PlaceStates:
     """The place with the evidence of each group in cells beside it that were not seen as clearly.
 
     Those that stood when the object did, of which a session did not see that they are otherwise.
+    Where objects change, sessions lie so well on each other that a cell counts by itself: near a
+    jamb the tolerance would fill the gap of an open door.
     """
     evidence = place.evidence.copy()
+    is_static = place.states.p_static > _MIN_PROBABILITY
     for group in groups:
         of = np.unique(group.cell)
         usual = np.median(place.evidence[of], axis=0)
@@ -128,11 +109,12 @@ def _share_evidence(place: PlaceStates, groups: list[_Events]) -> PlaceStates:
         low, high = place.cells[of].min(axis=0) - 3, place.cells[of].max(axis=0) + 3
         inside = np.flatnonzero(((place.cells >= low) & (place.cells <= high)).all(axis=1))
         inside = inside[_within(place.cells[inside], place.cells[of])]
-        stood = (place.evidence[inside][:, there] > _CLEAR).any(axis=1)
-        seen_since = (place.evidence[inside][:, gone] > _CLEAR).any(axis=1)
-        for k in inside[stood & ~seen_since].tolist():
-            unclear = np.abs(evidence[k]) < _CLEAR
-            evidence[k, unclear] = _SHARE * usual[unclear]
+        of_each = np.where(is_static[inside, None], place.own[inside], place.evidence[inside])
+        stood = (of_each[:, there] > _CLEAR).any(axis=1)
+        seen_since = (of_each[:, gone] > _CLEAR).any(axis=1)
+        fits = stood & ~seen_since
+        of_each = of_each[fits]
+        evidence[inside[fits]] = np.where(np.abs(of_each) < _CLEAR, _SHARE * usual, of_each)
     changed = np.flatnonzero((evidence != place.evidence).any(axis=1))
     return place.with_evidence(evidence, changed)
 
@@ -213,31 +195,38 @@ def _box(place: PlaceStates, cells: Index) -> tuple[Float, Float]:
 
 def _pair_positions(changes: list[PlaceChange], place: PlaceStates) -> list[PlaceChange]:
     """Objects that are gone in one place and appeared in another at the same time are one."""
-    gone = [one for one in changes if one.kind == "gone"]
-    came = [one for one in changes if one.kind == "appeared"]
+    hinged = _find_doors(changes, place)
+    gone = [k for k, one in enumerate(changes) if one.kind == "gone"]
+    came = [k for k, one in enumerate(changes) if one.kind == "appeared"]
     pairs = []
-    for i, one in enumerate(gone):
-        for j, other in enumerate(came):
+    for i in gone:
+        for j in came:
+            one, other = changes[i], changes[j]
             if (one.before, one.after) == (other.before, other.after):
-                kind, cost = _compare_positions(one, other, place)
+                kind, cost = _compare_positions(one, other, place, bool(hinged & {i, j}))
                 if kind:
                     pairs.append((cost, i, j, kind))
-    used_gone, used_came, out = set[int](), set[int](), list[PlaceChange]()
+    used, out = set[int](), list[PlaceChange]()
     for _, i, j, kind in sorted(pairs):
-        if i not in used_gone and j not in used_came:
-            used_gone.add(i)
-            used_came.add(j)
-            out.append(_join(gone[i], came[j], kind, place))
-    out += [one for i, one in enumerate(gone) if i not in used_gone]
-    return out + [one for j, one in enumerate(came) if j not in used_came]
+        if not used & {i, j}:
+            used |= {i, j}
+            out.append(_join(changes[i], changes[j], kind, place))
+    # most often one position of a door is seen: shut it hides the other, open it stands aside
+    out += [replace(changes[k], kind="door") for k in sorted(hinged - used)]
+    return out + [one for k, one in enumerate(changes) if k not in used | hinged]
 
 
 def _compare_positions(
-    gone: PlaceChange, came: PlaceChange, place: PlaceStates
+    gone: PlaceChange, came: PlaceChange, place: PlaceStates, has_hinge: bool
 ) -> tuple[Kind | None, float]:
-    """Classify two positions as a door, a moved object, or unrelated (None), with a cost."""
-    if _is_door(place.cells[gone.cells], place.cells[came.cells], place.resolution):
-        return "door", -1.0
+    """Classify two positions as a door, a moved object, or unrelated (None), with a cost.
+
+    has_hinge: whether one of them stands beside a gap in a wall that it could shut.
+    """
+    if has_hinge:
+        one, other = _see_leaf(place, gone.cells), _see_leaf(place, came.cells)
+        turned = one is not None and other is not None and turn_about_hinge(one, other)
+        return ("door", -1.0) if turned else (None, 0.0)
     distance = float(np.linalg.norm(0.5 * (gone.low + gone.high - came.low - came.high)))
     sides = np.sort(gone.high - gone.low), np.sort(came.high - came.low)
     shorter, longer = np.minimum(*sides), np.maximum(*sides)
@@ -248,38 +237,35 @@ def _compare_positions(
     return None, 0.0
 
 
-def _is_door(gone: Cells, came: Cells, resolution: float) -> bool:
-    """Whether cells (n, D) that are gone and others that came are a leaf about one hinge.
-
-    Both are straight, about as long as each other and a leaf, and end in one place; cells at the
-    hinge are missing, as they lie beside the wall.
-    """
-    one, other = (
-        _fit_leaf(np.asarray(np.unique(cells[:, :2], axis=0) * resolution, np.float64))
-        for cells in (gone, came)
-    )
-    if one is None or other is None:
-        return False
-    lengths = sorted(float(np.linalg.norm(ends[1] - ends[0])) for ends in (one, other))
-    apart = np.linalg.norm(one[:, None] - other[None], axis=2)
-    i, j = np.unravel_index(int(apart.argmin()), (2, 2))
-    u, v = one[1 - i] - one[i], other[1 - j] - other[j]
-    cosine = float(u @ v / (np.linalg.norm(u) * np.linalg.norm(v)))
-    turned = np.arccos(np.clip(cosine, -1.0, 1.0))
-    alike = lengths[1] <= _MAX_RATIO * lengths[0] + _HINGE_GAP
-    return bool(apart[i, j] <= _HINGE_GAP and alike and turned >= _MIN_TURN)
+def _see_leaf(place: PlaceStates, cells: Index) -> Leaf | None:
+    """The leaf that changed cells are, seen from above."""
+    plane = np.unique(place.cells[cells][:, :2], axis=0)
+    return fit_leaf(np.asarray((plane + 0.5) * place.resolution, np.float64))
 
 
-def _fit_leaf(points: Float) -> Float | None:
-    """(2, 2) ends of a straight leaf through points (n, 2) in metres; None: they are none."""
-    offset = points - points.mean(axis=0)
-    axis = np.linalg.eigh(offset.T @ offset)[1][:, 1]
-    along, across = offset @ axis, offset @ [-axis[1], axis[0]]
-    length = float(np.ptp(along))
-    if not _LEAF[0] <= length <= _LEAF[1] or float(np.abs(across).max()) > _LEAF_THICKNESS:
-        return None
-    ends: Float = points.mean(axis=0) + np.outer([along.min(), along.max()], axis)
-    return ends
+def _find_doors(changes: list[PlaceChange], place: PlaceStates) -> set[int]:
+    """The changes that are a leaf beside a gap in a wall that it could shut."""
+    is_static = place.states.p_static > _MIN_PROBABILITY
+    for one in changes:
+        is_static[one.cells] = False
+    static = place.cells[is_static]
+    margin = np.full(static.shape[1], np.ceil(_WALL_MARGIN / place.resolution))
+    out = set()
+    for k, one in enumerate(changes):
+        leaf = _see_leaf(place, one.cells)
+        if leaf is None:
+            continue
+        low, high = one.low / place.resolution - margin, one.high / place.resolution + margin
+        if len(low) == 3:  # walls at the height of its upper half, without floor and lintel
+            low[2], high[2] = (
+                (0.5 * (one.low + one.high) / place.resolution)[2],
+                high[2] - margin[2],
+            )
+        near = static[((static >= low) & (static < high)).all(axis=1)]
+        wall = (np.unique(near[:, :2], axis=0) + 0.5) * place.resolution
+        if is_hinged(leaf, np.asarray(wall)):
+            out.add(k)
+    return out
 
 
 def _join(gone: PlaceChange, came: PlaceChange, kind: Kind, place: PlaceStates) -> PlaceChange:

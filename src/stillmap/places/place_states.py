@@ -19,9 +19,10 @@ Cells = NDArray[np.int64]
 
 _BLOCKS_PER_TILE = 8  # along each axis
 # cells: within so many of each other two surfaces are the same; around a cell that must be passed
-TOLERANCE, _FREE_RADIUS = {2: 2, 3: 1}, 1
+TOLERANCE, _FREE_RADIUS = 1, 1
+_CANDIDATE_RADIUS = {2: 2, 3: 1}  # cells within which hits of one surface scatter
 MIN_HITS = 0.75  # expected static hits of a session that make a cell a candidate
-_MIN_PROMINENCE = 0.2  # share of the hits of the most-hit cell within the tolerance
+_MIN_PROMINENCE = 0.2  # share of the hits of the most-hit cell within that radius
 _POOL_RADIUS = 3.0  # cells within which those of one history decide together
 _CLEAR = 1.0  # nats from which on a session says something about a cell
 _MAX_FIT_ROWS = 50_000  # cells that the weights are fitted to
@@ -41,6 +42,7 @@ class PlaceStates(ShortRepr):
     Attributes:
         cells: (K, D) int64, sorted by tile.
         evidence: (K, S) float32, nats, see `session_hmm`; sessions in the order of time.
+        own: (K, S) float32, nats, the same without a tolerance: of each cell by itself.
         states: of each cell over the sessions.
         resolution: m, edge of a cell.
         weights: (3,) of static, free and changing cells.
@@ -48,6 +50,7 @@ class PlaceStates(ShortRepr):
 
     cells: Cells
     evidence: NDArray[np.float32]
+    own: NDArray[np.float32]
     states: CellStates
     resolution: float
     weights: Float
@@ -107,18 +110,18 @@ def estimate_place(sessions: Sequence[Evidence]) -> PlaceStates:
         sessions: evidence of each in the frame of the place, in the order of time.
     """
     D = sessions[0].dimension
-    cells, evidence = [np.zeros((0, D), np.int64)], [np.zeros((0, len(sessions)), np.float32)]
+    cells, observed = [np.zeros((0, D), np.int64)], [np.zeros((2, 0, len(sessions)), np.float32)]
     for tile in iter_tiles(sessions):
         of_tile, nats = _observe_tile(sessions, tile)
         cells.append(of_tile)
-        evidence.append(nats)
-    table = np.concatenate(evidence)
+        observed.append(nats)
+    table, own = np.concatenate(observed, axis=1)
     step = max(-(-len(table) // _MAX_FIT_ROWS), 1)
     weights = session_hmm.fit_weights(table[::step].astype(np.float64))
     all_cells = np.concatenate(cells)
     pairs = neighbor_pairs(all_cells, _POOL_RADIUS)
     states = session_hmm.estimate_states(table.astype(np.float64), weights, pairs)
-    return PlaceStates(all_cells, table, states, sessions[0].resolution, weights)
+    return PlaceStates(all_cells, table, own, states, sessions[0].resolution, weights)
 
 
 def iter_tiles(sessions: Sequence[Evidence]) -> Iterator[Tile]:
@@ -131,22 +134,44 @@ def iter_tiles(sessions: Sequence[Evidence]) -> Iterator[Tile]:
 
 
 def _observe_tile(sessions: Sequence[Evidence], tile: Tile) -> tuple[Cells, NDArray[np.float32]]:
-    """Candidate cells (k, D) of a tile, and the evidence (k, S) of every session."""
-    from scipy import ndimage  # slow to load
-
+    """Candidate cells (k, D) of a tile, and the evidence (2, k, S) of every session: with the
+    tolerance, and of each cell by itself."""
     D = len(tile.shape)
-    halo = TOLERANCE[D]
+    halo = _CANDIDATE_RADIUS[D]
     low, shape = tile.low - halo, tuple(n + 2 * halo for n in tile.shape)
     inner = (slice(halo, -halo),) * D
     sums = [crop_without_gaps(one, low, shape) for one in sessions]
-    is_candidate = np.zeros(tile.shape, np.bool_)
-    for hits, _ in sums:
-        strongest = ndimage.maximum_filter(hits, 2 * halo + 1, mode="constant")
-        is_candidate |= (hits >= np.maximum(MIN_HITS, _MIN_PROMINENCE * strongest))[inner]
-    at = np.nonzero(is_candidate)
-    nats = np.empty((len(at[0]), len(sessions)), np.float32)
+    at = np.nonzero(_find_candidates([hits for hits, _ in sums], halo)[inner])
+    nats = np.empty((2, len(at[0]), len(sessions)), np.float32)
     for s, (hits, passes) in enumerate(sums):
-        near = ndimage.maximum_filter(hits, 2 * TOLERANCE[D] + 1, mode="constant")
-        around = ndimage.minimum_filter(passes, 2 * _FREE_RADIUS + 1, mode="constant")
-        nats[:, s] = session_hmm.weigh_evidence(near[inner][at], around[inner][at])
+        share = hits / np.maximum(hits + passes, np.float32(1e-9))
+        for out, tolerance, around in ((0, TOLERANCE, _FREE_RADIUS), (1, 0, 0)):
+            most, fewest, stopped = (
+                _filter_around(layer, radius, largest)[inner][at]
+                for layer, radius, largest in (
+                    (hits, tolerance, True),
+                    (passes, around, False),
+                    (share, tolerance, True),
+                )
+            )
+            nats[out, :, s] = session_hmm.weigh_evidence(most, fewest, stopped)
     return np.stack(at, axis=1) + tile.low, nats
+
+
+def _find_candidates(hits: Sequence[NDArray[np.float32]], radius: int) -> NDArray[np.bool_]:
+    """The cells in which something stood in some session, and that are no noise of a wall."""
+    out = np.zeros(hits[0].shape, np.bool_)
+    for of in hits:
+        strongest = _filter_around(of, radius, largest=True)
+        out |= of >= np.maximum(MIN_HITS, _MIN_PROMINENCE * strongest)
+    return out
+
+
+def _filter_around(layer: NDArray[np.float32], radius: int, largest: bool) -> NDArray[np.float32]:
+    """The largest or smallest value of a layer within `radius` cells of each cell."""
+    from scipy import ndimage  # slow to load
+
+    if not radius:
+        return layer
+    of = ndimage.maximum_filter if largest else ndimage.minimum_filter
+    return np.asarray(of(layer, 2 * radius + 1, mode="constant"), np.float32)

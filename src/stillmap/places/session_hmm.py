@@ -19,8 +19,9 @@ Float = NDArray[np.float64]
 
 # nats: of a static hit within the tolerance, of a pass through all cells around; of one session at
 # most, since its beams share the session's errors
-_NATS_PER_HIT, _NATS_PER_PASS = 1.0, 1.5
+_NATS_PER_HIT, _NATS_PER_PASS = 1.5, 1.5
 _MAX_OCCUPIED, _MAX_FREE = 7.0, 9.0
+_MIN_STOPPED = 0.5  # share of the beams through a cell that a surface in it stops at least
 _SWITCH = 0.25  # probability that a changing cell is otherwise in the next session
 _WEIGHTS = (0.8, 0.1, 0.1)  # prior of static, free, changing
 # independent observations that neighbouring cells of one history amount to; nats of a cell at most
@@ -50,17 +51,22 @@ class CellStates(ShortRepr):
     observed: NDArray[np.bool_]
 
 
-def weigh_evidence(hits: NDArray[np.float32], passes: NDArray[np.float32]) -> NDArray[np.float32]:
+def weigh_evidence(
+    hits: NDArray[np.float32], passes: NDArray[np.float32], stopped: NDArray[np.float32]
+) -> NDArray[np.float32]:
     """Log likelihood ratio (nats) of occupied to free.
 
     Args:
         hits: of any shape, largest number of static hits within the tolerance.
         passes: of the same shape, smallest number of passes through the cells around.
+        stopped: of the same shape, largest share of hits among hits and passes of a cell within the
+            tolerance.
     """
     occupied = np.minimum(_NATS_PER_HIT * hits, _MAX_OCCUPIED)
-    # where something stands beams still graze the cells beside it
-    free = np.minimum(_NATS_PER_PASS * passes, _MAX_FREE) * np.maximum(1.0 - hits, 0.0)
-    return np.asarray(occupied - free)
+    free = np.minimum(_NATS_PER_PASS * passes, _MAX_FREE)
+    # a surface stops beams, though some still graze the cells beside it; who paused does not
+    solid = np.minimum(np.minimum(hits, stopped / _MIN_STOPPED), 1.0)
+    return np.asarray(solid * occupied - (1.0 - solid) * free)
 
 
 def fit_weights(evidence: Float, rare: tuple[float, float, float] = _WEIGHTS) -> Float:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from stillmap.core import arrays
 from stillmap.core.short_repr import ShortRepr
 from stillmap.places.beam_cells import BeamCells
-from stillmap.places.changes import PlaceChange
+from stillmap.places.place_change import PlaceChange
 from stillmap.places.place_states import PlaceStates
 
 Float = NDArray[np.float64]

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.short_repr import ShortRepr
-from stillmap.places.changes import Kind
+from stillmap.places.place_change import Kind
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]

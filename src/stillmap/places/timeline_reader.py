@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from stillmap.core.errors import InputError
 from stillmap.core.files import read_text, require_regular
-from stillmap.places.changes import Kind
 from stillmap.places.inputs import SESSIONS
+from stillmap.places.place_change import Kind
 from stillmap.places.reader import read_archive, read_sessions
 from stillmap.places.timeline import (
     ChangedCells,

@@ -13,11 +13,10 @@ from stillmap.core.arrays import write_npy, write_npz
 from stillmap.core.json import to_jsonable
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io.trajectory import write_tum
-from stillmap.places.change_files import change_cells, change_records
-from stillmap.places.changes import PlaceChange
 from stillmap.places.evidence import Evidence
 from stillmap.places.inputs import TIES
 from stillmap.places.place import Place, PlacedSession, Refusal
+from stillmap.places.place_change import PlaceChange, change_cells, change_records
 from stillmap.places.place_graph import Tie
 from stillmap.places.shown_state import ShownState, changed_cell_table, label_session
 from stillmap.places.store import STATE, read_beam_cells

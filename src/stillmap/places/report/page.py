@@ -14,8 +14,8 @@ from stillmap.core.grid_map import GridMap
 from stillmap.core.version import package_version
 from stillmap.io.trajectory import read_tum
 from stillmap.pipeline.options import MapMode
-from stillmap.places.changes import Kind
 from stillmap.places.pictures import KIND_COLORS, PlacePictures
+from stillmap.places.place_change import Kind
 from stillmap.places.report.marks import place_marks
 from stillmap.places.timeline import ChangeRecord, SessionRecord, Timeline, format_date_time
 from stillmap.places.timeline_reader import read_timeline

@@ -1,14 +1,42 @@
-"""The content of `changes.json` and `changes.npz`."""
+"""A change between sessions of a place, and the files that list them."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.places.changes import PlaceChange
+from stillmap.core.short_repr import ShortRepr
 from stillmap.places.place_states import PlaceStates
 
 Float = NDArray[np.float64]
+Index = NDArray[np.intp]
+Kind = Literal["appeared", "gone", "moved", "door"]
+
+
+@dataclass(frozen=True, eq=False)
+class PlaceChange(ShortRepr):
+    """Something that is otherwise from one session to the next that looked.
+
+    Attributes:
+        kind: it appeared, is gone, moved, or is a door in another position.
+        low, high: (D,) m, corners of its box: where it is now, or was.
+        from_low, from_high: (D,) of where it was before it moved; None otherwise.
+        before, after: indices of the sessions, in the order of time.
+        probability: that it changed.
+        cells: (K,) indices of its cells in `PlaceStates`, of both positions.
+    """
+
+    kind: Kind
+    low: Float
+    high: Float
+    before: int
+    after: int
+    probability: float
+    cells: Index
+    from_low: Float | None = None
+    from_high: Float | None = None
 
 
 def change_records(changes: Sequence[PlaceChange], names: Sequence[str]) -> list[dict[str, object]]:
