@@ -12,7 +12,6 @@ from stillmap.fleet.journal import Journal
 from stillmap.fleet.local_executor import Executor
 from stillmap.fleet.memory import estimate_memory, fitting_jobs, machine_memory
 from stillmap.fleet.outcomes import MAKE_ROOM, Outcome, outcome_of_error
-from stillmap.fleet.settings import Settings
 from stillmap.fleet.storage import Storage
 from stillmap.fleet.tasks import Inspect, Map, Merge, Task, outcome_of_label
 
@@ -104,26 +103,31 @@ def map_recordings(
 
 
 def merge_places(
-    jobs: Sequence[Job], storage: Storage, executor: Executor, journal: Journal, report: Reporter
+    jobs: Sequence[Job],
+    request: Request,
+    storage: Storage,
+    executor: Executor,
+    journal: Journal,
+    report: Reporter,
 ) -> list[Place]:
     """Merge the results of every place that has two of them."""
     members: dict[str, list[Job]] = {}
     for job in jobs:
         if job.source.place is not None:
             members.setdefault(job.source.place, []).append(job)
-    outcomes: dict[str, Outcome] = {}
-    tasks = []
+    settings, outcomes, tasks = request.settings.for_merging(), dict[str, Outcome](), list[Merge]()
     for name, of_place in members.items():
         done = [job for job in of_place if job.is_done]
         if len(done) < 2:
             continue
-        key = key_of("merge", [f"{job.source.name}:{job.key}" for job in done], Settings())
+        key = key_of("merge", [f"{job.source.name}:{job.key}" for job in done], settings)
         label = find_result(storage, f"{PLACES}/{name}", key)
         if label is not None:
             outcomes[name] = outcome_of_label(label)
             continue
         names = tuple(job.source.name for job in done)
-        tasks.append(Merge(name, names, tuple(job.source.input for job in done), key, storage.root))
+        sources = tuple(job.source.input for job in done)
+        tasks.append(Merge(name, names, sources, settings, key, storage.root))
     for task, outcome in _run_all(tasks, executor, "merging", journal, report):
         outcomes[task.name] = outcome
     return [Place(name, of_place, outcomes.get(name)) for name, of_place in members.items()]
