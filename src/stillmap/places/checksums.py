@@ -7,10 +7,9 @@ from pathlib import Path
 
 from stillmap.core.errors import InputError
 from stillmap.core.files import read_text, require_regular
-from stillmap.places.store import HINT, STATE
+from stillmap.places.store import BEAMS, HINT, STATE
 
 _FILE = "checksums.json"
-_BEAMS = ("stamp_ns", "offset", "hit")  # of `beams/`; labels are written anew by every merge
 _MAX_BYTES = 16 << 20
 _DIGEST = 16  # bytes: against damage and changes by hand, not against forgery
 
@@ -56,7 +55,7 @@ def _iter_files(home: Path) -> Iterator[Path]:
         require_regular(path)
         if path.is_file() and path.name != _FILE:
             yield path
-    for name in _BEAMS:
+    for name in BEAMS:
         path = home / "beams" / f"{name}.npy"
         require_regular(path)
         if path.is_file():

@@ -113,12 +113,13 @@ def write_place(folder: Path, result: PlaceResult, options: Options, map_state: 
     """
     place = result.place
     write_sessions(folder, result)
-    homes = [folder / "sessions" / one.session.name for one in place.sessions]
-    for home, one in zip(homes, place.sessions, strict=True):
-        place_objects(home, one)
+    objects = dict[Path, list[dict[str, Any]]]()
+    for one in place.sessions:
+        home = folder / "sessions" / one.session.name
+        objects[home] = place_objects(home, one)
         write_checksums(home)
     write_place_files(folder, result)
-    join_objects(folder, homes)
+    join_objects(folder, objects)
     if place.dimension == 3:
         write_place_clouds(folder, result)
     planar = [place.sessions[k].require_evidence()[1] for k in place.in_time()]

@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -52,32 +52,40 @@ def check_objects(state: Path) -> None:
         _split_cloud(path, path.read_bytes())
 
 
-def place_objects(home: Path, one: PlacedSession) -> None:
+def place_objects(home: Path, one: PlacedSession) -> list[dict[str, Any]]:
     """Write `objects/` of a session in the frame of the place.
 
     Args:
         home: `sessions/NAME`, with the objects in the session's frame in its state.
         one: the session in the place.
+
+    Returns:
+        The entries of its `objects.json`.
     """
     source, target = home / "state" / _ORIGINAL, home / _OBJECTS
-    shutil.rmtree(target, ignore_errors=True)
     if not source.is_dir():
-        return
+        return []
     target.mkdir()
     T = fit_alignment(one.session.node_poses, one.nodes)
     records = [_transform_record(record, T) for record in _read_records(source / _LIST)]
     _write_records(target / _LIST, records)
     for path in sorted(source.glob("*.ply")):
         _transform_cloud(path, target / path.name, T)
+    return records
 
 
-def join_objects(folder: Path, homes: Sequence[Path]) -> None:
-    """Write `objects/` and `traffic.npz` of a place: those of all sessions, numbered anew."""
+def join_objects(folder: Path, by_session: Mapping[Path, Sequence[dict[str, Any]]]) -> None:
+    """Write `objects/` and `traffic.npz` of a place: those of all sessions, numbered anew.
+
+    Args:
+        folder: of the place.
+        by_session: of each `sessions/NAME` the entries of its `objects.json`.
+    """
     target = folder / _OBJECTS
     target.mkdir()
     records = list[dict[str, Any]]()
-    for home in homes:
-        for record in _read_records(home / _OBJECTS / _LIST):
+    for home, of_session in by_session.items():
+        for record in of_session:
             number = len(records)
             cloud = home / _OBJECTS / f"{record['id']:04d}.ply"
             if cloud.is_file():

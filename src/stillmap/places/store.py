@@ -1,6 +1,7 @@
 """The state of a session in its place, `sessions/NAME/state/`: enough to merge further sessions
 without its recording."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 from stillmap.core import arrays
 from stillmap.core.arrays import write_npy
 from stillmap.core.errors import InputError
+from stillmap.core.files import require_regular
 from stillmap.io import stillmap_folder
 from stillmap.io.stillmap_folder import read as read_recording
 from stillmap.places.beam_cells import BeamCells
@@ -16,12 +18,15 @@ from stillmap.places.keyframes import Keyframes
 from stillmap.places.session import Session
 from stillmap.results.labels import read_array
 from stillmap.results.pose_graph_g2o import read_g2o, write_g2o
+from stillmap.results.run_json import RECORD
 
 Float = NDArray[np.float64]
 
 STATE = "state"
+BEAMS = ("stamp_ns", "offset", "hit")  # of `beams/`; labels are written anew by every merge
 HINT = "merge the sessions anew"
 _MAX_DISTANCE = 1e6  # m: no place is larger
+_COPIED_AT_ONCE = 1 << 20  # bytes
 _KEYFRAMES, _PLANAR, _GRAPH = "keyframes", "planar", "graph.g2o"
 
 
@@ -45,6 +50,41 @@ def write_session(folder: Path, session: Session, beams: BeamCells) -> None:
     write_npy(state / "cell_node.npy", beams.node)
     write_npy(state / "beam_cell.npy", beams.of_beam)
     write_npy(state / "p_static.npy", beams.p_static)
+
+
+def copy_session(source: Path, target: Path) -> None:
+    """Copy what a place keeps of a session, with permissions as of new files.
+
+    What every merge writes anew stays behind: labels, trajectory, placed objects.
+
+    Args:
+        source: `sessions/NAME` of a place.
+        target: the same of another place; must not exist.
+
+    Raises:
+        InputError: a file cannot be read.
+    """
+    target.mkdir()
+    _copy_file(source / RECORD, target / RECORD)
+    (target / "beams").mkdir()
+    for name in BEAMS:
+        _copy_file(source / "beams" / f"{name}.npy", target / "beams" / f"{name}.npy")
+    for path in [source / STATE, *sorted((source / STATE).rglob("*"))]:
+        copy = target / path.relative_to(source)
+        if path.is_dir():
+            copy.mkdir()
+        else:
+            _copy_file(path, copy)
+
+
+def _copy_file(source: Path, target: Path) -> None:
+    require_regular(source)
+    try:
+        file = source.open("rb")
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", where=str(source)) from error
+    with file, target.open("wb") as copy:
+        shutil.copyfileobj(file, copy, _COPIED_AT_ONCE)
 
 
 def _write_keyframes(folder: Path, keyframes: Keyframes) -> None:

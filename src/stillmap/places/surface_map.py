@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.short_repr import ShortRepr
-from stillmap.places.evidence import Evidence
+from stillmap.places.evidence import UNITS, Bytes, Evidence
 from stillmap.places.place_states import iter_tiles
 
 Float = NDArray[np.float64]
@@ -82,7 +82,7 @@ def make_surface_map(sessions: Sequence[Evidence], dimension: int = 2) -> Surfac
     edge = sessions[0].edge
     low = corners.min(axis=0) // edge * edge
     shape = tuple((corners.max(axis=0) + edge - low).tolist())
-    hits, passes = np.zeros((2, *(n // _STEP for n in shape)), np.float32)
+    hits, passes = np.zeros((2, *(n // _STEP for n in shape)), np.uint8)
     for tile in iter_tiles(sessions):
         first = np.maximum(tile.low, low)
         high = np.minimum(tile.low + tile.shape, low + shape)
@@ -93,23 +93,22 @@ def make_surface_map(sessions: Sequence[Evidence], dimension: int = 2) -> Surfac
         )
         for one in sessions:
             of_hits, of_passes = one.crop(first, part)
-            hits[where] = np.maximum(hits[where], _pool(of_hits, np.max))
-            passes[where] = np.maximum(passes[where], _pool(of_passes, np.min))
+            np.maximum(hits[where], _pool(of_hits, np.maximum), out=hits[where])
+            np.maximum(passes[where], _pool(of_passes, np.minimum), out=passes[where])
     min_hits, min_passes = _LIMITS[dimension]
-    surface = hits >= min_hits
+    surface = hits >= UNITS * min_hits
     near = ndimage.binary_dilation(surface, np.ones((3, 3), np.bool_))
-    free = ndimage.binary_erosion(passes >= min_passes, np.ones((3, 3), np.bool_)) & ~near
+    free = ndimage.binary_erosion(passes >= UNITS * min_passes, np.ones((3, 3), np.bool_)) & ~near
     square = _STEP * sessions[0].resolution
     squares = low // _STEP
     points = (np.argwhere(surface) + squares + 0.5) * square
     return SurfaceMap(points.astype(np.float32), squares, near, free, square)
 
 
-def _pool(cells: NDArray[np.float32], reduce: "np.ufunc | object") -> NDArray[np.float32]:
+def _pool(cells: Bytes, reduce: np.ufunc) -> Bytes:
     """Reduces squares of cells (X, Y) to one number each."""
-    X, Y = cells.shape
-    blocks = cells.reshape(X // _STEP, _STEP, Y // _STEP, _STEP)
-    out: NDArray[np.float32] = reduce(blocks, axis=(1, 3))  # type: ignore[operator]
+    rows = reduce.reduce([cells[k::_STEP] for k in range(_STEP)])
+    out: Bytes = reduce.reduce([rows[:, k::_STEP] for k in range(_STEP)])
     return out
 
 
