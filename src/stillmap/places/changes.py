@@ -237,7 +237,9 @@ def _compare_positions(
     gone: PlaceChange, came: PlaceChange, place: PlaceStates
 ) -> tuple[Kind | None, float]:
     """Classify two positions as a door, a moved object, or unrelated (None), with a cost."""
-    if _is_door(place.cells[gone.cells], place.cells[came.cells], place.resolution):
+    # leaves end at most their thickness outside their boxes: others share no hinge
+    near = _gap_between(gone, came) <= _HINGE_GAP + 2.0 * _LEAF_THICKNESS
+    if near and _is_door(place.cells[gone.cells], place.cells[came.cells], place.resolution):
         return "door", -1.0
     distance = float(np.linalg.norm(0.5 * (gone.low + gone.high - came.low - came.high)))
     sides = np.sort(gone.high - gone.low), np.sort(came.high - came.low)
@@ -247,6 +249,12 @@ def _compare_positions(
     if alike and count[1] <= 2.0 * _MAX_RATIO * count[0] and distance <= _MAX_MOTION:
         return "moved", distance + float(np.linalg.norm(longer - shorter))
     return None, 0.0
+
+
+def _gap_between(one: PlaceChange, other: PlaceChange) -> float:
+    """m between the boxes of two changes in the plane; 0 where they overlap."""
+    gap = np.maximum(one.low - other.high, other.low - one.high)[:2]
+    return float(np.linalg.norm(np.maximum(gap, 0.0)))
 
 
 def _is_door(gone: Cells, came: Cells, resolution: float) -> bool:

@@ -17,7 +17,7 @@ from stillmap.places.changes import detect_place_changes
 from stillmap.places.checksums import write_checksums
 from stillmap.places.clouds import write_place_clouds
 from stillmap.places.grow import estimate_planar
-from stillmap.places.objects import join_objects, place_objects
+from stillmap.places.objects import write_objects
 from stillmap.places.place import Place, Refusal
 from stillmap.places.place_map import make_place_map
 from stillmap.places.place_states import estimate_place
@@ -113,13 +113,10 @@ def write_place(folder: Path, result: PlaceResult, options: Options, map_state: 
     """
     place = result.place
     write_sessions(folder, result)
-    objects = dict[Path, list[dict[str, Any]]]()
     for one in place.sessions:
-        home = folder / "sessions" / one.session.name
-        objects[home] = place_objects(home, one)
-        write_checksums(home)
+        write_checksums(folder / "sessions" / one.session.name)
     write_place_files(folder, result)
-    join_objects(folder, objects)
+    write_objects(folder, place.sessions)
     if place.dimension == 3:
         write_place_clouds(folder, result)
     planar = [place.sessions[k].require_evidence()[1] for k in place.in_time()]

@@ -1,6 +1,7 @@
 """The state of a session in its place, `sessions/NAME/state/`: enough to merge further sessions
 without its recording."""
 
+import os
 import shutil
 from pathlib import Path
 
@@ -10,7 +11,6 @@ from numpy.typing import NDArray
 from stillmap.core import arrays
 from stillmap.core.arrays import write_npy
 from stillmap.core.errors import InputError
-from stillmap.core.files import require_regular
 from stillmap.io import stillmap_folder
 from stillmap.io.stillmap_folder import read as read_recording
 from stillmap.places.beam_cells import BeamCells
@@ -24,6 +24,11 @@ Float = NDArray[np.float64]
 
 STATE = "state"
 BEAMS = ("stamp_ns", "offset", "hit")  # of `beams/`; labels are written anew by every merge
+# of the state, by every merge
+WRITTEN_ANEW = (
+    *("nodes.npy", "covariance.npy", "measured_at.npy"),
+    *("evidence.npz", "planar_evidence.npz"),
+)
 HINT = "merge the sessions anew"
 _MAX_DISTANCE = 1e6  # m: no place is larger
 _COPIED_AT_ONCE = 1 << 20  # bytes
@@ -65,25 +70,22 @@ def copy_session(source: Path, target: Path) -> None:
         InputError: a file cannot be read.
     """
     target.mkdir()
-    _copy_file(source / RECORD, target / RECORD)
     (target / "beams").mkdir()
-    for name in BEAMS:
-        _copy_file(source / "beams" / f"{name}.npy", target / "beams" / f"{name}.npy")
-    for path in [source / STATE, *sorted((source / STATE).rglob("*"))]:
-        copy = target / path.relative_to(source)
-        if path.is_dir():
-            copy.mkdir()
-        else:
-            _copy_file(path, copy)
+    names = [RECORD, *(f"beams/{name}.npy" for name in BEAMS)]
+    for folder, _, files in os.walk(source / STATE):
+        part = os.path.relpath(folder, source)
+        os.mkdir(target / part)
+        names += [f"{part}/{name}" for name in sorted(files)]
+    for name in names:
+        _copy_file(f"{source}/{name}", f"{target}/{name}")
 
 
-def _copy_file(source: Path, target: Path) -> None:
-    require_regular(source)
+def _copy_file(source: str, target: str) -> None:
     try:
-        file = source.open("rb")
+        file = open(source, "rb", buffering=0)  # noqa: SIM115
     except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", where=str(source)) from error
-    with file, target.open("wb") as copy:
+        raise InputError(f"cannot be read: {error.strerror}", where=source) from error
+    with file, open(target, "wb", buffering=0) as copy:
         shutil.copyfileobj(file, copy, _COPIED_AT_ONCE)
 
 
