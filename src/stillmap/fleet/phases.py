@@ -15,7 +15,7 @@ from stillmap.fleet.outcomes import MAKE_ROOM, Outcome, outcome_of_error
 from stillmap.fleet.storage import Storage
 from stillmap.fleet.tasks import Inspect, Map, Merge, Task, outcome_of_label
 
-_RETRIES = 3  # of a task whose process was killed
+_RETRIES = 3  # of a task that was killed, or lost its bucket
 _GIGABYTE = 1e9
 
 
@@ -136,7 +136,8 @@ def merge_places(
 def _run_all(
     tasks: Sequence[Task], executor: Executor, what: str, journal: Journal, report: Reporter
 ) -> Iterator[tuple[Task, Outcome]]:
-    """Run tasks, those whose process is killed up to three times more; note how each ends.
+    """Run tasks, those that were killed or lost their bucket up to three times more; note how each
+    ends.
 
     Raises:
         InputError: a disk is full.
@@ -146,8 +147,8 @@ def _run_all(
     ended = 0
     while ended < len(tasks):
         task, outcome, attempt = executor.wait()
-        if outcome.status == "killed" and attempt <= _RETRIES:
-            journal.note("killed", what=what, name=task.name, why=outcome.why)
+        if outcome.status in ("killed", "unreachable") and attempt <= _RETRIES:
+            journal.note(outcome.status, what=what, name=task.name, why=outcome.why)
             executor.submit(task, attempt + 1, avoid=outcome.worker)
             continue
         if outcome.status == "full":
@@ -155,6 +156,8 @@ def _run_all(
         if outcome.status == "killed":
             why = f"{outcome.why} in {attempt} attempts: is there enough memory?"
             outcome = Outcome("failed", why)
+        if outcome.status == "unreachable":
+            outcome = Outcome("failed", outcome.why)
         ended += 1
         if outcome.status == "failed":
             _fail(task.name, outcome, journal, report, what)
