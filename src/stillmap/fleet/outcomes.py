@@ -26,8 +26,9 @@ class Outcome:
     """How a task ended.
 
     Attributes:
-        status: `done`; `failed`, not to be tried again; `killed`, or `unreachable` where a bucket did
-            not answer as it should, to be tried again; `full`: a disk is full, no task can go on.
+        status: `done`; `failed`, not to be tried again; `killed`, or `unreachable` where a bucket
+            did not answer as it should, to be tried again; `full`: a disk is full, no task can go
+            on.
         why: one line; empty where it is done.
         found: what it found out, JSON-able.
         cpu_seconds: of its child processes.
