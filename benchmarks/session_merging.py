@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,18 +19,21 @@ from stillmap.eval.session_poses import PoseScores, read_sessions, score_poses
 from stillmap.results.reader import read_grid
 from stillmap.sim.session_truth import load_session_truth
 
+_MAXRSS_UNIT = 1 if sys.platform == "darwin" else 1024  # bytes
 REFUSED = 2  # exit status: fewer than two sessions could be placed
 
 
 @dataclass(frozen=True)
 class Merged:
-    """A merge: its folder, exit status, wall-clock and CPU seconds, and its last words."""
+    """A merge: its folder, exit status, wall-clock and CPU seconds, its last words, and its peak of
+    memory, bytes."""
 
     place: Path
     status: int
     seconds: float
     cpu: float
     words: str
+    memory: int
 
 
 def call(program: Sequence[str], *words: object) -> Merged:
@@ -41,27 +45,31 @@ def call(program: Sequence[str], *words: object) -> Merged:
     place = Path(str(words[-1]))
     place.parent.mkdir(parents=True, exist_ok=True)
     shutil.rmtree(place, ignore_errors=True)
-    before, started = os.times(), time.perf_counter()
-    done = subprocess.run(
-        [*program, *map(str, words)], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
-    )
-    seconds, after = time.perf_counter() - started, os.times()
-    cpu = after.children_user + after.children_system
-    cpu -= before.children_user + before.children_system
-    last = done.stderr.strip().splitlines()[-1:] or [""]
-    if done.returncode not in (0, REFUSED):
-        raise RuntimeError(f"{' '.join(map(str, words))}: {done.returncode}\n{done.stderr}")
-    return Merged(place, done.returncode, seconds, cpu, last[0])
+    started = time.perf_counter()
+    with tempfile.TemporaryFile("w+") as errors:
+        process = subprocess.Popen(
+            [*program, *map(str, words)], stdout=subprocess.DEVNULL, stderr=errors
+        )
+        _, status, used = os.wait4(process.pid, 0)  # of this child alone
+        process.returncode = os.waitstatus_to_exitcode(status)
+        seconds = time.perf_counter() - started
+        errors.seek(0)
+        said = errors.read()
+    last = said.strip().splitlines()[-1:] or [""]
+    if process.returncode not in (0, REFUSED):
+        raise RuntimeError(f"{' '.join(map(str, words))}: {process.returncode}\n{said}")
+    cpu, memory = used.ru_utime + used.ru_stime, used.ru_maxrss * _MAXRSS_UNIT
+    return Merged(place, process.returncode, seconds, cpu, last[0], memory)
 
 
 def merge(program: Sequence[str], sessions: Sequence[Path], place: Path) -> Merged:
-    """`stillmap merge SESSION... -o PLACE`."""
-    return call(program, "merge", *sessions, "-o", place)
+    """`stillmap merge SESSION... --threads 1 -o PLACE`."""
+    return call(program, "merge", *sessions, "--threads", 1, "-o", place)
 
 
 def build_map(program: Sequence[str], session: Path, result: Path) -> Merged:
-    """`stillmap map SESSION -o RESULT`."""
-    return call(program, "map", session, "-o", result)
+    """`stillmap map SESSION --threads 1 -o RESULT`."""
+    return call(program, "map", session, "--threads", 1, "-o", result)
 
 
 def default_program() -> list[str]:

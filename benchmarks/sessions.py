@@ -14,14 +14,16 @@ in what the first one saw, and pairs that have nothing in common; --lasers: also
 different buildings, NAME.clf.gz, in pairs.
 labels: five sessions of a place: cells that changed, dates, ghosts and walls; the single sessions
 beside it.
-growth: one session after the other is added to the place; at 2, 4, 8 ... also all at once.
+growth: each session is mapped, then one result after the other is added to the place; at 2, 4,
+8 ... also all at once.
 laps: a log with NAME.reference.txt and NAME.relations beside it, cut into laps that are turned and
 shifted at random, against the uncut run.
 cuts: long simulated runs, cut likewise into equal sessions, against the uncut run.
 drive: packed sweeps of a street, cut into pieces without a common sweep: one after the other, or
 interleaved, so that all drive the same way.
 
-Simulated sessions are kept in DIR and used again; so is nothing else. Times are wall-clock.
+Simulated sessions are kept in DIR and used again; of growth also their results. Times are
+wall-clock unless they are named CPU.
 """
 
 import argparse
@@ -48,6 +50,7 @@ from stillmap.sim import scene_by_name, simulate, write_simulation
 _STRANGERS = (("aces", "fr101"), ("fr101", "edmonton"), ("aces", "seattle"))
 _LAP_SEED, _SCANS_PER_CUT = 4, 1000
 
+Mapped = tuple[Path, float]  # a result, and the CPU seconds of mapping it
 Done = tuple[merging.Merged, PoseScores | None]  # a pair
 
 
@@ -195,45 +198,62 @@ def _labels_row(
 
 
 def grow(args: argparse.Namespace) -> str:
-    """A line per session that is added; times, bytes, and how it agrees with all at once."""
+    """A line per session that is added; times, memory, bytes, and how it agrees with all at
+    once."""
     days = prepare_days(args.data, args.world, args.sessions, 1, args.scans)
     sessions = [days / f"session-{k + 1}" for k in range(args.sessions)]
+    mapped = [_map_once(args, one, args.data / f"maps-{days.name}") for one in sessions]
     work = args.data / "places" / f"growth-{days.name}"
     shutil.rmtree(work, ignore_errors=True)
-    hours, lines, place = _hours(sessions[0]), [], sessions[0]
+    hours, lines, place = _hours(sessions[0]), [], mapped[0][0]
     for k in range(1, args.sessions):
         hours += _hours(sessions[k])
-        merged = merging.merge(args.program, [place, sessions[k]], work / f"place-{k + 1}")
+        merged = merging.merge(args.program, [place, mapped[k][0]], work / f"place-{k + 1}")
         if merged.status == merging.REFUSED:
-            lines.append([str(k + 1), "refused: " + merged.words, *["-"] * 7])
+            lines.append([str(k + 1), "refused: " + merged.words, *["-"] * 11])
             continue
-        lines.append(_growth_row(k + 1, merged, hours, sessions, work, args))
+        lines.append(_growth_row(k + 1, merged, hours, mapped, work, args))
+        print("|".join(lines[-1]), flush=True)
         if place.parent == work:
             shutil.rmtree(place)
         place = merged.place
-    titles = ["sessions", "s", "CPU s", "MB", "kB per m2", "MB per session hour", "at once, s"]
-    return markdown([*titles, "poses differ, m", "labels F1"], lines)
+    titles = ["sessions", "map: CPU s", "merge: CPU s", "s", "peak MB", "place MB", "kB per m2"]
+    titles += ["MB per h", "at once: CPU s", "s", "peak MB", "poses differ, m", "labels F1"]
+    return markdown(titles, lines)
+
+
+def _map_once(args: argparse.Namespace, session: Path, folder: Path) -> Mapped:
+    """The result of a session, mapped unless it is there, and the CPU seconds that it took."""
+    result, note = folder / session.name, folder / f"{session.name}.cpu"
+    if not note.exists():
+        note.write_text(str(merging.build_map(args.program, session, result).cpu))
+    return result, float(note.read_text())
 
 
 def _growth_row(
     count: int,
     merged: merging.Merged,
     hours: float,
-    sessions: Sequence[Path],
+    mapped: Sequence[Mapped],
     work: Path,
     args: argparse.Namespace,
 ) -> list[str]:
     size = merging.folder_bytes(merged.place)
-    line = [str(count), f"{merged.seconds:.1f}", f"{merged.cpu:.1f}", f"{size / 1e6:.2f}"]
-    line += [f"{size / 1e3 / merging.known_m2(merged.place):.2f}", f"{size / 1e6 / hours:.1f}"]
+    line = [str(count), f"{mapped[count - 1][1]:.1f}", *_costs(merged), f"{size / 1e6:.1f}"]
+    line += [f"{size / 1e3 / merging.known_m2(merged.place):.1f}", f"{size / 1e6 / hours:.1f}"]
     if count & (count - 1):
-        return [*line, "", "", ""]
-    at_once = merging.merge(args.program, sessions[:count], work / "at-once")
+        return [*line, *[""] * 5]
+    results = [one for one, _ in mapped[:count]]
+    at_once = merging.merge(args.program, results, work / "at-once")
     if at_once.status == merging.REFUSED:
-        return [*line, "refused", "-", "-"]
+        return [*line, "refused", *["-"] * 4]
     differ = merging.largest_difference(merged.place, at_once.place)
     f1 = merging.labels_f1(merged.place, at_once.place)
-    return [*line, f"{at_once.seconds:.1f}", f"{differ:.4f}", f"{f1:.4f}"]
+    return [*line, *_costs(at_once), f"{differ:.4f}", f"{f1:.4f}"]
+
+
+def _costs(merged: merging.Merged) -> list[str]:
+    return [f"{merged.cpu:.1f}", f"{merged.seconds:.1f}", f"{merged.memory / 1e6:.0f}"]
 
 
 def _hours(session: Path) -> float:

@@ -18,7 +18,7 @@ def main(words: list[str]) -> int:
         return 0
     output = Path(words[words.index("-o") + 1])
     if words[0] == "merge":
-        return merge([Path(word) for word in words[1 : words.index("-o")]], output)
+        return merge([Path(word) for word in words[1 : words.index("-o")]], output, words)
     return map_recording(Path(words[1]), output, words)
 
 
@@ -44,13 +44,13 @@ def map_recording(recording: Path, output: Path, words: list[str]) -> int:
     return 0
 
 
-def merge(results: list[Path], output: Path) -> int:
+def merge(results: list[Path], output: Path, words: list[str]) -> int:
     if any((result / "run.json").stat().st_size == 0 for result in results):
         return 2
     if output.parent.joinpath("refuse").exists():
         return 2
     sessions = [{"name": one.name, "input": str(one), "accepted": True} for one in results]
-    write(output, {"merged": [one.name for one in results]})
+    write(output, {"merged": [one.name for one in results], "words": words})
     (output / "sessions.json").write_text(json.dumps(sessions))
     return 0
 

@@ -62,6 +62,22 @@ def test_options_reach_the_tasks(call, logs, tmp_path):
     assert given[given.index("--quiet") + 1 :] == expected
 
 
+def test_options_reach_the_merging_of_places(call, logs, tmp_path):
+    folder, out = logs(a="fine", b="fine"), tmp_path / "out"
+
+    def merged(*words):
+        done = call("fleet", folder, "-o", out, "--quiet", "--merge", *words)
+        assert done.returncode == 0, done.stderr
+        given = json.loads((out / "places/all/run.json").read_text())["words"]
+        return given[given.index("--quiet") + 1 :]
+
+    assert merged() == ["--set=threads=1"]
+    words = ["--resolution", 0.1, "--no-odometry"]
+    expected = ["--set=threads=2", "--set=slam.resolution=0.1", "--set=slam.voxel_size=0.1"]
+    assert merged("--threads", 2, *words) == expected
+    assert merged("--threads", 3, *words) == expected  # which is no reason to merge again
+
+
 def test_finished_tasks_are_not_run_again(call, logs, tmp_path):
     folder, out = logs(a="fine", b="bad"), tmp_path / "out"
     assert call("fleet", folder, "-o", out, "--quiet").returncode == 3

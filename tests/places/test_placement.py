@@ -116,3 +116,24 @@ def test_whether_the_maps_alone_say_where_a_session_is(corners, way, determined)
     one, _ = session("a", corners, way)
     own = make_surface_map([measure_evidence(one.planar, one.planar.poses, 0.05, 1)])
     assert is_determined(own, own, np.eye(3)) == determined
+
+
+def test_what_another_session_passed_is_no_surface():
+    """Else all that ever stood somewhere would speak against a further session."""
+    longer = [(0, 0), (16, 0), (16, 7), (0, 7)]
+    way = [(2, 2), (10, 2), (10, 5)]
+    evidence = []
+    for corners in (RECTANGLE, longer):
+        one, T = session("one", corners, way)
+        evidence.append(measure_evidence(one.planar, T @ one.planar.poses, 0.05, 1))
+
+    def wall_at(x, sessions):
+        surface = make_surface_map(sessions).surface
+        near = np.abs(surface[:, 0] - x) < 0.15
+        return np.count_nonzero(near & (np.abs(surface[:, 1] - 3.5) < 2.0))
+
+    first = evidence[0]
+    assert wall_at(12.0, [first]) > 20
+    assert wall_at(12.0, evidence) < 5  # it is gone, or not there yet
+    assert wall_at(16.0, evidence) > 20
+    assert wall_at(0.0, evidence) == wall_at(0.0, [first])

@@ -17,6 +17,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
 from stillmap.core.errors import InputError, import_extra
+from stillmap.fleet.outcomes import UnreachableError
 from stillmap.fleet.scratch import remove_stale, scratch_folder
 from stillmap.fleet.storage import RECORD, STATE
 
@@ -195,7 +196,8 @@ def explain(url: str, action: str) -> Iterator[None]:
     """Turn errors of S3 into one line.
 
     Raises:
-        InputError: whatever s3fs, botocore or the network raised.
+        InputError: there is no access, or nothing there.
+        UnreachableError: whatever else s3fs, botocore or the network raised.
     """
     try:
         yield
@@ -211,7 +213,7 @@ def explain(url: str, action: str) -> Iterator[None]:
             raise
         what = re.sub(r"\s+", " ", str(error)) or type(error).__name__
         what = re.sub(r"\?[^\s\"]*", "", what)  # the query of a URL
-        raise InputError(f"cannot be {action}: {what}", where=url) from error
+        raise UnreachableError(f"cannot be {action}: {what}", where=url) from error
 
 
 def _is_of_s3(error: Exception) -> bool:

@@ -5,9 +5,10 @@ import os
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from stillmap.core.errors import InputError
 from stillmap.fleet.child import Ended
 
-Status = Literal["done", "failed", "killed", "full"]
+Status = Literal["done", "failed", "killed", "unreachable", "full"]
 
 _INPUT_AT_FAULT = 2  # exit status of stillmap
 _STOPPED_BY_SIGNAL = (130, 143)  # the same, after a Ctrl-C and a SIGTERM from outside
@@ -16,13 +17,18 @@ MAKE_ROOM = "make room, then continue with the same command"
 _FULL = tuple(map(os.strerror, DISK_FULL))
 
 
+class UnreachableError(InputError):
+    """A bucket, or the way to it, fails; the same may succeed a little later."""
+
+
 @dataclass(frozen=True)
 class Outcome:
     """How a task ended.
 
     Attributes:
-        status: `done`; `failed`, not to be tried again; `killed`, to be tried again; `full`: a disk
-            is full, no task can go on.
+        status: `done`; `failed`, not to be tried again; `killed`, or `unreachable` where a bucket
+            did not answer as it should, to be tried again; `full`: a disk is full, no task can go
+            on.
         why: one line; empty where it is done.
         found: what it found out, JSON-able.
         cpu_seconds: of its child processes.
@@ -59,6 +65,8 @@ def outcome_of_error(error: Exception) -> Outcome:
     line = str(error)
     if any(text in line for text in _FULL):
         return Outcome("full", line)
+    if isinstance(error, UnreachableError):
+        return Outcome("unreachable", line)
     if isinstance(error, OSError):
         return Outcome("failed", f"{error.filename or 'the result'}: {error.strerror or error}")
     return Outcome("failed", line)

@@ -12,11 +12,10 @@ from stillmap.fleet.journal import Journal
 from stillmap.fleet.local_executor import Executor
 from stillmap.fleet.memory import estimate_memory, fitting_jobs, machine_memory
 from stillmap.fleet.outcomes import MAKE_ROOM, Outcome, outcome_of_error
-from stillmap.fleet.settings import Settings
 from stillmap.fleet.storage import Storage
 from stillmap.fleet.tasks import Inspect, Map, Merge, Task, outcome_of_label
 
-_RETRIES = 3  # of a task whose process was killed
+_RETRIES = 3  # of a task that was killed, or lost its bucket
 _GIGABYTE = 1e9
 
 
@@ -104,26 +103,31 @@ def map_recordings(
 
 
 def merge_places(
-    jobs: Sequence[Job], storage: Storage, executor: Executor, journal: Journal, report: Reporter
+    jobs: Sequence[Job],
+    request: Request,
+    storage: Storage,
+    executor: Executor,
+    journal: Journal,
+    report: Reporter,
 ) -> list[Place]:
     """Merge the results of every place that has two of them."""
     members: dict[str, list[Job]] = {}
     for job in jobs:
         if job.source.place is not None:
             members.setdefault(job.source.place, []).append(job)
-    outcomes: dict[str, Outcome] = {}
-    tasks = []
+    settings, outcomes, tasks = request.settings.for_merging(), dict[str, Outcome](), list[Merge]()
     for name, of_place in members.items():
         done = [job for job in of_place if job.is_done]
         if len(done) < 2:
             continue
-        key = key_of("merge", [f"{job.source.name}:{job.key}" for job in done], Settings())
+        key = key_of("merge", [f"{job.source.name}:{job.key}" for job in done], settings)
         label = find_result(storage, f"{PLACES}/{name}", key)
         if label is not None:
             outcomes[name] = outcome_of_label(label)
             continue
         names = tuple(job.source.name for job in done)
-        tasks.append(Merge(name, names, tuple(job.source.input for job in done), key, storage.root))
+        sources = tuple(job.source.input for job in done)
+        tasks.append(Merge(name, names, sources, settings, key, storage.root))
     for task, outcome in _run_all(tasks, executor, "merging", journal, report):
         outcomes[task.name] = outcome
     return [Place(name, of_place, outcomes.get(name)) for name, of_place in members.items()]
@@ -132,7 +136,8 @@ def merge_places(
 def _run_all(
     tasks: Sequence[Task], executor: Executor, what: str, journal: Journal, report: Reporter
 ) -> Iterator[tuple[Task, Outcome]]:
-    """Run tasks, those whose process is killed up to three times more; note how each ends.
+    """Run tasks, those that were killed or lost their bucket up to three times more; note how each
+    ends.
 
     Raises:
         InputError: a disk is full.
@@ -142,8 +147,8 @@ def _run_all(
     ended = 0
     while ended < len(tasks):
         task, outcome, attempt = executor.wait()
-        if outcome.status == "killed" and attempt <= _RETRIES:
-            journal.note("killed", what=what, name=task.name, why=outcome.why)
+        if outcome.status in ("killed", "unreachable") and attempt <= _RETRIES:
+            journal.note(outcome.status, what=what, name=task.name, why=outcome.why)
             executor.submit(task, attempt + 1, avoid=outcome.worker)
             continue
         if outcome.status == "full":
@@ -151,6 +156,8 @@ def _run_all(
         if outcome.status == "killed":
             why = f"{outcome.why} in {attempt} attempts: is there enough memory?"
             outcome = Outcome("failed", why)
+        if outcome.status == "unreachable":
+            outcome = Outcome("failed", outcome.why)
         ended += 1
         if outcome.status == "failed":
             _fail(task.name, outcome, journal, report, what)

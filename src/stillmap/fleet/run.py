@@ -36,7 +36,7 @@ def run_fleet(request: Request, report: Reporter) -> Fleet:
             inspect(jobs, request, executor, journal, report)
             waiting = plan(jobs, request, executor, storage, report)
             map_recordings(waiting, request, storage, executor, journal, report)
-            places = merge_places(jobs, storage, executor, journal, report)
+            places = merge_places(jobs, request, storage, executor, journal, report)
         finally:
             executor.close()
         fleet = Fleet(jobs, places)

@@ -28,6 +28,10 @@ class Settings:
         options = tuple(one for one in self.options if one[0].startswith("read."))
         return replace(self, options=options, use_odometry=True, keep_poses=False)
 
+    def for_merging(self) -> Self:
+        """The part that decides how results are merged."""
+        return replace(self, use_odometry=True, keep_poses=False)
+
     def describe(self) -> str:
         """A text that differs where a result may differ."""
         options = [one for one in self.options if one[0] not in _NO_MATTER]
@@ -47,9 +51,10 @@ def map_command(recording: Path, output: Path, settings: Settings) -> list[str]:
     return [*words, *_options(settings), *odometry, *poses]
 
 
-def merge_command(results: Sequence[Path], output: Path) -> list[str]:
+def merge_command(results: Sequence[Path], output: Path, settings: Settings) -> list[str]:
     """The command line that merges results."""
-    return ["merge", *map(str, results), "-o", str(output), "--threads", "1", "--quiet"]
+    words = ["merge", *map(str, results), "-o", str(output), "--quiet"]
+    return [*words, *_options(settings)]
 
 
 def _options(settings: Settings) -> list[str]:

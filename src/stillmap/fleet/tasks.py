@@ -10,6 +10,7 @@ import html
 import json
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -49,9 +50,11 @@ class Inspect:
     version: str = package_version()
 
     def run(self, stop: Stop) -> Outcome:
-        with _local_source(self.source) as path:
-            content = hash_content(path)
+        with _local_source(self.source) as path, ThreadPoolExecutor(1) as pool:
+            # both at once: what one of them has read, the other one finds in memory
+            hashing = pool.submit(hash_content, path)
             ended = run_stillmap(info_command(path, self.settings), stop)
+            content = hashing.result()
             outcome = _with_urls(outcome_of(ended), self.source, path)
         if outcome.status != "done":
             return outcome
@@ -105,12 +108,13 @@ class Merge:
         name: of the place.
         results: names of the results.
         sources: paths or URLs of their recordings, in the same order.
-        key, root, version: see `Map`.
+        settings, key, root, version: see `Map`.
     """
 
     name: str
     results: tuple[str, ...]
     sources: tuple[str, ...]
+    settings: Settings
     key: str
     root: str
     version: str = package_version()
@@ -129,7 +133,7 @@ class Merge:
                     texts[str(path)] = source
                 texts[str(folder)] = f"{storage.root}/{RESULTS}/{result}"
                 folders.append(folder)
-            ended = run_stillmap(merge_command(folders, place), stop)
+            ended = run_stillmap(merge_command(folders, place, self.settings), stop)
             outcome = outcome_of(ended)
             if outcome.status != "done":
                 return replace(outcome, why=_replace_all(outcome.why, texts))

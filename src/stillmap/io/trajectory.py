@@ -1,6 +1,7 @@
 """TUM trajectories (`stamp x y z qx qy qz qw`, stamps in s, exact to 1 ns) and poses at stamps."""
 
 import decimal
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -113,11 +114,12 @@ def _parse_pose(words: list[str], where: str) -> tuple[int, list[float]]:
         stamp = int(decimal.Decimal(words[0]).scaleb(9).to_integral_value())
     except (ValueError, decimal.DecimalException, OverflowError) as error:
         raise InputError("holds a word that is no number", where=where, hint=_COLUMNS) from error
-    if not np.all(np.isfinite(row)):
+    # plain Python: NumPy takes ten times as long for so few numbers
+    if not all(map(math.isfinite, row)):
         raise InputError("holds a number that is not finite", where=where)
     if abs(stamp) >= 2**63:
         raise InputError("has a stamp that 64 bit nanoseconds cannot hold", where=where)
-    if abs(np.linalg.norm(row[3:]) - 1) > _UNIT_TOLERANCE:
+    if abs(math.hypot(*row[3:]) - 1) > _UNIT_TOLERANCE:
         raise InputError("has a quaternion that is not of length one", where=where, hint=_COLUMNS)
     return stamp, row
 

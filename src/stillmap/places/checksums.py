@@ -2,15 +2,16 @@
 
 import hashlib
 import json
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
 from stillmap.core.errors import InputError
 from stillmap.core.files import read_text, require_regular
-from stillmap.places.store import HINT, STATE
+from stillmap.places.store import BEAMS, HINT, STATE, WRITTEN_ANEW
 
 _FILE = "checksums.json"
-_BEAMS = ("stamp_ns", "offset", "hit")  # of `beams/`; labels are written anew by every merge
+_ANEW = {f"{STATE}/{name}" for name in WRITTEN_ANEW}
 _MAX_BYTES = 16 << 20
 _DIGEST = 16  # bytes: against damage and changes by hand, not against forgery
 
@@ -18,12 +19,18 @@ _DIGEST = 16  # bytes: against damage and changes by hand, not against forgery
 def write_checksums(home: Path) -> None:
     """Write the checksums of a session.
 
+    Those of files that were copied from another place are taken over with it: they were checked
+    there, and would name the copy if that had failed.
+
     Args:
         home: `sessions/NAME` of a place, complete.
     """
-    sums = {path.relative_to(home).as_posix(): _digest(path) for path in _iter_files(home)}
+    path = home / STATE / _FILE
+    noted = _read_sums(path) if path.is_file() else {}
+    known = {name: digest for name, digest in noted.items() if name not in _ANEW}
+    sums = {name: known.get(name) or _digest(file) for name, file in _iter_files(home)}
     text = json.dumps(sums, indent=1, ensure_ascii=False)
-    (home / STATE / _FILE).write_text(text + "\n", encoding="utf-8")
+    path.write_text(text + "\n", encoding="utf-8")
 
 
 def check_checksums(home: Path) -> None:
@@ -37,41 +44,54 @@ def check_checksums(home: Path) -> None:
     """
     path = home / STATE / _FILE
     require_regular(path)
-    try:
-        noted = dict(json.loads(read_text(path, _MAX_BYTES)))
-    except (ValueError, TypeError, RecursionError) as error:
-        raise InputError("is damaged: no checksums", where=str(path), hint=HINT) from error
-    found = {one.relative_to(home).as_posix(): one for one in _iter_files(home)}
+    noted = _read_sums(path)
+    found = dict(_iter_files(home))
     for name in sorted({*noted, *found}, key=str):
         if name not in found:
             raise InputError("does not exist any more", where=f"{home}/{name}", hint=HINT)
         if noted.get(name) != _digest(found[name]):
             what = "was changed or damaged after it was written"
-            raise InputError(what, where=str(found[name]), hint=HINT)
+            raise InputError(what, where=found[name], hint=HINT)
 
 
-def _iter_files(home: Path) -> Iterator[Path]:
-    """The files that are checked, in order."""
-    for path in sorted((home / STATE).rglob("*")):
-        require_regular(path)
-        if path.is_file() and path.name != _FILE:
-            yield path
-    for name in _BEAMS:
-        path = home / "beams" / f"{name}.npy"
-        require_regular(path)
-        if path.is_file():
-            yield path
+def _read_sums(path: Path) -> dict[str, str]:
+    try:
+        return dict(json.loads(read_text(path, _MAX_BYTES)))
+    except (ValueError, TypeError, RecursionError) as error:
+        raise InputError("is damaged: no checksums", where=str(path), hint=HINT) from error
 
 
-def _digest(path: Path) -> str:
+def _iter_files(home: Path) -> Iterator[tuple[str, str]]:
+    """Names, relative to the session, and paths of the files that are checked, in order."""
+    root = str(home)
+    for folder, folders, names in os.walk(home / STATE):
+        folders.sort()
+        for name in sorted(names):
+            path = f"{folder}/{name}"
+            _require_file(path)
+            if name != _FILE:
+                yield path[len(root) + 1 :], path
+    for name in BEAMS:
+        path = f"{root}/beams/{name}.npy"
+        if os.path.exists(path):
+            _require_file(path)
+            yield f"beams/{name}.npy", path
+
+
+def _require_file(path: str) -> None:
+    if not os.path.isfile(path):  # folders come elsewhere: a pipe, or a link to nothing
+        raise InputError("is no regular file", where=path, hint=HINT)
+
+
+def _digest(path: str) -> str:
     """The BLAKE2b checksum of a file.
 
     Raises:
         InputError: it cannot be read.
     """
     try:
-        with path.open("rb") as file:
+        with open(path, "rb", buffering=0) as file:
             found = hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=_DIGEST))
     except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
+        raise InputError(f"cannot be read: {error.strerror}", where=path) from error
     return found.hexdigest()

@@ -15,11 +15,12 @@ from stillmap.core.short_repr import ShortRepr
 from stillmap.places.keyframes import Keyframes
 
 Float = NDArray[np.float64]
+Bytes = NDArray[np.uint8]
 
 BLOCK = {2: 32, 3: 8}  # cells, edge of a block
 _APPROACH = 0.2  # m before its end in which a beam is not used as free space
 _MAX_GAP = 3  # cells between two channels of a lidar, at 0.15 m as far as 13 m with 2 degrees
-_UNITS = 4.0  # of a byte in a hit or a cell passed: sums end at 63
+UNITS = 4.0  # of a byte in a hit or a cell passed: sums end at 63
 _MAX_BYTE = 255
 
 
@@ -35,8 +36,8 @@ class Evidence(ShortRepr):
     """
 
     corner: NDArray[np.int32]
-    hits: NDArray[np.uint8]
-    passes: NDArray[np.uint8]
+    hits: Bytes
+    passes: Bytes
     resolution: float
 
     @property
@@ -49,28 +50,30 @@ class Evidence(ShortRepr):
         """Cells along the edge of a block."""
         return BLOCK[self.dimension]
 
-    def crop(
-        self, low: NDArray[np.int64], shape: tuple[int, ...]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Hits and passes in a box of cells from `low` (D,) on; 0 where nothing was observed."""
-        out = np.zeros((2, *shape), np.float32)
-        high = low + shape
-        inside = ((self.corner + self.edge > low) & (self.corner < high)).all(axis=1)
-        for b in np.flatnonzero(inside).tolist():
-            first = self.corner[b] - low
-            there = tuple(
-                slice(max(f, 0), min(f + self.edge, n)) for f, n in zip(first, shape, strict=True)
-            )
-            here = tuple(slice(t.start - f, t.stop - f) for t, f in zip(there, first, strict=True))
-            out[0][there] = self.hits[b][here]
-            out[1][there] = self.passes[b][here]
-        out /= np.float32(_UNITS)
+    def crop(self, low: NDArray[np.int64], shape: tuple[int, ...]) -> tuple[Bytes, Bytes]:
+        """Hits and passes, in units of 1 / UNITS, in a box of cells from `low` (D,) on; 0 where
+        nothing was observed."""
+        edge = self.edge
+        first = low // edge
+        count = -(-(low + shape) // edge) - first
+        at = self.corner // edge - first
+        inside = np.flatnonzero(((at >= 0) & (at < count)).all(axis=1))
+        blocks = tuple(i for column in at[inside].T for i in (column, slice(None)))
+        whole = tuple((count * edge).tolist())
+        split = tuple(n for one in count.tolist() for n in (one, edge))
+        start = (low - first * edge).tolist()
+        box = tuple(slice(begin, begin + n) for begin, n in zip(start, shape, strict=True))
+        out = []
+        for sums in (self.hits, self.passes):
+            grid = np.zeros(split, np.uint8)
+            grid[blocks] = sums[inside]
+            out.append(grid.reshape(whole)[box])
         return out[0], out[1]
 
 
 def crop_without_gaps(
     evidence: Evidence, low: NDArray[np.int64], shape: tuple[int, ...]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+) -> tuple[Bytes, Bytes]:
     """`Evidence.crop`, in 3D without the gaps between the channels of a lidar.
 
     A cell counts as passed as far as cells above and below it, each within `_MAX_GAP`, were: beams
@@ -124,6 +127,11 @@ def _export(grid: em.Grid, D: int, resolution: float) -> Evidence:
     )
 
 
-def _to_bytes(sums: Float) -> NDArray[np.uint8]:
+def to_sums(units: NDArray[np.unsignedinteger]) -> NDArray[np.float32]:
+    """Hits or passes of what `Evidence.crop` counts."""
+    return units.astype(np.float32) / np.float32(UNITS)
+
+
+def _to_bytes(sums: Float) -> Bytes:
     # never 0 where there is something
-    return np.minimum(np.ceil(_UNITS * sums), _MAX_BYTE).astype(np.uint8)
+    return np.minimum(np.ceil(UNITS * sums), _MAX_BYTE).astype(np.uint8)

@@ -17,7 +17,7 @@ from stillmap.places.changes import detect_place_changes
 from stillmap.places.checksums import write_checksums
 from stillmap.places.clouds import write_place_clouds
 from stillmap.places.grow import estimate_planar
-from stillmap.places.objects import join_objects, place_objects
+from stillmap.places.objects import write_objects
 from stillmap.places.place import Place, Refusal
 from stillmap.places.place_map import make_place_map
 from stillmap.places.place_states import estimate_place
@@ -114,12 +114,10 @@ def write_place(folder: Path, result: PlaceResult, options: Options, map_state: 
     """
     place = result.place
     write_sessions(folder, result)
-    homes = [folder / "sessions" / one.session.name for one in place.sessions]
-    for home, one in zip(homes, place.sessions, strict=True):
-        place_objects(home, one)
-        write_checksums(home)
+    for one in place.sessions:
+        write_checksums(folder / "sessions" / one.session.name)
     write_place_files(folder, result)
-    join_objects(folder, homes)
+    write_objects(folder, place.sessions)
     if place.dimension == 3:
         write_place_clouds(folder, result)
     planar = [place.sessions[k].require_evidence()[1] for k in place.in_time()]

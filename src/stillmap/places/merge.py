@@ -8,7 +8,7 @@ from pathlib import Path
 from stillmap.core import se2
 from stillmap.core.config import override
 from stillmap.core.errors import InputError
-from stillmap.core.files import atomic_folder, require_regular
+from stillmap.core.files import atomic_folder
 from stillmap.core.parallel import limit_blas_threads, resolve_threads
 from stillmap.core.profiling import Progress, no_progress
 from stillmap.core.short_repr import ShortRepr
@@ -20,6 +20,7 @@ from stillmap.places.map_sessions import cell_size, prepare_sessions
 from stillmap.places.place import Place, Refusal, update_evidence
 from stillmap.places.reader import read_place
 from stillmap.places.session import Session
+from stillmap.places.store import copy_session
 from stillmap.places.writer import PlaceResult
 from stillmap.results.run_json import RECORD
 
@@ -91,34 +92,14 @@ def merge_sessions(
 
 
 def _open_base(job: MergeJob, folder: Path) -> tuple[Place | None, list[Refusal], list[str]]:
-    """The place to which sessions are added, its state copied; nothing for a new place."""
+    """The place to which sessions are added, what it keeps copied; nothing for a new place."""
     if job.base is None:
         return None, [], []
     place, refusals, order = read_place(job.base)
     for one in place.sessions:
         name = one.session.name
-        _copy_session(job.base / "sessions" / name, folder / "sessions" / name)
+        copy_session(job.base / "sessions" / name, folder / "sessions" / name)
     return place, refusals, order
-
-
-def _copy_session(source: Path, target: Path) -> None:
-    """Copy the folder of a session, with permissions as of new files.
-
-    Raises:
-        InputError: a file cannot be read.
-    """
-    target.mkdir()
-    for path in sorted(source.iterdir()):
-        if path.is_dir():
-            _copy_session(path, target / path.name)
-            continue
-        require_regular(path)
-        try:
-            file = path.open("rb")
-        except OSError as error:
-            raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
-        with file, (target / path.name).open("wb") as copy:
-            shutil.copyfileobj(file, copy)
 
 
 def _adopt_cells(options: Options, place: Place) -> Options:

@@ -52,39 +52,42 @@ def check_objects(state: Path) -> None:
         _split_cloud(path, path.read_bytes())
 
 
-def place_objects(home: Path, one: PlacedSession) -> None:
-    """Write `objects/` of a session in the frame of the place.
+def write_objects(folder: Path, sessions: Sequence[PlacedSession]) -> None:
+    """Write `objects/` of each session in the frame of the place, and of the place those of all,
+    numbered anew, with its `traffic.npz`.
 
     Args:
-        home: `sessions/NAME`, with the objects in the session's frame in its state.
-        one: the session in the place.
+        folder: of the place, with the objects in the session's frame in the state of each.
+        sessions: of the place.
     """
+    joined = folder / _OBJECTS
+    joined.mkdir()
+    records = list[dict[str, Any]]()
+    for one in sessions:
+        home = folder / "sessions" / one.session.name
+        of_session, clouds = _place_objects(home, one)
+        for record in of_session:
+            number = len(records)
+            if cloud := clouds.get(f"{record['id']:04d}.ply"):
+                (joined / f"{number:04d}.ply").write_bytes(cloud)
+            records.append({**record, "id": number, "session": home.name})
+    _write_records(joined / _LIST, records)
+    write_traffic(folder / "traffic.npz", compute_flow_map(read_tracks(joined / _LIST)))
+
+
+def _place_objects(home: Path, one: PlacedSession) -> tuple[list[dict[str, Any]], dict[str, bytes]]:
+    """Write the objects of a session; returns their records, and their clouds by name."""
     source, target = home / "state" / _ORIGINAL, home / _OBJECTS
-    shutil.rmtree(target, ignore_errors=True)
     if not source.is_dir():
-        return
+        return [], {}
     target.mkdir()
     T = fit_alignment(one.session.node_poses, one.nodes)
     records = [_transform_record(record, T) for record in _read_records(source / _LIST)]
     _write_records(target / _LIST, records)
-    for path in sorted(source.glob("*.ply")):
-        _transform_cloud(path, target / path.name, T)
-
-
-def join_objects(folder: Path, homes: Sequence[Path]) -> None:
-    """Write `objects/` and `traffic.npz` of a place: those of all sessions, numbered anew."""
-    target = folder / _OBJECTS
-    target.mkdir()
-    records = list[dict[str, Any]]()
-    for home in homes:
-        for record in _read_records(home / _OBJECTS / _LIST):
-            number = len(records)
-            cloud = home / _OBJECTS / f"{record['id']:04d}.ply"
-            if cloud.is_file():
-                shutil.copyfile(cloud, target / f"{number:04d}.ply")
-            records.append({**record, "id": number, "session": home.name})
-    _write_records(target / _LIST, records)
-    write_traffic(folder / "traffic.npz", compute_flow_map(read_tracks(target / _LIST)))
+    clouds = {path.name: _transform_cloud(path, T) for path in sorted(source.glob("*.ply"))}
+    for name, cloud in clouds.items():
+        (target / name).write_bytes(cloud)
+    return records, clouds
 
 
 def _read_records(path: Path) -> Iterator[dict[str, Any]]:
@@ -119,7 +122,7 @@ def _transform_record(record: dict[str, Any], T: Float) -> dict[str, Any]:
     return {**record, "track": {**track, **changed}}
 
 
-def _transform_cloud(source: Path, target: Path, T: Float) -> None:
+def _transform_cloud(source: Path, T: Float) -> bytes:
     """A cloud of an object in another frame.
 
     Raises:
@@ -131,7 +134,7 @@ def _transform_cloud(source: Path, target: Path, T: Float) -> None:
     points = np.stack([vertices[name] for name in "xyz"[:D]]).astype(np.float64)
     for name, values in zip("xyz", T[:D, :D] @ points + T[:D, D:], strict=False):
         vertices[name] = values
-    target.write_bytes(content[:end] + vertices.tobytes())
+    return content[:end] + vertices.tobytes()
 
 
 def _split_cloud(path: Path, content: bytes) -> tuple[int, NDArray[np.void]]:

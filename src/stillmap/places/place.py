@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,7 +47,7 @@ class PlacedSession(ShortRepr):
         out: Float = self.nodes[0] @ se2.inverse(self.session.node_poses[0])
         return out
 
-    @property
+    @cached_property
     def poses(self) -> Float:
         """(T, D+1, D+1) T_place_base of all scans."""
         T = fit_alignment(self.session.node_poses, self.nodes)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from stillmap.core.tiles import TILE, TiledArray, compact, crop
 from stillmap.em import OccupancyMap
-from stillmap.places.evidence import Evidence
+from stillmap.places.evidence import Evidence, to_sums
 from stillmap.places.place_states import MIN_HITS, Tile, iter_tiles
 from stillmap.places.shown_state import ShownState
 
@@ -72,11 +72,11 @@ def _draw_tile(
     from scipy import ndimage  # slow to load
 
     low, shape = tile.low - _REACH, tuple(n + 2 * _REACH for n in tile.shape)
-    hits, passes = np.zeros((2, *shape), np.float32)
+    units = np.zeros((2, *shape), np.uint32)
     for one in sessions:
-        of_hits, of_passes = one.crop(low, shape)
-        hits += of_hits
-        passes += of_passes
+        for total, of_session in zip(units, one.crop(low, shape), strict=True):
+            total += of_session
+    hits, passes = to_sums(units)
     at = tuple((shown.place.cells[cells] - low).T)
     stands = np.zeros(shape, np.float32)
     stands[at] = shown.p_shown[cells]

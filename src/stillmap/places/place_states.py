@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from stillmap.core.components import neighbor_pairs
 from stillmap.core.short_repr import ShortRepr
 from stillmap.places import session_hmm
 from stillmap.places.beam_cells import cell_keys
-from stillmap.places.evidence import BLOCK, Evidence, crop_without_gaps
+from stillmap.places.evidence import BLOCK, Bytes, Evidence, crop_without_gaps, to_sums
 from stillmap.places.session_hmm import CellStates
 
 Float = NDArray[np.float64]
@@ -91,16 +91,16 @@ class PlaceStates(ShortRepr):
 
 def measure_overlap(sessions: Sequence[Evidence], index: int) -> float:
     """Share of the hits of a session in cells that another one observed."""
-    known = total = 0.0
+    known = total = 0
     for tile in iter_tiles([sessions[index]]):
         hits, _ = sessions[index].crop(*tile)
-        total += float(hits.sum())
+        total += int(hits.sum())
         seen = np.zeros(tile.shape, np.bool_)
         for k, other in enumerate(sessions):
             if k != index:
-                seen |= sum(other.crop(*tile)) > 0.0
-        known += float(hits[seen].sum())
-    return known / max(total, 1e-9)
+                seen |= np.bitwise_or(*other.crop(*tile)) > 0
+        known += int(hits[seen].sum())
+    return known / max(total, 1)
 
 
 def estimate_place(sessions: Sequence[Evidence]) -> PlaceStates:
@@ -144,34 +144,34 @@ def _observe_tile(sessions: Sequence[Evidence], tile: Tile) -> tuple[Cells, NDAr
     at = np.nonzero(_find_candidates([hits for hits, _ in sums], halo)[inner])
     nats = np.empty((2, len(at[0]), len(sessions)), np.float32)
     for s, (hits, passes) in enumerate(sums):
-        share = hits / np.maximum(hits + passes, np.float32(1e-9))
+        share = hits / np.maximum(passes + hits.astype(np.float32), np.float32(1.0))
         for out, tolerance, around in ((0, TOLERANCE, _FREE_RADIUS), (1, 0, 0)):
-            most, fewest, stopped = (
-                _filter_around(layer, radius, largest)[inner][at]
-                for layer, radius, largest in (
-                    (hits, tolerance, True),
-                    (passes, around, False),
-                    (share, tolerance, True),
-                )
-            )
-            nats[out, :, s] = session_hmm.weigh_evidence(most, fewest, stopped)
+            most = _reduce_around(hits, tolerance, np.maximum)[inner][at]
+            fewest = _reduce_around(passes, around, np.minimum)[inner][at]
+            stopped = _reduce_around(share, tolerance, np.maximum)[inner][at]
+            nats[out, :, s] = session_hmm.weigh_evidence(to_sums(most), to_sums(fewest), stopped)
     return np.stack(at, axis=1) + tile.low, nats
 
 
-def _find_candidates(hits: Sequence[NDArray[np.float32]], radius: int) -> NDArray[np.bool_]:
+def _find_candidates(hits: Sequence[Bytes], radius: int) -> NDArray[np.bool_]:
     """The cells in which something stood in some session, and that are no noise of a wall."""
     out = np.zeros(hits[0].shape, np.bool_)
     for of in hits:
-        strongest = _filter_around(of, radius, largest=True)
-        out |= of >= np.maximum(MIN_HITS, _MIN_PROMINENCE * strongest)
+        at = np.nonzero(of)
+        own, strongest = (to_sums(c[at]) for c in (of, _reduce_around(of, radius, np.maximum)))
+        out[at] |= own >= np.maximum(MIN_HITS, _MIN_PROMINENCE * strongest)
     return out
 
 
-def _filter_around(layer: NDArray[np.float32], radius: int, largest: bool) -> NDArray[np.float32]:
-    """The largest or smallest value of a layer within `radius` cells of each cell."""
-    from scipy import ndimage  # slow to load
+def _reduce_around(cells: NDArray[Any], radius: int, reduce: "np.ufunc") -> NDArray[Any]:
+    """The extreme of all cells within a radius along each axis; cells at the border stay.
 
-    if not radius:
-        return layer
-    of = ndimage.maximum_filter if largest else ndimage.minimum_filter
-    return np.asarray(of(layer, 2 * radius + 1, mode="constant"), np.float32)
+    Shifted copies take a tenth of the time of a filter of SciPy.
+    """
+    for axis in range(cells.ndim if radius else 0):
+        n, out = cells.shape[axis] - 2 * radius, cells.copy()
+        inner = out[(slice(None),) * axis + (slice(radius, radius + n),)]
+        for shift in range(2 * radius + 1):
+            reduce(inner, cells[(slice(None),) * axis + (slice(shift, shift + n),)], out=inner)
+        cells = out
+    return cells

@@ -20,7 +20,9 @@ from stillmap.places.surface_map import is_determined, make_surface_map
 
 Float = NDArray[np.float64]
 
-_MAX_REFERENCES = 3  # sessions of the place that a new one is matched with
+# sessions of the place that a new one is matched with; share of its nodes that only a further one
+# is near to: each takes as long as the first
+_MAX_REFERENCES, _MIN_GAIN = 3, 0.1
 _MAX_TESTED = 60  # nodes that test a hypothesis, per reference
 # std (m, rad) of poses by a hypothesis, before the pose graph; after it
 PREDICTION_STD, CORRECTED_STD = (0.25, 0.04), (0.1, 0.015)
@@ -138,7 +140,7 @@ def select_references(place: Sequence[PlacedSession], planar: Keyframes, poses: 
             int((mask & missing).sum()) if k not in chosen else -1 for k, mask in enumerate(near)
         ]
         best = max(range(len(place)), key=lambda k: (gains[k], k))
-        if gains[best] <= 0 and chosen:
+        if chosen and gains[best] < _MIN_GAIN * len(xy):
             break
         chosen.append(best)
         missing &= ~near[best]

@@ -74,7 +74,7 @@ def fit_weights(evidence: Float, rare: tuple[float, float, float] = _WEIGHTS) ->
     weights = np.array(rare)
     if not len(evidence):
         return weights
-    log = _log_likelihoods(evidence)
+    log = _log_likelihoods(evidence, _chain_likelihood(evidence, _forward(evidence)[1]))
     likelihood = np.exp(log - log.max(axis=1, keepdims=True))
     for _ in range(_ROUNDS):
         joint = likelihood * weights
@@ -96,12 +96,13 @@ def estimate_states(
         pairs: (P, 2) cells beside each other: those with one history decide together on their
             class; None: each cell for itself.
     """
-    log, path, observed = _log_likelihoods(evidence), _decode(evidence), evidence != 0.0
+    log_chain, p_occupied = _chain(evidence)
+    log, path, observed = _log_likelihoods(evidence, log_chain), _decode(evidence), evidence != 0.0
     if pairs is not None and len(pairs):
         log = _pool(log, path, observed, pairs)
     joint = np.exp(log - log.max(axis=1, keepdims=True)) * weights
     posterior = joint / joint.sum(axis=1, keepdims=True)
-    p_occupied = posterior[:, :1] + posterior[:, 2:] * _chain(evidence)[1]
+    p_occupied = posterior[:, :1] + posterior[:, 2:] * p_occupied
     return CellStates(posterior[:, 0], posterior[:, 2], p_occupied, path, observed)
 
 
@@ -124,10 +125,9 @@ def _pool(
     return out
 
 
-def _log_likelihoods(evidence: Float) -> Float:
+def _log_likelihoods(evidence: Float, log_chain: Float) -> Float:
     """(K, 3) log likelihood of each class, relative to that of a free cell."""
     log_static = evidence.sum(axis=1)
-    log_chain, _ = _chain(evidence)
     return np.stack([log_static, np.zeros(len(evidence)), log_chain], axis=1)
 
 
@@ -136,62 +136,84 @@ def _chain(evidence: Float) -> tuple[Float, Float]:
 
     The histories of the chain without a switch belong to the other two classes.
     """
-    log_all = _forward(evidence)[1]
+    p, log_all = _forward(evidence)
+    occupied, _, rest = _split_histories(evidence, log_all)
+    p_occupied = (_smooth(evidence, p).T - occupied[:, None]) / rest[:, None]
+    return _chain_likelihood(evidence, log_all), np.clip(p_occupied, 0.0, 1.0)
+
+
+def _chain_likelihood(evidence: Float, log_all: Float) -> Float:
+    """(K,) log likelihood of the changing class, from that of the chain with all histories."""
+    stay = (1.0 - _SWITCH) ** (evidence.shape[1] - 1)
+    if stay == 1.0:
+        return np.full(len(log_all), -np.inf)
+    rest = _split_histories(evidence, log_all)[2]
+    return np.asarray(log_all + np.log(rest / max(1.0 - stay, _MIN_SHARE)))
+
+
+def _split_histories(evidence: Float, log_all: Float) -> tuple[Float, Float, Float]:
+    """(K,) shares in the likelihood of the chain of the histories that are occupied throughout,
+    free throughout, and of all others."""
     log_static, stay = evidence.sum(axis=1), (1.0 - _SWITCH) ** (evidence.shape[1] - 1)
-    # shares of the histories without a switch in the likelihood of the chain
     occupied, free = 0.5 * stay * np.exp(log_static - log_all), 0.5 * stay * np.exp(-log_all)
-    rest = np.maximum(1.0 - occupied - free, _MIN_SHARE)
-    log = log_all + np.log(rest / max(1.0 - stay, _MIN_SHARE))
-    p_occupied = (_smooth(evidence) - occupied[:, None]) / rest[:, None]
-    return (log if stay < 1.0 else np.full(len(log), -np.inf)), np.clip(p_occupied, 0.0, 1.0)
+    return occupied, free, np.maximum(1.0 - occupied - free, _MIN_SHARE)
 
 
 def _forward(evidence: Float) -> tuple[Float, Float]:
-    """(K, S) filtered P(occupied) of the chain, and its log likelihood (K,)."""
+    """(S, K) filtered P(occupied) of the chain, and its log likelihood (K,)."""
     K, S = evidence.shape
-    p, log = np.empty((K, S)), np.zeros(K)
+    p, log = np.empty((S, K)), np.zeros(K)
     prior = np.full(K, 0.5)
-    ratio = np.exp(evidence)
-    for s in range(S):
-        total = prior * ratio[:, s] + 1.0 - prior
-        p[:, s] = prior * ratio[:, s] / total
+    for s, ratio in enumerate(_ratios(evidence)):
+        total = prior * ratio + 1.0 - prior
+        p[s] = prior * ratio / total
         log += np.log(total)
-        prior = p[:, s] * (1.0 - _SWITCH) + (1.0 - p[:, s]) * _SWITCH
+        prior = p[s] * (1.0 - _SWITCH) + (1.0 - p[s]) * _SWITCH
     return p, log
 
 
-def _smooth(evidence: Float) -> Float:
-    """(K, S) P(occupied) of the chain given all sessions (forward-backward)."""
-    p, _ = _forward(evidence)
-    out = p.copy()
-    ratio = np.exp(evidence)
+def _ratios(evidence: Float) -> Float:
+    """(S, K) likelihood ratios; session by session, as the chain goes through them."""
+    out: Float = np.exp(np.ascontiguousarray(evidence.T))
+    return out
+
+
+def _smooth(evidence: Float, p: Float) -> Float:
+    """(S, K) P(occupied) of the chain given all sessions (forward-backward).
+
+    Args:
+        evidence: (K, S) nats.
+        p: (S, K) as of `_forward`.
+    """
+    out, ratio = p.copy(), _ratios(evidence)
     occupied, free = np.ones(len(evidence)), np.ones(len(evidence))  # backward messages
-    for s in range(evidence.shape[1] - 1, 0, -1):
-        by_occupied, by_free = occupied * ratio[:, s], free
+    for s in range(len(p) - 1, 0, -1):
+        by_occupied, by_free = occupied * ratio[s], free
         occupied = (1.0 - _SWITCH) * by_occupied + _SWITCH * by_free
         free = _SWITCH * by_occupied + (1.0 - _SWITCH) * by_free
         scale = occupied + free
         occupied, free = occupied / scale, free / scale
-        joint = p[:, s - 1] * occupied
-        out[:, s - 1] = joint / (joint + (1.0 - p[:, s - 1]) * free)
+        joint = p[s - 1] * occupied
+        out[s - 1] = joint / (joint + (1.0 - p[s - 1]) * free)
     return out
 
 
 def _decode(evidence: Float) -> NDArray[np.bool_]:
     """(K, S) most probable path of the chain (Viterbi); True: occupied."""
     K, S = evidence.shape
+    nats = np.ascontiguousarray(evidence.T)
     stay, switch = np.log(1.0 - _SWITCH), np.log(_SWITCH)
-    occupied, free = evidence[:, 0].copy(), np.zeros(K)
-    from_occupied, from_free = np.zeros((2, K, S), np.bool_)
+    occupied, free = nats[0].copy(), np.zeros(K)
+    from_occupied, from_free = np.zeros((2, S, K), np.bool_)
     for s in range(1, S):
         keeps, leaves = occupied + stay, occupied + switch
         comes, stays_free = free + switch, free + stay
-        from_occupied[:, s] = keeps >= comes  # to occupied
-        from_free[:, s] = leaves > stays_free  # to free, coming from occupied
-        occupied = np.maximum(keeps, comes) + evidence[:, s]
+        from_occupied[s] = keeps >= comes  # to occupied
+        from_free[s] = leaves > stays_free  # to free, coming from occupied
+        occupied = np.maximum(keeps, comes) + nats[s]
         free = np.maximum(leaves, stays_free)
-    path = np.zeros((K, S), np.bool_)
-    path[:, -1] = occupied > free
+    path = np.zeros((S, K), np.bool_)
+    path[-1] = occupied > free
     for s in range(S - 1, 0, -1):
-        path[:, s - 1] = np.where(path[:, s], from_occupied[:, s], from_free[:, s])
-    return path
+        path[s - 1] = np.where(path[s], from_occupied[s], from_free[s])
+    return np.ascontiguousarray(path.T)

@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +13,9 @@ from stillmap.core.short_repr import ShortRepr
 from stillmap.places.beam_cells import BeamCells
 from stillmap.places.place_change import PlaceChange
 from stillmap.places.place_states import PlaceStates
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -36,6 +41,20 @@ class ShownState(ShortRepr):
     p_shown: Float
     support: NDArray[np.float32]
     noise: Index
+
+    def find_cells(self, centres: Float) -> Index:
+        """(C,) the cell at or beside each centre (C, D) in metres; -1: none."""
+        if not len(self.place.cells) or not len(centres):
+            return np.full(len(centres), -1)
+        limit = _NEIGHBOUR_DISTANCE * self.place.resolution
+        distance, at = self._tree.query(centres, distance_upper_bound=limit)
+        return np.where(np.isfinite(distance), at, -1).astype(np.intp)
+
+    @cached_property
+    def _tree(self) -> "cKDTree":
+        from scipy.spatial import cKDTree  # slow to load
+
+        return cKDTree((self.place.cells + 0.5) * self.place.resolution)
 
 
 def show_state(place: PlaceStates, changes: list[PlaceChange], limit: int | None) -> ShownState:
@@ -105,7 +124,7 @@ def label_session(
         centres: (C, D) of the cells in the frame of the place, metres.
         session: its index in the order of time.
     """
-    of = _find_cells(shown.place, centres)
+    of = shown.find_cells(centres)
     known = of >= 0
     p_shown = np.where(known, shown.p_shown[of], 1.0).astype(np.float32)
     support = np.where(known, shown.support[of, session], 0.0).astype(np.float32)
@@ -117,18 +136,6 @@ def label_session(
         odds = own * np.exp(support[cell])
         out[block] = odds / (odds + 1.0 - own) * p_shown[cell]
     return out
-
-
-def _find_cells(place: PlaceStates, centres: Float) -> Index:
-    """(C,) the cell of the place at or beside each centre; -1: none."""
-    if not len(place.cells) or not len(centres):
-        return np.full(len(centres), -1)
-    from scipy.spatial import cKDTree  # slow to load
-
-    limit = _NEIGHBOUR_DISTANCE
-    tree = cKDTree((place.cells + 0.5) * place.resolution)
-    distance, at = tree.query(centres, distance_upper_bound=limit * place.resolution)
-    return np.where(np.isfinite(distance), at, -1).astype(np.intp)
 
 
 def changed_cell_table(shown: ShownState, names: Sequence[str]) -> dict[str, NDArray[np.generic]]:

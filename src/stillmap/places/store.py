@@ -1,6 +1,8 @@
 """The state of a session in its place, `sessions/NAME/state/`: enough to merge further sessions
 without its recording."""
 
+import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -16,12 +18,20 @@ from stillmap.places.keyframes import Keyframes
 from stillmap.places.session import Session
 from stillmap.results.labels import read_array
 from stillmap.results.pose_graph_g2o import read_g2o, write_g2o
+from stillmap.results.run_json import RECORD
 
 Float = NDArray[np.float64]
 
 STATE = "state"
+BEAMS = ("stamp_ns", "offset", "hit")  # of `beams/`; labels are written anew by every merge
+# of the state, by every merge
+WRITTEN_ANEW = (
+    *("nodes.npy", "covariance.npy", "measured_at.npy"),
+    *("evidence.npz", "planar_evidence.npz"),
+)
 HINT = "merge the sessions anew"
 _MAX_DISTANCE = 1e6  # m: no place is larger
+_COPIED_AT_ONCE = 1 << 20  # bytes
 _KEYFRAMES, _PLANAR, _GRAPH = "keyframes", "planar", "graph.g2o"
 
 
@@ -45,6 +55,38 @@ def write_session(folder: Path, session: Session, beams: BeamCells) -> None:
     write_npy(state / "cell_node.npy", beams.node)
     write_npy(state / "beam_cell.npy", beams.of_beam)
     write_npy(state / "p_static.npy", beams.p_static)
+
+
+def copy_session(source: Path, target: Path) -> None:
+    """Copy what a place keeps of a session, with permissions as of new files.
+
+    What every merge writes anew stays behind: labels, trajectory, placed objects.
+
+    Args:
+        source: `sessions/NAME` of a place.
+        target: the same of another place; must not exist.
+
+    Raises:
+        InputError: a file cannot be read.
+    """
+    target.mkdir()
+    (target / "beams").mkdir()
+    names = [RECORD, *(f"beams/{name}.npy" for name in BEAMS)]
+    for folder, _, files in os.walk(source / STATE):
+        part = os.path.relpath(folder, source)
+        os.mkdir(target / part)
+        names += [f"{part}/{name}" for name in sorted(files)]
+    for name in names:
+        _copy_file(f"{source}/{name}", f"{target}/{name}")
+
+
+def _copy_file(source: str, target: str) -> None:
+    try:
+        file = open(source, "rb", buffering=0)  # noqa: SIM115
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", where=source) from error
+    with file, open(target, "wb", buffering=0) as copy:
+        shutil.copyfileobj(file, copy, _COPIED_AT_ONCE)
 
 
 def _write_keyframes(folder: Path, keyframes: Keyframes) -> None:

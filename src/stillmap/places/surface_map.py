@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.short_repr import ShortRepr
-from stillmap.places.evidence import Evidence
+from stillmap.places.evidence import UNITS, Bytes, Evidence
 from stillmap.places.place_states import iter_tiles
 
 Float = NDArray[np.float64]
@@ -46,7 +46,7 @@ class SurfaceMap(ShortRepr):
     """Surfaces and free space on squares.
 
     Attributes:
-        surface: (N, 2) float32, centres of the squares with surface, metres.
+        surface: (N, 2) float32, centres of the squares with undisputed surface, metres.
         low: (2,) int64, lowest square.
         near: (X, Y) bool, squares with surface and their neighbours.
         free: (X, Y) bool, squares known to be free, as all around them are.
@@ -70,7 +70,8 @@ class SurfaceMap(ShortRepr):
 def make_surface_map(sessions: Sequence[Evidence], dimension: int = 2) -> SurfaceMap:
     """The surfaces of some sessions, in the frame of their evidence.
 
-    Free is what none of them saw occupied: where sessions differ, neither is known.
+    Free is what none of them saw occupied, and surface what none passed: where sessions differ,
+    neither is known. Else all that ever stood somewhere would speak against a further session.
 
     Args:
         sessions: evidence of each in the plane.
@@ -82,7 +83,9 @@ def make_surface_map(sessions: Sequence[Evidence], dimension: int = 2) -> Surfac
     edge = sessions[0].edge
     low = corners.min(axis=0) // edge * edge
     shape = tuple((corners.max(axis=0) + edge - low).tolist())
-    hits, passes = np.zeros((2, *(n // _STEP for n in shape)), np.float32)
+    min_hits, min_passes = _LIMITS[dimension]
+    hits, passes = np.zeros((2, *(n // _STEP for n in shape)), np.uint8)
+    disputed = np.zeros(hits.shape, np.bool_)
     for tile in iter_tiles(sessions):
         first = np.maximum(tile.low, low)
         high = np.minimum(tile.low + tile.shape, low + shape)
@@ -92,24 +95,24 @@ def make_surface_map(sessions: Sequence[Evidence], dimension: int = 2) -> Surfac
             for f, n in zip(first - low, part, strict=True)
         )
         for one in sessions:
-            of_hits, of_passes = one.crop(first, part)
-            hits[where] = np.maximum(hits[where], _pool(of_hits, np.max))
-            passes[where] = np.maximum(passes[where], _pool(of_passes, np.min))
-    min_hits, min_passes = _LIMITS[dimension]
-    surface = hits >= min_hits
+            cells = one.crop(first, part)
+            most, least = _pool(cells[0], np.maximum), _pool(cells[1], np.minimum)
+            np.maximum(hits[where], most, out=hits[where])
+            np.maximum(passes[where], least, out=passes[where])
+            disputed[where] |= (most == 0) & (least >= UNITS * min_passes)
+    surface = hits >= UNITS * min_hits
     near = ndimage.binary_dilation(surface, np.ones((3, 3), np.bool_))
-    free = ndimage.binary_erosion(passes >= min_passes, np.ones((3, 3), np.bool_)) & ~near
+    free = ndimage.binary_erosion(passes >= UNITS * min_passes, np.ones((3, 3), np.bool_)) & ~near
     square = _STEP * sessions[0].resolution
     squares = low // _STEP
-    points = (np.argwhere(surface) + squares + 0.5) * square
+    points = (np.argwhere(surface & ~disputed) + squares + 0.5) * square
     return SurfaceMap(points.astype(np.float32), squares, near, free, square)
 
 
-def _pool(cells: NDArray[np.float32], reduce: "np.ufunc | object") -> NDArray[np.float32]:
+def _pool(cells: Bytes, reduce: np.ufunc) -> Bytes:
     """Reduces squares of cells (X, Y) to one number each."""
-    X, Y = cells.shape
-    blocks = cells.reshape(X // _STEP, _STEP, Y // _STEP, _STEP)
-    out: NDArray[np.float32] = reduce(blocks, axis=(1, 3))  # type: ignore[operator]
+    rows = reduce.reduce([cells[k::_STEP] for k in range(_STEP)])
+    out: Bytes = reduce.reduce([rows[:, k::_STEP] for k in range(_STEP)])
     return out
 
 

@@ -78,11 +78,21 @@ def _write_state(state: Path, one: PlacedSession) -> None:
     write_npy(state / "nodes.npy", one.nodes)
     write_npy(state / "covariance.npy", one.known_covariance)
     evidence, planar = one.require_evidence()
+    if _is_measured_at(state, one):
+        return
     write_evidence(state / "evidence.npz", evidence)
     if planar is not evidence:
         write_evidence(state / "planar_evidence.npz", planar)
     if one.measured_at is not None:
         write_npy(state / "measured_at.npy", one.measured_at)
+
+
+def _is_measured_at(state: Path, one: PlacedSession) -> bool:
+    """Whether the evidence in a state, copied from the place that grew, is that of a session."""
+    path = state / "measured_at.npy"
+    if one.measured_at is None or not path.exists():
+        return False
+    return np.array_equal(read_array(path, (None, None, None), "f"), one.measured_at)
 
 
 def write_evidence(path: Path, evidence: Evidence) -> None:
@@ -118,7 +128,9 @@ def write_place_files(folder: Path, result: PlaceResult) -> None:
     homes = [folder / "sessions" / one.session.name for one in place.sessions]
     stamps = np.concatenate([one.session.stamp_ns for one in place.sessions])
     poses = np.concatenate([one.poses for one in place.sessions])
-    write_tum(folder / "trajectory.tum", stamps, poses)
+    with (folder / "trajectory.tum").open("wb") as file:
+        for home in homes:
+            file.write((home / "trajectory.tum").read_bytes())
     _write_beams(folder / "beams", homes, stamps)
     write_g2o(folder / "graph.g2o", _join_graphs(place), poses)
     write_json(folder / SESSIONS, session_records(result))

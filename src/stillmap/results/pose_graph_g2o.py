@@ -6,6 +6,8 @@ errors differ in second order only. In 3D the information is that of translation
 vector, as GTSAM reads it.
 """
 
+import math
+from bisect import bisect_left
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -41,12 +43,10 @@ def write_g2o(path: Path, graph: PoseGraph, poses: Float) -> None:
 
 def _lines(graph: PoseGraph, poses: Float) -> Iterator[str]:
     ids, D = graph.keyframes.tolist(), poses.shape[-1] - 1
-    for id_, x in zip(ids, _to_rows(poses[graph.keyframes]), strict=True):
+    for id_, x in zip(ids, _to_rows(poses[graph.keyframes]).tolist(), strict=True):
         yield f"{_VERTEX[D]} {id_} {_numbers(x)}"
-    for constraint in graph.constraints:
-        ends = f"{ids[constraint.first]} {ids[constraint.second]}"
-        [measured] = _to_rows(constraint.T[None])
-        yield f"{_EDGE[D]} {ends} {_numbers(measured)} {_numbers(_information(constraint))}"
+    for constraint, row in zip(graph.constraints, _edge_rows(graph.constraints, D), strict=True):
+        yield f"{_EDGE[D]} {ids[constraint.first]} {ids[constraint.second]} {_numbers(row)}"
     for first in ids[:1]:
         yield f"{_FIX} {first}"  # last: GTSAM reads no edge after it
 
@@ -56,16 +56,22 @@ def _to_rows(poses: Float) -> Float:
     return se2.parameters(poses) if poses.shape[-1] == 3 else pose_rows(poses)
 
 
-def _information(constraint: Constraint) -> Float:
-    """The upper triangle of the information matrix, row by row."""
-    information = np.linalg.inv(constraint.covariance)
-    upper: Float = (0.5 * (information + information.T))[np.triu_indices(len(information))]
-    return upper
+def _edge_rows(constraints: list[Constraint], D: int) -> list[list[float]]:
+    """Of each constraint the measured pose and the upper triangle of the information matrix, row
+    by row."""
+    if not constraints:
+        return []
+    measured = _to_rows(np.array([one.T for one in constraints]))
+    information = np.linalg.inv(np.array([one.covariance for one in constraints]))
+    information = 0.5 * (information + information.swapaxes(1, 2))
+    row, column = np.triu_indices(3 * (D - 1))
+    rows: list[list[float]] = np.hstack([measured, information[:, row, column]]).tolist()
+    return rows
 
 
-def _numbers(values: Float) -> str:
+def _numbers(values: list[float]) -> str:
     # as many digits as tell a number from its neighbours
-    return " ".join(repr(value) for value in values.tolist())
+    return " ".join(map(repr, values))
 
 
 def read_g2o(path: Path) -> PoseGraph:
@@ -88,11 +94,38 @@ def read_g2o(path: Path) -> PoseGraph:
             raise _damage_error(path, number, error) from error
     if not ids or np.any(np.diff(ids) <= 0):
         raise InputError("is damaged: vertices are missing or out of order", where=str(path))
+    return PoseGraph(
+        np.array(ids, np.intp), _to_poses(np.array(rows)), _read_edges(path, edges, ids, D)
+    )
+
+
+def _read_edges(path: Path, edges: list[list[str]], ids: list[int], D: int) -> list[Constraint]:
+    """The constraints of the words of edges between vertices.
+
+    Raises:
+        InputError: an edge is damaged.
+    """
+    if not edges:
+        return []
     try:
-        constraints = [_to_constraint(edge, ids, D) for edge in edges]
+        ends, rows = zip(*(_parse_edge(edge, ids, D) for edge in edges), strict=True)
+        values = np.array(rows)
+        n_pose, dof = (3, 3) if D == 2 else (7, 6)
+        upper = np.zeros((len(edges), dof, dof))
+        row, column = np.triu_indices(dof)
+        upper[:, row, column] = upper[:, column, row] = values[:, n_pose:]
+        covariance = np.asarray(np.linalg.inv(upper), np.float64)
+        bad = np.flatnonzero(np.linalg.eigvalsh(covariance)[:, 0] <= 0.0)
+        if len(bad):
+            between = " to ".join(edges[int(bad[0])][1:3])
+            raise ValueError(f"the information of {between} is not positive definite")
+        poses = _to_poses(values[:, :n_pose])
     except (ValueError, IndexError, np.linalg.LinAlgError) as error:
         raise InputError(f"is damaged: an edge: {error}", where=str(path)) from error
-    return PoseGraph(np.array(ids, np.intp), _to_poses(np.array(rows)), constraints)
+    return [
+        Constraint(first, second, T, covariance[k])
+        for k, ((first, second), T) in enumerate(zip(ends, poses, strict=True))
+    ]
 
 
 def _read_lines(path: Path) -> list[str]:
@@ -108,7 +141,7 @@ def _damage_error(path: Path, number: int, error: Exception) -> InputError:
 
 def _floats(words: list[str], count: int) -> list[float]:
     values = [float(word) for word in words]
-    if len(values) != count or not np.isfinite(values).all():
+    if len(values) != count or not all(map(math.isfinite, values)):
         raise ValueError(f"expected {count} finite numbers, got {' '.join(words)!r}")
     return values
 
@@ -117,11 +150,12 @@ def _to_poses(rows: Float) -> Float:
     return se2.matrix(*rows.T) if rows.shape[1] == 3 else poses_from_rows(rows)
 
 
-def _to_constraint(edge: list[str], ids: list[int], D: int) -> Constraint:
+def _parse_edge(edge: list[str], ids: list[int], D: int) -> tuple[tuple[int, int], list[float]]:
+    """The indices of both vertices of an edge, and its numbers."""
     tag, one, other, *words = edge
     if tag != _EDGE[D]:
         raise ValueError(f"{tag} among vertices of {D}D")
-    first, second = (int(np.searchsorted(ids, int(word))) for word in (one, other))
+    first, second = (bisect_left(ids, int(word)) for word in (one, other))
     if (
         first == len(ids)
         or second == len(ids)
@@ -129,11 +163,4 @@ def _to_constraint(edge: list[str], ids: list[int], D: int) -> Constraint:
     ):
         raise ValueError(f"no vertex {one} or {other}")
     n_pose, dof = (3, 3) if D == 2 else (7, 6)
-    values = np.array(_floats(words, n_pose + dof * (dof + 1) // 2))
-    information = np.zeros((dof, dof))
-    information[np.triu_indices(dof)] = values[n_pose:]
-    information += np.triu(information, 1).T
-    covariance = np.asarray(np.linalg.inv(information), np.float64)
-    if np.linalg.eigvalsh(covariance)[0] <= 0.0:
-        raise ValueError(f"the information of {one} to {other} is not positive definite")
-    return Constraint(first, second, _to_poses(values[None, :n_pose])[0], covariance)
+    return (first, second), _floats(words, n_pose + dof * (dof + 1) // 2)

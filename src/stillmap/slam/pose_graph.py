@@ -76,8 +76,7 @@ def optimize_poses(
 
     def solve(start: Any, weights: Float, tolerance: float) -> Any:
         weighted = graph.clone()
-        for constraint, weight in zip(loops, weights.tolist(), strict=True):
-            weighted.add(_factor(constraint, max(weight, 1e-9)))
+        _add_factors(weighted, loops, np.maximum(weights, 1e-9))
         parameters = gtsam.LevenbergMarquardtParams()
         parameters.setRelativeErrorTol(tolerance)
         return gtsam.LevenbergMarquardtOptimizer(weighted, start, parameters).optimize()
@@ -125,8 +124,7 @@ def _build_problem(poses: Float, chain: list[Constraint]) -> tuple[Any, Any]:
     fixed = gtsam.noiseModel.Isotropic.Sigma(3 if is_2d else 6, _PRIOR_STD)
     prior_factor = gtsam.PriorFactorPose2 if is_2d else gtsam.PriorFactorPose3
     graph.add(prior_factor(0, objects[0], fixed))
-    for constraint in chain:
-        graph.add(_factor(constraint, 1.0))
+    _add_factors(graph, chain, np.ones(len(chain)))
     return graph, start
 
 
@@ -144,17 +142,20 @@ def _extract_poses(found: Any, first: Float) -> Float:
     return out
 
 
-def _factor(constraint: Constraint, weight: float) -> Any:
+def _add_factors(graph: Any, constraints: list[Constraint], weights: Float) -> None:
+    """Add constraints with their weights (L,) to GTSAM's factor graph."""
     import gtsam
 
-    covariance = constraint.covariance / weight
+    if not constraints:
+        return
+    measured = np.array([one.T for one in constraints])
+    covariance = np.array([one.covariance for one in constraints]) / weights[:, None, None]
     factor: Any = gtsam.BetweenFactorPose2
-    if len(constraint.T) == 4:
+    if measured.shape[-1] == 4:
         factor = gtsam.BetweenFactorPose3
-        covariance = np.roll(covariance, 3, axis=(0, 1))  # GTSAM puts the rotation first
-    noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
-    [T] = _to_gtsam(constraint.T[None])
-    return factor(constraint.first, constraint.second, T, noise)
+        covariance = np.roll(covariance, 3, axis=(1, 2))  # GTSAM puts the rotation first
+    for one, T, of in zip(constraints, _to_gtsam(measured), covariance, strict=True):
+        graph.add(factor(one.first, one.second, T, gtsam.noiseModel.Gaussian.Covariance(of)))
 
 
 def _to_gtsam(poses: Float) -> list[Any]:

@@ -103,14 +103,17 @@ def _find_space(box: Box, size: tuple[float, float], taken: list[Box], view: Map
         (left - gap - width, bottom - height),
     ]
 
+    others = np.array(taken)
+
     def cost(label: Box) -> float:
         outside = -min(0.0, label[0], label[1], view.size[0] - label[2], view.size[1] - label[3])
-        return sum(_overlap(label, other) for other in taken) + 1e3 * outside
+        return float(_overlap(np.array(label), others).sum()) + 1e3 * outside
 
     return min(((x, y, x + width, y + height) for x, y in corners), key=cost)
 
 
-def _overlap(a: Box, b: Box) -> float:
-    """Area that two boxes share."""
-    width, height = min(a[2], b[2]) - max(a[0], b[0]), min(a[3], b[3]) - max(a[1], b[1])
-    return max(width, 0.0) * max(height, 0.0)
+def _overlap(box: Float, others: Float) -> Float:
+    """(n,) areas that a box (4,) shares with others (n, 4)."""
+    sides = np.minimum(box[2:], others[:, 2:]) - np.maximum(box[:2], others[:, :2])
+    out: Float = np.maximum(sides, 0.0).prod(axis=1)
+    return out
