@@ -7,7 +7,7 @@ from stillmap.core import se2
 from stillmap.places.alignment import propose_alignments
 from stillmap.places.map_refinement import MapRefiner
 from stillmap.places.map_search import search_alignments
-from stillmap.places.surface_map import SurfaceMap, compare_maps
+from stillmap.places.surface_map import SurfaceMap, compare_maps, find_sides
 
 EDGE = 0.1
 FLOOR = [(0, 0, 14, 0), (14, 0, 14, 5), (14, 5, 6, 5), (6, 5, 6, 11), (6, 11, 0, 11), (0, 11, 0, 0)]
@@ -34,7 +34,7 @@ def make_map(walls, T=None, inside=((0.4, 0.4, 13.6, 4.6),)):
             near[tuple((squares - low + (dx, dy)).T)] = True
     is_free[tuple((np.floor(free / EDGE).astype(np.int64) - low).T)] = True
     centres = ((squares + 0.5) * EDGE).astype(np.float32)
-    return SurfaceMap(centres, low, near, is_free & ~near, EDGE)
+    return SurfaceMap(centres, low, near, is_free & ~near, find_sides(is_free), EDGE)
 
 
 def move(T, points):
@@ -86,9 +86,21 @@ def test_refinement_reaches_the_optimum_nearby():
     assert after > before
 
 
+def test_the_other_face_of_a_wall_does_not_agree():
+    """A room beside another one, which share a wall: both see it, each from its own side."""
+    room = [(0, 0, 6, 0), (6, 0, 6, 4), (6, 4, 0, 4), (0, 4, 0, 0)]
+    west = make_map(room, inside=[(0.1, 0.1, 5.9, 3.9)])
+    same = compare_maps(west, west, np.eye(3))
+    beside = compare_maps(west, west, se2.matrix(6.0, 0.0, 0.0))
+    assert same.agree > 300
+    assert beside.agree < 0.05 * same.agree
+    assert beside.conflict == 0
+
+
 def test_nothing_is_found_in_an_empty_map():
     nothing = np.zeros((5, 5), bool)
-    empty = SurfaceMap(np.zeros((0, 2), np.float32), np.zeros(2, np.int64), nothing, nothing, EDGE)
+    points, low = np.zeros((0, 2), np.float32), np.zeros(2, np.int64)
+    empty = SurfaceMap(points, low, nothing, nothing, find_sides(nothing), EDGE)
     floor = make_map(FLOOR)
     assert search_alignments(empty, floor) == []
     assert propose_alignments(floor, empty) == []

@@ -17,9 +17,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
 from stillmap.core.errors import InputError, import_extra
-from stillmap.fleet.outcomes import UnreachableError
 from stillmap.fleet.scratch import remove_stale, scratch_folder
-from stillmap.fleet.storage import RECORD, STATE
+from stillmap.fleet.storage import RECORD, STATE, UnreachableError
 
 _RETRIES = {"max_attempts": 5, "mode": "standard"}
 _TIMEOUT = 10  # s for a connection

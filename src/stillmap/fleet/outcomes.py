@@ -5,8 +5,8 @@ import os
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from stillmap.core.errors import InputError
 from stillmap.fleet.child import Ended
+from stillmap.fleet.storage import UnreachableError
 
 Status = Literal["done", "failed", "killed", "unreachable", "full"]
 
@@ -15,10 +15,6 @@ _STOPPED_BY_SIGNAL = (130, 143)  # the same, after a Ctrl-C and a SIGTERM from o
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 MAKE_ROOM = "make room, then continue with the same command"
 _FULL = tuple(map(os.strerror, DISK_FULL))
-
-
-class UnreachableError(InputError):
-    """A bucket, or the way to it, fails; the same may succeed a little later."""
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,10 @@ STATE = ".fleet"  # folder of the journal, of the labels of results, and of unfi
 RECORD = "run.json"  # every result has it; in a bucket it appears last, and goes first
 
 
+class UnreachableError(InputError):
+    """A bucket, or the way to it, fails; the same may succeed a little later."""
+
+
 class Storage(Protocol):
     """A tree of files whose names are relative to a root.
 

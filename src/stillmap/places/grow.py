@@ -26,6 +26,7 @@ from stillmap.places.place_states import (
 from stillmap.places.placement import (
     CORRECTED_STD,
     PREDICTION_STD,
+    Placement,
     estimate_covariance,
     find_placement,
     select_references,
@@ -40,6 +41,9 @@ _MAX_CHANGED = 0.25  # share of the cells seen by it and others that nobody saw 
 # constraints between keyframes, and the share of them that the graph must keep; in 3D the maps
 # themselves are one: lidars see far beyond where robots drove
 _MIN_TIES, _MIN_AGREEING = 4, 0.6
+# in 3D, where maps alone leave a doubt: mean share of a sweep that submaps may leave unexplained,
+# as such and relative to any other alignment; most of a sweep is ground, which fits anywhere
+_MAX_UNEXPLAINED, _MAX_UNEXPLAINED_RATIO = 0.4, 0.6
 # m and rad, of an alignment of maps
 _MAP_STD = {2: (0.04, 0.04, 0.003), 3: (0.05, 0.05, 0.1, 0.01, 0.01, 0.004)}
 
@@ -76,12 +80,14 @@ def add_session(
     """
     report("aligning")
     found = find_placement(place.sessions, session)
-    if found.refused:
+    if found.refused and not found.rivals:
         return Growth(place, found.refused)
     start = placed = PlacedSession(session, lift_alignment(place, session, found))
     matches, states = found.matches, None
     if place.dimension == 3:
         matches = match_session(place, placed, PREDICTION_STD, None, threads)
+        if found.rivals and not _beats_rivals(place, session, found, matches, threads):
+            return Growth(place, found.refused)
     for number in range(_EM_ROUNDS):
         if states is not None:
             matches = match_session(place, placed, CORRECTED_STD, states, threads)
@@ -105,6 +111,27 @@ def add_session(
             why = f"{100 * changed:.0f} % of what both saw would have changed"
             return Growth(place, f"it contradicts the place: {why}")
     return Growth(_describe(update_evidence(grown, threads), ties))
+
+
+def _beats_rivals(
+    place: Place, session: Session, found: Placement, matches: Matches, threads: int
+) -> bool:
+    """Whether an alignment, with these matches, leaves far less unexplained than others do."""
+    unexplained = _unexplained_share(matches)
+    if unexplained > _MAX_UNEXPLAINED:
+        return False
+    for T in found.rivals:
+        nodes = lift_alignment(place, session, replace(found, T=T))
+        rival = match_session(place, PlacedSession(session, nodes), PREDICTION_STD, None, threads)
+        if unexplained > _MAX_UNEXPLAINED_RATIO * _unexplained_share(rival):
+            return False
+    return True
+
+
+def _unexplained_share(matches: Matches) -> float:
+    """Mean share of a sweep that the submaps do not explain; 1 where few were matched."""
+    shares = [1.0 - match.explained for of in matches.values() for match in of]
+    return float(np.mean(shares)) if len(shares) >= _MIN_TIES else 1.0
 
 
 def estimate_planar(place: Place) -> PlaceStates:

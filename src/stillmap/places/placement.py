@@ -32,9 +32,10 @@ _MIN_AGREEING = 200
 # of another one, relative to the best, at which none may: things move between sessions, but
 # look-alike places fit in several ways (docs/sessions.md has the distributions)
 _MAX_CONFLICT, _MAX_RIVAL = 0.15, 0.6
-# squares that must agree, and score of a rival, where the keyframes that fit do not say where a
-# session lies: the maps alone do
-_STRONG_AGREEING, _STRONG_RIVAL = 1000, 0.3
+_MAX_RIVALS = 3  # alignments that registered sweeps compare, the best one among them
+# squares that must agree, share that may differ, and score of a rival, where the keyframes that
+# fit do not say where a session lies: the maps alone do
+_STRONG_AGREEING, _STRONG_CONFLICT, _STRONG_RIVAL = 1000, 0.06, 0.3
 _MIN_FITTING = 5  # nodes
 # std along the least known direction (m), and of the heading (rad), up to which a session is placed
 _MAX_STD, _MAX_HEADING_STD = 0.05, math.radians(0.5)
@@ -49,11 +50,14 @@ class Placement(ShortRepr):
         T: (3, 3) T_place_session in the plane.
         matches: of each reference, by its index in the place.
         refused: the reason; empty if accepted.
+        rivals: (3, 3) further alignments. If there are any, `refused` holds unless registered
+            sweeps tell them from T.
     """
 
     T: Float
     matches: dict[int, list[KeyframeMatch]] = field(default_factory=dict)
     refused: str = ""
+    rivals: list[Float] = field(default_factory=list)
 
     def count(self, verdict: Verdict) -> int:
         """Number of matches with a verdict."""
@@ -73,10 +77,13 @@ def find_placement(place: Sequence[PlacedSession], session: Session) -> Placemen
     evidence = measure_evidence(session.planar, session.planar.poses, cell, 1)
     own = make_surface_map([evidence], D)
     proposed = propose_alignments(known, own)
-    if refused := _doubt(proposed):
+    refused = _doubt(proposed)
+    if D == 3 and not _is_out(proposed):
+        # sweeps are registered in space, which tells more than their planar views
+        rivals = [one.T for one in proposed[1:_MAX_RIVALS]] if refused else []
+        return Placement(proposed[0].T, refused=refused, rivals=rivals)
+    if refused:
         return Placement(np.eye(3), refused=refused)
-    if D == 3:  # sweeps are registered in space, which tells more than their planar views
-        return Placement(proposed[0].T)
     best = test_alignment(place, session, proposed[0].T)
     refused = _uncertainty(best, session)
     contradicted = best.count(Verdict.CONTRADICTS) > best.count(Verdict.FITS)
@@ -89,7 +96,16 @@ def _is_strong(proposed: list[Hypothesis]) -> bool:
     """Whether the comparison of the maps alone is enough."""
     best = proposed[0].comparison
     rival = max((other.comparison.score for other in proposed[1:]), default=0.0)
-    return best.agree >= _STRONG_AGREEING and rival <= _STRONG_RIVAL * best.score
+    few = best.conflict <= _STRONG_CONFLICT * (best.agree + best.conflict)
+    return best.agree >= _STRONG_AGREEING and few and rival <= _STRONG_RIVAL * best.score
+
+
+def _is_out(proposed: list[Hypothesis]) -> bool:
+    """Whether the maps exclude even the best alignment."""
+    if not proposed or proposed[0].comparison.agree < _MIN_AGREEING:
+        return True
+    best = proposed[0].comparison
+    return best.conflict > _MAX_CONFLICT * (best.agree + best.conflict)
 
 
 def _doubt(proposed: list[Hypothesis]) -> str:
@@ -98,7 +114,7 @@ def _doubt(proposed: list[Hypothesis]) -> str:
         return "no part of it looks like the place"
     best, others = proposed[0].comparison, proposed[1:]
     share = best.conflict / (best.agree + best.conflict)
-    if share > _MAX_CONFLICT:
+    if _is_out(proposed):
         return f"it contradicts the place: {100 * share:.0f} % of the surfaces that both saw differ"
     rival = max((other.comparison.score for other in others), default=0.0) / best.score
     if share > _MAX_CONFLICT * (1.0 - rival / _MAX_RIVAL):

@@ -18,8 +18,9 @@ _STEP = 2  # cells of the evidence along the edge of a square
 # hits of a surface, passes of a cell known to be free, by the dimension of the sessions: what 3D
 # sessions see of a bush or a fence at several heights is both at once
 _LIMITS = {2: (0.75, 2.0), 3: (3.0, 6.0)}
-
-
+# squares over which passed ones are averaged; slope of that from which a surface has one free side;
+# cosine between the free sides of two surfaces below which they are two faces of a wall
+_SIDE_BLUR, _MIN_SLOPE, _OPPOSITE = 2.0, 0.08, -0.3
 _SHIFT, _MAX_SHIFTED = 0.4, 0.75  # m; share of the score that may be left after it
 CONFLICT_WEIGHT = 5.0
 
@@ -50,6 +51,8 @@ class SurfaceMap(ShortRepr):
         low: (2,) int64, lowest square.
         near: (X, Y) bool, squares with surface and their neighbours.
         free: (X, Y) bool, squares known to be free, as all around them are.
+        side: (X, Y, 2) float32, unit vectors towards what beams passed; 0 where they passed on
+            both sides.
         edge: m, of a square.
     """
 
@@ -57,14 +60,33 @@ class SurfaceMap(ShortRepr):
     low: NDArray[np.int64]
     near: NDArray[np.bool_]
     free: NDArray[np.bool_]
+    side: NDArray[np.float32]
     edge: float
 
-    def look_up(self, points: Float) -> Comparison:
-        """How many of points (n, 2) in metres lie near surface, and in free space."""
-        at = np.floor(points / self.edge).astype(np.int64) - self.low
+    def look_up(self, points: Float, sides: Float) -> Comparison:
+        """How many surfaces lie near a surface with the same free side, and in free space.
+
+        Rooms that look alike fit on the other face of a wall, too.
+
+        Args:
+            points, sides: (n, 2) in metres, and as of `side`.
+        """
+        at = self._squares_of(points)
         inside = ((at >= 0) & (at < self.near.shape)).all(axis=1)
         x, y = at[inside].T
-        return Comparison(int(self.near[x, y].sum()), int(self.free[x, y].sum()))
+        is_other_face = (self.side[x, y] * sides[inside]).sum(axis=1) < _OPPOSITE
+        agree = self.near[x, y] & ~is_other_face
+        return Comparison(int(agree.sum()), int(self.free[x, y].sum()))
+
+    @property
+    def surface_sides(self) -> Float:
+        """(N, 2) the side of each surface."""
+        x, y = self._squares_of(self.surface).T
+        return np.asarray(self.side[x, y], np.float64)
+
+    def _squares_of(self, points: NDArray[np.floating]) -> NDArray[np.int64]:
+        out: NDArray[np.int64] = np.floor(points / self.edge).astype(np.int64) - self.low
+        return out
 
 
 def make_surface_map(sessions: Sequence[Evidence], dimension: int = 2) -> SurfaceMap:
@@ -106,7 +128,20 @@ def make_surface_map(sessions: Sequence[Evidence], dimension: int = 2) -> Surfac
     square = _STEP * sessions[0].resolution
     squares = low // _STEP
     points = (np.argwhere(surface & ~disputed) + squares + 0.5) * square
-    return SurfaceMap(points.astype(np.float32), squares, near, free, square)
+    side = find_sides(passes > 0)
+    return SurfaceMap(points.astype(np.float32), squares, near, free, side, square)
+
+
+def find_sides(passed: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """(X, Y, 2) unit vectors towards the squares (X, Y) that beams passed; 0 where these lie on
+    both sides."""
+    from scipy import ndimage  # slow to load
+
+    field = passed.astype(np.float32)
+    slopes = [ndimage.gaussian_filter(field, _SIDE_BLUR, order=order) for order in ((1, 0), (0, 1))]
+    out = np.stack(slopes, axis=2)
+    steep = np.linalg.norm(out, axis=2, keepdims=True)
+    return np.where(steep < _MIN_SLOPE, 0.0, out / np.maximum(steep, 1e-9)).astype(np.float32)
 
 
 def _pool(cells: Bytes, reduce: np.ufunc) -> Bytes:
@@ -118,8 +153,10 @@ def _pool(cells: Bytes, reduce: np.ufunc) -> Bytes:
 
 def compare_maps(place: SurfaceMap, session: SurfaceMap, T_place_session: Float) -> Comparison:
     """Squares of both maps that agree, and that are in conflict, under an alignment (3, 3)."""
-    forth = place.look_up(_transform(T_place_session, session.surface))
-    back = session.look_up(_transform(se2.inverse(T_place_session), place.surface))
+    T, T_back = T_place_session, se2.inverse(T_place_session)
+    forth = place.look_up(_transform(T, session.surface), session.surface_sides @ T[:2, :2].T)
+    sides = place.surface_sides @ T_back[:2, :2].T
+    back = session.look_up(_transform(T_back, place.surface), sides)
     return Comparison(forth.agree + back.agree, forth.conflict + back.conflict)
 
 
