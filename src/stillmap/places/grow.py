@@ -32,12 +32,15 @@ from stillmap.places.placement import (
     select_references,
 )
 from stillmap.places.session import Session
+from stillmap.places.surface_map import compare_maps, make_surface_map
 
 Float = NDArray[np.float64]
 Matches = dict[int, list[KeyframeMatch]]  # by the index of the reference in the place
 
 _EM_ROUNDS = 2
-_MAX_CHANGED = 0.25  # share of the cells seen by it and others that nobody saw as it did
+# share of the surfaces seen by a session and others that may differ at its optimized poses; more
+# than by its alignment, which leaves it in one piece
+_MAX_DIFFERING = 0.2
 # constraints between keyframes, and the share of them that the graph must keep; in 3D the maps
 # themselves are one: lidars see far beyond where robots drove
 _MIN_TIES, _MIN_AGREEING = 4, 0.6
@@ -106,11 +109,18 @@ def add_session(
         report("comparing sessions")
         grown = update_evidence(grown, threads, last_only=True)
         states = estimate_planar(grown)  # E-step
-        changed = states.disagreement_of(grown.in_time().index(len(grown.sessions) - 1))
-        if place.dimension == 2 and changed > _MAX_CHANGED:
-            why = f"{100 * changed:.0f} % of what both saw would have changed"
+        if place.dimension == 2 and (differ := _differing_share(grown)) > _MAX_DIFFERING:
+            why = f"{100 * differ:.0f} % of the surfaces that both saw differ after optimization"
             return Growth(place, f"it contradicts the place: {why}")
     return Growth(_describe(update_evidence(grown, threads), ties))
+
+
+def _differing_share(place: Place) -> float:
+    """Share of the surfaces seen by the last session and by others in conflict."""
+    *known, last = [one.require_evidence()[1] for one in place.sessions]
+    maps = make_surface_map(known), make_surface_map([last])
+    agree, conflict = compare_maps(*maps, np.eye(3))
+    return conflict / max(agree + conflict, 1)
 
 
 def _beats_rivals(

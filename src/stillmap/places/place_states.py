@@ -24,7 +24,6 @@ _CANDIDATE_RADIUS = {2: 2, 3: 1}  # cells within which hits of one surface scatt
 MIN_HITS = 0.75  # expected static hits of a session that make a cell a candidate
 _MIN_PROMINENCE = 0.2  # share of the hits of the most-hit cell within that radius
 _POOL_RADIUS = 3.0  # cells within which those of one history decide together
-_CLEAR = 1.0  # nats from which on a session says something about a cell
 _MAX_FIT_ROWS = 50_000  # cells that the weights are fitted to
 
 
@@ -78,15 +77,6 @@ class PlaceStates(ShortRepr):
         for name, column in columns.items():
             column[changed] = getattr(states, name)
         return replace(self, evidence=evidence, states=CellStates(**columns))
-
-    def disagreement_of(self, index: int) -> float:
-        """Share of the cells observed by a session and by others that no other saw as it did."""
-        observed = np.abs(self.evidence) > _CLEAR
-        occupied = self.evidence > 0.0
-        others = np.delete(observed, index, axis=1)
-        agree = others & (np.delete(occupied, index, axis=1) == occupied[:, [index]])
-        both = observed[:, index] & others.any(axis=1)
-        return float((both & ~agree.any(axis=1)).sum() / max(int(both.sum()), 1))
 
 
 def measure_overlap(sessions: Sequence[Evidence], index: int) -> float:
