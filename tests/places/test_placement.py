@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from stillmap import places
 from stillmap.core import se2
 from stillmap.core.recording import Recording
 from stillmap.places.evidence import measure_evidence
@@ -89,6 +90,20 @@ def test_another_room_is_refused():
     first, _ = session("a", L_SHAPE, [(1, 1), (12, 2), (3, 3), (2, 9)])
     second, _ = session("b", OTHER, [(2, 1), (7, 2), (8, 6), (14, 5), (2, 6)])
     assert grow(first, second).refused
+
+
+def test_a_session_that_the_graph_puts_beside_the_place_is_refused(monkeypatch):
+    first, _ = session("a", L_SHAPE, [(1, 1), (12, 2), (3, 3), (2, 9)])
+    second, _ = session("b", L_SHAPE, [(4, 9), (2, 4), (10, 3), (12, 1)])
+    optimize = places.grow._optimize
+
+    def displace(place, placed, ties):
+        grown, agreeing = optimize(place, placed, ties)
+        *nodes, last = [one.nodes for one in grown.sessions]
+        return grown.with_nodes([*nodes, se2.matrix(0.6, 0.3, 0.0) @ last]), agreeing
+
+    monkeypatch.setattr("stillmap.places.grow._optimize", displace)
+    assert "after optimization" in grow(first, second).refused
 
 
 def test_maps_agree_where_they_belong_and_contradict_elsewhere():
