@@ -129,7 +129,7 @@ def _count_passes(start: Float, end: Float, lattice: Lattice) -> NDArray[np.int6
 
 
 class ChangeTruth(Protocol):
-    """What scores of changes need to know about S sessions, on cells of any arrangement."""
+    """Observations of S sessions by which changes are scored, on cells of any arrangement."""
 
     @property
     def seen(self) -> "tuple[Seen, ...]":

@@ -21,7 +21,7 @@ _MIN_TURN = 0.15  # rad between two positions
 
 
 class Leaf(NamedTuple):
-    """What is seen of a leaf: its ends (2, 2) and its length, metres."""
+    """Ends (2, 2) and length of a leaf as it was observed, metres."""
 
     ends: Float
     length: float
