@@ -70,11 +70,16 @@ def _find_groups(place: PlaceStates) -> list[_Events]:
 
 
 def _attach(group: _Events, beside: _Events, place: PlaceStates) -> _Events:
-    """A group with the like events right beside it that are also near static surface."""
+    """A group with the like events right beside it that are also near static surface.
+
+    Of those that fit its span of time, the ones that share a part of it with most others.
+    """
     before, after = int(group.before.max()), int(group.after.min())
     like = (beside.came == group.came[0]) & (beside.before < after) & (beside.after > before)
     at = np.flatnonzero(like)
     at = at[_within(place.cells[beside.cell[at]], place.cells[group.cell])]
+    first, last = beside.before[at], beside.after[at]
+    at = max((at[(first <= s) & (last > s)] for s in range(before, after)), key=len)
     return _Events._make(
         np.concatenate([one, other[at]]) for one, other in zip(group, beside, strict=True)
     )

@@ -40,7 +40,7 @@ Matches = dict[int, list[KeyframeMatch]]  # by the index of the reference in the
 _EM_ROUNDS = 2
 # share of the surfaces seen by a session and others that may differ at its optimized poses; more
 # than by its alignment, which leaves it in one piece
-_MAX_DIFFERING = 0.2
+_MAX_DIFFERING = 0.3
 # constraints between keyframes, and the share of them that the graph must keep; in 3D the maps
 # themselves are one: lidars see far beyond where robots drove
 _MIN_TIES, _MIN_AGREEING = 4, 0.6

@@ -134,7 +134,7 @@ def label_session(
         cell = beams.of_beam[block]
         own = beams.p_static[block].astype(np.float32)
         odds = own * np.exp(support[cell])
-        out[block] = odds / (odds + 1.0 - own) * p_shown[cell]
+        out[block] = odds / (odds + (1.0 - own)) * p_shown[cell]
     return out
 
 
