@@ -38,9 +38,10 @@ Float = NDArray[np.float64]
 Matches = dict[int, list[KeyframeMatch]]  # by the index of the reference in the place
 
 _EM_ROUNDS = 2
+_MAX_MOTION = 1.0  # cells: what the E-step between two M-steps does not notice
 # share of the surfaces seen by a session and others that may differ at its optimized poses; more
 # than by its alignment, which leaves it in one piece
-_MAX_DIFFERING = 0.3
+_MAX_DIFFERING = 0.2
 # constraints between keyframes, and the share of them that the graph must keep; in 3D the maps
 # themselves are one: lidars see far beyond where robots drove
 _MIN_TIES, _MIN_AGREEING = 4, 0.6
@@ -107,7 +108,7 @@ def add_session(
         if number + 1 == _EM_ROUNDS:
             break
         report("comparing sessions")
-        grown = update_evidence(grown, threads, last_only=True)
+        grown = update_evidence(grown, threads, _MAX_MOTION)
         states = estimate_planar(grown)  # E-step
         if place.dimension == 2 and (differ := _differing_share(grown)) > _MAX_DIFFERING:
             why = f"{100 * differ:.0f} % of the surfaces that both saw differ after optimization"

@@ -16,7 +16,7 @@ from stillmap.places.session import Session
 Float = NDArray[np.float64]
 
 # of a cell, by which keyframes may move before the evidence of their session is measured again
-_MAX_MOTION = 0.5
+MAX_MOTION = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,20 +132,18 @@ class Place(ShortRepr):
         return replace(self, sessions=moved)
 
 
-def update_evidence(place: Place, threads: int, *, last_only: bool = False) -> Place:
+def update_evidence(place: Place, threads: int, max_motion: float = MAX_MOTION) -> Place:
     """The place with the evidence of sessions whose keyframes moved measured again.
 
-    last_only: only that of the last session.
+    max_motion: cells, up to which evidence holds.
     """
-    before, last = place.sessions[:-1], place.sessions[-1]
-    if not last_only:
-        before = [_measure(one, place, threads) for one in before]
-    return replace(place, sessions=[*before, _measure(last, place, threads)])
+    limit = max_motion * min(place.resolution, place.voxel_size)
+    sessions = [_measure(one, place, limit, threads) for one in place.sessions]
+    return replace(place, sessions=sessions)
 
 
-def _measure(one: PlacedSession, place: Place, threads: int) -> PlacedSession:
+def _measure(one: PlacedSession, place: Place, limit: float, threads: int) -> PlacedSession:
     poses = one.keyframe_poses
-    limit = _MAX_MOTION * min(place.resolution, place.voxel_size)
     if one.measured_at is not None:
         moved = np.linalg.norm((poses - one.measured_at)[:, :-1, -1], axis=1)
         if moved.max() <= limit:
