@@ -14,6 +14,8 @@ from stillmap.sim.session_truth import load_session_truth
 from stillmap.sim.session_writer import write_sessions
 from stillmap.sim.sessions import SessionOptions, plan_sessions
 
+pytestmark = pytest.mark.slow  # a minute: three sessions are simulated, mapped and merged twice
+
 SWEEPS = {"lidar": {"channels": 12, "columns": 300}, "robot": {"scans": 30}}
 OPTIONS = {"em.max_iterations": 1, "threads": 1}
 BEGINS = (40.0, 41.0, 39.0)  # m along the street
@@ -82,7 +84,6 @@ def test_growing_gives_the_same_files_as_merging_at_once(
     assert files_of(place) - same == {"run.json"}  # its options have the cells of the place
 
 
-@pytest.mark.slow
 def test_another_street_is_refused(results: list[Path], tmp_path: Path) -> None:
     scene = scene_by_name("crossing-empty", SWEEPS)
     plan = plan_sessions(scene, SessionOptions(1, begins=(60.0,)), 4)
