@@ -229,7 +229,7 @@ def _compare_positions(
     has_hinge: whether one of them stands beside a gap in a wall that it could shut.
     """
     if has_hinge:
-        one, other = _see_leaf(place, gone.cells), _see_leaf(place, came.cells)
+        one, other = _fit_leaf(place, gone.cells), _fit_leaf(place, came.cells)
         turned = one is not None and other is not None and turn_about_hinge(one, other)
         return ("door", -1.0) if turned else (None, 0.0)
     distance = float(np.linalg.norm(0.5 * (gone.low + gone.high - came.low - came.high)))
@@ -242,7 +242,7 @@ def _compare_positions(
     return None, 0.0
 
 
-def _see_leaf(place: PlaceStates, cells: Index) -> Leaf | None:
+def _fit_leaf(place: PlaceStates, cells: Index) -> Leaf | None:
     """The leaf that changed cells are, seen from above."""
     plane = np.unique(place.cells[cells][:, :2], axis=0)
     return fit_leaf(np.asarray((plane + 0.5) * place.resolution, np.float64))
@@ -257,7 +257,7 @@ def _find_doors(changes: list[PlaceChange], place: PlaceStates) -> set[int]:
     margin = np.full(static.shape[1], np.ceil(_WALL_MARGIN / place.resolution))
     out = set()
     for k, one in enumerate(changes):
-        leaf = _see_leaf(place, one.cells)
+        leaf = _fit_leaf(place, one.cells)
         if leaf is None:
             continue
         low, high = one.low / place.resolution - margin, one.high / place.resolution + margin

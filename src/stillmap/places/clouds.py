@@ -1,6 +1,5 @@
 """`static.ply` and `dynamic.ply` of a place in 3D: the points of its keyframes."""
 
-from functools import reduce
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ Float = NDArray[np.float64]
 def write_place_clouds(folder: Path, result: PlaceResult) -> None:
     """Write the clouds of all sessions, with labels by what all of them saw."""
     sessions = result.place.sessions
-    joined = reduce(join_keyframes, (one.session.keyframes for one in sessions))
+    joined = join_keyframes([one.session.keyframes for one in sessions])
     poses = np.concatenate([one.keyframe_poses for one in sessions])
     labels = np.concatenate([_label_keyframes(one, result.shown) for one in sessions])
     write_clouds(folder, joined.recording, poses, labels)

@@ -1,5 +1,6 @@
 """Keyframes of a session: the spaced scans that a place keeps for alignment and for its map."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -90,24 +91,31 @@ def _progress(
     return np.concatenate([[0.0], units.cumsum()])
 
 
-def join_keyframes(one: Keyframes, other: Keyframes) -> Keyframes:
-    """The keyframes of two sessions as those of one; poses are still each in its own frame."""
-    first, second = one.recording, other.recording
+def join_keyframes(sessions: Sequence[Keyframes]) -> Keyframes:
+    """The keyframes of some sessions, one or more, as those of one; poses are still each in its own
+    frame."""
+    recordings = [one.recording for one in sessions]
+    beams = np.cumsum([0, *(one.n_beams for one in recordings)])
+    sensors = np.cumsum([0, *(len(one.T_base_sensor) for one in recordings)])
+    keyframes = np.cumsum([0, *(len(one) for one in sessions)])
+    ends = [one.offset[1:] + first for one, first in zip(recordings, beams, strict=False)]
     recording = replace(
-        first,
-        stamp_ns=np.concatenate([first.stamp_ns, second.stamp_ns]),
-        offset=np.concatenate([first.offset, first.n_beams + second.offset[1:]]),
-        points=np.concatenate([first.points, second.points]),
-        hit=np.concatenate([first.hit, second.hit]),
-        T_base_sensor=np.concatenate([first.T_base_sensor, second.T_base_sensor]),
+        recordings[0],
+        stamp_ns=np.concatenate([one.stamp_ns for one in recordings]),
+        offset=np.concatenate([np.zeros(1, np.int64), *ends]),
+        points=np.concatenate([one.points for one in recordings]),
+        hit=np.concatenate([one.hit for one in recordings]),
+        T_base_sensor=np.concatenate([one.T_base_sensor for one in recordings]),
         sensor=np.concatenate(
-            [first.sensor, np.int32(len(first.T_base_sensor)) + second.sensor], dtype=np.int32
+            [one.sensor + first for one, first in zip(recordings, sensors, strict=False)],
+            dtype=np.int32,
+            casting="same_kind",
         ),
     )
     return Keyframes(
         recording,
-        np.concatenate([one.scans, other.scans]),
-        np.concatenate([one.poses, other.poses]),
-        np.concatenate([one.e, other.e]),
-        np.concatenate([one.nodes, len(one) + other.nodes]),
+        np.concatenate([one.scans for one in sessions]),
+        np.concatenate([one.poses for one in sessions]),
+        np.concatenate([one.e for one in sessions]),
+        np.concatenate([one.nodes + k for one, k in zip(sessions, keyframes, strict=False)]),
     )

@@ -104,7 +104,7 @@ def _make_context(
     reference: Keyframes, T_place_reference: Float, session: Keyframes, T_place_session: Float
 ) -> LoopContext:
     """Both sessions as one trajectory, the reference first."""
-    both = join_keyframes(reference, session)
+    both = join_keyframes([reference, session])
     poses = np.concatenate([T_place_reference, T_place_session])
     travelled = travelled_distance(poses)
     travelled[len(reference) :] += SESSION_GAP

@@ -35,7 +35,7 @@ def match_sessions(
         threads: the result does not depend on it.
     """
     one, other = reference.session.keyframes, placed.session.keyframes
-    both = join_keyframes(one, other)
+    both = join_keyframes([one, other])
     poses = np.concatenate([reference.keyframe_poses, placed.keyframe_poses])
     travelled = travelled_distance(poses)
     travelled[len(one) :] += SESSION_GAP

@@ -78,7 +78,7 @@ def find_placement(place: Sequence[PlacedSession], session: Session) -> Placemen
     own = make_surface_map([evidence], D)
     proposed = propose_alignments(known, own)
     refused = _doubt(proposed)
-    if D == 3 and not _is_out(proposed):
+    if D == 3 and not _is_excluded(proposed):
         # sweeps are registered in space, which tells more than their planar views
         rivals = [one.T for one in proposed[1:_MAX_RIVALS]] if refused else []
         return Placement(proposed[0].T, refused=refused, rivals=rivals)
@@ -100,7 +100,7 @@ def _is_strong(proposed: list[Hypothesis]) -> bool:
     return best.agree >= _STRONG_AGREEING and few and rival <= _STRONG_RIVAL * best.score
 
 
-def _is_out(proposed: list[Hypothesis]) -> bool:
+def _is_excluded(proposed: list[Hypothesis]) -> bool:
     """Whether the maps exclude even the best alignment."""
     if not proposed or proposed[0].comparison.agree < _MIN_AGREEING:
         return True
@@ -114,7 +114,7 @@ def _doubt(proposed: list[Hypothesis]) -> str:
         return "no part of it looks like the place"
     best, others = proposed[0].comparison, proposed[1:]
     share = best.conflict / (best.agree + best.conflict)
-    if _is_out(proposed):
+    if _is_excluded(proposed):
         return f"it contradicts the place: {100 * share:.0f} % of the surfaces that both saw differ"
     rival = max((other.comparison.score for other in others), default=0.0) / best.score
     if share > _MAX_CONFLICT * (1.0 - rival / _MAX_RIVAL):

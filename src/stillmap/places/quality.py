@@ -1,7 +1,5 @@
 """Quality of a place without truth: do its sessions see the same surfaces in the same places?"""
 
-from functools import reduce
-
 import numpy as np
 
 from stillmap.em import OccupancyMap
@@ -19,6 +17,6 @@ def rate_place(place: Place, occupancy: OccupancyMap) -> Quality:
         place: two sessions or more.
         occupancy: its map.
     """
-    joined = reduce(join_keyframes, (one.session.keyframes for one in place.sessions))
+    joined = join_keyframes([one.session.keyframes for one in place.sessions])
     poses = np.concatenate([one.keyframe_poses for one in place.sessions])
     return rate_geometry(joined.recording, poses, occupancy)

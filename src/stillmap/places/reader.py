@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core import arrays
 from stillmap.core.errors import InputError
 from stillmap.core.files import read_text, require_regular
 from stillmap.places.checksums import check_checksums
@@ -32,7 +33,6 @@ from stillmap.results.run_record import read_record
 Float = NDArray[np.float64]
 
 _MAX_JSON = 64 << 20  # bytes
-_MAX_TESTED = 20_000  # beams of keyframes that are compared with the evidence of a session
 _MAX_ARRAY = 1 << 31  # bytes of an array in an archive when it is unpacked
 
 
@@ -180,12 +180,14 @@ def _read_evidence(path: Path, keyframes: Keyframes, poses: Float) -> Evidence:
 
 
 def _end_within(keyframes: Keyframes, poses: Float, low: Float, high: Float) -> bool:
-    """Whether beams that hit something, evenly spread, end in a box of corners (D,), metres."""
+    """Whether all beams that hit something end in a box of corners (D,), metres."""
     recording = keyframes.recording
-    step = -(-recording.n_beams // _MAX_TESTED) or 1
-    beams = np.arange(0, recording.n_beams, step)
-    ends = recording.end_points(beams[recording.hit[beams]], poses)
-    return not ((ends < low) | (ends > high)).any()
+    for block in arrays.iter_blocks(recording.hit):
+        beams = block.start + np.flatnonzero(recording.hit[block])
+        ends = recording.end_points(beams, poses)
+        if ((ends < low) | (ends > high)).any():
+            return False
+    return True
 
 
 def _read_ties(path: Path, sessions: list[PlacedSession]) -> list[Tie]:

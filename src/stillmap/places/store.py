@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from stillmap.core import arrays
 from stillmap.core.arrays import write_npy
 from stillmap.core.errors import InputError
+from stillmap.core.files import require_regular
 from stillmap.io import stillmap_folder
 from stillmap.io.stillmap_folder import read as read_recording
 from stillmap.places.beam_cells import BeamCells
@@ -81,6 +82,7 @@ def copy_session(source: Path, target: Path) -> None:
 
 
 def _copy_file(source: str, target: str) -> None:
+    require_regular(Path(source))
     try:
         file = open(source, "rb", buffering=0)  # noqa: SIM115
     except OSError as error:

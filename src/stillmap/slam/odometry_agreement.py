@@ -49,8 +49,8 @@ def replace_stretches(
     measured = motion_model.compute_odometry_steps(T_odom_base)
     motion = se2.inverse(poses[:-1]) @ poses[1:]
     differs = find_differences(motion, measured.increments, stamp_ns, options)
-    by_odometry = _drop_decided(differs, measured.plausible, diagnostics)
-    if not 0.0 < by_odometry.mean() <= _MAX_SHARE:
+    by_odometry = _exclude_known_faults(differs, measured.plausible, diagnostics)
+    if not by_odometry.any() or by_odometry.mean() > _MAX_SHARE:
         return None
     out = np.array(poses)
     for t in range(int(np.argmax(by_odometry)) + 1, len(out)):
@@ -103,8 +103,8 @@ def _accumulate(steps: NDArray[Any]) -> Float:
     return np.concatenate([np.zeros((1, *steps.shape[1:])), np.cumsum(steps, axis=0)])
 
 
-def _drop_decided(differs: Mask, plausible: Mask, diagnostics: Diagnostics) -> Mask:
-    """The steps (T - 1,) of the stretches about which nothing else decides."""
+def _exclude_known_faults(differs: Mask, plausible: Mask, diagnostics: Diagnostics) -> Mask:
+    """The steps (T - 1,) of the stretches without faults, breaks or leaps that were noticed."""
     at_fault, breaks = np.zeros((2, len(differs) + 1), np.bool_)
     at_fault[diagnostics.odometry_faults] = True
     breaks[diagnostics.breaks] = True
