@@ -31,6 +31,7 @@ import itertools
 import json
 import os
 import shutil
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -107,7 +108,9 @@ def align_pairs(args: argparse.Namespace) -> str:
     rows: dict[str, list[Done]] = {}
     seeds = range(args.first_seed, args.first_seed + args.seeds)
     for pair in prepare_pairs(args.data, seeds):
-        rows.setdefault(pair.kind, []).append(_align(pair, args))
+        done = _align(pair, args)
+        print(f"{pair.folder.name}: {_describe(*done)}", file=sys.stderr, flush=True)
+        rows.setdefault(pair.kind, []).append(done)
     for one, other in _STRANGERS if args.lasers else ():
         logs = [args.lasers / f"{name}.clf.gz" for name in (one, other)]
         merged = merging.merge(args.program, logs, args.data / "places/strangers")
@@ -148,6 +151,11 @@ def _verdict(merged: merging.Merged, scores: PoseScores | None) -> str:
     if scores is None:
         return "refused" if merged.status == merging.REFUSED else "wrong"
     return "refused" if scores.verdict.startswith("refused") else scores.verdict
+
+
+def _describe(merged: merging.Merged, scores: PoseScores | None) -> str:
+    off = "" if scores is None else f", {scores.translation:.3f} m"
+    return f"{_verdict(merged, scores)}{off}, {merged.seconds:.1f} s; {merged.words}"
 
 
 def _median_and_max(values: Sequence[float], form: str) -> str:
