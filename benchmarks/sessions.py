@@ -2,8 +2,8 @@
 
 python benchmarks/sessions.py alignment --data DIR [--first-seed 0] [--seeds 3]
     [--lasers FOLDER]
-python benchmarks/sessions.py labels --data DIR [--worlds office hall] [--seeds 3]
-    [--people N]
+python benchmarks/sessions.py labels --data DIR [--worlds office hall] [--first-seed 1]
+    [--seeds 3] [--people N]
 python benchmarks/sessions.py growth --data DIR [--world office] [--sessions 32]
 python benchmarks/sessions.py laps LOG.clf.gz --data DIR
 python benchmarks/sessions.py cuts --data DIR [--worlds office hall] [--seeds 3] [--pieces 4]
@@ -81,8 +81,9 @@ def _parser() -> argparse.ArgumentParser:
         one.add_argument("--program", nargs="+", default=merging.default_program())
         if name in ("alignment", "labels", "cuts"):
             one.add_argument("--seeds", type=int, default=3)
+        if name in ("alignment", "labels"):
+            one.add_argument("--first-seed", type=int, default=0 if name == "alignment" else 1)
         if name == "alignment":
-            one.add_argument("--first-seed", type=int, default=0)
             one.add_argument("--lasers", type=Path)
         if name in ("labels", "cuts"):
             one.add_argument("--worlds", nargs="+", default=["office", "hall"])
@@ -167,7 +168,8 @@ def _median_and_max(values: Sequence[float], form: str) -> str:
 def score_labels(args: argparse.Namespace) -> str:
     """A line per world and seed."""
     lines = []
-    for world, seed in itertools.product(args.worlds, range(1, args.seeds + 1)):
+    seeds = range(args.first_seed, args.first_seed + args.seeds)
+    for world, seed in itertools.product(args.worlds, seeds):
         days = prepare_days(args.data, world, args.sessions, seed, people=args.people)
         sessions = [days / f"session-{k + 1}" for k in range(args.sessions)]
         singles = []
