@@ -8,6 +8,7 @@ void bind_grid(nanobind::module_& m);
 void bind_beam_counting(nanobind::module_& m);
 void bind_scan_registration(nanobind::module_& m);
 void bind_surfel_map(nanobind::module_& m);
+void bind_occupancy_filter(nanobind::module_& m);
 void bind_occupancy_hmm(nanobind::module_& m);
 void bind_tsdf(nanobind::module_& m);
 void bind_mean_field(nanobind::module_& m);

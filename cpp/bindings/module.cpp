@@ -14,6 +14,7 @@ NB_MODULE(_core, m) {
   stillmap::bindings::bind_beam_counting(m);
   stillmap::bindings::bind_scan_registration(m);
   stillmap::bindings::bind_surfel_map(m);
+  stillmap::bindings::bind_occupancy_filter(m);
   stillmap::bindings::bind_occupancy_hmm(m);
   stillmap::bindings::bind_tsdf(m);
   stillmap::bindings::bind_mean_field(m);

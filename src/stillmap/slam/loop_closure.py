@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,7 @@ from stillmap.slam.types import Index, LoopClosure, LoopContext, MStepResult, Sc
 
 Float = NDArray[np.float64]
 
-_KEYFRAME_DISTANCE, _SEARCH_DISTANCE = 1.0, 6.0  # m, defaults of the options
+KEYFRAME_DISTANCE, SEARCH_DISTANCE = 1.0, 6.0  # m, defaults of the options
 _MAX_CHI2 = 16.0  # 3 degrees of freedom; above it the graph rejects a loop
 
 
@@ -47,23 +48,12 @@ def close_loops(
     relocalized = _relocalize(recording, e, options, odometry)
     context, ties = relocalized.context, relocalized.closures
     chain = loop_candidates.odometry_constraints(context, options.odometry, relocalized.breaks)
-    poses, found = context.poses[context.keyframes], ties
-    attempted, fitting = list[LoopClosure](), ties
+    state = LoopState(context.poses[context.keyframes], found=ties, fitting=ties)
     centers = loop_candidates.view_centers(context)
     for first, last in loop_candidates.split_stages(context):
         progress(int(context.keyframes[first]), recording.n_scans)
-        candidates = loop_candidates.propose_candidates(
-            context, poses, centers, first, last, fitting
-        )
-        new = loop_verification.verify_candidates(context, candidates)
-        attempted += new
-        if all(closure.rejected for closure in new):
-            found = found + new
-            continue
-        found = ties + loop_consistency.reject_inconsistent_since(
-            context, chain, attempted, found[len(ties) :], first
-        )
-        poses, fitting = _correct_stage(context, chain, poses, last, found)
+        state = close_stage(context, chain, centers, state, first, last, len(ties))
+    poses, found = state.poses, state.found
     poses, found = solve_graph(context.keyframes, chain, poses, found, _MAX_CHI2)
     accepted = accepted_constraints(context.keyframes, found)
     return dataclasses.replace(
@@ -86,7 +76,7 @@ def _relocalize(
 ) -> Relocalization:
     """The trajectory with all segments relocalized."""
     poses, breaks = odometry.poses, odometry.diagnostics.breaks
-    keyframe_distance = options.keyframe_distance or _KEYFRAME_DISTANCE
+    keyframe_distance = options.keyframe_distance or KEYFRAME_DISTANCE
     search = options.loop_search_distance
     gap = loop_candidates.MIN_LOOP_TRAVEL + 2.0 * loop_verification.SUBMAP_TRAVEL
     context = LoopContext(
@@ -98,10 +88,60 @@ def _relocalize(
         local_map.select_keyframes(poses, keyframe_distance, local_map.KEYFRAME_ANGLE, breaks),
         options.resolution,
         keyframe_distance,
-        _SEARCH_DISTANCE if search is None else search,
+        SEARCH_DISTANCE if search is None else search,
         np.zeros((len(poses), 3, 3)) if odometry.drift is None else odometry.drift,
     )
     return relocalization.relocalize_segments(context, breaks)
+
+
+@dataclass(frozen=True, eq=False)
+class LoopState:
+    """Loop closure up to a keyframe.
+
+    Attributes:
+        poses: (K, 3, 3) keyframes, corrected so far.
+        attempted: closures, accepted and rejected, by the later scan.
+        found: the same after the comparison with those nearby, after those that were given.
+        fitting: accepted ones that agree with the poses.
+    """
+
+    poses: Float
+    attempted: list[LoopClosure] = field(default_factory=list)
+    found: list[LoopClosure] = field(default_factory=list)
+    fitting: list[LoopClosure] = field(default_factory=list)
+
+
+def close_stage(
+    context: LoopContext,
+    chain: list[Constraint],
+    centers: Float,
+    state: LoopState,
+    first: int,
+    last: int,
+    given: int = 0,
+) -> LoopState:
+    """Close the loops of the keyframes from `first` on, before `last`.
+
+    Args:
+        context: the trajectory.
+        chain: odometry constraints between the keyframes.
+        centers: (K, 2) as of `propose_candidates`.
+        state: of the keyframes before `first`; poses of all.
+        first, last: range of keyframes.
+        given: number of closures at the beginning of `state.found` that were not searched for.
+    """
+    candidates = loop_candidates.propose_candidates(
+        context, state.poses, centers, first, last, state.fitting
+    )
+    new = loop_verification.verify_candidates(context, candidates)
+    attempted = state.attempted + new
+    if all(closure.rejected for closure in new):
+        return dataclasses.replace(state, attempted=attempted, found=state.found + new)
+    found = state.found[:given] + loop_consistency.reject_inconsistent_since(
+        context, chain, attempted, state.found[given:], first
+    )
+    poses, fitting = _correct_stage(context, chain, state.poses, last, found)
+    return LoopState(poses, attempted, found, fitting)
 
 
 def _correct_stage(

@@ -75,17 +75,23 @@ def add_scan(
     Beams without a return may have met glass: they are no evidence against a surface.
     """
     beams = recording.beams_of(t)
-    points, hit, weights = recording.points[beams], recording.hit[beams], e[beams]
-    T_map_sensor = (T_map_base @ recording.T_base_sensor[recording.sensor[t]])[None]
-    all_hit, offset = hit[hit], np.array([0, np.count_nonzero(hit)])
-    _core.add_beams(grid, points[hit], all_hit, weights[hit], offset, T_map_sensor, remove=remove)
+    T_map_sensor = T_map_base @ recording.T_base_sensor[recording.sensor[t]]
+    points, hit = recording.points[beams], recording.hit[beams]
+    add_hits(grid, points, hit, e[beams], T_map_sensor, remove=remove)
+
+
+def add_hits(
+    grid: _core.OccupancyGrid2D,
+    points: Points,
+    hit: NDArray[np.bool_],
+    weights: NDArray[np.float32],
+    T_map_sensor: Float,
+    *,
+    remove: bool = False,
+) -> None:
+    """As `add_scan`, of points (N, 2) in the sensor frame with weights e (N,)."""
+    T, all_hit, offset = T_map_sensor[None], hit[hit], np.array([0, np.count_nonzero(hit)])
+    _core.add_beams(grid, points[hit], all_hit, weights[hit], offset, T, remove=remove)
     _core.interpolate_end_points(
-        grid,
-        points,
-        hit,
-        weights,
-        np.array([0, len(hit)]),
-        T_map_sensor,
-        **INTERPOLATION,
-        remove=remove,
+        grid, points, hit, weights, np.array([0, len(hit)]), T, **INTERPOLATION, remove=remove
     )

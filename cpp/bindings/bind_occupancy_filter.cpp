@@ -1,0 +1,179 @@
+#include <nanobind/stl/array.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/pair.h>
+#include <nanobind/stl/vector.h>
+
+#include <array>
+#include <limits>
+#include <vector>
+
+#include "arrays.hpp"
+#include "bindings.hpp"
+#include "cell_box.hpp"
+#include "stillmap/occupancy/occupancy_filter.hpp"
+
+namespace stillmap::bindings {
+namespace {
+
+template <int D>
+void check_options(double resolution, const FilterOptions& options) {
+  require(resolution > 0.0 && std::isfinite(resolution), "resolution: expected a positive length");
+  const size_t n = options.rho.size();
+  require(n > 0 && n <= OccupancyFilter<D>::kMaxClasses, "rho: expected 1 to 32 classes");
+  require(options.tau.size() == n && options.weights.size() == n,
+          "tau, weights: expected one for each class");
+  require(options.n_static > 0 && options.n_static < n,
+          "n_static: expected static classes and others");
+  for (size_t c = 0; c < n; ++c) {
+    require(options.rho[c] > 0.0 && options.rho[c] < 1.0, "rho: expected values in (0, 1)");
+    require(options.tau[c] > 0.0, "tau: expected positive seconds");
+    require(options.weights[c] > 0.0, "weights: expected positive values");
+  }
+  require(options.p_detection > 0.0 && options.p_detection < 1.0,
+          "p_detection: expected a probability in (0, 1)");
+  require(options.bin_seconds > 0.0, "bin_seconds: expected positive seconds");
+  require(options.lateral_std > 0.0, "lateral_std: expected a positive length in cells");
+  require(options.hit_radius >= 0.0, "hit_radius: expected a length in cells");
+  require(options.max_log_ratio > 0.0, "max_log_ratio: expected positive nats");
+}
+
+template <int D>
+auto add(OccupancyFilter<D>& filter, const Points<D>& points, const Flat<bool>& hit,
+         const Flat<float>& margin, const Flat<int64_t>& offset, const Poses<D>& poses,
+         int64_t time_bin, int32_t tag) {
+  const auto scans = scans_from<D>(points, hit, offset, poses);
+  const float* cells = per_beam(margin, points.shape(0), "margin");
+  for (size_t n = 0; n < points.shape(0); ++n)
+    require(cells[n] >= 0.0f, "margin: expected lengths in cells that are not negative");
+  require(tag >= 0, "tag: expected a number that is not negative");
+  nb::gil_scoped_release released;
+  filter.add(scans, cells, time_bin, tag);
+}
+
+template <int D>
+auto label(const OccupancyFilter<D>& filter, const Points<D>& points, const Flat<bool>& hit,
+           const Flat<int64_t>& offset, const Poses<D>& poses, double prior) {
+  require_probability(prior, "prior");
+  const auto scans = scans_from<D>(points, hit, offset, poses);
+  const auto otherwise = static_cast<float>(prior);
+  std::vector<float> out(points.shape(0), std::numeric_limits<float>::quiet_NaN());
+  {
+    nb::gil_scoped_release released;
+    for_each_beam<D>(scans, 0, scans.n_scans, [&](size_t, int64_t n, const Pose<D>& pose) {
+      const BeamSegment<D> beam(pose, scans.points + n * D, filter.resolution());
+      out[static_cast<size_t>(n)] =
+          scans.hit[n] ? filter.p_static_at(beam.end, otherwise) : otherwise;
+    });
+  }
+  const size_t n = out.size();
+  return to_numpy(std::move(out), {n});
+}
+
+template <int D>
+Box<D> box_around(const OccupancyFilter<D>& filter) {
+  Box<D> box;
+  if (filter.blocks().empty()) return box;
+  Cell<D> low = Cell<D>::Constant(std::numeric_limits<int32_t>::max()), high = -low;
+  for (const auto& block : filter.blocks()) {
+    low = low.cwiseMin(block->origin);
+    high = high.cwiseMax(block->origin);
+  }
+  box.first = BlockLayout<D>::cell_at(low, 0);
+  for (int d = 0; d < D; ++d)
+    box.size[static_cast<size_t>(d)] =
+        static_cast<size_t>(high[d] - low[d] + 1) * BlockLayout<D>::kEdge;
+  return box;
+}
+
+template <int D>
+auto dense(const OccupancyFilter<D>& filter, const OptionalCell<D>& first_cell,
+           const OptionalCell<D>& shape) {
+  require(first_cell.has_value() == shape.has_value(),
+          "first_cell, shape: expected both or neither");
+  const Box<D> box = shape ? Box<D>(*first_cell, *shape) : box_around(filter);
+  std::vector<float> out(box.total(), std::numeric_limits<float>::quiet_NaN());
+  {
+    nb::gil_scoped_release released;
+    box.for_each_block(filter, [&](const auto& block) {
+      filter.for_each_known_in(block, [&](const Cell<D>& cell, float p) {
+        if (box.contains(cell)) out[box.index(cell)] = p;
+      });
+    });
+  }
+  return std::make_pair(box.first_cell(), box.shaped(std::move(out)));
+}
+
+template <int D>
+auto take_changed(OccupancyFilter<D>& filter) {
+  std::vector<int64_t> cells;
+  const auto blocks = filter.take_changed_blocks();
+  for (const Cell<D>& block : blocks) {
+    const Cell<D> cell = BlockLayout<D>::cell_at(block, 0);
+    cells.insert(cells.end(), cell.data(), cell.data() + D);
+  }
+  return to_numpy(std::move(cells), {blocks.size(), static_cast<size_t>(D)});
+}
+
+template <int D>
+auto moved(const OccupancyFilter<D>& filter, const Poses<D>& motion) {
+  std::vector<Pose<D>> poses;
+  for (size_t k = 0; k < motion.shape(0); ++k) {
+    poses.push_back(pose_from<D>(motion.data() + k * (D + 1) * (D + 1)));
+    require(poses.back().R.allFinite() && poses.back().t.allFinite(), "motion: not finite");
+  }
+  nb::gil_scoped_release released;
+  return filter.moved(poses);
+}
+
+template <int D>
+void bind(nb::module_& m, const char* name) {
+  using Filter = OccupancyFilter<D>;
+  nb::class_<Filter>(m, name,
+                     "Forward filters of two-state hidden Markov models in every cell, updated "
+                     "scan by scan: the causal E-step.")
+      .def(
+          "__init__",
+          [](Filter* self, double resolution, std::vector<double> rho, std::vector<double> tau,
+             std::vector<double> weights, size_t n_static, double p_detection, double bin_seconds,
+             double lateral_std, double hit_radius, double max_log_ratio) {
+            FilterOptions options{std::move(rho), std::move(tau), std::move(weights),
+                                  n_static,       p_detection,    bin_seconds,
+                                  lateral_std,    hit_radius,     max_log_ratio};
+            check_options<D>(resolution, options);
+            new (self) Filter(resolution, std::move(options));
+          },
+          nb::arg("resolution"), nb::kw_only(), nb::arg("rho"), nb::arg("tau"), nb::arg("weights"),
+          nb::arg("n_static"), nb::arg("p_detection"), nb::arg("bin_seconds"),
+          nb::arg("lateral_std"), nb::arg("hit_radius"), nb::arg("max_log_ratio"),
+          "The first n_static classes of rho and tau (s) are static. lateral_std and hit_radius "
+          "are in cells, max_log_ratio in nats.")
+      .def_prop_ro("resolution", &Filter::resolution, "Edge of a cell, metres.")
+      .def_prop_ro("size", &Filter::size, "Number of cells in which beams ended.")
+      .def_prop_ro("memory_bytes", &Filter::memory_bytes)
+      .def("add", &add<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
+           nb::arg("margin").noconvert(), nb::arg("offset").noconvert(),
+           nb::arg("T_map_sensor").noconvert(), nb::kw_only(), nb::arg("time_bin"), nb::arg("tag"),
+           "Adds the hits of scans taken in one time bin. A beam passes the cells that lie more "
+           "than its margin (M,) float32, in cells, before its end. tag: see `moved`.")
+      .def("label", &label<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
+           nb::arg("offset").noconvert(), nb::arg("T_map_sensor").noconvert(), nb::arg("prior"),
+           "(M,) float32 P(static) of every beam by what was added so far. NaN for unusable "
+           "beams; the prior without a return, and where no beam ended before.")
+      .def("dense", &dense<D>, nb::arg("first_cell") = nb::none(), nb::arg("shape") = nb::none(),
+           "Lowest cell (D,), and P(static and occupied) as an array [(z,) y, x] float32 of a box "
+           "of cells, by default of all; NaN where no beam passed or ended.")
+      .def("take_changed_blocks", &take_changed<D>,
+           "Lowest cells (B, D) int64 of the blocks that changed since the last call.")
+      .def("moved", &moved<D>, nb::arg("motion").noconvert(),
+           "A filter whose cells are moved by the motions (K, D+1, D+1), metres, of the tags of "
+           "the scans that observed them last. Cells that meet add their evidence.");
+}
+
+}  // namespace
+
+void bind_occupancy_filter(nb::module_& m) {
+  bind<2>(m, "OccupancyFilter2D");
+  bind<3>(m, "OccupancyFilter3D");
+}
+
+}  // namespace stillmap::bindings

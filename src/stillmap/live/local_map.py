@@ -1,0 +1,93 @@
+"""The local map that scans are matched against: spaced scans of the last stretch of travel."""
+
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+import stillmap._core as _core
+from stillmap.core import se2
+from stillmap.core.short_repr import ShortRepr
+from stillmap.live.scan import ScanBeams
+from stillmap.slam import scan_hits
+from stillmap.slam.local_map import SCAN_SPACING, SPACING_PER_SECOND
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class MappedScan(ShortRepr):
+    """A scan in a map.
+
+    Attributes:
+        beams: of the scan.
+        e: (N,) float32, P(static) with which it was added.
+        T_map_base: (3, 3).
+        travelled: m up to it.
+    """
+
+    beams: ScanBeams
+    e: NDArray[np.float32]
+    T_map_base: Float
+    travelled: float
+
+
+class LocalMap:
+    """A map of spaced scans.
+
+    Args:
+        resolution: m, edge of a cell.
+    """
+
+    def __init__(self, resolution: float) -> None:
+        self.grid = _core.OccupancyGrid2D(resolution, scan_hits.FREE_SPACE_MARGIN)
+        self._scans = deque[MappedScan]()  # by travel
+        self._last: dict[str | int, MappedScan] = {}  # of each sensor
+
+    @classmethod
+    def of(cls, resolution: float, scans: Iterable[MappedScan]) -> "LocalMap":
+        """A map of scans, which leave it by their travel."""
+        out = cls(resolution)
+        for scan in sorted(scans, key=lambda scan: (scan.travelled, scan.beams.stamp_ns)):
+            out._insert(scan)
+        return out
+
+    def add(self, scan: MappedScan) -> bool:
+        """Add a scan unless it is too close to the last one of its sensor; True if it was added."""
+        if not self._is_spaced(scan):
+            return False
+        self._insert(scan)
+        return True
+
+    def remove_before(self, travelled: float) -> None:
+        """Remove the scans taken before that many metres of travel."""
+        while self._scans and self._scans[0].travelled < travelled:
+            _add_scan(self.grid, self._scans.popleft(), remove=True)
+
+    def has_sensor(self, sensor: str | int) -> bool:
+        """True if it holds a scan of a sensor."""
+        return sensor in self._last
+
+    def _insert(self, scan: MappedScan) -> None:
+        _add_scan(self.grid, scan)
+        self._scans.append(scan)
+        last = self._last.get(scan.beams.sensor)
+        if last is None or last.beams.stamp_ns <= scan.beams.stamp_ns:
+            self._last[scan.beams.sensor] = scan
+
+    def _is_spaced(self, scan: MappedScan) -> bool:
+        last = self._last.get(scan.beams.sensor)
+        if last is None:
+            return True
+        x, y, theta = se2.parameters(se2.inverse(last.T_map_base) @ scan.T_map_base)
+        seconds = 1e-9 * (scan.beams.stamp_ns - last.beams.stamp_ns)
+        return bool(np.hypot(x, y) + abs(theta) + SPACING_PER_SECOND * seconds >= SCAN_SPACING)
+
+
+def _add_scan(grid: _core.OccupancyGrid2D, scan: MappedScan, *, remove: bool = False) -> None:
+    beams = scan.beams
+    scan_hits.add_hits(
+        grid, beams.points, beams.hit, scan.e, scan.T_map_base @ beams.T_base_sensor, remove=remove
+    )

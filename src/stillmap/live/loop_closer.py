@@ -1,0 +1,193 @@
+"""Loop closure while the robot drives: the stages of `slam.loop_closure`, one after another."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core import se2
+from stillmap.core.recording import Recording
+from stillmap.core.short_repr import ShortRepr
+from stillmap.live.local_map import MappedScan
+from stillmap.slam import local_map, loop_candidates, loop_closure
+from stillmap.slam.loop_closure import LoopState
+from stillmap.slam.options import SlamOptions
+from stillmap.slam.types import LoopContext
+
+Float = NDArray[np.float64]
+
+_EVERY = 5.0  # m of travel between two searches for loops
+_NEAR_TRAVEL = 25.0  # m of drift up to which earlier scans are part of the local map
+_HEADING = 0.8  # rad between two earlier scans of one place in the local map
+_NEAR_DISTANCE = 25.0  # m from the robot up to which they are
+
+
+@dataclass(frozen=True, eq=False)
+class Correction(ShortRepr):
+    """What closing loops changed.
+
+    Attributes:
+        motion: (S, 3, 3) of the spaced scans, from the old map to the new one.
+        T_map_local: (3, 3) of the frame of the odometry by scans in the new map.
+        near: indices of the spaced scans whose place relative to the robot is well known.
+        poses: (S, 3, 3) T_map_base of all spaced scans in the new map.
+    """
+
+    motion: Float
+    T_map_local: Float
+    near: NDArray[np.intp]
+    poses: Float
+
+
+class LoopCloser:
+    """Spaced scans of the whole run, and the loops between them.
+
+    Args:
+        options: see SlamOptions.
+    """
+
+    def __init__(self, options: SlamOptions) -> None:
+        self.scans: list[MappedScan] = []
+        self._options = options
+        self._explained: list[float] = []
+        self._drift: list[Float] = []
+        self._keyframes: list[int] = []
+        self._since = np.inf  # travel since the last keyframe, in units of their spacing
+        self._state = LoopState(np.zeros((0, 3, 3)))
+        self._centers = np.zeros((0, 2))
+        self._poses = np.zeros((0, 3, 3))  # T_map_base of the spaced scans
+        self._T_map_local = np.eye(3)
+        self._searched_until = 0.0
+
+    def add(self, scan: MappedScan, explained: float, drift: Float) -> None:
+        """Add a spaced scan at its pose in the frame of the odometry by scans.
+
+        Args:
+            scan: the scan.
+            explained: share of it that the local map explained.
+            drift: (3, 3) covariance that the steps since the last one add, where scans say nothing.
+        """
+        if self.scans:
+            step = se2.parameters(se2.inverse(self.scans[-1].T_map_base) @ scan.T_map_base)
+            self._since += float(np.hypot(*step[:2])) / self._keyframe_distance
+            self._since += abs(float(step[2])) / local_map.KEYFRAME_ANGLE
+        if self._since >= 1.0:
+            self._keyframes.append(len(self.scans))
+            self._since = 0.0
+        self.scans.append(scan)
+        self._explained.append(explained)
+        self._drift.append(drift)
+        pose = self._T_map_local @ scan.T_map_base
+        self._poses = np.concatenate([self._poses, pose[None]])
+
+    @property
+    def count(self) -> int:
+        """Number of spaced scans."""
+        return len(self.scans)
+
+    @property
+    def is_due(self) -> bool:
+        """True if the robot has driven so far that loops are worth a search."""
+        return (
+            len(self._keyframes) > len(self._state.poses) + 1
+            and self.scans[-1].travelled >= self._searched_until + _EVERY
+        )
+
+    def close(self) -> Correction | None:
+        """Search loops of the keyframes since the last search; None: nothing changed."""
+        context = self._context()
+        first, last = len(self._state.poses), len(context.keyframes)
+        self._searched_until = self.scans[-1].travelled
+        chain = loop_candidates.odometry_constraints(context, self._options.odometry, [])
+        new = context.keyframes[first:]
+        self._centers = np.concatenate(
+            [self._centers, loop_candidates.view_centers(replace(context, keyframes=new))]
+        )
+        before = self._state
+        poses = np.concatenate([before.poses, self._T_map_local @ context.poses[new]])
+        state = replace(before, poses=poses)
+        self._state = loop_closure.close_stage(context, chain, self._centers, state, first, last)
+        if np.array_equal(self._state.poses, poses):
+            return None
+        return self._correct(context)
+
+    def near_scans(self, correction: Correction) -> list[MappedScan]:
+        """The scans of the local map after a correction, in the frame of the odometry by scans.
+
+        Of earlier travel one, the last, for each metre and heading.
+        """
+        now, back = self.scans[-1].travelled, se2.inverse(correction.T_map_local)
+        recent, earlier = list[MappedScan](), dict[tuple[int, ...], MappedScan]()
+        for s in correction.near.tolist():
+            T = back @ correction.poses[s]
+            if self.scans[s].travelled >= now - _NEAR_TRAVEL:
+                recent.append(replace(self.scans[s], T_map_base=T))
+                continue
+            x, y, theta = se2.parameters(T)
+            key = (int(np.floor(x)), int(np.floor(y)), int(np.floor(theta / _HEADING)))
+            earlier[key] = replace(self.scans[s], T_map_base=T, travelled=now)
+        return recent + list(earlier.values())
+
+    def _correct(self, context: LoopContext) -> Correction:
+        keyframes, poses = context.keyframes, self._state.poses
+        self._T_map_local = poses[-1] @ se2.inverse(context.poses[keyframes[-1]])
+        every = np.append(keyframes, len(self.scans) - 1)
+        last = self._T_map_local @ context.poses[-1]
+        corrected = local_map.propagate_corrections(
+            context.poses, *_without_repetition(every, np.concatenate([poses, last[None]]))
+        )
+        motion = corrected @ se2.inverse(self._poses)
+        self._poses = corrected
+        return Correction(motion, self._T_map_local, self._find_near(context), corrected)
+
+    def _find_near(self, context: LoopContext) -> NDArray[np.intp]:
+        """Spaced scans near the robot, along the graph and in the map."""
+        k = len(context.keyframes) - 1
+        metres = loop_candidates.graph_distances(context, k, self._state.fitting)
+        scans = np.arange(len(self.scans))
+        of = np.clip(np.searchsorted(context.keyframes, scans, side="right") - 1, 0, k)
+        away = np.hypot(*(self._poses[:, :2, 2] - self._poses[-1, :2, 2]).T)
+        return np.flatnonzero((metres[of] <= _NEAR_TRAVEL) & (away <= _NEAR_DISTANCE))
+
+    def _context(self) -> LoopContext:
+        search = self._options.loop_search_distance
+        return LoopContext(
+            _to_recording(self.scans),
+            np.concatenate([scan.e for scan in self.scans]),
+            np.array([scan.T_map_base for scan in self.scans]),
+            np.array([scan.travelled for scan in self.scans]),
+            np.array(self._explained),
+            np.array(self._keyframes, np.intp),
+            self._options.resolution,
+            self._keyframe_distance,
+            loop_closure.SEARCH_DISTANCE if search is None else search,
+            np.array(self._drift),
+        )
+
+    @property
+    def _keyframe_distance(self) -> float:
+        return self._options.keyframe_distance or loop_closure.KEYFRAME_DISTANCE
+
+
+def _without_repetition(
+    scans: NDArray[np.intp], poses: Float
+) -> tuple[NDArray[np.intp], Float]:
+    kept = np.append(True, np.diff(scans) > 0)
+    return scans[kept], poses[kept]
+
+
+def _to_recording(scans: list[MappedScan]) -> Recording:
+    """Spaced scans as a recording without odometry."""
+    beams = [scan.beams for scan in scans]
+    sensors = list(dict.fromkeys(one.sensor for one in beams))
+    mounts = {one.sensor: one.T_base_sensor for one in beams}
+    offset = np.concatenate([[0], np.cumsum([len(one.points) for one in beams])])
+    return Recording(
+        stamp_ns=np.array([one.stamp_ns for one in beams], np.int64),
+        offset=offset.astype(np.int64),
+        points=np.concatenate([one.points for one in beams]),
+        hit=np.concatenate([one.hit for one in beams]),
+        T_base_sensor=np.array([mounts[sensor] for sensor in sensors]),
+        sensor=np.array([sensors.index(one.sensor) for one in beams], np.int32),
+        T_odom_base=None,
+    )

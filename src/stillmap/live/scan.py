@@ -1,0 +1,134 @@
+"""Scans as they arrive: what users push, and the plain arrays that everything else works on."""
+
+# signatures name ArrayLike instead of spelling it out
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stillmap.core.short_repr import ShortRepr
+from stillmap.io.array_checks import poses_to_matrices, require_length, stamps_to_ns, to_array
+from stillmap.preprocessing.max_range import MAX_ZERO_RANGE
+from stillmap.preprocessing.options import MAX_PLAUSIBLE_RANGE
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Scan(ShortRepr):
+    """One scan of a laser, or one sweep of a lidar.
+
+    Readings mean what they mean in a ROS LaserScan: NaN, negative and near zero: unusable; +inf and
+    readings from `max_range` on: nothing within reach.
+
+    Attributes:
+        stamp: seconds as a float, nanoseconds as an integer, or datetime64.
+        ranges: (N,) metres; None: `points` are given.
+        angles: (N,) radians in the sensor frame, counter-clockwise.
+        points: (N, 2) or (N, 3) end points in the sensor frame, metres, instead of ranges and
+            angles; what is not finite is unusable.
+        hit: (N,) of `points`: False where nothing was met within reach; None: all are hits.
+        sensor: name or number; each has its own pose on the robot.
+        sensor_pose: of the sensor on the robot, (3,) x, y, theta, (3, 3) or (4, 4); None: at the
+            robot's centre.
+        beam_times: (N,) seconds after the stamp; None: all beams have the stamp of the scan.
+        min_range: metres; shorter readings are unusable.
+        max_range: metres; None: only +inf is beyond reach.
+    """
+
+    stamp: ArrayLike
+    ranges: ArrayLike | None = None
+    angles: ArrayLike | None = None
+    points: ArrayLike | None = None
+    hit: ArrayLike | None = None
+    sensor: str | int = 0
+    sensor_pose: ArrayLike | None = None
+    beam_times: ArrayLike | None = None
+    min_range: float = 0.0
+    max_range: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ScanBeams(ShortRepr):
+    """The beams of one scan.
+
+    Attributes:
+        stamp_ns: nanoseconds.
+        points: (N, D) float32, in the sensor frame; NaN: unusable. Without a return they end where
+            known free space ends.
+        hit: (N,) bool.
+        T_base_sensor: (D+1, D+1).
+        sensor: name or number.
+        beam_time: (N,) float32, seconds after the stamp; None: all beams have it.
+    """
+
+    stamp_ns: int
+    points: NDArray[np.float32]
+    hit: NDArray[np.bool_]
+    T_base_sensor: Float
+    sensor: str | int = 0
+    beam_time: NDArray[np.float32] | None = None
+
+    @property
+    def dimension(self) -> int:
+        """2 or 3."""
+        return self.points.shape[1]
+
+
+def to_beams(scan: Scan) -> ScanBeams:
+    """The beams of a scan.
+
+    Raises:
+        ValueError: names the argument, what was expected, and what it was.
+    """
+    stamp_ns = int(stamps_to_ns(np.atleast_1d(np.asarray(scan.stamp)))[0])
+    if scan.points is None:
+        points, hit = _from_ranges(scan)
+    else:
+        points, hit = _from_points(scan)
+    D = points.shape[1]
+    times = scan.beam_times
+    if times is not None:
+        times = to_array("beam_times", times, "(N,)").astype(np.float32)
+        require_length("beam_times", len(times), len(points), "the beams")
+    pose = _sensor_matrix(scan.sensor_pose, D)
+    return ScanBeams(stamp_ns, points, hit, pose, scan.sensor, times)
+
+
+def _from_ranges(scan: Scan) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    if scan.ranges is None or scan.angles is None:
+        raise ValueError("scan: expected ranges and angles, or points")
+    ranges = to_array("ranges", scan.ranges, "(N,)").astype(np.float64)
+    angles = to_array("angles", scan.angles, "(N,)").astype(np.float64)
+    require_length("angles", len(angles), len(ranges), "ranges")
+    limit = MAX_PLAUSIBLE_RANGE if scan.max_range is None else scan.max_range
+    beyond = ranges >= limit
+    usable = beyond | (ranges >= max(scan.min_range, MAX_ZERO_RANGE))
+    # without a stated range nobody knows how far a beam without a return went
+    usable &= ~beyond | (scan.max_range is not None)
+    length = np.where(usable, np.minimum(ranges, limit), np.nan)
+    points = length[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    return points.astype(np.float32), usable & ~beyond
+
+
+def _from_points(scan: Scan) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    points = np.array(scan.points, np.float32)
+    if points.ndim != 2 or points.shape[1] not in (2, 3):
+        raise ValueError(f"points: expected (N, 2) or (N, 3), got {points.shape}")
+    finite = np.isfinite(points).all(axis=1)
+    near = np.linalg.norm(np.where(finite[:, None], points, 0.0), axis=1)
+    usable = finite & (near >= max(scan.min_range, MAX_ZERO_RANGE)) & (near < MAX_PLAUSIBLE_RANGE)
+    points[~usable] = np.nan
+    if scan.hit is None:
+        return points, usable
+    hit = to_array("hit", scan.hit, "(N,)").astype(np.bool_)
+    require_length("hit", len(hit), len(points), "points")
+    return points, usable & hit
+
+
+def _sensor_matrix(pose: ArrayLike | None, dimension: int) -> Float:
+    if pose is None:
+        return np.eye(dimension + 1)
+    return poses_to_matrices("sensor_pose", np.asarray(pose)[None], 1, dimension)[0]

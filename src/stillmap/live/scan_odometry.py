@@ -1,0 +1,204 @@
+"""Causal scan matching in 2D: each scan is matched (9) against a map of the scans before it."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core import se2
+from stillmap.live.local_map import LocalMap, MappedScan
+from stillmap.live.scan import ScanBeams
+from stillmap.slam import kidnapping, motion_model
+from stillmap.slam.kidnapping import Evidence
+from stillmap.slam.motion_model import MotionPrior, OdometryNoise, VelocityNoise
+from stillmap.slam.options import SlamOptions
+from stillmap.slam.scan_hits import Scan
+from stillmap.slam.scan_matching import (
+    ScanMatch,
+    accept_prior,
+    is_inconsistent,
+    is_poor,
+    match_scan,
+    widen_match,
+)
+
+Float = NDArray[np.float64]
+
+_MAX_TRAVEL = 25.0  # m after which scans leave the local map
+_EXPLAINED_RATE = 0.1  # weight of one scan in the running average of the explained share
+_LEAP = 1.0  # m between two scans, and times the speed below, beyond which odometry has leaped
+_MAX_SPEED = 3.0  # m/s of robots
+# contradicting scans for each one that agrees, after which the robot was carried, and so many
+_CARRIED_AFTER, _MAX_STRAY = 20.0, 30.0
+
+
+@dataclass(frozen=True)
+class Registration:
+    """A registered scan.
+
+    Attributes:
+        T: (3, 3) pose of the base in the frame of the odometry by scans, which never jumps.
+        covariance: (3, 3) of x, y (axes of that frame) and heading, against the local map.
+        explained: share of the beams that the local map explains.
+        drift: (3, 3) covariance that the step adds where the scan says nothing.
+        is_slipping: odometry disagrees with the scans.
+        is_blind: no beam met anything that the local map knows.
+        is_carried: the scans contradict the local map, which begins anew.
+    """
+
+    T: Float
+    covariance: Float
+    explained: float
+    drift: Float
+    is_slipping: bool = False
+    is_blind: bool = False
+    is_carried: bool = False
+
+
+class ScanOdometry:
+    """Poses of scans as they arrive.
+
+    Args:
+        options: see SlamOptions.
+    """
+
+    def __init__(self, options: SlamOptions) -> None:
+        self.options = options
+        self.local_map = LocalMap(options.resolution)
+        self.travelled = 0.0
+        self._pose, self._before = np.eye(3), np.eye(3)
+        self._stamp_ns, self._seconds = 0, 0.0
+        self._velocity_noise, self._odometry_noise = VelocityNoise(), OdometryNoise()
+        self._usual: dict[str | int, float] = {}
+        self._contradictions = 0.0
+        self._is_first = True
+
+    def predict(self, beams: ScanBeams, increment: Float | None) -> MotionPrior:
+        """The prior of the next scan: odometry where it is plausible, else constant velocity.
+
+        Args:
+            beams: of the scan.
+            increment: (3, 3) of odometry since the last scan; None: there is none.
+        """
+        if self._is_first:
+            return motion_model.gaussian_prior(self._pose, 1e-3, 1e-3)
+        if increment is not None and self._is_plausible(increment, beams.stamp_ns):
+            return motion_model.odometry_prior(self._pose, increment, self.options.odometry)
+        return self._guess()
+
+    def register(
+        self, beams: ScanBeams, scan: Scan, prior: MotionPrior, increment: Float | None
+    ) -> Registration:
+        """Register a scan.
+
+        Args:
+            beams: of the scan.
+            scan: its hits with weights P(static).
+            prior: of `predict`.
+            increment: as of `predict`.
+        """
+        usual = self._usual.get(beams.sensor, 0.0)
+        match, is_slipping, is_carried = self._match(beams, scan, prior, increment, usual)
+        is_blind = not len(scan.points) or float(scan.weights.sum()) <= 0.0
+        learned = self._learned_prior(prior, increment) or prior
+        drift = motion_model.blind_drift(learned, match.covariance)
+        self._learn(beams, learned, match, usual)
+        self._advance(beams, match.T_map_base)
+        doubts = is_slipping, is_blind, is_carried
+        return Registration(match.T_map_base, match.covariance, match.explained, drift, *doubts)
+
+    def add(self, beams: ScanBeams, e: NDArray[np.float32]) -> MappedScan | None:
+        """Add the last scan to the local map, with P(static) e (N,), unless it is too close to the
+        one before; the scan if it was added."""
+        scan = MappedScan(beams, e, self._pose, self.travelled)
+        added = self.local_map.add(scan)
+        self.local_map.remove_before(self.travelled - _MAX_TRAVEL)
+        return scan if added else None
+
+    def replace_local_map(self, scans: Iterable[MappedScan]) -> None:
+        """Match against these scans, at poses in the frame of this odometry, from now on."""
+        self.local_map = LocalMap.of(self.options.resolution, scans)
+
+    def _match(
+        self,
+        beams: ScanBeams,
+        scan: Scan,
+        prior: MotionPrior,
+        increment: Float | None,
+        usual: float,
+    ) -> tuple[ScanMatch, bool, bool]:
+        """The match, whether odometry slips, and whether the robot was carried elsewhere."""
+        if not self.local_map.has_sensor(beams.sensor) or not len(scan.points):
+            return accept_prior(prior), False, False
+        grid = self.local_map.grid
+        match = match_scan(grid, scan, prior, usual, self._learned_prior(prior, increment))
+        if not is_poor(match, usual):
+            self._contradictions = 0.0
+            return match, match.contradicts_odometry, False
+        other = self._guess() if prior.is_odometry else None
+        wider = widen_match(grid, scan, prior, other, match, usual)
+        if wider.widened and self._is_reachable(beams, wider.T_map_base):
+            is_slipping = prior.is_odometry and is_inconsistent(prior, wider.T_map_base)
+            return wider, is_slipping, False
+        if self._is_carried(kidnapping.judge_scan(grid, scan, match, usual)):
+            self._start_anew()
+            return accept_prior(prior), False, True
+        return match, match.contradicts_odometry, False
+
+    def _is_carried(self, evidence: Evidence) -> bool:
+        """True when so many scans contradicted the local map, and hardly any agreed."""
+        if evidence is Evidence.CONTRADICTS:
+            self._contradictions = min(self._contradictions + 1.0, _MAX_STRAY)
+        elif evidence is Evidence.AGREES:
+            self._contradictions = max(self._contradictions - 4.0, 0.0)
+        return self._contradictions >= _CARRIED_AFTER
+
+    def _start_anew(self) -> None:
+        self.local_map = LocalMap(self.options.resolution)
+        self._usual.clear()
+        self._contradictions = 0.0
+
+    def _learned_prior(self, prior: MotionPrior, increment: Float | None) -> MotionPrior | None:
+        """The odometry prior with the noise learned so far; None: use `prior`."""
+        if not prior.is_odometry or increment is None:
+            return None
+        return motion_model.odometry_prior(
+            self._pose, increment, self.options.odometry, self._odometry_noise
+        )
+
+    def _guess(self) -> MotionPrior:
+        return motion_model.constant_velocity_prior(self._pose, self._before, self._velocity_noise)
+
+    def _is_plausible(self, increment: Float, stamp_ns: int) -> bool:
+        seconds = 1e-9 * (stamp_ns - self._stamp_ns)
+        metres = float(np.hypot(*increment[:2, 2]))
+        return metres <= max(_LEAP, _MAX_SPEED * seconds)
+
+    def _is_reachable(self, beams: ScanBeams, T: Float) -> bool:
+        return self._is_plausible(se2.inverse(self._pose) @ T, beams.stamp_ns)
+
+    def _learn(
+        self, beams: ScanBeams, learned: MotionPrior, match: ScanMatch, usual: float
+    ) -> None:
+        """Update the running averages of noise and of the explained share."""
+        if not self.local_map.has_sensor(beams.sensor):
+            return
+        if learned.is_odometry and not is_poor(match, usual):
+            self._odometry_noise = self._odometry_noise.update(
+                learned, match.T_map_base, match.covariance
+            )
+        rate = _EXPLAINED_RATE if usual > 0.0 else 1.0  # 0: the first scan of a map
+        self._usual[beams.sensor] = usual + rate * (match.explained - usual)
+        residual = self._guess().residual(match.T_map_base)
+        self._velocity_noise = self._velocity_noise.update(residual, self._seconds)
+
+    def _advance(self, beams: ScanBeams, T: Float) -> None:
+        if not self._is_first:
+            seconds = 1e-9 * (beams.stamp_ns - self._stamp_ns)
+            self._seconds = seconds if self._seconds == 0.0 else 0.9 * self._seconds + 0.1 * seconds
+            self.travelled += float(np.hypot(*(T[:2, 2] - self._pose[:2, 2])))
+            self._before = self._pose
+        else:
+            self._before = T
+        self._pose, self._stamp_ns, self._is_first = T, beams.stamp_ns, False

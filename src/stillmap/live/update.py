@@ -1,0 +1,33 @@
+"""What a pushed scan tells."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.short_repr import ShortRepr
+from stillmap.live.causal_labels import MapChange
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Update(ShortRepr):
+    """The answer to one scan.
+
+    Attributes:
+        pose: (D+1, D+1) T_map_base.
+        covariance: (3, 3) of x, y (map axes) and heading, in 3D (6, 6).
+        p_static: (N,) float32 of the beams, from what is known so far; NaN: unusable.
+        T_map_odom: (D+1, D+1); None: without odometry.
+        doubts: any of "slip" (odometry disagrees with the scans), "blind" (no beam met anything
+            that the map knows), "carried" (the scans contradict the map).
+        changes: parts of the map that changed since the last update.
+    """
+
+    pose: Float
+    covariance: Float
+    p_static: NDArray[np.float32]
+    T_map_odom: Float | None
+    doubts: tuple[str, ...] = ()
+    changes: list[MapChange] = field(default_factory=list)
