@@ -115,14 +115,16 @@ auto take_changed(OccupancyFilter<D>& filter) {
 }
 
 template <int D>
-auto moved(const OccupancyFilter<D>& filter, const Poses<D>& motion) {
+size_t take_over(OccupancyFilter<D>& filter, const OccupancyFilter<D>& from, const Poses<D>& motion,
+                 size_t first, size_t count) {
+  require(&filter != &from, "other: expected another filter");
   std::vector<Pose<D>> poses;
   for (size_t k = 0; k < motion.shape(0); ++k) {
     poses.push_back(pose_from<D>(motion.data() + k * (D + 1) * (D + 1)));
     require(poses.back().R.allFinite() && poses.back().t.allFinite(), "motion: not finite");
   }
   nb::gil_scoped_release released;
-  return filter.moved(poses);
+  return filter.take_over(from, poses, first, count);
 }
 
 template <int D>
@@ -154,7 +156,7 @@ void bind(nb::module_& m, const char* name) {
            nb::arg("margin").noconvert(), nb::arg("offset").noconvert(),
            nb::arg("T_map_sensor").noconvert(), nb::kw_only(), nb::arg("time_bin"), nb::arg("tag"),
            "Adds the hits of scans taken in one time bin. A beam passes the cells that lie more "
-           "than its margin (M,) float32, in cells, before its end. tag: see `moved`.")
+           "than its margin (M,) float32, in cells, before its end. tag: see `take_over`.")
       .def("label", &label<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
            nb::arg("offset").noconvert(), nb::arg("T_map_sensor").noconvert(), nb::arg("prior"),
            "(M,) float32 P(static) of every beam by what was added so far. NaN for unusable "
@@ -164,9 +166,13 @@ void bind(nb::module_& m, const char* name) {
            "of cells, by default of all; NaN where no beam passed or ended.")
       .def("take_changed_blocks", &take_changed<D>,
            "Lowest cells (B, D) int64 of the blocks that changed since the last call.")
-      .def("moved", &moved<D>, nb::arg("motion").noconvert(),
-           "A filter whose cells are moved by the motions (K, D+1, D+1), metres, of the tags of "
-           "the scans that observed them last. Cells that meet add their evidence.");
+      .def_prop_ro("block_count", [](const Filter& filter) { return filter.blocks().size(); })
+      .def("sibling", &Filter::sibling, "An empty filter of the same kind.")
+      .def("take_over", &take_over<D>, nb::arg("other"), nb::arg("motion").noconvert(),
+           nb::arg("first"), nb::arg("count"),
+           "Adds `count` blocks of another filter from `first` on, whose cells are moved by the "
+           "motions (K, D+1, D+1), metres, of the tags of the scans that observed them last. Cells "
+           "that meet add their evidence. Returns the first block that is left.");
 }
 
 }  // namespace

@@ -12,6 +12,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from stillmap.core.errors import InputError, MissingExtra
     from stillmap.core.recording import Recording
+    from stillmap.live.mapper import LiveMapper
+    from stillmap.live.scan import Scan
+    from stillmap.live.update import Update
     from stillmap.mesh.build import Models
     from stillmap.pipeline.em_loop import iterate
     from stillmap.pipeline.estimate import Iteration
@@ -32,6 +35,7 @@ __all__ = [
     "BuiltResult",
     "InputError",
     "Iteration",
+    "LiveMapper",
     "MissingExtra",
     "Models",
     "Options",
@@ -41,7 +45,9 @@ __all__ = [
     "Result",
     "SavedPlace",
     "SavedResult",
+    "Scan",
     "SessionChange",
+    "Update",
     "__version__",
     "build",
     "build_models",
@@ -56,6 +62,7 @@ _MODULES = {
     "BuiltResult": "results.result",
     "InputError": "core.errors",
     "Iteration": "pipeline.estimate",
+    "LiveMapper": "live.mapper",
     "MissingExtra": "core.errors",
     "Models": "mesh.build",
     "Options": "pipeline.options",
@@ -65,7 +72,9 @@ _MODULES = {
     "Result": "results.result",
     "SavedPlace": "places.saved_place",
     "SavedResult": "results.saved",
+    "Scan": "live.scan",
     "SessionChange": "places.records",
+    "Update": "live.update",
     "build": "results.build",
     "build_models": "pipeline.models",
     "iterate": "pipeline.em_loop",
@@ -78,6 +87,7 @@ _ROOMS = (
     "em",
     "eval",
     "io",
+    "live",
     "mapping",
     "mesh",
     "pipeline",

@@ -106,7 +106,7 @@ def test_folders_in_a_room_do_not_import_each_other():
     assert find_circle(graph) == []
 
 
-@pytest.mark.parametrize("room", ["places", "fleet"])
+@pytest.mark.parametrize("room", ["places", "fleet", "live"])
 def test_modules_of_a_room_are_listed_from_the_bottom_up(room):
     row = listed_modules(room)
     own = {name for name in MODULES if name.startswith(f"stillmap.{room}.")}

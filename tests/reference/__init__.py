@@ -40,6 +40,7 @@ from reference.ndt_map import (
 from reference.no_return_beams import add_no_return_beams
 from reference.observation import MeasurementModel, observe
 from reference.observation_counts import ObservationCounts, ObservationCounts2D, ObservationCounts3D
+from reference.occupancy_filter import OccupancyFilter, OccupancyFilter2D, OccupancyFilter3D
 from reference.occupancy_grid import OccupancyGrid, OccupancyGrid2D, OccupancyGrid3D, occupancy
 from reference.occupancy_hmm import OccupancyHmm, OccupancyHmm2D, OccupancyHmm3D
 from reference.ray_traversal import cell_of, traverse
@@ -60,6 +61,9 @@ __all__ = [
     "ObservationCounts",
     "ObservationCounts2D",
     "ObservationCounts3D",
+    "OccupancyFilter",
+    "OccupancyFilter2D",
+    "OccupancyFilter3D",
     "OccupancyGrid",
     "OccupancyGrid2D",
     "OccupancyGrid3D",

@@ -101,6 +101,7 @@ def _suggest(word: str, known: Iterable[str]) -> str:
 COMMANDS = {
     "map": "the main job: recording in, folder out",
     "merge": "sessions of one place into one map with dated changes",
+    "live": "map scan by scan, as a robot would while it drives",
     "info": "what is in a recording",
     "view": "look at a result",
     "fleet": "many recordings mapped, and merged per place",

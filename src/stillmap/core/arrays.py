@@ -80,12 +80,18 @@ class ArrayBuilder:
         dtype: of the elements.
         row: shape of one row, () for numbers.
         folder: of the temporary file; None: the system's.
+        in_memory: bytes that are kept in memory before the file is begun.
     """
 
     def __init__(
-        self, dtype: DTypeLike, row: tuple[int, ...] = (), folder: Path | None = None
+        self,
+        dtype: DTypeLike,
+        row: tuple[int, ...] = (),
+        folder: Path | None = None,
+        in_memory: int = MAX_BYTES_IN_MEMORY,
     ) -> None:
         self._dtype, self._row, self._folder = np.dtype(dtype), row, folder
+        self._in_memory = in_memory
         self._parts: list[NDArray[Any]] = []
         self._bytes = 0
         self._length = 0
@@ -106,9 +112,7 @@ class ArrayBuilder:
         self._length += len(rows)
         self._parts.append(rows)
         self._bytes += rows.nbytes
-        if self._bytes > (
-            MAX_BYTES_IN_MEMORY if self._file is None else min(MAX_BYTES_IN_MEMORY, _BUFFER)
-        ):
+        if self._bytes > (self._in_memory if self._file is None else min(self._in_memory, _BUFFER)):
             self._write()
 
     def _write(self) -> None:
@@ -117,6 +121,21 @@ class ArrayBuilder:
         for part in self._parts:
             self._file.write(part.reshape(-1).view(np.uint8).data)
         self._parts, self._bytes = [], 0
+
+    def close(self) -> None:
+        """Close the file, if there is one; arrays that were mapped stay as they are."""
+        self._parts = []
+        if self._file is not None:
+            self._file.close()
+
+    def view(self) -> NDArray[Any]:
+        """The array (N, *row) so far, read-only where it is memory-mapped; more may be appended."""
+        shape = (self._length, *self._row)
+        if self._file is None:
+            return np.concatenate(self._parts) if self._parts else np.empty(shape, self._dtype)
+        self._write()
+        self._file.flush()
+        return _map(self._file, shape, self._dtype, writable=False)
 
     def finish(self) -> NDArray[Any]:
         """The array (N, *row), read-only where it is memory-mapped. Ends appending."""

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
+from stillmap.core.grid_map import GridMap
 from stillmap.core.short_repr import ShortRepr
 from stillmap.em.observations import P_DETECTION
 from stillmap.em.options import EmOptions
@@ -20,6 +21,9 @@ _DYNAMIC = ((0.04, 0.5), (0.04, 3.0), (0.15, 3.0), (0.04, 12.0), (0.04, 45.0))
 _LATERAL_STD = 0.4  # cells, of a beam's lateral position
 _HIT_RADIUS = 1.0  # cells from an end point to the centres of the cells that it hits
 _MAX_LOG_RATIO = 20.0  # nats: what stood for hours is known to be gone after a few bins
+# scans of a sensor in a time bin in which each beam is followed through the cells that it passed;
+# in others only its end counts
+_FOLLOWED, _MAX_STRIDE, _RATE_GAIN = 3.0, 8, 0.1
 _MARGIN, _MAX_MARGIN = 0.1, 1.0  # m behind a surface where a beam has passed it; at grazing angles
 
 
@@ -64,6 +68,7 @@ class CausalLabels:
         )
         self._prior, self._bin_ns = prior, round(1e9 * options.time_bin)
         self._first_ns: int | None = None
+        self._rate = dict[str | int, _ScanRate]()
 
     @property
     def resolution(self) -> float:
@@ -75,6 +80,13 @@ class CausalLabels:
         T = (T_map_base @ beams.T_base_sensor)[None]
         offset = np.array([0, len(beams.points)])
         return self.filter.label(beams.points, beams.hit, offset, T, self._prior)
+
+    def label_ends(
+        self, points: NDArray[np.float32], T_map_base: Float
+    ) -> NDArray[np.float32]:
+        """(N,) P(static) of hits that end at points (N, D) in the base frame."""
+        every, offset = np.ones(len(points), np.bool_), np.array([0, len(points)])
+        return self.filter.label(points, every, offset, T_map_base[None], self._prior)
 
     def add(self, beams: ScanBeams, T_map_base: Float, normals: Float, tag: int) -> None:
         """Add the hits of a scan at a pose.
@@ -90,12 +102,22 @@ class CausalLabels:
         time_bin = max(beams.stamp_ns - self._first_ns, 0) // self._bin_ns
         T = (T_map_base @ beams.T_base_sensor)[None]
         margin = _margins(beams, normals) / np.float32(self.filter.resolution)
+        margin[~self._select_followed(beams)] = np.inf
         offset = np.array([0, len(beams.points)])
         self.filter.add(beams.points, beams.hit, margin, offset, T, time_bin=time_bin, tag=tag)
 
-    def correct(self, motion: Float) -> None:
-        """Move all cells by the motions (K, D+1, D+1) of their keyframes."""
-        self.filter = self.filter.moved(np.ascontiguousarray(motion))
+    def _select_followed(self, beams: ScanBeams) -> NDArray[np.bool_]:
+        """(N,) beams to follow: fast sensors see the same several times in a time bin."""
+        rate = self._rate.setdefault(beams.sensor, _ScanRate())
+        rate.update(beams.stamp_ns)
+        stride = int(np.clip(self._bin_ns / (_FOLLOWED * max(rate.period_ns, 1.0)), 1, _MAX_STRIDE))
+        return (np.arange(len(beams.points)) + rate.count) % stride == 0
+
+    def to_map(self) -> GridMap:
+        """The planar map of what stands; NaN: unknown."""
+        first, p_occupied = self.filter.dense()
+        x, y = (first * self.resolution).tolist()
+        return GridMap(p_occupied, (x, y, 0.0), self.resolution)
 
     def take_changes(self) -> list[MapChange]:
         """The parts of the map that changed since the last call."""
@@ -103,6 +125,23 @@ class CausalLabels:
         edge = 32 if lowest.shape[1] == 2 else 8
         shape = [edge] * lowest.shape[1]
         return [MapChange(cell, self.filter.dense(cell.tolist(), shape)[1]) for cell in lowest]
+
+
+@dataclass
+class _ScanRate:
+    """Running mean of the nanoseconds between the scans of a sensor, and their number."""
+
+    period_ns: float = np.inf
+    count: int = 0
+    last_ns: int = 0
+
+    def update(self, stamp_ns: int) -> None:
+        step = float(stamp_ns - self.last_ns)
+        if self.count == 1:
+            self.period_ns = step
+        elif self.count > 1:
+            self.period_ns += _RATE_GAIN * (step - self.period_ns)
+        self.count, self.last_ns = self.count + 1, stamp_ns
 
 
 def _margins(beams: ScanBeams, normals: Float) -> NDArray[np.float32]:

@@ -46,13 +46,10 @@ class LocalMap:
         self._scans = deque[MappedScan]()  # by travel
         self._last: dict[str | int, MappedScan] = {}  # of each sensor
 
-    @classmethod
-    def of(cls, resolution: float, scans: Iterable[MappedScan]) -> "LocalMap":
-        """A map of scans, which leave it by their travel."""
-        out = cls(resolution)
-        for scan in sorted(scans, key=lambda scan: (scan.travelled, scan.beams.stamp_ns)):
-            out._insert(scan)
-        return out
+    def extend(self, scans: Iterable[MappedScan]) -> None:
+        """Add scans, however close, in the order of travel."""
+        for scan in scans:
+            self._insert(scan)
 
     def add(self, scan: MappedScan) -> bool:
         """Add a scan unless it is too close to the last one of its sensor; True if it was added."""

@@ -16,7 +16,7 @@ from stillmap.slam.types import LoopContext
 
 Float = NDArray[np.float64]
 
-_EVERY = 5.0  # m of travel between two searches for loops
+_EVERY = 2.0  # m of travel between two searches for loops
 _NEAR_TRAVEL = 25.0  # m of drift up to which earlier scans are part of the local map
 _HEADING = 0.8  # rad between two earlier scans of one place in the local map
 _NEAR_DISTANCE = 25.0  # m from the robot up to which they are
@@ -29,14 +29,14 @@ class Correction(ShortRepr):
     Attributes:
         motion: (S, 3, 3) of the spaced scans, from the old map to the new one.
         T_map_local: (3, 3) of the frame of the odometry by scans in the new map.
-        near: indices of the spaced scans whose place relative to the robot is well known.
-        poses: (S, 3, 3) T_map_base of all spaced scans in the new map.
+        poses: (S, 3, 3) T_map_base of the spaced scans in the new map.
+        near: scans of the new local map, in the frame of the odometry by scans.
     """
 
     motion: Float
     T_map_local: Float
-    near: NDArray[np.intp]
     poses: Float
+    near: list[MappedScan]
 
 
 class LoopCloser:
@@ -80,10 +80,12 @@ class LoopCloser:
         pose = self._T_map_local @ scan.T_map_base
         self._poses = np.concatenate([self._poses, pose[None]])
 
-    @property
-    def count(self) -> int:
-        """Number of spaced scans."""
-        return len(self.scans)
+    def poll(self) -> Correction | None:
+        """Search loops where that is due; None: nothing changed."""
+        return self.close() if self.is_due else None
+
+    def stop(self) -> None:
+        """Nothing to end here."""
 
     @property
     def is_due(self) -> bool:
@@ -111,23 +113,6 @@ class LoopCloser:
             return None
         return self._correct(context)
 
-    def near_scans(self, correction: Correction) -> list[MappedScan]:
-        """The scans of the local map after a correction, in the frame of the odometry by scans.
-
-        Of earlier travel one, the last, for each metre and heading.
-        """
-        now, back = self.scans[-1].travelled, se2.inverse(correction.T_map_local)
-        recent, earlier = list[MappedScan](), dict[tuple[int, ...], MappedScan]()
-        for s in correction.near.tolist():
-            T = back @ correction.poses[s]
-            if self.scans[s].travelled >= now - _NEAR_TRAVEL:
-                recent.append(replace(self.scans[s], T_map_base=T))
-                continue
-            x, y, theta = se2.parameters(T)
-            key = (int(np.floor(x)), int(np.floor(y)), int(np.floor(theta / _HEADING)))
-            earlier[key] = replace(self.scans[s], T_map_base=T, travelled=now)
-        return recent + list(earlier.values())
-
     def _correct(self, context: LoopContext) -> Correction:
         keyframes, poses = context.keyframes, self._state.poses
         self._T_map_local = poses[-1] @ se2.inverse(context.poses[keyframes[-1]])
@@ -138,16 +123,29 @@ class LoopCloser:
         )
         motion = corrected @ se2.inverse(self._poses)
         self._poses = corrected
-        return Correction(motion, self._T_map_local, self._find_near(context), corrected)
+        return Correction(motion, self._T_map_local, corrected, self._find_near(context))
 
-    def _find_near(self, context: LoopContext) -> NDArray[np.intp]:
-        """Spaced scans near the robot, along the graph and in the map."""
+    def _find_near(self, context: LoopContext) -> list[MappedScan]:
+        """The scans of the local map: near the robot along the graph and in the map.
+
+        Of earlier travel one, the last, for each metre and heading.
+        """
         k = len(context.keyframes) - 1
         metres = loop_candidates.graph_distances(context, k, self._state.fitting)
         scans = np.arange(len(self.scans))
         of = np.clip(np.searchsorted(context.keyframes, scans, side="right") - 1, 0, k)
         away = np.hypot(*(self._poses[:, :2, 2] - self._poses[-1, :2, 2]).T)
-        return np.flatnonzero((metres[of] <= _NEAR_TRAVEL) & (away <= _NEAR_DISTANCE))
+        now, back = self.scans[-1].travelled, se2.inverse(self._T_map_local)
+        recent, earlier = list[MappedScan](), dict[tuple[int, ...], MappedScan]()
+        for s in np.flatnonzero((metres[of] <= _NEAR_TRAVEL) & (away <= _NEAR_DISTANCE)).tolist():
+            T = back @ self._poses[s]
+            if self.scans[s].travelled >= now - _NEAR_TRAVEL:
+                recent.append(replace(self.scans[s], T_map_base=T))
+                continue
+            x, y, theta = se2.parameters(T)
+            key = (int(np.floor(x)), int(np.floor(y)), int(np.floor(theta / _HEADING)))
+            earlier[key] = replace(self.scans[s], T_map_base=T, travelled=now)
+        return recent + list(earlier.values())
 
     def _context(self) -> LoopContext:
         search = self._options.loop_search_distance

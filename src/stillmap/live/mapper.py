@@ -3,25 +3,39 @@
 # signatures name ArrayLike instead of spelling it out
 from __future__ import annotations
 
+import dataclasses
+import os
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stillmap.core import se2
+from stillmap.core.grid_map import GridMap
+from stillmap.core.profiling import Progress, no_progress
 from stillmap.io.array_checks import poses_to_matrices
 from stillmap.live.causal_labels import CausalLabels, MapChange
-from stillmap.live.loop_closer import Correction, LoopCloser
+from stillmap.live.history import History
+from stillmap.live.loop_closer import LoopCloser
+from stillmap.live.loop_process import LoopProcess
+from stillmap.live.map_correction import LabelledScan, MapCorrection
+from stillmap.live.saving import save_live
 from stillmap.live.scan import Scan, ScanBeams, to_beams
 from stillmap.live.scan_odometry import Registration, ScanOdometry
 from stillmap.live.update import Update
 from stillmap.pipeline.options import Options
+from stillmap.pipeline.result import map_recording
 from stillmap.results.build import to_options
-from stillmap.slam import scan_hits
+from stillmap.results.result import BuiltResult
+from stillmap.slam import local_map, scan_hits
+from stillmap.slam.motion_model import MotionPrior
+from stillmap.tracking import MovingObject
 
 Float = NDArray[np.float64]
 
+_MAX_REGISTERED = 600  # end points of a scan that are registered
 _CHANGES_EVERY_NS = 10**9  # between two updates that tell what changed in the map
 
 
@@ -30,20 +44,39 @@ class LiveMapper:
 
     Args:
         options: `Options`, or the options to change, as of `stillmap.build`.
+        background: close loops in a process of their own, so that no scan waits for them; else
+            between two scans, the same to the bit every time.
+        scratch: folder of the files in which all scans are kept for `save` and `finish`; None: the
+            system's temporary folder.
 
     Examples:
-        >>> mapper = stillmap.LiveMapper()
-        >>> update = mapper.push(stillmap.Scan(stamp, ranges, angles), odometry=(x, y, theta))
-        >>> update.pose, update.p_static
+        >>> with stillmap.LiveMapper() as mapper:
+        >>>     update = mapper.push(stillmap.Scan(stamp, ranges, angles), odometry=(x, y, theta))
+        >>>     update.pose, update.p_static
+        >>>     mapper.save("out")
     """
 
-    def __init__(self, options: Options | Mapping[str, Any] | None = None) -> None:
+    def __init__(
+        self,
+        options: Options | Mapping[str, Any] | None = None,
+        *,
+        background: bool = False,
+        scratch: str | os.PathLike[str] | None = None,
+    ) -> None:
         self.options = to_options(options)
         self._odometry = ScanOdometry(self.options.slam)
         self._labels = CausalLabels(2, self.options.slam.resolution, self.options.em)
+        slam = self.options.slam
+        self._closer = LoopProcess(slam) if background else LoopCloser(slam)
+        self._in_background = background
+        self._scratch = None if scratch is None else Path(scratch)
+        self._history = History(2, self._scratch)
         self._T_odom_base: Float | None = None
-        self._closer = LoopCloser(self.options.slam)
         self._T_map_local, self._drift = np.eye(3), np.zeros((3, 3))
+        # of the spaced scans: in the frame of the odometry by scans; in the map, as far as corrected
+        self._spaced, self._corrected = list[Float](), np.zeros((0, 3, 3))
+        self._correction: MapCorrection | None = None
+        self._last_ns: int | None = None
         self._changes_due_ns = 0
 
     def push(self, scan: Scan | ScanBeams, odometry: ArrayLike | None = None) -> Update:
@@ -55,48 +88,164 @@ class LiveMapper:
 
         Raises:
             ValueError: names the argument, what was expected, and what it was.
+            OSError: the disk of `scratch` is full.
         """
         beams = scan if isinstance(scan, ScanBeams) else to_beams(scan)
         T_odom_base = _to_matrix(odometry)
+        self._require_next(beams)
         increment = self._increment(T_odom_base)
         prior = self._odometry.predict(beams, increment)
-        weights = self._labels.label(beams, self._T_map_local @ prior.T_map_base)  # E-step at the predicted pose
-        hits = _select_hits(beams, weights)
-        found = self._odometry.register(beams, hits, prior, increment)  # M-step: (9)
-        pose = self._T_map_local @ found.T
-        self._labels.add(beams, pose, _normals_of(beams, hits), max(self._closer.count - 1, 0))
+        hits = _select_hits(beams)
+        thinned = self._weigh(_thin(hits), prior)
+        found = self._odometry.register(beams, thinned, prior, increment)  # M-step: (9)
+        pose, anchor = self._T_map_local @ found.T, len(self._spaced) - 1
+        labelled = LabelledScan(beams, found.T, _normals_of(beams, hits), max(anchor, 0))
+        self._labels.add(beams, pose, labelled.normals, labelled.tag)
         p_static = self._labels.label(beams, pose)  # E-step: (8)
-        self._T_odom_base = T_odom_base
-        self._drift = self._drift + found.drift
-        self._add_to_maps(beams, np.nan_to_num(p_static), found)
-        return self._to_update(found, p_static, T_odom_base, beams.stamp_ns)
+        self._history.append(beams, p_static, T_odom_base, pose, found.T, anchor)
+        self._T_odom_base, self._last_ns = T_odom_base, beams.stamp_ns
+        update = self._to_update(beams.stamp_ns, found, p_static, T_odom_base)
+        self._add_to_maps(labelled, np.nan_to_num(p_static), found)
+        return update
 
-    def _add_to_maps(
-        self, beams: ScanBeams, e: NDArray[np.float32], found: Registration
+    def label(self, scan: Scan | ScanBeams, number: int) -> NDArray[np.float32]:
+        """(N,) P(static) of the beams of an earlier scan, by what is known now.
+
+        Args:
+            scan: as it was pushed.
+            number: how many scans were pushed before it.
+        """
+        beams = scan if isinstance(scan, ScanBeams) else to_beams(scan)
+        anchor, local = self._history.at(number)
+        pose = self._T_map_local @ local
+        if 0 <= anchor < len(self._corrected):
+            moved = self._corrected[anchor] @ se2.inverse(self._spaced[anchor])
+            pose = moved @ local
+        return self._labels.label(beams, pose)
+
+    @property
+    def poses(self) -> Float:
+        """(T, 3, 3) T_map_base of all scans, as they are known now."""
+        answers = self._history.answers()
+        # the scan after which each spaced one is the last: itself, but for the first
+        scans = np.searchsorted(answers.anchor, np.arange(len(self._spaced)) - 1, side="right") - 1
+        every, kept = np.unique(np.maximum(scans, 0), return_index=True)
+        corrected, last = self._spaced_poses()[kept], len(answers.local) - 1
+        if every[-1] != last:
+            every = np.append(every, last)
+            corrected = np.concatenate([corrected, (self._T_map_local @ answers.local[-1])[None]])
+        return local_map.propagate_corrections(answers.local, every, corrected)
+
+    @property
+    def map(self) -> GridMap:
+        """The map of what stands, as it is known now; NaN: unknown."""
+        return self._labels.to_map()
+
+    @property
+    def objects(self) -> list[MovingObject]:
+        """What moved so far, from the labels as they are known now."""
+        return self._to_result(no_progress).objects
+
+    def save(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        overwrite: bool = False,
+        progress: Progress = no_progress,
     ) -> None:
-        """Add a spaced scan to the local map and to the pose graph, and close loops."""
-        added = self._odometry.add(beams, e)
-        if added is None:
-            return
-        self._closer.add(added, found.explained, self._drift)
-        self._drift = np.zeros((3, 3))
-        if self._closer.is_due:
-            correction = self._closer.close()
-            if correction is not None:
-                self._correct(correction)
+        """Write the folder that `stillmap.build(...).save` writes, of what is known now.
 
-    def _correct(self, correction: Correction) -> None:
-        """Take over the corrected map: pose, labels, and local map."""
-        self._T_map_local = correction.T_map_local
-        if _largest_shift(correction.motion, correction.poses) > 0.5 * self._labels.resolution:
-            self._labels.correct(correction.motion)
-        self._odometry.replace_local_map(self._closer.near_scans(correction))
+        The poses are those known now, labels and map follow from all scans so far. `live/` has what
+        was answered at the time.
+
+        Raises:
+            InputError: the folder is taken or cannot be written to.
+        """
+        save_live(self._to_result(progress), self._history.answers(), Path(path), overwrite)
+
+    def finish(self, progress: Progress = no_progress) -> BuiltResult:
+        """The result of `stillmap.build` on all scans: poses, labels and map refined."""
+        found = map_recording(
+            self._history.recording(), self.options, progress=progress, scratch=self._scratch
+        )
+        return BuiltResult(**vars(found))
+
+    def close(self) -> None:
+        """Forget all scans, and end the process that closes loops, if there is one."""
+        self._closer.stop()
+        self._history.close()
+
+    def __enter__(self) -> LiveMapper:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _to_result(self, progress: Progress) -> BuiltResult:
+        found = map_recording(
+            self._history.recording(),
+            self.options,
+            poses=self.poses,
+            progress=progress,
+            scratch=self._scratch,
+        )
+        return BuiltResult(**vars(found))
+
+    def _require_next(self, beams: ScanBeams) -> None:
+        if beams.dimension != 2:
+            raise ValueError("scan: expected a planar one")
+        if self._last_ns is not None and beams.stamp_ns < self._last_ns:
+            late = 1e-9 * (self._last_ns - beams.stamp_ns)
+            raise ValueError(f"stamp: expected none before the last scan, got {late:.6f} s earlier")
+
+    def _weigh(self, hits: scan_hits.Scan, prior: MotionPrior) -> scan_hits.Scan:
+        """The hits with weights P(static): the E-step at the predicted pose."""
+        pose = self._T_map_local @ prior.T_map_base
+        return dataclasses.replace(hits, weights=self._labels.label_ends(hits.points, pose))
 
     def _increment(self, T_odom_base: Float | None) -> Float | None:
         if T_odom_base is None or self._T_odom_base is None:
             return None
         out: Float = se2.inverse(self._T_odom_base) @ T_odom_base
         return out
+
+    def _add_to_maps(
+        self, labelled: LabelledScan, e: NDArray[np.float32], found: Registration
+    ) -> None:
+        """Add a spaced scan to the local map and to the pose graph; go on correcting the map."""
+        self._drift = self._drift + found.drift
+        added = self._odometry.add(labelled.beams, e)
+        if added is not None:
+            self._spaced.append(added.T_map_base)
+            self._closer.add(added, found.explained, self._drift)
+            self._drift = np.zeros((3, 3))
+        if self._correction is not None:
+            self._correction.note_labelled(labelled)
+            if added is not None:
+                self._correction.note_added(added)
+        elif (correction := self._closer.poll()) is not None:
+            tags = len(self._spaced)
+            self._correction = MapCorrection(correction, self._labels, self._T_map_local, tags)
+        self._go_on_correcting()
+
+    def _go_on_correcting(self) -> None:
+        """A part of the work on a correction; all of it where nobody waits."""
+        if self._correction is None:
+            return
+        is_done = self._correction.step()
+        while not (is_done or self._in_background):
+            is_done = self._correction.step()
+        if is_done:
+            self._correction.finish(self._labels)
+            self._odometry.local_map = self._correction.local_map
+            self._T_map_local = self._correction.correction.T_map_local
+            self._corrected = self._correction.correction.poses
+            self._correction = None
+
+    def _spaced_poses(self) -> Float:
+        """(S, 3, 3) T_map_base of the spaced scans."""
+        since = np.array(self._spaced[len(self._corrected) :]).reshape(-1, 3, 3)
+        return np.concatenate([self._corrected, self._T_map_local @ since])
 
     def _take_changes(self, stamp_ns: int) -> list[MapChange]:
         """The parts of the map that changed, once a second."""
@@ -107,10 +256,10 @@ class LiveMapper:
 
     def _to_update(
         self,
+        stamp_ns: int,
         found: Registration,
         p_static: NDArray[np.float32],
         T_odom_base: Float | None,
-        stamp_ns: int,
     ) -> Update:
         doubts = {
             "slip": found.is_slipping,
@@ -128,26 +277,26 @@ class LiveMapper:
         )
 
 
-def _largest_shift(motion: Float, poses: Float) -> float:
-    """m by which the motion (S, 3, 3) moves any of the poses (S, 3, 3), to which it has led."""
-    before = se2.inverse(motion) @ poses
-    return float(np.hypot(*(poses[:, :2, 2] - before[:, :2, 2]).T).max())
-
-
 def _to_matrix(odometry: ArrayLike | None) -> Float | None:
     if odometry is None:
         return None
     return poses_to_matrices("odometry", np.asarray(odometry, np.float64)[None], 1, 2)[0]
 
 
-def _select_hits(beams: ScanBeams, weights: NDArray[np.float32]) -> scan_hits.Scan:
-    """The hits of a scan in the base frame; normals of all of them, whatever their weight."""
+def _select_hits(beams: ScanBeams) -> scan_hits.Scan:
+    """The hits of a scan in the base frame with weight 1, and the normals of their surfaces."""
     points = scan_hits.transform_points(beams.points[beams.hit], beams.T_base_sensor)
-    ones = np.ones(len(points), np.float32)
-    scan = scan_hits.make_scan(points, ones, beams.T_base_sensor)
-    return scan_hits.Scan(
-        points, weights[beams.hit], scan.T_base_sensor, scan.normals, scan.isotropy
+    return scan_hits.make_scan(points, np.ones(len(points), np.float32), beams.T_base_sensor)
+
+
+def _thin(hits: scan_hits.Scan) -> scan_hits.Scan:
+    """Hits for registration: more than so many say no more."""
+    every = slice(None, None, max(-(-len(hits.points) // _MAX_REGISTERED), 1))
+    points, weights, normals, isotropy = (
+        np.ascontiguousarray(a[every])
+        for a in (hits.points, hits.weights, hits.normals, hits.isotropy)
     )
+    return scan_hits.Scan(points, weights, hits.T_base_sensor, normals, isotropy)
 
 
 def _normals_of(beams: ScanBeams, hits: scan_hits.Scan) -> Float:

@@ -123,7 +123,7 @@ def _from_points(scan: Scan) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     points[~usable] = np.nan
     if scan.hit is None:
         return points, usable
-    hit = to_array("hit", scan.hit, "(N,)").astype(np.bool_)
+    hit = np.asarray(scan.hit, np.bool_)
     require_length("hit", len(hit), len(points), "points")
     return points, usable & hit
 

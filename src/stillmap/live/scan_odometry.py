@@ -1,6 +1,5 @@
 """Causal scan matching in 2D: each scan is matched (9) against a map of the scans before it."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -115,10 +114,6 @@ class ScanOdometry:
         added = self.local_map.add(scan)
         self.local_map.remove_before(self.travelled - _MAX_TRAVEL)
         return scan if added else None
-
-    def replace_local_map(self, scans: Iterable[MappedScan]) -> None:
-        """Match against these scans, at poses in the frame of this odometry, from now on."""
-        self.local_map = LocalMap.of(self.options.resolution, scans)
 
     def _match(
         self,

@@ -1,5 +1,6 @@
 """The result folder: every file of a run, appearing together or not at all."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -36,6 +37,7 @@ def save(
     staging_folder: Path | None = None,
     tilting: "TiltingResult | None" = None,
     models: "Models | None" = None,
+    write_more: Callable[[Path], None] | None = None,
 ) -> None:
     """Writes the folder `path`: map, trajectory, pose graph, labels, objects, report, meshes.
 
@@ -46,6 +48,7 @@ def save(
         staging_folder: where the new folder is written until then; None: beside `path`.
         tilting: 3D data of a rig's second laser.
         models: meshes of the place and of the moving objects.
+        write_more: called with the folder before it appears, to write other files into it.
 
     Raises:
         InputError: `path` is taken or cannot be written to, or the region of the options lies
@@ -82,6 +85,8 @@ def save(
         previews = None if models is None else _previews(models, result.options.threads)
         page = render_report(result, tilting, previews, folder)
         (folder / "report.html").write_text(page, encoding="utf-8")
+        if write_more is not None:
+            write_more(folder)
 
 
 def _write_tilting(

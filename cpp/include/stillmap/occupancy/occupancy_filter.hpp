@@ -74,7 +74,7 @@ class OccupancyFilter : public BlockMap<D, PassedCell> {
   }
 
   // Adds the beams of one scan. margin: (M,) cells before the end of each beam that it has not
-  // passed. tag: of the scan, for `moved`.
+  // passed. tag: of the scan, for `take_over`.
   void add(const Scans<D>& scans, const float* margin, int64_t time_bin, int32_t tag) {
     if (time_bin < 0 || time_bin > std::numeric_limits<int32_t>::max())
       throw std::invalid_argument("time_bin: expected an index from 0 to 2^31 - 1");
@@ -146,15 +146,23 @@ class OccupancyFilter : public BlockMap<D, PassedCell> {
     return out;
   }
 
-  // The filter with every cell moved by the motion (from the old map to the new one) of the scan
-  // that observed it last. Cells that meet add their evidence.
-  OccupancyFilter moved(const std::vector<Pose<D>>& motion) const {
-    OccupancyFilter out(resolution_, options_);
-    for (const auto& block : this->blocks())
+  // An empty filter of the same kind.
+  OccupancyFilter sibling() const { return OccupancyFilter(resolution_, options_); }
+
+  // Adds the cells of a part of the blocks of another filter, each moved by the motion (from the
+  // old map to the new one) of the scan that observed it last. Cells that meet add their evidence.
+  // Returns the number of the first block that is left.
+  size_t take_over(const OccupancyFilter& from, const std::vector<Pose<D>>& motion, size_t first,
+                   size_t count) {
+    const size_t last =
+        std::min(first + std::min(count, from.blocks().size()), from.blocks().size());
+    for (size_t b = first; b < last; ++b) {
+      const Block& block = *from.blocks()[b];
       for (int i = 0; i < Map::kCells; ++i)
-        out.take_over(*this, block->values[static_cast<size_t>(i)], Map::cell_at(block->origin, i),
-                      motion);
-    return out;
+        take_over_cell(from, block.values[static_cast<size_t>(i)], Map::cell_at(block.origin, i),
+                       motion);
+    }
+    return last;
   }
 
  private:
@@ -311,8 +319,8 @@ class OccupancyFilter : public BlockMap<D, PassedCell> {
     });
   }
 
-  void take_over(const OccupancyFilter& from, const PassedCell& source, const Cell<D>& cell,
-                 const std::vector<Pose<D>>& motion) {
+  void take_over_cell(const OccupancyFilter& from, const PassedCell& source, const Cell<D>& cell,
+                      const std::vector<Pose<D>>& motion) {
     const bool has_filter = source.filter >= 0;
     if (!has_filter && source.passed_bins == 0) return;
     const int32_t tag =

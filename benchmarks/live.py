@@ -1,0 +1,171 @@
+"""Live mapping: poses and labels as they were given at the time, and how long that took.
+
+python benchmarks/live.py logs LOGS [--names intel fr101] --data DIR
+python benchmarks/live.py labels [--worlds hall corridor] [--first-seed 11] [--seeds 2]
+python benchmarks/live.py latency [--world hall] [--seconds 600] [--rate 40] [--beams 1081]
+
+logs: each NAME.clf.gz with NAME.exact.relations or NAME.pseudo.relations beside it: relation errors of `stillmap live --replay`, of
+the poses at the time and at the end, beside those of `stillmap map`.
+labels: F1 of "dynamic" and average precision by the lag after which a beam is labelled, seconds.
+latency: scans pushed at their own pace, loops closed in another process.
+"""
+
+import argparse
+import math
+import resource
+import time
+from collections import deque
+from pathlib import Path
+
+import numpy as np
+import session_merging as merging
+from tables import markdown
+
+from stillmap.eval.readers import read_planar_trajectory, read_relations
+from stillmap.eval.relations import compute_relation_errors
+from stillmap.eval.trajectory import compute_absolute_errors
+from stillmap.live.mapper import LiveMapper
+from stillmap.live.replay import iter_beams
+from stillmap.sim import scene_by_name, simulate
+
+_LOGS = ("intel", "aces", "belgioioso", "edmonton", "fr101", "seattle")
+_LAGS = (0.0, 1.0, 5.0, 30.0, math.inf)  # s
+
+
+def main() -> None:
+    args = _parser().parse_args()
+    print(args.run(args), flush=True)
+
+
+def _parser() -> argparse.ArgumentParser:
+    p = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    commands = p.add_subparsers(required=True)
+    logs = commands.add_parser("logs")
+    logs.set_defaults(run=map_logs)
+    logs.add_argument("folder", type=Path)
+    logs.add_argument("--names", nargs="+", default=list(_LOGS))
+    logs.add_argument("--data", type=Path, required=True, help="folder for results")
+    logs.add_argument("--program", nargs="+", default=merging.default_program())
+    labels = commands.add_parser("labels")
+    labels.set_defaults(run=score_labels)
+    labels.add_argument("--worlds", nargs="+", default=["hall", "corridor"])
+    labels.add_argument("--first-seed", type=int, default=11)
+    labels.add_argument("--seeds", type=int, default=2)
+    latency = commands.add_parser("latency")
+    latency.set_defaults(run=measure_latency)
+    latency.add_argument("--world", default="hall")
+    latency.add_argument("--seconds", type=float, default=600.0)
+    latency.add_argument("--rate", type=float, default=40.0)
+    latency.add_argument("--beams", type=int, default=1081)
+    return p
+
+
+def map_logs(args: argparse.Namespace) -> str:
+    """A line per log."""
+    lines = []
+    for name in args.names:
+        log = args.folder / f"{name}.clf.gz"
+        kinds = ("exact.relations", "pseudo.relations")
+        relations = next(p for kind in kinds if (p := args.folder / f"{name}.{kind}").exists())
+        batch, live = args.data / f"batch-{name}", args.data / f"live-{name}"
+        if not (batch / "run.json").exists():
+            merging.build_map(args.program, log, batch)
+        done = merging.call(args.program, "live", "--replay", log, "--threads", 1, "-o", live)
+        runs = [batch / "trajectory.tum", live / "live/trajectory.tum", live / "trajectory.tum"]
+        errors = [_relation_error(run, relations) for run in runs]
+        line = [f"{t:.4f} / {r:.3f}" for t, r in errors]
+        lines.append([name, *line, f"{errors[1][0] / errors[0][0]:.2f}", f"{done.cpu:.0f}"])
+        print(" | ".join(lines[-1]), flush=True)
+    titles = ["log", "batch: m / deg", "live, at the time", "live, at the end", "ratio", "CPU s"]
+    return markdown(titles, lines)
+
+
+def _relation_error(trajectory: Path, relations: Path) -> tuple[float, float]:
+    """Mean translational (m) and rotational (degrees) error."""
+    errors = compute_relation_errors(
+        read_planar_trajectory(trajectory), read_relations(relations), None, 0.1, False
+    )
+    return errors.translation.mean, errors.rotation.mean
+
+
+def score_labels(args: argparse.Namespace) -> str:
+    """A line per world and seed, F1 / AP for each lag."""
+    lines = []
+    for world in args.worlds:
+        for seed in range(args.first_seed, args.first_seed + args.seeds):
+            simulation = simulate(scene_by_name(world), seed)
+            recording, static = simulation.recording, simulation.truth.static
+            hit = recording.hit
+            by_lag, poses = _label_by_lag(recording)
+            scores = [_score(p[hit], static[hit]) for p in by_lag]
+            error = compute_absolute_errors(poses, simulation.truth.T_world_base)
+            line = [f"{f1:.3f} / {ap:.3f}" for f1, ap in scores]
+            lines.append([world, str(seed), *line, f"{error.rmse:.3f}"])
+            print(" | ".join(lines[-1]), flush=True)
+    lags = [f"{lag:g} s" if math.isfinite(lag) else "end" for lag in _LAGS]
+    return markdown(["world", "seed", *lags, "ATE m"], lines)
+
+
+def _label_by_lag(recording):
+    """P(static) of all beams (M,) for each lag, and the poses as they were given."""
+    mapper, poses = LiveMapper(), []
+    by_lag = [np.full(recording.n_beams, np.nan, np.float32) for _ in _LAGS]
+    waiting = [deque() for _ in _LAGS]
+    for t, beams in enumerate(iter_beams(recording)):
+        odometry = None if recording.T_odom_base is None else recording.T_odom_base[t]
+        update = mapper.push(beams, odometry)
+        poses.append(update.pose)
+        by_lag[0][recording.beams_of(t)] = update.p_static
+        for lag, scans, out in zip(_LAGS[1:], waiting[1:], by_lag[1:], strict=True):
+            scans.append((t, beams))
+            while scans and beams.stamp_ns - scans[0][1].stamp_ns >= 1e9 * lag:
+                s, earlier = scans.popleft()
+                out[recording.beams_of(s)] = mapper.label(earlier, s)
+    for scans, out in zip(waiting[1:], by_lag[1:], strict=True):
+        for s, earlier in scans:
+            out[recording.beams_of(s)] = mapper.label(earlier, s)
+    return by_lag, np.array(poses)
+
+
+def _score(p_static, static) -> tuple[float, float]:
+    """F1 of "dynamic" and average precision."""
+    says, moves = p_static < 0.5, ~static
+    f1 = 2 * np.count_nonzero(says & moves) / max(says.sum() + moves.sum(), 1)
+    found = moves[np.argsort(p_static, kind="stable")]
+    precision = np.cumsum(found) / np.arange(1, len(found) + 1)
+    return float(f1), float(precision[found].mean()) if found.any() else float("nan")
+
+
+def measure_latency(args: argparse.Namespace) -> str:
+    """One line: latencies, memory and poses."""
+    changes = {
+        "laser": {"beams": args.beams, "fov": math.radians(270)},
+        "robot": {"scans": round(args.seconds * args.rate), "scan_rate": args.rate},
+    }
+    simulation = simulate(scene_by_name(args.world, changes), 1)
+    recording, before = simulation.recording, _peak_mb()
+    mapper, poses, seconds, late = LiveMapper(background=True), [], [], 0
+    start = time.perf_counter()
+    for t, beams in enumerate(iter_beams(recording)):
+        due = start + t / args.rate
+        late += time.perf_counter() > due + 1.0 / args.rate
+        time.sleep(max(due - time.perf_counter(), 0.0))
+        began = time.perf_counter()
+        poses.append(mapper.push(beams, recording.T_odom_base[t]).pose)
+        seconds.append(time.perf_counter() - began)
+    mapper.close()
+    ms = 1e3 * np.array(seconds)
+    error = compute_absolute_errors(np.array(poses), simulation.truth.T_world_base)
+    line = [f"{np.median(ms):.1f}", f"{np.quantile(ms, 0.99):.1f}", f"{ms.max():.1f}", str(late)]
+    line += [f"{_peak_mb() - before:.0f}", f"{error.rmse:.3f}"]
+    return markdown(["median ms", "99 %", "max", "late", "MB more at peak", "ATE m"], [line])
+
+
+def _peak_mb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,93 @@
+"""`stillmap live`: map while scans arrive; for now those of a recording."""
+
+import argparse
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from stillmap.cli.arguments import add_read_flags, read_changes, require_apart
+from stillmap.cli.config import add_option_flags, options_from_args
+from stillmap.cli.console import print_json, say, show_progress, show_share
+from stillmap.cli.map_flags import add_map_mode_flag, add_run_flags, shared_changes
+from stillmap.core.errors import InputError
+
+if TYPE_CHECKING:
+    from stillmap.core.recording import Recording
+    from stillmap.live.replay import Latency
+    from stillmap.pipeline.options import Options
+
+DESCRIPTION = (
+    "Map scan by scan, as a robot would while it drives: each pose and P(static) of each beam "
+    "follow from what is known at the time. With --replay the scans of a recording are pushed as "
+    "fast as possible, and the result is the same to the bit every time. DIR has what `stillmap "
+    "map` writes, of what is known at the end, and in live/ what was answered at the time."
+)
+EPILOG = """examples:
+  stillmap live --replay log.clf.gz -o out
+  stillmap live --replay log.bag -o out --json --quiet
+"""
+
+
+def add_arguments(p: argparse.ArgumentParser) -> None:
+    """Add the flags and arguments."""
+    p.add_argument("--replay", metavar="INPUT", required=True, help="a recording, of one laser plane")
+    p.add_argument("-o", "--output", metavar="DIR", required=True, help="result folder")
+    p.add_argument("--overwrite", action="store_true", help="replace what is in DIR")
+    p.add_argument("--no-odometry", action="store_true", help="ignore odometry in the recording")
+    p.add_argument(
+        "--resolution", metavar="M", type=float, help="edge of a map cell in metres (default: 0.05)"
+    )
+    add_map_mode_flag(p)
+    add_run_flags(p)
+    add_read_flags(p)
+    add_option_flags(p)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Push a recording through the live mapper.
+
+    Raises:
+        InputError: the recording cannot be read or is not planar, or the output is taken.
+    """
+    from stillmap.core.files import require_new
+    from stillmap.live.mapper import LiveMapper
+    from stillmap.live.replay import replay
+    from stillmap.results.run_json import RECORD
+
+    options = options_from_args(args, read_changes(args), shared_changes(args))
+    output = Path(args.output)
+    require_new(output, RECORD, args.overwrite)
+    require_apart(output, Path(args.replay))
+    with tempfile.TemporaryDirectory(prefix="stillmap-") as scratch:
+        recording = _read(args, options, Path(scratch))
+        mapper = LiveMapper(options, scratch=scratch)
+        with show_progress(args.quiet, 1) as progress:
+            latency = replay(recording, mapper, progress)
+            mapper.save(output, overwrite=args.overwrite, progress=progress)
+    if not args.quiet:
+        say(describe(latency))
+        say(f"wrote {output}")
+    if args.json:
+        print_json({"output": str(output), **latency.to_dict()})
+    return 0
+
+
+def _read(args: argparse.Namespace, options: "Options", scratch: Path) -> "Recording":
+    from stillmap.pipeline import inputs
+
+    with show_share(args.quiet, "reading") as progress:
+        recording = inputs.read(args.replay, options.read, progress=progress, scratch=scratch)
+    if recording.dimension != 2:
+        hint = "map it with `stillmap map`"
+        raise InputError("is 3D; live mapping is planar", where=args.replay, hint=hint)
+    inputs.require_mappable(recording, options, None)
+    return recording.without_odometry() if args.no_odometry else recording
+
+
+def describe(latency: "Latency") -> str:
+    """One line about the latencies of a replay."""
+    numbers = latency.to_dict()["latency_ms"]
+    assert isinstance(numbers, dict)
+    median, p99, most = (numbers[name] for name in ("median", "p99", "max"))
+    count = len(latency.seconds)
+    return f"{count} scans, {median:.1f} ms each (99 %: {p99:.1f} ms, at most {most:.1f} ms)"

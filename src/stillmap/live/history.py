@@ -1,0 +1,145 @@
+"""All that was pushed, and what was answered at the time, in files: memory stays flat."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.arrays import ArrayBuilder
+from stillmap.core.recording import Recording
+from stillmap.core.short_repr import ShortRepr
+from stillmap.live.scan import ScanBeams
+
+Float = NDArray[np.float64]
+
+_IN_MEMORY = 1 << 18  # bytes of each array that are not yet in its file
+
+
+@dataclass(frozen=True, eq=False)
+class Answers(ShortRepr):
+    """What was answered to T scans with M beams.
+
+    Attributes:
+        poses: (T, D+1, D+1) T_map_base as it was given.
+        local: (T, D+1, D+1) in the frame of the odometry by scans, which never jumps.
+        anchor: (T,) the last spaced scan at the time; -1: none yet.
+        p_static: (M,) float32.
+    """
+
+    poses: Float
+    local: Float
+    anchor: NDArray[np.int64]
+    p_static: NDArray[np.float32]
+
+
+class History:
+    """Scans and answers, appended.
+
+    Args:
+        dimension: 2 or 3.
+        folder: of the temporary files; None: the system's.
+    """
+
+    def __init__(self, dimension: int, folder: Path | None = None) -> None:
+        D = dimension
+
+        self._arrays: list[ArrayBuilder] = []
+
+        def array(dtype: type, *row: int) -> ArrayBuilder:
+            self._arrays.append(ArrayBuilder(dtype, row, folder, _IN_MEMORY))
+            return self._arrays[-1]
+
+        self._stamp_ns, self._count = array(np.int64), array(np.int64)
+        self._sensor, self._anchor = array(np.int32), array(np.int64)
+        self._points, self._hit = array(np.float32, D), array(np.bool_)
+        self._p_static, self._beam_time = array(np.float32), array(np.float32)
+        self._T_odom_base = array(np.float64, D + 1, D + 1)
+        self._poses, self._local = (array(np.float64, D + 1, D + 1) for _ in range(2))
+        self._mounts: dict[str | int, Float] = {}
+        self._has_odometry, self._has_times = True, False
+        self._folder = folder
+
+    def close(self) -> None:
+        """Remove the files."""
+        for array in self._arrays:
+            array.close()
+
+    def __len__(self) -> int:
+        return len(self._stamp_ns)
+
+    def append(
+        self,
+        beams: ScanBeams,
+        p_static: NDArray[np.float32],
+        T_odom_base: Float | None,
+        pose: Float,
+        local: Float,
+        anchor: int,
+    ) -> None:
+        """Append a scan and the answer to it; see `Answers`.
+
+        Raises:
+            OSError: the disk is full.
+        """
+        self._mounts.setdefault(beams.sensor, beams.T_base_sensor)
+        self._has_odometry &= T_odom_base is not None
+        self._has_times |= beams.beam_time is not None
+        n = len(beams.points)
+        times = np.zeros(n, np.float32) if beams.beam_time is None else beams.beam_time
+        sensor = list(self._mounts).index(beams.sensor)
+        for array, value in (
+            (self._stamp_ns, beams.stamp_ns),
+            (self._count, n),
+            (self._sensor, sensor),
+            (self._anchor, anchor),
+        ):
+            array.append(np.array([value]))
+        for array, rows in (
+            (self._points, beams.points),
+            (self._hit, beams.hit),
+            (self._p_static, p_static),
+            (self._beam_time, times),
+        ):
+            if len(rows):
+                array.append(rows)
+        unknown = np.full(pose.shape, np.nan)
+        odometry = unknown if T_odom_base is None else T_odom_base
+        for array, T in (
+            (self._T_odom_base, odometry),
+            (self._poses, pose),
+            (self._local, local),
+        ):
+            array.append(T[None])
+
+    def at(self, number: int) -> tuple[int, Float]:
+        """Anchor and local pose of a scan, see `Answers`."""
+        return int(self._anchor.view()[number]), np.array(self._local.view()[number])
+
+    def recording(self) -> Recording:
+        """All scans so far. Odometry only if every scan had it."""
+        offset = np.concatenate([np.zeros(1, np.int64), np.cumsum(self._count.view())])
+        sensors = [
+            {"name": str(name), "extrinsics": {"how": "given"}} for name in self._mounts
+        ]
+        return Recording(
+            stamp_ns=np.array(self._stamp_ns.view()),
+            offset=offset.astype(np.int64),
+            points=self._points.view(),
+            hit=self._hit.view(),
+            T_base_sensor=np.array(list(self._mounts.values())),
+            sensor=np.array(self._sensor.view()),
+            T_odom_base=np.array(self._T_odom_base.view()) if self._has_odometry else None,
+            source={"format": "live", "sensors": sensors, "warnings": []},
+            beam_time=self._beam_time.view() if self._has_times else None,
+            scratch=self._folder,
+        )
+
+    def answers(self) -> Answers:
+        """What was answered so far."""
+        return Answers(
+            np.array(self._poses.view()),
+            np.array(self._local.view()),
+            np.array(self._anchor.view()),
+            self._p_static.view(),
+        )

@@ -1,0 +1,75 @@
+"""A recording pushed through the live mapper, as fast as possible."""
+
+import resource
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.profiling import Progress, no_progress
+from stillmap.core.recording import Recording
+from stillmap.live.mapper import LiveMapper
+from stillmap.live.scan import ScanBeams
+
+_MAXRSS_UNIT = 1 if sys.platform == "darwin" else 1024  # bytes
+
+
+@dataclass(frozen=True, eq=False)
+class Latency:
+    """Seconds from a scan to its answer, of T scans.
+
+    Attributes:
+        seconds: (T,).
+        dropped: number of scans that could not be used.
+        peak_memory_bytes: of the process.
+    """
+
+    seconds: NDArray[np.float64]
+    dropped: int
+    peak_memory_bytes: int
+
+    def to_dict(self) -> dict[str, object]:
+        """As `stillmap live --json` prints it."""
+        ms = 1e3 * self.seconds if len(self.seconds) else np.zeros(1)
+        return {
+            "scans": len(self.seconds),
+            "dropped": self.dropped,
+            "latency_ms": {
+                "median": round(float(np.median(ms)), 3),
+                "p99": round(float(np.quantile(ms, 0.99)), 3),
+                "max": round(float(ms.max()), 3),
+            },
+            "peak_memory_bytes": self.peak_memory_bytes,
+        }
+
+
+def replay(
+    recording: Recording, mapper: LiveMapper, progress: Progress = no_progress
+) -> Latency:
+    """Push all scans of a recording, one after another; the same to the bit every time."""
+    seconds = []
+    for t, beams in enumerate(iter_beams(recording)):
+        odometry = None if recording.T_odom_base is None else recording.T_odom_base[t]
+        start = time.perf_counter()
+        mapper.push(beams, odometry)
+        seconds.append(time.perf_counter() - start)
+        progress("mapping", 0, t + 1, recording.n_scans)
+    used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * _MAXRSS_UNIT
+    return Latency(np.array(seconds), 0, used)
+
+
+def iter_beams(recording: Recording) -> Iterator[ScanBeams]:
+    """The scans of a recording, as they would arrive."""
+    for t in recording.iter_scans(range(recording.n_scans)):
+        beams, sensor = recording.beams_of(t), int(recording.sensor[t])
+        yield ScanBeams(
+            int(recording.stamp_ns[t]),
+            np.array(recording.points[beams]),
+            np.array(recording.hit[beams]),
+            recording.T_base_sensor[sensor],
+            sensor,
+            None if recording.beam_time is None else np.array(recording.beam_time[beams]),
+        )

@@ -1,0 +1,198 @@
+"""Causal forward filters: kernel against twin, and what they say of simple worlds."""
+
+import numpy as np
+import pytest
+import reference
+
+from stillmap import _core
+
+CLASSES = {
+    "rho": [0.998, 0.95, 0.04, 0.04, 0.15],
+    "tau": [25.0, 25.0, 0.5, 12.0, 3.0],
+    "weights": [0.45, 0.45, 0.04, 0.04, 0.02],
+    "n_static": 2,
+    "p_detection": 0.97,
+    "bin_seconds": 0.5,
+    "lateral_std": 0.4,
+    "hit_radius": 1.0,
+    "max_log_ratio": 20.0,
+}
+
+
+def make(kernels, dimension, resolution=0.1, **changes):
+    kind = kernels.OccupancyFilter2D if dimension == 2 else kernels.OccupancyFilter3D
+    return kind(resolution, **{**CLASSES, **changes})
+
+
+def add_scans(filter_, room, bins):
+    """All scans of a room one by one, in time bins that rise and once go back."""
+    points, hit, offset, T = room.arguments
+    for t, time_bin in enumerate(bins):
+        beams = slice(offset[t], offset[t + 1])
+        margin = np.linspace(0.5, 3.0, offset[t + 1] - offset[t]).astype(np.float32)
+        filter_.add(
+            points[beams],
+            hit[beams],
+            margin,
+            np.array([0, len(margin)]),
+            T[t : t + 1],
+            time_bin=time_bin,
+            tag=t // 3,
+        )
+
+
+@pytest.fixture(params=[2, 3])
+def scans(request, a_room):
+    dimension = request.param
+    room = a_room(dimension, dimension, 0.1 if dimension == 2 else 0.4, 14, 60).beams
+    bins = [0, 0, 1, 2, 5, 5, 4, 6, 90, 91, 92, 92, 93, 200]
+    both = [make(kernels, dimension, room.resolution) for kernels in (_core, reference)]
+    for one in both:
+        add_scans(one, room, bins[: len(room.T_map_sensor)])
+    return room, *both
+
+
+def known(core):
+    """{cell: P(standing)} of a kernel's filter."""
+    first, p = core.dense()
+    at = np.argwhere(~np.isnan(p))
+    cells = at[:, ::-1] + first
+    return dict(zip(map(tuple, cells.tolist()), p[tuple(at.T)].tolist(), strict=True))
+
+
+def test_agrees_with_the_twin(scans):
+    room, core, plain = scans
+    points, hit, offset, T = room.arguments
+    assert core.size == plain.size > 50
+    found, expected = known(core), plain.p_standing()
+    both = found.keys() & expected.keys()  # some are passed by the threshold, up to rounding
+    assert len(both) > 0.99 * len(found.keys() | expected.keys())
+    values = np.array([[found[cell], expected[cell]] for cell in both])
+    np.testing.assert_allclose(values[:, 0], values[:, 1], atol=2e-3)
+    assert values[:, 1].std() > 0.1
+    labels = core.label(points, hit, offset, T, 0.9)
+    np.testing.assert_allclose(labels, plain.label(points, hit, offset, T, 0.9), atol=2e-3)
+    np.testing.assert_array_equal(np.isnan(labels), np.isnan(points).any(axis=1))
+
+
+def test_a_part_of_the_map_is_that_part_of_all(scans):
+    _, core, _ = scans
+    first, every = core.dense()
+    shape = [4] * every.ndim
+    _, part = core.dense((first + 2).tolist(), shape)
+    np.testing.assert_array_equal(part, every[(slice(2, 6),) * every.ndim])
+
+
+def test_changed_blocks_are_told_once(scans):
+    room, core, _ = scans
+    blocks = core.take_changed_blocks()
+    assert len(blocks) > 0
+    assert len(np.unique(blocks, axis=0)) == len(blocks)
+    assert len(core.take_changed_blocks()) == 0
+    add_scans(core, room, [300])
+    assert 0 < len(core.take_changed_blocks()) <= len(blocks)
+
+
+def look(filter_, distance, time_bin, count=30):
+    """A fan of beams from the origin that end at a distance."""
+    angles = np.linspace(-0.3, 0.3, count)
+    points = (distance * np.stack([np.cos(angles), np.sin(angles)], axis=1)).astype(np.float32)
+    args = points, np.ones(count, bool)
+    offset, T = np.array([0, count]), np.eye(3)[None]
+    filter_.add(*args, np.full(count, 1.0, np.float32), offset, T, time_bin=time_bin, tag=0)
+    return filter_.label(*args, offset, T, 0.9)
+
+
+def test_what_appears_in_free_space_moves_and_the_wall_behind_does_not():
+    core = make(_core, 2)
+    for time_bin in range(8):
+        assert look(core, 4.0, time_bin).min() > 0.8
+    assert look(core, 2.0, 8).max() < 0.2
+    assert look(core, 4.0, 9).min() > 0.9
+
+
+def test_what_stood_for_long_and_has_left_is_soon_no_longer_shown():
+    core = make(_core, 2)
+    for time_bin in range(400):
+        look(core, 2.0, time_bin)
+    assert look(core, 2.0, 400).min() > 0.99
+    for time_bin in range(401, 420):
+        look(core, 4.0, time_bin)
+    first, p = core.dense()
+    column, row = np.floor(np.array([2.0, 0.0]) / 0.1).astype(int) - first
+    assert np.nanmax(p[row - 1 : row + 2, column - 1 : column + 2]) < 0.1
+
+
+def move(core, motion, step=1):
+    """A filter that takes over another, `step` blocks at a time."""
+    out, first = core.sibling(), 0
+    while first < core.block_count:
+        first = out.take_over(core, motion, first, step)
+    return out
+
+
+def test_moved_cells_take_their_evidence_along():
+    core = make(_core, 2)
+    for time_bin in range(10):
+        look(core, 2.0, time_bin)
+    T = np.eye(3)
+    T[:2, 2] = 1.0, -0.5
+    moved = move(core, T[None])
+    shift = np.array([10, -5])
+    expected = {tuple((np.array(c) + shift).tolist()): p for c, p in known(core).items()}
+    assert known(moved) == pytest.approx(expected)
+    assert moved.size == core.size
+
+
+def test_cells_that_meet_add_their_evidence():
+    core = make(_core, 2)
+    look(core, 2.0, 0)
+    points = np.array([[2.0, 0.02]], np.float32)
+    args = points, np.ones(1, bool), np.array([0, 1]), np.eye(3)[None]
+    core.add(*args[:2], np.ones(1, np.float32), *args[2:], time_bin=1, tag=1)
+    onto = np.stack([np.eye(3), np.eye(3)])
+    onto[1, :2, 2] = -0.1, 0.3
+    moved = move(core, onto, 100)
+    assert moved.size < core.size
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"rho": []}, "rho"),
+        ({"rho": [1.5, 0.9, 0.1, 0.1, 0.1]}, "rho"),
+        ({"tau": [1.0]}, "tau"),
+        ({"weights": [0.0] * 5}, "weights"),
+        ({"n_static": 5}, "n_static"),
+        ({"p_detection": 1.0}, "p_detection"),
+        ({"bin_seconds": 0.0}, "bin_seconds"),
+        ({"lateral_std": 0.0}, "lateral_std"),
+        ({"hit_radius": -1.0}, "hit_radius"),
+        ({"max_log_ratio": 0.0}, "max_log_ratio"),
+    ],
+)
+def test_wrong_options_are_named(changes, named):
+    with pytest.raises(ValueError, match=named):
+        make(_core, 2, **changes)
+
+
+def test_wrong_arguments_are_named():
+    core = make(_core, 2)
+    points, hit = np.ones((2, 2), np.float32), np.ones(2, bool)
+    offset, T = np.array([0, 2]), np.eye(3)[None]
+    margin = np.zeros(2, np.float32)
+    with pytest.raises(ValueError, match="margin"):
+        core.add(points, hit, margin[:1], offset, T, time_bin=0, tag=0)
+    with pytest.raises(ValueError, match="margin"):
+        core.add(points, hit, margin - 1, offset, T, time_bin=0, tag=0)
+    with pytest.raises(ValueError, match="time_bin"):
+        core.add(points, hit, margin, offset, T, time_bin=-1, tag=0)
+    with pytest.raises(ValueError, match="tag"):
+        core.add(points, hit, margin, offset, T, time_bin=0, tag=-1)
+    with pytest.raises(ValueError, match="prior"):
+        core.label(points, hit, offset, T, 1.5)
+    with pytest.raises(ValueError, match="motion"):
+        make(_core, 2).take_over(core, np.full((1, 3, 3), np.nan), 0, 1)
+    with pytest.raises(ValueError, match="other"):
+        core.take_over(core, T, 0, 1)
+    assert core.size == 0

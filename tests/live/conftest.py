@@ -1,0 +1,37 @@
+"""A populated corridor, pushed scan by scan."""
+
+import numpy as np
+import pytest
+
+from stillmap.live.mapper import LiveMapper
+from stillmap.live.replay import iter_beams
+from stillmap.sim import scene_by_name, simulate
+
+
+class Run:
+    """A recording, and what the live mapper answered to it."""
+
+    def __init__(self, simulation):
+        self.recording, self.truth = simulation.recording, simulation.truth
+        self.mapper = LiveMapper({"threads": 1})
+        odometry = self.recording.T_odom_base
+        self.updates = [
+            self.mapper.push(beams, None if odometry is None else odometry[t])
+            for t, beams in enumerate(iter_beams(self.recording))
+        ]
+
+    @property
+    def poses(self):
+        return np.array([update.pose for update in self.updates])
+
+    @property
+    def p_static(self):
+        return np.concatenate([update.p_static for update in self.updates])
+
+
+@pytest.fixture(scope="session")
+def corridor():
+    """There and back through a corridor with people: the way back closes loops."""
+    run = Run(simulate(scene_by_name("corridor", {"robot": {"scans": 400}}), 3))
+    yield run
+    run.mapper.close()

@@ -1,0 +1,178 @@
+"""The live mapper on a simulated corridor: causal poses, labels and map."""
+
+import itertools
+import json
+
+import numpy as np
+import pytest
+
+import stillmap
+from stillmap.core import se2
+from stillmap.eval.trajectory import compute_absolute_errors
+from stillmap.live.mapper import LiveMapper
+from stillmap.live.replay import iter_beams
+
+
+@pytest.fixture
+def fresh():
+    """Makes mappers, which are closed after the test."""
+    made = []
+
+    def make(**settings):
+        made.append(LiveMapper({"threads": 1}, **settings))
+        return made[-1]
+
+    yield make
+    for mapper in made:
+        mapper.close()
+
+
+def f1(p_static, static, use):
+    says, moves = (p_static < 0.5)[use], ~static[use]
+    return 2 * (says & moves).sum() / (says.sum() + moves.sum())
+
+
+def test_poses_as_they_were_given_are_those_of_the_truth(corridor):
+    errors = compute_absolute_errors(corridor.poses, corridor.truth.T_world_base)
+    assert errors.rmse < 0.05
+    assert errors.max < 0.15
+
+
+def test_poses_as_they_are_known_at_the_end_are_no_worse(corridor):
+    poses = corridor.mapper.poses
+    assert len(poses) == corridor.recording.n_scans
+    errors = compute_absolute_errors(poses, corridor.truth.T_world_base)
+    assert errors.rmse < 0.05
+    np.testing.assert_allclose(poses[-1], corridor.updates[-1].pose, atol=1e-9)
+
+
+def test_movers_are_told_at_once(corridor):
+    assert f1(corridor.p_static, corridor.truth.static, corridor.recording.hit) > 0.85
+    assert np.isnan(corridor.p_static[np.isnan(corridor.recording.points).any(axis=1)]).all()
+
+
+def test_odometry_and_its_correction_give_the_pose(corridor):
+    for t in (0, 100, 399):
+        update = corridor.updates[t]
+        np.testing.assert_allclose(
+            update.T_map_odom @ corridor.recording.T_odom_base[t], update.pose, atol=1e-9
+        )
+
+
+def test_the_answer_depends_on_earlier_scans_alone(corridor, fresh):
+    again = fresh()
+    odometry = corridor.recording.T_odom_base
+    for t, beams in zip(range(60), iter_beams(corridor.recording), strict=False):
+        update = again.push(beams, odometry[t])
+        np.testing.assert_array_equal(update.pose, corridor.updates[t].pose)
+        np.testing.assert_array_equal(update.p_static, corridor.updates[t].p_static)
+
+
+def test_the_map_shows_walls_and_nobody(corridor):
+    grid = corridor.mapper.map
+    rows, columns = np.nonzero(grid.p_occupied > 0.65)
+    assert len(rows) > 500
+    x, y = grid.origin[:2]
+    cells = np.stack([columns, rows], axis=1) + 0.5
+    T = corridor.truth.T_world_base[0]  # the map has the frame of the first scan
+    world = (cells * grid.resolution + [x, y]) @ T[:2, :2].T + T[:2, 2]
+    a, b = corridor.truth.walls[:, :2], corridor.truth.walls[:, 2:]
+    along = np.clip(
+        np.einsum("nwd,wd->nw", world[:, None] - a, b - a) / ((b - a) ** 2).sum(axis=1), 0, 1
+    )
+    distance = np.linalg.norm(world[:, None] - a - along[..., None] * (b - a), axis=2).min(axis=1)
+    assert np.mean(distance > 0.15) < 0.03
+
+
+def test_changed_parts_of_the_map_are_told(corridor):
+    changes = [update.changes for update in corridor.updates]
+    assert any(changes)
+    assert sum(map(bool, changes)) < len(changes) / 2  # once a second
+    first = next(filter(None, changes))[0]
+    assert first.p_occupied.shape == (32, 32)
+    assert np.all(first.first_cell % 32 == 0)
+
+
+def test_a_saved_run_is_a_result(corridor, tmp_path):
+    corridor.mapper.save(tmp_path / "out")
+    saved = stillmap.load(tmp_path / "out")
+    np.testing.assert_allclose(saved.poses, corridor.mapper.poses, atol=1e-6)
+    given = np.load(tmp_path / "out/live/beams/p_static.npy")
+    np.testing.assert_array_equal(given, corridor.p_static)
+    lines = (tmp_path / "out/live/trajectory.tum").read_text().splitlines()
+    assert len(lines) == corridor.recording.n_scans
+    assert json.loads((tmp_path / "out/run.json").read_text())["counts"]["scans"] == len(lines)
+    with pytest.raises(stillmap.InputError, match="out"):
+        corridor.mapper.save(tmp_path / "out")
+
+
+def test_finishing_is_building(corridor):
+    found = corridor.mapper.finish()
+    errors = compute_absolute_errors(found.poses, corridor.truth.T_world_base)
+    assert errors.rmse < 0.03
+    assert f1(found.p_static, corridor.truth.static, corridor.recording.hit) > 0.95
+
+
+def test_without_odometry(corridor, fresh):
+    mapper = fresh()
+    updates = [
+        mapper.push(beams)
+        for _, beams in zip(range(150), iter_beams(corridor.recording), strict=False)
+    ]
+    assert all(update.T_map_odom is None for update in updates)
+    poses = np.array([update.pose for update in updates])
+    assert compute_absolute_errors(poses, corridor.truth.T_world_base[:150]).rmse < 0.06
+
+
+def test_odometry_that_leaps_is_not_believed(corridor, fresh):
+    mapper = fresh()
+    odometry, leap = corridor.recording.T_odom_base, se2.matrix(5.0, -3.0, 1.0)
+    poses = []
+    for t, beams in zip(range(120), iter_beams(corridor.recording), strict=False):
+        poses.append(mapper.push(beams, leap @ odometry[t] if t >= 60 else odometry[t]).pose)
+    errors = compute_absolute_errors(np.array(poses), corridor.truth.T_world_base[:120])
+    assert errors.max < 0.2
+
+
+def test_late_scans_are_refused_and_change_nothing(corridor, fresh):
+    mapper = fresh()
+    first, second = [b for _, b in zip(range(2), iter_beams(corridor.recording), strict=False)]
+    mapper.push(second)
+    with pytest.raises(ValueError, match="stamp"):
+        mapper.push(first)
+    assert len(mapper.poses) == 1
+
+
+def push_all(mapper, recording, count=None):
+    odometry = recording.T_odom_base
+    beams = itertools.islice(iter_beams(recording), count)
+    return [mapper.push(scan, odometry[t]) for t, scan in enumerate(beams)]
+
+
+def test_loops_are_closed_in_the_background(corridor, fresh):
+    mapper = fresh(background=True)
+    updates = push_all(mapper, corridor.recording)
+    poses = np.array([update.pose for update in updates])
+    assert compute_absolute_errors(poses, corridor.truth.T_world_base).rmse < 0.06
+    assert compute_absolute_errors(mapper.poses, corridor.truth.T_world_base).rmse < 0.06
+
+
+def test_mapping_goes_on_when_the_process_that_closes_loops_dies(corridor, fresh, caplog):
+    mapper = fresh(background=True)
+    push_all(mapper, corridor.recording, 50)
+    mapper._closer._process.kill()
+    mapper._closer._process.wait()
+    odometry = corridor.recording.T_odom_base
+    for t, beams in enumerate(itertools.islice(iter_beams(corridor.recording), 50, 150), 50):
+        update = mapper.push(beams, odometry[t])
+    truth = corridor.truth.T_world_base
+    moved = se2.inverse(truth[0]) @ truth[149]
+    np.testing.assert_allclose(update.pose[:2, 2], moved[:2, 2], atol=0.1)
+    assert sum("closes loops" in record.message for record in caplog.records) == 1
+
+
+def test_an_earlier_scan_is_labelled_again(corridor):
+    beams = next(itertools.islice(iter_beams(corridor.recording), 200, None))
+    labels = corridor.mapper.label(beams, 200)
+    static = corridor.truth.static[corridor.recording.beams_of(200)]
+    assert np.mean((labels > 0.5)[beams.hit] == static[beams.hit]) > 0.95

@@ -1,0 +1,56 @@
+"""`stillmap live --replay`: a recording through the live mapper."""
+
+import json
+
+import numpy as np
+import pytest
+
+from stillmap.cli.main import main
+from stillmap.sim import scene_by_name, simulate, write_simulation
+
+
+@pytest.fixture(scope="module")
+def hall(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("live") / "hall"
+    write_simulation(simulate(scene_by_name("hall", {"robot": {"scans": 120}}), 1), folder)
+    return folder
+
+
+def contents(folder):
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.name not in ("run.json", "report.html")
+    }
+
+
+def test_the_same_to_the_bit_every_time(hall, tmp_path, capsys):
+    for name in ("one", "two"):
+        words = ["live", "--replay", str(hall), "-o", str(tmp_path / name), "--json", "--quiet"]
+        assert main(words) == 0
+        told = json.loads(capsys.readouterr().out)
+        assert told["scans"] == 120
+        assert told["dropped"] == 0
+        assert 0 < told["latency_ms"]["median"] <= told["latency_ms"]["max"]
+        assert told["peak_memory_bytes"] > 1e6
+    one = contents(tmp_path / "one")
+    assert one == contents(tmp_path / "two")
+    assert {"map.pgm", "trajectory.tum", "live/trajectory.tum", "live/beams/p_static.npy"} <= set(one)
+    given = np.load(tmp_path / "one/live/beams/p_static.npy")
+    assert given.shape == np.load(tmp_path / "one/beams/p_static.npy").shape
+
+
+def test_an_output_that_is_taken_is_refused_before_any_work(hall, tmp_path, capsys):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/mine.txt").write_text("mine")
+    assert main(["live", "--replay", str(hall), "-o", str(tmp_path / "out")]) == 2
+    assert "out" in capsys.readouterr().err
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["mine.txt"]
+
+
+def test_3d_is_refused(tmp_path, capsys):
+    scene = scene_by_name("street", {"lidar": {"channels": 4, "columns": 60}, "robot": {"scans": 3}})
+    write_simulation(simulate(scene, 1), tmp_path / "sim")
+    assert main(["live", "--replay", str(tmp_path / "sim"), "-o", str(tmp_path / "out")]) == 2
+    assert "3D" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
