@@ -4,8 +4,9 @@ python benchmarks/live.py logs LOGS [--names intel fr101] --data DIR
 python benchmarks/live.py labels [--worlds hall corridor] [--first-seed 11] [--seeds 2]
 python benchmarks/live.py latency [--world hall] [--seconds 600] [--rate 40] [--beams 1081]
 
-logs: each NAME.clf.gz with NAME.exact.relations or NAME.pseudo.relations beside it: relation errors of `stillmap live --replay`, of
-the poses at the time and at the end, beside those of `stillmap map`.
+logs: each NAME.clf.gz with NAME.exact.relations or NAME.pseudo.relations beside it: relation
+errors of `stillmap live --replay`, of the poses at the time and at the end, beside those of
+`stillmap map`.
 labels: F1 of "dynamic" and average precision by the lag after which a beam is labelled, seconds.
 latency: scans pushed at their own pace, loops closed in another process.
 """

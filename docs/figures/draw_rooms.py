@@ -47,7 +47,7 @@ ARROWS = (  # from, to, column
     ("cli", "live", 8.85),
     ("cli", "sim", 10.6),
     ("live", "io", 8.85),
-    ("live", "results", 7.7),
+    ("live", "results", 8.35),
     ("eval", "results", 2),
     ("viewer", "places", 5.3),
     ("places", "results", 5.3),

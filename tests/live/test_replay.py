@@ -35,7 +35,9 @@ def test_the_same_to_the_bit_every_time(hall, tmp_path, capsys):
         assert told["peak_memory_bytes"] > 1e6
     one = contents(tmp_path / "one")
     assert one == contents(tmp_path / "two")
-    assert {"map.pgm", "trajectory.tum", "live/trajectory.tum", "live/beams/p_static.npy"} <= set(one)
+    assert {"map.pgm", "trajectory.tum", "live/trajectory.tum", "live/beams/p_static.npy"} <= set(
+        one
+    )
     given = np.load(tmp_path / "one/live/beams/p_static.npy")
     assert given.shape == np.load(tmp_path / "one/beams/p_static.npy").shape
 
@@ -49,7 +51,9 @@ def test_an_output_that_is_taken_is_refused_before_any_work(hall, tmp_path, caps
 
 
 def test_3d_is_refused(tmp_path, capsys):
-    scene = scene_by_name("street", {"lidar": {"channels": 4, "columns": 60}, "robot": {"scans": 3}})
+    scene = scene_by_name(
+        "street", {"lidar": {"channels": 4, "columns": 60}, "robot": {"scans": 3}}
+    )
     write_simulation(simulate(scene, 1), tmp_path / "sim")
     assert main(["live", "--replay", str(tmp_path / "sim"), "-o", str(tmp_path / "out")]) == 2
     assert "3D" in capsys.readouterr().err

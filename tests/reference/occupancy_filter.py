@@ -78,7 +78,9 @@ class OccupancyFilter:
         return len(self.filters)
 
     def add(self, points, hit, margin, offset, T_map_sensor, *, time_bin, tag):
-        beams = [b for b in usable_beams(points.shape[1], points, hit, offset, T_map_sensor) if b.hit]
+        beams = [
+            b for b in usable_beams(points.shape[1], points, hit, offset, T_map_sensor) if b.hit
+        ]
         for beam in beams:
             self._pass(beam, float(margin[beam.number]), time_bin, tag)
         for beam in beams:

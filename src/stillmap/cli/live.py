@@ -30,7 +30,9 @@ EPILOG = """examples:
 
 def add_arguments(p: argparse.ArgumentParser) -> None:
     """Add the flags and arguments."""
-    p.add_argument("--replay", metavar="INPUT", required=True, help="a recording, of one laser plane")
+    p.add_argument(
+        "--replay", metavar="INPUT", required=True, help="a recording, of one laser plane"
+    )
     p.add_argument("-o", "--output", metavar="DIR", required=True, help="result folder")
     p.add_argument("--overwrite", action="store_true", help="replace what is in DIR")
     p.add_argument("--no-odometry", action="store_true", help="ignore odometry in the recording")

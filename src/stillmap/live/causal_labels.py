@@ -81,9 +81,7 @@ class CausalLabels:
         offset = np.array([0, len(beams.points)])
         return self.filter.label(beams.points, beams.hit, offset, T, self._prior)
 
-    def label_ends(
-        self, points: NDArray[np.float32], T_map_base: Float
-    ) -> NDArray[np.float32]:
+    def label_ends(self, points: NDArray[np.float32], T_map_base: Float) -> NDArray[np.float32]:
         """(N,) P(static) of hits that end at points (N, D) in the base frame."""
         every, offset = np.ones(len(points), np.bool_), np.array([0, len(points)])
         return self.filter.label(points, every, offset, T_map_base[None], self._prior)
@@ -111,7 +109,7 @@ class CausalLabels:
         rate = self._rate.setdefault(beams.sensor, _ScanRate())
         rate.update(beams.stamp_ns)
         stride = int(np.clip(self._bin_ns / (_FOLLOWED * max(rate.period_ns, 1.0)), 1, _MAX_STRIDE))
-        return (np.arange(len(beams.points)) + rate.count) % stride == 0
+        return np.asarray((np.arange(len(beams.points)) + rate.count) % stride == 0)
 
     def to_map(self) -> GridMap:
         """The planar map of what stands; NaN: unknown."""
@@ -125,6 +123,18 @@ class CausalLabels:
         edge = 32 if lowest.shape[1] == 2 else 8
         shape = [edge] * lowest.shape[1]
         return [MapChange(cell, self.filter.dense(cell.tolist(), shape)[1]) for cell in lowest]
+
+
+def take_over(
+    to: OccupancyFilter, source: OccupancyFilter, motion: Float, first: int, count: int
+) -> int:
+    """Add `count` blocks of a filter of the same kind from `first` on, moved by the motions
+    (K, D+1, D+1) of their tags; returns the first block that is left."""
+    if isinstance(to, _core.OccupancyFilter2D):
+        assert isinstance(source, _core.OccupancyFilter2D)
+        return to.take_over(source, motion, first, count)
+    assert isinstance(source, _core.OccupancyFilter3D)
+    return to.take_over(source, motion, first, count)
 
 
 @dataclass
@@ -151,4 +161,4 @@ def _margins(beams: ScanBeams, normals: Float) -> NDArray[np.float32]:
     cos = np.abs(np.einsum("nd,nd->n", points, normals)) / length
     cos[~normals.any(axis=1)] = 1.0
     margin = np.minimum(_MARGIN / np.maximum(cos, 1e-3), _MAX_MARGIN)
-    return margin.astype(np.float32)
+    return np.asarray(margin, np.float32)

@@ -119,9 +119,7 @@ class History:
     def recording(self) -> Recording:
         """All scans so far. Odometry only if every scan had it."""
         offset = np.concatenate([np.zeros(1, np.int64), np.cumsum(self._count.view())])
-        sensors = [
-            {"name": str(name), "extrinsics": {"how": "given"}} for name in self._mounts
-        ]
+        sensors = [{"name": str(name), "extrinsics": {"how": "given"}} for name in self._mounts]
         return Recording(
             stamp_ns=np.array(self._stamp_ns.view()),
             offset=offset.astype(np.int64),

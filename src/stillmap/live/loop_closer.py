@@ -167,9 +167,7 @@ class LoopCloser:
         return self._options.keyframe_distance or loop_closure.KEYFRAME_DISTANCE
 
 
-def _without_repetition(
-    scans: NDArray[np.intp], poses: Float
-) -> tuple[NDArray[np.intp], Float]:
+def _without_repetition(scans: NDArray[np.intp], poses: Float) -> tuple[NDArray[np.intp], Float]:
     kept = np.append(True, np.diff(scans) > 0)
     return scans[kept], poses[kept]
 

@@ -15,7 +15,7 @@ import traceback
 from collections import deque
 from contextlib import suppress
 from dataclasses import asdict
-from typing import Any, BinaryIO
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,11 +62,13 @@ class LoopProcess:
         if scan.beams.sensor not in self._sensors:
             self._sensors.append(scan.beams.sensor)
         sensor = self._sensors.index(scan.beams.sensor)
-        self._outgoing.put({
-            **_pack_scan(scan, sensor),
-            "explained": np.array(explained),
-            "drift": drift,
-        })
+        self._outgoing.put(
+            {
+                **_pack_scan(scan, sensor),
+                "explained": np.array(explained),
+                "drift": drift,
+            }
+        )
 
     def poll(self) -> Correction | None:
         """The last correction that has arrived; None: there is no new one."""
@@ -109,9 +111,7 @@ class LoopProcess:
         stream = self._process.stdout
         assert stream is not None
         while (message := read_message(stream)) is not None:
-            near = [
-                _unpack_scan(scan, self._sensors) for scan in _split(message, "near")
-            ]
+            near = [_unpack_scan(scan, self._sensors) for scan in _split(message, "near")]
             self._incoming.append(
                 Correction(message["motion"], message["T_map_local"], message["poses"], near)
             )
@@ -168,7 +168,7 @@ class _Numbered(list[Any]):
         return key
 
 
-def _serve(options: SlamOptions, source: BinaryIO, target: BinaryIO) -> None:
+def _serve(options: SlamOptions, source: IO[bytes], target: IO[bytes]) -> None:
     """Close loops between the scans that arrive, until there are no more."""
     closer = LoopCloser(options)
     arrived: queue.SimpleQueue[dict[str, NDArray[Any]] | None] = queue.SimpleQueue()

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.short_repr import ShortRepr
-from stillmap.live.causal_labels import CausalLabels, OccupancyFilter
+from stillmap.live.causal_labels import CausalLabels, OccupancyFilter, take_over
 from stillmap.live.local_map import LocalMap, MappedScan
 from stillmap.live.loop_closer import Correction
 from stillmap.live.scan import ScanBeams
@@ -72,8 +72,8 @@ class MapCorrection:
     def step(self) -> bool:
         """Do a part of the work; True when nothing is left."""
         if self.moves_cells and self._block < self._source.block_count:
-            self._block = self.filter.take_over(
-                self._source, self._motion, self._block, _BLOCKS_PER_STEP
+            self._block = take_over(
+                self.filter, self._source, self._motion, self._block, _BLOCKS_PER_STEP
             )
             return False
         if self._scans:

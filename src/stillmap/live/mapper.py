@@ -23,19 +23,20 @@ from stillmap.live.loop_process import LoopProcess
 from stillmap.live.map_correction import LabelledScan, MapCorrection
 from stillmap.live.saving import save_live
 from stillmap.live.scan import Scan, ScanBeams, to_beams
+from stillmap.live.scan_hits import normals_of, select_hits, thin
 from stillmap.live.scan_odometry import Registration, ScanOdometry
 from stillmap.live.update import Update
 from stillmap.pipeline.options import Options
 from stillmap.pipeline.result import map_recording
 from stillmap.results.build import to_options
 from stillmap.results.result import BuiltResult
-from stillmap.slam import local_map, scan_hits
+from stillmap.slam import local_map
 from stillmap.slam.motion_model import MotionPrior
+from stillmap.slam.scan_hits import Scan as Hits
 from stillmap.tracking import MovingObject
 
 Float = NDArray[np.float64]
 
-_MAX_REGISTERED = 600  # end points of a scan that are registered
 _CHANGES_EVERY_NS = 10**9  # between two updates that tell what changed in the map
 
 
@@ -73,7 +74,7 @@ class LiveMapper:
         self._history = History(2, self._scratch)
         self._T_odom_base: Float | None = None
         self._T_map_local, self._drift = np.eye(3), np.zeros((3, 3))
-        # of the spaced scans: in the frame of the odometry by scans; in the map, as far as corrected
+        # of the spaced scans: in the frame of the odometry by scans; in the map, where corrected
         self._spaced, self._corrected = list[Float](), np.zeros((0, 3, 3))
         self._correction: MapCorrection | None = None
         self._last_ns: int | None = None
@@ -95,11 +96,11 @@ class LiveMapper:
         self._require_next(beams)
         increment = self._increment(T_odom_base)
         prior = self._odometry.predict(beams, increment)
-        hits = _select_hits(beams)
-        thinned = self._weigh(_thin(hits), prior)
+        hits = select_hits(beams)
+        thinned = self._weigh(thin(hits), prior)
         found = self._odometry.register(beams, thinned, prior, increment)  # M-step: (9)
         pose, anchor = self._T_map_local @ found.T, len(self._spaced) - 1
-        labelled = LabelledScan(beams, found.T, _normals_of(beams, hits), max(anchor, 0))
+        labelled = LabelledScan(beams, found.T, normals_of(beams, hits), max(anchor, 0))
         self._labels.add(beams, pose, labelled.normals, labelled.tag)
         p_static = self._labels.label(beams, pose)  # E-step: (8)
         self._history.append(beams, p_static, T_odom_base, pose, found.T, anchor)
@@ -198,7 +199,7 @@ class LiveMapper:
             late = 1e-9 * (self._last_ns - beams.stamp_ns)
             raise ValueError(f"stamp: expected none before the last scan, got {late:.6f} s earlier")
 
-    def _weigh(self, hits: scan_hits.Scan, prior: MotionPrior) -> scan_hits.Scan:
+    def _weigh(self, hits: Hits, prior: MotionPrior) -> Hits:
         """The hits with weights P(static): the E-step at the predicted pose."""
         pose = self._T_map_local @ prior.T_map_base
         return dataclasses.replace(hits, weights=self._labels.label_ends(hits.points, pose))
@@ -280,27 +281,5 @@ class LiveMapper:
 def _to_matrix(odometry: ArrayLike | None) -> Float | None:
     if odometry is None:
         return None
-    return poses_to_matrices("odometry", np.asarray(odometry, np.float64)[None], 1, 2)[0]
-
-
-def _select_hits(beams: ScanBeams) -> scan_hits.Scan:
-    """The hits of a scan in the base frame with weight 1, and the normals of their surfaces."""
-    points = scan_hits.transform_points(beams.points[beams.hit], beams.T_base_sensor)
-    return scan_hits.make_scan(points, np.ones(len(points), np.float32), beams.T_base_sensor)
-
-
-def _thin(hits: scan_hits.Scan) -> scan_hits.Scan:
-    """Hits for registration: more than so many say no more."""
-    every = slice(None, None, max(-(-len(hits.points) // _MAX_REGISTERED), 1))
-    points, weights, normals, isotropy = (
-        np.ascontiguousarray(a[every])
-        for a in (hits.points, hits.weights, hits.normals, hits.isotropy)
-    )
-    return scan_hits.Scan(points, weights, hits.T_base_sensor, normals, isotropy)
-
-
-def _normals_of(beams: ScanBeams, hits: scan_hits.Scan) -> Float:
-    """(N, D) normals in the sensor frame; 0 where nothing was hit."""
-    out = np.zeros(beams.points.shape)
-    out[beams.hit] = hits.normals @ beams.T_base_sensor[:2, :2]  # rotated back
+    out: Float = poses_to_matrices("odometry", np.asarray(odometry, np.float64)[None], 1, 2)[0]
     return out

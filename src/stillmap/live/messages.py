@@ -3,7 +3,7 @@
 import json
 import struct
 from collections.abc import Mapping
-from typing import Any, BinaryIO
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ _LENGTH = struct.Struct("<Q")
 _MAX_HEADER = 1 << 20  # bytes
 
 
-def write_message(stream: BinaryIO, arrays: Arrays) -> None:
+def write_message(stream: IO[bytes], arrays: Arrays) -> None:
     """Write named arrays of numbers and flush."""
     plain = {name: np.asarray(array, order="C") for name, array in arrays.items()}
     fields = [[name, a.dtype.str, list(a.shape)] for name, a in plain.items()]
@@ -25,7 +25,7 @@ def write_message(stream: BinaryIO, arrays: Arrays) -> None:
     stream.flush()
 
 
-def read_message(stream: BinaryIO) -> dict[str, NDArray[Any]] | None:
+def read_message(stream: IO[bytes]) -> dict[str, NDArray[Any]] | None:
     """Read named arrays; None: the stream has ended.
 
     Raises:

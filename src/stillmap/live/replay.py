@@ -46,9 +46,7 @@ class Latency:
         }
 
 
-def replay(
-    recording: Recording, mapper: LiveMapper, progress: Progress = no_progress
-) -> Latency:
+def replay(recording: Recording, mapper: LiveMapper, progress: Progress = no_progress) -> Latency:
     """Push all scans of a recording, one after another; the same to the bit every time."""
     seconds = []
     for t, beams in enumerate(iter_beams(recording)):

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stillmap.core.arrays import finite_rows
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io.array_checks import poses_to_matrices, require_length, stamps_to_ns, to_array
 from stillmap.preprocessing.max_range import MAX_ZERO_RANGE
@@ -74,7 +75,7 @@ class ScanBeams(ShortRepr):
     @property
     def dimension(self) -> int:
         """2 or 3."""
-        return self.points.shape[1]
+        return int(self.points.shape[1])
 
 
 def to_beams(scan: Scan) -> ScanBeams:
@@ -109,7 +110,7 @@ def _from_ranges(scan: Scan) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     # without a stated range nobody knows how far a beam without a return went
     usable &= ~beyond | (scan.max_range is not None)
     length = np.where(usable, np.minimum(ranges, limit), np.nan)
-    points = length[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    points = np.stack([length * np.cos(angles), length * np.sin(angles)], axis=1)
     return points.astype(np.float32), usable & ~beyond
 
 
@@ -117,9 +118,10 @@ def _from_points(scan: Scan) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     points = np.array(scan.points, np.float32)
     if points.ndim != 2 or points.shape[1] not in (2, 3):
         raise ValueError(f"points: expected (N, 2) or (N, 3), got {points.shape}")
-    finite = np.isfinite(points).all(axis=1)
+    finite = finite_rows(points)
     near = np.linalg.norm(np.where(finite[:, None], points, 0.0), axis=1)
-    usable = finite & (near >= max(scan.min_range, MAX_ZERO_RANGE)) & (near < MAX_PLAUSIBLE_RANGE)
+    usable: NDArray[np.bool_] = finite & (near >= max(scan.min_range, MAX_ZERO_RANGE))
+    usable &= near < MAX_PLAUSIBLE_RANGE
     points[~usable] = np.nan
     if scan.hit is None:
         return points, usable
@@ -131,4 +133,5 @@ def _from_points(scan: Scan) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
 def _sensor_matrix(pose: ArrayLike | None, dimension: int) -> Float:
     if pose is None:
         return np.eye(dimension + 1)
-    return poses_to_matrices("sensor_pose", np.asarray(pose)[None], 1, dimension)[0]
+    out: Float = poses_to_matrices("sensor_pose", np.asarray(pose)[None], 1, dimension)[0]
+    return out
