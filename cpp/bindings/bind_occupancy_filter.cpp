@@ -51,6 +51,16 @@ auto add(OccupancyFilter<D>& filter, const Points<D>& points, const Flat<bool>& 
 }
 
 template <int D>
+void prime(OccupancyFilter<D>& filter, const Cells<D>& cells, const Flat<bool>& occupied,
+           double log_ratio) {
+  const size_t n = cells.shape(0);
+  require(occupied.shape(0) == n, "occupied: expected as many entries as cells has rows");
+  require(log_ratio >= 0.0, "log_ratio: expected nats that are not negative");
+  for (size_t k = 0; k < n; ++k)
+    filter.prime(cell_from<D>(cells, k), occupied.data()[k], log_ratio);
+}
+
+template <int D>
 auto label(const OccupancyFilter<D>& filter, const Points<D>& points, const Flat<bool>& hit,
            const Flat<int64_t>& offset, const Poses<D>& poses, double prior) {
   require_probability(prior, "prior");
@@ -157,6 +167,10 @@ void bind(nb::module_& m, const char* name) {
            nb::arg("T_map_sensor").noconvert(), nb::kw_only(), nb::arg("time_bin"), nb::arg("tag"),
            "Adds the hits of scans taken in one time bin. A beam passes the cells that lie more "
            "than its margin (M,) float32, in cells, before its end. tag: see `take_over`.")
+      .def("prime", &prime<D>, nb::arg("cells").noconvert(), nb::arg("occupied").noconvert(),
+           nb::arg("log_ratio"),
+           "What another map knows of cells (K, D) int64: that a static surface stands there, for "
+           "which dynamic classes fall behind by log_ratio nats, or that they are free.")
       .def("label", &label<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
            nb::arg("offset").noconvert(), nb::arg("T_map_sensor").noconvert(), nb::arg("prior"),
            "(M,) float32 P(static) of every beam by what was added so far. NaN for unusable "

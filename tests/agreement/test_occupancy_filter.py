@@ -196,3 +196,17 @@ def test_wrong_arguments_are_named():
     with pytest.raises(ValueError, match="other"):
         core.take_over(core, T, 0, 1)
     assert core.size == 0
+
+
+def test_what_another_map_knows_counts_at_once():
+    core = make(_core, 2)
+    wall = np.array([[40, row] for row in range(-20, 20)])
+    free = np.array([[column, row] for column in range(2, 38) for row in range(-20, 20)])
+    core.prime(np.concatenate([wall, free]), np.arange(len(wall) + len(free)) < len(wall), 8.0)
+    first, p = core.dense()
+    assert p[-20 - first[1], 40 - first[0]] > 0.99
+    assert p[-20 - first[1], 20 - first[0]] == 0.0
+    assert look(core, 2.0, 0).max() < 0.05  # in free space
+    assert look(core, 4.05, 1).min() > 0.99
+    with pytest.raises(ValueError, match="occupied"):
+        core.prime(wall, np.ones(1, bool), 8.0)

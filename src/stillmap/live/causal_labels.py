@@ -68,6 +68,7 @@ class CausalLabels:
         )
         self._prior, self._bin_ns = prior, round(1e9 * options.time_bin)
         self._first_ns: int | None = None
+        self.tags = 1  # numbers of keyframes are below
         self._rate = dict[str | int, _ScanRate]()
 
     @property
@@ -98,6 +99,7 @@ class CausalLabels:
         if self._first_ns is None:
             self._first_ns = beams.stamp_ns
         time_bin = max(beams.stamp_ns - self._first_ns, 0) // self._bin_ns
+        self.tags = max(self.tags, tag + 1)
         T = (T_map_base @ beams.T_base_sensor)[None]
         margin = _margins(beams, normals) / np.float32(self.filter.resolution)
         margin[~self._select_followed(beams)] = np.inf

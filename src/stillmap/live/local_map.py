@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +35,21 @@ class MappedScan(ShortRepr):
     travelled: float
 
 
+class MatchMap(Protocol):
+    """A map that scans are matched against: a `LocalMap`, or a `KnownLocalMap`."""
+
+    grid: _core.OccupancyGrid2D
+
+    def add(self, scan: MappedScan) -> bool:
+        """Add or note a scan; False if it is too close to the last one of its sensor."""
+
+    def remove_before(self, travelled: float) -> None:
+        """Remove the scans taken before that many metres of travel."""
+
+    def has_sensor(self, sensor: str | int, /) -> bool:
+        """True if it shows what a sensor sees."""
+
+
 class LocalMap:
     """A map of spaced scans.
 
@@ -53,7 +69,8 @@ class LocalMap:
 
     def add(self, scan: MappedScan) -> bool:
         """Add a scan unless it is too close to the last one of its sensor; True if it was added."""
-        if not self._is_spaced(scan):
+        last = self._last.get(scan.beams.sensor)
+        if last is not None and not is_spaced(last, scan):
             return False
         self._insert(scan)
         return True
@@ -61,29 +78,29 @@ class LocalMap:
     def remove_before(self, travelled: float) -> None:
         """Remove the scans taken before that many metres of travel."""
         while self._scans and self._scans[0].travelled < travelled:
-            _add_scan(self.grid, self._scans.popleft(), remove=True)
+            add_scan(self.grid, self._scans.popleft(), remove=True)
 
-    def has_sensor(self, sensor: str | int) -> bool:
+    def has_sensor(self, sensor: str | int, /) -> bool:
         """True if it holds a scan of a sensor."""
         return sensor in self._last
 
     def _insert(self, scan: MappedScan) -> None:
-        _add_scan(self.grid, scan)
+        add_scan(self.grid, scan)
         self._scans.append(scan)
         last = self._last.get(scan.beams.sensor)
         if last is None or last.beams.stamp_ns <= scan.beams.stamp_ns:
             self._last[scan.beams.sensor] = scan
 
-    def _is_spaced(self, scan: MappedScan) -> bool:
-        last = self._last.get(scan.beams.sensor)
-        if last is None:
-            return True
-        x, y, theta = se2.parameters(se2.inverse(last.T_map_base) @ scan.T_map_base)
-        seconds = 1e-9 * (scan.beams.stamp_ns - last.beams.stamp_ns)
-        return bool(np.hypot(x, y) + abs(theta) + SPACING_PER_SECOND * seconds >= SCAN_SPACING)
+
+def is_spaced(last: MappedScan, scan: MappedScan) -> bool:
+    """Whether a scan shows enough that is new after the last one."""
+    x, y, theta = se2.parameters(se2.inverse(last.T_map_base) @ scan.T_map_base)
+    seconds = 1e-9 * (scan.beams.stamp_ns - last.beams.stamp_ns)
+    return bool(np.hypot(x, y) + abs(theta) + SPACING_PER_SECOND * seconds >= SCAN_SPACING)
 
 
-def _add_scan(grid: _core.OccupancyGrid2D, scan: MappedScan, *, remove: bool = False) -> None:
+def add_scan(grid: _core.OccupancyGrid2D, scan: MappedScan, *, remove: bool = False) -> None:
+    """Add a scan to a map for registration, or remove it."""
     beams = scan.beams
     scan_hits.add_hits(
         grid, beams.points, beams.hit, scan.e, scan.T_map_base @ beams.T_base_sensor, remove=remove

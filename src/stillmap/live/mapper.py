@@ -18,9 +18,11 @@ from stillmap.core.profiling import Progress, no_progress
 from stillmap.io.array_checks import poses_to_matrices
 from stillmap.live.causal_labels import CausalLabels, MapChange
 from stillmap.live.history import History
+from stillmap.live.known_map import KnownMap
 from stillmap.live.loop_closer import LoopCloser
 from stillmap.live.loop_process import LoopProcess
 from stillmap.live.map_correction import LabelledScan, MapCorrection
+from stillmap.live.place import Mode, NoLoops, PlaceTracker
 from stillmap.live.saving import save_live
 from stillmap.live.scan import Scan, ScanBeams, to_beams
 from stillmap.live.scan_hits import normals_of, select_hits, thin
@@ -32,6 +34,7 @@ from stillmap.results.build import to_options
 from stillmap.results.result import BuiltResult
 from stillmap.slam import local_map
 from stillmap.slam.motion_model import MotionPrior
+from stillmap.slam.options import SlamOptions
 from stillmap.slam.scan_hits import Scan as Hits
 from stillmap.tracking import MovingObject
 
@@ -45,6 +48,9 @@ class LiveMapper:
 
     Args:
         options: `Options`, or the options to change, as of `stillmap.build`.
+        place: folder of a result or a place, in whose map the robot is localized; None: the map
+            begins empty.
+        mode: "localise": that map stays as it is; "extend": what is seen is added to it.
         background: close loops in a process of their own, so that no scan waits for them; else
             between two scans, the same to the bit every time.
         scratch: folder of the files in which all scans are kept for `save` and `finish`; None: the
@@ -61,6 +67,8 @@ class LiveMapper:
         self,
         options: Options | Mapping[str, Any] | None = None,
         *,
+        place: str | os.PathLike[str] | None = None,
+        mode: Mode = "localise",
         background: bool = False,
         scratch: str | os.PathLike[str] | None = None,
     ) -> None:
@@ -68,7 +76,8 @@ class LiveMapper:
         self._odometry = ScanOdometry(self.options.slam)
         self._labels = CausalLabels(2, self.options.slam.resolution, self.options.em)
         slam = self.options.slam
-        self._closer = LoopProcess(slam) if background else LoopCloser(slam)
+        self._place = None if place is None else PlaceTracker(KnownMap(place), mode)
+        self._closer = _make_closer(slam, background, place is not None)
         self._in_background = background
         self._scratch = None if scratch is None else Path(scratch)
         self._history = History(2, self._scratch)
@@ -99,6 +108,9 @@ class LiveMapper:
         hits = select_hits(beams)
         thinned = self._weigh(thin(hits), prior)
         found = self._odometry.register(beams, thinned, prior, increment)  # M-step: (9)
+        if found.is_carried and self._place is not None:
+            self._place.lose(len(self._history))
+            self._labels = CausalLabels(2, self.options.slam.resolution, self.options.em)
         pose, anchor = self._T_map_local @ found.T, len(self._spaced) - 1
         labelled = LabelledScan(beams, found.T, normals_of(beams, hits), max(anchor, 0))
         self._labels.add(beams, pose, labelled.normals, labelled.tag)
@@ -106,8 +118,24 @@ class LiveMapper:
         self._history.append(beams, p_static, T_odom_base, pose, found.T, anchor)
         self._T_odom_base, self._last_ns = T_odom_base, beams.stamp_ns
         update = self._to_update(beams.stamp_ns, found, p_static, T_odom_base)
-        self._add_to_maps(labelled, np.nan_to_num(p_static), found)
+        is_spaced = self._add_to_maps(labelled, np.nan_to_num(p_static), found)
+        if is_spaced and self._place is not None and self._place.is_lost:
+            return self._localize(self._place, thinned, update, T_odom_base)
         return update
+
+    def _localize(
+        self, place: PlaceTracker, hits: Hits, update: Update, T_odom_base: Float | None
+    ) -> Update:
+        """Search the robot in the known map; the update with its pose there, if it is found."""
+        T = place.localize(self._labels, hits, update.pose, len(self._history) - 1)
+        if T is None:
+            return update
+        self._odometry.enter(place.make_local_map(), T)
+        place.enter(self._labels, T)
+        pose = T @ update.pose
+        T_map_odom = None if T_odom_base is None else pose @ se2.inverse(T_odom_base)
+        doubts = tuple(doubt for doubt in update.doubts if doubt not in ("lost", "ambiguous"))
+        return dataclasses.replace(update, pose=pose, T_map_odom=T_map_odom, doubts=doubts)
 
     def label(self, scan: Scan | ScanBeams, number: int) -> NDArray[np.float32]:
         """(N,) P(static) of the beams of an earlier scan, by what is known now.
@@ -128,6 +156,8 @@ class LiveMapper:
     def poses(self) -> Float:
         """(T, 3, 3) T_map_base of all scans, as they are known now."""
         answers = self._history.answers()
+        if self._place is not None:
+            return self._place.to_known(answers.poses)
         # the scan after which each spaced one is the last: itself, but for the first
         scans = np.searchsorted(answers.anchor, np.arange(len(self._spaced)) - 1, side="right") - 1
         every, kept = np.unique(np.maximum(scans, 0), return_index=True)
@@ -212,8 +242,9 @@ class LiveMapper:
 
     def _add_to_maps(
         self, labelled: LabelledScan, e: NDArray[np.float32], found: Registration
-    ) -> None:
-        """Add a spaced scan to the local map and to the pose graph; go on correcting the map."""
+    ) -> bool:
+        """Add a spaced scan to the local map and to the pose graph, and go on correcting the map;
+        True if the scan is spaced."""
         self._drift = self._drift + found.drift
         added = self._odometry.add(labelled.beams, e)
         if added is not None:
@@ -228,6 +259,7 @@ class LiveMapper:
             tags = len(self._spaced)
             self._correction = MapCorrection(correction, self._labels, self._T_map_local, tags)
         self._go_on_correcting()
+        return added is not None
 
     def _go_on_correcting(self) -> None:
         """A part of the work on a correction; all of it where nobody waits."""
@@ -266,6 +298,8 @@ class LiveMapper:
             "slip": found.is_slipping,
             "blind": found.is_blind,
             "carried": found.is_carried,
+            "lost": self._place is not None and self._place.is_lost,
+            "ambiguous": self._place is not None and self._place.is_ambiguous,
         }
         pose = self._T_map_local @ found.T
         return Update(
@@ -276,6 +310,14 @@ class LiveMapper:
             tuple(name for name, is_so in doubts.items() if is_so),
             self._take_changes(stamp_ns),
         )
+
+
+def _make_closer(
+    options: SlamOptions, background: bool, is_known: bool
+) -> LoopCloser | LoopProcess | NoLoops:
+    if is_known:
+        return NoLoops()
+    return LoopProcess(options) if background else LoopCloser(options)
 
 
 def _to_matrix(odometry: ArrayLike | None) -> Float | None:

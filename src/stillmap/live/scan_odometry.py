@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
-from stillmap.live.local_map import LocalMap, MappedScan
+from stillmap.live.local_map import LocalMap, MappedScan, MatchMap
 from stillmap.live.scan import ScanBeams
 from stillmap.slam import kidnapping, motion_model
 from stillmap.slam.kidnapping import Evidence
@@ -64,7 +64,7 @@ class ScanOdometry:
 
     def __init__(self, options: SlamOptions) -> None:
         self.options = options
-        self.local_map = LocalMap(options.resolution)
+        self.local_map: MatchMap = LocalMap(options.resolution)
         self.travelled = 0.0
         self._pose, self._before = np.eye(3), np.eye(3)
         self._stamp_ns, self._seconds = 0, 0.0
@@ -114,6 +114,12 @@ class ScanOdometry:
         added = self.local_map.add(scan)
         self.local_map.remove_before(self.travelled - _MAX_TRAVEL)
         return scan if added else None
+
+    def enter(self, local_map: MatchMap, T: Float) -> None:
+        """Go on in another map, in whose frame the frame so far has the pose T (3, 3)."""
+        self.local_map = local_map
+        self._pose, self._before = T @ self._pose, T @ self._before
+        self._contradictions = 0.0
 
     def _match(
         self,

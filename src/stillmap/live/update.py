@@ -21,7 +21,8 @@ class Update(ShortRepr):
         p_static: (N,) float32 of the beams, from what is known so far; NaN: unusable.
         T_map_odom: (D+1, D+1); None: without odometry.
         doubts: any of "slip" (odometry disagrees with the scans), "blind" (no beam met anything
-            that the map knows), "carried" (the scans contradict the map).
+            that the map knows), "carried" (the scans contradict the map), "lost" (the pose is none
+            in the known map), "ambiguous" (several places in it fit about as well).
         changes: parts of the map that changed since the last update.
     """
 

@@ -34,7 +34,9 @@ class _Optimum(NamedTuple):
     heading: float
 
 
-def search_alignments(place: SurfaceMap, session: SurfaceMap) -> list[Float]:
+def search_alignments(
+    place: SurfaceMap, session: SurfaceMap, free_weight: float = CONFLICT_WEIGHT
+) -> list[Float]:
     """T_place_session (3, 3) about where the maps agree most, the best one first.
 
     Each is within about a cell of the search, and the step of its headings, of an optimum.
@@ -42,10 +44,12 @@ def search_alignments(place: SurfaceMap, session: SurfaceMap) -> list[Float]:
     Args:
         place: the map that is searched.
         session: in its own frame.
+        free_weight: of a surface of the session in the free space of the place, against one that
+            both show.
     """
     if not len(place.surface) or not len(session.surface):
         return []
-    search = _Search(place, session)
+    search = _Search(place, session, free_weight)
     headings = np.arange(search.headings) * (2.0 * np.pi / search.headings)
     found = [one for heading in headings.tolist() for one in search.find_optima(heading)]
     found.sort(key=lambda one: -one.score)
@@ -55,7 +59,7 @@ def search_alignments(place: SurfaceMap, session: SurfaceMap) -> list[Float]:
 class _Search:
     """Two maps on cells, and their correlation for one heading after the other."""
 
-    def __init__(self, place: SurfaceMap, session: SurfaceMap) -> None:
+    def __init__(self, place: SurfaceMap, session: SurfaceMap, free_weight: float) -> None:
         from scipy import fft, ndimage  # slow to load
 
         self._fft, self._filter = fft, ndimage.maximum_filter
@@ -68,8 +72,9 @@ class _Search:
         turns = 2.0 * np.pi * spread / (_TURN_CELLS * self.cell)
         self.headings = int(np.clip(np.ceil(turns), *_HEADINGS))
         self._offset = offset
-        field = _pool(_make_field(place, squares), squares)
-        self._field = ndimage.uniform_filter(_make_field(session, squares), squares)
+        field = _pool(_make_field(place, squares, free_weight), squares)
+        own = _make_field(session, squares, CONFLICT_WEIGHT)
+        self._field = ndimage.uniform_filter(own, squares)
         self._low = place.low * place.edge
         counts = _count((place.surface - self._low) / self.cell, field.shape)
         self._shape = tuple(fft.next_fast_len(n + 2 * self._half, real=True) for n in field.shape)
@@ -150,8 +155,8 @@ def _remove_duplicates(found: list[_Optimum], search: _Search) -> list[_Optimum]
     return out
 
 
-def _make_field(known: SurfaceMap, squares: int) -> Raster:
-    """(X, Y) evidence for a surface on each square: 1 near one, negative where it is free.
+def _make_field(known: SurfaceMap, squares: int, free_weight: float) -> Raster:
+    """(X, Y) evidence for a surface on each square: 1 near one, -free_weight where it is free.
 
     Both with the tolerance that cells of so many squares need.
     """
@@ -163,7 +168,7 @@ def _make_field(known: SurfaceMap, squares: int) -> Raster:
         near = ndimage.binary_dilation(near, around, steps)
         free = ndimage.binary_erosion(free, around, steps)
     blocked = (free & ~near).astype(np.float32)
-    out: Raster = near.astype(np.float32) - np.float32(CONFLICT_WEIGHT) * blocked
+    out: Raster = near.astype(np.float32) - np.float32(free_weight) * blocked
     return out
 
 

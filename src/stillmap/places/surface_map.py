@@ -153,11 +153,19 @@ def _pool(cells: Bytes, reduce: np.ufunc) -> Bytes:
 
 def compare_maps(place: SurfaceMap, session: SurfaceMap, T_place_session: Float) -> Comparison:
     """Squares of both maps that agree, and that are in conflict, under an alignment (3, 3)."""
+    forth, back = compare_surfaces(place, session, T_place_session)
+    return Comparison(forth.agree + back.agree, forth.conflict + back.conflict)
+
+
+def compare_surfaces(
+    place: SurfaceMap, session: SurfaceMap, T_place_session: Float
+) -> tuple[Comparison, Comparison]:
+    """The surfaces of the session in the place, and those of the place in the session, under an
+    alignment (3, 3)."""
     T, T_back = T_place_session, se2.inverse(T_place_session)
     forth = place.look_up(_transform(T, session.surface), session.surface_sides @ T[:2, :2].T)
     sides = place.surface_sides @ T_back[:2, :2].T
-    back = session.look_up(_transform(T_back, place.surface), sides)
-    return Comparison(forth.agree + back.agree, forth.conflict + back.conflict)
+    return forth, session.look_up(_transform(T_back, place.surface), sides)
 
 
 def is_determined(place: SurfaceMap, session: SurfaceMap, T_place_session: Float) -> bool:

@@ -87,6 +87,22 @@ class OccupancyFilter : public BlockMap<D, PassedCell> {
     });
   }
 
+  // What another map knows of a cell: that a static surface stands there, or that it is free.
+  // log_ratio: nats by which dynamic classes fall behind.
+  void prime(const Cell<D>& cell, bool is_occupied, double log_ratio) {
+    Block* block = find_or_add(Map::block_of(cell));
+    PassedCell& at = block->values[static_cast<size_t>(Map::local_of(cell))];
+    if (!is_occupied) {
+      at.passed_bins = std::max(at.passed_bins, kMaxPasses);
+      return;
+    }
+    if (at.filter < 0) at.filter = make_filter(cell, at, at.tag);
+    float* log_likelihood = state_.data() + (static_cast<size_t>(at.filter) * 2 + 1) * classes();
+    for (size_t c = 0; c < classes(); ++c)
+      if (c >= options_.n_static) log_likelihood[c] -= static_cast<float>(log_ratio);
+    normalize(log_likelihood);
+  }
+
   // P(static) of the cell in which a beam ended, or of the best one within the hit radius;
   // `otherwise` where no beam ended before.
   float p_static_at(const Vec<D>& end, float otherwise) const {

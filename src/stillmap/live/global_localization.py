@@ -1,0 +1,110 @@
+"""Where in a known map the robot is, without a prior."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core import se2
+from stillmap.core.grid_map import GridMap
+from stillmap.core.short_repr import ShortRepr
+from stillmap.live.known_map import KnownMap, to_surface_map
+from stillmap.places.map_search import search_alignments
+from stillmap.places.surface_map import CONFLICT_WEIGHT, SurfaceMap, compare_surfaces
+from stillmap.slam import motion_model, scan_matching
+from stillmap.slam.scan_hits import Scan
+
+Float = NDArray[np.float64]
+
+_MIN_SURFACE = 40  # squares of surface that a view needs
+_MIN_AGREE = 0.35  # share of the surfaces of the view that the map shows; others may be people
+# of a surface of the view where the map is free: somebody may stand there; one of the map where the
+# view is free weighs much
+_FREE_WEIGHT = 0.5
+# share of the best alignment's evidence that a rival may have: once, and twice in a row; m and rad
+# from which another alignment is a rival
+_MAX_RIVAL, _MAX_RIVAL_TWICE, _APART = 0.4, 0.7, (1.0, 0.5)
+_STD = 0.15, 0.04  # m, rad: of an alignment that the search finds
+_MAX_CANDIDATES = 20
+
+
+@dataclass(frozen=True, eq=False)
+class Localization(ShortRepr):
+    """Where the robot is.
+
+    Attributes:
+        T: (3, 3) of the searched view in the known map; None: not known.
+        is_ambiguous: several places fit about as well.
+    """
+
+    T: Float | None
+    is_ambiguous: bool = False
+
+
+class _Alignment(NamedTuple):
+    """A pose of the view, its evidence, and how many of its surfaces the map shows."""
+
+    evidence: float
+    agree: int
+    T: Float
+
+
+class GlobalLocalizer:
+    """Searches a known map.
+
+    Args:
+        known: the map.
+    """
+
+    def __init__(self, known: KnownMap) -> None:
+        self._surface = known.make_surface_map()
+        self._grid = known.make_grid()
+        self._last: Float | None = None
+
+    def localize(self, view: GridMap, scan: Scan, pose: Float) -> Localization:
+        """Where a view of the surroundings lies.
+
+        Args:
+            view: what was seen since the robot was lost, as a map in a frame of its own.
+            scan: the last scan.
+            pose: (3, 3) of the robot in the frame of the view.
+        """
+        session = to_surface_map(view)
+        if len(session.surface) < _MIN_SURFACE:
+            return Localization(None)
+        found = list[_Alignment]()
+        for T in search_alignments(self._surface, session, _FREE_WEIGHT)[:_MAX_CANDIDATES]:
+            refined = self._refine(scan, T @ pose) @ se2.inverse(pose)
+            found.append(self._weigh(session, refined))
+        return self._choose(sorted(found, key=lambda one: -one.evidence), len(session.surface))
+
+    def _choose(self, found: list[_Alignment], squares: int) -> Localization:
+        """The best alignment, if the evidence is clear."""
+        last, self._last = self._last, None
+        if not found or found[0].agree < _MIN_AGREE * squares or found[0].evidence <= 0.0:
+            return Localization(None)
+        best = found[0]
+        rivals = [one.evidence for one in found[1:] if _is_apart(best.T, one.T)]
+        share = max(rivals, default=0.0) / best.evidence
+        if share > _MAX_RIVAL_TWICE:
+            return Localization(None, is_ambiguous=True)
+        self._last = best.T
+        is_clear = share <= _MAX_RIVAL or (last is not None and not _is_apart(last, best.T))
+        return Localization(best.T if is_clear else None, is_ambiguous=not is_clear)
+
+    def _weigh(self, session: SurfaceMap, T: Float) -> _Alignment:
+        forth, back = compare_surfaces(self._surface, session, T)
+        evidence = forth.agree - _FREE_WEIGHT * forth.conflict
+        evidence += back.agree - CONFLICT_WEIGHT * back.conflict
+        return _Alignment(evidence, forth.agree, T)
+
+    def _refine(self, scan: Scan, pose: Float) -> Float:
+        prior = motion_model.gaussian_prior(pose, *_STD)
+        window = [2.0 * std for std in _STD]
+        return scan_matching.search_pose(self._grid, scan, prior, *window).T_map_base
+
+
+def _is_apart(one: Float, other: Float) -> bool:
+    x, y, theta = se2.parameters(se2.inverse(one) @ other)
+    return bool(np.hypot(x, y) > _APART[0] or abs(theta) > _APART[1])

@@ -1,0 +1,141 @@
+"""A map from an earlier run, for localization: to be matched, searched, and looked up."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+import stillmap._core as _core
+from stillmap.core.errors import InputError
+from stillmap.core.grid_map import GridMap
+from stillmap.live.causal_labels import OccupancyFilter
+from stillmap.live.local_map import MappedScan, add_scan, is_spaced
+from stillmap.places.surface_map import SurfaceMap, find_sides
+from stillmap.results.reader import FREE_THRESH, OCCUPIED_THRESH, Grid, read_grid
+from stillmap.slam import scan_hits
+
+Float = NDArray[np.float64]
+
+_SQUARE = 2  # cells along the edge of a square of the surface map
+_LOG_RATIO = 8.0  # nats by which the map speaks for static surface
+
+
+class KnownMap:
+    """A map to localize in.
+
+    Args:
+        folder: of a result or a place.
+
+    Raises:
+        InputError: it has no map, or an empty one.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str]) -> None:
+        self._grid = read_grid(Path(folder))
+        if not self._grid.occupied.any():
+            raise InputError("has an empty map", where=str(folder))
+        self.resolution = self._grid.resolution
+        self._centres = self._grid.centres(np.argwhere(self._grid.occupied))
+
+    def make_grid(self) -> _core.OccupancyGrid2D:
+        """The map for registration: an end point in every occupied cell, and free space."""
+        grid = _core.OccupancyGrid2D(self.resolution, scan_hits.FREE_SPACE_MARGIN)
+        ends = self._centres.astype(np.float32)
+        n, here = len(ends), np.eye(3)[None]
+        offset = np.array([0, n])
+        _core.add_end_points(grid, ends, np.ones(n, bool), np.ones(n, np.float32), offset, here)
+        poses, lengths = _free_runs(self._grid)
+        along = np.stack([lengths, np.zeros(len(lengths))], axis=1).astype(np.float32)
+        every = np.arange(len(lengths) + 1)
+        passed = np.zeros(len(lengths), bool)
+        _core.add_beams(grid, along, passed, np.ones(len(lengths), np.float32), every, poses)
+        return grid
+
+    def make_surface_map(self) -> SurfaceMap:
+        """The map for the search of alignments."""
+        return to_surface_map(self._grid)
+
+    def prime(self, labels: OccupancyFilter) -> None:
+        """Tell the filters of cells what the map knows."""
+        free = self._grid.centres(np.argwhere(self._grid.p_occupied < FREE_THRESH))
+        centres = np.concatenate([self._centres, free])
+        cells = np.floor(centres / labels.resolution).astype(np.int64)
+        occupied = np.arange(len(cells)) < len(self._centres)
+        labels.prime(np.ascontiguousarray(cells), occupied, _LOG_RATIO)
+
+
+class KnownLocalMap:
+    """A known map in place of a local one.
+
+    Args:
+        known: the map.
+        extends: whether scans are added to it.
+    """
+
+    def __init__(self, known: KnownMap, extends: bool) -> None:
+        self.grid = known.make_grid()
+        self._extends = extends
+        self._last: dict[str | int, MappedScan] = {}
+
+    def add(self, scan: MappedScan) -> bool:
+        """Note a scan unless it is too close to the last one of its sensor; True if it was noted.
+        In a map that is extended, it is added."""
+        last = self._last.get(scan.beams.sensor)
+        if last is not None and not is_spaced(last, scan):
+            return False
+        self._last[scan.beams.sensor] = scan
+        if self._extends:
+            add_scan(self.grid, scan)
+        return True
+
+    def remove_before(self, travelled: float) -> None:
+        """Nothing leaves a known map."""
+
+    def has_sensor(self, _sensor: str | int, /) -> bool:
+        """True: a known map holds what every sensor sees."""
+        return True
+
+
+def to_surface_map(grid: GridMap) -> SurfaceMap:
+    """Surfaces and free space of an occupancy map, on squares of two cells."""
+    from scipy import ndimage  # slow to load
+
+    at = grid if isinstance(grid, Grid) else Grid(grid.p_occupied, grid.origin, grid.resolution)
+    edge = _SQUARE * grid.resolution
+    with np.errstate(invalid="ignore"):
+        masks = grid.p_occupied > OCCUPIED_THRESH, grid.p_occupied < FREE_THRESH
+    squares = [np.floor(at.centres(np.argwhere(mask)) / edge).astype(np.int64) for mask in masks]
+    both = np.concatenate(squares)
+    low = both.min(axis=0) - 1
+    shape = both.max(axis=0) + 2 - low
+    surface, passes = (_count(cells - low, shape) for cells in squares)
+    passed = (passes >= _SQUARE**2 // 2) & (surface == 0)
+    around = np.ones((3, 3), np.bool_)
+    near = ndimage.binary_dilation(surface > 0, around)
+    free = ndimage.binary_erosion(passed, around) & ~near
+    points = (np.argwhere(surface > 0) + low + 0.5) * edge
+    return SurfaceMap(points.astype(np.float32), low, near, free, find_sides(passed), edge)
+
+
+def _count(cells: NDArray[np.int64], shape: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(X, Y) number of the cells (n, 2)."""
+    rows, columns = shape.tolist()
+    counts = np.bincount(cells[:, 0] * columns + cells[:, 1], minlength=rows * columns)
+    return np.asarray(counts.reshape(rows, columns), np.int64)
+
+
+def _free_runs(grid: Grid) -> tuple[Float, Float]:
+    """Runs of free cells along the rows: (R, 3, 3) poses of their begins, whose x axis is the row,
+    and (R,) m."""
+    with np.errstate(invalid="ignore"):
+        free = grid.p_occupied < FREE_THRESH
+    padded = np.pad(free, [(0, 0), (1, 1)]).astype(np.int8)
+    row, first = np.nonzero(np.diff(padded, axis=1) == 1)
+    _, last = np.nonzero(np.diff(padded, axis=1) == -1)
+    begins = grid.centres(np.stack([row, first], axis=1))
+    poses = np.tile(np.eye(3), (len(row), 1, 1))
+    c, s = np.cos(grid.origin[2]), np.sin(grid.origin[2])
+    poses[:, :2, :2] = [[c, -s], [s, c]]
+    poses[:, :2, 2] = begins
+    return poses, np.asarray((last - first - 1) * grid.resolution, np.float64)

@@ -1,0 +1,86 @@
+"""Localization in a known map: lost or not, and what that means for pose and labels."""
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.live.causal_labels import CausalLabels, take_over
+from stillmap.live.global_localization import GlobalLocalizer, Localization
+from stillmap.live.known_map import KnownLocalMap, KnownMap
+from stillmap.live.local_map import MappedScan
+from stillmap.live.loop_closer import Correction
+from stillmap.slam.scan_hits import Scan
+
+Float = NDArray[np.float64]
+Mode = Literal["localise", "extend"]
+
+
+class PlaceTracker:
+    """What a live mapper knows of its place in a known map.
+
+    Args:
+        known: the map.
+        mode: whether the map stays as it is, or is extended by what is seen.
+    """
+
+    def __init__(self, known: KnownMap, mode: Mode) -> None:
+        self.is_lost, self.is_ambiguous = True, False
+        self._known, self._extends = known, mode == "extend"
+        self._localizer = GlobalLocalizer(known)
+        self._lost_since = 0
+        self._moves: list[tuple[int, int, Float]] = []  # first scan, last + 1, and their motion
+
+    def lose(self, scan: int) -> None:
+        """The robot was carried elsewhere before a scan."""
+        self.is_lost, self._lost_since = True, scan
+
+    def localize(self, labels: CausalLabels, hits: Scan, pose: Float, scan: int) -> Float | None:
+        """(3, 3) of the frame of the labels in the known map, if the evidence is clear.
+
+        Args:
+            labels: of what was seen since the robot was lost.
+            hits: of the last scan.
+            pose: (3, 3) of the robot in the frame of the labels.
+            scan: number of the last scan.
+        """
+        found: Localization = self._localizer.localize(labels.to_map(), hits, pose)
+        self.is_ambiguous = found.is_ambiguous
+        if found.T is None:
+            return None
+        self.is_lost = False
+        self._moves.append((self._lost_since, scan + 1, found.T))
+        return found.T
+
+    def make_local_map(self) -> KnownLocalMap:
+        """The map that scans are matched against from now on."""
+        return KnownLocalMap(self._known, self._extends)
+
+    def enter(self, labels: CausalLabels, T: Float) -> None:
+        """Let labels go on from the known map, with what was seen since the robot was lost."""
+        known, seen = labels.filter.sibling(), labels.filter
+        self._known.prime(known)
+        tags = labels.tags
+        take_over(known, seen, np.tile(T, (tags, 1, 1)), 0, seen.block_count)
+        labels.filter = known
+
+    def to_known(self, given: Float) -> Float:
+        """(T, 3, 3) poses in the known map of poses as they were given."""
+        poses = given.copy()
+        for first, last, T in self._moves:
+            poses[first:last] = T @ poses[first:last]
+        return poses
+
+
+class NoLoops:
+    """In place of a `LoopCloser`: a known map needs no loops."""
+
+    def add(self, scan: MappedScan, explained: float, drift: Float) -> None:
+        """Nothing is kept."""
+
+    def poll(self) -> Correction | None:
+        """Nothing changes."""
+        return None
+
+    def stop(self) -> None:
+        """Nothing to end."""
