@@ -22,11 +22,13 @@ import numpy as np
 import session_merging as merging
 from tables import markdown
 
+from stillmap.eval.map import GHOST_DISTANCE, distance_to_walls
 from stillmap.eval.readers import read_planar_trajectory, read_relations
 from stillmap.eval.relations import compute_relation_errors
 from stillmap.eval.trajectory import compute_absolute_errors
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.replay import iter_beams
+from stillmap.results.reader import Grid, moved
 from stillmap.sim import scene_by_name, simulate
 
 _LOGS = ("intel", "aces", "belgioioso", "edmonton", "fr101", "seattle")
@@ -99,19 +101,23 @@ def score_labels(args: argparse.Namespace) -> str:
             simulation = simulate(scene_by_name(world), seed)
             recording, static = simulation.recording, simulation.truth.static
             hit = recording.hit
-            by_lag, poses = _label_by_lag(recording)
+            by_lag, poses, ghosts = _label_by_lag(simulation)
             scores = [_score(p[hit], static[hit]) for p in by_lag]
             error = compute_absolute_errors(poses, simulation.truth.T_world_base)
             line = [f"{f1:.3f} / {ap:.3f}" for f1, ap in scores]
-            lines.append([world, str(seed), *line, f"{error.rmse:.3f}"])
+            lines.append([world, str(seed), *line, f"{error.rmse:.3f}", f"{ghosts:.1f}"])
             print(" | ".join(lines[-1]), flush=True)
     lags = [f"{lag:g} s" if math.isfinite(lag) else "end" for lag in _LAGS]
-    return markdown(["world", "seed", *lags, "ATE m"], lines)
+    return markdown(["world", "seed", *lags, "ATE m", "ghosts per 100 m2"], lines)
 
 
-def _label_by_lag(recording):
-    """P(static) of all beams (M,) for each lag, and the poses as they were given."""
-    mapper, poses = LiveMapper(), []
+def _label_by_lag(simulation):
+    """P(static) of all beams (M,) for each lag, the poses as they were given, and ghosts of the map
+    per 100 m2 that stay for 10 s, the mean over time."""
+    recording, walls = simulation.recording, simulation.truth.walls
+    T_world_map = simulation.truth.T_world_base[0]
+    mapper, poses, ghosts = LiveMapper(), [], []
+    seen, due = set(), recording.stamp_ns[0]
     by_lag = [np.full(recording.n_beams, np.nan, np.float32) for _ in _LAGS]
     waiting = [deque() for _ in _LAGS]
     for t, beams in enumerate(iter_beams(recording)):
@@ -119,6 +125,10 @@ def _label_by_lag(recording):
         update = mapper.push(beams, odometry)
         poses.append(update.pose)
         by_lag[0][recording.beams_of(t)] = update.p_static
+        if beams.stamp_ns >= due:
+            due, before = due + 10 * 10**9, seen
+            seen, free = _find_ghosts(mapper.map, T_world_map, walls)
+            ghosts.append(100.0 * len(seen & before) / max(free, 1.0))
         for lag, scans, out in zip(_LAGS[1:], waiting[1:], by_lag[1:], strict=True):
             scans.append((t, beams))
             while scans and beams.stamp_ns - scans[0][1].stamp_ns >= 1e9 * lag:
@@ -127,7 +137,18 @@ def _label_by_lag(recording):
     for scans, out in zip(waiting[1:], by_lag[1:], strict=True):
         for s, earlier in scans:
             out[recording.beams_of(s)] = mapper.label(earlier, s)
-    return by_lag, np.array(poses)
+    mapper.close()
+    return by_lag, np.array(poses), float(np.mean(ghosts))
+
+
+def _find_ghosts(grid, T_world_map, walls):
+    """Cells far from every wall that the map shows as occupied, and its free area in m2."""
+    grid = Grid(grid.p_occupied, grid.origin, grid.resolution)
+    rows = np.argwhere(grid.occupied)
+    centres = grid.centres(rows)
+    far = distance_to_walls(moved(T_world_map, centres), walls) > GHOST_DISTANCE * grid.resolution
+    cells = np.floor(centres[far] / grid.resolution).astype(int)
+    return set(map(tuple, cells.tolist())), float(grid.free.sum()) * grid.resolution**2
 
 
 def _score(p_static, static) -> tuple[float, float]:

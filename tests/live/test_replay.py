@@ -58,3 +58,24 @@ def test_3d_is_refused(tmp_path, capsys):
     assert main(["live", "--replay", str(tmp_path / "sim"), "-o", str(tmp_path / "out")]) == 2
     assert "3D" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_at_its_own_pace(hall, tmp_path, capsys):
+    words = ["live", "--replay", str(hall), "-o", str(tmp_path / "out"), "--json", "--quiet"]
+    assert main([*words, "--rate", "8"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["scans"] + told["dropped"] == 120
+    assert told["scans"] > 60
+    assert main([*words, "--rate", "0", "--overwrite"]) == 2
+    assert "--rate" in capsys.readouterr().err
+
+
+def test_in_a_known_map(hall, tmp_path, capsys):
+    words = ["live", "--replay", str(hall), "--quiet"]
+    assert main([*words, "-o", str(tmp_path / "map")]) == 0
+    assert main([*words, "-o", str(tmp_path / "again"), "--map", str(tmp_path / "map")]) == 0
+    one, two = (np.loadtxt(tmp_path / name / "trajectory.tum")[:, 1:3] for name in ("map", "again"))
+    assert np.linalg.norm(one - two, axis=1).max() < 0.15
+    assert main([*words, "-o", str(tmp_path / "no"), "--map", str(tmp_path / "none")]) == 2
+    assert "none" in capsys.readouterr().err
+    assert not (tmp_path / "no").exists()

@@ -25,6 +25,8 @@ DESCRIPTION = (
 EPILOG = """examples:
   stillmap live --replay log.clf.gz -o out
   stillmap live --replay log.bag -o out --json --quiet
+  stillmap live --replay log.bag -o out --rate 1
+  stillmap live --replay tuesday.bag --map monday -o out
 """
 
 
@@ -35,6 +37,26 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     )
     p.add_argument("-o", "--output", metavar="DIR", required=True, help="result folder")
     p.add_argument("--overwrite", action="store_true", help="replace what is in DIR")
+    p.add_argument(
+        "--rate",
+        metavar="X",
+        type=float,
+        help="push scans at X times the speed of the recording, loops closed beside; a scan that "
+        "is due while earlier ones wait is dropped (default: one after another, the same to the "
+        "bit every time)",
+    )
+    p.add_argument(
+        "--map",
+        metavar="DIR",
+        help="a result or a place in whose map the robot is localized (default: map anew)",
+    )
+    p.add_argument(
+        "--mode",
+        choices=("localise", "extend"),
+        default="localise",
+        help="whether the map of --map stays as it is, or what is seen is added "
+        "(default: localise)",
+    )
     p.add_argument("--no-odometry", action="store_true", help="ignore odometry in the recording")
     p.add_argument(
         "--resolution", metavar="M", type=float, help="edge of a map cell in metres (default: 0.05)"
@@ -57,14 +79,21 @@ def run(args: argparse.Namespace) -> int:
     from stillmap.results.run_json import RECORD
 
     options = options_from_args(args, read_changes(args), shared_changes(args))
+    if args.rate is not None and not args.rate > 0.0:
+        raise InputError(f"--rate: expected a positive number, got {args.rate:g}")
     output = Path(args.output)
     require_new(output, RECORD, args.overwrite)
     require_apart(output, Path(args.replay))
     with tempfile.TemporaryDirectory(prefix="stillmap-") as scratch:
         recording = _read(args, options, Path(scratch))
-        mapper = LiveMapper(options, scratch=scratch)
-        with show_progress(args.quiet, 1) as progress:
-            latency = replay(recording, mapper, progress)
+        in_background = args.rate is not None
+        with (
+            LiveMapper(
+                options, place=args.map, mode=args.mode, background=in_background, scratch=scratch
+            ) as mapper,
+            show_progress(args.quiet, 1) as progress,
+        ):
+            latency = replay(recording, mapper, progress, rate=args.rate)
             mapper.save(output, overwrite=args.overwrite, progress=progress)
     if not args.quiet:
         say(describe(latency))

@@ -1,4 +1,4 @@
-"""A recording pushed through the live mapper, as fast as possible."""
+"""A recording pushed through the live mapper, as fast as possible or at its own pace."""
 
 import resource
 import sys
@@ -46,17 +46,38 @@ class Latency:
         }
 
 
-def replay(recording: Recording, mapper: LiveMapper, progress: Progress = no_progress) -> Latency:
-    """Push all scans of a recording, one after another; the same to the bit every time."""
-    seconds = []
+def replay(
+    recording: Recording,
+    mapper: LiveMapper,
+    progress: Progress = no_progress,
+    rate: float | None = None,
+) -> Latency:
+    """Push the scans of a recording.
+
+    Args:
+        recording: planar.
+        mapper: that takes them.
+        progress: called with the number of scans done and their total.
+        rate: times the speed of the recording: a latency counts from when the scan is due, and a
+            scan is dropped where the next one is due already. None: one after another.
+    """
+    seconds, dropped, begin = list[float](), 0, time.perf_counter()
+    due = np.zeros(recording.n_scans)
+    if rate is not None:
+        due = 1e-9 * (recording.stamp_ns - recording.stamp_ns[0]) / rate
     for t, beams in enumerate(iter_beams(recording)):
+        if rate is not None:
+            if t + 1 < len(due) and time.perf_counter() - begin > due[t + 1]:
+                dropped += 1
+                continue
+            time.sleep(max(begin + float(due[t]) - time.perf_counter(), 0.0))
         odometry = None if recording.T_odom_base is None else recording.T_odom_base[t]
-        start = time.perf_counter()
+        start = time.perf_counter() if rate is None else begin + float(due[t])
         mapper.push(beams, odometry)
         seconds.append(time.perf_counter() - start)
         progress("mapping", 0, t + 1, recording.n_scans)
     used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * _MAXRSS_UNIT
-    return Latency(np.array(seconds), 0, used)
+    return Latency(np.array(seconds), dropped, used)
 
 
 def iter_beams(recording: Recording) -> Iterator[ScanBeams]:

@@ -1,0 +1,117 @@
+"""Localization in a known map: from anywhere, in a crowd, after being carried, in doubt."""
+
+import numpy as np
+import pytest
+
+import stillmap
+from stillmap.core import se2
+from stillmap.core.errors import InputError
+from stillmap.live.mapper import LiveMapper
+from stillmap.live.replay import iter_beams
+from stillmap.sim import scene_by_name, simulate
+
+
+class Place:
+    """A map of a world without people, and runs through it."""
+
+    def __init__(self, world, seed, folder):
+        simulation = simulate(scene_by_name(world, {"crowd": {"people": 0}}), seed)
+        stillmap.build(simulation.recording, {"threads": 1, "em.max_iterations": 1}).save(folder)
+        self.folder, self._world = folder, world
+        self._T_map_world = se2.inverse(simulation.truth.T_world_base[0])
+
+    def simulate(self, seed, **changes):
+        return simulate(scene_by_name(self._world, changes), seed)
+
+    def error(self, update, simulation, scan):
+        """m and rad of a pose."""
+        true = self._T_map_world @ simulation.truth.T_world_base[scan]
+        x, y, theta = se2.parameters(se2.inverse(true) @ update.pose)
+        return np.hypot(x, y), abs(theta)
+
+
+@pytest.fixture(scope="module")
+def hall(tmp_path_factory):
+    return Place("hall", 1, tmp_path_factory.mktemp("place") / "hall")
+
+
+def run(place, simulation, scans, **settings):
+    """Scan, update and mapper of some scans."""
+    odometry = simulation.recording.T_odom_base
+    with LiveMapper({"threads": 1}, place=place.folder, **settings) as mapper:
+        for k, beams in enumerate(iter_beams(simulation.recording)):
+            if k in scans:
+                yield k, mapper.push(beams, odometry[k]), mapper
+
+
+@pytest.mark.parametrize(
+    "first", [900, *(pytest.param(k, marks=pytest.mark.slow) for k in (100, 1700))]
+)
+def test_the_robot_is_found_anywhere(hall, first):
+    simulation = hall.simulate(201, crowd={"people": 10})
+    answers = run(hall, simulation, range(first, first + 40))
+    k, update, _ = next(answers)
+    while "lost" in update.doubts:
+        k, update, _ = next(answers)
+    metres, radians = hall.error(update, simulation, k)
+    assert metres < 0.1
+    assert radians < 0.03
+
+
+@pytest.mark.slow
+def test_a_crowd_does_not_lose_it(hall):
+    simulation = hall.simulate(202, crowd={"people": 80})
+    found = [
+        hall.error(update, simulation, k)[0]
+        for k, update, _ in run(hall, simulation, range(200))
+        if "lost" not in update.doubts
+    ]
+    assert len(found) > 150
+    assert max(found) < 0.2
+    assert np.mean(found) < 0.06
+
+
+def test_a_robot_that_is_carried_is_found_again(hall):
+    robot = {"scans": 220, "carried_at": 0.4, "carried_time": 5.0}
+    simulation = hall.simulate(203, crowd={"people": 5}, robot=robot)
+    answers = list(run(hall, simulation, range(220)))
+    doubts = [update.doubts for _, update, _ in answers]
+    assert not any("carried" in doubt for doubt in doubts[:80])
+    assert any("carried" in doubt for doubt in doubts[80:140])
+    assert "lost" not in doubts[-1]
+    k, update, _ = answers[-1]
+    assert hall.error(update, simulation, k)[0] < 0.1
+    wrong = [k for k, one, _ in answers if "lost" not in one.doubts]
+    off = [hall.error(answers[k][1], simulation, k)[0] > 0.5 for k in wrong]
+    assert np.mean(off) < 0.15  # until the scans contradict the map for sure
+
+
+def test_what_is_seen_is_added_to_a_map_that_is_extended(hall):
+    simulation = hall.simulate(204, crowd={"people": 0})
+    known = np.nansum(stillmap.load(hall.folder).map.p_occupied > 0.65)
+    for mode in ("localise", "extend"):
+        answers = run(hall, simulation, range(60), mode=mode)
+        while (answer := next(answers))[0] < 59:
+            pass
+        k, update, mapper = answer
+        assert len(mapper.poses) == 60
+        shown = np.nansum(mapper.map.p_occupied > 0.65)
+        assert hall.error(update, simulation, k)[0] < 0.1
+        assert 0.9 * known < shown < 1.3 * known
+
+
+@pytest.mark.slow
+def test_where_places_look_alike_it_says_so(tmp_path):
+    place = Place("corridor", 1, tmp_path / "corridor")
+    simulation = place.simulate(205, crowd={"people": 0})
+    doubts, wrong = set(), 0
+    for k, update, _ in run(place, simulation, range(600, 625)):
+        doubts |= set(update.doubts)
+        wrong += "lost" not in update.doubts and place.error(update, simulation, k)[0] > 0.5
+    assert "ambiguous" in doubts
+    assert not wrong
+
+
+def test_folders_without_a_map_are_refused(tmp_path):
+    with pytest.raises(InputError, match="nothing"):
+        LiveMapper(place=tmp_path / "nothing")
