@@ -2,16 +2,20 @@
 
 python benchmarks/live.py logs LOGS [--names intel fr101] --data DIR
 python benchmarks/live.py labels [--worlds hall corridor] [--first-seed 11] [--seeds 2]
+python benchmarks/live.py localize --data DIR [--worlds hall office] [--starts 25] [--people N]
 python benchmarks/live.py latency [--world hall] [--seconds 600] [--rate 40] [--beams 1081]
 
 logs: each NAME.clf.gz with NAME.exact.relations or NAME.pseudo.relations beside it: relation
 errors of `stillmap live --replay`, of the poses at the time and at the end, beside those of
 `stillmap map`.
 labels: F1 of "dynamic" and average precision by the lag after which a beam is labelled, seconds.
+localize: the robot is put down at random places of a known map, and has 30 scans to find out where
+it is: right within 0.3 m.
 latency: scans pushed at their own pace, loops closed in another process.
 """
 
 import argparse
+import itertools
 import math
 import resource
 import time
@@ -22,6 +26,8 @@ import numpy as np
 import session_merging as merging
 from tables import markdown
 
+from stillmap import build
+from stillmap.core import se2
 from stillmap.eval.map import GHOST_DISTANCE, distance_to_walls
 from stillmap.eval.readers import read_planar_trajectory, read_relations
 from stillmap.eval.relations import compute_relation_errors
@@ -32,6 +38,7 @@ from stillmap.results.reader import Grid, moved
 from stillmap.sim import scene_by_name, simulate
 
 _LOGS = ("intel", "aces", "belgioioso", "edmonton", "fr101", "seattle")
+_MAP_SEED, _OTHER_SEED, _SCANS_TO_LOCALIZE = 11, 12, 30
 _LAGS = (0.0, 1.0, 5.0, 30.0, math.inf)  # s
 
 
@@ -56,6 +63,14 @@ def _parser() -> argparse.ArgumentParser:
     labels.add_argument("--worlds", nargs="+", default=["hall", "corridor"])
     labels.add_argument("--first-seed", type=int, default=11)
     labels.add_argument("--seeds", type=int, default=2)
+    localize = commands.add_parser("localize")
+    localize.set_defaults(run=localize_globally)
+    localize.add_argument(
+        "--worlds", nargs="+", default=["hall", "office", "warehouse", "corridor"]
+    )
+    localize.add_argument("--starts", type=int, default=25)
+    localize.add_argument("--people", type=int, help="default: as many as the world has")
+    localize.add_argument("--data", type=Path, required=True, help="folder for maps")
     latency = commands.add_parser("latency")
     latency.set_defaults(run=measure_latency)
     latency.add_argument("--world", default="hall")
@@ -158,6 +173,59 @@ def _score(p_static, static) -> tuple[float, float]:
     found = moves[np.argsort(p_static, kind="stable")]
     precision = np.cumsum(found) / np.arange(1, len(found) + 1)
     return float(f1), float(precision[found].mean()) if found.any() else float("nan")
+
+
+def localize_globally(args: argparse.Namespace) -> str:
+    """A line per world."""
+    lines = []
+    for world in args.worlds:
+        known, T_map_world = _build_known_map(args.data / world, world)
+        crowd = {} if args.people is None else {"crowd": {"people": args.people}}
+        simulation = simulate(scene_by_name(world, crowd), _OTHER_SEED)
+        rng = np.random.default_rng(0)
+        last = simulation.recording.n_scans - _SCANS_TO_LOCALIZE
+        runs = [
+            _localize_from(known, T_map_world, simulation, int(first))
+            for first in rng.integers(0, last, args.starts)
+        ]
+        verdicts = [verdict for verdict, *_ in runs]
+        found = [one[1:] for one in runs if one[0] == "right"]
+        counts = [str(verdicts.count(v)) for v in ("right", "wrong", "ambiguous", "lost")]
+        medians = [
+            f"{np.median(v):.{d}f}"
+            for v, d in zip(zip(*found, strict=True), (0, 3, 2), strict=True)
+        ]
+        lines.append(
+            [world, str(args.starts), *counts, *medians, f"{max(f[2] for f in found):.2f}"]
+        )
+        print(" | ".join(lines[-1]), flush=True)
+    titles = ["world", "places", "right", "wrong", "ambiguous", "lost", "scans", "m off"]
+    return markdown([*titles, "s of the last search", "at most"], lines)
+
+
+def _build_known_map(folder: Path, world: str):
+    """The map of another run, and the pose of the world in it."""
+    simulation = simulate(scene_by_name(world), _MAP_SEED)
+    if not (folder / "run.json").exists():
+        build(simulation.recording).save(folder)
+    return folder, se2.inverse(simulation.truth.T_world_base[0])
+
+
+def _localize_from(known: Path, T_map_world, simulation, first: int):
+    """Verdict, scans until then, m off, and s that the last push took."""
+    recording, doubts = simulation.recording, ()
+    with LiveMapper({"threads": 1}, place=known) as mapper:
+        scans = itertools.islice(iter_beams(recording), first, first + _SCANS_TO_LOCALIZE)
+        for t, beams in enumerate(scans, first):
+            start = time.perf_counter()
+            update = mapper.push(beams, recording.T_odom_base[t])
+            seconds, doubts = time.perf_counter() - start, update.doubts
+            if "lost" in doubts:
+                continue
+            true = T_map_world @ simulation.truth.T_world_base[t]
+            off = float(np.hypot(*(update.pose - true)[:2, 2]))
+            return "right" if off < 0.3 else "wrong", t - first + 1, off, seconds
+    return "ambiguous" if "ambiguous" in doubts else "lost", _SCANS_TO_LOCALIZE, math.inf, 0.0
 
 
 def measure_latency(args: argparse.Namespace) -> str:

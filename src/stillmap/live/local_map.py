@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -33,6 +33,17 @@ class MappedScan(ShortRepr):
     e: NDArray[np.float32]
     T_map_base: Float
     travelled: float
+
+
+def thin_scan(scan: MappedScan, max_beams: int) -> MappedScan:
+    """Every k-th beam of a scan, as many as are wanted at most."""
+    every = slice(None, None, max(-(-len(scan.e) // max_beams), 1))
+    beams = scan.beams
+    times = None if beams.beam_time is None else beams.beam_time[every].copy()
+    thinned = replace(
+        beams, points=beams.points[every].copy(), hit=beams.hit[every].copy(), beam_time=times
+    )
+    return replace(scan, beams=thinned, e=scan.e[every].copy())
 
 
 class MatchMap(Protocol):

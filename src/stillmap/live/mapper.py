@@ -19,6 +19,7 @@ from stillmap.io.array_checks import poses_to_matrices
 from stillmap.live.causal_labels import CausalLabels, MapChange
 from stillmap.live.history import History
 from stillmap.live.known_map import KnownMap
+from stillmap.live.local_map import thin_scan
 from stillmap.live.loop_closer import LoopCloser
 from stillmap.live.loop_process import LoopProcess
 from stillmap.live.map_correction import LabelledScan, MapCorrection
@@ -40,6 +41,7 @@ from stillmap.tracking import MovingObject
 
 Float = NDArray[np.float64]
 
+_MAX_KEPT_BEAMS = 400  # of a spaced scan, for loops and for the local map after them
 _CHANGES_EVERY_NS = 10**9  # between two updates that tell what changed in the map
 
 
@@ -249,7 +251,8 @@ class LiveMapper:
         added = self._odometry.add(labelled.beams, e)
         if added is not None:
             self._spaced.append(added.T_map_base)
-            self._closer.add(added, found.explained, self._drift)
+            kept = thin_scan(added, _MAX_KEPT_BEAMS)
+            self._closer.add(kept, found.explained, self._drift)
             self._drift = np.zeros((3, 3))
         if self._correction is not None:
             self._correction.note_labelled(labelled)
