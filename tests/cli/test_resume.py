@@ -192,6 +192,7 @@ def cut(path) -> None:
     path.write_bytes(path.read_bytes()[:-7])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", [flip, cut, os.remove])
 @pytest.mark.parametrize("name", ["state.json", "best.m_step.poses.npy", "e-2.npy"])
 def test_damaged_checkpoint_starts_anew(call, room, tmp_path, interrupted, whole, damage, name):

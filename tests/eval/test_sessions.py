@@ -93,6 +93,7 @@ def _map_of(truth: SessionTruth, folder: Path) -> Path:
     return folder / "other/map.npz"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("shift", "verdict"),
     [
@@ -163,6 +164,7 @@ def test_boxes_where_nothing_changed_are_spurious(place: Path, truth: SessionTru
     assert after.f1 == before.f1
 
 
+@pytest.mark.slow
 def test_cells_of_changes_take_the_place_of_boxes(place: Path, truth: SessionTruth) -> None:
     cells = collect_cells(truth, [0, 1, 2])
     T = np.linalg.inv(truth.T_world_session[0])

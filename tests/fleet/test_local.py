@@ -90,6 +90,7 @@ def begin(start, inputs, out):
     return process, children_of(process.pid)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("number", "status"), [("SIGINT", 130), ("SIGKILL", -9), *slow_params(("SIGTERM", 143))]
 )

@@ -125,6 +125,7 @@ def test_the_frame_of_another_session(days, place, tmp_path):
     assert np.abs(difference).max() < 0.02
 
 
+@pytest.mark.slow
 def test_the_map_shows_the_state_that_is_asked_for(days, place, tmp_path):
     results = [days / f"out-{k}" for k in (1, 2, 3)]
     assert merge(*results, "-o", tmp_path / "x", "--map-state", "out-1") == 0

@@ -56,6 +56,8 @@ def laser2d(shared_data):
 # runs a command and prints its peak memory in kilobytes
 _PRINT_PEAK = """
 import resource, subprocess, sys
+
+pytestmark = pytest.mark.slow
 subprocess.run(sys.argv[1:], check=True)
 print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
 """

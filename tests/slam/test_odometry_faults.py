@@ -184,6 +184,7 @@ def office(seed):
     return simulate(scene_by_name("office", {"robot": {"scans": 500}}), seed)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, *slow_params(1)])
 @pytest.mark.parametrize("n", [1, 3])
 def test_without_odometry(seed, n):
