@@ -97,6 +97,7 @@ def test_repeated_interruptions(call, room, tmp_path, stop_after, whole):
     assert contents(tmp_path / "out") == whole
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", ["paper", "tracker", "hit-ratio"])
 def test_other_estimators(call, room, tmp_path, stop_after, estimator):
     words = ("--estimator", estimator, *WORDS)

@@ -64,6 +64,7 @@ def test_where_all_beams_come_at_once_nothing_is_made_anew(room):
         assert it.deskewed is room.recording
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", ["stillmap", "hit-ratio", "tracker"])
 @pytest.mark.parametrize("given", [False, True])
 @pytest.mark.parametrize("loops", [False, True])

@@ -29,6 +29,7 @@ def in_form(recording, folder, ending):
     return again
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_the_same_map_at_given_poses(room, own, tmp_path, ending):
     poses = room.truth.T_world_base

@@ -109,6 +109,7 @@ def test_untold_it_is_found(mapped, good):
     assert mapped({"FLASER": seen(**FRONT)}) < good
 
 
+@pytest.mark.slow
 def test_backwards(mapped, good):
     assert mapped({"RLASER": seen(**REAR)}, [REAR_PARAM]) < good
 
@@ -127,6 +128,7 @@ def test_upside_down_said_wrongly(mapped, good):
     assert mapped({"FLASER": seen()}, **wrong) > 10 * good
 
 
+@pytest.mark.slow
 def test_upside_down_and_nobody_says_so(mapped, good):
     assert mapped({"FLASER": seen()}, flipped=["FLASER"]) < good
 

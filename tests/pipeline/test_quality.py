@@ -41,6 +41,7 @@ def rated(run):
     return rate
 
 
+@pytest.mark.slow
 def test_true_poses_and_labels_are_good(rated):
     quality = rated()
     assert quality.geometry > 60.0

@@ -108,6 +108,7 @@ def test_what_was_learned_is_of_all_classes(street, mapped):
     assert "put down" not in render_report(dataclasses.replace(mapped, estimate=estimate))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("threads", [2, *slow_params(3)])
 def test_any_number_of_threads_gives_the_same_bytes(street, mapped, threads):
     other = stillmap.build(

@@ -39,6 +39,7 @@ def short(name: str, **crowd: object) -> Scene:
     return scene_by_name(name, changes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*QUICK, *slow_params(*sorted(OTHERS))])
 def test_one_seed_one_recording(name: str) -> None:
     first, again = simulate(short(name), 11), simulate(short(name), 11)

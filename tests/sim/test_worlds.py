@@ -34,6 +34,7 @@ def test_there_is_an_empty_version_of_every_world() -> None:
     assert {name.removesuffix("-crowd") for name in SCENES if "-crowd" in name} < worlds
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", largest_slow(BARE))
 def test_empty_worlds_have_no_movers_but_things_whose_time_comes_later(name: str) -> None:
     # else mirrors show the robot to itself

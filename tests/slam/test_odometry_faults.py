@@ -206,11 +206,13 @@ def two_lasers(seed, both):
     return error(simulation.recording, simulation.truth.T_world_base)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, *slow_params(1)])
 def test_two_lasers_without_odometry(seed):
     assert two_lasers(seed, both=True) < 1.2 * two_lasers(seed, both=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, *slow_params(1)])
 def test_two_lasers_without_overlap_or_odometry(seed):
     options = {"robot": {"scans": 800}, "laser": {"second_laser": True}}
