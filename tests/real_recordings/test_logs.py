@@ -13,6 +13,8 @@ from stillmap.eval.readers import read_odometry, read_relations, to_seconds
 from stillmap.eval.relations import compute_relation_errors
 from stillmap.pipeline.options import Options
 
+pytestmark = pytest.mark.slow
+
 slow = pytest.mark.slow
 # Mean errors in metres and degrees. Generous: the references of all but intel come from another
 # program's run.
@@ -56,8 +58,6 @@ def laser2d(shared_data):
 # runs a command and prints its peak memory in kilobytes
 _PRINT_PEAK = """
 import resource, subprocess, sys
-
-pytestmark = pytest.mark.slow
 subprocess.run(sys.argv[1:], check=True)
 print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
 """

