@@ -106,6 +106,7 @@ def assert_finds_the_best(world, kind, window):
     return lattice, tried
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, *slow_params(2)])
 @pytest.mark.parametrize(
     "kind", ["none", "even", "one way only", "correlated", "narrow", "singular"]
@@ -117,6 +118,7 @@ def test_best_lattice_pose(a_room, dimension, window, kind, seed):
     assert_finds_the_best(World(a_room, seed, dimension), kind, window)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("dimension", "window"), [(2, (3.0, np.pi)), (3, (1.7, 0.5))])
 @pytest.mark.parametrize("kind", ["even", *slow_params("correlated")])
 def test_branch_and_bound_prunes(a_room, dimension, window, kind):

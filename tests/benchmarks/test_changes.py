@@ -22,6 +22,7 @@ def street() -> Simulation:
     return simulate(scene_by_name("street-moved", SHORT), 0)
 
 
+@pytest.mark.slow
 def test_stays_are_those_of_the_things(street: Simulation) -> None:
     stays = stays_of(street)
     kinds = street.truth.scene["mover_kinds"]

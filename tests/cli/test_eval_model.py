@@ -156,6 +156,7 @@ def _scores(capsys, *args: object) -> dict:
     return json.loads(out)
 
 
+@pytest.mark.slow
 def test_raised_floor(made, simulated, scored, capsys) -> None:
     found = scored
     assert found["surface"]["mean"] == pytest.approx(UP, abs=1e-3)

@@ -144,6 +144,7 @@ def test_options_of_reading_do_not_move_rows(call, tmp_path, options):
         assert (tmp_path / f"clean/velodyne/{k:06d}.bin").read_bytes() == expected
 
 
+@pytest.mark.slow
 def test_interrupted_copies_leave_nothing(start, tmp_path):
     (tmp_path / "pcd").mkdir()
     head = "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {0}\n"

@@ -97,6 +97,7 @@ def test_repeated_interruptions(call, room, tmp_path, stop_after, whole):
     assert contents(tmp_path / "out") == whole
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", ["paper", "tracker", "hit-ratio"])
 def test_other_estimators(call, room, tmp_path, stop_after, estimator):
     words = ("--estimator", estimator, *WORDS)
@@ -192,6 +193,7 @@ def cut(path) -> None:
     path.write_bytes(path.read_bytes()[:-7])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", [flip, cut, os.remove])
 @pytest.mark.parametrize("name", ["state.json", "best.m_step.poses.npy", "e-2.npy"])
 def test_damaged_checkpoint_starts_anew(call, room, tmp_path, interrupted, whole, damage, name):

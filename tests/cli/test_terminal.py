@@ -162,6 +162,7 @@ def test_ctrl_c_before_anything_is_finished(call, room, tmp_path, nothing_left, 
     nothing_left()
 
 
+@pytest.mark.slow
 def test_ctrl_c_restores_the_cursor(on_a_terminal, hall, tmp_path, nothing_left):
     status, written = on_a_terminal(
         "map", hall, "-o", tmp_path / "out", *ENDLESS, send_at=b"iteration 2 of"

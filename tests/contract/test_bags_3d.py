@@ -78,6 +78,7 @@ def decoded(mapped_street):
     return topics
 
 
+@pytest.mark.slow
 def test_topics(decoded):
     found = {topic: len(messages) for topic, messages in decoded.items()}
     assert 0 < found.pop("/objects") <= 40

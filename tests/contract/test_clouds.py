@@ -98,6 +98,7 @@ def test_points_equal_those_of_the_result(converted, mapped_street, ending):
         np.testing.assert_array_equal(its[:, 3], known[part][:, 3])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", READERS)
 @pytest.mark.parametrize("part", ["static", "dynamic"])
 def test_static_or_dynamic_points_only(converted, mapped_street, ending, part):
@@ -106,6 +107,7 @@ def test_static_or_dynamic_points_only(converted, mapped_street, ending, part):
     np.testing.assert_allclose(found, known, atol=ROUNDED + 1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", READERS)
 def test_files_are_reproducible(converted, ending):
     first = converted(ending).read_bytes()

@@ -37,6 +37,7 @@ def matrix(translation, q):
     return T[np.ix_([0, 1, 3], [0, 1, 3])]
 
 
+@pytest.mark.slow
 def test_schemas_are_complete(decoded):
     summary, _ = decoded
     for schema in summary.schemas.values():

@@ -159,6 +159,7 @@ def test_plan_is_the_map(of_hall, result):
     np.testing.assert_array_equal(texture[:, 1] == 1, corners[:, 1] == y0)
 
 
+@pytest.mark.slow
 def test_same_content_again(mapped_street, tmp_path):
     """By rerun's own comparison, and both files are found to be whole."""
     first, second = (convert(mapped_street, tmp_path / f"{name}.rrd") for name in "ab")

@@ -93,6 +93,7 @@ def _map_of(truth: SessionTruth, folder: Path) -> Path:
     return folder / "other/map.npz"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("shift", "verdict"),
     [
@@ -119,6 +120,7 @@ def test_a_shifted_session_is_found(truth, perfect, tmp_path, shift, verdict) ->
         assert one.median_seam == pytest.approx(np.hypot(*shift[:2]), abs=1e-5)
 
 
+@pytest.mark.slow
 def test_sessions_of_another_place_must_be_refused(tmp_path: Path) -> None:
     scenes = [scene_by_name(f"lookalike-{k}", QUICK) for k in (1, 2)]
     write_sessions(plan_strangers(*scenes), tmp_path / "days")
@@ -154,6 +156,7 @@ def test_changes_of_another_date_are_neither_found_nor_right(place, truth) -> No
     assert changes.f1 < 0.8
 
 
+@pytest.mark.slow
 def test_boxes_where_nothing_changed_are_spurious(place: Path, truth: SessionTruth) -> None:
     extra = {"kind": "gone", "box": [400.0, 400.0, 401.0, 401.0], "between": list(truth.names[:2])}
     before = changes_of(score_place(place, truth.folder))
@@ -163,6 +166,7 @@ def test_boxes_where_nothing_changed_are_spurious(place: Path, truth: SessionTru
     assert after.f1 == before.f1
 
 
+@pytest.mark.slow
 def test_cells_of_changes_take_the_place_of_boxes(place: Path, truth: SessionTruth) -> None:
     cells = collect_cells(truth, [0, 1, 2])
     T = np.linalg.inv(truth.T_world_session[0])
@@ -209,6 +213,7 @@ def test_gone_objects_in_the_map_are_ghosts_avoidable_where_a_later_session_look
     assert 0 < looked.sum() <= own.avoidable_ghosts < own.ghost_cells <= gone.sum()
 
 
+@pytest.mark.slow
 def test_single_sessions_are_scored_beside(perfect: Path, truth: SessionTruth, tmp_path) -> None:
     single = tmp_path / "out-2"
     single.mkdir()

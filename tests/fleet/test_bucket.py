@@ -43,6 +43,7 @@ def listed(s3):
     return [one.removeprefix("robots/") for one in s3.find("robots")]
 
 
+@pytest.mark.slow
 def test_recordings_and_results_in_a_bucket(call, s3, recordings, by_hand, tmp_path):
     for name in NAMES[:2]:
         s3.put(str(recordings / name), f"robots/day/{name}", recursive=True)

@@ -33,6 +33,7 @@ def command_of(pid):
         return b""
 
 
+@pytest.mark.slow
 def test_worker_killed_and_client_interrupted(dask_cluster, recordings, by_hand, start, tmp_path):
     address, workers = dask_cluster
     out = tmp_path / "out"

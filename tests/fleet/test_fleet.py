@@ -88,6 +88,7 @@ def test_finished_tasks_are_not_run_again(call, logs, tmp_path):
     assert (attempts(folder, "a"), attempts(folder, "b")) == (1, 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", ["recording", "options", "result", "removed", "label"])
 def test_result_of_something_else_is_made_again(call, logs, tmp_path, change):
     folder, out, words = logs(a="fine"), tmp_path / "out", []

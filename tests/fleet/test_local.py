@@ -90,6 +90,7 @@ def begin(start, inputs, out):
     return process, children_of(process.pid)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("number", "status"), [("SIGINT", 130), ("SIGKILL", -9), *slow_params(("SIGTERM", 143))]
 )
@@ -117,6 +118,7 @@ def test_stopped_and_continued(start, recordings, by_hand, tmp_path, number, sta
     assert unfinished(out) == set()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif("merge" not in COMMANDS, reason="stillmap merge is no command here")
 def test_sessions_of_one_place_are_merged(start, recordings, tmp_path):
     out = tmp_path / "out"

@@ -135,6 +135,27 @@ def test_scratch_of_a_killed_process_is_removed(tmp_path):
     assert not (tmp_path / "work").exists()
 
 
+SHARE = """
+import os, sys
+from stillmap.fleet.bucket import local_scratch
+for _ in range(400):
+    with local_scratch() as path:
+        (path / "file").write_text("mine")
+"""
+
+
+def test_fleets_of_one_user_share_the_folder_of_scratch_folders(tmp_path):
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    words = [sys.executable, "-c", SHARE]
+    fleets = [
+        subprocess.Popen(words, env=environment, stderr=subprocess.PIPE, text=True)
+        for _ in range(3)
+    ]
+    ended = [(fleet.communicate()[1], fleet.returncode) for fleet in fleets]
+    assert ended == [("", 0)] * 3
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_content_decides_on_keys(tmp_path):
     one, two = tmp_path / "one", tmp_path / "two"
     for folder in (one, two):

@@ -92,6 +92,7 @@ def write_inputs(folder, where):
         np.save(where / f"sweep{k}.npy", np.random.default_rng(k).uniform(1, 9, (40, 3)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", ["README.md", "docs/python.md"])
 def test_examples_of_the_main_job_run(page, folder, tmp_path, monkeypatch, capsys):
     pytest.importorskip("pandas")

@@ -82,6 +82,7 @@ def test_saved_and_loaded(merged, flat_place, tmp_path):
         stillmap.load(tmp_path / "place")
 
 
+@pytest.mark.slow
 def test_recordings_and_results_themselves(flat_days, flat_place):
     """Their labels are those of the files, to the bit."""
     recording = stillmap.read(flat_days / "day1")
@@ -123,6 +124,7 @@ def test_parts_of_one_run(flat_days, tmp_path):
     assert place.sessions[1].scans == slice(100, 200)
 
 
+@pytest.mark.slow
 def test_growing_without_the_recordings(merged, flat_days, tmp_path):
     """What the place keeps is enough."""
     before, days = files_of(merged.path), tmp_path / "flat"

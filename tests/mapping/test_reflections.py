@@ -41,6 +41,7 @@ def gallery() -> Simulation:
     return drive("gallery", 0, laser={"beams": 361})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "changes"),
     [
@@ -60,6 +61,7 @@ def test_most_reflections_are_found_and_nothing_else(
     assert mirrored[found & run.recording.hit].mean() > 0.96
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["hall", "office", "corridor", "warehouse", "ten-corridors", "street", "rounds"]
 )

@@ -308,6 +308,7 @@ def same(a, b):
     assert a.best_iteration == b.best_iteration
 
 
+@pytest.mark.slow
 @with_any_estimator
 @pytest.mark.parametrize("fixed", [False, True])
 def test_the_same_to_the_bit_with_any_number_of_threads(room, fixed, estimator):

@@ -73,6 +73,7 @@ def test_notes_of_other_programs(simulation):
         assert calibration._given_parameters(recording, OPTIONS, 0) == set()
 
 
+@pytest.mark.slow
 def test_the_result_is_that_of_the_corrected_recording(simulation):
     mirrored = mirror_beams(simulation.recording, 0)
     result = stillmap.build(mirrored, OPTIONS)

@@ -47,6 +47,7 @@ def outcome(result):
     return [it.bound for it in result.iterations], [a.tobytes() for a in (*arrays, *maps)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", ["stillmap", "hit-ratio", "paper", "tracker"])
 def test_it_can_be_left_and_the_printed_method_leaves_it(room, swept, estimator):
     chosen = options(estimator, max_iterations=3)
@@ -63,6 +64,7 @@ def test_where_all_beams_come_at_once_nothing_is_made_anew(room):
         assert it.deskewed is room.recording
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", ["stillmap", "hit-ratio", "tracker"])
 @pytest.mark.parametrize("given", [False, True])
 @pytest.mark.parametrize("loops", [False, True])
@@ -115,6 +117,7 @@ def test_what_tells_of_the_motion(swept, monkeypatch, odometry):
         np.testing.assert_array_equal(seen.points, expected.points)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("odometry", [True, False])
 @pytest.mark.parametrize("world", ["street", *slow_params("office")])
 def test_poses_at_speed(world, odometry):

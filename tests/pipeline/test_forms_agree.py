@@ -29,6 +29,7 @@ def in_form(recording, folder, ending):
     return again
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_the_same_map_at_given_poses(room, own, tmp_path, ending):
     poses = room.truth.T_world_base
@@ -40,6 +41,7 @@ def test_the_same_map_at_given_poses(room, own, tmp_path, ending):
     assert elsewhere < 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_the_same_way_and_map(room, own, tmp_path, ending):
     """Where two poses are about as good, the last digit may decide: by less than the noise."""

@@ -91,6 +91,7 @@ def good():
     return max(1.5 * ate(found.poses, centred.truth.T_world_base), 0.01)
 
 
+@pytest.mark.slow
 def test_off_centre_by_params(mapped, good):
     assert mapped({"FLASER": seen(**FRONT)}, FRONT_PARAMS) < good
 
@@ -108,6 +109,7 @@ def test_untold_it_is_found(mapped, good):
     assert mapped({"FLASER": seen(**FRONT)}) < good
 
 
+@pytest.mark.slow
 def test_backwards(mapped, good):
     assert mapped({"RLASER": seen(**REAR)}, [REAR_PARAM]) < good
 
@@ -126,10 +128,12 @@ def test_upside_down_said_wrongly(mapped, good):
     assert mapped({"FLASER": seen()}, **wrong) > 10 * good
 
 
+@pytest.mark.slow
 def test_upside_down_and_nobody_says_so(mapped, good):
     assert mapped({"FLASER": seen()}, flipped=["FLASER"]) < good
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("degrees", "beams"), [(90, 91), (270, 271), (360, 361)])
 def test_fields_of_view(mapped, good, degrees, beams):
     laser = seen(fov=math.radians(degrees), beams=beams)

@@ -37,6 +37,7 @@ def files_of(recording, estimator: str, out: Path) -> dict[str, bytes]:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_arrays_in_files_give_the_same_bytes(swept, estimator, tmp_path, monkeypatch):
     in_memory = files_of(swept, estimator, tmp_path / "in memory")

@@ -41,6 +41,7 @@ def rated(run):
     return rate
 
 
+@pytest.mark.slow
 def test_true_poses_and_labels_are_good(rated):
     quality = rated()
     assert quality.geometry > 60.0
@@ -86,6 +87,7 @@ def test_an_empty_map_has_no_geometry(rated):
     assert rated(p_occupied=np.zeros_like).geometry is None
 
 
+@pytest.mark.slow
 def test_in_3d_drift_lowers_geometry_and_wrong_labels_lower_labels():
     lidar = {"channels": 16, "columns": 450}
     run = simulate(scene_by_name("street", {"lidar": lidar, "robot": {"scans": 48}}), 0)

@@ -40,6 +40,7 @@ def near(street):
     return street.recording.hit & (distance > 2.5) & (distance < 40.0)
 
 
+@pytest.mark.slow
 def test_what_moves_is_told_from_what_stands(street, mapped):
     dynamic, near_ones = mapped.p_static < 0.5, near(street)
     static = street.truth.static
@@ -48,6 +49,7 @@ def test_what_moves_is_told_from_what_stands(street, mapped):
     assert dynamic[near_ones & static].mean() < 0.005
 
 
+@pytest.mark.slow
 def test_ground_contact_goes_with_the_mover_above(street, mapped, monkeypatch):
     monkeypatch.setattr("stillmap.em.spatial_coupling.GROUND_CLEARANCE", 100.0)
     other = stillmap.build(street.recording, poses=street.truth.T_world_base)
@@ -106,6 +108,7 @@ def test_what_was_learned_is_of_all_classes(street, mapped):
     assert "put down" not in render_report(dataclasses.replace(mapped, estimate=estimate))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("threads", [2, *slow_params(3)])
 def test_any_number_of_threads_gives_the_same_bytes(street, mapped, threads):
     other = stillmap.build(
@@ -174,6 +177,7 @@ def test_other_estimators_of_the_plane_are_refused(street):
         )
 
 
+@pytest.mark.slow
 def test_the_printed_method_runs_in_3d():
     lidar = {"channels": 16, "columns": 300, "sweep": False}
     scene = scene_by_name("street", {"lidar": lidar, "robot": {"scans": 10}})

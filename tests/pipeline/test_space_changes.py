@@ -16,6 +16,8 @@ from stillmap.sim import CrowdOptions, LidarOptions, RobotOptions, Scene, simula
 from stillmap.sim.scene import Stay, Thing
 from stillmap.sim.walls import box
 
+pytestmark = pytest.mark.slow
+
 LISTED = override(Options(), {"em": {"change_detection_3d": True}})
 LEFT, CAME = (3.0, 2.0), (-3.0, 2.0)  # m, where they stand
 

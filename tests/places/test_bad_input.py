@@ -44,6 +44,7 @@ def dump(array: np.ndarray) -> bytes:
 OUTPUTS = ("trajectory.tum", "beams/p_static.npy", "objects/")
 
 
+@pytest.mark.slow
 def test_a_session_that_was_changed_by_hand(flat_place: Path, tmp_path: Path) -> None:
     copy = tmp_path / "place"
     shutil.copytree(flat_place, copy)
@@ -237,6 +238,7 @@ def test_two_dimensions_do_not_mix(flat_days: Path, tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == []
 
 
+@pytest.mark.slow
 def test_an_unrelated_session_is_left_out(
     flat_place: Path, flat_days: Path, tmp_path: Path
 ) -> None:

@@ -125,6 +125,7 @@ def test_the_frame_of_another_session(days, place, tmp_path):
     assert np.abs(difference).max() < 0.02
 
 
+@pytest.mark.slow
 def test_the_map_shows_the_state_that_is_asked_for(days, place, tmp_path):
     results = [days / f"out-{k}" for k in (1, 2, 3)]
     assert merge(*results, "-o", tmp_path / "x", "--map-state", "out-1") == 0
@@ -144,6 +145,7 @@ def test_the_map_shows_the_state_that_is_asked_for(days, place, tmp_path):
     assert inside.mean() > 0.8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("state", ["yesterday", "1970-01-01"])
 def test_a_state_that_is_none_is_refused(days, tmp_path, state, capsys):
     assert merge(days / "out-1", days / "out-2", "-o", tmp_path / "x", "--map-state", state) == 2

@@ -36,6 +36,7 @@ def rate():
     return rate
 
 
+@pytest.mark.slow
 def test_sessions_that_lie_apart_lower_geometry(rate):
     figures = [rate(apart) for apart in (0.0, 0.03, 0.1)]
     assert figures[0].geometry > figures[1].geometry + 5.0 > figures[2].geometry + 10.0

@@ -37,6 +37,7 @@ ROUGH = {"bump_rate": 2.5, "bump_pitch": 0.06}
 POOR = {"translation_noise": 0.03, "rotation_noise": 0.06, "drift_noise": 0.024}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "laser", "robot"),
     [
@@ -59,6 +60,7 @@ def test_most_floor_is_found_and_little_else(
     assert run.truth.static[found].mean() < 0.03
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "changes"),
     [

@@ -14,6 +14,8 @@ from stillmap.preprocessing import self_filter
 from stillmap.preprocessing.options import ReadOptions
 from stillmap.sim import Simulation, scene_by_name, simulate
 
+pytestmark = pytest.mark.slow
+
 CAR = {"sees_robot": True, "roof_length": 4.0, "roof_width": 1.7}
 LOW = {"z": 0.7, "low": -0.6, "high": 0.3}  # the lidar of a small robot
 SMALL = {**LOW, "sees_robot": True, "roof_length": 0.6, "roof_width": 0.5, "roof_below": 0.2}

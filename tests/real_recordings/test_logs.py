@@ -13,6 +13,8 @@ from stillmap.eval.readers import read_odometry, read_relations, to_seconds
 from stillmap.eval.relations import compute_relation_errors
 from stillmap.pipeline.options import Options
 
+pytestmark = pytest.mark.slow
+
 slow = pytest.mark.slow
 # Mean errors in metres and degrees. Generous: the references of all but intel come from another
 # program's run.

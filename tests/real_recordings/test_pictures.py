@@ -64,6 +64,7 @@ def test_the_street_is_seen_where_its_points_are(street):
         assert right > 1.2 * max(wrong)
 
 
+@pytest.mark.slow
 def test_the_room_is_seen_where_its_points_are(kitchen):
     views, left_out = find_views(kitchen, kitchen.T_recorded_base)
     assert (len(views), left_out) == (125, {})

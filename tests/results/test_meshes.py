@@ -84,6 +84,7 @@ write_obj(Path(sys.argv[2]) / "obj", textured())
 """
 
 
+@pytest.mark.slow
 def test_the_same_bytes_every_time(tmp_path):
     made = []
     for seed in ("1", "2"):

@@ -42,6 +42,7 @@ def mapped(rig, tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 def test_labels_are_those_of_the_truth(rig, mapped):
     p_static = np.load(mapped / "tilting/beams/p_static.npy")
     hit, truth = np.load(rig / "tilting/hit.npy"), load_truth(rig / "tilting")

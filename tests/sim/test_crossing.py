@@ -18,6 +18,7 @@ def run(name: str) -> Simulation:
     return simulate(scene_by_name(name, {"laser": laser}), 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*slow_params("street-jam"), "crossing"])
 def test_the_robot_waits_at_a_light(name: str) -> None:
     x = run(name).truth.T_world_base[:, 0, 2]
@@ -27,6 +28,7 @@ def test_the_robot_waits_at_a_light(name: str) -> None:
     assert min(abs(x[np.flatnonzero(stands)[0]] - at) for at in lights) < 1.0
 
 
+@pytest.mark.slow
 def test_everybody_on_the_road_stops_and_the_queue_drives_on() -> None:
     truth = run("street-jam").truth
     cars = [k for k, kind in enumerate(truth.scene["mover_kinds"]) if kind == "car"]

@@ -10,6 +10,8 @@ from stillmap.core import se2
 from stillmap.sim import Light, RobotOptions, Simulation, scene_by_name
 from stillmap.sim.vehicles import SpeedProfile
 
+pytestmark = pytest.mark.slow
+
 Float = NDArray[np.float64]
 
 STRAIGHT = np.stack([np.arange(0, 300.01, 0.05), np.zeros(6001)], axis=-1)

@@ -160,6 +160,7 @@ def test_all_beams_at_once() -> None:
     np.testing.assert_allclose(z[road], 0.0, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_robot_stands_on_the_slope_and_shakes() -> None:
     lidar = {**SMALL, "vibration_roll": 0.01, "vibration_pitch": 0.02, "vibration_z": 0.03}
     ground = {"slope_x": 0.05, "bend_x": 0.001}

@@ -139,6 +139,7 @@ def test_everybody_else_goes_on_while_the_robot_is_carried() -> None:
     np.testing.assert_array_equal(before.T_world_base[:scan], run.truth.T_world_base[:scan])
 
 
+@pytest.mark.slow
 def test_a_carried_robot_gets_to_the_end_of_its_route() -> None:
     walls = tuple(box(0, 0, 40, 20))
     route = ((-18.0, -8.0), (18.0, -8.0), (18.0, 8.0), (-18.0, 8.0))

@@ -10,6 +10,8 @@ from stillmap.sim import SCENES, Simulation, Stay, scene_by_name, simulate
 from stillmap.sim.objects import place_faces
 from stillmap.sim.planner import compute_segment_distance
 
+pytestmark = pytest.mark.slow
+
 MOVED = ("office-moved", "street-moved", "warehouse-moved")
 
 

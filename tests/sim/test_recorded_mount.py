@@ -105,6 +105,7 @@ def test_a_robot_is_carried_as_far_as_said(by: float) -> None:
     assert (before < 0.3) == (by < 0)
 
 
+@pytest.mark.slow
 def test_a_robot_is_not_put_down_on_somebody() -> None:
     robot = {"scans": 120, "carried_at": 0.5, "carried_by": 10.0}
     for seed in range(3):

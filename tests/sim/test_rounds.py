@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 
 from stillmap.sim import Simulation, scene_by_name, simulate
 
+pytestmark = pytest.mark.slow
+
 Float = NDArray[np.float64]
 
 X, Y = (1.4, 48.2, 113.0, 195.8), (1.4, 34.2, 81.0)  # m, the corridors' middles

@@ -101,6 +101,7 @@ def test_hits_of_both_lasers_lie_on_the_walls(
     assert set(run.recording.sensor[scan[hit]]) == {0, 1}
 
 
+@pytest.mark.slow
 def test_each_of_two_lasers_has_the_rate_and_the_way_takes_as_long() -> None:
     changes = {"crowd": {"people": 0}, "laser": {"beams": 4}}
     one = simulate(scene_by_name("hall", changes), 0)

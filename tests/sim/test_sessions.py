@@ -213,6 +213,7 @@ def test_robots_stay_in_their_regions() -> None:
         assert x.max() < region[2]
 
 
+@pytest.mark.slow
 def test_wings_share_a_door_only() -> None:
     plan = plan_wings(1)
     scenes = [dataclasses.replace(s, crowd=quick_scene().crowd) for s in plan.scenes]

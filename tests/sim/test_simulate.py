@@ -39,6 +39,7 @@ def short(name: str, **crowd: object) -> Scene:
     return scene_by_name(name, changes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*QUICK, *slow_params(*sorted(OTHERS))])
 def test_one_seed_one_recording(name: str) -> None:
     first, again = simulate(short(name), 11), simulate(short(name), 11)
@@ -71,6 +72,7 @@ def test_another_laser_and_odometry_leave_everybody_where_they_were() -> None:
     np.testing.assert_array_equal(a.recording.points, c.recording.points)
 
 
+@pytest.mark.slow
 def test_static_hits_lie_on_walls(
     populated: Simulation, wall_distance: Distance, end_points: EndPoints
 ) -> None:
@@ -83,6 +85,7 @@ def test_static_hits_lie_on_walls(
     assert 0.3 * sigma < np.sqrt(np.mean(distance**2)) < sigma
 
 
+@pytest.mark.slow
 def test_hits_on_movers_lie_on_that_mover(any_run: Simulation, end_points: EndPoints) -> None:
     xy, scan = end_points(any_run)
     mover = any_run.truth.mover

@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 from stillmap.sim import Simulation, scene_by_name, simulate
 from stillmap.sim.laser import Movers, cast_beams, compute_beam_angles
 
+pytestmark = pytest.mark.slow
+
 Float = NDArray[np.float64]
 
 MIDDLES = 1.1 + 6.0 * np.arange(10)  # m, x of the corridors

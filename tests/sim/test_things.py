@@ -176,6 +176,7 @@ def test_a_pause_is_a_leap_of_the_stamps_and_of_nothing_else() -> None:
         assert way.max() < 0.11
 
 
+@pytest.mark.slow
 def test_nobody_is_where_he_was_before_the_pause() -> None:
     run, carries_on = paused(28_800.0), paused(0.0)
     np.testing.assert_array_equal(run.truth.movers[:100], carries_on.truth.movers[:100])
@@ -192,6 +193,7 @@ def test_without_a_pause_nothing_is_told_of_one() -> None:
     np.testing.assert_array_equal(run.recording.points, late.recording.points)
 
 
+@pytest.mark.slow
 def test_nothing_goes_on_evenly_through_a_pause() -> None:
     """The beams of the last scan before it meet people where they were then."""
     still = paused(0.0, laser={"beams": 60, "sweep_time": 0.2, "range_noise": 0.0})

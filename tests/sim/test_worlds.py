@@ -34,6 +34,7 @@ def test_there_is_an_empty_version_of_every_world() -> None:
     assert {name.removesuffix("-crowd") for name in SCENES if "-crowd" in name} < worlds
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", largest_slow(BARE))
 def test_empty_worlds_have_no_movers_but_things_whose_time_comes_later(name: str) -> None:
     # else mirrors show the robot to itself
@@ -53,6 +54,7 @@ def test_crowds_are_crowds() -> None:
     assert scene_by_name("hall-crowd").walls == scene_by_name("hall").walls
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", largest_slow(POPULATED))
 @pytest.mark.parametrize(
     ("beams", "degrees", "noise", "max_range"), [(1440, 360, 0.05, 5.0), (181, 90, 0.01, 80.0)]
@@ -71,6 +73,7 @@ def test_every_world_with_extreme_sensors(
     np.testing.assert_allclose(ranges[~run.recording.hit], max_range, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_static_hits_lie_on_what_stands_still(
     world: Simulation, end_points: EndPoints, wall_distance: Distance
 ) -> None:

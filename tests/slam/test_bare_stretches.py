@@ -67,6 +67,7 @@ def test_a_loop_measures_what_it_spans():
     assert without_loops(stretches, [dataclasses.replace(loop, later=30)]) == stretches
 
 
+@pytest.mark.slow
 def test_a_bare_corridor_is_named_where_odometry_is_missing():
     scene = Scene(
         "bare",

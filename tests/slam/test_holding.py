@@ -45,6 +45,7 @@ DRAGGED = pytest.param(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("laser", "people", "seed"),
     [

@@ -251,6 +251,7 @@ def test_the_grid_is_what_the_poses_make():
     np.testing.assert_array_equal(found.poses[0], np.eye(3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("threads", [1, 2])
 def test_reproducible_with_any_number_of_threads(threads):
     one, two = mapped(square()), mapped(square(), threads=threads)

@@ -62,6 +62,7 @@ def closed(drive, driven):
     return loop_closure_3d.close_loops_3d(recording, e, SlamOptions(), driven, _silent, 1)
 
 
+@pytest.mark.slow
 def test_loops_correct_drift(drive):
     truth = drive[1]
     driven = drifted(drive[3], [0.005, 0.0, 0.005, 0.0, 0.0, 0.0005])

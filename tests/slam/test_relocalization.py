@@ -34,6 +34,7 @@ def assert_noticed_and_placed(simulation):
     assert compute_absolute_errors(found.poses, simulation.truth.T_world_base).rmse < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, *slow_params(1)])
 def test_kidnapped_robot_is_relocalized(seed):
     simulation = carried("office", seed, 90, scans=500, speed=1.5, carried_at=0.7)

@@ -17,6 +17,8 @@ from stillmap.pipeline.result import map_recording
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.spin_estimation import estimate_spin
 
+pytestmark = pytest.mark.slow
+
 SWEEPS, PERIOD = 64, 0.1
 TWIST = np.array([4.0, 0.0, 0.0, 0.0, 0.0, 0.6])  # m/s and rad/s of the base: a wide curve
 SIGN = {"clockwise": -1.0, "counter-clockwise": 1.0, "none": 0.0}

@@ -7,6 +7,7 @@ import json
 import os
 import re
 import secrets
+import stat
 import tempfile
 import threading
 import time
@@ -17,7 +18,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
 from stillmap.core.errors import InputError, import_extra
-from stillmap.fleet.scratch import remove_stale, scratch_folder
+from stillmap.fleet.scratch import make_folder, remove_stale, scratch_folder
 from stillmap.fleet.storage import RECORD, STATE, UnreachableError
 
 _RETRIES = {"max_attempts": 5, "mode": "standard"}
@@ -251,8 +252,8 @@ def _scratch_parent() -> Path:
         InputError: it belongs to somebody else.
     """
     path = Path(tempfile.gettempdir()) / f"stillmap-fleet-{os.getuid()}"
-    path.mkdir(mode=0o700, exist_ok=True)
-    if path.is_symlink() or path.stat().st_uid != os.getuid():
+    found = make_folder(path, 0o700)
+    if stat.S_ISLNK(found.st_mode) or found.st_uid != os.getuid():
         raise InputError("belongs to somebody else", where=str(path), hint="TMPDIR decides")
     return path
 

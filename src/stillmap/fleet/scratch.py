@@ -1,8 +1,10 @@
 """Temporary folders that are found and removed even if their process was killed."""
 
 import fcntl
+import os
 import secrets
 import shutil
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -29,14 +31,34 @@ def scratch_folder(parent: Path) -> Iterator[Path]:
         _remove_empty(parent)
 
 
+def make_folder(path: Path, mode: int = 0o777) -> os.stat_result:
+    """Make a folder unless it is there, and look at it; others may remove it meanwhile.
+
+    Raises:
+        OSError: it cannot be made, or something else has its name.
+    """
+    while True:
+        taken = None
+        try:
+            path.mkdir(mode, parents=True)
+        except FileExistsError as error:
+            taken = error
+        with suppress(FileNotFoundError):
+            found = path.lstat()
+            if taken is not None and not stat.S_ISDIR(found.st_mode) and not path.is_dir():
+                raise taken
+            return found
+
+
 def remove_stale(parent: Path) -> None:
     """Remove the scratch folders below `parent` whose processes are gone, then `parent` if empty.
 
     A folder whose lock is held elsewhere stays.
     """
-    if not parent.is_dir():
-        return
-    for lock in sorted(parent.glob(f"*{_LOCK}")):
+    locks = list[Path]()
+    with suppress(FileNotFoundError, NotADirectoryError):
+        locks = [path for path in sorted(parent.iterdir()) if path.name.endswith(_LOCK)]
+    for lock in locks:
         with suppress(OSError), lock.open("ab") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             shutil.rmtree(lock.with_suffix(""), ignore_errors=True)
@@ -56,7 +78,7 @@ def _lock_of(path: Path) -> Path:
 def _make_locked(parent: Path) -> tuple[Path, IO[bytes]]:
     """The name of a folder, and its open lock, which the kernel frees when this process ends."""
     while True:
-        parent.mkdir(parents=True, exist_ok=True)
+        make_folder(parent)
         path = parent / secrets.token_hex(8)
         try:
             file = _lock_of(path).open("xb")

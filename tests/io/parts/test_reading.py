@@ -76,6 +76,7 @@ def test_what_parts_repeat_is_read_once(dimension, form, tmp_path):
     assert not joined.source.get("skipped")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("dimension", "form"), CASES)
 def test_the_time_window_counts_from_the_first_part(dimension, form, tmp_path):
     ending, recording = FORMS[dimension][form], make_recording(dimension)

@@ -21,6 +21,8 @@ from stillmap.io.trajectory import poses_from_tum
 from stillmap.mesh.place import assign_views
 from stillmap.sim import load_image_truth
 
+pytestmark = pytest.mark.slow
+
 QUICK = ("--quiet", "--threads", "1", "--set", "em.max_iterations=1")
 MODELS = ("mesh.glb", "mesh_faces.npz", "objects/*.glb", "objects/*_faces.npz", "objects/????.json")
 

@@ -134,12 +134,14 @@ def test_other_colours_than_beams_are_refused(mapped, tmp_path, capsys):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_threads_and_another_time_change_no_bit(result, mapped):
     again = mapped("again-points", "--threads", "2")
     for name in ("static.ply", "dynamic.ply", "beams/colour.npy"):
         assert (again / name).read_bytes() == (result / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_a_rig_has_them_beside_the_beams_of_the_laser_that_tilts(rig, mapped, tmp_path):
     """Of the flat one nobody asks for a cloud."""
     poses = ("--poses", rig / "horizontal/truth/trajectory.tum", "--tilting", rig / "tilting")
