@@ -3,6 +3,7 @@
 python benchmarks/live.py logs LOGS [--names intel fr101] --data DIR
 python benchmarks/live.py labels [--worlds hall corridor] [--first-seed 11] [--seeds 2]
 python benchmarks/live.py localize --data DIR [--worlds hall office] [--starts 25] [--people N]
+python benchmarks/live.py crowds --data DIR [--world hall] [--people 0 30 60 120] [--runs 5]
 python benchmarks/live.py latency [--world hall] [--seconds 600] [--rate 40] [--beams 1081]
 
 logs: each NAME.clf.gz with NAME.exact.relations or NAME.pseudo.relations beside it: relation
@@ -11,6 +12,9 @@ errors of `stillmap live --replay`, of the poses at the time and at the end, bes
 labels: F1 of "dynamic" and average precision by the lag after which a beam is labelled, seconds.
 localize: the robot is put down at random places of a known map, and has 30 scans to find out where
 it is: right within 0.3 m.
+crowds: runs of 400 scans through a known map among people: localized with P(static) and without,
+and by a particle filter with a likelihood field that is told where it starts. Lost: the last 50
+poses are more than 0.5 m off on average.
 latency: scans pushed at their own pace, loops closed in another process.
 """
 
@@ -24,6 +28,7 @@ from pathlib import Path
 
 import numpy as np
 import session_merging as merging
+from particle_filter import ParticleFilter
 from tables import markdown
 
 from stillmap import build
@@ -34,11 +39,12 @@ from stillmap.eval.relations import compute_relation_errors
 from stillmap.eval.trajectory import compute_absolute_errors
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.replay import iter_beams
-from stillmap.results.reader import Grid, moved
+from stillmap.results.reader import Grid, moved, read_grid
 from stillmap.sim import scene_by_name, simulate
 
 _LOGS = ("intel", "aces", "belgioioso", "edmonton", "fr101", "seattle")
 _MAP_SEED, _OTHER_SEED, _SCANS_TO_LOCALIZE = 11, 12, 30
+_SCANS_IN_CROWDS = 400
 _LAGS = (0.0, 1.0, 5.0, 30.0, math.inf)  # s
 
 
@@ -71,6 +77,12 @@ def _parser() -> argparse.ArgumentParser:
     localize.add_argument("--starts", type=int, default=25)
     localize.add_argument("--people", type=int, help="default: as many as the world has")
     localize.add_argument("--data", type=Path, required=True, help="folder for maps")
+    crowds = commands.add_parser("crowds")
+    crowds.set_defaults(run=localize_in_crowds)
+    crowds.add_argument("--world", default="hall")
+    crowds.add_argument("--people", nargs="+", type=int, default=[0, 30, 60, 120])
+    crowds.add_argument("--runs", type=int, default=5)
+    crowds.add_argument("--data", type=Path, required=True, help="folder for maps")
     latency = commands.add_parser("latency")
     latency.set_defaults(run=measure_latency)
     latency.add_argument("--world", default="hall")
@@ -226,6 +238,68 @@ def _localize_from(known: Path, T_map_world, simulation, first: int):
             off = float(np.hypot(*(update.pose - true)[:2, 2]))
             return "right" if off < 0.3 else "wrong", t - first + 1, off, seconds
     return "ambiguous" if "ambiguous" in doubts else "lost", _SCANS_TO_LOCALIZE, math.inf, 0.0
+
+
+class _EveryBeamCounts(LiveMapper):
+    """Without P(static): all beams count alike in matching."""
+
+    def _weigh(self, hits, prior):  # noqa: ARG002
+        return hits
+
+
+def localize_in_crowds(args: argparse.Namespace) -> str:
+    """A line per number of people: lost runs, and ATE of the others."""
+    known, T_map_world = _build_known_map(args.data / args.world, args.world)
+    lines = []
+    for people in args.people:
+        errors = {"with": [], "without": [], "filter": []}
+        for run in range(args.runs):
+            changes = {"crowd": {"people": people}, "robot": {"scans": _SCANS_IN_CROWDS}}
+            simulation = simulate(scene_by_name(args.world, changes), 100 + run)
+            true = T_map_world @ simulation.truth.T_world_base
+            for name, kind in (("with", LiveMapper), ("without", _EveryBeamCounts)):
+                errors[name].append(_track(kind, known, simulation.recording, true))
+            errors["filter"].append(_filter_particles(known, simulation.recording, true, run))
+        line = [f"{_count_lost(e)} / {_ate_of_others(e):.3f}" for e in errors.values()]
+        lines.append([str(people), *line])
+        print(" | ".join(lines[-1]), flush=True)
+    titles = ["people", "with P(static)", "without", "particle filter"]
+    return markdown([*titles[:1], *(f"{t}: lost / ATE m" for t in titles[1:])], lines)
+
+
+def _track(kind, known, recording, true):
+    """(T,) m off; infinite while lost."""
+    off = np.full(recording.n_scans, math.inf)
+    with kind({"threads": 1}, place=known) as mapper:
+        for t, beams in enumerate(iter_beams(recording)):
+            update = mapper.push(beams, recording.T_odom_base[t])
+            if "lost" not in update.doubts:
+                off[t] = np.hypot(*(update.pose - true[t])[:2, 2])
+    return off
+
+
+def _filter_particles(known, recording, true, seed: int):
+    filter_ = ParticleFilter(read_grid(known), true[0], np.random.default_rng(seed))
+    odometry = recording.T_odom_base
+    off = np.zeros(recording.n_scans)
+    for t, beams in enumerate(iter_beams(recording)):
+        increment = np.eye(3) if t == 0 else se2.inverse(odometry[t - 1]) @ odometry[t]
+        pose = filter_.push(beams.points, beams.hit, beams.T_base_sensor, increment)
+        off[t] = np.hypot(*(pose - true[t])[:2, 2])
+    return off
+
+
+def _is_lost(off) -> bool:
+    return bool(off[-50:].mean() > 0.5)
+
+
+def _count_lost(runs) -> int:
+    return sum(map(_is_lost, runs))
+
+
+def _ate_of_others(runs) -> float:
+    kept = [off[np.isfinite(off)] for off in runs if not _is_lost(off)]
+    return float(np.sqrt(np.mean(np.square(np.concatenate(kept))))) if kept else math.nan
 
 
 def measure_latency(args: argparse.Namespace) -> str:
