@@ -97,7 +97,8 @@ Box<D> box_around(const OccupancyFilter<D>& filter) {
 
 template <int D>
 auto dense(const OccupancyFilter<D>& filter, const OptionalCell<D>& first_cell,
-           const OptionalCell<D>& shape) {
+           const OptionalCell<D>& shape, double odds_factor) {
+  require(odds_factor > 0.0, "odds_factor: expected a positive number");
   require(first_cell.has_value() == shape.has_value(),
           "first_cell, shape: expected both or neither");
   const Box<D> box = shape ? Box<D>(*first_cell, *shape) : box_around(filter);
@@ -105,9 +106,10 @@ auto dense(const OccupancyFilter<D>& filter, const OptionalCell<D>& first_cell,
   {
     nb::gil_scoped_release released;
     box.for_each_block(filter, [&](const auto& block) {
-      filter.for_each_known_in(block, [&](const Cell<D>& cell, float p) {
-        if (box.contains(cell)) out[box.index(cell)] = p;
-      });
+      filter.for_each_known_in(block, static_cast<float>(odds_factor),
+                               [&](const Cell<D>& cell, float p) {
+                                 if (box.contains(cell)) out[box.index(cell)] = p;
+                               });
     });
   }
   return std::make_pair(box.first_cell(), box.shaped(std::move(out)));
@@ -176,8 +178,10 @@ void bind(nb::module_& m, const char* name) {
            "(M,) float32 P(static) of every beam by what was added so far. NaN for unusable "
            "beams; the prior without a return, and where no beam ended before.")
       .def("dense", &dense<D>, nb::arg("first_cell") = nb::none(), nb::arg("shape") = nb::none(),
+           nb::kw_only(), nb::arg("odds_factor") = 1.0,
            "Lowest cell (D,), and P(static and occupied) as an array [(z,) y, x] float32 of a box "
-           "of cells, by default of all; NaN where no beam passed or ended.")
+           "of cells, by default of all; NaN where no beam passed or ended. The prior odds of "
+           "static classes are those of the weights times odds_factor.")
       .def("take_changed_blocks", &take_changed<D>,
            "Lowest cells (B, D) int64 of the blocks that changed since the last call.")
       .def_prop_ro("block_count", [](const Filter& filter) { return filter.blocks().size(); })

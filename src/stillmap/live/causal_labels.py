@@ -24,6 +24,7 @@ _MAX_LOG_RATIO = 20.0  # nats: what stood for hours is known to be gone after a 
 # scans of a sensor in a time bin in which each beam is followed through the cells that it passed;
 # in others only its end counts
 _FOLLOWED, _MAX_STRIDE, _RATE_GAIN = 3.0, 8, 0.1
+_MAP_PRIOR = 0.5  # of static surface in the map: one look at a walker is no evidence for a wall
 _MARGIN, _MAX_MARGIN = 0.1, 1.0  # m behind a surface where a beam has passed it; at grazing angles
 
 
@@ -66,6 +67,7 @@ class CausalLabels:
             hit_radius=_HIT_RADIUS,
             max_log_ratio=_MAX_LOG_RATIO,
         )
+        self._odds_factor = _MAP_PRIOR / (1.0 - _MAP_PRIOR) * (1.0 - prior) / prior
         self._prior, self._bin_ns = prior, round(1e9 * options.time_bin)
         self._first_ns: int | None = None
         self.tags = 1  # numbers of keyframes are below
@@ -115,7 +117,14 @@ class CausalLabels:
 
     def to_map(self) -> GridMap:
         """The planar map of what stands; NaN: unknown."""
-        first, p_occupied = self.filter.dense()
+        return self._to_map(self._odds_factor)
+
+    def to_view(self) -> GridMap:
+        """The same where one look is enough: for comparison with another map."""
+        return self._to_map(1.0)
+
+    def _to_map(self, odds_factor: float) -> GridMap:
+        first, p_occupied = self.filter.dense(odds_factor=odds_factor)
         x, y = (first * self.resolution).tolist()
         return GridMap(p_occupied, (x, y, 0.0), self.resolution)
 
@@ -124,7 +133,11 @@ class CausalLabels:
         lowest = self.filter.take_changed_blocks()
         edge = 32 if lowest.shape[1] == 2 else 8
         shape = [edge] * lowest.shape[1]
-        return [MapChange(cell, self.filter.dense(cell.tolist(), shape)[1]) for cell in lowest]
+        tiles = [
+            self.filter.dense(cell.tolist(), shape, odds_factor=self._odds_factor)[1]
+            for cell in lowest
+        ]
+        return list(map(MapChange, lowest, tiles))
 
 
 def take_over(

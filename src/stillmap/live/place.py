@@ -44,7 +44,7 @@ class PlaceTracker:
             pose: (3, 3) of the robot in the frame of the labels.
             scan: number of the last scan.
         """
-        found: Localization = self._localizer.localize(labels.to_map(), hits, pose)
+        found: Localization = self._localizer.localize(labels.to_view(), hits, pose)
         self.is_ambiguous = found.is_ambiguous
         if found.T is None:
             return None

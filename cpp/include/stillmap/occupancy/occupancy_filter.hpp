@@ -141,12 +141,15 @@ class OccupancyFilter : public BlockMap<D, PassedCell> {
   }
 
   // Calls visit(cell, P(standing)) for the cells of a block that beams passed or ended in.
+  // odds_factor: by which the prior odds of the static classes differ from those of the weights.
   template <class Visit>
-  void for_each_known_in(const Block& block, Visit&& visit) const {
+  void for_each_known_in(const Block& block, float odds_factor, Visit&& visit) const {
     for (int i = 0; i < Map::kCells; ++i) {
       const PassedCell& cell = block.values[static_cast<size_t>(i)];
       if (cell.filter >= 0) {
-        visit(Map::cell_at(block.origin, i), posterior(cell.filter).p_standing);
+        const Posterior p = posterior(cell.filter);
+        const float scale = odds_factor / (odds_factor * p.p_static + 1.0f - p.p_static);
+        visit(Map::cell_at(block.origin, i), p.p_standing * scale);
       } else if (cell.passed_bins > 0) {
         visit(Map::cell_at(block.origin, i), 0.0f);
       }
