@@ -92,6 +92,9 @@ class KnownLocalMap:
     def remove_before(self, travelled: float) -> None:
         """Nothing leaves a known map."""
 
+    def remove_since(self, stamp_ns: int) -> None:
+        """Nothing leaves a known map."""
+
     def has_sensor(self, _sensor: str | int, /) -> bool:
         """True: a known map holds what every sensor sees."""
         return True

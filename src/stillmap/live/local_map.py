@@ -57,6 +57,9 @@ class MatchMap(Protocol):
     def remove_before(self, travelled: float) -> None:
         """Remove the scans taken before that many metres of travel."""
 
+    def remove_since(self, stamp_ns: int) -> None:
+        """Remove the scans taken since."""
+
     def has_sensor(self, sensor: str | int, /) -> bool:
         """True if it shows what a sensor sees."""
 
@@ -90,6 +93,15 @@ class LocalMap:
         """Remove the scans taken before that many metres of travel."""
         while self._scans and self._scans[0].travelled < travelled:
             add_scan(self.grid, self._scans.popleft(), remove=True)
+
+    def remove_since(self, stamp_ns: int) -> None:
+        """Remove the scans taken since."""
+        while self._scans and self._scans[-1].beams.stamp_ns >= stamp_ns:
+            add_scan(self.grid, self._scans.pop(), remove=True)
+        left = reversed(self._scans)
+        self._last = {}
+        for scan in left:
+            self._last.setdefault(scan.beams.sensor, scan)
 
     def has_sensor(self, sensor: str | int, /) -> bool:
         """True if it holds a scan of a sensor."""

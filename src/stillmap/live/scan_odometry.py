@@ -1,5 +1,6 @@
 """Causal scan matching in 2D: each scan is matched (9) against a map of the scans before it."""
 
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,7 @@ from stillmap.live.scan import ScanBeams
 from stillmap.slam import kidnapping, motion_model
 from stillmap.slam.kidnapping import Evidence
 from stillmap.slam.motion_model import MotionPrior, OdometryNoise, VelocityNoise
+from stillmap.slam.odometry_faults import SlipDetector
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.scan_hits import Scan
 from stillmap.slam.scan_matching import (
@@ -28,8 +30,19 @@ _MAX_TRAVEL = 25.0  # m after which scans leave the local map
 _EXPLAINED_RATE = 0.1  # weight of one scan in the running average of the explained share
 _LEAP = 1.0  # m between two scans, and times the speed below, beyond which odometry has leaped
 _MAX_SPEED = 3.0  # m/s of robots
+_MAX_STAMPS = 500  # of scans that a slip may change in hindsight
+_UNKNOWN = np.full((3, 3), np.inf)  # an increment that is not small
 # contradicting scans for each one that agrees, after which the robot was carried, and so many
 _CARRIED_AFTER, _MAX_STRAY = 20.0, 30.0
+
+
+class _LatestIncrement:
+    """The increment of odometry to the scan that is being registered, whatever the index."""
+
+    value: Float | None = None
+
+    def __getitem__(self, index: int, /) -> Float:
+        return _UNKNOWN if self.value is None else self.value
 
 
 @dataclass(frozen=True)
@@ -72,6 +85,10 @@ class ScanOdometry:
         self._usual: dict[str | int, float] = {}
         self._contradictions = 0.0
         self._is_first = True
+        self._increment = _LatestIncrement()
+        self._slip = SlipDetector(self._increment)
+        self._stamps = deque[int](maxlen=_MAX_STAMPS)  # of the last scans
+        self._count = 0
 
     def predict(self, beams: ScanBeams, increment: Float | None) -> MotionPrior:
         """The prior of the next scan: odometry where it is plausible, else constant velocity.
@@ -82,9 +99,11 @@ class ScanOdometry:
         """
         if self._is_first:
             return motion_model.gaussian_prior(self._pose, 1e-3, 1e-3)
-        if increment is not None and self._is_plausible(increment, beams.stamp_ns):
+        guess, self._increment.value = self._guess(), increment
+        is_slipping = self._slip.is_slipping(self._count, self._pose, guess)
+        if increment is not None and not is_slipping and self._is_plausible(increment, beams):
             return motion_model.odometry_prior(self._pose, increment, self.options.odometry)
-        return self._guess()
+        return guess
 
     def register(
         self, beams: ScanBeams, scan: Scan, prior: MotionPrior, increment: Float | None
@@ -98,7 +117,11 @@ class ScanOdometry:
             increment: as of `predict`.
         """
         usual = self._usual.get(beams.sensor, 0.0)
+        guess = self._guess()
         match, is_slipping, is_carried = self._match(beams, scan, prior, increment, usual)
+        if not self._is_first and not is_carried:
+            match, slips = self._detect_slip(guess, scan, match)
+            is_slipping = is_slipping or slips
         is_blind = not len(scan.points) or float(scan.weights.sum()) <= 0.0
         learned = self._learned_prior(prior, increment) or prior
         drift = motion_model.blind_drift(learned, match.covariance)
@@ -147,6 +170,21 @@ class ScanOdometry:
             return accept_prior(prior), False, True
         return match, match.contradicts_odometry, False
 
+    def _detect_slip(
+        self, guess: MotionPrior, scan: Scan, match: ScanMatch
+    ) -> tuple[ScanMatch, bool]:
+        """The match of constant velocity where odometry has stopped and the robot has not."""
+        grid = self.local_map.grid
+        slip = self._slip.detect(self._count, self._pose, guess, grid, scan, match)
+        if slip is None:
+            return match, False
+        back = min(self._count - slip.first, len(self._stamps))
+        if back:
+            self.local_map.remove_since(self._stamps[-back])
+        # the velocity is that of the hypothesis, too
+        self._pose = [slip.before, *(m.T_map_base for m in slip.matches)][-2]
+        return slip.matches[-1], True
+
     def _is_carried(self, evidence: Evidence) -> bool:
         """True when so many scans contradicted the local map, and hardly any agreed."""
         if evidence is Evidence.CONTRADICTS:
@@ -159,6 +197,7 @@ class ScanOdometry:
         self.local_map = LocalMap(self.options.resolution)
         self._usual.clear()
         self._contradictions = 0.0
+        self._slip.reset()
 
     def _learned_prior(self, prior: MotionPrior, increment: Float | None) -> MotionPrior | None:
         """The odometry prior with the noise learned so far; None: use `prior`."""
@@ -171,13 +210,13 @@ class ScanOdometry:
     def _guess(self) -> MotionPrior:
         return motion_model.constant_velocity_prior(self._pose, self._before, self._velocity_noise)
 
-    def _is_plausible(self, increment: Float, stamp_ns: int) -> bool:
-        seconds = 1e-9 * (stamp_ns - self._stamp_ns)
+    def _is_plausible(self, increment: Float, beams: ScanBeams) -> bool:
+        seconds = 1e-9 * (beams.stamp_ns - self._stamp_ns)
         metres = float(np.hypot(*increment[:2, 2]))
         return metres <= max(_LEAP, _MAX_SPEED * seconds)
 
     def _is_reachable(self, beams: ScanBeams, T: Float) -> bool:
-        return self._is_plausible(se2.inverse(self._pose) @ T, beams.stamp_ns)
+        return self._is_plausible(se2.inverse(self._pose) @ T, beams)
 
     def _learn(
         self, beams: ScanBeams, learned: MotionPrior, match: ScanMatch, usual: float
@@ -203,3 +242,5 @@ class ScanOdometry:
         else:
             self._before = T
         self._pose, self._stamp_ns, self._is_first = T, beams.stamp_ns, False
+        self._stamps.append(beams.stamp_ns)
+        self._count += 1

@@ -7,6 +7,7 @@ is summed over the scans.
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,13 @@ Float = NDArray[np.float64]
 _MIN_STEP = 0.02  # m and rad between scans: a slower robot may as well have stopped
 _STILL_RATIO = 0.2  # of the predicted step: shorter odometry steps count as standing still
 _MAX_SCANS = 500  # of one hypothesis
+
+
+class Increments(Protocol):
+    """Increments of odometry by the index of the scan before."""
+
+    def __getitem__(self, index: int, /) -> Float:
+        """(3, 3)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,10 +54,11 @@ class SlipDetector:
     """Tests for wheel slip scan by scan.
 
     Args:
-        increments: (T - 1, 3, 3) of odometry; None: no odometry, no slip.
+        increments: (T - 1, 3, 3) of odometry, or what gives one for each index; None: no odometry,
+            no slip.
     """
 
-    def __init__(self, increments: Float | None) -> None:
+    def __init__(self, increments: "Float | Increments | None") -> None:
         self._increments = increments
         self.reset()
 

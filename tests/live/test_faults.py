@@ -1,0 +1,75 @@
+"""What goes wrong on robots: nothing crashes, and nothing is silently wrong."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stillmap.core import se2
+from stillmap.live.mapper import LiveMapper
+from stillmap.live.replay import iter_beams
+
+FAULT = range(150, 200)  # 10 s
+
+
+@pytest.fixture(scope="module")
+def answers(corridor):
+    """Answers to the corridor's first 300 scans, with a fault in the midst."""
+
+    def run(change):
+        odometry, found = corridor.recording.T_odom_base, []
+        with LiveMapper({"threads": 1}) as mapper:
+            for k, beams in enumerate(iter_beams(corridor.recording)):
+                if k == 300:
+                    break
+                given = beams, odometry[k]
+                found.append(mapper.push(*(change(*given) if k in FAULT else given)))
+        return found
+
+    return run
+
+
+def error(corridor, updates, scans):
+    """m off, at most, relative to the first pose."""
+    T = corridor.truth.T_world_base
+    true = se2.inverse(T[0]) @ T[scans]
+    poses = np.array([updates[k].pose for k in scans])
+    return np.hypot(*(poses - true)[:, :2, 2].T).max()
+
+
+def test_a_laser_that_is_covered(corridor, answers):
+    def cover(beams, T_odom_base):
+        nothing = np.full_like(beams.points, np.nan)
+        return replace(beams, points=nothing, hit=np.zeros_like(beams.hit)), T_odom_base
+
+    updates = answers(cover)
+    assert all("blind" in updates[k].doubts for k in FAULT)
+    assert not any("blind" in updates[k].doubts for k in range(140))
+    before, meanwhile = updates[149].covariance, updates[199].covariance
+    assert meanwhile[0, 0] > before[0, 0]
+    assert error(corridor, updates, range(210, 300)) < 0.2
+
+
+def test_a_laser_that_shows_a_close_obstacle_everywhere(corridor, answers):
+    def blind(beams, T_odom_base):
+        length = np.linalg.norm(beams.points, axis=1, keepdims=True)
+        near = np.float32(0.1) * beams.points / np.maximum(length, np.float32(1e-3))
+        return replace(beams, points=near), T_odom_base
+
+    updates = answers(blind)
+    assert any(updates[k].doubts for k in FAULT)
+    assert error(corridor, updates, range(150)) < 0.1
+
+
+def test_odometry_that_is_lost(corridor, answers):
+    updates = answers(lambda beams, _: (beams, None))
+    assert all(updates[k].T_map_odom is None for k in FAULT)
+    assert updates[200].T_map_odom is not None
+    assert error(corridor, updates, range(300)) < 0.15
+
+
+def test_odometry_that_stands_still(corridor, answers):
+    T = corridor.recording.T_odom_base[149]
+    updates = answers(lambda beams, _: (beams, T))
+    assert any("slip" in updates[k].doubts for k in FAULT)
+    assert error(corridor, updates, range(300)) < 0.3
