@@ -27,13 +27,11 @@ class Correction(ShortRepr):
     """What closing loops changed.
 
     Attributes:
-        motion: (S, 3, 3) of the spaced scans, from the old map to the new one.
         T_map_local: (3, 3) of the frame of the odometry by scans in the new map.
         poses: (S, 3, 3) T_map_base of the spaced scans in the new map.
         near: scans of the new local map, in the frame of the odometry by scans.
     """
 
-    motion: Float
     T_map_local: Float
     poses: Float
     near: list[MappedScan]
@@ -121,9 +119,8 @@ class LoopCloser:
         corrected = local_map.propagate_corrections(
             context.poses, *_without_repetition(every, np.concatenate([poses, last[None]]))
         )
-        motion = corrected @ se2.inverse(self._poses)
         self._poses = corrected
-        return Correction(motion, self._T_map_local, corrected, self._find_near(context))
+        return Correction(self._T_map_local, corrected, self._find_near(context))
 
     def _find_near(self, context: LoopContext) -> list[MappedScan]:
         """The scans of the local map: near the robot along the graph and in the map.

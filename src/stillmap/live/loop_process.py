@@ -112,9 +112,7 @@ class LoopProcess:
         assert stream is not None
         while (message := read_message(stream)) is not None:
             near = [_unpack_scan(scan, self._sensors) for scan in _split(message, "near")]
-            self._incoming.append(
-                Correction(message["motion"], message["T_map_local"], message["poses"], near)
-            )
+            self._incoming.append(Correction(message["T_map_local"], message["poses"], near))
 
 
 def _pack_scan(scan: MappedScan, sensor: int) -> dict[str, NDArray[Any]]:
@@ -153,7 +151,7 @@ def _split(message: dict[str, NDArray[Any]], prefix: str) -> list[dict[str, NDAr
 
 
 def _pack_correction(found: Correction) -> dict[str, NDArray[Any]]:
-    out = {"motion": found.motion, "T_map_local": found.T_map_local, "poses": found.poses}
+    out = {"T_map_local": found.T_map_local, "poses": found.poses}
     for k, scan in enumerate(found.near):
         assert isinstance(scan.beams.sensor, int)
         packed = _pack_scan(scan, scan.beams.sensor)

@@ -15,6 +15,9 @@ from stillmap.live.scan import ScanBeams
 Float = NDArray[np.float64]
 
 _BLOCKS_PER_STEP, _SCANS_PER_STEP = 24, 4  # about 2 ms each
+# m that any spaced scan and that the last one move, and rad that it turns, up to which the map
+# stays as it is: constraints of loops have such errors themselves
+_SMALL = 0.1, 0.03, 0.005
 _MIN_SHIFT = 0.5  # cells by which the map must move for its cells to be moved
 
 
@@ -41,20 +44,24 @@ class MapCorrection:
     Args:
         correction: of the pose graph.
         labels: of the map so far.
-        T_map_local: (3, 3) of the frame of the odometry by scans in the map so far.
-        tags: number of spaced scans so far.
+        spaced: (S, 3, 3) poses of the spaced scans in the frame of the odometry by scans.
+        poses: (S, 3, 3) the same in the map so far.
     """
 
     def __init__(
-        self, correction: Correction, labels: CausalLabels, T_map_local: Float, tags: int
+        self, correction: Correction, labels: CausalLabels, spaced: Float, poses: Float
     ) -> None:
-        self.correction = correction
+        self.T_map_local = correction.T_map_local
+        self.poses = np.concatenate(
+            [correction.poses, correction.T_map_local @ spaced[len(correction.poses) :]]
+        )
         self.local_map = LocalMap(labels.resolution)
+        self._motion = self.poses @ se2.inverse(poses)
         self._source: OccupancyFilter = labels.filter
-        since = correction.T_map_local @ se2.inverse(T_map_local)  # of scans after the request
-        rest = np.broadcast_to(since, (max(tags - len(correction.motion), 0) + 1, 3, 3))
-        self._motion = np.concatenate([correction.motion, rest])
-        self.moves_cells = _largest_shift(correction) > _MIN_SHIFT * labels.resolution
+        shift = np.hypot(*(self.poses - poses)[:, :2, 2].T)
+        turn = abs(float(se2.parameters(self._motion[-1])[2]))
+        self.is_small = bool(shift.max() < _SMALL[0] and shift[-1] < _SMALL[1] and turn < _SMALL[2])
+        self.moves_cells = bool(shift.max() > _MIN_SHIFT * labels.resolution)
         self.filter: OccupancyFilter = self._source.sibling() if self.moves_cells else self._source
         self._block, self._scans = 0, sorted(correction.near, key=lambda scan: scan.travelled)
         self._labelled: list[LabelledScan] = []
@@ -89,12 +96,5 @@ class MapCorrection:
             return
         labels.filter = self.filter
         for scan in self._labelled:
-            T = self.correction.T_map_local @ scan.T
+            T = self.T_map_local @ scan.T
             labels.add(scan.beams, T, scan.normals, scan.tag)
-
-
-def _largest_shift(correction: Correction) -> float:
-    """m by which any spaced scan moves."""
-    after = correction.poses
-    before = se2.inverse(correction.motion) @ after
-    return float(np.hypot(*(after[:, :2, 2] - before[:, :2, 2]).T).max(initial=0.0))

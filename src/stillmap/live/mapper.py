@@ -259,8 +259,9 @@ class LiveMapper:
             if added is not None:
                 self._correction.note_added(added)
         elif (correction := self._closer.poll()) is not None:
-            tags = len(self._spaced)
-            self._correction = MapCorrection(correction, self._labels, self._T_map_local, tags)
+            spaced, poses = np.array(self._spaced), self._spaced_poses()
+            new = MapCorrection(correction, self._labels, spaced, poses)
+            self._correction = None if new.is_small else new
         self._go_on_correcting()
         return added is not None
 
@@ -274,8 +275,8 @@ class LiveMapper:
         if is_done:
             self._correction.finish(self._labels)
             self._odometry.local_map = self._correction.local_map
-            self._T_map_local = self._correction.correction.T_map_local
-            self._corrected = self._correction.correction.poses
+            self._T_map_local = self._correction.T_map_local
+            self._corrected = self._correction.poses
             self._correction = None
 
     def _spaced_poses(self) -> Float:
