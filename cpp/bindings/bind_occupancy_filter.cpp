@@ -69,10 +69,11 @@ auto label(const OccupancyFilter<D>& filter, const Points<D>& points, const Flat
   std::vector<float> out(points.shape(0), std::numeric_limits<float>::quiet_NaN());
   {
     nb::gil_scoped_release released;
+    std::vector<float> known(filter.size(), -1.0f);
     for_each_beam<D>(scans, 0, scans.n_scans, [&](size_t, int64_t n, const Pose<D>& pose) {
       const BeamSegment<D> beam(pose, scans.points + n * D, filter.resolution());
       out[static_cast<size_t>(n)] =
-          scans.hit[n] ? filter.p_static_at(beam.end, otherwise) : otherwise;
+          scans.hit[n] ? filter.p_static_at(beam.end, otherwise, known) : otherwise;
     });
   }
   const size_t n = out.size();

@@ -104,10 +104,15 @@ class OccupancyFilter : public BlockMap<D, PassedCell> {
   }
 
   // P(static) of the cell in which a beam ended, or of the best one within the hit radius;
-  // `otherwise` where no beam ended before.
-  float p_static_at(const Vec<D>& end, float otherwise) const {
+  // `otherwise` where no beam ended before. known: P(static) of each filter, negative where it has
+  // not been computed yet: most beams of a scan end in the cells of others.
+  float p_static_at(const Vec<D>& end, float otherwise, std::vector<float>& known) const {
     float best = -1.0f;
-    for_each_filter_near(end, [&](int32_t k) { best = std::max(best, posterior(k).p_static); });
+    for_each_filter_near(end, [&](int32_t k) {
+      float& p = known[static_cast<size_t>(k)];
+      if (p < 0.0f) p = posterior(k).p_static;
+      best = std::max(best, p);
+    });
     return best < 0.0f ? otherwise : best;
   }
 
