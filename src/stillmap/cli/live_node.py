@@ -2,6 +2,7 @@
 
 import argparse
 import tempfile
+from functools import partial
 from pathlib import Path
 
 from stillmap.cli.arguments import read_changes
@@ -26,17 +27,14 @@ def run_node(args: argparse.Namespace) -> int:
     require_new(output, RECORD, args.overwrite)
     if args.no_odometry or args.json:
         raise InputError("--no-odometry and --json are for --replay")
-    with (
-        tempfile.TemporaryDirectory(prefix="stillmap-") as scratch,
-        show_progress(args.quiet, 1) as progress,
-    ):
+    with tempfile.TemporaryDirectory(prefix="stillmap-") as scratch:
         scans = run(
             options,
             output,
             args.ros_args,
             overwrite=args.overwrite,
             scratch=Path(scratch),
-            progress=progress,
+            show_progress=partial(show_progress, args.quiet, 1),
         )
     if not args.quiet:
         say(f"wrote {output}" if scans else "no scan arrived: nothing was written")

@@ -4,8 +4,8 @@ import signal
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -225,9 +225,9 @@ def run(
     *,
     overwrite: bool,
     scratch: Path,
-    progress: Progress = no_progress,
+    show_progress: Callable[[], AbstractContextManager[Progress]],
 ) -> int:
-    """Map until Ctrl-C or SIGTERM, then save; returns the number of scans.
+    """Map until Ctrl-C or SIGTERM, then save, which `show_progress` shows; returns the scans.
 
     Raises:
         InputError: ROS is not there, a parameter is wrong, or the result cannot be written.
@@ -247,7 +247,8 @@ def run(
         with _signal_flag() as stop:
             _spin(ros, live, stop)
             if live.scans:
-                live.save(progress)
+                with show_progress() as progress:
+                    live.save(progress)
         return live.scans
     finally:
         if live is not None:
@@ -259,11 +260,10 @@ def _spin(ros: Ros, live: LiveNode, stop: threading.Event) -> None:
     # two threads: the map is saved in one, while the other goes on mapping
     executor = ros.module("executors").MultiThreadedExecutor(num_threads=2)
     executor.add_node(live.node)
-    try:
-        while not stop.is_set():
-            executor.spin_once(timeout_sec=_SPIN)
-    finally:
-        executor.shutdown()
+    while not stop.is_set():
+        executor.spin_once(timeout_sec=_SPIN)
+    # not shut down: callbacks that still run would complain
+    executor.remove_node(live.node)
 
 
 @contextmanager
