@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-import idl
+import ros_idl as idl
 from dds import Participant, wait_for
 
 from stillmap.core import se2
