@@ -1,6 +1,7 @@
 """A participant of Cyclone DDS on this machine alone, with readers and writers of ROS topics."""
 
 import time
+from functools import cache
 from typing import NamedTuple
 
 from cyclonedds.core import Listener, Policy, Qos
@@ -51,11 +52,17 @@ class _Collector(Listener):
                 self.received.append(Received(now, sample))
 
 
+@cache
+def _configure(domain):
+    """Once in a process."""
+    return Domain(domain, _CONFIGURATION)
+
+
 class Participant:
     """Reads and writes topics by their ROS names."""
 
     def __init__(self, domain):
-        self._domain = Domain(domain, _CONFIGURATION)
+        _configure(domain)
         self._participant = DomainParticipant(domain)
         self._entities = []
 

@@ -6,7 +6,6 @@ import time
 from pathlib import Path
 
 import numpy as np
-
 import ros_idl as idl
 from dds import Participant, wait_for
 

@@ -1,6 +1,6 @@
-"""The ROS messages that the tests exchange, as IDL types of Cyclone DDS: another stack than rclpy's.
+"""ROS messages as IDL types of Cyclone DDS: another stack than that of rclpy.
 
-Written after the definitions in common_interfaces; the names are those that ROS 2 gives on the wire.
+Written after the definitions in common_interfaces; names are those that ROS 2 gives on the wire.
 """
 
 from dataclasses import dataclass, field

@@ -73,9 +73,7 @@ def truth_at(simulation, stamps):
     return T[index]
 
 
-def test_a_whole_run_with_tf(
-    simulation, judge, tf_environment, start_node, start_robot, domain, tmp_path
-):
+def test_a_whole_run_with_tf(simulation, judge, tf_environment, start_node, start_robot, tmp_path):
     node = start_node(tf_environment, "map_update_interval:=1.0")
     robot, sent = start_robot("--tf")
     assert wait_for(lambda: len(judge.poses) == 400, 60.0), node.text + robot.text
@@ -220,9 +218,15 @@ def test_a_node_that_is_killed_can_be_started_again(
     before, maps = len(judge.poses), len(judge.maps)
     second = start_node(environment, laser_pose(simulation.recording))
     assert wait_for(lambda: len(judge.poses) > before + 30, 60.0), second.text
-    # it begins anew: its map has the frame of its first scan
-    start = poses_of(judge.poses)[before]
-    np.testing.assert_allclose(start, np.eye(3), atol=0.02)
+    # it begins anew: its map has the frame of its own first scan, on the robot's way
+    received = judge.poses[before:]
+    T_world_base = truth_at(simulation, [stamp_of(one) for one in received])
+    origins = T_world_base @ se2.inverse(poses_of(received))
+    assert np.ptp(origins[:, :2, 2], axis=0).max() < 0.1
+    way = simulation.truth.T_world_base[:, :2, 2]
+    distance = np.linalg.norm(way - origins[0, :2, 2], axis=1)
+    assert distance.min() < 0.05
+    assert distance[:50].min() > 0.1
     assert wait_for(lambda: len(judge.maps) > maps)
     assert robot.is_running
 

@@ -60,9 +60,9 @@ class Parameters:
         for name in ("throttle_scans", "scan_queue_size"):
             _require(self._raw(name) >= 1, name, "1 or more", self._raw(name))
         for name in ("map_frame", "base_frame", "map_name"):
-            _require(bool(self._raw(name)), name, "a name", "''")
+            _require(bool(self._raw(name)), name, "a name", self._raw(name))
         n = len(self.scan_topic)
-        _require(n > 0 and all(self.scan_topic), "scan_topic", "at least one name", "none")
+        _require(n > 0 and all(self.scan_topic), "scan_topic", "at least one name", self.scan_topic)
         _require(
             len(self.laser_pose) in (0, 3 * n), "laser_pose", f"{3 * n} numbers", self.laser_pose
         )
