@@ -19,6 +19,7 @@ def run_node(args: argparse.Namespace) -> int:
         InputError: ROS 2 is missing, a parameter is wrong, or the output is taken.
     """
     from stillmap.core.files import require_new
+    from stillmap.live.mapper import LiveMapper
     from stillmap.live.ros.node import run
     from stillmap.results.run_json import RECORD
 
@@ -33,7 +34,7 @@ def run_node(args: argparse.Namespace) -> int:
             output,
             args.ros_args,
             overwrite=args.overwrite,
-            scratch=Path(scratch),
+            make_mapper=partial(LiveMapper, background=True, scratch=scratch),
             show_progress=partial(show_progress, args.quiet, 1),
         )
     if not args.quiet:

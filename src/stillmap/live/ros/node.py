@@ -32,6 +32,8 @@ _DOUBTS = {
     "slip": "odometry disagrees with the scans",
     "blind": "no beam meets anything",
     "carried": "the scans contradict the map",
+    "lost": "the pose in the known map is not known",
+    "ambiguous": "several places in the known map fit",
 }
 
 
@@ -43,14 +45,20 @@ class LiveNode:
         options: see Options.
         output: result folder.
         overwrite: replace what is there.
-        scratch: folder of temporary files.
+        make_mapper: of these options, with what the parameters changed.
 
     Raises:
         InputError: a parameter is wrong.
     """
 
     def __init__(
-        self, ros: Ros, options: Options, output: Path, *, overwrite: bool, scratch: Path
+        self,
+        ros: Ros,
+        options: Options,
+        output: Path,
+        *,
+        overwrite: bool,
+        make_mapper: Callable[[Options], LiveMapper],
     ) -> None:
         self.node = ros.rclpy.create_node(_NAME)
         self._ros, self._output, self._overwrite = ros, output, overwrite
@@ -66,7 +74,7 @@ class LiveNode:
         self._stamp_ns, self.scans, self._map_due, self._is_map_old = 0, 0, 0.0, False
         self._doubts, self._reported = Counter[str](), Counter[str]()
         self._subscribe()
-        self._mapper = LiveMapper(options, background=True, scratch=scratch)
+        self._mapper = make_mapper(options)
 
     def close(self) -> None:
         """Forget all scans."""
@@ -224,7 +232,7 @@ def run(
     ros_arguments: Sequence[str],
     *,
     overwrite: bool,
-    scratch: Path,
+    make_mapper: Callable[[Options], LiveMapper],
     show_progress: Callable[[], AbstractContextManager[Progress]],
 ) -> int:
     """Map until Ctrl-C or SIGTERM, then save, which `show_progress` shows; returns the scans.
@@ -243,7 +251,7 @@ def run(
         raise InputError(f"--ros-args: {error}") from error
     live = None
     try:
-        live = LiveNode(ros, options, output, overwrite=overwrite, scratch=scratch)
+        live = LiveNode(ros, options, output, overwrite=overwrite, make_mapper=make_mapper)
         with _signal_flag() as stop:
             _spin(ros, live, stop)
             if live.scans:

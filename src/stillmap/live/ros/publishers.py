@@ -71,12 +71,13 @@ class Publishers:
         return self._tf is not None
 
     def publish_answer(self, arrival: Arrival, update: Update) -> None:
-        """Pose, transform and labelled scan; the pose first."""
+        """Pose, transform and labelled scan; the pose first, and none where the robot is lost."""
         names, stamp = self._parameters, stamp_ns(arrival.message.header)
-        pose = self._ros.message(_POSE)()
-        fill_pose(pose, names.map_frame, stamp, update.pose, update.covariance)
-        self._pose.publish(pose)
-        self._publish_transform(update, stamp)
+        if "lost" not in update.doubts:
+            pose = self._ros.message(_POSE)()
+            fill_pose(pose, names.map_frame, stamp, update.pose, update.covariance)
+            self._pose.publish(pose)
+            self._publish_transform(update, stamp)
         self._publish_scans(arrival, update)
 
     def publish_map(self, grid: GridMap, stamp: int) -> None:
