@@ -102,6 +102,11 @@ class ScanIntake:
         self._first_arrived: float | None = None
         self._awaits_odometry = True
 
+    @property
+    def has_waiting(self) -> bool:
+        """True while scans wait: look again after a while."""
+        return bool(self._waiting)
+
     def add_transforms(self, message: Any, *, static: bool) -> None:
         """Add a TFMessage; what we ourselves say about the map is left out."""
         for one in message.transforms:

@@ -121,7 +121,7 @@ class LiveNode:
         self._subscribe_to_tf(qos)
         clock = self._ros.module("clock")
         steady = clock.Clock(clock_type=clock.ClockType.STEADY_TIME)
-        node.create_timer(_POLL, self._answer_all, clock=steady)
+        self._poll = node.create_timer(_POLL, self._answer_all, clock=steady)
         node.create_timer(_STATUS_PERIOD, self._report, clock=steady)
         trigger = self._ros.message("std_srvs/srv/Trigger")
         if trigger is not None:
@@ -172,6 +172,10 @@ class LiveNode:
     def _answer_all(self) -> None:
         while (arrival := self._intake.take(time.monotonic())) is not None:
             self._answer(arrival)
+        if self._intake.has_waiting and self._poll.is_canceled():
+            self._poll.reset()
+        elif not self._intake.has_waiting and not self._poll.is_canceled():
+            self._poll.cancel()  # a timer that only ticks takes a tenth of a core
         now = time.monotonic()
         if self._is_map_old and now >= self._map_due:
             self._map_due, self._is_map_old = now + self.parameters.map_update_interval, False
@@ -189,7 +193,8 @@ class LiveNode:
         self._doubts.update(update.doubts)
 
     def _report(self) -> None:
-        """Diagnostics of the last second."""
+        """Diagnostics of the last second; the last map, where scans have stopped."""
+        self._answer_all()
         counts = self._intake.counts
         new, doubts = counts - self._reported, self._doubts
         self._reported, self._doubts = Counter(counts), Counter()
