@@ -258,10 +258,12 @@ def run(
     try:
         live = LiveNode(ros, options, output, overwrite=overwrite, make_mapper=make_mapper)
         with _signal_flag() as stop:
-            _spin(ros, live, stop)
-            if live.scans:
-                with show_progress() as progress:
-                    live.save(progress)
+            try:
+                _spin(ros, live, stop)
+            finally:  # whatever ended it: nobody drives the same way again
+                if live.scans:
+                    with show_progress() as progress:
+                        live.save(progress)
         return live.scans
     finally:
         if live is not None:
