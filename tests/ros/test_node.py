@@ -171,7 +171,7 @@ def test_lost_swapped_and_odd_stamps_and_a_robot_that_dies(
     simulation, judge, environment, start_node, start_robot, tmp_path
 ):
     """Without tf2_msgs: odometry from its topic, and the pose alone."""
-    node = start_node(environment, laser_pose(simulation.recording), "odom_topic:=odom")
+    node = start_node(environment, laser_pose(simulation.recording), "use_sim_time:=true")
     robot, sent = start_robot(
         *("--lose", "0.02", "--swap", "0.02", "--jump", "50", "--jump", "51", "--leap", "90")
     )
