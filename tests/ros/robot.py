@@ -23,12 +23,14 @@ def to_pose(T):
     return idl.Pose(idl.Point(x, y, 0.0), turn)
 
 
-def to_scan(recording, t, stamp):
-    beams = recording.beams_of(t)
+def to_scan(recording, t, stamp, part=slice(None)):
+    """The scan, or a part of its beams."""
+    beams = np.arange(recording.offset[t], recording.offset[t + 1])[part]
     points, hit = recording.points[beams], recording.hit[beams]
     length = np.linalg.norm(points, axis=1)
     sensor = recording.source["sensors"][0]
-    start, step = sensor["start_angle"], sensor["angle_step"]
+    step = sensor["angle_step"]
+    start = sensor["start_angle"] + step * (part.start or 0)
     return idl.LaserScan(
         header=idl.Header(to_stamp(stamp), "laser"),
         angle_min=start,
@@ -70,18 +72,23 @@ def main():
     p.add_argument("--swap", type=float, default=0.0)
     p.add_argument("--jump", type=int, default=[], action="append", help="scan with an old stamp")
     p.add_argument("--leap", type=int, default=[], action="append", help="scan far in the future")
+    p.add_argument("--split", action="store_true", help="as two lasers: scan_right, scan_left")
     p.add_argument("--tf", action="store_true", help="odometry and mount on /tf and /tf_static")
     args = p.parse_args()
     recording = read(args.recording)
     robot = Participant(args.domain)
-    scans = robot.write(idl.LaserScan, "scan")
+    parts = {"scan": slice(None)}
+    if args.split:
+        parts = {"scan_right": slice(0, 90), "scan_left": slice(90, None)}
+    scans = {topic: robot.write(idl.LaserScan, topic) for topic in parts}
     odometry = robot.write(idl.Odometry, "odom", reliable=True)
     tf = robot.write(idl.TFMessage, "tf", reliable=True) if args.tf else None
     if args.tf:
         static = robot.write(idl.TFMessage, "tf_static", depth=1, reliable=True, latched=True)
         mount = make_transform("base_footprint", "laser", 0, recording.T_base_sensor[0])
         static.write(idl.TFMessage([mount]))
-    assert wait_for(lambda: scans.get_publication_matched_status().current_count > 0, 30.0)
+    for writer in scans.values():
+        assert wait_for(lambda w=writer: w.get_publication_matched_status().current_count, 30.0)
     time.sleep(0.5)  # the others too
     T, stamps = recording.T_odom_base, recording.stamp_ns
     due = time.monotonic()
@@ -94,9 +101,10 @@ def main():
             stamp = int(stamps[t])
             stamp += -3_000_000_000 if t in args.jump else 0
             stamp += 3_600_000_000_000 if t in args.leap else 0
-            scan = to_scan(recording, t, stamp)
+            messages = {name: to_scan(recording, t, stamp, part) for name, part in parts.items()}
             sent = time.monotonic()
-            scans.write(scan)
+            for name, message in messages.items():
+                scans[name].write(message)
             if args.tf:
                 tf.write(idl.TFMessage([make_transform("odom", "base_footprint", stamps[t], T[t])]))
             else:

@@ -275,6 +275,24 @@ def test_a_robot_without_odometry_is_mapped_too(
     assert {one.child_frame_id for one in ours} == {"base_footprint"}
 
 
+def test_two_lasers(simulation, judge, domain, tf_environment, start_node, start_robot):
+    reader = Participant(domain)
+    of_each = [
+        reader.read(idl.LaserScan, f"{topic}_static", reliable=True)
+        for topic in ("scan_right", "scan_left")
+    ]
+    node = start_node(tf_environment, 'scan_topic:=["scan_right", "scan_left"]')
+    start_robot("--tf", "--split", "--last", "150")
+    assert wait_for(lambda: len(judge.poses) == 300, 60.0), node.text
+    stamps = [stamp_of(one) for one in judge.poses]
+    assert stamps == sorted(stamps)
+    errors = compute_absolute_errors(poses_of(judge.poses), truth_at(simulation, stamps))
+    assert errors.rmse < 0.05
+    assert wait_for(lambda: all(len(scans) == 150 for scans in of_each))
+    assert {one.message.angle_min < -1.5 for one in of_each[0]} == {True}
+    assert {one.message.angle_min > -0.1 for one in of_each[1]} == {True}
+
+
 @pytest.mark.parametrize(
     ("parameter", "says"),
     [
