@@ -20,7 +20,7 @@ def run_node(args: argparse.Namespace) -> int:
     """
     from stillmap.core.files import require_new
     from stillmap.live.mapper import LiveMapper
-    from stillmap.live.ros.node import run
+    from stillmap.live.ros.run import run
     from stillmap.results.run_json import RECORD
 
     options = options_from_args(args, read_changes(args), shared_changes(args))

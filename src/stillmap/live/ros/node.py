@@ -1,11 +1,9 @@
 """The ROS 2 node: scans in, answers out."""
 
-import signal
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +25,6 @@ _TF_DEPTH, _ODOMETRY_DEPTH = 100, 50
 _POLL = 0.02  # s between two looks at scans that wait
 _STATUS_PERIOD = 1.0  # s
 _LATENCIES = 1000  # scans over which latency is told
-_SPIN = 0.1  # s after which a signal is seen at the latest
 _DOUBTS = {
     "slip": "odometry disagrees with the scans",
     "blind": "no beam meets anything",
@@ -229,82 +226,3 @@ class LiveNode:
             if self._intake.counts[reason] == new[reason]:  # for the first time
                 hint = f" ({hints[reason]})" if reason in hints else ""
                 self.node.get_logger().warning(f"{reason}{hint}")
-
-
-def run(
-    options: Options,
-    output: Path,
-    ros_arguments: Sequence[str],
-    *,
-    overwrite: bool,
-    make_mapper: Callable[[Options], LiveMapper],
-    show_progress: Callable[[], AbstractContextManager[Progress]],
-) -> int:
-    """Map until Ctrl-C or SIGTERM, then save, which `show_progress` shows; returns the scans.
-
-    Raises:
-        InputError: ROS is not there, a parameter is wrong, or the result cannot be written.
-        KeyboardInterrupt: Ctrl-C again while the result is written.
-    """
-    ros = Ros()
-    options_of_signals = ros.module("signals").SignalHandlerOptions
-    try:
-        ros.rclpy.init(
-            args=["--ros-args", *ros_arguments], signal_handler_options=options_of_signals.NO
-        )
-    except RuntimeError as error:
-        raise InputError(f"--ros-args: {error}") from error
-    live = None
-    try:
-        live = LiveNode(ros, options, output, overwrite=overwrite, make_mapper=make_mapper)
-        with _signal_flag() as stop:
-            try:
-                _spin(ros, live, stop)
-            finally:  # whatever ended it: nobody drives the same way again
-                if live.scans:
-                    with show_progress() as progress:
-                        live.save(progress)
-        return live.scans
-    finally:
-        if live is not None:
-            live.close()
-        ros.rclpy.try_shutdown()
-
-
-def _spin(ros: Ros, live: LiveNode, stop: threading.Event) -> None:
-    # two threads: the map is saved in one, while the other goes on mapping
-    executor = ros.module("executors").MultiThreadedExecutor(num_threads=2)
-    executor.add_node(live.node)
-    while not stop.is_set():
-        executor.spin_once(timeout_sec=_SPIN)
-    # not shut down: callbacks that still run would complain
-    executor.remove_node(live.node)
-
-
-@contextmanager
-def _signal_flag() -> Iterator[threading.Event]:
-    """An event that Ctrl-C and SIGTERM set.
-
-    `ros2 launch` sends SIGTERM some seconds after Ctrl-C, and a terminal sends Ctrl-C to the node
-    and to launch alike: what comes while the result is written must not end it. Only Ctrl-C more
-    than a second after the first one does.
-    """
-    stop, since = threading.Event(), [0.0]
-
-    def handle(number: int, _: object) -> None:
-        if number == signal.SIGINT and stop.is_set() and time.monotonic() - since[0] > 1.0:
-            raise KeyboardInterrupt
-        if not stop.is_set():
-            since[0] = time.monotonic()
-            stop.set()
-
-    numbers = [signal.SIGTERM, signal.SIGINT]
-    before = {number: signal.getsignal(number) for number in numbers}
-    for number, handler in before.items():
-        if handler is not signal.SIG_IGN:  # as a shell script leaves it in the background
-            signal.signal(number, handle)
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
