@@ -298,7 +298,7 @@ def test_two_lasers(simulation, judge, domain, tf_environment, start_node, start
     [
         ("resolution:=-1.0", "parameter resolution: expected more than 0, got -1.0"),
         ("map_frame:=3", "parameter map_frame: expected text, got 3"),
-        ("resolution=", "--ros-args"),
+        ("resolution=", "arguments of ROS"),
     ],
 )
 def test_wrong_parameters_are_told_in_one_line(environment, start_node, parameter, says):

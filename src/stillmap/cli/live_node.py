@@ -32,7 +32,7 @@ def run_node(args: argparse.Namespace) -> int:
         scans = run(
             options,
             output,
-            args.ros_args,
+            ["--ros-args", *args.ros_args],
             overwrite=args.overwrite,
             make_mapper=partial(LiveMapper, background=True, scratch=scratch),
             show_progress=partial(show_progress, args.quiet, 1),

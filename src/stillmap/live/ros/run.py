@@ -26,7 +26,15 @@ def run(
     make_mapper: Callable[[Options], LiveMapper],
     show_progress: Callable[[], AbstractContextManager[Progress]],
 ) -> int:
-    """Map until Ctrl-C or SIGTERM, then save, which `show_progress` shows; returns the scans.
+    """Map until Ctrl-C or SIGTERM, then save; returns the number of scans.
+
+    Args:
+        options: see Options.
+        output: result folder.
+        ros_arguments: as ROS reads them.
+        overwrite: replace what is there.
+        make_mapper: see LiveNode.
+        show_progress: shows how far the result is written.
 
     Raises:
         InputError: ROS is not there, a parameter is wrong, or the result cannot be written.
@@ -35,11 +43,9 @@ def run(
     ros = Ros()
     options_of_signals = ros.module("signals").SignalHandlerOptions
     try:
-        ros.rclpy.init(
-            args=["--ros-args", *ros_arguments], signal_handler_options=options_of_signals.NO
-        )
+        ros.rclpy.init(args=list(ros_arguments), signal_handler_options=options_of_signals.NO)
     except RuntimeError as error:
-        raise InputError(f"--ros-args: {error}") from error
+        raise InputError(f"arguments of ROS: {error}") from error
     live = None
     try:
         live = LiveNode(ros, options, output, overwrite=overwrite, make_mapper=make_mapper)
