@@ -68,6 +68,18 @@ def test_the_first_scans_wait_longer_for_odometry():
     assert scans.take(2.1).T_odom_base is None
 
 
+def test_mapping_begins_with_odometry():
+    scans = make(**POSE)
+    feed(scans, 1 * S, 2 * S)
+    scans.add_odometry(odometry(2 * S))
+    assert stamps(take_all(scans, 0.0)) == [2 * S]
+    assert scans.counts == {intake.EARLY: 1}
+    of_tf = make(**POSE)
+    feed(of_tf, 1 * S, 2 * S)
+    of_tf.add_transforms(tf(transform("odom", "base_footprint", 2 * S)), static=False)
+    assert stamps(take_all(of_tf, 0.0)) == [2 * S]
+
+
 def test_a_robot_without_odometry():
     scans = make(odom_frame="", **POSE)
     feed(scans, 1 * S)

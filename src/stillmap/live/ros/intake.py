@@ -31,6 +31,7 @@ NO_STAMP = "scan without a stamp"
 BACKWARDS = "stamp before that of an earlier scan"
 REPEATED = "stamp of the scan before"
 AHEAD = "stamp far ahead of the scan before"
+EARLY = "scan before the first odometry"
 NO_MOUNT = "no transform from the robot to the laser"
 OVERFLOW = "more scans than can wait"
 NO_ODOMETRY = "scan without odometry"
@@ -98,7 +99,7 @@ class ScanIntake:
         self._mounts: dict[tuple[str, str], Mount] = {}
         self._waiting: list[_Waiting] = []
         self._numbers = itertools.count()
-        self._last: tuple[int, set[str]] = (0, set())  # stamp, and topics that had it
+        self._last_ns, self._last_topics = 0, set[str]()  # of the last scan that was mapped
         self._first_arrived: float | None = None
         self._awaits_odometry = True
 
@@ -148,21 +149,27 @@ class ScanIntake:
         """The next scan that can be mapped, or that has waited long enough; None: there is none."""
         while self._waiting:
             first = self._waiting[0]
-            if first.stamp_ns < self._last[0]:
-                self._drop(BACKWARDS)
-                continue
-            if first.stamp_ns == self._last[0] and first.topic in self._last[1]:
-                self._drop(REPEATED)
-                continue
             has_waited = now - first.arrived >= self._parameters.transform_timeout
             mount = self._find_mount(first)
-            pose = self.odometry.pose_at(first.stamp_ns)
-            if mount is None and has_waited:
-                self._drop(NO_MOUNT)
+            fault = NO_MOUNT if mount is None and has_waited else self._find_fault(first)
+            if fault is not None:
+                heapq.heappop(self._waiting)
+                self.counts[fault] += 1
                 continue
+            pose = self.odometry.pose_at(first.stamp_ns)
             if mount is None or self._must_wait(first, pose, now, has_waited):
                 return None
             return self._release(mount, pose)
+        return None
+
+    def _find_fault(self, scan: _Waiting) -> str | None:
+        """Why a scan cannot be mapped after those that were."""
+        if scan.stamp_ns < self._last_ns:
+            return BACKWARDS
+        if scan.stamp_ns == self._last_ns and scan.topic in self._last_topics:
+            return REPEATED
+        if not self._last_topics and self.odometry.begins_after(scan.stamp_ns):
+            return EARLY
         return None
 
     def _must_wait(self, scan: _Waiting, pose: Float | None, now: float, has_waited: bool) -> bool:
@@ -178,18 +185,15 @@ class ScanIntake:
 
     def _release(self, mount: Mount, pose: Float | None) -> Arrival:
         scan = heapq.heappop(self._waiting)
-        stamp, topics = self._last
-        self._last = (scan.stamp_ns, {scan.topic} | (topics if stamp == scan.stamp_ns else set()))
+        if scan.stamp_ns > self._last_ns:
+            self._last_ns, self._last_topics = scan.stamp_ns, set()
+        self._last_topics.add(scan.topic)
         if pose is None and self.odometry.is_expected:
             self.counts[NO_ODOMETRY] += 1
             self._awaits_odometry = False
         limits = self._parameters.min_laser_range, self._parameters.max_laser_range
         beams = to_scan_beams(scan.message, scan.topic, mount, *limits)
         return Arrival(scan.topic, scan.message, beams, pose, scan.arrived)
-
-    def _drop(self, reason: str) -> None:
-        heapq.heappop(self._waiting)
-        self.counts[reason] += 1
 
     def _check_leap(self, topic: str, stamp: int, now: float) -> str | None:
         """A single stamp far ahead would make all later ones too late: another must confirm it."""

@@ -60,6 +60,14 @@ class Odometry:
                 return to_plane(T @ self._child_to_base(stamp))
         return None
 
+    def begins_after(self, stamp: int) -> bool:
+        """True if it is known for later times alone."""
+        names = self._parameters
+        return self.is_expected and (
+            self._transforms.begins_after(names.odom_frame, names.base_frame, stamp)
+            or self._messages.begins_after("odometry", "robot", stamp)
+        )
+
     def _child_to_base(self, stamp: int) -> Float:
         """(4, 4) of the robot's frame in that of the messages; the same where nobody tells."""
         base = self._parameters.base_frame

@@ -102,6 +102,14 @@ class TransformBuffer:
             return None
         return se2.inverse(falling) @ rising
 
+    def begins_after(self, target: str, source: str, stamp_ns: int) -> bool:
+        """True if the frames are connected, but are known for later times alone."""
+        up = self._path(source)
+        if target not in up:
+            return False
+        edges = (self._edges[child] for child in up[: up.index(target)])
+        return any(edge.stamps and edge.stamps[0] > stamp_ns for edge in edges)
+
     def _path(self, child: str) -> list[str]:
         """A frame, its parent, and so on to the root."""
         path = [child]
