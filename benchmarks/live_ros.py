@@ -50,7 +50,7 @@ def measure(args: argparse.Namespace, folder: Path) -> str:
     scene = scene_by_name(args.world, {"laser": laser, "robot": robot})
     recording = simulate(scene, args.seed).recording
     write(recording, folder / "recording")
-    judge = Participant(args.domain)  # its readers end with it
+    judge = Participant(args.domain)
     poses = judge.read(idl.PoseWithCovarianceStamped, "pose", depth=1000, reliable=True)
     log = folder / "sent.jsonl"
     domain, period = str(args.domain), str(1.0 / args.rate)
@@ -62,6 +62,7 @@ def measure(args: argparse.Namespace, folder: Path) -> str:
         ),
     ):
         wait_for(lambda: len(poses) == recording.n_scans, _START + args.seconds + _REST)
+    judge.close()
     return describe([json.loads(line) for line in log.read_text().splitlines()], poses)
 
 

@@ -1,10 +1,19 @@
 """A participant of Cyclone DDS on this machine alone, with readers and writers of ROS topics."""
 
+import threading
 import time
 from functools import cache
 from typing import NamedTuple
 
-from cyclonedds.core import Listener, Policy, Qos
+from cyclonedds.core import (
+    InstanceState,
+    Policy,
+    Qos,
+    ReadCondition,
+    SampleState,
+    ViewState,
+    WaitSet,
+)
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
@@ -40,18 +49,6 @@ class Received(NamedTuple):
     message: object
 
 
-class _Collector(Listener):
-    def __init__(self):
-        super().__init__()
-        self.received = []
-
-    def on_data_available(self, reader):
-        now = time.monotonic()
-        for sample in reader.take(N=100):
-            if sample.sample_info.valid_data:
-                self.received.append(Received(now, sample))
-
-
 @cache
 def _configure(domain):
     """Once in a process."""
@@ -59,12 +56,20 @@ def _configure(domain):
 
 
 class Participant:
-    """Reads and writes topics by their ROS names."""
+    """Reads and writes topics by their ROS names, until it is closed."""
 
     def __init__(self, domain):
         _configure(domain)
         self._participant = DomainParticipant(domain)
-        self._entities = []
+        self._entities, self._threads = [], []
+        self._closed = threading.Event()
+
+    def close(self):
+        """Stop reading."""
+        self._closed.set()
+        for thread in self._threads:
+            thread.join()
+        self._entities.clear()
 
     def write(self, kind, topic, **policies):
         """A function that publishes messages, and the writer."""
@@ -76,15 +81,27 @@ class Participant:
 
     def read(self, kind, topic, **policies):
         """A list that grows with what is received."""
-        collector = _Collector()
         reader = DataReader(
-            self._participant,
-            Topic(self._participant, f"rt/{topic}", kind),
-            qos(**policies),
-            listener=collector,
+            self._participant, Topic(self._participant, f"rt/{topic}", kind), qos(**policies)
         )
-        self._entities.append(reader)
-        return collector.received
+        received = []
+        # not a listener: Python's are called before there is a reader, and lose what came
+        thread = threading.Thread(target=self._collect, args=(reader, received), daemon=True)
+        thread.start()
+        self._threads.append(thread)
+        return received
+
+    def _collect(self, reader, received):
+        waitset = WaitSet(self._participant)
+        waitset.attach(
+            ReadCondition(reader, InstanceState.Any | ViewState.Any | SampleState.NotRead)
+        )
+        while not self._closed.is_set():
+            if waitset.wait(duration(milliseconds=100)):
+                now = time.monotonic()
+                for sample in reader.take(N=100):
+                    if sample.sample_info.valid_data:
+                        received.append(Received(now, sample))
 
 
 def wait_for(condition, timeout=20.0):

@@ -22,8 +22,8 @@ from stillmap.eval.trajectory import compute_absolute_errors
 class Judge:
     """Reads what the node says."""
 
-    def __init__(self, domain):
-        self._participant = participant = Participant(domain)
+    def __init__(self, participant):
+        self._participant = participant
         self.poses = participant.read(idl.PoseWithCovarianceStamped, "pose", reliable=True)
         self.maps = self.read_map()
         self.static = participant.read(idl.LaserScan, "scan_static", reliable=True)
@@ -44,8 +44,15 @@ class Judge:
 
 
 @pytest.fixture
-def judge(domain):
-    return Judge(domain)
+def participant(domain):
+    made = Participant(domain)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def judge(participant):
+    return Judge(participant)
 
 
 def stamp_of(received):
@@ -275,10 +282,9 @@ def test_a_robot_without_odometry_is_mapped_too(
     assert {one.child_frame_id for one in ours} == {"base_footprint"}
 
 
-def test_two_lasers(simulation, judge, domain, tf_environment, start_node, start_robot):
-    reader = Participant(domain)
+def test_two_lasers(simulation, judge, participant, tf_environment, start_node, start_robot):
     of_each = [
-        reader.read(idl.LaserScan, f"{topic}_static", reliable=True)
+        participant.read(idl.LaserScan, f"{topic}_static", reliable=True)
         for topic in ("scan_right", "scan_left")
     ]
     node = start_node(tf_environment, 'scan_topic:=["scan_right", "scan_left"]')
