@@ -247,7 +247,7 @@ def test_the_map_is_saved_on_demand_while_mapping_goes_on(
     answer = subprocess.run(
         [sys.executable, "-c", CALL], env=environment, capture_output=True, text=True, timeout=60
     )
-    assert answer.stdout.startswith("True wrote"), answer.stdout + answer.stderr
+    assert answer.stdout.startswith("True wrote"), answer.stdout + answer.stderr + node.text
     saved = len(stillmap.load(tmp_path / "result").poses)
     assert 100 < saved <= 400
     assert wait_for(lambda: len(judge.poses) == 400, 60.0), "mapping did not go on"

@@ -37,6 +37,8 @@ _DOUBTS = {
 class LiveNode:
     """Maps what arrives, and answers.
 
+    `node` and `save_node` are to be spun, each in a thread of its own.
+
     Args:
         ros: the user's installation.
         options: see Options.
@@ -71,11 +73,13 @@ class LiveNode:
         self._stamp_ns, self.scans, self._map_due, self._is_map_old = 0, 0, 0.0, False
         self._doubts, self._reported = Counter[str](), Counter[str]()
         self._subscribe()
+        self.save_node = self._make_save_node()
         self._mapper = make_mapper(options)
 
     def close(self) -> None:
         """Forget all scans."""
         self._mapper.close()
+        self.save_node.destroy_node()
         self.node.destroy_node()
 
     def save(self, progress: Progress = no_progress) -> None:
@@ -120,10 +124,22 @@ class LiveNode:
         steady = clock.Clock(clock_type=clock.ClockType.STEADY_TIME)
         self._poll = node.create_timer(_POLL, self._answer_all, clock=steady)
         node.create_timer(_STATUS_PERIOD, self._report, clock=steady)
+
+    def _make_save_node(self) -> Any:
+        """A hidden node with the service ~/save_map, to be spun beside the other one."""
+        # without arguments: a new name or namespace is meant for the other one
+        node = self._ros.rclpy.create_node(
+            f"_{_NAME}_save",
+            namespace=self.node.get_namespace(),
+            use_global_arguments=False,
+            start_parameter_services=False,
+            enable_rosout=False,
+        )
         trigger = self._ros.message("std_srvs/srv/Trigger")
         if trigger is not None:
-            group = self._ros.module("callback_groups").MutuallyExclusiveCallbackGroup()
-            node.create_service(trigger, "~/save_map", self._on_save, callback_group=group)
+            name = f"{self.node.get_fully_qualified_name()}/save_map"
+            node.create_service(trigger, name, self._on_save)
+        return node
 
     def _subscribe_to_tf(self, qos: Any) -> None:
         message = self._ros.message(TF_MESSAGE)

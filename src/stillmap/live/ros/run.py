@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
+from typing import Any
 
 from stillmap.core.errors import InputError
 from stillmap.core.profiling import Progress
@@ -64,13 +65,26 @@ def run(
 
 
 def _spin(ros: Ros, live: LiveNode, stop: threading.Event) -> None:
-    # two threads: the map is saved in one, while the other goes on mapping
-    executor = ros.module("executors").MultiThreadedExecutor(num_threads=2)
-    executor.add_node(live.node)
-    while not stop.is_set():
-        executor.spin_once(timeout_sec=_SPIN)
-    # not shut down: callbacks that still run would complain
-    executor.remove_node(live.node)
+    """Answer until `stop`; requests to save in a thread of their own, so that mapping goes on.
+
+    Not by an executor of several threads: that of rclpy hands a callback that waits to its threads
+    over and over, and nothing else gets to run meanwhile.
+    """
+
+    def spin(node: Any) -> None:
+        executor = ros.module("executors").SingleThreadedExecutor()
+        executor.add_node(node)
+        while not stop.is_set():
+            executor.spin_once(timeout_sec=_SPIN)
+        executor.remove_node(node)
+
+    saves = threading.Thread(target=spin, args=(live.save_node,))
+    saves.start()
+    try:
+        spin(live.node)
+    finally:
+        stop.set()
+        saves.join()
 
 
 @contextmanager
