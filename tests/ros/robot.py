@@ -89,8 +89,19 @@ def main():
         static.write(idl.TFMessage([mount]))
     for writer in scans.values():
         assert wait_for(lambda w=writer: w.get_publication_matched_status().current_count, 30.0)
-    time.sleep(0.5)  # the others too
     T, stamps = recording.T_odom_base, recording.stamp_ns
+
+    def send_odometry(stamp, pose):
+        if args.tf:
+            tf.write(idl.TFMessage([make_transform("odom", "base_footprint", stamp, pose)]))
+        else:
+            header = idl.Header(to_stamp(stamp), "odom")
+            pose = idl.PoseWithCovariance(to_pose(pose))
+            odometry.write(idl.Odometry(header, "base_footprint", pose))
+
+    for k in range(20, 0, -1):  # it stands for a second, until the others have found it too
+        send_odometry(stamps[args.first] - k * 50_000_000, T[args.first])
+        time.sleep(0.05)
     due = time.monotonic()
     with open(args.log, "w", buffering=1) as log:
         for t in plan(args.last or recording.n_scans, args.lose, args.swap, 1):
@@ -105,12 +116,7 @@ def main():
             sent = time.monotonic()
             for name, message in messages.items():
                 scans[name].write(message)
-            if args.tf:
-                tf.write(idl.TFMessage([make_transform("odom", "base_footprint", stamps[t], T[t])]))
-            else:
-                header = idl.Header(to_stamp(stamps[t]), "odom")
-                pose = idl.PoseWithCovariance(to_pose(T[t]))
-                odometry.write(idl.Odometry(header, "base_footprint", pose))
+            send_odometry(stamps[t], T[t])
             log.write(json.dumps({"scan": t, "stamp_ns": stamp, "sent": sent}) + "\n")
     time.sleep(0.5)  # what is on its way
 
