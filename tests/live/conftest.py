@@ -1,11 +1,16 @@
 """A populated corridor, pushed scan by scan."""
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.replay import iter_beams
 from stillmap.sim import scene_by_name, simulate
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))  # for what the tests share
 
 
 class Run:

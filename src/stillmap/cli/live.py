@@ -1,4 +1,4 @@
-"""`stillmap live`: map while scans arrive; for now those of a recording."""
+"""`stillmap live`: map while scans arrive, from a robot in ROS 2 or from a recording."""
 
 import argparse
 import tempfile
@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 
 DESCRIPTION = (
     "Map scan by scan, as a robot would while it drives: each pose and P(static) of each beam "
-    "follow from what is known at the time. With --replay the scans of a recording are pushed as "
+    "follow from what is known at the time. Alone it is a node in ROS 2, which must be sourced "
+    "first; Ctrl-C ends it and writes DIR. With --replay the scans of a recording are pushed as "
     "fast as possible, and the result is the same to the bit every time. DIR has what `stillmap "
     "map` writes, of what is known at the end, and in live/ what was answered at the time."
 )
@@ -27,13 +28,16 @@ EPILOG = """examples:
   stillmap live --replay log.bag -o out --json --quiet
   stillmap live --replay log.bag -o out --rate 1
   stillmap live --replay tuesday.bag --map monday -o out
+  stillmap live -o out --ros-args -p base_frame:=base_link -r scan:=front/scan
 """
 
 
 def add_arguments(p: argparse.ArgumentParser) -> None:
     """Add the flags and arguments."""
     p.add_argument(
-        "--replay", metavar="INPUT", required=True, help="a recording, of one laser plane"
+        "--replay",
+        metavar="INPUT",
+        help="a recording, of one laser plane (default: a ROS 2 node that maps until Ctrl-C)",
     )
     p.add_argument("-o", "--output", metavar="DIR", required=True, help="result folder")
     p.add_argument("--overwrite", action="store_true", help="replace what is in DIR")
@@ -65,14 +69,22 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     add_run_flags(p)
     add_read_flags(p)
     add_option_flags(p)
+    p.add_argument(
+        "--ros-args", nargs=argparse.REMAINDER, default=[], help="of the node, up to the end"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
-    """Push a recording through the live mapper.
+    """Run the node, or push a recording through the live mapper.
 
     Raises:
-        InputError: the recording cannot be read or is not planar, or the output is taken.
+        InputError: ROS is missing, the recording cannot be read or is not planar, or the output is
+            taken.
     """
+    if args.replay is None:
+        from stillmap.cli.live_node import run_node
+
+        return run_node(args)
     from stillmap.core.files import require_new
     from stillmap.live.mapper import LiveMapper
     from stillmap.live.replay import replay

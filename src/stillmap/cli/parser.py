@@ -89,7 +89,7 @@ class Parser(argparse.ArgumentParser):
 
 def _flags(words: list[str]) -> Iterable[str]:
     """The words that can only be long flags."""
-    end = words.index("--") if "--" in words else len(words)
+    end = min(words.index(stop) if stop in words else len(words) for stop in ("--", "--ros-args"))
     return (word for word in words[:end] if word.startswith("--") and " " not in word)
 
 

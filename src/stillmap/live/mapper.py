@@ -24,7 +24,7 @@ from stillmap.live.loop_closer import LoopCloser
 from stillmap.live.loop_process import LoopProcess
 from stillmap.live.map_correction import LabelledScan, MapCorrection
 from stillmap.live.place import Mode, NoLoops, PlaceTracker
-from stillmap.live.saving import save_live
+from stillmap.live.saving import Snapshot
 from stillmap.live.scan import Scan, ScanBeams, to_beams
 from stillmap.live.scan_hits import normals_of, select_hits, thin
 from stillmap.live.scan_odometry import Registration, ScanOdometry
@@ -177,7 +177,7 @@ class LiveMapper:
     @property
     def objects(self) -> list[MovingObject]:
         """What moved so far, from the labels as they are known now."""
-        return self._to_result(no_progress).objects
+        return self.snapshot().build().objects
 
     def save(
         self,
@@ -194,7 +194,12 @@ class LiveMapper:
         Raises:
             InputError: the folder is taken or cannot be written to.
         """
-        save_live(self._to_result(progress), self._history.answers(), Path(path), overwrite)
+        self.snapshot().save(path, overwrite=overwrite, progress=progress)
+
+    def snapshot(self) -> Snapshot:
+        """All scans so far and what is known of them: to save them while more are pushed."""
+        recording, answers = self._history.recording(), self._history.answers()
+        return Snapshot(recording, self.poses, answers, self.options, self._scratch)
 
     def finish(self, progress: Progress = no_progress) -> BuiltResult:
         """The result of `stillmap.build` on all scans: poses, labels and map refined."""
@@ -213,16 +218,6 @@ class LiveMapper:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    def _to_result(self, progress: Progress) -> BuiltResult:
-        found = map_recording(
-            self._history.recording(),
-            self.options,
-            poses=self.poses,
-            progress=progress,
-            scratch=self._scratch,
-        )
-        return BuiltResult(**vars(found))
 
     def _require_next(self, beams: ScanBeams) -> None:
         if beams.dimension != 2:

@@ -1,0 +1,44 @@
+"""`stillmap live` without --replay: the ROS 2 node."""
+
+import argparse
+import tempfile
+from functools import partial
+from pathlib import Path
+
+from stillmap.cli.arguments import read_changes
+from stillmap.cli.config import options_from_args
+from stillmap.cli.console import say, show_progress
+from stillmap.cli.map_flags import shared_changes
+from stillmap.core.errors import InputError
+
+
+def run_node(args: argparse.Namespace) -> int:
+    """Map until Ctrl-C or SIGTERM, then write the result.
+
+    Raises:
+        InputError: ROS 2 is missing, a parameter is wrong, or the output is taken.
+    """
+    from stillmap.core.files import require_new
+    from stillmap.live.mapper import LiveMapper
+    from stillmap.live.ros.run import run
+    from stillmap.results.run_json import RECORD
+
+    options = options_from_args(args, read_changes(args), shared_changes(args))
+    output = Path(args.output)
+    require_new(output, RECORD, args.overwrite)
+    if args.no_odometry or args.json or args.rate is not None:
+        raise InputError("--no-odometry, --rate and --json are for --replay")
+    with tempfile.TemporaryDirectory(prefix="stillmap-") as scratch:
+        scans = run(
+            options,
+            output,
+            ["--ros-args", *args.ros_args],
+            overwrite=args.overwrite,
+            make_mapper=partial(
+                LiveMapper, place=args.map, mode=args.mode, background=True, scratch=scratch
+            ),
+            show_progress=partial(show_progress, args.quiet, 1),
+        )
+    if not args.quiet:
+        say(f"wrote {output}" if scans else "no scan arrived: nothing was written")
+    return 0

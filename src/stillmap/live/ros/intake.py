@@ -1,0 +1,245 @@
+"""Scans as they arrive, until all that is needed to map them is there; no ROS in it."""
+
+import heapq
+import itertools
+from collections import Counter
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core import se2
+from stillmap.core.short_repr import ShortRepr
+from stillmap.io.ros.base_frame import project_to_plane
+from stillmap.io.ros.messages import frame_name, stamp_ns
+from stillmap.live.ros.conversions import (
+    Mount,
+    scan_frame,
+    shape_of,
+    to_scan_beams,
+    transform_values,
+)
+from stillmap.live.ros.odometry import Odometry
+from stillmap.live.ros.parameters import Parameters
+from stillmap.live.ros.transforms import TransformBuffer
+from stillmap.live.scan import ScanBeams
+
+Float = NDArray[np.float64]
+
+NO_STAMP = "scan without a stamp"
+BACKWARDS = "stamp before that of an earlier scan"
+REPEATED = "stamp of the scan before"
+AHEAD = "stamp far ahead of the scan before"
+EARLY = "scan before the first odometry"
+NO_MOUNT = "no transform from the robot to the laser"
+OVERFLOW = "more scans than can wait"
+NO_ODOMETRY = "scan without odometry"
+BAD_TRANSFORM = "transform that is none"
+
+_FIRST_ODOMETRY = 2.0  # s for which the first scan waits for odometry
+_SILENCE = 1.0  # s after which nobody waits for a laser any more
+_LEAP_NS = 5 * 10**9  # that one scan alone may not be ahead of the one before
+
+
+@dataclass(frozen=True, eq=False)
+class Arrival(ShortRepr):
+    """A scan that can be mapped.
+
+    Attributes:
+        topic: where it came from.
+        message: the LaserScan.
+        beams: of the scan.
+        T_odom_base: (3, 3), or None: not known.
+        arrived: s of a steady clock.
+    """
+
+    topic: str
+    message: Any
+    beams: ScanBeams
+    T_odom_base: Float | None
+    arrived: float
+
+
+@dataclass(order=True)
+class _Waiting:
+    stamp_ns: int
+    number: int
+    topic: str
+    message: Any
+    arrived: float
+
+
+@dataclass
+class _Laser:
+    """What has arrived from a laser: newest stamp, when, and a leap nobody has confirmed yet."""
+
+    newest_ns: int
+    arrived: float
+    leap_ns: int | None = None
+    count: int = 0
+
+
+class ScanIntake:
+    """Puts scans of several lasers in order, and finds mounts and odometry for them.
+
+    Args:
+        parameters: see Parameters.
+
+    Attributes:
+        counts: scans and messages that were left out, by the reason.
+    """
+
+    def __init__(self, parameters: Parameters) -> None:
+        self._parameters = parameters
+        self.transforms = TransformBuffer(round(1e9 * parameters.tf_buffer_duration))
+        self.odometry = Odometry(parameters, self.transforms)
+        self.counts = Counter[str]()
+        self._lasers: dict[str, _Laser] = {}
+        self._mounts: dict[tuple[str, str], Mount] = {}
+        self._waiting: list[_Waiting] = []
+        self._numbers = itertools.count()
+        self._last_ns, self._last_topics = 0, set[str]()  # of the last scan that was mapped
+        self._first_arrived: float | None = None
+        self._awaits_odometry = True
+
+    @property
+    def has_waiting(self) -> bool:
+        """True while scans wait: look again after a while."""
+        return bool(self._waiting)
+
+    def add_transforms(self, message: Any, *, static: bool) -> None:
+        """Add a TFMessage; what we ourselves say about the map is left out."""
+        for one in message.transforms:
+            parent, child = frame_name(one.header.frame_id), frame_name(one.child_frame_id)
+            if parent == self._parameters.map_frame:
+                continue
+            values, stamp = transform_values(one.transform), stamp_ns(one.header)
+            if not self.transforms.add(parent, child, stamp, values, static=static):
+                self.counts[BAD_TRANSFORM] += 1
+        self._awaits_odometry = True
+
+    def add_odometry(self, message: Any) -> None:
+        """Add an Odometry message."""
+        if not self.odometry.add_message(message):
+            self.counts[BAD_TRANSFORM] += 1
+        self._awaits_odometry = True
+
+    def add_scan(self, topic: str, message: Any, now: float) -> None:
+        """Add a LaserScan that arrived now, in seconds of a steady clock."""
+        stamp = stamp_ns(message.header)
+        fault = shape_of(message).find_fault() or (None if stamp > 0 else NO_STAMP)
+        if fault is None:
+            fault = self._check_leap(topic, stamp, now)
+        if fault is not None:
+            self.counts[fault] += 1
+            return
+        laser = self._lasers[topic]
+        laser.count += 1
+        if (laser.count - 1) % self._parameters.throttle_scans:
+            return
+        if self._first_arrived is None:
+            self._first_arrived = now
+        heapq.heappush(self._waiting, _Waiting(stamp, next(self._numbers), topic, message, now))
+        if len(self._waiting) > self._parameters.scan_queue_size:
+            heapq.heappop(self._waiting)
+            self.counts[OVERFLOW] += 1
+
+    def take(self, now: float) -> Arrival | None:
+        """The next scan that can be mapped, or that has waited long enough; None: there is none."""
+        while self._waiting:
+            first = self._waiting[0]
+            has_waited = now - first.arrived >= self._parameters.transform_timeout
+            mount = self._find_mount(first)
+            fault = NO_MOUNT if mount is None and has_waited else self._find_fault(first)
+            if fault is not None:
+                heapq.heappop(self._waiting)
+                self.counts[fault] += 1
+                continue
+            pose = self.odometry.pose_at(first.stamp_ns)
+            if mount is None or self._must_wait(first, pose, now, has_waited):
+                return None
+            return self._release(mount, pose)
+        return None
+
+    def _find_fault(self, scan: _Waiting) -> str | None:
+        """Why a scan cannot be mapped after those that were."""
+        if scan.stamp_ns < self._last_ns:
+            return BACKWARDS
+        if scan.stamp_ns == self._last_ns and scan.topic in self._last_topics:
+            return REPEATED
+        if not self._last_topics and self.odometry.begins_after(scan.stamp_ns):
+            return EARLY
+        return None
+
+    def _must_wait(self, scan: _Waiting, pose: Float | None, now: float, has_waited: bool) -> bool:
+        if not has_waited and not self._is_in_order(scan, now):
+            return True
+        if pose is not None or not self.odometry.is_expected:
+            return False
+        if self.odometry.source is None:  # nothing yet: the robot has just been switched on
+            assert self._first_arrived is not None
+            return now - self._first_arrived < _FIRST_ODOMETRY
+        # odometry that failed once is not waited for until it comes again
+        return self._awaits_odometry and not has_waited
+
+    def _release(self, mount: Mount, pose: Float | None) -> Arrival:
+        scan = heapq.heappop(self._waiting)
+        if scan.stamp_ns > self._last_ns:
+            self._last_ns, self._last_topics = scan.stamp_ns, set()
+        self._last_topics.add(scan.topic)
+        if pose is None and self.odometry.is_expected:
+            self.counts[NO_ODOMETRY] += 1
+            self._awaits_odometry = False
+        limits = self._parameters.min_laser_range, self._parameters.max_laser_range
+        beams = to_scan_beams(scan.message, scan.topic, mount, *limits)
+        return Arrival(scan.topic, scan.message, beams, pose, scan.arrived)
+
+    def _check_leap(self, topic: str, stamp: int, now: float) -> str | None:
+        """A single stamp far ahead would make all later ones too late: another must confirm it."""
+        laser = self._lasers.get(topic)
+        if laser is None:
+            self._lasers[topic] = _Laser(stamp, now)
+            return None
+        elapsed = round(1e9 * (now - laser.arrived))
+        is_leap = stamp - laser.newest_ns > _LEAP_NS + elapsed
+        is_confirmed = laser.leap_ns is not None and 0 < stamp - laser.leap_ns <= _LEAP_NS
+        if is_leap and not is_confirmed:
+            laser.leap_ns = stamp
+            return AHEAD
+        laser.leap_ns = None
+        laser.newest_ns, laser.arrived = max(laser.newest_ns, stamp), now
+        return None
+
+    def _is_in_order(self, scan: _Waiting, now: float) -> bool:
+        """True if no other laser may still tell of something earlier."""
+        return all(
+            laser.newest_ns >= scan.stamp_ns or now - laser.arrived > _SILENCE
+            for laser in self._lasers.values()
+        )
+
+    def _find_mount(self, scan: _Waiting) -> Mount | None:
+        frame = scan_frame(scan.message)
+        key = (scan.topic, frame)
+        if key not in self._mounts:
+            mount = self._given_mount(scan.topic) or self._tf_mount(frame, scan.stamp_ns)
+            if mount is None:
+                return None
+            self._mounts[key] = mount
+        return self._mounts[key]
+
+    def _tf_mount(self, frame: str, stamp: int) -> Mount | None:
+        """The mount that TF tells."""
+        base = self._parameters.base_frame
+        T = np.eye(4) if frame == base else self.transforms.lookup(base, frame, stamp)
+        if T is None:
+            return None
+        flat, is_upside_down, _ = project_to_plane(T[None])
+        return Mount(flat[0], is_upside_down)
+
+    def _given_mount(self, topic: str) -> Mount | None:
+        """The mount that a parameter tells."""
+        if not self._parameters.laser_pose:
+            return None
+        k = self._parameters.scan_topic.index(topic)
+        return Mount(se2.matrix(*self._parameters.laser_pose[3 * k : 3 * k + 3]))

@@ -1,0 +1,244 @@
+"""The ROS 2 node: scans in, answers out."""
+
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stillmap.core import config
+from stillmap.core.errors import InputError
+from stillmap.core.profiling import Progress, no_progress
+from stillmap.live.mapper import LiveMapper
+from stillmap.live.ros import publishers
+from stillmap.live.ros.installation import Ros
+from stillmap.live.ros.intake import BACKWARDS, NO_MOUNT, NO_ODOMETRY, Arrival, ScanIntake
+from stillmap.live.ros.parameters import Parameters, declare
+from stillmap.live.ros.publishers import TF_MESSAGE, Publishers
+from stillmap.pipeline.options import Options
+
+_NAME = "stillmap"
+_TF_DEPTH, _ODOMETRY_DEPTH = 100, 50
+_POLL = 0.02  # s between two looks at scans that wait
+_STATUS_PERIOD = 1.0  # s
+_LATENCIES = 1000  # scans over which latency is told
+_DOUBTS = {
+    "slip": "odometry disagrees with the scans",
+    "blind": "no beam meets anything",
+    "carried": "the scans contradict the map",
+    "lost": "the pose in the known map is not known",
+    "ambiguous": "several places in the known map fit",
+}
+
+
+class LiveNode:
+    """Maps what arrives, and answers.
+
+    `node` and `save_node` are to be spun, each in a thread of its own.
+
+    Args:
+        ros: the user's installation.
+        options: see Options.
+        output: result folder.
+        overwrite: replace what is there.
+        make_mapper: of these options, with what the parameters changed.
+
+    Raises:
+        InputError: a parameter is wrong.
+    """
+
+    def __init__(
+        self,
+        ros: Ros,
+        options: Options,
+        output: Path,
+        *,
+        overwrite: bool,
+        make_mapper: Callable[[Options], LiveMapper],
+    ) -> None:
+        self.node = ros.rclpy.create_node(_NAME)
+        self._ros, self._output, self._overwrite = ros, output, overwrite
+        self.parameters = self._declare(options)
+        resolution = self.parameters.resolution
+        if resolution != options.slam.resolution:
+            changes = {"resolution": resolution, "voxel_size": resolution}
+            options = config.override(options, {"slam": changes}, "parameter")
+        self._intake = ScanIntake(self.parameters)
+        self._publishers = Publishers(ros, self.node, self.parameters, options.output.map_mode)
+        self._lock, self._save_lock = threading.Lock(), threading.Lock()
+        self._latency = deque[float](maxlen=_LATENCIES)
+        self._stamp_ns, self.scans, self._map_due, self._is_map_old = 0, 0, 0.0, False
+        self._doubts, self._reported = Counter[str](), Counter[str]()
+        self._subscribe()
+        self.save_node = self._make_save_node()
+        self._mapper = make_mapper(options)
+
+    def close(self) -> None:
+        """Forget all scans."""
+        self._mapper.close()
+        self.save_node.destroy_node()
+        self.node.destroy_node()
+
+    def save(self, progress: Progress = no_progress) -> None:
+        """Write the result folder, as known now. Mapping goes on meanwhile.
+
+        Raises:
+            InputError: there is nothing to save yet, or the folder cannot be written to.
+        """
+        with self._save_lock:
+            if not self.scans:
+                raise InputError("no scan has been mapped yet")
+            with self._lock:
+                snapshot = self._mapper.snapshot()
+            snapshot.save(self._output, overwrite=self._overwrite, progress=progress)
+            self._overwrite = True  # the next one replaces ours
+
+    def _declare(self, options: Options) -> Parameters:
+        descriptor = self._ros.message("rcl_interfaces/msg/ParameterDescriptor")
+
+        def declare_one(name: str, default: Any, meaning: str) -> Any:
+            about = descriptor(description=meaning, dynamic_typing=True, read_only=True)
+            return self.node.declare_parameter(name, default, about).value
+
+        return declare(declare_one, resolution=options.slam.resolution)
+
+    def _subscribe(self) -> None:
+        node, names, qos = self.node, self.parameters, self._ros.module("qos")
+        sensor = qos.QoSProfile(
+            depth=names.scan_queue_size, reliability=qos.ReliabilityPolicy.BEST_EFFORT
+        )
+        laser_scan = self._ros.message("sensor_msgs/msg/LaserScan")
+        for topic in names.scan_topic:
+            node.create_subscription(laser_scan, topic, self._scan_callback(topic), sensor)
+        odometry = self._ros.message("nav_msgs/msg/Odometry")
+        if names.odom_frame:
+            deep = qos.QoSProfile(
+                depth=_ODOMETRY_DEPTH, reliability=qos.ReliabilityPolicy.BEST_EFFORT
+            )
+            node.create_subscription(odometry, names.odom_topic, self._on_odometry, deep)
+        self._subscribe_to_tf(qos)
+        clock = self._ros.module("clock")
+        steady = clock.Clock(clock_type=clock.ClockType.STEADY_TIME)
+        self._poll = node.create_timer(_POLL, self._answer_all, clock=steady)
+        node.create_timer(_STATUS_PERIOD, self._report, clock=steady)
+
+    def _make_save_node(self) -> Any:
+        """A hidden node with the service ~/save_map, to be spun beside the other one."""
+        # without arguments: a new name or namespace is meant for the other one
+        node = self._ros.rclpy.create_node(
+            f"_{_NAME}_save",
+            namespace=self.node.get_namespace(),
+            use_global_arguments=False,
+            start_parameter_services=False,
+            enable_rosout=False,
+        )
+        trigger = self._ros.message("std_srvs/srv/Trigger")
+        if trigger is not None:
+            name = f"{self.node.get_fully_qualified_name()}/save_map"
+            node.create_service(trigger, name, self._on_save)
+        return node
+
+    def _subscribe_to_tf(self, qos: Any) -> None:
+        message = self._ros.message(TF_MESSAGE)
+        if message is None:
+            self.node.get_logger().warning(
+                "tf2_msgs is missing: /tf is neither read nor written. Mounts come from the "
+                "parameter laser_pose, odometry from odom_topic; the pose is on the topic pose."
+            )
+            return
+        latched = qos.QoSProfile(depth=_TF_DEPTH, durability=qos.DurabilityPolicy.TRANSIENT_LOCAL)
+        self.node.create_subscription(message, "/tf", self._on_tf, _TF_DEPTH)
+        self.node.create_subscription(message, "/tf_static", self._on_tf_static, latched)
+
+    def _scan_callback(self, topic: str) -> Any:
+        def add(message: Any) -> None:
+            self._intake.add_scan(topic, message, time.monotonic())
+            self._answer_all()
+
+        return add
+
+    def _on_odometry(self, message: Any) -> None:
+        self._intake.add_odometry(message)
+        self._answer_all()
+
+    def _on_tf(self, message: Any) -> None:
+        self._intake.add_transforms(message, static=False)
+        self._answer_all()
+
+    def _on_tf_static(self, message: Any) -> None:
+        self._intake.add_transforms(message, static=True)
+
+    def _on_save(self, _: Any, response: Any) -> Any:
+        try:
+            self.save()
+        except (InputError, OSError) as error:
+            response.success, response.message = False, str(error)
+        else:
+            response.success, response.message = True, f"wrote {self._output}"
+        log = self.node.get_logger()
+        (log.info if response.success else log.error)(response.message)
+        return response
+
+    def _answer_all(self) -> None:
+        while (arrival := self._intake.take(time.monotonic())) is not None:
+            self._answer(arrival)
+        if self._intake.has_waiting and self._poll.is_canceled():
+            self._poll.reset()
+        elif not self._intake.has_waiting and not self._poll.is_canceled():
+            self._poll.cancel()  # a timer that only ticks takes a tenth of a core
+        now = time.monotonic()
+        if self._is_map_old and now >= self._map_due:
+            self._map_due, self._is_map_old = now + self.parameters.map_update_interval, False
+            with self._lock:
+                grid = self._mapper.map
+            self._publishers.publish_map(grid, self._stamp_ns)
+
+    def _answer(self, arrival: Arrival) -> None:
+        with self._lock:
+            update = self._mapper.push(arrival.beams, arrival.T_odom_base)
+        self._publishers.publish_answer(arrival, update)
+        self._latency.append(time.monotonic() - arrival.arrived)
+        self._stamp_ns, self._is_map_old = arrival.beams.stamp_ns, True
+        self.scans += 1
+        self._doubts.update(update.doubts)
+
+    def _report(self) -> None:
+        """Diagnostics of the last second; the last map, where scans have stopped."""
+        self._answer_all()
+        counts = self._intake.counts
+        new, doubts = counts - self._reported, self._doubts
+        self._reported, self._doubts = Counter(counts), Counter()
+        ms = 1e3 * np.array(self._latency or [0.0])
+        values = {
+            "scans": str(self.scans),
+            "latency median (ms)": f"{np.median(ms):.1f}",
+            "latency 99 % (ms)": f"{np.quantile(ms, 0.99):.1f}",
+            "odometry": self._intake.odometry.source or "none",
+            **{reason: str(n) for reason, n in sorted(counts.items())},
+            **{_DOUBTS[doubt]: str(n) for doubt, n in sorted(doubts.items())},
+        }
+        level, text = publishers.OK, "mapping" if self.scans else "waiting for scans"
+        if new or doubts:
+            level, text = publishers.WARN, "; ".join([*new, *(_DOUBTS[name] for name in doubts)])
+        if new[BACKWARDS] or new[NO_MOUNT]:
+            level = publishers.ERROR
+        self._publishers.publish_status(level, text, values)
+        self._warn(new)
+
+    def _warn(self, new: Counter[str]) -> None:
+        """Say once in the log what keeps scans from being mapped."""
+        names = self.parameters
+        frames = ", ".join(sorted(self._intake.transforms.frames)) or "none"
+        hints = {
+            NO_MOUNT: f"base_frame is '{names.base_frame}'; frames of TF: {frames}",
+            NO_ODOMETRY: f"neither TF from '{names.odom_frame}' to '{names.base_frame}' nor "
+            f"'{names.odom_topic}'; scans are mapped without",
+            BACKWARDS: "such scans are left out; if the clock was set back, start the node anew",
+        }
+        for reason in new:
+            if self._intake.counts[reason] == new[reason]:  # for the first time
+                hint = f" ({hints[reason]})" if reason in hints else ""
+                self.node.get_logger().warning(f"{reason}{hint}")

@@ -1,0 +1,60 @@
+"""Parameters of the node, and what `stillmap live` says where there is no ROS."""
+
+import importlib.util
+
+import pytest
+
+from stillmap.cli.main import main
+from stillmap.core.errors import InputError
+from stillmap.live.ros.parameters import Parameters, declare
+
+
+def read(defaults=None, **given):
+    return declare(lambda name, default, _: given.get(name, default), **defaults or {})
+
+
+def test_what_is_declared_is_what_is_read():
+    assert read() == Parameters()
+    assert read(defaults={"resolution": 0.1}).resolution == 0.1
+    assert read(defaults={"resolution": 0.1}, resolution=0.2).resolution == 0.2
+
+
+def test_one_topic_or_several():
+    assert read(scan_topic="/scan").scan_topic == ("/scan",)
+    found = read(scan_topic=["front", "rear"], laser_pose=[0, 0, 0, 1, 0, 3.14])
+    assert found.scan_topic == ("front", "rear")
+    assert found.laser_pose == (0.0, 0.0, 0.0, 1.0, 0.0, 3.14)
+
+
+def test_a_whole_number_is_a_number():
+    assert read(map_update_interval=2).map_update_interval == 2.0
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        ({"resolution": 0.0}, "parameter resolution: expected more than 0, got 0.0"),
+        ({"resolution": "fine"}, "parameter resolution: expected a number, got 'fine'"),
+        ({"transform_timeout": -1.0}, "parameter transform_timeout: expected 0 or more, got -1.0"),
+        ({"throttle_scans": 0}, "parameter throttle_scans: expected 1 or more, got 0"),
+        ({"throttle_scans": 1.5}, "parameter throttle_scans: expected a whole number, got 1.5"),
+        ({"map_frame": ""}, "parameter map_frame: expected a name, got ''"),
+        ({"scan_topic": []}, "parameter scan_topic: expected at least one name, got ()"),
+        ({"scan_topic": [1]}, "parameter scan_topic: expected text, got 1"),
+        ({"laser_pose": [1.0]}, "parameter laser_pose: expected 3 numbers, got (1.0,)"),
+    ],
+)
+def test_wrong_values_are_told(given, says):
+    with pytest.raises(InputError) as error:
+        read(**given)
+    assert str(error.value) == says
+
+
+@pytest.mark.skipif(importlib.util.find_spec("rclpy") is not None, reason="ROS 2 is here")
+def test_without_ros_one_line_says_how_to_get_it(tmp_path, capsys):
+    arguments = ["live", "-o", str(tmp_path / "out"), "--ros-args", "--params-file", "my.yaml"]
+    assert main(arguments) == 2
+    line = capsys.readouterr().err
+    assert "rclpy of ROS 2 is not in this environment" in line
+    assert "source /opt/ros/" in line
+    assert line.count("\n") == 1

