@@ -79,6 +79,7 @@ def test_bash(ask):
     names = {
         "map",
         "info",
+        "live",
         "view",
         "merge",
         "fleet",

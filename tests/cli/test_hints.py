@@ -206,6 +206,7 @@ CALLS = [
     ("view", "out"),
     ("merge", "in", "in2", "-o", "out"),
     ("fleet", "in", "-o", "out"),
+    ("live", "-o", "out"),
     ("filter", "out", "-o", "clean"),
     ("convert", "in", "-o", "out"),
     ("simulate", "hall", "-o", "out"),

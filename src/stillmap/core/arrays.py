@@ -80,7 +80,8 @@ class ArrayBuilder:
         dtype: of the elements.
         row: shape of one row, () for numbers.
         folder: of the temporary file; None: the system's.
-        in_memory: bytes that are kept in memory before the file is begun.
+        in_memory: bytes that are kept in memory before the file is begun; None: as many as of any
+            array.
     """
 
     def __init__(
@@ -88,7 +89,7 @@ class ArrayBuilder:
         dtype: DTypeLike,
         row: tuple[int, ...] = (),
         folder: Path | None = None,
-        in_memory: int = MAX_BYTES_IN_MEMORY,
+        in_memory: int | None = None,
     ) -> None:
         self._dtype, self._row, self._folder = np.dtype(dtype), row, folder
         self._in_memory = in_memory
@@ -112,7 +113,8 @@ class ArrayBuilder:
         self._length += len(rows)
         self._parts.append(rows)
         self._bytes += rows.nbytes
-        if self._bytes > (self._in_memory if self._file is None else min(self._in_memory, _BUFFER)):
+        limit = MAX_BYTES_IN_MEMORY if self._in_memory is None else self._in_memory
+        if self._bytes > (limit if self._file is None else min(limit, _BUFFER)):
             self._write()
 
     def _write(self) -> None:
