@@ -172,8 +172,8 @@ void bind(nb::module_& m, const char* name) {
            "than its margin (M,) float32, in cells, before its end. tag: see `take_over`.")
       .def("prime", &prime<D>, nb::arg("cells").noconvert(), nb::arg("occupied").noconvert(),
            nb::arg("log_ratio"),
-           "What another map knows of cells (K, D) int64: that a static surface stands there, for "
-           "which dynamic classes fall behind by log_ratio nats, or that they are free.")
+           "Initializes cells (K, D) int64 from another map: occupied by static surface, for "
+           "which dynamic classes fall behind by log_ratio nats, or free.")
       .def("label", &label<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
            nb::arg("offset").noconvert(), nb::arg("T_map_sensor").noconvert(), nb::arg("prior"),
            "(M,) float32 P(static) of every beam by what was added so far. NaN for unusable "

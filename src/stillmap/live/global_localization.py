@@ -1,4 +1,4 @@
-"""Where in a known map the robot is, without a prior."""
+"""Global localization: the pose of the robot in a known map, without a prior."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -31,7 +31,7 @@ _MAX_CANDIDATES = 20
 
 @dataclass(frozen=True, eq=False)
 class Localization(ShortRepr):
-    """Where the robot is.
+    """Result of global localization.
 
     Attributes:
         T: (3, 3) of the searched view in the known map; None: not known.
@@ -63,7 +63,7 @@ class GlobalLocalizer:
         self._last: Float | None = None
 
     def localize(self, view: GridMap, scan: Scan, pose: Float) -> Localization:
-        """Where a view of the surroundings lies.
+        """Pose of a local map in the known map.
 
         Args:
             view: what was seen since the robot was lost, as a map in a frame of its own.

@@ -1,4 +1,4 @@
-"""All that was pushed, and what was answered at the time, in files: memory stays flat."""
+"""All scans, and the poses and labels returned for them, in temporary files."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +18,7 @@ _IN_MEMORY = 1 << 18  # bytes of each array that are not yet in its file
 
 @dataclass(frozen=True, eq=False)
 class Answers(ShortRepr):
-    """What was answered to T scans with M beams.
+    """Poses and labels returned by `push` for T scans with M beams.
 
     Attributes:
         poses: (T, D+1, D+1) T_map_base as it was given.
@@ -134,7 +134,7 @@ class History:
         )
 
     def answers(self) -> Answers:
-        """What was answered so far."""
+        """Poses and labels that `push` has returned so far."""
         return Answers(
             np.array(self._poses.view()),
             np.array(self._local.view()),

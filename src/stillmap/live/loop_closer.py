@@ -24,7 +24,7 @@ _NEAR_DISTANCE = 25.0  # m from the robot up to which they are
 
 @dataclass(frozen=True, eq=False)
 class Correction(ShortRepr):
-    """What closing loops changed.
+    """Poses after loop closure.
 
     Attributes:
         T_map_local: (3, 3) of the frame of the odometry by scans in the new map.

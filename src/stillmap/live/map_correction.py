@@ -1,4 +1,4 @@
-"""A corrected map, taken over a little with every scan: no scan waits for all of it."""
+"""Corrections of the map after loop closure, applied in parts so that no scan waits for them."""
 
 from dataclasses import dataclass
 
@@ -39,7 +39,7 @@ class LabelledScan(ShortRepr):
 
 
 class MapCorrection:
-    """What is left to do until a correction is taken over.
+    """Applies a correction of the pose graph to labels and local map, a part per scan.
 
     Args:
         correction: of the pose graph.

@@ -176,7 +176,7 @@ class LiveMapper:
 
     @property
     def objects(self) -> list[MovingObject]:
-        """What moved so far, from the labels as they are known now."""
+        """Moving objects, from the labels and poses of all scans so far."""
         return self.snapshot().build().objects
 
     def save(

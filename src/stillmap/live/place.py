@@ -1,4 +1,4 @@
-"""Localization in a known map: lost or not, and what that means for pose and labels."""
+"""Localization in a known map: global search while lost, then tracking."""
 
 from typing import Literal
 
@@ -17,7 +17,7 @@ Mode = Literal["localise", "extend"]
 
 
 class PlaceTracker:
-    """What a live mapper knows of its place in a known map.
+    """State of the localization in a known map: lost or localized, and the frames in between.
 
     Args:
         known: the map.

@@ -1,4 +1,4 @@
-"""What a pushed scan tells."""
+"""Result of one scan: pose, labels, doubts, changed map tiles."""
 
 from dataclasses import dataclass, field
 
@@ -13,7 +13,7 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Update(ShortRepr):
-    """The answer to one scan.
+    """Result of pushing one scan.
 
     Attributes:
         pose: (D+1, D+1) T_map_base.

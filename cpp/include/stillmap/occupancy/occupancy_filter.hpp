@@ -87,7 +87,7 @@ class OccupancyFilter : public BlockMap<D, PassedCell> {
     });
   }
 
-  // What another map knows of a cell: that a static surface stands there, or that it is free.
+  // Initializes a cell from another map: occupied by static surface, or free.
   // log_ratio: nats by which dynamic classes fall behind.
   void prime(const Cell<D>& cell, bool is_occupied, double log_ratio) {
     Block* block = find_or_add(Map::block_of(cell));

@@ -72,7 +72,7 @@ class _Waiting:
 
 @dataclass
 class _Laser:
-    """What has arrived from a laser: newest stamp, when, and a leap nobody has confirmed yet."""
+    """State of one scan topic: newest stamp, its arrival, an unconfirmed leap of stamps."""
 
     newest_ns: int
     arrived: float

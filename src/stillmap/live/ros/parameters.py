@@ -14,7 +14,7 @@ def _parameter(default: Any, meaning: str) -> Any:
 
 @dataclass(frozen=True)
 class Parameters:
-    """What can be set as a ROS parameter.
+    """ROS parameters of the node.
 
     Raises:
         InputError: a value is of the wrong type, or out of range.

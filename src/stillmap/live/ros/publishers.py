@@ -1,4 +1,4 @@
-"""What the node says: map, transform, pose, scans by label, diagnostics."""
+"""Publishers of the node: map, transform, pose, static and dynamic scans, diagnostics."""
 
 from typing import Any
 
