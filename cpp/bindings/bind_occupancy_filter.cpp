@@ -70,10 +70,11 @@ auto label(const OccupancyFilter<D>& filter, const Points<D>& points, const Flat
   {
     nb::gil_scoped_release released;
     std::vector<float> known(filter.size(), -1.0f);
+    typename OccupancyFilter<D>::ConstCursor cursor(filter);
     for_each_beam<D>(scans, 0, scans.n_scans, [&](size_t, int64_t n, const Pose<D>& pose) {
       const BeamSegment<D> beam(pose, scans.points + n * D, filter.resolution());
       out[static_cast<size_t>(n)] =
-          scans.hit[n] ? filter.p_static_at(beam.end, otherwise, known) : otherwise;
+          scans.hit[n] ? filter.p_static_at(cursor, beam.end, otherwise, known) : otherwise;
     });
   }
   const size_t n = out.size();
@@ -116,15 +117,68 @@ auto dense(const OccupancyFilter<D>& filter, const OptionalCell<D>& first_cell,
   return std::make_pair(box.first_cell(), box.shaped(std::move(out)));
 }
 
+// Number of values in a block of the dense array.
 template <int D>
-auto take_changed(OccupancyFilter<D>& filter) {
+constexpr size_t kBlockCells = static_cast<size_t>(BlockLayout<D>::kCells);
+
+template <int D>
+auto take_changed(OccupancyFilter<D>& filter, double odds_factor) {
+  require(odds_factor > 0.0, "odds_factor: expected a positive number");
   std::vector<int64_t> cells;
-  const auto blocks = filter.take_changed_blocks();
-  for (const Cell<D>& block : blocks) {
-    const Cell<D> cell = BlockLayout<D>::cell_at(block, 0);
-    cells.insert(cells.end(), cell.data(), cell.data() + D);
+  std::vector<float> tiles;
+  size_t count = 0;
+  {
+    nb::gil_scoped_release released;
+    for (const Cell<D>& origin : filter.take_changed_blocks()) {
+      const auto* block = filter.find(origin);
+      // in 3D most blocks are free space, of which there is too much to tell it all
+      if (!block || (D == 3 && !filter.has_surface(*block))) continue;
+      const Cell<D> first = BlockLayout<D>::cell_at(origin, 0);
+      cells.insert(cells.end(), first.data(), first.data() + D);
+      tiles.resize(++count * kBlockCells<D>, std::numeric_limits<float>::quiet_NaN());
+      float* tile = tiles.data() + (count - 1) * kBlockCells<D>;
+      filter.for_each_known_in(
+          *block, static_cast<float>(odds_factor),
+          [&](const Cell<D>& cell, float p) { tile[BlockLayout<D>::local_of(cell)] = p; });
+    }
   }
-  return to_numpy(std::move(cells), {blocks.size(), static_cast<size_t>(D)});
+  constexpr auto E = static_cast<size_t>(BlockLayout<D>::kEdge);
+  auto lowest = to_numpy(std::move(cells), {count, static_cast<size_t>(D)});
+  if constexpr (D == 2) {
+    return std::make_pair(lowest, to_numpy(std::move(tiles), {count, E, E}));
+  } else {
+    return std::make_pair(lowest, to_numpy(std::move(tiles), {count, E, E, E}));
+  }
+}
+
+template <int D>
+auto known_cells(const OccupancyFilter<D>& filter, double odds_factor) {
+  require(odds_factor > 0.0, "odds_factor: expected a positive number");
+  std::vector<int64_t> cells;
+  std::vector<float> p_occupied;
+  {
+    nb::gil_scoped_release released;
+    for (const auto& block : filter.blocks())
+      filter.for_each_surface_in(*block, static_cast<float>(odds_factor),
+                                 [&](const Cell<D>& cell, float p) {
+                                   cells.insert(cells.end(), cell.data(), cell.data() + D);
+                                   p_occupied.push_back(p);
+                                 });
+  }
+  const size_t n = p_occupied.size();
+  return std::make_pair(to_numpy(std::move(cells), {n, static_cast<size_t>(D)}),
+                        to_numpy(std::move(p_occupied), {n}));
+}
+
+template <int D>
+void forget_free_space(OccupancyFilter<D>& filter, const std::array<double, size_t{D}>& centre,
+                       double radius) {
+  require(radius >= 0.0 && std::isfinite(radius), "radius: expected a length that is not negative");
+  Vec<D> cells;
+  for (int d = 0; d < D; ++d) cells[d] = centre[static_cast<size_t>(d)] / filter.resolution();
+  require(cells.allFinite(), "centre: not finite");
+  nb::gil_scoped_release released;
+  filter.forget_free_space(cells, radius / filter.resolution());
 }
 
 template <int D>
@@ -183,9 +237,14 @@ void bind(nb::module_& m, const char* name) {
            "Lowest cell (D,), and P(static and occupied) as an array [(z,) y, x] float32 of a box "
            "of cells, by default of all; NaN where no beam passed or ended. The prior odds of "
            "static classes are those of the weights times odds_factor.")
-      .def("take_changed_blocks", &take_changed<D>,
-           "Lowest cells (B, D) int64 of the blocks that changed since the last call.")
+      .def("known_cells", &known_cells<D>, nb::kw_only(), nb::arg("odds_factor") = 1.0,
+           "Cells (K, D) int64 in which beams ended, and P(static and occupied) (K,) float32.")
+      .def("take_changed_blocks", &take_changed<D>, nb::kw_only(), nb::arg("odds_factor") = 1.0,
+           "Lowest cells (B, D) int64 of the blocks that changed since the last call, and their "
+           "values (B, [z,] y, x) as of `dense`; in 3D only blocks in which beams ended.")
       .def_prop_ro("block_count", [](const Filter& filter) { return filter.blocks().size(); })
+      .def("forget_free_space", &forget_free_space<D>, nb::arg("centre"), nb::arg("radius"),
+           "Removes blocks of free space only that are farther than a radius from a centre, m.")
       .def("sibling", &Filter::sibling, "An empty filter of the same kind.")
       .def("take_over", &take_over<D>, nb::arg("other"), nb::arg("motion").noconvert(),
            nb::arg("first"), nb::arg("count"),

@@ -84,6 +84,8 @@ class OccupancyFilter:
         for beam in beams:
             self._pass(beam, float(margin[beam.number]), time_bin, tag)
         for beam in beams:
+            self._add_filter(beam.end / self.resolution, tag)
+        for beam in beams:
             self._hit(beam.end / self.resolution, time_bin, tag)
 
     def label(self, points, hit, offset, T_map_sensor, prior):
@@ -162,12 +164,14 @@ class OccupancyFilter:
                 at.bins += 1
                 at.last_bin = time_bin
 
-    def _hit(self, end: Float, time_bin: int, tag: int) -> None:
+    def _add_filter(self, end: Float, tag: int) -> None:
         key = tuple(np.floor(end).astype(int).tolist())
         at = self.passed.setdefault(key, Passed())
         at.tag = tag
         if key not in self.filters:
             self.filters[key] = self._new_filter(at, tag)
+
+    def _hit(self, end: Float, time_bin: int, tag: int) -> None:
         for near in self._near(end):
             one = self.filters[near]
             self._open(one, time_bin)

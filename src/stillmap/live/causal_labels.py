@@ -8,8 +8,10 @@ from numpy.typing import NDArray
 import stillmap._core as _core
 from stillmap.core.grid_map import GridMap
 from stillmap.core.short_repr import ShortRepr
+from stillmap.em import CellProbabilities
 from stillmap.em.observations import P_DETECTION
 from stillmap.em.options import EmOptions
+from stillmap.live.observation import Observation
 from stillmap.live.scan import ScanBeams
 
 Float = NDArray[np.float64]
@@ -21,11 +23,10 @@ _DYNAMIC = ((0.04, 0.5), (0.04, 3.0), (0.15, 3.0), (0.04, 12.0), (0.04, 45.0))
 _LATERAL_STD = 0.4  # cells, of a beam's lateral position
 _HIT_RADIUS = 1.0  # cells from an end point to the centres of the cells that it hits
 _MAX_LOG_RATIO = 20.0  # nats: what stood for hours is known to be gone after a few bins
-# scans of a sensor in a time bin in which each beam is followed through the cells that it passed;
-# in others only its end counts
-_FOLLOWED, _MAX_STRIDE, _RATE_GAIN = 3.0, 8, 0.1
 _MAP_PRIOR = 0.5  # of static surface in the map: one look at a walker is no evidence for a wall
-_MARGIN, _MAX_MARGIN = 0.1, 1.0  # m behind a surface where a beam has passed it; at grazing angles
+# m before the end of a beam, or cells, that it has not passed; m at grazing angles
+_MARGIN, _MARGIN_CELLS, _MAX_MARGIN = 0.1, 1.0, 1.0
+_FREE_RADIUS, _FREE_STEP = 40.0, 10.0  # m around the robot where free space is kept in 3D
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +72,7 @@ class CausalLabels:
         self._prior, self._bin_ns = prior, round(1e9 * options.time_bin)
         self._first_ns: int | None = None
         self.tags = 1  # numbers of keyframes are below
-        self._rate = dict[str | int, _ScanRate]()
+        self._freed_at: Float | None = None  # where free space was forgotten last
 
     @property
     def resolution(self) -> float:
@@ -89,31 +90,36 @@ class CausalLabels:
         every, offset = np.ones(len(points), np.bool_), np.array([0, len(points)])
         return self.filter.label(points, every, offset, T_map_base[None], self._prior)
 
-    def add(self, beams: ScanBeams, T_map_base: Float, normals: Float, tag: int) -> None:
-        """Add the hits of a scan at a pose.
+    def add(
+        self, observation: Observation, T_map_base: Float, to: OccupancyFilter | None = None
+    ) -> None:
+        """Add the hits of a scan at a pose (D+1, D+1).
 
         Args:
-            beams: of the scan.
-            T_map_base: (D+1, D+1).
-            normals: (N, D) of the surfaces that were hit, in the sensor frame; 0: unknown.
-            tag: number of the keyframe by which the cells move when the map is corrected.
+            observation: of the scan.
+            T_map_base: its pose.
+            to: filters to add it to; None: those of the labels.
         """
+        beams, to = observation.beams, to or self.filter
         if self._first_ns is None:
             self._first_ns = beams.stamp_ns
         time_bin = max(beams.stamp_ns - self._first_ns, 0) // self._bin_ns
-        self.tags = max(self.tags, tag + 1)
+        self.tags = max(self.tags, observation.tag + 1)
         T = (T_map_base @ beams.T_base_sensor)[None]
-        margin = _margins(beams, normals) / np.float32(self.filter.resolution)
-        margin[~self._select_followed(beams)] = np.inf
-        offset = np.array([0, len(beams.points)])
-        self.filter.add(beams.points, beams.hit, margin, offset, T, time_bin=time_bin, tag=tag)
+        margin = _margins(beams, observation.normals, self.resolution)
+        margin[~observation.followed] = np.inf
+        offset, tag = np.array([0, len(beams.points)]), observation.tag
+        to.add(beams.points, beams.hit, margin, offset, T, time_bin=time_bin, tag=tag)
+        if beams.dimension == 3:
+            self._forget_free_space(T_map_base[:3, 3])
 
-    def _select_followed(self, beams: ScanBeams) -> NDArray[np.bool_]:
-        """(N,) beams to follow: fast sensors see the same several times in a time bin."""
-        rate = self._rate.setdefault(beams.sensor, _ScanRate())
-        rate.update(beams.stamp_ns)
-        stride = int(np.clip(self._bin_ns / (_FOLLOWED * max(rate.period_ns, 1.0)), 1, _MAX_STRIDE))
-        return np.asarray((np.arange(len(beams.points)) + rate.count) % stride == 0)
+    def _forget_free_space(self, position: Float) -> None:
+        """Forget the free space far away: memory grows with the surface, not with the volume."""
+        last = self._freed_at
+        if last is not None and np.linalg.norm(position - last) < _FREE_STEP:
+            return
+        self._freed_at = position.copy()
+        self.filter.forget_free_space(position.tolist(), _FREE_RADIUS)
 
     def to_map(self) -> GridMap:
         """The planar map of what stands; NaN: unknown."""
@@ -128,16 +134,15 @@ class CausalLabels:
         x, y = (first * self.resolution).tolist()
         return GridMap(p_occupied, (x, y, 0.0), self.resolution)
 
+    def known_cells(self) -> CellProbabilities:
+        """P(static and occupied) of the cells in which beams ended."""
+        cells, p_occupied = self.filter.known_cells(odds_factor=self._odds_factor)
+        return CellProbabilities(cells, p_occupied, 0.0)
+
     def take_changes(self) -> list[MapChange]:
         """The parts of the map that changed since the last call."""
-        lowest = self.filter.take_changed_blocks()
-        edge = 32 if lowest.shape[1] == 2 else 8
-        shape = [edge] * lowest.shape[1]
-        tiles = [
-            self.filter.dense(cell.tolist(), shape, odds_factor=self._odds_factor)[1]
-            for cell in lowest
-        ]
-        return list(map(MapChange, lowest, tiles))
+        first_cell, tiles = self.filter.take_changed_blocks(odds_factor=self._odds_factor)
+        return list(map(MapChange, first_cell, tiles))
 
 
 def take_over(
@@ -152,28 +157,12 @@ def take_over(
     return to.take_over(source, motion, first, count)
 
 
-@dataclass
-class _ScanRate:
-    """Running mean of the nanoseconds between the scans of a sensor, and their number."""
-
-    period_ns: float = np.inf
-    count: int = 0
-    last_ns: int = 0
-
-    def update(self, stamp_ns: int) -> None:
-        step = float(stamp_ns - self.last_ns)
-        if self.count == 1:
-            self.period_ns = step
-        elif self.count > 1:
-            self.period_ns += _RATE_GAIN * (step - self.period_ns)
-        self.count, self.last_ns = self.count + 1, stamp_ns
-
-
-def _margins(beams: ScanBeams, normals: Float) -> NDArray[np.float32]:
-    """(N,) m before the end of each beam that it has not passed."""
+def _margins(beams: ScanBeams, normals: Float, cell: float) -> NDArray[np.float32]:
+    """(N,) cells before the end of each beam that it has not passed."""
     points = np.where(beams.hit[:, None], beams.points, 0.0)
     length = np.maximum(np.linalg.norm(points, axis=1), 1e-6)
     cos = np.abs(np.einsum("nd,nd->n", points, normals)) / length
     cos[~normals.any(axis=1)] = 1.0
-    margin = np.minimum(_MARGIN / np.maximum(cos, 1e-3), _MAX_MARGIN)
-    return np.asarray(margin, np.float32)
+    least = max(_MARGIN, _MARGIN_CELLS * cell) if beams.dimension == 3 else _MARGIN
+    margin = np.minimum(least / np.maximum(cos, 1e-3), _MAX_MARGIN)
+    return np.asarray(margin / cell, np.float32)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 import stillmap._core as _core
 from stillmap.core import se2
 from stillmap.core.short_repr import ShortRepr
-from stillmap.live.scan import ScanBeams
+from stillmap.live.scan import ScanBeams, take_beams
 from stillmap.slam import scan_hits
 from stillmap.slam.local_map import SCAN_SPACING, SPACING_PER_SECOND
 
@@ -23,9 +23,9 @@ class MappedScan(ShortRepr):
     """A scan in a map.
 
     Attributes:
-        beams: of the scan.
+        beams: of the scan, as if all had been taken at its stamp.
         e: (N,) float32, P(static) with which it was added.
-        T_map_base: (3, 3).
+        T_map_base: (D+1, D+1).
         travelled: m up to it.
     """
 
@@ -38,12 +38,7 @@ class MappedScan(ShortRepr):
 def thin_scan(scan: MappedScan, max_beams: int) -> MappedScan:
     """Every k-th beam of a scan, as many as are wanted at most."""
     every = slice(None, None, max(-(-len(scan.e) // max_beams), 1))
-    beams = scan.beams
-    times = None if beams.beam_time is None else beams.beam_time[every].copy()
-    thinned = replace(
-        beams, points=beams.points[every].copy(), hit=beams.hit[every].copy(), beam_time=times
-    )
-    return replace(scan, beams=thinned, e=scan.e[every].copy())
+    return replace(scan, beams=take_beams(scan.beams, every), e=scan.e[every].copy())
 
 
 class MatchMap(Protocol):

@@ -15,6 +15,7 @@ import traceback
 from collections import deque
 from contextlib import suppress
 from dataclasses import asdict
+from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from stillmap.live.local_map import MappedScan
 from stillmap.live.loop_closer import Correction, LoopCloser
 from stillmap.live.messages import read_message, write_message
 from stillmap.live.scan import ScanBeams
+from stillmap.live.sweep_loop_closer import LiveSweepLoopCloser
 from stillmap.slam.options import SlamOptions
 
 Float = NDArray[np.float64]
@@ -39,11 +41,18 @@ class LoopProcess:
 
     Args:
         options: see SlamOptions.
+        dimension: 2 or 3.
+        folder: of temporary files; None: the system's.
     """
 
-    def __init__(self, options: SlamOptions) -> None:
+    def __init__(self, options: SlamOptions, dimension: int, folder: Path | None = None) -> None:
+        settings = {
+            "slam": asdict(options),
+            "dimension": dimension,
+            "folder": None if folder is None else str(folder),
+        }
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "stillmap.live.loop_process", json.dumps(asdict(options))],
+            [sys.executable, "-m", "stillmap.live.loop_process", json.dumps(settings)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
         )
@@ -166,9 +175,21 @@ class _Numbered(list[Any]):
         return key
 
 
-def _serve(options: SlamOptions, source: IO[bytes], target: IO[bytes]) -> None:
+def make_closer(
+    options: SlamOptions, dimension: int, folder: Path | None, threads: int
+) -> LoopCloser | LiveSweepLoopCloser:
+    """What closes loops in 2D or 3D, in this process."""
+    if dimension == 2:
+        return LoopCloser(options)
+    return LiveSweepLoopCloser(options, folder, threads)
+
+
+def _serve(settings: dict[str, Any], source: IO[bytes], target: IO[bytes]) -> None:
     """Close loops between the scans that arrive, until there are no more."""
-    closer = LoopCloser(options)
+    folder = None if settings["folder"] is None else Path(settings["folder"])
+    options = config.override(SlamOptions(), settings["slam"])
+    # one thread: the other cores answer scans
+    closer = make_closer(options, settings["dimension"], folder, threads=1)
     arrived: queue.SimpleQueue[dict[str, NDArray[Any]] | None] = queue.SimpleQueue()
 
     def listen() -> None:
@@ -186,10 +207,9 @@ def _serve(options: SlamOptions, source: IO[bytes], target: IO[bytes]) -> None:
 
 def main() -> None:
     """Serve the process that started this one."""
-    options = config.override(SlamOptions(), json.loads(sys.argv[1]))
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the other process decides when to end
     try:
-        _serve(options, sys.stdin.buffer, sys.stdout.buffer)
+        _serve(json.loads(sys.argv[1]), sys.stdin.buffer, sys.stdout.buffer)
     except BrokenPipeError:
         os._exit(0)  # the other process has ended
     except Exception:

@@ -1,5 +1,6 @@
 """Corrections of the map after loop closure, applied in parts so that no scan waits for them."""
 
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,11 +11,14 @@ from stillmap.core.short_repr import ShortRepr
 from stillmap.live.causal_labels import CausalLabels, OccupancyFilter, take_over
 from stillmap.live.local_map import LocalMap, MappedScan
 from stillmap.live.loop_closer import Correction
-from stillmap.live.scan import ScanBeams
+from stillmap.live.observation import Observation
 
 Float = NDArray[np.float64]
 
-_BLOCKS_PER_STEP, _SCANS_PER_STEP = 24, 4  # about 2 ms each
+# blocks of cells in 2D and 3D, scans of the local map: about 2 ms, in 3D 15 ms
+_BLOCKS_PER_STEP, _SCANS_PER_STEP = {2: 24, 3: 500}, 4
+_ADDED_PER_STEP = {2: 2, 3: 1}  # scans that came meanwhile
+_KEPT_EVERY_NS = {2: 0, 3: 500_000_000}  # between two of them
 # m that any spaced scan and that the last one move, and rad that it turns, up to which the map
 # stays as it is: constraints of loops have such errors themselves
 _SMALL = 0.1, 0.03, 0.005
@@ -26,16 +30,12 @@ class LabelledScan(ShortRepr):
     """A scan that was added to the labels.
 
     Attributes:
-        beams: of the scan.
-        T: (3, 3) pose of the base in the frame of the odometry by scans.
-        normals: (N, D), as of `CausalLabels.add`.
-        tag: likewise.
+        observation: of the scan.
+        T: (D+1, D+1) pose of the base in the frame of the odometry by scans.
     """
 
-    beams: ScanBeams
+    observation: Observation
     T: Float
-    normals: Float
-    tag: int
 
 
 class MapCorrection:
@@ -44,8 +44,8 @@ class MapCorrection:
     Args:
         correction: of the pose graph.
         labels: of the map so far.
-        spaced: (S, 3, 3) poses of the spaced scans in the frame of the odometry by scans.
-        poses: (S, 3, 3) the same in the map so far.
+        spaced: (S, D+1, D+1) poses of the spaced scans in the frame of the odometry by scans.
+        poses: (S, D+1, D+1) the same in the map so far.
     """
 
     def __init__(
@@ -55,46 +55,52 @@ class MapCorrection:
         self.poses = np.concatenate(
             [correction.poses, correction.T_map_local @ spaced[len(correction.poses) :]]
         )
-        self.local_map = LocalMap(labels.resolution)
+        self._D = poses.shape[-1] - 1
+        # in 3D the local map moves with its frame: it holds what is near, not what loops tie to it
+        self.local_map = LocalMap(labels.resolution) if self._D == 2 else None
         self._motion = self.poses @ se2.inverse(poses)
         self._source: OccupancyFilter = labels.filter
-        shift = np.hypot(*(self.poses - poses)[:, :2, 2].T)
-        turn = abs(float(se2.parameters(self._motion[-1])[2]))
+        D = self._D
+        shift = np.linalg.norm((self.poses - poses)[:, :D, D], axis=1)
+        # of a small rotation: that of R - I is the square root of two times as much
+        turn = float(np.linalg.norm(self._motion[-1, :D, :D] - np.eye(D))) / np.sqrt(2.0)
         self.is_small = bool(shift.max() < _SMALL[0] and shift[-1] < _SMALL[1] and turn < _SMALL[2])
         self.moves_cells = bool(shift.max() > _MIN_SHIFT * labels.resolution)
         self.filter: OccupancyFilter = self._source.sibling() if self.moves_cells else self._source
         self._block, self._scans = 0, sorted(correction.near, key=lambda scan: scan.travelled)
-        self._labelled: list[LabelledScan] = []
+        self._labelled = deque[LabelledScan]()
         self._added: list[MappedScan] = []
+        self._kept_ns = 0
 
     def note_labelled(self, scan: LabelledScan) -> None:
         """Tell of a scan that was added to the labels meanwhile."""
-        if self.moves_cells:
+        stamp_ns = scan.observation.beams.stamp_ns
+        if self.moves_cells and stamp_ns - self._kept_ns >= _KEPT_EVERY_NS[self._D]:
             self._labelled.append(scan)
+            self._kept_ns = stamp_ns
 
     def note_added(self, scan: MappedScan) -> None:
         """Tell of a scan that was added to the local map meanwhile."""
         self._added.append(scan)
 
-    def step(self) -> bool:
+    def step(self, labels: CausalLabels) -> bool:
         """Do a part of the work; True when nothing is left."""
         if self.moves_cells and self._block < self._source.block_count:
-            self._block = take_over(
-                self.filter, self._source, self._motion, self._block, _BLOCKS_PER_STEP
-            )
+            count = _BLOCKS_PER_STEP[self._D]
+            self._block = take_over(self.filter, self._source, self._motion, self._block, count)
             return False
-        if self._scans:
+        if self._scans and self.local_map is not None:
             self.local_map.extend(self._scans[:_SCANS_PER_STEP])
             self._scans = self._scans[_SCANS_PER_STEP:]
             return False
-        return True
+        for _ in range(min(_ADDED_PER_STEP[self._D], len(self._labelled))):
+            scan = self._labelled.popleft()
+            labels.add(scan.observation, self.T_map_local @ scan.T, self.filter)
+        return not self._labelled
 
     def finish(self, labels: CausalLabels) -> None:
-        """Replace the cells of the labels, and catch up with what came meanwhile."""
-        self.local_map.extend(self._added)
-        if not self.moves_cells:
-            return
-        labels.filter = self.filter
-        for scan in self._labelled:
-            T = self.T_map_local @ scan.T
-            labels.add(scan.beams, T, scan.normals, scan.tag)
+        """Replace the cells of the labels."""
+        if self.local_map is not None:
+            self.local_map.extend(self._added)
+        if self.moves_cells:
+            labels.filter = self.filter

@@ -3,11 +3,12 @@
 # signatures name ArrayLike instead of spelling it out
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+import stillmap._core as _core
 from stillmap.core.arrays import finite_rows
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io.array_checks import poses_to_matrices, require_length, stamps_to_ns, to_array
@@ -96,6 +97,33 @@ def to_beams(scan: Scan) -> ScanBeams:
         require_length("beam_times", len(times), len(points), "the beams")
     pose = _sensor_matrix(scan.sensor_pose, D)
     return ScanBeams(stamp_ns, points, hit, pose, scan.sensor, times)
+
+
+def take_beams(beams: ScanBeams, kept: NDArray[np.intp] | slice) -> ScanBeams:
+    """Some beams of a scan, copied."""
+    times = None if beams.beam_time is None else beams.beam_time[kept].copy()
+    points, hit = np.ascontiguousarray(beams.points[kept]), beams.hit[kept].copy()
+    return replace(beams, points=points.copy(), hit=hit, beam_time=times)
+
+
+def deskew(beams: ScanBeams, twist: Float) -> ScanBeams:
+    """A scan as if all its beams had been taken at its stamp.
+
+    Args:
+        beams: of the scan.
+        twist: (3,) or (6,) m/s and rad/s of the base in its own frame.
+    """
+    if beams.beam_time is None:
+        return beams
+    D, T = beams.dimension, beams.T_base_sensor
+    in_base = np.zeros((len(beams.points), 3), np.float32)
+    in_base[:, :D] = beams.points @ T[:D, :D].T + T[:D, D]
+    xi = twist if D == 3 else np.array([twist[0], twist[1], 0.0, 0.0, 0.0, twist[2]])
+    usable = finite_rows(in_base)
+    moved = np.full((len(in_base), D), np.nan)
+    moved[usable] = _core.transform_by_twist(in_base[usable], beams.beam_time[usable], xi)[:, :D]
+    points = ((moved - T[:D, D]) @ T[:D, :D]).astype(np.float32)
+    return replace(beams, points=points, beam_time=None)
 
 
 def _from_ranges(scan: Scan) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:

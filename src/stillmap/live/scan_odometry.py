@@ -1,15 +1,16 @@
 """Causal scan matching in 2D: each scan is matched (9) against a map of the scans before it."""
 
 from collections import deque
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.live.front_end import Registration
 from stillmap.live.local_map import LocalMap, MappedScan, MatchMap
-from stillmap.live.scan import ScanBeams
+from stillmap.live.scan import ScanBeams, deskew
+from stillmap.live.scan_hits import normals_of, select_hits, thin
 from stillmap.slam import kidnapping, motion_model
+from stillmap.slam.deskew import MAX_SPEED, MAX_TURN_RATE
 from stillmap.slam.kidnapping import Evidence
 from stillmap.slam.motion_model import MotionPrior, OdometryNoise, VelocityNoise
 from stillmap.slam.odometry_faults import SlipDetector
@@ -43,29 +44,6 @@ class _LatestIncrement:
 
     def __getitem__(self, index: int, /) -> Float:
         return _UNKNOWN if self.value is None else self.value
-
-
-@dataclass(frozen=True)
-class Registration:
-    """A registered scan.
-
-    Attributes:
-        T: (3, 3) pose of the base in the frame of the odometry by scans, which never jumps.
-        covariance: (3, 3) of x, y (axes of that frame) and heading, against the local map.
-        explained: share of the beams that the local map explains.
-        drift: (3, 3) covariance that the step adds where the scan says nothing.
-        is_slipping: odometry disagrees with the scans.
-        is_blind: no beam met anything that the local map knows.
-        is_carried: the scans contradict the local map, which begins anew.
-    """
-
-    T: Float
-    covariance: Float
-    explained: float
-    drift: Float
-    is_slipping: bool = False
-    is_blind: bool = False
-    is_carried: bool = False
 
 
 class ScanOdometry:
@@ -105,17 +83,26 @@ class ScanOdometry:
             return motion_model.odometry_prior(self._pose, increment, self.options.odometry)
         return guess
 
+    def select(self, beams: ScanBeams, prior: MotionPrior) -> Scan:
+        """The hits of a scan with weight 1, without the motion that is predicted during it."""
+        return select_hits(deskew(beams, self._twist_to(prior.T_map_base, beams.stamp_ns)))
+
+    def end_points(self, hits: Scan, prior: MotionPrior) -> tuple[NDArray[np.float32], Float]:
+        """(N, 2) points in the base frame at the stamp, and its pose, as predicted."""
+        return hits.points, prior.T_map_base
+
     def register(
-        self, beams: ScanBeams, scan: Scan, prior: MotionPrior, increment: Float | None
+        self, beams: ScanBeams, hits: Scan, prior: MotionPrior, increment: Float | None
     ) -> Registration:
         """Register a scan.
 
         Args:
             beams: of the scan.
-            scan: its hits with weights P(static).
+            hits: with weights P(static).
             prior: of `predict`.
             increment: as of `predict`.
         """
+        scan, twist = thin(hits), self._twist_to(prior.T_map_base, beams.stamp_ns)
         usual = self._usual.get(beams.sensor, 0.0)
         guess = self._guess()
         match, is_slipping, is_carried = self._match(beams, scan, prior, increment, usual)
@@ -128,7 +115,14 @@ class ScanOdometry:
         self._learn(beams, learned, match, usual)
         self._advance(beams, match.T_map_base)
         doubts = is_slipping, is_blind, is_carried
-        return Registration(match.T_map_base, match.covariance, match.explained, drift, *doubts)
+        T, covariance = match.T_map_base, match.covariance
+        return Registration(T, covariance, match.explained, drift, twist, *doubts)
+
+    def find_normals(
+        self, beams: ScanBeams, hits: Scan, followed: NDArray[np.bool_], T: Float
+    ) -> Float:
+        """(N, 2) normals of the surfaces that beams met, in the sensor frame; 0: unknown."""
+        return normals_of(beams, hits)
 
     def add(self, beams: ScanBeams, e: NDArray[np.float32]) -> MappedScan | None:
         """Add the last scan to the local map, with P(static) e (N,), unless it is too close to the
@@ -214,6 +208,15 @@ class ScanOdometry:
         seconds = 1e-9 * (beams.stamp_ns - self._stamp_ns)
         metres = float(np.hypot(*increment[:2, 2]))
         return metres <= max(_LEAP, _MAX_SPEED * seconds)
+
+    def _twist_to(self, T: Float, stamp_ns: int) -> Float:
+        """(3,) m/s and rad/s from the last pose to one; 0 for a leap."""
+        seconds = 1e-9 * (stamp_ns - self._stamp_ns)
+        if self._is_first or seconds <= 0.0:
+            return np.zeros(3)
+        twist: Float = se2.log((se2.inverse(self._pose) @ T)[None])[0] / seconds
+        is_leap = np.hypot(*twist[:2]) > MAX_SPEED or abs(twist[2]) > MAX_TURN_RATE
+        return np.zeros(3) if is_leap else twist
 
     def _is_reachable(self, beams: ScanBeams, T: Float) -> bool:
         return self._is_plausible(se2.inverse(self._pose) @ T, beams)

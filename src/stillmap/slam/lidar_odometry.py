@@ -26,8 +26,8 @@ _CELL, _LEVELS, _MAX_WEIGHT = 0.4, 4, 60.0
 # planes: beams around a position; variance across against variance along; variance along in square
 # edges
 _MIN_WEIGHT, _MAX_FLATNESS, _MIN_EXTENT = 5.0, 0.1, 0.02
-_MAX_RANGE = 100.0  # m to which the local map is kept
-_CROP_STEP = 0.1  # of that, after which the map is cropped again
+MAX_RANGE = 100.0  # m to which the local map is kept
+CROP_STEP = 10.0  # m of travel after which the map is cropped again
 _MAP_SPACING = 0.2  # m between the points of a sweep that enter the map
 # points that are registered: m between them, their number, factor of the spacing while too many
 _POINT_SPACING, _MAX_POINTS, _SPACING_FACTOR = 0.35, 4000, 1.25
@@ -87,17 +87,47 @@ def select_sweep(recording: Recording, e: NDArray[np.float32], t: int) -> Sweep:
 
     e: (M,) P(static) of every beam.
     """
-    beams = recording.beams_of(t)
-    points = np.asarray(recording.points[beams])
+    beams, times = recording.beams_of(t), recording.beam_time
+    sweep, _ = make_sweep(
+        np.asarray(recording.points[beams]),
+        np.asarray(recording.hit[beams]),
+        e[beams],
+        None if times is None else np.asarray(times[beams]),
+        recording.T_base_sensor[recording.sensor[t]],
+    )
+    return sweep
+
+
+def make_sweep(
+    points: Points,
+    hit: NDArray[np.bool_],
+    e: NDArray[np.float32],
+    times: NDArray[np.float32] | None,
+    T_base_sensor: Float,
+) -> tuple[Sweep, NDArray[np.int64]]:
+    """The first hit in each voxel within the range of the map, and the indices of these beams.
+
+    Args:
+        points: (N, 3) in the sensor frame.
+        hit: (N,).
+        e: (N,) P(static).
+        times: (N,) s from the stamp; None: all beams have it.
+        T_base_sensor: (4, 4).
+    """
     with np.errstate(invalid="ignore"):
-        near = np.einsum("ni,ni->n", points, points) <= _MAX_RANGE * _MAX_RANGE
-    weights = np.where(recording.hit[beams] & near, e[beams], np.float32(0.0))
+        near = np.einsum("ni,ni->n", points, points) <= MAX_RANGE * MAX_RANGE
+    weights = np.where(hit & near, e, np.float32(0.0))
     kept = _core.voxel_downsample(points, weights, _MAP_SPACING)
-    T = recording.T_base_sensor[recording.sensor[t]]
-    in_base = (points[kept] @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
-    times = recording.beam_time
-    seconds = np.zeros(len(kept), np.float32) if times is None else np.asarray(times[beams])[kept]
-    return Sweep(np.ascontiguousarray(in_base), weights[kept], seconds)
+    in_base = (points[kept] @ T_base_sensor[:3, :3].T + T_base_sensor[:3, 3]).astype(np.float32)
+    seconds = np.zeros(len(kept), np.float32) if times is None else times[kept]
+    return Sweep(np.ascontiguousarray(in_base), weights[kept], seconds), kept
+
+
+def initial_state(twist: Float | None = None) -> State:
+    """The state at the origin before the first sweep, with a twist (6,) if it is known."""
+    if twist is None:
+        return constant_velocity.initial_state(np.zeros(6), _INITIAL_SPEED, _INITIAL_TURN_RATE)
+    return constant_velocity.initial_state(twist, _FIRST_STD, _FIRST_STD)
 
 
 def downsample_sweep(sweep: Sweep) -> Sweep:
@@ -143,12 +173,12 @@ def register_sweeps(
     if T == 0:
         none = np.zeros((0, 6, 6))
         return LidarOdometry(np.zeros((0, 4, 4)), none[:, 0], none, np.zeros(0))
-    start = constant_velocity.initial_state(np.zeros(6), _INITIAL_SPEED, _INITIAL_TURN_RATE)
+    start = initial_state()
     odometry = _SweepOdometry(recording, e, options, threads)
     for _ in range(_FIRST_ROUNDS if T > 1 else 0):
         found = odometry.run(start, min(_FIRST_SWEEPS, T), lambda *_: None)
         twist = _initial_twist(recording, found.poses)
-        start = constant_velocity.initial_state(twist, _FIRST_STD, _FIRST_STD)
+        start = initial_state(twist)
     return odometry.run(start, T, progress)
 
 
@@ -186,11 +216,11 @@ class _SweepOdometry:
                     local, downsample_sweep(sweep), prior, self.threads
                 )
             poses[t], twists[t] = state.T_map_base, state.twist
-            covariance[t] = _rotate_to_map(state)
+            covariance[t] = rotate_to_map(state)
             local.add(sweep.deskew(state.twist), sweep.weights, state.T_map_base)
-            if np.linalg.norm(poses[t, :3, 3] - cropped_at) > _CROP_STEP * _MAX_RANGE:
+            if np.linalg.norm(poses[t, :3, 3] - cropped_at) > CROP_STEP:
                 cropped_at = poses[t, :3, 3].copy()
-                local.crop(poses[t], _MAX_RANGE)
+                local.crop(poses[t], MAX_RANGE)
             progress(t + 1, n)
         return LidarOdometry(poses, twists, covariance, explained)
 
@@ -257,7 +287,7 @@ def _prior_distance(covariance: Float) -> float:
     return float(np.sqrt(max(place, 1e-12)) + _LEVER_ARM * np.sqrt(max(turn, 0.0)))
 
 
-def _rotate_to_map(state: State) -> Float:
+def rotate_to_map(state: State) -> Float:
     """(6, 6) covariance of the pose along the axes of the map."""
     turn = np.kron(np.eye(2), state.T_map_base[:3, :3])
     out: Float = turn @ state.covariance[:6, :6] @ turn.T

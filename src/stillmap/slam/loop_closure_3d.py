@@ -23,7 +23,7 @@ from stillmap.slam.types import Index, LoopClosure, ScanProgress
 
 Float = NDArray[np.float64]
 
-_KEYFRAME_DISTANCE, _SEARCH_DISTANCE = 2.0, 8.0  # m, defaults of the options
+KEYFRAME_DISTANCE, SEARCH_DISTANCE = 2.0, 8.0  # m, defaults of the options
 # m after which a place counts as revisited; m of travel to either side that forms a submap: at most
 # half of that, or a sweep may lie in the submap it is registered to
 _MIN_LOOP_TRAVEL, _SUBMAP_TRAVEL = 40.0, 15.0
@@ -36,7 +36,7 @@ _CLOSURE_ROTATION = 0.002  # rad, min std of a closure
 _MIN_EXPLAINED_RATIO = 0.75  # of the share that the local map explained
 _MIN_PLANE_OVERLAP = 0.55  # share of planes, balanced over their directions, that meet earlier ones
 _MAX_OCCLUDED = 0.1  # share of beams through the submap, beyond that of the sweep at its center
-_MAX_CHI2 = 25.0  # 6 degrees of freedom; above it the graph rejects a loop
+MAX_CHI2 = 25.0  # 6 degrees of freedom; above it the graph rejects a loop
 _GRID_CELL, _WALL_MARGIN = 0.4, 1.0  # m: cells in which beams are traced; before the end of a beam
 
 
@@ -61,7 +61,7 @@ def close_loops_3d(
     poses = odometry.poses
     if len(poses) < 2:
         return poses, [], None
-    distance = options.keyframe_distance or _KEYFRAME_DISTANCE
+    distance = options.keyframe_distance or KEYFRAME_DISTANCE
     keyframes = local_map.select_keyframes(poses, distance, KEYFRAME_ANGLE)
     travelled = local_map.travelled_distance(poses)
     search = options.loop_search_distance
@@ -71,14 +71,14 @@ def close_loops_3d(
         odometry,
         travelled,
         keyframes,
-        _SEARCH_DISTANCE if search is None else search,
+        SEARCH_DISTANCE if search is None else search,
         threads,
     )
     found, chain = closer.search_loops(progress), closer.odometry_constraints()
     start = poses[keyframes]
     if all(closure.rejected for closure in found):
         return poses, found, PoseGraph(keyframes, start, chain)
-    corrected, found = solve_graph(keyframes, chain, start, found, _MAX_CHI2)
+    corrected, found = solve_graph(keyframes, chain, start, found, MAX_CHI2)
     graph = PoseGraph(keyframes, corrected, [*chain, *accepted_constraints(keyframes, found)])
     return local_map.propagate_corrections(poses, keyframes, corrected), found, graph
 
@@ -89,6 +89,19 @@ def _drift_std(metres: float) -> tuple[float, float]:
         float(np.hypot(_MIN_DRIFT[0], _DRIFT_TRANSLATION * metres)),
         float(np.hypot(_MIN_DRIFT[1], DRIFT_ROTATION * metres)),
     )
+
+
+class LoopSearch:
+    """Keyframes as the loops found so far correct them.
+
+    Args:
+        keyframes: their number.
+    """
+
+    def __init__(self, keyframes: int) -> None:
+        self.corrected = np.zeros((keyframes, 4, 4))
+        self.correction = np.eye(4)  # of what follows
+        self.since = 0.0  # m of travel up to the last loop
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,28 +139,38 @@ class SweepLoopCloser:
         An accepted closure corrects the keyframes that follow, and drift counts from there.
         """
         poses, found = self.odometry.poses, list[LoopClosure]()
-        correction, since = np.eye(4), 0.0
-        corrected = poses[self.keyframes].copy()
+        search = LoopSearch(len(self.keyframes))
         for k, t in enumerate(self.keyframes.tolist()):
             progress(t, len(poses))
-            corrected[k] = correction @ poses[t]
-            here = self.travelled[t]
-            earlier = here - _MIN_LOOP_TRAVEL
-            n = int(np.searchsorted(self.travelled[self.keyframes], earlier))
-            if n == 0:
-                continue
-            distance = np.linalg.norm(corrected[:n, :3, 3] - corrected[k, :3, 3], axis=1)
-            i = int(np.argmin(distance))
-            metres = here - max(since, float(self.travelled[self.keyframes[i]]))
-            if distance[i] > self.search_distance + _drift_std(metres)[0]:
-                continue
-            T = se2.inverse(corrected[i]) @ corrected[k]
-            closure = self.verify(int(self.keyframes[i]), t, T, *_drift_std(metres))
-            found.append(closure)
-            if not closure.rejected:
-                corrected[k] = corrected[i] @ closure.T
-                correction, since = corrected[k] @ se2.inverse(poses[t]), here
+            closure = self.search_keyframe(k, search)
+            if closure is not None:
+                found.append(closure)
         return found
+
+    def search_keyframe(self, k: int, search: "LoopSearch") -> LoopClosure | None:
+        """The closure of keyframe k with an earlier one, if one is near enough.
+
+        Args:
+            k: keyframe.
+            search: of the keyframes before; updated.
+        """
+        t, poses, corrected = int(self.keyframes[k]), self.odometry.poses, search.corrected
+        corrected[k] = search.correction @ poses[t]
+        here = self.travelled[t]
+        n = int(np.searchsorted(self.travelled[self.keyframes], here - _MIN_LOOP_TRAVEL))
+        if n == 0:
+            return None
+        distance = np.linalg.norm(corrected[:n, :3, 3] - corrected[k, :3, 3], axis=1)
+        i = int(np.argmin(distance))
+        metres = here - max(search.since, float(self.travelled[self.keyframes[i]]))
+        if distance[i] > self.search_distance + _drift_std(metres)[0]:
+            return None
+        T = se2.inverse(corrected[i]) @ corrected[k]
+        closure = self.verify(int(self.keyframes[i]), t, T, *_drift_std(metres))
+        if not closure.rejected:
+            corrected[k] = corrected[i] @ closure.T
+            search.correction, search.since = corrected[k] @ se2.inverse(poses[t]), here
+        return closure
 
     def verify(
         self, earlier: int, later: int, T: Float, translation_std: float, rotation_std: float
@@ -179,7 +202,7 @@ class SweepLoopCloser:
         if self._occluded_share(grid, sweep, later, state) > usual + _MAX_OCCLUDED:
             return closure.reject("passes through occupied space")
         off = se3.log(se2.inverse(T) @ found)
-        if off @ np.linalg.solve(covariance[:6, :6], off) > _MAX_CHI2:
+        if off @ np.linalg.solve(covariance[:6, :6], off) > MAX_CHI2:
             return closure.reject("exceeds the possible drift")
         return closure
 

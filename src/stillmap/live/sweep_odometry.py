@@ -1,0 +1,200 @@
+"""Causal scan matching in 3D: each sweep is registered to a map of the sweeps before it."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+import stillmap._core as _core
+from stillmap.core import se2, se3
+from stillmap.live.front_end import Registration
+from stillmap.live.local_map import MappedScan
+from stillmap.live.scan import ScanBeams, take_beams
+from stillmap.slam import constant_velocity, lidar_odometry
+from stillmap.slam.constant_velocity import State
+from stillmap.slam.lidar_odometry import Sweep
+from stillmap.slam.local_map import KEYFRAME_ANGLE
+from stillmap.slam.loop_closure_3d import KEYFRAME_DISTANCE
+from stillmap.slam.options import SlamOptions
+
+Float = NDArray[np.float64]
+
+# sweeps from which the motion during the first one is found; m/s and rad/s of it that matter
+_FIRST_SWEEPS, _MIN_MOTION = 5, 0.05
+_EXPLAINED_RATE = 0.1  # weight of one sweep in the running average of the explained share
+_POOR_SHARE = 0.5  # of the usual explained share, below which a sweep contradicts the local map
+_CARRIED_AFTER = 20  # sweeps that contradict the local map, without one that agrees
+
+
+class SweepOdometry:
+    """Poses of sweeps as they arrive.
+
+    Args:
+        options: see SlamOptions.
+        threads: the result does not depend on it.
+    """
+
+    def __init__(self, options: SlamOptions, threads: int) -> None:
+        self.local_map = lidar_odometry.make_local_map()
+        self.travelled = 0.0
+        self._options, self._threads = options, threads
+        self._state = lidar_odometry.initial_state()
+        self._stamp_ns: int | None = None
+        self._kept = np.zeros(0, np.int64)  # beams of the last sweep that are registered
+        self._usual, self._contradictions = 0.0, 0
+        self._is_slipping = False
+        self._cropped_at = np.zeros(3)
+        self._since = np.inf  # travel since the last keyframe, in units of their spacing
+        self._first = list[tuple[int, Sweep]]()  # stamps and sweeps
+
+    def predict(self, beams: ScanBeams, increment: Float | None) -> State:
+        """The prior of the next sweep: constant velocity, corrected by odometry.
+
+        Args:
+            beams: of the sweep.
+            increment: (4, 4) of odometry since the last sweep; None: there is none.
+        """
+        self._is_slipping = False
+        if self._stamp_ns is None:
+            return self._state
+        seconds, state = 1e-9 * (beams.stamp_ns - self._stamp_ns), self._state
+        if increment is not None:
+            state = constant_velocity.update_with_odometry(
+                state, increment, seconds, self._options.odometry
+            )
+            self._is_slipping = state is self._state  # gated
+        return constant_velocity.predict(state, seconds)
+
+    def select(self, beams: ScanBeams, prior: State) -> Sweep:
+        """The hits of a sweep, one for each voxel, with weight 1."""
+        every = np.ones(len(beams.points), np.float32)
+        sweep, self._kept = lidar_odometry.make_sweep(
+            beams.points, beams.hit, every, beams.beam_time, beams.T_base_sensor
+        )
+        return sweep
+
+    def end_points(self, hits: Sweep, prior: State) -> tuple[NDArray[np.float32], Float]:
+        """(N, 3) points in the base frame at the stamp, and its pose, as predicted."""
+        return hits.deskew(prior.twist), prior.T_map_base
+
+    def register(
+        self, beams: ScanBeams, hits: Sweep, prior: State, increment: Float | None
+    ) -> Registration:
+        """Register a sweep by its hits with weights P(static)."""
+        state, explained, is_blind = prior, 1.0, not float(hits.weights.sum()) > 0.0
+        if self._stamp_ns is not None and not is_blind:
+            registered = lidar_odometry.downsample_sweep(hits)
+            state, explained = lidar_odometry.register_sweep(
+                self.local_map, registered, prior, self._threads
+            )
+        is_carried = self._is_carried(explained)
+        if is_carried:
+            self._start_anew()
+            state = prior
+        self._advance(state, beams.stamp_ns)
+        self._note_first(beams.stamp_ns, hits)
+        state = self._state
+        return Registration(
+            state.T_map_base,
+            lidar_odometry.rotate_to_map(state),
+            explained,
+            np.zeros((3, 3)),
+            state.twist,
+            self._is_slipping,
+            is_blind,
+            is_carried,
+        )
+
+    def find_normals(
+        self, beams: ScanBeams, hits: Sweep, followed: NDArray[np.bool_], T: Float
+    ) -> Float:
+        """(N, 3) normals of the planes that the followed beams met, in the sensor frame; 0: none.
+
+        Args:
+            beams: of the sweep, as if taken at its stamp.
+            hits: of the sweep.
+            followed: (N,) bool.
+            T: (4, 4) pose of the base in the frame of the local map.
+        """
+        out = np.zeros(beams.points.shape)
+        in_base = beams.points[followed] @ beams.T_base_sensor[:3, :3].T
+        in_base = (in_base + beams.T_base_sensor[:3, 3]).astype(np.float64)
+        normals, known = lidar_odometry.match_planes(self.local_map, in_base, T)
+        out[followed] = np.where(known[:, None], normals, 0.0) @ beams.T_base_sensor[:3, :3]
+        return out
+
+    def add(self, beams: ScanBeams, e: NDArray[np.float32]) -> MappedScan | None:
+        """Add the last sweep to the local map, with P(static) e (N,); the sweep if it is a
+        keyframe.
+
+        Args:
+            beams: as if taken at the stamp.
+            e: of them.
+        """
+        kept, state = take_beams(beams, self._kept), self._state
+        T, weights = kept.T_base_sensor, e[self._kept]
+        in_base = (kept.points @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
+        self.local_map.add(in_base, weights, state.T_map_base)
+        here = state.T_map_base[:3, 3]
+        if np.linalg.norm(here - self._cropped_at) > lidar_odometry.CROP_STEP:
+            self._cropped_at = here.copy()
+            self.local_map.crop(state.T_map_base, lidar_odometry.MAX_RANGE)
+        if self._since < 1.0:
+            return None
+        self._since = 0.0
+        return MappedScan(kept, weights, state.T_map_base, self.travelled)
+
+    def enter(self, local_map: _core.NdtMap3D, T: Float) -> None:
+        """Go on in another map, in whose frame the frame so far has the pose T (4, 4)."""
+        self.local_map = local_map
+        state = self._state
+        self._state = State(T @ state.T_map_base, state.twist, state.covariance)
+
+    def _advance(self, state: State, stamp_ns: int) -> None:
+        step = se2.inverse(self._state.T_map_base) @ state.T_map_base
+        metres = float(np.linalg.norm(step[:3, 3]))
+        self.travelled += metres
+        self._since += metres / (self._options.keyframe_distance or KEYFRAME_DISTANCE)
+        self._since += float(np.linalg.norm(se3.log_rotation(step[:3, :3]))) / KEYFRAME_ANGLE
+        self._state, self._stamp_ns = state, stamp_ns
+
+    def _is_carried(self, explained: float) -> bool:
+        """True when so many sweeps in a row contradicted the local map."""
+        if self._stamp_ns is None:
+            return False
+        if explained < _POOR_SHARE * self._usual:
+            self._contradictions += 1
+        else:
+            self._contradictions = 0
+            rate = _EXPLAINED_RATE if self._usual > 0.0 else 1.0  # 0: the first sweep of a map
+            self._usual += rate * (explained - self._usual)
+        return self._contradictions >= _CARRIED_AFTER
+
+    def _start_anew(self) -> None:
+        self.local_map = lidar_odometry.make_local_map()
+        self._usual, self._contradictions = 0.0, 0
+
+    def _note_first(self, stamp_ns: int, hits: Sweep) -> None:
+        """Register the first sweeps again once the motion during the first one is known: it was
+        distorted, and all later ones would be distorted to match it."""
+        if len(self._first) == _FIRST_SWEEPS:
+            return
+        self._first.append((stamp_ns, hits))
+        state = self._state
+        is_known = len(self._first) == _FIRST_SWEEPS
+        if not is_known or np.abs(state.twist).max() < _MIN_MOTION or not hits.times.any():
+            return
+        # constant motion over these sweeps: their stamps are half a second apart at most
+        start = lidar_odometry.initial_state(state.twist)
+        self.local_map = lidar_odometry.make_local_map()
+        for number, (stamp, sweep) in enumerate(self._first[:-1]):
+            if number:
+                prior = constant_velocity.predict(start, 1e-9 * (stamp - before))
+                registered = lidar_odometry.downsample_sweep(sweep)
+                start, _ = lidar_odometry.register_sweep(
+                    self.local_map, registered, prior, self._threads
+                )
+            before = stamp
+            self.local_map.add(sweep.deskew(start.twist), sweep.weights, start.T_map_base)
+        prior = constant_velocity.predict(start, 1e-9 * (stamp_ns - before))
+        self._state, _ = lidar_odometry.register_sweep(
+            self.local_map, lidar_odometry.downsample_sweep(hits), prior, self._threads
+        )
