@@ -73,6 +73,13 @@ class CausalLabels:
         self._first_ns: int | None = None
         self.tags = 1  # numbers of keyframes are below
         self._freed_at: Float | None = None  # where free space was forgotten last
+        # blocks that were told of, as bytes, and the filter that has them
+        self._told, self._told_of = set[bytes](), self.filter
+
+    def clear(self) -> None:
+        """Forget all scans."""
+        self.filter, self._first_ns, self.tags = self.filter.sibling(), None, 1
+        self._freed_at = None
 
     @property
     def resolution(self) -> float:
@@ -100,7 +107,7 @@ class CausalLabels:
             T_map_base: its pose.
             to: filters to add it to; None: those of the labels.
         """
-        beams, to = observation.beams, to or self.filter
+        beams, to = observation.beams, self.filter if to is None else to
         if self._first_ns is None:
             self._first_ns = beams.stamp_ns
         time_bin = max(beams.stamp_ns - self._first_ns, 0) // self._bin_ns
@@ -140,9 +147,18 @@ class CausalLabels:
         return CellProbabilities(cells, p_occupied, 0.0)
 
     def take_changes(self) -> list[MapChange]:
-        """The parts of the map that changed since the last call."""
-        first_cell, tiles = self.filter.take_changed_blocks(odds_factor=self._odds_factor)
-        return list(map(MapChange, first_cell, tiles))
+        """The parts of the map that changed since the last call, those that emptied too."""
+        lowest, tiles = self.filter.take_changed_blocks(odds_factor=self._odds_factor)
+        changes = list(map(MapChange, lowest, tiles))
+        told = {cell.tobytes() for cell in lowest}
+        if self.filter is not self._told_of:  # the whole map was moved
+            gone = sorted(self._told - told)
+            emptied = np.frombuffer(b"".join(gone), lowest.dtype).reshape(-1, lowest.shape[1])
+            unknown = np.full(tiles.shape[1:], np.nan, np.float32)
+            changes += [MapChange(cell, unknown) for cell in emptied]
+            self._told, self._told_of = set(), self.filter
+        self._told |= told
+        return changes
 
 
 def take_over(
