@@ -5,21 +5,25 @@
 
 #include <array>
 #include <limits>
+#include <utility>
 #include <vector>
 
 #include "arrays.hpp"
 #include "bindings.hpp"
 #include "cell_box.hpp"
 #include "stillmap/occupancy/occupancy_filter.hpp"
+#include "stillmap/occupancy/sweep_filter.hpp"
 
 namespace stillmap::bindings {
 namespace {
 
-template <int D>
+constexpr float kUnknown = std::numeric_limits<float>::quiet_NaN();
+constexpr double kMinPixel = 0.004;  // radians: the image of a sweep has a few MB at most
+
 void check_options(double resolution, const FilterOptions& options) {
   require(resolution > 0.0 && std::isfinite(resolution), "resolution: expected a positive length");
   const size_t n = options.rho.size();
-  require(n > 0 && n <= OccupancyFilter<D>::kMaxClasses, "rho: expected 1 to 32 classes");
+  require(n > 0 && n <= CellFilters::kMaxClasses, "rho: expected 1 to 32 classes");
   require(options.tau.size() == n && options.weights.size() == n,
           "tau, weights: expected one for each class");
   require(options.n_static > 0 && options.n_static < n,
@@ -37,11 +41,12 @@ void check_options(double resolution, const FilterOptions& options) {
   require(options.max_log_ratio > 0.0, "max_log_ratio: expected positive nats");
 }
 
-template <int D>
-auto add(OccupancyFilter<D>& filter, const Points<D>& points, const Flat<bool>& hit,
-         const Flat<float>& margin, const Flat<int64_t>& offset, const Poses<D>& poses,
-         int64_t time_bin, int32_t tag) {
-  const auto scans = scans_from<D>(points, hit, offset, poses);
+using Filter2D = OccupancyFilter<2>;
+
+void add_scan(Filter2D& filter, const Points<2>& points, const Flat<bool>& hit,
+              const Flat<float>& margin, const Flat<int64_t>& offset, const Poses<2>& poses,
+              int64_t time_bin, int32_t tag) {
+  const auto scans = scans_from<2>(points, hit, offset, poses);
   const float* cells = per_beam(margin, points.shape(0), "margin");
   for (size_t n = 0; n < points.shape(0); ++n)
     require(cells[n] >= 0.0f, "margin: expected lengths in cells that are not negative");
@@ -50,66 +55,75 @@ auto add(OccupancyFilter<D>& filter, const Points<D>& points, const Flat<bool>& 
   filter.add(scans, cells, time_bin, tag);
 }
 
-template <int D>
-void prime(OccupancyFilter<D>& filter, const Cells<D>& cells, const Flat<bool>& occupied,
-           double log_ratio) {
+void add_sweep(SweepFilter& filter, const Points<3>& points, const Flat<bool>& hit,
+               const Flat<int64_t>& offset, const Poses<3>& poses,
+               const std::array<double, 2>& pixel, int64_t time_bin, int32_t tag) {
+  const auto sweep = scans_from<3>(points, hit, offset, poses);
+  require(sweep.n_scans == 1, "T_map_sensor: expected one pose, of one sweep");
+  for (const double angle : pixel)
+    require(angle >= kMinPixel && angle < 1.0, "pixel: expected angles of 0.004 to 1 rad");
+  require(tag >= 0, "tag: expected a number that is not negative");
+  const PixelSize size{static_cast<float>(pixel[0]), static_cast<float>(pixel[1])};
+  nb::gil_scoped_release released;
+  filter.add(sweep, size, time_bin, tag);
+}
+
+void prime(Filter2D& filter, const Cells<2>& cells, const Flat<bool>& occupied, double log_ratio) {
   const size_t n = cells.shape(0);
   require(occupied.shape(0) == n, "occupied: expected as many entries as cells has rows");
   require(log_ratio >= 0.0, "log_ratio: expected nats that are not negative");
   for (size_t k = 0; k < n; ++k)
-    filter.prime(cell_from<D>(cells, k), occupied.data()[k], log_ratio);
+    filter.prime(cell_from<2>(cells, k), occupied.data()[k], log_ratio);
 }
 
-template <int D>
-auto label(const OccupancyFilter<D>& filter, const Points<D>& points, const Flat<bool>& hit,
-           const Flat<int64_t>& offset, const Poses<D>& poses, double prior) {
+template <class Filter>
+auto label(Filter& filter, const Points<Filter::kDimension>& points, const Flat<bool>& hit,
+           const Flat<int64_t>& offset, const Poses<Filter::kDimension>& poses, double prior) {
+  constexpr int D = Filter::kDimension;
   require_probability(prior, "prior");
   const auto scans = scans_from<D>(points, hit, offset, poses);
   const auto otherwise = static_cast<float>(prior);
-  std::vector<float> out(points.shape(0), std::numeric_limits<float>::quiet_NaN());
+  std::vector<float> out(points.shape(0), kUnknown);
   {
     nb::gil_scoped_release released;
-    std::vector<float> known(filter.size(), -1.0f);
-    typename OccupancyFilter<D>::ConstCursor cursor(filter);
+    typename Filter::ConstCursor cursor(filter);
     for_each_beam<D>(scans, 0, scans.n_scans, [&](size_t, int64_t n, const Pose<D>& pose) {
       const BeamSegment<D> beam(pose, scans.points + n * D, filter.resolution());
       out[static_cast<size_t>(n)] =
-          scans.hit[n] ? filter.p_static_at(cursor, beam.end, otherwise, known) : otherwise;
+          scans.hit[n] ? filter.p_static_at(cursor, beam.end, otherwise) : otherwise;
     });
   }
   const size_t n = out.size();
   return to_numpy(std::move(out), {n});
 }
 
-template <int D>
-Box<D> box_around(const OccupancyFilter<D>& filter) {
-  Box<D> box;
+Box<2> box_around(const Filter2D& filter) {
+  Box<2> box;
   if (filter.blocks().empty()) return box;
-  Cell<D> low = Cell<D>::Constant(std::numeric_limits<int32_t>::max()), high = -low;
+  Cell<2> low = Cell<2>::Constant(std::numeric_limits<int32_t>::max()), high = -low;
   for (const auto& block : filter.blocks()) {
     low = low.cwiseMin(block->origin);
     high = high.cwiseMax(block->origin);
   }
-  box.first = BlockLayout<D>::cell_at(low, 0);
-  for (int d = 0; d < D; ++d)
+  box.first = BlockLayout<2>::cell_at(low, 0);
+  for (int d = 0; d < 2; ++d)
     box.size[static_cast<size_t>(d)] =
-        static_cast<size_t>(high[d] - low[d] + 1) * BlockLayout<D>::kEdge;
+        static_cast<size_t>(high[d] - low[d] + 1) * BlockLayout<2>::kEdge;
   return box;
 }
 
-template <int D>
-auto dense(const OccupancyFilter<D>& filter, const OptionalCell<D>& first_cell,
-           const OptionalCell<D>& shape, double odds_factor) {
+auto dense(const Filter2D& filter, const OptionalCell<2>& first_cell, const OptionalCell<2>& shape,
+           double odds_factor) {
   require(odds_factor > 0.0, "odds_factor: expected a positive number");
   require(first_cell.has_value() == shape.has_value(),
           "first_cell, shape: expected both or neither");
-  const Box<D> box = shape ? Box<D>(*first_cell, *shape) : box_around(filter);
-  std::vector<float> out(box.total(), std::numeric_limits<float>::quiet_NaN());
+  const Box<2> box = shape ? Box<2>(*first_cell, *shape) : box_around(filter);
+  std::vector<float> out(box.total(), kUnknown);
   {
     nb::gil_scoped_release released;
     box.for_each_block(filter, [&](const auto& block) {
       filter.for_each_known_in(block, static_cast<float>(odds_factor),
-                               [&](const Cell<D>& cell, float p) {
+                               [&](const Cell<2>& cell, float p) {
                                  if (box.contains(cell)) out[box.index(cell)] = p;
                                });
     });
@@ -117,12 +131,10 @@ auto dense(const OccupancyFilter<D>& filter, const OptionalCell<D>& first_cell,
   return std::make_pair(box.first_cell(), box.shaped(std::move(out)));
 }
 
-// Number of values in a block of the dense array.
-template <int D>
-constexpr size_t kBlockCells = static_cast<size_t>(BlockLayout<D>::kCells);
-
-template <int D>
-auto take_changed(OccupancyFilter<D>& filter, double odds_factor) {
+template <class Filter>
+auto take_changed(Filter& filter, double odds_factor) {
+  constexpr int D = Filter::kDimension;
+  constexpr auto E = static_cast<size_t>(Filter::kEdge), n = static_cast<size_t>(Filter::kCells);
   require(odds_factor > 0.0, "odds_factor: expected a positive number");
   std::vector<int64_t> cells;
   std::vector<float> tiles;
@@ -130,19 +142,15 @@ auto take_changed(OccupancyFilter<D>& filter, double odds_factor) {
   {
     nb::gil_scoped_release released;
     for (const Cell<D>& origin : filter.take_changed_blocks()) {
-      const auto* block = filter.find(origin);
-      // in 3D most blocks are free space, of which there is too much to tell it all
-      if (!block || (D == 3 && !filter.has_surface(*block))) continue;
-      const Cell<D> first = BlockLayout<D>::cell_at(origin, 0);
+      const Cell<D> first = Filter::cell_at(origin, 0);
       cells.insert(cells.end(), first.data(), first.data() + D);
-      tiles.resize(++count * kBlockCells<D>, std::numeric_limits<float>::quiet_NaN());
-      float* tile = tiles.data() + (count - 1) * kBlockCells<D>;
+      tiles.resize(++count * n, kUnknown);
+      float* tile = tiles.data() + (count - 1) * n;
       filter.for_each_known_in(
-          *block, static_cast<float>(odds_factor),
-          [&](const Cell<D>& cell, float p) { tile[BlockLayout<D>::local_of(cell)] = p; });
+          *filter.find(origin), static_cast<float>(odds_factor),
+          [&](const Cell<D>& cell, float p) { tile[Filter::local_of(cell)] = p; });
     }
   }
-  constexpr auto E = static_cast<size_t>(BlockLayout<D>::kEdge);
   auto lowest = to_numpy(std::move(cells), {count, static_cast<size_t>(D)});
   if constexpr (D == 2) {
     return std::make_pair(lowest, to_numpy(std::move(tiles), {count, E, E}));
@@ -151,8 +159,9 @@ auto take_changed(OccupancyFilter<D>& filter, double odds_factor) {
   }
 }
 
-template <int D>
-auto known_cells(const OccupancyFilter<D>& filter, double odds_factor) {
+template <class Filter>
+auto known_cells(const Filter& filter, double odds_factor) {
+  constexpr int D = Filter::kDimension;
   require(odds_factor > 0.0, "odds_factor: expected a positive number");
   std::vector<int64_t> cells;
   std::vector<float> p_occupied;
@@ -170,20 +179,10 @@ auto known_cells(const OccupancyFilter<D>& filter, double odds_factor) {
                         to_numpy(std::move(p_occupied), {n}));
 }
 
-template <int D>
-void forget_free_space(OccupancyFilter<D>& filter, const std::array<double, size_t{D}>& centre,
-                       double radius) {
-  require(radius >= 0.0 && std::isfinite(radius), "radius: expected a length that is not negative");
-  Vec<D> cells;
-  for (int d = 0; d < D; ++d) cells[d] = centre[static_cast<size_t>(d)] / filter.resolution();
-  require(cells.allFinite(), "centre: not finite");
-  nb::gil_scoped_release released;
-  filter.forget_free_space(cells, radius / filter.resolution());
-}
-
-template <int D>
-size_t take_over(OccupancyFilter<D>& filter, const OccupancyFilter<D>& from, const Poses<D>& motion,
+template <class Filter>
+size_t take_over(Filter& filter, const Filter& from, const Poses<Filter::kDimension>& motion,
                  size_t first, size_t count) {
+  constexpr int D = Filter::kDimension;
   require(&filter != &from, "other: expected another filter");
   std::vector<Pose<D>> poses;
   for (size_t k = 0; k < motion.shape(0); ++k) {
@@ -194,12 +193,10 @@ size_t take_over(OccupancyFilter<D>& filter, const OccupancyFilter<D>& from, con
   return filter.take_over(from, poses, first, count);
 }
 
-template <int D>
-void bind(nb::module_& m, const char* name) {
-  using Filter = OccupancyFilter<D>;
-  nb::class_<Filter>(m, name,
-                     "Forward filters of two-state hidden Markov models in every cell, updated "
-                     "scan by scan: the causal E-step.")
+// What the filters in 2D and 3D have in common.
+template <class Filter>
+nb::class_<Filter> bind_filter(nb::module_& m, const char* name, const char* doc) {
+  return nb::class_<Filter>(m, name, doc)
       .def(
           "__init__",
           [](Filter* self, double resolution, std::vector<double> rho, std::vector<double> tau,
@@ -208,7 +205,7 @@ void bind(nb::module_& m, const char* name) {
             FilterOptions options{std::move(rho), std::move(tau), std::move(weights),
                                   n_static,       p_detection,    bin_seconds,
                                   lateral_std,    hit_radius,     max_log_ratio};
-            check_options<D>(resolution, options);
+            check_options(resolution, options);
             new (self) Filter(resolution, std::move(options));
           },
           nb::arg("resolution"), nb::kw_only(), nb::arg("rho"), nb::arg("tau"), nb::arg("weights"),
@@ -219,34 +216,20 @@ void bind(nb::module_& m, const char* name) {
       .def_prop_ro("resolution", &Filter::resolution, "Edge of a cell, metres.")
       .def_prop_ro("size", &Filter::size, "Number of cells in which beams ended.")
       .def_prop_ro("memory_bytes", &Filter::memory_bytes)
-      .def("add", &add<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
-           nb::arg("margin").noconvert(), nb::arg("offset").noconvert(),
-           nb::arg("T_map_sensor").noconvert(), nb::kw_only(), nb::arg("time_bin"), nb::arg("tag"),
-           "Adds the hits of scans taken in one time bin. A beam passes the cells that lie more "
-           "than its margin (M,) float32, in cells, before its end. tag: see `take_over`.")
-      .def("prime", &prime<D>, nb::arg("cells").noconvert(), nb::arg("occupied").noconvert(),
-           nb::arg("log_ratio"),
-           "Initializes cells (K, D) int64 from another map: occupied by static surface, for "
-           "which dynamic classes fall behind by log_ratio nats, or free.")
-      .def("label", &label<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
+      .def("label", &label<Filter>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
            nb::arg("offset").noconvert(), nb::arg("T_map_sensor").noconvert(), nb::arg("prior"),
            "(M,) float32 P(static) of every beam by what was added so far. NaN for unusable "
            "beams; the prior without a return, and where no beam ended before.")
-      .def("dense", &dense<D>, nb::arg("first_cell") = nb::none(), nb::arg("shape") = nb::none(),
-           nb::kw_only(), nb::arg("odds_factor") = 1.0,
-           "Lowest cell (D,), and P(static and occupied) as an array [(z,) y, x] float32 of a box "
-           "of cells, by default of all; NaN where no beam passed or ended. The prior odds of "
-           "static classes are those of the weights times odds_factor.")
-      .def("known_cells", &known_cells<D>, nb::kw_only(), nb::arg("odds_factor") = 1.0,
-           "Cells (K, D) int64 in which beams ended, and P(static and occupied) (K,) float32.")
-      .def("take_changed_blocks", &take_changed<D>, nb::kw_only(), nb::arg("odds_factor") = 1.0,
-           "Lowest cells (B, D) int64 of the blocks that changed since the last call, and their "
-           "values (B, [z,] y, x) as of `dense`; in 3D only blocks in which beams ended.")
+      .def("known_cells", &known_cells<Filter>, nb::kw_only(), nb::arg("odds_factor") = 1.0,
+           "Cells (K, D) int64 in which beams ended, and P(static and occupied) (K,) float32. The "
+           "prior odds of static classes are those of the weights times odds_factor.")
+      .def("take_changed_blocks", &take_changed<Filter>, nb::kw_only(),
+           nb::arg("odds_factor") = 1.0,
+           "Lowest cells (B, D) int64 of the blocks that changed since the last call, and "
+           "P(static and occupied) of their cells, (B, [z,] y, x) float32; NaN: unknown.")
       .def_prop_ro("block_count", [](const Filter& filter) { return filter.blocks().size(); })
-      .def("forget_free_space", &forget_free_space<D>, nb::arg("centre"), nb::arg("radius"),
-           "Removes blocks of free space only that are farther than a radius from a centre, m.")
       .def("sibling", &Filter::sibling, "An empty filter of the same kind.")
-      .def("take_over", &take_over<D>, nb::arg("other"), nb::arg("motion").noconvert(),
+      .def("take_over", &take_over<Filter>, nb::arg("other"), nb::arg("motion").noconvert(),
            nb::arg("first"), nb::arg("count"),
            "Adds `count` blocks of another filter from `first` on, whose cells are moved by the "
            "motions (K, D+1, D+1), metres, of the tags of the scans that observed them last. Cells "
@@ -256,8 +239,29 @@ void bind(nb::module_& m, const char* name) {
 }  // namespace
 
 void bind_occupancy_filter(nb::module_& m) {
-  bind<2>(m, "OccupancyFilter2D");
-  bind<3>(m, "OccupancyFilter3D");
+  bind_filter<Filter2D>(m, "OccupancyFilter2D",
+                        "Forward filters of two-state hidden Markov models in every cell, updated "
+                        "scan by scan: the causal E-step.")
+      .def("add", &add_scan, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
+           nb::arg("margin").noconvert(), nb::arg("offset").noconvert(),
+           nb::arg("T_map_sensor").noconvert(), nb::kw_only(), nb::arg("time_bin"), nb::arg("tag"),
+           "Adds the hits of scans taken in one time bin. A beam passes the cells that lie more "
+           "than its margin (M,) float32, in cells, before its end. tag: see `take_over`.")
+      .def("prime", &prime, nb::arg("cells").noconvert(), nb::arg("occupied").noconvert(),
+           nb::arg("log_ratio"),
+           "Initializes cells (K, D) int64 from another map: occupied by static surface, for "
+           "which dynamic classes fall behind by log_ratio nats, or free.")
+      .def("dense", &dense, nb::arg("first_cell") = nb::none(), nb::arg("shape") = nb::none(),
+           nb::kw_only(), nb::arg("odds_factor") = 1.0,
+           "Lowest cell (D,), and P(static and occupied) as an array [y, x] float32 of a box "
+           "of cells, by default of all; NaN where no beam passed or ended.");
+  bind_filter<SweepFilter>(m, "SweepFilter3D",
+                           "The same in 3D: cells are looked up in the range image of each sweep.")
+      .def("add", &add_sweep, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
+           nb::arg("offset").noconvert(), nb::arg("T_map_sensor").noconvert(), nb::kw_only(),
+           nb::arg("pixel"), nb::arg("time_bin"), nb::arg("tag"),
+           "Adds the hits of one sweep. pixel: radians of azimuth and elevation of a pixel of its "
+           "range image, at least those between neighbouring beams. tag: see `take_over`.");
 }
 
 }  // namespace stillmap::bindings

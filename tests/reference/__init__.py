@@ -40,11 +40,12 @@ from reference.ndt_map import (
 from reference.no_return_beams import add_no_return_beams
 from reference.observation import MeasurementModel, observe
 from reference.observation_counts import ObservationCounts, ObservationCounts2D, ObservationCounts3D
-from reference.occupancy_filter import OccupancyFilter, OccupancyFilter2D, OccupancyFilter3D
+from reference.occupancy_filter import OccupancyFilter, OccupancyFilter2D
 from reference.occupancy_grid import OccupancyGrid, OccupancyGrid2D, OccupancyGrid3D, occupancy
 from reference.occupancy_hmm import OccupancyHmm, OccupancyHmm2D, OccupancyHmm3D
 from reference.ray_traversal import cell_of, traverse
 from reference.surfel_map import SurfelMap, SurfelMap2D, SurfelMap3D
+from reference.sweep_filter import SweepFilter3D
 from reference.texel_raster import rasterise_texels
 from reference.tsdf import TsdfVolume
 from reference.z_buffer import render_z_buffer
@@ -63,7 +64,6 @@ __all__ = [
     "ObservationCounts3D",
     "OccupancyFilter",
     "OccupancyFilter2D",
-    "OccupancyFilter3D",
     "OccupancyGrid",
     "OccupancyGrid2D",
     "OccupancyGrid3D",
@@ -76,6 +76,7 @@ __all__ = [
     "SurfelMap",
     "SurfelMap2D",
     "SurfelMap3D",
+    "SweepFilter3D",
     "TsdfVolume",
     "add_beams",
     "add_end_points",

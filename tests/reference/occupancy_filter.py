@@ -169,7 +169,8 @@ class OccupancyFilter:
         at = self.passed.setdefault(key, Passed())
         at.tag = tag
         if key not in self.filters:
-            self.filters[key] = self._new_filter(at, tag)
+            passes = [CLEARLY_PASSED] * min(at.bins, MAX_PASSES)
+            self.filters[key] = self._new_filter(passes, at.last_bin, tag)
 
     def _hit(self, end: Float, time_bin: int, tag: int) -> None:
         for near in self._near(end):
@@ -177,11 +178,12 @@ class OccupancyFilter:
             self._open(one, time_bin)
             one.hit, one.tag = True, tag
 
-    def _new_filter(self, at: Passed, tag: int) -> Filter:
+    def _new_filter(self, passes: list[float], last_bin: int, tag: int) -> Filter:
+        """After passes with these reliabilities, one for each bin; last_bin: -1: none."""
         p, log_likelihood = self.rho.copy(), -np.log(self.rho * self.p_detection)
-        for n in range(min(at.bins, MAX_PASSES)):
-            p, log_likelihood = self._step(p, log_likelihood, min(n, 1), False, CLEARLY_PASSED)
-        last = None if at.last_bin < 0 else at.last_bin
+        for n, reliability in enumerate(passes):
+            p, log_likelihood = self._step(p, log_likelihood, min(n, 1), False, reliability)
+        last = None if last_bin < 0 else last_bin
         return Filter(p, self._normalize(log_likelihood), last, tag)
 
     def _near(self, end: Float) -> list[tuple[int, ...]]:
@@ -196,4 +198,4 @@ class OccupancyFilter:
         return found
 
 
-OccupancyFilter2D = OccupancyFilter3D = OccupancyFilter
+OccupancyFilter2D = OccupancyFilter

@@ -37,7 +37,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument(
         "--replay",
         metavar="INPUT",
-        help="a recording, of one laser plane (default: a ROS 2 node that maps until Ctrl-C)",
+        help="a recording (default: a ROS 2 node that maps until Ctrl-C)",
     )
     p.add_argument("-o", "--output", metavar="DIR", required=True, help="result folder")
     p.add_argument("--overwrite", action="store_true", help="replace what is in DIR")
@@ -120,9 +120,8 @@ def _read(args: argparse.Namespace, options: "Options", scratch: Path) -> "Recor
 
     with show_share(args.quiet, "reading") as progress:
         recording = inputs.read(args.replay, options.read, progress=progress, scratch=scratch)
-    if recording.dimension != 2:
-        hint = "map it with `stillmap map`"
-        raise InputError("is 3D; live mapping is planar", where=args.replay, hint=hint)
+    if recording.dimension != 2 and args.map is not None:
+        raise InputError("is 3D; localization in a known map is planar", where=args.replay)
     inputs.require_mappable(recording, options, None)
     return recording.without_odometry() if args.no_odometry else recording
 

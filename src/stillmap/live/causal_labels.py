@@ -12,10 +12,11 @@ from stillmap.em import CellProbabilities
 from stillmap.em.observations import P_DETECTION
 from stillmap.em.options import EmOptions
 from stillmap.live.observation import Observation
+from stillmap.live.pixel_size import find_pixel_size
 from stillmap.live.scan import ScanBeams
 
 Float = NDArray[np.float64]
-OccupancyFilter = _core.OccupancyFilter2D | _core.OccupancyFilter3D
+OccupancyFilter = _core.OccupancyFilter2D | _core.SweepFilter3D
 
 # fewer classes than the E-step afterwards has: stationary probability, s of correlation
 _STATIC = ((0.998, 25.0), (0.95, 25.0))
@@ -24,9 +25,6 @@ _LATERAL_STD = 0.4  # cells, of a beam's lateral position
 _HIT_RADIUS = 1.0  # cells from an end point to the centres of the cells that it hits
 _MAX_LOG_RATIO = 20.0  # nats: what stood for hours is known to be gone after a few bins
 _MAP_PRIOR = 0.5  # of static surface in the map: one look at a walker is no evidence for a wall
-# m before the end of a beam, or cells, that it has not passed; m at grazing angles
-_MARGIN, _MARGIN_CELLS, _MAX_MARGIN = 0.1, 1.0, 1.0
-_FREE_RADIUS, _FREE_STEP = 40.0, 10.0  # m around the robot where free space is kept in 3D
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +50,7 @@ class CausalLabels:
     """
 
     def __init__(self, dimension: int, resolution: float, options: EmOptions) -> None:
-        kind = _core.OccupancyFilter2D if dimension == 2 else _core.OccupancyFilter3D
+        kind = _core.OccupancyFilter2D if dimension == 2 else _core.SweepFilter3D
         rho, tau = zip(*_STATIC, *_DYNAMIC, strict=True)
         prior, n = options.prior, len(_STATIC)
         weights = [prior / n] * n + [(1.0 - prior) / len(_DYNAMIC)] * len(_DYNAMIC)
@@ -72,14 +70,13 @@ class CausalLabels:
         self._prior, self._bin_ns = prior, round(1e9 * options.time_bin)
         self._first_ns: int | None = None
         self.tags = 1  # numbers of keyframes are below
-        self._freed_at: Float | None = None  # where free space was forgotten last
+        self._pixels = dict[str | int, tuple[float, float]]()  # of the sensors, in 3D
         # blocks that were told of, as bytes, and the filter that has them
         self._told, self._told_of = set[bytes](), self.filter
 
     def clear(self) -> None:
         """Forget all scans."""
         self.filter, self._first_ns, self.tags = self.filter.sibling(), None, 1
-        self._freed_at = None
 
     @property
     def resolution(self) -> float:
@@ -112,21 +109,21 @@ class CausalLabels:
             self._first_ns = beams.stamp_ns
         time_bin = max(beams.stamp_ns - self._first_ns, 0) // self._bin_ns
         self.tags = max(self.tags, observation.tag + 1)
-        T = (T_map_base @ beams.T_base_sensor)[None]
-        margin = _margins(beams, observation.normals, self.resolution)
-        margin[~observation.followed] = np.inf
-        offset, tag = np.array([0, len(beams.points)]), observation.tag
-        to.add(beams.points, beams.hit, margin, offset, T, time_bin=time_bin, tag=tag)
-        if beams.dimension == 3:
-            self._forget_free_space(T_map_base[:3, 3])
-
-    def _forget_free_space(self, position: Float) -> None:
-        """Forget the free space far away: memory grows with the surface, not with the volume."""
-        last = self._freed_at
-        if last is not None and np.linalg.norm(position - last) < _FREE_STEP:
+        T, tag = (T_map_base @ beams.T_base_sensor)[None], observation.tag
+        scan, offset = (beams.points, beams.hit), np.array([0, len(beams.points)])
+        if isinstance(to, _core.SweepFilter3D):
+            pixel = self._pixel_size(beams)
+            to.add(*scan, offset, T, pixel=pixel, time_bin=time_bin, tag=tag)
             return
-        self._freed_at = position.copy()
-        self.filter.forget_free_space(position.tolist(), _FREE_RADIUS)
+        assert observation.margin is not None
+        margin = observation.margin / np.float32(self.resolution)
+        to.add(*scan, margin, offset, T, time_bin=time_bin, tag=tag)
+
+    def _pixel_size(self, beams: ScanBeams) -> tuple[float, float]:
+        """Radians between the beams of a sensor, as of its first sweep."""
+        if beams.sensor not in self._pixels:
+            self._pixels[beams.sensor] = find_pixel_size(beams.points, beams.hit)
+        return self._pixels[beams.sensor]
 
     def to_map(self) -> GridMap:
         """The planar map of what stands; NaN: unknown."""
@@ -137,6 +134,7 @@ class CausalLabels:
         return self._to_map(1.0)
 
     def _to_map(self, odds_factor: float) -> GridMap:
+        assert isinstance(self.filter, _core.OccupancyFilter2D)
         first, p_occupied = self.filter.dense(odds_factor=odds_factor)
         x, y = (first * self.resolution).tolist()
         return GridMap(p_occupied, (x, y, 0.0), self.resolution)
@@ -169,16 +167,5 @@ def take_over(
     if isinstance(to, _core.OccupancyFilter2D):
         assert isinstance(source, _core.OccupancyFilter2D)
         return to.take_over(source, motion, first, count)
-    assert isinstance(source, _core.OccupancyFilter3D)
+    assert isinstance(source, _core.SweepFilter3D)
     return to.take_over(source, motion, first, count)
-
-
-def _margins(beams: ScanBeams, normals: Float, cell: float) -> NDArray[np.float32]:
-    """(N,) cells before the end of each beam that it has not passed."""
-    points = np.where(beams.hit[:, None], beams.points, 0.0)
-    length = np.maximum(np.linalg.norm(points, axis=1), 1e-6)
-    cos = np.abs(np.einsum("nd,nd->n", points, normals)) / length
-    cos[~normals.any(axis=1)] = 1.0
-    least = max(_MARGIN, _MARGIN_CELLS * cell) if beams.dimension == 3 else _MARGIN
-    margin = np.minimum(least / np.maximum(cos, 1e-3), _MAX_MARGIN)
-    return np.asarray(margin / cell, np.float32)

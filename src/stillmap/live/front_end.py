@@ -61,11 +61,6 @@ class FrontEnd(Protocol):
     ) -> Registration:
         """Register a scan, (9), by its hits with weights P(static)."""
 
-    def find_normals(
-        self, beams: ScanBeams, hits: Any, followed: NDArray[np.bool_], T: Float, /
-    ) -> Float:
-        """(N, D) normals of the surfaces that beams met, in the sensor frame; 0: unknown."""
-
     def add(self, beams: ScanBeams, e: NDArray[np.float32], /) -> MappedScan | None:
         """Add the last scan to the local map, with P(static) e (N,); the scan if it is spaced."""
 

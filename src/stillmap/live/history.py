@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core import se2, se3
 from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
@@ -115,6 +116,15 @@ class History:
     def at(self, number: int) -> tuple[int, Float]:
         """Anchor and local pose of a scan, see `Answers`."""
         return int(self._anchor.view()[number]), np.array(self._local.view()[number])
+
+    def twist_at(self, number: int) -> Float:
+        """(3,) or (6,) m/s and rad/s of the base from the scan before to one."""
+        stamps, local = self._stamp_ns.view()[: number + 1], self._local.view()
+        log = se2.log if local.shape[-1] == 3 else se3.log
+        seconds = 1e-9 * float(stamps[number] - stamps[number - 1]) if number else 0.0
+        step = log((se2.inverse(local[number - 1]) @ local[number])[None])[0]
+        out: Float = step / seconds if seconds > 0.0 else np.zeros_like(step)
+        return out
 
     def recording(self) -> Recording:
         """All scans so far. Odometry only if every scan had it."""

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 import stillmap._core as _core
 from stillmap.core.errors import InputError
 from stillmap.core.grid_map import GridMap
-from stillmap.live.causal_labels import OccupancyFilter
 from stillmap.live.local_map import MappedScan, add_scan, is_spaced
 from stillmap.places.surface_map import SurfaceMap, find_sides
 from stillmap.results.reader import FREE_THRESH, OCCUPIED_THRESH, Grid, read_grid
@@ -56,7 +55,7 @@ class KnownMap:
         """The map for the search of alignments."""
         return to_surface_map(self._grid)
 
-    def prime(self, labels: OccupancyFilter) -> None:
+    def prime(self, labels: _core.OccupancyFilter2D) -> None:
         """Tell the filters of cells what the map knows."""
         free = self._grid.centres(np.argwhere(self._grid.p_occupied < FREE_THRESH))
         centres = np.concatenate([self._centres, free])

@@ -14,34 +14,42 @@ from numpy.typing import ArrayLike, NDArray
 
 from stillmap.core import se2
 from stillmap.core.grid_map import GridMap
+from stillmap.core.parallel import resolve_threads
 from stillmap.core.profiling import Progress, no_progress
+from stillmap.em import CellProbabilities
 from stillmap.io.array_checks import poses_to_matrices
 from stillmap.live.causal_labels import CausalLabels, MapChange
+from stillmap.live.front_end import FrontEnd, Registration
 from stillmap.live.history import History
 from stillmap.live.known_map import KnownMap
 from stillmap.live.local_map import thin_scan
 from stillmap.live.loop_closer import LoopCloser
-from stillmap.live.loop_process import LoopProcess
+from stillmap.live.loop_process import LoopProcess, make_closer
 from stillmap.live.map_correction import LabelledScan, MapCorrection
+from stillmap.live.map_view import project_obstacles
+from stillmap.live.observation import BeamSelector, Observation, find_margins
 from stillmap.live.place import Mode, NoLoops, PlaceTracker
 from stillmap.live.saving import Snapshot
-from stillmap.live.scan import Scan, ScanBeams, to_beams
-from stillmap.live.scan_hits import normals_of, select_hits, thin
-from stillmap.live.scan_odometry import Registration, ScanOdometry
+from stillmap.live.scan import Scan, ScanBeams, deskew, to_beams
+from stillmap.live.scan_hits import normals_of, thin
+from stillmap.live.scan_odometry import ScanOdometry
+from stillmap.live.sweep_loop_closer import LiveSweepLoopCloser
+from stillmap.live.sweep_odometry import SweepOdometry
 from stillmap.live.update import Update
-from stillmap.pipeline.options import Options
+from stillmap.pipeline.options import Options, resolve_resolution
 from stillmap.pipeline.result import map_recording
 from stillmap.results.build import to_options
 from stillmap.results.result import BuiltResult
 from stillmap.slam import local_map
-from stillmap.slam.motion_model import MotionPrior
-from stillmap.slam.options import SlamOptions
-from stillmap.slam.scan_hits import Scan as Hits
+from stillmap.slam.scan_hits import Scan as PlanarHits
 from stillmap.tracking import MovingObject
 
 Float = NDArray[np.float64]
 
-_MAX_KEPT_BEAMS = 400  # of a spaced scan, for loops and for the local map after them
+_MAX_KEPT_BEAMS = {
+    2: 400,
+    3: 20_000,
+}  # of a spaced scan, for loops and for the local map after them
 _CHANGES_EVERY_NS = 10**9  # between two updates that tell what changed in the map
 
 
@@ -75,60 +83,77 @@ class LiveMapper:
         scratch: str | os.PathLike[str] | None = None,
     ) -> None:
         self.options = to_options(options)
-        self._odometry = ScanOdometry(self.options.slam)
-        self._labels = CausalLabels(2, self.options.slam.resolution, self.options.em)
-        slam = self.options.slam
         self._place = None if place is None else PlaceTracker(KnownMap(place), mode)
-        self._closer = _make_closer(slam, background, place is not None)
         self._in_background = background
         self._scratch = None if scratch is None else Path(scratch)
-        self._history = History(2, self._scratch)
         self._T_odom_base: Float | None = None
-        self._T_map_local, self._drift = np.eye(3), np.zeros((3, 3))
-        # of the spaced scans: in the frame of the odometry by scans; in the map, where corrected
-        self._spaced, self._corrected = list[Float](), np.zeros((0, 3, 3))
         self._path_begin = 0  # the first spaced scan in the frame of the map
-        self._correction: MapCorrection | None = None
         self._last_ns: int | None = None
         self._changes_due_ns = 0
+        self._begin(2)
+
+    def _begin(self, dimension: int) -> None:
+        """Be ready for the first scan."""
+        D, options = dimension, self.options
+        slam = resolve_resolution(options, D).slam
+        self._dimension, self._slam = D, slam
+        self._odometry: FrontEnd = (
+            ScanOdometry(slam) if D == 2 else SweepOdometry(slam, resolve_threads(options.threads))
+        )
+        self._labels = CausalLabels(D, slam.resolution, options.em)
+        self._selector = BeamSelector(options.em.time_bin)
+        self._history = History(D, self._scratch)
+        self._closer: LoopClosing | None = None
+        self._T_map_local, self._drift = np.eye(D + 1), np.zeros((3, 3))
+        # of the spaced scans: in the frame of the odometry by scans; in the map, where corrected
+        self._spaced, self._corrected = list[Float](), np.zeros((0, D + 1, D + 1))
+        self._correction: MapCorrection | None = None
 
     def push(self, scan: Scan | ScanBeams, odometry: ArrayLike | None = None) -> Update:
         """Register a scan, label its beams, and add it to the map.
 
         Args:
-            scan: the next scan in time.
-            odometry: x, y, theta or (3, 3) T_odom_base at its stamp; None: there is none.
+            scan: the next scan in time; the first one says whether mapping is in 2D or 3D.
+            odometry: T_odom_base at its stamp, (3,) x, y, theta, or (3, 3), in 3D (4, 4); None:
+                there is none.
 
         Raises:
             ValueError: names the argument, what was expected, and what it was.
             OSError: the disk of `scratch` is full.
         """
         beams = scan if isinstance(scan, ScanBeams) else to_beams(scan)
-        T_odom_base = _to_matrix(odometry)
         self._require_next(beams)
+        T_odom_base = self._to_matrix(odometry)
         increment = self._increment(T_odom_base)
         prior = self._odometry.predict(beams, increment)
-        hits = select_hits(beams)
-        thinned = self._weigh(thin(hits), prior)
-        found = self._odometry.register(beams, thinned, prior, increment)  # M-step: (9)
+        hits = self._weigh(self._odometry.select(beams, prior), prior)
+        found = self._odometry.register(beams, hits, prior, increment)  # M-step: (9)
         if found.is_carried and self._place is not None:
             self._place.lose(len(self._history))
             self._labels.clear()
             self._path_begin = len(self._spaced)
         pose, anchor = self._T_map_local @ found.T, len(self._spaced) - 1
-        labelled = LabelledScan(beams, found.T, normals_of(beams, hits), max(anchor, 0))
-        self._labels.add(beams, pose, labelled.normals, labelled.tag)
-        p_static = self._labels.label(beams, pose)  # E-step: (8)
+        deskewed = deskew(beams, found.twist)
+        labelled = LabelledScan(self._observe(deskewed, hits, anchor), found.T)
+        self._labels.add(labelled.observation, pose)
+        p_static = self._labels.label(deskewed, pose)  # E-step: (8)
         self._history.append(beams, p_static, T_odom_base, pose, found.T, anchor)
         self._T_odom_base, self._last_ns = T_odom_base, beams.stamp_ns
         update = self._to_update(beams.stamp_ns, found, p_static, T_odom_base)
-        is_spaced = self._add_to_maps(labelled, np.nan_to_num(p_static), found)
+        is_spaced = self._add_to_maps(deskewed, labelled, np.nan_to_num(p_static), found)
         if is_spaced and self._place is not None and self._place.is_lost:
-            return self._localize(self._place, thinned, update, T_odom_base)
+            return self._localize(self._place, thin(hits), update, T_odom_base)
         return update
 
+    def _observe(self, beams: ScanBeams, hits: Any, anchor: int) -> Observation:
+        """What a scan adds to the labels."""
+        margin = None
+        if isinstance(hits, PlanarHits):
+            margin = find_margins(beams, normals_of(beams, hits), self._selector.select(beams))
+        return Observation(beams, margin, max(anchor, 0))
+
     def _localize(
-        self, place: PlaceTracker, hits: Hits, update: Update, T_odom_base: Float | None
+        self, place: PlaceTracker, hits: PlanarHits, update: Update, T_odom_base: Float | None
     ) -> Update:
         """Search the robot in the known map; the update with its pose there, if it is found."""
         T = place.localize(self._labels, hits, update.pose, len(self._history) - 1)
@@ -151,6 +176,7 @@ class LiveMapper:
         """
         beams = scan if isinstance(scan, ScanBeams) else to_beams(scan)
         anchor, local = self._history.at(number)
+        beams = deskew(beams, self._history.twist_at(number))
         pose = self._T_map_local @ local
         if 0 <= anchor < len(self._corrected):
             moved = self._corrected[anchor] @ se2.inverse(self._spaced[anchor])
@@ -159,8 +185,10 @@ class LiveMapper:
 
     @property
     def poses(self) -> Float:
-        """(T, 3, 3) T_map_base of all scans, as they are known now."""
+        """(T, D+1, D+1) T_map_base of all scans, as they are known now."""
         answers = self._history.answers()
+        if not len(answers.poses):
+            return answers.poses
         if self._place is not None:
             return self._place.to_known(answers.poses)
         # the scan after which each spaced one is the last: itself, but for the first
@@ -174,14 +202,25 @@ class LiveMapper:
 
     @property
     def path(self) -> Float:
-        """(S, 3, 3) T_map_base of spaced scans, as they are known now: quicker than `poses`. In a
-        known map only those since the robot was found or lost."""
+        """(S, D+1, D+1) T_map_base of spaced scans, as they are known now: quicker than `poses`.
+        In a known map only those since the robot was found or lost."""
         return self._spaced_poses()[self._path_begin :]
 
     @property
     def map(self) -> GridMap:
-        """The map of what stands, as it is known now; NaN: unknown."""
-        return self._labels.to_map()
+        """The map of what stands, as it is known now; in 3D of the obstacles above the ground.
+        NaN: unknown."""
+        if self._dimension == 2:
+            return self._labels.to_map()
+        output, positions = self.options.output, self.path[:, :3, 3]
+        band = output.min_obstacle_height, output.max_obstacle_height
+        known, cell = self._labels.known_cells(), self._slam.resolution
+        return project_obstacles(known, positions, band, cell)
+
+    @property
+    def cells(self) -> CellProbabilities:
+        """P(static and occupied) of the cells, in 3D voxels, in which beams ended."""
+        return self._labels.known_cells()
 
     @property
     def objects(self) -> list[MovingObject]:
@@ -219,7 +258,8 @@ class LiveMapper:
 
     def close(self) -> None:
         """Forget all scans, and end the process that closes loops, if there is one."""
-        self._closer.stop()
+        if self._closer is not None:
+            self._closer.stop()
         self._history.close()
 
     def __enter__(self) -> LiveMapper:
@@ -229,16 +269,40 @@ class LiveMapper:
         self.close()
 
     def _require_next(self, beams: ScanBeams) -> None:
-        if beams.dimension != 2:
-            raise ValueError("scan: expected a planar one")
+        """Check a scan against those before; the first one begins mapping in its dimension."""
+        D, is_first = beams.dimension, self._last_ns is None
+        if self._place is not None and D == 3:
+            raise ValueError("scan: expected a planar one: localization is planar")
+        if is_first and self._dimension != D:
+            self._begin(D)
+        if self._dimension != D:
+            raise ValueError(f"scan: expected {self._dimension}D as before, got {D}D")
         if self._last_ns is not None and beams.stamp_ns < self._last_ns:
             late = 1e-9 * (self._last_ns - beams.stamp_ns)
             raise ValueError(f"stamp: expected none before the last scan, got {late:.6f} s earlier")
+        if self._closer is None:
+            self._closer = self._make_closer()
 
-    def _weigh(self, hits: Hits, prior: MotionPrior) -> Hits:
+    def _make_closer(self) -> LoopClosing:
+        if self._place is not None or not self._slam.loop_closure:
+            return NoLoops()
+        if self._in_background:
+            return LoopProcess(self._slam, self._dimension, self._scratch)
+        threads = resolve_threads(self.options.threads)
+        return make_closer(self._slam, self._dimension, self._scratch, threads)
+
+    def _weigh(self, hits: Any, prior: Any) -> Any:
         """The hits with weights P(static): the E-step at the predicted pose."""
-        pose = self._T_map_local @ prior.T_map_base
-        return dataclasses.replace(hits, weights=self._labels.label_ends(hits.points, pose))
+        points, T_local_base = self._odometry.end_points(hits, prior)
+        weights = self._labels.label_ends(points, self._T_map_local @ T_local_base)
+        return dataclasses.replace(hits, weights=weights)
+
+    def _to_matrix(self, odometry: ArrayLike | None) -> Float | None:
+        if odometry is None:
+            return None
+        given = np.asarray(odometry, np.float64)[None]
+        out: Float = poses_to_matrices("odometry", given, 1, self._dimension)[0]
+        return out
 
     def _increment(self, T_odom_base: Float | None) -> Float | None:
         if T_odom_base is None or self._T_odom_base is None:
@@ -247,15 +311,20 @@ class LiveMapper:
         return out
 
     def _add_to_maps(
-        self, labelled: LabelledScan, e: NDArray[np.float32], found: Registration
+        self,
+        beams: ScanBeams,
+        labelled: LabelledScan,
+        e: NDArray[np.float32],
+        found: Registration,
     ) -> bool:
         """Add a spaced scan to the local map and to the pose graph, and go on correcting the map;
         True if the scan is spaced."""
+        assert self._closer is not None
         self._drift = self._drift + found.drift
-        added = self._odometry.add(labelled.beams, e)
+        added = self._odometry.add(beams, e)
         if added is not None:
             self._spaced.append(added.T_map_base)
-            kept = thin_scan(added, _MAX_KEPT_BEAMS)
+            kept = thin_scan(added, _MAX_KEPT_BEAMS[self._dimension])
             self._closer.add(kept, found.explained, self._drift)
             self._drift = np.zeros((3, 3))
         if self._correction is not None:
@@ -273,19 +342,21 @@ class LiveMapper:
         """A part of the work on a correction; all of it where nobody waits."""
         if self._correction is None:
             return
-        is_done = self._correction.step()
+        is_done = self._correction.step(self._labels)
         while not (is_done or self._in_background):
-            is_done = self._correction.step()
+            is_done = self._correction.step(self._labels)
         if is_done:
             self._correction.finish(self._labels)
-            self._odometry.local_map = self._correction.local_map
+            if self._correction.local_map is not None:
+                self._odometry.local_map = self._correction.local_map
             self._T_map_local = self._correction.T_map_local
             self._corrected = self._correction.poses
             self._correction = None
 
     def _spaced_poses(self) -> Float:
-        """(S, 3, 3) T_map_base of the spaced scans."""
-        since = np.array(self._spaced[len(self._corrected) :]).reshape(-1, 3, 3)
+        """(S, D+1, D+1) T_map_base of the spaced scans."""
+        since = np.array(self._spaced[len(self._corrected) :])
+        since = since.reshape(-1, *self._T_map_local.shape)
         return np.concatenate([self._corrected, self._T_map_local @ since])
 
     def _take_changes(self, stamp_ns: int) -> list[MapChange]:
@@ -320,16 +391,4 @@ class LiveMapper:
         )
 
 
-def _make_closer(
-    options: SlamOptions, background: bool, is_known: bool
-) -> LoopCloser | LoopProcess | NoLoops:
-    if is_known:
-        return NoLoops()
-    return LoopProcess(options) if background else LoopCloser(options)
-
-
-def _to_matrix(odometry: ArrayLike | None) -> Float | None:
-    if odometry is None:
-        return None
-    out: Float = poses_to_matrices("odometry", np.asarray(odometry, np.float64)[None], 1, 2)[0]
-    return out
+LoopClosing = LoopCloser | LiveSweepLoopCloser | LoopProcess | NoLoops

@@ -1,21 +1,19 @@
-"""What a scan adds to the map: its hits, and the beams that are followed through free space."""
+"""What a scan adds to the labels: its hits, and the free space that its beams show."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-import stillmap._core as _core
 from stillmap.core.short_repr import ShortRepr
-from stillmap.live.scan import ScanBeams, take_beams
+from stillmap.live.scan import ScanBeams
 
 Float = NDArray[np.float64]
 
 # scans of a planar laser in a time bin in which each beam is followed; in others only its end
 # counts
 _FOLLOWED, _MAX_STRIDE, _RATE_GAIN = 3.0, 8, 0.1
-_MAX_FOLLOWED = 8000  # beams of a sweep in 3D
-_FOLLOWED_RANGE = 60.0  # m up to which beams of a sweep are followed
+_MARGIN, _MAX_MARGIN = 0.1, 1.0  # m behind a surface where a beam has passed it; at grazing angles
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,26 +21,20 @@ class Observation(ShortRepr):
     """A scan as the labels take it.
 
     Attributes:
-        beams: of the scan, as if all had been taken at its stamp; in 3D one hit for each voxel.
-        followed: (N,) bool, beams that show free space up to their end.
-        normals: (N, D) of the surfaces that were hit, in the sensor frame; 0: unknown.
+        beams: of the scan, as if all had been taken at its stamp.
+        margin: (N,) float32, m before the end of each beam that it has not passed; inf: only its
+            end counts. In 3D None: it follows from the beams around.
         tag: number of the keyframe by which cells move when the map is corrected.
     """
 
     beams: ScanBeams
-    followed: NDArray[np.bool_]
-    normals: Float
+    margin: NDArray[np.float32] | None
     tag: int = 0
 
 
-def thin_to_voxels(beams: ScanBeams, edge: float) -> ScanBeams:
-    """The first hit in each voxel of a 3D scan."""
-    kept = _core.voxel_downsample(beams.points, beams.hit.astype(np.float32), edge)
-    return take_beams(beams, kept)
-
-
 class BeamSelector:
-    """Selects the beams that are followed: fast sensors see the same several times in a time bin.
+    """Selects the beams of planar scans that are followed: fast sensors see the same several times
+    in a time bin.
 
     Args:
         bin_seconds: length of a time bin.
@@ -56,14 +48,9 @@ class BeamSelector:
         """(N,) beams to follow, others in every scan."""
         rate = self._rates.setdefault(beams.sensor, _ScanRate())
         rate.update(beams.stamp_ns)
-        number = np.arange(len(beams.points))
-        if beams.dimension == 2:
-            stride = self._bin_ns / (_FOLLOWED * max(rate.period_ns, 1.0))
-            return (number + rate.count) % int(np.clip(stride, 1, _MAX_STRIDE)) == 0
-        # squares of coordinates that are not finite compare as false
-        near = np.einsum("nd,nd->n", beams.points, beams.points) <= _FOLLOWED_RANGE**2
-        rank = np.cumsum(near)
-        return near & ((rank + rate.count) % max(-(-int(rank[-1:].sum()) // _MAX_FOLLOWED), 1) == 0)
+        scans = self._bin_ns / (_FOLLOWED * max(rate.period_ns, 1.0))
+        stride = int(np.clip(scans, 1, _MAX_STRIDE))
+        return np.asarray((np.arange(len(beams.points)) + rate.count) % stride == 0)
 
 
 @dataclass
@@ -81,3 +68,22 @@ class _ScanRate:
         elif self.count > 1:
             self.period_ns += _RATE_GAIN * (step - self.period_ns)
         self.count, self.last_ns = self.count + 1, stamp_ns
+
+
+def find_margins(
+    beams: ScanBeams, normals: Float, followed: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """(N,) margins of the beams of a planar scan, see `Observation`.
+
+    Args:
+        beams: of the scan.
+        normals: (N, 2) of the surfaces that were hit, in the sensor frame; 0: unknown.
+        followed: (N,) beams that show free space.
+    """
+    points = np.where(beams.hit[:, None], beams.points, 0.0)
+    length = np.maximum(np.linalg.norm(points, axis=1), 1e-6)
+    cos = np.abs(np.einsum("nd,nd->n", points, normals)) / length
+    cos[~normals.any(axis=1)] = 1.0
+    margin = np.minimum(_MARGIN / np.maximum(cos, 1e-3), _MAX_MARGIN)
+    margin[~followed] = np.inf
+    return np.asarray(margin, np.float32)

@@ -5,6 +5,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+import stillmap._core as _core
 from stillmap.live.causal_labels import CausalLabels, take_over
 from stillmap.live.global_localization import GlobalLocalizer, Localization
 from stillmap.live.known_map import KnownLocalMap, KnownMap
@@ -59,6 +60,7 @@ class PlaceTracker:
     def enter(self, labels: CausalLabels, T: Float) -> None:
         """Let labels go on from the known map, with what was seen since the robot was lost."""
         known, seen = labels.filter.sibling(), labels.filter
+        assert isinstance(known, _core.OccupancyFilter2D)
         self._known.prime(known)
         tags = labels.tags
         take_over(known, seen, np.tile(T, (tags, 1, 1)), 0, seen.block_count)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import stillmap._core as _core
+from stillmap.core import se2, se3
 from stillmap.core.arrays import finite_rows
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io.array_checks import poses_to_matrices, require_length, stamps_to_ns, to_array
@@ -116,13 +117,15 @@ def deskew(beams: ScanBeams, twist: Float) -> ScanBeams:
     if beams.beam_time is None:
         return beams
     D, T = beams.dimension, beams.T_base_sensor
+    if D == 3:
+        xi = se3.adjoint(se2.inverse(T)) @ twist  # of the sensor
+        moved = _core.transform_by_twist(beams.points, beams.beam_time, xi)
+        return replace(beams, points=moved, beam_time=None)
     in_base = np.zeros((len(beams.points), 3), np.float32)
-    in_base[:, :D] = beams.points @ T[:D, :D].T + T[:D, D]
-    xi = twist if D == 3 else np.array([twist[0], twist[1], 0.0, 0.0, 0.0, twist[2]])
-    usable = finite_rows(in_base)
-    moved = np.full((len(in_base), D), np.nan)
-    moved[usable] = _core.transform_by_twist(in_base[usable], beams.beam_time[usable], xi)[:, :D]
-    points = ((moved - T[:D, D]) @ T[:D, :D]).astype(np.float32)
+    in_base[:, :2] = beams.points @ T[:2, :2].T + T[:2, 2]
+    xi = np.array([twist[0], twist[1], 0.0, 0.0, 0.0, twist[2]])
+    moved = _core.transform_by_twist(in_base, beams.beam_time, xi)[:, :2]
+    points = ((moved - T[:2, 2]) @ T[:2, :2]).astype(np.float32)
     return replace(beams, points=points, beam_time=None)
 
 

@@ -1,6 +1,7 @@
 """Causal scan matching in 2D: each scan is matched (9) against a map of the scans before it."""
 
 from collections import deque
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -8,7 +9,7 @@ from stillmap.core import se2
 from stillmap.live.front_end import Registration
 from stillmap.live.local_map import LocalMap, MappedScan, MatchMap
 from stillmap.live.scan import ScanBeams, deskew
-from stillmap.live.scan_hits import normals_of, select_hits, thin
+from stillmap.live.scan_hits import select_hits, thin
 from stillmap.slam import kidnapping, motion_model
 from stillmap.slam.deskew import MAX_SPEED, MAX_TURN_RATE
 from stillmap.slam.kidnapping import Evidence
@@ -117,12 +118,6 @@ class ScanOdometry:
         doubts = is_slipping, is_blind, is_carried
         T, covariance = match.T_map_base, match.covariance
         return Registration(T, covariance, match.explained, drift, twist, *doubts)
-
-    def find_normals(
-        self, beams: ScanBeams, hits: Scan, followed: NDArray[np.bool_], T: Float
-    ) -> Float:
-        """(N, 2) normals of the surfaces that beams met, in the sensor frame; 0: unknown."""
-        return normals_of(beams, hits)
 
     def add(self, beams: ScanBeams, e: NDArray[np.float32]) -> MappedScan | None:
         """Add the last scan to the local map, with P(static) e (N,), unless it is too close to the

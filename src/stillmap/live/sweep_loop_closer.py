@@ -69,9 +69,7 @@ class LiveSweepLoopCloser:
 
     def _closer(self, view: SpacedView) -> SweepLoopCloser:
         n = len(view.poses)
-        odometry = LidarOdometry(
-            view.poses, np.zeros((n, 6)), np.zeros((n, 6, 6)), view.explained
-        )
+        odometry = LidarOdometry(view.poses, np.zeros((n, 6)), np.zeros((n, 6, 6)), view.explained)
         search = self._options.loop_search_distance
         return SweepLoopCloser(
             view.recording,

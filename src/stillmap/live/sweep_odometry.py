@@ -43,7 +43,7 @@ class SweepOdometry:
         self._is_slipping = False
         self._cropped_at = np.zeros(3)
         self._since = np.inf  # travel since the last keyframe, in units of their spacing
-        self._first = list[tuple[int, Sweep]]()  # stamps and sweeps
+        self._first, self._knows_first = list[tuple[int, Sweep]](), False  # stamps and sweeps
 
     def predict(self, beams: ScanBeams, increment: Float | None) -> State:
         """The prior of the next sweep: constant velocity, corrected by odometry.
@@ -63,7 +63,7 @@ class SweepOdometry:
             self._is_slipping = state is self._state  # gated
         return constant_velocity.predict(state, seconds)
 
-    def select(self, beams: ScanBeams, prior: State) -> Sweep:
+    def select(self, beams: ScanBeams, _prior: State) -> Sweep:
         """The hits of a sweep, one for each voxel, with weight 1."""
         every = np.ones(len(beams.points), np.float32)
         sweep, self._kept = lidar_odometry.make_sweep(
@@ -76,7 +76,7 @@ class SweepOdometry:
         return hits.deskew(prior.twist), prior.T_map_base
 
     def register(
-        self, beams: ScanBeams, hits: Sweep, prior: State, increment: Float | None
+        self, beams: ScanBeams, hits: Sweep, prior: State, _increment: Float | None
     ) -> Registration:
         """Register a sweep by its hits with weights P(static)."""
         state, explained, is_blind = prior, 1.0, not float(hits.weights.sum()) > 0.0
@@ -102,24 +102,6 @@ class SweepOdometry:
             is_blind,
             is_carried,
         )
-
-    def find_normals(
-        self, beams: ScanBeams, hits: Sweep, followed: NDArray[np.bool_], T: Float
-    ) -> Float:
-        """(N, 3) normals of the planes that the followed beams met, in the sensor frame; 0: none.
-
-        Args:
-            beams: of the sweep, as if taken at its stamp.
-            hits: of the sweep.
-            followed: (N,) bool.
-            T: (4, 4) pose of the base in the frame of the local map.
-        """
-        out = np.zeros(beams.points.shape)
-        in_base = beams.points[followed] @ beams.T_base_sensor[:3, :3].T
-        in_base = (in_base + beams.T_base_sensor[:3, 3]).astype(np.float64)
-        normals, known = lidar_odometry.match_planes(self.local_map, in_base, T)
-        out[followed] = np.where(known[:, None], normals, 0.0) @ beams.T_base_sensor[:3, :3]
-        return out
 
     def add(self, beams: ScanBeams, e: NDArray[np.float32]) -> MappedScan | None:
         """Add the last sweep to the local map, with P(static) e (N,); the sweep if it is a
@@ -175,26 +157,25 @@ class SweepOdometry:
     def _note_first(self, stamp_ns: int, hits: Sweep) -> None:
         """Register the first sweeps again once the motion during the first one is known: it was
         distorted, and all later ones would be distorted to match it."""
-        if len(self._first) == _FIRST_SWEEPS:
+        if self._knows_first:
             return
         self._first.append((stamp_ns, hits))
-        state = self._state
-        is_known = len(self._first) == _FIRST_SWEEPS
-        if not is_known or np.abs(state.twist).max() < _MIN_MOTION or not hits.times.any():
+        if len(self._first) < _FIRST_SWEEPS:
             return
-        # constant motion over these sweeps: their stamps are half a second apart at most
-        start = lidar_odometry.initial_state(state.twist)
+        first, self._first, self._knows_first = self._first, [], True
+        if np.abs(self._state.twist).max() < _MIN_MOTION or not hits.times.any():
+            return
+        start = lidar_odometry.initial_state(self._state.twist)
         self.local_map = lidar_odometry.make_local_map()
-        for number, (stamp, sweep) in enumerate(self._first[:-1]):
-            if number:
+        before = first[0][0]
+        for stamp, sweep in first:
+            if stamp != before:
                 prior = constant_velocity.predict(start, 1e-9 * (stamp - before))
                 registered = lidar_odometry.downsample_sweep(sweep)
                 start, _ = lidar_odometry.register_sweep(
                     self.local_map, registered, prior, self._threads
                 )
+            if sweep is not hits:  # `add` adds the last one
+                self.local_map.add(sweep.deskew(start.twist), sweep.weights, start.T_map_base)
             before = stamp
-            self.local_map.add(sweep.deskew(start.twist), sweep.weights, start.T_map_base)
-        prior = constant_velocity.predict(start, 1e-9 * (stamp_ns - before))
-        self._state, _ = lidar_odometry.register_sweep(
-            self.local_map, lidar_odometry.downsample_sweep(hits), prior, self._threads
-        )
+        self._state = start

@@ -97,11 +97,18 @@ def resolve_options(options: Options, recording: Recording) -> Options:
     if recording.dimension == 3:
         from stillmap.io.cameras import depth_camera_names  # 2D recordings need no camera
 
-        default = _DEPTH_VOXEL_SIZE if depth_camera_names(recording.source) else _VOXEL_SIZE
-        voxel = options.slam.voxel_size or default
-        slam = dataclasses.replace(options.slam, voxel_size=voxel, resolution=voxel)
-        options = dataclasses.replace(options, slam=slam)
+        is_depth = bool(depth_camera_names(recording.source))
+        options = resolve_resolution(options, 3, _DEPTH_VOXEL_SIZE if is_depth else _VOXEL_SIZE)
     if options.estimator == "paper":
         slam = dataclasses.replace(options.slam, loop_closure=False, deskew=False)
         options = dataclasses.replace(options, slam=slam)
     return options
+
+
+def resolve_resolution(options: Options, dimension: int, default: float = _VOXEL_SIZE) -> Options:
+    """Options whose `resolution` is the voxel size in 3D; default: m, where it is unset."""
+    if dimension == 2:
+        return options
+    voxel = options.slam.voxel_size or default
+    slam = dataclasses.replace(options.slam, voxel_size=voxel, resolution=voxel)
+    return dataclasses.replace(options, slam=slam)

@@ -27,8 +27,7 @@ struct FilterOptions {
 class CellFilters {
  public:
   static constexpr size_t kMaxClasses = 32;
-  static constexpr float kClearlyPassed = 0.5f;  // reliability of passes before the first hit
-  static constexpr int kMaxPasses = 32;          // that a new filter takes account of
+  static constexpr int kMaxPasses = 32;  // that a new filter takes account of
 
   struct Posterior {
     float p_static;    // of the static classes
@@ -54,18 +53,18 @@ class CellFilters {
   }
   int32_t tag(int32_t k) const { return filters_[static_cast<size_t>(k)].tag; }
 
-  // A new filter, after the passes of a cell in which no beam ended so far. last_bin: of the last
-  // pass; -1: none. Likelihoods are relative to that of a first hit, as only cells with hits are
-  // considered. Returns its index.
-  int32_t add(int passed_bins, int32_t last_bin, int32_t tag) {
-    filters_.push_back({tag, kNoBin, last_bin, 1.0f});
+  // A new filter, after the passes of a cell in which no beam ended so far, one for each time bin.
+  // reliability: of each, at most kMaxPasses. last_bin: of the last one; -1: none. Likelihoods are
+  // relative to that of a first hit, as only cells with hits are considered. Returns its index.
+  int32_t add(const float* reliability, int passes, int32_t last_bin, int32_t tag) {
+    filters_.push_back({tag, kNoBin, last_bin, 1.0f, kNotComputed});
     state_.insert(state_.end(), rho_.begin(), rho_.end());
     for (size_t c = 0; c < classes(); ++c) state_.push_back(1.0f / (rho_[c] * detection_));
     float* p = state_.data() + (filters_.size() - 1) * 2 * classes();
     float* likelihood = p + classes();
-    for (int pass = 0; pass < std::min(passed_bins, kMaxPasses); ++pass)
+    for (int pass = 0; pass < passes; ++pass)
       for (size_t c = 0; c < classes(); ++c)
-        step(c, pass ? 1 : 0, false, kClearlyPassed, p[c], likelihood[c]);
+        step(c, pass ? 1 : 0, false, reliability[pass], p[c], likelihood[c]);
     normalize(likelihood);
     return static_cast<int32_t>(filters_.size() - 1);
   }
@@ -73,14 +72,18 @@ class CellFilters {
   void hit(int32_t k, int32_t bin, int32_t tag) {
     open(k, bin);
     Filter& filter = filters_[static_cast<size_t>(k)];
-    filter.p_missed = kHitMark;
     filter.tag = tag;
+    if (filter.p_missed == kHitMark) return;
+    filter.p_missed = kHitMark;
+    filter.p_static = kNotComputed;
   }
 
   void miss(int32_t k, int32_t bin, float reliability) {
     open(k, bin);
     Filter& filter = filters_[static_cast<size_t>(k)];
-    if (filter.p_missed != kHitMark) filter.p_missed *= 1.0f - reliability;
+    if (filter.p_missed == kHitMark) return;
+    filter.p_missed *= 1.0f - reliability;
+    filter.p_static = kNotComputed;
   }
 
   // Lets the dynamic classes fall behind by so many nats.
@@ -89,6 +92,14 @@ class CellFilters {
     for (size_t c = options_.n_static; c < classes(); ++c)
       likelihood[c] *= static_cast<float>(std::exp(-log_ratio));
     normalize(likelihood);
+    filters_[static_cast<size_t>(k)].p_static = kNotComputed;
+  }
+
+  // P(static), which is computed where it has changed: most cells are hit again and again in a bin.
+  float p_static(int32_t k) {
+    float& p = filters_[static_cast<size_t>(k)].p_static;
+    if (p == kNotComputed) p = posterior(k).p_static;
+    return p;
   }
 
   // With the observation of the open time bin.
@@ -129,18 +140,21 @@ class CellFilters {
     }
     normalize(ours + classes());
     if (is_newer) filter = source;
+    filter.p_static = kNotComputed;
   }
 
  private:
   static constexpr int kTabulatedGaps = 64;
   static constexpr int32_t kNoBin = -1;
-  static constexpr float kHitMark = -1.0f;
+  static constexpr float kHitMark = -1.0f, kNotComputed = -1.0f;
   static constexpr float kMinProbability = 1e-6f;  // floor: no state becomes impossible
 
   struct Filter {
     int32_t tag;                 // of the scan that hit it last
     int32_t open_bin, last_bin;  // being observed; of the last observation before
-    float p_missed;              // P(all beams of the open bin missed the surface); kHitMark: a hit
+    // P(all beams of the open bin missed the surface); kHitMark: a hit
+    float p_missed;
+    float p_static;  // kNotComputed where it has changed
   };
 
   float* likelihoods(int32_t k) {
@@ -189,6 +203,7 @@ class CellFilters {
     // scans may come late: a bin before the last one has no gap
     filter.open_bin = std::max(bin, filter.last_bin);
     filter.p_missed = 1.0f;
+    filter.p_static = kNotComputed;
   }
 
   // Relative to the best class, which others fall behind by a bounded ratio: so what stood for
