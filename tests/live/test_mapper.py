@@ -8,9 +8,12 @@ import pytest
 
 import stillmap
 from stillmap.core import se2
+from stillmap.em.options import EmOptions
 from stillmap.eval.trajectory import compute_absolute_errors
+from stillmap.live.causal_labels import CausalLabels, take_over
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.replay import iter_beams
+from stillmap.live.scan import to_beams
 
 
 @pytest.fixture
@@ -91,6 +94,38 @@ def test_changed_parts_of_the_map_are_told(corridor):
     first = next(filter(None, changes))[0]
     assert first.p_occupied.shape == (32, 32)
     assert np.all(first.first_cell % 32 == 0)
+
+
+def test_parts_that_emptied_are_told():
+    """Where a correction moves all cells."""
+    labels = CausalLabels(2, 0.05, EmOptions())
+    angles = np.linspace(-1.0, 1.0, 200)
+    beams = to_beams(stillmap.Scan(0, np.full(200, 3.0), angles))
+    labels.add(beams, np.eye(3), np.zeros((200, 2)), 0)
+    before = {tuple(change.first_cell) for change in labels.take_changes()}
+    moved = labels.filter.sibling()
+    take_over(moved, labels.filter, se2.matrix(2.0, 0.0, 0.0)[None], 0, labels.filter.block_count)
+    labels.filter = moved
+    changes = {tuple(change.first_cell): change.p_occupied for change in labels.take_changes()}
+    emptied = {cell for cell, p in changes.items() if np.isnan(p).all()}
+    assert before <= changes.keys()
+    assert emptied
+    assert emptied <= before
+    known = np.concatenate([p[~np.isnan(p)] for p in changes.values()])
+    expected = labels.to_map().p_occupied
+    np.testing.assert_array_equal(np.sort(known), np.sort(expected[~np.isnan(expected)]))
+    assert labels.take_changes() == []
+
+
+def test_the_path_is_that_of_spaced_scans(corridor):
+    path = corridor.mapper.path
+    assert 20 < len(path) < corridor.recording.n_scans
+    steps = np.linalg.norm(np.diff(path[:, :2, 2], axis=0), axis=1)
+    assert steps.max() < 0.5
+    # corrected, as `poses` are
+    at = corridor.mapper.poses[:, :2, 2]
+    nearest = np.linalg.norm(path[:, None, :2, 2] - at[None], axis=2).min(axis=1)
+    assert nearest.max() < 1e-6
 
 
 def test_a_saved_run_is_a_result(corridor, tmp_path):

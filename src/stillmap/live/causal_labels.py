@@ -72,6 +72,13 @@ class CausalLabels:
         self._first_ns: int | None = None
         self.tags = 1  # numbers of keyframes are below
         self._rate = dict[str | int, _ScanRate]()
+        # blocks that were told of, as bytes, and the filter that has them
+        self._told, self._told_of = set[bytes](), self.filter
+
+    def clear(self) -> None:
+        """Forget all scans."""
+        self.filter, self._first_ns, self.tags = self.filter.sibling(), None, 1
+        self._rate.clear()
 
     @property
     def resolution(self) -> float:
@@ -129,8 +136,15 @@ class CausalLabels:
         return GridMap(p_occupied, (x, y, 0.0), self.resolution)
 
     def take_changes(self) -> list[MapChange]:
-        """The parts of the map that changed since the last call."""
+        """The parts of the map that changed since the last call, those that emptied too."""
         lowest = self.filter.take_changed_blocks()
+        told = {cell.tobytes() for cell in lowest}
+        if self.filter is not self._told_of:  # the whole map was moved
+            gone = sorted(self._told - told)
+            emptied = np.frombuffer(b"".join(gone), lowest.dtype).reshape(-1, lowest.shape[1])
+            lowest, self._told = np.concatenate([lowest, emptied]), set()
+            self._told_of = self.filter
+        self._told |= told
         edge = 32 if lowest.shape[1] == 2 else 8
         shape = [edge] * lowest.shape[1]
         tiles = [

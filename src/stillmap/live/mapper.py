@@ -87,6 +87,7 @@ class LiveMapper:
         self._T_map_local, self._drift = np.eye(3), np.zeros((3, 3))
         # of the spaced scans: in the frame of the odometry by scans; in the map, where corrected
         self._spaced, self._corrected = list[Float](), np.zeros((0, 3, 3))
+        self._path_begin = 0  # the first spaced scan in the frame of the map
         self._correction: MapCorrection | None = None
         self._last_ns: int | None = None
         self._changes_due_ns = 0
@@ -112,7 +113,8 @@ class LiveMapper:
         found = self._odometry.register(beams, thinned, prior, increment)  # M-step: (9)
         if found.is_carried and self._place is not None:
             self._place.lose(len(self._history))
-            self._labels = CausalLabels(2, self.options.slam.resolution, self.options.em)
+            self._labels.clear()
+            self._path_begin = len(self._spaced)
         pose, anchor = self._T_map_local @ found.T, len(self._spaced) - 1
         labelled = LabelledScan(beams, found.T, normals_of(beams, hits), max(anchor, 0))
         self._labels.add(beams, pose, labelled.normals, labelled.tag)
@@ -134,6 +136,7 @@ class LiveMapper:
             return update
         self._odometry.enter(place.make_local_map(), T)
         place.enter(self._labels, T)
+        self._path_begin = len(self._spaced)
         pose = T @ update.pose
         T_map_odom = None if T_odom_base is None else pose @ se2.inverse(T_odom_base)
         doubts = tuple(doubt for doubt in update.doubts if doubt not in ("lost", "ambiguous"))
@@ -168,6 +171,12 @@ class LiveMapper:
             every = np.append(every, last)
             corrected = np.concatenate([corrected, (self._T_map_local @ answers.local[-1])[None]])
         return local_map.propagate_corrections(answers.local, every, corrected)
+
+    @property
+    def path(self) -> Float:
+        """(S, 3, 3) T_map_base of spaced scans, as they are known now: quicker than `poses`. In a
+        known map only those since the robot was found or lost."""
+        return self._spaced_poses()[self._path_begin :]
 
     @property
     def map(self) -> GridMap:
