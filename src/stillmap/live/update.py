@@ -1,6 +1,7 @@
 """Result of one scan: pose, labels, doubts, changed map tiles."""
 
 from dataclasses import dataclass, field
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +10,17 @@ from stillmap.core.short_repr import ShortRepr
 from stillmap.live.causal_labels import MapChange
 
 Float = NDArray[np.float64]
+
+# for people
+DOUBTS = MappingProxyType(
+    {
+        "slip": "odometry disagrees with the scans",
+        "blind": "no beam meets anything",
+        "carried": "the scans contradict the map",
+        "lost": "the pose in the known map is not known",
+        "ambiguous": "several places in the known map fit",
+    }
+)
 
 
 @dataclass(frozen=True, eq=False)
