@@ -65,7 +65,7 @@ class Schemas:
                 self._add(name, part)
 
     def read(self, name, data):
-        """A dict of a message; fields that may be repeated are lists, those left out are missing."""
+        """A dict of a message: repeated fields are lists, those left out are missing."""
         out = {}
         for number, value in fields(data):
             field, label, kind, type_name = self.types[name][number]
@@ -89,6 +89,7 @@ class Client:
 
     Attributes:
         topics: schema by topic that is advertised.
+        subscribed: topics that were subscribed to.
         received: by topic, the messages as dicts, in their order.
         times: what the server said that time it is.
     """
@@ -97,7 +98,7 @@ class Client:
         self._socket = websockets.sync.client.connect(
             url, subprotocols=["foxglove.sdk.v1"], max_size=None, **options
         )
-        self.topics, self._channels, self._wanted = {}, {}, set()
+        self.topics, self._channels, self._wanted, self.subscribed = {}, {}, set(), set()
         self.received, self.times, self.info = {}, [], json.loads(self._socket.recv(10))
 
     def __enter__(self):
@@ -157,7 +158,8 @@ class Client:
     def _subscribe(self):
         ids = [k for k, (topic, *_) in self._channels.items() if topic in self._wanted]
         if ids:
-            self._wanted -= {self._channels[k][0] for k in ids}
+            self.subscribed |= {self._channels[k][0] for k in ids}
+            self._wanted -= self.subscribed
             subscriptions = [{"id": k, "channelId": k} for k in ids]
             self._socket.send(json.dumps({"op": "subscribe", "subscriptions": subscriptions}))
 

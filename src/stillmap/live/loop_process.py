@@ -7,7 +7,6 @@ import json
 import logging
 import os
 import queue
-import signal
 import subprocess
 import sys
 import threading
@@ -46,6 +45,7 @@ class LoopProcess:
             [sys.executable, "-m", "stillmap.live.loop_process", json.dumps(asdict(options))],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
+            process_group=0,  # Ctrl-C is for this process alone
         )
         self._outgoing: queue.SimpleQueue[dict[str, NDArray[Any]] | None] = queue.SimpleQueue()
         self._incoming = deque[Correction]()
@@ -187,7 +187,6 @@ def _serve(options: SlamOptions, source: IO[bytes], target: IO[bytes]) -> None:
 def main() -> None:
     """Serve the process that started this one."""
     options = config.override(SlamOptions(), json.loads(sys.argv[1]))
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the other process decides when to end
     try:
         _serve(options, sys.stdin.buffer, sys.stdout.buffer)
     except BrokenPipeError:

@@ -3,7 +3,6 @@
 import json
 import logging
 import os
-import signal
 import sys
 import threading
 import traceback
@@ -58,7 +57,6 @@ def _tell(**content: object) -> None:
 
 def main() -> None:
     """Serve the process that started this one."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the other process decides when to end
     logging.disable()  # about each client whose request is malformed
     try:
         _serve(sys.argv[1], int(sys.argv[2]))

@@ -47,6 +47,7 @@ class FoxgloveServer:
             [sys.executable, "-m", "stillmap.live.foxglove.process", host, str(port)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
+            process_group=0,  # Ctrl-C is for this process alone
         )
         self._mailbox, self._is_watched, self._is_closing = Mailbox(), False, False
         self._slow_due = 0.0
@@ -63,6 +64,16 @@ class FoxgloveServer:
         for thread in self._threads:
             thread.start()
 
+    @property
+    def is_watched(self) -> bool:
+        """True if anybody has subscribed to anything."""
+        return self._is_watched
+
+    @property
+    def process_id(self) -> int:
+        """Of the process that serves."""
+        return self._process.pid
+
     def show(self, mapper: LiveMapper, beams: ScanBeams, update: Update) -> None:
         """Show what the mapper answered to a scan. Never waits: what nobody takes is dropped.
 
@@ -74,13 +85,13 @@ class FoxgloveServer:
         if update.changes:
             self._mailbox.put_changes(update.changes, mapper.options.slam.resolution)
         now, answer = time.monotonic(), to_answer(beams, update)
-        self._last[beams.sensor] = answer
+        is_first, self._last[beams.sensor] = beams.sensor not in self._last, answer
         if now >= self._slow_due:
             self._slow_due = now + _SLOW_PERIOD
             D = len(update.pose) - 1
             self._mailbox.put_path(mapper.path[:, :D, D])
             self._mailbox.put_answer(answer)
-        elif self._is_watched:
+        elif self._is_watched or is_first:
             self._mailbox.put_answer(answer)
 
     def close(self) -> None:

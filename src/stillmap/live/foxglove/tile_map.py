@@ -87,6 +87,8 @@ def join_cells(percent: NDArray[np.uint8], k: int) -> NDArray[np.uint8]:
         return percent
     rows, columns = (-(-n // k) * k for n in percent.shape)
     known = np.full((rows, columns), -1, np.int16)
-    known[: percent.shape[0], : percent.shape[1]] = np.where(percent == UNKNOWN, -1, percent)
+    signed = percent.astype(np.int16)
+    signed[percent == UNKNOWN] = -1
+    known[: percent.shape[0], : percent.shape[1]] = signed
     most = known.reshape(rows // k, k, columns // k, k).max(axis=(1, 3))
     return np.where(most < 0, UNKNOWN, most).astype(np.uint8)
