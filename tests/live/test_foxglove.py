@@ -22,7 +22,7 @@ from stillmap.live.foxglove.server import FoxgloveServer
 from stillmap.live.foxglove.tile_map import TileMap
 from stillmap.sim import scene_by_name, simulate, write_simulation
 
-TOPICS = ("/map", "/pose", "/path", "/tf", "/doubts", "/scan_static", "/scan_dynamic")
+TOPICS = ("/map", "/pose", "/path", "/tf", "/doubts", "/movers", "/scan_static", "/scan_dynamic")
 
 
 @pytest.fixture
@@ -112,6 +112,7 @@ def test_a_client_sees_what_the_mapper_answered(server, corridor):
     assert client.times[-1] == corridor.beams[199].stamp_ns
     assert len(client.received["/tf"][-1]["transforms"]) == 2
     check_clouds(client, corridor, stamps)
+    check_movers(client, corridor, stamps)
     points = client.received["/path"][-1]["entities"][0]["lines"][0]["points"]
     path = np.array([[point.get("x", 0.0), point.get("y", 0.0)] for point in points])
     np.testing.assert_allclose(path, corridor.mapper.path[:, :2, 2])
@@ -133,6 +134,20 @@ def check_clouds(client, run, stamps):
             assert not points[:, 2].any()
             n_dynamic += len(points) if label == "dynamic" else 0
     assert n_dynamic > 20
+
+
+def check_movers(client, run, stamps):
+    n_movers = 0
+    for message in client.received["/movers"]:
+        movers = run.updates[stamps[message["log_time"]]].movers
+        entities = message.get("entities", [])
+        assert [entity["id"] for entity in entities] == [str(mover.number) for mover in movers]
+        for entity, mover in zip(entities, movers, strict=True):
+            at = pose_of(entity["cylinders"][0]["pose"])[:2, 3]
+            np.testing.assert_allclose(at, mover.position)
+            assert entity["cylinders"][0]["size"]["x"] == pytest.approx(2 * mover.radius)
+            n_movers += 1
+    assert n_movers > 5
 
 
 def test_who_comes_late_sees_the_map(server, corridor):

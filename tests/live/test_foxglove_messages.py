@@ -11,7 +11,7 @@ import stillmap  # noqa: E402
 from stillmap.core import se2, se3  # noqa: E402
 from stillmap.live.causal_labels import MapChange  # noqa: E402
 from stillmap.live.foxglove import schemas  # noqa: E402
-from stillmap.live.foxglove.answer import Answer, pack_answer, unpack_answer  # noqa: E402
+from stillmap.live.foxglove.answer import Answer, Movers, pack_answer, unpack_answer  # noqa: E402
 from stillmap.live.foxglove.mailbox import Mailbox  # noqa: E402
 from stillmap.live.foxglove.tile_map import TileMap, join_cells, to_percent  # noqa: E402
 
@@ -27,6 +27,12 @@ def read(message):
 
 def pose_3d():
     return se3.exp(np.array([1.0, 2.0, 3.0, 0.3, -0.5, 2.0]))
+
+
+def make_movers(dimension, n):
+    k = np.arange(n, dtype=np.float64)[:, None]
+    velocity = np.pad(np.repeat([[0.0, 1.5]], n, axis=0), [(0, 0), (0, dimension - 2)])
+    return Movers(np.arange(n) + 7, k + np.arange(dimension), velocity, np.full(n, 0.3))
 
 
 def make_answer(dimension, **changes):
@@ -47,6 +53,7 @@ def make_answer(dimension, **changes):
         "T_base_sensor": mount,
         "T_map_odom": T @ se2.inverse(odometry),
         "doubts": (),
+        "movers": make_movers(dimension, 0),
     }
     return Answer(**(given | changes))
 
@@ -131,6 +138,28 @@ def test_path():
     assert 2000 < len(entity["lines"][0]["points"]) <= 5000
 
 
+@dimensions
+def test_movers(dimension):
+    answer = make_answer(dimension, movers=make_movers(dimension, 2))
+    message = read(schemas.to_movers(answer))
+    (deletion,) = message["deletions"]
+    assert deletion["type"] == foxglove.messages.SceneEntityDeletionType.All.value
+    assert stamp_of(deletion) == STAMP
+    assert [entity["id"] for entity in message["entities"]] == ["7", "8"]
+    for k, entity in enumerate(message["entities"]):
+        assert stamp_of(entity) == STAMP
+        body, arrow = entity["cylinders"][0], entity["arrows"][0]
+        at = pose_of(body["pose"])[:3, 3]
+        np.testing.assert_allclose(at[:dimension], k + np.arange(dimension))
+        assert body["size"]["x"] == pytest.approx(0.6)
+        assert arrow["shaft_length"] + arrow["head_length"] == pytest.approx(1.5)
+        np.testing.assert_allclose(pose_of(arrow["pose"])[:3, 0], [0.0, 1.0, 0.0], atol=1e-12)
+        assert entity["texts"][0]["text"] == entity["id"]
+    nobody = read(schemas.to_movers(make_answer(dimension)))
+    assert "entities" not in nobody
+    assert len(nobody["deletions"]) == 1
+
+
 def test_doubts():
     quiet = read(schemas.to_log((), STAMP))
     loud = read(schemas.to_log(("slip", "lost"), STAMP))
@@ -144,10 +173,14 @@ def test_doubts():
 @pytest.mark.parametrize("sensor", [0, 3, "front/scan"])
 def test_answers_pass_between_processes(dimension, sensor):
     for changes in ({}, {"T_map_odom": None, "doubts": ("blind", "lost")}):
-        answer = make_answer(dimension, sensor=sensor, **changes)
+        movers = make_movers(dimension, 2 if changes else 0)
+        answer = make_answer(dimension, sensor=sensor, movers=movers, **changes)
         back = unpack_answer(pack_answer(answer))
         for name, value in vars(answer).items():
-            np.testing.assert_array_equal(getattr(back, name), value)
+            if name != "movers":
+                np.testing.assert_array_equal(getattr(back, name), value)
+        for got, expected in zip(back.movers, answer.movers, strict=True):
+            np.testing.assert_array_equal(got, expected)
 
 
 def tile(x, y, value=NAN, **cells):

@@ -23,6 +23,7 @@ from stillmap.live.local_map import thin_scan
 from stillmap.live.loop_closer import LoopCloser
 from stillmap.live.loop_process import LoopProcess
 from stillmap.live.map_correction import LabelledScan, MapCorrection
+from stillmap.live.movers import MoverTracker
 from stillmap.live.place import Mode, NoLoops, PlaceTracker
 from stillmap.live.saving import Snapshot
 from stillmap.live.scan import Scan, ScanBeams, to_beams
@@ -77,6 +78,7 @@ class LiveMapper:
         self.options = to_options(options)
         self._odometry = ScanOdometry(self.options.slam)
         self._labels = CausalLabels(2, self.options.slam.resolution, self.options.em)
+        self._movers = MoverTracker(2)
         slam = self.options.slam
         self._place = None if place is None else PlaceTracker(KnownMap(place), mode)
         self._closer = _make_closer(slam, background, place is not None)
@@ -111,6 +113,8 @@ class LiveMapper:
         hits = select_hits(beams)
         thinned = self._weigh(thin(hits), prior)
         found = self._odometry.register(beams, thinned, prior, increment)  # M-step: (9)
+        if found.is_carried:
+            self._movers.clear()
         if found.is_carried and self._place is not None:
             self._place.lose(len(self._history))
             self._labels.clear()
@@ -119,6 +123,7 @@ class LiveMapper:
         labelled = LabelledScan(beams, found.T, normals_of(beams, hits), max(anchor, 0))
         self._labels.add(beams, pose, labelled.normals, labelled.tag)
         p_static = self._labels.label(beams, pose)  # E-step: (8)
+        self._movers.add(beams, found.T, p_static)
         self._history.append(beams, p_static, T_odom_base, pose, found.T, anchor)
         self._T_odom_base, self._last_ns = T_odom_base, beams.stamp_ns
         update = self._to_update(beams.stamp_ns, found, p_static, T_odom_base)
@@ -137,10 +142,14 @@ class LiveMapper:
         self._odometry.enter(place.make_local_map(), T)
         place.enter(self._labels, T)
         self._path_begin = len(self._spaced)
+        self._movers.move(T)
         pose = T @ update.pose
         T_map_odom = None if T_odom_base is None else pose @ se2.inverse(T_odom_base)
         doubts = tuple(doubt for doubt in update.doubts if doubt not in ("lost", "ambiguous"))
-        return dataclasses.replace(update, pose=pose, T_map_odom=T_map_odom, doubts=doubts)
+        movers = self._movers.movers(self._T_map_local)
+        return dataclasses.replace(
+            update, pose=pose, T_map_odom=T_map_odom, doubts=doubts, movers=movers
+        )
 
     def label(self, scan: Scan | ScanBeams, number: int) -> NDArray[np.float32]:
         """(N,) P(static) of the beams of an earlier scan, by what is known now.
@@ -317,6 +326,7 @@ class LiveMapper:
             None if T_odom_base is None else pose @ se2.inverse(T_odom_base),
             tuple(name for name, is_so in doubts.items() if is_so),
             self._take_changes(stamp_ns),
+            self._movers.movers(self._T_map_local),
         )
 
 

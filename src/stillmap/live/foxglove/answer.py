@@ -1,7 +1,7 @@
 """What is shown of a scan, as an object and as arrays between two processes."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,10 +9,27 @@ from numpy.typing import NDArray
 from stillmap.core.short_repr import ShortRepr
 from stillmap.live.causal_labels import MapChange
 from stillmap.live.messages import Arrays
+from stillmap.live.movers import Mover
 from stillmap.live.scan import ScanBeams
 from stillmap.live.update import DOUBTS, Update
 
 Float = NDArray[np.float64]
+
+
+class Movers(NamedTuple):
+    """K movers, as of `Mover`.
+
+    Attributes:
+        number: (K,).
+        position: (K, D).
+        velocity: (K, D).
+        radius: (K,).
+    """
+
+    number: NDArray[np.int64]
+    position: Float
+    velocity: Float
+    radius: Float
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +46,7 @@ class Answer(ShortRepr):
         T_base_sensor: (D+1, D+1).
         T_map_odom: (D+1, D+1); None: without odometry.
         doubts: see Update.
+        movers: what moves, in the map.
     """
 
     stamp_ns: int
@@ -40,6 +58,7 @@ class Answer(ShortRepr):
     T_base_sensor: Float
     T_map_odom: Float | None
     doubts: tuple[str, ...]
+    movers: Movers
 
 
 def to_answer(beams: ScanBeams, update: Update) -> Answer:
@@ -54,7 +73,17 @@ def to_answer(beams: ScanBeams, update: Update) -> Answer:
         beams.T_base_sensor,
         update.T_map_odom,
         update.doubts,
+        _to_movers(update.movers, beams.dimension),
     )
+
+
+def _to_movers(movers: list[Mover], dimension: int) -> Movers:
+    position, velocity = (
+        np.array([getattr(one, name) for one in movers]).reshape(-1, dimension)
+        for name in ("position", "velocity")
+    )
+    number = np.array([one.number for one in movers], np.int64)
+    return Movers(number, position, velocity, np.array([one.radius for one in movers]))
 
 
 def pack_answer(answer: Answer) -> dict[str, NDArray[Any]]:
@@ -71,6 +100,7 @@ def pack_answer(answer: Answer) -> dict[str, NDArray[Any]]:
         "T_base_sensor": answer.T_base_sensor,
         "doubts": np.array([name in answer.doubts for name in DOUBTS]),
     }
+    out |= {f"movers.{name}": array for name, array in answer.movers._asdict().items()}
     if answer.T_map_odom is not None:
         out["T_map_odom"] = answer.T_map_odom
     return out
@@ -89,6 +119,7 @@ def unpack_answer(arrays: Arrays) -> Answer:
         arrays["T_base_sensor"],
         arrays.get("T_map_odom"),
         tuple(name for name, is_so in zip(DOUBTS, arrays["doubts"], strict=True) if is_so),
+        Movers(*(arrays[f"movers.{name}"] for name in Movers._fields)),
     )
 
 

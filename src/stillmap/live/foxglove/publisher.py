@@ -45,6 +45,7 @@ class Publisher:
         self._map_points = PointCloudChannel("/map_points", context=context)
         self._pose = PoseInFrameChannel("/pose", context=context)
         self._path = SceneUpdateChannel("/path", context=context)
+        self._movers = SceneUpdateChannel("/movers", context=context)
         self._tf = FrameTransformsChannel("/tf", context=context)
         self._doubts = LogChannel("/doubts", context=context)
         self._clouds = dict[str | int, tuple[PointCloudChannel, PointCloudChannel]]()
@@ -110,6 +111,7 @@ class Publisher:
             self._server.broadcast_time(stamp)
             self._tf.log(schemas.to_transforms(answer), log_time=stamp)
             self._pose.log(schemas.to_pose_in_frame(answer), log_time=stamp)
+            self._movers.log(schemas.to_movers(answer), log_time=stamp)
             if answer.doubts != self._told:
                 self._told = answer.doubts
                 self._doubts.log(schemas.to_log(answer.doubts, stamp), log_time=stamp)

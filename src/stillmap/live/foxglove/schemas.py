@@ -4,7 +4,9 @@ import math
 
 import numpy as np
 from foxglove.messages import (
+    ArrowPrimitive,
     Color,
+    CylinderPrimitive,
     FrameTransform,
     FrameTransforms,
     Grid,
@@ -20,7 +22,10 @@ from foxglove.messages import (
     PoseInFrame,
     Quaternion,
     SceneEntity,
+    SceneEntityDeletion,
+    SceneEntityDeletionType,
     SceneUpdate,
+    TextPrimitive,
     Timestamp,
     Vector2,
     Vector3,
@@ -40,7 +45,9 @@ MAP, ODOM, BASE = "map", "odom", "base"  # frames
 
 _NS, _MAX_SECONDS = 10**9, 2**32 - 1
 _FREE, _OCCUPIED = 245, 20  # grey
-_HEIGHT = 0.02  # m of path and movers above the map
+_HEIGHT = 0.02  # m of the path above the map
+_MOVER_HEIGHT = 1.7  # m
+_SHAFT, _ARROW_WIDTH, _FONT_SIZE = 0.8, 0.1, 0.4  # share of an arrow's length; m; m
 _LINE_WIDTH = 0.05  # m
 _MAX_PATH = 5000  # points
 _RGBA = [
@@ -142,11 +149,61 @@ def to_path(positions: Float, stamp_ns: int) -> SceneUpdate:
     return SceneUpdate(entities=[entity])
 
 
+def to_movers(answer: Answer) -> SceneUpdate:
+    """A cylinder with its number for each mover, and an arrow as long as its way in a second.
+
+    Those of before go: a message may be lost on the way.
+    """
+    stamp, movers = to_timestamp(answer.stamp_ns), answer.movers
+    every = SceneEntityDeletion(timestamp=stamp, type=SceneEntityDeletionType.All)
+    rows = zip(*(column.tolist() for column in movers), strict=True)
+    return SceneUpdate(deletions=[every], entities=[_mover(stamp, *row) for row in rows])
+
+
 def to_log(doubts: tuple[str, ...], stamp_ns: int) -> Log:
     """One line about what is in doubt."""
     level = LogLevel.Warning if doubts else LogLevel.Info
     text = "; ".join(DOUBTS[name] for name in doubts) or "no doubts"
     return Log(timestamp=to_timestamp(stamp_ns), level=level, name="stillmap", message=text)
+
+
+def _mover(
+    stamp: Timestamp, number: int, position: list[float], velocity: list[float], radius: float
+) -> SceneEntity:
+    x, y, z = position if len(position) == 3 else (*position, 0.5 * _MOVER_HEIGHT)
+    speed, half = math.hypot(*velocity), 0.5 * math.atan2(velocity[1], velocity[0])
+    upright = Pose(position=Vector3(x=x, y=y, z=z), orientation=Quaternion(w=1.0))
+    top = Vector3(x=x, y=y, z=z + 0.5 * _MOVER_HEIGHT)
+    body = CylinderPrimitive(
+        pose=upright,
+        size=Vector3(x=2.0 * radius, y=2.0 * radius, z=_MOVER_HEIGHT),
+        bottom_scale=1.0,
+        top_scale=1.0,
+        color=_color(ORANGE, 0.5),
+    )
+    arrow = ArrowPrimitive(
+        pose=Pose(position=top, orientation=Quaternion(z=math.sin(half), w=math.cos(half))),
+        shaft_length=_SHAFT * speed,
+        shaft_diameter=_ARROW_WIDTH,
+        head_length=(1.0 - _SHAFT) * speed,
+        head_diameter=2.0 * _ARROW_WIDTH,
+        color=_color(ORANGE),
+    )
+    label = TextPrimitive(
+        pose=Pose(position=top, orientation=Quaternion(w=1.0)),
+        billboard=True,
+        font_size=_FONT_SIZE,
+        color=_color(ORANGE),
+        text=str(number),
+    )
+    return SceneEntity(
+        timestamp=stamp,
+        frame_id=MAP,
+        id=str(number),
+        cylinders=[body],
+        arrows=[arrow],
+        texts=[label],
+    )
 
 
 def _cloud(
@@ -209,6 +266,6 @@ def _rotation(T: Float) -> Quaternion:
     return Quaternion(x=x, y=y, z=z, w=w)
 
 
-def _color(rgb: Rgb) -> Color:
+def _color(rgb: Rgb, alpha: float = 1.0) -> Color:
     r, g, b = (one / 255.0 for one in rgb)
-    return Color(r=r, g=g, b=b, a=1.0)
+    return Color(r=r, g=g, b=b, a=alpha)

@@ -32,7 +32,7 @@ _TILES_PER_MESSAGE = 64
 
 
 class FoxgloveServer:
-    """Serves map, labelled scans, pose, path and doubts to Foxglove and Lichtblick.
+    """Serves map, labelled scans, movers, pose, path and doubts to Foxglove and Lichtblick.
 
     Args:
         host: address to listen at; who reaches it can watch.
