@@ -193,6 +193,11 @@ class LiveMapper:
         return self._labels.to_map()
 
     @property
+    def resolution(self) -> float:
+        """m, edge of the cells in which `Update.changes` are, once a scan was pushed."""
+        return self._labels.resolution
+
+    @property
     def objects(self) -> list[MovingObject]:
         """Moving objects, from the labels and poses of all scans so far."""
         return self.snapshot().build().objects

@@ -83,7 +83,7 @@ class FoxgloveServer:
             update: the answer.
         """
         if update.changes:
-            self._mailbox.put_changes(update.changes, mapper.options.slam.resolution)
+            self._mailbox.put_changes(update.changes, mapper.resolution)
         now, answer = time.monotonic(), to_answer(beams, update)
         is_first, self._last[beams.sensor] = beams.sensor not in self._last, answer
         if now >= self._slow_due:
