@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,8 +19,12 @@ from foxglove_client import Client, grid_of, points_of, pose_of, stamp_of
 
 from stillmap.cli.main import main
 from stillmap.core.errors import InputError, MissingExtra
+from stillmap.live.causal_labels import MapChange
 from stillmap.live.foxglove.server import FoxgloveServer
 from stillmap.live.foxglove.tile_map import TileMap
+from stillmap.live.movers import Mover
+from stillmap.live.scan import Scan, to_beams
+from stillmap.live.update import Update
 from stillmap.sim import scene_by_name, simulate, write_simulation
 
 TOPICS = ("/map", "/pose", "/path", "/tf", "/doubts", "/movers", "/scan_static", "/scan_dynamic")
@@ -206,6 +211,32 @@ def test_several_lasers_have_topics_of_their_own(server, corridor):
                 }
             )
         )
+
+
+def test_in_three_dimensions(server):
+    """Of a mapper that answers with poses (4, 4), points (N, 3) and blocks of voxels."""
+    p_occupied = np.full((8, 8, 8), np.nan, np.float32)
+    p_occupied[0, 1, 2] = 1.0  # z, y, x
+    T = np.eye(4)
+    T[:3, 3] = 1.0, 2.0, 3.0
+    mapper = SimpleNamespace(path=np.stack([np.eye(4), T]), resolution=0.5)
+    beams = to_beams(Scan(10**9, points=[[1.0, 0.0, 0.5], [0.0, 2.0, 0.0], [0.0, 0.0, 9.0]]))
+    movers = [Mover(4, np.array([5.0, 5.0, 1.0]), np.zeros(3), np.eye(6), 0.3, 1.0)]
+    change = MapChange(np.array([0, 8, 0]), p_occupied)
+    p_static = np.float32([0.9, 0.1, np.nan])
+    server.show(mapper, beams, Update(T, np.eye(6), p_static, None, (), [change], movers))
+    with Client(server.url) as client:
+        client.subscribe("/map_points", *TOPICS)
+        client.wait(lambda client: client.received.keys() >= {"/map_points", *TOPICS} - {"/map"})
+    last = {topic: messages[-1] for topic, messages in client.received.items()}
+    np.testing.assert_allclose(points_of(last["/map_points"])[0], [[1.25, 4.75, 0.25]])
+    np.testing.assert_allclose(points_of(last["/scan_static"])[0], [[2.0, 2.0, 3.5]])
+    np.testing.assert_allclose(points_of(last["/scan_dynamic"])[0], [[1.0, 4.0, 3.0]])
+    np.testing.assert_allclose(pose_of(last["/pose"]["pose"]), T)
+    (mover,) = last["/movers"]["entities"]
+    np.testing.assert_allclose(pose_of(mover["cylinders"][0]["pose"])[:3, 3], [5.0, 5.0, 1.0])
+    line = last["/path"]["entities"][0]["lines"][0]["points"]
+    assert line[-1] == {"x": 1.0, "y": 2.0, "z": 3.0}
 
 
 def test_mapping_goes_on_when_the_server_dies(corridor, caplog):

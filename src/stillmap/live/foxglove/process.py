@@ -9,6 +9,7 @@ import traceback
 from typing import IO
 
 from stillmap.core.errors import InputError, MissingExtra, import_extra
+from stillmap.core.extras import install_command
 from stillmap.live.foxglove.answer import unpack_answer, unpack_changes
 from stillmap.live.foxglove.mailbox import Mailbox
 from stillmap.live.messages import read_message
@@ -35,7 +36,11 @@ def _serve(host: str, port: int) -> None:
         InputError: the library is missing, or nobody can be served there.
     """
     import_extra("foxglove", "the live view", "served", group="live")
-    from stillmap.live.foxglove.publisher import Publisher
+    try:
+        from stillmap.live.foxglove.publisher import Publisher
+    except ImportError as error:  # of another version
+        what = f"this foxglove-sdk cannot be used: {error}"
+        raise InputError(what, hint=install_command("live")) from error
 
     mailbox = Mailbox()
     publisher = Publisher(host, port, mailbox.wake)

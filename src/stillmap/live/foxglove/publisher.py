@@ -23,7 +23,7 @@ from stillmap.live.foxglove.tile_map import TileMap
 
 _PERIOD = 1.0  # s at least between two maps, and between two paths
 # messages that wait for a client that does not read; the oldest are dropped
-_BACKLOG = 64
+_BACKLOG = 128
 
 
 class Publisher:
