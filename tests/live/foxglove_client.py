@@ -95,17 +95,18 @@ class Client:
     """
 
     def __init__(self, url, **options):
-        self._socket = websockets.sync.client.connect(
+        self._connection = websockets.sync.client.connect(
             url, subprotocols=["foxglove.sdk.v1"], max_size=None, **options
         )
+        self._socket = self._connection.__enter__()
         self.topics, self._channels, self._wanted, self.subscribed = {}, {}, set(), set()
         self.received, self.times, self.info = {}, [], json.loads(self._socket.recv(10))
 
     def __enter__(self):
         return self
 
-    def __exit__(self, *_):
-        self._socket.close()
+    def __exit__(self, *error):
+        self._connection.__exit__(*error)
 
     def subscribe(self, *topics):
         """To be sent these, as soon as they are advertised."""
