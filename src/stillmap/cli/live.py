@@ -123,7 +123,7 @@ def _replay(args: argparse.Namespace) -> int:
         say(describe(latency))
         say(f"wrote {output}" if has_scans else "no scan was mapped: nothing was written")
     if args.json:
-        print_json({"output": str(output), **latency.to_dict()})
+        print_json({"output": str(output) if has_scans else None, **latency.to_dict()})
     return 0
 
 
