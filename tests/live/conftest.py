@@ -20,9 +20,10 @@ class Run:
         self.recording, self.truth = simulation.recording, simulation.truth
         self.mapper = LiveMapper({"threads": 1})
         odometry = self.recording.T_odom_base
+        self.beams = list(iter_beams(self.recording))
         self.updates = [
             self.mapper.push(beams, None if odometry is None else odometry[t])
-            for t, beams in enumerate(iter_beams(self.recording))
+            for t, beams in enumerate(self.beams)
         ]
 
     @property

@@ -1,14 +1,27 @@
 """Result of one scan: pose, labels, doubts, changed map tiles."""
 
 from dataclasses import dataclass, field
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.short_repr import ShortRepr
 from stillmap.live.causal_labels import MapChange
+from stillmap.live.movers import Mover
 
 Float = NDArray[np.float64]
+
+# for people
+DOUBTS = MappingProxyType(
+    {
+        "slip": "odometry disagrees with the scans",
+        "blind": "no beam meets anything",
+        "carried": "the scans contradict the map",
+        "lost": "the pose in the known map is not known",
+        "ambiguous": "several places in the known map fit",
+    }
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,6 +37,7 @@ class Update(ShortRepr):
             that the map knows), "carried" (the scans contradict the map), "lost" (the pose is none
             in the known map), "ambiguous" (several places in it fit about as well).
         changes: parts of the map that changed since the last update.
+        movers: what moves now, as far as it has been seen to.
     """
 
     pose: Float
@@ -32,3 +46,4 @@ class Update(ShortRepr):
     T_map_odom: Float | None
     doubts: tuple[str, ...] = ()
     changes: list[MapChange] = field(default_factory=list)
+    movers: list[Mover] = field(default_factory=list)

@@ -18,6 +18,8 @@ from stillmap.live.ros.installation import Ros
 from stillmap.live.ros.intake import BACKWARDS, NO_MOUNT, NO_ODOMETRY, Arrival, ScanIntake
 from stillmap.live.ros.parameters import Parameters, declare
 from stillmap.live.ros.publishers import TF_MESSAGE, Publishers
+from stillmap.live.scan import ScanBeams
+from stillmap.live.update import DOUBTS, Update
 from stillmap.pipeline.options import Options
 
 _NAME = "stillmap"
@@ -25,13 +27,7 @@ _TF_DEPTH, _ODOMETRY_DEPTH = 100, 50
 _POLL = 0.02  # s between two looks at scans that wait
 _STATUS_PERIOD = 1.0  # s
 _LATENCIES = 1000  # scans over which latency is told
-_DOUBTS = {
-    "slip": "odometry disagrees with the scans",
-    "blind": "no beam meets anything",
-    "carried": "the scans contradict the map",
-    "lost": "the pose in the known map is not known",
-    "ambiguous": "several places in the known map fit",
-}
+Show = Callable[[LiveMapper, ScanBeams, Update], None]
 
 
 class LiveNode:
@@ -45,6 +41,7 @@ class LiveNode:
         output: result folder.
         overwrite: replace what is there.
         make_mapper: of these options, with what the parameters changed.
+        show: called with each scan and its answer.
 
     Raises:
         InputError: a parameter is wrong.
@@ -58,9 +55,11 @@ class LiveNode:
         *,
         overwrite: bool,
         make_mapper: Callable[[Options], LiveMapper],
+        show: Show | None = None,
     ) -> None:
         self.node = ros.rclpy.create_node(_NAME)
         self._ros, self._output, self._overwrite = ros, output, overwrite
+        self._show = show
         self.parameters = self._declare(options)
         resolution = self.parameters.resolution
         if resolution != options.slam.resolution:
@@ -204,6 +203,8 @@ class LiveNode:
         self._stamp_ns, self._is_map_old = arrival.beams.stamp_ns, True
         self.scans += 1
         self._doubts.update(update.doubts)
+        if self._show is not None:
+            self._show(self._mapper, arrival.beams, update)
 
     def _report(self) -> None:
         """Diagnostics of the last second; the last map, where scans have stopped."""
@@ -218,11 +219,11 @@ class LiveNode:
             "latency 99 % (ms)": f"{np.quantile(ms, 0.99):.1f}",
             "odometry": self._intake.odometry.source or "none",
             **{reason: str(n) for reason, n in sorted(counts.items())},
-            **{_DOUBTS[doubt]: str(n) for doubt, n in sorted(doubts.items())},
+            **{DOUBTS[doubt]: str(n) for doubt, n in sorted(doubts.items())},
         }
         level, text = publishers.OK, "mapping" if self.scans else "waiting for scans"
         if new or doubts:
-            level, text = publishers.WARN, "; ".join([*new, *(_DOUBTS[name] for name in doubts)])
+            level, text = publishers.WARN, "; ".join([*new, *(DOUBTS[name] for name in doubts)])
         if new[BACKWARDS] or new[NO_MOUNT]:
             level = publishers.ERROR
         self._publishers.publish_status(level, text, values)
