@@ -20,8 +20,10 @@ Float = NDArray[np.float64]
 # sweeps from which the motion during the first one is found; m/s and rad/s of it that matter
 _FIRST_SWEEPS, _MIN_MOTION = 5, 0.05
 _EXPLAINED_RATE = 0.1  # weight of one sweep in the running average of the explained share
-_POOR_SHARE = 0.5  # of the usual explained share, below which a sweep contradicts the local map
-_CARRIED_AFTER = 20  # sweeps that contradict the local map, without one that agrees
+# of the usual explained share, below which a sweep contradicts the local map: it is not added, for
+# it would make the map agree with those that follow
+_POOR_SHARE = 0.6
+_CARRIED_AFTER = 5  # sweeps in a row that contradict the local map
 
 
 class SweepOdometry:
@@ -111,6 +113,8 @@ class SweepOdometry:
             beams: as if taken at the stamp.
             e: of them.
         """
+        if self._contradictions:
+            return None
         kept, state = take_beams(beams, self._kept), self._state
         T, weights = kept.T_base_sensor, e[self._kept]
         in_base = (kept.points @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
