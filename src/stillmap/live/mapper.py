@@ -20,6 +20,7 @@ from stillmap.em import CellProbabilities
 from stillmap.io.array_checks import poses_to_matrices
 from stillmap.live.causal_labels import CausalLabels, MapChange
 from stillmap.live.front_end import FrontEnd, Registration
+from stillmap.live.hindsight import Hindsight, LaterLabels
 from stillmap.live.history import History
 from stillmap.live.known_map import KnownMap
 from stillmap.live.local_map import thin_scan
@@ -66,6 +67,9 @@ class LiveMapper:
             between two scans, the same to the bit every time.
         scratch: folder of the files in which all scans are kept for `save` and `finish`; None: the
             system's temporary folder.
+        max_scratch: bytes, about, that their beams may take, 13 each: beyond, every second one of
+            the scans that lie most densely is dropped, the oldest first; None: all are kept.
+        lag: s after which each scan is labelled once more, see `Update.hindsight`; None: it is not.
 
     Examples:
         >>> with stillmap.LiveMapper() as mapper:
@@ -82,11 +86,15 @@ class LiveMapper:
         mode: Mode = "localise",
         background: bool = False,
         scratch: str | os.PathLike[str] | None = None,
+        max_scratch: int | None = None,
+        lag: float | None = None,
     ) -> None:
+        _require_positive(max_scratch=max_scratch, lag=lag)
         self.options = to_options(options)
         self._place = None if place is None else PlaceTracker(KnownMap(place), mode)
         self._in_background = background
         self._scratch = None if scratch is None else Path(scratch)
+        self._max_scratch, self._hindsight = max_scratch, Hindsight(lag)
         self._T_odom_base: Float | None = None
         self._path_begin = 0  # the first spaced scan in the frame of the map
         self._last_ns: int | None = None
@@ -104,7 +112,7 @@ class LiveMapper:
         self._labels = CausalLabels(D, slam.resolution, options.em)
         self._selector = BeamSelector(options.em.time_bin)
         self._movers = MoverTracker(D)
-        self._history = History(D, self._scratch)
+        self._history = History(D, self._scratch, self._max_scratch)
         self._closer: LoopClosing | None = None
         self._T_map_local, self._drift = np.eye(D + 1), np.zeros((3, 3))
         # of the spaced scans: in the frame of the odometry by scans; in the map, where corrected
@@ -145,6 +153,7 @@ class LiveMapper:
         self._history.append(beams, p_static, T_odom_base, pose, found.T, anchor)
         self._T_odom_base, self._last_ns = T_odom_base, beams.stamp_ns
         update = self._to_update(beams.stamp_ns, found, p_static, T_odom_base)
+        self._hindsight.add(len(self._history) - 1, beams)
         is_spaced = self._add_to_maps(deskewed, labelled, np.nan_to_num(p_static), found)
         if is_spaced and self._place is not None and self._place.is_lost:
             return self._localize(self._place, thin(hits), update, T_odom_base)
@@ -195,19 +204,17 @@ class LiveMapper:
     @property
     def poses(self) -> Float:
         """(T, D+1, D+1) T_map_base of all scans, as they are known now."""
-        answers = self._history.answers()
-        if not len(answers.poses):
-            return answers.poses
-        if self._place is not None:
-            return self._place.to_known(answers.poses)
+        given, local, anchor = self._history.poses()
+        if self._place is not None or not len(given):
+            return given if self._place is None else self._place.to_known(given)
         # the scan after which each spaced one is the last: itself, but for the first
-        scans = np.searchsorted(answers.anchor, np.arange(len(self._spaced)) - 1, side="right") - 1
+        scans = np.searchsorted(anchor, np.arange(len(self._spaced)) - 1, side="right") - 1
         every, kept = np.unique(np.maximum(scans, 0), return_index=True)
-        corrected, last = self._spaced_poses()[kept], len(answers.local) - 1
+        corrected, last = self._spaced_poses()[kept], len(local) - 1
         if every[-1] != last:
             every = np.append(every, last)
-            corrected = np.concatenate([corrected, (self._T_map_local @ answers.local[-1])[None]])
-        return local_map.propagate_corrections(answers.local, every, corrected)
+            corrected = np.concatenate([corrected, (self._T_map_local @ local[-1])[None]])
+        return local_map.propagate_corrections(local, every, corrected)
 
     @property
     def path(self) -> Float:
@@ -260,8 +267,9 @@ class LiveMapper:
 
     def snapshot(self) -> Snapshot:
         """All scans so far and what is known of them: to save them while more are pushed."""
-        recording, answers = self._history.recording(), self._history.answers()
-        return Snapshot(recording, self.poses, answers, self.options, self._scratch)
+        recording, answers = self._history.snapshot()
+        poses = self.poses[answers.number]
+        return Snapshot(recording, poses, answers, self.options, self._scratch)
 
     def finish(self, progress: Progress = no_progress) -> BuiltResult:
         """The result of `stillmap.build` on all scans: poses, labels and map refined."""
@@ -403,7 +411,14 @@ class LiveMapper:
             tuple(name for name, is_so in doubts.items() if is_so),
             self._take_changes(stamp_ns),
             self._movers.movers(self._T_map_local),
+            [LaterLabels(n, self.label(one, n)) for n, one in self._hindsight.take(stamp_ns)],
         )
 
 
 LoopClosing = LoopCloser | LiveSweepLoopCloser | LoopProcess | NoLoops
+
+
+def _require_positive(**numbers: float | None) -> None:
+    for name, number in numbers.items():
+        if number is not None and not 0.0 < number < np.inf:
+            raise ValueError(f"{name}: expected a positive number, got {number}")

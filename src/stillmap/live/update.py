@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from stillmap.core.short_repr import ShortRepr
 from stillmap.live.causal_labels import MapChange
+from stillmap.live.hindsight import LaterLabels
 from stillmap.live.movers import Mover
 
 Float = NDArray[np.float64]
@@ -38,6 +39,7 @@ class Update(ShortRepr):
             in the known map), "ambiguous" (several places in it fit about as well).
         changes: parts of the map that changed since the last update.
         movers: what moves now, as far as it has been seen to.
+        hindsight: earlier scans that are labelled once more, see `LiveMapper(lag=)`.
     """
 
     pose: Float
@@ -47,3 +49,4 @@ class Update(ShortRepr):
     doubts: tuple[str, ...] = ()
     changes: list[MapChange] = field(default_factory=list)
     movers: list[Mover] = field(default_factory=list)
+    hindsight: list[LaterLabels] = field(default_factory=list)
