@@ -269,7 +269,9 @@ class LiveMapper:
             is_done = self._correction.step()
         if is_done:
             self._correction.finish(self._labels)
-            self._odometry.local_map = self._correction.local_map
+            turned = self._correction.T_map_local @ se2.inverse(self._T_map_local)
+            turn = float(se2.parameters(turned)[2])
+            self._odometry.replace_map(self._correction.local_map, turn)
             self._T_map_local = self._correction.T_map_local
             self._corrected = self._correction.poses
             self._correction = None
