@@ -1,6 +1,7 @@
 """Live mapping: poses and labels as they were given at the time, and how long that took.
 
-python benchmarks/live.py logs LOGS [--names intel fr101] --data DIR
+python benchmarks/live.py logs LOGS [--names intel fr101] --data DIR [--finish]
+    [--karto-python PYTHON]
 python benchmarks/live.py labels [--worlds hall corridor] [--first-seed 11] [--seeds 2]
 python benchmarks/live.py localize --data DIR [--worlds hall office] [--starts 25] [--people N]
 python benchmarks/live.py crowds --data DIR [--world hall] [--people 0 30 60 120] [--runs 5]
@@ -8,7 +9,7 @@ python benchmarks/live.py latency [--world hall] [--seconds 600] [--rate 40] [--
 
 logs: each NAME.clf.gz with NAME.exact.relations or NAME.pseudo.relations beside it: relation
 errors of `stillmap live --replay`, of the poses at the time and at the end, beside those of
-`stillmap map`.
+`stillmap map`, of `LiveMapper.finish()` and of Karto, see live_logs.py.
 labels: F1 of "dynamic" and average precision by the lag after which a beam is labelled, seconds.
 localize: the robot is put down at random places of a known map, and has 30 scans to find out where
 it is: right within 0.3 m.
@@ -26,23 +27,20 @@ import time
 from collections import deque
 from pathlib import Path
 
+import live_logs
 import numpy as np
-import session_merging as merging
 from particle_filter import ParticleFilter
 from tables import markdown
 
 from stillmap import build
 from stillmap.core import se2
 from stillmap.eval.map import GHOST_DISTANCE, distance_to_walls
-from stillmap.eval.readers import read_planar_trajectory, read_relations
-from stillmap.eval.relations import compute_relation_errors
 from stillmap.eval.trajectory import compute_absolute_errors
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.replay import iter_beams
 from stillmap.results.reader import Grid, moved, read_grid
 from stillmap.sim import scene_by_name, simulate
 
-_LOGS = ("intel", "aces", "belgioioso", "edmonton", "fr101", "seattle")
 _MAP_SEED, _OTHER_SEED, _SCANS_TO_LOCALIZE = 11, 12, 30
 _SCANS_IN_CROWDS = 400
 _LAGS = (0.0, 1.0, 5.0, 30.0, math.inf)  # s
@@ -59,11 +57,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     commands = p.add_subparsers(required=True)
     logs = commands.add_parser("logs")
-    logs.set_defaults(run=map_logs)
-    logs.add_argument("folder", type=Path)
-    logs.add_argument("--names", nargs="+", default=list(_LOGS))
-    logs.add_argument("--data", type=Path, required=True, help="folder for results")
-    logs.add_argument("--program", nargs="+", default=merging.default_program())
+    logs.set_defaults(run=live_logs.map_logs)
+    live_logs.add_arguments(logs)
     labels = commands.add_parser("labels")
     labels.set_defaults(run=score_labels)
     labels.add_argument("--worlds", nargs="+", default=["hall", "corridor"])
@@ -90,34 +85,6 @@ def _parser() -> argparse.ArgumentParser:
     latency.add_argument("--rate", type=float, default=40.0)
     latency.add_argument("--beams", type=int, default=1081)
     return p
-
-
-def map_logs(args: argparse.Namespace) -> str:
-    """A line per log."""
-    lines = []
-    for name in args.names:
-        log = args.folder / f"{name}.clf.gz"
-        kinds = ("exact.relations", "pseudo.relations")
-        relations = next(p for kind in kinds if (p := args.folder / f"{name}.{kind}").exists())
-        batch, live = args.data / f"batch-{name}", args.data / f"live-{name}"
-        if not (batch / "run.json").exists():
-            merging.build_map(args.program, log, batch)
-        done = merging.call(args.program, "live", "--replay", log, "--threads", 1, "-o", live)
-        runs = [batch / "trajectory.tum", live / "live/trajectory.tum", live / "trajectory.tum"]
-        errors = [_relation_error(run, relations) for run in runs]
-        line = [f"{t:.4f} / {r:.3f}" for t, r in errors]
-        lines.append([name, *line, f"{errors[1][0] / errors[0][0]:.2f}", f"{done.cpu:.0f}"])
-        print(" | ".join(lines[-1]), flush=True)
-    titles = ["log", "batch: m / deg", "live, at the time", "live, at the end", "ratio", "CPU s"]
-    return markdown(titles, lines)
-
-
-def _relation_error(trajectory: Path, relations: Path) -> tuple[float, float]:
-    """Mean translational (m) and rotational (degrees) error."""
-    errors = compute_relation_errors(
-        read_planar_trajectory(trajectory), read_relations(relations), None, 0.1, False
-    )
-    return errors.translation.mean, errors.rotation.mean
 
 
 def score_labels(args: argparse.Namespace) -> str:

@@ -144,6 +144,9 @@ def test_a_saved_run_is_a_result(corridor, tmp_path):
 
 def test_finishing_is_building(corridor):
     found = corridor.mapper.finish()
+    built = stillmap.build(corridor.recording, {"threads": 1})
+    np.testing.assert_array_equal(found.poses, built.poses)
+    np.testing.assert_array_equal(found.p_static, built.p_static)
     errors = compute_absolute_errors(found.poses, corridor.truth.T_world_base)
     assert errors.rmse < 0.03
     assert f1(found.p_static, corridor.truth.static, corridor.recording.hit) > 0.95

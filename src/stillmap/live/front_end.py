@@ -66,3 +66,6 @@ class FrontEnd(Protocol):
 
     def enter(self, local_map: Any, T: Float, /) -> None:
         """Go on in another map, in whose frame the frame so far has the pose T."""
+
+    def correct(self, local_map: Any, motion: Float, /) -> None:
+        """Go on with a local map made anew, in 3D None, after the map has moved (D+1, D+1)."""

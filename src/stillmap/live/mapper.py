@@ -369,8 +369,8 @@ class LiveMapper:
             is_done = self._correction.step(self._labels)
         if is_done:
             self._correction.finish(self._labels)
-            if self._correction.local_map is not None:
-                self._odometry.local_map = self._correction.local_map
+            motion = self._correction.T_map_local @ se2.inverse(self._T_map_local)
+            self._odometry.correct(self._correction.local_map, motion)
             self._T_map_local = self._correction.T_map_local
             self._corrected = self._correction.poses
             self._correction = None

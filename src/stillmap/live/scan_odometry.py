@@ -1,6 +1,7 @@
 """Causal scan matching in 2D: each scan is matched (9) against a map of the scans before it."""
 
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,7 @@ from stillmap.live.front_end import Registration
 from stillmap.live.local_map import LocalMap, MappedScan, MatchMap
 from stillmap.live.scan import ScanBeams, deskew
 from stillmap.live.scan_hits import select_hits, thin
+from stillmap.live.wall_directions import WallDirections, correct_heading
 from stillmap.slam import kidnapping, motion_model
 from stillmap.slam.deskew import MAX_SPEED, MAX_TURN_RATE
 from stillmap.slam.kidnapping import Evidence
@@ -63,6 +65,7 @@ class ScanOdometry:
         self._velocity_noise, self._odometry_noise = VelocityNoise(), OdometryNoise()
         self._usual: dict[str | int, float] = {}
         self._contradictions = 0.0
+        self._walls: WallDirections | None = WallDirections()
         self._is_first = True
         self._increment = _LatestIncrement()
         self._slip = SlipDetector(self._increment)
@@ -110,6 +113,8 @@ class ScanOdometry:
         if not self._is_first and not is_carried:
             match, slips = self._detect_slip(guess, scan, match)
             is_slipping = is_slipping or slips
+        if not is_carried:
+            match = self._correct_heading(scan, match)
         is_blind = not len(scan.points) or float(scan.weights.sum()) <= 0.0
         learned = self._learned_prior(prior, increment) or prior
         drift = motion_model.blind_drift(learned, match.covariance)
@@ -132,6 +137,25 @@ class ScanOdometry:
         self.local_map = local_map
         self._pose, self._before = T @ self._pose, T @ self._before
         self._contradictions = 0.0
+        self._walls = None  # that map has the heading
+
+    def correct(self, local_map: MatchMap, motion: Float) -> None:
+        """Go on with a local map made anew, after the map has moved (3, 3)."""
+        self.local_map = local_map
+        if self._walls is not None:
+            self._walls.rotate(-float(se2.parameters(motion)[2]))
+
+    def _correct_heading(self, scan: Scan, match: ScanMatch) -> ScanMatch:
+        """The match with the heading that the walls so far suggest, too."""
+        if self._walls is None:
+            return match
+        T = match.T_map_base
+        metres = 0.0 if self._is_first else float(np.hypot(*(T[:2, 2] - self._pose[:2, 2])))
+        offset = self._walls.measure(scan, T)
+        if offset is not None:
+            T = correct_heading(T, match.covariance, offset)
+        self._walls.add(scan, T, metres)
+        return replace(match, T_map_base=T)
 
     def _match(
         self,
@@ -186,6 +210,7 @@ class ScanOdometry:
         self.local_map = LocalMap(self.options.resolution)
         self._usual.clear()
         self._contradictions = 0.0
+        self._walls = WallDirections()
         self._slip.reset()
 
     def _learned_prior(self, prior: MotionPrior, increment: Float | None) -> MotionPrior | None:

@@ -134,6 +134,9 @@ class SweepOdometry:
         state = self._state
         self._state = State(T @ state.T_map_base, state.twist, state.covariance)
 
+    def correct(self, _local_map: None, _motion: Float) -> None:
+        """The local map stays as it is: it holds what is near, not what loops tie to it."""
+
     def _advance(self, state: State, stamp_ns: int) -> None:
         step = se2.inverse(self._state.T_map_base) @ state.T_map_base
         metres = float(np.linalg.norm(step[:3, 3]))
