@@ -31,12 +31,12 @@ import session_merging as merging
 from particle_filter import ParticleFilter
 from tables import markdown
 
-from stillmap import build
+from stillmap import build, load
 from stillmap.core import se2
 from stillmap.eval.map import GHOST_DISTANCE, distance_to_walls
 from stillmap.eval.readers import read_planar_trajectory, read_relations
 from stillmap.eval.relations import compute_relation_errors
-from stillmap.eval.trajectory import compute_absolute_errors
+from stillmap.eval.trajectory import align, compute_absolute_errors
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.replay import iter_beams
 from stillmap.results.reader import Grid, moved, read_grid
@@ -191,7 +191,7 @@ def localize_globally(args: argparse.Namespace) -> str:
     """A line per world."""
     lines = []
     for world in args.worlds:
-        known, T_map_world = _build_known_map(args.data / world, world)
+        known, T_map_world = build_known_map(args.data / world, world)
         crowd = {} if args.people is None else {"crowd": {"people": args.people}}
         simulation = simulate(scene_by_name(world, crowd), _OTHER_SEED)
         rng = np.random.default_rng(0)
@@ -215,12 +215,13 @@ def localize_globally(args: argparse.Namespace) -> str:
     return markdown([*titles, "s of the last search", "at most"], lines)
 
 
-def _build_known_map(folder: Path, world: str):
-    """The map of another run, and the pose of the world in it."""
-    simulation = simulate(scene_by_name(world), _MAP_SEED)
+def build_known_map(folder: Path, world: str, seed: int = _MAP_SEED):
+    """The map of another run, and the pose of the world in it: by all poses of that run, since the
+    first one alone is off by some hundredths of a radian."""
+    simulation = simulate(scene_by_name(world), seed)
     if not (folder / "run.json").exists():
-        build(simulation.recording).save(folder)
-    return folder, se2.inverse(simulation.truth.T_world_base[0])
+        build(simulation.recording, {"threads": 1}).save(folder)
+    return folder, align(simulation.truth.T_world_base, load(folder).poses)
 
 
 def _localize_from(known: Path, T_map_world, simulation, first: int):
@@ -249,7 +250,7 @@ class _EveryBeamCounts(LiveMapper):
 
 def localize_in_crowds(args: argparse.Namespace) -> str:
     """A line per number of people: lost runs, and ATE of the others."""
-    known, T_map_world = _build_known_map(args.data / args.world, args.world)
+    known, T_map_world = build_known_map(args.data / args.world, args.world)
     lines = []
     for people in args.people:
         errors = {"with": [], "without": [], "filter": []}

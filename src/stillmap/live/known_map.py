@@ -12,7 +12,13 @@ from stillmap.core.grid_map import GridMap
 from stillmap.live.causal_labels import OccupancyFilter
 from stillmap.live.local_map import MappedScan, add_scan, is_spaced
 from stillmap.places.surface_map import SurfaceMap, find_sides
-from stillmap.results.reader import FREE_THRESH, OCCUPIED_THRESH, Grid, read_grid
+from stillmap.results.reader import (
+    FREE_THRESH,
+    OCCUPIED_THRESH,
+    Grid,
+    read_grid,
+    read_hit_sums,
+)
 from stillmap.slam import scan_hits
 
 Float = NDArray[np.float64]
@@ -37,11 +43,12 @@ class KnownMap:
             raise InputError("has an empty map", where=str(folder))
         self.resolution = self._grid.resolution
         self._centres = self._grid.centres(np.argwhere(self._grid.occupied))
+        self._ends = _find_surfaces(self._grid, read_hit_sums(Path(folder)))
 
     def make_grid(self) -> _core.OccupancyGrid2D:
-        """The map for registration: an end point in every occupied cell, and free space."""
+        """The map for registration: an end point for every occupied cell, and free space."""
         grid = _core.OccupancyGrid2D(self.resolution, scan_hits.FREE_SPACE_MARGIN)
-        ends = self._centres.astype(np.float32)
+        ends = self._ends.astype(np.float32)
         n, here = len(ends), np.eye(3)[None]
         offset = np.array([0, n])
         _core.add_end_points(grid, ends, np.ones(n, bool), np.ones(n, np.float32), offset, here)
@@ -126,6 +133,24 @@ def _count(cells: NDArray[np.int64], shape: NDArray[np.int64]) -> NDArray[np.int
     rows, columns = shape.tolist()
     counts = np.bincount(cells[:, 0] * columns + cells[:, 1], minlength=rows * columns)
     return np.asarray(counts.reshape(rows, columns), np.int64)
+
+
+def _find_surfaces(grid: Grid, hits: NDArray[np.floating]) -> Float:
+    """(N, 2) where the surface runs through each occupied cell: the mean of the cells around it,
+    weighted by their hits. Of a wall between two rows of cells it is nearer to the one hit more."""
+    from scipy import ndimage  # slow to load
+
+    if hits.shape != grid.p_occupied.shape:
+        raise InputError("alpha and p_occupied of the map differ in shape")
+    weights = np.nan_to_num(hits.astype(np.float64), nan=0.0)
+    steps = np.arange(-1.0, 2.0)
+    total, across, along = (
+        ndimage.correlate(weights, kernel, mode="constant")
+        for kernel in (np.ones((3, 3)), np.outer(steps, np.ones(3)), np.outer(np.ones(3), steps))
+    )
+    rows, columns = at = np.nonzero(grid.occupied)
+    shifts = np.stack([across[at], along[at]], axis=1) / np.maximum(total[at], 1e-9)[:, None]
+    return grid.centres(np.stack([rows, columns], axis=1) + shifts)
 
 
 def _free_runs(grid: Grid) -> tuple[Float, Float]:
