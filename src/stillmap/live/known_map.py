@@ -31,24 +31,33 @@ class KnownMap:
     """A map to localize in.
 
     Args:
-        folder: of a result or a place.
+        source: folder of a result or a place, or a map.
+
+    Attributes:
+        resolution: m, edge of a cell.
+        surfaces: (N, 2) where the surface runs through each occupied cell, m.
 
     Raises:
         InputError: it has no map, or an empty one.
     """
 
-    def __init__(self, folder: str | os.PathLike[str]) -> None:
-        self._grid = read_grid(Path(folder))
+    def __init__(self, source: str | os.PathLike[str] | GridMap) -> None:
+        if isinstance(source, GridMap):
+            self._grid = Grid(source.p_occupied, source.origin, source.resolution)
+            hits = self._grid.p_occupied
+        else:
+            self._grid, hits = read_grid(Path(source)), read_hit_sums(Path(source))
         if not self._grid.occupied.any():
-            raise InputError("has an empty map", where=str(folder))
+            where = None if isinstance(source, GridMap) else str(source)
+            raise InputError("has an empty map", where=where)
         self.resolution = self._grid.resolution
         self._centres = self._grid.centres(np.argwhere(self._grid.occupied))
-        self._ends = _find_surfaces(self._grid, read_hit_sums(Path(folder)))
+        self.surfaces = _find_surfaces(self._grid, hits)
 
     def make_grid(self) -> _core.OccupancyGrid2D:
         """The map for registration: an end point for every occupied cell, and free space."""
         grid = _core.OccupancyGrid2D(self.resolution, scan_hits.FREE_SPACE_MARGIN)
-        ends = self._ends.astype(np.float32)
+        ends = self.surfaces.astype(np.float32)
         n, here = len(ends), np.eye(3)[None]
         offset = np.array([0, n])
         _core.add_end_points(grid, ends, np.ones(n, bool), np.ones(n, np.float32), offset, here)

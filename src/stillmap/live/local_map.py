@@ -81,6 +81,10 @@ class LocalMap:
         for scan in scans:
             self._insert(scan)
 
+    def join(self, other: "LocalMap", T: NDArray[np.float64]) -> None:
+        """Add the scans of another map, which were taken later, moved by T (3, 3)."""
+        self.extend(replace(scan, T_map_base=T @ scan.T_map_base) for scan in other._scans)
+
     def add(self, scan: MappedScan) -> bool:
         """Add a scan unless it is too close to the last one of its sensor; True if it was added."""
         last = self._last.get(scan.beams.sensor)

@@ -24,8 +24,9 @@ from stillmap.live.loop_closer import LoopCloser
 from stillmap.live.loop_process import LoopProcess
 from stillmap.live.map_correction import LabelledScan, MapCorrection
 from stillmap.live.place import Mode, NoLoops, PlaceTracker
+from stillmap.live.relocalization import Relocalizer
 from stillmap.live.saving import Snapshot
-from stillmap.live.scan import Scan, ScanBeams, to_beams
+from stillmap.live.scan import Scan, ScanBeams, drop_cover, to_beams
 from stillmap.live.scan_hits import normals_of, select_hits, thin
 from stillmap.live.scan_odometry import Registration, ScanOdometry
 from stillmap.live.update import Update
@@ -88,6 +89,11 @@ class LiveMapper:
         # of the spaced scans: in the frame of the odometry by scans; in the map, where corrected
         self._spaced, self._corrected = list[Float](), np.zeros((0, 3, 3))
         self._correction: MapCorrection | None = None
+        # a robot that was carried while it maps; scans that were found later: first, last + 1, and
+        # their motion in the frame of the odometry by scans; the last scan that agreed with the map
+        self._carried: Relocalizer | None = None
+        self._moves = list[tuple[int, int, Float]]()
+        self._last_agreed = -1
         self._last_ns: int | None = None
         self._changes_due_ns = 0
 
@@ -102,7 +108,7 @@ class LiveMapper:
             ValueError: names the argument, what was expected, and what it was.
             OSError: the disk of `scratch` is full.
         """
-        beams = scan if isinstance(scan, ScanBeams) else to_beams(scan)
+        beams = drop_cover(scan if isinstance(scan, ScanBeams) else to_beams(scan))
         T_odom_base = _to_matrix(odometry)
         self._require_next(beams)
         increment = self._increment(T_odom_base)
@@ -110,20 +116,49 @@ class LiveMapper:
         hits = select_hits(beams)
         thinned = self._weigh(thin(hits), prior)
         found = self._odometry.register(beams, thinned, prior, increment)  # M-step: (9)
-        if found.is_carried and self._place is not None:
-            self._place.lose(len(self._history))
-            self._labels = CausalLabels(2, self.options.slam.resolution, self.options.em)
+        if found.is_carried:
+            self._lose()
+        elif not (found.is_contradicted or self._carried):
+            self._last_agreed = len(self._history)
         pose, anchor = self._T_map_local @ found.T, len(self._spaced) - 1
         labelled = LabelledScan(beams, found.T, normals_of(beams, hits), max(anchor, 0))
-        self._labels.add(beams, pose, labelled.normals, labelled.tag)
+        if not found.is_contradicted:
+            self._labels.add(beams, pose, labelled.normals, labelled.tag)
         p_static = self._labels.label(beams, pose)  # E-step: (8)
         self._history.append(beams, p_static, T_odom_base, pose, found.T, anchor)
         self._T_odom_base, self._last_ns = T_odom_base, beams.stamp_ns
         update = self._to_update(beams.stamp_ns, found, p_static, T_odom_base)
         is_spaced = self._add_to_maps(labelled, np.nan_to_num(p_static), found)
+        if is_spaced and self._carried is not None:
+            return self._relocalize(self._carried, thinned, update, T_odom_base)
         if is_spaced and self._place is not None and self._place.is_lost:
             return self._localize(self._place, thinned, update, T_odom_base)
         return update
+
+    def _lose(self) -> None:
+        """The robot was carried: the labels begin anew, until it is found."""
+        if self._place is not None:
+            self._place.lose(len(self._history))
+            self._labels = CausalLabels(2, self.options.slam.resolution, self.options.em)
+        elif self._carried is not None:
+            self._carried.begin(self._labels)
+        else:
+            self._go_on_correcting(to_the_end=True)
+            left_behind = self._odometry.left_behind
+            self._carried = Relocalizer(self._labels, left_behind, self._T_map_local)
+
+    def _relocalize(
+        self, carried: Relocalizer, hits: Hits, update: Update, T_odom_base: Float | None
+    ) -> Update:
+        """Search a robot that was carried in its own map; the update with its pose there."""
+        T = carried.localize(self._labels, hits, update.pose)
+        if T is None:
+            return update
+        self._odometry.enter(carried.join(self._labels, self._odometry.local_map, T), T)
+        self._moves.append((self._last_agreed + 1, len(self._history), T))
+        self._drift, self._carried = self._drift + carried.covariance, None
+        motion = self._T_map_local @ T @ se2.inverse(self._T_map_local)
+        return _move_update(update, motion, T_odom_base)
 
     def _localize(
         self, place: PlaceTracker, hits: Hits, update: Update, T_odom_base: Float | None
@@ -134,10 +169,7 @@ class LiveMapper:
             return update
         self._odometry.enter(place.make_local_map(), T)
         place.enter(self._labels, T)
-        pose = T @ update.pose
-        T_map_odom = None if T_odom_base is None else pose @ se2.inverse(T_odom_base)
-        doubts = tuple(doubt for doubt in update.doubts if doubt not in ("lost", "ambiguous"))
-        return dataclasses.replace(update, pose=pose, T_map_odom=T_map_odom, doubts=doubts)
+        return _move_update(update, T, T_odom_base)
 
     def label(self, scan: Scan | ScanBeams, number: int) -> NDArray[np.float32]:
         """(N,) P(static) of the beams of an earlier scan, by what is known now.
@@ -148,6 +180,8 @@ class LiveMapper:
         """
         beams = scan if isinstance(scan, ScanBeams) else to_beams(scan)
         anchor, local = self._history.at(number)
+        for first, last, T in self._moves:
+            local = T @ local if first <= number < last else local
         pose = self._T_map_local @ local
         if 0 <= anchor < len(self._corrected):
             moved = self._corrected[anchor] @ se2.inverse(self._spaced[anchor])
@@ -160,14 +194,17 @@ class LiveMapper:
         answers = self._history.answers()
         if self._place is not None:
             return self._place.to_known(answers.poses)
+        local = answers.local
+        for first, last, T in self._moves:
+            local[first:last] = T @ local[first:last]
         # the scan after which each spaced one is the last: itself, but for the first
         scans = np.searchsorted(answers.anchor, np.arange(len(self._spaced)) - 1, side="right") - 1
         every, kept = np.unique(np.maximum(scans, 0), return_index=True)
-        corrected, last = self._spaced_poses()[kept], len(answers.local) - 1
+        corrected, last = self._spaced_poses()[kept], len(local) - 1
         if every[-1] != last:
             every = np.append(every, last)
-            corrected = np.concatenate([corrected, (self._T_map_local @ answers.local[-1])[None]])
-        return local_map.propagate_corrections(answers.local, every, corrected)
+            corrected = np.concatenate([corrected, (self._T_map_local @ local[-1])[None]])
+        return local_map.propagate_corrections(local, every, corrected)
 
     @property
     def map(self) -> GridMap:
@@ -244,6 +281,8 @@ class LiveMapper:
         True if the scan is spaced."""
         self._drift = self._drift + found.drift
         added = self._odometry.add(labelled.beams, e)
+        if self._carried is not None:
+            return added is not None
         if added is not None:
             self._spaced.append(added.T_map_base)
             kept = thin_scan(added, _MAX_KEPT_BEAMS)
@@ -260,12 +299,12 @@ class LiveMapper:
         self._go_on_correcting()
         return added is not None
 
-    def _go_on_correcting(self) -> None:
+    def _go_on_correcting(self, *, to_the_end: bool = False) -> None:
         """A part of the work on a correction; all of it where nobody waits."""
         if self._correction is None:
             return
         is_done = self._correction.step()
-        while not (is_done or self._in_background):
+        while not is_done and (to_the_end or not self._in_background):
             is_done = self._correction.step()
         if is_done:
             self._correction.finish(self._labels)
@@ -293,12 +332,14 @@ class LiveMapper:
         p_static: NDArray[np.float32],
         T_odom_base: Float | None,
     ) -> Update:
+        place = self._place
         doubts = {
             "slip": found.is_slipping,
             "blind": found.is_blind,
             "carried": found.is_carried,
-            "lost": self._place is not None and self._place.is_lost,
-            "ambiguous": self._place is not None and self._place.is_ambiguous,
+            "contradicted": found.is_contradicted,
+            "lost": self._carried is not None or (place is not None and place.is_lost),
+            "ambiguous": any(one is not None and one.is_ambiguous for one in (self._carried, place)),
         }
         pose = self._T_map_local @ found.T
         return Update(
@@ -309,6 +350,14 @@ class LiveMapper:
             tuple(name for name, is_so in doubts.items() if is_so),
             self._take_changes(stamp_ns),
         )
+
+
+def _move_update(update: Update, T: Float, T_odom_base: Float | None) -> Update:
+    """The update of a robot that was found: its frame moved by T (3, 3)."""
+    pose = T @ update.pose
+    T_map_odom = None if T_odom_base is None else pose @ se2.inverse(T_odom_base)
+    doubts = tuple(doubt for doubt in update.doubts if doubt not in ("lost", "ambiguous"))
+    return dataclasses.replace(update, pose=pose, T_map_odom=T_map_odom, doubts=doubts)
 
 
 def _make_closer(

@@ -3,7 +3,7 @@
 # signatures name ArrayLike instead of spelling it out
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,6 +15,10 @@ from stillmap.preprocessing.max_range import MAX_ZERO_RANGE
 from stillmap.preprocessing.options import MAX_PLAUSIBLE_RANGE
 
 Float = NDArray[np.float64]
+
+# m within which nearly all readings of a covered sensor lie: what surrounds it so closely moves with
+# the robot
+_COVER_DISTANCE, _COVER_SHARE = 0.3, 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +100,16 @@ def to_beams(scan: Scan) -> ScanBeams:
         require_length("beam_times", len(times), len(points), "the beams")
     pose = _sensor_matrix(scan.sensor_pose, D)
     return ScanBeams(stamp_ns, points, hit, pose, scan.sensor, times)
+
+
+def drop_cover(beams: ScanBeams) -> ScanBeams:
+    """The beams of a scan; none of them usable if something covers the sensor."""
+    usable = finite_rows(beams.points)
+    near = np.linalg.norm(beams.points[usable], axis=1) < _COVER_DISTANCE
+    if np.count_nonzero(near) < max(_COVER_SHARE * len(near), 1.0):
+        return beams
+    nothing = np.full_like(beams.points, np.nan)
+    return replace(beams, points=nothing, hit=np.zeros_like(beams.hit))
 
 
 def _from_ranges(scan: Scan) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:

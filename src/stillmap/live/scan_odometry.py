@@ -34,6 +34,9 @@ _MAX_STAMPS = 500  # of scans that a slip may change in hindsight
 _UNKNOWN = np.full((3, 3), np.inf)  # an increment that is not small
 # contradicting scans for each one that agrees, after which the robot was carried, and so many
 _CARRIED_AFTER, _MAX_STRAY = 20.0, 30.0
+# of them that a scan outweighs which agrees, and one that says nothing; share of the usual explained
+# one below which nothing of a scan is in the local map, though the robot moved on continuously
+_AGREEMENT, _NO_EVIDENCE, _NOTHING = 4.0, 0.25, 0.15
 
 
 class _LatestIncrement:
@@ -57,6 +60,7 @@ class Registration:
         is_slipping: odometry disagrees with the scans.
         is_blind: no beam met anything that the local map knows.
         is_carried: the scans contradict the local map, which begins anew.
+        is_contradicted: the last ones do, or nothing of them is in it; not enough of them yet.
     """
 
     T: Float
@@ -66,6 +70,7 @@ class Registration:
     is_slipping: bool = False
     is_blind: bool = False
     is_carried: bool = False
+    is_contradicted: bool = False
 
 
 class ScanOdometry:
@@ -78,12 +83,14 @@ class ScanOdometry:
     def __init__(self, options: SlamOptions) -> None:
         self.options = options
         self.local_map: MatchMap = LocalMap(options.resolution)
+        self.left_behind = self.local_map  # the one before the robot was carried
         self.travelled = 0.0
         self._pose, self._before = np.eye(3), np.eye(3)
         self._stamp_ns, self._seconds = 0, 0.0
         self._velocity_noise, self._odometry_noise = VelocityNoise(), OdometryNoise()
         self._usual: dict[str | int, float] = {}
         self._contradictions = 0.0
+        self._blind = np.zeros((3, 3))  # covariance since the last scan that met anything
         self._is_first = True
         self._increment = _LatestIncrement()
         self._slip = SlipDetector(self._increment)
@@ -125,14 +132,19 @@ class ScanOdometry:
         is_blind = not len(scan.points) or float(scan.weights.sum()) <= 0.0
         learned = self._learned_prior(prior, increment) or prior
         drift = motion_model.blind_drift(learned, match.covariance)
-        self._learn(beams, learned, match, usual)
+        if not (is_blind or self._contradictions):
+            self._learn(beams, learned, match, usual)
         self._advance(beams, match.T_map_base)
-        doubts = is_slipping, is_blind, is_carried
-        return Registration(match.T_map_base, match.covariance, match.explained, drift, *doubts)
+        self._blind = self._blind + drift if is_blind else np.zeros((3, 3))
+        doubts = is_slipping, is_blind, is_carried, self._contradictions > 0.0
+        covariance = match.covariance + self._blind
+        return Registration(match.T_map_base, covariance, match.explained, drift, *doubts)
 
     def add(self, beams: ScanBeams, e: NDArray[np.float32]) -> MappedScan | None:
-        """Add the last scan to the local map, with P(static) e (N,), unless it is too close to the
-        one before; the scan if it was added."""
+        """Add the last scan to the local map, with P(static) e (N,), unless it contradicts it or is
+        too close to the one before; the scan if it was added."""
+        if self._contradictions > 0.0:
+            return None
         scan = MappedScan(beams, e, self._pose, self.travelled)
         added = self.local_map.add(scan)
         self.local_map.remove_before(self.travelled - _MAX_TRAVEL)
@@ -165,7 +177,10 @@ class ScanOdometry:
         if wider.widened and self._is_reachable(beams, wider.T_map_base):
             is_slipping = prior.is_odometry and is_inconsistent(prior, wider.T_map_base)
             return wider, is_slipping, False
-        if self._is_carried(kidnapping.judge_scan(grid, scan, match, usual)):
+        evidence = kidnapping.judge_scan(grid, scan, match, usual)
+        if match.explained < _NOTHING * usual:
+            evidence = Evidence.CONTRADICTS
+        if self._is_carried(evidence):
             self._start_anew()
             return accept_prior(prior), False, True
         return match, match.contradicts_odometry, False
@@ -189,12 +204,13 @@ class ScanOdometry:
         """True when so many scans contradicted the local map, and hardly any agreed."""
         if evidence is Evidence.CONTRADICTS:
             self._contradictions = min(self._contradictions + 1.0, _MAX_STRAY)
-        elif evidence is Evidence.AGREES:
-            self._contradictions = max(self._contradictions - 4.0, 0.0)
+        else:
+            less = _AGREEMENT if evidence is Evidence.AGREES else _NO_EVIDENCE
+            self._contradictions = max(self._contradictions - less, 0.0)
         return self._contradictions >= _CARRIED_AFTER
 
     def _start_anew(self) -> None:
-        self.local_map = LocalMap(self.options.resolution)
+        self.left_behind, self.local_map = self.local_map, LocalMap(self.options.resolution)
         self._usual.clear()
         self._contradictions = 0.0
         self._slip.reset()
