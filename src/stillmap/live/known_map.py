@@ -1,6 +1,7 @@
 """A map from an earlier run, for localization: to be matched, searched, and looked up."""
 
 import os
+from collections import deque
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,14 @@ import stillmap._core as _core
 from stillmap.core.errors import InputError
 from stillmap.core.grid_map import GridMap
 from stillmap.live.causal_labels import OccupancyFilter
-from stillmap.live.local_map import MappedScan, add_scan, is_spaced
+from stillmap.live.local_map import (
+    Labeller,
+    MappedScan,
+    add_scan,
+    is_spaced,
+    relabel_scan,
+    take_until,
+)
 from stillmap.places.surface_map import SurfaceMap, find_sides
 from stillmap.results.reader import (
     FREE_THRESH,
@@ -93,6 +101,7 @@ class KnownLocalMap:
         self.grid = known.make_grid()
         self._extends = extends
         self._last: dict[str | int, MappedScan] = {}
+        self._recent = deque[MappedScan]()  # that are to be labelled again
 
     def add(self, scan: MappedScan) -> bool:
         """Note a scan unless it is too close to the last one of its sensor; True if it was noted.
@@ -103,7 +112,13 @@ class KnownLocalMap:
         self._last[scan.beams.sensor] = scan
         if self._extends:
             add_scan(self.grid, scan)
+            self._recent.append(scan)
         return True
+
+    def relabel(self, until_ns: int, label: Labeller) -> None:
+        """Give the scans added up to then the labels that are known by now, each once."""
+        for scan in take_until(self._recent, until_ns):
+            relabel_scan(self.grid, scan, label)
 
     def remove_before(self, travelled: float) -> None:
         """Nothing leaves a known map."""

@@ -19,7 +19,7 @@ from stillmap.io.array_checks import poses_to_matrices
 from stillmap.live.causal_labels import CausalLabels, MapChange
 from stillmap.live.history import History
 from stillmap.live.known_map import KnownMap
-from stillmap.live.local_map import thin_scan
+from stillmap.live.local_map import MappedScan, thin_scan
 from stillmap.live.loop_closer import LoopCloser
 from stillmap.live.loop_process import LoopProcess
 from stillmap.live.map_correction import LabelledScan, MapCorrection
@@ -280,7 +280,7 @@ class LiveMapper:
         """Add a spaced scan to the local map and to the pose graph, and go on correcting the map;
         True if the scan is spaced."""
         self._drift = self._drift + found.drift
-        added = self._odometry.add(labelled.beams, e)
+        added = self._odometry.add(labelled.beams, e, self._labels.doubt(e), self._label_again)
         if self._carried is not None:
             return added is not None
         if added is not None:
@@ -298,6 +298,11 @@ class LiveMapper:
             self._correction = None if new.is_small else new
         self._go_on_correcting()
         return added is not None
+
+    def _label_again(self, scan: MappedScan) -> NDArray[np.float32]:
+        """(N,) P(static) of a scan of the local map by what is known now; 0: unusable."""
+        T = self._T_map_local @ scan.T_map_base
+        return np.nan_to_num(self._labels.label(scan.beams, T))
 
     def _go_on_correcting(self, *, to_the_end: bool = False) -> None:
         """A part of the work on a correction; all of it where nobody waits."""

@@ -1,13 +1,13 @@
 """Causal scan matching in 2D: each scan is matched (9) against a map of the scans before it."""
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
-from stillmap.live.local_map import LocalMap, MappedScan, MatchMap
+from stillmap.live.local_map import Labeller, LocalMap, MappedScan, MatchMap
 from stillmap.live.scan import ScanBeams
 from stillmap.slam import kidnapping, motion_model
 from stillmap.slam.kidnapping import Evidence
@@ -26,13 +26,14 @@ from stillmap.slam.scan_matching import (
 
 Float = NDArray[np.float64]
 
+_LABELLED_AFTER_NS = 10**9  # after which scans of the local map are labelled again
 _MAX_TRAVEL = 25.0  # m after which scans leave the local map
 _EXPLAINED_RATE = 0.1  # weight of one scan in the running average of the explained share
 _LEAP = 1.0  # m between two scans, and times the speed below, beyond which odometry has leaped
 _MAX_SPEED = 3.0  # m/s of robots
 _MAX_STAMPS = 500  # of scans that a slip may change in hindsight
 _UNKNOWN = np.full((3, 3), np.inf)  # an increment that is not small
-# contradicting scans for each one that agrees, after which the robot was carried, and so many
+# scans that contradict the map more than others agree, after which the robot was carried; at most
 _CARRIED_AFTER, _MAX_STRAY = 20.0, 30.0
 # of them that a scan outweighs which agrees, and one that says nothing; share of the usual explained
 # one below which nothing of a scan is in the local map, though the robot moved on continuously
@@ -140,13 +141,23 @@ class ScanOdometry:
         covariance = match.covariance + self._blind
         return Registration(match.T_map_base, covariance, match.explained, drift, *doubts)
 
-    def add(self, beams: ScanBeams, e: NDArray[np.float32]) -> MappedScan | None:
-        """Add the last scan to the local map, with P(static) e (N,), unless it contradicts it or is
-        too close to the one before; the scan if it was added."""
+    def add(
+        self, beams: ScanBeams, e: NDArray[np.float32], recent: NDArray[np.float32], label: Labeller
+    ) -> MappedScan | None:
+        """Add the last scan to the local map, unless it contradicts it or is too close to the one
+        before; the scan if it was added.
+
+        Args:
+            beams: of the scan.
+            e: (N,) P(static).
+            recent: (N,) the same with the prior of what was only just seen, for the local map.
+            label: labels an earlier scan again, after a second.
+        """
         if self._contradictions > 0.0:
             return None
         scan = MappedScan(beams, e, self._pose, self.travelled)
-        added = self.local_map.add(scan)
+        added = self.local_map.add(replace(scan, e=recent))
+        self.local_map.relabel(beams.stamp_ns - _LABELLED_AFTER_NS, label)
         self.local_map.remove_before(self.travelled - _MAX_TRAVEL)
         return scan if added else None
 
@@ -170,17 +181,20 @@ class ScanOdometry:
         grid = self.local_map.grid
         match = match_scan(grid, scan, prior, usual, self._learned_prior(prior, increment))
         if not is_poor(match, usual):
-            self._contradictions = 0.0
+            self._weigh_evidence(Evidence.AGREES)
             return match, match.contradicts_odometry, False
         other = self._guess() if prior.is_odometry else None
         wider = widen_match(grid, scan, prior, other, match, usual)
-        if wider.widened and self._is_reachable(beams, wider.T_map_base):
+        # after a scan that contradicted the map, a poor one is where a place only looks alike
+        is_sure = not (self._contradictions and is_poor(wider, usual))
+        if wider.widened and is_sure and self._is_reachable(beams, wider.T_map_base):
             is_slipping = prior.is_odometry and is_inconsistent(prior, wider.T_map_base)
             return wider, is_slipping, False
         evidence = kidnapping.judge_scan(grid, scan, match, usual)
         if match.explained < _NOTHING * usual:
             evidence = Evidence.CONTRADICTS
-        if self._is_carried(evidence):
+        self._weigh_evidence(evidence)
+        if self._contradictions >= _CARRIED_AFTER:
             self._start_anew()
             return accept_prior(prior), False, True
         return match, match.contradicts_odometry, False
@@ -200,14 +214,13 @@ class ScanOdometry:
         self._pose = [slip.before, *(m.T_map_base for m in slip.matches)][-2]
         return slip.matches[-1], True
 
-    def _is_carried(self, evidence: Evidence) -> bool:
-        """True when so many scans contradicted the local map, and hardly any agreed."""
+    def _weigh_evidence(self, evidence: Evidence) -> None:
+        """Count scans that contradict the local map, less those that agree."""
         if evidence is Evidence.CONTRADICTS:
             self._contradictions = min(self._contradictions + 1.0, _MAX_STRAY)
         else:
             less = _AGREEMENT if evidence is Evidence.AGREES else _NO_EVIDENCE
             self._contradictions = max(self._contradictions - less, 0.0)
-        return self._contradictions >= _CARRIED_AFTER
 
     def _start_anew(self) -> None:
         self.left_behind, self.local_map = self.local_map, LocalMap(self.options.resolution)
