@@ -43,6 +43,9 @@ from stillmap.tracking import MovingObject
 Float = NDArray[np.float64]
 
 _MAX_KEPT_BEAMS = 400  # of a spaced scan, for loops and for the local map after them
+# weight of a scan in the running share of hits on what moves; share from which people may walk along
+# with the robot, and what was only just seen counts little
+_MOVING_RATE, _CROWDED = 0.3, 0.15
 _CHANGES_EVERY_NS = 10**9  # between two updates that tell what changed in the map
 
 
@@ -91,6 +94,7 @@ class LiveMapper:
         self._correction: MapCorrection | None = None
         # a robot that was carried while it maps; scans that were found later: first, last + 1, and
         # their motion in the frame of the odometry by scans; the last scan that agreed with the map
+        self._moving = 0.0  # share of the hits, as the labels say a second later
         self._carried: Relocalizer | None = None
         self._moves = list[tuple[int, int, Float]]()
         self._last_agreed = -1
@@ -280,7 +284,10 @@ class LiveMapper:
         """Add a spaced scan to the local map and to the pose graph, and go on correcting the map;
         True if the scan is spaced."""
         self._drift = self._drift + found.drift
-        added = self._odometry.add(labelled.beams, e, self._labels.doubt(e), self._label_again)
+        # without odometry nothing else says how the robot moves
+        is_doubted = found.has_odometry and self._moving > _CROWDED
+        recent = self._labels.doubt(e) if is_doubted else e
+        added = self._odometry.add(labelled.beams, e, recent, self._label_again)
         if self._carried is not None:
             return added is not None
         if added is not None:
@@ -301,8 +308,11 @@ class LiveMapper:
 
     def _label_again(self, scan: MappedScan) -> NDArray[np.float32]:
         """(N,) P(static) of a scan of the local map by what is known now; 0: unusable."""
-        T = self._T_map_local @ scan.T_map_base
-        return np.nan_to_num(self._labels.label(scan.beams, T))
+        T, hit = self._T_map_local @ scan.T_map_base, scan.beams.hit
+        e = np.nan_to_num(self._labels.label(scan.beams, T))
+        if hit.any():
+            self._moving += _MOVING_RATE * (float((e[hit] < 0.5).mean()) - self._moving)
+        return e
 
     def _go_on_correcting(self, *, to_the_end: bool = False) -> None:
         """A part of the work on a correction; all of it where nobody waits."""

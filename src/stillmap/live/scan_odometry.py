@@ -62,6 +62,7 @@ class Registration:
         is_blind: no beam met anything that the local map knows.
         is_carried: the scans contradict the local map, which begins anew.
         is_contradicted: the last ones do, or nothing of them is in it; not enough of them yet.
+        has_odometry: the prior is that of odometry.
     """
 
     T: Float
@@ -72,6 +73,7 @@ class Registration:
     is_blind: bool = False
     is_carried: bool = False
     is_contradicted: bool = False
+    has_odometry: bool = False
 
 
 class ScanOdometry:
@@ -137,7 +139,7 @@ class ScanOdometry:
             self._learn(beams, learned, match, usual)
         self._advance(beams, match.T_map_base)
         self._blind = self._blind + drift if is_blind else np.zeros((3, 3))
-        doubts = is_slipping, is_blind, is_carried, self._contradictions > 0.0
+        doubts = is_slipping, is_blind, is_carried, self._contradictions > 0.0, prior.is_odometry
         covariance = match.covariance + self._blind
         return Registration(match.T_map_base, covariance, match.explained, drift, *doubts)
 
