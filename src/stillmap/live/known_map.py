@@ -42,6 +42,8 @@ class KnownMap:
         source: folder of a result or a place, or a map.
 
     Attributes:
+        grid: the map.
+        hits: (H, W) sums of hits of its cells.
         resolution: m, edge of a cell.
         surfaces: (N, 2) where the surface runs through each occupied cell, m.
 
@@ -51,16 +53,16 @@ class KnownMap:
 
     def __init__(self, source: str | os.PathLike[str] | GridMap) -> None:
         if isinstance(source, GridMap):
-            self._grid = Grid(source.p_occupied, source.origin, source.resolution)
-            hits = self._grid.p_occupied
+            self.grid = Grid(source.p_occupied, source.origin, source.resolution)
+            self.hits = self.grid.p_occupied
         else:
-            self._grid, hits = read_grid(Path(source)), read_hit_sums(Path(source))
-        if not self._grid.occupied.any():
+            self.grid, self.hits = read_grid(Path(source)), read_hit_sums(Path(source))
+        if not self.grid.occupied.any():
             where = None if isinstance(source, GridMap) else str(source)
             raise InputError("has an empty map", where=where)
-        self.resolution = self._grid.resolution
-        self._centres = self._grid.centres(np.argwhere(self._grid.occupied))
-        self.surfaces = _find_surfaces(self._grid, hits)
+        self.resolution = self.grid.resolution
+        self._centres = self.grid.centres(np.argwhere(self.grid.occupied))
+        self.surfaces = _find_surfaces(self.grid, self.hits)
 
     def make_grid(self) -> _core.OccupancyGrid2D:
         """The map for registration: an end point for every occupied cell, and free space."""
@@ -69,7 +71,7 @@ class KnownMap:
         n, here = len(ends), np.eye(3)[None]
         offset = np.array([0, n])
         _core.add_end_points(grid, ends, np.ones(n, bool), np.ones(n, np.float32), offset, here)
-        poses, lengths = _free_runs(self._grid)
+        poses, lengths = _free_runs(self.grid)
         along = np.stack([lengths, np.zeros(len(lengths))], axis=1).astype(np.float32)
         every = np.arange(len(lengths) + 1)
         passed = np.zeros(len(lengths), bool)
@@ -78,11 +80,11 @@ class KnownMap:
 
     def make_surface_map(self) -> SurfaceMap:
         """The map for the search of alignments."""
-        return to_surface_map(self._grid)
+        return to_surface_map(self.grid)
 
     def prime(self, labels: OccupancyFilter) -> None:
         """Tell the filters of cells what the map knows."""
-        free = self._grid.centres(np.argwhere(self._grid.p_occupied < FREE_THRESH))
+        free = self.grid.centres(np.argwhere(self.grid.p_occupied < FREE_THRESH))
         centres = np.concatenate([self._centres, free])
         cells = np.floor(centres / labels.resolution).astype(np.int64)
         occupied = np.arange(len(cells)) < len(self._centres)

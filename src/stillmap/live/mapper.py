@@ -240,7 +240,9 @@ class LiveMapper:
     def snapshot(self) -> Snapshot:
         """All scans so far and what is known of them: to save them while more are pushed."""
         recording, answers = self._history.recording(), self._history.answers()
-        return Snapshot(recording, self.poses, answers, self.options, self._scratch)
+        place, scratch = self._place, self._scratch
+        extended = place.known if place is not None and place.extends else None
+        return Snapshot(recording, self.poses, answers, self.options, scratch, extended)
 
     def finish(self, progress: Progress = no_progress) -> BuiltResult:
         """The result of `stillmap.build` on all scans: poses, labels and map refined."""
