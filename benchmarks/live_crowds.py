@@ -99,7 +99,7 @@ def _run(args, place, count, is_visited, run):
     simulation = simulate(scene_by_name(args.world, changes), args.first_seed + run)
     recording, true = simulation.recording, simulation.truth.T_world_base
     if is_visited:
-        recording = add_visitors(recording, true, count, np.random.default_rng(run))
+        recording = add_visitors(recording, count, np.random.default_rng(run))
     in_map = T_map_world @ true
     return [
         _track(LiveMapper, recording, in_map, known),
@@ -110,8 +110,8 @@ def _run(args, place, count, is_visited, run):
     ]
 
 
-def add_visitors(recording, true, count: int, rng):
-    """The recording with people around the robot, whose poses (T, 3, 3) are true."""
+def add_visitors(recording, count: int, rng):
+    """The recording with people who stay around the robot."""
     points, hit = recording.points.copy(), recording.hit.copy()
     bearing, distance = rng.uniform(-np.pi, np.pi, count), rng.uniform(*_DISTANCE, count)
     sway, kept = np.zeros((2, count)), math.exp(-1.0 / _SWAY_SCANS)

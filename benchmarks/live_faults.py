@@ -30,7 +30,7 @@ from stillmap.live.replay import iter_beams
 from stillmap.sim import scene_by_name, simulate
 
 _BEFORE, _FAULT, _AFTER = 150, 50, 200  # scans, 5 a second
-_MAPPED_BEFORE = 750  # instead, so that the place is known to which a robot is carried while it maps
+_MAPPED_BEFORE = 750  # instead, if it is carried while it maps: to a place that it knows
 _RATE = 5.0
 _CARRIED = 5.0, 10.0  # m
 _TOLERANCE = 0.3, 0.1  # m, rad

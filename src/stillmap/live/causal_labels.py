@@ -26,8 +26,8 @@ _MAX_LOG_RATIO = 20.0  # nats: what stood for hours is known to be gone after a 
 _FOLLOWED, _MAX_STRIDE, _RATE_GAIN = 3.0, 8, 0.1
 # of static surface in the map and in matching: one look at a walker is no evidence for a wall
 _MAP_PRIOR = 0.5
-# likewise for the local map until more is known: people who walk along with the robot are ahead of it
-# all the time, where nobody has looked before
+# likewise for the local map until more is known: people who walk along with the robot are always
+# ahead of it, where nobody has looked before
 _RECENT_PRIOR = 0.05
 _MARGIN, _MAX_MARGIN = 0.1, 1.0  # m behind a surface where a beam has passed it; at grazing angles
 

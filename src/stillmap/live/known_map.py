@@ -58,7 +58,7 @@ class KnownMap:
         else:
             self.grid, self.hits = read_grid(Path(source)), read_hit_sums(Path(source))
         if not self.grid.occupied.any():
-            where = None if isinstance(source, GridMap) else str(source)
+            where = "map" if isinstance(source, GridMap) else str(source)
             raise InputError("has an empty map", where=where)
         self.resolution = self.grid.resolution
         self._centres = self.grid.centres(np.argwhere(self.grid.occupied))

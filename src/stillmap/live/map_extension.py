@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 
 from stillmap.core.grid_map import GridMap
 from stillmap.em import OccupancyMap
+from stillmap.pipeline.options import MapMode
 from stillmap.results.map_npz import write_map_npz
-from stillmap.results.map_server import MapMode, write_map_server
+from stillmap.results.map_server import write_map_server
 
 Layer = NDArray[np.float32]
 

@@ -43,8 +43,8 @@ from stillmap.tracking import MovingObject
 Float = NDArray[np.float64]
 
 _MAX_KEPT_BEAMS = 400  # of a spaced scan, for loops and for the local map after them
-# weight of a scan in the running share of hits on what moves; share from which people may walk along
-# with the robot, and what was only just seen counts little
+# weight of a scan in the running share of hits on what moves; share from which people may walk
+# along with the robot, and what was only just seen counts little
 _MOVING_RATE, _CROWDED = 0.3, 0.15
 _CHANGES_EVERY_NS = 10**9  # between two updates that tell what changed in the map
 
@@ -349,14 +349,14 @@ class LiveMapper:
         p_static: NDArray[np.float32],
         T_odom_base: Float | None,
     ) -> Update:
-        place = self._place
+        place, carried = self._place, self._carried
         doubts = {
             "slip": found.is_slipping,
             "blind": found.is_blind,
             "carried": found.is_carried,
             "contradicted": found.is_contradicted,
-            "lost": self._carried is not None or (place is not None and place.is_lost),
-            "ambiguous": any(one is not None and one.is_ambiguous for one in (self._carried, place)),
+            "lost": carried is not None or (place is not None and place.is_lost),
+            "ambiguous": any(one is not None and one.is_ambiguous for one in (carried, place)),
         }
         pose = self._T_map_local @ found.T
         return Update(

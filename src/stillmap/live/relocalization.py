@@ -1,4 +1,4 @@
-"""Relocalization of a robot that was carried while it maps: it is searched in its own map so far."""
+"""Relocalization of a robot that was carried while it maps: it is searched in its own map."""
 
 import numpy as np
 from numpy.typing import NDArray

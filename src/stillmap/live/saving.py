@@ -74,8 +74,8 @@ def save_live(
     *,
     extended: KnownMap | None = None,
 ) -> None:
-    """Write a result, and `live/trajectory.tum` and `live/beams/p_static.npy` with the answers; with
-    a known map, its map is that one with what was seen.
+    """Write a result, and `live/trajectory.tum` and `live/beams/p_static.npy` with the answers;
+    with a known map, the map is that one with what was seen.
 
     Raises:
         InputError: `path` is taken or cannot be written to.

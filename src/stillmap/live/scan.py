@@ -16,8 +16,8 @@ from stillmap.preprocessing.options import MAX_PLAUSIBLE_RANGE
 
 Float = NDArray[np.float64]
 
-# m within which nearly all readings of a covered sensor lie: what surrounds it so closely moves with
-# the robot
+# m within which nearly all readings of a covered sensor lie: what surrounds it so closely moves
+# with the robot
 _COVER_DISTANCE, _COVER_SHARE = 0.3, 0.9
 
 

@@ -30,13 +30,14 @@ _LABELLED_AFTER_NS = 10**9  # after which scans of the local map are labelled ag
 _MAX_TRAVEL = 25.0  # m after which scans leave the local map
 _EXPLAINED_RATE = 0.1  # weight of one scan in the running average of the explained share
 _LEAP = 1.0  # m between two scans, and times the speed below, beyond which odometry has leaped
+_DISTRUST_NS = 10**9  # after a leap, in which smaller ones are none of odometry either
 _MAX_SPEED = 3.0  # m/s of robots
 _MAX_STAMPS = 500  # of scans that a slip may change in hindsight
 _UNKNOWN = np.full((3, 3), np.inf)  # an increment that is not small
 # scans that contradict the map more than others agree, after which the robot was carried; at most
 _CARRIED_AFTER, _MAX_STRAY = 20.0, 30.0
-# of them that a scan outweighs which agrees, and one that says nothing; share of the usual explained
-# one below which nothing of a scan is in the local map, though the robot moved on continuously
+# of them that a scan outweighs which agrees, and one that says nothing; share of the usual
+# explained one below which nothing of a scan is in the local map, though the robot moved on
 _AGREEMENT, _NO_EVIDENCE, _NOTHING = 4.0, 0.25, 0.15
 
 
@@ -86,13 +87,14 @@ class ScanOdometry:
     def __init__(self, options: SlamOptions) -> None:
         self.options = options
         self.local_map: MatchMap = LocalMap(options.resolution)
-        self.left_behind = self.local_map  # the one before the robot was carried
+        self.left_behind: MatchMap = self.local_map  # the one before the robot was carried
         self.travelled = 0.0
         self._pose, self._before = np.eye(3), np.eye(3)
         self._stamp_ns, self._seconds = 0, 0.0
         self._velocity_noise, self._odometry_noise = VelocityNoise(), OdometryNoise()
         self._usual: dict[str | int, float] = {}
         self._contradictions = 0.0
+        self._leaped_ns: int | None = None
         self._blind = np.zeros((3, 3))  # covariance since the last scan that met anything
         self._is_first = True
         self._increment = _LatestIncrement()
@@ -111,7 +113,9 @@ class ScanOdometry:
             return motion_model.gaussian_prior(self._pose, 1e-3, 1e-3)
         guess, self._increment.value = self._guess(), increment
         is_slipping = self._slip.is_slipping(self._count, self._pose, guess)
-        if increment is not None and not is_slipping and self._is_plausible(increment, beams):
+        if increment is not None and not self._is_plausible(increment, beams):
+            self._leaped_ns = beams.stamp_ns
+        if increment is not None and not is_slipping and not self._has_leaped(beams):
             return motion_model.odometry_prior(self._pose, increment, self.options.odometry)
         return guess
 
@@ -131,7 +135,9 @@ class ScanOdometry:
         match, is_slipping, is_carried = self._match(beams, scan, prior, increment, usual)
         if not self._is_first and not is_carried:
             match, slips = self._detect_slip(guess, scan, match)
-            is_slipping = is_slipping or slips
+            is_slipping = (
+                is_slipping or slips or (increment is not None and self._has_leaped(beams))
+            )
         is_blind = not len(scan.points) or float(scan.weights.sum()) <= 0.0
         learned = self._learned_prior(prior, increment) or prior
         drift = motion_model.blind_drift(learned, match.covariance)
@@ -245,6 +251,10 @@ class ScanOdometry:
         seconds = 1e-9 * (beams.stamp_ns - self._stamp_ns)
         metres = float(np.hypot(*increment[:2, 2]))
         return metres <= max(_LEAP, _MAX_SPEED * seconds)
+
+    def _has_leaped(self, beams: ScanBeams) -> bool:
+        """True if odometry has leaped lately."""
+        return self._leaped_ns is not None and beams.stamp_ns < self._leaped_ns + _DISTRUST_NS
 
     def _is_reachable(self, beams: ScanBeams, T: Float) -> bool:
         return self._is_plausible(se2.inverse(self._pose) @ T, beams)

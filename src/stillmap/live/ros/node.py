@@ -29,8 +29,9 @@ _DOUBTS = {
     "slip": "odometry disagrees with the scans",
     "blind": "no beam meets anything",
     "carried": "the scans contradict the map",
-    "lost": "the pose in the known map is not known",
-    "ambiguous": "several places in the known map fit",
+    "contradicted": "the last scans contradict the map",
+    "lost": "the pose in the map is not known",
+    "ambiguous": "several places in the map fit",
 }
 
 
