@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 import stillmap._core as _core
 from stillmap.core import se2, se3
 from stillmap.live.front_end import Registration
-from stillmap.live.local_map import MappedScan
+from stillmap.live.local_map import Labeller, MappedScan
 from stillmap.live.scan import ScanBeams, take_beams
 from stillmap.slam import constant_velocity, lidar_odometry
 from stillmap.slam.constant_velocity import State
@@ -35,7 +35,7 @@ class SweepOdometry:
     """
 
     def __init__(self, options: SlamOptions, threads: int) -> None:
-        self.local_map = lidar_odometry.make_local_map()
+        self.local_map = self.left_behind = lidar_odometry.make_local_map()
         self.travelled = 0.0
         self._options, self._threads = options, threads
         self._state = lidar_odometry.initial_state()
@@ -103,15 +103,22 @@ class SweepOdometry:
             self._is_slipping,
             is_blind,
             is_carried,
+            self._contradictions > 0,
         )
 
-    def add(self, beams: ScanBeams, e: NDArray[np.float32]) -> MappedScan | None:
-        """Add the last sweep to the local map, with P(static) e (N,); the sweep if it is a
+    def add(
+        self,
+        beams: ScanBeams,
+        e: NDArray[np.float32],
+        _recent: NDArray[np.float32],
+        _label: Labeller,
+    ) -> MappedScan | None:
+        """Add the last sweep to the local map, unless it contradicts it; the sweep if it is a
         keyframe.
 
         Args:
             beams: as if taken at the stamp.
-            e: of them.
+            e: (N,) P(static).
         """
         if self._contradictions:
             return None
@@ -158,7 +165,7 @@ class SweepOdometry:
         return self._contradictions >= _CARRIED_AFTER
 
     def _start_anew(self) -> None:
-        self.local_map = lidar_odometry.make_local_map()
+        self.left_behind, self.local_map = self.local_map, lidar_odometry.make_local_map()
         self._usual, self._contradictions = 0.0, 0
 
     def _note_first(self, stamp_ns: int, hits: Sweep) -> None:
