@@ -165,7 +165,7 @@ def test_doubts():
     loud = read(schemas.to_log(("slip", "lost"), STAMP))
     assert quiet["level"] < loud["level"]
     assert "odometry" in loud["message"]
-    assert "known map" in loud["message"]
+    assert "the map is not known" in loud["message"]
     assert stamp_of(loud) == STAMP
 
 

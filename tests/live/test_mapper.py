@@ -199,8 +199,8 @@ def test_loops_are_closed_in_the_background(corridor, fresh):
 def test_mapping_goes_on_when_the_process_that_closes_loops_dies(corridor, fresh, caplog):
     mapper = fresh(background=True)
     push_all(mapper, corridor.recording, 50)
-    mapper._closer._process.kill()
-    mapper._closer._process.wait()
+    mapper._frame._closer._process.kill()
+    mapper._frame._closer._process.wait()
     odometry = corridor.recording.T_odom_base
     for t, beams in enumerate(itertools.islice(iter_beams(corridor.recording), 50, 150), 50):
         update = mapper.push(beams, odometry[t])

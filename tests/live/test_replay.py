@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+import stillmap
 from stillmap.cli.main import main
 from stillmap.sim import scene_by_name, simulate, write_simulation
 
@@ -50,14 +51,19 @@ def test_an_output_that_is_taken_is_refused_before_any_work(hall, tmp_path, caps
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["mine.txt"]
 
 
-def test_3d_is_refused(tmp_path, capsys):
-    scene = scene_by_name(
-        "street", {"lidar": {"channels": 4, "columns": 60}, "robot": {"scans": 3}}
-    )
+def test_sweeps_are_mapped_but_not_localized(hall, tmp_path, capsys):
+    lidar = {"channels": 16, "columns": 300}
+    scene = scene_by_name("hall", {"lidar": lidar, "robot": {"scans": 12}})
     write_simulation(simulate(scene, 1), tmp_path / "sim")
-    assert main(["live", "--replay", str(tmp_path / "sim"), "-o", str(tmp_path / "out")]) == 2
+    words = ["live", "--replay", str(tmp_path / "sim"), "-o", str(tmp_path / "out"), "--quiet"]
+    assert main(words) == 0
+    assert (tmp_path / "out/live/trajectory.tum").is_file()
+    assert len(stillmap.load(tmp_path / "out").poses) == 12
+    assert main(["live", "--replay", str(hall), "-o", str(tmp_path / "flat"), "--quiet"]) == 0
+    again = [*words[:3], "-o", str(tmp_path / "again"), "--map", str(tmp_path / "flat")]
+    assert main(again) == 2
     assert "3D" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
+    assert not (tmp_path / "again").exists()
 
 
 def test_at_its_own_pace(hall, tmp_path, capsys):

@@ -1,14 +1,15 @@
 """Loop closure while the robot drives: the stages of `slam.loop_closure`, one after another."""
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
-from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.live.local_map import MappedScan
+from stillmap.live.spaced_scans import SpacedScans, SpacedView
 from stillmap.slam import local_map, loop_candidates, loop_closure
 from stillmap.slam.loop_closure import LoopState
 from stillmap.slam.options import SlamOptions
@@ -42,18 +43,18 @@ class LoopCloser:
 
     Args:
         options: see SlamOptions.
+        folder: of temporary files; None: the system's.
     """
 
-    def __init__(self, options: SlamOptions) -> None:
-        self.scans: list[MappedScan] = []
+    def __init__(self, options: SlamOptions, folder: Path | None = None) -> None:
+        self._scans = SpacedScans(2, folder)
         self._options = options
-        self._explained: list[float] = []
-        self._drift: list[Float] = []
+        self._last: MappedScan | None = None
         self._keyframes: list[int] = []
         self._since = np.inf  # travel since the last keyframe, in units of their spacing
         self._state = LoopState(np.zeros((0, 3, 3)))
         self._centers = np.zeros((0, 2))
-        self._poses = np.zeros((0, 3, 3))  # T_map_base of the spaced scans
+        self._poses = np.zeros((0, 3, 3))  # T_map_base of the spaced scans up to the last search
         self._T_map_local = np.eye(3)
         self._searched_until = 0.0
 
@@ -65,39 +66,41 @@ class LoopCloser:
             explained: share of it that the local map explained.
             drift: (3, 3) covariance that the steps since the last one add, where scans say nothing.
         """
-        if self.scans:
-            step = se2.parameters(se2.inverse(self.scans[-1].T_map_base) @ scan.T_map_base)
+        if self._last is not None:
+            step = se2.parameters(se2.inverse(self._last.T_map_base) @ scan.T_map_base)
             self._since += float(np.hypot(*step[:2])) / self._keyframe_distance
             self._since += abs(float(step[2])) / local_map.KEYFRAME_ANGLE
         if self._since >= 1.0:
-            self._keyframes.append(len(self.scans))
+            self._keyframes.append(len(self._scans))
             self._since = 0.0
-        self.scans.append(scan)
-        self._explained.append(explained)
-        self._drift.append(drift)
-        pose = self._T_map_local @ scan.T_map_base
-        self._poses = np.concatenate([self._poses, pose[None]])
+        self._last = scan
+        self._scans.append(scan, explained, drift)
 
     def poll(self) -> Correction | None:
         """Search loops where that is due; None: nothing changed."""
         return self.close() if self.is_due else None
 
     def stop(self) -> None:
-        """Nothing to end here."""
+        """Remove temporary files."""
+        self._scans.close()
 
     @property
     def is_due(self) -> bool:
         """True if the robot has driven so far that loops are worth a search."""
         return (
-            len(self._keyframes) > len(self._state.poses) + 1
-            and self.scans[-1].travelled >= self._searched_until + _EVERY
+            self._last is not None
+            and len(self._keyframes) > len(self._state.poses) + 1
+            and self._last.travelled >= self._searched_until + _EVERY
         )
 
     def close(self) -> Correction | None:
         """Search loops of the keyframes since the last search; None: nothing changed."""
-        context = self._context()
+        view = self._scans.view()
+        context = self._context(view)
         first, last = len(self._state.poses), len(context.keyframes)
-        self._searched_until = self.scans[-1].travelled
+        self._searched_until = float(view.travelled[-1])
+        since = self._T_map_local @ view.poses[len(self._poses) :]
+        self._poses = np.concatenate([self._poses, since])
         chain = loop_candidates.odometry_constraints(context, self._options.odometry, [])
         new = context.keyframes[first:]
         self._centers = np.concatenate(
@@ -109,54 +112,61 @@ class LoopCloser:
         self._state = loop_closure.close_stage(context, chain, self._centers, state, first, last)
         if np.array_equal(self._state.poses, poses):
             return None
-        return self._correct(context)
+        return self._correct(view, context)
 
-    def _correct(self, context: LoopContext) -> Correction:
+    def _correct(self, view: SpacedView, context: LoopContext) -> Correction:
         keyframes, poses = context.keyframes, self._state.poses
         self._T_map_local = poses[-1] @ se2.inverse(context.poses[keyframes[-1]])
-        every = np.append(keyframes, len(self.scans) - 1)
+        every = np.append(keyframes, len(view.poses) - 1)
         last = self._T_map_local @ context.poses[-1]
         corrected = local_map.propagate_corrections(
             context.poses, *_without_repetition(every, np.concatenate([poses, last[None]]))
         )
         self._poses = corrected
-        return Correction(self._T_map_local, corrected, self._find_near(context))
+        return Correction(self._T_map_local, corrected, self._find_near(view, context))
 
-    def _find_near(self, context: LoopContext) -> list[MappedScan]:
+    def _find_near(self, view: SpacedView, context: LoopContext) -> list[MappedScan]:
         """The scans of the local map: near the robot along the graph and in the map.
 
         Of earlier travel one, the last, for each metre and heading.
         """
         k = len(context.keyframes) - 1
         metres = loop_candidates.graph_distances(context, k, self._state.fitting)
-        scans = np.arange(len(self.scans))
+        scans = np.arange(len(view.poses))
         of = np.clip(np.searchsorted(context.keyframes, scans, side="right") - 1, 0, k)
         away = np.hypot(*(self._poses[:, :2, 2] - self._poses[-1, :2, 2]).T)
-        now, back = self.scans[-1].travelled, se2.inverse(self._T_map_local)
-        recent, earlier = list[MappedScan](), dict[tuple[int, ...], MappedScan]()
-        for s in np.flatnonzero((metres[of] <= _NEAR_TRAVEL) & (away <= _NEAR_DISTANCE)).tolist():
-            T = back @ self._poses[s]
-            if self.scans[s].travelled >= now - _NEAR_TRAVEL:
-                recent.append(replace(self.scans[s], T_map_base=T))
-                continue
-            x, y, theta = se2.parameters(T)
+        now = float(view.travelled[-1])
+        is_near = (metres[of] <= _NEAR_TRAVEL) & (away <= _NEAR_DISTANCE)
+        is_recent = view.travelled >= now - _NEAR_TRAVEL
+        local = se2.inverse(self._T_map_local) @ self._poses
+        earlier = dict[tuple[int, ...], int]()
+        for s in np.flatnonzero(is_near & ~is_recent).tolist():
+            x, y, theta = se2.parameters(local[s])
             key = (int(np.floor(x)), int(np.floor(y)), int(np.floor(theta / _HEADING)))
-            earlier[key] = replace(self.scans[s], T_map_base=T, travelled=now)
-        return recent + list(earlier.values())
+            earlier[key] = s
+        recent = np.flatnonzero(is_near & is_recent).tolist()
+        return [
+            replace(
+                self._scans.scan(view, s),
+                T_map_base=local[s],
+                travelled=float(view.travelled[s]) if is_recent[s] else now,
+            )
+            for s in (*recent, *earlier.values())
+        ]
 
-    def _context(self) -> LoopContext:
+    def _context(self, view: SpacedView) -> LoopContext:
         search = self._options.loop_search_distance
         return LoopContext(
-            _to_recording(self.scans),
-            np.concatenate([scan.e for scan in self.scans]),
-            np.array([scan.T_map_base for scan in self.scans]),
-            np.array([scan.travelled for scan in self.scans]),
-            np.array(self._explained),
+            view.recording,
+            view.e,
+            view.poses,
+            view.travelled,
+            view.explained,
             np.array(self._keyframes, np.intp),
             self._options.resolution,
             self._keyframe_distance,
             loop_closure.SEARCH_DISTANCE if search is None else search,
-            np.array(self._drift),
+            view.drift,
         )
 
     @property
@@ -164,23 +174,20 @@ class LoopCloser:
         return self._options.keyframe_distance or loop_closure.KEYFRAME_DISTANCE
 
 
+class NoLoops:
+    """In place of a `LoopCloser`: a known map needs no loops."""
+
+    def add(self, scan: MappedScan, explained: float, drift: Float) -> None:
+        """Nothing is kept."""
+
+    def poll(self) -> Correction | None:
+        """Nothing changes."""
+        return None
+
+    def stop(self) -> None:
+        """Nothing to end."""
+
+
 def _without_repetition(scans: NDArray[np.intp], poses: Float) -> tuple[NDArray[np.intp], Float]:
     kept = np.append(True, np.diff(scans) > 0)
     return scans[kept], poses[kept]
-
-
-def _to_recording(scans: list[MappedScan]) -> Recording:
-    """Spaced scans as a recording without odometry."""
-    beams = [scan.beams for scan in scans]
-    sensors = list(dict.fromkeys(one.sensor for one in beams))
-    mounts = {one.sensor: one.T_base_sensor for one in beams}
-    offset = np.concatenate([[0], np.cumsum([len(one.points) for one in beams])])
-    return Recording(
-        stamp_ns=np.array([one.stamp_ns for one in beams], np.int64),
-        offset=offset.astype(np.int64),
-        points=np.concatenate([one.points for one in beams]),
-        hit=np.concatenate([one.hit for one in beams]),
-        T_base_sensor=np.array([mounts[sensor] for sensor in sensors]),
-        sensor=np.array([sensors.index(one.sensor) for one in beams], np.int32),
-        T_odom_base=None,
-    )

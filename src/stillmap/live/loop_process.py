@@ -180,7 +180,7 @@ def make_closer(
 ) -> LoopCloser | LiveSweepLoopCloser:
     """What closes loops in 2D or 3D, in this process."""
     if dimension == 2:
-        return LoopCloser(options)
+        return LoopCloser(options, folder)
     return LiveSweepLoopCloser(options, folder, threads)
 
 

@@ -7,10 +7,9 @@ from stillmap.core import se2
 from stillmap.live.causal_labels import CausalLabels
 from stillmap.live.front_end import FrontEnd, Registration
 from stillmap.live.local_map import MappedScan, thin_scan
-from stillmap.live.loop_closer import LoopCloser
+from stillmap.live.loop_closer import LoopCloser, NoLoops
 from stillmap.live.loop_process import LoopProcess
 from stillmap.live.map_correction import LabelledScan, MapCorrection
-from stillmap.live.place import NoLoops
 from stillmap.live.sweep_loop_closer import LiveSweepLoopCloser
 from stillmap.slam import local_map
 

@@ -24,13 +24,14 @@ from stillmap.live.hindsight import Hindsight, LaterLabels
 from stillmap.live.history import History
 from stillmap.live.known_map import KnownMap
 from stillmap.live.local_map import MappedScan
+from stillmap.live.loop_closer import NoLoops
 from stillmap.live.loop_process import LoopProcess, make_closer
 from stillmap.live.map_correction import LabelledScan
 from stillmap.live.map_frame import LoopClosing, MapFrame
 from stillmap.live.map_view import project_obstacles
 from stillmap.live.movers import MoverTracker
 from stillmap.live.observation import BeamSelector, Observation, find_margins
-from stillmap.live.place import Mode, NoLoops, PlaceTracker
+from stillmap.live.place import Mode, PlaceTracker
 from stillmap.live.relocalization import Relocalizer
 from stillmap.live.saving import Snapshot
 from stillmap.live.scan import Scan, ScanBeams, deskew, drop_cover, to_beams

@@ -9,8 +9,6 @@ import stillmap._core as _core
 from stillmap.live.causal_labels import CausalLabels, take_over
 from stillmap.live.global_localization import GlobalLocalizer, Localization
 from stillmap.live.known_map import KnownLocalMap, KnownMap
-from stillmap.live.local_map import MappedScan
-from stillmap.live.loop_closer import Correction
 from stillmap.slam.scan_hits import Scan
 
 Float = NDArray[np.float64]
@@ -77,17 +75,3 @@ class PlaceTracker:
         for first, last, T in self._moves:
             poses[first:last] = T @ poses[first:last]
         return poses
-
-
-class NoLoops:
-    """In place of a `LoopCloser`: a known map needs no loops."""
-
-    def add(self, scan: MappedScan, explained: float, drift: Float) -> None:
-        """Nothing is kept."""
-
-    def poll(self) -> Correction | None:
-        """Nothing changes."""
-        return None
-
-    def stop(self) -> None:
-        """Nothing to end."""
