@@ -66,6 +66,16 @@ def test_sweeps_are_mapped_but_not_localized(hall, tmp_path, capsys):
     assert not (tmp_path / "again").exists()
 
 
+def test_what_is_kept_is_bounded(hall, tmp_path, capsys):
+    words = ["live", "--replay", str(hall), "-o", str(tmp_path / "out"), "--quiet"]
+    assert main([*words, "--max-scratch", "0.0002"]) == 0
+    lines = (tmp_path / "out/live/trajectory.tum").read_text().splitlines()
+    assert 40 < len(lines) < 120
+    assert len(stillmap.load(tmp_path / "out").poses) == len(lines)
+    assert main([*words, "--max-scratch", "0", "--overwrite"]) == 2
+    assert "--max-scratch" in capsys.readouterr().err
+
+
 def test_at_its_own_pace(hall, tmp_path, capsys):
     words = ["live", "--replay", str(hall), "-o", str(tmp_path / "out"), "--json", "--quiet"]
     assert main([*words, "--rate", "8"]) == 0

@@ -65,6 +65,13 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
         help="whether the map of --map stays as it is, or what is seen is added "
         "(default: localise)",
     )
+    p.add_argument(
+        "--max-scratch",
+        metavar="GB",
+        type=float,
+        help="disk, about, that the beams of all scans may take in temporary files: beyond, every "
+        "second one of the scans that lie most densely is dropped (default: all are kept)",
+    )
     p.add_argument("--no-odometry", action="store_true", help="ignore odometry in the recording")
     p.add_argument(
         "--resolution", metavar="M", type=float, help="edge of a map cell in metres (default: 0.05)"
@@ -94,6 +101,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _replay(args: argparse.Namespace) -> int:
+    from stillmap.cli.live_node import mapper_settings
     from stillmap.core.files import require_new
     from stillmap.live.mapper import LiveMapper
     from stillmap.live.replay import replay
@@ -102,16 +110,14 @@ def _replay(args: argparse.Namespace) -> int:
     options = options_from_args(args, read_changes(args), shared_changes(args))
     if args.rate is not None and not args.rate > 0.0:
         raise InputError(f"--rate: expected a positive number, got {args.rate:g}")
-    output = Path(args.output)
+    settings, output = mapper_settings(args), Path(args.output)
     require_new(output, RECORD, args.overwrite)
     require_apart(output, Path(args.replay))
     with tempfile.TemporaryDirectory(prefix="stillmap-") as scratch, serve(args) as show:
         recording = _read(args, options, Path(scratch))
         in_background = args.rate is not None
         with (
-            LiveMapper(
-                options, place=args.map, mode=args.mode, background=in_background, scratch=scratch
-            ) as mapper,
+            LiveMapper(options, **settings, background=in_background, scratch=scratch) as mapper,
             show_progress(args.quiet, 1) as progress,
             _stop_flag(args) as stop,
         ):

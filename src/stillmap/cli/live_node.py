@@ -1,9 +1,11 @@
 """`stillmap live` without --replay: the ROS 2 node."""
 
 import argparse
+import math
 import tempfile
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from stillmap.cli.arguments import read_changes
 from stillmap.cli.config import options_from_args
@@ -36,7 +38,7 @@ def run_node(args: argparse.Namespace) -> int:
             ["--ros-args", *args.ros_args],
             overwrite=args.overwrite,
             make_mapper=partial(
-                LiveMapper, place=args.map, mode=args.mode, background=True, scratch=scratch
+                LiveMapper, **mapper_settings(args), background=True, scratch=scratch
             ),
             show_progress=partial(show_progress, args.quiet, 1),
             show=show,
@@ -44,3 +46,16 @@ def run_node(args: argparse.Namespace) -> int:
     if not args.quiet:
         say(f"wrote {output}" if scans else "no scan arrived: nothing was written")
     return 0
+
+
+def mapper_settings(args: argparse.Namespace) -> dict[str, Any]:
+    """Arguments of the mapper that do not depend on where the scans come from.
+
+    Raises:
+        InputError: the bound is none.
+    """
+    limit = args.max_scratch
+    if limit is not None and not 0.0 < limit < math.inf:
+        raise InputError(f"--max-scratch: expected a positive number of GB, got {limit:g}")
+    max_scratch = None if limit is None else max(int(1e9 * limit), 1)
+    return {"place": args.map, "mode": args.mode, "max_scratch": max_scratch}
