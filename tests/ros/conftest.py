@@ -33,11 +33,11 @@ def environment(domain, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def tf_environment(environment):
-    """The same, with the tf2_msgs that was built, which the package index does not have."""
-    folder = Path(sys.prefix) / "tf2"
+    """The same, with tf2_msgs and map_msgs, which were built: the package index has neither."""
+    folder = Path(sys.prefix) / "messages"
     version = f"python{sys.version_info.major}.{sys.version_info.minor}"
     if not folder.is_dir():
-        pytest.skip(f"no tf2_msgs in {folder}: tools/ros_environment.sh builds it")
+        pytest.skip(f"no messages in {folder}: tools/ros_environment.sh builds it")
 
     def extend(name, path):
         return os.pathsep.join([str(path), *filter(None, [environment.get(name)])])

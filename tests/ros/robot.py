@@ -72,6 +72,7 @@ def main():
     p.add_argument("--swap", type=float, default=0.0)
     p.add_argument("--jump", type=int, default=[], action="append", help="scan with an old stamp")
     p.add_argument("--leap", type=int, default=[], action="append", help="scan far in the future")
+    p.add_argument("--shift", type=float, default=0.0, help="s that all stamps are later")
     p.add_argument("--split", action="store_true", help="as two lasers: scan_right, scan_left")
     p.add_argument("--tf", action="store_true", help="odometry and mount on /tf and /tf_static")
     args = p.parse_args()
@@ -89,7 +90,8 @@ def main():
         static.write(idl.TFMessage([mount]))
     for writer in scans.values():
         assert wait_for(lambda w=writer: w.get_publication_matched_status().current_count, 30.0)
-    T, stamps = recording.T_odom_base, recording.stamp_ns
+    T = recording.T_odom_base
+    stamps = recording.stamp_ns + round(1e9 * args.shift)
 
     def send_odometry(stamp, pose):
         if args.tf:

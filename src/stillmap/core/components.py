@@ -1,5 +1,7 @@
 """Neighbouring cells and the connected components of graphs."""
 
+import itertools
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,16 +23,20 @@ def neighbor_pairs(cells: NDArray[np.int64], max_distance: float) -> Index:
 
 
 def adjacent_pairs(cells: NDArray[np.int64]) -> Index:
-    """(P, 2) pairs of cells (K, 2) that share an edge or a corner; no cell may come twice."""
+    """(P, 2) pairs of cells (K, D) that touch, if only in a corner; no cell may come twice."""
     if not len(cells):
         return np.empty((0, 2), np.intp)
-    row, column = (cells - cells.min(axis=0)).T
-    width = int(column.max()) + 2  # the last column stays empty: rows do not touch
-    key = row * width + column
+    D, shifted = cells.shape[1], cells - cells.min(axis=0)
+    # a layer at the end of each axis stays empty: rows do not touch
+    stride = np.append(np.cumprod((shifted.max(axis=0) + 2)[:0:-1])[::-1], 1)
+    key = shifted @ stride
     order = np.argsort(key)
     key = key[order]
     pairs = []
-    for step in (1, width - 1, width, width + 1):
+    for offset in itertools.product((-1, 0, 1), repeat=D):
+        if offset <= (0,) * D:
+            continue
+        step = int(stride @ offset)
         at = np.minimum(np.searchsorted(key, key + step), len(key) - 1)
         is_cell = key[at] == key + step
         pairs.append(np.column_stack([order[is_cell], order[at[is_cell]]]))
@@ -53,11 +59,12 @@ def component_labels(pairs: Index, n: int) -> Index:
 def _label_few(pairs: Index, n: int) -> Index:
     """Components numbered by their first nodes: each node takes the lowest of its neighbours."""
     first = np.arange(n)
+    one, other = np.ascontiguousarray(pairs.T)
     while True:
-        lowest = first[pairs].min(axis=1)
+        lowest = np.minimum(first[one], first[other])
         before = first.copy()
-        np.minimum.at(first, pairs[:, 0], lowest)
-        np.minimum.at(first, pairs[:, 1], lowest)
+        np.minimum.at(first, one, lowest)
+        np.minimum.at(first, other, lowest)
         first = first[first]
         if np.array_equal(first, before):
             return np.asarray(np.unique(first, return_inverse=True)[1], np.intp)

@@ -1,4 +1,4 @@
-"""Constant-velocity Kalman filters in 2D, vectorized over K tracks; both axes share P."""
+"""Constant-velocity Kalman filters, vectorized over K tracks; all D axes share P."""
 
 from dataclasses import dataclass
 
@@ -15,8 +15,8 @@ class TrackStates:
     """States of K tracks.
 
     Attributes:
-        x: (K, 2) positions, m.
-        v: (K, 2) velocities, m/s.
+        x: (K, D) positions, m.
+        v: (K, D) velocities, m/s.
         P: (K, 3) covariance per axis: position, position-velocity, velocity.
     """
 
@@ -38,7 +38,7 @@ class TrackStates:
 
 
 def initialize(x: Float, position_std: float, speed_std: float = SPEED_STD) -> TrackStates:
-    """States at positions x (K, 2) with zero velocity; standard deviations in m and m/s."""
+    """States at positions x (K, D) with zero velocity; standard deviations in m and m/s."""
     return TrackStates(
         x, np.zeros_like(x), np.tile([position_std**2, 0.0, speed_std**2], (len(x), 1))
     )
@@ -78,7 +78,7 @@ def update(
     Args:
         states: predicted states.
         is_observed: (K,) mask of the tracks with a measurement.
-        positions: (K, 2) measured positions, m; ignored where not observed.
+        positions: (K, D) measured positions, m; ignored where not observed.
         position_std: standard deviation of a measured position, m.
     """
     xx, xv, vv = states.P.T

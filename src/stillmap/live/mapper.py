@@ -27,6 +27,7 @@ from stillmap.live.loop_closer import LoopCloser
 from stillmap.live.loop_process import LoopProcess, make_closer
 from stillmap.live.map_correction import LabelledScan, MapCorrection
 from stillmap.live.map_view import project_obstacles
+from stillmap.live.movers import MoverTracker
 from stillmap.live.observation import BeamSelector, Observation, find_margins
 from stillmap.live.place import Mode, NoLoops, PlaceTracker
 from stillmap.live.saving import Snapshot
@@ -102,6 +103,7 @@ class LiveMapper:
         )
         self._labels = CausalLabels(D, slam.resolution, options.em)
         self._selector = BeamSelector(options.em.time_bin)
+        self._movers = MoverTracker(D)
         self._history = History(D, self._scratch)
         self._closer: LoopClosing | None = None
         self._T_map_local, self._drift = np.eye(D + 1), np.zeros((3, 3))
@@ -128,6 +130,8 @@ class LiveMapper:
         prior = self._odometry.predict(beams, increment)
         hits = self._weigh(self._odometry.select(beams, prior), prior)
         found = self._odometry.register(beams, hits, prior, increment)  # M-step: (9)
+        if found.is_carried:
+            self._movers.clear()
         if found.is_carried and self._place is not None:
             self._place.lose(len(self._history))
             self._labels.clear()
@@ -137,6 +141,7 @@ class LiveMapper:
         labelled = LabelledScan(self._observe(deskewed, hits, anchor), found.T)
         self._labels.add(labelled.observation, pose)
         p_static = self._labels.label(deskewed, pose)  # E-step: (8)
+        self._movers.add(deskewed, found.T, p_static)
         self._history.append(beams, p_static, T_odom_base, pose, found.T, anchor)
         self._T_odom_base, self._last_ns = T_odom_base, beams.stamp_ns
         update = self._to_update(beams.stamp_ns, found, p_static, T_odom_base)
@@ -161,11 +166,15 @@ class LiveMapper:
             return update
         self._odometry.enter(place.make_local_map(), T)
         place.enter(self._labels, T)
+        self._movers.move(T)
         self._path_begin = len(self._spaced)
         pose = T @ update.pose
         T_map_odom = None if T_odom_base is None else pose @ se2.inverse(T_odom_base)
         doubts = tuple(doubt for doubt in update.doubts if doubt not in ("lost", "ambiguous"))
-        return dataclasses.replace(update, pose=pose, T_map_odom=T_map_odom, doubts=doubts)
+        movers = self._movers.movers(self._T_map_local)
+        return dataclasses.replace(
+            update, pose=pose, T_map_odom=T_map_odom, doubts=doubts, movers=movers
+        )
 
     def label(self, scan: Scan | ScanBeams, number: int) -> NDArray[np.float32]:
         """(N,) P(static) of the beams of an earlier scan, by what is known now.
@@ -388,6 +397,7 @@ class LiveMapper:
             None if T_odom_base is None else pose @ se2.inverse(T_odom_base),
             tuple(name for name, is_so in doubts.items() if is_so),
             self._take_changes(stamp_ns),
+            self._movers.movers(self._T_map_local),
         )
 
 

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from stillmap.core.short_repr import ShortRepr
 from stillmap.live.causal_labels import MapChange
+from stillmap.live.movers import Mover
 
 Float = NDArray[np.float64]
 
@@ -24,6 +25,7 @@ class Update(ShortRepr):
             that the map knows), "carried" (the scans contradict the map), "lost" (the pose is none
             in the known map), "ambiguous" (several places in it fit about as well).
         changes: parts of the map that changed since the last update.
+        movers: what moves now, as far as it has been seen to.
     """
 
     pose: Float
@@ -32,3 +34,4 @@ class Update(ShortRepr):
     T_map_odom: Float | None
     doubts: tuple[str, ...] = ()
     changes: list[MapChange] = field(default_factory=list)
+    movers: list[Mover] = field(default_factory=list)
