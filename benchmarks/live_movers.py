@@ -1,6 +1,6 @@
 """What moves, as live mapping tells it at the time, against the truth.
 
-python benchmarks/live_movers.py [--worlds hall corridor] [--seed 11] [--people N]
+python benchmarks/live_movers.py [--worlds hall corridor] [--seed 11] [--people N] [--beams N]
 
 Recall: of the walkers (more than 0.3 m/s) within 15 m that reflect a beam of the scan, also of
 those that have done so for a second; precision: of all movers that are told. A mover belongs to the
@@ -29,12 +29,15 @@ def main() -> None:
     p.add_argument("--worlds", nargs="+", default=["hall", "corridor"])
     p.add_argument("--seed", type=int, default=11)
     p.add_argument("--people", type=int, help="default: as many as the world has")
+    p.add_argument("--beams", type=int, help="default: as many as the world's laser has")
     args = p.parse_args()
+    laser = {} if args.beams is None else {"laser": {"beams": args.beams}}
     lines = []
     for world in args.worlds:
         crowd = {} if args.people is None else {"crowd": {"people": args.people}}
-        line = _score(*_run(simulate(scene_by_name(world, crowd), args.seed)))
-        empty = simulate(scene_by_name(world, {"crowd": {"people": 0}}), args.seed)
+        line = _score(*_run(simulate(scene_by_name(world, laser | crowd), args.seed)))
+        nobody = scene_by_name(world, laser | {"crowd": {"people": 0}})
+        empty = simulate(nobody, args.seed)
         alone = [update.movers for update in _run(empty)[1]]
         numbers = {mover.number for movers in alone for mover in movers}
         lines.append([world, *line, f"{len(numbers)} / {sum(map(bool, alone))}"])

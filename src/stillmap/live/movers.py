@@ -14,9 +14,9 @@ Float = NDArray[np.float64]
 Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
-_MAX_POINTS = 2000  # of a scan: every k-th of more
+_MAX_POINTS = 1200  # of a scan: every k-th of more
 _LINK = 0.35  # m between neighbours of one cluster in a planar scan
-_CELL = 0.2  # m: in 3D end points in a cell count as their mean, neighbouring cells are connected
+_CELL = 0.25  # m: in 3D end points in a cell count as their mean, neighbouring cells are connected
 # m around a cluster within which so many end points are its own: some beams of walls whose cells
 # are not known well are dynamic
 _AMID, _MIN_SHARE = 0.3, 0.35

@@ -240,12 +240,13 @@ class LiveNode:
         self._former.start()
 
     def _save_former(self, mapper: LiveMapper, folder: Path) -> None:
-        try:
-            mapper.save(folder, overwrite=True)
-        except (InputError, OSError) as error:
-            self.node.get_logger().error(str(error))
-        finally:
-            mapper.close()
+        with self._save_lock:  # a request to save it may not have been done yet
+            try:
+                mapper.save(folder, overwrite=True)
+            except (InputError, OSError) as error:
+                self.node.get_logger().error(str(error))
+            finally:
+                mapper.close()
 
     def _answer(self, arrival: Arrival) -> None:
         with self._lock:
