@@ -66,6 +66,19 @@ def recording(simulation, tmp_path_factory):
     return path
 
 
+@pytest.fixture(scope="session")
+def sweeps(tmp_path_factory):
+    """Sweeps of a lidar in a street: the simulation, and the folder of its recording."""
+    from stillmap.io.stillmap_folder import write
+    from stillmap.sim import scene_by_name, simulate
+
+    changes = {"lidar": {"channels": 16, "columns": 360}, "robot": {"scans": 60}}
+    simulation = simulate(scene_by_name("street", changes), 1)
+    path = tmp_path_factory.mktemp("lidar") / "recording"
+    write(simulation.recording, path)
+    return simulation, path
+
+
 class Process:
     """A child process with its output in a file."""
 
@@ -126,7 +139,7 @@ def start_node(start, tmp_path):
 def start_robot(start, environment, domain, recording, tmp_path):
     """Starts robots; the second value reads when they sent which stamps."""
 
-    def run(*flags):
+    def run(*flags, recording=recording):
         log = tmp_path / "robot.jsonl"
         words = [HERE / "robot.py", recording, "--domain", domain, "--log", log, *flags]
         robot = start(words, environment)

@@ -413,6 +413,35 @@ def test_two_lasers(simulation, judge, participant, tf_environment, start_node, 
     assert {one.message.angle_min > -0.1 for one in of_each[1]} == {True}
 
 
+def test_sweeps_of_a_lidar(
+    sweeps, judge, participant, tf_environment, start_node, start_robot, tmp_path
+):
+    simulation, path = sweeps
+    clouds = {
+        name: participant.read(idl.PointCloud2, f"points_{name}", reliable=True)
+        for name in ("static", "dynamic", "points")
+    }
+    node = start_node(tf_environment, "cloud_topic:=points", "map_update_interval:=1.0")
+    robot, _ = start_robot("--tf", "--period", "0.2", recording=path)
+    assert wait_for(lambda: len(judge.poses) == 60, 90.0), node.text + robot.text
+    stamps = [stamp_of(one) for one in judge.poses]
+    T = truth_at(simulation, stamps)
+    true = (se2.inverse(T[0]) @ T)[:, :3, 3]
+    poses = [one.message.pose.pose for one in judge.poses]
+    found = np.array([[p.position.x, p.position.y, p.position.z] for p in poses])
+    assert np.linalg.norm(found - true, axis=1).max() < 0.5
+    assert wait_for(lambda: all(len(one) == 60 for one in clouds.values()))
+    for static, dynamic, every in zip(*clouds.values(), strict=True):
+        widths = [one.message.width for one in (static, dynamic, every)]
+        assert widths[0] + widths[1] == widths[2] > 1000
+        assert every.message.header.frame_id == "laser"
+    assert wait_for(lambda: judge.maps)
+    assert 100 in judge.maps[-1].message.data
+    node.send(signal.SIGINT)
+    assert node.wait() == 0, node.text
+    assert len(stillmap.load(tmp_path / "result").poses) == 60
+
+
 @pytest.mark.parametrize(
     ("parameter", "says"),
     [
