@@ -48,7 +48,8 @@ class Mapped:
     """What Karto found.
 
     Attributes:
-        poses: (T, 3, 3) T_map_base of all scans.
+        poses: (T, 3, 3) T_map_base of all scans, as known at the end.
+        answers: (T, 3, 3) likewise, as known when the last scan that was taken had been processed.
         taken: how many scans it was given, see `moved`.
         closed: after how many of them a loop was closed.
         cpu: seconds that it worked on the scans.
@@ -56,6 +57,7 @@ class Mapped:
     """
 
     poses: Float
+    answers: Float
     taken: int
     closed: int
     cpu: float
@@ -103,11 +105,16 @@ def mapped(recording: stillmap.Recording, python: str | None) -> Mapped:
         np.savez(given, **scans, first_angle=first, angle_step=step)
         _, process_cpu = _run(str(python), str(_WORKER), str(given), str(found))
         answer = np.load(found)
-        T_map_sensor = se2.matrix(*answer["poses"].T)
+        poses, answers = (
+            carried(
+                se2.matrix(*answer[name].T) @ se2.inverse(recording.T_base_sensor),
+                taken,
+                recording.T_odom_base,
+            )
+            for name in ("poses", "answers")
+        )
         closed, cpu = int(answer["closed"]), float(answer["cpu"])
-    T_map_base = T_map_sensor @ se2.inverse(recording.T_base_sensor)
-    poses = carried(T_map_base, taken, recording.T_odom_base)
-    return Mapped(poses, len(taken), closed, cpu, process_cpu)
+    return Mapped(poses, answers, len(taken), closed, cpu, process_cpu)
 
 
 def require(python: str | None) -> None:

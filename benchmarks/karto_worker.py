@@ -7,8 +7,9 @@ defaults of its README), GraphSlam's own, loop closure on. Among them a range th
 `GraphSlam.default()`, which would say so in fewer words, fails in 0.3.0.
 
 SCANS.npz holds `ranges` (K, n) in m, `odometry` (K, 3) of the laser: x, y, heading, `first_angle`
-and `angle_step` in rad. FOUND.npz gets `poses` (K, 3) of the laser, `closed` and `cpu` in seconds,
-of the scans alone: neither the imports nor the files.
+and `angle_step` in rad. FOUND.npz gets `poses` and `answers` (K, 3) of the laser, at the end and
+when each scan had been processed, with the loops that it closed; `closed` and `cpu` in seconds, of
+the scans alone: neither the imports nor the files.
 """
 
 import sys
@@ -30,17 +31,22 @@ def main(given: str, found: str) -> None:
     last, farthest = first + step * (ranges.shape[1] - 1), float(np.nanmax(ranges))
     threshold = default_config["range_threshold"]
     slam = GraphSlam(Scan2DMatcherCpp({}), Scan2DMatcherCpp({}, loop=True))
-    scans, closed = [], 0
+    scans, answers, closed = [], [], 0
     started = time.process_time()
     for readings, pose in zip(ranges.tolist(), odometry.tolist(), strict=True):
         laser = (first, last, step, _MIN_RANGE, farthest, threshold)
         scans.append(LocalizedRangeScan(readings, *laser, *pose))
         _, has_closed = slam.process_scan(scans[-1])
         closed += bool(has_closed)
+        answers.append(_to_row(scans[-1]))
     cpu = time.process_time() - started
-    poses = [scan.corrected_pose for scan in scans]
-    rows = [(pose.x, pose.y, pose.euler[-1]) for pose in poses]
-    np.savez(found, poses=np.array(rows), closed=closed, cpu=cpu)
+    poses = np.array([_to_row(scan) for scan in scans])
+    np.savez(found, poses=poses, answers=np.array(answers), closed=closed, cpu=cpu)
+
+
+def _to_row(scan: LocalizedRangeScan) -> tuple[float, float, float]:
+    pose = scan.corrected_pose
+    return pose.x, pose.y, pose.euler[-1]
 
 
 if __name__ == "__main__":

@@ -1,20 +1,19 @@
 """Live mapping: poses and labels as they were given at the time, and how long that took.
 
-python benchmarks/live.py logs LOGS [--names intel fr101] --data DIR
+python benchmarks/live.py logs LOGS [--names intel fr101] --data DIR [--finish]
+    [--karto-python PYTHON]
 python benchmarks/live.py labels [--worlds hall corridor] [--first-seed 11] [--seeds 2]
-python benchmarks/live.py localize --data DIR [--worlds hall office] [--starts 25] [--people N]
-python benchmarks/live.py crowds --data DIR [--world hall] [--people 0 30 60 120] [--runs 5]
+python benchmarks/live.py localize --data DIR [--worlds hall office] [--starts 100] [--people N]
+    [--scans 30]
 python benchmarks/live.py latency [--world hall] [--seconds 600] [--rate 40] [--beams 1081]
 
 logs: each NAME.clf.gz with NAME.exact.relations or NAME.pseudo.relations beside it: relation
 errors of `stillmap live --replay`, of the poses at the time and at the end, beside those of
-`stillmap map`.
+`stillmap map`, of `LiveMapper.finish()` and of Karto, see live_logs.py.
 labels: F1 of "dynamic" and average precision by the lag after which a beam is labelled, seconds.
-localize: the robot is put down at random places of a known map, and has 30 scans to find out where
-it is: right within 0.3 m.
-crowds: runs of 400 scans through a known map among people: localized with P(static) and without,
-and by a particle filter with a likelihood field that is told where it starts. Lost: the last 50
-poses are more than 0.5 m off on average.
+localize: the robot is put down at random places of a known map, and has some scans to find out
+where it is: right within 0.3 m. Then it is localized for 30 scans more: the mean of its squared
+errors by its covariance (NEES, of 3), and the share of them within the 95 % ellipsoid.
 latency: scans pushed at their own pace, loops closed in another process.
 """
 
@@ -24,27 +23,24 @@ import math
 import resource
 import time
 from collections import deque
+from dataclasses import dataclass
 from pathlib import Path
 
+import live_logs
 import numpy as np
-import session_merging as merging
-from particle_filter import ParticleFilter
 from tables import markdown
 
-from stillmap import build
+from stillmap import build, load
 from stillmap.core import se2
 from stillmap.eval.map import GHOST_DISTANCE, distance_to_walls
-from stillmap.eval.readers import read_planar_trajectory, read_relations
-from stillmap.eval.relations import compute_relation_errors
-from stillmap.eval.trajectory import compute_absolute_errors
+from stillmap.eval.trajectory import align, compute_absolute_errors
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.replay import iter_beams
-from stillmap.results.reader import Grid, moved, read_grid
+from stillmap.results.reader import Grid, moved
 from stillmap.sim import scene_by_name, simulate
 
-_LOGS = ("intel", "aces", "belgioioso", "edmonton", "fr101", "seattle")
-_MAP_SEED, _OTHER_SEED, _SCANS_TO_LOCALIZE = 11, 12, 30
-_SCANS_IN_CROWDS = 400
+_MAP_SEED, _OTHER_SEED, _TRACKED = 11, 12, 30
+_WITHIN_95 = 7.815  # quantile of chi square with 3 degrees of freedom
 _LAGS = (0.0, 1.0, 5.0, 30.0, math.inf)  # s
 
 
@@ -59,11 +55,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     commands = p.add_subparsers(required=True)
     logs = commands.add_parser("logs")
-    logs.set_defaults(run=map_logs)
-    logs.add_argument("folder", type=Path)
-    logs.add_argument("--names", nargs="+", default=list(_LOGS))
-    logs.add_argument("--data", type=Path, required=True, help="folder for results")
-    logs.add_argument("--program", nargs="+", default=merging.default_program())
+    logs.set_defaults(run=live_logs.map_logs)
+    live_logs.add_arguments(logs)
     labels = commands.add_parser("labels")
     labels.set_defaults(run=score_labels)
     labels.add_argument("--worlds", nargs="+", default=["hall", "corridor"])
@@ -74,15 +67,11 @@ def _parser() -> argparse.ArgumentParser:
     localize.add_argument(
         "--worlds", nargs="+", default=["hall", "office", "warehouse", "corridor"]
     )
-    localize.add_argument("--starts", type=int, default=25)
+    localize.add_argument("--starts", type=int, default=100)
+    localize.add_argument("--scans", type=int, default=30, help="until it must be found")
+    localize.add_argument("--seed", type=int, default=_MAP_SEED, help="of the map")
     localize.add_argument("--people", type=int, help="default: as many as the world has")
     localize.add_argument("--data", type=Path, required=True, help="folder for maps")
-    crowds = commands.add_parser("crowds")
-    crowds.set_defaults(run=localize_in_crowds)
-    crowds.add_argument("--world", default="hall")
-    crowds.add_argument("--people", nargs="+", type=int, default=[0, 30, 60, 120])
-    crowds.add_argument("--runs", type=int, default=5)
-    crowds.add_argument("--data", type=Path, required=True, help="folder for maps")
     latency = commands.add_parser("latency")
     latency.set_defaults(run=measure_latency)
     latency.add_argument("--world", default="hall")
@@ -90,34 +79,6 @@ def _parser() -> argparse.ArgumentParser:
     latency.add_argument("--rate", type=float, default=40.0)
     latency.add_argument("--beams", type=int, default=1081)
     return p
-
-
-def map_logs(args: argparse.Namespace) -> str:
-    """A line per log."""
-    lines = []
-    for name in args.names:
-        log = args.folder / f"{name}.clf.gz"
-        kinds = ("exact.relations", "pseudo.relations")
-        relations = next(p for kind in kinds if (p := args.folder / f"{name}.{kind}").exists())
-        batch, live = args.data / f"batch-{name}", args.data / f"live-{name}"
-        if not (batch / "run.json").exists():
-            merging.build_map(args.program, log, batch)
-        done = merging.call(args.program, "live", "--replay", log, "--threads", 1, "-o", live)
-        runs = [batch / "trajectory.tum", live / "live/trajectory.tum", live / "trajectory.tum"]
-        errors = [_relation_error(run, relations) for run in runs]
-        line = [f"{t:.4f} / {r:.3f}" for t, r in errors]
-        lines.append([name, *line, f"{errors[1][0] / errors[0][0]:.2f}", f"{done.cpu:.0f}"])
-        print(" | ".join(lines[-1]), flush=True)
-    titles = ["log", "batch: m / deg", "live, at the time", "live, at the end", "ratio", "CPU s"]
-    return markdown(titles, lines)
-
-
-def _relation_error(trajectory: Path, relations: Path) -> tuple[float, float]:
-    """Mean translational (m) and rotational (degrees) error."""
-    errors = compute_relation_errors(
-        read_planar_trajectory(trajectory), read_relations(relations), None, 0.1, False
-    )
-    return errors.translation.mean, errors.rotation.mean
 
 
 def score_labels(args: argparse.Namespace) -> str:
@@ -191,115 +152,88 @@ def localize_globally(args: argparse.Namespace) -> str:
     """A line per world."""
     lines = []
     for world in args.worlds:
-        known, T_map_world = _build_known_map(args.data / world, world)
+        place = build_known_map(args.data / world, world, args.seed)
         crowd = {} if args.people is None else {"crowd": {"people": args.people}}
-        simulation = simulate(scene_by_name(world, crowd), _OTHER_SEED)
+        simulation = simulate(scene_by_name(world, crowd), args.seed + 1)
         rng = np.random.default_rng(0)
-        last = simulation.recording.n_scans - _SCANS_TO_LOCALIZE
+        last = simulation.recording.n_scans - args.scans - _TRACKED
         runs = [
-            _localize_from(known, T_map_world, simulation, int(first))
+            _localize_from(*place, simulation, int(first), args.scans)
             for first in rng.integers(0, last, args.starts)
         ]
-        verdicts = [verdict for verdict, *_ in runs]
-        found = [one[1:] for one in runs if one[0] == "right"]
-        counts = [str(verdicts.count(v)) for v in ("right", "wrong", "ambiguous", "lost")]
-        medians = [
-            f"{np.median(v):.{d}f}"
-            for v, d in zip(zip(*found, strict=True), (0, 3, 2), strict=True)
-        ]
-        lines.append(
-            [world, str(args.starts), *counts, *medians, f"{max(f[2] for f in found):.2f}"]
-        )
+        lines.append([world, str(args.starts), *_summarize(runs)])
         print(" | ".join(lines[-1]), flush=True)
     titles = ["world", "places", "right", "wrong", "ambiguous", "lost", "scans", "m off"]
-    return markdown([*titles, "s of the last search", "at most"], lines)
+    times = ["CPU s of a scan with a search: median", "at most"]
+    return markdown([*titles, *times, "NEES", "within 95 %"], lines)
 
 
-def _build_known_map(folder: Path, world: str):
-    """The map of another run, and the pose of the world in it."""
-    simulation = simulate(scene_by_name(world), _MAP_SEED)
+def _summarize(runs) -> list[str]:
+    """Verdicts, medians of those that are right, times of all searches, and NEES."""
+    verdicts = [one.verdict for one in runs]
+    counts = [str(verdicts.count(v)) for v in ("right", "wrong", "ambiguous", "lost")]
+    right = [one for one in runs if one.verdict == "right"]
+    medians = [
+        f"{np.median([r.scans for r in right]):.0f}",
+        f"{np.median([r.off for r in right]):.3f}",
+    ]
+    seconds = [s for one in runs for s in one.seconds]
+    nees = np.concatenate([one.nees for one in right])
+    times = [f"{np.median(seconds):.2f}", f"{max(seconds):.2f}"]
+    within = f"{(nees < _WITHIN_95).mean():.2f}"
+    return [*counts, *medians, *times, f"{nees.mean():.1f}", within]
+
+
+def build_known_map(folder: Path, world: str, seed: int = _MAP_SEED):
+    """The map of another run, and the pose of the world in it: by all poses of that run, since the
+    first one alone is off by some hundredths of a radian."""
+    simulation = simulate(scene_by_name(world), seed)
     if not (folder / "run.json").exists():
-        build(simulation.recording).save(folder)
-    return folder, se2.inverse(simulation.truth.T_world_base[0])
+        build(simulation.recording, {"threads": 1}).save(folder)
+    return folder, align(simulation.truth.T_world_base, load(folder).poses)
 
 
-def _localize_from(known: Path, T_map_world, simulation, first: int):
-    """Verdict, scans until then, m off, and s that the last push took."""
-    recording, doubts = simulation.recording, ()
+@dataclass
+class _Start:
+    """A robot put down somewhere: what was found, in how many scans, m off, s of each search, and
+    the normalized squared errors from then on."""
+
+    verdict: str
+    scans: int
+    off: float
+    seconds: list[float]
+    nees: list[float]
+
+
+def _localize_from(known: Path, T_map_world, simulation, first: int, scans: int) -> _Start:
+    out = _Start("lost", scans, math.inf, [], [])
+    odometry = simulation.recording.T_odom_base
     with LiveMapper({"threads": 1}, place=known) as mapper:
-        scans = itertools.islice(iter_beams(recording), first, first + _SCANS_TO_LOCALIZE)
-        for t, beams in enumerate(scans, first):
-            start = time.perf_counter()
-            update = mapper.push(beams, recording.T_odom_base[t])
-            seconds, doubts = time.perf_counter() - start, update.doubts
-            if "lost" in doubts:
-                continue
+        rest = itertools.islice(iter_beams(simulation.recording), first, None)
+        for t, beams in enumerate(rest, first):
+            start = time.process_time()
+            update = mapper.push(beams, odometry[t])
             true = T_map_world @ simulation.truth.T_world_base[t]
-            off = float(np.hypot(*(update.pose - true)[:2, 2]))
-            return "right" if off < 0.3 else "wrong", t - first + 1, off, seconds
-    return "ambiguous" if "ambiguous" in doubts else "lost", _SCANS_TO_LOCALIZE, math.inf, 0.0
+            if out.verdict == "right":
+                out.nees.append(normalized_error(update, true))
+            else:
+                out.seconds.append(time.process_time() - start)
+            if "lost" not in update.doubts and out.verdict != "right":
+                out.scans, out.off = t - first + 1, float(np.hypot(*(update.pose - true)[:2, 2]))
+                out.verdict = "right" if out.off < 0.3 else "wrong"
+            elif out.verdict == "lost" and t == first + scans - 1:
+                out.verdict = "ambiguous" if "ambiguous" in update.doubts else "lost"
+                break
+            if out.verdict == "wrong" or len(out.nees) == _TRACKED:
+                break
+    return out
 
 
-class _EveryBeamCounts(LiveMapper):
-    """Without P(static): all beams count alike in matching."""
-
-    def _weigh(self, hits, prior):  # noqa: ARG002
-        return hits
-
-
-def localize_in_crowds(args: argparse.Namespace) -> str:
-    """A line per number of people: lost runs, and ATE of the others."""
-    known, T_map_world = _build_known_map(args.data / args.world, args.world)
-    lines = []
-    for people in args.people:
-        errors = {"with": [], "without": [], "filter": []}
-        for run in range(args.runs):
-            changes = {"crowd": {"people": people}, "robot": {"scans": _SCANS_IN_CROWDS}}
-            simulation = simulate(scene_by_name(args.world, changes), 100 + run)
-            true = T_map_world @ simulation.truth.T_world_base
-            for name, kind in (("with", LiveMapper), ("without", _EveryBeamCounts)):
-                errors[name].append(_track(kind, known, simulation.recording, true))
-            errors["filter"].append(_filter_particles(known, simulation.recording, true, run))
-        line = [f"{_count_lost(e)} / {_ate_of_others(e):.3f}" for e in errors.values()]
-        lines.append([str(people), *line])
-        print(" | ".join(lines[-1]), flush=True)
-    titles = ["people", "with P(static)", "without", "particle filter"]
-    return markdown([*titles[:1], *(f"{t}: lost / ATE m" for t in titles[1:])], lines)
-
-
-def _track(kind, known, recording, true):
-    """(T,) m off; infinite while lost."""
-    off = np.full(recording.n_scans, math.inf)
-    with kind({"threads": 1}, place=known) as mapper:
-        for t, beams in enumerate(iter_beams(recording)):
-            update = mapper.push(beams, recording.T_odom_base[t])
-            if "lost" not in update.doubts:
-                off[t] = np.hypot(*(update.pose - true[t])[:2, 2])
-    return off
-
-
-def _filter_particles(known, recording, true, seed: int):
-    filter_ = ParticleFilter(read_grid(known), true[0], np.random.default_rng(seed))
-    odometry = recording.T_odom_base
-    off = np.zeros(recording.n_scans)
-    for t, beams in enumerate(iter_beams(recording)):
-        increment = np.eye(3) if t == 0 else se2.inverse(odometry[t - 1]) @ odometry[t]
-        pose = filter_.push(beams.points, beams.hit, beams.T_base_sensor, increment)
-        off[t] = np.hypot(*(pose - true[t])[:2, 2])
-    return off
-
-
-def _is_lost(off) -> bool:
-    return bool(off[-50:].mean() > 0.5)
-
-
-def _count_lost(runs) -> int:
-    return sum(map(_is_lost, runs))
-
-
-def _ate_of_others(runs) -> float:
-    kept = [off[np.isfinite(off)] for off in runs if not _is_lost(off)]
-    return float(np.sqrt(np.mean(np.square(np.concatenate(kept))))) if kept else math.nan
+def normalized_error(update, true) -> float:
+    """Squared error of a pose by its covariance."""
+    d = se2.parameters(update.pose) - se2.parameters(true)
+    d[2] = se2.wrap(d[2])
+    return float(d @ np.linalg.solve(update.covariance, d))
 
 
 def measure_latency(args: argparse.Namespace) -> str:

@@ -15,7 +15,7 @@ here=$(cd "$(dirname "$0")/.." && pwd)
 "$python" -m venv --clear "$folder"
 folder=$(cd "$folder" && pwd)
 pip="$folder/bin/python -m pip --quiet --disable-pip-version-check"
-$pip install cyclonedds pytest \
+$pip install cyclonedds pytest foxglove-sdk websockets \
   $ros-rclpy $ros-rmw-fastrtps-cpp $ros-std-srvs \
   $ros-sensor-msgs $ros-nav-msgs $ros-geometry-msgs $ros-diagnostic-msgs $ros-visualization-msgs
 # what builds messages; these packages do not ask for each other

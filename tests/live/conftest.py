@@ -16,13 +16,14 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))  # for what the tests s
 class Run:
     """A recording, and what the live mapper answered to it."""
 
-    def __init__(self, simulation):
+    def __init__(self, simulation, threads=1):
         self.recording, self.truth = simulation.recording, simulation.truth
-        self.mapper = LiveMapper({"threads": 1})
+        self.mapper = LiveMapper({"threads": threads})
         odometry = self.recording.T_odom_base
+        self.beams = list(iter_beams(self.recording))
         self.updates = [
             self.mapper.push(beams, None if odometry is None else odometry[t])
-            for t, beams in enumerate(iter_beams(self.recording))
+            for t, beams in enumerate(self.beams)
         ]
 
     @property
@@ -40,3 +41,17 @@ def corridor():
     run = Run(simulate(scene_by_name("corridor", {"robot": {"scans": 400}}), 3))
     yield run
     run.mapper.close()
+
+
+@pytest.fixture(scope="session")
+def sweeps():
+    """A spinning lidar of 24 channels in a hall with people."""
+    run = Run(simulate_sweeps("hall", 100))
+    yield run
+    run.mapper.close()
+
+
+def simulate_sweeps(scene, scans, seed=3):
+    """A recording of a spinning lidar, and its truth."""
+    lidar = {"channels": 24, "columns": 600}
+    return simulate(scene_by_name(scene, {"lidar": lidar, "robot": {"scans": scans}}), seed)

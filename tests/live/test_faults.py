@@ -57,8 +57,12 @@ def test_a_laser_that_shows_a_close_obstacle_everywhere(corridor, answers):
         return replace(beams, points=near), T_odom_base
 
     updates = answers(blind)
-    assert any(updates[k].doubts for k in FAULT)
-    assert error(corridor, updates, range(150)) < 0.1
+    assert all("blind" in updates[k].doubts for k in FAULT)
+    assert all(np.isnan(updates[k].p_static).all() for k in FAULT)
+    off = np.array([error(corridor, updates, range(k, k + 1)) for k in FAULT])
+    std = np.sqrt([updates[k].covariance[0, 0] for k in FAULT])
+    assert (off < 3.0 * std + 0.05).all()
+    assert error(corridor, updates, range(210, 300)) < 0.2
 
 
 def test_odometry_that_is_lost(corridor, answers):
@@ -73,3 +77,13 @@ def test_odometry_that_stands_still(corridor, answers):
     updates = answers(lambda beams, _: (beams, T))
     assert any("slip" in updates[k].doubts for k in FAULT)
     assert error(corridor, updates, range(300)) < 0.3
+
+
+def test_odometry_that_jumps(corridor, answers):
+    rng = np.random.default_rng(0)
+
+    def jump(beams, T_odom_base):
+        return beams, se2.matrix(*rng.normal(size=3) * (3.0, 3.0, 1.0)) @ T_odom_base
+
+    updates = answers(jump)
+    assert error(corridor, updates, range(300)) < 0.15

@@ -6,6 +6,7 @@ import pytest
 import stillmap
 from stillmap.core import se2
 from stillmap.core.errors import InputError
+from stillmap.live.known_map import KnownMap
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.replay import iter_beams
 from stillmap.sim import scene_by_name, simulate
@@ -115,3 +116,30 @@ def test_where_places_look_alike_it_says_so(tmp_path):
 def test_folders_without_a_map_are_refused(tmp_path):
     with pytest.raises(InputError, match="nothing"):
         LiveMapper(place=tmp_path / "nothing")
+
+
+def write_map(folder, alpha):
+    """A map folder: a wall along x in two rows of cells, hit so often each."""
+    p_occupied = np.zeros((20, 60), np.float32)
+    hits = np.zeros_like(p_occupied)
+    for row, count in alpha.items():
+        p_occupied[row, 10:50], hits[row, 10:50] = 0.9, count
+    folder.mkdir()
+    origin, resolution = np.zeros(3), 0.05
+    np.savez(
+        folder / "map.npz",
+        p_occupied=p_occupied,
+        alpha=hits,
+        origin=origin,
+        resolution=resolution,
+    )
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("alpha", "y"), [({9: 8.0}, 0.475), ({9: 4.0, 10: 4.0}, 0.5), ({9: 6.0, 10: 2.0}, 0.4875)]
+)
+def test_a_surface_runs_where_most_hits_are(tmp_path, alpha, y):
+    known = KnownMap(write_map(tmp_path / "map", alpha))
+    inner = (known.surfaces[:, 0] > 0.6) & (known.surfaces[:, 0] < 2.4)
+    np.testing.assert_allclose(known.surfaces[inner, 1], y, atol=1e-6)

@@ -12,6 +12,7 @@ from stillmap.em.options import EmOptions
 from stillmap.eval.trajectory import compute_absolute_errors
 from stillmap.live.causal_labels import CausalLabels, take_over
 from stillmap.live.mapper import LiveMapper
+from stillmap.live.observation import Observation
 from stillmap.live.replay import iter_beams
 from stillmap.live.scan import to_beams
 
@@ -101,7 +102,7 @@ def test_parts_that_emptied_are_told():
     labels = CausalLabels(2, 0.05, EmOptions())
     angles = np.linspace(-1.0, 1.0, 200)
     beams = to_beams(stillmap.Scan(0, np.full(200, 3.0), angles))
-    labels.add(beams, np.eye(3), np.zeros((200, 2)), 0)
+    labels.add(Observation(beams, np.full(200, 0.1, np.float32)), np.eye(3))
     before = {tuple(change.first_cell) for change in labels.take_changes()}
     moved = labels.filter.sibling()
     take_over(moved, labels.filter, se2.matrix(2.0, 0.0, 0.0)[None], 0, labels.filter.block_count)
@@ -143,6 +144,9 @@ def test_a_saved_run_is_a_result(corridor, tmp_path):
 
 def test_finishing_is_building(corridor):
     found = corridor.mapper.finish()
+    built = stillmap.build(corridor.recording, {"threads": 1})
+    np.testing.assert_array_equal(found.poses, built.poses)
+    np.testing.assert_array_equal(found.p_static, built.p_static)
     errors = compute_absolute_errors(found.poses, corridor.truth.T_world_base)
     assert errors.rmse < 0.03
     assert f1(found.p_static, corridor.truth.static, corridor.recording.hit) > 0.95

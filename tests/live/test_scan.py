@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stillmap.live.scan import Scan, to_beams
+from stillmap.live.scan import Scan, drop_cover, to_beams
 
 
 def test_readings_mean_what_they_mean_in_ros():
@@ -52,3 +52,21 @@ def test_points_with_and_without_returns():
 def test_what_is_wrong_is_named(scan, named):
     with pytest.raises(ValueError, match=named):
         to_beams(scan)
+
+
+@pytest.mark.parametrize(
+    ("near", "is_covered"), [(180, True), (165, True), (120, False), (0, False)]
+)
+def test_what_covers_the_laser_is_dropped(near, is_covered):
+    angles = np.linspace(-1.5, 1.5, 180)
+    ranges = np.where(np.arange(180) < near, 0.1, 4.0)
+    beams = to_beams(Scan(0.0, ranges, angles))
+    left = drop_cover(beams)
+    assert left.hit.any() != is_covered
+    assert np.isnan(left.points).all() == is_covered
+    assert beams.hit.all()
+
+
+def test_a_scan_without_readings_is_not_covered():
+    beams = to_beams(Scan(0.0, np.full(9, np.nan), np.zeros(9)))
+    assert drop_cover(beams) is beams

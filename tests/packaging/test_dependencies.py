@@ -15,6 +15,7 @@ PACKAGE = ROOT / "src" / "stillmap"
 # modules that are imported only where their extra is in use
 NEEDS_EXTRA = {
     "viewer/server.py": "viewer",
+    **{f"live/foxglove/{name}.py": "live" for name in ("publisher", "schemas")},
     # for type checkers alone
     **{f"results/{name}.py": "notebook" for name in ("plot", "result", "tables")},
     **{f"places/{name}.py": "notebook" for name in ("plot", "saved_place")},
@@ -108,7 +109,7 @@ def test_every_declared_library_is_used(declared):
             modules.setdefault(normalized(name), set()).add(top)
     unused = [
         name
-        for group in ("", "io", "mesh", "viewer")
+        for group in ("", "io", "live", "mesh", "viewer")
         for name in declared[group]
         if not any(re.search(rf"\b{re.escape(top)}\b", text) for top in modules.get(name, ()))
     ]

@@ -2,12 +2,15 @@
 
 import argparse
 import tempfile
+import threading
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stillmap.cli.arguments import add_read_flags, read_changes, require_apart
 from stillmap.cli.config import add_option_flags, options_from_args
 from stillmap.cli.console import print_json, say, show_progress, show_share
+from stillmap.cli.live_foxglove import add_foxglove_flags, serve
 from stillmap.cli.map_flags import add_map_mode_flag, add_run_flags, shared_changes
 from stillmap.core.errors import InputError
 
@@ -27,6 +30,7 @@ EPILOG = """examples:
   stillmap live --replay log.clf.gz -o out
   stillmap live --replay log.bag -o out --json --quiet
   stillmap live --replay log.bag -o out --rate 1
+  stillmap live --replay log.bag -o out --rate 1 --foxglove
   stillmap live --replay tuesday.bag --map monday -o out
   stillmap live -o out --ros-args -p base_frame:=base_link -r scan:=front/scan
 """
@@ -65,6 +69,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument(
         "--resolution", metavar="M", type=float, help="edge of a map cell in metres (default: 0.05)"
     )
+    add_foxglove_flags(p)
     add_map_mode_flag(p)
     add_run_flags(p)
     add_read_flags(p)
@@ -85,6 +90,10 @@ def run(args: argparse.Namespace) -> int:
         from stillmap.cli.live_node import run_node
 
         return run_node(args)
+    return _replay(args)
+
+
+def _replay(args: argparse.Namespace) -> int:
     from stillmap.core.files import require_new
     from stillmap.live.mapper import LiveMapper
     from stillmap.live.replay import replay
@@ -96,7 +105,7 @@ def run(args: argparse.Namespace) -> int:
     output = Path(args.output)
     require_new(output, RECORD, args.overwrite)
     require_apart(output, Path(args.replay))
-    with tempfile.TemporaryDirectory(prefix="stillmap-") as scratch:
+    with tempfile.TemporaryDirectory(prefix="stillmap-") as scratch, serve(args) as show:
         recording = _read(args, options, Path(scratch))
         in_background = args.rate is not None
         with (
@@ -104,15 +113,27 @@ def run(args: argparse.Namespace) -> int:
                 options, place=args.map, mode=args.mode, background=in_background, scratch=scratch
             ) as mapper,
             show_progress(args.quiet, 1) as progress,
+            _stop_flag(args) as stop,
         ):
-            latency = replay(recording, mapper, progress, rate=args.rate)
-            mapper.save(output, overwrite=args.overwrite, progress=progress)
+            latency = replay(recording, mapper, progress, args.rate, show, stop)
+            has_scans = len(latency.seconds) > 0
+            if has_scans:
+                mapper.save(output, overwrite=args.overwrite, progress=progress)
     if not args.quiet:
         say(describe(latency))
-        say(f"wrote {output}")
+        say(f"wrote {output}" if has_scans else "no scan was mapped: nothing was written")
     if args.json:
-        print_json({"output": str(output), **latency.to_dict()})
+        print_json({"output": str(output) if has_scans else None, **latency.to_dict()})
     return 0
+
+
+def _stop_flag(
+    args: argparse.Namespace,
+) -> "AbstractContextManager[threading.Event | None]":
+    """Where somebody looks on, Ctrl-C ends the drive and not the command, as with the node."""
+    from stillmap.live.stopping import signal_flag
+
+    return signal_flag() if args.foxglove or args.rate is not None else nullcontext()
 
 
 def _read(args: argparse.Namespace, options: "Options", scratch: Path) -> "Recording":

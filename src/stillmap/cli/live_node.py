@@ -8,6 +8,7 @@ from pathlib import Path
 from stillmap.cli.arguments import read_changes
 from stillmap.cli.config import options_from_args
 from stillmap.cli.console import say, show_progress
+from stillmap.cli.live_foxglove import serve
 from stillmap.cli.map_flags import shared_changes
 from stillmap.core.errors import InputError
 
@@ -28,7 +29,7 @@ def run_node(args: argparse.Namespace) -> int:
     require_new(output, RECORD, args.overwrite)
     if args.no_odometry or args.json or args.rate is not None:
         raise InputError("--no-odometry, --rate and --json are for --replay")
-    with tempfile.TemporaryDirectory(prefix="stillmap-") as scratch:
+    with tempfile.TemporaryDirectory(prefix="stillmap-") as scratch, serve(args) as show:
         scans = run(
             options,
             output,
@@ -38,6 +39,7 @@ def run_node(args: argparse.Namespace) -> int:
                 LiveMapper, place=args.map, mode=args.mode, background=True, scratch=scratch
             ),
             show_progress=partial(show_progress, args.quiet, 1),
+            show=show,
         )
     if not args.quiet:
         say(f"wrote {output}" if scans else "no scan arrived: nothing was written")

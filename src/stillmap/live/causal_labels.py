@@ -24,7 +24,11 @@ _DYNAMIC = ((0.04, 0.5), (0.04, 3.0), (0.15, 3.0), (0.04, 12.0), (0.04, 45.0))
 _LATERAL_STD = 0.4  # cells, of a beam's lateral position
 _HIT_RADIUS = 1.0  # cells from an end point to the centres of the cells that it hits
 _MAX_LOG_RATIO = 20.0  # nats: what stood for hours is known to be gone after a few bins
-_MAP_PRIOR = 0.5  # of static surface in the map: one look at a walker is no evidence for a wall
+# of static surface in the map and in matching: one look at a walker is no evidence for a wall
+_MAP_PRIOR = 0.5
+# likewise for the local map until more is known: people who walk along with the robot are always
+# ahead of it, where nobody has looked before
+_RECENT_PRIOR = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,9 +94,15 @@ class CausalLabels:
         return self.filter.label(beams.points, beams.hit, offset, T, self._prior)
 
     def label_ends(self, points: NDArray[np.float32], T_map_base: Float) -> NDArray[np.float32]:
-        """(N,) P(static) of hits that end at points (N, D) in the base frame."""
+        """(N,) P(static) of hits that end at points (N, D) in the base frame, with the prior of the
+        map."""
         every, offset = np.ones(len(points), np.bool_), np.array([0, len(points)])
-        return self.filter.label(points, every, offset, T_map_base[None], self._prior)
+        return self.filter.label(points, every, offset, T_map_base[None], _MAP_PRIOR)
+
+    def doubt(self, e: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(N,) P(static) of `label` with the prior of what was only just seen."""
+        odds = _RECENT_PRIOR / (1.0 - _RECENT_PRIOR) * (1.0 - self._prior) / self._prior
+        return np.asarray(odds * e / (odds * e + (1.0 - e)), np.float32)
 
     def add(
         self, observation: Observation, T_map_base: Float, to: OccupancyFilter | None = None

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.short_repr import ShortRepr
-from stillmap.live.local_map import MappedScan
+from stillmap.live.local_map import Labeller, MappedScan
 from stillmap.live.scan import ScanBeams
 
 Float = NDArray[np.float64]
@@ -27,6 +27,8 @@ class Registration(ShortRepr):
         is_slipping: odometry disagrees with the scans.
         is_blind: no beam met anything that the local map knows.
         is_carried: the scans contradict the local map, which begins anew.
+        is_contradicted: the last ones do, or nothing of them is in it; not enough of them yet.
+        has_odometry: the prior is that of odometry.
     """
 
     T: Float
@@ -37,6 +39,8 @@ class Registration(ShortRepr):
     is_slipping: bool = False
     is_blind: bool = False
     is_carried: bool = False
+    is_contradicted: bool = False
+    has_odometry: bool = False
 
 
 class FrontEnd(Protocol):
@@ -46,6 +50,7 @@ class FrontEnd(Protocol):
     """
 
     local_map: Any
+    left_behind: Any  # the local map before the robot was carried
 
     def predict(self, beams: ScanBeams, increment: Float | None, /) -> Any:
         """The prior of the next scan, given the increment (D+1, D+1) of odometry."""
@@ -61,8 +66,25 @@ class FrontEnd(Protocol):
     ) -> Registration:
         """Register a scan, (9), by its hits with weights P(static)."""
 
-    def add(self, beams: ScanBeams, e: NDArray[np.float32], /) -> MappedScan | None:
-        """Add the last scan to the local map, with P(static) e (N,); the scan if it is spaced."""
+    def add(
+        self,
+        beams: ScanBeams,
+        e: NDArray[np.float32],
+        recent: NDArray[np.float32],
+        label: Labeller,
+        /,
+    ) -> MappedScan | None:
+        """Add the last scan to the local map, unless it contradicts it; the scan if it is spaced.
+
+        Args:
+            beams: of the scan, as if taken at its stamp.
+            e: (N,) P(static).
+            recent: (N,) the same with the prior of what was only just seen, for the local map.
+            label: labels an earlier scan again, after a second.
+        """
 
     def enter(self, local_map: Any, T: Float, /) -> None:
         """Go on in another map, in whose frame the frame so far has the pose T."""
+
+    def correct(self, local_map: Any, motion: Float, /) -> None:
+        """Go on with a local map made anew, in 3D None, after the map has moved (D+1, D+1)."""

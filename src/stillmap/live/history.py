@@ -10,6 +10,7 @@ from stillmap.core import se2, se3
 from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
+from stillmap.live.beam_store import BeamStore
 from stillmap.live.scan import ScanBeams
 
 Float = NDArray[np.float64]
@@ -22,12 +23,14 @@ class Answers(ShortRepr):
     """Poses and labels returned by `push` for T scans with M beams.
 
     Attributes:
+        number: (T,) of the scans, as they were pushed: all, unless some were dropped.
         poses: (T, D+1, D+1) T_map_base as it was given.
         local: (T, D+1, D+1) in the frame of the odometry by scans, which never jumps.
         anchor: (T,) the last spaced scan at the time; -1: none yet.
         p_static: (M,) float32.
     """
 
+    number: NDArray[np.int64]
     poses: Float
     local: Float
     anchor: NDArray[np.int64]
@@ -40,9 +43,13 @@ class History:
     Args:
         dimension: 2 or 3.
         folder: of the temporary files; None: the system's.
+        max_bytes: about, of the beams, 13 bytes each: beyond, every second one of the scans that
+            lie most densely is dropped; None: unbounded.
     """
 
-    def __init__(self, dimension: int, folder: Path | None = None) -> None:
+    def __init__(
+        self, dimension: int, folder: Path | None = None, max_bytes: int | None = None
+    ) -> None:
         D = dimension
 
         self._arrays: list[ArrayBuilder] = []
@@ -51,10 +58,11 @@ class History:
             self._arrays.append(ArrayBuilder(dtype, row, folder, _IN_MEMORY))
             return self._arrays[-1]
 
-        self._stamp_ns, self._count = array(np.int64), array(np.int64)
+        self._stamp_ns = array(np.int64)
         self._sensor, self._anchor = array(np.int32), array(np.int64)
-        self._points, self._hit = array(np.float32, D), array(np.bool_)
-        self._p_static, self._beam_time = array(np.float32), array(np.float32)
+        # points, hit, P(static), time of each beam
+        fields = [(np.float32, (D,)), (np.bool_, ()), (np.float32, ()), (np.float32, ())]
+        self._beams = BeamStore(fields, folder, max_bytes)
         self._T_odom_base = array(np.float64, D + 1, D + 1)
         self._poses, self._local = (array(np.float64, D + 1, D + 1) for _ in range(2))
         self._mounts: dict[str | int, Float] = {}
@@ -63,6 +71,7 @@ class History:
 
     def close(self) -> None:
         """Remove the files."""
+        self._beams.close()
         for array in self._arrays:
             array.close()
 
@@ -86,24 +95,17 @@ class History:
         self._mounts.setdefault(beams.sensor, beams.T_base_sensor)
         self._has_odometry &= T_odom_base is not None
         self._has_times |= beams.beam_time is not None
-        n = len(beams.points)
-        times = np.zeros(n, np.float32) if beams.beam_time is None else beams.beam_time
+        times = beams.beam_time
+        if times is None:
+            times = np.zeros(len(beams.points), np.float32)
+        self._beams.append(len(self), [beams.points, beams.hit, p_static, times])
         sensor = list(self._mounts).index(beams.sensor)
         for array, value in (
             (self._stamp_ns, beams.stamp_ns),
-            (self._count, n),
             (self._sensor, sensor),
             (self._anchor, anchor),
         ):
             array.append(np.array([value]))
-        for array, rows in (
-            (self._points, beams.points),
-            (self._hit, beams.hit),
-            (self._p_static, p_static),
-            (self._beam_time, times),
-        ):
-            if len(rows):
-                array.append(rows)
         unknown = np.full(pose.shape, np.nan)
         odometry = unknown if T_odom_base is None else T_odom_base
         for array, T in (
@@ -127,27 +129,30 @@ class History:
         return out
 
     def recording(self) -> Recording:
-        """All scans so far. Odometry only if every scan had it."""
-        offset = np.concatenate([np.zeros(1, np.int64), np.cumsum(self._count.view())])
+        """The scans that are kept. Odometry only if every scan had it."""
+        return self.snapshot()[0]
+
+    def snapshot(self) -> tuple[Recording, Answers]:
+        """The scans that are kept, and what `push` has returned for them."""
+        kept, counts = self._beams.kept, self._beams.counts
+        points, hit, p_static, times = self._beams.view()
         sensors = [{"name": str(name), "extrinsics": {"how": "given"}} for name in self._mounts]
-        return Recording(
-            stamp_ns=np.array(self._stamp_ns.view()),
-            offset=offset.astype(np.int64),
-            points=self._points.view(),
-            hit=self._hit.view(),
+        recording = Recording(
+            stamp_ns=self._stamp_ns.view()[kept],
+            offset=np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)]),
+            points=points,
+            hit=hit,
             T_base_sensor=np.array(list(self._mounts.values())),
-            sensor=np.array(self._sensor.view()),
-            T_odom_base=np.array(self._T_odom_base.view()) if self._has_odometry else None,
+            sensor=self._sensor.view()[kept],
+            T_odom_base=self._T_odom_base.view()[kept] if self._has_odometry else None,
             source={"format": "live", "sensors": sensors, "warnings": []},
-            beam_time=self._beam_time.view() if self._has_times else None,
+            beam_time=times if self._has_times else None,
             scratch=self._folder,
         )
+        poses, local, anchor = self.poses()
+        return recording, Answers(kept, poses[kept], local[kept], anchor[kept], p_static)
 
-    def answers(self) -> Answers:
-        """Poses and labels that `push` has returned so far."""
-        return Answers(
-            np.array(self._poses.view()),
-            np.array(self._local.view()),
-            np.array(self._anchor.view()),
-            self._p_static.view(),
-        )
+    def poses(self) -> tuple[Float, Float, NDArray[np.int64]]:
+        """`poses`, `local` and `anchor` of all scans, see `Answers`."""
+        poses, local = np.array(self._poses.view()), np.array(self._local.view())
+        return poses, local, np.array(self._anchor.view())

@@ -1,6 +1,7 @@
 """A map from an earlier run, for localization: to be matched, searched, and looked up."""
 
 import os
+from collections import deque
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +10,22 @@ from numpy.typing import NDArray
 import stillmap._core as _core
 from stillmap.core.errors import InputError
 from stillmap.core.grid_map import GridMap
-from stillmap.live.local_map import MappedScan, add_scan, is_spaced
+from stillmap.live.local_map import (
+    Labeller,
+    MappedScan,
+    add_scan,
+    is_spaced,
+    relabel_scan,
+    take_until,
+)
 from stillmap.places.surface_map import SurfaceMap, find_sides
-from stillmap.results.reader import FREE_THRESH, OCCUPIED_THRESH, Grid, read_grid
+from stillmap.results.reader import (
+    FREE_THRESH,
+    OCCUPIED_THRESH,
+    Grid,
+    read_grid,
+    read_hit_sums,
+)
 from stillmap.slam import scan_hits
 
 Float = NDArray[np.float64]
@@ -24,27 +38,39 @@ class KnownMap:
     """A map to localize in.
 
     Args:
-        folder: of a result or a place.
+        source: folder of a result or a place, or a map.
+
+    Attributes:
+        grid: the map.
+        hits: (H, W) sums of hits of its cells.
+        resolution: m, edge of a cell.
+        surfaces: (N, 2) where the surface runs through each occupied cell, m.
 
     Raises:
         InputError: it has no map, or an empty one.
     """
 
-    def __init__(self, folder: str | os.PathLike[str]) -> None:
-        self._grid = read_grid(Path(folder))
-        if not self._grid.occupied.any():
-            raise InputError("has an empty map", where=str(folder))
-        self.resolution = self._grid.resolution
-        self._centres = self._grid.centres(np.argwhere(self._grid.occupied))
+    def __init__(self, source: str | os.PathLike[str] | GridMap) -> None:
+        if isinstance(source, GridMap):
+            self.grid = Grid(source.p_occupied, source.origin, source.resolution)
+            self.hits = self.grid.p_occupied
+        else:
+            self.grid, self.hits = read_grid(Path(source)), read_hit_sums(Path(source))
+        if not self.grid.occupied.any():
+            where = "map" if isinstance(source, GridMap) else str(source)
+            raise InputError("has an empty map", where=where)
+        self.resolution = self.grid.resolution
+        self._centres = self.grid.centres(np.argwhere(self.grid.occupied))
+        self.surfaces = _find_surfaces(self.grid, self.hits)
 
     def make_grid(self) -> _core.OccupancyGrid2D:
-        """The map for registration: an end point in every occupied cell, and free space."""
+        """The map for registration: an end point for every occupied cell, and free space."""
         grid = _core.OccupancyGrid2D(self.resolution, scan_hits.FREE_SPACE_MARGIN)
-        ends = self._centres.astype(np.float32)
+        ends = self.surfaces.astype(np.float32)
         n, here = len(ends), np.eye(3)[None]
         offset = np.array([0, n])
         _core.add_end_points(grid, ends, np.ones(n, bool), np.ones(n, np.float32), offset, here)
-        poses, lengths = _free_runs(self._grid)
+        poses, lengths = _free_runs(self.grid)
         along = np.stack([lengths, np.zeros(len(lengths))], axis=1).astype(np.float32)
         every = np.arange(len(lengths) + 1)
         passed = np.zeros(len(lengths), bool)
@@ -53,11 +79,11 @@ class KnownMap:
 
     def make_surface_map(self) -> SurfaceMap:
         """The map for the search of alignments."""
-        return to_surface_map(self._grid)
+        return to_surface_map(self.grid)
 
     def prime(self, labels: _core.OccupancyFilter2D) -> None:
         """Tell the filters of cells what the map knows."""
-        free = self._grid.centres(np.argwhere(self._grid.p_occupied < FREE_THRESH))
+        free = self.grid.centres(np.argwhere(self.grid.p_occupied < FREE_THRESH))
         centres = np.concatenate([self._centres, free])
         cells = np.floor(centres / labels.resolution).astype(np.int64)
         occupied = np.arange(len(cells)) < len(self._centres)
@@ -76,6 +102,7 @@ class KnownLocalMap:
         self.grid = known.make_grid()
         self._extends = extends
         self._last: dict[str | int, MappedScan] = {}
+        self._recent = deque[MappedScan]()  # that are to be labelled again
 
     def add(self, scan: MappedScan) -> bool:
         """Note a scan unless it is too close to the last one of its sensor; True if it was noted.
@@ -86,7 +113,13 @@ class KnownLocalMap:
         self._last[scan.beams.sensor] = scan
         if self._extends:
             add_scan(self.grid, scan)
+            self._recent.append(scan)
         return True
+
+    def relabel(self, until_ns: int, label: Labeller) -> None:
+        """Give the scans added up to then the labels that are known by now, each once."""
+        for scan in take_until(self._recent, until_ns):
+            relabel_scan(self.grid, scan, label)
 
     def remove_before(self, travelled: float) -> None:
         """Nothing leaves a known map."""
@@ -125,6 +158,24 @@ def _count(cells: NDArray[np.int64], shape: NDArray[np.int64]) -> NDArray[np.int
     rows, columns = shape.tolist()
     counts = np.bincount(cells[:, 0] * columns + cells[:, 1], minlength=rows * columns)
     return np.asarray(counts.reshape(rows, columns), np.int64)
+
+
+def _find_surfaces(grid: Grid, hits: NDArray[np.floating]) -> Float:
+    """(N, 2) where the surface runs through each occupied cell: the mean of the cells around it,
+    weighted by their hits. Of a wall between two rows of cells it is nearer to the one hit more."""
+    from scipy import ndimage  # slow to load
+
+    if hits.shape != grid.p_occupied.shape:
+        raise InputError("alpha and p_occupied of the map differ in shape")
+    weights = np.nan_to_num(hits.astype(np.float64), nan=0.0)
+    steps = np.arange(-1.0, 2.0)
+    total, across, along = (
+        ndimage.correlate(weights, kernel, mode="constant")
+        for kernel in (np.ones((3, 3)), np.outer(steps, np.ones(3)), np.outer(np.ones(3), steps))
+    )
+    rows, columns = at = np.nonzero(grid.occupied)
+    shifts = np.stack([across[at], along[at]], axis=1) / np.maximum(total[at], 1e-9)[:, None]
+    return grid.centres(np.stack([rows, columns], axis=1) + shifts)
 
 
 def _free_runs(grid: Grid) -> tuple[Float, Float]:

@@ -1,7 +1,7 @@
 """The local map that scans are matched against: spaced scans of the last stretch of travel."""
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -41,6 +41,9 @@ def thin_scan(scan: MappedScan, max_beams: int) -> MappedScan:
     return replace(scan, beams=take_beams(scan.beams, every), e=scan.e[every].copy())
 
 
+Labeller = Callable[[MappedScan], NDArray[np.float32]]  # P(static) (N,) of a scan
+
+
 class MatchMap(Protocol):
     """A map that scans are matched against: a `LocalMap`, or a `KnownLocalMap`."""
 
@@ -48,6 +51,9 @@ class MatchMap(Protocol):
 
     def add(self, scan: MappedScan) -> bool:
         """Add or note a scan; False if it is too close to the last one of its sensor."""
+
+    def relabel(self, until_ns: int, label: Labeller) -> None:
+        """Give the scans added up to then the labels that are known by now, each once."""
 
     def remove_before(self, travelled: float) -> None:
         """Remove the scans taken before that many metres of travel."""
@@ -70,11 +76,16 @@ class LocalMap:
         self.grid = _core.OccupancyGrid2D(resolution, scan_hits.FREE_SPACE_MARGIN)
         self._scans = deque[MappedScan]()  # by travel
         self._last: dict[str | int, MappedScan] = {}  # of each sensor
+        self._recent = deque[MappedScan]()  # that are to be labelled again
 
     def extend(self, scans: Iterable[MappedScan]) -> None:
         """Add scans, however close, in the order of travel."""
         for scan in scans:
             self._insert(scan)
+
+    def join(self, other: "LocalMap", T: NDArray[np.float64]) -> None:
+        """Add the scans of another map, which were taken later, moved by T (3, 3)."""
+        self.extend(replace(scan, T_map_base=T @ scan.T_map_base) for scan in other._scans)
 
     def add(self, scan: MappedScan) -> bool:
         """Add a scan unless it is too close to the last one of its sensor; True if it was added."""
@@ -82,7 +93,15 @@ class LocalMap:
         if last is not None and not is_spaced(last, scan):
             return False
         self._insert(scan)
+        self._recent.append(scan)
         return True
+
+    def relabel(self, until_ns: int, label: Labeller) -> None:
+        """Give the scans added up to then the labels that are known by now, each once."""
+        for scan in take_until(self._recent, until_ns):
+            at = next((k for k, one in enumerate(self._scans) if one is scan), None)
+            if at is not None:
+                self._scans[at] = relabel_scan(self.grid, scan, label)
 
     def remove_before(self, travelled: float) -> None:
         """Remove the scans taken before that many metres of travel."""
@@ -108,6 +127,20 @@ class LocalMap:
         last = self._last.get(scan.beams.sensor)
         if last is None or last.beams.stamp_ns <= scan.beams.stamp_ns:
             self._last[scan.beams.sensor] = scan
+
+
+def take_until(scans: deque[MappedScan], until_ns: int) -> Iterable[MappedScan]:
+    """Take the scans up to then out of a queue."""
+    while scans and scans[0].beams.stamp_ns <= until_ns:
+        yield scans.popleft()
+
+
+def relabel_scan(grid: _core.OccupancyGrid2D, scan: MappedScan, label: Labeller) -> MappedScan:
+    """Replace the labels of a scan in a map for registration."""
+    add_scan(grid, scan, remove=True)
+    relabelled = replace(scan, e=label(scan))
+    add_scan(grid, relabelled)
+    return relabelled
 
 
 def is_spaced(last: MappedScan, scan: MappedScan) -> bool:

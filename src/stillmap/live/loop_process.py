@@ -7,7 +7,6 @@ import json
 import logging
 import os
 import queue
-import signal
 import subprocess
 import sys
 import threading
@@ -55,6 +54,7 @@ class LoopProcess:
             [sys.executable, "-m", "stillmap.live.loop_process", json.dumps(settings)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
+            process_group=0,  # Ctrl-C is for this process alone
         )
         self._outgoing: queue.SimpleQueue[dict[str, NDArray[Any]] | None] = queue.SimpleQueue()
         self._incoming = deque[Correction]()
@@ -207,7 +207,6 @@ def _serve(settings: dict[str, Any], source: IO[bytes], target: IO[bytes]) -> No
 
 def main() -> None:
     """Serve the process that started this one."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the other process decides when to end
     try:
         _serve(json.loads(sys.argv[1]), sys.stdin.buffer, sys.stdout.buffer)
     except BrokenPipeError:

@@ -20,37 +20,36 @@ from stillmap.em import CellProbabilities
 from stillmap.io.array_checks import poses_to_matrices
 from stillmap.live.causal_labels import CausalLabels, MapChange
 from stillmap.live.front_end import FrontEnd, Registration
+from stillmap.live.hindsight import Hindsight, LaterLabels
 from stillmap.live.history import History
 from stillmap.live.known_map import KnownMap
-from stillmap.live.local_map import thin_scan
-from stillmap.live.loop_closer import LoopCloser
+from stillmap.live.local_map import MappedScan
 from stillmap.live.loop_process import LoopProcess, make_closer
-from stillmap.live.map_correction import LabelledScan, MapCorrection
+from stillmap.live.map_correction import LabelledScan
+from stillmap.live.map_frame import LoopClosing, MapFrame
 from stillmap.live.map_view import project_obstacles
 from stillmap.live.movers import MoverTracker
 from stillmap.live.observation import BeamSelector, Observation, find_margins
 from stillmap.live.place import Mode, NoLoops, PlaceTracker
+from stillmap.live.relocalization import Relocalizer
 from stillmap.live.saving import Snapshot
-from stillmap.live.scan import Scan, ScanBeams, deskew, to_beams
+from stillmap.live.scan import Scan, ScanBeams, deskew, drop_cover, to_beams
 from stillmap.live.scan_hits import normals_of, thin
 from stillmap.live.scan_odometry import ScanOdometry
-from stillmap.live.sweep_loop_closer import LiveSweepLoopCloser
 from stillmap.live.sweep_odometry import SweepOdometry
 from stillmap.live.update import Update
 from stillmap.pipeline.options import Options, resolve_resolution
 from stillmap.pipeline.result import map_recording
 from stillmap.results.build import to_options
 from stillmap.results.result import BuiltResult
-from stillmap.slam import local_map
 from stillmap.slam.scan_hits import Scan as PlanarHits
 from stillmap.tracking import MovingObject
 
 Float = NDArray[np.float64]
 
-_MAX_KEPT_BEAMS = {
-    2: 400,
-    3: 20_000,
-}  # of a spaced scan, for loops and for the local map after them
+# weight of a scan in the running share of hits on what moves; share from which people may walk
+# along with the robot, and what was only just seen counts little
+_MOVING_RATE, _CROWDED = 0.3, 0.15
 _CHANGES_EVERY_NS = 10**9  # between two updates that tell what changed in the map
 
 
@@ -66,6 +65,9 @@ class LiveMapper:
             between two scans, the same to the bit every time.
         scratch: folder of the files in which all scans are kept for `save` and `finish`; None: the
             system's temporary folder.
+        max_scratch: bytes, about, that their beams may take, 13 each: beyond, every second one of
+            the scans that lie most densely is dropped, the oldest first; None: all are kept.
+        lag: s after which each scan is labelled once more, see `Update.hindsight`; None: it is not.
 
     Examples:
         >>> with stillmap.LiveMapper() as mapper:
@@ -82,15 +84,25 @@ class LiveMapper:
         mode: Mode = "localise",
         background: bool = False,
         scratch: str | os.PathLike[str] | None = None,
+        max_scratch: int | None = None,
+        lag: float | None = None,
     ) -> None:
+        _require_positive(max_scratch=max_scratch, lag=lag)
         self.options = to_options(options)
         self._place = None if place is None else PlaceTracker(KnownMap(place), mode)
         self._in_background = background
         self._scratch = None if scratch is None else Path(scratch)
+        self._max_scratch, self._hindsight = max_scratch, Hindsight(lag)
         self._T_odom_base: Float | None = None
-        self._path_begin = 0  # the first spaced scan in the frame of the map
         self._last_ns: int | None = None
         self._changes_due_ns = 0
+        self._path_begin = 0  # the first spaced scan in the frame of the map
+        # a robot that was carried while it maps; scans that were found later: first, last + 1, and
+        # their motion in the frame of the odometry by scans; the last scan that agreed with the map
+        self._carried: Relocalizer | None = None
+        self._moves = list[tuple[int, int, Float]]()
+        self._last_agreed = -1
+        self._moving = 0.0  # share of the hits, as the labels say a second later
         self._begin(2)
 
     def _begin(self, dimension: int) -> None:
@@ -104,12 +116,8 @@ class LiveMapper:
         self._labels = CausalLabels(D, slam.resolution, options.em)
         self._selector = BeamSelector(options.em.time_bin)
         self._movers = MoverTracker(D)
-        self._history = History(D, self._scratch)
-        self._closer: LoopClosing | None = None
-        self._T_map_local, self._drift = np.eye(D + 1), np.zeros((3, 3))
-        # of the spaced scans: in the frame of the odometry by scans; in the map, where corrected
-        self._spaced, self._corrected = list[Float](), np.zeros((0, D + 1, D + 1))
-        self._correction: MapCorrection | None = None
+        self._history = History(D, self._scratch, self._max_scratch)
+        self._frame = MapFrame(D, NoLoops(), self._in_background)
 
     def push(self, scan: Scan | ScanBeams, odometry: ArrayLike | None = None) -> Update:
         """Register a scan, label its beams, and add it to the map.
@@ -123,7 +131,7 @@ class LiveMapper:
             ValueError: names the argument, what was expected, and what it was.
             OSError: the disk of `scratch` is full.
         """
-        beams = scan if isinstance(scan, ScanBeams) else to_beams(scan)
+        beams = drop_cover(scan if isinstance(scan, ScanBeams) else to_beams(scan))
         self._require_next(beams)
         T_odom_base = self._to_matrix(odometry)
         increment = self._increment(T_odom_base)
@@ -131,23 +139,22 @@ class LiveMapper:
         hits = self._weigh(self._odometry.select(beams, prior), prior)
         found = self._odometry.register(beams, hits, prior, increment)  # M-step: (9)
         if found.is_carried:
-            self._movers.clear()
-        if found.is_carried and self._place is not None:
-            self._place.lose(len(self._history))
-            self._labels.clear()
-            self._path_begin = len(self._spaced)
-        pose, anchor = self._T_map_local @ found.T, len(self._spaced) - 1
-        deskewed = deskew(beams, found.twist)
+            self._lose()
+        elif not (found.is_contradicted or self._carried):
+            self._last_agreed = len(self._history)
+        deskewed, anchor = deskew(beams, found.twist), self._frame.last
         labelled = LabelledScan(self._observe(deskewed, hits, anchor), found.T)
-        self._labels.add(labelled.observation, pose)
+        pose = self._frame.T_map_local @ found.T
+        if not found.is_contradicted:
+            self._labels.add(labelled.observation, pose)
         p_static = self._labels.label(deskewed, pose)  # E-step: (8)
         self._movers.add(deskewed, found.T, p_static)
         self._history.append(beams, p_static, T_odom_base, pose, found.T, anchor)
+        self._hindsight.add(len(self._history) - 1, beams)
         self._T_odom_base, self._last_ns = T_odom_base, beams.stamp_ns
-        update = self._to_update(beams.stamp_ns, found, p_static, T_odom_base)
-        is_spaced = self._add_to_maps(deskewed, labelled, np.nan_to_num(p_static), found)
-        if is_spaced and self._place is not None and self._place.is_lost:
-            return self._localize(self._place, thin(hits), update, T_odom_base)
+        update = self._to_update(beams.stamp_ns, found, p_static)
+        if self._add_to_maps(deskewed, labelled, np.nan_to_num(p_static), found):
+            return self._find_robot(hits, update)
         return update
 
     def _observe(self, beams: ScanBeams, hits: Any, anchor: int) -> Observation:
@@ -157,23 +164,55 @@ class LiveMapper:
             margin = find_margins(beams, normals_of(beams, hits), self._selector.select(beams))
         return Observation(beams, margin, max(anchor, 0))
 
-    def _localize(
-        self, place: PlaceTracker, hits: PlanarHits, update: Update, T_odom_base: Float | None
-    ) -> Update:
-        """Search the robot in the known map; the update with its pose there, if it is found."""
-        T = place.localize(self._labels, hits, update.pose, len(self._history) - 1)
-        if T is None:
-            return update
-        self._odometry.enter(place.make_local_map(), T)
-        place.enter(self._labels, T)
+    def _lose(self) -> None:
+        """The robot was carried: the labels begin anew, until it is found."""
+        self._movers.clear()
+        self._path_begin = self._frame.last + 1
+        if self._place is not None:
+            self._place.lose(len(self._history))
+            self._labels.clear()
+        elif self._dimension == 3:
+            self._labels.clear()  # in 3D it is not searched
+        elif self._carried is not None:
+            self._carried.begin(self._labels)
+        else:
+            self._frame.finish_correction(self._labels, self._odometry)
+            left_behind = self._odometry.left_behind
+            self._carried = Relocalizer(self._labels, left_behind, self._frame.T_map_local)
+
+    def _find_robot(self, hits: Any, update: Update) -> Update:
+        """Search the robot if it is lost; the update with its pose there, if it is found."""
+        labels, frame = self._labels, self._frame
+        if self._carried is not None:  # in its own map
+            carried = self._carried
+            T = carried.localize(labels, thin(hits), update.pose)
+            if T is None:
+                return update
+            self._odometry.enter(carried.join(labels, self._odometry.local_map, T), T)
+            self._moves.append((self._last_agreed + 1, len(self._history), T))
+            frame.add_drift(carried.covariance)
+            self._carried, self._path_begin = None, 0
+            return self._move(update, T, frame.T_map_local @ T @ se2.inverse(frame.T_map_local))
+        if self._place is not None and self._place.is_lost:
+            place, last = self._place, len(self._history) - 1
+            T = place.localize(labels, thin(hits), update.pose, last)
+            if T is None:
+                return update
+            self._odometry.enter(place.make_local_map(), T)
+            place.enter(labels, T)
+            self._path_begin = frame.last + 1
+            return self._move(update, T, T)
+        return update
+
+    def _move(self, update: Update, T: Float, motion: Float) -> Update:
+        """The update of a robot that was found: the frame of the odometry by scans moved by T, the
+        pose by `motion` (3, 3)."""
         self._movers.move(T)
-        self._path_begin = len(self._spaced)
-        pose = T @ update.pose
-        T_map_odom = None if T_odom_base is None else pose @ se2.inverse(T_odom_base)
+        pose = motion @ update.pose
         doubts = tuple(doubt for doubt in update.doubts if doubt not in ("lost", "ambiguous"))
-        movers = self._movers.movers(self._T_map_local)
+        movers = self._movers.movers(self._frame.T_map_local)
         return dataclasses.replace(
-            update, pose=pose, T_map_odom=T_map_odom, doubts=doubts, movers=movers
+            update, pose=pose, T_map_odom=self._to_map_odom(pose), doubts=doubts, movers=movers
         )
 
     def label(self, scan: Scan | ScanBeams, number: int) -> NDArray[np.float32]:
@@ -185,35 +224,26 @@ class LiveMapper:
         """
         beams = scan if isinstance(scan, ScanBeams) else to_beams(scan)
         anchor, local = self._history.at(number)
-        beams = deskew(beams, self._history.twist_at(number))
-        pose = self._T_map_local @ local
-        if 0 <= anchor < len(self._corrected):
-            moved = self._corrected[anchor] @ se2.inverse(self._spaced[anchor])
-            pose = moved @ local
-        return self._labels.label(beams, pose)
+        for first, last, T in self._moves:
+            local = T @ local if first <= number < last else local
+        deskewed = deskew(beams, self._history.twist_at(number))
+        return self._labels.label(deskewed, self._frame.to_map(local, anchor))
 
     @property
     def poses(self) -> Float:
         """(T, D+1, D+1) T_map_base of all scans, as they are known now."""
-        answers = self._history.answers()
-        if not len(answers.poses):
-            return answers.poses
-        if self._place is not None:
-            return self._place.to_known(answers.poses)
-        # the scan after which each spaced one is the last: itself, but for the first
-        scans = np.searchsorted(answers.anchor, np.arange(len(self._spaced)) - 1, side="right") - 1
-        every, kept = np.unique(np.maximum(scans, 0), return_index=True)
-        corrected, last = self._spaced_poses()[kept], len(answers.local) - 1
-        if every[-1] != last:
-            every = np.append(every, last)
-            corrected = np.concatenate([corrected, (self._T_map_local @ answers.local[-1])[None]])
-        return local_map.propagate_corrections(answers.local, every, corrected)
+        given, local, anchor = self._history.poses()
+        if self._place is not None or not len(given):
+            return given if self._place is None else self._place.to_known(given)
+        for first, last, T in self._moves:
+            local[first:last] = T @ local[first:last]
+        return self._frame.to_map_all(local, anchor)
 
     @property
     def path(self) -> Float:
         """(S, D+1, D+1) T_map_base of spaced scans, as they are known now: quicker than `poses`.
-        In a known map only those since the robot was found or lost."""
-        return self._spaced_poses()[self._path_begin :]
+        Only those since the robot was found or lost."""
+        return self._frame.spaced_poses()[self._path_begin :]
 
     @property
     def map(self) -> GridMap:
@@ -230,6 +260,11 @@ class LiveMapper:
     def cells(self) -> CellProbabilities:
         """P(static and occupied) of the cells, in 3D voxels, in which beams ended."""
         return self._labels.known_cells()
+
+    @property
+    def resolution(self) -> float:
+        """m, edge of the cells in which `Update.changes` are, once a scan was pushed."""
+        return self._labels.resolution
 
     @property
     def objects(self) -> list[MovingObject]:
@@ -255,8 +290,10 @@ class LiveMapper:
 
     def snapshot(self) -> Snapshot:
         """All scans so far and what is known of them: to save them while more are pushed."""
-        recording, answers = self._history.recording(), self._history.answers()
-        return Snapshot(recording, self.poses, answers, self.options, self._scratch)
+        recording, answers = self._history.snapshot()
+        poses, place = self.poses[answers.number], self._place
+        extended = place.known if place is not None and place.extends else None
+        return Snapshot(recording, poses, answers, self.options, self._scratch, extended)
 
     def finish(self, progress: Progress = no_progress) -> BuiltResult:
         """The result of `stillmap.build` on all scans: poses, labels and map refined."""
@@ -267,8 +304,7 @@ class LiveMapper:
 
     def close(self) -> None:
         """Forget all scans, and end the process that closes loops, if there is one."""
-        if self._closer is not None:
-            self._closer.stop()
+        self._frame.stop()
         self._history.close()
 
     def __enter__(self) -> LiveMapper:
@@ -279,18 +315,18 @@ class LiveMapper:
 
     def _require_next(self, beams: ScanBeams) -> None:
         """Check a scan against those before; the first one begins mapping in its dimension."""
-        D, is_first = beams.dimension, self._last_ns is None
+        D = beams.dimension
         if self._place is not None and D == 3:
             raise ValueError("scan: expected a planar one: localization is planar")
-        if is_first and self._dimension != D:
-            self._begin(D)
-        if self._dimension != D:
+        if self._last_ns is None:
+            if self._dimension != D:
+                self._begin(D)
+            self._frame = MapFrame(D, self._make_closer(), self._in_background)
+        elif self._dimension != D:
             raise ValueError(f"scan: expected {self._dimension}D as before, got {D}D")
-        if self._last_ns is not None and beams.stamp_ns < self._last_ns:
+        elif beams.stamp_ns < self._last_ns:
             late = 1e-9 * (self._last_ns - beams.stamp_ns)
             raise ValueError(f"stamp: expected none before the last scan, got {late:.6f} s earlier")
-        if self._closer is None:
-            self._closer = self._make_closer()
 
     def _make_closer(self) -> LoopClosing:
         if self._place is not None or not self._slam.loop_closure:
@@ -303,7 +339,7 @@ class LiveMapper:
     def _weigh(self, hits: Any, prior: Any) -> Any:
         """The hits with weights P(static): the E-step at the predicted pose."""
         points, T_local_base = self._odometry.end_points(hits, prior)
-        weights = self._labels.label_ends(points, self._T_map_local @ T_local_base)
+        weights = self._labels.label_ends(points, self._frame.T_map_local @ T_local_base)
         return dataclasses.replace(hits, weights=weights)
 
     def _to_matrix(self, odometry: ArrayLike | None) -> Float | None:
@@ -319,6 +355,10 @@ class LiveMapper:
         out: Float = se2.inverse(self._T_odom_base) @ T_odom_base
         return out
 
+    def _to_map_odom(self, pose: Float) -> Float | None:
+        """(D+1, D+1) T_map_odom at the pose of the last scan."""
+        return None if self._T_odom_base is None else pose @ se2.inverse(self._T_odom_base)
+
     def _add_to_maps(
         self,
         beams: ScanBeams,
@@ -326,47 +366,27 @@ class LiveMapper:
         e: NDArray[np.float32],
         found: Registration,
     ) -> bool:
-        """Add a spaced scan to the local map and to the pose graph, and go on correcting the map;
-        True if the scan is spaced."""
-        assert self._closer is not None
-        self._drift = self._drift + found.drift
-        added = self._odometry.add(beams, e)
+        """Add a scan to the local map and, if it is spaced, to the pose graph, and go on correcting
+        the map; True if the scan is spaced."""
+        self._frame.add_drift(found.drift)
+        # without odometry nothing else says how the robot moves
+        is_doubted = found.has_odometry and self._moving > _CROWDED
+        recent = self._labels.doubt(e) if is_doubted else e
+        added = self._odometry.add(beams, e, recent, self._label_again)
+        if self._carried is not None:
+            return added is not None
         if added is not None:
-            self._spaced.append(added.T_map_base)
-            kept = thin_scan(added, _MAX_KEPT_BEAMS[self._dimension])
-            self._closer.add(kept, found.explained, self._drift)
-            self._drift = np.zeros((3, 3))
-        if self._correction is not None:
-            self._correction.note_labelled(labelled)
-            if added is not None:
-                self._correction.note_added(added)
-        elif (correction := self._closer.poll()) is not None:
-            spaced, poses = np.array(self._spaced), self._spaced_poses()
-            new = MapCorrection(correction, self._labels, spaced, poses)
-            self._correction = None if new.is_small else new
-        self._go_on_correcting()
+            self._frame.add(added, found)
+        self._frame.correct(labelled, added, self._labels, self._odometry)
         return added is not None
 
-    def _go_on_correcting(self) -> None:
-        """A part of the work on a correction; all of it where nobody waits."""
-        if self._correction is None:
-            return
-        is_done = self._correction.step(self._labels)
-        while not (is_done or self._in_background):
-            is_done = self._correction.step(self._labels)
-        if is_done:
-            self._correction.finish(self._labels)
-            if self._correction.local_map is not None:
-                self._odometry.local_map = self._correction.local_map
-            self._T_map_local = self._correction.T_map_local
-            self._corrected = self._correction.poses
-            self._correction = None
-
-    def _spaced_poses(self) -> Float:
-        """(S, D+1, D+1) T_map_base of the spaced scans."""
-        since = np.array(self._spaced[len(self._corrected) :])
-        since = since.reshape(-1, *self._T_map_local.shape)
-        return np.concatenate([self._corrected, self._T_map_local @ since])
+    def _label_again(self, scan: MappedScan) -> NDArray[np.float32]:
+        """(N,) P(static) of a scan of the local map by what is known now; 0: unusable."""
+        T, hit = self._frame.T_map_local @ scan.T_map_base, scan.beams.hit
+        e = np.nan_to_num(self._labels.label(scan.beams, T))
+        if hit.any():
+            self._moving += _MOVING_RATE * (float((e[hit] < 0.5).mean()) - self._moving)
+        return e
 
     def _take_changes(self, stamp_ns: int) -> list[MapChange]:
         """The parts of the map that changed, once a second."""
@@ -376,29 +396,31 @@ class LiveMapper:
         return self._labels.take_changes()
 
     def _to_update(
-        self,
-        stamp_ns: int,
-        found: Registration,
-        p_static: NDArray[np.float32],
-        T_odom_base: Float | None,
+        self, stamp_ns: int, found: Registration, p_static: NDArray[np.float32]
     ) -> Update:
+        place, carried = self._place, self._carried
         doubts = {
             "slip": found.is_slipping,
             "blind": found.is_blind,
             "carried": found.is_carried,
-            "lost": self._place is not None and self._place.is_lost,
-            "ambiguous": self._place is not None and self._place.is_ambiguous,
+            "contradicted": found.is_contradicted,
+            "lost": carried is not None or (place is not None and place.is_lost),
+            "ambiguous": any(one is not None and one.is_ambiguous for one in (carried, place)),
         }
-        pose = self._T_map_local @ found.T
+        pose = self._frame.T_map_local @ found.T
         return Update(
             pose,
             found.covariance,
             p_static,
-            None if T_odom_base is None else pose @ se2.inverse(T_odom_base),
+            self._to_map_odom(pose),
             tuple(name for name, is_so in doubts.items() if is_so),
             self._take_changes(stamp_ns),
-            self._movers.movers(self._T_map_local),
+            self._movers.movers(self._frame.T_map_local),
+            [LaterLabels(n, self.label(one, n)) for n, one in self._hindsight.take(stamp_ns)],
         )
 
 
-LoopClosing = LoopCloser | LiveSweepLoopCloser | LoopProcess | NoLoops
+def _require_positive(**numbers: float | None) -> None:
+    for name, number in numbers.items():
+        if number is not None and not 0.0 < number < np.inf:
+            raise ValueError(f"{name}: expected a positive number, got {number}")

@@ -23,11 +23,16 @@ class PlaceTracker:
     Args:
         known: the map.
         mode: whether the map stays as it is, or is extended by what is seen.
+
+    Attributes:
+        known, extends: the map, and whether it is extended.
+        is_lost: the robot is not found in it yet.
+        is_ambiguous: several places fit about as well.
     """
 
     def __init__(self, known: KnownMap, mode: Mode) -> None:
         self.is_lost, self.is_ambiguous = True, False
-        self._known, self._extends = known, mode == "extend"
+        self.known, self.extends = known, mode == "extend"
         self._localizer = GlobalLocalizer(known)
         self._lost_since = 0
         self._moves: list[tuple[int, int, Float]] = []  # first scan, last + 1, and their motion
@@ -55,13 +60,13 @@ class PlaceTracker:
 
     def make_local_map(self) -> KnownLocalMap:
         """The map that scans are matched against from now on."""
-        return KnownLocalMap(self._known, self._extends)
+        return KnownLocalMap(self.known, self.extends)
 
     def enter(self, labels: CausalLabels, T: Float) -> None:
         """Let labels go on from the known map, with what was seen since the robot was lost."""
         known, seen = labels.filter.sibling(), labels.filter
         assert isinstance(known, _core.OccupancyFilter2D)
-        self._known.prime(known)
+        self.known.prime(known)
         tags = labels.tags
         take_over(known, seen, np.tile(T, (tags, 1, 1)), 0, seen.block_count)
         labels.filter = known

@@ -2,8 +2,9 @@
 
 import resource
 import sys
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,7 @@ from stillmap.core.profiling import Progress, no_progress
 from stillmap.core.recording import Recording
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.scan import ScanBeams
+from stillmap.live.update import Update
 
 _MAXRSS_UNIT = 1 if sys.platform == "darwin" else 1024  # bytes
 
@@ -51,6 +53,8 @@ def replay(
     mapper: LiveMapper,
     progress: Progress = no_progress,
     rate: float | None = None,
+    show: Callable[[LiveMapper, ScanBeams, Update], None] | None = None,
+    stop: threading.Event | None = None,
 ) -> Latency:
     """Push the scans of a recording.
 
@@ -60,7 +64,10 @@ def replay(
         progress: called with the number of scans done and their total.
         rate: times the speed of the recording: a latency counts from when the scan is due, and a
             scan is dropped where the next one is due already. None: one after another.
+        show: called with each scan and its answer.
+        stop: ends it early.
     """
+    stop = stop or threading.Event()
     seconds, dropped, begin = list[float](), 0, time.perf_counter()
     due = np.zeros(recording.n_scans)
     if rate is not None:
@@ -70,11 +77,15 @@ def replay(
             if t + 1 < len(due) and time.perf_counter() - begin > due[t + 1]:
                 dropped += 1
                 continue
-            time.sleep(max(begin + float(due[t]) - time.perf_counter(), 0.0))
+            stop.wait(max(begin + float(due[t]) - time.perf_counter(), 0.0))
+        if stop.is_set():
+            break
         odometry = None if recording.T_odom_base is None else recording.T_odom_base[t]
         start = time.perf_counter() if rate is None else begin + float(due[t])
-        mapper.push(beams, odometry)
+        update = mapper.push(beams, odometry)
         seconds.append(time.perf_counter() - start)
+        if show is not None:
+            show(mapper, beams, update)
         progress("mapping", 0, t + 1, recording.n_scans)
     used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * _MAXRSS_UNIT
     return Latency(np.array(seconds), dropped, used)

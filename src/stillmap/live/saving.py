@@ -2,7 +2,6 @@
 
 import os
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,8 @@ from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io.trajectory import write_tum
 from stillmap.live.history import Answers
+from stillmap.live.known_map import KnownMap
+from stillmap.live.map_extension import write_extended
 from stillmap.pipeline.options import Options
 from stillmap.pipeline.result import MappingResult, map_recording
 from stillmap.results.result import BuiltResult
@@ -32,6 +33,7 @@ class Snapshot(ShortRepr):
         answers: what was answered at the time.
         options: see Options.
         scratch: folder of temporary files; None: the system's.
+        extended: the known map that is extended; None: there is none.
     """
 
     recording: Recording
@@ -39,6 +41,7 @@ class Snapshot(ShortRepr):
     answers: Answers
     options: Options
     scratch: Path | None
+    extended: KnownMap | None = None
 
     def build(self, progress: Progress = no_progress) -> BuiltResult:
         """Labels, map and objects at these poses."""
@@ -59,17 +62,32 @@ class Snapshot(ShortRepr):
         Raises:
             InputError: the folder is taken or cannot be written to.
         """
-        save_live(self.build(progress), self.answers, Path(path), overwrite)
+        result = self.build(progress)
+        save_live(result, self.answers, Path(path), overwrite, extended=self.extended)
 
 
-def save_live(result: MappingResult, answers: Answers, path: Path, overwrite: bool = False) -> None:
-    """Write a result, and `live/trajectory.tum` and `live/beams/p_static.npy` with the answers.
+def save_live(
+    result: MappingResult,
+    answers: Answers,
+    path: Path,
+    overwrite: bool = False,
+    *,
+    extended: KnownMap | None = None,
+) -> None:
+    """Write a result, and `live/trajectory.tum` and `live/beams/p_static.npy` with the answers;
+    with a known map, the map is that one with what was seen.
 
     Raises:
         InputError: `path` is taken or cannot be written to.
     """
-    stamps = result.recording.stamp_ns
-    save(result, path, overwrite, write_more=partial(_write_answers, answers, stamps))
+
+    def write_more(folder: Path) -> None:
+        _write_answers(answers, result.recording.stamp_ns, folder)
+        if extended is not None:
+            mode = result.options.output.map_mode
+            write_extended(folder, extended.grid, extended.hits, result.map, mode)
+
+    save(result, path, overwrite, write_more=write_more)
 
 
 def _write_answers(answers: Answers, stamp_ns: NDArray[np.int64], folder: Path) -> None:

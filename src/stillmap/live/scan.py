@@ -18,6 +18,10 @@ from stillmap.preprocessing.options import MAX_PLAUSIBLE_RANGE
 
 Float = NDArray[np.float64]
 
+# m within which nearly all readings of a covered sensor lie: what surrounds it so closely moves
+# with the robot
+_COVER_DISTANCE, _COVER_SHARE = 0.3, 0.9
+
 
 @dataclass(frozen=True, eq=False)
 class Scan(ShortRepr):
@@ -98,6 +102,16 @@ def to_beams(scan: Scan) -> ScanBeams:
         require_length("beam_times", len(times), len(points), "the beams")
     pose = _sensor_matrix(scan.sensor_pose, D)
     return ScanBeams(stamp_ns, points, hit, pose, scan.sensor, times)
+
+
+def drop_cover(beams: ScanBeams) -> ScanBeams:
+    """The beams of a scan; none of them usable if something covers the sensor."""
+    usable = finite_rows(beams.points)
+    near = np.linalg.norm(beams.points[usable], axis=1) < _COVER_DISTANCE
+    if np.count_nonzero(near) < max(_COVER_SHARE * len(near), 1.0):
+        return beams
+    nothing = np.full_like(beams.points, np.nan)
+    return replace(beams, points=nothing, hit=np.zeros_like(beams.hit))
 
 
 def take_beams(beams: ScanBeams, kept: NDArray[np.intp] | slice) -> ScanBeams:

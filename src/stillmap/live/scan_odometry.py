@@ -1,15 +1,17 @@
 """Causal scan matching in 2D: each scan is matched (9) against a map of the scans before it."""
 
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.live.front_end import Registration
-from stillmap.live.local_map import LocalMap, MappedScan, MatchMap
+from stillmap.live.local_map import Labeller, LocalMap, MappedScan, MatchMap
 from stillmap.live.scan import ScanBeams, deskew
 from stillmap.live.scan_hits import select_hits, thin
+from stillmap.live.wall_directions import WallDirections, correct_heading
 from stillmap.slam import kidnapping, motion_model
 from stillmap.slam.deskew import MAX_SPEED, MAX_TURN_RATE
 from stillmap.slam.kidnapping import Evidence
@@ -28,14 +30,19 @@ from stillmap.slam.scan_matching import (
 
 Float = NDArray[np.float64]
 
+_LABELLED_AFTER_NS = 10**9  # after which scans of the local map are labelled again
 _MAX_TRAVEL = 25.0  # m after which scans leave the local map
 _EXPLAINED_RATE = 0.1  # weight of one scan in the running average of the explained share
 _LEAP = 1.0  # m between two scans, and times the speed below, beyond which odometry has leaped
+_DISTRUST_NS = 10**9  # after a leap, in which smaller ones are none of odometry either
 _MAX_SPEED = 3.0  # m/s of robots
 _MAX_STAMPS = 500  # of scans that a slip may change in hindsight
 _UNKNOWN = np.full((3, 3), np.inf)  # an increment that is not small
-# contradicting scans for each one that agrees, after which the robot was carried, and so many
+# scans that contradict the map more than others agree, after which the robot was carried; at most
 _CARRIED_AFTER, _MAX_STRAY = 20.0, 30.0
+# of them that a scan outweighs which agrees, and one that says nothing; share of the usual
+# explained one below which nothing of a scan is in the local map, though the robot moved on
+_AGREEMENT, _NO_EVIDENCE, _NOTHING = 4.0, 0.25, 0.15
 
 
 class _LatestIncrement:
@@ -57,12 +64,16 @@ class ScanOdometry:
     def __init__(self, options: SlamOptions) -> None:
         self.options = options
         self.local_map: MatchMap = LocalMap(options.resolution)
+        self.left_behind: MatchMap = self.local_map  # the one before the robot was carried
         self.travelled = 0.0
         self._pose, self._before = np.eye(3), np.eye(3)
         self._stamp_ns, self._seconds = 0, 0.0
         self._velocity_noise, self._odometry_noise = VelocityNoise(), OdometryNoise()
         self._usual: dict[str | int, float] = {}
         self._contradictions = 0.0
+        self._leaped_ns: int | None = None
+        self._blind = np.zeros((3, 3))  # covariance since the last scan that met anything
+        self._walls: WallDirections | None = WallDirections()
         self._is_first = True
         self._increment = _LatestIncrement()
         self._slip = SlipDetector(self._increment)
@@ -80,7 +91,9 @@ class ScanOdometry:
             return motion_model.gaussian_prior(self._pose, 1e-3, 1e-3)
         guess, self._increment.value = self._guess(), increment
         is_slipping = self._slip.is_slipping(self._count, self._pose, guess)
-        if increment is not None and not is_slipping and self._is_plausible(increment, beams):
+        if increment is not None and not self._is_plausible(increment, beams):
+            self._leaped_ns = beams.stamp_ns
+        if increment is not None and not is_slipping and not self._has_leaped(beams):
             return motion_model.odometry_prior(self._pose, increment, self.options.odometry)
         return guess
 
@@ -109,21 +122,38 @@ class ScanOdometry:
         match, is_slipping, is_carried = self._match(beams, scan, prior, increment, usual)
         if not self._is_first and not is_carried:
             match, slips = self._detect_slip(guess, scan, match)
-            is_slipping = is_slipping or slips
+            has_leaped = increment is not None and self._has_leaped(beams)
+            is_slipping = is_slipping or slips or has_leaped
+        if not is_carried:
+            match = self._correct_heading(scan, match)
         is_blind = not len(scan.points) or float(scan.weights.sum()) <= 0.0
         learned = self._learned_prior(prior, increment) or prior
         drift = motion_model.blind_drift(learned, match.covariance)
-        self._learn(beams, learned, match, usual)
+        if not (is_blind or self._contradictions):
+            self._learn(beams, learned, match, usual)
         self._advance(beams, match.T_map_base)
-        doubts = is_slipping, is_blind, is_carried
-        T, covariance = match.T_map_base, match.covariance
+        self._blind = self._blind + drift if is_blind else np.zeros((3, 3))
+        doubts = is_slipping, is_blind, is_carried, self._contradictions > 0.0, prior.is_odometry
+        T, covariance = match.T_map_base, match.covariance + self._blind
         return Registration(T, covariance, match.explained, drift, twist, *doubts)
 
-    def add(self, beams: ScanBeams, e: NDArray[np.float32]) -> MappedScan | None:
-        """Add the last scan to the local map, with P(static) e (N,), unless it is too close to the
-        one before; the scan if it was added."""
+    def add(
+        self, beams: ScanBeams, e: NDArray[np.float32], recent: NDArray[np.float32], label: Labeller
+    ) -> MappedScan | None:
+        """Add the last scan to the local map, unless it contradicts it or is too close to the one
+        before; the scan if it was added.
+
+        Args:
+            beams: of the scan.
+            e: (N,) P(static).
+            recent: (N,) the same with the prior of what was only just seen, for the local map.
+            label: labels an earlier scan again, after a second.
+        """
+        if self._contradictions > 0.0:
+            return None
         scan = MappedScan(beams, e, self._pose, self.travelled)
-        added = self.local_map.add(scan)
+        added = self.local_map.add(replace(scan, e=recent))
+        self.local_map.relabel(beams.stamp_ns - _LABELLED_AFTER_NS, label)
         self.local_map.remove_before(self.travelled - _MAX_TRAVEL)
         return scan if added else None
 
@@ -132,6 +162,25 @@ class ScanOdometry:
         self.local_map = local_map
         self._pose, self._before = T @ self._pose, T @ self._before
         self._contradictions = 0.0
+        self._walls = None  # that map has the heading
+
+    def correct(self, local_map: MatchMap, motion: Float) -> None:
+        """Go on with a local map made anew, after the map has moved (3, 3)."""
+        self.local_map = local_map
+        if self._walls is not None:
+            self._walls.rotate(-float(se2.parameters(motion)[2]))
+
+    def _correct_heading(self, scan: Scan, match: ScanMatch) -> ScanMatch:
+        """The match with the heading that the walls so far suggest, too."""
+        if self._walls is None:
+            return match
+        T = match.T_map_base
+        metres = 0.0 if self._is_first else float(np.hypot(*(T[:2, 2] - self._pose[:2, 2])))
+        offset = self._walls.measure(scan, T)
+        if offset is not None:
+            T = correct_heading(T, match.covariance, offset)
+        self._walls.add(scan, T, metres)
+        return replace(match, T_map_base=T)
 
     def _match(
         self,
@@ -147,14 +196,20 @@ class ScanOdometry:
         grid = self.local_map.grid
         match = match_scan(grid, scan, prior, usual, self._learned_prior(prior, increment))
         if not is_poor(match, usual):
-            self._contradictions = 0.0
+            self._weigh_evidence(Evidence.AGREES)
             return match, match.contradicts_odometry, False
         other = self._guess() if prior.is_odometry else None
         wider = widen_match(grid, scan, prior, other, match, usual)
-        if wider.widened and self._is_reachable(beams, wider.T_map_base):
+        # after a scan that contradicted the map, a poor one is where a place only looks alike
+        is_sure = not (self._contradictions and is_poor(wider, usual))
+        if wider.widened and is_sure and self._is_reachable(beams, wider.T_map_base):
             is_slipping = prior.is_odometry and is_inconsistent(prior, wider.T_map_base)
             return wider, is_slipping, False
-        if self._is_carried(kidnapping.judge_scan(grid, scan, match, usual)):
+        evidence = kidnapping.judge_scan(grid, scan, match, usual)
+        if match.explained < _NOTHING * usual:
+            evidence = Evidence.CONTRADICTS
+        self._weigh_evidence(evidence)
+        if self._contradictions >= _CARRIED_AFTER:
             self._start_anew()
             return accept_prior(prior), False, True
         return match, match.contradicts_odometry, False
@@ -174,18 +229,19 @@ class ScanOdometry:
         self._pose = [slip.before, *(m.T_map_base for m in slip.matches)][-2]
         return slip.matches[-1], True
 
-    def _is_carried(self, evidence: Evidence) -> bool:
-        """True when so many scans contradicted the local map, and hardly any agreed."""
+    def _weigh_evidence(self, evidence: Evidence) -> None:
+        """Count scans that contradict the local map, less those that agree."""
         if evidence is Evidence.CONTRADICTS:
             self._contradictions = min(self._contradictions + 1.0, _MAX_STRAY)
-        elif evidence is Evidence.AGREES:
-            self._contradictions = max(self._contradictions - 4.0, 0.0)
-        return self._contradictions >= _CARRIED_AFTER
+        else:
+            less = _AGREEMENT if evidence is Evidence.AGREES else _NO_EVIDENCE
+            self._contradictions = max(self._contradictions - less, 0.0)
 
     def _start_anew(self) -> None:
-        self.local_map = LocalMap(self.options.resolution)
+        self.left_behind, self.local_map = self.local_map, LocalMap(self.options.resolution)
         self._usual.clear()
         self._contradictions = 0.0
+        self._walls = WallDirections()
         self._slip.reset()
 
     def _learned_prior(self, prior: MotionPrior, increment: Float | None) -> MotionPrior | None:
@@ -203,6 +259,10 @@ class ScanOdometry:
         seconds = 1e-9 * (beams.stamp_ns - self._stamp_ns)
         metres = float(np.hypot(*increment[:2, 2]))
         return metres <= max(_LEAP, _MAX_SPEED * seconds)
+
+    def _has_leaped(self, beams: ScanBeams) -> bool:
+        """True if odometry has leaped lately."""
+        return self._leaped_ns is not None and beams.stamp_ns < self._leaped_ns + _DISTRUST_NS
 
     def _twist_to(self, T: Float, stamp_ns: int) -> Float:
         """(3,) m/s and rad/s from the last pose to one; 0 for a leap."""

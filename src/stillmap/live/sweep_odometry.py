@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 import stillmap._core as _core
 from stillmap.core import se2, se3
 from stillmap.live.front_end import Registration
-from stillmap.live.local_map import MappedScan
+from stillmap.live.local_map import Labeller, MappedScan
 from stillmap.live.scan import ScanBeams, take_beams
 from stillmap.slam import constant_velocity, lidar_odometry
 from stillmap.slam.constant_velocity import State
@@ -20,8 +20,10 @@ Float = NDArray[np.float64]
 # sweeps from which the motion during the first one is found; m/s and rad/s of it that matter
 _FIRST_SWEEPS, _MIN_MOTION = 5, 0.05
 _EXPLAINED_RATE = 0.1  # weight of one sweep in the running average of the explained share
-_POOR_SHARE = 0.5  # of the usual explained share, below which a sweep contradicts the local map
-_CARRIED_AFTER = 20  # sweeps that contradict the local map, without one that agrees
+# of the usual explained share, below which a sweep contradicts the local map: it is not added, for
+# it would make the map agree with those that follow
+_POOR_SHARE = 0.6
+_CARRIED_AFTER = 5  # sweeps in a row that contradict the local map
 
 
 class SweepOdometry:
@@ -33,7 +35,7 @@ class SweepOdometry:
     """
 
     def __init__(self, options: SlamOptions, threads: int) -> None:
-        self.local_map = lidar_odometry.make_local_map()
+        self.local_map = self.left_behind = lidar_odometry.make_local_map()
         self.travelled = 0.0
         self._options, self._threads = options, threads
         self._state = lidar_odometry.initial_state()
@@ -101,16 +103,25 @@ class SweepOdometry:
             self._is_slipping,
             is_blind,
             is_carried,
+            self._contradictions > 0,
         )
 
-    def add(self, beams: ScanBeams, e: NDArray[np.float32]) -> MappedScan | None:
-        """Add the last sweep to the local map, with P(static) e (N,); the sweep if it is a
+    def add(
+        self,
+        beams: ScanBeams,
+        e: NDArray[np.float32],
+        _recent: NDArray[np.float32],
+        _label: Labeller,
+    ) -> MappedScan | None:
+        """Add the last sweep to the local map, unless it contradicts it; the sweep if it is a
         keyframe.
 
         Args:
             beams: as if taken at the stamp.
-            e: of them.
+            e: (N,) P(static).
         """
+        if self._contradictions:
+            return None
         kept, state = take_beams(beams, self._kept), self._state
         T, weights = kept.T_base_sensor, e[self._kept]
         in_base = (kept.points @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
@@ -129,6 +140,9 @@ class SweepOdometry:
         self.local_map = local_map
         state = self._state
         self._state = State(T @ state.T_map_base, state.twist, state.covariance)
+
+    def correct(self, _local_map: None, _motion: Float) -> None:
+        """The local map stays as it is: it holds what is near, not what loops tie to it."""
 
     def _advance(self, state: State, stamp_ns: int) -> None:
         step = se2.inverse(self._state.T_map_base) @ state.T_map_base
@@ -151,7 +165,7 @@ class SweepOdometry:
         return self._contradictions >= _CARRIED_AFTER
 
     def _start_anew(self) -> None:
-        self.local_map = lidar_odometry.make_local_map()
+        self.left_behind, self.local_map = self.local_map, lidar_odometry.make_local_map()
         self._usual, self._contradictions = 0.0, 0
 
     def _note_first(self, stamp_ns: int, hits: Sweep) -> None:

@@ -1,15 +1,29 @@
 """Result of one scan: pose, labels, doubts, changed map tiles."""
 
 from dataclasses import dataclass, field
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.short_repr import ShortRepr
 from stillmap.live.causal_labels import MapChange
+from stillmap.live.hindsight import LaterLabels
 from stillmap.live.movers import Mover
 
 Float = NDArray[np.float64]
+
+# for people
+DOUBTS = MappingProxyType(
+    {
+        "slip": "odometry disagrees with the scans",
+        "blind": "no beam meets anything",
+        "carried": "the scans contradict the map",
+        "contradicted": "the last scans contradict the map",
+        "lost": "the pose in the map is not known",
+        "ambiguous": "several places in the map fit",
+    }
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,10 +36,12 @@ class Update(ShortRepr):
         p_static: (N,) float32 of the beams, from what is known so far; NaN: unusable.
         T_map_odom: (D+1, D+1); None: without odometry.
         doubts: any of "slip" (odometry disagrees with the scans), "blind" (no beam met anything
-            that the map knows), "carried" (the scans contradict the map), "lost" (the pose is none
-            in the known map), "ambiguous" (several places in it fit about as well).
+            that the map knows), "contradicted" (the last scans contradict the map: they are not
+            added to it), "carried" (so many do that the robot was carried), "lost" (the pose is
+            none in the map), "ambiguous" (several places in it fit about as well).
         changes: parts of the map that changed since the last update.
         movers: what moves now, as far as it has been seen to.
+        hindsight: earlier scans that are labelled once more, see `LiveMapper(lag=)`.
     """
 
     pose: Float
@@ -35,3 +51,4 @@ class Update(ShortRepr):
     doubts: tuple[str, ...] = ()
     changes: list[MapChange] = field(default_factory=list)
     movers: list[Mover] = field(default_factory=list)
+    hindsight: list[LaterLabels] = field(default_factory=list)

@@ -62,7 +62,7 @@ class _Search:
     def __init__(self, place: SurfaceMap, session: SurfaceMap, free_weight: float) -> None:
         from scipy import fft, ndimage  # slow to load
 
-        self._fft, self._filter = fft, ndimage.maximum_filter
+        self._fft = fft
         self._place, self._session = place, session
         self.middle = middle_of(session)
         offset = session.surface - self.middle
@@ -74,14 +74,13 @@ class _Search:
         self._offset = offset
         field = _pool(_make_field(place, squares, free_weight), squares)
         own = _make_field(session, squares, CONFLICT_WEIGHT)
-        self._field = ndimage.uniform_filter(own, squares)
+        self._field = np.pad(ndimage.uniform_filter(own, squares), 1)
         self._low = place.low * place.edge
         counts = _count((place.surface - self._low) / self.cell, field.shape)
         self._shape = tuple(fft.next_fast_len(n + 2 * self._half, real=True) for n in field.shape)
         self._inside = field.shape
         self._places = fft.rfft2(field, self._shape), fft.rfft2(counts, self._shape)
-        axis = (np.arange(2 * self._half) - self._half + 0.5) * self.cell
-        self._centres = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
+        self._axis = (np.arange(2 * self._half) - self._half + 0.5) * self.cell
 
     def _choose_cells(self) -> tuple[int, int]:
         """Squares along a cell of the search, and cells from the session's middle to its rim."""
@@ -96,16 +95,14 @@ class _Search:
     def find_optima(self, heading: float) -> list[_Optimum]:
         """The best positions under a heading."""
         rotated = self._offset @ _rotation(heading).T
-        counts = _count(rotated / self.cell + self._half, self._centres.shape[:2])
+        counts = _count(rotated / self.cell + self._half, (2 * self._half, 2 * self._half))
         field = self._rotate_field(heading)
         rfft2 = self._fft.rfft2
         of_place, of_counts = self._places
         product = of_place * np.conj(rfft2(counts, self._shape))
         product += of_counts * np.conj(rfft2(field, self._shape))
         score = self._fft.irfft2(product, self._shape)
-        is_optimum = score >= self._filter(score, 5, mode="wrap")
-        at = np.flatnonzero(is_optimum & (score > 0.0))
-        at = at[np.argsort(-score.ravel()[at], kind="stable")[:_PER_HEADING]]
+        at = _find_maxima(score, _PER_HEADING)
         cells = np.stack(np.unravel_index(at, self._shape), axis=1)
         cells -= np.where(cells >= self._inside, self._shape, 0)  # shifts to the other side
         xy = (cells + self._half) * self.cell + self._low
@@ -117,12 +114,19 @@ class _Search:
 
     def _rotate_field(self, heading: float) -> Raster:
         """The session's field on cells about its middle; 0 where nothing is known."""
-        points = self._centres @ _rotation(heading) + self.middle
-        at = np.floor(points / self._session.edge).astype(np.int64) - self._session.low
-        inside = ((at >= 0) & (at < self._field.shape)).all(axis=-1)
-        out = np.zeros(inside.shape, np.float32)
-        x, y = at[inside].T
-        out[inside] = self._field[x, y]
+        c, s = float(np.cos(heading)), float(np.sin(heading))
+        edge, (low_x, low_y) = self._session.edge, (self._session.low - 1).tolist()
+        x, y = self._axis * (c / edge), self._axis * (s / edge)
+        mx, my = (self.middle / edge).tolist()
+        # squares of the ring around the field are unknown, as all beyond it
+        rows = np.floor(x[:, None] + (y + (mx - low_x))).astype(np.int32)
+        columns = np.floor(x + (my - low_y) - y[:, None]).astype(np.int32)
+        height, width = self._field.shape
+        np.clip(rows, 0, height - 1, out=rows)
+        np.clip(columns, 0, width - 1, out=columns)
+        rows *= width
+        rows += columns
+        out: Raster = self._field.ravel().take(rows)
         return out
 
     def to_alignment(self, one: _Optimum) -> Float:
@@ -130,6 +134,25 @@ class _Search:
         back = se2.matrix(-self.middle[0], -self.middle[1], 0.0)
         out: Float = se2.matrix(one.x, one.y, one.heading) @ back
         return out
+
+
+def _find_maxima(score: Raster, most: int) -> NDArray[np.intp]:
+    """The highest positive values that none within two cells exceeds, the highest first: their
+    flat indices. The raster goes on at its other side."""
+    values, (X, Y) = score.ravel(), score.shape
+    around = np.arange(-2, 3)
+    for kept in (256, 4096, values.size):  # nearly always among the highest ones, which are few
+        n = min(kept, values.size)
+        limit = np.partition(values, values.size - n)[values.size - n]
+        at = np.flatnonzero((values >= limit) & (values > 0.0))
+        x, y = np.divmod(at, Y)
+        rows = (x[:, None] + around) % X * Y
+        near = rows[:, :, None] + ((y[:, None] + around) % Y)[:, None, :]
+        found = at[values[at] >= values[near].max(axis=(1, 2))]
+        if len(found) >= most or limit <= 0.0:
+            break
+    out: NDArray[np.intp] = found[np.argsort(-values[found], kind="stable")[:most]]
+    return out
 
 
 def middle_of(session: SurfaceMap) -> Float:

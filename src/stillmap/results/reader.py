@@ -43,8 +43,8 @@ class Grid(GridMap):
         T_grid_map = se2.inverse(se2.matrix(*self.origin))
         return np.floor(moved(T_grid_map, points) / self.resolution).astype(np.int64)[:, ::-1]
 
-    def centres(self, cells: NDArray[np.integer]) -> Float:
-        """(N, 2) centres in the map frame of (N, 2) cells, row and column."""
+    def centres(self, cells: NDArray[np.integer | np.floating]) -> Float:
+        """(N, 2) centres in the map frame of (N, 2) cells, row and column, or of parts of them."""
         return moved(se2.matrix(*self.origin), (cells[:, ::-1] + np.float64(0.5)) * self.resolution)
 
 
@@ -99,6 +99,16 @@ def read_grid(result: Path) -> Grid:
             hint="scores are for maps in the plane",
         )
     return Grid(p_occupied, origin, resolution)
+
+
+def read_hit_sums(result: Path) -> NDArray[np.floating[Any]]:
+    """`alpha` of the map that `read_grid` reads: (H, W) sums of hits on what stands.
+
+    Raises:
+        InputError: it is missing or damaged.
+    """
+    alpha: NDArray[np.floating[Any]] = _read_layer(_find_map(result) / "map.npz", "alpha")[0]
+    return alpha
 
 
 class Crossings(NamedTuple):

@@ -83,7 +83,8 @@ class SweepFilter : public FilterMap<3, SurfaceCell> {
   }
 
  private:
-  static constexpr float kReliability = 0.9f;     // of a miss in a cell that fills its pixel
+  static constexpr float kReliability = 0.9f;  // of a miss where surface fills its pixel
+  static constexpr float kExtent = 1.4f;       // cells that the surface around a cell has at least
   static constexpr float kMinReliability = 0.1f;  // of a miss that counts
   static constexpr float kMargin = 1.5f;          // cells before the end that are not free
 
@@ -109,8 +110,8 @@ class SweepFilter : public FilterMap<3, SurfaceCell> {
     const float distance = p.norm();
     if (distance + kMargin * cell >= view.image->free_range(p)) return 0.0f;
     const PixelSize pixel = view.image->pixel();
-    return kReliability * std::min(1.0f, cell / (distance * pixel.azimuth)) *
-           std::min(1.0f, cell / (distance * pixel.elevation));
+    return kReliability * std::min(1.0f, kExtent * cell / (distance * pixel.azimuth)) *
+           std::min(1.0f, kExtent * cell / (distance * pixel.elevation));
   }
 
   void miss_cells(const View& view) {

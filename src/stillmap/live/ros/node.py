@@ -25,6 +25,8 @@ from stillmap.live.ros.intake import (
 )
 from stillmap.live.ros.parameters import Parameters, declare
 from stillmap.live.ros.publishers import TF_MESSAGE, Publishers
+from stillmap.live.scan import ScanBeams
+from stillmap.live.update import DOUBTS, Update
 from stillmap.pipeline.options import Options
 
 _NAME = "stillmap"
@@ -38,13 +40,7 @@ _OPTIONAL = {
     "visualization_msgs/msg/MarkerArray": "movers are published as mover_poses alone",
     "map_msgs/msg/OccupancyGridUpdate": "the map is published whole, without updates",
 }
-_DOUBTS = {
-    "slip": "odometry disagrees with the scans",
-    "blind": "no beam meets anything",
-    "carried": "the scans contradict the map",
-    "lost": "the pose in the known map is not known",
-    "ambiguous": "several places in the known map fit",
-}
+Show = Callable[[LiveMapper, ScanBeams, Update], None]
 
 
 class LiveNode:
@@ -58,6 +54,7 @@ class LiveNode:
         output: result folder.
         overwrite: replace what is there.
         make_mapper: of these options, with what the parameters changed.
+        show: called with each scan and its answer.
 
     Raises:
         InputError: a parameter is wrong.
@@ -71,9 +68,11 @@ class LiveNode:
         *,
         overwrite: bool,
         make_mapper: Callable[[Options], LiveMapper],
+        show: Show | None = None,
     ) -> None:
         self.node = ros.rclpy.create_node(_NAME)
         self._ros, self._output, self._overwrite = ros, output, overwrite
+        self._show = show
         self.parameters = self._declare(options)
         resolution = self.parameters.resolution
         if resolution != options.slam.resolution:
@@ -258,6 +257,8 @@ class LiveNode:
             self._map_due = time.monotonic()
         self.scans += 1
         self._doubts.update(update.doubts)
+        if self._show is not None:
+            self._show(self._mapper, arrival.beams, update)
 
     def _report(self) -> None:
         """Diagnostics of the last second; the last map, where scans have stopped."""
@@ -272,11 +273,11 @@ class LiveNode:
             "latency 99 % (ms)": f"{np.quantile(ms, 0.99):.1f}",
             "odometry": self._intake.odometry.source or "none",
             **{reason: str(n) for reason, n in sorted(counts.items())},
-            **{_DOUBTS[doubt]: str(n) for doubt, n in sorted(doubts.items())},
+            **{DOUBTS[doubt]: str(n) for doubt, n in sorted(doubts.items())},
         }
         level, text = publishers.OK, "mapping" if self.scans else "waiting for scans"
         if new or doubts:
-            level, text = publishers.WARN, "; ".join([*new, *(_DOUBTS[name] for name in doubts)])
+            level, text = publishers.WARN, "; ".join([*new, *(DOUBTS[name] for name in doubts)])
         if new[BACKWARDS] or new[NO_MOUNT]:
             level = publishers.ERROR
         if self._intake.set_back:

@@ -1,10 +1,8 @@
 """A node from its start to its end: Ctrl-C or SIGTERM ends it, and the result is written."""
 
-import signal
 import threading
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +10,8 @@ from stillmap.core.errors import InputError
 from stillmap.core.profiling import Progress
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.ros.installation import Ros
-from stillmap.live.ros.node import LiveNode
+from stillmap.live.ros.node import LiveNode, Show
+from stillmap.live.stopping import signal_flag
 from stillmap.pipeline.options import Options
 
 _SPIN = 0.1  # s after which a signal is seen at the latest
@@ -26,6 +25,7 @@ def run(
     overwrite: bool,
     make_mapper: Callable[[Options], LiveMapper],
     show_progress: Callable[[], AbstractContextManager[Progress]],
+    show: Show | None = None,
 ) -> int:
     """Map until Ctrl-C or SIGTERM, then save; returns the number of scans.
 
@@ -36,6 +36,7 @@ def run(
         overwrite: replace what is there.
         make_mapper: see LiveNode.
         show_progress: shows how far the result is written.
+        show: see LiveNode.
 
     Raises:
         InputError: ROS is not there, a parameter is wrong, or the result cannot be written.
@@ -49,8 +50,10 @@ def run(
         raise InputError(f"arguments of ROS: {error}") from error
     live = None
     try:
-        live = LiveNode(ros, options, output, overwrite=overwrite, make_mapper=make_mapper)
-        with _signal_flag() as stop:
+        live = LiveNode(
+            ros, options, output, overwrite=overwrite, make_mapper=make_mapper, show=show
+        )
+        with signal_flag() as stop:
             try:
                 _spin(ros, live, stop)
             finally:  # whatever ended it: nobody drives the same way again
@@ -85,32 +88,3 @@ def _spin(ros: Ros, live: LiveNode, stop: threading.Event) -> None:
     finally:
         stop.set()
         saves.join()
-
-
-@contextmanager
-def _signal_flag() -> Iterator[threading.Event]:
-    """An event that Ctrl-C and SIGTERM set.
-
-    `ros2 launch` sends SIGTERM some seconds after Ctrl-C, and a terminal sends Ctrl-C to the node
-    and to launch alike: what comes while the result is written must not end it. Only Ctrl-C more
-    than a second after the first one does.
-    """
-    stop, since = threading.Event(), [0.0]
-
-    def handle(number: int, _: object) -> None:
-        if number == signal.SIGINT and stop.is_set() and time.monotonic() - since[0] > 1.0:
-            raise KeyboardInterrupt
-        if not stop.is_set():
-            since[0] = time.monotonic()
-            stop.set()
-
-    numbers = [signal.SIGTERM, signal.SIGINT]
-    before = {number: signal.getsignal(number) for number in numbers}
-    for number, handler in before.items():
-        if handler is not signal.SIG_IGN:  # as a shell script leaves it in the background
-            signal.signal(number, handle)
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

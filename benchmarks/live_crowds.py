@@ -1,0 +1,187 @@
+"""Localization in crowds: lost runs and errors against the number of people.
+
+python benchmarks/live_crowds.py --data DIR [--world hall] [--people 0 30 60 120] [--runs 5]
+    [--max-range 30] [--odometry-noise 1]
+python benchmarks/live_crowds.py --data DIR --visitors 0 5 10 20 [--max-range 8]
+
+Runs of 400 scans through a known map: localized without a prior, with P(static) and with all beams
+alike; and by a particle filter with a likelihood field that is told where it starts. Then the same
+scans without a map: poses of live mapping, with P(static) and with all beams alike.
+people: walk on ways of their own. visitors: gather around the robot after 10 s and stay with it,
+0.7 to 2.5 m away, wherever it goes. Lost: in a known map the last 50 poses are more than 0.5 m off
+on average; without one the poses of all scans are, after alignment. NEES: of 3.
+"""
+
+import argparse
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from live import build_known_map, normalized_error
+from particle_filter import ParticleFilter
+from tables import markdown
+
+from stillmap.core import se2
+from stillmap.eval.trajectory import compute_absolute_errors
+from stillmap.live.mapper import LiveMapper
+from stillmap.live.replay import iter_beams
+from stillmap.results.reader import read_grid
+from stillmap.sim import scene_by_name, simulate
+
+_SCANS, _BEFORE_VISITORS = 400, 50
+_DISTANCE, _RADIUS = (0.7, 2.5), 0.2  # m, of visitors
+_SWAY, _SWAY_SCANS = (0.3, 0.2), 25.0  # rad and m by which they move about, and how slowly
+_LOST = 0.5  # m
+_ODOMETRY = {
+    "wheel_radius_error": 0.0005,
+    "wheel_base_error": 0.01,
+    "translation_noise": 0.01,
+    "rotation_noise": 0.02,
+    "drift_noise": 0.008,
+}
+
+
+class EveryBeamCounts(LiveMapper):
+    """Without P(static): all beams count alike in matching, and in the map that is matched."""
+
+    def _weigh(self, hits, prior):  # noqa: ARG002
+        return hits
+
+    def _add_to_maps(self, labelled, e, found):
+        return super()._add_to_maps(labelled, np.ones_like(e), found)
+
+    def _label_again(self, scan):
+        return np.ones(len(scan.e), np.float32)
+
+
+def main() -> None:
+    args = _parser().parse_args()
+    place = build_known_map(args.data / args.world, args.world, args.map_seed)
+    is_visited = args.visitors is not None
+    lines = []
+    for count in args.visitors if is_visited else args.people:
+        runs = [_run(args, place, count, is_visited, run) for run in range(args.runs)]
+        lines.append([str(count), *map(_summarize, *runs)])
+        print(" | ".join(lines[-1]), flush=True)
+    known = ["with P(static)", "all alike", "particle filter"]
+    titles = [*known, "mapping, with P(static)", "mapping, all alike"]
+    print(markdown(["visitors" if is_visited else "people", *titles], lines))
+
+
+def _parser() -> argparse.ArgumentParser:
+    p = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    p.add_argument("--data", type=Path, required=True, help="folder for maps")
+    p.add_argument("--world", default="hall")
+    p.add_argument("--people", nargs="+", type=int, default=[0, 30, 60, 120])
+    p.add_argument("--visitors", nargs="+", type=int)
+    p.add_argument("--runs", type=int, default=5)
+    p.add_argument("--max-range", type=float, default=30.0, help="m")
+    p.add_argument("--fov", type=float, default=180.0, help="degrees")
+    p.add_argument("--odometry-noise", type=float, default=1.0, help="factor")
+    p.add_argument("--map-seed", type=int, default=11)
+    p.add_argument("--first-seed", type=int, default=100)
+    return p
+
+
+def _run(args, place, count, is_visited, run):
+    """(m off, NEES) of each method, each (T,); infinite while lost."""
+    known, T_map_world = place
+    changes = {
+        "robot": {"scans": _SCANS},
+        "laser": {"max_range": args.max_range, "fov": math.radians(args.fov)},
+        "odometry": {name: args.odometry_noise * value for name, value in _ODOMETRY.items()},
+    }
+    if not is_visited:
+        changes["crowd"] = {"people": count}
+    simulation = simulate(scene_by_name(args.world, changes), args.first_seed + run)
+    recording, true = simulation.recording, simulation.truth.T_world_base
+    if is_visited:
+        recording = add_visitors(recording, count, np.random.default_rng(run))
+    in_map = T_map_world @ true
+    return [
+        _track(LiveMapper, recording, in_map, known),
+        _track(EveryBeamCounts, recording, in_map, known),
+        _filter_particles(known, recording, in_map, run),
+        _track(LiveMapper, recording, true, None),
+        _track(EveryBeamCounts, recording, true, None),
+    ]
+
+
+def add_visitors(recording, count: int, rng):
+    """The recording with people who stay around the robot."""
+    points, hit = recording.points.copy(), recording.hit.copy()
+    bearing, distance = rng.uniform(-np.pi, np.pi, count), rng.uniform(*_DISTANCE, count)
+    sway, kept = np.zeros((2, count)), math.exp(-1.0 / _SWAY_SCANS)
+    for t in range(_BEFORE_VISITORS, recording.n_scans):
+        shock = rng.normal(size=(2, count)) * np.array(_SWAY)[:, None]
+        sway = kept * sway + math.sqrt(1.0 - kept**2) * shock
+        angle, away = bearing + sway[0], np.maximum(distance + sway[1], 0.5)
+        centres = np.stack([away * np.cos(angle), away * np.sin(angle)], axis=1)
+        back = se2.inverse(recording.T_base_sensor[recording.sensor[t]])
+        centres = centres @ back[:2, :2].T + back[:2, 2]
+        beams = recording.beams_of(t)
+        found = _meet(points[beams], centres)
+        length = np.linalg.norm(points[beams], axis=1)
+        nearer = found < length  # not where a beam is unusable
+        noisy = found[nearer] + rng.normal(size=np.count_nonzero(nearer)) * 0.02
+        points[beams][nearer] *= (noisy / length[nearer])[:, None].astype(np.float32)
+        hit[beams][nearer] = True
+    return replace(recording, points=points, hit=hit)
+
+
+def _meet(points, centres):
+    """(N,) m along each beam to the first circle (K, 2); infinite where it meets none."""
+    length = np.linalg.norm(points, axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        along = (points / length[:, None]) @ centres.T
+    off2 = np.square(centres).sum(axis=1) - along**2
+    meets = (along > 0.0) & (off2 < _RADIUS**2)
+    reach = np.where(meets, along - np.sqrt(np.maximum(_RADIUS**2 - off2, 0.0)), np.inf)
+    return reach.min(axis=1, initial=np.inf)
+
+
+def _track(kind, recording, true, known):
+    off, nees = np.full((2, recording.n_scans), math.inf)
+    poses = []
+    with kind({"threads": 1}, place=known) as mapper:
+        for t, beams in enumerate(iter_beams(recording)):
+            update = mapper.push(beams, recording.T_odom_base[t])
+            poses.append(update.pose)
+            if known is not None and "lost" not in update.doubts:
+                off[t] = np.hypot(*(update.pose - true[t])[:2, 2])
+                nees[t] = normalized_error(update, true[t])
+    if known is None:
+        return np.full(len(true), compute_absolute_errors(np.array(poses), true).rmse), None
+    return off, nees
+
+
+def _filter_particles(known, recording, true, seed: int):
+    filter_ = ParticleFilter(read_grid(known), true[0], np.random.default_rng(seed))
+    odometry = recording.T_odom_base
+    off = np.zeros(recording.n_scans)
+    for t, beams in enumerate(iter_beams(recording)):
+        increment = np.eye(3) if t == 0 else se2.inverse(odometry[t - 1]) @ odometry[t]
+        pose = filter_.push(beams.points, beams.hit, beams.T_base_sensor, increment)
+        off[t] = np.hypot(*(pose - true[t])[:2, 2])
+    return off, None
+
+
+def _summarize(*runs) -> str:
+    """Lost runs / ATE of the others, m (NEES of them, the median)."""
+    lost = [bool(off[-50:].mean() > _LOST) for off, _ in runs]
+    kept = [one for one, is_lost in zip(runs, lost, strict=True) if not is_lost]
+    if not kept:
+        return f"{sum(lost)} / "
+    off = np.concatenate([off[np.isfinite(off)] for off, _ in kept])
+    out = f"{sum(lost)} / {math.sqrt(np.mean(np.square(off))):.3f}"
+    if kept[0][1] is None:
+        return out
+    nees = np.concatenate([nees[np.isfinite(nees)] for _, nees in kept])
+    return f"{out} ({nees.mean():.1f})"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,158 @@
+"""The beams of all scans in temporary files, with a bound on what they take."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from stillmap.core.arrays import ArrayBuilder, empty, iter_blocks, release_pages
+
+Array = NDArray[Any]
+
+_IN_MEMORY = 1 << 18  # bytes of each array that are not yet in its file
+_SEGMENTS = 16  # into which the bound is divided
+_SCANS_PER_STEP = 64  # that are copied between two scans: about 1 ms
+
+
+class BeamStore:
+    """Beams of scans, appended. Where they take more than the bound, every second one of the scans
+    that lie most densely is dropped, the oldest first; a part of that work is done with each scan.
+
+    Args:
+        fields: dtype and shape of a row of each array.
+        folder: of the temporary files; None: the system's.
+        max_bytes: of all arrays, about; None: unbounded.
+    """
+
+    def __init__(
+        self,
+        fields: Sequence[tuple[DTypeLike, tuple[int, ...]]],
+        folder: Path | None,
+        max_bytes: int | None,
+    ) -> None:
+        self._fields, self._folder, self._max_bytes = fields, folder, max_bytes
+        self._segments = [self._make_segment()]
+        self._work: Iterator[None] = iter(())
+
+    def append(self, number: int, rows: list[Array]) -> None:
+        """Append the beams of a scan.
+
+        Args:
+            number: of the scan; they rise.
+            rows: (N, *row) of each array.
+
+        Raises:
+            OSError: the disk is full.
+        """
+        self._segments[-1].append(np.array([number]), np.array([len(rows[0])]), rows)
+        if self._max_bytes is None:
+            return
+        if self._segments[-1].byte_count > self._max_bytes / _SEGMENTS:
+            self._segments.append(self._make_segment())
+        is_idle = next(self._work, self) is self
+        if is_idle and sum(s.byte_count for s in self._segments) > self._max_bytes:
+            self._work = self._thin()
+
+    @property
+    def kept(self) -> NDArray[np.int64]:
+        """(K,) numbers of the scans that are kept, ascending."""
+        self._finish()
+        return np.concatenate([segment.numbers.view() for segment in self._segments])
+
+    @property
+    def counts(self) -> NDArray[np.int64]:
+        """(K,) number of beams of these scans."""
+        self._finish()
+        return np.concatenate([segment.counts.view() for segment in self._segments])
+
+    def view(self) -> list[Array]:
+        """The arrays (M, *row) of the scans that are kept; more may be appended."""
+        self._finish()
+        parts = [[array.view() for array in segment.arrays] for segment in self._segments]
+        if len(parts) == 1:
+            return parts[0]
+        return [_join(list(arrays), self._folder) for arrays in zip(*parts, strict=True)]
+
+    def close(self) -> None:
+        """Remove the files."""
+        for segment in self._segments:
+            segment.close()
+
+    def _finish(self) -> None:
+        """Finish what was begun: until then some scans are there twice."""
+        for _ in self._work:
+            pass
+
+    def _make_segment(self) -> "_Segment":
+        return _Segment([ArrayBuilder(t, row, self._folder, _IN_MEMORY) for t, row in self._fields])
+
+    def _thin(self) -> Iterator[None]:
+        """Drop every second scan of the densest segment, with as many halved before as another
+        one beside it, which it joins."""
+        halvings = [segment.halvings for segment in self._segments[:-1]]
+        if not halvings:
+            return
+        at = halvings.index(min(halvings))
+        old, thinned = self._segments[at], self._make_segment()
+        thinned.halvings = old.halvings + 1
+        before = self._segments[at - 1] if at else None
+        if before is not None and before.halvings == thinned.halvings and before.is_small(old):
+            thinned = before
+        yield from _copy_every_second(old, thinned)
+        self._segments[at : at + 1] = [] if thinned is before else [thinned]
+        old.close()
+
+
+class _Segment:
+    """Scans one after another, of which every second one was dropped `halvings` times."""
+
+    def __init__(self, arrays: list[ArrayBuilder]) -> None:
+        self.arrays = arrays
+        self.numbers, self.counts = (ArrayBuilder(np.int64, in_memory=_IN_MEMORY) for _ in range(2))
+        self.byte_count, self.halvings = 0, 0
+
+    def append(self, numbers: Array, counts: Array, rows: list[Array]) -> None:
+        self.numbers.append(numbers)
+        self.counts.append(counts)
+        self.byte_count += sum(a.nbytes for a in rows)
+        for array, more in zip(self.arrays, rows, strict=True):
+            if len(more):
+                array.append(more)
+
+    def is_small(self, other: "_Segment") -> bool:
+        """Whether half of another one would fill it up at most."""
+        return self.byte_count <= 0.6 * other.byte_count
+
+    def close(self) -> None:
+        for array in (*self.arrays, self.numbers, self.counts):
+            array.close()
+
+
+def _copy_every_second(source: _Segment, to: _Segment) -> Iterator[None]:
+    """Append every second scan of a segment to another one, some at a time."""
+    arrays = [array.view() for array in source.arrays]
+    numbers, counts = source.numbers.view(), source.counts.view()
+    end = np.cumsum(counts)
+    for first in range(0, len(numbers), _SCANS_PER_STEP):
+        scans = slice(first, first + _SCANS_PER_STEP)
+        beams = slice(int(end[first] - counts[first]), int(end[scans][-1]))
+        kept = (np.arange(len(numbers[scans])) + first) % 2 == 0
+        of_kept = np.repeat(kept, counts[scans])
+        to.append(numbers[scans][kept], counts[scans][kept], [a[beams][of_kept] for a in arrays])
+        for array in arrays:
+            release_pages(array)
+        yield
+
+
+def _join(parts: list[Array], folder: Path | None) -> Array:
+    """(M, *row) parts one after another, memory-mapped where they are large."""
+    out = empty((sum(map(len, parts)), *parts[0].shape[1:]), parts[0].dtype, folder)
+    first = 0
+    for part in parts:
+        for block in iter_blocks(part):
+            out[first + block.start : first + block.stop] = part[block]
+            release_pages(out)
+        first += len(part)
+    return out

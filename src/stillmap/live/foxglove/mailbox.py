@@ -1,0 +1,90 @@
+"""What waits to be shown: the newest alone, so that nobody who puts something in ever waits."""
+
+import threading
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.short_repr import ShortRepr
+from stillmap.live.causal_labels import MapChange
+from stillmap.live.foxglove.answer import Answer
+
+_MAX_LISTS = 32  # of changes, before several of the same tile become one
+
+
+@dataclass(eq=False)
+class Mail(ShortRepr):
+    """What was put into a mailbox since it was emptied.
+
+    Attributes:
+        answers: the last one of each sensor.
+        changes: parts of the map, in the order in which they changed.
+        resolution: m, edge of a cell of the map.
+        path: (S, D) positions; None: no new ones.
+    """
+
+    answers: dict[str | int, Answer] = field(default_factory=dict)
+    changes: list[list[MapChange]] = field(default_factory=list)
+    resolution: float = 0.0
+    path: NDArray[np.float64] | None = None
+
+
+class Mailbox:
+    """Between threads; what is older than the newest of its kind is dropped."""
+
+    def __init__(self) -> None:
+        self._condition = threading.Condition()
+        self._mail, self._has_news, self._is_closed = Mail(), False, False
+
+    def put_answer(self, answer: Answer) -> None:
+        """The next scan of a sensor."""
+        with self._condition:
+            self._mail.answers[answer.sensor] = answer
+            self._notify()
+
+    def put_changes(self, changes: list[MapChange], resolution: float) -> None:
+        """Parts of the map."""
+        with self._condition:
+            mail = self._mail
+            mail.changes.append(changes)
+            mail.resolution = resolution
+            if len(mail.changes) > _MAX_LISTS:  # who empties it has stopped
+                mail.changes = [keep_last(mail.changes)]
+            self._notify()
+
+    def put_path(self, path: NDArray[np.float64]) -> None:
+        """(S, D) positions of the robot so far."""
+        with self._condition:
+            self._mail.path = path
+            self._notify()
+
+    def wake(self) -> None:
+        """Let `take` return, though nothing is new."""
+        with self._condition:
+            self._notify()
+
+    def close(self) -> None:
+        """Let `take` return None from now on."""
+        with self._condition:
+            self._is_closed = True
+            self._notify()
+
+    def take(self, timeout: float | None = None) -> Mail | None:
+        """What is there as soon as something is, or after `timeout` (s); None: closed."""
+        with self._condition:
+            self._condition.wait_for(lambda: self._has_news, timeout)
+            if self._is_closed:
+                return None
+            mail, self._mail, self._has_news = self._mail, Mail(), False
+            return mail
+
+    def _notify(self) -> None:
+        self._has_news = True
+        self._condition.notify()
+
+
+def keep_last(changes: list[list[MapChange]]) -> list[MapChange]:
+    """Each part of the map as it changed last."""
+    last = {tuple(one.first_cell.tolist()): one for several in changes for one in several}
+    return list(last.values())

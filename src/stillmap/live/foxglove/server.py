@@ -1,0 +1,170 @@
+"""`stillmap live --foxglove`: what a live mapper answers, served by a process of its own.
+
+Not in a thread: messages are made in Python, and a map of a large building would hold its lock for
+longer than a scan may take.
+"""
+
+import json
+import logging
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+
+from stillmap.core.errors import InputError, MissingExtra
+from stillmap.live.foxglove.answer import Answer, pack_answer, pack_changes, to_answer
+from stillmap.live.foxglove.mailbox import Mail, Mailbox, keep_last
+from stillmap.live.mapper import LiveMapper
+from stillmap.live.messages import Arrays, write_message
+from stillmap.live.scan import ScanBeams
+from stillmap.live.update import Update
+
+HOST, PORT = "127.0.0.1", 8765
+
+_log = logging.getLogger(__name__)
+
+_SECONDS_TO_END = 5.0  # before the process is killed
+_SLOW_PERIOD = 1.0  # s between two paths, and between two scans where nobody looks
+_FAST_PERIOD = 0.02  # s at least between two scans: nobody sees more
+_TILES_PER_MESSAGE = 64
+
+
+class FoxgloveServer:
+    """Serves map, labelled scans, movers, pose, path and doubts to Foxglove and Lichtblick.
+
+    Args:
+        host: address to listen at; who reaches it can watch.
+        port: 0: any free one.
+
+    Raises:
+        InputError: foxglove-sdk is missing, the port is taken, or the host is none of this machine.
+    """
+
+    def __init__(self, host: str = HOST, port: int = PORT) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "stillmap.live.foxglove.process", host, str(port)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            process_group=0,  # Ctrl-C is for this process alone
+        )
+        self._mailbox, self._is_watched, self._is_closing = Mailbox(), False, False
+        self._slow_due = 0.0
+        self._last = dict[str | int, Answer]()  # of each sensor, for who comes while none arrives
+        self._threads: Sequence[threading.Thread] = ()
+        try:
+            self.url = f"ws://{_in_url(host)}:{self._read_port()}"
+        except BaseException:
+            self.close()
+            raise
+        self._threads = [
+            threading.Thread(target=work, daemon=True) for work in (self._send, self._listen)
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    @property
+    def is_watched(self) -> bool:
+        """True if anybody has subscribed to anything."""
+        return self._is_watched
+
+    @property
+    def process_id(self) -> int:
+        """Of the process that serves."""
+        return self._process.pid
+
+    def show(self, mapper: LiveMapper, beams: ScanBeams, update: Update) -> None:
+        """Show what the mapper answered to a scan. Never waits: what nobody takes is dropped.
+
+        Args:
+            mapper: which is not pushed to meanwhile.
+            beams: the scan.
+            update: the answer.
+        """
+        if update.changes:
+            self._mailbox.put_changes(update.changes, mapper.resolution)
+        now, answer = time.monotonic(), to_answer(beams, update)
+        is_first, self._last[beams.sensor] = beams.sensor not in self._last, answer
+        if now >= self._slow_due:
+            self._slow_due = now + _SLOW_PERIOD
+            D = len(update.pose) - 1
+            self._mailbox.put_path(mapper.path[:, :D, D])
+            self._mailbox.put_answer(answer)
+        elif self._is_watched or is_first:
+            self._mailbox.put_answer(answer)
+
+    def close(self) -> None:
+        """End the process."""
+        self._is_closing = True
+        self._mailbox.close()
+        stdin, stdout = self._process.stdin, self._process.stdout
+        assert stdin is not None
+        assert stdout is not None
+        if not self._threads:
+            stdin.close()
+        try:
+            self._process.wait(_SECONDS_TO_END)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        for thread in self._threads:
+            thread.join()
+        with suppress(BrokenPipeError):
+            stdin.close()
+        stdout.close()
+
+    def __enter__(self) -> "FoxgloveServer":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _read_port(self) -> int:
+        """The port, as soon as the process listens."""
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        if not line:
+            raise RuntimeError("the process that serves the live view has ended")
+        told = json.loads(line)
+        if "port" not in told:
+            kind = MissingExtra if told.pop("is_missing") else InputError
+            raise kind(told.pop("what"), **told)
+        return int(told["port"])
+
+    def _send(self) -> None:
+        """Write what is in the mailbox until it is closed."""
+        stream = self._process.stdin
+        assert stream is not None
+        with suppress(BrokenPipeError):
+            while (mail := self._mailbox.take()) is not None:
+                for arrays in _to_messages(mail):
+                    write_message(stream, arrays)
+                time.sleep(_FAST_PERIOD)
+        with suppress(BrokenPipeError):
+            stream.close()
+
+    def _listen(self) -> None:
+        """Note whether anybody looks, until the process ends."""
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            self._is_watched = bool(json.loads(line)["is_watched"])
+            for answer in list(self._last.values()) if self._is_watched else []:
+                self._mailbox.put_answer(answer)
+        self._is_watched = False
+        if not self._is_closing:
+            _log.warning("the process that serves the live view has ended; mapping goes on")
+
+
+def _to_messages(mail: Mail) -> Iterator[Arrays]:
+    changes = keep_last(mail.changes)
+    for first in range(0, len(changes), _TILES_PER_MESSAGE):
+        yield pack_changes(changes[first : first + _TILES_PER_MESSAGE], mail.resolution)
+    if mail.path is not None:
+        yield {"path": mail.path}
+    for answer in mail.answers.values():
+        yield pack_answer(answer)
+
+
+def _in_url(host: str) -> str:
+    return f"[{host}]" if ":" in host else host

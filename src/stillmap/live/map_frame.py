@@ -1,0 +1,129 @@
+"""Where the frame of the odometry by scans lies in the map: loops, and what they correct."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core import se2
+from stillmap.live.causal_labels import CausalLabels
+from stillmap.live.front_end import FrontEnd, Registration
+from stillmap.live.local_map import MappedScan, thin_scan
+from stillmap.live.loop_closer import LoopCloser
+from stillmap.live.loop_process import LoopProcess
+from stillmap.live.map_correction import LabelledScan, MapCorrection
+from stillmap.live.place import NoLoops
+from stillmap.live.sweep_loop_closer import LiveSweepLoopCloser
+from stillmap.slam import local_map
+
+Float = NDArray[np.float64]
+LoopClosing = LoopCloser | LiveSweepLoopCloser | LoopProcess | NoLoops
+
+# beams of a spaced scan in 2D and 3D, for loops and for the local map after them
+_MAX_KEPT_BEAMS = {2: 400, 3: 20_000}
+
+
+class MapFrame:
+    """The spaced scans in the frame of the odometry by scans and in the map.
+
+    Args:
+        dimension: 2 or 3.
+        closer: what closes loops between them.
+        in_background: apply corrections in parts, one with each scan; else at once.
+
+    Attributes:
+        T_map_local: (D+1, D+1) of the frame of the odometry by scans.
+    """
+
+    def __init__(self, dimension: int, closer: LoopClosing, in_background: bool) -> None:
+        D = dimension
+        self.T_map_local = np.eye(D + 1)
+        self._dimension, self._closer, self._in_background = D, closer, in_background
+        self._spaced, self._corrected = list[Float](), np.zeros((0, D + 1, D + 1))
+        self._drift = np.zeros((3, 3))  # covariance since the last spaced scan
+        self._correction: MapCorrection | None = None
+
+    @property
+    def last(self) -> int:
+        """Number of the last spaced scan; -1: there is none."""
+        return len(self._spaced) - 1
+
+    def add_drift(self, covariance: Float) -> None:
+        """Add the covariance (3, 3) of a step that the scans do not show."""
+        self._drift = self._drift + covariance
+
+    def add(self, scan: MappedScan, found: Registration) -> None:
+        """Add a spaced scan to the pose graph."""
+        self._spaced.append(scan.T_map_base)
+        kept = thin_scan(scan, _MAX_KEPT_BEAMS[self._dimension])
+        self._closer.add(kept, found.explained, self._drift)
+        self._drift = np.zeros((3, 3))
+
+    def correct(
+        self,
+        labelled: LabelledScan,
+        added: MappedScan | None,
+        labels: CausalLabels,
+        odometry: FrontEnd,
+    ) -> None:
+        """Go on correcting the map after a scan, if loops were closed.
+
+        Args:
+            labelled: the scan, which was added to the labels.
+            added: the same if it was added to the local map.
+            labels: of the map.
+            odometry: whose local map is made anew.
+        """
+        if self._correction is not None:
+            self._correction.note_labelled(labelled)
+            if added is not None:
+                self._correction.note_added(added)
+        elif (found := self._closer.poll()) is not None:
+            new = MapCorrection(found, labels, np.array(self._spaced), self.spaced_poses())
+            self._correction = None if new.is_small else new
+        self._go_on(labels, odometry, to_the_end=not self._in_background)
+
+    def finish_correction(self, labels: CausalLabels, odometry: FrontEnd) -> None:
+        """Finish the correction that was begun, if there is one."""
+        self._go_on(labels, odometry, to_the_end=True)
+
+    def _go_on(self, labels: CausalLabels, odometry: FrontEnd, *, to_the_end: bool) -> None:
+        if self._correction is None:
+            return
+        is_done = self._correction.step(labels)
+        while to_the_end and not is_done:
+            is_done = self._correction.step(labels)
+        if is_done:
+            self._correction.finish(labels)
+            motion = self._correction.T_map_local @ se2.inverse(self.T_map_local)
+            odometry.correct(self._correction.local_map, motion)
+            self.T_map_local = self._correction.T_map_local
+            self._corrected = self._correction.poses
+            self._correction = None
+
+    def spaced_poses(self) -> Float:
+        """(S, D+1, D+1) T_map_base of the spaced scans."""
+        since = np.array(self._spaced[len(self._corrected) :])
+        since = since.reshape(-1, *self.T_map_local.shape)
+        return np.concatenate([self._corrected, self.T_map_local @ since])
+
+    def to_map(self, local: Float, anchor: int) -> Float:
+        """(D+1, D+1) T_map_base of a scan at a pose in the frame of the odometry by scans, which
+        moves with spaced scan `anchor`; -1: none."""
+        if not 0 <= anchor < len(self._corrected):
+            return np.asarray(self.T_map_local @ local)
+        moved = self._corrected[anchor] @ se2.inverse(self._spaced[anchor])
+        return np.asarray(moved @ local)
+
+    def to_map_all(self, local: Float, anchor: NDArray[np.int64]) -> Float:
+        """(T, D+1, D+1) the same of all scans; between spaced ones corrections are blended."""
+        # the scan after which each spaced one is the last: itself, but for the first
+        scans = np.searchsorted(anchor, np.arange(len(self._spaced)) - 1, side="right") - 1
+        every, kept = np.unique(np.maximum(scans, 0), return_index=True)
+        corrected, last = self.spaced_poses()[kept], len(local) - 1
+        if every[-1] != last:
+            every = np.append(every, last)
+            corrected = np.concatenate([corrected, (self.T_map_local @ local[-1])[None]])
+        return local_map.propagate_corrections(local, every, corrected)
+
+    def stop(self) -> None:
+        """End the process that closes loops, if there is one."""
+        self._closer.stop()

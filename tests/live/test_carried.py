@@ -1,0 +1,61 @@
+"""A robot that is carried while it maps: held back, searched in its own map, and found again."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stillmap.core import se2
+from stillmap.eval.trajectory import align
+from stillmap.live.mapper import LiveMapper
+from stillmap.live.replay import iter_beams
+from stillmap.sim import scene_by_name, simulate
+
+BEFORE, AFTER = 300, 60
+
+
+@pytest.fixture(scope="module")
+def answers():
+    """Updates, poses in hindsight and true poses: after 300 scans the robot is put back to where it
+    was 200 scans before."""
+    simulation = simulate(scene_by_name("hall", {"crowd": {"people": 5}}), 1)
+    odometry, beams = simulation.recording.T_odom_base, list(iter_beams(simulation.recording))
+    scans = np.append(np.arange(BEFORE), np.arange(100, 100 + AFTER))
+    given, updates = odometry[0], []
+    with LiveMapper({"threads": 1}) as mapper:
+        for number, k in enumerate(scans):
+            if number not in (0, BEFORE):
+                given = given @ se2.inverse(odometry[k - 1]) @ odometry[k]
+            beams_now = replace(beams[k], stamp_ns=200_000_000 * number)
+            updates.append(mapper.push(beams_now, given))
+        poses = mapper.poses
+    return updates, poses, simulation.truth.T_world_base[scans]
+
+
+def errors(poses, true):
+    """m off, in the frame of the scans before."""
+    T = align(true[:BEFORE], poses[:BEFORE])
+    return np.hypot(*(T @ true - poses)[:, :2, 2].T)
+
+
+def test_no_scan_is_silently_wrong(answers):
+    updates, _, true = answers
+    off = errors(np.array([update.pose for update in updates]), true)
+    assert off[BEFORE] > 5.0
+    assert all(update.doubts for update, far in zip(updates, off, strict=True) if far > 0.3)
+    assert not any("contradicted" in update.doubts for update in updates[:BEFORE])
+
+
+def test_it_is_found_in_its_own_map(answers):
+    updates, _, true = answers
+    assert any("carried" in update.doubts for update in updates[BEFORE:])
+    assert not updates[-1].doubts
+    off = errors(np.array([update.pose for update in updates]), true)
+    assert off[-10:].max() < 0.1
+
+
+def test_the_poses_of_the_scans_until_then_are_known_in_hindsight(answers):
+    _, poses, true = answers
+    off = errors(poses, true)
+    assert np.median(off[BEFORE + 1 :]) < 0.1
+    assert off[BEFORE + 1 :].max() < 1.0

@@ -1,0 +1,323 @@
+"""`stillmap live --foxglove`, seen by a client of its own."""
+
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("foxglove")
+
+from foxglove_client import Client, grid_of, points_of, pose_of, stamp_of
+
+from stillmap.cli.main import main
+from stillmap.core.errors import InputError, MissingExtra
+from stillmap.live.causal_labels import MapChange
+from stillmap.live.foxglove.server import FoxgloveServer
+from stillmap.live.foxglove.tile_map import TileMap
+from stillmap.live.movers import Mover
+from stillmap.live.scan import Scan, to_beams
+from stillmap.live.update import Update
+from stillmap.sim import scene_by_name, simulate, write_simulation
+
+TOPICS = ("/map", "/pose", "/path", "/tf", "/doubts", "/movers", "/scan_static", "/scan_dynamic")
+
+
+@pytest.fixture
+def server():
+    with FoxgloveServer(port=0) as one:
+        yield one
+
+
+@pytest.fixture(scope="module")
+def hall(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("foxglove") / "hall"
+    write_simulation(simulate(scene_by_name("hall", {"robot": {"scans": 150}}), 1), folder)
+    return folder
+
+
+def show(server, run, scans, pause=0.0):
+    """Show some scans of a run as if they were answered now; seconds of each call."""
+    seconds = []
+    for k in scans:
+        begin = time.perf_counter()
+        server.show(run.mapper, run.beams[k], run.updates[k])
+        seconds.append(time.perf_counter() - begin)
+        time.sleep(pause)
+    return np.array(seconds)
+
+
+def subscribed(server, *topics):
+    """A client whose subscriptions have arrived."""
+    client = Client(server.url)
+    client.subscribe(*topics)
+    client.wait(lambda client: client.subscribed >= {"/pose"} & set(topics))
+    deadline = time.monotonic() + 20.0
+    while not server.is_watched:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    return client
+
+
+def last_pose_is(run, k):
+    def is_so(client):
+        poses = client.received.get("/pose", [])
+        return bool(poses) and stamp_of(poses[-1]) == run.beams[k].stamp_ns
+
+    return is_so
+
+
+def expected_map(run, scans):
+    tiles = TileMap()
+    for k in scans:
+        tiles.add(run.updates[k].changes, 0.05)
+    return tiles.to_cells()
+
+
+def has_map(cells):
+    """True as soon as the last map that arrived is this one."""
+
+    def is_so(client):
+        if "/map" not in client.received:
+            return False
+        _, _, percent = grid_of(client.received["/map"][-1])
+        return percent.shape == cells.percent.shape and (percent == cells.percent).all()
+
+    return is_so
+
+
+def test_a_client_sees_what_the_mapper_answered(server, corridor):
+    with subscribed(server, *TOPICS) as client:
+        assert client.info["name"] == "stillmap"
+        assert client.info["capabilities"] == ["time"]  # nobody may publish, call, or set anything
+        show(server, corridor, [120])
+        client.wait(lambda client: client.subscribed == set(TOPICS))
+        show(server, corridor, range(121, 200), pause=0.02)
+        client.wait(last_pose_is(corridor, 199))
+        cells = expected_map(corridor, range(120, 200))
+        client.wait(has_map(cells))
+    stamps = {beams.stamp_ns: k for k, beams in enumerate(corridor.beams)}
+    given = [(stamps[stamp_of(pose)], pose) for pose in client.received["/pose"]]
+    assert [k for k, _ in given] == sorted(k for k, _ in given)
+    for k, pose in given:
+        assert pose["log_time"] == corridor.beams[k].stamp_ns
+        T = pose_of(pose["pose"])
+        np.testing.assert_allclose(T[:2, :2], corridor.updates[k].pose[:2, :2], atol=1e-12)
+        np.testing.assert_allclose(T[:2, 3], corridor.updates[k].pose[:2, 2], atol=1e-12)
+    corner, edge, _ = grid_of(client.received["/map"][-1])
+    np.testing.assert_allclose(corner, cells.origin)
+    assert edge == pytest.approx(0.05)
+    assert client.times[-1] == corridor.beams[199].stamp_ns
+    assert len(client.received["/tf"][-1]["transforms"]) == 2
+    check_clouds(client, corridor, stamps)
+    check_movers(client, corridor, stamps)
+    points = client.received["/path"][-1]["entities"][0]["lines"][0]["points"]
+    path = np.array([[point.get("x", 0.0), point.get("y", 0.0)] for point in points])
+    np.testing.assert_allclose(path, corridor.mapper.path[:, :2, 2])
+
+
+def check_clouds(client, run, stamps):
+    """Static and dynamic points are the hits of their scan, in the map."""
+    n_dynamic = 0
+    for label in ("static", "dynamic"):
+        for cloud in client.received[f"/scan_{label}"]:
+            k = stamps[stamp_of(cloud)]
+            beams, update = run.beams[k], run.updates[k]
+            kept = beams.hit & ((update.p_static < 0.5) == (label == "dynamic"))
+            T = update.pose @ beams.T_base_sensor
+            points, p_static = points_of(cloud)
+            expected = beams.points[kept] @ T[:2, :2].T + T[:2, 2]
+            np.testing.assert_allclose(points[:, :2], expected, atol=1e-4)
+            np.testing.assert_array_equal(p_static, update.p_static[kept])
+            assert not points[:, 2].any()
+            n_dynamic += len(points) if label == "dynamic" else 0
+    assert n_dynamic > 20
+
+
+def check_movers(client, run, stamps):
+    n_movers = 0
+    for message in client.received["/movers"]:
+        movers = run.updates[stamps[message["log_time"]]].movers
+        entities = message.get("entities", [])
+        assert [entity["id"] for entity in entities] == [str(mover.number) for mover in movers]
+        for entity, mover in zip(entities, movers, strict=True):
+            at = pose_of(entity["cylinders"][0]["pose"])[:2, 3]
+            np.testing.assert_allclose(at, mover.position)
+            assert entity["cylinders"][0]["size"]["x"] == pytest.approx(2 * mover.radius)
+            n_movers += 1
+    assert n_movers > 5
+
+
+def test_who_comes_late_sees_the_map(server, corridor):
+    """Though no scan arrives any more."""
+    show(server, corridor, range(100))
+    time.sleep(0.3)
+    for _ in range(2):  # and who comes after that, too
+        with Client(server.url) as client:
+            client.subscribe(*TOPICS)
+            client.wait(has_map(expected_map(corridor, range(100))))
+            client.wait(last_pose_is(corridor, 99))
+            client.wait(lambda client: client.received.keys() >= set(TOPICS))
+            assert client.received["/doubts"][-1]["message"] == "no doubts"
+
+
+def test_a_client_that_reads_nothing_delays_nobody(server, corridor):
+    stuck = socket.create_connection(("127.0.0.1", int(server.url.rpartition(":")[2])))
+    stuck.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1024)
+    shake_hands_and_subscribe(stuck)
+    with subscribed(server, *TOPICS) as client:
+        seconds = np.concatenate([show(server, corridor, range(300)) for _ in range(10)])
+        assert np.median(seconds) < 1e-3
+        show(server, corridor, [399])
+        client.wait(last_pose_is(corridor, 399))
+    stuck.close()
+
+
+def shake_hands_and_subscribe(connection):
+    """To all channels, by hand: no library reads what comes."""
+    connection.sendall(
+        b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+        b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n"
+        b"Sec-WebSocket-Protocol: foxglove.sdk.v1\r\n\r\n"
+    )
+    assert connection.recv(12).endswith(b"101")
+    wanted = [{"id": k, "channelId": k} for k in range(1, 30)]
+    text = json.dumps({"op": "subscribe", "subscriptions": wanted}).encode()
+    head = bytes([0x81, 0x80 | 126]) + len(text).to_bytes(2, "big")
+    connection.sendall(head + bytes(4) + text)  # masked with zeros
+
+
+def test_several_lasers_have_topics_of_their_own(server, corridor):
+    beams, update = corridor.beams[0], corridor.updates[0]
+    for sensor in ("/front/scan", 2):
+        moved = type(beams)(**(vars(beams) | {"sensor": sensor}))
+        server.show(corridor.mapper, moved, update)
+    with Client(server.url) as client:
+        client.wait(
+            lambda client: (
+                client.topics.keys()
+                >= {
+                    "/front/scan_static",
+                    "/front/scan_dynamic",
+                    "/scan_2_static",
+                    "/scan_2_dynamic",
+                }
+            )
+        )
+
+
+def test_in_three_dimensions(server):
+    """Of a mapper that answers with poses (4, 4), points (N, 3) and blocks of voxels."""
+    p_occupied = np.full((8, 8, 8), np.nan, np.float32)
+    p_occupied[0, 1, 2] = 1.0  # z, y, x
+    T = np.eye(4)
+    T[:3, 3] = 1.0, 2.0, 3.0
+    mapper = SimpleNamespace(path=np.stack([np.eye(4), T]), resolution=0.5)
+    beams = to_beams(Scan(10**9, points=[[1.0, 0.0, 0.5], [0.0, 2.0, 0.0], [0.0, 0.0, 9.0]]))
+    movers = [Mover(4, np.array([5.0, 5.0, 1.0]), np.zeros(3), np.eye(6), 0.3, 1.0)]
+    change = MapChange(np.array([0, 8, 0]), p_occupied)
+    p_static = np.float32([0.9, 0.1, np.nan])
+    server.show(mapper, beams, Update(T, np.eye(6), p_static, None, (), [change], movers))
+    with Client(server.url) as client:
+        client.subscribe("/map_points", *TOPICS)
+        client.wait(lambda client: client.received.keys() >= {"/map_points", *TOPICS} - {"/map"})
+    last = {topic: messages[-1] for topic, messages in client.received.items()}
+    np.testing.assert_allclose(points_of(last["/map_points"])[0], [[1.25, 4.75, 0.25]])
+    np.testing.assert_allclose(points_of(last["/scan_static"])[0], [[2.0, 2.0, 3.5]])
+    np.testing.assert_allclose(points_of(last["/scan_dynamic"])[0], [[1.0, 4.0, 3.0]])
+    np.testing.assert_allclose(pose_of(last["/pose"]["pose"]), T)
+    (mover,) = last["/movers"]["entities"]
+    np.testing.assert_allclose(pose_of(mover["cylinders"][0]["pose"])[:3, 3], [5.0, 5.0, 1.0])
+    line = last["/path"]["entities"][0]["lines"][0]["points"]
+    assert line[-1] == {"x": 1.0, "y": 2.0, "z": 3.0}
+
+
+def test_mapping_goes_on_when_the_server_dies(corridor, caplog):
+    with FoxgloveServer(port=0) as server:
+        os.kill(server.process_id, signal.SIGKILL)
+        deadline = time.monotonic() + 20.0
+        while not caplog.records:
+            show(server, corridor, range(20))
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+    assert "mapping goes on" in caplog.text
+
+
+def test_a_port_that_is_taken_is_said_in_one_line(server, hall, tmp_path, capsys):
+    port = server.url.rpartition(":")[2]
+    words = ["live", "--replay", str(hall), "-o", str(tmp_path / "out"), "--foxglove"]
+    assert main([*words, "--port", port]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert f"127.0.0.1:{port}" in said
+    assert "in use" in said
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["--foxglove", "--port", "70000"], "--port"),
+        (["--foxglove", "--port", "0", "--host", "192.0.2.1"], "192.0.2.1"),
+        (["--port", "8765"], "--foxglove"),
+        (["--host", "0.0.0.0"], "--foxglove"),
+    ],
+)
+def test_calls_that_make_no_sense(hall, tmp_path, capsys, words, expected):
+    assert main(["live", "--replay", str(hall), "-o", str(tmp_path / "out"), *words]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert expected in said
+
+
+def test_without_the_library(tmp_path, monkeypatch):
+    (tmp_path / "foxglove.py").write_text("raise ImportError('none')\n")
+    path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    monkeypatch.setenv("PYTHONPATH", path)
+    with pytest.raises(MissingExtra, match=r"needs foxglove.*install.*\[live\]") as found:
+        FoxgloveServer(port=0)
+    assert isinstance(found.value, InputError)
+    assert "\n" not in str(found.value)
+
+
+def test_the_result_is_the_same_as_without(hall, tmp_path, capsys):
+    for name, words in (("plain", []), ("seen", ["--foxglove", "--port", "0"])):
+        assert main(["live", "--replay", str(hall), "-o", str(tmp_path / name), *words]) == 0
+    assert "ws://127.0.0.1:" in capsys.readouterr().err
+    for file in ("trajectory.tum", "live/trajectory.tum", "beams/p_static.npy", "map.pgm"):
+        assert (tmp_path / "plain" / file).read_bytes() == (tmp_path / "seen" / file).read_bytes()
+
+
+def test_ctrl_c_ends_it_with_a_whole_result(hall, tmp_path):
+    words = ["live", "--replay", hall, "-o", tmp_path / "out", "--rate", "0.5", "--foxglove"]
+    before = signal.signal(signal.SIGINT, signal.SIG_DFL)  # a child inherits it when ignored
+    try:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "stillmap", *map(str, words), "--port", "0", "--quiet"],
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+    finally:
+        signal.signal(signal.SIGINT, before)
+    with process:
+        url = re.search(r"ws://\S+?(?=[,\s])", process.stderr.readline())[0]
+        with Client(url) as client:
+            client.subscribe("/pose", "/map")
+            client.wait(lambda client: len(client.received.get("/pose", [])) > 3, 60.0)
+            os.killpg(process.pid, signal.SIGINT)  # as a terminal sends it, to the server as well
+            client.read_all()
+        _, said = process.communicate(timeout=60)
+    assert process.returncode == 0, said
+    assert "Traceback" not in said
+    n = len((tmp_path / "out/trajectory.tum").read_text().splitlines())
+    assert 3 <= n < 150
+    assert len((tmp_path / "out/live/trajectory.tum").read_text().splitlines()) == n
+    assert json.loads((tmp_path / "out/run.json").read_text())

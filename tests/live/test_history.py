@@ -1,0 +1,91 @@
+"""What is kept of a live run, its bound, and labels in hindsight."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+import stillmap
+from stillmap.live.beam_store import BeamStore
+from stillmap.live.mapper import LiveMapper
+
+
+def fill(max_bytes, scans, tmp_path):
+    """A store of scans of 1 to 20 beams, each with its number."""
+    store = BeamStore([(np.float32, (2,)), (np.int64, ())], tmp_path, max_bytes)
+    for number in range(scans):
+        n = 1 + number % 20
+        store.append(number, [np.full((n, 2), number, np.float32), np.full(n, number)])
+    return store
+
+
+def test_all_scans_are_kept_without_a_bound(tmp_path):
+    store = fill(None, 300, tmp_path)
+    assert store.kept.tolist() == list(range(300))
+    points, numbers = store.view()
+    np.testing.assert_array_equal(numbers, np.repeat(store.kept, store.counts))
+    np.testing.assert_array_equal(points[:, 1], numbers)
+
+
+@pytest.mark.parametrize("scans", [100, 3000, 20_000])
+def test_scans_are_dropped_evenly_beyond_the_bound(scans, tmp_path):
+    bound = 100_000
+    store = fill(bound, scans, tmp_path)
+    points, numbers = store.view()
+    np.testing.assert_array_equal(numbers, np.repeat(store.kept, store.counts))
+    np.testing.assert_array_equal(points[:, 0], numbers)
+    assert np.all(np.diff(store.kept) > 0)
+    assert store.kept[-1] == scans - 1
+    size = points.nbytes + numbers.nbytes
+    assert size <= 1.1 * bound
+    if scans * 10.5 * 16 < bound:
+        assert len(store.kept) == scans
+        return
+    assert size > 0.3 * bound
+    gaps = np.diff(store.kept)
+    assert gaps.max() <= 8 * scans * 10.5 * 16 / bound  # none is much emptier than the mean
+    assert gaps[0] > 1
+
+
+def test_the_store_is_empty_at_first(tmp_path):
+    store = BeamStore([(np.float32, (2,))], tmp_path, 10)
+    assert len(store.kept) == len(store.view()[0]) == 0
+
+
+def test_a_bounded_run_is_saved_with_fewer_scans(corridor, tmp_path):
+    with LiveMapper({"threads": 1}, max_scratch=400_000) as mapper:
+        for t, beams in enumerate(corridor.beams[:200]):
+            update = mapper.push(beams, corridor.recording.T_odom_base[t])
+        poses = mapper.poses
+        assert len(poses) == 200
+        np.testing.assert_array_equal(update.pose, corridor.updates[199].pose)
+        mapper.save(tmp_path / "out")
+        found = mapper.finish()
+    saved = stillmap.load(tmp_path / "out")
+    assert len(saved.poses) == len(found.poses) < 150
+    np.testing.assert_allclose(saved.poses[-1], poses[-1], atol=1e-6)
+
+
+def test_scans_are_labelled_once_more_after_the_lag(corridor):
+    with LiveMapper({"threads": 1}, lag=2.0) as mapper:
+        later = {}
+        for t, beams in enumerate(corridor.beams[:120]):
+            update = mapper.push(beams, corridor.recording.T_odom_base[t])
+            for one in update.hindsight:
+                later[one.number] = (t, one.p_static)
+    assert sorted(later) == list(range(len(later)))
+    stamps = corridor.recording.stamp_ns
+    lags = [1e-9 * (stamps[now] - stamps[t]) for t, (now, _) in later.items()]
+    assert 2.0 <= min(lags) <= max(lags) < 2.0 + 1e-9 * np.diff(stamps).max()
+    wrong = {"at once": 0, "later": 0}
+    for t, (_, p_static) in itertools.islice(later.items(), 20, None):
+        moves, hit = ~corridor.truth.static[corridor.recording.beams_of(t)], corridor.beams[t].hit
+        wrong["at once"] += np.sum(((corridor.updates[t].p_static < 0.5) != moves)[hit])
+        wrong["later"] += np.sum(((p_static < 0.5) != moves)[hit])
+    assert 0 < wrong["later"] < 0.9 * wrong["at once"]
+
+
+@pytest.mark.parametrize("name", ["max_scratch", "lag"])
+def test_wrong_bounds_are_named(name):
+    with pytest.raises(ValueError, match=name):
+        LiveMapper(**{name: 0})

@@ -1,0 +1,116 @@
+"""The live mapper in 3D: sweeps of a spinning lidar in a sweeps."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import Run, simulate_sweeps
+
+import stillmap
+from stillmap.core import se2
+from stillmap.live.mapper import LiveMapper
+from stillmap.live.pixel_size import find_pixel_size
+from stillmap.live.replay import iter_beams
+
+
+def from_first(poses):
+    return se2.inverse(poses[0]) @ poses
+
+
+def test_poses_as_they_were_given_are_those_of_the_truth(sweeps):
+    found, true = from_first(sweeps.poses), from_first(sweeps.truth.T_world_base)
+    off = np.linalg.norm((found - true)[:, :3, 3], axis=1)
+    assert np.linalg.norm(true[-1, :3, 3]) > 4.0
+    assert off.max() < 0.05
+    assert sweeps.updates[-1].covariance.shape == (6, 6)
+
+
+def test_what_moves_is_told_at_once(sweeps):
+    hit = sweeps.recording.hit.copy()
+    hit[: sweeps.recording.offset[50]] = False  # little is known yet
+    says, moves = (sweeps.p_static < 0.5)[hit], ~sweeps.truth.static[hit]
+    both = (says & moves).sum()
+    assert moves.sum() > 1000
+    assert both > 0.9 * says.sum()
+    assert both > 0.5 * moves.sum()
+
+
+def test_the_map_has_obstacles_above_the_ground(sweeps):
+    found = sweeps.mapper.map
+    occupied = found.p_occupied > 0.65
+    assert occupied.sum() > 100
+    assert (found.p_occupied < 0.2).sum() > 5 * occupied.sum()  # the ground
+    cells = sweeps.mapper.cells
+    assert cells.cells.shape[1] == 3
+    assert np.mean(cells.p_occupied > 0.5) > 0.5
+
+
+def test_changed_parts_of_the_map_are_told(sweeps):
+    changes = [change for update in sweeps.updates for change in update.changes]
+    assert changes[0].p_occupied.shape == (8, 8, 8)
+    assert np.all(changes[0].first_cell % 8 == 0)
+
+
+def test_odometry_and_its_correction_give_the_pose(sweeps):
+    for t in (0, 30, 99):
+        update, T_odom_base = sweeps.updates[t], sweeps.recording.T_odom_base[t]
+        np.testing.assert_allclose(update.T_map_odom @ T_odom_base, update.pose, atol=1e-9)
+
+
+def test_threads_change_nothing():
+    simulation = simulate_sweeps("hall", 12)
+    one, two = (Run(simulation, threads) for threads in (1, 2))
+    np.testing.assert_array_equal(one.poses, two.poses)
+    np.testing.assert_array_equal(one.p_static, two.p_static)
+    for run in (one, two):
+        run.mapper.close()
+
+
+def test_saves_what_map_writes(sweeps, tmp_path):
+    sweeps.mapper.save(tmp_path / "out")
+    result = stillmap.load(tmp_path / "out")
+    np.testing.assert_allclose(result.poses, sweeps.mapper.poses, atol=1e-6)
+    given = np.load(tmp_path / "out/live/beams/p_static.npy")
+    np.testing.assert_array_equal(given, sweeps.p_static)
+
+
+def test_labels_of_an_earlier_sweep_follow_from_what_is_known_now(sweeps):
+    t = 40
+    beams = sweeps.beams[t]
+    later, at_once = sweeps.mapper.label(beams, t), sweeps.updates[t].p_static
+    moves = ~sweeps.truth.static[sweeps.recording.beams_of(t)]
+    right, before = (np.mean((p < 0.5) == moves, where=beams.hit) for p in (later, at_once))
+    assert right > before
+
+
+def test_a_lidar_that_is_carried_begins_anew():
+    here, there = (
+        list(iter_beams(simulate_sweeps(scene, 40).recording)) for scene in ("hall", "corridor")
+    )
+    later = here[-1].stamp_ns - there[0].stamp_ns + 10**8
+    with LiveMapper({"threads": 1}) as mapper:
+        for one in here:
+            mapper.push(one)
+        moved = [replace(one, stamp_ns=one.stamp_ns + later) for one in there]
+        doubts = [mapper.push(one).doubts for one in moved]
+    assert sum("carried" in d for d in doubts) == 1
+
+
+def test_the_dimension_stays():
+    with LiveMapper({"threads": 1}) as mapper:
+        mapper.push(stillmap.Scan(0, np.full(10, 2.0), np.linspace(0.0, 1.0, 10)))
+        with pytest.raises(ValueError, match="2D"):
+            mapper.push(stillmap.Scan(10**8, points=np.ones((10, 3))))
+
+
+@pytest.mark.parametrize(("channels", "columns"), [(16, 900), (64, 1800), (128, 1024)])
+def test_pixels_are_about_the_angles_between_beams(channels, columns):
+    up = np.linspace(-0.4, 0.2, channels)
+    around = np.linspace(-np.pi, np.pi, columns, endpoint=False)
+    up, around = np.meshgrid(up, around)
+    flat = np.stack([np.cos(around), np.sin(around), np.tan(up)], axis=-1).reshape(-1, 3)
+    points = (10.0 * flat).astype(np.float32)
+    azimuth, elevation = find_pixel_size(points, np.ones(len(points), bool))
+    assert 0.006 <= azimuth < 0.01
+    between = 0.58 / (channels - 1)  # the sum of all is atan 0.4 + atan 0.2
+    assert 0.7 * between < elevation < max(2.0 * between, 0.006)

@@ -1,0 +1,96 @@
+"""A laser in front and one behind, through the live mapper."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stillmap.core import se2
+from stillmap.eval.trajectory import compute_absolute_errors
+from stillmap.live.mapper import LiveMapper
+from stillmap.live.replay import iter_beams
+from stillmap.sim import scene_by_name, simulate
+
+# T_base_sensor of the lasers; the one behind looks back
+FRONT, REAR = se2.matrix(0.2, 0.1, 0.3), se2.matrix(-0.3, 0.0, np.pi - 0.2)
+
+
+@pytest.fixture(scope="module")
+def simulation():
+    """There and back through a corridor with people, looking all around."""
+    laser = {"beams": 360, "fov": 2.0 * np.pi}
+    return simulate(scene_by_name("corridor", {"laser": laser, "robot": {"scans": 250}}), 3)
+
+
+@pytest.fixture(scope="module")
+def both(simulation):
+    """The mapper, its updates, and whether each is of the laser in front."""
+    recording = simulation.recording
+    updates, is_front = [], []
+    with LiveMapper({"threads": 1}) as mapper:
+        for t, beams in enumerate(iter_beams(recording)):
+            for scan in halves(beams):
+                updates.append(mapper.push(scan, recording.T_odom_base[t]))
+                is_front.append(scan.sensor == "front")
+        yield mapper, updates, np.array(is_front)
+
+
+def halves(beams):
+    """A scan all around as those of two lasers, with their stamps a little apart."""
+    ahead = beams.points[:, 0] >= 0.0
+    for name, sees, T, later in (("front", ahead, FRONT, 0), ("rear", ~ahead, REAR, 1000)):
+        to_sensor = se2.inverse(T) @ beams.T_base_sensor
+        points = beams.points[sees] @ to_sensor[:2, :2].T + to_sensor[:2, 2]
+        yield replace(
+            beams,
+            stamp_ns=beams.stamp_ns + later,
+            points=np.ascontiguousarray(points, np.float32),
+            hit=np.ascontiguousarray(beams.hit[sees]),
+            T_base_sensor=T,
+            sensor=name,
+        )
+
+
+def errors_of(updates, simulation):
+    return compute_absolute_errors(
+        np.array([update.pose for update in updates]), simulation.truth.T_world_base
+    )
+
+
+def test_poses_are_as_good_as_those_of_one_laser_that_sees_the_same(simulation, both):
+    recording = simulation.recording
+    with LiveMapper({"threads": 1}) as mapper:
+        one = [
+            mapper.push(beams, recording.T_odom_base[t])
+            for t, beams in enumerate(iter_beams(recording))
+        ]
+    wanted = errors_of(one, simulation).rmse
+    _, updates, is_front = both
+    for name, of_laser in (("front", is_front), ("rear", ~is_front)):
+        chosen = [update for update, is_its in zip(updates, of_laser, strict=True) if is_its]
+        errors = errors_of(chosen, simulation)
+        assert errors.rmse < 1.2 * wanted + 0.002, name
+        assert errors.max < 0.05, name
+
+
+def test_both_lasers_tell_movers(simulation, both):
+    updates, recording = both[1], simulation.recording
+    says, moves = [], []
+    for t in range(recording.n_scans):
+        beams = recording.beams_of(t)
+        static, hit = simulation.truth.static[beams], recording.hit[beams]
+        ahead = recording.points[beams][:, 0] >= 0.0
+        for update, half in ((updates[2 * t], ahead), (updates[2 * t + 1], ~ahead)):
+            says.append(update.p_static[hit[half]] < 0.5)
+            moves.append(~static[half & hit])
+    says, moves = np.concatenate(says), np.concatenate(moves)
+    assert 2 * (says & moves).sum() / (says.sum() + moves.sum()) > 0.85
+
+
+def test_all_scans_of_both_are_kept(simulation, both):
+    mapper, updates, _ = both
+    errors = compute_absolute_errors(
+        mapper.poses, np.repeat(simulation.truth.T_world_base, 2, axis=0)
+    )
+    assert len(mapper.poses) == len(updates)
+    assert errors.rmse < 0.01
