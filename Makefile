@@ -92,7 +92,7 @@ test-slow: $(VENV)/tested
 # ROS 2 beside .venv, and another DDS library that judges; nothing leaves this machine
 ROS_DISTROS := jazzy kilted
 
-build/ros/%/created: tools/ros_environment.sh $(shell find tests/ros/tf2_msgs -type f)
+build/ros/%/created: tools/ros_environment.sh $(shell find tests/ros/*_msgs -type f)
 	@tools/require.sh "$(PYTHON)"
 	@echo "making build/ros/$* with ROS 2"
 	@tools/ros_environment.sh "$(PYTHON)" build/ros/$* $*

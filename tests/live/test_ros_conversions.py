@@ -117,6 +117,18 @@ def test_poses_and_transforms():
     assert heading(transform.transform.rotation) == pytest.approx(-3.0)
 
 
+def test_poses_in_space():
+    T = np.eye(4)
+    T[:3, :3] = [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
+    T[:3, 3] = 1.0, 2.0, 3.0
+    pose = MagicMock()
+    conversions.fill_pose(pose, "map", 1, T, np.arange(36.0).reshape(6, 6))
+    assert pose.pose.pose.position.z == 3.0
+    q = pose.pose.pose.orientation
+    np.testing.assert_allclose([q.x, q.y, q.z, q.w], [0.5**0.5, 0.0, 0.0, 0.5**0.5])
+    np.testing.assert_array_equal(pose.pose.covariance, np.arange(36.0))
+
+
 def test_frames_without_their_old_slash():
     message = MagicMock(header=header(1, "/laser"))
     assert conversions.scan_frame(message) == "laser"

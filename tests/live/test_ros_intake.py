@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from ros_messages import laser_scan, odometry, tf, transform
+from ros_messages import laser_scan, odometry, point_cloud, tf, transform
 
 from stillmap.core import se2
 from stillmap.live.ros import intake
@@ -153,6 +153,90 @@ def test_a_pause_of_the_robot_is_no_leap():
     feed(scans, 1 * S)
     feed(scans, 61 * S, now=60.0)
     assert stamps(take_all(scans, 60.0)) == [1 * S, 61 * S]
+
+
+def test_a_clock_that_is_set_back_for_good():
+    scans = make(odom_frame="", **POSE)
+    feed(scans, 3600 * S)
+    assert stamps(take_all(scans, 0.0)) == [3600 * S]
+    for k in range(21):
+        feed(scans, (1000 + k) * S // 10, now=0.1 * k)
+    assert scans.set_back == 0.0  # not yet for 2 s
+    feed(scans, 103 * S, now=2.2)
+    assert scans.set_back == pytest.approx(3497.0)
+    feed(scans, 104 * S, now=2.3)
+    assert take_all(scans, 2.3) == []
+    assert scans.counts == {intake.SET_BACK: 1, intake.BACKWARDS: 23}
+    scans.begin_anew()
+    feed(scans, 105 * S, now=2.4)
+    assert stamps(take_all(scans, 2.4)) == [105 * S]
+    assert scans.set_back == 0.0
+
+
+def test_a_clock_that_catches_up_was_not_set_back():
+    scans = make(odom_frame="", **POSE)
+    for now, stamp in ((0.0, 100), (0.1, 50), (3.0, 50), (3.1, 101)):
+        feed(scans, stamp * S, now=now)
+        scans.take(now)
+    assert scans.set_back == 0.0
+    feed(scans, 50 * S, now=3.2)  # one laser of two has a wrong clock
+    feed(scans, 104 * S, now=6.0)
+    feed(scans, 53 * S, now=6.1)
+    assert scans.set_back == 0.0
+
+
+def test_transforms_from_before_the_clock_was_set_back_are_forgotten():
+    scans = make()
+    scans.add_transforms(tf(transform("base_footprint", "laser", 0, x=0.2)), static=True)
+    for stamp in (100, 102):
+        scans.add_transforms(tf(transform("odom", "base_footprint", stamp * S)), static=False)
+    feed(scans, 102 * S)
+    assert scans.take(0.0) is not None
+    scans.begin_anew()
+    for stamp, x in ((95, 1.0), (96, 1.0)):  # less ago than transforms are kept
+        moved = transform("odom", "base_footprint", stamp * S, x=x)
+        scans.add_transforms(tf(moved), static=False)
+    feed(scans, 96 * S)
+    arrival = scans.take(0.0)
+    assert arrival.T_odom_base[0, 2] == 1.0
+    assert arrival.beams.T_base_sensor[0, 2] == pytest.approx(0.2)
+
+
+def test_clouds_have_mount_and_odometry_in_space():
+    scans = make(cloud_topic=("points",))
+    mount = transform("base_footprint", "lidar", 0, x=0.2, roll=0.3)
+    mount.transform.translation.z = 1.5
+    scans.add_transforms(tf(mount), static=True)
+    odom = transform("odom", "base_footprint", 1 * S, x=3.0, roll=0.1)
+    scans.add_transforms(tf(odom), static=False)
+    points = [[1.0, 2.0, 3.0], [np.nan, 0.0, 0.0], [4.0, 0.0, 0.0]]
+    scans.add_scan("points", point_cloud(1 * S, points, times=[0.0, 0.05, 0.1]), 0.0)
+    arrival = scans.take(0.0)
+    beams = arrival.beams
+    np.testing.assert_allclose(beams.points[[0, 2]], [points[0], points[2]])
+    np.testing.assert_array_equal(beams.hit, [True, False, True])
+    np.testing.assert_allclose(beams.beam_time, [0.0, 0.05, 0.1], atol=1e-6)
+    assert (beams.sensor, beams.stamp_ns) == ("points", 1 * S)
+    assert beams.T_base_sensor[2, 3] == 1.5
+    assert beams.T_base_sensor[2, 1] == pytest.approx(np.sin(0.3))
+    assert arrival.T_odom_base.shape == (4, 4)
+    assert arrival.T_odom_base[2, 1] == pytest.approx(np.sin(0.1))
+    scans.add_odometry(odometry(2 * S))
+    broken = point_cloud(2 * S, points)
+    broken.fields = broken.fields[:2]
+    scans.add_scan("points", broken, 0.0)
+    assert scans.counts == {"cloud without x, y and z": 1}
+
+
+def test_the_mount_of_a_cloud_by_a_parameter():
+    scans = make(cloud_topic="points", laser_pose=(0.1, 0.2, 0.3, 0.0, 0.0, np.pi / 2))
+    scans.add_odometry(odometry(1 * S, x=2.0))
+    scans.add_scan("points", point_cloud(1 * S, [[9.0, 0.0, 0.0], [2.0, 0.0, 0.0]]), 0.0)
+    arrival = scans.take(0.0)
+    expected = np.eye(4)
+    expected[:2, :2], expected[:3, 3] = [[0.0, -1.0], [1.0, 0.0]], [0.1, 0.2, 0.3]
+    np.testing.assert_allclose(arrival.beams.T_base_sensor, expected, atol=1e-12)
+    assert arrival.T_odom_base[0, 3] == 2.0
 
 
 def test_two_lasers_are_put_in_order():

@@ -42,6 +42,11 @@ def test_a_whole_number_is_a_number():
         ({"scan_topic": []}, "parameter scan_topic: expected at least one name, got ()"),
         ({"scan_topic": [1]}, "parameter scan_topic: expected text, got 1"),
         ({"laser_pose": [1.0]}, "parameter laser_pose: expected 3 numbers, got (1.0,)"),
+        ({"cloud_topic": [2.0]}, "parameter cloud_topic: expected text, got 2.0"),
+        (
+            {"cloud_topic": "points", "laser_pose": [1.0, 0.0, 0.0]},
+            "parameter laser_pose: expected 6 numbers, got (1.0, 0.0, 0.0)",
+        ),
     ],
 )
 def test_wrong_values_are_told(given, says):

@@ -33,11 +33,11 @@ def environment(domain, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def tf_environment(environment):
-    """The same, with the tf2_msgs that was built, which the package index does not have."""
-    folder = Path(sys.prefix) / "tf2"
+    """The same, with tf2_msgs and map_msgs, which were built: the package index has neither."""
+    folder = Path(sys.prefix) / "messages"
     version = f"python{sys.version_info.major}.{sys.version_info.minor}"
     if not folder.is_dir():
-        pytest.skip(f"no tf2_msgs in {folder}: tools/ros_environment.sh builds it")
+        pytest.skip(f"no messages in {folder}: tools/ros_environment.sh builds it")
 
     def extend(name, path):
         return os.pathsep.join([str(path), *filter(None, [environment.get(name)])])
@@ -64,6 +64,19 @@ def recording(simulation, tmp_path_factory):
     path = tmp_path_factory.mktemp("robot") / "recording"
     write(simulation.recording, path)
     return path
+
+
+@pytest.fixture(scope="session")
+def sweeps(tmp_path_factory):
+    """Sweeps of a lidar in a street: the simulation, and the folder of its recording."""
+    from stillmap.io.stillmap_folder import write
+    from stillmap.sim import scene_by_name, simulate
+
+    changes = {"lidar": {"channels": 16, "columns": 360}, "robot": {"scans": 60}}
+    simulation = simulate(scene_by_name("street", changes), 1)
+    path = tmp_path_factory.mktemp("lidar") / "recording"
+    write(simulation.recording, path)
+    return simulation, path
 
 
 class Process:
@@ -126,7 +139,7 @@ def start_node(start, tmp_path):
 def start_robot(start, environment, domain, recording, tmp_path):
     """Starts robots; the second value reads when they sent which stamps."""
 
-    def run(*flags):
+    def run(*flags, recording=recording):
         log = tmp_path / "robot.jsonl"
         words = [HERE / "robot.py", recording, "--domain", domain, "--log", log, *flags]
         robot = start(words, environment)

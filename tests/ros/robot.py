@@ -1,4 +1,5 @@
-"""A robot: publishes a recording as LaserScan and Odometry messages, in a process of its own."""
+"""A robot: publishes a recording as LaserScan or PointCloud2, and Odometry messages, in a process
+of its own."""
 
 import argparse
 import json
@@ -8,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import ros_idl as idl
 from dds import Participant, wait_for
+from scipy.spatial.transform import Rotation
 
 from stillmap.core import se2
 from stillmap.io.stillmap_folder import read
@@ -18,6 +20,9 @@ def to_stamp(ns):
 
 
 def to_pose(T):
+    if len(T) == 4:
+        q = Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
+        return idl.Pose(idl.Point(*T[:3, 3].tolist()), idl.Quaternion(*q))
     x, y, theta = se2.parameters(T).tolist()
     turn = idl.Quaternion(z=float(np.sin(theta / 2)), w=float(np.cos(theta / 2)))
     return idl.Pose(idl.Point(x, y, 0.0), turn)
@@ -39,6 +44,17 @@ def to_scan(recording, t, stamp, part=slice(None)):
         range_max=float(np.nanmax(length[~hit], initial=30.0)),
         ranges=np.where(hit, length, np.inf).tolist(),
     )
+
+
+def to_cloud(recording, t, stamp):
+    """The sweep, with times of its points."""
+    beams = recording.beams_of(t)
+    points = np.where(recording.hit[beams, None], recording.points[beams], np.nan)
+    rows = np.column_stack([points, recording.beam_time[beams]]).astype("<f4")
+    fields = [idl.PointField(name, 4 * k, 7, 1) for k, name in enumerate("xyzt")]
+    header = idl.Header(to_stamp(stamp), "laser")
+    data = list(rows.tobytes())
+    return idl.PointCloud2(header, 1, len(rows), fields, False, 16, len(data), data, False)
 
 
 def make_transform(parent, child, stamp, T):
@@ -72,6 +88,7 @@ def main():
     p.add_argument("--swap", type=float, default=0.0)
     p.add_argument("--jump", type=int, default=[], action="append", help="scan with an old stamp")
     p.add_argument("--leap", type=int, default=[], action="append", help="scan far in the future")
+    p.add_argument("--shift", type=float, default=0.0, help="s that all stamps are later")
     p.add_argument("--split", action="store_true", help="as two lasers: scan_right, scan_left")
     p.add_argument("--tf", action="store_true", help="odometry and mount on /tf and /tf_static")
     args = p.parse_args()
@@ -80,7 +97,10 @@ def main():
     parts = {"scan": slice(None)}
     if args.split:
         parts = {"scan_right": slice(0, 90), "scan_left": slice(90, None)}
-    scans = {topic: robot.write(idl.LaserScan, topic) for topic in parts}
+    if recording.dimension == 3:
+        parts = {"points": None}
+    kind = idl.LaserScan if recording.dimension == 2 else idl.PointCloud2
+    scans = {topic: robot.write(kind, topic) for topic in parts}
     odometry = robot.write(idl.Odometry, "odom", reliable=True)
     tf = robot.write(idl.TFMessage, "tf", reliable=True) if args.tf else None
     if args.tf:
@@ -89,7 +109,8 @@ def main():
         static.write(idl.TFMessage([mount]))
     for writer in scans.values():
         assert wait_for(lambda w=writer: w.get_publication_matched_status().current_count, 30.0)
-    T, stamps = recording.T_odom_base, recording.stamp_ns
+    T = recording.T_odom_base
+    stamps = recording.stamp_ns + round(1e9 * args.shift)
 
     def send_odometry(stamp, pose):
         if args.tf:
@@ -112,7 +133,10 @@ def main():
             stamp = int(stamps[t])
             stamp += -3_000_000_000 if t in args.jump else 0
             stamp += 3_600_000_000_000 if t in args.leap else 0
-            messages = {name: to_scan(recording, t, stamp, part) for name, part in parts.items()}
+            if recording.dimension == 3:
+                messages = {"points": to_cloud(recording, t, stamp)}
+            else:
+                messages = {k: to_scan(recording, t, stamp, part) for k, part in parts.items()}
             sent = time.monotonic()
             for name, message in messages.items():
                 scans[name].write(message)

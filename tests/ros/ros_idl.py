@@ -6,7 +6,17 @@ Written after the definitions in common_interfaces; names are those that ROS 2 g
 from dataclasses import dataclass, field
 
 from cyclonedds.idl import IdlStruct
-from cyclonedds.idl.types import array, byte, float32, float64, int8, int32, sequence, uint32
+from cyclonedds.idl.types import (
+    array,
+    byte,
+    float32,
+    float64,
+    int8,
+    int32,
+    sequence,
+    uint8,
+    uint32,
+)
 
 
 def _name(package: str, message: str) -> str:
@@ -133,6 +143,104 @@ class OccupancyGrid(IdlStruct, typename=_name("nav_msgs", "OccupancyGrid")):
     header: Header = field(default_factory=Header)
     info: MapMetaData = field(default_factory=MapMetaData)
     data: sequence[int8] = field(default_factory=list)
+
+
+@dataclass
+class OccupancyGridUpdate(IdlStruct, typename=_name("map_msgs", "OccupancyGridUpdate")):
+    header: Header = field(default_factory=Header)
+    x: int32 = 0
+    y: int32 = 0
+    width: uint32 = 0
+    height: uint32 = 0
+    data: sequence[int8] = field(default_factory=list)
+
+
+@dataclass
+class PoseArray(IdlStruct, typename=_name("geometry_msgs", "PoseArray")):
+    header: Header = field(default_factory=Header)
+    poses: sequence[Pose] = field(default_factory=list)
+
+
+@dataclass
+class PointField(IdlStruct, typename=_name("sensor_msgs", "PointField")):
+    name: str = ""
+    offset: uint32 = 0
+    datatype: uint8 = 0
+    count: uint32 = 0
+
+
+@dataclass
+class PointCloud2(IdlStruct, typename=_name("sensor_msgs", "PointCloud2")):
+    header: Header = field(default_factory=Header)
+    height: uint32 = 0
+    width: uint32 = 0
+    fields: sequence[PointField] = field(default_factory=list)
+    is_bigendian: bool = False
+    point_step: uint32 = 0
+    row_step: uint32 = 0
+    data: sequence[uint8] = field(default_factory=list)
+    is_dense: bool = False
+
+
+@dataclass
+class ColorRGBA(IdlStruct, typename=_name("std_msgs", "ColorRGBA")):
+    r: float32 = 0.0
+    g: float32 = 0.0
+    b: float32 = 0.0
+    a: float32 = 0.0
+
+
+@dataclass
+class Duration(IdlStruct, typename=_name("builtin_interfaces", "Duration")):
+    sec: int32 = 0
+    nanosec: uint32 = 0
+
+
+@dataclass
+class CompressedImage(IdlStruct, typename=_name("sensor_msgs", "CompressedImage")):
+    header: Header = field(default_factory=Header)
+    format: str = ""
+    data: sequence[uint8] = field(default_factory=list)
+
+
+@dataclass
+class UVCoordinate(IdlStruct, typename=_name("visualization_msgs", "UVCoordinate")):
+    u: float32 = 0.0
+    v: float32 = 0.0
+
+
+@dataclass
+class MeshFile(IdlStruct, typename=_name("visualization_msgs", "MeshFile")):
+    filename: str = ""
+    data: sequence[uint8] = field(default_factory=list)
+
+
+@dataclass
+class Marker(IdlStruct, typename=_name("visualization_msgs", "Marker")):
+    header: Header = field(default_factory=Header)
+    ns: str = ""
+    id: int32 = 0
+    type: int32 = 0
+    action: int32 = 0
+    pose: Pose = field(default_factory=Pose)
+    scale: Vector3 = field(default_factory=Vector3)
+    color: ColorRGBA = field(default_factory=ColorRGBA)
+    lifetime: Duration = field(default_factory=Duration)
+    frame_locked: bool = False
+    points: sequence[Point] = field(default_factory=list)
+    colors: sequence[ColorRGBA] = field(default_factory=list)
+    texture_resource: str = ""
+    texture: CompressedImage = field(default_factory=CompressedImage)
+    uv_coordinates: sequence[UVCoordinate] = field(default_factory=list)
+    text: str = ""
+    mesh_resource: str = ""
+    mesh_file: MeshFile = field(default_factory=MeshFile)
+    mesh_use_embedded_materials: bool = False
+
+
+@dataclass
+class MarkerArray(IdlStruct, typename=_name("visualization_msgs", "MarkerArray")):
+    markers: sequence[Marker] = field(default_factory=list)
 
 
 @dataclass

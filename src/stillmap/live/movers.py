@@ -14,9 +14,9 @@ Float = NDArray[np.float64]
 Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
-_MAX_POINTS = 2000  # of a scan: every k-th of more
+_MAX_POINTS = 1200  # of a scan: every k-th of more
 _LINK = 0.35  # m between neighbours of one cluster in a planar scan
-_CELL = 0.2  # m: in 3D end points in a cell count as their mean, neighbouring cells are connected
+_CELL = 0.25  # m: in 3D end points in a cell count as their mean, neighbouring cells are connected
 # m around a cluster within which so many end points are its own: some beams of walls whose cells
 # are not known well are dynamic
 _AMID, _MIN_SHARE = 0.3, 0.35
@@ -30,7 +30,8 @@ _GATE, _SPACING, _SPACING_PER_METRE = 0.2, 0.5, 0.02
 _GATE_SIGMAS, _MAX_GATE = 2.0, 1.0  # standard deviations of the prediction in addition; m
 _MIN_RADIUS, _MAX_RADIUS = 0.2, 2.5  # m: a person, a car
 _GROWTH, _SHRINKAGE = 0.3, 0.03  # gains of the radius per scan: objects are often half hidden
-_SIGMAS, _MIN_SCANS = 3.0, 5  # beyond which a displacement is one; scans that show it
+# beyond which a displacement is one; scans with two end points: a single beam slides along a wall
+_SIGMAS, _MIN_SCANS = 3.0, 4
 _HEIGHT_WEIGHT = 0.3  # of vertical distances: objects are taller than wide, and seen in part
 
 
@@ -149,7 +150,7 @@ class MoverTracker:
         center = mean + _offset(mean, sensor, tracks.radius)
         self._states = kalman.update(self._states, seen, center, _POSITION_STD)
         tracks.seen_ns[seen] = self._now_ns
-        tracks.scans += seen
+        tracks.scans += np.bincount(claims[own], minlength=len(seen)) >= 2
         moved = self._distance(self._states.x - tracks.origin)
         noise = np.sqrt(self._states.P[:, 0] + _POSITION_STD**2)
         tracks.is_mover |= (moved > _SIGMAS * noise) & (tracks.scans >= _MIN_SCANS)

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from stillmap.core import se2
 from stillmap.core.grid_map import GridMap
@@ -25,10 +26,10 @@ _NS = 10**9
 
 
 class Mount(NamedTuple):
-    """A laser on the robot.
+    """A laser or a lidar on the robot.
 
     Attributes:
-        T_base_sensor: (3, 3).
+        T_base_sensor: (3, 3), of a lidar (4, 4).
         is_upside_down: its angles change their sign.
     """
 
@@ -100,22 +101,20 @@ def fill_header(header: Any, frame: str, stamp: int) -> None:
 
 
 def fill_transform(message: Any, parent: str, child: str, stamp: int, T: Float) -> None:
-    """Set a TransformStamped to a planar pose (3, 3) T_parent_child."""
+    """Set a TransformStamped to a pose (D+1, D+1) T_parent_child."""
     fill_header(message.header, parent, stamp)
     message.child_frame_id = child
-    t = message.transform.translation
-    t.x, t.y, t.z = float(T[0, 2]), float(T[1, 2]), 0.0
+    _fill_position(message.transform.translation, T)
     _fill_rotation(message.transform.rotation, T)
 
 
 def fill_pose(message: Any, frame: str, stamp: int, T: Float, covariance: Float) -> None:
-    """Set a PoseWithCovarianceStamped to a planar pose (3, 3) and its covariance (3, 3)."""
+    """Set a PoseWithCovarianceStamped to a pose (D+1, D+1), covariance (3, 3) or in 3D (6, 6)."""
     fill_header(message.header, frame, stamp)
-    p = message.pose.pose.position
-    p.x, p.y, p.z = float(T[0, 2]), float(T[1, 2]), 0.0
+    _fill_position(message.pose.pose.position, T)
     _fill_rotation(message.pose.pose.orientation, T)
     every = np.zeros((6, 6))
-    rows = [0, 1, 5]  # x, y, yaw
+    rows = [0, 1, 5] if len(T) == 3 else list(range(6))  # x, y, yaw
     every[np.ix_(rows, rows)] = covariance
     message.pose.covariance = every.ravel()
 
@@ -196,6 +195,13 @@ def scan_frame(message: Any) -> str:
     return frame_name(message.header.frame_id)
 
 
+def _fill_position(p: Any, T: Float) -> None:
+    p.x, p.y, p.z = float(T[0, -1]), float(T[1, -1]), float(T[2, 3]) if len(T) == 4 else 0.0
+
+
 def _fill_rotation(q: Any, T: Float) -> None:
+    if len(T) == 4:
+        q.x, q.y, q.z, q.w = Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
+        return
     half = 0.5 * math.atan2(T[1, 0], T[0, 0])
     q.x, q.y, q.z, q.w = 0.0, 0.0, math.sin(half), math.cos(half)

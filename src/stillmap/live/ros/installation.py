@@ -37,6 +37,11 @@ class Ros:
         except ImportError:
             return None
 
+    def create_publisher(self, node: Any, kind: str, topic: str, qos: Any) -> Any:
+        """A publisher of a node; None: the package of its messages is missing."""
+        message = self.message(kind)
+        return None if message is None else node.create_publisher(message, topic, qos)
+
     def module(self, name: str) -> Any:
         """A module of rclpy, as `qos`."""
         return import_module(f"rclpy.{name}")

@@ -8,11 +8,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from stillmap.core import se2
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io.ros.base_frame import project_to_plane
 from stillmap.io.ros.messages import frame_name, stamp_ns
+from stillmap.io.ros.point_cloud2 import find_layout
+from stillmap.live.ros.clouds import to_cloud_beams
 from stillmap.live.ros.conversions import (
     Mount,
     scan_frame,
@@ -36,10 +39,12 @@ NO_MOUNT = "no transform from the robot to the laser"
 OVERFLOW = "more scans than can wait"
 NO_ODOMETRY = "scan without odometry"
 BAD_TRANSFORM = "transform that is none"
+SET_BACK = "clock set back"
 
 _FIRST_ODOMETRY = 2.0  # s for which the first scan waits for odometry
 _SILENCE = 1.0  # s after which nobody waits for a laser any more
 _LEAP_NS = 5 * 10**9  # that one scan alone may not be ahead of the one before
+_SET_BACK_AFTER = 2.0  # s in which all scans are older than the last one by more than the same
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,9 +53,9 @@ class Arrival(ShortRepr):
 
     Attributes:
         topic: where it came from.
-        message: the LaserScan.
+        message: the LaserScan or PointCloud2.
         beams: of the scan.
-        T_odom_base: (3, 3), or None: not known.
+        T_odom_base: (D+1, D+1), or None: not known.
         arrived: s of a steady clock.
     """
 
@@ -88,6 +93,7 @@ class ScanIntake:
 
     Attributes:
         counts: scans and messages that were left out, by the reason.
+        set_back: s by which the clock of all scans was set back for good; 0: it was not.
     """
 
     def __init__(self, parameters: Parameters) -> None:
@@ -102,6 +108,18 @@ class ScanIntake:
         self._last_ns, self._last_topics = 0, set[str]()  # of the last scan that was mapped
         self._first_arrived: float | None = None
         self._awaits_odometry = True
+        self._behind_since: float | None = None
+        self.set_back = 0.0
+
+    def begin_anew(self) -> None:
+        """Forget scans, odometry and transforms that are not static: time has begun anew."""
+        self._lasers.clear()
+        self._waiting.clear()
+        self._last_ns, self._last_topics = 0, set()
+        self._first_arrived, self._awaits_odometry = None, True
+        self._behind_since, self.set_back = None, 0.0
+        self.transforms.forget()
+        self.odometry.forget()
 
     @property
     def has_waiting(self) -> bool:
@@ -126,10 +144,11 @@ class ScanIntake:
         self._awaits_odometry = True
 
     def add_scan(self, topic: str, message: Any, now: float) -> None:
-        """Add a LaserScan that arrived now, in seconds of a steady clock."""
+        """Add a LaserScan or PointCloud2 that arrived now, in seconds of a steady clock."""
         stamp = stamp_ns(message.header)
-        fault = shape_of(message).find_fault() or (None if stamp > 0 else NO_STAMP)
+        fault = self._find_damage(message) or (None if stamp > 0 else NO_STAMP)
         if fault is None:
+            self._check_set_back(stamp, now)
             fault = self._check_leap(topic, stamp, now)
         if fault is not None:
             self.counts[fault] += 1
@@ -162,6 +181,22 @@ class ScanIntake:
             return self._release(mount, pose)
         return None
 
+    def _find_damage(self, message: Any) -> str | None:
+        if self._parameters.dimension == 2:
+            return shape_of(message).find_fault()
+        layout = find_layout(message)
+        return layout if isinstance(layout, str) else None
+
+    def _check_set_back(self, stamp: int, now: float) -> None:
+        """One scan with an old stamp means nothing, but a while in which there are no others."""
+        if stamp >= self._last_ns - _LEAP_NS:
+            self._behind_since, self.set_back = None, 0.0
+        elif self._behind_since is None:
+            self._behind_since = now
+        elif now - self._behind_since > _SET_BACK_AFTER:
+            self.counts[SET_BACK] += self.set_back == 0.0
+            self.set_back = 1e-9 * (self._last_ns - stamp)
+
     def _find_fault(self, scan: _Waiting) -> str | None:
         """Why a scan cannot be mapped after those that were."""
         if scan.stamp_ns < self._last_ns:
@@ -192,7 +227,10 @@ class ScanIntake:
             self.counts[NO_ODOMETRY] += 1
             self._awaits_odometry = False
         limits = self._parameters.min_laser_range, self._parameters.max_laser_range
-        beams = to_scan_beams(scan.message, scan.topic, mount, *limits)
+        if self._parameters.dimension == 2:
+            beams = to_scan_beams(scan.message, scan.topic, mount, *limits)
+        else:
+            beams = to_cloud_beams(scan.message, scan.topic, mount.T_base_sensor, *limits)
         return Arrival(scan.topic, scan.message, beams, pose, scan.arrived)
 
     def _check_leap(self, topic: str, stamp: int, now: float) -> str | None:
@@ -234,6 +272,8 @@ class ScanIntake:
         T = np.eye(4) if frame == base else self.transforms.lookup(base, frame, stamp)
         if T is None:
             return None
+        if self._parameters.dimension == 3:
+            return Mount(T)
         flat, is_upside_down, _ = project_to_plane(T[None])
         return Mount(flat[0], is_upside_down)
 
@@ -241,5 +281,10 @@ class ScanIntake:
         """The mount that a parameter tells."""
         if not self._parameters.laser_pose:
             return None
-        k = self._parameters.scan_topic.index(topic)
-        return Mount(se2.matrix(*self._parameters.laser_pose[3 * k : 3 * k + 3]))
+        k = self._parameters.topics.index(topic)
+        if self._parameters.dimension == 2:
+            return Mount(se2.matrix(*self._parameters.laser_pose[3 * k : 3 * k + 3]))
+        T, values = np.eye(4), self._parameters.laser_pose[6 * k : 6 * k + 6]
+        T[:3, :3] = Rotation.from_euler("xyz", values[3:]).as_matrix()  # about fixed axes
+        T[:3, 3] = values[:3]
+        return Mount(T)

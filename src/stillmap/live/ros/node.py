@@ -15,7 +15,14 @@ from stillmap.core.profiling import Progress, no_progress
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.ros import publishers
 from stillmap.live.ros.installation import Ros
-from stillmap.live.ros.intake import BACKWARDS, NO_MOUNT, NO_ODOMETRY, Arrival, ScanIntake
+from stillmap.live.ros.intake import (
+    BACKWARDS,
+    NO_MOUNT,
+    NO_ODOMETRY,
+    SET_BACK,
+    Arrival,
+    ScanIntake,
+)
 from stillmap.live.ros.parameters import Parameters, declare
 from stillmap.live.ros.publishers import TF_MESSAGE, Publishers
 from stillmap.live.scan import ScanBeams
@@ -27,6 +34,12 @@ _TF_DEPTH, _ODOMETRY_DEPTH = 100, 50
 _POLL = 0.02  # s between two looks at scans that wait
 _STATUS_PERIOD = 1.0  # s
 _LATENCIES = 1000  # scans over which latency is told
+_OPTIONAL = {
+    TF_MESSAGE: "/tf is neither read nor written. Mounts come from the parameter laser_pose, "
+    "odometry from odom_topic; the pose is on the topic pose.",
+    "visualization_msgs/msg/MarkerArray": "movers are published as mover_poses alone",
+    "map_msgs/msg/OccupancyGridUpdate": "the map is published whole, without updates",
+}
 Show = Callable[[LiveMapper, ScanBeams, Update], None]
 
 
@@ -67,16 +80,22 @@ class LiveNode:
             options = config.override(options, {"slam": changes}, "parameter")
         self._intake = ScanIntake(self.parameters)
         self._publishers = Publishers(ros, self.node, self.parameters, options.output.map_mode)
+        self._is_simulated = bool(self.node.get_parameter("use_sim_time").value)
+        self._options, self._make_mapper = options, make_mapper
+        self._former: threading.Thread | None = None  # writes the map before this one
         self._lock, self._save_lock = threading.Lock(), threading.Lock()
         self._latency = deque[float](maxlen=_LATENCIES)
         self._stamp_ns, self.scans, self._map_due, self._is_map_old = 0, 0, 0.0, False
         self._doubts, self._reported = Counter[str](), Counter[str]()
         self._subscribe()
+        self._tell_what_is_missing()
         self.save_node = self._make_save_node()
         self._mapper = make_mapper(options)
 
     def close(self) -> None:
         """Forget all scans."""
+        if self._former is not None:
+            self._former.join()
         self._mapper.close()
         self.save_node.destroy_node()
         self.node.destroy_node()
@@ -109,9 +128,10 @@ class LiveNode:
         sensor = qos.QoSProfile(
             depth=names.scan_queue_size, reliability=qos.ReliabilityPolicy.BEST_EFFORT
         )
-        laser_scan = self._ros.message("sensor_msgs/msg/LaserScan")
-        for topic in names.scan_topic:
-            node.create_subscription(laser_scan, topic, self._scan_callback(topic), sensor)
+        kind = "LaserScan" if names.dimension == 2 else "PointCloud2"
+        scan = self._ros.message(f"sensor_msgs/msg/{kind}")
+        for topic in names.topics:
+            node.create_subscription(scan, topic, self._scan_callback(topic), sensor)
         odometry = self._ros.message("nav_msgs/msg/Odometry")
         if names.odom_frame:
             deep = qos.QoSProfile(
@@ -140,13 +160,16 @@ class LiveNode:
             node.create_service(trigger, name, self._on_save)
         return node
 
+    def _tell_what_is_missing(self) -> None:
+        """Packages of messages without which something is not published."""
+        for package, lost in _OPTIONAL.items():
+            if self._ros.message(package) is None:
+                name = package.split("/", maxsplit=1)[0]
+                self.node.get_logger().warning(f"{name} is missing: {lost}")
+
     def _subscribe_to_tf(self, qos: Any) -> None:
         message = self._ros.message(TF_MESSAGE)
         if message is None:
-            self.node.get_logger().warning(
-                "tf2_msgs is missing: /tf is neither read nor written. Mounts come from the "
-                "parameter laser_pose, odometry from odom_topic; the pose is on the topic pose."
-            )
             return
         latched = qos.QoSProfile(depth=_TF_DEPTH, durability=qos.DurabilityPolicy.TRANSIENT_LOCAL)
         self.node.create_subscription(message, "/tf", self._on_tf, _TF_DEPTH)
@@ -155,6 +178,8 @@ class LiveNode:
     def _scan_callback(self, topic: str) -> Any:
         def add(message: Any) -> None:
             self._intake.add_scan(topic, message, time.monotonic())
+            if self._intake.set_back and self._is_simulated:
+                self._begin_anew()
             self._answer_all()
 
         return add
@@ -195,12 +220,41 @@ class LiveNode:
                 grid = self._mapper.map
             self._publishers.publish_map(grid, self._stamp_ns)
 
+    def _begin_anew(self) -> None:
+        """Begin a new map: a simulation or the replay of a bag was started again. The one so far is
+        written beside the result, while the new one is made."""
+        folder = self._output.with_name(f"{self._output.name}-before")
+        self.node.get_logger().warning(
+            f"the clock was set back by {self._intake.set_back:.0f} s: a new map begins; "
+            f"the one so far goes to {folder}"
+        )
+        self._intake.begin_anew()
+        self._publishers.begin_anew()
+        if self._former is not None:
+            self._former.join()
+        with self._lock:
+            former, self._mapper = self._mapper, self._make_mapper(self._options)
+            self.scans = 0
+        self._former = threading.Thread(target=self._save_former, args=(former, folder))
+        self._former.start()
+
+    def _save_former(self, mapper: LiveMapper, folder: Path) -> None:
+        with self._save_lock:  # a request to save it may not have been done yet
+            try:
+                mapper.save(folder, overwrite=True)
+            except (InputError, OSError) as error:
+                self.node.get_logger().error(str(error))
+            finally:
+                mapper.close()
+
     def _answer(self, arrival: Arrival) -> None:
         with self._lock:
             update = self._mapper.push(arrival.beams, arrival.T_odom_base)
         self._publishers.publish_answer(arrival, update)
         self._latency.append(time.monotonic() - arrival.arrived)
         self._stamp_ns, self._is_map_old = arrival.beams.stamp_ns, True
+        if not self._publishers.publish_map_changes(update.changes, self._stamp_ns):
+            self._map_due = time.monotonic()
         self.scans += 1
         self._doubts.update(update.doubts)
         if self._show is not None:
@@ -226,6 +280,8 @@ class LiveNode:
             level, text = publishers.WARN, "; ".join([*new, *(DOUBTS[name] for name in doubts)])
         if new[BACKWARDS] or new[NO_MOUNT]:
             level = publishers.ERROR
+        if self._intake.set_back:
+            text = f"clock set back by {self._intake.set_back:.0f} s: no scan is mapped; {text}"
         self._publishers.publish_status(level, text, values)
         self._warn(new)
 
@@ -237,7 +293,9 @@ class LiveNode:
             NO_MOUNT: f"base_frame is '{names.base_frame}'; frames of TF: {frames}",
             NO_ODOMETRY: f"neither TF from '{names.odom_frame}' to '{names.base_frame}' nor "
             f"'{names.odom_topic}'; scans are mapped without",
-            BACKWARDS: "such scans are left out; if the clock was set back, start the node anew",
+            BACKWARDS: "such scans are left out",
+            SET_BACK: f"by {self._intake.set_back:.0f} s: no scan is mapped until it has caught "
+            "up; to map on, start the node anew",
         }
         for reason in new:
             if self._intake.counts[reason] == new[reason]:  # for the first time

@@ -14,7 +14,7 @@ Float = NDArray[np.float64]
 
 
 class Odometry:
-    """T_odom_base over the last seconds.
+    """T_odom_base over the last seconds; planar where the scans are.
 
     The source that is first able to tell a pose is kept: two of them may differ by any offset.
 
@@ -44,7 +44,7 @@ class Odometry:
         return self._messages.add("odometry", "robot", stamp, values, static=False)
 
     def pose_at(self, stamp: int) -> Float | None:
-        """(3, 3) T_odom_base; None: it is not known (yet)."""
+        """(D+1, D+1) T_odom_base; None: it is not known (yet)."""
         names, topic = self._parameters, self._parameters.odom_topic
         if not self.is_expected:
             return None
@@ -52,13 +52,17 @@ class Odometry:
             T = self._transforms.lookup(names.odom_frame, names.base_frame, stamp)
             if T is not None:
                 self.source = "TF"
-                return to_plane(T)
+                return self._flatten(T)
         if self.source in (None, topic):
             T = self._messages.lookup("odometry", "robot", stamp)
             if T is not None:
                 self.source = topic
-                return to_plane(T @ self._child_to_base(stamp))
+                return self._flatten(T @ self._child_to_base(stamp))
         return None
+
+    def forget(self) -> None:
+        """Forget all that was told so far: time has begun anew."""
+        self._messages.forget()
 
     def begins_after(self, stamp: int) -> bool:
         """True if it is known for later times alone."""
@@ -67,6 +71,9 @@ class Odometry:
             self._transforms.begins_after(names.odom_frame, names.base_frame, stamp)
             or self._messages.begins_after("odometry", "robot", stamp)
         )
+
+    def _flatten(self, T: Float) -> Float:
+        return to_plane(T) if self._parameters.dimension == 2 else T
 
     def _child_to_base(self, stamp: int) -> Float:
         """(4, 4) of the robot's frame in that of the messages; the same where nobody tells."""

@@ -21,13 +21,18 @@ class Parameters:
     """
 
     scan_topic: tuple[str, ...] = _parameter(("scan",), "LaserScan topics: one name, or several")
+    cloud_topic: tuple[str, ...] = _parameter(
+        (), "PointCloud2 topics: one name, or several; where there are any, scan_topic is not read"
+    )
     odom_topic: str = _parameter("odom", "Odometry topic, used where TF has no odometry")
     map_name: str = _parameter("map", "topic of the map")
     map_frame: str = _parameter("map", "frame of the map")
     odom_frame: str = _parameter("odom", "frame of the odometry; empty: there is none")
     base_frame: str = _parameter("base_footprint", "frame of the robot")
     laser_pose: tuple[float, ...] = _parameter(
-        (), "x, y, yaw (m, rad) of each laser on the robot; empty: from /tf_static"
+        (),
+        "x, y, yaw (m, rad) of each laser on the robot; x, y, z, roll, pitch, yaw of each topic of "
+        "clouds; empty: from /tf_static",
     )
     resolution: float = _parameter(0.05, "m, edge of a map cell")
     min_laser_range: float = _parameter(0.0, "m, nearer readings are ignored")
@@ -61,11 +66,21 @@ class Parameters:
             _require(self._raw(name) >= 1, name, "1 or more", self._raw(name))
         for name in ("map_frame", "base_frame", "map_name"):
             _require(bool(self._raw(name)), name, "a name", self._raw(name))
-        n = len(self.scan_topic)
-        _require(n > 0 and all(self.scan_topic), "scan_topic", "at least one name", self.scan_topic)
-        _require(
-            len(self.laser_pose) in (0, 3 * n), "laser_pose", f"{3 * n} numbers", self.laser_pose
-        )
+        names = self.scan_topic
+        _require(bool(names) and all(names), "scan_topic", "at least one name", names)
+        _require(all(self.cloud_topic), "cloud_topic", "names", self.cloud_topic)
+        n = len(self.topics) * (3 if self.dimension == 2 else 6)
+        _require(len(self.laser_pose) in (0, n), "laser_pose", f"{n} numbers", self.laser_pose)
+
+    @property
+    def dimension(self) -> int:
+        """2: scans are planar; 3: they are clouds."""
+        return 3 if self.cloud_topic else 2
+
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """Where scans come from."""
+        return self.cloud_topic or self.scan_topic
 
     def _raw(self, name: str) -> Any:
         return getattr(self, name)
@@ -93,7 +108,7 @@ def declare(declare_one: Callable[[str, Any, str], Any], **defaults: Any) -> Par
 def _convert(name: str, default: Any, value: Any) -> Any:
     """A value of the type of the default; whole numbers do for floats, one value for several."""
     if isinstance(default, tuple):
-        kind: Any = str if name == "scan_topic" else float
+        kind: Any = str if name.endswith("_topic") else float
         several = [value] if isinstance(value, str | float | int) else list(value or ())
         return tuple(_convert(name, kind(), one) for one in several)
     if isinstance(default, float):

@@ -1,5 +1,6 @@
-"""Publishers of the node: map, transform, pose, static and dynamic scans, diagnostics."""
+"""Publishers of the node: pose, transform, diagnostics, and those of map, movers and scans."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -7,25 +8,20 @@ from numpy.typing import NDArray
 
 from stillmap.core.grid_map import GridMap
 from stillmap.io.ros.messages import stamp_ns
-from stillmap.live.ros.conversions import (
-    copy_scan,
-    fill_grid,
-    fill_header,
-    fill_pose,
-    fill_status,
-    fill_transform,
-    split_ranges,
-)
+from stillmap.live.causal_labels import MapChange
+from stillmap.live.ros.conversions import fill_header, fill_pose, fill_status, fill_transform
 from stillmap.live.ros.installation import Ros
 from stillmap.live.ros.intake import Arrival
+from stillmap.live.ros.map_updates import MapPublisher
+from stillmap.live.ros.mover_markers import MoverPublisher
 from stillmap.live.ros.parameters import Parameters
+from stillmap.live.ros.scan_publishers import ScanPublishers
 from stillmap.live.update import Update
 from stillmap.pipeline.options import MapMode
 
 Float = NDArray[np.float64]
 
 TF_MESSAGE = "tf2_msgs/msg/TFMessage"
-_GRID, _SCAN = "nav_msgs/msg/OccupancyGrid", "sensor_msgs/msg/LaserScan"
 _POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 _TRANSFORM = "geometry_msgs/msg/TransformStamped"
 _DIAGNOSTICS, _STATUS = (
@@ -34,7 +30,7 @@ _DIAGNOSTICS, _STATUS = (
 )
 _KEY_VALUE = "diagnostic_msgs/msg/KeyValue"
 
-_POSE_DEPTH, _SCAN_DEPTH, _TF_DEPTH = 10, 5, 100  # messages kept for readers that fall behind
+_POSE_DEPTH, _TF_DEPTH = 10, 100  # messages kept for readers that fall behind
 OK, WARN, ERROR = b"\x00", b"\x01", b"\x02"  # levels of DiagnosticStatus
 
 
@@ -49,20 +45,13 @@ class Publishers:
     """
 
     def __init__(self, ros: Ros, node: Any, parameters: Parameters, mode: MapMode) -> None:
-        self._ros, self._node, self._parameters, self._mode = ros, node, parameters, mode
-        qos = ros.module("qos")
-        latched = qos.QoSProfile(depth=1, durability=qos.DurabilityPolicy.TRANSIENT_LOCAL)
-        self._map = self._create(_GRID, parameters.map_name, latched)
-        self._pose = self._create(_POSE, "pose", _POSE_DEPTH)
-        self._tf = self._create(TF_MESSAGE, "/tf", _TF_DEPTH)
-        self._diagnostics = self._create(_DIAGNOSTICS, "/diagnostics", _POSE_DEPTH)
-        self._scans = {
-            topic: tuple(
-                self._create(_SCAN, f"{topic}_{label}", _SCAN_DEPTH)
-                for label in ("static", "dynamic")
-            )
-            for topic in parameters.scan_topic
-        }
+        self._ros, self._node, self._parameters = ros, node, parameters
+        self._map = MapPublisher(ros, node, parameters.map_name, parameters.map_frame, mode)
+        self._movers = MoverPublisher(ros, node, parameters.map_frame)
+        self._scans = ScanPublishers(ros, node, parameters)
+        self._pose = ros.create_publisher(node, _POSE, "pose", _POSE_DEPTH)
+        self._tf = ros.create_publisher(node, TF_MESSAGE, "/tf", _TF_DEPTH)
+        self._diagnostics = ros.create_publisher(node, _DIAGNOSTICS, "/diagnostics", _POSE_DEPTH)
         self._tf_due_ns = 0
 
     @property
@@ -71,20 +60,29 @@ class Publishers:
         return self._tf is not None
 
     def publish_answer(self, arrival: Arrival, update: Update) -> None:
-        """Pose, transform and labelled scan; the pose first, and none where the robot is lost."""
+        """Pose, transform, movers and labelled scan; the pose first, and nothing in the map where
+        the robot is lost."""
         names, stamp = self._parameters, stamp_ns(arrival.message.header)
-        if "lost" not in update.doubts:
+        is_lost = "lost" in update.doubts
+        if not is_lost:
             pose = self._ros.message(_POSE)()
             fill_pose(pose, names.map_frame, stamp, update.pose, update.covariance)
             self._pose.publish(pose)
             self._publish_transform(update, stamp)
-        self._publish_scans(arrival, update)
+        self._movers.publish([] if is_lost else update.movers, stamp)
+        self._scans.publish(arrival, update.p_static)
 
     def publish_map(self, grid: GridMap, stamp: int) -> None:
         """The whole map; who comes later gets the last one."""
-        message = self._ros.message(_GRID)()
-        fill_grid(message, self._parameters.map_frame, stamp, grid, self._mode)
-        self._map.publish(message)
+        self._map.publish(grid, stamp)
+
+    def publish_map_changes(self, changes: Sequence[MapChange], stamp: int) -> bool:
+        """What changed since; False: a whole map is due, since it has become larger."""
+        return self._map.publish_changes(changes, stamp)
+
+    def begin_anew(self) -> None:
+        """Forget when something was published last: the clock was set back."""
+        self._tf_due_ns = 0
 
     def publish_status(self, level: bytes, text: str, values: dict[str, str]) -> None:
         """One line of diagnostics."""
@@ -96,10 +94,6 @@ class Publishers:
         fill_status(status, name, level, text, values, self._ros.message(_KEY_VALUE))
         message.status = [status]
         self._diagnostics.publish(message)
-
-    def _create(self, kind: str, topic: str, qos: Any) -> Any:
-        message = self._ros.message(kind)
-        return None if message is None else self._node.create_publisher(message, topic, qos)
 
     def _publish_transform(self, update: Update, stamp: int) -> None:
         """From the map to the odometry; to the robot itself where there is no odometry.
@@ -120,15 +114,3 @@ class Publishers:
         fill_transform(transform, names.map_frame, child, until, T)
         message.transforms = [transform]
         self._tf.publish(message)
-
-    def _publish_scans(self, arrival: Arrival, update: Update) -> None:
-        publishers = self._scans[arrival.topic]
-        if not any(publisher.get_subscription_count() for publisher in publishers):
-            return
-        ranges = np.asarray(arrival.message.ranges, np.float32)
-        for publisher, of_label in zip(
-            publishers, split_ranges(ranges, arrival.beams.hit, update.p_static), strict=True
-        ):
-            message = self._ros.message(_SCAN)()
-            copy_scan(message, arrival.message, of_label)
-            publisher.publish(message)

@@ -90,6 +90,10 @@ class TransformBuffer:
             edge.insert(stamp_ns, pose, self._duration_ns)
         return True
 
+    def forget(self) -> None:
+        """Forget all but the static transforms: time has begun anew."""
+        self._edges = {child: edge for child, edge in self._edges.items() if not edge.stamps}
+
     def lookup(self, target: str, source: str, stamp_ns: int) -> Float | None:
         """(4, 4) T_target_source; None: the frames are not connected, or not at this time."""
         up, down = self._path(source), self._path(target)

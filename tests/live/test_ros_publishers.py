@@ -1,0 +1,193 @@
+"""What the node says, without ROS: publishers are lists, messages objects that take any field."""
+
+import math
+from types import SimpleNamespace as Fields
+from unittest.mock import MagicMock
+
+import numpy as np
+import pytest
+from ros_messages import laser_scan, point_cloud
+
+from stillmap.core.grid_map import GridMap
+from stillmap.live.causal_labels import MapChange
+from stillmap.live.movers import Mover
+from stillmap.live.ros.clouds import to_cloud_beams
+from stillmap.live.ros.conversions import Mount, to_scan_beams
+from stillmap.live.ros.map_updates import MapPublisher
+from stillmap.live.ros.mover_markers import MoverPublisher
+from stillmap.live.ros.parameters import Parameters
+from stillmap.live.ros.scan_publishers import ScanPublishers
+
+NAN = math.nan
+
+
+class FakeRos:
+    """Publishers that keep what is published, by topic; `missing` packages are not there."""
+
+    def __init__(self, *missing):
+        self.missing, self.sent, self.listeners = missing, {}, 1
+
+    def message(self, name):
+        return None if name.split("/")[0] in self.missing else MagicMock
+
+    def module(self, _):
+        return MagicMock()
+
+    def create_publisher(self, _, kind, topic, __):
+        if self.message(kind) is None:
+            return None
+        self.sent[topic] = []
+        return Fields(
+            publish=self.sent[topic].append, get_subscription_count=lambda: self.listeners
+        )
+
+
+def make_mover(number, position=(1.0, 2.0), velocity=(0.0, 1.0)):
+    n = 2 * len(position)
+    return Mover(number, np.array(position), np.array(velocity), np.eye(n), 0.3, 2.0)
+
+
+class TestMovers:
+    def test_each_has_a_body_an_arrow_and_its_number(self):
+        ros = FakeRos()
+        MoverPublisher(ros, None, "map").publish([make_mover(7)], 3_000_000_005)
+        (message,) = ros.sent["movers"]
+        body, arrow, text = message.markers
+        assert {m.id for m in message.markers} == {7}
+        assert len({m.ns for m in message.markers}) == 3
+        assert (body.header.frame_id, body.header.stamp.sec) == ("map", 3)
+        assert (body.type, arrow.type, text.type) == (3, 0, 9)
+        assert (body.pose.position.x, body.pose.position.y) == (1.0, 2.0)
+        assert (body.scale.x, body.scale.y) == (0.6, 0.6)
+        begin, end = arrow.points
+        assert (end.x - begin.x, end.y - begin.y, end.z - begin.z) == (0.0, 1.0, 0.0)
+        assert text.text == "7"
+        assert text.pose.position.z > body.pose.position.z
+        assert all(m.lifetime.sec > 0 and m.pose.orientation.w == 1.0 for m in message.markers)
+
+    def test_markers_of_those_that_are_gone_are_removed_once(self):
+        ros = FakeRos()
+        publisher = MoverPublisher(ros, None, "map")
+        for movers in ([make_mover(1), make_mover(2)], [make_mover(2)], [], []):
+            publisher.publish(movers, 1)
+        deleted = [[m.id for m in one.markers if m.action == 2] for one in ros.sent["movers"]]
+        assert deleted == [[], [1, 1, 1], [2, 2, 2]]
+
+    def test_poses_are_headed_where_they_move_and_tell_that_there_is_nobody(self):
+        ros = FakeRos("visualization_msgs")
+        publisher = MoverPublisher(ros, None, "map")
+        publisher.publish([make_mover(1)], 1)
+        publisher.publish([], 2)
+        assert "movers" not in ros.sent
+        first, second = ros.sent["mover_poses"]
+        (pose,) = first.poses
+        q = pose.orientation
+        assert 2.0 * math.atan2(q.z, q.w) == pytest.approx(math.pi / 2)
+        assert second.poses == []
+
+    def test_in_space_they_have_their_own_height(self):
+        ros = FakeRos()
+        mover = make_mover(1, (1.0, 2.0, 3.0), (0.0, 0.0, 0.5))
+        MoverPublisher(ros, None, "map").publish([mover], 1)
+        body, arrow, _ = ros.sent["movers"][0].markers
+        assert body.pose.position.z == 3.0
+        assert arrow.points[1].z == 3.5
+
+    def test_nothing_is_sent_where_nobody_listens(self):
+        ros = FakeRos()
+        ros.listeners = 0
+        MoverPublisher(ros, None, "map").publish([make_mover(1)], 1)
+        assert not any(ros.sent.values())
+
+
+class TestMap:
+    def grid(self, rows=4, columns=6):
+        return GridMap(np.zeros((rows, columns), np.float32), (-0.5, 1.0, 0.0), 0.1)
+
+    def change(self, x, y, value, n=2):
+        return MapChange(np.array([x, y]), np.full((n, n), value, np.float32))
+
+    def test_what_changed_is_one_rectangle_of_the_last_whole_map(self):
+        ros = FakeRos()
+        publisher = MapPublisher(ros, None, "map", "map", "trinary")
+        publisher.publish(self.grid(), 1)
+        changes = [self.change(-5, 10, 1.0), self.change(-2, 12, NAN)]
+        assert publisher.publish_changes(changes, 2_000_000_000)
+        (update,) = ros.sent["map_updates"]
+        assert (update.x, update.y, update.width, update.height) == (0, 0, 5, 4)
+        cells = np.array(update.data).reshape(4, 5)
+        expected = np.zeros((4, 5))
+        expected[:2, :2], expected[2:, 3:] = 100, -1
+        np.testing.assert_array_equal(cells, expected)
+        assert update.header.stamp.sec == 2
+        # what was sent before stays
+        assert publisher.publish_changes([self.change(-4, 11, 0.0)], 3)
+        update = ros.sent["map_updates"][1]
+        assert (update.x, update.y) == (1, 1)
+        np.testing.assert_array_equal(np.array(update.data), [0, 0, 0, 0])
+        assert publisher.publish_changes([self.change(-5, 10, 0.5, n=3)], 4)
+        np.testing.assert_array_equal(np.array(ros.sent["map_updates"][2].data), [-1] * 9)
+
+    @pytest.mark.parametrize("at", [(-6, 10), (0, 12), (-5, 9), (-5, 13)])
+    def test_a_whole_map_is_due_where_it_has_grown(self, at):
+        ros = FakeRos()
+        publisher = MapPublisher(ros, None, "map", "map", "trinary")
+        assert not publisher.publish_changes([self.change(0, 0, 1.0)], 1)  # there is none yet
+        publisher.publish(self.grid(), 1)
+        assert not publisher.publish_changes([self.change(*at, 1.0)], 2)
+        assert not ros.sent["map_updates"]
+        ros.listeners = 0  # to updates: the whole map comes when it is due
+        assert publisher.publish_changes([self.change(*at, 1.0)], 2)
+
+    def test_without_map_msgs(self):
+        ros = FakeRos("map_msgs")
+        publisher = MapPublisher(ros, None, "map", "map", "trinary")
+        publisher.publish(self.grid(), 1)
+        assert publisher.publish_changes([self.change(50, 50, 1.0)], 2)
+        assert list(ros.sent) == ["map"]
+
+
+def read_cloud(message):
+    """(n, 4) the values of a PointCloud2 with four fields."""
+    assert [(f.name, f.offset, f.datatype, f.count) for f in message.fields] == [
+        (name, 4 * k, 7, 1) for k, name in enumerate(("x", "y", "z", "p_static"))
+    ]
+    assert message.data.typecode == "B"
+    values = np.frombuffer(message.data.tobytes(), "<f4").reshape(-1, 4)
+    assert (message.height, message.width) == (1, len(values))
+    assert (message.point_step, message.row_step) == (16, 16 * len(values))
+    return values
+
+
+class TestScans:
+    def test_points_of_a_laser_are_in_its_own_frame(self):
+        """Upside down too: the frame is, not the message."""
+        ros = FakeRos()
+        message = laser_scan(5_000_000_001, [1.0, math.inf, 2.0, 3.0], angle_min=0.0)
+        beams = to_scan_beams(message, "scan", Mount(np.eye(3), is_upside_down=True))
+        arrival = Fields(topic="scan", message=message, beams=beams)
+        p_static = np.array([0.9, 0.5, 0.2, NAN], np.float32)
+        ScanPublishers(ros, None, Parameters()).publish(arrival, p_static)
+        (cloud,) = ros.sent["scan_points"]
+        assert (cloud.header.frame_id, cloud.header.stamp.sec) == ("laser", 5)
+        expected = [[1.0, 0.0, 0.0, 0.9], [2 * np.cos(0.2), 2 * np.sin(0.2), 0.0, 0.2]]
+        np.testing.assert_allclose(read_cloud(cloud), expected, rtol=1e-6)
+        assert list(ros.sent["scan_static"][0].ranges)[2] == math.inf
+        assert list(ros.sent["scan_dynamic"][0].ranges)[2] == 2.0
+
+    def test_clouds_are_split_as_clouds(self):
+        ros = FakeRos()
+        points = [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0], [NAN, 0.0, 0.0], [0.0, 90.0, 0.0]]
+        message = point_cloud(5, points)
+        beams = to_cloud_beams(message, "points", np.eye(4), max_range=50.0)
+        np.testing.assert_array_equal(beams.hit, [True, True, False, False])
+        np.testing.assert_allclose(beams.points[3], [0.0, 50.0, 0.0])
+        arrival = Fields(topic="points", message=message, beams=beams)
+        p_static = np.array([0.9, 0.1, NAN, 0.5], np.float32)
+        ScanPublishers(ros, None, Parameters(cloud_topic="points")).publish(arrival, p_static)
+        static, dynamic, every = (
+            read_cloud(ros.sent[f"points_{name}"][0]) for name in ("static", "dynamic", "points")
+        )
+        np.testing.assert_allclose(static, [[1.0, 2.0, 3.0, 0.9]], rtol=1e-6)
+        np.testing.assert_allclose(dynamic, [[4.0, 5.0, 6.0, 0.1]], rtol=1e-6)
+        np.testing.assert_allclose(every, np.concatenate([static, dynamic]))
