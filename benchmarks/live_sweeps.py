@@ -5,9 +5,9 @@ python benchmarks/live_sweeps.py [--worlds street crossing hall] [--channels 64]
 python benchmarks/live_sweeps.py --kitti drive0005_000-076.npz
 
 Simulated worlds: error of the poses against the truth, F1 of "dynamic" over the hits after the
-first 2 s, at the time and at the end, and the same of `stillmap.build`. Movers that stand still so far
-cannot be known: recall of those that have moved by then is told apart. ms: of `LiveMapper.push`,
-loops closed in another process, sweeps pushed at 10 Hz.
+first 2 s, at the time and at the end, and the same of `stillmap.build`. Movers that stand still so
+far cannot be known: recall of those that have moved by then is told apart. ms: of
+`LiveMapper.push`, loops closed in another process, sweeps pushed at 10 Hz.
 kitti: a pack with labels (1: moving, 0: static, -1: unknown), points from 2.5 to 50 m.
 """
 

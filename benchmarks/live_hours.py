@@ -1,0 +1,82 @@
+"""Live mapping for hours: latency and memory while a recording is driven to and fro.
+
+python benchmarks/live_hours.py RECORDING [--hours 1] [--rate 1] [--max-scratch 1e9]
+
+The recording is pushed forwards, backwards, forwards and so on, which is one drive: poses and
+odometry are continuous, people turn round. Scans come at `rate` times their own speed, 0: as fast
+as possible; loops are closed in a process of their own. A latency counts from when a scan is due.
+Prints a line for each tenth: latencies, scans that came late, MB of this process more than at
+first, and of the other one.
+"""
+
+import argparse
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from tables import markdown
+
+import stillmap
+from stillmap.live.mapper import LiveMapper
+from stillmap.live.replay import iter_beams
+
+_TITLES = ("minutes", "scans", "ms: median", "99 %", "max", "late", "MB", "MB of loops")
+
+
+def main() -> None:
+    p = argparse.ArgumentParser(description=__doc__)
+    p.add_argument("recording", type=Path)
+    p.add_argument("--hours", type=float, default=1.0)
+    p.add_argument("--rate", type=float, default=1.0)
+    p.add_argument("--max-scratch", type=float)
+    args = p.parse_args()
+    recording = stillmap.read(args.recording)
+    beams = list(iter_beams(recording))
+    odometry = recording.T_odom_base
+    steps = np.diff(recording.stamp_ns)
+    period = float(np.median(steps))
+    count = round(3600e9 * args.hours / period)
+    limit = None if args.max_scratch is None else int(args.max_scratch)
+    before, lines, ms, late, every = _resident_mb("self"), [], [], 0, -(-count // 10)
+    with LiveMapper({"threads": 2}, background=True, max_scratch=limit) as mapper:
+        begin = time.perf_counter()
+        for n in range(count):
+            t = _to_and_fro(n, len(beams))
+            stamp_ns = round(n * period)
+            due = begin + 1e-9 * stamp_ns / args.rate if args.rate else time.perf_counter()
+            late += args.rate > 0 and time.perf_counter() > due + 1e-9 * period / args.rate
+            time.sleep(max(due - time.perf_counter(), 0.0))
+            scan = replace(beams[t], stamp_ns=stamp_ns)
+            mapper.push(scan, None if odometry is None else odometry[t])
+            ms.append(1e3 * (time.perf_counter() - due))
+            if (n + 1) % every == 0 or n + 1 == count:
+                child = _resident_mb(str(mapper._frame._closer._process.pid))
+                lines.append(_line(n + 1, period, ms[-every:], late, before, child))
+                print(" | ".join(lines[-1]), flush=True)
+    lines.append(_line(count, period, ms, late, before, 0.0))
+    lines[-1][0] = "all"
+    print(markdown(list(_TITLES), lines))
+
+
+def _to_and_fro(n: int, count: int) -> int:
+    """Index of the n-th scan of a drive to and fro over `count` scans."""
+    k = n % (2 * count)
+    return k if k < count else 2 * count - 1 - k
+
+
+def _line(n: int, period: float, ms: list[float], late: int, before: float, child: float):
+    quantiles = (np.median(ms), np.quantile(ms, 0.99), np.max(ms))
+    used = f"{_resident_mb('self') - before:.0f} + {before:.0f}"
+    times = [f"{q:.1f}" for q in quantiles]
+    return [f"{n * period / 60e9:.0f}", str(n), *times, str(late), used, f"{child:.0f}"]
+
+
+def _resident_mb(pid: str) -> float:
+    """Resident memory of a process now."""
+    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    return pages * 4096 / 2**20
+
+
+if __name__ == "__main__":
+    main()
