@@ -22,8 +22,8 @@ _MIN_AGREE = 0.35  # share of the surfaces of the view that the map shows; other
 # of a surface of the view where the map is free: somebody may stand there; one of the map where the
 # view is free weighs much
 _FREE_WEIGHT = 0.5
-# share of the best alignment's evidence that a rival may have where the best one is so for the first
-# time, and for so many times in a row: the robot sees more from one search to the next
+# share of the best alignment's evidence that a rival may have, by how many times in a row that one
+# is the best: the robot sees more from one search to the next
 _MAX_RIVAL = {1: 0.4, 2: 0.7, 5: 0.85}
 _APART = 1.0, 0.5  # m and rad from which another alignment is a rival
 _STD = 0.15, 0.04  # m, rad: of an alignment that the search finds
