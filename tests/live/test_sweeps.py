@@ -11,6 +11,7 @@ from stillmap.core import se2
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.pixel_size import find_pixel_size
 from stillmap.live.replay import iter_beams
+from stillmap.sim import scene_by_name, simulate
 
 
 def from_first(poses):
@@ -114,3 +115,25 @@ def test_pixels_are_about_the_angles_between_beams(channels, columns):
     assert 0.006 <= azimuth < 0.01
     between = 0.58 / (channels - 1)  # the sum of all is atan 0.4 + atan 0.2
     assert 0.7 * between < elevation < max(2.0 * between, 0.006)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("background", [False, True])
+def test_loops_are_closed(background):
+    lidar = {"channels": 16, "columns": 360}
+    robot = {"scans": 700, "scan_rate": 5.0, "speed": 1.0}
+    simulation = simulate(scene_by_name("corridor", {"lidar": lidar, "robot": robot}), 2)
+    recording, true = simulation.recording, from_first(simulation.truth.T_world_base)
+    assert np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1).sum() > 130.0
+    moved = []
+    with LiveMapper({"threads": 1}, background=background) as mapper:
+        for beams in iter_beams(recording):
+            update = mapper.push(beams)
+            moved.append(mapper._frame.T_map_local)
+        poses, cells = mapper.poses, mapper.cells
+    if not background:  # in the background they may come too late here
+        assert len(np.unique(np.array(moved).reshape(len(moved), -1), axis=0)) > 1
+        np.testing.assert_allclose(poses[-1], update.pose, atol=1e-9)
+    off = np.linalg.norm((from_first(poses) - true)[:, :3, 3], axis=1)
+    assert off.max() < 0.3
+    assert len(cells.cells) > 1000

@@ -22,9 +22,10 @@ _MIN_AGREE = 0.35  # share of the surfaces of the view that the map shows; other
 # of a surface of the view where the map is free: somebody may stand there; one of the map where the
 # view is free weighs much
 _FREE_WEIGHT = 0.5
-# share of the best alignment's evidence that a rival may have: once, and twice in a row; m and rad
-# from which another alignment is a rival
-_MAX_RIVAL, _MAX_RIVAL_TWICE, _APART = 0.4, 0.7, (1.0, 0.5)
+# share of the best alignment's evidence that a rival may have, by how many times in a row that one
+# is the best: the robot sees more from one search to the next
+_MAX_RIVAL = {1: 0.4, 2: 0.7, 5: 0.85}
+_APART = 1.0, 0.5  # m and rad from which another alignment is a rival
 _STD = 0.15, 0.04  # m, rad: of an alignment that the search finds
 _MAX_CANDIDATES = 20
 
@@ -61,6 +62,7 @@ class GlobalLocalizer:
         self._surface = known.make_surface_map()
         self._grid = known.make_grid()
         self._last: Float | None = None
+        self._times = 0  # that the last one was the best in a row
 
     def localize(self, view: GridMap, scan: Scan, pose: Float) -> Localization:
         """Pose of a local map in the known map.
@@ -87,10 +89,11 @@ class GlobalLocalizer:
         best = found[0]
         rivals = [one.evidence for one in found[1:] if _is_apart(best.T, one.T)]
         share = max(rivals, default=0.0) / best.evidence
-        if share > _MAX_RIVAL_TWICE:
+        if share > max(_MAX_RIVAL.values()):
             return Localization(None, is_ambiguous=True)
-        self._last = best.T
-        is_clear = share <= _MAX_RIVAL or (last is not None and not _is_apart(last, best.T))
+        is_same = last is not None and not _is_apart(last, best.T)
+        self._last, self._times = best.T, self._times + 1 if is_same else 1
+        is_clear = any(self._times >= n and share <= most for n, most in _MAX_RIVAL.items())
         return Localization(best.T if is_clear else None, is_ambiguous=not is_clear)
 
     def _weigh(self, session: SurfaceMap, T: Float) -> _Alignment:
