@@ -121,19 +121,18 @@ def test_pixels_are_about_the_angles_between_beams(channels, columns):
 @pytest.mark.parametrize("background", [False, True])
 def test_loops_are_closed(background):
     lidar = {"channels": 16, "columns": 360}
-    robot = {"scans": 700, "scan_rate": 5.0, "speed": 1.0}
+    robot = {"scans": 900, "speed": 3.0}
     simulation = simulate(scene_by_name("corridor", {"lidar": lidar, "robot": robot}), 2)
     recording, true = simulation.recording, from_first(simulation.truth.T_world_base)
-    assert np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1).sum() > 130.0
-    moved = []
+    assert np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1).sum() > 120.0
     with LiveMapper({"threads": 1}, background=background) as mapper:
         for beams in iter_beams(recording):
             update = mapper.push(beams)
-            moved.append(mapper._frame.T_map_local)
         poses, cells = mapper.poses, mapper.cells
-    if not background:  # in the background they may come too late here
-        assert len(np.unique(np.array(moved).reshape(len(moved), -1), axis=0)) > 1
-        np.testing.assert_allclose(poses[-1], update.pose, atol=1e-9)
+        if not background:  # elsewhere they are closed in another process
+            found = mapper._frame._closer._found
+            assert sum(not closure.rejected for closure in found) > 2
+    np.testing.assert_allclose(poses[-1], update.pose, atol=1e-9)
     off = np.linalg.norm((from_first(poses) - true)[:, :3, 3], axis=1)
     assert off.max() < 0.3
     assert len(cells.cells) > 1000
