@@ -77,6 +77,8 @@ class ScanOdometry:
         self._is_first = True
         self._increment = _LatestIncrement()
         self._slip = SlipDetector(self._increment)
+        self._guessed_of = (self._pose, self._before, self._velocity_noise)
+        self._guessed = motion_model.constant_velocity_prior(*self._guessed_of)
         self._stamps = deque[int](maxlen=_MAX_STAMPS)  # of the last scans
         self._count = 0
 
@@ -99,7 +101,7 @@ class ScanOdometry:
 
     def select(self, beams: ScanBeams, prior: MotionPrior) -> Scan:
         """The hits of a scan with weight 1, without the motion that is predicted during it."""
-        return select_hits(deskew(beams, self._twist_to(prior.T_map_base, beams.stamp_ns)))
+        return select_hits(deskew(beams, self._twist_to(prior.T_map_base, beams)))
 
     def end_points(self, hits: Scan, prior: MotionPrior) -> tuple[NDArray[np.float32], Float]:
         """(N, 2) points in the base frame at the stamp, and its pose, as predicted."""
@@ -116,18 +118,20 @@ class ScanOdometry:
             prior: of `predict`.
             increment: as of `predict`.
         """
-        scan, twist = thin(hits), self._twist_to(prior.T_map_base, beams.stamp_ns)
+        scan, twist = thin(hits), self._twist_to(prior.T_map_base, beams)
         usual = self._usual.get(beams.sensor, 0.0)
-        guess = self._guess()
-        match, is_slipping, is_carried = self._match(beams, scan, prior, increment, usual)
+        guess, learned = self._guess(), self._learned_prior(prior, increment)
+        match, is_slipping, is_carried = self._match(beams, scan, prior, learned, usual)
         if not self._is_first and not is_carried:
             match, slips = self._detect_slip(guess, scan, match)
+            if slips:
+                learned = self._learned_prior(prior, increment)  # the last pose has changed
             has_leaped = increment is not None and self._has_leaped(beams)
             is_slipping = is_slipping or slips or has_leaped
         if not is_carried:
             match = self._correct_heading(scan, match)
         is_blind = not len(scan.points) or float(scan.weights.sum()) <= 0.0
-        learned = self._learned_prior(prior, increment) or prior
+        learned = learned or prior
         drift = motion_model.blind_drift(learned, match.covariance)
         if not (is_blind or self._contradictions):
             self._learn(beams, learned, match, usual)
@@ -187,14 +191,14 @@ class ScanOdometry:
         beams: ScanBeams,
         scan: Scan,
         prior: MotionPrior,
-        increment: Float | None,
+        learned: MotionPrior | None,
         usual: float,
     ) -> tuple[ScanMatch, bool, bool]:
         """The match, whether odometry slips, and whether the robot was carried elsewhere."""
         if not self.local_map.has_sensor(beams.sensor) or not len(scan.points):
             return accept_prior(prior), False, False
         grid = self.local_map.grid
-        match = match_scan(grid, scan, prior, usual, self._learned_prior(prior, increment))
+        match = match_scan(grid, scan, prior, usual, learned)
         if not is_poor(match, usual):
             self._weigh_evidence(Evidence.AGREES)
             return match, match.contradicts_odometry, False
@@ -253,7 +257,12 @@ class ScanOdometry:
         )
 
     def _guess(self) -> MotionPrior:
-        return motion_model.constant_velocity_prior(self._pose, self._before, self._velocity_noise)
+        """Constant velocity from the last two poses."""
+        of = (self._pose, self._before, self._velocity_noise)
+        if any(new is not old for new, old in zip(of, self._guessed_of, strict=True)):
+            self._guessed_of = of
+            self._guessed = motion_model.constant_velocity_prior(*of)
+        return self._guessed
 
     def _is_plausible(self, increment: Float, beams: ScanBeams) -> bool:
         seconds = 1e-9 * (beams.stamp_ns - self._stamp_ns)
@@ -264,10 +273,11 @@ class ScanOdometry:
         """True if odometry has leaped lately."""
         return self._leaped_ns is not None and beams.stamp_ns < self._leaped_ns + _DISTRUST_NS
 
-    def _twist_to(self, T: Float, stamp_ns: int) -> Float:
-        """(3,) m/s and rad/s from the last pose to one; 0 for a leap."""
-        seconds = 1e-9 * (stamp_ns - self._stamp_ns)
-        if self._is_first or seconds <= 0.0:
+    def _twist_to(self, T: Float, beams: ScanBeams) -> Float:
+        """(3,) m/s and rad/s from the last pose to that of a scan; 0 for a leap, and where all
+        beams have the stamp of the scan."""
+        seconds = 1e-9 * (beams.stamp_ns - self._stamp_ns)
+        if self._is_first or seconds <= 0.0 or beams.beam_time is None:
             return np.zeros(3)
         twist: Float = se2.log((se2.inverse(self._pose) @ T)[None])[0] / seconds
         is_leap = np.hypot(*twist[:2]) > MAX_SPEED or abs(twist[2]) > MAX_TURN_RATE

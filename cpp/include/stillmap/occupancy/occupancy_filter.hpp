@@ -115,11 +115,18 @@ class OccupancyFilter : public FilterMap<D, PassedCell> {
     const double length = chord.norm(), usable = length - static_cast<double>(margin);
     if (!(usable > 0.0)) return;
     const Vec<D> direction = chord / length;
+    const Vec<D> to_centre = Vec<D>::Constant(0.5) - beam.start;
     const auto pass = [&](PassedCell* cell, const Cell<D>& at) {
-      const Vec<D> off = (at.template cast<double>().array() + 0.5).matrix() - beam.start;
-      const double along = off.dot(direction);
-      const auto reliability =
-          tables_.isotropic(static_cast<float>(std::max(off.squaredNorm() - along * along, 0.0)));
+      const Vec<D> off = at.template cast<double>() + to_centre;
+      double squared;  // of the distance of the beam from the centre
+      if constexpr (D == 2) {
+        const double distance = off[0] * direction[1] - off[1] * direction[0];
+        squared = distance * distance;
+      } else {
+        const double along = off.dot(direction);
+        squared = std::max(off.squaredNorm() - along * along, 0.0);
+      }
+      const auto reliability = tables_.isotropic(static_cast<float>(squared));
       if (reliability < kMinReliability) return;
       if (cell->filter >= 0) {
         filters_.miss(cell->filter, bin, reliability);
