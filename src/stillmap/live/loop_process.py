@@ -175,10 +175,18 @@ class _Numbered(list[Any]):
         return key
 
 
-def make_closer(
+def start_closer(
+    options: SlamOptions, dimension: int, background: bool, folder: Path | None, threads: int
+) -> LoopCloser | LiveSweepLoopCloser | LoopProcess:
+    """What closes loops in 2D or 3D, in a process of its own or in this one."""
+    if background:
+        return LoopProcess(options, dimension, folder)
+    return _make_closer(options, dimension, folder, threads)
+
+
+def _make_closer(
     options: SlamOptions, dimension: int, folder: Path | None, threads: int
 ) -> LoopCloser | LiveSweepLoopCloser:
-    """What closes loops in 2D or 3D, in this process."""
     if dimension == 2:
         return LoopCloser(options, folder)
     return LiveSweepLoopCloser(options, folder, threads)
@@ -189,7 +197,7 @@ def _serve(settings: dict[str, Any], source: IO[bytes], target: IO[bytes]) -> No
     folder = None if settings["folder"] is None else Path(settings["folder"])
     options = config.override(SlamOptions(), settings["slam"])
     # one thread: the other cores answer scans
-    closer = make_closer(options, settings["dimension"], folder, threads=1)
+    closer = _make_closer(options, settings["dimension"], folder, threads=1)
     arrived: queue.SimpleQueue[dict[str, NDArray[Any]] | None] = queue.SimpleQueue()
 
     def listen() -> None:

@@ -25,14 +25,14 @@ from stillmap.live.history import History
 from stillmap.live.known_map import KnownMap
 from stillmap.live.local_map import MappedScan
 from stillmap.live.loop_closer import NoLoops
-from stillmap.live.loop_process import LoopProcess, make_closer
+from stillmap.live.loop_process import start_closer
 from stillmap.live.map_correction import LabelledScan
-from stillmap.live.map_frame import LoopClosing, MapFrame
+from stillmap.live.map_frame import MapFrame
 from stillmap.live.map_view import project_obstacles
 from stillmap.live.movers import MoverTracker
 from stillmap.live.observation import BeamSelector, Observation, find_margins
 from stillmap.live.place import Mode, PlaceTracker
-from stillmap.live.relocalization import Relocalizer
+from stillmap.live.robot_finder import RobotFinder
 from stillmap.live.saving import Snapshot
 from stillmap.live.scan import Scan, ScanBeams, deskew, drop_cover, to_beams
 from stillmap.live.scan_hits import normals_of, thin
@@ -98,11 +98,6 @@ class LiveMapper:
         self._last_ns: int | None = None
         self._changes_due_ns = 0
         self._path_begin = 0  # the first spaced scan in the frame of the map
-        # a robot that was carried while it maps; scans that were found later: first, last + 1, and
-        # their motion in the frame of the odometry by scans; the last scan that agreed with the map
-        self._carried: Relocalizer | None = None
-        self._moves = list[tuple[int, int, Float]]()
-        self._last_agreed = -1
         self._moving = 0.0  # share of the hits, as the labels say a second later
         self._begin(2)
 
@@ -119,6 +114,7 @@ class LiveMapper:
         self._movers = MoverTracker(D)
         self._history = History(D, self._scratch, self._max_scratch)
         self._frame = MapFrame(D, NoLoops(), self._in_background)
+        self._finder = RobotFinder(self._place, D)
 
     def push(self, scan: Scan | ScanBeams, odometry: ArrayLike | None = None) -> Update:
         """Register a scan, label its beams, and add it to the map.
@@ -141,8 +137,8 @@ class LiveMapper:
         found = self._odometry.register(beams, hits, prior, increment)  # M-step: (9)
         if found.is_carried:
             self._lose()
-        elif not (found.is_contradicted or self._carried):
-            self._last_agreed = len(self._history)
+        elif not found.is_contradicted:
+            self._finder.agree(len(self._history))
         deskewed, anchor = deskew(beams, found.twist), self._frame.last
         labelled = LabelledScan(self._observe(deskewed, hits, anchor), found.T)
         pose = self._frame.T_map_local @ found.T
@@ -154,9 +150,8 @@ class LiveMapper:
         self._hindsight.add(len(self._history) - 1, beams)
         self._T_odom_base, self._last_ns = T_odom_base, beams.stamp_ns
         update = self._to_update(beams.stamp_ns, found, p_static)
-        if self._add_to_maps(deskewed, labelled, np.nan_to_num(p_static), found):
-            return self._find_robot(hits, update)
-        return update
+        is_spaced = self._add_to_maps(deskewed, labelled, np.nan_to_num(p_static), found)
+        return self._find_robot(hits, update) if is_spaced and self._finder.is_lost else update
 
     def _observe(self, beams: ScanBeams, hits: Any, anchor: int) -> Observation:
         """What a scan adds to the labels."""
@@ -166,54 +161,29 @@ class LiveMapper:
         return Observation(beams, margin, max(anchor, 0))
 
     def _lose(self) -> None:
-        """The robot was carried: the labels begin anew, until it is found."""
+        """The robot was carried: labels, tracks and path begin anew."""
         self._movers.clear()
         self._path_begin = self._frame.last + 1
-        if self._place is not None:
-            self._place.lose(len(self._history))
-            self._labels.clear()
-        elif self._dimension == 3:
-            self._labels.clear()  # in 3D it is not searched
-        elif self._carried is not None:
-            self._carried.begin(self._labels)
-        else:
-            self._frame.finish_correction(self._labels, self._odometry)
-            left_behind = self._odometry.left_behind
-            self._carried = Relocalizer(self._labels, left_behind, self._frame.T_map_local)
+        self._finder.lose(len(self._history), self._labels, self._frame, self._odometry)
 
-    def _find_robot(self, hits: Any, update: Update) -> Update:
-        """Search the robot if it is lost; the update with its pose there, if it is found."""
-        labels, frame = self._labels, self._frame
-        if self._carried is not None:  # in its own map
-            carried = self._carried
-            T = carried.localize(labels, thin(hits), update.pose)
-            if T is None:
-                return update
-            self._odometry.enter(carried.join(labels, self._odometry.local_map, T), T)
-            self._moves.append((self._last_agreed + 1, len(self._history), T))
-            frame.add_drift(carried.covariance)
-            self._carried, self._path_begin = None, 0
-            return self._move(update, T, frame.T_map_local @ T @ se2.inverse(frame.T_map_local))
-        if self._place is not None and self._place.is_lost:
-            place, last = self._place, len(self._history) - 1
-            T = place.localize(labels, thin(hits), update.pose, last)
-            if T is None:
-                return update
-            self._odometry.enter(place.make_local_map(), T)
-            place.enter(labels, T)
-            self._path_begin = frame.last + 1
-            return self._move(update, T, T)
-        return update
-
-    def _move(self, update: Update, T: Float, motion: Float) -> Update:
-        """The update of a robot that was found: the frame of the odometry by scans moved by T, the
-        pose by `motion` (3, 3)."""
+    def _find_robot(self, hits: PlanarHits, update: Update) -> Update:
+        """Search the robot, which is lost; the update with its pose in the map, if it is found."""
+        frame, scans = self._frame, len(self._history)
+        found = self._finder.find(
+            self._labels, thin(hits), update.pose, scans, frame, self._odometry
+        )
+        if found is None:
+            return update
+        T, motion = found
+        self._path_begin = 0 if self._place is None else frame.last + 1
         self._movers.move(T)
         pose = motion @ update.pose
-        doubts = tuple(doubt for doubt in update.doubts if doubt not in ("lost", "ambiguous"))
-        movers = self._movers.movers(self._frame.T_map_local)
         return dataclasses.replace(
-            update, pose=pose, T_map_odom=self._to_map_odom(pose), doubts=doubts, movers=movers
+            update,
+            pose=pose,
+            T_map_odom=self._to_map_odom(pose),
+            doubts=tuple(name for name in update.doubts if name not in ("lost", "ambiguous")),
+            movers=self._movers.movers(frame.T_map_local),
         )
 
     def label(self, scan: Scan | ScanBeams, number: int) -> NDArray[np.float32]:
@@ -225,10 +195,8 @@ class LiveMapper:
         """
         beams = scan if isinstance(scan, ScanBeams) else to_beams(scan)
         anchor, local = self._history.at(number)
-        for first, last, T in self._moves:
-            local = T @ local if first <= number < last else local
-        deskewed = deskew(beams, self._history.twist_at(number))
-        return self._labels.label(deskewed, self._frame.to_map(local, anchor))
+        pose = self._frame.to_map(self._finder.move(local, number), anchor)
+        return self._labels.label(deskew(beams, self._history.twist_at(number)), pose)
 
     @property
     def poses(self) -> Float:
@@ -236,9 +204,7 @@ class LiveMapper:
         given, local, anchor = self._history.poses()
         if self._place is not None or not len(given):
             return given if self._place is None else self._place.to_known(given)
-        for first, last, T in self._moves:
-            local[first:last] = T @ local[first:last]
-        return self._frame.to_map_all(local, anchor)
+        return self._frame.to_map_all(self._finder.move_all(local), anchor)
 
     @property
     def path(self) -> Float:
@@ -322,20 +288,19 @@ class LiveMapper:
         if self._last_ns is None:
             if self._dimension != D:
                 self._begin(D)
-            self._frame = MapFrame(D, self._make_closer(), self._in_background)
+            closes = self._place is None and self._slam.loop_closure
+            threads = resolve_threads(self.options.threads)
+            closer = (
+                start_closer(self._slam, D, self._in_background, self._scratch, threads)
+                if closes
+                else NoLoops()
+            )
+            self._frame = MapFrame(D, closer, self._in_background)
         elif self._dimension != D:
             raise ValueError(f"scan: expected {self._dimension}D as before, got {D}D")
         elif beams.stamp_ns < self._last_ns:
             late = 1e-9 * (self._last_ns - beams.stamp_ns)
             raise ValueError(f"stamp: expected none before the last scan, got {late:.6f} s earlier")
-
-    def _make_closer(self) -> LoopClosing:
-        if self._place is not None or not self._slam.loop_closure:
-            return NoLoops()
-        if self._in_background:
-            return LoopProcess(self._slam, self._dimension, self._scratch)
-        threads = resolve_threads(self.options.threads)
-        return make_closer(self._slam, self._dimension, self._scratch, threads)
 
     def _weigh(self, hits: Any, prior: Any) -> Any:
         """The hits with weights P(static): the E-step at the predicted pose."""
@@ -374,11 +339,10 @@ class LiveMapper:
         is_doubted = found.has_odometry and self._moving > _CROWDED
         recent = self._labels.doubt(e) if is_doubted else e
         added = self._odometry.add(beams, e, recent, self._label_again)
-        if self._carried is not None:
-            return added is not None
-        if added is not None:
-            self._frame.add(added, found)
-        self._frame.correct(labelled, added, self._labels, self._odometry)
+        if not self._finder.is_carried:
+            if added is not None:
+                self._frame.add(added, found)
+            self._frame.correct(labelled, added, self._labels, self._odometry)
         return added is not None
 
     def _label_again(self, scan: MappedScan) -> NDArray[np.float32]:
@@ -399,14 +363,13 @@ class LiveMapper:
     def _to_update(
         self, stamp_ns: int, found: Registration, p_static: NDArray[np.float32]
     ) -> Update:
-        place, carried = self._place, self._carried
         doubts = {
             "slip": found.is_slipping,
             "blind": found.is_blind,
             "carried": found.is_carried,
             "contradicted": found.is_contradicted,
-            "lost": carried is not None or (place is not None and place.is_lost),
-            "ambiguous": any(one is not None and one.is_ambiguous for one in (carried, place)),
+            "lost": self._finder.is_lost,
+            "ambiguous": self._finder.is_ambiguous,
         }
         pose = self._frame.T_map_local @ found.T
         return Update(
