@@ -10,7 +10,8 @@ python benchmarks/live.py latency [--world hall] [--seconds 600] [--rate 40] [--
 logs: each NAME.clf.gz with NAME.exact.relations or NAME.pseudo.relations beside it: relation
 errors of `stillmap live --replay`, of the poses at the time and at the end, beside those of
 `stillmap map`, of `LiveMapper.finish()` and of Karto, see live_logs.py.
-labels: F1 of "dynamic" and average precision by the lag after which a beam is labelled, seconds.
+labels: F1 of "dynamic", average precision and calibration error (equal-mass bins) by the lag after
+which a beam is labelled, seconds.
 localize: the robot is put down at random places of a known map, and has some scans to find out
 where it is: right within 0.3 m. Then it is localized for 30 scans more: the mean of its squared
 errors by its covariance (NEES, of 3), and the share of them within the 95 % ellipsoid.
@@ -32,6 +33,7 @@ from tables import markdown
 
 from stillmap import build, load
 from stillmap.core import se2
+from stillmap.eval.labels import assign_equal_mass_bins, compute_calibration_error
 from stillmap.eval.map import GHOST_DISTANCE, distance_to_walls
 from stillmap.eval.trajectory import align, compute_absolute_errors
 from stillmap.live.mapper import LiveMapper
@@ -82,7 +84,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def score_labels(args: argparse.Namespace) -> str:
-    """A line per world and seed, F1 / AP for each lag."""
+    """A line per world and seed, F1 / AP / ECE for each lag."""
     lines = []
     for world in args.worlds:
         for seed in range(args.first_seed, args.first_seed + args.seeds):
@@ -92,7 +94,7 @@ def score_labels(args: argparse.Namespace) -> str:
             by_lag, poses, ghosts = _label_by_lag(simulation)
             scores = [_score(p[hit], static[hit]) for p in by_lag]
             error = compute_absolute_errors(poses, simulation.truth.T_world_base)
-            line = [f"{f1:.3f} / {ap:.3f}" for f1, ap in scores]
+            line = [f"{f1:.3f} / {ap:.3f} / {ece:.3f}" for f1, ap, ece in scores]
             lines.append([world, str(seed), *line, f"{error.rmse:.3f}", f"{ghosts:.1f}"])
             print(" | ".join(lines[-1]), flush=True)
     lags = [f"{lag:g} s" if math.isfinite(lag) else "end" for lag in _LAGS]
@@ -139,13 +141,15 @@ def _find_ghosts(grid, T_world_map, walls):
     return set(map(tuple, cells.tolist())), float(grid.free.sum()) * grid.resolution**2
 
 
-def _score(p_static, static) -> tuple[float, float]:
-    """F1 of "dynamic" and average precision."""
+def _score(p_static, static) -> tuple[float, float, float]:
+    """F1 of "dynamic", average precision, and expected calibration error of P(static)."""
     says, moves = p_static < 0.5, ~static
     f1 = 2 * np.count_nonzero(says & moves) / max(says.sum() + moves.sum(), 1)
     found = moves[np.argsort(p_static, kind="stable")]
     precision = np.cumsum(found) / np.arange(1, len(found) + 1)
-    return float(f1), float(precision[found].mean()) if found.any() else float("nan")
+    ap = float(precision[found].mean()) if found.any() else float("nan")
+    p = p_static.astype(np.float64)
+    return float(f1), ap, compute_calibration_error(p, static, assign_equal_mass_bins(p))
 
 
 def localize_globally(args: argparse.Namespace) -> str:
