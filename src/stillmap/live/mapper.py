@@ -26,7 +26,7 @@ from stillmap.live.known_map import KnownMap
 from stillmap.live.local_map import MappedScan
 from stillmap.live.loop_closer import NoLoops
 from stillmap.live.loop_process import start_closer
-from stillmap.live.map_correction import LabelledScan
+from stillmap.live.map_correction import SPACED_PER_TAG, LabelledScan
 from stillmap.live.map_frame import MapFrame
 from stillmap.live.map_view import project_obstacles
 from stillmap.live.movers import MoverTracker
@@ -158,7 +158,7 @@ class LiveMapper:
         margin = None
         if isinstance(hits, PlanarHits):
             margin = find_margins(beams, normals_of(beams, hits), self._selector.select(beams))
-        return Observation(beams, margin, max(anchor, 0))
+        return Observation(beams, margin, max(anchor, 0) // SPACED_PER_TAG[beams.dimension])
 
     def _lose(self) -> None:
         """The robot was carried: labels, tracks and path begin anew."""
