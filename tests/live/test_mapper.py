@@ -208,6 +208,7 @@ def test_mapping_goes_on_when_the_process_that_closes_loops_dies(corridor, fresh
     moved = se2.inverse(truth[0]) @ truth[149]
     np.testing.assert_allclose(update.pose[:2, 2], moved[:2, 2], atol=0.1)
     assert sum("closes loops" in record.message for record in caplog.records) == 1
+    assert mapper._frame._closer._outgoing.qsize() <= 1  # nobody takes anything out
 
 
 def test_an_earlier_scan_is_labelled_again(corridor):

@@ -68,6 +68,8 @@ class LoopProcess:
 
     def add(self, scan: MappedScan, explained: float, drift: Float) -> None:
         """Add a spaced scan, as of `LoopCloser.add`. Never waits."""
+        if self._has_ended:
+            return  # nobody takes it out of the queue
         if scan.beams.sensor not in self._sensors:
             self._sensors.append(scan.beams.sensor)
         sensor = self._sensors.index(scan.beams.sensor)
