@@ -8,9 +8,11 @@ import pytest
 
 import stillmap
 from stillmap.core import se2
+from stillmap.core.errors import InputError
 from stillmap.em.options import EmOptions
 from stillmap.eval.trajectory import compute_absolute_errors
 from stillmap.live.causal_labels import CausalLabels, take_over
+from stillmap.live.loop_closer import NoLoops
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.observation import Observation
 from stillmap.live.replay import iter_beams
@@ -180,6 +182,39 @@ def test_late_scans_are_refused_and_change_nothing(corridor, fresh):
     with pytest.raises(ValueError, match="stamp"):
         mapper.push(first)
     assert len(mapper.poses) == 1
+
+
+def test_odometry_that_is_none_starts_nothing(corridor, fresh):
+    mapper = fresh(background=True)
+    first = next(iter_beams(corridor.recording))
+    with pytest.raises(ValueError, match="odometry"):
+        mapper.push(first, (0.0, np.nan, 0.0))
+    assert isinstance(mapper._frame._closer, NoLoops)
+    mapper.push(first, (0.0, 0.0, 0.0))
+    assert len(mapper.poses) == 1
+
+
+def test_before_the_first_scan(fresh, tmp_path):
+    mapper = fresh()
+    assert mapper.poses.shape == mapper.path.shape == (0, 3, 3)
+    assert mapper.map.p_occupied.size == len(mapper.cells.cells) == 0
+    for call in (mapper.finish, lambda: mapper.save(tmp_path / "out"), lambda: mapper.objects):
+        with pytest.raises(InputError, match="no scan"):
+            call()
+
+
+def test_a_mapper_that_is_closed_says_so(corridor, tmp_path):
+    mapper = LiveMapper({"threads": 1})
+    mapper.push(corridor.beams[0])
+    mapper.close()
+    mapper.close()
+    for call in (
+        lambda: mapper.push(corridor.beams[1]),
+        lambda: mapper.poses,
+        lambda: mapper.save(tmp_path / "out"),
+    ):
+        with pytest.raises(ValueError, match="closed"):
+            call()
 
 
 def push_all(mapper, recording, count=None):

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stillmap.core import se2
+from stillmap.core.errors import InputError
 from stillmap.core.grid_map import GridMap
 from stillmap.core.parallel import resolve_threads
 from stillmap.core.profiling import Progress, no_progress
@@ -27,7 +28,7 @@ from stillmap.live.local_map import MappedScan
 from stillmap.live.loop_closer import NoLoops
 from stillmap.live.loop_process import start_closer
 from stillmap.live.map_correction import LabelledScan
-from stillmap.live.map_frame import MapFrame
+from stillmap.live.map_frame import LoopClosing, MapFrame
 from stillmap.live.map_view import project_obstacles
 from stillmap.live.movers import MoverTracker
 from stillmap.live.observation import BeamSelector, Observation, find_margins
@@ -96,6 +97,7 @@ class LiveMapper:
         self._max_scratch, self._hindsight = max_scratch, Hindsight(lag)
         self._T_odom_base: Float | None = None
         self._last_ns: int | None = None
+        self._is_closed = False
         self._changes_due_ns = 0
         self._path_begin = 0  # the first spaced scan in the frame of the map
         self._moving = 0.0  # share of the hits, as the labels say a second later
@@ -125,12 +127,15 @@ class LiveMapper:
                 there is none.
 
         Raises:
-            ValueError: names the argument, what was expected, and what it was.
+            ValueError: names the argument, what was expected, and what it was; or the mapper is
+                closed.
             OSError: the disk of `scratch` is full.
         """
         beams = drop_cover(scan if isinstance(scan, ScanBeams) else to_beams(scan))
         self._require_next(beams)
-        T_odom_base = self._to_matrix(odometry)
+        T_odom_base = self._to_matrix(odometry, beams.dimension)
+        if self._last_ns is None:
+            self._start(beams.dimension)
         increment = self._increment(T_odom_base)
         prior = self._odometry.predict(beams, increment)
         hits = self._weigh(self._odometry.select(beams, prior), prior)
@@ -251,19 +256,29 @@ class LiveMapper:
         was answered at the time.
 
         Raises:
-            InputError: the folder is taken or cannot be written to.
+            InputError: no scan was pushed, or the folder is taken or cannot be written to.
         """
         self.snapshot().save(path, overwrite=overwrite, progress=progress)
 
     def snapshot(self) -> Snapshot:
-        """All scans so far and what is known of them: to save them while more are pushed."""
+        """All scans so far and what is known of them: to save them while more are pushed.
+
+        Raises:
+            InputError: no scan was pushed.
+        """
+        self._require_scans()
         recording, answers = self._history.snapshot()
         poses, place = self.poses[answers.number], self._place
         extended = place.known if place is not None and place.extends else None
         return Snapshot(recording, poses, answers, self.options, self._scratch, extended)
 
     def finish(self, progress: Progress = no_progress) -> BuiltResult:
-        """The result of `stillmap.build` on all scans: poses, labels and map refined."""
+        """The result of `stillmap.build` on all scans: poses, labels and map refined.
+
+        Raises:
+            InputError: no scan was pushed.
+        """
+        self._require_scans()
         found = map_recording(
             self._history.recording(), self.options, progress=progress, scratch=self._scratch
         )
@@ -271,6 +286,7 @@ class LiveMapper:
 
     def close(self) -> None:
         """Forget all scans, and end the process that closes loops, if there is one."""
+        self._is_closed = True
         self._frame.stop()
         self._history.close()
 
@@ -281,26 +297,35 @@ class LiveMapper:
         self.close()
 
     def _require_next(self, beams: ScanBeams) -> None:
-        """Check a scan against those before; the first one begins mapping in its dimension."""
+        """Check a scan against those before."""
         D = beams.dimension
+        if self._is_closed:
+            raise ValueError("mapper: expected one that is not closed")
         if self._place is not None and D == 3:
             raise ValueError("scan: expected a planar one: localization is planar")
         if self._last_ns is None:
-            if self._dimension != D:
-                self._begin(D)
-            closes = self._place is None and self._slam.loop_closure
-            threads = resolve_threads(self.options.threads)
-            closer = (
-                start_closer(self._slam, D, self._in_background, self._scratch, threads)
-                if closes
-                else NoLoops()
-            )
-            self._frame = MapFrame(D, closer, self._in_background)
-        elif self._dimension != D:
+            return
+        if self._dimension != D:
             raise ValueError(f"scan: expected {self._dimension}D as before, got {D}D")
-        elif beams.stamp_ns < self._last_ns:
+        if beams.stamp_ns < self._last_ns:
             late = 1e-9 * (self._last_ns - beams.stamp_ns)
             raise ValueError(f"stamp: expected none before the last scan, got {late:.6f} s earlier")
+
+    def _start(self, dimension: int) -> None:
+        """Begin mapping with the first scan, in its dimension, and start to close loops."""
+        self._frame.stop()  # of a first scan that could not be mapped
+        self._begin(dimension)
+        closer: LoopClosing = NoLoops()
+        if self._place is None and self._slam.loop_closure:
+            threads = resolve_threads(self.options.threads)
+            closer = start_closer(
+                self._slam, dimension, self._in_background, self._scratch, threads
+            )
+        self._frame = MapFrame(dimension, closer, self._in_background)
+
+    def _require_scans(self) -> None:
+        if self._last_ns is None:
+            raise InputError("no scan was pushed yet")
 
     def _weigh(self, hits: Any, prior: Any) -> Any:
         """The hits with weights P(static): the E-step at the predicted pose."""
@@ -308,11 +333,11 @@ class LiveMapper:
         weights = self._labels.label_ends(points, self._frame.T_map_local @ T_local_base)
         return dataclasses.replace(hits, weights=weights)
 
-    def _to_matrix(self, odometry: ArrayLike | None) -> Float | None:
+    def _to_matrix(self, odometry: ArrayLike | None, dimension: int) -> Float | None:
         if odometry is None:
             return None
         given = np.asarray(odometry, np.float64)[None]
-        out: Float = poses_to_matrices("odometry", given, 1, self._dimension)[0]
+        out: Float = poses_to_matrices("odometry", given, 1, dimension)[0]
         return out
 
     def _increment(self, T_odom_base: Float | None) -> Float | None:
