@@ -169,7 +169,7 @@ class LiveMapper:
         """The robot was carried: labels, tracks and path begin anew."""
         self._movers.clear()
         self._path_begin = self._frame.last + 1
-        self._finder.lose(len(self._history), self._labels, self._frame, self._odometry)
+        self._finder.lose(self._labels, self._frame, self._odometry)
 
     def _find_robot(self, hits: PlanarHits, update: Update) -> Update:
         """Search the robot, which is lost; the update with its pose in the map, if it is found."""
@@ -198,7 +198,7 @@ class LiveMapper:
             scan: as it was pushed.
             number: how many scans were pushed before it.
         """
-        beams = scan if isinstance(scan, ScanBeams) else to_beams(scan)
+        beams = drop_cover(scan if isinstance(scan, ScanBeams) else to_beams(scan))
         anchor, local = self._history.at(number)
         pose = self._frame.to_map(self._finder.move(local, number), anchor)
         return self._labels.label(deskew(beams, self._history.twist_at(number)), pose)
@@ -206,10 +206,11 @@ class LiveMapper:
     @property
     def poses(self) -> Float:
         """(T, D+1, D+1) T_map_base of all scans, as they are known now."""
-        given, local, anchor = self._history.poses()
-        if self._place is not None or not len(given):
-            return given if self._place is None else self._place.to_known(given)
-        return self._frame.to_map_all(self._finder.move_all(local), anchor)
+        _, local, anchor = self._history.poses()
+        moved = self._finder.move_all(local)
+        # in a known map that frame is the map's
+        is_map = self._place is not None or not len(moved)
+        return moved if is_map else self._frame.to_map_all(moved, anchor)
 
     @property
     def path(self) -> Float:
