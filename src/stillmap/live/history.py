@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core import se2, se3
 from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
@@ -43,8 +42,8 @@ class History:
     Args:
         dimension: 2 or 3.
         folder: of the temporary files; None: the system's.
-        max_bytes: about, of the beams, 13 bytes each: beyond, every second one of the scans that
-            lie most densely is dropped; None: unbounded.
+        max_bytes: about, of the beams, 17 bytes each, in 3D 21: beyond, every second one of the
+            scans that lie most densely is dropped; None: unbounded.
     """
 
     def __init__(
@@ -65,6 +64,7 @@ class History:
         self._beams = BeamStore(fields, folder, max_bytes)
         self._T_odom_base = array(np.float64, D + 1, D + 1)
         self._poses, self._local = (array(np.float64, D + 1, D + 1) for _ in range(2))
+        self._twist = array(np.float64, 3 if D == 2 else 6)
         self._mounts: dict[str | int, Float] = {}
         self._has_odometry, self._has_times = True, False
         self._folder = folder
@@ -86,8 +86,18 @@ class History:
         pose: Float,
         local: Float,
         anchor: int,
+        twist: Float,
     ) -> None:
         """Append a scan and the answer to it; see `Answers`.
+
+        Args:
+            beams: of the scan.
+            p_static: (N,).
+            T_odom_base: (D+1, D+1); None: without odometry.
+            pose: (D+1, D+1).
+            local: (D+1, D+1).
+            anchor: a spaced scan.
+            twist: (3,) or (6,) m/s and rad/s of the base during the scan, in its own frame.
 
         Raises:
             OSError: the disk is full.
@@ -112,6 +122,7 @@ class History:
             (self._T_odom_base, odometry),
             (self._poses, pose),
             (self._local, local),
+            (self._twist, twist),
         ):
             array.append(T[None])
 
@@ -120,13 +131,8 @@ class History:
         return int(self._anchor.view()[number]), np.array(self._local.view()[number])
 
     def twist_at(self, number: int) -> Float:
-        """(3,) or (6,) m/s and rad/s of the base from the scan before to one."""
-        stamps, local = self._stamp_ns.view()[: number + 1], self._local.view()
-        log = se2.log if local.shape[-1] == 3 else se3.log
-        seconds = 1e-9 * float(stamps[number] - stamps[number - 1]) if number else 0.0
-        step = log((se2.inverse(local[number - 1]) @ local[number])[None])[0]
-        out: Float = step / seconds if seconds > 0.0 else np.zeros_like(step)
-        return out
+        """(3,) or (6,) m/s and rad/s of the base during a scan."""
+        return np.array(self._twist.view()[number])
 
     def recording(self) -> Recording:
         """The scans that are kept. Odometry only if every scan had it."""

@@ -67,8 +67,9 @@ class LiveMapper:
             between two scans, the same to the bit every time.
         scratch: folder of the files in which all scans are kept for `save` and `finish`; None: the
             system's temporary folder.
-        max_scratch: bytes, about, that their beams may take, 13 each: beyond, every second one of
-            the scans that lie most densely is dropped, the oldest first; None: all are kept.
+        max_scratch: bytes, about, that their beams may take, 17 each, in 3D 21: beyond, every
+            second one of the scans that lie most densely is dropped, the oldest first; None: all
+            are kept.
         lag: s after which each scan is labelled once more, see `Update.hindsight`; None: it is not.
 
     Examples:
@@ -151,7 +152,7 @@ class LiveMapper:
             self._labels.add(labelled.observation, pose)
         p_static = self._labels.label(deskewed, pose)  # E-step: (8)
         self._movers.add(deskewed, found.T, p_static)
-        self._history.append(beams, p_static, T_odom_base, pose, found.T, anchor)
+        self._history.append(beams, p_static, T_odom_base, pose, found.T, anchor, found.twist)
         self._hindsight.add(len(self._history) - 1, beams)
         self._T_odom_base, self._last_ns = T_odom_base, beams.stamp_ns
         update = self._to_update(beams.stamp_ns, found, p_static)
