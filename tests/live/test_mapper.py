@@ -12,7 +12,8 @@ from stillmap.core.errors import InputError
 from stillmap.em.options import EmOptions
 from stillmap.eval.trajectory import compute_absolute_errors
 from stillmap.live.causal_labels import CausalLabels, take_over
-from stillmap.live.loop_closer import NoLoops
+from stillmap.live.loop_closer import Correction, NoLoops
+from stillmap.live.map_correction import MapCorrection
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.observation import Observation
 from stillmap.live.replay import iter_beams
@@ -118,6 +119,27 @@ def test_parts_that_emptied_are_told():
     expected = labels.to_map().p_occupied
     np.testing.assert_array_equal(np.sort(known), np.sort(expected[~np.isnan(expected)]))
     assert labels.take_changes() == []
+
+
+def test_cells_hit_while_a_correction_goes_on_move_with_it():
+    labels = CausalLabels(2, 0.05, EmOptions())
+    angles, margin = np.linspace(-1.0, 1.0, 200), np.full(200, 0.1, np.float32)
+
+    def see(stamp, tag):
+        beams = to_beams(stillmap.Scan(stamp, np.full(200, 3.0), angles))
+        labels.add(Observation(beams, margin, tag), np.eye(3))
+
+    see(0, 0)
+    T, here = se2.matrix(2.0, 0.0, 0.0), np.eye(3)[None]
+    correction = MapCorrection(Correction(T, T[None], []), labels, here, here)
+    see(10**9, 1)  # after the next spaced scan
+    while not correction.step(labels):
+        pass
+    correction.finish(labels)
+    grid = labels.to_map()
+    x = grid.origin[0] + 0.05 * np.nonzero(grid.p_occupied > 0.5)[1]
+    assert len(x) > 50
+    assert x.min() > 2.0 + 3.0 * np.cos(1.0) - 0.1
 
 
 def test_the_path_is_that_of_spaced_scans(corridor):

@@ -39,6 +39,7 @@ class MapFrame:
         self._spaced, self._corrected = list[Float](), np.zeros((0, D + 1, D + 1))
         self._drift = np.zeros((3, 3))  # covariance since the last spaced scan
         self._correction: MapCorrection | None = None
+        self._outdated = 0  # spaced scans of which corrections are not for where the robot is
 
     @property
     def last(self) -> int:
@@ -58,7 +59,7 @@ class MapFrame:
 
     def correct(
         self,
-        labelled: LabelledScan,
+        labelled: LabelledScan | None,
         added: MappedScan | None,
         labels: CausalLabels,
         odometry: FrontEnd,
@@ -66,19 +67,30 @@ class MapFrame:
         """Go on correcting the map after a scan, if loops were closed.
 
         Args:
-            labelled: the scan, which was added to the labels.
+            labelled: the scan if it was added to the labels.
             added: the same if it was added to the local map.
             labels: of the map.
             odometry: whose local map is made anew.
         """
         if self._correction is not None:
-            self._correction.note_labelled(labelled)
+            if labelled is not None:
+                self._correction.note_labelled(labelled)
             if added is not None:
                 self._correction.note_added(added)
-        elif (found := self._closer.poll()) is not None:
+        elif (found := self._closer.poll()) is not None and len(found.poses) > self._outdated:
             new = MapCorrection(found, labels, np.array(self._spaced), self.spaced_poses())
             self._correction = None if new.is_small else new
         self._go_on(labels, odometry, to_the_end=not self._in_background)
+
+    def enter(self, covariance: Float) -> None:
+        """Go on elsewhere in the map, where the robot was found: corrections that were begun
+        before have the local map of where it was, and those that follow correct as much.
+
+        Args:
+            covariance: (3, 3) of the pose at which it was found.
+        """
+        self.add_drift(covariance)
+        self._outdated = len(self._spaced)
 
     def finish_correction(self, labels: CausalLabels, odometry: FrontEnd) -> None:
         """Finish the correction that was begun, if there is one."""

@@ -369,7 +369,8 @@ class LiveMapper:
         if not self._finder.is_carried:
             if added is not None:
                 self._frame.add(added, found)
-            self._frame.correct(labelled, added, self._labels, self._odometry)
+            agrees = None if found.is_contradicted else labelled
+            self._frame.correct(agrees, added, self._labels, self._odometry)
         return added is not None
 
     def _label_again(self, scan: MappedScan) -> NDArray[np.float32]:

@@ -95,7 +95,7 @@ class RobotFinder:
                 return None
             odometry.enter(carried.join(labels, odometry.local_map, T), T)
             self._moves.append((self._lost_since, scans, T))
-            frame.add_drift(carried.covariance)
+            frame.enter(carried.covariance)
             self._carried = None
             return T, frame.T_map_local @ T @ se2.inverse(frame.T_map_local)
         place = self._place
