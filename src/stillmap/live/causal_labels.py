@@ -130,10 +130,13 @@ class CausalLabels:
         to.add(*scan, margin, offset, T, time_bin=time_bin, tag=tag)
 
     def _pixel_size(self, beams: ScanBeams) -> tuple[float, float]:
-        """Radians between the beams of a sensor, as of its first sweep."""
-        if beams.sensor not in self._pixels:
-            self._pixels[beams.sensor] = find_pixel_size(beams.points, beams.hit)
-        return self._pixels[beams.sensor]
+        """Radians between the beams of a sensor, as of its first sweep that met anything."""
+        if beams.sensor in self._pixels:
+            return self._pixels[beams.sensor]
+        found = find_pixel_size(beams.points, beams.hit)
+        if beams.hit.any():
+            self._pixels[beams.sensor] = found
+        return found
 
     def to_map(self) -> GridMap:
         """The planar map of what stands; NaN: unknown."""

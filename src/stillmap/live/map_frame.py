@@ -126,6 +126,8 @@ class MapFrame:
 
     def to_map_all(self, local: Float, anchor: NDArray[np.int64]) -> Float:
         """(T, D+1, D+1) the same of all scans; between spaced ones corrections are blended."""
+        if not self._spaced:
+            return np.asarray(self.T_map_local @ local)
         # the scan after which each spaced one is the last: itself, but for the first
         scans = np.searchsorted(anchor, np.arange(len(self._spaced)) - 1, side="right") - 1
         every, kept = np.unique(np.maximum(scans, 0), return_index=True)
