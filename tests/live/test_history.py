@@ -48,6 +48,15 @@ def test_scans_are_dropped_evenly_beyond_the_bound(scans, tmp_path):
     assert gaps[0] > 1
 
 
+@pytest.mark.parametrize("bound", [1, 2000])
+def test_a_bound_that_holds_a_few_scans(bound, tmp_path):
+    store = fill(bound, 2000, tmp_path)
+    assert len(store._segments) < 40
+    assert len(store.kept) < 60
+    assert store.kept[-1] == 1999
+    np.testing.assert_array_equal(store.view()[1], np.repeat(store.kept, store.counts))
+
+
 def test_the_store_is_empty_at_first(tmp_path):
     store = BeamStore([(np.float32, (2,))], tmp_path, 10)
     assert len(store.kept) == len(store.view()[0]) == 0

@@ -49,7 +49,7 @@ class BeamStore:
         self._segments[-1].append(np.array([number]), np.array([len(rows[0])]), rows)
         if self._max_bytes is None:
             return
-        if self._segments[-1].byte_count > self._max_bytes / _SEGMENTS:
+        if self._segments[-1].is_full(self._max_bytes / _SEGMENTS):
             self._segments.append(self._make_segment())
         is_idle = next(self._work, self) is self
         if is_idle and sum(s.byte_count for s in self._segments) > self._max_bytes:
@@ -120,6 +120,10 @@ class _Segment:
         for array, more in zip(self.arrays, rows, strict=True):
             if len(more):
                 array.append(more)
+
+    def is_full(self, most: float) -> bool:
+        """Whether it takes more than so many bytes; of one scan alone none could be dropped."""
+        return self.byte_count > most and len(self.numbers) > 1
 
     def is_small(self, other: "_Segment") -> bool:
         """Whether half of another one would fill it up at most."""
