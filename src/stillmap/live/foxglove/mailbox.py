@@ -22,12 +22,14 @@ class Mail(ShortRepr):
         changes: parts of the map, in the order in which they changed.
         resolution: m, edge of a cell of the map.
         path: (S, D) positions; None: no new ones.
+        begins_anew: it is all of a new map, and what was shown before is none of it.
     """
 
     answers: dict[str | int, Answer] = field(default_factory=dict)
     changes: list[list[MapChange]] = field(default_factory=list)
     resolution: float = 0.0
     path: NDArray[np.float64] | None = None
+    begins_anew: bool = False
 
 
 class Mailbox:
@@ -36,6 +38,12 @@ class Mailbox:
     def __init__(self) -> None:
         self._condition = threading.Condition()
         self._mail, self._has_news, self._is_closed = Mail(), False, False
+
+    def begin_anew(self) -> None:
+        """Drop all: a new map begins."""
+        with self._condition:
+            self._mail = Mail(begins_anew=True)
+            self._notify()
 
     def put_answer(self, answer: Answer) -> None:
         """The next scan of a sensor."""
