@@ -32,7 +32,7 @@ from stillmap.live.map_frame import LoopClosing, MapFrame
 from stillmap.live.map_view import project_obstacles
 from stillmap.live.movers import MoverTracker
 from stillmap.live.observation import BeamSelector, Observation, find_margins
-from stillmap.live.place import Mode, PlaceTracker
+from stillmap.live.place import Mode, PlaceTracker, adopt_resolution
 from stillmap.live.robot_finder import RobotFinder
 from stillmap.live.saving import Snapshot
 from stillmap.live.scan import Scan, ScanBeams, deskew, drop_cover, to_beams
@@ -72,6 +72,9 @@ class LiveMapper:
             are kept.
         lag: s after which each scan is labelled once more, see `Update.hindsight`; None: it is not.
 
+    Raises:
+        InputError: the place has no map, an empty one, or one of other cells that is to be extended.
+
     Examples:
         >>> with stillmap.LiveMapper() as mapper:
         >>>     update = mapper.push(stillmap.Scan(stamp, ranges, angles), odometry=(x, y, theta))
@@ -93,6 +96,8 @@ class LiveMapper:
         _require_positive(max_scratch=max_scratch, lag=lag)
         self.options = to_options(options)
         self._place = None if place is None else PlaceTracker(KnownMap(place), mode)
+        if self._place is not None and self._place.extends:
+            self.options = adopt_resolution(self.options, self._place.known)
         self._in_background = background
         self._scratch = None if scratch is None else Path(scratch)
         self._max_scratch, self._hindsight = max_scratch, Hindsight(lag)

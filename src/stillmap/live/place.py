@@ -6,13 +6,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
+from stillmap.core import config
+from stillmap.core.errors import InputError
 from stillmap.live.causal_labels import CausalLabels, take_over
 from stillmap.live.global_localization import GlobalLocalizer, Localization
 from stillmap.live.known_map import KnownLocalMap, KnownMap
+from stillmap.pipeline.options import DEFAULTS, Options
 from stillmap.slam.scan_hits import Scan
 
 Float = NDArray[np.float64]
 Mode = Literal["localise", "extend"]
+
+
+def adopt_resolution(options: Options, known: KnownMap) -> Options:
+    """The options with the edge of the cells of a map that is extended.
+
+    Raises:
+        InputError: they ask for another one.
+    """
+    edge, wanted = known.resolution, options.slam.resolution
+    if not np.isclose(wanted, [edge, DEFAULTS.slam.resolution]).any():
+        hint = f"it is extended with slam.resolution={edge:g}"
+        raise InputError(f"the map has cells of {edge:g} m", hint=hint)
+    return config.override(options, {"slam": {"resolution": edge}})
 
 
 class PlaceTracker:
