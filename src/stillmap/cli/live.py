@@ -90,8 +90,8 @@ def run(args: argparse.Namespace) -> int:
     """Run the node, or push a recording through the live mapper.
 
     Raises:
-        InputError: ROS is missing, the recording cannot be read or is not planar, or the output is
-            taken.
+        InputError: ROS is missing, the recording cannot be read or does not suit the map, or the
+            output is taken.
     """
     if args.replay is None:
         from stillmap.cli.live_node import run_node
