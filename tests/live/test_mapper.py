@@ -14,6 +14,7 @@ from stillmap.eval.trajectory import compute_absolute_errors
 from stillmap.live.causal_labels import CausalLabels, take_over
 from stillmap.live.loop_closer import Correction, NoLoops
 from stillmap.live.map_correction import MapCorrection
+from stillmap.live.map_frame import rotate_covariance
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.observation import Observation
 from stillmap.live.replay import iter_beams
@@ -273,3 +274,13 @@ def test_an_earlier_scan_is_labelled_again(corridor):
     labels = corridor.mapper.label(beams, 200)
     static = corridor.truth.static[corridor.recording.beams_of(200)]
     assert np.mean((labels > 0.5)[beams.hit] == static[beams.hit]) > 0.95
+
+
+def test_a_covariance_follows_the_axes_of_its_frame():
+    turn = se2.matrix(1.0, 2.0, np.pi / 2)
+    found = rotate_covariance(np.diag([4.0, 1.0, 0.1]), turn)
+    np.testing.assert_allclose(found, np.diag([1.0, 4.0, 0.1]), atol=1e-12)
+    T = np.eye(4)
+    T[:2, :2] = turn[:2, :2]
+    found = rotate_covariance(np.diag([4.0, 1.0, 2.0, 0.4, 0.1, 0.2]), T)
+    np.testing.assert_allclose(found, np.diag([1.0, 4.0, 2.0, 0.1, 0.4, 0.2]), atol=1e-12)

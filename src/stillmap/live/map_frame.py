@@ -140,3 +140,13 @@ class MapFrame:
     def stop(self) -> None:
         """End the process that closes loops, if there is one."""
         self._closer.stop()
+
+
+def rotate_covariance(covariance: Float, T: Float) -> Float:
+    """Covariance of a pose along the axes of another frame, in which its own frame has the pose
+    T (D+1, D+1): (3, 3) of x, y and heading, in 3D (6, 6) of translation and rotation."""
+    R, turn = T[:-1, :-1], np.eye(len(covariance))
+    turn[: len(R), : len(R)] = R
+    if len(R) == 3:
+        turn[3:, 3:] = R
+    return np.asarray(turn @ covariance @ turn.T)

@@ -28,7 +28,7 @@ from stillmap.live.local_map import MappedScan
 from stillmap.live.loop_closer import NoLoops
 from stillmap.live.loop_process import start_closer
 from stillmap.live.map_correction import LabelledScan
-from stillmap.live.map_frame import LoopClosing, MapFrame
+from stillmap.live.map_frame import LoopClosing, MapFrame, rotate_covariance
 from stillmap.live.map_view import project_obstacles
 from stillmap.live.movers import MoverTracker
 from stillmap.live.observation import BeamSelector, Observation, find_margins
@@ -192,6 +192,7 @@ class LiveMapper:
         return dataclasses.replace(
             update,
             pose=pose,
+            covariance=rotate_covariance(update.covariance, motion),
             T_map_odom=self._to_map_odom(pose),
             doubts=tuple(name for name in update.doubts if name not in ("lost", "ambiguous")),
             movers=self._movers.movers(frame.T_map_local),
@@ -407,7 +408,7 @@ class LiveMapper:
         pose = self._frame.T_map_local @ found.T
         return Update(
             pose,
-            found.covariance,
+            rotate_covariance(found.covariance, self._frame.T_map_local),
             p_static,
             self._to_map_odom(pose),
             tuple(name for name, is_so in doubts.items() if is_so),
