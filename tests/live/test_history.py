@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import stillmap
-from stillmap.live.beam_store import BeamStore
+from stillmap.live.beam_store import BeamStore, join_parts
 from stillmap.live.mapper import LiveMapper
 
 
@@ -23,7 +23,7 @@ def fill(max_bytes, scans, tmp_path):
 def test_all_scans_are_kept_without_a_bound(tmp_path):
     store = fill(None, 300, tmp_path)
     assert store.kept.tolist() == list(range(300))
-    points, numbers = store.view()
+    points, numbers = join_parts(store.parts(), tmp_path)
     np.testing.assert_array_equal(numbers, np.repeat(store.kept, store.counts))
     np.testing.assert_array_equal(points[:, 1], numbers)
 
@@ -32,7 +32,7 @@ def test_all_scans_are_kept_without_a_bound(tmp_path):
 def test_scans_are_dropped_evenly_beyond_the_bound(scans, tmp_path):
     bound = 100_000
     store = fill(bound, scans, tmp_path)
-    points, numbers = store.view()
+    points, numbers = join_parts(store.parts(), tmp_path)
     np.testing.assert_array_equal(numbers, np.repeat(store.kept, store.counts))
     np.testing.assert_array_equal(points[:, 0], numbers)
     assert np.all(np.diff(store.kept) > 0)
@@ -54,12 +54,24 @@ def test_a_bound_that_holds_a_few_scans(bound, tmp_path):
     assert len(store._segments) < 40
     assert len(store.kept) < 60
     assert store.kept[-1] == 1999
-    np.testing.assert_array_equal(store.view()[1], np.repeat(store.kept, store.counts))
+    np.testing.assert_array_equal(join_parts(store.parts(), tmp_path)[1], np.repeat(store.kept, store.counts))
 
 
 def test_the_store_is_empty_at_first(tmp_path):
     store = BeamStore([(np.float32, (2,))], tmp_path, 10)
-    assert len(store.kept) == len(store.view()[0]) == 0
+    assert len(store.kept) == len(join_parts(store.parts(), tmp_path)[0]) == 0
+
+
+def test_parts_stay_while_more_is_appended(tmp_path):
+    store = fill(20_000, 200, tmp_path)
+    kept, counts, parts = store.kept, store.counts, store.parts()
+    assert len(parts) > 1
+    for number in range(200, 3000):
+        store.append(number, [np.full((9, 2), number, np.float32), np.full(9, number)])
+    store.close()
+    points, numbers = join_parts(parts, tmp_path)
+    np.testing.assert_array_equal(numbers, np.repeat(kept, counts))
+    np.testing.assert_array_equal(points[:, 1], numbers)
 
 
 def test_a_bounded_run_is_saved_with_fewer_scans(corridor, tmp_path):

@@ -67,13 +67,11 @@ class BeamStore:
         self._finish()
         return np.concatenate([segment.counts.view() for segment in self._segments])
 
-    def view(self) -> list[Array]:
-        """The arrays (M, *row) of the scans that are kept; more may be appended."""
+    def parts(self) -> list[list[Array]]:
+        """The arrays of the scans that are kept, in parts for `join_parts`; more scans may be
+        appended."""
         self._finish()
-        parts = [[array.view() for array in segment.arrays] for segment in self._segments]
-        if len(parts) == 1:
-            return parts[0]
-        return [_join(list(arrays), self._folder) for arrays in zip(*parts, strict=True)]
+        return [[array.view() for array in segment.arrays] for segment in self._segments]
 
     def close(self) -> None:
         """Remove the files."""
@@ -148,6 +146,18 @@ def _copy_every_second(source: _Segment, to: _Segment) -> Iterator[None]:
         for array in arrays:
             release_pages(array)
         yield
+
+
+def join_parts(parts: list[list[Array]], folder: Path | None) -> list[Array]:
+    """The arrays (M, *row) of all parts, memory-mapped where they are large: copied, unless there
+    is one part alone.
+
+    Raises:
+        OSError: the disk is full.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    return [_join(list(arrays), folder) for arrays in zip(*parts, strict=True)]
 
 
 def _join(parts: list[Array], folder: Path | None) -> Array:

@@ -1,5 +1,6 @@
 """All scans, and the poses and labels returned for them, in temporary files."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
-from stillmap.live.beam_store import BeamStore
+from stillmap.live.beam_store import BeamStore, join_parts
 from stillmap.live.scan import ScanBeams
 
 Float = NDArray[np.float64]
@@ -34,6 +35,20 @@ class Answers(ShortRepr):
     local: Float
     anchor: NDArray[np.int64]
     p_static: NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class KeptScans(ShortRepr):
+    """The scans that are kept at a time, while more are appended.
+
+    Attributes:
+        number: (T,) of the scans, as they were pushed.
+        load: returns them with the answers; takes long where some scans were dropped, and may be
+            called in another thread.
+    """
+
+    number: NDArray[np.int64]
+    load: Callable[[], tuple[Recording, Answers]]
 
 
 class History:
@@ -136,27 +151,34 @@ class History:
 
     def recording(self) -> Recording:
         """The scans that are kept. Odometry only if every scan had it."""
-        return self.snapshot()[0]
+        return self.snapshot().load()[0]
 
-    def snapshot(self) -> tuple[Recording, Answers]:
+    def snapshot(self) -> KeptScans:
         """The scans that are kept, and what `push` has returned for them."""
-        kept, counts = self._beams.kept, self._beams.counts
-        points, hit, p_static, times = self._beams.view()
-        sensors = [{"name": str(name), "extrinsics": {"how": "given"}} for name in self._mounts]
-        recording = Recording(
-            stamp_ns=self._stamp_ns.view()[kept],
-            offset=np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)]),
-            points=points,
-            hit=hit,
-            T_base_sensor=np.array(list(self._mounts.values())),
-            sensor=self._sensor.view()[kept],
-            T_odom_base=self._T_odom_base.view()[kept] if self._has_odometry else None,
-            source={"format": "live", "sensors": sensors, "warnings": []},
-            beam_time=times if self._has_times else None,
-            scratch=self._folder,
-        )
-        poses, local, anchor = self.poses()
-        return recording, Answers(kept, poses[kept], local[kept], anchor[kept], p_static)
+        kept, counts, parts = self._beams.kept, self._beams.counts, self._beams.parts()
+        stamp_ns, sensor = self._stamp_ns.view()[kept], self._sensor.view()[kept]
+        odometry = self._T_odom_base.view()[kept] if self._has_odometry else None
+        mounts, has_times, folder = dict(self._mounts), self._has_times, self._folder
+        poses, local, anchor = (array[kept] for array in self.poses())
+
+        def load() -> tuple[Recording, Answers]:
+            points, hit, p_static, times = join_parts(parts, folder)
+            sensors = [{"name": str(name), "extrinsics": {"how": "given"}} for name in mounts]
+            recording = Recording(
+                stamp_ns=stamp_ns,
+                offset=np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)]),
+                points=points,
+                hit=hit,
+                T_base_sensor=np.array(list(mounts.values())),
+                sensor=sensor,
+                T_odom_base=odometry,
+                source={"format": "live", "sensors": sensors, "warnings": []},
+                beam_time=times if has_times else None,
+                scratch=folder,
+            )
+            return recording, Answers(kept, poses, local, anchor, p_static)
+
+        return KeptScans(kept, load)
 
     def poses(self) -> tuple[Float, Float, NDArray[np.int64]]:
         """`poses`, `local` and `anchor` of all scans, see `Answers`."""

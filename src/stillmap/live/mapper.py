@@ -275,10 +275,10 @@ class LiveMapper:
             InputError: no scan was pushed.
         """
         self._require_scans()
-        recording, answers = self._history.snapshot()
-        poses, place = self.poses[answers.number], self._place
+        kept, place = self._history.snapshot(), self._place
+        poses = self.poses[kept.number]
         extended = place.known if place is not None and place.extends else None
-        return Snapshot(recording, poses, answers, self.options, self._scratch, extended)
+        return Snapshot(kept, poses, self.options, self._scratch, extended)
 
     def finish(self, progress: Progress = no_progress) -> BuiltResult:
         """The result of `stillmap.build` on all scans: poses, labels and map refined.
