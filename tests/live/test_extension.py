@@ -97,5 +97,5 @@ def test_the_cells_are_those_of_the_map_that_is_extended(tmp_path):
     stillmap.build(simulation.recording, options).save(tmp_path / "known")
     with LiveMapper({"threads": 1}, place=tmp_path / "known", mode="extend") as mapper:
         assert mapper.resolution == 0.1
-    with pytest.raises(InputError, match="0.1 m"):
+    with pytest.raises(InputError, match=r"0\.1 m"):
         LiveMapper({"resolution": 0.2}, place=tmp_path / "known", mode="extend")

@@ -54,7 +54,9 @@ def test_a_bound_that_holds_a_few_scans(bound, tmp_path):
     assert len(store._segments) < 40
     assert len(store.kept) < 60
     assert store.kept[-1] == 1999
-    np.testing.assert_array_equal(join_parts(store.parts(), tmp_path)[1], np.repeat(store.kept, store.counts))
+    np.testing.assert_array_equal(
+        join_parts(store.parts(), tmp_path)[1], np.repeat(store.kept, store.counts)
+    )
 
 
 def test_the_store_is_empty_at_first(tmp_path):

@@ -73,7 +73,7 @@ class LiveMapper:
         lag: s after which each scan is labelled once more, see `Update.hindsight`; None: it is not.
 
     Raises:
-        InputError: the place has no map, an empty one, or one of other cells that is to be extended.
+        InputError: the place has no map, an empty one, or in mode "extend" one of other cells.
 
     Examples:
         >>> with stillmap.LiveMapper() as mapper:
