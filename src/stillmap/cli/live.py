@@ -136,7 +136,7 @@ def _replay(args: argparse.Namespace) -> int:
 def _stop_flag(
     args: argparse.Namespace,
 ) -> "AbstractContextManager[threading.Event | None]":
-    """Where somebody looks on, Ctrl-C ends the drive and not the command, as with the node."""
+    """An event that Ctrl-C sets with --rate or --foxglove: it ends the drive, not the command."""
     from stillmap.live.stopping import signal_flag
 
     return signal_flag() if args.foxglove or args.rate is not None else nullcontext()

@@ -180,7 +180,7 @@ class _Numbered(list[Any]):
 def start_closer(
     options: SlamOptions, dimension: int, background: bool, folder: Path | None, threads: int
 ) -> LoopCloser | LiveSweepLoopCloser | LoopProcess:
-    """What closes loops in 2D or 3D, in a process of its own or in this one."""
+    """A loop closer for 2D or 3D, in a process of its own or in this one."""
     if background:
         return LoopProcess(options, dimension, folder)
     return _make_closer(options, dimension, folder, threads)

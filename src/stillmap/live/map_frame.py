@@ -1,4 +1,4 @@
-"""Where the frame of the odometry by scans lies in the map: loops, and what they correct."""
+"""Pose of the frame of the odometry by scans in the map, as closed loops correct it."""
 
 import numpy as np
 from numpy.typing import NDArray

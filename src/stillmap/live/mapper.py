@@ -165,7 +165,7 @@ class LiveMapper:
         return self._find_robot(hits, update) if is_spaced and self._finder.is_lost else update
 
     def _observe(self, beams: ScanBeams, hits: Any, anchor: int) -> Observation:
-        """What a scan adds to the labels."""
+        """The observation by which a scan updates the labels."""
         margin = None
         if isinstance(hits, PlanarHits):
             margin = find_margins(beams, normals_of(beams, hits), self._selector.select(beams))

@@ -1,4 +1,4 @@
-"""What waits to be shown: the newest alone, so that nobody who puts something in ever waits."""
+"""A mailbox between threads: it keeps the newest message of each kind, and no `put` waits."""
 
 import threading
 from dataclasses import dataclass, field
@@ -15,7 +15,7 @@ _MAX_LISTS = 32  # of changes, before several of the same tile become one
 
 @dataclass(eq=False)
 class Mail(ShortRepr):
-    """What was put into a mailbox since it was emptied.
+    """Messages since the mailbox was emptied.
 
     Attributes:
         answers: the last one of each sensor.
@@ -33,7 +33,7 @@ class Mail(ShortRepr):
 
 
 class Mailbox:
-    """Between threads; what is older than the newest of its kind is dropped."""
+    """Keeps the newest message of each kind; safe to use from several threads."""
 
     def __init__(self) -> None:
         self._condition = threading.Condition()
@@ -79,7 +79,7 @@ class Mailbox:
             self._notify()
 
     def take(self, timeout: float | None = None) -> Mail | None:
-        """What is there as soon as something is, or after `timeout` (s); None: closed."""
+        """Wait for messages, at most `timeout` (s), and remove them; None: it is closed."""
         with self._condition:
             self._condition.wait_for(lambda: self._has_news, timeout)
             if self._is_closed:

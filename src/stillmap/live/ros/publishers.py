@@ -72,7 +72,7 @@ class Publishers:
         self._map.publish(grid, stamp)
 
     def publish_map_changes(self, changes: Sequence[MapChange], stamp: int) -> bool:
-        """What changed since; False: a whole map is due, since it has become larger."""
+        """Publish changed tiles; False: the map has become larger, and a whole one is due."""
         return self._map.publish_changes(changes, stamp)
 
     def begin_anew(self) -> None:
