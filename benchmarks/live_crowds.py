@@ -48,8 +48,8 @@ class EveryBeamCounts(LiveMapper):
     def _weigh(self, hits, prior):  # noqa: ARG002
         return hits
 
-    def _add_to_maps(self, labelled, e, found):
-        return super()._add_to_maps(labelled, np.ones_like(e), found)
+    def _add_to_maps(self, beams, labelled, e, found):
+        return super()._add_to_maps(beams, labelled, np.ones_like(e), found)
 
     def _label_again(self, scan):
         return np.ones(len(scan.e), np.float32)

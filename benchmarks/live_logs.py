@@ -27,7 +27,7 @@ _FURTHER = ("finish()", "Karto, at the time", "ratio", "Karto, at the end", "CPU
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Those of `live.py logs`."""
+    """Add the arguments of `live.py logs`."""
     parser.add_argument("folder", type=Path)
     parser.add_argument("--names", nargs="+", default=list(_LOGS))
     parser.add_argument("--data", type=Path, required=True, help="folder for results")

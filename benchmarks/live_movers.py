@@ -1,4 +1,4 @@
-"""What moves, as live mapping tells it at the time, against the truth.
+"""Moving objects of live mapping at the time, against the truth.
 
 python benchmarks/live_movers.py [--worlds hall corridor] [--seed 11] [--people N] [--beams N]
 

@@ -1,4 +1,4 @@
-"""What `stillmap live --foxglove` costs the mapper: CPU time per scan without it, with it, watched.
+"""CPU time per scan of live mapping without --foxglove, with it, and with a client.
 
 python benchmarks/live_view.py [--world hall] [--seconds 40] [--rate 40] [--beams 1081]
 

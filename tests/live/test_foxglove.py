@@ -168,6 +168,18 @@ def test_who_comes_late_sees_the_map(server, corridor):
             assert client.received["/doubts"][-1]["message"] == "no doubts"
 
 
+def test_a_new_mapper_begins_a_new_map(server, corridor):
+    """As the node has one when the clock was set back."""
+    other = SimpleNamespace(mapper=SimpleNamespace(path=corridor.mapper.path, resolution=0.05))
+    other.beams, other.updates = corridor.beams, corridor.updates
+    with subscribed(server, *TOPICS) as client:
+        show(server, corridor, range(100, 200))
+        client.wait(last_pose_is(corridor, 199))
+        show(server, other, range(60))
+        client.wait(last_pose_is(corridor, 59))
+        client.wait(has_map(expected_map(corridor, range(60))))
+
+
 def test_a_client_that_reads_nothing_delays_nobody(server, corridor):
     stuck = socket.create_connection(("127.0.0.1", int(server.url.rpartition(":")[2])))
     stuck.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1024)

@@ -1,12 +1,13 @@
 """What is kept of a live run, its bound, and labels in hindsight."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import stillmap
-from stillmap.live.beam_store import BeamStore
+from stillmap.live.beam_store import BeamStore, join_parts
 from stillmap.live.mapper import LiveMapper
 
 
@@ -22,7 +23,7 @@ def fill(max_bytes, scans, tmp_path):
 def test_all_scans_are_kept_without_a_bound(tmp_path):
     store = fill(None, 300, tmp_path)
     assert store.kept.tolist() == list(range(300))
-    points, numbers = store.view()
+    points, numbers = join_parts(store.parts(), tmp_path)
     np.testing.assert_array_equal(numbers, np.repeat(store.kept, store.counts))
     np.testing.assert_array_equal(points[:, 1], numbers)
 
@@ -31,7 +32,7 @@ def test_all_scans_are_kept_without_a_bound(tmp_path):
 def test_scans_are_dropped_evenly_beyond_the_bound(scans, tmp_path):
     bound = 100_000
     store = fill(bound, scans, tmp_path)
-    points, numbers = store.view()
+    points, numbers = join_parts(store.parts(), tmp_path)
     np.testing.assert_array_equal(numbers, np.repeat(store.kept, store.counts))
     np.testing.assert_array_equal(points[:, 0], numbers)
     assert np.all(np.diff(store.kept) > 0)
@@ -47,9 +48,32 @@ def test_scans_are_dropped_evenly_beyond_the_bound(scans, tmp_path):
     assert gaps[0] > 1
 
 
+@pytest.mark.parametrize("bound", [1, 2000])
+def test_a_bound_that_holds_a_few_scans(bound, tmp_path):
+    store = fill(bound, 2000, tmp_path)
+    assert len(store._segments) < 40
+    assert len(store.kept) < 60
+    assert store.kept[-1] == 1999
+    np.testing.assert_array_equal(
+        join_parts(store.parts(), tmp_path)[1], np.repeat(store.kept, store.counts)
+    )
+
+
 def test_the_store_is_empty_at_first(tmp_path):
     store = BeamStore([(np.float32, (2,))], tmp_path, 10)
-    assert len(store.kept) == len(store.view()[0]) == 0
+    assert len(store.kept) == len(join_parts(store.parts(), tmp_path)[0]) == 0
+
+
+def test_parts_stay_while_more_is_appended(tmp_path):
+    store = fill(20_000, 200, tmp_path)
+    kept, counts, parts = store.kept, store.counts, store.parts()
+    assert len(parts) > 1
+    for number in range(200, 3000):
+        store.append(number, [np.full((9, 2), number, np.float32), np.full(9, number)])
+    store.close()
+    points, numbers = join_parts(parts, tmp_path)
+    np.testing.assert_array_equal(numbers, np.repeat(kept, counts))
+    np.testing.assert_array_equal(points[:, 1], numbers)
 
 
 def test_a_bounded_run_is_saved_with_fewer_scans(corridor, tmp_path):
@@ -83,6 +107,22 @@ def test_scans_are_labelled_once_more_after_the_lag(corridor):
         wrong["at once"] += np.sum(((corridor.updates[t].p_static < 0.5) != moves)[hit])
         wrong["later"] += np.sum(((p_static < 0.5) != moves)[hit])
     assert 0 < wrong["later"] < 0.9 * wrong["at once"]
+
+
+def test_an_earlier_scan_is_labelled_as_it_was(corridor):
+    """Where scans are a millisecond apart, as those of two lasers, poses do not tell the motion."""
+    n = len(corridor.beams[0].points)
+    times = np.linspace(0.0, 0.1, n, dtype=np.float32)
+    with LiveMapper({"threads": 1}) as mapper:
+        for t, beams in enumerate(corridor.beams[:60]):
+            odometry = corridor.recording.T_odom_base[t]
+            mapper.push(replace(beams, sensor="other"), odometry)
+            last = replace(beams, stamp_ns=beams.stamp_ns + 10**6, beam_time=times)
+            update = mapper.push(last, odometry)
+        twist = mapper._history.twist_at(2 * t + 1)
+        again = mapper.label(last, 2 * t + 1)
+    np.testing.assert_allclose(twist, 0.0, atol=1e-6)
+    assert np.mean((again < 0.5) == (update.p_static < 0.5), where=last.hit) > 0.95
 
 
 @pytest.mark.parametrize("name", ["max_scratch", "lag"])

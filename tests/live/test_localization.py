@@ -1,5 +1,7 @@
 """Localization in a known map: from anywhere, in a crowd, after being carried, in doubt."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -72,10 +74,31 @@ def test_a_crowd_does_not_lose_it(hall):
     assert np.mean(found) < 0.06
 
 
+def test_scans_from_before_it_was_found_are_labelled_in_the_map(hall):
+    simulation = hall.simulate(201, crowd={"people": 10})
+    first, beams = 900, list(iter_beams(simulation.recording))
+    answers = run(hall, simulation, range(first, first + 40))
+    k, update, mapper = next(answers)
+    while "lost" in update.doubts:
+        k, update, mapper = next(answers)
+    assert k > first
+    labels, hit = mapper.label(beams[first], 0), beams[first].hit
+    static = simulation.truth.static[simulation.recording.beams_of(first)]
+    assert np.mean((labels >= 0.5) == static, where=hit) > 0.9
+
+
 def test_a_robot_that_is_carried_is_found_again(hall):
     robot = {"scans": 220, "carried_at": 0.4, "carried_time": 5.0}
     simulation = hall.simulate(203, crowd={"people": 5}, robot=robot)
-    answers = list(run(hall, simulation, range(220)))
+    answers = []
+    for k, update, mapper in run(hall, simulation, range(220)):
+        answers.append((k, update, mapper))
+        poses = mapper.poses if k == 219 else None
+    off = [
+        hall.error(replace(one, pose=T), simulation, k)[0]
+        for (k, one, _), T in zip(answers, poses, strict=True)
+    ]
+    assert np.mean(np.array(off) > 0.5) < 0.05  # in hindsight those until it was noticed, too
     doubts = [update.doubts for _, update, _ in answers]
     assert not any("carried" in doubt for doubt in doubts[:80])
     assert any("carried" in doubt for doubt in doubts[80:140])

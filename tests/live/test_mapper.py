@@ -8,9 +8,13 @@ import pytest
 
 import stillmap
 from stillmap.core import se2
+from stillmap.core.errors import InputError
 from stillmap.em.options import EmOptions
 from stillmap.eval.trajectory import compute_absolute_errors
 from stillmap.live.causal_labels import CausalLabels, take_over
+from stillmap.live.loop_closer import Correction, NoLoops
+from stillmap.live.map_correction import MapCorrection
+from stillmap.live.map_frame import rotate_covariance
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.observation import Observation
 from stillmap.live.replay import iter_beams
@@ -118,6 +122,27 @@ def test_parts_that_emptied_are_told():
     assert labels.take_changes() == []
 
 
+def test_cells_hit_while_a_correction_goes_on_move_with_it():
+    labels = CausalLabels(2, 0.05, EmOptions())
+    angles, margin = np.linspace(-1.0, 1.0, 200), np.full(200, 0.1, np.float32)
+
+    def see(stamp, tag):
+        beams = to_beams(stillmap.Scan(stamp, np.full(200, 3.0), angles))
+        labels.add(Observation(beams, margin, tag), np.eye(3))
+
+    see(0, 0)
+    T, here = se2.matrix(2.0, 0.0, 0.0), np.eye(3)[None]
+    correction = MapCorrection(Correction(T, T[None], []), labels, here, here)
+    see(10**9, 1)  # after the next spaced scan
+    while not correction.step(labels):
+        pass
+    correction.finish(labels)
+    grid = labels.to_map()
+    x = grid.origin[0] + 0.05 * np.nonzero(grid.p_occupied > 0.5)[1]
+    assert len(x) > 50
+    assert x.min() > 2.0 + 3.0 * np.cos(1.0) - 0.1
+
+
 def test_the_path_is_that_of_spaced_scans(corridor):
     path = corridor.mapper.path
     assert 20 < len(path) < corridor.recording.n_scans
@@ -182,6 +207,39 @@ def test_late_scans_are_refused_and_change_nothing(corridor, fresh):
     assert len(mapper.poses) == 1
 
 
+def test_odometry_that_is_none_starts_nothing(corridor, fresh):
+    mapper = fresh(background=True)
+    first = next(iter_beams(corridor.recording))
+    with pytest.raises(ValueError, match="odometry"):
+        mapper.push(first, (0.0, np.nan, 0.0))
+    assert isinstance(mapper._frame._closer, NoLoops)
+    mapper.push(first, (0.0, 0.0, 0.0))
+    assert len(mapper.poses) == 1
+
+
+def test_before_the_first_scan(fresh, tmp_path):
+    mapper = fresh()
+    assert mapper.poses.shape == mapper.path.shape == (0, 3, 3)
+    assert mapper.map.p_occupied.size == len(mapper.cells.cells) == 0
+    for call in (mapper.finish, lambda: mapper.save(tmp_path / "out"), lambda: mapper.objects):
+        with pytest.raises(InputError, match="no scan"):
+            call()
+
+
+def test_a_mapper_that_is_closed_says_so(corridor, tmp_path):
+    mapper = LiveMapper({"threads": 1})
+    mapper.push(corridor.beams[0])
+    mapper.close()
+    mapper.close()
+    for call in (
+        lambda: mapper.push(corridor.beams[1]),
+        lambda: mapper.poses,
+        lambda: mapper.save(tmp_path / "out"),
+    ):
+        with pytest.raises(ValueError, match="closed"):
+            call()
+
+
 def push_all(mapper, recording, count=None):
     odometry = recording.T_odom_base
     beams = itertools.islice(iter_beams(recording), count)
@@ -208,6 +266,7 @@ def test_mapping_goes_on_when_the_process_that_closes_loops_dies(corridor, fresh
     moved = se2.inverse(truth[0]) @ truth[149]
     np.testing.assert_allclose(update.pose[:2, 2], moved[:2, 2], atol=0.1)
     assert sum("closes loops" in record.message for record in caplog.records) == 1
+    assert mapper._frame._closer._outgoing.qsize() <= 1  # nobody takes anything out
 
 
 def test_an_earlier_scan_is_labelled_again(corridor):
@@ -215,3 +274,13 @@ def test_an_earlier_scan_is_labelled_again(corridor):
     labels = corridor.mapper.label(beams, 200)
     static = corridor.truth.static[corridor.recording.beams_of(200)]
     assert np.mean((labels > 0.5)[beams.hit] == static[beams.hit]) > 0.95
+
+
+def test_a_covariance_follows_the_axes_of_its_frame():
+    turn = se2.matrix(1.0, 2.0, np.pi / 2)
+    found = rotate_covariance(np.diag([4.0, 1.0, 0.1]), turn)
+    np.testing.assert_allclose(found, np.diag([1.0, 4.0, 0.1]), atol=1e-12)
+    T = np.eye(4)
+    T[:2, :2] = turn[:2, :2]
+    found = rotate_covariance(np.diag([4.0, 1.0, 2.0, 0.4, 0.1, 0.2]), T)
+    np.testing.assert_allclose(found, np.diag([1.0, 4.0, 2.0, 0.1, 0.4, 0.2]), atol=1e-12)

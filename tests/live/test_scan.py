@@ -46,6 +46,7 @@ def test_points_with_and_without_returns():
         (Scan(0, points=np.ones((3, 4))), "points"),
         (Scan(0, points=np.ones((3, 2)), hit=[True]), "hit"),
         (Scan(0, [1.0], [0.0], beam_times=[0.0, 1.0]), "beam_times"),
+        (Scan(0, [1.0], [0.0], beam_times=[np.inf]), "beam_times"),
         (Scan(0, [1.0], [0.0], sensor_pose=(1.0, 2.0)), "sensor_pose"),
     ],
 )

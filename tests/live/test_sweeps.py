@@ -93,8 +93,46 @@ def test_a_lidar_that_is_carried_begins_anew():
         for one in here:
             mapper.push(one)
         moved = [replace(one, stamp_ns=one.stamp_ns + later) for one in there]
-        doubts = [mapper.push(one).doubts for one in moved]
+        doubts, shown = [], []
+        for one in moved:
+            doubts.append(mapper.push(one).doubts)
+            shown.append(mapper.map.p_occupied.size)
     assert sum("carried" in d for d in doubts) == 1
+    assert min(shown) > 0
+
+
+def cover(beams):
+    nothing = np.full_like(beams.points, np.nan)
+    return replace(beams, points=nothing, hit=np.zeros_like(beams.hit))
+
+
+def test_a_lidar_that_is_covered_says_nothing_of_the_map(sweeps):
+    with LiveMapper({"threads": 1}) as mapper:
+        for t, one in enumerate(sweeps.beams[:30]):
+            if t == 20:
+                usual = mapper._odometry._usual
+            is_covered = 20 <= t < 25
+            doubts = mapper.push(cover(one) if is_covered else one).doubts
+            assert ("blind" in doubts) == is_covered
+            if is_covered:
+                assert mapper._odometry._usual == usual
+        assert not doubts
+
+
+def test_a_lidar_that_is_covered_at_first(sweeps):
+    true = from_first(sweeps.truth.T_world_base[2:30])
+    with LiveMapper({"threads": 1}) as mapper:
+        for one in sweeps.beams[:2]:
+            mapper.push(cover(one))
+        assert len(mapper.poses) == 2
+        assert not mapper.map.p_occupied.size
+        found = [mapper.push(one).pose for one in sweeps.beams[2:30]]
+        assert mapper._labels._pixels[0] == find_pixel_size(
+            sweeps.beams[2].points, sweeps.beams[2].hit
+        )
+        np.testing.assert_allclose(mapper.poses[2:], found, atol=1e-9)
+    off = np.linalg.norm((from_first(np.array(found)) - true)[:, :3, 3], axis=1)
+    assert off.max() < 0.2
 
 
 def test_the_dimension_stays():

@@ -90,8 +90,8 @@ def run(args: argparse.Namespace) -> int:
     """Run the node, or push a recording through the live mapper.
 
     Raises:
-        InputError: ROS is missing, the recording cannot be read or is not planar, or the output is
-            taken.
+        InputError: ROS is missing, the recording cannot be read or does not suit the map, or the
+            output is taken.
     """
     if args.replay is None:
         from stillmap.cli.live_node import run_node
@@ -136,7 +136,7 @@ def _replay(args: argparse.Namespace) -> int:
 def _stop_flag(
     args: argparse.Namespace,
 ) -> "AbstractContextManager[threading.Event | None]":
-    """Where somebody looks on, Ctrl-C ends the drive and not the command, as with the node."""
+    """An event that Ctrl-C sets with --rate or --foxglove: it ends the drive, not the command."""
     from stillmap.live.stopping import signal_flag
 
     return signal_flag() if args.foxglove or args.rate is not None else nullcontext()

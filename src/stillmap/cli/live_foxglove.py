@@ -38,7 +38,7 @@ def add_foxglove_flags(p: argparse.ArgumentParser) -> None:
 def serve(
     args: argparse.Namespace,
 ) -> "Iterator[Callable[[LiveMapper, ScanBeams, Update], None] | None]":
-    """What is to be called with each scan and its answer; None without --foxglove.
+    """A function to call with each scan and its update; None without --foxglove.
 
     Raises:
         InputError: foxglove-sdk is missing, or the port is taken.

@@ -97,6 +97,7 @@ class ArrayBuilder:
         self._bytes = 0
         self._length = 0
         self._file: Any = None
+        self._is_closed = False
 
     def __len__(self) -> int:
         return self._length
@@ -106,7 +107,9 @@ class ArrayBuilder:
 
         Raises:
             OSError: the disk is full.
+            ValueError: the rows have another shape, or the builder is closed.
         """
+        self._require_open()
         rows = np.array(rows, self._dtype, order="C", ndmin=1)
         if rows.shape[1:] != self._row:
             raise ValueError(f"rows: expected (n, *{self._row}), got {rows.shape}")
@@ -126,18 +129,23 @@ class ArrayBuilder:
 
     def close(self) -> None:
         """Close the file, if there is one; arrays that were mapped stay as they are."""
-        self._parts = []
+        self._parts, self._is_closed = [], True
         if self._file is not None:
             self._file.close()
 
     def view(self) -> NDArray[Any]:
         """The array (N, *row) so far, read-only where it is memory-mapped; more may be appended."""
+        self._require_open()
         shape = (self._length, *self._row)
         if self._file is None:
             return np.concatenate(self._parts) if self._parts else np.empty(shape, self._dtype)
         self._write()
         self._file.flush()
         return _map(self._file, shape, self._dtype, writable=False)
+
+    def _require_open(self) -> None:
+        if self._is_closed:
+            raise ValueError("array: expected a builder that is not closed")
 
     def finish(self) -> NDArray[Any]:
         """The array (N, *row), read-only where it is memory-mapped. Ends appending."""

@@ -49,7 +49,7 @@ class BeamStore:
         self._segments[-1].append(np.array([number]), np.array([len(rows[0])]), rows)
         if self._max_bytes is None:
             return
-        if self._segments[-1].byte_count > self._max_bytes / _SEGMENTS:
+        if self._segments[-1].is_full(self._max_bytes / _SEGMENTS):
             self._segments.append(self._make_segment())
         is_idle = next(self._work, self) is self
         if is_idle and sum(s.byte_count for s in self._segments) > self._max_bytes:
@@ -67,13 +67,11 @@ class BeamStore:
         self._finish()
         return np.concatenate([segment.counts.view() for segment in self._segments])
 
-    def view(self) -> list[Array]:
-        """The arrays (M, *row) of the scans that are kept; more may be appended."""
+    def parts(self) -> list[list[Array]]:
+        """The arrays of the scans that are kept, in parts for `join_parts`; more scans may be
+        appended."""
         self._finish()
-        parts = [[array.view() for array in segment.arrays] for segment in self._segments]
-        if len(parts) == 1:
-            return parts[0]
-        return [_join(list(arrays), self._folder) for arrays in zip(*parts, strict=True)]
+        return [[array.view() for array in segment.arrays] for segment in self._segments]
 
     def close(self) -> None:
         """Remove the files."""
@@ -121,6 +119,10 @@ class _Segment:
             if len(more):
                 array.append(more)
 
+    def is_full(self, most: float) -> bool:
+        """Whether it takes more than so many bytes; of one scan alone none could be dropped."""
+        return self.byte_count > most and len(self.numbers) > 1
+
     def is_small(self, other: "_Segment") -> bool:
         """Whether half of another one would fill it up at most."""
         return self.byte_count <= 0.6 * other.byte_count
@@ -144,6 +146,18 @@ def _copy_every_second(source: _Segment, to: _Segment) -> Iterator[None]:
         for array in arrays:
             release_pages(array)
         yield
+
+
+def join_parts(parts: list[list[Array]], folder: Path | None) -> list[Array]:
+    """The arrays (M, *row) of all parts, memory-mapped where they are large: copied, unless there
+    is one part alone.
+
+    Raises:
+        OSError: the disk is full.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    return [_join(list(arrays), folder) for arrays in zip(*parts, strict=True)]
 
 
 def _join(parts: list[Array], folder: Path | None) -> Array:

@@ -75,8 +75,8 @@ class CausalLabels:
         self._first_ns: int | None = None
         self.tags = 1  # numbers of keyframes are below
         self._pixels = dict[str | int, tuple[float, float]]()  # of the sensors, in 3D
-        # blocks that were told of, as bytes, and the filter that has them
-        self._told, self._told_of = set[bytes](), self.filter
+        # lowest cells of the blocks in `take_changes` so far, as bytes, and the filter they are of
+        self._reported, self._reported_of = set[bytes](), self.filter
 
     def clear(self) -> None:
         """Forget all scans."""
@@ -130,17 +130,20 @@ class CausalLabels:
         to.add(*scan, margin, offset, T, time_bin=time_bin, tag=tag)
 
     def _pixel_size(self, beams: ScanBeams) -> tuple[float, float]:
-        """Radians between the beams of a sensor, as of its first sweep."""
-        if beams.sensor not in self._pixels:
-            self._pixels[beams.sensor] = find_pixel_size(beams.points, beams.hit)
-        return self._pixels[beams.sensor]
+        """Radians between the beams of a sensor, as of its first sweep that met anything."""
+        if beams.sensor in self._pixels:
+            return self._pixels[beams.sensor]
+        found = find_pixel_size(beams.points, beams.hit)
+        if beams.hit.any():
+            self._pixels[beams.sensor] = found
+        return found
 
     def to_map(self) -> GridMap:
         """The planar map of what stands; NaN: unknown."""
         return self._to_map(self._odds_factor)
 
     def to_view(self) -> GridMap:
-        """The same where one look is enough: for comparison with another map."""
+        """The same without the prior of the map: for comparison with another map."""
         return self._to_map(1.0)
 
     def _to_map(self, odds_factor: float) -> GridMap:
@@ -158,14 +161,14 @@ class CausalLabels:
         """The parts of the map that changed since the last call, those that emptied too."""
         lowest, tiles = self.filter.take_changed_blocks(odds_factor=self._odds_factor)
         changes = list(map(MapChange, lowest, tiles))
-        told = {cell.tobytes() for cell in lowest}
-        if self.filter is not self._told_of:  # the whole map was moved
-            gone = sorted(self._told - told)
+        changed = {cell.tobytes() for cell in lowest}
+        if self.filter is not self._reported_of:  # the whole map was moved
+            gone = sorted(self._reported - changed)
             emptied = np.frombuffer(b"".join(gone), lowest.dtype).reshape(-1, lowest.shape[1])
             unknown = np.full(tiles.shape[1:], np.nan, np.float32)
             changes += [MapChange(cell, unknown) for cell in emptied]
-            self._told, self._told_of = set(), self.filter
-        self._told |= told
+            self._reported, self._reported_of = set(), self.filter
+        self._reported |= changed
         return changes
 
 

@@ -1,16 +1,16 @@
 """All scans, and the poses and labels returned for them, in temporary files."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core import se2, se3
 from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
-from stillmap.live.beam_store import BeamStore
+from stillmap.live.beam_store import BeamStore, join_parts
 from stillmap.live.scan import ScanBeams
 
 Float = NDArray[np.float64]
@@ -37,14 +37,28 @@ class Answers(ShortRepr):
     p_static: NDArray[np.float32]
 
 
+@dataclass(frozen=True, eq=False)
+class KeptScans(ShortRepr):
+    """The scans that are kept at a time, while more are appended.
+
+    Attributes:
+        number: (T,) of the scans, as they were pushed.
+        load: returns them with the answers; takes long where some scans were dropped, and may be
+            called in another thread.
+    """
+
+    number: NDArray[np.int64]
+    load: Callable[[], tuple[Recording, Answers]]
+
+
 class History:
     """Scans and answers, appended.
 
     Args:
         dimension: 2 or 3.
         folder: of the temporary files; None: the system's.
-        max_bytes: about, of the beams, 13 bytes each: beyond, every second one of the scans that
-            lie most densely is dropped; None: unbounded.
+        max_bytes: about, of the beams, 17 bytes each, in 3D 21: beyond, every second one of the
+            scans that lie most densely is dropped; None: unbounded.
     """
 
     def __init__(
@@ -65,6 +79,7 @@ class History:
         self._beams = BeamStore(fields, folder, max_bytes)
         self._T_odom_base = array(np.float64, D + 1, D + 1)
         self._poses, self._local = (array(np.float64, D + 1, D + 1) for _ in range(2))
+        self._twist = array(np.float64, 3 if D == 2 else 6)
         self._mounts: dict[str | int, Float] = {}
         self._has_odometry, self._has_times = True, False
         self._folder = folder
@@ -86,8 +101,18 @@ class History:
         pose: Float,
         local: Float,
         anchor: int,
+        twist: Float,
     ) -> None:
         """Append a scan and the answer to it; see `Answers`.
+
+        Args:
+            beams: of the scan.
+            p_static: (N,).
+            T_odom_base: (D+1, D+1); None: without odometry.
+            pose: (D+1, D+1).
+            local: (D+1, D+1).
+            anchor: a spaced scan.
+            twist: (3,) or (6,) m/s and rad/s of the base during the scan, in its own frame.
 
         Raises:
             OSError: the disk is full.
@@ -112,6 +137,7 @@ class History:
             (self._T_odom_base, odometry),
             (self._poses, pose),
             (self._local, local),
+            (self._twist, twist),
         ):
             array.append(T[None])
 
@@ -120,37 +146,40 @@ class History:
         return int(self._anchor.view()[number]), np.array(self._local.view()[number])
 
     def twist_at(self, number: int) -> Float:
-        """(3,) or (6,) m/s and rad/s of the base from the scan before to one."""
-        stamps, local = self._stamp_ns.view()[: number + 1], self._local.view()
-        log = se2.log if local.shape[-1] == 3 else se3.log
-        seconds = 1e-9 * float(stamps[number] - stamps[number - 1]) if number else 0.0
-        step = log((se2.inverse(local[number - 1]) @ local[number])[None])[0]
-        out: Float = step / seconds if seconds > 0.0 else np.zeros_like(step)
-        return out
+        """(3,) or (6,) m/s and rad/s of the base during a scan."""
+        return np.array(self._twist.view()[number])
 
     def recording(self) -> Recording:
         """The scans that are kept. Odometry only if every scan had it."""
-        return self.snapshot()[0]
+        return self.snapshot().load()[0]
 
-    def snapshot(self) -> tuple[Recording, Answers]:
+    def snapshot(self) -> KeptScans:
         """The scans that are kept, and what `push` has returned for them."""
-        kept, counts = self._beams.kept, self._beams.counts
-        points, hit, p_static, times = self._beams.view()
-        sensors = [{"name": str(name), "extrinsics": {"how": "given"}} for name in self._mounts]
-        recording = Recording(
-            stamp_ns=self._stamp_ns.view()[kept],
-            offset=np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)]),
-            points=points,
-            hit=hit,
-            T_base_sensor=np.array(list(self._mounts.values())),
-            sensor=self._sensor.view()[kept],
-            T_odom_base=self._T_odom_base.view()[kept] if self._has_odometry else None,
-            source={"format": "live", "sensors": sensors, "warnings": []},
-            beam_time=times if self._has_times else None,
-            scratch=self._folder,
-        )
+        kept, counts, parts = self._beams.kept, self._beams.counts, self._beams.parts()
+        stamp_ns, sensor = self._stamp_ns.view()[kept], self._sensor.view()[kept]
+        odometry = self._T_odom_base.view()[kept] if self._has_odometry else None
+        mounts, has_times, folder = dict(self._mounts), self._has_times, self._folder
         poses, local, anchor = self.poses()
-        return recording, Answers(kept, poses[kept], local[kept], anchor[kept], p_static)
+        poses, local, anchor = poses[kept], local[kept], anchor[kept]
+
+        def load() -> tuple[Recording, Answers]:
+            points, hit, p_static, times = join_parts(parts, folder)
+            sensors = [{"name": str(name), "extrinsics": {"how": "given"}} for name in mounts]
+            recording = Recording(
+                stamp_ns=stamp_ns,
+                offset=np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)]),
+                points=points,
+                hit=hit,
+                T_base_sensor=np.array(list(mounts.values())),
+                sensor=sensor,
+                T_odom_base=odometry,
+                source={"format": "live", "sensors": sensors, "warnings": []},
+                beam_time=times if has_times else None,
+                scratch=folder,
+            )
+            return recording, Answers(kept, poses, local, anchor, p_static)
+
+        return KeptScans(kept, load)
 
     def poses(self) -> tuple[Float, Float, NDArray[np.int64]]:
         """`poses`, `local` and `anchor` of all scans, see `Answers`."""

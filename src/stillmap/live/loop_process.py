@@ -69,6 +69,8 @@ class LoopProcess:
 
     def add(self, scan: MappedScan, explained: float, drift: Float) -> None:
         """Add a spaced scan, as of `LoopCloser.add`. Never waits."""
+        if self._has_ended:
+            return  # nobody takes it out of the queue
         if scan.beams.sensor not in self._sensors:
             self._sensors.append(scan.beams.sensor)
         message = _pack_scans([scan], self._sensors)
@@ -157,7 +159,7 @@ def _unpack_scans(message: dict[str, NDArray[Any]], sensors: list[str | int]) ->
 def start_closer(
     options: SlamOptions, dimension: int, background: bool, folder: Path | None, threads: int
 ) -> LoopCloser | LiveSweepLoopCloser | LoopProcess:
-    """What closes loops in 2D or 3D, in a process of its own or in this one."""
+    """A loop closer for 2D or 3D, in a process of its own or in this one."""
     if background:
         return LoopProcess(options, dimension, folder)
     return _make_closer(options, dimension, folder, threads)

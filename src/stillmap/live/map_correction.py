@@ -88,6 +88,9 @@ class MapCorrection:
 
     def step(self, labels: CausalLabels) -> bool:
         """Do a part of the work; True when nothing is left."""
+        if labels.tags > len(self._motion):  # scans that came meanwhile move as the last one
+            more = labels.tags - len(self._motion)
+            self._motion = np.concatenate([self._motion, self._motion[-1:].repeat(more, axis=0)])
         if self.moves_cells and self._block < self._source.block_count:
             count = _BLOCKS_PER_STEP[self._D]
             self._block = take_over(self.filter, self._source, self._motion, self._block, count)

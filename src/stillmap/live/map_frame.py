@@ -1,4 +1,4 @@
-"""Where the frame of the odometry by scans lies in the map: loops, and what they correct."""
+"""Pose of the frame of the odometry by scans in the map, as closed loops correct it."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,7 @@ class MapFrame:
         self._corrected = np.zeros((0, D + 1, D + 1))
         self._drift = np.zeros((3, 3))  # covariance since the last spaced scan
         self._correction: MapCorrection | None = None
+        self._outdated = 0  # spaced scans of which corrections are not for where the robot is
 
     @property
     def last(self) -> int:
@@ -65,7 +66,7 @@ class MapFrame:
 
     def correct(
         self,
-        labelled: LabelledScan,
+        labelled: LabelledScan | None,
         added: MappedScan | None,
         labels: CausalLabels,
         odometry: FrontEnd,
@@ -73,20 +74,31 @@ class MapFrame:
         """Go on correcting the map after a scan, if loops were closed.
 
         Args:
-            labelled: the scan, which was added to the labels.
+            labelled: the scan if it was added to the labels.
             added: the same if it was added to the local map.
             labels: of the map.
             odometry: whose local map is made anew.
         """
         if self._correction is not None:
-            self._correction.note_labelled(labelled)
+            if labelled is not None:
+                self._correction.note_labelled(labelled)
             if added is not None:
                 self._correction.note_added(added)
-        elif (found := self._closer.poll()) is not None:
+        elif (found := self._closer.poll()) is not None and len(found.poses) > self._outdated:
             spaced = self._spaced[: self._count].copy()
             new = MapCorrection(found, labels, spaced, self.spaced_poses())
             self._correction = None if new.is_small else new
         self._go_on(labels, odometry, to_the_end=not self._in_background)
+
+    def enter(self, covariance: Float) -> None:
+        """Go on elsewhere in the map, where the robot was found: corrections that were begun
+        before have the local map of where it was, and those that follow correct as much.
+
+        Args:
+            covariance: (3, 3) of the pose at which it was found.
+        """
+        self.add_drift(covariance)
+        self._outdated = self._count
 
     def finish_correction(self, labels: CausalLabels, odometry: FrontEnd) -> None:
         """Finish the correction that was begun, if there is one."""
@@ -121,6 +133,8 @@ class MapFrame:
 
     def to_map_all(self, local: Float, anchor: NDArray[np.int64]) -> Float:
         """(T, D+1, D+1) the same of all scans; between spaced ones corrections are blended."""
+        if not self._count:
+            return np.asarray(self.T_map_local @ local)
         # the scan after which each spaced one is the last: itself, but for the first
         scans = np.searchsorted(anchor, np.arange(self._count) - 1, side="right") - 1
         every, kept = np.unique(np.maximum(scans, 0), return_index=True)
@@ -133,3 +147,13 @@ class MapFrame:
     def stop(self) -> None:
         """End the process that closes loops, if there is one."""
         self._closer.stop()
+
+
+def rotate_covariance(covariance: Float, T: Float) -> Float:
+    """Covariance of a pose along the axes of another frame, in which its own frame has the pose
+    T (D+1, D+1): (3, 3) of x, y and heading, in 3D (6, 6) of translation and rotation."""
+    R, turn = T[:-1, :-1], np.eye(len(covariance))
+    turn[: len(R), : len(R)] = R
+    if len(R) == 3:
+        turn[3:, 3:] = R
+    return np.asarray(turn @ covariance @ turn.T)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stillmap.core import se2
+from stillmap.core.errors import InputError
 from stillmap.core.grid_map import GridMap
 from stillmap.core.parallel import resolve_threads
 from stillmap.core.profiling import Progress, no_progress
@@ -27,11 +28,11 @@ from stillmap.live.local_map import MappedScan
 from stillmap.live.loop_closer import NoLoops
 from stillmap.live.loop_process import start_closer
 from stillmap.live.map_correction import SPACED_PER_TAG, LabelledScan
-from stillmap.live.map_frame import MapFrame
+from stillmap.live.map_frame import LoopClosing, MapFrame, rotate_covariance
 from stillmap.live.map_view import project_obstacles
 from stillmap.live.movers import MoverTracker
 from stillmap.live.observation import BeamSelector, Observation, find_margins
-from stillmap.live.place import Mode, PlaceTracker
+from stillmap.live.place import Mode, PlaceTracker, adopt_resolution
 from stillmap.live.robot_finder import RobotFinder
 from stillmap.live.saving import Snapshot
 from stillmap.live.scan import Scan, ScanBeams, deskew, drop_cover, to_beams
@@ -66,9 +67,13 @@ class LiveMapper:
             between two scans, the same to the bit every time.
         scratch: folder of the files in which all scans are kept for `save` and `finish`; None: the
             system's temporary folder.
-        max_scratch: bytes, about, that their beams may take, 13 each: beyond, every second one of
-            the scans that lie most densely is dropped, the oldest first; None: all are kept.
+        max_scratch: bytes, about, that their beams may take, 17 each, in 3D 21: beyond, every
+            second one of the scans that lie most densely is dropped, the oldest first; None: all
+            are kept.
         lag: s after which each scan is labelled once more, see `Update.hindsight`; None: it is not.
+
+    Raises:
+        InputError: the place has no map, an empty one, or in mode "extend" one of other cells.
 
     Examples:
         >>> with stillmap.LiveMapper() as mapper:
@@ -91,11 +96,14 @@ class LiveMapper:
         _require_positive(max_scratch=max_scratch, lag=lag)
         self.options = to_options(options)
         self._place = None if place is None else PlaceTracker(KnownMap(place), mode)
+        if self._place is not None and self._place.extends:
+            self.options = adopt_resolution(self.options, self._place.known)
         self._in_background = background
         self._scratch = None if scratch is None else Path(scratch)
         self._max_scratch, self._hindsight = max_scratch, Hindsight(lag)
         self._T_odom_base: Float | None = None
         self._last_ns: int | None = None
+        self._is_closed = False
         self._changes_due_ns = 0
         self._path_begin = 0  # the first spaced scan in the frame of the map
         self._moving = 0.0  # share of the hits, as the labels say a second later
@@ -125,12 +133,15 @@ class LiveMapper:
                 there is none.
 
         Raises:
-            ValueError: names the argument, what was expected, and what it was.
+            ValueError: names the argument, what was expected, and what it was; or the mapper is
+                closed.
             OSError: the disk of `scratch` is full.
         """
         beams = drop_cover(scan if isinstance(scan, ScanBeams) else to_beams(scan))
         self._require_next(beams)
-        T_odom_base = self._to_matrix(odometry)
+        T_odom_base = self._to_matrix(odometry, beams.dimension)
+        if self._last_ns is None:
+            self._start(beams.dimension)
         increment = self._increment(T_odom_base)
         prior = self._odometry.predict(beams, increment)
         hits = self._weigh(self._odometry.select(beams, prior), prior)
@@ -146,7 +157,7 @@ class LiveMapper:
             self._labels.add(labelled.observation, pose)
         p_static = self._labels.label(deskewed, pose)  # E-step: (8)
         self._movers.add(deskewed, found.T, p_static)
-        self._history.append(beams, p_static, T_odom_base, pose, found.T, anchor)
+        self._history.append(beams, p_static, T_odom_base, pose, found.T, anchor, found.twist)
         self._hindsight.add(len(self._history) - 1, beams)
         self._T_odom_base, self._last_ns = T_odom_base, beams.stamp_ns
         update = self._to_update(beams.stamp_ns, found, p_static)
@@ -154,7 +165,7 @@ class LiveMapper:
         return self._find_robot(hits, update) if is_spaced and self._finder.is_lost else update
 
     def _observe(self, beams: ScanBeams, hits: Any, anchor: int) -> Observation:
-        """What a scan adds to the labels."""
+        """The observation by which a scan updates the labels."""
         margin = None
         if isinstance(hits, PlanarHits):
             margin = find_margins(beams, normals_of(beams, hits), self._selector.select(beams))
@@ -164,7 +175,7 @@ class LiveMapper:
         """The robot was carried: labels, tracks and path begin anew."""
         self._movers.clear()
         self._path_begin = self._frame.last + 1
-        self._finder.lose(len(self._history), self._labels, self._frame, self._odometry)
+        self._finder.lose(self._labels, self._frame, self._odometry)
 
     def _find_robot(self, hits: PlanarHits, update: Update) -> Update:
         """Search the robot, which is lost; the update with its pose in the map, if it is found."""
@@ -181,6 +192,7 @@ class LiveMapper:
         return dataclasses.replace(
             update,
             pose=pose,
+            covariance=rotate_covariance(update.covariance, motion),
             T_map_odom=self._to_map_odom(pose),
             doubts=tuple(name for name in update.doubts if name not in ("lost", "ambiguous")),
             movers=self._movers.movers(frame.T_map_local),
@@ -193,7 +205,7 @@ class LiveMapper:
             scan: as it was pushed.
             number: how many scans were pushed before it.
         """
-        beams = scan if isinstance(scan, ScanBeams) else to_beams(scan)
+        beams = drop_cover(scan if isinstance(scan, ScanBeams) else to_beams(scan))
         anchor, local = self._history.at(number)
         pose = self._frame.to_map(self._finder.move(local, number), anchor)
         return self._labels.label(deskew(beams, self._history.twist_at(number)), pose)
@@ -201,10 +213,11 @@ class LiveMapper:
     @property
     def poses(self) -> Float:
         """(T, D+1, D+1) T_map_base of all scans, as they are known now."""
-        given, local, anchor = self._history.poses()
-        if self._place is not None or not len(given):
-            return given if self._place is None else self._place.to_known(given)
-        return self._frame.to_map_all(self._finder.move_all(local), anchor)
+        _, local, anchor = self._history.poses()
+        moved = self._finder.move_all(local)
+        # in a known map that frame is the map's
+        is_map = self._place is not None or not len(moved)
+        return moved if is_map else self._frame.to_map_all(moved, anchor)
 
     @property
     def path(self) -> Float:
@@ -251,19 +264,29 @@ class LiveMapper:
         was answered at the time.
 
         Raises:
-            InputError: the folder is taken or cannot be written to.
+            InputError: no scan was pushed, or the folder is taken or cannot be written to.
         """
         self.snapshot().save(path, overwrite=overwrite, progress=progress)
 
     def snapshot(self) -> Snapshot:
-        """All scans so far and what is known of them: to save them while more are pushed."""
-        recording, answers = self._history.snapshot()
-        poses, place = self.poses[answers.number], self._place
+        """All scans so far and what is known of them: to save them while more are pushed.
+
+        Raises:
+            InputError: no scan was pushed.
+        """
+        self._require_scans()
+        kept, place = self._history.snapshot(), self._place
+        poses = self.poses[kept.number]
         extended = place.known if place is not None and place.extends else None
-        return Snapshot(recording, poses, answers, self.options, self._scratch, extended)
+        return Snapshot(kept, poses, self.options, self._scratch, extended)
 
     def finish(self, progress: Progress = no_progress) -> BuiltResult:
-        """The result of `stillmap.build` on all scans: poses, labels and map refined."""
+        """The result of `stillmap.build` on all scans: poses, labels and map refined.
+
+        Raises:
+            InputError: no scan was pushed.
+        """
+        self._require_scans()
         found = map_recording(
             self._history.recording(), self.options, progress=progress, scratch=self._scratch
         )
@@ -271,6 +294,7 @@ class LiveMapper:
 
     def close(self) -> None:
         """Forget all scans, and end the process that closes loops, if there is one."""
+        self._is_closed = True
         self._frame.stop()
         self._history.close()
 
@@ -281,26 +305,35 @@ class LiveMapper:
         self.close()
 
     def _require_next(self, beams: ScanBeams) -> None:
-        """Check a scan against those before; the first one begins mapping in its dimension."""
+        """Check a scan against those before."""
         D = beams.dimension
+        if self._is_closed:
+            raise ValueError("mapper: expected one that is not closed")
         if self._place is not None and D == 3:
             raise ValueError("scan: expected a planar one: localization is planar")
         if self._last_ns is None:
-            if self._dimension != D:
-                self._begin(D)
-            closes = self._place is None and self._slam.loop_closure
-            threads = resolve_threads(self.options.threads)
-            closer = (
-                start_closer(self._slam, D, self._in_background, self._scratch, threads)
-                if closes
-                else NoLoops()
-            )
-            self._frame = MapFrame(D, closer, self._in_background)
-        elif self._dimension != D:
+            return
+        if self._dimension != D:
             raise ValueError(f"scan: expected {self._dimension}D as before, got {D}D")
-        elif beams.stamp_ns < self._last_ns:
+        if beams.stamp_ns < self._last_ns:
             late = 1e-9 * (self._last_ns - beams.stamp_ns)
             raise ValueError(f"stamp: expected none before the last scan, got {late:.6f} s earlier")
+
+    def _start(self, dimension: int) -> None:
+        """Begin mapping with the first scan, in its dimension, and start to close loops."""
+        self._frame.stop()  # of a first scan that could not be mapped
+        self._begin(dimension)
+        closer: LoopClosing = NoLoops()
+        if self._place is None and self._slam.loop_closure:
+            threads = resolve_threads(self.options.threads)
+            closer = start_closer(
+                self._slam, dimension, self._in_background, self._scratch, threads
+            )
+        self._frame = MapFrame(dimension, closer, self._in_background)
+
+    def _require_scans(self) -> None:
+        if self._last_ns is None:
+            raise InputError("no scan was pushed yet")
 
     def _weigh(self, hits: Any, prior: Any) -> Any:
         """The hits with weights P(static): the E-step at the predicted pose."""
@@ -308,11 +341,11 @@ class LiveMapper:
         weights = self._labels.label_ends(points, self._frame.T_map_local @ T_local_base)
         return dataclasses.replace(hits, weights=weights)
 
-    def _to_matrix(self, odometry: ArrayLike | None) -> Float | None:
+    def _to_matrix(self, odometry: ArrayLike | None, dimension: int) -> Float | None:
         if odometry is None:
             return None
         given = np.asarray(odometry, np.float64)[None]
-        out: Float = poses_to_matrices("odometry", given, 1, self._dimension)[0]
+        out: Float = poses_to_matrices("odometry", given, 1, dimension)[0]
         return out
 
     def _increment(self, T_odom_base: Float | None) -> Float | None:
@@ -342,7 +375,8 @@ class LiveMapper:
         if not self._finder.is_carried:
             if added is not None:
                 self._frame.add(added, found)
-            self._frame.correct(labelled, added, self._labels, self._odometry)
+            agrees = None if found.is_contradicted else labelled
+            self._frame.correct(agrees, added, self._labels, self._odometry)
         return added is not None
 
     def _label_again(self, scan: MappedScan) -> NDArray[np.float32]:
@@ -374,7 +408,7 @@ class LiveMapper:
         pose = self._frame.T_map_local @ found.T
         return Update(
             pose,
-            found.covariance,
+            rotate_covariance(found.covariance, self._frame.T_map_local),
             p_static,
             self._to_map_odom(pose),
             tuple(name for name, is_so in doubts.items() if is_so),

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 Arrays = Mapping[str, NDArray[Any]]
 
 _LENGTH = struct.Struct("<Q")
-_MAX_HEADER = 1 << 20  # bytes
+_MAX_HEADER = 1 << 26  # bytes: a correction in a large hall has thousands of scans
 
 
 def write_message(stream: IO[bytes], arrays: Arrays) -> None:
@@ -26,7 +26,7 @@ def write_message(stream: IO[bytes], arrays: Arrays) -> None:
 
 
 def read_message(stream: IO[bytes]) -> dict[str, NDArray[Any]] | None:
-    """Read named arrays; None: the stream has ended.
+    """Read named arrays; None: the stream has ended, perhaps amid a message.
 
     Raises:
         ValueError: these are no arrays.
@@ -37,11 +37,17 @@ def read_message(stream: IO[bytes]) -> dict[str, NDArray[Any]] | None:
     (length,) = _LENGTH.unpack(start)
     if length > _MAX_HEADER:
         raise ValueError(f"header: expected at most {_MAX_HEADER} bytes, got {length}")
+    header = stream.read(length)
+    if len(header) < length:
+        return None
     out = {}
-    for name, dtype, shape in json.loads(stream.read(length)):
+    for name, dtype, shape in json.loads(header):
         kind = np.dtype(dtype)
         if kind.hasobject:
             raise ValueError(f"{name}: expected numbers")
-        data = stream.read(int(np.prod(shape, dtype=np.int64)) * kind.itemsize)
+        size = int(np.prod(shape, dtype=np.int64)) * kind.itemsize
+        data = stream.read(size)
+        if len(data) < size:
+            return None
         out[name] = np.frombuffer(data, kind).reshape(shape)
     return out

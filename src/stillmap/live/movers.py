@@ -95,7 +95,7 @@ class MoverTracker:
         self._begin(points[claims < 0], cluster[claims < 0], sensor)
 
     def movers(self, T_map_frame: Float) -> list[Mover]:
-        """What moves now, in the map, given the pose of the tracks' frame there (D+1, D+1)."""
+        """The confirmed tracks, in the map, given the pose (D+1, D+1) of their frame there."""
         states, tracks = self._states, self._tracks
         chosen = np.flatnonzero(tracks.is_mover)
         if not len(chosen):
@@ -188,7 +188,7 @@ class MoverTracker:
 
 @dataclass(eq=False)
 class _Tracks:
-    """What K tracks have beside their states: where and when they began, and were seen last."""
+    """Attributes of K tracks beside their states: origin, time of the first and last detection."""
 
     number: Index
     origin: Float

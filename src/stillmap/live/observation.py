@@ -1,4 +1,4 @@
-"""What a scan adds to the labels: its hits, and the free space that its beams show."""
+"""Observations that update the labels: hits of a scan, and free space along its beams."""
 
 from dataclasses import dataclass
 

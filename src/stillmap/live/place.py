@@ -6,13 +6,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
+from stillmap.core import config
+from stillmap.core.errors import InputError
 from stillmap.live.causal_labels import CausalLabels, take_over
 from stillmap.live.global_localization import GlobalLocalizer, Localization
 from stillmap.live.known_map import KnownLocalMap, KnownMap
+from stillmap.pipeline.options import DEFAULTS, Options
 from stillmap.slam.scan_hits import Scan
 
 Float = NDArray[np.float64]
 Mode = Literal["localise", "extend"]
+
+
+def adopt_resolution(options: Options, known: KnownMap) -> Options:
+    """The options with the edge of the cells of a map that is extended.
+
+    Raises:
+        InputError: they ask for another one.
+    """
+    edge, wanted = known.resolution, options.slam.resolution
+    if not np.isclose(wanted, [edge, DEFAULTS.slam.resolution]).any():
+        hint = f"it is extended with slam.resolution={edge:g}"
+        raise InputError(f"the map has cells of {edge:g} m", hint=hint)
+    return config.override(options, {"slam": {"resolution": edge}})
 
 
 class PlaceTracker:
@@ -32,28 +48,24 @@ class PlaceTracker:
         self.is_lost, self.is_ambiguous = True, False
         self.known, self.extends = known, mode == "extend"
         self._localizer = GlobalLocalizer(known)
-        self._lost_since = 0
-        self._moves: list[tuple[int, int, Float]] = []  # first scan, last + 1, and their motion
 
-    def lose(self, scan: int) -> None:
-        """The robot was carried elsewhere before a scan."""
-        self.is_lost, self._lost_since = True, scan
+    def lose(self) -> None:
+        """The robot was carried elsewhere."""
+        self.is_lost = True
 
-    def localize(self, labels: CausalLabels, hits: Scan, pose: Float, scan: int) -> Float | None:
+    def localize(self, labels: CausalLabels, hits: Scan, pose: Float) -> Float | None:
         """(3, 3) of the frame of the labels in the known map, if the evidence is clear.
 
         Args:
             labels: of what was seen since the robot was lost.
             hits: of the last scan.
             pose: (3, 3) of the robot in the frame of the labels.
-            scan: number of the last scan.
         """
         found: Localization = self._localizer.localize(labels.to_view(), hits, pose)
         self.is_ambiguous = found.is_ambiguous
         if found.T is None:
             return None
         self.is_lost = False
-        self._moves.append((self._lost_since, scan + 1, found.T))
         return found.T
 
     def make_local_map(self) -> KnownLocalMap:
@@ -68,10 +80,3 @@ class PlaceTracker:
         tags = labels.tags
         take_over(known, seen, np.tile(T, (tags, 1, 1)), 0, seen.block_count)
         labels.filter = known
-
-    def to_known(self, given: Float) -> Float:
-        """(T, 3, 3) poses in the known map of poses as they were given."""
-        poses = given.copy()
-        for first, last, T in self._moves:
-            poses[first:last] = T @ poses[first:last]
-        return poses

@@ -59,7 +59,7 @@ def replay(
     """Push the scans of a recording.
 
     Args:
-        recording: planar.
+        recording: in 2D or 3D.
         mapper: that takes them.
         progress: called with the number of scans done and their total.
         rate: times the speed of the recording: a latency counts from when the scan is due, and a

@@ -26,6 +26,7 @@ class RobotFinder:
         self._place, self._dimension = place, dimension
         self._carried: Relocalizer | None = None
         self._last_agreed = -1  # scan that agreed with the map
+        self._lost_since = 0  # scan
         # scans that were found later: first, last + 1, motion in the frame of the odometry by scans
         self._moves = list[tuple[int, int, Float]]()
 
@@ -50,17 +51,19 @@ class RobotFinder:
         if self._carried is None:
             self._last_agreed = scan
 
-    def lose(self, scan: int, labels: CausalLabels, frame: MapFrame, odometry: FrontEnd) -> None:
-        """The robot was carried before a scan: the labels begin anew, until it is found."""
+    def lose(self, labels: CausalLabels, frame: MapFrame, odometry: FrontEnd) -> None:
+        """The robot was carried: the labels begin anew, until it is found."""
+        if self._carried is not None:
+            self._carried.begin(labels)
+            return
+        self._lost_since = self._last_agreed + 1
+        frame.finish_correction(labels, odometry)
         if self._place is not None:
-            self._place.lose(scan)
+            self._place.lose()
             labels.clear()
         elif self._dimension == 3:
             labels.clear()
-        elif self._carried is not None:
-            self._carried.begin(labels)
         else:
-            frame.finish_correction(labels, odometry)
             self._carried = Relocalizer(labels, odometry.left_behind, frame.T_map_local)
 
     def find(
@@ -91,14 +94,15 @@ class RobotFinder:
             if T is None:
                 return None
             odometry.enter(carried.join(labels, odometry.local_map, T), T)
-            self._moves.append((self._last_agreed + 1, scans, T))
-            frame.add_drift(carried.covariance)
+            self._moves.append((self._lost_since, scans, T))
+            frame.enter(carried.covariance)
             self._carried = None
             return T, frame.T_map_local @ T @ se2.inverse(frame.T_map_local)
         place = self._place
-        T = None if place is None else place.localize(labels, hits, pose, scans - 1)
+        T = None if place is None else place.localize(labels, hits, pose)
         if T is None or place is None:
             return None
+        self._moves.append((self._lost_since, scans, T))
         odometry.enter(place.make_local_map(), T)
         place.enter(labels, T)
         return T, T

@@ -12,7 +12,7 @@ from stillmap.core.profiling import Progress, no_progress
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io.trajectory import write_tum
-from stillmap.live.history import Answers
+from stillmap.live.history import Answers, KeptScans
 from stillmap.live.known_map import KnownMap
 from stillmap.live.map_extension import write_extended
 from stillmap.pipeline.options import Options
@@ -28,27 +28,22 @@ class Snapshot(ShortRepr):
     """All scans so far and what is known of them, which stays while more scans are pushed.
 
     Attributes:
-        recording: the scans.
+        kept: the scans, and what was answered at the time.
         poses: (T, D+1, D+1) T_map_base.
-        answers: what was answered at the time.
         options: see Options.
         scratch: folder of temporary files; None: the system's.
         extended: the known map that is extended; None: there is none.
     """
 
-    recording: Recording
+    kept: KeptScans
     poses: NDArray[np.float64]
-    answers: Answers
     options: Options
     scratch: Path | None
     extended: KnownMap | None = None
 
     def build(self, progress: Progress = no_progress) -> BuiltResult:
         """Labels, map and objects at these poses."""
-        found = map_recording(
-            self.recording, self.options, poses=self.poses, progress=progress, scratch=self.scratch
-        )
-        return BuiltResult(**vars(found))
+        return self._map(self.kept.load()[0], progress)
 
     def save(
         self,
@@ -62,8 +57,15 @@ class Snapshot(ShortRepr):
         Raises:
             InputError: the folder is taken or cannot be written to.
         """
-        result = self.build(progress)
-        save_live(result, self.answers, Path(path), overwrite, extended=self.extended)
+        recording, answers = self.kept.load()
+        result = self._map(recording, progress)
+        save_live(result, answers, Path(path), overwrite, extended=self.extended)
+
+    def _map(self, recording: Recording, progress: Progress) -> BuiltResult:
+        found = map_recording(
+            recording, self.options, poses=self.poses, progress=progress, scratch=self.scratch
+        )
+        return BuiltResult(**vars(found))
 
 
 def save_live(

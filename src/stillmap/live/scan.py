@@ -12,7 +12,13 @@ import stillmap._core as _core
 from stillmap.core import se2, se3
 from stillmap.core.arrays import finite_rows
 from stillmap.core.short_repr import ShortRepr
-from stillmap.io.array_checks import poses_to_matrices, require_length, stamps_to_ns, to_array
+from stillmap.io.array_checks import (
+    poses_to_matrices,
+    require_all,
+    require_length,
+    stamps_to_ns,
+    to_array,
+)
 from stillmap.preprocessing.max_range import MAX_ZERO_RANGE
 from stillmap.preprocessing.options import MAX_PLAUSIBLE_RANGE
 
@@ -100,6 +106,7 @@ def to_beams(scan: Scan) -> ScanBeams:
     if times is not None:
         times = to_array("beam_times", times, "(N,)").astype(np.float32)
         require_length("beam_times", len(times), len(points), "the beams")
+        require_all("beam_times", np.isfinite(times), "finite seconds", times)
     pose = _sensor_matrix(scan.sensor_pose, D)
     return ScanBeams(stamp_ns, points, hit, pose, scan.sensor, times)
 

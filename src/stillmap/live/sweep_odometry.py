@@ -87,12 +87,13 @@ class SweepOdometry:
             state, explained = lidar_odometry.register_sweep(
                 self.local_map, registered, prior, self._threads
             )
-        is_carried = self._is_carried(explained)
+        is_carried = not is_blind and self._is_carried(explained)
         if is_carried:
             self._start_anew()
             state = prior
         self._advance(state, beams.stamp_ns)
-        self._note_first(beams.stamp_ns, hits)
+        if not is_blind:
+            self._note_first(beams.stamp_ns, hits)
         state = self._state
         return Registration(
             state.T_map_base,
@@ -130,7 +131,7 @@ class SweepOdometry:
         if np.linalg.norm(here - self._cropped_at) > lidar_odometry.CROP_STEP:
             self._cropped_at = here.copy()
             self.local_map.crop(state.T_map_base, lidar_odometry.MAX_RANGE)
-        if self._since < 1.0:
+        if self._since < 1.0 or not weights.any():
             return None
         self._since = 0.0
         return MappedScan(kept, weights, state.T_map_base, self.travelled)
@@ -166,7 +167,7 @@ class SweepOdometry:
 
     def _start_anew(self) -> None:
         self.left_behind, self.local_map = self.local_map, lidar_odometry.make_local_map()
-        self._usual, self._contradictions = 0.0, 0
+        self._usual, self._contradictions, self._since = 0.0, 0, np.inf
 
     def _note_first(self, stamp_ns: int, hits: Sweep) -> None:
         """Register the first sweeps again once the motion during the first one is known: it was

@@ -27,7 +27,7 @@ _EVIDENCE, _MIN_STD = 0.1, np.radians(0.3)
 
 
 class HeadingOffset(NamedTuple):
-    """What is to be added to a heading, rad, and its variance."""
+    """Correction of a heading, rad, and its variance, rad2."""
 
     value: float
     variance: float
@@ -53,9 +53,9 @@ class WallDirections:
         self._seen = (1.0 - share) * seen + share * np.roll(seen, 1)
 
     def measure(self, scan: Scan, T: Float) -> HeadingOffset | None:
-        """By what the heading of a scan at a pose (3, 3) is off.
+        """Correction of the heading of a scan at a pose T (3, 3).
 
-        The maximum of the likelihood of its normals near T; None: they say nothing.
+        It maximizes the likelihood of the normals of the scan near T; None: it is not defined.
         """
         if self._travelled < _MIN_TRAVEL or not self._seen.any():
             return None

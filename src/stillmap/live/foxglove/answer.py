@@ -1,4 +1,4 @@
-"""What is shown of a scan, as an object and as arrays between two processes."""
+"""A scan and its update as they are shown: as an object, and as arrays between processes."""
 
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -62,7 +62,7 @@ class Answer(ShortRepr):
 
 
 def to_answer(beams: ScanBeams, update: Update) -> Answer:
-    """What is shown of a scan."""
+    """The scan and its update, without what is not shown."""
     return Answer(
         beams.stamp_ns,
         beams.sensor,

@@ -1,4 +1,4 @@
-"""What waits to be shown: the newest alone, so that nobody who puts something in ever waits."""
+"""A mailbox between threads: it keeps the newest message of each kind, and no `put` waits."""
 
 import threading
 from dataclasses import dataclass, field
@@ -15,27 +15,35 @@ _MAX_LISTS = 32  # of changes, before several of the same tile become one
 
 @dataclass(eq=False)
 class Mail(ShortRepr):
-    """What was put into a mailbox since it was emptied.
+    """Messages since the mailbox was emptied.
 
     Attributes:
         answers: the last one of each sensor.
         changes: parts of the map, in the order in which they changed.
         resolution: m, edge of a cell of the map.
         path: (S, D) positions; None: no new ones.
+        begins_anew: it is all of a new map, and what was shown before is none of it.
     """
 
     answers: dict[str | int, Answer] = field(default_factory=dict)
     changes: list[list[MapChange]] = field(default_factory=list)
     resolution: float = 0.0
     path: NDArray[np.float64] | None = None
+    begins_anew: bool = False
 
 
 class Mailbox:
-    """Between threads; what is older than the newest of its kind is dropped."""
+    """Keeps the newest message of each kind; safe to use from several threads."""
 
     def __init__(self) -> None:
         self._condition = threading.Condition()
         self._mail, self._has_news, self._is_closed = Mail(), False, False
+
+    def begin_anew(self) -> None:
+        """Drop all: a new map begins."""
+        with self._condition:
+            self._mail = Mail(begins_anew=True)
+            self._notify()
 
     def put_answer(self, answer: Answer) -> None:
         """The next scan of a sensor."""
@@ -71,7 +79,7 @@ class Mailbox:
             self._notify()
 
     def take(self, timeout: float | None = None) -> Mail | None:
-        """What is there as soon as something is, or after `timeout` (s); None: closed."""
+        """Wait for messages, at most `timeout` (s), and remove them; None: it is closed."""
         with self._condition:
             self._condition.wait_for(lambda: self._has_news, timeout)
             if self._is_closed:

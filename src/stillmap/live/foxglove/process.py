@@ -19,7 +19,9 @@ def _receive(stream: IO[bytes], mailbox: Mailbox) -> None:
     """Put what arrives into the mailbox until the stream ends."""
     try:
         while (arrays := read_message(stream)) is not None:
-            if "first_cell" in arrays:
+            if "begins_anew" in arrays:
+                mailbox.begin_anew()
+            elif "first_cell" in arrays:
                 mailbox.put_changes(unpack_changes(arrays), float(arrays["resolution"]))
             elif "path" in arrays:
                 mailbox.put_path(arrays["path"])

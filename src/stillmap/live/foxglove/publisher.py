@@ -49,11 +49,8 @@ class Publisher:
         self._tf = FrameTransformsChannel("/tf", context=context)
         self._doubts = LogChannel("/doubts", context=context)
         self._clouds = dict[str | int, tuple[PointCloudChannel, PointCloudChannel]]()
-        self._tiles, self._positions = TileMap(), np.zeros((0, 2))
-        self._answers = dict[str | int, Answer]()
-        self._is_map_new, self._is_path_new, self._map_due, self._path_due = False, False, 0.0, 0.0
-        self._told: tuple[str, ...] | None = None
-        self._stamp_ns = 0
+        self._map_due, self._path_due = 0.0, 0.0
+        self._begin()
         try:
             self._server = start_server(
                 name="stillmap",
@@ -66,6 +63,14 @@ class Publisher:
             )
         except RuntimeError as error:
             raise InputError(f"cannot serve at {host}:{port}: {_reason(error)}") from error
+
+    def _begin(self) -> None:
+        """Nothing has been published of a map."""
+        self._tiles, self._positions = TileMap(), np.zeros((0, 2))
+        self._answers = dict[str | int, Answer]()
+        self._is_map_new, self._is_path_new = False, False
+        self._told: tuple[str, ...] | None = None
+        self._stamp_ns = 0
 
     @property
     def port(self) -> int:
@@ -90,6 +95,8 @@ class Publisher:
 
     def publish(self, mail: Mail) -> None:
         """Send what is new; to clients that have just come, what they missed."""
+        if mail.begins_anew:
+            self._begin()
         if mail.changes:
             self._tiles.add(keep_last(mail.changes), mail.resolution)
             self._is_map_new = True
@@ -157,8 +164,10 @@ class _Listener(ServerListener):
 
     def take_news(self) -> bool:
         """True if a client has subscribed since the last call."""
-        out, self._has_news = self._has_news, False
-        return out
+        if not self._has_news:  # set in another thread: what comes after this is news again
+            return False
+        self._has_news = False
+        return True
 
     def on_subscribe(self, client: Client, channel: ChannelView) -> None:
         self.subscriptions.add((client.id, channel.id))

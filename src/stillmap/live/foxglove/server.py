@@ -13,6 +13,8 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 
+import numpy as np
+
 from stillmap.core.errors import InputError, MissingExtra
 from stillmap.live.foxglove.answer import Answer, pack_answer, pack_changes, to_answer
 from stillmap.live.foxglove.mailbox import Mail, Mailbox, keep_last
@@ -51,6 +53,7 @@ class FoxgloveServer:
         )
         self._mailbox, self._is_watched, self._is_closing = Mailbox(), False, False
         self._slow_due = 0.0
+        self._mapper: LiveMapper | None = None
         self._last = dict[str | int, Answer]()  # of each sensor, for who comes while none arrives
         self._threads: Sequence[threading.Thread] = ()
         try:
@@ -78,10 +81,14 @@ class FoxgloveServer:
         """Show what the mapper answered to a scan. Never waits: what nobody takes is dropped.
 
         Args:
-            mapper: which is not pushed to meanwhile.
+            mapper: which is not pushed to meanwhile; with another one a new map begins.
             beams: the scan.
             update: the answer.
         """
+        if self._mapper is not None and mapper is not self._mapper:
+            self._last = {}
+            self._mailbox.begin_anew()
+        self._mapper = mapper
         if update.changes:
             self._mailbox.put_changes(update.changes, mapper.resolution)
         now, answer = time.monotonic(), to_answer(beams, update)
@@ -157,6 +164,8 @@ class FoxgloveServer:
 
 
 def _to_messages(mail: Mail) -> Iterator[Arrays]:
+    if mail.begins_anew:
+        yield {"begins_anew": np.array(1)}
     changes = keep_last(mail.changes)
     for first in range(0, len(changes), _TILES_PER_MESSAGE):
         yield pack_changes(changes[first : first + _TILES_PER_MESSAGE], mail.resolution)

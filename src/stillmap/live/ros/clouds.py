@@ -38,8 +38,11 @@ def to_cloud_beams(
         length = np.linalg.norm(points, axis=1)
         hit = ~(length > max_range)  # what is no number stays what it is
         points = points.copy()
-        points[~hit] *= (max_range / length[~hit])[:, None]
-    times = None if cloud.times is None else np.nan_to_num(cloud.times)
+        with np.errstate(invalid="ignore"):  # infinite ones become NaN: unusable
+            points[~hit] *= (max_range / length[~hit])[:, None]
+    times = None
+    if cloud.times is not None:
+        times = np.where(np.isfinite(cloud.times), cloud.times, 0.0)  # of unusable points
     return to_beams(
         Scan(
             stamp_ns(message.header),

@@ -30,8 +30,8 @@ class MapUpdate(NamedTuple):
     cells: NDArray[np.int8]
 
 
-class SentMap:
-    """The map as those who listen have it.
+class MapMirror:
+    """A copy of the map as it was published, with all updates.
 
     Args:
         mode: how it is written.
@@ -87,7 +87,7 @@ class MapPublisher:
         latched = qos.QoSProfile(depth=1, durability=qos.DurabilityPolicy.TRANSIENT_LOCAL)
         self._map = ros.create_publisher(node, _GRID, topic, latched)
         self._updates = ros.create_publisher(node, _UPDATE, f"{topic}_updates", _DEPTH)
-        self._sent = SentMap(mode)
+        self._mirror = MapMirror(mode)
 
     def publish(self, grid: GridMap, stamp: int) -> None:
         """The whole map; who comes later gets the last one."""
@@ -95,14 +95,14 @@ class MapPublisher:
         fill_grid(message, self._frame, stamp, grid, self._mode)
         self._map.publish(message)
         if self._updates is not None:
-            self._sent.set_whole(grid)
+            self._mirror.set_whole(grid)
 
     def publish_changes(self, changes: Sequence[MapChange], stamp: int) -> bool:
-        """What changed since; False: a whole map is due, since this one has become larger."""
+        """Publish changed tiles; False: the map has become larger, and a whole one is due."""
         planar = [change for change in changes if change.p_occupied.ndim == 2]
         if self._updates is None or not planar:
             return True
-        update = self._sent.take(planar)
+        update = self._mirror.take(planar)
         is_heard = self._updates.get_subscription_count() > 0
         if update is not None and is_heard:
             message = self._ros.message(_UPDATE)()

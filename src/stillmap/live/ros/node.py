@@ -235,6 +235,7 @@ class LiveNode:
         with self._lock:
             former, self._mapper = self._mapper, self._make_mapper(self._options)
             self.scans = 0
+        self._map_due = 0.0  # updates are of the new map
         self._former = threading.Thread(target=self._save_former, args=(former, folder))
         self._former.start()
 

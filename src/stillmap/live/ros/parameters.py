@@ -79,7 +79,7 @@ class Parameters:
 
     @property
     def topics(self) -> tuple[str, ...]:
-        """Where scans come from."""
+        """Names of the topics of the scans."""
         return self.cloud_topic or self.scan_topic
 
     def _raw(self, name: str) -> Any:

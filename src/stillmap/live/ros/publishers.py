@@ -54,11 +54,6 @@ class Publishers:
         self._diagnostics = ros.create_publisher(node, _DIAGNOSTICS, "/diagnostics", _POSE_DEPTH)
         self._tf_due_ns = 0
 
-    @property
-    def has_tf(self) -> bool:
-        """False where tf2_msgs is missing."""
-        return self._tf is not None
-
     def publish_answer(self, arrival: Arrival, update: Update) -> None:
         """Pose, transform, movers and labelled scan; the pose first, and nothing in the map where
         the robot is lost."""
@@ -77,7 +72,7 @@ class Publishers:
         self._map.publish(grid, stamp)
 
     def publish_map_changes(self, changes: Sequence[MapChange], stamp: int) -> bool:
-        """What changed since; False: a whole map is due, since it has become larger."""
+        """Publish changed tiles; False: the map has become larger, and a whole one is due."""
         return self._map.publish_changes(changes, stamp)
 
     def begin_anew(self) -> None:
