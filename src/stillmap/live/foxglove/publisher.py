@@ -69,7 +69,7 @@ class Publisher:
         self._tiles, self._positions = TileMap(), np.zeros((0, 2))
         self._answers = dict[str | int, Answer]()
         self._is_map_new, self._is_path_new = False, False
-        self._told: tuple[str, ...] | None = None
+        self._last_doubts: tuple[str, ...] | None = None
         self._stamp_ns = 0
 
     @property
@@ -105,7 +105,7 @@ class Publisher:
         answers = list(mail.answers.values())
         self._answers.update(mail.answers)
         if self._listener.take_news():
-            self._is_map_new, self._is_path_new, self._told = True, True, None
+            self._is_map_new, self._is_path_new, self._last_doubts = True, True, None
             answers = list(self._answers.values())
         for answer in sorted(answers, key=lambda answer: answer.stamp_ns):
             self._publish_answer(answer)
@@ -119,8 +119,8 @@ class Publisher:
             self._tf.log(schemas.to_transforms(answer), log_time=stamp)
             self._pose.log(schemas.to_pose_in_frame(answer), log_time=stamp)
             self._movers.log(schemas.to_movers(answer), log_time=stamp)
-            if answer.doubts != self._told:
-                self._told = answer.doubts
+            if answer.doubts != self._last_doubts:
+                self._last_doubts = answer.doubts
                 self._doubts.log(schemas.to_log(answer.doubts, stamp), log_time=stamp)
         channels = self._clouds_of(answer.sensor)
         if any(channel.has_sinks() for channel in channels):
