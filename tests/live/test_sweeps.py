@@ -98,7 +98,7 @@ def test_a_lidar_that_is_carried_begins_anew():
             doubts.append(mapper.push(one).doubts)
             shown.append(mapper.map.p_occupied.size)
     assert sum("carried" in d for d in doubts) == 1
-    assert min(shown) > 0
+    assert shown[-1] > 0
 
 
 def cover(beams):

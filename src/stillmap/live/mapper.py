@@ -52,6 +52,7 @@ Float = NDArray[np.float64]
 # weight of a scan in the running share of hits on what moves; share from which people may walk
 # along with the robot, and what was only just seen counts little
 _MOVING_RATE, _CROWDED = 0.3, 0.15
+_MIN_SCRATCH = 100_000  # bytes: some scans at least
 _CHANGES_EVERY_NS = 10**9  # between two updates that tell what changed in the map
 
 
@@ -93,7 +94,10 @@ class LiveMapper:
         max_scratch: int | None = None,
         lag: float | None = None,
     ) -> None:
-        _require_positive(max_scratch=max_scratch, lag=lag)
+        if max_scratch is not None and not max_scratch >= _MIN_SCRATCH:
+            raise ValueError(f"max_scratch: expected {_MIN_SCRATCH} bytes or more: {max_scratch}")
+        if lag is not None and not 0.0 < lag < np.inf:
+            raise ValueError(f"lag: expected positive seconds, got {lag}")
         self.options = to_options(options)
         self._place = None if place is None else PlaceTracker(KnownMap(place), mode)
         if self._place is not None and self._place.extends:
@@ -416,9 +420,3 @@ class LiveMapper:
             self._movers.movers(self._frame.T_map_local),
             [LaterLabels(n, self.label(one, n)) for n, one in self._hindsight.take(stamp_ns)],
         )
-
-
-def _require_positive(**numbers: float | None) -> None:
-    for name, number in numbers.items():
-        if number is not None and not 0.0 < number < np.inf:
-            raise ValueError(f"{name}: expected a positive number, got {number}")
