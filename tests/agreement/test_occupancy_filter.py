@@ -175,21 +175,6 @@ def test_what_stood_for_long_and_has_left_is_soon_no_longer_shown():
     assert np.nanmax(p[row - 1 : row + 2, column - 1 : column + 2]) < 0.1
 
 
-@pytest.mark.parametrize(("dimension", "see"), [(2, look), (3, sweep)])
-def test_what_moved_and_left_is_forgotten(dimension, see):
-    core = make(_core, dimension)
-    for time_bin in range(8):
-        see(core, 4.0, time_bin)
-    wall = core.size
-    see(core, 2.0, 8)
-    assert core.size > wall
-    for time_bin in range(9, 30):
-        see(core, 4.0, time_bin)
-    assert core.size <= wall + 2  # cells at the rim are not looked at
-    assert np.mean(see(core, 2.0, 30) < 0.1) > 0.95  # it still moves
-    assert see(core, 4.0, 31).min() > 0.9
-
-
 def move(core, motion, step=1):
     """A filter that takes over another, `step` blocks at a time."""
     out, first = core.sibling(), 0

@@ -16,7 +16,6 @@ Float = NDArray[np.float64]
 HALF_EXTENT = 0.5  # cells, of a surface of unknown direction
 MIN_RELIABILITY, CLEARLY_PASSED, MAX_PASSES = 0.05, 0.5, 32
 MIN_PROBABILITY = 1e-6
-FORGOTTEN, EMPTY = 1e-3, 0.05  # P(static), P(occupied) of a cell that is no more than free
 
 
 @dataclass
@@ -127,25 +126,9 @@ class OccupancyFilter:
     def _normalize(self, log_likelihood):
         return np.maximum(log_likelihood - log_likelihood.max(), -self.max_log_ratio)
 
-    def _miss(self, cell, time_bin: int, reliability: float) -> bool:
-        """False where the filter is forgotten: what moved has left."""
-        one = self.filters[cell]
-        if self._open(one, time_bin):
-            joint = self.weights * np.exp(one.log_likelihood)
-            joint /= joint.sum()
-            occupied = float((joint * one.p_occupied).sum())
-            if joint[: self.n_static].sum() < FORGOTTEN and occupied < EMPTY:
-                del self.filters[cell]
-                return False
-        if not one.hit:
-            one.p_missed *= 1.0 - reliability
-        return True
-
-    def _open(self, one: Filter, time_bin: int) -> bool:
-        """Whether there was an observation to apply."""
+    def _open(self, one: Filter, time_bin: int) -> None:
         if one.open_bin == time_bin:
-            return False
-        has_observation = one.open_bin is not None
+            return
         if one.open_bin is not None:
             gap = 0 if one.last_bin is None else one.open_bin - one.last_bin
             one.p_occupied, log_likelihood = self._step(
@@ -155,7 +138,6 @@ class OccupancyFilter:
             one.last_bin = one.open_bin
         one.open_bin = time_bin if one.last_bin is None else max(time_bin, one.last_bin)
         one.hit, one.p_missed = False, 1.0
-        return has_observation
 
     def _pass(self, beam, margin: float, time_bin: int, tag: int) -> None:
         start, end = beam.start / self.resolution, beam.end / self.resolution
@@ -174,8 +156,10 @@ class OccupancyFilter:
             at = self.passed.setdefault(key, Passed())
             at.tag = tag
             if key in self.filters:
-                if not self._miss(key, time_bin, reliability):
-                    at.bins, at.last_bin = MAX_PASSES, time_bin
+                one = self.filters[key]
+                self._open(one, time_bin)
+                if not one.hit:
+                    one.p_missed *= 1.0 - reliability
             elif reliability >= CLEARLY_PASSED and at.last_bin != time_bin:
                 at.bins += 1
                 at.last_bin = time_bin

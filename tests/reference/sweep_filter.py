@@ -80,10 +80,13 @@ class SweepFilter3D(OccupancyFilter):
         beams = [b for b in usable_beams(3, points, hit, offset, T_map_sensor) if b.hit]
         ends = np.array([points[b.number] for b in beams], np.float64).reshape(-1, 3)
         view = View(T_map_sensor[0], RangeImage(ends, pixel), time_bin)
-        for cell in list(self.filters):
+        for cell, one in self.filters.items():
             reliability = self._visibility(view, cell)
-            if reliability >= MIN_RELIABILITY:
-                self._miss(cell, time_bin, reliability)
+            if reliability < MIN_RELIABILITY:
+                continue
+            self._open(one, time_bin)
+            if not one.hit:
+                one.p_missed *= 1.0 - reliability
         first = {}
         for beam in beams:
             end = beam.end / self.resolution

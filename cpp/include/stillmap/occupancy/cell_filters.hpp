@@ -47,8 +47,7 @@ class CellFilters {
 
   const FilterOptions& options() const { return options_; }
   size_t classes() const { return options_.rho.size(); }
-  size_t size() const { return filters_.size() - unused_.size(); }
-  size_t capacity() const { return filters_.size(); }  // indices are below
+  size_t size() const { return filters_.size(); }
   size_t memory_bytes() const {
     return filters_.capacity() * sizeof(Filter) + state_.capacity() * sizeof(float);
   }
@@ -58,17 +57,16 @@ class CellFilters {
   // reliability: of each, at most kMaxPasses. last_bin: of the last one; -1: none. Likelihoods are
   // relative to that of a first hit, as only cells with hits are considered. Returns its index.
   int32_t add(const float* reliability, int passes, int32_t last_bin, int32_t tag) {
-    const int32_t k = make_index();
-    filters_[static_cast<size_t>(k)] = {tag, kNoBin, last_bin, 1.0f, kNotComputed};
-    float* p = state_.data() + static_cast<size_t>(k) * 2 * classes();
-    std::copy(rho_.begin(), rho_.end(), p);
-    for (size_t c = 0; c < classes(); ++c) p[classes() + c] = 1.0f / (rho_[c] * detection_);
+    filters_.push_back({tag, kNoBin, last_bin, 1.0f, kNotComputed});
+    state_.insert(state_.end(), rho_.begin(), rho_.end());
+    for (size_t c = 0; c < classes(); ++c) state_.push_back(1.0f / (rho_[c] * detection_));
+    float* p = state_.data() + (filters_.size() - 1) * 2 * classes();
     float* likelihood = p + classes();
     for (int pass = 0; pass < passes; ++pass)
       for (size_t c = 0; c < classes(); ++c)
         step(c, pass ? 1 : 0, false, reliability[pass], p[c], likelihood[c]);
     normalize(likelihood);
-    return k;
+    return static_cast<int32_t>(filters_.size() - 1);
   }
 
   void hit(int32_t k, int32_t bin, int32_t tag) {
@@ -80,19 +78,13 @@ class CellFilters {
     filter.p_static = kNotComputed;
   }
 
-  // False where the filter has no more to say than that its cell is free: what moved has left. The
-  // caller then releases it.
-  bool miss(int32_t k, int32_t bin, float reliability) {
-    if (open(k, bin) && is_forgettable(k)) return false;
+  void miss(int32_t k, int32_t bin, float reliability) {
+    open(k, bin);
     Filter& filter = filters_[static_cast<size_t>(k)];
-    if (filter.p_missed == kHitMark) return true;
+    if (filter.p_missed == kHitMark) return;
     filter.p_missed *= 1.0f - reliability;
     filter.p_static = kNotComputed;
-    return true;
   }
-
-  // Lets another cell have the filter.
-  void release(int32_t k) { unused_.push_back(k); }
 
   // Lets the dynamic classes fall behind by so many nats.
   void favour_static(int32_t k, double log_ratio) {
@@ -130,11 +122,9 @@ class CellFilters {
   // A copy of the filter of another bank of the same kind; returns its index.
   int32_t copy(const CellFilters& from, int32_t k) {
     const float* theirs = from.state_.data() + static_cast<size_t>(k) * 2 * classes();
-    const int32_t here = make_index();
-    filters_[static_cast<size_t>(here)] = from.filters_[static_cast<size_t>(k)];
-    std::copy(theirs, theirs + 2 * classes(),
-              state_.data() + static_cast<size_t>(here) * 2 * classes());
-    return here;
+    filters_.push_back(from.filters_[static_cast<size_t>(k)]);
+    state_.insert(state_.end(), theirs, theirs + 2 * classes());
+    return static_cast<int32_t>(filters_.size() - 1);
   }
 
   // Adds the evidence of a filter of another bank; the state of the one with the later tag stays.
@@ -158,8 +148,6 @@ class CellFilters {
   static constexpr int32_t kNoBin = -1;
   static constexpr float kHitMark = -1.0f, kNotComputed = -1.0f;
   static constexpr float kMinProbability = 1e-6f;  // floor: no state becomes impossible
-  // P(static) and P(occupied) below which a filter says no more than that its cell is free
-  static constexpr float kForgotten = 1e-3f, kEmpty = 0.05f;
 
   struct Filter {
     int32_t tag;                 // of the scan that hit it last
@@ -202,37 +190,11 @@ class CellFilters {
     p = std::max(missed / total, kMinProbability);
   }
 
-  int32_t make_index() {
-    if (!unused_.empty()) {
-      const int32_t k = unused_.back();
-      unused_.pop_back();
-      return k;
-    }
-    filters_.emplace_back();
-    state_.resize(state_.size() + 2 * classes());
-    return static_cast<int32_t>(filters_.size() - 1);
-  }
-
-  // Whether nothing static stands there, nor anything now.
-  bool is_forgettable(int32_t k) const {
-    const float* p = state_.data() + static_cast<size_t>(k) * 2 * classes();
-    float total = 0.0f, fixed = 0.0f, occupied = 0.0f;
-    for (size_t c = 0; c < classes(); ++c) {
-      const float joint = p[classes() + c] * weight_[c];
-      total += joint;
-      occupied += joint * p[c];
-      if (c < options_.n_static) fixed += joint;
-    }
-    return fixed < kForgotten * total && occupied < kEmpty * total;
-  }
-
-  // Applies the observation of the open bin, if there is one, and opens another; whether there was
-  // one to apply.
-  bool open(int32_t k, int32_t bin) {
+  // Applies the observation of the open bin, if there is one, and opens another.
+  void open(int32_t k, int32_t bin) {
     Filter& filter = filters_[static_cast<size_t>(k)];
-    if (filter.open_bin == bin) return false;
-    const bool has_observation = filter.open_bin != kNoBin;
-    if (has_observation) {
+    if (filter.open_bin == bin) return;
+    if (filter.open_bin != kNoBin) {
       float* p = state_.data() + static_cast<size_t>(k) * 2 * classes();
       for (size_t c = 0; c < classes(); ++c) step(c, filter, p[c], p[classes() + c]);
       normalize(p + classes());
@@ -242,7 +204,6 @@ class CellFilters {
     filter.open_bin = std::max(bin, filter.last_bin);
     filter.p_missed = 1.0f;
     filter.p_static = kNotComputed;
-    return has_observation;
   }
 
   // Relative to the best class, which others fall behind by a bounded ratio: so what stood for
@@ -256,8 +217,7 @@ class CellFilters {
   float detection_, least_;
   std::vector<float> rho_, weight_, persistence_;
   std::vector<Filter> filters_;
-  std::vector<float> state_;     // (filters, 2, classes): P(occupied), likelihood
-  std::vector<int32_t> unused_;  // filters without a cell
+  std::vector<float> state_;  // (filters, 2, classes): P(occupied), likelihood
 };
 
 }  // namespace stillmap

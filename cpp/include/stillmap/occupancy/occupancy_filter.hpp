@@ -129,10 +129,7 @@ class OccupancyFilter : public FilterMap<D, PassedCell> {
       const auto reliability = tables_.isotropic(static_cast<float>(squared));
       if (reliability < kMinReliability) return;
       if (cell->filter >= 0) {
-        if (!filters_.miss(cell->filter, bin, reliability)) {
-          filters_.release(cell->filter);
-          *cell = {-1, bin, tag, CellFilters::kMaxPasses};
-        }
+        filters_.miss(cell->filter, bin, reliability);
       } else if (reliability >= kClearlyPassed && cell->last_bin != bin) {
         ++cell->passed_bins;
         cell->last_bin = bin;

@@ -122,14 +122,12 @@ class SweepFilter : public FilterMap<3, SurfaceCell> {
       if ((middle - view.T_map_sensor.t).squaredNorm() > reach * reach) continue;
       bool is_changed = false;
       for (int i = 0; i < kCells; ++i) {
-        SurfaceCell& cell = block->values[static_cast<size_t>(i)];
-        if (cell.filter < 0) continue;
+        const int32_t k = block->values[static_cast<size_t>(i)].filter;
+        if (k < 0) continue;
         const float reliability = visibility(view, centre_of(cell_at(block->origin, i)));
         if (reliability < kMinReliability) continue;
+        filters_.miss(k, view.bin, reliability);
         is_changed = true;
-        if (filters_.miss(cell.filter, view.bin, reliability)) continue;
-        filters_.release(cell.filter);
-        cell.filter = -1;
       }
       if (is_changed) note_changed(block->origin);
     }
@@ -137,13 +135,13 @@ class SweepFilter : public FilterMap<3, SurfaceCell> {
 
   void record_hits(const std::vector<Vec<3>>& ends, int32_t bin, int32_t tag) {
     std::vector<Vec<3>> first;  // of each cell
-    hit_.assign(filters_.capacity(), false);
+    hit_.assign(filters_.size(), false);
     for (const Vec<3>& end : ends) {
       const Cell<3> cell = cell_of<3>(end);
       SurfaceCell& at = cell_at_or_new(cell);
       if (at.filter < 0) {
         at.filter = add_filter(cell, tag);
-        hit_.resize(filters_.capacity(), false);
+        hit_.push_back(false);
       }
       if (hit_[static_cast<size_t>(at.filter)]) continue;
       hit_[static_cast<size_t>(at.filter)] = true;
