@@ -93,9 +93,9 @@ def test_the_extended_map_shows_what_was_not_seen_again(run):
 
 def test_the_cells_are_those_of_the_map_that_is_extended(tmp_path):
     simulation = simulate(scene_by_name("hall", {"robot": {"scans": 20}}), 1)
-    options = {"threads": 1, "em.max_iterations": 1, "resolution": 0.1}
+    options = {"threads": 1, "em.max_iterations": 1, "slam.resolution": 0.1}
     stillmap.build(simulation.recording, options).save(tmp_path / "known")
     with LiveMapper({"threads": 1}, place=tmp_path / "known", mode="extend") as mapper:
         assert mapper.resolution == 0.1
     with pytest.raises(InputError, match=r"0\.1 m"):
-        LiveMapper({"resolution": 0.2}, place=tmp_path / "known", mode="extend")
+        LiveMapper({"slam.resolution": 0.2}, place=tmp_path / "known", mode="extend")

@@ -76,7 +76,7 @@ def test_a_crowd_does_not_lose_it(hall):
 
 def test_scans_from_before_it_was_found_are_labelled_in_the_map(hall):
     simulation = hall.simulate(201, crowd={"people": 10})
-    first, beams = 900, list(iter_beams(simulation.recording))
+    first, beams = 100, list(iter_beams(simulation.recording))
     answers = run(hall, simulation, range(first, first + 40))
     k, update, mapper = next(answers)
     while "lost" in update.doubts:

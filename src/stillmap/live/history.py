@@ -159,7 +159,8 @@ class History:
         stamp_ns, sensor = self._stamp_ns.view()[kept], self._sensor.view()[kept]
         odometry = self._T_odom_base.view()[kept] if self._has_odometry else None
         mounts, has_times, folder = dict(self._mounts), self._has_times, self._folder
-        poses, local, anchor = (array[kept] for array in self.poses())
+        poses, local, anchor = self.poses()
+        answers = kept, poses[kept], local[kept], anchor[kept]
 
         def load() -> tuple[Recording, Answers]:
             points, hit, p_static, times = join_parts(parts, folder)
@@ -176,7 +177,7 @@ class History:
                 beam_time=times if has_times else None,
                 scratch=folder,
             )
-            return recording, Answers(kept, poses, local, anchor, p_static)
+            return recording, Answers(*answers, p_static)
 
         return KeptScans(kept, load)
 
