@@ -124,7 +124,7 @@ def test_an_earlier_scan_is_labelled_as_it_was(corridor):
     assert np.mean((again < 0.5) == (update.p_static < 0.5), where=last.hit) > 0.95
 
 
-@pytest.mark.parametrize("name", ["max_scratch", "lag"])
-def test_wrong_bounds_are_named(name):
-    with pytest.raises(ValueError, match=name):
-        LiveMapper(**{name: 0})
+@pytest.mark.parametrize("settings", [{"max_scratch": 0}, {"max_scratch": 1000}, {"lag": 0.0}])
+def test_wrong_bounds_are_named(settings):
+    with pytest.raises(ValueError, match=next(iter(settings))):
+        LiveMapper(**settings)

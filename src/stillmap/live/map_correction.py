@@ -15,9 +15,11 @@ from stillmap.live.observation import Observation
 
 Float = NDArray[np.float64]
 
-# blocks of cells in 2D and 3D, scans of the local map: about 2 ms, in 3D 15 ms
-_BLOCKS_PER_STEP, _SCANS_PER_STEP = {2: 24, 3: 500}, 4
+# blocks of cells in 2D and 3D, scans of the local map: about 2 ms each, in 3D 15 ms
+_BLOCKS_PER_STEP, _SCANS_PER_STEP = {2: 24, 3: 500}, 2
 _ADDED_PER_STEP = {2: 2, 3: 1}  # scans that came meanwhile
+# spaced scans that move their cells alike: between neighbours corrections hardly differ
+SPACED_PER_TAG = {2: 4, 3: 1}
 _KEPT_EVERY_NS = {2: 0, 3: 500_000_000}  # between two of them
 # m that any spaced scan and that the last one move, and rad that it turns, up to which the map
 # stays as it is: constraints of loops have such errors themselves
@@ -58,7 +60,8 @@ class MapCorrection:
         self._D = poses.shape[-1] - 1
         # in 3D the local map moves with its frame: it holds what is near, not what loops tie to it
         self.local_map = LocalMap(labels.resolution) if self._D == 2 else None
-        self._motion = self.poses @ se2.inverse(poses)
+        every = SPACED_PER_TAG[self._D]
+        self._motion = self.poses[::every] @ se2.inverse(poses[::every])
         self._source: OccupancyFilter = labels.filter
         D = self._D
         shift = np.linalg.norm((self.poses - poses)[:, :D, D], axis=1)
@@ -67,9 +70,9 @@ class MapCorrection:
         self.is_small = bool(shift.max() < _SMALL[0] and shift[-1] < _SMALL[1] and turn < _SMALL[2])
         self.moves_cells = bool(shift.max() > _MIN_SHIFT * labels.resolution)
         self.filter: OccupancyFilter = self._source.sibling() if self.moves_cells else self._source
-        self._block, self._scans = 0, sorted(correction.near, key=lambda scan: scan.travelled)
+        self._block = 0
+        self._scans = deque(sorted(correction.near, key=lambda scan: scan.travelled))
         self._labelled = deque[LabelledScan]()
-        self._added: list[MappedScan] = []
         self._kept_ns = 0
 
     def note_labelled(self, scan: LabelledScan) -> None:
@@ -81,7 +84,7 @@ class MapCorrection:
 
     def note_added(self, scan: MappedScan) -> None:
         """Tell of a scan that was added to the local map meanwhile."""
-        self._added.append(scan)
+        self._scans.append(scan)
 
     def step(self, labels: CausalLabels) -> bool:
         """Do a part of the work; True when nothing is left."""
@@ -93,8 +96,8 @@ class MapCorrection:
             self._block = take_over(self.filter, self._source, self._motion, self._block, count)
             return False
         if self._scans and self.local_map is not None:
-            self.local_map.extend(self._scans[:_SCANS_PER_STEP])
-            self._scans = self._scans[_SCANS_PER_STEP:]
+            for _ in range(min(_SCANS_PER_STEP, len(self._scans))):
+                self.local_map.extend([self._scans.popleft()])
             return False
         for _ in range(min(_ADDED_PER_STEP[self._D], len(self._labelled))):
             scan = self._labelled.popleft()
@@ -103,7 +106,5 @@ class MapCorrection:
 
     def finish(self, labels: CausalLabels) -> None:
         """Replace the cells of the labels."""
-        if self.local_map is not None:
-            self.local_map.extend(self._added)
         if self.moves_cells:
             labels.filter = self.filter

@@ -18,6 +18,7 @@ LoopClosing = LoopCloser | LiveSweepLoopCloser | LoopProcess | NoLoops
 
 # beams of a spaced scan in 2D and 3D, for loops and for the local map after them
 _MAX_KEPT_BEAMS = {2: 400, 3: 20_000}
+_FIRST_SPACED = 256  # spaced scans for which there is room at first
 
 
 class MapFrame:
@@ -36,7 +37,10 @@ class MapFrame:
         D = dimension
         self.T_map_local = np.eye(D + 1)
         self._dimension, self._closer, self._in_background = D, closer, in_background
-        self._spaced, self._corrected = list[Float](), np.zeros((0, D + 1, D + 1))
+        # poses of the spaced scans: the first `_count` in the frame of the odometry by scans, and
+        # in the map those that were corrected
+        self._spaced, self._count = np.zeros((_FIRST_SPACED, D + 1, D + 1)), 0
+        self._corrected = np.zeros((0, D + 1, D + 1))
         self._drift = np.zeros((3, 3))  # covariance since the last spaced scan
         self._correction: MapCorrection | None = None
         self._outdated = 0  # spaced scans of which corrections are not for where the robot is
@@ -44,7 +48,7 @@ class MapFrame:
     @property
     def last(self) -> int:
         """Number of the last spaced scan; -1: there is none."""
-        return len(self._spaced) - 1
+        return self._count - 1
 
     def add_drift(self, covariance: Float) -> None:
         """Add the covariance (3, 3) of a step that the scans do not show."""
@@ -52,7 +56,10 @@ class MapFrame:
 
     def add(self, scan: MappedScan, found: Registration) -> None:
         """Add a spaced scan to the pose graph."""
-        self._spaced.append(scan.T_map_base)
+        if self._count == len(self._spaced):
+            self._spaced = np.concatenate([self._spaced, np.zeros_like(self._spaced)])
+        self._spaced[self._count] = scan.T_map_base
+        self._count += 1
         kept = thin_scan(scan, _MAX_KEPT_BEAMS[self._dimension])
         self._closer.add(kept, found.explained, self._drift)
         self._drift = np.zeros((3, 3))
@@ -78,7 +85,8 @@ class MapFrame:
             if added is not None:
                 self._correction.note_added(added)
         elif (found := self._closer.poll()) is not None and len(found.poses) > self._outdated:
-            new = MapCorrection(found, labels, np.array(self._spaced), self.spaced_poses())
+            spaced = self._spaced[: self._count].copy()
+            new = MapCorrection(found, labels, spaced, self.spaced_poses())
             self._correction = None if new.is_small else new
         self._go_on(labels, odometry, to_the_end=not self._in_background)
 
@@ -90,7 +98,7 @@ class MapFrame:
             covariance: (3, 3) of the pose at which it was found.
         """
         self.add_drift(covariance)
-        self._outdated = len(self._spaced)
+        self._outdated = self._count
 
     def finish_correction(self, labels: CausalLabels, odometry: FrontEnd) -> None:
         """Finish the correction that was begun, if there is one."""
@@ -112,9 +120,8 @@ class MapFrame:
 
     def spaced_poses(self) -> Float:
         """(S, D+1, D+1) T_map_base of the spaced scans."""
-        since = np.array(self._spaced[len(self._corrected) :])
-        since = since.reshape(-1, *self.T_map_local.shape)
-        return np.concatenate([self._corrected, self.T_map_local @ since])
+        since = self.T_map_local @ self._spaced[len(self._corrected) : self._count]
+        return np.concatenate([self._corrected, since])
 
     def to_map(self, local: Float, anchor: int) -> Float:
         """(D+1, D+1) T_map_base of a scan at a pose in the frame of the odometry by scans, which
@@ -126,10 +133,10 @@ class MapFrame:
 
     def to_map_all(self, local: Float, anchor: NDArray[np.int64]) -> Float:
         """(T, D+1, D+1) the same of all scans; between spaced ones corrections are blended."""
-        if not self._spaced:
+        if not self._count:
             return np.asarray(self.T_map_local @ local)
         # the scan after which each spaced one is the last: itself, but for the first
-        scans = np.searchsorted(anchor, np.arange(len(self._spaced)) - 1, side="right") - 1
+        scans = np.searchsorted(anchor, np.arange(self._count) - 1, side="right") - 1
         every, kept = np.unique(np.maximum(scans, 0), return_index=True)
         corrected, last = self.spaced_poses()[kept], len(local) - 1
         if every[-1] != last:

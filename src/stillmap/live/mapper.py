@@ -27,7 +27,7 @@ from stillmap.live.known_map import KnownMap
 from stillmap.live.local_map import MappedScan
 from stillmap.live.loop_closer import NoLoops
 from stillmap.live.loop_process import start_closer
-from stillmap.live.map_correction import LabelledScan
+from stillmap.live.map_correction import SPACED_PER_TAG, LabelledScan
 from stillmap.live.map_frame import LoopClosing, MapFrame, rotate_covariance
 from stillmap.live.map_view import project_obstacles
 from stillmap.live.movers import MoverTracker
@@ -52,6 +52,7 @@ Float = NDArray[np.float64]
 # weight of a scan in the running share of hits on what moves; share from which people may walk
 # along with the robot, and what was only just seen counts little
 _MOVING_RATE, _CROWDED = 0.3, 0.15
+_MIN_SCRATCH = 100_000  # bytes: some scans at least
 _CHANGES_EVERY_NS = 10**9  # between two updates that tell what changed in the map
 
 
@@ -93,7 +94,10 @@ class LiveMapper:
         max_scratch: int | None = None,
         lag: float | None = None,
     ) -> None:
-        _require_positive(max_scratch=max_scratch, lag=lag)
+        if max_scratch is not None and not max_scratch >= _MIN_SCRATCH:
+            raise ValueError(f"max_scratch: expected {_MIN_SCRATCH} bytes or more: {max_scratch}")
+        if lag is not None and not 0.0 < lag < np.inf:
+            raise ValueError(f"lag: expected positive seconds, got {lag}")
         self.options = to_options(options)
         self._place = None if place is None else PlaceTracker(KnownMap(place), mode)
         if self._place is not None and self._place.extends:
@@ -169,7 +173,7 @@ class LiveMapper:
         margin = None
         if isinstance(hits, PlanarHits):
             margin = find_margins(beams, normals_of(beams, hits), self._selector.select(beams))
-        return Observation(beams, margin, max(anchor, 0))
+        return Observation(beams, margin, max(anchor, 0) // SPACED_PER_TAG[beams.dimension])
 
     def _lose(self) -> None:
         """The robot was carried: labels, tracks and path begin anew."""
@@ -416,9 +420,3 @@ class LiveMapper:
             self._movers.movers(self._frame.T_map_local),
             [LaterLabels(n, self.label(one, n)) for n, one in self._hindsight.take(stamp_ns)],
         )
-
-
-def _require_positive(**numbers: float | None) -> None:
-    for name, number in numbers.items():
-        if number is not None and not 0.0 < number < np.inf:
-            raise ValueError(f"{name}: expected a positive number, got {number}")
