@@ -48,6 +48,16 @@ def test_scans_are_dropped_evenly_beyond_the_bound(scans, tmp_path):
     assert gaps[0] > 1
 
 
+@pytest.mark.parametrize(("bound", "scans"), [(1, 5000), (20_000, 10_000), (100_000, 40_000)])
+def test_a_store_has_as_few_files_after_a_long_run(bound, scans, tmp_path):
+    store = fill(bound, scans, tmp_path)
+    assert len(store._segments) < 40
+    numbers = join_parts(store.parts(), tmp_path)[1]
+    assert store.kept[-1] == scans - 1
+    np.testing.assert_array_equal(numbers, np.repeat(store.kept, store.counts))
+    assert numbers.nbytes < max(1.1 * bound, 80_000)
+
+
 def test_the_store_is_empty_at_first(tmp_path):
     store = BeamStore([(np.float32, (2,))], tmp_path, 10)
     assert len(store.kept) == len(join_parts(store.parts(), tmp_path)[0]) == 0

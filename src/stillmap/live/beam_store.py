@@ -13,7 +13,9 @@ Array = NDArray[Any]
 
 _IN_MEMORY = 1 << 18  # bytes of each array that are not yet in its file
 _SEGMENTS = 16  # into which the bound is divided
-_SCANS_PER_STEP = 64  # that are copied between two scans: about 1 ms
+_MIN_SCANS = 16  # of a segment: of few ones hardly any could be dropped
+# steps between two scans, and scans and beams that a step copies: about 1 ms, in 3D 5 ms
+_STEPS, _SCANS_PER_STEP, _BEAMS_PER_STEP = 4, 16, 20_000
 
 
 class BeamStore:
@@ -51,9 +53,10 @@ class BeamStore:
             return
         if self._segments[-1].is_full(self._max_bytes / _SEGMENTS):
             self._segments.append(self._make_segment())
-        is_idle = next(self._work, self) is self
-        if is_idle and sum(s.byte_count for s in self._segments) > self._max_bytes:
-            self._work = self._thin()
+        for _ in range(_STEPS):
+            is_idle = next(self._work, self) is self
+            if is_idle and sum(s.byte_count for s in self._segments) > self._max_bytes:
+                self._work = self._thin(self._max_bytes / _SEGMENTS)
 
     @property
     def kept(self) -> NDArray[np.int64]:
@@ -86,17 +89,22 @@ class BeamStore:
     def _make_segment(self) -> "_Segment":
         return _Segment([ArrayBuilder(t, row, self._folder, _IN_MEMORY) for t, row in self._fields])
 
-    def _thin(self) -> Iterator[None]:
-        """Drop every second scan of the densest segment, with as many halved before as another
-        one beside it, which it joins."""
-        halvings = [segment.halvings for segment in self._segments[:-1]]
+    def _thin(self, most: float) -> Iterator[None]:
+        """Drop every second scan of the densest segment, the oldest of those; it joins the one
+        before if that is as dense then and has room, in segments of at most so many bytes."""
+        newest = 1 if len(self._segments[-1].numbers) else 2  # with the last scan, which stays
+        halvings = [segment.halvings for segment in self._segments[:-newest]]
         if not halvings:
             return
         at = halvings.index(min(halvings))
         old, thinned = self._segments[at], self._make_segment()
         thinned.halvings = old.halvings + 1
         before = self._segments[at - 1] if at else None
-        if before is not None and before.halvings == thinned.halvings and before.is_small(old):
+        if (
+            before is not None
+            and before.halvings == thinned.halvings
+            and before.has_room(old, most)
+        ):
             thinned = before
         yield from _copy_every_second(old, thinned)
         self._segments[at : at + 1] = [] if thinned is before else [thinned]
@@ -120,12 +128,13 @@ class _Segment:
                 array.append(more)
 
     def is_full(self, most: float) -> bool:
-        """Whether it takes more than so many bytes; of one scan alone none could be dropped."""
-        return self.byte_count > most and len(self.numbers) > 1
+        """Whether it takes more than so many bytes, and has some scans."""
+        return self.byte_count > most and len(self.numbers) >= _MIN_SCANS
 
-    def is_small(self, other: "_Segment") -> bool:
-        """Whether half of another one would fill it up at most."""
-        return self.byte_count <= 0.6 * other.byte_count
+    def has_room(self, other: "_Segment", most: float) -> bool:
+        """Whether half of another one fits in, too."""
+        fits = self.byte_count + 0.5 * other.byte_count <= 1.1 * most
+        return fits or len(self.numbers) < _MIN_SCANS
 
     def close(self) -> None:
         for array in (*self.arrays, self.numbers, self.counts):
@@ -137,8 +146,9 @@ def _copy_every_second(source: _Segment, to: _Segment) -> Iterator[None]:
     arrays = [array.view() for array in source.arrays]
     numbers, counts = source.numbers.view(), source.counts.view()
     end = np.cumsum(counts)
-    for first in range(0, len(numbers), _SCANS_PER_STEP):
-        scans = slice(first, first + _SCANS_PER_STEP)
+    step = int(np.clip(_BEAMS_PER_STEP * len(counts) // max(end[-1], 1), 1, _SCANS_PER_STEP))
+    for first in range(0, len(numbers), step):
+        scans = slice(first, first + step)
         beams = slice(int(end[first] - counts[first]), int(end[scans][-1]))
         kept = (np.arange(len(numbers[scans])) + first) % 2 == 0
         of_kept = np.repeat(kept, counts[scans])
