@@ -144,7 +144,7 @@ def test_empty_sweeps(room):
 
 
 def test_memory_is_bounded_by_the_radius(monkeypatch):
-    monkeypatch.setattr(lidar_odometry, "_MAX_RANGE", 20.0)
+    monkeypatch.setattr(lidar_odometry, "MAX_RANGE", 20.0)
     street = Boxes.of([[0.0, 0.0, 1.0, 4000.0, 12.0, 5.0, 0, 0, 0]])
     recording, _, e = recorded(street, SPARSE, wobbling(40, speed=30.0, turn=0.0), 40, seed=4)
     local = _core.NdtMap3D(0.4, 4, 60.0)
