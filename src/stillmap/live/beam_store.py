@@ -128,11 +128,11 @@ class _Segment:
                 array.append(more)
 
     def is_full(self, most: float) -> bool:
-        """Whether it takes more than so many bytes, and has some scans."""
+        """True if the segment holds more than `most` bytes, in several scans."""
         return self.byte_count > most and len(self.numbers) >= _MIN_SCANS
 
     def has_room(self, other: "_Segment", most: float) -> bool:
-        """Whether half of another one fits in, too."""
+        """True if half of the bytes of another segment fit in, too."""
         fits = self.byte_count + 0.5 * other.byte_count <= 1.1 * most
         return fits or len(self.numbers) < _MIN_SCANS
 

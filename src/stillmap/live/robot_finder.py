@@ -32,17 +32,17 @@ class RobotFinder:
 
     @property
     def is_carried(self) -> bool:
-        """Whether the robot was carried while it maps, and has not been found yet."""
+        """True if the robot was carried while it maps and is not localized yet."""
         return self._carried is not None
 
     @property
     def is_lost(self) -> bool:
-        """Whether the pose is none in the map."""
+        """True if the robot is not localized in the map."""
         return self._carried is not None or (self._place is not None and self._place.is_lost)
 
     @property
     def is_ambiguous(self) -> bool:
-        """Whether several places fit about as well."""
+        """True if several poses in the map fit about equally well."""
         searches = (self._carried, self._place)
         return any(one is not None and one.is_ambiguous for one in searches)
 
