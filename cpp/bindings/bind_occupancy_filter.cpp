@@ -5,6 +5,7 @@
 
 #include <array>
 #include <limits>
+#include <type_traits>
 #include <utility>
 #include <vector>
 
@@ -13,6 +14,7 @@
 #include "cell_box.hpp"
 #include "stillmap/occupancy/occupancy_filter.hpp"
 #include "stillmap/occupancy/sweep_filter.hpp"
+#include "stillmap/util/parallel.hpp"
 
 namespace stillmap::bindings {
 namespace {
@@ -57,7 +59,7 @@ void add_scan(Filter2D& filter, const Points<2>& points, const Flat<bool>& hit,
 
 void add_sweep(SweepFilter& filter, const Points<3>& points, const Flat<bool>& hit,
                const Flat<int64_t>& offset, const Poses<3>& poses,
-               const std::array<double, 2>& pixel, int64_t time_bin, int32_t tag) {
+               const std::array<double, 2>& pixel, int64_t time_bin, int32_t tag, int threads) {
   const auto sweep = scans_from<3>(points, hit, offset, poses);
   require(sweep.n_scans == 1, "T_map_sensor: expected one pose, of one sweep");
   for (const double angle : pixel)
@@ -65,7 +67,7 @@ void add_sweep(SweepFilter& filter, const Points<3>& points, const Flat<bool>& h
   require(tag >= 0, "tag: expected a number that is not negative");
   const PixelSize size{static_cast<float>(pixel[0]), static_cast<float>(pixel[1])};
   nb::gil_scoped_release released;
-  filter.add(sweep, size, time_bin, tag);
+  filter.add(sweep, size, time_bin, tag, threads);
 }
 
 void prime(Filter2D& filter, const Cells<2>& cells, const Flat<bool>& occupied, double log_ratio) {
@@ -76,9 +78,24 @@ void prime(Filter2D& filter, const Cells<2>& cells, const Flat<bool>& occupied, 
     filter.prime(cell_from<2>(cells, k), occupied.data()[k], log_ratio);
 }
 
+// Labels beams first to last; a const filter may be shared between threads.
+template <class Filter, class Scans>
+void label_beams(Filter& filter, const Scans& scans, int64_t first, int64_t last, float prior,
+                 std::vector<float>& out) {
+  constexpr int D = std::remove_const_t<Filter>::kDimension;
+  typename std::remove_const_t<Filter>::ConstCursor cursor(filter);
+  for_each_beam<D>(scans, 0, scans.n_scans, [&](size_t, int64_t n, const Pose<D>& pose) {
+    if (n < first || n >= last) return;
+    const BeamSegment<D> beam(pose, scans.points + n * D, filter.resolution());
+    out[static_cast<size_t>(n)] =
+        scans.hit[n] ? filter.p_static_at(cursor, beam.end, prior) : prior;
+  });
+}
+
 template <class Filter>
 auto label(Filter& filter, const Points<Filter::kDimension>& points, const Flat<bool>& hit,
-           const Flat<int64_t>& offset, const Poses<Filter::kDimension>& poses, double prior) {
+           const Flat<int64_t>& offset, const Poses<Filter::kDimension>& poses, double prior,
+           int threads) {
   constexpr int D = Filter::kDimension;
   require_probability(prior, "prior");
   const auto scans = scans_from<D>(points, hit, offset, poses);
@@ -86,12 +103,16 @@ auto label(Filter& filter, const Points<Filter::kDimension>& points, const Flat<
   std::vector<float> out(points.shape(0), kUnknown);
   {
     nb::gil_scoped_release released;
-    typename Filter::ConstCursor cursor(filter);
-    for_each_beam<D>(scans, 0, scans.n_scans, [&](size_t, int64_t n, const Pose<D>& pose) {
-      const BeamSegment<D> beam(pose, scans.points + n * D, filter.resolution());
-      out[static_cast<size_t>(n)] =
-          scans.hit[n] ? filter.p_static_at(cursor, beam.end, otherwise) : otherwise;
-    });
+    const auto bounds = split_evenly(points.shape(0), threads);
+    if (bounds.size() == 2) {
+      label_beams(filter, scans, 0, static_cast<int64_t>(points.shape(0)), otherwise, out);
+    } else {
+      const Filter& shared = filter;
+      parallel_for_ranges(bounds, [&](size_t, size_t first, size_t last) {
+        label_beams(shared, scans, static_cast<int64_t>(first), static_cast<int64_t>(last),
+                    otherwise, out);
+      });
+    }
   }
   const size_t n = out.size();
   return to_numpy(std::move(out), {n});
@@ -132,7 +153,7 @@ auto dense(const Filter2D& filter, const OptionalCell<2>& first_cell, const Opti
 }
 
 template <class Filter>
-auto take_changed(Filter& filter, double odds_factor) {
+auto take_changed(Filter& filter, size_t most, double odds_factor) {
   constexpr int D = Filter::kDimension;
   constexpr auto E = static_cast<size_t>(Filter::kEdge), n = static_cast<size_t>(Filter::kCells);
   require(odds_factor > 0.0, "odds_factor: expected a positive number");
@@ -141,7 +162,7 @@ auto take_changed(Filter& filter, double odds_factor) {
   size_t count = 0;
   {
     nb::gil_scoped_release released;
-    for (const Cell<D>& origin : filter.take_changed_blocks()) {
+    for (const Cell<D>& origin : filter.take_changed_blocks(most)) {
       const Cell<D> first = Filter::cell_at(origin, 0);
       cells.insert(cells.end(), first.data(), first.data() + D);
       tiles.resize(++count * n, kUnknown);
@@ -157,6 +178,17 @@ auto take_changed(Filter& filter, double odds_factor) {
   } else {
     return std::make_pair(lowest, to_numpy(std::move(tiles), {count, E, E, E}));
   }
+}
+
+template <class Filter>
+auto blocks(const Filter& filter) {
+  constexpr int D = Filter::kDimension;
+  std::vector<int64_t> cells;
+  for (const auto& block : filter.blocks()) {
+    const Cell<D> first = Filter::cell_at(block->origin, 0);
+    cells.insert(cells.end(), first.data(), first.data() + D);
+  }
+  return to_numpy(std::move(cells), {filter.blocks().size(), static_cast<size_t>(D)});
 }
 
 template <class Filter>
@@ -218,15 +250,20 @@ nb::class_<Filter> bind_filter(nb::module_& m, const char* name, const char* doc
       .def_prop_ro("memory_bytes", &Filter::memory_bytes)
       .def("label", &label<Filter>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
            nb::arg("offset").noconvert(), nb::arg("T_map_sensor").noconvert(), nb::arg("prior"),
+           nb::arg("threads") = 1,
            "(M,) float32 P(static) of every beam by what was added so far. NaN for unusable "
            "beams; the prior without a return, and where no beam ended before.")
       .def("known_cells", &known_cells<Filter>, nb::kw_only(), nb::arg("odds_factor") = 1.0,
            "Cells (K, D) int64 in which beams ended, and P(static and occupied) (K,) float32. The "
            "prior odds of static classes are those of the weights times odds_factor.")
-      .def("take_changed_blocks", &take_changed<Filter>, nb::kw_only(),
+      .def_prop_ro("changed_count", &Filter::changed_count,
+                   "Number of blocks that changed since they were taken last.")
+      .def("take_changed_blocks", &take_changed<Filter>, nb::arg("most"), nb::kw_only(),
            nb::arg("odds_factor") = 1.0,
-           "Lowest cells (B, D) int64 of the blocks that changed since the last call, and "
-           "P(static and occupied) of their cells, (B, [z,] y, x) float32; NaN: unknown.")
+           "Lowest cells (B, D) int64 of the first `most` blocks that changed since they were "
+           "taken last, and P(static and occupied) of their cells, (B, [z,] y, x) float32; NaN: "
+           "unknown.")
+      .def("blocks", &blocks<Filter>, "Lowest cells (B, D) int64 of all blocks.")
       .def_prop_ro("block_count", [](const Filter& filter) { return filter.blocks().size(); })
       .def("sibling", &Filter::sibling, "An empty filter of the same kind.")
       .def("take_over", &take_over<Filter>, nb::arg("other"), nb::arg("motion").noconvert(),
@@ -259,7 +296,7 @@ void bind_occupancy_filter(nb::module_& m) {
                            "The same in 3D: cells are looked up in the range image of each sweep.")
       .def("add", &add_sweep, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
            nb::arg("offset").noconvert(), nb::arg("T_map_sensor").noconvert(), nb::kw_only(),
-           nb::arg("pixel"), nb::arg("time_bin"), nb::arg("tag"),
+           nb::arg("pixel"), nb::arg("time_bin"), nb::arg("tag"), nb::arg("threads") = 1,
            "Adds the hits of one sweep. pixel: radians of azimuth and elevation of a pixel of its "
            "range image, at least those between neighbouring beams. tag: see `take_over`.");
 }

@@ -99,8 +99,11 @@ def test_a_part_of_the_map_is_that_part_of_all(scans):
 
 def test_changed_blocks_are_told_once(scans):
     room, core, _ = scans
-    blocks, tiles = core.take_changed_blocks()
-    assert len(blocks) == len(tiles) > 0
+    changed = core.changed_count
+    parts = [core.take_changed_blocks(3) for _ in range(-(-changed // 3))]
+    blocks, tiles = (np.concatenate(one) for one in zip(*parts, strict=True))
+    assert len(blocks) == len(tiles) == changed > 3
+    assert {tuple(b) for b in blocks.tolist()} == {tuple(b) for b in core.blocks().tolist()}
     assert len(np.unique(blocks, axis=0)) == len(blocks)
     told = {}
     for first, tile in zip(blocks, tiles, strict=True):
@@ -108,19 +111,24 @@ def test_changed_blocks_are_told_once(scans):
         cells = map(tuple, (at[:, ::-1] + first).tolist())
         told.update(zip(cells, tile[tuple(at.T)].tolist(), strict=True))
     assert told == known(core)
-    assert len(core.take_changed_blocks()[0]) == 0
+    assert len(core.take_changed_blocks(100)[0]) == core.changed_count == 0
     add_scans(core, room, [300])
-    assert 0 < len(core.take_changed_blocks()[0]) <= len(blocks)
+    assert 0 < core.changed_count <= len(blocks)
 
 
-def look(filter_, distance, time_bin, count=30):
+def fan(distance, count=30):
     """A fan of beams from the origin that end at a distance."""
     angles = np.linspace(-0.3, 0.3, count)
     points = (distance * np.stack([np.cos(angles), np.sin(angles)], axis=1)).astype(np.float32)
-    args = points, np.ones(count, bool)
-    offset, T = np.array([0, count]), np.eye(3)[None]
-    filter_.add(*args, np.full(count, 1.0, np.float32), offset, T, time_bin=time_bin, tag=0)
-    return filter_.label(*args, offset, T, 0.9)
+    return points, np.ones(count, bool), np.array([0, count]), np.eye(3)[None]
+
+
+def look(filter_, distance, time_bin):
+    """Labels of a fan of beams that is added."""
+    points, *rest = fan(distance)
+    margin = np.full(len(points), 1.0, np.float32)
+    filter_.add(points, rest[0], margin, *rest[1:], time_bin=time_bin, tag=0)
+    return filter_.label(points, *rest, 0.9)
 
 
 def test_what_appears_in_free_space_moves_and_the_wall_behind_does_not():
@@ -131,14 +139,18 @@ def test_what_appears_in_free_space_moves_and_the_wall_behind_does_not():
     assert look(core, 4.0, 9).min() > 0.9
 
 
-def sweep(filter_, distance, time_bin):
+def patch(distance):
     """A patch of a wall at a distance along x, seen from the origin."""
     y, z = np.meshgrid(np.linspace(-1.0, 1.0, 81), np.linspace(-1.0, 1.0, 81))
     points = np.stack([np.ones_like(y), y, z], axis=-1).reshape(-1, 3) * distance
-    args = points.astype(np.float32), np.ones(len(points), bool)
-    where = np.array([0, len(points)]), np.eye(4)[None]
-    filter_.add(*args, *where, pixel=(0.03, 0.03), time_bin=time_bin, tag=0)
-    return filter_.label(*args, *where, 0.9)
+    every = np.ones(len(points), bool)
+    return points.astype(np.float32), every, np.array([0, len(points)]), np.eye(4)[None]
+
+
+def sweep(filter_, distance, time_bin):
+    """Labels of a sweep of a patch that is added."""
+    filter_.add(*patch(distance), pixel=(0.03, 0.03), time_bin=time_bin, tag=0)
+    return filter_.label(*patch(distance), 0.9)
 
 
 def test_what_appears_in_the_free_space_of_sweeps_moves():
@@ -147,6 +159,19 @@ def test_what_appears_in_the_free_space_of_sweeps_moves():
         assert sweep(core, 4.0, time_bin).min() > 0.8
     assert np.mean(sweep(core, 2.0, 4) < 0.2) > 0.95
     assert sweep(core, 4.0, 5).min() > 0.9
+
+
+def test_labels_and_sweeps_do_not_depend_on_the_threads():
+    cores = [make(_core, 3, 0.02) for _ in range(2)]
+    for time_bin in range(12):
+        args, labels = patch(2.0 if time_bin == 4 else 4.0), []
+        for core, threads in zip(cores, (1, 3), strict=True):
+            kept = {"pixel": (0.03, 0.03), "time_bin": time_bin, "tag": 0}
+            core.add(*args, **kept, threads=threads)
+            labels.append(core.label(*args, 0.9, threads=threads))
+        np.testing.assert_array_equal(*labels)
+    assert known(cores[0]) == known(cores[1])
+    assert np.concatenate(labels).size > 10_000
 
 
 def test_a_sweep_moves_with_its_map():

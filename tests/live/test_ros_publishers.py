@@ -121,11 +121,14 @@ class TestMap:
         np.testing.assert_array_equal(cells, expected)
         assert update.header.stamp.sec == 2
         # what was sent before stays
-        assert publisher.publish_changes([self.change(-4, 11, 0.0)], 3)
+        assert publisher.publish_changes([self.change(-4, 11, 0.0)], 2_900_000_000)
+        assert len(ros.sent["map_updates"]) == 1  # once a second
+        assert publisher.publish_changes([], 3_000_000_000)
         update = ros.sent["map_updates"][1]
         assert (update.x, update.y) == (1, 1)
         np.testing.assert_array_equal(np.array(update.data), [0, 0, 0, 0])
-        assert publisher.publish_changes([self.change(-5, 10, 0.5, n=3)], 4)
+        clock_set_back = 5
+        assert publisher.publish_changes([self.change(-5, 10, 0.5, n=3)], clock_set_back)
         np.testing.assert_array_equal(np.array(ros.sent["map_updates"][2].data), [-1] * 9)
 
     @pytest.mark.parametrize("at", [(-6, 10), (0, 12), (-5, 9), (-5, 13)])
@@ -134,10 +137,10 @@ class TestMap:
         publisher = MapPublisher(ros, None, "map", "map", "trinary")
         assert not publisher.publish_changes([self.change(0, 0, 1.0)], 1)  # there is none yet
         publisher.publish(self.grid(), 1)
-        assert not publisher.publish_changes([self.change(*at, 1.0)], 2)
+        assert not publisher.publish_changes([self.change(*at, 1.0)], 2_000_000_000)
         assert not ros.sent["map_updates"]
         ros.listeners = 0  # to updates: the whole map comes when it is due
-        assert publisher.publish_changes([self.change(*at, 1.0)], 2)
+        assert publisher.publish_changes([self.change(*at, 1.0)], 4_000_000_000)
 
     def test_without_map_msgs(self):
         ros = FakeRos("map_msgs")

@@ -1,5 +1,6 @@
 """The causal E-step: P(static) of beams from what is known so far, and the map of what stands."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +30,8 @@ _MAP_PRIOR = 0.5
 # likewise for the local map until more is known: people who walk along with the robot are always
 # ahead of it, where nobody has looked before
 _RECENT_PRIOR = 0.05
+# s after which a part of the map that changed is told, about; parts that are told at once
+_CHANGES_WITHIN, _MIN_CHANGES = 1.0, 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,9 +54,12 @@ class CausalLabels:
         dimension: 2 or 3.
         resolution: m, edge of a cell.
         options: see EmOptions.
+        threads: the result does not depend on it.
     """
 
-    def __init__(self, dimension: int, resolution: float, options: EmOptions) -> None:
+    def __init__(
+        self, dimension: int, resolution: float, options: EmOptions, threads: int = 1
+    ) -> None:
         kind = _core.OccupancyFilter2D if dimension == 2 else _core.SweepFilter3D
         rho, tau = zip(*_STATIC, *_DYNAMIC, strict=True)
         prior, n = options.prior, len(_STATIC)
@@ -72,6 +78,7 @@ class CausalLabels:
         )
         self._odds_factor = _MAP_PRIOR / (1.0 - _MAP_PRIOR) * (1.0 - prior) / prior
         self._prior, self._bin_ns = prior, round(1e9 * options.time_bin)
+        self._threads = threads
         self._first_ns: int | None = None
         self.tags = 1  # numbers of keyframes are below
         self._pixels = dict[str | int, tuple[float, float]]()  # of the sensors, in 3D
@@ -91,7 +98,9 @@ class CausalLabels:
         """(N,) P(static) of the beams of a scan at a pose; NaN: unusable."""
         T = (T_map_base @ beams.T_base_sensor)[None]
         offset = np.array([0, len(beams.points)])
-        return self.filter.label(beams.points, beams.hit, offset, T, self._prior)
+        return self.filter.label(
+            beams.points, beams.hit, offset, T, self._prior, threads=self._threads
+        )
 
     def label_ends(self, points: NDArray[np.float32], T_map_base: Float) -> NDArray[np.float32]:
         """(N,) P(static) of hits that end at points (N, D) in the base frame, with the prior of the
@@ -123,7 +132,8 @@ class CausalLabels:
         scan, offset = (beams.points, beams.hit), np.array([0, len(beams.points)])
         if isinstance(to, _core.SweepFilter3D):
             pixel = self._pixel_size(beams)
-            to.add(*scan, offset, T, pixel=pixel, time_bin=time_bin, tag=tag)
+            kept = {"time_bin": time_bin, "tag": tag, "threads": self._threads}
+            to.add(*scan, offset, T, pixel=pixel, **kept)
             return
         assert observation.margin is not None
         margin = observation.margin / np.float32(self.resolution)
@@ -157,18 +167,25 @@ class CausalLabels:
         cells, p_occupied = self.filter.known_cells(odds_factor=self._odds_factor)
         return CellProbabilities(cells, p_occupied, 0.0)
 
-    def take_changes(self) -> list[MapChange]:
-        """The parts of the map that changed since the last call, those that emptied too."""
-        lowest, tiles = self.filter.take_changed_blocks(odds_factor=self._odds_factor)
+    def take_changes(self, seconds: float) -> list[MapChange]:
+        """Parts of the map that changed, so many that each is among them once a second, about; and
+        those that emptied.
+
+        Args:
+            seconds: since the call before.
+        """
+        share = min(seconds / _CHANGES_WITHIN, 1.0)
+        most = max(math.ceil(share * self.filter.changed_count), _MIN_CHANGES)
+        lowest, tiles = self.filter.take_changed_blocks(most, odds_factor=self._odds_factor)
         changes = list(map(MapChange, lowest, tiles))
-        changed = {cell.tobytes() for cell in lowest}
         if self.filter is not self._reported_of:  # the whole map was moved
-            gone = sorted(self._reported - changed)
+            left = {cell.tobytes() for cell in self.filter.blocks()}
+            gone = sorted(self._reported - left)
             emptied = np.frombuffer(b"".join(gone), lowest.dtype).reshape(-1, lowest.shape[1])
             unknown = np.full(tiles.shape[1:], np.nan, np.float32)
             changes += [MapChange(cell, unknown) for cell in emptied]
-            self._reported, self._reported_of = set(), self.filter
-        self._reported |= changed
+            self._reported, self._reported_of = self._reported & left, self.filter
+        self._reported.update(cell.tobytes() for cell in lowest)
         return changes
 
 

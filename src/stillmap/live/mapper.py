@@ -53,7 +53,6 @@ Float = NDArray[np.float64]
 # along with the robot, and what was only just seen counts little
 _MOVING_RATE, _CROWDED = 0.3, 0.15
 _MIN_SCRATCH = 100_000  # bytes: some scans at least
-_CHANGES_EVERY_NS = 10**9  # between two updates that tell what changed in the map
 
 
 class LiveMapper:
@@ -108,7 +107,6 @@ class LiveMapper:
         self._T_odom_base: Float | None = None
         self._last_ns: int | None = None
         self._is_closed = False
-        self._changes_due_ns = 0
         self._path_begin = 0  # the first spaced scan in the frame of the map
         self._moving = 0.0  # share of the hits, as the labels say a second later
         self._begin(2)
@@ -118,10 +116,11 @@ class LiveMapper:
         D, options = dimension, self.options
         slam = resolve_resolution(options, D).slam
         self._dimension, self._slam = D, slam
+        threads = resolve_threads(options.threads)
         self._odometry: FrontEnd = (
-            ScanOdometry(slam) if D == 2 else SweepOdometry(slam, resolve_threads(options.threads))
+            ScanOdometry(slam) if D == 2 else SweepOdometry(slam, threads)
         )
-        self._labels = CausalLabels(D, slam.resolution, options.em)
+        self._labels = CausalLabels(D, slam.resolution, options.em, threads)
         self._selector = BeamSelector(options.em.time_bin)
         self._movers = MoverTracker(D)
         self._history = History(D, self._scratch, self._max_scratch)
@@ -163,8 +162,9 @@ class LiveMapper:
         self._movers.add(deskewed, found.T, p_static)
         self._history.append(beams, p_static, T_odom_base, pose, found.T, anchor, found.twist)
         self._hindsight.add(len(self._history) - 1, beams)
-        self._T_odom_base, self._last_ns = T_odom_base, beams.stamp_ns
+        self._T_odom_base = T_odom_base
         update = self._to_update(beams.stamp_ns, found, p_static)
+        self._last_ns = beams.stamp_ns
         is_spaced = self._add_to_maps(deskewed, labelled, np.nan_to_num(p_static), found)
         return self._find_robot(hits, update) if is_spaced and self._finder.is_lost else update
 
@@ -391,13 +391,6 @@ class LiveMapper:
             self._moving += _MOVING_RATE * (float((e[hit] < 0.5).mean()) - self._moving)
         return e
 
-    def _take_changes(self, stamp_ns: int) -> list[MapChange]:
-        """The parts of the map that changed, once a second."""
-        if stamp_ns < self._changes_due_ns:
-            return []
-        self._changes_due_ns = stamp_ns + _CHANGES_EVERY_NS
-        return self._labels.take_changes()
-
     def _to_update(
         self, stamp_ns: int, found: Registration, p_static: NDArray[np.float32]
     ) -> Update:
@@ -410,13 +403,14 @@ class LiveMapper:
             "ambiguous": self._finder.is_ambiguous,
         }
         pose = self._frame.T_map_local @ found.T
+        seconds = 0.0 if self._last_ns is None else 1e-9 * (stamp_ns - self._last_ns)
         return Update(
             pose,
             rotate_covariance(found.covariance, self._frame.T_map_local),
             p_static,
             self._to_map_odom(pose),
             tuple(name for name, is_so in doubts.items() if is_so),
-            self._take_changes(stamp_ns),
+            self._labels.take_changes(seconds),
             self._movers.movers(self._frame.T_map_local),
             [LaterLabels(n, self.label(one, n)) for n, one in self._hindsight.take(stamp_ns)],
         )

@@ -39,7 +39,8 @@ class Update(ShortRepr):
             that the map knows), "contradicted" (the last scans contradict the map: they are not
             added to it), "carried" (so many do that the robot was carried), "lost" (the pose is
             none in the map), "ambiguous" (several places in it fit about as well).
-        changes: parts of the map that changed since the last update.
+        changes: parts of the map that changed: with each scan some, so that each is told about once
+            a second.
         movers: what moves now, as far as it has been seen to.
         hindsight: earlier scans that are labelled once more, see `LiveMapper(lag=)`.
     """

@@ -3,6 +3,7 @@
 
 #include <Eigen/Core>
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <cstddef>
 #include <limits>
@@ -34,7 +35,7 @@ class RangeImage {
     range_.assign(static_cast<size_t>(rows_) * static_cast<size_t>(columns_), kEmpty);
     for (size_t n = 0; n < ends.size(); ++n) {
       const float range = ends[n].norm();
-      float& at = range_[index(row_of(elevation[n]), column_of(ends[n]))];
+      float& at = range_[index(row_of(elevation[n]), column_of(ends[n].x(), ends[n].y()))];
       at = std::min(at, range);
       longest_ = std::max(longest_, range);
     }
@@ -46,12 +47,28 @@ class RangeImage {
 
   // Metres of free space in the direction of a point; 0 where no beam went.
   float free_range(const Point& p) const {
-    const int row = row_of(elevation_of(p));
-    return row < 0 || row >= rows_ ? 0.0f : free_[index(row, column_of(p))];
+    float out;
+    free_ranges(&p.x(), &p.y(), &p.z(), 1, &out);
+    return out;
+  }
+
+  // The same for n points, at most kBatch.
+  static constexpr size_t kBatch = 512;
+  void free_ranges(const float* x, const float* y, const float* z, size_t n, float* out) const {
+    std::array<int, kBatch> pixel;
+    for (size_t k = 0; k < n; ++k) {  // without branches: the compiler vectorizes it
+      const float elevation = arctan2(z[k], std::sqrt(x[k] * x[k] + y[k] * y[k]));
+      const int row = elevation < lowest_ ? -1 : row_of(elevation);
+      const int in_row = row * columns_ + column_of(x[k], y[k]);
+      pixel[k] = row >= rows_ ? -1 : in_row;
+    }
+    for (size_t k = 0; k < n; ++k)
+      out[k] = pixel[k] < 0 ? 0.0f : free_[static_cast<size_t>(pixel[k])];
   }
 
  private:
   static constexpr float kPi = 3.14159265f;
+  static constexpr float kTiny = 1e-30f;  // m: no division by zero
   static constexpr float kEmpty = std::numeric_limits<float>::infinity();
 
   // Abramowitz and Stegun, 4.4.49: the error is below 1e-5
@@ -61,22 +78,22 @@ class RangeImage {
            (0.9998660f + s * (-0.3302995f + s * (0.1801410f + s * (-0.0851330f + s * 0.0208351f))));
   }
   static float arctan2(float y, float x) {
-    const float ax = std::abs(x), ay = std::abs(y), most = std::max(ax, ay);
-    if (!(most > 0.0f)) return 0.0f;
-    float angle = arctan(std::min(ax, ay) / most);
-    if (ay > ax) angle = 0.5f * kPi - angle;
-    if (x < 0.0f) angle = kPi - angle;
-    return y < 0.0f ? -angle : angle;
+    const float ax = std::abs(x), ay = std::abs(y);
+    const float angle = arctan(std::min(ax, ay) / std::max(std::max(ax, ay), kTiny));
+    const float steep = 0.5f * kPi - angle, up = ay > ax ? steep : angle;
+    const float behind = kPi - up, left = x < 0.0f ? behind : up;
+    return y < 0.0f ? -left : left;
   }
   static float elevation_of(const Point& p) {
     return arctan2(p.z(), std::sqrt(p.x() * p.x() + p.y() * p.y()));
   }
+  // not below the lowest beam
   int row_of(float elevation) const {
-    return static_cast<int>(std::floor((elevation - lowest_) / pixel_.elevation));
+    return static_cast<int>((elevation - lowest_) / pixel_.elevation);
   }
-  int column_of(const Point& p) const {
-    const auto column = static_cast<int>((arctan2(p.y(), p.x()) + kPi) / pixel_.azimuth);
-    return std::clamp(column, 0, columns_ - 1);
+  int column_of(float x, float y) const {
+    const auto column = static_cast<int>((arctan2(y, x) + kPi) / pixel_.azimuth);
+    return std::min(std::max(column, 0), columns_ - 1);
   }
   size_t index(int row, int column) const {
     return static_cast<size_t>(row) * static_cast<size_t>(columns_) + static_cast<size_t>(column);

@@ -53,20 +53,36 @@ class CellFilters {
   }
   int32_t tag(int32_t k) const { return filters_[static_cast<size_t>(k)].tag; }
 
-  // A new filter, after the passes of a cell in which no beam ended so far, one for each time bin.
-  // reliability: of each, at most kMaxPasses. last_bin: of the last one; -1: none. Likelihoods are
-  // relative to that of a first hit, as only cells with hits are considered. Returns its index.
+  // A new filter, after the passes of a cell in which no beam ended so far, see `initialize`.
+  // Returns its index.
   int32_t add(const float* reliability, int passes, int32_t last_bin, int32_t tag) {
-    filters_.push_back({tag, kNoBin, last_bin, 1.0f, kNotComputed});
-    state_.insert(state_.end(), rho_.begin(), rho_.end());
-    for (size_t c = 0; c < classes(); ++c) state_.push_back(1.0f / (rho_[c] * detection_));
-    float* p = state_.data() + (filters_.size() - 1) * 2 * classes();
+    const int32_t k = make_index();
+    initialize(k, reliability, passes, last_bin, tag);
+    return k;
+  }
+
+  // A filter that is to be initialized.
+  int32_t make_index() {
+    filters_.emplace_back();
+    state_.resize(state_.size() + 2 * classes());
+    return static_cast<int32_t>(filters_.size() - 1);
+  }
+
+  // reliability: of the passes, one for each time bin, at most kMaxPasses. last_bin: of the last
+  // one; -1: none. Likelihoods are relative to that of a first hit, as only cells with hits are
+  // considered.
+  void initialize(int32_t k, const float* reliability, int passes, int32_t last_bin, int32_t tag) {
+    filters_[static_cast<size_t>(k)] = {tag, kNoBin, last_bin, 1.0f, kNotComputed};
+    float* p = states(k);
     float* likelihood = p + classes();
+    for (size_t c = 0; c < classes(); ++c) {
+      p[c] = rho_[c];
+      likelihood[c] = 1.0f / (rho_[c] * detection_);
+    }
     for (int pass = 0; pass < passes; ++pass)
       for (size_t c = 0; c < classes(); ++c)
         step(c, pass ? 1 : 0, false, reliability[pass], p[c], likelihood[c]);
     normalize(likelihood);
-    return static_cast<int32_t>(filters_.size() - 1);
   }
 
   void hit(int32_t k, int32_t bin, int32_t tag) {
@@ -102,6 +118,12 @@ class CellFilters {
     return p;
   }
 
+  // The same without keeping it: other threads may ask for it, too.
+  float p_static(int32_t k) const {
+    const float p = filters_[static_cast<size_t>(k)].p_static;
+    return p == kNotComputed ? posterior(k).p_static : p;
+  }
+
   // With the observation of the open time bin.
   Posterior posterior(int32_t k) const {
     const Filter& filter = filters_[static_cast<size_t>(k)];
@@ -122,9 +144,10 @@ class CellFilters {
   // A copy of the filter of another bank of the same kind; returns its index.
   int32_t copy(const CellFilters& from, int32_t k) {
     const float* theirs = from.state_.data() + static_cast<size_t>(k) * 2 * classes();
-    filters_.push_back(from.filters_[static_cast<size_t>(k)]);
-    state_.insert(state_.end(), theirs, theirs + 2 * classes());
-    return static_cast<int32_t>(filters_.size() - 1);
+    const int32_t here = make_index();
+    filters_[static_cast<size_t>(here)] = from.filters_[static_cast<size_t>(k)];
+    std::copy(theirs, theirs + 2 * classes(), states(here));
+    return here;
   }
 
   // Adds the evidence of a filter of another bank; the state of the one with the later tag stays.
@@ -157,9 +180,8 @@ class CellFilters {
     float p_static;  // kNotComputed where it has changed
   };
 
-  float* likelihoods(int32_t k) {
-    return state_.data() + (static_cast<size_t>(k) * 2 + 1) * classes();
-  }
+  float* states(int32_t k) { return state_.data() + static_cast<size_t>(k) * 2 * classes(); }
+  float* likelihoods(int32_t k) { return states(k) + classes(); }
 
   float persistence(size_t c, int64_t gap) const {
     return static_cast<float>(
@@ -195,7 +217,7 @@ class CellFilters {
     Filter& filter = filters_[static_cast<size_t>(k)];
     if (filter.open_bin == bin) return;
     if (filter.open_bin != kNoBin) {
-      float* p = state_.data() + static_cast<size_t>(k) * 2 * classes();
+      float* p = states(k);
       for (size_t c = 0; c < classes(); ++c) step(c, filter, p[c], p[classes() + c]);
       normalize(p + classes());
       filter.last_bin = filter.open_bin;

@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <cstddef>
 #include <cstdint>
+#include <deque>
 #include <limits>
 #include <stdexcept>
 #include <unordered_set>
@@ -44,10 +45,10 @@ class FilterMap : public BlockMap<D, CellValue> {
   // P(static) of the cell in which a beam ended, or of the best one within the hit radius;
   // `otherwise` where no beam ended before.
   float p_static_at(ConstCursor& cursor, const Vec<D>& end, float otherwise) {
-    float best = -1.0f;
-    for_each_filter_near(cursor, end,
-                         [&](int32_t k) { best = std::max(best, filters_.p_static(k)); });
-    return best < 0.0f ? otherwise : best;
+    return find_best(cursor, end, otherwise, filters_);
+  }
+  float p_static_at(ConstCursor& cursor, const Vec<D>& end, float otherwise) const {
+    return find_best(cursor, end, otherwise, filters_);
   }
 
   // Calls visit(cell, P(standing)) for the cells of a block in which beams ended.
@@ -63,11 +64,16 @@ class FilterMap : public BlockMap<D, CellValue> {
     }
   }
 
-  // The blocks that changed since the last call, in the order in which they changed first.
-  std::vector<Cell<D>> take_changed_blocks() {
-    std::vector<Cell<D>> out;
-    out.swap(changed_);
-    is_changed_.clear();
+  size_t changed_count() const { return changed_.size(); }
+
+  // The first `most` of the blocks that changed since they were taken last, in the order in which
+  // they changed.
+  std::vector<Cell<D>> take_changed_blocks(size_t most) {
+    const auto end =
+        changed_.begin() + static_cast<std::ptrdiff_t>(std::min(most, changed_.size()));
+    std::vector<Cell<D>> out(changed_.begin(), end);
+    changed_.erase(changed_.begin(), end);
+    for (const Cell<D>& origin : out) is_changed_.erase(Map::key(origin));
     last_touched_ = nullptr;
     return out;
   }
@@ -79,19 +85,29 @@ class FilterMap : public BlockMap<D, CellValue> {
     const Cell<D> own = cell_of<D>(end);
     const double radius = filters_.options().hit_radius, limit = radius * radius;
     double squared[D][3];  // distance to the centres of the cells before, here and after
-    for (int d = 0; d < D; ++d)
+    Cell<D> low = own, high = own;
+    for (int d = 0; d < D; ++d) {
       for (int k = 0; k < 3; ++k) {
         const double off = own[d] + k - 0.5 - end[d];
         squared[d][k] = off * off;
       }
-    for_each_in_cube<D>(own, 1, [&](const Cell<D>& cell) {
+      low[d] -= squared[d][0] <= limit;
+      high[d] += squared[d][2] <= limit;
+    }
+    const auto visit_within = [&](const Block& block, const Cell<D>& cell) {
       double distance = 0.0;
       for (int d = 0; d < D; ++d) distance += squared[d][cell[d] - own[d] + 1];
       if (distance > limit && cell != own) return;
-      const auto* block = cursor.block(cell);
-      if (!block) return;
-      const int32_t k = block->values[static_cast<size_t>(Map::local_of(cell))].filter;
+      const int32_t k = block.values[static_cast<size_t>(Map::local_of(cell))].filter;
       if (k >= 0) visit(k);
+    };
+    // block by block: each is looked up once
+    for_each_in_box<D>(Map::block_of(low), Map::block_of(high), [&](const Cell<D>& origin) {
+      const Cell<D> first = Map::cell_at(origin, 0), last = Map::cell_at(origin, Map::kCells - 1);
+      const auto* block = cursor.block(first);
+      if (!block) return;
+      for_each_in_box<D>(low.cwiseMax(first), high.cwiseMin(last),
+                         [&](const Cell<D>& cell) { visit_within(*block, cell); });
     });
   }
 
@@ -137,7 +153,15 @@ class FilterMap : public BlockMap<D, CellValue> {
   CellFilters filters_;
 
  private:
-  std::vector<Cell<D>> changed_;  // blocks
+  template <class Filters>
+  float find_best(ConstCursor& cursor, const Vec<D>& end, float otherwise, Filters& filters) const {
+    float best = -1.0f;
+    for_each_filter_near(cursor, end,
+                         [&](int32_t k) { best = std::max(best, filters.p_static(k)); });
+    return best < 0.0f ? otherwise : best;
+  }
+
+  std::deque<Cell<D>> changed_;  // blocks
   std::unordered_set<uint64_t, typename Map::Hash> is_changed_;
   Block* last_touched_ = nullptr;
 };

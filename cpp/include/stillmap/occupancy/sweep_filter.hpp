@@ -6,6 +6,7 @@
 #include <Eigen/Core>
 #include <algorithm>
 #include <array>
+#include <cmath>
 #include <cstddef>
 #include <cstdint>
 #include <deque>
@@ -17,6 +18,7 @@
 #include "stillmap/grid/range_image.hpp"
 #include "stillmap/grid/scans.hpp"
 #include "stillmap/occupancy/filter_map.hpp"
+#include "stillmap/util/parallel.hpp"
 
 namespace stillmap {
 
@@ -36,7 +38,8 @@ class SweepFilter : public FilterMap<3, SurfaceCell> {
   SweepFilter& operator=(const SweepFilter&) = delete;
 
   // Adds the hits of one sweep. pixel: of its range image. tag: of the sweep, for `take_over`.
-  void add(const Scans<3>& sweep, PixelSize pixel, int64_t time_bin, int32_t tag) {
+  // The result does not depend on the threads.
+  void add(const Scans<3>& sweep, PixelSize pixel, int64_t time_bin, int32_t tag, int threads) {
     const int32_t bin = checked_bin(time_bin);
     const Pose<3> T = pose_from<3>(sweep.poses);
     std::vector<RangeImage::Point> points;
@@ -48,8 +51,8 @@ class SweepFilter : public FilterMap<3, SurfaceCell> {
     });
     const auto image = std::make_shared<const RangeImage>(points, pixel);
     const View view{T, image, bin, tag};
-    miss_cells(view);
-    record_hits(ends, bin, tag);
+    miss_cells(view, threads);
+    record_hits(ends, bin, tag, threads);
     // the first sweep of each bin stands for it
     if (views_.empty() || views_.back().bin < bin) views_.push_back(view);
     if (views_.size() > CellFilters::kMaxPasses) views_.pop_front();
@@ -87,6 +90,7 @@ class SweepFilter : public FilterMap<3, SurfaceCell> {
   static constexpr float kExtent = 1.4f;       // cells that the surface around a cell has at least
   static constexpr float kMinReliability = 0.1f;  // of a miss that counts
   static constexpr float kMargin = 1.5f;          // cells before the end that are not free
+  static constexpr size_t kMinBlocks = 64, kMinFilters = 256;  // fewer do not pay for a thread
 
   // What a sweep saw from where.
   struct View {
@@ -104,67 +108,157 @@ class SweepFilter : public FilterMap<3, SurfaceCell> {
   }
 
   // P(the beams of a view met the surface of a cell if it stood there); 0: they ended before it.
-  float visibility(const View& view, const Vec<3>& centre) const {
+  float visibility(const View& view, float distance, float free_range) const {
     const auto cell = static_cast<float>(resolution_);
-    const RangeImage::Point p = view.to_sensor(centre);
-    const float distance = p.norm();
-    if (distance + kMargin * cell >= view.image->free_range(p)) return 0.0f;
+    if (distance + kMargin * cell >= free_range) return 0.0f;
     const PixelSize pixel = view.image->pixel();
     return kReliability * std::min(1.0f, kExtent * cell / (distance * pixel.azimuth)) *
            std::min(1.0f, kExtent * cell / (distance * pixel.elevation));
   }
 
-  void miss_cells(const View& view) {
+  void miss_cells(const View& view, int threads) {
+    std::vector<Block*> near;
     const double reach = static_cast<double>(view.image->longest()) + resolution_ * kEdge;
     for (const auto& block : blocks()) {
       const Vec<3> middle =
           (block->origin.template cast<double>().array() + 0.5).matrix() * (resolution_ * kEdge);
-      if ((middle - view.T_map_sensor.t).squaredNorm() > reach * reach) continue;
-      bool is_changed = false;
-      for (int i = 0; i < kCells; ++i) {
-        const int32_t k = block->values[static_cast<size_t>(i)].filter;
-        if (k < 0) continue;
-        const float reliability = visibility(view, centre_of(cell_at(block->origin, i)));
-        if (reliability < kMinReliability) continue;
-        filters_.miss(k, view.bin, reliability);
-        is_changed = true;
-      }
-      if (is_changed) note_changed(block->origin);
+      if ((middle - view.T_map_sensor.t).squaredNorm() <= reach * reach)
+        near.push_back(block.get());
     }
+    std::vector<char> is_changed(near.size());
+    const auto bounds = split_evenly(near.size(), threads, kMinBlocks);
+    parallel_for_ranges(bounds, [&](size_t, size_t first, size_t last) {
+      for (size_t b = first; b < last; ++b) is_changed[b] = miss_block(view, *near[b]);
+    });
+    for (size_t b = 0; b < near.size(); ++b)
+      if (is_changed[b]) note_changed(near[b]->origin);
   }
 
-  void record_hits(const std::vector<Vec<3>>& ends, int32_t bin, int32_t tag) {
+  // Whether the view saw any of the cells of a block.
+  bool miss_block(const View& view, const Block& block) {
+    const SurfaceCells cells = find_cells(view, block);
+    if (cells.count == 0) return false;
+    std::array<float, kCells> free_range;
+    view.image->free_ranges(cells.x.data(), cells.y.data(), cells.z.data(), cells.count,
+                            free_range.data());
+    bool is_seen = false;
+    for (size_t n = 0; n < cells.count; ++n) {
+      const float reliability = visibility(view, cells.distance(n), free_range[n]);
+      if (reliability < kMinReliability) continue;
+      is_seen = true;
+      filters_.miss(cells.filter[n], view.bin, reliability);
+    }
+    return is_seen;
+  }
+
+  // The cells of a block that have filters, with their centres in the frame of the sensor.
+  struct SurfaceCells {
+    size_t count = 0;
+    std::array<int32_t, kCells> filter;
+    std::array<float, kCells> x, y, z;
+
+    float distance(size_t n) const { return std::sqrt(x[n] * x[n] + y[n] * y[n] + z[n] * z[n]); }
+  };
+
+  SurfaceCells find_cells(const View& view, const Block& block) const {
+    SurfaceCells out;
+    const RangeImage::Point first = view.to_sensor(centre_of(cell_at(block.origin, 0)));
+    const Eigen::Matrix3f steps =
+        (view.T_map_sensor.R.transpose() * resolution_).template cast<float>();
+    for (int row = 0; row < kCells; row += kEdge) {
+      const SurfaceCell* cells = &block.values[static_cast<size_t>(row)];
+      int32_t all = -1;
+      for (int k = 0; k < kEdge; ++k) all &= cells[k].filter;
+      if (all < 0) continue;  // each is: most rows have no filter
+      for (int k = 0; k < kEdge; ++k) {
+        if (cells[k].filter < 0) continue;
+        const Cell<3> offset = cell_at(Cell<3>::Zero(), row + k);
+        const RangeImage::Point p = first + steps * offset.cast<float>();
+        out.filter[out.count] = cells[k].filter;
+        out.x[out.count] = p.x();
+        out.y[out.count] = p.y();
+        out.z[out.count++] = p.z();
+      }
+    }
+    return out;
+  }
+
+  void record_hits(const std::vector<Vec<3>>& ends, int32_t bin, int32_t tag, int threads) {
     std::vector<Vec<3>> first;  // of each cell
-    hit_.assign(filters_.size(), false);
+    std::vector<NewFilter> added;
+    is_noted_.assign(filters_.size(), false);
     for (const Vec<3>& end : ends) {
       const Cell<3> cell = cell_of<3>(end);
       SurfaceCell& at = cell_at_or_new(cell);
       if (at.filter < 0) {
-        at.filter = add_filter(cell, tag);
-        hit_.push_back(false);
+        added.push_back({filters_.make_index(), centre_of(cell)});
+        at.filter = added.back().filter;
+        is_noted_.resize(filters_.size(), false);
       }
-      if (hit_[static_cast<size_t>(at.filter)]) continue;
-      hit_[static_cast<size_t>(at.filter)] = true;
-      first.push_back(end);
+      if (note(at.filter)) first.push_back(end);
     }
-    ConstCursor cursor(*this);
-    for (const Vec<3>& end : first)
-      for_each_filter_near(cursor, end, [&](int32_t k) { filters_.hit(k, bin, tag); });
+    parallel_for_ranges(
+        split_evenly(added.size(), threads, kMinFilters), [&](size_t, size_t from, size_t to) {
+          for (; from < to; from += RangeImage::kBatch)
+            initialize(added.data() + from, std::min(to - from, RangeImage::kBatch), tag);
+        });
+    const std::vector<int32_t> hits = filters_near(first);
+    parallel_for_ranges(split_evenly(hits.size(), threads), [&](size_t, size_t from, size_t to) {
+      for (; from < to; ++from) {
+        filters_.hit(hits[from], bin, tag);
+        filters_.p_static(hits[from]);  // which the labels of the sweep ask for
+      }
+    });
   }
 
-  // A filter after the views of the last time bins, in which its cell was free.
-  int32_t add_filter(const Cell<3>& cell, int32_t tag) {
-    const Vec<3> centre = centre_of(cell);
-    std::array<float, CellFilters::kMaxPasses> passes;
-    int count = 0;
-    int32_t last_bin = -1;
+  // Whether a filter is noted for the first time.
+  bool note(int32_t k) {
+    const auto at = static_cast<size_t>(k);
+    if (is_noted_[at]) return false;
+    is_noted_[at] = true;
+    return true;
+  }
+
+  // The filters that end points hit, each once.
+  std::vector<int32_t> filters_near(const std::vector<Vec<3>>& ends) {
+    std::vector<int32_t> out;
+    is_noted_.assign(filters_.size(), false);
+    ConstCursor cursor(*this);
+    for (const Vec<3>& end : ends)
+      for_each_filter_near(cursor, end, [&](int32_t k) {
+        if (note(k)) out.push_back(k);
+      });
+    return out;
+  }
+
+  struct NewFilter {
+    int32_t filter;
+    Vec<3> centre;  // metres, of its cell
+  };
+
+  // Initializes filters, at most RangeImage::kBatch, after the views of the last time bins, in
+  // which their cells were free.
+  void initialize(const NewFilter* added, size_t count, int32_t tag) {
+    std::vector<std::array<float, CellFilters::kMaxPasses>> passes(count);
+    std::vector<int> pass_count(count, 0);
+    std::vector<int32_t> last_bin(count, -1);
+    std::array<float, RangeImage::kBatch> x, y, z, free_range;
     for (const View& view : views_) {
-      const float reliability = visibility(view, centre);
-      if (reliability < kMinReliability) continue;
-      passes[static_cast<size_t>(count++)] = reliability;
-      last_bin = view.bin;
+      for (size_t n = 0; n < count; ++n) {
+        const RangeImage::Point p = view.to_sensor(added[n].centre);
+        x[n] = p.x(), y[n] = p.y(), z[n] = p.z();
+      }
+      view.image->free_ranges(x.data(), y.data(), z.data(), count, free_range.data());
+      for (size_t n = 0; n < count; ++n) {
+        const float distance = std::sqrt(x[n] * x[n] + y[n] * y[n] + z[n] * z[n]);
+        const float reliability = visibility(view, distance, free_range[n]);
+        if (reliability < kMinReliability) continue;
+        passes[n][static_cast<size_t>(pass_count[n]++)] = reliability;
+        last_bin[n] = view.bin;
+      }
     }
-    return filters_.add(passes.data(), count, last_bin, tag);
+    for (size_t n = 0; n < count; ++n)
+      filters_.initialize(added[n].filter, passes[n].data(), pass_count[n], last_bin[n], tag);
   }
 
   void take_over_views(const SweepFilter& from, const std::vector<Pose<3>>& motion) {
@@ -177,8 +271,8 @@ class SweepFilter : public FilterMap<3, SurfaceCell> {
     }
   }
 
-  std::deque<View> views_;  // one for each of the last time bins
-  std::vector<bool> hit_;   // (filters,), in the sweep that is being added
+  std::deque<View> views_;      // one for each of the last time bins
+  std::vector<bool> is_noted_;  // (filters,), see `note`
 };
 
 }  // namespace stillmap

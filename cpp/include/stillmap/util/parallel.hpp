@@ -44,11 +44,10 @@ inline std::vector<size_t> split_by_beams(const int64_t* offset, size_t scans, i
   return bounds;
 }
 
-// Range bounds that split n items evenly.
-inline std::vector<size_t> split_evenly(size_t n, int threads) {
-  constexpr size_t kMinItems = 1 << 12;  // items, fewer do not pay for a thread
+// Range bounds that split n items evenly; least: items that pay for a thread.
+inline std::vector<size_t> split_evenly(size_t n, int threads, size_t least = 1 << 12) {
   const size_t n_ranges = std::clamp<size_t>(static_cast<size_t>(std::max(threads, 1)), 1,
-                                             std::max<size_t>(n / kMinItems, 1));
+                                             std::max<size_t>(n / least, 1));
   std::vector<size_t> bounds;
   for (size_t i = 0; i <= n_ranges; ++i) bounds.push_back(n * i / n_ranges);
   return bounds;

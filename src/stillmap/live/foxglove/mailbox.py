@@ -52,14 +52,13 @@ class Mailbox:
             self._notify()
 
     def put_changes(self, changes: list[MapChange], resolution: float) -> None:
-        """Parts of the map."""
+        """Parts of the map, for the next `take`: they do not end waiting, for every scan has some."""
         with self._condition:
             mail = self._mail
             mail.changes.append(changes)
             mail.resolution = resolution
             if len(mail.changes) > _MAX_LISTS:  # who empties it has stopped
                 mail.changes = [keep_last(mail.changes)]
-            self._notify()
 
     def put_path(self, path: NDArray[np.float64]) -> None:
         """(S, D) positions of the robot so far."""

@@ -15,6 +15,7 @@ from stillmap.pipeline.options import MapMode
 
 _GRID, _UPDATE = "nav_msgs/msg/OccupancyGrid", "map_msgs/msg/OccupancyGridUpdate"
 _DEPTH = 10  # updates kept for readers that fall behind
+_PERIOD_NS = 10**9  # between two updates
 
 
 class MapUpdate(NamedTuple):
@@ -88,21 +89,31 @@ class MapPublisher:
         self._map = ros.create_publisher(node, _GRID, topic, latched)
         self._updates = ros.create_publisher(node, _UPDATE, f"{topic}_updates", _DEPTH)
         self._mirror = MapMirror(mode)
+        self._waiting = dict[tuple[int, ...], MapChange]()
+        self._published_ns = -_PERIOD_NS
 
     def publish(self, grid: GridMap, stamp: int) -> None:
         """The whole map; who comes later gets the last one."""
         message = self._ros.message(_GRID)()
         fill_grid(message, self._frame, stamp, grid, self._mode)
         self._map.publish(message)
+        self._waiting.clear()
         if self._updates is not None:
             self._mirror.set_whole(grid)
 
     def publish_changes(self, changes: Sequence[MapChange], stamp: int) -> bool:
-        """Publish changed tiles; False: the map has become larger, and a whole one is due."""
-        planar = [change for change in changes if change.p_occupied.ndim == 2]
-        if self._updates is None or not planar:
+        """Publish the tiles that changed, once a second; False: the map has become larger, and a
+        whole one is due."""
+        if self._updates is None:
             return True
-        update = self._mirror.take(planar)
+        for change in changes:
+            if change.p_occupied.ndim == 2:
+                self._waiting[tuple(change.first_cell.tolist())] = change
+        if not self._waiting or 0 <= stamp - self._published_ns < _PERIOD_NS:
+            return True
+        update = self._mirror.take(list(self._waiting.values()))
+        self._waiting.clear()
+        self._published_ns = stamp
         is_heard = self._updates.get_subscription_count() > 0
         if update is not None and is_heard:
             message = self._ros.message(_UPDATE)()
