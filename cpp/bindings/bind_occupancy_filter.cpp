@@ -181,17 +181,6 @@ auto take_changed(Filter& filter, size_t most, double odds_factor) {
 }
 
 template <class Filter>
-auto blocks(const Filter& filter) {
-  constexpr int D = Filter::kDimension;
-  std::vector<int64_t> cells;
-  for (const auto& block : filter.blocks()) {
-    const Cell<D> first = Filter::cell_at(block->origin, 0);
-    cells.insert(cells.end(), first.data(), first.data() + D);
-  }
-  return to_numpy(std::move(cells), {filter.blocks().size(), static_cast<size_t>(D)});
-}
-
-template <class Filter>
 auto known_cells(const Filter& filter, double odds_factor) {
   constexpr int D = Filter::kDimension;
   require(odds_factor > 0.0, "odds_factor: expected a positive number");
@@ -263,7 +252,8 @@ nb::class_<Filter> bind_filter(nb::module_& m, const char* name, const char* doc
            "Lowest cells (B, D) int64 of the first `most` blocks that changed since they were "
            "taken last, and P(static and occupied) of their cells, (B, [z,] y, x) float32; NaN: "
            "unknown.")
-      .def("blocks", &blocks<Filter>, "Lowest cells (B, D) int64 of all blocks.")
+      .def_prop_ro("block_cells", &lowest_cells<Filter>, nb::rv_policy::move,
+                   "(B, D) int64: lowest cell of each block, see `OccupancyGrid2D.block_cells`.")
       .def_prop_ro("block_count", [](const Filter& filter) { return filter.blocks().size(); })
       .def("sibling", &Filter::sibling, "An empty filter of the same kind.")
       .def("take_over", &take_over<Filter>, nb::arg("other"), nb::arg("motion").noconvert(),

@@ -103,7 +103,7 @@ def test_changed_blocks_are_told_once(scans):
     parts = [core.take_changed_blocks(3) for _ in range(-(-changed // 3))]
     blocks, tiles = (np.concatenate(one) for one in zip(*parts, strict=True))
     assert len(blocks) == len(tiles) == changed > 3
-    assert {tuple(b) for b in blocks.tolist()} == {tuple(b) for b in core.blocks().tolist()}
+    assert {tuple(b) for b in blocks.tolist()} == {tuple(b) for b in core.block_cells.tolist()}
     assert len(np.unique(blocks, axis=0)) == len(blocks)
     told = {}
     for first, tile in zip(blocks, tiles, strict=True):

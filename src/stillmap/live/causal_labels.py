@@ -132,8 +132,8 @@ class CausalLabels:
         scan, offset = (beams.points, beams.hit), np.array([0, len(beams.points)])
         if isinstance(to, _core.SweepFilter3D):
             pixel = self._pixel_size(beams)
-            kept = {"time_bin": time_bin, "tag": tag, "threads": self._threads}
-            to.add(*scan, offset, T, pixel=pixel, **kept)
+            n = self._threads
+            to.add(*scan, offset, T, pixel=pixel, time_bin=time_bin, tag=tag, threads=n)
             return
         assert observation.margin is not None
         margin = observation.margin / np.float32(self.resolution)
@@ -179,7 +179,7 @@ class CausalLabels:
         lowest, tiles = self.filter.take_changed_blocks(most, odds_factor=self._odds_factor)
         changes = list(map(MapChange, lowest, tiles))
         if self.filter is not self._reported_of:  # the whole map was moved
-            left = {cell.tobytes() for cell in self.filter.blocks()}
+            left = {cell.tobytes() for cell in self.filter.block_cells}
             gone = sorted(self._reported - left)
             emptied = np.frombuffer(b"".join(gone), lowest.dtype).reshape(-1, lowest.shape[1])
             unknown = np.full(tiles.shape[1:], np.nan, np.float32)

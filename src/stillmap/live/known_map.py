@@ -2,6 +2,7 @@
 
 import os
 from collections import deque
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -116,12 +117,15 @@ class KnownLocalMap:
             self._recent.append(scan)
         return True
 
-    def relabel(self, until_ns: int, label: Labeller) -> None:
-        """Give the scans added up to then the labels that are known by now, each once."""
-        for scan in take_until(self._recent, until_ns):
+    def relabel(self, until_ns: int, label: Labeller, most: int | None = None) -> int:
+        """Give the scans added up to then, or so many of them, the labels that are known by now,
+        each once; the number of scans."""
+        due = list(islice(take_until(self._recent, until_ns), most))
+        for scan in due:
             relabel_scan(self.grid, scan, label)
+        return len(due)
 
-    def remove_before(self, travelled: float) -> None:
+    def remove_before(self, travelled: float, most: int | None = None) -> None:
         """Nothing leaves a known map."""
 
     def remove_since(self, stamp_ns: int) -> None:

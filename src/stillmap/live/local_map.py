@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Protocol
 
 import numpy as np
@@ -52,11 +53,12 @@ class MatchMap(Protocol):
     def add(self, scan: MappedScan) -> bool:
         """Add or note a scan; False if it is too close to the last one of its sensor."""
 
-    def relabel(self, until_ns: int, label: Labeller) -> None:
-        """Give the scans added up to then the labels that are known by now, each once."""
+    def relabel(self, until_ns: int, label: Labeller, most: int | None = None) -> int:
+        """Give the scans added up to then, or so many of them, the labels that are known by now,
+        each once; the number of scans."""
 
-    def remove_before(self, travelled: float) -> None:
-        """Remove the scans taken before that many metres of travel."""
+    def remove_before(self, travelled: float, most: int | None = None) -> None:
+        """Remove the scans taken before that many metres of travel, or so many of them."""
 
     def remove_since(self, stamp_ns: int) -> None:
         """Remove the scans taken since."""
@@ -96,16 +98,22 @@ class LocalMap:
         self._recent.append(scan)
         return True
 
-    def relabel(self, until_ns: int, label: Labeller) -> None:
-        """Give the scans added up to then the labels that are known by now, each once."""
-        for scan in take_until(self._recent, until_ns):
+    def relabel(self, until_ns: int, label: Labeller, most: int | None = None) -> int:
+        """Give the scans added up to then, or so many of them, the labels that are known by now,
+        each once; the number of scans."""
+        count = 0
+        for scan in islice(take_until(self._recent, until_ns), most):
             at = next((k for k, one in enumerate(self._scans) if one is scan), None)
             if at is not None:
                 self._scans[at] = relabel_scan(self.grid, scan, label)
+            count += 1
+        return count
 
-    def remove_before(self, travelled: float) -> None:
-        """Remove the scans taken before that many metres of travel."""
-        while self._scans and self._scans[0].travelled < travelled:
+    def remove_before(self, travelled: float, most: int | None = None) -> None:
+        """Remove the scans taken before that many metres of travel, or so many of them."""
+        for _ in range(len(self._scans) if most is None else most):
+            if not self._scans or self._scans[0].travelled >= travelled:
+                return
             add_scan(self.grid, self._scans.popleft(), remove=True)
 
     def remove_since(self, stamp_ns: int) -> None:

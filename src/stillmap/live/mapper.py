@@ -19,7 +19,7 @@ from stillmap.core.parallel import resolve_threads
 from stillmap.core.profiling import Progress, no_progress
 from stillmap.em import CellProbabilities
 from stillmap.io.array_checks import poses_to_matrices
-from stillmap.live.causal_labels import CausalLabels, MapChange
+from stillmap.live.causal_labels import CausalLabels
 from stillmap.live.front_end import FrontEnd, Registration
 from stillmap.live.hindsight import Hindsight, LaterLabels
 from stillmap.live.history import History
@@ -117,9 +117,7 @@ class LiveMapper:
         slam = resolve_resolution(options, D).slam
         self._dimension, self._slam = D, slam
         threads = resolve_threads(options.threads)
-        self._odometry: FrontEnd = (
-            ScanOdometry(slam) if D == 2 else SweepOdometry(slam, threads)
-        )
+        self._odometry: FrontEnd = ScanOdometry(slam) if D == 2 else SweepOdometry(slam, threads)
         self._labels = CausalLabels(D, slam.resolution, options.em, threads)
         self._selector = BeamSelector(options.em.time_bin)
         self._movers = MoverTracker(D)

@@ -52,7 +52,7 @@ class Mailbox:
             self._notify()
 
     def put_changes(self, changes: list[MapChange], resolution: float) -> None:
-        """Parts of the map, for the next `take`: they do not end waiting, for every scan has some."""
+        """Parts of the map, for the next `take`; they alone do not end its waiting."""
         with self._condition:
             mail = self._mail
             mail.changes.append(changes)
