@@ -12,7 +12,7 @@ from stillmap.core.errors import InputError
 from stillmap.em.options import EmOptions
 from stillmap.eval.trajectory import compute_absolute_errors
 from stillmap.live.causal_labels import CausalLabels, take_over
-from stillmap.live.loop_closer import Correction, NoLoops
+from stillmap.live.loop_closer import Correction
 from stillmap.live.map_correction import MapCorrection
 from stillmap.live.map_frame import rotate_covariance
 from stillmap.live.mapper import LiveMapper
@@ -212,7 +212,7 @@ def test_odometry_that_is_none_starts_nothing(corridor, fresh):
     first = next(iter_beams(corridor.recording))
     with pytest.raises(ValueError, match="odometry"):
         mapper.push(first, (0.0, np.nan, 0.0))
-    assert isinstance(mapper._frame._closer, NoLoops)
+    assert mapper._slam is None
     mapper.push(first, (0.0, 0.0, 0.0))
     assert len(mapper.poses) == 1
 
@@ -257,13 +257,13 @@ def test_loops_are_closed_in_the_background(corridor, fresh):
 def test_mapping_goes_on_when_the_process_that_closes_loops_dies(corridor, fresh, caplog):
     mapper = fresh(background=True)
     push_all(mapper, corridor.recording, 50)
-    mapper._frame._closer._process.kill()
-    mapper._frame._closer._process.wait()
+    mapper._slam.frame._closer._process.kill()
+    mapper._slam.frame._closer._process.wait()
     odometry = corridor.recording.T_odom_base
     waiting = []
     for t, beams in enumerate(itertools.islice(iter_beams(corridor.recording), 50, 150), 50):
         update = mapper.push(beams, odometry[t])
-        waiting.append(mapper._frame._closer._outgoing.qsize())
+        waiting.append(mapper._slam.frame._closer._outgoing.qsize())
     truth = corridor.truth.T_world_base
     moved = se2.inverse(truth[0]) @ truth[149]
     np.testing.assert_allclose(update.pose[:2, 2], moved[:2, 2], atol=0.1)

@@ -16,7 +16,7 @@ from stillmap.live.history import Answers, KeptScans
 from stillmap.live.known_map import KnownMap
 from stillmap.live.map_extension import write_extended
 from stillmap.pipeline.options import Options
-from stillmap.pipeline.result import MappingResult, map_recording
+from stillmap.pipeline.result import map_recording
 from stillmap.results.result import BuiltResult
 from stillmap.results.save import save
 
@@ -43,7 +43,11 @@ class Snapshot(ShortRepr):
 
     def build(self, progress: Progress = no_progress) -> BuiltResult:
         """Labels, map and objects at these poses."""
-        return self._map(self.kept.load()[0], progress)
+        return self._map(self.kept.load()[0], self.poses, progress)
+
+    def refine(self, progress: Progress = no_progress) -> BuiltResult:
+        """The result of `stillmap.build` on the scans: poses, too."""
+        return self._map(self.kept.load()[0], None, progress)
 
     def save(
         self,
@@ -54,42 +58,30 @@ class Snapshot(ShortRepr):
     ) -> None:
         """Write the result folder, as `LiveMapper.save` does; may run in a thread of its own.
 
+        In it are `live/trajectory.tum` and `live/beams/p_static.npy` with the answers; with a known
+        map that is extended, the map is that one with what was seen.
+
         Raises:
             InputError: the folder is taken or cannot be written to.
         """
         recording, answers = self.kept.load()
-        result = self._map(recording, progress)
-        save_live(result, answers, Path(path), overwrite, extended=self.extended)
+        result, extended = self._map(recording, self.poses, progress), self.extended
 
-    def _map(self, recording: Recording, progress: Progress) -> BuiltResult:
+        def write_more(folder: Path) -> None:
+            _write_answers(answers, recording.stamp_ns, folder)
+            if extended is not None:
+                mode = self.options.output.map_mode
+                write_extended(folder, extended.grid, extended.hits, result.map, mode)
+
+        save(result, Path(path), overwrite, write_more=write_more)
+
+    def _map(
+        self, recording: Recording, poses: NDArray[np.float64] | None, progress: Progress
+    ) -> BuiltResult:
         found = map_recording(
-            recording, self.options, poses=self.poses, progress=progress, scratch=self.scratch
+            recording, self.options, poses=poses, progress=progress, scratch=self.scratch
         )
         return BuiltResult(**vars(found))
-
-
-def save_live(
-    result: MappingResult,
-    answers: Answers,
-    path: Path,
-    overwrite: bool = False,
-    *,
-    extended: KnownMap | None = None,
-) -> None:
-    """Write a result, and `live/trajectory.tum` and `live/beams/p_static.npy` with the answers;
-    with a known map, the map is that one with what was seen.
-
-    Raises:
-        InputError: `path` is taken or cannot be written to.
-    """
-
-    def write_more(folder: Path) -> None:
-        _write_answers(answers, result.recording.stamp_ns, folder)
-        if extended is not None:
-            mode = result.options.output.map_mode
-            write_extended(folder, extended.grid, extended.hits, result.map, mode)
-
-    save(result, path, overwrite, write_more=write_more)
 
 
 def _write_answers(answers: Answers, stamp_ns: NDArray[np.int64], folder: Path) -> None:
