@@ -132,7 +132,7 @@ def test_cells_hit_while_a_correction_goes_on_move_with_it():
 
     see(0, 0)
     T, here = se2.matrix(2.0, 0.0, 0.0), np.eye(3)[None]
-    correction = MapCorrection(Correction(T, T[None], []), labels, here, here)
+    correction = MapCorrection(Correction(T, T[None], []), labels, here, here, np.array([0]))
     see(10**9, 1)  # after the next spaced scan
     while not correction.step(labels):
         pass

@@ -121,8 +121,9 @@ class LiveMapper:
 
     @property
     def poses(self) -> Float:
-        """(T, D+1, D+1) T_map_base of all scans, as they are known now."""
-        return np.zeros((0, 3, 3)) if self._slam is None else self._slam.poses()
+        """(T, D+1, D+1) T_map_base of all scans, as they are known now; NaN where the place in the
+        map is not known: while the robot is lost, or if it was carried away before it was found."""
+        return np.zeros((0, 3, 3)) if self._slam is None else self._slam.placement().known_poses()
 
     @property
     def path(self) -> Float:
@@ -170,7 +171,8 @@ class LiveMapper:
         """Write the folder that `stillmap.build(...).save` writes, of what is known now.
 
         The poses are those known now, labels and map follow from all scans so far. `live/` has what
-        was answered at the time.
+        was answered at the time. Scans whose place in the map is not known are left out: see
+        `Snapshot.save`.
 
         Raises:
             InputError: no scan was pushed, or the folder is taken or cannot be written to.
@@ -185,8 +187,9 @@ class LiveMapper:
         """
         slam, place = self._pushed, self._place
         kept = slam.history.snapshot()
+        placement = slam.placement().select(kept.number)
         extended = place.known if place is not None and place.extends else None
-        return Snapshot(kept, slam.poses()[kept.number], self.options, self._scratch, extended)
+        return Snapshot(kept, placement, self.options, self._scratch, extended)
 
     def finish(self, progress: Progress = no_progress) -> BuiltResult:
         """The result of `stillmap.build` on all scans: poses, labels and map refined.

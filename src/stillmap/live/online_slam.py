@@ -16,11 +16,12 @@ from stillmap.live.history import History
 from stillmap.live.local_map import MappedScan
 from stillmap.live.loop_closer import NoLoops
 from stillmap.live.loop_process import start_closer
-from stillmap.live.map_correction import SPACED_PER_TAG, LabelledScan
+from stillmap.live.map_correction import LabelledScan
 from stillmap.live.map_frame import LoopClosing, MapFrame, rotate_covariance
 from stillmap.live.movers import MoverTracker
 from stillmap.live.observation import BeamSelector, Observation, find_margins
 from stillmap.live.place import PlaceTracker
+from stillmap.live.placement import Placement
 from stillmap.live.robot_finder import RobotFinder
 from stillmap.live.scan import ScanBeams, deskew
 from stillmap.live.scan_hits import normals_of, thin
@@ -103,7 +104,7 @@ class OnlineSlam:
         found = self.odometry.register(beams, hits, prior, increment)  # M-step: (9)
         self._judge(found)
         deskewed, anchor = deskew(beams, found.twist), self.frame.last
-        labelled = LabelledScan(self._observe(deskewed, hits, anchor), found.T)
+        labelled = LabelledScan(self._observe(deskewed, hits), found.T)
         pose = self.frame.T_map_local @ found.T
         if not found.is_contradicted:
             self.labels.add(labelled.observation, pose)
@@ -124,15 +125,16 @@ class OnlineSlam:
             number: how many scans were pushed before it.
         """
         anchor, local = self.history.at(number)
-        pose = self.frame.to_map(self._finder.move(local, number), anchor)
+        pose = self.frame.to_map(self._finder.move(local, number), anchor, number)
         return self.labels.label(deskew(beams, self.history.twist_at(number)), pose)
 
-    def poses(self) -> Float:
-        """(T, D+1, D+1) T_map_base of all scans, as they are known now."""
+    def placement(self) -> Placement:
+        """Where all scans were taken, as it is known now."""
         _, local, anchor = self.history.poses()
         moved = self._finder.move_all(local)
         # in a known map that frame is the map's
-        return moved if self._is_known else self.frame.to_map_all(moved, anchor)
+        poses = moved if self._is_known else self.frame.to_map_all(moved, anchor)
+        return Placement(poses, self._finder.submaps(len(poses)))
 
     def path(self) -> Float:
         """(S, D+1, D+1) T_map_base of the spaced scans since the robot was found or lost."""
@@ -154,16 +156,17 @@ class OnlineSlam:
         if found.is_carried:
             self._movers.clear()
             self._path_begin = self.frame.last + 1
-            self._finder.lose(self.labels, self.frame, self.odometry)
+            self._finder.lose(len(self.history), self.labels, self.frame, self.odometry)
+            self.frame.begin_anew(len(self.history))
         elif not found.is_contradicted:
             self._finder.agree(len(self.history))
 
-    def _observe(self, beams: ScanBeams, hits: Any, anchor: int) -> Observation:
+    def _observe(self, beams: ScanBeams, hits: Any) -> Observation:
         """The observation by which a scan updates the labels."""
         margin = None
         if isinstance(hits, PlanarHits):
             margin = find_margins(beams, normals_of(beams, hits), self._selector.select(beams))
-        return Observation(beams, margin, max(anchor, 0) // SPACED_PER_TAG[beams.dimension])
+        return Observation(beams, margin, self.frame.tag)
 
     def _add_to_maps(
         self,

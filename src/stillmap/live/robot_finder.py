@@ -1,5 +1,7 @@
 """A robot that is lost: in a known map, or carried elsewhere while it maps."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,6 +14,27 @@ from stillmap.live.relocalization import Relocalizer
 from stillmap.slam.scan_hits import Scan
 
 Float = NDArray[np.float64]
+
+# of the scans that agreed with the map before others contradicted it, the last ones: somewhere else
+# the first scans may agree by chance
+_DOUBTED = 5
+
+
+@dataclass
+class _Stretch:
+    """Scans since the robot was lost, in one frame.
+
+    Attributes:
+        first, last: the first one, and the one after the last; None: it goes on.
+        T: (3, 3) by which they move in the frame of the odometry by scans; None: it was not found.
+    """
+
+    first: int
+    last: int | None = None
+    T: Float | None = None
+
+    def slice(self) -> slice:
+        return slice(self.first, self.last)
 
 
 class RobotFinder:
@@ -26,9 +49,9 @@ class RobotFinder:
         self._place, self._dimension = place, dimension
         self._carried: Relocalizer | None = None
         self._last_agreed = -1  # scan that agreed with the map
-        self._lost_since = 0  # scan
-        # scans that were found later: first, last + 1, motion in the frame of the odometry by scans
-        self._moves = list[tuple[int, int, Float]]()
+        self._stretches = [] if place is None else [_Stretch(0)]
+        # scans that contradicted the map until it was known why: first, last + 1
+        self._contradicted = list[tuple[int, int]]()
 
     @property
     def is_carried(self) -> bool:
@@ -47,16 +70,15 @@ class RobotFinder:
         return any(one is not None and one.is_ambiguous for one in searches)
 
     def agree(self, scan: int) -> None:
-        """A scan agrees with the map."""
-        if self._carried is None:
-            self._last_agreed = scan
+        """A scan agrees with what is seen since the robot was lost, or with the map."""
+        self._last_agreed = scan
 
-    def lose(self, labels: CausalLabels, frame: MapFrame, odometry: FrontEnd) -> None:
-        """The robot was carried: the labels begin anew, until it is found."""
+    def lose(self, scan: int, labels: CausalLabels, frame: MapFrame, odometry: FrontEnd) -> None:
+        """The robot was carried before a scan: the labels begin anew, until it is found."""
+        self._begin_stretch(scan)
         if self._carried is not None:
             self._carried.begin(labels)
             return
-        self._lost_since = self._last_agreed + 1
         frame.finish_correction(labels, odometry)
         if self._place is not None:
             self._place.lose()
@@ -65,6 +87,13 @@ class RobotFinder:
             labels.clear()
         else:
             self._carried = Relocalizer(labels, odometry.left_behind, frame.T_map_local)
+
+    def _begin_stretch(self, scan: int) -> None:
+        agreed = max(self._last_agreed + 1 - _DOUBTED, 0)
+        if self._stretches and self._stretches[-1].last is None:
+            self._stretches[-1].last = max(agreed, self._stretches[-1].first)
+        self._stretches.append(_Stretch(scan))
+        self._contradicted.append((agreed, scan))
 
     def find(
         self,
@@ -94,28 +123,40 @@ class RobotFinder:
             if T is None:
                 return None
             odometry.enter(carried.join(labels, odometry.local_map, T), T)
-            self._moves.append((self._lost_since, scans, T))
             frame.enter(carried.covariance)
             self._carried = None
+            self._stretches[-1].last, self._stretches[-1].T = scans, T
             return T, frame.T_map_local @ T @ se2.inverse(frame.T_map_local)
         place = self._place
         T = None if place is None else place.localize(labels, hits, pose)
         if T is None or place is None:
             return None
-        self._moves.append((self._lost_since, scans, T))
         odometry.enter(place.make_local_map(), T)
         place.enter(labels, T)
+        self._stretches[-1].last, self._stretches[-1].T = scans, T
         return T, T
 
     def move(self, local: Float, scan: int) -> Float:
         """(3, 3) a pose in the frame of the odometry by scans, as it is known now."""
-        for first, last, T in self._moves:
-            local = T @ local if first <= scan < last else local
+        for one in self._stretches:
+            if one.T is not None and one.first <= scan < (one.last or 0):
+                return np.asarray(one.T @ local)
         return local
 
     def move_all(self, local: Float) -> Float:
         """(T, 3, 3) the same of all scans."""
         out = local.copy()
-        for first, last, T in self._moves:
-            out[first:last] = T @ out[first:last]
+        for one in self._stretches:
+            if one.T is not None:
+                out[one.slice()] = one.T @ out[one.slice()]
+        return out
+
+    def submaps(self, scans: int) -> NDArray[np.int64]:
+        """(T,) of all scans so far, see `Placement`."""
+        out = np.zeros(scans, np.int64)
+        for number, one in enumerate(self._stretches, 1):
+            if one.T is None:
+                out[one.slice()] = number
+        for first, last in self._contradicted:
+            out[first:last] = -1
         return out
