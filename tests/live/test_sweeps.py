@@ -84,23 +84,6 @@ def test_labels_of_an_earlier_sweep_follow_from_what_is_known_now(sweeps):
     assert right > before
 
 
-def test_a_lidar_that_is_carried_begins_anew():
-    here, there = (
-        list(iter_beams(simulate_sweeps(scene, 40).recording)) for scene in ("hall", "corridor")
-    )
-    later = here[-1].stamp_ns - there[0].stamp_ns + 10**8
-    with LiveMapper({"threads": 1}) as mapper:
-        for one in here:
-            mapper.push(one)
-        moved = [replace(one, stamp_ns=one.stamp_ns + later) for one in there]
-        doubts, shown = [], []
-        for one in moved:
-            doubts.append(mapper.push(one).doubts)
-            shown.append(mapper.map.p_occupied.size)
-    assert sum("carried" in d for d in doubts) == 1
-    assert shown[-1] > 0
-
-
 def cover(beams):
     nothing = np.full_like(beams.points, np.nan)
     return replace(beams, points=nothing, hit=np.zeros_like(beams.hit))

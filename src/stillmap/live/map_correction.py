@@ -59,7 +59,8 @@ class MapCorrection:
         poses: Float,
         tagged: NDArray[np.int64],
     ) -> None:
-        self.T_map_local = correction.T_map_local
+        self.T_map_local, self.untied = correction.T_map_local, correction.untied
+        self.count = len(correction.poses)  # of the spaced scans that were known
         self.poses = np.concatenate(
             [correction.poses, correction.T_map_local @ spaced[len(correction.poses) :]]
         )

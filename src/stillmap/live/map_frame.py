@@ -47,6 +47,7 @@ class MapFrame:
         self._tagged = [0]  # spaced scans with which the cells of each tag move
         # first scans after the robot was carried, and the spaced scans that came first after them
         self._breaks = list[tuple[int, int]]()
+        self._untied: tuple[int, ...] = ()  # of these spaced scans, see `Correction`
 
     @property
     def last(self) -> int:
@@ -59,9 +60,18 @@ class MapFrame:
         return len(self._tagged) - 1
 
     def begin_anew(self, scan: int) -> None:
-        """The robot was carried before a scan: from now on, scans move with those that follow."""
+        """The robot was carried before a scan: from now on, scans move with those that follow.
+        In 3D loops show where it is."""
         self._breaks.append((scan, self._count))
         self._tagged.append(self._count)
+        if self._dimension == 3:
+            self._untied = (*self._untied, self._count)
+            self._drift = np.full((3, 3), np.inf)
+
+    @property
+    def untied(self) -> list[int]:
+        """The first scans after the robot was carried whose place in the map no loop shows yet."""
+        return [scan for scan, first in self._breaks if first in self._untied]
 
     def add_drift(self, covariance: Float) -> None:
         """Add the covariance (3, 3) of a step that the scans do not show."""
@@ -104,6 +114,8 @@ class MapFrame:
             tagged = np.array(self._tagged)
             new = MapCorrection(found, labels, spaced, self.spaced_poses(), tagged)
             self._correction = None if new.is_small else new
+            if new.is_small:
+                self._keep_untied(new)
         self._go_on(labels, odometry, to_the_end=not self._in_background)
 
     def enter(self, covariance: Float) -> None:
@@ -132,12 +144,24 @@ class MapFrame:
             odometry.correct(self._correction.local_map, motion)
             self.T_map_local = self._correction.T_map_local
             self._corrected = self._correction.poses
+            self._keep_untied(self._correction)
             self._correction = None
+
+    def _keep_untied(self, correction: MapCorrection) -> None:
+        """Those of the correction, and those that it does not know yet."""
+        later = (first for first in self._untied if first >= correction.count)
+        self._untied = (*correction.untied, *later)
 
     def spaced_poses(self) -> Float:
         """(S, D+1, D+1) T_map_base of the spaced scans."""
         since = self.T_map_local @ self._spaced[len(self._corrected) : self._count]
         return np.concatenate([self._corrected, since])
+
+    def motion_since(self, poses: Float) -> Float:
+        """(K, D+1, D+1) of the cells of each tag since the first spaced scans had these poses
+        (S, D+1, D+1)."""
+        tagged = [k for k in self._tagged if k < len(poses)]
+        return np.asarray(self.spaced_poses()[tagged] @ se2.inverse(poses[tagged]))
 
     def to_map(self, local: Float, anchor: int, scan: int) -> Float:
         """(D+1, D+1) T_map_base of a scan at a pose in the frame of the odometry by scans, which

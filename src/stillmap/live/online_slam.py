@@ -115,7 +115,9 @@ class OnlineSlam:
         self._T_odom_base = T_odom_base
         update = self._to_update(beams.stamp_ns, found, p_static)
         is_spaced = self._add_to_maps(deskewed, labelled, np.nan_to_num(p_static), found)
-        return self._find_robot(hits, update) if is_spaced and self._finder.is_lost else update
+        if is_spaced and self._finder.is_lost and isinstance(hits, PlanarHits):
+            return self._find_robot(hits, update)
+        return update
 
     def label(self, beams: ScanBeams, number: int) -> NDArray[np.float32]:
         """(N,) P(static) of the beams of an earlier scan, by what is known now.
@@ -187,6 +189,8 @@ class OnlineSlam:
                 self.frame.add(added, found)
             agrees = None if found.is_contradicted else labelled
             self.frame.correct(agrees, added, self.labels, self.odometry)
+        if self.dimension == 3 and self._finder.tie(self.frame, self.labels):
+            self._path_begin = 0
         return added is not None
 
     def _label_again(self, scan: MappedScan) -> NDArray[np.float32]:

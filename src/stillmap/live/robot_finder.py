@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
-from stillmap.live.causal_labels import CausalLabels
+from stillmap.live.causal_labels import CausalLabels, OccupancyFilter, take_over
 from stillmap.live.front_end import FrontEnd
 from stillmap.live.map_frame import MapFrame
 from stillmap.live.place import PlaceTracker
@@ -27,11 +27,13 @@ class _Stretch:
     Attributes:
         first, last: the first one, and the one after the last; None: it goes on.
         T: (3, 3) by which they move in the frame of the odometry by scans; None: it was not found.
+        is_tied: loops show where they are in the map.
     """
 
     first: int
     last: int | None = None
     T: Float | None = None
+    is_tied: bool = False
 
     def slice(self) -> slice:
         return slice(self.first, self.last)
@@ -42,12 +44,15 @@ class RobotFinder:
 
     Args:
         place: localization in a known map; None: the robot maps.
-        dimension: 2 or 3; in 3D a robot that was carried is not searched, the map begins anew.
+        dimension: 2 or 3; in 3D a robot that was carried is not searched, but lost until loops are
+            closed with the map.
     """
 
     def __init__(self, place: PlaceTracker | None, dimension: int) -> None:
         self._place, self._dimension = place, dimension
         self._carried: Relocalizer | None = None
+        # in 3D before it was carried: cells of the labels, and poses of the spaced scans
+        self._left: tuple[OccupancyFilter, Float] | None = None
         self._last_agreed = -1  # scan that agreed with the map
         self._stretches = [] if place is None else [_Stretch(0)]
         # scans that contradicted the map until it was known why: first, last + 1
@@ -61,7 +66,8 @@ class RobotFinder:
     @property
     def is_lost(self) -> bool:
         """True if the robot is not localized in the map."""
-        return self._carried is not None or (self._place is not None and self._place.is_lost)
+        is_away = self._carried is not None or self._left is not None
+        return is_away or (self._place is not None and self._place.is_lost)
 
     @property
     def is_ambiguous(self) -> bool:
@@ -84,7 +90,9 @@ class RobotFinder:
             self._place.lose()
             labels.clear()
         elif self._dimension == 3:
-            labels.clear()
+            if self._left is None:
+                self._left = labels.filter, frame.spaced_poses()
+            labels.filter = labels.filter.sibling()
         else:
             self._carried = Relocalizer(labels, odometry.left_behind, frame.T_map_local)
 
@@ -136,6 +144,25 @@ class RobotFinder:
         self._stretches[-1].last, self._stretches[-1].T = scans, T
         return T, T
 
+    def tie(self, frame: MapFrame, labels: CausalLabels) -> bool:
+        """In 3D: the robot is found once loops show where it is; True if they do now.
+
+        Args:
+            frame: of the map.
+            labels: of what was seen since it was lost; they become those of the map with it.
+        """
+        untied = frame.untied
+        for one in self._stretches:
+            one.is_tied = one.first not in untied
+        if self._left is None or not self._stretches[-1].is_tied:
+            return False
+        (left, poses), seen = self._left, labels.filter
+        self._left, labels.filter = None, left.sibling()
+        # in the background loops from before may have been closed since; what was seen has moved
+        for source, motion in ((left, frame.motion_since(poses)), (seen, np.zeros((0, 4, 4)))):
+            take_over(labels.filter, source, motion, 0, source.block_count)
+        return True
+
     def move(self, local: Float, scan: int) -> Float:
         """(3, 3) a pose in the frame of the odometry by scans, as it is known now."""
         for one in self._stretches:
@@ -155,7 +182,7 @@ class RobotFinder:
         """(T,) of all scans so far, see `Placement`."""
         out = np.zeros(scans, np.int64)
         for number, one in enumerate(self._stretches, 1):
-            if one.T is None:
+            if one.T is None and not one.is_tied:
                 out[one.slice()] = number
         for first, last in self._contradicted:
             out[first:last] = -1
