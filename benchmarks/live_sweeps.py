@@ -103,7 +103,7 @@ def _push(recording, threads: int):
             ms.append(1e3 * (time.perf_counter() - began))
             poses.append(update.pose)
             at_once[recording.beams_of(t)] = update.p_static
-            moved = mapper._frame.T_map_local
+            moved = mapper._slam.frame.T_map_local
             loops += offset is not None and not np.array_equal(moved, offset)
             offset = moved
             kept.append(beams)

@@ -233,6 +233,22 @@ def test_cells_that_meet_add_their_evidence():
     assert moved.size < core.size
 
 
+def test_maps_that_meet_have_the_last_views_of_both():
+    earlier, later = make(_core, 3), make(_core, 3)
+    for time_bin in range(40):
+        sweep(earlier, 3.0, time_bin)
+        sweep(later, 4.0, 40 + time_bin)
+    both = earlier.sibling()
+    for one in (earlier, later):
+        both.take_over(one, np.eye(4)[None], 0, one.block_count)
+    assert both.size == earlier.size + later.size
+    for filter_ in (both, later):
+        assert np.mean(sweep(filter_, 2.0, 80) < 0.2) > 0.95
+    near = [{cell: p for cell, p in known(one).items() if cell[0] < 22} for one in (both, later)]
+    assert len(near[0]) > 100
+    assert near[0] == near[1]
+
+
 @pytest.mark.parametrize(
     ("changes", "named"),
     [

@@ -34,7 +34,7 @@ def answers():
 
 def errors(poses, true):
     """m off, in the frame of the scans before."""
-    T = align(true[:BEFORE], poses[:BEFORE])
+    T = align(true[: BEFORE - 5], poses[: BEFORE - 5])
     return np.hypot(*(T @ true - poses)[:, :2, 2].T)
 
 
@@ -55,7 +55,11 @@ def test_it_is_found_in_its_own_map(answers):
 
 
 def test_the_poses_of_the_scans_until_then_are_known_in_hindsight(answers):
-    _, poses, true = answers
+    updates, poses, true = answers
     off = errors(poses, true)
-    assert np.median(off[BEFORE + 1 :]) < 0.1
-    assert off[BEFORE + 1 :].max() < 1.0
+    assert off[: BEFORE - 5].max() < 0.1  # the last ones may have fit by chance
+    off = off[BEFORE:]
+    carried = next(k for k, one in enumerate(updates[BEFORE:]) if "carried" in one.doubts)
+    assert np.isnan(off[:carried]).all()  # they fit neither here nor there
+    assert any("lost" in one.doubts for one in updates[BEFORE + carried + 1 :])
+    assert off[carried:].max() < 0.1

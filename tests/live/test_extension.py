@@ -1,6 +1,7 @@
 """A map that is extended: what was moved between two runs is shown where it stands now."""
 
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from stillmap.results.reader import Grid
 from stillmap.sim import scene_by_name, simulate
 
 SCANS, RADIUS = 160, 0.45
+SEEN_WELL = 112  # scan, of the table where it stands now
 BEFORE, NOW = (15.5, 4.8), (11.5, 1.2)  # m, of a round table beside the way of the robot
 
 
@@ -60,25 +62,40 @@ def run(tmp_path_factory):
             mapper.save(folder / mode)
             maps[mode] = mapper.map, stillmap.load(folder / mode).map
     maps["known"] = stillmap.load(folder / "known").map
-    return maps, se2.inverse(simulations[0].truth.T_world_base[0])
+    return maps, se2.inverse(simulations[0].truth.T_world_base[0]), folder, recording
 
 
 def test_the_known_map_shows_the_table_where_it_was(run):
-    maps, T = run
+    maps, T, *_ = run
     assert share_occupied(maps["known"], T, BEFORE) > 0.3
     assert share_occupied(maps["known"], T, NOW) == 0.0
 
 
 def test_what_was_taken_away_is_forgotten(run):
-    maps, T = run
+    maps, T, *_ = run
     live, saved = maps["extend"]
     assert share_occupied(live, T, BEFORE) < 0.05
     assert share_occupied(saved, T, BEFORE) < 0.05
 
 
 def test_the_extended_map_shows_it_where_it_is(run):
-    maps, T = run
+    maps, T, *_ = run
     assert share_occupied(maps["extend"][1], T, NOW) > 0.3
+
+
+def test_the_map_shows_it_while_mapping_once_it_has_stood_for_minutes(run):
+    """The robot drives up to it and waits."""
+    _, T, folder, recording = run
+    with LiveMapper({"threads": 1}, place=folder / "known", mode="extend") as mapper:
+        for t, beams in enumerate(islice(iter_beams(recording), SEEN_WELL)):
+            mapper.push(beams, recording.T_odom_base[t])
+        at_once = mapper.map
+        for k in range(360):
+            stamp_ns = beams.stamp_ns + 500_000_000 * (k + 1)
+            mapper.push(replace(beams, stamp_ns=stamp_ns), recording.T_odom_base[t])
+        later = mapper.map
+    assert share_occupied(at_once, T, NOW) < 0.1
+    assert share_occupied(later, T, NOW) > 0.3
 
 
 def test_the_extended_map_shows_what_was_not_seen_again(run):

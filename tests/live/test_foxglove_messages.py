@@ -281,7 +281,7 @@ def test_what_the_mapper_answers_is_what_is_shown(corridor):
             tiles.add(update.changes, 0.05)
             if k > 40:
                 break
-        tiles.add(mapper._labels.take_changes(1.0), 0.05)
+        tiles.add(mapper._slam.labels.take_changes(beams.stamp_ns + 10**9), 0.05)
         grid = mapper.map
     cells = tiles.to_cells()
     np.testing.assert_allclose(cells.origin, grid.origin[:2])

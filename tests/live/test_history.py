@@ -118,7 +118,7 @@ def test_an_earlier_scan_is_labelled_as_it_was(corridor):
             mapper.push(replace(beams, sensor="other"), odometry)
             last = replace(beams, stamp_ns=beams.stamp_ns + 10**6, beam_time=times)
             update = mapper.push(last, odometry)
-        twist = mapper._history.twist_at(2 * t + 1)
+        twist = mapper._slam.history.twist_at(2 * t + 1)
         again = mapper.label(last, 2 * t + 1)
     np.testing.assert_allclose(twist, 0.0, atol=1e-6)
     assert np.mean((again < 0.5) == (update.p_static < 0.5), where=last.hit) > 0.95

@@ -86,7 +86,7 @@ def test_scans_from_before_it_was_found_are_labelled_in_the_map(hall):
             break
     assert k > first
     labels, hit = mapper.label(beams[first], 0), beams[first].hit
-    in_map = mapper._labels.label(beams[first], mapper.poses[0])
+    in_map = mapper._slam.labels.label(beams[first], mapper.poses[0])
     np.testing.assert_array_equal(labels, in_map)
     static = simulation.truth.static[simulation.recording.beams_of(first)]
     assert np.mean((labels >= 0.5) == static, where=hit) > 0.9

@@ -84,23 +84,6 @@ def test_labels_of_an_earlier_sweep_follow_from_what_is_known_now(sweeps):
     assert right > before
 
 
-def test_a_lidar_that_is_carried_begins_anew():
-    here, there = (
-        list(iter_beams(simulate_sweeps(scene, 40).recording)) for scene in ("hall", "corridor")
-    )
-    later = here[-1].stamp_ns - there[0].stamp_ns + 10**8
-    with LiveMapper({"threads": 1}) as mapper:
-        for one in here:
-            mapper.push(one)
-        moved = [replace(one, stamp_ns=one.stamp_ns + later) for one in there]
-        doubts, shown = [], []
-        for one in moved:
-            doubts.append(mapper.push(one).doubts)
-            shown.append(mapper.map.p_occupied.size)
-    assert sum("carried" in d for d in doubts) == 1
-    assert shown[-1] > 0
-
-
 def cover(beams):
     nothing = np.full_like(beams.points, np.nan)
     return replace(beams, points=nothing, hit=np.zeros_like(beams.hit))
@@ -110,12 +93,12 @@ def test_a_lidar_that_is_covered_says_nothing_of_the_map(sweeps):
     with LiveMapper({"threads": 1}) as mapper:
         for t, one in enumerate(sweeps.beams[:30]):
             if t == 20:
-                usual = mapper._odometry._usual
+                usual = mapper._slam.odometry._usual
             is_covered = 20 <= t < 25
             doubts = mapper.push(cover(one) if is_covered else one).doubts
             assert ("blind" in doubts) == is_covered
             if is_covered:
-                assert mapper._odometry._usual == usual
+                assert mapper._slam.odometry._usual == usual
         assert not doubts
 
 
@@ -127,7 +110,7 @@ def test_a_lidar_that_is_covered_at_first(sweeps):
         assert len(mapper.poses) == 2
         assert not mapper.map.p_occupied.size
         found = [mapper.push(one).pose for one in sweeps.beams[2:30]]
-        assert mapper._labels._pixels[0] == find_pixel_size(
+        assert mapper._slam.labels._pixels[0] == find_pixel_size(
             sweeps.beams[2].points, sweeps.beams[2].hit
         )
         np.testing.assert_allclose(mapper.poses[2:], found, atol=1e-9)
@@ -168,7 +151,7 @@ def test_loops_are_closed(background):
             update = mapper.push(beams)
         poses, cells = mapper.poses, mapper.cells
         if not background:  # elsewhere they are closed in another process
-            found = mapper._frame._closer._found
+            found = mapper._slam.frame._closer._found
             assert sum(not closure.rejected for closure in found) > 2
     np.testing.assert_allclose(poses[-1], update.pose, atol=1e-9)
     off = np.linalg.norm((from_first(poses) - true)[:, :3, 3], axis=1)

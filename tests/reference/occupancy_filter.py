@@ -126,9 +126,10 @@ class OccupancyFilter:
     def _normalize(self, log_likelihood):
         return np.maximum(log_likelihood - log_likelihood.max(), -self.max_log_ratio)
 
-    def _open(self, one: Filter, time_bin: int) -> None:
-        if one.open_bin == time_bin:
-            return
+    def _open(self, one: Filter, time_bin: int) -> bool:
+        """False if the open bin is a later one."""
+        if one.open_bin is not None and one.open_bin >= time_bin:
+            return one.open_bin == time_bin
         if one.open_bin is not None:
             gap = 0 if one.last_bin is None else one.open_bin - one.last_bin
             one.p_occupied, log_likelihood = self._step(
@@ -138,6 +139,7 @@ class OccupancyFilter:
             one.last_bin = one.open_bin
         one.open_bin = time_bin if one.last_bin is None else max(time_bin, one.last_bin)
         one.hit, one.p_missed = False, 1.0
+        return True
 
     def _pass(self, beam, margin: float, time_bin: int, tag: int) -> None:
         start, end = beam.start / self.resolution, beam.end / self.resolution
@@ -157,10 +159,9 @@ class OccupancyFilter:
             at.tag = tag
             if key in self.filters:
                 one = self.filters[key]
-                self._open(one, time_bin)
-                if not one.hit:
+                if self._open(one, time_bin) and not one.hit:
                     one.p_missed *= 1.0 - reliability
-            elif reliability >= CLEARLY_PASSED and at.last_bin != time_bin:
+            elif reliability >= CLEARLY_PASSED and at.last_bin < time_bin:
                 at.bins += 1
                 at.last_bin = time_bin
 
@@ -175,8 +176,8 @@ class OccupancyFilter:
     def _hit(self, end: Float, time_bin: int, tag: int) -> None:
         for near in self._near(end):
             one = self.filters[near]
-            self._open(one, time_bin)
-            one.hit, one.tag = True, tag
+            if self._open(one, time_bin):
+                one.hit, one.tag = True, tag
 
     def _new_filter(self, passes: list[float], last_bin: int, tag: int) -> Filter:
         """After passes with these reliabilities, one for each bin; last_bin: -1: none."""

@@ -84,8 +84,7 @@ class SweepFilter3D(OccupancyFilter):
             reliability = self._visibility(view, cell)
             if reliability < MIN_RELIABILITY:
                 continue
-            self._open(one, time_bin)
-            if not one.hit:
+            if self._open(one, time_bin) and not one.hit:
                 one.p_missed *= 1.0 - reliability
         first = {}
         for beam in beams:

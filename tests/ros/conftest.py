@@ -146,3 +146,21 @@ def start_robot(start, environment, domain, recording, tmp_path):
         return robot, lambda: [json.loads(line) for line in log.read_text().splitlines()]
 
     return run
+
+
+@pytest.fixture
+def participant(domain):
+    """The judge's in DDS."""
+    from dds import Participant
+
+    made = Participant(domain)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def judge(participant):
+    """What it hears."""
+    from judge import Judge
+
+    return Judge(participant)

@@ -30,8 +30,8 @@ _MAP_PRIOR = 0.5
 # likewise for the local map until more is known: people who walk along with the robot are always
 # ahead of it, where nobody has looked before
 _RECENT_PRIOR = 0.05
-# s after which a part of the map that changed is told, about; parts that are told at once
-_CHANGES_WITHIN, _MIN_CHANGES = 1.0, 8
+# ns within which a part of the map that changed is told, about; parts that are told at once
+_TOLD_WITHIN_NS, _MIN_CHANGES = 10**9, 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +84,7 @@ class CausalLabels:
         self._pixels = dict[str | int, tuple[float, float]]()  # of the sensors, in 3D
         # lowest cells of the blocks in `take_changes` so far, as bytes, and the filter they are of
         self._reported, self._reported_of = set[bytes](), self.filter
+        self._told_ns = -_TOLD_WITHIN_NS
 
     def clear(self) -> None:
         """Forget all scans."""
@@ -167,15 +168,16 @@ class CausalLabels:
         cells, p_occupied = self.filter.known_cells(odds_factor=self._odds_factor)
         return CellProbabilities(cells, p_occupied, 0.0)
 
-    def take_changes(self, seconds: float) -> list[MapChange]:
-        """Parts of the map that changed, so many that each is among them once a second, about; and
-        those that emptied.
+    def take_changes(self, stamp_ns: int) -> list[MapChange]:
+        """Parts of the map that changed, so many since the call before that each is told about once
+        a second; and those that emptied.
 
         Args:
-            seconds: since the call before.
+            stamp_ns: of the last scan.
         """
-        share = min(seconds / _CHANGES_WITHIN, 1.0)
+        share = min((stamp_ns - self._told_ns) / _TOLD_WITHIN_NS, 1.0)
         most = max(math.ceil(share * self.filter.changed_count), _MIN_CHANGES)
+        self._told_ns = stamp_ns
         lowest, tiles = self.filter.take_changed_blocks(most, odds_factor=self._odds_factor)
         changes = list(map(MapChange, lowest, tiles))
         if self.filter is not self._reported_of:  # the whole map was moved

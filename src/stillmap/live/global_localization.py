@@ -18,7 +18,9 @@ from stillmap.slam.scan_hits import Scan
 Float = NDArray[np.float64]
 
 _MIN_SURFACE = 40  # squares of surface that a view needs
-_MIN_AGREE = 0.35  # share of the surfaces of the view that the map shows; others may be people
+# share of the surfaces of the view that the map shows, others may be people or new; and where the
+# robot may be anywhere, as well as in the map
+MIN_AGREE, MIN_AGREE_ANYWHERE = 0.35, 0.7
 # of a surface of the view where the map is free: somebody may stand there; one of the map where the
 # view is free weighs much
 _FREE_WEIGHT = 0.5
@@ -56,9 +58,11 @@ class GlobalLocalizer:
 
     Args:
         known: the map.
+        min_agree: share of the surfaces of a view that the map shows, at least.
     """
 
-    def __init__(self, known: KnownMap) -> None:
+    def __init__(self, known: KnownMap, min_agree: float = MIN_AGREE) -> None:
+        self._min_agree = min_agree
         self._surface = known.make_surface_map()
         self._grid = known.make_grid()
         self._last: Float | None = None
@@ -84,7 +88,7 @@ class GlobalLocalizer:
     def _choose(self, found: list[_Alignment], squares: int) -> Localization:
         """The best alignment, if the evidence is clear."""
         last, self._last = self._last, None
-        if not found or found[0].agree < _MIN_AGREE * squares or found[0].evidence <= 0.0:
+        if not found or found[0].agree < self._min_agree * squares or found[0].evidence <= 0.0:
             return Localization(None)
         best = found[0]
         rivals = [one.evidence for one in found[1:] if _is_apart(best.T, one.T)]

@@ -31,11 +31,14 @@ class Correction(ShortRepr):
         T_map_local: (3, 3) of the frame of the odometry by scans in the new map.
         poses: (S, 3, 3) T_map_base of the spaced scans in the new map.
         near: scans of the new local map, in the frame of the odometry by scans.
+        untied: spaced scans that were the first ones after the robot was carried, whose place in
+            the map no loop shows.
     """
 
     T_map_local: Float
     poses: Float
     near: list[MappedScan]
+    untied: tuple[int, ...] = ()
 
 
 class LoopCloser:

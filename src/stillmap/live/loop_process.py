@@ -118,7 +118,10 @@ class LoopProcess:
         assert stream is not None
         while (message := read_message(stream)) is not None:
             near = _unpack_scans(message, self._sensors)
-            self._incoming.append(Correction(message["T_map_local"], message["poses"], near))
+            untied = tuple(message["untied"].tolist())
+            self._incoming.append(
+                Correction(message["T_map_local"], message["poses"], near, untied)
+            )
 
 
 def _pack_scans(scans: list[MappedScan], sensors: list[str | int]) -> dict[str, NDArray[Any]]:
@@ -192,7 +195,8 @@ def _serve(settings: dict[str, Any], source: IO[bytes], target: IO[bytes]) -> No
         closer.add(scan, float(message["explained"]), message["drift"])
         if arrived.empty() and (found := closer.poll()) is not None:
             poses = {"T_map_local": found.T_map_local, "poses": found.poses}
-            write_message(target, {**_pack_scans(found.near, _NUMBERS), **poses})
+            untied = {"untied": np.array(found.untied, np.int64)}
+            write_message(target, {**_pack_scans(found.near, _NUMBERS), **poses, **untied})
 
 
 def main() -> None:

@@ -48,20 +48,27 @@ class MapCorrection:
         labels: of the map so far.
         spaced: (S, D+1, D+1) poses of the spaced scans in the frame of the odometry by scans.
         poses: (S, D+1, D+1) the same in the map so far.
+        tagged: (K,) spaced scans with which the cells of each tag move.
     """
 
     def __init__(
-        self, correction: Correction, labels: CausalLabels, spaced: Float, poses: Float
+        self,
+        correction: Correction,
+        labels: CausalLabels,
+        spaced: Float,
+        poses: Float,
+        tagged: NDArray[np.int64],
     ) -> None:
-        self.T_map_local = correction.T_map_local
+        self.T_map_local, self.untied = correction.T_map_local, correction.untied
+        self.count = len(correction.poses)  # of the spaced scans that were known
         self.poses = np.concatenate(
             [correction.poses, correction.T_map_local @ spaced[len(correction.poses) :]]
         )
         self._D = poses.shape[-1] - 1
         # in 3D the local map moves with its frame: it holds what is near, not what loops tie to it
         self.local_map = LocalMap(labels.resolution) if self._D == 2 else None
-        every = SPACED_PER_TAG[self._D]
-        self._motion = self.poses[::every] @ se2.inverse(poses[::every])
+        tagged = np.minimum(tagged, len(poses) - 1)
+        self._motion = self.poses[tagged] @ se2.inverse(poses[tagged])
         self._source: OccupancyFilter = labels.filter
         D = self._D
         shift = np.linalg.norm((self.poses - poses)[:, :D, D], axis=1)

@@ -9,7 +9,7 @@ from stillmap.live.front_end import FrontEnd, Registration
 from stillmap.live.local_map import MappedScan, thin_scan
 from stillmap.live.loop_closer import LoopCloser, NoLoops
 from stillmap.live.loop_process import LoopProcess
-from stillmap.live.map_correction import LabelledScan, MapCorrection
+from stillmap.live.map_correction import SPACED_PER_TAG, LabelledScan, MapCorrection
 from stillmap.live.sweep_loop_closer import LiveSweepLoopCloser
 from stillmap.slam import local_map
 
@@ -44,11 +44,34 @@ class MapFrame:
         self._drift = np.zeros((3, 3))  # covariance since the last spaced scan
         self._correction: MapCorrection | None = None
         self._outdated = 0  # spaced scans of which corrections are not for where the robot is
+        self._tagged = [0]  # spaced scans with which the cells of each tag move
+        # first scans after the robot was carried, and the spaced scans that came first after them
+        self._breaks = list[tuple[int, int]]()
+        self._untied: tuple[int, ...] = ()  # of these spaced scans, see `Correction`
 
     @property
     def last(self) -> int:
         """Number of the last spaced scan; -1: there is none."""
         return self._count - 1
+
+    @property
+    def tag(self) -> int:
+        """Number by which the cells that a scan observes now move when the map is corrected."""
+        return len(self._tagged) - 1
+
+    def begin_anew(self, scan: int) -> None:
+        """The robot was carried before a scan: from now on, scans move with those that follow.
+        In 3D loops show where it is."""
+        self._breaks.append((scan, self._count))
+        self._tagged.append(self._count)
+        if self._dimension == 3:
+            self._untied = (*self._untied, self._count)
+            self._drift = np.full((3, 3), np.inf)
+
+    @property
+    def untied(self) -> list[int]:
+        """The first scans after the robot was carried whose place in the map no loop shows yet."""
+        return [scan for scan, first in self._breaks if first in self._untied]
 
     def add_drift(self, covariance: Float) -> None:
         """Add the covariance (3, 3) of a step that the scans do not show."""
@@ -59,6 +82,8 @@ class MapFrame:
         if self._count == len(self._spaced):
             self._spaced = np.concatenate([self._spaced, np.zeros_like(self._spaced)])
         self._spaced[self._count] = scan.T_map_base
+        if self._count - self._tagged[-1] >= SPACED_PER_TAG[self._dimension]:
+            self._tagged.append(self._count)
         self._count += 1
         kept = thin_scan(scan, _MAX_KEPT_BEAMS[self._dimension])
         self._closer.add(kept, found.explained, self._drift)
@@ -86,8 +111,11 @@ class MapFrame:
                 self._correction.note_added(added)
         elif (found := self._closer.poll()) is not None and len(found.poses) > self._outdated:
             spaced = self._spaced[: self._count].copy()
-            new = MapCorrection(found, labels, spaced, self.spaced_poses())
+            tagged = np.array(self._tagged)
+            new = MapCorrection(found, labels, spaced, self.spaced_poses(), tagged)
             self._correction = None if new.is_small else new
+            if new.is_small:
+                self._keep_untied(new)
         self._go_on(labels, odometry, to_the_end=not self._in_background)
 
     def enter(self, covariance: Float) -> None:
@@ -116,16 +144,29 @@ class MapFrame:
             odometry.correct(self._correction.local_map, motion)
             self.T_map_local = self._correction.T_map_local
             self._corrected = self._correction.poses
+            self._keep_untied(self._correction)
             self._correction = None
+
+    def _keep_untied(self, correction: MapCorrection) -> None:
+        """Those of the correction, and those that it does not know yet."""
+        later = (first for first in self._untied if first >= correction.count)
+        self._untied = (*correction.untied, *later)
 
     def spaced_poses(self) -> Float:
         """(S, D+1, D+1) T_map_base of the spaced scans."""
         since = self.T_map_local @ self._spaced[len(self._corrected) : self._count]
         return np.concatenate([self._corrected, since])
 
-    def to_map(self, local: Float, anchor: int) -> Float:
+    def motion_since(self, poses: Float) -> Float:
+        """(K, D+1, D+1) of the cells of each tag since the first spaced scans had these poses
+        (S, D+1, D+1)."""
+        tagged = [k for k in self._tagged if k < len(poses)]
+        return np.asarray(self.spaced_poses()[tagged] @ se2.inverse(poses[tagged]))
+
+    def to_map(self, local: Float, anchor: int, scan: int) -> Float:
         """(D+1, D+1) T_map_base of a scan at a pose in the frame of the odometry by scans, which
-        moves with spaced scan `anchor`; -1: none."""
+        moves with spaced scan `anchor`, or the first one since the robot was carried; -1: none."""
+        anchor = max([anchor, *(first for begin, first in self._breaks if begin <= scan)])
         if not 0 <= anchor < len(self._corrected):
             return np.asarray(self.T_map_local @ local)
         moved = self._corrected[anchor] @ se2.inverse(self._spaced[anchor])
@@ -138,10 +179,17 @@ class MapFrame:
         # the scan after which each spaced one is the last: itself, but for the first
         scans = np.searchsorted(anchor, np.arange(self._count) - 1, side="right") - 1
         every, kept = np.unique(np.maximum(scans, 0), return_index=True)
-        corrected, last = self.spaced_poses()[kept], len(local) - 1
-        if every[-1] != last:
-            every = np.append(every, last)
-            corrected = np.concatenate([corrected, (self.T_map_local @ local[-1])[None]])
+        poses = self.spaced_poses()
+        known = dict(zip(every.tolist(), poses[kept], strict=True))
+        known.setdefault(len(local) - 1, self.T_map_local @ local[-1])
+        motion = poses @ se2.inverse(self._spaced[: self._count])
+        for scan, first in self._breaks:  # nothing is blended across
+            if first > 0:
+                known.setdefault(scan - 1, motion[first - 1] @ local[scan - 1])
+            if first < self._count:
+                known.setdefault(scan, motion[first] @ local[scan])
+        every = np.array(sorted(known))
+        corrected = np.array([known[scan] for scan in every.tolist()])
         return local_map.propagate_corrections(local, every, corrected)
 
     def stop(self) -> None:

@@ -13,6 +13,11 @@ Float = NDArray[np.float64]
 _STANDS = 0.5  # P(static and occupied) of a cell that counts as surface
 
 
+def empty_map(resolution: float) -> GridMap:
+    """A map without cells; resolution: m."""
+    return GridMap(np.zeros((0, 0), np.float32), (0.0, 0.0, 0.0), resolution)
+
+
 def project_obstacles(
     known: CellProbabilities, positions: Float, band: tuple[float, float], cell: float
 ) -> GridMap:
@@ -28,7 +33,7 @@ def project_obstacles(
     """
     stands = known.p_occupied >= _STANDS
     if not stands.any():
-        return GridMap(np.zeros((0, 0), np.float32), (0.0, 0.0, 0.0), cell)
+        return empty_map(cell)
     cells = known.cells[stands]
     floor = np.asarray((cells[_is_level(cells)] + 0.5) * cell, np.float64)
     ground = fit_ground(floor, positions)

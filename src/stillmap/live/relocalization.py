@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.live.causal_labels import CausalLabels, take_over
-from stillmap.live.global_localization import GlobalLocalizer
+from stillmap.live.global_localization import MIN_AGREE_ANYWHERE, GlobalLocalizer
 from stillmap.live.known_map import KnownMap
 from stillmap.live.local_map import LocalMap, MatchMap
 from stillmap.slam.scan_hits import Scan
@@ -31,7 +31,10 @@ class Relocalizer:
         self._filter, self._local_map = labels.filter, local_map
         self._T_map_local = T_map_local
         try:
-            self._localizer: GlobalLocalizer | None = GlobalLocalizer(KnownMap(labels.to_map()))
+            known = KnownMap(labels.to_map())
+            # it may be where it has never been; the map is that of a moment ago
+            localizer = GlobalLocalizer(known, MIN_AGREE_ANYWHERE)
+            self._localizer: GlobalLocalizer | None = localizer
         except InputError:  # an empty map
             self._localizer = None
         self.is_ambiguous = False

@@ -1,10 +1,12 @@
 """A robot that is lost: in a known map, or carried elsewhere while it maps."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
-from stillmap.live.causal_labels import CausalLabels
+from stillmap.live.causal_labels import CausalLabels, OccupancyFilter, take_over
 from stillmap.live.front_end import FrontEnd
 from stillmap.live.map_frame import MapFrame
 from stillmap.live.place import PlaceTracker
@@ -13,22 +15,48 @@ from stillmap.slam.scan_hits import Scan
 
 Float = NDArray[np.float64]
 
+# of the scans that agreed with the map before others contradicted it, the last ones: somewhere else
+# the first scans may agree by chance
+_DOUBTED = 5
+
+
+@dataclass
+class _Stretch:
+    """Scans since the robot was lost, in one frame.
+
+    Attributes:
+        first, last: the first one, and the one after the last; None: it goes on.
+        T: (3, 3) by which they move in the frame of the odometry by scans; None: it was not found.
+        is_tied: loops show where they are in the map.
+    """
+
+    first: int
+    last: int | None = None
+    T: Float | None = None
+    is_tied: bool = False
+
+    def slice(self) -> slice:
+        return slice(self.first, self.last)
+
 
 class RobotFinder:
     """Searches the robot while it is lost.
 
     Args:
         place: localization in a known map; None: the robot maps.
-        dimension: 2 or 3; in 3D a robot that was carried is not searched, the map begins anew.
+        dimension: 2 or 3; in 3D a robot that was carried is not searched, but lost until loops are
+            closed with the map.
     """
 
     def __init__(self, place: PlaceTracker | None, dimension: int) -> None:
         self._place, self._dimension = place, dimension
         self._carried: Relocalizer | None = None
+        # in 3D before it was carried: cells of the labels, and poses of the spaced scans
+        self._left: tuple[OccupancyFilter, Float] | None = None
         self._last_agreed = -1  # scan that agreed with the map
-        self._lost_since = 0  # scan
-        # scans that were found later: first, last + 1, motion in the frame of the odometry by scans
-        self._moves = list[tuple[int, int, Float]]()
+        self._stretches = [] if place is None else [_Stretch(0)]
+        # scans that contradicted the map until it was known why: first, last + 1
+        self._contradicted = list[tuple[int, int]]()
 
     @property
     def is_carried(self) -> bool:
@@ -38,7 +66,8 @@ class RobotFinder:
     @property
     def is_lost(self) -> bool:
         """True if the robot is not localized in the map."""
-        return self._carried is not None or (self._place is not None and self._place.is_lost)
+        is_away = self._carried is not None or self._left is not None
+        return is_away or (self._place is not None and self._place.is_lost)
 
     @property
     def is_ambiguous(self) -> bool:
@@ -47,24 +76,32 @@ class RobotFinder:
         return any(one is not None and one.is_ambiguous for one in searches)
 
     def agree(self, scan: int) -> None:
-        """A scan agrees with the map."""
-        if self._carried is None:
-            self._last_agreed = scan
+        """A scan agrees with what is seen since the robot was lost, or with the map."""
+        self._last_agreed = scan
 
-    def lose(self, labels: CausalLabels, frame: MapFrame, odometry: FrontEnd) -> None:
-        """The robot was carried: the labels begin anew, until it is found."""
+    def lose(self, scan: int, labels: CausalLabels, frame: MapFrame, odometry: FrontEnd) -> None:
+        """The robot was carried before a scan: the labels begin anew, until it is found."""
+        self._begin_stretch(scan)
         if self._carried is not None:
             self._carried.begin(labels)
             return
-        self._lost_since = self._last_agreed + 1
         frame.finish_correction(labels, odometry)
         if self._place is not None:
             self._place.lose()
             labels.clear()
         elif self._dimension == 3:
-            labels.clear()
+            if self._left is None:
+                self._left = labels.filter, frame.spaced_poses()
+            labels.filter = labels.filter.sibling()
         else:
             self._carried = Relocalizer(labels, odometry.left_behind, frame.T_map_local)
+
+    def _begin_stretch(self, scan: int) -> None:
+        agreed = max(self._last_agreed + 1 - _DOUBTED, 0)
+        if self._stretches and self._stretches[-1].last is None:
+            self._stretches[-1].last = max(agreed, self._stretches[-1].first)
+        self._stretches.append(_Stretch(scan))
+        self._contradicted.append((agreed, scan))
 
     def find(
         self,
@@ -94,28 +131,59 @@ class RobotFinder:
             if T is None:
                 return None
             odometry.enter(carried.join(labels, odometry.local_map, T), T)
-            self._moves.append((self._lost_since, scans, T))
             frame.enter(carried.covariance)
             self._carried = None
+            self._stretches[-1].last, self._stretches[-1].T = scans, T
             return T, frame.T_map_local @ T @ se2.inverse(frame.T_map_local)
         place = self._place
         T = None if place is None else place.localize(labels, hits, pose)
         if T is None or place is None:
             return None
-        self._moves.append((self._lost_since, scans, T))
         odometry.enter(place.make_local_map(), T)
         place.enter(labels, T)
+        self._stretches[-1].last, self._stretches[-1].T = scans, T
         return T, T
+
+    def tie(self, frame: MapFrame, labels: CausalLabels) -> bool:
+        """In 3D: the robot is found once loops show where it is; True if they do now.
+
+        Args:
+            frame: of the map.
+            labels: of what was seen since it was lost; they become those of the map with it.
+        """
+        untied = frame.untied
+        for one in self._stretches:
+            one.is_tied = one.first not in untied
+        if self._left is None or not self._stretches[-1].is_tied:
+            return False
+        (left, poses), seen = self._left, labels.filter
+        self._left, labels.filter = None, left.sibling()
+        # in the background loops from before may have been closed since; what was seen has moved
+        for source, motion in ((left, frame.motion_since(poses)), (seen, np.zeros((0, 4, 4)))):
+            take_over(labels.filter, source, motion, 0, source.block_count)
+        return True
 
     def move(self, local: Float, scan: int) -> Float:
         """(3, 3) a pose in the frame of the odometry by scans, as it is known now."""
-        for first, last, T in self._moves:
-            local = T @ local if first <= scan < last else local
+        for one in self._stretches:
+            if one.T is not None and one.first <= scan < (one.last or 0):
+                return np.asarray(one.T @ local)
         return local
 
     def move_all(self, local: Float) -> Float:
         """(T, 3, 3) the same of all scans."""
         out = local.copy()
-        for first, last, T in self._moves:
-            out[first:last] = T @ out[first:last]
+        for one in self._stretches:
+            if one.T is not None:
+                out[one.slice()] = one.T @ out[one.slice()]
+        return out
+
+    def submaps(self, scans: int) -> NDArray[np.int64]:
+        """(T,) of all scans so far, see `Placement`."""
+        out = np.zeros(scans, np.int64)
+        for number, one in enumerate(self._stretches, 1):
+            if one.T is None and not one.is_tied:
+                out[one.slice()] = number
+        for first, last in self._contradicted:
+            out[first:last] = -1
         return out

@@ -1,12 +1,14 @@
 """The result folder of a live run: that of `stillmap map`, and what was answered at the time."""
 
+import logging
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.advice import advise
 from stillmap.core.arrays import write_npy
 from stillmap.core.profiling import Progress, no_progress
 from stillmap.core.recording import Recording
@@ -15,12 +17,16 @@ from stillmap.io.trajectory import write_tum
 from stillmap.live.history import Answers, KeptScans
 from stillmap.live.known_map import KnownMap
 from stillmap.live.map_extension import write_extended
+from stillmap.live.placement import Placement, take_scans
 from stillmap.pipeline.options import Options
-from stillmap.pipeline.result import MappingResult, map_recording
+from stillmap.pipeline.result import map_recording
 from stillmap.results.result import BuiltResult
 from stillmap.results.save import save
 
 FOLDER = "live"
+SUBMAPS = "live/submaps"  # of where the robot was lost, each in a folder with its number
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,21 +35,25 @@ class Snapshot(ShortRepr):
 
     Attributes:
         kept: the scans, and what was answered at the time.
-        poses: (T, D+1, D+1) T_map_base.
+        placement: where they were taken.
         options: see Options.
         scratch: folder of temporary files; None: the system's.
         extended: the known map that is extended; None: there is none.
     """
 
     kept: KeptScans
-    poses: NDArray[np.float64]
+    placement: Placement
     options: Options
     scratch: Path | None
     extended: KnownMap | None = None
 
     def build(self, progress: Progress = no_progress) -> BuiltResult:
-        """Labels, map and objects at these poses."""
-        return self._map(self.kept.load()[0], progress)
+        """Labels, map and objects of the scans that are in the map, at these poses."""
+        return self._build(*self.kept.load(), self.placement.main, progress)[0]
+
+    def refine(self, progress: Progress = no_progress) -> BuiltResult:
+        """The result of `stillmap.build` on all scans: poses, too."""
+        return self._map(self.kept.load()[0], None, progress)
 
     def save(
         self,
@@ -54,42 +64,75 @@ class Snapshot(ShortRepr):
     ) -> None:
         """Write the result folder, as `LiveMapper.save` does; may run in a thread of its own.
 
+        In it are `live/trajectory.tum` and `live/beams/p_static.npy` with the answers; with a known
+        map that is extended, the map is that one with what was seen. Scans whose place in the map
+        is not known are left out, which a warning says; where they make a submap of their own, its
+        result is in `live/submaps/N`. If there are none but such, the result is the largest submap.
+
         Raises:
             InputError: the folder is taken or cannot be written to.
         """
         recording, answers = self.kept.load()
-        result = self._map(recording, progress)
-        save_live(result, answers, Path(path), overwrite, extended=self.extended)
+        main, others = self.placement.main, self.placement.others()
+        warnings = self._describe_lost(recording.stamp_ns, len(others))
+        for text in warnings:
+            _log.warning(text)
+        source = {**recording.source, "warnings": [*recording.source["warnings"], *warnings]}
+        if warnings:
+            source["lost_scans"] = int(np.count_nonzero(self.placement.submap))
+        recording = replace(recording, source=source)
+        result, given = self._build(recording, answers, main, progress)
 
-    def _map(self, recording: Recording, progress: Progress) -> BuiltResult:
+        def write_more(folder: Path) -> None:
+            _write_answers(given, result.recording.stamp_ns, folder)
+            if self.extended is not None and main == 0:
+                mode = self.options.output.map_mode
+                write_extended(folder, self.extended.grid, self.extended.hits, result.map, mode)
+            for number, submap in enumerate(others, 1):
+                self._save_submap(recording, answers, submap, folder / SUBMAPS / str(number))
+
+        save(result, Path(path), overwrite, write_more=write_more)
+
+    def _save_submap(self, recording: Recording, answers: Answers, submap: int, path: Path) -> None:
+        path.parent.mkdir(exist_ok=True)
+        recording = replace(recording, source={**recording.source, "warnings": []})
+        result, given = self._build(recording, answers, submap, no_progress)
+        stamp_ns = result.recording.stamp_ns
+        save(result, path, write_more=lambda folder: _write_answers(given, stamp_ns, folder))
+
+    def _build(
+        self, recording: Recording, answers: Answers, submap: int, progress: Progress
+    ) -> tuple[BuiltResult, Answers]:
+        """The result of the scans of a submap, and the answers to them."""
+        scans = np.flatnonzero(self.placement.submap == submap)
+        taken, given = take_scans(recording, answers, scans, self.scratch)
+        return self._map(taken, self.placement.poses[scans], progress), given
+
+    def _map(
+        self, recording: Recording, poses: NDArray[np.float64] | None, progress: Progress
+    ) -> BuiltResult:
         found = map_recording(
-            recording, self.options, poses=self.poses, progress=progress, scratch=self.scratch
+            recording, self.options, poses=poses, progress=progress, scratch=self.scratch
         )
         return BuiltResult(**vars(found))
 
-
-def save_live(
-    result: MappingResult,
-    answers: Answers,
-    path: Path,
-    overwrite: bool = False,
-    *,
-    extended: KnownMap | None = None,
-) -> None:
-    """Write a result, and `live/trajectory.tum` and `live/beams/p_static.npy` with the answers;
-    with a known map, the map is that one with what was seen.
-
-    Raises:
-        InputError: `path` is taken or cannot be written to.
-    """
-
-    def write_more(folder: Path) -> None:
-        _write_answers(answers, result.recording.stamp_ns, folder)
-        if extended is not None:
-            mode = result.options.output.map_mode
-            write_extended(folder, extended.grid, extended.hits, result.map, mode)
-
-    save(result, path, overwrite, write_more=write_more)
+    def _describe_lost(self, stamp_ns: NDArray[np.int64], submaps: int) -> list[str]:
+        """What a warning says about the scans whose place in the map is not known."""
+        lost = np.flatnonzero(self.placement.submap)
+        if not len(lost):
+            return []
+        if self.placement.main:
+            return [
+                "the robot was never found in the map: poses and map are in a frame of their own"
+            ]
+        first = 1e-9 * float(stamp_ns[lost[0]] - stamp_ns[0])
+        text = (
+            f"{len(lost)} scan{'s' * (len(lost) > 1)}, first at {first:.1f} s, are left out: the "
+            "robot was carried, and where they were taken in the map is not known"
+        )
+        if not submaps:
+            return [text]
+        return [advise(text, f"see their own map{'s' * (submaps > 1)} in {SUBMAPS}")]
 
 
 def _write_answers(answers: Answers, stamp_ns: NDArray[np.int64], folder: Path) -> None:

@@ -1,5 +1,8 @@
 """Loop closure in 3D while the robot drives: keyframe by keyframe, as `slam.loop_closure_3d`."""
 
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +11,7 @@ from numpy.typing import NDArray
 from stillmap.core import se2
 from stillmap.live.local_map import MappedScan
 from stillmap.live.loop_closer import Correction
+from stillmap.live.place_recognition import find_alike, view_from_above
 from stillmap.live.spaced_scans import SpacedScans, SpacedView
 from stillmap.slam import loop_closure
 from stillmap.slam.lidar_odometry import LidarOdometry
@@ -21,6 +25,13 @@ from stillmap.slam.options import SlamOptions
 from stillmap.slam.types import LoopClosure
 
 Float = NDArray[np.float64]
+
+_CARRIED_TRAVEL = 2000.0  # m of travel, as uncertain as the place to which a robot is carried
+_ANYWHERE = np.diag(np.square([100.0] * 3 + [3.0] * 3))  # of that place, m and rad
+_MIN_LOOPS = 2  # that show it: one may be wrong
+# sweeps that are compared with one after the robot was carried; m and rad from where they were
+_MAX_ALIKE, _ALIKE_STD = 4, (2.0, 0.2)
+_STATIC = 0.5  # P(static) of the beams that say how a place looks
 
 
 class LiveSweepLoopCloser:
@@ -38,9 +49,11 @@ class LiveSweepLoopCloser:
         self._found: list[LoopClosure] = []
         self._search = LoopSearch(0)
         self._searched = 0
+        self._from_above = list[NDArray[np.float32]]()  # views of the first keyframes
 
     def add(self, scan: MappedScan, explained: float, drift: Float) -> None:
-        """Add a keyframe at its pose in the frame of the odometry by scans; drift is not used."""
+        """Add a keyframe at its pose in the frame of the odometry by scans; drift: infinite if the
+        robot was carried before it, else not used."""
         self._scans.append(scan, explained, drift)
 
     def poll(self) -> Correction | None:
@@ -51,17 +64,57 @@ class LiveSweepLoopCloser:
         closer, last = self._closer(view), len(view.poses)
         search, self._searched = self._search, last
         search.corrected = np.concatenate([search.corrected, np.zeros((last - first, 4, 4))])
-        attempted = [closer.search_keyframe(k, search) for k in range(first, last)]
+        attempted = [self._search_keyframe(closer, view, k) for k in range(first, last)]
         new = [closure for closure in attempted if closure is not None]
         self._found += new
         if all(closure.rejected for closure in new):
             return None
+        carried = _find_carried(view)
+        chain = [
+            replace(one, covariance=_ANYWHERE) if one.second in carried else one
+            for one in closer.odometry_constraints()
+        ]
         corrected, self._found = loop_closure.solve_graph(
-            closer.keyframes, closer.odometry_constraints(), view.poses, self._found, MAX_CHI2
+            closer.keyframes, chain, view.poses, self._found, MAX_CHI2
         )
         search.corrected = corrected.copy()
         search.correction = corrected[-1] @ se2.inverse(view.poses[-1])
-        return Correction(search.correction, corrected, [])
+        untied = _find_untied(carried, self._found)
+        return Correction(search.correction, corrected, [], untied)
+
+    def _search_keyframe(
+        self, closer: SweepLoopCloser, view: SpacedView, k: int
+    ) -> LoopClosure | None:
+        """The closure of keyframe k with an earlier one: with one that looks alike, as long as it
+        is not known where the robot was carried."""
+        first = max((one for one in _find_carried(view) if one <= k), default=0)
+        known = (one for one in self._found if one.earlier < first <= one.later)
+        if not first or any(not one.rejected for one in known):
+            return closer.search_keyframe(k, self._search)
+        search = self._search
+        search.corrected[k] = search.correction @ view.poses[k]
+        for one in find_alike(self._view(view, k), self._views(view, first), _MAX_ALIKE):
+            T = np.eye(4)
+            T[:2, :2] = se2.matrix(0.0, 0.0, one.yaw)[:2, :2]
+            closure = closer.verify(one.number, k, T, *_ALIKE_STD)
+            if not closure.rejected:
+                search.corrected[k] = search.corrected[one.number] @ closure.T
+                search.correction = search.corrected[k] @ se2.inverse(view.poses[k])
+                search.since = float(closer.travelled[k])
+                return closure
+        return None
+
+    def _views(self, view: SpacedView, count: int) -> NDArray[np.float32]:
+        """(K, R, S) views from above of the first keyframes."""
+        for k in range(len(self._from_above), count):
+            self._from_above.append(self._view(view, k))
+        return np.array(self._from_above[:count])
+
+    def _view(self, view: SpacedView, k: int) -> NDArray[np.float32]:
+        scan = self._scans.scan(view, k)
+        use = scan.beams.hit & (scan.e >= _STATIC)
+        points, T = scan.beams.points[use], scan.beams.T_base_sensor
+        return view_from_above(points @ T[:3, :3].T + T[:3, 3])
 
     def stop(self) -> None:
         """Remove temporary files."""
@@ -75,8 +128,28 @@ class LiveSweepLoopCloser:
             view.recording,
             view.e,
             odometry,
-            view.travelled,
+            # loops lead back to all from before, in a wide window; and no submap has both places
+            view.travelled
+            + _CARRIED_TRAVEL * np.cumsum(np.isin(np.arange(n), _find_carried(view))),
             np.arange(n),
             SEARCH_DISTANCE if search is None else search,
             self._threads,
         )
+
+
+def _find_carried(view: SpacedView) -> list[int]:
+    """The first keyframes after the robot was carried."""
+    return [int(k) for k in np.flatnonzero(np.isinf(view.drift[:, 0, 0]))]
+
+
+def _find_untied(carried: Sequence[int], closures: Sequence[LoopClosure]) -> tuple[int, ...]:
+    """Those of them whose stretch no loops tie to the first one, nor to others that are."""
+    accepted = [one for one in closures if not one.rejected]
+    ends = np.array([(one.earlier, one.later) for one in accepted], np.int64).reshape(-1, 2)
+    stretches = np.searchsorted(carried, ends, side="right")  # 0: before the first time
+    counts = Counter((int(a), int(b)) for a, b in stretches if a != b)
+    loops = [pair for pair, count in counts.items() if count >= _MIN_LOOPS]
+    tied = {0}
+    for _ in carried:
+        tied |= {one for pair in loops if not tied.isdisjoint(pair) for one in pair}
+    return tuple(k for number, k in enumerate(carried, 1) if number not in tied)

@@ -85,8 +85,10 @@ class CellFilters {
     normalize(likelihood);
   }
 
+  // Observations of bins before the open one are ignored: after a correction of the map, scans are
+  // added again, also to cells that were copied with their evidence.
   void hit(int32_t k, int32_t bin, int32_t tag) {
-    open(k, bin);
+    if (!open(k, bin)) return;
     Filter& filter = filters_[static_cast<size_t>(k)];
     filter.tag = tag;
     if (filter.p_missed == kHitMark) return;
@@ -95,7 +97,7 @@ class CellFilters {
   }
 
   void miss(int32_t k, int32_t bin, float reliability) {
-    open(k, bin);
+    if (!open(k, bin)) return;
     Filter& filter = filters_[static_cast<size_t>(k)];
     if (filter.p_missed == kHitMark) return;
     filter.p_missed *= 1.0f - reliability;
@@ -212,20 +214,22 @@ class CellFilters {
     p = std::max(missed / total, kMinProbability);
   }
 
-  // Applies the observation of the open bin, if there is one, and opens another.
-  void open(int32_t k, int32_t bin) {
+  // Applies the observation of the open bin, if there is one, and opens another; false if that is
+  // an earlier one.
+  bool open(int32_t k, int32_t bin) {
     Filter& filter = filters_[static_cast<size_t>(k)];
-    if (filter.open_bin == bin) return;
+    if (filter.open_bin >= bin) return filter.open_bin == bin;
     if (filter.open_bin != kNoBin) {
       float* p = states(k);
       for (size_t c = 0; c < classes(); ++c) step(c, filter, p[c], p[classes() + c]);
       normalize(p + classes());
       filter.last_bin = filter.open_bin;
     }
-    // scans may come late: a bin before the last one has no gap
+    // beams may have passed later, before the first hit: then there is no gap
     filter.open_bin = std::max(bin, filter.last_bin);
     filter.p_missed = 1.0f;
     filter.p_static = kNotComputed;
+    return true;
   }
 
   // Relative to the best class, which others fall behind by a bounded ratio: so what stood for

@@ -130,7 +130,7 @@ class OccupancyFilter : public FilterMap<D, PassedCell> {
       if (reliability < kMinReliability) return;
       if (cell->filter >= 0) {
         filters_.miss(cell->filter, bin, reliability);
-      } else if (reliability >= kClearlyPassed && cell->last_bin != bin) {
+      } else if (reliability >= kClearlyPassed && cell->last_bin < bin) {
         ++cell->passed_bins;
         cell->last_bin = bin;
       }

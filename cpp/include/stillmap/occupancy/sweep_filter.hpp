@@ -269,6 +269,7 @@ class SweepFilter : public FilterMap<3, SurfaceCell> {
       }
       views_.push_back(view);
     }
+    while (views_.size() > CellFilters::kMaxPasses) views_.pop_front();
   }
 
   std::deque<View> views_;      // one for each of the last time bins

@@ -1,0 +1,253 @@
+"""Online SLAM: the state of one mapping, and the steps by which it takes a scan."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core import se2
+from stillmap.core.parallel import resolve_threads
+from stillmap.live.causal_labels import CausalLabels
+from stillmap.live.front_end import FrontEnd, Registration
+from stillmap.live.hindsight import Hindsight, LaterLabels
+from stillmap.live.history import History
+from stillmap.live.local_map import MappedScan
+from stillmap.live.loop_closer import NoLoops
+from stillmap.live.loop_process import start_closer
+from stillmap.live.map_correction import LabelledScan
+from stillmap.live.map_frame import LoopClosing, MapFrame, rotate_covariance
+from stillmap.live.movers import MoverTracker
+from stillmap.live.observation import BeamSelector, Observation, find_margins
+from stillmap.live.place import PlaceTracker
+from stillmap.live.placement import Placement
+from stillmap.live.robot_finder import RobotFinder
+from stillmap.live.scan import ScanBeams, deskew
+from stillmap.live.scan_hits import normals_of, thin
+from stillmap.live.scan_odometry import ScanOdometry
+from stillmap.live.sweep_odometry import SweepOdometry
+from stillmap.live.update import Update
+from stillmap.pipeline.options import Options, resolve_resolution
+from stillmap.slam.scan_hits import Scan as PlanarHits
+
+Float = NDArray[np.float64]
+
+# weight of a scan in the running share of hits on what moves; share from which people may walk
+# along with the robot, and what was only just seen counts little
+_MOVING_RATE, _CROWDED = 0.3, 0.15
+
+
+class OnlineSlam:
+    """Poses, labels and map from the scans so far: EM with one M-step and two E-steps a scan.
+
+    Args:
+        dimension: 2 or 3.
+        options: see Options.
+        place: localization in a known map; None: the map begins empty.
+        in_background: close loops in a process of their own; else between two scans.
+        scratch: folder of temporary files; None: the system's.
+        max_scratch: bytes that all beams may take there, about; None: any number.
+        lag: s after which each scan is labelled once more; None: it is not.
+
+    Attributes:
+        dimension: 2 or 3.
+        resolution: m, edge of a cell.
+        odometry: by scans, which registers them against the local map.
+        labels: of the cells, in the frame of the map.
+        frame: the odometry by scans in the map, and the loops that correct it.
+        history: all scans, and what was answered.
+    """
+
+    def __init__(
+        self,
+        dimension: int,
+        options: Options,
+        place: PlaceTracker | None = None,
+        *,
+        in_background: bool = False,
+        scratch: Path | None = None,
+        max_scratch: int | None = None,
+        lag: float | None = None,
+    ) -> None:
+        D, slam = dimension, resolve_resolution(options, dimension).slam
+        threads = resolve_threads(options.threads)
+        self.dimension, self.resolution = D, slam.resolution
+        self.odometry: FrontEnd = ScanOdometry(slam) if D == 2 else SweepOdometry(slam, threads)
+        self.labels = CausalLabels(D, slam.resolution, options.em, threads)
+        self.history = History(D, scratch, max_scratch)
+        self._selector = BeamSelector(options.em.time_bin)
+        self._movers = MoverTracker(D)
+        self._finder = RobotFinder(place, D)
+        self._hindsight = Hindsight(lag)
+        closer: LoopClosing = NoLoops()
+        if place is None and slam.loop_closure:
+            closer = start_closer(slam, D, in_background, scratch, threads)
+        self.frame = MapFrame(D, closer, in_background)
+        self._is_known = place is not None
+        self._T_odom_base: Float | None = None  # of the last scan
+        self._path_begin = 0  # the first spaced scan in the frame of the map
+        self._moving = 0.0  # share of the hits, as the labels say a second later
+
+    def push(self, beams: ScanBeams, T_odom_base: Float | None) -> Update:
+        """Register a scan, label its beams, and add it to the map.
+
+        Args:
+            beams: of the next scan in time.
+            T_odom_base: (D+1, D+1) odometry at its stamp; None: there is none.
+        """
+        increment = self._increment(T_odom_base)
+        prior = self.odometry.predict(beams, increment)
+        hits = self._weigh(self.odometry.select(beams, prior), prior)  # E-step as predicted
+        found = self.odometry.register(beams, hits, prior, increment)  # M-step: (9)
+        self._judge(found)
+        deskewed, anchor = deskew(beams, found.twist), self.frame.last
+        labelled = LabelledScan(self._observe(deskewed, hits), found.T)
+        pose = self.frame.T_map_local @ found.T
+        if not found.is_contradicted:
+            self.labels.add(labelled.observation, pose)
+        p_static = self.labels.label(deskewed, pose)  # E-step: (8)
+        self._movers.add(deskewed, found.T, p_static)
+        self.history.append(beams, p_static, T_odom_base, pose, found.T, anchor, found.twist)
+        self._hindsight.add(len(self.history) - 1, beams)
+        self._T_odom_base = T_odom_base
+        update = self._to_update(beams.stamp_ns, found, p_static)
+        is_spaced = self._add_to_maps(deskewed, labelled, np.nan_to_num(p_static), found)
+        if is_spaced and self._finder.is_lost and isinstance(hits, PlanarHits):
+            return self._find_robot(hits, update)
+        return update
+
+    def label(self, beams: ScanBeams, number: int) -> NDArray[np.float32]:
+        """(N,) P(static) of the beams of an earlier scan, by what is known now.
+
+        Args:
+            beams: as they were pushed.
+            number: how many scans were pushed before it.
+        """
+        anchor, local = self.history.at(number)
+        pose = self.frame.to_map(self._finder.move(local, number), anchor, number)
+        return self.labels.label(deskew(beams, self.history.twist_at(number)), pose)
+
+    def placement(self) -> Placement:
+        """Where all scans were taken, as it is known now."""
+        _, local, anchor = self.history.poses()
+        moved = self._finder.move_all(local)
+        # in a known map that frame is the map's
+        poses = moved if self._is_known else self.frame.to_map_all(moved, anchor)
+        return Placement(poses, self._finder.submaps(len(poses)))
+
+    def path(self) -> Float:
+        """(S, D+1, D+1) T_map_base of the spaced scans since the robot was found or lost."""
+        return self.frame.spaced_poses()[self._path_begin :]
+
+    def close(self) -> None:
+        """Forget all scans, and end the process that closes loops, if there is one."""
+        self.frame.stop()
+        self.history.close()
+
+    def _weigh(self, hits: Any, prior: Any) -> Any:
+        """The hits with weights P(static): the E-step at the predicted pose."""
+        points, T_local_base = self.odometry.end_points(hits, prior)
+        weights = self.labels.label_ends(points, self.frame.T_map_local @ T_local_base)
+        return dataclasses.replace(hits, weights=weights)
+
+    def _judge(self, found: Registration) -> None:
+        """Whether the robot was carried, or is still where the map says."""
+        if found.is_carried:
+            self._movers.clear()
+            self._path_begin = self.frame.last + 1
+            self._finder.lose(len(self.history), self.labels, self.frame, self.odometry)
+            self.frame.begin_anew(len(self.history))
+        elif not found.is_contradicted:
+            self._finder.agree(len(self.history))
+
+    def _observe(self, beams: ScanBeams, hits: Any) -> Observation:
+        """The observation by which a scan updates the labels."""
+        margin = None
+        if isinstance(hits, PlanarHits):
+            margin = find_margins(beams, normals_of(beams, hits), self._selector.select(beams))
+        return Observation(beams, margin, self.frame.tag)
+
+    def _add_to_maps(
+        self,
+        beams: ScanBeams,
+        labelled: LabelledScan,
+        e: NDArray[np.float32],
+        found: Registration,
+    ) -> bool:
+        """Add a scan to the local map and, if it is spaced, to the pose graph, and go on correcting
+        the map; True if the scan is spaced."""
+        self.frame.add_drift(found.drift)
+        # without odometry nothing else says how the robot moves
+        is_doubted = found.has_odometry and self._moving > _CROWDED
+        recent = self.labels.doubt(e) if is_doubted else e
+        added = self.odometry.add(beams, e, recent, self._label_again)
+        if not self._finder.is_carried:
+            if added is not None:
+                self.frame.add(added, found)
+            agrees = None if found.is_contradicted else labelled
+            self.frame.correct(agrees, added, self.labels, self.odometry)
+        if self.dimension == 3 and self._finder.tie(self.frame, self.labels):
+            self._path_begin = 0
+        return added is not None
+
+    def _label_again(self, scan: MappedScan) -> NDArray[np.float32]:
+        """(N,) P(static) of a scan of the local map by what is known now; 0: unusable."""
+        T, hit = self.frame.T_map_local @ scan.T_map_base, scan.beams.hit
+        e = np.nan_to_num(self.labels.label(scan.beams, T))
+        if hit.any():
+            self._moving += _MOVING_RATE * (float((e[hit] < 0.5).mean()) - self._moving)
+        return e
+
+    def _find_robot(self, hits: PlanarHits, update: Update) -> Update:
+        """Search the robot, which is lost; the update with its pose in the map, if it is found."""
+        frame, scans = self.frame, len(self.history)
+        found = self._finder.find(self.labels, thin(hits), update.pose, scans, frame, self.odometry)
+        if found is None:
+            return update
+        T, motion = found
+        self._path_begin = frame.last + 1 if self._is_known else 0
+        self._movers.move(T)
+        pose = motion @ update.pose
+        return dataclasses.replace(
+            update,
+            pose=pose,
+            covariance=rotate_covariance(update.covariance, motion),
+            T_map_odom=self._to_map_odom(pose),
+            doubts=tuple(name for name in update.doubts if name not in ("lost", "ambiguous")),
+            movers=self._movers.movers(frame.T_map_local),
+        )
+
+    def _to_update(
+        self, stamp_ns: int, found: Registration, p_static: NDArray[np.float32]
+    ) -> Update:
+        doubts = {
+            "slip": found.is_slipping,
+            "blind": found.is_blind,
+            "carried": found.is_carried,
+            "contradicted": found.is_contradicted,
+            "lost": self._finder.is_lost,
+            "ambiguous": self._finder.is_ambiguous,
+        }
+        pose = self.frame.T_map_local @ found.T
+        return Update(
+            pose,
+            rotate_covariance(found.covariance, self.frame.T_map_local),
+            p_static,
+            self._to_map_odom(pose),
+            tuple(name for name, is_so in doubts.items() if is_so),
+            self.labels.take_changes(stamp_ns),
+            self._movers.movers(self.frame.T_map_local),
+            [LaterLabels(n, self.label(one, n)) for n, one in self._hindsight.take(stamp_ns)],
+        )
+
+    def _increment(self, T_odom_base: Float | None) -> Float | None:
+        """(D+1, D+1) of odometry since the last scan; None: not known."""
+        if T_odom_base is None or self._T_odom_base is None:
+            return None
+        out: Float = se2.inverse(self._T_odom_base) @ T_odom_base
+        return out
+
+    def _to_map_odom(self, pose: Float) -> Float | None:
+        """(D+1, D+1) T_map_odom at the pose of the last scan; None: without odometry."""
+        return None if self._T_odom_base is None else pose @ se2.inverse(self._T_odom_base)

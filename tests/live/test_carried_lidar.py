@@ -1,0 +1,111 @@
+"""A lidar that is carried while it maps: lost until it recognizes a place, and apart until then."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import simulate_sweeps
+
+import stillmap
+from stillmap.core import se2
+from stillmap.live.mapper import LiveMapper
+from stillmap.live.replay import iter_beams
+from stillmap.live.sweep_loop_closer import _find_untied
+from stillmap.sim import scene_by_name, simulate
+from stillmap.slam.types import LoopClosure
+
+BEFORE, FROM, TO = 110, 40, 85  # sweeps until it is put back; then those from there on
+
+
+def follow(*parts):
+    """Sweeps one after another, ten a second."""
+    every = [beams for part in parts for beams in part]
+    return [replace(beams, stamp_ns=10**8 * k) for k, beams in enumerate(every)]
+
+
+@pytest.fixture(scope="module")
+def back():
+    """A lidar that is put back to where it was: updates, map sizes, poses, true poses, mapper."""
+    lidar = {"channels": 16, "columns": 360}
+    changes = {"lidar": lidar, "robot": {"scans": BEFORE, "speed": 2.0}}
+    simulation = simulate(scene_by_name("hall", changes), 2)
+    beams, true = list(iter_beams(simulation.recording)), simulation.truth.T_world_base
+    updates, sizes = [], []
+    with LiveMapper({"threads": 1}) as mapper:
+        for one in follow(beams, beams[FROM:TO]):
+            updates.append(mapper.push(one))
+            sizes.append(len(mapper.cells.cells))
+        yield updates, sizes, mapper.poses, np.concatenate([true, true[FROM:TO]]), mapper
+
+
+def errors(poses, true):
+    """m off, in the frame of the first sweep."""
+    return np.linalg.norm((se2.inverse(true[0]) @ true - poses)[:, :3, 3], axis=1)
+
+
+def test_it_is_lost_until_it_recognizes_the_place(back):
+    updates, _, _, true, _ = back
+    doubts = [update.doubts for update in updates]
+    carried = next(k for k, one in enumerate(doubts) if "carried" in one)
+    assert BEFORE < carried < BEFORE + 8
+    found = next(k for k in range(carried, len(doubts)) if "lost" not in doubts[k])
+    assert not any(doubts[found:])
+    off = errors(np.array([update.pose for update in updates]), true)
+    assert off[carried] > 5.0
+    assert off[found:].max() < 0.3
+    assert all("lost" in one for one in doubts[carried:found])
+
+
+def test_poses_are_known_in_hindsight(back):
+    _, _, poses, true, _ = back
+    off = errors(poses, true)
+    unknown = np.flatnonzero(np.isnan(off))  # those that contradicted the map
+    assert unknown[0] > BEFORE - 6
+    assert unknown[-1] < BEFORE + 8
+    assert np.nanmax(off) < 0.3
+
+
+def test_nothing_is_drawn_over_the_map_until_then(back):
+    updates, sizes, _, _, mapper = back
+    lost = ["lost" in update.doubts for update in updates]
+    first, found = lost.index(True), len(lost) - lost[::-1].index(True)
+    assert sizes[first] < 0.5 * sizes[first - 1]  # what is seen now is apart
+    assert sizes[found] > sizes[first - 1]
+    # one hall, not two
+    shape = np.array(mapper.map.p_occupied.shape) * mapper.map.resolution
+    assert shape.max() < 60.0
+    assert len(mapper.path) > 12
+
+
+def test_where_it_has_never_been_it_stays_lost(tmp_path):
+    hall, corridor = (
+        list(iter_beams(simulate_sweeps(scene, 40).recording)) for scene in ("hall", "corridor")
+    )
+    with LiveMapper({"threads": 1}) as mapper:
+        doubts = [mapper.push(one).doubts for one in follow(hall, corridor)]
+        assert sum("carried" in one for one in doubts) == 1
+        assert "lost" in doubts[-1]
+        assert mapper.map.p_occupied.size > 0
+        known = np.isfinite(mapper.poses).all(axis=(1, 2))
+        mapper.save(tmp_path / "out")
+    assert known[:35].all()
+    assert not known[40:].any()
+    assert len(stillmap.load(tmp_path / "out").poses) == known.sum()
+    assert len(stillmap.load(tmp_path / "out/live/submaps/1").poses) > 30
+    record = json.loads((tmp_path / "out/run.json").read_text())
+    assert record["input"]["lost_scans"] == (~known).sum()
+
+
+def test_stretches_are_tied_by_two_loops():
+    def loops(*ends):
+        return [LoopClosure(a, b, np.eye(4), np.eye(6), 1.0) for a, b in ends]
+
+    carried = [10, 20]  # 0: 0 to 9, 1: 10 to 19, 2: from 20 on
+    assert _find_untied(carried, []) == (10, 20)
+    assert _find_untied(carried, loops((1, 2), (1, 12), (11, 12))) == (10, 20)
+    assert _find_untied(carried, loops((1, 12), (2, 13))) == (20,)
+    assert _find_untied(carried, loops((11, 22), (12, 23))) == (10, 20)
+    assert _find_untied(carried, loops((11, 22), (12, 23), (3, 14), (4, 15))) == ()
+    wrong = [one.reject("explains too little") for one in loops((1, 12))]
+    assert _find_untied(carried, [*loops((2, 13)), *wrong]) == (10, 20)

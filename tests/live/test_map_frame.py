@@ -1,0 +1,94 @@
+"""Poses and cells after a correction of the pose graph, where the robot was carried between."""
+
+import numpy as np
+import pytest
+
+import stillmap
+from stillmap.core import se2
+from stillmap.em.options import EmOptions
+from stillmap.live.causal_labels import CausalLabels
+from stillmap.live.front_end import Registration
+from stillmap.live.local_map import LocalMap, MappedScan
+from stillmap.live.loop_closer import Correction
+from stillmap.live.map_correction import LabelledScan
+from stillmap.live.map_frame import MapFrame
+from stillmap.live.observation import Observation
+from stillmap.live.scan import to_beams
+
+CARRIED = 7  # spaced scans before the robot was carried, 1 m apart; as many scans after each
+MOTION = se2.matrix(0.0, 3.0, 0.0)  # of what was mapped since
+
+
+class Closer:
+    """Moves what was mapped since the robot was carried."""
+
+    def __init__(self):
+        self.poses = []
+        self.found = None
+
+    def add(self, scan, _explained, _drift):
+        self.poses.append(scan.T_map_base)
+
+    def poll(self):
+        found, self.found = self.found, None
+        return found
+
+    def stop(self):
+        pass
+
+
+class Odometry:
+    local_map = LocalMap(0.05)
+
+    def correct(self, local_map, motion):
+        pass
+
+
+@pytest.fixture
+def run():
+    """A frame and labels after a correction; poses and anchors of all scans. Each scan sees a spot
+    2 m ahead of it."""
+    closer, labels = Closer(), CausalLabels(2, 0.05, EmOptions())
+    frame, odometry = MapFrame(2, closer, in_background=False), Odometry()
+    poses, anchors = [], []
+    for k in range(4 * 2 * CARRIED):
+        if k == 4 * CARRIED + 2:  # not at a spaced scan
+            frame.begin_anew(k)
+        T = se2.matrix(0.25 * k, 0.0, 0.0)
+        beams = to_beams(stillmap.Scan(k * 10**9, np.full(3, 2.0), np.full(3, 1e-3)))
+        poses.append(T)
+        anchors.append(frame.last)
+        labelled = LabelledScan(Observation(beams, np.full(3, 0.1, np.float32), frame.tag), T)
+        labels.add(labelled.observation, T)
+        added = None
+        if k % 4 == 0:
+            added = MappedScan(beams, np.ones(3, np.float32), T, 0.25 * k)
+            frame.add(added, Registration(T, np.eye(3), 1.0, np.zeros((3, 3)), np.zeros(3)))
+        if k == 4 * 2 * CARRIED - 1:
+            since = np.arange(len(closer.poses)) > CARRIED
+            moved = np.where(since[:, None, None], MOTION @ closer.poses, closer.poses)
+            closer.found = Correction(MOTION, moved, [])
+        frame.correct(labelled, added, labels, odometry)
+    return frame, labels, np.array(poses), np.array(anchors)
+
+
+def test_poses_move_with_those_after(run):
+    frame, _, poses, anchors = run
+    carried = 4 * CARRIED + 2
+    moved = frame.to_map_all(poses, anchors)
+    np.testing.assert_allclose(moved[:carried], poses[:carried], atol=1e-9)
+    np.testing.assert_allclose(moved[carried:], MOTION @ poses[carried:], atol=1e-9)
+    for scan in (carried - 1, carried, carried + 2, len(poses) - 1):
+        found = frame.to_map(poses[scan], anchors[scan], scan)
+        np.testing.assert_allclose(found, moved[scan], atol=1e-9)
+
+
+def test_cells_move_with_the_scans_after(run):
+    _, labels, poses, _ = run
+    known = labels.known_cells()
+    at = 0.05 * (known.cells + 0.5)
+    seen = poses[:, 0, 2] + 2.0
+    for k, x in enumerate(seen):
+        near = np.abs(at[:, 0] - x) < 0.06
+        expected = 0.0 if k < 4 * CARRIED + 2 else 3.0
+        np.testing.assert_allclose(at[near, 1], expected, atol=0.1)
