@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.arrays import write_npy
+from stillmap.core.files import nearest_folder_above
 from stillmap.core.profiling import Progress, no_progress
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
@@ -43,7 +44,8 @@ class Snapshot(ShortRepr):
 
     def build(self, progress: Progress = no_progress) -> BuiltResult:
         """Labels, map and objects at these poses."""
-        return self._map(self.kept.load()[0], progress)
+        scratch = None if self.kept.disk_was_full else self.scratch
+        return self._map(self.kept.load(scratch)[0], progress, scratch)
 
     def save(
         self,
@@ -53,17 +55,19 @@ class Snapshot(ShortRepr):
         progress: Progress = no_progress,
     ) -> None:
         """Write the result folder, as `LiveMapper.save` does; may run in a thread of its own.
+        If the disk of `scratch` was full, temporary files lie where the result goes.
 
         Raises:
             InputError: the folder is taken or cannot be written to.
         """
-        recording, answers = self.kept.load()
-        result = self._map(recording, progress)
+        scratch = nearest_folder_above(path) if self.kept.disk_was_full else self.scratch
+        recording, answers = self.kept.load(scratch)
+        result = self._map(recording, progress, scratch)
         save_live(result, answers, Path(path), overwrite, extended=self.extended)
 
-    def _map(self, recording: Recording, progress: Progress) -> BuiltResult:
+    def _map(self, recording: Recording, progress: Progress, scratch: Path | None) -> BuiltResult:
         found = map_recording(
-            recording, self.options, poses=self.poses, progress=progress, scratch=self.scratch
+            recording, self.options, poses=self.poses, progress=progress, scratch=scratch
         )
         return BuiltResult(**vars(found))
 
