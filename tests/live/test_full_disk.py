@@ -32,7 +32,7 @@ def kept_of(store, tmp_path):
 
 @pytest.fixture
 def small_memory(monkeypatch):
-    monkeypatch.setattr(beam_store, "IN_MEMORY", 10_000)
+    monkeypatch.setattr(beam_store, "QUICKLY_WRITTEN", 10_000)
     monkeypatch.setattr(beam_store, "_free_bytes", lambda _: 0)
     monkeypatch.setattr(beam_store, "_IN_MEMORY_IF_FULL", 1_600_000)
     return 1_600_000

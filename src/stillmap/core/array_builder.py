@@ -16,6 +16,8 @@ from stillmap.core import arrays
 
 Array = NDArray[Any]
 
+# bytes in memory of an array that grows while somebody waits: more take long to write
+QUICKLY_WRITTEN = 1 << 17
 _WRITTEN_AT_ONCE = 1 << 20  # bytes at most in memory, once there is a file
 _SMALL_PARTS = 256  # appended rows that become one array
 

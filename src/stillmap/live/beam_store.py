@@ -11,14 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from stillmap.core.array_builder import ArrayBuilder, append_together
+from stillmap.core.array_builder import QUICKLY_WRITTEN, ArrayBuilder, append_together
 from stillmap.core.arrays import empty, iter_blocks, release_pages
 
 Array = NDArray[Any]
 
 _log = logging.getLogger(__name__)
 
-IN_MEMORY = 1 << 17  # bytes of each array that are not yet in its file: more take long to write
 _IN_MEMORY_IF_FULL = 128 << 20  # bytes, about, of all arrays while the disk is full
 _SEGMENTS = 16  # into which the bound is divided
 _MIN_SCANS = 16  # of a segment: of few ones hardly any could be dropped
@@ -118,7 +117,7 @@ class BeamStore:
 
     def _make_segment(self) -> "_Segment":
         fields = [*self._fields, (np.int64, ()), (np.int64, ())]
-        return _Segment([ArrayBuilder(t, row, self._folder, IN_MEMORY) for t, row in fields])
+        return _Segment([ArrayBuilder(t, row, self._folder, QUICKLY_WRITTEN) for t, row in fields])
 
     def _thin_if_due(self) -> Iterator[None]:
         """What is to be done now, step by step: where too much is held, `_thin`."""

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.array_builder import ArrayBuilder
+from stillmap.core.array_builder import QUICKLY_WRITTEN, ArrayBuilder
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
-from stillmap.live.beam_store import IN_MEMORY, BeamStore, join_parts
+from stillmap.live.beam_store import BeamStore, join_parts
 from stillmap.live.scan import ScanBeams
 
 Float = NDArray[np.float64]
@@ -78,7 +78,7 @@ class History:
             ("sensor", np.int32),
         ]
         self._answer = np.dtype(answer, align=True)
-        self._answers = ArrayBuilder(self._answer, (), folder, IN_MEMORY)
+        self._answers = ArrayBuilder(self._answer, (), folder, QUICKLY_WRITTEN)
         # points, hit, P(static), time of each beam
         fields = [(np.float32, (D,)), (np.bool_, ()), (np.float32, ()), (np.float32, ())]
         self._beams = BeamStore(fields, folder, max_bytes)

@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from stillmap.core.array_builder import ArrayBuilder, append_together
+from stillmap.core.array_builder import QUICKLY_WRITTEN, ArrayBuilder, append_together
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
-from stillmap.live.beam_store import IN_MEMORY
 from stillmap.live.local_map import MappedScan
 from stillmap.live.scan import ScanBeams
 
@@ -60,7 +59,7 @@ class SpacedScans:
         ]
         fields: list[tuple[DTypeLike, tuple[int, ...]]]
         fields = [(np.dtype(scan), ()), (np.float32, (D,)), (np.bool_, ()), (np.float32, ())]
-        self._arrays = [ArrayBuilder(t, row, folder, IN_MEMORY) for t, row in fields]
+        self._arrays = [ArrayBuilder(t, row, folder, QUICKLY_WRITTEN) for t, row in fields]
         self._scans, self._points, self._hit, self._e = self._arrays
         self._scan = np.dtype(scan)
         self._mounts: dict[str | int, Float] = {}
