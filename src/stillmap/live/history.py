@@ -126,9 +126,10 @@ class History:
         answer["T_odom_base"] = np.nan if T_odom_base is None else T_odom_base
         answer["pose"], answer["local"], answer["twist"] = pose, local, twist
         answer["sensor"] = list(self._mounts).index(beams.sensor)
-        self._beams.append(len(self), [beams.points, beams.hit, p_static, times])
+        number = len(self)
         with suppress(OSError):  # it stays in memory, as the beams do, which say so
             self._answers.append(answer)
+        self._beams.append(number, [beams.points, beams.hit, p_static, times])
 
     @property
     def was_full(self) -> bool:
