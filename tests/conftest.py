@@ -1,7 +1,9 @@
 """Settings and fixtures of all tests; tests/reference and tests/marks.py can be imported."""
 
 import gc
+import resource
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -18,6 +20,19 @@ def shared_data() -> Path:
     if not path.is_dir():
         pytest.skip("no folder of real recordings beside the checkout (../shared/data)")
     return path
+
+
+@pytest.fixture
+def limit_files() -> Iterator[Callable[[int | None], None]]:
+    """Limits the bytes of each file that is written to, as a disk does that is full (the error is
+    EFBIG instead of ENOSPC); None: no longer."""
+    before, most = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def limit(size: int | None) -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (before if size is None else size, most))
+
+    yield limit
+    limit(None)
 
 
 @pytest.fixture(scope="session")

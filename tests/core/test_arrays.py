@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from stillmap.core import arrays
+from stillmap.core.array_builder import ArrayBuilder, append_together
 from stillmap.io import builder
 from stillmap.io.builder import ReadContext, RecordingBuilder
 from stillmap.preprocessing.options import ReadOptions
@@ -24,7 +25,7 @@ def limit(request, monkeypatch):
 
 
 def test_a_column_is_what_was_added(limit, tmp_path, rng):
-    column, parts = arrays.ArrayBuilder(np.float32, (3,), tmp_path), []
+    column, parts = ArrayBuilder(np.float32, (3,), tmp_path), []
     for n in (5, 0, 1, 70):
         parts.append(rng.normal(size=(n, 3)).astype(np.float32))
         column.append(parts[-1])
@@ -39,12 +40,12 @@ def test_a_column_is_what_was_added(limit, tmp_path, rng):
 
 
 def test_an_empty_column(limit, tmp_path):  # noqa: ARG001
-    assert arrays.ArrayBuilder(np.int32, (), tmp_path).finish().shape == (0,)
+    assert ArrayBuilder(np.int32, (), tmp_path).finish().shape == (0,)
 
 
 def test_wrong_rows_are_refused():
     with pytest.raises(ValueError, match=r"expected \(n, \*\(2,\)\)"):
-        arrays.ArrayBuilder(np.float32, (2,)).append(np.zeros((4, 3)))
+        ArrayBuilder(np.float32, (2,)).append(np.zeros((4, 3)))
 
 
 def test_new_arrays_keep_what_is_written(limit, tmp_path):  # noqa: ARG001
@@ -60,9 +61,76 @@ def test_a_full_disk_is_an_error(monkeypatch):
     if not full.exists():
         pytest.skip("no /dev/full here")
     with full.open("r+b", buffering=0) as file:
-        monkeypatch.setattr(arrays, "_open_unlinked", lambda _: file)
+        monkeypatch.setattr(arrays, "open_unlinked", lambda _: file)
         with pytest.raises(OSError, match="No space left"):
-            arrays.ArrayBuilder(np.float32).append(np.ones(3))
+            ArrayBuilder(np.float32).append(np.ones(3))
+
+
+def test_what_could_not_be_written_is_written_once_there_is_room(tmp_path, rng, limit_files):
+    column = ArrayBuilder(np.float32, (3,), tmp_path, in_memory=1000)
+    rows = rng.normal(size=(4000, 3)).astype(np.float32)
+    limit_files(20_001)  # amid a row
+    failures, views = 0, []
+    for first in range(0, 4000, 10):
+        try:
+            column.append(rows[first : first + 10])
+        except OSError:
+            failures += 1
+        assert len(column) == first + 10
+        if first % 500 == 0:
+            views.append((first + 10, column.view(), column.parts()))
+        if first == 3000:
+            limit_files(None)
+    assert 1 <= failures < 30  # not tried at every row
+    assert column.memory_bytes <= 1000
+    for length, view, parts in views:
+        np.testing.assert_array_equal(view, rows[:length])
+        np.testing.assert_array_equal(np.concatenate(parts), rows[:length])
+    for at in (0, 1600, 3995, 3999):
+        np.testing.assert_array_equal(column.row(at), rows[at])
+    np.testing.assert_array_equal(column.finish(), rows)
+
+
+def test_arrays_that_grow_together_stay_of_one_length(tmp_path, limit_files):
+    both = {row: ArrayBuilder(np.int64, row, tmp_path, in_memory=0) for row in ((8,), ())}
+    limit_files(1000)
+    failures = 0
+    for number in range(100):
+        try:
+            append_together((array, np.full((1, *row), number)) for row, array in both.items())
+        except OSError:
+            failures += 1
+        assert {len(array) for array in both.values()} == {number + 1}
+    assert failures
+    for array in both.values():
+        np.testing.assert_array_equal(array.view().reshape(100, -1)[:, 0], np.arange(100))
+        array.close()
+
+
+def test_small_parts_and_structures(tmp_path):
+    kind = np.dtype([("number", np.int32), ("pose", float, (2, 2))], align=True)
+    column = ArrayBuilder(kind, (), tmp_path, in_memory=40_000)
+    rows = np.zeros(3000, kind)
+    rows["number"], rows["pose"] = np.arange(3000), np.arange(12_000.0).reshape(-1, 2, 2)
+    for at in range(3000):
+        column.append(rows[at : at + 1])
+        assert column.row(at) == rows[at]
+    assert len(column.parts()) == 2
+    np.testing.assert_array_equal(column.view(), rows)
+    column.close()
+
+
+def test_a_temporary_folder_that_is_gone(tmp_path, caplog, limit):
+    gone = tmp_path / "stillmap-1" / "more"
+    for _ in range(2):
+        column = ArrayBuilder(np.float32, (), gone)
+        column.append(np.arange(5))
+        np.testing.assert_array_equal(column.finish(), np.arange(5))
+        arrays.empty((7,), np.float64, gone)[:] = 1.0
+    expected = (
+        [f"{gone} does not exist any more: temporary files are in {tmp_path}"] if limit == 0 else []
+    )
+    assert [record.getMessage() for record in caplog.records] == expected
 
 
 @pytest.mark.parametrize("block", [4, 1 << 20])
@@ -164,7 +232,7 @@ def test_what_is_looked_at_together_lies_together(monkeypatch, rng, rows):
 
 def test_some_rows_are_those_of_the_array(limit, monkeypatch, tmp_path, rng):
     monkeypatch.setattr(arrays, "BLOCK", 100)
-    column = arrays.ArrayBuilder(np.float32, (2,), tmp_path)
+    column = ArrayBuilder(np.float32, (2,), tmp_path)
     column.append(rng.normal(size=(1000, 2)))
     array = column.finish()
     assert array.flags.writeable == (limit > 0)

@@ -87,3 +87,19 @@ def test_odometry_that_jumps(corridor, answers):
 
     updates = answers(jump)
     assert error(corridor, updates, range(300)) < 0.15
+
+
+def test_a_clock_that_leaps_by_decades(corridor):
+    """As where it was not set before the network was there."""
+    leap_ns = 40 * 365 * 86_400 * 10**9
+    updates = []
+    with LiveMapper({"threads": 1}) as mapper:
+        for k, beams in enumerate(corridor.beams[:150]):
+            later = replace(
+                beams, stamp_ns=beams.stamp_ns + (k >= 50) * leap_ns + (k >= 100) * leap_ns
+            )
+            updates.append(mapper.push(later, corridor.recording.T_odom_base[k]))
+    assert error(corridor, updates, range(150)) < 0.15
+    for k in (60, 140):
+        hit, static = corridor.beams[k].hit, corridor.truth.static[corridor.recording.beams_of(k)]
+        assert np.mean((updates[k].p_static > 0.5) == static, where=hit) > 0.9

@@ -2,6 +2,9 @@
 
 import itertools
 import json
+import os
+import signal
+import time
 
 import numpy as np
 import pytest
@@ -260,8 +263,10 @@ def test_loops_are_closed_in_the_background(corridor, fresh):
 def test_mapping_goes_on_when_the_process_that_closes_loops_dies(corridor, fresh, caplog):
     mapper = fresh(background=True)
     push_all(mapper, corridor.recording, 50)
-    mapper._slam.frame._closer._process.kill()
-    mapper._slam.frame._closer._process.wait()
+    process = mapper._slam.frame._closer._process
+    os.kill(process.id, signal.SIGKILL)
+    while not process.has_ended:
+        time.sleep(0.01)
     odometry = corridor.recording.T_odom_base
     waiting = []
     for t, beams in enumerate(itertools.islice(iter_beams(corridor.recording), 50, 150), 50):

@@ -1,10 +1,10 @@
 """Memory-mapped buffers for arrays larger than memory, `.npy` and `.npz` files, array helpers.
 
 Large arrays lie in unlinked temporary files, which vanish with the last reference even if the
-process is killed. They are written, not mapped, while they grow, so that a full disk is an OSError
-and no crash.
+process is killed.
 """
 
+import logging
 import mmap
 import os
 import tempfile
@@ -13,13 +13,13 @@ import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import IO, Any, Protocol, TypeVar, cast
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from stillmap.core.errors import InputError
-from stillmap.core.files import require_regular
+from stillmap.core.files import nearest_folder_above, require_regular
 
 
 def write_npz(path: Path, arrays: Mapping[str, "Writable"]) -> None:
@@ -70,93 +70,8 @@ ITEMS_PER_RELEASE = 500  # items of the size of a 2D scan between two releases o
 
 _Item = TypeVar("_Item")
 
-_BUFFER = 1 << 20  # bytes written at once
-
-
-class ArrayBuilder:
-    """Builds an array by appending rows.
-
-    Args:
-        dtype: of the elements.
-        row: shape of one row, () for numbers.
-        folder: of the temporary file; None: the system's.
-        in_memory: bytes that are kept in memory before the file is begun; None: as many as of any
-            array.
-    """
-
-    def __init__(
-        self,
-        dtype: DTypeLike,
-        row: tuple[int, ...] = (),
-        folder: Path | None = None,
-        in_memory: int | None = None,
-    ) -> None:
-        self._dtype, self._row, self._folder = np.dtype(dtype), row, folder
-        self._in_memory = in_memory
-        self._parts: list[NDArray[Any]] = []
-        self._bytes = 0
-        self._length = 0
-        self._file: Any = None
-        self._is_closed = False
-
-    def __len__(self) -> int:
-        return self._length
-
-    def append(self, rows: NDArray[Any]) -> None:
-        """Append a copy of rows (n, *row).
-
-        Raises:
-            OSError: the disk is full.
-            ValueError: the rows have another shape, or the builder is closed.
-        """
-        self._require_open()
-        rows = np.array(rows, self._dtype, order="C", ndmin=1)
-        if rows.shape[1:] != self._row:
-            raise ValueError(f"rows: expected (n, *{self._row}), got {rows.shape}")
-        self._length += len(rows)
-        self._parts.append(rows)
-        self._bytes += rows.nbytes
-        limit = MAX_BYTES_IN_MEMORY if self._in_memory is None else self._in_memory
-        if self._bytes > (limit if self._file is None else min(limit, _BUFFER)):
-            self._write()
-
-    def _write(self) -> None:
-        if self._file is None:
-            self._file = _open_unlinked(self._folder)
-        for part in self._parts:
-            self._file.write(part.reshape(-1).view(np.uint8).data)
-        self._parts, self._bytes = [], 0
-
-    def close(self) -> None:
-        """Close the file, if there is one; arrays that were mapped stay as they are."""
-        self._parts, self._is_closed = [], True
-        if self._file is not None:
-            self._file.close()
-
-    def view(self) -> NDArray[Any]:
-        """The array (N, *row) so far, read-only where it is memory-mapped; more may be appended."""
-        self._require_open()
-        shape = (self._length, *self._row)
-        if self._file is None:
-            return np.concatenate(self._parts) if self._parts else np.empty(shape, self._dtype)
-        self._write()
-        self._file.flush()
-        return _map(self._file, shape, self._dtype, writable=False)
-
-    def _require_open(self) -> None:
-        if self._is_closed:
-            raise ValueError("array: expected a builder that is not closed")
-
-    def finish(self) -> NDArray[Any]:
-        """The array (N, *row), read-only where it is memory-mapped. Ends appending."""
-        shape = (self._length, *self._row)
-        if self._file is None:
-            parts, self._parts = self._parts, []
-            return np.concatenate(parts) if parts else np.empty(shape, self._dtype)
-        self._write()
-        self._file.flush()
-        with self._file as file:
-            return _map(file, shape, self._dtype, writable=False)
+_log = logging.getLogger(__name__)
+_reported = set[Path]()  # folders that are gone
 
 
 def empty(shape: tuple[int, ...], dtype: DTypeLike, folder: Path | None = None) -> NDArray[Any]:
@@ -169,10 +84,10 @@ def empty(shape: tuple[int, ...], dtype: DTypeLike, folder: Path | None = None) 
     size = int(np.prod(shape, dtype=object)) * dtype.itemsize
     if size <= MAX_BYTES_IN_MEMORY:
         return np.empty(shape, dtype)
-    with _open_unlinked(folder) as file:
+    with open_unlinked(folder) as file:
         # a hole that no longer fits on the disk would kill the process by SIGBUS
         os.posix_fallocate(file.fileno(), 0, size)
-        return _map(file, shape, dtype, writable=True)
+        return map_file(file, shape, dtype, writable=True)
 
 
 def release_pages(array: NDArray[Any]) -> None:
@@ -238,13 +153,41 @@ def copy(array: NDArray[Any], folder: Path | None = None) -> NDArray[Any]:
     return out
 
 
-def _open_unlinked(folder: Path | None) -> Any:
-    return tempfile.TemporaryFile(buffering=_BUFFER, prefix="stillmap-", dir=folder)
+def open_unlinked(folder: Path | None) -> IO[bytes]:
+    """A new file without a name in a folder; None: the system's for temporary files.
+
+    If the folder is gone, as after a temporary folder was cleaned up, the file is in the nearest
+    one above that is left, or in the system's.
+
+    Raises:
+        OSError: no file can be made there.
+    """
+    try:
+        return _open_in(folder)
+    except FileNotFoundError:
+        if folder is None:
+            raise
+    above = nearest_folder_above(folder)
+    if folder not in _reported:
+        _reported.add(folder)
+        _log.warning("%s does not exist any more: temporary files are in %s", folder, above)
+    try:
+        return _open_in(above)
+    except OSError:
+        return _open_in(None)
 
 
-def _map(file: Any, shape: tuple[int, ...], dtype: np.dtype[Any], writable: bool) -> NDArray[Any]:
+def _open_in(folder: Path | None) -> IO[bytes]:
+    return cast(IO[bytes], tempfile.TemporaryFile(prefix="stillmap-", dir=folder))
+
+
+def map_file(
+    file: IO[bytes], shape: tuple[int, ...], dtype: np.dtype[Any], writable: bool
+) -> NDArray[Any]:
+    """Memory-map an array at the begin of a file."""
+    size = int(np.prod(shape, dtype=object)) * dtype.itemsize
     access = mmap.ACCESS_WRITE if writable else mmap.ACCESS_READ
-    mapped: NDArray[Any] = np.frombuffer(mmap.mmap(file.fileno(), 0, access=access), dtype)
+    mapped: NDArray[Any] = np.frombuffer(mmap.mmap(file.fileno(), size, access=access), dtype)
     return mapped.reshape(shape)
 
 

@@ -150,6 +150,11 @@ def read_text(path: Path, max_bytes: int) -> str:
     return content.decode("utf-8")
 
 
+def nearest_folder_above(path: str | os.PathLike[str]) -> Path:
+    """The first folder above a path that is there."""
+    return next(one for one in Path(path).absolute().parents if one.is_dir())
+
+
 def require_regular(path: Path) -> None:
     """Reject pipes and devices, on which reading may block for ever.
 

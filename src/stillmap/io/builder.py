@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.advice import advise
-from stillmap.core.arrays import ArrayBuilder, empty
+from stillmap.core.array_builder import ArrayBuilder
+from stillmap.core.arrays import empty
 from stillmap.core.recording import Recording
 from stillmap.io.text_lines import Progress, share_progress
 from stillmap.preprocessing.options import MAX_POINT_DISTANCE, ReadOptions

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stillmap.core import arrays
+from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.errors import InputError
 from stillmap.core.files import require_new, require_new_file
 from stillmap.core.json import count_skipped
@@ -284,9 +285,9 @@ def _to_misses(job: FilterJob) -> Recording:
 def _without_beams(job: FilterJob) -> Recording:
     """The recording without the blanked beams."""
     recording, scratch = job.recording, job.output.absolute().parent
-    points = arrays.ArrayBuilder(np.float32, (recording.dimension,), scratch)
-    hit = arrays.ArrayBuilder(np.bool_, (), scratch)
-    times = arrays.ArrayBuilder(np.float32, (), scratch)
+    points = ArrayBuilder(np.float32, (recording.dimension,), scratch)
+    hit = ArrayBuilder(np.bool_, (), scratch)
+    times = ArrayBuilder(np.float32, (), scratch)
     length = np.zeros(recording.n_scans + 1, np.int64)
     for scan in recording.iter_scans(range(recording.n_scans), job.blank):
         beams = recording.beams_of(scan)

@@ -25,6 +25,9 @@ _DYNAMIC = ((0.04, 0.5), (0.04, 3.0), (0.15, 3.0), (0.04, 12.0), (0.04, 45.0))
 _LATERAL_STD = 0.4  # cells, of a beam's lateral position
 _HIT_RADIUS = 1.0  # cells from an end point to the centres of the cells that it hits
 _MAX_LOG_RATIO = 20.0  # nats: what stood for hours is known to be gone after a few bins
+_MAX_GAP = (
+    1 << 20
+)  # time bins, three hours at least, after which no filter knows anything of before
 # of static surface in the map and in matching: one look at a walker is no evidence for a wall
 _MAP_PRIOR = 0.5
 # likewise for the local map until more is known: people who walk along with the robot are always
@@ -80,6 +83,7 @@ class CausalLabels:
         self._prior, self._bin_ns = prior, round(1e9 * options.time_bin)
         self._threads = threads
         self._first_ns: int | None = None
+        self._last_bin = 0
         self.tags = 1  # numbers of keyframes are below
         self._pixels = dict[str | int, tuple[float, float]]()  # of the sensors, in 3D
         # lowest cells of the blocks in `take_changes` so far, as bytes, and the filter they are of
@@ -89,6 +93,7 @@ class CausalLabels:
     def clear(self) -> None:
         """Forget all scans."""
         self.filter, self._first_ns, self.tags = self.filter.sibling(), None, 1
+        self._last_bin = 0
 
     @property
     def resolution(self) -> float:
@@ -125,9 +130,7 @@ class CausalLabels:
             to: filters to add it to; None: those of the labels.
         """
         beams, to = observation.beams, self.filter if to is None else to
-        if self._first_ns is None:
-            self._first_ns = beams.stamp_ns
-        time_bin = max(beams.stamp_ns - self._first_ns, 0) // self._bin_ns
+        time_bin = self._time_bin(beams.stamp_ns)
         self.tags = max(self.tags, observation.tag + 1)
         T, tag = (T_map_base @ beams.T_base_sensor)[None], observation.tag
         scan, offset = (beams.points, beams.hit), np.array([0, len(beams.points)])
@@ -139,6 +142,17 @@ class CausalLabels:
         assert observation.margin is not None
         margin = observation.margin / np.float32(self.resolution)
         to.add(*scan, margin, offset, T, time_bin=time_bin, tag=tag)
+
+    def _time_bin(self, stamp_ns: int) -> int:
+        """Index of the time bin of a scan; where the clock leaps far, the bins between are left
+        out: the filters count in 32 bits."""
+        if self._first_ns is None:
+            self._first_ns = stamp_ns
+        time_bin = max(stamp_ns - self._first_ns, 0) // self._bin_ns
+        left_out = max(time_bin - self._last_bin - _MAX_GAP, 0)
+        self._first_ns += left_out * self._bin_ns
+        self._last_bin = max(self._last_bin, time_bin - left_out)
+        return time_bin - left_out
 
     def _pixel_size(self, beams: ScanBeams) -> tuple[float, float]:
         """Radians between the beams of a sensor, as of its first sweep that met anything."""

@@ -1,21 +1,21 @@
 """All scans, and the poses and labels returned for them, in temporary files."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.arrays import ArrayBuilder
+from stillmap.core.array_builder import QUICKLY_WRITTEN, ArrayBuilder
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.live.beam_store import BeamStore, join_parts
 from stillmap.live.scan import ScanBeams
 
 Float = NDArray[np.float64]
-
-_IN_MEMORY = 1 << 18  # bytes of each array that are not yet in its file
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,12 +43,14 @@ class KeptScans(ShortRepr):
 
     Attributes:
         number: (T,) of the scans, as they were pushed.
-        load: returns them with the answers; takes long where some scans were dropped, and may be
-            called in another thread.
+        disk_was_full: that of the temporary files.
+        load: returns them with the answers, in temporary files in a folder (None: the system's);
+            takes long where some scans were dropped, and may be called in another thread.
     """
 
     number: NDArray[np.int64]
-    load: Callable[[], tuple[Recording, Answers]]
+    disk_was_full: bool
+    load: Callable[[Path | None], tuple[Recording, Answers]]
 
 
 class History:
@@ -65,21 +67,21 @@ class History:
         self, dimension: int, folder: Path | None = None, max_bytes: int | None = None
     ) -> None:
         D = dimension
-
-        self._arrays: list[ArrayBuilder] = []
-
-        def array(dtype: type, *row: int) -> ArrayBuilder:
-            self._arrays.append(ArrayBuilder(dtype, row, folder, _IN_MEMORY))
-            return self._arrays[-1]
-
-        self._stamp_ns = array(np.int64)
-        self._sensor, self._anchor = array(np.int32), array(np.int64)
+        T = (np.float64, (D + 1, D + 1))
+        answer = [
+            ("stamp_ns", np.int64),
+            ("anchor", np.int64),
+            ("T_odom_base", *T),
+            ("pose", *T),
+            ("local", *T),
+            ("twist", np.float64, 3 if D == 2 else 6),
+            ("sensor", np.int32),
+        ]
+        self._answer = np.dtype(answer, align=True)
+        self._answers = ArrayBuilder(self._answer, (), folder, QUICKLY_WRITTEN)
         # points, hit, P(static), time of each beam
         fields = [(np.float32, (D,)), (np.bool_, ()), (np.float32, ()), (np.float32, ())]
         self._beams = BeamStore(fields, folder, max_bytes)
-        self._T_odom_base = array(np.float64, D + 1, D + 1)
-        self._poses, self._local = (array(np.float64, D + 1, D + 1) for _ in range(2))
-        self._twist = array(np.float64, 3 if D == 2 else 6)
         self._mounts: dict[str | int, Float] = {}
         self._has_odometry, self._has_times = True, False
         self._folder = folder
@@ -87,11 +89,10 @@ class History:
     def close(self) -> None:
         """Remove the files."""
         self._beams.close()
-        for array in self._arrays:
-            array.close()
+        self._answers.close()
 
     def __len__(self) -> int:
-        return len(self._stamp_ns)
+        return len(self._answers)
 
     def append(
         self,
@@ -113,9 +114,6 @@ class History:
             local: (D+1, D+1).
             anchor: a spaced scan.
             twist: (3,) or (6,) m/s and rad/s of the base during the scan, in its own frame.
-
-        Raises:
-            OSError: the disk is full.
         """
         self._mounts.setdefault(beams.sensor, beams.T_base_sensor)
         self._has_odometry &= T_odom_base is not None
@@ -123,65 +121,69 @@ class History:
         times = beams.beam_time
         if times is None:
             times = np.zeros(len(beams.points), np.float32)
-        self._beams.append(len(self), [beams.points, beams.hit, p_static, times])
-        sensor = list(self._mounts).index(beams.sensor)
-        for array, value in (
-            (self._stamp_ns, beams.stamp_ns),
-            (self._sensor, sensor),
-            (self._anchor, anchor),
-        ):
-            array.append(np.array([value]))
-        unknown = np.full(pose.shape, np.nan)
-        odometry = unknown if T_odom_base is None else T_odom_base
-        for array, T in (
-            (self._T_odom_base, odometry),
-            (self._poses, pose),
-            (self._local, local),
-            (self._twist, twist),
-        ):
-            array.append(T[None])
+        answer = np.zeros(1, self._answer)
+        answer["stamp_ns"], answer["anchor"] = beams.stamp_ns, anchor
+        answer["T_odom_base"] = np.nan if T_odom_base is None else T_odom_base
+        answer["pose"], answer["local"], answer["twist"] = pose, local, twist
+        answer["sensor"] = list(self._mounts).index(beams.sensor)
+        number = len(self)
+        with suppress(OSError):  # it stays in memory, as the beams do, which say so
+            self._answers.append(answer)
+        self._beams.append(number, [beams.points, beams.hit, p_static, times])
+
+    @property
+    def was_full(self) -> bool:
+        """True if the disk was full: scans may be missing."""
+        return self._beams.was_full
 
     def at(self, number: int) -> tuple[int, Float]:
         """Anchor and local pose of a scan, see `Answers`."""
-        return int(self._anchor.view()[number]), np.array(self._local.view()[number])
+        answer = self._answers.row(number)
+        return int(answer["anchor"]), np.array(answer["local"])
 
     def twist_at(self, number: int) -> Float:
         """(3,) or (6,) m/s and rad/s of the base during a scan."""
-        return np.array(self._twist.view()[number])
+        return np.array(self._answers.row(number)["twist"])
 
     def recording(self) -> Recording:
-        """The scans that are kept. Odometry only if every scan had it."""
-        return self.snapshot().load()[0]
+        """The scans that are kept. Odometry only if every scan had it. If the disk was full,
+        temporary files are in the system's folder."""
+        return self.snapshot().load(None if self.was_full else self._folder)[0]
 
     def snapshot(self) -> KeptScans:
         """The scans that are kept, and what `push` has returned for them."""
         kept, counts, parts = self._beams.kept, self._beams.counts, self._beams.parts()
-        stamp_ns, sensor = self._stamp_ns.view()[kept], self._sensor.view()[kept]
-        odometry = self._T_odom_base.view()[kept] if self._has_odometry else None
-        mounts, has_times, folder = dict(self._mounts), self._has_times, self._folder
-        poses, local, anchor = self.poses()
-        poses, local, anchor = poses[kept], local[kept], anchor[kept]
+        answers, mounts = self._answers.view()[kept], dict(self._mounts)
+        has_odometry, has_times, warnings = self._has_odometry, self._has_times, list[str]()
+        if self.was_full and len(kept) < len(self):
+            warnings.append(
+                f"the disk of temporary files was full: of {len(self)} scans {len(kept)} were kept"
+            )
 
-        def load() -> tuple[Recording, Answers]:
+        def load(folder: Path | None) -> tuple[Recording, Answers]:
             points, hit, p_static, times = join_parts(parts, folder)
             sensors = [{"name": str(name), "extrinsics": {"how": "given"}} for name in mounts]
             recording = Recording(
-                stamp_ns=stamp_ns,
+                stamp_ns=answers["stamp_ns"].copy(),
                 offset=np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)]),
                 points=points,
                 hit=hit,
                 T_base_sensor=np.array(list(mounts.values())),
-                sensor=sensor,
-                T_odom_base=odometry,
-                source={"format": "live", "sensors": sensors, "warnings": []},
+                sensor=answers["sensor"].copy(),
+                T_odom_base=answers["T_odom_base"].copy() if has_odometry else None,
+                source={"format": "live", "sensors": sensors, "warnings": warnings},
                 beam_time=times if has_times else None,
                 scratch=folder,
             )
+            poses, local, anchor = _split(answers)
             return recording, Answers(kept, poses, local, anchor, p_static)
 
-        return KeptScans(kept, load)
+        return KeptScans(kept, self.was_full, load)
 
     def poses(self) -> tuple[Float, Float, NDArray[np.int64]]:
         """`poses`, `local` and `anchor` of all scans, see `Answers`."""
-        poses, local = np.array(self._poses.view()), np.array(self._local.view())
-        return poses, local, np.array(self._anchor.view())
+        return _split(self._answers.view())
+
+
+def _split(answers: NDArray[Any]) -> tuple[Float, Float, NDArray[np.int64]]:
+    return answers["pose"].copy(), answers["local"].copy(), answers["anchor"].copy()

@@ -5,14 +5,10 @@ Not in a thread: GTSAM holds Python's lock while it solves a pose graph.
 
 import json
 import logging
-import os
 import queue
-import subprocess
 import sys
 import threading
-import traceback
 from collections import deque
-from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import IO, Any
@@ -21,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import config
+from stillmap.live.child_process import ChildProcess, serve
 from stillmap.live.local_map import MappedScan
 from stillmap.live.loop_closer import Correction, LoopCloser
 from stillmap.live.messages import read_message, write_message
@@ -32,7 +29,6 @@ Float = NDArray[np.float64]
 
 _log = logging.getLogger(__name__)
 
-_SECONDS_TO_END = 5.0  # before the process is killed
 _NUMBERS = list[str | int](range(256))  # of sensors, which stand for their names in the child
 
 
@@ -51,21 +47,12 @@ class LoopProcess:
             "dimension": dimension,
             "folder": None if folder is None else str(folder),
         }
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "stillmap.live.loop_process", json.dumps(settings)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            process_group=0,  # Ctrl-C is for this process alone
-        )
+        self._process = ChildProcess("stillmap.live.loop_process", json.dumps(settings))
         self._outgoing: queue.SimpleQueue[dict[str, NDArray[Any]] | None] = queue.SimpleQueue()
         self._incoming = deque[Correction]()
         self._sensors: list[str | int] = []
         self._has_ended = False
-        self._threads = [
-            threading.Thread(target=work, daemon=True) for work in (self._send, self._receive)
-        ]
-        for thread in self._threads:
-            thread.start()
+        self._process.start(self._send, self._receive)
 
     def add(self, scan: MappedScan, explained: float, drift: Float) -> None:
         """Add a spaced scan, as of `LoopCloser.add`. Never waits."""
@@ -81,7 +68,7 @@ class LoopProcess:
         found = None
         while self._incoming:
             found = self._incoming.popleft()
-        if not self._has_ended and self._process.poll() is not None:
+        if not self._has_ended and self._process.has_ended:
             self._has_ended = True
             _log.warning("the process that closes loops has ended: loops are no longer closed")
         return found
@@ -90,33 +77,13 @@ class LoopProcess:
         """End the process."""
         self._has_ended = True
         self._outgoing.put(None)
-        try:
-            self._process.wait(_SECONDS_TO_END)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        for thread in self._threads:
-            thread.join()
-        for stream in (self._process.stdin, self._process.stdout):
-            assert stream is not None
-            with suppress(BrokenPipeError):
-                stream.close()
+        self._process.stop()
 
     def _send(self) -> None:
-        stream = self._process.stdin
-        assert stream is not None
-        while (message := self._outgoing.get()) is not None:
-            try:
-                write_message(stream, message)
-            except BrokenPipeError:
-                return
-        with suppress(BrokenPipeError):
-            stream.close()
+        self._process.send(iter(self._outgoing.get, None))
 
     def _receive(self) -> None:
-        stream = self._process.stdout
-        assert stream is not None
-        while (message := read_message(stream)) is not None:
+        while (message := read_message(self._process.stdout)) is not None:
             near = _unpack_scans(message, self._sensors)
             untied = tuple(message["untied"].tolist())
             self._incoming.append(
@@ -176,7 +143,7 @@ def _make_closer(
     return LiveSweepLoopCloser(options, folder, threads)
 
 
-def _serve(settings: dict[str, Any], source: IO[bytes], target: IO[bytes]) -> None:
+def _close_loops(settings: dict[str, Any], source: IO[bytes], target: IO[bytes]) -> None:
     """Close loops between the scans that arrive, until there are no more."""
     folder = None if settings["folder"] is None else Path(settings["folder"])
     options = config.override(SlamOptions(), settings["slam"])
@@ -199,16 +166,6 @@ def _serve(settings: dict[str, Any], source: IO[bytes], target: IO[bytes]) -> No
             write_message(target, {**_pack_scans(found.near, _NUMBERS), **poses, **untied})
 
 
-def main() -> None:
-    """Serve the process that started this one."""
-    try:
-        _serve(json.loads(sys.argv[1]), sys.stdin.buffer, sys.stdout.buffer)
-    except BrokenPipeError:
-        os._exit(0)  # the other process has ended
-    except Exception:
-        traceback.print_exc()
-        os._exit(1)  # at once: a thread still reads
-
-
 if __name__ == "__main__":
-    main()
+    settings = json.loads(sys.argv[1])
+    serve(lambda: _close_loops(settings, sys.stdin.buffer, sys.stdout.buffer))

@@ -44,7 +44,8 @@ class LiveMapper:
         background: close loops in a process of their own, so that no scan waits for them; else
             between two scans, the same to the bit every time.
         scratch: folder of the files in which all scans are kept for `save` and `finish`; None: the
-            system's temporary folder.
+            system's temporary folder. While its disk is full scans are kept in memory: beyond
+            128 MB every second one is dropped.
         max_scratch: bytes, about, that their beams may take, 17 each, in 3D 21: beyond, every
             second one of the scans that lie most densely is dropped, the oldest first; None: all
             are kept.
@@ -96,7 +97,6 @@ class LiveMapper:
         Raises:
             ValueError: names the argument, what was expected, and what it was; or the mapper is
                 closed.
-            OSError: the disk of `scratch` is full.
         """
         beams = _to_usable_beams(scan)
         self._require_next(beams)

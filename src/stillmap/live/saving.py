@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from stillmap.core.advice import advise
 from stillmap.core.arrays import write_npy
+from stillmap.core.files import nearest_folder_above
 from stillmap.core.profiling import Progress, no_progress
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
@@ -49,11 +50,12 @@ class Snapshot(ShortRepr):
 
     def build(self, progress: Progress = no_progress) -> BuiltResult:
         """Labels, map and objects of the scans that are in the map, at these poses."""
-        return self._build(*self.kept.load(), self.placement.main, progress)[0]
+        scratch = self._usable_scratch(None)
+        return self._build(*self.kept.load(scratch), self.placement.main, progress)[0]
 
     def refine(self, progress: Progress = no_progress) -> BuiltResult:
         """The result of `stillmap.build` on all scans: poses, too."""
-        return self._map(self.kept.load()[0], None, progress)
+        return self._map(self.kept.load(self._usable_scratch(None))[0], None, progress)
 
     def save(
         self,
@@ -63,6 +65,7 @@ class Snapshot(ShortRepr):
         progress: Progress = no_progress,
     ) -> None:
         """Write the result folder, as `LiveMapper.save` does; may run in a thread of its own.
+        If the disk of `scratch` was full, temporary files lie where the result goes.
 
         In it are `live/trajectory.tum` and `live/beams/p_static.npy` with the answers; with a known
         map that is extended, the map is that one with what was seen. Scans whose place in the map
@@ -72,7 +75,8 @@ class Snapshot(ShortRepr):
         Raises:
             InputError: the folder is taken or cannot be written to.
         """
-        recording, answers = self.kept.load()
+        scratch = self._usable_scratch(nearest_folder_above(path))
+        recording, answers = self.kept.load(scratch)
         main, others = self.placement.main, self.placement.others()
         warnings = self._describe_lost(recording.stamp_ns, len(others))
         for text in warnings:
@@ -105,16 +109,20 @@ class Snapshot(ShortRepr):
     ) -> tuple[BuiltResult, Answers]:
         """The result of the scans of a submap, and the answers to them."""
         scans = np.flatnonzero(self.placement.submap == submap)
-        taken, given = take_scans(recording, answers, scans, self.scratch)
+        taken, given = take_scans(recording, answers, scans, recording.scratch)
         return self._map(taken, self.placement.poses[scans], progress), given
 
     def _map(
         self, recording: Recording, poses: NDArray[np.float64] | None, progress: Progress
     ) -> BuiltResult:
         found = map_recording(
-            recording, self.options, poses=poses, progress=progress, scratch=self.scratch
+            recording, self.options, poses=poses, progress=progress, scratch=recording.scratch
         )
         return BuiltResult(**vars(found))
+
+    def _usable_scratch(self, other: Path | None) -> Path | None:
+        """The folder of temporary files, or another one if its disk was full."""
+        return other if self.kept.disk_was_full else self.scratch
 
     def _describe_lost(self, stamp_ns: NDArray[np.int64], submaps: int) -> list[str]:
         """What a warning says about the scans whose place in the map is not known."""

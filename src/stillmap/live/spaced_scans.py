@@ -1,20 +1,19 @@
 """The spaced scans of a whole run, in temporary files: loops may lead back to any of them."""
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
-from stillmap.core.arrays import ArrayBuilder
+from stillmap.core.array_builder import QUICKLY_WRITTEN, ArrayBuilder, append_together
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.live.local_map import MappedScan
 from stillmap.live.scan import ScanBeams
 
 Float = NDArray[np.float64]
-
-_IN_MEMORY = 1 << 18  # bytes of each array that are not yet in its file
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,63 +47,53 @@ class SpacedScans:
     """
 
     def __init__(self, dimension: int, folder: Path | None = None) -> None:
-        self._arrays: list[ArrayBuilder] = []
-
-        def array(dtype: type, *row: int) -> ArrayBuilder:
-            self._arrays.append(ArrayBuilder(dtype, row, folder, _IN_MEMORY))
-            return self._arrays[-1]
-
         D = dimension
-        self._stamp_ns, self._count, self._sensor = array(np.int64), array(np.int64), array(int)
-        self._points, self._hit = array(np.float32, D), array(np.bool_)
-        self._e, self._poses = array(np.float32), array(np.float64, D + 1, D + 1)
-        self._travelled, self._explained = array(np.float64), array(np.float64)
-        self._drift = array(np.float64, 3, 3)
+        scan = [
+            ("stamp_ns", np.int64),
+            ("count", np.int64),
+            ("sensor", np.int64),
+            ("pose", np.float64, (D + 1, D + 1)),
+            ("travelled", np.float64),
+            ("explained", np.float64),
+            ("drift", np.float64, (3, 3)),
+        ]
+        fields: list[tuple[DTypeLike, tuple[int, ...]]]
+        fields = [(np.dtype(scan), ()), (np.float32, (D,)), (np.bool_, ()), (np.float32, ())]
+        self._arrays = [ArrayBuilder(t, row, folder, QUICKLY_WRITTEN) for t, row in fields]
+        self._scans, self._points, self._hit, self._e = self._arrays
+        self._scan = np.dtype(scan)
         self._mounts: dict[str | int, Float] = {}
 
     def __len__(self) -> int:
-        return len(self._stamp_ns)
+        return len(self._scans)
 
     def append(self, scan: MappedScan, explained: float, drift: Float) -> None:
-        """Append a scan; see `SpacedView`.
-
-        Raises:
-            OSError: the disk is full.
-        """
+        """Append a scan; see `SpacedView`. While the disk is full it stays in memory."""
         beams = scan.beams
         self._mounts.setdefault(beams.sensor, beams.T_base_sensor)
-        for array, value in (
-            (self._stamp_ns, beams.stamp_ns),
-            (self._count, len(beams.points)),
-            (self._sensor, list(self._mounts).index(beams.sensor)),
-            (self._travelled, scan.travelled),
-            (self._explained, explained),
-        ):
-            array.append(np.array([value]))
-        for array, rows in (
-            (self._points, beams.points),
-            (self._hit, beams.hit),
-            (self._e, scan.e),
-            (self._poses, scan.T_map_base[None]),
-            (self._drift, drift[None]),
-        ):
-            if len(rows):
-                array.append(rows)
+        row = np.zeros(1, self._scan)
+        row["stamp_ns"], row["count"] = beams.stamp_ns, len(beams.points)
+        row["sensor"] = list(self._mounts).index(beams.sensor)
+        row["pose"], row["travelled"] = scan.T_map_base, scan.travelled
+        row["explained"], row["drift"] = explained, drift
+        with suppress(OSError):
+            append_together(zip(self._arrays, (row, beams.points, beams.hit, scan.e), strict=True))
 
     def view(self) -> SpacedView:
         """All scans so far."""
-        offset = np.concatenate([np.zeros(1, np.int64), np.cumsum(self._count.view())])
+        scans = self._scans.view()
+        offset = np.concatenate([np.zeros(1, np.int64), np.cumsum(scans["count"])])
         recording = Recording(
-            stamp_ns=np.array(self._stamp_ns.view()),
+            stamp_ns=scans["stamp_ns"].copy(),
             offset=offset.astype(np.int64),
             points=self._points.view(),
             hit=self._hit.view(),
             T_base_sensor=np.array(list(self._mounts.values())),
-            sensor=self._sensor.view().astype(np.int32),
+            sensor=scans["sensor"].astype(np.int32),
             T_odom_base=None,
         )
-        arrays = (self._poses, self._travelled, self._explained, self._drift)
-        return SpacedView(recording, self._e.view(), *(np.array(a.view()) for a in arrays))
+        fields = (scans[name].copy() for name in ("pose", "travelled", "explained", "drift"))
+        return SpacedView(recording, self._e.view(), *fields)
 
     def scan(self, view: SpacedView, number: int) -> MappedScan:
         """One of the scans of a view."""

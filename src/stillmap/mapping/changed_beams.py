@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from stillmap import em
 from stillmap.core import arrays
+from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.chunks import iter_beams
 from stillmap.core.recording import Recording
 from stillmap.mapping.change_detection import Change
@@ -77,7 +78,7 @@ def find_changed_object_beams(
         for one in changes
         if one.kind != "comes and goes" or len(one.swept_cells) != len(one.cells)
     ]
-    found = arrays.ArrayBuilder(np.intp, (), recording.scratch)
+    found = ArrayBuilder(np.intp, (), recording.scratch)
     for block in arrays.iter_blocks(recording.hit, p_static) if stays else ():
         beam = block.start + np.flatnonzero(recording.hit[block] & (p_static[block] < 0.5))
         ends, scan = recording.end_points(beam, poses), recording.scans_of(beam)

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from stillmap import em
 from stillmap.core import se2
-from stillmap.core.arrays import ArrayBuilder, finite_rows, first_index_per_group
+from stillmap.core.array_builder import ArrayBuilder
+from stillmap.core.arrays import finite_rows, first_index_per_group
 from stillmap.core.parallel import map_ordered
 from stillmap.core.recording import Recording
 from stillmap.em import GroundMap

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
-from stillmap.core.arrays import ArrayBuilder
+from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.recording import Recording
 from stillmap.sim import lidar, ray_casting
 from stillmap.sim.dynamics import Moment, Progress

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays
+from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.tracking.association import ACCELERATION, MAX_GAP, assign_tracks
@@ -118,9 +119,9 @@ class _ObjectStore:
     _OF_SCANS: ClassVar = {"scan": np.intp, "stamp_ns": np.int64, "xy": float, "velocity": float}
 
     def __init__(self, scratch: Path | None) -> None:
-        self._beams = arrays.ArrayBuilder(np.intp, (), scratch)
+        self._beams = ArrayBuilder(np.intp, (), scratch)
         self._columns = {
-            name: arrays.ArrayBuilder(dtype, (2,) if dtype is float else (), scratch)
+            name: ArrayBuilder(dtype, (2,) if dtype is float else (), scratch)
             for name, dtype in self._OF_SCANS.items()
         }
         self._rows: list[tuple[int, int, tuple[float, ...], float]] = []

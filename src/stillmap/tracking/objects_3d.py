@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
-from stillmap.core.arrays import ArrayBuilder, take_rows
+from stillmap.core.array_builder import ArrayBuilder
+from stillmap.core.arrays import take_rows
 from stillmap.core.components import component_labels, neighbor_pairs
 from stillmap.core.parallel import map_ordered
 from stillmap.core.recording import Recording

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays
+from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.camera import Images
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
@@ -61,9 +62,9 @@ class _Joiner:
 
     def __init__(self, first: Recording, scratch: Path | None) -> None:
         self._dimension, self._scratch = first.dimension, scratch
-        self._points = arrays.ArrayBuilder(np.float32, (first.dimension,), scratch)
-        self._hit = arrays.ArrayBuilder(np.bool_, (), scratch)
-        self._times = arrays.ArrayBuilder(np.float32, (), scratch)
+        self._points = ArrayBuilder(np.float32, (first.dimension,), scratch)
+        self._hit = ArrayBuilder(np.bool_, (), scratch)
+        self._times = ArrayBuilder(np.float32, (), scratch)
         self._has_times = False
         self._scans: list[_Scans] = []
         self._sensors: list[Float] = []

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.advice import advise
-from stillmap.core.arrays import ArrayBuilder
+from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.timestamps import longest_non_decreasing
 from stillmap.io.builder import SkippedRecords
 from stillmap.io.ros.bag_types import Message

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.arrays import ArrayBuilder, release_pages, release_periodically
+from stillmap.core.array_builder import ArrayBuilder
+from stillmap.core.arrays import release_pages, release_periodically
 from stillmap.io.ros.laser_scan import LaserScans, ScanShape
 from stillmap.preprocessing import max_range
 from stillmap.preprocessing.options import MAX_PLAUSIBLE_RANGE, ReadOptions

@@ -2,14 +2,13 @@
 
 import json
 import logging
-import os
 import sys
 import threading
-import traceback
 from typing import IO
 
 from stillmap.core.errors import InputError, MissingExtra, import_extra
 from stillmap.core.extras import install_command
+from stillmap.live.child_process import serve
 from stillmap.live.foxglove.answer import unpack_answer, unpack_changes
 from stillmap.live.foxglove.mailbox import Mailbox
 from stillmap.live.messages import read_message
@@ -31,8 +30,8 @@ def _receive(stream: IO[bytes], mailbox: Mailbox) -> None:
         mailbox.close()
 
 
-def _serve(host: str, port: int) -> None:
-    """Serve until the other process has ended or has no more to say.
+def _publish(host: str, port: int) -> None:
+    """Publish what arrives until the other process has ended or has no more to say.
 
     Raises:
         InputError: the library is missing, or nobody can be served there.
@@ -62,20 +61,14 @@ def _tell(**content: object) -> None:
     sys.stdout.flush()
 
 
-def main() -> None:
-    """Serve the process that started this one."""
+def _work() -> None:
     logging.disable()  # about each client whose request is malformed
     try:
-        _serve(sys.argv[1], int(sys.argv[2]))
+        _publish(sys.argv[1], int(sys.argv[2]))
     except InputError as error:
         is_missing = isinstance(error, MissingExtra)
         _tell(what=error.what, where=error.where, hint=error.hint, is_missing=is_missing)
-    except BrokenPipeError:
-        os._exit(0)  # the other process has ended
-    except Exception:
-        traceback.print_exc()
-        os._exit(1)  # at once: a thread still reads
 
 
 if __name__ == "__main__":
-    main()
+    serve(_work)

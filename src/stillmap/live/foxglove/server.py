@@ -6,20 +6,17 @@ longer than a scan may take.
 
 import json
 import logging
-import subprocess
-import sys
-import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Iterator
 
 import numpy as np
 
 from stillmap.core.errors import InputError, MissingExtra
+from stillmap.live.child_process import ChildProcess
 from stillmap.live.foxglove.answer import Answer, pack_answer, pack_changes, to_answer
 from stillmap.live.foxglove.mailbox import Mail, Mailbox, keep_last
 from stillmap.live.mapper import LiveMapper
-from stillmap.live.messages import Arrays, write_message
+from stillmap.live.messages import Arrays
 from stillmap.live.scan import ScanBeams
 from stillmap.live.update import Update
 
@@ -27,7 +24,6 @@ HOST, PORT = "127.0.0.1", 8765
 
 _log = logging.getLogger(__name__)
 
-_SECONDS_TO_END = 5.0  # before the process is killed
 _SLOW_PERIOD = 1.0  # s between two paths, and between two scans where nobody looks
 _FAST_PERIOD = 0.02  # s at least between two scans: nobody sees more
 _TILES_PER_MESSAGE = 64
@@ -45,27 +41,17 @@ class FoxgloveServer:
     """
 
     def __init__(self, host: str = HOST, port: int = PORT) -> None:
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "stillmap.live.foxglove.process", host, str(port)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            process_group=0,  # Ctrl-C is for this process alone
-        )
+        self._process = ChildProcess("stillmap.live.foxglove.process", host, str(port))
         self._mailbox, self._is_watched, self._is_closing = Mailbox(), False, False
         self._slow_due = 0.0
         self._mapper: LiveMapper | None = None
         self._last = dict[str | int, Answer]()  # of each sensor, for who comes while none arrives
-        self._threads: Sequence[threading.Thread] = ()
         try:
             self.url = f"ws://{_in_url(host)}:{self._read_port()}"
         except BaseException:
             self.close()
             raise
-        self._threads = [
-            threading.Thread(target=work, daemon=True) for work in (self._send, self._listen)
-        ]
-        for thread in self._threads:
-            thread.start()
+        self._process.start(self._send, self._listen)
 
     @property
     def is_watched(self) -> bool:
@@ -75,7 +61,7 @@ class FoxgloveServer:
     @property
     def process_id(self) -> int:
         """Of the process that serves."""
-        return self._process.pid
+        return self._process.id
 
     def show(self, mapper: LiveMapper, beams: ScanBeams, update: Update) -> None:
         """Show what the mapper answered to a scan. Never waits: what nobody takes is dropped.
@@ -105,21 +91,7 @@ class FoxgloveServer:
         """End the process."""
         self._is_closing = True
         self._mailbox.close()
-        stdin, stdout = self._process.stdin, self._process.stdout
-        assert stdin is not None
-        assert stdout is not None
-        if not self._threads:
-            stdin.close()
-        try:
-            self._process.wait(_SECONDS_TO_END)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        for thread in self._threads:
-            thread.join()
-        with suppress(BrokenPipeError):
-            stdin.close()
-        stdout.close()
+        self._process.stop()
 
     def __enter__(self) -> "FoxgloveServer":
         return self
@@ -129,7 +101,6 @@ class FoxgloveServer:
 
     def _read_port(self) -> int:
         """The port, as soon as the process listens."""
-        assert self._process.stdout is not None
         line = self._process.stdout.readline()
         if not line:
             raise RuntimeError("the process that serves the live view has ended")
@@ -141,19 +112,15 @@ class FoxgloveServer:
 
     def _send(self) -> None:
         """Write what is in the mailbox until it is closed."""
-        stream = self._process.stdin
-        assert stream is not None
-        with suppress(BrokenPipeError):
-            while (mail := self._mailbox.take()) is not None:
-                for arrays in _to_messages(mail):
-                    write_message(stream, arrays)
-                time.sleep(_FAST_PERIOD)
-        with suppress(BrokenPipeError):
-            stream.close()
+        self._process.send(self._messages())
+
+    def _messages(self) -> Iterator[Arrays]:
+        while (mail := self._mailbox.take()) is not None:
+            yield from _to_messages(mail)
+            time.sleep(_FAST_PERIOD)
 
     def _listen(self) -> None:
         """Note whether anybody looks, until the process ends."""
-        assert self._process.stdout is not None
         for line in self._process.stdout:
             self._is_watched = bool(json.loads(line)["is_watched"])
             for answer in list(self._last.values()) if self._is_watched else []:

@@ -1,0 +1,136 @@
+"""A disk that is full while the robot drives: mapping goes on, and what fits is kept."""
+
+import itertools
+import shutil
+
+import numpy as np
+import pytest
+
+import stillmap
+from stillmap.live import beam_store
+from stillmap.live.beam_store import BeamStore, join_parts
+from stillmap.live.loop_process import LoopProcess
+from stillmap.live.mapper import LiveMapper
+
+FULL = 9_000  # bytes of each file: fewer than are written at once
+FIELDS = [(np.float32, (2,)), (np.int64, ())]  # 16 bytes a beam
+
+
+def append(store, numbers, beams=50):
+    for number in numbers:
+        store.append(number, [np.full((beams, 2), number, np.float32), np.full(beams, number)])
+
+
+def kept_of(store, tmp_path):
+    """The numbers of the scans that are kept, of which all beams are there."""
+    kept, counts = store.kept, store.counts
+    points, numbers = join_parts(store.parts(), tmp_path)
+    np.testing.assert_array_equal(numbers, np.repeat(kept, counts))
+    np.testing.assert_array_equal(points[:, 1], numbers)
+    return kept
+
+
+@pytest.fixture
+def small_memory(monkeypatch):
+    monkeypatch.setattr(beam_store, "QUICKLY_WRITTEN", 10_000)
+    monkeypatch.setattr(beam_store, "_free_bytes", lambda _: 0)
+    monkeypatch.setattr(beam_store, "_IN_MEMORY_IF_FULL", 1_600_000)
+    return 1_600_000
+
+
+def test_scans_are_dropped_evenly_while_the_disk_is_full(
+    tmp_path, limit_files, small_memory, caplog
+):
+    store = BeamStore(FIELDS, tmp_path, None)
+    append(store, range(5000))
+    limit_files(FULL)
+    append(store, range(5000, 13_000))
+    held = sum(segment.memory_bytes for segment in store._segments)
+    assert held < 1.2 * small_memory
+    limit_files(None)
+    kept = kept_of(store, tmp_path)
+    assert kept[:5000].tolist() == list(range(5000))
+    assert kept[-1] == 12_999
+    assert np.diff(kept).max() <= 16  # of 8000 scans there is room for 2000
+    assert store.was_full
+    assert len(caplog.records) == 1
+    assert "mapping goes on" in caplog.text
+    store.close()
+
+
+def test_all_scans_are_kept_again_once_there_is_room(tmp_path, limit_files, small_memory):
+    store = BeamStore(FIELDS, tmp_path, None)
+    limit_files(FULL)
+    append(store, range(4000))
+    assert store.was_full
+    limit_files(None)
+    append(store, range(4000, 10_000))
+    assert sum(segment.memory_bytes for segment in store._segments) < 1.2 * small_memory
+    kept = kept_of(store, tmp_path)
+    assert np.count_nonzero(kept >= 4000) == 6000
+    assert len(store._segments) < 20
+    store.close()
+
+
+def test_a_bounded_store_stays_even_on_a_full_disk(tmp_path, limit_files, small_memory):
+    bound = 2 * small_memory
+    store = BeamStore(FIELDS, tmp_path, bound)
+    append(store, range(8000))
+    limit_files(FULL)
+    append(store, range(8000, 20_000))
+    limit_files(None)
+    kept = kept_of(store, tmp_path)
+    assert store.was_full
+    assert kept[-1] == 19_999
+    assert np.diff(kept).max() <= 64
+    assert len(kept) * 800 > 0.3 * small_memory
+    store.close()
+
+
+def test_a_drive_goes_on_while_the_disk_is_full(corridor, tmp_path, limit_files, caplog):
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    odometry, count = corridor.recording.T_odom_base, 200
+    with LiveMapper({"threads": 1}, scratch=scratch) as mapper:
+        for t, beams in enumerate(corridor.beams[:count]):
+            if t == 50:
+                limit_files(100_000)
+            update = mapper.push(beams, odometry[t])
+            np.testing.assert_array_equal(update.pose, corridor.updates[t].pose)
+            np.testing.assert_array_equal(update.p_static, corridor.updates[t].p_static)
+        assert len(mapper.poses) == count
+        limit_files(None)
+        shutil.rmtree(scratch)  # only the disk of the result has room
+        mapper.save(tmp_path / "out")
+        assert len(mapper.objects) > 0
+    assert len(stillmap.load(tmp_path / "out").poses) == count
+    given = np.load(tmp_path / "out/live/beams/p_static.npy")
+    np.testing.assert_array_equal(given, corridor.p_static[: len(given)])
+    assert sum("mapping goes on" in record.getMessage() for record in caplog.records) == 1
+
+
+def test_a_result_says_that_scans_are_missing(corridor, tmp_path, limit_files, monkeypatch):
+    monkeypatch.setattr(beam_store, "_IN_MEMORY_IF_FULL", 800_000)
+    with LiveMapper({"threads": 1}, scratch=tmp_path) as mapper:
+        limit_files(150_000)
+        for t, beams in enumerate(corridor.beams):
+            mapper.push(beams, corridor.recording.T_odom_base[t])
+        limit_files(None)
+        mapper.save(tmp_path / "out")
+    saved = stillmap.load(tmp_path / "out")
+    assert 50 < len(saved.poses) < len(corridor.beams)
+    (told,) = [what for what in saved.run["warnings"] if "full" in what]
+    assert f"{len(corridor.beams)} scans {len(saved.poses)} were kept" in told
+
+
+def test_loops_are_closed_beside_while_the_disk_is_full(corridor, tmp_path, limit_files):
+    limit_files(100_000)
+    with LiveMapper({"threads": 1}, scratch=tmp_path, background=True) as mapper:
+        odometry = corridor.recording.T_odom_base
+        for t, beams in enumerate(itertools.islice(corridor.beams, 300)):
+            mapper.push(beams, odometry[t])
+        closer = mapper._frame._closer
+        assert isinstance(closer, LoopProcess)
+        closer.poll()
+        assert not closer._process.has_ended
+        limit_files(None)
