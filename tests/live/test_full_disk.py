@@ -129,7 +129,7 @@ def test_loops_are_closed_beside_while_the_disk_is_full(corridor, tmp_path, limi
         odometry = corridor.recording.T_odom_base
         for t, beams in enumerate(itertools.islice(corridor.beams, 300)):
             mapper.push(beams, odometry[t])
-        closer = mapper._frame._closer
+        closer = mapper._slam.frame._closer
         assert isinstance(closer, LoopProcess)
         closer.poll()
         assert not closer._process.has_ended

@@ -72,8 +72,8 @@ def take_scans(
         arrays.append(recording.beam_time)
     runs = np.split(scans, np.flatnonzero(np.diff(scans) > 1) + 1) if len(scans) else []
     spans = [slice(recording.offset[run[0]], recording.offset[run[-1] + 1]) for run in runs]
-    parts = [[array[span] for array in arrays] for span in spans or [slice(0, 0)]]
-    points, hit, p_static, *times = join_parts(parts, scratch)
+    fields = [[array[span] for span in spans or [slice(0, 0)]] for array in arrays]
+    points, hit, p_static, *times = join_parts(fields, scratch)
     counts = np.diff(recording.offset)[scans]
     odometry = recording.T_odom_base
     taken = replace(
