@@ -18,6 +18,10 @@ from stillmap.slam.local_map import SCAN_SPACING, SPACING_PER_SECOND
 
 Float = NDArray[np.float64]
 
+_LABELLED_AFTER_NS = 10**9  # after which scans are labelled again
+_MAX_TRAVEL = 25.0  # m after which scans leave
+_MAX_DELAY_NS, _MAX_DELAY = 250_000_000, 1.0  # ns and m by which both may be late
+
 
 @dataclass(frozen=True, eq=False)
 class MappedScan(ShortRepr):
@@ -135,6 +139,24 @@ class LocalMap:
         last = self._last.get(scan.beams.sensor)
         if last is None or last.beams.stamp_ns <= scan.beams.stamp_ns:
             self._last[scan.beams.sensor] = scan
+
+
+def tend(
+    local_map: MatchMap, stamp_ns: int, travelled: float, label: Labeller, most: int | None
+) -> None:
+    """Label the scans of a map again after a second, and remove those of long ago.
+
+    Args:
+        local_map: at a time, after so many metres of travel.
+        most: scans for which this is done now, unless it is overdue; None: all.
+    """
+    due_ns, left = stamp_ns - _LABELLED_AFTER_NS, travelled - _MAX_TRAVEL
+    if most is not None:
+        most -= local_map.relabel(due_ns, label, most)
+        local_map.remove_before(left, most)
+        due_ns, left = due_ns - _MAX_DELAY_NS, left - _MAX_DELAY
+    local_map.relabel(due_ns, label)
+    local_map.remove_before(left)
 
 
 def take_until(scans: deque[MappedScan], until_ns: int) -> Iterable[MappedScan]:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.live.front_end import Registration
-from stillmap.live.local_map import Labeller, LocalMap, MappedScan, MatchMap
+from stillmap.live.local_map import Labeller, LocalMap, MappedScan, MatchMap, tend
 from stillmap.live.scan import ScanBeams, deskew
 from stillmap.live.scan_hits import select_hits, thin
 from stillmap.live.wall_directions import WallDirections, correct_heading
@@ -30,10 +30,7 @@ from stillmap.slam.scan_matching import (
 
 Float = NDArray[np.float64]
 
-_LABELLED_AFTER_NS = 10**9  # after which scans of the local map are labelled again
-_MAX_TRAVEL = 25.0  # m after which scans leave the local map
-# s between fast scans; ns and m that they may be late with both
-_FAST, _MAX_DELAY_NS, _MAX_DELAY = 0.05, 250_000_000, 1.0
+_FAST = 0.05  # s between fast scans: work that is due for several ones would delay their poses
 _EXPLAINED_RATE = 0.1  # weight of one scan in the running average of the explained share
 _LEAP = 1.0  # m between two scans, and times the speed below, beyond which odometry has leaped
 _DISTRUST_NS = 10**9  # after a leap, in which smaller ones are none of odometry either
@@ -159,19 +156,9 @@ class ScanOdometry:
             return None
         scan = MappedScan(beams, e, self._pose, self.travelled)
         added = self.local_map.add(replace(scan, e=recent))
-        self._tend_local_map(beams.stamp_ns, label, is_idle=not added)
+        most = None if self._seconds >= _FAST else 0 if added else 1
+        tend(self.local_map, beams.stamp_ns, self.travelled, label, most)
         return scan if added else None
-
-    def _tend_local_map(self, stamp_ns: int, label: Labeller, *, is_idle: bool) -> None:
-        """Label scans of the local map again and remove old ones; of fast scans one with each that
-        was not added itself, for several would delay its pose."""
-        due_ns, travelled = stamp_ns - _LABELLED_AFTER_NS, self.travelled - _MAX_TRAVEL
-        if self._seconds < _FAST:
-            if is_idle and not self.local_map.relabel(due_ns, label, most=1):
-                self.local_map.remove_before(travelled, most=1)
-            due_ns, travelled = due_ns - _MAX_DELAY_NS, travelled - _MAX_DELAY
-        self.local_map.relabel(due_ns, label)
-        self.local_map.remove_before(travelled)
 
     def enter(self, local_map: MatchMap, T: Float) -> None:
         """Go on in another map, in whose frame the frame so far has the pose T (3, 3)."""
