@@ -112,7 +112,8 @@ class CausalLabels:
         """(N,) P(static) of hits that end at points (N, D) in the base frame, with the prior of the
         map."""
         every, offset = np.ones(len(points), np.bool_), np.array([0, len(points)])
-        return self.filter.label(points, every, offset, T_map_base[None], _MAP_PRIOR)
+        T = T_map_base[None]
+        return self.filter.label(points, every, offset, T, _MAP_PRIOR, threads=self._threads)
 
     def doubt(self, e: NDArray[np.float32]) -> NDArray[np.float32]:
         """(N,) P(static) of `label` with the prior of what was only just seen."""
