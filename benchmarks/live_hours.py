@@ -51,7 +51,7 @@ def main() -> None:
             mapper.push(scan, None if odometry is None else odometry[t])
             ms.append(1e3 * (time.perf_counter() - due))
             if (n + 1) % every == 0 or n + 1 == count:
-                child = _resident_mb(str(mapper._slam.frame._closer._process.pid))
+                child = _resident_mb(str(mapper._slam.frame._closer._process.id))
                 lines.append(_line(n + 1, period, ms[-every:], late, before, child))
                 print(" | ".join(lines[-1]), flush=True)
     lines.append(_line(count, period, ms, late, before, 0.0))
