@@ -150,6 +150,16 @@ def read_text(path: Path, max_bytes: int) -> str:
     return content.decode("utf-8")
 
 
+def to_encodable(text: str) -> str:
+    """A text that UTF-8 can hold: bytes of file names that are no UTF-8 become escapes."""
+    return text.encode("utf-8", "backslashreplace").decode("utf-8")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text as UTF-8; see `to_encodable`."""
+    path.write_bytes(to_encodable(text).encode("utf-8"))
+
+
 def require_regular(path: Path) -> None:
     """Reject pipes and devices, on which reading may block for ever.
 
