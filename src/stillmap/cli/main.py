@@ -34,29 +34,34 @@ def main(argv: list[str] | None = None) -> int:
         if sys.stdout is not None:  # None: closed before the start
             sys.stdout.flush()
         return status
-    except InputError as error:
-        fail(str(in_flags(_with_similar_name(error, args))))
-        return EXIT_INPUT
+    except Exception as error:
+        return _report_failure(error, args)
     except KeyboardInterrupt:
         return _report_interrupt()
-    except BrokenPipeError:
+
+
+def _report_failure(error: Exception, args: argparse.Namespace) -> int:
+    """Print why the command failed; the exit status."""
+    # a clean-up may fail, too, as on a terminal that has gone
+    cause = _find_interrupt(error)
+    if cause is not None:
+        return EXIT_TERMINATED if isinstance(cause, SystemExit) else _report_interrupt()
+    if isinstance(error, InputError):
+        fail(str(in_flags(_with_similar_name(error, args))))
+    elif isinstance(error, BrokenPipeError):
         # the reader of stdout has closed it: not an error
         _drop_stdout()
         return 0
-    except OSError as error:
+    elif isinstance(error, OSError):
         # a full disk behind stdout, or a file that vanished while it was read
         fail(f"{error.filename or 'the output'}: {error.strerror or error}")
         _drop_stdout()
-        return EXIT_INPUT
-    except MemoryError as error:
+    elif isinstance(error, MemoryError):
         fail(f"not enough memory{': ' if str(error) else ''}{error}")
-        return EXIT_INPUT
-    except Exception as error:
-        cause = _find_interrupt(error)
-        if cause is not None:
-            return EXIT_TERMINATED if isinstance(cause, SystemExit) else _report_interrupt()
+    else:
         _report_defect(error)
         return EXIT_DEFECT
+    return EXIT_INPUT
 
 
 def _parse(words: list[str]) -> argparse.Namespace:
