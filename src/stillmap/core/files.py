@@ -93,11 +93,11 @@ def atomic_folder(
             but cannot take its place is kept: the message says where.
     """
     given, path = path, resolve_output(path)
+    remove_stale(path)
     require_new(given, marker, overwrite)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         finish_exchange(path)
-        remove_stale(path)
         with temporary_folder(path, staging_folder) as work:
             yield work
             work.chmod(0o777 & ~_umask())
