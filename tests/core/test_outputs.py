@@ -1,9 +1,10 @@
-"""Outputs appear whole or not at all: through links, on mount points, with long names, side by side."""
+"""Outputs appear whole or not at all: behind links, on mount points, with long names."""
 
 import errno
 import os
 import shutil
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -33,9 +34,25 @@ def content(folder: Path) -> dict[str, str]:
     }
 
 
-def write(path: Path, files: dict[str, str] = NEW, **options: bool) -> None:
-    with atomic_folder(path, "mark", **options) as work:
+def write(
+    path: Path,
+    files: dict[str, str] = NEW,
+    overwrite: bool = False,
+    meanwhile: Callable[[], None] = lambda: None,
+) -> None:
+    with atomic_folder(path, "mark", overwrite) as work:
         fill(work, files)
+        meanwhile()
+
+
+def write_file(path: Path, text: str, meanwhile: Callable[[], None] = lambda: None) -> None:
+    with atomic_file(path) as work:
+        work.write_text(text)
+        meanwhile()
+
+
+def stop() -> None:
+    raise RuntimeError("stop")
 
 
 @pytest.fixture
@@ -146,8 +163,8 @@ def test_temporary_name_cannot_be_taken_before(tmp_path, monkeypatch):
     monkeypatch.setattr("secrets.token_hex", lambda _: "0" * 16)
     (tmp_path / "victim").write_text("mine")
     (tmp_path / f".file.{'0' * 16}.part").symlink_to("victim")
-    with pytest.raises(InputError, match="File exists"), atomic_file(tmp_path / "file") as work:
-        work.write_text("new")
+    with pytest.raises(InputError, match="File exists"):
+        write_file(tmp_path / "file", "new")
     assert (tmp_path / "victim").read_text() == "mine"
 
 
@@ -164,9 +181,8 @@ def test_folder_that_cannot_be_renamed(fixed, tmp_path):
 
 def test_failure_before_the_exchange_leaves_the_earlier_folder(fixed):
     write(fixed, OLD)
-    with pytest.raises(RuntimeError, match="stop"), atomic_folder(fixed, "mark", True) as work:
-        fill(work, NEW)
-        raise RuntimeError("stop")
+    with pytest.raises(RuntimeError, match="stop"):
+        write(fixed, NEW, True, stop)
     assert content(fixed) == OLD
 
 
@@ -246,17 +262,16 @@ def test_file_that_cannot_be_replaced_is_written_in_place(tmp_path, monkeypatch,
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr("os.replace", refuse)
-    with atomic_file(path) as work:
-        work.write_text(text)
+    write_file(path, text)
     assert path.read_text() == text
     assert os.listdir(tmp_path) == ["file"]
 
-    def stop(*_):
+    def fail(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr("shutil.copyfileobj", stop)
-    with pytest.raises(InputError, match="No space") as failed, atomic_file(path) as work:
-        work.write_text(text)
+    monkeypatch.setattr("shutil.copyfileobj", fail)
+    with pytest.raises(InputError, match="No space") as failed:
+        write_file(path, text)
     assert path.read_bytes() == b""
     kept = Path(failed.value.hint.removeprefix("what was made is kept in "))
     assert kept.read_text() == text
@@ -264,15 +279,13 @@ def test_file_that_cannot_be_replaced_is_written_in_place(tmp_path, monkeypatch,
 
 def test_what_was_finished_is_kept_where_its_place_is_taken(tmp_path):
     path = tmp_path / "out"
-    with pytest.raises(InputError, match="already holds") as failed, atomic_folder(path, "m") as at:
-        fill(at, NEW)
-        fill(path, {"mine": "mine"})
+    with pytest.raises(InputError, match="already holds") as failed:
+        write(path, meanwhile=lambda: fill(path, {"mine": "mine"}))
     assert content(path) == {"mine": "mine"}
     kept = Path(failed.value.hint.removeprefix("what was made is kept in "))
     assert content(kept) == NEW
-    with pytest.raises(InputError, match="has appeared") as failed, atomic_file(path / "f") as work:
-        work.write_text("new")
-        (path / "f").write_text("mine")
+    with pytest.raises(InputError, match="has appeared") as failed:
+        write_file(path / "f", "new", lambda: fill(path, {"f": "mine"}))
     kept = Path(failed.value.hint.removeprefix("what was made is kept in "))
     assert (kept.read_text(), (path / "f").read_text()) == ("new", "mine")
 
