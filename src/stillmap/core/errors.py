@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from importlib import import_module
 from typing import Any
 
-from stillmap.core.extras import install_command
+from stillmap.core.extras import install_hint
 
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f]")
 
@@ -75,5 +75,5 @@ def import_extra(module: str, path: object, action: str = "read", *, group: str 
     except ImportError as error:
         package = module.partition(".")[0]
         raise MissingExtra(
-            f"needs {package} to be {action}", where=str(path), hint=install_command(group)
+            f"needs {package} to be {action}", where=str(path), hint=install_hint(package, group)
         ) from error
