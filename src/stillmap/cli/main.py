@@ -5,6 +5,7 @@ import io
 import logging
 import os
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 from stillmap.cli.console import EXIT_INTERRUPTED, EXIT_TERMINATED, fail, handle_signals, say
@@ -139,5 +140,5 @@ def _report_interrupt() -> int:
 
 def _drop_stdout() -> None:
     """Discard what is buffered, which would fail once more when Python exits."""
-    if sys.stdout is not None:
+    with suppress(OSError, AttributeError):  # None: closed before the start; or no file
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -181,7 +181,8 @@ def _kept_on_failure(work: Path, path: Path) -> Iterator[None]:
         if os.path.lexists(resolve_output(path) / UNFINISHED):
             hint = "its new files lie inside; overwrite=True goes on"
         else:
-            hint = f"what was made is kept in {keep(work, path)}"
+            kept = keep(work, path)
+            hint = "" if kept is None else f"what was made is kept in {kept}"
         raise InputError(what, where=str(path), hint=hint) from error
 
 

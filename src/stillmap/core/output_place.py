@@ -27,10 +27,16 @@ def resolve_output(path: Path) -> Path:
     """The absolute path of an output without links: what they point to is replaced, not they.
 
     Raises:
-        InputError: links lead to each other.
+        InputError: links lead to each other, or no file can have such a name there.
     """
     found = Path(os.path.realpath(path))
-    if found.is_symlink():
+    try:
+        is_loop = stat.S_ISLNK(found.lstat().st_mode)
+    except (FileNotFoundError, NotADirectoryError):
+        is_loop = False
+    except OSError as error:
+        raise InputError(f"cannot be written: {error.strerror}", where=str(path)) from error
+    if is_loop:
         raise InputError("is a link that leads to itself", where=str(path))
     return found
 

@@ -214,16 +214,16 @@ def _write_in_place(work: Path, path: Path) -> None:
             raise
 
 
-def keep(work: Path, path: Path) -> Path:
+def keep(work: Path, path: Path) -> Path | None:
     """Give finished work that cannot be moved to its place a name beside it that stays.
 
     Returns:
-        Where it lies now.
+        Where it lies now; None where it has gone.
     """
     name = hidden_path(path, f"{secrets.token_hex(4)}.kept")
     kept = name.with_name(name.name.lstrip("."))
     try:
         os.rename(work, kept)
     except OSError:
-        return work
+        return work if os.path.lexists(work) else None
     return kept

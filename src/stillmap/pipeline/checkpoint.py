@@ -52,6 +52,8 @@ class CheckpointFolder:
     @property
     def newest(self) -> Path | None:
         """The last complete checkpoint; None where there is none."""
+        if not self.folder.is_dir():  # somebody has removed it
+            return None
         numbers = [
             int(path.name.removeprefix("iteration-"))
             for path in self.folder.iterdir()
