@@ -128,9 +128,13 @@ def _report_defect(error: Exception) -> None:
 
 def _find_interrupt(error: BaseException | None) -> BaseException | None:
     """The Ctrl-C or SIGTERM that an error was raised from during clean-up, or None."""
-    while error is not None and not isinstance(error, KeyboardInterrupt | SystemExit):
+    seen = list[BaseException]()  # a library may raise an error from a later one
+    while error is not None and not any(error is one for one in seen):
+        if isinstance(error, KeyboardInterrupt | SystemExit):
+            return error
+        seen.append(error)
         error = error.__cause__ or error.__context__
-    return error
+    return None
 
 
 def _report_interrupt() -> int:

@@ -105,7 +105,9 @@ def atomic_folder(
                 require_new(given, marker, overwrite)  # it may have appeared meanwhile
                 publish_folder(work, path, marker)
     except OSError as error:
-        raise InputError(f"cannot be written: {error.strerror}", where=str(given)) from error
+        raise InputError(
+            f"cannot be written: {error.strerror or error}", where=str(given)
+        ) from error
 
 
 @contextmanager
@@ -152,7 +154,9 @@ def atomic_file(path: Path) -> Iterator[Path]:
                         raise InputError("has appeared meanwhile", where=str(given))
                     publish_file(work, path)
     except OSError as error:
-        raise InputError(f"cannot be written: {error.strerror}", where=str(given)) from error
+        raise InputError(
+            f"cannot be written: {error.strerror or error}", where=str(given)
+        ) from error
 
 
 @contextmanager
@@ -177,7 +181,7 @@ def _kept_on_failure(work: Path, path: Path) -> Iterator[None]:
         if isinstance(error, InputError):
             what = error.what
         else:
-            what = f"cannot be written: {error.strerror}"
+            what = f"cannot be written: {error.strerror or error}"
         if os.path.lexists(resolve_output(path) / UNFINISHED):
             hint = "its new files lie inside; overwrite=True goes on"
         else:

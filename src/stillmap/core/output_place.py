@@ -35,7 +35,9 @@ def resolve_output(path: Path) -> Path:
     except (FileNotFoundError, NotADirectoryError):
         is_loop = False
     except OSError as error:
-        raise InputError(f"cannot be written: {error.strerror}", where=str(path)) from error
+        raise InputError(
+            f"cannot be written: {error.strerror or error}", where=str(path)
+        ) from error
     if is_loop:
         raise InputError("is a link that leads to itself", where=str(path))
     return found

@@ -167,7 +167,9 @@ def lock_checkpoints(output: Path) -> Iterator[CheckpointFolder]:
     try:
         file = _open_lock(folder, given)
     except OSError as error:
-        raise InputError(f"cannot be written: {error.strerror}", where=str(given)) from error
+        raise InputError(
+            f"cannot be written: {error.strerror or error}", where=str(given)
+        ) from error
     checkpoints = CheckpointFolder(folder)
     try:
         finish_exchange(output)
