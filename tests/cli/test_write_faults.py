@@ -257,7 +257,6 @@ def test_fault(call, inputs, tmp_path, writer, fault):
     with fault.make(tmp_path, stem + writer.ending, writer) as output:
         known = _names(tmp_path)
         done = call(*words, "-o", output, "--quiet", *more)
-        print(done.stderr)
         assert done.returncode in fault.statuses, done.stderr
         if done.returncode == 0:
             _check_output(output, writer)

@@ -7,7 +7,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stillmap.core.errors import InputError
+from stillmap.core.errors import InputError, cannot_write
 
 if TYPE_CHECKING:
     from stillmap.preprocessing.options import ReadOptions
@@ -168,8 +168,7 @@ def make_parents(output: Path) -> Iterator[None]:
                 with temporary_folder(output):
                     pass
         except OSError as error:
-            what = f"cannot be written: {error.strerror or error}"
-            raise InputError(what, where=str(output)) from error
+            raise cannot_write(error, output) from error
         yield
     except BaseException:
         with suppress(OSError):  # not empty

@@ -35,6 +35,11 @@ class InputError(Exception):
         return _CONTROL.sub(lambda found: f"\\x{ord(found[0]):02x}", line)
 
 
+def cannot_write(error: OSError, path: object) -> InputError:
+    """The error of an output that the system refuses to write."""
+    return InputError(f"cannot be written: {error.strerror or error}", where=str(path))
+
+
 def _truncate(text: str) -> str:
     return text if len(text) <= _MAX_LENGTH else f"{text[: _MAX_LENGTH - 3]}..."
 

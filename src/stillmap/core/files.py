@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from stillmap.core.errors import InputError
+from stillmap.core.errors import InputError, cannot_write
 from stillmap.core.output_place import (
     UNFINISHED,
     hidden_path,
@@ -105,9 +105,7 @@ def atomic_folder(
                 require_new(given, marker, overwrite)  # it may have appeared meanwhile
                 publish_folder(work, path, marker)
     except OSError as error:
-        raise InputError(
-            f"cannot be written: {error.strerror or error}", where=str(given)
-        ) from error
+        raise cannot_write(error, given) from error
 
 
 @contextmanager
@@ -154,9 +152,7 @@ def atomic_file(path: Path) -> Iterator[Path]:
                         raise InputError("has appeared meanwhile", where=str(given))
                     publish_file(work, path)
     except OSError as error:
-        raise InputError(
-            f"cannot be written: {error.strerror or error}", where=str(given)
-        ) from error
+        raise cannot_write(error, given) from error
 
 
 @contextmanager
@@ -178,10 +174,7 @@ def _kept_on_failure(work: Path, path: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, InputError) as error:
-        if isinstance(error, InputError):
-            what = error.what
-        else:
-            what = f"cannot be written: {error.strerror or error}"
+        what = (error if isinstance(error, InputError) else cannot_write(error, path)).what
         if os.path.lexists(resolve_output(path) / UNFINISHED):
             hint = "its new files lie inside; overwrite=True goes on"
         else:

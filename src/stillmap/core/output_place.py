@@ -11,12 +11,13 @@ import stat
 import tempfile
 from pathlib import Path
 
-from stillmap.core.errors import InputError
+from stillmap.core.errors import InputError, cannot_write
 
 PREFIX = ".stillmap."  # of hidden names inside an output
 UNFINISHED = f"{PREFIX}unfinished"  # the journal of a folder whose files are being exchanged
 
-_MAX_STEM = 200  # bytes of a name, of 255 that file systems allow
+# bytes of a name to which something is added: file systems allow 255, and SQLite 512 of a path
+_MAX_STEM = 100
 _RANDOM = re.compile(r"[0-9a-f]{16}\.(part|old)")
 _OF_DISKS = "lost+found"  # in the uppermost folder of a disk
 _MOUNTS = Path("/proc/self/mountinfo")
@@ -35,9 +36,7 @@ def resolve_output(path: Path) -> Path:
     except (FileNotFoundError, NotADirectoryError):
         is_loop = False
     except OSError as error:
-        raise InputError(
-            f"cannot be written: {error.strerror or error}", where=str(path)
-        ) from error
+        raise cannot_write(error, path) from error
     if is_loop:
         raise InputError("is a link that leads to itself", where=str(path))
     return found

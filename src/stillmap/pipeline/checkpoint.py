@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.arrays import iter_bytes, write_npy
-from stillmap.core.errors import InputError
+from stillmap.core.errors import InputError, cannot_write
 from stillmap.core.files import sync
 from stillmap.core.output_place import hidden_path, resolve_output
 from stillmap.core.profiling import StageTimer
@@ -167,9 +167,7 @@ def lock_checkpoints(output: Path) -> Iterator[CheckpointFolder]:
     try:
         file = _open_lock(folder, given)
     except OSError as error:
-        raise InputError(
-            f"cannot be written: {error.strerror or error}", where=str(given)
-        ) from error
+        raise cannot_write(error, given) from error
     checkpoints = CheckpointFolder(folder)
     try:
         finish_exchange(output)

@@ -156,8 +156,7 @@ def new_bag(
             return
         mcap |= kind == "mcap"
         plugin = rosbag2.StoragePlugin.MCAP if mcap else rosbag2.StoragePlugin.SQLITE3
-        named = resolve_output(path)
-        folder = beside / shorten(named.stem if kind != "ros2" else named.name)
+        folder = beside / (shorten(resolve_output(path).name) if kind == "ros2" else "bag")
         writer2 = rosbag2.Writer(folder, version=_VERSION, storage_plugin=plugin)
         if mcap:
             compression = rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD
