@@ -62,7 +62,8 @@ def _write(line: str) -> None:
     if sys.stderr is None:
         return
     try:
-        print(line, file=sys.stderr, flush=True)
+        # names need not be UTF-8, and a caller may have put another stream there
+        print(line.encode("utf-8", "backslashreplace").decode(), file=sys.stderr, flush=True)
     except OSError:  # closed by the reader, a full disk, or a terminal that has gone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
 
