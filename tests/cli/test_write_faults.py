@@ -268,6 +268,26 @@ def test_fault(call, inputs, tmp_path, writer, fault):
     _check_what_is_left(left, done, output)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in FAULTS if name not in ("vanishes", "mount")])
+def test_fleet(call, room, tmp_path, name):
+    """Its tasks are processes of their own, where faults cannot be set from here."""
+    fault, writer = FAULTS[name], Writer(())
+    with fault.make(tmp_path, fault.stem, writer) as output:
+        known = _names(tmp_path)
+        done = call("fleet", room, "-o", output, "--quiet", *QUICK)
+        assert done.returncode in fault.statuses, done.stderr
+        if done.returncode == 0:
+            assert (output / "fleet.html").is_file()
+            assert os.listdir(output / "results") == ["room"]
+        else:
+            assert done.stderr.count("\n") == 1
+            assert done.stderr.startswith("stillmap: ")
+        left = {one.split("/")[0] for one in _names(tmp_path) - known}
+    # what a fleet has noted stays: the same command goes on
+    assert left <= {output.name, "disk"}
+
+
 def _stamps(folder: Path) -> dict[str, int]:
     return {str(path): path.stat().st_mtime_ns for path in folder.rglob("*")}
 
