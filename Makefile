@@ -7,6 +7,7 @@
 #   make pictures  the pictures of README.md and of the documentation, from simulated data
 #   make wheel   a wheel that needs no compiler, for this Python, into dist/
 #   make fuzz    files changed for every reader, a minute each (FUZZ_SECONDS)
+#   make licenses  of everything that is needed at run time; fails on what is not permissive
 #   make check   lint and test, then what takes longer: slow tests, real recordings, packages,
 #                the kernels under sanitizers, fuzzing
 #   make clean   remove what was made
@@ -29,10 +30,10 @@ export PYTHONNOUSERSITE := 1
 unexport PYTHONPATH PYTHONHOME
 
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-slow test-ros test-models wheel lint docs pictures stub sanitize fuzz check format clean
+.PHONY: help demo test test-slow test-ros test-models wheel lint licenses docs pictures stub sanitize fuzz check format clean
 
 help:
-	@sed -n 's/^#  *//p' Makefile | sed -n '1,13p'
+	@sed -n 's/^#  *//p' Makefile | sed -n '1,14p'
 
 # The user's way: an isolated build. `make test` installs over it.
 $(VENV)/installed: $(VENV)/created $(SOURCES)
@@ -130,6 +131,9 @@ lint: $(VENV)/tested
 	$(BIN)/python -m mypy
 	find cpp -name '*.[ch]pp' -print0 | xargs -0 $(BIN)/clang-format --dry-run --Werror
 
+licenses: $(VENV)/tested
+	$(BIN)/python tools/supply.py licenses
+
 $(VENV)/site: $(VENV)/tested
 	@echo "installing what builds the documentation into $(VENV)"
 	@$(BIN)/python tools/requirements.py docs | $(PIP) install -r /dev/stdin
@@ -171,7 +175,7 @@ $(VENV)/fuzzed: $(VENV)/tested
 fuzz: $(VENV)/fuzzed
 	$(BIN)/python tests/fuzz/run.py $(FUZZ_SECONDS)
 
-check: lint test test-slow test-models sanitize fuzz
+check: lint licenses test test-slow test-models sanitize fuzz
 
 clean:
 	rm -rf $(VENV) build dist demo .mypy_cache .pytest_cache .ruff_cache .hypothesis

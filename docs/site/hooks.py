@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from notebook_page import render_notebook
 
 ROOT = Path(__file__).resolve().parents[2]
-ROOT_PAGES = ("BENCHMARK.md", "CHANGELOG.md", "CONTRIBUTING.md")
+ROOT_PAGES = ("BENCHMARK.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md")
 LINK = re.compile(r"(\]\()(?!\w+:|#)([^)#\s]+)")
 
 

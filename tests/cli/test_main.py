@@ -7,6 +7,7 @@ import subprocess
 import pytest
 from refusals import refused
 
+from stillmap.cli import main as main_module
 from stillmap.cli.main import main
 
 COMMANDS = [
@@ -154,3 +155,12 @@ def test_interrupt_behind_another_error(monkeypatch, capsys, stop, status, said,
     monkeypatch.setattr("stillmap.cli.config.run", fail)
     assert main(["config"]) == status
     assert capsys.readouterr() == ("", said)
+
+
+def test_errors_that_are_raised_from_each_other_end():
+    """As laspy's, when a file cannot be closed: their chain has no end."""
+    first, second = OSError(27, "File too large"), RuntimeError("while closing")
+    first.__cause__, second.__cause__ = second, first
+    assert main_module._find_interrupt(first) is None
+    second.__cause__ = KeyboardInterrupt()
+    assert main_module._find_interrupt(first) is second.__cause__

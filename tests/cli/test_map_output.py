@@ -1,11 +1,16 @@
 """The folder that `stillmap map` writes to: what is replaced and what is refused."""
 
+import errno
 import os
+import shlex
 import shutil
+from pathlib import Path
 
 import pytest
 from maps import ENDLESS, FILES, QUICK, list_files
 from refusals import refused
+
+import stillmap.results.save
 
 
 def test_non_empty_folder_is_refused(call, room, tmp_path):
@@ -63,3 +68,56 @@ def test_unwritable_folder_is_refused_before_the_work(call, room, tmp_path):
 @pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="no /proc here")
 def test_failed_write_is_refused_after_the_work(call, room):
     refused(call("map", room, "-o", "/proc/out", "--quiet", *QUICK), "/proc/out: cannot be written")
+
+
+@pytest.mark.parametrize("step", ["render_report", "write_labels", "write_run_json"])
+def test_failure_at_the_end_keeps_what_was_computed(call, room, tmp_path, monkeypatch, step):
+    """One line says how to go on; the same command with --resume does."""
+    out, words = tmp_path / "out", ("--quiet", *QUICK)
+
+    def fail(*_, **__):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(f"stillmap.results.save.{step}", fail)
+        done = call("map", room, "-o", out, *words)
+    refused(
+        done, f"{out}: cannot be written: No space left on device (continue after iteration 1: "
+    )
+    command = shlex.split(done.stderr.partition("iteration 1: ")[2].rstrip(")\n"))
+    assert command == ["stillmap", "map", str(room), "-o", str(out), *words, "--resume"]
+    assert list_files(tmp_path) >= {".out.resume/iteration-1/state.json"}
+    done = call("map", room, "-o", out, *QUICK, "--resume")
+    assert done.returncode == 0
+    assert "continues after iteration 1" in done.stderr
+    assert list_files(out) >= FILES
+    assert os.listdir(tmp_path) == ["out"]
+
+
+def test_defect_at_the_end_keeps_what_was_computed(call, room, tmp_path, monkeypatch):
+    def fail(*_, **__):
+        raise RuntimeError("a defect")
+
+    monkeypatch.setattr("stillmap.results.save.render_report", fail)
+    done = call("map", room, "-o", tmp_path / "out", "--quiet", *QUICK)
+    assert done.returncode == 1
+    assert "stillmap: continue after iteration 1: stillmap map" in done.stderr
+    assert "this is a defect of stillmap" in done.stderr
+    assert list_files(tmp_path) >= {".out.resume/iteration-1/state.json"}
+
+
+def test_folder_that_appears_meanwhile(call, room, tmp_path, monkeypatch):
+    """Neither that nor what was computed is lost."""
+    out, save = tmp_path / "out", stillmap.results.save.render_report
+
+    def render(*words):
+        out.mkdir()
+        (out / "mine").write_text("mine")
+        return save(*words)
+
+    monkeypatch.setattr("stillmap.results.save.render_report", render)
+    done = call("map", room, "-o", out, "--quiet", *QUICK)
+    refused(done, "already holds something", "what was made is kept in ")
+    kept = done.stderr.partition("what was made is kept in ")[2].partition(";")[0]
+    assert list_files(Path(kept)) >= FILES
+    assert list_files(out) == {"mine"}

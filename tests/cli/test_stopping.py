@@ -36,7 +36,9 @@ def only_a_checkpoint_left(folder) -> None:
         assert {one.name.partition("-")[0] for one in path.iterdir()} == {"lock", "iteration"}
 
 
-@pytest.mark.parametrize(("number", "expected"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("number", "expected"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 143)]
+)
 def test_interrupted_while_mapping(start, hall, tmp_path, number, expected):
     process = start("map", hall, "-o", tmp_path / "out", *ENDLESS)
     status, err = stopped_after_a_line(process, number)
@@ -175,10 +177,11 @@ def test_signal_is_deferred_while_packing(tmp_path, command):
         assert list(tmp_path.iterdir()) == []
 
 
-def test_ignored_ctrl_c_stays_ignored(command):
+@pytest.mark.parametrize("name", ["SIGINT", "SIGHUP"])
+def test_ignored_signals_stay_ignored(command, name):
     program = (
-        "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
+        f"import signal; signal.signal(signal.{name}, signal.SIG_IGN)\n"
         "from stillmap.cli.console import handle_signals\n"
-        "handle_signals(handle_signals.__code__); signal.raise_signal(signal.SIGINT)\n"
+        f"handle_signals(handle_signals.__code__); signal.raise_signal(signal.{name})\n"
     )
     assert subprocess.run([command[0], "-c", program], timeout=50).returncode == 0

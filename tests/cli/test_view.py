@@ -7,6 +7,7 @@ import signal
 import socket
 import sys
 import time
+import urllib.error
 import urllib.request
 
 import pytest
@@ -66,7 +67,7 @@ def served(process):
     said = ""
     for line in process.stderr:
         said += line
-        if found := re.search(r"http://127\.0\.0\.1:\d+", line):
+        if found := re.search(r"http://127\.0\.0\.1:\d+/[\w-]{32}", line):
             return found[0], said
     raise AssertionError(said)
 
@@ -111,8 +112,15 @@ def test_opens_browser_of_the_environment(start, mapped, browser):
             break
 
         time.sleep(0.05)
+    # the command line of a browser can be read by all: another address, which works once
+    opened = note.read_text().rstrip("\n")
+    assert opened != address
+    with urllib.request.urlopen(opened, timeout=10) as page:
+        assert page.url == f"{address}/"
+    with pytest.raises(urllib.error.HTTPError, match="403") as caught:
+        urllib.request.urlopen(opened, timeout=10)
+    caught.value.close()
     assert ended(process)[0] == 0
-    assert note.read_text() == f"{address}\n"
 
 
 def test_port(start, mapped):
@@ -122,7 +130,7 @@ def test_port(start, mapped):
         port = one.getsockname()[1]
     process = start("view", mapped, "--port", port, env=without_a_screen())
     address, _ = served(process)
-    assert address.endswith(f":{port}")
+    assert f":{port}/" in address
     assert ended(process)[0] == 0
 
 

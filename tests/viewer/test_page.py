@@ -6,6 +6,7 @@ import socket
 import urllib.error
 import urllib.request
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -15,17 +16,28 @@ from stillmap.viewer.scene import read_scene
 viser = pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 sockets = pytest.importorskip("websockets.sync.client")
 
+from stillmap.viewer import access  # noqa: E402
 from stillmap.viewer import server as module  # noqa: E402
 from stillmap.viewer.window import Window  # noqa: E402
 
 
 def port_of(window):
-    return int(window.url.rpartition(":")[2])
+    return urlsplit(window.url).port
 
 
 def get(window, path="/", **headers):
-    request = urllib.request.Request(window.url + path, headers=headers)
-    return urllib.request.urlopen(request, timeout=10)
+    return get_url(window.url + path, **headers)
+
+
+def get_url(url, **headers):
+    return urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=10)
+
+
+def refuse(url):
+    with pytest.raises(urllib.error.HTTPError) as caught:
+        get_url(url)
+    with caught.value:
+        assert caught.value.code == 403
 
 
 def test_page_is_served_with_its_policy(window):
@@ -44,6 +56,39 @@ def test_foreign_page_is_refused(window, headers):
         get(window, **headers)
     with caught.value:
         assert caught.value.code == 403
+
+
+def test_page_is_for_those_who_know_its_address(window):
+    """Any user of the machine reaches the port; the secret is compared in constant time."""
+    root, _, token = window.url.rpartition("/")
+    assert len(token) >= 32
+    wrong = (token[:-1] + ("a" if token[-1] != "a" else "b"), token[:-1], token + "a", "%FF")
+    paths = ("", "/", "/index.html", f"/?token={token}", f"//{token}/")
+    for path in (*paths, *(f"/{one}/" for one in wrong)):
+        refuse(root + path)
+    with get_url(window.url) as page:  # without a slash: a redirect
+        assert page.status == 200
+        assert page.url == f"{window.url}/"
+        assert page.headers["Referrer-Policy"] == "no-referrer"
+
+
+def test_token_is_compared_in_constant_time(window, monkeypatch):
+    asked = []
+    monkeypatch.setattr(access, "compare_digest", lambda *words: asked.append(words) or False)
+    refuse(window.url)
+    assert (window.url.rpartition("/")[2].encode(),) * 2 in asked
+
+
+def test_address_for_the_browser_works_once(window):
+    address = window.make_single_url()
+    assert window.url.rpartition("/")[2] not in address
+    with get_url(address) as page:
+        assert (page.status, page.url) == (200, f"{window.url}/")
+    refuse(address)
+
+
+def test_tokens_differ(window, result_of, opened):
+    assert window.url.rpartition("/")[2] not in opened(read_scene(result_of(2)), None).url
 
 
 @pytest.mark.parametrize("packed", ["gzip", "identity"])
@@ -71,11 +116,16 @@ def test_title_is_escaped(result_of, opened):
 
 
 def test_socket_answers_only_its_page(window):
-    address, protocol = f"ws://127.0.0.1:{port_of(window)}", [f"viser-v{viser.__version__}"]
-    with sockets.connect(address, subprotocols=protocol, origin=window.url) as socket_:
-        assert len(socket_.recv(timeout=10)) > 0
+    origin = window.url.rpartition("/")[0]
+    address, protocol = window.url.replace("http", "ws"), [f"viser-v{viser.__version__}"]
+    for url in (address, f"{address}/"):
+        with sockets.connect(url, subprotocols=protocol, origin=origin) as socket_:
+            assert len(socket_.recv(timeout=10)) > 0
     with pytest.raises(Exception, match="403"):
         sockets.connect(address, subprotocols=protocol, origin="https://example.org")
+    for url in (origin.replace("http", "ws"), f"{address}x"):
+        with pytest.raises(Exception, match="403"):
+            sockets.connect(url, subprotocols=protocol)
 
 
 def test_only_loopback_answers(window):
@@ -139,7 +189,7 @@ def test_unknown_viser_is_refused(result_of, monkeypatch):
     from contextlib import contextmanager
 
     @contextmanager
-    def nothing(_title):
+    def nothing(_title, _access):
         yield []
 
     monkeypatch.setattr(module, "_guard_servers", nothing)

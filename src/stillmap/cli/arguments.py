@@ -2,14 +2,12 @@
 
 import argparse
 import math
-import os
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stillmap.core.errors import InputError
+from stillmap.core.errors import InputError, cannot_write
 
 if TYPE_CHECKING:
     from stillmap.preprocessing.options import ReadOptions
@@ -151,9 +149,13 @@ def make_parents(output: Path) -> Iterator[None]:
     """Create the parent folders of an output; remove them again if the block fails.
 
     Raises:
-        InputError: they cannot be created, or are not writable; before anything is read.
+        InputError: they cannot be created, or the output cannot be written there; before anything
+            is read.
     """
-    parent = Path(os.path.abspath(output)).parent
+    from stillmap.core.files import temporary_folder
+    from stillmap.core.output_place import resolve_output
+
+    parent = resolve_output(output).parent
     created: list[Path] = []
     try:
         try:
@@ -163,10 +165,10 @@ def make_parents(output: Path) -> Iterator[None]:
                     created.append(folder)
             # the writer reports a device at this path
             if not output.exists() or output.is_file() or output.is_dir():
-                tempfile.TemporaryFile(dir=parent).close()
+                with temporary_folder(output):
+                    pass
         except OSError as error:
-            what = f"cannot be written: {error.strerror or error}"
-            raise InputError(what, where=str(output)) from error
+            raise cannot_write(error, output) from error
         yield
     except BaseException:
         with suppress(OSError):  # not empty

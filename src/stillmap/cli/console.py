@@ -62,8 +62,9 @@ def _write(line: str) -> None:
     if sys.stderr is None:
         return
     try:
-        print(line, file=sys.stderr, flush=True)
-    except OSError:  # closed by the reader, or a full disk
+        # names need not be UTF-8, and a caller may have put another stream there
+        print(line.encode("utf-8", "backslashreplace").decode(), file=sys.stderr, flush=True)
+    except OSError:  # closed by the reader, a full disk, or a terminal that has gone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
 
 
@@ -203,10 +204,11 @@ _PACKING = "lazrsbackend.py"  # of laspy
 
 
 def handle_signals(command: CodeType) -> None:
-    """Make Ctrl-C raise KeyboardInterrupt, and SIGTERM SystemExit, within `command`.
+    """Make Ctrl-C raise KeyboardInterrupt, SIGTERM and SIGHUP SystemExit, within `command`.
 
-    Both run the clean-up of any exception: temporary folders go. Ctrl-C that was ignored at the
-    start, as in the background of a shell script, stays ignored. During an import a signal is
+    Both run the clean-up of any exception: temporary folders go. SIGHUP comes when the terminal
+    goes, as when ssh is cut off. What was ignored at the start, as Ctrl-C in the background of a
+    shell script, or SIGHUP by nohup, stays ignored. During an import a signal is
     deferred: a library may take the exception for a missing module, turn it into another error,
     or execute text as code, after which Python reports an uncaught interrupt. Likewise while
     points are packed as LAZ, where the exception becomes another one.
@@ -223,9 +225,9 @@ def handle_signals(command: CodeType) -> None:
         else:
             sys.exit(EXIT_TERMINATED)
 
-    signal.signal(signal.SIGTERM, handle)
-    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
-        signal.signal(signal.SIGINT, handle)
+    for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
+        if number == signal.SIGTERM or signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, handle)
 
 
 def _must_defer(frame: FrameType | None, command: CodeType) -> bool:

@@ -18,6 +18,7 @@ from stillmap.cli.convert_result import (
     given_zone_flags,
 )
 from stillmap.core.errors import InputError
+from stillmap.core.output_place import workplace
 
 # copies for the help: the modules that define them take long to load
 ENDINGS = (
@@ -112,7 +113,7 @@ def _convert_recording(
     writer = writers.find_writer(output, args.to)
     writers.require_free(output, writer, args.overwrite)
     with show_share(args.quiet, "reading") as progress:
-        recording = read(source, options, progress=progress, scratch=output.absolute().parent)
+        recording = read(source, options, progress=progress, scratch=workplace(output))
     if not recording.n_scans:
         raise InputError("holds no scan", where=str(source))
     losses = writers.write(recording, output, name=args.to, overwrite=args.overwrite)

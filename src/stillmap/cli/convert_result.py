@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, get_args
 from stillmap.cli.arguments import read_changes, require_apart
 from stillmap.cli.console import show_share
 from stillmap.core.errors import InputError
+from stillmap.core.output_place import workplace
 
 if TYPE_CHECKING:
     from stillmap.results import point_cloud
@@ -213,7 +214,7 @@ def _convert_to_bag(
 
 def _read_result(args: argparse.Namespace, result: "ResultFolder", output: Path) -> "Exported":
     with show_share(args.quiet, "reading") as progress:
-        return result.export(progress, output.absolute().parent)
+        return result.export(progress, workplace(output))
 
 
 def _convert_to_cloud(
@@ -230,7 +231,7 @@ def _convert_to_cloud(
     if isinstance(result.record.get(TILTING), dict) or is_place(result.folder):
         points = point_cloud.cloud_from_folder(result.folder, args.only)
     else:
-        points = _build_cloud(args, result, output.absolute().parent)
+        points = _build_cloud(args, result, workplace(output))
     with show_share(args.quiet, "writing") as progress:
         point_cloud_files.write(points, output, form, progress)
     return f"{points.count} points as {form.description}"

@@ -1,7 +1,6 @@
 """`stillmap filter PLACE`: the recordings of all its sessions with their dynamic beams blanked."""
 
 import argparse
-import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -44,6 +43,7 @@ def filter_place(args: argparse.Namespace, place: Path, output: Path) -> None:
         InputError: a recording is not there any more, or the output is taken.
     """
     from stillmap.core.files import atomic_folder, require_new
+    from stillmap.core.json import write_json
 
     if args.input is not None:
         hint = f"one by one: stillmap filter {place}/sessions/NAME -o FILE --input FILE"
@@ -57,8 +57,7 @@ def filter_place(args: argparse.Namespace, place: Path, output: Path) -> None:
             records.append(_record(one, done))
             if not args.quiet:
                 _report(one, done)
-        text = json.dumps(records, indent=1, ensure_ascii=False)
-        (folder / _INDEX).write_text(text + "\n", encoding="utf-8")
+        write_json(folder / _INDEX, records)
     if args.json:
         print_json({"output": str(output), "sessions": records})
     if not args.quiet:

@@ -71,9 +71,10 @@ def write_filtered(
     Raises:
         InputError: labels and recording cannot be read, or do not belong together.
     """
+    from stillmap.core.output_place import workplace
     from stillmap.io.filtered_copy import FilterJob
 
-    scratch = output.absolute().parent
+    scratch = workplace(output)
     with show_share(args.quiet, "reading") as progress:
         recording, labels = result.read(progress, scratch)
     if target.takes_poses and recording.T_recorded_base is None:

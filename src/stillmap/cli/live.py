@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stillmap.cli.arguments import add_read_flags, read_changes, require_apart
+from stillmap.cli.arguments import add_read_flags, make_parents, read_changes, require_apart
 from stillmap.cli.config import add_option_flags, options_from_args
 from stillmap.cli.console import print_json, say, show_progress, show_share
 from stillmap.cli.live_foxglove import add_foxglove_flags, serve
@@ -113,7 +113,11 @@ def _replay(args: argparse.Namespace) -> int:
     settings, output = mapper_settings(args), Path(args.output)
     require_new(output, RECORD, args.overwrite)
     require_apart(output, Path(args.replay))
-    with tempfile.TemporaryDirectory(prefix="stillmap-") as scratch, serve(args) as show:
+    with (
+        make_parents(output),
+        tempfile.TemporaryDirectory(prefix="stillmap-") as scratch,
+        serve(args) as show,
+    ):
         recording = _read(args, options, Path(scratch))
         in_background = args.rate is not None
         with (

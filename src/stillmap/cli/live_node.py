@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from stillmap.cli.arguments import read_changes
+from stillmap.cli.arguments import make_parents, read_changes
 from stillmap.cli.config import options_from_args
 from stillmap.cli.console import say, show_progress
 from stillmap.cli.live_foxglove import serve
@@ -31,7 +31,11 @@ def run_node(args: argparse.Namespace) -> int:
     require_new(output, RECORD, args.overwrite)
     if args.no_odometry or args.json or args.rate is not None:
         raise InputError("--no-odometry, --rate and --json are for --replay")
-    with tempfile.TemporaryDirectory(prefix="stillmap-") as scratch, serve(args) as show:
+    with (
+        make_parents(output),
+        tempfile.TemporaryDirectory(prefix="stillmap-") as scratch,
+        serve(args) as show,
+    ):
         scans = run(
             options,
             output,

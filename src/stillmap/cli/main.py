@@ -5,6 +5,7 @@ import io
 import logging
 import os
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 from stillmap.cli.console import EXIT_INTERRUPTED, EXIT_TERMINATED, fail, handle_signals, say
@@ -34,29 +35,34 @@ def main(argv: list[str] | None = None) -> int:
         if sys.stdout is not None:  # None: closed before the start
             sys.stdout.flush()
         return status
-    except InputError as error:
-        fail(str(in_flags(_with_similar_name(error, args))))
-        return EXIT_INPUT
+    except Exception as error:
+        return _report_failure(error, args)
     except KeyboardInterrupt:
         return _report_interrupt()
-    except BrokenPipeError:
+
+
+def _report_failure(error: Exception, args: argparse.Namespace) -> int:
+    """Print why the command failed; the exit status."""
+    # a clean-up may fail, too, as on a terminal that has gone
+    cause = _find_interrupt(error)
+    if cause is not None:
+        return EXIT_TERMINATED if isinstance(cause, SystemExit) else _report_interrupt()
+    if isinstance(error, InputError):
+        fail(str(in_flags(_with_similar_name(error, args))))
+    elif isinstance(error, BrokenPipeError):
         # the reader of stdout has closed it: not an error
         _drop_stdout()
         return 0
-    except OSError as error:
+    elif isinstance(error, OSError):
         # a full disk behind stdout, or a file that vanished while it was read
         fail(f"{error.filename or 'the output'}: {error.strerror or error}")
         _drop_stdout()
-        return EXIT_INPUT
-    except MemoryError as error:
+    elif isinstance(error, MemoryError):
         fail(f"not enough memory{': ' if str(error) else ''}{error}")
-        return EXIT_INPUT
-    except Exception as error:
-        cause = _find_interrupt(error)
-        if cause is not None:
-            return EXIT_TERMINATED if isinstance(cause, SystemExit) else _report_interrupt()
+    else:
         _report_defect(error)
         return EXIT_DEFECT
+    return EXIT_INPUT
 
 
 def _parse(words: list[str]) -> argparse.Namespace:
@@ -122,9 +128,13 @@ def _report_defect(error: Exception) -> None:
 
 def _find_interrupt(error: BaseException | None) -> BaseException | None:
     """The Ctrl-C or SIGTERM that an error was raised from during clean-up, or None."""
-    while error is not None and not isinstance(error, KeyboardInterrupt | SystemExit):
+    seen = list[BaseException]()  # a library may raise an error from a later one
+    while error is not None and not any(error is one for one in seen):
+        if isinstance(error, KeyboardInterrupt | SystemExit):
+            return error
+        seen.append(error)
         error = error.__cause__ or error.__context__
-    return error
+    return None
 
 
 def _report_interrupt() -> int:
@@ -134,5 +144,5 @@ def _report_interrupt() -> int:
 
 def _drop_stdout() -> None:
     """Discard what is buffered, which would fail once more when Python exits."""
-    if sys.stdout is not None:
+    with suppress(OSError, AttributeError):  # None: closed before the start; or no file
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

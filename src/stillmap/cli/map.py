@@ -150,12 +150,13 @@ def _merge_sessions(args: argparse.Namespace, groups: "list[InputGroup]") -> int
 def _require_usable_output(args: argparse.Namespace, output: Path) -> None:
     """Refuse an output that is taken, holds an input or cannot be written, before any work."""
     from stillmap.core.files import require_new
+    from stillmap.core.output_place import workplace
     from stillmap.results.run_json import RECORD
 
     require_new(output, RECORD, args.overwrite or args.resume)
     for source in filter(None, (*args.input, args.tilting)):
         require_apart(output, Path(source))
-    parent = Path(os.path.abspath(output)).parent
+    parent = workplace(output)
     while not parent.exists():
         parent = parent.parent
     if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
@@ -164,22 +165,31 @@ def _require_usable_output(args: argparse.Namespace, output: Path) -> None:
 
 @contextmanager
 def _explain_failure(args: argparse.Namespace, checkpoints: "CheckpointFolder") -> Iterator[None]:
-    """Report a full disk in one line, and after an interruption how to go on."""
+    """Say after a failure or an interruption how to go on; report a full disk in one line."""
     try:
         yield
-    except OSError as error:
-        if error.errno not in _DISK_FULL:
-            raise
-        where = str(checkpoints.folder)
-        raise InputError(f"cannot continue: {error.strerror}", where=where) from error
+    except (InputError, OSError) as error:
+        if isinstance(error, OSError):
+            if error.errno not in _DISK_FULL and not checkpoints.is_in_use:
+                raise
+            what = f"cannot continue: {error.strerror or error}"
+            error = InputError(what, where=str(error.filename or checkpoints.folder))
+        if not checkpoints.is_in_use:
+            raise error
+        hints = filter(None, (error.hint, _describe_continuation(args.words, checkpoints)))
+        raise InputError(error.what, where=error.where, hint="; ".join(hints)) from error
     except (KeyboardInterrupt, SystemExit):
         if not args.quiet:
-            say(_describe_interruption(args.words, checkpoints))
+            say(_describe_continuation(args.words, checkpoints))
+        raise
+    except Exception:
+        if checkpoints.is_in_use:
+            say(_describe_continuation(args.words, checkpoints))
         raise
 
 
-def _describe_interruption(words: list[str], checkpoints: "CheckpointFolder") -> str:
-    """The command that continues an interrupted run with these words on its command line."""
+def _describe_continuation(words: list[str], checkpoints: "CheckpointFolder") -> str:
+    """The command that continues a run that ended early, with these words on its command line."""
     if checkpoints.newest is None:
         return "no iteration was finished: nothing was written, and there is nothing to resume"
     given = [word for word in words if word not in ("--resume", "--overwrite")]

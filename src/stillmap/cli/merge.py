@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stillmap.cli.arguments import add_read_flags, read_changes, require_apart
+from stillmap.cli.arguments import add_read_flags, make_parents, read_changes, require_apart
 from stillmap.cli.config import add_option_flags, options_from_args
 from stillmap.cli.console import list_files, print_json, say, show_progress
 from stillmap.cli.map_flags import add_map_mode_flag, add_run_flags, option_changes, shared_changes
@@ -131,7 +131,10 @@ def _merge(
     taken = [] if base is None else [record["name"] for record in read_sessions(base)]
     sessions = list_sessions(groups, taken)
     job = MergeJob(base, sessions, options, args.frame, args.map_state, not args.no_odometry)
-    with show_progress(args.quiet, options.em.max_iterations) as progress:
+    with (
+        make_parents(output),
+        show_progress(args.quiet, options.em.max_iterations) as progress,
+    ):
         result = merge_sessions(job, output, args.overwrite, progress)
     if not args.quiet:
         _print_summary(job, result, output)

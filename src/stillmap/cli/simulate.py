@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from stillmap.cli.arguments import make_parents
 from stillmap.cli.config import add_set_flag, complete_assignments
 from stillmap.cli.console import list_files, print_json, say, show_share
 from stillmap.core.errors import InputError
@@ -173,6 +174,7 @@ def run(args: argparse.Namespace) -> int:
     import numpy as np
 
     from stillmap.core.files import require_new
+    from stillmap.core.output_place import workplace
     from stillmap.sim import scene_by_name, simulate, simulate_rig
     from stillmap.sim.writer import MARK, RIG_MARK, require_carmen, write_rig, write_simulation
 
@@ -185,18 +187,18 @@ def run(args: argparse.Namespace) -> int:
     if args.sessions is not None:
         return _run_sessions(scene, args, output)
     require_new(output, RIG_MARK if scene.rig.tilts else MARK, args.overwrite)
-    with show_share(args.quiet, "simulating") as progress:
-        rng, parent = np.random.default_rng(args.seed), output.absolute().parent
-        scratch = parent if parent.is_dir() else None
+    with make_parents(output):
+        with show_share(args.quiet, "simulating") as progress:
+            rng, scratch = np.random.default_rng(args.seed), workplace(output)
+            if scene.rig.tilts:
+                rig = simulate_rig(scene, rng, progress, scratch)
+                simulations = [rig.horizontal, rig.tilting]
+            else:
+                simulations = [simulate(scene, rng, progress, scratch)]
         if scene.rig.tilts:
-            rig = simulate_rig(scene, rng, progress, scratch)
-            simulations = [rig.horizontal, rig.tilting]
+            write_rig(rig, output, overwrite=args.overwrite)
         else:
-            simulations = [simulate(scene, rng, progress, scratch)]
-    if scene.rig.tilts:
-        write_rig(rig, output, overwrite=args.overwrite)
-    else:
-        write_simulation(simulations[0], output, format=args.format, overwrite=args.overwrite)
+            write_simulation(simulations[0], output, format=args.format, overwrite=args.overwrite)
     summary = _summarize(simulations, output)
     if not args.quiet:
         _print_summary(summary)
@@ -217,7 +219,7 @@ def _run_sessions(scene: "Scene", args: argparse.Namespace, output: Path) -> int
         raise InputError(f"--sessions wants 1 or more, got {args.sessions}")
     require_new(output, MARK, args.overwrite)
     plan = plan_sessions(scene, SessionOptions(args.sessions), args.seed)
-    with show_share(args.quiet, "simulating") as progress:
+    with make_parents(output), show_share(args.quiet, "simulating") as progress:
         sessions = write_sessions(
             [plan], output, seed=args.seed, overwrite=args.overwrite, tell=progress
         )

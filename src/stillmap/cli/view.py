@@ -81,11 +81,13 @@ def _find_report(folder: Path) -> Path:
     Raises:
         InputError: there is none.
     """
+    from stillmap.core.output_place import require_finished
     from stillmap.places.inputs import is_place
 
     hint = "DIR is what `stillmap map` or `merge` wrote"
     if not folder.exists():
         raise InputError("does not exist", where=str(folder), hint=hint)
+    require_finished(folder)
     report = Path(os.path.abspath(folder)) / _REPORT
     place = report.parent.parent.parent  # of a session, in its folder `sessions`
     if not report.is_file() and report.parent.parent.name == "sessions" and is_place(place):
@@ -136,7 +138,8 @@ def _serve(args: argparse.Namespace, folder: Path) -> None:
     window = Window(scene, beams, args.port)
     try:
         # some browsers block until they are closed
-        threading.Thread(target=_open_browser, args=(window.url,), daemon=True).start()
+        address = window.make_single_url()
+        threading.Thread(target=_open_browser, args=(address,), daemon=True).start()
         prefix = "" if _has_screen() else "no browser found; "
         say(f"{prefix}{folder} is at {window.url}, until Ctrl-C")
         while True:

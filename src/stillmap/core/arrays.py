@@ -212,7 +212,10 @@ def open_npy(path: Path) -> NDArray[Any]:
 
 
 def write_npy(path: Path, array: NDArray[Any]) -> None:
-    """Write the same file as np.save, block by block."""
+    """Write the same file as np.save, block by block.
+
+    `np.save` and `ndarray.tofile` do not notice that a disk is full.
+    """
     header = np.lib.format.header_data_from_array_1_0(np.empty((0, *array.shape[1:]), array.dtype))
     with path.open("wb") as file:
         np.lib.format.write_array_header_1_0(file, {**header, "shape": array.shape})

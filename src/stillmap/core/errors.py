@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from importlib import import_module
 from typing import Any
 
-from stillmap.core.extras import install_command
+from stillmap.core.extras import install_hint
 
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f]")
 
@@ -33,6 +33,11 @@ class InputError(Exception):
         line = f"{place}{self.what}{advice}".replace("\n", " ")
         # names may hold control characters of terminals
         return _CONTROL.sub(lambda found: f"\\x{ord(found[0]):02x}", line)
+
+
+def cannot_write(error: OSError, path: object) -> InputError:
+    """The error of an output that the system refuses to write."""
+    return InputError(f"cannot be written: {error.strerror or error}", where=str(path))
 
 
 def _truncate(text: str) -> str:
@@ -75,5 +80,5 @@ def import_extra(module: str, path: object, action: str = "read", *, group: str 
     except ImportError as error:
         package = module.partition(".")[0]
         raise MissingExtra(
-            f"needs {package} to be {action}", where=str(path), hint=install_command(group)
+            f"needs {package} to be {action}", where=str(path), hint=install_hint(package, group)
         ) from error

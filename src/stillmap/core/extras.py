@@ -2,6 +2,7 @@
 
 import json
 import os
+import platform
 import shlex
 import shutil
 import sys
@@ -10,6 +11,25 @@ from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
 _NAME = "stillmap"
+
+
+def has_wheels(package: str) -> bool:
+    """True if a library of an extra is on the package index for this Python and processor.
+
+    The markers in `pyproject.toml` say the same: elsewhere the extra leaves the library out.
+    """
+    is_common = sys.platform != "linux" or platform.machine() == "x86_64"
+    if package == "xatlas":
+        return is_common and sys.version_info < (3, 14)
+    return package != "pye57" or is_common
+
+
+def install_hint(package: str, group: str) -> str:
+    """How to get a library of an extra."""
+    if has_wheels(package):
+        return install_command(group)
+    here = f"Python {sys.version_info[0]}.{sys.version_info[1]} on {platform.machine()}"
+    return f"the extra {group} is without it for {here}; from source: {_pip()} install {package}"
 
 
 def install_command(group: str) -> str:

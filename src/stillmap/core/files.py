@@ -2,36 +2,54 @@
 
 import os
 import secrets
-import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
-from stillmap.core.errors import InputError
+from stillmap.core.errors import InputError, cannot_write
+from stillmap.core.output_place import (
+    UNFINISHED,
+    hidden_path,
+    list_entries,
+    require_finished,
+    resolve_output,
+)
+from stillmap.core.publishing import (
+    finish_exchange,
+    hold,
+    keep,
+    publish_file,
+    publish_folder,
+    remove,
+    remove_stale,
+)
 
 
 def require_new(path: Path, marker: str, overwrite: bool = False) -> None:
     """Reject an output folder that is not empty.
 
     Args:
-        path: the output folder.
+        path: the output folder, or a link to it.
         marker: glob of a file that every such folder holds; others are never overwritten.
         overwrite: whether such a folder may be replaced.
 
     Raises:
         InputError: `path` is a file, or a folder that is not empty and may not be replaced.
     """
-    if not path.exists() and not path.is_symlink():
+    target = resolve_output(path)
+    if not target.exists():
         return
-    if not path.is_dir():
+    if not target.is_dir():
         raise InputError("is in the way: not a folder", where=str(path))
-    if not any(path.iterdir()):
+    if not overwrite:
+        require_finished(target)
+    if not list_entries(target) or os.path.lexists(target / UNFINISHED):
         return
     if not overwrite:
         raise InputError(
             "already holds something", where=str(path), hint="choose another or give overwrite=True"
         )
-    if not any(path.glob(marker)):
+    if not any(target.glob(marker)):
         what = f"holds other things: only a folder with {marker} is replaced"
         raise InputError(what, where=str(path), hint="choose another")
 
@@ -42,15 +60,16 @@ def require_new_file(path: Path, overwrite: bool = False) -> None:
     Raises:
         InputError: the path exists and may not be replaced, or its folder does not exist.
     """
-    if path.is_dir():
+    target = resolve_output(path)
+    if target.is_dir():
         raise InputError("is in the way: a folder", where=str(path))
-    if path.exists() and not path.is_file():
+    if target.exists() and not target.is_file():
         raise InputError("is in the way: no regular file", where=str(path))
-    if path.exists() and not overwrite:
+    if target.exists() and not overwrite:
         raise InputError(
             "is there already", where=str(path), hint="choose another or give overwrite=True"
         )
-    if not path.absolute().parent.is_dir():
+    if not target.parent.is_dir():
         raise InputError("cannot be written: no such folder", where=str(path.parent))
 
 
@@ -58,49 +77,110 @@ def require_new_file(path: Path, overwrite: bool = False) -> None:
 def atomic_folder(
     path: Path, marker: str, overwrite: bool = False, *, staging_folder: Path | None = None
 ) -> Iterator[Path]:
-    """Context manager of a temporary folder that is renamed to `path` on success.
+    """Context manager of a temporary folder that takes the place of `path` on success.
+
+    A link is followed. Where `path` cannot be renamed, as a mount point, its files are exchanged
+    under a journal; see `output_place.require_finished`.
 
     Args:
         path: the output folder.
         marker, overwrite: see `require_new`.
-        staging_folder: parent of the temporary folder, on the same file system; None: that of
-            `path`.
+        staging_folder: parent of the temporary folder, on the same file system; None: see
+            `output_place.workplace`.
 
     Raises:
-        InputError: `path` is taken, or its parent cannot be written.
+        InputError: `path` is taken, or its parent cannot be written. A folder that was finished
+            but cannot take its place is kept: the message says where.
     """
-    path = Path(os.path.abspath(path))
-    require_new(path, marker, overwrite)
-    # named before it is made: an interruption right after that finds it
-    work = (staging_folder or path.parent) / f".{path.name}.{secrets.token_hex(8)}.part"
+    given, path = path, resolve_output(path)
+    remove_stale(path)
+    require_new(given, marker, overwrite)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        work.mkdir(mode=0o700)
-        yield work
-        work.chmod(0o777 & ~_umask())
-        require_new(path, marker, overwrite)  # it may have appeared meanwhile
-        _move_into_place(work, path)
+        finish_exchange(path)
+        with temporary_folder(path, staging_folder) as work:
+            yield work
+            work.chmod(0o777 & ~_umask())
+            with _kept_on_failure(work, given):
+                require_new(given, marker, overwrite)  # it may have appeared meanwhile
+                publish_folder(work, path, marker)
     except OSError as error:
-        raise InputError(f"cannot be written: {error.strerror}", where=str(path)) from error
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
+        raise cannot_write(error, given) from error
+
+
+@contextmanager
+def temporary_folder(output: Path, parent: Path | None = None) -> Iterator[Path]:
+    """Context manager of a folder for work on an output, removed at the end.
+
+    Args:
+        output: file or folder.
+        parent: where it lies; None: see `output_place.workplace`.
+
+    Raises:
+        OSError: it cannot be made.
+    """
+    # named before it is made: an interruption right after that finds it
+    work = hidden_path(output, f"{secrets.token_hex(8)}.part")
+    work = work if parent is None else parent / work.name
+    with _removed_at_the_end(work, resolve_output(output)):
+        work.mkdir(mode=0o700)
+        with hold(work):
+            yield work
 
 
 @contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
-    """Context manager of a temporary file that is renamed to `path` on success."""
-    path = Path(os.path.abspath(path))
-    work, free = path.with_name(f".{path.name}.{os.getpid()}.part"), not path.exists()
+    """Context manager of a temporary file that takes the place of `path` on success.
+
+    A link is followed. The temporary file is there, and empty.
+
+    Raises:
+        InputError: it cannot be written, or something else has this name.
+    """
+    given, path = path, resolve_output(path)
+    require_new_file(given, overwrite=True)
+    free = not path.exists()
     try:
-        yield work
-        if free and path.exists():
-            raise InputError("has appeared meanwhile", where=str(path), hint="choose another")
-        os.replace(work, path)
+        remove_stale(path)
+        work = hidden_path(path, f"{secrets.token_hex(8)}.part")
+        with _removed_at_the_end(work, path):
+            os.close(os.open(work, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
+            with hold(work):
+                yield work
+                with _kept_on_failure(work, given):
+                    if free and path.exists():
+                        raise InputError("has appeared meanwhile", where=str(given))
+                    publish_file(work, path)
     except OSError as error:
-        raise InputError(f"cannot be written: {error.strerror}", where=str(path)) from error
+        raise cannot_write(error, given) from error
+
+
+@contextmanager
+def _removed_at_the_end(work: Path, path: Path) -> Iterator[None]:
+    try:
+        yield
     finally:
-        with suppress(OSError):  # read-only file systems refuse this, too
-            work.unlink()
+        if not os.path.lexists(path / UNFINISHED):  # otherwise the rest of an exchange lies there
+            remove(work)
+
+
+@contextmanager
+def _kept_on_failure(work: Path, path: Path) -> Iterator[None]:
+    """Keep what was finished where it cannot take its place.
+
+    Raises:
+        InputError: it cannot; says where it lies.
+    """
+    try:
+        yield
+    except (OSError, InputError) as error:
+        what = (error if isinstance(error, InputError) else cannot_write(error, path)).what
+        if os.path.lexists(resolve_output(path) / UNFINISHED):
+            hint = "its new files lie inside; overwrite=True goes on"
+        else:
+            kept = keep(work, path)
+            hint = "" if kept is None else f"what was made is kept in {kept}"
+        raise InputError(what, where=str(path), hint=hint) from error
 
 
 def sync(path: Path) -> None:
@@ -110,21 +190,6 @@ def sync(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
-
-
-def _move_into_place(work: Path, path: Path) -> None:
-    if not path.exists():
-        os.rename(work, path)
-        return
-    # rename(2) does not replace a folder that is not empty
-    old = work.with_suffix(".old")
-    os.rename(path, old)
-    try:
-        os.rename(work, path)
-    except OSError:
-        os.rename(old, path)
-        raise
-    shutil.rmtree(old, ignore_errors=True)
 
 
 def _umask() -> int:
@@ -153,6 +218,16 @@ def read_text(path: Path, max_bytes: int) -> str:
 def nearest_folder_above(path: str | os.PathLike[str]) -> Path:
     """The first folder above a path that is there."""
     return next(one for one in Path(path).absolute().parents if one.is_dir())
+
+
+def to_encodable(text: str) -> str:
+    """A text that UTF-8 can hold: bytes of file names that are no UTF-8 become escapes."""
+    return text.encode("utf-8", "backslashreplace").decode("utf-8")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text as UTF-8; see `to_encodable`."""
+    path.write_bytes(to_encodable(text).encode("utf-8"))
 
 
 def require_regular(path: Path) -> None:

@@ -1,10 +1,14 @@
 """Conversion of values to JSON."""
 
+import json
 import math
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from stillmap.core.files import to_encodable, write_text
 
 
 def count_skipped(source: Mapping[str, Any]) -> int:
@@ -24,3 +28,22 @@ def to_jsonable(value: Any) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value if value is None or isinstance(value, bool | int | str) else str(value)
+
+
+def to_json(value: Any, indent: int | None = None) -> str:
+    """JSON text of a value, which can be encoded as UTF-8 whatever file names it holds.
+
+    Bytes of a name that are no UTF-8 are lone surrogates in Python; here they become the escapes of
+    JSON, which `json.loads` turns back.
+
+    Args:
+        value: see `to_jsonable`.
+        indent: spaces per level; None: one line.
+    """
+    text = json.dumps(to_jsonable(value), indent=indent, ensure_ascii=False, allow_nan=False)
+    return to_encodable(text)
+
+
+def write_json(path: Path, value: Any, indent: int | None = 1) -> None:
+    """Write a value as a file of JSON; see `to_json`."""
+    write_text(path, f"{to_json(value, indent)}\n")

@@ -7,6 +7,7 @@ cut off, and any other that is damaged, is passed over: what it said is found ou
 import json
 from typing import Any
 
+from stillmap.core.json import to_json
 from stillmap.fleet.storage import STATE, Storage
 
 _NAME = f"{STATE}/journal"
@@ -34,7 +35,7 @@ class Journal:
             OSError, InputError: it cannot be written.
         """
         entry = {"event": event, **content}
-        self._storage.append_line(_NAME, json.dumps(entry, ensure_ascii=False).encode())
+        self._storage.append_line(_NAME, to_json(entry).encode())
         self._entries.append(entry)
 
 

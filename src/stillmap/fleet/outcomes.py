@@ -12,7 +12,7 @@ Status = Literal["done", "failed", "killed", "unreachable", "full"]
 
 _INPUT_AT_FAULT = 2  # exit status of stillmap
 _STOPPED_BY_SIGNAL = (130, 143)  # the same, after a Ctrl-C and a SIGTERM from outside
-DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 MAKE_ROOM = "make room, then continue with the same command"
 _FULL = tuple(map(os.strerror, DISK_FULL))
 

@@ -1,7 +1,7 @@
 """A fleet from its inputs to its page: expand, inspect, plan, map, merge, write."""
 
-import json
-
+from stillmap.core.files import to_encodable
+from stillmap.core.json import to_json
 from stillmap.fleet.backends import open_storage
 from stillmap.fleet.inputs import find_sources
 from stillmap.fleet.jobs import Fleet, Job, Reporter, Request
@@ -74,7 +74,7 @@ def _note_start(jobs: list[Job], journal: Journal) -> None:
 
 def _write(fleet: Fleet, storage: Storage) -> None:
     """Write the list and the page, and remove what killed processes left."""
-    content = json.dumps(fleet.to_list(), indent=2, ensure_ascii=False, allow_nan=False)
+    content = to_json(fleet.to_list(), indent=2)
     storage.write(LIST, content.encode() + b"\n")
-    storage.write(PAGE, render_page(fleet).encode())
+    storage.write(PAGE, to_encodable(render_page(fleet)).encode())
     storage.remove_unfinished()

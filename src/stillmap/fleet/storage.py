@@ -10,6 +10,7 @@ from typing import Protocol
 
 from stillmap.core.errors import InputError
 from stillmap.core.files import sync
+from stillmap.core.output_place import resolve_output
 from stillmap.fleet.scratch import remove_stale, scratch_folder
 
 STATE = ".fleet"  # folder of the journal, of the labels of results, and of unfinished results
@@ -60,8 +61,8 @@ class FolderStorage:
     """A folder of a file system, which the workers of a cluster share."""
 
     def __init__(self, root: str) -> None:
-        self.root = os.path.abspath(root)
-        self._path = Path(self.root)
+        self._path = resolve_output(Path(root))
+        self.root = str(self._path)
 
     def read(self, name: str) -> bytes | None:
         path = self._path / name

@@ -27,7 +27,7 @@ def main(descriptor: int, parent: int, command: list[str]) -> None:
         os.close(descriptor)
         _end_with(me)
         os.execv(command[0], command)
-    for number in (signal.SIGTERM, signal.SIGINT):
+    for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
         signal.signal(number, lambda *_: _send(child, signal.SIGTERM))
     signal.signal(signal.SIGALRM, lambda *_: _kill_orphan(parent, child))
     signal.setitimer(signal.ITIMER_REAL, _PERIOD, _PERIOD)

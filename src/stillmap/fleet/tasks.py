@@ -17,6 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from stillmap.core.errors import InputError
+from stillmap.core.files import to_encodable, write_text
+from stillmap.core.json import to_json
 from stillmap.core.version import package_version
 from stillmap.fleet.artifacts import PLACES, RESULTS, find_result, write_label
 from stillmap.fleet.backends import open_storage
@@ -219,7 +221,7 @@ def _point_to_copy(folder: Path, new: Path, source: str, path: Path) -> Path:
         if one.name != RECORD:
             (new / one.name).symlink_to(one)
     text = (folder / RECORD).read_text(encoding="utf-8")
-    (new / RECORD).write_text(_replace_all(text, {source: str(path)}), encoding="utf-8")
+    write_text(new / RECORD, _replace_all(text, {source: str(path)}))
     return new
 
 
@@ -229,16 +231,20 @@ def _replace_in_texts(folder: Path, texts: dict[str, str]) -> None:
     for path in folder.rglob("*") if texts else ():
         if path.suffix in (".json", ".html") and path.is_file():
             text = path.read_text(encoding="utf-8")
-            path.write_text(_replace_all(text, texts), encoding="utf-8")
+            write_text(path, _replace_all(text, texts))
 
 
 def _replace_all(text: str, texts: dict[str, str]) -> str:
     """Replace texts, as they are and as JSON and HTML write them; the longest first."""
     for old in sorted(texts, key=len, reverse=True):
-        for write in (str, _in_json, html.escape):
+        for write in (str, _in_json, html.escape, _in_html):
             text = text.replace(write(old), write(texts[old]))
     return text
 
 
+def _in_html(text: str) -> str:
+    return to_encodable(html.escape(text))
+
+
 def _in_json(text: str) -> str:
-    return json.dumps(text, ensure_ascii=False)[1:-1]
+    return to_json(text)[1:-1]

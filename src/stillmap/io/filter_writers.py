@@ -18,6 +18,7 @@ from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.errors import InputError
 from stillmap.core.files import require_new, require_new_file
 from stillmap.core.json import count_skipped
+from stillmap.core.output_place import workplace
 from stillmap.core.recording import Recording
 from stillmap.io import stillmap_folder, writers
 from stillmap.io.filtered_copy import FilterJob, Mask, Omissions
@@ -276,7 +277,7 @@ def _convert(job: FilterJob, writer: writers.Writer) -> Omissions:
 
 def _to_misses(job: FilterJob) -> Recording:
     """The recording with blanked beams as misses of the same length."""
-    hit = arrays.copy(job.recording.hit, job.output.absolute().parent)
+    hit = arrays.copy(job.recording.hit, workplace(job.output))
     for block in arrays.iter_blocks(hit, job.blank):
         hit[block] &= ~job.blank[block]
     return replace(job.recording, hit=hit)
@@ -284,7 +285,7 @@ def _to_misses(job: FilterJob) -> Recording:
 
 def _without_beams(job: FilterJob) -> Recording:
     """The recording without the blanked beams."""
-    recording, scratch = job.recording, job.output.absolute().parent
+    recording, scratch = job.recording, workplace(job.output)
     points = ArrayBuilder(np.float32, (recording.dimension,), scratch)
     hit = ArrayBuilder(np.bool_, (), scratch)
     times = ArrayBuilder(np.float32, (), scratch)

@@ -45,10 +45,14 @@ def read_image(path: Path) -> NDArray[Any]:
         return np.array(image.convert("RGB"))
 
 
-def write_png(image: NDArray[Any], path: Path) -> None:
-    """Write an integer image as PNG; see `read_image` for its shape and type."""
-    # higher levels take ten times as long
-    Image.fromarray(image).save(path, format="PNG", compress_level=1)
+def write_png(image: NDArray[Any], path: Path, compress_level: int = 1) -> None:
+    """Write an integer image as PNG; see `read_image` for its shape and type.
+
+    Higher levels than 1 take ten times as long.
+    """
+    buffer = io.BytesIO()  # Pillow does not notice that a disk is full
+    Image.fromarray(image).save(buffer, format="PNG", compress_level=compress_level)
+    path.write_bytes(buffer.getbuffer())
 
 
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"

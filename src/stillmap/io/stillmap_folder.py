@@ -39,12 +39,12 @@ def _write_images(images: Images, folder: Path) -> tuple[dict[str, Any], list[st
             continue
         path = folder / _IMAGES / f"{len(kept):06d}"
         if pixels.dtype.kind == "f":
-            np.save(path.with_suffix(".npy"), pixels.astype(np.float32), allow_pickle=False)
+            write_npy(path.with_suffix(".npy"), pixels.astype(np.float32))
         else:
             write_png(pixels, path.with_suffix(".png"))
         kept.append(image)
-    np.save(folder / "image_stamp_ns.npy", images.stamp_ns[kept], allow_pickle=False)
-    np.save(folder / "image_camera.npy", images.camera[kept], allow_pickle=False)
+    write_npy(folder / "image_stamp_ns.npy", images.stamp_ns[kept])
+    write_npy(folder / "image_camera.npy", images.camera[kept])
     cameras = [
         {
             name: value.tolist() if isinstance(value, np.ndarray) else value

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def signal_flag() -> Iterator[threading.Event]:
-    """An event that Ctrl-C and SIGTERM set.
+    """An event that Ctrl-C, SIGTERM and SIGHUP, the end of the terminal, set.
 
     `ros2 launch` sends SIGTERM some seconds after Ctrl-C, and a terminal sends Ctrl-C to the node
     and to launch alike: what comes while the result is written must not end it. Only Ctrl-C more
@@ -24,7 +24,7 @@ def signal_flag() -> Iterator[threading.Event]:
             since[0] = time.monotonic()
             stop.set()
 
-    numbers = [signal.SIGTERM, signal.SIGINT]
+    numbers = [signal.SIGTERM, signal.SIGHUP, signal.SIGINT]
     before = {number: signal.getsignal(number) for number in numbers}
     for number, handler in before.items():
         if handler is not signal.SIG_IGN:  # as a shell script leaves it in the background

@@ -1,8 +1,9 @@
 """The folder beside a result in which a run keeps its checkpoints, locked while it runs.
 
-`.NAME.resume/` beside NAME holds `lock`, and `iteration-K/` once iteration K is finished: flat
-arrays and `state.json`, which knows the checksum of each. A checkpoint is written beside the one
-before, which goes only when the new one is whole and on the disk.
+`.NAME.resume/` beside NAME (`.stillmap.resume/` inside, where NAME is a mount point) holds `lock`,
+and `iteration-K/` once iteration K is finished: flat arrays and `state.json`, which knows the
+checksum of each. A checkpoint is written beside the one before, which goes only when the new one is
+whole and on the disk.
 """
 
 import fcntl
@@ -20,9 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.arrays import iter_bytes, write_npy
-from stillmap.core.errors import InputError
+from stillmap.core.errors import InputError, cannot_write
 from stillmap.core.files import sync
+from stillmap.core.output_place import hidden_path, resolve_output
 from stillmap.core.profiling import StageTimer
+from stillmap.core.publishing import finish_exchange
 from stillmap.pipeline.checkpoint_files import pack_state, require_same_run, unpack_state
 from stillmap.pipeline.estimate import EmState
 from stillmap.pipeline.options import Options
@@ -44,10 +47,13 @@ class CheckpointFolder:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._arrays: dict[str, dict[str, Any]] = {}  # those of the present checkpoint
+        self.is_in_use = False  # the newest checkpoint is of this run
 
     @property
     def newest(self) -> Path | None:
         """The last complete checkpoint; None where there is none."""
+        if not self.folder.is_dir():  # somebody has removed it
+            return None
         numbers = [
             int(path.name.removeprefix("iteration-"))
             for path in self.folder.iterdir()
@@ -81,7 +87,7 @@ class CheckpointFolder:
             run = unpack_state(state["state"], arrays, options)
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise DamagedCheckpoint(f"{self.newest / _STATE}: {error!r}") from error
-        self._arrays = state["arrays"]
+        self._arrays, self.is_in_use = state["arrays"], True
         stages.add(state["stages"])
         return run
 
@@ -107,7 +113,7 @@ class CheckpointFolder:
             self._clear(work)
             what = f"no checkpoint can be written: {error.strerror or error}"
             raise InputError(what, where=str(self.folder)) from error
-        self._arrays = about
+        self._arrays, self.is_in_use = about, True
         self._clear(
             *(path for path in self.folder.iterdir() if path.name not in (_LOCK, final.name))
         )
@@ -155,15 +161,16 @@ def lock_checkpoints(output: Path) -> Iterator[CheckpointFolder]:
     Raises:
         InputError: another run holds the lock, or the folder cannot be made.
     """
-    output = Path(os.path.abspath(output))
-    folder = output.parent / f".{output.name}.resume"
+    given, output = output, resolve_output(output)
+    folder = hidden_path(output, "resume")
     made = [path for path in (*reversed(output.parents),) if not path.exists()]
     try:
-        file = _open_lock(folder, output)
+        file = _open_lock(folder, given)
     except OSError as error:
-        raise InputError(f"cannot be written: {error.strerror}", where=str(output)) from error
+        raise cannot_write(error, given) from error
     checkpoints = CheckpointFolder(folder)
     try:
+        finish_exchange(output)
         checkpoints.recover(output)
         yield checkpoints
     finally:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from stillmap.core.errors import InputError
 from stillmap.core.files import read_text, require_regular
+from stillmap.core.json import write_json
 from stillmap.places.store import BEAMS, HINT, STATE, WRITTEN_ANEW
 
 _FILE = "checksums.json"
@@ -29,8 +30,7 @@ def write_checksums(home: Path) -> None:
     noted = _read_sums(path) if path.is_file() else {}
     known = {name: digest for name, digest in noted.items() if name not in _ANEW}
     sums = {name: known.get(name) or _digest(file) for name, file in _iter_files(home)}
-    text = json.dumps(sums, indent=1, ensure_ascii=False)
-    path.write_text(text + "\n", encoding="utf-8")
+    write_json(path, sums)
 
 
 def check_checksums(home: Path) -> None:

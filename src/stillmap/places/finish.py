@@ -10,6 +10,8 @@ import numpy as np
 from stillmap.core.arrays import iter_blocks
 from stillmap.core.config import to_dict
 from stillmap.core.errors import InputError
+from stillmap.core.files import write_text
+from stillmap.core.json import write_json
 from stillmap.core.version import package_version
 from stillmap.em import OccupancyMap
 from stillmap.pipeline.options import Options
@@ -24,7 +26,7 @@ from stillmap.places.place_states import estimate_place
 from stillmap.places.quality import rate_place
 from stillmap.places.report.page import render_place_report
 from stillmap.places.shown_state import show_state
-from stillmap.places.writer import PlaceResult, write_json, write_place_files, write_sessions
+from stillmap.places.writer import PlaceResult, write_place_files, write_sessions
 from stillmap.results.labels import read_array
 from stillmap.results.map_npz import write_map_npz
 from stillmap.results.map_server import write_map_server
@@ -126,7 +128,7 @@ def write_place(folder: Path, result: PlaceResult, options: Options, map_state: 
     write_map_npz(folder / "map.npz", occupancy)
     record = place_record(folder, result, options, map_state, occupancy)
     page = render_place_report(folder, occupancy, options.output.map_mode, record)
-    (folder / "report.html").write_text(page, encoding="utf-8")
+    write_text(folder / "report.html", page)
     write_json(folder / RECORD, record)
 
 

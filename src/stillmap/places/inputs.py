@@ -1,6 +1,5 @@
 """The inputs of a merge: recordings, result folders, or a place."""
 
-import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,6 +9,7 @@ from typing import TypeAlias
 import numpy as np
 
 from stillmap.core.errors import InputError
+from stillmap.core.json import write_json
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io.registry import detect_format
@@ -167,5 +167,4 @@ def load_mapped(
 def copy_record(result: Path, folder: Path, dimension: int) -> None:
     """Copy what describes how a session of a dimension was read and mapped."""
     record = {**read_record(result), "dimension": dimension}
-    text = json.dumps(record, indent=2, ensure_ascii=False)
-    (folder / RECORD).write_text(text + "\n", encoding="utf-8")
+    write_json(folder / RECORD, record, indent=2)

@@ -1,6 +1,5 @@
 """The folder of a place: everything that the result of one recording has, and its sessions."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.arrays import write_npy, write_npz
-from stillmap.core.json import to_jsonable
+from stillmap.core.json import write_json
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io.trajectory import write_tum
 from stillmap.places.evidence import Evidence
@@ -139,12 +138,6 @@ def write_place_files(folder: Path, result: PlaceResult) -> None:
     write_npz(folder / STATES, changed_cell_table(result.planar, result.names_in_time))
     dof = 3 if place.dimension == 2 else 6
     write_ties(folder / TIES, place.ties, dof)
-
-
-def write_json(path: Path, content: Any) -> None:
-    """Write JSON, numbers that are not finite as null."""
-    text = json.dumps(to_jsonable(content), indent=1, ensure_ascii=False, allow_nan=False)
-    path.write_text(text + "\n", encoding="utf-8")
 
 
 def _write_beams(folder: Path, homes: list[Path], stamps: NDArray[np.int64]) -> None:

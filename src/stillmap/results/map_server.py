@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from PIL import Image
 
 from stillmap.core.grid_map import GridMap
 from stillmap.core.tiles import Layer, rows_of
+from stillmap.io.images import write_png
 from stillmap.pipeline.options import MapMode
 from stillmap.results.reader import FREE_THRESH, OCCUPIED_THRESH
 
@@ -62,7 +62,7 @@ def write_map_server(folder: Path, occupancy: GridMap, mode: MapMode = "trinary"
     if not p_occupied.size:
         p_occupied = np.full((1, 1), np.nan, np.float32)  # readers refuse a picture without pixels
     if mode == "scale":
-        Image.fromarray(scale_pixels(np.asarray(p_occupied)[::-1])).save(folder / name)
+        write_png(scale_pixels(np.asarray(p_occupied)[::-1]), folder / name, compress_level=6)
     else:
         _write_pgm(folder / name, p_occupied, trinary_pixels if mode == "trinary" else raw_pixels)
     _write_yaml(folder / "map.yaml", name, mode, occupancy, (FREE_THRESH, OCCUPIED_THRESH))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from stillmap.core.arrays import iter_blocks
-from stillmap.core.errors import import_extra
+from stillmap.core.errors import InputError, import_extra
 from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.mapping.beam_statistics import sample_dynamic_points
 from stillmap.pipeline.quality import Quality
@@ -28,10 +28,8 @@ def plot_result(
     result: ResultData, ax: "Axes | None", *, trajectory: bool, dynamic: bool
 ) -> "Axes":
     """See `Result.plot`."""
-    pyplot = import_extra("matplotlib.pyplot", "a plot", "drawn", group="notebook")
     if ax is None:
-        _, ax = pyplot.subplots(layout="constrained")
-    assert ax is not None
+        ax = _make_axes()
     window = map_window([result.map])
     image = draw_map(result.map, window).convert("RGB")
     ax.imshow(np.asarray(image), extent=_extent(result, image), interpolation="nearest")
@@ -46,6 +44,23 @@ def plot_result(
     ax.set_xlabel("x (m)")
     ax.set_ylabel("y (m)")
     return ax
+
+
+def _make_axes() -> "Axes":
+    """New axes of pyplot.
+
+    Raises:
+        MissingExtra: matplotlib is not installed.
+        InputError: the backend that `MPLBACKEND` names is missing.
+    """
+    try:
+        pyplot = import_extra("matplotlib.pyplot", "a plot", "drawn", group="notebook")
+        axes: Axes = pyplot.subplots(layout="constrained")[1]
+    except (ImportError, ValueError) as error:
+        raise InputError(
+            f"no plot can be drawn: {error}", hint="MPLBACKEND=agg needs no screen, or give ax"
+        ) from error
+    return axes
 
 
 def draw_dynamic(result: ResultData, ax: "Axes") -> None:

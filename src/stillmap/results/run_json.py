@@ -1,12 +1,11 @@
 """`run.json`: the input, the resolved options, the iterations, counts, times and warnings."""
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stillmap.core.config import to_dict
-from stillmap.core.json import count_skipped, to_jsonable
+from stillmap.core.json import count_skipped, to_jsonable, write_json
 from stillmap.core.version import package_version
 from stillmap.mapping import Change
 from stillmap.mapping.beam_statistics import count_beams
@@ -87,8 +86,7 @@ def write_run_json(
     path: Path, result: MappingResult, more: Mapping[str, Any] | None = None
 ) -> None:
     """Write `run_record` to `path`."""
-    text = json.dumps(run_record(result, more), indent=2, ensure_ascii=False, allow_nan=False)
-    path.write_text(text + "\n", encoding="utf-8")
+    write_json(path, run_record(result, more), indent=2)
 
 
 def tilting_record(tilting: "TiltingResult") -> dict[str, Any]:

@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 from stillmap.core import config
 from stillmap.core.errors import InputError
 from stillmap.core.files import read_text, require_regular
+from stillmap.core.output_place import require_finished
 from stillmap.core.region import Region
 from stillmap.core.short_repr import ShortRepr
 from stillmap.mesh.options import MeshOptions
@@ -153,6 +154,7 @@ def read_record(result: Path) -> dict[str, Any]:
         InputError: it is missing or damaged.
     """
     path = result / RECORD
+    require_finished(result)
     try:
         require_regular(path)
         record = json.loads(read_text(path, _MAX_RUN))

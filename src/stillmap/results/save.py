@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.files import atomic_folder
+from stillmap.core.files import atomic_folder, write_text
 from stillmap.core.parallel import resolve_threads
 from stillmap.core.region import Region, limit_hits
 from stillmap.io.trajectory import write_tum
@@ -84,7 +84,7 @@ def save(
         write_run_json(folder / RECORD, result, more)
         previews = None if models is None else _previews(models, result.options.threads)
         page = render_report(result, tilting, previews, folder)
-        (folder / "report.html").write_text(page, encoding="utf-8")
+        write_text(folder / "report.html", page)
         if write_more is not None:
             write_more(folder)
 

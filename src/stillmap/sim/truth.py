@@ -23,7 +23,6 @@ _STANDING, _MOVING, _POSE = "standing.npz", "moving.npz", "moving_pose.npy"
 _CAMERAS = "T_world_camera.npy"
 _SCENE = "scene.json"
 _ARRAYS = ("static", "mover", "T_world_base", "walls", "movers")
-_PER_BEAM = ("static", "mover", "thing")
 _LASTING = "lasting"  # only where there are any
 _MOUNT = "T_base_sensor"  # only where the recorder is wrong about it
 _THING = "thing"  # only where movable objects stand still
@@ -69,9 +68,7 @@ def write_truth(truth: Truth, stamp_ns: NDArray[np.int64], folder: Path) -> None
     optional = [_LASTING] if len(truth.lasting) else []
     optional += [name for name in (_MOUNT, _THING) if getattr(truth, name) is not None]
     for name in (*_ARRAYS, *optional):
-        # per-beam arrays may be larger than memory
-        write = write_npy if name in _PER_BEAM else np.save
-        write(inside / f"{name}.npy", getattr(truth, name))
+        write_npy(inside / f"{name}.npy", np.asarray(getattr(truth, name)))
     write_tum(inside / "trajectory.tum", stamp_ns, truth.T_world_base)
     (inside / _SCENE).write_text(json.dumps(truth.scene, indent=1) + "\n", encoding="utf-8")
 
@@ -129,7 +126,7 @@ def write_image_truth(truth: ImageTruth, folder: Path) -> None:
     moving = truth.moving.solids._asdict()
     write_npy(folder / _POSE, moving.pop("pose"))
     write_npz(folder / _MOVING, {"stamp_ns": truth.moving.stamp_ns, **moving})
-    np.save(folder / _CAMERAS, truth.T_world_camera)
+    write_npy(folder / _CAMERAS, truth.T_world_camera)
 
 
 def load_image_truth(path: str | Path) -> ImageTruth:

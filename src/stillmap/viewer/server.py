@@ -1,8 +1,8 @@
-"""A viser server for this machine only.
+"""A viser server for this machine only, and for those who know its address.
 
 Every page in a browser of the machine can reach a port of the loopback interface. Requests of other
-pages are recognized by `Origin`, DNS rebinding by `Host`; a content security policy keeps the page
-itself from requests to elsewhere.
+pages are recognized by `Origin`, DNS rebinding by `Host`, those of other users by the lack of the
+token (see `access`); a content security policy keeps the page itself from requests to elsewhere.
 """
 
 import gzip
@@ -20,6 +20,7 @@ import viser
 import websockets.asyncio.server
 
 from stillmap.core.errors import InputError
+from stillmap.viewer.access import Access
 
 HOST = "127.0.0.1"
 
@@ -95,7 +96,18 @@ _PORT_VARIABLE = "_VISER_PORT_OVERRIDE"  # environment variable that overrides v
 
 
 class Server(viser.ViserServer):
-    """Without sharing of the page through a remote server."""
+    """Without sharing of the page through a remote server.
+
+    Attributes:
+        access: the secrets in its addresses.
+    """
+
+    access: Access
+
+    @property
+    def address(self) -> str:
+        """Of the server, without a path."""
+        return f"http://{self.get_host()}:{self.get_port()}"
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         del verbose
@@ -114,10 +126,11 @@ def start_server(port: int, title: str) -> Server:
     """
     # websockets logs malformed requests with a traceback
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
-    port_override = os.environ.pop(_PORT_VARIABLE, None)
+    port_override, access = os.environ.pop(_PORT_VARIABLE, None), Access()
     try:
-        with _quiet_console(), _guard_servers(title) as ports:
+        with _quiet_console(), _guard_servers(title, access) as ports:
             server = Server(HOST, port, label="stillmap", verbose=False)
+            server.access = access
     finally:
         if port_override is not None:
             os.environ[_PORT_VARIABLE] = port_override
@@ -149,7 +162,7 @@ def _quiet_console() -> Iterator[None]:
 
 
 @contextmanager
-def _guard_servers(title: str) -> Iterator[list[int]]:
+def _guard_servers(title: str, access: Access) -> Iterator[list[int]]:
     """Within the context, new servers check requests and send the policy; yields their ports."""
     module, ports = websockets.asyncio.server, list[int]()
     original = module.serve
@@ -160,12 +173,21 @@ def _guard_servers(title: str) -> Iterator[list[int]]:
         def answer(connection: Any, request: Any) -> Any:
             if not is_local_request(request.headers):
                 return connection.respond(HTTPStatus.FORBIDDEN, "not from this page\n")
+            path, is_page = access.strip(request.path), "Upgrade" not in request.headers
+            if access.redeem(request.path) or (is_page and path == ""):
+                response = connection.respond(HTTPStatus.FOUND, "")
+                response.headers["Location"] = f"/{access.token}/"
+                return response
+            if path is None:
+                return connection.respond(HTTPStatus.FORBIDDEN, "the address has no token\n")
+            request.path = path or "/"
             response = process_request(connection, request)
             if response is not None:
                 adapt_page(response, title)
                 response.headers["Content-Security-Policy"] = content_security_policy(
                     request.headers["Host"]
                 )
+                response.headers["Referrer-Policy"] = "no-referrer"
             return response
 
         return original(handler, host, port, process_request=answer, **options)

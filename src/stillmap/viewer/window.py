@@ -74,8 +74,12 @@ class Window:
 
     @property
     def url(self) -> str:
-        """Address of the page."""
-        return f"http://{self._server.get_host()}:{self._server.get_port()}"
+        """Address of the page: who knows it can see the page."""
+        return f"{self._server.address}/{self._server.access.token}"
+
+    def make_single_url(self) -> str:
+        """An address that works once, for the command line of a browser, which others can read."""
+        return f"{self._server.address}/{self._server.access.issue_ticket()}"
 
     def close(self) -> None:
         """Stop the server."""

@@ -2,7 +2,9 @@
 
 import bz2
 import shutil
+import sqlite3
 import struct
+from contextlib import closing
 from pathlib import Path
 
 import lz4.frame
@@ -167,9 +169,7 @@ def test_only_empty_topics(bag, messages, kind):
     if kind in ("bag", "mcap"):
         pytest.skip("topics without messages are not written here")
     path = bag(scans_of(messages, 2))
-    import sqlite3
-
-    with sqlite3.connect(file_of(path)) as database:
+    with closing(sqlite3.connect(file_of(path))) as database, database:
         database.execute("DELETE FROM messages")
     with pytest.raises(InputError, match="holds no scans: /scan is empty"):
         read(path)

@@ -4,6 +4,7 @@ import bz2
 import os
 import sqlite3
 import struct
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -99,10 +100,10 @@ def test_tree_with_a_shared_page(db3, monkeypatch):
     monkeypatch.setattr(limits, "_STEPS_PER_BYTE", 3)
     path, size = db3(), 4096
     content = bytearray(path.read_bytes())
-    root = sqlite3.connect(path).execute(
-        "SELECT rootpage FROM sqlite_master WHERE name = 'messages'"
-    )
-    at = (next(root)[0] - 1) * size
+    with closing(sqlite3.connect(path)) as database:
+        query = "SELECT rootpage FROM sqlite_master WHERE name = 'messages'"
+        ((root,),) = database.execute(query).fetchall()
+    at = (root - 1) * size
     content += content[at : at + size]
     for _ in range(3):
         child, inner = len(content) // size, bytearray(size)

@@ -232,7 +232,7 @@ def write(recording: Recording, path: str | Path, *, overwrite: bool = False) ->
             points, _ = scan_hits(recording, scan)
             rows = np.zeros((len(points), 4), "<f4")
             rows[:, :3] = points
-            rows.tofile(folder / "velodyne" / f"{scan:0{digits}d}.bin")
+            (folder / "velodyne" / f"{scan:0{digits}d}.bin").write_bytes(rows.data)
         stamps = (f"{format_seconds(stamp)}\n" for stamp in recording.stamp_ns.tolist())
         (folder / "times.txt").write_text("".join(stamps), encoding="ascii")
         identity = " ".join(f"{value:g}" for value in np.eye(4)[:3].ravel())

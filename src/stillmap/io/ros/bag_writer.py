@@ -1,8 +1,8 @@
 """Writes a new ROS bag of any kind, message by message."""
 
+import os
 import shutil
 import sqlite3
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -20,7 +20,8 @@ from rosbags.interfaces import (
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from stillmap.core.errors import InputError
-from stillmap.core.files import atomic_file, atomic_folder
+from stillmap.core.files import atomic_file, atomic_folder, temporary_folder
+from stillmap.core.output_place import resolve_output, shorten
 from stillmap.io.ros.bag_types import BagKind, Channel
 from stillmap.io.ros.messages import load_typestore
 
@@ -146,18 +147,16 @@ def new_bag(
             work = stack.enter_context(atomic_folder(path, "metadata.yaml", overwrite))
         else:
             work = stack.enter_context(atomic_file(path))
+        # rosbags refuses existing files; for ROS 2 it makes a folder, and names its files after it
+        beside = stack.enter_context(temporary_folder(path))
         if kind == "bag":
-            work.unlink(missing_ok=True)  # left by a killed run: rosbags refuses existing files
-            with _sqlite_errors(path), rosbag1.Writer(work) as writer1:
+            with _sqlite_errors(path), rosbag1.Writer(beside / "bag") as writer1:
                 yield BagWriter(kind, writer1)
+            os.replace(beside / "bag", work)
             return
-        # the ROS 2 writer of rosbags creates a folder, and names its files after it: on this disk
-        beside = tempfile.TemporaryDirectory(
-            prefix=f".{path.name}.", suffix=".part", dir=path.absolute().parent
-        )
         mcap |= kind == "mcap"
         plugin = rosbag2.StoragePlugin.MCAP if mcap else rosbag2.StoragePlugin.SQLITE3
-        folder = Path(stack.enter_context(beside), path.stem if kind != "ros2" else path.name)
+        folder = beside / (shorten(resolve_output(path).name) if kind == "ros2" else "bag")
         writer2 = rosbag2.Writer(folder, version=_VERSION, storage_plugin=plugin)
         if mcap:
             compression = rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD

@@ -8,6 +8,7 @@ from typing import Any, cast
 import numpy as np
 
 from stillmap.core.errors import InputError
+from stillmap.core.output_place import workplace
 from stillmap.core.recording import Recording
 from stillmap.io.filtered_copy import FilterJob, Mask, Omissions, other_recording_error
 from stillmap.io.ros.bag import open_bag
@@ -41,7 +42,7 @@ def write_filtered(job: FilterJob) -> Omissions:
     """
     for trusted in (True, False):
         try:
-            scratch = job.output.absolute().parent
+            scratch = workplace(job.output)
             with closing(open_bag(job.source, scratch, trusted=trusted)) as bag:
                 return _copy(bag, job)
         except DamagedBagError:

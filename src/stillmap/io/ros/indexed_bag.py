@@ -2,9 +2,11 @@
 
 from collections.abc import Iterator
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import apsw
 from rosbags.interfaces import ConnectionExtRosbag2, MessageDefinitionFormat, Qos, QosDurability
 from rosbags.rosbag1 import reader as rosbag1
 from rosbags.rosbag2 import storage_mcap, storage_sqlite3
@@ -14,6 +16,34 @@ from stillmap.core.errors import InputError
 from stillmap.io.builder import SkippedRecords
 from stillmap.io.ros import limits
 from stillmap.io.ros.bag_types import MAX_STAMP_NS, Channel, DamagedBagError, Message
+
+_CHUNK_READERS = ("open", "read_index_data", "read_chunk")  # of rosbag1.Reader
+
+
+def require_known_rosbags() -> None:
+    """Refuse a version of rosbags in which the limits below would not take effect.
+
+    They are set where rosbags has no option: in its tables of decompressors, in its parser of
+    quality of service, and in methods that `_Bag1Reader` overrides.
+
+    Raises:
+        InputError: it is one.
+    """
+    checks = {
+        "storage_mcap.DECOMPRESSORS": set(storage_mcap.DECOMPRESSORS) == {"", "lz4", "zstd"},
+        "reader.decompressors": set(rosbag1.decompressors) == {"none", "bz2", "lz4"},
+        "reader.Chunk": "decompressor" in rosbag1.Chunk._fields,
+        "reader.Reader": all(hasattr(rosbag1.Reader, name) for name in _CHUNK_READERS),
+        "parse_qos": all("parse_qos" in vars(one) for one in (storage_mcap, storage_sqlite3)),
+        "storage_sqlite3.apsw": vars(storage_sqlite3).get("apsw") is apsw,
+    }
+    changed = [name for name, is_known in checks.items() if not is_known]
+    if changed:
+        what = f"rosbags {version('rosbags')} is not supported: {', '.join(changed)} has changed"
+        raise InputError(what, hint="constraints.txt names the version that is")
+
+
+require_known_rosbags()
 
 # rosbags decompresses without a limit; its table is where one can be set
 storage_mcap.DECOMPRESSORS["lz4"] = lambda data, _: limits.decompress("lz4", data)

@@ -100,8 +100,12 @@ class LiveNode:
         self.save_node.destroy_node()
         self.node.destroy_node()
 
-    def save(self, progress: Progress = no_progress) -> None:
+    def save(self, progress: Progress = no_progress, output: Path | None = None) -> None:
         """Write the result folder, as known now. Mapping goes on meanwhile.
+
+        Args:
+            progress: shows how far it is written.
+            output: another folder than the one that was given at the start.
 
         Raises:
             InputError: there is nothing to save yet, or the folder cannot be written to.
@@ -111,6 +115,9 @@ class LiveNode:
                 raise InputError("no scan has been mapped yet")
             with self._lock:
                 snapshot = self._mapper.snapshot()
+            if output is not None:
+                snapshot.save(output, progress=progress)
+                return
             snapshot.save(self._output, overwrite=self._overwrite, progress=progress)
             self._overwrite = True  # the next one replaces ours
 

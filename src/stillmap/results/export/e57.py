@@ -24,6 +24,16 @@ _AXES = ("cartesianX", "cartesianY", "cartesianZ")
 _COLORS = ("colorRed", "colorGreen", "colorBlue")
 
 
+def require_name(path: Path) -> None:
+    """Refuse a name that libe57 cannot open.
+
+    Raises:
+        InputError: it is one.
+    """
+    if not str(path).isprintable():
+        raise InputError("has a name that libe57 cannot open", where=str(path))
+
+
 def write(cloud: Cloud, path: Path, progress: Callable[[float], None] | None) -> None:
     """Write `cartesianX`, `Y`, `Z`, `intensity` and, with colors, `colorRed`, `Green`, `Blue`.
 
@@ -34,8 +44,7 @@ def write(cloud: Cloud, path: Path, progress: Callable[[float], None] | None) ->
         OSError: the file cannot be created.
     """
     library = import_extra("pye57.libe57", path, "written")
-    if not str(path).isprintable():
-        raise InputError("has a name that libe57 cannot open", where=str(path))
+    require_name(path)
     path.open("wb").close()  # raises an OSError that names the reason; libe57 does not
     try:
         file = library.ImageFile(str(path), "w")

@@ -97,7 +97,9 @@ def encode_obj(
         file = f"{prefix}{title}{page.suffix}"
         material_text = material_text.replace(f"map_Kd {title}.png\n", f"map_Kd {file}\n")
         named[file] = page.data
-    return {f"{name}.obj": text.encode("utf-8"), materials: material_text.encode("utf-8"), **named}
+    texts = {f"{name}.obj": text, materials: material_text}
+    # they name files, whose names need not be UTF-8
+    return {file: one.encode("utf-8", "surrogateescape") for file, one in texts.items()} | named
 
 
 def _material(trimesh: Any, page: int) -> Any:

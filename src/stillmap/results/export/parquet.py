@@ -43,7 +43,8 @@ def write(result: Exported, deskewed: Recording, path: Path) -> None:
     recording, schema = result.recording, beam_schema(result.recording.dimension)
     with (
         atomic_file(path) as work,
-        parquet.ParquetWriter(str(work), schema, compression="zstd") as writer,
+        work.open("wb") as file,  # not by name: it need not be UTF-8
+        parquet.ParquetWriter(file, schema, compression="zstd") as writer,
     ):
         for scans in split_scans(recording):
             columns = beam_columns(recording, deskewed, result.poses, result.p_static, scans)

@@ -57,14 +57,16 @@ def format_for(path: Path, name: str | None = None) -> Format | None:
 
 
 def require_extras(file_format: Format, path: Path) -> None:
-    """Check that the libraries for a format are installed.
+    """Check that the libraries for a format are installed, and can open a file of this name.
 
     Raises:
-        InputError: a library is missing.
+        InputError: a library is missing, or cannot.
     """
     compressed = path.suffix.lower() == ".laz"
     for module in (*file_format.requires, *(("lazrs",) if compressed else ())):
         import_extra(module, path, "written")
+    if file_format.name == "e57":
+        e57.require_name(path)
 
 
 def write(cloud: Cloud, path: Path, file_format: Format, progress: Progress | None = None) -> None:

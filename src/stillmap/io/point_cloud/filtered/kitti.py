@@ -39,4 +39,4 @@ def _copy_rows(path: Path, new: Path, mask: Mask, size: int) -> None:
     """Copy a file of rows of `size` bytes without those of a mask."""
     rows = np.fromfile(path, np.uint8)
     require_rows(mask, len(rows) // size, path)
-    rows.reshape(-1, size)[~mask].tofile(new)
+    new.write_bytes(rows.reshape(-1, size)[~mask].data)

@@ -1,0 +1,50 @@
+"""Writers that do not notice a full disk are not used: half a file would pass for a whole one."""
+
+import re
+import resource
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stillmap.core.arrays import write_npy, write_npz
+from stillmap.core.files import write_text
+from stillmap.core.json import write_json
+from stillmap.io.images import write_png
+
+PACKAGE = Path(__file__).resolve().parents[2] / "src" / "stillmap"
+ARRAY = np.random.default_rng(0).integers(0, 255, (50, 50)).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda path: write_npy(path, ARRAY),
+        lambda path: write_npz(path, {"a": ARRAY}),
+        lambda path: write_png(ARRAY, path),
+        lambda path: write_text(path, "text" * 500),
+        lambda path: write_json(path, ["text"] * 500),
+    ],
+)
+def test_full_disk_is_noticed(tmp_path, write):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            write(tmp_path / "file")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_writers_that_do_not_notice_it_are_not_used():
+    """`ndarray.tofile` and `np.save` leave what is in a buffer of C to a close that fails in
+    silence; Pillow takes the first part of a write for all of it."""
+    calls = (r"\.tofile\(", r"\bnp\.save(z|txt)?\(", r"Image\.\w+\(.*\.save\((?!buffer|out)")
+    to_a_file = re.compile("|".join(calls))
+    found = [
+        f"{path.relative_to(PACKAGE)}: {line.strip()}"
+        for path in PACKAGE.rglob("*.py")
+        for line in path.read_text().splitlines()
+        if to_a_file.search(line)
+    ]
+    assert found == []

@@ -1,0 +1,323 @@
+"""Outputs appear whole or not at all: behind links, on mount points, with long names."""
+
+import errno
+import os
+import shutil
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from stillmap.core import output_place, publishing
+from stillmap.core.errors import InputError
+from stillmap.core.files import atomic_file, atomic_folder, require_new, require_new_file
+from stillmap.core.output_place import UNFINISHED, hidden_path, is_fixed, require_finished
+from stillmap.io.registry import detect_format
+from stillmap.results.run_record import read_record
+
+NEW = {"mark": "new", "b/c": "new", "d": "new"}
+OLD = {"mark": "old", "a": "old", "b/x": "old"}
+
+
+def fill(folder: Path, files: dict[str, str]) -> None:
+    for name, text in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+
+
+def content(folder: Path) -> dict[str, str]:
+    return {
+        str(path.relative_to(folder)): path.read_text()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
+
+
+def write(
+    path: Path,
+    files: dict[str, str] = NEW,
+    overwrite: bool = False,
+    meanwhile: Callable[[], None] = lambda: None,
+) -> None:
+    with atomic_folder(path, "mark", overwrite) as work:
+        fill(work, files)
+        meanwhile()
+
+
+def write_file(path: Path, text: str, meanwhile: Callable[[], None] = lambda: None) -> None:
+    with atomic_file(path) as work:
+        work.write_text(text)
+        meanwhile()
+
+
+def stop() -> None:
+    raise RuntimeError("stop")
+
+
+@pytest.fixture
+def fixed(tmp_path, monkeypatch) -> Path:
+    """A folder that cannot be renamed."""
+    path = tmp_path / "fixed"
+    path.mkdir()
+    monkeypatch.setattr(output_place, "_mount_points", lambda: {os.fsencode(path)})
+    rename = os.rename
+
+    def refuse(source, target):
+        if path in (Path(source), Path(target)):
+            raise OSError(errno.EBUSY, os.strerror(errno.EBUSY))
+        rename(source, target)
+
+    monkeypatch.setattr("os.rename", refuse)
+    return path
+
+
+def test_folder_behind_a_link(tmp_path):
+    (tmp_path / "disk" / "there").mkdir(parents=True)
+    (tmp_path / "link").symlink_to("disk/there")
+    with atomic_folder(tmp_path / "link", "mark") as work:
+        assert work.parent == tmp_path / "disk"
+        fill(work, NEW)
+    assert (tmp_path / "link").is_symlink()
+    assert content(tmp_path / "disk/there") == NEW
+    assert os.listdir(tmp_path / "disk") == ["there"]
+
+
+def test_link_to_nothing(tmp_path):
+    (tmp_path / "link").symlink_to("new/there")
+    (tmp_path / "file").symlink_to("plain")
+    write(tmp_path / "link")
+    assert content(tmp_path / "new/there") == NEW
+    with atomic_file(tmp_path / "file") as work:
+        work.write_text("new")
+    assert (tmp_path / "file").is_symlink()
+    assert (tmp_path / "plain").read_text() == "new"
+
+
+def test_link_to_itself_is_refused(tmp_path):
+    (tmp_path / "link").symlink_to("link")
+    for check in (lambda path: require_new(path, "mark"), require_new_file, write):
+        with pytest.raises(InputError, match="leads to itself"):
+            check(tmp_path / "link")
+
+
+def test_pipe_is_not_replaced(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(InputError, match="no regular file"), atomic_file(tmp_path / "pipe"):
+        pass
+    with pytest.raises(InputError, match="not a folder"):
+        write(tmp_path / "pipe")
+    assert (tmp_path / "pipe").is_fifo()
+
+
+@pytest.mark.parametrize("name", ["n" * 255, "ä" * 127, "n" * 254 + ".", "n" * 251 + ".bag"])
+def test_long_names(tmp_path, name):
+    write(tmp_path / name)
+    write(tmp_path / name, overwrite=True)
+    assert content(tmp_path / name) == NEW
+    shutil.rmtree(tmp_path / name)
+    with atomic_file(tmp_path / name) as work:
+        work.write_text("new")
+    assert (tmp_path / name).read_text() == "new"
+    assert os.listdir(tmp_path) == [name]
+
+
+def test_names_that_are_too_long_have_one_line(tmp_path):
+    for check in (write, lambda path: atomic_file(path).__enter__()):
+        with pytest.raises((InputError, OSError), match="File name too long"):
+            check(tmp_path / ("n" * 256))
+
+
+def test_hidden_names_of_long_names_differ(tmp_path):
+    first, second = tmp_path / ("n" * 230 + "a"), tmp_path / ("n" * 230 + "b")
+    assert hidden_path(first, "resume") != hidden_path(second, "resume")
+    assert hidden_path(first, "resume") == hidden_path(first, "resume")
+    assert hidden_path(tmp_path / "out", "resume") == tmp_path / ".out.resume"
+
+
+def test_two_threads_write_one_file(tmp_path):
+    path, both = tmp_path / "file", threading.Barrier(2)
+    path.write_text("old")
+    failed = []
+
+    def put(letter: str) -> None:
+        try:
+            with atomic_file(path) as work:
+                both.wait(10)
+                work.write_text(letter * 100_000)
+                both.wait(10)
+        except Exception as error:
+            failed.append(error)
+
+    threads = [threading.Thread(target=put, args=(letter,)) for letter in "ab"]
+    for one in threads:
+        one.start()
+    for one in threads:
+        one.join()
+    assert failed == []
+    assert path.read_text() in ("a" * 100_000, "b" * 100_000)
+    assert os.listdir(tmp_path) == ["file"]
+
+
+def test_temporary_name_cannot_be_taken_before(tmp_path, monkeypatch):
+    monkeypatch.setattr("secrets.token_hex", lambda _: "0" * 16)
+    (tmp_path / "victim").write_text("mine")
+    (tmp_path / f".file.{'0' * 16}.part").symlink_to("victim")
+    with pytest.raises(InputError, match="File exists"):
+        write_file(tmp_path / "file", "new")
+    assert (tmp_path / "victim").read_text() == "mine"
+
+
+def test_folder_that_cannot_be_renamed(fixed, tmp_path):
+    write(fixed)
+    assert content(fixed) == NEW
+    with pytest.raises(InputError, match="already holds something"):
+        write(fixed)
+    fill(fixed, {"lost+found/x": "of the disk"})
+    write(fixed, OLD, overwrite=True)
+    assert content(fixed) == OLD | {"lost+found/x": "of the disk"}
+    assert os.listdir(tmp_path) == ["fixed"]
+
+
+def test_failure_before_the_exchange_leaves_the_earlier_folder(fixed):
+    write(fixed, OLD)
+    with pytest.raises(RuntimeError, match="stop"):
+        write(fixed, NEW, True, stop)
+    assert content(fixed) == OLD
+
+
+def test_other_things_on_a_mount_point_stay(fixed):
+    fill(fixed, {"mine": "mine"})
+    with pytest.raises(InputError, match="holds other things"):
+        write(fixed, overwrite=True)
+    assert content(fixed) == {"mine": "mine"}
+
+
+@pytest.mark.parametrize("step", range(9))
+def test_interrupted_exchange_is_recognized_and_finished(fixed, monkeypatch, step):
+    write(fixed, OLD)
+    steps = iter(range(100))
+
+    def stopping(function):
+        def call(*words, **options):
+            if next(steps) == step:
+                raise KeyboardInterrupt
+            return function(*words, **options)
+
+        return call
+
+    with monkeypatch.context() as patch:
+        patch.setattr("os.rename", stopping(os.rename))
+        patch.setattr(publishing, "remove", stopping(publishing.remove))
+        try:
+            write(fixed, overwrite=True)
+        except KeyboardInterrupt:
+            assert (fixed / UNFINISHED).exists()
+            assert {"mark": "new"}.items() <= content(fixed).items() or step < 8
+            for check in (require_finished, detect_format, read_record):
+                with pytest.raises(InputError, match="is not whole: writing it was interrupted"):
+                    check(fixed)
+            with pytest.raises(InputError, match=r"is not whole.*overwrite=True"):
+                require_new(fixed, "mark")
+    require_new(fixed, "mark", overwrite=True)
+    publishing.finish_exchange(fixed)
+    assert content(fixed) == NEW
+    write(fixed, OLD, overwrite=True)
+    assert content(fixed) == OLD
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"work": "../x", "old": [], "new": []}'])
+def test_damaged_journal_is_one_line(fixed, text):
+    fill(fixed, {UNFINISHED: text, "mine": "mine"})
+    with pytest.raises(InputError, match="is damaged"):
+        write(fixed, overwrite=True)
+    assert content(fixed)["mine"] == "mine"
+
+
+@pytest.mark.parametrize("number", [errno.EBUSY, errno.EXDEV, errno.EACCES])
+@pytest.mark.parametrize("earlier", [False, True])
+def test_rename_that_fails_at_the_end(tmp_path, monkeypatch, number, earlier):
+    """Where nothing told before that it would."""
+    path, rename = tmp_path / "out", os.rename
+    if earlier:
+        write(path, OLD)
+
+    def refuse(source, target):
+        if path in (Path(source), Path(target)):
+            raise OSError(number, os.strerror(number))
+        rename(source, target)
+
+    monkeypatch.setattr("os.rename", refuse)
+    write(path, overwrite=True)
+    assert content(path) == NEW
+    assert os.listdir(tmp_path) == ["out"]
+
+
+@pytest.mark.parametrize("number", [errno.EBUSY, errno.EXDEV])
+def test_file_that_cannot_be_replaced_is_written_in_place(tmp_path, monkeypatch, number):
+    path, text = tmp_path / "file", "0123456789" * 10_000
+    path.write_text("old" * 100_000)
+
+    def refuse(*_):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr("os.replace", refuse)
+    write_file(path, text)
+    assert path.read_text() == text
+    assert os.listdir(tmp_path) == ["file"]
+
+    def fail(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("shutil.copyfileobj", fail)
+    with pytest.raises(InputError, match="No space") as failed:
+        write_file(path, text)
+    assert path.read_bytes() == b""
+    kept = Path(failed.value.hint.removeprefix("what was made is kept in "))
+    assert kept.read_text() == text
+
+
+def test_what_was_finished_is_kept_where_its_place_is_taken(tmp_path):
+    path = tmp_path / "out"
+    with pytest.raises(InputError, match="already holds") as failed:
+        write(path, meanwhile=lambda: fill(path, {"mine": "mine"}))
+    assert content(path) == {"mine": "mine"}
+    kept = Path(failed.value.hint.removeprefix("what was made is kept in "))
+    assert content(kept) == NEW
+    with pytest.raises(InputError, match="has appeared") as failed:
+        write_file(path / "f", "new", lambda: fill(path, {"f": "mine"}))
+    kept = Path(failed.value.hint.removeprefix("what was made is kept in "))
+    assert (kept.read_text(), (path / "f").read_text()) == ("new", "mine")
+
+
+def test_work_of_killed_processes_is_removed(tmp_path, monkeypatch):
+    monkeypatch.setattr(publishing, "_MIN_AGE", 0.0)
+    stale = [f".out.{digit * 16}.part" for digit in "ab"]
+    fill(tmp_path, {f"{stale[0]}/x": "", stale[1]: "", ".out.part": "", ".out.abc.part": ""})
+    with atomic_folder(tmp_path / "out", "mark") as work:  # which is alive
+        write(tmp_path / "out")
+        assert work.is_dir()
+        assert not {*os.listdir(tmp_path)} & {*stale}
+        shutil.rmtree(tmp_path / "out")
+    assert sorted(os.listdir(tmp_path)) == [".out.abc.part", ".out.part", "out"]
+
+
+def test_folder_that_a_killed_process_moved_aside_comes_back(tmp_path, monkeypatch):
+    monkeypatch.setattr(publishing, "_MIN_AGE", 0.0)
+    fill(tmp_path / f".out.{'a' * 16}.old", OLD)
+    with pytest.raises(InputError, match="holds something"):
+        write(tmp_path / "out")
+    assert content(tmp_path / "out") == OLD
+    assert os.listdir(tmp_path) == ["out"]
+
+
+def test_mounts_of_linux_are_found(tmp_path, monkeypatch):
+    if not os.path.exists("/proc/self/mountinfo"):
+        pytest.skip("no Linux")
+    monkeypatch.setattr(output_place, "_MOUNTS", tmp_path / "mountinfo")
+    path = tmp_path / "a b"
+    path.mkdir()
+    assert not is_fixed(path)
+    name = os.fsencode(path).replace(b" ", b"\\040")
+    (tmp_path / "mountinfo").write_bytes(b"36 35 98:0 /mnt1 %s rw - ext3 /dev/root rw\n" % name)
+    assert is_fixed(path)
