@@ -1,12 +1,12 @@
 """The summary that `stillmap map` prints."""
 
-import json
 import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stillmap.cli.console import list_files, say
 from stillmap.core.advice import split_advice
+from stillmap.results.run_record import read_record
 
 if TYPE_CHECKING:
     import numpy as np
@@ -22,7 +22,7 @@ _IN_SUMMARY = ("version", "converged", "best_iteration", "counts", "area", "seco
 
 def summarize(output: Path) -> dict[str, Any]:
     """The main entries of `run.json`, and the files of the result."""
-    record = json.loads((output / "run.json").read_text(encoding="utf-8"))
+    record = read_record(output)
     return {
         "output": str(output),
         "files": list_files(output),

@@ -1,4 +1,4 @@
-"""Atomic output of files and folders; bounded reading of text files."""
+"""Atomic output of files and folders."""
 
 import os
 import secrets
@@ -131,32 +131,3 @@ def _umask() -> int:
     mask = os.umask(0)
     os.umask(mask)
     return mask
-
-
-def read_text(path: Path, max_bytes: int) -> str:
-    """Read a UTF-8 file of at most `max_bytes` bytes.
-
-    Raises:
-        InputError: it cannot be read, or is larger.
-        UnicodeDecodeError: it is not UTF-8.
-    """
-    try:
-        with path.open("rb") as file:
-            content = file.read(max_bytes + 1)
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
-    if len(content) > max_bytes:
-        raise InputError(f"is too large: more than {max_bytes >> 10} KiB", where=str(path))
-    return content.decode("utf-8")
-
-
-def require_regular(path: Path) -> None:
-    """Reject pipes and devices, on which reading may block for ever.
-
-    Folders and missing paths pass: opening them fails.
-
-    Raises:
-        InputError: the path is a pipe, socket or device.
-    """
-    if path.exists() and not path.is_file() and not path.is_dir():
-        raise InputError("is no regular file", where=str(path))

@@ -1,10 +1,33 @@
-"""Conversion of values to JSON."""
+"""Reading of JSON files, and conversion of values to JSON."""
 
+import json
 import math
 from collections.abc import Mapping
-from typing import Any
+from pathlib import Path
+from typing import Any, NoReturn
 
 import numpy as np
+
+from stillmap.core.errors import InputError
+from stillmap.core.input_files import read_text
+
+
+def read_json(path: Path, max_bytes: int, hint: str = "") -> Any:
+    """The content of a JSON file of at most `max_bytes` bytes, without NaN and infinity.
+
+    Raises:
+        InputError: it cannot be read, is larger, or no JSON; with the hint.
+    """
+    try:
+        return json.loads(read_text(path, max_bytes), parse_constant=_reject_constant)
+    except InputError as error:
+        raise InputError(error.what, where=error.where, hint=hint) from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"is not JSON: {error}", where=str(path), hint=hint) from error
+
+
+def _reject_constant(text: str) -> NoReturn:
+    raise ValueError(f"{text} is no number of JSON")
 
 
 def count_skipped(source: Mapping[str, Any]) -> int:

@@ -1,4 +1,4 @@
-"""stillmap's recording folder: `recording.json`, memory-mapped `.npy` arrays, images as PNG files.
+"""stillmap's recording folder: `recording.json`, arrays as `.npy` files, images as PNG files.
 
 Images of floats (depth in metres) are `.npy` files of float32.
 """
@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from stillmap.core.arrays import iter_blocks, open_npy, write_npy
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
-from stillmap.core.files import atomic_folder, read_text, require_regular
+from stillmap.core.files import atomic_folder
+from stillmap.core.json import read_json
 from stillmap.core.recording import Recording
 from stillmap.io.images import read_image, write_png
 from stillmap.preprocessing.options import MAX_POINT_DISTANCE
@@ -145,8 +146,10 @@ def write_into(recording: Recording, folder: Path) -> None:
     (folder / HEADER).write_text(text + "\n", encoding="utf-8")
 
 
-def read(path: Path) -> Recording:
-    """Read a recording folder; per-beam arrays are memory-mapped.
+def read(path: Path, scratch: Path | None = None) -> Recording:
+    """Read a recording folder; large arrays are memory-mapped copies in the folder `scratch`.
+
+    None is the system's temporary folder.
 
     Raises:
         InputError: a file is missing, damaged, or inconsistent with the others.
@@ -162,11 +165,11 @@ def read(path: Path) -> Recording:
     if header.get("recorded_poses"):
         T_recorded_base = _read_poses(path, "T_recorded_base", T, D)
     if header.get("beam_times"):
-        beam_time = _open_array(path, "beam_time", (M,), np.float32)
+        beam_time = _open_array(path, "beam_time", (M,), np.float32, scratch)
     stamp_ns = np.array(_open_array(path, "stamp_ns", (T,), np.int64))
     offset = np.array(_open_array(path, "offset", (T + 1,), np.int64))
-    points = _open_array(path, "points", (M, D), np.float32)
-    hit = _open_array(path, "hit", (M,), np.bool_)
+    points = _open_array(path, "points", (M, D), np.float32, scratch)
+    hit = _open_array(path, "hit", (M,), np.bool_, scratch)
     sensor = np.array(_open_array(path, "sensor", (T,), np.int32))
     # np.diff could overflow
     if np.any(stamp_ns[1:] < stamp_ns[:-1]):
@@ -193,16 +196,17 @@ def read(path: Path) -> Recording:
         raise InputError(f"is damaged: {error}", where=str(path)) from error
 
 
-def _reject_constant(text: str) -> float:
-    raise ValueError(f"{text} is no number of JSON")
+def has_beam_times(path: Path) -> bool:
+    """Whether a recording folder holds the times of its beams.
+
+    Raises:
+        InputError: its header is missing or damaged.
+    """
+    return bool(_read_header(path / HEADER).get("beam_times"))
 
 
 def _read_header(path: Path) -> dict[str, Any]:
-    try:
-        require_regular(path)
-        header = json.loads(read_text(path, _MAX_HEADER), parse_constant=_reject_constant)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"is not JSON: {error}", where=str(path)) from error
+    header = read_json(path, _MAX_HEADER)
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise InputError(f"is not the header of a {FORMAT}", where=str(path))
     if header.get("format_version") != FORMAT_VERSION:
@@ -218,9 +222,11 @@ def _read_count(path: Path, header: dict[str, Any], key: str) -> int:
     return value
 
 
-def _open_array(path: Path, name: str, shape: tuple[int, ...], dtype: type) -> NDArray[Any]:
-    """Memory-map one `.npy` file of exactly this shape and type."""
-    loaded = open_npy(path / f"{name}.npy")
+def _open_array(
+    path: Path, name: str, shape: tuple[int, ...], dtype: type, scratch: Path | None = None
+) -> NDArray[Any]:
+    """The content of one `.npy` file of exactly this shape and type."""
+    loaded = open_npy(path / f"{name}.npy", scratch)
     if loaded.shape != shape or loaded.dtype != np.dtype(dtype):
         what = f"expected {shape} {np.dtype(dtype)}, got {loaded.shape} {loaded.dtype}"
         raise _damaged_error(path, name, what)

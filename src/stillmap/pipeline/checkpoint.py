@@ -19,9 +19,11 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.arrays import iter_bytes, write_npy
+from stillmap.core.arrays import iter_bytes, open_npy, write_npy
 from stillmap.core.errors import InputError
 from stillmap.core.files import sync
+from stillmap.core.json import read_json
+from stillmap.core.locks import open_lock
 from stillmap.core.profiling import StageTimer
 from stillmap.pipeline.checkpoint_files import pack_state, require_same_run, unpack_state
 from stillmap.pipeline.estimate import EmState
@@ -180,7 +182,7 @@ def _open_lock(folder: Path, output: Path) -> IO[bytes]:
     while True:
         folder.mkdir(parents=True, exist_ok=True)
         try:
-            file = (folder / _LOCK).open("ab")
+            file = open_lock(folder / _LOCK)
         except FileNotFoundError:  # the run that had it has just ended
             continue
         try:
@@ -214,14 +216,14 @@ def _write_state(path: Path, state: Mapping[str, Any]) -> None:
 
 def _state(path: Path) -> dict[str, Any]:
     try:
-        if path.stat().st_size > _LARGEST_STATE:
-            raise DamagedCheckpoint(f"{path}: too large")
-        whole = json.loads(path.read_text(encoding="utf-8"))
+        whole = read_json(path, _LARGEST_STATE)
         text = whole["text"]
         if zlib.crc32(text.encode()) != whole["crc32"]:
             raise DamagedCheckpoint(f"{path}: its checksum differs")
         state: dict[str, Any] = json.loads(text)
-    except (OSError, ValueError, KeyError, TypeError, RecursionError, AttributeError) as error:
+    except InputError as error:
+        raise DamagedCheckpoint(str(error)) from error
+    except (ValueError, KeyError, TypeError, RecursionError, AttributeError) as error:
         raise DamagedCheckpoint(f"{path}: {error!r}") from error
     if state["format_version"] != _FORMAT_VERSION:
         raise DamagedCheckpoint(
@@ -234,15 +236,14 @@ def _array(path: Path, about: Mapping[str, Any]) -> NDArray[Any]:
     if not _NAME.fullmatch(path.name):
         raise DamagedCheckpoint(f"{path}: no name of an array")
     try:
-        # np.load would also open archives and pickles
-        found = np.lib.format.open_memmap(path, mode="r")
-    except Exception as error:  # whatever NumPy's parser makes of damaged bytes
-        raise DamagedCheckpoint(f"{path}: {error!r}") from error
+        found = open_npy(path)
+    except InputError as error:
+        raise DamagedCheckpoint(str(error)) from error
     if list(found.shape) != about["shape"] or found.dtype.str != about["dtype"]:
         raise DamagedCheckpoint(f"{path}: not the array that was written")
     if _checksum(found) != about["crc32"]:
         raise DamagedCheckpoint(f"{path}: its checksum differs")
-    return np.array(found) if found.nbytes < _IN_MEMORY else np.asarray(found)
+    return np.array(found) if found.nbytes < _IN_MEMORY else found
 
 
 def _checksum(array: NDArray[Any]) -> int:
