@@ -14,6 +14,7 @@ import numpy as np
 TESTS = Path(__file__).resolve().parent.parent
 sys.path.append(str(TESTS / "fuzz"))
 
+import containers  # noqa: E402
 import corpus  # noqa: E402
 import corpus_bags  # noqa: E402
 import corpus_images  # noqa: E402
@@ -178,3 +179,18 @@ def _files_beside() -> Iterator[Reader]:
 
 
 RECORDINGS = (*_recordings(), *_files_beside())
+
+
+def fetching_e57(folder: Path) -> Path:
+    """An E57 file that names a schema which the XML library would fetch."""
+    (folder / "made").mkdir()
+    attributes = (
+        b' xmlns:i="http://www.w3.org/2001/XMLSchema-instance" i:schemaLocation="'
+        b'http://www.astm.org/COMMIT/E57/2010-e57-v1.0 http://127.0.0.1:9/a.xsd"'
+    )
+    content = containers.change_e57_xml(
+        next(corpus.e57(folder / "made")),
+        lambda xml: xml.replace(b"<e57Root", b"<e57Root" + attributes, 1),
+    )
+    (folder / "fetching.e57").write_bytes(content)
+    return folder / "fetching.e57"

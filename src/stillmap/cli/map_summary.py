@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 
 from stillmap.cli.console import list_files, say
 from stillmap.core.advice import split_advice
-from stillmap.results.run_record import read_record
 
 if TYPE_CHECKING:
     import numpy as np
@@ -22,6 +21,8 @@ _IN_SUMMARY = ("version", "converged", "best_iteration", "counts", "area", "seco
 
 def summarize(output: Path) -> dict[str, Any]:
     """The main entries of `run.json`, and the files of the result."""
+    from stillmap.results.run_record import read_record
+
     record = read_record(output)
     return {
         "output": str(output),
