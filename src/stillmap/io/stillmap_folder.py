@@ -6,18 +6,21 @@ Images of floats (depth in metres) are `.npy` files of float32.
 import json
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, NotRequired, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.arrays import iter_blocks, open_npy, write_npy
 from stillmap.core.camera import Camera, Images
+from stillmap.core.config import Limits
 from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_folder
 from stillmap.core.json import read_json
 from stillmap.core.recording import Recording
+from stillmap.core.schema import SchemaError, check
 from stillmap.io.images import read_image, write_png
+from stillmap.io.notes import prune_notes
 from stillmap.preprocessing.options import MAX_POINT_DISTANCE
 
 _IMAGES = "images"
@@ -61,11 +64,11 @@ def _read_images(path: Path, header: dict[str, Any]) -> Images | None:
     """The images of a recording folder, each read on demand."""
     if "images" not in header:
         return None
-    N = _read_count(path, header, "images")
+    N = header["images"]
     stamp_ns = np.array(_open_array(path, "image_stamp_ns", (N,), np.int64))
     camera = np.array(_open_array(path, "image_camera", (N,), np.int32))
     try:
-        cameras = tuple(_camera_from_dict(one) for one in header.get("cameras"))  # type: ignore[union-attr]
+        cameras = tuple(_camera_from_dict(one) for one in header.get("cameras", ()))
         return Images(stamp_ns, camera, cameras, partial(_load_image, path / _IMAGES))
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"is damaged: its cameras: {error}", where=str(path)) from error
@@ -73,11 +76,11 @@ def _read_images(path: Path, header: dict[str, Any]) -> Images | None:
 
 def _camera_from_dict(one: dict[str, Any]) -> Camera:
     return Camera(
-        name=str(one["name"]),
-        width=int(one["width"]),
-        height=int(one["height"]),
+        name=one["name"],
+        width=one["width"],
+        height=one["height"],
         K=_matrix(one["K"], 3),
-        model=str(one["model"]),
+        model=one["model"],
         distortion=np.array(one["distortion"], np.float64).reshape(-1),
         T_base_camera=_matrix(one["T_base_camera"], 4),
     )
@@ -101,6 +104,33 @@ def _load_image(folder: Path, image: int) -> NDArray[Any]:
 HEADER = "recording.json"
 FORMAT = "stillmap-recording"
 FORMAT_VERSION = 1
+_Count = Annotated[int, Limits(ge=0, lt=1 << 60)]
+_Pixels = Annotated[int, Limits(ge=1, le=1 << 16)]
+_Row = list[float]
+
+
+class _CameraHeader(TypedDict):
+    name: str
+    width: _Pixels
+    height: _Pixels
+    K: list[_Row] | None
+    model: str
+    distortion: list[float]
+    T_base_camera: list[_Row] | None
+
+
+class _Header(TypedDict):
+    dimension: Literal[2, 3]
+    scans: _Count
+    beams: _Count
+    sensors: _Count
+    odometry: NotRequired[bool]
+    beam_times: NotRequired[bool]
+    recorded_poses: NotRequired[bool]
+    images: NotRequired[_Count]
+    cameras: NotRequired[list[_CameraHeader]]
+
+
 _ARRAYS = (
     *("stamp_ns", "offset", "points", "hit", "T_base_sensor", "sensor"),
     *("T_odom_base", "beam_time", "T_recorded_base"),
@@ -155,10 +185,7 @@ def read(path: Path, scratch: Path | None = None) -> Recording:
         InputError: a file is missing, damaged, or inconsistent with the others.
     """
     header = _read_header(path / HEADER)
-    T, M = _read_count(path, header, "scans"), _read_count(path, header, "beams")
-    S, D = _read_count(path, header, "sensors"), _read_count(path, header, "dimension")
-    if D not in (2, 3):
-        raise InputError(f"dimension must be 2 or 3, got {D}", where=str(path / HEADER))
+    T, M, S, D = (header[key] for key in ("scans", "beams", "sensors", "dimension"))
     T_odom_base = T_recorded_base = beam_time = None
     if header.get("odometry"):
         T_odom_base = _read_poses(path, "T_odom_base", T, D)
@@ -177,7 +204,6 @@ def read(path: Path, scratch: Path | None = None) -> Recording:
     if offset[0] != 0 or offset[-1] != M or np.any(offset[1:] < offset[:-1]):
         raise _damaged_error(path, "offset", f"must rise from 0 to {M}")
     _check_points(path, points, hit)
-    source = header.get("source", {})
     try:
         return Recording(
             stamp_ns=stamp_ns,
@@ -187,7 +213,7 @@ def read(path: Path, scratch: Path | None = None) -> Recording:
             T_base_sensor=_read_poses(path, "T_base_sensor", S, D),
             sensor=sensor,
             T_odom_base=T_odom_base,
-            source=source if isinstance(source, dict) else {},
+            source=prune_notes(header.get("source")),
             beam_time=beam_time,
             T_recorded_base=T_recorded_base,
             images=_read_images(path, header),
@@ -212,14 +238,11 @@ def _read_header(path: Path) -> dict[str, Any]:
     if header.get("format_version") != FORMAT_VERSION:
         what = f"format_version {header.get('format_version')!r} is unknown here"
         raise InputError(what, where=str(path), hint=f"this version reads {FORMAT_VERSION}")
+    try:
+        check(header, _Header)
+    except SchemaError as error:
+        raise InputError(f"is damaged: {error}", where=str(path)) from error
     return header
-
-
-def _read_count(path: Path, header: dict[str, Any], key: str) -> int:
-    value = header.get(key)
-    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 60:
-        raise InputError(f"'{key}' must be a count, got {value!r}", where=str(path / HEADER))
-    return value
 
 
 def _open_array(

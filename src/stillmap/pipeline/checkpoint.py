@@ -25,6 +25,8 @@ from stillmap.core.files import sync
 from stillmap.core.json import read_json
 from stillmap.core.locks import open_lock
 from stillmap.core.profiling import StageTimer
+from stillmap.core.recording import Recording
+from stillmap.pipeline.checkpoint_checks import check_state
 from stillmap.pipeline.checkpoint_files import pack_state, require_same_run, unpack_state
 from stillmap.pipeline.estimate import EmState
 from stillmap.pipeline.options import Options
@@ -58,13 +60,18 @@ class CheckpointFolder:
         return self.folder / f"iteration-{max(numbers)}" if numbers else None
 
     def load(
-        self, identity: Mapping[str, Any], options: Options, stages: StageTimer
+        self,
+        identity: Mapping[str, Any],
+        options: Options,
+        recording: Recording,
+        stages: StageTimer,
     ) -> EmState | None:
         """The state of the run at its last checkpoint; None where there is none.
 
         Args:
             identity: of the run, see `identify_run`.
             options: of the run, resolved.
+            recording: that is mapped.
             stages: the time that the run took so far is added here.
 
         Raises:
@@ -74,17 +81,20 @@ class CheckpointFolder:
         if self.newest is None:
             return None
         state = _state(self.newest / _STATE)
-        require_same_run(state["identity"], dict(identity), str(self.folder))
-        arrays = {
-            name: _array(self.newest / f"{name}.npy", about)
-            for name, about in state["arrays"].items()
-        }
         try:
+            require_same_run(state["identity"], dict(identity), str(self.folder))
+            arrays = {
+                name: _array(self.newest / f"{name}.npy", about)
+                for name, about in state["arrays"].items()
+            }
             run = unpack_state(state["state"], arrays, options)
-        except (KeyError, TypeError, ValueError, IndexError) as error:
+            check_state(run, recording)
+            stages.add(state["stages"])
+        except InputError:
+            raise
+        except Exception as error:  # whatever comes of values that no run has written
             raise DamagedCheckpoint(f"{self.newest / _STATE}: {error!r}") from error
         self._arrays = state["arrays"]
-        stages.add(state["stages"])
         return run
 
     def save(self, run: EmState, identity: Mapping[str, Any], stages: StageTimer) -> None:
@@ -225,10 +235,9 @@ def _state(path: Path) -> dict[str, Any]:
         raise DamagedCheckpoint(str(error)) from error
     except (ValueError, KeyError, TypeError, RecursionError, AttributeError) as error:
         raise DamagedCheckpoint(f"{path}: {error!r}") from error
-    if state["format_version"] != _FORMAT_VERSION:
-        raise DamagedCheckpoint(
-            f"{path}: format_version {state['format_version']!r} is unknown here"
-        )
+    if not isinstance(state, dict) or state.get("format_version") != _FORMAT_VERSION:
+        version = state.get("format_version") if isinstance(state, dict) else None
+        raise DamagedCheckpoint(f"{path}: format_version {version!r} is unknown here")
     return state
 
 

@@ -163,6 +163,7 @@ def moved(T: Float, points: Float) -> Float:
 
 
 _MAX_OBJECTS = 256 << 20  # bytes of an objects.json
+_MAX_ID = 2**31 - 1  # as messages of ROS hold it
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,6 +220,8 @@ def _track(one: dict[str, Any]) -> Track:
         raise ValueError("columns of unequal length")
     if not np.isfinite([*numbers.ravel(), *size, *([] if z is None else z)]).all():
         raise ValueError("a number is not finite")
+    if not 0 <= int(one["id"]) <= _MAX_ID:
+        raise ValueError(f"an id of {one['id']}")
     beams = None if one.get("beams") is None else int(one["beams"])
     p_dynamic = None if one.get("p_dynamic") is None else float(one["p_dynamic"])
     xy, velocity, session = numbers[:, :2], numbers[:, 2:], str(one.get("session", ""))
