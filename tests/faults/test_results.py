@@ -15,6 +15,7 @@ for needed in ("pye57", "laspy", "lazrs", "lzf"):  # of other inputs
 
 from faulty_inputs import Reader  # noqa: E402
 from file_faults import BEFORE, MEANWHILE, be_one_of_many, be_pipe, run, while_read  # noqa: E402
+from marks import slow_params  # noqa: E402
 
 import stillmap  # noqa: E402
 from stillmap.cli.main import main  # noqa: E402
@@ -229,11 +230,20 @@ CHANGES = {
 }
 
 
+QUICK_CHANGES = ("no state", "huge scan", "far window", "no identity")
+
+
 def note(state: dict, key: str, value: object) -> None:
     state["state"]["best"]["m_step"]["diagnostics"][key] = value
 
 
-@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES.keys())
+@pytest.mark.parametrize(
+    "change",
+    [
+        pytest.param(one, id=name, marks=() if name in QUICK_CHANGES else pytest.mark.slow)
+        for name, one in CHANGES.items()
+    ],
+)
 def test_state_that_no_run_has_written(checkpoint, tmp_path, capsys, change):
     rewrite(checkpoint, change)
     said = resume(tmp_path / "in", capsys)
@@ -245,12 +255,14 @@ def test_state_that_no_run_has_written(checkpoint, tmp_path, capsys, change):
     [
         ("best.m_step.poses", lambda a: a[:-1]),
         ("best.m_step.poses", lambda a: np.full_like(a, np.nan)),
-        ("latest.m_step.poses", lambda a: 1e300 * a),
         ("e-1", lambda a: a[:-1]),
-        ("e-2", lambda a: a - 2),
-        ("e-2", lambda a: a.astype("U4")),
-        ("best.e_step.occupied.cells", lambda a: np.full_like(a, 2**62)),
-        ("best.m_step.graph.keyframes", lambda a: a + 5000),
+        *slow_params(
+            ("latest.m_step.poses", lambda a: 1e300 * a),
+            ("e-2", lambda a: a - 2),
+            ("e-2", lambda a: a.astype("U4")),
+            ("best.e_step.occupied.cells", lambda a: np.full_like(a, 2**62)),
+            ("best.m_step.graph.keyframes", lambda a: a + 5000),
+        ),
     ],
 )
 def test_array_that_no_run_has_written(checkpoint, tmp_path, capsys, name, change):
@@ -259,8 +271,15 @@ def test_array_that_no_run_has_written(checkpoint, tmp_path, capsys, name, chang
 
 
 def test_bare_stretches_are_resumed(checkpoint, tmp_path, capsys):
-    rewrite(checkpoint, lambda state: note(state, "bare_stretches", [[3, 9, 4.5, 0.5]]))
-    assert resume(tmp_path / "in", capsys) == ""
+    def change(state: dict) -> None:
+        note(state, "bare_stretches", [[3, 9, 4.5, 0.5]])
+        state["state"]["records"]["held_out_log_likelihood"] = [0.0, 1e9]  # it stays the best
+
+    rewrite(checkpoint, change)
+    assert "starts anew" not in resume(tmp_path / "in", capsys)
+    run = json.loads((tmp_path / "in" / "out" / "run.json").read_text())
+    found = {"first": 3, "last": 9, "metres": 4.5, "std": 0.5}
+    assert run["doubts"]["length_unknown"] == [found]
 
 
 # tampered records

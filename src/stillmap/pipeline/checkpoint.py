@@ -90,7 +90,7 @@ class CheckpointFolder:
             run = unpack_state(state["state"], arrays, options)
             check_state(run, recording)
             stages.add(state["stages"])
-        except InputError:
+        except (InputError, DamagedCheckpoint):
             raise
         except Exception as error:  # whatever comes of values that no run has written
             raise DamagedCheckpoint(f"{self.newest / _STATE}: {error!r}") from error

@@ -65,10 +65,11 @@ def open_las_reader(path: Path) -> Iterator[Any]:
     laspy = import_extra("laspy", path)
     # single-threaded: the parallel backend trusts chunk sizes
     backend = laspy.LazBackend.Lazrs
-    with library_errors(path):
-        reader = laspy.open(InputFile(path), read_evlrs=False, laz_backend=backend)
-    with closing(reader):
-        yield reader
+    with InputFile(path) as file:
+        with library_errors(path):
+            reader = laspy.open(file, closefd=False, read_evlrs=False, laz_backend=backend)
+        with closing(reader):
+            yield reader
 
 
 def iter_blocks(reader: Any, path: Path) -> Iterator[Any]:
