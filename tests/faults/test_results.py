@@ -227,6 +227,8 @@ CHANGES = {
     "no arrays": lambda state: state.update(arrays=3),
     "no identity": lambda state: state.update(identity=None),
     "no stages": lambda state: state.update(stages={"read": 3}),
+    "no time": lambda state: state["stages"]["m_step"].update(seconds=float("nan")),
+    "no source": lambda state: state["state"]["records"].update(source=["", "\0"]),
 }
 
 

@@ -14,18 +14,20 @@ import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Annotated, Any, NotRequired, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.arrays import iter_bytes, open_npy, write_npy
+from stillmap.core.config import Limits
 from stillmap.core.errors import InputError
 from stillmap.core.files import sync
 from stillmap.core.json import read_json
 from stillmap.core.locks import open_lock
 from stillmap.core.profiling import StageTimer
 from stillmap.core.recording import Recording
+from stillmap.core.schema import check
 from stillmap.pipeline.checkpoint_checks import check_state
 from stillmap.pipeline.checkpoint_files import pack_state, require_same_run, unpack_state
 from stillmap.pipeline.estimate import EmState
@@ -36,6 +38,17 @@ _STATE, _LOCK = "state.json", "lock"
 _NAME = re.compile(r"[A-Za-z0-9_.-]+")
 _LARGEST_STATE = 1 << 30  # bytes
 _IN_MEMORY = 1 << 20  # bytes of an array that is read at once instead of mapped
+
+
+_Seconds = Annotated[float, Limits(ge=0.0)]
+
+
+class _Stage(TypedDict):
+    """Of a StageTimer."""
+
+    seconds: _Seconds
+    cpu_seconds: _Seconds
+    peak_memory_bytes: NotRequired[Annotated[int, Limits(ge=0)]]
 
 
 class DamagedCheckpoint(Exception):
@@ -89,6 +102,7 @@ class CheckpointFolder:
             }
             run = unpack_state(state["state"], arrays, options)
             check_state(run, recording)
+            check(state["stages"], dict[str, _Stage], "stages")
             stages.add(state["stages"])
         except (InputError, DamagedCheckpoint):
             raise

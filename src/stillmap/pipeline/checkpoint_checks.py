@@ -15,6 +15,7 @@ from stillmap.pipeline.snapshots import Snapshot
 
 Array = NDArray[np.generic]
 
+_SOURCES = ("", "odometry", "scans", "odometry_in_stretches")  # see IterationRecord
 _MAX_COORDINATE = 1e12  # m, as of a recording
 _MAX_CELL = 1 << 40  # cells from the origin
 
@@ -25,9 +26,10 @@ def check_state(state: EmState, recording: Recording) -> None:
     Raises:
         ValueError: names what is wrong.
     """
-    _require(
-        [one.number for one in state.records] == [*range(1, len(state.records) + 1)], "records"
-    )
+    numbers = [one.number for one in state.records]
+    _require(numbers == [*range(1, len(numbers) + 1)], "records")
+    _require(all(one.source in _SOURCES for one in state.records), "records.source")
+    _require(all(0.0 <= one.seconds < np.inf for one in state.records), "records.seconds")
     _require(state.best is not None and state.latest is not None, "best and latest")
     for name, one in (("best", state.best), ("latest", state.latest)):
         assert one is not None
@@ -35,9 +37,7 @@ def check_state(state: EmState, recording: Recording) -> None:
         _check_estimate(name, one, recording)
     if state.window is not None:
         x0, y0, x1, y1 = state.window
-        _require(
-            bool(np.abs(state.window).max() < _MAX_COORDINATE and x0 < x1 and y0 < y1), "window"
-        )
+        _require(_are_small(np.array(state.window)) and x0 < x1 and y0 < y1, "window")
     for number, part in state.snapshots.items():
         _check_snapshot(f"snapshots.{number}", part)
 
