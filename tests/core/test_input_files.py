@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from stillmap.core import arrays
+from stillmap.core.array_files import open_npy
 from stillmap.core.errors import InputError
 from stillmap.core.input_files import (
     InputFile,
@@ -126,7 +127,7 @@ def test_arrays_are_copies(tmp_path, monkeypatch, limit, order):
     monkeypatch.setattr(arrays, "MAX_BYTES_IN_MEMORY", limit)
     array = np.arange(5000, dtype=np.float32).reshape(50, 100)
     np.save(tmp_path / "a.npy", np.asarray(array, order=order))
-    found = arrays.open_npy(tmp_path / "a.npy")
+    found = open_npy(tmp_path / "a.npy")
     os.truncate(tmp_path / "a.npy", 0)
     arrays.release_pages(found)
     np.testing.assert_array_equal(found, array)
@@ -137,17 +138,17 @@ def test_arrays_are_copies(tmp_path, monkeypatch, limit, order):
 @pytest.mark.parametrize("shape", [(0,), (0, 3), (3, 0)])
 def test_arrays_of_nothing(tmp_path, shape):
     np.save(tmp_path / "a.npy", np.empty(shape))
-    assert arrays.open_npy(tmp_path / "a.npy").shape == shape
+    assert open_npy(tmp_path / "a.npy").shape == shape
 
 
 def test_arrays_that_cannot_be(tmp_path):
     np.save(tmp_path / "a.npy", np.array([{}]), allow_pickle=True)
     with pytest.raises(InputError, match="is damaged"):
-        arrays.open_npy(tmp_path / "a.npy")
+        open_npy(tmp_path / "a.npy")
     np.save(tmp_path / "a.npy", np.arange(100))
     os.truncate(tmp_path / "a.npy", 500)
     with pytest.raises(InputError, match=r"is damaged: no \(100,\) int64 follow its header"):
-        arrays.open_npy(tmp_path / "a.npy")
+        open_npy(tmp_path / "a.npy")
 
 
 def test_lock_is_a_file(tmp_path):
@@ -167,10 +168,11 @@ import os, sys
 from pathlib import Path
 import numpy as np
 from stillmap.core import arrays
+from stillmap.core.array_files import open_npy
 from stillmap.core.errors import InputError
 path = Path(sys.argv[1])
 np.save(path, np.ones(1 << 23))
-array = arrays.open_npy(path)
+array = open_npy(path)
 os.truncate(path, 1000)
 arrays.release_pages(array)
 assert array.sum() == 1 << 23

@@ -19,7 +19,8 @@ from typing import IO, Annotated, Any, NotRequired, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.arrays import iter_bytes, open_npy, write_npy
+from stillmap.core.array_files import open_npy
+from stillmap.core.arrays import iter_bytes, write_npy
 from stillmap.core.config import Limits
 from stillmap.core.errors import InputError
 from stillmap.core.files import sync
