@@ -69,7 +69,7 @@ def test_files_that_are_no_text(tmp_path):
     for read in (read_trajectory, read_relations, read_odometry):
         with pytest.raises(InputError, match="cannot be read"):
             read(tmp_path / "absent")
-        with pytest.raises(InputError, match="is a folder"):
+        with pytest.raises(InputError, match="cannot be read"):
             read(tmp_path)
 
 

@@ -94,7 +94,7 @@ def require_regular(path: str | os.PathLike[str]) -> None:
     """
     mode = os.stat(path).st_mode
     if stat.S_ISDIR(mode):
-        raise InputError("is a folder, not a file", where=os.fspath(path))
+        raise InputError("cannot be read: it is a folder", where=os.fspath(path))
     if not stat.S_ISREG(mode):
         raise _irregular_error(path)
 
