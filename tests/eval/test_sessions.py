@@ -247,7 +247,7 @@ def test_scores_as_text_and_as_json(perfect: Path, truth: SessionTruth, capsys) 
 @pytest.mark.parametrize(
     ("file", "text", "error"),
     [
-        ("sessions.json", "[", "is no JSON"),
+        ("sessions.json", "[", "is not JSON"),
         ("sessions.json", '[{"name": "../x", "accepted": true}]', "is damaged"),
         ("sessions.json", '[{"name": "monday", "accepted": true}]', "is not in"),
         ("changes.json", '[{"kind": "gone"}]', "is damaged"),

@@ -258,21 +258,33 @@ def _crc32c(data: bytes) -> int:
     return crc ^ 0xFFFFFFFF
 
 
+def change_e57_xml(data: bytes, change: Mutation) -> bytes:
+    """An E57 file with another XML section, its last one, and valid checksums."""
+    text = _e57_content(data)
+    at, end = text.find(b"<?xml"), text.rfind(b">") + 1
+    new = change(text[at:end]).ljust(end - at, b" ")
+    text = text[:at] + new + text[end:]
+    return _e57_pages(text[:32] + struct.pack("<Q", len(new)) + text[40:])
+
+
 def mutate_e57(data: bytes, mutate: Mutation, chance: random.Random) -> bytes:
     """Mutate a page or the XML section of an E57 file, with valid checksums."""
-    pages = [data[at : at + _KEPT] for at in range(0, len(data), _PAGE)]
-    text = b"".join(pages)
-    at = text.find(b"<?xml")
-    if at >= 0 and chance.random() < 0.6:
-        # the XML section is the last one: its length may change
-        end = text.rfind(b">") + 1
-        new = mutate(text[at:end])[: 16 * _KEPT]
-        text = text[:at] + new.ljust(end - at, b" ")
-        text = text[:32] + struct.pack("<Q", len(new.ljust(end - at, b" "))) + text[40:]
-    else:
-        at = chance.randrange(max(len(pages), 1)) * _KEPT
-        old = text[at : at + _KEPT]
-        text = text[:at] + mutate(old)[: len(old)].ljust(len(old), b"\0") + text[at + _KEPT :]
+    text = _e57_content(data)
+    if b"<?xml" in text and chance.random() < 0.6:
+        return change_e57_xml(data, lambda xml: mutate(xml)[: 16 * _KEPT])
+    at = chance.randrange(max(-(-len(text) // _KEPT), 1)) * _KEPT
+    old = text[at : at + _KEPT]
+    return _e57_pages(
+        text[:at] + mutate(old)[: len(old)].ljust(len(old), b"\0") + text[at + _KEPT :]
+    )
+
+
+def _e57_content(data: bytes) -> bytes:
+    """All pages without their checksums."""
+    return b"".join(data[at : at + _KEPT] for at in range(0, len(data), _PAGE))
+
+
+def _e57_pages(text: bytes) -> bytes:
     pages = [text[at : at + _KEPT].ljust(_KEPT, b"\0") for at in range(0, len(text), _KEPT)]
     if pages:
         # the header holds the physical length of the file

@@ -1,6 +1,8 @@
 """stillmap's own recording folder: what is written is read, what is damaged is refused."""
 
 import json
+import mmap
+import os
 import warnings
 from dataclasses import replace
 
@@ -9,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from stillmap.core import se2
+from stillmap.core import arrays, se2
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
@@ -112,11 +114,20 @@ def test_carmen_log_survives_the_round_trip(tmp_path, read_log, flaser):
     require_same(read(tmp_path / "rec"), recording)
 
 
-def test_points_stay_on_disk(tmp_path):
+def test_large_arrays_are_copies_on_disk(tmp_path, monkeypatch):
+    monkeypatch.setattr(arrays, "MAX_BYTES_IN_MEMORY", 16)
     write(made(), tmp_path / "rec")
-    points = read(tmp_path / "rec").points
-    assert isinstance(points.base, np.memmap)
-    assert not points.flags.writeable
+    recording = read(tmp_path / "rec")
+    before = np.array(recording.points)
+    base = recording.points
+    while isinstance(base, np.ndarray | memoryview):
+        base = base.base if isinstance(base, np.ndarray) else base.obj
+    assert isinstance(base, mmap.mmap)
+    assert not recording.points.flags.writeable
+    for file in (tmp_path / "rec").iterdir():
+        os.truncate(file, 0)  # would end a process that had mapped it
+    recording.release_pages()
+    np.testing.assert_array_equal(recording.points, before)
 
 
 def test_does_not_write_over_anything(tmp_path):

@@ -91,19 +91,19 @@ def test_pipe_in_a_recording(tmp_path, log, name):
 
 
 @pytest.mark.parametrize(
-    ("reader", "said"),
+    "reader",
     [
-        (load_toml, "is too large: more than 64 KiB"),
-        (read_tum, "is too large"),
-        (readers.read_relations, "is too large"),
-        (readers.read_trajectory, "is no regular file"),
-        (readers.read_odometry, "is no regular file"),
-        (read, "is no regular file"),
+        load_toml,
+        read_tum,
+        readers.read_relations,
+        readers.read_trajectory,
+        readers.read_odometry,
+        read,
     ],
 )
-def test_device_without_end(tmp_path, reader, said):
+def test_device_without_end(tmp_path, reader):
     (tmp_path / "zero").symlink_to("/dev/zero")
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match="is no regular file"):
         reader(tmp_path / "zero")
 
 
@@ -121,7 +121,7 @@ def test_map_that_unpacks_to_too_much(tmp_path, monkeypatch):
     monkeypatch.setattr(reader, "_MAX_MAP", 1 << 20)
     with zipfile.ZipFile(tmp_path / "map.npz", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("p_occupied.npy", b"\0" * (2 << 20))
-    with pytest.raises(InputError, match="2 MiB when unpacked"):
+    with pytest.raises(InputError, match="2 MiB of p_occupied when unpacked"):
         reader.read_grid(tmp_path)
 
 

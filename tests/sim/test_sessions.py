@@ -194,7 +194,7 @@ def test_damaged_truth_is_refused(tmp_path: Path) -> None:
         load_session_truth(tmp_path)
     for text in ("{", "[]", json.dumps({"sessions": [{"name": "../x"}], "objects": []})):
         (tmp_path / "sessions.json").write_text(text)
-        with pytest.raises(InputError, match="is damaged"):
+        with pytest.raises(InputError, match=r"is damaged|is not JSON"):
             load_session_truth(tmp_path)
 
 

@@ -65,7 +65,7 @@ def test_damaged_model_is_refused(tmp_path, data):
 
 
 def test_size_limit(tmp_path, glb):
-    assert "larger" in refusal(tmp_path / "a.glb", glb, len(glb) - 1)
+    assert "too large" in refusal(tmp_path / "a.glb", glb, len(glb) - 1)
 
 
 def test_y_up_becomes_z_up():

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stillmap.cli.console import print_json
+from stillmap.cli.console import print_json, print_lines
 
 if TYPE_CHECKING:
     from stillmap.pipeline.options import Options
@@ -111,7 +111,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json(_describe(options, args.only))
     else:
-        print(text, end="")
+        print_lines(text.splitlines())
     return 0
 
 

@@ -1,16 +1,17 @@
-"""Messages and progress on stderr, JSON on stdout, and signals."""
+"""Messages and progress on stderr, text and JSON on stdout, and signals."""
 
 import os
 import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import CodeType, FrameType
 from typing import IO, TYPE_CHECKING, Any
 
+from stillmap.core.printable import printable
 from stillmap.core.progress_bar import Step, make_bar, terminal_bar
 
 if TYPE_CHECKING:
@@ -46,19 +47,20 @@ _LINE_PERIOD = 10.0  # s between lines of progress without a terminal
 
 
 def say(line: str) -> None:
-    """Print one line to stderr; a closed stderr is ignored."""
-    prefix = "warning:"
+    """Print one line to stderr, control characters escaped; a closed stderr is ignored."""
+    prefix, line = "warning:", printable(line)
     if line.startswith(prefix):
         line = colorize(prefix, "warning", sys.stderr) + line[len(prefix) :]
-    _write(f"stillmap: {line}")
+    write_line(f"stillmap: {line}")
 
 
 def fail(line: str) -> None:
-    """Print the error that ends the command."""
-    _write(f"{colorize('stillmap:', 'error', sys.stderr)} {line}")
+    """Print the error that ends the command, control characters escaped."""
+    write_line(f"{colorize('stillmap:', 'error', sys.stderr)} {printable(line)}")
 
 
-def _write(line: str) -> None:
+def write_line(line: str) -> None:
+    """Print a line as it is to stderr; a closed stderr is ignored."""
     if sys.stderr is None:
         return
     try:
@@ -180,6 +182,11 @@ class _Lines:
         if done < total:
             text += f", {(total - done) / max(rate, 1e-3):.0f} s left"
         say(text)
+
+
+def print_lines(lines: Iterable[str]) -> None:
+    """Print lines of text to stdout, control characters escaped."""
+    print("\n".join(map(printable, lines)))
 
 
 def print_json(content: dict[str, Any] | list[dict[str, Any]]) -> None:

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stillmap.cli.console import print_json
+from stillmap.cli.console import print_json, print_lines
 
 if TYPE_CHECKING:
     from stillmap.cli.eval_scores import Scores
@@ -202,7 +202,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json(scores)
     else:
-        print("\n".join(lines))
+        print_lines(lines)
     return 0
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from stillmap.cli.arguments import add_read_flags, read_changes, read_options
 from stillmap.cli.config import add_option_flags, options_from_args
-from stillmap.cli.console import show_share
+from stillmap.cli.console import print_lines, show_share
 
 if TYPE_CHECKING:
     from stillmap.io.input_groups import InputGroup
@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps(_to_json(groups, found), indent=2, allow_nan=False))
     else:
-        print("\n".join(_format_groups(groups, found)))
+        print_lines(_format_groups(groups, found))
     return 0
 
 

@@ -8,10 +8,18 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-from stillmap.cli.console import EXIT_INTERRUPTED, EXIT_TERMINATED, fail, handle_signals, say
+from stillmap.cli.console import (
+    EXIT_INTERRUPTED,
+    EXIT_TERMINATED,
+    fail,
+    handle_signals,
+    say,
+    write_line,
+)
 from stillmap.cli.flags import in_flags
 from stillmap.cli.parser import COMMANDS, EXIT_INPUT, parser
 from stillmap.core.errors import InputError, closest_match
+from stillmap.core.printable import printable
 
 EXIT_DEFECT = 1
 
@@ -121,8 +129,9 @@ def _report_defect(error: Exception) -> None:
     """Print the trace and ask for a report."""
     import traceback
 
-    if sys.stderr is not None:
-        traceback.print_exception(error)
+    for lines in traceback.format_exception(error):
+        for line in lines.rstrip("\n").split("\n"):
+            write_line(printable(line))
     fail("this is a defect of stillmap: please report it, with the lines above")
 
 

@@ -141,7 +141,7 @@ def build_all(
         progress=progress,
         stages=stages,
         scratch=checkpoints.folder,
-        resume=_load_checkpoint(args, checkpoints, run_id, options, stages),
+        resume=_load_checkpoint(args, checkpoints, run_id, found, stages),
         checkpoint=lambda state: checkpoints.save(state, run_id, stages),
     )
     require_overlap(result.map, options.output.region)
@@ -194,7 +194,7 @@ def _load_checkpoint(
     args: argparse.Namespace,
     checkpoints: CheckpointFolder,
     run_id: dict[str, Any],
-    options: Options,
+    found: Inputs,
     stages: StageTimer,
 ) -> EmState | None:
     """The state of an interrupted run, where there is one and `--resume` is given."""
@@ -206,7 +206,7 @@ def _load_checkpoint(
         checkpoints.clear()
         return None
     try:
-        state = checkpoints.load(run_id, options, stages)
+        state = checkpoints.load(run_id, found.options, found.recording, stages)
     except DamagedCheckpoint as error:
         say(f"warning: {error}; starts anew")
         checkpoints.clear()

@@ -1,6 +1,5 @@
 """The summary that `stillmap map` prints."""
 
-import json
 import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,7 +21,9 @@ _IN_SUMMARY = ("version", "converged", "best_iteration", "counts", "area", "seco
 
 def summarize(output: Path) -> dict[str, Any]:
     """The main entries of `run.json`, and the files of the result."""
-    record = json.loads((output / "run.json").read_text(encoding="utf-8"))
+    from stillmap.results.run_record import read_record
+
+    record = read_record(output)
     return {
         "output": str(output),
         "files": list_files(output),

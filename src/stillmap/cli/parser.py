@@ -9,6 +9,7 @@ from typing import Any, NoReturn
 
 from stillmap.cli.console import colorize
 from stillmap.core.errors import closest_match
+from stillmap.core.printable import printable
 
 EXIT_INPUT = 2
 
@@ -57,7 +58,9 @@ class Parser(argparse.ArgumentParser):
         """Print the error on one line and exit."""
         advice = f"{hint} see" if hint else "see"
         line = f"{message} ({advice} {self.prog} --help)".replace("\n", " ")
-        self.exit(EXIT_INPUT, f"{colorize(f'{self.prog}:', 'error', sys.stderr)} {line}\n")
+        self.exit(
+            EXIT_INPUT, f"{colorize(f'{self.prog}:', 'error', sys.stderr)} {printable(line)}\n"
+        )
 
     def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
         """Flush and exit: --help and --version may go into a closed pipe."""

@@ -8,9 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stillmap.cli.console import say, show_share
+from stillmap.cli.console import is_terminal, say, show_share
 from stillmap.cli.flags import in_flags
 from stillmap.core.errors import InputError, MissingExtra, import_extra
+from stillmap.core.printable import printable
 
 if TYPE_CHECKING:
     from stillmap.results.folder import ResultFolder
@@ -61,7 +62,8 @@ def run(args: argparse.Namespace) -> int:
     folder = Path(args.result)
     report = _find_report(folder)
     if args.print:
-        print(report)
+        # a script gets the name itself
+        print(printable(str(report)) if is_terminal(sys.stdout) else report)
     elif args.report:
         _show_report(report)
     else:

@@ -8,7 +8,6 @@ import logging
 import mmap
 import os
 import tempfile
-import warnings
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import pairwise
@@ -18,8 +17,7 @@ from typing import IO, Any, Protocol, TypeVar, cast
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from stillmap.core.errors import InputError
-from stillmap.core.files import nearest_folder_above, require_regular
+from stillmap.core.files import nearest_folder_above
 
 
 def write_npz(path: Path, arrays: Mapping[str, "Writable"]) -> None:
@@ -189,26 +187,6 @@ def map_file(
     access = mmap.ACCESS_WRITE if writable else mmap.ACCESS_READ
     mapped: NDArray[Any] = np.frombuffer(mmap.mmap(file.fileno(), size, access=access), dtype)
     return mapped.reshape(shape)
-
-
-def open_npy(path: Path) -> NDArray[Any]:
-    """Memory-map a `.npy` file, read-only.
-
-    Raises:
-        InputError: it is missing, damaged, or holds Python objects.
-    """
-    require_regular(path)
-    try:
-        with warnings.catch_warnings():
-            # on headers of Python 2, or damaged ones
-            warnings.simplefilter("ignore")
-            # np.load would also open archives and pickles
-            loaded: NDArray[Any] = np.lib.format.open_memmap(path, mode="r")
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror or error}", where=str(path)) from error
-    except Exception as error:  # the header parser fails in many ways
-        raise InputError(f"is damaged: {error}", where=str(path)) from error
-    return loaded
 
 
 def write_npy(path: Path, array: NDArray[Any]) -> None:

@@ -137,6 +137,8 @@ def _convert(value: Any, hint: Any, name: str, where: str) -> Any:
                 raise InputError(what, where=where)
             return float(value)
         if kind in (int, bool, str) and type(value) is kind:
+            if kind is str and "\0" in value:
+                raise InputError(f"'{name}' must hold no NUL", where=where)
             if kind is int and abs(value) > _MAX_INTEGER:
                 raise InputError(f"'{name}' is too large: {_format(value)}", where=where)
             return value

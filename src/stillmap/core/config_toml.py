@@ -9,7 +9,7 @@ from typing import Any
 
 from stillmap.core.config import is_within, iter_names, iter_options, nest
 from stillmap.core.errors import InputError, closest_match
-from stillmap.core.files import read_text
+from stillmap.core.input_files import read_text
 
 _MAX_FILE_SIZE = 64 << 10  # bytes; Python needs minutes for more of nested keys
 

@@ -1,13 +1,11 @@
 """InputError, the one exception for invalid input or calls, and import of optional libraries."""
 
-import re
 from collections.abc import Iterable
 from importlib import import_module
 from typing import Any
 
 from stillmap.core.extras import install_hint
-
-_CONTROL = re.compile("[\x00-\x1f\x7f-\x9f]")
+from stillmap.core.printable import printable
 
 _MAX_LENGTH = 1000  # characters of a message: damaged files may hold long words
 
@@ -30,9 +28,7 @@ class InputError(Exception):
     def __str__(self) -> str:
         place = f"{self.where}: " if self.where else ""
         advice = f" ({self.hint})" if self.hint else ""
-        line = f"{place}{self.what}{advice}".replace("\n", " ")
-        # names may hold control characters of terminals
-        return _CONTROL.sub(lambda found: f"\\x{ord(found[0]):02x}", line)
+        return printable(f"{place}{self.what}{advice}".replace("\n", " "))
 
 
 def cannot_write(error: OSError, path: object) -> InputError:

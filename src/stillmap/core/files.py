@@ -1,4 +1,4 @@
-"""Atomic output of files and folders; bounded reading of text files."""
+"""Atomic output of files and folders."""
 
 import os
 import secrets
@@ -198,23 +198,6 @@ def _umask() -> int:
     return mask
 
 
-def read_text(path: Path, max_bytes: int) -> str:
-    """Read a UTF-8 file of at most `max_bytes` bytes.
-
-    Raises:
-        InputError: it cannot be read, or is larger.
-        UnicodeDecodeError: it is not UTF-8.
-    """
-    try:
-        with path.open("rb") as file:
-            content = file.read(max_bytes + 1)
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
-    if len(content) > max_bytes:
-        raise InputError(f"is too large: more than {max_bytes >> 10} KiB", where=str(path))
-    return content.decode("utf-8")
-
-
 def nearest_folder_above(path: str | os.PathLike[str]) -> Path:
     """The first folder above a path that is there."""
     return next(one for one in Path(path).absolute().parents if one.is_dir())
@@ -228,15 +211,3 @@ def to_encodable(text: str) -> str:
 def write_text(path: Path, text: str) -> None:
     """Write a text as UTF-8; see `to_encodable`."""
     path.write_bytes(to_encodable(text).encode("utf-8"))
-
-
-def require_regular(path: Path) -> None:
-    """Reject pipes and devices, on which reading may block for ever.
-
-    Folders and missing paths pass: opening them fails.
-
-    Raises:
-        InputError: the path is a pipe, socket or device.
-    """
-    if path.exists() and not path.is_file() and not path.is_dir():
-        raise InputError("is no regular file", where=str(path))

@@ -1,14 +1,51 @@
-"""Conversion of values to JSON."""
+"""Reading of JSON files, and conversion of values to JSON."""
 
 import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
+from stillmap.core.errors import InputError
 from stillmap.core.files import to_encodable, write_text
+from stillmap.core.input_files import read_text
+
+
+def read_json(path: Path, max_bytes: int, hint: str = "") -> Any:
+    """The content of a JSON file of at most `max_bytes` bytes; no NaN, infinity or NUL in texts.
+
+    Raises:
+        InputError: it cannot be read, is larger, or no JSON; with the hint.
+    """
+    try:
+        text = read_text(path, max_bytes)
+        content = json.loads(text, parse_constant=_reject_constant)
+        if "\\u0000" in text:
+            _reject_nul(content)
+        return content
+    except InputError as error:
+        raise InputError(error.what, where=error.where, hint=hint) from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"is not JSON: {error}", where=str(path), hint=hint) from error
+
+
+def _reject_nul(content: Any) -> None:
+    """Refuse texts with NUL, which no path, topic or name can hold."""
+    rest = [content]
+    while rest:
+        one = rest.pop()
+        if isinstance(one, dict):
+            rest += [*one, *one.values()]
+        elif isinstance(one, list):
+            rest += one
+        elif isinstance(one, str) and "\0" in one:
+            raise ValueError("a text holds NUL")
+
+
+def _reject_constant(text: str) -> NoReturn:
+    raise ValueError(f"{text} is no number of JSON")
 
 
 def count_skipped(source: Mapping[str, Any]) -> int:

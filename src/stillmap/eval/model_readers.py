@@ -1,16 +1,17 @@
 """Readers of simulations with cameras, and of models in result folders."""
 
-import json
+import io
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.array_files import open_npy, read_npz
 from stillmap.core.errors import InputError, import_extra
-from stillmap.core.files import read_text, require_regular
+from stillmap.core.input_files import read_bytes
+from stillmap.core.json import read_json
 from stillmap.eval import mesh_distance, readers
 from stillmap.eval.mesh import SAMPLES, ColoredPoints, TextureRecord, TrueImages
 from stillmap.eval.object_models import Model, MoverHits, Track
@@ -24,6 +25,7 @@ RECORD = "mesh_faces.npz"
 _VOXEL = 0.05  # m, for thinning the observed surface points
 _SPAN_NS = 10**9  # before and after the model of a person, who walks on
 _MAX_JSON = 1 << 28  # bytes
+_MAX_GLB, _MAX_ARRAY = 4 << 30, 1 << 31  # bytes of a file, of an unpacked array
 
 
 class CameraSimulation(NamedTuple):
@@ -55,7 +57,7 @@ class CameraSimulation(NamedTuple):
     def mover_hits(self) -> MoverHits:
         """The hits on movers."""
         recording = self.truth.recording
-        mover = np.load(self.truth.folder / "truth/mover.npy", allow_pickle=False)
+        mover = open_npy(self.truth.folder / "truth/mover.npy")
         beams = np.flatnonzero(recording.hit & (mover >= 0))
         stamps = recording.stamp_ns[recording.scans_of(beams)]
         if recording.beam_time is not None:
@@ -107,10 +109,10 @@ def read_glb(path: Path, n: int = SAMPLES) -> GlbContent:
     Raises:
         InputError: it is damaged, or trimesh is not installed.
     """
-    require_regular(path)
+    data = io.BytesIO(read_bytes(path, _MAX_GLB))
     trimesh = import_extra("trimesh", path, "compared with the truth", group="mesh")
     try:
-        parts = list(_parts(trimesh.load_scene(path, process=False)))
+        parts = list(_parts(trimesh.load_scene(data, file_type="glb", process=False)))
         return _concatenate(parts, n)
     except Exception as error:  # whatever trimesh makes of damaged bytes
         raise InputError(f"is damaged: {error}", where=str(path)) from error
@@ -186,14 +188,14 @@ def read_record(path: Path, n_pictures: int, frame: str = "map") -> TextureRecor
     """
     if not path.exists():
         return None
-    require_regular(path)
+    names = ("vertices", "faces", "image", f"T_camera_{frame}")
+    columns = [*read_npz(path, names, _MAX_ARRAY).values()]
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            vertices = np.asarray(archive["vertices"], np.float64).reshape(-1, 3)
-            faces = np.asarray(archive["faces"], np.int32).reshape(-1, 3)
-            image = np.asarray(archive["image"], np.int32).reshape(len(faces))
-            T = np.asarray(archive[f"T_camera_{frame}"], np.float64).reshape(-1, 4, 4)
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+        vertices = np.asarray(columns[0], np.float64).reshape(-1, 3)
+        faces = np.asarray(columns[1], np.int32).reshape(-1, 3)
+        image = np.asarray(columns[2], np.int32).reshape(len(faces))
+        T = np.asarray(columns[3], np.float64).reshape(-1, 4, 4)
+    except (ValueError, TypeError) as error:
         raise InputError(f"is damaged: {error}", where=str(path)) from error
     if len(T) != n_pictures or image.max(initial=-1) >= n_pictures or image.min(initial=0) < -1:
         what = f"has {len(T)} images, the recording {n_pictures}"
@@ -219,7 +221,7 @@ def read_tracks(folder: Path, T_world_map: Float) -> list[Track]:
         InputError: it is missing or damaged.
     """
     path = folder / "objects.json"
-    out, content = [], _json(path)
+    out, content = [], read_json(path, _MAX_JSON)
     if not isinstance(content, list):
         raise InputError("is damaged: no list of objects", where=str(path))
     for one in content:
@@ -252,7 +254,7 @@ def read_model(folder: Path, id: int, rigid: bool, n_pictures: int) -> Model | N
         return None
     glb, about = read_glb(path, n=1), path.with_suffix(".json")
     try:
-        content = _json(about)
+        content = read_json(about, _MAX_JSON)
         T, stamp = np.array(content["T_map_object"], float).reshape(4, 4), int(content["stamp_ns"])
         first, last = content.get("first_stamp_ns"), content.get("last_stamp_ns")
         if first is None or last is None:
@@ -263,11 +265,3 @@ def read_model(folder: Path, id: int, rigid: bool, n_pictures: int) -> Model | N
         raise InputError(f"is damaged: {error!r}", where=str(about)) from error
     record = read_record(folder / f"{id:04d}_faces.npz", n_pictures, "object")
     return Model(glb.vertices, glb.faces, T, stamp, span, record)
-
-
-def _json(path: Path) -> Any:
-    require_regular(path)
-    try:
-        return json.loads(read_text(path, _MAX_JSON))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"is no JSON: {error}", where=str(path)) from error

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import arrays, se2
 from stillmap.core.errors import InputError
-from stillmap.core.files import read_text, require_regular
+from stillmap.core.input_files import read_text
 from stillmap.core.recording import Recording
 from stillmap.io.carmen.log import CarmenLog, read_log
 from stillmap.io.reader import read as recording_of
@@ -229,7 +229,6 @@ def _log_rows(log: CarmenLog) -> Float:
 
 def _first_row(path: Path, wanted: str) -> tuple[int, bool]:
     """Number of columns of the first row, and whether it starts with a word."""
-    require_regular(path)
     text = read_head(path, _HEAD).decode("utf-8", "replace")
     for line in text.splitlines():
         words = line.split("#")[0].split()

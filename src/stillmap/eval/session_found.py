@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.array_files import read_npz
 from stillmap.core.errors import InputError
 from stillmap.eval.session_cells import ChangeTruth
 from stillmap.eval.session_poses import PlacedSession, read_json
@@ -13,6 +14,7 @@ from stillmap.eval.session_poses import PlacedSession, read_json
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
+_MAX_CELLS = 1 << 31  # bytes of an array when it is unpacked
 _CELLS = "changes.npz"
 _KINDS = ("appeared", "gone", "moved", "door")
 
@@ -56,11 +58,11 @@ def read_named_cells(place: Path, T_world_place: Float) -> NamedCells | None:
     if not path.is_file():
         return None
     try:
-        with np.load(path, allow_pickle=False) as file:
-            ids, centres = np.asarray(file["change"]), np.asarray(file["xyz"[:D]], np.float64)
+        ids, centres = read_npz(path, ("change", "xyz"[:D]), _MAX_CELLS).values()
+        centres = np.asarray(centres, np.float64)
         if centres.shape != (len(ids), D):
             raise ValueError(f"{'xyz'[:D]} is {centres.shape}")
-    except (OSError, ValueError, KeyError, EOFError) as error:
+    except (TypeError, ValueError) as error:
         raise InputError(f"is damaged: {error}", where=str(path)) from error
     return NamedCells(ids, _transform(T_world_place, centres))
 

@@ -1,6 +1,5 @@
 """Scores of the poses of sessions that `stillmap merge` put into one frame."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -9,9 +8,9 @@ import numpy as np
 import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
 
+from stillmap.core import json as json_files
 from stillmap.core import se2
 from stillmap.core.errors import InputError
-from stillmap.core.files import read_text
 from stillmap.eval.labels import Scores
 from stillmap.eval.readers import read_trajectory
 from stillmap.eval.trajectory import align, associate_trajectories
@@ -94,10 +93,7 @@ def read_json(path: Path) -> Any:
     if not path.is_file():
         hint = "a folder that 'stillmap merge' wrote"
         raise InputError("does not exist", where=str(path), hint=hint)
-    try:
-        return json.loads(read_text(path, _MAX_BYTES))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"is no JSON: {error}", where=str(path)) from error
+    return json_files.read_json(path, _MAX_BYTES)
 
 
 def read_sessions(place: Path, truth: SessionTruth) -> list[PlacedSession]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from stillmap.core.errors import InputError
+from stillmap.core.input_files import InputFile
 from stillmap.fleet.urls import is_url
 
 _BLOCK = 1 << 20  # bytes
@@ -56,7 +57,7 @@ def hash_content(path: Path) -> Content:
     whole, size = hashlib.sha256(), 0
     for name, file_path in _files(path):
         one = hashlib.sha256()
-        with file_path.open("rb") as file:
+        with InputFile(file_path) as file:
             while block := file.read(_BLOCK):
                 one.update(block)
                 size += len(block)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from stillmap.core.errors import InputError, closest_match
-from stillmap.core.files import read_text
+from stillmap.core.input_files import read_text
 from stillmap.fleet.urls import is_url, make_absolute
 
 _MAX_BYTES = 64 << 20  # of a manifest: half a million recordings

@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from stillmap.core.errors import InputError
+from stillmap.core.locks import open_lock
 from stillmap.fleet.journal import Journal
 from stillmap.fleet.outcomes import DISK_FULL, MAKE_ROOM
 from stillmap.fleet.storage import STATE, FolderStorage, Storage
@@ -37,7 +38,7 @@ def lock_output(storage: Storage) -> Iterator[None]:
     path = Path(storage.root) / _LOCK
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        file = path.open("ab")
+        file = open_lock(path)
     except OSError as error:
         raise InputError(f"cannot be written: {error.strerror}", where=storage.root) from error
     with file:

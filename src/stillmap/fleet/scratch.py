@@ -10,6 +10,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
+from stillmap.core.errors import InputError
+from stillmap.core.locks import open_lock
+
 _LOCK = ".lock"
 
 
@@ -59,7 +62,7 @@ def remove_stale(parent: Path) -> None:
     with suppress(FileNotFoundError, NotADirectoryError):
         locks = [path for path in sorted(parent.iterdir()) if path.name.endswith(_LOCK)]
     for lock in locks:
-        with suppress(OSError), lock.open("ab") as file:
+        with suppress(OSError, InputError), open_lock(lock) as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             shutil.rmtree(lock.with_suffix(""), ignore_errors=True)
             lock.unlink(missing_ok=True)

@@ -10,10 +10,12 @@ from typing import Protocol
 
 from stillmap.core.errors import InputError
 from stillmap.core.files import sync
+from stillmap.core.input_files import read_bytes
 from stillmap.core.output_place import resolve_output
 from stillmap.fleet.scratch import remove_stale, scratch_folder
 
 STATE = ".fleet"  # folder of the journal, of the labels of results, and of unfinished results
+_MAX_BYTES = 1 << 30  # of a file of the state, read as a whole
 RECORD = "run.json"  # every result has it; in a bucket it appears last, and goes first
 
 
@@ -66,7 +68,7 @@ class FolderStorage:
 
     def read(self, name: str) -> bytes | None:
         path = self._path / name
-        return path.read_bytes() if path.is_file() else None
+        return read_bytes(path, _MAX_BYTES) if path.is_file() else None
 
     def write(self, name: str, content: bytes) -> None:
         path = self._path / name

@@ -6,7 +6,7 @@ from typing import Any
 
 from stillmap.core.advice import split_advice
 from stillmap.core.errors import InputError
-from stillmap.core.files import read_text
+from stillmap.core.input_files import read_text
 from stillmap.results.reader import read_grid
 from stillmap.results.report.figures import data_uri, draw_map, map_window
 from stillmap.results.run_record import read_record

@@ -18,6 +18,7 @@ from typing import Any
 
 from stillmap.core.errors import InputError
 from stillmap.core.files import to_encodable, write_text
+from stillmap.core.input_files import read_bytes, read_text
 from stillmap.core.json import to_json
 from stillmap.core.version import package_version
 from stillmap.fleet.artifacts import PLACES, RESULTS, find_result, write_label
@@ -29,6 +30,8 @@ from stillmap.fleet.settings import Settings, info_command, map_command, merge_c
 from stillmap.fleet.storage import RECORD, Storage
 from stillmap.fleet.summary import summarize_result, summarize_sessions
 from stillmap.fleet.urls import is_url
+
+_MAX_BYTES = 1 << 30  # of a record or report
 
 Stop = threading.Event | None
 
@@ -192,7 +195,7 @@ def _publish(
         "peak_memory_bytes": outcome.peak_memory_bytes,
     }
     # the label fits the record of this result alone: until the result is there, it says nothing
-    write_label(storage, name, key, (folder / RECORD).read_bytes(), label)
+    write_label(storage, name, key, read_bytes(folder / RECORD, _MAX_BYTES), label)
     storage.publish(folder, name)
     return outcome_of_label(label)
 
@@ -220,7 +223,7 @@ def _point_to_copy(folder: Path, new: Path, source: str, path: Path) -> Path:
     for one in folder.iterdir():
         if one.name != RECORD:
             (new / one.name).symlink_to(one)
-    text = (folder / RECORD).read_text(encoding="utf-8")
+    text = read_text(folder / RECORD, _MAX_BYTES)
     write_text(new / RECORD, _replace_all(text, {source: str(path)}))
     return new
 
@@ -230,7 +233,7 @@ def _replace_in_texts(folder: Path, texts: dict[str, str]) -> None:
     texts = {old: new for old, new in texts.items() if old != new}
     for path in folder.rglob("*") if texts else ():
         if path.suffix in (".json", ".html") and path.is_file():
-            text = path.read_text(encoding="utf-8")
+            text = read_text(path, _MAX_BYTES)
             write_text(path, _replace_all(text, texts))
 
 

@@ -9,7 +9,6 @@ import numpy as np
 
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
-from stillmap.core.files import require_regular
 from stillmap.core.recording import Recording
 from stillmap.io import camera_file
 from stillmap.io.camera_file import CameraOverride
@@ -136,7 +135,6 @@ def _read_folder(name: str, override: CameraOverride, folder: Path, where: str) 
     if not files:
         raise InputError("holds no images", where=str(folder))
     if override.times is not None:
-        require_regular(override.times)
         times = read_times(override.times)
         rows = assign_rows(files, len(times), override.times)
         stamps = [None if row is None else times[row] for row in rows]

@@ -85,7 +85,7 @@ def _writer(module: str, function: str = "write_filtered") -> Write:
 def _write_stillmap(job: FilterJob) -> Omissions:
     recording = _to_misses(job)
     folder = job.source if job.source.is_dir() else job.source.parent
-    if stillmap_folder.read(folder).beam_time is None:  # times that were estimated stay out
+    if not stillmap_folder.has_beam_times(folder):  # times that were estimated stay out
         source = {key: value for key, value in recording.source.items() if key != SPIN_KEY}
         recording = replace(recording, beam_time=None, source=source)
     stillmap_folder.write(recording, job.output, overwrite=job.overwrite)

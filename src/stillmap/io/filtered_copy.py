@@ -1,7 +1,6 @@
 """Filtered copies of recordings: what a writer of one gets and returns, and copies of folders."""
 
 import os
-import shutil
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from stillmap.core.arrays import release_pages
 from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_file, atomic_folder
+from stillmap.core.input_files import copy_file
 from stillmap.core.recording import Recording
 from stillmap.io.text_lines import Progress
 from stillmap.preprocessing.options import ReadOptions
@@ -142,7 +142,7 @@ def _filter_file(
     is_whole = not any(mask is None or mask.any() for mask in masks)
     try:
         if is_whole and file.suffix.lower() == suffix.lower():
-            shutil.copy2(file, new)
+            copy_file(file, new)
         else:
             filter_file(file, new, masks)
     except MemoryError as error:
@@ -159,16 +159,16 @@ def copy_others(
     Raises:
         OSError: something cannot be read or written.
     """
-    left_out = {path.resolve() for path in omit}
+    left_out = {os.path.realpath(path) for path in omit}
     folders = {parent for file in files for parent in file.parents}
     for entry in sorted(source.iterdir()):
         new = target / entry.name
-        if entry in files or entry.resolve() in left_out:
+        if entry in files or os.path.realpath(entry) in left_out:
             continue
         if entry.is_symlink() and entry not in folders:
-            new.symlink_to(os.path.abspath(entry.resolve()))
+            new.symlink_to(os.path.realpath(entry))
         elif entry.is_dir():
             new.mkdir()
             copy_others(entry, new, files, omit)
         elif entry.is_file():
-            shutil.copy2(entry, new)
+            copy_file(entry, new)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from stillmap.core.errors import InputError
+from stillmap.core.input_files import InputFile, read_bytes
 
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".pgm")
 
@@ -55,13 +56,14 @@ def write_png(image: NDArray[Any], path: Path, compress_level: int = 1) -> None:
     path.write_bytes(buffer.getbuffer())
 
 
+_MAX_FILE = 1 << 30  # bytes
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _PNG_PIXELS = (b"IHDR", b"IDAT", b"IEND")  # chunks that follow from the pixels
 
 
 def is_png(path: Path) -> bool:
     """True if a file begins as a PNG image."""
-    with path.open("rb") as file:
+    with InputFile(path) as file:
         return file.read(len(_PNG_MAGIC)) == _PNG_MAGIC
 
 
@@ -74,7 +76,7 @@ def rewrite_png(path: Path, image: NDArray[Any]) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, format="PNG")
     new = list(_iter_png_chunks(buffer.getvalue(), path))
-    old = list(_iter_png_chunks(path.read_bytes(), path))
+    old = list(_iter_png_chunks(read_bytes(path, _MAX_FILE), path))
     first_pixels = next((k for k, (kind, _) in enumerate(old) if kind == b"IDAT"), len(old))
     before, after = (
         [data for kind, data in part if kind not in _PNG_PIXELS]
@@ -108,7 +110,8 @@ def _open(path: Path) -> Iterator[Image.Image]:
             # an image that unpacks to more than memory
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             warnings.filterwarnings("ignore", category=UserWarning)
-            with Image.open(path) as image:
+            # given a path, Pillow maps files of bare pixels into memory
+            with InputFile(path) as file, Image.open(file) as image:
                 yield image
     except UnidentifiedImageError as error:
         raise InputError("is no image", where=str(path)) from error

@@ -66,7 +66,7 @@ def _is_stillmap_folder(path: Path, start: bytes | None) -> bool:
 
 def _read_stillmap_folder(path: Path, context: ReadContext) -> Recording:
     folder = path if path.is_dir() else path.parent
-    recording = stillmap_folder.read(folder)
+    recording = stillmap_folder.read(folder, context.scratch)
     try:
         return apply_options(recording, context.options)
     except InputError as error:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2, se3
 from stillmap.core.errors import InputError
+from stillmap.core.input_files import InputFile
 from stillmap.core.timestamps import parse_ns
 from stillmap.io.rigid_transforms import rigid_transform
 from stillmap.io.text_lines import read_lines
@@ -126,11 +127,11 @@ def _read_matrix(path: Path, count: int) -> Float | None:
     try:
         if not path.is_file():
             return None
-        with path.open("rb") as file:
+        with InputFile(path) as file:
             words = file.read(_MAX_MATRIX_BYTES).split()
         n = round(count**0.5)
         return np.array([float(word) for word in words]).reshape(n, n)
-    except (OSError, ValueError):
+    except (InputError, OSError, ValueError):
         return None
 
 

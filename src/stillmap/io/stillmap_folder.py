@@ -1,4 +1,4 @@
-"""stillmap's recording folder: `recording.json`, memory-mapped `.npy` arrays, images as PNG files.
+"""stillmap's recording folder: `recording.json`, arrays as `.npy` files, images as PNG files.
 
 Images of floats (depth in metres) are `.npy` files of float32.
 """
@@ -6,17 +6,22 @@ Images of floats (depth in metres) are `.npy` files of float32.
 import json
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, NotRequired, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.arrays import iter_blocks, open_npy, write_npy
+from stillmap.core.array_files import open_npy
+from stillmap.core.arrays import iter_blocks, write_npy
 from stillmap.core.camera import Camera, Images
+from stillmap.core.config import Limits
 from stillmap.core.errors import InputError
-from stillmap.core.files import atomic_folder, read_text, require_regular
+from stillmap.core.files import atomic_folder
+from stillmap.core.json import read_json
 from stillmap.core.recording import Recording
+from stillmap.core.schema import SchemaError, check
 from stillmap.io.images import read_image, write_png
+from stillmap.io.notes import prune_notes
 from stillmap.preprocessing.options import MAX_POINT_DISTANCE
 
 _IMAGES = "images"
@@ -60,11 +65,11 @@ def _read_images(path: Path, header: dict[str, Any]) -> Images | None:
     """The images of a recording folder, each read on demand."""
     if "images" not in header:
         return None
-    N = _read_count(path, header, "images")
+    N = header["images"]
     stamp_ns = np.array(_open_array(path, "image_stamp_ns", (N,), np.int64))
     camera = np.array(_open_array(path, "image_camera", (N,), np.int32))
     try:
-        cameras = tuple(_camera_from_dict(one) for one in header.get("cameras"))  # type: ignore[union-attr]
+        cameras = tuple(_camera_from_dict(one) for one in header.get("cameras", ()))
         return Images(stamp_ns, camera, cameras, partial(_load_image, path / _IMAGES))
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"is damaged: its cameras: {error}", where=str(path)) from error
@@ -72,11 +77,11 @@ def _read_images(path: Path, header: dict[str, Any]) -> Images | None:
 
 def _camera_from_dict(one: dict[str, Any]) -> Camera:
     return Camera(
-        name=str(one["name"]),
-        width=int(one["width"]),
-        height=int(one["height"]),
+        name=one["name"],
+        width=one["width"],
+        height=one["height"],
         K=_matrix(one["K"], 3),
-        model=str(one["model"]),
+        model=one["model"],
         distortion=np.array(one["distortion"], np.float64).reshape(-1),
         T_base_camera=_matrix(one["T_base_camera"], 4),
     )
@@ -100,6 +105,33 @@ def _load_image(folder: Path, image: int) -> NDArray[Any]:
 HEADER = "recording.json"
 FORMAT = "stillmap-recording"
 FORMAT_VERSION = 1
+_Count = Annotated[int, Limits(ge=0, lt=1 << 60)]
+_Pixels = Annotated[int, Limits(ge=1, le=1 << 16)]
+_Row = list[float]
+
+
+class _CameraHeader(TypedDict):
+    name: str
+    width: _Pixels
+    height: _Pixels
+    K: list[_Row] | None
+    model: str
+    distortion: list[float]
+    T_base_camera: list[_Row] | None
+
+
+class _Header(TypedDict):
+    dimension: Literal[2, 3]
+    scans: _Count
+    beams: _Count
+    sensors: _Count
+    odometry: NotRequired[bool]
+    beam_times: NotRequired[bool]
+    recorded_poses: NotRequired[bool]
+    images: NotRequired[_Count]
+    cameras: NotRequired[list[_CameraHeader]]
+
+
 _ARRAYS = (
     *("stamp_ns", "offset", "points", "hit", "T_base_sensor", "sensor"),
     *("T_odom_base", "beam_time", "T_recorded_base"),
@@ -145,28 +177,27 @@ def write_into(recording: Recording, folder: Path) -> None:
     (folder / HEADER).write_text(text + "\n", encoding="utf-8")
 
 
-def read(path: Path) -> Recording:
-    """Read a recording folder; per-beam arrays are memory-mapped.
+def read(path: Path, scratch: Path | None = None) -> Recording:
+    """Read a recording folder; large arrays are memory-mapped copies in the folder `scratch`.
+
+    None is the system's temporary folder.
 
     Raises:
         InputError: a file is missing, damaged, or inconsistent with the others.
     """
     header = _read_header(path / HEADER)
-    T, M = _read_count(path, header, "scans"), _read_count(path, header, "beams")
-    S, D = _read_count(path, header, "sensors"), _read_count(path, header, "dimension")
-    if D not in (2, 3):
-        raise InputError(f"dimension must be 2 or 3, got {D}", where=str(path / HEADER))
+    T, M, S, D = (header[key] for key in ("scans", "beams", "sensors", "dimension"))
     T_odom_base = T_recorded_base = beam_time = None
     if header.get("odometry"):
         T_odom_base = _read_poses(path, "T_odom_base", T, D)
     if header.get("recorded_poses"):
         T_recorded_base = _read_poses(path, "T_recorded_base", T, D)
     if header.get("beam_times"):
-        beam_time = _open_array(path, "beam_time", (M,), np.float32)
+        beam_time = _open_array(path, "beam_time", (M,), np.float32, scratch)
     stamp_ns = np.array(_open_array(path, "stamp_ns", (T,), np.int64))
     offset = np.array(_open_array(path, "offset", (T + 1,), np.int64))
-    points = _open_array(path, "points", (M, D), np.float32)
-    hit = _open_array(path, "hit", (M,), np.bool_)
+    points = _open_array(path, "points", (M, D), np.float32, scratch)
+    hit = _open_array(path, "hit", (M,), np.bool_, scratch)
     sensor = np.array(_open_array(path, "sensor", (T,), np.int32))
     # np.diff could overflow
     if np.any(stamp_ns[1:] < stamp_ns[:-1]):
@@ -174,7 +205,6 @@ def read(path: Path) -> Recording:
     if offset[0] != 0 or offset[-1] != M or np.any(offset[1:] < offset[:-1]):
         raise _damaged_error(path, "offset", f"must rise from 0 to {M}")
     _check_points(path, points, hit)
-    source = header.get("source", {})
     try:
         return Recording(
             stamp_ns=stamp_ns,
@@ -184,7 +214,7 @@ def read(path: Path) -> Recording:
             T_base_sensor=_read_poses(path, "T_base_sensor", S, D),
             sensor=sensor,
             T_odom_base=T_odom_base,
-            source=source if isinstance(source, dict) else {},
+            source=prune_notes(header.get("source")),
             beam_time=beam_time,
             T_recorded_base=T_recorded_base,
             images=_read_images(path, header),
@@ -193,34 +223,34 @@ def read(path: Path) -> Recording:
         raise InputError(f"is damaged: {error}", where=str(path)) from error
 
 
-def _reject_constant(text: str) -> float:
-    raise ValueError(f"{text} is no number of JSON")
+def has_beam_times(path: Path) -> bool:
+    """Whether a recording folder holds the times of its beams.
+
+    Raises:
+        InputError: its header is missing or damaged.
+    """
+    return bool(_read_header(path / HEADER).get("beam_times"))
 
 
 def _read_header(path: Path) -> dict[str, Any]:
-    try:
-        require_regular(path)
-        header = json.loads(read_text(path, _MAX_HEADER), parse_constant=_reject_constant)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"is not JSON: {error}", where=str(path)) from error
+    header = read_json(path, _MAX_HEADER)
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise InputError(f"is not the header of a {FORMAT}", where=str(path))
     if header.get("format_version") != FORMAT_VERSION:
         what = f"format_version {header.get('format_version')!r} is unknown here"
         raise InputError(what, where=str(path), hint=f"this version reads {FORMAT_VERSION}")
+    try:
+        check(header, _Header)
+    except SchemaError as error:
+        raise InputError(f"is damaged: {error}", where=str(path)) from error
     return header
 
 
-def _read_count(path: Path, header: dict[str, Any], key: str) -> int:
-    value = header.get(key)
-    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 60:
-        raise InputError(f"'{key}' must be a count, got {value!r}", where=str(path / HEADER))
-    return value
-
-
-def _open_array(path: Path, name: str, shape: tuple[int, ...], dtype: type) -> NDArray[Any]:
-    """Memory-map one `.npy` file of exactly this shape and type."""
-    loaded = open_npy(path / f"{name}.npy")
+def _open_array(
+    path: Path, name: str, shape: tuple[int, ...], dtype: type, scratch: Path | None = None
+) -> NDArray[Any]:
+    """The content of one `.npy` file of exactly this shape and type."""
+    loaded = open_npy(path / f"{name}.npy", scratch)
     if loaded.shape != shape or loaded.dtype != np.dtype(dtype):
         what = f"expected {shape} {np.dtype(dtype)}, got {loaded.shape} {loaded.dtype}"
         raise _damaged_error(path, name, what)

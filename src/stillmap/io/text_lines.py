@@ -10,6 +10,7 @@ from typing import IO, NamedTuple
 
 from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_file
+from stillmap.core.input_files import InputFile
 
 MAX_LINE = 1 << 20  # bytes: a scan of 3600 readings with remissions has a tenth of it
 _MAX_RATIO, _MIN_LIMIT = 100, 64 << 20  # size of a decompressed text: ratio (logs have 20), bytes
@@ -43,7 +44,7 @@ class Line(NamedTuple):
 
 def is_gzip(path: Path) -> bool:
     """True if the content of a file is gzip."""
-    with _open(path) as file:
+    with InputFile(path) as file:
         return file.read(2) == _GZIP_MAGIC
 
 
@@ -72,7 +73,7 @@ def open_new_text(path: Path, compressed: bool) -> Iterator[IO[bytes] | gzip.Gzi
 
 def read_head(path: Path, size: int) -> bytes:
     """The first `size` bytes of a text, decompressed if gzip, fewer if damaged."""
-    with _open(path) as file:
+    with InputFile(path) as file:
         compressed = file.read(2) == _GZIP_MAGIC
         file.seek(0)
         if not compressed:
@@ -90,8 +91,8 @@ def read_lines(path: Path, progress: Progress | None = None) -> Iterator[Line]:
     Raises:
         InputError: the file cannot be opened or read.
     """
-    with _open(path) as file:
-        size = max(path.stat().st_size, 1)
+    with InputFile(path) as file:
+        size = max(file.size, 1)
         compressed = file.read(2) == _GZIP_MAGIC
         file.seek(0)
         stream = gzip.GzipFile(fileobj=file, mode="rb") if compressed else file
@@ -126,10 +127,3 @@ def _skip_rest(stream: IO[bytes] | gzip.GzipFile, limit: int) -> int:
         if rest.endswith(b"\n"):
             break
     return skipped
-
-
-def _open(path: Path) -> IO[bytes]:
-    try:
-        return path.open("rb")
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error

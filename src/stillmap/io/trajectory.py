@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from stillmap.core import se2
 from stillmap.core.arrays import iter_blocks
 from stillmap.core.errors import InputError
-from stillmap.core.files import read_text
+from stillmap.core.input_files import read_text
 from stillmap.core.recording import Recording
 from stillmap.core.timestamps import format_seconds
 

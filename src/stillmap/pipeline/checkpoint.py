@@ -15,17 +15,24 @@ import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Annotated, Any, NotRequired, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.array_files import open_npy
 from stillmap.core.arrays import iter_bytes, write_npy
+from stillmap.core.config import Limits
 from stillmap.core.errors import InputError, cannot_write
 from stillmap.core.files import sync
+from stillmap.core.json import read_json
+from stillmap.core.locks import open_lock
 from stillmap.core.output_place import hidden_path, resolve_output
 from stillmap.core.profiling import StageTimer
 from stillmap.core.publishing import finish_exchange
+from stillmap.core.recording import Recording
+from stillmap.core.schema import check
+from stillmap.pipeline.checkpoint_checks import check_state
 from stillmap.pipeline.checkpoint_files import pack_state, require_same_run, unpack_state
 from stillmap.pipeline.estimate import EmState
 from stillmap.pipeline.options import Options
@@ -35,6 +42,17 @@ _STATE, _LOCK = "state.json", "lock"
 _NAME = re.compile(r"[A-Za-z0-9_.-]+")
 _LARGEST_STATE = 1 << 30  # bytes
 _IN_MEMORY = 1 << 20  # bytes of an array that is read at once instead of mapped
+
+
+_Seconds = Annotated[float, Limits(ge=0.0)]
+
+
+class _Stage(TypedDict):
+    """Of a StageTimer."""
+
+    seconds: _Seconds
+    cpu_seconds: _Seconds
+    peak_memory_bytes: NotRequired[Annotated[int, Limits(ge=0)]]
 
 
 class DamagedCheckpoint(Exception):
@@ -62,13 +80,18 @@ class CheckpointFolder:
         return self.folder / f"iteration-{max(numbers)}" if numbers else None
 
     def load(
-        self, identity: Mapping[str, Any], options: Options, stages: StageTimer
+        self,
+        identity: Mapping[str, Any],
+        options: Options,
+        recording: Recording,
+        stages: StageTimer,
     ) -> EmState | None:
         """The state of the run at its last checkpoint; None where there is none.
 
         Args:
             identity: of the run, see `identify_run`.
             options: of the run, resolved.
+            recording: that is mapped.
             stages: the time that the run took so far is added here.
 
         Raises:
@@ -78,17 +101,21 @@ class CheckpointFolder:
         if self.newest is None:
             return None
         state = _state(self.newest / _STATE)
-        require_same_run(state["identity"], dict(identity), str(self.folder))
-        arrays = {
-            name: _array(self.newest / f"{name}.npy", about)
-            for name, about in state["arrays"].items()
-        }
         try:
+            require_same_run(state["identity"], dict(identity), str(self.folder))
+            arrays = {
+                name: _array(self.newest / f"{name}.npy", about)
+                for name, about in state["arrays"].items()
+            }
             run = unpack_state(state["state"], arrays, options)
-        except (KeyError, TypeError, ValueError, IndexError) as error:
+            check_state(run, recording)
+            check(state["stages"], dict[str, _Stage], "stages")
+            stages.add(state["stages"])
+        except (InputError, DamagedCheckpoint):
+            raise
+        except Exception as error:  # whatever comes of values that no run has written
             raise DamagedCheckpoint(f"{self.newest / _STATE}: {error!r}") from error
         self._arrays, self.is_in_use = state["arrays"], True
-        stages.add(state["stages"])
         return run
 
     def save(self, run: EmState, identity: Mapping[str, Any], stages: StageTimer) -> None:
@@ -187,7 +214,7 @@ def _open_lock(folder: Path, output: Path) -> IO[bytes]:
     while True:
         folder.mkdir(parents=True, exist_ok=True)
         try:
-            file = (folder / _LOCK).open("ab")
+            file = open_lock(folder / _LOCK)
         except FileNotFoundError:  # the run that had it has just ended
             continue
         try:
@@ -221,19 +248,18 @@ def _write_state(path: Path, state: Mapping[str, Any]) -> None:
 
 def _state(path: Path) -> dict[str, Any]:
     try:
-        if path.stat().st_size > _LARGEST_STATE:
-            raise DamagedCheckpoint(f"{path}: too large")
-        whole = json.loads(path.read_text(encoding="utf-8"))
+        whole = read_json(path, _LARGEST_STATE)
         text = whole["text"]
         if zlib.crc32(text.encode()) != whole["crc32"]:
             raise DamagedCheckpoint(f"{path}: its checksum differs")
         state: dict[str, Any] = json.loads(text)
-    except (OSError, ValueError, KeyError, TypeError, RecursionError, AttributeError) as error:
+    except InputError as error:
+        raise DamagedCheckpoint(str(error)) from error
+    except (ValueError, KeyError, TypeError, RecursionError, AttributeError) as error:
         raise DamagedCheckpoint(f"{path}: {error!r}") from error
-    if state["format_version"] != _FORMAT_VERSION:
-        raise DamagedCheckpoint(
-            f"{path}: format_version {state['format_version']!r} is unknown here"
-        )
+    if not isinstance(state, dict) or state.get("format_version") != _FORMAT_VERSION:
+        version = state.get("format_version") if isinstance(state, dict) else None
+        raise DamagedCheckpoint(f"{path}: format_version {version!r} is unknown here")
     return state
 
 
@@ -241,15 +267,14 @@ def _array(path: Path, about: Mapping[str, Any]) -> NDArray[Any]:
     if not _NAME.fullmatch(path.name):
         raise DamagedCheckpoint(f"{path}: no name of an array")
     try:
-        # np.load would also open archives and pickles
-        found = np.lib.format.open_memmap(path, mode="r")
-    except Exception as error:  # whatever NumPy's parser makes of damaged bytes
-        raise DamagedCheckpoint(f"{path}: {error!r}") from error
+        found = open_npy(path)
+    except InputError as error:
+        raise DamagedCheckpoint(str(error)) from error
     if list(found.shape) != about["shape"] or found.dtype.str != about["dtype"]:
         raise DamagedCheckpoint(f"{path}: not the array that was written")
     if _checksum(found) != about["crc32"]:
         raise DamagedCheckpoint(f"{path}: its checksum differs")
-    return np.array(found) if found.nbytes < _IN_MEMORY else np.asarray(found)
+    return np.array(found) if found.nbytes < _IN_MEMORY else found
 
 
 def _checksum(array: NDArray[Any]) -> int:

@@ -24,6 +24,8 @@ from stillmap.pipeline.options import Options
 Arrays = dict[str, NDArray[Any]]
 Float = NDArray[np.float64]
 
+_PLAIN = (bool, int, float, str)
+
 _NO_MATTER = ("threads", "output.region")  # options on which no byte of a checkpoint depends
 
 
@@ -93,9 +95,10 @@ def _unpack(hint: Any, value: Any, arrays: Mapping[str, Any]) -> Any:
         [hint] = (one for one in typing.get_args(hint) if one is not type(None))
     origin, parameters = typing.get_origin(hint), typing.get_args(hint)
     if origin is np.ndarray:
-        return arrays[value]
+        return _array_of(hint, arrays[value], value)
     if origin is tuple:
-        return tuple(value)
+        kinds = typing.get_args(hint)
+        return tuple(_unpack(k, one, arrays) for k, one in zip(kinds, value, strict=True))
     if origin is list and dataclasses.is_dataclass(parameters[0]):
         return _unpack_list(parameters[0], value, arrays)
     if origin is dict and dataclasses.is_dataclass(parameters[1]):
@@ -105,7 +108,39 @@ def _unpack(hint: Any, value: Any, arrays: Mapping[str, Any]) -> Any:
     if dataclasses.is_dataclass(hint):
         hints = _hints(hint)
         return hint(**{n: _unpack(hints[n], one, arrays) for n, one in value.items()})  # type: ignore[operator]
-    return value
+    if origin is list:
+        return [_unpack(parameters[0], one, arrays) for one in _typed(value, list)]
+    if hasattr(hint, "_fields"):  # a NamedTuple, of which JSON makes a list
+        return hint(
+            *(
+                _unpack(kind, one, arrays)
+                for kind, one in zip(typing.get_type_hints(hint).values(), value, strict=True)
+            )
+        )
+    return _typed(value, hint)
+
+
+def _array_of(hint: Any, array: NDArray[Any], name: str) -> NDArray[Any]:
+    """The array, of the elements that its type hint names."""
+    wanted = typing.get_args(typing.get_args(hint)[1])[0]
+    if not np.issubdtype(array.dtype, wanted):
+        raise TypeError(f"{name} holds {array.dtype}")
+    return array
+
+
+def _typed(value: Any, kind: Any) -> Any:
+    """A value of JSON, of the type of its hint.
+
+    Raises:
+        TypeError: it is another one, or an integer of more than 64 bits.
+    """
+    if kind is float and type(value) in (int, float):
+        return float(value)
+    if kind is int and type(value) is int and abs(value) < 2**63:
+        return value
+    if (kind in (bool, str, list) and type(value) is kind) or kind not in (*_PLAIN, list):
+        return value
+    raise TypeError(f"{value!r} is no {kind.__name__}")
 
 
 def _unpack_list(kind: Any, columns: Any, arrays: Mapping[str, Any]) -> list[Any]:
@@ -116,7 +151,11 @@ def _unpack_list(kind: Any, columns: Any, arrays: Mapping[str, Any]) -> list[Any
     return [
         kind(
             **{
-                n: value if isinstance(value, np.ndarray) else _unpack(hints[n], value, arrays)
+                n: (
+                    _array_of(hints[n], value, n)
+                    if isinstance(value, np.ndarray)
+                    else _unpack(hints[n], value, arrays)
+                )
                 for n, value in zip(columns, row, strict=True)
             }
         )

@@ -1,14 +1,13 @@
 """Checksums of what a place keeps of a session: a place grows only from what a merge wrote."""
 
 import hashlib
-import json
 import os
 from collections.abc import Iterator
 from pathlib import Path
 
 from stillmap.core.errors import InputError
-from stillmap.core.files import read_text, require_regular
-from stillmap.core.json import write_json
+from stillmap.core.input_files import InputFile
+from stillmap.core.json import read_json, write_json
 from stillmap.places.store import BEAMS, HINT, STATE, WRITTEN_ANEW
 
 _FILE = "checksums.json"
@@ -43,7 +42,6 @@ def check_checksums(home: Path) -> None:
         InputError: names a file that is missing, changed or new.
     """
     path = home / STATE / _FILE
-    require_regular(path)
     noted = _read_sums(path)
     found = dict(_iter_files(home))
     for name in sorted({*noted, *found}, key=str):
@@ -56,8 +54,8 @@ def check_checksums(home: Path) -> None:
 
 def _read_sums(path: Path) -> dict[str, str]:
     try:
-        return dict(json.loads(read_text(path, _MAX_BYTES)))
-    except (ValueError, TypeError, RecursionError) as error:
+        return dict(read_json(path, _MAX_BYTES, HINT))
+    except (ValueError, TypeError) as error:
         raise InputError("is damaged: no checksums", where=str(path), hint=HINT) from error
 
 
@@ -89,9 +87,6 @@ def _digest(path: str) -> str:
     Raises:
         InputError: it cannot be read.
     """
-    try:
-        with open(path, "rb", buffering=0) as file:
-            found = hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=_DIGEST))
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", where=path) from error
+    with InputFile(path) as file:
+        found = hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=_DIGEST))
     return found.hexdigest()

@@ -1,7 +1,6 @@
 """Moving objects of sessions in the frame of their place."""
 
 import json
-import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.errors import InputError
-from stillmap.core.files import read_text
+from stillmap.core.input_files import copy_content, read_bytes
+from stillmap.core.json import read_json
 from stillmap.places.place import PlacedSession
 from stillmap.places.place_graph import fit_alignment
 from stillmap.results.objects import MILLIMETRES, write_traffic
@@ -22,6 +22,7 @@ Float = NDArray[np.float64]
 
 _OBJECTS, _LIST, _ORIGINAL = "objects", "objects.json", "objects"
 _MAX_BYTES = 256 << 20
+_MAX_CLOUD = 1 << 30  # bytes
 _FIELDS = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("seconds", "<f4"), ("p_dynamic", "<f4")]
 
 
@@ -37,7 +38,7 @@ def copy_objects(result: Path, state: Path) -> None:
     target.mkdir()
     for path in sorted(source.iterdir()):
         if path.name == _LIST or path.suffix == ".ply":
-            shutil.copyfile(path, target / path.name)
+            copy_content(path, target / path.name)
 
 
 def check_objects(state: Path) -> None:
@@ -49,7 +50,7 @@ def check_objects(state: Path) -> None:
     source = state / _ORIGINAL
     read_tracks(source / _LIST)
     for path in source.glob("*.ply"):
-        _split_cloud(path, path.read_bytes())
+        _split_cloud(path, read_bytes(path, _MAX_CLOUD))
 
 
 def write_objects(folder: Path, sessions: Sequence[PlacedSession]) -> None:
@@ -99,7 +100,7 @@ def _read_records(path: Path) -> Iterator[dict[str, Any]]:
     tracks = read_tracks(path)  # which checks it
     if not tracks:
         return
-    yield from json.loads(read_text(path, _MAX_BYTES))
+    yield from read_json(path, _MAX_BYTES)
 
 
 def _write_records(path: Path, records: list[dict[str, Any]]) -> None:
@@ -128,7 +129,7 @@ def _transform_cloud(source: Path, T: Float) -> bytes:
     Raises:
         InputError: it is not as it was written.
     """
-    content = source.read_bytes()
+    content = read_bytes(source, _MAX_CLOUD)
     end, vertices = _split_cloud(source, content)
     D = T.shape[-1] - 1
     points = np.stack([vertices[name] for name in "xyz"[:D]]).astype(np.float64)

@@ -1,6 +1,5 @@
 """A place read again from its folder."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -8,8 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays
+from stillmap.core.array_files import read_npz
 from stillmap.core.errors import InputError
-from stillmap.core.files import read_text, require_regular
+from stillmap.core.json import read_json
 from stillmap.places.checksums import check_checksums
 from stillmap.places.evidence import BLOCK, Evidence
 from stillmap.places.inputs import TIES
@@ -100,9 +100,8 @@ def read_sessions(folder: Path) -> list[dict[str, Any]]:
         InputError: it is missing or damaged.
     """
     path = folder / SESSIONS
-    require_regular(path)
+    records = read_json(path, _MAX_JSON, HINT)
     try:
-        records = json.loads(read_text(path, _MAX_JSON))
         for record in records:
             name = record["name"]
             if not isinstance(name, str) or not name or "/" in name or name in (".", ".."):
@@ -113,9 +112,7 @@ def read_sessions(folder: Path) -> list[dict[str, Any]]:
                 raise ValueError(f"'accepted' of {name} is neither true nor false")
         if len({record["name"] for record in records}) != len(records):
             raise ValueError("two sessions have one name")
-    except InputError:
-        raise
-    except (ValueError, TypeError, KeyError, RecursionError) as error:
+    except (ValueError, TypeError, KeyError) as error:
         raise InputError(f"is damaged: {error}", where=str(path), hint=HINT) from error
     return list(records)
 
@@ -164,9 +161,9 @@ def _read_beams(folder: Path) -> tuple[NDArray[np.int64], int]:
 def _read_evidence(path: Path, keyframes: Keyframes, poses: Float) -> Evidence:
     """The evidence of keyframes that lay at poses (K, D+1, D+1) when it was measured."""
     D = poses.shape[-1] - 1
-    corner, hits, passes, resolution = read_archive(
-        path, ("corner", "hits", "passes", "resolution")
-    )
+    corner, hits, passes, resolution = read_npz(
+        path, ("corner", "hits", "passes", "resolution"), _MAX_ARRAY, HINT
+    ).values()
     shape = (len(corner), *(BLOCK[D],) * D)
     fits = corner.shape == (len(corner), D) and hits.shape == shape and passes.shape == shape
     kinds = corner.dtype == np.int32 and hits.dtype == np.uint8 and passes.dtype == np.uint8
@@ -193,9 +190,9 @@ def _end_within(keyframes: Keyframes, poses: Float, low: Float, high: Float) -> 
 def _read_ties(path: Path, sessions: list[PlacedSession]) -> list[Tie]:
     D = sessions[0].session.dimension
     dof = 3 * (D - 1)
-    first, first_node, second, second_node, T, covariance = read_archive(
-        path, ("first", "first_node", "second", "second_node", "T", "covariance")
-    )
+    first, first_node, second, second_node, T, covariance = read_npz(
+        path, ("first", "first_node", "second", "second_node", "T", "covariance"), _MAX_ARRAY, HINT
+    ).values()
     L, counts = len(first), np.array([len(one.nodes) for one in sessions])
     columns = first, first_node, second, second_node
     if any(column.shape != (L,) or column.dtype.kind != "i" for column in columns):
@@ -215,26 +212,3 @@ def _read_ties(path: Path, sessions: list[PlacedSession]) -> list[Tie]:
         Tie(a, i, b, j, T[k], covariance[k])
         for k, (a, i, b, j) in enumerate(zip(*(c.tolist() for c in columns), strict=True))
     ]
-
-
-def read_archive(path: Path, names: tuple[str, ...]) -> list[NDArray[Any]]:
-    """Arrays of an `.npz` file.
-
-    Raises:
-        InputError: it is missing, damaged, or too large when unpacked.
-    """
-    require_regular(path)
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            out = []
-            for name in names:
-                if archive.zip.getinfo(f"{name}.npy").file_size > _MAX_ARRAY:
-                    raise InputError(f"{name} is too large when unpacked", where=str(path))
-                out.append(np.asarray(archive[name]))
-            return out
-    except InputError:
-        raise
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror or error}", where=str(path)) from error
-    except Exception as error:  # whatever NumPy, zip and zlib make of damaged bytes
-        raise InputError(f"is damaged: {error}", where=str(path), hint=HINT) from error

@@ -2,7 +2,6 @@
 without its recording."""
 
 import os
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from stillmap.core import arrays
 from stillmap.core.arrays import write_npy
 from stillmap.core.errors import InputError
-from stillmap.core.files import require_regular
+from stillmap.core.input_files import copy_content
 from stillmap.io import stillmap_folder
 from stillmap.io.stillmap_folder import read as read_recording
 from stillmap.places.beam_cells import BeamCells
@@ -78,17 +77,7 @@ def copy_session(source: Path, target: Path) -> None:
         os.mkdir(target / part)
         names += [f"{part}/{name}" for name in sorted(files)]
     for name in names:
-        _copy_file(f"{source}/{name}", f"{target}/{name}")
-
-
-def _copy_file(source: str, target: str) -> None:
-    require_regular(Path(source))
-    try:
-        file = open(source, "rb", buffering=0)  # noqa: SIM115
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", where=source) from error
-    with file, open(target, "wb", buffering=0) as copy:
-        shutil.copyfileobj(file, copy, _COPIED_AT_ONCE)
+        copy_content(f"{source}/{name}", f"{target}/{name}")
 
 
 def _write_keyframes(folder: Path, keyframes: Keyframes) -> None:

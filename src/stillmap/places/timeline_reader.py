@@ -1,6 +1,5 @@
 """A place over its sessions read from its folder: `sessions.json`, `changes.json`, `states.npz`."""
 
-import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,11 +8,12 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.array_files import read_npz
 from stillmap.core.errors import InputError
-from stillmap.core.files import read_text, require_regular
+from stillmap.core.json import read_json
 from stillmap.places.inputs import SESSIONS
 from stillmap.places.place_change import Kind
-from stillmap.places.reader import read_archive, read_sessions
+from stillmap.places.reader import read_sessions
 from stillmap.places.timeline import (
     ChangedCells,
     ChangeRecord,
@@ -25,6 +25,7 @@ from stillmap.places.writer import CHANGES, STATES
 
 Float = NDArray[np.float64]
 
+_MAX_ARRAY = 1 << 31  # bytes of an array when it is unpacked
 _MAX_JSON = 64 << 20  # bytes
 _MAX_STAMP = 2**63  # ns
 _MAX_CELL = 2**30  # of either axis
@@ -70,9 +71,8 @@ def read_changes(folder: Path, names: Sequence[str]) -> list[ChangeRecord]:
         InputError: the file is missing or damaged.
     """
     path = folder / CHANGES
-    require_regular(path)
+    records = read_json(path, _MAX_JSON, _HINT)
     try:
-        records = json.loads(read_text(path, _MAX_JSON))
         if not isinstance(records, list):
             raise ValueError("is no list")
         changes = [_change_of(record, names) for record in records]
@@ -80,9 +80,7 @@ def read_changes(folder: Path, names: Sequence[str]) -> list[ChangeRecord]:
             raise ValueError("boxes in 2D and in 3D")
         if len({one.id for one in changes}) < len(changes):
             raise ValueError("two changes have one id")
-    except InputError:
-        raise
-    except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
+    except (ValueError, TypeError, KeyError, OverflowError) as error:
         raise InputError(_damage(error), where=str(path), hint=_HINT) from error
     return changes
 
@@ -94,9 +92,12 @@ def read_states(folder: Path) -> tuple[ChangedCells, list[str]]:
         InputError: the file is missing or damaged.
     """
     path = folder / STATES
-    cells, occupied, observed, shown, resolution, sessions = read_archive(
-        path, ("cells", "occupied", "observed", "shown", "resolution", "sessions")
-    )
+    cells, occupied, observed, shown, resolution, sessions = read_npz(
+        path,
+        ("cells", "occupied", "observed", "shown", "resolution", "sessions"),
+        _MAX_ARRAY,
+        _HINT,
+    ).values()
     K, S = len(cells) if cells.ndim else 0, len(sessions) if sessions.ndim else 0
     shapes = {"cells": (K, 2), "occupied": (K, S), "observed": (K, S), "shown": (K,)}
     arrays = {"cells": cells, "occupied": occupied, "observed": observed, "shown": shown}

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.arrays import write_npy, write_npz
+from stillmap.core.input_files import read_bytes
 from stillmap.core.json import write_json
 from stillmap.core.short_repr import ShortRepr
-from stillmap.io.trajectory import write_tum
+from stillmap.io.trajectory import MAX_BYTES, write_tum
 from stillmap.places.evidence import Evidence
 from stillmap.places.inputs import TIES
 from stillmap.places.place import Place, PlacedSession, Refusal
@@ -129,7 +130,7 @@ def write_place_files(folder: Path, result: PlaceResult) -> None:
     poses = np.concatenate([one.poses for one in place.sessions])
     with (folder / "trajectory.tum").open("wb") as file:
         for home in homes:
-            file.write((home / "trajectory.tum").read_bytes())
+            file.write(read_bytes(home / "trajectory.tum", MAX_BYTES))
     _write_beams(folder / "beams", homes, stamps)
     write_g2o(folder / "graph.g2o", _join_graphs(place), poses)
     write_json(folder / SESSIONS, session_records(result))

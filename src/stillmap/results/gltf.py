@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from stillmap.core.errors import InputError, import_extra
-from stillmap.core.files import atomic_file, require_regular
+from stillmap.core.files import atomic_file
+from stillmap.core.input_files import read_bytes
 from stillmap.mesh.texture.atlas import GRAY, TexturedMesh
 from stillmap.mesh.triangle_mesh import Mesh
 
@@ -228,10 +229,7 @@ def read_glb(path: Path, most: int) -> bytes:
     Raises:
         InputError: it is missing, too large, damaged, or refers to other files.
     """
-    require_regular(path)
-    if path.stat().st_size > most:
-        raise InputError(f"is larger than {most >> 20} MiB", where=str(path))
-    data = path.read_bytes()
+    data = read_bytes(path, most)
     try:
         document = _document(data)
     except (ValueError, RecursionError, struct.error) as error:

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays
-from stillmap.core.arrays import open_npy, write_npy
+from stillmap.core.array_files import open_npy
+from stillmap.core.arrays import write_npy
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.errors import InputError
-from stillmap.core.files import read_text
+from stillmap.core.input_files import read_text
 from stillmap.io.trajectory import pose_rows, poses_from_rows
 from stillmap.slam import PoseGraph
 from stillmap.slam.pose_graph import Constraint

@@ -1,6 +1,5 @@
 """A result folder read again, beside the recording that it was made from."""
 
-import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.array_files import read_npz
 from stillmap.core.errors import InputError
 from stillmap.core.extras import install_command
-from stillmap.core.files import require_regular
 from stillmap.core.grid_map import GridMap
+from stillmap.core.json import read_json
 from stillmap.core.short_repr import ShortRepr
 from stillmap.results.labels import shape_text
 
@@ -49,6 +49,8 @@ class Grid(GridMap):
 
 
 SESSIONS = "sessions.json"  # every place has it
+_MAX_ORIGIN = 1e9  # m, farther than any map projection has
+_MIN_RESOLUTION, _MAX_RESOLUTION = 1e-4, 1e3  # m
 _MAX_MAP = 1 << 29  # bytes of a map when it is unpacked: a thousand times what they take packed
 
 
@@ -144,23 +146,14 @@ def read_crossings(result: Path) -> Crossings:
 
 def _read_layer(path: Path, name: str) -> tuple[NDArray[Any], Origin, float]:
     """A layer of a map, the origin (x, y, yaw) of its lower-left corner, and its resolution."""
-    require_regular(path)
+    layer, origin, edge = read_npz(path, (name, "origin", "resolution"), _MAX_MAP).values()
     try:
-        # opened here: given a path, np.load leaves a damaged archive open
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            size = archive.zip.getinfo(f"{name}.npy").file_size
-            if size > _MAX_MAP:
-                raise InputError(f"is too large: {size >> 20} MiB when unpacked", where=str(path))
-            layer = np.asarray(archive[name])
-            x, y, yaw = (float(value) for value in archive["origin"])
-            resolution = float(archive["resolution"])
-    except InputError:
-        raise
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror or error}", where=str(path)) from error
-    except Exception as error:  # whatever NumPy, zip and zlib make of damaged bytes
+        x, y, yaw = (float(value) for value in origin)
+        resolution = float(edge)
+    except (TypeError, ValueError) as error:
         raise InputError(f"is damaged: {error}", where=str(path)) from error
-    if not (np.isfinite((x, y, yaw)).all() and 0 < resolution < np.inf):
+    inside = np.abs((x, y, yaw)) < _MAX_ORIGIN
+    if not (inside.all() and _MIN_RESOLUTION < resolution < _MAX_RESOLUTION):
         raise InputError("origin or resolution is no usable number", where=str(path))
     return layer, (x, y, yaw), resolution
 
@@ -170,6 +163,7 @@ def moved(T: Float, points: Float) -> Float:
 
 
 _MAX_OBJECTS = 256 << 20  # bytes of an objects.json
+_MAX_ID = 2**31 - 1  # as messages of ROS hold it
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,16 +199,11 @@ def read_tracks(path: Path) -> list[Track]:
     Raises:
         InputError: the file is damaged.
     """
-    try:
-        require_regular(path)
-        if path.stat().st_size > _MAX_OBJECTS:
-            raise InputError("is no list of objects: too large", where=str(path))
-        return [_track(one) for one in json.loads(path.read_text(encoding="utf-8"))]
-    except FileNotFoundError:
+    if not os.path.lexists(path):
         return []
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
-    except (ValueError, TypeError, KeyError, RecursionError, OverflowError) as error:
+    try:
+        return [_track(one) for one in read_json(path, _MAX_OBJECTS)]
+    except (ValueError, TypeError, KeyError, OverflowError) as error:
         raise InputError(f"is damaged: {error!r}", where=str(path)) from error
 
 
@@ -231,6 +220,8 @@ def _track(one: dict[str, Any]) -> Track:
         raise ValueError("columns of unequal length")
     if not np.isfinite([*numbers.ravel(), *size, *([] if z is None else z)]).all():
         raise ValueError("a number is not finite")
+    if not 0 <= int(one["id"]) <= _MAX_ID:
+        raise ValueError(f"an id of {one['id']}")
     beams = None if one.get("beams") is None else int(one["beams"])
     p_dynamic = None if one.get("p_dynamic") is None else float(one["p_dynamic"])
     xy, velocity, session = numbers[:, :2], numbers[:, 2:], str(one.get("session", ""))

@@ -1,13 +1,12 @@
 """The `run.json` of a result folder read again: options, quality and what was mapped."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 from stillmap.core import config
 from stillmap.core.errors import InputError
-from stillmap.core.files import read_text, require_regular
+from stillmap.core.json import read_json
 from stillmap.core.output_place import require_finished
 from stillmap.core.region import Region
 from stillmap.core.short_repr import ShortRepr
@@ -155,14 +154,7 @@ def read_record(result: Path) -> dict[str, Any]:
     """
     path = result / RECORD
     require_finished(result)
-    try:
-        require_regular(path)
-        record = json.loads(read_text(path, _MAX_RUN))
-    except InputError as error:
-        hint = "a result is what `stillmap map` wrote"
-        raise InputError(error.what, where=error.where, hint=hint) from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"is not JSON: {error}", where=str(path)) from error
+    record = read_json(path, _MAX_RUN, "a result is what `stillmap map` wrote")
     if not isinstance(record, dict) or not isinstance(record.get("input"), dict):
         raise InputError("is no record of a run: no input named", where=str(path))
     return record

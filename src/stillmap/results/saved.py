@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_folder
+from stillmap.core.input_files import copy_file
 from stillmap.core.recording import Recording
 from stillmap.io.trajectory import read_tum
 from stillmap.pipeline.options import Options
@@ -132,7 +133,7 @@ class SavedResult(Result):
         if self.path.resolve() in (target.resolve(), *target.resolve().parents):
             raise InputError("is the result itself, or inside", where=str(target))
         with atomic_folder(target, RECORD, overwrite) as folder:
-            shutil.copytree(self.path, folder, dirs_exist_ok=True)
+            shutil.copytree(self.path, folder, dirs_exist_ok=True, copy_function=copy_file)
 
 
 def load(

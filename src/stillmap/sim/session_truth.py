@@ -1,6 +1,5 @@
 """The truth about sessions: where each began, what stood where, what changed when."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.errors import InputError
+from stillmap.core.json import read_json
 from stillmap.sim.furniture import ObjectKind, Place, StandingObject
 from stillmap.sim.objects import place_faces
 from stillmap.sim.options import HeightOptions
@@ -159,11 +159,10 @@ def load_session_truth(folder: str | Path) -> SessionTruth:
     if not path.is_file():
         hint = "a folder of sessions that 'stillmap simulate' wrote"
         raise InputError("holds no truth about sessions", where=str(folder), hint=hint)
-    if path.stat().st_size > _MAX_BYTES:
-        raise InputError("is too large for a truth about sessions", where=str(path))
+    tree = read_json(path, _MAX_BYTES)
     try:
-        return _parse(Path(folder), json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, KeyError, TypeError, IndexError, RecursionError) as error:
+        return _parse(Path(folder), tree)
+    except (ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError) as error:
         raise InputError(f"is damaged: {error!r}", where=str(path)) from error
 
 

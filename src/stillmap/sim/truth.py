@@ -5,13 +5,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.arrays import open_npy, write_npy, write_npz
+from stillmap.core.array_files import open_npy, read_npz
+from stillmap.core.arrays import write_npy, write_npz
 from stillmap.core.errors import InputError
+from stillmap.core.json import read_json
 from stillmap.io.images import read_image
 from stillmap.io.trajectory import write_tum
 from stillmap.sim.geometry import Faces, Float, Ground, Solids
@@ -21,6 +22,7 @@ FOLDER = "truth"
 IMAGES = "images"  # in it
 _STANDING, _MOVING, _POSE = "standing.npz", "moving.npz", "moving_pose.npy"
 _CAMERAS = "T_world_camera.npy"
+_MAX_SCENE, _MAX_ARRAY = 64 << 20, 1 << 31  # bytes of the file, of an unpacked array
 _SCENE = "scene.json"
 _ARRAYS = ("static", "mover", "T_world_base", "walls", "movers")
 _LASTING = "lasting"  # only where there are any
@@ -84,8 +86,8 @@ def load_truth(path: str | Path) -> Truth:
     names = (*_ARRAYS, *optional)
     try:
         arrays = {name: np.array(open_npy(folder / f"{name}.npy")) for name in names}
-        return Truth(**arrays, scene=json.loads((folder / _SCENE).read_text(encoding="utf-8")))
-    except (OSError, ValueError, EOFError) as error:
+        return Truth(**arrays, scene=read_json(folder / _SCENE, _MAX_SCENE))
+    except (TypeError, ValueError) as error:
         raise InputError(f"is damaged: {error}", where=str(folder)) from error
 
 
@@ -146,7 +148,7 @@ def load_image_truth(path: str | Path) -> ImageTruth:
         parts = Solids(open_npy(folder / _POSE), *(moves[name] for name in Solids._fields[1:]))
         moving = MovingSurfaces(moves["stamp_ns"], parts)
         T_world_camera = np.array(open_npy(folder / _CAMERAS))
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+    except (TypeError, ValueError, KeyError, OverflowError) as error:
         raise InputError(f"is damaged: {error}", where=str(folder)) from error
     standing = StaticSurfaces(faces, solids, ground, None if np.isnan(ceiling) else ceiling)
 
@@ -181,5 +183,4 @@ def image_files(folder: Path, image: int) -> tuple[Path, Path]:
 
 
 def _arrays(path: Path) -> dict[str, NDArray[Any]]:
-    with np.load(path, allow_pickle=False) as archive:
-        return dict(archive)
+    return read_npz(path, None, _MAX_ARRAY)

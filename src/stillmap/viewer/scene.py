@@ -1,6 +1,5 @@
 """The content of a result folder as arrays, subsampled to what a browser can draw."""
 
-import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from stillmap.core.errors import InputError
-from stillmap.core.files import read_text
+from stillmap.core.json import read_json
 from stillmap.core.se2 import inverse
 from stillmap.io.trajectory import read_tum
 from stillmap.pipeline.snapshots import Window
@@ -216,10 +215,10 @@ def _model(path: Path, track: Track, max_bytes: int) -> Model:
     data = gltf.read_glb(path, max_bytes)
     record_path = path.with_suffix(".json")
     try:
-        record = json.loads(read_text(record_path, _MAX_RECORD))
+        record = read_json(record_path, _MAX_RECORD)
         T = np.array(record["T_map_object"], np.float64).reshape(4, 4)
         stamp_ns = int(record["stamp_ns"])
-    except (ValueError, TypeError, KeyError, RecursionError, OverflowError) as error:
+    except (ValueError, TypeError, KeyError, OverflowError) as error:
         raise InputError(f"is damaged: {error!r}", where=str(record_path)) from error
     if not np.isfinite(T).all() or not math.isclose(np.linalg.det(T), 1.0, abs_tol=1e-3):
         raise InputError("T_map_object is not a pose", where=str(record_path))

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from stillmap.core.errors import InputError
+from stillmap.core.input_files import InputFile
 from stillmap.io.text_lines import read_lines
 
 _BLOCK = 1 << 18  # points read at once
@@ -129,12 +130,12 @@ def record_dtype(columns: Mapping[str, tuple[DTypeLike, int]], size: int) -> np.
 def _read_records(layout: TableLayout, wanted: Sequence[str]) -> Iterator[list[NDArray[Any]]]:
     check_record_size(layout)
     columns = [layout.find_column(name) for name in wanted]
-    available = (layout.path.stat().st_size - layout.start) // layout.record
-    if available < layout.rows:
-        raise truncated_error(layout.path, max(available, 0), layout.rows)
     by_name = {str(i): (field.dtype, byte) for i, (field, byte, _) in enumerate(columns)}
     dtype = record_dtype(by_name, layout.record)
-    with layout.path.open("rb") as file:
+    with InputFile(layout.path) as file:
+        available = (file.size - layout.start) // layout.record
+        if available < layout.rows:
+            raise truncated_error(layout.path, max(available, 0), layout.rows)
         file.seek(layout.start)
         for first in range(0, layout.rows, _BLOCK):
             n = min(_BLOCK, layout.rows - first)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.errors import InputError, MissingExtra, import_extra
+from stillmap.core.input_files import InputFile
 from stillmap.core.recording import Recording
 from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud.binary_table import truncated_error
@@ -29,7 +30,13 @@ _BLOCK = 1 << 14  # points read at once; libe57 keeps the buffers where packets 
 _PAGE, _CHECKSUM = 1024, 4  # bytes
 _MAX_XML = 16 << 20  # bytes: parsed by libe57 it takes fifty times as much memory
 _MAX_DEPTH = 100  # nested elements: the time of libe57 grows with the square
-_NO_TAGS = re.compile(rb"<!\[CDATA\[.*?\]\]>|<!--.*?-->|<\?.*?\?>", re.DOTALL)
+# what begins with "<"; possessive quantifiers: a failure costs one pass, and is the last
+_MARKUP = re.compile(
+    rb"(?P<other><!--.*?-->|<!\[CDATA\[.*?\]\]>|<\?.*?\?>)"
+    rb"|(?P<tag><[^<>\"'!?][^<>\"']*+(?:\"[^\"]*+\"[^<>\"']*+|'[^']*+'[^<>\"']*+)*+>)",
+    re.DOTALL,
+)
+_SCHEMA = b"chemaLocation"  # of a namespace, or without one: libe57 would fetch it from anywhere
 _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 GPS_EPOCH_S = 315_964_800  # 6 January 1980 since 1970, without leap seconds
@@ -91,16 +98,17 @@ def open_e57(path: Path) -> Iterator[tuple[Any, Any]]:
 
 
 def _check_xml(path: Path) -> None:
-    """Refuse XML sections with entities (which expand without limit), deep nesting or huge size.
+    """Refuse XML sections with entities (which expand without limit), schemas elsewhere, deep
+    nesting or huge size.
 
     Page checksums are removed first, so that they cannot hide a tag.
     """
-    with path.open("rb") as file:
+    with InputFile(path) as file:
         head = file.read(48)
         start, length = (int.from_bytes(head[at : at + 8], "little") for at in (24, 32))
         if len(head) < 48 or head[:8] != E57_MAGIC:
             raise InputError("is no E57 file", where=str(path))
-        if length > _MAX_XML or start > path.stat().st_size:
+        if length > _MAX_XML or start > file.size:
             raise InputError("is damaged: its XML section", where=str(path))
         first = start // _PAGE * _PAGE
         file.seek(first)
@@ -112,20 +120,30 @@ def _check_xml(path: Path) -> None:
         raise InputError("is damaged: its XML section is not UTF-8", where=str(path))
     if b"<!DOCTYPE" in text:
         raise InputError("is refused: its XML section defines entities", where=str(path))
-    if _nesting_depth(text) > _MAX_DEPTH:
-        raise InputError("is refused: its XML section is nested too deeply", where=str(path))
+    depth = 0
+    for tag in _iter_tags(text, path):
+        if _SCHEMA in tag:
+            raise InputError("is refused: its XML section names a schema to fetch", where=str(path))
+        depth += -1 if tag.startswith(b"</") else not tag.endswith(b"/>")
+        if depth > _MAX_DEPTH:
+            raise InputError("is refused: its XML section is nested too deeply", where=str(path))
 
 
-def _nesting_depth(xml: bytes) -> int:
-    """Maximum nesting depth of elements."""
-    depth = deepest = 0
-    for tag in re.finditer(rb"<(/?)[^<>]*?(/?)>", _NO_TAGS.sub(b"", xml)):
-        if tag[1]:
-            depth -= 1
-        elif not tag[2]:
-            depth += 1
-            deepest = max(deepest, depth)
-    return deepest
+def _iter_tags(xml: bytes, path: Path) -> Iterator[bytes]:
+    """The tags of elements, in one pass.
+
+    Raises:
+        InputError: a tag, comment, CDATA section or instruction does not end.
+    """
+    at = 0
+    while (at := xml.find(b"<", at)) >= 0:
+        found = _MARKUP.match(xml, at)
+        if found is None:
+            what = f"is damaged: byte {at} of its XML section begins what does not end"
+            raise InputError(what, where=str(path))
+        at = found.end()
+        if found["tag"]:
+            yield found["tag"]
 
 
 def _count_scans(path: Path) -> int:

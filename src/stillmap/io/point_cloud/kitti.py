@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_folder
+from stillmap.core.input_files import read_bytes
 from stillmap.core.recording import Recording
 from stillmap.core.timestamps import format_seconds
 from stillmap.io.builder import ReadContext, part_context
@@ -116,6 +117,7 @@ def _read_oxts(folder: Path) -> Poses:
 MARKER = "times.txt"  # only folders with this file are overwritten
 
 RECORD = 16  # bytes of a point: float32 x y z reflectance
+MAX_SCAN = 4 << 30  # bytes of a file
 
 _RAW = Path("velodyne_points/data")
 
@@ -208,10 +210,10 @@ def _read_untimed(path: Path, context: ReadContext) -> Recording:
 
 def _read_scan(path: Path, T: NDArray[np.float64] | None) -> Cloud:
     require_nonempty_file(path)
-    size = path.stat().st_size
-    if size % RECORD:
-        raise truncated_error(path, size // RECORD, size // RECORD + 1)
-    return Cloud(np.fromfile(path, "<f4").reshape(-1, 4)[:, :3], T)
+    content = read_bytes(path, MAX_SCAN)
+    if len(content) % RECORD:
+        raise truncated_error(path, len(content) // RECORD, len(content) // RECORD + 1)
+    return Cloud(np.frombuffer(content, "<f4").reshape(-1, 4)[:, :3], T)
 
 
 def write(recording: Recording, path: str | Path, *, overwrite: bool = False) -> None:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from stillmap.core import se2
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
+from stillmap.core.input_files import InputFile
 from stillmap.io import cameras, images
 from stillmap.io.rigid_transforms import pose_from_row, rigid_transform
 from stillmap.io.scan_files import assign_rows, list_files, read_times
@@ -104,11 +105,8 @@ def _to_projection(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _read_entries(path: Path) -> dict[str, NDArray[np.float64]]:
     """Numbers by the key before the colon; other lines are skipped."""
-    try:
-        with path.open("rb") as file:
-            text = file.read(_MAX_BYTES).decode("ascii", "replace")
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
+    with InputFile(path) as file:
+        text = file.read(_MAX_BYTES).decode("ascii", "replace")
     out = {}
     for line in text.splitlines():
         name, _, numbers = line.partition(":")

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.errors import InputError, import_extra
 from stillmap.core.files import atomic_file
+from stillmap.core.input_files import InputFile
 from stillmap.core.recording import Recording
 from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud.binary_table import truncated_error
@@ -64,10 +65,11 @@ def open_las_reader(path: Path) -> Iterator[Any]:
     laspy = import_extra("laspy", path)
     # single-threaded: the parallel backend trusts chunk sizes
     backend = laspy.LazBackend.Lazrs
-    with library_errors(path):
-        reader = laspy.open(path, read_evlrs=False, laz_backend=backend)
-    with closing(reader):
-        yield reader
+    with InputFile(path) as file:
+        with library_errors(path):
+            reader = laspy.open(file, closefd=False, read_evlrs=False, laz_backend=backend)
+        with closing(reader):
+            yield reader
 
 
 def iter_blocks(reader: Any, path: Path) -> Iterator[Any]:
@@ -96,9 +98,8 @@ def _check_header(path: Path) -> None:
     Raises:
         InputError: the header is invalid, or lazrs is missing.
     """
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        head = file.read(_HEADER)
+    with InputFile(path) as file:
+        size, head = file.size, file.read(_HEADER)
         if len(head) < _HEADER or head[:4] != LAS_MAGIC:
             raise InputError("is no LAS file", where=str(path))
         header_size, start, extras, kind = struct.unpack_from("<HIIB", head, 94)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from stillmap.core import se2
 from stillmap.core.errors import InputError, import_extra
 from stillmap.core.files import atomic_folder
+from stillmap.core.input_files import InputFile
 from stillmap.core.recording import Recording
 from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud.binary_table import (
@@ -57,7 +58,7 @@ def read_header(path: Path) -> PcdHeader:
         InputError: it is missing, truncated or invalid.
     """
     require_nonempty_file(path)
-    with path.open("rb") as file:
+    with InputFile(path) as file:
         head = file.read(MAX_PCD_HEADER)
     if not is_pcd(head):
         raise InputError("is no PCD file", where=str(path))
@@ -142,7 +143,7 @@ def unpack_columns(layout: TableLayout) -> bytes:
     if size > _MAX_UNPACKED:
         what = f"is too large: more than {_MAX_UNPACKED >> 20} MiB when unpacked"
         raise InputError(what, where=str(path))
-    with path.open("rb") as file:
+    with InputFile(path) as file:
         file.seek(layout.start)
         sizes = file.read(8)
         packed_size, unpacked_size = struct.unpack("<II", sizes) if len(sizes) == 8 else (0, 0)

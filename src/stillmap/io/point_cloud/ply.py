@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_file
+from stillmap.core.input_files import InputFile
 from stillmap.core.recording import Recording
 from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud.binary_table import Field, TableLayout, read_columns, split_header
@@ -65,7 +66,7 @@ def read_header(path: Path) -> PlyHeader:
         InputError: it is no PLY file, or its vertices cannot be located.
     """
     require_nonempty_file(path)
-    with path.open("rb") as file:
+    with InputFile(path) as file:
         head = file.read(_MAX_HEADER)
     lines, start = split_header(path, head, lambda words: words == ["end_header"])
     if lines[0] != ["ply"]:

@@ -13,6 +13,7 @@ import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
 
 from stillmap.core.errors import InputError
+from stillmap.core.input_files import InputFile
 from stillmap.core.recording import Recording
 from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud.binary_table import iter_text_lines, parse_numbers
@@ -97,11 +98,11 @@ def _read_pose(path: Path) -> NDArray[np.float64] | None:
     try:
         if not file.is_file():
             return None
-        with file.open("rb") as opened:
+        with InputFile(file) as opened:
             words = opened.read(_MAX_POSE).split()
         numbers = np.array([float(word) for word in words[:6]])
         position, angles = numbers.reshape(2, 3)
         R = scipy.spatial.transform.Rotation.from_euler("XYZ", angles, degrees=True).as_matrix()
         return rigid_transform(_AXES @ R @ _AXES.T, _METRES * _AXES @ position)
-    except (OSError, ValueError):
+    except (InputError, OSError, ValueError):
         return None

@@ -8,7 +8,7 @@ from pathlib import Path
 import yaml
 
 from stillmap.core.errors import InputError
-from stillmap.core.files import require_regular
+from stillmap.core.input_files import InputFile, read_text
 from stillmap.io.builder import SkippedRecords
 from stillmap.io.parts.repeats import RepeatFilter
 from stillmap.io.ros import damaged_bag, indexed_bag
@@ -89,12 +89,8 @@ def bag_size(path: Path) -> int:
 
 
 def _open_file(path: Path, scratch: Path | None, trusted: bool) -> Bag:
-    require_regular(path)
-    try:
-        with path.open("rb") as file:
-            start = file.read(32)
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
+    with InputFile(path) as file:
+        start = file.read(32)
     if is_compressed(path, start):
         return _CompressedBag(path, scratch, trusted)
     for magic, (kind, open_indexed, scan) in _STORAGES.items():
@@ -120,13 +116,11 @@ def _list_files(folder: Path) -> list[Path]:
     """The files of a ROS 2 folder in the order of `metadata.yaml`, if there is one."""
     present = storage_files(folder)
     try:
-        file = folder / "metadata.yaml"
-        usable = file.is_file() and file.stat().st_size <= _MAX_METADATA
-        text = file.read_text("utf-8") if usable else ""
-        names = yaml.safe_load(text)["rosbag2_bagfile_information"]["relative_file_paths"]
+        about = yaml.safe_load(read_text(folder / "metadata.yaml", _MAX_METADATA))
+        names = about["rosbag2_bagfile_information"]["relative_file_paths"]
         # YAML aliases can nest lists without end
         paths = [folder / Path(name).name for name in names if isinstance(name, str)]
-    except (OSError, ValueError, LookupError, TypeError, RecursionError, yaml.YAMLError):
+    except (InputError, ValueError, LookupError, TypeError, RecursionError, yaml.YAMLError):
         return present
     missing = [path.name for path in paths if path not in present]
     if missing:
@@ -209,9 +203,9 @@ class _CompressedBag:
 
 def _decompress(path: Path, out: Path) -> bool:
     """Decompress a file; False if the stream is damaged, so that only its beginning is there."""
-    limit = max(_MAX_RATIO * path.stat().st_size, _MIN_LIMIT)
     written = 0
-    with path.open("rb") as compressed, open_zstd(compressed) as stream, out.open("wb") as file:
+    with InputFile(path) as compressed, open_zstd(compressed) as stream, out.open("wb") as file:
+        limit = max(_MAX_RATIO * compressed.size, _MIN_LIMIT)
         try:
             while piece := stream.read(_PIECE):
                 written += len(piece)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
 
 from stillmap.core.errors import InputError
+from stillmap.core.input_files import InputFile
 from stillmap.io.builder import SkippedRecords
 
 BagKind = Literal["bag", "ros2", "db3", "mcap"]
@@ -108,7 +109,7 @@ def detect_kind(path: Path) -> tuple[BagKind, bool]:
     """The kind of a bag, and whether it stores messages as MCAP."""
     if path.is_dir():
         return "ros2", any(".mcap" in file.name for file in storage_files(path))
-    with path.open("rb") as file:
+    with InputFile(path) as file:
         start = file.read(len(DB3_MAGIC))
     if start.startswith(BAG1_MAGIC):
         return "bag", False

@@ -18,6 +18,7 @@ from typing import IO, Any
 from rosbags.rosbag1.reader import Header, RecordType, normalize
 from rosbags.typesys.msg import normalize_msgtype
 
+from stillmap.core.input_files import InputFile, ShorterFileError
 from stillmap.io.builder import SkippedRecords
 from stillmap.io.ros import limits
 from stillmap.io.ros.bag_types import MAX_STAMP_NS, Channel, Message
@@ -61,7 +62,7 @@ class DamagedBag:
 
 def scan_bag1(path: Path, found: dict[int, Channel], damage: SkippedRecords) -> Records:
     """Records of a ROS 1 bag."""
-    with path.open("rb") as file:
+    with InputFile(path) as file:
         file.readline(64)  # #ROSBAG V2.0
         yield from _until_cut(file, damage, _bag1_records(file, found, damage))
 
@@ -105,7 +106,7 @@ def _bag1_channel(header: Header, data: bytes) -> Channel:
 
 def scan_mcap(path: Path, found: dict[int, Channel], damage: SkippedRecords) -> Records:
     """Records of an MCAP file."""
-    with path.open("rb") as file:
+    with InputFile(path) as file:
         file.read(8)  # magic
         yield from _until_cut(file, damage, _mcap_records(file, {}, found, damage))
 
@@ -169,7 +170,7 @@ def _chunk_records(
     try:
         compression, data = read()
         raw = data if compression in ("", "none") else limits.decompress(compression, data)
-    except limits.OutputLimitError:
+    except (limits.OutputLimitError, ShorterFileError):
         raise
     except Exception:  # any error of a library about damaged bytes
         damage.add(BAD_CHUNK, at)
@@ -204,7 +205,7 @@ def _until_cut(
     """Records up to the first invalid one; `at` is the position of the enclosing chunk."""
     try:
         yield from records
-    except limits.OutputLimitError:
+    except (limits.OutputLimitError, ShorterFileError):
         raise
     except Exception:  # any error of a library about damaged bytes
         damage.add(CUT, file.tell() if at is None else at)

@@ -13,6 +13,7 @@ from rosbags.rosbag2 import storage_mcap, storage_sqlite3
 from rosbags.rosbag2.metadata import parse_qos
 
 from stillmap.core.errors import InputError
+from stillmap.core.input_files import InputPath
 from stillmap.io.builder import SkippedRecords
 from stillmap.io.ros import limits
 from stillmap.io.ros.bag_types import MAX_STAMP_NS, Channel, DamagedBagError, Message
@@ -120,14 +121,14 @@ class IndexedBag:
 
 def open_bag1(path: Path) -> Any:
     """Open the reader of a ROS 1 bag. Any error of rosbags means damage; likewise below."""
-    reader = _Bag1Reader(path)
+    reader = _Bag1Reader(InputPath(path))
     reader.open()
     return reader
 
 
 def open_mcap(path: Path) -> Any:
     """Open the reader of an MCAP file of ROS 2."""
-    reader = storage_mcap.McapReader(path)
+    reader = storage_mcap.McapReader(InputPath(path))
     reader.open()
     return reader
 

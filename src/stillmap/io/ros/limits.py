@@ -20,6 +20,7 @@ import apsw
 import lz4.frame  # type: ignore[import-untyped]
 
 from stillmap.core.errors import InputError
+from stillmap.core.input_files import require_regular
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -101,7 +102,7 @@ def decompress(compression: str, data: bytes) -> bytes:
 
 def database_path(path: Path) -> str:
     """The path quoted for a SQLite URI, in which ?, # and % have a meaning."""
-    return quote(os.fsencode(path.resolve()))
+    return quote(os.path.realpath(os.fsencode(path)))
 
 
 def open_database(path: Path) -> sqlite3.Connection:
@@ -111,6 +112,7 @@ def open_database(path: Path) -> sqlite3.Connection:
         sqlite3.Error: it cannot be read.
         InputError: see `_require_plain_tables`.
     """
+    require_regular(path)
     database = sqlite3.connect(f"file:{database_path(path)}?immutable=1&mode=ro", uri=True)
     try:
         database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_CHUNK)

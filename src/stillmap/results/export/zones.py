@@ -1,6 +1,5 @@
 """Zones of a map as polygons in a GeoJSON file (RFC 7946), in metres in the map frame."""
 
-import json
 import math
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
@@ -9,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.errors import InputError, closest_match
-from stillmap.core.files import read_text, require_regular
+from stillmap.core.json import read_json
 
 Float = NDArray[np.float64]
 Action = Literal["erase", "block", "keepout", "speed"]
@@ -79,11 +78,7 @@ def read_zones(path: Path) -> list[Zone]:
     Raises:
         InputError: names the file and the feature that is at fault.
     """
-    require_regular(path)
-    try:
-        content = json.loads(read_text(path, _MAX_BYTES))
-    except (ValueError, RecursionError) as error:  # JSON or UTF-8
-        raise InputError(f"is no GeoJSON: {error}", where=str(path)) from error
+    content = read_json(path, _MAX_BYTES)
     features = content.get("features") if isinstance(content, dict) else None
     if not isinstance(features, list) or content.get("type") != "FeatureCollection":
         raise InputError("is no GeoJSON FeatureCollection", where=str(path))

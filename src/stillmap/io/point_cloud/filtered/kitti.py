@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from stillmap.core.input_files import read_bytes
 from stillmap.io.filtered_copy import FilterJob, Mask, Omissions, require_rows, write_files
 from stillmap.io.point_cloud import kitti
 
@@ -37,6 +38,6 @@ def _filter_file(path: Path, new: Path, masks: list[Mask | None], source: Path) 
 
 def _copy_rows(path: Path, new: Path, mask: Mask, size: int) -> None:
     """Copy a file of rows of `size` bytes without those of a mask."""
-    rows = np.fromfile(path, np.uint8)
+    rows = np.frombuffer(read_bytes(path, kitti.MAX_SCAN), np.uint8)
     require_rows(mask, len(rows) // size, path)
     new.write_bytes(rows.reshape(-1, size)[~mask].data)

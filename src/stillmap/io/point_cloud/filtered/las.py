@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.errors import InputError, import_extra
+from stillmap.core.input_files import InputFile
 from stillmap.io.filtered_copy import FilterJob, Mask, Omissions, require_rows, write_files
 from stillmap.io.point_cloud import las
 from stillmap.io.point_cloud.scans import files_of
@@ -63,7 +64,7 @@ def write_filtered(job: FilterJob) -> Omissions:
 def _filter_file(path: Path, new: Path, masks: list[Mask | None]) -> None:
     mask, statistics = masks[0], _Statistics()
     assert mask is not None
-    with las.open_las_reader(path) as reader, path.open("rb") as source, new.open("w+b") as target:
+    with las.open_las_reader(path) as reader, InputFile(path) as source, new.open("w+b") as target:
         require_rows(mask, reader.header.point_count, path)
         sections = _find_sections(reader, path)
         target.write(source.read(sections.points))

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from stillmap.core.errors import import_extra
+from stillmap.core.input_files import InputFile
 from stillmap.io.filtered_copy import FilterJob, Mask, Omissions, require_rows, write_files
 from stillmap.io.point_cloud import pcd
 from stillmap.io.point_cloud.binary_table import TableLayout
@@ -65,7 +66,7 @@ def _write_compressed(
     if data:
         # room for more bytes than LZF makes of any data: else it refuses what it cannot shorten
         packed = lzf.compress(data, len(data) + len(data) // 8 + 64)
-    with layout.path.open("rb") as source, new.open("wb") as target:
+    with InputFile(layout.path) as source, new.open("wb") as target:
         table.write_header(source, target, layout, edit_line)
         target.write(struct.pack("<II", len(packed), len(data)) + packed)
         size = int.from_bytes(source.read(8)[:4], "little")

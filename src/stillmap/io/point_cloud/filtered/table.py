@@ -9,6 +9,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.input_files import InputFile
 from stillmap.io.filtered_copy import Mask, require_rows
 from stillmap.io.point_cloud.binary_table import (
     Field,
@@ -40,7 +41,7 @@ def write_table(
         InputError: the file has another number of points, or is damaged.
     """
     require_rows(mask, layout.rows, layout.path)
-    with layout.path.open("rb") as source, new.open("wb") as target:
+    with InputFile(layout.path) as source, new.open("wb") as target:
         write_header(source, target, layout, edit_header_line)
         copy = _copy_lines if layout.text else _copy_records
         copy(source, target, layout, mask, keep)

@@ -1,12 +1,12 @@
 """Filtered copies of 3DTK scans."""
 
-import shutil
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from stillmap.core.files import atomic_file, require_new_file
+from stillmap.core.input_files import copy_content
 from stillmap.io.filtered_copy import FilterJob, Mask, Omissions, require_rows, write_files
 from stillmap.io.point_cloud import threedtk
 from stillmap.io.point_cloud.binary_table import is_blank
@@ -33,7 +33,7 @@ def write_filtered(job: FilterJob) -> Omissions:
         return write_files(job, files, filter_file)
     require_new_file(new_pose, job.overwrite)
     with atomic_file(new_pose) as work:
-        shutil.copyfile(pose, work)
+        copy_content(pose, work)
         return write_files(job, files, filter_file)
 
 

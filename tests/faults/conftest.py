@@ -1,0 +1,28 @@
+"""What all tests of faults share: modules beside them, and an end in time."""
+
+import signal
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+sys.path.append(str(Path(__file__).resolve().parent))
+
+_PATIENCE = 60  # s
+
+
+class Stuck(BaseException):
+    """A command does not end."""
+
+
+@pytest.fixture(autouse=True)
+def end_in_time() -> Iterator[None]:
+    def stop(*_: object) -> None:
+        raise Stuck
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.alarm(_PATIENCE)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)

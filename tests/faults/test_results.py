@@ -1,0 +1,307 @@
+"""Results, places and truths with every fault; and checkpoints: see `test_readers`."""
+
+import json
+import os
+import shutil
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+for needed in ("pye57", "laspy", "lazrs", "lzf"):  # of other inputs
+    pytest.importorskip(needed)
+
+from faulty_inputs import Reader  # noqa: E402
+from file_faults import BEFORE, MEANWHILE, be_one_of_many, be_pipe, run, while_read  # noqa: E402
+from marks import slow_params  # noqa: E402
+
+import stillmap  # noqa: E402
+from stillmap.cli.main import main  # noqa: E402
+from stillmap.core.errors import InputError  # noqa: E402
+from stillmap.pipeline import result as result_module  # noqa: E402
+from stillmap.pipeline.em_loop import iterate  # noqa: E402
+
+ZONES = """{"type": "FeatureCollection", "features": [{"type": "Feature",
+"properties": {"action": "erase"}, "geometry": {"type": "Polygon",
+"coordinates": [[[0, 0], [1, 0], [1, 1], [0, 0]]]}}]}"""
+
+
+def to_bag(home: Path, output: Path) -> list[str]:
+    words = ["convert", f"{home}/map1", "--input", f"{home}/day1", "--quiet"]
+    return [*words, "-o", f"{output}.mcap"]
+
+
+def to_nav2(home: Path, output: Path) -> list[str]:
+    words = ["convert", f"{home}/map1", "--to", "nav2", "--quiet", "-o", str(output)]
+    return [*words, "--mask", f"{home}/zones.geojson", "--keepout-crossings", "9"]
+
+
+def score_labels(home: Path, output: Path) -> list[str]:  # noqa: ARG001
+    return ["eval", "labels", f"{home}/map1", f"{home}/day1"]
+
+
+def score_map(home: Path, output: Path) -> list[str]:  # noqa: ARG001
+    return ["eval", "map", f"{home}/map1", f"{home}/day1"]
+
+
+def place_to_nav2(home: Path, output: Path) -> list[str]:
+    return ["convert", f"{home}/place", "--to", "nav2", "--quiet", "-o", str(output)]
+
+
+def grow(home: Path, output: Path) -> list[str]:
+    words = ["merge", f"{home}/place", f"{home}/map3", "--quiet", "--threads", "1"]
+    return [*words, "-o", str(output)]
+
+
+def merge(home: Path, output: Path) -> list[str]:
+    words = ["merge", f"{home}/map1", f"{home}/map2", "--quiet", "--threads", "1"]
+    return [*words, "-o", str(output)]
+
+
+COMMANDS: dict[Callable[[Path, Path], list[str]], tuple[str, ...]] = {
+    to_bag: (
+        *("map1/run.json", "map1/map.npz", "map1/trajectory.tum", "map1/objects/objects.json"),
+        *(f"map1/beams/{name}.npy" for name in ("stamp_ns", "offset", "p_static", "hit")),
+    ),
+    to_nav2: ("zones.geojson", "map1/traffic.npz"),
+    score_labels: ("day1/truth/static.npy",),
+    score_map: ("day1/truth/walls.npy", "day1/truth/T_world_base.npy"),
+    place_to_nav2: ("place/run.json", "place/map.npz", "place/sessions.json"),
+    merge: ("map1/graph.g2o", "map1/objects/0000.ply", "map2/trajectory.tum"),
+    grow: (
+        *("place/run.json", "place/sessions.json", "place/ties.npz"),
+        *(
+            f"place/sessions/map1/{name}"
+            for name in (
+                *("run.json", "beams/hit.npy", "state/checksums.json", "state/evidence.npz"),
+                *("state/nodes.npy", "state/graph.g2o", "state/objects/objects.json"),
+                *("state/keyframes/recording.json", "state/keyframes/points.npy"),
+            )
+        ),
+    ),
+}
+QUICK = ("map1/trajectory.tum", "map1/beams/p_static.npy", "zones.geojson", "day1/truth/walls.npy")
+
+
+@pytest.fixture
+def home(flat_days: Path, flat_place: Path, tmp_path: Path) -> Path:
+    """A copy of the days, their results and their place."""
+    out = tmp_path / "in"
+    shutil.copytree(flat_days, out)
+    shutil.copytree(flat_place, out / "place")
+    (out / "zones.geojson").write_text(ZONES)
+    return out
+
+
+def rows(faults: tuple[Callable[..., None], ...]) -> list[object]:
+    return [
+        pytest.param(
+            Reader(victim, lambda home: home, victim, command),
+            fault,
+            id=f"{command.__name__}-{victim.replace('/', '-')}-{fault.__name__}",
+            marks=() if victim in QUICK and fault is not be_one_of_many else pytest.mark.slow,
+        )
+        for command, victims in COMMANDS.items()
+        for victim in victims
+        for fault in faults
+    ]
+
+
+@pytest.mark.parametrize(("reader", "fault"), rows(BEFORE))
+def test_fault_before(home, tmp_path, capsys, reader, fault):
+    fault(home / reader.victim)
+    run(reader, tmp_path, home, capsys)
+
+
+@pytest.mark.parametrize(("reader", "fault"), rows(MEANWHILE))
+def test_fault_meanwhile(home, tmp_path, capsys, monkeypatch, reader, fault):
+    while_read(monkeypatch, home / reader.victim, fault)
+    run(reader, tmp_path, home, capsys)
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda one: one.__name__)
+def test_without_fault(home, tmp_path, capsys, command):
+    assert main(command(home, tmp_path / "out")) == 0, capsys.readouterr().err
+
+
+# checkpoints
+
+MAP = ["--quiet", "--threads", "1", "--set", "em.max_iterations=3", "--set", "em.tolerance=0"]
+MAP += ["--set", "em.label_tolerance=0", "--set", "em.patience=9"]
+
+
+@pytest.fixture(scope="module")
+def interrupted(flat_days, tmp_path_factory) -> Path:
+    """A folder with the recording `day1` and the checkpoint of a run that was interrupted."""
+    out = tmp_path_factory.mktemp("interrupted")
+    shutil.copytree(flat_days / "day1", out / "day1")
+
+    def stop(*args, **how):
+        for number, iteration in enumerate(iterate(*args, **how)):
+            if number == 2:
+                raise KeyboardInterrupt
+            yield iteration
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(result_module, "iterate", stop)
+        assert main(["map", f"{out}/day1", "-o", f"{out}/out", *MAP]) == 130
+    return out
+
+
+def resume(folder: Path, capsys: pytest.CaptureFixture[str]) -> str:
+    """Go on, with the same recording, whatever the checkpoint holds; what is said."""
+    status = main(["map", f"{folder}/day1", "-o", f"{folder}/out", "--resume", *MAP])
+    said = capsys.readouterr().err
+    assert status in (0, 2), said
+    assert len(said.splitlines()) <= 1
+    assert (folder / "out").exists() == (status == 0)
+    assert sorted(os.listdir(folder)) == sorted(
+        ["day1", "out"] if status == 0 else ["day1", ".out.resume"]
+    )
+    return said
+
+
+@pytest.fixture
+def checkpoint(interrupted, tmp_path) -> Path:
+    shutil.copytree(interrupted, tmp_path / "in")
+    return tmp_path / "in" / ".out.resume" / "iteration-2"
+
+
+@pytest.mark.parametrize("name", ["state.json", "e-1.npy", "best.m_step.poses.npy"])
+@pytest.mark.parametrize(
+    "fault",
+    [
+        pytest.param(one, marks=() if one is be_pipe else pytest.mark.slow)
+        for one in BEFORE
+        if one is not be_one_of_many
+    ],
+)
+def test_checkpoint_with_fault(checkpoint, tmp_path, capsys, name, fault):
+    fault(checkpoint / name)
+    assert "starts anew" in resume(tmp_path / "in", capsys)
+
+
+def test_pipe_as_lock(checkpoint, tmp_path, capsys):
+    (checkpoint.parent / "lock").unlink()
+    os.mkfifo(checkpoint.parent / "lock")
+    assert main(["map", f"{tmp_path}/in/day1", "-o", f"{tmp_path}/in/out", *MAP]) == 2
+    assert "lock: is in the way: no regular file" in capsys.readouterr().err
+
+
+def rewrite(checkpoint: Path, change: Callable[[dict], object]) -> None:
+    """Change the state of a checkpoint; its checksum is right."""
+    path = checkpoint / "state.json"
+    state = json.loads(json.loads(path.read_text())["text"])
+    change(state)
+    text = json.dumps(state)
+    path.write_text(json.dumps({"crc32": zlib.crc32(text.encode()), "text": text}))
+
+
+def put_array(checkpoint: Path, name: str, array: np.ndarray) -> None:
+    """Another array in a checkpoint, with the right checksum."""
+    (checkpoint / f"{name}.npy").unlink()
+    np.save(checkpoint / f"{name}.npy", array)
+    about = {
+        "crc32": zlib.crc32(np.ascontiguousarray(array).tobytes()),
+        "shape": list(array.shape),
+        "dtype": array.dtype.str,
+    }
+    rewrite(checkpoint, lambda state: state["arrays"].update({name: about}))
+
+
+CHANGES = {
+    "no state": lambda state: state.update(state=[]),
+    "no number": lambda state: state["state"]["records"].update(number=["1", "2"]),
+    "other numbers": lambda state: state["state"]["records"].update(number=[1, 3]),
+    "nothing best": lambda state: state["state"].update(best=None),
+    "huge scan": lambda state: note(state, "widened", [2**70]),
+    "scan that is not there": lambda state: note(state, "widened", [5000]),
+    "text for scans": lambda state: note(state, "breaks", "abc"),
+    "no stretch": lambda state: note(state, "bare_stretches", [[1, 2]]),
+    "far window": lambda state: state["state"].update(window=[0, 0, 1e300, 1e300]),
+    "unknown array": lambda state: state["state"]["best"].update(weights="e-9"),
+    "another array": lambda state: state["state"]["best"].update(weights="best.m_step.poses"),
+    "array out of the folder": lambda state: state["arrays"].update({"../x": {}}),
+    "no arrays": lambda state: state.update(arrays=3),
+    "no identity": lambda state: state.update(identity=None),
+    "no stages": lambda state: state.update(stages={"read": 3}),
+    "no time": lambda state: state["stages"]["m_step"].update(seconds=float("nan")),
+    "no source": lambda state: state["state"]["records"].update(source=["", "\0"]),
+}
+
+
+QUICK_CHANGES = ("no state", "huge scan", "far window", "no identity")
+
+
+def note(state: dict, key: str, value: object) -> None:
+    state["state"]["best"]["m_step"]["diagnostics"][key] = value
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        pytest.param(one, id=name, marks=() if name in QUICK_CHANGES else pytest.mark.slow)
+        for name, one in CHANGES.items()
+    ],
+)
+def test_state_that_no_run_has_written(checkpoint, tmp_path, capsys, change):
+    rewrite(checkpoint, change)
+    said = resume(tmp_path / "in", capsys)
+    assert said.count("starts anew") == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("best.m_step.poses", lambda a: a[:-1]),
+        ("best.m_step.poses", lambda a: np.full_like(a, np.nan)),
+        ("e-1", lambda a: a[:-1]),
+        *slow_params(
+            ("latest.m_step.poses", lambda a: 1e300 * a),
+            ("e-2", lambda a: a - 2),
+            ("e-2", lambda a: a.astype("U4")),
+            ("best.e_step.occupied.cells", lambda a: np.full_like(a, 2**62)),
+            ("best.m_step.graph.keyframes", lambda a: a + 5000),
+        ),
+    ],
+)
+def test_array_that_no_run_has_written(checkpoint, tmp_path, capsys, name, change):
+    put_array(checkpoint, name, change(np.load(checkpoint / f"{name}.npy")))
+    assert "starts anew" in resume(tmp_path / "in", capsys)
+
+
+def test_bare_stretches_are_resumed(checkpoint, tmp_path, capsys):
+    def change(state: dict) -> None:
+        note(state, "bare_stretches", [[3, 9, 4.5, 0.5]])
+        state["state"]["records"]["held_out_log_likelihood"] = [0.0, 1e9]  # it stays the best
+
+    rewrite(checkpoint, change)
+    assert "starts anew" not in resume(tmp_path / "in", capsys)
+    run = json.loads((tmp_path / "in" / "out" / "run.json").read_text())
+    found = {"first": 3, "last": 9, "metres": 4.5, "std": 0.5}
+    assert run["doubts"]["length_unknown"] == [found]
+
+
+# tampered records
+
+
+@pytest.mark.parametrize("name", ["map1/run.json", "day1/recording.json", "place/sessions.json"])
+def test_texts_with_nul(home, tmp_path, capsys, name):
+    text = (home / name).read_text()
+    (home / name).write_text(text.replace("day1", "da\\u0000y1").replace("simul", "\\u0000", 1))
+    commands = {"map1": to_bag, "day1": lambda home, _: ["info", f"{home}/day1"]}
+    command = commands.get(name.partition("/")[0], place_to_nav2)
+    run(Reader(name, lambda home: home, name, command), tmp_path, home, capsys)
+
+
+@pytest.mark.parametrize("origin", [[1e300, 0, 0], [np.nan, 0, 0], [0, 0], [0, 0, np.inf]])
+@pytest.mark.parametrize("resolution", [0.05, 1e300, -1.0, 1e-300])
+def test_map_that_lies_nowhere(home, origin, resolution):
+    path = home / "map1" / "map.npz"
+    with np.load(path) as archive:
+        content = {**archive, "origin": np.array(origin), "resolution": np.array(resolution)}
+    np.savez(path, **content)
+    with pytest.raises(InputError, match=r"map\.npz: (origin or resolution|is damaged)"):
+        _ = stillmap.load(home / "map1", recording=home / "day1").map

@@ -1,0 +1,75 @@
+"""The XML section of E57 files: what would fetch a schema, or take too long, is refused."""
+
+import socket
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("pye57")
+pytest.importorskip("lzf")  # of the seeds
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "fuzz"))
+
+import containers
+import corpus
+
+from stillmap.core.errors import InputError
+from stillmap.io import read
+
+XSI = b' xmlns:i="http://www.w3.org/2001/XMLSchema-instance"'
+
+
+@pytest.fixture
+def write_e57(tmp_path):
+    """Writes an E57 file whose XML section is changed."""
+    (tmp_path / "made").mkdir()
+    seed = next(corpus.e57(tmp_path / "made"))
+
+    def write(change):
+        (tmp_path / "a.e57").write_bytes(containers.change_e57_xml(seed, change))
+        return tmp_path / "a.e57"
+
+    return write
+
+
+def at_root(attribute):
+    return lambda xml: xml.replace(b"<e57Root", b"<e57Root" + XSI + attribute, 1)
+
+
+def at_end(text):
+    return lambda xml: xml.replace(b"</e57Root>", text + b"</e57Root>", 1)
+
+
+@pytest.mark.parametrize(
+    "attribute",
+    [
+        b' i:schemaLocation="http://www.astm.org/COMMIT/E57/2010-e57-v1.0 URL"',
+        b" i:noNamespaceSchemaLocation='URL'",
+        b' more=">" i:schemaLocation = "http://www.astm.org/COMMIT/E57/2010-e57-v1.0 URL"',
+    ],
+)
+def test_no_schema_is_fetched(write_e57, attribute):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        url = f"http://127.0.0.1:{server.getsockname()[1]}/a.xsd".encode()
+        with pytest.raises(InputError, match="names a schema to fetch"):
+            read(write_e57(at_root(attribute.replace(b"URL", url))))
+        server.settimeout(0.1)
+        with pytest.raises(TimeoutError):
+            server.accept()
+
+
+@pytest.mark.parametrize("opening", [b"<!--", b"<![CDATA[", b"<?", b"<", b'<a "', b"<a '<b "])
+def test_markup_that_does_not_end(write_e57, opening):
+    path = write_e57(at_end(opening * ((4 << 20) // len(opening))))
+    start = time.process_time()
+    with pytest.raises(InputError, match="begins what does not end"):
+        read(path)
+    assert time.process_time() - start < 5.0  # quadratic: minutes
+
+
+def test_depth_counts_tags_alone(write_e57):
+    quiet = b"<!-- <a> -->" * 200 + b"<?p <a '> ?>" * 200
+    assert read(write_e57(at_end(quiet))).n_scans == 2
+    with pytest.raises(InputError, match="nested too deeply"):
+        read(write_e57(at_end(b'<a x="/>">' * 200)))
