@@ -13,6 +13,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 
 from stillmap.core.errors import InputError
+from stillmap.core.input_files import read_bytes
 from stillmap.core.output_place import (
     PREFIX,
     UNFINISHED,
@@ -167,12 +168,11 @@ def finish_exchange(path: Path) -> None:
 
 
 def _read_journal(path: Path) -> tuple[Path, list[str], list[str]] | None:
-    try:
-        with (path / UNFINISHED).open("rb") as file:
-            journal = json.loads(file.read(_MAX_JOURNAL))
-        work, old, new = Path(journal["work"]), list(journal["old"]), list(journal["new"])
-    except FileNotFoundError:
+    if not os.path.lexists(path / UNFINISHED):
         return None
+    try:
+        journal = json.loads(read_bytes(path / UNFINISHED, _MAX_JOURNAL))
+        work, old, new = Path(journal["work"]), list(journal["old"]), list(journal["new"])
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError("is damaged", where=str(path / UNFINISHED)) from error
     names = [*work.parts, *old, *new]
