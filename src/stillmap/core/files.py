@@ -147,10 +147,10 @@ def atomic_file(path: Path) -> Iterator[Path]:
             os.close(os.open(work, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
             with hold(work):
                 yield work
-                with _kept_on_failure(work, given):
-                    if free and path.exists():
-                        raise InputError("has appeared meanwhile", where=str(given))
-                    publish_file(work, path)
+                if free and path.exists():
+                    what, hint = "has appeared meanwhile", "choose another"
+                    raise InputError(what, where=str(given), hint=hint)
+                publish_file(work, path)
     except OSError as error:
         raise cannot_write(error, given) from error
 
