@@ -206,8 +206,8 @@ def test_missing_parts_are_not_scored(result, simulated, capsys) -> None:
     [
         ("mesh.glb", "is damaged"),
         ("mesh_faces.npz", "is damaged"),
-        ("tilting/objects/objects.json", "no JSON"),
-        ("tilting/objects/0003.json", "no JSON"),
+        ("tilting/objects/objects.json", "is not JSON"),
+        ("tilting/objects/0003.json", "is not JSON"),
         ("tilting/objects/0003.glb", "is damaged"),
     ],
 )
