@@ -6,6 +6,7 @@ python benchmarks/live_sweep_places.py [--worlds hall street] [--seeds 11 12] [-
 The map is `stillmap.build` (one iteration) of a run of another seed: other people and traffic,
 other parked cars. Each start has up to 40 sweeps to be found, and 15 more are tracked. Errors are
 in the frame in which the poses of the map fit the truth best. wrong: found more than 0.5 m off.
+NEES: mean squared error of the position by its covariance, of 3.
 """
 
 import argparse
@@ -17,7 +18,6 @@ import numpy as np
 from tables import markdown
 
 from stillmap import build
-from stillmap.core import se2
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.replay import iter_beams
 from stillmap.sim import scene_by_name, simulate
@@ -25,7 +25,7 @@ from stillmap.sim import scene_by_name, simulate
 _SWEEPS = {"hall": 400, "street": 150, "crossing": 150, "corridor": 400}
 _SEARCHED, _TRACKED, _WRONG = 40, 15, 0.5  # sweeps, sweeps, m
 _TITLES = ("world", "seed", "starts", "found", "wrong", "sweeps until found: median", "max")
-_FURTHER = ("m off: median", "max", "CPU ms of a sweep: tracked", "of a search")
+_FURTHER = ("m off: median", "max", "NEES", "CPU ms of a sweep: tracked", "of a search")
 
 
 def main() -> None:
@@ -55,14 +55,15 @@ def localize(world: str, seed: int, folder: Path, args: argparse.Namespace) -> l
     beams = list(iter_beams(run.recording))
     last = len(beams) - _SEARCHED - _TRACKED
     starts = np.random.default_rng(seed).integers(0, last, args.starts)
-    needed, wrong, off, tracked, searched = [], 0, [], [], []
+    needed, wrong, off, nees, tracked, searched = [], 0, [], [], [], []
     for start in starts.tolist():
-        found, errors, ms = _drive(folder, beams, true, start)
+        found, errors, squared, ms = _drive(folder, beams, true, start)
         searched += [one for one in ms[1 : None if found is None else found + 1] if one > 200.0]
         if found is not None:
             needed.append(found + 1)
             wrong += errors[0] > _WRONG
             off += errors
+            nees += squared
             tracked += ms[found + 1 :]
     return [
         world,
@@ -72,6 +73,7 @@ def localize(world: str, seed: int, folder: Path, args: argparse.Namespace) -> l
         str(wrong),
         *(f"{f(needed):.0f}" for f in (np.median, np.max)),
         *(f"{f(off):.3f}" for f in (np.median, np.max)),
+        f"{np.mean(nees):.1f}",
         *(f"{np.median(one):.0f}" for one in (tracked, searched)),
     ]
 
@@ -93,8 +95,9 @@ def _make_map(simulation, folder: Path):
 
 
 def _drive(folder: Path, beams, true, start: int):
-    """After how many sweeps it was found (None: not), m off since, and CPU ms of each sweep."""
-    found, errors, ms = None, [], []
+    """After how many sweeps it was found (None: not), m off and squared errors by the covariance
+    since, and CPU ms of each sweep."""
+    found, errors, nees, ms = None, [], [], []
     with LiveMapper({"threads": 1}, place=folder) as mapper:
         for k in range(_SEARCHED + _TRACKED):
             began = time.process_time()
@@ -102,11 +105,12 @@ def _drive(folder: Path, beams, true, start: int):
             ms.append(1e3 * (time.process_time() - began))
             if "lost" not in update.doubts:
                 found = k if found is None else found
-                off = se2.inverse(true[start + k]) @ update.pose
-                errors.append(float(np.linalg.norm(off[:3, 3])))
+                off = update.pose[:3, 3] - true[start + k][:3, 3]
+                errors.append(float(np.linalg.norm(off)))
+                nees.append(float(off @ np.linalg.solve(update.covariance[:3, :3], off)))
             if (k >= _SEARCHED and found is None) or (found is not None and k > found + _TRACKED):
                 break
-    return found, errors, ms
+    return found, errors, nees, ms
 
 
 if __name__ == "__main__":

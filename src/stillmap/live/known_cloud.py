@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core.errors import InputError
-from stillmap.em import CellProbabilities, GroundMap
+from stillmap.em import GroundMap
+from stillmap.em.ground import fit_ground
 from stillmap.io.trajectory import read_tum
 from stillmap.live.known_map import LOG_RATIO, KnownMap
-from stillmap.live.map_view import find_ground
+from stillmap.live.map_view import is_level
 from stillmap.results.point_cloud import cloud_from_folder
 from stillmap.slam import lidar_odometry
 
@@ -95,10 +96,10 @@ class KnownCloud:
         return np.column_stack([columns[of], first[of] + up])
 
     def _find_ground(self) -> GroundMap:
-        cells = _cells_of(self.points, _GROUND_CELL)
-        stands = CellProbabilities(cells, np.ones(len(cells), np.float32), 0.0)
-        positions = self.poses[:, :3, 3] + [0.0, 0.0, _RAISE]
-        return find_ground(stands, positions, _GROUND_CELL)
+        points = np.column_stack([self.points, np.ones(len(self.points))])
+        cells, sums = _sum_up(np.floor(self.points / _GROUND_CELL).astype(np.int64), points)
+        floor = (sums[:, :3] / sums[:, 3:])[is_level(cells)]
+        return fit_ground(floor, self.poses[:, :3, 3] + [0.0, 0.0, _RAISE])
 
 
 def _read_route(folder: Path) -> Float:
@@ -126,14 +127,19 @@ def _read_points(folder: Path) -> tuple[NDArray[np.float32], NDArray[np.float32]
 
 
 def _sum_up(keys: Index, values: Float) -> tuple[Index, Float]:
-    """Keys (N, D), each once, and the sums of their values (N, K)."""
-    order = np.lexsort(keys.T)
-    keys = keys[order]
-    first = np.flatnonzero(np.append(True, np.any(keys[1:] != keys[:-1], axis=1)))
-    return keys[first], np.add.reduceat(values[order], first, axis=0)
+    """Cells (N, D), each once, and the sums of their values (N, K)."""
+    if not len(keys):
+        return keys, values
+    low = keys.min(axis=0)
+    shape = tuple((keys.max(axis=0) - low + 1).tolist())
+    flat = np.ravel_multi_index(tuple((keys - low).T), shape)
+    order = np.argsort(flat, kind="stable")
+    flat = flat[order]
+    first = np.flatnonzero(np.append(True, flat[1:] != flat[:-1]))
+    return keys[order[first]], np.add.reduceat(values[order], first, axis=0)
 
 
 def _cells_of(points: NDArray[np.floating], edge: float) -> Index:
     """(K, D) the cells of points (N, D), each once."""
     cells = np.floor(points / edge).astype(np.int64)
-    return _sum_up(cells, np.zeros((len(cells), 0)))[0]
+    return _sum_up(cells, np.zeros((len(cells), 1)))[0]

@@ -50,11 +50,11 @@ def project_obstacles(
 def find_ground(known: CellProbabilities, positions: Float, cell: float) -> GroundMap:
     """The ground, as level surface shows it; see `project_obstacles`."""
     cells = known.cells[known.p_occupied >= _STANDS].reshape(-1, 3)
-    floor = cells[_is_level(cells)] if len(cells) else cells
+    floor = cells[is_level(cells)] if len(cells) else cells
     return fit_ground(np.asarray((floor + 0.5) * cell, np.float64), positions)
 
 
-def _is_level(cells: NDArray[np.int64]) -> NDArray[np.bool_]:
+def is_level(cells: NDArray[np.int64]) -> NDArray[np.bool_]:
     """(K,) cells (K, 3) without one right above: those of walls have one."""
     low = cells.min(axis=0)
     size = cells.max(axis=0) - low + 2

@@ -32,7 +32,7 @@ class SweepView:
         self._band = band
         self._positions = np.zeros((0, 3))  # of the sensor
         self._ground: GroundMap | None = None
-        self._free = np.zeros((0, 2), np.int64)  # cells
+        self._free = np.zeros((0, 2), np.int64)  # cells, each once
 
     def add(self, labels: CausalLabels, scan: MappedScan, pose: Float) -> None:
         """Add the free space of a sweep.
@@ -49,7 +49,7 @@ class SweepView:
         ends = beams.points[near].astype(np.float64) @ T[:3, :3].T + T[:3, 3]
         free = _trace_low(T[:3, 3], ends, self._ground, _STEP * edge)
         cells = np.floor(free / edge).astype(np.int64)
-        self._free = np.unique(np.concatenate([self._free, cells]), axis=0)
+        self._free = _take_each_once(np.concatenate([self._free, cells]))
 
     def draw(self, labels: CausalLabels) -> GridMap:
         """The view, in the frame of the labels; NaN: unknown."""
@@ -98,3 +98,13 @@ def _trace_low(start: Float, ends: Float, ground: GroundMap, step: float) -> Flo
     share = (first[of] + (number + 0.5) * step) / length[of]
     out: Float = start[:2] + share[:, None] * (ends[of, :2] - start[:2])
     return out
+
+
+def _take_each_once(cells: Index) -> Index:
+    """(K, 2) of the cells (N, 2)."""
+    if not len(cells):
+        return cells
+    low = cells.min(axis=0)
+    width = int(cells[:, 1].max() - low[1]) + 1
+    flat = np.unique((cells[:, 0] - low[0]) * width + (cells[:, 1] - low[1]))
+    return np.stack(np.divmod(flat, width), axis=1) + low
