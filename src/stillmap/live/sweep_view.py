@@ -107,4 +107,5 @@ def _take_each_once(cells: Index) -> Index:
     low = cells.min(axis=0)
     width = int(cells[:, 1].max() - low[1]) + 1
     flat = np.unique((cells[:, 0] - low[0]) * width + (cells[:, 1] - low[1]))
-    return np.stack(np.divmod(flat, width), axis=1) + low
+    out: Index = np.stack(np.divmod(flat, width), axis=1) + low
+    return out
