@@ -148,6 +148,14 @@ def test_what_is_known_of_voxels(place):
     assert 1.5 < height.max() < 1.8
 
 
+def test_where_nothing_stands_there_is_nothing_to_search(place):
+    sky = stillmap.Scan(0, points=np.random.default_rng(0).uniform(5.0, 9.0, (400, 3)))
+    with LiveMapper({"threads": 1}, place=place[0]) as mapper:
+        update = mapper.push(sky)
+    assert "lost" in update.doubts
+    assert "ambiguous" not in update.doubts
+
+
 def test_only_beams_that_run_low_show_free_space():
     class Flat:
         def height_at(self, xy):

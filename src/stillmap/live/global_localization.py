@@ -15,6 +15,7 @@ from stillmap.core.short_repr import ShortRepr
 from stillmap.live.known_map import KnownMap, to_surface_map
 from stillmap.places.map_search import search_alignments
 from stillmap.places.surface_map import CONFLICT_WEIGHT, SurfaceMap, compare_surfaces
+from stillmap.results.reader import OCCUPIED_THRESH
 from stillmap.slam import motion_model, scan_matching
 from stillmap.slam.scan_hits import Scan
 
@@ -91,6 +92,8 @@ class GlobalLocalizer:
             view: as of `localize`.
             refine: a better alignment (3, 3) near the one given, which the search found.
         """
+        if np.count_nonzero(view.p_occupied > OCCUPIED_THRESH) < _MIN_SURFACE:  # maybe none at all
+            return Localization(None)
         session = to_surface_map(view)
         if len(session.surface) < _MIN_SURFACE:
             return Localization(None)
