@@ -70,12 +70,14 @@ void add_sweep(SweepFilter& filter, const Points<3>& points, const Flat<bool>& h
   filter.add(sweep, size, time_bin, tag, threads);
 }
 
-void prime(Filter2D& filter, const Cells<2>& cells, const Flat<bool>& occupied, double log_ratio) {
+template <class Filter>
+void prime(Filter& filter, const Cells<Filter::kDimension>& cells, const Flat<bool>& occupied,
+           double log_ratio) {
   const size_t n = cells.shape(0);
   require(occupied.shape(0) == n, "occupied: expected as many entries as cells has rows");
   require(log_ratio >= 0.0, "log_ratio: expected nats that are not negative");
   for (size_t k = 0; k < n; ++k)
-    filter.prime(cell_from<2>(cells, k), occupied.data()[k], log_ratio);
+    filter.prime(cell_from<Filter::kDimension>(cells, k), occupied.data()[k], log_ratio);
 }
 
 // Labels beams first to last; a const filter may be shared between threads.
@@ -256,6 +258,10 @@ nb::class_<Filter> bind_filter(nb::module_& m, const char* name, const char* doc
                    "(B, D) int64: lowest cell of each block, see `OccupancyGrid2D.block_cells`.")
       .def_prop_ro("block_count", [](const Filter& filter) { return filter.blocks().size(); })
       .def("sibling", &Filter::sibling, "An empty filter of the same kind.")
+      .def("prime", &prime<Filter>, nb::arg("cells").noconvert(), nb::arg("occupied").noconvert(),
+           nb::arg("log_ratio"),
+           "Initializes cells (K, D) int64 from another map: occupied by static surface, for "
+           "which dynamic classes fall behind by log_ratio nats, or free.")
       .def("take_over", &take_over<Filter>, nb::arg("other"), nb::arg("motion").noconvert(),
            nb::arg("first"), nb::arg("count"),
            "Adds `count` blocks of another filter from `first` on, whose cells are moved by the "
@@ -274,10 +280,6 @@ void bind_occupancy_filter(nb::module_& m) {
            nb::arg("T_map_sensor").noconvert(), nb::kw_only(), nb::arg("time_bin"), nb::arg("tag"),
            "Adds the hits of scans taken in one time bin. A beam passes the cells that lie more "
            "than its margin (M,) float32, in cells, before its end. tag: see `take_over`.")
-      .def("prime", &prime, nb::arg("cells").noconvert(), nb::arg("occupied").noconvert(),
-           nb::arg("log_ratio"),
-           "Initializes cells (K, D) int64 from another map: occupied by static surface, for "
-           "which dynamic classes fall behind by log_ratio nats, or free.")
       .def("dense", &dense, nb::arg("first_cell") = nb::none(), nb::arg("shape") = nb::none(),
            nb::kw_only(), nb::arg("odds_factor") = 1.0,
            "Lowest cell (D,), and P(static and occupied) as an array [y, x] float32 of a box "

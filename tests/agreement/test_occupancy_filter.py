@@ -309,3 +309,30 @@ def test_what_another_map_knows_counts_at_once():
     assert np.median(look(core, 4.05, 1)) > 0.99
     with pytest.raises(ValueError, match="occupied"):
         core.prime(wall, np.ones(1, bool), 8.0)
+
+
+def test_sweeps_go_on_from_what_another_map_knows(a_room):
+    room = a_room(3, 3, 0.4, 14, 60).beams
+    points, hit, offset, T = room.arguments
+    ends = np.einsum("nij,nj->ni", np.repeat(T[:, :3, :3], np.diff(offset), axis=0), points)
+    ends += np.repeat(T[:, :3, 3], np.diff(offset), axis=0)
+    usable = ends[hit & np.isfinite(ends).all(axis=1)]
+    cells = np.unique(np.floor(usable / room.resolution).astype(np.int64), axis=0)
+    both = [make(kernels, 3, room.resolution) for kernels in (_core, reference)]
+    for one in both:
+        one.prime(np.ascontiguousarray(cells[::2]), np.arange(len(cells[::2])) % 2 == 0, 8.0)
+        add_scans(one, room, np.arange(len(T)))
+    found, expected = known(both[0]), both[1].p_standing()
+    assert found.keys() == expected.keys()
+    values = np.array([[found[cell], expected[cell]] for cell in found])
+    np.testing.assert_allclose(values[:, 0], values[:, 1], atol=2e-3)
+
+
+def test_what_appears_where_another_map_is_free_moves():
+    core = make(_core, 3)
+    y, z = (one.ravel() for one in np.meshgrid(np.arange(-42, 42), np.arange(-42, 42)))
+    wall, free = (np.stack([np.full_like(y, x), y, z], axis=1) for x in (40, 20))
+    core.prime(np.concatenate([wall, free]), np.arange(2 * len(y)) < len(y), 8.0)
+    assert core.size == len(y)  # free voxels have no filter
+    assert np.median(sweep(core, 4.05, 0)) > 0.99
+    assert np.mean(sweep(core, 2.05, 1) < 0.2) > 0.9

@@ -75,6 +75,20 @@ class SweepFilter3D(OccupancyFilter):
     def __init__(self, resolution: float, **options) -> None:
         super().__init__(resolution, **options)
         self.views: list[View] = []
+        self.known_free = set[tuple[int, ...]]()
+
+    def prime(self, cells, occupied, log_ratio):
+        for cell, is_occupied in zip(map(tuple, cells.tolist()), occupied, strict=True):
+            if cell in self.filters and not is_occupied:
+                continue
+            if not is_occupied:
+                self.known_free.add(cell)
+                continue
+            if cell not in self.filters:
+                self.filters[cell], self.passed[cell] = self._new_filter([], -1, 0), Passed()
+            one = self.filters[cell]
+            one.log_likelihood[self.n_static :] -= log_ratio
+            one.log_likelihood = self._normalize(one.log_likelihood)
 
     def add(self, points, hit, offset, T_map_sensor, *, pixel, time_bin, tag):
         beams = [b for b in usable_beams(3, points, hit, offset, T_map_sensor) if b.hit]
@@ -100,6 +114,8 @@ class SweepFilter3D(OccupancyFilter):
             self.views = [*self.views, view][-MAX_PASSES:]
 
     def _after_views(self, cell, tag):
+        if cell in self.known_free:
+            return self._new_filter([RELIABILITY] * MAX_PASSES, -1, tag)
         passes = [(self._visibility(view, cell), view.time_bin) for view in self.views]
         passes = [(r, time_bin) for r, time_bin in passes if r >= MIN_RELIABILITY]
         last = passes[-1][1] if passes else -1

@@ -151,8 +151,6 @@ def _read(args: argparse.Namespace, options: "Options", scratch: Path) -> "Recor
 
     with show_share(args.quiet, "reading") as progress:
         recording = inputs.read(args.replay, options.read, progress=progress, scratch=scratch)
-    if recording.dimension != 2 and args.map is not None:
-        raise InputError("is 3D; localization in a known map is planar", where=args.replay)
     inputs.require_mappable(recording, options, None)
     return recording.without_odometry() if args.no_odometry else recording
 

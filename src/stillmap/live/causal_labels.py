@@ -183,6 +183,11 @@ class CausalLabels:
         cells, p_occupied = self.filter.known_cells(odds_factor=self._odds_factor)
         return CellProbabilities(cells, p_occupied, 0.0)
 
+    def seen_cells(self) -> CellProbabilities:
+        """The same without the prior of the map: for comparison with another map."""
+        cells, p_occupied = self.filter.known_cells(odds_factor=1.0)
+        return CellProbabilities(cells, p_occupied, 0.0)
+
     def take_changes(self, stamp_ns: int) -> list[MapChange]:
         """Parts of the map that changed, so many since the call before that each is told about once
         a second; and those that emptied.

@@ -1,17 +1,21 @@
 """Global localization: the pose of the robot in a known map, without a prior."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+import stillmap._core as _core
 from stillmap.core import se2
 from stillmap.core.grid_map import GridMap
 from stillmap.core.short_repr import ShortRepr
 from stillmap.live.known_map import KnownMap, to_surface_map
 from stillmap.places.map_search import search_alignments
 from stillmap.places.surface_map import CONFLICT_WEIGHT, SurfaceMap, compare_surfaces
+from stillmap.results.reader import OCCUPIED_THRESH
 from stillmap.slam import motion_model, scan_matching
 from stillmap.slam.scan_hits import Scan
 
@@ -37,7 +41,7 @@ class Localization(ShortRepr):
     """Result of global localization.
 
     Attributes:
-        T: (3, 3) of the searched view in the known map; None: not known.
+        T: (D+1, D+1) of the searched view in the known map; None: not known.
         is_ambiguous: several places fit about as well.
     """
 
@@ -59,12 +63,15 @@ class GlobalLocalizer:
     Args:
         known: the map.
         min_agree: share of the surfaces of a view that the map shows, at least.
+        gone_weight: weight of a surface of the map where the view is free, against one that both
+            show.
     """
 
-    def __init__(self, known: KnownMap, min_agree: float = MIN_AGREE) -> None:
-        self._min_agree = min_agree
-        self._surface = known.make_surface_map()
-        self._grid = known.make_grid()
+    def __init__(
+        self, known: KnownMap, min_agree: float = MIN_AGREE, gone_weight: float = CONFLICT_WEIGHT
+    ) -> None:
+        self._min_agree, self._gone_weight = min_agree, gone_weight
+        self._known, self._surface = known, known.make_surface_map()
         self._last: Float | None = None
         self._times = 0  # that the last one was the best in a row
 
@@ -76,13 +83,24 @@ class GlobalLocalizer:
             scan: the last scan.
             pose: (3, 3) of the robot in the frame of the view.
         """
+        return self.search(view, lambda T: self._refine(scan, T @ pose) @ se2.inverse(pose))
+
+    def search(self, view: GridMap, refine: Callable[[Float], Float]) -> Localization:
+        """Pose of a local map in the known map.
+
+        Args:
+            view: as of `localize`.
+            refine: a better alignment (3, 3) near the one given, which the search found.
+        """
+        if np.count_nonzero(view.p_occupied > OCCUPIED_THRESH) < _MIN_SURFACE:  # maybe none at all
+            return Localization(None)
         session = to_surface_map(view)
         if len(session.surface) < _MIN_SURFACE:
             return Localization(None)
         found = list[_Alignment]()
-        for T in search_alignments(self._surface, session, _FREE_WEIGHT)[:_MAX_CANDIDATES]:
-            refined = self._refine(scan, T @ pose) @ se2.inverse(pose)
-            found.append(self._weigh(session, refined))
+        proposed = search_alignments(self._surface, session, _FREE_WEIGHT, self._gone_weight)
+        for T in proposed[:_MAX_CANDIDATES]:
+            found.append(self._weigh(session, refine(T)))
         return self._choose(sorted(found, key=lambda one: -one.evidence), len(session.surface))
 
     def _choose(self, found: list[_Alignment], squares: int) -> Localization:
@@ -103,8 +121,12 @@ class GlobalLocalizer:
     def _weigh(self, session: SurfaceMap, T: Float) -> _Alignment:
         forth, back = compare_surfaces(self._surface, session, T)
         evidence = forth.agree - _FREE_WEIGHT * forth.conflict
-        evidence += back.agree - CONFLICT_WEIGHT * back.conflict
+        evidence += back.agree - self._gone_weight * back.conflict
         return _Alignment(evidence, forth.agree, T)
+
+    @cached_property
+    def _grid(self) -> _core.OccupancyGrid2D:
+        return self._known.make_grid()
 
     def _refine(self, scan: Scan, pose: Float) -> Float:
         prior = motion_model.gaussian_prior(pose, *_STD)

@@ -32,7 +32,7 @@ from stillmap.slam import scan_hits
 Float = NDArray[np.float64]
 
 _SQUARE = 2  # cells along the edge of a square of the surface map
-_LOG_RATIO = 8.0  # nats by which the map speaks for static surface
+LOG_RATIO = 8.0  # nats by which the map speaks for static surface
 
 
 class KnownMap:
@@ -88,7 +88,7 @@ class KnownMap:
         centres = np.concatenate([self._centres, free])
         cells = np.floor(centres / labels.resolution).astype(np.int64)
         occupied = np.arange(len(cells)) < len(self._centres)
-        labels.prime(np.ascontiguousarray(cells), occupied, _LOG_RATIO)
+        labels.prime(np.ascontiguousarray(cells), occupied, LOG_RATIO)
 
 
 class KnownLocalMap:

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.grid_map import GridMap
-from stillmap.em import CellProbabilities
+from stillmap.em import CellProbabilities, GroundMap
 from stillmap.em.ground import fit_ground
 from stillmap.mapping.projection import project_cells
 
@@ -35,8 +35,7 @@ def project_obstacles(
     if not stands.any():
         return empty_map(cell)
     cells = known.cells[stands]
-    floor = np.asarray((cells[_is_level(cells)] + 0.5) * cell, np.float64)
-    ground = fit_ground(floor, positions)
+    ground = find_ground(known, positions, cell)
     obstacles = project_cells(known, ground, band, cell)
     columns = np.concatenate([cells[:, :2], obstacles.cells])
     first, last = columns.min(axis=0), columns.max(axis=0)
@@ -48,7 +47,14 @@ def project_obstacles(
     return GridMap(p_occupied, (x, y, 0.0), cell)
 
 
-def _is_level(cells: NDArray[np.int64]) -> NDArray[np.bool_]:
+def find_ground(known: CellProbabilities, positions: Float, cell: float) -> GroundMap:
+    """The ground, as level surface shows it; see `project_obstacles`."""
+    cells = known.cells[known.p_occupied >= _STANDS].reshape(-1, 3)
+    floor = cells[is_level(cells)] if len(cells) else cells
+    return fit_ground(np.asarray((floor + 0.5) * cell, np.float64), positions)
+
+
+def is_level(cells: NDArray[np.int64]) -> NDArray[np.bool_]:
     """(K,) cells (K, 3) without one right above: those of walls have one."""
     low = cells.min(axis=0)
     size = cells.max(axis=0) - low + 2

@@ -19,7 +19,7 @@ from stillmap.io.array_checks import poses_to_matrices
 from stillmap.live.known_map import KnownMap
 from stillmap.live.map_view import empty_map, project_obstacles
 from stillmap.live.online_slam import OnlineSlam
-from stillmap.live.place import Mode, PlaceTracker, adopt_resolution
+from stillmap.live.place import Mode, adopt_resolution, make_tracker
 from stillmap.live.saving import Snapshot
 from stillmap.live.scan import Scan, ScanBeams, drop_cover, to_beams
 from stillmap.live.update import Update
@@ -53,6 +53,8 @@ class LiveMapper:
 
     Raises:
         InputError: the place has no map, an empty one, or in mode "extend" one of other cells.
+            Likewise `push` of a first sweep of a lidar, if it is of a planar laser, or in mode
+            "extend".
 
     Examples:
         >>> with stillmap.LiveMapper() as mapper:
@@ -77,9 +79,10 @@ class LiveMapper:
         if lag is not None and not 0.0 < lag < np.inf:
             raise ValueError(f"lag: expected positive seconds, got {lag}")
         self.options = to_options(options)
-        self._place = None if place is None else PlaceTracker(KnownMap(place), mode)
-        if self._place is not None and self._place.extends:
-            self.options = adopt_resolution(self.options, self._place.known)
+        self._source, self._mode = place, mode
+        self._known = None if place is None else KnownMap(place)
+        if self._known is not None and mode == "extend":
+            self.options = adopt_resolution(self.options, self._known)
         self._in_background, self._max_scratch, self._lag = background, max_scratch, lag
         self._scratch = None if scratch is None else Path(scratch)
         self._slam: OnlineSlam | None = None  # since the first scan
@@ -141,8 +144,7 @@ class LiveMapper:
         if self._slam.dimension == 2:
             return labels.to_map()
         band = output.min_obstacle_height, output.max_obstacle_height
-        positions = self.path[:, :3, 3]
-        return project_obstacles(labels.known_cells(), positions, band, self.resolution)
+        return project_obstacles(labels.known_cells(), self._slam.route(), band, self.resolution)
 
     @property
     def cells(self) -> CellProbabilities:
@@ -185,10 +187,10 @@ class LiveMapper:
         Raises:
             InputError: no scan was pushed.
         """
-        slam, place = self._pushed, self._place
+        slam = self._pushed
         kept = slam.history.snapshot()
         placement = slam.placement().select(kept.number)
-        extended = place.known if place is not None and place.extends else None
+        extended = self._known if self._mode == "extend" else None
         return Snapshot(kept, placement, self.options, self._scratch, extended)
 
     def finish(self, progress: Progress = no_progress) -> BuiltResult:
@@ -215,10 +217,13 @@ class LiveMapper:
         """Begin mapping with the first scan, in its dimension."""
         if self._slam is not None:  # of a first scan that could not be mapped
             self._slam.close()
+        place = None
+        if self._source is not None and self._known is not None:
+            place = make_tracker(self._source, self._known, self._mode, dimension, self.options)
         return OnlineSlam(
             dimension,
             self.options,
-            self._place,
+            place,
             in_background=self._in_background,
             scratch=self._scratch,
             max_scratch=self._max_scratch,
@@ -237,8 +242,6 @@ class LiveMapper:
         D = beams.dimension
         if self._is_closed:
             raise ValueError("mapper: expected one that is not closed")
-        if self._place is not None and D == 3:
-            raise ValueError("scan: expected a planar one: localization is planar")
         if self._slam is None or self._last_ns is None:
             return
         if self._slam.dimension != D:

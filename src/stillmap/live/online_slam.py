@@ -36,6 +36,7 @@ Float = NDArray[np.float64]
 # weight of a scan in the running share of hits on what moves; share from which people may walk
 # along with the robot, and what was only just seen counts little
 _MOVING_RATE, _CROWDED = 0.3, 0.15
+_SEARCH_DISTANCE = 0.5  # m between the sweeps with which a robot is searched in a known map
 
 
 class OnlineSlam:
@@ -73,18 +74,20 @@ class OnlineSlam:
         D, slam = dimension, resolve_resolution(options, dimension).slam
         threads = resolve_threads(options.threads)
         self.dimension, self.resolution = D, slam.resolution
-        self.odometry: FrontEnd = ScanOdometry(slam) if D == 2 else SweepOdometry(slam, threads)
+        spacing = None if place is None else _SEARCH_DISTANCE
+        self.odometry: FrontEnd = (
+            ScanOdometry(slam) if D == 2 else SweepOdometry(slam, threads, spacing)
+        )
         self.labels = CausalLabels(D, slam.resolution, options.em, threads)
         self.history = History(D, scratch, max_scratch)
         self._selector = BeamSelector(options.em.time_bin)
         self._movers = MoverTracker(D)
-        self._finder = RobotFinder(place, D)
+        self._place, self._finder = place, RobotFinder(place, D)
         self._hindsight = Hindsight(lag)
         closer: LoopClosing = NoLoops()
         if place is None and slam.loop_closure:
             closer = start_closer(slam, D, in_background, scratch, threads)
         self.frame = MapFrame(D, closer, in_background)
-        self._is_known = place is not None
         self._T_odom_base: Float | None = None  # of the last scan
         self._path_begin = 0  # the first spaced scan in the frame of the map
         self._moving = 0.0  # share of the hits, as the labels say a second later
@@ -112,10 +115,10 @@ class OnlineSlam:
         self._hindsight.add(len(self.history) - 1, beams)
         self._T_odom_base = T_odom_base
         update = self._to_update(beams.stamp_ns, found, p_static)
-        is_spaced = self._add_to_maps(deskewed, labelled, np.nan_to_num(p_static), found)
-        if is_spaced and self._finder.is_lost and isinstance(hits, PlanarHits):
-            return self._find_robot(hits, update)
-        return update
+        added = self._add_to_maps(deskewed, labelled, np.nan_to_num(p_static), found)
+        if added is None or not self._finder.is_lost:
+            return update
+        return self._find_robot(thin(hits) if isinstance(hits, PlanarHits) else added, update)
 
     def label(self, beams: ScanBeams, number: int) -> NDArray[np.float32]:
         """(N,) P(static) of the beams of an earlier scan, by what is known now.
@@ -133,12 +136,18 @@ class OnlineSlam:
         _, local, anchor = self.history.poses()
         moved = self._finder.move_all(local)
         # in a known map that frame is the map's
-        poses = moved if self._is_known else self.frame.to_map_all(moved, anchor)
+        poses = moved if self._place is not None else self.frame.to_map_all(moved, anchor)
         return Placement(poses, self._finder.submaps(len(poses)))
 
     def path(self) -> Float:
         """(S, D+1, D+1) T_map_base of the spaced scans since the robot was found or lost."""
         return self.frame.spaced_poses()[self._path_begin :]
+
+    def route(self) -> Float:
+        """(S, D) positions from where what the map shows was seen, in 3D."""
+        D = self.dimension
+        own = self.path()[:, :D, D]
+        return own if self._place is None else np.concatenate([self._place.route, own])
 
     def close(self) -> None:
         """Forget all scans, and end the process that closes loops, if there is one."""
@@ -174,9 +183,9 @@ class OnlineSlam:
         labelled: LabelledScan,
         e: NDArray[np.float32],
         found: Registration,
-    ) -> bool:
+    ) -> MappedScan | None:
         """Add a scan to the local map and, if it is spaced, to the pose graph, and go on correcting
-        the map; True if the scan is spaced."""
+        the map; the scan if it is spaced."""
         self.frame.add_drift(found.drift)
         # without odometry nothing else says how the robot moves
         is_doubted = found.has_odometry and self._moving > _CROWDED
@@ -189,7 +198,7 @@ class OnlineSlam:
             self.frame.correct(agrees, added, self.labels, self.odometry)
         if self.dimension == 3 and self._finder.tie(self.frame, self.labels):
             self._path_begin = 0
-        return added is not None
+        return added
 
     def _label_again(self, scan: MappedScan) -> NDArray[np.float32]:
         """(N,) P(static) of a scan of the local map by what is known now; 0: unusable."""
@@ -199,14 +208,14 @@ class OnlineSlam:
             self._moving += _MOVING_RATE * (float((e[hit] < 0.5).mean()) - self._moving)
         return e
 
-    def _find_robot(self, hits: PlanarHits, update: Update) -> Update:
+    def _find_robot(self, scan: PlanarHits | MappedScan, update: Update) -> Update:
         """Search the robot, which is lost; the update with its pose in the map, if it is found."""
         frame, scans = self.frame, len(self.history)
-        found = self._finder.find(self.labels, thin(hits), update.pose, scans, frame, self.odometry)
+        found = self._finder.find(self.labels, scan, update.pose, scans, frame, self.odometry)
         if found is None:
             return update
         T, motion = found
-        self._path_begin = frame.last + 1 if self._is_known else 0
+        self._path_begin = frame.last + 1 if self._place is not None else 0
         self._movers.move(T)
         pose = motion @ update.pose
         return dataclasses.replace(

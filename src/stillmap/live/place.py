@@ -1,6 +1,7 @@
 """Localization in a known map: global search while lost, then tracking."""
 
-from typing import Literal
+import os
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,9 +9,12 @@ from numpy.typing import NDArray
 import stillmap._core as _core
 from stillmap.core import config
 from stillmap.core.errors import InputError
-from stillmap.live.causal_labels import CausalLabels, take_over
+from stillmap.core.parallel import resolve_threads
+from stillmap.live.causal_labels import CausalLabels, OccupancyFilter, take_over
 from stillmap.live.global_localization import GlobalLocalizer, Localization
+from stillmap.live.known_cloud import KnownCloud
 from stillmap.live.known_map import KnownLocalMap, KnownMap
+from stillmap.live.sweep_localization import SweepLocalizer
 from stillmap.pipeline.options import DEFAULTS, Options
 from stillmap.slam.scan_hits import Scan
 
@@ -31,52 +35,125 @@ def adopt_resolution(options: Options, known: KnownMap) -> Options:
     return config.override(options, {"slam": {"resolution": edge}})
 
 
+def make_tracker(
+    source: str | os.PathLike[str], known: KnownMap, mode: Mode, dimension: int, options: Options
+) -> "PlaceTracker":
+    """What tracks a robot in a known map.
+
+    Args:
+        source: folder of a result or a place.
+        known: its planar map.
+        mode: whether the map stays as it is, or is extended by what is seen.
+        dimension: of the scans.
+        options: see Options.
+
+    Raises:
+        InputError: scans in 3D, and the place is of a planar laser, or is to be extended.
+    """
+    if dimension == 2:
+        return PlaceTracker(PlanarLocalizer(known, mode == "extend"))
+    if mode == "extend":
+        hint = 'mode "localise" takes sweeps'
+        raise InputError("only planar maps can be extended", where=str(source), hint=hint)
+    threads = resolve_threads(options.threads)
+    return PlaceTracker(SweepLocalizer(KnownCloud(source, known), options, threads))
+
+
+class Localizer(Protocol):
+    """A known map in 2D or 3D, and the search in it: `PlanarLocalizer`, `SweepLocalizer`."""
+
+    route: Float  # (T, D) from where it was mapped; empty in 2D, where nobody asks
+
+    def localize(self, labels: CausalLabels, scan: Any, pose: Float, /) -> Localization:
+        """The frame of the labels in the known map, by the last scan at its pose there."""
+
+    def forget(self) -> None:
+        """The robot was carried: what it saw before was elsewhere."""
+
+    def make_local_map(self) -> Any:
+        """The map that scans are matched against once the robot is found."""
+
+    def prime(self, labels: OccupancyFilter, /) -> None:
+        """Tell the filters of cells what the map knows."""
+
+
+class PlanarLocalizer:
+    """A planar map, and the search in it.
+
+    Args:
+        known: the map.
+        extends: whether scans are added to it.
+    """
+
+    def __init__(self, known: KnownMap, extends: bool) -> None:
+        self.route = np.zeros((0, 2))
+        self._known, self._extends, self._search = known, extends, GlobalLocalizer(known)
+
+    def localize(self, labels: CausalLabels, scan: Scan, pose: Float) -> Localization:
+        """(3, 3) of the frame of the labels in the known map, if the evidence is clear."""
+        return self._search.localize(labels.to_view(), scan, pose)
+
+    def forget(self) -> None:
+        """Nothing: the labels hold all that was seen."""
+
+    def make_local_map(self) -> KnownLocalMap:
+        """The map that scans are matched against from now on."""
+        return KnownLocalMap(self._known, self._extends)
+
+    def prime(self, labels: OccupancyFilter) -> None:
+        """Tell the filters of cells what the map knows."""
+        assert isinstance(labels, _core.OccupancyFilter2D)
+        self._known.prime(labels)
+
+
 class PlaceTracker:
     """State of the localization in a known map: lost or localized, and the frames in between.
 
     Args:
-        known: the map.
-        mode: whether the map stays as it is, or is extended by what is seen.
+        localizer: the map, and the search in it.
 
     Attributes:
-        known, extends: the map, and whether it is extended.
         is_lost: the robot is not found in it yet.
         is_ambiguous: several places fit about as well.
     """
 
-    def __init__(self, known: KnownMap, mode: Mode) -> None:
+    def __init__(self, localizer: Localizer) -> None:
         self.is_lost, self.is_ambiguous = True, False
-        self.known, self.extends = known, mode == "extend"
-        self._localizer = GlobalLocalizer(known)
+        self._localizer = localizer
+
+    @property
+    def route(self) -> Float:
+        """(T, D) from where the map was made, in 3D, once the robot is found in it."""
+        return self._localizer.route[:0] if self.is_lost else self._localizer.route
 
     def lose(self) -> None:
         """The robot was carried elsewhere."""
         self.is_lost = True
+        self._localizer.forget()
 
-    def localize(self, labels: CausalLabels, hits: Scan, pose: Float) -> Float | None:
-        """(3, 3) of the frame of the labels in the known map, if the evidence is clear.
+    def localize(self, labels: CausalLabels, scan: Any, pose: Float) -> Float | None:
+        """(D+1, D+1) of the frame of the labels in the known map, if the evidence is clear.
 
         Args:
             labels: of what was seen since the robot was lost.
-            hits: of the last scan.
-            pose: (3, 3) of the robot in the frame of the labels.
+            scan: the last one; in 2D its hits.
+            pose: (D+1, D+1) of the robot in the frame of the labels.
         """
-        found: Localization = self._localizer.localize(labels.to_view(), hits, pose)
+        found = self._localizer.localize(labels, scan, pose)
         self.is_ambiguous = found.is_ambiguous
         if found.T is None:
             return None
         self.is_lost = False
         return found.T
 
-    def make_local_map(self) -> KnownLocalMap:
+    def make_local_map(self) -> Any:
         """The map that scans are matched against from now on."""
-        return KnownLocalMap(self.known, self.extends)
+        return self._localizer.make_local_map()
 
     def enter(self, labels: CausalLabels, T: Float) -> None:
         """Let labels go on from the known map, with what was seen since the robot was lost."""
         known, seen = labels.filter.sibling(), labels.filter
-        assert isinstance(known, _core.OccupancyFilter2D)
-        self.known.prime(known)
+        self._localizer.prime(known)
         tags = labels.tags
         take_over(known, seen, np.tile(T, (tags, 1, 1)), 0, seen.block_count)
         labels.filter = known

@@ -1,6 +1,7 @@
 """A robot that is lost: in a known map, or carried elsewhere while it maps."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,6 @@ from stillmap.live.front_end import FrontEnd
 from stillmap.live.map_frame import MapFrame
 from stillmap.live.place import PlaceTracker
 from stillmap.live.relocalization import Relocalizer
-from stillmap.slam.scan_hits import Scan
 
 Float = NDArray[np.float64]
 
@@ -26,7 +26,8 @@ class _Stretch:
 
     Attributes:
         first, last: the first one, and the one after the last; None: it goes on.
-        T: (3, 3) by which they move in the frame of the odometry by scans; None: it was not found.
+        T: (D+1, D+1) by which they move in the frame of the odometry by scans; None: it was not
+            found.
         is_tied: loops show where they are in the map.
     """
 
@@ -44,8 +45,8 @@ class RobotFinder:
 
     Args:
         place: localization in a known map; None: the robot maps.
-        dimension: 2 or 3; in 3D a robot that was carried is not searched, but lost until loops are
-            closed with the map.
+        dimension: 2 or 3; in 3D a robot that was carried while it maps is not searched, but lost
+            until loops are closed with the map.
     """
 
     def __init__(self, place: PlaceTracker | None, dimension: int) -> None:
@@ -106,7 +107,7 @@ class RobotFinder:
     def find(
         self,
         labels: CausalLabels,
-        hits: Scan,
+        scan: Any,
         pose: Float,
         scans: int,
         frame: MapFrame,
@@ -116,18 +117,18 @@ class RobotFinder:
 
         Args:
             labels: of what was seen since it was lost.
-            hits: of the last scan.
-            pose: (3, 3) of the robot in the frame of the labels.
+            scan: the last one, see `PlaceTracker.localize`.
+            pose: (D+1, D+1) of the robot in the frame of the labels.
             scans: number of scans so far.
             frame: of the map.
             odometry: by scans.
 
         Returns:
-            (3, 3) by which its frame moves, and by which poses in the map do; None: not found.
+            (D+1, D+1) by which its frame moves, and by which poses in the map do; None: not found.
         """
         if self._carried is not None:
             carried = self._carried
-            T = carried.localize(labels, hits, pose)
+            T = carried.localize(labels, scan, pose)
             if T is None:
                 return None
             odometry.enter(carried.join(labels, odometry.local_map, T), T)
@@ -136,7 +137,7 @@ class RobotFinder:
             self._stretches[-1].last, self._stretches[-1].T = scans, T
             return T, frame.T_map_local @ T @ se2.inverse(frame.T_map_local)
         place = self._place
-        T = None if place is None else place.localize(labels, hits, pose)
+        T = None if place is None else place.localize(labels, scan, pose)
         if T is None or place is None:
             return None
         odometry.enter(place.make_local_map(), T)
@@ -145,12 +146,14 @@ class RobotFinder:
         return T, T
 
     def tie(self, frame: MapFrame, labels: CausalLabels) -> bool:
-        """In 3D: the robot is found once loops show where it is; True if they do now.
+        """While it maps in 3D, the robot is found once loops show where it is; True if they do now.
 
         Args:
             frame: of the map.
             labels: of what was seen since it was lost; they become those of the map with it.
         """
+        if self._place is not None:
+            return False
         untied = frame.untied
         for one in self._stretches:
             one.is_tied = one.first not in untied
@@ -164,14 +167,14 @@ class RobotFinder:
         return True
 
     def move(self, local: Float, scan: int) -> Float:
-        """(3, 3) a pose in the frame of the odometry by scans, as it is known now."""
+        """(D+1, D+1) a pose in the frame of the odometry by scans, as it is known now."""
         for one in self._stretches:
             if one.T is not None and one.first <= scan < (one.last or 0):
                 return np.asarray(one.T @ local)
         return local
 
     def move_all(self, local: Float) -> Float:
-        """(T, 3, 3) the same of all scans."""
+        """(T, D+1, D+1) the same of all scans."""
         out = local.copy()
         for one in self._stretches:
             if one.T is not None:

@@ -24,6 +24,7 @@ _EXPLAINED_RATE = 0.1  # weight of one sweep in the running average of the expla
 # it would make the map agree with those that follow
 _POOR_SHARE = 0.6
 _CARRIED_AFTER = 5  # sweeps in a row that contradict the local map
+_FOUND_STD = (0.1, 0.02)  # m and rad, of a pose in a known map that was found
 
 
 class SweepOdometry:
@@ -32,12 +33,14 @@ class SweepOdometry:
     Args:
         options: see SlamOptions.
         threads: the result does not depend on it.
+        spacing: m between keyframes; None: as the options say.
     """
 
-    def __init__(self, options: SlamOptions, threads: int) -> None:
+    def __init__(self, options: SlamOptions, threads: int, spacing: float | None = None) -> None:
         self.local_map = self.left_behind = lidar_odometry.make_local_map()
         self.travelled = 0.0
         self._options, self._threads = options, threads
+        self._spacing = spacing or options.keyframe_distance or KEYFRAME_DISTANCE
         self._state = lidar_odometry.initial_state()
         self._stamp_ns: int | None = None
         self._kept = np.zeros(0, np.int64)  # beams of the last sweep that are registered
@@ -45,6 +48,7 @@ class SweepOdometry:
         self._is_slipping = False
         self._cropped_at = np.zeros(3)
         self._since = np.inf  # travel since the last keyframe, in units of their spacing
+        self._is_known = False  # the local map is one to localize in, which stays as it is
         self._first, self._knows_first = list[tuple[int, Sweep]](), False  # stamps and sweeps
 
     def predict(self, beams: ScanBeams, increment: Float | None) -> State:
@@ -126,21 +130,28 @@ class SweepOdometry:
         kept, state = take_beams(beams, self._kept), self._state
         T, weights = kept.T_base_sensor, e[self._kept]
         in_base = (kept.points @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
-        self.local_map.add(in_base, weights, state.T_map_base)
-        here = state.T_map_base[:3, 3]
-        if np.linalg.norm(here - self._cropped_at) > lidar_odometry.CROP_STEP:
-            self._cropped_at = here.copy()
-            self.local_map.crop(state.T_map_base, lidar_odometry.MAX_RANGE)
+        if not self._is_known:
+            self._add(in_base, weights)
         if self._since < 1.0 or not weights.any():
             return None
         self._since = 0.0
         return MappedScan(kept, weights, state.T_map_base, self.travelled)
 
-    def enter(self, local_map: _core.NdtMap3D, T: Float) -> None:
-        """Go on in another map, in whose frame the frame so far has the pose T (4, 4)."""
-        self.local_map = local_map
+    def _add(self, points: NDArray[np.float32], weights: NDArray[np.float32]) -> None:
+        """Add points (N, 3) in the base frame to the local map, and forget what is far away."""
         state = self._state
-        self._state = State(T @ state.T_map_base, state.twist, state.covariance)
+        self.local_map.add(points, weights, state.T_map_base)
+        here = state.T_map_base[:3, 3]
+        if np.linalg.norm(here - self._cropped_at) > lidar_odometry.CROP_STEP:
+            self._cropped_at = here.copy()
+            self.local_map.crop(state.T_map_base, lidar_odometry.MAX_RANGE)
+
+    def enter(self, local_map: _core.NdtMap3D, T: Float) -> None:
+        """Go on in a known map, in whose frame the frame so far has the pose T (4, 4)."""
+        self.local_map, self._is_known, self._knows_first = local_map, True, True
+        state, covariance = self._state, self._state.covariance.copy()
+        covariance[:6, :6] += np.diag(np.square(np.repeat(_FOUND_STD, 3)))
+        self._state = State(T @ state.T_map_base, state.twist, covariance)
 
     def correct(self, _local_map: None, _motion: Float) -> None:
         """The local map stays as it is: it holds what is near, not what loops tie to it."""
@@ -149,7 +160,7 @@ class SweepOdometry:
         step = se2.inverse(self._state.T_map_base) @ state.T_map_base
         metres = float(np.linalg.norm(step[:3, 3]))
         self.travelled += metres
-        self._since += metres / (self._options.keyframe_distance or KEYFRAME_DISTANCE)
+        self._since += metres / self._spacing
         self._since += float(np.linalg.norm(se3.log_rotation(step[:3, :3]))) / KEYFRAME_ANGLE
         self._state, self._stamp_ns = state, stamp_ns
 
@@ -168,6 +179,7 @@ class SweepOdometry:
     def _start_anew(self) -> None:
         self.left_behind, self.local_map = self.local_map, lidar_odometry.make_local_map()
         self._usual, self._contradictions, self._since = 0.0, 0, np.inf
+        self._is_known = False
 
     def _note_first(self, stamp_ns: int, hits: Sweep) -> None:
         """Register the first sweeps again once the motion during the first one is known: it was

@@ -35,7 +35,10 @@ class _Optimum(NamedTuple):
 
 
 def search_alignments(
-    place: SurfaceMap, session: SurfaceMap, free_weight: float = CONFLICT_WEIGHT
+    place: SurfaceMap,
+    session: SurfaceMap,
+    free_weight: float = CONFLICT_WEIGHT,
+    gone_weight: float = CONFLICT_WEIGHT,
 ) -> list[Float]:
     """T_place_session (3, 3) about where the maps agree most, the best one first.
 
@@ -46,10 +49,11 @@ def search_alignments(
         session: in its own frame.
         free_weight: of a surface of the session in the free space of the place, against one that
             both show.
+        gone_weight: likewise of a surface of the place in the free space of the session.
     """
     if not len(place.surface) or not len(session.surface):
         return []
-    search = _Search(place, session, free_weight)
+    search = _Search(place, session, free_weight, gone_weight)
     headings = np.arange(search.headings) * (2.0 * np.pi / search.headings)
     found = [one for heading in headings.tolist() for one in search.find_optima(heading)]
     found.sort(key=lambda one: -one.score)
@@ -59,7 +63,9 @@ def search_alignments(
 class _Search:
     """Two maps on cells, and their correlation for one heading after the other."""
 
-    def __init__(self, place: SurfaceMap, session: SurfaceMap, free_weight: float) -> None:
+    def __init__(
+        self, place: SurfaceMap, session: SurfaceMap, free_weight: float, gone_weight: float
+    ) -> None:
         from scipy import fft, ndimage  # slow to load
 
         self._fft = fft
@@ -73,7 +79,7 @@ class _Search:
         self.headings = int(np.clip(np.ceil(turns), *_HEADINGS))
         self._offset = offset
         field = _pool(_make_field(place, squares, free_weight), squares)
-        own = _make_field(session, squares, CONFLICT_WEIGHT)
+        own = _make_field(session, squares, gone_weight)
         self._field = np.pad(ndimage.uniform_filter(own, squares), 1)
         self._low = place.low * place.edge
         counts = _count((place.surface - self._low) / self.cell, field.shape)

@@ -34,7 +34,7 @@ _STEP_TRANSLATION, _STEP_ROTATION = 0.01, 0.0005  # random walk, m and rad per r
 _TWIST_STD = 0.05  # m/s and rad/s, of the motion during a registered sweep
 _CLOSURE_ROTATION = 0.002  # rad, min std of a closure
 _MIN_EXPLAINED_RATIO = 0.75  # of the share that the local map explained
-_MIN_PLANE_OVERLAP = 0.55  # share of planes, balanced over their directions, that meet earlier ones
+MIN_PLANE_OVERLAP = 0.55  # share of planes, balanced over their directions, that meet earlier ones
 _MAX_OCCLUDED = 0.1  # share of beams through the submap, beyond that of the sweep at its center
 MAX_CHI2 = 25.0  # 6 degrees of freedom; above it the graph rejects a loop
 _GRID_CELL, _WALL_MARGIN = 0.4, 1.0  # m: cells in which beams are traced; before the end of a beam
@@ -196,7 +196,7 @@ class SweepLoopCloser:
         )
         if explained < _MIN_EXPLAINED_RATIO * odometry.explained[later]:
             return closure.reject("explains too little")
-        if self._plane_overlap(planes, sweep, later, state) < _MIN_PLANE_OVERLAP:
+        if self._plane_overlap(planes, sweep, later, state) < MIN_PLANE_OVERLAP:
             return closure.reject("surfaces do not overlap")
         grid, usual = self._build_grid(earlier)
         if self._occluded_share(grid, sweep, later, state) > usual + _MAX_OCCLUDED:
@@ -243,22 +243,10 @@ class SweepLoopCloser:
     def _plane_overlap(
         self, planes: _core.NdtMap3D, sweep: Sweep, later: int, state: State
     ) -> float:
-        """Share of the planes around a later sweep that lie on earlier ones.
-
-        Most of what a lidar sees in a street is the street, which fits any other. So every beam
-        counts by its leverage n^T (sum n n^T)^-1 n with the normal n at its end in the submap of
-        its own time: planes of every direction count the same.
-        """
-        own = self._build_planes(later)
+        """Share of the planes around a later sweep that lie on earlier ones."""
         points = sweep.deskew(state.twist).astype(np.float64)
-        normals, known = lidar_odometry.match_planes(own, points, self.odometry.poses[later])
-        n = normals[known]
-        if len(n) < 10:
-            return 0.0
-        spread = n.T @ n + 1e-6 * len(n) * np.eye(3)
-        leverage = np.einsum("ni,ij,nj->n", n, np.linalg.inv(spread), n)
-        _, met = lidar_odometry.match_planes(planes, points[known], state.T_map_base)
-        return float(leverage[met].sum() / leverage.sum())
+        own, T_own = self._build_planes(later), self.odometry.poses[later]
+        return plane_overlap(points, own, T_own, planes, state.T_map_base)
 
     def _occluded_share(
         self, grid: _core.OccupancyGrid3D, sweep: Sweep, t: int, state: State
@@ -273,3 +261,27 @@ class SweepLoopCloser:
             margin=_WALL_MARGIN,
             min_occupancy=WALL_OCCUPANCY,
         )
+
+
+def plane_overlap(
+    points: Float, own: _core.NdtMap3D, T_own: Float, planes: _core.NdtMap3D, T: Float
+) -> float:
+    """Share of the planes that a sweep meets in its own map which another map has, too.
+
+    Most of what a lidar sees in a street is the street, which fits any other. So every beam
+    counts by its leverage n^T (sum n n^T)^-1 n with the normal n at its end in its own map:
+    planes of every direction count the same.
+
+    Args:
+        points: (N, 3) of the sweep in the base frame.
+        own, planes: its own map, and the other one.
+        T_own, T: (4, 4) pose of the base in each.
+    """
+    normals, known = lidar_odometry.match_planes(own, points, T_own)
+    n = normals[known]
+    if len(n) < 10:
+        return 0.0
+    spread = n.T @ n + 1e-6 * len(n) * np.eye(3)
+    leverage = np.einsum("ni,ij,nj->n", n, np.linalg.inv(spread), n)
+    _, met = lidar_odometry.match_planes(planes, points[known], T)
+    return float(leverage[met].sum() / leverage.sum())

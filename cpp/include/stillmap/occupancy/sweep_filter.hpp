@@ -23,7 +23,8 @@
 namespace stillmap {
 
 struct SurfaceCell {
-  int32_t filter = -1;  // index of the cell's filter; -1: no beam ended here
+  static constexpr int32_t kNone = -1, kKnownFree = -2;
+  int32_t filter = kNone;  // index of the cell's filter; negative: no beam ended here
 };
 
 class SweepFilter : public FilterMap<3, SurfaceCell> {
@@ -56,6 +57,17 @@ class SweepFilter : public FilterMap<3, SurfaceCell> {
     // the first sweep of each bin stands for it
     if (views_.empty() || views_.back().bin < bin) views_.push_back(view);
     if (views_.size() > CellFilters::kMaxPasses) views_.pop_front();
+  }
+
+  // As of OccupancyFilter.
+  void prime(const Cell<3>& cell, bool is_occupied, double log_ratio) {
+    SurfaceCell& at = cell_at_or_new(cell);
+    if (!is_occupied) {
+      if (at.filter < 0) at.filter = SurfaceCell::kKnownFree;
+      return;
+    }
+    if (at.filter < 0) at.filter = filters_.add(nullptr, 0, -1, 0);
+    filters_.favour_static(at.filter, log_ratio);
   }
 
   // Calls visit(cell, P(standing)) for the cells of a block in which beams ended.
@@ -191,7 +203,8 @@ class SweepFilter : public FilterMap<3, SurfaceCell> {
       const Cell<3> cell = cell_of<3>(end);
       SurfaceCell& at = cell_at_or_new(cell);
       if (at.filter < 0) {
-        added.push_back({filters_.make_index(), centre_of(cell)});
+        const bool is_free = at.filter == SurfaceCell::kKnownFree;
+        added.push_back({filters_.make_index(), centre_of(cell), is_free});
         at.filter = added.back().filter;
         is_noted_.resize(filters_.size(), false);
       }
@@ -234,15 +247,20 @@ class SweepFilter : public FilterMap<3, SurfaceCell> {
   struct NewFilter {
     int32_t filter;
     Vec<3> centre;  // metres, of its cell
+    bool is_free;   // another map says so
   };
 
   // Initializes filters, at most RangeImage::kBatch, after the views of the last time bins, in
-  // which their cells were free.
+  // which their cells were free, or as free as can be.
   void initialize(const NewFilter* added, size_t count, int32_t tag) {
     std::vector<std::array<float, CellFilters::kMaxPasses>> passes(count);
     std::vector<int> pass_count(count, 0);
     std::vector<int32_t> last_bin(count, -1);
     std::array<float, RangeImage::kBatch> x, y, z, free_range;
+    for (size_t n = 0; n < count; ++n) {
+      passes[n].fill(kReliability);
+      if (added[n].is_free) pass_count[n] = CellFilters::kMaxPasses;
+    }
     for (const View& view : views_) {
       for (size_t n = 0; n < count; ++n) {
         const RangeImage::Point p = view.to_sensor(added[n].centre);
@@ -252,7 +270,7 @@ class SweepFilter : public FilterMap<3, SurfaceCell> {
       for (size_t n = 0; n < count; ++n) {
         const float distance = std::sqrt(x[n] * x[n] + y[n] * y[n] + z[n] * z[n]);
         const float reliability = visibility(view, distance, free_range[n]);
-        if (reliability < kMinReliability) continue;
+        if (reliability < kMinReliability || added[n].is_free) continue;
         passes[n][static_cast<size_t>(pass_count[n]++)] = reliability;
         last_bin[n] = view.bin;
       }

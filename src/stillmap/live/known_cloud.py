@@ -1,0 +1,145 @@
+"""A map in 3D from an earlier run, for localization: what stands, and where it was mapped from."""
+
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+import stillmap._core as _core
+from stillmap.core.errors import InputError
+from stillmap.em import GroundMap
+from stillmap.em.ground import fit_ground
+from stillmap.io.trajectory import read_tum
+from stillmap.live.known_map import LOG_RATIO, KnownMap
+from stillmap.live.map_view import is_level
+from stillmap.results.point_cloud import cloud_from_folder
+from stillmap.slam import lidar_odometry
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+_SPACING = 0.1  # m between the points that are kept: where sweeps are dense, all would be one ring
+# m by which the route is raised for the ground: the robot's base may lie in it
+_RAISE = 1.0
+_GROUND_CELL = 0.3  # m, of the level surface that shows the ground
+
+
+class KnownVoxels(NamedTuple):
+    """(K, 3) voxels, and (K,) whether surface runs there; else they are free."""
+
+    cells: Index
+    is_surface: NDArray[np.bool_]
+
+    def prime(self, labels: _core.SweepFilter3D) -> None:
+        """Tell the filters of voxels what is known of them."""
+        labels.prime(self.cells, self.is_surface, LOG_RATIO)
+
+
+class KnownCloud:
+    """A map in 3D to localize in.
+
+    Args:
+        source: folder of a result or a place of a lidar.
+        planar: its planar map.
+
+    Attributes:
+        planar: the planar map.
+        poses: (T, 4, 4) T_map_base from where it was mapped.
+        points: (N, 3) float32 where surface runs, m, in random order.
+        p_static: (N,) float32.
+
+    Raises:
+        InputError: it is of a planar laser, or damaged.
+    """
+
+    def __init__(self, source: str | os.PathLike[str], planar: KnownMap) -> None:
+        folder = Path(source)
+        if not (folder / "static.ply").exists():
+            hint = "sweeps are localized in the result of a spinning lidar"
+            raise InputError("holds no static.ply", where=str(source), hint=hint)
+        self.planar = planar
+        self.poses = _read_route(folder)
+        points, p_static = _read_points(folder)
+        # cells of planes take in so many points only, which must not all lie on one side
+        order = np.random.default_rng(0).permutation(len(points))
+        self.points, self.p_static = points[order], p_static[order]
+
+    def make_local_map(self) -> _core.NdtMap3D:
+        """The map that sweeps are registered to."""
+        local = lidar_odometry.make_local_map()
+        local.add(self.points, self.p_static, np.eye(4))
+        return local
+
+    def find_voxels(self, edge: float, band: tuple[float, float]) -> "KnownVoxels":
+        """What is known of voxels.
+
+        Args:
+            edge: m.
+            band: m above the ground in which columns that are free in the planar map are free.
+        """
+        surface = _cells_of(self.points, edge)
+        cells = np.concatenate([surface, self._free_voxels(edge, band)])
+        return KnownVoxels(np.ascontiguousarray(cells), np.arange(len(cells)) < len(surface))
+
+    def _free_voxels(self, edge: float, band: tuple[float, float]) -> Index:
+        """(K, 3) voxels that lie in the band of columns which are free."""
+        grid, ground = self.planar.grid, self._find_ground()
+        columns = _cells_of(grid.centres(np.argwhere(grid.free)), edge)
+        height = ground.height_at(np.asarray((columns + 0.5) * edge, np.float64))
+        first = np.ceil((height + band[0]) / edge).astype(np.int64)
+        last = np.floor((height + band[1]) / edge).astype(np.int64)
+        counts = np.maximum(last - first, 0)
+        of = np.repeat(np.arange(len(columns)), counts)
+        up = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+        return np.column_stack([columns[of], first[of] + up])
+
+    def _find_ground(self) -> GroundMap:
+        points = np.column_stack([self.points, np.ones(len(self.points))])
+        cells, sums = _sum_up(np.floor(self.points / _GROUND_CELL).astype(np.int64), points)
+        floor = (sums[:, :3] / sums[:, 3:])[is_level(cells)]
+        return fit_ground(floor, self.poses[:, :3, 3] + [0.0, 0.0, _RAISE])
+
+
+def _read_route(folder: Path) -> Float:
+    """(T, 4, 4) poses of a result, or of all sessions of a place."""
+    single = folder / "trajectory.tum"
+    paths = [single] if single.exists() else sorted(folder.glob("sessions/*/trajectory.tum"))
+    poses = [read_tum(path)[1] for path in paths]
+    if not sum(map(len, poses)):
+        raise InputError("holds no trajectory", where=str(folder))
+    return np.concatenate(poses)
+
+
+def _read_points(folder: Path) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(N, 3) the mean of the points in every voxel, and (N,) their mean P(static)."""
+    parts = [(np.zeros((0, 3), np.int64), np.zeros((0, 5)))]
+    for block in cloud_from_folder(folder, "static").iter_blocks():
+        more = np.column_stack([block.points, block.p_static, np.ones(len(block.points))])
+        cells = np.floor(block.points / _SPACING).astype(np.int64)
+        parts.append(_sum_up(cells, more))
+    keys, sums = _sum_up(*(np.concatenate(one) for one in zip(*parts, strict=True)))
+    if not len(keys):
+        raise InputError("has an empty map", where=str(folder / "static.ply"))
+    means = (sums[:, :4] / sums[:, 4:]).astype(np.float32)
+    return np.ascontiguousarray(means[:, :3]), np.ascontiguousarray(means[:, 3])
+
+
+def _sum_up(keys: Index, values: Float) -> tuple[Index, Float]:
+    """Cells (N, D), each once, and the sums of their values (N, K)."""
+    if not len(keys):
+        return keys, values
+    low = keys.min(axis=0)
+    shape = tuple((keys.max(axis=0) - low + 1).tolist())
+    flat = np.ravel_multi_index(tuple((keys - low).T), shape)
+    order = np.argsort(flat, kind="stable")
+    flat = flat[order]
+    first = np.flatnonzero(np.append(True, flat[1:] != flat[:-1]))
+    return keys[order[first]], np.add.reduceat(values[order], first, axis=0)
+
+
+def _cells_of(points: NDArray[np.floating], edge: float) -> Index:
+    """(K, D) the cells of points (N, D), each once."""
+    cells = np.floor(points / edge).astype(np.int64)
+    return _sum_up(cells, np.zeros((len(cells), 1)))[0]

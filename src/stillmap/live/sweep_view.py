@@ -1,0 +1,111 @@
+"""What a lidar saw since the robot was lost, in the plane, for the search in a planar map."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.grid_map import GridMap
+from stillmap.em import CellProbabilities, GroundMap
+from stillmap.live.causal_labels import CausalLabels
+from stillmap.live.local_map import MappedScan
+from stillmap.live.map_view import find_ground
+from stillmap.mapping.projection import project_cells
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+# m from the sensor to which the surroundings are compared: farther off sweeps show little of them
+_MAX_RANGE = 40.0
+# m above the ground below which beams show that nothing stands there: higher ones pass over cars;
+# m before their ends, which may be surface
+_CLEARANCE, _MARGIN = 0.6, 0.15
+_STEP = 0.5  # cells along a beam
+
+
+class SweepView:
+    """The planar view.
+
+    Args:
+        band: m above the ground, lowest and highest of obstacles.
+    """
+
+    def __init__(self, band: tuple[float, float]) -> None:
+        self._band = band
+        self._positions = np.zeros((0, 3))  # of the sensor
+        self._ground: GroundMap | None = None
+        self._free = np.zeros((0, 2), np.int64)  # cells, each once
+
+    def add(self, labels: CausalLabels, scan: MappedScan, pose: Float) -> None:
+        """Add the free space of a sweep.
+
+        Args:
+            labels: of what was seen so far.
+            scan: the sweep.
+            pose: (4, 4) of the robot in the frame of the labels.
+        """
+        beams, T, edge = scan.beams, pose @ scan.beams.T_base_sensor, labels.resolution
+        self._positions = np.concatenate([self._positions, T[None, :3, 3]])
+        self._ground = find_ground(labels.known_cells(), self._positions, edge)
+        near = beams.hit & (np.einsum("ni,ni->n", beams.points, beams.points) < _MAX_RANGE**2)
+        ends = beams.points[near].astype(np.float64) @ T[:3, :3].T + T[:3, 3]
+        free = _trace_low(T[:3, 3], ends, self._ground, _STEP * edge)
+        cells = np.floor(free / edge).astype(np.int64)
+        self._free = _take_each_once(np.concatenate([self._free, cells]))
+
+    def draw(self, labels: CausalLabels) -> GridMap:
+        """The view, in the frame of the labels; NaN: unknown."""
+        assert self._ground is not None
+        edge = labels.resolution
+        near = self._select_near(labels.seen_cells(), edge)
+        columns = project_cells(near, self._ground, self._band, edge)
+        both = np.concatenate([self._free, columns.cells])
+        if not len(both):
+            return GridMap(np.zeros((0, 0), np.float32), (0.0, 0.0, 0.0), edge)
+        first = both.min(axis=0)
+        p_occupied = np.full((both.max(axis=0) + 1 - first)[::-1], np.nan, np.float32)
+        for cells, p in ((self._free, np.float32(0.0)), (columns.cells, columns.p_occupied)):
+            x, y = (cells - first).T
+            p_occupied[y, x] = p
+        x0, y0 = (first * edge).tolist()
+        return GridMap(p_occupied, (x0, y0, 0.0), edge)
+
+    def _select_near(self, seen: CellProbabilities, edge: float) -> CellProbabilities:
+        from scipy import spatial  # slow to load
+
+        tree = spatial.cKDTree(self._positions[:, :2])
+        distance, _ = tree.query((seen.cells[:, :2] + 0.5) * edge)
+        near = distance < _MAX_RANGE
+        return CellProbabilities(seen.cells[near], seen.p_occupied[near], seen.free_prior)
+
+
+def _trace_low(start: Float, ends: Float, ground: GroundMap, step: float) -> Float:
+    """(n, 2) positions along beams where these run low above the ground.
+
+    Args:
+        start: (3,) of the sensor.
+        ends: (N, 3).
+        ground: height of the ground.
+        step: m between positions.
+    """
+    length = np.linalg.norm(ends[:, :2] - start[:2], axis=1)
+    top = start[2] - float(ground.height_at(start[None, :2])[0])
+    bottom = ends[:, 2] - ground.height_at(ends[:, :2])
+    low = (bottom < _CLEARANCE) & (length > _MARGIN)
+    ends, length, bottom = ends[low], length[low], bottom[low]
+    first = np.clip((top - _CLEARANCE) / np.maximum(top - bottom, 1e-6), 0.0, 1.0) * length
+    counts = np.maximum(np.floor((length - _MARGIN - first) / step), 0.0).astype(np.int64)
+    of = np.repeat(np.arange(len(ends)), counts)
+    number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    share = (first[of] + (number + 0.5) * step) / length[of]
+    out: Float = start[:2] + share[:, None] * (ends[of, :2] - start[:2])
+    return out
+
+
+def _take_each_once(cells: Index) -> Index:
+    """(K, 2) of the cells (N, 2)."""
+    if not len(cells):
+        return cells
+    low = cells.min(axis=0)
+    width = int(cells[:, 1].max() - low[1]) + 1
+    flat = np.unique((cells[:, 0] - low[0]) * width + (cells[:, 1] - low[1]))
+    out: Index = np.stack(np.divmod(flat, width), axis=1) + low
+    return out
