@@ -90,11 +90,11 @@ def stated_license(name: str) -> str:
         about = metadata.metadata(name)
     except metadata.PackageNotFoundError:
         return ""
-    if about["License-Expression"]:
+    if about.get("License-Expression"):
         return str(about["License-Expression"])
     kinds = [one.split(" :: ") for one in about.get_all("Classifier") or []]
     classified = [kind[-1] for kind in kinds if kind[0] == "License" and len(kind) > 1]
-    text = str(about["License"] or "").strip()
+    text = str(about.get("License") or "").strip()
     # some have the whole text there, below its name
     stated = [text.partition("\n")[0].strip(), " OR ".join(classified)]
     return next(filter(is_permissive, stated), next(filter(None, stated), ""))

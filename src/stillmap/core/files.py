@@ -69,8 +69,11 @@ def require_new_file(path: Path, overwrite: bool = False) -> None:
         raise InputError(
             "is there already", where=str(path), hint="choose another or give overwrite=True"
         )
-    if not target.parent.is_dir():
-        raise InputError("cannot be written: no such folder", where=str(path.parent))
+    if target.parent.is_dir():
+        return
+    if target.parent.exists():
+        raise InputError("cannot be written: Not a directory", where=str(path))
+    raise InputError("cannot be written: no such folder", where=str(path.parent))
 
 
 @contextmanager
