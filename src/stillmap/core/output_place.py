@@ -1,4 +1,4 @@
-"""Where an output is written: links followed, hidden names for what is not finished yet.
+"""Paths of outputs and of their temporary files; symbolic links are followed.
 
 Usually that is beside the output, so that a rename makes it appear. A folder that cannot be renamed
 (a mount point, or one in a folder that must not be changed) has the hidden names inside.

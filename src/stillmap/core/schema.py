@@ -53,7 +53,7 @@ def check(value: Any, kind: Any, name: str = "") -> None:
 
 
 def fits(value: Any, kind: Any) -> bool:
-    """Whether a value has a type."""
+    """True if a value is of a type."""
     try:
         check(value, kind)
     except SchemaError:

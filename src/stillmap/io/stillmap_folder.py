@@ -224,7 +224,7 @@ def read(path: Path, scratch: Path | None = None) -> Recording:
 
 
 def has_beam_times(path: Path) -> bool:
-    """Whether a recording folder holds the times of its beams.
+    """True if a recording folder has the time of each beam.
 
     Raises:
         InputError: its header is missing or damaged.

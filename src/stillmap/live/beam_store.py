@@ -120,7 +120,7 @@ class BeamStore:
         return _Segment([ArrayBuilder(t, row, self._folder, QUICKLY_WRITTEN) for t, row in fields])
 
     def _thin_if_due(self) -> Iterator[None]:
-        """What is to be done now, step by step: where too much is held, `_thin`."""
+        """Begin to thin if more than the bound is held; the steps, or none."""
         in_memory = self.was_full and self._sum("memory_bytes") > _IN_MEMORY_IF_FULL
         on_disk = self._sum("byte_count") > self._max_bytes
         if not in_memory and not on_disk:

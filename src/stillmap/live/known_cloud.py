@@ -73,7 +73,7 @@ class KnownCloud:
         return local
 
     def find_voxels(self, edge: float, band: tuple[float, float]) -> "KnownVoxels":
-        """What is known of voxels.
+        """Voxels of the known map with which the labels are initialized.
 
         Args:
             edge: m.

@@ -232,7 +232,7 @@ class LiveMapper:
 
     @property
     def _pushed(self) -> OnlineSlam:
-        """What is known since the first scan; an error before."""
+        """The mapping that began with the first scan; an error before it."""
         if self._slam is None or self._last_ns is None:
             raise InputError("no scan was pushed yet")
         return self._slam

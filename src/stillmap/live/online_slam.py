@@ -132,7 +132,7 @@ class OnlineSlam:
         return self.labels.label(deskew(beams, self.history.twist_at(number)), pose)
 
     def placement(self) -> Placement:
-        """Where all scans were taken, as it is known now."""
+        """Poses and submaps of all scans, as they are estimated now."""
         _, local, anchor = self.history.poses()
         moved = self._finder.move_all(local)
         # in a known map that frame is the map's

@@ -38,7 +38,7 @@ def adopt_resolution(options: Options, known: KnownMap) -> Options:
 def make_tracker(
     source: str | os.PathLike[str], known: KnownMap, mode: Mode, dimension: int, options: Options
 ) -> "PlaceTracker":
-    """What tracks a robot in a known map.
+    """Make the tracker of a robot in a known map.
 
     Args:
         source: folder of a result or a place.

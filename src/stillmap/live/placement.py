@@ -1,4 +1,4 @@
-"""Where scans were taken: in the map, in another one of their own, or nobody knows."""
+"""Poses of scans in the map or in a submap that no constraint ties to it."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,7 +19,7 @@ _MIN_SCANS = 20  # of a map of its own
 
 @dataclass(frozen=True, eq=False)
 class Placement(ShortRepr):
-    """Where T scans were taken.
+    """Poses of T scans, each in the map or in a submap.
 
     Attributes:
         poses: (T, D+1, D+1) T_map_base, in the frame of the submap.

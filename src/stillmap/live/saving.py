@@ -125,7 +125,7 @@ class Snapshot(ShortRepr):
         return other if self.kept.disk_was_full else self.scratch
 
     def _describe_lost(self, stamp_ns: NDArray[np.int64], submaps: int) -> list[str]:
-        """What a warning says about the scans whose place in the map is not known."""
+        """Warnings about scans whose pose in the map is unknown."""
         lost = np.flatnonzero(self.placement.submap)
         if not len(lost):
             return []

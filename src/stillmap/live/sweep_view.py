@@ -1,4 +1,4 @@
-"""What a lidar saw since the robot was lost, in the plane, for the search in a planar map."""
+"""Planar projection of the sweeps since the robot was lost, for global localization."""
 
 import numpy as np
 from numpy.typing import NDArray
