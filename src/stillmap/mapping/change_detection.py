@@ -12,6 +12,7 @@ from stillmap.core.short_repr import ShortRepr
 from stillmap.em import CellHistories, ChangedCells, time_bin_index
 from stillmap.em.change_hmm import MIN_RECURRING_CHANGES
 from stillmap.mapping.doors import compute_swept_cells
+from stillmap.mapping.witnesses import MoverPoints, is_explained
 
 Cells = NDArray[np.int64]
 Index = NDArray[np.intp]
@@ -68,7 +69,11 @@ class Change(ShortRepr):
 
 
 def detect_changes(
-    histories: CellHistories, recording: Recording, resolution: float, time_bin: float
+    histories: CellHistories,
+    recording: Recording,
+    resolution: float,
+    time_bin: float,
+    movers: MoverPoints | None = None,
 ) -> list[Change]:
     """The changed places, in the order of time.
 
@@ -77,12 +82,14 @@ def detect_changes(
         recording: with the stamps of the time bins.
         resolution: m, edge of a cell.
         time_bin: s, width of a time bin.
+        movers: end points on movers; of the changes in view only those near one are kept. None:
+            all are.
     """
     changed = histories.select(
         (histories.p_changing > _MIN_PROBABILITY) & (histories.n_changes > 0)
     )
     unchanged = histories.cells[histories.p_unchanged > _MIN_PROBABILITY]
-    return group_changes(changed, unchanged, recording, resolution, time_bin)
+    return group_changes(changed, unchanged, recording, resolution, time_bin, movers)
 
 
 def group_changes(
@@ -91,6 +98,7 @@ def group_changes(
     recording: Recording,
     resolution: float,
     time_bin: float,
+    movers: MoverPoints | None = None,
 ) -> list[Change]:
     """Group changed cells to places, in the order of time.
 
@@ -100,11 +108,19 @@ def group_changes(
         recording: with the stamps of the time bins.
         resolution: m, edge of a cell.
         time_bin: s, width of a time bin.
+        movers: see `detect_changes`.
     """
     radius = _LINK_DISTANCE / resolution
-    recurring = changed.n_changes >= MIN_RECURRING_CHANGES
     stamps = _BinStamps(recording, time_bin)
-    events = _make_events(changed, np.flatnonzero(~recurring), stamps)
+    recurring = changed.n_changes >= MIN_RECURRING_CHANGES
+    if movers is not None:
+        recurring &= _explained_recurring(changed, stamps, resolution, movers)
+    single = changed.n_changes < MIN_RECURRING_CHANGES
+    events = _make_events(changed, np.flatnonzero(single), stamps)
+    if movers is not None:
+        xy = np.asarray((changed.cells[events.cell] + 0.5) * resolution, np.float64)
+        kept = is_explained(xy, events.before, events.after, movers)
+        events = events.select(np.flatnonzero(kept))
     out = []
     for group in _group_events(events, changed.cells, radius):
         out += _split_by_time(group, changed.cells, resolution)
@@ -148,6 +164,19 @@ def _make_events(changed: ChangedCells, cells: Index, stamps: _BinStamps) -> _Ev
     came = (changed.p_object[cell] > 0.5) == (which == 1)
     bins = changed.change_bins[cell, which]
     return _Events(cell, came, stamps.last(bins[:, 0]), stamps.first(bins[:, 1]))
+
+
+def _explained_recurring(
+    changed: ChangedCells, stamps: _BinStamps, resolution: float, movers: MoverPoints
+) -> NDArray[np.bool_]:
+    """(K,) whether the first or the last change of a cell is explained."""
+    xy = np.asarray((changed.cells + 0.5) * resolution, np.float64)
+    bins = np.maximum(changed.change_bins, 0)
+    first, last = (
+        is_explained(xy, stamps.last(bins[:, k, 0]), stamps.first(bins[:, k, 1]), movers)
+        for k in (0, 1)
+    )
+    return np.asarray(first | last)
 
 
 def _group_events(events: _Events, cells: Cells, radius: float) -> list[_Events]:

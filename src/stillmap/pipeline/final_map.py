@@ -16,16 +16,19 @@ from stillmap.core.short_repr import ShortRepr
 from stillmap.em import GroundMap, estimate_ground
 from stillmap.mapping import (
     Change,
+    MoverPoints,
     detect_changes,
     detect_changes_3d,
     find_changed_object_beams,
     relabel_changes,
+    update_occupancy,
 )
 from stillmap.mapping.projection import project_cells, project_to_plane
 from stillmap.mapping.reflections import P_REFLECTED, remove_reflections
 from stillmap.pipeline.estimate import Estimate
 from stillmap.pipeline.options import Options
 from stillmap.tracking import MovingObject, track_objects
+from stillmap.tracking.motion_evidence import apply_motion_evidence
 from stillmap.tracking.objects_3d import track_objects_3d
 
 
@@ -72,9 +75,10 @@ def final_estimate(
     best = best.with_labels(p_static=found.p_static, occupied=found.occupied, learned=found.learned)
     if courses is None:
         return deskewed, best, []
+    best, movers = _add_motion_evidence(deskewed, best, courses, threads)
     if best.e_step.occupied is None:
         raise RuntimeError("the default estimator knows its cells")
-    changes = detect_changes(courses, deskewed, cell, look)
+    changes = detect_changes(courses, deskewed, cell, look, movers)
     p_static, occupied = relabel_changes(
         deskewed,
         best.poses,
@@ -91,6 +95,19 @@ def final_estimate(
         best.with_labels(p_static=p_static, occupied=occupied, learned=learned),
         changes,
     )
+
+
+def _add_motion_evidence(
+    deskewed: Recording, best: Estimate, courses: em.CellHistories, threads: int
+) -> tuple[Estimate, MoverPoints]:
+    """Labels of beams and cells, given which tracks are movers; the end points on these."""
+    if best.e_step.occupied is None:
+        raise RuntimeError("the default estimator knows its cells")
+    p_static, movers = apply_motion_evidence(deskewed, best.poses, best.p_static)
+    occupied = update_occupancy(
+        deskewed, best.poses, best.p_static, p_static, courses, best.e_step.occupied, threads
+    )
+    return best.with_labels(p_static=p_static, occupied=occupied), movers
 
 
 def make_maps(

@@ -110,9 +110,15 @@ def stitch_tracklets(points: DynamicPoints, owner: Index) -> Index:
         points: dynamic end points.
         owner: (N,) track numbers from `assign_tracks`.
     """
-    owner = _merge_pairs(points, owner)
-    owner = _join_across_gaps(points, owner)
-    return _confirm(points, owner)
+    return _confirm(points, join_tracklets(points, owner))
+
+
+def join_tracklets(points: DynamicPoints, owner: Index) -> Index:
+    """(N,) track numbers after parts of one object were joined, at one time and across gaps.
+
+    Args: see `stitch_tracklets`.
+    """
+    return _join_across_gaps(points, _merge_pairs(points, owner))
 
 
 def _merge_pairs(points: DynamicPoints, owner: Index) -> Index:

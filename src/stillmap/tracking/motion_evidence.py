@@ -1,0 +1,209 @@
+"""Motion evidence: the probability that what a track follows is a mover, not clutter.
+
+Furniture that some looks hit and others pass (legs of chairs, edges, thin stands, under a scan
+plane that tilts) resembles a mover in each of its cells. Over a track it does not: it goes nowhere,
+beams pass its place between two detections, it appears and vanishes in plain view. The share of
+movers among the tracks is learned from each recording by EM: where many people walk, one that
+stands is believed to be another; where nobody walks, it is not. See `docs/objects.md`.
+"""
+
+import itertools
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core import arrays
+from stillmap.core.recording import Recording
+from stillmap.mapping import MoverPoints
+from stillmap.tracking.association import MAX_GAP, assign_tracks, regress_velocity
+from stillmap.tracking.clustering import DynamicPoints, extract_dynamic_points
+from stillmap.tracking.looks import Look, classify_looks
+from stillmap.tracking.steady_motion import count_steady_windows
+from stillmap.tracking.tracklets import compute_centroids, iterate_tracks, join_tracklets
+
+Float = NDArray[np.float64]
+Index = NDArray[np.intp]
+Places = tuple[Index, Float]  # scans (n,) and positions (n, 2) of one track
+
+_MIN_P_DYNAMIC = 0.5  # of the beams that are judged
+_LOOK_TIME = 0.1  # s: looks nearer in time say the same
+_EDGE_TIME, _EDGE_LOOKS = 1.0, 8  # s before the first and after the last detection; looks there
+_OPEN_SHARE = 0.28  # of these looks that pass: the end lies in plain view
+_REST_TIME = 0.3  # s, see regress_velocity
+_BATCH = 1 << 12  # tracks whose looks are classified at once
+
+# Beta(1, 15): share of the windows in which clutter seems to move; also of half of the movers
+_STILL_WINDOWS = 15.0
+_SEEN_LOOKS = 19.0  # Beta(19, 1): share of the looks that detect a mover in view
+_THIN_HITS, _THIN = 3.0, (5.0, 3.0)  # hits per look below which half of the movers are thin: Beta
+_OPEN = 0.5  # nats against a mover, for each end in plain view
+_ROUNDS = 100  # of EM at most
+_TOLERANCE = 1e-6  # of the share, at which EM ends
+_MIN_SHARE = 1e-4  # of movers, and of clutter
+_MAX_LOG_ODDS = 50.0
+
+
+class TrackEvidence(NamedTuple):
+    """What is known of K tracks, each (K,).
+
+    Attributes:
+        looks: detections, at most one per 0.1 s.
+        hits: end points per detection.
+        missed: looks between detections in which beams passed.
+        windows, moving: windows of 1.5 s, one after the other, and those of steady motion.
+        open_ends: 0 to 2, how many of its ends lie in plain view.
+    """
+
+    looks: Float
+    hits: Float
+    missed: Float
+    windows: Float
+    moving: Float
+    open_ends: Float
+
+
+def apply_motion_evidence(
+    recording: Recording, poses: Float, p_static: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], MoverPoints]:
+    """Labels of the beams, given what the tracks of the dynamic ones say.
+
+    A beam is dynamic if its cell says so and its track does: 1 - e becomes (1 - e) P(mover).
+
+    Args:
+        recording: 2D, M beams, deskewed.
+        poses: (T, 3, 3) T_map_base.
+        p_static: (M,) P(c = 1) from the cells alone.
+
+    Returns:
+        (M,) P(c = 1); the end points of tracks that are more probably movers, thinned.
+    """
+    points = extract_dynamic_points(recording, poses, p_static, _MIN_P_DYNAMIC)
+    if not len(points.scan):
+        return p_static, MoverPoints.none()
+    owner = join_tracklets(points, assign_tracks(points, MAX_GAP))
+    p_mover = weigh_tracks(recording, poses, points, owner)
+    out, movers = arrays.copy(p_static, recording.scratch), list[MoverPoints]()
+    for block in arrays.iter_blocks(points.beam, points.xy, points.scan):
+        p, beam = p_mover[owner[block]].astype(np.float32), points.beam[block]
+        out[beam] = 1.0 - (1.0 - out[beam]) * p
+        xy, stamp_ns = points.xy[block], recording.stamp_ns[points.scan[block]]
+        movers.append(MoverPoints(xy[p > 0.5], stamp_ns[p > 0.5]).thin())
+    return out, MoverPoints.concatenate(movers)
+
+
+def weigh_tracks(recording: Recording, poses: Float, points: DynamicPoints, owner: Index) -> Float:
+    """(K,) P(mover) by track number; 0 where no track has that number.
+
+    Args:
+        recording, poses: see `apply_motion_evidence`.
+        points: dynamic end points.
+        owner: (N,) their tracks, from 0 to K - 1.
+    """
+    tracks, evidence = collect_evidence(recording, recording.T_map_sensor(poses), points, owner)
+    out = np.zeros(int(tracks.max()) + 1)
+    out[tracks] = fit_share(compute_log_ratio(evidence), evidence.looks)
+    return out
+
+
+def fit_share(log_ratio: Float, weight: Float) -> Float:
+    """(K,) P(mover) of tracks with log likelihood ratios (K,), the share of movers fitted by EM.
+
+    Args:
+        log_ratio: nats, of mover to clutter.
+        weight: (K,) of each track in the share.
+    """
+    share, p = 0.5, np.full(len(log_ratio), 0.5)
+    for _ in range(_ROUNDS):
+        log_odds = log_ratio + np.log(share / (1.0 - share))
+        p = 1.0 / (1.0 + np.exp(-np.clip(log_odds, -_MAX_LOG_ODDS, _MAX_LOG_ODDS)))
+        last, share = share, float((np.sum(weight * p) + 1.0) / (np.sum(weight) + 2.0))
+        share = min(max(share, _MIN_SHARE), 1.0 - _MIN_SHARE)
+        if abs(share - last) < _TOLERANCE:
+            break
+    return p
+
+
+def compute_log_ratio(e: TrackEvidence) -> Float:
+    """(K,) log likelihood ratio of mover to clutter, nats: motion + detection + open ends."""
+    rest = e.windows - e.moving
+    still = _log_mean_power(e.moving, rest, 1.0, _STILL_WINDOWS)
+    motion = np.logaddexp(_log_mean_power(e.moving, rest, 1.0, 1.0), still) - np.log(2.0) - still
+    # the first detection began the track: it says nothing
+    seen = np.maximum(e.looks - 1.0, 0.0)
+    thick = _log_mean_power(seen, e.missed, _SEEN_LOOKS, 1.0)
+    thin = np.logaddexp(thick, _log_mean_power(seen, e.missed, *_THIN)) - np.log(2.0)
+    detection = np.where(e.hits < _THIN_HITS, thin, thick)
+    detection -= _log_mean_power(seen, e.missed, 1.0, 1.0)
+    return np.asarray(motion + detection - _OPEN * e.open_ends)
+
+
+def _log_mean_power(successes: Float, failures: Float, a: float, b: float) -> Float:
+    """(K,) ln of the mean of q^successes (1 - q)^failures over q from Beta(a, b)."""
+    from scipy.special import betaln  # slow to load
+
+    return np.asarray(betaln(successes + a, failures + b) - betaln(a, b))
+
+
+def collect_evidence(
+    recording: Recording, T_map_sensor: Float, points: DynamicPoints, owner: Index
+) -> tuple[Index, TrackEvidence]:
+    """Track numbers (K,), rising, and what is known of each.
+
+    Args:
+        recording: 2D.
+        T_map_sensor: (T, 3, 3) sensor poses.
+        points, owner: see `weigh_tracks`.
+    """
+    period = float(np.median(np.diff(points.seconds))) if len(points.seconds) > 1 else _LOOK_TIME
+    stride = max(1, round(_LOOK_TIME / max(period, 1e-3)))
+    parts, tracks = [], list[int]()
+    pairs = iterate_tracks(points, owner)
+    while batch := list(itertools.islice(pairs, _BATCH)):
+        tracks += [track for track, _ in batch]
+        rows, gaps, ends = [], list[Places](), list[Places]()
+        for _, here in batch:
+            found = compute_centroids(points, owner, here)
+            looks, t = len(found.scan), points.seconds[found.scan]
+            steady = count_steady_windows(t, found.xy, period)
+            rows.append((max(1.0, looks / stride), len(here) / looks, *steady))
+            gaps.append(_interpolate_gaps(points.seconds, found.scan, found.xy, stride))
+            ends += _extrapolate_ends(points.seconds, found.scan, found.xy)
+        missed = _count_passed(recording, T_map_sensor, gaps)
+        sampled = np.array([len(scan) for scan, _ in ends])
+        passed = _count_passed(recording, T_map_sensor, ends)
+        is_open = (sampled > 1) & (passed >= _OPEN_SHARE * sampled)
+        parts.append(np.column_stack([np.array(rows), missed, is_open.reshape(-1, 2).sum(axis=1)]))
+    looks_, hits, windows, moving, missed, open_ends = np.concatenate(parts).T
+    evidence = TrackEvidence(looks_, hits, missed, windows, moving, open_ends)
+    return np.array(tracks), evidence
+
+
+def _count_passed(recording: Recording, T_map_sensor: Float, places: list[Places]) -> Float:
+    """(L,) looks that passed, of L lists of places."""
+    of = np.repeat(np.arange(len(places)), [len(scan) for scan, _ in places])
+    scan, xy = (np.concatenate(column) for column in zip(*places, strict=True))
+    look = classify_looks(recording, T_map_sensor, scan, xy)
+    passed = (look == Look.PASSED).astype(np.float64)
+    return np.asarray(np.bincount(of, passed, minlength=len(places)), np.float64)
+
+
+def _interpolate_gaps(seconds: Float, scan: Index, xy: Float, stride: int) -> Places:
+    """Scans without a detection between those with one (L,), every `stride`-th, and the places."""
+    between = np.setdiff1d(np.arange(scan[0], scan[-1]), scan)[::stride]
+    t, at = seconds[scan], seconds[between]
+    return between, np.column_stack([np.interp(at, t, xy[:, 0]), np.interp(at, t, xy[:, 1])])
+
+
+def _extrapolate_ends(seconds: Float, scan: Index, xy: Float) -> Iterator[Places]:
+    """Scans of the second before the first detection and after the last, and the places then."""
+    t = seconds[scan]
+    first, last = np.searchsorted(seconds, [t[0] - _EDGE_TIME, t[-1] + _EDGE_TIME])
+    for at, end, scans in (
+        (0, t <= t[0] + _EDGE_TIME, np.arange(first, scan[0])),
+        (-1, t >= t[-1] - _EDGE_TIME, np.arange(scan[-1] + 1, last)),
+    ):
+        some = scans[:: max(1, -(-len(scans) // _EDGE_LOOKS))]
+        velocity = regress_velocity(t[end], xy[end], _REST_TIME)
+        yield some, xy[at] + (seconds[some] - t[at])[:, None] * velocity
