@@ -29,6 +29,7 @@ Places = tuple[Index, Float]  # scans (n,) and positions (n, 2) of one track
 
 _MIN_P_DYNAMIC = 0.5  # of the beams that are judged
 _LOOK_TIME = 0.1  # s: looks nearer in time say the same
+_MAX_JUMP = 1.0  # m between two detections at one place
 _EDGE_TIME, _EDGE_LOOKS = 1.0, 8  # s before the first and after the last detection; looks there
 _OPEN_SHARE = 0.28  # of these looks that pass: the end lies in plain view
 _REST_TIME = 0.3  # s, see regress_velocity
@@ -190,8 +191,13 @@ def _count_passed(recording: Recording, T_map_sensor: Float, places: list[Places
 
 
 def _interpolate_gaps(seconds: Float, scan: Index, xy: Float, stride: int) -> Places:
-    """Scans without a detection between those with one (L,), every `stride`-th, and the places."""
+    """Scans without a detection between those with one (L,), every `stride`-th, and the places.
+
+    Only between two detections at one place: of a track that has jumped the place is not known.
+    """
     between = np.setdiff1d(np.arange(scan[0], scan[-1]), scan)[::stride]
+    after = np.searchsorted(scan, between)
+    between = between[np.linalg.norm(xy[after] - xy[after - 1], axis=1) < _MAX_JUMP]
     t, at = seconds[scan], seconds[between]
     return between, np.column_stack([np.interp(at, t, xy[:, 0]), np.interp(at, t, xy[:, 1])])
 
