@@ -135,6 +135,17 @@ class EStepResult(ShortRepr):
     changed_cells: ChangedCells | None = None
     ground: GroundMap | None = None
 
+    @property
+    def known_cells(self) -> CellProbabilities:
+        """Occupancy of cells in which beams ended.
+
+        Raises:
+            ValueError: the estimator has none.
+        """
+        if self.occupied is None:
+            raise ValueError("occupied: only the default estimator knows its cells")
+        return self.occupied
+
 
 def fill_beams(
     points: NDArray[np.float32], hit: NDArray[np.bool_], values: NDArray[np.float32], prior: float

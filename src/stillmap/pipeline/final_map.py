@@ -76,36 +76,40 @@ def final_estimate(
     if courses is None:
         return deskewed, best, []
     best, movers = _add_motion_evidence(deskewed, best, courses, threads)
-    if best.e_step.occupied is None:
-        raise RuntimeError("the default estimator knows its cells")
     changes = detect_changes(courses, deskewed, cell, look, movers)
+    return deskewed, _relabel(deskewed, best, courses, changes, options, threads), changes
+
+
+def _relabel(
+    deskewed: Recording,
+    best: Estimate,
+    courses: em.CellHistories,
+    changes: list[Change],
+    options: Options,
+    threads: int,
+) -> Estimate:
+    """The labels and cells of changed places, in the state that the map shows."""
     p_static, occupied = relabel_changes(
         deskewed,
         best.poses,
         best.p_static,
-        best.e_step.occupied,
+        best.e_step.known_cells,
         courses,
         changes,
         options.output.map_state,
         threads,
     )
     learned = {**best.e_step.learned, "changing": round(courses.changing_weight, 6)}
-    return (
-        deskewed,
-        best.with_labels(p_static=p_static, occupied=occupied, learned=learned),
-        changes,
-    )
+    return best.with_labels(p_static=p_static, occupied=occupied, learned=learned)
 
 
 def _add_motion_evidence(
     deskewed: Recording, best: Estimate, courses: em.CellHistories, threads: int
 ) -> tuple[Estimate, MoverPoints]:
     """Labels of beams and cells, given which tracks are movers; the end points on these."""
-    if best.e_step.occupied is None:
-        raise RuntimeError("the default estimator knows its cells")
     p_static, movers = apply_motion_evidence(deskewed, best.poses, best.p_static)
     occupied = update_occupancy(
-        deskewed, best.poses, best.p_static, p_static, courses, best.e_step.occupied, threads
+        deskewed, best.poses, best.p_static, p_static, courses, best.e_step.known_cells, threads
     )
     return best.with_labels(p_static=p_static, occupied=occupied), movers
 

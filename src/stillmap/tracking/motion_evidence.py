@@ -39,6 +39,7 @@ _BATCH = 1 << 12  # tracks whose looks are classified at once
 _STILL_WINDOWS = 15.0
 _SEEN_LOOKS = 19.0  # Beta(19, 1): share of the looks that detect a mover in view
 _THIN_HITS, _THIN = 3.0, (5.0, 3.0)  # hits per look below which half of the movers are thin: Beta
+_CLUTTER = (1.0, 1.0)  # Beta: share of the looks that detect clutter
 _OPEN = 0.5  # nats against a mover, for each end in plain view
 _ROUNDS = 100  # of EM at most
 _TOLERANCE = 1e-6  # of the share, at which EM ends
@@ -136,7 +137,7 @@ def compute_log_ratio(e: TrackEvidence) -> Float:
     thick = _log_mean_power(seen, e.missed, _SEEN_LOOKS, 1.0)
     thin = np.logaddexp(thick, _log_mean_power(seen, e.missed, *_THIN)) - np.log(2.0)
     detection = np.where(e.hits < _THIN_HITS, thin, thick)
-    detection -= _log_mean_power(seen, e.missed, 1.0, 1.0)
+    detection -= _log_mean_power(seen, e.missed, *_CLUTTER)
     return np.asarray(motion + detection - _OPEN * e.open_ends)
 
 
