@@ -21,6 +21,7 @@ from stillmap.pipeline.diagnostics import find_map_warnings, find_warnings
 from stillmap.pipeline.em_loop import iterate
 from stillmap.pipeline.estimate import EmState, Estimate, IterationRecord
 from stillmap.pipeline.final_map import Maps, final_estimate, find_objects, make_maps
+from stillmap.pipeline.memory_need import require_map_memory
 from stillmap.pipeline.options import DEFAULTS, Options, resolve_options
 from stillmap.pipeline.pose_sources import better_source
 from stillmap.pipeline.quality import Quality, rate_quality
@@ -151,6 +152,7 @@ def map_recording(
 
     Raises:
         ValueError: a recording without scans, or poses of another shape.
+        InputError: the map takes more memory than may be used.
         OSError: the disk of `scratch` is full.
     """
     if recording.n_scans == 0:
@@ -165,6 +167,7 @@ def map_recording(
         if poses is not None:
             recording, more = leave_out_far_scans(recording, poses, options.slam.resolution)
             notes += more
+        require_map_memory(recording, poses, options.slam.resolution)
         recording, options, more = time_sweeps(recording, options)
         notes += more
         if poses is None:
