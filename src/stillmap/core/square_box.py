@@ -1,8 +1,8 @@
 """Boxes for dense arrays of squares: around everything seen, or around most of it.
 
 One pose that is kilometres off makes the box around all squares nearly empty, and too large for
-memory and disk. Real places fill their boxes: a strip 20 m wide around a square of 1 km fills an
-eighth of it. So a box that is much larger than what was seen shrinks to where most was.
+memory and disk. So a box that is much larger than what was seen shrinks: to the place where most
+was seen, whole if it is connected, and to what lies near it.
 """
 
 import math
@@ -11,9 +11,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.components import adjacent_pairs, component_labels
+
 Squares = NDArray[np.int64]
 
 _MOST_PER_SEEN = 64  # squares of a box for each that was seen
+_GAP = 16  # squares, about, between parts of one place, which stays whole
 
 
 class SquareBox(NamedTuple):
@@ -66,12 +69,22 @@ def bound_box(
     if whole.area <= limit:
         return whole
     center = find_busiest(squares if places is None else places, math.isqrt(limit) // 2)
-    order = np.argsort(np.abs(squares - center).max(axis=1), kind="stable")
+    distance = np.abs(squares - center).max(axis=1)
+    joined = _find_joined(squares, distance)
+    order = np.lexsort((distance, ~joined))
     low = np.minimum.accumulate(squares[order], axis=0)
     high = np.maximum.accumulate(squares[order], axis=0)
-    areas = (high - low + 1).astype(np.float64).prod(axis=1)  # of the boxes around the nearest
+    areas = (high - low + 1).astype(np.float64).prod(axis=1)  # of the boxes around the first
+    limit = min(max(limit, int(areas[np.count_nonzero(joined) - 1])), most)
     last = int(np.searchsorted(areas, float(limit), side="right")) - 1
     return SquareBox(low[last], high[last])
+
+
+def _find_joined(squares: Squares, distance: Squares) -> NDArray[np.bool_]:
+    """(N,) squares that others without larger gaps join to the one at the least distance (N,)."""
+    large, of = np.unique(squares // _GAP, axis=0, return_inverse=True)
+    part = component_labels(adjacent_pairs(large), len(large))[of.reshape(-1)]
+    return np.asarray(part == part[np.argmin(distance)])
 
 
 def find_busiest(places: Squares, edge: int) -> Squares:

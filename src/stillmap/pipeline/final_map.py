@@ -174,7 +174,8 @@ def _occupancy_maps(
 def _wanted_places(planar: Recording, estimate: Estimate, options: Options) -> NDArray[np.float64]:
     """(K, 2) m, around which a map lies that cannot be whole: the region, or all sensors."""
     if options.output.region is not None:
-        return np.reshape(options.output.region, (2, 2)).mean(axis=0, keepdims=True)
+        x0, y0, x1, y1 = options.output.region
+        return np.array([[x0 + x1, y0 + y1]]) / 2.0
     return np.asarray(planar.T_map_sensor(estimate.poses)[:, :2, 2])
 
 

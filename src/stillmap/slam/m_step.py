@@ -62,8 +62,8 @@ def m_step(
         dof = D * (D + 1) // 2
         found = MStepResult(poses, np.zeros((T, dof, dof)), grid, np.full(T, np.nan))
     else:
-        matched = thin_scans(recording, e) if D == 2 else (recording, e)
-        step = _PoseStep(*matched, options, threads, progress, free_space_margin)
+        matched, weights = thin_scans(recording, e) if D == 2 else (recording, e)
+        step = _PoseStep(matched, weights, options, threads, progress, free_space_margin)
         found = step.estimate_3d() if D == 3 else step.estimate_2d(initial, earlier_poses)
         progress("counting beams", 0, 0)
     if with_grid:
