@@ -185,6 +185,7 @@ def _limit_memory(
         report.say(f"at most {most:.2g} GB of memory per worker and thread, for {name}")
         return
     given = request.settings.memory
+    whose = "of this machine" if given is None else "that are given"
     memory = machine_memory() if given is None else round(given * _GIGABYTE)
     wanted = min(request.jobs, len(waiting))
     jobs = fitting_jobs(estimates, wanted, memory)
@@ -192,7 +193,7 @@ def _limit_memory(
     if jobs < wanted:
         report.say(
             f"warning: not {wanted} at once: they may need more than the "
-            f"{memory / _GIGABYTE:.3g} GB of {'this machine' if given is None else '--memory'}"
+            f"{memory / _GIGABYTE:.3g} GB {whose}"
         )
     executor.limit(jobs)
 
