@@ -78,3 +78,16 @@ def test_one_iteration_from_all_static():
     for estimator in ("stillmap", "paper"):
         e = em.initial_p_static(recording, estimator, options)
         assert (e == np.float32(options.prior)).all()
+
+
+def test_cells_in_blocks_far_apart():
+    recording = lane(3, 1)
+    poses = np.eye(3)[None].copy()
+    poses[0, :2, 2] = 0.5
+    grid = _core.OccupancyGrid2D(1.0)
+    for far in (0.0, 2e6, -1e6):  # dense, that is 4 million rows
+        poses[0, 1, 2] = far + 0.5
+        em.add_recording(grid, recording, poses, None)
+    found = beam_counting.threshold_hit_ratio(grid)
+    assert found.cells.tolist() == [[3, -1_000_000], [3, 0], [3, 2_000_000]]
+    assert found.p_occupied.tolist() == [1.0, 1.0, 1.0]

@@ -55,3 +55,14 @@ def test_height_outside_is_that_of_the_edge():
     ground = fit_ground(level(means, normals), way_over(0.0))
     far = ground.height_at(np.array([[1e4, 0.0], [-1e4, 0.0]]))
     assert far[0] > 1.0 > -0.2 > far[1]
+
+
+def test_one_far_position_leaves_the_ground_as_it_is():
+    means, normals, _ = floor_with_tables(np.random.default_rng(3))
+    way = way_over(0.0)
+    expected = fit_ground(level(means, normals), way)
+    far = np.insert(way, 20, [1e5, -1e5, 3.0], axis=0)
+    ground = fit_ground(level(means, normals), far)
+    np.testing.assert_array_equal(ground.height, expected.height)
+    np.testing.assert_array_equal(ground.corner, expected.corner)
+    assert ground.sensor_height == expected.sensor_height

@@ -172,3 +172,40 @@ def test_windows_and_tiles_equal_the_whole(printed, monkeypatch):
         np.testing.assert_array_equal(getattr(again, name), all_of_it)
         padded = np.pad(all_of_it, 40, constant_values=nothing)
         np.testing.assert_array_equal(getattr(part, name), padded[38:50, 60:75])
+
+
+def rooms(*corners):
+    """The grid of a robot in rooms of 4 m at corners (2,), and its positions."""
+    grid, places = _core.OccupancyGrid2D(0.05), []
+    angle = np.linspace(0.0, 2.0 * np.pi, 200, endpoint=False)
+    points = (2.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)).astype(np.float32)
+    for corner in corners:
+        T = np.eye(3)[None].copy()
+        T[0, :2, 2] = corner
+        places.append(T[0, :2, 2])
+        every = np.ones(len(points), bool), np.ones(len(points), np.float32)
+        _core.add_beams(grid, points, *every, np.array([0, len(points)]), T)
+    return grid, np.array(places)
+
+
+def test_a_far_room_is_left_out():
+    alone = em.make_occupancy_map(rooms((0, 0))[0])
+    grid, places = rooms((0, 0), (0, 0), (3e4, -2e4))
+    m = em.make_occupancy_map(grid, places=places)
+    assert np.abs(np.subtract(m.origin, alone.origin)).max() < 1.6  # a block
+    assert (~np.isnan(m.p_occupied)).sum() == (~np.isnan(alone.p_occupied)).sum()
+    beyond = em.find_hits_beyond(grid, m.window)
+    assert np.abs(beyond - [3e4, -2e4]).max() < 5.0
+    assert not len(em.find_hits_beyond(rooms((0, 0))[0], alone.window))
+
+
+def test_the_map_lies_around_the_places():
+    grid, _ = rooms((0, 0), (3e4, -2e4))
+    m = em.make_occupancy_map(grid, places=np.array([[3e4, -2e4]]))
+    assert np.abs(np.array(m.origin[:2]) - [3e4, -2e4]).max() < 5.0
+
+
+def test_rooms_of_one_building_stay_together():
+    m = em.make_occupancy_map(rooms((0, 0), (300, 200))[0])
+    height, width = m.p_occupied.shape
+    assert (round(0.05 * width), round(0.05 * height)) == (304, 204)

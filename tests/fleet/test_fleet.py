@@ -267,6 +267,14 @@ def test_fewer_at_once_where_memory_is_short(call, logs, tmp_path, monkeypatch):
     assert "not 2 at once: they may need more than the 0.315 GB of this machine" in warning
 
 
+def test_memory_that_is_given(call, logs, tmp_path):
+    folder, out = logs(a="fine", b="fine"), tmp_path / "out"
+    done = call("fleet", folder, "-o", out, "--jobs", 2, "--memory", 0.3)
+    assert done.returncode == 0
+    assert "not 2 at once: they may need more than the 0.3 GB that are given" in done.stderr
+    assert call("fleet", folder, "-o", out, "--memory", -1).returncode == 2
+
+
 def test_lines_without_a_terminal(call, logs, tmp_path):
     folder, out = logs(a="fine", b="bad"), tmp_path / "out"
     lines = call("fleet", folder, "-o", out, "--jobs", 1).stderr.splitlines()

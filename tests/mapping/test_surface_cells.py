@@ -28,3 +28,17 @@ def test_the_last_bin_of_one_direction_is_no_neighbour_of_the_first_of_the_next(
     for normal, distance in found:
         near = np.abs((cells + 0.5) * RESOLUTION @ normal - distance) < 0.1
         assert near.sum() >= 10
+
+
+def test_places_far_apart_have_the_same_lines():
+    """The distances of lines are counted without the gaps between places."""
+    wall = np.stack([np.arange(60), np.full(60, 7)], axis=-1)
+    far = wall[:, ::-1] + np.array([3_000_000, -2_000_000])  # 100 km
+    found = list(iter_lines(np.concatenate([wall, far]), RESOLUTION))
+    for cells in (wall, far):
+        ((normal, distance),) = iter_lines(cells, RESOLUTION)
+        assert any(
+            np.allclose(normal * np.sign(normal @ other), other)
+            and abs(distance * np.sign(normal @ other) - at) < 1e-6
+            for other, at in found
+        )

@@ -88,3 +88,12 @@ def test_snapshot_thins_points(grid, monkeypatch):
 def test_a_turned_map_is_refused(grid):
     with pytest.raises(ValueError, match="turned"):
         cut(dataclasses.replace(grid, origin=(0.0, 0.0, 0.1)), (0, 0, 1, 1))
+
+
+def test_points_far_apart_take_little_memory():
+    near = np.random.default_rng(0).uniform(50_000.0, 50_004.0, (20, 2))
+    points = np.concatenate([near, [[-90_000.0, 90_000.0]]])
+    x0, y0, x1, y1 = choose_window((-1e5, -1e5, 1e5, 1e5), 0.05, points)
+    assert x1 - x0 == pytest.approx(12.0)
+    assert x0 < near[:, 0].min() < near[:, 0].max() < x1
+    assert y0 < near[:, 1].min() < near[:, 1].max() < y1

@@ -49,6 +49,15 @@ def test_who_comes_back_after_a_while_crosses_again():
     )
 
 
+def test_one_who_is_far_away_is_left_out():
+    near = [went([[0.1, 0.1], [3.9, 0.1]], [0.0, 3.8])]
+    far = went([[9e4, -9e4], [9e4, -9e4 + 1.0]], [0.0, 1.0])
+    found, expected = compute_flow_map([*near, far], 1.0), compute_flow_map(near, 1.0)
+    assert found.origin == expected.origin
+    np.testing.assert_array_equal(found.crossings, expected.crossings)
+    np.testing.assert_array_equal(found.speed, expected.speed)
+
+
 @pytest.mark.parametrize("objects", [[], [went([[0.2, 0.3]], [4.0])]])
 def test_little(objects):
     found = compute_flow_map(objects)

@@ -12,7 +12,12 @@ from typing import TYPE_CHECKING
 from stillmap.cli.arguments import add_read_flags, read_changes
 from stillmap.cli.config import add_option_flags, options_from_args
 from stillmap.cli.console import fail, print_json, say, show_tasks
-from stillmap.cli.map_flags import add_map_flags, add_method_flags, option_changes
+from stillmap.cli.map_flags import (
+    add_map_flags,
+    add_method_flags,
+    option_changes,
+    require_memory_flag,
+)
 from stillmap.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -68,6 +73,14 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument(
         "--threads", metavar="N", type=int, default=1, help="of each recording (default: 1)"
     )
+    p.add_argument(
+        "--memory",
+        dest="memory_of_tasks",
+        metavar="GB",
+        type=float,
+        help="memory of all recordings at once (default: what the machine has): fewer run at once, "
+        "and none takes more",
+    )
     p.add_argument("--json", action="store_true", help="the content of fleet.json on stdout")
     p.add_argument("--quiet", action="store_true", help="no progress, no summary")
     add_method_flags(p.add_argument_group("method"))
@@ -105,12 +118,16 @@ def _read_request(args: argparse.Namespace) -> "Request":
         raise InputError(f"--jobs must be 1 to 1024, got {args.jobs}")
     if args.jobs is not None and args.scheduler:
         raise InputError("--jobs and --scheduler exclude each other")
+    if args.memory_of_tasks is not None:
+        require_memory_flag(args.memory_of_tasks)
     args.tilting_topic = None  # a flag of `map` alone
     options = options_from_args(args, read_changes(args), option_changes(args))
     return Request(
         entries=_read_entries(args),
         output=args.output,
-        settings=Settings(_changed_options(options), not args.no_odometry, bool(args.poses)),
+        settings=Settings(
+            _changed_options(options), not args.no_odometry, bool(args.poses), args.memory_of_tasks
+        ),
         resolution=options.slam.resolution,
         jobs=args.jobs or resolve_threads(0),
         scheduler=args.scheduler,

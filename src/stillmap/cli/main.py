@@ -17,8 +17,17 @@ from stillmap.cli.console import (
     write_line,
 )
 from stillmap.cli.flags import in_flags
+from stillmap.cli.map_flags import require_memory_flag
 from stillmap.cli.parser import COMMANDS, EXIT_INPUT, parser
 from stillmap.core.errors import InputError, closest_match
+from stillmap.core.memory import (
+    GIGABYTE,
+    SHARE,
+    available_memory,
+    is_out_of_memory,
+    limit_memory,
+    memory_error,
+)
 from stillmap.core.printable import printable
 
 EXIT_DEFECT = 1
@@ -39,7 +48,7 @@ def main(argv: list[str] | None = None) -> int:
         args = _parse(sys.argv[1:] if argv is None else argv)
         _set_up_logging(args)
         handle_signals(main.__code__)
-        status: int = args.run(args)
+        status = _run(args)
         if sys.stdout is not None:  # None: closed before the start
             sys.stdout.flush()
         return status
@@ -49,9 +58,28 @@ def main(argv: list[str] | None = None) -> int:
         return _report_interrupt()
 
 
+def _run(args: argparse.Namespace) -> int:
+    """Run the command, within the memory that it may use if it maps."""
+    if not hasattr(args, "memory"):
+        status: int = args.run(args)
+        return status
+    if args.memory is not None:
+        require_memory_flag(args.memory)
+    allowed = SHARE * available_memory() if args.memory is None else GIGABYTE * args.memory
+    with limit_memory(round(allowed)):
+        try:
+            status = args.run(args)
+        except Exception as error:
+            if is_out_of_memory(error):
+                raise memory_error(error) from error
+            raise
+    return status
+
+
 def _report_failure(error: Exception, args: argparse.Namespace) -> int:
     """Print why the command failed; the exit status."""
     # a clean-up may fail, too, as on a terminal that has gone
+    error = memory_error(error) if is_out_of_memory(error) else error
     cause = _find_interrupt(error)
     if cause is not None:
         return EXIT_TERMINATED if isinstance(cause, SystemExit) else _report_interrupt()
@@ -65,8 +93,6 @@ def _report_failure(error: Exception, args: argparse.Namespace) -> int:
         # a full disk behind stdout, or a file that vanished while it was read
         fail(f"{error.filename or 'the output'}: {error.strerror or error}")
         _drop_stdout()
-    elif isinstance(error, MemoryError):
-        fail(f"not enough memory{': ' if str(error) else ''}{error}")
     else:
         _report_defect(error)
         return EXIT_DEFECT

@@ -20,6 +20,7 @@ from stillmap.cli.map_flags import (
 )
 from stillmap.cli.map_summary import print_summary, summarize
 from stillmap.core.errors import InputError
+from stillmap.core.memory import is_out_of_memory, memory_error
 
 if TYPE_CHECKING:
     from stillmap.core.profiling import StageTimer
@@ -168,24 +169,32 @@ def _explain_failure(args: argparse.Namespace, checkpoints: "CheckpointFolder") 
     """Say after a failure or an interruption how to go on; report a full disk in one line."""
     try:
         yield
-    except (InputError, OSError) as error:
-        if isinstance(error, OSError):
-            if error.errno not in _DISK_FULL and not checkpoints.is_in_use:
-                raise
-            what = f"cannot continue: {error.strerror or error}"
-            error = InputError(what, where=str(error.filename or checkpoints.folder))
-        if not checkpoints.is_in_use:
-            raise error
-        hints = filter(None, (error.hint, _describe_continuation(args.words, checkpoints)))
-        raise InputError(error.what, where=error.where, hint="; ".join(hints)) from error
     except (KeyboardInterrupt, SystemExit):
         if not args.quiet:
             say(_describe_continuation(args.words, checkpoints))
         raise
-    except Exception:
+    except Exception as error:
+        reason = memory_error(error) if is_out_of_memory(error) else error
+        if isinstance(reason, InputError | OSError):
+            raise _with_continuation(reason, args, checkpoints) from error
         if checkpoints.is_in_use:
             say(_describe_continuation(args.words, checkpoints))
         raise
+
+
+def _with_continuation(
+    error: InputError | OSError, args: argparse.Namespace, checkpoints: "CheckpointFolder"
+) -> InputError | OSError:
+    """The error, with how to go on if there is anything to go on with."""
+    if isinstance(error, OSError):
+        if error.errno not in _DISK_FULL and not checkpoints.is_in_use:
+            return error
+        what = f"cannot continue: {error.strerror or error}"
+        error = InputError(what, where=str(error.filename or checkpoints.folder))
+    if not checkpoints.is_in_use:
+        return error
+    hints = filter(None, (error.hint, _describe_continuation(args.words, checkpoints)))
+    return InputError(error.what, where=error.where, hint="; ".join(hints))
 
 
 def _describe_continuation(words: list[str], checkpoints: "CheckpointFolder") -> str:

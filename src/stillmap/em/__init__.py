@@ -18,7 +18,13 @@ from stillmap.em.estimator import (
 )
 from stillmap.em.ground import estimate_ground
 from stillmap.em.observations import time_bin_index
-from stillmap.em.occupancy_grid import GridWindow, ObservedCells, OccupancyMap, make_occupancy_map
+from stillmap.em.occupancy_grid import (
+    GridWindow,
+    ObservedCells,
+    OccupancyMap,
+    find_hits_beyond,
+    make_occupancy_map,
+)
 from stillmap.em.occupancy_hmm import final_e_step
 from stillmap.em.options import EmOptions, MapState
 from stillmap.em.quality import Coverage, count_observations, score_held_out_scans
@@ -59,6 +65,7 @@ __all__ = [
     "e_step",
     "estimate_ground",
     "final_e_step",
+    "find_hits_beyond",
     "fixed_iterations",
     "initial_p_static",
     "make_grid",

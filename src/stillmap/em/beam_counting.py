@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 import stillmap._core as _core
 from stillmap.core.chunks import iter_beams, iter_chunks
 from stillmap.core.recording import Recording
+from stillmap.em.occupancy_grid import BLOCK_CELLS
 from stillmap.em.types import CellProbabilities, EStepResult, Float, Grid, Likelihood, fill_beams
 
 MIN_HIT_RATIO = 0.25  # hits / (hits + passes) below which such mappers drop a cell
@@ -76,9 +77,13 @@ def hit_ratio_e_step(
 
 def threshold_hit_ratio(grid: _core.OccupancyGrid2D) -> CellProbabilities:
     """Occupancy 1 where alpha / (alpha + beta) reaches the threshold MIN_HIT_RATIO, else 0."""
-    first, alpha, beta = grid.dense()
-    ratio = np.divide(alpha, alpha + beta, out=np.zeros_like(alpha), where=alpha + beta > 0.0)
-    rows = np.argwhere(alpha > 0.0)
-    cells = np.ascontiguousarray(rows[:, ::-1] + first)
-    kept = ratio[tuple(rows.T)] >= MIN_HIT_RATIO
-    return CellProbabilities(cells, kept.astype(np.float32), 0.0)
+    found, stands = [np.zeros((0, 2), np.int64)], [np.zeros(0, np.float32)]
+    for first in grid.block_cells:
+        _, alpha, beta = grid.dense(first.tolist(), (BLOCK_CELLS, BLOCK_CELLS))
+        rows = np.argwhere(alpha > 0.0)
+        alpha, beta = alpha[tuple(rows.T)], beta[tuple(rows.T)]
+        found.append(rows[:, ::-1] + first)
+        stands.append((alpha / (alpha + beta) >= MIN_HIT_RATIO).astype(np.float32))
+    cells, p_occupied = np.concatenate(found), np.concatenate(stands)
+    order = np.lexsort(cells.T)  # row by row
+    return CellProbabilities(cells[order], p_occupied[order], 0.0)

@@ -166,11 +166,12 @@ def add_trusted_beams(
     e: NDArray[np.float32],
     no_return: NoReturnModel | None,
     threads: int = 1,
+    places: Float | None = None,
 ) -> ObservedCells | None:
     """Adds the same counts as `add_recording` to an empty grid, and finds the observed cells.
 
     Beams without a return observe cells as far as `no_return` says. Returns None where they all
-    count at full length.
+    count at full length. `places`: see `map_window`.
     """
     if no_return is None:
         add_recording(grid, recording, poses, e, threads)
@@ -180,7 +181,7 @@ def add_trusted_beams(
     for *_, data in iter_beams(recording, poses):
         used = counting_threads(len(data.hit), threads)
         _core.add_no_return_beams(grid, None, *data, *trust, used)
-    observed = observed_cells(grid, recording.scratch)
+    observed = observed_cells(grid, recording.scratch, places)
     # beams once more rather than another grid, as large as this one
     for *_, data in iter_beams(recording, poses):
         used = counting_threads(len(data.hit), threads)

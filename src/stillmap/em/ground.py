@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 import stillmap._core as _core
 from stillmap.core.chunks import iter_beams
 from stillmap.core.recording import Recording
+from stillmap.core.square_box import bound_box
 from stillmap.em.observations import SurfelMap, iter_surfel_rows
 from stillmap.em.types import DYNAMIC_BELOW, GROUND_SQUARE, Float, GroundMap
 
@@ -18,6 +19,8 @@ _HEIGHT_RADIUS = 8.0  # m around the trajectory within which the ground shows th
 _HEIGHT_BIN = 0.05  # m, of the histogram of sensor heights
 _MAX_STEP = 0.3  # m, between neighbouring squares
 _BORDER = 2  # squares around everything observed
+# squares of the box around it: up to which it is always whole, and at most
+_LEAST_SQUARES, _MOST_SQUARES = 1 << 20, 1 << 26
 
 
 def estimate_ground(
@@ -64,7 +67,10 @@ def fit_ground(floor: Float, positions: Float) -> GroundMap:
     Args:
         floor: (N, 3) points of level, static surface, metres; includes tops of objects.
         positions: (T, 3) of the sensors in the map frame, whose z axis points up.
+
+    The ground reaches as far as the box around both, unless that would be nearly empty.
     """
+    floor, positions = _leave_out_far_points(floor, positions)
     sensor_height = _sensor_height(floor, positions)
     known = [xyz[:, :2] for xyz in (floor, positions) if len(xyz)]
     low = np.vstack([xy.min(axis=0) for xy in known])
@@ -78,6 +84,18 @@ def fit_ground(floor: Float, positions: Float) -> GroundMap:
     z.reshape(-1)[count > 0] = total[count > 0] / count[count > 0]
     _grow(z, corner, floor if sensor_height is not None else floor[:0])
     return GroundMap(z, corner, sensor_height or 0.0, sensor_height is not None)
+
+
+def _leave_out_far_points(floor: Float, positions: Float) -> tuple[Float, Float]:
+    """Both without the points outside the box of the ground."""
+    squares = np.floor(np.concatenate([floor, positions])[:, :2] / GROUND_SQUARE).astype(np.int64)
+    places = squares[len(floor) :]
+    near = places if len(places) else None
+    box = bound_box(squares, _LEAST_SQUARES, _MOST_SQUARES, places=near)
+    inside = box.contains(squares)
+    if inside.all():
+        return floor, positions
+    return floor[inside[: len(floor)]], positions[inside[len(floor) :]]
 
 
 def _sensor_height(floor: Float, positions: Float) -> float | None:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core.grid_map import GridMap
+from stillmap.core.square_box import SquareBox, bound_box
 from stillmap.core.tiles import (
     TILE,
     TILES_PER_RELEASE,
@@ -22,6 +23,9 @@ from stillmap.core.tiles import (
 from stillmap.em.types import CellProbabilities, Float, Grid
 
 BLOCK_CELLS = 32  # edge of the blocks of the grid
+# blocks of the box of a map: up to which it is always whole (a square of 580 m at 0.05 m), and at
+# most (2^31 cells: what readers of images take)
+_LEAST_BLOCKS, _MOST_BLOCKS = 1 << 17, 1 << 21
 
 
 class ObservedCells(NamedTuple):
@@ -74,6 +78,7 @@ def make_occupancy_map(
     observed: ObservedCells | None = None,
     window: GridWindow | None = None,
     scratch: Path | None = None,
+    places: Float | None = None,
 ) -> OccupancyMap:
     """Makes the map of a grid. Large layers are `TiledArray`s, which NumPy takes for arrays.
 
@@ -84,6 +89,7 @@ def make_occupancy_map(
         observed: the observed cells, which give the size of the map; None: all that beams crossed.
         window: cells to return instead.
         scratch: folder of temporary files for layers larger than memory; None: the system's.
+        places: see `map_window`.
 
     Raises:
         ValueError: the grid is 3D.
@@ -93,8 +99,7 @@ def make_occupancy_map(
     if observed is not None:
         window = GridWindow(observed.first_cell, observed.mask.shape)
     if window is None:
-        first_cell, (height, width) = grid.bounding_box()
-        window = GridWindow(first_cell, (height, width))
+        window = map_window(grid, places)
     p_occupied = TiledArray(window.shape, np.float32, np.nan, scratch)
     a, b = (TiledArray(window.shape, np.float32, 0.0, scratch) for _ in range(2))
     for k, ((i, j), alpha, beta) in enumerate(_iter_tiles(grid, window)):
@@ -116,13 +121,57 @@ def make_occupancy_map(
     return OccupancyMap(layers[0], (x, y, 0.0), grid.resolution, *layers[1:])
 
 
-def observed_cells(grid: _core.OccupancyGrid2D, scratch: Path | None = None) -> ObservedCells:
-    """The cells that any beam of a grid crossed or ended in."""
-    first_cell, (height, width) = grid.bounding_box()
-    mask = TiledArray((height, width), np.bool_, False, scratch)
-    for (i, j), alpha, beta in _iter_tiles(grid, GridWindow(first_cell, (height, width))):
+def observed_cells(
+    grid: _core.OccupancyGrid2D, scratch: Path | None = None, places: Float | None = None
+) -> ObservedCells:
+    """The cells of `map_window` that any beam of a grid crossed or ended in."""
+    window = map_window(grid, places)
+    mask = TiledArray(window.shape, np.bool_, False, scratch)
+    for (i, j), alpha, beta in _iter_tiles(grid, window):
         mask.set_tile(i, j, alpha + beta > 0.0)
-    return ObservedCells(first_cell, mask)
+    return ObservedCells(window.first_cell, mask)
+
+
+def map_window(grid: _core.OccupancyGrid2D, places: Float | None = None) -> GridWindow:
+    """The box of all observed cells; where it is nearly empty, that around most of the hits.
+
+    Args:
+        grid: 2D counts.
+        places: (K, 2) m, around which the map is to lie if it cannot be whole; None: around most
+            of the hits.
+    """
+    first_cell, (height, width) = grid.bounding_box()
+    observed = SquareBox(first_cell, first_cell + np.array([width, height]) - 1)
+    if observed.area <= _LEAST_BLOCKS * BLOCK_CELLS**2:
+        return GridWindow(first_cell, (height, width))
+    near = None
+    if places is not None:
+        near = np.floor(places / (BLOCK_CELLS * grid.resolution)).astype(np.int64)
+    whole = SquareBox(observed.low // BLOCK_CELLS, observed.high // BLOCK_CELLS)
+    blocks = _hit_blocks(grid)
+    box = bound_box(blocks, _LEAST_BLOCKS, _MOST_BLOCKS, places=near, around=whole)
+    low = np.maximum(box.low * BLOCK_CELLS, observed.low)
+    high = np.minimum((box.high + 1) * BLOCK_CELLS - 1, observed.high)
+    return GridWindow(low, SquareBox(low, high).shape)
+
+
+def find_hits_beyond(grid: _core.OccupancyGrid2D, window: GridWindow) -> Float:
+    """(K, 2) m, middles of the blocks of a grid that hold hits and lie outside a map's window."""
+    _, (height, width) = grid.bounding_box()
+    if height * width <= _LEAST_BLOCKS * BLOCK_CELLS**2:
+        return np.zeros((0, 2))  # `map_window` is whole
+    low = window.first_cell // BLOCK_CELLS
+    high = (window.first_cell + np.array(window.shape[::-1]) - 1) // BLOCK_CELLS
+    blocks = _hit_blocks(grid)
+    beyond = blocks[~SquareBox(low, high).contains(blocks)]
+    return np.asarray((beyond + 0.5) * (BLOCK_CELLS * grid.resolution))
+
+
+def _hit_blocks(grid: _core.OccupancyGrid2D) -> NDArray[np.int64]:
+    """(B, 2) column and row of the blocks in which beams ended; all blocks where none did."""
+    blocks = grid.block_cells
+    hit = [bool(grid.dense(one, (BLOCK_CELLS, BLOCK_CELLS))[1].any()) for one in blocks.tolist()]
+    return (blocks[hit] if any(hit) else blocks) // BLOCK_CELLS
 
 
 def _iter_tiles(

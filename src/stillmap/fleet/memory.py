@@ -1,18 +1,16 @@
 """Memory that a recording needs to be mapped, told from its summary, and that of the machine."""
 
 import math
-import os
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
-from pathlib import Path
 from typing import Any
+
+from stillmap.core.memory import total_memory
 
 # an upper figure: of 13 recordings of 60 to 100 000 scans none needed more (docs/fleet.md)
 _BASE = {2: 200 << 20, 3: 300 << 20}  # bytes: interpreter, libraries, arrays that do not grow
 _PER_SCAN = 30_000  # bytes: poses, covariances, the map that a scan adds
 _PER_BEAM = 60  # bytes: arrays, and pages of files that are mapped
 _PER_CELL = 70  # bytes of a cell of the plane within range
-_CGROUP = Path("/sys/fs/cgroup/memory.max")
 _KEPT_FREE = 0.1  # share of the memory for everything else
 
 
@@ -32,10 +30,7 @@ def estimate_memory(info: Mapping[str, Any], resolution: float) -> int:
 
 def machine_memory() -> int:
     """Bytes that processes of this machine, or container, may use together."""
-    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    with suppress(OSError, ValueError):  # no limit is `max`
-        total = min(total, int(_CGROUP.read_text()))
-    return round(total * (1 - _KEPT_FREE))
+    return round(total_memory() * (1 - _KEPT_FREE))
 
 
 def fitting_jobs(estimates: Iterable[int], jobs: int, memory: int) -> int:

@@ -184,14 +184,16 @@ def _limit_memory(
     if request.scheduler:
         report.say(f"at most {most:.2g} GB of memory per worker and thread, for {name}")
         return
-    memory = machine_memory()
+    given = request.settings.memory
+    whose = "of this machine" if given is None else "that are given"
+    memory = machine_memory() if given is None else round(given * _GIGABYTE)
     wanted = min(request.jobs, len(waiting))
     jobs = fitting_jobs(estimates, wanted, memory)
     report.say(f"{jobs} at once, each with at most {most:.2g} GB of memory, for {name}")
     if jobs < wanted:
         report.say(
             f"warning: not {wanted} at once: they may need more than the "
-            f"{memory / _GIGABYTE:.3g} GB of this machine"
+            f"{memory / _GIGABYTE:.3g} GB {whose}"
         )
     executor.limit(jobs)
 

@@ -17,11 +17,13 @@ class Settings:
         options: name and JSON value of every option that is not the default.
         use_odometry: whether odometry in the recordings is used.
         keep_poses: whether poses stored in the recordings are kept.
+        memory: GB that all tasks may use together; None: what the machine has.
     """
 
     options: tuple[tuple[str, str], ...] = ()
     use_odometry: bool = True
     keep_poses: bool = False
+    memory: float | None = None
 
     def for_reading(self) -> Self:
         """The part that decides how a recording is read."""
@@ -48,13 +50,17 @@ def map_command(recording: Path, output: Path, settings: Settings) -> list[str]:
     odometry = [] if settings.use_odometry else ["--no-odometry"]
     poses = ["--poses", "recording"] if settings.keep_poses else []
     words = ["map", str(recording), "-o", str(output), "--quiet"]
-    return [*words, *_options(settings), *odometry, *poses]
+    return [*words, *_options(settings), *_memory(settings), *odometry, *poses]
 
 
 def merge_command(results: Sequence[Path], output: Path, settings: Settings) -> list[str]:
     """The command line that merges results."""
     words = ["merge", *map(str, results), "-o", str(output), "--quiet"]
-    return [*words, *_options(settings)]
+    return [*words, *_options(settings), *_memory(settings)]
+
+
+def _memory(settings: Settings) -> list[str]:
+    return [] if settings.memory is None else [f"--memory={settings.memory!r}"]
 
 
 def _options(settings: Settings) -> list[str]:

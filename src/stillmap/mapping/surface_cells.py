@@ -14,6 +14,7 @@ _MIN_HITS, _MIN_DYNAMIC_HITS = 2, 5  # in a cell with a surface; mirrors make so
 _MAX_CELLS, _MAX_LINES = 10_000, 40
 _ANGLES = 180  # directions of lines that are tried
 _LINE_WIDTH = 0.1  # m, in which the cells of a line lie
+_MAX_BINS = 1 << 17  # of the distances of lines, 6 km; of places farther apart gaps count as one
 _MIN_LINE, _MIN_LINE_CELLS = 1.0, 5  # m and cells of wall on a line, such as frames of mirrors
 
 
@@ -72,6 +73,8 @@ def iter_lines(cells: Cells, resolution: float) -> Iterator[tuple[Float, float]]
     angle = np.arange(_ANGLES) * (np.pi / _ANGLES)
     normals = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     bins = np.floor(centers @ normals.T / (0.5 * _LINE_WIDTH)).astype(np.int64)
+    if int(np.ptp(bins)) > _MAX_BINS:
+        bins = np.stack([_close_gaps(column) for column in bins.T], axis=-1)
     first = int(bins.min())
     width = int(bins.max()) - first + 2  # at least one pair
     bins += np.arange(_ANGLES) * width - first
@@ -91,3 +94,9 @@ def iter_lines(cells: Cells, resolution: float) -> Iterator[tuple[Float, float]]
         middle = centers[on].mean(axis=0)
         _, _, axes = np.linalg.svd(centers[on] - middle, full_matrices=False)
         yield axes[1], float(middle @ axes[1])
+
+
+def _close_gaps(numbers: Cells) -> Cells:
+    """Numbers (N,) in the same order, with one between those that are not successive."""
+    known, of = np.unique(numbers, return_inverse=True)
+    return np.asarray(np.cumsum(np.minimum(np.diff(known, prepend=known[:1]), 2))[of])

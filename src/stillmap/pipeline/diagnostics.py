@@ -4,11 +4,14 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stillmap.core.advice import advise
 from stillmap.core.json import count_skipped
 from stillmap.core.recording import Recording
 from stillmap.pipeline.estimate import Estimate, IterationRecord
+from stillmap.pipeline.final_map import Maps
+from stillmap.pipeline.snapshots import extent
 
 _LOST = 0.2  # explained share of a scan's beams below which its pose cannot be trusted
 
@@ -45,6 +48,37 @@ def find_warnings(
             )
         )
     return out
+
+
+def find_map_warnings(maps: Maps, recording: Recording, poses: NDArray[np.float64]) -> list[str]:
+    """That the map leaves out what is far from most of the place: one sentence, or none.
+
+    Args:
+        maps: of the recording.
+        recording: T scans.
+        poses: (T, D+1, D+1) T_map_base.
+    """
+    if not len(maps.beyond):
+        return []
+    x0, y0, x1, y1 = extent(maps.filtered)
+    x, y = recording.T_map_sensor(poses)[:, :2, -1].T
+    outside = np.flatnonzero((x < x0) | (x > x1) | (y < y0) | (y > y1))
+    what = "surfaces that a few beams show lie"
+    if len(outside):
+        scan = outside[0]
+        named = f"scan {scan} at x {x[scan]:.7g} m, y {y[scan]:.7g} m"
+        what = f"{_count_scans(len(outside))} lie{'s' * (len(outside) == 1)}"
+        what += f" (first {named})" if len(outside) > 1 else f" ({named})"
+    middle = np.array([x0 + x1, y0 + y1]) / 2.0
+    distance = float(np.linalg.norm(maps.beyond - middle, axis=1).max())
+    return [
+        advise(
+            f"{what} outside the map, up to {distance:.4g} m from its middle: a map of everything "
+            f"would be nearly empty, so it shows {x0:.1f} to {x1:.1f} m in x and {y0:.1f} to "
+            f"{y1:.1f} m in y, where most was seen; poses and labels are of all scans",
+            "check the poses of these scans" if len(outside) else "limit read.max_range",
+        )
+    ]
 
 
 def _reader_warnings(source: Mapping[str, Any]) -> list[str]:

@@ -1,7 +1,7 @@
 """After the loop: the last E-step, the maps, the objects, the changes, all of the best estimate."""
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,12 +41,15 @@ class Maps(ShortRepr):
         raw: every hit counted as static, from the same poses.
         evidence: observation counts of these cells.
         ground: height of the ground; None in 2D.
+        beyond: (K, 2) m, places with hits that lie outside, where the box around everything would
+            be nearly empty.
     """
 
     filtered: em.OccupancyMap
     raw: em.OccupancyMap
     evidence: em.Coverage
     ground: GroundMap | None
+    beyond: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
 
 
 def final_estimate(
@@ -131,7 +134,7 @@ def make_maps(
                 deskewed, estimate.poses, estimate.p_static, threads
             )
             planar, estimate = _project(deskewed, estimate, ground, options, threads)
-        filtered, raw = _occupancy_maps(planar, estimate, options, threads)
+        filtered, raw, beyond = _occupancy_maps(planar, estimate, options, threads)
     trim_heap()
     progress("counting observations", 0, 0, 0)
     with stages.measure("evidence"):
@@ -144,7 +147,7 @@ def make_maps(
             options.em,
             threads,
         )
-    return Maps(filtered, raw, evidence, ground)
+    return Maps(filtered, raw, evidence, ground, beyond)
 
 
 def _project(
@@ -170,8 +173,8 @@ def _project(
 
 def _occupancy_maps(
     planar: Recording, estimate: Estimate, options: Options, threads: int
-) -> tuple[em.OccupancyMap, em.OccupancyMap]:
-    """The map, and the same cells with every hit counted as static.
+) -> tuple[em.OccupancyMap, em.OccupancyMap, NDArray[np.float64]]:
+    """The map, the same cells with every hit counted as static, and places with hits outside.
 
     Labels that follow from the sums go with the weights that made the sums; others make them.
     """
@@ -179,11 +182,22 @@ def _occupancy_maps(
     labels_make_sums = options.estimator in ("stillmap", "tracker")
     weights = estimate.p_static if labels_make_sums else estimate.weights
     grid = _core.OccupancyGrid2D(options.slam.resolution, moments=False)
-    seen = em.add_trusted_beams(grid, planar, estimate.poses, weights, e_step.no_return, threads)
-    scratch = planar.scratch
-    filtered = em.make_occupancy_map(grid, e_step.occupied, seen, scratch=scratch)
+    places, scratch = _wanted_places(planar, estimate, options), planar.scratch
+    seen = em.add_trusted_beams(
+        grid, planar, estimate.poses, weights, e_step.no_return, threads, places
+    )
+    filtered = em.make_occupancy_map(grid, e_step.occupied, seen, scratch=scratch, places=places)
     em.recount_as_static(grid, planar, estimate.poses, weights)
-    return filtered, em.make_occupancy_map(grid, window=filtered.window, scratch=scratch)
+    raw = em.make_occupancy_map(grid, window=filtered.window, scratch=scratch)
+    return filtered, raw, em.find_hits_beyond(grid, filtered.window)
+
+
+def _wanted_places(planar: Recording, estimate: Estimate, options: Options) -> NDArray[np.float64]:
+    """(K, 2) m, around which a map lies that cannot be whole: the region, or all sensors."""
+    if options.output.region is not None:
+        x0, y0, x1, y1 = options.output.region
+        return np.array([[x0 + x1, y0 + y1]]) / 2.0
+    return np.asarray(planar.T_map_sensor(estimate.poses)[:, :2, 2])
 
 
 def find_objects(

@@ -17,14 +17,16 @@ from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.mapping import Change
 from stillmap.pipeline.calibration import calibrate_recording, time_sweeps
-from stillmap.pipeline.diagnostics import find_warnings
+from stillmap.pipeline.diagnostics import find_map_warnings, find_warnings
 from stillmap.pipeline.em_loop import iterate
 from stillmap.pipeline.estimate import EmState, Estimate, IterationRecord
 from stillmap.pipeline.final_map import Maps, final_estimate, find_objects, make_maps
+from stillmap.pipeline.memory_need import require_map_memory
 from stillmap.pipeline.options import DEFAULTS, Options, resolve_options
 from stillmap.pipeline.pose_sources import better_source
 from stillmap.pipeline.quality import Quality, rate_quality
 from stillmap.pipeline.snapshots import Snapshot
+from stillmap.preprocessing.impossible_motion import leave_out_far_scans, remove_leaps
 from stillmap.slam.mount_calibration import Calibration
 from stillmap.tracking import FlowMap, MovingObject, compute_flow_map
 
@@ -150,6 +152,7 @@ def map_recording(
 
     Raises:
         ValueError: a recording without scans, or poses of another shape.
+        InputError: the map takes more memory than may be used.
         OSError: the disk of `scratch` is full.
     """
     if recording.n_scans == 0:
@@ -160,7 +163,13 @@ def map_recording(
     options = resolve_options(options, recording)
     found = Calibration()
     with stages.measure("calibration"):
-        recording, options, notes = time_sweeps(recording, options)
+        recording, notes = remove_leaps(recording)
+        if poses is not None:
+            recording, more = leave_out_far_scans(recording, poses, options.slam.resolution)
+            notes += more
+        require_map_memory(recording, poses, options.slam.resolution)
+        recording, options, more = time_sweeps(recording, options)
+        notes += more
         if poses is None:
             recording, found, more = calibrate_recording(recording, options)
             notes += more
@@ -236,7 +245,10 @@ def _finish(
         estimate=estimate,
         maps=maps,
         converged=state.converged,
-        warnings=find_warnings(estimate, recording, state.records),
+        warnings=[
+            *find_warnings(estimate, recording, state.records),
+            *find_map_warnings(maps, recording, estimate.poses),
+        ],
         objects=objects,
         traffic=crossings,
         changes=changes,

@@ -7,11 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.grid_map import GridMap
+from stillmap.core.square_box import bound_box
 from stillmap.core.tiles import crop
 
 Window = tuple[float, float, float, float]
 Value = TypeVar("Value", np.float32, np.bool_)
 _MOST_POINTS = 50_000
+_MOST_SQUARES = 1 << 22  # in which points are counted; those far from most others are left out
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,6 +127,9 @@ def _densest(
     """(2,) middle of the square of edge `size` with most points, to an eighth of its edge."""
     step = size / 8
     index = np.floor((points - low) / step).astype(np.int64)
+    if float((index.max(axis=0) + 17.0).prod()) > _MOST_SQUARES:
+        box = bound_box(index, _MOST_SQUARES, _MOST_SQUARES)
+        low, index = low + box.low * step, index[box.contains(index)] - box.low
     # eight empty rows and columns on either side: the square may hang over the edge
     counts = np.zeros(index.max(axis=0) + 17)
     np.add.at(counts, (index[:, 0] + 8, index[:, 1] + 8), 1)

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.square_box import bound_box
 from stillmap.core.tiles import TILE, TiledArray, compact, crop
 from stillmap.em import OccupancyMap
 from stillmap.places.evidence import Evidence, to_sums
@@ -15,30 +16,38 @@ from stillmap.places.shown_state import ShownState
 Float = NDArray[np.float64]
 Image = NDArray[np.float32]
 
+# blocks of the box around the evidence: up to which it is always whole, and at most
+_LEAST_BLOCKS, _MOST_BLOCKS = 1 << 17, 1 << 21
+
 _FREE_PRIOR = 0.2  # occupancy of a cell that no beam passed; as of single recordings
 # share of the hits of the most-hit cell, one and two cells around, below which it is its noise
 _MIN_PROMINENCE, _MIN_FAR_PROMINENCE, _REACH = 0.25, 0.08, 2
 
 
 def make_place_map(sessions: Sequence[Evidence], shown: ShownState) -> OccupancyMap:
-    """The map of a place, in the plane.
+    """The map of a place, in the plane, without what is far from most of it: see `bound_box`.
 
     Args:
         sessions: evidence of each in the plane.
         shown: the state that the map shows, of planar cells.
     """
     corners = np.concatenate([one.corner for one in sessions]).astype(np.int64)
+    edge = sessions[0].edge
+    box = bound_box(corners // edge, _LEAST_BLOCKS, _MOST_BLOCKS)
+    corners = corners[box.contains(corners // edge)]
     low = corners.min(axis=0) // TILE * TILE
     width, height = ((corners.max(axis=0) - low) // TILE * TILE + TILE).tolist()
     layers = [TiledArray((height, width), np.float32, fill) for fill in (np.nan, 0.0, 0.0)]
     order, starts = _split_by_tile(shown)
     for tile in iter_tiles(sessions):
+        if (tile.low < low).any() or (tile.low >= low + np.array([width, height])).any():
+            continue
         cells = order[starts.get(tuple((tile.low // TILE).tolist()), slice(0, 0))]
         j, i = ((tile.low - low) // TILE).tolist()
         for layer, part in zip(layers, _draw_tile(sessions, tile, shown, cells), strict=True):
             layer.set_tile(i, j, part.T)
     first = corners.min(axis=0) - low
-    last = corners.max(axis=0) + sessions[0].edge - low
+    last = corners.max(axis=0) + edge - low
     block = slice(int(first[1]), int(last[1])), slice(int(first[0]), int(last[0]))
     resolution = sessions[0].resolution
     x, y = ((low + first) * resolution).tolist()

@@ -9,11 +9,14 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.short_repr import ShortRepr
+from stillmap.core.square_box import bound_box
 from stillmap.places.evidence import UNITS, Bytes, Evidence
 from stillmap.places.place_states import iter_tiles
 
 Float = NDArray[np.float64]
 
+# blocks of the box around the evidence: up to which it is always whole, and at most
+_LEAST_BLOCKS, _MOST_BLOCKS = 1 << 15, 1 << 20
 _STEP = 2  # cells of the evidence along the edge of a square
 # hits of a surface, passes of a cell known to be free, by the dimension of the sessions: what 3D
 # sessions see of a bush or a fence at several heights is both at once
@@ -94,6 +97,7 @@ def make_surface_map(sessions: Sequence[Evidence], dimension: int = 2) -> Surfac
 
     Free is what none of them saw occupied, and surface what none passed: where sessions differ,
     neither is known. Else all that ever stood somewhere would speak against a further session.
+    What is far from most of it is left out, see `bound_box`.
 
     Args:
         sessions: evidence of each in the plane.
@@ -103,14 +107,16 @@ def make_surface_map(sessions: Sequence[Evidence], dimension: int = 2) -> Surfac
 
     corners = np.concatenate([one.corner for one in sessions]).astype(np.int64)
     edge = sessions[0].edge
-    low = corners.min(axis=0) // edge * edge
-    shape = tuple((corners.max(axis=0) + edge - low).tolist())
+    box = bound_box(corners // edge, _LEAST_BLOCKS, _MOST_BLOCKS)
+    low, shape = box.low * edge, tuple((edge * (box.high + 1 - box.low)).tolist())
     min_hits, min_passes = _LIMITS[dimension]
     hits, passes = np.zeros((2, *(n // _STEP for n in shape)), np.uint8)
     disputed = np.zeros(hits.shape, np.bool_)
     for tile in iter_tiles(sessions):
         first = np.maximum(tile.low, low)
         high = np.minimum(tile.low + tile.shape, low + shape)
+        if (first >= high).any():
+            continue
         part = tuple((high - first).tolist())
         where = tuple(
             slice(int(f) // _STEP, int(f + n) // _STEP)

@@ -18,6 +18,7 @@ from stillmap.slam.odometry_2d import register_scans
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.refinement import refine_poses
 from stillmap.slam.scan_hits import FREE_SPACE_MARGIN
+from stillmap.slam.scan_subset import thin_scans
 from stillmap.slam.types import MStepResult, ScanProgress
 
 Float = NDArray[np.float64]
@@ -61,7 +62,8 @@ def m_step(
         dof = D * (D + 1) // 2
         found = MStepResult(poses, np.zeros((T, dof, dof)), grid, np.full(T, np.nan))
     else:
-        step = _PoseStep(recording, e, options, threads, progress, free_space_margin)
+        matched, weights = thin_scans(recording, e) if D == 2 else (recording, e)
+        step = _PoseStep(matched, weights, options, threads, progress, free_space_margin)
         found = step.estimate_3d() if D == 3 else step.estimate_2d(initial, earlier_poses)
         progress("counting beams", 0, 0)
     if with_grid:

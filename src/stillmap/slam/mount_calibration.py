@@ -26,6 +26,7 @@ from stillmap.slam.hand_eye import (
     laser_names,
 )
 from stillmap.slam.scan_motion import MotionWindows, measure_motion, select_segments
+from stillmap.slam.scan_subset import thin_scans
 from stillmap.slam.turn_rates import fit_latency
 
 Float = NDArray[np.float64]
@@ -108,6 +109,7 @@ def calibrate_mounts(
     lasers = len(recording.T_base_sensor)
     if recording.dimension != 2 or recording.T_odom_base is None or lasers > _MAX_LASERS:
         return Calibration()
+    recording, _ = thin_scans(recording, recording.hit)
     given = list(given) or [()] * lasers
     windows = max(_LEAST_WINDOWS, min(_FIRST_WINDOWS, recording.n_scans // _SCANS_PER_WINDOW))
     found = _Calibrator(recording, resolution, given, windows).calibrate()

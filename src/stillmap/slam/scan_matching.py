@@ -24,6 +24,7 @@ _FIELD_STD, _FLOOR, _UNKNOWN, _INFORMATION_SCALE = 0.04, 0.05, 0.2, 0.2
 _MAX_ITERATIONS = 20  # Newton
 _MAX_SEARCH_RANGE = 20.0  # m; longer beams are left out of the correlative search
 _MAX_CANDIDATES = 3  # poses of the correlative search that are refined
+_MAX_WINDOW = 100.0  # m, half width of a search window, whatever odometry claims
 _SEARCH_STDS = 3.0  # half width of the search window in standard deviations of the prior
 # of the usual explained share: enough for the optimum next to odometry; too little without a wider
 # search
@@ -195,7 +196,7 @@ def search_pose(
     grid: _core.OccupancyGrid2D, scan: Scan, prior: MotionPrior, translation: float, rotation: float
 ) -> ScanMatch:
     """The best pose in a window of half widths `translation` (m) and `rotation` (rad)."""
-    rotation = min(rotation, float(np.pi))
+    translation, rotation = min(translation, _MAX_WINDOW), min(rotation, float(np.pi))
     return _register(grid, scan, prior, window_translation=translation, window_rotation=rotation)
 
 

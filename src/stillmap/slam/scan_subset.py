@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,8 +10,10 @@ from numpy.typing import NDArray
 from stillmap.core.recording import Recording
 
 Float = NDArray[np.float64]
+Values = NDArray[Any]
 Index = NDArray[np.intp]
 
+_MAX_BEAMS = 8192  # of a planar scan that are registered: more than lasers have
 # of an all-round view: sectors, the share of them that is seen, and scans that are looked at
 _SECTORS, _MIN_SECTORS, _SAMPLED = 36, 0.8, 9
 
@@ -47,6 +50,29 @@ def select_beams(
         images=None,
         record=None,
     )
+
+
+def thin_scans(recording: Recording, values: Values) -> tuple[Recording, Values]:
+    """A planar recording with fewer beams in the scans that have more than registration needs.
+
+    Normals take time in proportion to the square of the beams on a surface.
+
+    Args:
+        recording: 2D, M beams.
+        values: (M,) of every beam.
+
+    Returns:
+        The recording and the values of its beams, themselves where no scan has too many.
+    """
+    if int(np.diff(recording.offset).max(initial=0)) <= _MAX_BEAMS:
+        return recording, values
+    beams = beams_of_scans(recording, np.arange(recording.n_scans), _MAX_BEAMS)
+    kept = np.concatenate(beams)
+    thinned = replace(
+        select_beams(recording, np.arange(recording.n_scans), beams, recording.T_odom_base),
+        beam_time=None if recording.beam_time is None else recording.beam_time[kept],
+    )
+    return thinned, values[kept]
 
 
 def sees_all_round(recording: Recording) -> bool:

@@ -8,11 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.short_repr import ShortRepr
+from stillmap.core.square_box import bound_box
 
 Float = NDArray[np.float64]
 
 _STEP = 0.25  # of a square: spacing of the samples along a track
 _MIN_ABSENCE = 5.0  # s after which a return to a square is another crossing
+# squares of the box around all crossings: up to which it is always whole, and at most
+_LEAST_SQUARES, _MOST_SQUARES = 1 << 22, 1 << 26
 
 
 class MovingTrack(Protocol):
@@ -47,6 +50,7 @@ def compute_flow_map(objects: Sequence[MovingTrack], resolution: float = 0.5) ->
     """Count the crossings of each square.
 
     An object that stays in a square, or returns to it within a few seconds, crosses it once.
+    Crossings far from all others are left out where the map would be nearly empty.
 
     Args:
         objects: moving objects.
@@ -58,8 +62,10 @@ def compute_flow_map(objects: Sequence[MovingTrack], resolution: float = 0.5) ->
     if len(cells) == 0:
         none = np.zeros((0, 0), np.int32)
         return FlowMap(none, none.astype(np.float32), (0.0, 0.0, 0.0), resolution)
-    first = cells.min(axis=0)
-    width, height = (cells.max(axis=0) - first + 1).tolist()
+    box = bound_box(cells, _LEAST_SQUARES, _MOST_SQUARES)
+    inside = box.contains(cells)
+    cells, speeds = cells[inside], speeds[inside]
+    first, (height, width) = box.low, box.shape
     column, row = (cells - first).T
     flat = row * width + column
     count = np.bincount(flat, minlength=height * width)

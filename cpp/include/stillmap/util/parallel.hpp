@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <cstddef>
 #include <exception>
+#include <system_error>
 #include <thread>
 #include <vector>
 
@@ -22,7 +23,14 @@ void parallel_for_ranges(const std::vector<size_t>& bounds, Work&& work) {
     }
   };
   std::vector<std::thread> others;
-  for (size_t i = 1; i < n; ++i) others.emplace_back(guarded, i);
+  others.reserve(n);
+  for (size_t i = 1; i < n; ++i) {
+    try {
+      others.emplace_back(guarded, i);
+    } catch (const std::system_error&) {  // no memory for another stack
+      guarded(i);
+    }
+  }
   guarded(0);
   for (auto& other : others) other.join();
   for (const auto& error : errors)

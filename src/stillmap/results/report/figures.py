@@ -26,6 +26,7 @@ VEIL_ALPHA = 80  # of 255, of thinly observed cells: walls and free space show t
 MAX_PIXELS = 1_500_000  # of a map: fills a large screen, a few hundred kB as PNG
 _SNAPSHOT_PIXELS = 480  # longest edge of a snapshot
 _STRIP = 1 << 20  # cells drawn at once
+_MAX_MARGIN = 500  # cells around pictures of long, narrow maps
 _DOT_WIDTH = 600  # pixels of image width per pixel of dot size
 
 UNKNOWN_LEVEL, _ORANGE_INDEX = 101, 102
@@ -212,7 +213,8 @@ def _box(occupancy: GridMap, select: Callable[[NDArray[np.float32]], Mask]) -> W
     left, right, bottom, top = (
         int(n) for some in (columns, rows) for n in np.flatnonzero(some)[[0, -1]]
     )
-    margin = 4 + max(right - left, top - bottom) // 20
+    shorter, longer = sorted((right - left, top - bottom))
+    margin = 4 + min(longer // 20, _MAX_MARGIN + 5 * shorter)
     return (
         x + (left - margin) * occupancy.resolution,
         y + (bottom - margin) * occupancy.resolution,

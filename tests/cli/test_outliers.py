@@ -1,0 +1,173 @@
+"""Poses, odometry and ranges that are far off: the rest is mapped, in little memory."""
+
+import json
+import os
+import resource
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from maps import QUICK
+
+from stillmap.cli.main import main
+
+MOST = 700 << 20  # bytes of the process
+LIMIT = 5 << 30  # of address space, so that a failure does not take all of the machine
+
+
+@pytest.fixture
+def map_it(command, tmp_path):
+    """Maps: status, lines on stderr, peak memory in bytes, and the result folder."""
+
+    def run(recording, *words):
+        out = tmp_path / "out"
+        call = [*command, "map", str(recording), "-o", str(out), "--quiet", "--threads", "1"]
+        process = subprocess.Popen(
+            [*call, *QUICK, *map(str, words)],
+            stderr=subprocess.PIPE,
+            text=True,
+            preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (LIMIT, LIMIT)),
+        )
+        said = process.stderr.read()
+        process.stderr.close()
+        _, status, used = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        return process.returncode, said.splitlines(), used.ru_maxrss * 1024, out
+
+    return run
+
+
+@pytest.fixture
+def poses(room, tmp_path):
+    """Writes the true poses of the room, changed by a function of x and y (T, 2), as a file."""
+
+    def write(change):
+        rows = np.loadtxt(room / "truth" / "trajectory.tum", dtype=str)
+        rows[:, 1:3] = np.array(
+            [f"{v:.9g}" for v in change(rows[:, 1:3].astype(float)).flat]
+        ).reshape(-1, 2)
+        path = tmp_path / "poses.tum"
+        np.savetxt(path, rows, fmt="%s")
+        return path
+
+    return write
+
+
+@pytest.fixture
+def changed(room, tmp_path):
+    """The room with an array that a function changes in place."""
+
+    def write(name, change):
+        folder = tmp_path / "changed"
+        shutil.copytree(room, folder)
+        array = np.load(folder / f"{name}.npy")
+        change(array)
+        np.save(folder / f"{name}.npy", array)
+        return folder
+
+    return write
+
+
+def size_of_map(out: Path) -> tuple[int, ...]:
+    with np.load(out / "map.npz") as npz:
+        return npz["p_occupied"].shape
+
+
+@pytest.mark.parametrize("far", [1e4, 1e5, 1e7])
+def test_one_far_pose(map_it, room, poses, far):
+    def change(xy):
+        xy[20] = far, -far
+        return xy
+
+    status, said, peak, out = map_it(room, "--poses", poses(change))
+    assert (status, said) == (0, [])
+    assert peak < MOST
+    height, width = size_of_map(out)
+    assert max(height, width) * 0.05 < 15  # m, the room
+    assert np.loadtxt(out / "trajectory.tum")[20, 1:3].tolist() == [far, -far]
+    (warning,) = [
+        w for w in json.loads((out / "run.json").read_text())["warnings"] if "scan 20" in w
+    ]
+    assert "outside the map" in warning or "farther than 100 km" in warning
+    assert (out / "report.html").stat().st_size > 10_000
+
+
+def test_poses_all_over_the_country(map_it, room, poses):
+    rng = np.random.default_rng(0)
+    status, said, peak, out = map_it(
+        room, "--poses", poses(lambda xy: rng.uniform(-9e4, 9e4, xy.shape))
+    )
+    assert (status, said) == (0, [])
+    assert peak < MOST
+    assert np.prod(size_of_map(out)) < 2e8
+
+
+@pytest.mark.parametrize("leap", [1e4, 1e6])
+def test_odometry_that_leaps(map_it, changed, leap):
+    def change(T):
+        T[20:, :2, 2] += leap
+
+    status, said, peak, out = map_it(changed("T_odom_base", change))
+    assert (status, said) == (0, [])
+    assert peak < MOST
+    assert np.ptp(np.loadtxt(out / "trajectory.tum")[:, 1:3], axis=0).max() < 10.0
+    assert any(
+        "odometry leaps" in w for w in json.loads((out / "run.json").read_text())["warnings"]
+    )
+
+
+def test_one_beam_of_ten_kilometres(map_it, changed):
+    def change(points):
+        points[1000] *= 1e4 / np.linalg.norm(points[1000])
+
+    status, said, peak, out = map_it(changed("points", change))
+    assert (status, said) == (0, [])
+    assert peak < MOST
+    assert np.prod(size_of_map(out)) < 1e6
+
+
+def test_beams_of_kilometres_are_refused_beforehand(map_it, changed):
+    def change(points):
+        points *= 1000.0
+
+    status, said, peak, out = map_it(changed("points", change), "--memory", "0.6")
+    assert status == 2
+    (line,) = said
+    for words in ("takes at least", "0.6 GB may be used", "--memory GB", "read.max_range"):
+        assert words in line
+    assert peak < 600e6
+    assert not out.exists()
+
+
+def test_memory_that_runs_out_later(map_it, room, tmp_path):
+    status, said, _, _ = map_it(room, "--memory", "0.001")
+    assert status == 2
+    (line,) = said
+    assert "not enough memory: it takes more than the 0.001 GB that may be used" in line
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize("given", ["0", "-1", "nan", "inf"])
+def test_no_amount_of_memory(map_it, room, given):
+    status, said, _, _ = map_it(room, f"--memory={given}")
+    assert status == 2
+    assert said[-1].startswith("stillmap: --memory must be a positive number of GB")
+
+
+def test_what_was_computed_is_resumed(room, tmp_path, monkeypatch, capsys):
+    def fail(*_):
+        raise MemoryError("std::bad_alloc")
+
+    words = ["map", str(room), "-o", str(tmp_path / "out"), "--quiet", *QUICK]
+    with monkeypatch.context() as patched:
+        patched.setattr("stillmap.results.save.write_labels", fail)
+        assert main(words) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "not enough memory" in line
+    assert "continue after iteration 1: stillmap map" in line
+    assert os.listdir(tmp_path) == [".out.resume"]
+    monkeypatch.setattr("stillmap.pipeline.em_loop._m_step", fail)  # nothing is computed again
+    assert main([*words, "--memory", "3", "--resume"]) == 0, capsys.readouterr()
+    assert os.listdir(tmp_path) == ["out"]

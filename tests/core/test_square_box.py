@@ -1,0 +1,66 @@
+"""Boxes of squares: whole where they are filled, else around most of what was seen."""
+
+import numpy as np
+import pytest
+
+from stillmap.core.square_box import SquareBox, bound_box, find_busiest
+
+RNG = np.random.default_rng(3)
+PLACE = RNG.integers(0, 30, (500, 2))
+FAR = np.array([[200_000, -100_000]])
+
+
+def limits(box):
+    return box.low.tolist(), box.high.tolist()
+
+
+def test_everything_where_it_is_small():
+    box = bound_box(PLACE, 10_000, 10**9)
+    assert limits(box) == (PLACE.min(axis=0).tolist(), PLACE.max(axis=0).tolist())
+    assert box.area == box.shape[0] * box.shape[1]
+    assert box.contains(PLACE).all()
+
+
+def test_one_far_square_is_left_out():
+    squares = np.concatenate([PLACE[:250], FAR, PLACE[250:]])
+    box = bound_box(squares, 10_000, 10**9)
+    assert limits(box) == limits(bound_box(PLACE, 10_000, 10**9))
+    assert not box.contains(FAR).any()
+
+
+def test_a_connected_place_stays_whole():
+    along, beside = np.arange(3000), np.full(3000, 40)
+    loop = [np.stack(one, 1) for one in ((along, 0 * along), (along, beside), (0 * along, along))]
+    box = bound_box(np.concatenate([*loop, FAR]), 100, 10**9)
+    assert limits(box) == ([0, 0], [2999, 2999])
+    parts = [one * 17 for one in loop]  # with larger gaps than within a place
+    assert bound_box(np.concatenate(parts), 100, 10**9).area < 10**6
+
+
+def test_no_box_exceeds_the_most():
+    cloud = RNG.integers(0, 1000, (200_000, 2))
+    box = bound_box(cloud, 100, 90_000)
+    assert 60_000 < box.area <= 90_000
+
+
+def test_the_part_lies_around_the_places():
+    other = PLACE[:100] + np.array([50_000, 0])
+    squares = np.concatenate([PLACE, other])
+    box = bound_box(squares, 10_000, 10**9, places=np.tile([50_010, 15], (3, 1)))
+    assert box.contains(other).all()
+    assert not box.contains(PLACE).any()
+
+
+def test_a_larger_box_around_is_returned_where_it_is_filled():
+    around = SquareBox(np.array([-5, -5]), np.array([60, 60]))
+    assert bound_box(PLACE, 100, 10**9, around=around) is around
+    far = SquareBox(np.array([-5, -5]), np.array([10**6, 10**6]))
+    assert limits(bound_box(PLACE, 10_000, 10**9, around=far)) == limits(
+        bound_box(PLACE, 10_000, 10**9)
+    )
+
+
+@pytest.mark.parametrize("shift", [0, -7_000_000, 7_000_000])
+def test_busiest_place(shift):
+    places = np.concatenate([PLACE, PLACE[:40] + 5000]) + shift
+    assert np.abs(find_busiest(places, 1000) - shift - 15).max() <= 15
