@@ -1,6 +1,6 @@
 """The points of a 3D result in the map frame, block by block."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from stillmap.core import arrays
 from stillmap.core.chunks import Chunk, iter_chunks
 from stillmap.core.errors import InputError
+from stillmap.core.local_frame import FAR
 from stillmap.core.recording import Recording
 from stillmap.core.timestamps import beam_stamps_ns
 from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.io.point_cloud import ply
-from stillmap.io.point_cloud.binary_table import read_columns
+from stillmap.io.point_cloud.binary_table import TableLayout, read_columns
 
 Part = Literal["static", "dynamic"]
 
@@ -64,6 +65,11 @@ class Cloud:
     start_ns: int | None
     make_blocks: Callable[[], Iterator[Block]]
     has_colors: bool = False
+
+    @property
+    def is_far(self) -> bool:
+        """Whether 32-bit coordinates would lose the millimetre."""
+        return bool(np.abs(self.origin).max() > FAR)
 
     def iter_blocks(self, progress: Callable[[float], None] | None = None) -> Iterator[Block]:
         """The blocks; `progress` is called with the share of the points that is done."""
@@ -159,7 +165,19 @@ def cloud_from_folder(folder: Path, only: Part | None = None) -> Cloud:
                 colors = np.stack(values[4:], axis=1).astype(np.uint8) if has_colors else None
                 yield Block(points, values[3].astype(np.float32), None, colors)
 
-    return Cloud(sum(layout.rows for layout in layouts), np.zeros(3), None, make_blocks, has_colors)
+    count = sum(layout.rows for layout in layouts)
+    return Cloud(count, _find_origin(layouts), None, make_blocks, has_colors)
+
+
+def _find_origin(layouts: Sequence[TableLayout]) -> NDArray[np.float64]:
+    """(3,) whole m near the points of files; zero where they are 32-bit, and so near it."""
+    for layout in layouts:
+        is_double = all(one.dtype == np.float64 for one in layout.fields if one.name in "xyz")
+        if is_double and layout.rows:
+            x, y, z = next(iter(read_columns(layout, _FIELDS[:3])))
+            first = np.array([x[0], y[0], z[0]])
+            return np.round(first) if np.isfinite(first).all() else np.zeros(3)
+    return np.zeros(3)
 
 
 def _select(
