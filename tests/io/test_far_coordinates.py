@@ -79,5 +79,5 @@ def test_a_recording_folder_whose_poses_cannot_be(space, tmp_path, number):
     write_folder(dataclasses.replace(space), tmp_path / "folder")
     poses[1, 0, 3] = number
     np.save(tmp_path / "folder" / "T_recorded_base.npy", poses)
-    with pytest.raises(InputError, match=r"T_recorded_base\.npy: is damaged: pose 1 is not finite"):
+    with pytest.raises(InputError, match=r"T_recorded_base\.npy: .* pose 1 is not finite"):
         read(tmp_path / "folder")

@@ -97,7 +97,7 @@ def poses_to_matrices(
     array = array.astype(np.float64)
     finite = np.isfinite(array).reshape(count, -1).all(axis=1)
     require_all(name, finite, "finite numbers", array)
-    near = (np.abs(array) < MAX_TRANSLATION).reshape(count, -1).all(axis=1)
+    near = (np.abs(array) < MAX_TRANSLATION).all(axis=tuple(range(1, array.ndim)))
     require_all(name, near, f"numbers below {MAX_TRANSLATION:g}", array)
     if flat:
         return se2.matrix(*array.T)

@@ -261,9 +261,9 @@ def _open_array(
 def _read_poses(path: Path, name: str, count: int, D: int) -> NDArray[np.float64]:
     T = np.array(_open_array(path, name, (count, D + 1, D + 1), np.float64))
     R = T[:, :D, :D]
-    far = np.flatnonzero(~(np.abs(T) < MAX_TRANSLATION).reshape(count, -1).all(axis=1))
+    far = np.flatnonzero(~(np.abs(T) < MAX_TRANSLATION).all(axis=(1, 2)))
     if len(far):
-        what = f"pose {far[0]} is not finite, or a million kilometres away"
+        what = f"not rigid transforms: pose {far[0]} is not finite, or a million kilometres away"
         raise _damaged_error(path, name, what)
     if not (
         np.all(T[:, D] == np.eye(D + 1)[D])
