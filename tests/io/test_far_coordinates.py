@@ -58,6 +58,25 @@ def test_a_folder_of_pcd_says_where_it_was(cloud, tmp_path):
     np.testing.assert_allclose(ends, points, rtol=0, atol=1e-4)
 
 
+def test_scans_without_a_pose_beside_others(tmp_path):
+    """Only the one in the projection is shifted, and its pose says so."""
+    points = np.random.default_rng(3).uniform(-20.0, 20.0, (50, 3))
+    for name, viewpoint, these in (
+        ("1.pcd", "0 0 0 1 0 0 0", points + UTM),
+        ("2.pcd", "500003 5300004 800 1 0 0 0", points),
+    ):
+        head = (
+            "VERSION 0.7\nFIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 50\nHEIGHT 1\n"
+        )
+        head += f"VIEWPOINT {viewpoint}\nPOINTS 50\nDATA binary\n"
+        (tmp_path / name).write_bytes(head.encode() + these.astype("<f8").tobytes())
+    found = read(tmp_path)
+    ends = found.end_points(np.arange(found.n_beams), found.T_recorded_base)
+    np.testing.assert_allclose(ends[:50], points + UTM, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(ends[50:], points + [500_003, 5_300_004, 800], rtol=0, atol=1e-5)
+    assert "origin" not in found.source
+
+
 @pytest.mark.parametrize("number", ["1e9", "-3e300", "1e12"])
 def test_a_trajectory_a_million_kilometres_away(tmp_path, number):
     path = tmp_path / "poses.tum"

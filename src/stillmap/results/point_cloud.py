@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from stillmap.core import arrays
 from stillmap.core.chunks import Chunk, iter_chunks
 from stillmap.core.errors import InputError
-from stillmap.core.local_frame import FAR
+from stillmap.core.local_frame import FAR, LocalFrame
 from stillmap.core.recording import Recording
 from stillmap.core.timestamps import beam_stamps_ns
 from stillmap.em.types import DYNAMIC_BELOW
@@ -119,7 +119,7 @@ def cloud_from_recording(
     if times is not None:
         for block in arrays.iter_blocks(times):
             earliest = min(earliest, float(times[block].min()))
-    T_map_sensor = deskewed.T_map_sensor(poses)
+    T_map_sensor, near = deskewed.T_map_sensor(poses), LocalFrame.near(poses)
 
     def make_blocks() -> Iterator[Block]:
         mapped = [one for one in (p_static, times, colors) if one is not None]
@@ -135,7 +135,7 @@ def cloud_from_recording(
             int(np.count_nonzero(_select(deskewed.hit[block], p_static[block], only)))
             for block in arrays.iter_blocks(deskewed.hit, p_static)
         ),
-        origin=np.round(poses[0, :3, 3]),
+        origin=near.origin if near.is_shifted else np.round(poses[0, :3, 3]),
         start_ns=int(recording.stamp_ns[0]) + int(np.floor(1e9 * earliest)),
         make_blocks=make_blocks,
         has_colors=colors is not None,

@@ -32,6 +32,14 @@ class Origin:
         with np.errstate(over="ignore"):
             return (points - (0.0 if self.position is None else self.position)).astype(np.float32)
 
+    def place(self, recording: Recording) -> None:
+        """Let the recorded poses of scans whose points were shifted say so, in place: they are the
+        scans without a rotation and a position, beside others that have them."""
+        T = recording.T_recorded_base
+        if T is not None and self.position is not None:
+            is_unplaced = np.equal(T, np.eye(4)).all(axis=(1, 2))
+            T[is_unplaced, :3, 3] = self.position
+
     def add_notes(self, recording: Recording, *, in_sensor_frame: bool = False) -> None:
         """Note the origin in the source of a recording, and warn that the sensor is assumed there;
         neither where points are `in_sensor_frame` and near its origin."""

@@ -186,7 +186,9 @@ def read(path: Path, context: ReadContext) -> Recording:
         info.warnings.append(text)
     read_cloud = partial(_read_cloud, in_map_frame=in_map_frame, origin=origin)
     recording = build_recording(sources_of(files, PCD_EXTENSIONS, read_cloud), info, context)
-    origin.add_notes(recording, in_sensor_frame=True)
+    origin.place(recording)
+    if recording.T_recorded_base is None:
+        origin.add_notes(recording, in_sensor_frame=True)
     return recording
 
 
