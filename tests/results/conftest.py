@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
+from stillmap.core.local_frame import LocalFrame
 from stillmap.core.recording import Recording
 from stillmap.core.se2 import inverse, matrix
 from stillmap.em import Coverage
@@ -103,6 +104,7 @@ class FakeResult:
     doubts: Diagnostics = field(default_factory=Diagnostics)
     calibration: Calibration = field(default_factory=Calibration)
     quality: Quality = field(default_factory=Quality)
+    frame: LocalFrame = field(default_factory=LocalFrame)
 
     @property
     def deskewed(self) -> Recording:

@@ -22,6 +22,7 @@ from stillmap.pipeline import inputs
 from stillmap.pipeline.checkpoint import CheckpointFolder, DamagedCheckpoint
 from stillmap.pipeline.checkpoint_files import identify_run
 from stillmap.pipeline.estimate import EmState
+from stillmap.pipeline.map_frame import objects_to_local
 from stillmap.pipeline.options import Options, resolve_options
 from stillmap.pipeline.result import MappingResult, map_recording
 from stillmap.preprocessing.options import ReadOptions
@@ -221,8 +222,15 @@ def _map_tilting_laser(
     result: MappingResult, tilting: Recording, options: Options
 ) -> "TiltingResult":
     """Map the tilting laser in 3D, given the labels and objects of the planar one."""
-    from stillmap.rig.build import PlanarResult, build_tilting
+    from stillmap.rig.build import PlanarResult, build_tilting, shift_tilting
 
-    planar = PlanarResult(result.deskewed, result.poses, result.p_static, result.objects)
+    frame = result.frame
+    planar = PlanarResult(
+        result.deskewed,
+        frame.to_local(result.poses),
+        result.p_static,
+        objects_to_local(result.objects, frame),
+    )
     threads = resolve_threads(options.threads)
-    return build_tilting(planar, tilting, options.rig, options.em, threads)
+    found = build_tilting(planar, tilting, options.rig, options.em, threads)
+    return shift_tilting(found, frame.origin)

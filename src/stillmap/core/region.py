@@ -19,6 +19,12 @@ def is_inside(points: NDArray[Any], region: Region) -> NDArray[np.bool_]:
     return np.asarray((x >= x0) & (x <= x1) & (y >= y0) & (y <= y1))
 
 
+def shift_region(region: Region, by: NDArray[np.float64]) -> Region:
+    """The region moved by the first two of (3,) metres."""
+    (x0, y0, x1, y1), (x, y) = region, by[:2].tolist()
+    return x0 + x, y0 + y, x1 + x, y1 + y
+
+
 def limit_hits(
     recording: Recording, T_map_base: NDArray[np.float64], region: Region | None
 ) -> Recording:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stillmap.core import se2
+from stillmap.io.rigid_transforms import MAX_TRANSLATION
 
 Float = NDArray[np.float64]
 
@@ -96,6 +97,8 @@ def poses_to_matrices(
     array = array.astype(np.float64)
     finite = np.isfinite(array).reshape(count, -1).all(axis=1)
     require_all(name, finite, "finite numbers", array)
+    near = (np.abs(array) < MAX_TRANSLATION).all(axis=tuple(range(1, array.ndim)))
+    require_all(name, near, f"numbers below {MAX_TRANSLATION:g}", array)
     if flat:
         return se2.matrix(*array.T)
     R = array[:, :dimension, :dimension]

@@ -22,6 +22,7 @@ from stillmap.core.recording import Recording
 from stillmap.core.schema import SchemaError, check
 from stillmap.io.images import read_image, write_png
 from stillmap.io.notes import prune_notes
+from stillmap.io.rigid_transforms import MAX_TRANSLATION
 from stillmap.preprocessing.options import MAX_POINT_DISTANCE
 
 _IMAGES = "images"
@@ -260,9 +261,12 @@ def _open_array(
 def _read_poses(path: Path, name: str, count: int, D: int) -> NDArray[np.float64]:
     T = np.array(_open_array(path, name, (count, D + 1, D + 1), np.float64))
     R = T[:, :D, :D]
+    far = np.flatnonzero(~(np.abs(T) < MAX_TRANSLATION).all(axis=(1, 2)))
+    if len(far):
+        what = f"not rigid transforms: pose {far[0]} is not finite, or a million kilometres away"
+        raise _damaged_error(path, name, what)
     if not (
-        np.all(np.abs(T) < 1e12)
-        and np.all(T[:, D] == np.eye(D + 1)[D])
+        np.all(T[:, D] == np.eye(D + 1)[D])
         and np.allclose(R @ R.transpose(0, 2, 1), np.eye(D), atol=1e-6)
     ):
         raise _damaged_error(path, name, "not rigid transforms")

@@ -14,6 +14,7 @@ from stillmap.core.errors import InputError
 from stillmap.core.input_files import read_text
 from stillmap.core.recording import Recording
 from stillmap.core.timestamps import format_seconds
+from stillmap.io.rigid_transforms import MAX_TRANSLATION
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -117,6 +118,8 @@ def _parse_pose(words: list[str], where: str) -> tuple[int, list[float]]:
     # plain Python: NumPy takes ten times as long for so few numbers
     if not all(map(math.isfinite, row)):
         raise InputError("holds a number that is not finite", where=where)
+    if max(map(abs, row[:3])) >= MAX_TRANSLATION:
+        raise InputError("has a position a million kilometres away", where=where, hint=_COLUMNS)
     if abs(stamp) >= 2**63:
         raise InputError("has a stamp that 64 bit nanoseconds cannot hold", where=where)
     if abs(math.hypot(*row[3:]) - 1) > _UNIT_TOLERANCE:

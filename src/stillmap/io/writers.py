@@ -16,6 +16,7 @@ from stillmap.core.recording import Recording
 from stillmap.io import stillmap_folder
 from stillmap.io.carmen.writer import write_log
 from stillmap.io.point_cloud import kitti, las, pcd, ply
+from stillmap.io.point_cloud.origin import place_clouds
 from stillmap.io.ros.recording_writer import write_recording as write_bag
 
 # (recording, path, overwrite=...) -> what could not be written, a sentence each
@@ -91,7 +92,7 @@ def _write_cloud(
         D = recording.dimension
         T = np.tile(np.eye(D + 1), (recording.n_scans, 1, 1))
         losses = ["there are no poses: all scans lie at one place"] if len(T) > 1 else []
-    write(recording, path, T)
+    write(recording, path, place_clouds(recording, T))
     return [*losses, *_describe_non_returns(recording)]
 
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core.errors import InputError
+from stillmap.core.local_frame import LocalFrame
 from stillmap.em import GroundMap
 from stillmap.em.ground import fit_ground
 from stillmap.io.trajectory import read_tum
@@ -45,7 +46,7 @@ class KnownCloud:
         planar: its planar map.
 
     Attributes:
-        planar: the planar map.
+        planar: the planar map, in whose frame all is.
         poses: (T, 4, 4) T_map_base from where it was mapped.
         points: (N, 3) float32 where surface runs, m, in random order.
         p_static: (N,) float32.
@@ -60,8 +61,8 @@ class KnownCloud:
             hint = "sweeps are localized in the result of a spinning lidar"
             raise InputError("holds no static.ply", where=str(source), hint=hint)
         self.planar = planar
-        self.poses = _read_route(folder)
-        points, p_static = _read_points(folder)
+        self.poses = planar.frame.to_local(_read_route(folder))
+        points, p_static = _read_points(folder, planar.frame)
         # cells of planes take in so many points only, which must not all lie on one side
         order = np.random.default_rng(0).permutation(len(points))
         self.points, self.p_static = points[order], p_static[order]
@@ -112,12 +113,15 @@ def _read_route(folder: Path) -> Float:
     return np.concatenate(poses)
 
 
-def _read_points(folder: Path) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(N, 3) the mean of the points in every voxel, and (N,) their mean P(static)."""
+def _read_points(
+    folder: Path, frame: LocalFrame
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(N, 3) the mean of the points in every voxel, in a frame, and (N,) their mean P(static)."""
     parts = [(np.zeros((0, 3), np.int64), np.zeros((0, 5)))]
     for block in cloud_from_folder(folder, "static").iter_blocks():
-        more = np.column_stack([block.points, block.p_static, np.ones(len(block.points))])
-        cells = np.floor(block.points / _SPACING).astype(np.int64)
+        points = frame.points_to_local(block.points)
+        more = np.column_stack([points, block.p_static, np.ones(len(points))])
+        cells = np.floor(points / _SPACING).astype(np.int64)
         parts.append(_sum_up(cells, more))
     keys, sums = _sum_up(*(np.concatenate(one) for one in zip(*parts, strict=True)))
     if not len(keys):

@@ -1,5 +1,6 @@
 """A map from an earlier run, for localization: to be matched, searched, and looked up."""
 
+import dataclasses
 import os
 from collections import deque
 from itertools import islice
@@ -9,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
+from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.core.grid_map import GridMap
+from stillmap.core.local_frame import LocalFrame
 from stillmap.live.local_map import (
     Labeller,
     MappedScan,
@@ -42,6 +45,7 @@ class KnownMap:
         source: folder of a result or a place, or a map.
 
     Attributes:
+        frame: near the map, in its map frame: all else here is in it.
         grid: the map.
         hits: (H, W) sums of hits of its cells.
         resolution: m, edge of a cell.
@@ -57,12 +61,20 @@ class KnownMap:
             self.hits = self.grid.p_occupied
         else:
             self.grid, self.hits = read_grid(Path(source)), read_hit_sums(Path(source))
+        self.frame = LocalFrame.near(se2.matrix(*self.grid.origin)[None])
+        corner = self.frame.corner_to_local(self.grid.origin)
+        self.grid = dataclasses.replace(self.grid, origin=corner)
         if not self.grid.occupied.any():
             where = "map" if isinstance(source, GridMap) else str(source)
             raise InputError("has an empty map", where=where)
         self.resolution = self.grid.resolution
         self._centres = self.grid.centres(np.argwhere(self.grid.occupied))
         self.surfaces = _find_surfaces(self.grid, self.hits)
+
+    @property
+    def in_map_frame(self) -> Grid:
+        """The map where it was."""
+        return dataclasses.replace(self.grid, origin=self.frame.corner_to_map(self.grid.origin))
 
     def make_grid(self) -> _core.OccupancyGrid2D:
         """The map for registration: an end point for every occupied cell, and free space."""

@@ -3,6 +3,7 @@
 # signatures name ArrayLike instead of spelling it out
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from stillmap.core.errors import InputError
 from stillmap.core.grid_map import GridMap
+from stillmap.core.local_frame import LocalFrame
 from stillmap.core.profiling import Progress, no_progress
 from stillmap.em import CellProbabilities
 from stillmap.io.array_checks import poses_to_matrices
@@ -142,13 +144,26 @@ class LiveMapper:
             return empty_map(self.resolution)
         labels, output = self._slam.labels, self.options.output
         if self._slam.dimension == 2:
-            return labels.to_map()
-        band = output.min_obstacle_height, output.max_obstacle_height
-        return project_obstacles(labels.known_cells(), self._slam.route(), band, self.resolution)
+            found = labels.to_map()
+        else:
+            band, cells = (output.min_obstacle_height, output.max_obstacle_height), self._cells()
+            found = project_obstacles(cells, self._slam.route(), band, self.resolution)
+        origin = self._slam.known_frame.corner_to_map(found.origin)
+        return dataclasses.replace(found, origin=origin)
 
     @property
     def cells(self) -> CellProbabilities:
         """P(static and occupied) of the cells, in 3D voxels, in which beams ended."""
+        found, frame = self._cells(), LocalFrame()
+        if self._slam is not None:
+            frame = self._slam.known_frame
+        if not frame.is_shifted:
+            return found
+        by = np.round(frame.origin[: found.cells.shape[1]] / self.resolution).astype(np.int64)
+        return dataclasses.replace(found, cells=found.cells + by)
+
+    def _cells(self) -> CellProbabilities:
+        """The same in the frame of the labels."""
         if self._slam is None:
             return CellProbabilities(np.zeros((0, 2), np.int64), np.zeros(0, np.float32), 0.0)
         return self._slam.labels.known_cells()

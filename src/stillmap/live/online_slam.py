@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.local_frame import LocalFrame
 from stillmap.core.parallel import resolve_threads
-from stillmap.live.causal_labels import CausalLabels
+from stillmap.live.causal_labels import CausalLabels, MapChange
 from stillmap.live.front_end import FrontEnd, Registration
 from stillmap.live.hindsight import Hindsight, LaterLabels
 from stillmap.live.history import History
@@ -18,7 +19,7 @@ from stillmap.live.loop_closer import NoLoops
 from stillmap.live.loop_process import start_closer
 from stillmap.live.map_correction import LabelledScan
 from stillmap.live.map_frame import LoopClosing, MapFrame, rotate_covariance
-from stillmap.live.movers import MoverTracker
+from stillmap.live.movers import Mover, MoverTracker
 from stillmap.live.observation import BeamSelector, Observation, find_margins
 from stillmap.live.place import PlaceTracker
 from stillmap.live.placement import Placement
@@ -111,7 +112,8 @@ class OnlineSlam:
             self.labels.add(labelled.observation, pose)
         p_static = self.labels.label(deskewed, pose)  # E-step: (8)
         self._movers.add(deskewed, found.T, p_static)
-        self.history.append(beams, p_static, T_odom_base, pose, found.T, anchor, found.twist)
+        answer = self.known_frame.to_map(pose)
+        self.history.append(beams, p_static, T_odom_base, answer, found.T, anchor, found.twist)
         self._hindsight.add(len(self.history) - 1, beams)
         self._T_odom_base = T_odom_base
         update = self._to_update(beams.stamp_ns, found, p_static)
@@ -137,16 +139,30 @@ class OnlineSlam:
         moved = self._finder.move_all(local)
         # in a known map that frame is the map's
         poses = moved if self._place is not None else self.frame.to_map_all(moved, anchor)
-        return Placement(poses, self._finder.submaps(len(poses)))
+        submaps = self._finder.submaps(len(poses))
+        if self._place is not None and self._place.frame.is_shifted:
+            poses = np.where((submaps == 0)[:, None, None], self._place.frame.to_map(poses), poses)
+        return Placement(poses, submaps)
+
+    @property
+    def known_frame(self) -> LocalFrame:
+        """The frame in which a known map is searched, and poses are once the robot is found, in its
+        map frame; else the map frame itself."""
+        if self._place is None or self._finder.is_lost:
+            return LocalFrame()
+        return self._place.frame
 
     def path(self) -> Float:
         """(S, D+1, D+1) T_map_base of the spaced scans since the robot was found or lost."""
+        return self.known_frame.to_map(self._path())
+
+    def _path(self) -> Float:
         return self.frame.spaced_poses()[self._path_begin :]
 
     def route(self) -> Float:
-        """(S, D) positions from where what the map shows was seen, in 3D."""
+        """(S, D) positions from where what the map shows was seen, in 3D, in the labels' frame."""
         D = self.dimension
-        own = self.path()[:, :D, D]
+        own = self._path()[:, :D, D]
         return own if self._place is None else np.concatenate([self._place.route, own])
 
     def close(self) -> None:
@@ -217,14 +233,14 @@ class OnlineSlam:
         T, motion = found
         self._path_begin = frame.last + 1 if self._place is not None else 0
         self._movers.move(T)
-        pose = motion @ update.pose
+        pose = self.known_frame.to_map(motion @ update.pose)
         return dataclasses.replace(
             update,
             pose=pose,
             covariance=rotate_covariance(update.covariance, motion),
             T_map_odom=self._to_map_odom(pose),
             doubts=tuple(name for name in update.doubts if name not in ("lost", "ambiguous")),
-            movers=self._movers.movers(frame.T_map_local),
+            movers=self._find_movers(),
         )
 
     def _to_update(
@@ -238,17 +254,34 @@ class OnlineSlam:
             "lost": self._finder.is_lost,
             "ambiguous": self._finder.is_ambiguous,
         }
-        pose = self.frame.T_map_local @ found.T
+        pose = self.known_frame.to_map(self.frame.T_map_local @ found.T)
         return Update(
             pose,
             rotate_covariance(found.covariance, self.frame.T_map_local),
             p_static,
             self._to_map_odom(pose),
             tuple(name for name, is_so in doubts.items() if is_so),
-            self.labels.take_changes(stamp_ns),
-            self._movers.movers(self.frame.T_map_local),
+            self._take_changes(stamp_ns),
+            self._find_movers(),
             [LaterLabels(n, self.label(one, n)) for n, one in self._hindsight.take(stamp_ns)],
         )
+
+    def _take_changes(self, stamp_ns: int) -> list[MapChange]:
+        """The parts of the map that changed, in the map frame."""
+        changes, known = self.labels.take_changes(stamp_ns), self.known_frame
+        if not known.is_shifted:
+            return changes
+        by = np.round(known.origin[: self.dimension] / self.resolution).astype(np.int64)
+        return [dataclasses.replace(one, first_cell=one.first_cell + by) for one in changes]
+
+    def _find_movers(self) -> list[Mover]:
+        """What moves now, in the map frame."""
+        movers, known = self._movers.movers(self.frame.T_map_local), self.known_frame
+        if not known.is_shifted:
+            return movers
+        return [
+            dataclasses.replace(one, position=known.points_to_map(one.position)) for one in movers
+        ]
 
     def _increment(self, T_odom_base: Float | None) -> Float | None:
         """(D+1, D+1) of odometry since the last scan; None: not known."""

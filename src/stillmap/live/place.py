@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 import stillmap._core as _core
 from stillmap.core import config
 from stillmap.core.errors import InputError
+from stillmap.core.local_frame import LocalFrame
 from stillmap.core.parallel import resolve_threads
 from stillmap.live.causal_labels import CausalLabels, OccupancyFilter, take_over
 from stillmap.live.global_localization import GlobalLocalizer, Localization
@@ -51,12 +52,13 @@ def make_tracker(
         InputError: scans in 3D, and the place is of a planar laser, or is to be extended.
     """
     if dimension == 2:
-        return PlaceTracker(PlanarLocalizer(known, mode == "extend"))
+        return PlaceTracker(PlanarLocalizer(known, mode == "extend"), known.frame)
     if mode == "extend":
         hint = 'mode "localise" takes sweeps'
         raise InputError("only planar maps can be extended", where=str(source), hint=hint)
     threads = resolve_threads(options.threads)
-    return PlaceTracker(SweepLocalizer(KnownCloud(source, known), options, threads))
+    localizer = SweepLocalizer(KnownCloud(source, known), options, threads)
+    return PlaceTracker(localizer, known.frame)
 
 
 class Localizer(Protocol):
@@ -111,13 +113,16 @@ class PlaceTracker:
 
     Args:
         localizer: the map, and the search in it.
+        frame: of the localizer, in the map frame.
 
     Attributes:
+        frame: the same.
         is_lost: the robot is not found in it yet.
         is_ambiguous: several places fit about as well.
     """
 
-    def __init__(self, localizer: Localizer) -> None:
+    def __init__(self, localizer: Localizer, frame: LocalFrame) -> None:
+        self.frame = frame
         self.is_lost, self.is_ambiguous = True, False
         self._localizer = localizer
 

@@ -91,7 +91,8 @@ class Snapshot(ShortRepr):
             _write_answers(given, result.recording.stamp_ns, folder)
             if self.extended is not None and main == 0:
                 mode = self.options.output.map_mode
-                write_extended(folder, self.extended.grid, self.extended.hits, result.map, mode)
+                known = self.extended.in_map_frame
+                write_extended(folder, known, self.extended.hits, result.map, mode)
             for number, submap in enumerate(others, 1):
                 self._save_submap(recording, answers, submap, folder / SUBMAPS / str(number))
 

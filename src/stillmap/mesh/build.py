@@ -2,7 +2,7 @@
 (Sect. 4.4, 4.5)."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
@@ -75,6 +75,7 @@ class Models(ShortRepr):
         objects: models of moving objects, in the order of the objects.
         n_objects: number of moving objects.
         point_colors: colors of the end points; None without images.
+        origin: (3,) metres in the map frame, the origin of the frame that all this is in.
     """
 
     assignment: ViewAssignment
@@ -86,6 +87,7 @@ class Models(ShortRepr):
     objects: list[ObjectModel]
     n_objects: int
     point_colors: PointColors | None = None
+    origin: Float = field(default_factory=lambda: np.zeros(3))
 
 
 def require_extras() -> None:

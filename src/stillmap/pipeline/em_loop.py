@@ -35,7 +35,7 @@ def iterate(
     Args:
         recording: at least one scan.
         options: see Options.
-        poses: (T, D+1, D+1) T_map_base to keep instead of estimating them.
+        poses: (T, D+1, D+1) T_map_base to keep instead of estimating them; near the origin.
         progress: called with the stage, the iteration, scans done, and of how many.
         stages: where time and memory per stage are noted.
         scratch: folder for per-beam arrays too large for memory, in anonymous files that the

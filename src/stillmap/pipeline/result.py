@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from stillmap import em, slam
 from stillmap.core.heap import trim_heap
+from stillmap.core.local_frame import LocalFrame
 from stillmap.core.parallel import limit_blas_threads, resolve_threads
 from stillmap.core.profiling import Progress, StageTimer, no_progress
 from stillmap.core.recording import Recording
@@ -21,6 +22,16 @@ from stillmap.pipeline.diagnostics import find_map_warnings, find_warnings
 from stillmap.pipeline.em_loop import iterate
 from stillmap.pipeline.estimate import EmState, Estimate, IterationRecord
 from stillmap.pipeline.final_map import Maps, final_estimate, find_objects, make_maps
+from stillmap.pipeline.map_frame import (
+    changes_to_map,
+    enter_local_frame,
+    estimate_to_map,
+    maps_to_map,
+    objects_to_map,
+    restore_odometry,
+    snapshots_to_map,
+    traffic_to_map,
+)
 from stillmap.pipeline.memory_need import require_map_memory
 from stillmap.pipeline.options import DEFAULTS, Options, resolve_options
 from stillmap.pipeline.pose_sources import better_source
@@ -52,6 +63,7 @@ class MappingResult(ShortRepr):
         stages: seconds and peak memory.
         calibration: poses of the lasers and errors of odometry, as the motion shows them.
         quality: of labels and geometry, from 0 to 100.
+        frame: in which it was computed; everything here is in the map frame.
     """
 
     recording: Recording
@@ -68,6 +80,7 @@ class MappingResult(ShortRepr):
     stages: Mapping[str, Mapping[str, Any]]
     calibration: Calibration = field(default_factory=Calibration)
     quality: Quality = field(default_factory=Quality)
+    frame: LocalFrame = field(default_factory=LocalFrame)
 
     @property
     def poses(self) -> Float:
@@ -143,12 +156,13 @@ def map_recording(
     """Maps a recording: EM until the bound stops improving, then maps, changes and objects.
 
     First, sweeps without beam times get some where they are distorted, and without given poses,
-    mounts of the lasers and errors of odometry are calibrated.
+    mounts of the lasers and errors of odometry are calibrated. What is far from the origin of the
+    map frame is computed in a frame near the robot.
 
     Args:
         recording, options, poses, progress, stages, scratch: see `stillmap.iterate`.
         resume: state of an interrupted run with the same arguments.
-        checkpoint: called with the state after every iteration.
+        checkpoint: called with the state, in the frame near the robot, after every iteration.
 
     Raises:
         ValueError: a recording without scans, or poses of another shape.
@@ -161,6 +175,7 @@ def map_recording(
         recording = dataclasses.replace(recording, scratch=scratch)
     stages = stages or StageTimer()
     options = resolve_options(options, recording)
+    frame, odometry, recording, poses = enter_local_frame(recording, poses)
     found = Calibration()
     with stages.measure("calibration"):
         recording, notes = remove_leaps(recording)
@@ -188,7 +203,9 @@ def map_recording(
             _run_em(recording, state, None, progress, stages, checkpoint)
     result = _finish(state, recording, progress, stages)
     warnings = [*result.warnings, *notes]
-    return dataclasses.replace(result, calibration=found, warnings=warnings)
+    recording = restore_odometry(recording, odometry)
+    result = dataclasses.replace(result, recording=recording, calibration=found, warnings=warnings)
+    return _to_map_frame(result, frame)
 
 
 def _run_em(
@@ -254,4 +271,20 @@ def _finish(
         changes=changes,
         stages=stages.to_dict(),
         quality=quality,
+    )
+
+
+def _to_map_frame(result: MappingResult, frame: LocalFrame) -> MappingResult:
+    """A result that was computed in a frame near the robot, in the map frame."""
+    if not frame.is_shifted:
+        return result
+    return dataclasses.replace(
+        result,
+        snapshots=snapshots_to_map(result.snapshots, frame),
+        estimate=estimate_to_map(result.estimate, frame, result.options.slam.resolution),
+        maps=maps_to_map(result.maps, frame),
+        objects=objects_to_map(result.objects, frame),
+        traffic=traffic_to_map(result.traffic, frame),
+        changes=changes_to_map(result.changes, frame, result.map),
+        frame=frame,
     )

@@ -22,11 +22,12 @@ class Snapshot(GridMap):
 
     Attributes:
         number: the iteration, from 1.
-        dynamic_points: (K, 2) float32, end points in the map frame that lie in this part.
+        dynamic_points: (K, 2) float32, end points in the map frame that lie in this part; float64
+            where that is far from the origin.
     """
 
     number: int
-    dynamic_points: NDArray[np.float32]
+    dynamic_points: NDArray[np.float32] | NDArray[np.float64]
 
 
 def extent(occupancy: GridMap) -> Window:

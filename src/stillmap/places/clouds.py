@@ -20,7 +20,7 @@ def write_place_clouds(folder: Path, result: PlaceResult) -> None:
     joined = join_keyframes([one.session.keyframes for one in sessions])
     poses = np.concatenate([one.keyframe_poses for one in sessions])
     labels = np.concatenate([_label_keyframes(one, result.shown) for one in sessions])
-    write_clouds(folder, joined.recording, poses, labels)
+    write_clouds(folder, joined.recording, result.place.local_frame.to_map(poses), labels)
 
 
 def _label_keyframes(one: PlacedSession, shown: ShownState) -> NDArray[np.float32]:

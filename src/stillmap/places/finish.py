@@ -2,6 +2,7 @@
 
 import datetime
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ from stillmap.places.writer import PlaceResult, write_place_files, write_session
 from stillmap.results.labels import read_array
 from stillmap.results.map_npz import write_map_npz
 from stillmap.results.map_server import write_map_server
-from stillmap.results.run_json import FORMAT_VERSION, RECORD, quality_record
+from stillmap.results.run_json import FORMAT_VERSION, LOCAL_ORIGIN, RECORD, quality_record
 
 LAST, MAJORITY = "last", "majority"
 _STATES_HINT = "map_state=last, majority, the name of a session, or a date such as 2026-05-31"
@@ -119,14 +120,15 @@ def write_place(folder: Path, result: PlaceResult, options: Options, map_state: 
     for one in place.sessions:
         write_checksums(folder / "sessions" / one.session.name)
     write_place_files(folder, result)
-    write_objects(folder, place.sessions)
+    write_objects(folder, place)
     if place.dimension == 3:
         write_place_clouds(folder, result)
     planar = [place.sessions[k].require_evidence()[1] for k in place.in_time()]
     occupancy = make_place_map(planar, result.planar)
+    record = place_record(folder, result, options, map_state, occupancy)
+    occupancy = replace(occupancy, origin=place.local_frame.corner_to_map(occupancy.origin))
     write_map_server(folder, occupancy, options.output.map_mode)
     write_map_npz(folder / "map.npz", occupancy)
-    record = place_record(folder, result, options, map_state, occupancy)
     page = render_place_report(folder, occupancy, options.output.map_mode, record)
     write_text(folder / "report.html", page)
     write_json(folder / RECORD, record)
@@ -139,8 +141,9 @@ def place_record(
     map_state: str,
     occupancy: OccupancyMap,
 ) -> dict[str, Any]:
-    """The content of `run.json` of a place."""
+    """The content of `run.json` of a place; `occupancy` is its map in its local frame."""
     place = result.place
+    origin = place.local_frame.origin
     known = int(np.count_nonzero(~np.isnan(np.asarray(occupancy.p_occupied))))
     return {
         "format_version": FORMAT_VERSION,
@@ -151,6 +154,7 @@ def place_record(
             "sessions": [one.session.name for one in place.sessions],
         },
         "dimension": place.dimension,
+        **({LOCAL_ORIGIN: origin.tolist()} if origin.any() else {}),
         "options": to_dict(options),
         "iterations": [],
         "counts": _count(folder),

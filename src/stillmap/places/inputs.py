@@ -1,5 +1,6 @@
 """The inputs of a merge: recordings, result folders, or a place."""
 
+import dataclasses
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,20 +11,24 @@ import numpy as np
 
 from stillmap.core.errors import InputError
 from stillmap.core.json import write_json
+from stillmap.core.local_frame import LocalFrame
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io.registry import detect_format
 from stillmap.places.prepare import MappedRecording
+from stillmap.places.session import Session
 from stillmap.results.folder import open_result
 from stillmap.results.pose_graph_g2o import read_g2o
 from stillmap.results.reader import SESSIONS as SESSIONS  # of places, found there as well
 from stillmap.results.result import BuiltResult
-from stillmap.results.run_json import RECORD, TILTING
+from stillmap.results.run_json import LOCAL_ORIGIN, RECORD, TILTING
 from stillmap.results.run_record import is_result, read_record
 from stillmap.results.saved import SavedResult, load
 from stillmap.slam import deskew_recording
 
 TIES = "ties.npz"  # constraints between the sessions of a place
+# in the record of a session: of the frame that a place has it in, in the map frame of its result
+SESSION_ORIGIN = "session_origin"
 
 Given: TypeAlias = Sequence[str | os.PathLike[str]] | Recording | BuiltResult | SavedResult
 
@@ -134,7 +139,7 @@ def _unique(stem: str, names: set[str]) -> str:
 def load_mapped(
     name: str, folder: Path, threads: int, recording: Recording | None = None
 ) -> tuple[MappedRecording, SavedResult]:
-    """A result folder as a session.
+    """A result folder as a session, in the frame near the robot in which it was computed.
 
     Args:
         name: of the session.
@@ -152,19 +157,28 @@ def load_mapped(
         deskewed = result.deskewed
     else:
         deskewed = deskew_recording(recording, result.poses, result.folder.slam_options)
+    frame, pose_graph = result.folder.frame, read_g2o(graph) if graph.is_file() else None
+    if not frame.is_shifted:  # a session of a place does not say
+        frame = LocalFrame.near(result.poses)
+    if pose_graph is not None:
+        pose_graph = dataclasses.replace(pose_graph, poses=frame.to_local(pose_graph.poses))
     mapped = MappedRecording(
         name,
         deskewed,
-        result.poses,
+        frame.to_local(result.poses),
         np.asarray(result.p_static),
-        read_g2o(graph) if graph.is_file() else None,
+        pose_graph,
         (output.min_obstacle_height, output.max_obstacle_height),
         threads,
+        frame,
     )
     return mapped, result
 
 
-def copy_record(result: Path, folder: Path, dimension: int) -> None:
-    """Copy what describes how a session of a dimension was read and mapped."""
-    record = {**read_record(result), "dimension": dimension}
+def copy_record(result: Path, folder: Path, session: Session) -> None:
+    """Copy what describes how a session was read and mapped."""
+    record = {**read_record(result), "dimension": session.dimension}
+    record.pop(LOCAL_ORIGIN, None)  # what is written of a session is in the frame of its place
+    if session.frame.is_shifted:
+        record[SESSION_ORIGIN] = session.frame.origin.tolist()
     write_json(folder / RECORD, record, indent=2)

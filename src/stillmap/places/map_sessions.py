@@ -108,7 +108,7 @@ def _keep_session(
     beams = find_beam_cells(found.deskewed, found.poses, found.p_static, session.graph, cell)
     home = folder / "sessions" / one.name
     home.mkdir()
-    copy_record(mapped, home, session.dimension)
+    copy_record(mapped, home, session)
     (home / "beams").mkdir()
     for array in ("stamp_ns", "offset", "hit"):
         write_npy(home / "beams" / f"{array}.npy", np.asarray(getattr(result.labels, array)))

@@ -1,7 +1,7 @@
 """Moving objects of sessions in the frame of their place."""
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from stillmap.core.errors import InputError
 from stillmap.core.input_files import copy_content, read_bytes
 from stillmap.core.json import read_json
-from stillmap.places.place import PlacedSession
+from stillmap.core.local_frame import LocalFrame
+from stillmap.places.place import Place, PlacedSession
 from stillmap.places.place_graph import fit_alignment
-from stillmap.results.objects import MILLIMETRES, write_traffic
-from stillmap.results.points import ply_header
+from stillmap.results.objects import MILLIMETRES, OBJECT_FIELDS, write_traffic
+from stillmap.results.points import coordinate_fields, ply_header
 from stillmap.results.reader import read_tracks
 from stillmap.tracking import compute_flow_map
 
@@ -23,11 +24,10 @@ Float = NDArray[np.float64]
 _OBJECTS, _LIST, _ORIGINAL = "objects", "objects.json", "objects"
 _MAX_BYTES = 256 << 20
 _MAX_CLOUD = 1 << 30  # bytes
-_FIELDS = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("seconds", "<f4"), ("p_dynamic", "<f4")]
 
 
 def copy_objects(result: Path, state: Path) -> None:
-    """Keep the objects of a session in its own frame: the list, and clouds of points.
+    """Keep the objects of a session in the map frame of its result: the list, and clouds of points.
 
     Textured models stay with the result.
     """
@@ -53,20 +53,20 @@ def check_objects(state: Path) -> None:
         _split_cloud(path, read_bytes(path, _MAX_CLOUD))
 
 
-def write_objects(folder: Path, sessions: Sequence[PlacedSession]) -> None:
+def write_objects(folder: Path, place: Place) -> None:
     """Write `objects/` of each session in the frame of the place, and of the place those of all,
     numbered anew, with its `traffic.npz`.
 
     Args:
         folder: of the place, with the objects in the session's frame in the state of each.
-        sessions: of the place.
+        place: the place.
     """
     joined = folder / _OBJECTS
     joined.mkdir()
     records = list[dict[str, Any]]()
-    for one in sessions:
+    for one in place.sessions:
         home = folder / "sessions" / one.session.name
-        of_session, clouds = _place_objects(home, one)
+        of_session, clouds = _place_objects(home, one, place.local_frame)
         for record in of_session:
             number = len(records)
             if cloud := clouds.get(f"{record['id']:04d}.ply"):
@@ -76,13 +76,16 @@ def write_objects(folder: Path, sessions: Sequence[PlacedSession]) -> None:
     write_traffic(folder / "traffic.npz", compute_flow_map(read_tracks(joined / _LIST)))
 
 
-def _place_objects(home: Path, one: PlacedSession) -> tuple[list[dict[str, Any]], dict[str, bytes]]:
+def _place_objects(
+    home: Path, one: PlacedSession, frame: LocalFrame
+) -> tuple[list[dict[str, Any]], dict[str, bytes]]:
     """Write the objects of a session; returns their records, and their clouds by name."""
     source, target = home / "state" / _ORIGINAL, home / _OBJECTS
     if not source.is_dir():
         return [], {}
     target.mkdir()
-    T = fit_alignment(one.session.node_poses, one.nodes)
+    # objects are kept in the map frame of the result
+    T = one.between_maps(fit_alignment(one.session.node_poses, one.nodes), frame)
     records = [_transform_record(record, T) for record in _read_records(source / _LIST)]
     _write_records(target / _LIST, records)
     clouds = {path.name: _transform_cloud(path, T) for path in sorted(source.glob("*.ply"))}
@@ -145,8 +148,10 @@ def _split_cloud(path: Path, content: bytes) -> tuple[int, NDArray[np.void]]:
         InputError: it is not as it was written.
     """
     end = content.find(b"end_header\n") + len(b"end_header\n")
-    dtype = np.dtype(_FIELDS)
-    count, rest = divmod(len(content) - end, dtype.itemsize)
-    if rest or content[:end] != ply_header(_FIELDS, count):
-        raise InputError("is no cloud of an object as stillmap writes it", where=str(path))
-    return end, np.frombuffer(content, dtype, offset=end).copy()
+    for is_far in (False, True):
+        fields = coordinate_fields(OBJECT_FIELDS, is_far)
+        dtype = np.dtype(fields)
+        count, rest = divmod(len(content) - end, dtype.itemsize)
+        if not rest and content[:end] == ply_header(fields, count):
+            return end, np.frombuffer(content, dtype, offset=end).copy()
+    raise InputError("is no cloud of an object as stillmap writes it", where=str(path))

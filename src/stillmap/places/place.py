@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.local_frame import LocalFrame
 from stillmap.core.short_repr import ShortRepr
 from stillmap.places.evidence import Evidence, measure_evidence
 from stillmap.places.place_graph import Tie, fit_alignment, place_scans
@@ -46,6 +47,14 @@ class PlacedSession(ShortRepr):
         """(D+1, D+1) T_place_session, where the first scan is."""
         out: Float = self.nodes[0] @ se2.inverse(self.session.node_poses[0])
         return out
+
+    def between_maps(self, T: Float, frame: LocalFrame) -> Float:
+        """A transform (D+1, D+1) from the session's frame to that of the place, from the map frame
+        of the session's result to that of the place; `frame` is the place's in its map frame."""
+        own = self.session.frame
+        if not own.is_shifted and not frame.is_shifted:
+            return T
+        return frame.to_map(np.asarray(T @ own.to_local(np.eye(len(T)))))
 
     @cached_property
     def poses(self) -> Float:
@@ -115,6 +124,12 @@ class Place(ShortRepr):
     resolution: float
     voxel_size: float
     frame: str | None = None
+
+    @property
+    def local_frame(self) -> LocalFrame:
+        """Its frame, in the map frame of the result of the session that has its frame."""
+        named = self.frame or self.sessions[0].session.name
+        return next(one.session.frame for one in self.sessions if one.session.name == named)
 
     @property
     def dimension(self) -> int:

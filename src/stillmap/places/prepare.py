@@ -1,12 +1,13 @@
 """From a mapped recording to a session: keyframes and pose graph."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import em
 from stillmap.core import se2
+from stillmap.core.local_frame import LocalFrame
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.mapping.projection import project_to_plane
@@ -36,6 +37,7 @@ class MappedRecording(ShortRepr):
         graph: the pose graph; None: there is none.
         band: m above the ground, lowest and greatest height of obstacles.
         threads: number of threads.
+        frame: that of the poses, in the map frame of the result.
     """
 
     name: str
@@ -45,6 +47,7 @@ class MappedRecording(ShortRepr):
     graph: PoseGraph | None
     band: tuple[float, float]
     threads: int = 1
+    frame: LocalFrame = field(default_factory=LocalFrame)
 
 
 def make_session(mapped: MappedRecording) -> Session:
@@ -64,6 +67,7 @@ def make_session(mapped: MappedRecording) -> Session:
         keyframes,
         planar,
         clearance,
+        mapped.frame,
     )
 
 

@@ -1,10 +1,11 @@
 """A session: one mapped recording as a place keeps it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.local_frame import LocalFrame
 from stillmap.core.short_repr import ShortRepr
 from stillmap.places.keyframes import Keyframes
 from stillmap.slam import PoseGraph
@@ -25,6 +26,7 @@ class Session(ShortRepr):
         keyframes: spaced scans in D dimensions.
         planar: the same scans in the plane; in 2D the keyframes themselves.
         clearance: (K,) height of the base of each keyframe above the ground, metres; 0 in 2D.
+        frame: the session's frame, in the map frame of the result that it was made from.
     """
 
     name: str
@@ -35,6 +37,7 @@ class Session(ShortRepr):
     keyframes: Keyframes
     planar: Keyframes
     clearance: Float
+    frame: LocalFrame = field(default_factory=LocalFrame)
 
     @property
     def dimension(self) -> int:

@@ -14,11 +14,13 @@ from stillmap.core.input_files import copy_content
 from stillmap.io import stillmap_folder
 from stillmap.io.stillmap_folder import read as read_recording
 from stillmap.places.beam_cells import BeamCells
+from stillmap.places.inputs import SESSION_ORIGIN
 from stillmap.places.keyframes import Keyframes
 from stillmap.places.session import Session
 from stillmap.results.labels import read_array
 from stillmap.results.pose_graph_g2o import read_g2o, write_g2o
 from stillmap.results.run_json import RECORD
+from stillmap.results.run_record import read_frame, read_record
 
 Float = NDArray[np.float64]
 
@@ -117,7 +119,8 @@ def read_session(folder: Path, path: str | None, stamp_ns: NDArray[np.int64]) ->
         or not (np.abs(clearance) < _MAX_DISTANCE).all()
     ):
         raise _inconsistent(state)
-    return Session(folder.name, path, stamp_ns, poses, graph, keyframes, planar, clearance)
+    frame = read_frame(folder, read_record(folder), SESSION_ORIGIN)
+    return Session(folder.name, path, stamp_ns, poses, graph, keyframes, planar, clearance, frame)
 
 
 def read_poses(path: Path, count: int, D: int) -> Float:

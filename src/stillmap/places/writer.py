@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from stillmap.core.arrays import write_npy, write_npz
 from stillmap.core.input_files import read_bytes
 from stillmap.core.json import write_json
+from stillmap.core.local_frame import LocalFrame
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io.trajectory import MAX_BYTES, write_tum
 from stillmap.places.evidence import Evidence
@@ -64,7 +65,8 @@ def write_sessions(folder: Path, result: PlaceResult) -> None:
     for time, k in enumerate(place.in_time()):
         one = place.sessions[k]
         home = folder / "sessions" / one.session.name
-        write_tum(home / "trajectory.tum", one.session.stamp_ns, one.poses)
+        poses = place.local_frame.to_map(one.poses)
+        write_tum(home / "trajectory.tum", one.session.stamp_ns, poses)
         hit = read_array(home / "beams" / "hit.npy", (None,), "b")
         beams = read_beam_cells(home, len(hit), place.voxel_size)
         centres = beams.place_centres(one.session.node_poses, one.nodes)
@@ -127,16 +129,17 @@ def write_place_files(folder: Path, result: PlaceResult) -> None:
     place = result.place
     homes = [folder / "sessions" / one.session.name for one in place.sessions]
     stamps = np.concatenate([one.session.stamp_ns for one in place.sessions])
-    poses = np.concatenate([one.poses for one in place.sessions])
+    frame = place.local_frame
+    poses = frame.to_map(np.concatenate([one.poses for one in place.sessions]))
     with (folder / "trajectory.tum").open("wb") as file:
         for home in homes:
             file.write(read_bytes(home / "trajectory.tum", MAX_BYTES))
     _write_beams(folder / "beams", homes, stamps)
     write_g2o(folder / "graph.g2o", _join_graphs(place), poses)
     write_json(folder / SESSIONS, session_records(result))
-    write_json(folder / CHANGES, change_records(result.changes, result.names_in_time))
-    write_npz(folder / CELLS, change_cells(result.changes, result.shown.place))
-    write_npz(folder / STATES, changed_cell_table(result.planar, result.names_in_time))
+    write_json(folder / CHANGES, change_records(result.changes, result.names_in_time, frame))
+    write_npz(folder / CELLS, change_cells(result.changes, result.shown.place, frame))
+    write_npz(folder / STATES, changed_cell_table(result.planar, result.names_in_time, frame))
     dof = 3 if place.dimension == 2 else 6
     write_ties(folder / TIES, place.ties, dof)
 
@@ -201,7 +204,7 @@ def session_records(result: PlaceResult) -> list[dict[str, Any]]:
     counts = [len(one.session.stamp_ns) for one in result.place.sessions]
     first_scan = dict(zip(placed, np.cumsum([0, *counts]).tolist(), strict=False))
     return [
-        _placed_record(placed[name], first_scan[name])
+        _placed_record(placed[name], first_scan[name], result.place.local_frame)
         if name in placed
         else {
             "name": name,
@@ -214,14 +217,14 @@ def session_records(result: PlaceResult) -> list[dict[str, Any]]:
     ]
 
 
-def _placed_record(one: PlacedSession, first_scan: int) -> dict[str, Any]:
+def _placed_record(one: PlacedSession, first_scan: int, frame: LocalFrame) -> dict[str, Any]:
     """The entry of a session whose scans begin at `first_scan` of those of the place."""
     stamp_ns = one.session.stamp_ns
     return {
         "name": one.session.name,
         "input": one.session.input,
         "accepted": True,
-        "T_place_session": one.T.tolist(),
+        "T_place_session": one.between_maps(one.T, frame).tolist(),
         "covariance": one.known_covariance.tolist(),
         "overlap": round(one.overlap, 4),
         "first_stamp_ns": int(stamp_ns[0]),

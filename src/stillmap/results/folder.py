@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from stillmap.core import arrays
 from stillmap.core.errors import InputError
+from stillmap.core.local_frame import LocalFrame
 from stillmap.core.recording import Recording
-from stillmap.core.region import Region
+from stillmap.core.region import Region, shift_region
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io import read
 from stillmap.io.input_groups import read_parts
@@ -53,6 +54,23 @@ class Exported(ShortRepr):
     def deskew(self) -> Recording:
         """The recording without the motion during its scans."""
         return deskew_recording(self.recording, self.poses, self.slam)
+
+    def to_local(self, frame: LocalFrame) -> "Exported":
+        """The same in a frame near the robot; itself if that is the map frame."""
+        if not frame.is_shifted:
+            return self
+        tracks = [
+            replace(
+                one,
+                xy=frame.points_to_local(one.xy),
+                z=None if one.z is None else one.z - frame.origin[2],
+            )
+            for one in self.tracks
+        ]
+        grid = replace(self.map, origin=frame.corner_to_local(self.map.origin))
+        region = None if self.region is None else shift_region(self.region, -frame.origin)
+        poses = frame.to_local(self.poses)
+        return replace(self, poses=poses, map=grid, tracks=tracks, region=region)
 
 
 @dataclass(frozen=True)

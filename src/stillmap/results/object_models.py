@@ -1,5 +1,6 @@
 """Writes models: `mesh.glb`, `objects/NNNN.glb`, and the views that texture their faces."""
 
+import dataclasses
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.arrays import write_npz
+from stillmap.core.local_frame import LocalFrame
 from stillmap.mesh.build import Models
 from stillmap.mesh.place import ViewAssignment
 from stillmap.mesh.texture.atlas import TexturedMesh
@@ -29,9 +31,13 @@ def write_models(folder: Path, models: Models, n_images: int, quality: int) -> N
         n_images: of the recording.
         quality: JPEG quality of texture pages; 0: PNG.
     """
+    frame = LocalFrame(models.origin)
     if len(models.textured):
-        write_glb(folder / "mesh.glb", _drop_empty_texture(models.textured), quality)
-        write_faces(folder / "mesh_faces.npz", models.assignment, models.views, n_images, "map")
+        place = models.textured
+        place = dataclasses.replace(place, vertices=frame.points_to_map(place.vertices))
+        write_glb(folder / "mesh.glb", _drop_empty_texture(place), quality)
+        path = folder / "mesh_faces.npz"
+        write_faces(path, models.assignment, models.views, n_images, "map", frame)
     objects = folder / "objects"
     if models.objects:
         objects.mkdir(exist_ok=True)
@@ -45,7 +51,7 @@ def write_models(folder: Path, models: Models, n_images: int, quality: int) -> N
             "stamp_ns": one.stamp_ns,
             "first_stamp_ns": one.span_ns[0],
             "last_stamp_ns": one.span_ns[1],
-            "T_map_object": np.round(one.T_map_object, _MICROMETRES).tolist(),
+            "T_map_object": np.round(frame.to_map(one.T_map_object), _MICROMETRES).tolist(),
             "rigid": one.shape.rigid,
         }
         text = json.dumps(record, allow_nan=False)
@@ -58,25 +64,33 @@ def _drop_empty_texture(model: TexturedMesh) -> TexturedMesh | Mesh:
 
 
 def write_faces(
-    path: Path, assignment: ViewAssignment, views: Sequence[View], n_images: int, frame: str
+    path: Path,
+    assignment: ViewAssignment,
+    views: Sequence[View],
+    n_images: int,
+    name: str,
+    frame: LocalFrame | None = None,
 ) -> None:
-    """Writes which image textures each face.
+    """Writes which image textures each face; `name` of the frame that they are written in.
 
     `vertices` (V, 3) metres, `faces` (F, 3), `image` (F,) number of the image or -1, `p_static`
     (F,), and `T_camera_map` or `T_camera_object` (N, 4, 4) of all images, NaN where not used.
     """
     number = np.array([view.image for view in views] + [-1], np.int32)
+    frame = frame or LocalFrame()
     poses = np.full((n_images, 4, 4), np.nan)
+    T_local_map = frame.to_local(np.eye(4))
     for view in views:
-        poses[view.image] = view.T_camera_map
+        T = view.T_camera_map
+        poses[view.image] = T @ T_local_map if frame.is_shifted else T
     write_npz(
         path,
         {
-            "vertices": assignment.mesh.vertices,
+            "vertices": frame.points_to_map(assignment.mesh.vertices),
             "faces": assignment.mesh.faces,
             "image": number[assignment.view],
             "p_static": assignment.p_static,
-            f"T_camera_{frame}": poses,
+            f"T_camera_{name}": poses,
         },
     )
 

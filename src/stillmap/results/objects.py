@@ -8,13 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.arrays import write_npz
+from stillmap.core.local_frame import FAR
 from stillmap.pipeline.result import MappingResult
-from stillmap.results.points import ply_header
+from stillmap.results.points import Fields, coordinate_fields, ply_header
 from stillmap.tracking import FlowMap, MovingObject
 
 if TYPE_CHECKING:
     from stillmap.rig.build import TiltingResult
 
+# of the cloud of an object
+OBJECT_FIELDS: Fields = [(name, "<f4") for name in ("x", "y", "z", "seconds", "p_dynamic")]
 MILLIMETRES = 3  # digits: finer is noise, and makes the file twice as long
 
 
@@ -62,8 +65,9 @@ def write_ply(
     seconds: NDArray[np.float64],
     p_dynamic: NDArray[np.float32],
 ) -> None:
-    """Points (n, D) of an object, when each was seen, and how probably it is dynamic; 2D: z = 0."""
-    fields = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("seconds", "<f4"), ("p_dynamic", "<f4")]
+    """Points (n, D) of an object, when each was seen, and how probably it is dynamic; 2D: z = 0.
+    Coordinates far from the origin have 64 bits."""
+    fields = coordinate_fields(OBJECT_FIELDS, bool(np.abs(ends).max(initial=0.0) > FAR))
     vertices = np.zeros(len(ends), fields)
     for name, column in zip("xyz", ends.T, strict=False):
         vertices[name] = column

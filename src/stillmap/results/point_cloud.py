@@ -1,6 +1,6 @@
 """The points of a 3D result in the map frame, block by block."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from stillmap.core import arrays
 from stillmap.core.chunks import Chunk, iter_chunks
 from stillmap.core.errors import InputError
+from stillmap.core.local_frame import FAR, LocalFrame
 from stillmap.core.recording import Recording
 from stillmap.core.timestamps import beam_stamps_ns
 from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.io.point_cloud import ply
-from stillmap.io.point_cloud.binary_table import read_columns
+from stillmap.io.point_cloud.binary_table import TableLayout, read_columns
 
 Part = Literal["static", "dynamic"]
 
@@ -65,6 +66,11 @@ class Cloud:
     make_blocks: Callable[[], Iterator[Block]]
     has_colors: bool = False
 
+    @property
+    def is_far(self) -> bool:
+        """Whether 32-bit coordinates would lose the millimetre."""
+        return bool(np.abs(self.origin).max() > FAR)
+
     def iter_blocks(self, progress: Callable[[float], None] | None = None) -> Iterator[Block]:
         """The blocks; `progress` is called with the share of the points that is done."""
         done = 0
@@ -113,7 +119,7 @@ def cloud_from_recording(
     if times is not None:
         for block in arrays.iter_blocks(times):
             earliest = min(earliest, float(times[block].min()))
-    T_map_sensor = deskewed.T_map_sensor(poses)
+    T_map_sensor, near = deskewed.T_map_sensor(poses), LocalFrame.near(poses)
 
     def make_blocks() -> Iterator[Block]:
         mapped = [one for one in (p_static, times, colors) if one is not None]
@@ -129,7 +135,7 @@ def cloud_from_recording(
             int(np.count_nonzero(_select(deskewed.hit[block], p_static[block], only)))
             for block in arrays.iter_blocks(deskewed.hit, p_static)
         ),
-        origin=np.round(poses[0, :3, 3]),
+        origin=near.origin if near.is_shifted else np.round(poses[0, :3, 3]),
         start_ns=int(recording.stamp_ns[0]) + int(np.floor(1e9 * earliest)),
         make_blocks=make_blocks,
         has_colors=colors is not None,
@@ -159,7 +165,19 @@ def cloud_from_folder(folder: Path, only: Part | None = None) -> Cloud:
                 colors = np.stack(values[4:], axis=1).astype(np.uint8) if has_colors else None
                 yield Block(points, values[3].astype(np.float32), None, colors)
 
-    return Cloud(sum(layout.rows for layout in layouts), np.zeros(3), None, make_blocks, has_colors)
+    count = sum(layout.rows for layout in layouts)
+    return Cloud(count, _find_origin(layouts), None, make_blocks, has_colors)
+
+
+def _find_origin(layouts: Sequence[TableLayout]) -> NDArray[np.float64]:
+    """(3,) whole m near the points of files; zero where they are 32-bit, and so near it."""
+    for layout in layouts:
+        is_double = all(one.dtype == np.float64 for one in layout.fields if one.name in "xyz")
+        if is_double and layout.rows:
+            x, y, z = next(iter(read_columns(layout, _FIELDS[:3])))
+            first = np.array([x[0], y[0], z[0]])
+            return np.round(first) if np.isfinite(first).all() else np.zeros(3)
+    return np.zeros(3)
 
 
 def _select(

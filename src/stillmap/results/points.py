@@ -8,14 +8,14 @@ from numpy.typing import NDArray
 from stillmap.core.arrays import iter_blocks
 from stillmap.core.recording import Recording
 from stillmap.em.types import DYNAMIC_BELOW
-from stillmap.results.point_cloud import Block, cloud_from_recording
+from stillmap.results.point_cloud import Block, Cloud, cloud_from_recording
 
 Fields = list[tuple[str, str]]  # names and types
 
 FIELDS: Fields = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("p_static", "<f4")]
 COLOURS: Fields = [("red", "u1"), ("green", "u1"), ("blue", "u1")]
 PACKED_COLOUR: Fields = [("rgb", "<u4")]  # 0x00RRGGBB, of PCD
-_TYPES = {"<f4": "float", "u1": "uchar"}
+_TYPES = {"<f4": "float", "<f8": "double", "u1": "uchar"}
 _BLOCK = 1 << 16  # vertices in memory
 
 
@@ -40,7 +40,7 @@ def write_clouds(
         for block in iter_blocks(seen.hit, p_static)
     )
     cloud = cloud_from_recording(seen, seen, poses, p_static, colors=colours)
-    fields = FIELDS if colours is None else FIELDS + COLOURS
+    fields = cloud_fields(cloud, COLOURS)
     with (
         (folder / "static.ply").open("wb") as static,
         (folder / "dynamic.ply").open("wb") as moving,
@@ -55,8 +55,21 @@ def write_clouds(
                 moving.write(vertices[moves].tobytes())
 
 
+def cloud_fields(cloud: Cloud, colours: Fields) -> Fields:
+    """FIELDS of the points of a cloud, with `colours` where it has them; those of one that is far
+    from the origin have coordinates of 64 bits."""
+    return coordinate_fields(FIELDS, cloud.is_far) + (colours if cloud.has_colors else [])
+
+
+def coordinate_fields(fields: Fields, is_far: bool) -> Fields:
+    """Fields of which x, y and z have 64 bits where they are far from the origin."""
+    if not is_far:
+        return fields
+    return [(name, "<f8" if name in ("x", "y", "z") else kind) for name, kind in fields]
+
+
 def ply_header(fields: Fields, count: int) -> bytes:
-    """Of a little-endian PLY whose vertices have these fields, float32 or uint8."""
+    """Of a little-endian PLY whose vertices have these fields, float32, float64 or uint8."""
     properties = "".join(f"property {_TYPES[kind]} {name}\n" for name, kind in fields)
     head = f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}"
     return (head + "end_header\n").encode("ascii")

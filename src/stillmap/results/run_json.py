@@ -53,6 +53,7 @@ def run_record(result: MappingResult, more: Mapping[str, Any] | None = None) -> 
         "warnings": list(result.warnings),
         "quality": quality_record(result.quality),
         "learned": result.learned,
+        **({LOCAL_ORIGIN: result.frame.origin.tolist()} if result.frame.is_shifted else {}),
         "calibration": _calibration(result.calibration),
         "doubts": {
             "odometry_disagrees": result.doubts.odometry_faults,
@@ -79,6 +80,7 @@ def quality_record(quality: Quality) -> dict[str, float | None]:
 
 
 RECORD = "run.json"  # every result has it
+LOCAL_ORIGIN = "local_origin"  # its entry, where what it was computed in was not the map frame
 TILTING = "tilting"  # its entry, and the folder, of 3D data of a rig's tilting laser
 
 

@@ -4,17 +4,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+
 from stillmap.core import config
 from stillmap.core.errors import InputError
 from stillmap.core.json import read_json
+from stillmap.core.local_frame import LocalFrame
 from stillmap.core.output_place import require_finished
 from stillmap.core.region import Region
 from stillmap.core.short_repr import ShortRepr
+from stillmap.io.rigid_transforms import MAX_TRANSLATION
 from stillmap.mesh.options import MeshOptions
 from stillmap.pipeline.options import MapMode, Options, OutputOptions
 from stillmap.pipeline.quality import Quality
 from stillmap.preprocessing.options import ReadOptions
-from stillmap.results.run_json import RECORD
+from stillmap.results.run_json import LOCAL_ORIGIN, RECORD
 from stillmap.slam import SlamOptions
 
 T = TypeVar("T")
@@ -87,6 +91,15 @@ class RunRecord(ShortRepr):
         return self._override(OutputOptions(), {"region": section.get("region")}).region
 
     @property
+    def frame(self) -> LocalFrame:
+        """The frame in which it was computed.
+
+        Raises:
+            InputError: the record has an origin that cannot be.
+        """
+        return read_frame(self.folder, self.record, LOCAL_ORIGIN)
+
+    @property
     def map_mode(self) -> MapMode:
         """Mode of its map image; the default where the record does not say."""
         mode = (self._section("output") or {}).get("map_mode")
@@ -128,6 +141,25 @@ def _drop_unset(changes: dict[str, Any]) -> dict[str, Any]:
         for key, value in changes.items()
         if value is not None
     }
+
+
+def read_frame(folder: Path, record: dict[str, Any], name: str) -> LocalFrame:
+    """The frame whose origin (3,) a record of a folder has under a name; without one the map frame.
+
+    Raises:
+        InputError: it is no place.
+    """
+    noted = record.get(name)
+    if noted is None:
+        return LocalFrame()
+    try:
+        origin = np.array(noted, np.float64)
+        usable = origin.shape == (3,) and bool((np.abs(origin) < MAX_TRANSLATION).all())
+    except (TypeError, ValueError):
+        usable = False
+    if not usable:
+        raise InputError(f"{name} is no place", where=str(folder / RECORD))
+    return LocalFrame(origin)
 
 
 def is_result(path: Path) -> bool:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.errors import import_extra
+from stillmap.core.local_frame import LocalFrame
 from stillmap.core.recording import Recording
 from stillmap.io.trajectory import pose_rows
 from stillmap.results.reader import Track
@@ -37,8 +38,8 @@ def make_table(result: ResultData, name: TableName) -> "pyarrow.Table":
         raise ValueError(f"table: expected one of {names}, got {name!r}")
     arrow = import_extra("pyarrow", "a table", "made", group="notebook")
     if name == "beams":
-        schema = beam_schema(result.recording.dimension)
         poses, p_static = result.poses, result.p_static
+        schema = beam_schema(poses)
         recording, deskewed = result.recording, result.deskewed
         parts = [
             arrow.table(beam_columns(recording, deskewed, poses, p_static, scans), schema)
@@ -49,14 +50,15 @@ def make_table(result: ResultData, name: TableName) -> "pyarrow.Table":
     return arrow.table(make(result))
 
 
-def beam_schema(dimension: int) -> "pyarrow.Schema":
-    """Names and types of the columns of a beam; see `beam_columns`."""
+def beam_schema(poses: Float) -> "pyarrow.Schema":
+    """Names and types of the columns of a beam; see `beam_columns`. `poses` (T, D+1, D+1)."""
     arrow = importlib.import_module("pyarrow")
+    length = arrow.float64() if LocalFrame.near(poses).is_shifted else arrow.float32()
     kinds = {
         "scan": arrow.int32(),
         "stamp_ns": arrow.int64(),
         "beam": arrow.int32(),
-        **dict.fromkeys("xyz"[:dimension], arrow.float32()),
+        **dict.fromkeys("xyz"[: poses.shape[-1] - 1], length),
         "range": arrow.float32(),
         "hit": arrow.bool_(),
         "p_static": arrow.float32(),
@@ -74,13 +76,16 @@ def beam_columns(
     """Columns of the beams of a slice of scans, in the order of the recording.
 
     `scan` (from 0), `stamp_ns`, `beam` (index in the scan), `x`, `y`, in 3D `z` (end point in m in
-    the map frame), `range` (m), `hit`, `p_static`. Unusable beams are NaN.
+    the map frame; 64 bits where it is far from the origin), `range` (m), `hit`, `p_static`.
+    Unusable beams are NaN.
     """
     offset = recording.offset[scans.start : scans.stop + 1]
     beams = slice(int(offset[0]), int(offset[-1]))
     scan = np.repeat(np.arange(scans.start, scans.stop, dtype=np.int32), np.diff(offset))
     number = np.arange(beams.start, beams.stop)
-    ends = deskewed.end_points(number, poses).astype(np.float32)
+    ends = deskewed.end_points(number, poses)
+    if not LocalFrame.near(poses).is_shifted:
+        ends = ends.astype(np.float32)
     points = recording.points[beams].astype(np.float64)
     return {
         "scan": scan,

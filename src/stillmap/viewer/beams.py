@@ -11,6 +11,8 @@ from stillmap.core.recording import Recording
 from stillmap.slam.deskew import deskew_recording
 from stillmap.slam.options import SlamOptions
 
+Float = NDArray[np.float64]
+
 MAX_BEAMS = 60_000  # shown of a scan
 _BLOCK_SCANS = 256  # deskewed at once
 _MAX_READ = 20_000_000  # beams read to find the dynamic ones, which takes seconds
@@ -67,7 +69,7 @@ class Beams:
         self.recording.release_pages(self.p_static)
         return ScanView(ends, p_static, origin)
 
-    def dynamic_ends(self, max_count: int) -> NDArray[np.float32]:
+    def dynamic_ends(self, max_count: int) -> Float:
         """At most `max_count` end points (n, D) in m, in the map frame, of dynamic returns.
 
         The recording is read in blocks of scans; of a long one not every block.
@@ -76,10 +78,10 @@ class Beams:
         first = np.arange(0, T, _BLOCK_SCANS)
         use = first[sample_indices(len(first), max(1, _MAX_READ * len(first) // int(offset[-1])))]
         ends = [self._dynamic_ends_of(int(n), min(int(n) + _BLOCK_SCANS, T)) for n in use]
-        found = np.concatenate([np.zeros((0, self.recording.dimension), np.float32), *ends])
+        found = np.concatenate([np.zeros((0, self.recording.dimension)), *ends])
         return found[sample_indices(len(found), max_count)]
 
-    def _dynamic_ends_of(self, first: int, end: int) -> NDArray[np.float32]:
+    def _dynamic_ends_of(self, first: int, end: int) -> Float:
         """Dynamic end points (n, D) of scans first:end."""
         beams = slice(*self.recording.offset[[first, end]].tolist())
         poses = self.poses[first:end]
@@ -87,7 +89,7 @@ class Beams:
         use = np.flatnonzero(block.hit & (self.p_static[beams] < 0.5))
         ends = block.end_points(use, poses)
         self.recording.release_pages(self.p_static)
-        return ends.astype(np.float32)
+        return ends
 
 
 def slice_scans(recording: Recording, first: int, end: int) -> Recording:

@@ -57,6 +57,7 @@ def read(path: Path, context: ReadContext) -> Recording:
             sources.append(CloudSource(name, read_cloud))
     info = DatasetInfo(path, "E57", [], single=path.is_file() and len(sources) == 1)
     recording = build_recording(sources, info, context)
+    origin.place(recording)
     if recording.T_recorded_base is None:
         origin.add_notes(recording)
     return recording

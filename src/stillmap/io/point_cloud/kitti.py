@@ -22,6 +22,7 @@ from stillmap.io.point_cloud import kitti_cameras
 from stillmap.io.point_cloud.binary_table import iter_text_lines, parse_numbers, truncated_error
 from stillmap.io.point_cloud.hits import require_single_sensor, scan_hits, sensor_poses
 from stillmap.io.point_cloud.kitti_cameras import Calibration, find_images
+from stillmap.io.point_cloud.origin import place_clouds
 from stillmap.io.point_cloud.scans import Cloud, CloudSource, DatasetInfo, build_recording, reject
 from stillmap.io.rigid_transforms import pose_from_row, rigid_transform
 from stillmap.io.scan_files import assign_rows, list_files, read_times, require_nonempty_file
@@ -226,7 +227,7 @@ def write(recording: Recording, path: str | Path, *, overwrite: bool = False) ->
     """
     require_single_sensor(recording, str(path))
     T = recording.T_odom_base if recording.T_recorded_base is None else recording.T_recorded_base
-    T = sensor_poses(recording, T)
+    T = sensor_poses(recording, place_clouds(recording, T))
     digits = max(6, len(str(recording.n_scans)))
     with atomic_folder(Path(path), MARKER, overwrite) as folder:
         (folder / "velodyne").mkdir()

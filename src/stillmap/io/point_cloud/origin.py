@@ -6,8 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.arrays import finite_rows
+from stillmap.core.local_frame import LocalFrame
 from stillmap.core.recording import Recording
+from stillmap.io.rigid_transforms import MAX_TRANSLATION
 
+_KEY = "origin"  # in the source of a recording
 _MAX_COORDINATE = 4096.0  # m: float32 resolves half a millimetre up to there
 
 
@@ -29,11 +32,19 @@ class Origin:
         with np.errstate(over="ignore"):
             return (points - (0.0 if self.position is None else self.position)).astype(np.float32)
 
+    def place(self, recording: Recording) -> None:
+        """Let the recorded poses of scans whose points were shifted say so, in place: they are the
+        scans without a rotation and a position, beside others that have them."""
+        T = recording.T_recorded_base
+        if T is not None and self.position is not None:
+            is_unplaced = np.equal(T, np.eye(4)).all(axis=(1, 2))
+            T[is_unplaced, :3, 3] = self.position
+
     def add_notes(self, recording: Recording, *, in_sensor_frame: bool = False) -> None:
         """Note the origin in the source of a recording, and warn that the sensor is assumed there;
         neither where points are `in_sensor_frame` and near its origin."""
         if self.position is not None and np.any(self.position != 0.0):
-            recording.source["origin"] = self.position.tolist()
+            recording.source[_KEY] = self.position.tolist()
             at = " ".join(f"{value:.0f}" for value in self.position)
             at = f"{at}, the new origin"
         elif in_sensor_frame:
@@ -41,6 +52,31 @@ class Origin:
         else:
             at = "the origin"
         recording.source["warnings"].append(f"no sensor pose is recorded: beams start at {at}")
+
+
+def cloud_origin(recording: Recording) -> NDArray[np.float64]:
+    """(3,) metres by which the coordinates of a recording's clouds were shifted in reading."""
+    noted = recording.source.get(_KEY) if recording.dimension == 3 else None
+    origin = np.array([] if noted is None else noted, np.float64)
+    usable = origin.shape == (3,) and (np.abs(origin) < MAX_TRANSLATION).all()
+    return origin if usable else np.zeros(3)
+
+
+def place_clouds(
+    recording: Recording, poses: NDArray[np.float64] | None
+) -> NDArray[np.float64] | None:
+    """Poses (T, D+1, D+1) for writing; None: there are none, and the coordinates are as they were.
+
+    Args:
+        recording: T scans.
+        poses: as the recording has them; None: there are none.
+    """
+    origin = cloud_origin(recording)
+    if not origin.any() or recording.T_recorded_base is not None:
+        return poses
+    if poses is None:
+        poses = np.tile(np.eye(4), (recording.n_scans, 1, 1))
+    return LocalFrame(origin).to_map(poses)
 
 
 def _find_origin(points: NDArray[np.float64]) -> NDArray[np.float64] | None:

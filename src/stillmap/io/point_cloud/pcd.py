@@ -27,7 +27,7 @@ from stillmap.io.point_cloud.binary_table import (
     truncated_error,
 )
 from stillmap.io.point_cloud.hits import require_single_sensor, scan_hits, sensor_poses
-from stillmap.io.point_cloud.origin import Origin
+from stillmap.io.point_cloud.origin import Origin, place_clouds
 from stillmap.io.point_cloud.scans import Cloud, DatasetInfo, build_recording, files_of, sources_of
 from stillmap.io.point_cloud.signatures import MAX_PCD_HEADER, PCD_EXTENSIONS, is_pcd
 from stillmap.io.point_cloud.time_field import find_time_column
@@ -186,7 +186,9 @@ def read(path: Path, context: ReadContext) -> Recording:
         info.warnings.append(text)
     read_cloud = partial(_read_cloud, in_map_frame=in_map_frame, origin=origin)
     recording = build_recording(sources_of(files, PCD_EXTENSIONS, read_cloud), info, context)
-    origin.add_notes(recording, in_sensor_frame=True)
+    origin.place(recording)
+    if recording.T_recorded_base is None:
+        origin.add_notes(recording, in_sensor_frame=True)
     return recording
 
 
@@ -236,13 +238,14 @@ def write(recording: Recording, path: str | Path, *, overwrite: bool = False) ->
     """Write a folder of binary PCD files with the hits of each scan in the sensor frame.
 
     Names are stamps in nanoseconds, with `_1` and so on for repeated stamps. VIEWPOINT is the
-    recorded pose of the sensor; `time` is in seconds after the stamp.
+    recorded pose of the sensor, or where a cloud without one lies; `time` is in seconds after the
+    stamp.
 
     Raises:
         InputError: `path` is taken or cannot be written, or there are several sensors.
     """
     require_single_sensor(recording, str(path))
-    T = sensor_poses(recording, recording.T_recorded_base)
+    T = sensor_poses(recording, place_clouds(recording, recording.T_recorded_base))
     with atomic_folder(Path(path), MARKER, overwrite) as folder:
         repeats = 0
         for scan in recording.iter_scans(range(recording.n_scans)):

@@ -1,6 +1,6 @@
 """Writes recordings as ROS bags."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -100,15 +100,20 @@ class LaserScanEncoder:
         ]
 
 
-def write_sensor_frames(bag: BagWriter, recording: Recording) -> list[str]:
-    """Write the sensors' extrinsics to /tf_static; returns their S frames."""
+def write_sensor_frames(
+    bag: BagWriter,
+    recording: Recording,
+    more: Sequence[tuple[str, str, NDArray[np.float64]]] = (),
+) -> list[str]:
+    """Write the sensors' extrinsics to /tf_static, and more transforms (parent, child, T); returns
+    their S frames."""
     S = len(recording.T_base_sensor)
     frames = number_names("laser" if recording.dimension == 2 else "lidar", S)
     send = bag.add_topic("/tf_static", TF, latched=True)
     if recording.n_scans:
         first = int(recording.stamp_ns[0])
         poses = [(BASE, f, T) for f, T in zip(frames, recording.T_base_sensor, strict=True)]
-        send(first, message_writer.make_transforms(bag, first, poses))
+        send(first, message_writer.make_transforms(bag, first, [*poses, *more]))
     return frames
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from stillmap.core import se2
+from stillmap.core.local_frame import LocalFrame
 from stillmap.core.region import limit_hits
 from stillmap.io.ros import message_writer
 from stillmap.io.ros.bag_types import BagKind
@@ -20,6 +21,7 @@ from stillmap.results.point_cloud import cloud_from_recording
 
 Progress = Callable[[float], None]
 
+_LOCAL = "map_local"  # a frame near the robot, where the map frame begins far away
 _MAX_POINTS = 1_000_000  # of the static cloud, which programs hold as one message
 
 
@@ -56,10 +58,12 @@ def write(
     require_stamps(stamps[0], stamps[-1], kind)
     scans = LaserWriter(result) if recording.dimension == 2 else LidarWriter(result)
     with new_bag(path, kind, overwrite=overwrite) as bag:
-        frames = write_sensor_frames(bag, recording)
+        near = LocalFrame.near(result.poses)
+        more = [(MAP, _LOCAL, near.to_map(np.eye(4)))] if near.is_shifted else []
+        frames = write_sensor_frames(bag, recording, more)
         _write_latched_topics(bag, result)
         if isinstance(scans, LidarWriter):
-            _write_static_points(bag, result, scans)
+            _write_static_points(bag, result, scans, near)
         scans.open(bag, frames)
         write_frames = _make_frame_writer(bag, result)
         write_objects = make_object_writer(bag, result.tracks, recording.stamp_ns)
@@ -86,15 +90,21 @@ def _write_latched_topics(bag: BagWriter, result: Exported) -> None:
     send(first, message_writer.make_path(bag, stamp_ns, result.poses))
 
 
-def _write_static_points(bag: BagWriter, result: Exported, scans: LidarWriter) -> None:
-    """At most `_MAX_POINTS` static points in the map frame, as one latched message."""
+def _write_static_points(
+    bag: BagWriter, result: Exported, scans: LidarWriter, near: LocalFrame
+) -> None:
+    """At most `_MAX_POINTS` static points as one latched message, in a frame near the robot:
+    programs expect coordinates of 32 bits."""
     seen = limit_hits(scans.deskewed, result.poses, result.region)
     cloud = cloud_from_recording(
         result.recording, seen, result.poses, result.p_static, "static", result.colors
     )
     first = int(result.recording.stamp_ns[0])
     send = bag.add_topic("/static_points", POINT_CLOUD, latched=True)
-    send(first, make_cloud_message(bag, first, MAP, cloud.sample(_MAX_POINTS)))
+    block = cloud.sample(_MAX_POINTS)
+    block = block._replace(points=near.points_to_local(block.points))
+    frame = _LOCAL if near.is_shifted else MAP
+    send(first, make_cloud_message(bag, first, frame, block))
 
 
 def _make_frame_writer(bag: BagWriter, result: Exported) -> Callable[[int], None]:

@@ -40,7 +40,7 @@ def write(result: Exported, deskewed: Recording, path: Path) -> None:
     """
     parquet = require_pyarrow()
     arrow = importlib.import_module("pyarrow")
-    recording, schema = result.recording, beam_schema(result.recording.dimension)
+    recording, schema = result.recording, beam_schema(result.poses)
     with (
         atomic_file(path) as work,
         work.open("wb") as file,  # not by name: it need not be UTF-8

@@ -18,6 +18,7 @@ from stillmap.results.points import (
     FIELDS,
     PACKED_COLOUR,
     Fields,
+    cloud_fields,
     make_vertices,
     ply_header,
 )
@@ -91,18 +92,18 @@ def write(cloud: Cloud, path: Path, file_format: Format, progress: Progress | No
 
 
 def _write_ply(cloud: Cloud, path: Path, _: bool, progress: Progress | None) -> None:
-    fields = FIELDS + COLOURS if cloud.has_colors else FIELDS
+    fields = cloud_fields(cloud, COLOURS)
     _write_records(cloud, path, ply_header(fields, cloud.count), fields, progress)
 
 
 def _write_pcd(cloud: Cloud, path: Path, _: bool, progress: Progress | None) -> None:
-    fields = FIELDS + PACKED_COLOUR if cloud.has_colors else FIELDS
+    fields = cloud_fields(cloud, PACKED_COLOUR)
     names = [name for name, _ in fields]
     lines = (
         "# .PCD v0.7 - Point Cloud Data file format",
         "VERSION 0.7",
         f"FIELDS {' '.join(names)}",
-        f"SIZE {' '.join('4' for _ in names)}",
+        f"SIZE {' '.join(kind[-1] for _, kind in fields)}",
         f"TYPE {' '.join('F' for _ in names)}",  # of packed colours too, by convention of PCL
         f"COUNT {' '.join('1' for _ in names)}",
         f"WIDTH {cloud.count}",

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from stillmap.core.errors import import_extra
 from stillmap.core.files import atomic_file
+from stillmap.core.local_frame import LocalFrame
 from stillmap.results.colors import BLUE, color_by_height, color_by_id, color_by_p_static
 from stillmap.results.folder import Exported
 from stillmap.results.object_poses import interpolate_pose, iter_present_tracks
@@ -46,8 +47,9 @@ def write(result: Exported, path: Path, progress: Progress | None = None) -> Non
     Entities below `map`: `plan`, an image of the map on the floor; in 3D `static_points`, a sample;
     `path`; `base` with a scan of each sensor, coloured from orange (dynamic) to blue (static) and
     with `p_static`; `objects`, a box with a number for each moving object. Timelines are `stamp`
-    and `scan`. rerun gives rows and chunks ids by the time of writing: two files of the same
-    result hold the same data, but are not equal byte by byte.
+    and `scan`. Where the map frame begins far away, all is relative to `origin` of `map`: rerun has
+    coordinates of 32 bits. rerun gives rows and chunks ids by the time of writing: two files of the
+    same result hold the same data, but are not equal byte by byte.
 
     Args:
         result: recording, poses, labels, map and tracks.
@@ -60,13 +62,14 @@ def write(result: Exported, path: Path, progress: Progress | None = None) -> Non
     rerun = require_rerun(path)
     with atomic_file(path) as work, work.open("wb") as file:
         pipe = _Pipe(file)
+        frame = LocalFrame.near(result.poses)
         stream = _make_stream(rerun, result)
         try:
             view = rerun.blueprint.Spatial3DView(origin="/map", name="stillmap")
             blueprint = rerun.blueprint.Blueprint(view, collapse_panels=True)
             stream.save(pipe.name, default_blueprint=blueprint)
             pipe.start()
-            _Writer(rerun, stream, result).write(pipe, progress)
+            _Writer(rerun, stream, result.to_local(frame), frame).write(pipe, progress)
         finally:
             stream.disconnect()
             pipe.finish()
@@ -132,8 +135,8 @@ def _make_stream(rerun: Any, result: Exported) -> Any:
 class _Writer:
     """Writes the entities of a result to a stream."""
 
-    def __init__(self, rerun: Any, stream: Any, result: Exported) -> None:
-        self._rerun, self._stream, self._result = rerun, stream, result
+    def __init__(self, rerun: Any, stream: Any, result: Exported, frame: LocalFrame) -> None:
+        self._rerun, self._stream, self._result, self._frame = rerun, stream, result, frame
         self._seen = result.deskew()
         lasers = "laser" if self._seen.dimension == 2 else "lidar"
         S = len(self._seen.T_base_sensor)
@@ -177,6 +180,8 @@ class _Writer:
             self._stream.log(entity, *what, static=True, strict=True)
 
         log("map", rerun.ViewCoordinates.RIGHT_HAND_Z_UP)
+        if self._frame.is_shifted:
+            log("map", rerun.AnyValues(origin=self._frame.origin))
         if result.map.p_occupied.size:
             log("map/plan", self._plan())
         log("map/path", rerun.LineStrips3D([_positions(result.poses)], colors=[BLUE]))

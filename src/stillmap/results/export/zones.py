@@ -16,7 +16,7 @@ Polygon = list[Float]  # rings (n, 2), the last position equal to the first: out
 
 _ACTIONS: tuple[Action, ...] = get_args(Action)
 _MAX_BYTES = 16 << 20
-_MAX_COORDINATE = 1e6  # m
+_MAX_COORDINATE = 1e9  # m
 _MIN_PERCENT, _MIN_SPEED, _MAX_SPEED = 1.0, 0.01, 100.0  # m/s
 _MAX_NAME = 40  # characters in messages
 
@@ -137,7 +137,7 @@ def _read_ring(positions: Any) -> Float:
     if len(ring) < 4 or (ring[0] != ring[-1]).any():
         raise ValueError("a ring of less than four positions, or whose last is not its first")
     if not (np.abs(ring) <= _MAX_COORDINATE).all():
-        raise ValueError("beyond a thousand kilometres; they are metres in the map frame")
+        raise ValueError("beyond a million kilometres; they are metres in the map frame")
     return ring
 
 

@@ -154,7 +154,7 @@ def draw_thinly_observed(
     return color_by_index(shown[::-1].astype(np.uint8), (UNKNOWN, VIOLET), bytes([0, VEIL_ALPHA]))
 
 
-def draw_points(points: NDArray[np.float32], view: MapView) -> Image.Image:
+def draw_points(points: NDArray[np.float32] | NDArray[np.float64], view: MapView) -> Image.Image:
     """Orange dots on a transparent layer over the `draw_map` of a view."""
     width, height = view.size
     pixels = np.zeros((height, width), np.uint8)

@@ -43,15 +43,19 @@ def points_data(
     seen = result if tilting is None else tilting
     if seen.recording.dimension == 2:
         return None
-    deskewed, poses = seen.deskewed, seen.poses
-    static = sample_static_points(deskewed, poses, seen.p_static, _MAX_STATIC)
-    dynamic = sample_dynamic_points(deskewed, poses, seen.p_static, _MAX_DYNAMIC)
+    deskewed, poses = seen.deskewed, result.frame.to_local(seen.poses)
+    samples = (
+        sample_static_points(deskewed, poses, seen.p_static, _MAX_STATIC),
+        sample_dynamic_points(deskewed, poses, seen.p_static, _MAX_DYNAMIC),
+    )
+    static, dynamic = (np.asarray(points, np.float32) for points in samples)
     ceiling = find_ceiling(static[:, 2], float(poses[:, 2, 3].mean()))
     static, dynamic = (points[points[:, 2] < ceiling] for points in (static, dynamic))
     if not len(static):
         return None
     heights_shown = np.quantile(static[:, 2], [_OUTLIERS, 1.0 - _OUTLIERS]).round(1) + 0.0
     low, high = heights_shown.tolist()
+    above = float(result.frame.origin[2])
     heights = color_by_height(static[:, 2], low, high)
     orange = np.broadcast_to(np.array(ORANGE, np.uint8), (len(dynamic), 3))
     T = _choose_view(static)
@@ -62,7 +66,7 @@ def points_data(
     return {
         "size": _SIZE,
         "images": [data_uri(one, "jpeg", quality=_JPEG_QUALITY) for one in pictures],
-        "heights": (low, high),
+        "heights": (low + above, high + above),
         "has_ceiling": math.isfinite(ceiling),
     }
 

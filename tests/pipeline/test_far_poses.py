@@ -1,0 +1,169 @@
+"""A map frame that begins far away, as map projections do: the same result, shifted."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import yaml
+from choices import options
+from scipy.spatial import cKDTree
+
+import stillmap
+from stillmap.core.recording import Recording
+from stillmap.io.point_cloud.ply import read_layout
+from stillmap.io.trajectory import read_tum, write_tum
+from stillmap.results.point_cloud import cloud_from_folder
+from stillmap.sim import scene_by_name, simulate
+
+UTM = np.array([500_000.0, 5_300_000.0, 800.0])
+
+
+def shift(poses, by=UTM):
+    moved, D = poses.copy(), poses.shape[-1] - 1
+    moved[:, :D, D] += by[:D]
+    return moved
+
+
+@pytest.fixture(scope="module")
+def lidar():
+    """10 sweeps of 8 channels."""
+    settings = {"channels": 8, "columns": 400, "sweep": False}
+    scene = scene_by_name("hall", {"lidar": settings, "robot": {"scans": 10}})
+    return simulate(scene, 3)
+
+
+def require_shifted(far, near, dimension):
+    """The same labels and map, at poses shifted by UTM."""
+    np.testing.assert_allclose(
+        far.poses[:, :-1, -1] - UTM[:dimension], near.poses[:, :-1, -1], rtol=0, atol=1e-6
+    )
+    np.testing.assert_allclose(far.p_static, near.p_static, rtol=0, atol=1e-5)
+    assert far.map.p_occupied.shape == near.map.p_occupied.shape
+    np.testing.assert_allclose(
+        np.asarray(far.map.p_occupied), np.asarray(near.map.p_occupied), rtol=0, atol=1e-5
+    )
+    np.testing.assert_allclose(
+        np.array(far.map.origin[:2]) - UTM[:2], near.map.origin[:2], atol=1e-8
+    )
+    assert len(far.objects) == len(near.objects)
+    for one, other in zip(far.objects, near.objects, strict=True):
+        np.testing.assert_allclose(one.xy - UTM[:2], other.xy, rtol=0, atol=1e-5)
+    assert [(c.kind, len(c.cells)) for c in far.changes] == [
+        (c.kind, len(c.cells)) for c in near.changes
+    ]
+
+
+def test_a_planar_laser(room, tmp_path):
+    poses = room.truth.T_world_base
+    near = stillmap.build(room.recording, options(max_iterations=2), poses=poses)
+    far = stillmap.build(room.recording, options(max_iterations=2), poses=shift(poses))
+    require_shifted(far, near, 2)
+    assert near.objects
+    assert "local_origin" not in near.run
+    assert far.run["local_origin"] == [500_000.0, 5_300_000.0, 0.0]
+    for name, result in (("near", near), ("far", far)):
+        result.save(tmp_path / name)
+    maps = [yaml.safe_load((tmp_path / name / "map.yaml").read_text()) for name in ("near", "far")]
+    np.testing.assert_allclose(
+        np.array(maps[1]["origin"][:2]) - maps[0]["origin"][:2], UTM[:2], atol=1e-8
+    )
+    pixels = [(tmp_path / name / "map.pgm").read_bytes() for name in ("near", "far")]
+    assert pixels[0] == pixels[1]
+    changed = [np.load(tmp_path / name / "map.npz")["changed"] for name in ("near", "far")]
+    np.testing.assert_array_equal(*changed)
+    _, written = read_tum(tmp_path / "far" / "trajectory.tum")
+    np.testing.assert_allclose(written[:, :2, 3], shift(poses)[:, :2, 2], rtol=0, atol=1e-6)
+    track = json.loads((tmp_path / "far" / "objects" / "objects.json").read_text())[0]["track"]
+    np.testing.assert_allclose(track["x"], far.objects[0].xy[:, 0], rtol=0, atol=1e-3)
+    again = stillmap.load(tmp_path / "far", recording=room.recording)
+    assert again.map.origin == pytest.approx(far.map.origin, abs=1e-9)
+
+
+def test_a_lidar(lidar, tmp_path):
+    poses = lidar.truth.T_world_base
+    results = {
+        name: stillmap.build(lidar.recording, {"threads": 1}, poses=one)
+        for name, one in (("near", poses), ("far", shift(poses)))
+    }
+    require_shifted(results["far"], results["near"], 3)
+    for name, result in results.items():
+        result.save(tmp_path / name)
+    points = {
+        name: np.concatenate([b.points for b in cloud_from_folder(tmp_path / name).iter_blocks()])
+        for name in results
+    }
+    # near ones are written with 32 bits
+    np.testing.assert_allclose(points["far"] - UTM, points["near"], rtol=0, atol=2e-5)
+    kinds = {
+        name: {str(one.dtype) for one in read_layout(tmp_path / name / "static.ply").fields[:3]}
+        for name in results
+    }
+    assert kinds == {"near": {"float32"}, "far": {"float64"}}
+
+
+def test_a_region_is_in_the_map_frame(room):
+    chosen = dataclasses.replace(options(max_iterations=1))
+    region = (UTM[0] - 1.0, UTM[1] - 1.0, UTM[0] + 2.0, UTM[1] + 1.5)
+    output = dataclasses.replace(chosen.output, region=region)
+    chosen = dataclasses.replace(chosen, output=output)
+    result = stillmap.build(room.recording, chosen, poses=shift(room.truth.T_world_base))
+    from stillmap.results.region import crop_result
+
+    cropped = crop_result(result)
+    assert cropped.map.origin[:2] == pytest.approx(region[:2], abs=1e-6)
+    assert cropped.map.p_occupied.shape == (50, 60)
+
+
+def test_odometry_that_begins_far_away(room):
+    """In numbers that are exact in either place: matching makes millimetres of rounding errors."""
+    odometry = room.recording.T_odom_base.copy()
+    odometry[:, :2, 2] = np.round(odometry[:, :2, 2] * 2**20) / 2**20
+    near = dataclasses.replace(room.recording, T_odom_base=odometry)
+    far = dataclasses.replace(near, T_odom_base=shift(odometry))
+    one, other = (stillmap.build(each, options(max_iterations=2)) for each in (near, far))
+    np.testing.assert_array_equal(other.poses, one.poses)
+    np.testing.assert_array_equal(other.p_static, one.p_static)
+    np.testing.assert_array_equal(other.recording.T_odom_base, far.T_odom_base)
+    assert "local_origin" not in other.run
+
+
+def test_clouds_in_a_map_projection(tmp_path):
+    """Coordinates that are shifted when they are read come back where they were."""
+    rng = np.random.default_rng(1)
+    walls = rng.uniform(-8.0, 8.0, (4000, 3))
+    walls[:2000, 0], walls[2000:, 1] = 8.0, -8.0
+    (tmp_path / "clouds").mkdir()
+    table = np.zeros(len(walls), [(axis, "<f8") for axis in "xyz"])
+    for axis, column in zip("xyz", (walls + UTM).T, strict=True):
+        table[axis] = column
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(walls)}\n"
+    head += "".join(f"property double {axis}\n" for axis in "xyz") + "end_header\n"
+    (tmp_path / "clouds" / "1.ply").write_bytes(head.encode() + table.tobytes())
+    recording = stillmap.read(tmp_path / "clouds")
+    result = stillmap.build(recording, {"threads": 1})
+    result.save(tmp_path / "out")
+    points = np.concatenate(
+        [block.points for block in cloud_from_folder(tmp_path / "out").iter_blocks()]
+    )
+    apart, _ = cKDTree(walls).query(points - UTM)
+    assert len(points) == len(walls)
+    assert apart.max() < 1e-3
+    np.testing.assert_allclose(result.poses[0][:3, 3], recording.source["origin"], atol=1e-9)
+
+
+def test_a_trajectory_that_was_written_is_read_again(room, tmp_path):
+    poses = shift(room.truth.T_world_base)
+    write_tum(tmp_path / "poses.tum", room.recording.stamp_ns, poses)
+    result = stillmap.build(room.recording, options(max_iterations=1), poses=tmp_path / "poses.tum")
+    np.testing.assert_allclose(result.poses, poses, rtol=0, atol=1e-8)
+
+
+def test_absurd_poses_are_refused(room: object, tmp_path) -> None:
+    recording: Recording = room.recording  # type: ignore[attr-defined]
+    poses = shift(room.truth.T_world_base, 1e10 * np.ones(3))  # type: ignore[attr-defined]
+    with pytest.raises(ValueError, match=r"(?s)poses: expected numbers below 1e\+09, got .* at 0"):
+        stillmap.build(recording, poses=poses)
+    write_tum(tmp_path / "poses.tum", recording.stamp_ns, poses)
+    with pytest.raises(stillmap.InputError, match=r"poses\.tum:1: has a position a million kilo"):
+        stillmap.build(recording, poses=tmp_path / "poses.tum")
