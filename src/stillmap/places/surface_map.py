@@ -102,6 +102,8 @@ def make_surface_map(sessions: Sequence[Evidence], dimension: int = 2) -> Surfac
     from scipy import ndimage  # slow to load
 
     corners = np.concatenate([one.corner for one in sessions]).astype(np.int64)
+    if not len(corners):  # nothing was seen: one empty tile
+        corners = np.zeros((1, 2), np.int64)
     edge = sessions[0].edge
     low = corners.min(axis=0) // edge * edge
     shape = tuple((corners.max(axis=0) + edge - low).tolist())
