@@ -117,8 +117,8 @@ NAN_POSE = np.where(np.arange(T)[:, None] == 3, np.nan, ODOMETRY)
         ({"min_range": 3.0, "max_range": 2.0}, "min_range, max_range: expected"),
         ({"min_range": float("nan")}, "min_range, max_range: expected"),
         ({"sensor_pose": (1.0, 2.0)}, r"sensor_pose: expected \(3,\) x, y, theta"),
-        ({"time_increment": -1e3}, "time_increment: expected scans of up to 3600 s"),
-        ({"time_increment": float("inf")}, "time_increment: expected scans of up to 3600 s"),
+        ({"time_increment": -1e3}, "time_increment: expected scans of up to 60 s"),
+        ({"time_increment": float("inf")}, "time_increment: expected scans of up to 60 s"),
     ],
 )
 def test_wrong_arguments_are_named(arguments, said):

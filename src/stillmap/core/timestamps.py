@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 # ns from 1970, the years 1824 to 2116: the time between any two stamps fits into int64
 MAX_STAMP_NS = 2**62 - 1
 
-MAX_BEAM_TIME = 3600.0  # s from the stamp of a scan: the slowest scanners turn within an hour
+MAX_BEAM_TIME = 60.0  # s from the stamp of a scan: times farther from it are damaged
 
 
 def parse_ns(text: str) -> int:
