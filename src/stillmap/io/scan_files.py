@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
+from decimal import Decimal
 from pathlib import Path
 
 from stillmap.core.errors import InputError
@@ -108,8 +109,8 @@ def _parse_line(text: str) -> int | None:
         if date is None:
             return parse_ns(text)
         at = datetime.fromisoformat(date[1]).replace(tzinfo=UTC)
-        whole = parse_ns(str(int(at.timestamp())))  # refuses years after 2116
-        return whole + parse_ns(f"0{date[2] or '.0'}")
+        seconds = int(at.timestamp()) + Decimal(f"0{date[2] or '.0'}")
+        return parse_ns(f"{seconds:f}")  # refuses years after 2116
     except (ValueError, OverflowError):
         return None
 
