@@ -19,8 +19,15 @@ _MANY = 150_000  # beams of a recording: more take seconds
 
 _ODD = (0.0, -0.0, -1.0, 1e-30, 1e-3, 5.0, REACH, 1.1e5, 1e9, 3e38, -1e9)
 _NO_NUMBERS = (np.nan, np.inf, -np.inf)
-_STAMPS = (0, 1, -1, 10**9, 2**53, 2**63 - 1, -(2**63), 10**18)
+_STAMPS = (0, 1, -1, 10**9, 2**53, 10**18, 4 * 10**18, -4 * 10**18)
+_EXTREME_STAMPS = (2**63 - 1, -(2**63), 2**62)
 _NS = 10**8  # between scans
+_WORDS = (  # of `stillmap map`
+    *([], [], [], ["--no-odometry"], ["--resolution", "0.3"], ["--map-mode", "raw"]),
+    *(["--region", "-1", "-1", "2", "3"], ["--set", "em.change_detection=true"]),
+)
+_WORDS_2D = (*_WORDS, ["--paper"], ["--estimator", "hit-ratio"], ["--estimator", "tracker"])
+_WORDS_3D = (*_WORDS, ["--mesh"], ["--spin", "clockwise"], ["--set", "read.self_filter=false"])
 
 
 @dataclass(frozen=True, repr=False)
@@ -36,6 +43,9 @@ class OddRecording:
         odometry, poses: (T, D+1, D+1), or None.
         beam_time: (M,) s, or None.
         form: "arrays", "folder" or "log".
+        words: of the command line.
+        then: numbers of the commands that follow.
+        notes: how it was made.
     """
 
     stamp_ns: Any
@@ -48,6 +58,8 @@ class OddRecording:
     poses: Any
     beam_time: Any
     form: str
+    words: tuple[str, ...] = ()
+    then: tuple[int, ...] = ()
     notes: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -58,7 +70,8 @@ class OddRecording:
         return (
             f"<{self.dimension}D as {self.form}, scans of {list(self.counts)} beams, stamps "
             f"{list(self.stamp_ns)}, odometry {self.odometry is not None}, poses "
-            f"{self.poses is not None}, times {self.beam_time is not None}, {self.notes}>"
+            f"{self.poses is not None}, times {self.beam_time is not None}, "
+            f"{' '.join(self.words)}, then {self.then}, {self.notes}>"
         )
 
 
@@ -83,6 +96,8 @@ def odd_recordings(draw: Any, far: float = FAR) -> OddRecording:
         odometry=_moved(one.odometry, start) if draw(st.booleans()) else None,
         poses=_moved(one.poses, start) if draw(st.booleans()) else None,
         beam_time=one.beam_time if draw(st.booleans()) else None,
+        words=tuple(draw(st.sampled_from(_WORDS_2D if D == 2 else _WORDS_3D))),
+        then=tuple(draw(st.lists(st.integers(0, 99), max_size=2))),
         notes={"seed": seed, "start": start, "faults": []},
     )
     for _ in range(draw(st.integers(0, 4))):
@@ -137,14 +152,15 @@ def _moved(poses: Any, metres: float) -> Any:
 
 
 def _stamps(draw: Any, T: int) -> Any:
-    kind = draw(st.sampled_from(["even", "even", "equal", "any", "apart", "sorted"]))
-    first = draw(st.sampled_from([0, 10**18]))
+    kind = draw(st.sampled_from([*["even"] * 4, "equal", "apart", "sorted", "any"]))
     if kind in ("even", "equal"):
+        first = draw(st.sampled_from([0, 10**18]))
         return first + np.arange(T, dtype=np.int64) * (_NS if kind == "even" else 0)
-    some = draw(st.lists(st.sampled_from(_STAMPS), min_size=T, max_size=T))
-    if kind == "apart":  # seconds, hours, years
+    if kind == "apart":  # from microseconds to years
         step = draw(st.sampled_from([10**3, 10**9, 10**13, 10**17]))
         return np.arange(T, dtype=np.int64) * step
+    values = st.sampled_from(_STAMPS if kind == "sorted" else _STAMPS + _EXTREME_STAMPS)
+    some = draw(st.lists(values, min_size=T, max_size=T))
     return np.array(sorted(some) if kind == "sorted" else some, np.int64)
 
 

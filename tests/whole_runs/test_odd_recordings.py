@@ -1,8 +1,12 @@
 """Whatever a recording holds, a run maps it or refuses it in one line, within bounds of memory and
 time; what it writes is whole, and of numbers."""
 
+import dataclasses
+import os
 import resource
 import signal
+import subprocess
+import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,9 +23,23 @@ from stillmap.cli.main import main
 _MEMORY = 1 << 30  # bytes more than before a run
 _SECONDS = 30.0  # of processor time
 _OPTIONS = ["--threads", "1", "--quiet"]
+# what is done with a result, and endings of what is written
+_BOTH = (
+    ("filter {out} --to stillmap", ""),
+    ("convert {path} --to stillmap", ""),
+    *(("convert {out}", end) for end in (".mcap", ".bag")),
+    ("convert {out} --to nav2", ""),
+    ("merge {out} {path} --threads 1", ""),
+    ("live --replay {path} --threads 1", ""),
+)
+_FURTHER = {
+    2: (*_BOTH, ("convert {out}", ".parquet"), ("filter {out}", ".log")),
+    3: (*_BOTH, *(("convert {out}", end) for end in (".ply", ".las", ".e57", ".xyz"))),
+}
 
 
 def runs(count):
+    """So many examples, the same every time."""
     return settings(
         max_examples=count,
         deadline=None,
@@ -76,20 +94,20 @@ def run_in_python(one: OddRecording, folder: Path) -> None:
 
 
 def run_commands(one: OddRecording, folder: Path, said: pytest.CaptureFixture[str]) -> None:
-    path = write(one, folder)
-    words = ["map", str(path), "-o", str(folder / "map"), *_OPTIONS]
+    path, out = write(one, folder), folder / "map"
+    words = ["map", str(path), "-o", str(out), *_OPTIONS, *one.words]
     if one.poses is not None:
         write_poses(one, folder / "odd.tum")
         words += ["--poses", str(folder / "odd.tum")]
-    if not succeeds(words, said):
-        return
-    require_finite(folder / "map")
-    for more in (
-        ["filter", str(folder / "map"), "-o", str(folder / "clean"), "--to", "stillmap"],
-        ["convert", str(folder / "map"), "-o", str(folder / "cloud.ply")],
-        ["convert", str(path), "-o", str(folder / "same"), "--to", "stillmap"],
-    ):
-        succeeds([*more, "--quiet"], said)
+    if succeeds(words, said):
+        require_finite(out)
+        known = _FURTHER[one.dimension]
+        for number in one.then:
+            more, end = known[number % len(known)]
+            further = [word.format(path=path, out=out) for word in more.split()]
+            succeeds(
+                [*further, "-o", str(folder / f"{number}{end}"), "--overwrite", "--quiet"], said
+            )
 
 
 def succeeds(words: list[str], said: pytest.CaptureFixture[str]) -> bool:
@@ -125,7 +143,29 @@ def test_odd_recordings(one, capsys):
 
 
 @pytest.mark.slow
-@runs(1500)
+@runs(600)
 @given(one=odd_recordings())
 def test_many_odd_recordings(one, capsys):
     require_run(one, capsys)
+
+
+@runs(4)
+@given(one=odd_recordings())
+def test_as_a_process(one):
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        if one.form == "arrays":
+            one = dataclasses.replace(one, form="folder")
+        words = ["map", str(write(one, folder)), "-o", str(folder / "map"), *_OPTIONS]
+        process = subprocess.Popen(
+            [sys.executable, "-m", "stillmap", *words], stderr=subprocess.PIPE, text=True
+        )
+        with process.stderr as stream:
+            text = stream.read()
+        _, state, used = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(state)
+        assert process.returncode in (0, 2), text
+        assert (folder / "map").exists() == (process.returncode == 0)
+        assert len(text.splitlines()) == (process.returncode == 2), text
+        assert used.ru_maxrss << 10 < _MEMORY
+        assert used.ru_utime + used.ru_stime < _SECONDS
