@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 
 import stillmap
 
-FAR = 30.0  # m, of poses and odometry
-REACH = 100.0  # m, of returns that are no damage
+# m, of poses and odometry, and of returns that are no damage: a map takes the memory of the box
+# around all of them
+FAR, REACH = 30.0, 100.0
 MAX_SCANS = 10
 MAX_BEAMS = 100_000  # of a scan
 _MANY = 150_000  # beams of a recording: more take seconds
