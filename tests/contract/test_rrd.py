@@ -8,7 +8,9 @@ from collections import defaultdict
 import numpy as np
 import pytest
 
+import stillmap
 from stillmap.cli.main import main
+from stillmap.io import stillmap_folder
 from stillmap.io.trajectory import read_tum
 
 rerun = pytest.importorskip("rerun")
@@ -59,6 +61,29 @@ def test_entities(of_hall, of_street):
     assert set(of_hall) == fixed | hall | {("/map/base/laser",), ("/map/base/laser2",)}
     street = {"/map/base", "/map/base/lidar", "/map/objects"}
     assert set(of_street) == fixed | street | {("/map/base/lidar",), ("/map/static_points",)}
+
+
+@pytest.mark.parametrize(("dimension", "first"), [(2, 1), (3, 3)])
+def test_scans_without_returns(dimension, first, tmp_path):
+    """The first ones, of which rerun would have to learn the type of the labels; or all."""
+    angles = np.linspace(0.0, 2 * np.pi, 90, endpoint=False)
+    if dimension == 2:
+        ranges = np.tile(np.linspace(3.0, 4.0, 90), (3, 1))
+        ranges[:first] = np.nan
+        recording = stillmap.Recording.from_scans(np.arange(3.0), ranges, angles)
+    else:
+        recording = stillmap.Recording.from_clouds(np.arange(3.0), [np.zeros((0, 3))] * 3)
+    stillmap_folder.write(recording, tmp_path / "recording")
+    words = ["map", tmp_path / "recording", "-o", tmp_path / "map", "--quiet"]
+    assert main([*map(str, words)]) == 0
+    # in a process of its own: rerun remembers types
+    words = [tmp_path / "map", "-o", tmp_path / "map.rrd", "--quiet"]
+    command = [sys.executable, "-m", "stillmap", "convert", *words]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    sensor = "/map/base/laser" if dimension == 2 else "/map/base/lidar"
+    counts = [len(row["p_static"] or []) for row in rows(tmp_path / "map.rrd")[sensor]]
+    assert counts == [0] * first + [90] * (3 - first)
 
 
 @pytest.mark.parametrize("case", ["hall", "street"])

@@ -99,6 +99,10 @@ NAN_POSE = np.where(np.arange(T)[:, None] == 3, np.nan, ODOMETRY)
         ({"stamps": ["a"] * T}, "stamps: expected"),
         ({"stamps": STAMPS[::-1]}, "stamps: expected no decrease, got .* at 1"),
         ({"stamps": np.where(np.arange(T) == 5, np.nan, STAMPS)}, "stamps: .* got nan at 5"),
+        ({"stamps": STAMPS + 4.7e9}, "stamps: expected times from 1824 to 2116"),
+        ({"stamps": np.full(T, 2**63 - 1)}, "stamps: expected times from 1824 to 2116"),
+        ({"stamps": np.full(T, "3000-01-01", "datetime64[s]")}, "stamps: expected times from"),
+        ({"stamps": np.full(T, "NaT", "datetime64[s]")}, "stamps: expected times .* got NaT at 0"),
         ({"stamps": range(T)}, "stamps: integers are nanoseconds, these span 39 ns"),
         ({"ranges": RANGES[:-1]}, "ranges: expected 40 as in stamps, got 39"),
         ({"ranges": RANGES[0]}, r"ranges: expected \(T, N\) real numbers, got \(181,\)"),
@@ -113,7 +117,8 @@ NAN_POSE = np.where(np.arange(T)[:, None] == 3, np.nan, ODOMETRY)
         ({"min_range": 3.0, "max_range": 2.0}, "min_range, max_range: expected"),
         ({"min_range": float("nan")}, "min_range, max_range: expected"),
         ({"sensor_pose": (1.0, 2.0)}, r"sensor_pose: expected \(3,\) x, y, theta"),
-        ({"time_increment": float("inf")}, "time_increment: expected finite seconds"),
+        ({"time_increment": -1e3}, "time_increment: expected scans of up to 60 s"),
+        ({"time_increment": float("inf")}, "time_increment: expected scans of up to 60 s"),
     ],
 )
 def test_wrong_arguments_are_named(arguments, said):

@@ -32,6 +32,23 @@ def test_a_loaded_result_has_what_the_built_one_has(built, saved):
     np.testing.assert_array_equal(loaded.deskewed.points, built.deskewed.points)
 
 
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_map_without_cells(dimension, tmp_path):
+    """Of a recording without a return, the map shows nothing."""
+    stamps = np.arange(3.0)
+    if dimension == 2:
+        ranges = np.full((3, 9), np.nan)
+        recording = stillmap.Recording.from_scans(stamps, ranges, np.linspace(-1.0, 1.0, 9))
+    else:
+        recording = stillmap.Recording.from_clouds(stamps, [np.zeros((0, 3))] * 3)
+    result = stillmap.build(recording, {"threads": 1})
+    assert result.map.p_occupied.size == 0
+    result.save(tmp_path / "map")
+    for one in (result, stillmap.load(tmp_path / "map", recording=recording)):
+        assert "3 in 2.0 s" in one._repr_html_()
+        assert one.plot().get_aspect() == 1.0
+
+
 def test_a_part_of_the_options_and_a_resolution(built):
     assert built.options.slam.resolution == built.map.resolution == 0.1
     assert (built.options.threads, built.options.em.max_iterations) == (1, 2)

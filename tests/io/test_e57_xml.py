@@ -1,5 +1,6 @@
 """The XML section of E57 files: what would fetch a schema, or take too long, is refused."""
 
+import re
 import socket
 import sys
 import time
@@ -16,6 +17,7 @@ import corpus
 
 from stillmap.core.errors import InputError
 from stillmap.io import read
+from stillmap.io.point_cloud import e57
 
 XSI = b' xmlns:i="http://www.w3.org/2001/XMLSchema-instance"'
 
@@ -73,3 +75,34 @@ def test_depth_counts_tags_alone(write_e57):
     assert read(write_e57(at_end(quiet))).n_scans == 2
     with pytest.raises(InputError, match="nested too deeply"):
         read(write_e57(at_end(b'<a x="/>">' * 200)))
+
+
+def test_damaged_scans_are_given_up_on(write_e57, monkeypatch):
+    """Each costs memory that libe57 keeps."""
+
+    def repeat(xml):
+        first = re.search(rb"<vectorChild.*?</vectorChild>", xml, re.DOTALL)[0]
+        damaged = re.sub(rb'fileOffset="\d+"', b'fileOffset="99999999"', first)
+        return xml.replace(first, first + 9 * damaged, 1)
+
+    tried, read_cloud = [], e57._read_cloud
+    monkeypatch.setattr(e57, "_MAX_DAMAGED", 5)
+    monkeypatch.setattr(e57, "_read_cloud", lambda *a: [tried.append(a), read_cloud(*a)][1])
+    recording = read(write_e57(repeat))
+    assert (recording.n_scans, len(tried)) == (1, 6)
+    skipped = recording.source["skipped"]
+    assert skipped["holds too many damaged scans"]["count"] == 5
+    assert sum(one["count"] for one in skipped.values()) == 10
+
+
+@pytest.mark.parametrize(("seconds", "is_stamp"), [("1e9", True), ("4.9e9", False), ("-1", False)])
+def test_stamps_that_are_no_time(write_e57, seconds, is_stamp):
+    start = f"<acquisitionStart type='Structure'><dateTimeValue type='Float'>{seconds}"
+    start += "</dateTimeValue></acquisitionStart>"
+
+    def stamp(xml):
+        kept = re.sub(rb"<acquisitionStart.*?</acquisitionStart>", b"", xml, flags=re.DOTALL)
+        return kept.replace(b"<pose type", start.encode() + b"<pose type")
+
+    stamps = read(write_e57(stamp)).stamp_ns.tolist()
+    assert stamps == ([10**18 + e57.GPS_EPOCH_S * 10**9] * 2 if is_stamp else [0, 10**9])

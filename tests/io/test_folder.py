@@ -181,6 +181,8 @@ def test_pickles_are_never_opened(tmp_path):
             lambda a: np.where(a == a[1], np.iinfo(np.int64).max, -(2**62)),
             "stamps decrease",
         ),
+        ("stamp_ns", lambda a: np.where(a == a[-1], np.iinfo(np.int64).max, a), "1824 to 2116"),
+        ("stamp_ns", lambda a: np.where(a == a[0], np.iinfo(np.int64).min, a), "1824 to 2116"),
         ("offset", lambda a: a + 1, "rise"),
         ("offset", lambda a: a[[0, 3, 1, 3]], "rise"),
         ("offset", lambda a: np.where(a == 3, np.iinfo(np.int64).min, a), "rise"),
@@ -192,6 +194,7 @@ def test_pickles_are_never_opened(tmp_path):
         ("T_base_sensor", lambda a: a * 2.0, "rigid"),
         ("T_odom_base", lambda a: a * np.nan, "rigid"),
         ("beam_time", lambda a: a * np.float32(np.inf), "beam_time"),
+        ("beam_time", lambda a: a + np.float32(1e9), "beam_time"),
         ("beam_time", lambda a: a[:2], "expected"),
     ],
 )

@@ -221,6 +221,9 @@ def test_times(tmp_path):
     file = tmp_path / "times.txt"
     file.write_text("0.1\n\n2011-09-26 13:02:25.000000001\n2011-13-26 13:02:25\n1e400\n-1.5\n\n \n")
     assert read_times(file) == [10**8, None, 1_317_042_145_000_000_001, None, None, -1_500_000_000]
+    last = "2116-02-20 23:53:38"
+    file.write_text(f"1969-12-31 23:59:58.25\n{last}.5\n{last}.427387903\n")
+    assert read_times(file) == [-1_750_000_000, None, 2**62 - 1]
 
 
 @pytest.mark.slow

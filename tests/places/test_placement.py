@@ -1,5 +1,7 @@
 """Placement of sessions of made-up rooms: found, ambiguous, undetermined, foreign."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -90,6 +92,19 @@ def test_another_room_is_refused():
     first, _ = session("a", L_SHAPE, [(1, 1), (12, 2), (3, 3), (2, 9)])
     second, _ = session("b", OTHER, [(2, 1), (7, 2), (8, 6), (14, 5), (2, 6)])
     assert grow(first, second).refused
+
+
+@pytest.mark.parametrize("empty_first", [False, True])
+def test_a_session_without_a_return_is_refused(empty_first):
+    full, _ = session("full", L_SHAPE, [(1, 1), (12, 2), (3, 3), (2, 9)])
+    poses = se2.matrix(np.arange(4.0), np.zeros(4), np.zeros(4))
+    seen = scan(L_SHAPE, se2.matrix(1.0, 1.0, 0.0) @ poses)
+    nothing = np.full_like(seen.points, np.nan)
+    blind = replace(seen, points=nothing, hit=np.zeros_like(seen.hit))
+    unknown = np.full(len(nothing), np.nan, np.float32)
+    empty = make_session(MappedRecording("empty", blind, poses, unknown, None, (0.2, 1.8)))
+    growth = grow(*((empty, full) if empty_first else (full, empty)))
+    assert growth.refused == "no part of it looks like the place"
 
 
 def test_a_session_that_the_graph_puts_beside_the_place_is_refused(monkeypatch):

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from stillmap.core.errors import InputError
 from stillmap.core.se2 import matrix
+from stillmap.core.timestamps import MAX_STAMP_NS
 from stillmap.io.trajectory import read_tum, write_tum
 
 STAMPS = np.array([1, 999_999_999, 1_000_000_000, 1_699_999_999_123_456_789], np.int64)
@@ -49,7 +50,7 @@ def test_evo_reads_the_same(tmp_path, monkeypatch):
     np.testing.assert_allclose(read[:, :2, :2], POSES[:, :2, :2], atol=5e-9)
 
 
-@given(st.lists(st.integers(-(2**63) + 1, 2**63 - 1), min_size=1, max_size=20))
+@given(st.lists(st.integers(-MAX_STAMP_NS, MAX_STAMP_NS), min_size=1, max_size=20))
 def test_stamps_survive_exactly(tmp_path_factory, stamps):
     path = tmp_path_factory.mktemp("tum") / "t.tum"
     write_tum(path, np.array(stamps, np.int64), matrix(0 * np.ones(len(stamps)), 0.0, 0.0))
@@ -97,8 +98,8 @@ def test_reads_what_others_write(tmp_path):
         ("nan 0 0 0 0 0 0 1", "no number"),
         ("inf 0 0 0 0 0 0 1", "no number"),
         ("snan 0 0 0 0 0 0 1", "no number"),
-        ("1e300 0 0 0 0 0 0 1", "64 bit"),
-        ("1e999999999 0 0 0 0 0 0 1", "no number|64 bit"),
+        ("1e300 0 0 0 0 0 0 1", "1824 to 2116"),
+        ("1e999999999 0 0 0 0 0 0 1", "no number|1824 to 2116"),
         ("1 0 0 0 0 0 0 0", "length one"),
         ("1 0 0 0 1 1 0 0", "length one"),
     ],

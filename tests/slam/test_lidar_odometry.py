@@ -143,6 +143,22 @@ def test_empty_sweeps(room):
     assert np.abs(nothing.poses - np.eye(4)).max() < 1e-9
 
 
+def test_a_pause_says_nothing_about_motion(room):
+    """A robot that drove is not looked for where it would be a year later."""
+    recording, truth, e = room
+    stamp_ns = recording.stamp_ns + np.where(np.arange(recording.n_scans) > 15, 3 * 10**16, 0)
+    found = built(replace(recording, stamp_ns=stamp_ns), e)
+    assert compute_absolute_errors(found.poses, truth).rmse < 0.02
+
+
+def test_stamps_a_nanosecond_apart(room):
+    recording, truth, e = room
+    stamp_ns = recording.stamp_ns.copy()
+    stamp_ns[1:4] = stamp_ns[0] + np.arange(1, 4)
+    found = built(replace(recording, stamp_ns=stamp_ns), e)
+    assert compute_absolute_errors(found.poses, truth).rmse < 0.1
+
+
 def test_memory_is_bounded_by_the_radius(monkeypatch):
     monkeypatch.setattr(lidar_odometry, "MAX_RANGE", 20.0)
     street = Boxes.of([[0.0, 0.0, 1.0, 4000.0, 12.0, 5.0, 0, 0, 0]])

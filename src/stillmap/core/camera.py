@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.short_repr import ShortRepr
+from stillmap.core.timestamps import are_dated
 
 Float = NDArray[np.float64]
 
@@ -74,6 +75,8 @@ class Images(ShortRepr):
             raise ValueError("images: expected int64 stamps and int32 cameras")
         if self.camera.shape != (N,) or np.any(self.stamp_ns[1:] < self.stamp_ns[:-1]):
             raise ValueError(f"images: expected ({N},) cameras and non-decreasing stamps")
+        if not are_dated(self.stamp_ns):
+            raise ValueError("images: expected times from 1824 to 2116")
         if N and (self.camera.min() < 0 or self.camera.max() >= len(self.cameras)):
             raise ValueError("images: camera index out of range")
 

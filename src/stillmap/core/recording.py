@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from stillmap.core import arrays
 from stillmap.core.camera import Images
 from stillmap.core.short_repr import ShortRepr
+from stillmap.core.timestamps import MAX_BEAM_TIME, are_dated
 
 _BLOCK = 1 << 14  # end points transformed at once
 
@@ -23,7 +24,8 @@ class Recording(ShortRepr):
     """T scans with M beams in all, in D dimensions, taken by S sensors on one robot.
 
     Attributes:
-        stamp_ns: (T,) int64, the recording's own stamps in nanoseconds, non-decreasing.
+        stamp_ns: (T,) int64, the recording's own stamps in nanoseconds, non-decreasing, from
+            1824 to 2116: the time between any two fits into int64.
         offset: (T+1,) int64, scan t has the beams offset[t]:offset[t+1].
         points: (M, D) float32, end points in the sensor frame in metres. NaN marks an unusable
             beam; a maximum-range beam (not hit, finite) ends where known free space ends.
@@ -31,8 +33,8 @@ class Recording(ShortRepr):
         T_base_sensor: (S, D+1, D+1) float64, sensor poses on the robot.
         sensor: (T,) int32, sensor index of each scan.
         T_odom_base: (T, D+1, D+1) float64, odometry at each scan; None: no odometry.
-        beam_time: (M,) float32, seconds after the stamp of the scan, finite; None: all beams of a
-            scan have its stamp.
+        beam_time: (M,) float32, seconds after the stamp of the scan, at most `MAX_BEAM_TIME`;
+            None: all beams of a scan have its stamp.
         source: JSON-able notes of the reader: input, format, sensors, warnings, skipped records.
         T_recorded_base: (T, D+1, D+1) float64, poses stored in the recording, of a survey or other
             programs; used only on request. None: no poses.
@@ -75,8 +77,10 @@ class Recording(ShortRepr):
         if self.beam_time is not None:
             _check("beam_time", self.beam_time, (M,), np.float32)
             for block in arrays.iter_blocks(self.beam_time):
-                if not np.isfinite(self.beam_time[block]).all():
-                    raise ValueError("beam_time: a time is not finite")
+                if not np.all(np.abs(self.beam_time[block]) <= MAX_BEAM_TIME):
+                    raise ValueError(f"beam_time: expected up to {MAX_BEAM_TIME:g} s")
+        if not are_dated(self.stamp_ns):
+            raise ValueError("stamp_ns: expected times from 1824 to 2116")
         if (
             self.offset[0] != 0
             or self.offset[-1] != M

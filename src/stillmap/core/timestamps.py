@@ -1,23 +1,32 @@
 """Time stamps: exact nanoseconds from decimal text, clock jumps, and times of beams."""
 
+# signatures name Recording, which needs this module
+from __future__ import annotations
+
 from bisect import bisect_right
 from collections.abc import Sequence
 from decimal import ROUND_HALF_EVEN, Decimal, InvalidOperation
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays
-from stillmap.core.recording import Recording
 
-_MAX_SECONDS = 9_000_000_000  # int64 holds 9.22e9 s in nanoseconds
+if TYPE_CHECKING:
+    from stillmap.core.recording import Recording
+
+# ns from 1970, the years 1824 to 2116: the time between any two stamps fits into int64
+MAX_STAMP_NS = 2**62 - 1
+
+MAX_BEAM_TIME = 60.0  # s from the stamp of a scan: times farther from it are damaged
 
 
 def parse_ns(text: str) -> int:
     """Nanoseconds of a decimal number of seconds, exact; rounded half to even.
 
     Raises:
-        ValueError: not a number, not finite, or outside the range of int64 nanoseconds.
+        ValueError: not a number, not finite, or more than `MAX_STAMP_NS` from 1970.
     """
     try:
         seconds = Decimal(text)
@@ -28,9 +37,14 @@ def parse_ns(text: str) -> int:
         raise ValueError(f"not a time stamp: {text!r}")
     if seconds.adjusted() < -12:
         return 0
-    if abs(seconds) > _MAX_SECONDS:
+    if abs(seconds) * 10**9 > MAX_STAMP_NS:
         raise ValueError(f"not a time stamp: {text!r}")
     return int(seconds.scaleb(9).to_integral_value(ROUND_HALF_EVEN))
+
+
+def are_dated(stamp_ns: NDArray[np.int64]) -> bool:
+    """Whether all of stamps (T,) lie at most `MAX_STAMP_NS` before or after 1970."""
+    return not np.any((stamp_ns < -MAX_STAMP_NS) | (stamp_ns > MAX_STAMP_NS))
 
 
 def format_seconds(stamp_ns: int) -> str:

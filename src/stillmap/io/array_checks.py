@@ -6,11 +6,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stillmap.core import se2
+from stillmap.core.timestamps import MAX_STAMP_NS
 from stillmap.io.rigid_transforms import MAX_TRANSLATION
 
 Float = NDArray[np.float64]
 
-_MAX_SECONDS = 9e9  # int64 holds 9.22e9 s in nanoseconds
+_MAX_SECONDS = MAX_STAMP_NS // 10**9
 _MIN_STEP_NS = 1000  # between scans: integers that rise more slowly are no nanoseconds
 _MAX_SKEW = 1e-3  # of R R^T from the identity: poses printed with few digits pass
 
@@ -19,7 +20,7 @@ def stamps_to_ns(stamps: ArrayLike) -> NDArray[np.int64]:
     """(T,) int64 nanoseconds of stamps in seconds (float), nanoseconds (integer) or datetime64.
 
     Raises:
-        ValueError: no vector of T >= 1 finite numbers that do not decrease.
+        ValueError: no vector of T >= 1 times from 1824 to 2116 that do not decrease.
     """
     given = np.asarray(stamps)
     if given.ndim != 1 or not len(given) or given.dtype.kind not in "fiuM":
@@ -27,13 +28,13 @@ def stamps_to_ns(stamps: ArrayLike) -> NDArray[np.int64]:
             "stamps: expected (T,) seconds (float), nanoseconds (int) or datetime64, T >= 1, "
             f"got {describe(given)}"
         )
-    if given.dtype.kind == "M":
-        bad = np.isnat(given)
-        require_all("stamps", ~bad, "a time", given)
+    kind = given.dtype.kind
+    seconds = given.astype("datetime64[s]").astype(np.int64) if kind == "M" else given
+    seconds = seconds.astype(np.float64) * (1e-9 if kind in "iu" else 1.0)
+    require_all("stamps", np.abs(seconds) < _MAX_SECONDS, "times from 1824 to 2116", given)
+    if kind == "M":
         out = given.astype("datetime64[ns]").astype(np.int64)
-    elif given.dtype.kind == "f":
-        seconds = given.astype(np.float64)
-        require_all("stamps", np.abs(seconds) < _MAX_SECONDS, "finite seconds", given)
+    elif kind == "f":
         whole = np.floor(seconds)  # seconds of 1970 have no exact product with 1e9
         out = whole.astype(np.int64) * 10**9 + np.rint((seconds - whole) * 1e9).astype(np.int64)
     else:

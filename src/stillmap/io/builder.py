@@ -14,6 +14,7 @@ from stillmap.core.advice import advise
 from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.arrays import empty
 from stillmap.core.recording import Recording
+from stillmap.core.timestamps import MAX_BEAM_TIME
 from stillmap.io.text_lines import Progress, share_progress
 from stillmap.preprocessing.options import MAX_POINT_DISTANCE, ReadOptions
 
@@ -82,7 +83,7 @@ class RecordingBuilder:
             points: (n, D) metres in the sensor's frame, larger than memory at will; not finite or
                 implausibly far ones are unusable.
             sensor: index of its sensor.
-            beam_time: (n,) seconds after the stamp; not finite counts as 0.
+            beam_time: (n,) seconds after the stamp; implausible ones count as 0.
         """
         for start in range(0, len(points), _BLOCK):
             block = slice(start, start + _BLOCK)
@@ -91,7 +92,7 @@ class RecordingBuilder:
             self._hit.append(hit)
             if self._times is not None:
                 times = np.zeros(len(known)) if beam_time is None else beam_time[block]
-                self._times.append(np.where(np.isfinite(times), times, 0.0))
+                self._times.append(np.where(np.abs(times) <= MAX_BEAM_TIME, times, 0.0))
         self.stamp_ns.append(stamp_ns)
         self.length.append(len(points))
         self.sensor.append(sensor)

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from stillmap.core import arrays
 from stillmap.core.recording import Recording
+from stillmap.core.timestamps import MAX_BEAM_TIME
 from stillmap.io.array_checks import (
     describe,
     poses_to_matrices,
@@ -49,8 +50,9 @@ def recording_from_scans(
     require_all("angles", np.isfinite(directions), "finite radians", directions)
     if not N:
         raise ValueError("ranges: expected at least one beam, got none")
-    if not np.isfinite(time_increment):
-        raise ValueError(f"time_increment: expected finite seconds, got {time_increment}")
+    if not abs(time_increment) * (N - 1) <= MAX_BEAM_TIME:
+        what = f"expected scans of up to {MAX_BEAM_TIME:g} s"
+        raise ValueError(f"time_increment: {what}, got {time_increment}")
     options = _read_options(min_range, max_range)
     with np.errstate(over="ignore", invalid="ignore"):
         step = max(1, -(-T * N // _SAMPLE))

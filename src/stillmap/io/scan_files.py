@@ -3,10 +3,11 @@
 import re
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
+from decimal import Decimal
 from pathlib import Path
 
 from stillmap.core.errors import InputError
-from stillmap.core.timestamps import parse_ns
+from stillmap.core.timestamps import MAX_STAMP_NS, parse_ns
 from stillmap.io.text_lines import read_lines
 
 _NUMBER = re.compile(r"(?:^-)?\d+(?:\.\d+)?$")
@@ -80,7 +81,7 @@ def _parse_stamp(stem: str) -> tuple[int, int] | None:
         except ValueError:
             return None
     scale = _NS_BY_DIGITS.get(len(match[0].lstrip("-")))
-    if scale is None or not -(2**63) < int(match[0]) * scale < 2**63:
+    if scale is None or abs(int(match[0]) * scale) > MAX_STAMP_NS:
         return None
     return scale, int(match[0]) * scale
 
@@ -108,8 +109,8 @@ def _parse_line(text: str) -> int | None:
         if date is None:
             return parse_ns(text)
         at = datetime.fromisoformat(date[1]).replace(tzinfo=UTC)
-        whole = parse_ns(str(int(at.timestamp())))  # refuses years beyond int64 ns
-        return whole + parse_ns(f"0{date[2] or '.0'}")
+        seconds = int(at.timestamp()) + Decimal(f"0{date[2] or '.0'}")
+        return parse_ns(f"{seconds:f}")  # refuses years after 2116
     except (ValueError, OverflowError):
         return None
 

@@ -13,7 +13,7 @@ from stillmap.core.arrays import iter_blocks
 from stillmap.core.errors import InputError
 from stillmap.core.input_files import read_text
 from stillmap.core.recording import Recording
-from stillmap.core.timestamps import format_seconds
+from stillmap.core.timestamps import MAX_STAMP_NS, format_seconds
 from stillmap.io.rigid_transforms import MAX_TRANSLATION
 
 if TYPE_CHECKING:
@@ -120,8 +120,8 @@ def _parse_pose(words: list[str], where: str) -> tuple[int, list[float]]:
         raise InputError("holds a number that is not finite", where=where)
     if max(map(abs, row[:3])) >= MAX_TRANSLATION:
         raise InputError("has a position a million kilometres away", where=where, hint=_COLUMNS)
-    if abs(stamp) >= 2**63:
-        raise InputError("has a stamp that 64 bit nanoseconds cannot hold", where=where)
+    if abs(stamp) > MAX_STAMP_NS:
+        raise InputError("has a stamp that is no time from 1824 to 2116", where=where)
     if abs(math.hypot(*row[3:]) - 1) > _UNIT_TOLERANCE:
         raise InputError("has a quaternion that is not of length one", where=where, hint=_COLUMNS)
     return stamp, row

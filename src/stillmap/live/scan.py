@@ -12,6 +12,7 @@ import stillmap._core as _core
 from stillmap.core import se2, se3
 from stillmap.core.arrays import finite_rows
 from stillmap.core.short_repr import ShortRepr
+from stillmap.core.timestamps import MAX_BEAM_TIME
 from stillmap.io.array_checks import (
     poses_to_matrices,
     require_all,
@@ -106,7 +107,8 @@ def to_beams(scan: Scan) -> ScanBeams:
     if times is not None:
         times = to_array("beam_times", times, "(N,)").astype(np.float32)
         require_length("beam_times", len(times), len(points), "the beams")
-        require_all("beam_times", np.isfinite(times), "finite seconds", times)
+        good = np.abs(times) <= MAX_BEAM_TIME
+        require_all("beam_times", good, f"up to {MAX_BEAM_TIME:g} s", times)
     pose = _sensor_matrix(scan.sensor_pose, D)
     return ScanBeams(stamp_ns, points, hit, pose, scan.sensor, times)
 

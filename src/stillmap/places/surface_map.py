@@ -106,6 +106,8 @@ def make_surface_map(sessions: Sequence[Evidence], dimension: int = 2) -> Surfac
     from scipy import ndimage  # slow to load
 
     corners = np.concatenate([one.corner for one in sessions]).astype(np.int64)
+    if not len(corners):  # nothing was seen: one empty tile
+        corners = np.zeros((1, 2), np.int64)
     edge = sessions[0].edge
     box = bound_box(corners // edge, _LEAST_BLOCKS, _MOST_BLOCKS)
     low, shape = box.low * edge, tuple((edge * (box.high + 1 - box.low)).tolist())

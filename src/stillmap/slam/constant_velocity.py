@@ -15,7 +15,9 @@ from stillmap.slam.options import OdometryOptions
 
 Float = NDArray[np.float64]
 
-_MIN_STEP = 1e-3  # s between two sweeps; less counts as this
+# s between two sweeps; less counts as the first, more as the second: whoever has not been seen for
+# so long may have done anything, and most likely stands near
+MIN_STEP, _MAX_STEP = 1e-3, 10.0
 _INITIAL_POSE_STD = 1e-4  # m and rad; the first pose defines the map frame
 _MAX_ODOMETRY_CHI2 = 25.0  # 6 degrees of freedom; exceeded once in three thousand steps
 _ACCELERATION, _ANGULAR_ACCELERATION = 3.0, 3.0  # std, m/s^2 and rad/s^2
@@ -49,7 +51,7 @@ def predict(state: State, seconds: float) -> State:
     covariance q dt^3/3, q dt^2/2, q dt with q = a^2 dt (Barfoot, State Estimation for Robotics,
     Sect. 11.1); the adjoint transforms the error of the pose into the new frame.
     """
-    dt = max(seconds, _MIN_STEP)
+    dt = float(np.clip(seconds, MIN_STEP, _MAX_STEP))
     step = se3.exp(dt * state.twist)
     F = np.eye(12)
     F[:6, :6] = se3.adjoint(se2.inverse(step))
@@ -71,7 +73,7 @@ def update_with_odometry(
         seconds: duration of the step.
         options: noise of odometry.
     """
-    dt = max(seconds, _MIN_STEP)
+    dt = float(np.clip(seconds, MIN_STEP, _MAX_STEP))
     moved = se3.log(increment)
     std = motion_model.odometry_std(
         float(np.linalg.norm(moved[:3])), float(np.linalg.norm(moved[3:])), options

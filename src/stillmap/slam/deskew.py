@@ -108,6 +108,8 @@ def _select_scan_pairs(
 ) -> tuple[tuple[Index, Index], tuple[Index, Index]]:
     """Two scans from whose poses each scan's velocity follows: after its stamp, and before it.
 
+    Twice the same, so that there is none, where the recording is too short to tell.
+
     Args:
         stamp_ns: (T,).
         latest: seconds after the stamp of the last beam.
@@ -123,12 +125,12 @@ def _select_scan_pairs(
 
     next_, last = neighbors(latest)
     ahead = next_ < T
-    after = (np.where(ahead, here, np.maximum(last, 0)), np.where(ahead, next_, here))
+    after = (np.where(ahead | (last < 0), here, last), np.where(ahead, next_, here))
     if earliest <= 0.0:
         return after, after
     next_, last = neighbors(earliest)
     behind = last >= 0
-    before = (np.where(behind, last, here), np.where(behind, here, np.minimum(next_, T - 1)))
+    before = (np.where(behind, last, here), np.where(behind | (next_ == T), here, next_))
     return after, before
 
 
@@ -138,6 +140,7 @@ def _sensor_twists(recording: Recording, poses: Float, first: Index, second: Ind
     steps = se2.log(se2.inverse(poses[first]) @ poses[second])
     twists = steps / np.where(seconds > 0.0, seconds, np.inf)[:, None]
     is_leap = _has_leap(poses, first, second) | (np.abs(twists[:, 2]) > MAX_TURN_RATE)
+    is_leap |= np.hypot(twists[:, 0], twists[:, 1]) > MAX_SPEED
     twists[is_leap] = 0.0
     vx, vy, turn = _smooth(twists).T
     # lever arm: a sensor off the center of rotation moves with the rotation

@@ -185,7 +185,7 @@ def register_sweeps(
 def _initial_twist(recording: Recording, poses: Float) -> Float:
     """(6,) constant motion from the first of poses (n, 4, 4) to the second later one."""
     seconds = 1e-9 * (recording.stamp_ns[: len(poses)] - recording.stamp_ns[0])
-    later = np.flatnonzero(seconds > 0.0)
+    later = np.flatnonzero(seconds >= constant_velocity.MIN_STEP)
     if not len(later):
         return np.zeros(6)
     n = int(later[:2][-1])  # the first later one alone would double the uncertainty

@@ -17,6 +17,7 @@ from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.errors import InputError, MissingExtra, import_extra
 from stillmap.core.input_files import InputFile
 from stillmap.core.recording import Recording
+from stillmap.core.timestamps import MAX_STAMP_NS
 from stillmap.io.builder import ReadContext
 from stillmap.io.point_cloud.binary_table import truncated_error
 from stillmap.io.point_cloud.library_errors import damaged_error, library_errors
@@ -27,6 +28,7 @@ from stillmap.io.rigid_transforms import pose_from_quaternion
 from stillmap.io.scan_files import require_nonempty_file
 
 _BLOCK = 1 << 14  # points read at once; libe57 keeps the buffers where packets are damaged
+_MAX_DAMAGED = 50  # scans of a file
 _PAGE, _CHECKSUM = 1024, 4  # bytes
 _MAX_XML = 16 << 20  # bytes: parsed by libe57 it takes fifty times as much memory
 _MAX_DEPTH = 100  # nested elements: the time of libe57 grows with the square
@@ -51,9 +53,10 @@ def read(path: Path, context: ReadContext) -> Recording:
     import_extra("pye57.libe57", path)
     origin, sources, files = Origin(), [], files_of(path, E57_EXTENSIONS)
     for file, count in zip(files, count_scans(files, path.is_file()), strict=True):
+        scans = _Scans(file, origin, context.scratch)
         for scan in range(count):
             name = file.name if count == 1 else f"{file.name} scan {scan + 1}"
-            read_cloud = partial(_read_cloud, file, scan, origin, context.scratch)
+            read_cloud = partial(scans.read, scan)
             sources.append(CloudSource(name, read_cloud))
     info = DatasetInfo(path, "E57", [], single=path.is_file() and len(sources) == 1)
     recording = build_recording(sources, info, context)
@@ -153,6 +156,28 @@ def _count_scans(path: Path) -> int:
         return len(root["data3D"]) if root.isDefined("data3D") else 0
 
 
+class _Scans:
+    """The scans of a file, up to too many damaged ones: libe57 keeps 2 MB for each."""
+
+    def __init__(self, path: Path, origin: Origin, scratch: Path | None) -> None:
+        self._path, self._origin, self._scratch = path, origin, scratch
+        self._damaged = 0
+
+    def read(self, scan: int) -> Cloud:
+        """Read one scan.
+
+        Raises:
+            InputError: it is damaged, or so were too many before it.
+        """
+        if self._damaged >= _MAX_DAMAGED:
+            raise InputError("holds too many damaged scans", where=str(self._path))
+        try:
+            return _read_cloud(self._path, scan, self._origin, self._scratch)
+        except InputError:
+            self._damaged += 1
+            raise
+
+
 def _read_cloud(path: Path, scan: int, origin: Origin, scratch: Path | None) -> Cloud:
     with open_e57(path) as (library, file):
         node = file.root()["data3D"][scan]
@@ -231,6 +256,6 @@ def _read_stamp(node: Any) -> int | None:
         return None
     start = node["acquisitionStart"]
     seconds = start["dateTimeValue"].value() if start.isDefined("dateTimeValue") else 0.0
-    if not 0.0 < seconds < 5e9:
+    if not 0.0 < seconds < MAX_STAMP_NS // 10**9 - GPS_EPOCH_S:
         return None
     return round((seconds + GPS_EPOCH_S) * 1e9)

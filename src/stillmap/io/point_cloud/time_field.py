@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.timestamps import MAX_BEAM_TIME, MAX_STAMP_NS
+
 NAMES = ("t", "time", "timestamp", "timestamps", "time_stamp", "offset_time", "time_offset")
 
 _UNITS = (1, 10**3, 10**6, 10**9)  # per second: s, ms, us, ns
@@ -13,8 +15,6 @@ _SINCE_1970 = (6e8, 5e9)  # s: the years 1989 to 2128
 # the limits differ by less than 1000: at most one unit fits
 _SCAN_DURATION = (0.005, 2.0)  # s
 _PERIOD_SHARE = (0.05, 1.5)  # duration of a scan over the time between stamps
-_MAX_OFFSET = 60.0  # s: times farther from the stamp are damaged
-_MAX_NS = 9.2e18
 _SAME_CLOCK_NS = 10 * 10**9
 
 
@@ -80,7 +80,7 @@ def convert_times(
     if not clock.absolute:
         return stamp_ns, _drop_outliers(values.astype(np.float64) / clock.per_second)
     unit = 10**9 // clock.per_second  # ns
-    known = usable & np.isfinite(values) & (values > 0) & (values < _MAX_NS / unit)
+    known = usable & np.isfinite(values) & (values > 0) & (values < MAX_STAMP_NS / unit)
     after = np.full(len(values), np.nan)
     if not known.any():
         return stamp_ns, after
@@ -88,7 +88,7 @@ def convert_times(
     # integers stay exact
     ns = kept.astype(np.int64) * unit if kept.dtype.kind != "f" else _round(kept * float(unit))
     middle = np.partition(ns, len(ns) // 2)[len(ns) // 2]
-    first = int(ns[np.abs(ns - middle) < int(_MAX_OFFSET * 1e9)].min())
+    first = int(ns[np.abs(ns - middle) < int(MAX_BEAM_TIME * 1e9)].min())
     if stamp_ns is None:
         stamp_ns = first
     same_clock = abs(stamp_ns - first) < _SAME_CLOCK_NS
@@ -101,4 +101,4 @@ def _round(ns: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def _drop_outliers(seconds: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.where(np.abs(seconds) <= _MAX_OFFSET, seconds, np.nan)
+    return np.where(np.abs(seconds) <= MAX_BEAM_TIME, seconds, np.nan)

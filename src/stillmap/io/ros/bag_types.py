@@ -7,6 +7,7 @@ from typing import Any, Literal, NamedTuple, Protocol
 
 from stillmap.core.errors import InputError
 from stillmap.core.input_files import InputFile
+from stillmap.core.timestamps import MAX_STAMP_NS
 from stillmap.io.builder import SkippedRecords
 
 BagKind = Literal["bag", "ros2", "db3", "mcap"]
@@ -16,7 +17,6 @@ BAG1_MAGIC = b"#ROSBAG V"
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 DB3_MAGIC = b"SQLite format 3\0"
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-MAX_STAMP_NS = 2**63 - 1  # log times are 64 bit
 
 
 class DamagedBagError(Exception):
@@ -83,6 +83,11 @@ class Bag(Protocol):
     def close(self) -> None:
         """Close the files."""
         ...
+
+
+def is_log_time(value: object) -> bool:
+    """True for log times in ns: columns of SQLite are not typed."""
+    return isinstance(value, int) and abs(value) <= MAX_STAMP_NS
 
 
 def is_bag(path: Path, start: bytes | None) -> bool:

@@ -19,9 +19,10 @@ from rosbags.rosbag1.reader import Header, RecordType, normalize
 from rosbags.typesys.msg import normalize_msgtype
 
 from stillmap.core.input_files import InputFile, ShorterFileError
+from stillmap.core.timestamps import MAX_STAMP_NS
 from stillmap.io.builder import SkippedRecords
 from stillmap.io.ros import limits
-from stillmap.io.ros.bag_types import MAX_STAMP_NS, Channel, Message
+from stillmap.io.ros.bag_types import Channel, Message, is_log_time
 
 CUT = "end that is no record"
 BAD_CHUNK = "chunk that cannot be decompressed"
@@ -193,7 +194,7 @@ def scan_db3(path: Path, found: dict[int, Channel], damage: SkippedRecords) -> R
                 "SELECT topic_id, timestamp, data FROM messages"
             ):
                 rows += 1
-                if isinstance(raw, bytes) and isinstance(log_ns, int) and number in found:
+                if isinstance(raw, bytes) and is_log_time(log_ns) and number in found:
                     yield number, log_ns, raw
     except sqlite3.Error:
         damage.add(BAD_ROWS, rows + 1)

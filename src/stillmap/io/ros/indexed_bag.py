@@ -16,7 +16,7 @@ from stillmap.core.errors import InputError
 from stillmap.core.input_files import InputPath
 from stillmap.io.builder import SkippedRecords
 from stillmap.io.ros import limits
-from stillmap.io.ros.bag_types import MAX_STAMP_NS, Channel, DamagedBagError, Message
+from stillmap.io.ros.bag_types import Channel, DamagedBagError, Message, is_log_time
 
 _CHUNK_READERS = ("open", "read_index_data", "read_chunk")  # of rosbag1.Reader
 
@@ -109,8 +109,7 @@ class IndexedBag:
                 raise
             except Exception as error:  # any error of rosbags about damaged bytes
                 raise DamagedBagError(str(error) or type(error).__name__) from error
-            # SQLite columns are not typed
-            if not (isinstance(log_ns, int) and log_ns <= MAX_STAMP_NS and isinstance(raw, bytes)):
+            if not (is_log_time(log_ns) and isinstance(raw, bytes)):
                 raise DamagedBagError("a message without time or content")
             yield Message(channels[connection.id], log_ns, raw)
 

@@ -195,7 +195,7 @@ class _Writer:
             if colors is None:  # not those of the labels, in which the scans appear
                 colors = color_by_height(z, *np.quantile(z, [0.02, 0.98])) if len(z) else None
             points = rerun.Points3D(cloud.points, colors=colors, radii=rerun.Radius.ui_points(0.75))
-            log("map/static_points", points, rerun.AnyValues(p_static=cloud.p_static))
+            log("map/static_points", points, self._labels(cloud.p_static))
 
     def _plan(self) -> Any:
         """The map as a picture on a rectangle."""
@@ -220,8 +220,13 @@ class _Writer:
         p_static = np.asarray(self._result.p_static[beams][hit])
         radius = self._rerun.Radius.ui_points(1.5)
         cloud = self._rerun.Points3D(points, colors=color_by_p_static(p_static), radii=radius)
-        values = self._rerun.AnyValues(p_static=p_static)
-        self._log(self._sensors[int(seen.sensor[t])], cloud, values)
+        self._log(self._sensors[int(seen.sensor[t])], cloud, self._labels(p_static))
+
+    def _labels(self, p_static: NDArray[np.float32]) -> Any:
+        """P(static) of the points that are logged with it."""
+        import pyarrow  # which rerun needs; an array of NumPy without numbers has no type for it
+
+        return self._rerun.AnyValues(p_static=pyarrow.array(p_static))
 
     def _boxes(self, present: list[int], stamp_ns: int) -> Any:
         """A box with a number for each of the present objects."""

@@ -92,7 +92,8 @@ class MapView:
 def map_window(maps: Sequence[GridMap]) -> Window:
     """The smallest window that contains every occupied cell of `maps`, with a margin.
 
-    Without occupied cells: every known cell; without known cells: the whole first map.
+    Without occupied cells: every known cell; without known cells: the whole first map, of a map
+    without cells the place of one.
     """
     for select in (_is_occupied, _is_known):
         boxes = [box for box in (_box(one, select) for one in maps) if box is not None]
@@ -101,7 +102,9 @@ def map_window(maps: Sequence[GridMap]) -> Window:
             x0, y0 = corners[:, :2].min(axis=0).tolist()
             x1, y1 = corners[:, 2:].max(axis=0).tolist()
             return x0, y0, x1, y1
-    return extent(maps[0])
+    x0, y0, x1, y1 = extent(maps[0])
+    cell = maps[0].resolution
+    return x0, y0, max(x1, x0 + cell), max(y1, y0 + cell)
 
 
 def draw_map(occupancy: GridMap, window: Window, max_pixels: int = MAX_PIXELS) -> Image.Image:

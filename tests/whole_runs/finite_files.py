@@ -1,0 +1,96 @@
+"""Numbers in the files of a result: finite, or NaN where docs/output.md has it."""
+
+import json
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+_MAY_BE_NAN = {"p_occupied", "p_static", "speed"}
+
+
+def require_finite(folder: Path) -> None:
+    """Raises AssertionError for the first number that is none."""
+    for path in sorted(folder.rglob("*")):
+        if path.is_file():
+            _CHECKS.get(path.suffix, _pass)(path)
+
+
+def _pass(path: Path) -> None:
+    assert path.stat().st_size, path
+
+
+def _json(path: Path) -> None:
+    def refuse(word: str) -> None:
+        raise AssertionError(f"{path.name}: {word}")
+
+    json.loads(path.read_text(encoding="utf-8"), parse_constant=refuse)
+
+
+def _array(name: str, array: Any) -> None:
+    if array.dtype.kind != "f":
+        return
+    bad = np.isinf(array) if name in _MAY_BE_NAN else ~np.isfinite(array)
+    assert not bad.any(), f"{name}: {array[bad][:3]}"
+
+
+def _npy(path: Path) -> None:
+    _array(path.stem, np.load(path))
+
+
+def _npz(path: Path) -> None:
+    with np.load(path) as file:
+        for name in file.files:
+            _array(name, file[name])
+
+
+def _words(path: Path) -> None:
+    for word in path.read_text(encoding="utf-8").split():
+        try:
+            number = float(word)
+        except ValueError:
+            continue
+        assert math.isfinite(number), path
+
+
+def _yaml(path: Path) -> None:
+    for value in np.ravel(list(_leaves(yaml.safe_load(path.read_text(encoding="utf-8"))))):
+        assert not isinstance(value, float) or math.isfinite(value), path
+
+
+def _leaves(value: Any) -> Any:
+    if isinstance(value, dict | list):
+        for one in value.values() if isinstance(value, dict) else value:
+            yield from _leaves(one)
+    else:
+        yield value
+
+
+def _ply(path: Path) -> None:
+    head, _, body = path.read_bytes().partition(b"end_header\n")
+    types = {b"float": "<f4", b"double": "<f8", b"uchar": "u1", b"int": "<i4"}
+    columns = re.findall(rb"property (\w+) (\w+)", head)
+    rows = np.frombuffer(body, [(name.decode(), types[kind]) for kind, name in columns])
+    assert len(rows) == int(re.findall(rb"element vertex (\d+)", head)[0])
+    for name in rows.dtype.names or ():
+        _array(f"{path.name} {name}", rows[name])
+
+
+def _html(path: Path) -> None:
+    text = re.sub(r"<(script|style)\b.*?</\1>", "", path.read_text(encoding="utf-8"), flags=re.S)
+    assert not re.search(r"(?i)>[^<>]*\b(nan|inf|infinity)\b[^<>]*<", text), path
+
+
+_CHECKS = {
+    ".json": _json,
+    ".npy": _npy,
+    ".npz": _npz,
+    ".tum": _words,
+    ".g2o": _words,
+    ".yaml": _yaml,
+    ".ply": _ply,
+    ".html": _html,
+}
