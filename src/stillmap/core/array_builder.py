@@ -144,6 +144,11 @@ class ArrayBuilder:
             found.append(part.view(self._dtype).reshape(-1, *self._row))
         return found or [np.empty((0, *self._row), self._dtype)]
 
+    def files(self) -> list[IO[bytes] | None]:
+        """The file that holds each of `parts` from its begin; None: it is in memory."""
+        in_file: list[IO[bytes] | None] = [self._file] if self._written else []
+        return in_file + [None] * len(self._parts) or [None]
+
     def row(self, at: int) -> Any:
         """Row `at`, copied: of the last ones without reading the file."""
         self._require_open()
