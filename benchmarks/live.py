@@ -72,6 +72,7 @@ def _parser() -> argparse.ArgumentParser:
     localize.add_argument("--starts", type=int, default=100)
     localize.add_argument("--scans", type=int, default=30, help="until it must be found")
     localize.add_argument("--seed", type=int, default=_MAP_SEED, help="of the map")
+    localize.add_argument("--robot-in", metavar="WORLD", help="another one: found is wrong")
     localize.add_argument("--people", type=int, help="default: as many as the world has")
     localize.add_argument("--data", type=Path, required=True, help="folder for maps")
     latency = commands.add_parser("latency")
@@ -158,7 +159,7 @@ def localize_globally(args: argparse.Namespace) -> str:
     for world in args.worlds:
         place = build_known_map(args.data / world, world, args.seed)
         crowd = {} if args.people is None else {"crowd": {"people": args.people}}
-        simulation = simulate(scene_by_name(world, crowd), args.seed + 1)
+        simulation = simulate(scene_by_name(args.robot_in or world, crowd), args.seed + 1)
         rng = np.random.default_rng(0)
         last = simulation.recording.n_scans - args.scans - _TRACKED
         runs = [
@@ -177,6 +178,8 @@ def _summarize(runs) -> list[str]:
     verdicts = [one.verdict for one in runs]
     counts = [str(verdicts.count(v)) for v in ("right", "wrong", "ambiguous", "lost")]
     right = [one for one in runs if one.verdict == "right"]
+    if not right:
+        return counts
     medians = [
         f"{np.median([r.scans for r in right]):.0f}",
         f"{np.median([r.off for r in right]):.3f}",

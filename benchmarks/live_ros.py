@@ -85,7 +85,7 @@ class _Child:
     """A Python process that is killed at the end of a with block: nothing is to be saved."""
 
     def __init__(self, domain: int, *words: str) -> None:
-        folder = Path(sys.prefix) / "tf2/lib"
+        folder = Path(sys.prefix) / "messages/lib"
         version = f"python{sys.version_info.major}.{sys.version_info.minor}"
         environment = {
             **os.environ,

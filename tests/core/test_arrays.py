@@ -91,6 +91,21 @@ def test_what_could_not_be_written_is_written_once_there_is_room(tmp_path, rng, 
     np.testing.assert_array_equal(column.finish(), rows)
 
 
+@pytest.mark.parametrize("last", [3, 200, 4000])
+def test_some_of_the_last_rows_are_dropped(tmp_path, rng, last):
+    """In memory, and in the file."""
+    column = ArrayBuilder(np.float32, (3,), tmp_path, in_memory=1000)
+    rows = rng.normal(size=(4000, 3)).astype(np.float32)
+    column.append(rows[:3990])
+    column.append(rows[3990:])
+    assert column.written == 3990
+    column.select_last(np.arange(last) % 2 == 0)
+    expected = np.concatenate([rows[: 4000 - last], rows[4000 - last :: 2]])
+    np.testing.assert_array_equal(np.concatenate(column.parts()), expected)
+    column.append(rows)
+    np.testing.assert_array_equal(column.finish(), np.concatenate([expected, rows]))
+
+
 def test_arrays_that_grow_together_stay_of_one_length(tmp_path, limit_files):
     both = {row: ArrayBuilder(np.int64, row, tmp_path, in_memory=0) for row in ((8,), ())}
     limit_files(1000)

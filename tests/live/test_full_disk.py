@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 
 import stillmap
-from stillmap.live import beam_store
+from stillmap.live import beam_store, spaced_scans
 from stillmap.live.beam_store import BeamStore, join_parts
+from stillmap.live.local_map import MappedScan
 from stillmap.live.loop_process import LoopProcess
 from stillmap.live.mapper import LiveMapper
+from stillmap.live.scan import ScanBeams
+from stillmap.live.spaced_scans import SpacedScans
 
 FULL = 9_000  # bytes of each file: fewer than are written at once
 FIELDS = [(np.float32, (2,)), (np.int64, ())]  # 16 bytes a beam
@@ -134,3 +137,38 @@ def test_loops_are_closed_beside_while_the_disk_is_full(corridor, tmp_path, limi
         closer.poll()
         assert not closer._process.has_ended
         limit_files(None)
+
+
+def spaced_scan(number, beams=200):
+    points = np.stack([np.full(beams, number), np.arange(beams)], axis=1).astype(np.float32)
+    scan = ScanBeams(10**9 * number, points, np.ones(beams, bool), np.eye(3), 0)
+    return MappedScan(scan, np.full(beams, 0.5, np.float32), np.eye(3), float(number))
+
+
+def test_spaced_scans_in_memory_are_bounded_and_stay_even(tmp_path, limit_files, monkeypatch):
+    most = 1_000_000
+    monkeypatch.setattr(spaced_scans, "_IN_MEMORY_IF_FULL", most)
+    monkeypatch.setattr(spaced_scans, "_LITTLE", 300_000)
+    scans = SpacedScans(2, tmp_path)
+    for number in range(2000):
+        if number == 300:
+            limit_files(500_000)
+        if number == 1800:
+            limit_files(None)
+        scans.append(spaced_scan(number), 1.0, np.zeros((3, 3)))
+        assert sum(one.memory_bytes for one in scans._arrays[1:]) <= most + 3000
+        if number % 100 == 0:
+            scans.view()  # as loops are searched on the way
+    view = scans.view()
+    counts = np.diff(view.recording.offset)
+    assert len(counts) == 2000
+    assert (counts[:300] == 200).all()
+    assert (counts[-100:] == 200).all()
+    thinned = counts[600:1700]
+    assert thinned.min() >= 50
+    assert thinned.max() <= 2 * thinned.min() + 1
+    np.testing.assert_array_equal(view.recording.points[:, 0], np.repeat(np.arange(2000), counts))
+    one = scans.scan(view, 1000)
+    np.testing.assert_array_equal(one.beams.points[:, 1], np.arange(0, 200, 200 // counts[1000]))
+    assert len(one.e) == counts[1000]
+    scans.close()

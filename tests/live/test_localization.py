@@ -61,6 +61,14 @@ def test_the_robot_is_found_anywhere(hall, first):
     assert radians < 0.03
 
 
+@pytest.mark.parametrize("first", [291, 384])
+def test_a_robot_that_is_elsewhere_is_not_found(hall, first):
+    """Half of an office fits into a hall somewhere, but not what comes into view after that."""
+    simulation = simulate(scene_by_name("office"), 3)
+    for _, update, _ in run(hall, simulation, range(first, first + 14)):
+        assert "lost" in update.doubts
+
+
 @pytest.mark.slow
 def test_a_crowd_does_not_lose_it(hall):
     simulation = hall.simulate(202, crowd={"people": 80})

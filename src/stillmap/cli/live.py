@@ -32,6 +32,7 @@ EPILOG = """examples:
   stillmap live --replay log.bag -o out --rate 1
   stillmap live --replay log.bag -o out --rate 1 --foxglove
   stillmap live --replay tuesday.bag --map monday -o out
+  stillmap live --drive /tmp/stillmap-drive-abc -o elsewhere
   stillmap live -o out --ros-args -p base_frame:=base_link -r scan:=front/scan
 """
 
@@ -42,6 +43,12 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
         "--replay",
         metavar="INPUT",
         help="a recording (default: a ROS 2 node that maps until Ctrl-C)",
+    )
+    p.add_argument(
+        "--drive",
+        metavar="FOLDER",
+        help="write the result of a drive that was kept because its disk was full, and remove "
+        "FOLDER; the options are those of the drive",
     )
     p.add_argument("-o", "--output", metavar="DIR", required=True, help="result folder")
     p.add_argument("--overwrite", action="store_true", help="replace what is in DIR")
@@ -93,6 +100,8 @@ def run(args: argparse.Namespace) -> int:
         InputError: ROS is missing, the recording cannot be read or does not suit the map, or the
             output is taken.
     """
+    if args.drive is not None:
+        return _save_drive(args)
     if args.replay is None:
         from stillmap.cli.live_node import run_node
 
@@ -103,6 +112,7 @@ def run(args: argparse.Namespace) -> int:
 def _replay(args: argparse.Namespace) -> int:
     from stillmap.cli.live_node import mapper_settings
     from stillmap.core.files import require_new
+    from stillmap.live.last_save import save_last
     from stillmap.live.mapper import LiveMapper
     from stillmap.live.replay import replay
     from stillmap.results.run_json import RECORD
@@ -128,12 +138,32 @@ def _replay(args: argparse.Namespace) -> int:
             latency = replay(recording, mapper, progress, args.rate, show, stop)
             has_scans = len(latency.seconds) > 0
             if has_scans:
-                mapper.save(output, overwrite=args.overwrite, progress=progress)
+                save_last(mapper.snapshot(), output, overwrite=args.overwrite, progress=progress)
     if not args.quiet:
         say(describe(latency))
         say(f"wrote {output}" if has_scans else "no scan was mapped: nothing was written")
     if args.json:
         print_json({"output": str(output) if has_scans else None, **latency.to_dict()})
+    return 0
+
+
+def _save_drive(args: argparse.Namespace) -> int:
+    from stillmap.core.files import require_new
+    from stillmap.live.drive_folder import read_drive, remove_drive
+    from stillmap.results.run_json import RECORD
+
+    output, folder = Path(args.output), Path(args.drive)
+    if args.replay is not None or args.map is not None or args.config or args.assignments:
+        raise InputError("--drive excludes --replay, --map, --config and --set")
+    require_new(output, RECORD, args.overwrite)
+    require_apart(output, folder)
+    with make_parents(output), show_progress(args.quiet, 1) as progress:
+        read_drive(folder).save(output, overwrite=args.overwrite, progress=progress)
+    remove_drive(folder)
+    if not args.quiet:
+        say(f"wrote {output}, and removed {folder}")
+    if args.json:
+        print_json({"output": str(output)})
     return 0
 
 

@@ -124,6 +124,31 @@ class ArrayBuilder:
     def _row_bytes(self) -> int:
         return self._dtype.itemsize * int(np.prod(self._row, dtype=np.int64))
 
+    @property
+    def written(self) -> int:
+        """Number of rows in the file; those behind them are in memory."""
+        return self._written
+
+    def select_last(self, kept: NDArray[np.bool_]) -> None:
+        """Drop some of the last rows; the others are in memory then. Not while a view of them that
+        is memory-mapped is in use.
+
+        Args:
+            kept: (n,) of the last n rows, those that stay.
+        """
+        first = self._length - len(kept)
+        if first < self._written:
+            again = np.array(self.parts()[0][first:])
+            self._parts.insert(0, again.reshape(-1).view(np.uint8))
+            self._written = first
+        self._join_from(0)
+        if not self._parts:
+            return
+        rows = self._parts[0].reshape(-1, self._row_bytes)
+        at = first - self._written
+        self._parts = [np.concatenate([rows[:at], rows[at:][kept]]).reshape(-1)]
+        self._length, self._bytes = first + int(kept.sum()), self._parts[0].nbytes
+
     def close(self) -> None:
         """Close the file, if there is one; arrays that were mapped stay as they are."""
         self._parts, self._bytes, self._is_closed = [], 0, True
@@ -143,6 +168,11 @@ class ArrayBuilder:
             part.flags.writeable = False
             found.append(part.view(self._dtype).reshape(-1, *self._row))
         return found or [np.empty((0, *self._row), self._dtype)]
+
+    def files(self) -> list[IO[bytes] | None]:
+        """The file that holds each of `parts` from its begin; None: it is in memory."""
+        in_file: list[IO[bytes] | None] = [self._file] if self._written else []
+        return in_file + [None] * len(self._parts) or [None]
 
     def row(self, at: int) -> Any:
         """Row `at`, copied: of the last ones without reading the file."""

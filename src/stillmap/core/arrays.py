@@ -176,6 +176,11 @@ def open_unlinked(folder: Path | None) -> IO[bytes]:
 
 
 def _open_in(folder: Path | None) -> IO[bytes]:
+    try:  # unlike that of tempfile, this one can be given a name later
+        flags = os.O_RDWR | os.O_TMPFILE | os.O_CLOEXEC
+        return os.fdopen(os.open(folder or tempfile.gettempdir(), flags, 0o600), "w+b")
+    except (AttributeError, OSError):  # the system, or the file system, has none such
+        pass
     return cast(IO[bytes], tempfile.TemporaryFile(prefix="stillmap-", dir=folder))
 
 

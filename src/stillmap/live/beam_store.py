@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -104,6 +104,11 @@ class BeamStore:
             segment.try_to_write()  # of one part no copy is needed
         fields = zip(*(segment.arrays for segment in self._segments), strict=True)
         return [[part for array in field for part in array.parts()] for field in fields]
+
+    def files(self) -> list[list[IO[bytes] | None]]:
+        """The file of each of `parts`, asked for after them; None: it is in memory."""
+        fields = zip(*(segment.arrays for segment in self._segments), strict=True)
+        return [[file for array in field for file in array.files()] for field in fields]
 
     def close(self) -> None:
         """Remove the files."""

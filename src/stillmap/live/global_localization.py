@@ -31,6 +31,10 @@ _FREE_WEIGHT = 0.5
 # share of the best alignment's evidence that a rival may have, by how many times in a row that one
 # is the best: the robot sees more from one search to the next
 _MAX_RIVAL = {1: 0.4, 2: 0.7, 5: 0.85}
+# Of a view of which the map shows less than `sure_agree`: squares that came into view since
+# the place was the best for the first time, and the share of them that the map shows. What was in
+# view before fits in part anywhere, for the place that fits best was chosen; those were not.
+_MIN_FRESH, _MIN_FRESH_AGREE = 80, 0.5
 _APART = 1.0, 0.5  # m and rad from which another alignment is a rival
 _STD = 0.15, 0.04  # m, rad: of an alignment that the search finds
 _MAX_CANDIDATES = 20
@@ -65,15 +69,27 @@ class GlobalLocalizer:
         min_agree: share of the surfaces of a view that the map shows, at least.
         gone_weight: weight of a surface of the map where the view is free, against one that both
             show.
+        sure_agree: share of them below which the robot may as well be elsewhere: then the map must
+            show what comes into view later, too.
     """
 
     def __init__(
-        self, known: KnownMap, min_agree: float = MIN_AGREE, gone_weight: float = CONFLICT_WEIGHT
+        self,
+        known: KnownMap,
+        min_agree: float = MIN_AGREE,
+        gone_weight: float = CONFLICT_WEIGHT,
+        sure_agree: float = -np.inf,
     ) -> None:
-        self._min_agree, self._gone_weight = min_agree, gone_weight
+        self._min_agree, self._sure_agree = min_agree, sure_agree
+        self._gone_weight = gone_weight
         self._known, self._surface = known, known.make_surface_map()
         self._last: Float | None = None
         self._times = 0  # that the last one was the best in a row
+        self._first: SurfaceMap | None = None  # the view when it was for the first time
+
+    def forget(self) -> None:
+        """The view begins anew, in another frame."""
+        self._last = None
 
     def localize(self, view: GridMap, scan: Scan, pose: Float) -> Localization:
         """Pose of a local map in the known map.
@@ -101,11 +117,12 @@ class GlobalLocalizer:
         proposed = search_alignments(self._surface, session, _FREE_WEIGHT, self._gone_weight)
         for T in proposed[:_MAX_CANDIDATES]:
             found.append(self._weigh(session, refine(T)))
-        return self._choose(sorted(found, key=lambda one: -one.evidence), len(session.surface))
+        return self._choose(sorted(found, key=lambda one: -one.evidence), session)
 
-    def _choose(self, found: list[_Alignment], squares: int) -> Localization:
+    def _choose(self, found: list[_Alignment], session: SurfaceMap) -> Localization:
         """The best alignment, if the evidence is clear."""
         last, self._last = self._last, None
+        squares = len(session.surface)
         if not found or found[0].agree < self._min_agree * squares or found[0].evidence <= 0.0:
             return Localization(None)
         best = found[0]
@@ -115,8 +132,24 @@ class GlobalLocalizer:
             return Localization(None, is_ambiguous=True)
         is_same = last is not None and not _is_apart(last, best.T)
         self._last, self._times = best.T, self._times + 1 if is_same else 1
-        is_clear = any(self._times >= n and share <= most for n, most in _MAX_RIVAL.items())
-        return Localization(best.T if is_clear else None, is_ambiguous=not is_clear)
+        if self._first is None or not is_same:
+            self._first = session
+        if not any(self._times >= n and share <= most for n, most in _MAX_RIVAL.items()):
+            return Localization(None, is_ambiguous=True)
+        # in walls that the map shows and the robot does not see, too
+        is_sure = min(best.agree, best.evidence) >= self._sure_agree * squares
+        is_here = is_sure or self._predicts(session, best.T)
+        return Localization(best.T if is_here else None)
+
+    def _predicts(self, session: SurfaceMap, T: Float) -> bool:
+        """True if under an alignment the map shows what came into view since it was the best."""
+        assert self._first is not None
+        fresh = ~self._first.is_near(session.surface)
+        T = np.asarray(T)
+        points = session.surface[fresh] @ T[:2, :2].T + T[:2, 2]
+        found = self._surface.look_up(points, session.surface_sides[fresh] @ T[:2, :2].T)
+        count = int(fresh.sum())
+        return count >= _MIN_FRESH and found.agree >= _MIN_FRESH_AGREE * count
 
     def _weigh(self, session: SurfaceMap, T: Float) -> _Alignment:
         forth, back = compare_surfaces(self._surface, session, T)

@@ -1,13 +1,12 @@
 """All scans, and the poses and labels returned for them, in temporary files."""
 
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from stillmap.core.array_builder import QUICKLY_WRITTEN, ArrayBuilder
 from stillmap.core.recording import Recording
@@ -43,14 +42,71 @@ class KeptScans(ShortRepr):
 
     Attributes:
         number: (T,) of the scans, as they were pushed.
+        counts: (T,) number of beams of each.
+        answers: (T,) of `answer_type`.
+        parts: points, hit, P(static) and time of the beams, each in parts one after another.
+        files: the open file that holds each of the parts; None: it is in memory.
+        sensors: name and T_base_sensor of each.
+        has_odometry: every scan had it.
+        has_times: the beams have times.
+        warnings: about scans that are missing.
         disk_was_full: that of the temporary files.
-        load: returns them with the answers, in temporary files in a folder (None: the system's);
-            takes long where some scans were dropped, and may be called in another thread.
     """
 
     number: NDArray[np.int64]
+    counts: NDArray[np.int64]
+    answers: NDArray[Any]
+    parts: list[list[NDArray[Any]]]
+    files: list[list[IO[bytes] | None]]
+    sensors: list[tuple[str, Float]]
+    has_odometry: bool
+    has_times: bool
+    warnings: list[str]
     disk_was_full: bool
-    load: Callable[[Path | None], tuple[Recording, Answers]]
+
+    def load(self, folder: Path | None) -> tuple[Recording, Answers]:
+        """The scans and what was answered, in temporary files in a folder (None: the system's);
+        takes long where some scans were dropped, and may be called in another thread.
+
+        Raises:
+            OSError: the disk is full.
+        """
+        points, hit, p_static, times = join_parts(self.parts, folder)
+        sensors = [{"name": name, "extrinsics": {"how": "given"}} for name, _ in self.sensors]
+        answers = self.answers
+        recording = Recording(
+            stamp_ns=answers["stamp_ns"].copy(),
+            offset=np.concatenate([np.zeros(1, np.int64), np.cumsum(self.counts)]),
+            points=points,
+            hit=hit,
+            T_base_sensor=np.array([T for _, T in self.sensors]),
+            sensor=answers["sensor"].copy(),
+            T_odom_base=answers["T_odom_base"].copy() if self.has_odometry else None,
+            source={"format": "live", "sensors": sensors, "warnings": self.warnings},
+            beam_time=times if self.has_times else None,
+            scratch=folder,
+        )
+        return recording, Answers(self.number, *_split(answers), p_static)
+
+
+def answer_type(dimension: int) -> np.dtype[Any]:
+    """A scan and the answer to it, in D dimensions."""
+    T = (np.float64, (dimension + 1, dimension + 1))
+    fields = [
+        ("stamp_ns", np.int64),
+        ("anchor", np.int64),
+        ("T_odom_base", *T),
+        ("pose", *T),
+        ("local", *T),
+        ("twist", np.float64, 3 if dimension == 2 else 6),
+        ("sensor", np.int32),
+    ]
+    return np.dtype(fields, align=True)
+
+
+def beam_fields(dimension: int) -> list[tuple[DTypeLike, tuple[int, ...]]]:
+    """Type and shape of a row of points, hit, P(static) and time of the beams."""
+    return [(np.float32, (dimension,)), (np.bool_, ()), (np.float32, ()), (np.float32, ())]
 
 
 class History:
@@ -66,22 +122,9 @@ class History:
     def __init__(
         self, dimension: int, folder: Path | None = None, max_bytes: int | None = None
     ) -> None:
-        D = dimension
-        T = (np.float64, (D + 1, D + 1))
-        answer = [
-            ("stamp_ns", np.int64),
-            ("anchor", np.int64),
-            ("T_odom_base", *T),
-            ("pose", *T),
-            ("local", *T),
-            ("twist", np.float64, 3 if D == 2 else 6),
-            ("sensor", np.int32),
-        ]
-        self._answer = np.dtype(answer, align=True)
+        self._answer = answer_type(dimension)
         self._answers = ArrayBuilder(self._answer, (), folder, QUICKLY_WRITTEN)
-        # points, hit, P(static), time of each beam
-        fields = [(np.float32, (D,)), (np.bool_, ()), (np.float32, ()), (np.float32, ())]
-        self._beams = BeamStore(fields, folder, max_bytes)
+        self._beams = BeamStore(beam_fields(dimension), folder, max_bytes)
         self._mounts: dict[str | int, Float] = {}
         self._has_odometry, self._has_times = True, False
         self._folder = folder
@@ -152,33 +195,24 @@ class History:
 
     def snapshot(self) -> KeptScans:
         """The scans that are kept, and what `push` has returned for them."""
-        kept, counts, parts = self._beams.kept, self._beams.counts, self._beams.parts()
-        answers, mounts = self._answers.view()[kept], dict(self._mounts)
-        has_odometry, has_times, warnings = self._has_odometry, self._has_times, list[str]()
+        beams, warnings = self._beams, list[str]()
+        kept = beams.kept
         if self.was_full and len(kept) < len(self):
             warnings.append(
                 f"the disk of temporary files was full: of {len(self)} scans {len(kept)} were kept"
             )
-
-        def load(folder: Path | None) -> tuple[Recording, Answers]:
-            points, hit, p_static, times = join_parts(parts, folder)
-            sensors = [{"name": str(name), "extrinsics": {"how": "given"}} for name in mounts]
-            recording = Recording(
-                stamp_ns=answers["stamp_ns"].copy(),
-                offset=np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)]),
-                points=points,
-                hit=hit,
-                T_base_sensor=np.array(list(mounts.values())),
-                sensor=answers["sensor"].copy(),
-                T_odom_base=answers["T_odom_base"].copy() if has_odometry else None,
-                source={"format": "live", "sensors": sensors, "warnings": warnings},
-                beam_time=times if has_times else None,
-                scratch=folder,
-            )
-            poses, local, anchor = _split(answers)
-            return recording, Answers(kept, poses, local, anchor, p_static)
-
-        return KeptScans(kept, self.was_full, load)
+        return KeptScans(
+            kept,
+            beams.counts,
+            self._answers.view()[kept],
+            beams.parts(),
+            beams.files(),
+            [(str(name), T) for name, T in self._mounts.items()],
+            self._has_odometry,
+            self._has_times,
+            warnings,
+            self.was_full,
+        )
 
     def poses(self) -> tuple[Float, Float, NDArray[np.int64]]:
         """`poses`, `local` and `anchor` of all scans, see `Answers`."""

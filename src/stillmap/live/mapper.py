@@ -205,7 +205,9 @@ class LiveMapper:
         slam = self._pushed
         kept = slam.history.snapshot()
         placement = slam.placement().select(kept.number)
-        extended = self._known if self._mode == "extend" else None
+        extended = None
+        if self._known is not None and self._mode == "extend":
+            extended = self._known.in_map_frame, self._known.hits
         return Snapshot(kept, placement, self.options, self._scratch, extended)
 
     def finish(self, progress: Progress = no_progress) -> BuiltResult:

@@ -12,7 +12,7 @@ from stillmap.core.errors import InputError
 from stillmap.core.local_frame import LocalFrame
 from stillmap.core.parallel import resolve_threads
 from stillmap.live.causal_labels import CausalLabels, OccupancyFilter, take_over
-from stillmap.live.global_localization import GlobalLocalizer, Localization
+from stillmap.live.global_localization import MIN_AGREE_ANYWHERE, GlobalLocalizer, Localization
 from stillmap.live.known_cloud import KnownCloud
 from stillmap.live.known_map import KnownLocalMap, KnownMap
 from stillmap.live.sweep_localization import SweepLocalizer
@@ -89,14 +89,16 @@ class PlanarLocalizer:
 
     def __init__(self, known: KnownMap, extends: bool) -> None:
         self.route = np.zeros((0, 2))
-        self._known, self._extends, self._search = known, extends, GlobalLocalizer(known)
+        self._known, self._extends = known, extends
+        self._search = GlobalLocalizer(known, sure_agree=MIN_AGREE_ANYWHERE)
 
     def localize(self, labels: CausalLabels, scan: Scan, pose: Float) -> Localization:
         """(3, 3) of the frame of the labels in the known map, if the evidence is clear."""
         return self._search.localize(labels.to_view(), scan, pose)
 
     def forget(self) -> None:
-        """Nothing: the labels hold all that was seen."""
+        """The robot was carried: the labels begin anew."""
+        self._search.forget()
 
     def make_local_map(self) -> KnownLocalMap:
         """The map that scans are matched against from now on."""

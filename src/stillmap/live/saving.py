@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from stillmap.core.advice import advise
 from stillmap.core.arrays import write_npy
 from stillmap.core.files import nearest_folder_above
+from stillmap.core.grid_map import GridMap
 from stillmap.core.profiling import Progress, no_progress
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io.trajectory import write_tum
 from stillmap.live.history import Answers, KeptScans
-from stillmap.live.known_map import KnownMap
 from stillmap.live.map_extension import write_extended
 from stillmap.live.placement import Placement, take_scans
 from stillmap.pipeline.options import Options
@@ -39,14 +39,14 @@ class Snapshot(ShortRepr):
         placement: where they were taken.
         options: see Options.
         scratch: folder of temporary files; None: the system's.
-        extended: the known map that is extended; None: there is none.
+        extended: the known map that is extended, and its (H, W) sums of hits; None: there is none.
     """
 
     kept: KeptScans
     placement: Placement
     options: Options
     scratch: Path | None
-    extended: KnownMap | None = None
+    extended: tuple[GridMap, NDArray[np.floating]] | None = None
 
     def build(self, progress: Progress = no_progress) -> BuiltResult:
         """Labels, map and objects of the scans that are in the map, at these poses."""
@@ -75,7 +75,27 @@ class Snapshot(ShortRepr):
         Raises:
             InputError: the folder is taken or cannot be written to.
         """
-        scratch = self._usable_scratch(nearest_folder_above(path))
+        self.prepare(path, progress).write(path, overwrite)
+
+    def prepare(
+        self, path: str | os.PathLike[str], progress: Progress = no_progress
+    ) -> "LiveResult":
+        """What `save` writes. Temporary files lie where the result goes if the disk of `scratch`
+        was full, or is now.
+
+        Raises:
+            OSError: no disk has room for them.
+        """
+        beside = nearest_folder_above(path)
+        scratch = self._usable_scratch(beside)
+        try:
+            return self._prepare(scratch, progress)
+        except OSError:
+            if scratch == beside:
+                raise
+            return self._prepare(beside, progress)
+
+    def _prepare(self, scratch: Path | None, progress: Progress) -> "LiveResult":
         recording, answers = self.kept.load(scratch)
         main, others = self.placement.main, self.placement.others()
         warnings = self._describe_lost(recording.stamp_ns, len(others))
@@ -84,26 +104,11 @@ class Snapshot(ShortRepr):
         source = {**recording.source, "warnings": [*recording.source["warnings"], *warnings]}
         if warnings:
             source["lost_scans"] = int(np.count_nonzero(self.placement.submap))
-        recording = replace(recording, source=source)
-        result, given = self._build(recording, answers, main, progress)
-
-        def write_more(folder: Path) -> None:
-            _write_answers(given, result.recording.stamp_ns, folder)
-            if self.extended is not None and main == 0:
-                mode = self.options.output.map_mode
-                known = self.extended.in_map_frame
-                write_extended(folder, known, self.extended.hits, result.map, mode)
-            for number, submap in enumerate(others, 1):
-                self._save_submap(recording, answers, submap, folder / SUBMAPS / str(number))
-
-        save(result, Path(path), overwrite, write_more=write_more)
-
-    def _save_submap(self, recording: Recording, answers: Answers, submap: int, path: Path) -> None:
-        path.parent.mkdir(exist_ok=True)
+        built = self._build(replace(recording, source=source), answers, main, progress)
         recording = replace(recording, source={**recording.source, "warnings": []})
-        result, given = self._build(recording, answers, submap, no_progress)
-        stamp_ns = result.recording.stamp_ns
-        save(result, path, write_more=lambda folder: _write_answers(given, stamp_ns, folder))
+        submaps = [self._build(recording, answers, one, no_progress) for one in others]
+        extended = self.extended if main == 0 else None
+        return LiveResult(*built, submaps, extended)
 
     def _build(
         self, recording: Recording, answers: Answers, submap: int, progress: Progress
@@ -142,6 +147,37 @@ class Snapshot(ShortRepr):
         if not submaps:
             return [text]
         return [advise(text, f"see their own map{'s' * (submaps > 1)} in {SUBMAPS}")]
+
+
+@dataclass(frozen=True, eq=False)
+class LiveResult(ShortRepr):
+    """What is written of a drive.
+
+    Attributes:
+        result: labels, map and objects.
+        given: what was answered at the time.
+        submaps: the same of where the robot was lost.
+        extended: see `Snapshot`.
+    """
+
+    result: BuiltResult
+    given: Answers
+    submaps: list[tuple[BuiltResult, Answers]]
+    extended: tuple[GridMap, NDArray[np.floating]] | None
+
+    def write(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
+        """Write the result folder; see `Snapshot.save`."""
+        save(self.result, Path(path), overwrite, write_more=self._write_more)
+
+    def _write_more(self, folder: Path) -> None:
+        _write_answers(self.given, self.result.recording.stamp_ns, folder)
+        if self.extended is not None:
+            mode = self.result.options.output.map_mode
+            write_extended(folder, *self.extended, self.result.map, mode)
+        for number, (result, given) in enumerate(self.submaps, 1):
+            inside = folder / SUBMAPS / str(number)
+            inside.parent.mkdir(exist_ok=True)
+            LiveResult(result, given, [], None).write(inside)
 
 
 def _write_answers(answers: Answers, stamp_ns: NDArray[np.int64], folder: Path) -> None:

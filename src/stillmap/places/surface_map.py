@@ -81,6 +81,15 @@ class SurfaceMap(ShortRepr):
         agree = self.near[x, y] & ~is_other_face
         return Comparison(int(agree.sum()), int(self.free[x, y].sum()))
 
+    def is_near(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """(n,) whether points (n, 2) in metres lie near a surface."""
+        at = self._squares_of(points)
+        out = np.zeros(len(at), np.bool_)
+        inside = ((at >= 0) & (at < self.near.shape)).all(axis=1)
+        x, y = at[inside].T
+        out[inside] = self.near[x, y]
+        return out
+
     @property
     def surface_sides(self) -> Float:
         """(N, 2) the side of each surface."""

@@ -11,7 +11,8 @@ import numpy as np
 
 from stillmap.core import config
 from stillmap.core.errors import InputError
-from stillmap.core.profiling import Progress, no_progress
+from stillmap.core.profiling import Progress
+from stillmap.live.last_save import save_last
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.ros import publishers
 from stillmap.live.ros.installation import Ros
@@ -100,12 +101,8 @@ class LiveNode:
         self.save_node.destroy_node()
         self.node.destroy_node()
 
-    def save(self, progress: Progress = no_progress, output: Path | None = None) -> None:
+    def save(self) -> None:
         """Write the result folder, as known now. Mapping goes on meanwhile.
-
-        Args:
-            progress: shows how far it is written.
-            output: another folder than the one that was given at the start.
 
         Raises:
             InputError: there is nothing to save yet, or the folder cannot be written to.
@@ -115,11 +112,21 @@ class LiveNode:
                 raise InputError("no scan has been mapped yet")
             with self._lock:
                 snapshot = self._mapper.snapshot()
-            if output is not None:
-                snapshot.save(output, progress=progress)
-                return
-            snapshot.save(self._output, overwrite=self._overwrite, progress=progress)
+            snapshot.save(self._output, overwrite=self._overwrite)
             self._overwrite = True  # the next one replaces ours
+
+    def save_last(self, progress: Progress) -> None:
+        """Write the result folder at the end of the drive, or keep it elsewhere.
+
+        Args:
+            progress: shows how far it is written.
+
+        Raises:
+            InputError: the folder cannot be written to; says where the result is.
+        """
+        with self._save_lock:
+            snapshot = self._mapper.snapshot()
+            save_last(snapshot, self._output, overwrite=self._overwrite, progress=progress)
 
     def _declare(self, options: Options) -> Parameters:
         descriptor = self._ros.message("rcl_interfaces/msg/ParameterDescriptor")
@@ -249,7 +256,7 @@ class LiveNode:
     def _save_former(self, mapper: LiveMapper, folder: Path) -> None:
         with self._save_lock:  # a request to save it may not have been done yet
             try:
-                mapper.save(folder, overwrite=True)
+                save_last(mapper.snapshot(), folder, overwrite=True)
             except (InputError, OSError) as error:
                 self.node.get_logger().error(str(error))
             finally:

@@ -1,9 +1,8 @@
 """A node from its start to its end: Ctrl-C or SIGTERM ends it, and the result is written."""
 
-import tempfile
 import threading
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, suppress
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -60,32 +59,12 @@ def run(
             finally:  # whatever ended it: nobody drives the same way again
                 if live.scans:
                     with show_progress() as progress:
-                        _save(live, progress)
+                        live.save_last(progress)
         return live.scans
     finally:
         if live is not None:
             live.close()
         ros.rclpy.try_shutdown()
-
-
-def _save(live: LiveNode, progress: Progress) -> None:
-    """Write the result; if it cannot be written where it should, then among temporary files.
-
-    Raises:
-        InputError: it cannot be written there; says where it lies now.
-    """
-    try:
-        live.save(progress)
-    except InputError as error:
-        spare = Path(tempfile.mkdtemp(prefix="stillmap-live-"))
-        try:
-            live.save(progress, spare)
-        except InputError:
-            with suppress(OSError):
-                spare.rmdir()
-            raise error from None
-        hint = f"the result is kept in {spare}"
-        raise InputError(error.what, where=error.where, hint=hint) from error
 
 
 def _spin(ros: Ros, live: LiveNode, stop: threading.Event) -> None:

@@ -1,0 +1,252 @@
+"""A drive in a folder: its scans, poses and answers, of which the result can be made later.
+
+Scans lie in temporary files already, which have no name. Here they get one, without a copy where
+both are on one disk: it may be full.
+"""
+
+import os
+import shutil
+import stat
+import tempfile
+from contextlib import suppress
+from pathlib import Path
+from typing import IO, Annotated, Any, TypedDict
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from stillmap.core import config
+from stillmap.core.array_files import open_npy
+from stillmap.core.arrays import iter_bytes, map_file, write_npy
+from stillmap.core.config import Limits
+from stillmap.core.errors import InputError
+from stillmap.core.files import sync
+from stillmap.core.grid_map import GridMap
+from stillmap.core.json import read_json, write_json
+from stillmap.core.schema import SchemaError, check
+from stillmap.live.history import KeptScans, answer_type, beam_fields
+from stillmap.live.placement import Placement
+from stillmap.live.saving import Snapshot
+from stillmap.pipeline.options import Options
+
+_FORMAT_VERSION = 1
+_RECORD = "drive.json"
+_BEAMS = ("points", "hit", "p_static", "time")
+_ARRAYS = ("number", "counts", "answers", "poses", "submap", "p_occupied", "hits")
+_LARGEST_RECORD = 16 << 20  # bytes
+
+_Row = list[float]
+
+
+class _Sensor(TypedDict):
+    name: str
+    T_base_sensor: list[_Row]
+
+
+class _Record(TypedDict):
+    format_version: int
+    dimension: Annotated[int, Limits(ge=2, le=3)]
+    rows: list[Annotated[int, Limits(ge=0)]]  # of beams in each part
+    sensors: list[_Sensor]
+    has_odometry: bool
+    has_times: bool
+    disk_was_full: bool
+    warnings: list[str]
+    options: dict[str, Any]
+    extended: dict[str, Any] | None
+
+
+def keep_drive(snapshot: Snapshot, parent: Path) -> Path:
+    """Make a folder of a drive, from which `read_drive` reads it.
+
+    Args:
+        snapshot: all scans, and what is known of them.
+        parent: a new folder is made there.
+
+    Raises:
+        OSError: there is no room; nothing is left of it.
+    """
+    folder = Path(tempfile.mkdtemp(prefix="stillmap-drive-", dir=parent))
+    try:
+        _write(snapshot, folder)
+        sync(folder)
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+    return folder
+
+
+def _write(snapshot: Snapshot, folder: Path) -> None:
+    kept, arrays = snapshot.kept, _small_arrays(snapshot)
+    for name, array in arrays.items():
+        write_npy(folder / f"{name}.npy", array)
+        sync(folder / f"{name}.npy")
+    for name, parts, files in zip(_BEAMS, kept.parts, kept.files, strict=True):
+        for number, (part, file) in enumerate(zip(parts, files, strict=True)):
+            _put(part, file, folder / f"{name}-{number}")
+    extended = None if snapshot.extended is None else snapshot.extended[0]
+    record = {
+        "format_version": _FORMAT_VERSION,
+        "dimension": snapshot.placement.poses.shape[-1] - 1,
+        "sensors": [{"name": name, "T_base_sensor": T} for name, T in kept.sensors],
+        "has_odometry": kept.has_odometry,
+        "has_times": kept.has_times,
+        "disk_was_full": kept.disk_was_full,
+        "warnings": kept.warnings,
+        "options": config.to_dict(snapshot.options),
+        "rows": [len(part) for part in kept.parts[0]],
+        "extended": extended
+        and {"origin": extended.origin, "resolution": float(extended.resolution)},
+    }
+    write_json(folder / _RECORD, record)
+    sync(folder / _RECORD)
+
+
+def _small_arrays(snapshot: Snapshot) -> dict[str, NDArray[Any]]:
+    kept, placement = snapshot.kept, snapshot.placement
+    arrays = {"number": kept.number, "counts": kept.counts, "answers": kept.answers}
+    arrays |= {"poses": placement.poses, "submap": placement.submap}
+    if snapshot.extended is not None:
+        grid, hits = snapshot.extended
+        arrays |= {"p_occupied": np.asarray(grid.p_occupied), "hits": np.asarray(hits)}
+    return arrays
+
+
+def _put(part: NDArray[Any], file: IO[bytes] | None, path: Path) -> None:
+    """Give the open file of an array a name, or copy it."""
+    if file is not None and not file.closed:
+        with suppress(OSError):  # another disk, or a file that had a name once
+            _link(file, path)
+            os.fsync(file.fileno())
+            return
+    with path.open("wb") as copy:
+        for block in iter_bytes(part):
+            copy.write(block)
+    sync(path)
+
+
+def _link(file: IO[bytes], path: Path) -> None:
+    here = os.open(path.parent, os.O_RDONLY)  # with it os.link follows links
+    try:
+        source = f"/proc/self/fd/{file.fileno()}"
+        os.link(source, path.name, src_dir_fd=here, dst_dir_fd=here, follow_symlinks=True)
+    finally:
+        os.close(here)
+
+
+def read_drive(folder: Path) -> Snapshot:
+    """A drive that `keep_drive` has left.
+
+    Raises:
+        InputError: it is none, or damaged.
+    """
+    record = read_json(folder / _RECORD, _LARGEST_RECORD)
+    try:
+        check(record, _Record)
+        if record["format_version"] != _FORMAT_VERSION:
+            raise ValueError(f"its version {record['format_version']} is unknown here")
+        return _read(folder, record)
+    except (SchemaError, ValueError) as error:
+        raise InputError(f"is damaged: {error}", where=str(folder / _RECORD)) from error
+
+
+def remove_drive(folder: Path) -> None:
+    """Remove the files that `keep_drive` has made, and the folder if it holds nothing else."""
+    known = {_RECORD, *(f"{name}.npy" for name in _ARRAYS)}
+    for path in list(folder.iterdir()):
+        if path.name in known or path.name.rpartition("-")[0] in _BEAMS:
+            path.unlink()
+    with suppress(OSError):
+        folder.rmdir()
+
+
+def _read(folder: Path, record: _Record) -> Snapshot:
+    D = record["dimension"]
+    number, counts, answers, poses, submap = given = [
+        open_npy(folder / f"{name}.npy") for name in _ARRAYS[:5]
+    ]
+    sensors = [(one["name"], np.array(one["T_base_sensor"], float)) for one in record["sensors"]]
+    _check_arrays(D, record["rows"], given)
+    _check_sensors(D, [mount for _, mount in sensors], answers["sensor"])
+    parts = [
+        [_map(folder / f"{name}-{k}", rows, *kind) for k, rows in enumerate(record["rows"])]
+        for name, kind in zip(_BEAMS, beam_fields(D), strict=True)
+    ]
+    kept = KeptScans(
+        number,
+        counts,
+        answers,
+        parts,
+        [[None] * len(one) for one in parts],
+        sensors,
+        record["has_odometry"],
+        record["has_times"],
+        record["warnings"],
+        record["disk_was_full"],
+    )
+    options = config.override(Options(), record["options"], str(folder / _RECORD))
+    extended = _read_extended(folder, record["extended"])
+    return Snapshot(kept, Placement(poses, submap), options, None, extended)
+
+
+def _check_arrays(D: int, rows: list[int], given: list[NDArray[Any]]) -> None:
+    """Refuse arrays of other types or lengths than were written.
+
+    Raises:
+        ValueError: they are others.
+    """
+    number, counts, answers, poses, submap = given
+    int64, T = np.dtype(np.int64), len(number)
+    types = [int64, int64, answer_type(D), np.dtype(np.float64), submap.dtype]
+    if (
+        [one.dtype for one in given] != types
+        or not np.issubdtype(submap.dtype, np.integer)
+        or {one.shape for one in (number, counts, answers, submap)} != {(T,)}
+        or poses.shape != (T, D + 1, D + 1)
+        or not T
+        or (counts < 0).any()
+        or counts.sum() != sum(rows)
+    ):
+        raise ValueError("its arrays do not fit together")
+
+
+def _check_sensors(D: int, mounts: list[NDArray[Any]], sensor: NDArray[np.int32]) -> None:
+    """Refuse sensors that are not there.
+
+    Raises:
+        ValueError: a scan is of none, or a mount is no pose.
+    """
+    if {mount.shape for mount in mounts} != {(D + 1, D + 1)}:
+        raise ValueError("a mount is no pose")
+    if sensor.min() < 0 or sensor.max() >= len(mounts):
+        raise ValueError("a scan is of no sensor")
+
+
+def _read_extended(
+    folder: Path, about: dict[str, Any] | None
+) -> tuple[GridMap, NDArray[np.floating]] | None:
+    if about is None:
+        return None
+    check(about, dict[str, float | list[float]])
+    p_occupied, hits = (open_npy(folder / f"{name}.npy") for name in ("p_occupied", "hits"))
+    x, y, yaw = about["origin"]
+    if p_occupied.shape != hits.shape:
+        raise ValueError("its known map does not fit")
+    return GridMap(p_occupied, (x, y, yaw), about["resolution"]), hits
+
+
+def _map(path: Path, rows: int, kind: DTypeLike, row: tuple[int, ...]) -> NDArray[Any]:
+    """Rows of a file of beams, not copied: the disk may be full."""
+    shape, dtype = (rows, *row), np.dtype(kind)
+    if not rows:
+        return np.empty(shape, dtype)
+    try:
+        with path.open("rb") as file:
+            found = os.fstat(file.fileno())
+            if not stat.S_ISREG(found.st_mode):
+                raise InputError("is no regular file", where=str(path))
+            if found.st_size < dtype.itemsize * int(np.prod(shape)):
+                raise InputError("is too short", where=str(path))
+            return map_file(file, shape, dtype, writable=False)
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror or error}", where=str(path)) from error
