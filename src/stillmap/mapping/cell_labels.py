@@ -13,6 +13,8 @@ from stillmap.em.types import DYNAMIC_BELOW
 Float = NDArray[np.float64]
 Labels = NDArray[np.float32]
 
+_STRAY_SHARE = 0.15  # of the time, of readings where nothing stands
+
 
 def update_occupancy(
     recording: Recording,
@@ -26,7 +28,8 @@ def update_occupancy(
     """Occupancy of cells in which P(dynamic) of the beams became less.
 
     P(dynamic) of a cell becomes less by the same factor as that of the beams that ended in it
-    together: it belongs to the movers among them.
+    together: it belongs to the movers among them. The rest is clutter, which is an obstacle where
+    it was there for much of the time: a stray reading of the floor is none.
 
     Args:
         recording: M beams.
@@ -46,5 +49,7 @@ def update_occupancy(
         for row, p_static in zip(sums, (old, new), strict=True):
             row += np.bincount(surfel[ended], 1.0 - p_static[ended], minlength=len(row))
     factor = np.divide(sums[1], sums[0], out=np.ones(sums.shape[1]), where=sums[0] > 0.0)
-    p = factor * occupied.p_occupied + (1.0 - factor) * histories.p_in_cell
+    share = histories.occupied_share
+    p_clutter = histories.p_in_cell * share / (share + _STRAY_SHARE)
+    p = factor * occupied.p_occupied + (1.0 - factor) * p_clutter
     return dataclasses.replace(occupied, p_occupied=p.astype(np.float32))

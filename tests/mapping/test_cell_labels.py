@@ -1,0 +1,67 @@
+"""Occupancy of cells after the labels of their beams changed."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from synthetic_histories import course
+
+from stillmap.core.recording import Recording
+from stillmap.em import CellProbabilities
+from stillmap.mapping import update_occupancy
+
+
+class _SurfelOfBeams:
+    """Beams end in cell 0, 0, 1, 1 and none, scan by scan."""
+
+    def associate_beams(self, points, hit, offset, T, threads):  # noqa: ARG002
+        assert threads == 1
+        assert len(hit) == len(points)
+        return np.array([0, 0, 1, 1, -1] * (len(points) // 5))
+
+
+def updated(before, after, share):
+    n = 2
+    recording = Recording(
+        stamp_ns=np.arange(n, dtype=np.int64) * 10**8,
+        offset=np.arange(n + 1, dtype=np.int64) * 5,
+        points=np.ones((5 * n, 2), np.float32),
+        hit=np.ones(5 * n, bool),
+        T_odom_base=None,
+        T_base_sensor=np.eye(3)[None],
+        sensor=np.zeros(n, np.int32),
+    )
+    cells = np.array([[1, 1], [5, 5]])
+    histories = course(cells, True, share=share)
+    histories = dataclasses.replace(histories, surfel_map=_SurfelOfBeams())
+    occupied = CellProbabilities(cells, np.full(2, 0.05, np.float32), 0.2)
+    poses = np.tile(np.eye(3), (n, 1, 1))
+    labels = (np.tile(np.array(row, np.float32), n) for row in (before, after))
+    return update_occupancy(recording, poses, *labels, histories, occupied).p_occupied
+
+
+def test_cells_of_movers_stay_and_clutter_becomes_an_obstacle_if_it_was_there_for_long():
+    before, after = [0.05, 0.05, 0.05, 0.05, 0.05], [0.05, 0.05, 1.0, 1.0, 1.0]
+    stays, often = updated(before, after, share=0.6)
+    assert stays == pytest.approx(0.05)
+    assert often > 0.65
+    assert updated(before, after, share=0.02)[1] < 0.2
+
+
+def test_a_cell_of_both_lies_between():
+    before = [0.05] * 5
+    both = updated(before, [0.05, 1.0, 1.0, 1.0, 1.0], share=0.8)
+    assert 0.05 < both[0] < both[1]
+    assert both[0] == pytest.approx(0.5 * (0.05 + both[1]), abs=0.01)
+
+
+def test_static_beams_and_those_without_a_label_do_not_count():
+    labels = [0.9, np.nan, 0.6, 0.8, np.nan]
+    assert updated(labels, labels, share=0.5) == pytest.approx([0.05, 0.05])
+
+
+def test_cells_of_another_step_are_refused():
+    histories = course(np.array([[1, 1]]), True)
+    other = CellProbabilities(np.array([[2, 2]]), np.zeros(1, np.float32), 0.2)
+    with pytest.raises(ValueError, match="occupied"):
+        update_occupancy(None, None, None, None, histories, other)
