@@ -1,20 +1,11 @@
-"""Time stamps: exact nanoseconds from decimal text, clock jumps, and times of beams."""
-
-# signatures name Recording, which needs this module
-from __future__ import annotations
+"""Time stamps: exact nanoseconds from decimal text, and clock jumps."""
 
 from bisect import bisect_right
 from collections.abc import Sequence
 from decimal import ROUND_HALF_EVEN, Decimal, InvalidOperation
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-
-from stillmap.core import arrays
-
-if TYPE_CHECKING:
-    from stillmap.core.recording import Recording
 
 # ns from 1970, the years 1824 to 2116: the time between any two stamps fits into int64
 MAX_STAMP_NS = 2**62 - 1
@@ -77,26 +68,3 @@ def longest_non_decreasing(values: Sequence[int]) -> NDArray[np.intp]:
         out[k] = i
         i = int(before[i])
     return out
-
-
-def beam_stamps_ns(recording: Recording, scans: slice) -> NDArray[np.int64]:
-    """(n,) stamp in nanoseconds of each beam of a slice of scans."""
-    offset = recording.offset[scans.start : scans.stop + 1]
-    stamps = np.repeat(recording.stamp_ns[scans], np.diff(offset))
-    if recording.beam_time is None:
-        return stamps
-    seconds = recording.beam_time[offset[0] : offset[-1]].astype(np.float64)
-    return np.asarray(stamps + np.round(1e9 * seconds).astype(np.int64))
-
-
-def max_scan_duration_ns(recording: Recording) -> int:
-    """Maximum time in nanoseconds from the stamp of a scan to its beams.
-
-    Without beam times the median time between stamps (of all sensors, which may be interleaved).
-    """
-    steps, times = np.diff(recording.stamp_ns), recording.beam_time
-    longest = float(np.median(steps)) if len(steps) else 0.0
-    if times is not None:
-        for block in arrays.iter_blocks(times):
-            longest = max(longest, 1e9 * float(np.abs(times[block]).max()))
-    return int(np.ceil(longest))

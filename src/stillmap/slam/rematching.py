@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 import stillmap._core as _core
 from stillmap.core import se2, se3
 from stillmap.core.recording import Recording
+from stillmap.preprocessing.options import MAX_POINT_DISTANCE
 from stillmap.slam.lidar_odometry import register_sweeps
 from stillmap.slam.local_map import LocalMap
 from stillmap.slam.motion_model import compute_odometry_steps, odometry_prior
@@ -87,7 +88,8 @@ def rematch_windows(recording: Recording, poses: Float, threads: int = 1) -> Ite
         threads: does not change the result.
     """
     can_match = recording.dimension == 2 or sees_all_round(recording)
-    for scans in select_windows(recording, poses):
+    for selected in select_windows(recording, poses):
+        scans = _drop_far(selected, poses)
         beams = beams_of_scans(recording, scans, _MAX_BEAMS)
         window = select_beams(recording, scans, beams, np.ascontiguousarray(poses[scans]))
         rematched = _rematch(window, poses[scans], threads) if can_match else None
@@ -102,6 +104,13 @@ def select_windows(recording: Recording, poses: Float) -> list[Index]:
     count = min(max(1, T // (every * _SCANS_PER_WINDOW[D])), _MAX_WINDOWS)
     first = np.linspace(0, T - span, count).astype(np.int64)
     return [np.arange(a, a + span, every) for a in first.tolist()]
+
+
+def _drop_far(scans: Index, poses: Float) -> Index:
+    """The scans whose poses are within reach of most others: no beam of the others is used."""
+    xyz = poses[scans, :-1, -1]
+    distance = np.linalg.norm(xyz - np.median(xyz, axis=0), axis=1)
+    return np.asarray(scans[distance <= max(MAX_POINT_DISTANCE, float(distance.min()))])
 
 
 def _spacing(recording: Recording, poses: Float) -> int:

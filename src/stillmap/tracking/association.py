@@ -30,6 +30,7 @@ _SPLIT_DISTANCE = 0.7  # m: distance between parts of two objects
 _SHAPE_WINDOW = 0.6  # s
 _MAX_SHAPE_POINTS = 100  # more of them add nothing
 _MAX_PAIRS = 1 << 16  # distances computed at once: they fit into the cache
+_MAX_COSTS = 1 << 22  # of points and tracks that are held at once
 _MAX_UNSEEN = 1.0  # s without points after which one of two split tracks had not begun
 _REST_TIME = 0.3  # s: shrinks the speed of few points towards 0
 _MAX_RADIUS = 0.45  # m from the center of an object to its points
@@ -151,21 +152,31 @@ class _Tracker:
             return claims
         xy = self._points.xy[here]
         cluster = self._points.cluster[here] - self._points.cluster[here[0]]
-        squared = self._squared_distances(xy)
-        variance = _POSITION_STD**2 + self._states.P[:, 0]
-        # a 2D Gaussian has twice the logarithm, which would favor long occluded tracks too little
-        cost = squared / variance + np.log(variance)
         sigma = self._states.position_std
-        gate = np.minimum(_GATE + _GATE_SIGMAS * sigma, _MAX_GATE)
-        claims = _argmin_allowed(cost, squared < gate**2)
+        every = np.ones(len(sigma), bool)
+        claims = self._nearest(xy, _GATE, every)
         if (claims == NO_TRACK).any():
             found = np.bincount(claims[claims >= 0], minlength=len(sigma)) > 0
             taken = np.bincount(cluster[claims >= 0], minlength=cluster[-1] + 1) > 0
-            wide_gate = np.minimum(_WIDE_GATE + _GATE_SIGMAS * sigma, _MAX_GATE)
-            allowed = (squared < wide_gate**2) & ~found & ~taken[cluster][:, None]
-            claims = np.where(claims == NO_TRACK, _argmin_allowed(cost, allowed), claims)
+            open_to = np.flatnonzero((claims == NO_TRACK) & ~taken[cluster])
+            claims[open_to] = self._nearest(xy[open_to], _WIDE_GATE, ~found)
             claims = _complete_clusters(claims, cluster, len(sigma))
         return claims
+
+    def _nearest(self, xy: Float, gate: float, among: NDArray[np.bool_]) -> Index:
+        """(n,) the most likely of some tracks (K,) within `gate` metres and the uncertainty."""
+        sigma = self._states.position_std
+        gates = np.minimum(gate + _GATE_SIGMAS * sigma, _MAX_GATE)
+        variance = _POSITION_STD**2 + self._states.P[:, 0]
+        log_variance, out = np.log(variance), np.full(len(xy), NO_TRACK)
+        rows = max(1, _MAX_COSTS // len(sigma))
+        for first in range(0, len(xy), rows):
+            squared = self._squared_distances(xy[first : first + rows])
+            # a 2D Gaussian has twice the logarithm, which would favor long occluded tracks too
+            # little
+            cost = squared / variance + log_variance
+            out[first : first + rows] = _argmin_allowed(cost, (squared < gates**2) & among)
+        return out
 
     def _squared_distances(self, xy: Float) -> Float:
         """(n, K) from points to the nearest predicted shape point of each track."""
