@@ -42,11 +42,13 @@ def main() -> None:
     p.add_argument("--processes", type=int, default=2)
     args = p.parse_args()
     jobs = [Job(case, seed) for seed, case in itertools.product(seeds_of(args), chosen(args.cases))]
-    done = dict(outcomes(_compare, jobs, args.processes))
+    done = {
+        (job.case.name, job.seed): found for job, found in outcomes(_compare, jobs, args.processes)
+    }
     lines = []
     for job in jobs:
         cells = [
-            [f"{scores[key]:.{n}f}" for scores in done[job]]
+            [f"{scores[key]:.{n}f}" for scores in done[job.case.name, job.seed]]
             for key, n in zip((*_KEYS, "changes", "objects"), (*_DIGITS, 0, 0), strict=True)
         ]
         lines.append([job.case.name, str(job.seed), *(" -> ".join(pair) for pair in cells)])

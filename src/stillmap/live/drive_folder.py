@@ -6,7 +6,6 @@ both are on one disk: it may be full.
 
 import os
 import shutil
-import stat
 import tempfile
 from contextlib import suppress
 from pathlib import Path
@@ -22,6 +21,7 @@ from stillmap.core.config import Limits
 from stillmap.core.errors import InputError
 from stillmap.core.files import sync
 from stillmap.core.grid_map import GridMap
+from stillmap.core.input_files import require_regular
 from stillmap.core.json import read_json, write_json
 from stillmap.core.schema import SchemaError, check
 from stillmap.live.history import KeptScans, answer_type, beam_fields
@@ -240,12 +240,10 @@ def _map(path: Path, rows: int, kind: DTypeLike, row: tuple[int, ...]) -> NDArra
     shape, dtype = (rows, *row), np.dtype(kind)
     if not rows:
         return np.empty(shape, dtype)
+    require_regular(path)
     try:
         with path.open("rb") as file:
-            found = os.fstat(file.fileno())
-            if not stat.S_ISREG(found.st_mode):
-                raise InputError("is no regular file", where=str(path))
-            if found.st_size < dtype.itemsize * int(np.prod(shape)):
+            if os.fstat(file.fileno()).st_size < dtype.itemsize * int(np.prod(shape)):
                 raise InputError("is too short", where=str(path))
             return map_file(file, shape, dtype, writable=False)
     except OSError as error:
