@@ -240,8 +240,8 @@ def _map(path: Path, rows: int, kind: DTypeLike, row: tuple[int, ...]) -> NDArra
     shape, dtype = (rows, *row), np.dtype(kind)
     if not rows:
         return np.empty(shape, dtype)
-    require_regular(path)
     try:
+        require_regular(path)
         with path.open("rb") as file:
             if os.fstat(file.fileno()).st_size < dtype.itemsize * int(np.prod(shape)):
                 raise InputError("is too short", where=str(path))
