@@ -80,3 +80,13 @@ def test_of_large_scans_every_so_many_beams_are_used(hall, monkeypatch):
     assert np.array_equal(window.beams[used], np.arange(beams.start, beams.stop, 4))  # of 181
     for part in window.split(100):
         assert np.array_equal(part.recording.points, recording.points[part.beams])
+
+
+def test_scans_thousands_of_kilometres_away_are_left_out(hall):
+    recording, poses = hall
+    far = poses.copy()
+    far[0, 1, 2] = -1e7
+    (window,) = rematch_windows(recording, far)
+    (usual,) = rematch_windows(recording, poses)
+    assert np.array_equal(window.scans, usual.scans[1:])
+    assert window.rematched.shape == window.poses.shape

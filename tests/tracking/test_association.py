@@ -120,3 +120,11 @@ def test_time_that_stands_still_is_no_trouble():
     same = dataclasses.replace(points, seconds=np.zeros_like(points.seconds))
     assert (assign_tracks(same, MAX_GAP) == 0).all()
     assert (found(same) == -1).all()  # nothing lasts
+
+
+def test_how_many_costs_are_held_at_once_changes_nothing(monkeypatch):
+    ways = [straight(3, y, 0.7, 0.05 * y) for y in (-2.0, -1.2, 0.0, 0.9, 2.5)]
+    points, _ = watched(ways)
+    expected = assign_tracks(points, MAX_GAP)
+    monkeypatch.setattr("stillmap.tracking.association._MAX_COSTS", 1)
+    assert np.array_equal(assign_tracks(points, MAX_GAP), expected)
