@@ -86,7 +86,6 @@ def test_scans_thousands_of_kilometres_away_are_left_out(hall):
     recording, poses = hall
     far = poses.copy()
     far[0, 1, 2] = -1e7
-    (window,) = rematch_windows(recording, far)
-    (usual,) = rematch_windows(recording, poses)
-    assert np.array_equal(window.scans, usual.scans[1:])
-    assert window.rematched.shape == window.poses.shape
+    window = next(rematch_windows(recording, far))
+    assert window.scans[0] == 1
+    assert np.abs(window.rematched - window.poses).max() < 1.0
