@@ -56,21 +56,23 @@ class TooSlow(BaseException):
 @contextmanager
 def bounds() -> Iterator[None]:
     """Limits what a run takes of memory and time."""
-    now = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    before = resource.getrlimit(resource.RLIMIT_AS)
+    status = Path("/proc/self/status").read_text()
+    now = 1024 * int(status.partition("VmData:")[2].split()[0])
+    before = resource.getrlimit(resource.RLIMIT_DATA)
 
     def stop(*_: object) -> None:
         raise TooSlow
 
     handler = signal.signal(signal.SIGPROF, stop)
-    resource.setrlimit(resource.RLIMIT_AS, (now + _MEMORY, before[1]))
+    # unlike RLIMIT_AS it leaves room for the stack, without which the process would be killed
+    resource.setrlimit(resource.RLIMIT_DATA, (now + _MEMORY, before[1]))
     signal.setitimer(signal.ITIMER_PROF, _SECONDS)
     try:
         yield
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0.0)
         signal.signal(signal.SIGPROF, handler)
-        resource.setrlimit(resource.RLIMIT_AS, before)
+        resource.setrlimit(resource.RLIMIT_DATA, before)
 
 
 def run_in_python(one: OddRecording, folder: Path) -> None:
