@@ -31,6 +31,9 @@ _FORBIDDEN = (
 )
 
 
+_SYSTEM = ("/proc/self/", "/proc/meminfo\0", "/sys/fs/cgroup/")  # what memory may be used
+
+
 def forbid_sockets() -> bool:
     """Let the kernel end this process at its next socket; False: it cannot."""
     if _SOCKET is None or sys.platform != "linux":
@@ -62,7 +65,7 @@ def watch(allowed: Callable[[], list[str]]) -> list[str]:
         name = details[0]
         path = os.fsdecode(name) if isinstance(name, str | bytes | os.PathLike) else str(name)
         path = os.path.abspath(path.removeprefix("file:").partition("?")[0])
-        if not f"{path}\0".startswith((*own, *allowed(), "/proc/self/", "/dev/null\0")):
+        if not f"{path}\0".startswith((*own, *allowed(), *_SYSTEM, "/dev/null\0")):
             found.append(f"{event} {path}")
 
     sys.addaudithook(look)

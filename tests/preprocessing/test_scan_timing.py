@@ -84,7 +84,9 @@ def test_recorded_times_are_kept(sweeps):
 
 
 def test_stamps_that_tell_no_rate(timeless):
-    odd = replace(timeless, stamp_ns=timeless.stamp_ns * 100)
+    odd = replace(
+        timeless, stamp_ns=timeless.stamp_ns[0] + 100 * (timeless.stamp_ns - timeless.stamp_ns[0])
+    )
     found = add_beam_times(odd, LEFT)
     assert found.beam_time is None
     assert any("rate of turns" in text for text in found.source["warnings"])

@@ -18,7 +18,7 @@ def scans(*counts):
         T_base_sensor=np.eye(3)[None],
         sensor=np.zeros(T, np.int32),
         T_odom_base=np.tile(np.eye(3), (T, 1, 1)),
-        beam_time=points[:, 1].copy(),
+        beam_time=1e-3 * points[:, 1],
     )
 
 

@@ -13,7 +13,7 @@ import stillmap
 
 # m, of poses and odometry, and of returns that are no damage: a map takes the memory of the box
 # around all of them
-FAR, REACH = 1e7, 1e9
+FAR, REACH = 1e7, 100.0
 MAX_SCANS = 10
 MAX_BEAMS = 100_000  # of a scan
 _MANY = 150_000  # beams of a recording: more take seconds

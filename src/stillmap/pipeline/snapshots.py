@@ -27,7 +27,7 @@ class Snapshot(GridMap):
     """
 
     number: int
-    dynamic_points: NDArray[np.float32] | NDArray[np.float64]
+    dynamic_points: NDArray[np.floating]
 
 
 def extent(occupancy: GridMap) -> Window:
