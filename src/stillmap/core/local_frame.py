@@ -53,7 +53,7 @@ class LocalFrame(ShortRepr):
 
     @property
     def is_shifted(self) -> bool:
-        """Whether it is another frame than the map frame."""
+        """True if it differs from the map frame."""
         return bool(self.origin.any())
 
     def to_local(self, poses: Float) -> Float:

@@ -101,7 +101,7 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 
 def memory_error(error: BaseException, hint: str = "") -> InputError:
-    """What to say when memory ran out; within `limit_memory` its limit, which ends here."""
+    """The error for memory that ran out; within `limit_memory` its limit, which ends here."""
     if _allowed is None:
         return InputError(f"not enough memory{': ' if str(error) else ''}{error}", hint=hint)
     _set_limit(_before)  # what is done about it takes some as well

@@ -34,7 +34,7 @@ def parse_ns(text: str) -> int:
 
 
 def are_dated(stamp_ns: NDArray[np.int64]) -> bool:
-    """Whether all of stamps (T,) lie at most `MAX_STAMP_NS` before or after 1970."""
+    """True if all stamps (T,) lie at most `MAX_STAMP_NS` before or after 1970."""
     return not np.any((stamp_ns < -MAX_STAMP_NS) | (stamp_ns > MAX_STAMP_NS))
 
 

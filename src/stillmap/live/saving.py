@@ -80,8 +80,8 @@ class Snapshot(ShortRepr):
     def prepare(
         self, path: str | os.PathLike[str], progress: Progress = no_progress
     ) -> "LiveResult":
-        """What `save` writes. Temporary files lie where the result goes if the disk of `scratch`
-        was full, or is now.
+        """Build the result that `save` writes. Temporary files lie where the result goes if the
+        disk of `scratch` was full, or is now.
 
         Raises:
             OSError: no disk has room for them.
@@ -151,7 +151,7 @@ class Snapshot(ShortRepr):
 
 @dataclass(frozen=True, eq=False)
 class LiveResult(ShortRepr):
-    """What is written of a drive.
+    """Result of a drive, ready to be written.
 
     Attributes:
         result: labels, map and objects.

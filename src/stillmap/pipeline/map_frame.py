@@ -27,7 +27,7 @@ Object = TypeVar("Object", bound=MovingObject)
 
 
 class LocalInputs(NamedTuple):
-    """What is mapped in a frame near the robot.
+    """Recording and poses in a local frame near the robot.
 
     Attributes:
         frame: that frame.

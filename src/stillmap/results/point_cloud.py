@@ -68,7 +68,7 @@ class Cloud:
 
     @property
     def is_far(self) -> bool:
-        """Whether 32-bit coordinates would lose the millimetre."""
+        """True if float32 coordinates would be off by a millimetre or more."""
         return bool(np.abs(self.origin).max() > FAR)
 
     def iter_blocks(self, progress: Callable[[float], None] | None = None) -> Iterator[Block]:

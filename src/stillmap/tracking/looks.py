@@ -1,4 +1,4 @@
-"""What scans saw at given places: something in front of it, something there, or past it."""
+"""Visibility of given places in scans: hidden behind something, reached, or passed by the beams."""
 
 from enum import IntEnum
 
@@ -16,7 +16,7 @@ _MAX_BEARING = 0.06  # rad to the nearest beam: farther off is out of view
 
 
 class Look(IntEnum):
-    """What the beams in the direction of a place say about it."""
+    """Outcome of the beams in the direction of a place."""
 
     HIDDEN = -1  # they end before it, or there are none
     REACHED = 0  # they end there, or disagree

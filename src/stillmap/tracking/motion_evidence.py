@@ -48,7 +48,7 @@ _MAX_LOG_ODDS = 50.0
 
 
 class TrackEvidence(NamedTuple):
-    """What is known of K tracks, each (K,).
+    """Features of K tracks for the likelihood ratio of mover to clutter, each (K,).
 
     Attributes:
         looks: detections, at most one per 0.1 s.
@@ -172,9 +172,9 @@ def collect_evidence(
             rows.append((max(1.0, looks / stride), len(here) / looks, *steady))
             gaps.append(_interpolate_gaps(points.seconds, found.scan, found.xy, stride))
             ends += _extrapolate_ends(points.seconds, found.scan, found.xy)
-        missed = _count_passed(recording, T_map_sensor, gaps)
+        missed = _count_passes(recording, T_map_sensor, gaps)
         sampled = np.array([len(scan) for scan, _ in ends])
-        passed = _count_passed(recording, T_map_sensor, ends)
+        passed = _count_passes(recording, T_map_sensor, ends)
         is_open = (sampled > 1) & (passed >= _OPEN_SHARE * sampled)
         parts.append(np.column_stack([np.array(rows), missed, is_open.reshape(-1, 2).sum(axis=1)]))
     looks_, hits, windows, moving, missed, open_ends = np.concatenate(parts).T
@@ -182,7 +182,7 @@ def collect_evidence(
     return np.array(tracks), evidence
 
 
-def _count_passed(recording: Recording, T_map_sensor: Float, places: list[Places]) -> Float:
+def _count_passes(recording: Recording, T_map_sensor: Float, places: list[Places]) -> Float:
     """(L,) looks that passed, of L lists of places."""
     of = np.repeat(np.arange(len(places)), [len(scan) for scan, _ in places])
     scan, xy = (np.concatenate(column) for column in zip(*places, strict=True))
