@@ -147,3 +147,18 @@ from stillmap.core.memory import available_memory
 print(1 << 30 < available_memory() < 2 << 30)
 """
     assert run(program) == ["True"]
+
+
+@needs_proc
+def test_what_a_process_uses_already_is_allowed_to_it():
+    program = """
+import resource
+import numpy as np
+from stillmap.core.memory import default_memory, limit_memory
+used = np.ones(100_000_000)  # 0.8 GB
+data = resource.getrlimit(resource.RLIMIT_DATA)
+resource.setrlimit(resource.RLIMIT_DATA, (1_700_000_000, data[1]))
+with limit_memory(default_memory()):
+    print(np.ones(40_000_000).sum())
+"""
+    assert run(program) == ["40000000.0"]

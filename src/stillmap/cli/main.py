@@ -22,8 +22,7 @@ from stillmap.cli.parser import COMMANDS, EXIT_INPUT, parser
 from stillmap.core.errors import InputError, closest_match
 from stillmap.core.memory import (
     GIGABYTE,
-    SHARE,
-    available_memory,
+    default_memory,
     is_out_of_memory,
     limit_memory,
     memory_error,
@@ -65,8 +64,8 @@ def _run(args: argparse.Namespace) -> int:
         return status
     if args.memory is not None:
         require_memory_flag(args.memory)
-    allowed = SHARE * available_memory() if args.memory is None else GIGABYTE * args.memory
-    with limit_memory(round(allowed)):
+    allowed = default_memory() if args.memory is None else round(GIGABYTE * args.memory)
+    with limit_memory(allowed):
         try:
             status = args.run(args)
         except Exception as error:

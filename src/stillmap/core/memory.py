@@ -15,7 +15,8 @@ from typing import NamedTuple
 from stillmap.core.errors import InputError
 
 GIGABYTE = 1e9
-SHARE = 0.8  # of the available memory that a run may use, where nothing is said
+
+_SHARE = 0.8  # of the available memory that a run may use, where nothing is said
 
 _MORE = "memory=GB allows more, where the machine has it"
 _PROCESS = Path("/proc/self/status")
@@ -85,6 +86,12 @@ def require_memory(needed: float, what: str, hint: str = "") -> None:
         f"{allowed / GIGABYTE:.3g} GB may be used",
         hint=_join(hint, _MORE),
     )
+
+
+def default_memory() -> int:
+    """Bytes in total that this process may use where the user says nothing: those that it uses
+    already, and a share of what is available."""
+    return _read_table(_PROCESS).get("VmRSS", 0) + round(_SHARE * available_memory())
 
 
 def allowed_memory() -> int:
