@@ -18,6 +18,8 @@ Index = NDArray[np.intp]
 MIN_BEAMS = 3  # of a scan on an object, or through its place: an observation
 MIN_PASSES = 3  # scans with a beam through a cell that show it to be free
 MAX_DISTANCE = 0.5  # m between a detected change and its object
+MIN_CELLS = 8  # of a thing, hit and off walls, for its state to count
+ONE_STATE = 0.1  # share of its cells that may be shown in the other state
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +93,21 @@ class ChangeScores(Scores):
     new_kept: float
     old_cells: int
     old_occupied: float
+
+
+@dataclass(frozen=True)
+class ThingScores(Scores):
+    """How a map shows things that were brought or taken away.
+
+    Attributes:
+        things: stays that began or ended, with MIN_CELLS cells off walls, seen present and absent.
+        one_state: those whose cells are all shown occupied, or all free, but for ONE_STATE.
+        right: those that are shown so, in a state that fits all looks.
+    """
+
+    things: int
+    one_state: int
+    right: int
 
 
 class DetectedChange(Protocol):
@@ -171,6 +188,65 @@ def score_changes(
         old_cells=len(old),
         old_occupied=_mean(_occupied(grid, old)),
     )
+
+
+def score_things(
+    grid: Grid,
+    stays: Sequence[Stay],
+    beams: Beams,
+    walls: Float,
+    T_world_map: Float,
+    majority: bool,
+) -> ThingScores:
+    """Whether the cells of each thing that was brought or taken away are shown in one state.
+
+    A cell is shown occupied if it or a neighbour is. Other things at the same place at other times
+    leave it out.
+
+    Args:
+        grid, stays, beams, walls, T_world_map: see `score_changes`.
+        majority: whether the map shows the modal state, between the first and the last observation
+            of the thing's place, or the last one.
+    """
+    T_map_world = inverse(T_world_map)
+    things = one_state = right = 0
+    for stay in stays:
+        on = _observation_stamps(beams.hits_on(stay), beams)
+        through = _observation_stamps(_beams_through(stay, beams), beams)
+        center = stay.center[None]
+        others = [o.faces for o in stays if o is not stay and _distance(center, o)[0] < 2.0]
+        if not len(on) or not len(through):
+            continue
+        cells = _cells(grid, beams.end[beams.hits_on(stay)], T_map_world)
+        centres = moved(T_world_map, grid.centres(cells))
+        solid = np.concatenate([walls, *others])
+        cells = cells[distance_to_walls(centres, solid) > GHOST_DISTANCE * grid.resolution]
+        if len(cells) < MIN_CELLS:
+            continue
+        share = _mean(is_near_occupied(grid, grid.centres(cells)))
+        things += 1
+        if min(share, 1.0 - share) <= ONE_STATE:
+            one_state += 1
+            right += (share > 0.5) in _possible_states(on, through, majority)
+    return ThingScores(things, one_state, right)
+
+
+def _possible_states(
+    on: NDArray[np.int64], through: NDArray[np.int64], majority: bool
+) -> set[bool]:
+    """Whether a thing was there at last, or most of the time between the first and the last look.
+
+    Args:
+        on, through: (n,) stamps in ns, rising, of looks at the thing, and through its place.
+        majority: whether most of the time counts. Nobody knows when between two looks it changed.
+    """
+    first, last = min(on[0], through[0]), max(on[-1], through[-1])
+    if not majority:
+        return {bool(on[-1] > through[-1])}
+    earlier, later = through[through < on[0]], through[through > on[-1]]
+    shortest = on[-1] - on[0]
+    longest = (later[0] if len(later) else last) - (earlier[-1] if len(earlier) else first)
+    return {bool(2 * length > last - first) for length in (shortest, longest)}
 
 
 def list_true_changes(stays: Iterable[Stay], beams: Beams) -> list[TrueChange]:

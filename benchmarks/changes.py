@@ -17,7 +17,14 @@ from dataclasses import asdict
 
 import numpy as np
 from cases import MOVED
-from change_scores import Beams, Stay, list_true_changes, score_change_times, score_changes
+from change_scores import (
+    Beams,
+    Stay,
+    list_true_changes,
+    score_change_times,
+    score_changes,
+    score_things,
+)
 from common import Run, Scores, options_of, rows_of
 from numpy.typing import NDArray
 from prepared import grid_of
@@ -44,6 +51,9 @@ COLUMNS = (
     Column("false", "false", ".0f"),
     Column("in_time", "within 2 s", ".3f", True),
     Column("largest_error", "off, most s", ".1f"),
+    Column("things", "things", ".0f"),
+    Column("one_state", "in one state", ".0f", True),
+    Column("right", "the true one", ".0f", True),
     Column("ate", "ATE m", ".3f"),
 )
 
@@ -66,11 +76,16 @@ def scores_of(result: stillmap.BuiltResult, simulation: Simulation) -> Scores:
     truth, stays, beams = simulation.truth, stays_of(simulation), beams_of(simulation)
     T_world_map = align(result.poses, truth.T_world_base)
     of_map = score_changes(grid_of(result.map), stays, beams, truth.walls, T_world_map)
+    majority = result.options.output.map_state == "majority"
+    things = score_things(
+        grid_of(result.map), stays, beams, truth.walls, T_world_map, majority=majority
+    )
     found = _of_things(result.changes, simulation, T_world_map)
     times = score_change_times(found, list_true_changes(stays, beams), T_world_map)
     off = np.array(times.errors)
     return {
         **asdict(of_map),
+        **asdict(things),
         **{name: getattr(times, name) for name in ("seen", "found", "missed", "false")},
         "in_time": float(np.mean(off <= _IN_TIME)) if len(off) else float("nan"),
         "largest_error": float(off.max()) if len(off) else float("nan"),

@@ -59,7 +59,8 @@ def perfect(simulation: Simulation, state: str) -> SimpleNamespace:
         )
         for c in list_true_changes(stays, beams) if c.observed_ns is not None
     ]  # fmt: skip
-    return SimpleNamespace(poses=truth.T_world_base, map=occupancy, changes=found)
+    options = SimpleNamespace(output=SimpleNamespace(map_state="last"))
+    return SimpleNamespace(poses=truth.T_world_base, map=occupancy, changes=found, options=options)
 
 
 def test_what_is_right_scores_full_marks(street: Simulation) -> None:
@@ -70,7 +71,9 @@ def test_what_is_right_scores_full_marks(street: Simulation) -> None:
     assert scores["old_cells"] > 50
     assert scores["seen"] == scores["found"] >= 3
     assert scores["missed"] == scores["false"] == scores["largest_error"] == 0
+    assert scores["things"] == scores["one_state"] == scores["right"] >= 3
     first = scores_of(perfect(street, "first"), street)
+    assert (first["one_state"], first["right"]) == (scores["things"], 0)
     assert (first["new_kept"], first["old_occupied"]) == (0.0, 1.0)
 
 

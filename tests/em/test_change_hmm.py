@@ -3,6 +3,7 @@
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import NamedTuple
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -220,9 +221,12 @@ def final_e_step(seen, state="last", threads=1, **options):
     all_static = np.ones(seen.recording.n_beams, np.float32)
     before = em.CellProbabilities(found.cells, np.zeros(len(found.cells), np.float32), 0.2)
     places = [Everywhere(found.cells)]
-    shown = relabel_changes(
-        seen.recording, seen.poses, all_static, before, found, places, state, threads
-    )
+    # each cell decides alone
+    alone = "stillmap.mapping.changed_beams.pool_states"
+    with mock.patch(alone, lambda histories, *_: histories.share_there(state)):
+        shown = relabel_changes(
+            seen.recording, seen.poses, all_static, before, found, places, state, threads
+        )
     return shown, found
 
 

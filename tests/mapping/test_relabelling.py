@@ -11,6 +11,7 @@ from stillmap.core import chunks, se2
 from stillmap.core.recording import Recording
 from stillmap.em.observations import build_surfel_map
 from stillmap.mapping import Change, relabel_changes
+from stillmap.mapping.changed_objects import pool_states
 
 SCANS, BEAMS = 60, 20
 # around the origin, and with cells in which no beam ended
@@ -34,6 +35,9 @@ class Known:
     p_static: np.ndarray
     occupied: em.CellProbabilities
     histories: em.CellHistories
+
+    def p_in_map(self, state):
+        return self.histories.p_in_map(state, pool_states(self.histories, CHANGES, state))
 
     def relabelled(self, changes=CHANGES, state="last", threads=1, **other):
         said = {"occupied": self.occupied, "histories": self.histories} | other
@@ -94,9 +98,7 @@ def test_labels_of_beams_that_end_there_are_what_is_shown(known, state):
     there = listed(known.ends) & known.seen.hit
     assert 50 < there.sum() < 400
     of_cell = dict(
-        zip(
-            map(tuple, known.histories.cells.tolist()), known.histories.p_in_map(state), strict=True
-        )
+        zip(map(tuple, known.histories.cells.tolist()), known.p_in_map(state), strict=True)
     )
     shown = np.array([of_cell.get(tuple(cell), np.nan) for cell in known.ends.tolist()], np.float32)
     assert p_static.dtype == np.float32
@@ -109,7 +111,7 @@ def test_the_map_says_there_what_is_shown_as_far_as_it_covers_the_cell(known, st
     _, occupied = known.relabelled(state=state)
     there = listed(known.occupied.cells)
     assert 15 < there.sum() < 30
-    shown = known.histories.p_in_map(state) * known.histories.p_in_cell
+    shown = known.p_in_map(state) * known.histories.p_in_cell
     assert occupied.p_occupied.dtype == np.float32
     np.testing.assert_array_equal(
         occupied.p_occupied, np.where(there, shown, known.occupied.p_occupied)

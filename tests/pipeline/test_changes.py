@@ -8,6 +8,7 @@ import pytest
 import stillmap
 from stillmap import em
 from stillmap.core.config import override
+from stillmap.mapping.changed_objects import pool_states
 from stillmap.pipeline.options import Options
 from stillmap.results.map_npz import CHANGED, changed_cells
 from stillmap.sim import (
@@ -104,6 +105,17 @@ def test_the_map_is_that_of_its_state():
     ]
 
 
+@pytest.mark.parametrize("state", ["last", "majority"])
+def test_an_object_is_shown_in_one_state(state):
+    occupied = [
+        (shown(built(state), one.cells) > 0.5).mean()
+        for one in built().changes
+        if one.kind != "comes and goes"
+    ]
+    # corners of cells that hardly hold any surface stay free
+    assert all(min(share, 1.0 - share) < 0.15 for share in occupied)
+
+
 def test_labels_are_those_of_the_map_shown():
     truth, recording = world().truth, world().recording
     seconds = 1e-9 * (recording.stamp_ns - recording.stamp_ns[0])
@@ -128,7 +140,8 @@ def test_what_is_not_listed_stays_what_it_is_without_changes():
     of_cells = np.array([tuple(cell) in cells for cell in courses.cells.tolist()])
     there = (element >= 0) & of_cells[element]
     assert 0.01 < there.mean() < 0.3
-    shown = courses.p_in_map("last")[element]
+    pooled = pool_states(courses, result.changes, "last")
+    shown = courses.p_in_map("last", pooled)[element]
     others, _ = apply_motion_evidence(result.deskewed, result.poses, without.p_static)
     np.testing.assert_array_equal(result.p_static, np.where(there, shown, others))
     assert (result.p_static != without.p_static).mean() > 0.01

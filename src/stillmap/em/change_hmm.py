@@ -75,13 +75,26 @@ class CellHistories(ChangedCells):
         """(E,) probability of surface that never left."""
         return self.p_static + self.p_view_dependent
 
-    def p_in_map(self, state: MapState) -> NDArray[np.float32]:
-        """(E,) probability that a map of changed places in that state has something in the cell.
+    def share_there(self, state: MapState) -> NDArray[np.float32]:
+        """(E,) probability that an object is in the cell at last, or its share of the time.
 
         In the last state, what comes and goes is absent: its present state is unknown.
         """
-        last = np.where(self.n_changes < MIN_RECURRING_CHANGES, self.p_object, np.float32(0.0))
-        there = last if state == "last" else (self.occupied_share > 0.5).astype(np.float32)
+        if state == "majority":
+            return self.occupied_share
+        return np.where(self.n_changes < MIN_RECURRING_CHANGES, self.p_object, np.float32(0.0))
+
+    def p_in_map(
+        self, state: MapState, share: NDArray[np.float32] | None = None
+    ) -> NDArray[np.float32]:
+        """(E,) probability that a map of changed places in that state has something in the cell.
+
+        Args:
+            state: state that the map shows.
+            share: (E,) in place of `share_there`.
+        """
+        share = self.share_there(state) if share is None else share
+        there = share if state == "last" else (share > 0.5).astype(np.float32)
         # conditional on the cell not being view-dependent
         visible = np.maximum(1.0 - self.p_view_dependent, _MIN_P_CHANGED)
         p = (self.p_static + self.p_changing * there) / visible

@@ -13,6 +13,7 @@ from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.chunks import iter_beams
 from stillmap.core.recording import Recording
 from stillmap.mapping.change_detection import Change
+from stillmap.mapping.changed_objects import cell_keys, is_same_place, pool_states
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -32,7 +33,8 @@ def relabel_changes(
     """Labels (M,) and map cells, taken from the cell histories within the listed changes.
 
     There p_static of a beam is the probability that the map in this state shows the object that
-    reflected it. Changes of cells that are not listed are noise.
+    reflected it. Cells of one object decide together (`pool_states`). Changes of cells that are not
+    listed are noise.
 
     Args:
         recording: M beams.
@@ -46,8 +48,10 @@ def relabel_changes(
         return p_static, occupied
     if not np.array_equal(occupied.cells, histories.cells):
         raise ValueError("occupied: expected the cells of the final E-step")
-    listed = np.isin(_keys(histories.cells), _keys(np.concatenate([one.cells for one in changes])))
-    p_in_map, out = histories.p_in_map(state), arrays.copy(p_static, recording.scratch)
+    changed = np.concatenate([one.cells for one in changes])
+    listed = np.isin(cell_keys(histories.cells), cell_keys(changed))
+    p_in_map = histories.p_in_map(state, pool_states(histories, changes, state))
+    out = arrays.copy(p_static, recording.scratch)
     for _, beams, data in iter_beams(recording, poses, release=[out]):
         surfel = histories.surfel_map.associate_beams(*data, threads)
         ended = np.flatnonzero(surfel >= 0)
@@ -55,11 +59,6 @@ def relabel_changes(
         out[beams][ended] = p_in_map[surfel[ended]]
     p_occupied = np.where(listed, p_in_map * histories.p_in_cell, occupied.p_occupied)
     return out, dataclasses.replace(occupied, p_occupied=p_occupied)
-
-
-def _keys(cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(N,) one key per cell (N, 2); map coordinates stay far below 2 ** 31 cells."""
-    return np.asarray((cells[:, 0] << 32) + cells[:, 1], np.int64)
 
 
 def find_changed_object_beams(
@@ -117,21 +116,13 @@ def _stay_span(change: Change, changes: list[Change]) -> tuple[int, int]:
     """The stamps after which and until which an object stood there, as far as is known."""
     limits = np.iinfo(np.int64)
     since, until = limits.min, limits.max
+    here = [one for one in changes if is_same_place(one, change)]
     if change.kind == "came":
         since = change.before_ns
-        left = [one.before_ns for one in changes if one.kind == "left" and _overlap(one, change)]
+        left = [one.before_ns for one in here if one.kind == "left"]
         until = min((stamp for stamp in left if stamp > since), default=until)
     elif change.kind == "left":
         until = change.before_ns
-        came = [one.before_ns for one in changes if one.kind == "came" and _overlap(one, change)]
+        came = [one.before_ns for one in here if one.kind == "came"]
         since = max((stamp for stamp in came if stamp < until), default=since)
     return since, until
-
-
-def _overlap(one: Change, other: Change) -> bool:
-    """True if the larger of two places holds more than half of the smaller."""
-    distance = np.abs([one.x - other.x, one.y - other.y])
-    if np.any(distance > np.array(one.size) + np.array(other.size)):
-        return False
-    smaller, larger = sorted((one.cells, other.cells), key=len)
-    return bool(np.mean(np.isin(_keys(smaller), _keys(larger))) > 0.5)

@@ -1,0 +1,88 @@
+"""Objects that came and left: which changes are of one object, and the state of all its cells."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap import em
+from stillmap.core.components import connected_components, neighbor_pairs
+from stillmap.mapping.change_detection import Change
+
+Cells = NDArray[np.int64]
+Index = NDArray[np.intp]
+
+_RADIUS = 3.0  # cells between cells of a recurring change that decide together: leaves of doors
+_MIN_WEIGHT = 1e-3
+
+
+def pool_states(
+    histories: em.CellHistories, changes: list[Change], state: em.MapState
+) -> NDArray[np.float32]:
+    """(E,) `share_there` of each cell, the same in all cells of an object.
+
+    Each cell was observed at times of its own, so that the modal state of an object that was moved
+    between two visits differs from cell to cell. An object takes the mean over its cells. Where
+    something comes and goes, cells nearby decide together: a door has leaves in several positions.
+
+    Args:
+        histories: of E cells.
+        changes: from `detect_changes`.
+        state: state of changed places that the map shows.
+    """
+    keys = cell_keys(histories.cells)
+    rows = [np.flatnonzero(np.isin(keys, cell_keys(one.cells))) for one in changes]
+    share = histories.share_there(state)
+    weight = np.maximum(histories.p_changing, _MIN_WEIGHT).astype(np.float64)
+    out = share.copy()
+    often = np.array([one.kind == "comes and goes" for one in changes], bool)
+    recurring = [rows[k] for k in np.flatnonzero(often)]
+    if recurring:
+        of = np.unique(np.concatenate(recurring))
+        out[of] = _local_mean(histories.cells[of], share[of], weight[of])
+    objects = group_objects([one for one in changes if one.kind != "comes and goes"])
+    single = np.flatnonzero(~often)
+    members = [np.unique(np.concatenate([rows[k] for k in single[one]])) for one in objects]
+    for of in members:
+        out[of] = 0.0
+    for of in filter(len, members):  # where two objects stood in turn, the likelier one
+        out[of] = np.maximum(out[of], np.average(share[of], weights=weight[of]))
+    return out
+
+
+def _local_mean(
+    cells: Cells, share: NDArray[np.float32], weight: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(K,) weighted mean of the share (K,) of the cells (K, 2) within a radius of each."""
+    pairs = neighbor_pairs(cells, _RADIUS)
+    one, other = np.concatenate([pairs, pairs[:, ::-1]]).T
+    sums = [
+        value + np.bincount(one, value[other], minlength=len(cells))
+        for value in (weight * share, weight)
+    ]
+    return np.asarray(sums[0] / sums[1])
+
+
+def group_objects(changes: list[Change]) -> list[Index]:
+    """Indices, rising, of the changes of each object: those of the same place."""
+    xy = np.array([(one.x, one.y) for one in changes]).reshape(-1, 2)
+    size = np.array([one.size[:2] for one in changes]).reshape(-1, 2)
+    near = (np.abs(xy[:, None] - xy) <= size[:, None] + size).all(axis=2)
+    pairs = [
+        pair
+        for pair in np.argwhere(np.triu(near, 1)).tolist()
+        if is_same_place(changes[pair[0]], changes[pair[1]])
+    ]
+    return connected_components(np.array(pairs, np.intp).reshape(-1, 2), len(changes))
+
+
+def is_same_place(one: Change, other: Change) -> bool:
+    """True if the larger of two places holds more than half of the smaller."""
+    distance = np.abs([one.x - other.x, one.y - other.y])
+    if np.any(distance > np.array(one.size) + np.array(other.size)):
+        return False
+    smaller, larger = sorted((one.cells, other.cells), key=len)
+    return bool(np.mean(np.isin(cell_keys(smaller), cell_keys(larger))) > 0.5)
+
+
+def cell_keys(cells: Cells) -> Cells:
+    """(N,) one key per cell (N, 2); map coordinates stay far below 2 ** 31 cells."""
+    return np.asarray((cells[:, 0] << 32) + cells[:, 1], np.int64)
