@@ -199,6 +199,7 @@ def test_ghosts_and_missing_walls_show_in_the_map(place: Path, truth: SessionTru
     assert (own.ghost_cells, own.avoidable_ghosts) == (1, 1)
 
 
+@pytest.mark.slow
 def test_gone_objects_in_the_map_are_ghosts_avoidable_where_a_later_session_looked(
     place, truth
 ) -> None:

@@ -118,11 +118,13 @@ def test_upside_down_by_option(mapped, good):
     assert mapped({"FLASER": seen()}, flipped=["FLASER"], laser_upside_down=True) < good
 
 
+@pytest.mark.slow
 def test_upside_down_and_off_centre_by_params(mapped, good):
     params = [*FRONT_PARAMS, "robot_frontlaser_flipped 1"]
     assert mapped({"FLASER": seen(**FRONT)}, params, ["FLASER"]) < good
 
 
+@pytest.mark.slow
 def test_upside_down_said_wrongly(mapped, good):
     wrong = {"flipped": ["FLASER"], "laser_upside_down": False}
     assert mapped({"FLASER": seen()}, **wrong) > 10 * good
@@ -151,6 +153,7 @@ def test_front_and_rear_the_rear_one_upside_down(mapped, good):
     assert mapped(lasers, params, ["RLASER"]) < good
 
 
+@pytest.mark.slow
 def test_two_raw_lasers_told_by_options(mapped, good):
     lasers = {"RAWLASER1": seen(**FRONT), "RAWLASER3": seen(**REAR)}
     rear = {"laser2_x": -0.2, "laser2_theta": math.pi}

@@ -66,6 +66,7 @@ def test_given_poses_take_one_e_step(mapped):
     assert mapped.converged
 
 
+@pytest.mark.slow
 def test_estimated_poses_are_those_of_the_truth(street):
     result = stillmap.build(street.recording)
     truth = np.linalg.inv(street.truth.T_world_base[0]) @ street.truth.T_world_base
@@ -84,6 +85,7 @@ def test_the_plan_is_free_where_the_robot_drove(street, mapped):
     assert (mapped.map.p_occupied > 0.65).sum() > 500
 
 
+@pytest.mark.slow
 def test_what_was_learned_is_of_all_classes(street, mapped):
     """Also of what came to stay or left: as the labels are."""
     recording, voxel = street.recording, mapped.options.slam.voxel_size

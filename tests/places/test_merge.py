@@ -97,6 +97,7 @@ def test_labels_follow_what_all_sessions_saw(days, place):
     assert np.mean(labels.p_static[others] > 0.5) > 0.98
 
 
+@pytest.mark.slow
 def test_growing_gives_the_same_files_as_merging_at_once(days, place, tmp_path):
     assert merge(days / "out-1", days / "out-2", "-o", tmp_path / "two") == 0
     before = {name: (tmp_path / "two" / name).read_bytes() for name in files_of(tmp_path / "two")}

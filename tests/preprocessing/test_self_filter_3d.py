@@ -42,6 +42,7 @@ def gone(recording: Recording) -> np.ndarray:
     return lost
 
 
+@pytest.mark.slow
 def test_a_car_that_sees_its_roof(drive):
     own = (drive.truth.mover == -2) & drive.recording.hit
     assert own.mean() > 0.2
@@ -83,6 +84,7 @@ def test_a_small_robot_indoors(world):
     assert np.count_nonzero(lost & ~own) < 1e-3 * own.sum()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("world", "scans", "lidar"),
     [
@@ -98,6 +100,7 @@ def test_where_nothing_of_the_robot_shows_nothing_is_lost(world, scans, lidar):
     assert self_filter.remove_self_returns(recording) is recording
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("world", ["street-jam", "hall"])
 def test_a_robot_that_stands_loses_nothing(world):
     """What stands near it could be a part of it."""

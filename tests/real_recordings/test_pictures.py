@@ -13,6 +13,8 @@ import stillmap
 from stillmap.core import camera
 from stillmap.mesh.texture.views import View, find_views, read_color_image
 
+pytestmark = pytest.mark.slow
+
 slow = pytest.mark.slow
 
 

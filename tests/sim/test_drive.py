@@ -31,6 +31,7 @@ def motion(simulation: Simulation) -> tuple[Float, Float, Float]:
     return speed, np.stack([x, y], axis=-1), heading
 
 
+@pytest.mark.slow
 def test_it_is_a_kilometre_with_one_corner(drive: Simulation) -> None:
     speed, xy, heading = motion(drive)
     assert 950 < speed.sum() / 10 < 1050

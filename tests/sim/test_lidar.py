@@ -210,6 +210,7 @@ def test_the_robot_itself_is_neither_static_nor_a_mover() -> None:
     np.testing.assert_array_equal(run.recording.points[~own], without.recording.points[~own])
 
 
+@pytest.mark.slow
 def test_doors_have_lintels_and_rooms_have_ceilings() -> None:
     lidar = {**EXACT, "channels": 32, "columns": 360, "low": -0.5, "high": 0.5}
     run = simulate(scene_by_name("office", {"lidar": lidar, "robot": {"scans": 60}}), 3)

@@ -76,6 +76,7 @@ def test_more_resets_than_scans_are_as_many_as_there_can_be() -> None:
     np.testing.assert_allclose(odometry[1:], np.eye(3)[None].repeat(3, axis=0), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_nothing_but_the_odometry_changes_when_it_lies() -> None:
     plain = short()
     lies = {"stall_rate": 6.0, "stall_time": 3.0, "resets": 2}
@@ -126,6 +127,7 @@ def test_a_carried_robot_goes_on_elsewhere_and_odometry_knows_nothing(seed: int)
     assert np.hypot(*np.diff(after, axis=0).T).sum() > 8.0
 
 
+@pytest.mark.slow
 def test_everybody_else_goes_on_while_the_robot_is_carried() -> None:
     run = short(robot={"scans": 400, "carried_at": 0.5})
     scan = run.truth.scene["carried_at_scan"]

@@ -29,6 +29,7 @@ def end(stay: Stay) -> float:
     return np.inf if stay.until is None else stay.until
 
 
+@pytest.mark.slow
 def test_every_thing_is_seen_wherever_it_stays(moved: Simulation) -> None:
     recording, truth = moved.recording, moved.truth
     seconds = 1e-9 * (recording.stamp_ns - recording.stamp_ns[0])

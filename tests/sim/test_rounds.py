@@ -28,6 +28,7 @@ def test_loops_are_large() -> None:
     assert 150.0 < min(LOOPS) < max(LOOPS) < 300.0
 
 
+@pytest.mark.slow
 def test_the_robot_goes_through_every_corridor_and_home(whole: Simulation) -> None:
     robot = whole.truth.T_world_base[:, :2, 2]
     middles = [((a + b) / 2, y) for a, b in pairwise(X) for y in Y]
@@ -47,6 +48,7 @@ def test_the_first_loop_is_closed_after_one_round(whole: Simulation) -> None:
     assert 1200.0 < along[-1] < 1500.0
 
 
+@pytest.mark.slow
 def test_people_are_everywhere() -> None:
     scene = scene_by_name("rounds", {"laser": {"beams": 60}, "robot": {"scans": 500}})
     truth = simulate(scene, 2).truth

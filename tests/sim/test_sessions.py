@@ -48,6 +48,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_more_sessions_leave_the_first_ones_as_they_are() -> None:
     few, more = quick_plan(2), plan_sessions(quick_scene(), SessionOptions(4, odd_sensor=False), 2)
     assert few.first_stamp_ns == more.first_stamp_ns[:2]
@@ -57,6 +58,7 @@ def test_more_sessions_leave_the_first_ones_as_they_are() -> None:
         assert one.things == other.things
 
 
+@pytest.mark.slow
 def test_a_plan_follows_from_its_seed() -> None:
     again = plan_sessions(quick_scene(), SessionOptions(3), 2)
     assert again == quick_plan()

@@ -56,6 +56,7 @@ def test_a_generator_and_its_seed_give_the_same() -> None:
     assert b.truth.scene["seed"] == 4
 
 
+@pytest.mark.slow
 def test_another_laser_and_odometry_leave_everybody_where_they_were() -> None:
     scene = short("hall")
     laser = dataclasses.replace(scene.laser, beams=33, range_noise=0.0)

@@ -44,6 +44,7 @@ def test_no_corridor_tells_itself_from_another(facing: float) -> None:
     assert np.abs(seen_from(MIDDLES[1], -facing)[::-1] - one).max() > 1.0
 
 
+@pytest.mark.slow
 def test_the_robot_goes_through_all_and_through_two_again(whole: Simulation) -> None:
     x, y = whole.truth.T_world_base[:, :2, 2].T
     visits = []

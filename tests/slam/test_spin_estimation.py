@@ -70,15 +70,18 @@ def test_the_direction_is_found(direction):
     assert estimate_spin(drive(direction), SlamOptions()) == direction
 
 
+@pytest.mark.slow
 def test_corrected_sweeps_stay_as_they_are():
     assert estimate_spin(drive("none"), SlamOptions()) is None
 
 
+@pytest.mark.slow
 def test_thinned_sweeps_stay_as_they_are():
     """A turn seems to take five times as long, so that beam times would add distortion."""
     assert estimate_spin(drive("clockwise", pace=0.3, every=5), SlamOptions()) is None
 
 
+@pytest.mark.slow
 def test_scans_without_points_do_not_matter():
     recording = drive("clockwise")
     hit = recording.hit.copy()
@@ -86,6 +89,7 @@ def test_scans_without_points_do_not_matter():
     assert estimate_spin(dataclasses.replace(recording, hit=hit), SlamOptions()) == "clockwise"
 
 
+@pytest.mark.slow
 def test_slow_motion_shows_no_direction():
     assert estimate_spin(drive("clockwise", pace=0.05), SlamOptions()) is None
 
@@ -113,6 +117,7 @@ def test_interrupted_mapping_with_the_direction():
     np.testing.assert_array_equal(resumed.p_static, result.p_static)
 
 
+@pytest.mark.slow
 def test_saved_results_have_the_beam_times_again(tmp_path):
     recording = drive("counter-clockwise")
     built = stillmap.build(recording, {"threads": 1, "em.max_iterations": 1})

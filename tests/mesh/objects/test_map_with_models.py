@@ -57,6 +57,7 @@ def spoiled(out, recording):
     return area[bad].sum() / area[faces["image"] >= 0].sum()
 
 
+@pytest.mark.slow
 def test_the_texture_shows_no_people_unless_beams_are_not_believed(
     room, result, mapped, monkeypatch
 ):
@@ -134,10 +135,12 @@ def test_movers_have_models_where_they_were(result):
         assert faces["T_camera_object"].shape[1:] == (4, 4)
 
 
+@pytest.mark.slow
 def test_threads_and_another_time_change_no_bit(result, mapped):
     assert models_in(mapped("again", "--threads", "2")) == models_in(result)
 
 
+@pytest.mark.slow
 def test_the_same_from_python(room, result, tmp_path):
     recording = stillmap.read(room)
     poses = poses_from_tum(room / "truth/trajectory.tum", recording)
@@ -167,6 +170,7 @@ def test_without_pictures_the_surface_is_grey_and_lit(room, result, mapped, tmp_
     assert record["area"] == pytest.approx(record_of(result)["area"], rel=0.01)
 
 
+@pytest.mark.slow
 def test_damaged_pictures_are_told_of_and_others_paint_in_their_place(
     room, result, mapped, tmp_path
 ):
@@ -258,6 +262,7 @@ def test_none_where_they_are_not_wanted(mapped, words):
     assert "models" not in json.loads((out / "run.json").read_text())
 
 
+@pytest.mark.slow
 def test_a_laser_that_tilts_and_pictures_beside_it(rig, tmp_path):
     out = tmp_path / "out"
     words = ("map", rig / "horizontal", "--tilting", rig / "tilting", "-o", out, *QUICK)
