@@ -212,6 +212,7 @@ class Everywhere(NamedTuple):
     """A place that is all there is."""
 
     cells: np.ndarray
+    door: None = None
 
 
 def final_e_step(seen, state="last", threads=1, **options):
@@ -222,7 +223,7 @@ def final_e_step(seen, state="last", threads=1, **options):
     before = em.CellProbabilities(found.cells, np.zeros(len(found.cells), np.float32), 0.2)
     places = [Everywhere(found.cells)]
     # each cell decides alone
-    alone = "stillmap.mapping.changed_beams.pool_states"
+    alone = "stillmap.mapping.changed_objects.pool_states"
     with mock.patch(alone, lambda histories, *_: histories.share_there(state)):
         shown = relabel_changes(
             seen.recording, seen.poses, all_static, before, found, places, state, threads

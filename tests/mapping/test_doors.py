@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from synthetic_histories import RESOLUTION, block, course, found
 
-from stillmap.mapping import compute_swept_cells
-from stillmap.mapping.doors import _fit_sector
+from stillmap.mapping.doors import _fit_two_lines, fit_sector
 
 LENGTH = 18.0  # cells
 HINGE = np.array([-7, 12])
@@ -23,6 +22,14 @@ def leaf(angle, length=LENGTH, hinge=HINGE, thick=2):
 
 def door(first, swing, **line):
     return np.unique(np.concatenate([leaf(first, **line), leaf(first + swing, **line)]), axis=0)
+
+
+def compute_swept_cells(cells, resolution):
+    """The cells and, if they are a door, those that it sweeps."""
+    sector = fit_sector(cells, resolution)
+    if sector is None:
+        return cells
+    return np.unique(np.concatenate([cells, sector.swept_cells()]), axis=0)
 
 
 def held(cells):
@@ -84,7 +91,7 @@ def test_a_leaf_that_is_seen_on_its_way_now_and_then_is_still_a_door():
 @pytest.mark.parametrize("length", [10.0, 18.0, 40.0])
 def test_a_leaf_is_as_long_as_those_of_doors(length):
     cells = door(0.0, np.pi / 2, length=length)
-    assert _fit_sector(cells).length == pytest.approx(length, abs=1.0)
+    assert _fit_two_lines(cells).length == pytest.approx(length, abs=1.0)
 
     def sweeps(metres):
         return len(compute_swept_cells(cells, metres / length)) > len(cells)
@@ -102,21 +109,21 @@ def test_a_blob_is_its_cells():
     x, y = block(-8, -8, 17, 17).T
     disc = np.column_stack([x, y])[np.hypot(x, y) < 8]
     ring = disc[np.hypot(*disc.T) > 5]
-    assert _fit_sector(ring) is None
+    assert _fit_two_lines(ring) is None
     assert alone(disc)
     assert alone(ring)  # and not what it goes round
 
 
 def test_two_bays_beside_each_other_are_their_cells():
     bays = np.concatenate([block(0, 0, 6, 3), block(12, 0, 6, 3)])
-    assert _fit_sector(bays) is None
+    assert _fit_two_lines(bays) is None
     assert alone(bays)
 
 
 def test_a_wide_shelf_round_a_corner_is_its_cells():
     # thicker than a leaf
     shelf = np.concatenate([block(0, 0, 20, 7), block(0, 7, 7, 13)])
-    assert _fit_sector(shelf) is None
+    assert _fit_two_lines(shelf) is None
     assert alone(shelf)
 
 
@@ -142,10 +149,18 @@ def test_cells_in_a_line_are_all_there_is(cells):
     assert alone(np.array(cells, np.int64))
 
 
-def test_only_what_comes_and_goes_sweeps():
+def test_changes_are_their_cells_until_they_are_known_as_doors():
     cells = door(0.0, np.pi / 2, length=9.0)
     (often,) = found(course(cells, True, (10, 12), (80, 82), count=5))
     assert often.resolution == RESOLUTION
-    assert held(often.swept_cells) == held(compute_swept_cells(cells, RESOLUTION)) > held(cells)
-    (once,) = found(course(cells, True, (10, 12)))
-    assert held(once.swept_cells) == held(cells)
+    assert held(often.swept_cells) == held(cells)
+
+
+def test_both_directions_and_the_nearer_one_of_cells():
+    sector = fit_sector(door(0.3, 1.4), LEAF)
+    np.testing.assert_allclose(sorted(sector.directions), [0.3, 1.7], atol=0.1)
+    first, second = np.argsort(sector.directions)
+    far = LENGTH * 0.8
+    points = HINGE + far * np.array([[np.cos(a), np.sin(a)] for a in (0.3, 1.7, 1.0)])
+    cells = np.round(points).astype(np.int64)
+    assert sector.nearer_ends(cells).tolist() == [first, second, -1]

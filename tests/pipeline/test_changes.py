@@ -90,7 +90,7 @@ def test_what_was_moved_left_one_place_and_came_to_another():
         assert before < after
     taken = only("left", Stay(-2.6, -2.0))
     assert seconds(taken)[1] == pytest.approx(GONE, abs=2.0)
-    assert len([one for one in built().changes if one.kind != "comes and goes"]) == 3
+    assert len([one for one in built().changes if one.kind in ("came", "left")]) == 3
 
 
 def test_the_map_is_that_of_its_state():
@@ -110,7 +110,7 @@ def test_an_object_is_shown_in_one_state(state):
     occupied = [
         (shown(built(state), one.cells) > 0.5).mean()
         for one in built().changes
-        if one.kind != "comes and goes"
+        if one.kind in ("came", "left")
     ]
     # corners of cells that hardly hold any surface stay free
     assert all(min(share, 1.0 - share) < 0.15 for share in occupied)
@@ -156,14 +156,45 @@ def test_a_crate_is_no_object_on_its_way_and_people_are():
 
 
 def swing():
-    return next(one for one in built().changes if one.kind == "comes and goes")
+    return next(one for one in built().changes if one.kind == "door")
 
 
 def test_a_door_that_swings_is_one_place():
-    often = [one for one in built().changes if one.kind == "comes and goes"]
-    assert len(often) == 1
-    assert often[0].times >= 3
-    assert seconds(often[0])[1] < often[0].last_ns * 1e-9
+    (door,) = [one for one in built().changes if one.kind not in ("came", "left")]
+    assert door.kind == "door"
+    assert door.times >= 3
+    assert seconds(door)[1] < door.last_ns * 1e-9
+    np.testing.assert_allclose(door.door.hinge, HINGE, atol=0.2)
+    assert door.door.length == pytest.approx(WIDTH, abs=0.2)
+
+
+def test_a_door_is_open_and_shut_when_it_is():
+    truth, recording = world().truth, world().recording
+    leaf = truth.scene["mover_kinds"].index("door")
+    turned = np.abs(np.angle(np.exp(1j * (truth.movers[:, leaf, 2] - -np.pi / 2))))
+    is_shut, is_open = turned < 0.1, turned > np.pi / 2 - 0.1
+    assert {one.position for one in swing().door.states} == {"open", "shut"}
+    right = total = 0
+    for position, since, until in swing().door.states:
+        during = (recording.stamp_ns >= since) & (recording.stamp_ns <= until)
+        right += (is_shut if position == "shut" else is_open)[during].sum()
+        total += during.sum()
+    assert total > 0.5 * recording.n_scans
+    assert right > 0.9 * total
+    away = np.angle(np.exp(1j * (swing().door.shut - -np.pi / 2)))
+    assert abs(away) < 0.15
+
+
+@pytest.mark.parametrize("state", ["open", "shut"])
+def test_all_doors_are_shown_open_or_shut(state):
+    door = swing().door
+    leaf = {"open": door.open_cells, "shut": door.shut_cells}
+    assert (shown(built(state), leaf.pop(state)) > 0.5).mean() > 0.7
+    (other,) = leaf.values()
+    assert (shown(built(state), other) < 0.2).all()
+    came, left = only("came", HERE), only("left", AWAY)
+    assert (shown(built(state), came.cells) > 0.65).mean() > 0.5
+    assert (shown(built(state), left.cells) < 0.2).mean() > 0.9
 
 
 def in_the_sector(margin):
@@ -184,7 +215,7 @@ def test_where_a_door_swings_the_map_is_free_and_marked(state):
     layer = changed_cells(result.map, result.changes)
     first = np.round(np.array(result.map.origin[:2]) / result.map.resolution).astype(int)
     column, row = (cells - first).T
-    assert (layer[row, column] == CHANGED["comes and goes"]).mean() > 0.95
+    assert (layer[row, column] == CHANGED["door"]).mean() > 0.95
     assert (shown(result, cells) < 0.2).mean() > 0.97
     # the leaf itself, too: in the last state nobody knows how long it stays
     if state == "last":

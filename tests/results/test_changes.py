@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from stillmap.mapping import Change
+from stillmap.mapping import Change, Door
+from stillmap.mapping.door import DoorState
 from stillmap.results.map_npz import changed_cells, write_map_npz
 from stillmap.results.report import maps
 from stillmap.results.report.maps import changes_data, draw_filtered_map
@@ -67,12 +68,27 @@ def test_the_layer_says_how_a_place_changed(changed):
 
 def test_the_layer_holds_all_that_a_door_sweeps_over(result):
     leaves = np.concatenate([block(60, 30, 10, 2), block(60, 32, 2, 8)])
-    one = change(result, "comes and goes", leaves, 4.0, 5.25, 4000.0, times=7)
+    states = (DoorState("shut", 4, 5), DoorState("open", 6, 7))
+    door = Door(
+        (6.05, 3.05), 1.0, 0.0, 0.5 * np.pi, leaves[:20], leaves[20:], block(60, 30, 8, 8), states
+    )
+    one = change(result, "door", leaves, 4.0, 5.25, 4000.0, times=7)
+    one = dataclasses.replace(one, door=door)
     swung = dataclasses.replace(result, changes=[one])
-    assert layer(swung, leaves) == layer(swung, block(61, 31, 6, 6)) == {3}
+    assert layer(swung, block(61, 31, 6, 6)) == {4}
     assert layer(swung, block(69, 39, 3, 3)) == {0}
     (listed,) = run_record(swung)["changes"]
     assert listed["cells"] == len(leaves)  # those that changed
+    assert listed["door"] == {
+        "hinge": [6.05, 3.05],
+        "length": 1.0,
+        "shut": 0.0,
+        "open": round(0.5 * np.pi, 3),
+        "states": [
+            {"position": "shut", "since_ns": 4, "until_ns": 5},
+            {"position": "open", "since_ns": 6, "until_ns": 7},
+        ],
+    }
 
 
 def test_the_last_of_several_changes_is_told(changed):

@@ -76,7 +76,9 @@ def add_map_flags(p: argparse._ArgumentGroup) -> None:
         help="write this part of the map frame alone, in metres; poses are of all scans",
     )
     p.add_argument(
-        "--map-state", choices=("last", "majority"), help="state of changed places (default: last)"
+        "--map-state",
+        choices=("last", "majority", "open", "shut"),
+        help="state of changed places (default: last); open or shut: that of doors",
     )
 
 

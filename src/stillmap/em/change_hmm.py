@@ -75,8 +75,15 @@ class CellHistories(ChangedCells):
         """(E,) probability of surface that never left."""
         return self.p_static + self.p_view_dependent
 
+    @property
+    def unchanged_cells(self) -> NDArray[np.int64]:
+        """(U, 2) those that more probably than not hold surface that never left."""
+        return self.cells[self.p_unchanged > 0.5]
+
     def share_there(self, state: MapState) -> NDArray[np.float32]:
         """(E,) probability that an object is in the cell at last, or its share of the time.
+
+        Of states of doors, the last one.
 
         In the last state, what comes and goes is absent: its present state is unknown.
         """
@@ -94,7 +101,7 @@ class CellHistories(ChangedCells):
             share: (E,) in place of `share_there`.
         """
         share = self.share_there(state) if share is None else share
-        there = share if state == "last" else (share > 0.5).astype(np.float32)
+        there = (share > 0.5).astype(np.float32) if state == "majority" else share
         # conditional on the cell not being view-dependent
         visible = np.maximum(1.0 - self.p_view_dependent, _MIN_P_CHANGED)
         p = (self.p_static + self.p_changing * there) / visible

@@ -6,7 +6,7 @@ from typing import Literal
 from stillmap.core.config import Section, option
 
 # state of changed places in the map: the last one, or the one held longest
-MapState = Literal["last", "majority"]
+MapState = Literal["last", "majority", "open", "shut"]
 
 
 @dataclass(frozen=True)

@@ -4,16 +4,19 @@ from stillmap.mapping.cell_labels import update_occupancy
 from stillmap.mapping.change_detection import Change, detect_changes
 from stillmap.mapping.change_detection_3d import detect_changes_3d
 from stillmap.mapping.changed_beams import find_changed_object_beams, relabel_changes
-from stillmap.mapping.doors import compute_swept_cells
+from stillmap.mapping.door import Door
+from stillmap.mapping.door_detection import find_doors, join_doors
 from stillmap.mapping.witnesses import MoverPoints
 
 __all__ = [
     "Change",
+    "Door",
     "MoverPoints",
-    "compute_swept_cells",
     "detect_changes",
     "detect_changes_3d",
     "find_changed_object_beams",
+    "find_doors",
+    "join_doors",
     "relabel_changes",
     "update_occupancy",
 ]

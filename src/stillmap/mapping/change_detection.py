@@ -11,14 +11,14 @@ from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.em import CellHistories, ChangedCells, time_bin_index
 from stillmap.em.change_hmm import MIN_RECURRING_CHANGES
-from stillmap.mapping.doors import compute_swept_cells
+from stillmap.mapping.door import Door
 from stillmap.mapping.witnesses import MoverPoints, is_explained
 
 Cells = NDArray[np.int64]
 Index = NDArray[np.intp]
-Kind = Literal["came", "left", "comes and goes"]
+Kind = Literal["came", "left", "comes and goes", "door"]
 
-_MIN_PROBABILITY = 0.5  # that a cell changed, or never did
+_MIN_PROBABILITY = 0.5  # that a cell changed
 _LINK_DISTANCE = 0.5  # m within which changed cells form one place
 _MAX_TIME_GAP = 2.0  # s between the changes of cells of one place
 _MIN_CELLS = 4  # of a listed change
@@ -30,7 +30,7 @@ class Change(ShortRepr):
     """A changed place.
 
     Attributes:
-        kind: an object came, left, or comes and goes.
+        kind: an object came, left, or comes and goes; or a door swings.
         x, y: metres, mean of the cells in the map frame.
         size: metres, along x and y, and in 3D z.
         cells: (K, 2) int64, the changed cells.
@@ -41,6 +41,7 @@ class Change(ShortRepr):
         last_ns: the same of the last change; `stamp_ns` where there was one only.
         times: number of changes.
         z: metres, mean height in 3D; None in 2D.
+        door: of kind `door`, its leaf.
     """
 
     kind: Kind
@@ -54,13 +55,12 @@ class Change(ShortRepr):
     last_ns: int
     times: int
     z: float | None = None
+    door: Door | None = None
 
     @property
     def swept_cells(self) -> Cells:
         """(S, 2) cells of the whole place; of a door all that it sweeps."""
-        if self.kind != "comes and goes":
-            return self.cells
-        return compute_swept_cells(self.cells, self.resolution)
+        return self.cells if self.door is None else self.door.swept_cells
 
     @property
     def appeared(self) -> bool:
@@ -88,7 +88,7 @@ def detect_changes(
     changed = histories.select(
         (histories.p_changing > _MIN_PROBABILITY) & (histories.n_changes > 0)
     )
-    unchanged = histories.cells[histories.p_unchanged > _MIN_PROBABILITY]
+    unchanged = histories.unchanged_cells
     return group_changes(changed, unchanged, recording, resolution, time_bin, movers)
 
 

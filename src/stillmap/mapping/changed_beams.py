@@ -13,7 +13,8 @@ from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.chunks import iter_beams
 from stillmap.core.recording import Recording
 from stillmap.mapping.change_detection import Change
-from stillmap.mapping.changed_objects import cell_keys, is_same_place, pool_states
+from stillmap.mapping.changed_objects import compute_p_in_map, is_same_place
+from stillmap.mapping.doors import fit_sector
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -33,8 +34,8 @@ def relabel_changes(
     """Labels (M,) and map cells, taken from the cell histories within the listed changes.
 
     There p_static of a beam is the probability that the map in this state shows the object that
-    reflected it. Cells of one object decide together (`pool_states`). Changes of cells that are not
-    listed are noise.
+    reflected it. Cells of one object decide together. Changes of cells that are not listed are
+    noise.
 
     Args:
         recording: M beams.
@@ -48,9 +49,7 @@ def relabel_changes(
         return p_static, occupied
     if not np.array_equal(occupied.cells, histories.cells):
         raise ValueError("occupied: expected the cells of the final E-step")
-    changed = np.concatenate([one.cells for one in changes])
-    listed = np.isin(cell_keys(histories.cells), cell_keys(changed))
-    p_in_map = histories.p_in_map(state, pool_states(histories, changes, state))
+    listed, p_in_map = compute_p_in_map(histories, changes, state)
     out = arrays.copy(p_static, recording.scratch)
     for _, beams, data in iter_beams(recording, poses, release=[out]):
         surfel = histories.surfel_map.associate_beams(*data, threads)
@@ -75,7 +74,7 @@ def find_changed_object_beams(
     stays = [
         _Stay.from_change(one, changes)
         for one in changes
-        if one.kind != "comes and goes" or len(one.swept_cells) != len(one.cells)
+        if one.kind != "comes and goes" or fit_sector(one.cells, one.resolution) is not None
     ]
     found = ArrayBuilder(np.intp, (), recording.scratch)
     for block in arrays.iter_blocks(recording.hit, p_static) if stays else ():

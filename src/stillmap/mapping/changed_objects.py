@@ -10,8 +10,29 @@ from stillmap.mapping.change_detection import Change
 Cells = NDArray[np.int64]
 Index = NDArray[np.intp]
 
-_RADIUS = 3.0  # cells between cells of a recurring change that decide together: leaves of doors
+_RADIUS = 3.0  # cells between cells of a recurring change that decide together
 _MIN_WEIGHT = 1e-3
+
+
+def compute_p_in_map(
+    histories: em.CellHistories, changes: list[Change], state: em.MapState
+) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
+    """Which cells (E,) the changes concern, and the probability that the map shows an object.
+
+    Args:
+        histories: of E cells.
+        changes: from `detect_changes`, and `join_doors`.
+        state: state of changed places that the map shows.
+    """
+    keys = cell_keys(histories.cells)
+    listed = np.isin(keys, cell_keys(np.concatenate([one.cells for one in changes])))
+    p = histories.p_in_map(state, pool_states(histories, changes, state))
+    for door in (one.door for one in changes if one.door is not None):
+        for position, leaf in (("open", door.open_cells), ("shut", door.shut_cells)):
+            if state in ("open", "shut"):
+                of = _rows(keys, leaf)
+                listed[of], p[of] = True, float(position == state)
+    return listed, p
 
 
 def pool_states(
@@ -20,8 +41,8 @@ def pool_states(
     """(E,) `share_there` of each cell, the same in all cells of an object.
 
     Each cell was observed at times of its own, so that the modal state of an object that was moved
-    between two visits differs from cell to cell. An object takes the mean over its cells. Where
-    something comes and goes, cells nearby decide together: a door has leaves in several positions.
+    between two visits differs from cell to cell. An object takes the mean over its cells, as does
+    each position of a door. Where something comes and goes, cells nearby decide together.
 
     Args:
         histories: of E cells.
@@ -29,23 +50,32 @@ def pool_states(
         state: state of changed places that the map shows.
     """
     keys = cell_keys(histories.cells)
-    rows = [np.flatnonzero(np.isin(keys, cell_keys(one.cells))) for one in changes]
     share = histories.share_there(state)
     weight = np.maximum(histories.p_changing, _MIN_WEIGHT).astype(np.float64)
     out = share.copy()
-    often = np.array([one.kind == "comes and goes" for one in changes], bool)
-    recurring = [rows[k] for k in np.flatnonzero(often)]
+    recurring = [one.cells for one in changes if one.kind == "comes and goes"]
     if recurring:
-        of = np.unique(np.concatenate(recurring))
+        of = _rows(keys, np.concatenate(recurring))
         out[of] = _local_mean(histories.cells[of], share[of], weight[of])
-    objects = group_objects([one for one in changes if one.kind != "comes and goes"])
-    single = np.flatnonzero(~often)
-    members = [np.unique(np.concatenate([rows[k] for k in single[one]])) for one in objects]
+    moved = [one for one in changes if one.kind in ("came", "left")]
+    members = [
+        _rows(keys, np.concatenate([moved[k].cells for k in one])) for one in group_objects(moved)
+    ]
     for of in members:
         out[of] = 0.0
     for of in filter(len, members):  # where two objects stood in turn, the likelier one
         out[of] = np.maximum(out[of], np.average(share[of], weights=weight[of]))
+    for one in changes:
+        for leaf in () if one.door is None else (one.door.open_cells, one.door.shut_cells):
+            of = _rows(keys, leaf[np.isin(cell_keys(leaf), cell_keys(one.cells))])
+            if len(of):
+                out[of] = np.average(share[of], weights=weight[of])
     return out
+
+
+def _rows(keys: Cells, cells: Cells) -> Index:
+    """Rows, rising, of cells (K, 2) among those with the keys (E,)."""
+    return np.flatnonzero(np.isin(keys, cell_keys(cells)))
 
 
 def _local_mean(

@@ -16,18 +16,7 @@ _MIN_ANGLE, _MAX_ANGLE = math.radians(20.0), math.radians(200.0)  # of the swing
 _NEAR_HINGE = 0.5  # of the leaf: cells nearer to the hinge have uncertain directions
 
 
-def compute_swept_cells(cells: Cells, resolution: float) -> Cells:
-    """(S, 2) the cells (K, 2) and, if they are a door both open and shut, those that it sweeps."""
-    sector = _fit_sector(cells)
-    if sector is None or not _MIN_LENGTH <= sector.length * resolution <= _MAX_LENGTH:
-        return cells
-    radius = math.ceil(sector.length)
-    square = np.arange(-radius, radius + 1)
-    around = sector.hinge + np.stack(np.meshgrid(square, square), axis=-1).reshape(-1, 2)
-    return np.unique(np.concatenate([cells, around[sector.contains(around)]]), axis=0)
-
-
-class _Sector:
+class Sector:
     """A leaf of `length` cells that swings about a hinge between two end directions."""
 
     def __init__(self, hinge: Cells, cells: Cells) -> None:
@@ -47,6 +36,26 @@ class _Sector:
     def angle(self) -> float:
         """Radians of the swing."""
         return self._high - self._low
+
+    @property
+    def directions(self) -> tuple[float, float]:
+        """Radians of the leaf from the hinge in both end positions."""
+        return self._mean + self._low, self._mean + self._high
+
+    def swept_cells(self) -> Cells:
+        """(S, 2) cells that the leaf sweeps over."""
+        radius = math.ceil(self.length)
+        square = np.arange(-radius, radius + 1)
+        around = self.hinge + np.stack(np.meshgrid(square, square), axis=-1).reshape(-1, 2)
+        return np.asarray(around[self.contains(around)])
+
+    def nearer_ends(self, cells: Cells) -> NDArray[np.intp]:
+        """(N,) end position, 0 or 1, nearer to each of cells (N, 2); -1: farther than the leaf."""
+        distance, turned = self._relative_polar(cells)
+        off = np.abs(turned[:, None] - [self._low, self._high])
+        aside = distance[:, None] * np.sin(np.minimum(off, math.pi / 2))
+        on_leaf = (aside.min(axis=1) <= _TOLERANCE) & (distance <= self.length + _TOLERANCE)
+        return np.where(on_leaf, aside.argmin(axis=1), -1)
 
     def _polar(self, cells: Cells) -> tuple[Float, Float]:
         x, y = (cells - self.hinge).T
@@ -78,13 +87,20 @@ class _Sector:
         return True
 
 
-def _fit_sector(cells: Cells) -> _Sector | None:
-    """The door, if it is one: cells along two lines from one of them, the hinge."""
+def fit_sector(cells: Cells, resolution: float) -> Sector | None:
+    """The door, if it is one: cells (K, 2) along two lines from one of them, the hinge."""
+    sector = _fit_two_lines(cells)
+    if sector is None or not _MIN_LENGTH <= sector.length * resolution <= _MAX_LENGTH:
+        return None
+    return sector
+
+
+def _fit_two_lines(cells: Cells) -> Sector | None:
     if _width(cells) <= 2.0 * _TOLERANCE + 1.0:
         return None  # straight: two opposite leaves would look alike
     best, best_score = None, (_MIN_INLIERS, -math.inf)
     for hinge in cells[:: math.ceil(len(cells) / _MAX_HINGES)]:
-        sector = _Sector(hinge, cells)
+        sector = Sector(hinge, cells)
         # cells beside the hinge of a wide swing fit as many cells with longer leaves
         score = (sector.inlier_share(cells), -sector.length)
         if (

@@ -20,6 +20,8 @@ from stillmap.mapping import (
     detect_changes,
     detect_changes_3d,
     find_changed_object_beams,
+    find_doors,
+    join_doors,
     relabel_changes,
     update_occupancy,
 )
@@ -79,7 +81,9 @@ def final_estimate(
     if courses is None:
         return deskewed, best, []
     best, movers = _add_motion_evidence(deskewed, best, courses, threads)
-    changes = detect_changes(courses, deskewed, cell, look, movers)
+    surface = courses.cells[courses.p_in_map("majority") > 0.5]
+    doors = find_doors(detect_changes(courses, deskewed, cell, look), surface, deskewed, best.poses)
+    changes = join_doors(detect_changes(courses, deskewed, cell, look, movers), doors)
     return deskewed, _relabel(deskewed, best, courses, changes, options, threads), changes
 
 

@@ -15,7 +15,7 @@ from stillmap.core.local_frame import LocalFrame
 from stillmap.core.recording import Recording
 from stillmap.em import GroundMap
 from stillmap.io.point_cloud.origin import cloud_origin
-from stillmap.mapping import Change
+from stillmap.mapping import Change, Door
 from stillmap.pipeline.estimate import Estimate
 from stillmap.pipeline.final_map import Maps
 from stillmap.pipeline.snapshots import Snapshot
@@ -174,9 +174,21 @@ def changes_to_map(
             y=one.y + float(frame.origin[1]),
             z=None if one.z is None else one.z + float(frame.origin[2]),
             cells=one.cells + by,
+            door=None if one.door is None else _door_to_map(one.door, frame, by),
         )
         for one in changes
     ]
+
+
+def _door_to_map(door: Door, frame: LocalFrame, by: Cells) -> Door:
+    x, y = (np.array(door.hinge) + frame.origin[:2]).tolist()
+    return dataclasses.replace(
+        door,
+        hinge=(x, y),
+        shut_cells=door.shut_cells + by,
+        open_cells=door.open_cells + by,
+        swept_cells=door.swept_cells + by,
+    )
 
 
 def _add(cells: Cells, by: Cells) -> Cells:

@@ -27,7 +27,9 @@ class OutputOptions(Section, section="output"):
         "PNG with transparency) or raw (occupancy in percent, 255 unknown).",
     )
     map_state: MapState = option(
-        "last", "State of changed places shown in the map: the last one, or the one held longest."
+        "last",
+        "State of changed places shown in the map: the last one, or the one held longest "
+        "(majority); or the last one with all doors open or shut.",
     )
     min_obstacle_height: float = option(
         0.2,

@@ -17,7 +17,7 @@ from stillmap.mapping import Change
 from stillmap.pipeline.result import MappingResult
 
 # what `changed` says of a cell
-CHANGED = {"came": 1, "left": 2, "comes and goes": 3}
+CHANGED = {"came": 1, "left": 2, "comes and goes": 3, "door": 4}
 
 
 def write_map_npz(

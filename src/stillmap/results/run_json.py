@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from stillmap.core.config import to_dict
 from stillmap.core.json import count_skipped, to_jsonable, write_json
 from stillmap.core.version import package_version
-from stillmap.mapping import Change
+from stillmap.mapping import Change, Door
 from stillmap.mapping.beam_statistics import count_beams
 from stillmap.pipeline.estimate import IterationRecord
 from stillmap.pipeline.quality import Quality
@@ -182,6 +182,17 @@ def _change(one: Change) -> dict[str, Any]:
         "stamp_ns": one.stamp_ns,
         "last_ns": one.last_ns,
         "times": one.times,
+        **({} if one.door is None else {"door": _door(one.door)}),
+    }
+
+
+def _door(door: Door) -> dict[str, Any]:
+    return {
+        "hinge": [round(metres, MILLIMETRES) for metres in door.hinge],
+        "length": round(door.length, MILLIMETRES),
+        "shut": round(door.shut, MILLIMETRES),
+        "open": round(door.opened, MILLIMETRES),
+        "states": [one._asdict() for one in door.states],
     }
 
 

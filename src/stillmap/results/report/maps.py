@@ -31,7 +31,12 @@ from stillmap.results.report.written_map import draw_written_map
 
 _MAX_PATH_POINTS = 3000
 _MAX_ROWS = 50
-_COLORS = {"came": (20, 120, 60), "left": (190, 40, 120), "comes and goes": (40, 90, 200)}
+_COLORS = {
+    "came": (20, 120, 60),
+    "left": (190, 40, 120),
+    "comes and goes": (40, 90, 200),
+    "door": (200, 120, 20),
+}
 
 
 class MapFigure(NamedTuple):

@@ -1,0 +1,49 @@
+"""A door as it was observed."""
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.short_repr import ShortRepr
+
+Cells = NDArray[np.int64]
+Position = Literal["open", "shut"]
+
+
+class DoorState(NamedTuple):
+    """A time in which every observation saw the leaf in one position.
+
+    Attributes:
+        position: `open` or `shut`.
+        since_ns, until_ns: stamps of the first and the last scan that saw it so.
+    """
+
+    position: Position
+    since_ns: int
+    until_ns: int
+
+
+@dataclass(frozen=True, eq=False)
+class Door(ShortRepr):
+    """A leaf that swings about a hinge.
+
+    Attributes:
+        hinge: metres, in the map frame.
+        length: metres, of the leaf.
+        shut, opened: rad, directions from the hinge along the leaf. Shut is the one in which a wall
+            goes on beyond the leaf.
+        shut_cells, open_cells: (K, 2) cells that changed, of the leaf in each position.
+        swept_cells: (S, 2) all that it sweeps over.
+        states: in the order of time.
+    """
+
+    hinge: tuple[float, float]
+    length: float
+    shut: float
+    opened: float
+    shut_cells: Cells
+    open_cells: Cells
+    swept_cells: Cells
+    states: tuple[DoorState, ...] = ()

@@ -1,0 +1,180 @@
+"""Doors among the changes: one entry each, with the two positions of the leaf and its states."""
+
+import dataclasses
+import itertools
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.recording import Recording
+from stillmap.mapping.change_detection import Change
+from stillmap.mapping.changed_objects import cell_keys
+from stillmap.mapping.door import Door
+from stillmap.mapping.door_states import observe_states
+from stillmap.mapping.doors import Sector, fit_sector
+from stillmap.mapping.resting_leaf import find_resting_leaf
+
+Cells = NDArray[np.int64]
+Float = NDArray[np.float64]
+
+_MAX_TIME_GAP = 2.0  # s between the departure from one position and the arrival in the other
+_REACH = 0.5  # m between the cells of both positions, which have the hinge in common
+_MIN_ON_LEAF = 0.7  # share of a change's cells that lie on the leaf, for it to be of the door
+_BEYOND = 0.4  # m beyond the leaf, in which the wall goes on that it closes
+
+
+def find_doors(
+    changes: list[Change], surface: Cells, recording: Recording, poses: Float
+) -> list[Change]:
+    """One change of kind `door` for all changes of each door, in the order of time.
+
+    What comes and goes lies along two lines from a hinge; or a leaf leaves one of them as it
+    arrives in the other; or only one of them changes, and the leaf seemed never to leave the other
+    one, because it rests there. Beams must have ended on it in both positions, in turn.
+
+    Args:
+        changes: from `detect_changes`; a leaf that swings needs nobody near it.
+        surface: (U, 2) cells that are occupied most of the time.
+        recording: with the beams that show the states.
+        poses: (T, 3, 3) T_map_base.
+    """
+    left = list(changes)
+    out: list[Change] = []
+    for candidate in _find_candidates(changes, surface):
+        if not all(_holds(left, one) for one in candidate.changes):
+            continue  # of a door that was found before
+        door = _make_door(candidate, surface)
+        states = observe_states([door], recording, poses, changes[0].resolution)[0]
+        if len({one.position for one in states}) < 2:
+            continue  # nobody saw it in both positions
+        mine = [
+            one
+            for one in left
+            if _holds(candidate.changes, one) or _is_on_leaf(candidate.sector, one)
+        ]
+        left = [one for one in left if not _holds(mine, one)]
+        out.append(_join_changes(mine, dataclasses.replace(door, states=states)))
+    return sorted(out, key=lambda one: (one.stamp_ns, one.x, one.y))
+
+
+def join_doors(changes: list[Change], doors: list[Change]) -> list[Change]:
+    """All changes with the doors in place of those of their leaves, in the order of time."""
+    leaves = [
+        cell_keys(np.concatenate([one.cells, one.door.shut_cells, one.door.open_cells]))
+        for one in doors
+        if one.door is not None
+    ]
+    others = [
+        one
+        for one in changes
+        if not any(np.isin(cell_keys(one.cells), leaf).mean() >= _MIN_ON_LEAF for leaf in leaves)
+    ]
+    return sorted([*others, *doors], key=lambda one: (one.stamp_ns, one.x, one.y))
+
+
+def _holds(changes: list[Change], one: Change) -> bool:
+    return any(one is other for other in changes)
+
+
+class _Candidate(NamedTuple):
+    """A sector, the changes that it was fitted to, and all cells of the leaf in both positions.
+
+    `rests`: one of them is surface that did not change.
+    """
+
+    sector: Sector
+    changes: list[Change]
+    cells: Cells
+    rests: bool
+
+
+def _find_candidates(changes: list[Change], surface: Cells) -> list[_Candidate]:
+    """What may be doors: those whose positions both changed first, and those of most cells."""
+    came = [one for one in changes if one.kind == "came"]
+    gone = [one for one in changes if one.kind == "left"]
+    pairs = [
+        [one, other] for one, other in itertools.product(came, gone) if _may_be_one(one, other)
+    ]
+    found = []
+    for group in [*([one] for one in changes), *pairs]:
+        cells = np.unique(np.concatenate([one.cells for one in group]), axis=0)
+        resolution = group[0].resolution
+        sector = fit_sector(cells, resolution)
+        rests = sector is None
+        if rests and len(group) == 1:
+            others = surface[~np.isin(cell_keys(surface), cell_keys(cells))]
+            leaf = find_resting_leaf(cells, others, resolution)
+            cells = np.unique(np.concatenate([cells, leaf]), axis=0)
+            sector = fit_sector(cells, resolution) if len(leaf) else None
+        if sector is not None:
+            found.append(_Candidate(sector, group, cells, rests))
+    return sorted(found, key=lambda one: (one.rests, -len(one.cells)))
+
+
+def _may_be_one(came: Change, gone: Change) -> bool:
+    """True if an arrival and a departure may be of one leaf: at one time, and near each other."""
+    slack = round(_MAX_TIME_GAP * 1e9)
+    if max(came.before_ns, gone.before_ns) >= min(came.stamp_ns, gone.stamp_ns) + slack:
+        return False
+    apart = np.abs([came.x - gone.x, came.y - gone.y])
+    return bool(np.all(apart <= (np.array(came.size) + np.array(gone.size)) / 2 + _REACH))
+
+
+def _is_on_leaf(sector: Sector, change: Change) -> bool:
+    on_leaf = sector.nearer_ends(change.cells) >= 0
+    return bool(on_leaf.mean() >= _MIN_ON_LEAF)
+
+
+def _make_door(candidate: _Candidate, surface: Cells) -> Door:
+    sector, cells = candidate.sector, candidate.cells
+    resolution = candidate.changes[0].resolution
+    nearer = sector.nearer_ends(cells)
+    shut = _find_shut(sector, surface, resolution)
+    x, y = ((sector.hinge + 0.5) * resolution).tolist()
+    return Door(
+        hinge=(x, y),
+        length=sector.length * resolution,
+        shut=math.remainder(sector.directions[shut], 2.0 * math.pi),
+        opened=math.remainder(sector.directions[1 - shut], 2.0 * math.pi),
+        shut_cells=cells[nearer == shut],
+        open_cells=cells[nearer == 1 - shut],
+        swept_cells=np.unique(np.concatenate([cells, sector.swept_cells()]), axis=0),
+    )
+
+
+def _join_changes(changes: list[Change], door: Door) -> Change:
+    """All changes of a door in one."""
+    cells = np.unique(np.concatenate([one.cells for one in changes]), axis=0)
+    resolution = changes[0].resolution
+    x, y = ((cells.mean(axis=0) + 0.5) * resolution).tolist()
+    # each swing is a departure and an arrival
+    times = max(*(one.times for one in changes), math.ceil(len(changes) / 2), len(door.states) - 1)
+    return dataclasses.replace(
+        min(changes, key=lambda one: one.stamp_ns),
+        kind="door",
+        x=x,
+        y=y,
+        size=tuple((np.ptp(cells, axis=0) * resolution + resolution).tolist()),
+        cells=cells,
+        last_ns=max(one.last_ns for one in changes),
+        times=times,
+        door=door,
+    )
+
+
+def _find_shut(sector: Sector, surface: Cells, resolution: float) -> int:
+    """The end position, 0 or 1, in which the wall goes on beyond the leaf: it is shut."""
+    reach = math.ceil(_BEYOND / resolution)
+    counts = []
+    for direction in sector.directions:
+        along = np.array([math.cos(direction), math.sin(direction)])
+        off = surface - sector.hinge
+        ahead = off @ along
+        aside = np.abs(off @ np.array([-along[1], along[0]]))
+        # beyond the leaf, and behind the hinge
+        beyond = (ahead > sector.length) & (ahead <= sector.length + reach) & (aside <= 3.0)
+        behind = (ahead < 0.0) & (ahead >= -reach) & (aside <= 3.0)
+        counts.append(2 * np.count_nonzero(beyond) + np.count_nonzero(behind))
+    return int(np.argmax(counts))

@@ -1,0 +1,142 @@
+"""The position of a leaf in which it rests: surface that seemed never to leave.
+
+Of a door that stands open for most of the time only its shut position changes. The leaf then is a
+straight free end of surface as long as the changed line, from one end of that line.
+"""
+
+import itertools
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Cells = NDArray[np.int64]
+Float = NDArray[np.float64]
+
+_MIN_LENGTH, _MAX_LENGTH = 0.4, 1.4  # m, of the changed line
+_MAX_WIDTH = 5.0  # cells of it across
+_MIN_ON_LINE, _REFITS = 0.65, 3  # share of the cells of the change
+_MAX_HIDDEN = 0.15  # m of the line that is not seen to change beside the jambs
+_ANGLES = np.radians(np.arange(40.0, 161.0, 3.0))  # between both positions
+_MIN_COVERED, _MIN_EXACT = 0.85, 0.5  # share of the leaf within a cell of surface, and on it
+_MIN_CLEAR = 0.9  # share of the cells beside the leaf that are none
+_ASIDE = 3.0  # cells to both sides of it
+_NEAR_HINGE = 0.3  # of the leaf, where the wall is beside it
+_BEYOND = (2.5, 5.0)  # cells beyond its end, which is free
+
+
+class _Line(NamedTuple):
+    """A straight row of cells: its middle, unit direction, and length in cells."""
+
+    middle: Float
+    along: Float
+    length: float
+
+
+def find_resting_leaf(changed: Cells, surface: Cells, resolution: float) -> Cells:
+    """(L, 2) cells of the surface that are a leaf whose other position is the changed line.
+
+    Args:
+        changed: (K, 2) cells of a change.
+        surface: (S, 2) occupied cells that did not change.
+        resolution: m, edge of a cell.
+
+    Returns:
+        the cells of the leaf; none where there is no such leaf.
+    """
+    none = np.empty((0, 2), np.int64)
+    line = _fit_line(changed, resolution)
+    if line is None:
+        return none
+    reach = 1.5 * line.length + 10.0
+    surface = surface[(np.abs(surface - line.middle) < reach).all(axis=1)]
+    field = _Field.of_cells(surface, line.middle, reach)
+    best, best_score = none, 0.0
+    most = round(_MAX_HIDDEN / resolution)
+    hidden = [(at_hinge, at_end) for at_hinge in range(most + 1) for at_end in range(most + 1)]
+    for end, (at_hinge, at_end) in itertools.product((-1.0, 1.0), hidden):
+        hinge = line.middle + end * (0.5 * line.length + at_hinge) * line.along
+        length = line.length + at_hinge + at_end
+        for angle in np.concatenate([_ANGLES, -_ANGLES]) if at_hinge + at_end <= most else ():
+            score, cells = _rate_leaf(field, hinge, length, -end * line.along, angle)
+            if score > best_score:
+                best, best_score = cells, score
+    return best
+
+
+def _fit_line(cells: Cells, resolution: float) -> _Line | None:
+    """The line along which most of the cells lie."""
+    kept = cells
+    for _ in range(_REFITS):
+        middle = kept.mean(axis=0)
+        along = np.linalg.svd(kept - middle, full_matrices=False)[2][0]
+        off = (cells - middle) @ np.array([-along[1], along[0]])
+        kept = cells[np.abs(off) <= _MAX_WIDTH / 2.0]
+        if len(kept) < max(_MIN_ON_LINE * len(cells), 2.0):
+            return None
+    at = (kept - middle) @ along
+    length = float(np.ptp(at)) + 1.0
+    if not _MIN_LENGTH <= length * resolution <= _MAX_LENGTH:
+        return None
+    return _Line(middle + 0.5 * (at.max() + at.min()) * along, along, length)
+
+
+class _Field(NamedTuple):
+    """Which cells are surface, and which have some within a cell, in a box from `low` on."""
+
+    low: Cells
+    is_surface: NDArray[np.bool_]
+    is_near: NDArray[np.bool_]
+
+    @classmethod
+    def of_cells(cls, cells: Cells, middle: Float, reach: float) -> "_Field":
+        low = np.floor(middle - reach).astype(np.int64) - 2
+        size = 2 * math.ceil(reach) + 6
+        is_surface = np.zeros((size, size), bool)
+        is_surface[tuple((cells - low).T)] = True
+        padded = np.pad(is_surface, 1)
+        is_near = np.zeros_like(is_surface)
+        for i in range(3):
+            for j in range(3):
+                is_near |= padded[i : i + size, j : j + size]
+        return cls(low, is_surface, is_near)
+
+    def sample(self, layer: NDArray[np.bool_], points: NDArray[Any]) -> NDArray[np.bool_]:
+        """(N,) of a layer at points (N, 2) in cells; outside False."""
+        at = np.round(points).astype(np.int64) - self.low
+        inside = ((at >= 0) & (at < layer.shape[0])).all(axis=1)
+        out = np.zeros(len(points), bool)
+        out[inside] = layer[tuple(at[inside].T)]
+        return out
+
+
+def _rate_leaf(
+    field: _Field, hinge: Float, length: float, line: Float, angle: float
+) -> tuple[float, Cells]:
+    """Score of a leaf, 0 if it is none, and its cells; the line is a unit direction (2,)."""
+    none = np.empty((0, 2), np.int64)
+    c, s = math.cos(angle), math.sin(angle)
+    along = np.array([c * line[0] - s * line[1], s * line[0] + c * line[1]])
+    across = np.array([-along[1], along[0]])
+    t = np.arange(1.0, length)[:, None]
+    covered = float(field.sample(field.is_near, hinge + t * along).mean())
+    if covered < _MIN_COVERED:
+        return 0.0, none
+    beyond = hinge + np.arange(length + _BEYOND[0], length + _BEYOND[1])[:, None] * along
+    around = np.concatenate([beyond + k * across for k in np.arange(-_ASIDE, _ASIDE + 1.0)])
+    if field.sample(field.is_surface, around).any():
+        return 0.0, none
+    far = t[t[:, 0] >= _NEAR_HINGE * length]
+    clear = min(
+        1.0 - float(field.sample(field.is_surface, hinge + far * along + side * across).mean())
+        for side in (-_ASIDE, _ASIDE)
+    )
+    if clear < _MIN_CLEAR:
+        return 0.0, none
+    exactly = float(field.sample(field.is_surface, hinge + t * along).mean())
+    if exactly < _MIN_EXACT:
+        return 0.0, none
+    points = np.concatenate([hinge + t * along + k * across for k in (-1.0, 0.0, 1.0)])
+    cells = np.unique(np.round(points).astype(np.int64), axis=0)
+    return covered + clear + exactly, cells[field.sample(field.is_surface, cells)]
