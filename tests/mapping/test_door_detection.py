@@ -47,7 +47,7 @@ CRATE = change("came", np.array([[60, 60], [61, 60], [60, 61], [61, 61]]), 20, 2
 
 
 def joined(changes, surface, seen, poses):
-    return join_doors(changes, find_doors(changes, surface, seen, poses))
+    return join_doors(changes, find_doors(changes, [], surface, seen, poses, RESOLUTION))
 
 
 def test_departure_and_arrival_of_a_leaf_are_one_door():
@@ -64,7 +64,7 @@ def test_departure_and_arrival_of_a_leaf_are_one_door():
         ("open", 50 * S, 104 * S),
     ]
     assert found[1].times == 1
-    assert (found[1].before_ns, found[1].stamp_ns) == (39 * S, 45 * S)
+    assert (found[1].before_ns, found[1].stamp_ns) == (44 * S, 50 * S)
 
 
 def test_the_wall_says_which_position_is_shut():

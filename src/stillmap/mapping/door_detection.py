@@ -22,11 +22,17 @@ Float = NDArray[np.float64]
 _MAX_TIME_GAP = 2.0  # s between the departure from one position and the arrival in the other
 _REACH = 0.5  # m between the cells of both positions, which have the hinge in common
 _MIN_ON_LEAF = 0.7  # share of a change's cells that lie on the leaf, for it to be of the door
+_MIN_LEAF = 0.6  # m
 _BEYOND = 0.4  # m beyond the leaf, in which the wall goes on that it closes
 
 
 def find_doors(
-    changes: list[Change], surface: Cells, recording: Recording, poses: Float
+    changes: list[Change],
+    lines: list[Cells],
+    surface: Cells,
+    recording: Recording,
+    poses: Float,
+    resolution: float,
 ) -> list[Change]:
     """One change of kind `door` for all changes of each door, in the order of time.
 
@@ -36,17 +42,20 @@ def find_doors(
 
     Args:
         changes: from `detect_changes`; a leaf that swings needs nobody near it.
+        lines: (K, 2) cells of each row of dynamic hits that may be a leaf (`find_leaf_lines`).
         surface: (U, 2) cells that are occupied most of the time.
         recording: with the beams that show the states.
         poses: (T, 3, 3) T_map_base.
+        resolution: m, edge of a cell.
     """
+    changes = [*changes, *(_as_change(line, recording, resolution) for line in lines)]
     left = list(changes)
     out: list[Change] = []
     for candidate in _find_candidates(changes, surface):
         if not all(_holds(left, one) for one in candidate.changes):
             continue  # of a door that was found before
         door = _make_door(candidate, surface)
-        states = observe_states([door], recording, poses, changes[0].resolution)[0]
+        states = observe_states([door], recording, poses, resolution)[0]
         if len({one.position for one in states}) < 2:
             continue  # nobody saw it in both positions
         mine = [
@@ -57,6 +66,14 @@ def find_doors(
         left = [one for one in left if not _holds(mine, one)]
         out.append(_join_changes(mine, dataclasses.replace(door, states=states)))
     return sorted(out, key=lambda one: (one.stamp_ns, one.x, one.y))
+
+
+def _as_change(line: Cells, recording: Recording, resolution: float) -> Change:
+    """A row of cells as a change at any time: its states tell when."""
+    x, y = ((line.mean(axis=0) + 0.5) * resolution).tolist()
+    first, last = recording.stamp_ns[[0, -1]].tolist()
+    size = tuple((np.ptp(line, axis=0) * resolution + resolution).tolist())
+    return Change("comes and goes", x, y, size, line, resolution, first, last, last, 1)
 
 
 def join_doors(changes: list[Change], doors: list[Change]) -> list[Change]:
@@ -108,7 +125,7 @@ def _find_candidates(changes: list[Change], surface: Cells) -> list[_Candidate]:
             leaf = find_resting_leaf(cells, others, resolution)
             cells = np.unique(np.concatenate([cells, leaf]), axis=0)
             sector = fit_sector(cells, resolution) if len(leaf) else None
-        if sector is not None:
+        if sector is not None and sector.length * resolution >= _MIN_LEAF:
             found.append(_Candidate(sector, group, cells, rests))
     return sorted(found, key=lambda one: (one.rests, -len(one.cells)))
 
@@ -149,17 +166,18 @@ def _join_changes(changes: list[Change], door: Door) -> Change:
     cells = np.unique(np.concatenate([one.cells for one in changes]), axis=0)
     resolution = changes[0].resolution
     x, y = ((cells.mean(axis=0) + 0.5) * resolution).tolist()
-    # each swing is a departure and an arrival
-    times = max(*(one.times for one in changes), math.ceil(len(changes) / 2), len(door.states) - 1)
-    return dataclasses.replace(
-        min(changes, key=lambda one: one.stamp_ns),
+    swings = list(itertools.pairwise(door.states))
+    return Change(
         kind="door",
         x=x,
         y=y,
         size=tuple((np.ptp(cells, axis=0) * resolution + resolution).tolist()),
         cells=cells,
-        last_ns=max(one.last_ns for one in changes),
-        times=times,
+        resolution=resolution,
+        before_ns=swings[0][0].until_ns,
+        stamp_ns=swings[0][1].since_ns,
+        last_ns=swings[-1][1].since_ns,
+        times=len(swings),
         door=door,
     )
 

@@ -26,7 +26,7 @@ _NEAR_HINGE = 0.3  # of the leaf, where the wall is beside it
 _BEYOND = (2.5, 5.0)  # cells beyond its end, which is free
 
 
-class _Line(NamedTuple):
+class Line(NamedTuple):
     """A straight row of cells: its middle, unit direction, and length in cells."""
 
     middle: Float
@@ -46,26 +46,24 @@ def find_resting_leaf(changed: Cells, surface: Cells, resolution: float) -> Cell
         the cells of the leaf; none where there is no such leaf.
     """
     none = np.empty((0, 2), np.int64)
-    line = _fit_line(changed, resolution)
+    line = fit_line(changed, resolution)
     if line is None:
         return none
     reach = 1.5 * line.length + 10.0
     surface = surface[(np.abs(surface - line.middle) < reach).all(axis=1)]
     field = _Field.of_cells(surface, line.middle, reach)
-    best, best_score = none, 0.0
+    best: tuple[float, Cells] = 0.0, none
     most = round(_MAX_HIDDEN / resolution)
-    hidden = [(at_hinge, at_end) for at_hinge in range(most + 1) for at_end in range(most + 1)]
-    for end, (at_hinge, at_end) in itertools.product((-1.0, 1.0), hidden):
+    for end, at_hinge in itertools.product((-1.0, 1.0), range(most + 1)):
         hinge = line.middle + end * (0.5 * line.length + at_hinge) * line.along
-        length = line.length + at_hinge + at_end
-        for angle in np.concatenate([_ANGLES, -_ANGLES]) if at_hinge + at_end <= most else ():
-            score, cells = _rate_leaf(field, hinge, length, -end * line.along, angle)
-            if score > best_score:
-                best, best_score = cells, score
-    return best
+        for at_end in range(most + 1 - at_hinge):
+            length = line.length + at_hinge + at_end
+            rated = _rate_leaves(field, hinge, length, -end * line.along)
+            best = max(best, rated, key=lambda one: one[0])
+    return best[1]
 
 
-def _fit_line(cells: Cells, resolution: float) -> _Line | None:
+def fit_line(cells: Cells, resolution: float) -> Line | None:
     """The line along which most of the cells lie."""
     kept = cells
     for _ in range(_REFITS):
@@ -79,7 +77,7 @@ def _fit_line(cells: Cells, resolution: float) -> _Line | None:
     length = float(np.ptp(at)) + 1.0
     if not _MIN_LENGTH <= length * resolution <= _MAX_LENGTH:
         return None
-    return _Line(middle + 0.5 * (at.max() + at.min()) * along, along, length)
+    return Line(middle + 0.5 * (at.max() + at.min()) * along, along, length)
 
 
 class _Field(NamedTuple):
@@ -103,40 +101,43 @@ class _Field(NamedTuple):
         return cls(low, is_surface, is_near)
 
     def sample(self, layer: NDArray[np.bool_], points: NDArray[Any]) -> NDArray[np.bool_]:
-        """(N,) of a layer at points (N, 2) in cells; outside False."""
+        """(...,) of a layer at points (..., 2) in cells; outside False."""
         at = np.round(points).astype(np.int64) - self.low
-        inside = ((at >= 0) & (at < layer.shape[0])).all(axis=1)
-        out = np.zeros(len(points), bool)
+        inside = ((at >= 0) & (at < layer.shape[0])).all(axis=-1)
+        out = np.zeros(points.shape[:-1], bool)
         out[inside] = layer[tuple(at[inside].T)]
         return out
 
 
-def _rate_leaf(
-    field: _Field, hinge: Float, length: float, line: Float, angle: float
-) -> tuple[float, Cells]:
-    """Score of a leaf, 0 if it is none, and its cells; the line is a unit direction (2,)."""
-    none = np.empty((0, 2), np.int64)
-    c, s = math.cos(angle), math.sin(angle)
-    along = np.array([c * line[0] - s * line[1], s * line[0] + c * line[1]])
-    across = np.array([-along[1], along[0]])
-    t = np.arange(1.0, length)[:, None]
-    covered = float(field.sample(field.is_near, hinge + t * along).mean())
-    if covered < _MIN_COVERED:
-        return 0.0, none
-    beyond = hinge + np.arange(length + _BEYOND[0], length + _BEYOND[1])[:, None] * along
-    around = np.concatenate([beyond + k * across for k in np.arange(-_ASIDE, _ASIDE + 1.0)])
-    if field.sample(field.is_surface, around).any():
-        return 0.0, none
-    far = t[t[:, 0] >= _NEAR_HINGE * length]
-    clear = min(
-        1.0 - float(field.sample(field.is_surface, hinge + far * along + side * across).mean())
-        for side in (-_ASIDE, _ASIDE)
+def _rate_leaves(field: _Field, hinge: Float, length: float, line: Float) -> tuple[float, Cells]:
+    """Score of the best leaf at any angle to the line, 0 if there is none, and its cells.
+
+    Args:
+        field: of the surface.
+        hinge: (2,) cells.
+        length: cells, of the leaf.
+        line: (2,) unit direction from the hinge along the other position.
+    """
+    turned = math.atan2(line[1], line[0]) + np.concatenate([_ANGLES, -_ANGLES])
+    along = np.stack([np.cos(turned), np.sin(turned)], axis=1)[:, None]
+    across = along[..., ::-1] * [-1.0, 1.0]
+    t = np.arange(1.0, length)
+    leaf = hinge + t[:, None] * along
+    covered = field.sample(field.is_near, leaf).mean(axis=1)
+    exactly = field.sample(field.is_surface, leaf).mean(axis=1)
+    ahead = np.arange(length + _BEYOND[0], length + _BEYOND[1])[:, None]
+    beyond = hinge + ahead * along
+    is_end = np.ones(len(turned), bool)
+    for side in np.arange(-_ASIDE, _ASIDE + 1.0):
+        is_end &= ~field.sample(field.is_surface, beyond + side * across).any(axis=1)
+    far = leaf[:, t >= _NEAR_HINGE * length]
+    clear = 1.0 - np.max(
+        [field.sample(field.is_surface, far + k * across).mean(axis=1) for k in (-_ASIDE, _ASIDE)],
+        axis=0,
     )
-    if clear < _MIN_CLEAR:
-        return 0.0, none
-    exactly = float(field.sample(field.is_surface, hinge + t * along).mean())
-    if exactly < _MIN_EXACT:
-        return 0.0, none
-    points = np.concatenate([hinge + t * along + k * across for k in (-1.0, 0.0, 1.0)])
+    good = is_end & (covered >= _MIN_COVERED) & (exactly >= _MIN_EXACT) & (clear >= _MIN_CLEAR)
+    score = np.where(good, covered + exactly + clear, 0.0)
+    best = int(score.argmax())
+    points = np.concatenate([leaf[best] + k * across[best] for k in (-1.0, 0.0, 1.0)])
     cells = np.unique(np.round(points).astype(np.int64), axis=0)
-    return covered + clear + exactly, cells[field.sample(field.is_surface, cells)]
+    return float(score[best]), cells[field.sample(field.is_surface, cells)]

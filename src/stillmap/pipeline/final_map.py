@@ -25,6 +25,7 @@ from stillmap.mapping import (
     relabel_changes,
     update_occupancy,
 )
+from stillmap.mapping.leaf_lines import find_leaf_lines
 from stillmap.mapping.projection import project_cells, project_to_plane
 from stillmap.mapping.reflections import P_REFLECTED, remove_reflections
 from stillmap.pipeline.estimate import Estimate
@@ -81,10 +82,19 @@ def final_estimate(
     if courses is None:
         return deskewed, best, []
     best, movers = _add_motion_evidence(deskewed, best, courses, threads)
-    surface = courses.cells[courses.p_in_map("majority") > 0.5]
-    doors = find_doors(detect_changes(courses, deskewed, cell, look), surface, deskewed, best.poses)
-    changes = join_doors(detect_changes(courses, deskewed, cell, look, movers), doors)
+    changes = detect_changes(courses, deskewed, cell, look, movers)
+    changes = join_doors(changes, _find_doors(deskewed, best, courses, cell, look))
     return deskewed, _relabel(deskewed, best, courses, changes, options, threads), changes
+
+
+def _find_doors(
+    deskewed: Recording, best: Estimate, courses: em.CellHistories, cell: float, look: float
+) -> list[Change]:
+    """Doors, from what changed and from dynamic hits, beside what is there most of the time."""
+    surface = courses.cells[courses.p_in_map("majority") > 0.5]
+    changes = detect_changes(courses, deskewed, cell, look)
+    lines = find_leaf_lines(deskewed, best.poses, best.p_static, cell)
+    return find_doors(changes, lines, surface, deskewed, best.poses, cell)
 
 
 def _relabel(
