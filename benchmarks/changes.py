@@ -97,7 +97,7 @@ def _of_things(
     changes: Sequence[Change], simulation: Simulation, T_world_map: NDArray[np.float64]
 ) -> list[Change]:
     """Where something came or left, but for the leaves of doors."""
-    once = [one for one in changes if one.kind != "comes and goes"]
+    once = [one for one in changes if one.kind in ("came", "left")]
     at = moved(T_world_map, np.array([(one.x, one.y) for one in once]).reshape(-1, 2))
     swings = np.zeros(len(once), bool)
     for door in simulation.scene.leaves:

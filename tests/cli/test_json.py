@@ -76,7 +76,7 @@ def test_config(call):
         "doc": "Prior probability p(c = 1) that a beam is static.",
     }
     assert found["read.max_range"]["type"] == "float or unset"
-    assert found["output.map_state"]["choices"] == ["last", "majority"]
+    assert found["output.map_state"]["choices"] == ["last", "majority", "open", "shut"]
     assert all(one["doc"] for one in found.values())
     odometry = parsed(call("config", "slam.odometry", "--json"))
     assert set(odometry) == {name for name in found if name.startswith("slam.odometry.")}

@@ -24,9 +24,13 @@ def change(kind, cells, before, after, times=1):
     return Change(kind, x, y, size, cells, RESOLUTION, before * S, after * S, after * S, times)
 
 
-def looks(positions):
+BEHIND = np.array([[35, 45], [36, 45], [37, 45]])  # seen through the open door
+
+
+def looks(positions, passing=True):
     """Scans that end on all cells of the leaf where it is, in the middle of the cells."""
-    ends = [{"shut": SHUT, "open": OPEN, None: WALL}[one] for one in positions]
+    through = np.concatenate([OPEN, BEHIND]) if passing else OPEN
+    ends = [{"shut": SHUT, "open": through, None: WALL}[one] for one in positions]
     counts = [len(one) for one in ends]
     points = (np.concatenate(ends) + 0.5) * RESOLUTION
     seen = recording(range(len(positions)), 1)
@@ -105,6 +109,16 @@ def test_a_leaf_at_rest_is_free_at_its_end_and_beside():
 def test_what_is_seen_in_one_position_only_is_no_door():
     changes = [LEFT, CAME]
     found = joined(changes, WALL, *looks(["shut"] * 40 + [None] * 60))
+    assert [one.kind for one in found] == ["came", "left"]
+
+
+def test_two_sides_of_a_box_that_are_seen_in_turn_are_no_door():
+    found = joined([LEFT, CAME], WALL, *looks(["shut"] * 40 + ["open"] * 60, passing=False))
+    assert [one.kind for one in found] == ["came", "left"]
+
+
+def test_who_walks_by_once_is_no_leaf():
+    found = joined([LEFT, CAME], WALL, *looks(["shut"] + ["open"] * 99))
     assert [one.kind for one in found] == ["came", "left"]
 
 

@@ -12,7 +12,7 @@ from stillmap.core.recording import Recording
 from stillmap.mapping.change_detection import Change
 from stillmap.mapping.changed_objects import cell_keys
 from stillmap.mapping.door import Door
-from stillmap.mapping.door_states import observe_states
+from stillmap.mapping.door_states import is_passed, observe_states
 from stillmap.mapping.doors import Sector, fit_sector
 from stillmap.mapping.resting_leaf import find_resting_leaf
 
@@ -56,7 +56,8 @@ def find_doors(
             continue  # of a door that was found before
         door = _make_door(candidate, surface)
         states = observe_states([door], recording, poses, resolution)[0]
-        if len({one.position for one in states}) < 2:
+        door = dataclasses.replace(door, states=states)
+        if not states or not is_passed(door, recording, poses):
             continue  # nobody saw it in both positions
         mine = [
             one
@@ -64,7 +65,7 @@ def find_doors(
             if _holds(candidate.changes, one) or _is_on_leaf(candidate.sector, one)
         ]
         left = [one for one in left if not _holds(mine, one)]
-        out.append(_join_changes(mine, dataclasses.replace(door, states=states)))
+        out.append(_join_changes(mine, door))
     return sorted(out, key=lambda one: (one.stamp_ns, one.x, one.y))
 
 

@@ -17,6 +17,10 @@ Cells = NDArray[np.int64]
 _BIN_NS = 10**9  # in which the cells that were hit make one observation
 # share of the cells of a leaf that are hit in an observation: who walks through hits fewer
 _MIN_SHARE = 0.35
+_MIN_LOOKS = 2  # observations of each position
+_CROSSED = (0.3, 0.9)  # of the leaf, where beams pass if it is not there
+_GOES_ON = 0.3  # m beyond it
+_MIN_CROSSING, _MAX_SCANS = 3, 500  # scans that show it; scans that are looked at
 _RATIO = 2.0  # of that share to the one of the other position
 
 
@@ -24,6 +28,8 @@ def observe_states(
     doors: Sequence[Door], recording: Recording, poses: Float, resolution: float
 ) -> list[tuple[DoorState, ...]]:
     """The states of each door: its leaf is where beams end on much of one of its positions.
+
+    None where one of the positions was hardly seen.
 
     Args:
         doors: with the cells of both positions.
@@ -79,6 +85,7 @@ def _list_states(
 ) -> tuple[DoorState, ...]:
     """Runs of observations (N, 2), of scan and cell, that saw the leaf in the same position."""
     out: list[DoorState] = []
+    looks = {"shut": 0, "open": 0}
     bins = (stamp_ns[hits[:, 0]] - stamp_ns[0]) // _BIN_NS
     for one in group_indices(bins):
         scans, number = hits[one].T
@@ -88,8 +95,58 @@ def _list_states(
         position: Position = "shut" if shares["shut"] >= shares["open"] else "open"
         if shares[position] < max(_MIN_SHARE, _RATIO * min(shares.values())):
             continue
+        looks[position] += 1
         first, last = int(stamp_ns[scans.min()]), int(stamp_ns[scans.max()])
         if out and out[-1].position == position:
             first = out.pop().since_ns
         out.append(DoorState(position, first, last))
-    return tuple(out)
+    # a single one may be of somebody who walks by
+    return tuple(out) if min(looks.values()) >= _MIN_LOOKS else ()
+
+
+def is_passed(door: Door, recording: Recording, poses: Float) -> bool:
+    """True if beams passed through one position of the leaf while it was in the other one.
+
+    Two sides of a box that are seen in turn look like a leaf otherwise.
+    """
+    other: tuple[tuple[Position, float], ...] = (("open", door.shut), ("shut", door.opened))
+    for position, direction in other:
+        scans = _scans_during(door, position, recording.stamp_ns)
+        along = np.array([np.cos(direction), np.sin(direction)])
+        ends = np.array(door.hinge) + door.length * np.array(_CROSSED)[:, None] * along
+        if _count_crossing(ends, scans, recording, poses) >= _MIN_CROSSING:
+            return True
+    return False
+
+
+def _scans_during(door: Door, position: Position, stamp_ns: NDArray[np.int64]) -> NDArray[np.intp]:
+    """Scans in the states of that position, thinned evenly where there are many."""
+    inside = np.zeros(len(stamp_ns), bool)
+    for one in door.states:
+        if one.position == position:
+            inside |= (stamp_ns >= one.since_ns) & (stamp_ns <= one.until_ns)
+    scans = np.flatnonzero(inside)
+    return scans[:: -(-len(scans) // _MAX_SCANS) or 1]
+
+
+def _count_crossing(
+    ends: Float, scans: NDArray[np.intp], recording: Recording, poses: Float
+) -> int:
+    """Number of scans of which a beam crosses the segment between ends (2, 2) and goes on."""
+    first, count = recording.offset[scans], np.diff(recording.offset)[scans]
+    of = np.repeat(np.arange(len(scans)), count)
+    beam = np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count) + first[of]
+    hit = recording.hit[beam]
+    beam, of = beam[hit], of[hit]
+    T = recording.T_map_sensor(poses)[scans]
+    start, end = T[of, :2, 2], recording.end_points(beam, poses)
+    a, b = ends
+    side = np.stack([_cross(end - start, one - start) for one in (a, b)])
+    beyond = _cross(b - a, end - a) * np.sign(_cross(b - a, start - a))
+    # by so far that noise does not reach back
+    passes = (side.prod(axis=0) < 0.0) & (beyond < -_GOES_ON * np.linalg.norm(b - a))
+    return len(np.unique(of[passes]))
+
+
+def _cross(one: Float, other: Float) -> Float:
+    return np.asarray(one[..., 0] * other[..., 1] - one[..., 1] * other[..., 0])
