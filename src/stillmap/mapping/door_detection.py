@@ -51,12 +51,13 @@ def find_doors(
     changes = [*changes, *(_as_change(line, recording, resolution) for line in lines)]
     left = list(changes)
     out: list[Change] = []
-    for candidate in _find_candidates(changes, surface):
+    candidates = _find_candidates(changes, surface)
+    doors = [_make_door(one, surface) for one in candidates]
+    observed = observe_states(doors, recording, poses, resolution)
+    for candidate, shape, states in zip(candidates, doors, observed, strict=True):
         if not all(_holds(left, one) for one in candidate.changes):
             continue  # of a door that was found before
-        door = _make_door(candidate, surface)
-        states = observe_states([door], recording, poses, resolution)[0]
-        door = dataclasses.replace(door, states=states)
+        door = dataclasses.replace(shape, states=states)
         if not states or not is_passed(door, recording, poses):
             continue  # nobody saw it in both positions
         mine = [

@@ -39,7 +39,7 @@ def observe_states(
     """
     masks = [_LeafMask.of_door(door) for door in doors]
     seen: list[list[NDArray[np.int64]]] = [[np.empty((0, 2), np.int64)] for _ in doors]
-    for block in iter_blocks(recording.hit):
+    for block in iter_blocks(recording.hit) if doors else ():
         beam = block.start + np.flatnonzero(recording.hit[block])
         scan = recording.scans_of(beam)
         cells = np.floor(recording.end_points(beam, poses) / resolution).astype(np.int64)

@@ -59,6 +59,8 @@ def find_resting_leaf(changed: Cells, surface: Cells, resolution: float) -> Cell
         for at_end in range(most + 1 - at_hinge):
             length = line.length + at_hinge + at_end
             rated = _rate_leaves(field, hinge, length, -end * line.along)
+            if rated is None:
+                break  # there is less of a longer one
             best = max(best, rated, key=lambda one: one[0])
     return best[1]
 
@@ -109,8 +111,12 @@ class _Field(NamedTuple):
         return out
 
 
-def _rate_leaves(field: _Field, hinge: Float, length: float, line: Float) -> tuple[float, Cells]:
-    """Score of the best leaf at any angle to the line, 0 if there is none, and its cells.
+def _rate_leaves(
+    field: _Field, hinge: Float, length: float, line: Float
+) -> tuple[float, Cells] | None:
+    """Score of the best leaf at any angle to the line and its cells; None without surface.
+
+    The score is 0 if none of them is a leaf.
 
     Args:
         field: of the surface.
@@ -120,14 +126,18 @@ def _rate_leaves(field: _Field, hinge: Float, length: float, line: Float) -> tup
     """
     turned = math.atan2(line[1], line[0]) + np.concatenate([_ANGLES, -_ANGLES])
     along = np.stack([np.cos(turned), np.sin(turned)], axis=1)[:, None]
-    across = along[..., ::-1] * [-1.0, 1.0]
     t = np.arange(1.0, length)
+    covered = field.sample(field.is_near, hinge + t[:, None] * along).mean(axis=1)
+    kept = covered >= _MIN_COVERED
+    if not kept.any():
+        return None
+    covered, along = covered[kept], along[kept]
+    across = along[..., ::-1] * [-1.0, 1.0]
     leaf = hinge + t[:, None] * along
-    covered = field.sample(field.is_near, leaf).mean(axis=1)
     exactly = field.sample(field.is_surface, leaf).mean(axis=1)
     ahead = np.arange(length + _BEYOND[0], length + _BEYOND[1])[:, None]
     beyond = hinge + ahead * along
-    is_end = np.ones(len(turned), bool)
+    is_end = np.ones(len(along), bool)
     for side in np.arange(-_ASIDE, _ASIDE + 1.0):
         is_end &= ~field.sample(field.is_surface, beyond + side * across).any(axis=1)
     far = leaf[:, t >= _NEAR_HINGE * length]
@@ -135,7 +145,7 @@ def _rate_leaves(field: _Field, hinge: Float, length: float, line: Float) -> tup
         [field.sample(field.is_surface, far + k * across).mean(axis=1) for k in (-_ASIDE, _ASIDE)],
         axis=0,
     )
-    good = is_end & (covered >= _MIN_COVERED) & (exactly >= _MIN_EXACT) & (clear >= _MIN_CLEAR)
+    good = is_end & (exactly >= _MIN_EXACT) & (clear >= _MIN_CLEAR)
     score = np.where(good, covered + exactly + clear, 0.0)
     best = int(score.argmax())
     points = np.concatenate([leaf[best] + k * across[best] for k in (-1.0, 0.0, 1.0)])
