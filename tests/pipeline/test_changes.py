@@ -8,7 +8,7 @@ import pytest
 import stillmap
 from stillmap import em
 from stillmap.core.config import override
-from stillmap.mapping.changed_objects import pool_states
+from stillmap.mapping.changed_objects import cell_keys, pool_states
 from stillmap.pipeline.options import Options
 from stillmap.results.map_npz import CHANGED, changed_cells
 from stillmap.sim import (
@@ -142,6 +142,12 @@ def test_what_is_not_listed_stays_what_it_is_without_changes():
     assert 0.01 < there.mean() < 0.3
     pooled = pool_states(courses, result.changes, "last")
     shown = courses.p_in_map("last", pooled)[element]
+    on_leaf = np.zeros(len(courses.cells), bool)
+    for position, leaf in (("open", swing().door.open_cells), ("shut", swing().door.shut_cells)):
+        of = np.isin(cell_keys(courses.cells), cell_keys(leaf))
+        on_leaf |= of
+        shown[of[element] & (element >= 0)] = position == swing().door.states[-1].position
+    there |= (element >= 0) & on_leaf[element]
     others, _ = apply_motion_evidence(result.deskewed, result.poses, without.p_static)
     np.testing.assert_array_equal(result.p_static, np.where(there, shown, others))
     assert (result.p_static != without.p_static).mean() > 0.01
@@ -217,9 +223,22 @@ def test_where_a_door_swings_the_map_is_free_and_marked(state):
     column, row = (cells - first).T
     assert (layer[row, column] == CHANGED["door"]).mean() > 0.95
     assert (shown(result, cells) < 0.2).mean() > 0.97
-    # the leaf itself, too: in the last state nobody knows how long it stays
+
+
+@pytest.mark.parametrize("state", ["last", "majority"])
+def test_the_leaf_is_shown_where_it_was_last_or_mostly(state):
+    door = swing().door
+    leaf = {"open": door.open_cells, "shut": door.shut_cells}
     if state == "last":
-        assert (shown(result, swing().cells) < 0.5).mean() > 0.9
+        position = door.states[-1].position
+    else:
+        seconds = {"open": 0.0, "shut": 0.0}
+        for one in door.states:
+            seconds[one.position] += one.until_ns - one.since_ns
+        position = max(seconds, key=seconds.get)
+    assert (shown(built(state), leaf.pop(position)) > 0.5).mean() > 0.7
+    (other,) = leaf.values()
+    assert (shown(built(state), other) < 0.2).all()
 
 
 def test_threads_change_no_bit():

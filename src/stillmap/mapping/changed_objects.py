@@ -28,10 +28,10 @@ def compute_p_in_map(
     listed = np.isin(keys, cell_keys(np.concatenate([one.cells for one in changes])))
     p = histories.p_in_map(state, pool_states(histories, changes, state))
     for door in (one.door for one in changes if one.door is not None):
+        shown = door.position_in(state)
         for position, leaf in (("open", door.open_cells), ("shut", door.shut_cells)):
-            if state in ("open", "shut"):
-                of = _rows(keys, leaf)
-                listed[of], p[of] = True, float(position == state)
+            of = _rows(keys, leaf)
+            listed[of], p[of] = True, float(position == shown)
     return listed, p
 
 
@@ -41,8 +41,8 @@ def pool_states(
     """(E,) `share_there` of each cell, the same in all cells of an object.
 
     Each cell was observed at times of its own, so that the modal state of an object that was moved
-    between two visits differs from cell to cell. An object takes the mean over its cells, as does
-    each position of a door. Where something comes and goes, cells nearby decide together.
+    between two visits differs from cell to cell. An object takes the mean over its cells. Where
+    something comes and goes, cells nearby decide together.
 
     Args:
         histories: of E cells.
@@ -65,11 +65,6 @@ def pool_states(
         out[of] = 0.0
     for of in filter(len, members):  # where two objects stood in turn, the likelier one
         out[of] = np.maximum(out[of], np.average(share[of], weights=weight[of]))
-    for one in changes:
-        for leaf in () if one.door is None else (one.door.open_cells, one.door.shut_cells):
-            of = _rows(keys, leaf[np.isin(cell_keys(leaf), cell_keys(one.cells))])
-            if len(of):
-                out[of] = np.average(share[of], weights=weight[of])
     return out
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.short_repr import ShortRepr
+from stillmap.em.options import MapState
 
 Cells = NDArray[np.int64]
 Position = Literal["open", "shut"]
@@ -47,3 +48,14 @@ class Door(ShortRepr):
     open_cells: Cells
     swept_cells: Cells
     states: tuple[DoorState, ...] = ()
+
+    def position_in(self, state: MapState) -> Position:
+        """Where a map in that state shows the leaf: where it was last, or for most of the time."""
+        if state in ("open", "shut"):
+            return "open" if state == "open" else "shut"
+        if state == "last":
+            return self.states[-1].position
+        seconds = {"open": 0, "shut": 0}
+        for one in self.states:
+            seconds[one.position] += one.until_ns - one.since_ns
+        return "open" if seconds["open"] >= seconds["shut"] else "shut"
