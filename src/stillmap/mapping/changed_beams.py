@@ -13,7 +13,7 @@ from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.chunks import iter_beams
 from stillmap.core.recording import Recording
 from stillmap.mapping.change_detection import Change
-from stillmap.mapping.changed_objects import compute_p_in_map, is_same_place
+from stillmap.mapping.changed_objects import find_shown_cells, is_same_place
 from stillmap.mapping.doors import fit_sector
 
 Float = NDArray[np.float64]
@@ -34,8 +34,8 @@ def relabel_changes(
     """Labels (M,) and map cells, taken from the cell histories within the listed changes.
 
     There p_static of a beam is the probability that the map in this state shows the object that
-    reflected it. Cells of one object decide together. Changes of cells that are not listed are
-    noise.
+    reflected it, and 0 on the leaf of a door. Cells of one object decide together. Changes of cells
+    that are not listed are noise.
 
     Args:
         recording: M beams.
@@ -49,13 +49,15 @@ def relabel_changes(
         return p_static, occupied
     if not np.array_equal(occupied.cells, histories.cells):
         raise ValueError("occupied: expected the cells of the final E-step")
-    listed, p_in_map = compute_p_in_map(histories, changes, state)
+    listed, p_in_map, is_door = find_shown_cells(histories, changes, state)
+    # a leaf that swings is no static object, wherever the map shows it
+    label = np.where(is_door, np.float32(0.0), p_in_map)
     out = arrays.copy(p_static, recording.scratch)
     for _, beams, data in iter_beams(recording, poses, release=[out]):
         surfel = histories.surfel_map.associate_beams(*data, threads)
         ended = np.flatnonzero(surfel >= 0)
         ended = ended[listed[surfel[ended]]]
-        out[beams][ended] = p_in_map[surfel[ended]]
+        out[beams][ended] = label[surfel[ended]]
     p_occupied = np.where(listed, p_in_map * histories.p_in_cell, occupied.p_occupied)
     return out, dataclasses.replace(occupied, p_occupied=p_occupied)
 

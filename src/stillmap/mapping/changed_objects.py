@@ -1,5 +1,7 @@
 """Objects that came and left: which changes are of one object, and the state of all its cells."""
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,10 +16,24 @@ _RADIUS = 3.0  # cells between cells of a recurring change that decide together
 _MIN_WEIGHT = 1e-3
 
 
-def compute_p_in_map(
+class ShownCells(NamedTuple):
+    """What a map in some state shows of E cells.
+
+    Attributes:
+        listed: (E,) cells that changes concern.
+        p_in_map: (E,) float32, probability that the map shows something there.
+        is_door: (E,) cells of leaves, in any position.
+    """
+
+    listed: NDArray[np.bool_]
+    p_in_map: NDArray[np.float32]
+    is_door: NDArray[np.bool_]
+
+
+def find_shown_cells(
     histories: em.CellHistories, changes: list[Change], state: em.MapState
-) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
-    """Which cells (E,) the changes concern, and the probability that the map shows an object.
+) -> ShownCells:
+    """What a map in that state shows of places that changed.
 
     Args:
         histories: of E cells.
@@ -27,12 +43,13 @@ def compute_p_in_map(
     keys = cell_keys(histories.cells)
     listed = np.isin(keys, cell_keys(np.concatenate([one.cells for one in changes])))
     p = histories.p_in_map(state, pool_states(histories, changes, state))
+    is_door = np.zeros(len(keys), bool)
     for door in (one.door for one in changes if one.door is not None):
         shown = door.position_in(state)
         for position, leaf in (("open", door.open_cells), ("shut", door.shut_cells)):
             of = _rows(keys, leaf)
-            listed[of], p[of] = True, float(position == shown)
-    return listed, p
+            is_door[of], p[of] = True, float(position == shown)
+    return ShownCells(listed | is_door, p, is_door)
 
 
 def pool_states(
