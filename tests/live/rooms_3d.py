@@ -15,7 +15,7 @@ GONE, CAME = (4.5, 6.6, 1.6, 0.8), (10.5, 2.4, 0.8, 1.4)  # x, y, width, depth, 
 DOOR = 14.0  # m, x of the wall between the rooms
 FIRST_ROOM = ((3.0, 3.0), (8.0, 2.2), (11.8, 4.6), (8.0, 6.0))
 BOTH_ROOMS = ((7.0, 6.2), (8.0, 2.6), (11.8, 4.4), (16.5, 4.4), (23.0, 2.0))
-AND_BACK = ((18.0, -1.0), (17.5, 5.5), (17.0, 4.4), (11.0, 4.4))
+AND_BACK = ((17.0, 4.4), (11.0, 4.4))
 
 
 def run_through_rooms(thing, route, scans, seed, people=5):

@@ -3,6 +3,7 @@ away does not, what is new comes in, and nobody who walked through."""
 
 import json
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -46,7 +47,7 @@ def rooms(tmp_path_factory):
     folder = tmp_path_factory.mktemp("rooms") / "known"
     options = {"threads": 1, "em.max_iterations": 1, "objects.enabled": False}
     stillmap.build(first.recording, options).save(folder)
-    return first, folder, run_through_rooms(CAME, (*BOTH_ROOMS, *AND_BACK), 230, 101)
+    return first, folder, run_through_rooms(CAME, (*BOTH_ROOMS, *AND_BACK), 250, 101)
 
 
 @pytest.fixture(scope="module")
@@ -71,8 +72,9 @@ def voxels(points):
 
 
 def share_near(points, others, most=EDGE):
-    """Share of points that have one of the others near."""
-    return float((cKDTree(others).query(points)[0] < most).mean())
+    """Share of points that have one of the others near; of those every third one is enough."""
+    near = cKDTree(others[::3]).query(points, distance_upper_bound=most)[0]
+    return float(np.isfinite(near).mean())
 
 
 def test_it_is_localized_beyond_the_known_map_and_back(rooms, drive):
@@ -104,12 +106,12 @@ def test_the_cloud_shows_old_and_new_in_one_frame(rooms, drive):
 
 def test_what_was_not_seen_again_stays(rooms, drive):
     first, known, second = rooms
-    unseen = voxels(static_ends(first))
-    now = static_ends(second)
-    unseen = unseen[cKDTree(now).query(unseen)[0] > 0.3]
-    assert len(unseen) > 20
-    assert share_near(unseen, to_world(first, read_cloud(known))) > 0.9
-    assert share_near(unseen, to_world(first, read_cloud(drive[2]))) > 0.8
+    before, now = static_ends(first), static_ends(second)
+    unseen = voxels(before[~is_of(before, GONE)])
+    unseen = unseen[cKDTree(now[::3]).query(unseen)[0] > 0.3]
+    assert len(unseen) > 200
+    assert share_near(unseen, to_world(first, read_cloud(known))) > 0.98
+    assert share_near(unseen, to_world(first, read_cloud(drive[2]))) > 0.95
 
 
 def test_what_was_taken_away_is_gone_and_what_was_brought_is_there(rooms, drive):
@@ -125,11 +127,11 @@ def test_what_was_taken_away_is_gone_and_what_was_brought_is_there(rooms, drive)
     saved = stillmap.load(folder)
     for grid in (saved.map, mapper.map):
         occupied = occupied_of(first, grid)
-        assert is_of(occupied, GONE).sum() == 0
+        assert is_of(occupied, GONE).sum() <= 1
     occupied = occupied_of(first, saved.map)
     assert is_of(occupied, CAME).sum() > 10
     assert (occupied[:, 0] > DOOR + 5.0).sum() > 100
-    assert is_of(occupied_of(first, stillmap.load(known).map), GONE).sum() > 10
+    assert is_of(occupied_of(first, stillmap.load(known).map), GONE).sum() > 50
 
 
 def occupied_of(first, grid):
@@ -152,11 +154,17 @@ def test_the_result_is_whole(drive):
     assert (folder / "live/trajectory.tum").is_file()
 
 
-def test_a_drive_that_was_kept_makes_the_same(drive, tmp_path):
-    mapper, _, folder = drive
-    kept = keep_drive(mapper.snapshot(), tmp_path)
-    read_drive(kept).save(tmp_path / "out")
-    assert contents(tmp_path / "out") == contents(folder)
+def test_a_drive_that_was_kept_makes_the_same(rooms, tmp_path):
+    _, known, second = rooms
+    options = {"threads": 1, "objects.enabled": False}
+    with LiveMapper(options, place=known, mode="extend") as mapper:
+        for beams in islice(iter_beams(second.recording), 35):
+            update = mapper.push(beams)
+        assert "lost" not in update.doubts
+        kept = keep_drive(mapper.snapshot(), tmp_path)
+        mapper.save(tmp_path / "at once")
+    read_drive(kept).save(tmp_path / "later")
+    assert contents(tmp_path / "later") == contents(tmp_path / "at once")
     np.save(kept / "known_points.npy", np.zeros((3, 2)))
     with pytest.raises(InputError, match="known cloud does not fit"):
         read_drive(kept)
@@ -179,8 +187,7 @@ def test_it_is_found_again_in_what_was_added(rooms):
     first, known, second = rooms
     every, true = list(iter_beams(second.recording)), true_poses(first, second)
     inside = np.flatnonzero(second.truth.T_world_base[:, 0, 3] > DOOR + 2.0)
-    middle = inside[len(inside) // 2]
-    order = [*range(inside[-1] - 5), *range(inside[0] + 5, middle + 20)]
+    order = [*range(inside[-1] - 5), *range(inside[0] + 5, inside[0] + 40)]
     off, lost = [], []
     with LiveMapper({"threads": 1}, place=known, mode="extend") as mapper:
         for number, t in enumerate(order):
@@ -194,7 +201,7 @@ def test_it_is_found_again_in_what_was_added(rooms):
     assert not lost[-1]
     assert max(off[-5:]) < 0.15
     # what was seen before it was carried is still known
-    assert is_of(to_world(first, kept.cloud.points), GONE).sum() == 0
+    assert is_of(to_world(first, kept.cloud.points), GONE).sum() <= 5
     assert (shown[:, 0] > DOOR + 5.0).sum() > 100
     assert is_of(shown, CAME).sum() > 5
 
@@ -213,9 +220,8 @@ def test_clouds_far_from_the_origin_are_joined(tmp_path):
     """In a map projection: a known point in a voxel in which this run saw surface is left out."""
     utm = np.array([500_000.0, 5_300_000.0, 100.0])
     fields = coordinate_fields(FIELDS, is_far=True)
-    own = make_vertices(
-        Block(utm + np.array([[0.01, 0.0, 0.0]]), np.ones(1, np.float32), None), fields
-    )
+    point = Block(utm + np.array([[0.01, 0.0, 0.0]]), np.ones(1, np.float32), None)
+    own = make_vertices(point, fields)
     (tmp_path / "static.ply").write_bytes(ply_header(fields, 1) + own.tobytes())
     (tmp_path / "live").mkdir()
     points = utm + np.array([[0.02, 0.01, 0.0], [0.02, 40.003, 0.0]])

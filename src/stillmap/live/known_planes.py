@@ -8,6 +8,7 @@ import stillmap._core as _core
 Float = NDArray[np.float64]
 
 _SPACING = 0.5  # m between the poses that are noted of a route
+_STATIC = 0.5  # P(static) of the points that are added: over hours others would fill the cells
 
 
 class KnownPlanes:
@@ -29,7 +30,8 @@ class KnownPlanes:
     ) -> None:
         """Add points (N, 3) in the base frame with weights P(static), if the map is extended."""
         if self._extends:
-            self.planes.add(points, weights, T_map_base)
+            static = weights >= _STATIC
+            self.planes.add(points[static], weights[static], T_map_base)
             cube = np.floor(T_map_base[:3, 3] / _SPACING).astype(np.int64)
             self._route.setdefault(tuple(cube.tolist()), T_map_base)
 
