@@ -2,7 +2,7 @@
 
 python benchmarks/live_sweep_places.py [--worlds hall street] [--seeds 11 12] [--starts 20]
     [--channels 16] [--columns 360]
-python benchmarks/live_sweep_places.py --extend [--worlds corridor street] ...
+python benchmarks/live_sweep_places.py --extend [--worlds corridor street] [--scans 520] ...
 
 The map is `stillmap.build` (one iteration) of a run of another seed: other people and traffic,
 other parked cars. Each start has up to 40 sweeps to be found, and 15 more are tracked. Errors are
@@ -38,6 +38,7 @@ from stillmap.slam.options import SlamOptions
 _SWEEPS = {"hall": 400, "street": 150, "crossing": 150, "corridor": 400}
 _SEARCHED, _TRACKED, _WRONG = 40, 15, 0.5  # sweeps, sweeps, m
 _TITLES = ("world", "seed", "starts", "found", "wrong", "sweeps until found: median", "max")
+_FURTHER = ("m off: median", "max", "NEES", "CPU ms of a sweep: tracked", "of a search")
 # sweeps and m/s of the run that extends a map; x, y, width, depth of what is gone, and of what came
 _EXTENDED = {
     "corridor": (520, 2.0, (12.0, 2.1, 0.8, 0.45), (28.0, 2.1, 0.8, 0.45)),
@@ -49,7 +50,6 @@ _OF_EXTENSION = (
     *("beyond", "max", "at the end", "shown by the map", "extended", "ghosts", "gone: voxels left"),
     *("came: shown", "CPU ms of a sweep: median", "99 %"),
 )
-_FURTHER = ("m off: median", "max", "NEES", "CPU ms of a sweep: tracked", "of a search")
 
 
 def main() -> None:
@@ -58,6 +58,7 @@ def main() -> None:
     p.add_argument("--worlds", nargs="+", choices=_SWEEPS)
     p.add_argument("--seeds", nargs="+", type=int, default=[11, 12])
     p.add_argument("--starts", type=int, default=20)
+    p.add_argument("--scans", type=int, help="of the run that extends the map")
     p.add_argument("--channels", type=int, default=16)
     p.add_argument("--columns", type=int, default=360)
     args = p.parse_args()
@@ -108,6 +109,7 @@ def extend(world: str, seed: int, folder: Path, args: argparse.Namespace) -> lis
     """A line of the table of maps that are extended."""
     scans, speed, gone, came = _EXTENDED[world]
     lidar = {"channels": args.channels, "columns": args.columns}
+    scans = args.scans or scans
 
     def run(thing, seed: int, scans: int):
         changes = {"lidar": lidar, "robot": {"scans": scans, "speed": speed}}

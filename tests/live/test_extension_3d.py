@@ -24,9 +24,11 @@ from rooms_3d import (
 from scipy.spatial import cKDTree
 
 import stillmap
+from stillmap.cli.main import main
 from stillmap.core.errors import InputError
 from stillmap.core.grid_map import GridMap
 from stillmap.em import OccupancyMap
+from stillmap.io.point_cloud.ply import read_layout
 from stillmap.live.cloud_extension import KeptCloud, write_extended_cloud
 from stillmap.live.drive_folder import keep_drive, read_drive
 from stillmap.live.known_cloud import KnownCloud
@@ -152,6 +154,13 @@ def test_the_result_is_whole(drive):
     assert run["input"]["extends_map"] is True
     assert saved.map.resolution == EDGE
     assert (folder / "live/trajectory.tum").is_file()
+
+
+def test_it_is_converted_with_what_was_known(drive, tmp_path):
+    """Of which its recording shows nothing."""
+    folder = drive[2]
+    assert main(["convert", str(folder), "-o", str(tmp_path / "out.ply"), "--only", "static"]) == 0
+    assert read_layout(tmp_path / "out.ply").rows == len(read_cloud(folder))
 
 
 def test_a_drive_that_was_kept_makes_the_same(rooms, tmp_path):
