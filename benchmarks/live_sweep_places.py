@@ -138,7 +138,7 @@ def extend(world: str, seed: int, folder: Path, args: argparse.Namespace) -> lis
         f"{off[-1]:.3f}",
         *(f"{_share_shown(truth, one):.3f}" for one in clouds),
         f"{ghosts.mean():.4f}",
-        "{} of {}".format(*(len(_voxels(one[_is_of(one, gone)])) for one in clouds[::-1])),
+        "{} of {}".format(*(_count_left(one[_is_of(one, gone)], now) for one in clouds[::-1])),
         f"{_share_shown(now[_is_of(now, came)], clouds[1]):.3f}",
         *(f"{f:.0f}" for f in (np.median(ms[found + 1 :]), np.quantile(ms[found + 1 :], 0.99))),
     ]
@@ -182,6 +182,11 @@ def _is_of(points, thing):
 
 def _voxels(points):
     return (np.unique(np.floor(points / _EDGE).astype(np.int64), axis=0) + 0.5) * _EDGE
+
+
+def _count_left(points, now) -> int:
+    """Number of voxels in which nothing stands any more: a wall behind the box does."""
+    return int((cKDTree(now).query(_voxels(points))[0] > _EDGE).sum())
 
 
 def _share_shown(truth, points) -> float:
