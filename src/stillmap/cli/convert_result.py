@@ -228,7 +228,8 @@ def _convert_to_cloud(
 
     require_new_file(output, args.overwrite)
     point_cloud_files.require_extras(form, output)
-    if isinstance(result.record.get(TILTING), dict) or is_place(result.folder):
+    is_whole = isinstance(result.record.get(TILTING), dict) or is_place(result.folder)
+    if is_whole or result.extends_map:  # no recording has all of it
         points = point_cloud.cloud_from_folder(result.folder, args.only)
     else:
         points = _build_cloud(args, result, workplace(output))

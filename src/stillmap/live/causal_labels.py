@@ -178,9 +178,14 @@ class CausalLabels:
         x, y = (first * self.resolution).tolist()
         return GridMap(p_occupied, (x, y, 0.0), self.resolution)
 
-    def known_cells(self) -> CellProbabilities:
-        """P(static and occupied) of the cells in which beams ended."""
-        cells, p_occupied = self.filter.known_cells(odds_factor=self._odds_factor)
+    def known_cells(self, of: OccupancyFilter | None = None) -> CellProbabilities:
+        """P(static and occupied) of the cells in which beams ended.
+
+        Args:
+            of: filters; None: those of the labels.
+        """
+        known = self.filter if of is None else of
+        cells, p_occupied = known.known_cells(odds_factor=self._odds_factor)
         return CellProbabilities(cells, p_occupied, 0.0)
 
     def seen_cells(self) -> CellProbabilities:

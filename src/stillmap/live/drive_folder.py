@@ -24,7 +24,9 @@ from stillmap.core.grid_map import GridMap
 from stillmap.core.input_files import require_regular
 from stillmap.core.json import read_json, write_json
 from stillmap.core.schema import SchemaError, check
+from stillmap.live.cloud_extension import KeptCloud
 from stillmap.live.history import KeptScans, answer_type, beam_fields
+from stillmap.live.map_extension import KeptMap
 from stillmap.live.placement import Placement
 from stillmap.live.saving import Snapshot
 from stillmap.pipeline.options import Options
@@ -32,7 +34,10 @@ from stillmap.pipeline.options import Options
 _FORMAT_VERSION = 1
 _RECORD = "drive.json"
 _BEAMS = ("points", "hit", "p_static", "time")
-_ARRAYS = ("number", "counts", "answers", "poses", "submap", "p_occupied", "hits")
+_SCANS = ("number", "counts", "answers", "poses", "submap")
+_KNOWN = ("p_occupied", "hits")  # of a map that is extended
+_KNOWN_CLOUD = ("known_points", "known_p_static", "known_route", "stands")  # in 3D likewise
+_CLOUD_TYPES = [np.float64, np.float32, np.float64, np.bool_]
 _LARGEST_RECORD = 16 << 20  # bytes
 
 _Row = list[float]
@@ -84,7 +89,7 @@ def _write(snapshot: Snapshot, folder: Path) -> None:
     for name, parts, files in zip(_BEAMS, kept.parts, kept.files, strict=True):
         for number, (part, file) in enumerate(zip(parts, files, strict=True)):
             _put(part, file, folder / f"{name}-{number}")
-    extended = None if snapshot.extended is None else snapshot.extended[0]
+    grid = None if snapshot.kept_map is None else snapshot.kept_map.grid
     record = {
         "format_version": _FORMAT_VERSION,
         "dimension": snapshot.placement.poses.shape[-1] - 1,
@@ -95,8 +100,7 @@ def _write(snapshot: Snapshot, folder: Path) -> None:
         "warnings": kept.warnings,
         "options": config.to_dict(snapshot.options),
         "rows": [len(part) for part in kept.parts[0]],
-        "extended": extended
-        and {"origin": extended.origin, "resolution": float(extended.resolution)},
+        "extended": grid and {"origin": grid.origin, "resolution": float(grid.resolution)},
     }
     write_json(folder / _RECORD, record)
     sync(folder / _RECORD)
@@ -106,9 +110,12 @@ def _small_arrays(snapshot: Snapshot) -> dict[str, NDArray[Any]]:
     kept, placement = snapshot.kept, snapshot.placement
     arrays = {"number": kept.number, "counts": kept.counts, "answers": kept.answers}
     arrays |= {"poses": placement.poses, "submap": placement.submap}
-    if snapshot.extended is not None:
-        grid, hits = snapshot.extended
-        arrays |= {"p_occupied": np.asarray(grid.p_occupied), "hits": np.asarray(hits)}
+    if (kept_map := snapshot.kept_map) is not None:
+        planar = kept_map.grid.p_occupied, kept_map.hits
+        arrays |= dict(zip(_KNOWN, map(np.asarray, planar), strict=True))
+        if (cloud := kept_map.cloud) is not None:
+            in_space = cloud.points, cloud.p_static, cloud.route, cloud.stands
+            arrays |= dict(zip(_KNOWN_CLOUD, in_space, strict=True))
     return arrays
 
 
@@ -152,7 +159,7 @@ def read_drive(folder: Path) -> Snapshot:
 
 def remove_drive(folder: Path) -> None:
     """Remove the files that `keep_drive` has made, and the folder if it holds nothing else."""
-    known = {_RECORD, *(f"{name}.npy" for name in _ARRAYS)}
+    known = {_RECORD, *(f"{name}.npy" for name in (*_SCANS, *_KNOWN, *_KNOWN_CLOUD))}
     for path in list(folder.iterdir()):
         if path.name in known or path.name.rpartition("-")[0] in _BEAMS:
             path.unlink()
@@ -163,7 +170,7 @@ def remove_drive(folder: Path) -> None:
 def _read(folder: Path, record: _Record) -> Snapshot:
     D = record["dimension"]
     number, counts, answers, poses, submap = given = [
-        open_npy(folder / f"{name}.npy") for name in _ARRAYS[:5]
+        open_npy(folder / f"{name}.npy") for name in _SCANS
     ]
     sensors = [(one["name"], np.array(one["T_base_sensor"], float)) for one in record["sensors"]]
     _check_arrays(D, record["rows"], given)
@@ -185,8 +192,8 @@ def _read(folder: Path, record: _Record) -> Snapshot:
         record["disk_was_full"],
     )
     options = config.override(Options(), record["options"], str(folder / _RECORD))
-    extended = _read_extended(folder, record["extended"])
-    return Snapshot(kept, Placement(poses, submap), options, None, extended)
+    kept_map = _read_kept_map(folder, record["extended"], D)
+    return Snapshot(kept, Placement(poses, submap), options, None, kept_map)
 
 
 def _check_arrays(D: int, rows: list[int], given: list[NDArray[Any]]) -> None:
@@ -222,17 +229,23 @@ def _check_sensors(D: int, mounts: list[NDArray[Any]], sensor: NDArray[np.int32]
         raise ValueError("a scan is of no sensor")
 
 
-def _read_extended(
-    folder: Path, about: dict[str, Any] | None
-) -> tuple[GridMap, NDArray[np.floating]] | None:
+def _read_kept_map(folder: Path, about: dict[str, Any] | None, dimension: int) -> KeptMap | None:
     if about is None:
         return None
     check(about, dict[str, float | list[float]])
-    p_occupied, hits = (open_npy(folder / f"{name}.npy") for name in ("p_occupied", "hits"))
+    p_occupied, hits = (open_npy(folder / f"{name}.npy") for name in _KNOWN)
     x, y, yaw = about["origin"]
     if p_occupied.shape != hits.shape:
         raise ValueError("its known map does not fit")
-    return GridMap(p_occupied, (x, y, yaw), about["resolution"]), hits
+    cloud = None
+    if dimension == 3:
+        given = [open_npy(folder / f"{name}.npy") for name in _KNOWN_CLOUD]
+        cloud = KeptCloud(*given)
+        n, route = len(cloud.points), len(cloud.route)
+        shapes = [(n, 3), (n,), (route, 4, 4), p_occupied.shape]
+        if [one.shape for one in given] != shapes or [one.dtype for one in given] != _CLOUD_TYPES:
+            raise ValueError("its known cloud does not fit")
+    return KeptMap(GridMap(p_occupied, (x, y, yaw), about["resolution"]), hits, cloud)
 
 
 def _map(path: Path, rows: int, kind: DTypeLike, row: tuple[int, ...]) -> NDArray[Any]:

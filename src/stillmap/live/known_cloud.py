@@ -1,6 +1,7 @@
 """A map in 3D from an earlier run, for localization: what stands, and where it was mapped from."""
 
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -8,13 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
+from stillmap.core.array_files import open_npy
 from stillmap.core.errors import InputError
 from stillmap.core.local_frame import LocalFrame
-from stillmap.em import GroundMap
+from stillmap.em import CellProbabilities, GroundMap
 from stillmap.em.ground import fit_ground
 from stillmap.io.trajectory import read_tum
+from stillmap.live.cloud_extension import ROUTE, KeptCloud
 from stillmap.live.known_map import LOG_RATIO, KnownMap
-from stillmap.live.map_view import is_level
+from stillmap.live.map_extension import KeptMap
+from stillmap.live.map_view import STANDS, is_level
+from stillmap.places.beam_cells import cell_keys
 from stillmap.results.point_cloud import cloud_from_folder
 from stillmap.slam import lidar_odometry
 
@@ -24,6 +29,7 @@ Index = NDArray[np.int64]
 _SPACING = 0.1  # m between the points that are kept: where sweeps are dense, all would be one ring
 # m by which the route is raised for the ground: the robot's base may lie in it
 _RAISE = 1.0
+_ROUTE_SPACING = 0.5  # m between the poses that are kept of a route
 _GROUND_CELL = 0.3  # m, of the level surface that shows the ground
 
 
@@ -48,6 +54,7 @@ class KnownCloud:
     Attributes:
         planar: the planar map, in whose frame all is.
         poses: (T, 4, 4) T_map_base from where it was mapped.
+        ground: its height.
         points: (N, 3) float32 where surface runs, m, in random order.
         p_static: (N,) float32.
 
@@ -66,6 +73,7 @@ class KnownCloud:
         # cells of planes take in so many points only, which must not all lie on one side
         order = np.random.default_rng(0).permutation(len(points))
         self.points, self.p_static = points[order], p_static[order]
+        self.ground = self._find_ground()
 
     def make_local_map(self) -> _core.NdtMap3D:
         """The map that sweeps are registered to."""
@@ -84,11 +92,50 @@ class KnownCloud:
         cells = np.concatenate([surface, self._free_voxels(edge, band)])
         return KnownVoxels(np.ascontiguousarray(cells), np.arange(len(cells)) < len(surface))
 
+    def keep(
+        self, now: CellProbabilities | None, edge: float, band: tuple[float, float]
+    ) -> KeptMap:
+        """What still stands of it.
+
+        Args:
+            now: P(static and occupied) of the voxels of `find_voxels`, and of others; None: all
+                that is known still stands.
+            edge: m, of a voxel.
+            band: as of `find_voxels`.
+        """
+        stands, planar = np.ones(len(self.points), np.bool_), self.planar
+        if now is not None:
+            stands = _look_up(now, self.points, edge) >= STANDS
+        grid, hits = planar.in_map_frame, np.array(planar.hits)
+        z = self.points[:, 2] - self.ground.height_at(self.points[:, :2].astype(np.float64))
+        is_obstacle = (z >= band[0]) & (z <= band[1])
+        there, gone = (
+            self._columns(self.points[is_obstacle & which]) for which in (stands, ~stands)
+        )
+        gone &= ~there & grid.occupied
+        p_occupied = np.where(gone, np.float32(0.0), grid.p_occupied)
+        hits[gone] = 0.0
+        cloud = KeptCloud(
+            planar.frame.points_to_map(self.points[stands]),
+            self.p_static[stands],
+            planar.frame.to_map(thin_route(self.poses)),
+            there & grid.occupied,
+        )
+        return KeptMap(replace(grid, p_occupied=p_occupied), hits, cloud)
+
+    def _columns(self, points: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """(H, W) cells of the planar map in which points (N, 3) lie."""
+        out = np.zeros(self.planar.grid.p_occupied.shape, np.bool_)
+        at = self.planar.grid.cells(points[:, :2].astype(np.float64))
+        row, column = at[((at >= 0) & (at < out.shape)).all(axis=1)].T
+        out[row, column] = True
+        return out
+
     def _free_voxels(self, edge: float, band: tuple[float, float]) -> Index:
         """(K, 3) voxels that lie in the band of columns which are free."""
-        grid, ground = self.planar.grid, self._find_ground()
+        grid = self.planar.grid
         columns = _cells_of(grid.centres(np.argwhere(grid.free)), edge)
-        height = ground.height_at(np.asarray((columns + 0.5) * edge, np.float64))
+        height = self.ground.height_at(np.asarray((columns + 0.5) * edge, np.float64))
         first = np.ceil((height + band[0]) / edge).astype(np.int64)
         last = np.floor((height + band[1]) / edge).astype(np.int64)
         counts = np.maximum(last - first, 0)
@@ -103,14 +150,40 @@ class KnownCloud:
         return fit_ground(floor, self.poses[:, :3, 3] + [0.0, 0.0, _RAISE])
 
 
+def thin_route(poses: Float) -> Float:
+    """(K, 4, 4) of poses (T, 4, 4), the first in each cube of `_ROUTE_SPACING`."""
+    cubes = np.floor(poses[:, :3, 3] / _ROUTE_SPACING).astype(np.int64)
+    _, first = np.unique(cubes, axis=0, return_index=True)
+    return poses[np.sort(first)]
+
+
+def _look_up(now: CellProbabilities, points: NDArray[np.float32], edge: float) -> Float:
+    """(N,) probabilities of the cells in which points (N, 3) lie; 1: nothing is known of it."""
+    keys = cell_keys(now.cells)
+    order = np.argsort(keys)
+    sought = cell_keys(np.floor(points / edge).astype(np.int64))
+    at = np.minimum(np.searchsorted(keys, sought, sorter=order), len(keys) - 1)
+    found = order[at]
+    return np.where(keys[found] == sought, now.p_occupied[found], 1.0)
+
+
 def _read_route(folder: Path) -> Float:
-    """(T, 4, 4) poses of a result, or of all sessions of a place."""
+    """(T, 4, 4) poses of a result and of a map that it extends, or of all sessions of a place."""
     single = folder / "trajectory.tum"
     paths = [single] if single.exists() else sorted(folder.glob("sessions/*/trajectory.tum"))
     poses = [read_tum(path)[1] for path in paths]
+    if (folder / ROUTE).exists():
+        poses.append(_check_route(folder / ROUTE))
     if not sum(map(len, poses)):
         raise InputError("holds no trajectory", where=str(folder))
     return np.concatenate(poses)
+
+
+def _check_route(path: Path) -> Float:
+    route = open_npy(path)
+    if route.dtype != np.float64 or route.shape[1:] != (4, 4) or not np.isfinite(route).all():
+        raise InputError("holds no poses", where=str(path))
+    return route
 
 
 def _read_points(

@@ -1,12 +1,15 @@
 """The map of an extended place: what this run saw, and what the known map shows elsewhere."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.grid_map import GridMap
+from stillmap.core.short_repr import ShortRepr
 from stillmap.em import OccupancyMap
+from stillmap.live.cloud_extension import KeptCloud, write_extended_cloud
 from stillmap.pipeline.options import MapMode
 from stillmap.results.map_npz import write_map_npz
 from stillmap.results.map_server import write_map_server
@@ -14,49 +17,100 @@ from stillmap.results.map_server import write_map_server
 Layer = NDArray[np.float32]
 
 
-def extend_map(known: GridMap, hits: NDArray[np.floating], seen: OccupancyMap) -> OccupancyMap:
-    """The known map, where this run saw cells replaced by what it saw.
+@dataclass(frozen=True, eq=False)
+class KeptMap(ShortRepr):
+    """What is kept of a known map that is extended, in its map frame.
+
+    Attributes:
+        grid: the planar map.
+        hits: (H, W) its sums of hits.
+        cloud: of a map in 3D, what still stands.
+    """
+
+    grid: GridMap
+    hits: NDArray[np.floating]
+    cloud: KeptCloud | None = None
+
+
+class Overlay:
+    """The box around two maps with the same axes and cells, one of which lies on the other.
 
     Args:
-        known: a map whose axes are those of `seen`.
-        hits: (H, W) its sums of hits.
-        seen: the map of this run.
+        below, above: the maps.
     """
-    corners = [
-        np.round(np.array(one.origin[1::-1]) / seen.resolution).astype(int) for one in (known, seen)
-    ]
-    low = np.minimum(*corners)
-    high = np.maximum(
-        corners[0] + known.p_occupied.shape, corners[1] + np.array(seen.p_occupied.shape)
-    )
-    at = [
-        tuple(slice(a, a + n) for a, n in zip((corner - low).tolist(), shape, strict=True))
-        for corner, shape in zip(
-            corners, (known.p_occupied.shape, seen.p_occupied.shape), strict=True
-        )
-    ]
-    looked = ~np.isnan(np.asarray(seen.p_occupied))
 
-    def lay(fill: float, below: NDArray[np.floating], above: Layer) -> Layer:
-        out = np.full(tuple((high - low).tolist()), fill, np.float32)
-        out[at[0]] = below
-        out[at[1]][looked] = np.asarray(above)[looked]
+    def __init__(self, below: GridMap, above: GridMap) -> None:
+        edge = above.resolution
+        shapes = [np.array(one.p_occupied.shape) for one in (below, above)]
+        corners = [
+            np.round(np.array(one.origin[1::-1]) / edge).astype(int) for one in (below, above)
+        ]
+        low = np.minimum(*corners)
+        high = np.maximum(*(a + n for a, n in zip(corners, shapes, strict=True)))
+        self.shape = tuple((high - low).tolist())
+        y, x = (low * edge).tolist()
+        self.origin = (x, y, 0.0)
+        self._below, self._above = (
+            tuple(slice(a, a + n) for a, n in zip((corner - low).tolist(), shape, strict=True))
+            for corner, shape in zip(corners, np.array(shapes).tolist(), strict=True)
+        )
+
+    def lay(
+        self,
+        fill: float,
+        below: NDArray[np.floating],
+        above: NDArray[np.floating],
+        use: NDArray[np.bool_],
+    ) -> Layer:
+        """A layer of both: `above` where `use`, `below` elsewhere, `fill` where there is none."""
+        out = np.full(self.shape, fill, np.float32)
+        out[self._below] = below
+        out[self._above][use] = np.asarray(above)[use]
         return out
 
-    y, x = (low * seen.resolution).tolist()
+    def find_below(self, fill: float, below: NDArray[np.floating]) -> Layer:
+        """What the map below shows in the cells of the one above; `fill` where there is none."""
+        out = np.full(self.shape, fill, np.float32)
+        out[self._below] = below
+        return out[self._above]
+
+
+def overlay(below: GridMap, above: GridMap) -> GridMap:
+    """A map on which another one lies, where that one is known."""
+    box = Overlay(below, above)
+    seen = np.asarray(above.p_occupied)
+    p_occupied = box.lay(np.nan, below.p_occupied, seen, ~np.isnan(seen))
+    return GridMap(p_occupied, box.origin, above.resolution)
+
+
+def extend_map(kept: KeptMap, seen: OccupancyMap) -> OccupancyMap:
+    """The known map, where this run saw cells replaced by what it saw. Of a map in 3D, cells stay
+    occupied where the known one shows what this run did not see through: it may have looked over
+    it.
+
+    Args:
+        kept: a map whose axes are those of `seen`.
+        seen: the map of this run.
+    """
+    known, p = kept.grid, np.asarray(seen.p_occupied)
+    box, use = Overlay(known, seen), ~np.isnan(p)
+    if kept.cloud is not None:
+        standing = np.where(kept.cloud.stands, known.p_occupied, np.nan)
+        use &= ~(box.find_below(np.nan, standing) > p)
     return OccupancyMap(
-        lay(np.nan, known.p_occupied, seen.p_occupied),
-        (x, y, 0.0),
+        box.lay(np.nan, known.p_occupied, p, use),
+        box.origin,
         seen.resolution,
-        lay(0.0, hits, seen.alpha),
-        lay(0.0, np.zeros_like(hits), seen.beta),
+        box.lay(0.0, kept.hits, seen.alpha, use),
+        box.lay(0.0, np.zeros_like(kept.hits), seen.beta, use),
     )
 
 
-def write_extended(
-    folder: Path, known: GridMap, hits: NDArray[np.floating], seen: OccupancyMap, mode: MapMode
-) -> None:
-    """Replace `map.npz`, `map.yaml` and the picture of a result by those of the extended map."""
-    extended = extend_map(known, hits, seen)
+def write_extended(folder: Path, kept: KeptMap, seen: OccupancyMap, mode: MapMode) -> None:
+    """Replace `map.npz`, `map.yaml` and the picture of a result by those of the extended map, and
+    in 3D its cloud."""
+    extended = extend_map(kept, seen)
     write_map_server(folder, extended, mode)
     write_map_npz(folder / "map.npz", extended)
+    if kept.cloud is not None:
+        write_extended_cloud(folder, kept.cloud, seen.resolution)

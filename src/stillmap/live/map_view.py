@@ -10,7 +10,7 @@ from stillmap.mapping.projection import project_cells
 
 Float = NDArray[np.float64]
 
-_STANDS = 0.5  # P(static and occupied) of a cell that counts as surface
+STANDS = 0.5  # P(static and occupied) of a cell that counts as surface
 
 
 def empty_map(resolution: float) -> GridMap:
@@ -31,7 +31,7 @@ def project_obstacles(
         band: m above the ground, lowest and highest of obstacles.
         cell: m, edge of a cell.
     """
-    stands = known.p_occupied >= _STANDS
+    stands = known.p_occupied >= STANDS
     if not stands.any():
         return empty_map(cell)
     cells = known.cells[stands]
@@ -49,7 +49,7 @@ def project_obstacles(
 
 def find_ground(known: CellProbabilities, positions: Float, cell: float) -> GroundMap:
     """The ground, as level surface shows it; see `project_obstacles`."""
-    cells = known.cells[known.p_occupied >= _STANDS].reshape(-1, 3)
+    cells = known.cells[known.p_occupied >= STANDS].reshape(-1, 3)
     floor = cells[is_level(cells)] if len(cells) else cells
     return fit_ground(np.asarray((floor + 0.5) * cell, np.float64), positions)
 

@@ -56,7 +56,7 @@ class LiveMapper:
     Raises:
         InputError: the place has no map, an empty one, or in mode "extend" one of other cells.
             Likewise `push` of a first sweep of a lidar, if it is of a planar laser, or in mode
-            "extend".
+            "extend" has other voxels.
 
     Examples:
         >>> with stillmap.LiveMapper() as mapper:
@@ -205,10 +205,8 @@ class LiveMapper:
         slam = self._pushed
         kept = slam.history.snapshot()
         placement = slam.placement().select(kept.number)
-        extended = None
-        if self._known is not None and self._mode == "extend":
-            extended = self._known.in_map_frame, self._known.hits
-        return Snapshot(kept, placement, self.options, self._scratch, extended)
+        kept_map = slam.keep_map() if self._mode == "extend" else None
+        return Snapshot(kept, placement, self.options, self._scratch, kept_map)
 
     def finish(self, progress: Progress = no_progress) -> BuiltResult:
         """The result of `stillmap.build` on all scans: poses, labels and map refined.
@@ -236,6 +234,8 @@ class LiveMapper:
             self._slam.close()
         place = None
         if self._source is not None and self._known is not None:
+            if self._mode == "extend" and dimension == 3:
+                self.options = adopt_resolution(self.options, self._known, 3)
             place = make_tracker(self._source, self._known, self._mode, dimension, self.options)
         return OnlineSlam(
             dimension,

@@ -18,6 +18,7 @@ from stillmap.live.local_map import MappedScan
 from stillmap.live.loop_closer import NoLoops
 from stillmap.live.loop_process import start_closer
 from stillmap.live.map_correction import LabelledScan
+from stillmap.live.map_extension import KeptMap
 from stillmap.live.map_frame import LoopClosing, MapFrame, rotate_covariance
 from stillmap.live.movers import Mover, MoverTracker
 from stillmap.live.observation import BeamSelector, Observation, find_margins
@@ -143,6 +144,10 @@ class OnlineSlam:
         if self._place is not None and self._place.frame.is_shifted:
             poses = np.where((submaps == 0)[:, None, None], self._place.frame.to_map(poses), poses)
         return Placement(poses, submaps)
+
+    def keep_map(self) -> KeptMap | None:
+        """What is kept of a known map that is extended, as it is known now; None: there is none."""
+        return None if self._place is None else self._place.keep(self.labels)
 
     @property
     def known_frame(self) -> LocalFrame:

@@ -15,6 +15,7 @@ from stillmap.live.causal_labels import CausalLabels, OccupancyFilter, take_over
 from stillmap.live.global_localization import MIN_AGREE_ANYWHERE, GlobalLocalizer, Localization
 from stillmap.live.known_cloud import KnownCloud
 from stillmap.live.known_map import KnownLocalMap, KnownMap
+from stillmap.live.map_extension import KeptMap
 from stillmap.live.sweep_localization import SweepLocalizer
 from stillmap.pipeline.options import DEFAULTS, Options
 from stillmap.slam.scan_hits import Scan
@@ -23,17 +24,22 @@ Float = NDArray[np.float64]
 Mode = Literal["localise", "extend"]
 
 
-def adopt_resolution(options: Options, known: KnownMap) -> Options:
-    """The options with the edge of the cells of a map that is extended.
+def adopt_resolution(options: Options, known: KnownMap, dimension: int = 2) -> Options:
+    """The options with the edge of the cells of a map that is extended, in 3D of its voxels.
 
     Raises:
         InputError: they ask for another one.
     """
-    edge, wanted = known.resolution, options.slam.resolution
-    if not np.isclose(wanted, [edge, DEFAULTS.slam.resolution]).any():
-        hint = f"it is extended with slam.resolution={edge:g}"
+    name = "resolution" if dimension == 2 else "voxel_size"
+    edge, wanted, default = (
+        known.resolution,
+        getattr(options.slam, name),
+        getattr(DEFAULTS.slam, name),
+    )
+    if wanted != default and not np.isclose(wanted, edge):
+        hint = f"it is extended with slam.{name}={edge:g}"
         raise InputError(f"the map has cells of {edge:g} m", hint=hint)
-    return config.override(options, {"slam": {"resolution": edge}})
+    return config.override(options, {"slam": {name: edge}})
 
 
 def make_tracker(
@@ -49,34 +55,42 @@ def make_tracker(
         options: see Options.
 
     Raises:
-        InputError: scans in 3D, and the place is of a planar laser, or is to be extended.
+        InputError: scans in 3D, and the place is of a planar laser.
     """
+    extends = mode == "extend"
     if dimension == 2:
-        return PlaceTracker(PlanarLocalizer(known, mode == "extend"), known.frame)
-    if mode == "extend":
-        hint = 'mode "localise" takes sweeps'
-        raise InputError("only planar maps can be extended", where=str(source), hint=hint)
+        return PlaceTracker(PlanarLocalizer(known, extends), known.frame)
     threads = resolve_threads(options.threads)
-    localizer = SweepLocalizer(KnownCloud(source, known), options, threads)
+    localizer = SweepLocalizer(KnownCloud(source, known), extends, options, threads)
     return PlaceTracker(localizer, known.frame)
 
 
 class Localizer(Protocol):
     """A known map in 2D or 3D, and the search in it: `PlanarLocalizer`, `SweepLocalizer`."""
 
-    route: Float  # (T, D) from where it was mapped; empty in 2D, where nobody asks
+    @property
+    def route(self) -> Float:
+        """(T, D) from where it was mapped; empty in 2D, where nobody asks."""
 
     def localize(self, labels: CausalLabels, scan: Any, pose: Float, /) -> Localization:
         """The frame of the labels in the known map, by the last scan at its pose there."""
 
-    def forget(self) -> None:
-        """The robot was carried: what it saw before was elsewhere."""
+    def forget(self, labels: CausalLabels, was_lost: bool, /) -> None:
+        """The robot was carried: the labels, of what was seen so far, begin anew.
+
+        Args:
+            labels: of the map; where the robot was lost already, of elsewhere.
+            was_lost: that it was.
+        """
 
     def make_local_map(self) -> Any:
         """The map that scans are matched against once the robot is found."""
 
-    def prime(self, labels: OccupancyFilter, /) -> None:
-        """Tell the filters of cells what the map knows."""
+    def known_filter(self, empty: OccupancyFilter, /) -> OccupancyFilter:
+        """Filters of cells with what the map knows; `empty`: such of the same kind."""
+
+    def keep(self, labels: CausalLabels, is_lost: bool, /) -> KeptMap:
+        """What is kept of a map that is extended, by what is known now; arguments: see `forget`."""
 
 
 class PlanarLocalizer:
@@ -88,26 +102,36 @@ class PlanarLocalizer:
     """
 
     def __init__(self, known: KnownMap, extends: bool) -> None:
-        self.route = np.zeros((0, 2))
         self._known, self._extends = known, extends
         self._search = GlobalLocalizer(known, sure_agree=MIN_AGREE_ANYWHERE)
+
+    @property
+    def route(self) -> Float:
+        """(0, 2)."""
+        return np.zeros((0, 2))
 
     def localize(self, labels: CausalLabels, scan: Scan, pose: Float) -> Localization:
         """(3, 3) of the frame of the labels in the known map, if the evidence is clear."""
         return self._search.localize(labels.to_view(), scan, pose)
 
-    def forget(self) -> None:
+    def forget(self, labels: CausalLabels, _was_lost: bool) -> None:
         """The robot was carried: the labels begin anew."""
         self._search.forget()
+        labels.clear()
 
     def make_local_map(self) -> KnownLocalMap:
         """The map that scans are matched against from now on."""
         return KnownLocalMap(self._known, self._extends)
 
-    def prime(self, labels: OccupancyFilter) -> None:
-        """Tell the filters of cells what the map knows."""
-        assert isinstance(labels, _core.OccupancyFilter2D)
-        self._known.prime(labels)
+    def known_filter(self, empty: OccupancyFilter) -> OccupancyFilter:
+        """The filters of cells with what the map knows."""
+        assert isinstance(empty, _core.OccupancyFilter2D)
+        self._known.prime(empty)
+        return empty
+
+    def keep(self, _labels: CausalLabels, _is_lost: bool) -> KeptMap:
+        """The map as it was."""
+        return KeptMap(self._known.in_map_frame, self._known.hits)
 
 
 class PlaceTracker:
@@ -133,10 +157,18 @@ class PlaceTracker:
         """(T, D) from where the map was made, in 3D, once the robot is found in it."""
         return self._localizer.route[:0] if self.is_lost else self._localizer.route
 
-    def lose(self) -> None:
-        """The robot was carried elsewhere."""
+    def lose(self, labels: CausalLabels) -> None:
+        """The robot was carried elsewhere: the labels begin anew."""
+        self._localizer.forget(labels, self.is_lost)
         self.is_lost = True
-        self._localizer.forget()
+
+    def keep(self, labels: CausalLabels) -> KeptMap:
+        """What is kept of a map that is extended, by what is known now.
+
+        Args:
+            labels: of what was seen so far.
+        """
+        return self._localizer.keep(labels, self.is_lost)
 
     def localize(self, labels: CausalLabels, scan: Any, pose: Float) -> Float | None:
         """(D+1, D+1) of the frame of the labels in the known map, if the evidence is clear.
@@ -159,8 +191,8 @@ class PlaceTracker:
 
     def enter(self, labels: CausalLabels, T: Float) -> None:
         """Let labels go on from the known map, with what was seen since the robot was lost."""
-        known, seen = labels.filter.sibling(), labels.filter
-        self._localizer.prime(known)
+        seen = labels.filter
+        known = self._localizer.known_filter(seen.sibling())
         tags = labels.tags
         take_over(known, seen, np.tile(T, (tags, 1, 1)), 0, seen.block_count)
         labels.filter = known

@@ -88,8 +88,7 @@ class RobotFinder:
             return
         frame.finish_correction(labels, odometry)
         if self._place is not None:
-            self._place.lose()
-            labels.clear()
+            self._place.lose(labels)
         elif self._dimension == 3:
             if self._left is None:
                 self._left = labels.filter, frame.spaced_poses()

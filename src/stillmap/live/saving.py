@@ -11,17 +11,17 @@ from numpy.typing import NDArray
 from stillmap.core.advice import advise
 from stillmap.core.arrays import write_npy
 from stillmap.core.files import nearest_folder_above
-from stillmap.core.grid_map import GridMap
 from stillmap.core.profiling import Progress, no_progress
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io.trajectory import write_tum
 from stillmap.live.history import Answers, KeptScans
-from stillmap.live.map_extension import write_extended
+from stillmap.live.map_extension import KeptMap, write_extended
 from stillmap.live.placement import Placement, take_scans
 from stillmap.pipeline.options import Options
 from stillmap.pipeline.result import map_recording
 from stillmap.results.result import BuiltResult
+from stillmap.results.run_json import EXTENDS
 from stillmap.results.save import save
 
 FOLDER = "live"
@@ -39,14 +39,14 @@ class Snapshot(ShortRepr):
         placement: where they were taken.
         options: see Options.
         scratch: folder of temporary files; None: the system's.
-        extended: the known map that is extended, and its (H, W) sums of hits; None: there is none.
+        kept_map: what is kept of the known map that is extended; None: there is none.
     """
 
     kept: KeptScans
     placement: Placement
     options: Options
     scratch: Path | None
-    extended: tuple[GridMap, NDArray[np.floating]] | None = None
+    kept_map: KeptMap | None = None
 
     def build(self, progress: Progress = no_progress) -> BuiltResult:
         """Labels, map and objects of the scans that are in the map, at these poses."""
@@ -101,14 +101,16 @@ class Snapshot(ShortRepr):
         warnings = self._describe_lost(recording.stamp_ns, len(others))
         for text in warnings:
             _log.warning(text)
+        kept_map = self.kept_map if main == 0 else None
         source = {**recording.source, "warnings": [*recording.source["warnings"], *warnings]}
         if warnings:
             source["lost_scans"] = int(np.count_nonzero(self.placement.submap))
+        if kept_map is not None and kept_map.cloud is not None:
+            source[EXTENDS] = True
         built = self._build(replace(recording, source=source), answers, main, progress)
         recording = replace(recording, source={**recording.source, "warnings": []})
         submaps = [self._build(recording, answers, one, no_progress) for one in others]
-        extended = self.extended if main == 0 else None
-        return LiveResult(*built, submaps, extended)
+        return LiveResult(*built, submaps, kept_map)
 
     def _build(
         self, recording: Recording, answers: Answers, submap: int, progress: Progress
@@ -157,13 +159,13 @@ class LiveResult(ShortRepr):
         result: labels, map and objects.
         given: what was answered at the time.
         submaps: the same of where the robot was lost.
-        extended: see `Snapshot`.
+        kept_map: see `Snapshot`.
     """
 
     result: BuiltResult
     given: Answers
     submaps: list[tuple[BuiltResult, Answers]]
-    extended: tuple[GridMap, NDArray[np.floating]] | None
+    kept_map: KeptMap | None
 
     def write(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
         """Write the result folder; see `Snapshot.save`."""
@@ -171,9 +173,9 @@ class LiveResult(ShortRepr):
 
     def _write_more(self, folder: Path) -> None:
         _write_answers(self.given, self.result.recording.stamp_ns, folder)
-        if self.extended is not None:
+        if self.kept_map is not None:
             mode = self.result.options.output.map_mode
-            write_extended(folder, *self.extended, self.result.map, mode)
+            write_extended(folder, self.kept_map, self.result.map, mode)
         for number, (result, given) in enumerate(self.submaps, 1):
             inside = folder / SUBMAPS / str(number)
             inside.parent.mkdir(exist_ok=True)

@@ -9,7 +9,11 @@ from stillmap.core import se2
 from stillmap.live.causal_labels import CausalLabels, OccupancyFilter
 from stillmap.live.global_localization import GlobalLocalizer, Localization
 from stillmap.live.known_cloud import KnownCloud
+from stillmap.live.known_map import KnownMap
+from stillmap.live.known_planes import KnownPlanes
 from stillmap.live.local_map import MappedScan
+from stillmap.live.map_extension import KeptMap, overlay
+from stillmap.live.map_view import project_obstacles
 from stillmap.live.sweep_view import SweepView
 from stillmap.pipeline.options import Options, resolve_resolution
 from stillmap.slam import lidar_odometry
@@ -30,34 +34,82 @@ class SweepLocalizer:
 
     Args:
         known: the map.
+        extends: whether sweeps are added to it.
         options: see Options.
         threads: the result does not depend on it.
     """
 
-    def __init__(self, known: KnownCloud, options: Options, threads: int) -> None:
+    def __init__(self, known: KnownCloud, extends: bool, options: Options, threads: int) -> None:
         output = options.output
         self._known, self._threads = known, threads
         self._band = output.min_obstacle_height, output.max_obstacle_height
-        edge = resolve_resolution(options, 3).slam.resolution
-        self._voxels = known.find_voxels(edge, self._band)
+        self._extends = extends
+        self._edge = resolve_resolution(options, 3).slam.resolution
+        self._voxels = known.find_voxels(self._edge, self._band)
         self._planar = GlobalLocalizer(known.planar, gone_weight=_GONE_WEIGHT)
-        self._planes = known.make_local_map()
-        self.route = known.poses[:, :3, 3]
-        self.forget()
+        self._local_map = KnownPlanes(known.make_local_map(), extends)
+        self._poses = known.poses  # from where it was mapped, and extended
+        # labels of all voxels when the robot was carried, in a map that is extended
+        self._left: OccupancyFilter | None = None
+        self._begin_search()
 
-    def forget(self) -> None:
-        """The robot was carried: what it saw before was elsewhere."""
+    def _begin_search(self) -> None:
         self._view = SweepView(self._band)
         self._seen = lidar_odometry.make_local_map()
 
-    def make_local_map(self) -> _core.NdtMap3D:
-        """The map that sweeps are registered to: one and the same, which they are not added to."""
-        return self._planes
+    @property
+    def route(self) -> Float:
+        """(T, 3) positions from where it was mapped, and extended before the robot was carried."""
+        return self._poses[:, :3, 3]
 
-    def prime(self, labels: OccupancyFilter) -> None:
-        """Tell the filters of voxels what the map knows."""
-        assert isinstance(labels, _core.SweepFilter3D)
-        self._voxels.prime(labels)
+    def forget(self, labels: CausalLabels, was_lost: bool) -> None:
+        """The robot was carried: the labels begin anew. A map that is extended is searched with
+        what they added, and they go on with it once the robot is found.
+
+        Args:
+            labels: of what was seen so far.
+            was_lost: of what was seen elsewhere.
+        """
+        self._begin_search()
+        if not self._extends:
+            labels.clear()
+            return
+        if not was_lost:
+            self._left = labels.filter
+            self._poses = np.concatenate([self._known.poses, self._local_map.route])
+            known, now = self._known.planar, labels.known_cells()
+            seen = project_obstacles(now, self.route, self._band, self._edge)
+            extended = KnownMap(overlay(known.grid, seen))
+            self._planar = GlobalLocalizer(extended, gone_weight=_GONE_WEIGHT)
+        labels.filter = labels.filter.sibling()
+
+    def make_local_map(self) -> KnownPlanes:
+        """The map that sweeps are registered to: one and the same."""
+        return self._local_map
+
+    def known_filter(self, empty: OccupancyFilter) -> OccupancyFilter:
+        """The filters of voxels with what the map knows.
+
+        Args:
+            empty: filters of the same kind.
+        """
+        if self._left is not None:
+            return self._left
+        assert isinstance(empty, _core.SweepFilter3D)
+        self._voxels.prime(empty)
+        return empty
+
+    def keep(self, labels: CausalLabels, is_lost: bool) -> KeptMap:
+        """What is kept of the map, by what is known now.
+
+        Args:
+            labels: of what was seen so far.
+            is_lost: they are of what was seen elsewhere.
+        """
+        if is_lost and self._left is None:  # it was never found
+            return self._known.keep(None, self._edge, self._band)
+        now = labels.known_cells(self._left if is_lost else None)
+        return self._known.keep(now, self._edge, self._band)
 
     def localize(self, labels: CausalLabels, scan: MappedScan, pose: Float) -> Localization:
         """(4, 4) of the frame of the labels in the known map, if the evidence is clear.
@@ -85,7 +137,7 @@ class SweepLocalizer:
             return found
         T_map_base = self._register(sweep, found.T @ in_plane)
         points = sweep.points.astype(np.float64)
-        overlap = plane_overlap(points, self._seen, pose, self._planes, T_map_base)
+        overlap = plane_overlap(points, self._seen, pose, self._local_map.planes, T_map_base)
         if overlap < MIN_PLANE_OVERLAP:
             return Localization(None)
         return Localization(T_map_base @ se2.inverse(pose))
@@ -93,14 +145,16 @@ class SweepLocalizer:
     def _register(self, sweep: Sweep, in_plane: Float) -> Float:
         """(4, 4) T_map_base of a sweep at a planar pose (3, 3) of the robot."""
         prior = State(self._lift(in_plane), np.zeros(6), np.diag(np.square(_STD)))
-        state, _ = lidar_odometry.register_sweep(self._planes, sweep, prior, self._threads)
+        state, _ = lidar_odometry.register_sweep(
+            self._local_map.planes, sweep, prior, self._threads
+        )
         return state.T_map_base
 
     def _lift(self, in_plane: Float) -> Float:
         """(4, 4) a planar pose (3, 3), as high and inclined as the route where it is nearest."""
         offset = in_plane[:2, 2] - self.route[:, :2]
         nearest = int(np.argmin(np.square(offset).sum(axis=1)))
-        up = self._known.poses[nearest, :3, 2]
+        up = self._poses[nearest, :3, 2]
         slope = -up[:2] / up[2]
         x = np.append(in_plane[:2, 0], slope @ in_plane[:2, 0])
         x /= np.linalg.norm(x)

@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-import stillmap._core as _core
 from stillmap.core import se2, se3
 from stillmap.live.front_end import Registration
+from stillmap.live.known_planes import KnownPlanes
 from stillmap.live.local_map import Labeller, MappedScan
 from stillmap.live.scan import ScanBeams, take_beams
 from stillmap.slam import constant_velocity, lidar_odometry
@@ -48,7 +48,7 @@ class SweepOdometry:
         self._is_slipping = False
         self._cropped_at = np.zeros(3)
         self._since = np.inf  # travel since the last keyframe, in units of their spacing
-        self._is_known = False  # the local map is one to localize in, which stays as it is
+        self._known: KnownPlanes | None = None  # the local map is that of a known one
         self._first, self._knows_first = list[tuple[int, Sweep]](), False  # stamps and sweeps
 
     def predict(self, beams: ScanBeams, increment: Float | None) -> State:
@@ -130,8 +130,10 @@ class SweepOdometry:
         kept, state = take_beams(beams, self._kept), self._state
         T, weights = kept.T_base_sensor, e[self._kept]
         in_base = (kept.points @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
-        if not self._is_known:
+        if self._known is None:
             self._add(in_base, weights)
+        else:
+            self._known.add(in_base, weights, state.T_map_base)
         if self._since < 1.0 or not weights.any():
             return None
         self._since = 0.0
@@ -146,9 +148,9 @@ class SweepOdometry:
             self._cropped_at = here.copy()
             self.local_map.crop(state.T_map_base, lidar_odometry.MAX_RANGE)
 
-    def enter(self, local_map: _core.NdtMap3D, T: Float) -> None:
+    def enter(self, known: KnownPlanes, T: Float) -> None:
         """Go on in a known map, in whose frame the frame so far has the pose T (4, 4)."""
-        self.local_map, self._is_known, self._knows_first = local_map, True, True
+        self.local_map, self._known, self._knows_first = known.planes, known, True
         state, covariance = self._state, self._state.covariance.copy()
         covariance[:6, :6] += np.diag(np.square(np.repeat(_FOUND_STD, 3)))
         self._state = State(T @ state.T_map_base, state.twist, covariance)
@@ -179,7 +181,7 @@ class SweepOdometry:
     def _start_anew(self) -> None:
         self.left_behind, self.local_map = self.local_map, lidar_odometry.make_local_map()
         self._usual, self._contradictions, self._since = 0.0, 0, np.inf
-        self._is_known = False
+        self._known = None
 
     def _note_first(self, stamp_ns: int, hits: Sweep) -> None:
         """Register the first sweeps again once the motion during the first one is known: it was

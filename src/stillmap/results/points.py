@@ -1,5 +1,6 @@
 """`static.ply` and `dynamic.ply`: the end points of a 3D recording in the map frame."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ from numpy.typing import NDArray
 from stillmap.core.arrays import iter_blocks
 from stillmap.core.recording import Recording
 from stillmap.em.types import DYNAMIC_BELOW
+from stillmap.io.point_cloud.ply import read_layout
 from stillmap.results.point_cloud import Block, Cloud, cloud_from_recording
 
 Fields = list[tuple[str, str]]  # names and types
@@ -55,6 +57,23 @@ def write_clouds(
                 moving.write(vertices[moves].tobytes())
 
 
+def append_vertices(path: Path, block: Block) -> None:
+    """Append points to a cloud that `write_clouds` wrote; colours, where it has them, are black.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    layout, whole = read_layout(path), path.with_suffix(".whole")
+    fields = [(one.name, one.dtype.str.lstrip("|")) for one in layout.fields]
+    with path.open("rb") as before, whole.open("wb") as file:
+        file.write(ply_header(fields, layout.rows + len(block.points)))
+        before.seek(layout.start)
+        shutil.copyfileobj(before, file)
+        for part in block.split(_BLOCK):
+            file.write(make_vertices(part, fields).tobytes())
+    whole.replace(path)
+
+
 def cloud_fields(cloud: Cloud, colours: Fields) -> Fields:
     """FIELDS of the points of a cloud, with `colours` where it has them; those of one that is far
     from the origin have coordinates of 64 bits."""
@@ -83,7 +102,7 @@ def put_colours(vertices: NDArray[np.void], colours: NDArray[np.uint8]) -> None:
 
 def make_vertices(block: Block, fields: Fields) -> NDArray[np.void]:
     """(n,) points with FIELDS and, for colours, COLOURS or PACKED_COLOUR."""
-    vertices = np.empty(len(block.points), fields)
+    vertices = np.zeros(len(block.points), fields)
     vertices["x"], vertices["y"], vertices["z"] = block.points.T
     vertices["p_static"] = block.p_static
     if block.colors is not None and fields[-1:] == PACKED_COLOUR:

@@ -80,6 +80,7 @@ def quality_record(quality: Quality) -> dict[str, float | None]:
 
 
 RECORD = "run.json"  # every result has it
+EXTENDS = "extends_map"  # of the input: the result holds what still stands of a known map, too
 LOCAL_ORIGIN = "local_origin"  # its entry, where what it was computed in was not the map frame
 TILTING = "tilting"  # its entry, and the folder, of 3D data of a rig's tilting laser
 

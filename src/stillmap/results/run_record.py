@@ -18,7 +18,7 @@ from stillmap.mesh.options import MeshOptions
 from stillmap.pipeline.options import MapMode, Options, OutputOptions
 from stillmap.pipeline.quality import Quality
 from stillmap.preprocessing.options import ReadOptions
-from stillmap.results.run_json import LOCAL_ORIGIN, RECORD
+from stillmap.results.run_json import EXTENDS, LOCAL_ORIGIN, RECORD
 from stillmap.slam import SlamOptions
 
 T = TypeVar("T")
@@ -126,6 +126,11 @@ class RunRecord(ShortRepr):
         if noted in (2, 3):
             return int(noted)
         return 3 if (self.folder / _STATIC_CLOUD).is_file() else 2
+
+    @property
+    def extends_map(self) -> bool:
+        """True if its clouds hold what its recording does not show: it extends a known map."""
+        return self.record["input"].get(EXTENDS) is True
 
     @property
     def n_sensors(self) -> int:

@@ -1,0 +1,260 @@
+"""A map in 3D that is extended: what was known and is not seen again stays in it, what was taken
+away does not, what is new comes in, and nobody who walked through."""
+
+import json
+from dataclasses import replace
+from itertools import islice
+
+import numpy as np
+import pytest
+from result_contents import contents
+from rooms_3d import (
+    AND_BACK,
+    BOTH_ROOMS,
+    CAME,
+    DOOR,
+    FIRST_ROOM,
+    GONE,
+    is_of,
+    run_through_rooms,
+    static_ends,
+    to_world,
+    true_poses,
+)
+from scipy.spatial import cKDTree
+
+import stillmap
+from stillmap.cli.main import main
+from stillmap.core.errors import InputError
+from stillmap.core.grid_map import GridMap
+from stillmap.em import OccupancyMap
+from stillmap.io import stillmap_folder
+from stillmap.io.point_cloud.ply import read_layout
+from stillmap.live.cloud_extension import KeptCloud, write_extended_cloud
+from stillmap.live.drive_folder import keep_drive, read_drive
+from stillmap.live.known_cloud import KnownCloud
+from stillmap.live.known_map import KnownMap
+from stillmap.live.map_extension import KeptMap, extend_map
+from stillmap.live.mapper import LiveMapper
+from stillmap.live.replay import iter_beams
+from stillmap.results.point_cloud import Block, cloud_from_folder
+from stillmap.results.points import FIELDS, coordinate_fields, make_vertices, ply_header
+
+EDGE = 0.15  # m, of a voxel
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory):
+    """The first run, and the folder of its map; the second run."""
+    first = run_through_rooms(GONE, FIRST_ROOM, 70, 1)
+    folder = tmp_path_factory.mktemp("rooms") / "known"
+    options = {"threads": 1, "em.max_iterations": 1, "objects.enabled": False}
+    stillmap.build(first.recording, options).save(folder)
+    return first, folder, run_through_rooms(CAME, (*BOTH_ROOMS, *AND_BACK), 250, 101)
+
+
+@pytest.fixture(scope="module")
+def drive(rooms, tmp_path_factory):
+    """The second run extends the map: mapper, updates, folder."""
+    _, known, second = rooms
+    folder = tmp_path_factory.mktemp("extended") / "out"
+    options = {"threads": 1, "objects.enabled": False}
+    with LiveMapper(options, place=known, mode="extend") as mapper:
+        updates = [mapper.push(beams) for beams in iter_beams(second.recording)]
+        mapper.save(folder)
+        yield mapper, updates, folder
+
+
+def read_cloud(folder):
+    blocks = cloud_from_folder(folder, "static").iter_blocks()
+    return np.concatenate([block.points for block in blocks])
+
+
+def voxels(points):
+    return (np.unique(np.floor(points / EDGE).astype(np.int64), axis=0) + 0.5) * EDGE
+
+
+def share_near(points, others, most=EDGE):
+    """Share of points that have one of the others near."""
+    near = cKDTree(others).query(points, distance_upper_bound=most)[0]
+    return float(np.isfinite(near).mean())
+
+
+def test_it_is_localized_beyond_the_known_map_and_back(rooms, drive):
+    first, _, second = rooms
+    _, updates, _ = drive
+    lost = np.array(["lost" in one.doubts for one in updates])
+    found = int(np.argmin(lost))
+    assert found < 40
+    assert not lost[found:].any()
+    given, true = np.array([one.pose for one in updates]), true_poses(first, second)
+    off = np.linalg.norm((given - true)[:, :3, 3], axis=1)
+    x = second.truth.T_world_base[:, 0, 3]
+    assert (x > DOOR + 5.0).sum() > 20
+    assert off[found:].max() < 0.15
+    assert x[-1] < DOOR
+    assert off[-1] < 0.08
+
+
+def test_the_cloud_shows_old_and_new_in_one_frame(rooms, drive):
+    first, known, second = rooms
+    before, now = static_ends(first), static_ends(second)
+    truth = np.concatenate([before[~is_of(before, GONE)], now])
+    extended = to_world(first, read_cloud(drive[2]))
+    assert share_near(voxels(truth), extended) > 0.97
+    assert share_near(voxels(truth), to_world(first, read_cloud(known))) < 0.8
+    # nobody who walked through either run
+    assert share_near(voxels(extended), truth[::3], 0.25) > 0.995
+
+
+def test_what_was_not_seen_again_stays(rooms, drive):
+    first, known, second = rooms
+    before, now = static_ends(first), static_ends(second)
+    unseen = voxels(before[~is_of(before, GONE)])
+    unseen = unseen[cKDTree(now[::3]).query(unseen)[0] > 0.3]
+    assert len(unseen) > 200
+    assert share_near(unseen, to_world(first, read_cloud(known))) > 0.98
+    assert share_near(unseen, to_world(first, read_cloud(drive[2]))) > 0.95
+
+
+def test_what_was_taken_away_is_gone_and_what_was_brought_is_there(rooms, drive):
+    first, known, _ = rooms
+    mapper, _, folder = drive
+    clouds = {
+        name: to_world(first, read_cloud(one)) for name, one in (("was", known), ("is", folder))
+    }
+    assert is_of(clouds["was"], GONE).sum() > 500
+    assert is_of(clouds["is"], GONE).sum() == 0
+    assert is_of(clouds["was"], CAME).sum() == 0
+    assert is_of(clouds["is"], CAME).sum() > 500
+    saved = stillmap.load(folder)
+    for grid in (saved.map, mapper.map):
+        occupied = occupied_of(first, grid)
+        assert is_of(occupied, GONE).sum() <= 1
+    occupied = occupied_of(first, saved.map)
+    assert is_of(occupied, CAME).sum() > 10
+    assert (occupied[:, 0] > DOOR + 5.0).sum() > 100
+    assert is_of(occupied_of(first, stillmap.load(known).map), GONE).sum() > 50
+
+
+def occupied_of(first, grid):
+    """(N, 3) occupied cells of a map, half a metre high, in the world."""
+    row, column = np.nonzero(grid.p_occupied > 0.65)
+    xy = (np.stack([column, row], axis=1) + 0.5) * grid.resolution + grid.origin[:2]
+    out = to_world(first, np.column_stack([xy, np.zeros(len(xy))]))
+    out[:, 2] = 0.5
+    return out
+
+
+def test_the_result_is_whole(drive):
+    mapper, updates, folder = drive
+    saved, run = stillmap.load(folder), json.loads((folder / "run.json").read_text())
+    np.testing.assert_allclose(saved.poses, mapper.poses, atol=1e-6)
+    assert len(saved.poses) == len(updates) == run["counts"]["scans"]
+    assert len(saved.p_static) == run["counts"]["beams"]
+    assert run["input"]["extends_map"] is True
+    assert saved.map.resolution == EDGE
+    assert (folder / "live/trajectory.tum").is_file()
+
+
+def test_it_is_converted_with_what_was_known(rooms, drive, tmp_path):
+    """Of which its recording shows nothing."""
+    folder = drive[2]
+    stillmap_folder.write(rooms[2].recording, tmp_path / "in")
+    words = ["convert", str(folder), "--input", str(tmp_path / "in"), "--only", "static", "-o"]
+    assert main([*words, str(tmp_path / "out.ply")]) == 0
+    assert read_layout(tmp_path / "out.ply").rows == read_layout(folder / "static.ply").rows
+
+
+def test_a_drive_that_was_kept_makes_the_same(rooms, tmp_path):
+    _, known, second = rooms
+    options = {"threads": 1, "objects.enabled": False}
+    with LiveMapper(options, place=known, mode="extend") as mapper:
+        for beams in islice(iter_beams(second.recording), 35):
+            update = mapper.push(beams)
+        assert "lost" not in update.doubts
+        kept = keep_drive(mapper.snapshot(), tmp_path)
+        mapper.save(tmp_path / "at once")
+    read_drive(kept).save(tmp_path / "later")
+    assert contents(tmp_path / "later") == contents(tmp_path / "at once")
+    np.save(kept / "known_points.npy", np.zeros((3, 2)))
+    with pytest.raises(InputError, match="known cloud does not fit"):
+        read_drive(kept)
+
+
+def test_it_can_be_extended_again(rooms, drive):
+    """Which then goes on from the route of both runs, though nobody drives the first one again."""
+    _, known, _ = rooms
+    once = KnownCloud(drive[2], KnownMap(drive[2]))
+    before = KnownCloud(known, KnownMap(known)).poses[:, :3, 3]
+    off = np.linalg.norm(before[:, None] - once.poses[None, :, :3, 3], axis=2).min(axis=1)
+    assert off.max() < 1.0
+    kept = once.keep(None, EDGE, (0.2, 1.8))
+    assert len(kept.cloud.points) == len(once.points)
+    assert len(kept.cloud.route) < len(once.poses)
+
+
+def test_it_is_found_again_in_what_was_added(rooms):
+    """The robot is carried in the second room, which is not in the known map."""
+    first, known, second = rooms
+    every, true = list(iter_beams(second.recording)), true_poses(first, second)
+    inside = np.flatnonzero(second.truth.T_world_base[:, 0, 3] > DOOR + 2.0)
+    order = [*range(inside[-1] - 5), *range(inside[0] + 5, inside[0] + 40)]
+    off, lost = [], []
+    with LiveMapper({"threads": 1}, place=known, mode="extend") as mapper:
+        for number, t in enumerate(order):
+            update = mapper.push(replace(every[t], stamp_ns=10**8 * number))
+            off.append(np.linalg.norm((update.pose - true[t])[:3, 3]))
+            lost.append("lost" in update.doubts)
+        kept = mapper.snapshot().kept_map
+        shown = occupied_of(first, mapper.map)
+    carried = inside[-1] - 5
+    assert any(lost[carried : carried + 10])
+    assert not lost[-1]
+    assert max(off[-5:]) < 0.15
+    # what was seen before it was carried is still known
+    assert is_of(to_world(first, kept.cloud.points), GONE).sum() <= 5
+    assert (shown[:, 0] > DOOR + 5.0).sum() > 100
+    assert is_of(shown, CAME).sum() > 5
+
+
+def test_voxels_are_those_of_the_map(rooms):
+    _, known, second = rooms
+    beams = next(iter_beams(second.recording))
+    with (
+        LiveMapper({"slam.voxel_size": 0.3}, place=known, mode="extend") as mapper,
+        pytest.raises(InputError, match=r"cells of 0\.15 m"),
+    ):
+        mapper.push(beams)
+
+
+def test_clouds_far_from_the_origin_are_joined(tmp_path):
+    """In a map projection: a known point in a voxel in which this run saw surface is left out."""
+    utm = np.array([500_000.0, 5_300_000.0, 100.0])
+    fields = coordinate_fields(FIELDS, is_far=True)
+    point = Block(utm + np.array([[0.01, 0.0, 0.0]]), np.ones(1, np.float32), None)
+    own = make_vertices(point, fields)
+    (tmp_path / "static.ply").write_bytes(ply_header(fields, 1) + own.tobytes())
+    (tmp_path / "live").mkdir()
+    points = utm + np.array([[0.02, 0.01, 0.0], [0.02, 40.003, 0.0]])
+    p_static, route = np.array([0.9, 0.7], np.float32), np.eye(4)[None]
+    cloud = KeptCloud(points, p_static, route, np.zeros((1, 1), bool))
+    write_extended_cloud(tmp_path, cloud, EDGE)
+    (block,) = cloud_from_folder(tmp_path, "static").iter_blocks()
+    expected = utm + np.array([[0.01, 0.0, 0.0], [0.02, 40.003, 0.0]])
+    np.testing.assert_array_equal(block.points, expected)
+    np.testing.assert_array_equal(block.p_static, np.array([1.0, 0.7], np.float32))
+    np.testing.assert_array_equal(np.load(tmp_path / "live/known_route.npy"), route)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["live", "static.ply"]
+
+
+def test_cells_that_were_looked_over_stay_occupied():
+    """A low thing stands in the left cell: beams of this run passed above it."""
+    zeros = np.zeros((1, 2), np.float32)
+    known = GridMap(np.array([[0.9, 0.9]], np.float32), (0.0, 0.0, 0.0), 1.0)
+    seen = OccupancyMap(np.array([[0.1, 0.1]], np.float32), (0.0, 0.0, 0.0), 1.0, zeros, zeros)
+    assert extend_map(KeptMap(known, zeros), seen).p_occupied.max() < 0.2
+    none = np.zeros((0, 3)), np.zeros(0, np.float32), np.zeros((0, 4, 4))
+    cloud = KeptCloud(*none, np.array([[True, False]]))
+    found = extend_map(KeptMap(known, zeros, cloud), seen).p_occupied
+    np.testing.assert_allclose(found, [[0.9, 0.1]], atol=1e-6)
