@@ -3,7 +3,9 @@
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
+#include <algorithm>
 #include <array>
+#include <cmath>
 #include <limits>
 #include <optional>
 
@@ -123,37 +125,66 @@ OccupancyClasses checked_classes(std::vector<double> rho, std::vector<double> ta
   return {std::move(rho), std::move(tau), std::move(view_angle), p_detection};
 }
 
+auto miss_counts(const OccupancyHmm<3>& hmm, const std::optional<Slice>& rows) {
+  const std::vector<MissCounts>& counts = hmm.miss_counts();
+  const auto [first, step, n] = rows_from(rows, counts.size());
+  std::vector<float> out;
+  out.reserve(2 * n);
+  for (size_t i = 0; i < n; ++i) {
+    const MissCounts& of = counts[first + i * step];
+    out.insert(out.end(), {of.all(), of.surrounded()});
+  }
+  return to_numpy(std::move(out), {n, 2});
+}
+
+void bind_surroundings(nb::class_<OccupancyHmm<3>>& c) {
+  using W = OccupancyHmm<3>;
+  c.def(
+       "track_surroundings",
+       [](W& w, double edge) {
+         const double cells = edge / w.surfel_map().resolution();
+         require(cells > 0.0 && cells < 1e6, "edge: expected a length in metres");
+         w.track_surroundings(std::max(1, static_cast<int32_t>(std::lround(cells))));
+       },
+       nb::arg("edge"),
+       "Enables `miss_counts`; to be called before the first observation. edge: metres, of the "
+       "coarse cells that surroundings are made of, rounded to cells.")
+      .def("miss_counts", &miss_counts, nb::arg("rows") = nb::none(),
+           "(E, 2) float32: misses of each surfel, and misses in time bins in which beams ended in "
+           "its surroundings, on surfels without a plane; summed by reliability, without those one "
+           "time bin before or after a hit of it. rows (first, last, step) selects surfels.");
+}
+
 template <int D>
-void bind(nb::module_& m, const char* name) {
+nb::class_<OccupancyHmm<D>> bind(nb::module_& m, const char* name) {
   using W = OccupancyHmm<D>;
-  nb::class_<W>(
+  nb::class_<W> c(
       m, name,
       "Occupancy HMM of each surfel: likelihood of its observations under classes of two-state "
       "Markov chains with stationary occupancy rho, correlation time tau (seconds) and correlation "
-      "angle view_angle of the line of sight (radians; inf or none given: independent of it).")
-      .def(
-          "__init__",
-          [](W* self, const SurfelMap<D>& s, std::vector<double> rho, std::vector<double> tau,
-             std::vector<double> view_angle, double p_detection, double bin_seconds,
-             double lateral_std, double margin, double hit_radius, double end_margin,
-             bool use_normals, int threads) {
-            for (const double x : {bin_seconds, lateral_std, margin, hit_radius, end_margin})
-              require(x > 0.0 && std::isfinite(x),
-                      "bin_seconds, lateral_std, margin, hit_radius, end_margin: expected positive "
-                      "numbers");
-            const double r = s.resolution();
-            new (self) W(
-                s,
-                checked_classes(std::move(rho), std::move(tau), std::move(view_angle), p_detection),
-                {bin_seconds, lateral_std / r, margin / r, hit_radius / r, end_margin / r, 1.0,
-                 use_normals},
-                threads);
-          },
-          nb::arg("surfel_map"), nb::kw_only(), nb::arg("rho"), nb::arg("tau"),
-          nb::arg("view_angle") = std::vector<double>{}, nb::arg("p_detection"),
-          nb::arg("bin_seconds"), nb::arg("lateral_std"), nb::arg("margin"), nb::arg("hit_radius"),
-          nb::arg("end_margin"), nb::arg("use_normals") = true, nb::arg("threads") = 1,
-          nb::keep_alive<1, 2>())
+      "angle view_angle of the line of sight (radians; inf or none given: independent of it).");
+  c.def(
+       "__init__",
+       [](W* self, const SurfelMap<D>& s, std::vector<double> rho, std::vector<double> tau,
+          std::vector<double> view_angle, double p_detection, double bin_seconds,
+          double lateral_std, double margin, double hit_radius, double end_margin, bool use_normals,
+          int threads) {
+         for (const double x : {bin_seconds, lateral_std, margin, hit_radius, end_margin})
+           require(x > 0.0 && std::isfinite(x),
+                   "bin_seconds, lateral_std, margin, hit_radius, end_margin: expected positive "
+                   "numbers");
+         const double r = s.resolution();
+         new (self) W(
+             s, checked_classes(std::move(rho), std::move(tau), std::move(view_angle), p_detection),
+             {bin_seconds, lateral_std / r, margin / r, hit_radius / r, end_margin / r, 1.0,
+              use_normals},
+             threads);
+       },
+       nb::arg("surfel_map"), nb::kw_only(), nb::arg("rho"), nb::arg("tau"),
+       nb::arg("view_angle") = std::vector<double>{}, nb::arg("p_detection"),
+       nb::arg("bin_seconds"), nb::arg("lateral_std"), nb::arg("margin"), nb::arg("hit_radius"),
+       nb::arg("end_margin"), nb::arg("use_normals") = true, nb::arg("threads") = 1,
+       nb::keep_alive<1, 2>())
       .def("add", &add_observations<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
            nb::arg("offset").noconvert(), nb::arg("T_map_sensor").noconvert(),
            nb::arg("time_bin").noconvert(), nb::arg("threads") = 1,
@@ -210,13 +241,15 @@ void bind(nb::module_& m, const char* name) {
            "Likelihood of the observations of each surfel given one return in its cell: (E, C) "
            "float32 relative to the best class, (E,) float64 logarithm of the best. classes (bool, "
            "one per class) selects classes, rows (first, last, step) surfels.");
+  return c;
 }
 
 }  // namespace
 
 void bind_occupancy_hmm(nb::module_& m) {
   bind<2>(m, "OccupancyHmm2D");
-  bind<3>(m, "OccupancyHmm3D");
+  auto in_3d = bind<3>(m, "OccupancyHmm3D");
+  bind_surroundings(in_3d);
 }
 
 }  // namespace stillmap::bindings

@@ -19,6 +19,7 @@ from reference.observation import (
     view_angle_between,
 )
 from reference.surfel_map import Surfel, SurfelMap
+from reference.surroundings import count_misses, mark_misses
 
 Float = NDArray[np.float64]
 
@@ -95,6 +96,9 @@ class OccupancyHmm:
         # time, HIT or reliability, position
         self.observations: list[list[tuple[float, float, Float]]] = [[] for _ in surfel_map.fitted]
         self.change_model: ChangeModel | None = None
+        self.edge = 0  # cells, of coarse cells; 0: surroundings are not tracked
+        # by time bin, see `mark_misses`
+        self.marked: list[dict[int, tuple[float, bool]]] = [{} for _ in surfel_map.fitted]
 
     def add(
         self,
@@ -120,8 +124,13 @@ class OccupancyHmm:
         where = sensors if positions is None else np.asarray(positions, float)
         for n, beams in beams_of.items():
             at = self._move_to(where[bins == n].mean(axis=0))
-            for k, reliability in observe(self.surfel_map, beams, self.model).items():
+            seen = observe(self.surfel_map, beams, self.model)
+            for k, reliability in seen.items():
                 self.observations[k].append((n * self.bin_seconds, reliability, at))
+            if self.edge:
+                marked = mark_misses(seen, self.surfel_map.fitted, self.edge)
+                for k, one in marked.items():
+                    self.marked[k][n] = one
 
     def _move_to(self, position: Float) -> Float:
         if self.position is None or (
@@ -163,6 +172,18 @@ class OccupancyHmm:
         if any(self.observations):
             raise ValueError("track_changes: expected before the first observation")
         self.change_model = ChangeModel(tau, passer_by_rho, passer_by_tau, p_detection)
+
+    def track_surroundings(self, edge: float) -> None:
+        """Enable `miss_counts`; edge: metres, of coarse cells."""
+        if any(self.observations):
+            raise ValueError("track_surroundings: expected before the first observation")
+        self.edge = max(1, round(edge / self.surfel_map.resolution))
+
+    def miss_counts(self) -> NDArray[np.float32]:
+        """(E, 2) misses, and those while something was hit in the surroundings."""
+        if not self.edge:
+            raise ValueError("miss_counts: expected track_surroundings before")
+        return np.array([count_misses(one) for one in self.marked], np.float32).reshape(-1, 2)
 
     def changes(
         self,

@@ -124,6 +124,47 @@ def change_parameters(recording: Recording, with_paths: bool = True) -> dict[str
     }
 
 
+class _MixtureClasses:
+    """The N classes of `ChangeMixture`: static ones first, the change HMM last.
+
+    With surroundings there are two of each of the C classes of HMMs and the change HMM, in
+    surroundings that last and in those that empty. What comes and goes, or changes, while its
+    surroundings last is static: it was hit or passed by chance, by view or by an error of the pose.
+
+    Args:
+        view, half_time: (C,) masks of the classes of HMMs.
+        n_static: number of static ones, which come first.
+        with_surroundings: see above.
+
+    Attributes:
+        n_static: number of static ones among the N.
+        columns: (N,) index among the 2 C + 2 columns of classes in lasting and in emptied
+            surroundings.
+        static, view, half_time, changing: (N,) masks, none of which overlap.
+    """
+
+    def __init__(
+        self,
+        view: NDArray[np.bool_],
+        half_time: NDArray[np.bool_],
+        n_static: int,
+        with_surroundings: bool,
+    ) -> None:
+        n = len(view) + 1
+        self.n_static, self.columns = n_static, np.arange(n)
+        view, half_time = np.append(view, False), np.append(half_time, False)
+        if with_surroundings:
+            fixed, changing = np.arange(n) < n_static, np.arange(n) == n - 1
+            is_static = np.concatenate([fixed | half_time | changing, fixed])
+            self.columns = np.argsort(~is_static, kind="stable")
+            self.n_static = int(is_static.sum())
+        of, static = self.columns % n, np.arange(len(self.columns)) < self.n_static
+        self.view = view[of]
+        self.static = static & ~self.view
+        self.half_time = half_time[of] & ~static
+        self.changing = np.arange(len(of)) == len(of) - 1
+
+
 class ChangeMixture:
     """Mixture of classes with the change HMM as the last one, its weights fitted to observations.
 
@@ -141,24 +182,30 @@ class ChangeMixture:
         kept = (observations.tau <= _MAX_DYNAMIC_TAU) | (rho == HALF_TIME_RHO)
         kept[:n_static] = True
         self._observations, self._kept = observations, kept
-        # (C + 1,) masks of the classes
-        view = np.append(np.isfinite(observations.view_angle[kept]), False)
-        self._static = (np.arange(len(view)) < n_static) & ~view
-        changing = np.arange(len(view)) == len(view) - 1
-        half_time = np.append(rho[kept] == HALF_TIME_RHO, False)
-        self._groups = self._static, view, half_time, changing
+        classes = _MixtureClasses(
+            np.isfinite(observations.view_angle[kept]),
+            rho[kept] == HALF_TIME_RHO,
+            n_static,
+            observations.has_surroundings,
+        )
+        self._columns, self._static = classes.columns, classes.static
+        self._groups = classes.static, classes.view, classes.half_time, classes.changing
         sample = self._likelihood(observations.sample_rows())
-        self._weights = fit_weights(sample, n_static, options.prior)
+        self._weights = fit_weights(sample, classes.n_static, options.prior)
         self.changing_weight = float(self._weights[-1])
 
     def _likelihood(self, rows: Rows) -> NDArray[np.float32]:
-        """(K, C + 1) of some surfels, relative to the best class; the change HMM is bounded."""
+        """(K, N) of some surfels, relative to the best class; the change HMM is bounded."""
         hmm = self._observations.hmm
         likelihood, log_best = self._observations.likelihood(self._kept, rows)
         log_ratio = np.minimum(hmm.change_log_likelihood(rows) - log_best, _MAX_LOG_RATIO)
         table = np.column_stack([likelihood, np.exp(log_ratio).astype(np.float32)])
         table /= np.exp(np.maximum(log_ratio, 0.0)).astype(np.float32)[:, None]
-        return table
+        if not self._observations.has_surroundings:
+            return table
+        lasting, empty = self._observations.likelihood_of_surroundings(rows).T
+        both = np.concatenate([table * lasting[:, None], table * empty[:, None]], axis=1)
+        return np.asarray(both[:, self._columns])
 
     def label_surfels(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Labels of each surfel.

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 import stillmap._core as _core
 from stillmap.core.chunks import ScanBeams, iter_beams
 from stillmap.core.recording import Recording
+from stillmap.em import surroundings
 from stillmap.em.mixture import MAX_FIT_ROWS
 from stillmap.em.options import EmOptions
 from stillmap.em.types import Float
@@ -94,6 +95,7 @@ class Observations:
         hmm: the forward filters.
         trust: in beams without a return, 0 to 1.
         rho, tau, view_angle: (C,) of the classes; the first `n_static` are static.
+        has_surroundings: whether `hmm.miss_counts` is known.
         threads: does not change the result.
     """
 
@@ -105,6 +107,7 @@ class Observations:
     view_angle: Float
     n_static: int
     threads: int = 1
+    has_surroundings: bool = False
 
     def likelihood(
         self, classes: NDArray[np.bool_] | None = None, rows: Rows | None = None
@@ -120,6 +123,11 @@ class Observations:
         """
         return self.hmm.likelihood(classes, rows, self.threads)
 
+    def likelihood_of_surroundings(self, rows: Rows) -> NDArray[np.float32]:
+        """(K, 2) of the misses of some surfels; see `surroundings.likelihood_of_misses`."""
+        assert isinstance(self.hmm, _core.OccupancyHmm3D)
+        return surroundings.likelihood_of_misses(self.hmm.miss_counts(rows))
+
     def sample_rows(self) -> Rows:
         """Every k-th surfel, enough of them to fit mixture weights."""
         return 0, self.surfel_map.size, max(-(-self.surfel_map.size // MAX_FIT_ROWS), 1)
@@ -133,6 +141,8 @@ def collect_observations(
     threads: int,
     classes: HmmClasses = LOOP_CLASSES,
     changes: dict[str, Any] | None = None,
+    *,
+    with_surroundings: bool = False,
 ) -> Observations:
     """Runs the forward filters of all cells in which beams ended over a recording.
 
@@ -140,6 +150,7 @@ def collect_observations(
         recording, poses, resolution, options, threads: see `occupancy_hmm.e_step`.
         classes: of the filters.
         changes: parameters of the change HMM, which runs along; None: it does not.
+        with_surroundings: also count what is hit around each surfel while it is missed; 3D only.
     """
     time_bin = time_bin_index(recording, options.time_bin) if recording.dimension == 3 else None
     surfel_map = build_surfel_map(recording, poses, resolution, threads, time_bin)
@@ -148,10 +159,16 @@ def collect_observations(
     hmm.set_trust_beyond_solid(used_trust)
     if changes is not None:
         hmm.track_changes(**changes)
+    if with_surroundings:
+        assert isinstance(hmm, _core.OccupancyHmm3D)
+        hmm.track_surroundings(surroundings.EDGE)
     add_observations(recording, poses, hmm, options.time_bin, threads, without_blank=blind)
     hmm.release_buffers()
     rho, tau, view_angle = (np.array(values) for values in classes.grid())
-    return Observations(surfel_map, hmm, trust, rho, tau, view_angle, classes.n_static, threads)
+    n_static = classes.n_static
+    return Observations(
+        surfel_map, hmm, trust, rho, tau, view_angle, n_static, threads, with_surroundings
+    )
 
 
 def build_surfel_map(

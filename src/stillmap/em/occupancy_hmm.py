@@ -89,7 +89,14 @@ def e_step_3d(
 
     changes = change_parameters(recording, with_paths=options.change_detection_3d)
     observations = collect_observations(
-        recording, poses, resolution, options, threads, _CLASSES_3D, changes
+        recording,
+        poses,
+        resolution,
+        options,
+        threads,
+        _CLASSES_3D,
+        changes,
+        with_surroundings=True,
     )
     surfel_map, mixture = observations.surfel_map, ChangeMixture(observations, options)
     assert isinstance(surfel_map, _core.SurfelMap3D)

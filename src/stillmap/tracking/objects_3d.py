@@ -20,6 +20,7 @@ from stillmap.em import GroundMap
 from stillmap.mapping.projection import DIRECTIONS, make_planar_recording
 from stillmap.tracking import MovingObject, ObjectOptions, track_objects
 from stillmap.tracking.clustering import MIN_P_DYNAMIC
+from stillmap.tracking.displacement import select_movers
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -39,6 +40,8 @@ def track_objects_3d(
     threads: int = 1,
 ) -> list[MovingObject]:
     """Detect and track the moving objects of a 3D recording, with the height of track and box.
+
+    What goes nowhere, and whose place is never seen empty, is left out (`displacement.py`).
 
     Dynamic end points in connected columns above the ground are one segment. The nearest point in
     each direction, which a planar laser would see, is tracked; the other points of a segment
@@ -60,10 +63,11 @@ def track_objects_3d(
     planar = make_planar_recording(recording, found.points, hit, found.offset)
     objects = track_objects(planar, planar_poses, p_static[found.nearest], options)
     owned = _collect_beams(objects, found.nearest, found.segment, found.beam)
-    return [
+    found_3d = [
         _add_height(one, beams, recording, poses, p_static)
         for one, beams in zip(objects, owned, strict=True)
     ]
+    return select_movers(found_3d, recording, poses)
 
 
 class _Segments(NamedTuple):

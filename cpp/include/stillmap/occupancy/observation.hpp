@@ -29,7 +29,12 @@ struct NoReturnStats {
 struct Observation {
   static constexpr float kHit = 2.0f;
   int32_t surfel;
-  float reliability;  // kHit, or P(some beam intersected the surfel's extent) in (0, 1]
+  float value;  // kHit, or the reliability of a miss; negative if its surroundings were hit
+
+  bool is_hit() const { return value == kHit; }
+  // P(some beam intersected the surfel's extent), of a miss, in (0, 1].
+  float reliability() const { return std::abs(value); }
+  bool is_surrounded() const { return value < 0.0f; }
 };
 
 // Observations of one time bin, grouped by spans of surfels. The state of one span fits in

@@ -17,6 +17,7 @@
 #include "stillmap/occupancy/surfel_map.hpp"
 #include "stillmap/occupancy/surfel_neighbours.hpp"
 #include "stillmap/occupancy/surfel_traversal.hpp"
+#include "stillmap/occupancy/surroundings.hpp"
 #include "stillmap/util/lie.hpp"
 
 namespace stillmap {
@@ -67,9 +68,10 @@ inline NoReturnStats count_no_return_beams(const SurfelMap<D>& surfel_map,
 template <int D>
 class ObservationCollector {
  public:
+  // surroundings: null where misses are not to say whether something was hit around them.
   ObservationCollector(const SurfelMap<D>& surfel_map, const SurfelBitmap<D>& bitmap,
                        const SurfelNeighbours<D>& neighbours, const ObservationOptions& options,
-                       const IntersectionTables& tables)
+                       const IntersectionTables& tables, const Surroundings* surroundings = nullptr)
       : surfel_map_(surfel_map),
         bitmap_(bitmap),
         neighbours_(neighbours),
@@ -80,6 +82,7 @@ class ObservationCollector {
         touched_(ObservationBatch::n_spans(surfel_map.size())),
         open_bits_(bitmap.bits()),
         traversal_(surfel_map, bitmap) {
+    if (surroundings) occupied_.emplace(*surroundings);
     for (size_t k = 0; k < states_.size(); ++k)
       states_[k] = state_of(surfel_map, static_cast<int32_t>(k), options.use_normals);
   }
@@ -99,12 +102,13 @@ class ObservationCollector {
   // Writes the observations to `out` and resets the collector.
   void take_batch(ObservationBatch& out) {
     spread_hits();
+    mark_surroundings();
     out.observations.clear();
     out.begin.assign(1, 0);
     for (auto& touched_span : touched_) {
       for (const int32_t k : touched_span) {
         float& p_missed = states_[static_cast<size_t>(k)].p_missed;
-        if (p_missed < kMaxMissed) out.observations.push_back({k, miss_reliability(p_missed)});
+        if (p_missed < kMaxMissed) out.observations.push_back({k, observed_value(k, p_missed)});
         p_missed = kUntouched;
       }
       touched_span.clear();
@@ -155,9 +159,10 @@ class ObservationCollector {
     return state;
   }
 
-  static float miss_reliability(float p_missed) {
+  float observed_value(int32_t k, float p_missed) const {
     if (p_missed == kHitMark) return Observation::kHit;
-    return p_missed < kSaturated ? 1.0f : 1.0f - p_missed;
+    const float reliability = p_missed < kSaturated ? 1.0f : 1.0f - p_missed;
+    return occupied_ && occupied_->around(k) ? -reliability : reliability;
   }
 
   // Marks a hit; false if it was marked before.
@@ -257,6 +262,14 @@ class ObservationCollector {
         record_hit(*k);
   }
 
+  void mark_surroundings() {
+    if (!occupied_) return;
+    occupied_->clear();
+    for (const auto& touched_span : touched_)
+      for (const int32_t k : touched_span)
+        if (states_[static_cast<size_t>(k)].p_missed == kHitMark) occupied_->hit(k);
+  }
+
   const SurfelMap<D>& surfel_map_;
   const SurfelBitmap<D>& bitmap_;
   const SurfelNeighbours<D>& neighbours_;
@@ -270,6 +283,7 @@ class ObservationCollector {
   std::vector<typename SurfelBitmap<D>::BlockBits> open_bits_;    // cells that are not saturated
   std::vector<size_t> closed_blocks_;                             // with excluded cells
   SurfelTraversal<D> traversal_;
+  std::optional<OccupiedSurroundings> occupied_;
 };
 
 }  // namespace stillmap

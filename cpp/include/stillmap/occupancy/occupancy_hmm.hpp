@@ -25,6 +25,7 @@
 #include "stillmap/occupancy/surfel_bitmap.hpp"
 #include "stillmap/occupancy/surfel_map.hpp"
 #include "stillmap/occupancy/surfel_neighbours.hpp"
+#include "stillmap/occupancy/surroundings.hpp"
 #include "stillmap/occupancy/two_state_chains.hpp"
 #include "stillmap/util/lie.hpp"
 #include "stillmap/util/parallel.hpp"
@@ -83,6 +84,21 @@ class OccupancyHmm {
       throw std::invalid_argument("track_changes: expected before the first observation");
     change_hmm_.emplace(surfel_map_.size(), options, options_.bin_seconds, with_paths);
   }
+  // Also counts misses, and those while something in the surroundings was hit. edge: of the coarse
+  // cells that surroundings are made of, in cells; 3D only.
+  void track_surroundings(int32_t edge) {
+    static_assert(D == 3);
+    if (last_time_bin_ != kNoTimeBin)
+      throw std::invalid_argument("track_surroundings: expected before the first observation");
+    surroundings_.emplace(surfel_map_, edge);
+    miss_counts_.assign(surfel_map_.size(), {});
+    release_buffers();
+  }
+  const std::vector<MissCounts>& miss_counts() const {
+    if (!surroundings_)
+      throw std::invalid_argument("miss_counts: expected track_surroundings before");
+    return miss_counts_;
+  }
   const ChangeHmm& change_hmm() const {
     if (!change_hmm_) throw std::invalid_argument("changes: expected track_changes before");
     return *change_hmm_;
@@ -95,7 +111,7 @@ class OccupancyHmm {
     for (size_t t = 0; t < T; ++t)
       if (time_bin[t] < (t ? time_bin[t - 1] : last_time_bin_))
         throw std::invalid_argument("time_bin: must not fall");
-    if (change_hmm_ && T &&
+    if ((change_hmm_ || surroundings_) && T &&
         !(ChangeHmm::is_valid_time_bin(time_bin[0]) &&
           ChangeHmm::is_valid_time_bin(time_bin[T - 1])))
       throw std::invalid_argument("time_bin: expected 0 to 2147483647");
@@ -159,7 +175,8 @@ class OccupancyHmm {
     collectors_.resize(n);
     parallel_for_ranges(one_per_thread(n - existing), [&](size_t i, size_t, size_t) {
       collectors_[existing + i] = std::make_unique<ObservationCollector<D>>(
-          surfel_map_, bitmap_, neighbours_, options_, tables_);
+          surfel_map_, bitmap_, neighbours_, options_, tables_,
+          surroundings_ ? &*surroundings_ : nullptr);
     });
   }
 
@@ -207,15 +224,18 @@ class OccupancyHmm {
   void apply_batch(const ObservationBatch& batch, size_t span, int64_t time_bin,
                    int32_t viewpoint) {
     for (size_t i = batch.begin[span]; i < batch.begin[span + 1]; ++i) {
-      const auto k = static_cast<size_t>(batch.observations[i].surfel);
-      const float reliability = batch.observations[i].reliability;
-      if (reliability == Observation::kHit) {
+      const Observation& seen = batch.observations[i];
+      const auto k = static_cast<size_t>(seen.surfel);
+      if (seen.is_hit()) {
         chains_.hit(k, viewpoint);
         if (change_hmm_) change_hmm_->hit(k, time_bin);
-      } else {
-        chains_.miss(k, viewpoint, reliability);
-        if (change_hmm_) change_hmm_->miss(k, time_bin, reliability);
+        if (surroundings_) miss_counts_[k].hit(time_bin);
+        continue;
       }
+      const float reliability = seen.reliability();
+      chains_.miss(k, viewpoint, reliability);
+      if (change_hmm_) change_hmm_->miss(k, time_bin, reliability);
+      if (surroundings_) miss_counts_[k].miss(time_bin, reliability, seen.is_surrounded());
     }
   }
 
@@ -226,6 +246,8 @@ class OccupancyHmm {
   SurfelBitmap<D> bitmap_;
   TwoStateChains<D == 2 ? 8 : 4> chains_;
   std::optional<ChangeHmm> change_hmm_;
+  std::optional<Surroundings> surroundings_;
+  std::vector<MissCounts> miss_counts_;  // empty without surroundings
   // one per thread, each of the size of the map
   std::vector<std::unique_ptr<ObservationCollector<D>>> collectors_;
   int64_t last_time_bin_ = kNoTimeBin;
