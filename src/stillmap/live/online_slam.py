@@ -140,6 +140,7 @@ class OnlineSlam:
         # in a known map that frame is the map's
         poses = moved if self._place is not None else self.frame.to_map_all(moved, anchor)
         submaps = self._finder.submaps(len(poses))
+        submaps[self.history.dropped] = -1
         if self._place is not None and self._place.frame.is_shifted:
             poses = np.where((submaps == 0)[:, None, None], self._place.frame.to_map(poses), poses)
         return Placement(poses, submaps)
@@ -263,7 +264,11 @@ class OnlineSlam:
             tuple(name for name, is_so in doubts.items() if is_so),
             self._take_changes(stamp_ns),
             self._find_movers(),
-            [LaterLabels(n, self.label(one, n)) for n, one in self._hindsight.take(stamp_ns)],
+            [
+                LaterLabels(n, self.label(one, n))
+                for n, one in self._hindsight.take(stamp_ns)
+                if self.history.has(n)
+            ],
         )
 
     def _take_changes(self, stamp_ns: int) -> list[MapChange]:
