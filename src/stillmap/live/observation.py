@@ -85,6 +85,6 @@ def find_margins(
     length = np.maximum(np.linalg.norm(points, axis=1), 1e-6)
     normals = normals[followed]
     cos = np.abs(np.einsum("nd,nd->n", points, normals)) / length
-    cos[~normals.any(axis=1)] = 1.0
+    cos[(normals[:, 0] == 0.0) & (normals[:, 1] == 0.0)] = 1.0
     margin[followed] = np.minimum(_MARGIN / np.maximum(cos, 1e-3), _MAX_MARGIN)
     return margin
