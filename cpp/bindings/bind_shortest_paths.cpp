@@ -1,7 +1,6 @@
-#include "stillmap/util/shortest_paths.hpp"
-
 #include "arrays.hpp"
 #include "bindings.hpp"
+#include "stillmap/util/shortest_paths.hpp"
 
 namespace stillmap::bindings {
 namespace {
