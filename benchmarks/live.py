@@ -260,6 +260,7 @@ def measure_latency(args: argparse.Namespace) -> str:
         began = time.perf_counter()
         poses.append(mapper.push(beams, recording.T_odom_base[t]).pose)
         seconds.append(time.perf_counter() - began)
+        mapper.update_map()
     mapper.close()
     ms = 1e3 * np.array(seconds)
     error = compute_absolute_errors(np.array(poses), simulation.truth.T_world_base)

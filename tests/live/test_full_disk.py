@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import stillmap
-from stillmap.live import beam_store, spaced_scans
+from stillmap.core.errors import InputError
+from stillmap.live import beam_store, history, spaced_scans
 from stillmap.live.beam_store import BeamStore, join_parts
 from stillmap.live.local_map import MappedScan
 from stillmap.live.loop_process import LoopProcess
@@ -124,6 +125,39 @@ def test_a_result_says_that_scans_are_missing(corridor, tmp_path, limit_files, m
     assert 50 < len(saved.poses) < len(corridor.beams)
     (told,) = [what for what in saved.run["warnings"] if "full" in what]
     assert f"{len(corridor.beams)} scans {len(saved.poses)} were kept" in told
+
+
+def test_answers_to_dropped_scans_are_dropped(corridor, tmp_path, limit_files, monkeypatch):
+    monkeypatch.setattr(beam_store, "_IN_MEMORY_IF_FULL", 400_000)
+    monkeypatch.setattr(history, "_IN_MEMORY_IF_FULL", 20_000)
+    odometry, count = corridor.recording.T_odom_base, len(corridor.beams)
+    with LiveMapper({"threads": 1}, scratch=tmp_path, lag=1.0) as mapper:
+        limit_files(150_000)
+        for t, beams in enumerate(corridor.beams):
+            mapper.push(beams, odometry[t])
+        kept = mapper._slam.history
+        dropped, poses = kept.dropped, mapper.poses
+        assert 20 < len(dropped) < count
+        assert kept._answers.memory_bytes < (count - len(dropped) // 2) * 264
+        assert not np.isin(dropped, kept.snapshot().number).any()
+        known = np.setdiff1d(np.arange(count), dropped)
+        # others than spaced scans are where the graph bends between these
+        np.testing.assert_allclose(poses[known], corridor.mapper.poses[known], atol=1e-3)
+        assert np.isnan(poses[dropped]).all()
+        with pytest.raises(InputError, match="was dropped"):
+            mapper.label(corridor.beams[dropped[0]], int(dropped[0]))
+        limit_files(None)
+        mapper.save(tmp_path / "out")
+    saved = stillmap.load(tmp_path / "out")
+    expected = poses[kept_numbers(tmp_path / "out", corridor)]
+    np.testing.assert_allclose(saved.poses, expected, atol=1e-6)
+
+
+def kept_numbers(folder, run):
+    """Numbers of the scans of a result, by their stamps."""
+    stamps = np.loadtxt(folder / "live/trajectory.tum")[:, 0]
+    every = 1e-9 * run.recording.stamp_ns
+    return np.abs(every[:, None] - stamps).argmin(axis=0)
 
 
 def test_loops_are_closed_beside_while_the_disk_is_full(corridor, tmp_path, limit_files):

@@ -1,5 +1,7 @@
 """The local map of live mapping: scans labelled again and removed, all at once or a part."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,9 @@ from stillmap.core import se2
 from stillmap.live import local_map as module
 from stillmap.live.local_map import LocalMap, MappedScan
 from stillmap.live.scan import to_beams
+from stillmap.live.scan_hits import select_hits
+from stillmap.slam.motion_model import gaussian_prior
+from stillmap.slam.scan_matching import refine_pose
 
 ANGLES = np.linspace(-2.0, 2.0, 90)
 
@@ -58,21 +63,54 @@ def test_parts_of_the_work_are_all_of_it(ten):
 @pytest.mark.parametrize("rate", [40.0, 25.0])
 def test_fast_scans_are_not_delayed_by_several_others(monkeypatch, rate):
     """Only one of them is added, labelled again or removed with each scan."""
-    count, add_scan = [0], module.add_scan
+    work = [[]]
 
-    def count_scans(*args, **kwargs):
-        count[-1] += 1
-        add_scan(*args, **kwargs)
+    def count_calls(name):
+        function = getattr(module, name)
 
-    monkeypatch.setattr(module, "add_scan", count_scans)
+        def call(*args, **kwargs):
+            work[-1].append(name)
+            return function(*args, **kwargs)
+
+        monkeypatch.setattr(module, name, call)
+
+    count_calls("add_scan")
+    count_calls("relabel_scan")
     with stillmap.LiveMapper({"slam": {"loop_closure": False}}) as mapper:
         for n in range(round(8.0 * rate)):
             x = 0.5 * n / rate
             ends = np.stack([4.0 * np.cos(ANGLES) - 0.1 * x, 4.0 * np.sin(ANGLES)], axis=1)
             scan = stillmap.Scan(n / rate, np.linalg.norm(ends, axis=1), ANGLES)
             mapper.push(scan, (0.1 * x, 0.0, 0.0))
-            count.append(0)
-    assert max(count) == 2
-    added = sum(c % 2 for c in count)
-    assert 10 < added < len(count)
-    assert sum(count) > 2 * added  # they are labelled again, too
+            work.append([])
+    assert max(map(len, work)) == 1
+    assert 5 < work.count(["add_scan"]) < len(work)
+    assert work.count(["relabel_scan"]) > 5
+
+
+def test_new_labels_are_those_of_a_scan_that_is_added_anew():
+    rng = np.random.default_rng(3)
+    angles = np.linspace(-2.0, 2.0, 300)
+    ranges = np.where(rng.random(300) < 0.1, np.inf, 4.0 / np.cos(0.3 * angles))
+    mount = 0.2, 0.1, 0.3
+    beams = to_beams(stillmap.Scan(0.0, ranges, angles, max_range=20.0, sensor_pose=mount))
+    e, later = rng.random((2, 300), dtype=np.float32)
+    later[:100], e[150:] = e[:100], 1.0
+    scan = MappedScan(beams, e, se2.matrix(1.3, -0.4, 0.7), 0.0)
+    maps = LocalMap(0.05), LocalMap(0.05)
+    maps[0].add(scan)
+    maps[0].relabel(0, lambda _: later)
+    maps[1].add(replace(scan, e=later))
+    assert counts(maps[0]) != counts(LocalMap(0.05))
+    for cells in (maps[0].grid.block_cells, maps[1].grid.block_cells):
+        every = (cells[:, None] + np.argwhere(np.ones((32, 32)))).reshape(-1, 2)
+        np.testing.assert_array_equal(*(one.grid.alpha_beta(every) for one in maps))
+    pose = scan_matching_pose(maps)
+    np.testing.assert_array_equal(*pose)
+
+
+def scan_matching_pose(maps):
+    """The poses that the end points have in two maps, by their means, too."""
+    prior = gaussian_prior(se2.matrix(1.32, -0.41, 0.69), 0.1, 0.1)
+    hits = select_hits(to_beams(stillmap.Scan(0.0, np.full(90, 4.0), ANGLES)))
+    return [refine_pose(one.grid, hits, prior, prior.T_map_base).T_map_base for one in maps]

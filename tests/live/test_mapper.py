@@ -294,3 +294,30 @@ def test_a_covariance_follows_the_axes_of_its_frame():
     T[:2, :2] = turn[:2, :2]
     found = rotate_covariance(np.diag([4.0, 1.0, 2.0, 0.4, 0.1, 0.2]), T)
     np.testing.assert_allclose(found, np.diag([1.0, 4.0, 2.0, 0.1, 0.4, 0.2]), atol=1e-12)
+
+
+def test_answers_do_not_depend_on_when_the_map_is_updated(corridor):
+    odometry, count = corridor.recording.T_odom_base, 120
+    with LiveMapper({"threads": 1}) as mapper:
+        for t, beams in enumerate(corridor.beams[:count]):
+            update, expected = mapper.push(beams, odometry[t]), corridor.updates[t]
+            assert len(mapper._mapping.history) == t  # the answer came before
+            mapper.update_map()
+            mapper.update_map()
+            assert len(mapper._mapping.history) == t + 1
+            np.testing.assert_array_equal(update.pose, expected.pose)
+            np.testing.assert_array_equal(update.p_static, expected.p_static)
+            assert len(update.changes) == len(expected.changes)
+        update.p_static[:] = 0.0  # of the user from now on
+        mapper.push(corridor.beams[count], odometry[count])
+        assert len(mapper.poses) == count + 1
+
+
+def test_what_is_kept_does_not_change_with_the_answer(corridor):
+    with LiveMapper({"threads": 1}) as mapper:
+        update = mapper.push(corridor.beams[0], corridor.recording.T_odom_base[0])
+        update.p_static[:] = update.pose[:] = 0.0
+        recording, answers = mapper.snapshot().kept.load(None)
+        np.testing.assert_array_equal(answers.p_static, corridor.updates[0].p_static)
+        np.testing.assert_array_equal(answers.poses, corridor.poses[:1])
+        assert recording.n_scans == 1

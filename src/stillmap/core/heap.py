@@ -5,7 +5,7 @@ import sys
 
 
 def trim_heap() -> None:
-    """Give freed memory back to the system, between stages that need much of it.
+    """Give freed memory back to the system, after a stage that needed much of it.
 
     The blocks of the kernels' grids are small: the allocator keeps them when a grid goes, one heap
     per thread, and the next stage takes others. Only glibc does so and has a function against it.

@@ -8,6 +8,9 @@ Float = NDArray[np.float64]
 
 def matrix(x: ArrayLike, y: ArrayLike, theta: ArrayLike) -> Float:
     """(..., 3, 3) homogeneous matrices of x, y (m) and theta (rad)."""
+    if isinstance(theta, float) and isinstance(x, float) and isinstance(y, float):
+        c, s = np.cos(theta), np.sin(theta)
+        return np.array([[c, -s, x], [s, c, y], [0.0, 0.0, 1.0]])
     T = np.zeros((*np.broadcast(x, y, theta).shape, 3, 3))
     T[..., 0, 0] = T[..., 1, 1] = np.cos(theta)
     T[..., 1, 0] = np.sin(theta)

@@ -78,7 +78,7 @@ class BeamStore:
     def _report(self, error: OSError) -> None:
         _log.warning(
             "%s: %s; mapping goes on. Until temporary files can be written again, scans are kept "
-            "in %d MB of memory: beyond, every second one is dropped",
+            "in %d MB of memory: beyond, every second one is dropped, later its pose as well",
             self._folder or tempfile.gettempdir(),
             error.strerror or error,
             _IN_MEMORY_IF_FULL >> 20,
@@ -89,6 +89,10 @@ class BeamStore:
         """(K,) numbers of the scans that are kept, ascending."""
         self._finish()
         return np.concatenate([segment.numbers.view() for segment in self._segments])
+
+    def has(self, numbers: Array) -> NDArray[np.bool_]:
+        """(n,) which of the scans with numbers (n,) are kept."""
+        return np.isin(numbers, np.concatenate([one.numbers.view() for one in self._segments]))
 
     @property
     def counts(self) -> NDArray[np.int64]:

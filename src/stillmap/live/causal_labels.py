@@ -67,7 +67,7 @@ class CausalLabels:
         rho, tau = zip(*_STATIC, *_DYNAMIC, strict=True)
         prior, n = options.prior, len(_STATIC)
         weights = [prior / n] * n + [(1.0 - prior) / len(_DYNAMIC)] * len(_DYNAMIC)
-        self.filter: OccupancyFilter = kind(
+        self._filter: OccupancyFilter = kind(
             resolution,
             rho=list(rho),
             tau=list(tau),
@@ -86,9 +86,18 @@ class CausalLabels:
         self._last_bin = 0
         self.tags = 1  # numbers of keyframes are below
         self._pixels = dict[str | int, tuple[float, float]]()  # of the sensors, in 3D
-        # lowest cells of the blocks in `take_changes` so far, as bytes, and the filter they are of
-        self._reported, self._reported_of = set[bytes](), self.filter
+        # lowest cells of the blocks in `take_changes` so far, as bytes; of another filter than now
+        self._reported, self._is_replaced = set[bytes](), False
         self._told_ns = -_TOLD_WITHIN_NS
+
+    @property
+    def filter(self) -> OccupancyFilter:
+        """The filters of all cells. Where they are replaced, the whole map has moved."""
+        return self._filter
+
+    @filter.setter
+    def filter(self, new: OccupancyFilter) -> None:
+        self._filter, self._is_replaced = new, True
 
     def clear(self) -> None:
         """Forget all scans."""
@@ -205,13 +214,13 @@ class CausalLabels:
         self._told_ns = stamp_ns
         lowest, tiles = self.filter.take_changed_blocks(most, odds_factor=self._odds_factor)
         changes = list(map(MapChange, lowest, tiles))
-        if self.filter is not self._reported_of:  # the whole map was moved
+        if self._is_replaced:
             left = {cell.tobytes() for cell in self.filter.block_cells}
             gone = sorted(self._reported - left)
             emptied = np.frombuffer(b"".join(gone), lowest.dtype).reshape(-1, lowest.shape[1])
             unknown = np.full(tiles.shape[1:], np.nan, np.float32)
             changes += [MapChange(cell, unknown) for cell in emptied]
-            self._reported, self._reported_of = self._reported & left, self.filter
+            self._reported, self._is_replaced = self._reported & left, False
         self._reported.update(cell.tobytes() for cell in lowest)
         return changes
 

@@ -9,12 +9,18 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from stillmap.core.array_builder import QUICKLY_WRITTEN, ArrayBuilder
+from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.live.beam_store import BeamStore, join_parts
+from stillmap.live.row_numbers import RowNumbers
 from stillmap.live.scan import ScanBeams
 
 Float = NDArray[np.float64]
+
+# bytes of answers in memory while the disk is full, 25 minutes of 40 Hz: beyond, those to scans
+# that were dropped are dropped as well, but for spaced ones; share of them, the last, that stays
+_IN_MEMORY_IF_FULL, _RECENT = 16 << 20, 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,6 +131,7 @@ class History:
         self._answer = answer_type(dimension)
         self._answers = ArrayBuilder(self._answer, (), folder, QUICKLY_WRITTEN)
         self._beams = BeamStore(beam_fields(dimension), folder, max_bytes)
+        self._count, self._rows, self._due = 0, RowNumbers(), _IN_MEMORY_IF_FULL
         self._mounts: dict[str | int, Float] = {}
         self._has_odometry, self._has_times = True, False
         self._folder = folder
@@ -135,7 +142,7 @@ class History:
         self._answers.close()
 
     def __len__(self) -> int:
-        return len(self._answers)
+        return self._count
 
     def append(
         self,
@@ -172,21 +179,48 @@ class History:
         number = len(self)
         with suppress(OSError):  # it stays in memory, as the beams do, which say so
             self._answers.append(answer)
+        self._rows.append(number)
+        self._count += 1
         self._beams.append(number, [beams.points, beams.hit, p_static, times])
+        if self._answers.memory_bytes > self._due:
+            self._drop_answers()
+
+    def _drop_answers(self) -> None:
+        """Drop the answers to scans that were dropped, of those in memory: the disk is full."""
+        with suppress(OSError):
+            self._answers.write()  # perhaps there is room again
+        if self._answers.memory_bytes <= self._due:
+            return
+        kept = self._beams.has(self._rows.numbers()[self._answers.written :])
+        anchor = self._answers.parts()[-1]["anchor"]  # in memory there is one part
+        kept |= np.diff(anchor, append=anchor[-1]) != 0  # spaced scans: the poses between follow
+        kept[int(_RECENT * len(kept)) :] = True
+        self._answers.select_last(kept)
+        self._rows.select_last(kept)
+        self._due = max(_IN_MEMORY_IF_FULL, 2 * self._answers.memory_bytes)
 
     @property
     def was_full(self) -> bool:
         """True if the disk was full: scans may be missing."""
         return self._beams.was_full
 
+    def has(self, number: int) -> bool:
+        """True if the answer to a scan is kept: all are, unless the disk was full."""
+        return self._rows.has(number)
+
     def at(self, number: int) -> tuple[int, Float]:
         """Anchor and local pose of a scan, see `Answers`."""
-        answer = self._answers.row(number)
+        answer = self._answers.row(self._row_of(number))
         return int(answer["anchor"]), np.array(answer["local"])
 
     def twist_at(self, number: int) -> Float:
         """(3,) or (6,) m/s and rad/s of the base during a scan."""
-        return np.array(self._answers.row(number)["twist"])
+        return np.array(self._answers.row(self._row_of(number))["twist"])
+
+    def _row_of(self, number: int) -> int:
+        if not self.has(number):
+            raise InputError(f"scan {number}: was dropped while the disk was full")
+        return int(self._rows.find(np.array([number]))[0])
 
     def recording(self) -> Recording:
         """The scans that are kept. Odometry only if every scan had it. If the disk was full,
@@ -204,7 +238,7 @@ class History:
         return KeptScans(
             kept,
             beams.counts,
-            self._answers.view()[kept],
+            self._answers.view()[self._rows.find(kept)],
             beams.parts(),
             beams.files(),
             [(str(name), T) for name, T in self._mounts.items()],
@@ -215,8 +249,19 @@ class History:
         )
 
     def poses(self) -> tuple[Float, Float, NDArray[np.int64]]:
-        """`poses`, `local` and `anchor` of all scans, see `Answers`."""
-        return _split(self._answers.view())
+        """`poses`, `local` and `anchor` of all scans, see `Answers`; of one whose answer was
+        dropped those of the last one before it."""
+        answers = self._answers.view()
+        if len(self._rows) < len(self):
+            answers = answers[self._rows.find(np.arange(len(self)))]
+        return _split(answers)
+
+    @property
+    def dropped(self) -> NDArray[np.int64]:
+        """(K,) numbers of the scans the answers to which were dropped."""
+        if len(self._rows) == len(self):
+            return np.zeros(0, np.int64)
+        return np.setdiff1d(np.arange(len(self)), self._rows.numbers(), assume_unique=True)
 
 
 def _split(answers: NDArray[Any]) -> tuple[Float, Float, NDArray[np.int64]]:

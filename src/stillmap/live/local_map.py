@@ -167,9 +167,9 @@ def take_until(scans: deque[MappedScan], until_ns: int) -> Iterable[MappedScan]:
 
 def relabel_scan(grid: _core.OccupancyGrid2D, scan: MappedScan, label: Labeller) -> MappedScan:
     """Replace the labels of a scan in a map for registration."""
-    add_scan(grid, scan, remove=True)
-    relabelled = replace(scan, e=label(scan))
-    add_scan(grid, relabelled)
+    relabelled, beams = replace(scan, e=label(scan)), scan.beams
+    T = scan.T_map_base @ beams.T_base_sensor
+    scan_hits.replace_weights(grid, beams.points, beams.hit, scan.e, relabelled.e, T)
     return relabelled
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import config
+from stillmap.core.heap import trim_heap
 from stillmap.live.child_process import ChildProcess, serve
 from stillmap.live.local_map import MappedScan
 from stillmap.live.loop_closer import Correction, LoopCloser
@@ -164,6 +165,8 @@ def _close_loops(settings: dict[str, Any], source: IO[bytes], target: IO[bytes])
             poses = {"T_map_local": found.T_map_local, "poses": found.poses}
             untied = {"untied": np.array(found.untied, np.int64)}
             write_message(target, {**_pack_scans(found.near, _NUMBERS), **poses, **untied})
+            del found, message
+            trim_heap()
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.heap import trim_heap
 from stillmap.live.causal_labels import CausalLabels
 from stillmap.live.front_end import FrontEnd, Registration
 from stillmap.live.local_map import MappedScan, thin_scan
@@ -146,6 +147,7 @@ class MapFrame:
             self._corrected = self._correction.poses
             self._keep_untied(self._correction)
             self._correction = None
+            trim_heap()  # of the map before
 
     def _keep_untied(self, correction: MapCorrection) -> None:
         """Those of the correction, and those that it does not know yet."""

@@ -87,7 +87,7 @@ class LiveMapper:
             self.options = adopt_resolution(self.options, self._known)
         self._in_background, self._max_scratch, self._lag = background, max_scratch, lag
         self._scratch = None if scratch is None else Path(scratch)
-        self._slam: OnlineSlam | None = None  # since the first scan
+        self._mapping: OnlineSlam | None = None  # since the first scan
         self._last_ns: int | None = None
         self._is_closed = False
 
@@ -107,10 +107,20 @@ class LiveMapper:
         self._require_next(beams)
         T_odom_base = _to_matrix(odometry, beams.dimension)
         if self._slam is None or self._last_ns is None:
-            self._slam = self._begin(beams.dimension)
-        update = self._slam.push(beams, T_odom_base)
+            self._mapping = self._begin(beams.dimension)
+        assert self._mapping is not None
+        update = self._mapping.push(beams, T_odom_base)
         self._last_ns = beams.stamp_ns
         return update
+
+    def update_map(self) -> None:
+        """Add the last scan to the map and to what is kept.
+
+        `push` answers before that; whatever is called next does it, with the same results. Called
+        once an answer is on its way, the next one comes sooner.
+        """
+        if self._mapping is not None:
+            self._mapping.update_map()
 
     def label(self, scan: Scan | ScanBeams, number: int) -> NDArray[np.float32]:
         """(N,) P(static) of the beams of an earlier scan, by what is known now.
@@ -171,7 +181,8 @@ class LiveMapper:
     @property
     def resolution(self) -> float:
         """m, edge of the cells in which `Update.changes` are, once a scan was pushed."""
-        return self.options.slam.resolution if self._slam is None else self._slam.resolution
+        begun = self._mapping
+        return self.options.slam.resolution if begun is None else begun.resolution
 
     @property
     def objects(self) -> list[MovingObject]:
@@ -219,8 +230,8 @@ class LiveMapper:
     def close(self) -> None:
         """Forget all scans, and end the process that closes loops, if there is one."""
         self._is_closed = True
-        if self._slam is not None:
-            self._slam.close()
+        if self._mapping is not None:
+            self._mapping.close()
 
     def __enter__(self) -> LiveMapper:
         return self
@@ -230,8 +241,8 @@ class LiveMapper:
 
     def _begin(self, dimension: int) -> OnlineSlam:
         """Begin mapping with the first scan, in its dimension."""
-        if self._slam is not None:  # of a first scan that could not be mapped
-            self._slam.close()
+        if self._mapping is not None:  # of a first scan that could not be mapped
+            self._mapping.close()
         place = None
         if self._source is not None and self._known is not None:
             if self._mode == "extend" and dimension == 3:
@@ -246,6 +257,12 @@ class LiveMapper:
             max_scratch=self._max_scratch,
             lag=self._lag,
         )
+
+    @property
+    def _slam(self) -> OnlineSlam | None:
+        """The mapping that began with the first scan, with all that the last one changes."""
+        self.update_map()
+        return self._mapping
 
     @property
     def _pushed(self) -> OnlineSlam:

@@ -80,10 +80,11 @@ def find_margins(
         normals: (N, 2) of the surfaces that were hit, in the sensor frame; 0: unknown.
         followed: (N,) beams that show free space.
     """
-    points = np.where(beams.hit[:, None], beams.points, 0.0)
+    margin = np.full(len(beams.points), np.inf, np.float32)
+    points = np.where(beams.hit[followed, None], beams.points[followed], 0.0)
     length = np.maximum(np.linalg.norm(points, axis=1), 1e-6)
+    normals = normals[followed]
     cos = np.abs(np.einsum("nd,nd->n", points, normals)) / length
-    cos[~normals.any(axis=1)] = 1.0
-    margin = np.minimum(_MARGIN / np.maximum(cos, 1e-3), _MAX_MARGIN)
-    margin[~followed] = np.inf
-    return np.asarray(margin, np.float32)
+    cos[(normals[:, 0] == 0.0) & (normals[:, 1] == 0.0)] = 1.0
+    margin[followed] = np.minimum(_MARGIN / np.maximum(cos, 1e-3), _MAX_MARGIN)
+    return margin

@@ -1,6 +1,7 @@
 """Online SLAM: the state of one mapping, and the steps by which it takes a scan."""
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -90,6 +91,7 @@ class OnlineSlam:
         if place is None and slam.loop_closure:
             closer = start_closer(slam, D, in_background, scratch, threads)
         self.frame = MapFrame(D, closer, in_background)
+        self._work_left: Callable[[], object] | None = None  # by the last scan
         self._T_odom_base: Float | None = None  # of the last scan
         self._path_begin = 0  # the first spaced scan in the frame of the map
         self._moving = 0.0  # share of the hits, as the labels say a second later
@@ -101,6 +103,7 @@ class OnlineSlam:
             beams: of the next scan in time.
             T_odom_base: (D+1, D+1) odometry at its stamp; None: there is none.
         """
+        self.update_map()
         increment = self._increment(T_odom_base)
         prior = self.odometry.predict(beams, increment)
         hits = self._weigh(self.odometry.select(beams, prior), prior)  # E-step as predicted
@@ -113,15 +116,29 @@ class OnlineSlam:
             self.labels.add(labelled.observation, pose)
         p_static = self.labels.label(deskewed, pose)  # E-step: (8)
         self._movers.add(deskewed, found.T, p_static)
-        answer = self.known_frame.to_map(pose)
-        self.history.append(beams, p_static, T_odom_base, answer, found.T, anchor, found.twist)
-        self._hindsight.add(len(self.history) - 1, beams)
         self._T_odom_base = T_odom_base
         update = self._to_update(beams.stamp_ns, found, p_static)
-        added = self._add_to_maps(deskewed, labelled, np.nan_to_num(p_static), found)
+        answer, p_static = self.known_frame.to_map(pose), p_static.copy()  # the user has the other
+
+        def keep() -> MappedScan | None:
+            self.history.append(beams, p_static, T_odom_base, answer, found.T, anchor, found.twist)
+            self._hindsight.add(len(self.history) - 1, beams)
+            return self._add_to_maps(deskewed, labelled, np.nan_to_num(p_static), found)
+
+        if not self._finder.is_lost:
+            self._work_left = keep
+            return update
+        added = keep()
         if added is None or not self._finder.is_lost:
             return update
         return self._find_robot(thin(hits) if isinstance(hits, PlanarHits) else added, update)
+
+    def update_map(self) -> None:
+        """Keep the last scan and add it to the maps, unless that is done: the answer to it does not
+        wait for that. Due before anything else here is asked for."""
+        work, self._work_left = self._work_left, None
+        if work is not None:
+            work()
 
     def label(self, beams: ScanBeams, number: int) -> NDArray[np.float32]:
         """(N,) P(static) of the beams of an earlier scan, by what is known now.
@@ -141,6 +158,7 @@ class OnlineSlam:
         # in a known map that frame is the map's
         poses = moved if self._place is not None else self.frame.to_map_all(moved, anchor)
         submaps = self._finder.submaps(len(poses))
+        submaps[self.history.dropped] = -1
         if self._place is not None and self._place.frame.is_shifted:
             poses = np.where((submaps == 0)[:, None, None], self._place.frame.to_map(poses), poses)
         return Placement(poses, submaps)
@@ -268,7 +286,11 @@ class OnlineSlam:
             tuple(name for name, is_so in doubts.items() if is_so),
             self._take_changes(stamp_ns),
             self._find_movers(),
-            [LaterLabels(n, self.label(one, n)) for n, one in self._hindsight.take(stamp_ns)],
+            [
+                LaterLabels(n, self.label(one, n))
+                for n, one in self._hindsight.take(stamp_ns)
+                if self.history.has(n)
+            ],
         )
 
     def _take_changes(self, stamp_ns: int) -> list[MapChange]:

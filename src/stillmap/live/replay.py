@@ -86,6 +86,7 @@ def replay(
         seconds.append(time.perf_counter() - start)
         if show is not None:
             show(mapper, beams, update)
+        mapper.update_map()
         progress("mapping", 0, t + 1, recording.n_scans)
     used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * _MAXRSS_UNIT
     return Latency(np.array(seconds), dropped, used)

@@ -28,6 +28,7 @@ Float = NDArray[np.float64]
 # m within which nearly all readings of a covered sensor lie: what surrounds it so closely moves
 # with the robot
 _COVER_DISTANCE, _COVER_SHARE = 0.3, 0.9
+_MAY_COVER = 1.01 * _COVER_DISTANCE**2  # m2
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +116,10 @@ def to_beams(scan: Scan) -> ScanBeams:
 
 def drop_cover(beams: ScanBeams) -> ScanBeams:
     """The beams of a scan; none of them usable if something covers the sensor."""
+    squared = np.einsum("nd,nd->n", beams.points, beams.points)
+    near, usable = squared < _MAY_COVER, squared < np.inf
+    if near.sum() < _COVER_SHARE * usable.sum():  # nearly all scans; what follows takes longer
+        return beams
     usable = finite_rows(beams.points)
     near = np.linalg.norm(beams.points[usable], axis=1) < _COVER_DISTANCE
     if np.count_nonzero(near) < max(_COVER_SHARE * len(near), 1.0):

@@ -169,6 +169,8 @@ class ScanOdometry:
 
     def correct(self, local_map: MatchMap, motion: Float) -> None:
         """Go on with a local map made anew, after the map has moved (3, 3)."""
+        if self.left_behind is self.local_map:  # nothing was: its memory is free
+            self.left_behind = local_map
         self.local_map = local_map
         if self._walls is not None:
             self._walls.rotate(-float(se2.parameters(motion)[2]))

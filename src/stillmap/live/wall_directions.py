@@ -86,7 +86,7 @@ def correct_heading(T: Float, covariance: Float, offset: HeadingOffset) -> Float
 def _count(scan: Scan, T: Float) -> Float:
     """(_BINS,) weights of the normals of a scan by their direction at a pose (3, 3)."""
     weights = scan.weights * (1.0 - scan.isotropy)
-    flat = (weights > 0.0) & scan.normals.any(axis=1)
+    flat = (weights > 0.0) & ((scan.normals[:, 0] != 0.0) | (scan.normals[:, 1] != 0.0))
     normals = scan.normals[flat].astype(np.float64)
     angles = np.arctan2(normals[:, 1], normals[:, 0]) + se2.parameters(T)[2]
     bins = angles / _BIN

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+import stillmap._core as _core
 from stillmap.core import se2
 from stillmap.core.recording import Recording
 from stillmap.slam import motion_model
@@ -75,17 +76,12 @@ def _shortest_paths(
     is_before = np.array([closure.later <= context.keyframes[k] for closure in closures], np.bool_)
     if not is_before.any():
         return np.append(steps[::-1].cumsum()[::-1], 0.0)
-    from scipy import sparse
-    from scipy.sparse import csgraph  # loading it takes long
-
     scans = np.array([[closure.earlier, closure.later] for closure in closures])[is_before]
     first, second = np.searchsorted(context.keyframes, scans).T
-    # an edge of weight zero would be no edge
-    weights = np.concatenate([steps, lengths[is_before]]).clip(1e-9)
     ends = np.append(np.arange(k), first), np.append(np.arange(1, k + 1), second)
-    graph = sparse.csr_array((weights, ends), shape=(k + 1, k + 1))
-    found: Float = csgraph.dijkstra(graph, directed=False, indices=[k])[0]
-    return found
+    # even where the robot stands a path through fewer keyframes is the shorter one
+    weights = np.concatenate([steps, lengths[is_before]]).clip(1e-9)
+    return _core.shortest_paths(np.stack(ends, axis=1), weights, k + 1, k)
 
 
 def blind_stds(context: LoopContext, k: int, closures: list[LoopClosure]) -> tuple[Float, Float]:

@@ -95,3 +95,25 @@ def add_hits(
     _core.interpolate_end_points(
         grid, points, hit, weights, np.array([0, len(hit)]), T, **INTERPOLATION, remove=remove
     )
+
+
+def replace_weights(
+    grid: _core.OccupancyGrid2D,
+    points: Points,
+    hit: NDArray[np.bool_],
+    before: NDArray[np.float32],
+    after: NDArray[np.float32],
+    T_map_sensor: Float,
+) -> None:
+    """Give the hits that `add_hits` added other weights, as if it had added those; no beam is
+    followed again, since free space does not depend on them."""
+    T, offset = T_map_sensor[None], np.array([0, len(hit)])
+    changed = hit & (before != after)
+    ends = points[changed]
+    every, offset_of_ends = changed[changed], np.array([0, len(ends)])
+    for weights, remove in ((before, True), (after, False)):
+        e = weights[changed]
+        _core.add_end_points(grid, ends, every, e, offset_of_ends, T, remove=remove)
+        _core.interpolate_end_points(
+            grid, points, hit, weights, offset, T, **INTERPOLATION, remove=remove
+        )

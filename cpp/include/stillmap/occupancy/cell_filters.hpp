@@ -104,6 +104,12 @@ class CellFilters {
     filter.p_static = kNotComputed;
   }
 
+  // Whether a miss in a bin changes nothing.
+  bool is_settled(int32_t k, int32_t bin) const {
+    const Filter& filter = filters_[static_cast<size_t>(k)];
+    return filter.open_bin > bin || (filter.open_bin == bin && filter.p_missed == kHitMark);
+  }
+
   // Lets the dynamic classes fall behind by so many nats.
   void favour_static(int32_t k, double log_ratio) {
     float* likelihood = likelihoods(k);

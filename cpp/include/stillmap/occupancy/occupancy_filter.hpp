@@ -117,6 +117,7 @@ class OccupancyFilter : public FilterMap<D, PassedCell> {
     const Vec<D> direction = chord / length;
     const Vec<D> to_centre = Vec<D>::Constant(0.5) - beam.start;
     const auto pass = [&](PassedCell* cell, const Cell<D>& at) {
+      if (cell->tag == tag && is_settled(*cell, bin)) return;
       const Vec<D> off = at.template cast<double>() + to_centre;
       double squared;  // of the distance of the beam from the centre
       if constexpr (D == 2) {
@@ -141,6 +142,12 @@ class OccupancyFilter : public FilterMap<D, PassedCell> {
     const Vec<D> last = beam.start + usable * direction;
     traverse<D>(beam.start, last, walker);
     walker.visit(0.0);
+  }
+
+  // Whether another pass in a bin changes nothing but the tag: most beams of a fast sensor pass
+  // where others did just before.
+  bool is_settled(const PassedCell& cell, int32_t bin) const {
+    return cell.filter >= 0 ? filters_.is_settled(cell.filter, bin) : cell.last_bin >= bin;
   }
 
   // The filter of the cell in which a beam ended.

@@ -8,6 +8,7 @@
 #include <Eigen/Cholesky>
 #include <Eigen/Eigenvalues>
 #include <algorithm>
+#include <optional>
 #include <vector>
 
 #include "stillmap/grid/cell.hpp"
@@ -24,6 +25,13 @@ struct WeightedBeams {
   std::vector<SurfaceNormal<D>> normals;   // moving frame; empty: unknown
   std::vector<GaussianWindow<D>> windows;  // cache, one per beam
   std::vector<bool> beyond_map;            // see mark_beyond_map; empty: none is
+  // share of each beam that the map explains at a pose; of the last one that was evaluated
+  std::vector<double> explained;
+  std::optional<Pose<D>> explained_at;
+
+  bool is_explained_at(const Pose<D>& pose) const {
+    return explained_at && explained_at->R == pose.R && explained_at->t == pose.t;
+  }
 };
 
 struct ScanRegistrationOptions {
@@ -90,6 +98,8 @@ inline QuadraticModel<D> linearise(LikelihoodField<D>& field, WeightedBeams<D>& 
                                    const Pose<D>& pose, const ScanRegistrationOptions& options) {
   QuadraticModel<D> model;
   beams.windows.resize(beams.points.size());
+  beams.explained.assign(beams.points.size(), 0.0);
+  beams.explained_at.reset();
   double total = 0.0;
   for (size_t n = 0; n < beams.points.size(); ++n) {
     const double weight = options.information_scale * beams.weights[n];
@@ -103,6 +113,7 @@ inline QuadraticModel<D> linearise(LikelihoodField<D>& field, WeightedBeams<D>& 
     model.cost -= weight * std::log((sample.baseline + sample.value) / (options.field.floor + 1.0));
     if (sample.value <= 0.0) continue;
     const double p_explained = sample.value / (sample.baseline + sample.value);
+    beams.explained[n] = p_explained;
     const auto J = Lie<D>::jacobian(lever);
     model.inliers += beams.weights[n] * p_explained;
     model.gradient.noalias() -= weight * p_explained * (J.transpose() * sample.log_gradient);
@@ -110,6 +121,7 @@ inline QuadraticModel<D> linearise(LikelihoodField<D>& field, WeightedBeams<D>& 
         weight * p_explained * (J.transpose() * curvature<D>(sample, options.field.sigma) * J);
   }
   if (total > 0.0) model.inliers /= total;
+  if (beams.beyond_map.empty()) beams.explained_at = pose;
   return model;
 }
 
@@ -121,11 +133,11 @@ inline Eigen::Matrix<double, Lie<D>::kDof, Lie<D>::kDof> surface_information(
   Eigen::Matrix<double, Lie<D>::kDof, Lie<D>::kDof> information =
       Eigen::Matrix<double, Lie<D>::kDof, Lie<D>::kDof>::Zero();
   const double per_beam = options.information_scale / (options.field.sigma * options.field.sigma);
+  if (!beams.is_explained_at(pose)) linearise<D>(field, beams, pose, options);
   for (size_t n = 0; n < beams.points.size(); ++n) {
+    const double p_explained = beams.explained[n];
+    if (p_explained <= 0.0) continue;
     const Vec<D> lever = pose.R * beams.points[n];
-    const FieldSample<D> sample = field.evaluate(pose.t + lever, beams.windows[n]);
-    if (sample.value <= 0.0) continue;
-    const double p_explained = sample.value / (sample.baseline + sample.value);
     const auto& surface = beams.normals[n];
     information.noalias() +=
         per_beam * beams.weights[n] * p_explained *

@@ -6,6 +6,7 @@
 #include <Eigen/Eigenvalues>
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <vector>
 
 #include "stillmap/grid/cell.hpp"
@@ -27,19 +28,37 @@ struct SurfaceNormal {
   double isotropy = 0.0;  // 0: a plane, 1: a point
 };
 
+// The largest square of which the square root is not above a length.
+inline double squared_limit(double length) {
+  constexpr double inf = std::numeric_limits<double>::infinity();
+  double squared = length * length;
+  while (std::sqrt(squared) > length) squared = std::nextafter(squared, 0.0);
+  while (squared < inf && std::sqrt(std::nextafter(squared, inf)) <= length)
+    squared = std::nextafter(squared, inf);
+  return squared;
+}
+
 // Normals of a planar scan from the neighbouring end points, in the order of the beams. An end
 // point with fewer than two neighbours may lie on a wall of any direction and has no normal.
 inline std::vector<SurfaceNormal<2>> estimate_normals(const std::vector<Vec<2>>& points,
                                                       const NormalOptions& options) {
   const auto n_points = static_cast<int64_t>(points.size());
   const auto at = [&](int64_t n) -> const Vec<2>& { return points[static_cast<size_t>(n)]; };
-  // the last end point on the same surface in one direction
+  const double max_gap = squared_limit(options.max_gap), radius = squared_limit(options.radius);
+  // begin of the run of end points without a gap that each one belongs to, and its end
+  std::vector<int64_t> begin(points.size(), 0), end(points.size(), n_points);
+  const auto is_gap = [&](int64_t n) { return (at(n) - at(n - 1)).squaredNorm() > max_gap; };
+  for (int64_t n = 1; n < n_points; ++n)
+    begin[static_cast<size_t>(n)] = is_gap(n) ? n : begin[static_cast<size_t>(n - 1)];
+  for (int64_t n = n_points - 1; n > 0; --n)
+    end[static_cast<size_t>(n - 1)] =
+        begin[static_cast<size_t>(n)] == n ? n : end[static_cast<size_t>(n)];
+  // the last end point on the same surface in one direction, the next one at any distance
   const auto extend = [&](int64_t n, int64_t step) {
+    const auto i = static_cast<size_t>(n);
     int64_t last = n;
-    for (int64_t k = n + step; k >= 0 && k < n_points; k += step) {
-      const bool is_next = std::abs(k - n) == 1;
-      if ((at(k) - at(last)).norm() > options.max_gap) break;
-      if (!is_next && (at(k) - at(n)).norm() > options.radius) break;
+    for (int64_t k = n + step; k >= begin[i] && k < end[i]; k += step) {
+      if (last != n && (at(k) - at(n)).squaredNorm() > radius) break;
       last = k;
     }
     return last;

@@ -274,6 +274,8 @@ class LiveNode:
         self._doubts.update(update.doubts)
         if self._show is not None:
             self._show(self._mapper, arrival.beams, update)
+        with self._lock:
+            self._mapper.update_map()
 
     def _report(self) -> None:
         """Diagnostics of the last second; the last map, where scans have stopped."""
