@@ -48,7 +48,7 @@ def update_occupancy(
         ended = np.flatnonzero((surfel >= 0) & (old < DYNAMIC_BELOW))
         for row, p_static in zip(sums, (old, new), strict=True):
             row += np.bincount(surfel[ended], 1.0 - p_static[ended], minlength=len(row))
-        ended = np.flatnonzero(surfel >= 0)
+        ended = np.flatnonzero((surfel >= 0) & ~np.isnan(old))
         for row, p_static in zip(static, (old, np.minimum(old, new)), strict=True):
             row += np.bincount(surfel[ended], p_static[ended], minlength=len(row))
     factor, kept = (

@@ -55,7 +55,7 @@ def explain_hits(
     places, place = np.unique(key, return_inverse=True)
     explained = np.bincount(place, weight, minlength=len(places)).astype(np.float64)
     others = _static_hits(recording, poses, p_static, places)
-    others -= np.bincount(place, p_static[beam], minlength=len(places))
+    others -= np.bincount(place, np.nan_to_num(p_static[beam]), minlength=len(places))
     others = np.maximum(others, 0.0)
     p_place = _compute_p_static(explained, others)[place]
     out = arrays.copy(p_static, recording.scratch)
@@ -127,7 +127,7 @@ def _static_hits(
     """(P,) expected number of static hits in each place."""
     out = np.zeros(len(places))
     for block in arrays.iter_blocks(recording.hit, p_static):
-        beam = block.start + np.flatnonzero(recording.hit[block])
+        beam = block.start + np.flatnonzero(recording.hit[block] & ~np.isnan(p_static[block]))
         key = _keys(recording.end_points(beam, poses))
         at = np.minimum(np.searchsorted(places, key), len(places) - 1)
         found = places[at] == key
