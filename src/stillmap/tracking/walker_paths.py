@@ -15,6 +15,7 @@ from stillmap.tracking.tracklets import compute_centroids, iterate_tracks
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
 
+_MIN_P_MOVER = 0.99  # what explains hits must be certain: clutter would make more of itself
 _WIDTH = 0.5  # m, of a person
 _MIN_TRAVEL, _MIN_LOOKS = 1.5, 5  # m, several times that; looks
 
@@ -22,7 +23,7 @@ _MIN_TRAVEL, _MIN_LOOKS = 1.5, 5  # m, several times that; looks
 def iterate_walker_paths(
     points: DynamicPoints, owner: Index, p_mover: Float, others: Container[int]
 ) -> Iterator[tuple[int, MoverPath]]:
-    """Yield tracks that are more probably movers and went somewhere, and their paths.
+    """Yield tracks that are certainly movers and went somewhere, and their paths.
 
     Args:
         points: dynamic end points.
@@ -31,7 +32,7 @@ def iterate_walker_paths(
         others: tracks that are left out.
     """
     for track, here in iterate_tracks(points, owner):
-        if track in others or p_mover[track] <= 0.5:
+        if track in others or p_mover[track] <= _MIN_P_MOVER:
             continue
         scan, xy = compute_centroids(points, owner, here)[1:]
         if len(scan) < _MIN_LOOKS or np.linalg.norm(np.ptp(xy, axis=0)) < _MIN_TRAVEL:
