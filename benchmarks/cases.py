@@ -15,8 +15,9 @@ SENSORS = "sensors"
 ODOMETRY = "odometry"
 ONCE = "passed once"  # nothing in the recording shows that these cars move: in no mean
 MOVED = "moved"  # things are moved between two visits: run only where it is named
+FAST_OR_FAR = "fast or far"  # movers seen for moments: run only where it is named
 TRAJECTORY = "trajectory"  # hard for poses, long or both: run only where it is named
-GROUPS = (POPULATED, STOPS, EMPTY, SENSORS, ODOMETRY, ONCE, MOVED, TRAJECTORY)
+GROUPS = (POPULATED, STOPS, EMPTY, SENSORS, ODOMETRY, ONCE, MOVED, FAST_OR_FAR, TRAJECTORY)
 
 Changes = Mapping[str, Any]
 
@@ -42,7 +43,7 @@ def chosen(names: Iterable[str]) -> list[Case]:
         known = ", ".join(case.name for case in CASES)
         raise SystemExit(f"no case {', '.join(sorted(unknown))}; cases: {known}; groups: {GROUPS}")
     if not wanted:
-        return [case for case in CASES if case.group not in (MOVED, TRAJECTORY)]
+        return [case for case in CASES if case.group not in (MOVED, FAST_OR_FAR, TRAJECTORY)]
     return [case for case in CASES if wanted & {case.name, case.group}]
 
 
@@ -50,13 +51,13 @@ def _crowd(people: int, shape: str = "mixed", scans: int | None = None) -> dict[
     return {"crowd": {"people": people, "shape": shape}, "robot": {"scans": scans}}
 
 
-def _part(scans: int) -> dict[str, Any]:
+def _part(scans: int | None) -> dict[str, Any]:
     """The first part of the route."""
     return {"robot": {"scans": scans}}
 
 
 def _sensor(
-    beams: int, degrees: float, max_range: float, noise: float, scans: int
+    beams: int, degrees: float, max_range: float, noise: float, scans: int | None = None
 ) -> dict[str, Any]:
     """A laser, on part of the route: many beams take as long as many scans."""
     return {
@@ -128,6 +129,11 @@ CASES = (
     Case("office-moved", MOVED, "office-moved"),
     Case("street-moved", MOVED, "street-moved"),
     Case("warehouse-moved", MOVED, "warehouse-moved"),
+    Case("street-oncoming", FAST_OR_FAR, "street-oncoming"),
+    Case("street-oncoming-361-40m", FAST_OR_FAR, "street-oncoming", _sensor(361, 180, 40, 0.02)),
+    Case("street-oncoming-720", FAST_OR_FAR, "street-oncoming", _sensor(720, 360, 60, 0.02)),
+    Case("corridor-40-once", FAST_OR_FAR, "corridor-crowd", _part(600)),
+    Case("corridor-40-once-legs", FAST_OR_FAR, "corridor-crowd", _crowd(40, "legs", 600)),
     Case("hall-8m", TRAJECTORY, "hall", few_walls(20)),
     Case("hall-8m-empty", TRAJECTORY, "hall", few_walls(0)),
     Case("drive-75hz", TRAJECTORY, "drive", {}),

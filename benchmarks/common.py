@@ -36,7 +36,7 @@ METHODS: dict[str, dict[str, Any]] = {
 }
 MIN_HIT_RATIO = {"tracker-0.1": 0.1, "hit-ratio-0.1": 0.1}  # by method; 0.25 for the others
 
-_VEHICLES = ["car", "forklift"]
+VEHICLES = ["car", "forklift"]
 LASTING = ["door", "thing"]  # stand still for so long that they may be seen in one state only
 _NAN = float("nan")
 
@@ -203,7 +203,7 @@ def _by_mover(p_static: NDArray[np.floating], run: Prepared) -> Scores:
     kinds = np.array([*truth.scene["mover_kinds"], "none"])[truth.mover]
     without = score_labels(p_static, truth.static, hit & ~np.isin(kinds, LASTING))
     found = p_static < 0.5
-    named = {"people": ["person"], "doors": ["door"], "vehicles": _VEHICLES, "things": ["thing"]}
+    named = {"people": ["person"], "doors": ["door"], "vehicles": VEHICLES, "things": ["thing"]}
     recall = {
         f"recall_{name}": float(found[of].mean()) if (of := np.isin(kinds, some)).any() else _NAN
         for name, some in named.items()

@@ -8,16 +8,17 @@ object if it has more than half of his beams, no more than a fifth of them is wi
 more than a fifth of its own beams then is of anything else. A switch is a change of the object with
 most of his beams. False objects have most beams on what is static. Traffic: Spearman's correlation
 of how often squares of the known floor were crossed, with how often movers crossed them while they
-were seen. Cost is the share of all CPU time of the job.
+were seen. Cost is the share of all CPU time of the job. Vehicles are scored like walkers.
 """
 
 from dataclasses import asdict
 
 import numpy as np
 from cases import POPULATED
-from common import Run, Scores, options_of, rows_of
+from common import VEHICLES, Run, Scores, options_of, rows_of
 from numpy.typing import NDArray
 from object_scores import (
+    ObjectScores,
     compute_rank_correlation,
     compute_true_flow_map,
     find_sightings,
@@ -43,6 +44,9 @@ COLUMNS = (
     Column("objects", "objects", ".0f"),
     Column("false_per_100_m", "false per 100 m", ".2f"),
     Column("speed_error", "speed off, m/s", ".3f"),
+    Column("vehicles", "vehicles > 3 s", ".0f"),
+    Column("vehicles_whole", "one object, %", ".1f", True),
+    Column("vehicles_speed_error", "their speed off, m/s", ".3f"),
     Column("traffic", "traffic, 0.5 m", ".3f", True),
     Column("traffic_1_m", "1 m", ".3f", True),
     Column("cost", "cost, %", ".1f"),
@@ -72,18 +76,27 @@ def scores_of(result: MappingResult, simulation: Simulation) -> Scores:
     seconds = 1e-9 * (recording.stamp_ns - recording.stamp_ns[0])
     kinds = np.array(truth.scene["mover_kinds"], dtype=object)
     people = np.flatnonzero(kinds == "person").tolist()
-    found = score_objects(
-        result.objects, truth.mover, truth.movers, recording.offset, seconds, people
+    vehicles = np.flatnonzero(np.isin(kinds, VEHICLES)).tolist()
+    found, driven = (
+        score_objects(result.objects, truth.mover, truth.movers, recording.offset, seconds, some)
+        for some in (people, vehicles)
     )
     way = np.linalg.norm(np.diff(truth.T_world_base[:, :2, 2], axis=0), axis=1).sum()
-    whole = 100.0 * found.whole / found.sightings if found.sightings else float("nan")
     return {
         **asdict(found),
-        "whole": whole,
+        "whole": _share_whole(found),
+        "vehicles": driven.sightings,
+        "vehicles_whole": _share_whole(driven),
+        "vehicles_speed_error": driven.speed_error,
         "false_per_100_m": 100.0 * found.false / way,
         "traffic": _of_traffic(result, simulation, seconds, 0.5),
         "traffic_1_m": _of_traffic(result, simulation, seconds, 1.0),
     }
+
+
+def _share_whole(found: ObjectScores) -> float:
+    """Percent of the sightings that are one object; NaN without any."""
+    return 100.0 * found.whole / found.sightings if found.sightings else float("nan")
 
 
 def _of_traffic(

@@ -4,6 +4,7 @@ import pytest
 from cases import (
     CASES,
     EMPTY,
+    FAST_OR_FAR,
     GROUPS,
     MOVED,
     ONCE,
@@ -42,7 +43,7 @@ def test_catalogue_covers_what_is_wanted() -> None:
 
 
 def test_names_and_groups_choose_cases() -> None:
-    assert {case.group for case in chosen([])} == {*GROUPS} - {MOVED, TRAJECTORY}
+    assert {case.group for case in chosen([])} == {*GROUPS} - {MOVED, FAST_OR_FAR, TRAJECTORY}
     assert chosen(GROUPS) == list(CASES)
     assert {case.group for case in chosen([ONCE, "hall-15"])} == {ONCE, POPULATED}
     with pytest.raises(SystemExit, match="no case nowhere"):

@@ -150,3 +150,15 @@ def test_tracks_may_be_looked_at_in_any_number_at_once(batch, monkeypatch):
     monkeypatch.setattr("stillmap.tracking.motion_evidence._BATCH", batch)
     found, _ = judged([walker(-2.5), *CHAIRS])
     assert found == expected
+
+
+def test_a_walker_is_dynamic_where_his_cells_do_not_say_so():
+    recording, who = recorded([walker(-2.5)])
+    p_static = np.where(who >= 0, 0.05, 0.95).astype(np.float32)
+    scan = np.repeat(np.arange(recording.n_scans), len(ANGLES))
+    unknown = (who == 0) & (scan % 4 == 0)
+    p_static[unknown] = 0.8
+    poses = np.tile(np.eye(3), (recording.n_scans, 1, 1))
+    found, _ = apply_motion_evidence(recording, poses, p_static)
+    assert np.mean(found[unknown] < 0.5) > 0.9
+    np.testing.assert_array_equal(found[who < 0], p_static[who < 0])

@@ -28,6 +28,7 @@ _SCENES = {
     "street-moved": "parked cars drive off, others park",
     "street-turn": "185 m, one way, waiting and driving cars",
     "street-jam": "the street with lights and a queue; everybody stops at times",
+    "street-oncoming": "260 m of a bending road, one way, 16 cars that come towards the robot",
     "crossing": "two streets of 180 m, lights, old trees, a park, 16 cars, 30 pedestrians",
     "drive": "970 m by car, with a red light",
     "building": "grows with --scans, wing by wing",

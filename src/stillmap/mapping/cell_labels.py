@@ -25,31 +25,37 @@ def update_occupancy(
     occupied: em.CellProbabilities,
     threads: int = 1,
 ) -> em.CellProbabilities:
-    """Occupancy of cells in which P(dynamic) of the beams became less.
+    """Occupancy of cells in which P(dynamic) or P(static) of the beams became less.
 
     P(dynamic) of a cell becomes less by the same factor as that of the beams that ended in it
     together: it belongs to the movers among them. The rest is clutter, which is an obstacle where
-    it was there for much of the time: a stray reading of the floor is none.
+    it was there for much of the time: a stray reading of the floor is none. So does P(static).
 
     Args:
         recording: M beams.
         poses: (T, 3, 3) T_map_base.
-        before, after: (M,) P(c = 1) of each beam, before <= after.
+        before, after: (M,) P(c = 1) of each beam.
         histories: with the surfels of the same cells.
         occupied: with the labels before.
         threads: number of threads; the result does not depend on it.
     """
     if not np.array_equal(occupied.cells, histories.cells):
         raise ValueError("occupied: expected the cells of the final E-step")
-    sums = np.zeros((2, len(occupied.cells)))
+    sums, static = np.zeros((2, 2, len(occupied.cells)))
     for _, beams, data in iter_beams(recording, poses, release=[before, after]):
         surfel = histories.surfel_map.associate_beams(*data, threads)
         old, new = before[beams], after[beams]
         ended = np.flatnonzero((surfel >= 0) & (old < DYNAMIC_BELOW))
         for row, p_static in zip(sums, (old, new), strict=True):
             row += np.bincount(surfel[ended], 1.0 - p_static[ended], minlength=len(row))
-    factor = np.divide(sums[1], sums[0], out=np.ones(sums.shape[1]), where=sums[0] > 0.0)
+        ended = np.flatnonzero((surfel >= 0) & ~np.isnan(old))
+        for row, p_static in zip(static, (old, np.minimum(old, new)), strict=True):
+            row += np.bincount(surfel[ended], p_static[ended], minlength=len(row))
+    factor, kept = (
+        np.divide(new, old, out=np.ones(len(old)), where=old > 0.0) for old, new in (sums, static)
+    )
     share = histories.occupied_share
     p_clutter = histories.p_in_cell * share / (share + _STRAY_SHARE)
-    p = factor * occupied.p_occupied + (1.0 - factor) * p_clutter
+    factor = np.minimum(factor, 1.0)
+    p = kept * (factor * occupied.p_occupied + (1.0 - factor) * p_clutter)
     return dataclasses.replace(occupied, p_occupied=p.astype(np.float32))

@@ -4,11 +4,13 @@ Furniture that some looks hit and others pass (legs of chairs, edges, thin stand
 plane that tilts) resembles a mover in each of its cells. Over a track it does not: it goes nowhere,
 beams pass its place between two detections, it appears and vanishes in plain view. The share of
 movers among the tracks is learned from each recording by EM: where many people walk, one that
-stands is believed to be another; where nobody walks, it is not. See `docs/objects.md`.
+stands is believed to be another; where nobody walks, it is not. Then movers explain all hits on
+them (`explained_hits.py`). See `docs/objects.md`.
 """
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -19,9 +21,13 @@ from stillmap.core.recording import Recording
 from stillmap.mapping import MoverPoints
 from stillmap.tracking.association import MAX_GAP, assign_tracks, regress_velocity
 from stillmap.tracking.clustering import DynamicPoints, extract_dynamic_points
+from stillmap.tracking.explained_hits import explain_hits
+from stillmap.tracking.fast_movers import find_fast_movers, tracks_of_paths
 from stillmap.tracking.looks import Look, classify_looks
+from stillmap.tracking.mover_path import MoverPath
 from stillmap.tracking.steady_motion import count_steady_windows
 from stillmap.tracking.tracklets import compute_centroids, iterate_tracks, join_tracklets
+from stillmap.tracking.walker_paths import iterate_walker_paths
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -33,6 +39,7 @@ _MAX_JUMP = 1.0  # m between two detections at one place
 _EDGE_TIME, _EDGE_LOOKS = 1.0, 8  # s before the first and after the last detection; looks there
 _OPEN_SHARE = 0.28  # of these looks that pass: the end lies in plain view
 _REST_TIME = 0.3  # s, see regress_velocity
+_FAST_TRAVEL = 3.0  # m along the path of a fast mover that count as a window of steady motion
 _BATCH = 1 << 12  # tracks whose looks are classified at once
 
 # Beta(1, 15): share of the windows in which clutter seems to move; also of half of the movers
@@ -71,7 +78,9 @@ def apply_motion_evidence(
 ) -> tuple[NDArray[np.float32], MoverPoints]:
     """Labels of the beams, given what the tracks of the dynamic ones say.
 
-    A beam is dynamic if its cell says so and its track does: 1 - e becomes (1 - e) P(mover).
+    A beam is dynamic if its cell says so and its track does: 1 - e becomes (1 - e) P(mover). One
+    that ended on somebody who is followed is dynamic as well, whatever its cell says, unless
+    something static is there at other times.
 
     Args:
         recording: 2D, M beams, deskewed.
@@ -84,26 +93,44 @@ def apply_motion_evidence(
     points = extract_dynamic_points(recording, poses, p_static, _MIN_P_DYNAMIC)
     if not len(points.scan):
         return p_static, MoverPoints.none()
-    owner = join_tracklets(points, assign_tracks(points, MAX_GAP))
-    p_mover = weigh_tracks(recording, poses, points, owner)
+    owner, paths = find_fast_movers(points, assign_tracks(points, MAX_GAP))
+    owner = join_tracklets(points, owner)
+    fast = tracks_of_paths(points, owner, paths)
+    p_mover = weigh_tracks(recording, poses, points, owner, dict(zip(fast, paths, strict=True)))
     out, movers = arrays.copy(p_static, recording.scratch), list[MoverPoints]()
     for block in arrays.iter_blocks(points.beam, points.xy, points.scan):
         p, beam = p_mover[owner[block]].astype(np.float32), points.beam[block]
         out[beam] = 1.0 - (1.0 - out[beam]) * p
         xy, stamp_ns = points.xy[block], recording.stamp_ns[points.scan[block]]
         movers.append(MoverPoints(xy[p > 0.5], stamp_ns[p > 0.5]).thin())
+    walkers = dict(iterate_walker_paths(points, owner, p_mover, fast))
+    tracks = np.array([*fast, *walkers], np.intp)
+    of_path = np.where(tracks >= 0, p_mover[tracks], 0.0)
+    followed = [*paths, *walkers.values()]
+    out = explain_hits(recording, poses, points.seconds, out, followed, of_path)
     return out, MoverPoints.concatenate(movers)
 
 
-def weigh_tracks(recording: Recording, poses: Float, points: DynamicPoints, owner: Index) -> Float:
+def weigh_tracks(
+    recording: Recording,
+    poses: Float,
+    points: DynamicPoints,
+    owner: Index,
+    paths: Mapping[int, MoverPath] = MappingProxyType({}),
+) -> Float:
     """(K,) P(mover) by track number; 0 where no track has that number.
 
     Args:
         recording, poses: see `apply_motion_evidence`.
         points: dynamic end points.
         owner: (N,) their tracks, from 0 to K - 1.
+        paths: by track number, of fast movers.
     """
     tracks, evidence = collect_evidence(recording, recording.T_map_sensor(poses), points, owner)
+    for k in np.flatnonzero(np.isin(tracks, list(paths))).tolist():
+        moving = paths[int(tracks[k])].travel / _FAST_TRAVEL
+        evidence.windows[k] = max(evidence.windows[k], moving)
+        evidence.moving[k] = max(evidence.moving[k], moving)
     out = np.zeros(int(tracks.max()) + 1)
     out[tracks] = fit_share(compute_log_ratio(evidence), evidence.looks)
     return out

@@ -18,6 +18,8 @@ from stillmap.tracking.clustering import (
     DynamicPoints,
     extract_dynamic_points,
 )
+from stillmap.tracking.fast_movers import find_fast_movers, tracks_of_paths
+from stillmap.tracking.mover_path import MoverPath
 from stillmap.tracking.options import ObjectOptions
 from stillmap.tracking.smoother import smooth_track
 from stillmap.tracking.tracklets import compute_centroids, iterate_tracks, stitch_tracklets
@@ -27,9 +29,11 @@ Index = NDArray[np.intp]
 
 HEADING_SPEED = 0.3  # m/s: a faster object is heading where it moves
 
-_SMOOTHER_STD = 0.28  # m: of a center over time, more than at an instant because legs swing
+SMOOTHER_STD = 0.28  # m: of a center over time, more than at an instant because legs swing
 _WIDTH_QUANTILE = 0.8  # of the widths seen in single scans
 _MAX_OFFSET = 0.9  # m, half the width of a car
+_PATH_REACH = 1.0  # s for which a path goes on at constant velocity
+_VEHICLE_ACCELERATION = 4.0  # m2/s3
 _OUTLIERS = 5.0  # percent of the points on either side outside the box: legs swing
 
 
@@ -100,11 +104,14 @@ def track_objects(
     points = extract_dynamic_points(recording, poses, p_static, MIN_P_DYNAMIC)
     if len(points.scan) == 0:
         return []
-    owner = stitch_tracklets(points, assign_tracks(points, MAX_GAP))
+    owner, paths = find_fast_movers(points, assign_tracks(points, MAX_GAP))
+    owner = stitch_tracklets(points, owner)
     kept = _ObjectStore(recording.scratch)
-    for _, here in iterate_tracks(points, owner):
+    fast = tracks_of_paths(points, owner, paths)
+    for track, here in iterate_tracks(points, owner):
         found = compute_centroids(points, owner, here)
-        one = _make_object(points, here, found.scan, found.xy, recording, p_static)
+        mine = [path for path, number in zip(paths, fast, strict=True) if number == track]
+        one = _make_object(points, here, found.scan, found.xy, mine, recording, p_static)
         if float(np.linalg.norm(np.ptp(one.xy, axis=0))) + max(one.size) >= options.min_extent:
             kept.add(one)
         arrays.release_pages(p_static)
@@ -150,15 +157,19 @@ def _make_object(
     here: Index,
     scan: Index,
     centroid: Float,
+    paths: list[MoverPath],
     recording: Recording,
     p_static: NDArray[np.float32],
 ) -> MovingObject:
     """The object of points `here` with these centroids (L, 2) in scans (L,)."""
     at = np.searchsorted(scan, points.scan[here])
     offset = estimate_center_offset(centroid, points.sensor[scan], points.xy[here], at)
-    xy, velocity = smooth_track(
-        points.seconds[scan], centroid + offset, _SMOOTHER_STD, ACCELERATION
-    )
+    center, t = centroid + offset, points.seconds[scan]
+    for path in paths:
+        on = (t >= path.seconds[0] - _PATH_REACH) & (t <= path.seconds[-1] + _PATH_REACH)
+        center[on] = path.state_at(t[on])[0]
+    acceleration = _VEHICLE_ACCELERATION if paths else ACCELERATION
+    xy, velocity = smooth_track(t, center, SMOOTHER_STD, acceleration)
     beams = points.beam[here]
     return MovingObject(
         0,

@@ -14,6 +14,7 @@ from stillmap.sim.worlds.indoor import corridor, hall, warehouse, warehouse_move
 from stillmap.sim.worlds.large import building
 from stillmap.sim.worlds.loops import rounds, ten_corridors
 from stillmap.sim.worlds.office import office, office_moved
+from stillmap.sim.worlds.oncoming import street_oncoming
 from stillmap.sim.worlds.street import crossing, street, street_jam, street_moved
 from stillmap.sim.worlds.wings import lookalike, two_wings
 
@@ -28,6 +29,7 @@ _WORLDS: dict[str, Callable[[], Scene]] = {
     "street": street,
     "street-turn": street_turn,
     "street-jam": street_jam,
+    "street-oncoming": street_oncoming,
     "crossing": crossing,
     "drive": drive,
     "building": building,

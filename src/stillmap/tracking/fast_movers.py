@@ -1,0 +1,278 @@
+"""Fast movers: clusters of several scans that one velocity explains, followed as one object.
+
+A new track stands, give or take the speed of a walker, and so loses a car whose next look is a
+metre away. Here the first looks determine the velocity: five clusters that lie on a line at
+constant speed begin a track, which is followed in both directions. Its reference is the edge of the
+object that faces the sensor along the motion (the front of what approaches, the rear of what
+recedes), not the mean of what is visible, which stands still while a car comes into view.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core import arrays
+from stillmap.tracking.clustering import DynamicPoints
+from stillmap.tracking.mover_path import MoverPath, fit_path
+from stillmap.tracking.vehicle_filter import MAX_SPEED, MIN_SPEED, follow
+
+Float = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+_MAX_FRAGMENT = 0.6  # s: tracks of walkers that last for longer are none
+_MAX_STEP = 0.45  # s between two looks of a seed
+_MAX_SCANS = 2  # from one to the next
+_DIRECTIONS = 16  # of motion, in which the edges of a cluster are known
+_GATE_ALONG, _GATE_ACROSS, _ACROSS_PER_METRE = 0.5, 0.4, 0.02  # m; beams lie apart across
+_EXTENSIONS = 3  # of a pair of clusters: five looks are a seed
+_MAX_PAIRS = 1 << 20  # at once
+_MIN_DENSITY = 0.4  # of the scans of a lasting track that detect it
+_WIDE = 1.2  # m: clusters of nobody who walks alone
+_CLAIM = 0.3  # m around a fast mover, within which points are its own
+_MIN_SHARE = 0.7  # of a track of walkers within a fast mover, from which on it is part of it
+
+
+class _Looks(NamedTuple):
+    """C clusters that no lasting track explains, in the order of time.
+
+    Attributes:
+        cluster: (C,) their numbers.
+        scan: (C,) their scans.
+        seconds: (C,) their times.
+        range: (C,) metres from the sensor.
+        sensor: (C, 2) its position.
+        edge: (C, 16, 2) the outermost point in each direction.
+    """
+
+    cluster: Index
+    scan: Index
+    seconds: Float
+    range: Float
+    sensor: Float
+    edge: Float
+
+
+class _Seeds(NamedTuple):
+    """H hypotheses: looks (H, n), their times, the edges (H, n, 2) that one velocity explains.
+
+    `side` is the direction (H,) in which the edge lies, `cost` the sum of squared residuals in
+    units of the gates.
+    """
+
+    look: Index
+    xy: Float
+    side: Index
+    cost: Float
+
+
+def find_fast_movers(points: DynamicPoints, owner: Index) -> tuple[Index, list[MoverPath]]:
+    """Track numbers (N,) after fast movers have taken their points, and the paths of these.
+
+    The k-th path has the number max(owner) + 1 + k.
+
+    Args:
+        points: dynamic end points.
+        owner: (N,) track numbers from `assign_tracks`.
+    """
+    lasting = _find_lasting(points, owner)
+    looks = _select_looks(points, owner, lasting)
+    if not len(looks.cluster):
+        return owner, []
+    paths = _follow_seeds(points, looks, _find_seeds(looks))
+    owner, first = arrays.copy(owner, points.scratch), len(lasting)
+    for number, path in enumerate(paths, start=first):
+        owner[_claim(points, owner, path, lasting, first)] = number
+    return owner, paths
+
+
+def tracks_of_paths(points: DynamicPoints, owner: Index, paths: list[MoverPath]) -> list[int]:
+    """Number of the track that each path is of now, after tracks were joined; -1: of none."""
+    out = []
+    for path in paths:
+        tracks = owner[path.find_points(points, _CLAIM)]
+        tracks = tracks[tracks >= 0]
+        out.append(int(np.bincount(tracks).argmax()) if len(tracks) else -1)
+    return out
+
+
+def _find_lasting(points: DynamicPoints, owner: Index) -> NDArray[np.bool_]:
+    """(K,) tracks that are seen for longer than in passing, and in most scans."""
+    n = max(int(owner[block].max()) for block in arrays.iter_blocks(owner)) + 1
+    scans, last = np.zeros((2, n), np.intp)
+    first = np.full(n, len(points.seconds) - 1)
+    for block in arrays.iter_blocks(owner, points.scan):
+        pairs = np.unique(np.column_stack([owner[block], points.scan[block]]), axis=0)
+        scans += np.bincount(pairs[:, 0], minlength=n)
+        np.minimum.at(first, pairs[:, 0], pairs[:, 1])
+        np.maximum.at(last, pairs[:, 0], pairs[:, 1])
+    lasts = points.seconds[last] - points.seconds[first] >= _MAX_FRAGMENT
+    return np.asarray(lasts & (scans >= _MIN_DENSITY * (last - first + 1)))
+
+
+def _select_looks(points: DynamicPoints, owner: Index, lasting: NDArray[np.bool_]) -> _Looks:
+    """The clusters whose first point is of no lasting track, and wide ones."""
+    begins = _cluster_begins(points)
+    ends = np.append(begins[1:], len(points.cluster))
+    wide = np.linalg.norm(points.xy[ends - 1] - points.xy[begins], axis=1) > _WIDE
+    chosen = wide | ~lasting[owner[begins]]
+    begins, size = begins[chosen], (ends - begins)[chosen]
+    own = np.repeat(begins - np.cumsum(size) + size, size) + np.arange(size.sum())
+    xy, first = points.xy[own], np.cumsum(size) - size
+    edge = np.empty((len(begins), _DIRECTIONS, 2))
+    of = np.repeat(np.arange(len(begins)), size)
+    for k, u in enumerate(_unit_vectors() if len(begins) else ()):
+        order = np.lexsort((xy @ u, of))  # the last one of each cluster lies farthest
+        edge[:, k] = xy[order[first + size - 1]]
+    scan = points.scan[begins]
+    nearest = np.minimum.reduceat(points.range[own], first) if len(begins) else np.zeros(0)
+    return _Looks(
+        points.cluster[begins], scan, points.seconds[scan], nearest, points.sensor[scan], edge
+    )
+
+
+def _cluster_begins(points: DynamicPoints) -> Index:
+    """(C,) the first point of each cluster."""
+    parts, last = [np.zeros(0, np.intp)], -1
+    for block in arrays.iter_blocks(points.cluster):
+        cluster = points.cluster[block]
+        parts.append(block.start + np.flatnonzero(np.diff(cluster, prepend=last)))
+        last = int(cluster[-1])
+    return np.concatenate(parts)
+
+
+def _unit_vectors() -> Float:
+    angle = 2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
+    return np.column_stack([np.cos(angle), np.sin(angle)])
+
+
+def _find_seeds(looks: _Looks) -> _Seeds:
+    """Hypotheses of five looks, the best ones first."""
+    parts = []
+    count = _count_later(looks, np.arange(len(looks.scan)))
+    for block in np.split(
+        np.arange(len(count)), np.flatnonzero(np.diff(np.cumsum(count) // _MAX_PAIRS)) + 1
+    ):
+        seeds = _pair(looks, block)
+        for _ in range(_EXTENSIONS):
+            seeds = _extend(looks, seeds)
+        parts.append(seeds)
+    found = _Seeds._make(np.concatenate(column) for column in zip(*parts, strict=True))
+    order = np.argsort(found.cost, kind="stable")
+    return _Seeds._make(column[order] for column in found)
+
+
+def _later_range(looks: _Looks, of: Index) -> tuple[Index, Index]:
+    """First look of the next scans, and the one after the last of them, of looks (n,)."""
+    low = np.searchsorted(looks.scan, looks.scan[of], side="right")
+    high = np.searchsorted(looks.scan, looks.scan[of] + _MAX_SCANS, side="right")
+    until = np.searchsorted(looks.seconds, looks.seconds[of] + _MAX_STEP, side="right")
+    return low, np.maximum(np.minimum(high, until), low)
+
+
+def _count_later(looks: _Looks, of: Index) -> Index:
+    low, high = _later_range(looks, of)
+    return high - low
+
+
+def _pairs_of(looks: _Looks, of: Index) -> tuple[Index, Index]:
+    """Which of `of` (n,), and each of its later looks."""
+    low, high = _later_range(looks, of)
+    count = high - low
+    which = np.repeat(np.arange(len(of)), count)
+    return which, np.arange(count.sum()) - np.repeat(np.cumsum(count) - count - low, count)
+
+
+def _pair(looks: _Looks, of: Index) -> _Seeds:
+    """Pairs of looks that something fast explains, by the edges that face the sensor."""
+    which, later = _pairs_of(looks, of)
+    one = of[which]
+    dt = (looks.seconds[later] - looks.seconds[one])[:, None]
+    middle = looks.edge.mean(axis=1)
+    step = middle[later] - middle[one]
+    near = np.linalg.norm(step, axis=1) < 1.5 * MAX_SPEED * dt[:, 0] + 1.0
+    one, later, step, dt = one[near], later[near], step[near], dt[near]
+    facing = ((looks.sensor[one] - middle[one]) * step).sum(axis=1) > 0.0
+    turn = np.arctan2(step[:, 1], step[:, 0]) + np.where(facing, 0.0, np.pi)
+    side = np.round(turn * _DIRECTIONS / (2.0 * np.pi)).astype(np.intp) % _DIRECTIONS
+    xy = np.stack([looks.edge[one, side], looks.edge[later, side]], axis=1)
+    speed = np.linalg.norm(xy[:, 1] - xy[:, 0], axis=1) / np.maximum(dt[:, 0], 1e-6)
+    fast = (speed >= MIN_SPEED) & (speed <= MAX_SPEED)
+    seeds = _Seeds(np.column_stack([one, later]), xy, side, np.zeros(len(one)))
+    return _Seeds._make(column[fast] for column in seeds)
+
+
+def _extend(looks: _Looks, seeds: _Seeds) -> _Seeds:
+    """Hypotheses with one more look, the nearest to where their velocity leads."""
+    which, later = _pairs_of(looks, seeds.look[:, -1])
+    t = looks.seconds[seeds.look]
+    span = np.maximum(t[:, -1] - t[:, 0], 1e-6)[:, None]
+    velocity = (seeds.xy[:, -1] - seeds.xy[:, 0]) / span
+    speed = np.linalg.norm(velocity, axis=1)
+    u = velocity / np.maximum(speed, 1e-9)[:, None]
+    dt = looks.seconds[later] - t[which, -1]
+    xy = looks.edge[later, seeds.side[which]]
+    off = xy - seeds.xy[which, -1] - dt[:, None] * velocity[which]
+    along = (off * u[which]).sum(axis=1) / _GATE_ALONG
+    across = (off[:, 1] * u[which, 0] - off[:, 0] * u[which, 1]) / (
+        _GATE_ACROSS + _ACROSS_PER_METRE * looks.range[later]
+    )
+    cost = along**2 + across**2
+    order = np.lexsort((cost, which))
+    order = order[(cost < 1.0)[order]]
+    best = order[np.flatnonzero(np.diff(which[order], prepend=-1))]
+    of = which[best]
+    return _Seeds(
+        np.column_stack([seeds.look[of], later[best]]),
+        np.concatenate([seeds.xy[of], xy[best][:, None]], axis=1),
+        seeds.side[of],
+        seeds.cost[of] + cost[best],
+    )
+
+
+def _follow_seeds(points: DynamicPoints, looks: _Looks, seeds: _Seeds) -> list[MoverPath]:
+    """Paths that begin with a seed, those with most looks first; no other has most of its points.
+
+    A seed may mistake what comes into view for motion, but cannot be followed for long.
+    """
+    used = np.zeros(int(points.cluster[-1]) + 1, bool)
+    found = list[tuple[MoverPath, Index]]()
+    for k in range(len(seeds.cost)):
+        cluster = looks.cluster[seeds.look[k]]
+        if used[cluster].any():
+            continue
+        used[cluster] = True
+        t = looks.seconds[seeds.look[k]]
+        track = follow(points, looks.scan[seeds.look[k]], t, seeds.xy[k])
+        if track is not None:
+            path = fit_path(track, points.seconds)
+            mine = path.find_points(points, _CLAIM)
+            found.append((path, mine))
+            used[points.cluster[mine]] = True
+    found.sort(key=lambda one: -len(one[0].seconds))
+    taken, out = np.zeros(len(points.scan), bool), []
+    for path, mine in found:
+        if 2 * np.count_nonzero(taken[mine]) <= len(mine):
+            out.append(path)
+            taken[mine] = True
+    return out
+
+
+def _claim(
+    points: DynamicPoints, owner: Index, path: MoverPath, lasting: NDArray[np.bool_], first: int
+) -> Index:
+    """The points of a fast mover without those of people whom it passes.
+
+    A lasting track that lies within it most of the time is one of its sides. Tracks from `first`
+    on are other fast movers.
+    """
+    mine = path.find_points(points, _CLAIM)
+    mine = mine[owner[mine] < first]
+    if not len(mine):
+        return mine
+    low, high = points.first[[points.scan[mine[0]], points.scan[mine[-1]] + 1]]
+    here = owner[low:high]
+    total = np.bincount(here[here < first], minlength=first)
+    inside = np.bincount(owner[mine], minlength=first)
+    passed = lasting & (inside < _MIN_SHARE * total)
+    return mine[~passed[owner[mine]]]

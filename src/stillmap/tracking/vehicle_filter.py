@@ -1,0 +1,137 @@
+"""A Kalman filter that follows a fast object by the edge that faces the sensor."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core import kalman
+from stillmap.tracking.clustering import DynamicPoints
+
+Float = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+MIN_SPEED, MAX_SPEED = 2.5, 30.0  # m/s: faster than walkers; slower than what anybody maps
+_STOPPED = 1.5  # m/s, below which it is left to the tracker of walkers
+_ACCELERATION = 4.0  # m2/s3: cars brake, and turn
+_EDGE_STD = 0.25  # m, of the edge along the motion, and across
+_GATE, _MAX_GATE, _GATE_SIGMAS = 0.3, 1.2, 2.0  # m, m, standard deviations of the prediction
+_LENGTH, _HALF_WIDTH = 6.5, 1.3  # m, of a large van
+_EDGE_DEPTH = 0.4  # m of the object that count as its edge
+_MAX_GAP = 1.2  # s without a point
+_MIN_LOOKS, _MIN_TRAVEL, _MIN_FOUND = 5, 3.0, 0.6  # looks, m, share of the looks: a track
+_EXTENT_LOOKS = 3  # that see as much of it as its length and width
+
+
+class EdgeLooks(NamedTuple):
+    """Looks at the edge of an object, rising in time.
+
+    Attributes:
+        scan: (L,) their scans.
+        xy: (L, 2) the edge.
+        heading: (L, 2) unit vectors along the motion.
+        leads: (L,) whether it is the front, else the rear.
+        length, width: m, the largest extents seen along the motion and across.
+    """
+
+    scan: Index
+    xy: Float
+    heading: Float
+    leads: NDArray[np.bool_]
+    length: float
+    width: float
+
+
+class _Run(NamedTuple):
+    """Scans in which it was found; rows scan, x, y, heading, leads of its edge; its extents."""
+
+    scans: list[int]
+    edges: list[tuple[float, ...]]
+    extents: list[tuple[float, float]]
+
+
+def follow(points: DynamicPoints, scan: Index, seconds: Float, xy: Float) -> EdgeLooks | None:
+    """Follow an object forwards and backwards from its seed; None if that is no object.
+
+    Args:
+        points: dynamic end points.
+        scan, seconds: (n,) of the looks of the seed.
+        xy: (n, 2) its edge that faces the sensor.
+    """
+    velocity = (xy[-1] - xy[0]) / (seconds[-1] - seconds[0])
+    back = _run(points, int(scan[0]), xy[0], velocity, -1)
+    ahead = _run(points, int(scan[0]), xy[0], velocity, 1)
+    rows = np.array([*back.edges[:0:-1], *ahead.edges])
+    scans = {*back.scans, *ahead.scans}
+    if len(rows) < _MIN_LOOKS or len(scans) < _MIN_FOUND * (max(scans) - min(scans) + 1):
+        return None
+    if np.linalg.norm(rows[-1, 1:3] - rows[0, 1:3]) < _MIN_TRAVEL:
+        return None
+    extents = np.sort([*back.extents, *ahead.extents], axis=0)
+    length, width = extents[-_EXTENT_LOOKS].tolist()
+    looks = rows[:, 0].astype(np.intp)
+    return EdgeLooks(looks, rows[:, 1:3], rows[:, 3:5], rows[:, 5] > 0.0, length, width)
+
+
+def _run(points: DynamicPoints, scan: int, edge: Float, velocity: Float, step: int) -> _Run:
+    """Follow in one direction of time, from an edge at a scan on."""
+    run, length = _Run([], [], []), 0.0
+    state = kalman.initialize(edge[None], _EDGE_STD, speed_std=2.0)
+    state.v[0] = velocity
+    now = last = float(points.seconds[scan])
+    u = velocity / np.linalg.norm(velocity)
+    leads = float((points.sensor[scan] - edge) @ u) > 0.0
+    while 0 <= scan < len(points.seconds):
+        t = float(points.seconds[scan])
+        if abs(t - last) > _MAX_GAP:
+            break
+        state, now = kalman.predict(state, t - now, _ACCELERATION), t
+        speed = float(np.linalg.norm(state.v[0]))
+        if not _STOPPED <= speed <= 1.5 * MAX_SPEED:
+            break
+        u = state.v[0] / speed
+        faces = float((points.sensor[scan] - state.x[0]) @ u) > 0.0
+        if faces != leads:  # passed: from the front to the rear, or back
+            state.x[0] += u * (length if faces else -length)
+            leads = faces
+        here, along, across = _within_box(points, scan, state, u, leads)
+        if len(here):
+            last, length = t, max(length, float(np.ptp(along)))
+            run.scans.append(scan)
+            run.extents.append((float(np.ptp(along)), float(np.ptp(across))))
+            seen = _find_edge(state, u, along, across, leads)
+            if seen is not None:
+                run.edges.append((scan, *seen, *u, float(leads)))
+                state = kalman.update(state, np.array([True]), seen[None], _EDGE_STD)
+        scan += step
+    return run
+
+
+def _within_box(
+    points: DynamicPoints, scan: int, state: kalman.TrackStates, u: Float, leads: bool
+) -> tuple[Index, Float, Float]:
+    """Points within the object as it is expected, and their offsets along and across."""
+    here = np.arange(points.first[scan], points.first[scan + 1])
+    off = points.xy[here] - state.x[0]
+    along, across = off @ u, off[:, 1] * u[0] - off[:, 0] * u[1]
+    gate = _gate(state)
+    behind = along * (-1.0 if leads else 1.0)  # m into the object from the edge
+    inside = (behind >= -gate) & (behind <= _LENGTH) & (np.abs(across) <= _HALF_WIDTH + gate)
+    return here[inside], along[inside], across[inside]
+
+
+def _gate(state: kalman.TrackStates) -> float:
+    return min(_GATE + _GATE_SIGMAS * float(state.position_std[0]), _MAX_GATE)
+
+
+def _find_edge(
+    state: kalman.TrackStates, u: Float, along: Float, across: Float, leads: bool
+) -> Float | None:
+    """(2,) the edge; None where it is hidden or out of view: then all points lie behind it."""
+    sign = 1.0 if leads else -1.0
+    edge = float((sign * along).max())
+    if edge < -_gate(state):
+        return None
+    side = float(across[sign * along >= edge - _EDGE_DEPTH].mean())
+    # half: the mean moves to one side while the other comes into view
+    return np.asarray(state.x[0] + sign * edge * u + 0.5 * side * np.array([-u[1], u[0]]))

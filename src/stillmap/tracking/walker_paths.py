@@ -1,0 +1,46 @@
+"""Paths of walkers, who are smaller than the gaps between what is known of a place."""
+
+from collections.abc import Container, Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.tracking.association import ACCELERATION
+from stillmap.tracking.clustering import DynamicPoints
+from stillmap.tracking.mover_path import MoverPath
+from stillmap.tracking.objects import SMOOTHER_STD, estimate_center_offset
+from stillmap.tracking.smoother import smooth_track
+from stillmap.tracking.tracklets import compute_centroids, iterate_tracks
+
+Float = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+_MIN_P_MOVER = 0.99  # what explains hits must be certain: clutter would make more of itself
+_WIDTH = 0.5  # m, of a person
+_MIN_TRAVEL, _MIN_LOOKS = 1.5, 5  # m, several times that; looks
+
+
+def iterate_walker_paths(
+    points: DynamicPoints, owner: Index, p_mover: Float, others: Container[int]
+) -> Iterator[tuple[int, MoverPath]]:
+    """Yield tracks that are certainly movers and went somewhere, and their paths.
+
+    Args:
+        points: dynamic end points.
+        owner: (N,) their tracks.
+        p_mover: (K,) by track.
+        others: tracks that are left out.
+    """
+    for track, here in iterate_tracks(points, owner):
+        if track in others or p_mover[track] <= _MIN_P_MOVER:
+            continue
+        scan, xy = compute_centroids(points, owner, here)[1:]
+        if len(scan) < _MIN_LOOKS or np.linalg.norm(np.ptp(xy, axis=0)) < _MIN_TRAVEL:
+            continue
+        at = np.searchsorted(scan, points.scan[here])
+        center = xy + estimate_center_offset(xy, points.sensor[scan], points.xy[here], at)
+        t = points.seconds[scan]
+        yield (
+            track,
+            MoverPath(t, *smooth_track(t, center, SMOOTHER_STD, ACCELERATION), _WIDTH, _WIDTH),
+        )

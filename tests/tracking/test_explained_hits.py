@@ -1,0 +1,61 @@
+"""What a fast mover explains is dynamic, and what stands beside its way is not."""
+
+import numpy as np
+
+from stillmap.core.recording import Recording
+from stillmap.tracking.explained_hits import explain_hits
+from stillmap.tracking.mover_path import MoverPath
+
+SECONDS = np.arange(0.0, 4.0, 0.1)
+CAR = np.array([1.0, 0.0])  # where a beam ends on it at each time, from its center
+POST = np.array([10.0, 1.0])  # right beside the way
+
+
+def recorded():
+    """Two beams per scan: one on the car that moves along x with 5 m/s, one on a post."""
+    on_car = np.column_stack([5.0 * SECONDS, np.zeros(len(SECONDS))]) + CAR
+    points = np.stack([on_car, np.tile(POST, (len(SECONDS), 1))], axis=1).reshape(-1, 2)
+    n = len(SECONDS)
+    return Recording(
+        stamp_ns=(SECONDS * 1e9).astype(np.int64),
+        offset=np.arange(n + 1, dtype=np.int64) * 2,
+        points=points.astype(np.float32),
+        hit=np.ones(2 * n, bool),
+        T_odom_base=None,
+        T_base_sensor=np.eye(3)[None],
+        sensor=np.zeros(n, np.int32),
+    )
+
+
+def path():
+    xy = np.column_stack([5.0 * SECONDS, np.zeros(len(SECONDS))])
+    velocity = np.tile([5.0, 0.0], (len(SECONDS), 1))
+    return MoverPath(SECONDS, xy, velocity, length=4.0, width=2.0)
+
+
+def explained(p_mover, paths):
+    recording = recorded()
+    before = np.full(recording.n_beams, 0.9, np.float32)
+    poses = np.tile(np.eye(3), (len(SECONDS), 1, 1))
+    after = explain_hits(recording, poses, SECONDS, before, paths, np.array(p_mover))
+    assert (before == np.float32(0.9)).all()
+    return after.reshape(-1, 2).T
+
+
+def test_static_hits_on_a_car_become_dynamic_and_the_post_beside_it_stays():
+    car, post = explained([1.0], [path()])
+    assert car.max() < 0.4
+    assert np.median(car) < 0.35
+    assert post.min() > 0.85
+
+
+def test_as_far_as_the_path_is_one_of_a_mover():
+    (whole, _), (car, _) = explained([1.0], [path()]), explained([0.4], [path()])
+    assert (whole < car - 0.1).all()
+    assert (car < 0.8).all()
+
+
+def test_without_a_path_nothing_changes():
+    car, post = explained([], [])
+    np.testing.assert_array_equal(car, np.float32(0.9))
+    np.testing.assert_array_equal(post, np.float32(0.9))
