@@ -37,6 +37,7 @@ from stillmap.pipeline.options import DEFAULTS, Options, resolve_options
 from stillmap.pipeline.pose_sources import better_source
 from stillmap.pipeline.quality import Quality, rate_quality
 from stillmap.pipeline.snapshots import Snapshot
+from stillmap.preprocessing.far_returns import leave_out_far_returns
 from stillmap.preprocessing.impossible_motion import leave_out_far_scans, remove_leaps
 from stillmap.slam.mount_calibration import Calibration
 from stillmap.tracking import FlowMap, MovingObject, compute_flow_map
@@ -178,11 +179,14 @@ def map_recording(
     frame, odometry, recording, poses = enter_local_frame(recording, poses)
     found = Calibration()
     with stages.measure("calibration"):
+        cell, max_range = options.slam.resolution, options.read.max_range
         recording, notes = remove_leaps(recording)
         if poses is not None:
-            recording, more = leave_out_far_scans(recording, poses, options.slam.resolution)
+            recording, more = leave_out_far_scans(recording, poses, cell)
             notes += more
-        require_map_memory(recording, poses, options.slam.resolution)
+        recording, more = leave_out_far_returns(recording, cell, max_range)
+        notes += more
+        require_map_memory(recording, poses, cell)
         recording, options, more = time_sweeps(recording, options)
         notes += more
         if poses is None:

@@ -1,0 +1,44 @@
+"""Returns from farther away than any laser reaches, which took memory for all cells on their way."""
+
+import dataclasses
+
+import numpy as np
+from choices import options
+
+import stillmap
+from stillmap.live.mapper import LiveMapper
+from stillmap.live.replay import iter_beams
+
+FAR = 900.0  # m
+
+
+def spoil(recording):
+    """Every third beam ends at FAR."""
+    points = recording.points.copy()
+    far = slice(None, None, 3)
+    points[far] *= FAR / np.linalg.norm(points[far], axis=1, keepdims=True)
+    hit = recording.hit.copy()
+    hit[far] = True
+    return dataclasses.replace(recording, points=points, hit=hit)
+
+
+def is_small(grid):
+    return max(grid.p_occupied.shape) * grid.resolution < 50.0
+
+
+def test_a_map_has_what_is_near(short):
+    spoiled = spoil(short.recording)
+    result = stillmap.build(spoiled, options(max_iterations=1))
+    assert is_small(result.map)
+    assert (np.asarray(result.map.p_occupied) > 0.5).sum() > 50
+    (sentence,) = (one for one in result.warnings if "farther than 100 m" in one)
+    assert sentence.startswith(f"{len(spoiled.hit[::3])} of {spoiled.hit.sum()} returns")
+
+
+def test_so_has_the_map_of_a_drive(short):
+    spoiled = spoil(short.recording)
+    with LiveMapper({"threads": 1}) as mapper:
+        for beams, odometry in zip(iter_beams(spoiled), spoiled.T_odom_base, strict=True):
+            mapper.push(beams, odometry)
+        assert is_small(mapper.map)
+        assert (mapper.map.p_occupied > 0.5).sum() > 50
