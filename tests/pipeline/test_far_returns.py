@@ -1,4 +1,4 @@
-"""Returns from farther away than any laser reaches, which took memory for all cells on their way."""
+"""Returns from farther away than lasers reach, which took memory for all cells on their way."""
 
 import dataclasses
 

@@ -17,7 +17,7 @@ MAX_BEAMS = 100_000  # of a scan
 _MANY = {2: 300_000, 3: 150_000}  # beams of a recording, by dimension: more take seconds
 
 _ODD = (0.0, -0.0, -1.0, 1e-30, 1e-3, 5.0, 99.0, 300.0, 990.0, 7e3, 9e4, 1.1e5, 1e9, 3e38, -1e9)
-# of ranges that differ from beam to beam: m, to the power of ten; files with more than 1e5 are refused
+# of ranges that differ from beam to beam: m, to the power of ten; files with 1e5 are refused
 _SPREAD_FROM, _SPREAD_TO = -1.0, (2.0, 3.0, 5.0, 9.0)
 _NO_NUMBERS = (np.nan, np.inf, -np.inf)
 _STAMPS = (0, 1, -1, 10**9, 2**53, 10**18, 4 * 10**18, -4 * 10**18)
