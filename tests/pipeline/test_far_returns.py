@@ -3,9 +3,12 @@
 import dataclasses
 
 import numpy as np
+import pytest
 from choices import options
 
 import stillmap
+from stillmap.cli.main import main
+from stillmap.io.stillmap_folder import write
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.replay import iter_beams
 
@@ -33,6 +36,31 @@ def test_a_map_has_what_is_near(short):
     assert (np.asarray(result.map.p_occupied) > 0.5).sum() > 50
     (sentence,) = (one for one in result.warnings if "farther than 100 m" in one)
     assert sentence.startswith(f"{len(spoiled.hit[::3])} of {spoiled.hit.sum()} returns")
+
+
+def test_a_result_knows_its_recording(short, tmp_path):
+    spoiled, out = spoil(short.recording), tmp_path / "map"
+    write(spoiled, tmp_path / "log")
+    result = stillmap.build(stillmap.read(tmp_path / "log"), options(max_iterations=1))
+    result.save(out)
+    opened = stillmap.load(out)
+    np.testing.assert_array_equal(opened.recording.hit, result.recording.hit)
+    np.testing.assert_array_equal(opened.recording.points, result.recording.points)
+    assert not opened.recording.hit[::3].any()
+    other = dataclasses.replace(spoiled, hit=np.arange(len(spoiled.hit)) % 3 == 0)
+    with pytest.raises(stillmap.InputError, match="other beams hit something"):
+        _ = stillmap.load(out, recording=other).recording
+
+
+def test_a_filtered_copy_keeps_what_has_no_label(short, tmp_path):
+    spoiled = spoil(short.recording)
+    write(spoiled, tmp_path / "log")
+    words = [str(tmp_path / "log"), "-o", str(tmp_path / "map"), "--threads", "1", "--quiet"]
+    assert main(["map", *words]) == 0
+    words = [str(tmp_path / "map"), "-o", str(tmp_path / "copy"), "--to", "stillmap", "--quiet"]
+    assert main(["filter", *words]) == 0
+    copy = stillmap.read(tmp_path / "copy")
+    np.testing.assert_array_equal(copy.points[::3], spoiled.points[::3])
 
 
 def test_so_has_the_map_of_a_drive(short):
