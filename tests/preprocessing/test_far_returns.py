@@ -9,6 +9,7 @@ from stillmap.preprocessing.far_returns import (
     mapped_range,
     shorten_far_beams,
 )
+from stillmap.preprocessing.laser_scan import stated_max_range
 
 
 def scan(lengths, hit, dimension=2):
@@ -39,6 +40,24 @@ def scan(lengths, hit, dimension=2):
 )
 def test_mapped_range(dimension, cell, max_range, reach):
     assert mapped_range(dimension, cell, max_range) == reach
+
+
+@pytest.mark.parametrize(
+    ("how", "stated"),
+    [
+        ("given", 250.0),
+        ("declared in the recording; 250.00 m repeats", 250.0),
+        ("250.00 m repeats at the top of the readings (9 x)", None),
+    ],
+)
+def test_what_is_said_of_the_laser_is_believed(how, stated):
+    recording = scan([5.0], [True])
+    recording.source["sensors"] = [{"ranges": {"threshold": 250.0, "threshold_how": how}}]
+    assert stated_max_range(recording) == stated
+
+
+def test_nothing_is_said():
+    assert stated_max_range(scan([5.0], [True])) is None
 
 
 def test_what_is_near_stays():

@@ -272,7 +272,8 @@ class LiveMapper:
         """The beams of a scan that can be mapped."""
         beams = drop_cover(scan if isinstance(scan, ScanBeams) else to_beams(scan))
         cell = resolve_resolution(self.options, beams.dimension).slam.resolution
-        reach = mapped_range(beams.dimension, cell, self.options.read.max_range)
+        stated = scan.max_range if isinstance(scan, Scan) else None
+        reach = mapped_range(beams.dimension, cell, stated or self.options.read.max_range)
         points, hit = shorten_far_beams(beams.points, beams.hit, reach)
         return beams if hit is beams.hit else dataclasses.replace(beams, points=points, hit=hit)
 

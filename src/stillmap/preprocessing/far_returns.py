@@ -25,7 +25,7 @@ def mapped_range(dimension: int, resolution: float, max_range: float | None = No
     Args:
         dimension: 2 or 3.
         resolution: m, edge of a cell.
-        max_range: m, stated by the user, who knows the sensor; None: not stated.
+        max_range: m, that the user or the recording states of the sensor; None: not stated.
     """
     reach = max(_LEAST_REACH[dimension], _REACH_CELLS[dimension] * resolution)
     return reach if max_range is None else max(reach, max_range)
