@@ -88,3 +88,15 @@ def test_near_scans_are_used():
     poses = recording.T_odom_base.copy()
     poses[5, 0, 2] = 9e4
     assert leave_out_far_scans(recording, poses, 0.05) == (recording, [])
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_of_two_places_that_of_the_origin_stays(dimension):
+    """Cells of the other one have no numbers."""
+    recording = drive(dimension)
+    poses = recording.T_odom_base.copy()
+    poses[T // 2 :, 0, -1] -= 1e7
+    found, (sentence,) = leave_out_far_scans(recording, poses, 0.05)
+    assert np.isfinite(found.points[: N * T // 2]).all()
+    assert np.isnan(found.points[N * T // 2 :]).all()
+    assert "10 scans are farther" in sentence

@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 
 import stillmap
 
-# m, of poses and odometry, and of returns that are no damage: a map takes the memory of the box
-# around all of them
-FAR, REACH = 1e7, 100.0
+FAR = 1e7  # m, of poses and odometry
 MAX_SCANS = 10
 MAX_BEAMS = 100_000  # of a scan
-_MANY = 150_000  # beams of a recording: more take seconds
+_MANY = {2: 300_000, 3: 150_000}  # beams of a recording, by dimension: more take seconds
 
-_ODD = (0.0, -0.0, -1.0, 1e-30, 1e-3, 5.0, REACH, 1.1e5, 1e9, 3e38, -1e9)
+_ODD = (0.0, -0.0, -1.0, 1e-30, 1e-3, 5.0, 99.0, 300.0, 990.0, 7e3, 9e4, 1.1e5, 1e9, 3e38, -1e9)
+# of ranges that differ from beam to beam: m, to the power of ten; files with 1e5 are refused
+_SPREAD_FROM, _SPREAD_TO = -1.0, (2.0, 3.0, 5.0, 9.0)
 _NO_NUMBERS = (np.nan, np.inf, -np.inf)
 _STAMPS = (0, 1, -1, 10**9, 2**53, 10**18, 4 * 10**18, -4 * 10**18)
 _EXTREME_STAMPS = (2**63 - 1, -(2**63), 2**62)
@@ -84,7 +84,7 @@ def odd_recordings(draw: Any, far: float = FAR) -> OddRecording:
     seed = draw(st.integers(0, 2**32 - 1))
     T = draw(st.integers(1, MAX_SCANS))
     sizes = st.sampled_from([0, 1, 2, 3, 12, 60, 180, 181, 360, 360, 1000, MAX_BEAMS])
-    most = _MANY // T
+    most = _MANY[D] // T
     if form == "folder":
         counts = np.array([min(draw(sizes), most) for _ in range(T)])
     else:
@@ -167,17 +167,22 @@ def _stamps(draw: Any, T: int) -> Any:
 
 def _spoil(draw: Any, one: OddRecording, far: float) -> None:
     """Put an odd value into some rows of one array."""
-    names = ["ranges", "ranges", "ranges", "directions", "odometry", "poses", "beam_time", "mounts"]
+    names = [*["ranges"] * 3, "directions", "odometry", "poses", "beam_time", "mounts"]
     name = draw(st.sampled_from([n for n in names if getattr(one, n) is not None]))
     array = getattr(one, name)
     if not len(array):
         return
     first = draw(st.integers(0, len(array) - 1))
-    rows = slice(first, first + draw(st.sampled_from([1, 1, 2, 7, len(array)])))
+    rows = slice(first, first + draw(st.sampled_from([1, 1, 2, 7, len(array) // 3, len(array)])))
     if name in ("odometry", "poses", "mounts"):
         values = [0.0, 1.0, -50.0, far, -far, *_NO_NUMBERS] if name != "mounts" else [1.0, -30.0]
         value = draw(st.sampled_from(values))
         array[rows, draw(st.integers(0, one.dimension - 1)), one.dimension] = value
+    elif name == "ranges" and draw(st.integers(0, 3)) == 0:
+        value = draw(st.sampled_from(_SPREAD_TO))
+        rng = np.random.default_rng(one.notes["seed"])
+        array[rows] = 10.0 ** rng.uniform(_SPREAD_FROM, value, len(array[rows]))
+        name = "spread"
     else:
         value = draw(st.sampled_from([*_ODD, *_NO_NUMBERS, *_NO_NUMBERS]))
         with np.errstate(over="ignore"):

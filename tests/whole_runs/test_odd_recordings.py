@@ -137,6 +137,7 @@ def succeeds(words: list[str], said: pytest.CaptureFixture[str]) -> bool:
         return True
     assert not output.exists()
     assert "memory" not in text, text
+    assert "is not the recording that was mapped" not in text, text
     assert [line for line in text.splitlines() if not line.startswith("warning")][1:] == [], text
     return False
 

@@ -76,7 +76,7 @@ def write_filtered(
 
     scratch = workplace(output)
     with show_share(args.quiet, "reading") as progress:
-        recording, labels = result.read(progress, scratch)
+        recording, labels = result.read(progress, scratch, left_out=True)
     if target.takes_poses and recording.T_recorded_base is None:
         recording = _place(recording, result, target)
     blank, hits, blanked = _select_beams(recording, labels.p_static, args.below, scratch)

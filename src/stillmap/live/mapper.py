@@ -25,7 +25,8 @@ from stillmap.live.place import Mode, adopt_resolution, make_tracker
 from stillmap.live.saving import Snapshot
 from stillmap.live.scan import Scan, ScanBeams, drop_cover, to_beams
 from stillmap.live.update import Update
-from stillmap.pipeline.options import Options
+from stillmap.pipeline.options import Options, resolve_resolution
+from stillmap.preprocessing.far_returns import mapped_range, shorten_far_beams
 from stillmap.results.build import to_options
 from stillmap.results.result import BuiltResult
 from stillmap.tracking import MovingObject
@@ -103,7 +104,7 @@ class LiveMapper:
             ValueError: names the argument, what was expected, and what it was; or the mapper is
                 closed.
         """
-        beams = _to_usable_beams(scan)
+        beams = self._to_usable_beams(scan)
         self._require_next(beams)
         T_odom_base = _to_matrix(odometry, beams.dimension)
         if self._slam is None or self._last_ns is None:
@@ -132,7 +133,7 @@ class LiveMapper:
         Raises:
             InputError: no scan was pushed.
         """
-        return self._pushed.label(_to_usable_beams(scan), number)
+        return self._pushed.label(self._to_usable_beams(scan), number)
 
     @property
     def poses(self) -> Float:
@@ -284,9 +285,14 @@ class LiveMapper:
             late = 1e-9 * (self._last_ns - beams.stamp_ns)
             raise ValueError(f"stamp: expected none before the last scan, got {late:.6f} s earlier")
 
-
-def _to_usable_beams(scan: Scan | ScanBeams) -> ScanBeams:
-    return drop_cover(scan if isinstance(scan, ScanBeams) else to_beams(scan))
+    def _to_usable_beams(self, scan: Scan | ScanBeams) -> ScanBeams:
+        """The beams of a scan that can be mapped."""
+        beams = drop_cover(scan if isinstance(scan, ScanBeams) else to_beams(scan))
+        cell = resolve_resolution(self.options, beams.dimension).slam.resolution
+        stated = scan.max_range if isinstance(scan, Scan) else None
+        reach = mapped_range(beams.dimension, cell, stated or self.options.read.max_range)
+        points, hit = shorten_far_beams(beams.points, beams.hit, reach)
+        return beams if hit is beams.hit else dataclasses.replace(beams, points=points, hit=hit)
 
 
 def _to_matrix(odometry: ArrayLike | None, dimension: int) -> Float | None:

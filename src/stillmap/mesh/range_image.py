@@ -211,7 +211,8 @@ def _make_patch(
     )
     origin = T[scan, :3, 3]
     x, y, z = points.T
-    use = recording.hit[beam] & np.isfinite(x + y + z)
+    # a return at the sensor itself has no direction
+    use = recording.hit[beam] & np.isfinite(x + y + z) & local.any(axis=1)
     points[~use] = 0.0  # in no triangle
     directions = beam_directions(local)
     if layout.is_planar:

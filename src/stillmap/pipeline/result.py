@@ -37,7 +37,9 @@ from stillmap.pipeline.options import DEFAULTS, Options, resolve_options
 from stillmap.pipeline.pose_sources import better_source
 from stillmap.pipeline.quality import Quality, rate_quality
 from stillmap.pipeline.snapshots import Snapshot
+from stillmap.preprocessing.far_returns import leave_out_far_returns
 from stillmap.preprocessing.impossible_motion import leave_out_far_scans, remove_leaps
+from stillmap.preprocessing.laser_scan import stated_max_range
 from stillmap.slam.mount_calibration import Calibration
 from stillmap.tracking import FlowMap, MovingObject, compute_flow_map
 
@@ -178,11 +180,15 @@ def map_recording(
     frame, odometry, recording, poses = enter_local_frame(recording, poses)
     found = Calibration()
     with stages.measure("calibration"):
+        cell = options.slam.resolution
         recording, notes = remove_leaps(recording)
         if poses is not None:
-            recording, more = leave_out_far_scans(recording, poses, options.slam.resolution)
+            recording, more = leave_out_far_scans(recording, poses, cell)
             notes += more
-        require_map_memory(recording, poses, options.slam.resolution)
+        max_range = options.read.max_range or stated_max_range(recording)
+        recording, more = leave_out_far_returns(recording, cell, max_range)
+        notes += more
+        require_map_memory(recording, poses, cell)
         recording, options, more = time_sweeps(recording, options)
         notes += more
         if poses is None:

@@ -57,12 +57,15 @@ def leave_out_far_scans(
 
     Args:
         recording: T scans.
-        poses: (T, D+1, D+1) T_map_base that were given.
+        poses: (T, D+1, D+1) T_map_base that were given, in a frame that begins at one of them.
         resolution: m, edge of a cell.
     """
     xy = poses[:, :2, -1]
-    reach = min(MAX_POINT_DISTANCE, _REACH[recording.dimension] * resolution)
+    numbered = _REACH[recording.dimension] * resolution
+    reach = min(MAX_POINT_DISTANCE, numbered)
     middle = find_busiest(np.floor(xy).astype(np.int64), int(reach))
+    if np.abs(middle).max() > numbered:  # of two places the one where the frame begins
+        middle = np.zeros(2, np.int64)
     distance = np.linalg.norm(poses[:, :-1, -1] - [*middle, 0.0][: recording.dimension], axis=1)
     far = np.flatnonzero(distance > reach)
     if not len(far):

@@ -20,6 +20,9 @@ MIN_ZERO_SHARE = 0.005  # of the readings: zero is a code
 MIN_ZERO_RATIO = 10.0  # zeros over other no-return readings, where drivers have both
 FREE_QUANTILE = 0.999  # of the hits: the range up to which the laser detects obstacles
 
+# how a range is known, where somebody says so
+GIVEN, DECLARED = "given", "declared in the recording"
+
 _CODE_WINDOW = 0.2  # m below the largest reading: noise of a code
 _REFERENCE_WINDOW = 1.0  # m below that: real readings
 _SICK_CODES = (81.825, 81.92)  # m: overflow values of the LMS 2xx, 8183 to 8191 cm
@@ -75,7 +78,7 @@ def find_max_range(ranges: NDArray[np.float32], declared: float | None = None) -
     found = _find_code(ranges, real) if real.size else None
     if declared is not None and (found is None or declared < found[0]):
         also = f"; {found[1]}" if found else ""
-        return MaxRange(declared, f"declared in the recording{also}", found is not None)
+        return MaxRange(declared, f"{DECLARED}{also}", found is not None)
     if found is not None:
         return MaxRange(found[0], found[1], True)
     if np.any(ranges >= MAX_PLAUSIBLE_RANGE):
@@ -140,7 +143,7 @@ def infer_range_rule(
     found = find_max_range(ranges, declared)
     threshold, how, warnings = found.threshold, found.how, []
     if options.max_range is not None:
-        threshold, how = options.max_range, "given"
+        threshold, how = options.max_range, GIVEN
         if found.coded and found.threshold is not None and found.threshold < options.max_range:
             warnings.append(
                 f"max_range {options.max_range:g} m exceeds a likely maximum-range code "
@@ -180,7 +183,7 @@ def _zero_meaning(
 ) -> tuple[Literal["unusable", "max-range"], str]:
     """Meaning of zero, where a share of the readings has another value for no return."""
     if option != "auto":
-        return option, "given"
+        return option, GIVEN
     share = float(np.mean((ranges >= 0.0) & (ranges < MAX_ZERO_RANGE))) if ranges.size else 0.0
     text = f"{100.0 * share:.2f} % of the readings are zero"
     if no_return_share > 0.0 and share <= MIN_ZERO_RATIO * no_return_share:
@@ -200,7 +203,7 @@ def _free_range(
     the 99.9 % quantile of its hits, at most the threshold.
     """
     if option is not None:
-        return option, "given"
+        return option, GIVEN
     if hits.size == 0:
         return threshold, "the maximum range: there are no hits"
     seen = _decimal(np.quantile(hits, FREE_QUANTILE, method="lower"))

@@ -105,13 +105,18 @@ class ResultFolder(RunRecord):
         return self.source
 
     def read(
-        self, progress: Progress | None = None, scratch: Path | None = None
+        self,
+        progress: Progress | None = None,
+        scratch: Path | None = None,
+        *,
+        left_out: bool = False,
     ) -> tuple[Recording, Labels]:
-        """The recording, as it was read when it was mapped, and its labels.
+        """The recording, as it was mapped, and its labels.
 
         Args:
             progress: hears which share of the recording is read.
             scratch: folder for what is too large for memory; None: the system's temporary folder.
+            left_out: with the returns that the map left out.
 
         Raises:
             InputError: one of them is not there, or they do not belong together.
@@ -122,8 +127,8 @@ class ResultFolder(RunRecord):
             recording = read_parts(self.parts, read_as, progress=progress, scratch=scratch)
         else:
             recording = read(source, read_as, progress=progress, scratch=scratch)
-        require_labelled(recording, labels, str(source))
-        return recording, labels
+        mapped = match_labels(recording, labels, str(source))
+        return recording if left_out else mapped, labels
 
     def calibrate(self, recording: Recording) -> Recording:
         """The recording with mounts and odometry as they were calibrated for the map.
@@ -167,25 +172,37 @@ class ResultFolder(RunRecord):
         )
 
 
-def require_labelled(recording: Recording, labels: Labels, where: str) -> None:
-    """Refuse a recording other than the one that was mapped.
+def match_labels(recording: Recording, labels: Labels, where: str) -> Recording:
+    """The recording without the returns that its map left out, which have no label.
 
     Raises:
         InputError: scans, beams or hits are others than those of the labels.
     """
-    other = ""
+    other, left_out = "", False
     if not np.array_equal(recording.stamp_ns, labels.stamp_ns) or not np.array_equal(
         recording.offset, labels.offset
     ):
         other = "scans or beams"
-    elif any(
-        (recording.hit[b] != labels.hit[b]).any()
-        for b in arrays.iter_blocks(recording.hit, labels.hit)
-    ):
-        other = "beams hit something"
+    else:
+        for b in arrays.iter_blocks(recording.hit, labels.hit):
+            odd = np.flatnonzero(recording.hit[b] != labels.hit[b])
+            left_out |= bool(len(odd))
+            if not (recording.hit[b][odd] & np.isnan(labels.p_static[b][odd])).all():
+                other = "beams hit something"
     if other:
         what = f"is not the recording that was mapped: other {other}"
         raise InputError(what, where=where, hint="name it with recording=PATH")
+    return _drop_unlabelled(recording, labels) if left_out else recording
+
+
+def _drop_unlabelled(recording: Recording, labels: Labels) -> Recording:
+    """The recording without the returns that have no label."""
+    points = arrays.copy(recording.points, recording.scratch)
+    hit = arrays.copy(recording.hit, recording.scratch)
+    for b in arrays.iter_blocks(points, hit):
+        points[b][hit[b] & ~labels.hit[b]] = np.nan
+        hit[b] = labels.hit[b]
+    return replace(recording, points=points, hit=hit)
 
 
 def open_result(

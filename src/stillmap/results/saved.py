@@ -20,7 +20,7 @@ from stillmap.io.trajectory import read_tum
 from stillmap.pipeline.options import Options
 from stillmap.pipeline.quality import Quality
 from stillmap.preprocessing.scan_timing import add_beam_times
-from stillmap.results.folder import ResultFolder, open_result, require_labelled
+from stillmap.results.folder import ResultFolder, match_labels, open_result
 from stillmap.results.labels import Labels, read_labels
 from stillmap.results.reader import Grid, Track, read_grid, read_tracks
 from stillmap.results.result import Result
@@ -104,9 +104,9 @@ class SavedResult(Result):
             InputError: it is not there, or is not the one that was mapped.
         """
         if isinstance(self.source, Recording):
-            require_labelled(self.source, self.labels, "recording")
+            mapped = match_labels(self.source, self.labels, "recording")
             # read from a file, it would have them already
-            recording = add_beam_times(self.source, self.folder.read_options.spin)
+            recording = add_beam_times(mapped, self.folder.read_options.spin)
         else:
             recording, _ = open_result(self.path, self.source).read()
         if recording.dimension != self.poses.shape[-1] - 1:

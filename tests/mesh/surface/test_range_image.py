@@ -217,3 +217,12 @@ def test_scans_without_surface_are_no_trouble(room):
     _, three = patches(recording, room.standing(3))
     assert [len(one.faces) for one in three] == [0, 0, 0]
     assert [len(one.points) for one in three] == [0, 0, 0]
+
+
+def test_returns_at_the_sensor_are_no_trouble(room):
+    looking = np.random.default_rng(0).permutation(room.lidar())
+    recording = room.scans(looking, room.standing())
+    recording.points[5:8] = 0.0
+    _, (patch,) = patches(recording, room.standing())
+    assert len(patch.faces) > 5000
+    assert not np.isin([5, 6, 7], patch.beam).any()
