@@ -1,8 +1,8 @@
-"""Hits that movers explain: who is followed over several lengths moved in all of its looks.
+"""Hits that movers explain: a mover followed over several lengths moved in every detection.
 
-Where a car hides the road behind it in every look at a place, and nobody looks there again, cells
-alone take its side for a wall. Its path says that it was there just then: what is known of the
-place itself are the hits at other times.
+Where a car occludes the road behind it whenever a place is seen, the cells alone take its side for
+a wall. Its path shows that it was there at these times: only hits at other times are evidence of
+the place itself.
 """
 
 from collections.abc import Sequence

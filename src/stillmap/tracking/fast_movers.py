@@ -1,10 +1,11 @@
 """Fast movers: clusters of several scans that one velocity explains, followed as one object.
 
-A new track stands, give or take the speed of a walker, and so loses a car whose next look is a
-metre away. Here the first looks determine the velocity: five clusters that lie on a line at
-constant speed begin a track, which is followed in both directions. Its reference is the edge of the
-object that faces the sensor along the motion (the front of what approaches, the rear of what
-recedes), not the mean of what is visible, which stands still while a car comes into view.
+A new track starts with velocity zero, give or take the speed of a walker, and so loses a car whose
+next detection is a metre away. Here the first detections determine the velocity: five clusters that
+lie on a line at constant speed begin a track, which is followed in both directions. Its reference
+point is the edge of the object that faces the sensor along the motion (the front of an approaching
+car, the rear of a receding one), not the mean of the visible points, which stands still while a car
+comes into view.
 """
 
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""Paths of walkers, who are smaller than the gaps between what is known of a place."""
+"""Paths of walkers, with a box about each, from tracks that certainly are movers."""
 
 from collections.abc import Container, Iterator
 
