@@ -128,17 +128,29 @@ def test_one_beam_of_ten_kilometres(map_it, changed):
     assert np.prod(size_of_map(out)) < 1e6
 
 
-def test_beams_of_kilometres_are_refused_beforehand(map_it, changed):
+def test_beams_of_hundreds_of_metres_are_refused_beforehand(map_it, changed):
     def change(points):
-        points *= 1000.0
+        points *= 90.0
 
-    status, said, peak, out = map_it(changed("points", change), "--memory", "0.6")
+    # a longer range is believed only where somebody states it
+    far = changed("points", change)
+    status, said, peak, out = map_it(far, "--memory", "0.6", "--set", "read.max_range=1000")
     assert status == 2
     (line,) = said
     for words in ("takes at least", "0.6 GB may be used", "--memory GB", "read.max_range"):
         assert words in line
     assert peak < 600e6
     assert not out.exists()
+
+
+def test_beams_of_kilometres_are_left_out_with_a_warning(map_it, changed):
+    def change(points):
+        points[::2] *= 1000.0
+
+    status, said, peak, out = map_it(changed("points", change), "--memory", "0.6")
+    assert (status, said) == (0, [])
+    assert peak < MOST
+    assert any("100 m" in w for w in json.loads((out / "run.json").read_text())["warnings"])
 
 
 def test_memory_that_runs_out_later(map_it, room, tmp_path):

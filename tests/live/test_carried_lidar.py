@@ -78,6 +78,7 @@ def test_nothing_is_drawn_over_the_map_until_then(back):
     assert len(mapper.path) > 12
 
 
+@pytest.mark.slow
 def test_where_it_has_never_been_it_stays_lost(tmp_path):
     hall, corridor = (
         list(iter_beams(simulate_sweeps(scene, 40).recording)) for scene in ("hall", "corridor")

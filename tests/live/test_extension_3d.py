@@ -194,6 +194,7 @@ def test_it_can_be_extended_again(rooms, drive):
     assert len(kept.cloud.route) < len(once.poses)
 
 
+@pytest.mark.slow
 def test_it_is_found_again_in_what_was_added(rooms):
     """The robot is carried in the second room, which is not in the known map."""
     first, known, second = rooms

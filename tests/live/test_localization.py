@@ -61,6 +61,7 @@ def test_the_robot_is_found_anywhere(hall, first):
     assert radians < 0.03
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", [291, 384])
 def test_a_robot_that_is_elsewhere_is_not_found(hall, first):
     """Half of an office fits into a hall somewhere, but not what comes into view after that."""
@@ -82,6 +83,7 @@ def test_a_crowd_does_not_lose_it(hall):
     assert np.mean(found) < 0.06
 
 
+@pytest.mark.slow
 def test_scans_from_before_it_was_found_are_labelled_in_the_map(hall):
     simulation = hall.simulate(201, crowd={"people": 10})
     beams = list(iter_beams(simulation.recording))

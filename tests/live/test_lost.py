@@ -52,6 +52,7 @@ def run(worlds, tmp_path_factory):
     return poses, true, doubts, folder
 
 
+@pytest.mark.slow
 def test_poses_elsewhere_are_not_known(run):
     poses, true, doubts, _ = run
     known = np.isfinite(poses).all(axis=(1, 2))

@@ -111,6 +111,7 @@ def test_the_result_is_in_the_frame_of_the_map(drive, tmp_path):
     np.testing.assert_allclose(stillmap.load(tmp_path / "out").poses, poses[known], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_elsewhere_it_stays_lost(place):
     corridor = simulate_sweeps("corridor", 30)
     with LiveMapper({"threads": 1}, place=place[0]) as mapper:

@@ -78,6 +78,7 @@ def test_loops_correct_drift(drive):
     assert len(graph.constraints) == len(graph.keyframes) - 1 + len(accepted)
 
 
+@pytest.mark.slow
 def test_false_candidates_are_rejected(drive, monkeypatch):
     """Turned so far that the far side of the block seems to be where the drive began."""
     driven = drive[3]
