@@ -23,6 +23,7 @@ _MAX_TIME_GAP = 2.0  # s between the departure from one position and the arrival
 _REACH = 0.5  # m between the cells of both positions, which have the hinge in common
 _MIN_ON_LEAF = 0.7  # share of a change's cells that lie on the leaf, for it to be of the door
 _MIN_LEAF = 0.6  # m
+_MIN_SWING, _MAX_SWING = math.radians(60.0), math.radians(145.0)  # walls stop leaves
 _BEYOND = 0.4  # m beyond the leaf, in which the wall goes on that it closes
 
 
@@ -127,7 +128,11 @@ def _find_candidates(changes: list[Change], surface: Cells) -> list[_Candidate]:
             leaf = find_resting_leaf(cells, others, resolution)
             cells = np.unique(np.concatenate([cells, leaf]), axis=0)
             sector = fit_sector(cells, resolution) if len(leaf) else None
-        if sector is not None and sector.length * resolution >= _MIN_LEAF:
+        if (
+            sector is not None
+            and sector.length * resolution >= _MIN_LEAF
+            and _MIN_SWING <= sector.angle <= _MAX_SWING
+        ):
             found.append(_Candidate(sector, group, cells, rests))
     return sorted(found, key=lambda one: (one.rests, -len(one.cells)))
 

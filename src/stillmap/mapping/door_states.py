@@ -85,13 +85,14 @@ def _list_states(
 ) -> tuple[DoorState, ...]:
     """Runs of observations (N, 2), of scan and cell, that saw the leaf in the same position."""
     out: list[DoorState] = []
-    looks = {"shut": 0, "open": 0}
+    looks, contradicted = {"shut": 0, "open": 0}, 0
     bins = (stamp_ns[hits[:, 0]] - stamp_ns[0]) // _BIN_NS
     for one in group_indices(bins):
         scans, number = hits[one].T
         number = np.unique(number)
         n_shut = int(np.count_nonzero(number < mask.n_shut))
         shares = {"shut": n_shut / mask.n_shut, "open": (len(number) - n_shut) / mask.n_open}
+        contradicted += min(shares.values()) >= _MIN_SHARE
         position: Position = "shut" if shares["shut"] >= shares["open"] else "open"
         if shares[position] < max(_MIN_SHARE, _RATIO * min(shares.values())):
             continue
@@ -100,8 +101,9 @@ def _list_states(
         if out and out[-1].position == position:
             first = out.pop().since_ns
         out.append(DoorState(position, first, last))
-    # a single one may be of somebody who walks by
-    return tuple(out) if min(looks.values()) >= _MIN_LOOKS else ()
+    # a single one may be of somebody who walks by; a leaf is not in two positions
+    swings = min(looks.values()) >= max(_MIN_LOOKS, contradicted)
+    return tuple(out) if swings else ()
 
 
 def is_passed(door: Door, recording: Recording, poses: Float) -> bool:
