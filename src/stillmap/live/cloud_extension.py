@@ -19,7 +19,7 @@ ROUTE = "live/known_route.npy"  # of a result that extends a map, from where tha
 
 @dataclass(frozen=True, eq=False)
 class KeptCloud(ShortRepr):
-    """What still stands of a known cloud, in its map frame.
+    """Points of a known cloud that are still occupied, in its map frame.
 
     Attributes:
         points: (N, 3) float64, m.

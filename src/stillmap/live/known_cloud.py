@@ -95,7 +95,7 @@ class KnownCloud:
     def keep(
         self, now: CellProbabilities | None, edge: float, band: tuple[float, float]
     ) -> KeptMap:
-        """What still stands of it.
+        """The points that are still occupied.
 
         Args:
             now: P(static and occupied) of the voxels of `find_voxels`, and of others; None: all

@@ -19,7 +19,7 @@ Layer = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class KeptMap(ShortRepr):
-    """What is kept of a known map that is extended, in its map frame.
+    """The part of a known map that an extended one keeps, in its map frame.
 
     Attributes:
         grid: the planar map.
@@ -69,7 +69,7 @@ class Overlay:
         return out
 
     def find_below(self, fill: float, below: NDArray[np.floating]) -> Layer:
-        """What the map below shows in the cells of the one above; `fill` where there is none."""
+        """Values of the lower map in the cells of the upper one; `fill` outside it."""
         out = np.full(self.shape, fill, np.float32)
         out[self._below] = below
         return out[self._above]

@@ -164,7 +164,7 @@ class OnlineSlam:
         return Placement(poses, submaps)
 
     def keep_map(self) -> KeptMap | None:
-        """What is kept of a known map that is extended, as it is known now; None: there is none."""
+        """The part of a known map that an extended one keeps, as of now; None: no such map."""
         return None if self._place is None else self._place.keep(self.labels)
 
     @property
@@ -302,7 +302,7 @@ class OnlineSlam:
         return [dataclasses.replace(one, first_cell=one.first_cell + by) for one in changes]
 
     def _find_movers(self) -> list[Mover]:
-        """What moves now, in the map frame."""
+        """Moving objects at present, in the map frame."""
         movers, known = self._movers.movers(self.frame.T_map_local), self.known_frame
         if not known.is_shifted:
             return movers

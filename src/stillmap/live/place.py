@@ -90,7 +90,7 @@ class Localizer(Protocol):
         """Filters of cells with what the map knows; `empty`: such of the same kind."""
 
     def keep(self, labels: CausalLabels, is_lost: bool, /) -> KeptMap:
-        """What is kept of a map that is extended, by what is known now; arguments: see `forget`."""
+        """The part of a known map that an extended one keeps now; arguments: see `forget`."""
 
 
 class PlanarLocalizer:
@@ -163,7 +163,7 @@ class PlaceTracker:
         self.is_lost = True
 
     def keep(self, labels: CausalLabels) -> KeptMap:
-        """What is kept of a map that is extended, by what is known now.
+        """The part of a known map that an extended one keeps, as of now.
 
         Args:
             labels: of what was seen so far.

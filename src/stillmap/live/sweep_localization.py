@@ -100,7 +100,7 @@ class SweepLocalizer:
         return empty
 
     def keep(self, labels: CausalLabels, is_lost: bool) -> KeptMap:
-        """What is kept of the map, by what is known now.
+        """The part of the map that an extended one keeps, as of now.
 
         Args:
             labels: of what was seen so far.

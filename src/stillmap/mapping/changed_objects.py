@@ -17,7 +17,7 @@ _MIN_WEIGHT = 1e-3
 
 
 class ShownCells(NamedTuple):
-    """What a map in some state shows of E cells.
+    """The map in some state, in E cells.
 
     Attributes:
         listed: (E,) cells that changes concern.
@@ -33,7 +33,7 @@ class ShownCells(NamedTuple):
 def find_shown_cells(
     histories: em.CellHistories, changes: list[Change], state: em.MapState
 ) -> ShownCells:
-    """What a map in that state shows of places that changed.
+    """The map in some state, in the cells of places that changed.
 
     Args:
         histories: of E cells.

@@ -111,7 +111,7 @@ class _Candidate(NamedTuple):
 
 
 def _find_candidates(changes: list[Change], surface: Cells) -> list[_Candidate]:
-    """What may be doors: those whose positions both changed first, and those of most cells."""
+    """Candidates for doors: first those whose positions both changed, then those of most cells."""
     came = [one for one in changes if one.kind == "came"]
     gone = [one for one in changes if one.kind == "left"]
     pairs = [
