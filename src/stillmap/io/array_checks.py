@@ -113,7 +113,7 @@ def poses_to_matrices(
 
 
 def _is_plainly_rigid(first: list[float], second: list[float], last: list[float]) -> bool:
-    """Whether the rows of a matrix (3, 3) are those of a pose, well within the tolerances."""
+    """True if a matrix (3, 3) is a pose in the plane, well within the tolerances."""
     (a, b, x), (c, d, y) = first, second
     skew = abs(a * a + b * b - 1.0) + abs(c * c + d * d - 1.0) + abs(a * c + b * d)
     is_near = abs(x) < MAX_TRANSLATION and abs(y) < MAX_TRANSLATION

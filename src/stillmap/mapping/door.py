@@ -50,7 +50,7 @@ class Door(ShortRepr):
     states: tuple[DoorState, ...] = ()
 
     def position_in(self, state: MapState) -> Position:
-        """Where a map in that state shows the leaf: where it was last, or for most of the time."""
+        """Position of the leaf in a map: the last one, or that of most of the time, or as asked."""
         if state in ("open", "shut"):
             return "open" if state == "open" else "shut"
         if state == "last":

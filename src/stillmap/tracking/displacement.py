@@ -80,7 +80,7 @@ def _place(one: MovingObject) -> Float:
 
 
 def _passes(ends: Float, place: Float, one: MovingObject) -> bool | None:
-    """Whether all beams that reach a place pass it; None: too few do. Most pass a thin post, too.
+    """True if all beams that reach a place pass it; None: too few do. Most pass a thin post, too.
 
     Args:
         ends: (N, 3) from the sensor, in the axes of the map.
