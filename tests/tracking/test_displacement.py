@@ -1,5 +1,7 @@
 """Which tracks in 3D are listed: those that travel, and what is seen to come or leave."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -71,6 +73,23 @@ def test_standing(there, listed):
 def test_beams_beside_a_thin_post_do_not_empty_its_place(width):
     recording, poses = street(scans((0, SCANS)), width=width)
     assert select_movers([an_object(recording, 20, 40)], recording, poses) == []
+
+
+@pytest.mark.parametrize(("share", "listed"), [(0.2, False), (1.0, True)], ids=["bush", "person"])
+def test_few_beams_empty_the_place_of_what_stops_all(share, listed):
+    """Before and after one beam passes through the outline, and others do beside it."""
+    there = scans((20, 40))
+    recording, poses = street(there)
+    points = recording.points.reshape(SCANS, -1, 3).copy()
+    hit = np.ones(points.shape[:2], bool)
+    direction = points[0] / points[0][:, :1]
+    on = np.abs(direction[:, 1] * AT[0]) < 0.25
+    passing = on & (np.random.default_rng(1).random(len(on)) > share)
+    points[:, passing] = 8.0 * direction[passing]
+    hit[~there] = ~on
+    hit[~there, np.flatnonzero(on)[np.count_nonzero(on) // 2]] = True
+    recording = dataclasses.replace(recording, points=points.reshape(-1, 3), hit=hit.reshape(-1))
+    assert len(select_movers([an_object(recording, 20, 40)], recording, poses)) == listed
 
 
 @pytest.mark.parametrize(("travel", "listed"), [(0.4, False), (0.6, True)])

@@ -8,6 +8,7 @@ nowhere while it is seen, but beams pass its place.
 import dataclasses
 from collections import defaultdict
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,9 @@ _RADIUS = 0.4  # m around the center of what stands, that count as its place
 _HALF_HEIGHT = 0.2  # m, at least, of its place above and below the center
 _LOOK_TIME, _LOOKS = 3.0, 4  # s before the first detection and after the last; looks there at most
 _MIN_BEAMS = 5  # that reach a place, for a look
+_BEFORE, _AFTER, _DURING = 0, 1, 2
+_MIN_HALF_SIZE = 0.05  # m, of the outline of a thin or flat object
+_MAX_P_MISSED = 0.05  # that an object which is still there stops no beam
 
 
 def select_movers(
@@ -41,36 +45,68 @@ def select_movers(
     return [dataclasses.replace(one, id=number) for number, one in enumerate(kept)]
 
 
+class _Look(NamedTuple):
+    """Beams of a scan that reach a place.
+
+    Attributes:
+        around: number of them within 0.4 m of its center line.
+        stopped: number of those that do not pass.
+        through: number of them within the outline of the object.
+        inside: number of those that end there.
+    """
+
+    around: int
+    stopped: int
+    through: int
+    inside: int
+
+
 def _remain_occupied(
     standing: Sequence[MovingObject], recording: Recording, poses: Float
 ) -> set[int]:
     """Ids of those whose place is not seen empty, neither before nor after."""
-    looks: dict[int, list[tuple[int, int]]] = defaultdict(list)  # by scan: object, side
+    looks: dict[int, list[tuple[int, int]]] = defaultdict(list)  # by scan: object, time
     for k, one in enumerate(standing):
-        for side, scans in enumerate(_choose_looks(one, recording.stamp_ns)):
+        for time, scans in enumerate(_choose_looks(one, recording.stamp_ns)):
             for t in scans.tolist():
-                looks[t].append((k, side))
-    counts = np.zeros((len(standing), 2, 2), np.int64)  # by side: looks, and those that pass
+                looks[t].append((k, time))
+    found: dict[tuple[int, int], list[_Look]] = defaultdict(list)
     T_map_sensor = recording.T_map_sensor(poses)
     for t in sorted(looks):
         beams = recording.beams_of(t)
         points = recording.points[beams][recording.hit[beams]].astype(np.float64)
         ends = points @ T_map_sensor[t, :3, :3].T
-        for k, side in looks[t]:
-            passed = _passes(ends, _place(standing[k]) - T_map_sensor[t, :3, 3], standing[k])
-            if passed is not None:
-                counts[k, side] += 1, int(passed)
-    is_empty = (counts[..., 0] > 0) & (2 * counts[..., 1] > counts[..., 0])
-    return {one.id for one, sides in zip(standing, is_empty, strict=True) if not sides.any()}
+        for k, time in looks[t]:
+            place = _place(standing[k]) - T_map_sensor[t, :3, 3]
+            found[k, time].append(_look_at(ends, place, standing[k].size))
+    return {
+        one.id
+        for k, one in enumerate(standing)
+        if not any(_is_empty(found[k, side], found[k, _DURING]) for side in (_BEFORE, _AFTER))
+    }
 
 
-def _choose_looks(one: MovingObject, stamp_ns: NDArray[np.int64]) -> tuple[Index, Index]:
-    """Scans before the first detection and after the last."""
+def _is_empty(looks: Sequence[_Look], during: Sequence[_Look]) -> bool:
+    """Whether what was seen at a place `during` a track is not there in other looks.
+
+    Most looks see all beams pass, and so many of them within its outline that the object, which
+    stopped a share of such beams, would have stopped one.
+    """
+    looks = [one for one in looks if one.around >= _MIN_BEAMS]
+    passed = [one for one in looks if not one.stopped]
+    through, inside = (sum(getattr(one, name) for one in during) for name in ("through", "inside"))
+    p_pass = 1.0 - inside / max(through, 1)
+    expected = sum(one.through for one in passed)
+    return 2 * len(passed) > len(looks) and p_pass**expected < _MAX_P_MISSED
+
+
+def _choose_looks(one: MovingObject, stamp_ns: NDArray[np.int64]) -> tuple[Index, Index, Index]:
+    """Scans before the first detection, after the last, and some with a detection."""
     reach = round(1e9 * _LOOK_TIME)
     first, last = np.searchsorted(stamp_ns, [one.stamp_ns[0] - reach, one.stamp_ns[-1] + reach])
-    sides = np.arange(first, one.scan[0]), np.arange(one.scan[-1] + 1, last)
-    before, after = (side[:: max(1, -(-len(side) // _LOOKS))] for side in sides)
-    return before, after
+    times = np.arange(first, one.scan[0]), np.arange(one.scan[-1] + 1, last), one.scan
+    before, after, during = (scans[:: max(1, -(-len(scans) // _LOOKS))] for scans in times)
+    return before, after, during
 
 
 def _place(one: MovingObject) -> Float:
@@ -79,20 +115,26 @@ def _place(one: MovingObject) -> Float:
     return np.array([*one.xy.mean(axis=0), one.z.mean()])
 
 
-def _passes(ends: Float, place: Float, one: MovingObject) -> bool | None:
-    """True if all beams that reach a place pass it; None: too few do. Most pass a thin post, too.
+def _look_at(ends: Float, place: Float, size: Sequence[float]) -> _Look:
+    """What a scan shows of the place of an object.
 
     Args:
         ends: (N, 3) from the sensor, in the axes of the map.
         place: (3,) from the sensor, likewise.
-        one: whose height counts.
+        size: metres along, across and up.
     """
     length = np.maximum(np.linalg.norm(ends[:, :2], axis=1), 1e-6)
     along = ends[:, :2] @ place[:2] / length
     off = np.abs(ends[:, 0] * place[1] - ends[:, 1] * place[0]) / length
-    height = ends[:, 2] * (along / length) - place[2]
+    height = np.abs(ends[:, 2] * (along / length) - place[2])
     towards = (along > 0) & (off < _RADIUS) & (length > along - _RADIUS)
-    towards &= np.abs(height) < max(0.5 * one.size[2], _HALF_HEIGHT)
-    if np.count_nonzero(towards) < _MIN_BEAMS:
-        return None
-    return bool((length[towards] > along[towards] + _RADIUS).all())
+    towards &= height < max(0.5 * size[2], _HALF_HEIGHT)
+    passes = length > along + _RADIUS
+    width = max(0.5 * min(size[:2]), _MIN_HALF_SIZE)
+    within = towards & (off < width) & (height < max(0.5 * size[2], _MIN_HALF_SIZE))
+    return _Look(
+        int(np.count_nonzero(towards)),
+        int(np.count_nonzero(towards & ~passes)),
+        int(np.count_nonzero(within)),
+        int(np.count_nonzero(within & ~passes)),
+    )

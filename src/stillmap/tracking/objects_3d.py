@@ -19,6 +19,7 @@ from stillmap.core.recording import Recording
 from stillmap.em import GroundMap
 from stillmap.mapping.projection import DIRECTIONS, make_planar_recording
 from stillmap.tracking import MovingObject, ObjectOptions, track_objects
+from stillmap.tracking.attachment import drop_attached
 from stillmap.tracking.clustering import MIN_P_DYNAMIC
 from stillmap.tracking.displacement import select_movers
 
@@ -41,7 +42,8 @@ def track_objects_3d(
 ) -> list[MovingObject]:
     """Detect and track the moving objects of a 3D recording, with the height of track and box.
 
-    What goes nowhere, and whose place is never seen empty, is left out (`displacement.py`).
+    What goes nowhere, and whose place is never seen empty, is left out (`displacement.py`), and so
+    are parts of static surfaces (`attachment.py`).
 
     Dynamic end points in connected columns above the ground are one segment. The nearest point in
     each direction, which a planar laser would see, is tracked; the other points of a segment
@@ -67,7 +69,7 @@ def track_objects_3d(
         _add_height(one, beams, recording, poses, p_static)
         for one, beams in zip(objects, owned, strict=True)
     ]
-    return select_movers(found_3d, recording, poses)
+    return select_movers(drop_attached(found_3d, recording, p_static), recording, poses)
 
 
 class _Segments(NamedTuple):
