@@ -31,7 +31,7 @@ from stillmap.mesh.types import Float, Float32, Int64, Tell, no_tell
 
 Tile = tuple[int, ...]
 
-_MIN_P_STATIC = 0.5  # product over a triangle's beams below which it is left out
+_MIN_P_STATIC = 0.8  # product over a triangle's beams; below, a beam has little but its prior
 TILE = 64  # voxels along a tile, whole blocks
 _MAX_STEP = 2.5  # voxels between distances within a cube: more, and two surfaces meet there
 _EXTRACT_BYTES = 48e6  # of new voxels after which complete tiles are extracted

@@ -52,6 +52,12 @@ def walked(room):
     return room.scans(room.lidar(360, 40), poses, noise=0.01), poses
 
 
+@pytest.mark.parametrize(("p", "has_surface"), [(0.9, False), (0.95, True)], ids=["prior", "sure"])
+def test_what_only_the_prior_takes_for_static_is_no_surface(walked, p, has_surface):
+    mesh = build_surface(walked[0], walked[1], p * static(walked[0]), OPTIONS)
+    assert (len(mesh) > 0) == has_surface
+
+
 def test_the_room_is_where_it_is(room, walked):
     mesh = build_surface(walked[0], walked[1], static(walked[0]), OPTIONS)
     at, face = samples(mesh)
