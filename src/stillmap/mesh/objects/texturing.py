@@ -30,6 +30,8 @@ OUTLINE_DRIFT = 0.05  # of an object's motion since its observation: error of it
 _OUTLINE_INSET = 0.01  # m inside an object's outline, where an image may show the background
 _UNCERTAIN_INSET = 0.05  # m more where the background is unknown
 _MIN_BACKGROUND_DIFFERENCE = 30.0  # of 442, of colors from those of the background
+_MIN_VISIBLE_SHARE = 0.8  # of an object's faces in a view that the background does not hide
+_MIN_DIFFERENT_SHARE = 0.8  # of these that differ from the background, where it is known
 _MAX_FACE_EDGE = 0.05  # m: longer edges are subdivided
 _MIN_TEXTURED_SHARE = 0.05  # of an object's area: less is no texture of it
 
@@ -113,14 +115,21 @@ def assign_object_views(
 def _shows_object(points: Float, depth: Float, number: int, background: Background) -> Bool:
     """(n,) whether a view shows an object, and not the background, at map points (n, 3).
 
-    They lie `depth` (n,) metres farther inside its outline than they need to.
+    They lie `depth` (n,) metres farther inside its outline than they need to. Where the background
+    hides much of the object, errors of the edge that hides it matter; where much of it has the
+    colors of the background, the object is elsewhere: such a view shows none of it.
     """
     shown = depth >= 0.0
+    inside = np.count_nonzero(shown)
     shown[shown] = background.is_unoccluded(number, points[shown])
-    if shown.any():
-        difference = background.color_difference(number, points[shown])
-        uncertain = np.isnan(difference) & (depth[shown] >= _UNCERTAIN_INSET)
-        shown[shown] = uncertain | (difference >= _MIN_BACKGROUND_DIFFERENCE)
+    if np.count_nonzero(shown) < max(_MIN_VISIBLE_SHARE * inside, 1.0):
+        return np.zeros_like(shown)
+    difference = background.color_difference(number, points[shown])
+    differs = difference >= _MIN_BACKGROUND_DIFFERENCE
+    unknown = np.isnan(difference)
+    if np.count_nonzero(differs) < _MIN_DIFFERENT_SHARE * np.count_nonzero(~unknown):
+        return np.zeros_like(shown)
+    shown[shown] = differs | (unknown & (depth[shown] >= _UNCERTAIN_INSET))
     return shown
 
 
