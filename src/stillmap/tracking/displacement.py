@@ -23,6 +23,7 @@ _RADIUS = 0.4  # m around the center of what stands, that count as its place
 _HALF_HEIGHT = 0.2  # m, at least, of its place above and below the center
 _LOOK_TIME, _LOOKS = 3.0, 4  # s before the first detection and after the last; looks there at most
 _MIN_BEAMS = 5  # that reach a place, for a look
+_ROUNDING = 1e-3  # m, far more than rounding errors of distances
 
 
 def select_movers(
@@ -56,8 +57,12 @@ def _remain_occupied(
         beams = recording.beams_of(t)
         points = recording.points[beams][recording.hit[beams]].astype(np.float64)
         ends = points @ T_map_sensor[t, :3, :3].T
+        flat = np.ascontiguousarray(ends[:, :2].T)
+        length = np.sqrt(np.square(flat[0]) + np.square(flat[1]))
         for k, side in looks[t]:
-            passed = _passes(ends, _place(standing[k]) - T_map_sensor[t, :3, 3], standing[k])
+            place = _place(standing[k]) - T_map_sensor[t, :3, 3]
+            near = _find_near_line(flat, length, place)
+            passed = _passes(ends[near], place, standing[k])
             if passed is not None:
                 counts[k, side] += 1, int(passed)
     is_empty = (counts[..., 0] > 0) & (2 * counts[..., 1] > counts[..., 0])
@@ -77,6 +82,18 @@ def _place(one: MovingObject) -> Float:
     """(3,) mean center in the map frame, metres."""
     assert one.z is not None
     return np.array([*one.xy.mean(axis=0), one.z.mean()])
+
+
+def _find_near_line(flat: Float, length: Float, place: Float) -> Index:
+    """The beams that may come near a place, in the plane; `_passes` decides for these few.
+
+    Args:
+        flat: (2, N) ends from the sensor.
+        length: (N,) of these.
+        place: (3,) from the sensor.
+    """
+    across = np.abs(flat[0] * place[1] - flat[1] * place[0])
+    return np.flatnonzero(across <= (_RADIUS + _ROUNDING) * (length + _ROUNDING))
 
 
 def _passes(ends: Float, place: Float, one: MovingObject) -> bool | None:
