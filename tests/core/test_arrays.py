@@ -253,3 +253,12 @@ def test_some_rows_are_those_of_the_array(limit, monkeypatch, tmp_path, rng):
     assert array.flags.writeable == (limit > 0)
     for numbers in (np.zeros(0, np.intp), np.array([0, 99, 100, 999]), np.arange(1000)):
         np.testing.assert_array_equal(arrays.take_rows(array, numbers), array[numbers])
+
+
+def test_different_cells_are_those_of_numpy(rng):
+    for n in (0, 1, 300):
+        cells = rng.integers(-(2**22), 2**22, (n, 2)) // rng.choice([1, 2**20], (n, 1))
+        expected, of = np.unique(cells, axis=0, return_inverse=True)
+        found = arrays.unique_cells(cells)
+        np.testing.assert_array_equal(found[0], expected)
+        np.testing.assert_array_equal(found[1], of.reshape(-1))

@@ -6,7 +6,7 @@ import pytest
 import scipy.linalg  # noqa: F401  (its BLAS is loaded before threads are counted)
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from stillmap.core.parallel import limit_blas_threads, map_ordered
+from stillmap.core.parallel import limit_blas_threads, map_ordered, work_beside
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])
@@ -18,6 +18,27 @@ def test_outcomes_keep_the_order_of_the_items(threads):
 def test_work_goes_on_side_by_side():
     both = threading.Barrier(2, timeout=30.0)  # one alone would never pass
     assert len(list(map_ordered(lambda _: both.wait(), range(4), 2))) == 4
+
+
+def test_work_is_done_during_the_block():
+    both = threading.Barrier(2, timeout=30.0)
+    with work_beside(lambda: both.wait() >= 0, 2) as done:
+        both.wait()
+        assert done()
+
+
+def test_one_thread_does_work_when_it_is_asked_for():
+    order = []
+    with work_beside(lambda: order.append("work"), 1) as done:
+        order.append("block")
+        done()
+    assert order == ["block", "work"]
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_errors_of_work_beside_are_raised_where_it_is_asked_for(threads):
+    with work_beside(lambda: 1 // 0, threads) as done, pytest.raises(ZeroDivisionError):
+        done()
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])

@@ -234,6 +234,21 @@ def sample_indices(count: int, max_count: int) -> NDArray[np.int64]:
     return np.minimum((at * (count / max_count)).astype(np.int64), count - 1)
 
 
+def unique_cells(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
+    """`np.unique` of the rows of cells (n, 2) and their inverse (n,); faster, as it sorts numbers.
+
+    Returns:
+        (m, 2) different cells, by the first coordinate, then the second; (n,) which each one is.
+    """
+    if not len(cells):
+        return cells, np.zeros(0, np.intp)
+    low = cells.min(axis=0)
+    x, y = (cells - low).T
+    wide = int(y.max()) + 1
+    flat, of = np.unique(x * wide + y, return_inverse=True)
+    return np.stack(np.divmod(flat, wide), axis=1) + low, of.reshape(-1)
+
+
 def first_index_per_group(group: NDArray[np.int64]) -> NDArray[np.int64]:
     """Index of the first row of each group, as `np.unique(..., return_index=True)[1]`.
 

@@ -94,3 +94,16 @@ def map_ordered(
                 yield ahead.popleft().result()
         while ahead:
             yield ahead.popleft().result()
+
+
+@contextmanager
+def work_beside(work: Callable[[], _Outcome], threads: int) -> Iterator[Callable[[], _Outcome]]:
+    """Do `work` in another thread during the block, which is given a function that waits for it.
+
+    With one thread, `work` is done when its outcome is asked for.
+    """
+    if threads <= 1:
+        yield work
+        return
+    with ThreadPoolExecutor(1) as pool:
+        yield pool.submit(work).result

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.components import connected_components, neighbor_pairs
+from stillmap.core.parallel import map_ordered
 from stillmap.core.recording import Recording
 from stillmap.em.mixture import fit_weights, posterior
 from stillmap.em.observations import (
@@ -216,7 +217,8 @@ class ChangeMixture:
         """
         surfel_map = self._observations.surfel_map
         p_static, change = np.empty((2, surfel_map.size), np.float32)
-        for rows in iter_surfel_rows(surfel_map):
+
+        def process(rows: Rows) -> None:
             likelihood = self._likelihood(rows)
             p_static[slice(*rows)] = posterior(likelihood, self._weights, self._static)
             log_changed, log_static = (
@@ -224,6 +226,10 @@ class ChangeMixture:
                 for of in (self._groups[-1], self._static)
             )
             change[slice(*rows)] = np.clip(log_changed - log_static, -_MAX_CHANGE, _MAX_CHANGE)
+
+        blocks = map_ordered(process, iter_surfel_rows(surfel_map), self._observations.threads)
+        for _ in blocks:
+            pass
         return p_static, change
 
     def decode_histories(self) -> CellHistories:

@@ -7,12 +7,14 @@ view-dependent class would explain walls duplicated by pose error, and preserve 
 """
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core.chunks import iter_beams
+from stillmap.core.parallel import map_ordered, work_beside
 from stillmap.core.recording import Recording
 from stillmap.em import spatial_coupling
 from stillmap.em.change_hmm import (
@@ -29,6 +31,7 @@ from stillmap.em.observations import (
     MIN_TRUST,
     HmmClasses,
     Observations,
+    Rows,
     collect_observations,
     iter_surfel_rows,
     probability_in_cell,
@@ -73,7 +76,9 @@ def e_step(
         threads: does not change the result.
     """
     observations = collect_observations(recording, poses, resolution, options, threads)
-    return label_beams(observations, None, recording, poses, options)
+    return label_beams(
+        observations, None, _fit_classes(observations, None, options), recording, poses
+    )
 
 
 def e_step_3d(
@@ -98,17 +103,20 @@ def e_step_3d(
         changes,
         with_surroundings=True,
     )
-    surfel_map, mixture = observations.surfel_map, ChangeMixture(observations, options)
+    surfel_map = observations.surfel_map
     assert isinstance(surfel_map, _core.SurfelMap3D)
-    own_p_static, change = mixture.label_surfels()
-    p_static = spatial_coupling.smooth_mean_field(own_p_static, surfel_map, threads)
+    with work_beside(lambda: _fit_classes(observations, None, options), threads) as fitted:
+        mixture = ChangeMixture(observations, options)
+        own_p_static, change = mixture.label_surfels()
+        p_static = spatial_coupling.smooth_mean_field(own_p_static, surfel_map, threads)
+        fit = fitted()
     ground = ground_from_surfels(surfel_map, p_static, recording.T_map_sensor(poses)[:, :3, 3])
     obstacles = spatial_coupling.select_obstacles(ground, surfel_map)
     if obstacles is not None:
         p_static = spatial_coupling.pool_clusters(
             p_static, change, obstacles, recording, poses, threads
         )
-    found = label_beams(observations, None, recording, poses, options, p_static, obstacles)
+    found = label_beams(observations, None, fit, recording, poses, p_static, obstacles)
     changed_cells = None
     if options.change_detection_3d:
         changed_cells = select_changed_cells(mixture.decode_histories())
@@ -134,7 +142,9 @@ def final_e_step(
     observations = collect_observations(
         recording, poses, resolution, options, threads, _FINAL_CLASSES, changes
     )
-    labels = label_beams(observations, _label_classes(observations), recording, poses, options)
+    classes = _label_classes(observations)
+    fit = _fit_classes(observations, classes, options)
+    labels = label_beams(observations, classes, fit, recording, poses)
     if changes is None:
         return labels, None
     return labels, ChangeMixture(observations, options).decode_histories()
@@ -148,31 +158,52 @@ def _label_classes(observations: Observations) -> NDArray[np.bool_]:
     return np.asarray(kept)
 
 
-def label_beams(
-    observations: Observations,
-    classes: NDArray[np.bool_] | None,
-    recording: Recording,
-    poses: Float,
-    options: EmOptions,
-    p_static: NDArray[np.float32] | None = None,
-    obstacles: ObstacleSurfels | None = None,
-) -> EStepResult:
-    """Fits the mixture weights and labels each beam by the cell in which it ended.
+class ClassFit(NamedTuple):
+    """Mixture of classes, fitted to all observations.
 
-    Args:
-        observations: E surfels with their observations.
-        classes: (C,) classes to use; None: all.
-        recording, poses, options: see `e_step`.
-        p_static: (E,) P(static) of each surfel to use instead of the posterior.
-        obstacles: relabel beams that end on the ground below something that moves.
+    Attributes:
+        weights: (C,) of the classes.
+        p_static: (E,) posterior of each surfel.
+        likelihood: of the observations.
     """
+
+    weights: Float
+    p_static: NDArray[np.float32]
+    likelihood: Likelihood
+
+
+def _fit_classes(
+    observations: Observations, classes: NDArray[np.bool_] | None, options: EmOptions
+) -> ClassFit:
+    """Fits the weights of some classes; None: all."""
     sample, _ = observations.likelihood(classes, observations.sample_rows())
     long = _long_movers(observations, classes)
     weights = fit_weights(sample, observations.n_static, options.prior, rare=long)
-    posterior, likelihood = _surfel_posterior(observations, classes, weights)
-    prior = float(weights[: observations.n_static].sum())
+    return ClassFit(weights, *_surfel_posterior(observations, classes, weights))
+
+
+def label_beams(
+    observations: Observations,
+    classes: NDArray[np.bool_] | None,
+    fit: ClassFit,
+    recording: Recording,
+    poses: Float,
+    p_static: NDArray[np.float32] | None = None,
+    obstacles: ObstacleSurfels | None = None,
+) -> EStepResult:
+    """Labels each beam by the cell in which it ended.
+
+    Args:
+        observations: E surfels with their observations.
+        classes: (C,) classes that were fitted; None: all.
+        fit: of these classes.
+        recording, poses: see `e_step`.
+        p_static: (E,) P(static) of each surfel to use instead of the posterior.
+        obstacles: relabel beams that end on the ground below something that moves.
+    """
+    prior = float(fit.weights[: observations.n_static].sum())
     if p_static is None:
-        p_static = posterior
+        p_static = fit.p_static
     elif len(p_static):
         prior = float(np.mean(p_static, dtype=np.float64))
     surfel_map, threads = observations.surfel_map, observations.threads
@@ -189,9 +220,9 @@ def label_beams(
     end_margin = MAX_RANGE_MARGIN if observations.trust >= MIN_TRUST else float("inf")
     return EStepResult(
         p_static=e,
-        likelihood=likelihood,
+        likelihood=fit.likelihood,
         occupied=CellProbabilities(surfel_cells(surfel_map), p_occupied, _FREE_PRIOR),
-        learned=_parameter_record(observations, classes, weights, prior),
+        learned=_parameter_record(observations, classes, fit.weights, prior),
         no_return=NoReturnModel(observations.hmm.solid_cells(), end_margin),
     )
 
@@ -216,14 +247,20 @@ def _surfel_posterior(
 ) -> tuple[NDArray[np.float32], Likelihood]:
     """(E,) P(static) of each surfel, and the bound sum ln sum_c w_c L_c."""
     p_static, bound, entropy = np.empty(observations.surfel_map.size, np.float32), 0.0, 0.0
-    for rows in iter_surfel_rows(observations.surfel_map):
+
+    def process(rows: Rows) -> tuple[float, float]:
         table, log_best = observations.likelihood(classes, rows)
         p_static[slice(*rows)] = posterior_static(table, weights, observations.n_static)
         joint = table * weights
         evidence = joint.sum(axis=1)  # sum_c w_c L_c
         r = joint / evidence[:, None]  # responsibilities of the classes
-        entropy -= float(np.sum(r * np.log(np.maximum(r, 1e-30))))
-        bound += float(np.sum(np.log(evidence) + log_best))
+        negative_entropy = float(np.sum(r * np.log(np.maximum(r, 1e-30))))
+        return float(np.sum(np.log(evidence) + log_best)), -negative_entropy
+
+    blocks = map_ordered(process, iter_surfel_rows(observations.surfel_map), observations.threads)
+    for evidence_of_rows, entropy_of_rows in blocks:
+        bound += evidence_of_rows
+        entropy += entropy_of_rows
     return p_static, Likelihood(expected=bound - entropy, bound=bound)
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from stillmap import em
 from stillmap.core import se2
 from stillmap.core.array_builder import ArrayBuilder
-from stillmap.core.arrays import finite_rows, first_index_per_group
+from stillmap.core.arrays import finite_rows, first_index_per_group, unique_cells
 from stillmap.core.parallel import map_ordered
 from stillmap.core.recording import Recording
 from stillmap.em import GroundMap
@@ -184,7 +184,7 @@ def project_cells(
     middle = np.asarray((known.cells + 0.5) * cell, np.float64)
     above = middle[:, 2] - ground.height_at(middle[:, :2])
     inside = (above >= band[0]) & (above <= band[1])
-    columns, of = np.unique(known.cells[inside, :2], axis=0, return_inverse=True)
+    columns, of = unique_cells(known.cells[inside, :2])
     p = np.zeros(len(columns), np.float32)
-    np.maximum.at(p, of.reshape(-1), known.p_occupied[inside])
+    np.maximum.at(p, of, known.p_occupied[inside])
     return em.CellProbabilities(columns, p, known.free_prior)

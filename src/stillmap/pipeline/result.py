@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from stillmap import em, slam
 from stillmap.core.heap import trim_heap
 from stillmap.core.local_frame import LocalFrame
-from stillmap.core.parallel import limit_blas_threads, resolve_threads
+from stillmap.core.parallel import limit_blas_threads, resolve_threads, work_beside
 from stillmap.core.profiling import Progress, StageTimer, no_progress
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
@@ -250,15 +251,8 @@ def _finish(
     trim_heap()
     maps = make_maps(deskewed, estimate, options, progress, stages)
     trim_heap()
-    progress("tracking objects", 0, 0, 0)
-    with stages.measure("objects"):
-        objects = find_objects(deskewed, estimate, maps, changes, options)
-        crossings = compute_flow_map(objects)
-    progress("rating the map", 0, 0, 0)
-    with stages.measure("quality"):
-        threads = resolve_threads(options.threads)
-        quality = rate_quality(deskewed, estimate.poses, estimate.p_static, maps.filtered, threads)
-        del deskewed
+    objects, quality = _track_and_rate(deskewed, estimate, maps, changes, options, progress, stages)
+    del deskewed
     trim_heap()
     return MappingResult(
         recording=recording,
@@ -273,11 +267,38 @@ def _finish(
             *find_map_warnings(maps, recording, estimate.poses),
         ],
         objects=objects,
-        traffic=crossings,
+        traffic=compute_flow_map(objects),
         changes=changes,
         stages=stages.to_dict(),
         quality=quality,
     )
+
+
+def _track_and_rate(
+    deskewed: Recording,
+    estimate: Estimate,
+    maps: Maps,
+    changes: list[Change],
+    options: Options,
+    progress: Progress,
+    stages: StageTimer,
+) -> tuple[list[MovingObject], Quality]:
+    """Moving objects, and the quality of the result.
+
+    Both are mostly serial. In 3D, where little of it holds Python's lock, they share the
+    processors; the stage "quality" is then what is left of it after the objects.
+    """
+    progress("tracking objects", 0, 0, 0)
+    threads = resolve_threads(options.threads)
+    rate = partial(
+        rate_quality, deskewed, estimate.poses, estimate.p_static, maps.filtered, threads
+    )
+    with work_beside(rate, threads if deskewed.dimension == 3 else 1) as rated:
+        with stages.measure("objects"):
+            objects = find_objects(deskewed, estimate, maps, changes, options)
+        progress("rating the map", 0, 0, 0)
+        with stages.measure("quality"):
+            return objects, rated()
 
 
 def _to_map_frame(result: MappingResult, frame: LocalFrame) -> MappingResult:

@@ -27,6 +27,7 @@ _MIN_BEAMS = 5  # that reach a place, for a look
 _BEFORE, _AFTER, _DURING = 0, 1, 2
 _MIN_HALF_SIZE = 0.05  # m, of the outline of a thin or flat object
 _MAX_P_MISSED = 0.05  # that an object which is still there stops no beam
+_ROUNDING = 1e-3  # m, far more than rounding errors of distances
 
 
 def select_movers(
@@ -76,9 +77,12 @@ def _remain_occupied(
         beams = recording.beams_of(t)
         points = recording.points[beams][recording.hit[beams]].astype(np.float64)
         ends = points @ T_map_sensor[t, :3, :3].T
+        flat = np.ascontiguousarray(ends[:, :2].T)
+        length = np.sqrt(np.square(flat[0]) + np.square(flat[1]))
         for k, time in looks[t]:
             place = _place(standing[k]) - T_map_sensor[t, :3, 3]
-            found[k, time].append(_look_at(ends, place, standing[k].size))
+            near = _find_near_line(flat, length, place)
+            found[k, time].append(_look_at(ends[near], place, standing[k].size))
     return {
         one.id
         for k, one in enumerate(standing)
@@ -113,6 +117,18 @@ def _place(one: MovingObject) -> Float:
     """(3,) mean center in the map frame, metres."""
     assert one.z is not None
     return np.array([*one.xy.mean(axis=0), one.z.mean()])
+
+
+def _find_near_line(flat: Float, length: Float, place: Float) -> Index:
+    """The beams that may come near a place, in the plane; `_look_at` decides for these few.
+
+    Args:
+        flat: (2, N) ends from the sensor.
+        length: (N,) of these.
+        place: (3,) from the sensor.
+    """
+    across = np.abs(flat[0] * place[1] - flat[1] * place[0])
+    return np.flatnonzero(across <= (_RADIUS + _ROUNDING) * (length + _ROUNDING))
 
 
 def _look_at(ends: Float, place: Float, size: Sequence[float]) -> _Look:

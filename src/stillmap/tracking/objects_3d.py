@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.array_builder import ArrayBuilder
-from stillmap.core.arrays import take_rows
+from stillmap.core.arrays import take_rows, unique_cells
 from stillmap.core.components import component_labels, neighbor_pairs
 from stillmap.core.parallel import map_ordered
 from stillmap.core.recording import Recording
@@ -132,13 +132,8 @@ def _connect_columns(xy: Float) -> Index:
     """(n,) connected component of columns that each position (n, 2) lies in."""
     if not len(xy):
         return np.zeros(0, np.intp)
-    column = np.floor(xy / _COLUMN).astype(np.int64)
-    x, y = (column - column.min(axis=0)).T
-    wide = int(y.max()) + 1
-    flat, of = np.unique(x * wide + y, return_inverse=True)  # faster than that of rows
-    cells = np.stack(np.divmod(flat, wide), axis=1)
-    label = component_labels(neighbor_pairs(cells, 1.5), len(cells))
-    return label[of.reshape(-1)]
+    cells, of = unique_cells(np.floor(xy / _COLUMN).astype(np.int64))
+    return component_labels(neighbor_pairs(cells, 1.5), len(cells))[of]
 
 
 def _nearest_per_direction(local: Float) -> Index:

@@ -2,6 +2,7 @@
 #pragma once
 
 #include <array>
+#include <limits>
 #include <memory>
 #include <unordered_map>
 #include <utility>
@@ -23,9 +24,16 @@ class BlockMap : public BlockLayout<D> {
     std::array<Value, kCells> values;  // one per cell
   };
 
+  static constexpr size_t kNoBlock = std::numeric_limits<size_t>::max();
+
   const Block* find(const Cell<D>& block) const {
+    const size_t number = find_number(block);
+    return number == kNoBlock ? nullptr : blocks_[number].get();
+  }
+  // Index in `blocks`; kNoBlock if there is none.
+  size_t find_number(const Cell<D>& block) const {
     const auto it = index_.find(BlockLayout<D>::key(block));
-    return it == index_.end() ? nullptr : blocks_[it->second].get();
+    return it == index_.end() ? kNoBlock : it->second;
   }
 
   // In order of insertion.

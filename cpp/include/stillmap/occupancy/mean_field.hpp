@@ -38,7 +38,8 @@ class MeanField {
         options_(options),
         threads_(threads),
         p_static_(surfel_map.size()),
-        window_(window_rows<D>(options.radius, false)) {
+        window_(window_rows<D>(options.radius, false)),
+        masks_(surfel_map) {
     nodes_.reserve(surfel_map.size());
     for (size_t k = 0; k < surfel_map.size(); ++k) {
       nodes_.push_back(node_of(static_cast<int32_t>(k), log_odds[k]));
@@ -53,7 +54,7 @@ class MeanField {
       const std::vector<float> previous = p_static_;
       parallel_for_ranges(split_evenly(p_static_.size(), threads_),
                           [&](size_t, size_t begin, size_t end) {
-                            WindowQuery<D> query(surfel_map_);
+                            WindowQuery<D> query(surfel_map_, masks_);
                             for (size_t k = begin; k < end; ++k)
                               if (active[k]) p_static_[k] = update(query, k, previous);
                           });
@@ -124,7 +125,7 @@ class MeanField {
                                   std::vector<uint8_t>& active) const {
     std::fill(active.begin(), active.end(), uint8_t{0});
     bool changed = false;
-    WindowQuery<D> query(surfel_map_);
+    WindowQuery<D> query(surfel_map_, masks_);
     for (size_t k = 0; k < p_static_.size(); ++k) {
       if (!(std::abs(p_static_[k] - previous[k]) > options_.tolerance)) continue;
       for_each_neighbour(query, k, [&](size_t other) { active[other] = 1; });
@@ -139,6 +140,7 @@ class MeanField {
   std::vector<float> p_static_;
   std::vector<Node> nodes_;
   CellRows<D> window_;
+  RowMasks<D> masks_;
 };
 
 }  // namespace stillmap

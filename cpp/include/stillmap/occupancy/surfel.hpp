@@ -71,24 +71,24 @@ struct WindowMoments {
 
   double count = 0.0, max_count = 0.0;  // total; largest of any cell
   Vec<D> first = Vec<D>::Zero();
-  Square second = Square::Zero();
+  Square second = Square::Zero();  // lower triangle
 
   void add(const EndPointSums<D>& s, const Cell<D>& centre) {
     const Vec<D> corner = (s.cell - centre).template cast<double>();
     const double n = static_cast<double>(s.count);
     Vec<D> sum;
     for (int d = 0; d < D; ++d) sum[d] = from_fixed(s.first[static_cast<size_t>(d)]);
-    Square products;
-    size_t product = 0;
-    for (int i = 0; i < D; ++i)
-      for (int j = i; j < D; ++j) products(i, j) = products(j, i) = from_fixed(s.second[product++]);
     count += n;
     max_count = std::max(max_count, n);
     first += sum + n * corner;
-    second += products + corner * sum.transpose() + sum * corner.transpose() +
-              n * corner * corner.transpose();
+    size_t product = 0;
+    for (int j = 0; j < D; ++j)
+      for (int i = j; i < D; ++i)
+        second(i, j) += from_fixed(s.second[product++]) + corner[i] * sum[j] + sum[i] * corner[j] +
+                        n * corner[i] * corner[j];
   }
   Vec<D> mean() const { return first / count; }
+  // Its lower triangle.
   Square covariance() const { return second / count - mean() * mean().transpose(); }
 };
 

@@ -104,8 +104,9 @@ class SurfelMap : public CellIndex<D> {
     surfels_.assign(size(), {});
     for (size_t k = 0; k < size(); ++k) surfels_[k].mean = mean_of(sums_[k]);
     // noise as large as the window hides every wall: enlarge the window
+    const RowMasks<D> masks(*this);
     for (const int radius : {2, 4, 6})
-      if (fit_normals(radius, threads) >= 0.5) break;
+      if (fit_normals(radius, masks, threads) >= 0.5) break;
     cells_.reserve(size());
     beam_counts_.reserve(size());
     if (has_time_bins_) hit_spans_.reserve(size());
@@ -193,11 +194,11 @@ class SurfelMap : public CellIndex<D> {
 
   // Fits planes to the end points within `radius` cells of each surfel by principal component
   // analysis; returns the share of beams on planes.
-  double fit_normals(int radius, int threads) {
+  double fit_normals(int radius, const RowMasks<D>& masks, int threads) {
     const std::vector<size_t> bounds = split_evenly(size(), threads);
     std::vector<NormalFit> partial(bounds.size() - 1);
     parallel_for_ranges(bounds, [&](size_t i, size_t first, size_t last) {
-      partial[i] = fit_normals(radius, first, last);
+      partial[i] = fit_normals(radius, masks, first, last);
     });
     NormalFit& total = partial.front();
     for (size_t i = 1; i < partial.size(); ++i) {
@@ -217,18 +218,17 @@ class SurfelMap : public CellIndex<D> {
     std::vector<std::pair<double, int64_t>> deviations;
   };
 
-  NormalFit fit_normals(int radius, size_t first_surfel, size_t last_surfel) {
+  NormalFit fit_normals(int radius, const RowMasks<D>& masks, size_t first_surfel,
+                        size_t last_surfel) {
     NormalFit fit_result;
     auto& [n_beams, n_planar, deviations] = fit_result;
-    WindowQuery<D> query(*this);
+    WindowQuery<D> query(*this, masks);
     const CellRows<D> window = window_rows<D>(radius, true);
     for (size_t k = first_surfel; k < last_surfel; ++k) {
       WindowMoments<D> moments;
       query.for_each(sums_[k].cell, window, [&](int32_t neighbour) {
         moments.add(sums_[static_cast<size_t>(neighbour)], sums_[k].cell);
       });
-      const Eigen::SelfAdjointEigenSolver<Square> eigen(moments.covariance());
-      const Vec<D> variance = eigen.eigenvalues().cwiseMax(0.0);  // ascending
       Surfel<D>& surfel = surfels_[k];
       surfel.normal.setZero();
       surfel.centre_to_plane = 0.0;
@@ -236,7 +236,12 @@ class SurfelMap : public CellIndex<D> {
       surfel.half_extent = 0.5;
       surfel.prominence = static_cast<double>(sums_[k].count) / moments.max_count;
       n_beams += sums_[k].count;
-      const bool is_extended = variance[1] > 0.15 * radius * radius;  // over 3 of 5 cells
+      const double min_variance = 0.15 * radius * radius;  // over 3 of 5 cells
+      const Square covariance = moments.covariance();
+      if (max_second_variance(covariance) < min_variance) continue;
+      const Eigen::SelfAdjointEigenSolver<Square> eigen(covariance);  // of the lower triangle
+      const Vec<D> variance = eigen.eigenvalues().cwiseMax(0.0);      // ascending
+      const bool is_extended = variance[1] > min_variance;
       if (!is_extended || variance[0] >= 0.25 * variance[1]) continue;
       const Vec<D> normal = eigen.eigenvectors().col(0);
       const Vec<D> plane_point = sums_[k].cell.template cast<double>() + moments.mean();
@@ -255,6 +260,22 @@ class SurfelMap : public CellIndex<D> {
       surfel.centre_to_plane = surfel.normal.dot(centre - moments.mean());
     }
     return fit_result;
+  }
+
+  // Upper bound of the second smallest eigenvalue, which is cheaper than the eigenvalues: in 3D,
+  // the product of the larger two is at most the sum of the principal minors of order two, and the
+  // largest is at least a third of the trace.
+  static double max_second_variance(const Square& lower) {
+    if constexpr (D == 2) {
+      return std::numeric_limits<double>::infinity();
+    } else {
+      constexpr double rounding = 1e-6;  // relative to variances, far more than its errors
+      const auto minor = [&](int i, int j) {
+        return lower(i, i) * lower(j, j) - lower(j, i) * lower(j, i);
+      };
+      const double trace = lower.trace();
+      return 3.0 * (minor(0, 1) + minor(0, 2) + minor(1, 2)) / trace + rounding * (1.0 + trace);
+    }
   }
 
   static double weighted_median(std::vector<std::pair<double, int64_t>>& values) {

@@ -19,9 +19,10 @@ class SurfelNeighbours {
   SurfelNeighbours() = default;
   SurfelNeighbours(const SurfelMap<D>& surfel_map, double radius, int threads) {
     const std::vector<size_t> bounds = split_evenly(surfel_map.size(), threads);
+    const RowMasks<D> masks(surfel_map);
     std::vector<SurfelNeighbours> parts(bounds.size() - 1);
     parallel_for_ranges(bounds, [&](size_t i, size_t first, size_t last) {
-      parts[i].add(surfel_map, radius, first, last);
+      parts[i].add(surfel_map, masks, radius, first, last);
     });
     size_t pairs = 0;
     for (const SurfelNeighbours& part : parts) pairs += part.indices_.size();
@@ -43,9 +44,10 @@ class SurfelNeighbours {
   }
 
  private:
-  void add(const SurfelMap<D>& surfel_map, double radius, size_t first, size_t last) {
+  void add(const SurfelMap<D>& surfel_map, const RowMasks<D>& masks, double radius, size_t first,
+           size_t last) {
     const CellRows<D> window = window_rows<D>(std::ceil(radius), true);
-    WindowQuery<D> query(surfel_map);
+    WindowQuery<D> query(surfel_map, masks);
     for (size_t i = first; i < last; ++i) {
       const auto k = static_cast<int32_t>(i);
       query.for_each(surfel_map.cell(k), window, [&](int32_t other) {

@@ -40,12 +40,12 @@ class SurfelTraversal {
     compute_borders(start, end);
     Cell<D> block = BlockLayout<D>::block_of(first_);
     const int32_t* page = bitmap_.page_of(block);
-    std::array<int32_t, D> exit_border;  // index of the border at which each axis leaves the block
+    std::array<int32_t, D> exit_border;  // number of the border at which each axis leaves the block
     std::array<double, D> exit_length;   // arc length there
     for (int d = 0; d < D; ++d) {
       const int32_t local = first_[d] & (kEdge - 1);
-      exit_border[to_size(d)] = step_[to_size(d)] > 0 ? kEdge - 1 - local : local;
-      exit_length[to_size(d)] = borders_[to_size(d)][exit_border[to_size(d)] + 1];
+      exit_border[to_size(d)] = axes_[to_size(d)].step > 0 ? kEdge - 1 - local : local;
+      exit_length[to_size(d)] = axes_[to_size(d)].border(exit_border[to_size(d)]);
     }
     double enter_at = 0.0;
     for (;;) {
@@ -59,9 +59,9 @@ class SurfelTraversal {
       if (!(leave_at < kInf)) return;
       enter_at = leave_at;
       exit_border[to_size(axis)] += kEdge;
-      exit_length[to_size(axis)] = borders_[to_size(axis)][exit_border[to_size(axis)] + 1];
+      exit_length[to_size(axis)] = axes_[to_size(axis)].border(exit_border[to_size(axis)]);
       const int32_t previous = block[axis];
-      block[axis] = previous + step_[to_size(axis)];
+      block[axis] = previous + axes_[to_size(axis)].step;
       if (!SurfelBitmap<D>::same_page(previous, block[axis])) page = bitmap_.page_of(block);
     }
   }
@@ -75,8 +75,15 @@ class SurfelTraversal {
 
   static size_t to_size(int axis) { return static_cast<size_t>(axis); }
 
-  // Arc lengths at the borders of each axis, accumulated as in `traverse`. Border i is at index i +
-  // 1; index 0 is the start.
+  // Borders between the cells along one axis, numbered from 0 in the order of the ray.
+  struct Axis {
+    double first, delta;  // arc length at border 0, and between two borders
+    int32_t count, step;  // borders that the ray crosses; +1 or -1
+
+    // Arc length at a border; infinite behind the last one.
+    double border(int32_t i) const { return i < count ? first + i * delta : kInf; }
+  };
+
   void compute_borders(const Vec<D>& start, const Vec<D>& end) {
     first_ = cell_of<D>(start);
     const Cell<D> cells = cell_of<D>(end) - first_;
@@ -86,20 +93,9 @@ class SurfelTraversal {
     length_ = length;
     direction_ = direction * (1.0 / length);
     for (int d = 0; d < D; ++d) {
-      const int32_t n = std::abs(cells[d]);
-      step_[to_size(d)] = cells[d] > 0 ? 1 : -1;
-      const size_t size = static_cast<size_t>(n) + kEdge + 2;
-      if (border_storage_[to_size(d)].size() < size) border_storage_[to_size(d)].resize(size);
-      double* out = border_storage_[to_size(d)].data();
-      borders_[to_size(d)] = out;
-      *out++ = -kInf;
-      if (n) {
-        const double to_border = first_[d] + (cells[d] > 0 ? 1 : 0) - start[d];
-        const double delta = length / std::abs(direction[d]);
-        double next = to_border / direction[d] * length;
-        for (int32_t i = 0; i < n; ++i, next += delta) *out++ = next;
-      }
-      std::fill_n(out, kEdge + 1, kInf);
+      const double to_border = first_[d] + (cells[d] > 0 ? 1 : 0) - start[d];
+      axes_[to_size(d)] = {to_border / direction[d] * length, length / std::abs(direction[d]),
+                           std::abs(cells[d]), cells[d] > 0 ? 1 : -1};
     }
   }
 
@@ -142,11 +138,12 @@ class SurfelTraversal {
     double exit = kInf;
     int exit_axis = 0;
     for (int d = 0; d < D; ++d) {
-      const int32_t i = (cell[d] - first_[d]) * step_[to_size(d)];
-      if (i < 0) return -1;
-      const double* border = borders_[to_size(d)] + i;
-      entry[to_size(d)] = border[0];
-      if (border[1] < exit) exit = border[1], exit_axis = d;
+      const Axis& axis = axes_[to_size(d)];
+      const int32_t i = (cell[d] - first_[d]) * axis.step;
+      if (i < 0 || i > axis.count) return -1;
+      entry[to_size(d)] = i > 0 ? axis.border(i - 1) : -kInf;
+      const double border = axis.border(i);
+      if (border < exit) exit = border, exit_axis = d;
       steps += i;
     }
     bool crosses = exit < kInf;
@@ -160,9 +157,7 @@ class SurfelTraversal {
   double length_;
   Cell<D> first_;
   int32_t last_block_ = SurfelBitmap<D>::kNone;
-  std::array<int32_t, D> step_;
-  std::array<std::vector<double>, D> border_storage_;
-  std::array<const double*, D> borders_;
+  std::array<Axis, D> axes_;
   std::array<std::pair<int32_t, Crossing>, D * kEdge> crossings_;
 };
 
