@@ -9,7 +9,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from stillmap.core.recording import Recording
 from stillmap.tracking.objects import MovingObject
@@ -85,6 +84,8 @@ def _count_beside(directions: Float, ranges: Float, own: Bool, is_static: Bool) 
     """
     if not own.any():
         return 0, 0
+    from scipy.spatial import cKDTree  # slow to load
+
     middle = directions[own].mean(axis=0)
     middle /= max(float(np.linalg.norm(middle)), 1e-9)
     away = directions @ middle
