@@ -10,7 +10,7 @@ from stillmap.core import arrays
 from stillmap.sim import RobotOptions, Scene, simulate
 from stillmap.sim.options import CrowdOptions, LaserOptions, OdometryOptions
 from stillmap.sim.walls import box
-from stillmap.tracking import ObjectOptions, compute_flow_map, track_objects, tracklets
+from stillmap.tracking import ObjectOptions, compute_flow_map, joins, track_objects, tracklets
 from stillmap.tracking.objects import estimate_center_offset, measure_box
 
 OPTIONS = ObjectOptions()
@@ -70,7 +70,7 @@ def test_pieces_of_any_size_and_files_make_no_difference(monkeypatch, tmp_path, 
     whole = found(simulation)
     monkeypatch.setattr(arrays, "MAX_BYTES_IN_MEMORY", 0)
     monkeypatch.setattr(arrays, "BLOCK", block)
-    monkeypatch.setattr(tracklets, "_MAX_ENDS", 7)
+    monkeypatch.setattr(joins, "_MAX_ENDS", 7)
     recording = dataclasses.replace(simulation.recording, scratch=tmp_path)
     pieces = found(dataclasses.replace(simulation, recording=recording))
     assert len(pieces) == len(whole) > 3

@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 
 from stillmap.tracking.association import ACCELERATION
 from stillmap.tracking.clustering import DynamicPoints
+from stillmap.tracking.detections import compute_centroids, iterate_tracks
 from stillmap.tracking.mover_path import MoverPath
 from stillmap.tracking.objects import SMOOTHER_STD, estimate_center_offset
 from stillmap.tracking.smoother import smooth_track
-from stillmap.tracking.tracklets import compute_centroids, iterate_tracks
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
