@@ -50,8 +50,8 @@ def test_people_are_found_and_followed(shape):
     beams = np.concatenate([one.beams for one in objects])
     assert len(np.unique(beams)) == len(beams)
     assert len(beams) > 0.97 * np.count_nonzero(mover >= 0)
-    pure = [np.mean(mover[one.beams] == k) for one, k in zip(objects, of_walker, strict=True)]
-    assert np.mean(pure) > 0.97
+    own = [mover[one.beams] == k for one, k in zip(objects, of_walker, strict=True)]
+    assert np.mean(np.concatenate(own)) > 0.97
     seconds = 1e-9 * simulation.recording.stamp_ns
     velocity = np.gradient(truth.movers[:, :, :2], seconds, axis=0)
     off, speed = [], []

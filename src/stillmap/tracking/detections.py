@@ -23,13 +23,13 @@ class Centroids(NamedTuple):
         track: (L,) track numbers.
         scan: (L,) of the recording.
         xy: (L, 2) mean of the end points, in the map frame.
-        count: (L,) end points.
+        hits: (L,) end points.
     """
 
     track: Index
     scan: Index
     xy: Float
-    count: Index
+    hits: Index
 
 
 def compute_centroids(points: DynamicPoints, owner: Index, here: slice | Index) -> Centroids:
@@ -60,7 +60,7 @@ def measure_widths(points: DynamicPoints, found: Centroids) -> Float:
     adjacent = (np.diff(points.beam[some]) == 1) & (np.diff(points.cluster[some]) == 0)
     between = float(np.median(turn[adjacent])) if adjacent.any() else 0.0
     distance = np.linalg.norm(found.xy - points.sensor[found.scan], axis=1)
-    return np.asarray(found.count * between * distance)
+    return np.asarray(found.hits * between * distance)
 
 
 def find_near_pairs(scan: Index, xy: Float, max_distance: float) -> Index:

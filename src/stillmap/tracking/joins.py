@@ -212,7 +212,7 @@ def _compare(ends: _Ends, before: Index, after: Index) -> Float:
     duration = np.log(_SEEN_AGAIN / _HIDDEN) - gap / _HIDDEN
     variance = ends.speed_std[after] ** 2 + end.P[:, 2]
     other = np.log(_BIRTHS / (2.0 * np.pi * variance)) - 0.5 * (end.v**2).sum(axis=1) / variance
-    return motion + duration + _compare_widths(ends, before, after) - other
+    return np.asarray(motion + duration + _compare_widths(ends, before, after) - other)
 
 
 def _log_density(predicted: TrackStates, found: TrackStates) -> Float:
