@@ -34,7 +34,8 @@ def iterate_walker_paths(
     for track, here in iterate_tracks(points, owner):
         if track in others or p_mover[track] <= _MIN_P_MOVER:
             continue
-        scan, xy = compute_centroids(points, owner, here)[1:]
+        found = compute_centroids(points, owner, here)
+        scan, xy = found.scan, found.xy
         if len(scan) < _MIN_LOOKS or np.linalg.norm(np.ptp(xy, axis=0)) < _MIN_TRAVEL:
             continue
         at = np.searchsorted(scan, points.scan[here])
