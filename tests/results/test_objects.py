@@ -37,6 +37,7 @@ def test_the_list_says_all_that_is_known(tmp_path, result):
         assert record["size"] == [0.5, 0.3]
         assert record["beams"] == len(one.beams)
         assert record["p_dynamic"] == 0.9
+        assert record["p_identity"] == 1.0
         track = record["track"]
         assert set(track) == {"stamp_ns", "x", "y", "vx", "vy"}
         np.testing.assert_allclose(np.transpose([track["x"], track["y"]]), one.xy, atol=6e-4)

@@ -14,7 +14,7 @@ MAX_GAP = 2.0
 
 
 def found(points):
-    return stitch_tracklets(points, assign_tracks(points, MAX_GAP))
+    return stitch_tracklets(points, assign_tracks(points, MAX_GAP))[0]
 
 
 def straight(x, y, vx, vy):
@@ -49,7 +49,7 @@ def test_one_that_is_hidden_for_a_while():
 
 
 def test_one_that_is_hidden_for_long_is_another():
-    points, _ = watched([straight(3, -4, 0.1, 1.0)], lambda _, t: not 2.0 < t < 6.0)
+    points, _ = watched([straight(3, -4, 0.1, 1.0)], lambda _, t: not 1.4 < t < 6.2)
     assert len(np.unique(found(points))) == 2
 
 
@@ -128,3 +128,19 @@ def test_how_many_costs_are_held_at_once_changes_nothing(monkeypatch):
     expected = assign_tracks(points, MAX_GAP)
     monkeypatch.setattr("stillmap.tracking.association._MAX_COSTS", 1)
     assert np.array_equal(assign_tracks(points, MAX_GAP), expected)
+
+
+@pytest.mark.parametrize("angle", [0.5, 0.7, 1.0])
+def test_tracks_that_were_exchanged_behind_one_another_are_set_right(angle):
+    vx, vy = 1.2 * np.cos(angle), 1.2 * np.sin(angle)
+    ways = [
+        straight(6.0 - 4.0 * vx, -4.0 * vy, vx, vy),
+        straight(6.1 - 4.0 * vx, 4.0 * vy, vx, -vy),
+    ]
+    points, who = watched(ways)
+    exchanged = np.where(points.seconds[points.scan] < 4.0, who, 1 - who)
+    assert not one_each(exchanged, who)
+    owner, p_identity = stitch_tracklets(points, exchanged)
+    apart = np.abs(points.seconds[points.scan] - 4.0) > 1.5
+    assert one_each(owner[apart], who[apart])
+    assert (p_identity[np.unique(owner[apart])] > 0.8).all()

@@ -10,7 +10,7 @@ from stillmap.core import arrays
 from stillmap.sim import RobotOptions, Scene, simulate
 from stillmap.sim.options import CrowdOptions, LaserOptions, OdometryOptions
 from stillmap.sim.walls import box
-from stillmap.tracking import ObjectOptions, compute_flow_map, track_objects, tracklets
+from stillmap.tracking import ObjectOptions, compute_flow_map, joins, track_objects, tracklets
 from stillmap.tracking.objects import estimate_center_offset, measure_box
 
 OPTIONS = ObjectOptions()
@@ -50,8 +50,8 @@ def test_people_are_found_and_followed(shape):
     beams = np.concatenate([one.beams for one in objects])
     assert len(np.unique(beams)) == len(beams)
     assert len(beams) > 0.97 * np.count_nonzero(mover >= 0)
-    pure = [np.mean(mover[one.beams] == k) for one, k in zip(objects, of_walker, strict=True)]
-    assert np.mean(pure) > 0.97
+    own = [mover[one.beams] == k for one, k in zip(objects, of_walker, strict=True)]
+    assert np.mean(np.concatenate(own)) > 0.97
     seconds = 1e-9 * simulation.recording.stamp_ns
     velocity = np.gradient(truth.movers[:, :, :2], seconds, axis=0)
     off, speed = [], []
@@ -70,7 +70,7 @@ def test_pieces_of_any_size_and_files_make_no_difference(monkeypatch, tmp_path, 
     whole = found(simulation)
     monkeypatch.setattr(arrays, "MAX_BYTES_IN_MEMORY", 0)
     monkeypatch.setattr(arrays, "BLOCK", block)
-    monkeypatch.setattr(tracklets, "_MAX_ENDS", 7)
+    monkeypatch.setattr(joins, "_MAX_ENDS", 7)
     recording = dataclasses.replace(simulation.recording, scratch=tmp_path)
     pieces = found(dataclasses.replace(simulation, recording=recording))
     assert len(pieces) == len(whole) > 3

@@ -49,16 +49,16 @@ def concatenate(a: TrackStates, b: TrackStates) -> TrackStates:
     return TrackStates(*(np.concatenate([p, q]) for p, q in ((a.x, b.x), (a.v, b.v), (a.P, b.P))))
 
 
-def predict(states: TrackStates, dt: float, acceleration: float) -> TrackStates:
+def predict(states: TrackStates, dt: float | Float, acceleration: float) -> TrackStates:
     """Predict the states after dt.
 
     Args:
         states: current states.
-        dt: s; negative: backwards in time.
+        dt: s, of all or (K,) of each; negative: backwards in time.
         acceleration: spectral density of white acceleration noise, m2/s3.
     """
     xx, xv, vv = states.P.T
-    q, t = acceleration, abs(dt)
+    q, t = acceleration, np.abs(dt)
     P = np.stack(
         [
             xx + 2.0 * dt * xv + dt**2 * vv + q * t**3 / 3.0,
@@ -67,7 +67,7 @@ def predict(states: TrackStates, dt: float, acceleration: float) -> TrackStates:
         ],
         axis=-1,
     )
-    return TrackStates(states.x + states.v * dt, states.v, P)
+    return TrackStates(states.x + states.v * np.expand_dims(dt, -1), states.v, P)
 
 
 def update(

@@ -52,6 +52,7 @@ def object_record(one: MovingObject) -> dict[str, Any]:
         "size": [round(metres, MILLIMETRES) for metres in one.size],
         "beams": len(one.beams),
         "p_dynamic": round(one.p_dynamic, 6),
+        "p_identity": round(one.p_identity, 6),
         "track": {
             "stamp_ns": one.stamp_ns.tolist(),
             **{name: np.round(values, MILLIMETRES).tolist() for name, values in columns.items()},

@@ -180,6 +180,7 @@ class Track(ShortRepr):
         beams: how many fell on it; None where the file does not say.
         p_dynamic: their mean P(dynamic); None likewise.
         session: of a place, in which it was seen; empty otherwise.
+        p_identity: P that it is one mover all the time; None where the file does not say.
     """
 
     id: int
@@ -191,6 +192,7 @@ class Track(ShortRepr):
     beams: int | None = None
     p_dynamic: float | None = None
     session: str = ""
+    p_identity: float | None = None
 
 
 def read_tracks(path: Path) -> list[Track]:
@@ -224,5 +226,7 @@ def _track(one: dict[str, Any]) -> Track:
         raise ValueError(f"an id of {one['id']}")
     beams = None if one.get("beams") is None else int(one["beams"])
     p_dynamic = None if one.get("p_dynamic") is None else float(one["p_dynamic"])
+    p_identity = None if one.get("p_identity") is None else float(one["p_identity"])
     xy, velocity, session = numbers[:, :2], numbers[:, 2:], str(one.get("session", ""))
-    return Track(int(one["id"]), size, stamp_ns, xy, velocity, z, beams, p_dynamic, session)
+    known = (beams, p_dynamic, session, p_identity)
+    return Track(int(one["id"]), size, stamp_ns, xy, velocity, z, *known)

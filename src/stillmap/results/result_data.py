@@ -53,7 +53,8 @@ class ResultData:
         @property
         @abstractmethod
         def objects(self) -> Sequence[MovingObject | Track]:
-            """Movers: `id`, `stamp_ns` (L,), `xy`, `velocity` (L, 2), `size`, `p_dynamic`."""
+            """Movers: `id`, `stamp_ns` (L,), `xy`, `velocity` (L, 2), `size`, `p_dynamic`,
+            `p_identity`."""
 
         @property
         @abstractmethod

@@ -121,7 +121,7 @@ def _pose_columns(result: ResultData) -> dict[str, NDArray[Any]]:
 
 def _object_columns(result: ResultData) -> dict[str, Any]:
     """A row per object: `id`, `first_stamp_ns`, `last_stamp_ns`, `length`, `width`, in 3D `height`
-    (m), `distance` (m along its track), `speed` (m/s, mean), `beams`, `p_dynamic`."""
+    (m), `distance` (m along its track), `speed` (m/s, mean), `beams`, `p_dynamic`, `p_identity`."""
     objects = result.objects
     sides = ("length", "width", "height")[: result.poses.shape[-1] - 1]
     return {
@@ -136,6 +136,7 @@ def _object_columns(result: ResultData) -> dict[str, Any]:
         "speed": np.array([mean_speed(one.velocity) for one in objects], np.float64),
         "beams": np.array([_count_beams(one) for one in objects], np.int64),
         "p_dynamic": np.array([one.p_dynamic for one in objects], np.float64),
+        "p_identity": np.array([one.p_identity for one in objects], np.float64),
     }
 
 

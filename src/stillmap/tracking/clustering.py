@@ -50,6 +50,11 @@ class DynamicPoints:
     first: Index
     scratch: Path | None = None
 
+    @property
+    def period(self) -> float:
+        """Median time from scan to scan, s; 0 of one scan."""
+        return float(np.median(np.diff(self.seconds))) if len(self.seconds) > 1 else 0.0
+
     def release(self, *more: NDArray[Any]) -> None:
         """Release the cached pages of the memory-mapped points, and of other arrays."""
         for array in (self.scan, self.beam, self.xy, self.range, self.cluster, *more):

@@ -21,12 +21,13 @@ from stillmap.core.recording import Recording
 from stillmap.mapping import MoverPoints
 from stillmap.tracking.association import MAX_GAP, assign_tracks, regress_velocity
 from stillmap.tracking.clustering import DynamicPoints, extract_dynamic_points
+from stillmap.tracking.detections import compute_centroids, iterate_tracks
 from stillmap.tracking.explained_hits import explain_hits
 from stillmap.tracking.fast_movers import find_fast_movers, tracks_of_paths
 from stillmap.tracking.looks import Look, classify_looks
 from stillmap.tracking.mover_path import MoverPath
 from stillmap.tracking.steady_motion import count_steady_windows
-from stillmap.tracking.tracklets import compute_centroids, iterate_tracks, join_tracklets
+from stillmap.tracking.tracklets import join_tracklets
 from stillmap.tracking.walker_paths import iterate_walker_paths
 
 Float = NDArray[np.float64]
@@ -94,7 +95,7 @@ def apply_motion_evidence(
     if not len(points.scan):
         return p_static, MoverPoints.none()
     owner, paths = find_fast_movers(points, assign_tracks(points, MAX_GAP))
-    owner = join_tracklets(points, owner)
+    owner, _ = join_tracklets(points, owner, paths)
     fast = tracks_of_paths(points, owner, paths)
     p_mover = weigh_tracks(recording, poses, points, owner, dict(zip(fast, paths, strict=True)))
     out, movers = arrays.copy(p_static, recording.scratch), list[MoverPoints]()

@@ -18,11 +18,12 @@ from stillmap.tracking.clustering import (
     DynamicPoints,
     extract_dynamic_points,
 )
+from stillmap.tracking.detections import compute_centroids, iterate_tracks
 from stillmap.tracking.fast_movers import find_fast_movers, tracks_of_paths
 from stillmap.tracking.mover_path import MoverPath
 from stillmap.tracking.options import ObjectOptions
 from stillmap.tracking.smoother import smooth_track
-from stillmap.tracking.tracklets import compute_centroids, iterate_tracks, stitch_tracklets
+from stillmap.tracking.tracklets import stitch_tracklets
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -52,6 +53,7 @@ class MovingObject(ShortRepr):
         beams: (n,) beams of the recording that ended on it, rising.
         p_dynamic: mean P(dynamic) of these beams.
         z: (L,) metres, height of the center in the map frame; None in 2D.
+        p_identity: probability that it is one mover all the time, given who was near or hidden.
     """
 
     id: int
@@ -63,6 +65,7 @@ class MovingObject(ShortRepr):
     beams: Index
     p_dynamic: float
     z: Float | None = None
+    p_identity: float = 1.0
 
 
 def track_length(xy: Float) -> float:
@@ -105,7 +108,7 @@ def track_objects(
     if len(points.scan) == 0:
         return []
     owner, paths = find_fast_movers(points, assign_tracks(points, MAX_GAP))
-    owner = stitch_tracklets(points, owner)
+    owner, p_identity = stitch_tracklets(points, owner, paths)
     kept = _ObjectStore(recording.scratch)
     fast = tracks_of_paths(points, owner, paths)
     for track, here in iterate_tracks(points, owner):
@@ -113,7 +116,7 @@ def track_objects(
         mine = [path for path, number in zip(paths, fast, strict=True) if number == track]
         one = _make_object(points, here, found.scan, found.xy, mine, recording, p_static)
         if float(np.linalg.norm(np.ptp(one.xy, axis=0))) + max(one.size) >= options.min_extent:
-            kept.add(one)
+            kept.add(dataclasses.replace(one, p_identity=float(p_identity[track])))
         arrays.release_pages(p_static)
     objects = kept.objects()
     objects.sort(key=lambda one: (one.scan[0], one.beams[0]))
@@ -131,10 +134,10 @@ class _ObjectStore:
             name: ArrayBuilder(dtype, (2,) if dtype is float else (), scratch)
             for name, dtype in self._OF_SCANS.items()
         }
-        self._rows: list[tuple[int, int, tuple[float, ...], float]] = []
+        self._rows: list[tuple[int, int, tuple[float, ...], float, float]] = []
 
     def add(self, one: MovingObject) -> None:
-        self._rows.append((len(one.scan), len(one.beams), one.size, one.p_dynamic))
+        self._rows.append((len(one.scan), len(one.beams), one.size, one.p_dynamic, one.p_identity))
         self._beams.append(one.beams)
         for name, column in self._columns.items():
             column.append(getattr(one, name))
@@ -144,10 +147,11 @@ class _ObjectStore:
         beams = self._beams.finish()
         columns = {name: column.finish() for name, column in self._columns.items()}
         out, scan, beam = [], 0, 0
-        for n_scans, n_beams, size, p_dynamic in self._rows:
+        for n_scans, n_beams, size, p_dynamic, p_identity in self._rows:
             part = {name: column[scan : scan + n_scans] for name, column in columns.items()}
             mine = beams[beam : beam + n_beams]
-            out.append(MovingObject(0, size=size, beams=mine, p_dynamic=p_dynamic, **part))
+            p = {"p_dynamic": p_dynamic, "p_identity": p_identity}
+            out.append(MovingObject(0, size=size, beams=mine, **p, **part))
             scan, beam = scan + n_scans, beam + n_beams
         return out
 

@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 
 from stillmap.tracking.association import ACCELERATION
 from stillmap.tracking.clustering import DynamicPoints
+from stillmap.tracking.detections import compute_centroids, iterate_tracks
 from stillmap.tracking.mover_path import MoverPath
 from stillmap.tracking.objects import SMOOTHER_STD, estimate_center_offset
 from stillmap.tracking.smoother import smooth_track
-from stillmap.tracking.tracklets import compute_centroids, iterate_tracks
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -34,7 +34,8 @@ def iterate_walker_paths(
     for track, here in iterate_tracks(points, owner):
         if track in others or p_mover[track] <= _MIN_P_MOVER:
             continue
-        scan, xy = compute_centroids(points, owner, here)[1:]
+        found = compute_centroids(points, owner, here)
+        scan, xy = found.scan, found.xy
         if len(scan) < _MIN_LOOKS or np.linalg.norm(np.ptp(xy, axis=0)) < _MIN_TRAVEL:
             continue
         at = np.searchsorted(scan, points.scan[here])

@@ -60,4 +60,6 @@ def describe_object(track: Track, stamp_ns: int, start_ns: int) -> list[tuple[st
         facts.append(("Beams", f"{track.beams:,}"))
     if track.p_dynamic is not None:
         facts.append(("Mean P(dynamic)", f"{track.p_dynamic:.3f}"))
+    if track.p_identity is not None:
+        facts.append(("P(one mover)", f"{track.p_identity:.3f}"))
     return facts

@@ -1,0 +1,130 @@
+"""Detections of tracks: the points that a track has in a scan, as one position and a width."""
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core import arrays
+from stillmap.tracking.clustering import DynamicPoints
+
+Float = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+
+_MANY = 1 << 16  # points that tell how far apart beams are
+
+
+class Centroids(NamedTuple):
+    """Mean end point of each track in each scan, in the order of tracks, then scans.
+
+    Attributes:
+        track: (L,) track numbers.
+        scan: (L,) of the recording.
+        xy: (L, 2) mean of the end points, in the map frame.
+        hits: (L,) end points.
+    """
+
+    track: Index
+    scan: Index
+    xy: Float
+    hits: Index
+
+
+def compute_centroids(points: DynamicPoints, owner: Index, here: slice | Index) -> Centroids:
+    """Centroids of some points, all or none of a scan; points without a track (-1) are left out."""
+    track, scan, xy = owner[here], points.scan[here], points.xy[here]
+    own = np.flatnonzero(track >= 0)
+    order = own[np.lexsort((scan[own], track[own]))]
+    track, scan = track[order], scan[order]
+    begins = np.flatnonzero(np.diff(track, prepend=-1) | np.diff(scan, prepend=-1))
+    count = np.diff(begins, append=len(order))
+    sums = np.add.reduceat(xy[order], begins) if len(begins) else np.zeros((0, 2))
+    return Centroids(track[begins], scan[begins], sums / count[:, None], count)
+
+
+def collect_centroids(points: DynamicPoints, owner: Index) -> Centroids:
+    """Centroids of all points."""
+    blocks = [compute_centroids(points, owner, here) for here in scan_blocks(points, owner)]
+    found = Centroids._make(np.concatenate(column) for column in zip(*blocks, strict=True))
+    order = np.argsort(found.track, kind="stable")  # blocks follow each other in time
+    return Centroids._make(column[order] for column in found)
+
+
+def measure_widths(points: DynamicPoints, found: Centroids) -> Float:
+    """(L,) metres across the line of sight that the beams of a centroid cover."""
+    some = slice(0, _MANY)
+    bearing = np.arctan2(*(points.xy[some] - points.sensor[points.scan[some]]).T[::-1])
+    turn = np.abs((np.diff(bearing) + np.pi) % (2.0 * np.pi) - np.pi)
+    adjacent = (np.diff(points.beam[some]) == 1) & (np.diff(points.cluster[some]) == 0)
+    between = float(np.median(turn[adjacent])) if adjacent.any() else 0.0
+    distance = np.linalg.norm(found.xy - points.sensor[found.scan], axis=1)
+    return np.asarray(found.hits * between * distance)
+
+
+def find_near_pairs(scan: Index, xy: Float, max_distance: float) -> Index:
+    """(P, 2) pairs of positions (K, 2) of the same scan within a distance of each other.
+
+    The k-th and the (k + shift)-th position by scan are compared for every shift, of which there
+    are as many as positions in one scan.
+    """
+    order = np.argsort(scan, kind="stable")
+    scan, xy = scan[order], xy[order]
+    parts, shift = [np.empty((0, 2), np.intp)], 1
+    while (first := np.flatnonzero(scan[shift:] == scan[:-shift])).size:
+        near = ((xy[first + shift] - xy[first]) ** 2).sum(axis=1) <= max_distance**2
+        parts.append(np.column_stack([first, first + shift])[near])
+        shift += 1
+    return order[np.concatenate(parts)]
+
+
+def iterate_tracks(points: DynamicPoints, owner: Index) -> Iterator[tuple[int, Index]]:
+    """Yield each track number, rising, with its points, rising; in bounded memory."""
+    count = np.zeros(count_tracks(owner), np.intp)
+    for block in arrays.iter_blocks(owner):
+        count += np.bincount(owner[block][owner[block] >= 0], minlength=len(count))
+    first = np.cumsum(count) - count
+    order = arrays.empty((int(count.sum()),), np.intp, points.scratch)
+    free = first.copy()
+    for block in arrays.iter_blocks(owner, order):
+        own = np.flatnonzero(owner[block] >= 0)
+        own = own[np.argsort(owner[block][own], kind="stable")]
+        track = owner[block][own]
+        begins = np.flatnonzero(np.diff(track, prepend=-1))
+        runs = np.diff(begins, append=len(track))
+        at = np.repeat(free[track[begins]] - begins, runs) + np.arange(len(track))
+        order[at] = block.start + own
+        free[track[begins]] += runs
+    read = 0
+    for k in np.flatnonzero(count).tolist():
+        yield k, np.array(order[first[k] : first[k] + count[k]])
+        read += count[k]
+        if read > arrays.BLOCK:
+            points.release(owner, order)
+            read = 0
+
+
+def count_tracks(owner: Index) -> int:
+    """The largest track number + 1."""
+    return max((int(owner[b].max()) for b in arrays.iter_blocks(owner)), default=-1) + 1
+
+
+def scan_blocks(points: DynamicPoints, *beside: Index) -> Iterator[slice]:
+    """Slices of points of whole scans; their cached pages are released afterwards."""
+    first, at = points.first, 0
+    while at < len(points.scan):
+        end = first[np.searchsorted(first, at + arrays.BLOCK, side="right") - 1]
+        if end <= at:  # one scan alone
+            end = first[np.searchsorted(first, at, side="right")]
+        yield slice(at, int(end))
+        points.release(*beside)
+        at = int(end)
+
+
+def renumber(points: DynamicPoints, owner: Index, new_number: Callable[[Index], Index]) -> Index:
+    """(N,) track numbers replaced block by block."""
+    out = arrays.empty(owner.shape, np.intp, points.scratch)
+    for block in arrays.iter_blocks(owner, out):
+        out[block] = new_number(owner[block])
+    return out
