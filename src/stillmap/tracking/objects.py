@@ -148,10 +148,10 @@ class _ObjectStore:
         columns = {name: column.finish() for name, column in self._columns.items()}
         out, scan, beam = [], 0, 0
         for n_scans, n_beams, size, p_dynamic, p_identity in self._rows:
-            part = {name: column[scan : scan + n_scans] for name, column in columns.items()}
+            at, stamps, xy, velocity = (c[scan : scan + n_scans] for c in columns.values())
             mine = beams[beam : beam + n_beams]
-            p = {"p_dynamic": p_dynamic, "p_identity": p_identity}
-            out.append(MovingObject(0, size=size, beams=mine, **p, **part))
+            p = p_dynamic, None, p_identity
+            out.append(MovingObject(0, at, stamps, xy, velocity, size, mine, *p))
             scan, beam = scan + n_scans, beam + n_beams
         return out
 
