@@ -10,7 +10,10 @@ from stillmap.fleet.summary import summarize_result
 from stillmap.live.drive_folder import keep_drive, read_drive
 from stillmap.live.known_cloud import KnownCloud
 from stillmap.live.known_map import KnownMap
+from stillmap.live.mapper import LiveMapper
+from stillmap.live.replay import iter_beams
 from stillmap.results.reader import read_grid
+from stillmap.sim import scene_by_name, simulate
 
 VERTEX = np.dtype([(name, "<f4") for name in ("x", "y", "z", "p_static")])
 
@@ -156,8 +159,12 @@ def test_layers_of_a_kept_drive(kept_drive):
 
 
 @pytest.fixture
-def kept_drive(corridor, tmp_path):
-    return keep_drive(corridor.mapper.snapshot(), tmp_path)
+def kept_drive(tmp_path):
+    recording = simulate(scene_by_name("corridor", {"robot": {"scans": 5}}), 3).recording
+    with LiveMapper({"threads": 1}) as mapper:
+        for beams in iter_beams(recording):
+            mapper.push(beams)
+        return keep_drive(mapper.snapshot(), tmp_path)
 
 
 @pytest.mark.parametrize("changes", [5, None, "many", {"kind": "door"}])
