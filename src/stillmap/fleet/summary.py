@@ -2,11 +2,12 @@
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 from stillmap.core.advice import split_advice
 from stillmap.core.errors import InputError
 from stillmap.core.input_files import read_text
+from stillmap.core.schema import prune
 from stillmap.results.reader import read_grid
 from stillmap.results.report.figures import data_uri, draw_map, map_window
 from stillmap.results.run_record import read_record
@@ -16,14 +17,24 @@ _GREYS = 16  # so that it takes a few kB
 _MAX_SESSIONS = 64 << 20  # bytes of a sessions.json
 
 
+class _Noted(TypedDict, total=False):
+    """What the page shows of a `run.json`."""
+
+    counts: dict[str, int]
+    area: dict[str, float]
+    quality: dict[str, float | None]
+    changes: list[Any]
+    warnings: list[str]
+
+
 def summarize_result(folder: Path) -> dict[str, Any]:
     """The JSON-able summary of a result folder or a place.
 
     Raises:
         InputError: a file of it is damaged.
     """
-    record = read_record(folder)
-    warnings = [split_advice(str(text)) for text in record.get("warnings", ())]
+    record = prune(read_record(folder), _Noted)
+    warnings = [split_advice(text) for text in record.get("warnings", ())]
     return {
         "counts": record.get("counts", {}),
         "area": record.get("area", {}),

@@ -17,7 +17,8 @@ def rigid_transform(R: ArrayLike, t: ArrayLike) -> NDArray[np.float64]:
     R, t = np.asarray(R, np.float64).reshape(3, 3), np.asarray(t, np.float64).reshape(3)
     if not (np.isfinite(R).all() and np.all(np.abs(t) < MAX_TRANSLATION)):
         raise ValueError("a pose is not finite")
-    if np.abs(R @ R.T - np.eye(3)).max() > _TOLERANCE or np.linalg.det(R) < 0:
+    is_small = np.abs(R).max() <= 1.0 + _TOLERANCE
+    if not is_small or np.abs(R @ R.T - np.eye(3)).max() > _TOLERANCE or np.linalg.det(R) < 0:
         raise ValueError("a pose has no rotation matrix")
     if not np.array_equal(R @ R.T, np.eye(3)):  # an exact rotation stays bit-identical
         U, _, Vt = np.linalg.svd(R)
@@ -25,6 +26,16 @@ def rigid_transform(R: ArrayLike, t: ArrayLike) -> NDArray[np.float64]:
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, t
     return T
+
+
+def are_rigid(T: NDArray[np.float64]) -> bool:
+    """True if all of (N, 4, 4) matrices are rigid transforms within the tolerance."""
+    R, t = T[:, :3, :3], T[:, :3, 3]
+    if not ((np.abs(R) <= 1.0 + _TOLERANCE).all() and (np.abs(t) < MAX_TRANSLATION).all()):
+        return False
+    is_orthogonal = np.abs(R @ R.swapaxes(1, 2) - np.eye(3)) <= _TOLERANCE
+    is_affine = (T[:, 3] == [0.0, 0.0, 0.0, 1.0]).all()
+    return bool(is_orthogonal.all() and is_affine and (np.linalg.det(R) > 0.0).all())
 
 
 def pose_from_row(row: ArrayLike) -> NDArray[np.float64]:

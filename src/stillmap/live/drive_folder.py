@@ -24,6 +24,7 @@ from stillmap.core.grid_map import GridMap
 from stillmap.core.input_files import require_regular
 from stillmap.core.json import read_json, write_json
 from stillmap.core.schema import SchemaError, check
+from stillmap.io.rigid_transforms import MAX_TRANSLATION
 from stillmap.live.cloud_extension import KeptCloud
 from stillmap.live.history import KeptScans, answer_type, beam_fields
 from stillmap.live.map_extension import KeptMap
@@ -41,11 +42,17 @@ _CLOUD_TYPES = [np.float64, np.float32, np.float64, np.bool_]
 _LARGEST_RECORD = 16 << 20  # bytes
 
 _Row = list[float]
+_Coordinate = Annotated[float, Limits(gt=-MAX_TRANSLATION, lt=MAX_TRANSLATION)]
 
 
 class _Sensor(TypedDict):
     name: str
     T_base_sensor: list[_Row]
+
+
+class _Extended(TypedDict):
+    origin: tuple[_Coordinate, _Coordinate, _Coordinate]
+    resolution: Annotated[float, Limits(gt=0.0, lt=1e3)]
 
 
 class _Record(TypedDict):
@@ -58,7 +65,7 @@ class _Record(TypedDict):
     disk_was_full: bool
     warnings: list[str]
     options: dict[str, Any]
-    extended: dict[str, Any] | None
+    extended: _Extended | None
 
 
 def keep_drive(snapshot: Snapshot, parent: Path) -> Path:
@@ -229,13 +236,13 @@ def _check_sensors(D: int, mounts: list[NDArray[Any]], sensor: NDArray[np.int32]
         raise ValueError("a scan is of no sensor")
 
 
-def _read_kept_map(folder: Path, about: dict[str, Any] | None, dimension: int) -> KeptMap | None:
+def _read_kept_map(folder: Path, about: _Extended | None, dimension: int) -> KeptMap | None:
     if about is None:
         return None
-    check(about, dict[str, float | list[float]])
-    p_occupied, hits = (open_npy(folder / f"{name}.npy") for name in _KNOWN)
+    p_occupied, hits = layers = [open_npy(folder / f"{name}.npy") for name in _KNOWN]
     x, y, yaw = about["origin"]
-    if p_occupied.shape != hits.shape:
+    is_plane = p_occupied.ndim == 2 and p_occupied.shape == hits.shape
+    if not is_plane or {one.dtype.kind for one in layers} != {"f"}:
         raise ValueError("its known map does not fit")
     cloud = None
     if dimension == 3:

@@ -14,6 +14,7 @@ from stillmap.core.errors import InputError
 from stillmap.core.local_frame import LocalFrame
 from stillmap.em import CellProbabilities, GroundMap
 from stillmap.em.ground import fit_ground
+from stillmap.io.rigid_transforms import are_rigid
 from stillmap.io.trajectory import read_tum
 from stillmap.live.cloud_extension import ROUTE, KeptCloud
 from stillmap.live.known_map import LOG_RATIO, KnownMap
@@ -26,6 +27,8 @@ from stillmap.slam import lidar_odometry
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
 
+# m from the origin of the local frame: squares and cubes of all cells are numbered in 64 bits
+_MAX_EXTENT = 5e4
 _SPACING = 0.1  # m between the points that are kept: where sweeps are dense, all would be one ring
 # m by which the route is raised for the ground: the robot's base may lie in it
 _RAISE = 1.0
@@ -181,7 +184,7 @@ def _read_route(folder: Path) -> Float:
 
 def _check_route(path: Path) -> Float:
     route = open_npy(path)
-    if route.dtype != np.float64 or route.shape[1:] != (4, 4) or not np.isfinite(route).all():
+    if route.dtype != np.float64 or route.shape[1:] != (4, 4) or not are_rigid(route):
         raise InputError("holds no poses", where=str(path))
     return route
 
@@ -193,6 +196,9 @@ def _read_points(
     parts = [(np.zeros((0, 3), np.int64), np.zeros((0, 5)))]
     for block in cloud_from_folder(folder, "static").iter_blocks():
         points = frame.points_to_local(block.points)
+        if not (np.abs(points) < _MAX_EXTENT).all():
+            what = f"holds a point more than {_MAX_EXTENT / 1e3:g} km from its planar map"
+            raise InputError(what, where=str(folder / "static.ply"))
         more = np.column_stack([points, block.p_static, np.ones(len(points))])
         cells = np.floor(points / _SPACING).astype(np.int64)
         parts.append(_sum_up(cells, more))

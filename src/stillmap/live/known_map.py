@@ -60,7 +60,8 @@ class KnownMap:
             self.grid = Grid(source.p_occupied, source.origin, source.resolution)
             self.hits = self.grid.p_occupied
         else:
-            self.grid, self.hits = read_grid(Path(source)), read_hit_sums(Path(source))
+            self.grid = read_grid(Path(source))
+            self.hits = read_hit_sums(Path(source), self.grid.p_occupied.shape)
         self.frame = LocalFrame.near(se2.matrix(*self.grid.origin)[None])
         corner = self.frame.corner_to_local(self.grid.origin)
         self.grid = dataclasses.replace(self.grid, origin=corner)
@@ -181,8 +182,6 @@ def _find_surfaces(grid: Grid, hits: NDArray[np.floating]) -> Float:
     weighted by their hits. Of a wall between two rows of cells it is nearer to the one hit more."""
     from scipy import ndimage  # slow to load
 
-    if hits.shape != grid.p_occupied.shape:
-        raise InputError("alpha and p_occupied of the map differ in shape")
     weights = np.nan_to_num(hits.astype(np.float64), nan=0.0)
     steps = np.arange(-1.0, 2.0)
     total, across, along = (

@@ -6,6 +6,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.errors import InputError
 from stillmap.core.grid_map import GridMap
 from stillmap.core.square_box import bound_box
 from stillmap.core.tiles import crop
@@ -31,10 +32,14 @@ class Snapshot(GridMap):
 
 
 def extent(occupancy: GridMap) -> Window:
-    """x0, y0, x1, y1 of the whole map in metres, in the map frame."""
+    """x0, y0, x1, y1 of the whole map in metres, in the map frame.
+
+    Raises:
+        InputError: its rows are not parallel to the x axis.
+    """
     x, y, yaw = occupancy.origin
     if yaw != 0:
-        raise ValueError(f"a map turned by {yaw} rad cannot be cut along its axes")
+        raise InputError(f"a map turned by {yaw:g} rad cannot be cut along its axes")
     height, width = occupancy.p_occupied.shape
     return x, y, x + width * occupancy.resolution, y + height * occupancy.resolution
 

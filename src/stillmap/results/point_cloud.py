@@ -17,6 +17,7 @@ from stillmap.core.recording import Recording
 from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.io.point_cloud import ply
 from stillmap.io.point_cloud.binary_table import TableLayout, read_columns
+from stillmap.io.rigid_transforms import MAX_TRANSLATION
 
 Part = Literal["static", "dynamic"]
 
@@ -160,10 +161,14 @@ def cloud_from_folder(folder: Path, only: Part | None = None) -> Cloud:
         for layout in layouts:
             for values in read_columns(layout, wanted):
                 points = np.stack(values[:3], axis=1).astype(np.float64)
-                if not np.isfinite(points).all():
-                    raise InputError("holds a point that is not finite", where=str(layout.path))
+                if not (np.abs(points) < MAX_TRANSLATION).all():
+                    what = "holds a point that is not finite, or too far away"
+                    raise InputError(what, where=str(layout.path))
+                p_static = values[3].astype(np.float32)
+                if not ((p_static >= 0.0) & (p_static <= 1.0)).all():
+                    raise InputError("p_static is no probability", where=str(layout.path))
                 colors = np.stack(values[4:], axis=1).astype(np.uint8) if has_colors else None
-                yield Block(points, values[3].astype(np.float32), None, colors)
+                yield Block(points, p_static, None, colors)
 
     count = sum(layout.rows for layout in layouts)
     return Cloud(count, _find_origin(layouts), None, make_blocks, has_colors)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.array_files import read_npz
+from stillmap.core.arrays import iter_blocks
 from stillmap.core.errors import InputError
 from stillmap.core.extras import install_command
 from stillmap.core.grid_map import GridMap
@@ -51,6 +52,8 @@ class Grid(GridMap):
 SESSIONS = "sessions.json"  # every place has it
 _MAX_ORIGIN = 1e9  # m, farther than any map projection has
 _MIN_RESOLUTION, _MAX_RESOLUTION = 1e-4, 1e3  # m
+_ROWS = 256  # of a map that are checked at a time
+_MAX_HITS = 1e30  # in a cell: single precision holds it
 _MAX_MAP = 1 << 29  # bytes of a map when it is unpacked: a thousand times what they take packed
 
 
@@ -100,17 +103,37 @@ def read_grid(result: Path) -> Grid:
             where=str(path),
             hint="scores are for maps in the plane",
         )
-    return Grid(p_occupied, origin, resolution)
+    if not _is_within(p_occupied, 1.0):
+        raise InputError("p_occupied is no probability", where=str(path))
+    return Grid(p_occupied.astype(np.float32, copy=False), origin, resolution)
 
 
-def read_hit_sums(result: Path) -> NDArray[np.floating[Any]]:
+def read_hit_sums(result: Path, shape: tuple[int, ...]) -> NDArray[np.floating[Any]]:
     """`alpha` of the map that `read_grid` reads: (H, W) sums of hits on what stands.
+
+    Args:
+        result: the folder.
+        shape: of the map.
 
     Raises:
         InputError: it is missing or damaged.
     """
-    alpha: NDArray[np.floating[Any]] = _read_layer(_find_map(result) / "map.npz", "alpha")[0]
+    path = _find_map(result) / "map.npz"
+    alpha: NDArray[np.floating[Any]] = _read_layer(path, "alpha")[0]
+    if alpha.shape != shape or alpha.dtype.kind != "f":
+        what = f"alpha is {shape_text(alpha.shape)} {alpha.dtype}, p_occupied {shape_text(shape)}"
+        raise InputError(what, where=str(path))
+    if not _is_within(alpha, _MAX_HITS):
+        raise InputError("alpha is no sum of hits", where=str(path))
     return alpha
+
+
+def _is_within(layer: NDArray[np.floating[Any]], limit: float) -> bool:
+    """True if all values that are not NaN are from 0 to a limit."""
+    return not any(
+        ((layer[rows] < 0.0) | (layer[rows] > limit)).any()
+        for rows in iter_blocks(layer, rows=_ROWS)
+    )
 
 
 class Crossings(NamedTuple):

@@ -4,7 +4,9 @@
 
 #include <array>
 #include <cstdint>
+#include <memory>
 #include <type_traits>
+#include <utility>
 #include <vector>
 
 #include "stillmap/grid/block_layout.hpp"
@@ -131,13 +133,13 @@ class SurfelBitmap {
     const int32_t* page = page_of(block);
     return page ? page[index_in_page(block)] : kNone;
   }
-  // Numbers of the blocks of a page (8 blocks a side); nullptr if it has none.
+  // Numbers of the blocks of a page; nullptr if it has none.
   const int32_t* page_of(const Cell<D>& block) const {
     if (slots_.empty()) return nullptr;
     const uint64_t key = BlockLayout<D>::key(page_index(block));
     for (size_t slot = hash_(key) & (slots_.size() - 1);; slot = (slot + 1) & (slots_.size() - 1)) {
-      if (slots_[slot].page < 0) return nullptr;
-      if (slots_[slot].key == key) return pages_[static_cast<size_t>(slots_[slot].page)].data();
+      if (!slots_[slot].page) return nullptr;
+      if (slots_[slot].key == key) return slots_[slot].page->data();
     }
   }
   static Cell<D> page_index(const Cell<D>& block) {
@@ -177,12 +179,14 @@ class SurfelBitmap {
   }
 
  private:
-  static constexpr int kPageShift = 3;
+  // 8 blocks a side in 2D, 4 in 3D: both take 256 bytes, which a single return far from all others
+  // needs
+  static constexpr int kPageShift = D == 2 ? 3 : 2;
   static constexpr int kTileBits = SurfelMap<D>::kShift - kShift;
   using Page = std::array<int32_t, 1 << (D * kPageShift)>;
   struct Slot {
     uint64_t key = 0;
-    int32_t page = -1;  // -1: free
+    std::unique_ptr<Page> page;  // null: free
   };
 
   // Index within a cube of 2^Shift cells a side, x fastest.
@@ -195,32 +199,32 @@ class SurfelBitmap {
   }
 
   void add_block(const Cell<D>& block, int32_t number) {
-    if (2 * (pages_.size() + 1) > slots_.size()) grow();
+    if (2 * (n_pages_ + 1) > slots_.size()) grow();
     Slot& slot = slot_of(BlockLayout<D>::key(page_index(block)));
-    if (slot.page < 0) {
-      slot.page = static_cast<int32_t>(pages_.size());
-      pages_.emplace_back().fill(kNone);
+    if (!slot.page) {
+      slot.page = std::make_unique<Page>();
+      slot.page->fill(kNone);
+      ++n_pages_;
     }
-    pages_[static_cast<size_t>(slot.page)][index_in_page(block)] = number;
+    (*slot.page)[index_in_page(block)] = number;
   }
   // Slot of a key; assigns a free one to a new key.
   Slot& slot_of(uint64_t key) {
     size_t slot = hash_(key) & (slots_.size() - 1);
-    while (slots_[slot].page >= 0 && slots_[slot].key != key)
-      slot = (slot + 1) & (slots_.size() - 1);
+    while (slots_[slot].page && slots_[slot].key != key) slot = (slot + 1) & (slots_.size() - 1);
     slots_[slot].key = key;
     return slots_[slot];
   }
   void grow() {
     std::vector<Slot> old_slots(slots_.empty() ? 64 : 2 * slots_.size());
     old_slots.swap(slots_);
-    for (const Slot& slot : old_slots)
-      if (slot.page >= 0) slot_of(slot.key).page = slot.page;
+    for (Slot& slot : old_slots)
+      if (slot.page) slot_of(slot.key).page = std::move(slot.page);
   }
 
   typename BlockLayout<D>::Hash hash_;
   std::vector<Slot> slots_;
-  std::vector<Page> pages_;
+  size_t n_pages_ = 0;
   std::vector<BlockBits> bits_;  // per block
   std::vector<std::array<int32_t, kTilesPerBlock>> first_surfel_;
 };

@@ -6,32 +6,32 @@
 #pragma once
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <cstdint>
 #include <vector>
 
 #include "stillmap/grid/cell.hpp"
-#include "stillmap/grid/cell_index.hpp"
-#include "stillmap/grid/ray_walker.hpp"
 #include "stillmap/occupancy/surfel_map.hpp"
 
 namespace stillmap {
 
 // Coarse cells with surfels in them. The surroundings of a surfel are its coarse cell and the eight
 // beside it at the same height.
-class Surroundings : public CellIndex<3> {
+class Surroundings {
  public:
   // edge: of coarse cells, in cells.
   Surroundings(const SurfelMap<3>& surfel_map, int32_t edge)
       : surfel_map_(surfel_map), edge_(edge), coarse_of_(surfel_map.size()) {
-    for (size_t k = 0; k < coarse_of_.size(); ++k) {
-      int32_t& index = index_of(coarse_cell(static_cast<int32_t>(k)));
-      if (index == kNone) index = n_cells_++;
-      coarse_of_[k] = index;
-    }
+    const std::vector<Cell<3>> cells = number_cells();
+    around_.resize(cells.size());
+    for (auto& around : around_) around.fill(kNone);
+    size_t side = 0;
+    for (int dx = -1; dx <= 1; ++dx)
+      for (int dy = -1; dy <= 1; ++dy) find_beside(cells, Cell<3>(dx, dy, 0), side++);
   }
 
-  size_t n_cells() const { return static_cast<size_t>(n_cells_); }
+  size_t n_cells() const { return around_.size(); }
   size_t coarse_index(int32_t surfel) const {
     return static_cast<size_t>(coarse_of_[static_cast<size_t>(surfel)]);
   }
@@ -42,20 +42,49 @@ class Surroundings : public CellIndex<3> {
 
   // Coarse cells in the surroundings of a surfel.
   template <class Visit>
-  void for_each_around(BlockCursor<const Surroundings>& cursor, int32_t surfel,
-                       Visit&& visit) const {
-    const Cell<3> centre = coarse_cell(surfel);
-    for (int dx = -1; dx <= 1; ++dx)
-      for (int dy = -1; dy <= 1; ++dy) {
-        const Cell<3> cell = centre + Cell<3>(dx, dy, 0);
-        const auto* block = cursor.block(cell);
-        if (!block) continue;
-        const int32_t index = block->values[static_cast<size_t>(local_of(cell))];
-        if (index != kNone) visit(static_cast<size_t>(index));
-      }
+  void for_each_around(int32_t surfel, Visit&& visit) const {
+    for (const int32_t index : around_[coarse_index(surfel)])
+      if (index != kNone) visit(static_cast<size_t>(index));
   }
 
  private:
+  static constexpr int32_t kNone = -1;
+
+  static bool is_before(const Cell<3>& a, const Cell<3>& b) {
+    return std::lexicographical_compare(a.data(), a.data() + 3, b.data(), b.data() + 3);
+  }
+
+  // Numbers the coarse cells of all surfels in lexicographic order, and returns them. A map of
+  // blocks would take kilobytes for each surfel that is far from all others.
+  std::vector<Cell<3>> number_cells() {
+    std::vector<Cell<3>> cells;
+    for (size_t k = 0; k < coarse_of_.size(); ++k) {  // successive surfels often share theirs
+      const Cell<3> cell = coarse_cell(static_cast<int32_t>(k));
+      if (cells.empty() || cells.back() != cell) cells.push_back(cell);
+      coarse_of_[k] = static_cast<int32_t>(cells.size() - 1);
+    }
+    std::vector<Cell<3>> sorted = cells;
+    std::sort(sorted.begin(), sorted.end(), is_before);
+    sorted.erase(std::unique(sorted.begin(), sorted.end()), sorted.end());
+    std::vector<int32_t> number(cells.size());
+    for (size_t i = 0; i < cells.size(); ++i)
+      number[i] = static_cast<int32_t>(
+          std::lower_bound(sorted.begin(), sorted.end(), cells[i], is_before) - sorted.begin());
+    for (int32_t& coarse : coarse_of_) coarse = number[static_cast<size_t>(coarse)];
+    return sorted;
+  }
+
+  // Writes the coarse cell at an offset from each. Both are in the same order, so one pass finds
+  // them.
+  void find_beside(const std::vector<Cell<3>>& cells, const Cell<3>& offset, size_t side) {
+    size_t at = 0;
+    for (size_t i = 0; i < cells.size(); ++i) {
+      const Cell<3> beside = cells[i] + offset;
+      while (at < cells.size() && is_before(cells[at], beside)) ++at;
+      if (at < cells.size() && cells[at] == beside) around_[i][side] = static_cast<int32_t>(at);
+    }
+  }
+
   Cell<3> coarse_cell(int32_t surfel) const {
     const auto floor_divide = [this](int32_t x) {
       return (x - (x % edge_ + edge_) % edge_) / edge_;
@@ -64,9 +93,9 @@ class Surroundings : public CellIndex<3> {
   }
 
   const SurfelMap<3>& surfel_map_;
-  int32_t edge_;  // cells
-  int32_t n_cells_ = 0;
-  std::vector<int32_t> coarse_of_;  // index of each surfel's coarse cell
+  int32_t edge_;                                // cells
+  std::vector<int32_t> coarse_of_;              // index of each surfel's coarse cell
+  std::vector<std::array<int32_t, 9>> around_;  // by coarse cell; kNone where there is none
 };
 
 // The coarse cells in whose surroundings something was hit in one time bin.
@@ -74,7 +103,6 @@ class OccupiedSurroundings {
  public:
   explicit OccupiedSurroundings(const Surroundings& surroundings)
       : surroundings_(surroundings),
-        cursor_(surroundings),
         is_hit_(surroundings.n_cells(), false),
         is_occupied_(surroundings.n_cells(), false) {}
 
@@ -83,7 +111,7 @@ class OccupiedSurroundings {
     if (is_hit_[coarse] || !surroundings_.counts(surfel)) return;
     is_hit_[coarse] = true;
     hits_.push_back(coarse);
-    surroundings_.for_each_around(cursor_, surfel, [&](size_t around) {
+    surroundings_.for_each_around(surfel, [&](size_t around) {
       if (is_occupied_[around]) return;
       is_occupied_[around] = true;
       occupied_.push_back(around);
@@ -101,7 +129,6 @@ class OccupiedSurroundings {
 
  private:
   const Surroundings& surroundings_;
-  BlockCursor<const Surroundings> cursor_;
   std::vector<uint8_t> is_hit_, is_occupied_;  // by coarse cell
   std::vector<size_t> hits_, occupied_;
 };

@@ -1,0 +1,184 @@
+"""Known maps that hold what no map does are refused in one line that names the file."""
+
+import json
+
+import numpy as np
+import pytest
+
+from stillmap.core.errors import InputError
+from stillmap.fleet.summary import summarize_result
+from stillmap.live.drive_folder import keep_drive, read_drive
+from stillmap.live.known_cloud import KnownCloud
+from stillmap.live.known_map import KnownMap
+from stillmap.live.mapper import LiveMapper
+from stillmap.live.replay import iter_beams
+from stillmap.results.reader import read_grid
+from stillmap.sim import scene_by_name, simulate
+
+VERTEX = np.dtype([(name, "<f4") for name in ("x", "y", "z", "p_static")])
+
+
+@pytest.fixture
+def place(tmp_path):
+    """A room of 8 m, and the points of its walls."""
+    p_occupied = np.full((40, 40), 0.01, np.float32)
+    p_occupied[[0, -1]] = p_occupied[:, [0, -1]] = 0.99
+    put_map(tmp_path, p_occupied=p_occupied, alpha=10.0 * p_occupied)
+    rows, columns = np.nonzero(p_occupied > 0.5)
+    points = np.zeros(3 * len(rows), VERTEX)
+    points["x"], points["y"] = np.tile([0.2 * columns + 0.1, 0.2 * rows + 0.1], 3)
+    points["z"], points["p_static"] = np.repeat([0.1, 0.6, 1.1], len(rows)), 0.9
+    put_points(tmp_path, points)
+    (tmp_path / "trajectory.tum").write_text("0 4 4 0.5 0 0 0 1\n1 4.5 4 0.5 0 0 0 1\n")
+    (tmp_path / "live").mkdir()
+    return tmp_path
+
+
+def put_map(folder, **layers):
+    path = folder / "map.npz"
+    known = {"origin": np.zeros(3), "resolution": 0.2}
+    if path.exists():
+        with np.load(path) as file:
+            known = dict(file)
+    np.savez(path, **{**known, **layers})
+
+
+def put_points(folder, points):
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
+    head += [f"property float {name}" for name in VERTEX.names]
+    text = "\n".join([*head, "end_header\n"])
+    (folder / "static.ply").write_bytes(text.encode() + points.tobytes())
+
+
+def open_cloud(folder):
+    known = KnownCloud(folder, KnownMap(folder))
+    known.make_local_map()
+    known.find_voxels(0.2, (0.1, 2.0))
+    return known.keep(None, 0.2, (0.1, 2.0))
+
+
+def test_it_is_a_known_map(place):
+    np.save(place / "live/known_route.npy", np.eye(4)[None])
+    kept = open_cloud(place)
+    assert kept.cloud.route.shape == (3, 4, 4)
+    assert kept.cloud.stands.any()
+
+
+@pytest.mark.parametrize(
+    ("name", "layer"),
+    [
+        ("alpha", np.full((40, 40), np.inf)),
+        ("alpha", np.full((40, 40), -1e20)),
+        ("alpha", np.full((40, 40), 1.0 + 1j)),
+        ("alpha", np.full((40, 40), "x")),
+        ("alpha", np.ones((40, 39))),
+        ("p_occupied", np.full((40, 40), np.inf)),
+        ("p_occupied", np.full((40, 40), -0.5)),
+        ("p_occupied", np.full((40, 40), 1.0 + 1j)),
+    ],
+)
+def test_layers_of_the_map(place, name, layer):
+    put_map(place, **{name: layer})
+    with pytest.raises(InputError, match=rf"map\.npz: {name} is"):
+        KnownMap(place).make_grid()
+
+
+@pytest.mark.parametrize("kind", [np.float16, np.float64, np.longdouble])
+def test_probabilities_of_other_precision_are_read(place, kind):
+    put_map(place, p_occupied=read_grid(place).p_occupied.astype(kind))
+    grid = read_grid(place)
+    assert grid.p_occupied.dtype == np.float32
+    assert grid.occupied.sum() == 156
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "said"),
+    [
+        ("x", 1e30, "not finite, or too far away"),
+        ("y", np.nan, "not finite, or too far away"),
+        ("z", 1e8, "more than 50 km"),
+        ("p_static", np.nan, "p_static is no probability"),
+        ("p_static", 1e30, "p_static is no probability"),
+    ],
+)
+def test_points(place, field, value, said):
+    body = (place / "static.ply").read_bytes().partition(b"end_header\n")[2]
+    points = np.frombuffer(body, VERTEX).copy()
+    points[field][3] = value
+    put_points(place, points)
+    with pytest.raises(InputError, match=rf"static\.ply: .*{said}"):
+        open_cloud(place)
+
+
+@pytest.mark.parametrize(
+    "route",
+    [
+        np.eye(4),
+        np.array([None]),
+        np.zeros((2, 4, 4)),
+        np.ones((2, 4, 4)),
+        np.full((2, 4, 4), np.nan),
+        np.diag([1e300, 1e300, 1e300, 1.0])[None],
+        np.eye(4)[None] + np.array([0.0, 0.0, 0.0, 1e12]),
+    ],
+)
+def test_poses_from_where_it_was_made(place, route):
+    np.save(place / "live/known_route.npy", route)
+    with pytest.raises(InputError, match=r"known_route\.npy"):
+        open_cloud(place)
+
+
+@pytest.mark.parametrize(
+    "extended",
+    [
+        {},
+        {"origin": 0.0, "resolution": 0.1},
+        {"origin": [0.0, 0.0], "resolution": 0.1},
+        {"origin": [0.0, 0.0, 1e300], "resolution": 0.1},
+        {"origin": [0.0, 0.0, 0.0], "resolution": [0.1]},
+        {"origin": [0.0, 0.0, 0.0], "resolution": 0.0},
+    ],
+)
+def test_the_known_map_of_a_kept_drive(kept_drive, extended):
+    for name in ("p_occupied", "hits"):
+        np.save(kept_drive / f"{name}.npy", np.ones((3, 3), np.float32))
+    record = json.loads((kept_drive / "drive.json").read_text())
+    (kept_drive / "drive.json").write_text(json.dumps({**record, "extended": extended}))
+    with pytest.raises(InputError, match=r"drive\.json: is damaged"):
+        read_drive(kept_drive)
+
+
+def test_layers_of_a_kept_drive(kept_drive):
+    for name in ("p_occupied", "hits"):
+        np.save(kept_drive / f"{name}.npy", np.full(3, "x"))
+    extended = {"origin": [0.0, 0.0, 0.0], "resolution": 0.1}
+    record = json.loads((kept_drive / "drive.json").read_text())
+    (kept_drive / "drive.json").write_text(json.dumps({**record, "extended": extended}))
+    with pytest.raises(InputError, match="its known map does not fit"):
+        read_drive(kept_drive)
+
+
+@pytest.fixture
+def kept_drive(tmp_path):
+    recording = simulate(scene_by_name("corridor", {"robot": {"scans": 5}}), 3).recording
+    with LiveMapper({"threads": 1}) as mapper:
+        for beams in iter_beams(recording):
+            mapper.push(beams)
+        return keep_drive(mapper.snapshot(), tmp_path)
+
+
+@pytest.mark.parametrize("changes", [5, None, "many", {"kind": "door"}])
+@pytest.mark.parametrize("warnings", [5, None, [[1], {}]])
+def test_the_page_of_a_fleet_shows_what_can_be_shown(place, changes, warnings):
+    record = {"input": {}, "changes": changes, "warnings": warnings, "counts": 3, "area": [1]}
+    (place / "run.json").write_text(json.dumps({**record, "quality": {"overall": "good"}}))
+    shown = summarize_result(place)
+    assert shown["map"].startswith("data:image/png")
+    assert (shown["changes"], shown["warnings"], shown["quality"]) == (0, [], {})
+
+
+def test_a_turned_map_is_not_drawn(place):
+    put_map(place, origin=np.array([0.0, 0.0, 1.0]))
+    (place / "run.json").write_text('{"input": {}}')
+    with pytest.raises(InputError, match="turned by 1 rad"):
+        summarize_result(place)
