@@ -98,6 +98,8 @@ def fit_sector(cells: Cells, resolution: float) -> Sector | None:
 
 def is_row(cells: Cells, resolution: float) -> bool:
     """True for a straight row of cells (K, 2) that is as long as a leaf may be."""
+    if not len(cells):
+        return False
     along, across = _extent(cells)
     is_thin = across <= _MAX_WIDTH and along >= _MIN_ELONGATION * across
     return is_thin and _MIN_LENGTH <= (along + 1.0) * resolution <= _MAX_LENGTH
