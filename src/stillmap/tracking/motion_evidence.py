@@ -5,8 +5,7 @@ plane that tilts) resembles a mover in each of its cells. Over a track it does n
 beams pass its place between two detections, it appears and vanishes in plain view. The share of
 movers among the tracks is learned from each recording by EM: where many people walk, one that
 stands is believed to be another; where nobody walks, it is not. Then movers explain all hits on
-them (`explained_hits.py`), and hits on nobody are static rather (`unfollowed_hits.py`). See
-`docs/objects.md`.
+them (`explained_hits.py`). See `docs/objects.md`.
 """
 
 import itertools
@@ -29,7 +28,6 @@ from stillmap.tracking.looks import Look, classify_looks
 from stillmap.tracking.mover_path import MoverPath
 from stillmap.tracking.steady_motion import count_steady_windows
 from stillmap.tracking.tracklets import compute_centroids, iterate_tracks, join_tracklets
-from stillmap.tracking.unfollowed_hits import weigh_unfollowed_hits
 from stillmap.tracking.walker_paths import iterate_walker_paths
 
 Float = NDArray[np.float64]
@@ -79,8 +77,7 @@ def apply_motion_evidence(
 
     A beam is dynamic if its cell says so and its track does: 1 - e becomes (1 - e) P(mover). One
     that ended on somebody who is followed is dynamic as well, whatever its cell says, unless
-    something static is there at other times. One that ended on nobody who is followed is static
-    rather, the more so the more of the movers are followed.
+    something static is there at other times.
 
     Args:
         recording: 2D, M beams, deskewed.
@@ -110,7 +107,6 @@ def apply_motion_evidence(
     on_movers = find_mover_hits(recording, poses, points.seconds, followed, of_path)
     is_vehicle = np.arange(len(followed)) < len(paths)
     out = explain_hits(recording, poses, out, on_movers, is_vehicle)
-    out = weigh_unfollowed_hits(recording, p_static, out, on_movers)
     return out, MoverPoints.concatenate(movers)
 
 
