@@ -52,6 +52,7 @@ class Beams:
     span: NDArray[np.int32]
     range: Float
     cell: NDArray[np.intp]  # in which they ended, numbered
+    door: NDArray[np.bool_]  # on a leaf that moved at any time, seen by the laser or not
 
     def of(self, which: NDArray[np.bool_]) -> "Beams":
         return Beams(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
@@ -62,7 +63,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     add_arguments(p, ["stillmap"])
-    add_run_arguments(p, [POPULATED, STOPS])
+    add_run_arguments(p, [POPULATED, STOPS, "street-oncoming", "corridor-40-once"])
     p.add_argument("--png", type=Path, help="reliability diagrams; the method's name is added")
     args = p.parse_args()
     done = list(outcomes(_beams_of, runs_of(args, args.methods), args.processes))
@@ -70,7 +71,8 @@ def main() -> None:
         beams = joined([beams for _, beams in some])
         named = [(f"{run.case.name}, {run.seed}", one) for run, one in some]
         print(f"\n## {method}: {len(some)} runs, {len(beams.p)} beams that hit something\n")
-        print("\n\n".join([*_tables(beams), *_by_run([*named, ("all", beams)])]))
+        named += [("all", beams), ("all but doors", beams.of(~beams.door))]
+        print("\n\n".join([*_tables(beams), *_by_run(named)]))
         if args.png:
             _draw(beams, args.png.with_stem(f"{args.png.stem}-{method}"))
 
@@ -92,7 +94,8 @@ def _beams_of(run: Run) -> Beams:
     ranges = np.hypot(*recording.points.T.astype(np.float64))
     _, cell = np.unique(_end_cells(recording, result.poses), axis=0, return_inverse=True)
     p = result.p_static.astype(np.float64)
-    all_beams = Beams(p, truth.static, looks, span, ranges, cell.ravel())
+    door = np.array([*truth.scene["mover_kinds"], "none"])[truth.mover] == "door"
+    all_beams = Beams(p, truth.static, looks, span, ranges, cell.ravel(), door)
     return all_beams.of(recording.hit & ~np.isnan(result.p_static))
 
 

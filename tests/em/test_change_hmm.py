@@ -213,6 +213,7 @@ class Everywhere(NamedTuple):
 
     cells: np.ndarray
     door: None = None
+    resolution: float = 0.0  # too small for the leaf of a door
 
 
 def final_e_step(seen, state="last", threads=1, **options):

@@ -8,7 +8,7 @@ import pytest
 import stillmap
 from stillmap import em
 from stillmap.core.config import override
-from stillmap.mapping.changed_objects import cell_keys, pool_states
+from stillmap.mapping.changed_objects import cell_keys, find_shown_cells, pool_states
 from stillmap.pipeline.options import Options
 from stillmap.results.map_npz import CHANGED, changed_cells
 from stillmap.sim import (
@@ -147,6 +147,7 @@ def test_what_is_not_listed_stays_what_it_is_without_changes():
         on_leaf |= np.isin(cell_keys(courses.cells), cell_keys(leaf))
     there |= (element >= 0) & on_leaf[element]
     shown[on_leaf[element]] = 0.0
+    shown *= 1.0 - find_shown_cells(courses, result.changes, "last").p_leaf[element]
     others, _ = apply_motion_evidence(result.deskewed, result.poses, without.p_static)
     np.testing.assert_array_equal(result.p_static, np.where(there, shown, others))
     assert (result.p_static != without.p_static).mean() > 0.01

@@ -3,7 +3,7 @@
 import numpy as np
 
 from stillmap.core.recording import Recording
-from stillmap.tracking.explained_hits import explain_hits
+from stillmap.tracking.explained_hits import compute_log_ratio, explain_hits, find_mover_hits
 from stillmap.tracking.mover_path import MoverPath
 
 SECONDS = np.arange(0.0, 4.0, 0.1)
@@ -33,11 +33,13 @@ def path():
     return MoverPath(SECONDS, xy, velocity, length=4.0, width=2.0)
 
 
-def explained(p_mover, paths):
+def explained(p_mover, paths, is_vehicle=True):
     recording = recorded()
     before = np.full(recording.n_beams, 0.9, np.float32)
     poses = np.tile(np.eye(3), (len(SECONDS), 1, 1))
-    after = explain_hits(recording, poses, SECONDS, before, paths, np.array(p_mover))
+    on_movers = find_mover_hits(recording, poses, SECONDS, paths, np.array(p_mover))
+    vehicles = np.full(len(paths), is_vehicle)
+    after = explain_hits(recording, poses, before, on_movers, vehicles)
     assert (before == np.float32(0.9)).all()
     return after.reshape(-1, 2).T
 
@@ -59,3 +61,17 @@ def test_without_a_path_nothing_changes():
     car, post = explained([], [])
     np.testing.assert_array_equal(car, np.float32(0.9))
     np.testing.assert_array_equal(post, np.float32(0.9))
+
+
+def test_a_place_with_hits_at_other_times_is_static_and_one_without_is_not():
+    stays, passes = compute_log_ratio(np.array([20.0, 20.0]), np.array([20.0, 0.0]))
+    assert stays > 5.0
+    assert passes < -1.0
+
+
+def test_few_hits_in_a_place_follow_what_holds_elsewhere_on_the_road():
+    """A look at a place says little by itself; where cars explain all places, they explain it."""
+    (car, _), (walker, _) = explained([1.0], [path()]), explained([1.0], [path()], False)
+    alone = 1.0 / (1.0 + np.exp(-compute_log_ratio(np.array([1.0]), np.array([0.0]))))
+    np.testing.assert_allclose(walker.max(), 0.9 * alone[0], rtol=1e-5)
+    assert car.max() < walker.min() - 0.05

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from stillmap.core.recording import Recording
+from stillmap.tracking.learned_share import fit_share
 from stillmap.tracking.motion_evidence import (
     TrackEvidence,
     apply_motion_evidence,
     compute_log_ratio,
-    fit_share,
 )
 
 ANGLES = np.radians(np.arange(-180.0, 180.0, 0.5))

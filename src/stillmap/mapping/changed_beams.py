@@ -34,8 +34,8 @@ def relabel_changes(
     """Labels (M,) and map cells, taken from the cell histories within the listed changes.
 
     There p_static of a beam is the probability that the map in this state shows the object that
-    reflected it, and 0 on the leaf of a door. Cells of one object decide together. Changes of cells
-    that are not listed are noise.
+    reflected it, and that this is not the leaf of a door. Cells of one object decide together.
+    Changes of cells that are not listed are noise.
 
     Args:
         recording: M beams.
@@ -49,9 +49,9 @@ def relabel_changes(
         return p_static, occupied
     if not np.array_equal(occupied.cells, histories.cells):
         raise ValueError("occupied: expected the cells of the final E-step")
-    listed, p_in_map, is_door = find_shown_cells(histories, changes, state)
+    listed, p_in_map, p_leaf = find_shown_cells(histories, changes, state)
     # a leaf that swings is no static object, wherever the map shows it
-    label = np.where(is_door, np.float32(0.0), p_in_map)
+    label = p_in_map * (1.0 - p_leaf)
     out = arrays.copy(p_static, recording.scratch)
     for _, beams, data in iter_beams(recording, poses, release=[out]):
         surfel = histories.surfel_map.associate_beams(*data, threads)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from stillmap import em
 from stillmap.core.components import connected_components, neighbor_pairs
 from stillmap.mapping.change_detection import Change
+from stillmap.mapping.doors import is_row
 
 Cells = NDArray[np.int64]
 Index = NDArray[np.intp]
@@ -22,12 +23,12 @@ class ShownCells(NamedTuple):
     Attributes:
         listed: (E,) cells that changes concern.
         p_in_map: (E,) float32, probability that the map shows something there.
-        is_door: (E,) cells of leaves, in any position.
+        p_leaf: (E,) float32, probability that it is the leaf of a door, in any position.
     """
 
     listed: NDArray[np.bool_]
     p_in_map: NDArray[np.float32]
-    is_door: NDArray[np.bool_]
+    p_leaf: NDArray[np.float32]
 
 
 def find_shown_cells(
@@ -43,13 +44,29 @@ def find_shown_cells(
     keys = cell_keys(histories.cells)
     listed = np.isin(keys, cell_keys(np.concatenate([one.cells for one in changes])))
     p = histories.p_in_map(state, pool_states(histories, changes, state))
-    is_door = np.zeros(len(keys), bool)
+    p_leaf = _weigh_leaves(keys, changes)
     for door in (one.door for one in changes if one.door is not None):
         shown = door.position_in(state)
         for position, leaf in (("open", door.open_cells), ("shut", door.shut_cells)):
             of = _rows(keys, leaf)
-            is_door[of], p[of] = True, float(position == shown)
-    return ShownCells(listed | is_door, p, is_door)
+            p_leaf[of], p[of], listed[of] = 1.0, float(position == shown), True
+    return ShownCells(listed, p, p_leaf)
+
+
+def _weigh_leaves(keys: Cells, changes: list[Change]) -> NDArray[np.float32]:
+    """(E,) probability that what changed in the cells with these keys is the leaf of a door.
+
+    A straight row of cells that changed may be a leaf that was seen in one position only, or one
+    side of a thing. Of all such rows, the share that others are doors by what was seen of them.
+    """
+    doors = [one for one in changes if one.door is not None]
+    rows = [one for one in changes if one.door is None and is_row(one.cells, one.resolution)]
+    share = (len(doors) + 1.0) / (len(doors) + len(rows) + 2.0)
+    out = np.zeros(len(keys), np.float32)
+    for some, p in ((rows, share), (doors, 1.0)):
+        for one in some:
+            out[_rows(keys, one.cells)] = p
+    return out
 
 
 def pool_states(

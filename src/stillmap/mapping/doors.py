@@ -9,6 +9,7 @@ Cells = NDArray[np.int64]
 Float = NDArray[np.float64]
 
 _TOLERANCE = 2.0  # cells between the leaf and a cell on it
+_MAX_WIDTH, _MIN_ELONGATION = 2.0 * _TOLERANCE + 1.0, 3.0  # of a straight row: cells; of its width
 _MIN_INLIERS = 0.8  # share of the cells on the leaf in its end positions
 _MAX_HINGES = 400  # candidates that are tried
 _MIN_LENGTH, _MAX_LENGTH = 0.4, 2.0  # m, of leaves
@@ -95,8 +96,17 @@ def fit_sector(cells: Cells, resolution: float) -> Sector | None:
     return sector
 
 
+def is_row(cells: Cells, resolution: float) -> bool:
+    """True for a straight row of cells (K, 2) that is as long as a leaf may be."""
+    if not len(cells):
+        return False
+    along, across = _extent(cells)
+    is_thin = across <= _MAX_WIDTH and along >= _MIN_ELONGATION * across
+    return is_thin and _MIN_LENGTH <= (along + 1.0) * resolution <= _MAX_LENGTH
+
+
 def _fit_two_lines(cells: Cells) -> Sector | None:
-    if _width(cells) <= 2.0 * _TOLERANCE + 1.0:
+    if _extent(cells)[1] <= _MAX_WIDTH:
         return None  # straight: two opposite leaves would look alike
     best, best_score = None, (_MIN_INLIERS, -math.inf)
     for hinge in cells[:: math.ceil(len(cells) / _MAX_HINGES)]:
@@ -112,8 +122,9 @@ def _fit_two_lines(cells: Cells) -> Sector | None:
     return best
 
 
-def _width(cells: Cells) -> float:
-    """Width in cells across the principal direction."""
+def _extent(cells: Cells) -> tuple[float, float]:
+    """Length in cells along the principal direction, and width across."""
     x, y = (cells - cells.mean(axis=0)).T
     along = 0.5 * math.atan2(2.0 * float(np.sum(x * y)), float(np.sum(x * x - y * y)))
-    return float(np.ptp(y * math.cos(along) - x * math.sin(along)))
+    u, v = math.cos(along), math.sin(along)
+    return float(np.ptp(x * u + y * v)), float(np.ptp(y * u - x * v))

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import arrays
 from stillmap.core.recording import Recording
+from stillmap.tracking.learned_share import compute_probability, fit_share
 from stillmap.tracking.mover_path import MoverPath
 
 Float = NDArray[np.float64]
@@ -22,33 +23,44 @@ Labels = NDArray[np.float32]
 _MARGIN = 0.15  # m around the box
 _CELL = 0.25  # m, of a place
 _STRAY = 19.0  # Beta(1, 19): share of the hits outside, of places that only movers were in
-_MAX_LOG_ODDS = 50.0
+
+
+class MoverHits(NamedTuple):
+    """Hits within the boxes of movers.
+
+    Attributes:
+        beam: (n,) rising.
+        path: (n,) whose box it is.
+        p_mover: (n,) probability that this is a mover.
+    """
+
+    beam: Index
+    path: Index
+    p_mover: Float
 
 
 def explain_hits(
     recording: Recording,
     poses: Float,
-    seconds: Float,
     p_static: Labels,
-    paths: Sequence[MoverPath],
-    p_mover: Float,
+    on_movers: MoverHits,
+    is_vehicle: NDArray[np.bool_],
 ) -> Labels:
     """(M,) P(static), lower for beams that ended on movers.
 
     Of the m + n hits of a place, m are explained by movers and n not. Where something static
-    stands, the share n / (m + n) may be any; where only movers were, it is small: stray hits.
+    stands, the share n / (m + n) may be any; where only movers were, it is small: stray hits. How
+    much stands where vehicles drive is learned from the hits on all of them; beside people, who
+    keep to chairs and walls, either is as probable before any hit.
 
     Args:
         recording: 2D, M beams.
         poses: (T, 3, 3) T_map_base.
-        seconds: (T,) times of the scans.
         p_static: (M,) P(c = 1).
-        paths: K, of what is followed.
-        p_mover: (K,) probability that each is of a mover.
+        on_movers: from `find_mover_hits`.
+        is_vehicle: (K,) the paths of vehicles.
     """
-    if not len(paths):
-        return p_static
-    beam, weight = _beams_within(recording, poses, seconds, paths, p_mover)
+    beam, path, weight = on_movers
     if not len(beam):
         return p_static
     key = _keys(recording.end_points(beam, poses))
@@ -56,21 +68,27 @@ def explain_hits(
     explained = np.bincount(place, weight, minlength=len(places)).astype(np.float64)
     others = _static_hits(recording, poses, p_static, places)
     others -= np.bincount(place, np.nan_to_num(p_static[beam]), minlength=len(places))
-    others = np.maximum(others, 0.0)
-    p_place = _compute_p_static(explained, others)[place]
+    log_ratio = compute_log_ratio(explained, np.maximum(others, 0.0))
+    on_vehicle = is_vehicle[path]
+    by_vehicles = np.bincount(place, weight * on_vehicle, minlength=len(places)).astype(np.float64)
+    p_place = np.where(
+        on_vehicle, fit_share(log_ratio, by_vehicles)[place], compute_probability(log_ratio)[place]
+    )
     out = arrays.copy(p_static, recording.scratch)
     out[beam] *= (1.0 - weight * (1.0 - p_place)).astype(np.float32)
     return out
 
 
-def _compute_p_static(explained: Float, others: Float) -> Float:
-    """(P,) that something static is there, given the hits within boxes and at other times."""
+def compute_log_ratio(explained: Float, others: Float) -> Float:
+    """(P,) nats, log likelihood ratio of something static in a place to movers alone.
+
+    Args:
+        explained, others: (P,) hits within boxes and at other times.
+    """
     from scipy.special import betaln  # slow to load
 
-    log_static = betaln(others + 1.0, explained + 1.0)
     log_mover = betaln(others + 1.0, explained + _STRAY) - betaln(1.0, _STRAY)
-    log_odds = log_static - log_mover
-    return np.asarray(1.0 / (1.0 + np.exp(-np.clip(log_odds, -_MAX_LOG_ODDS, _MAX_LOG_ODDS))))
+    return np.asarray(betaln(others + 1.0, explained + 1.0) - log_mover)
 
 
 class _Boxes(NamedTuple):
@@ -93,19 +111,29 @@ def _place_boxes(seconds: Float, paths: Sequence[MoverPath]) -> _Boxes:
     return _Boxes(scan[order], path[order], xy[order], heading[order])
 
 
-def _beams_within(
+def find_mover_hits(
     recording: Recording,
     poses: Float,
     seconds: Float,
     paths: Sequence[MoverPath],
     p_mover: Float,
-) -> tuple[Index, Float]:
-    """Hits within a box (n,), rising, and the probability of the mover."""
+) -> MoverHits:
+    """The hits within the boxes of what is followed.
+
+    Args:
+        recording: 2D, M beams.
+        poses: (T, 3, 3) T_map_base.
+        seconds: (T,) times of the scans.
+        paths: K, of what is followed.
+        p_mover: (K,) probability that each is of a mover.
+    """
+    if not len(paths):
+        return MoverHits(np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros(0))
     boxes = _place_boxes(seconds, paths)
     half = 0.5 * np.array([(path.length, path.width) for path in paths]) + _MARGIN
     begins = np.flatnonzero(np.diff(boxes.scan, prepend=-1))
     rows = np.split(np.arange(len(boxes.scan)), begins[1:])
-    beams, weights = [np.zeros(0, np.intp)], [np.zeros(0)]
+    found = []
     T_map_sensor = recording.T_map_sensor(poses)
     for k in recording.iter_scans(range(len(rows))):
         row, t = rows[k], int(boxes.scan[rows[k][0]])
@@ -115,10 +143,12 @@ def _beams_within(
         off, u, size = xy[:, None] - boxes.xy[row], boxes.heading[row], half[boxes.path[row]]
         inside = np.abs((off * u).sum(axis=-1)) <= size[:, 0]
         inside &= np.abs(off[..., 1] * u[:, 0] - off[..., 0] * u[:, 1]) <= size[:, 1]
-        weight = (inside * p_mover[boxes.path[row]]).max(axis=1)
-        beams.append(beam[weight > 0.0])
-        weights.append(weight[weight > 0.0])
-    return np.concatenate(beams), np.concatenate(weights)
+        weights = inside * p_mover[boxes.path[row]]
+        likeliest = weights.argmax(axis=1)
+        weight = weights[np.arange(len(beam)), likeliest]
+        kept = weight > 0.0
+        found.append((beam[kept], boxes.path[row[likeliest[kept]]], weight[kept]))
+    return MoverHits(*(np.concatenate(column) for column in zip(*found, strict=True)))
 
 
 def _static_hits(

@@ -22,8 +22,9 @@ from stillmap.mapping import MoverPoints
 from stillmap.tracking.association import MAX_GAP, assign_tracks, regress_velocity
 from stillmap.tracking.clustering import DynamicPoints, extract_dynamic_points
 from stillmap.tracking.detections import compute_centroids, iterate_tracks
-from stillmap.tracking.explained_hits import explain_hits
+from stillmap.tracking.explained_hits import explain_hits, find_mover_hits
 from stillmap.tracking.fast_movers import find_fast_movers, tracks_of_paths
+from stillmap.tracking.learned_share import fit_share
 from stillmap.tracking.looks import Look, classify_looks
 from stillmap.tracking.mover_path import MoverPath
 from stillmap.tracking.steady_motion import count_steady_windows
@@ -49,10 +50,6 @@ _SEEN_LOOKS = 19.0  # Beta(19, 1): share of the looks that detect a mover in vie
 _THIN_HITS, _THIN = 3.0, (5.0, 3.0)  # hits per look below which half of the movers are thin: Beta
 _CLUTTER = (1.0, 1.0)  # Beta: share of the looks that detect clutter
 _OPEN = 0.5  # nats against a mover, for each end in plain view
-_ROUNDS = 100  # of EM at most
-_TOLERANCE = 1e-6  # of the share, at which EM ends
-_MIN_SHARE = 1e-4  # of movers, and of clutter
-_MAX_LOG_ODDS = 50.0
 
 
 class TrackEvidence(NamedTuple):
@@ -108,7 +105,9 @@ def apply_motion_evidence(
     tracks = np.array([*fast, *walkers], np.intp)
     of_path = np.where(tracks >= 0, p_mover[tracks], 0.0)
     followed = [*paths, *walkers.values()]
-    out = explain_hits(recording, poses, points.seconds, out, followed, of_path)
+    on_movers = find_mover_hits(recording, poses, points.seconds, followed, of_path)
+    is_vehicle = np.arange(len(followed)) < len(paths)
+    out = explain_hits(recording, poses, out, on_movers, is_vehicle)
     return out, MoverPoints.concatenate(movers)
 
 
@@ -135,24 +134,6 @@ def weigh_tracks(
     out = np.zeros(int(tracks.max()) + 1)
     out[tracks] = fit_share(compute_log_ratio(evidence), evidence.looks)
     return out
-
-
-def fit_share(log_ratio: Float, weight: Float) -> Float:
-    """(K,) P(mover) of tracks with log likelihood ratios (K,), the share of movers fitted by EM.
-
-    Args:
-        log_ratio: nats, of mover to clutter.
-        weight: (K,) of each track in the share.
-    """
-    share, p = 0.5, np.full(len(log_ratio), 0.5)
-    for _ in range(_ROUNDS):
-        log_odds = log_ratio + np.log(share / (1.0 - share))
-        p = 1.0 / (1.0 + np.exp(-np.clip(log_odds, -_MAX_LOG_ODDS, _MAX_LOG_ODDS)))
-        last, share = share, float((np.sum(weight * p) + 1.0) / (np.sum(weight) + 2.0))
-        share = min(max(share, _MIN_SHARE), 1.0 - _MIN_SHARE)
-        if abs(share - last) < _TOLERANCE:
-            break
-    return p
 
 
 def compute_log_ratio(e: TrackEvidence) -> Float:
