@@ -3,6 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from stillmap.core.errors import InputError
 from stillmap.pipeline import snapshots
 from stillmap.pipeline.snapshots import choose_window, cut, extent, snapshot
 
@@ -86,7 +87,7 @@ def test_snapshot_thins_points(grid, monkeypatch):
 
 
 def test_a_turned_map_is_refused(grid):
-    with pytest.raises(ValueError, match="turned"):
+    with pytest.raises(InputError, match="turned"):
         cut(dataclasses.replace(grid, origin=(0.0, 0.0, 0.1)), (0, 0, 1, 1))
 
 
