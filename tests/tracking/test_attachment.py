@@ -7,7 +7,7 @@ import pytest
 
 from stillmap import Recording
 from stillmap.tracking import MovingObject
-from stillmap.tracking.attachment import count_neighbors, drop_attached
+from stillmap.tracking.attachment import count_neighbors, drop_surface_parts
 
 SCANS = 6
 ACROSS, UP = np.meshgrid(np.radians(np.arange(-20, 20.1, 1.0)), np.radians(np.arange(-9, 10, 2.0)))
@@ -49,14 +49,14 @@ def labelled(p_static, own, others=None):
 def test_a_patch_of_a_wall_is_no_object():
     recording, p = room(np.full(len(DIRECTIONS), 5.0))
     one = an_object(recording, PATCH)
-    assert drop_attached([one], recording, labelled(p, PATCH)) == []
+    assert drop_surface_parts([one], recording, labelled(p, PATCH)) == []
 
 
 @pytest.mark.parametrize("depth", [1.0, 4.5], ids=["far before", "half a metre before"])
 def test_an_object_before_a_wall_is_kept(depth):
     recording, p = room(np.where(PATCH, depth, 5.0))
     one = an_object(recording, PATCH)
-    assert drop_attached([one], recording, labelled(p, PATCH)) == [one]
+    assert drop_surface_parts([one], recording, labelled(p, PATCH)) == [one]
 
 
 def test_surface_on_one_side_does_not_count_enough():
@@ -64,7 +64,7 @@ def test_surface_on_one_side_does_not_count_enough():
     one = an_object(recording, PATCH)
     on_it, behind = count_neighbors([one], recording, labelled(p, PATCH))[0]
     assert 0 < on_it < behind
-    assert drop_attached([one], recording, labelled(p, PATCH)) == [one]
+    assert drop_surface_parts([one], recording, labelled(p, PATCH)) == [one]
 
 
 def test_neighbors_that_move_do_not_count():
@@ -73,7 +73,7 @@ def test_neighbors_that_move_do_not_count():
     one = an_object(recording, PATCH)
     p = labelled(p, PATCH, others=~PATCH)
     assert count_neighbors([one], recording, p).tolist() == [[0, 0]]
-    assert drop_attached([one], recording, p) == [one]
+    assert drop_surface_parts([one], recording, p) == [one]
 
 
 def test_what_is_nearer_hides_and_does_not_count():
@@ -88,7 +88,7 @@ def test_a_single_beam_and_no_object():
     on_it, behind = count_neighbors([an_object(recording, own)], recording, p)[0]
     assert on_it > 0
     assert behind == 0
-    assert drop_attached([], recording, p) == []
+    assert drop_surface_parts([], recording, p) == []
 
 
 def test_beams_that_hit_nothing_are_no_neighbors():

@@ -24,7 +24,7 @@ _MAX_ATTACHMENT = 0.4  # one side of an object and its ground are less
 _MIN_BEAMS = 5  # beside an object, for a decision
 
 
-def drop_attached(
+def drop_surface_parts(
     objects: Sequence[MovingObject], recording: Recording, p_static: NDArray[np.float32]
 ) -> list[MovingObject]:
     """The objects that are no part of a static surface.

@@ -91,7 +91,7 @@ def _remain_occupied(
 
 
 def _is_empty(looks: Sequence[_Look], during: Sequence[_Look]) -> bool:
-    """Whether what was seen at a place `during` a track is not there in other looks.
+    """True if other looks show that the object of the looks `during` its track is not there.
 
     Most looks see all beams pass, and so many of them within its outline that the object, which
     stopped a share of such beams, would have stopped one.

@@ -19,7 +19,7 @@ from stillmap.core.recording import Recording
 from stillmap.em import GroundMap
 from stillmap.mapping.projection import DIRECTIONS, make_planar_recording
 from stillmap.tracking import MovingObject, ObjectOptions, track_objects
-from stillmap.tracking.attachment import drop_attached
+from stillmap.tracking.attachment import drop_surface_parts
 from stillmap.tracking.clustering import MIN_P_DYNAMIC
 from stillmap.tracking.displacement import select_movers
 
@@ -69,7 +69,7 @@ def track_objects_3d(
         _add_height(one, beams, recording, poses, p_static)
         for one, beams in zip(objects, owned, strict=True)
     ]
-    return select_movers(drop_attached(found_3d, recording, p_static), recording, poses)
+    return select_movers(drop_surface_parts(found_3d, recording, p_static), recording, poses)
 
 
 class _Segments(NamedTuple):
