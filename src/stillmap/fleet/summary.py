@@ -18,7 +18,7 @@ _MAX_SESSIONS = 64 << 20  # bytes of a sessions.json
 
 
 class _Noted(TypedDict, total=False):
-    """What the page shows of a `run.json`."""
+    """Fields of a `run.json` that the fleet page shows."""
 
     counts: dict[str, int]
     area: dict[str, float]

@@ -12,7 +12,7 @@ from stillmap.core.recording import Recording
 from stillmap.mapping.change_detection import Change
 from stillmap.mapping.changed_objects import cell_keys
 from stillmap.mapping.door import Door
-from stillmap.mapping.door_states import have_beams_passed, observe_states
+from stillmap.mapping.door_states import is_passage_observed, observe_states
 from stillmap.mapping.doors import Sector, fit_sector
 from stillmap.mapping.resting_leaf import find_resting_leaf
 
@@ -59,7 +59,7 @@ def find_doors(
         if not all(_holds(left, one) for one in candidate.changes):
             continue  # of a door that was found before
         door = dataclasses.replace(shape, states=states)
-        if not states or not have_beams_passed(door, recording, poses):
+        if not states or not is_passage_observed(door, recording, poses):
             continue  # nobody saw it in both positions
         mine = [
             one

@@ -106,7 +106,7 @@ def _list_states(
     return tuple(out) if swings else ()
 
 
-def have_beams_passed(door: Door, recording: Recording, poses: Float) -> bool:
+def is_passage_observed(door: Door, recording: Recording, poses: Float) -> bool:
     """True if beams passed through one position of the leaf while it was in the other one.
 
     Two sides of a box that are seen in turn look like a leaf otherwise.

@@ -132,7 +132,7 @@ def _find_near_line(flat: Float, length: Float, place: Float) -> Index:
 
 
 def _look_at(ends: Float, place: Float, size: Sequence[float]) -> _Look:
-    """What a scan shows of the place of an object.
+    """Count the beams of a scan that reach the place of an object, and those that end there.
 
     Args:
         ends: (N, 3) from the sensor, in the axes of the map.
