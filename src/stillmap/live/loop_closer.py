@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.short_repr import ShortRepr
+from stillmap.live.anchored_poses import AnchoredPoses
+from stillmap.live.graph_sparsification import select_scans, select_state
 from stillmap.live.local_map import MappedScan
 from stillmap.live.spaced_scans import SpacedScans, SpacedView
 from stillmap.slam import local_map, loop_candidates, loop_closure
@@ -21,6 +23,13 @@ _EVERY = 2.0  # m of travel between two searches for loops
 _NEAR_TRAVEL = 25.0  # m of drift up to which earlier scans are part of the local map
 _HEADING = 0.8  # rad between two earlier scans of one place in the local map
 _NEAR_DISTANCE = 25.0  # m from the robot up to which they are
+# m that any spaced scan and that the last one move, and rad that it turns, up to which the map
+# stays as it is: constraints of loops have such errors themselves
+_SMALL = 0.1, 0.03, 0.005
+_REPEATED_AFTER = 25.0  # m after which small corrections are told: the last large one may be lost
+# spaced scans, a kilometre of travel, before which none leaves the graph; how many times as many as
+# were left the last time there are when some leave again
+_MIN_SCANS, _GROWTH = 6000, 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,8 +50,24 @@ class Correction(ShortRepr):
     untied: tuple[int, ...] = ()
 
 
+def is_small(before: Float, after: Float, motion: Float) -> bool:
+    """True if a correction leaves the map as it is.
+
+    Args:
+        before: (S, D+1, D+1) poses of the spaced scans.
+        after: (S, D+1, D+1) the same after the correction.
+        motion: (D+1, D+1) of the map where the robot is.
+    """
+    D = before.shape[-1] - 1
+    shift = np.linalg.norm((after - before)[:, :D, D], axis=1)
+    # of a small rotation: that of R - I is the square root of two times as much
+    turn = float(np.linalg.norm(motion[:D, :D] - np.eye(D))) / np.sqrt(2.0)
+    return bool(shift.max() < _SMALL[0] and shift[-1] < _SMALL[1] and turn < _SMALL[2])
+
+
 class LoopCloser:
-    """Spaced scans of the whole run, and the loops between them.
+    """Spaced scans of the whole run, and the loops between them. Where the robot drives through
+    the same places again and again, scans leave the graph: it grows with the area.
 
     Args:
         options: see SlamOptions.
@@ -50,7 +75,7 @@ class LoopCloser:
     """
 
     def __init__(self, options: SlamOptions, folder: Path | None = None) -> None:
-        self._scans = SpacedScans(2, folder)
+        self._scans, self._folder = SpacedScans(2, folder), folder
         self._options = options
         self._last: MappedScan | None = None
         self._keyframes: list[int] = []
@@ -59,7 +84,12 @@ class LoopCloser:
         self._centers = np.zeros((0, 2))
         self._poses = np.zeros((0, 3, 3))  # T_map_base of the spaced scans up to the last search
         self._T_map_local = np.eye(3)
+        self._anchored = AnchoredPoses()
         self._searched_until = 0.0
+        # the last large correction: poses of the spaced scans up to now, T_map_local
+        self._told, self._T_told = np.zeros((0, 3, 3)), np.eye(3)
+        self._told_until = 0.0  # m of travel at the last correction
+        self._due = _MIN_SCANS  # spaced scans from which some leave
 
     def add(self, scan: MappedScan, explained: float, drift: Float) -> None:
         """Add a spaced scan at its pose in the frame of the odometry by scans.
@@ -97,13 +127,14 @@ class LoopCloser:
         )
 
     def close(self) -> Correction | None:
-        """Search loops of the keyframes since the last search; None: nothing changed."""
+        """Search loops of the keyframes since the last search; None: hardly anything changed."""
         view = self._scans.view()
         context = self._context(view)
         first, last = len(self._state.poses), len(context.keyframes)
         self._searched_until = float(view.travelled[-1])
         since = self._T_map_local @ view.poses[len(self._poses) :]
         self._poses = np.concatenate([self._poses, since])
+        self._told = np.concatenate([self._told, self._T_told @ view.poses[len(self._told) :]])
         chain = loop_candidates.odometry_constraints(context, self._options.odometry, [])
         new = context.keyframes[first:]
         self._centers = np.concatenate(
@@ -113,20 +144,47 @@ class LoopCloser:
         poses = np.concatenate([before.poses, self._T_map_local @ context.poses[new]])
         state = replace(before, poses=poses)
         self._state = loop_closure.close_stage(context, chain, self._centers, state, first, last)
-        if np.array_equal(self._state.poses, poses):
-            return None
-        return self._correct(view, context)
+        is_changed = not np.array_equal(self._state.poses, poses)
+        correction = self._correct(view, context) if is_changed else None
+        if len(self._scans) >= self._due:
+            self._sparsify(view, context)
+        return correction
 
-    def _correct(self, view: SpacedView, context: LoopContext) -> Correction:
+    def _correct(self, view: SpacedView, context: LoopContext) -> Correction | None:
         keyframes, poses = context.keyframes, self._state.poses
         self._T_map_local = poses[-1] @ se2.inverse(context.poses[keyframes[-1]])
         every = np.append(keyframes, len(view.poses) - 1)
         last = self._T_map_local @ context.poses[-1]
-        corrected = local_map.propagate_corrections(
+        self._poses = corrected = local_map.propagate_corrections(
             context.poses, *_without_repetition(every, np.concatenate([poses, last[None]]))
         )
-        self._poses = corrected
-        return Correction(self._T_map_local, corrected, self._find_near(view, context))
+        is_large = not is_small(self._told, corrected, last @ se2.inverse(self._told[-1]))
+        now = float(view.travelled[-1])
+        if not is_large and now < self._told_until + _REPEATED_AFTER:
+            return None
+        self._told_until = now
+        if is_large:
+            self._told, self._T_told = corrected, self._T_map_local
+        near = self._find_near(view, context)
+        return Correction(self._T_map_local, self._anchored.place(corrected), near)
+
+    def _sparsify(self, view: SpacedView, context: LoopContext) -> None:
+        """Take scans out of the graph. The others stay as they are in the map."""
+        stay = select_scans(view, context.keyframes, self._state)
+        local = se2.inverse(self._T_map_local) @ self._poses
+        scans = SpacedScans(2, self._folder)
+        for s in np.flatnonzero(stay).tolist():
+            scan = replace(self._scans.scan(view, s), T_map_base=local[s])
+            scans.append(scan, float(view.explained[s]), view.drift[s])
+        context.recording.release_pages(context.e)
+        self._scans.close()
+        self._scans = scans
+        self._anchored.remove(stay, self._poses)
+        self._state = select_state(self._state, context.keyframes, stay)
+        self._centers = self._centers[stay[context.keyframes]]
+        self._keyframes = (np.cumsum(stay) - 1)[context.keyframes[stay[context.keyframes]]].tolist()
+        self._poses, self._told = self._poses[stay], self._told[stay]
+        self._due = max(_MIN_SCANS, round(_GROWTH * len(scans)))
 
     def _find_near(self, view: SpacedView, context: LoopContext) -> list[MappedScan]:
         """The scans of the local map: near the robot along the graph and in the map.

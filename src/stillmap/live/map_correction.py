@@ -10,7 +10,7 @@ from stillmap.core import se2
 from stillmap.core.short_repr import ShortRepr
 from stillmap.live.causal_labels import CausalLabels, OccupancyFilter, take_over
 from stillmap.live.local_map import LocalMap, MappedScan
-from stillmap.live.loop_closer import Correction
+from stillmap.live.loop_closer import Correction, is_small
 from stillmap.live.observation import Observation
 
 Float = NDArray[np.float64]
@@ -21,9 +21,6 @@ _ADDED_PER_STEP = {2: 2, 3: 1}  # scans that came meanwhile
 # spaced scans that move their cells alike: between neighbours corrections hardly differ
 SPACED_PER_TAG = {2: 4, 3: 1}
 _KEPT_EVERY_NS = {2: 0, 3: 500_000_000}  # between two of them
-# m that any spaced scan and that the last one move, and rad that it turns, up to which the map
-# stays as it is: constraints of loops have such errors themselves
-_SMALL = 0.1, 0.03, 0.005
 _MIN_SHIFT = 0.5  # cells by which the map must move for its cells to be moved
 
 
@@ -72,9 +69,7 @@ class MapCorrection:
         self._source: OccupancyFilter = labels.filter
         D = self._D
         shift = np.linalg.norm((self.poses - poses)[:, :D, D], axis=1)
-        # of a small rotation: that of R - I is the square root of two times as much
-        turn = float(np.linalg.norm(self._motion[-1, :D, :D] - np.eye(D))) / np.sqrt(2.0)
-        self.is_small = bool(shift.max() < _SMALL[0] and shift[-1] < _SMALL[1] and turn < _SMALL[2])
+        self.is_small = is_small(poses, self.poses, self._motion[-1])
         self.moves_cells = bool(shift.max() > _MIN_SHIFT * labels.resolution)
         self.filter: OccupancyFilter = self._source.sibling() if self.moves_cells else self._source
         self._block = 0

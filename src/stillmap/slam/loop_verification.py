@@ -31,7 +31,7 @@ _OBSERVED_MARGIN, MIN_COMPARABLE = 1.0, 0.3
 MIN_EXPLAINED, _MIN_EXPLAINED_RATIO = 0.5, 0.65
 # the first of them in wide windows; std, m, from which a window is wider and at which it is wide
 _MIN_EXPLAINED_WIDE, _WIDE_WINDOW = 0.85, (0.3, 1.0)
-CLOSURE_TRANSLATION, _CLOSURE_ROTATION = 0.03, 0.006  # m, rad: min std of a closure
+CLOSURE_TRANSLATION, CLOSURE_ROTATION = 0.03, 0.006  # m, rad: min std of a closure
 # a view is matched again while the comparable beams change by more than this share, at most
 _MAX_ROUNDS, _MAX_CHANGE = 3, 0.05
 _SHIFTS = (-0.6, -0.3, 0.3, 0.6)  # m, to test whether a view could slide along a wall
@@ -111,7 +111,7 @@ def verify_candidate(
         if np.abs(here.weights - part.weights).sum() < _MAX_CHANGE * view.weights.sum():
             break
         part = here
-    floor = [CLOSURE_TRANSLATION] * 2 + [_CLOSURE_ROTATION]
+    floor = [CLOSURE_TRANSLATION] * 2 + [CLOSURE_ROTATION]
     covariance = match.covariance + np.diag(np.square(floor))
     too_little = share < MIN_COMPARABLE or match.explained < max(
         min_explained, _MIN_EXPLAINED_RATIO * context.explained[later]

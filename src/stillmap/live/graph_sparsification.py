@@ -1,0 +1,165 @@
+"""Sparsification of the pose graph in 2D: of many passes through a place a few stay."""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core import se2
+from stillmap.live.spaced_scans import SpacedView
+from stillmap.slam.loop_candidates import MIN_LOOP_TRAVEL
+from stillmap.slam.loop_closure import LoopState
+from stillmap.slam.loop_verification import CLOSURE_ROTATION, CLOSURE_TRANSLATION, SUBMAP_TRAVEL
+from stillmap.slam.types import Index, LoopClosure
+
+Float = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_LATEST = 4  # stretches of other passes that stay at a place, the latest, besides the first
+_PLACE_DISTANCE, _PLACE_ANGLE = 1.5, 0.8  # m and rad between keyframes that show one place
+_RECENT = 50.0  # m of travel of which all stays: its loops are still compared with new ones
+_STEP = 0.05  # m or rad: between keyframes, scans of a robot that stands are not needed
+_ROWS = 256  # of a matrix of distances
+
+
+def select_scans(view: SpacedView, keyframes: Index, state: LoopState) -> Mask:
+    """(S,) the spaced scans that stay.
+
+    Stretches of `SUBMAP_TRAVEL` stay or leave whole: a submap needs all scans of one. Those stay
+    that first showed a place, the latest few that show it, and those that no loop ties to others.
+
+    Args:
+        view: all spaced scans.
+        keyframes: (K,) of them.
+        state: loops of these keyframes, and their corrected poses.
+    """
+    stretch = (view.travelled // SUBMAP_TRAVEL).astype(np.int64)
+    travelled, of = view.travelled[keyframes], stretch[keyframes]
+    near = [
+        others[np.abs(travelled[others] - travelled[k]) > MIN_LOOP_TRAVEL]
+        for k, others in enumerate(_iter_near(state.poses))
+    ]
+    stay = _find_first(of, near) | _find_indispensable(travelled, of, keyframes, state.fitting)
+    stay |= _find_latest(of, near, stay)
+    is_recent = view.travelled > view.travelled[-1] - _RECENT
+    out: Mask = is_recent | np.isin(stretch, of[stay])
+    return out & ~_find_standing(view.poses, keyframes)
+
+
+def _iter_near(poses: Float) -> Iterator[Index]:
+    """For each of the poses (K, 3, 3) those that show the same place, itself among them."""
+    x = se2.parameters(poses)
+    for first in range(0, len(x), _ROWS):
+        rows = x[first : first + _ROWS, None]
+        away = np.hypot(rows[..., 0] - x[:, 0], rows[..., 1] - x[:, 1])
+        turn = np.abs(se2.wrap(rows[..., 2] - x[:, 2]))
+        for row in (away < _PLACE_DISTANCE) & (turn < _PLACE_ANGLE):
+            yield np.flatnonzero(row)
+
+
+def _find_first(of: Index, near: Sequence[Index]) -> Mask:
+    """(K,) keyframes of stretches in which a place was seen for the first time."""
+    stay = np.zeros(len(of), np.bool_)
+    for one in np.unique(of):
+        members = np.flatnonzero(of == one).tolist()
+        if any(not stay[near[k]].any() for k in members):
+            stay[members] = True
+    return stay
+
+
+def _find_latest(of: Index, near: Sequence[Index], stay: Mask) -> Mask:
+    """(K,) keyframes of the latest stretches at each place; `stay`: those that stay anyhow."""
+    latest = np.zeros(len(of), np.bool_)
+    for one in np.unique(of)[::-1]:
+        members = np.flatnonzero(of == one).tolist()
+        is_needed = (len(np.unique(of[near[k][latest[near[k]]]])) < _LATEST for k in members)
+        if stay[members].any() or any(is_needed):
+            latest[members] = True
+    return latest
+
+
+def _find_indispensable(
+    travelled: Float, of: Index, keyframes: Index, fitting: Sequence[LoopClosure]
+) -> Mask:
+    """(K,) keyframes of recent stretches, of those to which they are tied, and of those that no
+    loop ties to others."""
+    ends = [(closure.earlier, closure.later) for closure in fitting]
+    at = np.searchsorted(keyframes, np.array(ends, np.intp).reshape(-1, 2))
+    recent = travelled > travelled[-1] - _RECENT
+    of_recent = of[at[recent[at[:, 1]]]]
+    out: Mask = recent | np.isin(of, of_recent) | ~np.isin(of, of[at])
+    return out
+
+
+def _find_standing(poses: Float, keyframes: Index) -> Mask:
+    """(S,) scans from about where the scan before was taken, which are no keyframes."""
+    x = se2.parameters(poses)
+    step = np.hypot(*np.diff(x[:, :2], axis=0).T) + np.abs(se2.wrap(np.diff(x[:, 2])))
+    standing = np.append(False, step < _STEP)
+    standing[[*keyframes, -1]] = False
+    return standing
+
+
+def find_nearest(poses: Float, among: Float) -> Index:
+    """(n,) the nearest ones among poses (K, 3, 3) of poses (n, 3, 3), by m and rad."""
+    x, others = se2.parameters(poses), se2.parameters(among)
+    found = np.zeros(len(x), np.intp)
+    for first in range(0, len(x), _ROWS):
+        rows = x[first : first + _ROWS, None]
+        away = np.hypot(rows[..., 0] - others[:, 0], rows[..., 1] - others[:, 1])
+        turn = np.abs(se2.wrap(rows[..., 2] - others[:, 2]))
+        found[first : first + _ROWS] = np.argmin(away + turn, axis=1)
+    return found
+
+
+def select_state(state: LoopState, keyframes: Index, stay: Mask) -> LoopState:
+    """The loops between the scans that stay, with their new numbers.
+
+    A loop to an earlier keyframe that leaves becomes one to the nearest that stays.
+
+    Args:
+        state: loops of the keyframes.
+        keyframes: (K,) scans.
+        stay: (S,) the scans that stay.
+    """
+    at = np.flatnonzero(stay[keyframes])
+    number = np.cumsum(stay) - 1  # of each scan from now on
+    is_fitting = set(map(id, state.fitting))
+    attempted, found, fitting = [], [], []
+    for attempt, decided in zip(state.attempted, state.found, strict=True):
+        moved = _move_closure(decided, state.poses, keyframes, at)
+        if moved is None or not stay[decided.later]:
+            continue
+        new = dataclasses.replace(
+            moved, earlier=int(number[moved.earlier]), later=int(number[moved.later])
+        )
+        found.append(new)
+        attempted.append(dataclasses.replace(new, rejected=attempt.rejected))
+        if id(decided) in is_fitting:
+            fitting.append(new)
+    return LoopState(state.poses[at], attempted, found, fitting)
+
+
+def _move_closure(
+    closure: LoopClosure, poses: Float, keyframes: Index, at: Index
+) -> LoopClosure | None:
+    """A closure with one of the keyframes `at` for the earlier one; None: none of them is near."""
+    earlier, later = np.searchsorted(keyframes, [closure.earlier, closure.later])
+    if np.isin(earlier, at):
+        return closure
+    before = at[at < later]
+    if closure.rejected or not len(before):
+        return None
+    k = before[find_nearest(poses[earlier][None], poses[before])[0]]
+    between = se2.inverse(poses[k]) @ poses[earlier]
+    if np.hypot(*between[:2, 2]) > _PLACE_DISTANCE:
+        return None
+    # both are tied to what is around them by loops
+    floor = np.square([CLOSURE_TRANSLATION] * 2 + [CLOSURE_ROTATION])
+    return dataclasses.replace(
+        closure,
+        earlier=int(keyframes[k]),
+        T=between @ closure.T,
+        covariance=closure.covariance + np.diag(floor),
+    )

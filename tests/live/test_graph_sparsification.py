@@ -1,0 +1,200 @@
+"""Where a robot drives the same way again and again, its pose graph stays as large as the area."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+import stillmap
+from stillmap.core import se2
+from stillmap.core.recording import Recording
+from stillmap.live import graph_sparsification, loop_closer
+from stillmap.live.anchored_poses import AnchoredPoses
+from stillmap.live.local_map import MappedScan
+from stillmap.live.loop_closer import LoopCloser
+from stillmap.live.scan import to_beams
+from stillmap.live.spaced_scans import SpacedView
+from stillmap.slam.loop_closure import LoopState
+from stillmap.slam.options import SlamOptions
+from stillmap.slam.types import LoopClosure
+
+SIDE = 10.0  # m of a square; scans 0.5 m apart, every second one a keyframe
+LAP = round(4 * SIDE / 0.5)
+ANGLES = np.linspace(-np.pi, np.pi, 180, endpoint=False)
+
+
+def drive(laps):
+    """(S, 3, 3) poses on the way round the square."""
+    s = np.arange(laps * LAP) * 0.5 % (4 * SIDE)
+    side, along = np.divmod(s, SIDE)
+    corner = np.array([[0.0, 0.0], [SIDE, 0.0], [SIDE, SIDE], [0.0, SIDE]])[side.astype(int)]
+    heading = side * np.pi / 2
+    xy = corner + along[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    return se2.matrix(*xy.T, heading)
+
+
+def view_of(poses, travelled):
+    n = len(poses)
+    recording = Recording(
+        stamp_ns=np.arange(n) * 10**9,
+        offset=np.arange(n + 1),
+        points=np.ones((n, 2), np.float32),
+        hit=np.ones(n, np.bool_),
+        T_base_sensor=np.eye(3)[None],
+        sensor=np.zeros(n, np.int32),
+        T_odom_base=None,
+    )
+    flat = np.zeros((n, 3, 3))
+    return SpacedView(recording, np.ones(n, np.float32), poses, travelled, np.ones(n), flat)
+
+
+def tie(first, second, rejected=""):
+    return LoopClosure(first, second, np.eye(3), 1e-4 * np.eye(3), 1.0, rejected)
+
+
+def state_of(poses, keyframes, loops):
+    return LoopState(poses[keyframes], loops, loops, [one for one in loops if not one.rejected])
+
+
+def laps_with_loops(laps):
+    """A view, its keyframes, and the loops of all keyframes but those of the first lap, each with
+    the keyframe at the same place one lap before."""
+    poses = drive(laps)
+    view = view_of(poses, 0.5 * np.arange(len(poses)))
+    keyframes = np.arange(0, len(poses), 2)
+    loops = [tie(k - LAP, k) for k in keyframes.tolist() if k >= LAP]
+    return view, keyframes, state_of(poses, keyframes, loops)
+
+
+def count_passes(stay):
+    """(L,) of each lap, the share of its scans that stay."""
+    return stay.reshape(-1, LAP).mean(axis=1)
+
+
+def test_the_first_and_the_latest_passes_stay():
+    view, keyframes, state = laps_with_loops(20)
+    stay = graph_sparsification.select_scans(view, keyframes, state)
+    passes = count_passes(stay)
+    assert passes[0] == 1.0
+    assert (passes[1:12] == 0.0).all()
+    assert passes[-2:].min() == 1.0
+    assert stay.sum() <= 8 * LAP
+
+
+def test_as_many_stay_after_twice_the_travel():
+    counts = [graph_sparsification.select_scans(*laps_with_loops(laps)).sum() for laps in (15, 30)]
+    assert counts[0] == counts[1]
+
+
+def test_stretches_that_no_loop_ties_stay():
+    view, keyframes, state = laps_with_loops(20)
+    loops = [one for one in state.found if not 5 * LAP <= one.later < 6 * LAP]
+    loops = [one for one in loops if not 5 * LAP <= one.earlier < 6 * LAP]
+    state = state_of(view.poses, keyframes, loops)
+    passes = count_passes(graph_sparsification.select_scans(view, keyframes, state))
+    assert passes[5] == 1.0
+    assert passes[4] == 0.0
+
+
+def test_scans_of_a_robot_that_stands_leave():
+    poses = np.concatenate([np.eye(3)[None].repeat(40, axis=0), drive(1)])
+    view = view_of(poses, np.append(np.zeros(40), 0.5 * np.arange(LAP)))
+    keyframes = np.append(0, np.arange(41, len(poses), 2))
+    stay = graph_sparsification.select_scans(view, keyframes, state_of(poses, keyframes, []))
+    assert stay[0]
+    assert not stay[1:40].any()
+    assert stay[41:].all()
+
+
+def test_a_loop_to_a_scan_that_leaves_becomes_one_to_the_nearest_that_stays():
+    view, keyframes, state = laps_with_loops(20)
+    stay = graph_sparsification.select_scans(view, keyframes, state)
+    moved = graph_sparsification.select_state(state, keyframes, stay)
+    kept = np.flatnonzero(stay)
+    poses = view.poses[kept]
+    assert len(moved.attempted) == len(moved.found)
+    assert len(moved.fitting) == stay[keyframes][LAP // 2 :].sum()
+    later = [one.later for one in moved.found]
+    assert later == sorted(later)
+    for one in moved.fitting:
+        between = se2.inverse(poses[one.earlier]) @ poses[one.later]
+        np.testing.assert_allclose(one.T, between, atol=1e-9)
+        assert one.earlier < one.later
+
+
+def test_scans_that_left_the_graph_move_with_one_that_stayed():
+    poses, anchored = drive(6), AnchoredPoses()
+    stay = np.ones(4 * LAP, np.bool_)
+    stay[LAP : 3 * LAP] = False
+    anchored.remove(stay, poses[: 4 * LAP])
+    in_graph = np.concatenate([poses[: 4 * LAP][stay], poses[4 * LAP :]])
+    np.testing.assert_allclose(anchored.place(in_graph), poses, atol=1e-9)
+    # what they move with leaves as well
+    again = np.ones(len(in_graph), np.bool_)
+    again[:LAP] = False
+    anchored.remove(again, in_graph)
+    T = se2.matrix(1.0, 2.0, 0.3)
+    np.testing.assert_allclose(anchored.place(T @ in_graph[LAP:]), T @ poses, atol=1e-9)
+
+
+class _Room:
+    """Scans from within a room with a step in each wall."""
+
+    CORNERS = np.array(
+        "-3,-3 14,-3 14,5 12.5,5 12.5,13 4,13 4,14 -3,14 -3,6 -2,6".replace(",", " ").split(), float
+    ).reshape(-1, 2)
+    WALLS = np.concatenate([CORNERS, np.roll(CORNERS, -1, axis=0)], axis=1)
+
+    def look(self, T):
+        x, y, theta = se2.parameters(T)
+        directions = np.stack([np.cos(ANGLES + theta), np.sin(ANGLES + theta)], axis=1)
+        a, b = self.WALLS[:, :2] - (x, y), self.WALLS[:, 2:] - self.WALLS[:, :2]
+        cross = directions[:, 0, None] * b[:, 1] - directions[:, 1, None] * b[:, 0]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / cross
+            u = (a[:, 0] * directions[:, 1, None] - a[:, 1] * directions[:, 0, None]) / cross
+        return np.where((t > 0) & (u >= -1e-9) & (u <= 1 + 1e-9), t, np.inf).min(axis=1)
+
+
+@pytest.fixture
+def closers(monkeypatch):
+    """Made closers, which are stopped after the test, for many laps of a drifting robot."""
+    made = []
+
+    def close_laps(laps, least, noise):
+        monkeypatch.setattr(loop_closer, "_MIN_SCANS", least)
+        monkeypatch.setattr(graph_sparsification, "_LATEST", 1)
+        closer, room = LoopCloser(SlamOptions()), _Room()
+        made.append(closer)
+        rng, truth, T, told = np.random.default_rng(2), drive(laps), np.eye(3), []
+        for k, at in enumerate(truth):
+            step = se2.matrix(*rng.normal(0.0, noise * np.array([2.0, 2.0, 1.0])))
+            T = T if k == 0 else T @ se2.inverse(truth[k - 1]) @ at @ step
+            beams = to_beams(stillmap.Scan(k * 10**9, room.look(at), ANGLES))
+            scan = MappedScan(beams, np.ones(len(ANGLES), np.float32), T, 0.5 * k)
+            closer.add(scan, 1.0, np.zeros((3, 3)))
+            told.append(closer.poll())
+        return closer, truth, [one for one in told if one is not None]
+
+    yield close_laps
+    for closer in made:
+        closer.stop()
+
+
+def test_poses_stay_right_while_scans_leave_the_graph(closers):
+    closer, truth, _ = closers(8, 4 * LAP, 0.003)
+    assert len(closer._scans) < 6 * LAP
+    assert len(closer._state.poses) == len(closer._centers) <= len(closer._keyframes)
+    every = closer._anchored.place(closer._poses)
+    found = np.hypot(*(every[:, :2, 2] - truth[: len(every), :2, 2]).T)
+    assert len(every) >= len(truth) - 8
+    assert np.sqrt(np.mean(found**2)) < 0.1
+    drift = np.hypot(*(closer._last.T_map_base[:2, 2] - truth[-1, :2, 2]))
+    assert drift > 0.3  # of what was added
+
+
+def test_small_corrections_are_told_now_and_then(closers):
+    _, truth, told = closers(4, 10**6, 0.0002)
+    counts = [len(one.poses) for one in told]
+    assert 3 <= len(told) < 0.2 * 0.5 * len(truth) / loop_closer._EVERY
+    assert all(b > a for a, b in itertools.pairwise(counts))
