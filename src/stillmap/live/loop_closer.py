@@ -30,6 +30,7 @@ _REPEATED_AFTER = 25.0  # m after which small corrections are told: the last lar
 # spaced scans, a kilometre of travel, before which none leaves the graph; how many times as many as
 # were left the last time there are when some leave again
 _MIN_SCANS, _GROWTH = 6000, 1.5
+_RELEASED_AFTER = 512  # scans that are read, after which the memory that they took is given back
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,9 +174,11 @@ class LoopCloser:
         stay = select_scans(view, context.keyframes, self._state)
         local = se2.inverse(self._T_map_local) @ self._poses
         scans = SpacedScans(2, self._folder)
-        for s in np.flatnonzero(stay).tolist():
+        for n, s in enumerate(np.flatnonzero(stay).tolist(), start=1):
             scan = replace(self._scans.scan(view, s), T_map_base=local[s])
             scans.append(scan, float(view.explained[s]), view.drift[s])
+            if n % _RELEASED_AFTER == 0:
+                context.recording.release_pages(context.e)
         context.recording.release_pages(context.e)
         self._scans.close()
         self._scans = scans

@@ -3,6 +3,7 @@
 Not in a thread: GTSAM holds Python's lock while it solves a pose graph.
 """
 
+import itertools
 import json
 import logging
 import queue
@@ -31,6 +32,7 @@ Float = NDArray[np.float64]
 _log = logging.getLogger(__name__)
 
 _NUMBERS = list[str | int](range(256))  # of sensors, which stand for their names in the child
+_TRIM_EVERY = 64  # scans after which the child gives freed memory back
 
 
 class LoopProcess:
@@ -158,7 +160,11 @@ def _close_loops(settings: dict[str, Any], source: IO[bytes], target: IO[bytes])
         arrived.put(None)
 
     threading.Thread(target=listen, daemon=True).start()
-    while (message := arrived.get()) is not None:
+    for number in itertools.count(1):
+        if (message := arrived.get()) is None:
+            return
+        if number % _TRIM_EVERY == 0:
+            trim_heap()
         (scan,) = _unpack_scans(message, _NUMBERS)
         closer.add(scan, float(message["explained"]), message["drift"])
         if arrived.empty() and (found := closer.poll()) is not None:

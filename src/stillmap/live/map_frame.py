@@ -20,6 +20,7 @@ LoopClosing = LoopCloser | LiveSweepLoopCloser | LoopProcess | NoLoops
 # beams of a spaced scan in 2D and 3D, for loops and for the local map after them
 _MAX_KEPT_BEAMS = {2: 400, 3: 20_000}
 _FIRST_SPACED = 256  # spaced scans for which there is room at first
+_TRIM_EVERY = 128  # spaced scans after which freed memory is given back: 10 ms after an answer
 
 
 class MapFrame:
@@ -86,6 +87,8 @@ class MapFrame:
         if self._count - self._tagged[-1] >= SPACED_PER_TAG[self._dimension]:
             self._tagged.append(self._count)
         self._count += 1
+        if self._count % _TRIM_EVERY == 0:
+            trim_heap()
         kept = thin_scan(scan, _MAX_KEPT_BEAMS[self._dimension])
         self._closer.add(kept, found.explained, self._drift)
         self._drift = np.zeros((3, 3))
