@@ -1,7 +1,7 @@
 """Live mapping: poses and labels as they were given at the time, and how long that took.
 
 python benchmarks/live.py logs LOGS [--names intel fr101] --data DIR [--finish]
-    [--karto-python PYTHON]
+    [--karto-python PYTHON] [--starts 0 30 60]
 python benchmarks/live.py labels [--worlds hall corridor] [--first-seed 11] [--seeds 2]
 python benchmarks/live.py localize --data DIR [--worlds hall office] [--starts 100] [--people N]
     [--scans 30]

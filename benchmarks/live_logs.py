@@ -18,7 +18,7 @@ import stillmap
 from stillmap.eval.readers import read_planar_trajectory, read_relations
 from stillmap.eval.relations import compute_relation_errors
 from stillmap.live.mapper import LiveMapper
-from stillmap.live.replay import replay
+from stillmap.live.replay import iter_beams, replay
 
 Float = NDArray[np.float64]
 _LOGS = ("intel", "aces", "belgioioso", "edmonton", "fr101", "seattle")
@@ -34,6 +34,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--program", nargs="+", default=merging.default_program())
     parser.add_argument("--finish", action="store_true", help="LiveMapper.finish(), too")
     parser.add_argument("--karto-python", metavar="PYTHON", help="an interpreter with yag-slam")
+    parser.add_argument(
+        "--starts",
+        type=int,
+        nargs="+",
+        help="instead of all: only poses at the time, of drives that begin so many scans later",
+    )
 
 
 def map_logs(args: argparse.Namespace) -> str:
@@ -45,6 +51,9 @@ def map_logs(args: argparse.Namespace) -> str:
         batch, live = args.data / f"batch-{name}", args.data / f"live-{name}"
         if not (batch / "run.json").exists():
             merging.build_map(args.program, log, batch)
+        if args.starts:
+            lines += _start_later(log, batch, relations, args.starts)
+            continue
         done = merging.call(args.program, "live", "--replay", log, "--threads", 1, "-o", live)
         runs = (batch / "trajectory.tum", live / "live/trajectory.tum", live / "trajectory.tum")
         wanted, answered, known = (_errors(read_planar_trajectory(run), relations) for run in runs)
@@ -54,7 +63,29 @@ def map_logs(args: argparse.Namespace) -> str:
         line += [_shown(finished), _shown(peer[0]), _ratio(peer[0], wanted), _shown(peer[1])]
         lines.append([*line, f"{done.cpu:.0f}", peer[2]])
         print(" | ".join(lines[-1]), flush=True)
-    return markdown([*_TITLES, *_FURTHER], lines)
+    return markdown(
+        ["log", "start", *_TITLES[2:4]] if args.starts else [*_TITLES, *_FURTHER], lines
+    )
+
+
+def _start_later(log: Path, batch: Path, relations: Float, starts: list[int]) -> list[list[str]]:
+    """A line for each start, and the mean: the drift of the first round is another one."""
+    recording = stillmap.read(log)
+    odometry, beams = recording.T_odom_base, list(iter_beams(recording))
+    wanted = _errors(read_planar_trajectory(batch / "trajectory.tum"), relations)
+    lines, found = [], []
+    for start in starts:
+        with LiveMapper({"threads": 1}) as mapper:
+            poses = [
+                mapper.push(scan, None if odometry is None else odometry[t]).pose
+                for t, scan in enumerate(beams[start:], start)
+            ]
+        run = timed_poses(recording.stamp_ns[start:], np.array(poses))
+        found.append(_errors(run, relations))
+        lines.append([log.name, str(start), _shown(found[-1]), _ratio(found[-1], wanted)])
+        print(" | ".join(lines[-1]), flush=True)
+    mean = (float(np.mean([one[0] for one in found])), float(np.mean([one[1] for one in found])))
+    return [*lines, [log.name, "mean", _shown(mean), _ratio(mean, wanted)]]
 
 
 def _find_relations(folder: Path, name: str) -> Float:
