@@ -53,7 +53,7 @@ def count_neighbors(
     for k, one in enumerate(objects):
         for t in one.scan[:: -(-len(one.scan) // _LOOKS)].tolist():
             looks[t].append(k)
-    for t in sorted(looks):
+    for t in recording.iter_scans(sorted(looks), p_static):
         beams = recording.beams_of(t)
         numbers = beams.start + np.flatnonzero(recording.hit[beams])
         ends = recording.points[numbers].astype(np.float64)
