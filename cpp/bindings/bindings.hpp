@@ -17,6 +17,7 @@ void bind_ground_contact(nanobind::module_& m);
 void bind_held_out_likelihood(nanobind::module_& m);
 void bind_observation_counts(nanobind::module_& m);
 void bind_mesh_distance(nanobind::module_& m);
+void bind_plane_projection(nanobind::module_& m);
 void bind_plane_registration(nanobind::module_& m);
 void bind_pose_refinement(nanobind::module_& m);
 void bind_shortest_paths(nanobind::module_& m);

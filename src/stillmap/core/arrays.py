@@ -247,14 +247,3 @@ def unique_cells(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[n
     wide = int(y.max()) + 1
     flat, of = np.unique(x * wide + y, return_inverse=True)
     return np.stack(np.divmod(flat, wide), axis=1) + low, of.reshape(-1)
-
-
-def first_index_per_group(group: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Index of the first row of each group, as `np.unique(..., return_index=True)[1]`.
-
-    Args:
-        group: (N,), 0 to 2^62 / N.
-    """
-    bits = max(len(group) - 1, 1).bit_length()
-    key = np.sort((group << bits) | np.arange(len(group)))  # faster than argsort
-    return key[np.diff(key >> bits, prepend=-1) > 0] & ((1 << bits) - 1)

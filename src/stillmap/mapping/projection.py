@@ -6,17 +6,20 @@ a planar scan, and all 2D steps apply.
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+import stillmap._core as _core
 from stillmap import em
 from stillmap.core import se2
 from stillmap.core.array_builder import ArrayBuilder
-from stillmap.core.arrays import finite_rows, first_index_per_group, unique_cells
+from stillmap.core.arrays import unique_cells
 from stillmap.core.parallel import map_ordered
 from stillmap.core.recording import Recording
 from stillmap.em import GroundMap
+from stillmap.em.types import GROUND_SQUARE
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -92,20 +95,18 @@ def project_to_plane(
     """
     T_map_sensor = recording.T_map_sensor(poses)
     planar_poses = se2.project_to_plane(T_map_sensor)
-    low, high = band
-    top = max(high, ground.sensor_height + _SENSOR_MARGIN)
+    settings = _kernel_settings(ground, band, cell, open_space)
     scratch, offset = recording.scratch, np.zeros(recording.n_scans + 1, np.int64)
     ends, hits = ArrayBuilder(np.float32, (2,), scratch), ArrayBuilder(np.bool_, (), scratch)
     numbers = ArrayBuilder(np.intp, (), scratch)
 
     def process(t: int) -> tuple[NDArray[np.float32], NDArray[np.bool_], Index]:
         beams = recording.beams_of(t)
-        xy, hit, number = _project_scan(
-            recording.points[beams], recording.hit[beams], T_map_sensor[t], ground,
-            (low, high, top), cell, open_space,
-        )  # fmt: skip
+        xy, hit, number = _core.project_scan(
+            recording.points[beams], recording.hit[beams], T_map_sensor[t], **settings
+        )
         local = (xy - planar_poses[t, :2, 2]) @ planar_poses[t, :2, :2]
-        return local.astype(np.float32), hit, beams.start + number
+        return local.astype(np.float32), hit.view(np.bool_), beams.start + number
 
     scans = recording.iter_scans(range(recording.n_scans))
     for t, (local, hit, number) in enumerate(map_ordered(process, scans, threads)):
@@ -117,57 +118,24 @@ def project_to_plane(
     return PlanarProjection(flat, planar_poses, numbers.finish())
 
 
-def _project_scan(
-    points: NDArray[np.float32],
-    hit: NDArray[np.bool_],
-    T: Float,
-    ground: GroundMap,
-    heights: tuple[float, float, float],
-    cell: float,
-    open_space: bool,
-) -> tuple[Float, NDArray[np.bool_], Index]:
-    """End points (n, 2) in the map frame, whether they are hits, and their beams."""
-    low, high, top = heights
-    at = np.flatnonzero(finite_rows(points) & (hit | open_space))
-    end: Float = points.take(at, axis=0).astype(np.float64) @ T[:3, :3].T + T[:3, 3]
-    start = T[:3, 3] - [0.0, 0.0, ground.height_at(T[None, :2, 3])[0]]
-    above: Float = end[:, 2] - ground.height_at(end[:, :2])
-    is_obstacle = hit[at] & (above >= low) & (above <= high)
-    share = _share_in_band(start[2], above, low, top)
-    beam = (end[:, :2] - T[:2, 3]) * share[:, None]
-    length = np.sqrt(np.square(beam[:, 0]) + np.square(beam[:, 1]))
-    direction = np.floor(np.arctan2(beam[:, 1], beam[:, 0]) * (DIRECTIONS / (2.0 * np.pi)))
-    direction = direction.astype(np.int64) % DIRECTIONS
-    kept = _select_beams(direction, length, is_obstacle, cell)
-    return T[:2, 3] + beam[kept], is_obstacle[kept], at[kept]
-
-
-def _select_beams(
-    direction: Index, length: Float, is_obstacle: NDArray[np.bool_], cell: float
-) -> Index:
-    """Indices of the first hit per direction and cell, and of the longest other beam per direction.
-
-    Of equals the first. Sorted by direction, the other beam first, then the hits by distance.
-    """
-    rank = np.where(is_obstacle, 1 + np.floor(length / cell).astype(np.int64), 0)
-    group = direction * (rank.max(initial=0) + 1) + rank
-    hits, others = np.flatnonzero(is_obstacle), np.flatnonzero(~is_obstacle)
-    hits = hits[first_index_per_group(group[hits])]
-    longest = np.zeros(DIRECTIONS)
-    np.maximum.at(longest, direction[others], length[others])
-    others = others[length[others] == longest[direction[others]]]
-    others = others[first_index_per_group(direction[others])]
-    kept = np.concatenate([others, hits])
-    return np.asarray(kept[np.argsort(group[kept])])
-
-
-def _share_in_band(start: float, above: Float, low: float, top: float) -> Float:
-    """(n,) share of its length after which a beam leaves the band; heights above the ground."""
-    rise = above - start
-    with np.errstate(divide="ignore", invalid="ignore"):
-        down = np.where(above < low, (start - low) / -rise, 1.0)
-        up = np.where(above > top, (top - start) / rise, 1.0)
-    return np.clip(np.minimum(down, up), 0.0, 1.0)
+def _kernel_settings(
+    ground: GroundMap, band: tuple[float, float], cell: float, open_space: bool
+) -> dict[str, Any]:
+    """Arguments of `_core.project_scan` that are those of all scans."""
+    low, high = band
+    corner_x, corner_y = ground.corner.tolist()
+    return {
+        "height": np.ascontiguousarray(ground.height),
+        "corner_x": corner_x,
+        "corner_y": corner_y,
+        "edge": GROUND_SQUARE,
+        "low": low,
+        "high": high,
+        "top": max(high, ground.sensor_height + _SENSOR_MARGIN),
+        "cell": cell,
+        "directions": DIRECTIONS,
+        "open_space": open_space,
+    }
 
 
 def project_cells(

@@ -182,6 +182,7 @@ def _project(
         m_step=dataclasses.replace(estimate.m_step, poses=plan.poses),
     )
     p_static = estimate.p_static[plan.beam]
+    deskewed.release_pages(estimate.weights, estimate.p_static)
     return plan.recording, planar.with_labels(p_static=p_static, occupied=occupied, no_return=None)
 
 

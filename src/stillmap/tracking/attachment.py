@@ -15,6 +15,7 @@ from stillmap.tracking.objects import MovingObject
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
+Index = NDArray[np.intp]
 
 _LOOKS = 4  # scans of a track that are evaluated
 _NEIGHBORS = 8  # of a beam: the ring around it in an image
@@ -52,37 +53,36 @@ def count_neighbors(
     for k, one in enumerate(objects):
         for t in one.scan[:: -(-len(one.scan) // _LOOKS)].tolist():
             looks[t].append(k)
-    for t in sorted(looks):
+    for t in recording.iter_scans(sorted(looks), p_static):
         beams = recording.beams_of(t)
         numbers = beams.start + np.flatnonzero(recording.hit[beams])
         ends = recording.points[numbers].astype(np.float64)
-        ranges = np.linalg.norm(ends, axis=1)
+        x, y, z = ends.T  # a column at a time: rows of three numbers are slow
+        ranges = np.sqrt(x * x + y * y + z * z)
         directions = ends / np.maximum(ranges, 1e-9)[:, None]
         is_static = p_static[numbers] >= 0.5
         for k in looks[t]:
-            own = _is_among(numbers, objects[k].beams)
+            own = _find_own(numbers, objects[k].beams)
             counts[k] += _count_beside(directions, ranges, own, is_static)
     return counts
 
 
-def _is_among(numbers: NDArray[np.intp], beams: NDArray[np.intp]) -> Bool:
-    """(N,) which of the rising beam numbers (N,) are among the rising beams of an object."""
+def _find_own(numbers: Index, beams: Index) -> Index:
+    """Where in the rising beam numbers (N,) those of an object lie, which rise as well."""
     first, last = np.searchsorted(beams, [numbers[0], numbers[-1] + 1]) if len(numbers) else (0, 0)
-    own = np.zeros(len(numbers), np.bool_)
-    own[np.searchsorted(numbers, beams[first:last])] = True
-    return own
+    return np.asarray(np.searchsorted(numbers, beams[first:last]))
 
 
-def _count_beside(directions: Float, ranges: Float, own: Bool, is_static: Bool) -> tuple[int, int]:
+def _count_beside(directions: Float, ranges: Float, own: Index, is_static: Bool) -> tuple[int, int]:
     """Beams beside an object's own that end on its surface, and behind it.
 
     Args:
         directions: (N, 3) of unit length.
         ranges: (N,) metres.
-        own: (N,) beams of the object.
+        own: beams of the object, rising.
         is_static: (N,) others that are static.
     """
-    if not own.any():
+    if not len(own):
         return 0, 0
     from scipy.spatial import cKDTree  # slow to load
 
@@ -94,7 +94,7 @@ def _count_beside(directions: Float, ranges: Float, own: Bool, is_static: Bool) 
     tree = cKDTree(directions[near])
     _, neighbors = tree.query(directions[own], k=min(_NEIGHBORS + 1, len(near)))
     beside = np.unique(np.atleast_1d(neighbors))
-    beside = near[beside[~own[near[beside]]]]
+    beside = np.setdiff1d(near[beside], own, assume_unique=True)
     if not len(beside):
         return 0, 0
     nearest = cKDTree(directions[own]).query(directions[beside])[1]

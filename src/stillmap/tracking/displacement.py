@@ -73,7 +73,7 @@ def _remain_occupied(
                 looks[t].append((k, time))
     found: dict[tuple[int, int], list[_Look]] = defaultdict(list)
     T_map_sensor = recording.T_map_sensor(poses)
-    for t in sorted(looks):
+    for t in recording.iter_scans(sorted(looks)):
         beams = recording.beams_of(t)
         points = recording.points[beams][recording.hit[beams]].astype(np.float64)
         ends = points @ T_map_sensor[t, :3, :3].T
