@@ -11,7 +11,7 @@ Float = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 _DIRECTIONS = 60  # of half a turn, of which walls may have some
-_MIN_WALL, _MIN_SHARE = 0.5, 0.25  # m of a wall; of the wall in the direction that has most
+_MIN_WALL, _MIN_SHARE = 0.5, 0.05  # m of a wall; of the direction that has most
 _NEAR = 3  # directions within which the one with most wall counts
 _WIDTH = (0.6, 1.3)  # m
 _POSTS = (0.35, 1.0)  # m at least, of the shorter and the longer wall beside it
@@ -85,8 +85,11 @@ def _find_directions(cells: Cells, resolution: float) -> Float:
     """(D, 2) unit vectors along most of the walls, cells (K, 2)."""
     angle = np.arange(_DIRECTIONS) * (math.pi / _DIRECTIONS)
     unit = np.column_stack([np.cos(angle), np.sin(angle)])
-    lengths = [_Runs.of_cells(cells, u, 0).length for u in unit]
-    wall = np.array([one[one >= _MIN_WALL / resolution].sum() for one in lengths])
+    across = np.round(cells @ np.array([[0.0, 1.0], [-1.0, 0.0]]) @ unit.T).astype(np.int64)
+    rows = [np.bincount(one - one.min()) for one in across.T]
+    # cells beside each other in rows of walls, of which each direction has some by chance
+    wall = np.array([np.sum(one[one >= _MIN_WALL / resolution] ** 2.0) for one in rows])
+    wall -= wall.min()
     around = np.stack([np.roll(wall, k) for k in range(-_NEAR, _NEAR + 1)])
     kept = (wall == around.max(axis=0)) & (wall >= max(_MIN_SHARE * wall.max(), 1))
     return np.asarray(unit[kept])

@@ -54,25 +54,25 @@ def find_lone_doors(
         resolution: m, edge of a cell.
         threads: number of threads; the result does not depend on it.
     """
+    doorways = find_doorways(surface, resolution)
+    if not doorways:
+        return []
+    counts = _count_beams(recording, poses, resolution, threads)
     left = [
-        (doorway, leaf, is_open)
-        for doorway in find_doorways(surface, resolution)
+        (leaf, is_open)
+        for doorway in doorways
+        if is_doorway_free(doorway, counts)
         for leaf, is_open in (
             (find_open_leaf(doorway, surface), True),
             (find_shut_leaf(doorway, surface), False),
         )
         if leaf is not None
     ]
-    if not left:
-        return []
-    counts = _count_beams(recording, poses, resolution, threads)
     taken = [one.swept_cells for one in doors]
     found: list[tuple[LoneLeaf, bool]] = []
-    for doorway, leaf, is_open in sorted(left, key=lambda one: not one[2]):
-        if (
-            is_doorway_free(doorway, counts)
-            and (not is_open or is_thin(leaf, counts))
-            and not any(_is_part(leaf.cells, cells) for cells in taken)
+    for leaf, is_open in sorted(left, key=lambda one: not one[1]):
+        if (not is_open or is_thin(leaf, counts)) and not any(
+            _is_part(leaf.cells, cells) for cells in taken
         ):
             taken.append(leaf.cells)
             found.append((leaf, is_open))
