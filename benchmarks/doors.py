@@ -6,21 +6,28 @@ python benchmarks/doors.py [--cases NAME|GROUP ...] [--seeds tuning|reporting] [
 A door counts as seen if 40 beams ended on its leaf while it was shut and 40 while it was open, or
 on its way. It is found if a change of kind `door` has its hinge within 0.3 m of it; every other one
 is false. State: share of the time in the states of found doors in which the leaf was where it is
-said to be.
+said to be. Seen once: doors listed with one position, and those of them that are not at a door of
+the world, by either end. Ghosts: cells per 100 m2, all of them, and those farther than one cell
+from the leaf of a listed door.
 """
 
+import itertools
 import time
+from collections.abc import Callable
+from typing import Any
 from unittest import mock
 
 import numpy as np
 from cases import chosen
 from common import Run, Scores, options_of, rows_of
 from numpy.typing import NDArray
+from prepared import grid_of
 from tables import Column, means_and_worst
 
 import stillmap
+from stillmap.eval.map import GHOST_DISTANCE, distance_to_walls
 from stillmap.eval.trajectory import align
-from stillmap.mapping import Change
+from stillmap.mapping.changed_objects import cell_keys
 from stillmap.mapping.door import Door
 from stillmap.pipeline import final_map
 from stillmap.results.reader import moved
@@ -38,6 +45,10 @@ COLUMNS = (
     Column("false", "false", ".0f"),
     Column("hinge", "hinge off, m", ".2f"),
     Column("states", "states right", ".3f", True),
+    Column("once", "seen once", ".0f"),
+    Column("once_false", "false", ".0f"),
+    Column("ghosts", "ghosts", ".1f"),
+    Column("besides", "besides doors", ".1f"),
     Column("cost", "cost, %", ".1f"),
 )
 
@@ -53,17 +64,22 @@ def _scored(run: Run) -> Scores:
     simulation = simulate(case.build(), run.seed)
     poses = simulation.truth.T_world_base if run.true_poses else None
     seconds = 0.0
-    find = final_map._find_doors
 
-    def timed(*args: object) -> list[Change]:
-        nonlocal seconds
-        begun = time.process_time()
-        out: list[Change] = find(*args)
-        seconds = time.process_time() - begun
-        return out
+    def timed(find: Callable[..., Any]) -> Callable[..., Any]:
+        def found(*args: object) -> Any:
+            nonlocal seconds
+            begun = time.process_time()
+            out = find(*args)
+            seconds += time.process_time() - begun
+            return out
+
+        return found
 
     begun = time.process_time()
-    with mock.patch.object(final_map, "_find_doors", timed):
+    with (
+        mock.patch.object(final_map, "_find_doors", timed(final_map._find_doors)),
+        mock.patch.object(final_map, "find_lone_doors", timed(final_map.find_lone_doors)),
+    ):
         result = stillmap.build(
             simulation.recording, options_of("stillmap", run.settings), poses=poses
         )
@@ -83,7 +99,12 @@ def scores_of(result: stillmap.BuiltResult, simulation: Simulation) -> Scores:
     pairs = [(k, int(row.argmin())) for k, row in enumerate(off) if row.min(initial=9.0) < _NEAR]
     right = [_state_is_right(doors[k], leaf, simulation) for k, leaf in pairs]
     looked = sum(len(one) for one in right)
+    once = [one for one in result.doors if len(one.states) == 1]
+    at_leaf = [_is_at_leaf(one, simulation, T_world_map) for one in once]
     return {
+        "once": len(once),
+        "once_false": len(once) - sum(at_leaf),
+        **_count_ghosts(result, simulation, T_world_map),
         "doors": len(leaves),
         "seen": sum(_is_seen(k, simulation) for k in range(len(leaves))),
         "found": len({leaf for _, leaf in pairs}),
@@ -91,6 +112,32 @@ def scores_of(result: stillmap.BuiltResult, simulation: Simulation) -> Scores:
         "hinge": float(np.mean([off[pair] for pair in pairs])) if pairs else float("nan"),
         "states": sum(int(one.sum()) for one in right) / looked if looked else float("nan"),
     }
+
+
+def _is_at_leaf(door: Door, simulation: Simulation, T_world_map: NDArray[np.float64]) -> bool:
+    """Whether either end of the doorway of a door is near a hinge of the world."""
+    along = door.length * np.array([np.cos(door.shut), np.sin(door.shut)])
+    ends = moved(T_world_map, np.array([door.hinge, door.hinge + along]))
+    hinges = np.array([one.hinge for one in simulation.scene.leaves]).reshape(-1, 2)
+    off = np.linalg.norm(ends[:, None] - hinges, axis=2)
+    return bool(off.min(initial=9.0) < _NEAR)
+
+
+def _count_ghosts(
+    result: stillmap.BuiltResult, simulation: Simulation, T_world_map: NDArray[np.float64]
+) -> Scores:
+    """Ghosts per 100 m2 of free space: all, and those that no door of the result explains."""
+    grid, truth = grid_of(result.map), simulation.truth
+    occupied = np.argwhere(grid.occupied)
+    off = distance_to_walls(moved(T_world_map, grid.centres(occupied)), truth.walls)
+    ghosts = occupied[off > GHOST_DISTANCE * grid.resolution][:, ::-1]
+    ghosts = ghosts + result.map.window.first_cell
+    leaves = [np.concatenate([one.shut_cells, one.open_cells]) for one in result.doors]
+    around = [cells + step for cells in leaves for step in itertools.product((-1, 0, 1), repeat=2)]
+    keys = cell_keys(np.concatenate([np.empty((0, 2), np.int64), *around]))
+    besides = np.count_nonzero(~np.isin(cell_keys(ghosts), keys))
+    area = 1e-2 * float(np.count_nonzero(grid.free)) * grid.resolution**2
+    return {"ghosts": len(ghosts) / area, "besides": besides / area}
 
 
 def _turned(leaf: int, simulation: Simulation) -> NDArray[np.float64]:

@@ -15,7 +15,7 @@ BOX = block(10, 20, 4, 3)
 def labels_without(seen, poses, p_static, places, resolution):
     """The labels, but one for the beams on things."""
     out = p_static.copy()
-    out[find_changed_object_beams(seen, poses, p_static, places, resolution)] = 1.0
+    out[find_changed_object_beams(seen, poses, p_static, places, [], resolution)] = 1.0
     return out
 
 
@@ -123,4 +123,4 @@ def test_where_nothing_changed_nothing_is_touched():
     seen = recording(range(3), beams=1)
     p = np.array([0.1, 0.2, np.nan], np.float32)
     poses = np.tile(np.eye(3), (3, 1, 1))
-    assert not len(find_changed_object_beams(seen, poses, p, [], RESOLUTION))
+    assert not len(find_changed_object_beams(seen, poses, p, [], [], RESOLUTION))

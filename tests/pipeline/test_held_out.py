@@ -17,7 +17,7 @@ WITHOUT_LAST = {"change_detection": False}
 @pytest.fixture(autouse=True)
 def without_final_e_step(monkeypatch):
     """The score is of the loop's labels: the final E-step comes after it."""
-    monkeypatch.setattr(results, "final_estimate", lambda scans, best, _: (scans, best, []))
+    monkeypatch.setattr(results, "final_estimate", lambda scans, best, _: (scans, best, [], []))
 
 
 def options(estimator, **changes):

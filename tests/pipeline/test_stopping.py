@@ -45,7 +45,7 @@ def build(monkeypatch, short):
                 yield made_up(recording, number, bound * recording.n_beams, share, **more)
 
         monkeypatch.setattr(results, "iterate", fake)
-        monkeypatch.setattr(results, "final_estimate", lambda scans, best, _: (scans, best, []))
+        monkeypatch.setattr(results, "final_estimate", lambda scans, best, _: (scans, best, [], []))
         return stillmap.build(recording, chosen), len(asked)
 
     return run

@@ -100,6 +100,7 @@ class FakeResult:
     objects: list = field(default_factory=list)
     traffic: FlowMap = field(default_factory=lambda: compute_flow_map([]))
     changes: list = field(default_factory=list)
+    doors: list = field(default_factory=list)
     graph: PoseGraph | None = None
     doubts: Diagnostics = field(default_factory=Diagnostics)
     calibration: Calibration = field(default_factory=Calibration)

@@ -91,6 +91,18 @@ def test_the_layer_holds_all_that_a_door_sweeps_over(result):
     }
 
 
+def test_a_door_that_was_only_seen_shut_is_listed_without_a_change(result):
+    none = np.empty((0, 2), np.int64)
+    leaf, states = block(60, 30, 10, 1), (DoorState("shut", 4, 7),)
+    door = Door((6.05, 3.05), 1.0, 0.0, np.nan, leaf, none, leaf, states, 0.61234)
+    record = run_record(dataclasses.replace(result, doors=[door]))
+    assert record["changes"] == []
+    (listed,) = record["doors"]
+    assert listed["open"] is None
+    assert listed["p_moved"] == 0.6123
+    assert [one["position"] for one in listed["states"]] == ["shut"]
+
+
 def test_the_last_of_several_changes_is_told(changed):
     assert layer(changed, block(12, 20, 2, 3)) == {2}
     turned = dataclasses.replace(changed, changes=changed.changes[::-1])

@@ -40,6 +40,7 @@ def test_the_keys_that_scripts_rely_on(tmp_path, result):
         "calibration",
         "doubts",
         "changes",
+        "doors",
         "loops",
     ]
     assert run["format_version"] == 1

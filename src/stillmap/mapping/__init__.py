@@ -6,6 +6,7 @@ from stillmap.mapping.change_detection_3d import detect_changes_3d
 from stillmap.mapping.changed_beams import find_changed_object_beams, relabel_changes
 from stillmap.mapping.door import Door
 from stillmap.mapping.door_detection import find_doors, join_doors
+from stillmap.mapping.lone_doors import find_lone_doors, relabel_lone_doors
 from stillmap.mapping.witnesses import MoverPoints
 
 __all__ = [
@@ -16,7 +17,9 @@ __all__ = [
     "detect_changes_3d",
     "find_changed_object_beams",
     "find_doors",
+    "find_lone_doors",
     "join_doors",
     "relabel_changes",
+    "relabel_lone_doors",
     "update_occupancy",
 ]

@@ -14,11 +14,14 @@ from stillmap.core.chunks import iter_beams
 from stillmap.core.recording import Recording
 from stillmap.mapping.change_detection import Change
 from stillmap.mapping.changed_objects import find_shown_cells, is_same_place
+from stillmap.mapping.door import Door
 from stillmap.mapping.doors import fit_sector
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
 Labels = NDArray[np.float32]
+
+_EVER = (int(np.iinfo(np.int64).min), int(np.iinfo(np.int64).max))  # stamps
 
 
 def relabel_changes(
@@ -67,17 +70,20 @@ def find_changed_object_beams(
     poses: Float,
     p_static: NDArray[np.float32],
     changes: list[Change],
+    doors: list[Door],
     resolution: float,
 ) -> Index:
     """(n,) dynamic beams, rising, that ended on an object while it stood in a changed place.
 
-    Recurring changes other than doors are left out: they may be people who wait there.
+    Or on the leaf of one of the doors that were only seen open. Recurring changes other than doors
+    are left out: they may be people who wait there.
     """
     stays = [
         _Stay.from_change(one, changes)
         for one in changes
         if one.kind != "comes and goes" or fit_sector(one.cells, one.resolution) is not None
     ]
+    stays += [_Stay.around_cells(one.open_cells, _EVER) for one in doors if len(one.open_cells)]
     found = ArrayBuilder(np.intp, (), recording.scratch)
     for block in arrays.iter_blocks(recording.hit, p_static) if stays else ():
         beam = block.start + np.flatnonzero(recording.hit[block] & (p_static[block] < 0.5))
@@ -101,11 +107,16 @@ class _Stay(NamedTuple):
 
     @classmethod
     def from_change(cls, change: Change, changes: list[Change]) -> "_Stay":
-        low, high = change.cells.min(axis=0) - 1, change.cells.max(axis=0) + 2
+        return cls.around_cells(change.cells, _stay_span(change, changes))
+
+    @classmethod
+    def around_cells(cls, cells: NDArray[np.int64], span: tuple[int, int]) -> "_Stay":
+        """In cells (K, 2) and those around them, in a span of stamps."""
+        low, high = cells.min(axis=0) - 1, cells.max(axis=0) + 2
         mask = np.zeros(tuple((high - low).tolist()), bool)
-        for i, j in itertools.product((-1, 0, 1), repeat=2):  # and the cells around them
-            mask[tuple((change.cells - low + (i, j)).T)] = True
-        return cls(*_stay_span(change, changes), low, mask)
+        for i, j in itertools.product((-1, 0, 1), repeat=2):
+            mask[tuple((cells - low + (i, j)).T)] = True
+        return cls(*span, low, mask)
 
     def bounds(self, cells: NDArray[np.int64], stamp: NDArray[np.int64]) -> NDArray[np.bool_]:
         """(n,) whether cells (n, 2) at stamps (n,) lie within the mask's box during the stay."""
@@ -115,8 +126,7 @@ class _Stay(NamedTuple):
 
 def _stay_span(change: Change, changes: list[Change]) -> tuple[int, int]:
     """The stamps after which and until which an object stood there, as far as is known."""
-    limits = np.iinfo(np.int64)
-    since, until = limits.min, limits.max
+    since, until = _EVER
     here = [one for one in changes if is_same_place(one, change)]
     if change.kind == "came":
         since = change.before_ns

@@ -34,10 +34,12 @@ class Door(ShortRepr):
         hinge: metres, in the map frame.
         length: metres, of the leaf.
         shut, opened: rad, directions from the hinge along the leaf. Shut is the one in which a wall
-            goes on beyond the leaf.
+            goes on beyond the leaf. NaN: it was never seen open.
         shut_cells, open_cells: (K, 2) cells that changed, of the leaf in each position.
         swept_cells: (S, 2) all that it sweeps over.
-        states: in the order of time.
+        states: in the order of time; one of a door that was seen in one position only. Its cells in
+            the other position are none.
+        p_moved: probability that it is a door that moved during the recording; 1: it was seen to.
     """
 
     hinge: tuple[float, float]
@@ -48,12 +50,13 @@ class Door(ShortRepr):
     open_cells: Cells
     swept_cells: Cells
     states: tuple[DoorState, ...] = ()
+    p_moved: float = 1.0
 
     def position_in(self, state: MapState) -> Position:
         """Position of the leaf in a map: the last one, or that of most of the time, or as asked."""
         if state in ("open", "shut"):
             return "open" if state == "open" else "shut"
-        if state == "last":
+        if state == "last" or len(self.states) == 1:
             return self.states[-1].position
         seconds = {"open": 0, "shut": 0}
         for one in self.states:

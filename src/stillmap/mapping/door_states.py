@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from stillmap.core.arrays import iter_blocks
 from stillmap.core.components import group_indices
 from stillmap.core.recording import Recording
+from stillmap.mapping.changed_objects import cell_keys
 from stillmap.mapping.door import Door, DoorState, Position
 
 Float = NDArray[np.float64]
@@ -51,6 +52,46 @@ def observe_states(
         _list_states(mask, np.concatenate(rows), recording.stamp_ns)
         for mask, rows in zip(masks, seen, strict=True)
     ]
+
+
+def observe_looks(
+    leaves: Sequence[Cells], recording: Recording, poses: Float, resolution: float
+) -> list[NDArray[np.int64]]:
+    """(L, 2) stamps of the first and the last scan of each second that saw a leaf.
+
+    Args:
+        leaves: (K, 2) cells of each; none in common.
+        recording, poses, resolution: see `observe_states`.
+    """
+    cells = np.concatenate([np.empty((0, 2), np.int64), *leaves])
+    of = np.repeat(np.arange(len(leaves)), [len(one) for one in leaves])
+    order = np.argsort(cell_keys(cells))
+    keys, of = cell_keys(cells)[order], of[order]
+    seen = [np.empty((0, 2), np.int64)]
+    for block in iter_blocks(recording.hit) if len(keys) else ():
+        beam = block.start + np.flatnonzero(recording.hit[block])
+        key = cell_keys(np.floor(recording.end_points(beam, poses) / resolution).astype(np.int64))
+        at = np.minimum(np.searchsorted(keys, key), len(keys) - 1)
+        found = np.flatnonzero(keys[at] == key)
+        seen.append(np.column_stack([recording.scans_of(beam[found]), at[found]]))
+    scan, cell = np.concatenate(seen).T
+    return [
+        _list_looks(recording.stamp_ns, scan[mine], cell[mine], _MIN_SHARE * len(leaf))
+        for leaf, mine in ((leaf, of[cell] == k) for k, leaf in enumerate(leaves))
+    ]
+
+
+def _list_looks(
+    stamp_ns: NDArray[np.int64], scan: NDArray[np.int64], cell: NDArray[np.int64], least: float
+) -> NDArray[np.int64]:
+    """(L, 2) first and last stamp of the seconds in which that many cells were hit."""
+    stamps = stamp_ns[scan]
+    looks = [
+        (stamps[one].min(), stamps[one].max())
+        for one in group_indices((stamps - stamp_ns[0]) // _BIN_NS)
+        if len(np.unique(cell[one])) >= least
+    ]
+    return np.array(looks, np.int64).reshape(-1, 2)
 
 
 class _LeafMask(NamedTuple):

@@ -51,7 +51,7 @@ def find_resting_leaf(changed: Cells, surface: Cells, resolution: float) -> Cell
         return none
     reach = 1.5 * line.length + 10.0
     surface = surface[(np.abs(surface - line.middle) < reach).all(axis=1)]
-    field = _Field.of_cells(surface, line.middle, reach)
+    field = SurfaceField.of_cells(surface, line.middle, reach)
     best: tuple[float, Cells] = 0.0, none
     most = round(_MAX_HIDDEN / resolution)
     for end, at_hinge in itertools.product((-1.0, 1.0), range(most + 1)):
@@ -82,7 +82,7 @@ def fit_line(cells: Cells, resolution: float) -> Line | None:
     return Line(middle + 0.5 * (at.max() + at.min()) * along, along, length)
 
 
-class _Field(NamedTuple):
+class SurfaceField(NamedTuple):
     """Which cells are surface, and which have some within a cell, in a box from `low` on."""
 
     low: Cells
@@ -90,7 +90,7 @@ class _Field(NamedTuple):
     is_near: NDArray[np.bool_]
 
     @classmethod
-    def of_cells(cls, cells: Cells, middle: Float, reach: float) -> "_Field":
+    def of_cells(cls, cells: Cells, middle: Float, reach: float) -> "SurfaceField":
         low = np.floor(middle - reach).astype(np.int64) - 2
         size = 2 * math.ceil(reach) + 6
         is_surface = np.zeros((size, size), bool)
@@ -112,7 +112,7 @@ class _Field(NamedTuple):
 
 
 def _rate_leaves(
-    field: _Field, hinge: Float, length: float, line: Float
+    field: SurfaceField, hinge: Float, length: float, line: Float
 ) -> tuple[float, Cells] | None:
     """Score of the best leaf at any angle to the line and its cells; None without surface.
 

@@ -16,13 +16,16 @@ from stillmap.core.short_repr import ShortRepr
 from stillmap.em import GroundMap, estimate_ground
 from stillmap.mapping import (
     Change,
+    Door,
     MoverPoints,
     detect_changes,
     detect_changes_3d,
     find_changed_object_beams,
     find_doors,
+    find_lone_doors,
     join_doors,
     relabel_changes,
+    relabel_lone_doors,
     update_occupancy,
 )
 from stillmap.mapping.leaf_lines import find_leaf_lines
@@ -57,11 +60,12 @@ class Maps(ShortRepr):
 
 def final_estimate(
     recording: Recording, best: Estimate, options: Options
-) -> tuple[Recording, Estimate, list[Change]]:
-    """The last E-step: labels of the map as it is shown, and the places that changed.
+) -> tuple[Recording, Estimate, list[Change], list[Door]]:
+    """The last E-step: labels of the map as it is shown, the places that changed, and the doors.
 
     Returns:
-        the recording without motion during its scans, the estimate with these labels, changes.
+        the recording without motion during its scans, the estimate with these labels, changes,
+        doors, of which those that were seen to swing are among the changes, too.
     """
     threads = resolve_threads(options.threads)
     deskewed = slam.deskew_recording(recording, best.poses, options.slam, threads)
@@ -69,9 +73,9 @@ def final_estimate(
     changed = best.e_step.changed_cells
     if changed is not None:  # 3D: every E-step knows of them
         changes = detect_changes_3d(changed, deskewed, best.poses, cell, look)
-        return deskewed, best, changes
+        return deskewed, best, changes, []
     if recording.dimension == 3 or options.estimator != "stillmap":
-        return deskewed, best, []
+        return deskewed, best, [], []
     deskewed, reflected = remove_reflections(deskewed, best.poses, best.p_static, cell)
     found, courses = em.final_e_step(deskewed, best.poses, cell, options.em, threads)
     if reflected is not None:  # unusable beams have no label
@@ -80,18 +84,26 @@ def final_estimate(
         )
     best = best.with_labels(p_static=found.p_static, occupied=found.occupied, learned=found.learned)
     if courses is None:
-        return deskewed, best, []
+        return deskewed, best, [], []
     best, movers = _add_motion_evidence(deskewed, best, courses, threads)
     changes = detect_changes(courses, deskewed, cell, look, movers)
-    changes = join_doors(changes, _find_doors(deskewed, best, courses, cell, look))
-    return deskewed, _relabel(deskewed, best, courses, changes, options, threads), changes
+    surface = courses.cells[courses.p_in_map("majority") > 0.5]
+    changes = join_doors(changes, _find_doors(deskewed, best, courses, surface, cell, look))
+    swung = [one.door for one in changes if one.door is not None]
+    lone = find_lone_doors(surface, swung, deskewed, best.poses, cell, threads)
+    best = _relabel(deskewed, best, courses, changes, lone, options, threads)
+    return deskewed, best, changes, [*swung, *lone]
 
 
 def _find_doors(
-    deskewed: Recording, best: Estimate, courses: em.CellHistories, cell: float, look: float
+    deskewed: Recording,
+    best: Estimate,
+    courses: em.CellHistories,
+    surface: NDArray[np.int64],
+    cell: float,
+    look: float,
 ) -> list[Change]:
     """Doors, from what changed and from dynamic hits, beside what is there most of the time."""
-    surface = courses.cells[courses.p_in_map("majority") > 0.5]
     changes = detect_changes(courses, deskewed, cell, look)
     lines = find_leaf_lines(deskewed, best.poses, best.p_static, cell)
     return find_doors(changes, lines, surface, deskewed, best.poses, cell)
@@ -102,19 +114,18 @@ def _relabel(
     best: Estimate,
     courses: em.CellHistories,
     changes: list[Change],
+    lone_doors: list[Door],
     options: Options,
     threads: int,
 ) -> Estimate:
-    """The labels and cells of changed places, in the state that the map shows."""
+    """The labels and cells of changed places and doors, in the state that the map shows."""
+    p_static, occupied = best.p_static, best.e_step.known_cells
+    state = options.output.map_state
     p_static, occupied = relabel_changes(
-        deskewed,
-        best.poses,
-        best.p_static,
-        best.e_step.known_cells,
-        courses,
-        changes,
-        options.output.map_state,
-        threads,
+        deskewed, best.poses, p_static, occupied, courses, changes, state, threads
+    )
+    p_static, occupied = relabel_lone_doors(
+        deskewed, best.poses, p_static, occupied, courses, lone_doors, state, threads
     )
     learned = {**best.e_step.learned, "changing": round(courses.changing_weight, 6)}
     return best.with_labels(p_static=p_static, occupied=occupied, learned=learned)
@@ -216,16 +227,22 @@ def _wanted_places(planar: Recording, estimate: Estimate, options: Options) -> N
 
 
 def find_objects(
-    deskewed: Recording, estimate: Estimate, maps: Maps, changes: list[Change], options: Options
+    deskewed: Recording,
+    estimate: Estimate,
+    maps: Maps,
+    changes: list[Change],
+    doors: list[Door],
+    options: Options,
 ) -> list[MovingObject]:
-    """Moving objects; in 2D without those whose beams ended on what is listed as a change."""
+    """Moving objects; in 2D without those whose beams ended on a door or what is a change."""
     poses, p_static = estimate.poses, estimate.p_static
     if maps.ground is not None:
         threads = resolve_threads(options.threads)
         return track_objects_3d(deskewed, poses, p_static, maps.ground, options.objects, threads)
     objects = track_objects(deskewed, poses, p_static, options.objects)
+    lone = [one for one in doors if len(one.states) == 1]
     changed = find_changed_object_beams(
-        deskewed, poses, p_static, changes, maps.filtered.resolution
+        deskewed, poses, p_static, changes, lone, maps.filtered.resolution
     )
     moved = [one for one in objects if 2 * _count_common(one.beams, changed) <= len(one.beams)]
     return [dataclasses.replace(one, id=k) for k, one in enumerate(moved)]

@@ -165,8 +165,7 @@ def changes_to_map(
         frame: the local frame.
         local_map: the map in `frame`: cells of changes stay the same cells of it.
     """
-    moved = dataclasses.replace(local_map, origin=frame.corner_to_map(local_map.origin))
-    by = moved.window.first_cell - local_map.window.first_cell
+    by = _cells_to_map(frame, local_map)
     return [
         dataclasses.replace(
             one,
@@ -178,6 +177,20 @@ def changes_to_map(
         )
         for one in changes
     ]
+
+
+def doors_to_map(
+    doors: Iterable[Door], frame: LocalFrame, local_map: em.OccupancyMap
+) -> list[Door]:
+    """Doors of a local frame in the map frame; arguments as of `changes_to_map`."""
+    by = _cells_to_map(frame, local_map)
+    return [_door_to_map(one, frame, by) for one in doors]
+
+
+def _cells_to_map(frame: LocalFrame, local_map: em.OccupancyMap) -> Cells:
+    """(2,) cells by which cells of a local frame are others in the map frame."""
+    moved = dataclasses.replace(local_map, origin=frame.corner_to_map(local_map.origin))
+    return np.asarray(moved.window.first_cell - local_map.window.first_cell)
 
 
 def _door_to_map(door: Door, frame: LocalFrame, by: Cells) -> Door:

@@ -17,7 +17,7 @@ from stillmap.core.parallel import limit_blas_threads, resolve_threads, work_bes
 from stillmap.core.profiling import Progress, StageTimer, no_progress
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
-from stillmap.mapping import Change
+from stillmap.mapping import Change, Door
 from stillmap.pipeline.calibration import calibrate_recording, time_sweeps
 from stillmap.pipeline.diagnostics import find_map_warnings, find_warnings
 from stillmap.pipeline.em_loop import iterate
@@ -25,6 +25,7 @@ from stillmap.pipeline.estimate import EmState, Estimate, IterationRecord
 from stillmap.pipeline.final_map import Maps, final_estimate, find_objects, make_maps
 from stillmap.pipeline.map_frame import (
     changes_to_map,
+    doors_to_map,
     enter_local_frame,
     estimate_to_map,
     maps_to_map,
@@ -63,6 +64,7 @@ class MappingResult(ShortRepr):
         objects: moving objects, in the order in which they were first observed.
         traffic: how often objects crossed each square of the floor.
         changes: places where something appeared, disappeared, or comes and goes.
+        doors: those that swung, which are changes, too, and those seen in one position only.
         stages: seconds and peak memory.
         calibration: poses of the lasers and errors of odometry, as the motion shows them.
         quality: of labels and geometry, from 0 to 100.
@@ -80,6 +82,7 @@ class MappingResult(ShortRepr):
     objects: list[MovingObject]
     traffic: FlowMap
     changes: list[Change]
+    doors: list[Door]
     stages: Mapping[str, Mapping[str, Any]]
     calibration: Calibration = field(default_factory=Calibration)
     quality: Quality = field(default_factory=Quality)
@@ -247,11 +250,15 @@ def _finish(
     options = state.options
     progress("labelling beams", 0, 0, 0)
     with stages.measure("changes"):
-        deskewed, estimate, changes = final_estimate(recording, state.require_best(), options)
+        deskewed, estimate, changes, doors = final_estimate(
+            recording, state.require_best(), options
+        )
     trim_heap()
     maps = make_maps(deskewed, estimate, options, progress, stages)
     trim_heap()
-    objects, quality = _track_and_rate(deskewed, estimate, maps, changes, options, progress, stages)
+    objects, quality = _track_and_rate(
+        deskewed, estimate, maps, changes, doors, options, progress, stages
+    )
     del deskewed
     trim_heap()
     return MappingResult(
@@ -269,6 +276,7 @@ def _finish(
         objects=objects,
         traffic=compute_flow_map(objects),
         changes=changes,
+        doors=doors,
         stages=stages.to_dict(),
         quality=quality,
     )
@@ -279,6 +287,7 @@ def _track_and_rate(
     estimate: Estimate,
     maps: Maps,
     changes: list[Change],
+    doors: list[Door],
     options: Options,
     progress: Progress,
     stages: StageTimer,
@@ -295,7 +304,7 @@ def _track_and_rate(
     )
     with work_beside(rate, threads if deskewed.dimension == 3 else 1) as rated:
         with stages.measure("objects"):
-            objects = find_objects(deskewed, estimate, maps, changes, options)
+            objects = find_objects(deskewed, estimate, maps, changes, doors, options)
         progress("rating the map", 0, 0, 0)
         with stages.measure("quality"):
             return objects, rated()
@@ -313,5 +322,6 @@ def _to_map_frame(result: MappingResult, frame: LocalFrame) -> MappingResult:
         objects=objects_to_map(result.objects, frame),
         traffic=traffic_to_map(result.traffic, frame),
         changes=changes_to_map(result.changes, frame, result.map),
+        doors=doors_to_map(result.doors, frame, result.map),
         frame=frame,
     )

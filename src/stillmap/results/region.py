@@ -69,6 +69,7 @@ def crop_result(result: Some) -> Some:
         result,
         maps=dataclasses.replace(maps, filtered=filtered, raw=raw, evidence=evidence),
         changes=[one for one in result.changes if is_inside(np.array([one.x, one.y]), region)],
+        doors=[one for one in result.doors if is_inside(np.array(one.hinge), region)],
         objects=[one for one in result.objects if passes(one, region)],
         traffic=_crop_traffic(result.traffic, region),
     )

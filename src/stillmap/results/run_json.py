@@ -64,6 +64,7 @@ def run_record(result: MappingResult, more: Mapping[str, Any] | None = None) -> 
             "length_unknown": [_stretch(one) for one in result.doubts.bare_stretches],
         },
         "changes": [_change(one) for one in result.changes],
+        "doors": [_door(one) | {"p_moved": round(one.p_moved, 4)} for one in result.doors],
         "loops": {
             "accepted": [_loop(one) for one in result.loops if not one.rejected],
             "refused": [_loop(one) | {"why": one.rejected} for one in result.loops if one.rejected],

@@ -1,0 +1,239 @@
+"""Doors that were seen in one position only: which there are, and whether they moved unseen.
+
+How often doors swing is learned from all doors of the recording: from those that swung, and from
+those that were in the same position whenever somebody looked.
+"""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+import stillmap._core as _core
+from stillmap import em
+from stillmap.core import arrays
+from stillmap.core.chunks import iter_beams
+from stillmap.core.recording import Recording
+from stillmap.mapping.changed_objects import cell_keys
+from stillmap.mapping.door import Door, DoorState
+from stillmap.mapping.door_states import observe_looks
+from stillmap.mapping.doorways import find_doorways
+from stillmap.mapping.lone_leaves import LoneLeaf, find_open_leaf, is_doorway_free, is_thin
+from stillmap.mapping.shut_leaves import estimate_door_share, find_shut_leaf
+
+Cells = NDArray[np.int64]
+Float = NDArray[np.float64]
+Labels = NDArray[np.float32]
+
+_P_LEAF = 36.0 / 37.0  # 35 of 35 open ones in four simulated offices were; rule of succession
+_MIN_P_LISTED = 0.2  # that what fills a doorway is a door at all
+_RATES = np.geomspace(1e-5, 1.0, 61)  # per s, of swings, each as probable before any is seen
+_WATCHED = 2.0  # s between two looks within which a swing would have been seen
+_LOOK = 0.2  # s between scans whose beams show what is free
+_LEAST = 1e-3  # s that a swing takes
+_MAX_COMMON = 0.3  # share of the cells of a leaf that may be of another door
+
+
+def find_lone_doors(
+    surface: Cells,
+    doors: Sequence[Door],
+    recording: Recording,
+    poses: Float,
+    resolution: float,
+    threads: int = 1,
+) -> list[Door]:
+    """Doors that were in the same position whenever they were seen.
+
+    Args:
+        surface: (S, 2) cells that are occupied most of the time.
+        doors: those that were seen to swing.
+        recording: 2D.
+        poses: (T, 3, 3) T_map_base.
+        resolution: m, edge of a cell.
+        threads: number of threads; the result does not depend on it.
+    """
+    doorways = find_doorways(surface, resolution)
+    if not doorways:
+        return []
+    counts = _count_beams(recording, poses, resolution, threads)
+    left = [
+        (leaf, is_open)
+        for doorway in doorways
+        if is_doorway_free(doorway, counts)
+        for leaf, is_open in (
+            (find_open_leaf(doorway, surface), True),
+            (find_shut_leaf(doorway, surface), False),
+        )
+        if leaf is not None
+    ]
+    taken = [one.swept_cells for one in doors]
+    found: list[tuple[LoneLeaf, bool]] = []
+    for leaf, is_open in sorted(left, key=lambda one: not one[1]):
+        if (not is_open or is_thin(leaf, counts)) and not any(
+            _is_part(leaf.cells, cells) for cells in taken
+        ):
+            taken.append(leaf.cells)
+            found.append((leaf, is_open))
+    return _observe(found, doors, recording, poses, resolution)
+
+
+def _count_beams(
+    recording: Recording, poses: Float, resolution: float, threads: int
+) -> _core.OccupancyGrid2D:
+    """Counts of the hits of some scans, as if all were static."""
+    seconds = 1e-9 * float(recording.stamp_ns[-1] - recording.stamp_ns[0])
+    every = max(1, int(_LOOK * recording.n_scans / max(seconds, _LOOK)))
+    counts = _core.OccupancyGrid2D(resolution, moments=False)
+    for scans, _, (points, hit, offset, T_map_sensor) in iter_beams(recording, poses):
+        is_looked_at = np.arange(scans.start, scans.stop) % every == 0
+        used = hit & np.repeat(is_looked_at, np.diff(offset))
+        ends = np.where(used[:, None], points, np.float32(np.nan))
+        weights = np.ones(len(used), np.float32)
+        _core.add_beams(counts, ends, used, weights, offset, T_map_sensor, threads)
+    return counts
+
+
+def _observe(
+    found: Sequence[tuple[LoneLeaf, bool]],
+    doors: Sequence[Door],
+    recording: Recording,
+    poses: Float,
+    resolution: float,
+) -> list[Door]:
+    """The doors with these leaves, each open or shut, when they were seen, and P(moved)."""
+    n_open = sum(is_open for _, is_open in found)
+    share = estimate_door_share(len(found) - n_open, n_open, doors)
+    if share < _MIN_P_LISTED:
+        found = [one for one in found if one[1]]
+    looks = observe_looks([leaf.cells for leaf, _ in found], recording, poses, resolution)
+    seen = [k for k, one in enumerate(looks) if len(one)]
+    found, looks = [found[k] for k in seen], [looks[k] for k in seen]
+    moved = compute_p_moved(doors, looks, recording.stamp_ns)
+    return [
+        _make_door(leaf, is_open, resolution, stamps, p * (_P_LEAF if is_open else share))
+        for (leaf, is_open), stamps, p in zip(found, looks, moved, strict=True)
+    ]
+
+
+def _is_part(cells: Cells, others: Cells) -> bool:
+    return bool(np.isin(cell_keys(cells), cell_keys(others)).mean() > _MAX_COMMON)
+
+
+def _make_door(
+    leaf: LoneLeaf, is_open: bool, resolution: float, stamps: NDArray[np.int64], p_moved: float
+) -> Door:
+    x, y = ((leaf.hinge + 0.5) * resolution).tolist()
+    none = np.empty((0, 2), np.int64)
+    state = DoorState("open" if is_open else "shut", int(stamps[0, 0]), int(stamps[-1, 1]))
+    return Door(
+        hinge=(x, y),
+        length=leaf.length * resolution,
+        shut=math.atan2(leaf.shut[1], leaf.shut[0]),
+        opened=math.atan2(leaf.leaf[1], leaf.leaf[0]) if is_open else math.nan,
+        shut_cells=none if is_open else leaf.cells,
+        open_cells=leaf.cells if is_open else none,
+        swept_cells=leaf.cells,
+        states=(state,),
+        p_moved=p_moved,
+    )
+
+
+def compute_p_moved(
+    doors: Sequence[Door], looks: Sequence[NDArray[np.int64]], stamp_ns: NDArray[np.int64]
+) -> list[float]:
+    """Probability that each of some doors moved while nobody saw it.
+
+    A door swings at a constant rate, the same for all of them. The two positions of a door that
+    swung at the rate r differ after t with probability (1 - exp(-2 r t)) / 2.
+
+    Args:
+        doors: those that were seen to swing.
+        looks: (L, 2) of each of the others, see `observe_looks`.
+        stamp_ns: (T,) of the recording.
+    """
+    log_likelihood = np.zeros(len(_RATES))
+    for door in doors:
+        log_likelihood += _log_likelihood_of_swings(door)
+    spans = [_split_looks(one) for one in looks]
+    for watched, gaps in spans:
+        same = 0.5 * (1.0 + np.exp(-2.0 * np.outer(_RATES, gaps)))
+        log_likelihood += np.log(same).sum(axis=1) - _RATES * watched
+    posterior = np.exp(log_likelihood - log_likelihood.max())
+    posterior /= posterior.sum()
+    out = []
+    for stamps, (_, gaps) in zip(looks, spans, strict=True):
+        ends = 1e-9 * float((stamps[0, 0] - stamp_ns[0]) + (stamp_ns[-1] - stamps[-1, 1]))
+        # it was in one position at both ends of a gap: an even number of swings, none with 1 / cosh
+        log_still = -_RATES * ends - np.logaddexp(
+            np.outer(_RATES, gaps), -np.outer(_RATES, gaps)
+        ).sum(axis=1)
+        log_still += len(gaps) * math.log(2.0)
+        out.append(1.0 - float(posterior @ np.exp(log_still)))
+    return out
+
+
+def _log_likelihood_of_swings(door: Door) -> Float:
+    """(R,) of the states of a door, at each rate.
+
+    Each state lasts from the first to the last time the leaf was seen so; it may have moved to and
+    fro meanwhile.
+    """
+    since, until = 1e-9 * np.array([[one.since_ns, one.until_ns] for one in door.states], float).T
+    between = np.maximum(since[1:] - until[:-1], _LEAST)
+    differs = 0.5 * -np.expm1(-2.0 * np.outer(_RATES, between))
+    same = 0.5 * (1.0 + np.exp(-2.0 * np.outer(_RATES, until - since)))
+    return np.asarray(np.log(differs).sum(axis=1) + np.log(same).sum(axis=1))
+
+
+def _split_looks(stamps: NDArray[np.int64]) -> tuple[float, Float]:
+    """Seconds in which a leaf was watched, and the gaps between them."""
+    pauses = 1e-9 * (stamps[1:, 0] - stamps[:-1, 1]).astype(np.float64)
+    watched = 1e-9 * float((stamps[:, 1] - stamps[:, 0]).sum()) + float(
+        pauses[pauses <= _WATCHED].sum()
+    )
+    return watched, pauses[pauses > _WATCHED]
+
+
+def relabel_lone_doors(
+    recording: Recording,
+    poses: Float,
+    p_static: Labels,
+    occupied: em.CellProbabilities,
+    histories: em.CellHistories,
+    doors: Sequence[Door],
+    state: em.MapState,
+    threads: int = 1,
+) -> tuple[Labels, em.CellProbabilities]:
+    """Labels (M,) and map cells with doors that were seen in one position only.
+
+    P(static) of a beam on an open leaf is less by the probability that the leaf moved. The map
+    shows it as it was found, or, where all doors are to be shut, not at all: nobody saw it there.
+    What fills a doorway stays as it is: it may be the back of a niche.
+
+    Args:
+        recording: M beams.
+        poses: (T, 3, 3) T_map_base.
+        p_static, occupied: to be changed.
+        histories: with the surfels of the same cells.
+        doors: from `find_lone_doors`.
+        state: state of changed places that the map shows.
+        threads: number of threads; the result does not depend on it.
+    """
+    doors = [one for one in doors if len(one.open_cells)]
+    if not doors:
+        return p_static, occupied
+    keys, p_moved = cell_keys(histories.cells), np.zeros(len(histories.cells), np.float32)
+    p_occupied = occupied.p_occupied.copy()
+    for one in doors:
+        of = np.isin(keys, cell_keys(one.open_cells))
+        p_moved[of] = np.maximum(p_moved[of], one.p_moved)
+        if one.position_in(state) != "open":
+            p_occupied[of] = 0.0
+    out = arrays.copy(p_static, recording.scratch)
+    for _, beams, data in iter_beams(recording, poses, release=[out]):
+        surfel = histories.surfel_map.associate_beams(*data, threads)
+        ended = np.flatnonzero(surfel >= 0)
+        out[beams][ended] *= 1.0 - p_moved[surfel[ended]]
+    return out, dataclasses.replace(occupied, p_occupied=p_occupied)

@@ -1,0 +1,226 @@
+"""Leaves of doors that stood open whenever they were seen, found by the doorway that they fit.
+
+Such a leaf is a straight row of surface from one end of a doorway, as long as that is wide, with a
+free end. It is thin, as beams passed on both sides of it, they passed through the doorway, and
+nothing stands where it swings.
+"""
+
+import itertools
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+import stillmap._core as _core
+from stillmap.mapping.doorways import Doorway
+from stillmap.mapping.resting_leaf import SurfaceField
+
+Cells = NDArray[np.int64]
+Float = NDArray[np.float64]
+
+_ANGLES = np.radians(np.arange(60.0, 148.0, 4.0))  # from the doorway to the leaf
+_SHIFT = np.array([-0.5, 1.0])  # cells of the hinge into the doorway
+_BACK = np.arange(-1.0, 6.0)  # cells of the hinge behind the face of the wall
+_LONGER = np.arange(-2.0, 5.0)  # cells by which the leaf is longer than the doorway is wide
+_MIN_COVERED, _MIN_EXACT = 0.85, 0.5  # share of the leaf within a cell of surface, and on it
+_MIN_CLEAR, _ASIDE = 0.85, 3.0  # share of the cells so far beside it that are none
+_NEAR_HINGE = 0.3  # of the leaf, where the wall is beside it
+_BEYOND = (2.0, 5.0)  # cells beyond its end, which is free
+_NOISE = math.radians(15.0)  # of the swing beside either position
+_RADII = np.array([0.4, 0.55, 0.7, 0.85, 0.97])  # of the leaf, where the swing is looked at
+_MAX_SWEPT = 0.02  # share of the swing that is surface
+_BAND, _MAX_ROUGHNESS = 4.0, 1.0  # cells beside the leaf that are of it, and their deviation
+_JAMB = 4.0  # cells behind the face of the wall, where its edge and the leaf are one
+_BEHIND_WALL, _GOES_ON, _MAX_GOES_ON = 8.0, 7.0, 1  # cells behind the hinge; of a row beyond; in it
+_MIN_PASSED = 0.9  # share of the doorway, and of its side of the leaf, that beams passed
+_MIN_BEHIND = 0.4  # the same of the other side, which walls hide from the doorway
+_BESIDE = np.array([3.0, 4.0, 5.0])  # cells from the leaf, of a row that beams pass beside it
+_MAX_HIT_SHARE, _MIN_LENGTHS = 0.25, 0.5  # of the beams in a cell that passed; cell lengths
+
+
+class LoneLeaf(NamedTuple):
+    """A leaf that stands open.
+
+    Attributes:
+        hinge: (2,) cells.
+        length: cells.
+        shut, leaf: (2,) unit directions from the hinge to the other end of the doorway, and along
+            the leaf.
+        cells: (K, 2) of it, without those at the edge of the wall.
+    """
+
+    hinge: Float
+    length: float
+    shut: Float
+    leaf: Float
+    cells: Cells
+
+
+def find_open_leaf(doorway: Doorway, surface: Cells) -> LoneLeaf | None:
+    """What looks like a leaf that stands open at a doorway, if there is anything.
+
+    Args:
+        doorway: a gap in a wall.
+        surface: (S, 2) occupied cells.
+    """
+    middle = doorway.ends.mean(axis=0)
+    reach = 2.0 * doorway.width + 12.0
+    near = surface[(np.abs(surface - middle) < reach).all(axis=1)]
+    field = SurfaceField.of_cells(near, middle, reach)
+    best: tuple[float, LoneLeaf | None] = 0.0, None
+    for end, side in itertools.product((0, 1), (-1.0, 1.0)):
+        rated = _rate_leaves(field, doorway, end, side)
+        if rated is not None and rated[0] > best[0]:
+            best = rated
+    leaf = best[1]
+    return leaf if leaf is not None and _is_straight(leaf, near) else None
+
+
+def _is_straight(one: LoneLeaf, surface: Cells) -> bool:
+    """Whether what is seen of a leaf lies on a line, which ends at the hinge."""
+    off = surface - one.hinge
+    along, across = off @ one.leaf, off @ np.array([-one.leaf[1], one.leaf[0]])
+    of_leaf = (along > _NEAR_HINGE * one.length) & (along < one.length)
+    of_leaf &= np.abs(across) <= _BAND
+    line = np.column_stack([along[of_leaf], np.ones(np.count_nonzero(of_leaf))])
+    fitted = line @ np.linalg.lstsq(line, across[of_leaf], rcond=None)[0]
+    behind = (along < -_BEHIND_WALL) & (along > -_BEHIND_WALL - _GOES_ON)
+    goes_on = np.unique(np.round(along[behind & (np.abs(across) <= 1.5)]))
+    is_line = np.mean((across[of_leaf] - fitted) ** 2) <= _MAX_ROUGHNESS**2
+    return bool(is_line and len(goes_on) <= _MAX_GOES_ON)
+
+
+def is_doorway_free(doorway: Doorway, counts: _core.OccupancyGrid2D) -> bool:
+    """Whether beams passed through a doorway; `counts` of all beams, as if all hits were static."""
+    gap = doorway.ends[0] + np.linspace(0.2, 0.8, 9)[:, None] * np.diff(doorway.ends, axis=0)
+    return _passed_share(counts, gap) >= _MIN_PASSED
+
+
+def is_thin(one: LoneLeaf, counts: _core.OccupancyGrid2D) -> bool:
+    """Whether beams passed on both sides of a leaf; `counts` as for `is_doorway_free`."""
+    across = np.array([-one.leaf[1], one.leaf[0]])
+    if across @ one.shut < 0.0:
+        across = -across
+    t = np.arange(_NEAR_HINGE * one.length + 1.0, one.length)
+    row = one.hinge + t[:, None] * one.leaf
+    inside, behind = (
+        max(_passed_share(counts, row + k * side * across) for k in _BESIDE) for side in (1.0, -1.0)
+    )
+    return inside >= _MIN_PASSED and behind >= _MIN_BEHIND
+
+
+def _passed_share(counts: _core.OccupancyGrid2D, points: Float) -> float:
+    """Share of the cells at points (n, 2) that beams passed, and few ended in."""
+    alpha, beta = counts.alpha_beta(np.round(points).astype(np.int64)).T
+    passed = (beta >= _MIN_LENGTHS) & (alpha <= _MAX_HIT_SHARE * (alpha + beta))
+    return float(passed.mean())
+
+
+class _Hypotheses(NamedTuple):
+    """H leaves of any length at one end of a doorway, sampled at every cell along them, N of them.
+
+    Attributes:
+        hinge, leaf: (H, 2).
+        angle: (H,) rad from the doorway.
+        row: (H, N, 2) cells along each.
+        is_near, is_on: (H, N) whether they are within a cell of surface, and on it.
+    """
+
+    hinge: Float
+    leaf: Float
+    angle: Float
+    row: Float
+    is_near: NDArray[np.bool_]
+    is_on: NDArray[np.bool_]
+
+    def select(self, kept: NDArray[np.bool_]) -> "_Hypotheses":
+        return _Hypotheses._make(column[kept] for column in self)
+
+
+def _rate_leaves(
+    field: SurfaceField, doorway: Doorway, end: int, side: float
+) -> tuple[float, LoneLeaf] | None:
+    """Score and shape of the best leaf hinged at one end of a doorway, towards one side of it."""
+    u = (doorway.ends[1 - end] - doorway.ends[end]) / doorway.width
+    v = side * np.array([-u[1], u[0]])
+    t = _along(doorway)
+    every = _sample_leaves(field, doorway, doorway.ends[end], u, v)
+    if every is not None:
+        every = every.select(_swept_share(field, doorway.width, every, u, v) <= _MAX_SWEPT)
+    if every is None or not len(every.hinge):
+        return None
+    across = every.leaf[:, ::-1] * [-1.0, 1.0]
+    aside = np.stack(
+        [
+            field.sample(field.is_surface, every.row + k * across[:, None])
+            for k in np.arange(-_ASIDE, _ASIDE + 1.0)
+        ]
+    )
+    best: tuple[float, LoneLeaf] | None = None
+    for length in doorway.width + _LONGER:
+        score = _score_leaves(every, aside, t, length)
+        k = int(score.argmax())
+        if score[k] > (best[0] if best else 0.0):
+            points = [every.row[k, t <= length] + j * across[k] for j in (-1.0, 0.0, 1.0)]
+            cells = np.unique(np.round(np.concatenate(points)).astype(np.int64), axis=0)
+            cells = cells[field.sample(field.is_surface, cells)]
+            cells = cells[(cells - doorway.ends[end]) @ v > _JAMB]
+            best = float(score[k]), LoneLeaf(every.hinge[k], length, u, every.leaf[k], cells)
+    return best
+
+
+def _sample_leaves(
+    field: SurfaceField, doorway: Doorway, end: Float, u: Float, v: Float
+) -> _Hypotheses | None:
+    """Those that lie on surface over the shortest length; None: there are none."""
+    grids = np.meshgrid(_SHIFT, _BACK, _ANGLES, indexing="ij")
+    shift, back, angle = (one.ravel() for one in grids)
+    hinge = end + shift[:, None] * u + back[:, None] * v
+    leaf = np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * v
+    t = _along(doorway)
+    least = t[t <= doorway.width + _LONGER[0]]
+    kept = np.arange(len(angle))
+    for layer, share in ((field.is_near, _MIN_COVERED), (field.is_surface, _MIN_EXACT)):
+        row = hinge[kept, None] + least[:, None] * leaf[kept, None]
+        kept = kept[field.sample(layer, row).mean(axis=1) >= share]
+    if not len(kept):
+        return None
+    row = hinge[kept, None] + t[:, None] * leaf[kept, None]
+    is_near, is_on = (field.sample(layer, row) for layer in (field.is_near, field.is_surface))
+    return _Hypotheses(hinge[kept], leaf[kept], angle[kept], row, is_near, is_on)
+
+
+def _along(doorway: Doorway) -> Float:
+    """(N,) cells from the hinge, as far as leaves are looked at."""
+    return np.arange(1.0, doorway.width + _LONGER[-1] + _BEYOND[1])
+
+
+def _score_leaves(every: _Hypotheses, aside: NDArray[np.bool_], t: Float, length: float) -> Float:
+    """(H,) score of the leaves of one length; 0 where there is none.
+
+    Args:
+        every: H leaves.
+        aside: (A, H, N) surface in rows beside them, from one side to the other.
+        t: (N,) cells from the hinge.
+        length: cells.
+    """
+    on = t <= length
+    far = on & (t >= _NEAR_HINGE * length)
+    beyond = (t >= length + _BEYOND[0]) & (t <= length + _BEYOND[1])
+    covered, exact = every.is_near[:, on].mean(axis=1), every.is_on[:, on].mean(axis=1)
+    clear = 1.0 - aside[[0, -1]][:, :, far].mean(axis=2).max(axis=0)
+    good = ~aside[:, :, beyond].any(axis=(0, 2)) & (clear >= _MIN_CLEAR)
+    good &= (covered >= _MIN_COVERED) & (exact >= _MIN_EXACT)
+    return np.where(good, covered + exact + clear, 0.0)
+
+
+def _swept_share(
+    field: SurfaceField, width: float, every: _Hypotheses, u: Float, v: Float
+) -> Float:
+    """(H,) share of surface in the sectors from the doorway to each leaf."""
+    part = np.linspace(0.0, 1.0, 16)
+    turned = _NOISE + part * (every.angle[:, None] - 2.0 * _NOISE)
+    rays = np.cos(turned)[..., None] * u + np.sin(turned)[..., None] * v
+    points = every.hinge[:, None, None] + (_RADII * width)[:, None] * rays[:, :, None]
+    return np.asarray(field.sample(field.is_surface, points).mean(axis=(1, 2)))

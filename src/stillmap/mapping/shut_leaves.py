@@ -1,0 +1,83 @@
+"""What fills a doorway behind the face of the wall: a leaf that was shut, or the back of a niche.
+
+Of one that never was seen open nothing tells which. But doors stand open for a share of the time,
+so that those which were found open tell how many others there are to be found shut.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.mapping.door import Door
+from stillmap.mapping.doorways import Doorway
+from stillmap.mapping.lone_leaves import LoneLeaf
+from stillmap.mapping.resting_leaf import SurfaceField
+
+Cells = NDArray[np.int64]
+Float = NDArray[np.float64]
+
+_RECESS = np.arange(2.0, 7.0)  # cells behind the face of the wall
+_MIN_COVERED, _MIN_EXACT = 0.9, 0.5  # share of the leaf within a cell of surface, and on it
+_MIN_JAMB = 0.5  # share of the edges of the wall, from its face to the leaf, that are seen
+_ASIDE, _MAX_ASIDE = np.array([3.0, 4.0, 5.0]), 0.4  # cells beside the leaf; share that is surface
+_PRIOR_SECONDS = 300.0  # for which doors that stand open half of the time count
+
+
+def find_shut_leaf(doorway: Doorway, surface: Cells) -> LoneLeaf | None:
+    """What fills a doorway, if there is something.
+
+    Which end its hinge is at nobody knows: the first one is given.
+
+    Args:
+        doorway: a gap in a wall.
+        surface: (S, 2) occupied cells.
+    """
+    middle, reach = doorway.ends.mean(axis=0), doorway.width + 14.0
+    near = surface[(np.abs(surface - middle) < reach).all(axis=1)]
+    field = SurfaceField.of_cells(near, middle, reach)
+    best: tuple[float, LoneLeaf | None] = 0.0, None
+    u = (doorway.ends[1] - doorway.ends[0]) / doorway.width
+    for v in (np.array([-u[1], u[0]]), np.array([u[1], -u[0]])):
+        for back in _RECESS.tolist():
+            score, cells = _rate_leaf(field, doorway, u, back * v)
+            if score > best[0]:
+                hinge = doorway.ends[0] + back * v
+                best = score, LoneLeaf(hinge, doorway.width, u, u, cells)
+    return best[1]
+
+
+def _rate_leaf(
+    field: SurfaceField, doorway: Doorway, u: Float, recess: Float
+) -> tuple[float, Cells]:
+    """Score of the leaf so far behind a doorway along u, 0 where there is none, and its cells."""
+    row = doorway.ends[0] + recess + np.arange(2.0, doorway.width - 1.0)[:, None] * u
+    covered = float(field.sample(field.is_near, row).mean())
+    exact = float(field.sample(field.is_surface, row).mean())
+    if covered < _MIN_COVERED or exact < _MIN_EXACT:
+        return 0.0, np.empty((0, 2), np.int64)
+    depth = np.arange(1.0, float(np.linalg.norm(recess)))[:, None] / np.linalg.norm(recess)
+    for end, outwards in zip(doorway.ends, (-u, u), strict=True):
+        jamb = field.sample(field.is_near, end + depth * recess).mean()
+        aside = field.sample(field.is_surface, end + recess + _ASIDE[:, None] * outwards).mean()
+        if jamb < _MIN_JAMB or aside > _MAX_ASIDE:
+            return 0.0, np.empty((0, 2), np.int64)
+    across = recess / np.linalg.norm(recess)
+    points = np.concatenate([row + k * across for k in (-1.0, 0.0, 1.0)])
+    cells = np.unique(np.round(points).astype(np.int64), axis=0)
+    return covered + exact, cells[field.sample(field.is_surface, cells)]
+
+
+def estimate_door_share(n_filled: int, n_open: int, doors: Sequence[Door]) -> float:
+    """Share of the doorways which are filled that have a door which opens at times.
+
+    Args:
+        n_filled: doorways that something fills.
+        n_open: doors that stood open whenever they were seen.
+        doors: those that were seen to swing, which tell for how much of the time doors are open.
+    """
+    seconds = {"open": 0.5 * _PRIOR_SECONDS, "shut": 0.5 * _PRIOR_SECONDS}
+    for state in (state for door in doors for state in door.states):
+        seconds[state.position] += 1e-9 * (state.until_ns - state.since_ns)
+    expected = n_open * seconds["shut"] / seconds["open"]
+    return min((expected + 0.5) / (n_filled + 1.0), 1.0)

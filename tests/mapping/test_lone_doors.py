@@ -1,0 +1,220 @@
+"""Doors that were seen in one position only: doorways, leaves at them, and whether they moved."""
+
+import dataclasses
+import functools
+import json
+import math
+
+import numpy as np
+import pytest
+
+import stillmap
+from stillmap.core.config import override
+from stillmap.mapping.door import Door, DoorState
+from stillmap.mapping.doorways import find_doorways
+from stillmap.mapping.lone_doors import compute_p_moved
+from stillmap.mapping.lone_leaves import find_open_leaf
+from stillmap.mapping.shut_leaves import estimate_door_share, find_shut_leaf
+from stillmap.pipeline.options import Options
+from stillmap.sim import CrowdOptions, LaserOptions, RobotOptions, Scene, simulate
+from stillmap.sim.walls import box
+
+RESOLUTION = 0.05
+S = 10**9
+GAP = 19  # cells, of the doorway
+
+
+def row(start, angle, length):
+    """Cells of a straight row, rising."""
+    t = np.arange(0.0, length, 0.4)[:, None]
+    along = np.array([math.cos(math.radians(angle)), math.sin(math.radians(angle))])
+    return np.unique(np.round(np.array(start) + t * along).astype(np.int64), axis=0)
+
+
+def wall(gap=GAP):
+    """Along x, with a doorway from x = 40 on."""
+    return [row((0, 0), 0, 41), row((40 + gap, 0), 0, 40)]
+
+
+def cells(*rows):
+    return np.unique(np.concatenate(rows), axis=0)
+
+
+def leaf(angle=100.0, length=GAP, at=(40.0, 3.0)):
+    """Hinged at the left end, behind a wall of 0.15 m."""
+    return [row(at, angle, length), row((40, 0), 90, 4)]
+
+
+@pytest.mark.parametrize("angle", [0.0, 31.0, 75.0])
+def test_a_gap_as_wide_as_a_door_in_a_wall_of_any_direction(angle):
+    c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
+    begin = np.array([c, s]) * (40 + GAP)
+    (found,) = find_doorways(cells(row((0, 0), angle, 41), row(begin, angle, 40)), RESOLUTION)
+    np.testing.assert_allclose(found.ends, [[40 * c, 40 * s], begin], atol=1.5)
+
+
+@pytest.mark.parametrize("gap", [5, 40])
+def test_other_gaps_are_no_doorways(gap):
+    assert not find_doorways(cells(*wall(gap)), RESOLUTION)
+
+
+def test_no_surface_has_no_doorways():
+    assert not find_doorways(np.empty((0, 2), np.int64), RESOLUTION)
+
+
+def find_leaf(*more):
+    surface = cells(*wall(), *more)
+    (doorway,) = find_doorways(surface, RESOLUTION)
+    return find_open_leaf(doorway, surface)
+
+
+@pytest.mark.parametrize("angle", [75.0, 90.0, 110.0])
+def test_an_open_leaf_from_one_end_of_a_doorway(angle):
+    found = find_leaf(*leaf(angle))
+    assert found.length == pytest.approx(GAP, abs=3)
+    assert math.degrees(math.acos(found.leaf @ [1, 0])) == pytest.approx(angle, abs=5)
+    np.testing.assert_allclose(found.shut, [1, 0], atol=0.01)
+    of_leaf = leaf(angle)[0]
+    assert {tuple(cell) for cell in found.cells.tolist()} <= {tuple(c) for c in of_leaf.tolist()}
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        [],  # no leaf
+        leaf(length=0.25 * GAP),
+        leaf(length=2.0 * GAP),
+        [*leaf(), row((46, 8), 0, 8)],  # it could not have swung
+        [*leaf(90.0), row((36, 21), 0, 5), row((36, 3), 90, 19)],  # the side of a box
+        [*leaf(90.0), row((40, -20), 90, 20)],  # a wall that crosses
+    ],
+)
+def test_what_is_no_leaf(more):
+    assert find_leaf(*more) is None
+
+
+def filled(depth, beyond=0):
+    edges = [row((x, 0), 90, depth + 1) for x in (40, 40 + GAP)]
+    back = row((41 - beyond, depth), 0, GAP - 1 + 2 * beyond)
+    surface = cells(*wall(), back, *edges)
+    (doorway,) = find_doorways(surface, RESOLUTION)
+    return find_shut_leaf(doorway, surface)
+
+
+def test_what_fills_a_doorway_behind_its_face():
+    found = filled(4)
+    assert found.length == pytest.approx(GAP, abs=1)
+    assert set(found.cells[:, 1].tolist()) == {4}
+    assert filled(4, beyond=8) is None  # a wall behind the gap
+    assert filled(12) is None
+
+
+def door(*states):
+    stamps = [DoorState(position, since * S, until * S) for position, since, until in states]
+    none = np.empty((0, 2), np.int64)
+    return Door((0.0, 0.0), 0.9, 0.0, 1.5, none, none, none, tuple(stamps))
+
+
+SWINGS = door(*[("open" if k % 2 else "shut", 20 * k, 20 * k + 10) for k in range(10)])
+
+
+def test_as_many_doors_are_shut_as_the_open_ones_tell():
+    assert estimate_door_share(10, 0, []) < 0.1
+    assert estimate_door_share(10, 5, []) == pytest.approx(0.5, abs=0.05)
+    mostly_open = door(("open", 0, 5000), ("shut", 5010, 5020))
+    assert estimate_door_share(10, 5, [mostly_open]) < 0.15
+    assert estimate_door_share(2, 5, []) == 1.0
+
+
+def p_moved(doors, *looks, seconds=300):
+    stamps = [np.array(one, np.int64) * S for one in looks]
+    return compute_p_moved(doors, stamps, np.array([0, seconds]) * S)
+
+
+def test_a_leaf_seen_once_moved_where_doors_swing():
+    seen = [(100 + k, 101 + k) for k in range(10)]
+    assert p_moved([SWINGS], seen)[0] > 0.95
+    assert p_moved([], seen)[0] < 0.6
+
+
+def test_where_leaves_rest_all_the_time_they_did_not_move():
+    always = [(k, k + 1) for k in range(0, 300)]
+    some = [(100, 110), (250, 260)]
+    assert p_moved([], always)[0] < 0.02
+    assert p_moved([], always, always, always, some)[-1] < 0.25
+    assert p_moved([], some)[0] > p_moved([], always, some)[1]
+
+
+def test_a_gap_in_the_looks_hides_swings():
+    assert p_moved([SWINGS], [(0, 100), (200, 300)])[0] > 0.7
+    assert p_moved([SWINGS], [(0, 150), (151, 300)])[0] < 0.1
+
+
+HINGE, OPENED = (0.5, 0.15), math.radians(100.0)
+TIP = (HINGE[0] + 0.96 * math.cos(OPENED), HINGE[1] + 0.96 * math.sin(OPENED))
+FREE = ((*HINGE, *TIP),)
+BOX = tuple(box(0.0, 0.65, 1.0, 0.96))
+
+
+@functools.cache
+def built(leaf, state="last"):
+    """A corridor and a room that the robot enters; what stands at the doorway between them."""
+    partition = ((-4.0, 0.0, 0.5, 0.0), (0.5, 0.0, *HINGE), (1.5, 0.0, 1.5, 0.15), (1.5, 0, 5.0, 0))
+    scene = Scene(
+        "corridor",
+        walls=(*box(0.5, 0.5, 9, 5), *partition, *leaf),
+        route=((-2.0, -0.9), (1.0, -0.9), (1.0, 2.0), (-2.0, 2.0)),
+        crowd=CrowdOptions(people=0),
+        laser=LaserOptions(beams=361, range_noise=0.01, fov=2 * np.pi),
+        robot=RobotOptions(scans=120, scan_rate=4.0, speed=0.5),
+    )
+    sim = simulate(scene, np.random.default_rng(3))
+    chosen = {"threads": 1, "em": {"max_iterations": 1}, "output": {"map_state": state}}
+    options = override(Options(), chosen)
+    return stillmap.build(sim.recording, options, poses=sim.truth.T_world_base), sim
+
+
+def shown(result, cells):
+    first = np.round(np.array(result.map.origin[:2]) / result.map.resolution).astype(int)
+    column, row = (cells - first).T
+    return result.map.p_occupied[row, column]
+
+
+def test_an_open_door_is_named_and_shown_as_found(tmp_path):
+    result, _ = built(FREE)
+    (found,) = result.doors
+    assert not result.changes
+    assert np.hypot(found.hinge[0] - HINGE[0], found.hinge[1] - HINGE[1]) < 0.2
+    assert [one.position for one in found.states] == ["open"]
+    assert (shown(result, found.open_cells) > 0.5).mean() > 0.7
+    result.save(tmp_path / "out")
+    (told,) = json.loads((tmp_path / "out/run.json").read_text())["doors"]
+    assert told["p_moved"] == pytest.approx(found.p_moved, abs=1e-4)
+    assert told["states"][0]["position"] == "open"
+
+
+def test_beams_on_it_are_static_as_far_as_it_may_have_moved():
+    result, sim = built(FREE)
+    ends = sim.recording.end_points(np.arange(sim.recording.n_beams), result.poses)
+    middle = 0.5 * (np.array(HINGE) + TIP)
+    on = sim.recording.hit & (np.linalg.norm(ends - middle, axis=1) < 0.2)
+    (found,) = result.doors
+    assert 0.02 < found.p_moved < 0.6  # nobody saw a door move here
+    assert np.median(result.p_static[on]) == pytest.approx(1.0 - found.p_moved, abs=0.05)
+
+
+def test_it_is_left_out_where_all_doors_are_to_be_shut():
+    result, _ = built(FREE, "shut")
+    (found,) = result.doors
+    assert (shown(result, found.open_cells) < 0.5).all()
+
+
+def test_the_side_of_a_box_is_no_door():
+    result, _ = built(BOX)
+    assert not result.doors
+
+
+def test_a_door_found_once_has_one_position():
+    shut = dataclasses.replace(door(("shut", 5, 5)), opened=math.nan)
+    assert shut.position_in("last") == shut.position_in("majority") == "shut"
+    assert shut.position_in("open") == "open"
