@@ -35,7 +35,7 @@ def are_rigid(T: NDArray[np.float64]) -> bool:
     if not ((np.abs(R) <= 1.0 + _TOLERANCE).all() and (np.abs(t) < MAX_TRANSLATION).all()):
         return False
     is_orthogonal = np.abs(R @ R.swapaxes(1, 2) - np.eye(D)) <= _TOLERANCE
-    is_affine = (T[:, D] == np.eye(D + 1)[D]).all()
+    is_affine = (np.abs(T[:, D] - np.eye(D + 1)[D]) <= _TOLERANCE).all()
     return bool(is_orthogonal.all() and is_affine and (np.linalg.det(R) > 0.0).all())
 
 
