@@ -204,6 +204,16 @@ def test_inputs_that_cannot_be_merged(flat_place: Path, flat_days: Path, tmp_pat
     assert "no session is as old" in said
 
 
+def test_a_result_that_was_computed_elsewhere(flat_days: Path, tmp_path: Path) -> None:
+    moved = tmp_path / "moved"
+    shutil.copytree(flat_days / "map2", moved)
+    record = json.loads((moved / "run.json").read_text())
+    record["local_origin"] = [9e8, 9e8, 9e8]
+    (moved / "run.json").write_text(json.dumps(record))
+    said = refused([flat_days / "map1", moved], tmp_path)
+    assert said == f"{moved}/run.json: local_origin is far from its trajectory"
+
+
 def test_a_result_whose_recording_is_gone(flat_days: Path, tmp_path: Path) -> None:
     moved = tmp_path / "moved"
     shutil.copytree(flat_days / "map2", moved)

@@ -1,12 +1,16 @@
 """Which end points are of moving things, where they lie, and which belong together."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
-from stillmap.core import arrays, se2
+from stillmap.core import chunks, se2
 from stillmap.core.recording import Recording
 from stillmap.tracking import clustering
+from stillmap.tracking.association import MAX_GAP, assign_tracks
 from stillmap.tracking.clustering import extract_dynamic_points
+from stillmap.tracking.fast_movers import find_fast_movers
 
 MIN_P_DYNAMIC = 0.7
 
@@ -52,7 +56,7 @@ def test_pieces_of_any_size_make_no_difference(monkeypatch, block):
     r = recording(rng.choice([2.0, 2.1, 5.0], (6, 5)), rng.random((6, 5)) < 0.9)
     p, poses = rng.choice([0.1, 0.9], 30).astype(np.float32), np.tile(np.eye(3), (6, 1, 1))
     whole = extract_dynamic_points(r, poses, p, MIN_P_DYNAMIC)
-    monkeypatch.setattr(arrays, "BLOCK", block)
+    monkeypatch.setattr(chunks, "CHUNK_BEAMS", block)
     pieces = extract_dynamic_points(r, poses, p, MIN_P_DYNAMIC)
     for name in ("scan", "beam", "xy", "range", "cluster", "first"):
         np.testing.assert_array_equal(getattr(pieces, name), getattr(whole, name))
@@ -80,3 +84,28 @@ def test_nothing_that_moves(n):
     found = extract_dynamic_points(r, poses, np.ones(4 * n, np.float32), MIN_P_DYNAMIC)
     assert len(found.beam) == len(found.cluster) == len(found.xy) == 0
     assert found.first.tolist() == [0] * (n + 1)
+
+
+def test_of_a_scan_the_largest_clusters_are_followed(monkeypatch):
+    monkeypatch.setattr(clustering, "_MAX_CLUSTERS", 2)
+    r = recording([[2, 2, 5, 8, 8, 8], [2, 2, 2, 5, 5, 5], [2, 5, 2, 5, 2, 5]])
+    poses = np.tile(np.eye(3), (3, 1, 1))
+    found = extract_dynamic_points(r, poses, np.zeros(18, np.float32), MIN_P_DYNAMIC)
+    # of 2 + 1 + 1 + 1 + 1 beams, of 3 + 1 + 1 + 1, and of six equal ones the first
+    assert found.beam.tolist() == [0, 1, 2, 6, 7, 8, 9, 12, 13]
+    assert found.cluster.tolist() == [0, 0, 1, 2, 2, 2, 3, 4, 5]
+    assert found.first.tolist() == [0, 3, 7, 9]
+
+
+def test_scans_of_noise_take_little_memory():
+    """Pairs of all their clusters would take gigabytes."""
+    rng = np.random.default_rng(3)
+    r = recording(10.0 ** rng.uniform(-1.0, 2.0, (3, 20_000)), stamps=[0, 10**8, 2 * 10**8])
+    poses, p = np.tile(np.eye(3), (3, 1, 1)), np.zeros(60_000, np.float32)
+    tracemalloc.start()
+    try:
+        points = extract_dynamic_points(r, poses, p, MIN_P_DYNAMIC)
+        find_fast_movers(points, assign_tracks(points, MAX_GAP))
+        assert tracemalloc.get_traced_memory()[1] < 500e6
+    finally:
+        tracemalloc.stop()

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from synthetic_tracks import watched
 
+from stillmap.tracking import fast_movers
 from stillmap.tracking.association import MAX_GAP, assign_tracks
 from stillmap.tracking.clustering import DynamicPoints, _cluster
 from stillmap.tracking.fast_movers import find_fast_movers
@@ -114,3 +115,15 @@ def test_hits_here_and_there_are_no_fast_movers():
     )
     _, paths = found(points)
     assert not paths
+
+
+@pytest.mark.parametrize("pairs", [1, 7, 100])
+def test_pairs_of_looks_in_pieces_make_no_difference(monkeypatch, pairs):
+    points, _ = driven([oncoming(40.0, 9.0), oncoming(53.0, 9.0)], 3.0)
+    owner, paths = found(points)
+    monkeypatch.setattr(fast_movers, "_MAX_PAIRS", pairs)
+    again, others = found(points)
+    np.testing.assert_array_equal(again, owner)
+    assert len(others) == len(paths) == 2
+    for one, other in zip(paths, others, strict=True):
+        np.testing.assert_array_equal(one.xy, other.xy)

@@ -29,12 +29,13 @@ def rigid_transform(R: ArrayLike, t: ArrayLike) -> NDArray[np.float64]:
 
 
 def are_rigid(T: NDArray[np.float64]) -> bool:
-    """True if all of (N, 4, 4) matrices are rigid transforms within the tolerance."""
-    R, t = T[:, :3, :3], T[:, :3, 3]
+    """True if all of (N, D+1, D+1) matrices are rigid transforms within the tolerance."""
+    D = T.shape[-1] - 1
+    R, t = T[:, :D, :D], T[:, :D, D]
     if not ((np.abs(R) <= 1.0 + _TOLERANCE).all() and (np.abs(t) < MAX_TRANSLATION).all()):
         return False
-    is_orthogonal = np.abs(R @ R.swapaxes(1, 2) - np.eye(3)) <= _TOLERANCE
-    is_affine = (T[:, 3] == [0.0, 0.0, 0.0, 1.0]).all()
+    is_orthogonal = np.abs(R @ R.swapaxes(1, 2) - np.eye(D)) <= _TOLERANCE
+    is_affine = (np.abs(T[:, D] - np.eye(D + 1)[D]) <= _TOLERANCE).all()
     return bool(is_orthogonal.all() and is_affine and (np.linalg.det(R) > 0.0).all())
 
 

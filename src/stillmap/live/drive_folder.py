@@ -26,7 +26,14 @@ from stillmap.core.json import read_json, write_json
 from stillmap.core.schema import SchemaError, check
 from stillmap.io.rigid_transforms import MAX_TRANSLATION
 from stillmap.live.cloud_extension import KeptCloud
-from stillmap.live.history import KeptScans, answer_type, beam_fields
+from stillmap.live.drive_checks import (
+    check_arrays,
+    check_cloud,
+    check_map,
+    check_scans,
+    check_sensors,
+)
+from stillmap.live.history import KeptScans, beam_fields
 from stillmap.live.map_extension import KeptMap
 from stillmap.live.placement import Placement
 from stillmap.live.saving import Snapshot
@@ -38,7 +45,6 @@ _BEAMS = ("points", "hit", "p_static", "time")
 _SCANS = ("number", "counts", "answers", "poses", "submap")
 _KNOWN = ("p_occupied", "hits")  # of a map that is extended
 _KNOWN_CLOUD = ("known_points", "known_p_static", "known_route", "stands")  # in 3D likewise
-_CLOUD_TYPES = [np.float64, np.float32, np.float64, np.bool_]
 _LARGEST_RECORD = 16 << 20  # bytes
 
 _Row = list[float]
@@ -180,8 +186,8 @@ def _read(folder: Path, record: _Record) -> Snapshot:
         open_npy(folder / f"{name}.npy") for name in _SCANS
     ]
     sensors = [(one["name"], np.array(one["T_base_sensor"], float)) for one in record["sensors"]]
-    _check_arrays(D, record["rows"], given)
-    _check_sensors(D, [mount for _, mount in sensors], answers["sensor"])
+    check_arrays(D, record["rows"], given)
+    check_sensors(D, [mount for _, mount in sensors], answers["sensor"])
     parts = [
         [_map(folder / f"{name}-{k}", rows, *kind) for k, rows in enumerate(record["rows"])]
         for name, kind in zip(_BEAMS, beam_fields(D), strict=True)
@@ -199,59 +205,21 @@ def _read(folder: Path, record: _Record) -> Snapshot:
         record["disk_was_full"],
     )
     options = config.override(Options(), record["options"], str(folder / _RECORD))
-    kept_map = _read_kept_map(folder, record["extended"], D)
-    return Snapshot(kept, Placement(poses, submap), options, None, kept_map)
-
-
-def _check_arrays(D: int, rows: list[int], given: list[NDArray[Any]]) -> None:
-    """Refuse arrays of other types or lengths than were written.
-
-    Raises:
-        ValueError: they are others.
-    """
-    number, counts, answers, poses, submap = given
-    int64, T = np.dtype(np.int64), len(number)
-    types = [int64, int64, answer_type(D), np.dtype(np.float64), submap.dtype]
-    if (
-        [one.dtype for one in given] != types
-        or not np.issubdtype(submap.dtype, np.integer)
-        or {one.shape for one in (number, counts, answers, submap)} != {(T,)}
-        or poses.shape != (T, D + 1, D + 1)
-        or not T
-        or (counts < 0).any()
-        or counts.sum() != sum(rows)
-    ):
-        raise ValueError("its arrays do not fit together")
-
-
-def _check_sensors(D: int, mounts: list[NDArray[Any]], sensor: NDArray[np.int32]) -> None:
-    """Refuse sensors that are not there.
-
-    Raises:
-        ValueError: a scan is of none, or a mount is no pose.
-    """
-    if {mount.shape for mount in mounts} != {(D + 1, D + 1)}:
-        raise ValueError("a mount is no pose")
-    if sensor.min() < 0 or sensor.max() >= len(mounts):
-        raise ValueError("a scan is of no sensor")
+    kept_map, placement = _read_kept_map(folder, record["extended"], D), Placement(poses, submap)
+    check_scans(kept, placement)
+    return Snapshot(kept, placement, options, None, kept_map)
 
 
 def _read_kept_map(folder: Path, about: _Extended | None, dimension: int) -> KeptMap | None:
     if about is None:
         return None
     p_occupied, hits = layers = [open_npy(folder / f"{name}.npy") for name in _KNOWN]
-    x, y, yaw = about["origin"]
-    is_plane = p_occupied.ndim == 2 and p_occupied.shape == hits.shape
-    if not is_plane or {one.dtype.kind for one in layers} != {"f"}:
-        raise ValueError("its known map does not fit")
+    check_map(layers)
     cloud = None
     if dimension == 3:
-        given = [open_npy(folder / f"{name}.npy") for name in _KNOWN_CLOUD]
-        cloud = KeptCloud(*given)
-        n, route = len(cloud.points), len(cloud.route)
-        shapes = [(n, 3), (n,), (route, 4, 4), p_occupied.shape]
-        if [one.shape for one in given] != shapes or [one.dtype for one in given] != _CLOUD_TYPES:
-            raise ValueError("its known cloud does not fit")
+        cloud = KeptCloud(*(open_npy(folder / f"{name}.npy") for name in _KNOWN_CLOUD))
+        check_cloud(cloud, p_occupied.shape)
+    x, y, yaw = about["origin"]
     return KeptMap(GridMap(p_occupied, (x, y, yaw), about["resolution"]), hits, cloud)
 
 

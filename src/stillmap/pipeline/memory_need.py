@@ -1,4 +1,5 @@
-"""The memory that a map takes at least, known before it is made: that of the cells seen in 2D."""
+"""The memory that a map takes at least, known before it is made: of the cells that are seen in 2D,
+and of those that are hit in 3D."""
 
 import math
 
@@ -6,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
-from stillmap.core.arrays import iter_blocks
+from stillmap.core.arrays import iter_blocks, sample_indices
 from stillmap.core.chunks import iter_beams
 from stillmap.core.memory import allowed_memory, require_memory
 from stillmap.core.recording import Recording
@@ -22,24 +23,60 @@ _MAX_SQUARES = 2048  # along either axis, of the squares in which seen area is c
 # a corner
 _LEAST_SHARE = 0.5
 
+# bytes in 3D of a block of cells, and of the surfel and the filters of a cell on which beams ended;
+# measured on returns far from each other
+_PER_BLOCK_3D, _PER_SURFEL = 4 * 8**3, 700
+_EDGE_3D = 8  # cells, of a block
+_MAX_BEAMS = 1 << 22  # of a recording in 3D that are looked at
+_KEY_BITS = 21  # of a coordinate: what lies farther apart counts once, as little as it is
+
 
 def require_map_memory(recording: Recording, poses: Float | None, resolution: float) -> None:
-    """Refuse a planar recording whose grids do not fit into the memory that may be used.
+    """Refuse a recording whose grids do not fit into the memory that may be used.
 
     Args:
-        recording: 2D; nothing is known of 3D ones, whose grids hold what beams ended on.
-        poses: (T, 3, 3) T_map_base; None: those of odometry, or the robot stands still.
+        recording: T scans.
+        poses: (T, D+1, D+1) T_map_base; None: those of odometry, or the robot stands still.
         resolution: m, edge of a cell.
 
     Raises:
         InputError: says how much it takes, and what would take less.
     """
-    if recording.dimension != 2:
-        return
+    D = recording.dimension
     if poses is None:
         poses = recording.T_odom_base
     if poses is None:
-        poses = np.tile(np.eye(3), (recording.n_scans, 1, 1))
+        poses = np.tile(np.eye(D + 1), (recording.n_scans, 1, 1))
+    if D == 2:
+        _require_planar(recording, poses, resolution)
+    elif recording.n_beams * (_PER_BLOCK_3D + _PER_SURFEL) > allowed_memory():
+        require_memory(
+            _measure_surfels(recording, poses, resolution),
+            f"a map with voxels of {resolution:g} m",
+            "coarser slam.voxel_size or a shorter read.max_range takes less",
+        )
+
+
+def _measure_surfels(recording: Recording, poses: Float, resolution: float) -> int:
+    """Bytes, at least, of the cells in 3D on which beams ended."""
+    cells, blocks = (np.zeros(0, np.int64),) * 2
+    beams = sample_indices(recording.n_beams, _MAX_BEAMS)
+    for some in iter_blocks(beams):
+        ended = beams[some][recording.hit[beams[some]]]
+        cell = np.floor(recording.end_points(ended, poses) / resolution).astype(np.int64)
+        cells = np.union1d(cells, _keys(cell))
+        blocks = np.union1d(blocks, _keys(cell // _EDGE_3D))
+    return len(blocks) * _PER_BLOCK_3D + len(cells) * _PER_SURFEL
+
+
+def _keys(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(N,) a number for each of cells (N, 3)."""
+    x, y, z = (cells & ((1 << _KEY_BITS) - 1)).T
+    return np.asarray((x << 2 * _KEY_BITS) | (y << _KEY_BITS) | z, np.int64)
+
+
+def _require_planar(recording: Recording, poses: Float, resolution: float) -> None:
+    """Refuse a recording in 2D; arguments as of `require_map_memory`."""
     reach = _reach(recording)
     xy = recording.T_map_sensor(poses)[:, :2, 2]
     extent = np.ptp(xy, axis=0) + 2.0 * reach

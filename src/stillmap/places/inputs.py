@@ -29,6 +29,7 @@ from stillmap.slam import deskew_recording
 TIES = "ties.npz"  # constraints between the sessions of a place
 # in the record of a session: of the frame that a place has it in, in the map frame of its result
 SESSION_ORIGIN = "session_origin"
+MAX_DISTANCE = 1e6  # m, of poses from the origin of their session: no place is larger
 
 Given: TypeAlias = Sequence[str | os.PathLike[str]] | Recording | BuiltResult | SavedResult
 
@@ -160,12 +161,15 @@ def load_mapped(
     frame, pose_graph = result.folder.frame, read_g2o(graph) if graph.is_file() else None
     if not frame.is_shifted:  # a session of a place does not say
         frame = LocalFrame.near(result.poses)
+    poses = frame.to_local(result.poses)
+    if not (np.abs(poses) < MAX_DISTANCE).all():
+        raise InputError("local_origin is far from its trajectory", where=str(folder / RECORD))
     if pose_graph is not None:
         pose_graph = dataclasses.replace(pose_graph, poses=frame.to_local(pose_graph.poses))
     mapped = MappedRecording(
         name,
         deskewed,
-        frame.to_local(result.poses),
+        poses,
         np.asarray(result.p_static),
         pose_graph,
         (output.min_obstacle_height, output.max_obstacle_height),

@@ -14,7 +14,7 @@ from stillmap.core.input_files import copy_content
 from stillmap.io import stillmap_folder
 from stillmap.io.stillmap_folder import read as read_recording
 from stillmap.places.beam_cells import BeamCells
-from stillmap.places.inputs import SESSION_ORIGIN
+from stillmap.places.inputs import MAX_DISTANCE, SESSION_ORIGIN
 from stillmap.places.keyframes import Keyframes
 from stillmap.places.session import Session
 from stillmap.results.labels import read_array
@@ -32,7 +32,6 @@ WRITTEN_ANEW = (
     *("evidence.npz", "planar_evidence.npz"),
 )
 HINT = "merge the sessions anew"
-_MAX_DISTANCE = 1e6  # m: no place is larger
 _COPIED_AT_ONCE = 1 << 20  # bytes
 _KEYFRAMES, _PLANAR, _GRAPH = "keyframes", "planar", "graph.g2o"
 
@@ -116,7 +115,7 @@ def read_session(folder: Path, path: str | None, stamp_ns: NDArray[np.int64]) ->
         or not np.array_equal(keyframes.scans[keyframes.nodes], graph.keyframes)
         or keyframes.scans[-1] >= len(poses)
         or not np.array_equal(keyframes.poses, poses[keyframes.scans])
-        or not (np.abs(clearance) < _MAX_DISTANCE).all()
+        or not (np.abs(clearance) < MAX_DISTANCE).all()
     ):
         raise _inconsistent(state)
     frame = read_frame(folder, read_record(folder), SESSION_ORIGIN)
@@ -140,7 +139,7 @@ def is_rigid(poses: Float) -> bool:
     D = poses.shape[-1] - 1
     R = poses[:, :D, :D]
     return bool(
-        (np.abs(poses) < _MAX_DISTANCE).all()
+        (np.abs(poses) < MAX_DISTANCE).all()
         and (poses[:, D] == np.eye(D + 1)[D]).all()
         and np.allclose(R @ R.swapaxes(1, 2), np.eye(D), atol=1e-6)
     )

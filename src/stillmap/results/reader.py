@@ -103,7 +103,7 @@ def read_grid(result: Path) -> Grid:
             where=str(path),
             hint="scores are for maps in the plane",
         )
-    if not _is_within(p_occupied, 1.0):
+    if not is_probability(p_occupied):
         raise InputError("p_occupied is no probability", where=str(path))
     return Grid(p_occupied.astype(np.float32, copy=False), origin, resolution)
 
@@ -123,9 +123,19 @@ def read_hit_sums(result: Path, shape: tuple[int, ...]) -> NDArray[np.floating[A
     if alpha.shape != shape or alpha.dtype.kind != "f":
         what = f"alpha is {shape_text(alpha.shape)} {alpha.dtype}, p_occupied {shape_text(shape)}"
         raise InputError(what, where=str(path))
-    if not _is_within(alpha, _MAX_HITS):
+    if not is_hit_sum(alpha):
         raise InputError("alpha is no sum of hits", where=str(path))
     return alpha
+
+
+def is_probability(layer: NDArray[np.floating[Any]]) -> bool:
+    """True if all values that are not NaN are from 0 to 1."""
+    return _is_within(layer, 1.0)
+
+
+def is_hit_sum(layer: NDArray[np.floating[Any]]) -> bool:
+    """True if all values that are not NaN can be sums of hits in a cell."""
+    return _is_within(layer, _MAX_HITS)
 
 
 def _is_within(layer: NDArray[np.floating[Any]], limit: float) -> bool:

@@ -5,6 +5,8 @@ relative to its position. A point goes to the track whose predicted shape is nea
 objects that were tracked as one separate, the past points are split between them as well.
 """
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -165,23 +167,46 @@ class _Tracker:
 
     def _nearest(self, xy: Float, gate: float, among: NDArray[np.bool_]) -> Index:
         """(n,) the most likely of some tracks (K,) within `gate` metres and the uncertainty."""
-        sigma = self._states.position_std
-        gates = np.minimum(gate + _GATE_SIGMAS * sigma, _MAX_GATE)
-        variance = _POSITION_STD**2 + self._states.P[:, 0]
-        log_variance, out = np.log(variance), np.full(len(xy), NO_TRACK)
-        rows = max(1, _MAX_COSTS // len(sigma))
-        for first in range(0, len(xy), rows):
-            squared = self._squared_distances(xy[first : first + rows])
-            # a 2D Gaussian has twice the logarithm, which would favor long occluded tracks too
-            # little
-            cost = squared / variance + log_variance
-            out[first : first + rows] = _argmin_allowed(cost, (squared < gates**2) & among)
+        out = np.full(len(xy), NO_TRACK)
+        left, right = self._extents()
+        # strips along y, each compared with the tracks that reach into it
+        strips = math.ceil(math.sqrt(len(xy) * len(self._of) / _MAX_PAIRS))
+        for part in np.array_split(np.argsort(xy[:, 0], kind="stable"), max(strips, 1)):
+            low, high = xy[part[[0, -1]], 0] if len(part) else (0.0, 0.0)
+            near = among & (left < high + _MAX_GATE) & (right > low - _MAX_GATE)
+            rows = max(1, _MAX_COSTS // max(int(near.sum()), 1))
+            for first in range(0, len(part), rows):
+                some = part[first : first + rows]
+                out[some] = self._nearest_of(np.flatnonzero(near), xy[some], gate)
         return out
 
-    def _squared_distances(self, xy: Float) -> Float:
-        """(n, K) from points to the nearest predicted shape point of each track."""
-        expected_x, expected_y = (self._states.x[self._of] + self._offset).T
+    def _extents(self) -> tuple[Float, Float]:
+        """(K,) lowest and highest x of the predicted shape points of each track."""
+        x = self._states.x[self._of, 0] + self._offset[:, 0]
         begin = np.searchsorted(self._of, np.arange(len(self._states)))
+        return np.minimum.reduceat(x, begin), np.maximum.reduceat(x, begin)
+
+    def _nearest_of(self, tracks: Index, xy: Float, gate: float) -> Index:
+        """(n,) the same, of these tracks, rising."""
+        if not len(tracks):
+            return np.full(len(xy), NO_TRACK)
+        states = self._states.select(tracks)
+        gates = np.minimum(gate + _GATE_SIGMAS * states.position_std, _MAX_GATE)
+        variance = _POSITION_STD**2 + states.P[:, 0]
+        squared = self._squared_distances(tracks, xy)
+        # a 2D Gaussian has twice the logarithm, which would favor long occluded tracks too little
+        cost = squared / variance + np.log(variance)
+        best = _argmin_allowed(cost, squared < gates**2)
+        return np.where(best == NO_TRACK, NO_TRACK, tracks[best])
+
+    def _squared_distances(self, tracks: Index, xy: Float) -> Float:
+        """(n, K) from points to the nearest predicted shape point of each of K tracks."""
+        number = np.full(len(self._states), NO_TRACK)
+        number[tracks] = np.arange(len(tracks))
+        shape = np.flatnonzero(number[self._of] != NO_TRACK)
+        of = self._of[shape]
+        expected_x, expected_y = (self._states.x[of] + self._offset[shape]).T
+        begin = np.searchsorted(of, tracks)
         out = np.empty((len(xy), len(begin)))
         step = max(1, _MAX_PAIRS // len(expected_x))
         for first in range(0, len(xy), step):  # a crowd close to the laser is large
@@ -329,10 +354,12 @@ def _argmin_allowed(cost: Float, allowed: NDArray[np.bool_]) -> Index:
 
 def _complete_clusters(claims: Index, cluster: Index, tracks: int) -> Index:
     """Give unclaimed points to the track that claims most of their cluster."""
-    votes = np.zeros((cluster[-1] + 1, tracks), np.intp)
     claimed = claims >= 0
-    np.add.at(votes, (cluster[claimed], claims[claimed]), 1)
-    best = np.where(votes.max(axis=1) > 0, votes.argmax(axis=1), NO_TRACK)
+    pairs, votes = np.unique(cluster[claimed] * tracks + claims[claimed], return_counts=True)
+    order = np.lexsort((pairs, -votes, pairs // tracks))  # of equal votes, the lowest track
+    which, first = np.unique(pairs[order] // tracks, return_index=True)
+    best = np.full(cluster[-1] + 1, NO_TRACK)
+    best[which] = pairs[order[first]] % tracks
     return np.where(claimed, claims, best[cluster])
 
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import arrays
 from stillmap.core.array_builder import ArrayBuilder
+from stillmap.core.chunks import iter_chunks
 from stillmap.core.recording import Recording
 
 Float = NDArray[np.float64]
@@ -20,8 +21,9 @@ MIN_P_DYNAMIC = 0.7
 _LINK = 0.35  # m: distance between neighbours of one cluster
 LINK_PER_METRE = 0.02  # m more per metre of range
 
-_Last = tuple[Index, Float, Float, int]
-_FIRST: _Last = np.zeros(0, np.intp), np.zeros((0, 2)), np.zeros(0), -1
+# of a scan, the largest ones, that are followed: pairs of them are compared, and objects that a
+# laser sees at once, which hide each other, are fewer
+_MAX_CLUSTERS = 250
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,16 +88,21 @@ def extract_dynamic_points(
         )
     }
     count = np.zeros(recording.n_scans + 1, np.intp)
-    last = _FIRST
-    for block in arrays.iter_blocks(recording.hit, p_static):
+    n_clusters = 0
+    for _, block, _ in iter_chunks(recording, release=[p_static]):
         dynamic = recording.hit[block] & (p_static[block] <= 1.0 - min_p_dynamic)
         beam = block.start + np.flatnonzero(dynamic)
         if len(beam) == 0:
             continue
         scan, xy = recording.scans_of(beam), recording.end_points(beam, poses)
         distance = np.linalg.norm(recording.points[beam].astype(np.float64), axis=1)
-        cluster = _cluster(scan, xy, distance, last)
-        last = scan[-1:], xy[-1:], distance[-1:], int(cluster[-1])
+        cluster = _cluster(scan, xy, distance)
+        kept = _largest_clusters(scan, cluster)
+        if not kept.all():
+            beam, scan, xy, distance = beam[kept], scan[kept], xy[kept], distance[kept]
+            cluster = np.cumsum(np.diff(cluster[kept], prepend=-1) > 0) - 1
+        cluster += n_clusters
+        n_clusters = int(cluster[-1]) + 1
         for column, part in zip(columns.values(), (scan, beam, xy, distance, cluster), strict=True):
             column.append(part)
         count[scan[0] + 1 : scan[-1] + 2] += np.bincount(scan - scan[0])
@@ -108,17 +115,19 @@ def extract_dynamic_points(
     )
 
 
-def _cluster(scan: Index, xy: Float, distance: Float, last: _Last = _FIRST) -> Index:
-    """(N,) cluster numbers: a cluster ends with its scan or at a gap to the next end point.
-
-    `last` holds scan, position, range and cluster number of the preceding point.
-    """
-    new = len(scan)
-    scan = np.concatenate([last[0], scan])
-    xy, distance = np.concatenate([last[1], xy]), np.concatenate([last[2], distance])
+def _cluster(scan: Index, xy: Float, distance: Float) -> Index:
+    """(N,) cluster numbers from 0: one ends with its scan, or at a gap to the next end point."""
     step = np.linalg.norm(np.diff(xy, axis=0), axis=1)
     max_step = _LINK + LINK_PER_METRE * np.minimum(distance[1:], distance[:-1])
-    begins = (np.diff(scan) > 0) | (step > max_step)
-    if len(scan) == new:  # no preceding point
-        begins = np.concatenate([[True], begins])
-    return last[-1] + np.cumsum(begins)
+    return np.append(0, np.cumsum((np.diff(scan) > 0) | (step > max_step)))
+
+
+def _largest_clusters(scan: Index, cluster: Index) -> NDArray[np.bool_]:
+    """(N,) whether a point is of one of the clusters of its scan that are followed."""
+    _, first, size = np.unique(cluster, return_index=True, return_counts=True)
+    of = scan[first]
+    order = np.lexsort((-size, of))
+    begin = np.searchsorted(of, of)
+    kept = np.empty(len(of), bool)
+    kept[order] = np.arange(len(of)) - begin < _MAX_CLUSTERS
+    return kept[cluster]

@@ -150,17 +150,29 @@ def _unit_vectors() -> Float:
 def _find_seeds(looks: _Looks) -> _Seeds:
     """Hypotheses of five looks, the best ones first."""
     parts = []
-    count = _count_later(looks, np.arange(len(looks.scan)))
-    for block in np.split(
-        np.arange(len(count)), np.flatnonzero(np.diff(np.cumsum(count) // _MAX_PAIRS)) + 1
-    ):
+    for block in _blocks_of_pairs(looks, np.arange(len(looks.scan))):
         seeds = _pair(looks, block)
         for _ in range(_EXTENSIONS):
-            seeds = _extend(looks, seeds)
+            blocks = _blocks_of_pairs(looks, seeds.look[:, -1])
+            seeds = _join([_extend(looks, _select(seeds, some)) for some in blocks])
         parts.append(seeds)
-    found = _Seeds._make(np.concatenate(column) for column in zip(*parts, strict=True))
-    order = np.argsort(found.cost, kind="stable")
-    return _Seeds._make(column[order] for column in found)
+    found = _join(parts)
+    return _select(found, np.argsort(found.cost, kind="stable"))
+
+
+def _blocks_of_pairs(looks: _Looks, of: Index) -> list[Index]:
+    """Rows of `of` (n,) in order, so many at once that they and their later looks are few."""
+    low, high = _later_range(looks, of)
+    ends = np.flatnonzero(np.diff(np.cumsum(high - low) // _MAX_PAIRS)) + 1
+    return np.split(np.arange(len(of)), ends)
+
+
+def _select(seeds: _Seeds, rows: Index | NDArray[np.bool_]) -> _Seeds:
+    return _Seeds._make(column[rows] for column in seeds)
+
+
+def _join(parts: list[_Seeds]) -> _Seeds:
+    return _Seeds._make(np.concatenate(column) for column in zip(*parts, strict=True))
 
 
 def _later_range(looks: _Looks, of: Index) -> tuple[Index, Index]:
@@ -169,11 +181,6 @@ def _later_range(looks: _Looks, of: Index) -> tuple[Index, Index]:
     high = np.searchsorted(looks.scan, looks.scan[of] + _MAX_SCANS, side="right")
     until = np.searchsorted(looks.seconds, looks.seconds[of] + _MAX_STEP, side="right")
     return low, np.maximum(np.minimum(high, until), low)
-
-
-def _count_later(looks: _Looks, of: Index) -> Index:
-    low, high = _later_range(looks, of)
-    return high - low
 
 
 def _pairs_of(looks: _Looks, of: Index) -> tuple[Index, Index]:
@@ -200,7 +207,7 @@ def _pair(looks: _Looks, of: Index) -> _Seeds:
     speed = np.linalg.norm(xy[:, 1] - xy[:, 0], axis=1) / np.maximum(dt[:, 0], 1e-6)
     fast = (speed >= MIN_SPEED) & (speed <= MAX_SPEED)
     seeds = _Seeds(np.column_stack([one, later]), xy, side, np.zeros(len(one)))
-    return _Seeds._make(column[fast] for column in seeds)
+    return _select(seeds, fast)
 
 
 def _extend(looks: _Looks, seeds: _Seeds) -> _Seeds:
@@ -219,8 +226,8 @@ def _extend(looks: _Looks, seeds: _Seeds) -> _Seeds:
         _GATE_ACROSS + _ACROSS_PER_METRE * looks.range[later]
     )
     cost = along**2 + across**2
-    order = np.lexsort((cost, which))
-    order = order[(cost < 1.0)[order]]
+    near = np.flatnonzero(cost < 1.0)
+    order = near[np.lexsort((cost[near], which[near]))]
     best = order[np.flatnonzero(np.diff(which[order], prepend=-1))]
     of = which[best]
     return _Seeds(
