@@ -16,6 +16,7 @@ _NEAR = 3  # directions within which the one with most wall counts
 _WIDTH = (0.6, 1.3)  # m
 _POSTS = (0.35, 1.0)  # m at least, of the shorter and the longer wall beside it
 _MAX_HOLE = 2  # cells of a wall that were not hit
+_MAX_SPARSE = 4  # rows for each cell, beyond which rows without cells are not counted
 _APART = 6.0  # cells by which the middles of two doorways differ at least
 
 
@@ -86,13 +87,21 @@ def _find_directions(cells: Cells, resolution: float) -> Float:
     angle = np.arange(_DIRECTIONS) * (math.pi / _DIRECTIONS)
     unit = np.column_stack([np.cos(angle), np.sin(angle)])
     across = np.round(cells @ np.array([[0.0, 1.0], [-1.0, 0.0]]) @ unit.T).astype(np.int64)
-    rows = [np.bincount(one - one.min()) for one in across.T]
+    rows = map(_count_in_rows, across.T)
     # cells beside each other in rows of walls, of which each direction has some by chance
     wall = np.array([np.sum(one[one >= _MIN_WALL / resolution] ** 2.0) for one in rows])
     wall -= wall.min()
     around = np.stack([np.roll(wall, k) for k in range(-_NEAR, _NEAR + 1)])
     kept = (wall == around.max(axis=0)) & (wall >= max(_MIN_SHARE * wall.max(), 1))
     return np.asarray(unit[kept])
+
+
+def _count_in_rows(across: Index) -> Index:
+    """Number of cells in each row: of all rows, or of those with cells where they are sparse."""
+    number = across - across.min()
+    if number.max() > _MAX_SPARSE * len(number):  # far apart: an array of all rows is large
+        return np.unique(number, return_counts=True)[1]
+    return np.bincount(number)
 
 
 def _find_gaps(cells: Cells, u: Float, resolution: float) -> tuple[Float, Index]:
