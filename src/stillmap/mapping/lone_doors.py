@@ -66,7 +66,7 @@ def find_lone_doors(
             (find_open_leaf(doorway, surface), True),
             (find_shut_leaf(doorway, surface), False),
         )
-        if leaf is not None
+        if leaf is not None and len(leaf.cells)  # of coarse cells, all may be at the wall
     ]
     taken = [one.swept_cells for one in doors]
     found: list[tuple[LoneLeaf, bool]] = []
