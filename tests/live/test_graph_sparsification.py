@@ -166,15 +166,15 @@ def closers(monkeypatch):
         monkeypatch.setattr(graph_sparsification, "_LATEST", 1)
         closer, room = LoopCloser(SlamOptions()), _Room()
         made.append(closer)
-        rng, truth, T, told = np.random.default_rng(2), drive(laps), np.eye(3), []
+        rng, truth, T, reported = np.random.default_rng(2), drive(laps), np.eye(3), []
         for k, at in enumerate(truth):
             step = se2.matrix(*rng.normal(0.0, noise * np.array([2.0, 2.0, 1.0])))
             T = T if k == 0 else T @ se2.inverse(truth[k - 1]) @ at @ step
             beams = to_beams(stillmap.Scan(k * 10**9, room.look(at), ANGLES))
             scan = MappedScan(beams, np.ones(len(ANGLES), np.float32), T, 0.5 * k)
             closer.add(scan, 1.0, np.zeros((3, 3)))
-            told.append(closer.poll())
-        return closer, truth, [one for one in told if one is not None]
+            reported.append(closer.poll())
+        return closer, truth, [one for one in reported if one is not None]
 
     yield close_laps
     for closer in made:
@@ -193,8 +193,8 @@ def test_poses_stay_right_while_scans_leave_the_graph(closers):
     assert drift > 0.3  # of what was added
 
 
-def test_small_corrections_are_told_now_and_then(closers):
-    _, truth, told = closers(4, 10**6, 0.0002)
-    counts = [len(one.poses) for one in told]
-    assert 3 <= len(told) < 0.2 * 0.5 * len(truth) / loop_closer._EVERY
+def test_small_corrections_are_reported_every_25_metres(closers):
+    _, truth, reported = closers(4, 10**6, 0.0002)
+    counts = [len(one.poses) for one in reported]
+    assert 3 <= len(reported) < 0.2 * 0.5 * len(truth) / loop_closer._EVERY
     assert all(b > a for a, b in itertools.pairwise(counts))

@@ -1,4 +1,4 @@
-"""Whether the files of a kept drive can be what was written."""
+"""Checks of the files of a kept drive: types, shapes and ranges of values."""
 
 from collections.abc import Sequence
 from typing import Any

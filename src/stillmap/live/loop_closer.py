@@ -26,7 +26,7 @@ _NEAR_DISTANCE = 25.0  # m from the robot up to which they are
 # m that any spaced scan and that the last one move, and rad that it turns, up to which the map
 # stays as it is: constraints of loops have such errors themselves
 _SMALL = 0.1, 0.03, 0.005
-_REPEATED_AFTER = 25.0  # m after which small corrections are told: the last large one may be lost
+_REPEATED_AFTER = 25.0  # m after which small corrections are reported: one may have been lost
 # spaced scans, a kilometre of travel, before which none leaves the graph; how many times as many as
 # were left the last time there are when some leave again
 _MIN_SCANS, _GROWTH = 6000, 1.5
@@ -88,8 +88,8 @@ class LoopCloser:
         self._anchored = AnchoredPoses()
         self._searched_until = 0.0
         # the last large correction: poses of the spaced scans up to now, T_map_local
-        self._told, self._T_told = np.zeros((0, 3, 3)), np.eye(3)
-        self._told_until = 0.0  # m of travel at the last correction
+        self._reported, self._reported_T_map_local = np.zeros((0, 3, 3)), np.eye(3)
+        self._reported_at = 0.0  # m of travel at the last correction
         self._due = _MIN_SCANS  # spaced scans from which some leave
 
     def add(self, scan: MappedScan, explained: float, drift: Float) -> None:
@@ -135,7 +135,8 @@ class LoopCloser:
         self._searched_until = float(view.travelled[-1])
         since = self._T_map_local @ view.poses[len(self._poses) :]
         self._poses = np.concatenate([self._poses, since])
-        self._told = np.concatenate([self._told, self._T_told @ view.poses[len(self._told) :]])
+        since = self._reported_T_map_local @ view.poses[len(self._reported) :]
+        self._reported = np.concatenate([self._reported, since])
         chain = loop_candidates.odometry_constraints(context, self._options.odometry, [])
         new = context.keyframes[first:]
         self._centers = np.concatenate(
@@ -159,13 +160,13 @@ class LoopCloser:
         self._poses = corrected = local_map.propagate_corrections(
             context.poses, *_without_repetition(every, np.concatenate([poses, last[None]]))
         )
-        is_large = not is_small(self._told, corrected, last @ se2.inverse(self._told[-1]))
+        is_large = not is_small(self._reported, corrected, last @ se2.inverse(self._reported[-1]))
         now = float(view.travelled[-1])
-        if not is_large and now < self._told_until + _REPEATED_AFTER:
+        if not is_large and now < self._reported_at + _REPEATED_AFTER:
             return None
-        self._told_until = now
+        self._reported_at = now
         if is_large:
-            self._told, self._T_told = corrected, self._T_map_local
+            self._reported, self._reported_T_map_local = corrected, self._T_map_local
         near = self._find_near(view, context)
         return Correction(self._T_map_local, self._anchored.place(corrected), near)
 
@@ -186,7 +187,7 @@ class LoopCloser:
         self._state = select_state(self._state, context.keyframes, stay)
         self._centers = self._centers[stay[context.keyframes]]
         self._keyframes = (np.cumsum(stay) - 1)[context.keyframes[stay[context.keyframes]]].tolist()
-        self._poses, self._told = self._poses[stay], self._told[stay]
+        self._poses, self._reported = self._poses[stay], self._reported[stay]
         self._due = max(_MIN_SCANS, round(_GROWTH * len(scans)))
 
     def _find_near(self, view: SpacedView, context: LoopContext) -> list[MappedScan]:

@@ -58,7 +58,7 @@ class LoneLeaf(NamedTuple):
 
 
 def find_open_leaf(doorway: Doorway, surface: Cells) -> LoneLeaf | None:
-    """What looks like a leaf that stands open at a doorway, if there is anything.
+    """The best candidate for a leaf that stands open at a doorway; None: there is none.
 
     Args:
         doorway: a gap in a wall.
@@ -78,7 +78,7 @@ def find_open_leaf(doorway: Doorway, surface: Cells) -> LoneLeaf | None:
 
 
 def _is_straight(one: LoneLeaf, surface: Cells) -> bool:
-    """Whether what is seen of a leaf lies on a line, which ends at the hinge."""
+    """True if the surface of a leaf lies on a line that ends at the hinge."""
     off = surface - one.hinge
     along, across = off @ one.leaf, off @ np.array([-one.leaf[1], one.leaf[0]])
     of_leaf = (along > _NEAR_HINGE * one.length) & (along < one.length)
@@ -92,13 +92,13 @@ def _is_straight(one: LoneLeaf, surface: Cells) -> bool:
 
 
 def is_doorway_free(doorway: Doorway, counts: _core.OccupancyGrid2D) -> bool:
-    """Whether beams passed through a doorway; `counts` of all beams, as if all hits were static."""
+    """True if beams passed through a doorway; `counts` of all beams, all hits as if static."""
     gap = doorway.ends[0] + np.linspace(0.2, 0.8, 9)[:, None] * np.diff(doorway.ends, axis=0)
     return _passed_share(counts, gap) >= _MIN_PASSED
 
 
 def is_thin(one: LoneLeaf, counts: _core.OccupancyGrid2D) -> bool:
-    """Whether beams passed on both sides of a leaf; `counts` as for `is_doorway_free`."""
+    """True if beams passed on both sides of a leaf; `counts` as for `is_doorway_free`."""
     across = np.array([-one.leaf[1], one.leaf[0]])
     if across @ one.shut < 0.0:
         across = -across

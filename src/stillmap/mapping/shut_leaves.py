@@ -1,4 +1,4 @@
-"""What fills a doorway behind the face of the wall: a leaf that was shut, or the back of a niche.
+"""Surfaces that fill a doorway behind the face of the wall: shut leaves, or backs of niches.
 
 Of one that never was seen open nothing tells which. But doors stand open for a share of the time,
 so that those which were found open tell how many others there are to be found shut.
@@ -25,7 +25,7 @@ _PRIOR_SECONDS = 300.0  # for which doors that stand open half of the time count
 
 
 def find_shut_leaf(doorway: Doorway, surface: Cells) -> LoneLeaf | None:
-    """What fills a doorway, if there is something.
+    """The surface that fills a doorway; None: there is none.
 
     Which end its hinge is at nobody knows: the first one is given.
 

@@ -68,7 +68,7 @@ def count_neighbors(
 
 
 def _find_own(numbers: Index, beams: Index) -> Index:
-    """Where in the rising beam numbers (N,) those of an object lie, which rise as well."""
+    """Indices into the rising beam numbers (N,) of the rising beam numbers of an object."""
     first, last = np.searchsorted(beams, [numbers[0], numbers[-1] + 1]) if len(numbers) else (0, 0)
     return np.asarray(np.searchsorted(numbers, beams[first:last]))
 
