@@ -14,7 +14,7 @@ from stillmap.mapping.door import Door, DoorState
 from stillmap.mapping.doorways import find_doorways
 from stillmap.mapping.lone_doors import compute_p_moved
 from stillmap.mapping.lone_leaves import find_open_leaf
-from stillmap.mapping.shut_leaves import estimate_door_share, find_shut_leaf
+from stillmap.mapping.shut_leaves import estimate_p_door, estimate_shut_share, find_shut_leaf
 from stillmap.pipeline.options import Options
 from stillmap.sim import CrowdOptions, LaserOptions, RobotOptions, Scene, simulate
 from stillmap.sim.walls import box
@@ -118,17 +118,28 @@ def door(*states):
 SWINGS = door(*[("open" if k % 2 else "shut", 20 * k, 20 * k + 10) for k in range(10)])
 
 
-def test_as_many_doors_are_shut_as_the_open_ones_tell():
-    assert estimate_door_share(10, 0, []) < 0.1
-    assert estimate_door_share(10, 5, []) == pytest.approx(0.5, abs=0.05)
+def test_what_fills_a_doorway_is_a_door_where_doorways_have_doors():
+    always_shut = np.full(8, 0.4)
+    assert estimate_p_door(always_shut, 0).max() < 0.15
+    assert estimate_p_door(always_shut, 7).min() > 0.3
+    assert estimate_p_door(np.full(30, 0.4), 2).max() < 0.1
+    assert len(estimate_p_door(np.zeros(0), 3)) == 0
+
+
+def test_a_leaf_that_would_have_been_seen_to_swing_is_no_door():
+    watched, glanced_at = estimate_p_door(np.array([0.01, 0.5]), 3)
+    assert watched < 0.05 < 0.3 < glanced_at
+
+
+def test_how_long_doors_are_shut_is_learned_from_those_that_swing():
+    assert estimate_shut_share([]) == pytest.approx(0.5)
     mostly_open = door(("open", 0, 5000), ("shut", 5010, 5020))
-    assert estimate_door_share(10, 5, [mostly_open]) < 0.15
-    assert estimate_door_share(2, 5, []) == 1.0
+    assert estimate_shut_share([mostly_open]) < 0.05
 
 
 def p_moved(doors, *looks, seconds=300):
     stamps = [np.array(one, np.int64) * S for one in looks]
-    return compute_p_moved(doors, stamps, np.array([0, seconds]) * S)
+    return compute_p_moved(doors, stamps, np.array([0, seconds]) * S)[1]
 
 
 def test_a_leaf_seen_once_moved_where_doors_swing():

@@ -21,7 +21,11 @@ from stillmap.mapping.door import Door, DoorState
 from stillmap.mapping.door_states import observe_looks
 from stillmap.mapping.doorways import find_doorways
 from stillmap.mapping.lone_leaves import LoneLeaf, find_open_leaf, is_doorway_free, is_thin
-from stillmap.mapping.shut_leaves import estimate_door_share, find_shut_leaf
+from stillmap.mapping.shut_leaves import (
+    estimate_p_door,
+    estimate_shut_share,
+    find_shut_leaf,
+)
 
 Cells = NDArray[np.int64]
 Float = NDArray[np.float64]
@@ -103,17 +107,18 @@ def _observe(
     resolution: float,
 ) -> list[Door]:
     """The doors with these leaves, each open or shut, when they were seen, and P(moved)."""
-    n_open = sum(is_open for _, is_open in found)
-    share = estimate_door_share(len(found) - n_open, n_open, doors)
-    if share < _MIN_P_LISTED:
-        found = [one for one in found if one[1]]
     looks = observe_looks([leaf.cells for leaf, _ in found], recording, poses, resolution)
     seen = [k for k, one in enumerate(looks) if len(one)]
     found, looks = [found[k] for k in seen], [looks[k] for k in seen]
-    moved = compute_p_moved(doors, looks, recording.stamp_ns)
+    is_open = np.array([one[1] for one in found], bool)
+    same, moved = compute_p_moved(doors, looks, recording.stamp_ns)
+    p_door = np.full(len(found), _P_LEAF)
+    p_door[~is_open] = estimate_p_door(
+        estimate_shut_share(doors) * same[~is_open], len(doors) + int(is_open.sum())
+    )
     return [
-        _make_door(leaf, is_open, resolution, stamps, p * (_P_LEAF if is_open else share))
-        for (leaf, is_open), stamps, p in zip(found, looks, moved, strict=True)
+        _make_door(*found[k], resolution, looks[k], float(moved[k] * p_door[k]))
+        for k in np.flatnonzero(p_door >= _MIN_P_LISTED)
     ]
 
 
@@ -142,8 +147,9 @@ def _make_door(
 
 def compute_p_moved(
     doors: Sequence[Door], looks: Sequence[NDArray[np.int64]], stamp_ns: NDArray[np.int64]
-) -> list[float]:
-    """Probability that each of some doors moved while nobody saw it.
+) -> tuple[Float, Float]:
+    """Probability that each of some doors was in the same position at all looks, (K,), and if it
+    was, that it moved while nobody saw it, (K,).
 
     A door swings at a constant rate, the same for all of them. The two positions of a door that
     swung at the rate r differ after t with probability (1 - exp(-2 r t)) / 2.
@@ -153,16 +159,17 @@ def compute_p_moved(
         looks: (L, 2) of each of the others, see `observe_looks`.
         stamp_ns: (T,) of the recording.
     """
-    log_likelihood = np.zeros(len(_RATES))
-    for door in doors:
-        log_likelihood += _log_likelihood_of_swings(door)
     spans = [_split_looks(one) for one in looks]
-    for watched, gaps in spans:
-        same = 0.5 * (1.0 + np.exp(-2.0 * np.outer(_RATES, gaps)))
-        log_likelihood += np.log(same).sum(axis=1) - _RATES * watched
+    log_same = [
+        np.log(0.5 * (1.0 + np.exp(-2.0 * np.outer(_RATES, gaps)))).sum(axis=1) - _RATES * watched
+        for watched, gaps in spans
+    ]
+    swings = [_log_likelihood_of_swings(door) for door in doors]
+    log_likelihood = np.sum([np.zeros(len(_RATES)), *swings, *log_same], axis=0)
     posterior = np.exp(log_likelihood - log_likelihood.max())
     posterior /= posterior.sum()
-    out = []
+    same = [float(posterior @ np.exp(one)) for one in log_same]
+    moved = []
     for stamps, (_, gaps) in zip(looks, spans, strict=True):
         ends = 1e-9 * float((stamps[0, 0] - stamp_ns[0]) + (stamp_ns[-1] - stamps[-1, 1]))
         # it was in one position at both ends of a gap: an even number of swings, none with 1 / cosh
@@ -170,8 +177,8 @@ def compute_p_moved(
             np.outer(_RATES, gaps), -np.outer(_RATES, gaps)
         ).sum(axis=1)
         log_still += len(gaps) * math.log(2.0)
-        out.append(1.0 - float(posterior @ np.exp(log_still)))
-    return out
+        moved.append(1.0 - float(posterior @ np.exp(log_still)))
+    return np.array(same), np.array(moved)
 
 
 def _log_likelihood_of_swings(door: Door) -> Float:

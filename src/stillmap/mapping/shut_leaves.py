@@ -1,7 +1,7 @@
 """Surfaces that fill a doorway behind the face of the wall: shut leaves, or backs of niches.
 
-Of one that never was seen open nothing tells which. But doors stand open for a share of the time,
-so that those which were found open tell how many others there are to be found shut.
+Of one that never was seen open nothing tells which. But those that were seen to swing or stood open
+tell how many of the doorways have a door, and for which share of the time doors are shut.
 """
 
 from collections.abc import Sequence
@@ -22,6 +22,7 @@ _MIN_COVERED, _MIN_EXACT = 0.9, 0.5  # share of the leaf within a cell of surfac
 _MIN_JAMB = 0.5  # share of the edges of the wall, from its face to the leaf, that are seen
 _ASIDE, _MAX_ASIDE = np.array([3.0, 4.0, 5.0]), 0.4  # cells beside the leaf; share that is surface
 _PRIOR_SECONDS = 300.0  # for which doors that stand open half of the time count
+_MAX_ITERATIONS = 100
 
 
 def find_shut_leaf(doorway: Doorway, surface: Cells) -> LoneLeaf | None:
@@ -68,16 +69,28 @@ def _rate_leaf(
     return covered + exact, cells[field.sample(field.is_surface, cells)]
 
 
-def estimate_door_share(n_filled: int, n_open: int, doors: Sequence[Door]) -> float:
-    """Share of the doorways which are filled that have a door which opens at times.
+def estimate_p_door(p_shut: Float, n_doors: int) -> Float:
+    """(F,) probability that each of F surfaces which fill a doorway is a door that opens at times.
+
+    Of all doorways the share pi has such a door, and pi ~ Beta(1, 1). EM: pi given which of the
+    filled ones are doors, and which are given pi.
 
     Args:
-        n_filled: doorways that something fills.
-        n_open: doors that stood open whenever they were seen.
-        doors: those that were seen to swing, which tell for how much of the time doors are open.
+        p_shut: (F,) probability that a door would have been shut whenever this one was seen.
+        n_doors: doorways that have one for certain: it was seen to swing, or stood open.
     """
+    p_door = np.full(len(p_shut), 0.5)
+    for _ in range(_MAX_ITERATIONS):
+        share = (n_doors + p_door.sum() + 1.0) / (n_doors + len(p_door) + 2.0)
+        p_door, before = share * p_shut / (share * p_shut + 1.0 - share), p_door
+        if np.allclose(p_door, before, rtol=0.0, atol=1e-3):
+            break
+    return p_door
+
+
+def estimate_shut_share(doors: Sequence[Door]) -> float:
+    """Share of the time for which doors are shut, by those that were seen to swing."""
     seconds = {"open": 0.5 * _PRIOR_SECONDS, "shut": 0.5 * _PRIOR_SECONDS}
     for state in (state for door in doors for state in door.states):
         seconds[state.position] += 1e-9 * (state.until_ns - state.since_ns)
-    expected = n_open * seconds["shut"] / seconds["open"]
-    return min((expected + 0.5) / (n_filled + 1.0), 1.0)
+    return seconds["shut"] / (seconds["open"] + seconds["shut"])
