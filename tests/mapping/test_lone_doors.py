@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 import stillmap
+from stillmap import _core
 from stillmap.core.config import override
 from stillmap.mapping.door import Door, DoorState
 from stillmap.mapping.doorways import find_doorways
 from stillmap.mapping.lone_doors import compute_p_moved
-from stillmap.mapping.lone_leaves import find_open_leaf
+from stillmap.mapping.lone_leaves import find_open_leaf, is_thin
 from stillmap.mapping.shut_leaves import estimate_p_door, estimate_shut_share, find_shut_leaf
 from stillmap.pipeline.options import Options
 from stillmap.sim import CrowdOptions, LaserOptions, RobotOptions, Scene, simulate
@@ -93,6 +94,35 @@ def test_what_is_no_leaf(more):
     assert find_leaf(*more) is None
 
 
+@pytest.mark.parametrize(
+    ("roughness", "share_behind", "is_leaf"),
+    [(1.0, 1.0, True), (1.0, 0.5, False), (0.8, 0.5, True), (0.4, 0.1, False), (1.3, 1.0, False)],
+)
+def test_a_rough_leaf_must_be_thin(roughness, share_behind, is_leaf):
+    one = find_leaf(*leaf(90.0))._replace(roughness=roughness)
+    counts = _core.OccupancyGrid2D(RESOLUTION, moments=False)
+    t = np.arange(one.length + 1.0)
+    passed = []
+    for side, share in ((1.0, 1.0), (-1.0, share_behind)):
+        across = side * one.shut
+        upto = t[: round(0.3 * len(t) + share * 0.7 * len(t))]
+        passed += [one.hinge + upto[:, None] * one.leaf + k * across for k in (3.0, 4.0, 5.0)]
+    ends = RESOLUTION * (np.concatenate(passed) + 0.5)
+    for _ in range(3):
+        add_passes(counts, ends)
+    assert is_thin(one, counts) == is_leaf
+
+
+def add_passes(counts, points):
+    """Beams of a cell and a half that pass cells from left to right and end in the next ones."""
+    T = np.tile(np.eye(3), (len(points), 1, 1))
+    T[:, :2, 2] = points - [0.6 * RESOLUTION, 0.0]
+    beams = np.tile(np.float32([1.5 * RESOLUTION, 0.0]), (len(points), 1))
+    offset = np.arange(len(points) + 1)
+    is_hit = np.zeros(len(points), bool)
+    _core.add_beams(counts, beams, is_hit, np.ones(len(points), np.float32), offset, T, 1)
+
+
 def filled(depth, beyond=0):
     edges = [row((x, 0), 90, depth + 1) for x in (40, 40 + GAP)]
     back = row((41 - beyond, depth), 0, GAP - 1 + 2 * beyond)
@@ -107,6 +137,16 @@ def test_what_fills_a_doorway_behind_its_face():
     assert set(found.cells[:, 1].tolist()) == {4}
     assert filled(4, beyond=8) is None  # a wall behind the gap
     assert filled(12) is None
+
+
+def test_the_edge_of_a_wall_drawn_too_long_hides_a_part_of_the_leaf():
+    edges = [row((x, 0), 90, 5) for x in (45, 40 + GAP)]
+    leaf_row, longer_wall = row((40, 4), 0, GAP), row((40, 0), 0, 6)
+    surface = cells(*wall(), leaf_row, longer_wall, *edges)
+    (doorway,) = find_doorways(surface, RESOLUTION)
+    found = find_shut_leaf(doorway, surface)
+    assert found is not None
+    assert found.cells[:, 0].min() <= 41
 
 
 def door(*states):

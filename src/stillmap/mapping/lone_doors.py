@@ -32,7 +32,7 @@ Float = NDArray[np.float64]
 Labels = NDArray[np.float32]
 
 _P_LEAF = 36.0 / 37.0  # 35 of 35 open ones in four simulated offices were; rule of succession
-_MIN_P_LISTED = 0.2  # that what fills a doorway is a door at all
+_MIN_P_LISTED = 0.15  # that what fills a doorway is a door at all
 _RATES = np.geomspace(1e-5, 1.0, 61)  # per s, of swings, each as probable before any is seen
 _WATCHED = 2.0  # s between two looks within which a swing would have been seen
 _LOOK = 0.2  # s between scans whose beams show what is free

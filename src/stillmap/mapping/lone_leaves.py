@@ -30,11 +30,14 @@ _BEYOND = (2.0, 5.0)  # cells beyond its end, which is free
 _NOISE = math.radians(15.0)  # of the swing beside either position
 _RADII = np.array([0.4, 0.55, 0.7, 0.85, 0.97])  # of the leaf, where the swing is looked at
 _MAX_SWEPT = 0.02  # share of the swing that is surface
-_BAND, _MAX_ROUGHNESS = 4.0, 1.0  # cells beside the leaf that are of it, and their deviation
+_BAND = 4.0  # cells beside the leaf that are of it
 _JAMB = 4.0  # cells behind the face of the wall, where its edge and the leaf are one
 _BEHIND_WALL, _GOES_ON, _MAX_GOES_ON = 8.0, 7.0, 1  # cells behind the hinge; of a row beyond; in it
 _MIN_PASSED = 0.9  # share of the doorway, and of its side of the leaf, that beams passed
-_MIN_BEHIND = 0.4  # the same of the other side, which walls hide from the doorway
+_MIN_BEHIND = 0.3  # the same of the other side, which walls hide from the doorway
+# cells that surface deviates from a line, where none of the other side was passed, and more where
+# all of it was
+_ROUGHNESS, _MORE_ROUGHNESS = 0.75, 0.35
 _BESIDE = np.array([3.0, 4.0, 5.0])  # cells from the leaf, of a row that beams pass beside it
 _MAX_HIT_SHARE, _MIN_LENGTHS = 0.25, 0.5  # of the beams in a cell that passed; cell lengths
 
@@ -48,6 +51,7 @@ class LoneLeaf(NamedTuple):
         shut, leaf: (2,) unit directions from the hinge to the other end of the doorway, and along
             the leaf.
         cells: (K, 2) of it, without those at the edge of the wall.
+        roughness: cells, standard deviation of its surface from a line.
     """
 
     hinge: Float
@@ -55,6 +59,7 @@ class LoneLeaf(NamedTuple):
     shut: Float
     leaf: Float
     cells: Cells
+    roughness: float = 0.0
 
 
 def find_open_leaf(doorway: Doorway, surface: Cells) -> LoneLeaf | None:
@@ -74,21 +79,34 @@ def find_open_leaf(doorway: Doorway, surface: Cells) -> LoneLeaf | None:
         if rated is not None and rated[0] > best[0]:
             best = rated
     leaf = best[1]
-    return leaf if leaf is not None and _is_straight(leaf, near) else None
+    if leaf is None or _goes_on(leaf, near):
+        return None
+    leaf = leaf._replace(roughness=_measure_roughness(leaf, near))
+    return leaf if leaf.roughness <= _ROUGHNESS + _MORE_ROUGHNESS else None
 
 
-def _is_straight(one: LoneLeaf, surface: Cells) -> bool:
-    """True if the surface of a leaf lies on a line that ends at the hinge."""
-    off = surface - one.hinge
-    along, across = off @ one.leaf, off @ np.array([-one.leaf[1], one.leaf[0]])
+def _goes_on(one: LoneLeaf, surface: Cells) -> bool:
+    """True if the surface of a leaf goes on behind the hinge."""
+    along, across = _along_and_across(one, surface)
+    behind = (along < -_BEHIND_WALL) & (along > -_BEHIND_WALL - _GOES_ON)
+    row = np.unique(np.round(along[behind & (np.abs(across) <= 1.5)]))
+    return len(row) > _MAX_GOES_ON
+
+
+def _measure_roughness(one: LoneLeaf, surface: Cells) -> float:
+    """Standard deviation of the surface of a leaf from a line, cells."""
+    along, across = _along_and_across(one, surface)
     of_leaf = (along > _NEAR_HINGE * one.length) & (along < one.length)
     of_leaf &= np.abs(across) <= _BAND
     line = np.column_stack([along[of_leaf], np.ones(np.count_nonzero(of_leaf))])
     fitted = line @ np.linalg.lstsq(line, across[of_leaf], rcond=None)[0]
-    behind = (along < -_BEHIND_WALL) & (along > -_BEHIND_WALL - _GOES_ON)
-    goes_on = np.unique(np.round(along[behind & (np.abs(across) <= 1.5)]))
-    is_line = np.mean((across[of_leaf] - fitted) ** 2) <= _MAX_ROUGHNESS**2
-    return bool(is_line and len(goes_on) <= _MAX_GOES_ON)
+    return float(np.sqrt(np.mean((across[of_leaf] - fitted) ** 2)))
+
+
+def _along_and_across(one: LoneLeaf, cells: Cells) -> tuple[Float, Float]:
+    """Coordinates of cells from the hinge of a leaf, along it and across."""
+    off = cells - one.hinge
+    return off @ one.leaf, off @ np.array([-one.leaf[1], one.leaf[0]])
 
 
 def is_doorway_free(doorway: Doorway, counts: _core.OccupancyGrid2D) -> bool:
@@ -98,7 +116,8 @@ def is_doorway_free(doorway: Doorway, counts: _core.OccupancyGrid2D) -> bool:
 
 
 def is_thin(one: LoneLeaf, counts: _core.OccupancyGrid2D) -> bool:
-    """True if beams passed on both sides of a leaf; `counts` as for `is_doorway_free`."""
+    """True if beams passed on both sides of a leaf, the more the rougher it is; `counts` as for
+    `is_doorway_free`."""
     across = np.array([-one.leaf[1], one.leaf[0]])
     if across @ one.shut < 0.0:
         across = -across
@@ -107,7 +126,8 @@ def is_thin(one: LoneLeaf, counts: _core.OccupancyGrid2D) -> bool:
     inside, behind = (
         max(_passed_share(counts, row + k * side * across) for k in _BESIDE) for side in (1.0, -1.0)
     )
-    return inside >= _MIN_PASSED and behind >= _MIN_BEHIND
+    is_straight = one.roughness <= _ROUGHNESS + _MORE_ROUGHNESS * behind
+    return inside >= _MIN_PASSED and behind >= _MIN_BEHIND and is_straight
 
 
 def _passed_share(counts: _core.OccupancyGrid2D, points: Float) -> float:

@@ -21,6 +21,7 @@ _RECESS = np.arange(2.0, 7.0)  # cells behind the face of the wall
 _MIN_COVERED, _MIN_EXACT = 0.9, 0.5  # share of the leaf within a cell of surface, and on it
 _MIN_JAMB = 0.5  # share of the edges of the wall, from its face to the leaf, that are seen
 _ASIDE, _MAX_ASIDE = np.array([3.0, 4.0, 5.0]), 0.4  # cells beside the leaf; share that is surface
+_HIDDEN = np.arange(5.0)  # cells of the leaf that the edge of a wall may hide, drawn too long
 _PRIOR_SECONDS = 300.0  # for which doors that stand open half of the time count
 _MAX_ITERATIONS = 100
 
@@ -60,9 +61,14 @@ def _rate_leaf(
     depth = np.arange(1.0, float(np.linalg.norm(recess)))[:, None] / np.linalg.norm(recess)
     for end, outwards in zip(doorway.ends, (-u, u), strict=True):
         jamb = field.sample(field.is_near, end + depth * recess).mean()
-        aside = field.sample(field.is_surface, end + recess + _ASIDE[:, None] * outwards).mean()
-        if jamb < _MIN_JAMB or aside > _MAX_ASIDE:
+        beside = end + recess + (_HIDDEN[:, None] + _ASIDE)[..., None] * outwards
+        is_free = field.sample(field.is_surface, beside).mean(axis=1) <= _MAX_ASIDE
+        if jamb < _MIN_JAMB or not is_free.any():
             return 0.0, np.empty((0, 2), np.int64)
+        hidden = float(is_free.argmax())
+        if hidden:
+            more = np.arange(hidden + _ASIDE[0])[:, None] * outwards
+            row = np.concatenate([row, end + recess + more])
     across = recess / np.linalg.norm(recess)
     points = np.concatenate([row + k * across for k in (-1.0, 0.0, 1.0)])
     cells = np.unique(np.round(points).astype(np.int64), axis=0)
@@ -72,7 +78,7 @@ def _rate_leaf(
 def estimate_p_door(p_shut: Float, n_doors: int) -> Float:
     """(F,) probability that each of F surfaces which fill a doorway is a door that opens at times.
 
-    Of all doorways the share pi has such a door, and pi ~ Beta(1, 1). EM: pi given which of the
+    Of all doorways the share pi has such a door, and pi ~ Beta(1, 2). EM: pi given which of the
     filled ones are doors, and which are given pi.
 
     Args:
@@ -81,7 +87,7 @@ def estimate_p_door(p_shut: Float, n_doors: int) -> Float:
     """
     p_door = np.full(len(p_shut), 0.5)
     for _ in range(_MAX_ITERATIONS):
-        share = (n_doors + p_door.sum() + 1.0) / (n_doors + len(p_door) + 2.0)
+        share = (n_doors + p_door.sum() + 1.0) / (n_doors + len(p_door) + 3.0)
         p_door, before = share * p_shut / (share * p_shut + 1.0 - share), p_door
         if np.allclose(p_door, before, rtol=0.0, atol=1e-3):
             break
