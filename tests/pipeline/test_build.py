@@ -100,8 +100,10 @@ def test_the_map_follows_from_the_labels(room, fixed):
     assert np.isnan(e[100:110]).all()
     assert np.ptp(e[hit]) > 0.5
     assert result.changes == []
-    again, _ = em.final_e_step(recording, result.poses, m.resolution, result.options.em, threads=2)
-    given_tracks, _ = apply_motion_evidence(result.deskewed, result.poses, again.p_static)
+    poses, chosen = result.poses, result.options.em
+    again, courses = em.final_e_step(recording, poses, m.resolution, chosen, threads=2)
+    noise_std = courses.surfel_map.noise_std
+    given_tracks, _ = apply_motion_evidence(result.deskewed, poses, again.p_static, noise_std)
     np.testing.assert_array_equal(given_tracks, e)
     assert again.learned == {k: v for k, v in result.learned.items() if k != "changing"}
     assert 0.0 < result.learned["changing"] < 1.0

@@ -148,7 +148,8 @@ def test_what_is_not_listed_stays_what_it_is_without_changes():
     there |= (element >= 0) & on_leaf[element]
     shown[on_leaf[element]] = 0.0
     shown *= 1.0 - find_shown_cells(courses, result.changes, "last").p_leaf[element]
-    others, _ = apply_motion_evidence(result.deskewed, result.poses, without.p_static)
+    noise_std = courses.surfel_map.noise_std
+    others, _ = apply_motion_evidence(result.deskewed, result.poses, without.p_static, noise_std)
     np.testing.assert_array_equal(result.p_static, np.where(there, shown, others))
     assert (result.p_static != without.p_static).mean() > 0.01
     assert result.learned == {**without.learned, "changing": round(courses.changing_weight, 6)}

@@ -1,5 +1,7 @@
 """What a fast mover explains is dynamic, and what stands beside its way is not."""
 
+import dataclasses
+
 import numpy as np
 
 from stillmap.core.recording import Recording
@@ -75,3 +77,13 @@ def test_few_hits_in_a_place_follow_what_holds_elsewhere_on_the_road():
     alone = 1.0 / (1.0 + np.exp(-compute_log_ratio(np.array([1.0]), np.array([0.0]))))
     np.testing.assert_allclose(walker.max(), 0.9 * alone[0], rtol=1e-5)
     assert car.max() < walker.min() - 0.05
+
+
+def test_what_is_beside_a_walker_is_not_on_him():
+    xy = np.tile([10.0, 0.7], (len(SECONDS), 1))
+    walker = MoverPath(SECONDS, xy, np.zeros_like(xy), length=0.5, width=0.5, is_round=True)
+    poses, recording = np.tile(np.eye(3), (len(SECONDS), 1, 1)), recorded()
+    for offset, n_hits in (((0.0, 0.0), len(SECONDS)), ((0.24, 0.0), 0)):
+        moved = dataclasses.replace(walker, xy=xy + offset)
+        found = find_mover_hits(recording, poses, SECONDS, [moved], np.ones(1))
+        assert np.count_nonzero(found.beam % 2) == n_hits  # on the post 0.3 m away, or 0.38 m

@@ -4,22 +4,27 @@ import numpy as np
 import pytest
 
 from stillmap.core.recording import Recording
+from stillmap.tracking.clustering import extract_dynamic_points
 from stillmap.tracking.learned_share import fit_share
 from stillmap.tracking.motion_evidence import (
     TrackEvidence,
     apply_motion_evidence,
+    collect_evidence,
     compute_log_ratio,
+    ignore_sliding,
 )
 
 ANGLES = np.radians(np.arange(-180.0, 180.0, 0.5))
 ROOM = 8.0  # m to the wall
+NOISE_STD = 0.01  # m
 RATE = 10.0
 
 
 def evidence(**changes):
     """One track: 40 looks at something thick, seen from first to last, that stands."""
     usual = {"looks": 40, "hits": 6, "missed": 0, "windows": 3, "moving": 0, "open_ends": 0}
-    return TrackEvidence(*(np.array([float(x)]) for x in (usual | changes).values()))
+    values = (usual | {"spread": 0.1} | changes).values()
+    return TrackEvidence(*(np.array([float(x)]) for x in values))
 
 
 def log_ratio(**changes):
@@ -95,7 +100,7 @@ def judged(things):
     recording, who = recorded(things)
     p_static = np.where(who >= 0, 0.05, 0.95).astype(np.float32)
     poses = np.tile(np.eye(3), (recording.n_scans, 1, 1))
-    found, movers = apply_motion_evidence(recording, poses, p_static)
+    found, movers = apply_motion_evidence(recording, poses, p_static, NOISE_STD)
     assert np.array_equal(found[who < 0], p_static[who < 0])
     return [float(found[who == i].mean()) for i in range(len(things))], movers
 
@@ -123,6 +128,41 @@ def test_walkers_stay_dynamic_and_furniture_becomes_static():
     assert near_chair > 0.5
 
 
+def sliding_patch(width):
+    """Evidence of a part of a wall, or of something that wide, that slides along it at .5 m/s."""
+    rng = np.random.default_rng(5)
+    seconds = np.arange(0.0, 6.0, 1.0 / RATE)
+    along = 0.5 * seconds[:, None] + np.linspace(-0.15, 0.15, 6)
+    across = rng.normal(0.0, width, along.shape)
+    n = len(seconds)
+    recording = Recording(
+        stamp_ns=(1e9 * seconds).astype(np.int64),
+        offset=np.arange(n + 1, dtype=np.int64) * 6,
+        points=np.stack([along, 3.0 + across], axis=-1).reshape(-1, 2).astype(np.float32),
+        hit=np.ones(6 * n, bool),
+        T_odom_base=None,
+        T_base_sensor=np.eye(3)[None],
+        sensor=np.zeros(n, np.int32),
+    )
+    poses = np.tile(np.eye(3), (n, 1, 1))
+    points = extract_dynamic_points(recording, poses, np.zeros(6 * n, np.float32), 0.5)
+    owner = np.zeros(len(points.scan), np.intp)
+    _, found = collect_evidence(recording, poses, points, owner)
+    return found, ignore_sliding(found, NOISE_STD)
+
+
+def test_a_part_of_a_wall_that_slides_along_it_shows_no_motion():
+    before, walks = sliding_patch(0.05)
+    assert before.moving[0] >= 3
+    assert before.spread[0] == pytest.approx(0.05, rel=0.1)
+    assert walks == before
+    before, slides = sliding_patch(NOISE_STD)
+    assert before.moving[0] >= 3
+    assert slides.moving[0] == 0
+    assert slides.windows[0] == before.windows[0] - before.moving[0]
+    assert compute_log_ratio(slides)[0] < compute_log_ratio(before)[0] - 4.0
+
+
 def test_where_nobody_walks_all_is_furniture():
     found, movers = judged(CHAIRS)
     assert min(found) > 0.9
@@ -139,7 +179,7 @@ def test_no_dynamic_beams_no_work():
     recording, who = recorded([walker(2.0)])
     p_static = np.ones(len(who), np.float32)
     poses = np.tile(np.eye(3), (recording.n_scans, 1, 1))
-    found, movers = apply_motion_evidence(recording, poses, p_static)
+    found, movers = apply_motion_evidence(recording, poses, p_static, NOISE_STD)
     assert np.array_equal(found, p_static)
     assert len(movers.xy) == 0
 
@@ -159,6 +199,6 @@ def test_a_walker_is_dynamic_where_his_cells_do_not_say_so():
     unknown = (who == 0) & (scan % 4 == 0)
     p_static[unknown] = 0.8
     poses = np.tile(np.eye(3), (recording.n_scans, 1, 1))
-    found, _ = apply_motion_evidence(recording, poses, p_static)
+    found, _ = apply_motion_evidence(recording, poses, p_static, NOISE_STD)
     assert np.mean(found[unknown] < 0.5) > 0.9
     np.testing.assert_array_equal(found[who < 0], p_static[who < 0])

@@ -135,7 +135,8 @@ def _add_motion_evidence(
     deskewed: Recording, best: Estimate, courses: em.CellHistories, threads: int
 ) -> tuple[Estimate, MoverPoints]:
     """Labels of beams and cells, given which tracks are movers; the end points on these."""
-    p_static, movers = apply_motion_evidence(deskewed, best.poses, best.p_static)
+    noise_std = courses.surfel_map.noise_std
+    p_static, movers = apply_motion_evidence(deskewed, best.poses, best.p_static, noise_std)
     occupied = update_occupancy(
         deskewed, best.poses, best.p_static, p_static, courses, best.e_step.known_cells, threads
     )

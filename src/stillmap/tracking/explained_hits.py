@@ -20,13 +20,13 @@ Float = NDArray[np.float64]
 Index = NDArray[np.intp]
 Labels = NDArray[np.float32]
 
-_MARGIN = 0.15  # m around the box
+_MARGIN, _MARGIN_OF_WALKERS = 0.15, 0.1  # m around the box, the circle: chairs are near walkers
 _CELL = 0.25  # m, of a place
 _STRAY = 19.0  # Beta(1, 19): share of the hits outside, of places that only movers were in
 
 
 class MoverHits(NamedTuple):
-    """Hits within the boxes of movers.
+    """Hits within the boxes, of walkers circles, of movers.
 
     Attributes:
         beam: (n,) rising.
@@ -130,7 +130,9 @@ def find_mover_hits(
     if not len(paths):
         return MoverHits(np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros(0))
     boxes = _place_boxes(seconds, paths)
-    half = 0.5 * np.array([(path.length, path.width) for path in paths]) + _MARGIN
+    is_round = np.array([path.is_round for path in paths])
+    half = 0.5 * np.array([(path.length, path.width) for path in paths])
+    half += np.where(is_round, _MARGIN_OF_WALKERS, _MARGIN)[:, None]
     begins = np.flatnonzero(np.diff(boxes.scan, prepend=-1))
     rows = np.split(np.arange(len(boxes.scan)), begins[1:])
     found = []
@@ -143,6 +145,7 @@ def find_mover_hits(
         off, u, size = xy[:, None] - boxes.xy[row], boxes.heading[row], half[boxes.path[row]]
         inside = np.abs((off * u).sum(axis=-1)) <= size[:, 0]
         inside &= np.abs(off[..., 1] * u[:, 0] - off[..., 0] * u[:, 1]) <= size[:, 1]
+        inside &= ~is_round[boxes.path[row]] | ((off**2).sum(axis=-1) <= size[:, 0] ** 2)
         weights = inside * p_mover[boxes.path[row]]
         likeliest = weights.argmax(axis=1)
         weight = weights[np.arange(len(beam)), likeliest]

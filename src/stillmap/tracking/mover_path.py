@@ -26,6 +26,7 @@ class MoverPath:
         xy: (L, 2) metres, its center in the map frame.
         velocity: (L, 2) metres per second.
         length, width: metres, of the box.
+        is_round: it is a walker's, whose width is that of a circle.
     """
 
     seconds: Float
@@ -33,6 +34,7 @@ class MoverPath:
     velocity: Float
     length: float
     width: float
+    is_round: bool = False
 
     @property
     def travel(self) -> float:

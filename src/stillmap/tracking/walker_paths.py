@@ -41,7 +41,5 @@ def iterate_walker_paths(
         at = np.searchsorted(scan, points.scan[here])
         center = xy + estimate_center_offset(xy, points.sensor[scan], points.xy[here], at)
         t = points.seconds[scan]
-        yield (
-            track,
-            MoverPath(t, *smooth_track(t, center, SMOOTHER_STD, ACCELERATION), _WIDTH, _WIDTH),
-        )
+        smooth = smooth_track(t, center, SMOOTHER_STD, ACCELERATION)
+        yield track, MoverPath(t, *smooth, _WIDTH, _WIDTH, is_round=True)
