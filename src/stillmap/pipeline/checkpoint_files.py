@@ -93,6 +93,7 @@ def _unpack(hint: Any, value: Any, arrays: Mapping[str, Any]) -> Any:
         if hint == em.Grid:
             return em.make_grid(*value)
         [hint] = (one for one in typing.get_args(hint) if one is not type(None))
+    hint = _resolve_alias(hint)
     origin, parameters = typing.get_origin(hint), typing.get_args(hint)
     if origin is np.ndarray:
         return _array_of(hint, arrays[value], value)
@@ -120,9 +121,15 @@ def _unpack(hint: Any, value: Any, arrays: Mapping[str, Any]) -> Any:
     return _typed(value, hint)
 
 
+def _resolve_alias(hint: Any) -> Any:
+    """What a type alias with parameters stands for; `NDArray` is one since NumPy 2.5."""
+    alias = typing.get_origin(hint)
+    return alias.__value__[typing.get_args(hint)] if hasattr(alias, "__value__") else hint
+
+
 def _array_of(hint: Any, array: NDArray[Any], name: str) -> NDArray[Any]:
     """The array, of the elements that its type hint names."""
-    wanted = typing.get_args(typing.get_args(hint)[1])[0]
+    wanted = typing.get_args(typing.get_args(_resolve_alias(hint))[1])[0]
     if not np.issubdtype(array.dtype, wanted):
         raise TypeError(f"{name} holds {array.dtype}")
     return array
