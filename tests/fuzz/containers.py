@@ -9,6 +9,7 @@ import bz2
 import random
 import sqlite3
 import struct
+from contextlib import closing
 
 import lz4.frame
 import lzf
@@ -210,28 +211,34 @@ def mutate_db3(data: bytes, mutate: Mutation, chance: random.Random) -> bytes:
     if chance.random() < 0.3:
         return mutate(data)
     try:
-        base = sqlite3.connect(":memory:")
-        base.deserialize(data)
-        if chance.random() < 0.05:
-            base.executescript(chance.choice(_HOSTILE))
-        else:
-            table = chance.choice(["messages", "messages", "messages", "topics", "schema"])
-            columns = [row[1] for row in base.execute(f"PRAGMA table_info({table})")]
-            rows = [row[0] for row in base.execute(f"SELECT rowid FROM {table} LIMIT 100")]
-            column, row = chance.choice(columns), chance.choice(rows)
-            query = f"SELECT {column} FROM {table} WHERE rowid = ?"
-            (old,) = base.execute(query, (row,)).fetchone() or (None,)
-            if isinstance(old, bytes) and chance.random() < 0.8:
-                new = mutate(old)
-            elif isinstance(old, str) and chance.random() < 0.5:
-                new = mutate(old.encode()).decode("utf-8", "replace")
-            else:
-                new = chance.choice(_ODD)
-            base.execute(f"UPDATE {table} SET {column} = ? WHERE rowid = ?", (new, row))
-        base.commit()
-        return bytes(base.serialize())
+        with closing(sqlite3.connect(":memory:")) as base:
+            _mutate_database(base, data, mutate, chance)
+            return bytes(base.serialize())
     except (sqlite3.Error, LookupError, ValueError, OverflowError):
         return mutate(data)
+
+
+def _mutate_database(
+    base: sqlite3.Connection, data: bytes, mutate: Mutation, chance: random.Random
+) -> None:
+    base.deserialize(data)
+    if chance.random() < 0.05:
+        base.executescript(chance.choice(_HOSTILE))
+    else:
+        table = chance.choice(["messages", "messages", "messages", "topics", "schema"])
+        columns = [row[1] for row in base.execute(f"PRAGMA table_info({table})")]
+        rows = [row[0] for row in base.execute(f"SELECT rowid FROM {table} LIMIT 100")]
+        column, row = chance.choice(columns), chance.choice(rows)
+        query = f"SELECT {column} FROM {table} WHERE rowid = ?"
+        (old,) = base.execute(query, (row,)).fetchone() or (None,)
+        if isinstance(old, bytes) and chance.random() < 0.8:
+            new = mutate(old)
+        elif isinstance(old, str) and chance.random() < 0.5:
+            new = mutate(old.encode()).decode("utf-8", "replace")
+        else:
+            new = chance.choice(_ODD)
+        base.execute(f"UPDATE {table} SET {column} = ? WHERE rowid = ?", (new, row))
+    base.commit()
 
 
 # E57
