@@ -3,7 +3,7 @@
 import subprocess
 import sys
 
-PER_RETURN = 4200  # bytes; blocks of cells around each would take twice as much
+PER_RETURN = 2000  # bytes; whole blocks of cells around each would take twice as much
 SCRIPT = """
 from pathlib import Path
 import numpy as np

@@ -21,19 +21,19 @@ def allow(monkeypatch, megabytes):
 
 
 def test_returns_far_from_each_other_are_refused(monkeypatch):
-    allow(monkeypatch, 80)
-    with pytest.raises(stillmap.InputError, match=r"0\.15 m takes at least 0\.1\d* GB") as caught:
+    allow(monkeypatch, 50)
+    with pytest.raises(stillmap.InputError, match=r"0\.15 m takes at least 0\.05\d* GB") as caught:
         stillmap.build(sweeps(500.0), {"threads": 1})
     assert "slam.voxel_size" in str(caught.value)
 
 
 def test_as_many_close_to_each_other_are_not(monkeypatch):
-    allow(monkeypatch, 80)
+    allow(monkeypatch, 50)
     require_map_memory(sweeps(3.0), None, CELL)
 
 
 def test_more_memory_is_enough(monkeypatch):
-    allow(monkeypatch, 120)
+    allow(monkeypatch, 60)
     require_map_memory(sweeps(500.0), None, CELL)
 
 
@@ -52,6 +52,6 @@ def test_the_way_of_the_robot_counts(monkeypatch):
 
 def test_of_long_recordings_some_beams_are_enough(monkeypatch):
     monkeypatch.setattr("stillmap.pipeline.memory_need._MAX_BEAMS", 20_000)
-    allow(monkeypatch, 50)
-    with pytest.raises(stillmap.InputError, match=r"at least 0\.05\d* GB"):
+    allow(monkeypatch, 25)
+    with pytest.raises(stillmap.InputError, match=r"at least 0\.02\d* GB"):
         require_map_memory(sweeps(500.0), None, CELL)

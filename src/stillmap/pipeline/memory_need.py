@@ -25,7 +25,7 @@ _LEAST_SHARE = 0.5
 
 # bytes in 3D of a block of cells, and of the surfel and the filters of a cell on which beams ended;
 # measured on returns far from each other
-_PER_BLOCK_3D, _PER_SURFEL = 4 * 8**3, 700
+_PER_BLOCK_3D, _PER_SURFEL = 700, 700
 _EDGE_3D = 8  # cells, of a block
 _MAX_BEAMS = 1 << 22  # of a recording in 3D that are looked at
 _KEY_BITS = 21  # of a coordinate: what lies farther apart counts once, as little as it is

@@ -14,14 +14,15 @@
 namespace stillmap {
 
 // Has the block layout of OccupancyGrid, so BlockCursor and RayWalker work on both.
-template <int D, class Value>
+// Values: container of the values of a block.
+template <int D, class Value, class Values = std::array<Value, BlockLayout<D>::kCells>>
 class BlockMap : public BlockLayout<D> {
  public:
   using BlockLayout<D>::kCells;
 
   struct Block {
-    Cell<D> origin;                    // in blocks
-    std::array<Value, kCells> values;  // one per cell
+    Cell<D> origin;  // in blocks
+    Values values;   // one per cell
   };
 
   static constexpr size_t kNoBlock = std::numeric_limits<size_t>::max();

@@ -1,10 +1,12 @@
-// Queries of all indexed cells in a window around a cell. Caches the 3^D blocks around the block of
-// the window's centre, since successive queries are usually close together. In 3D, where most cells
-// are empty, indexed ones are found in bit masks of the rows of cells.
+// Queries of all indexed cells in a window around a cell. Caches those of the 3^D blocks around the
+// block of the window's centre that windows reached, since successive queries are usually close
+// together. In 3D, where most cells are empty, indexed ones are found in bit masks of the rows of
+// cells.
 #pragma once
 
 #include <algorithm>
 #include <array>
+#include <bitset>
 #include <cmath>
 #include <cstdint>
 #include <vector>
@@ -44,14 +46,15 @@ template <int D>
 class RowMasks {
  public:
   static constexpr bool kUsed = D == 3;
-  static constexpr size_t kRows = static_cast<size_t>(CellIndex<D>::kCells / CellIndex<D>::kEdge);
+  using Index = SurfaceIndex<D>;
+  static constexpr size_t kRows = static_cast<size_t>(Index::kCells / Index::kEdge);
   using Masks = std::array<uint8_t, kRows>;
 
-  explicit RowMasks(const CellIndex<D>& index) {
+  explicit RowMasks(const Index& index) {
     if constexpr (kUsed) {
-      static_assert(CellIndex<D>::kEdge == 8);
+      static_assert(Index::kEdge == 8);
       masks_.reserve(index.blocks().size());
-      for (const auto& block : index.blocks()) masks_.push_back(masks_of(block->values.data()));
+      for (const auto& block : index.blocks()) masks_.push_back(masks_of(block->values));
     }
   }
 
@@ -62,11 +65,19 @@ class RowMasks {
   }
 
  private:
-  static Masks masks_of(const int32_t* index) {
+  static Masks masks_of(const SlicedIndices& indices) {
     Masks masks{};
-    for (uint8_t& mask : masks)
-      for (unsigned x = 0; x < 8; ++x, ++index)
-        mask = static_cast<uint8_t>(mask | (unsigned{*index != CellIndex<D>::kNone} << x));
+    auto mask = masks.begin();
+    for (size_t z = 0; z < SlicedIndices::kSlices; ++z) {
+      const SlicedIndices::Slice* slice = indices.slice(z);
+      if (!slice) {
+        mask += Index::kEdge;
+        continue;
+      }
+      for (auto index = slice->begin(); index != slice->end(); ++mask)
+        for (unsigned x = 0; x < 8; ++x, ++index)
+          *mask = static_cast<uint8_t>(*mask | (unsigned{*index != Index::kNone} << x));
+    }
     return masks;
   }
 
@@ -76,16 +87,19 @@ class RowMasks {
 template <int D>
 class WindowQuery {
  public:
+  using Index = SurfaceIndex<D>;
+
   // Both are referred to, and the index must not change.
-  WindowQuery(const CellIndex<D>& index, const RowMasks<D>& masks) : index_(index), masks_(masks) {}
+  WindowQuery(const Index& index, const RowMasks<D>& masks) : index_(index), masks_(masks) {}
 
   // Calls visit(index) for the indexed cells of a window around a cell, row by row.
   template <class Visit>
   void for_each(const Cell<D>& centre, const CellRows<D>& rows, Visit&& visit) {
-    cache_blocks(CellIndex<D>::block_of(centre));
+    if (rows.empty()) return;
+    const int32_t radius = -rows.front().offset[D - 1];
+    cache_blocks(centre, radius);
     if constexpr (RowMasks<D>::kUsed) {
-      const int32_t radius = rows.empty() ? 0 : -rows.front().offset[D - 1];
-      if (radius <= CellIndex<D>::kEdge) {  // within the blocks around that of the centre
+      if (radius <= Index::kEdge) {  // within the blocks around that of the centre
         for_each_by_masks(centre, rows, visit);
         return;
       }
@@ -94,12 +108,13 @@ class WindowQuery {
       Cell<D> cell = centre + row.offset;
       const int32_t last = cell[0] + row.half_width;
       for (cell[0] -= row.half_width; cell[0] <= last;) {
-        const int32_t stop = std::min(last, cell[0] | (CellIndex<D>::kEdge - 1));
-        const Block* block = cached_block(CellIndex<D>::block_of(cell));
+        const int32_t stop = std::min(last, cell[0] | (Index::kEdge - 1));
+        const Block* block = cached_block(Index::block_of(cell));
         if (block) {
-          const int32_t* index = block->values.data() + CellIndex<D>::local_of(cell);
-          for (const int32_t* end = index + (stop - cell[0] + 1); index != end; ++index)
-            if (*index != CellIndex<D>::kNone) visit(*index);
+          const auto first = static_cast<size_t>(Index::local_of(cell));
+          const size_t end = first + static_cast<size_t>(stop - cell[0] + 1);
+          for (size_t local = first; local < end; ++local)
+            if (const int32_t index = block->values[local]; index != Index::kNone) visit(index);
         }
         cell[0] = stop + 1;
       }
@@ -109,8 +124,8 @@ class WindowQuery {
  private:
   template <class Visit>
   void for_each_by_masks(const Cell<D>& centre, const CellRows<D>& rows, Visit&& visit) const {
-    constexpr int32_t edge = CellIndex<D>::kEdge;
-    const Cell<D> local = centre - CellIndex<D>::block_of(centre) * edge;
+    constexpr int32_t edge = Index::kEdge;
+    const Cell<D> local = centre - Index::block_of(centre) * edge;
     for (const CellRow<D>& row : rows) {
       // from the lowest corner of the cached blocks
       const auto y = static_cast<size_t>(local[1] + row.offset[1] + edge);
@@ -127,37 +142,68 @@ class WindowQuery {
     }
   }
 
-  using Block = typename CellIndex<D>::Block;
+  using Block = typename Index::Block;
   static constexpr size_t kBlocks = D == 2 ? 9 : 27;
 
-  void cache_blocks(const Cell<D>& block) {
-    if (valid_ && block == centre_block_) return;
-    centre_block_ = block;
-    valid_ = true;
+  // Looks up the blocks that a window reaches. Where surfaces are far apart few windows share a
+  // block, and most of the blocks around it would be looked up in vain.
+  void cache_blocks(const Cell<D>& centre, int32_t radius) {
+    const Cell<D> block = Index::block_of(centre);
+    if (!valid_ || block != centre_block_) {
+      centre_block_ = block;
+      valid_ = true;
+      reached_ = 0;
+      is_cached_.reset();
+      if constexpr (RowMasks<D>::kUsed) block_masks_.fill(&RowMasks<D>::none());
+      cache_block(Cell<D>::Zero());
+    }
+    uint32_t reached = 0;
+    for (int d = 0; d < D; ++d) {
+      const int32_t local = centre[d] & (Index::kEdge - 1);
+      reached |= uint32_t{local < radius} << (2 * d);
+      reached |= uint32_t{local >= Index::kEdge - radius} << (2 * d + 1);
+    }
+    if ((reached & ~reached_) == 0) return;
+    reached_ |= reached;
+    Cell<D> low, high;
+    for (int d = 0; d < D; ++d) {
+      low[d] = -static_cast<int32_t>(reached_ >> (2 * d) & 1u);
+      high[d] = static_cast<int32_t>(reached_ >> (2 * d + 1) & 1u);
+    }
+    for_each_in_box<D>(low, high, [&](const Cell<D>& step) { cache_block(step); });
+  }
+
+  // step: from the centre's block.
+  void cache_block(const Cell<D>& step) {
+    const size_t i = cached_index(step);
+    if (is_cached_[i]) return;
+    is_cached_.set(i);
+    const size_t number = index_.find_number(centre_block_ + step);
+    const bool is_there = number != Index::kNoBlock;
+    if constexpr (RowMasks<D>::kUsed)
+      block_masks_[i] = is_there ? &masks_.of_block(number) : &RowMasks<D>::none();
+    blocks_[i] = is_there ? index_.blocks()[number].get() : nullptr;
+  }
+
+  // Index of a block among those around the centre's, by the steps from that, -1 to 1.
+  static size_t cached_index(const Cell<D>& step) {
     size_t i = 0;
-    for_each_in_cube<D>(block, 1, [&](const Cell<D>& neighbour) {
-      const size_t number = index_.find_number(neighbour);
-      const bool is_there = number != CellIndex<D>::kNoBlock;
-      if constexpr (RowMasks<D>::kUsed)
-        block_masks_[i] = is_there ? &masks_.of_block(number) : &RowMasks<D>::none();
-      blocks_[i++] = is_there ? index_.blocks()[number].get() : nullptr;
-    });
+    for (int d = D - 1; d >= 0; --d) i = 3 * i + static_cast<size_t>(step[d] + 1);
+    return i;
   }
 
   const Block* cached_block(const Cell<D>& block) const {
-    size_t i = 0;
-    for (int d = D - 1; d >= 0; --d) {
-      const int32_t step = block[d] - centre_block_[d] + 1;
-      if (step < 0 || step > 2) return index_.find(block);
-      i = 3 * i + static_cast<size_t>(step);
-    }
-    return blocks_[i];
+    const Cell<D> step = block - centre_block_;
+    if ((step.array().abs() > 1).any()) return index_.find(block);
+    return blocks_[cached_index(step)];
   }
 
-  const CellIndex<D>& index_;
+  const Index& index_;
   const RowMasks<D>& masks_;
-  Cell<D> centre_block_ = Cell<D>::Zero();
   bool valid_ = false;
+  Cell<D> centre_block_ = Cell<D>::Zero();
+  uint32_t reached_ = 0;  // the sides on which blocks are cached, two bits for each axis
+  std::bitset<kBlocks> is_cached_;
   std::array<const Block*, kBlocks> blocks_{};
   std::array<const typename RowMasks<D>::Masks*, kBlocks> block_masks_{};  // 3D only
 };

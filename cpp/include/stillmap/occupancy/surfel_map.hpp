@@ -27,7 +27,7 @@ namespace stillmap {
 constexpr int32_t kNoSurfel = CellIndex<2>::kNone;
 
 template <int D>
-class SurfelMap : public CellIndex<D> {
+class SurfelMap : public SurfaceIndex<D> {
  public:
   // In 3D objects stand on surfaces, above all on the ground, so end points off a plane belong to
   // another object. In 2D objects stand neighbour walls, and end points off a wall are mostly the
@@ -37,7 +37,8 @@ class SurfelMap : public CellIndex<D> {
   static constexpr double kEndPointSigmas = 3.0;  // of noise_std, for a single end point
   static constexpr double kMinOffPlane = 0.2;     // cells: closer points are on the plane
 
-  using Block = typename CellIndex<D>::Block;
+  using Index = SurfaceIndex<D>;
+  using Block = typename Index::Block;
 
   explicit SurfelMap(double resolution) : resolution_(resolution) {
     if (!(resolution > 0.0) || !std::isfinite(resolution))
@@ -133,10 +134,10 @@ class SurfelMap : public CellIndex<D> {
     const std::vector<size_t> order = tile_order();
     for (const auto& block : this->blocks())
       for (const size_t local : order) {
-        int32_t& k = block->values[local];
+        const int32_t k = std::as_const(block->values)[local];
         if (k == kNoSurfel) continue;
+        block->values[local] = static_cast<int32_t>(sorted.size());
         sorted.push_back(sums_[static_cast<size_t>(k)]);
-        k = static_cast<int32_t>(sorted.size() - 1);
       }
     sums_.swap(sorted);
   }
@@ -145,12 +146,12 @@ class SurfelMap : public CellIndex<D> {
   static std::vector<size_t> tile_order() {
     constexpr int tile = 4;
     std::vector<std::pair<int64_t, size_t>> keyed;
-    for (size_t local = 0; local < static_cast<size_t>(CellIndex<D>::kCells); ++local) {
+    for (size_t local = 0; local < static_cast<size_t>(Index::kCells); ++local) {
       int64_t outer = 0, inner = 0;
       for (int d = D - 1; d >= 0; --d) {
-        const auto coordinate = static_cast<int>((local >> (d * CellIndex<D>::kShift)) &
-                                                 static_cast<size_t>(CellIndex<D>::kEdge - 1));
-        outer = outer * CellIndex<D>::kEdge + coordinate / tile;
+        const auto coordinate = static_cast<int>((local >> (d * Index::kShift)) &
+                                                 static_cast<size_t>(Index::kEdge - 1));
+        outer = outer * Index::kEdge + coordinate / tile;
         inner = inner * tile + coordinate % tile;
       }
       keyed.emplace_back(outer * 64 + inner, local);
