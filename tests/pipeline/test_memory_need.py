@@ -55,3 +55,12 @@ def test_of_long_recordings_some_beams_are_enough(monkeypatch):
     allow(monkeypatch, 25)
     with pytest.raises(stillmap.InputError, match=r"at least 0\.02\d* GB"):
         require_map_memory(sweeps(500.0), None, CELL)
+
+
+def test_the_printed_method_counts_what_beams_cross(monkeypatch):
+    allow(monkeypatch, 100)
+    require_map_memory(sweeps(20.0, 2000), None, CELL)
+    with pytest.raises(stillmap.InputError, match="beams of up to 3") as caught:
+        stillmap.build(sweeps(20.0, 2000), {"threads": 1, "estimator": "paper"})
+    assert "slam.voxel_size" in str(caught.value)
+    require_map_memory(sweeps(3.0, 2000), None, CELL, counts_beams=True)

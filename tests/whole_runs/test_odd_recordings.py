@@ -94,7 +94,8 @@ def run_in_python(one: OddRecording, folder: Path) -> None:
     except ValueError:
         return
     try:
-        result = stillmap.build(recording, {"threads": 1}, poses=one.poses, scratch=folder)
+        options = {"threads": 1, "estimator": estimator_of(one.words)}
+        result = stillmap.build(recording, options, poses=one.poses, scratch=folder)
     except ValueError as error:
         if not str(error).startswith("poses: expected"):
             raise
@@ -106,6 +107,12 @@ def run_in_python(one: OddRecording, folder: Path) -> None:
     saved = stillmap.load(folder / "map", recording=recording)
     assert saved.stamp_ns.tolist() == recording.stamp_ns.tolist()
     repr(result), result._repr_html_(), repr(saved)
+
+
+def estimator_of(words: tuple[str, ...]) -> str:
+    if "--paper" in words:
+        return "paper"
+    return words[-1] if "--estimator" in words else "stillmap"
 
 
 def run_commands(one: OddRecording, folder: Path, said: pytest.CaptureFixture[str]) -> None:

@@ -1,5 +1,5 @@
-"""The memory that a map takes at least, known before it is made: of the cells that are seen in 2D,
-and of those that are hit in 3D."""
+"""The memory that a map takes at least, known before it is made: of the cells that beams cross; of
+those that are hit, where beams are not counted in 3D."""
 
 import math
 
@@ -15,29 +15,33 @@ from stillmap.em.occupancy_grid import BLOCK_CELLS
 
 Float = NDArray[np.float64]
 
-# bytes of a block of a grid: two sums of 8 bytes per cell, and of the same block of a second grid
-# beside it; measured on scans with beams of kilometres
-_PER_BLOCK = 2 * 16 * BLOCK_CELLS**2
-_MAX_SQUARES = 2048  # along either axis, of the squares in which seen area is counted
+# by dimension: cells along a side of a block of a grid, and bytes of one: two sums of 8 bytes per
+# cell, in 2D also of the same block of a second grid beside it, which was measured on scans with
+# beams of kilometres
+_EDGE = {2: BLOCK_CELLS, 3: 8}
+_PER_BLOCK = {2: 2 * 16 * BLOCK_CELLS**2, 3: 16 * 8**3}
+_MAX_SQUARES = {2: 2048, 3: 256}  # along each axis, of the squares or cubes that are counted
 # blocks in a square of n x n blocks that a beam crosses are at least n, or half where it cuts off
 # a corner
 _LEAST_SHARE = 0.5
 
-# bytes in 3D of a block of cells, and of the surfel and the filters of a cell on which beams ended;
-# measured on returns far from each other
-_PER_BLOCK_3D, _PER_SURFEL = 700, 700
-_EDGE_3D = 8  # cells, of a block
+# bytes in 3D of a block of surfels, and of the surfel and the filters of a cell on which beams
+# ended; measured on returns far from each other
+_PER_SURFEL_BLOCK, _PER_SURFEL = 700, 700
 _MAX_BEAMS = 1 << 22  # of a recording in 3D that are looked at
 _KEY_BITS = 21  # of a coordinate: what lies farther apart counts once, as little as it is
 
 
-def require_map_memory(recording: Recording, poses: Float | None, resolution: float) -> None:
+def require_map_memory(
+    recording: Recording, poses: Float | None, resolution: float, *, counts_beams: bool = False
+) -> None:
     """Refuse a recording whose grids do not fit into the memory that may be used.
 
     Args:
         recording: T scans.
         poses: (T, D+1, D+1) T_map_base; None: those of odometry, or the robot stands still.
         resolution: m, edge of a cell.
+        counts_beams: whether beams are counted in all cells that they cross in 3D, too.
 
     Raises:
         InputError: says how much it takes, and what would take less.
@@ -47,9 +51,9 @@ def require_map_memory(recording: Recording, poses: Float | None, resolution: fl
         poses = recording.T_odom_base
     if poses is None:
         poses = np.tile(np.eye(D + 1), (recording.n_scans, 1, 1))
-    if D == 2:
-        _require_planar(recording, poses, resolution)
-    elif recording.n_beams * (_PER_BLOCK_3D + _PER_SURFEL) > allowed_memory():
+    if D == 2 or counts_beams:
+        _require_crossed(recording, poses, resolution)
+    elif recording.n_beams * (_PER_SURFEL_BLOCK + _PER_SURFEL) > allowed_memory():
         require_memory(
             _measure_surfels(recording, poses, resolution),
             f"a map with voxels of {resolution:g} m",
@@ -65,8 +69,8 @@ def _measure_surfels(recording: Recording, poses: Float, resolution: float) -> i
         ended = beams[some][recording.hit[beams[some]]]
         cell = np.floor(recording.end_points(ended, poses) / resolution).astype(np.int64)
         cells = np.union1d(cells, _keys(cell))
-        blocks = np.union1d(blocks, _keys(cell // _EDGE_3D))
-    return len(blocks) * _PER_BLOCK_3D + len(cells) * _PER_SURFEL
+        blocks = np.union1d(blocks, _keys(cell // _EDGE[3]))
+    return len(blocks) * _PER_SURFEL_BLOCK + len(cells) * _PER_SURFEL
 
 
 def _keys(cells: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -75,21 +79,22 @@ def _keys(cells: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.asarray((x << 2 * _KEY_BITS) | (y << _KEY_BITS) | z, np.int64)
 
 
-def _require_planar(recording: Recording, poses: Float, resolution: float) -> None:
-    """Refuse a recording in 2D; arguments as of `require_map_memory`."""
-    reach = _reach(recording)
-    xy = recording.T_map_sensor(poses)[:, :2, 2]
-    extent = np.ptp(xy, axis=0) + 2.0 * reach
-    block = BLOCK_CELLS * resolution
-    if float((extent / block + 1.0).prod()) * _PER_BLOCK < allowed_memory():
+def _require_crossed(recording: Recording, poses: Float, resolution: float) -> None:
+    """Refuse by the cells that beams cross; arguments as of `require_map_memory`."""
+    D, reach = recording.dimension, _reach(recording)
+    positions = recording.T_map_sensor(poses)[:, :D, D]
+    extent = np.ptp(positions, axis=0) + 2.0 * reach
+    block = _EDGE[D] * resolution
+    if float((extent / block + 1.0).prod()) * _PER_BLOCK[D] < allowed_memory():
         return  # even if everything was seen
-    edge = block * max(1, math.ceil(float(extent.max()) / block / _MAX_SQUARES))
+    edge = block * max(1, math.ceil(float(extent.max()) / block / _MAX_SQUARES[D]))
     squares = _count_squares(recording, poses, edge)
     per_square = 1.0 if edge == block else _LEAST_SHARE * edge / block
+    option = "slam.resolution" if D == 2 else "slam.voxel_size"
     require_memory(
-        squares * per_square * _PER_BLOCK,
+        squares * per_square * _PER_BLOCK[D],
         f"a map with cells of {resolution:g} m and beams of up to {reach:.4g} m",
-        "a shorter read.max_range or coarser slam.resolution takes less",
+        f"a shorter read.max_range or coarser {option} takes less",
     )
 
 
@@ -103,12 +108,13 @@ def _reach(recording: Recording) -> float:
 
 
 def _count_squares(recording: Recording, poses: Float, edge: float) -> int:
-    """Number of squares of `edge` m that beams cross."""
-    grid = _core.OccupancyGrid2D(edge, moments=False)
+    """Number of squares, in 3D of cubes, of `edge` m that beams cross."""
+    D = recording.dimension
+    grid = (_core.OccupancyGrid2D if D == 2 else _core.OccupancyGrid3D)(edge, moments=False)
     for _, _, (points, hit, offset, T) in iter_beams(recording, poses):
         _core.add_beams(grid, points, hit, np.ones(len(hit), np.float32), offset, T)
-    count = 0
+    count, shape = 0, (_EDGE[D],) * D
     for one in grid.block_cells.tolist():
-        _, alpha, beta = grid.dense(one, (BLOCK_CELLS, BLOCK_CELLS))
+        _, alpha, beta = grid.dense(one, shape)
         count += int(np.count_nonzero(alpha + beta > 0.0))
     return count

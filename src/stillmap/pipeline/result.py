@@ -192,7 +192,7 @@ def map_recording(
         max_range = options.read.max_range or stated_max_range(recording)
         recording, more = leave_out_far_returns(recording, cell, max_range)
         notes += more
-        require_map_memory(recording, poses, cell)
+        require_map_memory(recording, poses, cell, counts_beams=em.needs_counts(options.estimator))
         recording, options, more = time_sweeps(recording, options)
         notes += more
         if poses is None:
