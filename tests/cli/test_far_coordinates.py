@@ -6,6 +6,7 @@ import laspy
 import numpy as np
 import pytest
 import yaml
+from refusals import refused
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial import cKDTree
@@ -96,4 +97,18 @@ def test_a_pose_that_cannot_be(call, lidar, tmp_path):
     assert done.returncode == 2
     assert done.stderr.startswith(f"stillmap: {path}:3: has a position a million kilometres away")
     assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("command", ["map", "live --replay", "convert"])
+@pytest.mark.parametrize("lidar_settings", [None, {"channels": 8, "columns": 60, "sweep": False}])
+def test_a_sensor_that_is_not_on_the_robot(call, tmp_path, command, lidar_settings):
+    settings = {"lidar": lidar_settings} if lidar_settings else {}
+    made = simulate(scene_by_name("hall", {**settings, "robot": {"scans": 3}}), 3)
+    write_simulation(made, tmp_path / "sim")
+    mounts = made.recording.T_base_sensor.copy()
+    mounts[0, 0, -1] = 1e7
+    np.save(tmp_path / "sim" / "T_base_sensor.npy", mounts)
+    done = call(*command.split(), tmp_path / "sim", "-o", tmp_path / "out", "--quiet")
+    refused(done, "sensor 0 is mounted 1e+07 m from the robot's base")
     assert not (tmp_path / "out").exists()
