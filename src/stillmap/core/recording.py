@@ -246,8 +246,10 @@ class Recording(ShortRepr):
         D, ends = self.dimension, np.empty((len(beams), self.dimension))
         for part in arrays.split_by_block(beams, _BLOCK):
             scan = self.scans_of(beams[part])
-            # few beams: only the poses of their scans
-            T = T_map_base[scan] @ self.T_base_sensor[self.sensor[scan]]
+            if len(scan) < self.n_scans:  # few beams: only the poses of their scans
+                T = T_map_base[scan] @ self.T_base_sensor[self.sensor[scan]]
+            else:
+                T = self.T_map_sensor(T_map_base)[scan]
             points = self.points[beams[part]].astype(np.float64)
             ends[part] = np.einsum("nij,nj->ni", T[:, :D, :D], points) + T[:, :D, D]
             self.release_pages()

@@ -30,6 +30,7 @@ _LEAST_SHARE = 0.5
 _PER_SURFEL_BLOCK, _PER_SURFEL = 700, 700
 _MAX_BEAMS = 1 << 22  # of a recording in 3D that are looked at
 _KEY_BITS = 21  # of a coordinate: what lies farther apart counts once, as little as it is
+_BLOCK_BITS = 3  # the lowest of a coordinate, which the cells of a block differ in
 
 
 def require_map_memory(
@@ -53,7 +54,7 @@ def require_map_memory(
         poses = np.tile(np.eye(D + 1), (recording.n_scans, 1, 1))
     if D == 2 or counts_beams:
         _require_crossed(recording, poses, resolution)
-    elif recording.n_beams * (_PER_SURFEL_BLOCK + _PER_SURFEL) > allowed_memory():
+    elif min(recording.n_beams, _MAX_BEAMS) * (_PER_SURFEL_BLOCK + _PER_SURFEL) > allowed_memory():
         require_memory(
             _measure_surfels(recording, poses, resolution),
             f"a map with voxels of {resolution:g} m",
@@ -63,13 +64,14 @@ def require_map_memory(
 
 def _measure_surfels(recording: Recording, poses: Float, resolution: float) -> int:
     """Bytes, at least, of the cells in 3D on which beams ended."""
-    cells, blocks = (np.zeros(0, np.int64),) * 2
+    cells = np.zeros(0, np.int64)
     beams = sample_indices(recording.n_beams, _MAX_BEAMS)
     for some in iter_blocks(beams):
         ended = beams[some][recording.hit[beams[some]]]
         cell = np.floor(recording.end_points(ended, poses) / resolution).astype(np.int64)
-        cells = np.union1d(cells, _keys(cell))
-        blocks = np.union1d(blocks, _keys(cell // _EDGE[3]))
+        cells = _distinct(np.append(cells, _keys(cell)))
+    within_block = _keys(np.full((1, 3), (1 << _BLOCK_BITS) - 1))
+    blocks = _distinct(cells & ~within_block)
     return len(blocks) * _PER_SURFEL_BLOCK + len(cells) * _PER_SURFEL
 
 
@@ -77,6 +79,12 @@ def _keys(cells: NDArray[np.int64]) -> NDArray[np.int64]:
     """(N,) a number for each of cells (N, 3)."""
     x, y, z = (cells & ((1 << _KEY_BITS) - 1)).T
     return np.asarray((x << 2 * _KEY_BITS) | (y << _KEY_BITS) | z, np.int64)
+
+
+def _distinct(keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The different ones, rising; `np.unique` hashes them, which takes ten times as long."""
+    keys.sort()
+    return keys[np.append(True, keys[1:] != keys[:-1])] if len(keys) else keys
 
 
 def _require_crossed(recording: Recording, poses: Float, resolution: float) -> None:
