@@ -208,6 +208,10 @@ class ObservationCollector {
                                  __builtin_prefetch(states_.data() + crossing.surfel, 1);
                                  crossings_.push_back(crossing);
                                });
+    if constexpr (SurfelTraversal<D>::kUsesBits)
+      if (!hit)  // what is behind something solid counts less
+        std::sort(crossings_.begin(), crossings_.end(),
+                  [](const auto& a, const auto& b) { return a.n_before < b.n_before; });
     const Cell<D> corner = cell_of<D>(beam.start);
     return LocalRay{corner, (beam.start - corner.template cast<double>()).template cast<float>(),
                     direction.template cast<float>(), static_cast<float>(length), hit};

@@ -1,12 +1,12 @@
-// Traversal of the cells with surfels along a ray: the same cells as `traverse`, in the same order.
-// It proceeds block by block and tests the few set cells of a block instead of all cells along the
-// ray.
+// Traversal of the cells with surfels along a ray: the same cells as `traverse`. It proceeds block
+// by block and tests the few set cells of a block instead of all cells along the ray.
 #pragma once
 
 #include <algorithm>
 #include <array>
 #include <cmath>
 #include <limits>
+#include <type_traits>
 #include <vector>
 
 #include "stillmap/grid/block_layout.hpp"
@@ -28,12 +28,14 @@ class SurfelTraversal {
   struct Crossing {
     size_t block;  // number in the bitmap
     int32_t surfel;
+    int32_t n_before;  // borders on the ray before it
     Cell<D> cell;
   };
 
   SurfelTraversal(const SurfelMap<D>&, const SurfelBitmap<D>& bitmap) : bitmap_(bitmap) {}
 
-  // Calls visit(crossing) for the set cells of `bits` that the ray leaves before its end.
+  // Calls visit(crossing) for the set cells of `bits` that the ray leaves before its end, block by
+  // block; those of one block in any order.
   template <class Visit>
   void traverse_marked(const Vec<D>& start, const Vec<D>& end, const std::vector<BlockBits>& bits,
                        Visit&& visit) {
@@ -48,21 +50,35 @@ class SurfelTraversal {
       exit_length[to_size(d)] = axes_[to_size(d)].border(exit_border[to_size(d)]);
     }
     double enter_at = 0.0;
-    for (;;) {
-      int axis = exit_length[1] < exit_length[0] ? 1 : 0;
-      if (D == 3 && exit_length[D - 1] < exit_length[to_size(axis)]) axis = D - 1;
-      const double leave_at = exit_length[to_size(axis)];
+    // Leaves the block along an axis, known when compiled; false in the last block.
+    const auto leave = [&](auto axis) {
+      constexpr int d = decltype(axis)::value;
+      const double leave_at = exit_length[d];
       last_block_ = page ? page[SurfelBitmap<D>::index_in_page(block)] : SurfelBitmap<D>::kNone;
       if (last_block_ != SurfelBitmap<D>::kNone)
         visit_block(enter_at, std::min(leave_at, length_), block, static_cast<size_t>(last_block_),
                     bits, visit);
-      if (!(leave_at < kInf)) return;
+      if (!(leave_at < kInf)) return false;
       enter_at = leave_at;
-      exit_border[to_size(axis)] += kEdge;
-      exit_length[to_size(axis)] = axes_[to_size(axis)].border(exit_border[to_size(axis)]);
-      const int32_t previous = block[axis];
-      block[axis] = previous + axes_[to_size(axis)].step;
-      if (!SurfelBitmap<D>::same_page(previous, block[axis])) page = bitmap_.page_of(block);
+      exit_border[d] += kEdge;
+      exit_length[d] = axes_[d].border(exit_border[d]);
+      const int32_t previous = block[d];
+      block[d] = previous + axes_[d].step;
+      if (!SurfelBitmap<D>::same_page(previous, block[d])) page = bitmap_.page_of(block);
+      return true;
+    };
+    using X = std::integral_constant<int, 0>;
+    using Y = std::integral_constant<int, 1>;
+    using Z = std::integral_constant<int, D - 1>;
+    for (bool is_inside = true; is_inside;) {  // branches, as an index would wait for comparisons
+      const bool y_first = exit_length[1] < exit_length[0];
+      if (D == 3 && exit_length[D - 1] < exit_length[y_first ? 1 : 0]) {
+        is_inside = leave(Z{});
+      } else if (y_first) {
+        is_inside = leave(Y{});
+      } else {
+        is_inside = leave(X{});
+      }
     }
   }
 
@@ -117,39 +133,40 @@ class SurfelTraversal {
       slices[to_size(d)] = static_cast<uint32_t>(box) & block_bits.slices[to_size(d)];
       if (!slices[to_size(d)]) return;
     }
-    size_t n_crossings = 0;
     block_bits.for_each_in_slices(slices, [&](size_t tile, size_t bit, const Cell<D>& local) {
       const Cell<D> cell = block * kEdge + local;
-      const int32_t steps = borders_before(cell);
-      if (steps < 0) return;
-      size_t crossing = n_crossings++;  // insertion sort by the order along the ray
-      for (; crossing > 0 && crossings_[crossing - 1].first > steps; --crossing)
-        crossings_[crossing] = crossings_[crossing - 1];
-      crossings_[crossing] = {steps, {number, bitmap_.surfel(number, tile, bit), cell}};
+      const int32_t n_before = borders_before(cell);
+      if (n_before >= 0) visit(Crossing{number, bitmap_.surfel(number, tile, bit), n_before, cell});
     });
-    for (size_t i = 0; i < n_crossings; ++i) visit(crossings_[i].second);
   }
 
-  // Number of borders before a cell; negative if the ray misses the cell or ends in it. At a corner
-  // the border of the lower axis comes first, as in `traverse`.
+  // Number of borders before a cell; negative if the ray misses the cell or ends in it.
   int32_t borders_before(const Cell<D>& cell) const {
-    int32_t steps = 0;
-    std::array<double, D> entry;
-    double exit = kInf;
-    int exit_axis = 0;
+    int32_t n_before = 0;
+    std::array<double, D> entry, exit;
+    double entered = -kInf, left = kInf;
     for (int d = 0; d < D; ++d) {
       const Axis& axis = axes_[to_size(d)];
       const int32_t i = (cell[d] - first_[d]) * axis.step;
       if (i < 0 || i > axis.count) return -1;
       entry[to_size(d)] = i > 0 ? axis.border(i - 1) : -kInf;
-      const double border = axis.border(i);
-      if (border < exit) exit = border, exit_axis = d;
-      steps += i;
+      exit[to_size(d)] = axis.border(i);
+      entered = std::max(entered, entry[to_size(d)]);
+      left = std::min(left, exit[to_size(d)]);
+      n_before += i;
     }
-    bool crosses = exit < kInf;
-    for (int d = 0; d < D; ++d)
-      crosses &= (entry[to_size(d)] < exit) | ((entry[to_size(d)] == exit) & (d < exit_axis));
-    return crosses ? steps : -1;
+    if (!(left < kInf)) return -1;
+    return entered < left || (entered == left && crosses_corner(entry, exit, left)) ? n_before : -1;
+  }
+
+  // Whether a ray crosses a cell whose corner it meets: there the border of the lower axis comes
+  // first, as in `traverse`.
+  static bool crosses_corner(const std::array<double, D>& entry, const std::array<double, D>& exit,
+                             double left) {
+    const auto exit_axis = std::find(exit.begin(), exit.end(), left) - exit.begin();
+    bool crosses = true;
+    for (int d = 0; d < D; ++d) crosses &= (entry[to_size(d)] < left) | (d < exit_axis);
+    return crosses;
   }
 
   const SurfelBitmap<D>& bitmap_;
@@ -158,7 +175,6 @@ class SurfelTraversal {
   Cell<D> first_;
   int32_t last_block_ = SurfelBitmap<D>::kNone;
   std::array<Axis, D> axes_;
-  std::array<std::pair<int32_t, Crossing>, D * kEdge> crossings_;
 };
 
 // In 2D surfels are dense along rays, so all cells are visited.
