@@ -95,14 +95,16 @@ class ObservationCollector {
       if (!scans.hit[n]) return;
       const Cell<D> end = cell_of<D>(beam.end);
       const int32_t k = has_length ? traversal_.surfel_at_end(end) : bitmap_.surfel(end);
-      if (k != kNoSurfel && record_hit(k)) hit_surfels_.push_back(k);
+      if (k == kNoSurfel || !record_hit(k)) return;
+      hit_surfels_.push_back(k);
+      if constexpr (SurfelTraversal<D>::kUsesBits)
+        close(static_cast<size_t>(bitmap_.block_number(BlockLayout<D>::block_of(end))), end);
     });
   }
 
   // Writes the observations to `out` and resets the collector.
   void take_batch(ObservationBatch& out) {
     spread_hits();
-    mark_surroundings();
     out.observations.clear();
     out.begin.assign(1, 0);
     for (auto& touched_span : touched_) {
@@ -171,10 +173,6 @@ class ObservationCollector {
     if (p_missed == kHitMark) return false;
     if (p_missed == kUntouched) touched_[ObservationBatch::span_of(k)].push_back(k);
     p_missed = kHitMark;
-    if constexpr (SurfelTraversal<D>::kUsesBits) {
-      const Cell<D>& cell = surfel_map_.cell(k);
-      close(static_cast<size_t>(bitmap_.block_number(BlockLayout<D>::block_of(cell))), cell);
-    }
     return true;
   }
 
@@ -260,18 +258,17 @@ class ObservationCollector {
     return tables_(half_extent, std::sqrt(offset_squared));
   }
 
+  // Marks the neighbours of what was hit, and the surroundings of both.
   void spread_hits() {
-    for (const int32_t from : hit_surfels_)
+    if (occupied_) occupied_->clear();
+    const auto occupy = [this](int32_t k) {
+      if (occupied_) occupied_->hit(k);
+    };
+    for (const int32_t from : hit_surfels_) {
+      occupy(from);
       for (const int32_t* k = neighbours_.begin(from); k != neighbours_.end(from); ++k)
-        record_hit(*k);
-  }
-
-  void mark_surroundings() {
-    if (!occupied_) return;
-    occupied_->clear();
-    for (const auto& touched_span : touched_)
-      for (const int32_t k : touched_span)
-        if (states_[static_cast<size_t>(k)].p_missed == kHitMark) occupied_->hit(k);
+        if (record_hit(*k)) occupy(*k);
+    }
   }
 
   const SurfelMap<D>& surfel_map_;
