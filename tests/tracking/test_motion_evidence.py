@@ -11,7 +11,6 @@ from stillmap.tracking.motion_evidence import (
     apply_motion_evidence,
     collect_evidence,
     compute_log_ratio,
-    ignore_sliding,
 )
 
 ANGLES = np.radians(np.arange(-180.0, 180.0, 0.5))
@@ -23,7 +22,7 @@ RATE = 10.0
 def evidence(**changes):
     """One track: 40 looks at something thick, seen from first to last, that stands."""
     usual = {"looks": 40, "hits": 6, "missed": 0, "windows": 3, "moving": 0, "open_ends": 0}
-    values = (usual | {"spread": 0.1} | changes).values()
+    values = (usual | {"slides": 0} | changes).values()
     return TrackEvidence(*(np.array([float(x)]) for x in values))
 
 
@@ -128,11 +127,11 @@ def test_walkers_stay_dynamic_and_furniture_becomes_static():
     assert near_chair > 0.5
 
 
-def sliding_patch(width):
-    """Evidence of a part of a wall, or of something that wide, that slides along it at .5 m/s."""
+def sliding_patch(width, speed=0.15):
+    """Evidence of a part of a wall, or of something that wide, that slides along it."""
     rng = np.random.default_rng(5)
     seconds = np.arange(0.0, 6.0, 1.0 / RATE)
-    along = 0.5 * seconds[:, None] + np.linspace(-0.15, 0.15, 6)
+    along = speed * seconds[:, None] + np.linspace(-0.15, 0.15, 6)
     across = rng.normal(0.0, width, along.shape)
     n = len(seconds)
     recording = Recording(
@@ -147,20 +146,18 @@ def sliding_patch(width):
     poses = np.tile(np.eye(3), (n, 1, 1))
     points = extract_dynamic_points(recording, poses, np.zeros(6 * n, np.float32), 0.5)
     owner = np.zeros(len(points.scan), np.intp)
-    _, found = collect_evidence(recording, poses, points, owner)
-    return found, ignore_sliding(found, NOISE_STD)
+    return collect_evidence(recording, poses, points, owner, NOISE_STD)[1]
 
 
 def test_a_part_of_a_wall_that_slides_along_it_shows_no_motion():
-    before, walks = sliding_patch(0.05)
-    assert before.moving[0] >= 3
-    assert before.spread[0] == pytest.approx(0.05, rel=0.1)
-    assert walks == before
-    before, slides = sliding_patch(NOISE_STD)
-    assert before.moving[0] >= 3
-    assert slides.moving[0] == 0
-    assert slides.windows[0] == before.windows[0] - before.moving[0]
-    assert compute_log_ratio(slides)[0] < compute_log_ratio(before)[0] - 4.0
+    walks, slides = sliding_patch(0.05), sliding_patch(NOISE_STD)
+    assert (walks.slides[0], slides.slides[0]) == (0, 1)
+    assert compute_log_ratio(slides)[0] < compute_log_ratio(walks)[0] - 3.0
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.5])
+def test_what_stands_or_walks_does_not_slide(speed):
+    assert sliding_patch(NOISE_STD, speed).slides[0] == 0
 
 
 def test_where_nobody_walks_all_is_furniture():

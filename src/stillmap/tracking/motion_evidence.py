@@ -43,6 +43,8 @@ _OPEN_SHARE = 0.28  # of these looks that pass: the end lies in plain view
 _REST_TIME = 0.3  # s, see regress_velocity
 _FAST_TRAVEL = 3.0  # m along the path of a fast mover that count as a window of steady motion
 _MAX_LINE_SPREAD = 1.25  # times the noise, across a straight surface
+_MIN_LINE, _MAX_SLIDE_SPEED = 0.75, 0.25  # m of it: people are less wide; m/s: they walk faster
+_P_WALKS_ON_LINE = 0.01  # that end points on somebody who walks spread as little: 4 of 440 tracks
 _BATCH = 1 << 12  # tracks whose looks are classified at once
 
 # Beta(1, 15): share of the windows in which clutter seems to move; also of half of the movers
@@ -62,7 +64,9 @@ class TrackEvidence(NamedTuple):
         missed: looks between detections in which beams passed.
         windows, moving: windows of 1.5 s, one after the other, and those of steady motion.
         open_ends: 0 to 2, how many of its ends lie in plain view.
-        spread: m, standard deviation of the end points from the straight line through them.
+        slides: 1 if its end points lie on a line that is longer than a person is wide, along which
+            it moves slowly: the part of a wall that is labelled dynamic does so as the robot drives
+            by; else 0.
     """
 
     looks: Float
@@ -71,7 +75,7 @@ class TrackEvidence(NamedTuple):
     windows: Float
     moving: Float
     open_ends: Float
-    spread: Float
+    slides: Float
 
 
 def apply_motion_evidence(
@@ -99,14 +103,14 @@ def apply_motion_evidence(
     owner, _ = join_tracklets(points, owner, paths)
     fast = tracks_of_paths(points, owner, paths)
     of_fast = dict(zip(fast, paths, strict=True))
-    p_mover = weigh_tracks(recording, poses, points, owner, noise_std, of_fast)
+    p_mover, sliding = weigh_tracks(recording, poses, points, owner, noise_std, of_fast)
     out, movers = arrays.copy(p_static, recording.scratch), list[MoverPoints]()
     for block in arrays.iter_blocks(points.beam, points.xy, points.scan):
         p, beam = p_mover[owner[block]].astype(np.float32), points.beam[block]
         out[beam] = 1.0 - (1.0 - out[beam]) * p
         xy, stamp_ns = points.xy[block], recording.stamp_ns[points.scan[block]]
         movers.append(MoverPoints(xy[p > 0.5], stamp_ns[p > 0.5]).thin())
-    walkers = dict(iterate_walker_paths(points, owner, p_mover, fast))
+    walkers = dict(iterate_walker_paths(points, owner, p_mover, {*fast, *sliding}))
     tracks = np.array([*fast, *walkers], np.intp)
     of_path = np.where(tracks >= 0, p_mover[tracks], 0.0)
     followed = [*paths, *walkers.values()]
@@ -123,8 +127,8 @@ def weigh_tracks(
     owner: Index,
     noise_std: float,
     paths: Mapping[int, MoverPath] = MappingProxyType({}),
-) -> Float:
-    """(K,) P(mover) by track number; 0 where no track has that number.
+) -> tuple[Float, list[int]]:
+    """(K,) P(mover) by track number, 0 where no track has that number; the tracks that slide.
 
     Args:
         recording, poses: see `apply_motion_evidence`.
@@ -133,26 +137,16 @@ def weigh_tracks(
         noise_std: see `apply_motion_evidence`.
         paths: by track number, of fast movers.
     """
-    tracks, evidence = collect_evidence(recording, recording.T_map_sensor(poses), points, owner)
-    evidence = ignore_sliding(evidence, noise_std)
+    T_map_sensor = recording.T_map_sensor(poses)
+    tracks, evidence = collect_evidence(recording, T_map_sensor, points, owner, noise_std)
     for k in np.flatnonzero(np.isin(tracks, list(paths))).tolist():
         moving = paths[int(tracks[k])].travel / _FAST_TRAVEL
         evidence.windows[k] = max(evidence.windows[k], moving)
         evidence.moving[k] = max(evidence.moving[k], moving)
+        evidence.slides[k] = 0.0  # the side of a car is as straight
     out = np.zeros(int(tracks.max()) + 1)
     out[tracks] = fit_share(compute_log_ratio(evidence), evidence.looks)
-    return out
-
-
-def ignore_sliding(e: TrackEvidence, noise_std: float) -> TrackEvidence:
-    """Evidence without the steady motion of tracks whose end points lie on a line, up to noise.
-
-    The part of a wall that is labelled dynamic slides along it as the robot drives by. Of people
-    who walk, end points spread 2 to 10 times as much.
-    """
-    on_line = e.spread <= _MAX_LINE_SPREAD * noise_std
-    moving = np.where(on_line, 0.0, e.moving)
-    return e._replace(windows=e.windows - e.moving + moving, moving=moving)
+    return out, tracks[evidence.slides > 0.0].tolist()
 
 
 def compute_log_ratio(e: TrackEvidence) -> Float:
@@ -160,6 +154,7 @@ def compute_log_ratio(e: TrackEvidence) -> Float:
     rest = e.windows - e.moving
     still = _log_mean_power(e.moving, rest, 1.0, _STILL_WINDOWS)
     motion = np.logaddexp(_log_mean_power(e.moving, rest, 1.0, 1.0), still) - np.log(2.0) - still
+    motion = np.where(e.slides > 0.0, np.log(_P_WALKS_ON_LINE), motion)
     # the first detection began the track: it says nothing
     seen = np.maximum(e.looks - 1.0, 0.0)
     thick = _log_mean_power(seen, e.missed, _SEEN_LOOKS, 1.0)
@@ -177,14 +172,18 @@ def _log_mean_power(successes: Float, failures: Float, a: float, b: float) -> Fl
 
 
 def collect_evidence(
-    recording: Recording, T_map_sensor: Float, points: DynamicPoints, owner: Index
+    recording: Recording,
+    T_map_sensor: Float,
+    points: DynamicPoints,
+    owner: Index,
+    noise_std: float,
 ) -> tuple[Index, TrackEvidence]:
     """Track numbers (K,), rising, and what is known of each.
 
     Args:
         recording: 2D.
         T_map_sensor: (T, 3, 3) sensor poses.
-        points, owner: see `weigh_tracks`.
+        points, owner, noise_std: see `weigh_tracks`.
     """
     period = float(np.median(np.diff(points.seconds))) if len(points.seconds) > 1 else _LOOK_TIME
     stride = max(1, round(_LOOK_TIME / max(period, 1e-3)))
@@ -197,8 +196,9 @@ def collect_evidence(
             found = compute_centroids(points, owner, here)
             looks, t = len(found.scan), points.seconds[found.scan]
             steady = count_steady_windows(t, found.xy, period)
-            spread = _measure_spread(points.xy[here])
-            rows.append((max(1.0, looks / stride), len(here) / looks, *steady, spread))
+            most = _MAX_SLIDE_SPEED * float(t[-1] - t[0])
+            slides = lies_on_line(points.xy[here], noise_std, _MIN_LINE, most)
+            rows.append((max(1.0, looks / stride), len(here) / looks, *steady, slides))
             gaps.append(_interpolate_gaps(points.seconds, found.scan, found.xy, stride))
             ends += _extrapolate_ends(points.seconds, found.scan, found.xy)
         missed = _count_passes(recording, T_map_sensor, gaps)
@@ -206,15 +206,18 @@ def collect_evidence(
         passed = _count_passes(recording, T_map_sensor, ends)
         is_open = (sampled > 1) & (passed >= _OPEN_SHARE * sampled)
         parts.append(np.column_stack([np.array(rows), missed, is_open.reshape(-1, 2).sum(axis=1)]))
-    looks_, hits, windows, moving, spread, missed, open_ends = np.concatenate(parts).T
-    evidence = TrackEvidence(looks_, hits, missed, windows, moving, open_ends, spread)
+    looks_, hits, windows, moving, slides, missed, open_ends = np.concatenate(parts).T
+    evidence = TrackEvidence(looks_, hits, missed, windows, moving, open_ends, slides)
     return np.array(tracks), evidence
 
 
-def _measure_spread(xy: Float) -> float:
-    """Standard deviation of points (n, 2) from the straight line through them."""
+def lies_on_line(xy: Float, noise_std: float, least: float, most: float) -> bool:
+    """True if points (n, 2) lie on a line, up to noise, that is from `least` to `most` m long."""
     off = xy - xy.mean(axis=0)
-    return float(np.sqrt(max(np.linalg.eigvalsh(off.T @ off / len(off))[0], 0.0)))
+    _, axes = np.linalg.eigh(off.T @ off)
+    across, along = (off @ axes).T
+    is_thin = float(across.std()) <= _MAX_LINE_SPREAD * noise_std
+    return is_thin and least <= float(np.ptp(along)) <= most
 
 
 def _count_passes(recording: Recording, T_map_sensor: Float, places: list[Places]) -> Float:
