@@ -122,7 +122,7 @@ def _unpack(hint: Any, value: Any, arrays: Mapping[str, Any]) -> Any:
 
 
 def _resolve_alias(hint: Any) -> Any:
-    """What a type alias with parameters stands for; `NDArray` is one since NumPy 2.5."""
+    """The type that an alias with parameters names; `NDArray` is an alias since NumPy 2.5."""
     alias = typing.get_origin(hint)
     return alias.__value__[typing.get_args(hint)] if hasattr(alias, "__value__") else hint
 

@@ -53,7 +53,7 @@ def require_map_memory(
     if poses is None:
         poses = np.tile(np.eye(D + 1), (recording.n_scans, 1, 1))
     if D == 2 or counts_beams:
-        _require_crossed(recording, poses, resolution)
+        _require_memory_of_rays(recording, poses, resolution)
     elif min(recording.n_beams, _MAX_BEAMS) * (_PER_SURFEL_BLOCK + _PER_SURFEL) > allowed_memory():
         require_memory(
             _measure_surfels(recording, poses, resolution),
@@ -87,7 +87,7 @@ def _distinct(keys: NDArray[np.int64]) -> NDArray[np.int64]:
     return keys[np.append(True, keys[1:] != keys[:-1])] if len(keys) else keys
 
 
-def _require_crossed(recording: Recording, poses: Float, resolution: float) -> None:
+def _require_memory_of_rays(recording: Recording, poses: Float, resolution: float) -> None:
     """Refuse by the cells that beams cross; arguments as of `require_map_memory`."""
     D, reach = recording.dimension, _reach(recording)
     positions = recording.T_map_sensor(poses)[:, :D, D]
