@@ -147,6 +147,7 @@ def test_the_edge_of_a_wall_drawn_too_long_hides_a_part_of_the_leaf():
     found = find_shut_leaf(doorway, surface)
     assert found is not None
     assert found.cells[:, 0].min() <= 41
+    assert 47 in found.cells[:, 0]
 
 
 def door(*states):
@@ -163,7 +164,17 @@ def test_what_fills_a_doorway_is_a_door_where_doorways_have_doors():
     assert estimate_p_door(always_shut, 0).max() < 0.15
     assert estimate_p_door(always_shut, 7).min() > 0.3
     assert estimate_p_door(np.full(30, 0.4), 2).max() < 0.1
+    assert estimate_p_door(np.full(1, 0.23), 0)[0] < 0.1
     assert len(estimate_p_door(np.zeros(0), 3)) == 0
+
+
+def test_a_leaf_says_nothing_of_how_probable_its_own_looks_are():
+    rates = np.geomspace(1e-5, 1.0, 61)
+    one = np.array([(0, 300)], np.int64) * S
+    (same,), _ = compute_p_moved([], [one], np.array([0, 300]) * S)
+    assert same == pytest.approx(np.exp(-300.0 * rates).mean(), rel=1e-6)
+    (with_swings,), _ = compute_p_moved([SWINGS], [one], np.array([0, 300]) * S)
+    assert with_swings < 0.1 * same
 
 
 def test_a_leaf_that_would_have_been_seen_to_swing_is_no_door():

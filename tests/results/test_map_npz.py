@@ -47,7 +47,7 @@ def test_equal_maps_give_equal_bytes_whatever_their_layout(tmp_path, result):
         assert {entry.date_time for entry in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
 
 
-# of an array whose writer was not made; Python says so since 3.13
+# the writer of an array that was never created is finalized; Python 3.13 warns
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("stopped", [KeyboardInterrupt, SystemExit, OSError("disk full")])
 @pytest.mark.parametrize("within", ["_get_compressor", "_ZipWriteFile.write"])

@@ -11,7 +11,9 @@ from stillmap.tracking.motion_evidence import (
     apply_motion_evidence,
     collect_evidence,
     compute_log_ratio,
+    weigh_tracks,
 )
+from stillmap.tracking.mover_path import MoverPath
 
 ANGLES = np.radians(np.arange(-180.0, 180.0, 0.5))
 ROOM = 8.0  # m to the wall
@@ -127,8 +129,8 @@ def test_walkers_stay_dynamic_and_furniture_becomes_static():
     assert near_chair > 0.5
 
 
-def sliding_patch(width, speed=0.15):
-    """Evidence of a part of a wall, or of something that wide, that slides along it."""
+def sliding_track(width, speed):
+    """The dynamic end points on a part of a wall, or of something that wide, that slides along."""
     rng = np.random.default_rng(5)
     seconds = np.arange(0.0, 6.0, 1.0 / RATE)
     along = speed * seconds[:, None] + np.linspace(-0.15, 0.15, 6)
@@ -146,13 +148,26 @@ def sliding_patch(width, speed=0.15):
     poses = np.tile(np.eye(3), (n, 1, 1))
     points = extract_dynamic_points(recording, poses, np.zeros(6 * n, np.float32), 0.5)
     owner = np.zeros(len(points.scan), np.intp)
-    return collect_evidence(recording, poses, points, owner, NOISE_STD)[1]
+    return recording, poses, points, owner
+
+
+def sliding_patch(width, speed=0.15):
+    """Evidence of that track."""
+    return collect_evidence(*sliding_track(width, speed), NOISE_STD)[1]
 
 
 def test_a_part_of_a_wall_that_slides_along_it_shows_no_motion():
     walks, slides = sliding_patch(0.05), sliding_patch(NOISE_STD)
     assert (walks.slides[0], slides.slides[0]) == (0, 1)
     assert compute_log_ratio(slides)[0] < compute_log_ratio(walks)[0] - 3.0
+
+
+def test_the_straight_side_of_a_car_does_not_slide():
+    recording, poses, points, owner = sliding_track(NOISE_STD, 0.15)
+    assert weigh_tracks(recording, poses, points, owner, NOISE_STD)[1] == [0]
+    t = points.seconds
+    side = MoverPath(t, np.column_stack([0.15 * t, 0.0 * t]), np.ones((len(t), 2)), 4.0, 2.0)
+    assert weigh_tracks(recording, poses, points, owner, NOISE_STD, {0: side})[1] == []
 
 
 @pytest.mark.parametrize("speed", [0.0, 0.5])

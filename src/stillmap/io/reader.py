@@ -14,7 +14,7 @@ from stillmap.io.registry import detect_format
 from stillmap.io.text_lines import Progress
 from stillmap.preprocessing.options import ReadOptions
 
-MAX_MOUNT = 1e5  # m from the robot's base to a sensor; the kernels' cells end at a few hundred km
+_MAX_MOUNT = 1e5  # m from the robot's base to a sensor; the kernels' cells end at a few hundred km
 
 
 def read(
@@ -68,9 +68,9 @@ def _require_mounts(recording: Recording, where: str) -> None:
     D = recording.dimension
     for sensor in np.unique(recording.sensor).tolist():
         distance = float(np.linalg.norm(recording.T_base_sensor[sensor, :D, D]))
-        if not distance <= MAX_MOUNT:
+        if not distance <= _MAX_MOUNT:
             what = f"sensor {sensor} is mounted {distance:.4g} m from the robot's base"
-            hint = f"at most {MAX_MOUNT:.0f} m: poses in a map are no mounts"
+            hint = f"at most {_MAX_MOUNT:.0f} m: poses in a map are no mounts"
             raise InputError(what, where=where, hint=hint)
 
 

@@ -1,7 +1,7 @@
 """Doors that were seen in one position only: which there are, and whether they moved unseen.
 
 How often doors swing is learned from all doors of the recording: from those that swung, and from
-those that were in the same position whenever somebody looked.
+those that were in the same position whenever somebody looked, all that fills a doorway included.
 """
 
 import dataclasses
@@ -32,7 +32,7 @@ Float = NDArray[np.float64]
 Labels = NDArray[np.float32]
 
 _P_LEAF = 36.0 / 37.0  # 35 of 35 open ones in four simulated offices were; rule of succession
-_MIN_P_LISTED = 0.15  # that what fills a doorway is a door at all
+_MIN_P_LISTED = 0.1  # that what fills a doorway is a door at all
 _RATES = np.geomspace(1e-5, 1.0, 61)  # per s, of swings, each as probable before any is seen
 _WATCHED = 2.0  # s between two looks within which a swing would have been seen
 _LOOK = 0.2  # s between scans whose beams show what is free
@@ -166,9 +166,9 @@ def compute_p_moved(
     ]
     swings = [_log_likelihood_of_swings(door) for door in doors]
     log_likelihood = np.sum([np.zeros(len(_RATES)), *swings, *log_same], axis=0)
-    posterior = np.exp(log_likelihood - log_likelihood.max())
-    posterior /= posterior.sum()
-    same = [float(posterior @ np.exp(one)) for one in log_same]
+    posterior = _normalize(log_likelihood)
+    # by the rate that all others tell
+    same = [float(_normalize(log_likelihood - one) @ np.exp(one)) for one in log_same]
     moved = []
     for stamps, (_, gaps) in zip(looks, spans, strict=True):
         ends = 1e-9 * float((stamps[0, 0] - stamp_ns[0]) + (stamp_ns[-1] - stamps[-1, 1]))
@@ -179,6 +179,12 @@ def compute_p_moved(
         log_still += len(gaps) * math.log(2.0)
         moved.append(1.0 - float(posterior @ np.exp(log_still)))
     return np.array(same), np.array(moved)
+
+
+def _normalize(log_likelihood: Float) -> Float:
+    """(R,) probability of each rate."""
+    weights = np.exp(log_likelihood - log_likelihood.max())
+    return np.asarray(weights / weights.sum())
 
 
 def _log_likelihood_of_swings(door: Door) -> Float:

@@ -43,7 +43,7 @@ _MAX_HIT_SHARE, _MIN_LENGTHS = 0.25, 0.5  # of the beams in a cell that passed; 
 
 
 class LoneLeaf(NamedTuple):
-    """A leaf that stands open.
+    """A leaf that was in one position, open or shut.
 
     Attributes:
         hinge: (2,) cells.
@@ -51,7 +51,7 @@ class LoneLeaf(NamedTuple):
         shut, leaf: (2,) unit directions from the hinge to the other end of the doorway, and along
             the leaf.
         cells: (K, 2) of it, without those at the edge of the wall.
-        roughness: cells, standard deviation of its surface from a line.
+        roughness: cells, standard deviation of its surface from a line; 0 of a shut one.
     """
 
     hinge: Float

@@ -67,7 +67,7 @@ def _rate_leaf(
             return 0.0, np.empty((0, 2), np.int64)
         hidden = float(is_free.argmax())
         if hidden:
-            more = np.arange(hidden + _ASIDE[0])[:, None] * outwards
+            more = np.arange(-1.0, hidden + _ASIDE[0])[:, None] * outwards
             row = np.concatenate([row, end + recess + more])
     across = recess / np.linalg.norm(recess)
     points = np.concatenate([row + k * across for k in (-1.0, 0.0, 1.0)])
@@ -78,8 +78,8 @@ def _rate_leaf(
 def estimate_p_door(p_shut: Float, n_doors: int) -> Float:
     """(F,) probability that each of F surfaces which fill a doorway is a door that opens at times.
 
-    Of all doorways the share pi has such a door, and pi ~ Beta(1, 2). EM: pi given which of the
-    filled ones are doors, and which are given pi.
+    Of all doorways the share pi has such a door, and pi ~ Beta(1, 2). Its posterior mean given
+    which of the filled ones are doors, and these given pi, are computed in turn.
 
     Args:
         p_shut: (F,) probability that a door would have been shut whenever this one was seen.

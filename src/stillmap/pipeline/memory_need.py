@@ -30,7 +30,6 @@ _LEAST_SHARE = 0.5
 _PER_SURFEL_BLOCK, _PER_SURFEL = 700, 700
 _MAX_BEAMS = 1 << 22  # of a recording in 3D that are looked at
 _KEY_BITS = 21  # of a coordinate: what lies farther apart counts once, as little as it is
-_BLOCK_BITS = 3  # the lowest of a coordinate, which the cells of a block differ in
 
 
 def require_map_memory(
@@ -70,7 +69,7 @@ def _measure_surfels(recording: Recording, poses: Float, resolution: float) -> i
         ended = beams[some][recording.hit[beams[some]]]
         cell = np.floor(recording.end_points(ended, poses) / resolution).astype(np.int64)
         cells = _distinct(np.append(cells, _keys(cell)))
-    within_block = _keys(np.full((1, 3), (1 << _BLOCK_BITS) - 1))
+    within_block = _keys(np.full((1, 3), _EDGE[3] - 1))
     blocks = _distinct(cells & ~within_block)
     return len(blocks) * _PER_SURFEL_BLOCK + len(cells) * _PER_SURFEL
 
@@ -82,7 +81,7 @@ def _keys(cells: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _distinct(keys: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The different ones, rising; `np.unique` hashes them, which takes ten times as long."""
+    """The different ones, rising; newer NumPy's `np.unique` hashes, which takes far longer."""
     keys.sort()
     return keys[np.append(True, keys[1:] != keys[:-1])] if len(keys) else keys
 

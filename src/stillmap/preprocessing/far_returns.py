@@ -56,7 +56,8 @@ def leave_out_far_returns(
     if len(free):
         limit = _longest_return(kept) or reach
         length = np.linalg.norm(points[free].astype(np.float64), axis=1, keepdims=True)
-        points[free] = (points[free] * (limit / length)).astype(np.float32)
+        with np.errstate(invalid="ignore"):  # infinite ones become NaN
+            points[free] = (points[free] * (limit / length)).astype(np.float32)
     return kept, [_sentence(recording, len(returns), len(free), reach)]
 
 

@@ -26,7 +26,7 @@ _STRAY = 19.0  # Beta(1, 19): share of the hits outside, of places that only mov
 
 
 class MoverHits(NamedTuple):
-    """Hits within the boxes, of walkers circles, of movers.
+    """Hits within the boxes of vehicles and the circles of walkers.
 
     Attributes:
         beam: (n,) rising.
@@ -108,6 +108,7 @@ def _place_boxes(seconds: Float, paths: Sequence[MoverPath]) -> _Boxes:
     path = np.repeat(np.arange(len(paths)), [len(some) for some in scans])
     order = np.argsort(scan, kind="stable")
     heading = velocity / np.maximum(np.linalg.norm(velocity, axis=1, keepdims=True), 1e-9)
+    heading[~heading.any(axis=1)] = (1.0, 0.0)  # of what stands, any
     return _Boxes(scan[order], path[order], xy[order], heading[order])
 
 

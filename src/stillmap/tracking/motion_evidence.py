@@ -65,8 +65,8 @@ class TrackEvidence(NamedTuple):
         windows, moving: windows of 1.5 s, one after the other, and those of steady motion.
         open_ends: 0 to 2, how many of its ends lie in plain view.
         slides: 1 if its end points lie on a line that is longer than a person is wide, along which
-            it moves slowly: the part of a wall that is labelled dynamic does so as the robot drives
-            by; else 0.
+            it moves slower than people walk: the part of a wall that is labelled dynamic does so as
+            the robot drives by; else 0.
     """
 
     looks: Float

@@ -26,7 +26,7 @@ class MoverPath:
         xy: (L, 2) metres, its center in the map frame.
         velocity: (L, 2) metres per second.
         length, width: metres, of the box.
-        is_round: it is a walker's, whose width is that of a circle.
+        is_round: of a walker; the width is the diameter of a circle.
     """
 
     seconds: Float

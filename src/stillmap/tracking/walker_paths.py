@@ -1,4 +1,4 @@
-"""Paths of walkers, with a box about each, from tracks that certainly are movers."""
+"""Paths of walkers, with a circle about each, from tracks that certainly are movers."""
 
 from collections.abc import Container, Iterator
 
