@@ -37,6 +37,7 @@ _RATES = np.geomspace(1e-5, 1.0, 61)  # per s, of swings, each as probable befor
 _WATCHED = 2.0  # s between two looks within which a swing would have been seen
 _LOOK = 0.2  # s between scans whose beams show what is free
 _LEAST = 1e-3  # s that a swing takes
+_THREADS = 2  # that count beams: every one has a heap of its own
 _MAX_COMMON = 0.3  # share of the cells of a leaf that may be of another door
 
 
@@ -95,7 +96,7 @@ def _count_beams(
         used = hit & np.repeat(is_looked_at, np.diff(offset))
         ends = np.where(used[:, None], points, np.float32(np.nan))
         weights = np.ones(len(used), np.float32)
-        _core.add_beams(counts, ends, used, weights, offset, T_map_sensor, threads)
+        _core.add_beams(counts, ends, used, weights, offset, T_map_sensor, min(threads, _THREADS))
     return counts
 
 
