@@ -130,7 +130,8 @@ def _resolve_alias(hint: Any) -> Any:
 def _array_of(hint: Any, array: NDArray[Any], name: str) -> NDArray[Any]:
     """The array, of the elements that its type hint names."""
     wanted = typing.get_args(typing.get_args(_resolve_alias(hint))[1])[0]
-    if not np.issubdtype(array.dtype, wanted):
+    # by its size: C has two integer types of 64 bits, which NumPy tells apart
+    if not np.issubdtype(np.dtype(array.dtype.str), wanted):
         raise TypeError(f"{name} holds {array.dtype}")
     return array
 
