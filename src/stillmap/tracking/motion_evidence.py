@@ -44,7 +44,7 @@ _REST_TIME = 0.3  # s, see regress_velocity
 _FAST_TRAVEL = 3.0  # m along the path of a fast mover that count as a window of steady motion
 _MAX_LINE_SPREAD = 1.25  # times the noise, across a straight surface
 _MIN_LINE, _MAX_SLIDE_SPEED = 0.75, 0.25  # m of it: people are less wide; m/s: they walk faster
-_P_WALKS_ON_LINE = 0.01  # that end points on somebody who walks spread as little: 4 of 440 tracks
+_P_WALKS_ON_LINE = 0.01  # that end points on who walks spread as little: 4 tracks of nine runs
 _BATCH = 1 << 12  # tracks whose looks are classified at once
 
 # Beta(1, 15): share of the windows in which clutter seems to move; also of half of the movers
