@@ -41,7 +41,7 @@ _TITLES = ("world", "seed", "starts", "found", "wrong", "sweeps until found: med
 _FURTHER = ("m off: median", "max", "NEES", "CPU ms of a sweep: tracked", "of a search")
 # sweeps and m/s of the run that extends a map; x, y, width, depth of what is gone, and of what came
 _EXTENDED = {
-    "corridor": (520, 2.0, (12.0, 2.1, 0.8, 0.45), (28.0, 2.1, 0.8, 0.45)),
+    "corridor": (520, 2.0, (31.0, 2.1, 0.8, 0.45), (28.0, 2.1, 0.8, 0.45)),
     "street": (300, 5.0, (40.0, -11.6, 1.6, 1.0), (70.0, -11.6, 1.6, 1.0)),
 }
 _EDGE, _NEAR, _BEYOND = 0.15, 0.25, 5.0  # m

@@ -54,7 +54,7 @@ def open_cloud(folder):
     known = KnownCloud(folder, KnownMap(folder))
     known.make_local_map()
     known.find_voxels(0.2, (0.1, 2.0))
-    return known.keep(None, 0.2, (0.1, 2.0))
+    return known.keep(None, 1.0, 0.2, (0.1, 2.0))
 
 
 def test_it_is_a_known_map(place):

@@ -189,7 +189,7 @@ def test_it_can_be_extended_again(rooms, drive):
     before = KnownCloud(known, KnownMap(known)).poses[:, :3, 3]
     off = np.linalg.norm(before[:, None] - once.poses[None, :, :3, 3], axis=2).min(axis=1)
     assert off.max() < 1.0
-    kept = once.keep(None, EDGE, (0.2, 1.8))
+    kept = once.keep(None, 1.0, EDGE, (0.2, 1.8))
     assert len(kept.cloud.points) == len(once.points)
     assert len(kept.cloud.route) < len(once.poses)
 

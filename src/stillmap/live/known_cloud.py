@@ -33,6 +33,7 @@ _SPACING = 0.1  # m between the points that are kept: where sweeps are dense, al
 # m by which the route is raised for the ground: the robot's base may lie in it
 _RAISE = 1.0
 _ROUTE_SPACING = 0.5  # m between the poses that are kept of a route
+_NEIGHBOUR_WEIGHT = 0.5  # of what was seen of a voxel, for each of those around it
 _GROUND_CELL = 0.3  # m, of the level surface that shows the ground
 
 
@@ -96,19 +97,24 @@ class KnownCloud:
         return KnownVoxels(np.ascontiguousarray(cells), np.arange(len(cells)) < len(surface))
 
     def keep(
-        self, now: CellProbabilities | None, edge: float, band: tuple[float, float]
+        self,
+        now: CellProbabilities | None,
+        p_unseen: float,
+        edge: float,
+        band: tuple[float, float],
     ) -> KeptMap:
         """The points that are still occupied.
 
         Args:
             now: P(static and occupied) of the voxels of `find_voxels`, and of others; None: all
                 that is known still stands.
+            p_unseen: of a voxel with surface, before this run saw it.
             edge: m, of a voxel.
             band: as of `find_voxels`.
         """
         stands, planar = np.ones(len(self.points), np.bool_), self.planar
         if now is not None:
-            stands = _look_up(now, self.points, edge) >= STANDS
+            stands = _find_standing(self.points, now, p_unseen, edge)
         grid, hits = planar.in_map_frame, np.array(planar.hits)
         z = self.points[:, 2] - self.ground.height_at(self.points[:, :2].astype(np.float64))
         is_obstacle = (z >= band[0]) & (z <= band[1])
@@ -160,11 +166,46 @@ def thin_route(poses: Float) -> Float:
     return poses[np.sort(first)]
 
 
-def _look_up(now: CellProbabilities, points: NDArray[np.float32], edge: float) -> Float:
-    """(N,) probabilities of the cells in which points (N, 3) lie; 1: nothing is known of it."""
+def _find_standing(
+    points: NDArray[np.float32], now: CellProbabilities, p_unseen: float, edge: float
+) -> NDArray[np.bool_]:
+    """(N,) which points (N, 3) lie in voxels that are still occupied."""
+    cells = _cells_of(points, edge)
+    shared = _share_evidence(cells, _look_up(now, cells), p_unseen).astype(np.float32)
+    of_points = np.floor(points / edge).astype(np.int64)
+    return _look_up(CellProbabilities(cells, shared, 0.0), of_points) >= STANDS
+
+
+def _share_evidence(cells: Index, p_occupied: Float, p_unseen: float) -> Float:
+    """(N,) probabilities of voxels (N, 3) in lexicographic order after what this run saw of those
+    around them, too: voxels of one thing leave together, and rings of a sweep miss many of them."""
+    logit = _logit(p_occupied)
+    evidence = np.clip(logit - _logit(np.array(p_unseen)), -LOG_RATIO, LOG_RATIO)
+    around = _sum_around(cells, evidence) - evidence
+    return np.asarray(1.0 / (1.0 + np.exp(-(logit + _NEIGHBOUR_WEIGHT * around))))
+
+
+def _logit(p: Float) -> Float:
+    within = np.clip(p, 1e-6, 1.0 - 1e-6)
+    return np.asarray(np.log(within / (1.0 - within)))
+
+
+def _sum_around(cells: Index, values: Float) -> Float:
+    """(N,) sums of the values (N,) of cells (N, 3) in lexicographic order over the 3 x 3 x 3 cells
+    around each."""
+    keys, sums = cell_keys(cells), np.append(0.0, np.cumsum(values))
+    out = np.zeros(len(cells))
+    for x, y in np.ndindex(3, 3):
+        first, last = (cell_keys(cells + np.array([x - 1, y - 1, z])) for z in (-1, 1))
+        out += sums[np.searchsorted(keys, last, "right")] - sums[np.searchsorted(keys, first)]
+    return out
+
+
+def _look_up(now: CellProbabilities, cells: Index) -> Float:
+    """(N,) probabilities of cells (N, 3); 1: nothing is known of it."""
     keys = cell_keys(now.cells)
     order = np.argsort(keys)
-    sought = cell_keys(np.floor(points / edge).astype(np.int64))
+    sought = cell_keys(cells)
     at = np.minimum(np.searchsorted(keys, sought, sorter=order), len(keys) - 1)
     found = order[at]
     return np.where(keys[found] == sought, now.p_occupied[found], 1.0)

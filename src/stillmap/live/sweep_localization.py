@@ -8,7 +8,7 @@ import stillmap._core as _core
 from stillmap.core import se2
 from stillmap.live.causal_labels import CausalLabels, OccupancyFilter
 from stillmap.live.global_localization import GlobalLocalizer, Localization
-from stillmap.live.known_cloud import KnownCloud
+from stillmap.live.known_cloud import KnownCloud, KnownVoxels
 from stillmap.live.known_map import KnownMap
 from stillmap.live.known_planes import KnownPlanes
 from stillmap.live.local_map import MappedScan
@@ -107,9 +107,9 @@ class SweepLocalizer:
             is_lost: they are of what was seen elsewhere.
         """
         if is_lost and self._left is None:  # it was never found
-            return self._known.keep(None, self._edge, self._band)
+            return self._known.keep(None, 1.0, self._edge, self._band)
         now = labels.known_cells(self._left if is_lost else None)
-        return self._known.keep(now, self._edge, self._band)
+        return self._known.keep(now, _p_unseen(labels), self._edge, self._band)
 
     def localize(self, labels: CausalLabels, scan: MappedScan, pose: Float) -> Localization:
         """(4, 4) of the frame of the labels in the known map, if the evidence is clear.
@@ -162,3 +162,11 @@ class SweepLocalizer:
         T[:3, :3] = np.column_stack([x, np.cross(up, x), up])
         T[:3, 3] = [*in_plane[:2, 2], self.route[nearest, 2] + slope @ offset[nearest]]
         return T
+
+
+def _p_unseen(labels: CausalLabels) -> float:
+    """P(static and occupied) of a voxel of which only the known map speaks."""
+    empty = labels.filter.sibling()
+    assert isinstance(empty, _core.SweepFilter3D)
+    KnownVoxels(np.zeros((1, 3), np.int64), np.ones(1, np.bool_)).prime(empty)
+    return float(labels.known_cells(empty).p_occupied[0])
