@@ -2,13 +2,14 @@
 
 python benchmarks/live_crowds.py --data DIR [--world hall] [--people 0 30 60 120] [--runs 5]
     [--max-range 30] [--odometry-noise 1]
-python benchmarks/live_crowds.py --data DIR --visitors 0 5 10 20 [--max-range 8]
+python benchmarks/live_crowds.py --data DIR --visitors 0 5 10 20 [--max-range 8] [--arrive 20]
 
 Runs of 400 scans through a known map: localized without a prior, with P(static) and with all beams
 alike; and by a particle filter with a likelihood field that is told where it starts. Then the same
 scans without a map: poses of live mapping, with P(static) and with all beams alike.
 people: walk on ways of their own. visitors: gather around the robot after 10 s and stay with it,
-0.7 to 2.5 m away, wherever it goes. Lost: in a known map the last 50 poses are more than 0.5 m off
+0.7 to 2.5 m away, wherever it goes; at once, or with --arrive each after up to so many seconds
+more, walking up from 9 to 14 m. Lost: in a known map the last 50 poses are more than 0.5 m off
 on average; without one the poses of all scans are, after alignment. NEES: of 3.
 """
 
@@ -34,6 +35,7 @@ from stillmap.sim import scene_by_name, simulate
 _SCANS, _BEFORE_VISITORS = 400, 50
 _DISTANCE, _RADIUS = (0.7, 2.5), 0.2  # m, of visitors
 _SWAY, _SWAY_SCANS = (0.3, 0.2), 25.0  # rad and m by which they move about, and how slowly
+_COME_FROM, _WALK = (9.0, 14.0), 1.3  # m, m/s
 _LOST = 0.5  # m
 _ODOMETRY = {
     "wheel_radius_error": 0.0005,
@@ -79,6 +81,7 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--world", default="hall")
     p.add_argument("--people", nargs="+", type=int, default=[0, 30, 60, 120])
     p.add_argument("--visitors", nargs="+", type=int)
+    p.add_argument("--arrive", type=float, default=0.0, help="s")
     p.add_argument("--runs", type=int, default=5)
     p.add_argument("--max-range", type=float, default=30.0, help="m")
     p.add_argument("--fov", type=float, default=180.0, help="degrees")
@@ -101,7 +104,8 @@ def _run(args, place, count, is_visited, run):
     simulation = simulate(scene_by_name(args.world, changes), args.first_seed + run)
     recording, true = simulation.recording, simulation.truth.T_world_base
     if is_visited:
-        recording = add_visitors(recording, count, np.random.default_rng(run))
+        rng = np.random.default_rng(run)
+        recording = add_visitors(recording, count, rng, args.arrive)
     in_map = T_map_world @ true
     return [
         _track(OnlineSlam, recording, in_map, known),
@@ -112,16 +116,21 @@ def _run(args, place, count, is_visited, run):
     ]
 
 
-def add_visitors(recording, count: int, rng):
-    """The recording with people who stay around the robot."""
+def add_visitors(recording, count: int, rng, arrive: float = 0.0):
+    """The recording with people who stay around the robot, within `arrive` s."""
     points, hit = recording.points.copy(), recording.hit.copy()
     bearing, distance = rng.uniform(-np.pi, np.pi, count), rng.uniform(*_DISTANCE, count)
+    seconds = 1e-9 * (recording.stamp_ns - recording.stamp_ns[_BEFORE_VISITORS])
+    begin = rng.uniform(0.0, arrive, count) if arrive else np.full(count, -np.inf)
+    far = rng.uniform(*_COME_FROM, count) if arrive else distance
     sway, kept = np.zeros((2, count)), math.exp(-1.0 / _SWAY_SCANS)
     for t in range(_BEFORE_VISITORS, recording.n_scans):
         shock = rng.normal(size=(2, count)) * np.array(_SWAY)[:, None]
         sway = kept * sway + math.sqrt(1.0 - kept**2) * shock
-        angle, away = bearing + sway[0], np.maximum(distance + sway[1], 0.5)
-        centres = np.stack([away * np.cos(angle), away * np.sin(angle)], axis=1)
+        walked = _WALK * (seconds[t] - begin)
+        angle = bearing + sway[0]
+        away = np.maximum(np.maximum(distance, far - walked) + sway[1], 0.5)
+        centres = np.stack([away * np.cos(angle), away * np.sin(angle)], axis=1)[walked >= 0.0]
         back = se2.inverse(recording.T_base_sensor[recording.sensor[t]])
         centres = centres @ back[:2, :2].T + back[:2, 2]
         beams = recording.beams_of(t)

@@ -126,8 +126,11 @@ class CausalLabels:
 
     def doubt(self, e: NDArray[np.float32]) -> NDArray[np.float32]:
         """(N,) P(static) of `label` with the prior of what was only just seen."""
-        odds = _RECENT_PRIOR / (1.0 - _RECENT_PRIOR) * (1.0 - self._prior) / self._prior
-        return np.asarray(odds * e / (odds * e + (1.0 - e)), np.float32)
+        return _doubt(e, self._prior)
+
+    def doubt_ends(self, e: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(N,) P(static) of `label_ends` with the prior of what was only just seen."""
+        return _doubt(e, _MAP_PRIOR)
 
     def add(
         self, observation: Observation, T_map_base: Float, to: OccupancyFilter | None = None
@@ -223,6 +226,12 @@ class CausalLabels:
             self._reported, self._is_replaced = self._reported & left, False
         self._reported.update(cell.tobytes() for cell in lowest)
         return changes
+
+
+def _doubt(e: NDArray[np.float32], prior: float) -> NDArray[np.float32]:
+    """(N,) P(static) with that prior, with the prior of what was only just seen."""
+    odds = _RECENT_PRIOR / (1.0 - _RECENT_PRIOR) * (1.0 - prior) / prior
+    return np.asarray(odds * e / (odds * e + (1.0 - e)), np.float32)
 
 
 def take_over(

@@ -1,0 +1,109 @@
+"""People who walk along with the robot are noticed, and do not take its map along."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stillmap.eval.trajectory import compute_absolute_errors
+from stillmap.live.crowd import Crowd
+from stillmap.live.mapper import LiveMapper
+from stillmap.live.replay import iter_beams
+from stillmap.sim import scene_by_name, simulate
+
+STEP, PERIOD_NS = 0.1, 200_000_000
+ROOM = np.stack(np.meshgrid(np.arange(-3.0, 30.0, 0.7), [-3.1, -2.2, 2.4, 3.3]), axis=-1).reshape(
+    -1, 2
+)
+BESIDE = np.random.default_rng(3).uniform([0.5, -1.5], [2.5, 1.5], (40, 2))
+
+
+def drive(crowd, scans, *, companions, speed=1.0):
+    """Scans of posts in a room, while odometry says STEP a scan."""
+    increment = np.eye(3)
+    increment[0, 2] = STEP
+    rng = np.random.default_rng(0)
+    for t in range(scans):
+        posts = ROOM - [speed * STEP * t, 0.0]
+        posts = posts[np.hypot(*posts.T) < 6.0]
+        points = np.concatenate([posts, BESIDE]) if companions else posts
+        noisy = (points + rng.normal(0.0, 0.01, points.shape)).astype(np.float32)
+        crowd.observe(noisy, None if t == 0 else increment, t * PERIOD_NS)
+    return crowd
+
+
+def test_people_who_walk_along_are_noticed():
+    assert drive(Crowd(), 40, companions=True).walks_along
+    assert not drive(Crowd(), 40, companions=False).walks_along
+
+
+def test_wheels_that_spin_are_no_crowd():
+    assert not drive(Crowd(), 40, companions=False, speed=0.0).walks_along
+    assert not drive(Crowd(), 40, companions=True, speed=0.0).walks_along
+
+
+def test_without_odometry_nothing_is_compared():
+    crowd = drive(Crowd(), 40, companions=True)
+    before = vars(crowd)["_along"]
+    crowd.observe(BESIDE.astype(np.float32), None, 10**10)
+    crowd.observe(BESIDE.astype(np.float32), np.eye(3), 2 * 10**10)
+    assert vars(crowd)["_along"] == before
+
+
+def test_stamps_of_any_order_and_scans_without_hits():
+    crowd, nothing = Crowd(), np.zeros((0, 2), np.float32)
+    increment = np.eye(3)
+    increment[0, 2] = 0.4
+    for stamp in (0, 10**18, -(10**18), 5, 5, 10**9):
+        crowd.observe(nothing, increment, stamp)
+        crowd.observe(BESIDE.astype(np.float32), increment, stamp)
+    assert not crowd.is_dense
+
+
+def test_labels_show_a_crowd():
+    crowd = Crowd()
+    crowd.learn(np.zeros(0, np.float32))
+    assert not crowd.is_dense
+    crowd.learn(np.array([0.1, 0.2, 0.9], np.float32))
+    assert crowd.is_dense
+    assert not crowd.walks_along
+
+
+def surrounded(recording, count, first):
+    """The recording with people 0.7 to 2.5 m around the robot from a scan on."""
+    rng = np.random.default_rng(4)
+    bearing, distance = rng.uniform(-np.pi, np.pi, count), rng.uniform(0.7, 2.5, count)
+    phase = rng.uniform(0.0, 2.0 * np.pi, (2, count))
+    points, hit = recording.points.copy(), recording.hit.copy()
+    for t in range(first, recording.n_scans):
+        angle = bearing + 0.15 * np.sin(0.1 * t + phase[0])
+        away = distance + 0.15 * np.sin(0.07 * t + phase[1])
+        beams = recording.beams_of(t)
+        length = np.linalg.norm(points[beams], axis=1)
+        direction = points[beams] / length[:, None]
+        centres = away * np.stack([np.cos(angle), np.sin(angle)])
+        along = direction @ centres
+        off2 = away**2 - along**2
+        meets = (along > 0.0) & (off2 < 0.04)
+        reach = np.where(meets, along - np.sqrt(np.maximum(0.04 - off2, 0.0)), np.inf).min(axis=1)
+        nearer = reach < length
+        points[beams][nearer] = direction[nearer] * reach[nearer, None]
+        hit[beams][nearer] = True
+    return replace(recording, points=points, hit=hit)
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_the_map_stays_where_visitors_surround_the_robot(seed):
+    changes = {"robot": {"scans": 300}, "laser": {"max_range": 8.0, "fov": math.pi}}
+    simulation = simulate(scene_by_name("hall", {**changes, "crowd": {"people": 0}}), seed)
+    recording = surrounded(simulation.recording, 20, 50)
+    with LiveMapper({"threads": 1}) as mapper:
+        poses = [
+            mapper.push(beams, recording.T_odom_base[t]).pose
+            for t, beams in enumerate(iter_beams(recording))
+        ]
+    true = simulation.truth.T_world_base
+    off = compute_absolute_errors(np.array(poses), true).rmse
+    assert off < 0.3
+    assert off < 1.5 * compute_absolute_errors(recording.T_odom_base, true).rmse + 0.1
