@@ -70,6 +70,7 @@ def test_a_clock_that_is_set_back_is_told(
     start_robot("--last", "200")
     text = "clock set back by 3"
     assert wait_for(lambda: any(text in status(one) for one in judge.diagnostics), 30.0)
+    assert wait_for(lambda: "clock set back" in node.text, 10.0)
     assert node.text.count("clock set back") == 1
     assert len(judge.poses) == 60
     node.send(signal.SIGINT)
