@@ -20,9 +20,10 @@ _SPACING_NS = 10**8  # between scans that are kept
 _MAX_HITS = 150  # of a scan, which are compared with all of another one
 _NEAR, _OFF = 0.1, 0.15  # m to the nearest hit of the other scan: fits; does not
 _RATE = 0.15  # weight of a scan in the running shares
-# running shares of the hits that keep their place beside the robot, from which people walk along;
-# and of those that are where odometry says, below which rather the wheels spin
-_ALONG, _STATIC = 0.1, 0.02
+# running share of the hits that keep their place beside the robot, from which people walk along;
+# and of those that are where odometry says in the same scans, below which rather the wheels spin;
+# both while nobody walks along, and while people do
+_ALONG, _STATIC = (0.1, 0.05), (0.05, 0.003)
 
 
 class _Kept(NamedTuple):
@@ -32,14 +33,19 @@ class _Kept(NamedTuple):
 
 
 class Crowd:
-    """The share of hits on what moves, and of those on what moves along with the robot."""
+    """The share of hits on what moves, and of those on what moves along with the robot.
+
+    Attributes:
+        walks_along: people walk along with the robot.
+    """
 
     def __init__(self) -> None:
         from scipy.spatial import cKDTree  # slow to load: not while a pose is waited for
 
         self._make_tree = cKDTree
+        self.walks_along = False
         self._moving = 0.0  # share of the hits, as labels say a second later
-        self._along, self._static = 0.0, 0.0
+        self._along, self._both = 0.0, 0.0
         self._kept = deque[_Kept]()
         self._T_odom_base = np.eye(3)
 
@@ -47,11 +53,6 @@ class Crowd:
     def is_dense(self) -> bool:
         """True if people may walk along with the robot: many move, or some do that."""
         return self._moving > _CROWDED or self.walks_along
-
-    @property
-    def walks_along(self) -> bool:
-        """True if people walk along with the robot."""
-        return self._along > _ALONG and self._static > _STATIC
 
     def learn(self, e: NDArray[np.float32]) -> None:
         """Take the labels of an earlier scan.
@@ -100,8 +101,11 @@ class Crowd:
         T = se2.inverse(other.T_odom_base) @ self._T_odom_base
         moved = thin @ T[:2, :2].T + T[:2, 2]
         along, static = (np.asarray(tree.query(at)[0], np.float64) for at in (thin, moved))
-        self._along += _RATE * (_share(along, static) - self._along)
-        self._static += _RATE * (_share(static, along) - self._static)
+        share = _share(along, static)
+        self._along += _RATE * (share - self._along)
+        self._both += _RATE * (share * _share(static, along) - self._both)
+        least, least_static = (limits[self.walks_along] for limits in (_ALONG, _STATIC))
+        self.walks_along = self._along > least and self._both > least_static * self._along
 
 
 def _share(fits: Float, not_fits: Float) -> float:
