@@ -161,8 +161,8 @@ def make_parents(output: Path) -> Iterator[None]:
         try:
             for folder in reversed((parent, *parent.parents)):
                 if not folder.exists():
+                    created.append(folder)  # an interruption right after it was made finds it
                     folder.mkdir(exist_ok=True)
-                    created.append(folder)
             # the writer reports a device at this path
             if not output.exists() or output.is_file() or output.is_dir():
                 with temporary_folder(output):

@@ -11,6 +11,7 @@ from pathlib import Path
 from types import CodeType, FrameType
 from typing import IO, TYPE_CHECKING, Any
 
+from stillmap.core.interrupts import is_uninterrupted, send_again
 from stillmap.core.printable import printable
 from stillmap.core.progress_bar import Step, make_bar, terminal_bar
 
@@ -205,7 +206,6 @@ def list_files(folder: Path) -> list[str]:
 
 EXIT_INTERRUPTED, EXIT_TERMINATED = 130, 143
 
-_RETRY = 0.02  # s until a deferred signal is sent again
 _IMPORTS = "<frozen importlib"  # file name of the frames of an import
 _PACKING = "lazrsbackend.py"  # of laspy
 
@@ -218,15 +218,13 @@ def handle_signals(command: CodeType) -> None:
     shell script, or SIGHUP by nohup, stays ignored. During an import a signal is
     deferred: a library may take the exception for a missing module, turn it into another error,
     or execute text as code, after which Python reports an uncaught interrupt. Likewise while
-    points are packed as LAZ, where the exception becomes another one.
+    points are packed as LAZ, where the exception becomes another one, and while something is made
+    or removed that must not stay; see `core.interrupts`.
     """
-    main = threading.get_ident()  # Python handles signals in this thread alone
 
     def handle(number: int, frame: FrameType | None) -> None:
         if _must_defer(frame, command):
-            again = threading.Timer(_RETRY, signal.pthread_kill, (main, number))
-            again.daemon = True
-            again.start()
+            send_again(number)
         elif number == signal.SIGINT:
             raise KeyboardInterrupt
         else:
@@ -240,7 +238,7 @@ def handle_signals(command: CodeType) -> None:
 def _must_defer(frame: FrameType | None, command: CodeType) -> bool:
     while frame is not None and frame.f_code is not command:
         name = frame.f_code.co_filename
-        if name.startswith(_IMPORTS) or name.endswith(_PACKING):
+        if name.startswith(_IMPORTS) or name.endswith(_PACKING) or is_uninterrupted(frame):
             return True
         frame = frame.f_back
     return False

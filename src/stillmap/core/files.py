@@ -2,11 +2,13 @@
 
 import os
 import secrets
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from stillmap.core.errors import InputError, cannot_write
+from stillmap.core.interrupts import uninterrupted
 from stillmap.core.output_place import (
     UNFINISHED,
     hidden_path,
@@ -112,6 +114,7 @@ def atomic_folder(
 
 
 @contextmanager
+@uninterrupted
 def temporary_folder(output: Path, parent: Path | None = None) -> Iterator[Path]:
     """Context manager of a folder for work on an output, removed at the end.
 
@@ -159,11 +162,13 @@ def atomic_file(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
+@uninterrupted
 def _removed_at_the_end(work: Path, path: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        if not os.path.lexists(path / UNFINISHED):  # otherwise the rest of an exchange lies there
+        # otherwise the rest of an exchange lies there
+        if path not in work.parents or not os.path.lexists(path / UNFINISHED):
             remove(work)
 
 
@@ -184,6 +189,28 @@ def _kept_on_failure(work: Path, path: Path) -> Iterator[None]:
             kept = keep(work, path)
             hint = "" if kept is None else f"what was made is kept in {kept}"
         raise InputError(what, where=str(path), hint=hint) from error
+
+
+@contextmanager
+@uninterrupted
+def new_folder(prefix: str, parent: Path | None = None) -> Iterator[Path]:
+    """Context manager of a new folder, of which nothing is left if the block fails.
+
+    Args:
+        prefix: start of its name.
+        parent: where it lies; None: among temporary files.
+
+    Raises:
+        OSError: it cannot be made.
+    """
+    parent = Path(tempfile.gettempdir()) if parent is None else parent
+    folder = parent / f"{prefix}{secrets.token_hex(8)}"
+    try:
+        folder.mkdir(mode=0o700)
+        yield folder
+    except BaseException:
+        remove(folder)
+        raise
 
 
 def sync(path: Path) -> None:

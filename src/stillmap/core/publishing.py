@@ -14,6 +14,7 @@ from pathlib import Path
 
 from stillmap.core.errors import InputError
 from stillmap.core.input_files import read_bytes
+from stillmap.core.interrupts import uninterrupted
 from stillmap.core.output_place import (
     PREFIX,
     UNFINISHED,
@@ -69,8 +70,17 @@ def _remove_unless_held(entry: Path, output: Path) -> None:
         os.close(handle)
 
 
+@uninterrupted
 def remove(path: Path) -> None:
     """Remove a file, a link, or a folder with all in it, as far as that is possible."""
+    try:
+        _remove(path)
+    except BaseException:  # Ctrl-C, where `uninterrupted` is of no use
+        _remove(path)
+        raise
+
+
+def _remove(path: Path) -> None:
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:
@@ -97,34 +107,54 @@ def publish_folder(work: Path, path: Path, marker: str) -> None:
         except OSError as error:
             if error.errno not in _NO_RENAME:
                 raise
-    inside = work
-    path.mkdir(exist_ok=True)
-    if path not in work.parents:
+    if path in work.parents:
+        _exchange_files(work, path, marker)
+    else:
         inside = path / f"{PREFIX}{secrets.token_hex(8)}.part"
-    try:
-        if inside is not work:
+        with _removed_on_failure(inside, path):
+            path.mkdir(exist_ok=True)
             shutil.copytree(work, inside, symlinks=True)
-        _note_exchange(inside, path, marker)
+            _exchange_files(inside, path, marker)
+
+
+@contextmanager
+@uninterrupted
+def _removed_on_failure(inside: Path, path: Path) -> Iterator[None]:
+    """Remove a copy inside a folder if the block fails, and the folder if it was not there."""
+    is_new = not path.exists()
+    try:
+        yield
     except BaseException:
-        if inside is not work:
+        if not os.path.lexists(path / UNFINISHED):  # otherwise the exchange goes on from there
             remove(inside)
+        if is_new:
+            with suppress(OSError):  # something is in it
+                path.rmdir()
         raise
-    finish_exchange(path)
 
 
+@uninterrupted
 def _replace_folder(work: Path, path: Path) -> None:
     if not path.exists():
         os.rename(work, path)
         return
     # rename(2) does not replace a folder that is not empty
     old = work.with_suffix(".old")
-    os.rename(path, old)
     try:
+        os.rename(path, old)
         os.rename(work, path)
-    except OSError:
-        os.rename(old, path)
-        raise
-    remove(old)
+    finally:
+        if not os.path.lexists(work):
+            remove(old)
+        elif os.path.lexists(old):
+            os.rename(old, path)
+
+
+@uninterrupted
+def _exchange_files(work: Path, path: Path, marker: str) -> None:
+    """Move a finished folder inside another one to the place of what that one holds."""
+    _note_exchange(work, path, marker)
+    finish_exchange(path)
 
 
 def _note_exchange(work: Path, path: Path, marker: str) -> None:
@@ -139,13 +169,18 @@ def _note_exchange(work: Path, path: Path, marker: str) -> None:
         "new": sorted(os.listdir(work), key=lambda name: (is_marker(name), name)),
     }
     draft = path / f"{UNFINISHED}.part"
-    with draft.open("w", encoding="ascii") as file:
-        json.dump(journal, file)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(draft, path / UNFINISHED)
+    try:
+        with draft.open("w", encoding="ascii") as file:
+            json.dump(journal, file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(draft, path / UNFINISHED)
+    except BaseException:
+        remove(draft)
+        raise
 
 
+@uninterrupted
 def finish_exchange(path: Path) -> None:
     """Go on with the exchange of files that the journal of a folder names, if there is one.
 

@@ -5,8 +5,6 @@ both are on one disk: it may be full.
 """
 
 import os
-import shutil
-import tempfile
 from contextlib import suppress
 from pathlib import Path
 from typing import IO, Annotated, Any, TypedDict
@@ -19,7 +17,7 @@ from stillmap.core.array_files import open_npy
 from stillmap.core.arrays import iter_bytes, map_file, write_npy
 from stillmap.core.config import Limits
 from stillmap.core.errors import InputError
-from stillmap.core.files import sync
+from stillmap.core.files import new_folder, sync
 from stillmap.core.grid_map import GridMap
 from stillmap.core.input_files import require_regular
 from stillmap.core.json import read_json, write_json
@@ -84,13 +82,9 @@ def keep_drive(snapshot: Snapshot, parent: Path) -> Path:
     Raises:
         OSError: there is no room; nothing is left of it.
     """
-    folder = Path(tempfile.mkdtemp(prefix="stillmap-drive-", dir=parent))
-    try:
+    with new_folder("stillmap-drive-", parent) as folder:
         _write(snapshot, folder)
         sync(folder)
-    except BaseException:
-        shutil.rmtree(folder, ignore_errors=True)
-        raise
     return folder
 
 

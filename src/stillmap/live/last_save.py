@@ -3,14 +3,13 @@
 import logging
 import os
 import shlex
-import shutil
 import tempfile
 import time
 from contextlib import suppress
 from pathlib import Path
 
 from stillmap.core.errors import InputError, cannot_write
-from stillmap.core.files import nearest_folder_above
+from stillmap.core.files import nearest_folder_above, new_folder
 from stillmap.core.profiling import Progress, no_progress
 from stillmap.live.drive_folder import keep_drive
 from stillmap.live.saving import LiveResult, Snapshot
@@ -69,13 +68,10 @@ class _Attempt:
 
     def keep_result(self) -> str | None:
         """Write the result among temporary files; tells where, or None: there is no room."""
-        spare = None
         try:
-            spare = Path(tempfile.mkdtemp(prefix="stillmap-live-"))
-            self._prepare(spare / "map").write(spare)
+            with new_folder("stillmap-live-") as spare:
+                self._prepare(spare / "map").write(spare)
         except (InputError, OSError):
-            if spare is not None:
-                shutil.rmtree(spare, ignore_errors=True)
             return None
         return f"the result is kept in {spare}"
 

@@ -5,6 +5,9 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import FrameType
+
+from stillmap.core.interrupts import is_uninterrupted, send_again
 
 
 @contextmanager
@@ -17,8 +20,11 @@ def signal_flag() -> Iterator[threading.Event]:
     """
     stop, since = threading.Event(), [0.0]
 
-    def handle(number: int, _: object) -> None:
+    def handle(number: int, frame: FrameType | None) -> None:
         if number == signal.SIGINT and stop.is_set() and time.monotonic() - since[0] > 1.0:
+            if is_uninterrupted(frame):
+                send_again(number)
+                return
             raise KeyboardInterrupt
         if not stop.is_set():
             since[0] = time.monotonic()

@@ -25,6 +25,7 @@ from stillmap.core.arrays import iter_bytes, write_npy
 from stillmap.core.config import Limits
 from stillmap.core.errors import InputError, cannot_write
 from stillmap.core.files import sync
+from stillmap.core.interrupts import uninterrupted
 from stillmap.core.json import read_json
 from stillmap.core.locks import open_lock
 from stillmap.core.output_place import hidden_path, resolve_output
@@ -136,8 +137,10 @@ class CheckpointFolder:
             sync(work)
             os.rename(work, final)
             sync(self.folder)
-        except OSError as error:
+        except BaseException as error:
             self._clear(work)
+            if not isinstance(error, OSError):
+                raise
             what = f"no checkpoint can be written: {error.strerror or error}"
             raise InputError(what, where=str(self.folder)) from error
         self._arrays, self.is_in_use = about, True
@@ -168,6 +171,7 @@ class CheckpointFolder:
             elif path.name.endswith((".part", ".old")):
                 self._clear(path)
 
+    @uninterrupted
     def _clear(self, *paths: Path) -> None:
         for path in paths:
             if path.is_dir() and not path.is_symlink():
@@ -180,6 +184,7 @@ class CheckpointFolder:
 
 
 @contextmanager
+@uninterrupted
 def lock_checkpoints(output: Path) -> Iterator[CheckpointFolder]:
     """The checkpoint folder of a result folder, locked against other runs while the block runs.
 

@@ -4,13 +4,12 @@
 from __future__ import annotations
 
 import os
-import shutil
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
 from stillmap.core.errors import InputError
+from stillmap.core.files import new_folder
 from stillmap.core.profiling import Progress
 from stillmap.core.recording import Recording
 from stillmap.pipeline.options import Options
@@ -100,12 +99,8 @@ def _require_apart(output: Path, job: MergeJob) -> None:
 
 
 def _merge_temporarily(job: MergeJob, tell: Progress) -> SavedPlace:
-    home = Path(tempfile.mkdtemp(prefix="stillmap-place-"))
-    try:
+    with new_folder("stillmap-place-") as home:
         merge_sessions(job, home / "place", progress=tell)
         place = load_place(home / "place")
-    except BaseException:
-        shutil.rmtree(home, ignore_errors=True)
-        raise
-    remove_with(place, home)
+        remove_with(place, home)
     return place
