@@ -48,6 +48,10 @@ def test_points_with_and_without_returns():
         (Scan(0, [1.0], [0.0], beam_times=[0.0, 1.0]), "beam_times"),
         (Scan(0, [1.0], [0.0], beam_times=[np.inf]), "beam_times"),
         (Scan(0, [1.0], [0.0], sensor_pose=(1.0, 2.0)), "sensor_pose"),
+        (
+            Scan(0, [1.0], [0.0], sensor_pose=(1e6, 0.0, 0.0)),
+            "sensor_pose: .* from the robot's base",
+        ),
     ],
 )
 def test_what_is_wrong_is_named(scan, named):

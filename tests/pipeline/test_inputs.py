@@ -12,6 +12,8 @@ from stillmap.core.config import override
 from stillmap.core.recording import Recording
 from stillmap.em import beam_counting
 
+NOT_FINITE = (np.nan, np.inf, -np.inf)
+
 
 @pytest.mark.parametrize("how", ["one scan", "no hits", "all unusable", "no beams"])
 @pytest.mark.parametrize("odometry", [True, False])
@@ -135,3 +137,58 @@ def test_missing_odometry_is_reported(short):
     without = stillmap.build(short.recording.without_odometry(), options(max_iterations=1))
     assert not any("no odometry" in warning for warning in with_it.warnings)
     assert any("no odometry" in warning for warning in without.warnings)
+
+
+def _transform(dimension, x=0.0, rotation=1.0):
+    T = np.eye(dimension + 1)
+    T[0, dimension] = x
+    T[:dimension, :dimension] *= rotation
+    return T
+
+
+def _small_recording(dimension, mount=None):
+    rng = np.random.default_rng(1)
+    stamps, still = np.arange(4) * 10**8, np.tile(np.eye(dimension + 1), (4, 1, 1))
+    if dimension == 2:
+        angles = np.linspace(-3.0, 3.0, 60)
+        ranges = 3.0 + rng.normal(0.0, 0.01, (4, 60))
+        return Recording.from_scans(stamps, ranges, angles, still, sensor_pose=mount)
+    clouds = rng.normal(size=(4, 60, 3))
+    return Recording.from_clouds(stamps, list(clouds), still, sensor_pose=mount)
+
+
+@pytest.mark.parametrize("metres", [1.01e5, 1e7, 9e8])
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_far_mounts_are_named(dimension, metres):
+    """As when files are read; a kernel would only say that some point is too far away."""
+    recording = _small_recording(dimension, _transform(dimension, metres))
+    with pytest.raises(stillmap.InputError, match=r"sensor 0 is mounted .* m from"):
+        stillmap.build(recording, {"threads": 1})
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "what"),
+    [
+        *[("T_base_sensor", {"x": x}, "the mount of sensor 0 is not finite") for x in NOT_FINITE],
+        *[("T_base_sensor", {"x": x}, "sensor 0 is mounted") for x in (1e30, 1e300)],
+        *[("T_base_sensor", {"rotation": r}, "no rigid transform") for r in (0.0, -1.0, 2.0)],
+        *[("T_odom_base", {"x": x}, "odometry: expected") for x in (1e10, 1e300, *NOT_FINITE)],
+        *[("T_odom_base", {"rotation": r}, "odometry: expected") for r in (0.0, 3.0, np.nan)],
+        ("stamp_ns", np.arange(4)[::-1], "stamps must not fall"),
+        ("stamp_ns", np.array([0, 4 * 10**18, 4 * 10**18, -4 * 10**18]), "stamps must not fall"),
+    ],
+)
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_transforms_that_are_none_are_named(dimension, name, value, what):
+    """Of recordings that no reader and no constructor has checked."""
+    recording = _small_recording(dimension)
+    if isinstance(value, dict):
+        array = getattr(recording, name).copy()
+        array[-1] = _transform(3 if array.shape[-1] == 4 else 2, **value)
+        # a turn by half a circle in the plane, a mirror in space
+        if value.get("rotation") == -1.0 and dimension == 2:
+            array[-1, 0, 0] = 1.0
+        value = array
+    recording = dataclasses.replace(recording, **{name: value})
+    with pytest.raises(stillmap.InputError, match=what):
+        stillmap.build(recording, {"threads": 1})

@@ -10,11 +10,10 @@ import numpy as np
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.io.builder import ReadContext
+from stillmap.io.recording_checks import require_mounts
 from stillmap.io.registry import detect_format
 from stillmap.io.text_lines import Progress
 from stillmap.preprocessing.options import ReadOptions
-
-_MAX_MOUNT = 1e5  # m from the robot's base to a sensor; the kernels' cells end at a few hundred km
 
 
 def read(
@@ -51,7 +50,7 @@ def prepare(
         InputError: options are for recordings of another dimension, or a sensor is far from the
             robot.
     """
-    _require_mounts(recording, where)
+    require_mounts(recording, where)
     if recording.dimension == 3:
         return _prepare_3d(recording, options, scratch)
     for name, given in (
@@ -62,16 +61,6 @@ def prepare(
             what = f"read.{name} is for 3D recordings, this one is in 2D"
             raise InputError(what, where=where)
     return recording
-
-
-def _require_mounts(recording: Recording, where: str) -> None:
-    D = recording.dimension
-    for sensor in np.unique(recording.sensor).tolist():
-        distance = float(np.linalg.norm(recording.T_base_sensor[sensor, :D, D]))
-        if not distance <= _MAX_MOUNT:
-            what = f"sensor {sensor} is mounted {distance:.4g} m from the robot's base"
-            hint = f"at most {_MAX_MOUNT:.0f} m: poses in a map are no mounts"
-            raise InputError(what, where=where, hint=hint)
 
 
 @contextmanager

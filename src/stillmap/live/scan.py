@@ -20,6 +20,7 @@ from stillmap.io.array_checks import (
     stamps_to_ns,
     to_array,
 )
+from stillmap.io.recording_checks import MAX_MOUNT
 from stillmap.preprocessing.max_range import MAX_ZERO_RANGE
 from stillmap.preprocessing.options import MAX_PLAUSIBLE_RANGE
 
@@ -193,4 +194,6 @@ def _sensor_matrix(pose: ArrayLike | None, dimension: int) -> Float:
     if pose is None:
         return np.eye(dimension + 1)
     out: Float = poses_to_matrices("sensor_pose", np.asarray(pose)[None], 1, dimension)[0]
+    if not np.hypot.reduce(out[:dimension, dimension]) <= MAX_MOUNT:
+        raise ValueError(f"sensor_pose: expected at most {MAX_MOUNT:.0f} m from the robot's base")
     return out

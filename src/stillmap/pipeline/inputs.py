@@ -14,6 +14,7 @@ from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.io.array_checks import poses_to_matrices
 from stillmap.io.input_groups import InputGroup, group_inputs, read_parts
+from stillmap.io.recording_checks import require_plausible
 from stillmap.io.text_lines import Progress, share_progress
 from stillmap.io.trajectory import poses_from_tum
 from stillmap.pipeline.options import Options
@@ -126,12 +127,14 @@ def require_mappable(
     """Refuse what cannot be mapped.
 
     Raises:
-        InputError: a recording without scans, an estimator that is for 2D alone, or depth images
-            without poses: their narrow view is not registered.
+        InputError: a recording without scans, mounts or odometry that no robot has, an estimator
+            that is for 2D alone, or depth images without poses: their narrow view is not
+            registered.
     """
     where = str(recording.source.get("path", "the recording"))
     if recording.n_scans == 0:
         raise InputError("holds no scan that can be used", where=where)
+    require_plausible(recording, where)
     if recording.dimension == 3 and options.estimator not in em.ESTIMATORS_3D:
         raise InputError(
             f"is 3D: estimator '{options.estimator}' is for 2D recordings",
