@@ -28,7 +28,10 @@ _WORDS = (  # of `stillmap map`
     *(["--region", "-1", "-1", "2", "3"], ["--set", "em.change_detection=true"]),
 )
 _WORDS_2D = (*_WORDS, ["--paper"], ["--estimator", "hit-ratio"], ["--estimator", "tracker"])
-_WORDS_3D = (*_WORDS, ["--mesh"], ["--spin", "clockwise"], ["--set", "read.self_filter=false"])
+_WORDS_3D = (
+    *(*_WORDS, ["--paper"], ["--mesh"], ["--spin", "clockwise"]),
+    ["--set", "read.self_filter=false"],
+)
 
 
 @dataclass(frozen=True, repr=False)
