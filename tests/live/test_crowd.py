@@ -43,6 +43,18 @@ def test_wheels_that_spin_are_no_crowd():
     assert not drive(Crowd(), 40, companions=True, speed=0.0).walks_along
 
 
+def test_hits_on_the_robot_are_no_crowd():
+    on_it = np.tile([[0.2, 0.3], [0.2, -0.3]], (20, 1))
+    crowd = Crowd()
+    increment = np.eye(3)
+    increment[0, 2] = STEP
+    for t in range(40):
+        posts = ROOM - [STEP * t, 0.0]
+        points = np.concatenate([posts[np.hypot(*posts.T) < 6.0], on_it]).astype(np.float32)
+        crowd.observe(points, increment, t * PERIOD_NS)
+    assert not crowd.walks_along
+
+
 def test_without_odometry_nothing_is_compared():
     crowd = drive(Crowd(), 40, companions=True)
     before = vars(crowd)["_along"]

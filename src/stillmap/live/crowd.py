@@ -17,6 +17,7 @@ _LABEL_RATE, _CROWDED = 0.3, 0.15
 _BASELINE, _MAX_BASELINE = 0.3, 1.0
 _MAX_AGE_NS = 3 * 10**9  # between the two
 _SPACING_NS = 10**8  # between scans that are kept
+_BODY = 0.5  # m from the base, within which hits are on the robot
 _MAX_HITS = 150  # of a scan, which are compared with all of another one
 _NEAR, _OFF = 0.1, 0.15  # m to the nearest hit of the other scan: fits; does not
 _RATE = 0.15  # weight of a scan in the running shares
@@ -80,6 +81,7 @@ class Crowd:
         self._T_odom_base = self._T_odom_base @ increment
         if self._kept and 0 <= stamp_ns - self._kept[-1].stamp_ns < _SPACING_NS:
             return
+        points = points[np.hypot(*points.T) > _BODY]
         other = self._find_other(stamp_ns)
         if other is not None and len(points) and len(other.points):
             self._compare(points, other)
