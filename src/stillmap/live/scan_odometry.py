@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.live.dead_reckoning import DeadReckoning
 from stillmap.live.front_end import Registration
 from stillmap.live.local_map import Labeller, LocalMap, MappedScan, MatchMap, tend
 from stillmap.live.scan import ScanBeams, deskew
@@ -71,7 +72,8 @@ class ScanOdometry:
         self._usual: dict[str | int, float] = {}
         self._contradictions = 0.0
         self._leaped_ns: int | None = None
-        self._blind = np.zeros((3, 3))  # covariance since the last scan that met anything
+        self._reckoning = DeadReckoning()
+        self._is_adrift = False  # after a blind stretch no scan showed yet where the robot is
         self._walls: WallDirections | None = WallDirections()
         self._is_first = True
         self._increment = _LatestIncrement()
@@ -129,15 +131,19 @@ class ScanOdometry:
             is_slipping = is_slipping or slips or has_leaped
         if not is_carried:
             match = self._correct_heading(scan, match)
-        is_blind = not len(scan.points) or float(scan.weights.sum()) <= 0.0
+        is_blind = not len(scan.points) or float(scan.weights.sum()) <= 0.0 or self._is_adrift
         learned = learned or prior
         drift = motion_model.blind_drift(learned, match.covariance)
-        if not (is_blind or self._contradictions):
+        if not (is_blind or self._contradictions or self._reckoning.is_far):
             self._learn(beams, learned, match, usual)
+        if is_blind:
+            self._reckoning.move(self._pose, match.T_map_base, drift)
+        else:
+            self._reckoning.reset()
         self._advance(beams, match.T_map_base)
-        self._blind = self._blind + drift if is_blind else np.zeros((3, 3))
-        doubts = is_slipping, is_blind, is_carried, self._contradictions > 0.0, prior.is_odometry
-        T, covariance = match.T_map_base, match.covariance + self._blind
+        is_contradicted = self._contradictions > 0.0 or self._is_adrift
+        doubts = is_slipping, is_blind, is_carried, is_contradicted, prior.is_odometry
+        T, covariance = match.T_map_base, match.covariance + self._reckoning.covariance
         return Registration(T, covariance, match.explained, drift, twist, *doubts)
 
     def add(
@@ -152,7 +158,7 @@ class ScanOdometry:
             recent: (N,) the same with the prior of what was only just seen, for the local map.
             label: labels an earlier scan again, after a second.
         """
-        if self._contradictions > 0.0:
+        if self._contradictions > 0.0 or self._is_adrift:
             return None
         scan = MappedScan(beams, e, self._pose, self.travelled)
         added = self.local_map.add(replace(scan, e=recent))
@@ -165,6 +171,7 @@ class ScanOdometry:
         self.local_map = local_map
         self._pose, self._before = T @ self._pose, T @ self._before
         self._contradictions = 0.0
+        self._reckoning.reset()
         self._walls = None  # that map has the heading
 
     def correct(self, local_map: MatchMap, motion: Float) -> None:
@@ -196,9 +203,12 @@ class ScanOdometry:
         usual: float,
     ) -> tuple[ScanMatch, bool, bool]:
         """The match, whether odometry slips, and whether the robot was carried elsewhere."""
+        self._is_adrift = False
         if not self.local_map.has_sensor(beams.sensor) or not len(scan.points):
             return accept_prior(prior), False, False
         grid = self.local_map.grid
+        if self._reckoning.is_far and prior.is_odometry:
+            return self._find_again(scan, prior, usual)
         match = match_scan(grid, scan, prior, usual, learned)
         if not is_poor(match, usual):
             self._weigh_evidence(Evidence.AGREES)
@@ -218,6 +228,26 @@ class ScanOdometry:
             self._start_anew()
             return accept_prior(prior), False, True
         return match, match.contradicts_odometry, False
+
+    def _find_again(
+        self, scan: Scan, prior: MotionPrior, usual: float
+    ) -> tuple[ScanMatch, bool, bool]:
+        """As of `_match`, after a stretch in which no scan met anything."""
+        grid = self.local_map.grid
+        found, evidence = self._reckoning.search(grid, scan, prior, self._pose, usual)
+        if found is not None:
+            # it was there before, too: the step is that of odometry
+            self._pose = found.T_map_base @ se2.inverse(prior.T_map_base) @ self._pose
+            self._contradictions = 0.0
+            return found, False, False
+        self._is_adrift = not self._reckoning.is_over
+        if evidence is Evidence.CONTRADICTS:
+            self._weigh_evidence(evidence)
+        if self._contradictions >= _CARRIED_AFTER:
+            self._start_anew()
+            self._is_adrift = False
+            return accept_prior(prior), False, True
+        return accept_prior(prior), False, False
 
     def _detect_slip(
         self, guess: MotionPrior, scan: Scan, match: ScanMatch
@@ -248,6 +278,7 @@ class ScanOdometry:
         self._contradictions = 0.0
         self._walls = WallDirections()
         self._slip.reset()
+        self._reckoning.reset()
 
     def _learned_prior(self, prior: MotionPrior, increment: Float | None) -> MotionPrior | None:
         """The odometry prior with the noise learned so far; None: use `prior`."""

@@ -1,0 +1,101 @@
+"""After a stretch in which no scan met anything, the robot is where odometry may have led it."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from stillmap.core import se2
+from stillmap.eval.trajectory import compute_absolute_errors
+from stillmap.live.dead_reckoning import DeadReckoning
+from stillmap.live.mapper import LiveMapper
+from stillmap.live.replay import iter_beams
+from stillmap.sim import scene_by_name, simulate
+
+
+def test_an_error_of_the_heading_grows_with_the_way():
+    """Against many runs with a heading that is off from the start."""
+    reckoning, rng = DeadReckoning(), np.random.default_rng(0)
+    step = se2.matrix(0.1, 0.0, 0.01)
+    noise = np.diag([1e-4, 1e-4, 4e-4])
+    runs, pose = [np.eye(3)] * 2000, np.eye(3)
+    for _ in range(60):
+        after = pose @ step
+        reckoning.move(pose, after, noise)
+        shocks = rng.normal(size=(len(runs), 3)) * np.sqrt(np.diag(noise))
+        runs = [
+            one @ step @ se2.matrix(*shock)
+            for one, shock in zip(runs, shocks.tolist(), strict=True)
+        ]
+        pose = after
+    off = np.array([se2.parameters(one) - se2.parameters(pose) for one in runs])
+    expected = np.cov(off.T)
+    np.testing.assert_allclose(np.diag(reckoning.covariance), np.diag(expected), rtol=0.15)
+    assert reckoning.is_far
+    reckoning.reset()
+    assert not reckoning.is_far
+
+
+def drive(recording, odometry):
+    """(T, 3, 3) poses at the time, and all doubts."""
+    with LiveMapper({"threads": 1}) as mapper:
+        updates = [mapper.push(beams, odometry[t]) for t, beams in enumerate(iter_beams(recording))]
+    return np.array([one.pose for one in updates]), [one.doubts for one in updates]
+
+
+def simulated(world, seed, laser, scans):
+    changes = {"laser": laser, "crowd": {"people": 0}, "robot": {"scans": scans}}
+    return simulate(scene_by_name(world, changes), seed)
+
+
+def test_the_robot_was_not_carried_while_it_saw_nothing():
+    laser = {"beams": 120, "fov": math.pi, "max_range": 15.0}
+    simulation = simulated("corridor", 1, laser, 450)
+    recording, true = simulation.recording, simulation.truth.T_world_base
+    hit = recording.hit.copy()
+    hit[recording.beams_of(150).start : recording.beams_of(250).start] = False
+    # a heading that drifts while nothing is seen
+    turn = se2.matrix(0.0, 0.0, 0.004)
+    odometry = [recording.T_odom_base[0]]
+    for before, after in zip(recording.T_odom_base[:-1], recording.T_odom_base[1:], strict=True):
+        is_blind = 150 <= len(odometry) < 250
+        odometry.append(
+            odometry[-1] @ se2.inverse(before) @ after @ (turn if is_blind else np.eye(3))
+        )
+    poses, doubts = drive(replace(recording, hit=hit), odometry)
+    assert all("blind" in one for one in doubts[150:250])
+    assert not any("carried" in one for one in doubts)
+    assert doubts[-1] == ()
+    assert compute_absolute_errors(poses[:150], true[:150]).rmse < 0.1
+    assert compute_absolute_errors(poses[300:], true[300:]).rmse < 0.2
+
+
+def test_it_is_found_where_it_was_before():
+    """It turns on the spot while nothing is seen, and odometry misses a part of that."""
+    simulation = simulated("office", 3, {"beams": 360, "max_range": 12.0}, 200)
+    recording, true = simulation.recording, simulation.truth.T_world_base
+    order = [*range(150), *[149] * 40, *range(150, 200)]
+    beams, period = list(iter_beams(recording)), int(np.diff(recording.stamp_ns).mean())
+    off = se2.matrix(1.4, 1.2, 0.5)
+    poses, doubts = [], []
+    with LiveMapper({"threads": 1}) as mapper:
+        T_odom_base = np.eye(3)
+        for n, t in enumerate(order):
+            scan, is_blind = beams[t], 150 <= n < 190
+            if is_blind:
+                scan = replace(scan, hit=np.zeros_like(scan.hit))
+                # the wheels say that it wanders about
+                T_odom_base = T_odom_base @ se2.matrix(0.1, 0.0, 0.157)
+                if n == 189:
+                    T_odom_base = T_odom_base @ off
+            elif n:
+                last = recording.T_odom_base[order[n - 1]]
+                T_odom_base = T_odom_base @ se2.inverse(last) @ recording.T_odom_base[t]
+            update = mapper.push(replace(scan, stamp_ns=n * period), T_odom_base)
+            poses.append(update.pose)
+            doubts.append(update.doubts)
+    assert not any("carried" in one for one in doubts)
+    error = compute_absolute_errors(
+        np.array(poses)[[*range(150), *range(195, 240)]], true[[*range(150), *range(155, 200)]]
+    )
+    assert error.rmse < 0.1
