@@ -24,7 +24,7 @@ _RATE = 0.15  # weight of a scan in the running shares
 # running share of the hits that keep their place beside the robot, from which people walk along;
 # and of those that are where odometry says in the same scans, below which rather the wheels spin;
 # both while nobody walks along, and while people do
-_ALONG, _STATIC = (0.1, 0.05), (0.05, 0.003)
+_ALONG, _STATIC = (0.12, 0.05), (0.05, 0.003)
 
 
 class _Kept(NamedTuple):
