@@ -54,3 +54,13 @@ def test_a_picture_that_nobody_may_read(picture, monkeypatch):
     assert said(picture) == f"{picture}: cannot be read: Permission denied"
     monkeypatch.setattr(Path, "is_file", denied)
     assert said(picture) == f"{picture}: cannot be read: Permission denied"
+
+
+def test_a_small_file_does_not_unpack_to_a_gigabyte(tmp_path):
+    """67 million pixels at most; Pillow itself allows 89 million, a gigabyte with all copies."""
+    path = tmp_path / "wide.png"
+    Image.new("P", (8300, 8200)).save(path)
+    assert path.stat().st_size < 1 << 20
+    assert said(path) == f"{path}: is too large an image"
+    with pytest.raises(InputError, match="is too large an image"):
+        read_image_size(path)

@@ -17,6 +17,9 @@ from stillmap.core.input_files import InputFile, read_bytes
 
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".pgm")
 
+# of an image: Pillow unpacks it to 4 bytes a pixel, and an array takes two copies of 3
+_MAX_PIXELS = 64 << 20
+
 _MODES_16_BIT = {"I;16", "I;16B", "I;16L", "I;16N", "I"}
 
 
@@ -43,7 +46,7 @@ def read_image(path: Path) -> NDArray[Any]:
             return np.array(image).astype(np.uint16)
         if image.mode == "F":
             return np.array(image, np.float32)
-        return np.array(image.convert("RGB"))
+        return np.array(image if image.mode == "RGB" else image.convert("RGB"))
 
 
 def write_png(image: NDArray[Any], path: Path, compress_level: int = 1) -> None:
@@ -112,6 +115,8 @@ def _open(path: Path) -> Iterator[Image.Image]:
             warnings.filterwarnings("ignore", category=UserWarning)
             # given a path, Pillow maps files of bare pixels into memory
             with InputFile(path) as file, Image.open(file) as image:
+                if image.size[0] * image.size[1] > _MAX_PIXELS:
+                    raise InputError("is too large an image", where=str(path))
                 yield image
     except UnidentifiedImageError as error:
         raise InputError("is no image", where=str(path)) from error
