@@ -11,7 +11,7 @@ from pathlib import Path
 from types import CodeType, FrameType
 from typing import IO, TYPE_CHECKING, Any
 
-from stillmap.core.interrupts import is_uninterrupted, send_again
+from stillmap.core.interrupts import defers_signals_in, send_again
 from stillmap.core.printable import printable
 from stillmap.core.progress_bar import Step, make_bar, terminal_bar
 
@@ -238,7 +238,7 @@ def handle_signals(command: CodeType) -> None:
 def _must_defer(frame: FrameType | None, command: CodeType) -> bool:
     while frame is not None and frame.f_code is not command:
         name = frame.f_code.co_filename
-        if name.startswith(_IMPORTS) or name.endswith(_PACKING) or is_uninterrupted(frame):
+        if name.startswith(_IMPORTS) or name.endswith(_PACKING) or defers_signals_in(frame):
             return True
         frame = frame.f_back
     return False

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from stillmap.core.errors import InputError, cannot_write
-from stillmap.core.interrupts import uninterrupted
+from stillmap.core.interrupts import defer_signals
 from stillmap.core.output_place import (
     UNFINISHED,
     hidden_path,
@@ -114,7 +114,7 @@ def atomic_folder(
 
 
 @contextmanager
-@uninterrupted
+@defer_signals
 def temporary_folder(output: Path, parent: Path | None = None) -> Iterator[Path]:
     """Context manager of a folder for work on an output, removed at the end.
 
@@ -162,7 +162,7 @@ def atomic_file(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-@uninterrupted
+@defer_signals
 def _removed_at_the_end(work: Path, path: Path) -> Iterator[None]:
     try:
         yield
@@ -192,7 +192,7 @@ def _kept_on_failure(work: Path, path: Path) -> Iterator[None]:
 
 
 @contextmanager
-@uninterrupted
+@defer_signals
 def new_folder(prefix: str, parent: Path | None = None) -> Iterator[Path]:
     """Context manager of a new folder, of which nothing is left if the block fails.
 

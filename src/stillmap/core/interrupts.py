@@ -1,7 +1,7 @@
 """Steps that no signal may cut in two: making what is removed later, removing it, exchanging names.
 
 An exception that a signal handler raises between two of them would leave the first without the
-second. Handlers of signals ask `is_uninterrupted`, and if so `send_again`. Where others handle
+second. Handlers of signals ask `defers_signals_in`, and if so `send_again`. Where others handle
 Ctrl-C, as in notebooks, the functions are as any.
 """
 
@@ -17,7 +17,7 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 _RETRY = 0.02  # s until a deferred signal is sent again
 
-_uninterrupted = set[CodeType]()
+_deferring = set[CodeType]()
 # these start and resume a generator that is a context manager
 _generators = {
     contextlib._GeneratorContextManager.__enter__.__code__,
@@ -25,26 +25,26 @@ _generators = {
 }
 
 
-def uninterrupted(function: _Function) -> _Function:
+def defer_signals(function: _Function) -> _Function:
     """Decorator of a short function within which signals wait.
 
     Of a context manager that is a generator it belongs below `contextmanager`: signals wait before
     and after the block, not within it.
     """
-    _uninterrupted.add(function.__code__)
+    _deferring.add(function.__code__)
     return function
 
 
-def is_uninterrupted(frame: FrameType | None) -> bool:
+def defers_signals_in(frame: FrameType | None) -> bool:
     """True if a signal that came in this frame has to wait; frames that called it do not count."""
     if frame is None:
         return False
     code = frame.f_code
     if code in _generators:
         generator = getattr(frame.f_locals.get("self"), "gen", None)
-        return getattr(generator, "gi_code", None) in _uninterrupted
+        return getattr(generator, "gi_code", None) in _deferring
     # its temporary folders are made before they are registered, and forgotten before they go
-    return code in _uninterrupted or code.co_filename == tempfile.__file__
+    return code in _deferring or code.co_filename == tempfile.__file__
 
 
 def send_again(number: int) -> None:

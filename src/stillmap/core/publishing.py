@@ -14,7 +14,7 @@ from pathlib import Path
 
 from stillmap.core.errors import InputError
 from stillmap.core.input_files import read_bytes
-from stillmap.core.interrupts import uninterrupted
+from stillmap.core.interrupts import defer_signals
 from stillmap.core.output_place import (
     PREFIX,
     UNFINISHED,
@@ -70,12 +70,12 @@ def _remove_unless_held(entry: Path, output: Path) -> None:
         os.close(handle)
 
 
-@uninterrupted
+@defer_signals
 def remove(path: Path) -> None:
     """Remove a file, a link, or a folder with all in it, as far as that is possible."""
     try:
         _remove(path)
-    except BaseException:  # Ctrl-C, where `uninterrupted` is of no use
+    except BaseException:  # Ctrl-C, where `defer_signals` is of no use
         _remove(path)
         raise
 
@@ -118,7 +118,7 @@ def publish_folder(work: Path, path: Path, marker: str) -> None:
 
 
 @contextmanager
-@uninterrupted
+@defer_signals
 def _removed_on_failure(inside: Path, path: Path) -> Iterator[None]:
     """Remove a copy inside a folder if the block fails, and the folder if it was not there."""
     is_new = not path.exists()
@@ -133,7 +133,7 @@ def _removed_on_failure(inside: Path, path: Path) -> Iterator[None]:
         raise
 
 
-@uninterrupted
+@defer_signals
 def _replace_folder(work: Path, path: Path) -> None:
     if not path.exists():
         os.rename(work, path)
@@ -150,7 +150,7 @@ def _replace_folder(work: Path, path: Path) -> None:
             os.rename(old, path)
 
 
-@uninterrupted
+@defer_signals
 def _exchange_files(work: Path, path: Path, marker: str) -> None:
     """Move a finished folder inside another one to the place of what that one holds."""
     _note_exchange(work, path, marker)
@@ -180,7 +180,7 @@ def _note_exchange(work: Path, path: Path, marker: str) -> None:
         raise
 
 
-@uninterrupted
+@defer_signals
 def finish_exchange(path: Path) -> None:
     """Go on with the exchange of files that the journal of a folder names, if there is one.
 

@@ -11,14 +11,14 @@ from pathlib import Path
 from typing import IO
 
 from stillmap.core.errors import InputError
-from stillmap.core.interrupts import uninterrupted
+from stillmap.core.interrupts import defer_signals
 from stillmap.core.locks import open_lock
 
 _LOCK = ".lock"
 
 
 @contextmanager
-@uninterrupted
+@defer_signals
 def scratch_folder(parent: Path) -> Iterator[Path]:
     """A new folder below `parent`, locked while the block runs and removed after it.
 

@@ -11,7 +11,7 @@ from typing import Protocol
 from stillmap.core.errors import InputError
 from stillmap.core.files import sync
 from stillmap.core.input_files import read_bytes
-from stillmap.core.interrupts import uninterrupted
+from stillmap.core.interrupts import defer_signals
 from stillmap.core.output_place import resolve_output
 from stillmap.fleet.scratch import remove_stale, scratch_folder
 
@@ -106,7 +106,7 @@ class FolderStorage:
         with scratch_folder(self._work) as path:
             yield path
 
-    @uninterrupted
+    @defer_signals
     def publish(self, folder: Path, name: str) -> None:
         path, old = self._path / name, folder.with_name(f"{folder.name}.old")
         _sync(folder)

@@ -1,4 +1,4 @@
-"""Whether people walk along with the robot: what was only just seen then counts little."""
+"""Detection of people who walk along with the robot, from scans and odometry."""
 
 from collections import deque
 from typing import NamedTuple

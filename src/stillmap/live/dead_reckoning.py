@@ -1,4 +1,4 @@
-"""Where the robot may be after a stretch by odometry alone, and how it is found again there."""
+"""Pose covariance of dead reckoning, and the search for the pose once scans have returns again."""
 
 import dataclasses
 import math

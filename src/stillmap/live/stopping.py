@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-from stillmap.core.interrupts import is_uninterrupted, send_again
+from stillmap.core.interrupts import defers_signals_in, send_again
 
 
 @contextmanager
@@ -22,7 +22,7 @@ def signal_flag() -> Iterator[threading.Event]:
 
     def handle(number: int, frame: FrameType | None) -> None:
         if number == signal.SIGINT and stop.is_set() and time.monotonic() - since[0] > 1.0:
-            if is_uninterrupted(frame):
+            if defers_signals_in(frame):
                 send_again(number)
                 return
             raise KeyboardInterrupt

@@ -25,7 +25,7 @@ from stillmap.core.arrays import iter_bytes, write_npy
 from stillmap.core.config import Limits
 from stillmap.core.errors import InputError, cannot_write
 from stillmap.core.files import sync
-from stillmap.core.interrupts import uninterrupted
+from stillmap.core.interrupts import defer_signals
 from stillmap.core.json import read_json
 from stillmap.core.locks import open_lock
 from stillmap.core.output_place import hidden_path, resolve_output
@@ -171,7 +171,7 @@ class CheckpointFolder:
             elif path.name.endswith((".part", ".old")):
                 self._clear(path)
 
-    @uninterrupted
+    @defer_signals
     def _clear(self, *paths: Path) -> None:
         for path in paths:
             if path.is_dir() and not path.is_symlink():
@@ -184,7 +184,7 @@ class CheckpointFolder:
 
 
 @contextmanager
-@uninterrupted
+@defer_signals
 def lock_checkpoints(output: Path) -> Iterator[CheckpointFolder]:
     """The checkpoint folder of a result folder, locked against other runs while the block runs.
 
