@@ -1,5 +1,7 @@
 """Errors on images that cannot be read."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -64,3 +66,37 @@ def test_a_small_file_does_not_unpack_to_a_gigabyte(tmp_path):
     assert said(path) == f"{path}: is too large an image"
     with pytest.raises(InputError, match="is too large an image"):
         read_image_size(path)
+
+
+@pytest.mark.parametrize("mode", ["L", "I;16", "I", "F", "RGB", "RGBA", "P", "1"])
+def test_images_are_unpacked_some_rows_at_a_time(mode, tmp_path, monkeypatch):
+    """Every pixel of every kind comes where it was."""
+    rng = np.random.default_rng(1)
+    grey = rng.integers(0, 255, (37, 23)).astype(np.uint8)
+    image = Image.fromarray(grey.astype(np.uint16) if mode == "I;16" else grey)
+    path = tmp_path / "a.tif"
+    image.convert(mode).save(path)
+    monkeypatch.setattr("stillmap.io.images._UNPACKED", 100)
+    whole = np.array(image.convert("1") if mode == "1" else image)
+    expected = whole if mode in ("L", "I;16", "I", "F") else np.repeat(whole[..., None], 3, axis=2)
+    np.testing.assert_array_equal(
+        read_image(path), expected.astype(np.uint8) * 255 if mode == "1" else expected
+    )
+
+
+def test_the_largest_image_with_transparency_takes_half_a_gigabyte(tmp_path):
+    """Two images and the list of their parts took twice as much."""
+    path = tmp_path / "a.png"
+    Image.new("RGBA", (8192, 8192)).save(path, compress_level=1)
+    code = "\n".join(
+        (
+            "import resource, sys, pathlib",
+            "from stillmap.io.images import read_image",
+            "read_image(pathlib.Path(sys.argv[1]))",
+            "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10)",
+        )
+    )
+    run = subprocess.run(
+        [sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True
+    )
+    assert int(run.stdout) < 700

@@ -17,8 +17,9 @@ from stillmap.core.input_files import InputFile, read_bytes
 
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".pgm")
 
-# of an image: Pillow unpacks it to 4 bytes a pixel, and an array takes two copies of 3
+# of an image: Pillow unpacks it to 4 bytes a pixel, and an array takes 1 to 4
 _MAX_PIXELS = 64 << 20
+_UNPACKED = 1 << 20  # pixels of an image that become an array at a time
 
 _MODES_16_BIT = {"I;16", "I;16B", "I;16L", "I;16N", "I"}
 
@@ -41,12 +42,23 @@ def read_image(path: Path) -> NDArray[Any]:
     """
     with _open(path) as image:
         if image.mode == "L":
-            return np.array(image)
+            return _unpack(image, np.uint8)
         if image.mode in _MODES_16_BIT:
-            return np.array(image).astype(np.uint16)
+            return _unpack(image, np.uint16)
         if image.mode == "F":
-            return np.array(image, np.float32)
-        return np.array(image if image.mode == "RGB" else image.convert("RGB"))
+            return _unpack(image, np.float32)
+        return _unpack(image, np.uint8, is_color=True)
+
+
+def _unpack(image: Image.Image, dtype: Any, *, is_color: bool = False) -> NDArray[Any]:
+    """The array of an image, some rows at a time: at once it would take three times the memory."""
+    width, height = image.size
+    out = np.empty((height, width, 3) if is_color else (height, width), dtype)
+    rows = max(_UNPACKED // max(width, 1), 1)
+    for first in range(0, height, rows):
+        part = image.crop((0, first, width, min(first + rows, height)))
+        out[first : first + rows] = part.convert("RGB") if is_color else part
+    return out
 
 
 def write_png(image: NDArray[Any], path: Path, compress_level: int = 1) -> None:
