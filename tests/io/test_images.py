@@ -100,3 +100,17 @@ def test_the_largest_image_with_transparency_takes_half_a_gigabyte(tmp_path):
         [sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True
     )
     assert int(run.stdout) < 700
+
+
+@pytest.mark.parametrize("format", ["EPS", "TGA", "GIF", "PCX"])
+def test_other_formats_are_refused_whatever_the_name(format, picture, monkeypatch):
+    """To read EPS, Pillow starts Ghostscript."""
+
+    def start(*_, **__):
+        raise AssertionError("a program was started")
+
+    monkeypatch.setattr(subprocess, "Popen", start)
+    image = Image.open(picture)
+    image.load()
+    image.convert("P" if format == "GIF" else "RGB").save(picture, format=format)
+    assert said(picture) == f"{picture}: is no image"

@@ -1,6 +1,10 @@
 """Folders of RGB-D cameras, whole and damaged."""
 
 import shutil
+import struct
+import subprocess
+import sys
+import zlib
 
 import numpy as np
 import pytest
@@ -366,3 +370,26 @@ def test_other_folders_are_none_of_these(tmp_path, scenes):
 def test_options_that_cannot_be(given):
     with pytest.raises(ValueError, match=next(iter(given))):
         ReadOptions(**given)
+
+
+def test_a_header_that_claims_many_pixels_costs_little(scenes):
+    """The rays of all pixels follow from it; they are computed some at a time."""
+    for file in scenes.glob("*.depth.png"):
+        content = bytearray(file.read_bytes())
+        content[16:24] = struct.pack(">II", 8192, 8191)
+        content[29:33] = struct.pack(">I", zlib.crc32(content[12:29]))
+        file.write_bytes(content)
+    code = "\n".join(
+        (
+            "import resource, sys, stillmap",
+            "try: stillmap.read(sys.argv[1])",
+            "except stillmap.InputError as error: print(error)",
+            "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10)",
+        )
+    )
+    run = subprocess.run(
+        [sys.executable, "-c", code, str(scenes)], capture_output=True, text=True, check=True
+    )
+    said, megabytes = run.stdout.splitlines()
+    assert "holds no usable scan" in said
+    assert int(megabytes) < 700

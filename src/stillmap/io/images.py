@@ -15,7 +15,10 @@ from PIL import Image, UnidentifiedImageError
 from stillmap.core.errors import InputError
 from stillmap.core.input_files import InputFile, read_bytes
 
+# names of files, and what they may hold whatever their name: of some other formats Pillow starts a
+# program to read them
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".pgm")
+_FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "PPM")
 
 # of an image: Pillow unpacks it to 4 bytes a pixel, and an array takes 1 to 4
 _MAX_PIXELS = 64 << 20
@@ -126,7 +129,7 @@ def _open(path: Path) -> Iterator[Image.Image]:
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             warnings.filterwarnings("ignore", category=UserWarning)
             # given a path, Pillow maps files of bare pixels into memory
-            with InputFile(path) as file, Image.open(file) as image:
+            with InputFile(path) as file, Image.open(file, formats=_FORMATS) as image:
                 if image.size[0] * image.size[1] > _MAX_PIXELS:
                     raise InputError("is too large an image", where=str(path))
                 yield image

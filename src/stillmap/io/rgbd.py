@@ -38,6 +38,7 @@ T_BASE_CAMERA = np.array(
 COLOR, DEPTH = "color", "depth"  # names of the cameras
 
 _MAX_DEPTH = 5.0  # m: structured light gives no reliable depth beyond
+_RAYS_AT_ONCE = 1 << 20  # of a depth camera, which are computed with three times the memory
 _MAX_UNITS = 65535  # of 16 bits: 7-Scenes has it where depth is unknown
 
 
@@ -146,11 +147,15 @@ def first_image_size(images: list[tuple[int, Path]]) -> tuple[int, int] | None:
 
 def _make_grid(camera: Camera, options: ReadOptions, scale: float) -> _Grid:
     step = options.depth_step
-    columns, rows = np.meshgrid(np.arange(0, camera.width, step), np.arange(0, camera.height, step))
-    pixels = np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64)
-    rays = camera_module.unproject(camera, pixels) @ T_BASE_CAMERA[:3, :3].T
-    shaped = rays.reshape(*columns.shape, 3).astype(np.float32)
-    return _Grid(camera.width, camera.height, step, shaped, scale)
+    columns, rows = (np.arange(0, size, step) for size in (camera.width, camera.height))
+    rays = np.empty((len(rows), len(columns), 3), np.float32)
+    some = max(_RAYS_AT_ONCE // max(len(columns), 1), 1)
+    for first in range(0, len(rows), some):
+        part = np.meshgrid(columns, rows[first : first + some])
+        pixels = np.stack(part, axis=-1).reshape(-1, 2).astype(np.float64)
+        found = camera_module.unproject(camera, pixels) @ T_BASE_CAMERA[:3, :3].T
+        rays[first : first + some] = found.reshape(-1, len(columns), 3)
+    return _Grid(camera.width, camera.height, step, rays, scale)
 
 
 def _read_cloud(file: Path, T: Float | None, grid: _Grid) -> Cloud:
