@@ -1,14 +1,16 @@
 """Faults on a robot while it maps and while it is localized: how long until its pose holds again.
 
 python benchmarks/live_faults.py --data DIR [--world hall] [--runs 10] [--seed 12]
-    [--modes map localise] [--faults covered dark "no odometry" frozen jumping carried]
+    [--modes map localise]
+    [--faults covered dark "no odometry" frozen jumping spinning carried]
 
 Each run begins anywhere in a simulation; after 30 s there are 10 s of a fault, or the robot is
 carried 5 to 10 m from one scan to the next, and 40 s without. A robot that maps is carried after
 150 s, to where it has been.
 
 covered: all readings are 0.1 m. dark: there are none. no odometry: None. frozen: odometry stands
-still, and goes on from there. jumping: it leaps by metres once a second.
+still, and goes on from there. jumping: it leaps by metres once a second. spinning: the robot stands
+where it is, people, too, while odometry goes on at 0.5 m/s.
 recovered: runs whose pose is within 0.3 m and 0.1 rad of the truth at the end, without the doubt
 "lost"; s: from the end of the fault to the last time that it was not. silent: share of the scans
 from the fault on that have no doubt and are off by more than 3 standard deviations and 5 cm (or
@@ -34,6 +36,7 @@ _MAPPED_BEFORE = 750  # instead, if it is carried while it maps: to a place that
 _RATE = 5.0
 _CARRIED = 5.0, 10.0  # m
 _TOLERANCE = 0.3, 0.1  # m, rad
+_SPINNING = se2.matrix(0.1, 0.0, 0.0)  # odometry from scan to scan while the wheels spin
 _SLACK = 0.05  # m and rad beside three standard deviations
 
 
@@ -57,12 +60,20 @@ def leap(beams, T_odom_base, since, rng):
     return beams, T_odom_base
 
 
+def blur(beams, T_odom_base, _since, rng):
+    """The same scan once more, with noise of 1 cm."""
+    length = np.linalg.norm(beams.points, axis=1, keepdims=True)
+    noise = rng.normal(0.0, 0.01, length.shape) / np.maximum(length, 1e-3)
+    return replace(beams, points=(beams.points * (1.0 + noise)).astype(np.float32)), T_odom_base
+
+
 _FAULTS = {
     "covered": cover,
     "dark": darken,
     "no odometry": lambda beams, *_: (beams, None),
     "frozen": None,
     "jumping": leap,
+    "spinning": blur,
     "carried": None,
 }
 
@@ -108,7 +119,9 @@ def _run(simulation, fault, place, number):
         for since, k in enumerate(scans, -before):
             is_fault = 0 <= since < _FAULT
             moved = since > -before and not (fault == "carried" and since == 0)
-            if moved and not (is_fault and fault == "frozen"):
+            if is_fault and fault == "spinning":
+                given = given @ _SPINNING
+            elif moved and not (is_fault and fault == "frozen"):
                 given = given @ se2.inverse(last) @ odometry[k]
             last = odometry[k]
             now = replace(beams[k], stamp_ns=int(stamp_ns)), given
@@ -125,6 +138,10 @@ def _choose_scans(true, fault, before, rng):
     while True:
         first = int(rng.integers(0, len(true) - length))
         scans = np.arange(first, first + length)
+        if fault == "spinning":
+            return np.concatenate(
+                [scans[:before], np.full(_FAULT, before + first), scans[before:-_FAULT]]
+            )
         if fault != "carried":
             return scans
         away = np.hypot(*(true[:, :2, 2] - true[first + before, :2, 2]).T)

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.short_repr import ShortRepr
+from stillmap.live.crowd import Crowd
 from stillmap.live.local_map import Labeller, MappedScan
 from stillmap.live.scan import ScanBeams
 
@@ -49,6 +50,7 @@ class FrontEnd(Protocol):
     Hits and priors are those of the registration in 2D or 3D.
     """
 
+    crowd: Crowd
     local_map: Any
     left_behind: Any  # the local map before the robot was carried
 

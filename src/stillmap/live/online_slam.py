@@ -12,7 +12,6 @@ from stillmap.core import se2
 from stillmap.core.local_frame import LocalFrame
 from stillmap.core.parallel import resolve_threads
 from stillmap.live.causal_labels import CausalLabels, MapChange
-from stillmap.live.crowd import Crowd
 from stillmap.live.front_end import FrontEnd, Registration
 from stillmap.live.hindsight import Hindsight, LaterLabels
 from stillmap.live.history import History
@@ -92,7 +91,6 @@ class OnlineSlam:
         self._work_left: Callable[[], object] | None = None  # by the last scan
         self._T_odom_base: Float | None = None  # of the last scan
         self._path_begin = 0  # the first spaced scan in the frame of the map
-        self._crowd = Crowd()
 
     def push(self, beams: ScanBeams, T_odom_base: Float | None) -> Update:
         """Register a scan, label its beams, and add it to the map.
@@ -105,8 +103,6 @@ class OnlineSlam:
         increment = self._increment(T_odom_base)
         prior = self.odometry.predict(beams, increment)
         hits = self.odometry.select(beams, prior)
-        if isinstance(hits, PlanarHits):
-            self._crowd.observe(hits.points, increment, beams.stamp_ns)
         hits = self._weigh(hits, prior)  # E-step as predicted
         found = self.odometry.register(beams, hits, prior, increment)  # M-step: (9)
         self._judge(found)
@@ -198,7 +194,7 @@ class OnlineSlam:
         """The hits with weights P(static): the E-step at the predicted pose."""
         points, T_local_base = self.odometry.end_points(hits, prior)
         weights = self.labels.label_ends(points, self.frame.T_map_local @ T_local_base)
-        if self._crowd.walks_along:
+        if self.odometry.crowd.walks_along:
             weights = self.labels.doubt_ends(weights)
         return dataclasses.replace(hits, weights=weights)
 
@@ -230,7 +226,7 @@ class OnlineSlam:
         the map; the scan if it is spaced."""
         self.frame.add_drift(found.drift)
         # without odometry nothing else says how the robot moves
-        is_doubted = found.has_odometry and self._crowd.is_dense
+        is_doubted = found.has_odometry and self.odometry.crowd.is_dense
         recent = self.labels.doubt(e) if is_doubted else e
         added = self.odometry.add(beams, e, recent, self._label_again)
         if not self._finder.is_carried:
@@ -246,7 +242,7 @@ class OnlineSlam:
         """(N,) P(static) of a scan of the local map by what is known now; 0: unusable."""
         T, hit = self.frame.T_map_local @ scan.T_map_base, scan.beams.hit
         e = np.nan_to_num(self.labels.label(scan.beams, T))
-        self._crowd.learn(e[hit])
+        self.odometry.crowd.learn(e[hit])
         return e
 
     def _find_robot(self, scan: PlanarHits | MappedScan, update: Update) -> Update:

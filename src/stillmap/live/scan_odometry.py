@@ -1,15 +1,16 @@
 """Causal scan matching in 2D: each scan is matched (9) against a map of the scans before it."""
 
-from collections import deque
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.live.crowd import Crowd
 from stillmap.live.dead_reckoning import DeadReckoning
 from stillmap.live.front_end import Registration
 from stillmap.live.local_map import Labeller, LocalMap, MappedScan, MatchMap, tend
+from stillmap.live.odometry_faults import OdometryFaults, is_plausible
 from stillmap.live.scan import ScanBeams, deskew
 from stillmap.live.scan_hits import select_hits, thin
 from stillmap.live.wall_directions import WallDirections, correct_heading
@@ -17,7 +18,6 @@ from stillmap.slam import kidnapping, motion_model
 from stillmap.slam.deskew import MAX_SPEED, MAX_TURN_RATE
 from stillmap.slam.kidnapping import Evidence
 from stillmap.slam.motion_model import MotionPrior, OdometryNoise, VelocityNoise
-from stillmap.slam.odometry_faults import SlipDetector
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.scan_hits import Scan
 from stillmap.slam.scan_matching import (
@@ -33,11 +33,6 @@ Float = NDArray[np.float64]
 
 _FAST = 0.05  # s between fast scans: work that is due for several ones would delay their poses
 _EXPLAINED_RATE = 0.1  # weight of one scan in the running average of the explained share
-_LEAP = 1.0  # m between two scans, and times the speed below, beyond which odometry has leaped
-_DISTRUST_NS = 10**9  # after a leap, in which smaller ones are none of odometry either
-_MAX_SPEED = 3.0  # m/s of robots
-_MAX_STAMPS = 500  # of scans that a slip may change in hindsight
-_UNKNOWN = np.full((3, 3), np.inf)  # an increment that is not small
 # scans that contradict the map more than others agree, after which the robot was carried; at most
 _CARRIED_AFTER, _MAX_STRAY = 20.0, 30.0
 # of them that a scan outweighs which agrees, and one that says nothing; share of the usual
@@ -45,43 +40,33 @@ _CARRIED_AFTER, _MAX_STRAY = 20.0, 30.0
 _AGREEMENT, _NO_EVIDENCE, _NOTHING = 4.0, 0.25, 0.15
 
 
-class _LatestIncrement:
-    """The increment of odometry to the scan that is being registered, whatever the index."""
-
-    value: Float | None = None
-
-    def __getitem__(self, index: int, /) -> Float:
-        return _UNKNOWN if self.value is None else self.value
-
-
 class ScanOdometry:
     """Poses of scans as they arrive.
 
     Args:
         options: see SlamOptions.
+
+    Attributes:
+        crowd: people who move along with the robot.
     """
 
     def __init__(self, options: SlamOptions) -> None:
         self.options = options
         self.local_map: MatchMap = LocalMap(options.resolution)
         self.left_behind: MatchMap = self.local_map  # the one before the robot was carried
-        self.travelled = 0.0
+        self.travelled, self.crowd = 0.0, Crowd()
         self._pose, self._before = np.eye(3), np.eye(3)
         self._stamp_ns, self._seconds = 0, 0.0
         self._velocity_noise, self._odometry_noise = VelocityNoise(), OdometryNoise()
         self._usual: dict[str | int, float] = {}
         self._contradictions = 0.0
-        self._leaped_ns: int | None = None
         self._reckoning = DeadReckoning()
         self._is_adrift = False  # after a blind stretch no scan showed yet where the robot is
         self._walls: WallDirections | None = WallDirections()
         self._is_first = True
-        self._increment = _LatestIncrement()
-        self._slip = SlipDetector(self._increment)
+        self._faults = OdometryFaults(options.odometry)
         self._guessed_of = (self._pose, self._before, self._velocity_noise)
         self._guessed = motion_model.constant_velocity_prior(*self._guessed_of)
-        self._stamps = deque[int](maxlen=_MAX_STAMPS)  # of the last scans
-        self._count = 0
 
     def predict(self, beams: ScanBeams, increment: Float | None) -> MotionPrior:
         """The prior of the next scan: odometry where it is plausible, else constant velocity.
@@ -92,17 +77,17 @@ class ScanOdometry:
         """
         if self._is_first:
             return motion_model.gaussian_prior(self._pose, 1e-3, 1e-3)
-        guess, self._increment.value = self._guess(), increment
-        is_slipping = self._slip.is_slipping(self._count, self._pose, guess)
-        if increment is not None and not self._is_plausible(increment, beams):
-            self._leaped_ns = beams.stamp_ns
-        if increment is not None and not is_slipping and not self._has_leaped(beams):
-            return motion_model.odometry_prior(self._pose, increment, self.options.odometry)
-        return guess
+        seconds = 1e-9 * (beams.stamp_ns - self._stamp_ns)
+        return self._faults.predict(self._pose, self._guess(), increment, beams.stamp_ns, seconds)
 
     def select(self, beams: ScanBeams, prior: MotionPrior) -> Scan:
-        """The hits of a scan with weight 1, without the motion that is predicted during it."""
-        return select_hits(deskew(beams, self._twist_to(prior.T_map_base, beams)))
+        """The hits of a scan with weight 1, without the motion that is predicted during it.
+
+        They are compared with those before: do people walk along?
+        """
+        hits = select_hits(deskew(beams, self._twist_to(prior.T_map_base, beams)))
+        self.crowd.observe(hits.points, self._faults.increment, beams.stamp_ns)
+        return hits
 
     def end_points(self, hits: Scan, prior: MotionPrior) -> tuple[NDArray[np.float32], Float]:
         """(N, 2) points in the base frame at the stamp, and its pose, as predicted."""
@@ -124,11 +109,11 @@ class ScanOdometry:
         guess, learned = self._guess(), self._learned_prior(prior, increment)
         match, is_slipping, is_carried = self._match(beams, scan, prior, learned, usual)
         if not self._is_first and not is_carried:
-            match, slips = self._detect_slip(guess, scan, match)
-            if slips:
+            match, has_fault = self._detect_fault(beams, scan, (prior, guess), match)
+            if has_fault:
                 learned = self._learned_prior(prior, increment)  # the last pose has changed
-            has_leaped = increment is not None and self._has_leaped(beams)
-            is_slipping = is_slipping or slips or has_leaped
+            is_rejected = increment is not None and not prior.is_odometry
+            is_slipping = is_slipping or has_fault or is_rejected
         if not is_carried:
             match = self._correct_heading(scan, match)
         is_blind = not len(scan.points) or float(scan.weights.sum()) <= 0.0 or self._is_adrift
@@ -249,20 +234,24 @@ class ScanOdometry:
             return accept_prior(prior), False, True
         return accept_prior(prior), False, False
 
-    def _detect_slip(
-        self, guess: MotionPrior, scan: Scan, match: ScanMatch
+    def _detect_fault(
+        self,
+        beams: ScanBeams,
+        scan: Scan,
+        priors: tuple[MotionPrior, MotionPrior],
+        match: ScanMatch,
     ) -> tuple[ScanMatch, bool]:
-        """The match of constant velocity where odometry has stopped and the robot has not."""
-        grid = self.local_map.grid
-        slip = self._slip.detect(self._count, self._pose, guess, grid, scan, match)
-        if slip is None:
+        """The match without odometry where that is at fault, and whether it is."""
+        has_map = self.local_map.has_sensor(beams.sensor) and not self._contradictions
+        usual = self._usual.get(beams.sensor) if has_map and not self.crowd.walks_along else None
+        grid, ns = self.local_map.grid, beams.stamp_ns
+        fault = self._faults.detect(grid, scan, self._pose, priors, match, ns, usual)
+        if fault is None:
             return match, False
-        back = min(self._count - slip.first, len(self._stamps))
-        if back:
-            self.local_map.remove_since(self._stamps[-back])
-        # the velocity is that of the hypothesis, too
-        self._pose = [slip.before, *(m.T_map_base for m in slip.matches)][-2]
-        return slip.matches[-1], True
+        if fault.first_ns is not None:
+            self.local_map.remove_since(fault.first_ns)
+        self._pose = fault.before
+        return fault.match, True
 
     def _weigh_evidence(self, evidence: Evidence) -> None:
         """Count scans that contradict the local map, less those that agree."""
@@ -277,7 +266,7 @@ class ScanOdometry:
         self._usual.clear()
         self._contradictions = 0.0
         self._walls = WallDirections()
-        self._slip.reset()
+        self._faults.reset()
         self._reckoning.reset()
 
     def _learned_prior(self, prior: MotionPrior, increment: Float | None) -> MotionPrior | None:
@@ -296,15 +285,6 @@ class ScanOdometry:
             self._guessed = motion_model.constant_velocity_prior(*of)
         return self._guessed
 
-    def _is_plausible(self, increment: Float, beams: ScanBeams) -> bool:
-        seconds = 1e-9 * (beams.stamp_ns - self._stamp_ns)
-        metres = float(np.hypot(*increment[:2, 2]))
-        return metres <= max(_LEAP, _MAX_SPEED * seconds)
-
-    def _has_leaped(self, beams: ScanBeams) -> bool:
-        """True if odometry has leaped lately."""
-        return self._leaped_ns is not None and beams.stamp_ns < self._leaped_ns + _DISTRUST_NS
-
     def _twist_to(self, T: Float, beams: ScanBeams) -> Float:
         """(3,) m/s and rad/s from the last pose to that of a scan; 0 for a leap, and where all
         beams have the stamp of the scan."""
@@ -316,7 +296,8 @@ class ScanOdometry:
         return np.zeros(3) if is_leap else twist
 
     def _is_reachable(self, beams: ScanBeams, T: Float) -> bool:
-        return self._is_plausible(se2.inverse(self._pose) @ T, beams)
+        seconds = 1e-9 * (beams.stamp_ns - self._stamp_ns)
+        return is_plausible(se2.inverse(self._pose) @ T, seconds)
 
     def _learn(
         self, beams: ScanBeams, learned: MotionPrior, match: ScanMatch, usual: float
@@ -342,5 +323,4 @@ class ScanOdometry:
         else:
             self._before = T
         self._pose, self._stamp_ns, self._is_first = T, beams.stamp_ns, False
-        self._stamps.append(beams.stamp_ns)
-        self._count += 1
+        self._faults.advance(beams.stamp_ns)

@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2, se3
+from stillmap.live.crowd import Crowd
 from stillmap.live.front_end import Registration
 from stillmap.live.known_planes import KnownPlanes
 from stillmap.live.local_map import Labeller, MappedScan
@@ -38,7 +39,7 @@ class SweepOdometry:
 
     def __init__(self, options: SlamOptions, threads: int, spacing: float | None = None) -> None:
         self.local_map = self.left_behind = lidar_odometry.make_local_map()
-        self.travelled = 0.0
+        self.travelled, self.crowd = 0.0, Crowd()  # nobody hides all that a lidar sees
         self._options, self._threads = options, threads
         self._spacing = spacing or options.keyframe_distance or KEYFRAME_DISTANCE
         self._state = lidar_odometry.initial_state()

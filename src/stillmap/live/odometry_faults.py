@@ -1,0 +1,172 @@
+"""Faults of wheel odometry as scans arrive: leaps, wheels that slip, wheels that spin."""
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+import stillmap._core as _core
+from stillmap.live.standing_test import StandingTest, standing_prior
+from stillmap.slam import motion_model
+from stillmap.slam.motion_model import MotionPrior
+from stillmap.slam.odometry_faults import SlipDetector
+from stillmap.slam.options import OdometryOptions
+from stillmap.slam.scan_hits import Scan
+from stillmap.slam.scan_matching import ScanMatch, is_inconsistent, is_poor
+
+Float = NDArray[np.float64]
+
+_LEAP = 1.0  # m between two scans, and times the speed below, beyond which odometry has leaped
+_DISTRUST_NS = 10**9  # after a leap, in which smaller ones are none of odometry either
+_MAX_SPEED = 3.0  # m/s of robots
+_MAX_STAMPS = 500  # of scans that a fault may change in hindsight
+_UNKNOWN = np.full((3, 3), np.inf)  # an increment that is not small
+
+
+@dataclass(frozen=True, eq=False)
+class Fault:
+    """Odometry was wrong for some scans.
+
+    Attributes:
+        first_ns: stamp of the first one; None: none is known.
+        before: (3, 3) T_map_base of the scan before the last one.
+        match: of the last one.
+    """
+
+    first_ns: int | None
+    before: Float
+    match: ScanMatch
+
+
+class _LatestIncrement:
+    """The increment of odometry to the scan that is being registered, whatever the index."""
+
+    value: Float | None = None
+
+    def __getitem__(self, index: int, /) -> Float:
+        return _UNKNOWN if self.value is None else self.value
+
+
+class OdometryFaults:
+    """Tests odometry scan by scan.
+
+    Args:
+        options: see OdometryOptions.
+    """
+
+    def __init__(self, options: OdometryOptions) -> None:
+        self._options = options
+        self._increment = _LatestIncrement()
+        self._slip, self._standing = SlipDetector(self._increment), StandingTest()
+        self._leaped_ns: int | None = None
+        self._stamps = deque[int](maxlen=_MAX_STAMPS)  # of the last scans
+        self._count = 0
+
+    @property
+    def increment(self) -> Float | None:
+        """(3, 3) of odometry to the scan that is being registered; None: there is none."""
+        return self._increment.value
+
+    def predict(
+        self, pose: Float, guess: MotionPrior, increment: Float | None, ns: int, seconds: float
+    ) -> MotionPrior:
+        """The prior of the next scan: odometry where it is plausible, else another.
+
+        Args:
+            pose: (3, 3) T_map_base of the last scan.
+            guess: prior of constant velocity.
+            increment: (3, 3) of odometry since; None: there is none.
+            ns: stamp of the scan.
+            seconds: since the last one.
+        """
+        self._increment.value = increment
+        is_slipping = self._slip.is_slipping(self._count, pose, guess)
+        if increment is None:
+            return guess
+        if not is_plausible(increment, seconds):
+            self._leaped_ns = ns
+        if self._standing.stands:
+            return standing_prior(pose, increment)
+        has_leaped = self._leaped_ns is not None and ns < self._leaped_ns + _DISTRUST_NS
+        if is_slipping or has_leaped:
+            return guess
+        return motion_model.odometry_prior(pose, increment, self._options)
+
+    def detect(
+        self,
+        grid: _core.OccupancyGrid2D,
+        scan: Scan,
+        pose: Float,
+        priors: tuple[MotionPrior, MotionPrior],
+        match: ScanMatch,
+        ns: int,
+        usual: float | None,
+    ) -> Fault | None:
+        """The fault that a scan shows.
+
+        Args:
+            grid: the local map.
+            scan: the hits of the scan.
+            pose: (3, 3) T_map_base of the scan before.
+            priors: of the scan, and that of constant velocity.
+            match: by the prior.
+            ns: stamp of the scan.
+            usual: recent average of the explained share; None: the robot is not tested for standing
+                still: people may walk along, or the scans contradict the map.
+        """
+        prior, guess = priors
+        slip = self._slip.detect(self._count, pose, guess, grid, scan, match)
+        if slip is not None:
+            back = min(self._count - slip.first, len(self._stamps))
+            # the velocity is that of the hypothesis, too
+            before = [slip.before, *(one.T_map_base for one in slip.matches)][-2]
+            self._standing.reset()
+            return Fault(self._stamps[-back] if back else None, before, slip.matches[-1])
+        increment = self.increment
+        if increment is None:
+            return None
+        if self._standing.stands:
+            by_odometry = motion_model.odometry_prior(pose, increment, self._options)
+            self._standing.stands = is_inconsistent(by_odometry, match.T_map_base)
+            return None
+        if usual is None or not prior.is_odometry or match.contradicts_odometry:
+            return None
+        return self._detect_standing(grid, scan, pose, match, increment, ns, usual)
+
+    def advance(self, ns: int) -> None:
+        """The scan with that stamp is registered."""
+        self._stamps.append(ns)
+        self._count += 1
+
+    def reset(self) -> None:
+        """Discard the past motion, after the robot was carried elsewhere."""
+        self._slip.reset()
+        self._standing = StandingTest()
+
+    def _detect_standing(
+        self,
+        grid: _core.OccupancyGrid2D,
+        scan: Scan,
+        pose: Float,
+        match: ScanMatch,
+        increment: Float,
+        ns: int,
+        usual: float,
+    ) -> Fault | None:
+        if not len(scan.points):
+            return None
+        test = self._standing
+        found = test.observe(grid, scan, pose, match.T_map_base, increment, ns)
+        if found is None:
+            return None
+        self._standing = StandingTest()
+        if is_poor(found, usual):  # the robot is elsewhere
+            return None
+        self._standing.stands = True
+        return Fault(test.first_ns, found.T_map_base, found)
+
+
+def is_plausible(step: Float, seconds: float) -> bool:
+    """True if a robot can move by a step (3, 3) in that time."""
+    return float(np.hypot(*step[:2, 2])) <= max(_LEAP, _MAX_SPEED * seconds)
