@@ -29,11 +29,37 @@ def test_an_error_of_the_heading_grows_with_the_way():
         ]
         pose = after
     off = np.array([se2.parameters(one) - se2.parameters(pose) for one in runs])
-    expected = np.cov(off.T)
-    np.testing.assert_allclose(np.diag(reckoning.covariance), np.diag(expected), rtol=0.15)
+    bias = np.square([0.03 * 6.0, 0.03 * 6.0, 0.01 * 6.0 + 0.02 * 0.6])
+    expected = np.diag(np.cov(off.T)) + bias
+    np.testing.assert_allclose(np.diag(reckoning.covariance), expected, rtol=0.15)
     assert reckoning.is_far
     reckoning.reset()
     assert not reckoning.is_far
+
+
+def test_a_place_that_is_not_mapped_is_no_contradiction():
+    """After a stretch without a return the robot sees, between people, what the map lacks."""
+    changes = {
+        "laser": {"beams": 180, "fov": 0.5 * math.pi, "max_range": 14.0},
+        "crowd": {"people": 36},
+        "robot": {"scans": 420},
+    }
+    simulation = simulate(scene_by_name("hall", changes), 1)
+    recording, true = simulation.recording, simulation.truth.T_world_base
+    hit = recording.hit.copy()
+    hit[recording.beams_of(200).start : recording.beams_of(320).start] = False
+    with LiveMapper({"threads": 1}) as mapper:
+        updates = [
+            mapper.push(beams, recording.T_odom_base[t])
+            for t, beams in enumerate(iter_beams(replace(recording, hit=hit)))
+        ]
+    assert not any("carried" in one.doubts for one in updates)
+    # of noise that was learned, not that of the options, which would be metres
+    assert math.sqrt(updates[319].covariance[0, 0]) < 1.0
+    poses = np.array([one.pose for one in updates])
+    off = poses[-1] - se2.inverse(true[0]) @ true[-1]
+    assert np.hypot(*off[:2, 2]) < 3.0 * math.sqrt(updates[319].covariance[:2, :2].trace())
+    assert compute_absolute_errors(poses, true).rmse < 0.4
 
 
 def drive(recording, odometry):

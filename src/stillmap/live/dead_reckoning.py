@@ -7,34 +7,42 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
+from stillmap.core import se2
 from stillmap.slam import kidnapping
 from stillmap.slam.kidnapping import Evidence
 from stillmap.slam.motion_model import MotionPrior
 from stillmap.slam.scan_hits import Scan
-from stillmap.slam.scan_matching import MIN_GAIN, ScanMatch, search_pose
+from stillmap.slam.scan_matching import MIN_GAIN, ScanMatch, occluded_share, search_pose
 
 Float = NDArray[np.float64]
 
 # m and rad, standard deviations beyond which the search next to odometry may miss the pose
-_FAR = 0.15, 0.15
+_FAR = 0.05, 0.02
+# standard deviation of what odometry adds in every step alike: m per m, rad per m, rad per rad
+_BIAS = 0.03, 0.01, 0.02
 _WINDOW_STDS = 3.0  # half width of the search
 _MAX_ROTATION = math.pi / 2.0  # rad, half width
 _EXPLAINED = 0.7  # of the usual share, for a pose to be the right one
+_MAX_OCCLUDED = 0.4  # share of the beams through walls where odometry leads, up to which it may be
 _ALIKE = 0.3, 0.3  # m and rad within which two optima are one pose
 # scans that see another part of the map, or are ambiguous, until odometry is believed
 _MAX_UNKNOWN, _MAX_SCANS = 10, 100
 
 
 class DeadReckoning:
-    """The uncertainty of the pose since the last scan that met anything.
-
-    Attributes:
-        covariance: (3, 3) of x, y (map axes) and heading.
-    """
+    """The uncertainty of the pose since the last scan that met anything."""
 
     def __init__(self) -> None:
-        self.covariance = np.zeros((3, 3))
+        self._noise = np.zeros((3, 3))
+        self._metres, self._radians = 0.0, 0.0
         self._unknown, self._scans = 0, 0
+
+    @property
+    def covariance(self) -> Float:
+        """(3, 3) of x, y (map axes) and heading: noise of the steps, and their bias."""
+        a = _BIAS[0] * self._metres
+        b = _BIAS[1] * self._metres + _BIAS[2] * self._radians
+        return np.asarray(self._noise + np.diag([a**2, a**2, b**2]))
 
     @property
     def is_far(self) -> bool:
@@ -49,11 +57,15 @@ class DeadReckoning:
             before, after: (3, 3) T_map_base.
             drift: (3, 3) covariance of the step alone.
         """
-        self.covariance = _propagate(self.covariance, before, after) + drift
+        self._noise = _propagate(self._noise, before, after) + drift
+        x, y, theta = se2.parameters(se2.inverse(before) @ after)
+        self._metres += float(np.hypot(x, y))
+        self._radians += abs(float(theta))
 
     def reset(self) -> None:
         """The pose is known."""
-        self.covariance = np.zeros((3, 3))
+        self._noise = np.zeros((3, 3))
+        self._metres, self._radians = 0.0, 0.0
         self._unknown, self._scans = 0, 0
 
     def search(
@@ -85,6 +97,10 @@ class DeadReckoning:
         window = _WINDOW_STDS * metres, min(_WINDOW_STDS * radians, _MAX_ROTATION)
         match = search_pose(grid, alike, wide, *window)
         evidence = kidnapping.judge_scan(grid, alike, match, usual)
+        if evidence is Evidence.CONTRADICTS:
+            occluded = occluded_share(grid, alike, prior.T_map_base)
+            # where odometry leads, it may see what the map does not show
+            evidence = Evidence.UNKNOWN if occluded <= _MAX_OCCLUDED else evidence
         if evidence is not Evidence.CONTRADICTS:
             if match.explained >= _EXPLAINED * usual and not _is_ambiguous(match):
                 return match, Evidence.AGREES

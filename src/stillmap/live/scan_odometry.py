@@ -190,10 +190,10 @@ class ScanOdometry:
         """The match, whether odometry slips, and whether the robot was carried elsewhere."""
         self._is_adrift = False
         if not self.local_map.has_sensor(beams.sensor) or not len(scan.points):
-            return accept_prior(prior), False, False
+            return accept_prior(learned or prior), False, False
         grid = self.local_map.grid
         if self._reckoning.is_far and prior.is_odometry:
-            return self._find_again(scan, prior, usual)
+            return self._find_again(scan, learned or prior, usual)
         match = match_scan(grid, scan, prior, usual, learned)
         if not is_poor(match, usual):
             self._weigh_evidence(Evidence.AGREES)
@@ -226,6 +226,8 @@ class ScanOdometry:
             self._contradictions = 0.0
             return found, False, False
         self._is_adrift = not self._reckoning.is_over
+        if not self._is_adrift:
+            self._contradictions = 0.0
         if evidence is Evidence.CONTRADICTS:
             self._weigh_evidence(evidence)
         if self._contradictions >= _CARRIED_AFTER:
