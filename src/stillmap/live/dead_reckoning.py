@@ -99,7 +99,7 @@ class DeadReckoning:
         evidence = kidnapping.judge_scan(grid, alike, match, usual)
         if evidence is Evidence.CONTRADICTS:
             occluded = occluded_share(grid, alike, prior.T_map_base)
-            # where odometry leads, it may see what the map does not show
+            # odometry may have led the robot to where nothing is mapped
             evidence = Evidence.UNKNOWN if occluded <= _MAX_OCCLUDED else evidence
         if evidence is not Evidence.CONTRADICTS:
             if match.explained >= _EXPLAINED * usual and not _is_ambiguous(match):

@@ -226,7 +226,7 @@ class ScanOdometry:
             self._contradictions = 0.0
             return found, False, False
         self._is_adrift = not self._reckoning.is_over
-        if not self._is_adrift:
+        if not self._is_adrift:  # from here on scans are added to the map again
             self._contradictions = 0.0
         if evidence is Evidence.CONTRADICTS:
             self._weigh_evidence(evidence)
