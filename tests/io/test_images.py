@@ -1,15 +1,22 @@
 """Errors on images that cannot be read."""
 
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from peak_memory import run_measured
 from PIL import Image
 
 from stillmap.core.errors import InputError
 from stillmap.io.images import read_image, read_image_size
+
+READ = """
+import sys
+from pathlib import Path
+from stillmap.io.images import read_image
+read_image(Path(sys.argv[1]))
+"""
 
 
 @pytest.fixture
@@ -88,19 +95,8 @@ def test_the_largest_image_with_transparency_takes_half_a_gigabyte(tmp_path):
     """Two images and the list of their parts took twice as much."""
     path = tmp_path / "a.png"
     Image.new("RGBA", (8192, 8192)).save(path, compress_level=1)
-    code = "\n".join(
-        (
-            "import sys, pathlib",
-            "from stillmap.io.images import read_image",
-            "read_image(pathlib.Path(sys.argv[1]))",
-            "status = pathlib.Path('/proc/self/status').read_text()",
-            "print(int(status.split('VmHWM:')[1].split()[0]) >> 10)",
-        )
-    )
-    run = subprocess.run(
-        [sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True
-    )
-    assert int(run.stdout) < 700
+    _, megabytes = run_measured(READ, path)
+    assert megabytes < 700
 
 
 @pytest.mark.parametrize("format", ["EPS", "TGA", "GIF", "PCX"])

@@ -2,12 +2,11 @@
 
 import shutil
 import struct
-import subprocess
-import sys
 import zlib
 
 import numpy as np
 import pytest
+from peak_memory import run_measured
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -19,6 +18,14 @@ from stillmap.io.rgbd import T_BASE_CAMERA
 from stillmap.io.rgbd_folders import SCENES, TUM, detect_layout
 from stillmap.preprocessing.options import ReadOptions
 
+READ = """
+import sys
+import stillmap
+try:
+    stillmap.read(sys.argv[1])
+except stillmap.InputError as error:
+    print(error)
+"""
 W, H = 64, 48
 K = np.array([[60.0, 0.0, 31.5], [0.0, 58.0, 23.5], [0.0, 0.0, 1.0]])
 ROOM = (np.array([-3.0, -2.0, 0.0]), np.array([3.0, 2.0, 2.4]))  # m, its corners
@@ -379,18 +386,6 @@ def test_a_header_that_claims_many_pixels_costs_little(scenes):
         content[16:24] = struct.pack(">II", 8192, 8191)
         content[29:33] = struct.pack(">I", zlib.crc32(content[12:29]))
         file.write_bytes(content)
-    code = "\n".join(
-        (
-            "import sys, pathlib, stillmap",
-            "try: stillmap.read(sys.argv[1])",
-            "except stillmap.InputError as error: print(error)",
-            "status = pathlib.Path('/proc/self/status').read_text()",
-            "print(int(status.split('VmHWM:')[1].split()[0]) >> 10)",
-        )
-    )
-    run = subprocess.run(
-        [sys.executable, "-c", code, str(scenes)], capture_output=True, text=True, check=True
-    )
-    said, megabytes = run.stdout.splitlines()
-    assert "holds no usable scan" in said
-    assert int(megabytes) < 700
+    said, megabytes = run_measured(READ, scenes)
+    assert "holds no usable scan" in said[0]
+    assert megabytes < 700

@@ -43,6 +43,12 @@ def test_wheels_that_spin_are_no_crowd():
     assert not drive(Crowd(), 40, companions=True, speed=0.0).walks_along
 
 
+def test_the_first_people_may_walk_along():
+    assert drive(Crowd(), 8, companions=True).may_walk_along
+    assert not drive(Crowd(), 40, companions=False).may_walk_along
+    assert not drive(Crowd(), 40, companions=True, speed=0.0).may_walk_along
+
+
 def test_hits_on_the_robot_are_no_crowd():
     on_it = np.tile([[0.2, 0.3], [0.2, -0.3]], (20, 1))
     crowd = Crowd()

@@ -15,9 +15,8 @@ from PIL import Image, UnidentifiedImageError
 from stillmap.core.errors import InputError
 from stillmap.core.input_files import InputFile, read_bytes
 
-# names of files, and what they may hold whatever their name: of some other formats Pillow starts a
-# program to read them
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".pgm")
+# whatever the name: for EPS, Pillow starts Ghostscript
 _FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "PPM")
 
 # of an image: Pillow unpacks it to 4 bytes a pixel, and an array takes 1 to 4
@@ -54,7 +53,7 @@ def read_image(path: Path) -> NDArray[Any]:
 
 
 def _unpack(image: Image.Image, dtype: Any, *, is_color: bool = False) -> NDArray[Any]:
-    """The array of an image, some rows at a time: at once it would take three times the memory."""
+    """The array of an image, some rows at a time: at once it takes twice the memory."""
     width, height = image.size
     out = np.empty((height, width, 3) if is_color else (height, width), dtype)
     rows = max(_UNPACKED // max(width, 1), 1)

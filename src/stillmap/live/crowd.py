@@ -25,6 +25,7 @@ _RATE = 0.15  # weight of a scan in the running shares
 # and of those that are where odometry says in the same scans, below which rather the wheels spin;
 # both while nobody walks along, and while people do
 _ALONG, _STATIC = (0.12, 0.05), (0.05, 0.003)
+_MAY_WALK = 0.04  # the first of them, from which people may walk along
 
 
 class _Kept(NamedTuple):
@@ -54,6 +55,12 @@ class Crowd:
     def is_dense(self) -> bool:
         """True if people may walk along with the robot: many move, or some do that."""
         return self._moving > _CROWDED or self.walks_along
+
+    @property
+    def may_walk_along(self) -> bool:
+        """True if people may walk along, too few as yet to be sure: some hits keep their place, and
+        others are where odometry says."""
+        return self._along > _MAY_WALK and self._both > _STATIC[0] * self._along
 
     def learn(self, e: NDArray[np.float32]) -> None:
         """Take the labels of an earlier scan.

@@ -23,7 +23,7 @@ _BIAS = 0.03, 0.01, 0.02
 _WINDOW_STDS = 3.0  # half width of the search
 _MAX_ROTATION = math.pi / 2.0  # rad, half width
 _EXPLAINED = 0.7  # of the usual share, for a pose to be the right one
-_MAX_OCCLUDED = 0.4  # share of the beams through walls where odometry leads, up to which it may be
+_MAX_OCCLUDED = 0.4  # share of beams through walls at the pose by odometry: more contradict the map
 _ALIKE = 0.3, 0.3  # m and rad within which two optima are one pose
 # scans that see another part of the map, or are ambiguous, until odometry is believed
 _MAX_UNKNOWN, _MAX_SCANS = 10, 100
@@ -33,6 +33,10 @@ class DeadReckoning:
     """The uncertainty of the pose since the last scan that met anything."""
 
     def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """The pose is known."""
         self._noise = np.zeros((3, 3))
         self._metres, self._radians = 0.0, 0.0
         self._unknown, self._scans = 0, 0
@@ -40,9 +44,9 @@ class DeadReckoning:
     @property
     def covariance(self) -> Float:
         """(3, 3) of x, y (map axes) and heading: noise of the steps, and their bias."""
-        a = _BIAS[0] * self._metres
-        b = _BIAS[1] * self._metres + _BIAS[2] * self._radians
-        return np.asarray(self._noise + np.diag([a**2, a**2, b**2]))
+        metres = _BIAS[0] * self._metres
+        radians = _BIAS[1] * self._metres + _BIAS[2] * self._radians
+        return np.asarray(self._noise + np.diag(np.square([metres, metres, radians])))
 
     @property
     def is_far(self) -> bool:
@@ -61,12 +65,6 @@ class DeadReckoning:
         x, y, theta = se2.parameters(se2.inverse(before) @ after)
         self._metres += float(np.hypot(x, y))
         self._radians += abs(float(theta))
-
-    def reset(self) -> None:
-        """The pose is known."""
-        self._noise = np.zeros((3, 3))
-        self._metres, self._radians = 0.0, 0.0
-        self._unknown, self._scans = 0, 0
 
     def search(
         self,

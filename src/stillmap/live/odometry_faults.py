@@ -59,6 +59,7 @@ class OdometryFaults:
         self._options = options
         self._increment = _LatestIncrement()
         self._slip, self._standing = SlipDetector(self._increment), StandingTest()
+        self._stands = False  # confirmed, and odometry has not agreed with a scan since
         self._leaped_ns: int | None = None
         self._stamps = deque[int](maxlen=_MAX_STAMPS)  # of the last scans
         self._count = 0
@@ -71,7 +72,8 @@ class OdometryFaults:
     def predict(
         self, pose: Float, guess: MotionPrior, increment: Float | None, ns: int, seconds: float
     ) -> MotionPrior:
-        """The prior of the next scan: odometry where it is plausible, else another.
+        """The prior of the next scan: odometry where it is plausible, a robot that stands while its
+        wheels spin, else constant velocity.
 
         Args:
             pose: (3, 3) T_map_base of the last scan.
@@ -86,7 +88,7 @@ class OdometryFaults:
             return guess
         if not is_plausible(increment, seconds):
             self._leaped_ns = ns
-        if self._standing.stands:
+        if self._stands:
             return standing_prior(pose, increment)
         has_leaped = self._leaped_ns is not None and ns < self._leaped_ns + _DISTRUST_NS
         if is_slipping or has_leaped:
@@ -102,6 +104,8 @@ class OdometryFaults:
         match: ScanMatch,
         ns: int,
         usual: float | None,
+        *,
+        may_stand: bool,
     ) -> Fault | None:
         """The fault that a scan shows.
 
@@ -112,8 +116,9 @@ class OdometryFaults:
             priors: of the scan, and that of constant velocity.
             match: by the prior.
             ns: stamp of the scan.
-            usual: recent average of the explained share; None: the robot is not tested for standing
-                still: people may walk along, or the scans contradict the map.
+            usual: recent average of the explained share; None: whether the robot stands is not
+                tested, for the scans contradict the map.
+            may_stand: if it does, that is believed now: what keeps its place is not people.
         """
         prior, guess = priors
         slip = self._slip.detect(self._count, pose, guess, grid, scan, match)
@@ -126,13 +131,16 @@ class OdometryFaults:
         increment = self.increment
         if increment is None:
             return None
-        if self._standing.stands:
+        if self._stands:
             by_odometry = motion_model.odometry_prior(pose, increment, self._options)
-            self._standing.stands = is_inconsistent(by_odometry, match.T_map_base)
+            self._stands = is_inconsistent(by_odometry, match.T_map_base)
             return None
         if usual is None or not prior.is_odometry or match.contradicts_odometry:
             return None
-        return self._detect_standing(grid, scan, pose, match, increment, ns, usual)
+        if not len(scan.points):
+            return None
+        standing = self._standing.observe(grid, scan, pose, match.T_map_base, increment, ns)
+        return self._accept_standing(standing, usual) if may_stand else None
 
     def advance(self, ns: int) -> None:
         """The scan with that stamp is registered."""
@@ -142,29 +150,18 @@ class OdometryFaults:
     def reset(self) -> None:
         """Discard the past motion, after the robot was carried elsewhere."""
         self._slip.reset()
-        self._standing = StandingTest()
+        self._standing.reset()
+        self._stands = False
 
-    def _detect_standing(
-        self,
-        grid: _core.OccupancyGrid2D,
-        scan: Scan,
-        pose: Float,
-        match: ScanMatch,
-        increment: Float,
-        ns: int,
-        usual: float,
-    ) -> Fault | None:
-        if not len(scan.points):
+    def _accept_standing(self, standing: ScanMatch | None, usual: float) -> Fault | None:
+        if standing is None:
             return None
-        test = self._standing
-        found = test.observe(grid, scan, pose, match.T_map_base, increment, ns)
-        if found is None:
+        first_ns = self._standing.first_ns
+        self._standing.reset()
+        if is_poor(standing, usual):  # the robot is elsewhere
             return None
-        self._standing = StandingTest()
-        if is_poor(found, usual):  # the robot is elsewhere
-            return None
-        self._standing.stands = True
-        return Fault(test.first_ns, found.T_map_base, found)
+        self._stands = True
+        return Fault(first_ns, standing.T_map_base, standing)
 
 
 def is_plausible(step: Float, seconds: float) -> bool:

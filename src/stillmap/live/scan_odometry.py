@@ -54,7 +54,8 @@ class ScanOdometry:
         self.options = options
         self.local_map: MatchMap = LocalMap(options.resolution)
         self.left_behind: MatchMap = self.local_map  # the one before the robot was carried
-        self.travelled, self.crowd = 0.0, Crowd()
+        self.travelled = 0.0
+        self.crowd = Crowd()
         self._pose, self._before = np.eye(3), np.eye(3)
         self._stamp_ns, self._seconds = 0, 0.0
         self._velocity_noise, self._odometry_noise = VelocityNoise(), OdometryNoise()
@@ -69,7 +70,7 @@ class ScanOdometry:
         self._guessed = motion_model.constant_velocity_prior(*self._guessed_of)
 
     def predict(self, beams: ScanBeams, increment: Float | None) -> MotionPrior:
-        """The prior of the next scan: odometry where it is plausible, else constant velocity.
+        """The prior of the next scan, see `OdometryFaults.predict`.
 
         Args:
             beams: of the scan.
@@ -83,7 +84,7 @@ class ScanOdometry:
     def select(self, beams: ScanBeams, prior: MotionPrior) -> Scan:
         """The hits of a scan with weight 1, without the motion that is predicted during it.
 
-        They are compared with those before: do people walk along?
+        The crowd observes them.
         """
         hits = select_hits(deskew(beams, self._twist_to(prior.T_map_base, beams)))
         self.crowd.observe(hits.points, self._faults.increment, beams.stamp_ns)
@@ -245,9 +246,12 @@ class ScanOdometry:
     ) -> tuple[ScanMatch, bool]:
         """The match without odometry where that is at fault, and whether it is."""
         has_map = self.local_map.has_sensor(beams.sensor) and not self._contradictions
-        usual = self._usual.get(beams.sensor) if has_map and not self.crowd.walks_along else None
+        may_be_people = self.crowd.walks_along or self.crowd.may_walk_along
+        usual = self._usual.get(beams.sensor) if has_map else None
         grid, ns = self.local_map.grid, beams.stamp_ns
-        fault = self._faults.detect(grid, scan, self._pose, priors, match, ns, usual)
+        fault = self._faults.detect(
+            grid, scan, self._pose, priors, match, ns, usual, may_stand=not may_be_people
+        )
         if fault is None:
             return match, False
         if fault.first_ns is not None:

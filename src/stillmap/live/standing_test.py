@@ -31,11 +31,9 @@ class StandingTest:
 
     Attributes:
         first_ns: stamp of the first scan of the hypothesis.
-        stands: an earlier one was confirmed, and odometry has not agreed with a scan since.
     """
 
     def __init__(self) -> None:
-        self.stands = False
         self.reset()
 
     def reset(self) -> None:
@@ -59,7 +57,7 @@ class StandingTest:
             ns: its stamp.
 
         Returns:
-            The match of the standing pose at the scan that confirms it.
+            The match of the standing pose, if the scans so far confirm it.
         """
         if self._pose is None:
             self._pose, self.first_ns = last, ns

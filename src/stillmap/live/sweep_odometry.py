@@ -39,7 +39,8 @@ class SweepOdometry:
 
     def __init__(self, options: SlamOptions, threads: int, spacing: float | None = None) -> None:
         self.local_map = self.left_behind = lidar_odometry.make_local_map()
-        self.travelled, self.crowd = 0.0, Crowd()  # nobody hides all that a lidar sees
+        self.travelled = 0.0
+        self.crowd = Crowd()  # observes nothing: people do not hide all that a lidar sees
         self._options, self._threads = options, threads
         self._spacing = spacing or options.keyframe_distance or KEYFRAME_DISTANCE
         self._state = lidar_odometry.initial_state()
