@@ -5,7 +5,13 @@ import pytest
 
 from stillmap.core import se2
 from stillmap.slam import pose_graph
-from stillmap.slam.pose_graph import Constraint, optimize_poses, squared_mahalanobis
+from stillmap.slam.pose_graph import (
+    Constraint,
+    HeadingMeasurement,
+    optimize_headings,
+    optimize_poses,
+    squared_mahalanobis,
+)
 
 SURE = np.diag([1e-4, 1e-4, 1e-6])
 STEP = np.diag([1e-2, 1e-2, 1e-4])
@@ -204,3 +210,19 @@ def test_consistent_loops_keep_their_weight():
     robust = optimize_poses(dead_reckoned(chain), chain, loops, MAX_CHI2)
     assert squared_mahalanobis(plain, loops).max() < MAX_CHI2
     np.testing.assert_array_equal(robust, plain)
+
+
+def test_measured_headings_bend_the_chain():
+    # four steps straight ahead, turned by .01 rad in all: .0025 each
+    chain = [Constraint(k, k + 1, se2.matrix(1.0, 0, 0), STEP) for k in range(4)]
+    measured = [HeadingMeasurement(0, 1.0, 1e-5), HeadingMeasurement(4, 1.01, 1e-5)]
+    x = se2.parameters(optimize_headings(dead_reckoned(chain), chain, measured))
+    np.testing.assert_allclose(x[:, 2], [0.0, 0.0025, 0.005, 0.0075, 0.01], atol=1e-3)
+    np.testing.assert_allclose(x[0], 0.0, atol=1e-12)
+
+
+def test_one_wrong_heading_counts_little():
+    chain = [Constraint(k, k + 1, se2.matrix(1.0, 0, 0), STEP) for k in range(4)]
+    measured = [HeadingMeasurement(k, 0.0 if k != 2 else 0.5, 1e-4) for k in range(5)]
+    x = se2.parameters(optimize_headings(dead_reckoned(chain), chain, measured))
+    assert np.abs(x[:, 2]).max() < 0.01

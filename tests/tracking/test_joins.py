@@ -107,3 +107,13 @@ def test_marginals_of_one_with_two_successors_are_exact():
     log_ratio = np.array([1.0, 2.0])
     found = compute_marginals(np.zeros(2, int), np.array([1, 2]), log_ratio, 3)
     np.testing.assert_allclose(found, np.exp(log_ratio) / (1.0 + np.exp(log_ratio).sum()))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_marginals_of_likely_joins_are_probabilities(seed):
+    # sums of such ratios less one of their terms are negative by rounding
+    before, after = np.triu_indices(5, 1)
+    log_ratio = np.random.default_rng(seed).uniform(20.0, 60.0, len(before))
+    found = compute_marginals(before, after, log_ratio, 5)
+    assert (found >= 0.0).all()
+    assert np.bincount(before, found).max() <= 1.0 + 1e-9

@@ -9,11 +9,11 @@ from stillmap.core import se2
 from stillmap.live.crowd import Crowd
 from stillmap.live.dead_reckoning import DeadReckoning
 from stillmap.live.front_end import Registration
+from stillmap.live.heading_drift import WallDirections, correct_heading
 from stillmap.live.local_map import Labeller, LocalMap, MappedScan, MatchMap, tend
 from stillmap.live.odometry_faults import OdometryFaults, is_plausible
 from stillmap.live.scan import ScanBeams, deskew
 from stillmap.live.scan_hits import select_hits, thin
-from stillmap.live.wall_directions import WallDirections, correct_heading
 from stillmap.slam import kidnapping, motion_model
 from stillmap.slam.deskew import MAX_SPEED, MAX_TURN_RATE
 from stillmap.slam.kidnapping import Evidence

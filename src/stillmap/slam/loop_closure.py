@@ -18,6 +18,7 @@ from stillmap.slam import (
     pose_graph,
     relocalization,
 )
+from stillmap.slam.heading_alignment import align_headings
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.pose_graph import Constraint, PoseGraph
 from stillmap.slam.relocalization import Relocalization
@@ -56,11 +57,13 @@ def close_loops(
     poses, found = state.poses, state.found
     poses, found = solve_graph(context.keyframes, chain, poses, found, _MAX_CHI2)
     accepted = accepted_constraints(context.keyframes, found)
+    graph = PoseGraph(context.keyframes, poses, [*chain, *accepted])
+    graph = align_headings(recording, e, graph)
     return dataclasses.replace(
         odometry,
-        poses=local_map.propagate_corrections(context.poses, context.keyframes, poses),
+        poses=local_map.propagate_corrections(context.poses, context.keyframes, graph.poses),
         loops=found,
-        graph=PoseGraph(context.keyframes, poses, [*chain, *accepted]),
+        graph=graph,
         diagnostics=dataclasses.replace(
             odometry.diagnostics,
             breaks=relocalized.breaks,

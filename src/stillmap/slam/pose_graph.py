@@ -4,8 +4,9 @@ Residuals of constraints are x, y, heading in the frame of the second pose in 2D
 (translation, rotation) to it in 3D. The shape of the poses, (K, 3, 3) or (K, 4, 4), decides.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,20 @@ class Constraint(ShortRepr):
     second: int
     T: Float
     covariance: Float
+
+
+class HeadingMeasurement(NamedTuple):
+    """A measured heading of a pose in 2D.
+
+    Attributes:
+        pose: its index.
+        heading: rad, in the map frame.
+        variance: rad2.
+    """
+
+    pose: int
+    heading: float
+    variance: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,16 +85,13 @@ def optimize_poses(
         loops: constraints that may be false.
         max_chi2: chi-square at which a loop keeps a quarter of its weight; None: no kernel.
     """
-    import gtsam  # loading it takes long
-
     graph, start = _build_problem(poses, chain)
+    _fix_first(graph, poses)
 
     def solve(start: Any, weights: Float, tolerance: float) -> Any:
         weighted = graph.clone()
         _add_factors(weighted, loops, np.maximum(weights, 1e-9))
-        parameters = gtsam.LevenbergMarquardtParams()
-        parameters.setRelativeErrorTol(tolerance)
-        return gtsam.LevenbergMarquardtOptimizer(weighted, start, parameters).optimize()
+        return _solve(weighted, start, tolerance)
 
     found = solve(start, np.ones(len(loops)), _TOLERANCE)
     out = _extract_poses(found, poses[0])
@@ -97,6 +109,35 @@ def optimize_poses(
         found = solve(found, weights, _TOLERANCE if is_last else _COARSE_TOLERANCE)
         out = _extract_poses(found, poses[0])
         chi2 = squared_mahalanobis(out, loops)
+    return out
+
+
+def optimize_headings(
+    poses: Float, constraints: list[Constraint], headings: Sequence[HeadingMeasurement]
+) -> Float:
+    """(K, 3, 3) poses of least squares whose headings were measured, weighted by the Cauchy kernel.
+
+    Measured headings are those of a frame that may be rotated against the map: the poses are
+    rotated and moved together so that the first one stays as it is.
+
+    Args:
+        poses: (K, 3, 3) the start.
+        constraints: trusted constraints.
+        headings: at least one.
+    """
+    import gtsam
+
+    graph, start = _build_problem(poses, constraints)
+    noise = gtsam.noiseModel
+    fixed = noise.Isotropic.Sigma(2, _PRIOR_STD)
+    graph.add(gtsam.PoseTranslationPrior2D(0, poses[0, :2, 2], fixed))
+    for one in headings:
+        model = noise.Isotropic.Sigma(1, float(np.sqrt(one.variance)))
+        robust = noise.Robust.Create(noise.mEstimator.Cauchy.Create(1.0), model)
+        graph.add(gtsam.PoseRotationPrior2D(one.pose, gtsam.Rot2(one.heading), robust))
+    found = se2.matrix(*gtsam.utilities.extractPose2(_solve(graph, start, _TOLERANCE)).T)
+    out: Float = se2.normalize(poses[0] @ se2.inverse(found[0]) @ found)
+    out[0] = poses[0]
     return out
 
 
@@ -118,14 +159,29 @@ def _build_problem(poses: Float, chain: list[Constraint]) -> tuple[Any, Any]:
     import gtsam
 
     start, graph = gtsam.Values(), gtsam.NonlinearFactorGraph()
-    objects, is_2d = _to_gtsam(poses), poses.shape[-1] == 3
-    for k, pose in enumerate(objects):
+    for k, pose in enumerate(_to_gtsam(poses)):
         start.insert(k, pose)
-    fixed = gtsam.noiseModel.Isotropic.Sigma(3 if is_2d else 6, _PRIOR_STD)
-    prior_factor = gtsam.PriorFactorPose2 if is_2d else gtsam.PriorFactorPose3
-    graph.add(prior_factor(0, objects[0], fixed))
     _add_factors(graph, chain, np.ones(len(chain)))
     return graph, start
+
+
+def _fix_first(graph: Any, poses: Float) -> None:
+    """Add the first of the poses (K, D+1, D+1) to GTSAM's factor graph, known exactly."""
+    import gtsam
+
+    is_2d = poses.shape[-1] == 3
+    fixed = gtsam.noiseModel.Isotropic.Sigma(3 if is_2d else 6, _PRIOR_STD)
+    prior_factor = gtsam.PriorFactorPose2 if is_2d else gtsam.PriorFactorPose3
+    graph.add(prior_factor(0, _to_gtsam(poses[:1])[0], fixed))
+
+
+def _solve(graph: Any, start: Any, tolerance: float) -> Any:
+    """Values of least squares; `tolerance`: relative change of the cost."""
+    import gtsam
+
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setRelativeErrorTol(tolerance)
+    return gtsam.LevenbergMarquardtOptimizer(graph, start, parameters).optimize()
 
 
 def _extract_poses(found: Any, first: Float) -> Float:

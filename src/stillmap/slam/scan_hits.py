@@ -1,5 +1,6 @@
 """The hits of a scan as registration takes them, and their part in maps for registration."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,21 +45,28 @@ def transform_points(points: Points, T: Float) -> Points:
     return np.ascontiguousarray(points @ T[:-1, :-1].T + T[:-1, -1], dtype=np.float32)
 
 
-def select_hits(recording: Recording, e: NDArray[np.float32], t: int) -> Scan:
-    """The hits of scan t."""
+def select_hits(
+    recording: Recording, e: NDArray[np.float32], t: int, normals: Mapping[str, float] = NORMALS
+) -> Scan:
+    """The hits of scan t; `normals`: how they are estimated, see NORMALS."""
     beams = recording.beams_of(t)
     hit = recording.hit[beams]
     T_base_sensor = recording.T_base_sensor[recording.sensor[t]]
     points = transform_points(recording.points[beams][hit], T_base_sensor)
-    return make_scan(points, e[beams][hit], T_base_sensor)
+    return make_scan(points, e[beams][hit], T_base_sensor, normals)
 
 
-def make_scan(points: Points, weights: NDArray[np.float32], T_base_sensor: Float) -> Scan:
+def make_scan(
+    points: Points,
+    weights: NDArray[np.float32],
+    T_base_sensor: Float,
+    normals: Mapping[str, float] = NORMALS,
+) -> Scan:
     """A scan of end points (N, 2) in the order of the beams, with the normals of its surfaces."""
-    normals, isotropy = np.zeros_like(points), np.zeros_like(weights)
+    n, isotropy = np.zeros_like(points), np.zeros_like(weights)
     counts = weights > 0.0
-    normals[counts], isotropy[counts] = _core.estimate_normals(points[counts], **NORMALS)
-    return Scan(points, weights, T_base_sensor, normals, isotropy)
+    n[counts], isotropy[counts] = _core.estimate_normals(points[counts], **normals)
+    return Scan(points, weights, T_base_sensor, n, isotropy)
 
 
 def add_scan(

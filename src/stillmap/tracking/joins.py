@@ -112,7 +112,10 @@ def compute_marginals(before: Index, after: Index, log_ratio: Float, n: int) -> 
     free = np.ones(len(ratio))  # how far the later piece is left by its other rivals
     for _ in range(_ROUNDS):
         pull = ratio * free
-        pull = ratio / (1.0 + np.bincount(before, pull, minlength=n)[before] - pull)
+        # a sum less one of its terms can be negative by rounding
+        pull = ratio / (
+            1.0 + np.maximum(np.bincount(before, pull, minlength=n)[before] - pull, 0.0)
+        )
         free = 1.0 / (1.0 + np.maximum(np.bincount(after, pull, minlength=n)[after] - pull, 0.0))
     pull = ratio * free
     return np.asarray(pull / (1.0 + np.bincount(before, pull, minlength=n)[before]))

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from stillmap.core import se2
+from stillmap.live.heading_drift import WallDirections, correct_heading
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.replay import iter_beams
-from stillmap.live.wall_directions import HeadingOffset, WallDirections, correct_heading
 from stillmap.sim import scene_by_name, simulate
 from stillmap.slam.scan_hits import Scan
+from stillmap.slam.wall_directions import HeadingOffset
 
 
 def look(normals_deg, weight=1.0):

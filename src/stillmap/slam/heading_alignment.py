@@ -1,0 +1,116 @@
+"""Headings of a pose graph, aligned by the directions of walls.
+
+Loops say how far the heading has drifted where they close, and nothing about an open route. The
+directions of all walls of the recording, modulo a quarter turn, measure the heading of every
+keyframe. Directions and headings are estimated in turn.
+"""
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core import se2
+from stillmap.core.recording import Recording
+from stillmap.slam.pose_graph import Constraint, HeadingMeasurement, PoseGraph, optimize_headings
+from stillmap.slam.scan_hits import select_hits
+from stillmap.slam.wall_directions import DirectionDensity, Directions
+
+Float = NDArray[np.float64]
+
+# normals along 3 m of a surface, whose noise is a tenth of that of the normals of registration;
+# only straight surfaces have one
+_NORMALS = {"radius": 1.5, "max_gap": 1.0, "flat_below": 0.003, "round_from": 0.01}
+_KERNEL = np.radians(0.5)  # std of these normals about the direction of a wall
+_EVIDENCE = 0.03  # of each: those within 3 m share their end points
+_MIN_TRAVEL = 8.0  # m from which on directions are known
+_MIN_STD = np.radians(0.3)  # of a building's walls about its directions
+_CORRELATION = 4.0  # m along which walls deviate alike from the directions of the building
+_UPDATES = 2  # of directions and headings in turn; more draw walls of many directions together
+# the chain's covariance is that of windows in which loops are searched: scan matching drifts less
+# in heading; variance of a step across a break, rad2, which stays unconstrained
+_DRIFT_SHARE, _BREAK_VARIANCE = 0.2, 1.0
+
+
+def align_headings(recording: Recording, e: NDArray[np.float32], graph: PoseGraph) -> PoseGraph:
+    """The graph with keyframes whose headings agree with the directions of the walls.
+
+    Where the walls have directions of all kinds it is hardly changed. Steps of the chain change
+    with the poses.
+
+    Args:
+        recording: 2D.
+        e: (M,) P(static) of every beam.
+        graph: optimized.
+    """
+    x = se2.parameters(graph.poses)
+    steps = np.hypot(*np.diff(x[:, :2], axis=0).T).clip(0.0, 1.0)
+    if steps.sum() < _MIN_TRAVEL:
+        return graph
+    metres = np.append(steps, steps[-1])
+    scans = recording.iter_scans(graph.keyframes.tolist(), e)
+    views = [Directions.of_scan(select_hits(recording, e, t, _NORMALS), 0.0) for t in scans]
+    constraints = [_keep_error(one, graph.poses) for one in graph.constraints]
+    poses = graph.poses
+    for _ in range(_UPDATES):
+        before = se2.parameters(poses)[:, 2]
+        headings = _measure_headings(views, before, metres)
+        if not headings:
+            break
+        poses = optimize_headings(poses, constraints, headings)
+    turned = [_turn_step(one, graph.poses, poses) for one in graph.constraints]
+    return PoseGraph(graph.keyframes, poses, turned)
+
+
+def _is_step(constraint: Constraint) -> bool:
+    """Whether it is of the chain, and not across a break."""
+    successive = constraint.second == constraint.first + 1
+    return successive and bool(constraint.covariance[2, 2] < _BREAK_VARIANCE)
+
+
+def _turn_step(constraint: Constraint, before: Float, after: Float) -> Constraint:
+    """A step of the chain with the change of the poses: who solves the graph again finds them."""
+    if not _is_step(constraint):
+        return constraint
+    k = [constraint.first, constraint.second]
+    (i, j), (to_i, to_j) = before[k], after[k]
+    change = se2.inverse(se2.inverse(i) @ j) @ se2.inverse(to_i) @ to_j
+    return dataclasses.replace(constraint, T=se2.normalize(constraint.T @ change))
+
+
+def _keep_error(constraint: Constraint, poses: Float) -> Constraint:
+    """The constraint as the optimized poses have it, so that nothing but headings changes them."""
+    T = se2.inverse(poses[constraint.first]) @ poses[constraint.second]
+    covariance = constraint.covariance
+    if _is_step(constraint):
+        scale = np.array([1.0, 1.0, _DRIFT_SHARE])
+        covariance = scale[:, None] * covariance * scale
+    return dataclasses.replace(constraint, T=T, covariance=covariance)
+
+
+def _measure_headings(
+    views: list[Directions], headings: Float, metres: Float
+) -> list[HeadingMeasurement]:
+    """Headings of keyframes that agree with the directions of all of them.
+
+    Their noise is learned: how far the keyframes are off the common directions, and along some
+    metres all in the same way.
+
+    Args:
+        views: (K,) directions in the frames of the keyframes.
+        headings: (K,) rad, so far.
+        metres: (K,) of travel that a keyframe stands for, at most 1.
+    """
+    rotated = [view.rotate(heading) for view, heading in zip(views, headings, strict=True)]
+    seen = Directions(sum(m * one.weights for m, one in zip(metres, rotated, strict=True)))
+    if not seen.weights.any():
+        return []
+    density = DirectionDensity(seen, _KERNEL)
+    offsets = [(k, density.measure(one, _EVIDENCE)) for k, one in enumerate(rotated)]
+    measured = [(k, offset) for k, offset in offsets if offset is not None]
+    spread = float(np.mean([offset.value**2 for _, offset in measured])) if measured else 0.0
+    learned = max(_CORRELATION * spread, _MIN_STD**2)
+    return [
+        HeadingMeasurement(k, float(headings[k] + offset.value), max(offset.variance, learned))
+        for k, offset in measured
+    ]
