@@ -52,10 +52,15 @@ def drive(drift, walls, headings):
     return recording, PoseGraph(np.arange(K), poses, chain)
 
 
+def matched(K, std=0.004):
+    """(K, 3, 3) covariances of scans whose heading the local map measures to `std` rad."""
+    return np.tile(np.diag([1e-4, 1e-4, std**2]), (K, 1, 1))
+
+
 def aligned(drift, walls, headings):
     recording, graph = drive(drift, walls, headings)
     e = np.ones(recording.n_beams, np.float32)
-    found = se2.parameters(align_headings(recording, e, graph).poses)[:, 2]
+    found = se2.parameters(align_headings(recording, e, graph, matched(60)).poses)[:, 2]
     off = se2.wrap(found - headings)
     return off - off.mean()
 
@@ -87,15 +92,25 @@ def test_rooms_of_all_directions_change_hardly_anything():
 
 def test_what_moves_says_nothing():
     recording, graph = drive(DRIFT, np.zeros(60), HEADINGS)
-    found = align_headings(recording, np.zeros(recording.n_beams, np.float32), graph)
+    found = align_headings(recording, np.zeros(recording.n_beams, np.float32), graph, matched(60))
     np.testing.assert_allclose(found.poses, graph.poses, atol=1e-9)
 
 
 def test_the_graph_solved_again_has_the_same_poses():
     recording, graph = drive(DRIFT, np.zeros(60), HEADINGS)
-    found = align_headings(recording, np.ones(recording.n_beams, np.float32), graph)
+    found = align_headings(recording, np.ones(recording.n_beams, np.float32), graph, matched(60))
     again = optimize_poses(graph.poses, found.constraints, [])
     np.testing.assert_allclose(again, found.poses, atol=1e-4)
+
+
+def test_precise_scan_matching_is_hardly_corrected():
+    recording, graph = drive(DRIFT, np.zeros(60), HEADINGS)
+    e, spread = np.ones(recording.n_beams, np.float32), []
+    for std in (0.001, 0.004):
+        found = align_headings(recording, e, graph, matched(60, std))
+        off = se2.parameters(found.poses)[:, 2] - se2.parameters(graph.poses)[:, 2]
+        spread.append(off.std())
+    assert spread[0] < 0.1 * spread[1]
 
 
 def test_a_step_across_a_break_stays_as_it_was():
@@ -104,14 +119,14 @@ def test_a_step_across_a_break_stays_as_it_was():
     broken = PoseGraph(
         graph.keyframes, graph.poses, [*graph.constraints[:29], unknown, *graph.constraints[30:]]
     )
-    found = align_headings(recording, np.ones(recording.n_beams, np.float32), broken)
+    found = align_headings(recording, np.ones(recording.n_beams, np.float32), broken, matched(60))
     assert found.constraints[29] is unknown
 
 
 def test_a_short_way_is_left_as_it_is():
     recording, graph = drive(DRIFT[:8], np.zeros(8), HEADINGS[:8])
     e = np.ones(recording.n_beams, np.float32)
-    assert align_headings(recording, e, graph) is graph
+    assert align_headings(recording, e, graph, matched(8)) is graph
 
 
 def heading_error(result, truth):
@@ -129,7 +144,7 @@ def test_headings_of_an_open_route(monkeypatch):
         truth = simulation.truth.T_world_base
         with_it.append(heading_error(stillmap.build(simulation.recording), truth))
         with monkeypatch.context() as patch:
-            patch.setattr(loop_closure, "align_headings", lambda _, __, graph: graph)
+            patch.setattr(loop_closure, "align_headings", lambda _, __, graph, ___: graph)
             without.append(heading_error(stillmap.build(simulation.recording), truth))
     assert np.mean(with_it) < 0.8 * np.mean(without)
     assert np.mean(with_it) < np.radians(0.12)

@@ -27,12 +27,16 @@ _MIN_TRAVEL = 8.0  # m from which on directions are known
 _MIN_STD = np.radians(0.3)  # of a building's walls about its directions
 _CORRELATION = 4.0  # m along which walls deviate alike from the directions of the building
 _UPDATES = 2  # of directions and headings in turn; more draw walls of many directions together
-# the chain's covariance is that of windows in which loops are searched: scan matching drifts less
-# in heading; variance of a step across a break, rad2, which stays unconstrained
-_DRIFT_SHARE, _BREAK_VARIANCE = 0.2, 1.0
+# the chain's covariance is that of windows in which loops are searched, and scan matching drifts
+# less in heading: by this share of its std where the local map measures the heading of a scan to
+# so many rad, and by the square of that more or less elsewhere, at most the last one
+_DRIFT_SHARE, _MATCHING_STD, _MAX_DRIFT_SHARE = 0.2, 0.004, 0.5
+_BREAK_VARIANCE = 1.0  # rad2, from which on a step is one across a break: it stays unconstrained
 
 
-def align_headings(recording: Recording, e: NDArray[np.float32], graph: PoseGraph) -> PoseGraph:
+def align_headings(
+    recording: Recording, e: NDArray[np.float32], graph: PoseGraph, covariance: Float
+) -> PoseGraph:
     """The graph with keyframes whose headings agree with the directions of the walls.
 
     Where the walls have directions of all kinds it is hardly changed. Steps of the chain change
@@ -42,6 +46,7 @@ def align_headings(recording: Recording, e: NDArray[np.float32], graph: PoseGrap
         recording: 2D.
         e: (M,) P(static) of every beam.
         graph: optimized.
+        covariance: (T, 3, 3) of x, y, heading of the scans against the local map.
     """
     x = se2.parameters(graph.poses)
     steps = np.hypot(*np.diff(x[:, :2], axis=0).T).clip(0.0, 1.0)
@@ -50,7 +55,8 @@ def align_headings(recording: Recording, e: NDArray[np.float32], graph: PoseGrap
     metres = np.append(steps, steps[-1])
     scans = recording.iter_scans(graph.keyframes.tolist(), e)
     views = [Directions.of_scan(select_hits(recording, e, t, _NORMALS), 0.0) for t in scans]
-    constraints = [_keep_error(one, graph.poses) for one in graph.constraints]
+    shares = _drift_shares(covariance[graph.keyframes])
+    constraints = [_keep_error(one, graph.poses, shares) for one in graph.constraints]
     poses = graph.poses
     for _ in range(_UPDATES):
         before = se2.parameters(poses)[:, 2]
@@ -78,12 +84,22 @@ def _turn_step(constraint: Constraint, before: Float, after: Float) -> Constrain
     return dataclasses.replace(constraint, T=se2.normalize(constraint.T @ change))
 
 
-def _keep_error(constraint: Constraint, poses: Float) -> Constraint:
-    """The constraint as the optimized poses have it, so that nothing but headings changes them."""
+def _drift_shares(covariance: Float) -> Float:
+    """(K,) std of the heading's drift up to keyframes, as a share of that of the chain."""
+    relative = covariance[:, 2, 2] / _MATCHING_STD**2
+    return np.minimum(_DRIFT_SHARE * relative, _MAX_DRIFT_SHARE)
+
+
+def _keep_error(constraint: Constraint, poses: Float, shares: Float) -> Constraint:
+    """The constraint as the optimized poses have it, so that nothing but headings changes them.
+
+    Args:
+        shares: (K,) of the std of a step's heading, by its second keyframe.
+    """
     T = se2.inverse(poses[constraint.first]) @ poses[constraint.second]
     covariance = constraint.covariance
     if _is_step(constraint):
-        scale = np.array([1.0, 1.0, _DRIFT_SHARE])
+        scale = np.array([1.0, 1.0, shares[constraint.second]])
         covariance = scale[:, None] * covariance * scale
     return dataclasses.replace(constraint, T=T, covariance=covariance)
 

@@ -58,7 +58,7 @@ def close_loops(
     poses, found = solve_graph(context.keyframes, chain, poses, found, _MAX_CHI2)
     accepted = accepted_constraints(context.keyframes, found)
     graph = PoseGraph(context.keyframes, poses, [*chain, *accepted])
-    graph = align_headings(recording, e, graph)
+    graph = align_headings(recording, e, graph, odometry.covariance)
     return dataclasses.replace(
         odometry,
         poses=local_map.propagate_corrections(context.poses, context.keyframes, graph.poses),
