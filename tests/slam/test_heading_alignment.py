@@ -113,6 +113,13 @@ def test_precise_scan_matching_is_hardly_corrected():
     assert spread[0] < 0.1 * spread[1]
 
 
+def test_exact_scan_matching_is_kept():
+    recording, graph = drive(DRIFT, np.zeros(60), HEADINGS)
+    e = np.ones(recording.n_beams, np.float32)
+    found = align_headings(recording, e, graph, matched(60, 0.0))
+    np.testing.assert_allclose(found.poses, graph.poses, atol=1e-3)
+
+
 def test_a_step_across_a_break_stays_as_it_was():
     recording, graph = drive(DRIFT, np.zeros(60), HEADINGS)
     unknown = Constraint(29, 30, graph.constraints[29].T, np.diag([1e6, 1e6, 100.0]))

@@ -28,8 +28,8 @@ _MIN_STD = np.radians(0.3)  # of a building's walls about its directions
 _CORRELATION = 4.0  # m along which walls deviate alike from the directions of the building
 _UPDATES = 2  # of directions and headings in turn; more draw walls of many directions together
 # the chain's covariance is that of windows in which loops are searched, and scan matching drifts
-# less in heading: by this share of its std where the local map measures the heading of a scan to
-# so many rad, and by the square of that more or less elsewhere, at most the last one
+# less in heading: its std is this share of the chain's where the local map measures the heading of
+# a scan to _MATCHING_STD rad, and proportional to the variance of that measurement
 _DRIFT_SHARE, _MATCHING_STD, _MAX_DRIFT_SHARE = 0.2, 0.004, 0.5
 _BREAK_VARIANCE = 1.0  # rad2, from which on a step is one across a break: it stays unconstrained
 
@@ -69,13 +69,13 @@ def align_headings(
 
 
 def _is_step(constraint: Constraint) -> bool:
-    """Whether it is of the chain, and not across a break."""
+    """True for an odometry constraint between successive keyframes, unless across a break."""
     successive = constraint.second == constraint.first + 1
     return successive and bool(constraint.covariance[2, 2] < _BREAK_VARIANCE)
 
 
 def _turn_step(constraint: Constraint, before: Float, after: Float) -> Constraint:
-    """A step of the chain with the change of the poses: who solves the graph again finds them."""
+    """The step with the change of the poses, so that the graph solved again has these poses."""
     if not _is_step(constraint):
         return constraint
     k = [constraint.first, constraint.second]

@@ -43,7 +43,7 @@ class HeadingMeasurement(NamedTuple):
 
     Attributes:
         pose: its index.
-        heading: rad, in the map frame.
+        heading: rad, in a frame that all headings share.
         variance: rad2.
     """
 
@@ -117,8 +117,8 @@ def optimize_headings(
 ) -> Float:
     """(K, 3, 3) poses of least squares whose headings were measured, weighted by the Cauchy kernel.
 
-    Measured headings are those of a frame that may be rotated against the map: the poses are
-    rotated and moved together so that the first one stays as it is.
+    The frame of the headings may be rotated against that of the map: the solution is transformed
+    so that the first pose stays as it is.
 
     Args:
         poses: (K, 3, 3) the start.
@@ -156,7 +156,7 @@ def squared_mahalanobis(poses: Float, constraints: list[Constraint]) -> Float:
 
 def _build_problem(poses: Float, chain: list[Constraint]) -> tuple[Any, Any]:
     """GTSAM's factor graph of the chain and the initial values."""
-    import gtsam
+    import gtsam  # loading it takes long
 
     start, graph = gtsam.Values(), gtsam.NonlinearFactorGraph()
     for k, pose in enumerate(_to_gtsam(poses)):
