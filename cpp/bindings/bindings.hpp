@@ -12,6 +12,7 @@ void bind_occupancy_filter(nanobind::module_& m);
 void bind_occupancy_hmm(nanobind::module_& m);
 void bind_tsdf(nanobind::module_& m);
 void bind_mean_field(nanobind::module_& m);
+void bind_line_support(nanobind::module_& m);
 void bind_cluster_pooling(nanobind::module_& m);
 void bind_ground_contact(nanobind::module_& m);
 void bind_held_out_likelihood(nanobind::module_& m);

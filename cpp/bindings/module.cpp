@@ -18,6 +18,7 @@ NB_MODULE(_core, m) {
   stillmap::bindings::bind_occupancy_hmm(m);
   stillmap::bindings::bind_tsdf(m);
   stillmap::bindings::bind_mean_field(m);
+  stillmap::bindings::bind_line_support(m);
   stillmap::bindings::bind_cluster_pooling(m);
   stillmap::bindings::bind_ground_contact(m);
   stillmap::bindings::bind_held_out_likelihood(m);

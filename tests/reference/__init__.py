@@ -28,6 +28,7 @@ from reference.likelihood_field import (
     registration_gradient,
     smoothed_occupancy,
 )
+from reference.line_support import line_support
 from reference.mean_field import smooth_mean_field
 from reference.mesh_distance import MeshDistance
 from reference.ndt_map import (
@@ -86,6 +87,7 @@ __all__ = [
     "em_fixed_poses",
     "ends_of_surfaces",
     "interpolate_end_points",
+    "line_support",
     "linearise_sweep",
     "log_likelihood",
     "m_step_map",

@@ -16,6 +16,7 @@ from stillmap.em.estimator import (
     recount_as_static,
     touched_share,
 )
+from stillmap.em.final_labels import final_e_step
 from stillmap.em.ground import estimate_ground
 from stillmap.em.observations import time_bin_index
 from stillmap.em.occupancy_grid import (
@@ -25,7 +26,6 @@ from stillmap.em.occupancy_grid import (
     find_hits_beyond,
     make_occupancy_map,
 )
-from stillmap.em.occupancy_hmm import final_e_step
 from stillmap.em.options import EmOptions, MapState
 from stillmap.em.quality import Coverage, count_observations, score_held_out_scans
 from stillmap.em.types import (

@@ -1,9 +1,7 @@
 """E-step of the occupancy HMM: a forward filter per cell under several classes.
 
 In 3D, objects that arrived or left are dynamic as well, and neighbouring voxels are labelled
-jointly. The final E-step, at the final poses, has additional classes. Within the loop a
-view-dependent class would explain walls duplicated by pose error, and preserve that error.
-`docs/estimator.md` derives the equations.
+jointly. `docs/estimator.md` derives the equations.
 """
 
 from dataclasses import replace
@@ -18,7 +16,6 @@ from stillmap.core.parallel import map_ordered, work_beside
 from stillmap.core.recording import Recording
 from stillmap.em import spatial_coupling
 from stillmap.em.change_hmm import (
-    CellHistories,
     ChangeMixture,
     change_parameters,
     select_changed_cells,
@@ -26,7 +23,6 @@ from stillmap.em.change_hmm import (
 from stillmap.em.ground import ground_from_surfels
 from stillmap.em.mixture import fit_weights, posterior_static
 from stillmap.em.observations import (
-    HALF_TIME_RHO,
     MAX_RANGE_MARGIN,
     MIN_TRUST,
     HmmClasses,
@@ -53,15 +49,6 @@ _LONG_TAU = 12.0  # s, from which on a mover resembles a wall that two visits pu
 
 _CLASSES_3D = HmmClasses(dynamic_tau=(0.5, 3.0, 6.0, 12.0), half_time_tau=(8.0, 24.0))
 
-_CROWD_RHO, _CROWD_TAU = 0.15, 3.0  # rho and tau (s) of places crossed by many people
-_WAITING_TAU = 6.0  # s; used for change detection only, not for labels
-_FINAL_CLASSES = HmmClasses(
-    view_rho=(0.65,),
-    dynamic_rho=(0.01, 0.04, _CROWD_RHO),
-    dynamic_tau=(0.5, _CROWD_TAU, _WAITING_TAU, 12.0, 45.0),
-    half_time_tau=(8.0, 24.0),
-)
-
 
 def e_step(
     recording: Recording, poses: Float, resolution: float, options: EmOptions, threads: int = 1
@@ -77,7 +64,7 @@ def e_step(
     """
     observations = collect_observations(recording, poses, resolution, options, threads)
     return label_beams(
-        observations, None, _fit_classes(observations, None, options), recording, poses
+        observations, None, fit_classes(observations, None, options), recording, poses
     )
 
 
@@ -105,7 +92,7 @@ def e_step_3d(
     )
     surfel_map = observations.surfel_map
     assert isinstance(surfel_map, _core.SurfelMap3D)
-    with work_beside(lambda: _fit_classes(observations, None, options), threads) as fitted:
+    with work_beside(lambda: fit_classes(observations, None, options), threads) as fitted:
         mixture = ChangeMixture(observations, options)
         own_p_static, change = mixture.label_surfels()
         p_static = spatial_coupling.smooth_mean_field(own_p_static, surfel_map, threads)
@@ -128,36 +115,6 @@ def e_step_3d(
     )
 
 
-def final_e_step(
-    recording: Recording, poses: Float, resolution: float, options: EmOptions, threads: int = 1
-) -> tuple[EStepResult, CellHistories | None]:
-    """E-step at the final poses, with view-dependent and half-time classes.
-
-    Args: see `e_step`.
-
-    Returns:
-        labels; histories of the same cells, None without `change_detection`.
-    """
-    changes = change_parameters(recording) if options.change_detection else None
-    observations = collect_observations(
-        recording, poses, resolution, options, threads, _FINAL_CLASSES, changes
-    )
-    classes = _label_classes(observations)
-    fit = _fit_classes(observations, classes, options)
-    labels = label_beams(observations, classes, fit, recording, poses)
-    if changes is None:
-        return labels, None
-    return labels, ChangeMixture(observations, options).decode_histories()
-
-
-def _label_classes(observations: Observations) -> NDArray[np.bool_]:
-    """(C,) classes used for labels; without the crowd class, which explains chairs as well."""
-    crowds = (observations.rho == _CROWD_RHO) & (observations.tau == _CROWD_TAU)
-    kept = ~crowds & (observations.tau != _WAITING_TAU) & (observations.rho != HALF_TIME_RHO)
-    kept[: observations.n_static] = True
-    return np.asarray(kept)
-
-
 class ClassFit(NamedTuple):
     """Mixture of classes, fitted to all observations.
 
@@ -172,14 +129,22 @@ class ClassFit(NamedTuple):
     likelihood: Likelihood
 
 
-def _fit_classes(
-    observations: Observations, classes: NDArray[np.bool_] | None, options: EmOptions
+def fit_classes(
+    observations: Observations,
+    classes: NDArray[np.bool_] | None,
+    options: EmOptions,
+    shape_log_ratio: Float | None = None,
 ) -> ClassFit:
-    """Fits the weights of some classes; None: all."""
-    sample, _ = observations.likelihood(classes, observations.sample_rows())
+    """Fits the weights of some classes; None: all.
+
+    shape_log_ratio: (E,) nats, of the dynamic classes to the static ones; None: 0.
+    """
+    n_static, rows = observations.n_static, observations.sample_rows()
+    sample, _ = observations.likelihood(classes, rows)
+    sample = _weigh_dynamic(sample, n_static, shape_log_ratio, rows)
     long = _long_movers(observations, classes)
-    weights = fit_weights(sample, observations.n_static, options.prior, rare=long)
-    return ClassFit(weights, *_surfel_posterior(observations, classes, weights))
+    weights = fit_weights(sample, n_static, options.prior, rare=long)
+    return ClassFit(weights, *_surfel_posterior(observations, classes, weights, shape_log_ratio))
 
 
 def label_beams(
@@ -242,14 +207,27 @@ def _long_movers(
     return np.asarray(long[of])
 
 
+def _weigh_dynamic(
+    likelihood: NDArray[np.float32], n_static: int, log_ratio: Float | None, rows: Rows
+) -> NDArray[np.float32]:
+    """Likelihood (K, C) of some rows, that of the dynamic classes times exp(log_ratio)."""
+    if log_ratio is not None:
+        likelihood[:, n_static:] *= np.exp(log_ratio[slice(*rows)])[:, None].astype(np.float32)
+    return likelihood
+
+
 def _surfel_posterior(
-    observations: Observations, classes: NDArray[np.bool_] | None, weights: Float
+    observations: Observations,
+    classes: NDArray[np.bool_] | None,
+    weights: Float,
+    shape_log_ratio: Float | None,
 ) -> tuple[NDArray[np.float32], Likelihood]:
     """(E,) P(static) of each surfel, and the bound sum ln sum_c w_c L_c."""
     p_static, bound, entropy = np.empty(observations.surfel_map.size, np.float32), 0.0, 0.0
 
     def process(rows: Rows) -> tuple[float, float]:
         table, log_best = observations.likelihood(classes, rows)
+        table = _weigh_dynamic(table, observations.n_static, shape_log_ratio, rows)
         p_static[slice(*rows)] = posterior_static(table, weights, observations.n_static)
         joint = table * weights
         evidence = joint.sum(axis=1)  # sum_c w_c L_c

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.recording import Recording
+from stillmap.em.scan_segments import find_lost_beams
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -27,7 +28,8 @@ def classify_looks(recording: Recording, T_map_sensor: Float, scan: Index, xy: F
     """(Q,) the Look of scans `scan` (Q,) at places `xy` (Q, 2), metres in the map frame.
 
     The beam nearest in direction decides with those on either side of it that are less than 8 cm
-    off: most of them pass the place, or end before it.
+    off: most of them pass the place, or end before it. A beam without a return passes if more of
+    them are beside it.
 
     Args:
         recording: 2D.
@@ -41,7 +43,10 @@ def classify_looks(recording: Recording, T_map_sensor: Float, scan: Index, xy: F
         here = groups[g]
         t = int(scan[here[0]])
         R, origin = T_map_sensor[t, :2, :2], T_map_sensor[t, :2, 2]
-        out[here] = _look_at(recording.points[recording.beams_of(t)], (xy[here] - origin) @ R)
+        beams = recording.beams_of(t)
+        points, hit = recording.points[beams], recording.hit[beams]
+        lost = find_lost_beams(hit, points, np.zeros(len(hit), np.intp))
+        out[here] = _look_at(points[~lost], (xy[here] - origin) @ R)
     return out
 
 

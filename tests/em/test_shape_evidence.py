@@ -1,0 +1,157 @@
+"""Shapes tell people from walls where the history of a place does not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stillmap import _core, em
+from stillmap.em import final_labels
+from stillmap.em.scan_segments import N_SEGMENT_TYPES
+from stillmap.em.shape_evidence import _MAX_LOG_RATIO, ShapeEvidence, _fit_shapes, count_segments
+from stillmap.sim import scene_by_name, simulate
+
+RESOLUTION = 0.05
+
+
+@pytest.fixture(scope="module")
+def crowd():
+    return simulate(scene_by_name("corridor-crowd", {"robot": {"scans": 250}}), 3)
+
+
+@pytest.fixture(scope="module")
+def empty():
+    return simulate(scene_by_name("corridor-empty", {"robot": {"scans": 150}}), 3)
+
+
+def label(simulation, threads=1):
+    recording, poses = simulation.recording, simulation.truth.T_world_base
+    return em.final_e_step(recording, poses, RESOLUTION, em.EmOptions(), threads)[0]
+
+
+@pytest.fixture(scope="module")
+def found(crowd):
+    return label(crowd)
+
+
+def log_loss(p, static):
+    p = np.clip(p.astype(float), 1e-4, 1.0 - 1e-4)
+    return -float(np.mean(np.log(np.where(static, p, 1.0 - p))))
+
+
+def test_labels_are_better_than_by_history_alone(crowd, found):
+    hit, static = crowd.recording.hit, crowd.truth.static[crowd.recording.hit]
+    with_shapes, by_history = found.p_static[hit], found.p_by_history[hit]
+    assert log_loss(with_shapes, static) < 0.7 * log_loss(by_history, static)
+    wrong = [np.mean((p >= 0.5) != static) for p in (with_shapes, by_history)]
+    assert wrong[0] < wrong[1]
+
+
+def test_people_seen_for_a_moment_are_no_obstacles(crowd, found):
+    """Places without a history that tells, where people were."""
+    hit = crowd.recording.hit
+    unsure = hit & (found.p_by_history > 0.3) & (found.p_by_history < 0.7)
+    people = unsure & ~crowd.truth.static
+    assert people.sum() > 50
+    assert np.mean(found.p_static[people] >= 0.5) < 0.5 * np.mean(found.p_by_history[people] >= 0.5)
+
+
+def test_where_nobody_is_nothing_changes(empty):
+    last = label(empty)
+    hit = empty.recording.hit
+    assert np.mean(last.p_static[hit] < 0.5) <= np.mean(last.p_by_history[hit] < 0.5) + 1e-3
+    np.testing.assert_allclose(last.p_static[hit], last.p_by_history[hit], atol=0.2)
+
+
+def test_threads_change_nothing(crowd, found):
+    assert label(crowd, threads=3).p_static.tobytes() == found.p_static.tobytes()
+
+
+def test_without_changes_there_are_no_labels_by_history(crowd):
+    recording, poses = crowd.recording, crowd.truth.T_world_base
+    options = replace(em.EmOptions(), change_detection=False)
+    last, histories = em.final_e_step(recording, poses, 0.2, options)
+    assert histories is None
+    assert last.p_by_history is None
+
+
+def test_shares_of_segments(crowd):
+    recording, poses = crowd.recording, crowd.truth.T_world_base
+    surfels = em.observations.build_surfel_map(recording, poses, RESOLUTION)
+    shares = count_segments(surfels, recording, poses)
+    assert shares.shape == (surfels.size, N_SEGMENT_TYPES)
+    np.testing.assert_allclose(shares.sum(axis=1), 1.0, atol=1e-5)
+
+
+def made_up(n=4000, seed=0):
+    """Histories of static and dynamic surfels, half of which say nothing, and one type of each."""
+    rng = np.random.default_rng(seed)
+    static = rng.random(n) < 0.7
+    history = np.where(static, 6.0, -6.0) * (rng.random(n) < 0.5)
+    is_narrow = rng.random(n) < np.where(static, 0.1, 0.8)
+    segments = np.zeros((n, N_SEGMENT_TYPES), np.float32)
+    segments[np.arange(n), np.where(is_narrow, 0, 20)] = 1.0
+    return static, history, is_narrow, segments
+
+
+def test_frequencies_are_learned_from_histories_that_tell():
+    static, history, is_narrow, segments = made_up()
+    log_ratio = _fit_shapes(history, segments, np.zeros(len(static), np.intp), 0.7)
+    # tempered by one half, and by those whose labels follow from the tempered ones
+    for some, expected in ((is_narrow, np.log(0.8 / 0.1)), (~is_narrow, np.log(0.2 / 0.9))):
+        share = log_ratio[some] / expected
+        assert 0.25 < share.min() <= share.max() < 0.55
+
+
+def test_without_a_history_that_tells_shapes_say_nothing():
+    static, _, _, segments = made_up()
+    support = np.zeros(len(static), np.intp)
+    log_ratio = _fit_shapes(np.zeros(len(static)), segments, support, 0.7)
+    np.testing.assert_allclose(log_ratio, 0.0, atol=1e-9)
+
+
+def test_shapes_never_decide_alone():
+    static, history, _, segments = made_up()
+    # everything static has one type, everything dynamic another one
+    segments[:] = 0.0
+    segments[np.arange(len(static)), np.where(static, 3, 7)] = 1.0
+    log_ratio = _fit_shapes(history, segments, np.zeros(len(static), np.intp), 0.7)
+    assert np.abs(log_ratio).max() <= _MAX_LOG_RATIO
+    assert (log_ratio > 0.0).tolist() == (~static).tolist()
+
+
+def test_few_surfels_say_little():
+    _, history, _, segments = made_up(6)
+    log_ratio = _fit_shapes(history, segments, np.zeros(6, np.intp), 0.7)
+    assert np.abs(log_ratio).max() < 0.3
+
+
+def test_the_shape_of_a_wall_does_not_outweigh_misses(crowd):
+    """A door that was seen to open has the shape of a wall."""
+    recording, poses = crowd.recording, crowd.truth.T_world_base
+    observations = em.observations.collect_observations(
+        recording, poses, RESOLUTION, em.EmOptions(), 1, final_labels._CLASSES
+    )
+    surfels = observations.surfel_map
+    shapes = ShapeEvidence(surfels, recording, poses)
+    classes = final_labels._label_classes(observations)
+    fit = final_labels.fit_classes(observations, classes, em.EmOptions())
+    prior = float(fit.weights[: observations.n_static].sum())
+    shapes.fit(fit.p_static, prior)
+    history = np.log(np.maximum(fit.p_static, 1e-6) / np.maximum(1.0 - fit.p_static, 1e-6))
+    history -= np.log(prior / (1.0 - prior))
+    missed = history < -4.0
+    assert missed.sum() > 100
+    assert shapes.log_ratio[missed].min() > -_MAX_LOG_RATIO * np.exp(-4.0)
+    assert shapes.log_ratio.min() < -0.5
+
+
+def test_no_surfels():
+    surfels = _core.SurfelMap2D(RESOLUTION)
+    surfels.fit()
+    recording = simulate(scene_by_name("corridor-empty", {"robot": {"scans": 2}}), 0).recording
+    nothing = replace(recording, hit=np.zeros_like(recording.hit))
+    shapes = ShapeEvidence(surfels, nothing, np.tile(np.eye(3), (2, 1, 1)))
+    shapes.fit(np.zeros(0, np.float32), 0.9)
+    shapes.fit(np.zeros(0, np.float32), 0.9)
+    assert shapes.log_ratio.shape == (0,)
