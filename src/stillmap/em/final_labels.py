@@ -20,7 +20,7 @@ from stillmap.em.observations import (
 )
 from stillmap.em.occupancy_hmm import ClassFit, fit_classes, label_beams
 from stillmap.em.options import EmOptions
-from stillmap.em.shape_evidence import ShapeEvidence
+from stillmap.em.shape_evidence import ShapeEvidence, limit_raise
 from stillmap.em.types import EStepResult, Float
 
 _CROWD_RHO, _CROWD_TAU = 0.15, 3.0  # rho and tau (s) of places crossed by many people
@@ -35,12 +35,19 @@ _SHAPE_ROUNDS = 3  # shapes are learned from labels, which follow from the shape
 
 
 def final_e_step(
-    recording: Recording, poses: Float, resolution: float, options: EmOptions, threads: int = 1
+    recording: Recording,
+    poses: Float,
+    resolution: float,
+    options: EmOptions,
+    threads: int = 1,
+    *,
+    with_shapes: bool = True,
 ) -> tuple[EStepResult, CellHistories | None]:
     """P(c = 1) of every beam at the final poses, and what happened in every cell.
 
     Args:
         recording, poses, resolution, options, threads: see `occupancy_hmm.e_step`.
+        with_shapes: in 2D.
 
     Returns:
         labels; histories of the same cells, None without `change_detection`.
@@ -51,9 +58,8 @@ def final_e_step(
     )
     classes = _label_classes(observations)
     fit, by_history = fit_classes(observations, classes, options), None
-    if isinstance(observations.surfel_map, _core.SurfelMap2D):
-        if changes is not None:
-            by_history = label_beams(observations, classes, fit, recording, poses).p_static
+    if with_shapes and isinstance(observations.surfel_map, _core.SurfelMap2D):
+        by_history = label_beams(observations, classes, fit, recording, poses).p_static
         shapes = ShapeEvidence(observations.surfel_map, recording, poses, threads)
         fit = _fit_with_shapes(observations, classes, options, fit, shapes)
     labels = label_beams(observations, classes, fit, recording, poses)
@@ -75,11 +81,13 @@ def _fit_with_shapes(
     observations: Observations,
     classes: NDArray[np.bool_],
     options: EmOptions,
-    fit: ClassFit,
+    by_history: ClassFit,
     shapes: ShapeEvidence,
 ) -> ClassFit:
     """Weights of the classes and frequencies of the shapes, fitted by turns."""
+    fit = by_history
     for _ in range(_SHAPE_ROUNDS):
-        shapes.fit(fit.p_static, float(fit.weights[: observations.n_static].sum()))
-        fit = fit_classes(observations, classes, options, shapes.log_ratio)
-    return fit
+        shapes.fit(fit.p_static, fit.p_view_dependent)
+        fit = fit_classes(observations, classes, options, shapes.factors)
+    prior = float(by_history.weights[: observations.n_static].sum())
+    return fit._replace(p_static=limit_raise(fit.p_static, by_history.p_static, prior))

@@ -55,7 +55,7 @@ def count_expected(
     hits = recording.hit & np.isfinite(recording.points).all(axis=1)
     q, cell = np.ones(int(hits.sum())), _CELL[recording.dimension]
     for poses in candidates:
-        judged, _ = final_e_step(recording, poses, cell, _OPTIONS, threads)
+        judged, _ = final_e_step(recording, poses, cell, _OPTIONS, threads, with_shapes=False)
         q = np.minimum(q, 1.0 - judged.p_static[hits].astype(np.float64))
     dynamic = p_static[hits] < DYNAMIC_BELOW
     sums = (float(q[dynamic].sum()), float(q.sum()), float(dynamic.sum()))

@@ -7,7 +7,7 @@ from stillmap.em.types import Float
 
 MAX_FIT_ROWS = 100_000  # maximum number of rows used in the fit; more make no relevant difference
 _PSEUDO_COUNT = 1.0  # per class, so that none becomes impossible
-MAX_STATIC_WEIGHT = 0.998  # upper bound: no recording proves that nothing moves
+_MAX_STATIC_WEIGHT = 0.998  # upper bound: no recording proves that nothing moves
 
 
 def fit_weights(
@@ -54,7 +54,7 @@ def _normalize(counts: Float, n_static: int, initial_static: float) -> Float:
     static, dynamic = counts[:n_static] + _PSEUDO_COUNT, counts[n_static:] + _PSEUDO_COUNT
     total = counts.sum()
     weight = counts[:n_static].sum() / total if total > 0.0 else initial_static
-    weight = float(np.clip(weight, 1.0 - MAX_STATIC_WEIGHT, MAX_STATIC_WEIGHT))
+    weight = float(np.clip(weight, 1.0 - _MAX_STATIC_WEIGHT, _MAX_STATIC_WEIGHT))
     return np.concatenate(
         [weight * static / static.sum(), (1.0 - weight) * dynamic / dynamic.sum()]
     )

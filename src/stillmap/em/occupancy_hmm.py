@@ -21,7 +21,7 @@ from stillmap.em.change_hmm import (
     select_changed_cells,
 )
 from stillmap.em.ground import ground_from_surfels
-from stillmap.em.mixture import fit_weights, posterior_static
+from stillmap.em.mixture import fit_weights, posterior, posterior_static
 from stillmap.em.observations import (
     MAX_RANGE_MARGIN,
     MIN_TRUST,
@@ -120,12 +120,14 @@ class ClassFit(NamedTuple):
 
     Attributes:
         weights: (C,) of the classes.
-        p_static: (E,) posterior of each surfel.
+        p_static: (E,) posterior of the static classes for each surfel.
+        p_view_dependent: (E,) of those among them that are view-dependent.
         likelihood: of the observations.
     """
 
     weights: Float
     p_static: NDArray[np.float32]
+    p_view_dependent: NDArray[np.float32]
     likelihood: Likelihood
 
 
@@ -133,18 +135,16 @@ def fit_classes(
     observations: Observations,
     classes: NDArray[np.bool_] | None,
     options: EmOptions,
-    shape_log_ratio: Float | None = None,
+    shapes: NDArray[np.float32] | None = None,
 ) -> ClassFit:
     """Fits the weights of some classes; None: all.
 
-    shape_log_ratio: (E,) nats, of the dynamic classes to the static ones; None: 0.
+    shapes: (E, 2) factors of the likelihood of view-dependent and of dynamic classes; None: 1.
     """
-    n_static, rows = observations.n_static, observations.sample_rows()
-    sample, _ = observations.likelihood(classes, rows)
-    sample = _weigh_dynamic(sample, n_static, shape_log_ratio, rows)
+    sample, _ = _likelihood_with_shapes(observations, classes, observations.sample_rows(), shapes)
     long = _long_movers(observations, classes)
-    weights = fit_weights(sample, n_static, options.prior, rare=long)
-    return ClassFit(weights, *_surfel_posterior(observations, classes, weights, shape_log_ratio))
+    weights = fit_weights(sample, observations.n_static, options.prior, rare=long)
+    return ClassFit(weights, *_surfel_posterior(observations, classes, weights, shapes))
 
 
 def label_beams(
@@ -207,28 +207,48 @@ def _long_movers(
     return np.asarray(long[of])
 
 
-def _weigh_dynamic(
-    likelihood: NDArray[np.float32], n_static: int, log_ratio: Float | None, rows: Rows
-) -> NDArray[np.float32]:
-    """Likelihood (K, C) of some rows, that of the dynamic classes times exp(log_ratio)."""
-    if log_ratio is not None:
-        likelihood[:, n_static:] *= np.exp(log_ratio[slice(*rows)])[:, None].astype(np.float32)
-    return likelihood
+def _likelihood_with_shapes(
+    observations: Observations,
+    classes: NDArray[np.bool_] | None,
+    rows: Rows,
+    shapes: NDArray[np.float32] | None,
+) -> tuple[NDArray[np.float32], Float]:
+    """Likelihood (K, C) of some surfels, times the factors of their shapes (E, 2).
+
+    Relative to the best class without them, whose logarithm (K,) comes second.
+    """
+    table, log_best = observations.likelihood(classes, rows)
+    if shapes is not None:
+        of_rows = shapes[slice(*rows)]
+        table[:, _view_dependent(observations, classes)] *= of_rows[:, :1]
+        table[:, observations.n_static :] *= of_rows[:, 1:]
+    return table, log_best
+
+
+def _view_dependent(
+    observations: Observations, classes: NDArray[np.bool_] | None
+) -> NDArray[np.bool_]:
+    """Select those of the used classes that are view-dependent."""
+    of = slice(None) if classes is None else classes
+    return np.asarray(np.isfinite(observations.view_angle[of]))
 
 
 def _surfel_posterior(
     observations: Observations,
     classes: NDArray[np.bool_] | None,
     weights: Float,
-    shape_log_ratio: Float | None,
-) -> tuple[NDArray[np.float32], Likelihood]:
-    """(E,) P(static) of each surfel, and the bound sum ln sum_c w_c L_c."""
-    p_static, bound, entropy = np.empty(observations.surfel_map.size, np.float32), 0.0, 0.0
+    shapes: NDArray[np.float32] | None,
+) -> tuple[NDArray[np.float32], NDArray[np.float32], Likelihood]:
+    """(E,) P(static) and P(view-dependent) of each surfel, and the bound sum ln sum_c w_c L_c."""
+    p_static, p_view = np.zeros((2, observations.surfel_map.size), np.float32)
+    bound, entropy = 0.0, 0.0
+    view = _view_dependent(observations, classes)
 
     def process(rows: Rows) -> tuple[float, float]:
-        table, log_best = observations.likelihood(classes, rows)
-        table = _weigh_dynamic(table, observations.n_static, shape_log_ratio, rows)
+        table, log_best = _likelihood_with_shapes(observations, classes, rows, shapes)
         p_static[slice(*rows)] = posterior_static(table, weights, observations.n_static)
+        if view.any():
+            p_view[slice(*rows)] = posterior(table, weights, view)
         joint = table * weights
         evidence = joint.sum(axis=1)  # sum_c w_c L_c
         r = joint / evidence[:, None]  # responsibilities of the classes
@@ -239,7 +259,7 @@ def _surfel_posterior(
     for evidence_of_rows, entropy_of_rows in blocks:
         bound += evidence_of_rows
         entropy += entropy_of_rows
-    return p_static, Likelihood(expected=bound - entropy, bound=bound)
+    return p_static, p_view, Likelihood(expected=bound - entropy, bound=bound)
 
 
 def _parameter_record(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 import stillmap._core as _core
 from stillmap.core.chunks import iter_beams
 from stillmap.core.recording import Recording
-from stillmap.em.mixture import MAX_FIT_ROWS, MAX_STATIC_WEIGHT
+from stillmap.em.mixture import MAX_FIT_ROWS
 from stillmap.em.scan_segments import N_SEGMENT_TYPES, classify_segments
 from stillmap.em.types import MIN_PROBABILITY, Float
 
@@ -30,7 +30,7 @@ _MAX_ITERATIONS, _TOLERANCE = 60, 1e-3  # of EM; nats, largest change of a log r
 
 
 class ShapeEvidence:
-    """Shapes of E surfels, and what they say, which `fit` learns.
+    """Shapes of E surfels, and their frequencies, which `fit` learns.
 
     Args:
         surfel_map: E surfels.
@@ -39,7 +39,8 @@ class ShapeEvidence:
         threads: does not change the result.
 
     Attributes:
-        log_ratio: (E,) nats, ln P(shape | dynamic) / P(shape | static), tempered; 0 before `fit`.
+        factors: (E, 2) P(shape | group) / P(shape | static), tempered, of the groups of
+            view-dependent and of dynamic surfels; 1 before `fit`.
     """
 
     def __init__(
@@ -52,23 +53,42 @@ class ShapeEvidence:
         self._surfel_map, self._threads = surfel_map, threads
         self._segments = count_segments(surfel_map, recording, poses, threads)
         self._support: NDArray[np.intp] | None = None
-        self.log_ratio = np.zeros(surfel_map.size)
+        self.factors = np.ones((surfel_map.size, 2), np.float32)
 
-    def fit(self, p_static: NDArray[np.float32], prior: float) -> None:
-        """Learns from P(static) (E,) by history and shape, of which `prior` is the prior.
+    def fit(self, p_static: NDArray[np.float32], p_view_dependent: NDArray[np.float32]) -> None:
+        """Learns from P(static) and P(view-dependent) (E,) by history and the factors before.
 
         Lines of static surface count from the second time on: the first labels lack all shapes.
         """
-        p = np.clip(p_static.astype(np.float64), MIN_PROBABILITY, 1.0 - MIN_PROBABILITY)
-        history = _logit(p) - _logit(np.float64(prior)) + self.log_ratio
+        p = np.stack([p_static - p_view_dependent, p_view_dependent, 1.0 - p_static], axis=1)
+        history = np.maximum(p.astype(np.float64), MIN_PROBABILITY)
+        history[:, 1:] /= self.factors
         if self._support is None:
             self._support = np.zeros(len(p), np.intp)
         else:
-            self._support = _classify_support(self._surfel_map, p, self._threads)
-        log_ratio = _fit_shapes(history, self._segments, self._support, prior)
-        # leaves of doors have the shape of walls, so shape does not outweigh a history of misses
-        fade = np.where(log_ratio < 0.0, np.exp(np.minimum(history, 0.0)), 1.0)
-        self.log_ratio = fade * log_ratio
+            self._support = _classify_support(self._surfel_map, p_static, self._threads)
+        log_ratio = _fit_shapes(history, self._segments, self._support)
+        self.factors = np.exp(log_ratio[:, 1:]).astype(np.float32)
+
+
+def limit_raise(
+    p_static: NDArray[np.float32], by_history: NDArray[np.float32], prior: float
+) -> NDArray[np.float32]:
+    """(E,) P(static), raised less by shapes where the history speaks against it.
+
+    Leaves of doors have the shape of walls. Where the likelihood ratio h of the history, of static
+    to dynamic, is below 1, shapes raise the log odds by h^2 of what they would.
+
+    Args:
+        p_static: (E,) given history and shape.
+        by_history: (E,) given the history alone.
+        prior: weight of the static classes in it.
+    """
+    before, after = (_logit(_clip(p)) for p in (by_history, p_static))
+    log_ratio = before - _logit(np.float64(prior))  # ln h
+    share = np.exp(2.0 * np.minimum(log_ratio, 0.0))
+    limited = _sigmoid(before + share * (after - before)).astype(np.float32)
+    return np.where(p_static > by_history, limited, p_static)
 
 
 def count_segments(
@@ -86,14 +106,14 @@ def count_segments(
 
 
 def _classify_support(
-    surfel_map: _core.SurfelMap2D, p_static: Float, threads: int
+    surfel_map: _core.SurfelMap2D, p_static: NDArray[np.float32], threads: int
 ) -> NDArray[np.intp]:
     """(E,) class of the length of static surface on the best line through each surfel."""
     cell = surfel_map.resolution
     radius = min(max(_RADIUS / cell, 1.0), _MAX_RADIUS)
     support = _core.line_support(
         surfel_map,
-        p_static.astype(np.float32),
+        np.clip(p_static, np.float32(0.0), np.float32(1.0)),
         radius=radius,
         gap=min(_GAP / cell, radius),
         half_width=min(max(_HALF_WIDTH / cell, 0.75), radius),
@@ -103,12 +123,19 @@ def _classify_support(
 
 
 def _fit_shapes(
-    history: Float, segments: NDArray[np.float32], support: NDArray[np.intp], prior: float
+    history: Float,
+    segments: NDArray[np.float32],
+    support: NDArray[np.intp],
 ) -> Float:
-    """(E,) ln P(shape | dynamic) / P(shape | static).
+    """(E, G) tempered ln P(shape | group) / P(shape | first group) of G groups of surfels.
 
-    EM over the frequencies of shapes, pairs of a class of support and a type of segment, among
-    static and among dynamic surfels. The types of one surfel count as one, by their shares.
+    EM over the frequencies of shapes, pairs of a class of support and a type of segment, in each
+    group. The types of one surfel count as one, by their shares.
+
+    Args:
+        history: (E, G) weight times likelihood of each group, up to a factor of the surfel.
+        segments: (E, N_SEGMENT_TYPES) shares.
+        support: (E,) class of support.
     """
     step = max(-(-len(history) // MAX_FIT_ROWS), 1)
     sample = [
@@ -117,41 +144,39 @@ def _fit_shapes(
     ]
     everything = np.array([shares.sum(axis=0, dtype=np.float64) for _, shares in sample])
     pseudo = _PSEUDO_COUNT * everything / max(everything.sum(), 1.0)
-    log_frequency = np.zeros_like(everything)  # ratio of dynamic to static
-    share = prior
+    G = history.shape[1]
+    log_ratio = np.zeros((G, *everything.shape))  # of frequencies to those in the first group
     for _ in range(_MAX_ITERATIONS):
-        static, total, n = np.zeros_like(everything), 0.0, 0
-        for b, (ratio, shares) in enumerate(sample):
-            p = _sigmoid(ratio + _logit(np.float64(share)) - _log_ratio(shares, log_frequency[b]))
-            static[b] = np.einsum("e,ek->k", p, shares)
-            total, n = total + float(p.sum()), n + len(p)
-        share = float(np.clip(total / max(n, 1), 1.0 - MAX_STATIC_WEIGHT, MAX_STATIC_WEIGHT))
-        last, log_frequency = log_frequency, _compare(everything - static, static, pseudo)
-        if np.abs(log_frequency - last).max() < _TOLERANCE:
+        counts = np.empty_like(log_ratio)
+        for b, (weights, shares) in enumerate(sample):
+            joint = weights * np.exp(_temper(shares, log_ratio[:, b]))
+            counts[:, b] = np.einsum("eg,ek->gk", joint / joint.sum(axis=1, keepdims=True), shares)
+        last, log_ratio = log_ratio, _compare(counts, pseudo)
+        if np.abs(log_ratio - last).max() < _TOLERANCE:
             break
-    out = np.empty(len(history))
+    out = np.empty_like(history)
     for b in range(len(_SUPPORT) + 1):
-        of = support == b
-        out[of] = _log_ratio(segments[of], log_frequency[b])
+        out[support == b] = _temper(segments[support == b], log_ratio[:, b])
     return out
 
 
-def _compare(dynamic: Float, static: Float, pseudo: Float) -> Float:
-    """Logarithm of the ratio of the frequencies of all shapes; 0 for those that never occur."""
-    dynamic, static = np.maximum(dynamic, 0.0) + pseudo, static + pseudo
-    ratio = np.divide(
-        dynamic * static.sum(),
-        static * max(dynamic.sum(), MIN_PROBABILITY),
-        out=np.ones_like(static),
-        where=pseudo > 0.0,
-    )
+def _compare(counts: Float, pseudo: Float) -> Float:
+    """Logarithm of the frequencies (G, ...) relative to the first; 0 of shapes that never occur."""
+    frequency = counts + pseudo
+    frequency /= np.maximum(frequency.sum(axis=(1, 2), keepdims=True), MIN_PROBABILITY)
+    ratio = np.ones_like(frequency)
+    np.divide(frequency, frequency[:1], out=ratio, where=pseudo > 0.0)
     return np.asarray(np.log(ratio))
 
 
-def _log_ratio(shares: NDArray[np.float32], log_frequency: Float) -> Float:
-    """(K,) tempered, within bounds."""
-    log_ratio = _TEMPER * np.einsum("ek,k->e", shares, log_frequency)
-    return np.asarray(np.clip(log_ratio, -_MAX_LOG_RATIO, _MAX_LOG_RATIO))
+def _temper(shares: NDArray[np.float32], log_ratio: Float) -> Float:
+    """(K, G) mean log ratio by the shares (K, N), tempered, within bounds."""
+    out = _TEMPER * np.einsum("ek,gk->eg", shares, log_ratio)
+    return np.asarray(np.clip(out, -_MAX_LOG_RATIO, _MAX_LOG_RATIO))
+
+
+def _clip(p: NDArray[np.float32]) -> Float:
+    return np.clip(p.astype(np.float64), MIN_PROBABILITY, 1.0 - MIN_PROBABILITY)
 
 
 def _logit(p: Float | np.float64) -> Float:
