@@ -1,5 +1,7 @@
 """What a scan says about places: hidden, reached, passed."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -72,3 +74,17 @@ def test_each_place_is_looked_up_in_its_own_scan():
     places = np.array([(2.0, 0.0), (2.0, 0.0), (4.0, 0.0)])
     found = classify_looks(recording, np.tile(np.eye(3), (2, 1, 1)), scan, places)
     assert found.tolist() == [Look.PASSED, Look.HIDDEN, Look.REACHED]
+
+
+@pytest.mark.parametrize(("lost", "look"), [(1, Look.HIDDEN), (2, Look.HIDDEN), (3, Look.PASSED)])
+def test_three_beams_without_a_return_pass_fewer_may_have_been_lost(lost, look):
+    # half a degree apart, before a wall of 2 m: the place 2.5 m away is hidden where beams return
+    angles = np.radians(np.arange(-90.0, 90.5, 0.5))
+    recording = scans_of([np.full(len(angles), 2.0)], angles)
+    points, hit = recording.points.copy(), recording.hit.copy()
+    some = np.arange(180 - lost // 2, 180 - lost // 2 + lost)
+    points[some] *= 15.0
+    hit[some] = False
+    lossy = dataclasses.replace(recording, points=points, hit=hit)
+    place = np.array([[10.0, 0.0]])
+    assert classify_looks(lossy, np.eye(3)[None], np.zeros(1, np.intp), place) == [look]
