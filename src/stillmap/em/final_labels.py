@@ -4,8 +4,6 @@ Within the loop a view-dependent class would explain walls duplicated by pose er
 that error. `docs/estimator/map.md` and `docs/estimator/shapes.md` have the equations.
 """
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,7 +18,7 @@ from stillmap.em.observations import (
 )
 from stillmap.em.occupancy_hmm import ClassFit, fit_classes, label_beams
 from stillmap.em.options import EmOptions
-from stillmap.em.shape_evidence import ShapeEvidence, limit_raise
+from stillmap.em.shape_evidence import ShapeEvidence
 from stillmap.em.types import EStepResult, Float
 
 _CROWD_RHO, _CROWD_TAU = 0.15, 3.0  # rho and tau (s) of places crossed by many people
@@ -57,15 +55,13 @@ def final_e_step(
         recording, poses, resolution, options, threads, _CLASSES, changes
     )
     classes = _label_classes(observations)
-    fit, by_history = fit_classes(observations, classes, options), None
+    fit = fit_classes(observations, classes, options)
     if with_shapes and isinstance(observations.surfel_map, _core.SurfelMap2D):
-        by_history = label_beams(observations, classes, fit, recording, poses).p_static
         shapes = ShapeEvidence(observations.surfel_map, recording, poses, threads)
         fit = _fit_with_shapes(observations, classes, options, fit, shapes)
     labels = label_beams(observations, classes, fit, recording, poses)
     if changes is None:
         return labels, None
-    labels = replace(labels, p_by_history=by_history)
     return labels, ChangeMixture(observations, options).decode_histories()
 
 
@@ -81,13 +77,11 @@ def _fit_with_shapes(
     observations: Observations,
     classes: NDArray[np.bool_],
     options: EmOptions,
-    by_history: ClassFit,
+    fit: ClassFit,
     shapes: ShapeEvidence,
 ) -> ClassFit:
     """Weights of the classes and frequencies of the shapes, fitted by turns."""
-    fit = by_history
     for _ in range(_SHAPE_ROUNDS):
         shapes.fit(fit.p_static, fit.p_view_dependent)
         fit = fit_classes(observations, classes, options, shapes.factors)
-    prior = float(by_history.weights[: observations.n_static].sum())
-    return fit._replace(p_static=limit_raise(fit.p_static, by_history.p_static, prior))
+    return fit

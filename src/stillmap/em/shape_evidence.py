@@ -24,7 +24,8 @@ _SUPPORT = np.array([0.025, 0.1, 0.2, 0.35, 0.5, 0.7, 0.9])  # m of static surfa
 
 # exponent of the likelihood ratio: neighbouring surfels see the same thing, and so do both features
 _TEMPER = 0.5
-_MAX_LOG_RATIO = float(np.log(30.0))  # shape alone decides nothing that the history denies
+# nats of dynamic to static: leaves of doors have the shape of walls, so it hardly says static
+_MIN_LOG_RATIO, _MAX_LOG_RATIO = -0.4, 3.4
 _PSEUDO_COUNT = 20.0  # surfels, distributed as all surfels are
 _MAX_ITERATIONS, _TOLERANCE = 60, 1e-3  # of EM; nats, largest change of a log ratio
 
@@ -69,26 +70,6 @@ class ShapeEvidence:
             self._support = _classify_support(self._surfel_map, p_static, self._threads)
         log_ratio = _fit_shapes(history, self._segments, self._support)
         self.factors = np.exp(log_ratio[:, 1:]).astype(np.float32)
-
-
-def limit_raise(
-    p_static: NDArray[np.float32], by_history: NDArray[np.float32], prior: float
-) -> NDArray[np.float32]:
-    """(E,) P(static), raised less by shapes where the history speaks against it.
-
-    Leaves of doors have the shape of walls. Where the likelihood ratio h of the history, of static
-    to dynamic, is below 1, shapes raise the log odds by h^2 of what they would.
-
-    Args:
-        p_static: (E,) given history and shape.
-        by_history: (E,) given the history alone.
-        prior: weight of the static classes in it.
-    """
-    before, after = (_logit(_clip(p)) for p in (by_history, p_static))
-    log_ratio = before - _logit(np.float64(prior))  # ln h
-    share = np.exp(2.0 * np.minimum(log_ratio, 0.0))
-    limited = _sigmoid(before + share * (after - before)).astype(np.float32)
-    return np.where(p_static > by_history, limited, p_static)
 
 
 def count_segments(
@@ -172,16 +153,4 @@ def _compare(counts: Float, pseudo: Float) -> Float:
 def _temper(shares: NDArray[np.float32], log_ratio: Float) -> Float:
     """(K, G) mean log ratio by the shares (K, N), tempered, within bounds."""
     out = _TEMPER * np.einsum("ek,gk->eg", shares, log_ratio)
-    return np.asarray(np.clip(out, -_MAX_LOG_RATIO, _MAX_LOG_RATIO))
-
-
-def _clip(p: NDArray[np.float32]) -> Float:
-    return np.clip(p.astype(np.float64), MIN_PROBABILITY, 1.0 - MIN_PROBABILITY)
-
-
-def _logit(p: Float | np.float64) -> Float:
-    return np.asarray(np.log(p / (1.0 - p)))
-
-
-def _sigmoid(log_odds: Float) -> Float:
-    return np.asarray(1.0 / (1.0 + np.exp(-log_odds)))
+    return np.asarray(np.clip(out, _MIN_LOG_RATIO, _MAX_LOG_RATIO))

@@ -125,7 +125,6 @@ class EStepResult(ShortRepr):
         no_return: free space shown by beams without a return; None: they count at full length.
         changed_cells: cells of objects that arrived or left, in 3D with `change_detection_3d`.
         ground: height of the ground, in 3D where the estimator needs it.
-        p_by_history: (M,) float32, `p_static` without shapes; None but for the final one in 2D.
     """
 
     p_static: NDArray[np.float32]
@@ -135,7 +134,6 @@ class EStepResult(ShortRepr):
     no_return: NoReturnModel | None = None
     changed_cells: ChangedCells | None = None
     ground: GroundMap | None = None
-    p_by_history: NDArray[np.float32] | None = None
 
     @property
     def known_cells(self) -> CellProbabilities:

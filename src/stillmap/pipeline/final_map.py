@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap import em, slam
-from stillmap.core import arrays
 from stillmap.core.heap import trim_heap
 from stillmap.core.parallel import resolve_threads
 from stillmap.core.profiling import Progress, StageTimer
@@ -83,12 +82,7 @@ def final_estimate(
         found.p_static[reflected] = np.where(
             recording.hit[reflected], P_REFLECTED, options.em.prior
         )
-    best = best.with_labels(
-        p_static=found.p_static,
-        occupied=found.occupied,
-        learned=found.learned,
-        p_by_history=found.p_by_history,
-    )
+    best = best.with_labels(p_static=found.p_static, occupied=found.occupied, learned=found.learned)
     if courses is None:
         return deskewed, best, [], []
     best, movers = _add_motion_evidence(deskewed, best, courses, threads)
@@ -111,18 +105,8 @@ def _find_doors(
 ) -> list[Change]:
     """Doors, from what changed and from dynamic hits, beside what is there most of the time."""
     changes = detect_changes(courses, deskewed, cell, look)
-    lines = find_leaf_lines(deskewed, best.poses, _labels_of_leaves(best), cell)
+    lines = find_leaf_lines(deskewed, best.poses, best.p_static, cell)
     return find_doors(changes, lines, surface, deskewed, best.poses, cell)
-
-
-def _labels_of_leaves(best: Estimate) -> NDArray[np.float32]:
-    """(M,) P(c = 1) by which leaves of doors are looked for: their shape is that of walls."""
-    p_static, by_history = best.p_static, best.e_step.p_by_history
-    if by_history is None:
-        return p_static
-    for block in arrays.iter_blocks(p_static, by_history):
-        by_history[block] = np.fmin(p_static[block], by_history[block])
-    return by_history
 
 
 def _relabel(
@@ -144,9 +128,7 @@ def _relabel(
         deskewed, best.poses, p_static, occupied, courses, lone_doors, state, threads
     )
     learned = {**best.e_step.learned, "changing": round(courses.changing_weight, 6)}
-    return best.with_labels(
-        p_static=p_static, occupied=occupied, learned=learned, p_by_history=None
-    )
+    return best.with_labels(p_static=p_static, occupied=occupied, learned=learned)
 
 
 def _add_motion_evidence(
