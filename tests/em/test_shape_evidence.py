@@ -9,7 +9,6 @@ from stillmap import _core, em
 from stillmap.em.scan_segments import N_SEGMENT_TYPES
 from stillmap.em.shape_evidence import (
     _MAX_LOG_RATIO,
-    _MIN_LOG_RATIO,
     ShapeEvidence,
     _fit_shapes,
     count_segments,
@@ -54,9 +53,16 @@ def log_loss(p, static):
 
 def test_labels_are_better_than_by_history_alone(crowd, found, by_history):
     hit, static = crowd.recording.hit, crowd.truth.static[crowd.recording.hit]
-    assert log_loss(found[hit], static) < 0.85 * log_loss(by_history[hit], static)
+    assert log_loss(found[hit], static) < 0.98 * log_loss(by_history[hit], static)
     wrong = [np.mean((p[hit] >= 0.5) != static) for p in (found, by_history)]
     assert wrong[0] < wrong[1]
+
+
+def test_shapes_never_raise_p_static(crowd, found, by_history):
+    """Leaves of doors have the shape of walls."""
+    hit = crowd.recording.hit
+    assert (found[hit] <= by_history[hit]).all()
+    assert np.mean(found[hit] < by_history[hit]) > 0.01
 
 
 def test_people_seen_for_a_moment_are_no_obstacles(crowd, found, by_history):
@@ -109,9 +115,9 @@ def test_frequencies_are_learned_from_histories_that_tell():
     _, history, is_narrow, segments = made_up()
     log_ratio = fit(history, segments)
     # tempered by one half, and by those whose labels follow from the tempered ones
-    share = log_ratio[is_narrow] / np.log(0.8 / 0.1)
-    assert 0.25 < share.min() <= share.max() < 0.55
-    np.testing.assert_array_equal(log_ratio[~is_narrow], _MIN_LOG_RATIO)  # walls and doors
+    for some, expected in ((is_narrow, np.log(0.8 / 0.1)), (~is_narrow, np.log(0.2 / 0.9))):
+        share = log_ratio[some] / expected
+        assert 0.25 < share.min() <= share.max() < 0.55
 
 
 def test_without_a_history_that_tells_shapes_say_nothing():
@@ -126,8 +132,7 @@ def test_shapes_never_decide_alone():
     segments[:] = 0.0
     segments[np.arange(len(static)), np.where(static, 3, 7)] = 1.0
     log_ratio = fit(history, segments)
-    assert log_ratio.min() == _MIN_LOG_RATIO
-    assert 0.9 < log_ratio.max() <= _MAX_LOG_RATIO
+    assert 0.9 < np.abs(log_ratio).max() <= _MAX_LOG_RATIO
     assert (log_ratio > 0.0).tolist() == (~static).tolist()
 
 

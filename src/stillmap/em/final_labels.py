@@ -80,8 +80,12 @@ def _fit_with_shapes(
     fit: ClassFit,
     shapes: ShapeEvidence,
 ) -> ClassFit:
-    """Weights of the classes and frequencies of the shapes, fitted by turns."""
+    """Weights of the classes and frequencies of the shapes, fitted by turns.
+
+    P(static) is at most that by history: leaves of doors have the shape of walls.
+    """
+    by_history = fit.p_static
     for _ in range(_SHAPE_ROUNDS):
         shapes.fit(fit.p_static, fit.p_view_dependent)
         fit = fit_classes(observations, classes, options, shapes.factors)
-    return fit
+    return fit._replace(p_static=np.minimum(fit.p_static, by_history))

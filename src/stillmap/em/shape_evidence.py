@@ -24,8 +24,7 @@ _SUPPORT = np.array([0.025, 0.1, 0.2, 0.35, 0.5, 0.7, 0.9])  # m of static surfa
 
 # exponent of the likelihood ratio: neighbouring surfels see the same thing, and so do both features
 _TEMPER = 0.5
-# nats of dynamic to static: leaves of doors have the shape of walls, so it hardly says static
-_MIN_LOG_RATIO, _MAX_LOG_RATIO = -0.4, 3.4
+_MAX_LOG_RATIO = float(np.log(30.0))  # of a shape alone
 _PSEUDO_COUNT = 20.0  # surfels, distributed as all surfels are
 _MAX_ITERATIONS, _TOLERANCE = 60, 1e-3  # of EM; nats, largest change of a log ratio
 
@@ -153,4 +152,4 @@ def _compare(counts: Float, pseudo: Float) -> Float:
 def _temper(shares: NDArray[np.float32], log_ratio: Float) -> Float:
     """(K, G) mean log ratio by the shares (K, N), tempered, within bounds."""
     out = _TEMPER * np.einsum("ek,gk->eg", shares, log_ratio)
-    return np.asarray(np.clip(out, _MIN_LOG_RATIO, _MAX_LOG_RATIO))
+    return np.asarray(np.clip(out, -_MAX_LOG_RATIO, _MAX_LOG_RATIO))
