@@ -49,12 +49,12 @@ def test_what_is_told_is_in_the_frame_of_the_map(hall, tmp_path, mode):
         assert found == ["lost" not in one.doubts for one in told]
         for one, other, is_found in zip(told, told_far, found, strict=True):
             by = UTM * is_found
-            np.testing.assert_allclose(other.pose[:2, 2] - by, one.pose[:2, 2], atol=2e-3)
+            np.testing.assert_allclose(other.pose[:2, 2] - by, one.pose[:2, 2], atol=5e-3)
             np.testing.assert_allclose(
                 other.T_map_odom[:2, 2] - by, one.T_map_odom[:2, 2], atol=0.1
             )
-        np.testing.assert_allclose(far.poses[-1, :2, 2] - UTM, near.poses[-1, :2, 2], atol=2e-3)
-        np.testing.assert_allclose(far.path[-1, :2, 2] - UTM, near.path[-1, :2, 2], atol=2e-3)
+        np.testing.assert_allclose(far.poses[-1, :2, 2] - UTM, near.poses[-1, :2, 2], atol=5e-3)
+        np.testing.assert_allclose(far.path[-1, :2, 2] - UTM, near.path[-1, :2, 2], atol=5e-3)
         np.testing.assert_allclose(
             np.array(far.map.origin[:2]) - UTM, near.map.origin[:2], atol=0.2
         )

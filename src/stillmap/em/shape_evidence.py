@@ -20,7 +20,8 @@ from stillmap.em.types import MIN_PROBABILITY, Float
 # m: reach of a line beyond the thing itself; nearer surfels may be of the same person
 _RADIUS, _GAP, _HALF_WIDTH = 1.0, 0.15, 0.06
 _MAX_RADIUS = 24.0  # cells: bounds the work at fine resolutions
-_SUPPORT = np.array([0.025, 0.1, 0.2, 0.35, 0.5, 0.7, 0.9])  # m of static surface on a line
+# m of static surface on a line; whole cells of the default resolution lie between
+_SUPPORT = np.array([0.025, 0.095, 0.195, 0.345, 0.495, 0.695, 0.895])
 
 # exponent of the likelihood ratio: neighbouring surfels see the same thing, and so do both features
 _TEMPER = 0.5
