@@ -38,8 +38,10 @@ def drive(recording, place, mode="localise"):
     return mapper, updates
 
 
-@pytest.mark.parametrize("mode", ["localise", "extend"])
-def test_what_is_told_is_in_the_frame_of_the_map(hall, tmp_path, mode):
+# m: rounding moves single scans, as their cost has steps where end points leave observed space
+# (docs/lab/cost.md#rounding), and in a map that grows the scans after them
+@pytest.mark.parametrize(("mode", "rounding"), [("localise", 2e-3), ("extend", 4e-3)])
+def test_what_is_told_is_in_the_frame_of_the_map(hall, tmp_path, mode, rounding):
     recording, folder = hall
     near, told = drive(recording, folder / "near", mode)
     far, told_far = drive(recording, folder / "far", mode)
@@ -49,12 +51,12 @@ def test_what_is_told_is_in_the_frame_of_the_map(hall, tmp_path, mode):
         assert found == ["lost" not in one.doubts for one in told]
         for one, other, is_found in zip(told, told_far, found, strict=True):
             by = UTM * is_found
-            np.testing.assert_allclose(other.pose[:2, 2] - by, one.pose[:2, 2], atol=5e-3)
+            np.testing.assert_allclose(other.pose[:2, 2] - by, one.pose[:2, 2], atol=rounding)
             np.testing.assert_allclose(
                 other.T_map_odom[:2, 2] - by, one.T_map_odom[:2, 2], atol=0.1
             )
-        np.testing.assert_allclose(far.poses[-1, :2, 2] - UTM, near.poses[-1, :2, 2], atol=5e-3)
-        np.testing.assert_allclose(far.path[-1, :2, 2] - UTM, near.path[-1, :2, 2], atol=5e-3)
+        np.testing.assert_allclose(far.poses[-1, :2, 2] - UTM, near.poses[-1, :2, 2], atol=2e-3)
+        np.testing.assert_allclose(far.path[-1, :2, 2] - UTM, near.path[-1, :2, 2], atol=2e-3)
         np.testing.assert_allclose(
             np.array(far.map.origin[:2]) - UTM, near.map.origin[:2], atol=0.2
         )

@@ -45,7 +45,7 @@ def final_e_step(
 
     Args:
         recording, poses, resolution, options, threads: see `occupancy_hmm.e_step`.
-        with_shapes: in 2D.
+        with_shapes: lower P(static) by the shapes of surfels, in 2D; in 3D there are none.
 
     Returns:
         labels; histories of the same cells, None without `change_detection`.

@@ -20,7 +20,8 @@ from stillmap.em.types import MIN_PROBABILITY, Float
 # m: reach of a line beyond the thing itself; nearer surfels may be of the same person
 _RADIUS, _GAP, _HALF_WIDTH = 1.0, 0.15, 0.06
 _MAX_RADIUS = 24.0  # cells: bounds the work at fine resolutions
-# m of static surface on a line; whole cells of the default resolution lie between
+# m of static surface on a line: borders are no multiples of the default cell of 5 cm, so that
+# surfels with P(static) = 1 up to rounding are on the same side
 _SUPPORT = np.array([0.025, 0.095, 0.195, 0.345, 0.495, 0.695, 0.895])
 
 # exponent of the likelihood ratio: neighbouring surfels see the same thing, and so do both features
