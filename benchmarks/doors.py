@@ -7,7 +7,7 @@ A door counts as seen if 40 beams ended on its leaf while it was shut and 40 whi
 on its way. It is found if a change of kind `door` has its hinge within 0.3 m of it; every other one
 is false. State: share of the time in the states of found doors in which the leaf was where it is
 said to be. Seen once: doors listed with one position, and those of them that are not at a door of
-the world, by either end. Ghosts: cells per 100 m2, all of them, and those farther than one cell
+the world, by either end; passed: the same of those whose shut leaf beams passed. Ghosts: cells per 100 m2, all of them, and those farther than one cell
 from the leaf of a listed door.
 """
 
@@ -47,6 +47,8 @@ COLUMNS = (
     Column("states", "states right", ".3f", True),
     Column("once", "seen once", ".0f"),
     Column("once_false", "false", ".0f"),
+    Column("passed", "passed", ".0f"),
+    Column("passed_false", "false", ".0f"),
     Column("ghosts", "ghosts", ".1f"),
     Column("besides", "besides doors", ".1f"),
     Column("cost", "cost, %", ".1f"),
@@ -100,10 +102,14 @@ def scores_of(result: stillmap.BuiltResult, simulation: Simulation) -> Scores:
     right = [_state_is_right(doors[k], leaf, simulation) for k, leaf in pairs]
     looked = sum(len(one) for one in right)
     once = [one for one in result.doors if len(one.states) == 1]
-    at_leaf = [_is_at_leaf(one, simulation, T_world_map) for one in once]
+    passed = [one for one in result.doors if len(one.states) > 1 and not len(one.open_cells)]
+    listed = {
+        name: [_is_at_leaf(one, simulation, T_world_map) for one in some]
+        for name, some in (("once", once), ("passed", passed))
+    }
     return {
-        "once": len(once),
-        "once_false": len(once) - sum(at_leaf),
+        **{name: len(is_leaf) for name, is_leaf in listed.items()},
+        **{f"{name}_false": len(is_leaf) - sum(is_leaf) for name, is_leaf in listed.items()},
         **_count_ghosts(result, simulation, T_world_map),
         "doors": len(leaves),
         "seen": sum(_is_seen(k, simulation) for k in range(len(leaves))),

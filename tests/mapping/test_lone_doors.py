@@ -12,10 +12,11 @@ import stillmap
 from stillmap import _core
 from stillmap.core.config import override
 from stillmap.mapping.door import Door, DoorState
+from stillmap.mapping.door_states import list_runs
 from stillmap.mapping.doorways import find_doorways
-from stillmap.mapping.lone_doors import compute_p_moved
 from stillmap.mapping.lone_leaves import find_open_leaf, is_thin
 from stillmap.mapping.shut_leaves import estimate_p_door, estimate_shut_share, find_shut_leaf
+from stillmap.mapping.swing_rate import compute_p_moved
 from stillmap.pipeline.options import Options
 from stillmap.sim import CrowdOptions, LaserOptions, RobotOptions, Scene, simulate
 from stillmap.sim.walls import box
@@ -215,12 +216,39 @@ def test_a_gap_in_the_looks_hides_swings():
 HINGE, OPENED = (0.5, 0.15), math.radians(100.0)
 TIP = (HINGE[0] + 0.96 * math.cos(OPENED), HINGE[1] + 0.96 * math.sin(OPENED))
 FREE = ((*HINGE, *TIP),)
+SHUT_FROM = 55  # scan; the robot is in the room
 BOX = tuple(box(0.0, 0.65, 1.0, 0.96))
 
 
 @functools.cache
-def built(leaf, state="last"):
-    """A corridor and a room that the robot enters; what stands at the doorway between them."""
+def built(leaf, state="last", shut_from=None):
+    """A corridor and a room that the robot enters; what stands at the doorway between them.
+
+    From scan `shut_from` on, if any, the door is shut.
+    """
+    sim = world(leaf)
+    recording = sim.recording if shut_from is None else shut(sim, shut_from)
+    chosen = {"threads": 1, "em": {"max_iterations": 1}, "output": {"map_state": state}}
+    options = override(Options(), chosen)
+    return stillmap.build(recording, options, poses=sim.truth.T_world_base), recording
+
+
+def shut(sim, since):
+    """Beams of the scans from `since` on end at the leaf that is shut in the doorway."""
+    recording, poses = sim.recording, sim.truth.T_world_base
+    scan = recording.scans_of(np.arange(recording.n_beams))
+    start = recording.T_map_sensor(poses)[scan, :2, 2]
+    way = recording.end_points(np.arange(recording.n_beams), poses) - start
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = (HINGE[1] - start[:, 1]) / way[:, 1]
+        x = start[:, 0] + share * way[:, 0]
+    blocked = (scan >= since) & (share > 0.0) & (share < 1.0) & (x > HINGE[0]) & (x < 1.5)
+    points = recording.points.copy()
+    points[blocked] *= share[blocked, None].astype(np.float32)
+    return dataclasses.replace(recording, points=points, hit=recording.hit | blocked)
+
+
+def world(leaf):
     partition = ((-4.0, 0.0, 0.5, 0.0), (0.5, 0.0, *HINGE), (1.5, 0.0, 1.5, 0.15), (1.5, 0, 5.0, 0))
     scene = Scene(
         "corridor",
@@ -230,10 +258,7 @@ def built(leaf, state="last"):
         laser=LaserOptions(beams=361, range_noise=0.01, fov=2 * np.pi),
         robot=RobotOptions(scans=120, scan_rate=4.0, speed=0.5),
     )
-    sim = simulate(scene, np.random.default_rng(3))
-    chosen = {"threads": 1, "em": {"max_iterations": 1}, "output": {"map_state": state}}
-    options = override(Options(), chosen)
-    return stillmap.build(sim.recording, options, poses=sim.truth.T_world_base), sim
+    return simulate(scene, np.random.default_rng(3))
 
 
 def shown(result, cells):
@@ -256,10 +281,10 @@ def test_an_open_door_is_named_and_shown_as_found(tmp_path):
 
 
 def test_beams_on_it_are_static_as_far_as_it_may_have_moved():
-    result, sim = built(FREE)
-    ends = sim.recording.end_points(np.arange(sim.recording.n_beams), result.poses)
+    result, recording = built(FREE)
+    ends = recording.end_points(np.arange(recording.n_beams), result.poses)
     middle = 0.5 * (np.array(HINGE) + TIP)
-    on = sim.recording.hit & (np.linalg.norm(ends - middle, axis=1) < 0.2)
+    on = recording.hit & (np.linalg.norm(ends - middle, axis=1) < 0.2)
     (found,) = result.doors
     assert 0.02 < found.p_moved < 0.6  # nobody saw a door move here
     assert np.median(result.p_static[on]) == pytest.approx(1.0 - found.p_moved, abs=0.05)
@@ -274,6 +299,53 @@ def test_it_is_left_out_where_all_doors_are_to_be_shut():
 def test_the_side_of_a_box_is_no_door():
     result, _ = built(BOX)
     assert not result.doors
+
+
+def on_leaf(result, recording):
+    ends = recording.end_points(np.arange(recording.n_beams), result.poses)
+    inside = (np.abs(ends[:, 0] - 1.0) < 0.3) & (np.abs(ends[:, 1] - HINGE[1]) < 0.05)
+    return recording.hit & inside
+
+
+def test_a_leaf_that_beams_passed_before_is_a_door_that_moved():
+    result, recording = built((), shut_from=SHUT_FROM)
+    (found,) = result.doors
+    before, after = found.states
+    assert (before.position, after.position) == ("open", "shut")
+    assert before.until_ns < recording.stamp_ns[SHUT_FROM] <= after.since_ns
+    assert math.isnan(found.opened)
+    assert found.p_moved > 0.9
+    assert on_leaf(result, recording).sum() > 50
+    assert np.median(result.p_static[on_leaf(result, recording)]) < 0.1
+    assert (shown(result, found.shut_cells) > 0.5).mean() > 0.7  # it was seen shut last
+    assert not result.objects
+
+
+def test_it_is_left_out_where_all_doors_are_to_be_open():
+    result, _ = built((), "open", shut_from=SHUT_FROM)
+    (found,) = result.doors
+    assert (shown(result, found.shut_cells) < 0.5).all()
+
+
+def test_a_leaf_that_was_shut_all_the_time_stays_as_it_is():
+    result, recording = built((), shut_from=0)
+    assert all(len(one.states) == 1 for one in result.doors)
+    assert np.median(result.p_static[on_leaf(result, recording)]) > 0.5
+
+
+def seen_at(*seconds):
+    return np.array(seconds, np.int64).reshape(-1, 2) * S
+
+
+def test_states_of_a_leaf_in_the_order_of_time():
+    runs = list_runs("shut", seen_at(1, 2, 4, 5, 20, 21), np.array([9, 11, 30]) * S)
+    assert runs == (
+        DoorState("shut", S, 5 * S),
+        DoorState("open", 9 * S, 11 * S),
+        DoorState("shut", 20 * S, 21 * S),
+        DoorState("open", 30 * S, 30 * S),
+    )
+    assert list_runs("open", seen_at(1, 2), np.zeros(0, np.int64)) == (DoorState("open", S, 2 * S),)
 
 
 def test_a_door_found_once_has_one_position():

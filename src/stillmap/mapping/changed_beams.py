@@ -75,15 +75,17 @@ def find_changed_object_beams(
 ) -> Index:
     """(n,) dynamic beams, rising, that ended on an object while it stood in a changed place.
 
-    Or on the leaf of one of the doors that were only seen open. Recurring changes other than doors
-    are left out: they may be people who wait there.
+    Or on the leaf of a door that was not seen in its other position. Recurring changes other than
+    doors are left out: they may be people who wait there.
     """
     stays = [
         _Stay.from_change(one, changes)
         for one in changes
         if one.kind != "comes and goes" or fit_sector(one.cells, one.resolution) is not None
     ]
-    stays += [_Stay.around_cells(one.open_cells, _EVER) for one in doors if len(one.open_cells)]
+    for one in doors:  # whose leaf is elsewhere is among the changes
+        if not (len(one.shut_cells) and len(one.open_cells)):
+            stays.append(_Stay.around_cells(one.swept_cells, _EVER))
     found = ArrayBuilder(np.intp, (), recording.scratch)
     for block in arrays.iter_blocks(recording.hit, p_static) if stays else ():
         beam = block.start + np.flatnonzero(recording.hit[block] & (p_static[block] < 0.5))

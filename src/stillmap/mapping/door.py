@@ -37,8 +37,8 @@ class Door(ShortRepr):
             goes on beyond the leaf. NaN: it was never seen open.
         shut_cells, open_cells: (K, 2) cells that changed, of the leaf in each position.
         swept_cells: (S, 2) all that it sweeps over.
-        states: in the order of time; one of a door that was seen in one position only. Its cells in
-            the other position are none.
+        states: in the order of time; one of a door that was seen in one position only. Cells of a
+            position in which its leaf was never seen are none.
         p_moved: probability that it is a door that moved during the recording; 1: it was seen to.
     """
 

@@ -20,8 +20,11 @@ _BIN_NS = 10**9  # in which the cells that were hit make one observation
 _MIN_SHARE = 0.35
 _MIN_LOOKS = 2  # observations of each position
 _CROSSED = (0.3, 0.9)  # of the leaf, where beams pass if it is not there
+INNER = (0.2, 0.8)  # the same where it is not known which end its hinge is at
 _GOES_ON = 0.3  # m beyond it
 _MIN_CROSSING, _MAX_SCANS = 3, 500  # scans that show it; scans that are looked at
+_MAX_DISTANCE = 10.0  # m from the sensor to a leaf: from farther off few beams cross it
+_AROUND_NS = 5 * 10**8  # before and after a look, in which the leaf is where it was seen
 _RATIO = 2.0  # of that share to the one of the other position
 
 
@@ -157,9 +160,47 @@ def is_passage_observed(door: Door, recording: Recording, poses: Float) -> bool:
         scans = _scans_during(door, position, recording.stamp_ns)
         along = np.array([np.cos(direction), np.sin(direction)])
         ends = np.array(door.hinge) + door.length * np.array(_CROSSED)[:, None] * along
-        if _count_crossing(ends, scans, recording, poses) >= _MIN_CROSSING:
+        if len(_find_crossing(ends, scans, recording, poses)) >= _MIN_CROSSING:
             return True
     return False
+
+
+def observe_passages(
+    ends: Float, looks: NDArray[np.int64], recording: Recording, poses: Float
+) -> NDArray[np.intp]:
+    """(n,) scans whose beams passed through a leaf while nothing was seen there.
+
+    None where fewer than three did, or where the leaf was never seen. At most 500 scans are looked
+    at.
+
+    Args:
+        ends: (2, 2) m, of the leaf.
+        looks: (L, 2) from `observe_looks`.
+        recording, poses: see `observe_states`.
+    """
+    stamp_ns = recording.stamp_ns
+    seen = np.zeros(len(stamp_ns), bool)
+    for first, last in looks:
+        seen |= (stamp_ns >= first - _AROUND_NS) & (stamp_ns <= last + _AROUND_NS)
+    sensor = recording.T_map_sensor(poses)[:, :2, 2]
+    is_near = np.linalg.norm(sensor - ends.mean(axis=0), axis=1) <= _MAX_DISTANCE
+    inner = ends[0] + np.array(INNER)[:, None] * (ends[1] - ends[0])
+    scans = _find_crossing(inner, _thin(np.flatnonzero(is_near & ~seen)), recording, poses)
+    return scans if len(scans) >= _MIN_CROSSING else scans[:0]
+
+
+def list_runs(
+    position: Position, looks: NDArray[np.int64], passages: NDArray[np.int64]
+) -> tuple[DoorState, ...]:
+    """States of a leaf seen in one position in looks (L, 2), and not there at stamps (n,)."""
+    other: Position = "shut" if position == "open" else "open"
+    seen = [DoorState(position, first, last) for first, last in looks.tolist()]
+    seen += [DoorState(other, stamp, stamp) for stamp in passages.tolist()]
+    out: list[DoorState] = []
+    for one in sorted(seen, key=lambda state: state.since_ns):
+        same = bool(out) and out[-1].position == one.position
+        out.append(one._replace(since_ns=out.pop().since_ns) if same else one)
+    return tuple(out)
 
 
 def _scans_during(door: Door, position: Position, stamp_ns: NDArray[np.int64]) -> NDArray[np.intp]:
@@ -168,19 +209,38 @@ def _scans_during(door: Door, position: Position, stamp_ns: NDArray[np.int64]) -
     for one in door.states:
         if one.position == position:
             inside |= (stamp_ns >= one.since_ns) & (stamp_ns <= one.until_ns)
-    scans = np.flatnonzero(inside)
+    return _thin(np.flatnonzero(inside))
+
+
+def _thin(scans: NDArray[np.intp]) -> NDArray[np.intp]:
+    """At most `_MAX_SCANS` of them, evenly."""
     return scans[:: -(-len(scans) // _MAX_SCANS) or 1]
 
 
-def _count_crossing(
-    ends: Float, scans: NDArray[np.intp], recording: Recording, poses: Float
-) -> int:
-    """Number of scans of which a beam crosses the segment between ends (2, 2) and goes on."""
+def find_hit_cells(
+    scans: NDArray[np.intp], recording: Recording, poses: Float, resolution: float
+) -> Cells:
+    """(n, 2) cells in which the beams of some scans ended."""
+    beam, _ = _list_hits(scans, recording)
+    return np.floor(recording.end_points(beam, poses) / resolution).astype(np.int64)
+
+
+def _list_hits(
+    scans: NDArray[np.intp], recording: Recording
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """(n,) beams of some scans that hit something, and which of these scans they are of."""
     first, count = recording.offset[scans], np.diff(recording.offset)[scans]
     of = np.repeat(np.arange(len(scans)), count)
     beam = np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count) + first[of]
     hit = recording.hit[beam]
-    beam, of = beam[hit], of[hit]
+    return beam[hit], of[hit]
+
+
+def _find_crossing(
+    ends: Float, scans: NDArray[np.intp], recording: Recording, poses: Float
+) -> NDArray[np.intp]:
+    """Those of some scans of which a beam crosses the segment between ends (2, 2) and goes on."""
+    beam, of = _list_hits(scans, recording)
     T = recording.T_map_sensor(poses)[scans]
     start, end = T[of, :2, 2], recording.end_points(beam, poses)
     a, b = ends
@@ -188,7 +248,8 @@ def _count_crossing(
     beyond = _cross(b - a, end - a) * np.sign(_cross(b - a, start - a))
     # by so far that noise does not reach back
     passes = (side.prod(axis=0) < 0.0) & (beyond < -_GOES_ON * np.linalg.norm(b - a))
-    return len(np.unique(of[passes]))
+    crossing: NDArray[np.intp] = scans[np.unique(of[passes])]
+    return crossing
 
 
 def _cross(one: Float, other: Float) -> Float:

@@ -1,7 +1,7 @@
-"""Doors that were seen in one position only: which there are, and whether they moved unseen.
+"""Doors whose leaf was seen in one position only: which there are, and whether they moved.
 
-How often doors swing is learned from all doors of the recording: from those that swung, and from
-those that were in the same position whenever somebody looked, all that fills a doorway included.
+That a shut leaf moved is seen where beams passed through it at other times. Whether others moved
+unseen follows from how often doors swing.
 """
 
 import dataclasses
@@ -18,7 +18,13 @@ from stillmap.core.chunks import iter_beams
 from stillmap.core.recording import Recording
 from stillmap.mapping.changed_objects import cell_keys
 from stillmap.mapping.door import Door, DoorState
-from stillmap.mapping.door_states import observe_looks
+from stillmap.mapping.door_states import (
+    INNER,
+    find_hit_cells,
+    list_runs,
+    observe_looks,
+    observe_passages,
+)
 from stillmap.mapping.doorways import find_doorways
 from stillmap.mapping.lone_leaves import LoneLeaf, find_open_leaf, is_doorway_free, is_thin
 from stillmap.mapping.shut_leaves import (
@@ -26,17 +32,17 @@ from stillmap.mapping.shut_leaves import (
     estimate_shut_share,
     find_shut_leaf,
 )
+from stillmap.mapping.swing_rate import compute_p_moved
 
 Cells = NDArray[np.int64]
 Float = NDArray[np.float64]
 Labels = NDArray[np.float32]
 
 _P_LEAF = 36.0 / 37.0  # 35 of 35 open ones in four simulated offices were; rule of succession
+_P_PASSED = 27.0 / 28.0  # the same of shut ones that beams passed: 26 of 26 in nine offices
+_MIN_MOVED = 0.8  # share of the inner part of the leaf that must be gone meanwhile
 _MIN_P_LISTED = 0.1  # that what fills a doorway is a door at all
-_RATES = np.geomspace(1e-5, 1.0, 61)  # per s, of swings, each as probable before any is seen
-_WATCHED = 2.0  # s between two looks within which a swing would have been seen
 _LOOK = 0.2  # s between scans whose beams show what is free
-_LEAST = 1e-3  # s that a swing takes
 _THREADS = 2  # that count beams: every one has a heap of its own
 _MAX_COMMON = 0.3  # share of the cells of a leaf that may be of another door
 
@@ -49,7 +55,7 @@ def find_lone_doors(
     resolution: float,
     threads: int = 1,
 ) -> list[Door]:
-    """Doors that were in the same position whenever they were seen.
+    """Doors whose leaf was in the same position whenever it was seen.
 
     Args:
         surface: (S, 2) cells that are occupied most of the time.
@@ -109,17 +115,62 @@ def _observe(
 ) -> list[Door]:
     """The doors with these leaves, each open or shut, when they were seen, and P(moved)."""
     looks = observe_looks([leaf.cells for leaf, _ in found], recording, poses, resolution)
-    seen = [k for k, one in enumerate(looks) if len(one)]
-    found, looks = [found[k] for k in seen], [looks[k] for k in seen]
-    is_open = np.array([one[1] for one in found], bool)
-    same, moved = compute_p_moved(doors, looks, recording.stamp_ns)
-    p_door = np.full(len(found), _P_LEAF)
+    passed_doors, lone_doors, lone_looks = list[Door](), list[Door](), list[NDArray[np.int64]]()
+    for (leaf, is_open), seen in zip(found, looks, strict=True):
+        if not len(seen):
+            continue
+        passed = np.empty(0, np.intp)
+        if not is_open:
+            leaf, passed = _find_passages(leaf, seen, recording, poses, resolution)
+        states = list_runs("open" if is_open else "shut", seen, recording.stamp_ns[passed])
+        one = _make_door(leaf, is_open, resolution, states)
+        if len(passed):
+            passed_doors.append(one)
+        else:
+            lone_doors.append(one)
+            lone_looks.append(seen)
+    lone_doors = _rate_lone(lone_doors, lone_looks, [*doors, *passed_doors], recording.stamp_ns)
+    return [*passed_doors, *lone_doors]
+
+
+def _find_passages(
+    leaf: LoneLeaf,
+    looks: NDArray[np.int64],
+    recording: Recording,
+    poses: Float,
+    resolution: float,
+) -> tuple[LoneLeaf, NDArray[np.intp]]:
+    """A shut leaf without what is hit while beams pass through it, and the scans of these.
+
+    What is hit then is the edge of a wall; where little else is left, it is no leaf that moved.
+    """
+    ends = resolution * (leaf.hinge + 0.5 + np.outer([0.0, leaf.length], leaf.shut))
+    scans = observe_passages(ends, looks, recording, poses)
+    hit = find_hit_cells(scans, recording, poses, resolution)
+    moved = leaf._replace(cells=leaf.cells[~np.isin(cell_keys(leaf.cells), cell_keys(hit))])
+    along = np.round((moved.cells - leaf.hinge) @ leaf.shut)
+    inner = np.arange(math.ceil(INNER[0] * leaf.length), INNER[1] * leaf.length)
+    if np.isin(inner, along).mean() < _MIN_MOVED:
+        return leaf, scans[:0]
+    return moved, scans
+
+
+def _rate_lone(
+    lone: Sequence[Door],
+    looks: Sequence[NDArray[np.int64]],
+    swung: Sequence[Door],
+    stamp_ns: NDArray[np.int64],
+) -> list[Door]:
+    """The doors seen in one position with P(moved), without those that hardly are doors."""
+    is_open = np.array([len(one.open_cells) > 0 for one in lone], bool)
+    same, moved = compute_p_moved(swung, looks, stamp_ns)
+    p_door = np.full(len(lone), _P_LEAF)
     p_door[~is_open] = estimate_p_door(
-        estimate_shut_share(doors) * same[~is_open], len(doors) + int(is_open.sum())
+        estimate_shut_share(swung) * same[~is_open], len(swung) + int(is_open.sum())
     )
     return [
-        _make_door(*found[k], resolution, looks[k], float(moved[k] * p_door[k]))
-        for k in np.flatnonzero(p_door >= _MIN_P_LISTED)
+        dataclasses.replace(lone[k], p_moved=float(moved[k] * p_door[k]))
+        for k in np.flatnonzero(p_door >= _MIN_P_LISTED).tolist()
     ]
 
 
@@ -128,11 +179,10 @@ def _is_part(cells: Cells, others: Cells) -> bool:
 
 
 def _make_door(
-    leaf: LoneLeaf, is_open: bool, resolution: float, stamps: NDArray[np.int64], p_moved: float
+    leaf: LoneLeaf, is_open: bool, resolution: float, states: tuple[DoorState, ...]
 ) -> Door:
     x, y = ((leaf.hinge + 0.5) * resolution).tolist()
     none = np.empty((0, 2), np.int64)
-    state = DoorState("open" if is_open else "shut", int(stamps[0, 0]), int(stamps[-1, 1]))
     return Door(
         hinge=(x, y),
         length=leaf.length * resolution,
@@ -141,73 +191,9 @@ def _make_door(
         shut_cells=none if is_open else leaf.cells,
         open_cells=leaf.cells if is_open else none,
         swept_cells=leaf.cells,
-        states=(state,),
-        p_moved=p_moved,
+        states=states,
+        p_moved=_P_PASSED,
     )
-
-
-def compute_p_moved(
-    doors: Sequence[Door], looks: Sequence[NDArray[np.int64]], stamp_ns: NDArray[np.int64]
-) -> tuple[Float, Float]:
-    """Probability that each of some doors was in the same position at all looks, (K,), and if it
-    was, that it moved while nobody saw it, (K,).
-
-    A door swings at a constant rate, the same for all of them. The two positions of a door that
-    swung at the rate r differ after t with probability (1 - exp(-2 r t)) / 2.
-
-    Args:
-        doors: those that were seen to swing.
-        looks: (L, 2) of each of the others, see `observe_looks`.
-        stamp_ns: (T,) of the recording.
-    """
-    spans = [_split_looks(one) for one in looks]
-    log_same = [
-        np.log(0.5 * (1.0 + np.exp(-2.0 * np.outer(_RATES, gaps)))).sum(axis=1) - _RATES * watched
-        for watched, gaps in spans
-    ]
-    swings = [_log_likelihood_of_swings(door) for door in doors]
-    log_likelihood = np.sum([np.zeros(len(_RATES)), *swings, *log_same], axis=0)
-    posterior = _normalize(log_likelihood)
-    # by the rate that all others tell
-    same = [float(_normalize(log_likelihood - one) @ np.exp(one)) for one in log_same]
-    moved = []
-    for stamps, (_, gaps) in zip(looks, spans, strict=True):
-        ends = 1e-9 * float((stamps[0, 0] - stamp_ns[0]) + (stamp_ns[-1] - stamps[-1, 1]))
-        # it was in one position at both ends of a gap: an even number of swings, none with 1 / cosh
-        log_still = -_RATES * ends - np.logaddexp(
-            np.outer(_RATES, gaps), -np.outer(_RATES, gaps)
-        ).sum(axis=1)
-        log_still += len(gaps) * math.log(2.0)
-        moved.append(1.0 - float(posterior @ np.exp(log_still)))
-    return np.array(same), np.array(moved)
-
-
-def _normalize(log_likelihood: Float) -> Float:
-    """(R,) probability of each rate."""
-    weights = np.exp(log_likelihood - log_likelihood.max())
-    return np.asarray(weights / weights.sum())
-
-
-def _log_likelihood_of_swings(door: Door) -> Float:
-    """(R,) of the states of a door, at each rate.
-
-    Each state lasts from the first to the last time the leaf was seen so; it may have moved to and
-    fro meanwhile.
-    """
-    since, until = 1e-9 * np.array([[one.since_ns, one.until_ns] for one in door.states], float).T
-    between = np.maximum(since[1:] - until[:-1], _LEAST)
-    differs = 0.5 * -np.expm1(-2.0 * np.outer(_RATES, between))
-    same = 0.5 * (1.0 + np.exp(-2.0 * np.outer(_RATES, until - since)))
-    return np.asarray(np.log(differs).sum(axis=1) + np.log(same).sum(axis=1))
-
-
-def _split_looks(stamps: NDArray[np.int64]) -> tuple[float, Float]:
-    """Seconds in which a leaf was watched, and the gaps between them."""
-    pauses = 1e-9 * (stamps[1:, 0] - stamps[:-1, 1]).astype(np.float64)
-    watched = 1e-9 * float((stamps[:, 1] - stamps[:, 0]).sum()) + float(
-        pauses[pauses <= _WATCHED].sum()
-    )
-    return watched, pauses[pauses > _WATCHED]
 
 
 def relabel_lone_doors(
@@ -220,11 +206,12 @@ def relabel_lone_doors(
     state: em.MapState,
     threads: int = 1,
 ) -> tuple[Labels, em.CellProbabilities]:
-    """Labels (M,) and map cells with doors that were seen in one position only.
+    """Labels (M,) and map cells with doors whose leaf was seen in one position only.
 
-    P(static) of a beam on an open leaf is less by the probability that the leaf moved. The map
-    shows it as it was found, or, where all doors are to be shut, not at all: nobody saw it there.
-    What fills a doorway stays as it is: it may be the back of a niche.
+    P(static) of a beam on a leaf that stood open, or that beams passed, is less by the probability
+    that the leaf moved. The map shows it where it was found, unless the door is to be, or was seen
+    to be, in the other position. What else fills a doorway stays as it is: it may be the back of a
+    niche.
 
     Args:
         recording: M beams.
@@ -235,16 +222,19 @@ def relabel_lone_doors(
         state: state of changed places that the map shows.
         threads: number of threads; the result does not depend on it.
     """
-    doors = [one for one in doors if len(one.open_cells)]
+    doors = [one for one in doors if len(one.open_cells) or len(one.states) > 1]
     if not doors:
         return p_static, occupied
     keys, p_moved = cell_keys(histories.cells), np.zeros(len(histories.cells), np.float32)
     p_occupied = occupied.p_occupied.copy()
     for one in doors:
-        of = np.isin(keys, cell_keys(one.open_cells))
-        p_moved[of] = np.maximum(p_moved[of], one.p_moved)
-        if one.position_in(state) != "open":
-            p_occupied[of] = 0.0
+        is_open = len(one.open_cells) > 0
+        on_leaf = np.isin(keys, cell_keys(one.open_cells if is_open else one.shut_cells))
+        p_moved[on_leaf] = np.maximum(p_moved[on_leaf], one.p_moved)
+        if one.position_in(state) != ("open" if is_open else "shut"):
+            p_occupied[on_leaf] = 0.0
+        elif len(one.states) > 1:  # of what moved all cells are shown
+            p_occupied[on_leaf] = histories.p_in_cell[on_leaf]
     out = arrays.copy(p_static, recording.scratch)
     for _, beams, data in iter_beams(recording, poses, release=[out]):
         surfel = histories.surfel_map.associate_beams(*data, threads)

@@ -241,9 +241,8 @@ def find_objects(
         threads = resolve_threads(options.threads)
         return track_objects_3d(deskewed, poses, p_static, maps.ground, options.objects, threads)
     objects = track_objects(deskewed, poses, p_static, options.objects)
-    lone = [one for one in doors if len(one.states) == 1]
     changed = find_changed_object_beams(
-        deskewed, poses, p_static, changes, lone, maps.filtered.resolution
+        deskewed, poses, p_static, changes, doors, maps.filtered.resolution
     )
     moved = [one for one in objects if 2 * _count_common(one.beams, changed) <= len(one.beams)]
     return [dataclasses.replace(one, id=k) for k, one in enumerate(moved)]
