@@ -7,8 +7,8 @@ A door counts as seen if 40 beams ended on its leaf while it was shut and 40 whi
 on its way. It is found if a change of kind `door` has its hinge within 0.3 m of it; every other one
 is false. State: share of the time in the states of found doors in which the leaf was where it is
 said to be. Seen once: doors listed with one position, and those of them that are not at a door of
-the world, by either end; passed: the same of those whose shut leaf beams passed. Ghosts: cells per 100 m2, all of them, and those farther than one cell
-from the leaf of a listed door.
+the world, by either end; passed: the same of those whose shut leaf beams passed. Ghosts: cells per
+100 m2, all of them, and those farther than one cell from the leaf of a listed door.
 """
 
 import itertools
