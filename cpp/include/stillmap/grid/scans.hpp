@@ -34,16 +34,28 @@ inline Vec<D> point_at(const float* p) {
   return Eigen::Map<const Eigen::Matrix<float, D, 1>>(p).template cast<double>();
 }
 
+template <int D>
+inline void require_near(const Vec<D>& position) {
+  if (!all_below<D>(position, BlockLayout<D>::kMaxCell))
+    throw std::invalid_argument("beam: a pose or end point is not finite or too far away");
+}
+
+// End of a beam in units of cells; throws where its coordinates exceed kMaxCell.
+template <int D>
+inline Vec<D> beam_end(const Pose<D>& T_map_sensor, const float* point, double resolution) {
+  const Vec<D> end = (T_map_sensor * point_at<D>(point)) / resolution;
+  require_near<D>(end);
+  return end;
+}
+
 // One beam in units of cells; throws where its coordinates exceed kMaxCell.
 template <int D>
 struct BeamSegment {
   Vec<D> start, end;
 
   BeamSegment(const Pose<D>& T_map_sensor, const float* point, double resolution)
-      : start(T_map_sensor.t / resolution), end((T_map_sensor * point_at<D>(point)) / resolution) {
-    if (!all_below<D>(start, BlockLayout<D>::kMaxCell) ||
-        !all_below<D>(end, BlockLayout<D>::kMaxCell))
-      throw std::invalid_argument("beam: a pose or end point is not finite or too far away");
+      : start(T_map_sensor.t / resolution), end(beam_end<D>(T_map_sensor, point, resolution)) {
+    require_near<D>(start);
   }
 };
 

@@ -85,8 +85,8 @@ class ClusterPooling {
     BlockCursor<const SurfelMap<3>> cursor(surfel_map_);
     for_each_beam<3>(scans, t, t + 1, [&](size_t, int64_t n, const Pose<3>& pose) {
       if (!scans.hit[n]) return;
-      const BeamSegment<3> beam(pose, scans.points + n * 3, surfel_map_.resolution());
-      const int32_t k = surfel_map_.surfel_at(cursor, cell_of<3>(beam.end));
+      const Vec<3> end = beam_end<3>(pose, scans.points + n * 3, surfel_map_.resolution());
+      const int32_t k = surfel_map_.surfel_at(cursor, cell_of<3>(end));
       if (k != kNoSurfel && is_obstacle_[static_cast<size_t>(k)]) columns.add(k);
     });
     columns.sort();

@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <cstdint>
 #include <optional>
 #include <vector>
 
@@ -81,30 +82,26 @@ class ObservationCollector {
         states_(surfel_map.size()),
         touched_(ObservationBatch::n_spans(surfel_map.size())),
         open_bits_(bitmap.bits()),
+        has_closed_(bitmap.bits().size(), false),
         traversal_(surfel_map, bitmap) {
     if (surroundings) occupied_.emplace(*surroundings);
     for (size_t k = 0; k < states_.size(); ++k)
       states_[k] = state_of(surfel_map, static_cast<int32_t>(k), options.use_normals);
   }
 
+  // Adds all scans of a time bin. Hits come first: beams that pass what was hit say nothing more,
+  // so its cells need not be tested along their rays.
   void add(const Scans<D>& scans, size_t first, size_t last) {
+    record_hits(scans, first, last);
     for_each_beam<D>(scans, first, last, [&](size_t t, int64_t n, const Pose<D>& pose) {
       if (!scans.hit[n] && !in_no_return_run(scans, t, n)) return;
-      const BeamSegment<D> beam(pose, scans.points + n * D, surfel_map_.resolution());
-      const bool has_length = record_pass(beam, scans.hit[n]);
-      if (!scans.hit[n]) return;
-      const Cell<D> end = cell_of<D>(beam.end);
-      const int32_t k = has_length ? traversal_.surfel_at_end(end) : bitmap_.surfel(end);
-      if (k == kNoSurfel || !record_hit(k)) return;
-      hit_surfels_.push_back(k);
-      if constexpr (SurfelTraversal<D>::kUsesBits)
-        close(static_cast<size_t>(bitmap_.block_number(BlockLayout<D>::block_of(end))), end);
+      record_pass(BeamSegment<D>(pose, scans.points + n * D, surfel_map_.resolution()),
+                  scans.hit[n]);
     });
   }
 
   // Writes the observations to `out` and resets the collector.
   void take_batch(ObservationBatch& out) {
-    spread_hits();
     out.observations.clear();
     out.begin.assign(1, 0);
     for (auto& touched_span : touched_) {
@@ -117,7 +114,10 @@ class ObservationCollector {
       out.begin.push_back(out.observations.size());
     }
     hit_surfels_.clear();
-    for (const size_t block : closed_blocks_) open_bits_[block] = bitmap_.bits()[block];
+    for (const size_t block : closed_blocks_) {
+      open_bits_[block] = bitmap_.bits()[block];
+      has_closed_[block] = false;
+    }
     closed_blocks_.clear();
   }
 
@@ -167,20 +167,47 @@ class ObservationCollector {
     return occupied_ && occupied_->around(k) ? -reliability : reliability;
   }
 
+  // Marks the surfels in which beams ended and their neighbours as hit, and closes their cells.
+  void record_hits(const Scans<D>& scans, size_t first, size_t last) {
+    Cell<D> block = Cell<D>::Zero();  // of the beam before: successive ones often share theirs
+    int32_t number = bitmap_.block_number(block);
+    for_each_beam<D>(scans, first, last, [&](size_t, int64_t n, const Pose<D>& pose) {
+      if (!scans.hit[n]) return;
+      const Cell<D> end =
+          cell_of<D>(beam_end<D>(pose, scans.points + n * D, surfel_map_.resolution()));
+      if (const Cell<D> its = BlockLayout<D>::block_of(end); its != block) {
+        block = its;
+        number = bitmap_.block_number(block);
+      }
+      if (number == SurfelBitmap<D>::kNone) return;
+      const auto its_block = static_cast<size_t>(number);
+      if (!open_bits_[its_block].contains(end)) return;  // without a surfel, or hit before
+      const int32_t k = bitmap_.surfel(number, end);
+      record_hit(k);
+      hit_surfels_.push_back(k);
+    });
+    spread_hits();
+    if constexpr (SurfelTraversal<D>::kUsesBits)
+      for (const size_t block : closed_blocks_) open_bits_[block].find_slices();
+  }
+
   // Marks a hit; false if it was marked before.
   bool record_hit(int32_t k) {
     float& p_missed = states_[static_cast<size_t>(k)].p_missed;
     if (p_missed == kHitMark) return false;
     if (p_missed == kUntouched) touched_[ObservationBatch::span_of(k)].push_back(k);
     p_missed = kHitMark;
+    open_for_closing(bitmap_.block_of_surfel(k)).clear_in_tile(surfel_map_.cell(k));
     return true;
   }
 
   // Excludes a cell from further traversals of this time bin.
-  void close(size_t block, const Cell<D>& cell) {
-    auto& bits_left = open_bits_[block];
-    if (bits_left.tiles == bitmap_.bits()[block].tiles) closed_blocks_.push_back(block);
-    bits_left.clear(cell);
+  void close(size_t block, const Cell<D>& cell) { open_for_closing(block).clear(cell); }
+
+  typename SurfelBitmap<D>::BlockBits& open_for_closing(size_t block) {
+    if (!has_closed_[block]) closed_blocks_.push_back(block);
+    has_closed_[block] = true;
+    return open_bits_[block];
   }
 
   // Ray in single precision, relative to the corner of its start cell.
@@ -216,10 +243,10 @@ class ObservationCollector {
   }
 
   // Updates p_missed of the surfels that a beam passed. Behind the first solid surfel a beam
-  // without a return counts by trust_beyond_solid. Returns false for a beam of zero length.
-  bool record_pass(const BeamSegment<D>& beam, bool hit) {
+  // without a return counts by trust_beyond_solid.
+  void record_pass(const BeamSegment<D>& beam, bool hit) {
     const std::optional<LocalRay> ray = list_crossings(beam, hit);
-    if (!ray) return false;
+    if (!ray) return;
     float trust = 1.0f;
     for (const auto& crossing : crossings_) {
       SurfelState& state = states_[static_cast<size_t>(crossing.surfel)];
@@ -235,7 +262,6 @@ class ObservationCollector {
       if constexpr (SurfelTraversal<D>::kUsesBits)
         if (state.p_missed < kSaturated) close(crossing.block, crossing.cell);
     }
-    return true;
   }
 
   // P(the beam intersects the surfel's extent) given the lateral noise; small at grazing incidence.
@@ -282,7 +308,8 @@ class ObservationCollector {
   std::vector<int32_t> hit_surfels_;
   std::vector<typename SurfelTraversal<D>::Crossing> crossings_;  // of one beam, prefetched
   std::vector<typename SurfelBitmap<D>::BlockBits> open_bits_;    // cells that are not saturated
-  std::vector<size_t> closed_blocks_;                             // with excluded cells
+  std::vector<uint8_t> has_closed_;                               // by block: excluded cells
+  std::vector<size_t> closed_blocks_;                             // these
   SurfelTraversal<D> traversal_;
   std::optional<OccupiedSurroundings> occupied_;
 };

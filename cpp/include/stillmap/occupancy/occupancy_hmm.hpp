@@ -263,8 +263,8 @@ inline void associate_beams(const SurfelMap<D>& surfel_map, const Scans<D>& scan
     BlockCursor<const SurfelMap<D>> cursor(surfel_map);
     for_each_beam<D>(scans, first, last, [&](size_t, int64_t n, const Pose<D>& pose) {
       if (!scans.hit[n]) return;
-      const BeamSegment<D> beam(pose, scans.points + n * D, surfel_map.resolution());
-      surfel[n] = surfel_map.associate(cursor, beam.end);
+      const Vec<D> end = beam_end<D>(pose, scans.points + n * D, surfel_map.resolution());
+      surfel[n] = surfel_map.associate(cursor, end);
     });
   });
 }

@@ -57,6 +57,7 @@ class SurfelBitmap {
     std::array<Mask, kTilesPerBlock> tiles{};
     std::array<SliceMask, D> slices{};  // slices masks each axis that have set cells
 
+    bool contains(const Cell<D>& cell) const { return tiles[tile_of(cell)] & bit(bit_of(cell)); }
     void set(const Cell<D>& cell) {
       tiles[tile_of(cell)] |= bit(bit_of(cell));
       for (int d = 0; d < D; ++d)
@@ -69,6 +70,19 @@ class SurfelBitmap {
         const int slice = cell[d] & (SurfelMap<D>::kEdge - 1);
         if (!any_in_slice(d, slice))
           slices[static_cast<size_t>(d)] &= static_cast<SliceMask>(~(1u << slice));
+      }
+    }
+
+    // `clear`, for many cells before one call of `find_slices`.
+    void clear_in_tile(const Cell<D>& cell) {
+      tiles[tile_of(cell)] &= static_cast<Mask>(~bit(bit_of(cell)));
+    }
+    void find_slices() {
+      for (int d = 0; d < D; ++d) {
+        auto& found = slices[static_cast<size_t>(d)];
+        for (int slice = 0; slice < SurfelMap<D>::kEdge; ++slice)
+          if ((found >> slice & 1u) && !any_in_slice(d, slice))
+            found &= static_cast<SliceMask>(~(1u << slice));
       }
     }
 
@@ -113,6 +127,7 @@ class SurfelBitmap {
   explicit SurfelBitmap(const SurfelMap<D>& surfel_map) {
     bits_.resize(surfel_map.blocks().size());
     first_surfel_.resize(surfel_map.blocks().size());
+    block_of_surfel_.resize(surfel_map.size());
     for (size_t b = 0; b < bits_.size(); ++b) {
       const auto& block = *surfel_map.blocks()[b];
       first_surfel_[b].fill(kNoSurfel);
@@ -121,6 +136,7 @@ class SurfelBitmap {
         if (k == kNoSurfel) continue;
         const Cell<D> cell = BlockLayout<D>::cell_at(Cell<D>::Zero(), local);
         bits_[b].set(cell);
+        block_of_surfel_[static_cast<size_t>(k)] = static_cast<int32_t>(b);
         int32_t& first = first_surfel_[b][tile_of(cell)];
         if (first == kNoSurfel || k < first) first = k;
       }
@@ -132,6 +148,10 @@ class SurfelBitmap {
   int32_t block_number(const Cell<D>& block) const {
     const int32_t* page = page_of(block);
     return page ? page[index_in_page(block)] : kNone;
+  }
+  // Number of the block of a surfel.
+  size_t block_of_surfel(int32_t k) const {
+    return static_cast<size_t>(block_of_surfel_[static_cast<size_t>(k)]);
   }
   // Numbers of the blocks of a page; nullptr if it has none.
   const int32_t* page_of(const Cell<D>& block) const {
@@ -227,6 +247,7 @@ class SurfelBitmap {
   size_t n_pages_ = 0;
   std::vector<BlockBits> bits_;  // per block
   std::vector<std::array<int32_t, kTilesPerBlock>> first_surfel_;
+  std::vector<int32_t> block_of_surfel_;
 };
 
 }  // namespace stillmap

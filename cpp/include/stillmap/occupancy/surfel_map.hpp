@@ -165,9 +165,9 @@ class SurfelMap : public SurfaceIndex<D> {
   void add_range(const Scans<D>& scans, const int64_t* time_bin, size_t first, size_t last) {
     for_each_beam<D>(scans, first, last, [&](size_t t, int64_t n, const Pose<D>& pose) {
       if (!scans.hit[n]) return;
-      const BeamSegment<D> beam(pose, scans.points + n * D, resolution_);
-      EndPointSums<D>& sums = sums_at(cell_of<D>(beam.end));
-      sums.add(beam.end);
+      const Vec<D> end = beam_end<D>(pose, scans.points + n * D, resolution_);
+      EndPointSums<D>& sums = sums_at(cell_of<D>(end));
+      sums.add(end);
       if (time_bin) sums.hit_span.extend(time_bin[t]);
     });
   }

@@ -41,7 +41,12 @@ class SurfelTraversal {
                        Visit&& visit) {
     compute_borders(start, end);
     Cell<D> block = BlockLayout<D>::block_of(first_);
-    const int32_t* page = bitmap_.page_of(block);
+    if (!has_start_ || block != start_block_) {  // the beams of a sweep start in one block
+      has_start_ = true;
+      start_block_ = block;
+      start_page_ = bitmap_.page_of(block);
+    }
+    const int32_t* page = start_page_;
     std::array<int32_t, D> exit_border;  // number of the border at which each axis leaves the block
     std::array<double, D> exit_length;   // arc length there
     for (int d = 0; d < D; ++d) {
@@ -54,10 +59,11 @@ class SurfelTraversal {
     const auto leave = [&](auto axis) {
       constexpr int d = decltype(axis)::value;
       const double leave_at = exit_length[d];
-      last_block_ = page ? page[SurfelBitmap<D>::index_in_page(block)] : SurfelBitmap<D>::kNone;
-      if (last_block_ != SurfelBitmap<D>::kNone)
-        visit_block(enter_at, std::min(leave_at, length_), block, static_cast<size_t>(last_block_),
-                    bits, visit);
+      const int32_t number =
+          page ? page[SurfelBitmap<D>::index_in_page(block)] : SurfelBitmap<D>::kNone;
+      if (number != SurfelBitmap<D>::kNone)
+        visit_block(enter_at, std::min(leave_at, length_), block, static_cast<size_t>(number), bits,
+                    visit);
       if (!(leave_at < kInf)) return false;
       enter_at = leave_at;
       exit_border[d] += kEdge;
@@ -81,9 +87,6 @@ class SurfelTraversal {
       }
     }
   }
-
-  // Surfel in the end cell of the last ray.
-  int32_t surfel_at_end(const Cell<D>& end) { return bitmap_.surfel(last_block_, end); }
 
  private:
   static constexpr int kEdge = SurfelMap<D>::kEdge;
@@ -173,7 +176,9 @@ class SurfelTraversal {
   Vec<D> start_, direction_;
   double length_;
   Cell<D> first_;
-  int32_t last_block_ = SurfelBitmap<D>::kNone;
+  bool has_start_ = false;
+  Cell<D> start_block_;  // of the last ray
+  const int32_t* start_page_;
   std::array<Axis, D> axes_;
 };
 
@@ -206,11 +211,6 @@ class SurfelTraversal<2> {
     traverse<2>(start, end, walker);
     for (const Crossing* crossing = crossings_.data(); crossing != next; ++crossing)
       visit(*crossing);
-  }
-
-  int32_t surfel_at_end(const Cell<2>& end) {
-    const auto* block = cursor_.block(end);
-    return block ? block->values[static_cast<size_t>(SurfelMap<2>::local_of(end))] : kNoSurfel;
   }
 
  private:
