@@ -118,8 +118,8 @@ def test_two_lasers_do_not_turn_the_view():
 
 def test_label_classes_leave_out_crowds_waiting_and_half_time():
     """A chair that a robot passes resembles them."""
-    rho, tau, _ = (np.array(values) for values in module._CLASSES.grid())
-    n_static = module._CLASSES.n_static
+    rho, tau, _ = (np.array(values) for values in module._CHANGE_CLASSES.grid())
+    n_static = module._CHANGE_CLASSES.n_static
     kept = module._label_classes(SimpleNamespace(rho=rho, tau=tau, n_static=n_static))
     assert kept[:n_static].all()
     movers = {(r, t) for r, t in zip(rho[n_static:], tau[n_static:], strict=True)}

@@ -4,6 +4,8 @@ Within the loop a view-dependent class would explain walls duplicated by pose er
 that error. `docs/estimator/map.md` and `docs/estimator/shapes.md` have the equations.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,9 +25,13 @@ from stillmap.em.types import EStepResult, Float
 
 _CROWD_RHO, _CROWD_TAU = 0.15, 3.0  # rho and tau (s) of places crossed by many people
 _WAITING_TAU = 6.0  # s; used for change detection only, not for labels
-_CLASSES = HmmClasses(
+_LABEL_CLASSES = HmmClasses(
     view_rho=(0.65,),
     dynamic_rho=(0.01, 0.04, _CROWD_RHO),
+    dynamic_tau=(0.5, _CROWD_TAU, 12.0, 45.0),
+)
+_CHANGE_CLASSES = replace(  # and those of labels
+    _LABEL_CLASSES,
     dynamic_tau=(0.5, _CROWD_TAU, _WAITING_TAU, 12.0, 45.0),
     half_time_tau=(8.0, 24.0),
 )
@@ -57,8 +63,9 @@ def final_e_step(
         labels; histories of the same cells, None without `change_detection`.
     """
     changes = change_parameters(recording) if options.change_detection else None
+    computed = _LABEL_CLASSES if changes is None else _CHANGE_CLASSES
     observations = collect_observations(
-        recording, poses, resolution, options, threads, _CLASSES, changes
+        recording, poses, resolution, options, threads, computed, changes
     )
     classes = _label_classes(observations)
     fit = fit_classes(observations, classes, options)
