@@ -250,7 +250,7 @@ class Recording(ShortRepr):
                 T = T_map_base[scan] @ self.T_base_sensor[self.sensor[scan]]
             else:
                 T = self.T_map_sensor(T_map_base)[scan]
-            points = self.points[beams[part]].astype(np.float64)
+            points = self.points.take(beams[part], axis=0).astype(np.float64)
             ends[part] = np.einsum("nij,nj->ni", T[:, :D, :D], points) + T[:, :D, D]
             self.release_pages()
         return ends

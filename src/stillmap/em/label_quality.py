@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.arrays import finite_rows
 from stillmap.core.recording import Recording
 from stillmap.em.final_labels import final_e_step
 from stillmap.em.options import EmOptions
@@ -52,7 +53,7 @@ def count_expected(
         p_static: (M,) labels of any estimator.
         threads: does not change the result.
     """
-    hits = recording.hit & np.isfinite(recording.points).all(axis=1)
+    hits = recording.hit & finite_rows(recording.points)
     q, cell = np.ones(int(hits.sum())), _CELL[recording.dimension]
     for poses in candidates:
         judged, _ = final_e_step(recording, poses, cell, _OPTIONS, threads, with_shapes=False)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
-from stillmap.core.arrays import iter_blocks, sample_indices
+from stillmap.core.arrays import iter_blocks, sample_indices, squared_lengths
 from stillmap.core.chunks import iter_beams
 from stillmap.core.memory import allowed_memory, require_memory
 from stillmap.core.recording import Recording
@@ -109,7 +109,7 @@ def _reach(recording: Recording) -> float:
     """Length of the longest beam, m."""
     longest = 0.0
     for block in iter_blocks(recording.points):
-        squared = np.square(recording.points[block], dtype=np.float64).sum(axis=1)
+        squared = squared_lengths(recording.points[block])
         longest = float(np.fmax.reduce(squared, initial=longest))
     return math.sqrt(longest)
 

@@ -83,7 +83,7 @@ def _find_far(recording: Recording, reach: float) -> NDArray[np.intp]:
     """Beams longer than `reach` m."""
     found = [np.zeros(0, np.intp)]
     for block in arrays.iter_blocks(recording.points):
-        squared = np.square(recording.points[block], dtype=np.float64).sum(axis=1)
+        squared = arrays.squared_lengths(recording.points[block])
         found.append(np.flatnonzero(squared > reach * reach) + block.start)
     return np.concatenate(found)
 
@@ -92,7 +92,7 @@ def _longest_return(recording: Recording) -> float:
     """Length of the longest return, m; 0: there is none."""
     longest = 0.0
     for block in arrays.iter_blocks(recording.points, recording.hit):
-        squared = np.square(recording.points[block], dtype=np.float64).sum(axis=1)
+        squared = arrays.squared_lengths(recording.points[block])
         longest = max(longest, float(squared[recording.hit[block]].max(initial=0.0)))
     return math.sqrt(longest)
 

@@ -82,7 +82,7 @@ def sees_all_round(recording: Recording) -> bool:
     """True if scans cover nearly all azimuths of the sensor."""
     scans = np.unique(np.linspace(0, recording.n_scans - 1, _SAMPLED).astype(np.int64))
     beams = [recording.beams_of(t) for t in scans.tolist()]
-    points = np.concatenate([recording.points[of][recording.hit[of]] for of in beams])
+    points = np.concatenate([recording.points[of].compress(recording.hit[of], 0) for of in beams])
     azimuth = np.arctan2(points[:, 1], points[:, 0])
     sector = np.floor((azimuth[np.isfinite(azimuth)] / math.tau + 0.5) * _SECTORS)
     return len(np.unique(sector % _SECTORS)) >= _MIN_SECTORS * _SECTORS

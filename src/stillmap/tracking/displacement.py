@@ -75,7 +75,7 @@ def _remain_occupied(
     T_map_sensor = recording.T_map_sensor(poses)
     for t in recording.iter_scans(sorted(looks)):
         beams = recording.beams_of(t)
-        points = recording.points[beams][recording.hit[beams]].astype(np.float64)
+        points = recording.points[beams].compress(recording.hit[beams], axis=0).astype(np.float64)
         ends = points @ T_map_sensor[t, :3, :3].T
         flat = np.ascontiguousarray(ends[:, :2].T)
         length = np.sqrt(np.square(flat[0]) + np.square(flat[1]))

@@ -108,7 +108,7 @@ def _segment_scans(
         beams = recording.beams_of(t)
         dynamic = recording.hit[beams] & (p_static[beams] <= 1.0 - min_p_dynamic)
         number, T = beams.start + np.flatnonzero(dynamic), T_map_sensor[t]
-        end = recording.points[number].astype(np.float64) @ T[:3, :3].T + T[:3, 3]
+        end = recording.points.take(number, axis=0).astype(np.float64) @ T[:3, :3].T + T[:3, 3]
         above = end[:, 2] - ground.height_at(end[:, :2])
         kept = (above > _MIN_HEIGHT) & (above < _MAX_HEIGHT)
         number, end = number[kept], end[kept]
