@@ -174,6 +174,17 @@ def test_memory_is_bounded_by_the_radius(monkeypatch):
     assert max(sizes[20:]) < 1.2 * max(sizes[10:20])
 
 
+def test_fewer_points_find_the_same_way(room):
+    recording, truth, e = room
+    sweep = lidar_odometry.select_sweep(recording, e, 3)
+    assert len(lidar_odometry.downsample_sweep(sweep).points) > 300
+    assert len(lidar_odometry.downsample_sweep(sweep, 300).points) <= 300
+    found = lidar_odometry.register_sweeps(
+        recording, e, OdometryOptions(), _silent, 1, max_points=300
+    )
+    assert compute_absolute_errors(found.poses, truth).rmse < 0.02
+
+
 def test_2d_is_rejected(room):
     flat = replace(
         room[0], points=np.ascontiguousarray(room[0].points[:, :2]), T_base_sensor=np.eye(3)[None]

@@ -130,11 +130,11 @@ def initial_state(twist: Float | None = None) -> State:
     return constant_velocity.initial_state(twist, _FIRST_STD, _FIRST_STD)
 
 
-def downsample_sweep(sweep: Sweep) -> Sweep:
+def downsample_sweep(sweep: Sweep, max_points: int = _MAX_POINTS) -> Sweep:
     """The points that are registered: one per voxel, of larger voxels where too many are left."""
     edge = _POINT_SPACING
     kept = _core.voxel_downsample(sweep.points, sweep.weights, edge)
-    while len(kept) > _MAX_POINTS:
+    while len(kept) > max_points:
         edge *= _SPACING_FACTOR
         kept = _core.voxel_downsample(sweep.points, sweep.weights, edge)
     return sweep.select(kept)
@@ -151,6 +151,7 @@ def register_sweeps(
     options: OdometryOptions,
     progress: ScanProgress,
     threads: int,
+    max_points: int = _MAX_POINTS,
 ) -> LidarOdometry:
     """Registers every sweep to the local map, then adds it.
 
@@ -163,6 +164,7 @@ def register_sweeps(
         options: noise of odometry, where there is some.
         progress: called with the number of sweeps done and their total.
         threads: the result does not depend on it.
+        max_points: of a sweep that are registered.
 
     Raises:
         ValueError: the recording is not 3D.
@@ -174,7 +176,7 @@ def register_sweeps(
         none = np.zeros((0, 6, 6))
         return LidarOdometry(np.zeros((0, 4, 4)), none[:, 0], none, np.zeros(0))
     start = initial_state()
-    odometry = _SweepOdometry(recording, e, options, threads)
+    odometry = _SweepOdometry(recording, e, options, threads, max_points)
     for _ in range(_FIRST_ROUNDS if T > 1 else 0):
         found = odometry.run(start, min(_FIRST_SWEEPS, T), lambda *_: None)
         twist = _initial_twist(recording, found.poses)
@@ -201,6 +203,7 @@ class _SweepOdometry:
     e: NDArray[np.float32]
     options: OdometryOptions
     threads: int
+    max_points: int
 
     def run(self, state: State, n: int, progress: ScanProgress) -> LidarOdometry:
         """Registers the first n sweeps, from a state at the first one."""
@@ -212,9 +215,8 @@ class _SweepOdometry:
             sweep = select_sweep(self.recording, self.e, t)
             if t:
                 prior = self._predict(state, t)
-                state, explained[t] = register_sweep(
-                    local, downsample_sweep(sweep), prior, self.threads
-                )
+                points = downsample_sweep(sweep, self.max_points)
+                state, explained[t] = register_sweep(local, points, prior, self.threads)
             poses[t], twists[t] = state.T_map_base, state.twist
             covariance[t] = rotate_to_map(state)
             local.add(sweep.deskew(state.twist), sweep.weights, state.T_map_base)

@@ -31,6 +31,7 @@ _MAX_SPACING, _MAX_STEP = 0.5, 0.5  # s and m between the scans of a window
 _SCANS_PER_WINDOW = {2: 1500, 3: 480}  # of the recording, at that spacing
 _MAX_WINDOWS = 4
 _MAX_BEAMS = 20_000  # of a scan; of larger ones every so many beams are used
+_MAX_POINTS = 1500  # of these in 3D that are registered: more are not needed for a median
 
 
 class Window(NamedTuple):
@@ -129,7 +130,10 @@ def _rematch(window: Recording, poses: Float, threads: int) -> Float:
     if window.dimension == 2:
         found, normalize = _match_scans(window, e, options), se2.normalize
     else:
-        found = register_sweeps(window, e, options.odometry, _no_progress, threads).poses
+        odometry = register_sweeps(
+            window, e, options.odometry, _no_progress, threads, max_points=_MAX_POINTS
+        )
+        found = odometry.poses
         normalize = se3.normalize
     return normalize(poses[0] @ se2.inverse(found[0]) @ found)
 
