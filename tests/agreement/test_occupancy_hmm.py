@@ -65,6 +65,36 @@ def test_noise_widens_the_window(a_room, noise, least):
     assert plain.noise_std > least  # a window of two cells to each side would see less
 
 
+@pytest.mark.parametrize(("apart", "noise"), [(0.11, 0.008), (0.13, 0.015), (0.1, 0.04)])
+def test_both_faces_of_a_thin_wall(apart, noise):
+    """A window of five cells holds both; without noise as wide, each of them has a normal."""
+    rng = np.random.default_rng(4)
+    x = rng.uniform(-2.0, 2.0, 3000)
+    face = np.where(rng.random(len(x)) < 0.5, 0.033, 0.033 + apart)
+    sensor = np.column_stack([x, np.where(face < 0.1, -1.0, 1.5)])
+    y = face + noise * rng.standard_normal(len(x)) - sensor[:, 1]
+    points = np.column_stack([np.zeros(len(x)), y]).astype(np.float32)
+    alone = rng.uniform(-8.0, -6.0, (400, 2)).astype(np.float32)  # clutter
+    T = np.tile(np.eye(3), (len(x) + 400, 1, 1))
+    T[: len(x), :2, 2] = sensor
+    beams = np.concatenate([points, alone]), np.ones(len(T), bool), np.arange(len(T) + 1), T
+    found = []
+    for kernels in (_core, reference):
+        surface = kernels.SurfelMap2D(0.05)
+        surface.add_end_points(*beams)
+        surface.fit()
+        found.append(surface)
+    core, plain = found
+    of_core, of_plain = order(core), order(plain)
+    normals, expected = core.surfels()[2][of_core], plain.surfels()[2][of_plain]
+    np.testing.assert_array_equal(normals.any(axis=1), expected.any(axis=1))
+    np.testing.assert_allclose(np.abs(normals), np.abs(expected), atol=1e-4)
+    of_wall = core.surfels()[0][of_core][:, 1] > -10
+    if noise < 0.03:
+        assert normals[of_wall].any(axis=1).mean() > 0.9
+        assert np.abs(normals[of_wall & normals.any(axis=1), 1]).min() > 0.9
+
+
 def test_associate_beams(room, a_room):
     core, plain = room.surface(_core), room.surface(reference)
     other = a_room(9, room.beams.dimension, room.beams.resolution, 8, 60).beams

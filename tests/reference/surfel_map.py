@@ -1,6 +1,6 @@
 """Surfel map: one surfel per cell with returns, and the plane through its neighbourhood."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 
@@ -20,6 +20,8 @@ MAX_FLATNESS = 0.25  # of a plane: variance across it / variance along it
 OFF = 2.0  # standard deviations from the plane beyond which a cell is not part of it
 OFF_END = 3.0  # the same for a single end point, in noise_std
 MIN_OFF = 0.2  # cells, tolerance for smooth planes
+FACE = 1.0  # cells between the plane of one face of a thin wall and the cells that belong to it
+STRAY = 0.1  # share of the end points that are of neither face
 EXTENT = 0.5  # of the half width of uniformly spread end points that counts as plane
 
 
@@ -111,6 +113,9 @@ class SurfelMap:
             if 2 * len(across) >= sum(e.beams for e in self.fitted):
                 break
         self.noise_std = float(np.sort(across)[(len(across) - 1) // 2]) if across else 0.0
+        are_planar = 2 * len(across) >= sum(e.beams for e in self.fitted)
+        if self.dimension == 2 and are_planar and 2.0 * self.noise_std <= FACE * self.resolution:
+            self.fitted = [e if e.plane else self._fit_face(e, radius) for e in self.fitted]
 
     def surfels(self) -> tuple[Int, Float, Float, Float, Float, Int]:
         """cells, means, normals (E, D) each, off_plane, prominence, beams (E,) each."""
@@ -184,8 +189,7 @@ class SurfelMap:
     def _fit_plane(self, cell: Cell, window: list[Cell], radius: int) -> Plane | None:
         around = np.array([end for c in window for end in self.ends[c]])
         variance, axes = np.linalg.eigh(np.cov(around.T, bias=True))  # ascending
-        wide = variance[1] > MIN_EXTENT * (radius * self.resolution) ** 2
-        if not wide or variance[0] >= MAX_FLATNESS * variance[1]:
+        if not self._is_flat(variance, radius):
             return None
         normal, centre = axes[:, 0], around.mean(axis=0)
         apart = abs(float(normal @ (np.mean(self.ends[cell], axis=0) - centre)))
@@ -200,6 +204,37 @@ class SurfelMap:
             off_plane=float(normal @ (middle - centre)),
             across=float(np.sqrt(max(variance[0], 0.0))),
         )
+
+    def _is_extended(self, variance: Float, radius: int) -> bool:
+        return bool(variance[1] > MIN_EXTENT * (radius * self.resolution) ** 2)
+
+    def _is_flat(self, variance: Float, radius: int) -> bool:
+        flat = bool(variance[0] < MAX_FLATNESS * variance[1])
+        return flat and self._is_extended(variance, radius)
+
+    def _fit_face(self, surfel: Surfel, radius: int) -> Surfel:
+        """With the plane of the face that it is on, where a wall has another one in the window."""
+        window = [c for c in window_cells(surfel.cell, radius) if c in self.ends]
+        ends = np.array([end for c in window for end in self.ends[c]])
+        variance, axes = np.linalg.eigh(np.cov(ends.T, bias=True))
+        if not self._is_extended(variance, radius):
+            return surfel
+        normal = axes[:, 0]
+        offset = np.array([normal @ (np.mean(self.ends[c], axis=0) - surfel.mean) for c in window])
+        beams = np.array([len(self.ends[c]) for c in window])
+        near = np.abs(offset) <= FACE * self.resolution
+        strays, other = ~near & (offset < 0.0), ~near & (offset > 0.0)
+        if beams[strays].sum() > beams[other].sum():
+            strays, other = other, strays
+        if beams[strays].sum() > STRAY * beams.sum() or not other.any():
+            return surfel
+        far = np.array(
+            [end for c, of in zip(window, other, strict=True) if of for end in self.ends[c]]
+        )
+        if not self._is_flat(np.linalg.eigvalsh(np.cov(far.T, bias=True)), radius):
+            return surfel
+        own = [c for c, of in zip(window, near, strict=True) if of]
+        return replace(surfel, plane=self._fit_plane(surfel.cell, own, radius))
 
 
 def window_cells(cell: Cell, radius: int) -> list[Cell]:

@@ -1,5 +1,6 @@
 """When doors were open and shut, from the beams that ended on their leaves."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -24,6 +25,7 @@ INNER = (0.2, 0.8)  # the same where it is not known which end its hinge is at
 _GOES_ON = 0.3  # m beyond it
 _MIN_CROSSING, _MAX_SCANS = 3, 500  # scans that show it; scans that are looked at
 _MAX_DISTANCE = 10.0  # m from the sensor to a leaf: from farther off few beams cross it
+_ASIDE = 0.3  # m to either side of a leaf, where surface is its own or goes across
 _AROUND_NS = 5 * 10**8  # before and after a look, in which the leaf is where it was seen
 _RATIO = 2.0  # of that share to the one of the other position
 
@@ -187,6 +189,28 @@ def observe_passages(
     inner = ends[0] + np.array(INNER)[:, None] * (ends[1] - ends[0])
     scans = _find_crossing(inner, _thin(np.flatnonzero(is_near & ~seen)), recording, poses)
     return scans if len(scans) >= _MIN_CROSSING else scans[:0]
+
+
+def measure_slope(
+    ends: Float, looks: NDArray[np.int64], recording: Recording, poses: Float
+) -> float:
+    """Slope of the surface that was hit in some looks along a leaf, against it; NaN: none was.
+
+    Args:
+        ends, looks, recording, poses: see `observe_passages`.
+    """
+    first, last = looks[:, :1], looks[:, 1:]
+    seen = ((recording.stamp_ns >= first) & (recording.stamp_ns <= last)).any(axis=0)
+    beam, _ = _list_hits(_thin(np.flatnonzero(seen)), recording)
+    length = float(np.linalg.norm(ends[1] - ends[0]))
+    u = (ends[1] - ends[0]) / length
+    off = recording.end_points(beam, poses) - ends[0]
+    along, across = off @ u, _cross(u, off)
+    inner = (along > INNER[0] * length) & (along < INNER[1] * length) & (np.abs(across) < _ASIDE)
+    if np.count_nonzero(inner) < 2:
+        return math.nan
+    x, y = (one[inner] - one[inner].mean() for one in (along, across))
+    return float((x @ y) / max(x @ x, np.finfo(np.float64).tiny))
 
 
 def list_runs(

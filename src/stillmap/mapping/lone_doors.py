@@ -22,6 +22,7 @@ from stillmap.mapping.door_states import (
     INNER,
     find_hit_cells,
     list_runs,
+    measure_slope,
     observe_looks,
     observe_passages,
 )
@@ -41,6 +42,7 @@ Labels = NDArray[np.float32]
 _P_LEAF = 36.0 / 37.0  # 35 of 35 open ones in four simulated offices were; rule of succession
 _P_PASSED = 27.0 / 28.0  # the same of shut ones that beams passed: 26 of 26 in nine offices
 _MIN_MOVED = 0.8  # share of the inner part of the leaf that must be gone meanwhile
+_MAX_SLOPE = 0.1  # of the surface of a leaf against the doorway; .04 at most of these 26
 _MIN_P_LISTED = 0.1  # that what fills a doorway is a door at all
 _LOOK = 0.2  # s between scans whose beams show what is free
 _THREADS = 2  # that count beams: every one has a heap of its own
@@ -142,7 +144,8 @@ def _find_passages(
 ) -> tuple[LoneLeaf, NDArray[np.intp]]:
     """A shut leaf without what is hit while beams pass through it, and the scans of these.
 
-    What is hit then is the edge of a wall; where little else is left, it is no leaf that moved.
+    What is hit then is the edge of a wall; where little else is left, it is no leaf that moved. Nor
+    is it one if the surface that the looks saw does not lie along the doorway.
     """
     ends = resolution * (leaf.hinge + 0.5 + np.outer([0.0, leaf.length], leaf.shut))
     scans = observe_passages(ends, looks, recording, poses)
@@ -151,6 +154,8 @@ def _find_passages(
     along = np.round((moved.cells - leaf.hinge) @ leaf.shut)
     inner = np.arange(math.ceil(INNER[0] * leaf.length), INNER[1] * leaf.length)
     if np.isin(inner, along).mean() < _MIN_MOVED:
+        return leaf, scans[:0]
+    if not abs(measure_slope(ends, looks, recording, poses)) <= _MAX_SLOPE:
         return leaf, scans[:0]
     return moved, scans
 

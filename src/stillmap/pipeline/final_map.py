@@ -37,6 +37,8 @@ from stillmap.tracking import MovingObject, track_objects
 from stillmap.tracking.motion_evidence import apply_motion_evidence
 from stillmap.tracking.objects_3d import track_objects_3d
 
+_MIN_TRAVEL = 1.5  # m: leaves of doors swing less far
+
 
 @dataclass(frozen=True, eq=False)
 class Maps(ShortRepr):
@@ -244,11 +246,19 @@ def find_objects(
     changed = find_changed_object_beams(
         deskewed, poses, p_static, changes, doors, maps.filtered.resolution
     )
-    moved = [one for one in objects if 2 * _count_common(one.beams, changed) <= len(one.beams)]
+    moved = [one for one in objects if not _is_change(one, changed, deskewed)]
     return [dataclasses.replace(one, id=k) for k, one in enumerate(moved)]
 
 
-def _count_common(one: NDArray[np.intp], other: NDArray[np.intp]) -> int:
-    """Number of values that two sorted arrays have in common."""
-    at = np.searchsorted(other, one)
-    return int(np.count_nonzero(one[at < len(other)] == other[at[at < len(other)]]))
+def _is_change(one: MovingObject, changed: NDArray[np.intp], recording: Recording) -> bool:
+    """Whether an object is what came, left or swung, and no mover that stood there for long.
+
+    Most of its beams are among `changed`, rising, and where most of a scan's are not, it is near.
+    """
+    is_changed = np.isin(one.beams, changed, assume_unique=True)
+    if 2 * np.count_nonzero(is_changed) <= len(one.beams):
+        return False
+    scan, of = np.unique(recording.scans_of(one.beams), return_inverse=True)
+    elsewhere = scan[2 * np.bincount(of, is_changed) < np.bincount(of)]
+    xy = one.xy[np.isin(one.scan, elsewhere)]
+    return not len(xy) or float(np.linalg.norm(np.ptp(xy, axis=0))) < _MIN_TRAVEL

@@ -1,6 +1,7 @@
 // Surfels and the sums over end points from which they are fitted.
 #pragma once
 
+#include <Eigen/Eigenvalues>
 #include <algorithm>
 #include <array>
 #include <limits>
@@ -90,6 +91,43 @@ struct WindowMoments {
   Vec<D> mean() const { return first / count; }
   // Its lower triangle.
   Square covariance() const { return second / count - mean() * mean().transpose(); }
+};
+
+// Principal axes of the end points in a window, whose radius is in cells.
+template <int D>
+struct PrincipalAxes {
+  using Square = Eigen::Matrix<double, D, D>;
+
+  Vec<D> variance = Vec<D>::Zero(), normal = Vec<D>::Zero();  // ascending; of the first one
+  bool is_extended = false, is_flat = false;
+
+  PrincipalAxes(const WindowMoments<D>& moments, int radius) {
+    const double min_variance = 0.15 * radius * radius;  // over 3 of 5 cells
+    const Square covariance = moments.covariance();
+    if (max_second_variance(covariance) < min_variance) return;
+    const Eigen::SelfAdjointEigenSolver<Square> eigen(covariance);  // of the lower triangle
+    variance = eigen.eigenvalues().cwiseMax(0.0);
+    normal = eigen.eigenvectors().col(0);
+    is_extended = variance[1] > min_variance;
+    is_flat = is_extended && variance[0] < 0.25 * variance[1];
+  }
+
+ private:
+  // Upper bound of the second smallest eigenvalue, which is cheaper than the eigenvalues: in 3D,
+  // the product of the larger two is at most the sum of the principal minors of order two, and the
+  // largest is at least a third of the trace.
+  static double max_second_variance(const Square& lower) {
+    if constexpr (D == 2) {
+      return std::numeric_limits<double>::infinity();
+    } else {
+      constexpr double rounding = 1e-6;  // relative to variances, far more than its errors
+      const auto minor = [&](int i, int j) {
+        return lower(i, i) * lower(j, j) - lower(j, i) * lower(j, i);
+      };
+      const double trace = lower.trace();
+      return 3.0 * (minor(0, 1) + minor(0, 2) + minor(1, 2)) / trace + rounding * (1.0 + trace);
+    }
+  }
 };
 
 }  // namespace stillmap

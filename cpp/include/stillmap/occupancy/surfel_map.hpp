@@ -2,7 +2,6 @@
 // the surface around it and the standard deviation of end points across surfaces.
 #pragma once
 
-#include <Eigen/Eigenvalues>
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -36,6 +35,11 @@ class SurfelMap : public SurfaceIndex<D> {
   static constexpr double kOffPlaneSigmas = 2.0;  // of plane noise, for the mean of a cell
   static constexpr double kEndPointSigmas = 3.0;  // of noise_std, for a single end point
   static constexpr double kMinOffPlane = 0.2;     // cells: closer points are on the plane
+  // Both faces of a thin wall may lie in one window, in 2D, where cells are small; cells of one
+  // face are at most that far from it.
+  static constexpr bool kWallsHaveTwoFaces = D == 2;
+  static constexpr double kMaxFaceOffset = 1.0;
+  static constexpr double kMaxStray = 0.1;  // share of the beams that are of neither face
 
   using Index = SurfaceIndex<D>;
   using Block = typename Index::Block;
@@ -106,8 +110,12 @@ class SurfelMap : public SurfaceIndex<D> {
     for (size_t k = 0; k < size(); ++k) surfels_[k].mean = mean_of(sums_[k]);
     // noise as large as the window hides every wall: enlarge the window
     const RowMasks<D> masks(*this);
-    for (const int radius : {2, 4, 6})
-      if (fit_normals(radius, masks, threads) >= 0.5) break;
+    for (const int radius : {2, 4, 6}) {
+      const bool are_planar = fit_normals(radius, masks, threads) >= 0.5;
+      if (kWallsHaveTwoFaces && are_planar && 2.0 * noise_std_ <= kMaxFaceOffset)
+        fit_faces(radius, masks, threads);
+      if (are_planar) break;
+    }
     cells_.reserve(size());
     beam_counts_.reserve(size());
     if (has_time_bins_) hit_spans_.reserve(size());
@@ -191,8 +199,6 @@ class SurfelMap : public SurfaceIndex<D> {
     return mean;
   }
 
-  using Square = Eigen::Matrix<double, D, D>;
-
   // Fits planes to the end points within `radius` cells of each surfel by principal component
   // analysis; returns the share of beams on planes.
   double fit_normals(int radius, const RowMasks<D>& masks, int threads) {
@@ -222,61 +228,84 @@ class SurfelMap : public SurfaceIndex<D> {
   NormalFit fit_normals(int radius, const RowMasks<D>& masks, size_t first_surfel,
                         size_t last_surfel) {
     NormalFit fit_result;
-    auto& [n_beams, n_planar, deviations] = fit_result;
     WindowQuery<D> query(*this, masks);
     const CellRows<D> window = window_rows<D>(radius, true);
     for (size_t k = first_surfel; k < last_surfel; ++k) {
-      WindowMoments<D> moments;
-      query.for_each(sums_[k].cell, window, [&](int32_t neighbour) {
-        moments.add(sums_[static_cast<size_t>(neighbour)], sums_[k].cell);
-      });
+      const WindowMoments<D> moments = moments_around(k, query, window);
       Surfel<D>& surfel = surfels_[k];
       surfel.normal.setZero();
       surfel.centre_to_plane = 0.0;
       surfel.centre = surfel.mean;
       surfel.half_extent = 0.5;
       surfel.prominence = static_cast<double>(sums_[k].count) / moments.max_count;
-      n_beams += sums_[k].count;
-      const double min_variance = 0.15 * radius * radius;  // over 3 of 5 cells
-      const Square covariance = moments.covariance();
-      if (max_second_variance(covariance) < min_variance) continue;
-      const Eigen::SelfAdjointEigenSolver<Square> eigen(covariance);  // of the lower triangle
-      const Vec<D> variance = eigen.eigenvalues().cwiseMax(0.0);      // ascending
-      const bool is_extended = variance[1] > min_variance;
-      if (!is_extended || variance[0] >= 0.25 * variance[1]) continue;
-      const Vec<D> normal = eigen.eigenvectors().col(0);
-      const Vec<D> plane_point = sums_[k].cell.template cast<double>() + moments.mean();
+      fit_result.n_beams += sums_[k].count;
+      const PrincipalAxes<D> axes(moments, radius);
+      if (!axes.is_flat) continue;
       // feet and wheels are not part of the ground below them
-      const double distance = std::abs(normal.dot(surfel.mean - plane_point));
+      const double distance = std::abs(axes.normal.dot(surfel.mean - centre_of(moments, k)));
       if (kObjectsStandOnSurfaces && distance > kMinOffPlane &&
-          distance * distance > kOffPlaneSigmas * kOffPlaneSigmas * variance[0])
+          distance * distance > kOffPlaneSigmas * kOffPlaneSigmas * axes.variance[0])
         continue;
-      n_planar += sums_[k].count;
-      deviations.emplace_back(std::sqrt(variance[0]), sums_[k].count);
-      surfel.normal = normal;
-      surfel.centre = plane_point;
-      // uniformly moments points reach sqrt(3) standard deviations; take the inner half
-      surfel.half_extent = 0.5 * std::sqrt(3.0 * variance[1]);
-      const Vec<D> centre = Vec<D>::Constant(0.5);  // from the cell's corner
-      surfel.centre_to_plane = surfel.normal.dot(centre - moments.mean());
+      fit_result.n_planar += sums_[k].count;
+      fit_result.deviations.emplace_back(std::sqrt(axes.variance[0]), sums_[k].count);
+      set_plane(k, moments, axes);
     }
     return fit_result;
   }
 
-  // Upper bound of the second smallest eigenvalue, which is cheaper than the eigenvalues: in 3D,
-  // the product of the larger two is at most the sum of the principal minors of order two, and the
-  // largest is at least a third of the trace.
-  static double max_second_variance(const Square& lower) {
-    if constexpr (D == 2) {
-      return std::numeric_limits<double>::infinity();
-    } else {
-      constexpr double rounding = 1e-6;  // relative to variances, far more than its errors
-      const auto minor = [&](int i, int j) {
-        return lower(i, i) * lower(j, j) - lower(j, i) * lower(j, i);
-      };
-      const double trace = lower.trace();
-      return 3.0 * (minor(0, 1) + minor(0, 2) + minor(1, 2)) / trace + rounding * (1.0 + trace);
-    }
+  // Fits planes to the faces of walls that are so thin that both of them lie in one window.
+  void fit_faces(int radius, const RowMasks<D>& masks, int threads) {
+    parallel_for_ranges(split_evenly(size(), threads), [&](size_t, size_t first, size_t last) {
+      WindowQuery<D> query(*this, masks);
+      const CellRows<D> window = window_rows<D>(radius, true);
+      for (size_t k = first; k < last; ++k) {
+        if (!surfels_[k].normal.isZero(0.0)) continue;
+        const PrincipalAxes<D> both(moments_around(k, query, window), radius);
+        if (!both.is_extended) continue;
+        const auto [own, other, strays] = split_faces(k, both.normal, query, window);
+        const PrincipalAxes<D> axes(own, radius);
+        if (axes.is_flat && other.count > 0.0 && PrincipalAxes<D>(other, radius).is_flat &&
+            strays.count <= kMaxStray * (own.count + other.count + strays.count))
+          set_plane(k, own, axes);
+      }
+    });
+  }
+
+  // The face that a cell is on, the one with most beams to either side of it, and what is left.
+  std::array<WindowMoments<D>, 3> split_faces(size_t k, const Vec<D>& normal, WindowQuery<D>& query,
+                                              const CellRows<D>& window) const {
+    std::array<WindowMoments<D>, 3> faces;
+    query.for_each(sums_[k].cell, window, [&](int32_t neighbour) {
+      const auto n = static_cast<size_t>(neighbour);
+      const double offset = normal.dot(surfels_[n].mean - surfels_[k].mean);
+      const size_t side = std::abs(offset) <= kMaxFaceOffset ? 0 : offset > 0.0 ? 1 : 2;
+      faces[side].add(sums_[n], sums_[k].cell);
+    });
+    if (faces[2].count > faces[1].count) std::swap(faces[1], faces[2]);
+    return faces;
+  }
+
+  WindowMoments<D> moments_around(size_t k, WindowQuery<D>& query,
+                                  const CellRows<D>& window) const {
+    WindowMoments<D> moments;
+    query.for_each(sums_[k].cell, window, [&](int32_t neighbour) {
+      moments.add(sums_[static_cast<size_t>(neighbour)], sums_[k].cell);
+    });
+    return moments;
+  }
+
+  Vec<D> centre_of(const WindowMoments<D>& moments, size_t k) const {
+    return sums_[k].cell.template cast<double>() + moments.mean();
+  }
+
+  void set_plane(size_t k, const WindowMoments<D>& moments, const PrincipalAxes<D>& axes) {
+    Surfel<D>& surfel = surfels_[k];
+    surfel.normal = axes.normal;
+    surfel.centre = centre_of(moments, k);
+    // uniformly spread points reach sqrt(3) standard deviations; take the inner half
+    surfel.half_extent = 0.5 * std::sqrt(3.0 * axes.variance[1]);
+    const Vec<D> centre = Vec<D>::Constant(0.5);  // from the cell's corner
+    surfel.centre_to_plane = surfel.normal.dot(centre - moments.mean());
   }
 
   static double weighted_median(std::vector<std::pair<double, int64_t>>& values) {
