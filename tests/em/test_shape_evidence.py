@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from stillmap import _core, em
-from stillmap.em.final_labels import _MAX_RAISE, _RAISED_FROM
 from stillmap.em.scan_segments import N_SEGMENT_TYPES
 from stillmap.em.shape_evidence import (
     _MAX_LOG_RATIO,
@@ -54,29 +53,16 @@ def log_loss(p, static):
 
 def test_labels_are_better_than_by_history_alone(crowd, found, by_history):
     hit, static = crowd.recording.hit, crowd.truth.static[crowd.recording.hit]
-    assert log_loss(found[hit], static) < 0.8 * log_loss(by_history[hit], static)
+    assert log_loss(found[hit], static) < 0.98 * log_loss(by_history[hit], static)
     wrong = [np.mean((p[hit] >= 0.5) != static) for p in (found, by_history)]
     assert wrong[0] < wrong[1]
 
 
-def test_shapes_raise_p_static_only_where_history_leaves_it_open(crowd, found, by_history):
-    """Leaves of doors, which were seen to change, have the shape of walls."""
-    last, before = found[crowd.recording.hit], by_history[crowd.recording.hit]
-    assert np.mean(last < before) > 0.01
-    raised = last > before
-    assert np.mean(raised) > 0.01
-    assert before[raised].min() > _RAISED_FROM
-    odds = [p[raised].astype(float) / (1.0 - p[raised]) for p in (last, before)]
-    sure = before[raised] > 0.9999  # single precision
-    assert (odds[0] <= 1.01 * _MAX_RAISE * odds[1])[~sure].all()
-    assert not ((last >= 0.5) & (before < 0.5)).any()
-
-
-def test_walls_seen_for_a_moment_are_walls(crowd, found, by_history):
+def test_shapes_never_raise_p_static(crowd, found, by_history):
+    """Leaves of doors have the shape of walls."""
     hit = crowd.recording.hit
-    walls = hit & crowd.truth.static & (by_history > 0.6) & (by_history < 0.95)
-    assert walls.sum() > 200
-    assert np.mean(1.0 - found[walls]) < 0.6 * np.mean(1.0 - by_history[walls])
+    assert (found[hit] <= by_history[hit]).all()
+    assert np.mean(found[hit] < by_history[hit]) > 0.01
 
 
 def test_people_seen_for_a_moment_are_no_obstacles(crowd, found, by_history):

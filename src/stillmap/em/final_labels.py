@@ -36,12 +36,6 @@ _CHANGE_CLASSES = replace(  # and those of labels
     half_time_tau=(8.0, 24.0),
 )
 _SHAPE_ROUNDS = 3  # shapes are learned from labels, which follow from the shapes before
-# P(static) by history from which on shapes may raise it, and from which on they do so fully: what
-# was seen to change may be the leaf of a door, which has the shape of a wall
-_RAISED_FROM, _RAISED_FULLY = 0.6, 0.9
-_MAX_RAISE = (
-    5.0  # factor of the odds of static: a leaf that was not seen to swing looks like a wall
-)
 
 
 def final_e_step(
@@ -57,7 +51,7 @@ def final_e_step(
 
     Args:
         recording, poses, resolution, options, threads: see `occupancy_hmm.e_step`.
-        with_shapes: use the shapes of surfels, in 2D; in 3D there are none.
+        with_shapes: lower P(static) by the shapes of surfels, in 2D; in 3D there are none.
 
     Returns:
         labels; histories of the same cells, None without `change_detection`.
@@ -93,20 +87,12 @@ def _fit_with_shapes(
     fit: ClassFit,
     shapes: ShapeEvidence,
 ) -> ClassFit:
-    """Weights of the classes and frequencies of the shapes, fitted by turns."""
+    """Weights of the classes and frequencies of the shapes, fitted by turns.
+
+    P(static) is at most that by history: leaves of doors have the shape of walls.
+    """
     by_history = fit.p_static
     for _ in range(_SHAPE_ROUNDS):
         shapes.fit(fit.p_static, fit.p_view_dependent)
         fit = fit_classes(observations, classes, options, shapes.factors)
-    return fit._replace(p_static=_limit_raise(fit.p_static, by_history))
-
-
-def _limit_raise(
-    p_static: NDArray[np.float32], by_history: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    """P(static) (E,) with shapes, raised only as far as history leaves it open. No label flips."""
-    before = by_history.astype(np.float64)
-    most = _MAX_RAISE * before / (1.0 + (_MAX_RAISE - 1.0) * before)
-    share = np.clip((before - _RAISED_FROM) / (_RAISED_FULLY - _RAISED_FROM), 0.0, 1.0)
-    raised = before + share * (np.minimum(p_static, most) - before)
-    return np.where(p_static > before, raised, p_static).astype(np.float32)
+    return fit._replace(p_static=np.minimum(fit.p_static, by_history))
