@@ -251,9 +251,10 @@ def find_objects(
 
 
 def _is_change(one: MovingObject, changed: NDArray[np.intp], recording: Recording) -> bool:
-    """Whether an object is what came, left or swung, and no mover that stood there for long.
+    """True if an object is a listed change or the leaf of a door, not a mover that stood there.
 
-    Most of its beams are among `changed`, rising, and where most of a scan's are not, it is near.
+    More than half of its beams are among `changed` (rising), and in the scans in which they are
+    not, its path extends over less than `_MIN_TRAVEL`.
     """
     is_changed = np.isin(one.beams, changed, assume_unique=True)
     if 2 * np.count_nonzero(is_changed) <= len(one.beams):
