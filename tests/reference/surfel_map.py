@@ -81,7 +81,6 @@ class SurfelMap:
         self.resolution = resolution
         self.dimension = dimension
         self.ends: dict[Cell, list[Float]] = {}
-        self.ways: dict[Cell, list[Float]] = {}  # of the beams that ended there
         self.time_bins: dict[Cell, list[int]] = {}
         self.fitted: list[Surfel] = []
         self.noise_std = 0.0
@@ -103,7 +102,6 @@ class SurfelMap:
             if beam.hit:
                 cell = self._end_cell(beam)
                 self.ends.setdefault(cell, []).append(beam.end)
-                self.ways.setdefault(cell, []).append(beam.end - beam.start)
                 if time_bin is not None:
                     self.time_bins.setdefault(cell, []).append(int(np.asarray(time_bin)[beam.scan]))
 
@@ -236,17 +234,7 @@ class SurfelMap:
         if not self._is_flat(np.linalg.eigvalsh(np.cov(far.T, bias=True)), radius):
             return surfel
         own = [c for c, of in zip(window, near, strict=True) if of]
-        plane = self._fit_plane(surfel.cell, own, radius)
-        if plane is None:
-            return surfel
-        beyond = [c for c, of in zip(window, other, strict=True) if of]
-        views = [self._view(cells) @ plane.normal for cells in (own, beyond)]
-        return replace(surfel, plane=plane) if views[0] * views[1] < 0.0 else surfel
-
-    def _view(self, cells: list[Cell]) -> Float:
-        """Sum of the unit vectors of the beams that ended in some cells."""
-        ways = np.array([way for c in cells for way in self.ways[c]])
-        return np.asarray((ways / np.linalg.norm(ways, axis=1, keepdims=True)).sum(axis=0))
+        return replace(surfel, plane=self._fit_plane(surfel.cell, own, radius))
 
 
 def window_cells(cell: Cell, radius: int) -> list[Cell]:

@@ -39,17 +39,14 @@ struct TimeSpan {
 template <int D>
 struct EndPointSums {
   static constexpr int kProducts = D * (D + 1) / 2;
-  static constexpr bool kHasView = D == 2;
 
   Cell<D> cell;
   int64_t count = 0;
-  std::array<Fixed, D> first{};                // sum of x = end point - cell corner
-  std::array<Fixed, kProducts> second{};       // sum of x x^T, upper triangle by rows
-  std::array<Fixed, kHasView ? D : 0> view{};  // sum of the unit vectors of the beams
+  std::array<Fixed, D> first{};           // sum of x = end point - cell corner
+  std::array<Fixed, kProducts> second{};  // sum of x x^T, upper triangle by rows
   TimeSpan hit_span;
 
-  // An end point, and where the beam started, both in units of cells.
-  void add(const Vec<D>& end, const Vec<D>& start) {
+  void add(const Vec<D>& end) {
     const Vec<D> x = end - cell.template cast<double>();
     ++count;
     size_t product = 0;
@@ -57,17 +54,12 @@ struct EndPointSums {
       first[static_cast<size_t>(i)] += to_fixed(x[i]);
       for (int j = i; j < D; ++j) second[product++] += to_fixed(x[i] * x[j]);
     }
-    if constexpr (kHasView) {
-      const Vec<D> direction = (end - start).normalized();  // zero where both are the same
-      for (int d = 0; d < D; ++d) view[static_cast<size_t>(d)] += to_fixed(direction[d]);
-    }
   }
   // Adds the sums over other end points in the same cell.
   void add(const EndPointSums& other) {
     count += other.count;
     for (size_t i = 0; i < first.size(); ++i) first[i] += other.first[i];
     for (size_t i = 0; i < second.size(); ++i) second[i] += other.second[i];
-    for (size_t i = 0; i < view.size(); ++i) view[i] += other.view[i];
     hit_span.first = std::min(hit_span.first, other.hit_span.first);
     hit_span.last = std::max(hit_span.last, other.hit_span.last);
   }
@@ -81,7 +73,6 @@ struct WindowMoments {
   double count = 0.0, max_count = 0.0;  // total; largest of any cell
   Vec<D> first = Vec<D>::Zero();
   Square second = Square::Zero();  // lower triangle
-  Vec<D> view = Vec<D>::Zero();    // see EndPointSums; zero if it has none
 
   void add(const EndPointSums<D>& s, const Cell<D>& centre) {
     const Vec<D> corner = (s.cell - centre).template cast<double>();
@@ -96,7 +87,6 @@ struct WindowMoments {
       for (int i = j; i < D; ++i)
         second(i, j) += from_fixed(s.second[product++]) + corner[i] * sum[j] + sum[i] * corner[j] +
                         n * corner[i] * corner[j];
-    for (size_t i = 0; i < s.view.size(); ++i) view[static_cast<int>(i)] += from_fixed(s.view[i]);
   }
   Vec<D> mean() const { return first / count; }
   // Its lower triangle.

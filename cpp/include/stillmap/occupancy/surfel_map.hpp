@@ -175,7 +175,7 @@ class SurfelMap : public SurfaceIndex<D> {
       if (!scans.hit[n]) return;
       const Vec<D> end = beam_end<D>(pose, scans.points + n * D, resolution_);
       EndPointSums<D>& sums = sums_at(cell_of<D>(end));
-      sums.add(end, pose.t / resolution_);
+      sums.add(end);
       if (time_bin) sums.hit_span.extend(time_bin[t]);
     });
   }
@@ -253,8 +253,7 @@ class SurfelMap : public SurfaceIndex<D> {
     return fit_result;
   }
 
-  // Fits planes to the faces of walls that are so thin that both of them lie in one window. They
-  // are seen from opposite sides; a leaf of a door beside a wall is seen from the same one.
+  // Fits planes to the faces of walls that are so thin that both of them lie in one window.
   void fit_faces(int radius, const RowMasks<D>& masks, int threads) {
     parallel_for_ranges(split_evenly(size(), threads), [&](size_t, size_t first, size_t last) {
       WindowQuery<D> query(*this, masks);
@@ -266,8 +265,7 @@ class SurfelMap : public SurfaceIndex<D> {
         const auto [own, other, strays] = split_faces(k, both.normal, query, window);
         const PrincipalAxes<D> axes(own, radius);
         if (axes.is_flat && other.count > 0.0 && PrincipalAxes<D>(other, radius).is_flat &&
-            strays.count <= kMaxStray * (own.count + other.count + strays.count) &&
-            own.view.dot(axes.normal) * other.view.dot(axes.normal) < 0.0)
+            strays.count <= kMaxStray * (own.count + other.count + strays.count))
           set_plane(k, own, axes);
       }
     });
