@@ -65,34 +65,67 @@ def test_noise_widens_the_window(a_room, noise, least):
     assert plain.noise_std > least  # a window of two cells to each side would see less
 
 
-@pytest.mark.parametrize(("apart", "noise"), [(0.11, 0.008), (0.13, 0.015), (0.1, 0.04)])
-def test_both_faces_of_a_thin_wall(apart, noise):
-    """A window of five cells holds both; without noise as wide, each of them has a normal."""
+def see_both_faces(apart, noise, y_other=1.5, dated=None):
+    """Surfel maps (of the kernel, plain) of a thin wall along x, of clutter and of plain walls.
+
+    One face is seen from y = -1, the other one from `y_other`; `dated`: time bins, given x. So much
+    is on plain walls that windows stay small.
+    """
     rng = np.random.default_rng(4)
     x = rng.uniform(-2.0, 2.0, 3000)
     face = np.where(rng.random(len(x)) < 0.5, 0.033, 0.033 + apart)
-    sensor = np.column_stack([x, np.where(face < 0.1, -1.0, 1.5)])
+    sensor = np.column_stack([x, np.where(face < 0.1, -1.0, y_other)])
     y = face + noise * rng.standard_normal(len(x)) - sensor[:, 1]
     points = np.column_stack([np.zeros(len(x)), y]).astype(np.float32)
-    alone = rng.uniform(-8.0, -6.0, (400, 2)).astype(np.float32)  # clutter
-    T = np.tile(np.eye(3), (len(x) + 400, 1, 1))
+    clutter = rng.uniform(-8.0, -6.0, (400, 2))
+    plain = np.column_stack([rng.uniform(-6.0, 6.0, 5000), 5.0 + noise * rng.standard_normal(5000)])
+    others = np.concatenate([clutter, plain]).astype(np.float32)
+    T = np.tile(np.eye(3), (len(x) + len(others), 1, 1))
     T[: len(x), :2, 2] = sensor
-    beams = np.concatenate([points, alone]), np.ones(len(T), bool), np.arange(len(T) + 1), T
+    beams = np.concatenate([points, others]), np.ones(len(T), bool), np.arange(len(T) + 1), T
+    time_bin = None
+    if dated is not None:
+        time_bin = np.concatenate([dated(x), np.zeros(len(others))]).astype(np.int64)
     found = []
     for kernels in (_core, reference):
         surface = kernels.SurfelMap2D(0.05)
-        surface.add_end_points(*beams)
+        surface.add_end_points(*beams, time_bin)
         surface.fit()
         found.append(surface)
-    core, plain = found
+    return found
+
+
+def compare_normals(core, plain):
+    """(N, 2) normals of the surfels of the face at y = 0.033, 0 where there is none."""
     of_core, of_plain = order(core), order(plain)
     normals, expected = core.surfels()[2][of_core], plain.surfels()[2][of_plain]
     np.testing.assert_array_equal(normals.any(axis=1), expected.any(axis=1))
     np.testing.assert_allclose(np.abs(normals), np.abs(expected), atol=1e-4)
-    of_wall = core.surfels()[0][of_core][:, 1] > -10
+    return normals[core.surfels()[0][of_core][:, 1] == 0]
+
+
+@pytest.mark.parametrize(("apart", "noise"), [(0.11, 0.008), (0.13, 0.015), (0.1, 0.04)])
+def test_both_faces_of_a_thin_wall(apart, noise):
+    """A window of five cells holds both; without noise as wide, each of them has a normal."""
+    normals = compare_normals(*see_both_faces(apart, noise))
+    has_normal = normals.any(axis=1)
     if noise < 0.03:
-        assert normals[of_wall].any(axis=1).mean() > 0.9
-        assert np.abs(normals[of_wall & normals.any(axis=1), 1]).min() > 0.9
+        assert has_normal.mean() > 0.9
+        assert (np.abs(normals[has_normal, 1]) > 0.9).mean() > 0.95
+
+
+@pytest.mark.parametrize(
+    ("dated", "least", "most"),
+    [
+        (lambda x: np.arange(len(x)) % 100, 0.9, 1.0),  # in view all the time
+        (lambda x: 10.0 * (x + 2.0), 0.0, 0.1),  # feet of somebody who walks by
+        (None, 0.0, 0.1),
+    ],
+)
+def test_two_faces_that_are_seen_from_one_side(dated, least, most):
+    """They are those of a wall if all of their cells are hit for about as long."""
+    normals = compare_normals(*see_both_faces(0.11, 0.008, y_other=-1.0, dated=dated))
+    assert least <= normals.any(axis=1).mean() <= most
 
 
 def test_associate_beams(room, a_room):

@@ -72,9 +72,9 @@ def test_a_place_grows_and_keeps_its_frame(call, flat_days, flat_place, tmp_path
     assert [one["first_scan"] for one in new] == [0, 100, 200]
     for one, other in zip(old, new, strict=False):
         assert one["input"] == other["input"]
-    first, other_first = (sessions[0]["T_place_session"] for sessions in (old, new))
-    np.testing.assert_allclose(first, other_first, atol=1e-9)
-    # a third day says where the second one lies, too: by 7 mm in the median of 15 seeds
+        for row, other_row in zip(one["T_place_session"], other["T_place_session"], strict=True):
+            assert row == pytest.approx(other_row, abs=0.01)
+    # what the third day says about the second one brings it no farther from the truth
     before, after = (
         measure_errors(one, flat_days, "2") for one in (flat_place, tmp_path / "grown")
     )

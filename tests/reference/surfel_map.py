@@ -22,6 +22,7 @@ OFF_END = 3.0  # the same for a single end point, in noise_std
 MIN_OFF = 0.2  # cells, tolerance for smooth planes
 FACE = 1.0  # cells between the plane of one face of a thin wall and the cells that belong to it
 STRAY = 0.1  # share of the end points that are of neither face
+LASTING = 0.5  # mean hit span of a cell of a face over that of the face
 EXTENT = 0.5  # of the half width of uniformly spread end points that counts as plane
 
 
@@ -81,6 +82,7 @@ class SurfelMap:
         self.resolution = resolution
         self.dimension = dimension
         self.ends: dict[Cell, list[Float]] = {}
+        self.ways: dict[Cell, list[Float]] = {}  # of the beams that ended there
         self.time_bins: dict[Cell, list[int]] = {}
         self.fitted: list[Surfel] = []
         self.noise_std = 0.0
@@ -102,6 +104,7 @@ class SurfelMap:
             if beam.hit:
                 cell = self._end_cell(beam)
                 self.ends.setdefault(cell, []).append(beam.end)
+                self.ways.setdefault(cell, []).append(beam.end - beam.start)
                 if time_bin is not None:
                     self.time_bins.setdefault(cell, []).append(int(np.asarray(time_bin)[beam.scan]))
 
@@ -234,7 +237,27 @@ class SurfelMap:
         if not self._is_flat(np.linalg.eigvalsh(np.cov(far.T, bias=True)), radius):
             return surfel
         own = [c for c, of in zip(window, near, strict=True) if of]
-        return replace(surfel, plane=self._fit_plane(surfel.cell, own, radius))
+        plane = self._fit_plane(surfel.cell, own, radius)
+        if plane is None:
+            return surfel
+        beyond = [c for c, of in zip(window, other, strict=True) if of]
+        views = [self._view(cells) @ plane.normal for cells in (own, beyond)]
+        lasts = min(self._span_share(cells) for cells in (own, beyond)) >= LASTING
+        is_face = views[0] * views[1] < 0.0 or lasts
+        return replace(surfel, plane=plane) if is_face else surfel
+
+    def _view(self, cells: list[Cell]) -> Float:
+        """Sum of the unit vectors of the beams that ended in some cells."""
+        ways = np.array([way for c in cells for way in self.ways[c]])
+        return np.asarray((ways / np.linalg.norm(ways, axis=1, keepdims=True)).sum(axis=0))
+
+    def _span_share(self, cells: list[Cell]) -> float:
+        """Mean hit span of some cells over that of all of them; 0 without time bins."""
+        bins = [self.time_bins[c] for c in cells if c in self.time_bins]
+        if not bins:
+            return 0.0
+        spans = [max(one) - min(one) + 1 for one in bins]
+        return float(np.mean(spans)) / (max(map(max, bins)) - min(map(min, bins)) + 1)
 
 
 def window_cells(cell: Cell, radius: int) -> list[Cell]:

@@ -152,7 +152,7 @@ def collect_observations(
         changes: parameters of the change HMM, which runs along; None: it does not.
         with_surroundings: also count what is hit around each surfel while it is missed; 3D only.
     """
-    time_bin = time_bin_index(recording, options.time_bin) if recording.dimension == 3 else None
+    time_bin = time_bin_index(recording, options.time_bin)
     surfel_map = build_surfel_map(recording, poses, resolution, threads, time_bin)
     hmm = make_hmm(surfel_map, options, classes, threads)
     trust, used_trust, blind = _estimate_trust(recording, poses, hmm, threads)

@@ -32,6 +32,11 @@ struct TimeSpan {
     first = std::min(first, static_cast<int32_t>(time_bin));
     last = std::max(last, static_cast<int32_t>(time_bin));
   }
+  void extend(const TimeSpan& other) {
+    first = std::min(first, other.first);
+    last = std::max(last, other.last);
+  }
+  bool empty() const { return last < first; }
   int64_t n_bins() const { return int64_t{last} - first + 1; }
 };
 
@@ -39,14 +44,17 @@ struct TimeSpan {
 template <int D>
 struct EndPointSums {
   static constexpr int kProducts = D * (D + 1) / 2;
+  static constexpr bool kHasFaces = D == 2;  // see SurfelMap::fit_faces
 
   Cell<D> cell;
   int64_t count = 0;
-  std::array<Fixed, D> first{};           // sum of x = end point - cell corner
-  std::array<Fixed, kProducts> second{};  // sum of x x^T, upper triangle by rows
+  std::array<Fixed, D> first{};                 // sum of x = end point - cell corner
+  std::array<Fixed, kProducts> second{};        // sum of x x^T, upper triangle by rows
+  std::array<Fixed, kHasFaces ? D : 0> view{};  // sum of the unit vectors of the beams
   TimeSpan hit_span;
 
-  void add(const Vec<D>& end) {
+  // An end point, and where the beam started, both in units of cells.
+  void add(const Vec<D>& end, const Vec<D>& start) {
     const Vec<D> x = end - cell.template cast<double>();
     ++count;
     size_t product = 0;
@@ -54,14 +62,18 @@ struct EndPointSums {
       first[static_cast<size_t>(i)] += to_fixed(x[i]);
       for (int j = i; j < D; ++j) second[product++] += to_fixed(x[i] * x[j]);
     }
+    if constexpr (kHasFaces) {
+      const Vec<D> direction = (end - start).normalized();  // zero where both are the same
+      for (int d = 0; d < D; ++d) view[static_cast<size_t>(d)] += to_fixed(direction[d]);
+    }
   }
   // Adds the sums over other end points in the same cell.
   void add(const EndPointSums& other) {
     count += other.count;
     for (size_t i = 0; i < first.size(); ++i) first[i] += other.first[i];
     for (size_t i = 0; i < second.size(); ++i) second[i] += other.second[i];
-    hit_span.first = std::min(hit_span.first, other.hit_span.first);
-    hit_span.last = std::max(hit_span.last, other.hit_span.last);
+    for (size_t i = 0; i < view.size(); ++i) view[i] += other.view[i];
+    hit_span.extend(other.hit_span);
   }
 };
 
@@ -72,7 +84,10 @@ struct WindowMoments {
 
   double count = 0.0, max_count = 0.0;  // total; largest of any cell
   Vec<D> first = Vec<D>::Zero();
-  Square second = Square::Zero();  // lower triangle
+  Square second = Square::Zero();      // lower triangle
+  Vec<D> view = Vec<D>::Zero();        // see EndPointSums; zero if it has none
+  TimeSpan hit_span;                   // of all cells; empty in 3D and without time bins
+  double n_cells = 0.0, n_bins = 0.0;  // with a hit span; in these spans in total
 
   void add(const EndPointSums<D>& s, const Cell<D>& centre) {
     const Vec<D> corner = (s.cell - centre).template cast<double>();
@@ -87,8 +102,19 @@ struct WindowMoments {
       for (int i = j; i < D; ++i)
         second(i, j) += from_fixed(s.second[product++]) + corner[i] * sum[j] + sum[i] * corner[j] +
                         n * corner[i] * corner[j];
+    if constexpr (EndPointSums<D>::kHasFaces) {
+      for (int d = 0; d < D; ++d) view[d] += from_fixed(s.view[static_cast<size_t>(d)]);
+      if (s.hit_span.empty()) return;
+      hit_span.extend(s.hit_span);
+      n_cells += 1.0;
+      n_bins += static_cast<double>(s.hit_span.n_bins());
+    }
   }
   Vec<D> mean() const { return first / count; }
+  // Mean hit span of a cell over that of all cells.
+  double mean_span_share() const {
+    return n_cells > 0.0 ? n_bins / (n_cells * static_cast<double>(hit_span.n_bins())) : 0.0;
+  }
   // Its lower triangle.
   Square covariance() const { return second / count - mean() * mean().transpose(); }
 };

@@ -40,6 +40,8 @@ class SurfelMap : public SurfaceIndex<D> {
   static constexpr bool kWallsHaveTwoFaces = D == 2;
   static constexpr double kMaxFaceOffset = 1.0;
   static constexpr double kMaxStray = 0.1;  // share of the beams that are of neither face
+  // of a wall, whose cells are in view for as long as each other: .3 to .7 differ little
+  static constexpr double kMinSpanShare = 0.5;
 
   using Index = SurfaceIndex<D>;
   using Block = typename Index::Block;
@@ -175,7 +177,7 @@ class SurfelMap : public SurfaceIndex<D> {
       if (!scans.hit[n]) return;
       const Vec<D> end = beam_end<D>(pose, scans.points + n * D, resolution_);
       EndPointSums<D>& sums = sums_at(cell_of<D>(end));
-      sums.add(end);
+      sums.add(end, pose.t / resolution_);
       if (time_bin) sums.hit_span.extend(time_bin[t]);
     });
   }
@@ -253,7 +255,9 @@ class SurfelMap : public SurfaceIndex<D> {
     return fit_result;
   }
 
-  // Fits planes to the faces of walls that are so thin that both of them lie in one window.
+  // Fits planes to the faces of walls that are so thin that both of them lie in one window. They
+  // are seen from opposite sides, or every cell of them is hit for most of the time: the feet of
+  // people who walk along a line hit one cell after the other.
   void fit_faces(int radius, const RowMasks<D>& masks, int threads) {
     parallel_for_ranges(split_evenly(size(), threads), [&](size_t, size_t first, size_t last) {
       WindowQuery<D> query(*this, masks);
@@ -265,7 +269,9 @@ class SurfelMap : public SurfaceIndex<D> {
         const auto [own, other, strays] = split_faces(k, both.normal, query, window);
         const PrincipalAxes<D> axes(own, radius);
         if (axes.is_flat && other.count > 0.0 && PrincipalAxes<D>(other, radius).is_flat &&
-            strays.count <= kMaxStray * (own.count + other.count + strays.count))
+            strays.count <= kMaxStray * (own.count + other.count + strays.count) &&
+            (own.view.dot(axes.normal) * other.view.dot(axes.normal) < 0.0 ||
+             std::min(own.mean_span_share(), other.mean_span_share()) >= kMinSpanShare))
           set_plane(k, own, axes);
       }
     });
