@@ -15,8 +15,9 @@ auto relabel_ground_contact(const SurfelMap<3>& surfel_map, const Points<3>& poi
                             const Flat<bool>& hit, const Flat<int64_t>& offset,
                             const Poses<3>& poses, const Flat<int32_t>& surfel,
                             const Flat<bool>& is_obstacle, const Flat<float>& p_static,
-                            const Flat<float>& ground_height, int column_cells,
-                            double max_ground_height, double min_end_height, int threads) {
+                            const Flat<float>& ground_height, const Flat<bool>& at_any_height,
+                            int column_cells, double max_ground_height, double min_end_height,
+                            int threads) {
   const auto scans = scans_from<3>(points, hit, offset, poses);
   const size_t n = surfel_map.size(), beams = points.shape(0);
   require(surfel_map.fitted(), "surfel_map: fit it first");
@@ -32,6 +33,7 @@ auto relabel_ground_contact(const SurfelMap<3>& surfel_map, const Points<3>& poi
   require(is_obstacle.shape(0) == n, "is_obstacle: expected one per surfel");
   require(p_static.shape(0) == n, "p_static: expected one per surfel");
   require(ground_height.shape(0) == n, "ground_height: expected one per surfel");
+  require(at_any_height.shape(0) == n, "at_any_height: expected one per surfel");
   bool valid_p = true, finite_heights = true;
   for (size_t k = 0; k < n; ++k) {
     valid_p = valid_p && p_static.data()[k] >= 0.0f && p_static.data()[k] <= 1.0f;
@@ -48,8 +50,8 @@ auto relabel_ground_contact(const SurfelMap<3>& surfel_map, const Points<3>& poi
   {
     nb::gil_scoped_release released;
     const GroundContact contact(
-        surfel_map, {is_obstacle.data(), p_static.data(), ground_height.data(), column_cells,
-                     max_ground_height, min_end_height});
+        surfel_map, {is_obstacle.data(), p_static.data(), ground_height.data(),
+                     at_any_height.data(), column_cells, max_ground_height, min_end_height});
     contact.relabel(scans, surfel.data(), threads, out.data());
   }
   return to_numpy(std::move(out), {beams});
@@ -63,14 +65,17 @@ void bind_ground_contact(nb::module_& m) {
       nb::arg("points").noconvert(), nb::arg("hit").noconvert(), nb::arg("offset").noconvert(),
       nb::arg("T_map_sensor").noconvert(), nb::arg("surfel").noconvert(), nb::kw_only(),
       nb::arg("is_obstacle").noconvert(), nb::arg("p_static").noconvert(),
-      nb::arg("ground_height").noconvert(), nb::arg("column_cells"), nb::arg("max_ground_height"),
-      nb::arg("min_end_height"), nb::arg("threads") = 1,
+      nb::arg("ground_height").noconvert(), nb::arg("at_any_height").noconvert(),
+      nb::arg("column_cells"), nb::arg("max_ground_height"), nb::arg("min_end_height"),
+      nb::arg("threads") = 1,
       "(M,) float32: P(static) of beams that end on static ground surfels below a moving object: "
       "the mean p_static of the obstacle surfels hit in the same column of column_cells x "
       "column_cells cells by the same sweep; NaN where it is 1/2 or more, and for all other beams. "
       "surfel (M,) int32 is the surfel of each beam, -1: none; is_obstacle (E,) bool; p_static "
       "(E,) float32; ground_height (E,) float32, metres, below each surfel. Ground surfels lie at "
-      "most max_ground_height above the ground, the beams end more than min_end_height above it.");
+      "most max_ground_height above the ground, the beams end more than min_end_height above it, "
+      "or "
+      "anywhere on surfels that are at_any_height (E,) bool.");
 }
 
 }  // namespace stillmap::bindings

@@ -82,8 +82,10 @@ def test_threads_and_chunks_change_nothing():
 
 
 @pytest.mark.parametrize("seed", [0, *slow_params(1, 2)])
-@pytest.mark.parametrize(("column", "least"), [(2, 0.02), (3, 0.0)])
-def test_ground_contact_agreement(seed, column, least):
+@pytest.mark.parametrize(
+    ("column", "least", "share"), [(2, 0.02, 0.0), (3, 0.0, 0.0), (2, 0.05, 0.5)]
+)
+def test_ground_contact_agreement(seed, column, least, share):
     rng = np.random.default_rng(seed + 40)
     xy = rng.uniform(-2.5, 2.5, (1600, 2))
     floor = np.column_stack([xy, rng.normal(0.1, 0.01, 1600) * np.sign(rng.normal(2, 1, 1600))])
@@ -94,12 +96,15 @@ def test_ground_contact_agreement(seed, column, least):
     of_core, of_plain = order(core), order(plain)
     low = rng.random(plain.size) < 0.5
     p, ground = rng.random(plain.size), rng.normal(0.0, 0.05, plain.size)
+    any_height = rng.random(plain.size) < share
     found = []
     for kernels, surface, of in ((_core, core, of_core), (reference, plain, of_plain)):
-        stands = np.empty(plain.size, bool)
+        stands, at_any_height = (np.empty(plain.size, bool) for _ in range(2))
         mine = np.empty((2, plain.size), np.float32)
         stands[of], mine[0][of], mine[1][of] = ~low, np.where(low, 0.5 + p / 2, 0.6 * p), ground
+        at_any_height[of] = any_height
         known = {"is_obstacle": stands, "p_static": mine[0], "ground_height": mine[1]}
+        known["at_any_height"] = at_any_height
         surfel = surface.associate_beams(*beams)
         for threads in (1, 3):
             found.append(
@@ -120,7 +125,7 @@ def test_ground_contact_agreement(seed, column, least):
     assert np.nanmax(found[2]) < 0.5
 
 
-def relabelled(points, *, is_obstacle, p_static, ground=0.0, least=0.05, scans=1):
+def relabelled(points, *, is_obstacle, p_static, ground=0.0, at_any_height=0, least=0.05, scans=1):
     """Relabelled beams in cells of 1 m; surfels by ascending x, then z."""
     points = np.array(points, np.float32)
     hit, offset = np.ones(len(points), bool), np.linspace(0, len(points), scans + 1).astype(int)
@@ -129,13 +134,15 @@ def relabelled(points, *, is_obstacle, p_static, ground=0.0, least=0.05, scans=1
     surface.add_end_points(points, hit, offset, T)
     surface.fit()
     of = np.lexsort(surface.surfels()[0].T[[2, 1, 0]])
-    values = np.empty((3, surface.size), np.float32)
-    values[0][of], values[1][of], values[2][of] = is_obstacle, p_static, ground
+    values = np.empty((4, surface.size), np.float32)
+    for row, given in zip(values, (is_obstacle, p_static, ground, at_any_height), strict=True):
+        row[of] = given
     surfel = surface.associate_beams(points, hit, offset, T)
     known = {
         "is_obstacle": values[0].astype(bool),
         "p_static": values[1],
         "ground_height": values[2],
+        "at_any_height": values[3].astype(bool),
     }
     return _core.relabel_ground_contact(
         surface,
@@ -156,6 +163,8 @@ def test_sole_below_a_moving_leg():
     given = {"is_obstacle": [0, 1, 0], "p_static": [0.9, 0.2, 0.9]}
     found = relabelled([leg, sole, below, beside], **given)
     np.testing.assert_array_equal(found, np.array([np.nan, 0.2, np.nan, np.nan], np.float32))
+    lower = relabelled([leg, sole, below, beside], **given, at_any_height=[1, 0, 1])
+    np.testing.assert_array_equal(lower, np.array([np.nan, 0.2, 0.2, np.nan], np.float32))
     assert np.isnan(relabelled([leg, sole, below, beside], **given, ground=0.03)).all()
     static = {**given, "p_static": [0.9, 0.6, 0.9]}
     assert np.isnan(relabelled([leg, sole, below, beside], **static)).all()
@@ -185,6 +194,7 @@ def test_ground_contact_within_one_sweep():
         ({"is_obstacle": np.ones(1, bool)}, "is_obstacle: expected one per surfel"),
         ({"p_static": np.ones(3, np.float32)}, "p_static: expected one per surfel"),
         ({"ground_height": np.ones(1, np.float32)}, "ground_height: expected one per surfel"),
+        ({"at_any_height": np.ones(1, bool)}, "at_any_height: expected one per surfel"),
         ({"p_static": np.array([0.5, 1.5], np.float32)}, "p_static: expected a probability"),
         ({"ground_height": np.array([0.0, np.nan], np.float32)}, "ground_height: not finite"),
         ({"column_cells": 0}, "column_cells"),
@@ -202,6 +212,7 @@ def test_ground_contact_argument_errors(changes, match):
         "is_obstacle": np.ones(2, bool),
         "p_static": np.ones(2, np.float32),
         "ground_height": np.zeros(2, np.float32),
+        "at_any_height": np.zeros(2, bool),
         "column_cells": 1,
         "max_ground_height": 0.2,
         "min_end_height": 0.0,
@@ -229,6 +240,7 @@ def test_ground_contact_with_unusable_beams():
             is_obstacle=one.astype(bool),
             p_static=one,
             ground_height=one,
+            at_any_height=one.astype(bool),
             column_cells=1,
             max_ground_height=0.2,
             min_end_height=0.0,

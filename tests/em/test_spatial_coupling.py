@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 
 from stillmap import _core
+from stillmap.core.chunks import ScanBeams
 from stillmap.core.recording import Recording
 from stillmap.em import spatial_coupling
 from stillmap.em.ground import ground_from_surfels
 from stillmap.em.spatial_coupling import (
     apply_pooled_evidence,
     pool_clusters,
+    raise_ground,
     select_obstacles,
 )
 from stillmap.em.types import GroundMap
@@ -132,6 +134,49 @@ def test_the_clearance_follows_from_the_noise_of_end_points(monkeypatch):
     for clearance, expected in ((0.06, 0.06), (0.0, 2.5 * surface.noise_std)):
         monkeypatch.setattr(spatial_coupling, "GROUND_CLEARANCE", clearance)
         assert obstacles.min_end_height == expected
+
+
+def test_ground_has_at_least_its_mean_p_static():
+    _, _, surface = standing(CAR)
+    obstacles = select_obstacles(FLAT, surface)
+    means = surface.surfels()[1]
+    ground = np.abs(means[:, 2]) <= obstacles.min_end_height
+    np.testing.assert_array_equal(obstacles.is_ground, ground)
+    p, _ = labelled(surface, front)
+    p[ground] = np.random.default_rng(0).uniform(0.3, 1.0, ground.sum())
+    before, mean = p.copy(), np.float32(p[ground].mean(dtype=np.float64))
+    found, raised = raise_ground(p, obstacles)
+    np.testing.assert_array_equal(p, before)
+    np.testing.assert_array_equal(found, np.where(ground, np.maximum(p, mean), p))
+    np.testing.assert_array_equal(raised.was_dynamic, ground & (p < 0.5))
+    assert 100 < raised.was_dynamic.sum() < ground.sum() < len(p)
+
+
+def test_what_is_hit_below_a_mover_goes_with_it():
+    """A sole on ground that is grazed: dynamic where the leg above it was hit in the same sweep."""
+    leg = np.column_stack([np.full(40, 3.07), np.full(40, 3.07), np.linspace(0.3, 1.5, 40)])
+    sole = np.array([[3.07, 3.07, 0.02]])
+    recording, T, surface = standing(leg, sole, scans=1)
+    p, means = labelled(surface, lambda m: (m[:, 0] > 3.0) & (m[:, 0] < 3.15) & (m[:, 2] > 0.2))
+    obstacles = select_obstacles(FLAT, surface)
+    hidden = np.linalg.norm(means - sole[0], axis=1) < 0.12
+    p[hidden] = 0.1
+    found, raised = raise_ground(p, obstacles)
+    assert (found[hidden] > 0.5).all()
+    data = recording.points, recording.hit, recording.offset, T
+    surfel = surface.associate_beams(*data)
+    above = raised.label_ground_contact(found, ScanBeams(*data), surfel)
+    at_sole = hidden[surfel]
+    assert at_sole.any()
+    np.testing.assert_allclose(above[at_sole], 0.02, atol=1e-6)
+    assert np.isnan(obstacles.label_ground_contact(found, ScanBeams(*data), surfel)).all()
+
+
+def test_without_surfels_on_the_ground_none_are_raised():
+    _, _, surface = standing(CAR)
+    high = dataclasses.replace(FLAT, height=FLAT.height - 50.0)
+    p = np.full(surface.size, 0.3, np.float32)
+    np.testing.assert_array_equal(raise_ground(p, select_obstacles(high, surface))[0], p)
 
 
 def test_ground_from_static_surfels():

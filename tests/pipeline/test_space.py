@@ -51,7 +51,7 @@ def test_what_moves_is_told_from_what_stands(street, mapped):
 
 @pytest.mark.slow
 def test_ground_contact_goes_with_the_mover_above(street, mapped, monkeypatch):
-    monkeypatch.setattr("stillmap.em.spatial_coupling.GROUND_CLEARANCE", 100.0)
+    monkeypatch.setattr("stillmap.em.spatial_coupling.ObstacleSurfels.min_end_height", 100.0)
     other = stillmap.build(street.recording, poses=street.truth.T_world_base)
     mine = near(street) & ~street.truth.static
     found = [np.mean(one.p_static[mine] < 0.5) for one in (mapped, other)]
@@ -59,6 +59,29 @@ def test_ground_contact_goes_with_the_mover_above(street, mapped, monkeypatch):
     lost = np.mean(mapped.p_static[static] < 0.5) - np.mean(other.p_static[static] < 0.5)
     assert lost < 5e-4
     assert found[0] > found[1] + 0.002
+
+
+def share_of_far_ground_called_dynamic(street, result):
+    """Of static hits on the ground from 15 m on, where the rings of the lidar lie apart."""
+    recording = street.recording
+    beams = np.flatnonzero(recording.hit & street.truth.static)
+    ends = recording.end_points(beams, street.truth.T_world_base)
+    far = np.linalg.norm(recording.points[beams], axis=1) > 15.0
+    on_ground = far & (ends[:, 2] < np.quantile(ends[:, 2], 0.01) + 0.05)
+    assert on_ground.sum() > 1000
+    return np.mean(result.p_static[beams[on_ground]] < 0.5)
+
+
+@pytest.mark.slow
+def test_single_rings_on_far_ground_are_static(street, mapped, monkeypatch):
+    monkeypatch.setattr("stillmap.em.spatial_coupling.raise_ground", lambda *same: same)
+    other = stillmap.build(street.recording, poses=street.truth.T_world_base)
+    now, before = (share_of_far_ground_called_dynamic(street, one) for one in (mapped, other))
+    assert now < 0.001
+    assert before > 5.0 * now
+    mine = near(street) & ~street.truth.static
+    lost = np.mean(other.p_static[mine] < 0.5) - np.mean(mapped.p_static[mine] < 0.5)
+    assert lost < 0.002
 
 
 def test_given_poses_take_one_e_step(mapped):

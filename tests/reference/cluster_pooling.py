@@ -99,6 +99,7 @@ def relabel_ground_contact(
     is_obstacle: ArrayLike,
     p_static: ArrayLike,
     ground_height: ArrayLike,
+    at_any_height: ArrayLike,
     column_cells: int,
     max_ground_height: float,
     min_end_height: float,
@@ -113,12 +114,14 @@ def relabel_ground_contact(
         is_obstacle: (E,) surfels of objects on the ground.
         p_static: (E,).
         ground_height: (E,) metres, of the ground below each surfel.
+        at_any_height: (E,) surfels on which beams are relabelled however low they end.
         column_cells: cells, edge of the vertical columns.
         max_ground_height: metres, means of ground surfels are at most so high above the ground.
         min_end_height: metres, beams are relabelled if they end higher above the ground.
     """
     of, obstacle = np.asarray(surfel), np.asarray(is_obstacle, bool)
     p, z = np.asarray(p_static, float), np.asarray(ground_height, float)
+    low = np.where(np.asarray(at_any_height, bool), -np.inf, min_end_height)
     bounds, out = np.asarray(offset), np.full(len(of), np.nan)
     for beam in usable_beams(3, points, hit, offset, T_map_sensor):
         k = of[beam.number]
@@ -126,7 +129,7 @@ def relabel_ground_contact(
             continue
         if (
             surfel_map.fitted[k].mean[2] - z[k] > max_ground_height
-            or _height(surfel_map, k, beam.end, z[k]) <= min_end_height
+            or _height(surfel_map, k, beam.end, z[k]) <= low[k]
         ):
             continue
         of_scan = of[bounds[beam.scan] : bounds[beam.scan + 1]]

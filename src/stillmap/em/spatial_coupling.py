@@ -1,10 +1,10 @@
-"""Spatial coupling of surfels in 3D: mean field, cluster pooling and ground contact.
+"""Spatial coupling of surfels in 3D: mean field, cluster pooling, far ground, ground contact.
 
 Objects are larger than a voxel, so neighbouring voxels and the clusters of a sweep are labelled
 together. `docs/estimator/spatial.md` has the equations.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ import stillmap._core as _core
 from stillmap.core.chunks import ScanBeams, iter_beams
 from stillmap.core.recording import Recording
 from stillmap.em.observations import iter_surfel_rows
-from stillmap.em.types import MIN_PROBABILITY, Float, GroundMap
+from stillmap.em.types import DYNAMIC_BELOW, MIN_PROBABILITY, Float, GroundMap
 
 _MEAN_FIELD = {
     "radius": 2.5,  # voxels
@@ -67,19 +67,23 @@ class ObstacleSurfels:
     Attributes:
         surfel_map: E surfels in 3D.
         is_obstacle: (E,) bool, 0.2 to 3 m above the ground.
+        is_ground: (E,) bool, as far above or below it as end points on it may be.
+        was_dynamic: (E,) bool, on the ground, and dynamic until `raise_ground`.
         ground_height: (E,) float32 metres, of the ground below each surfel.
         column_cells: voxels, edge of the columns that touch within a cluster.
     """
 
     surfel_map: _core.SurfelMap3D
     is_obstacle: NDArray[np.bool_]
+    is_ground: NDArray[np.bool_]
+    was_dynamic: NDArray[np.bool_]
     ground_height: NDArray[np.float32]
     column_cells: int
 
     @property
     def min_end_height(self) -> float:
         """Metres above the ground; a beam that ends lower ended on the ground."""
-        return max(GROUND_CLEARANCE, _CLEARANCE_STD * self.surfel_map.noise_std)
+        return _clearance(self.surfel_map)
 
     def label_ground_contact(
         self,
@@ -103,6 +107,7 @@ class ObstacleSurfels:
             is_obstacle=self.is_obstacle,
             p_static=p_static,
             ground_height=self.ground_height,
+            at_any_height=self.was_dynamic,
             column_cells=self.column_cells,
             max_ground_height=_MIN_CLUSTER_HEIGHT,
             min_end_height=self.min_end_height,
@@ -114,16 +119,45 @@ def select_obstacles(ground: GroundMap, surfels: _core.SurfelMap3D) -> ObstacleS
     """The surfels of obstacles on the ground; None where no ground was observed."""
     if not ground.observed:
         return None
-    is_obstacle = np.empty(surfels.size, np.bool_)
+    is_obstacle, is_ground = (np.empty(surfels.size, np.bool_) for _ in range(2))
     ground_height = np.empty(surfels.size, np.float32)
     for rows in iter_surfel_rows(surfels):
         means = surfels.surfels(rows)[1]
         below = ground.height_at(means[:, :2])
         above = means[:, 2] - below
         is_obstacle[slice(*rows)] = (above > _MIN_CLUSTER_HEIGHT) & (above < _MAX_CLUSTER_HEIGHT)
+        is_ground[slice(*rows)] = np.abs(above) <= _clearance(surfels)
         ground_height[slice(*rows)] = below
     column_cells = max(1, round(_COLUMN / surfels.resolution))
-    return ObstacleSurfels(surfels, is_obstacle, ground_height, column_cells)
+    none = np.zeros(surfels.size, np.bool_)
+    return ObstacleSurfels(surfels, is_obstacle, is_ground, none, ground_height, column_cells)
+
+
+def _clearance(surfel_map: _core.SurfelMap3D) -> float:
+    return max(GROUND_CLEARANCE, _CLEARANCE_STD * surfel_map.noise_std)
+
+
+def raise_ground(
+    p_static: NDArray[np.float32], obstacles: ObstacleSurfels
+) -> tuple[NDArray[np.float32], ObstacleSurfels]:
+    """(E,) P(static) of each surfel, of those on the ground at least their mean.
+
+    Far away the rings of a lidar lie metres apart on the ground: no plane can be fitted, and as the
+    robot moves, beams of one ring graze where those of another ended, which then seems to be empty.
+    The obstacles note which were dynamic: what is hit while one that moves is above it is labelled
+    by that.
+
+    Args:
+        p_static: (E,) of each surfel.
+        obstacles: of the same surfels.
+    """
+    is_ground = obstacles.is_ground
+    if not is_ground.any():
+        return p_static, obstacles
+    mean = p_static[is_ground].mean(dtype=np.float64)
+    was_dynamic = is_ground & (p_static < DYNAMIC_BELOW)
+    out = np.where(is_ground, np.maximum(p_static, np.float32(mean)), p_static)
+    return out, replace(obstacles, was_dynamic=was_dynamic)
 
 
 def pool_clusters(

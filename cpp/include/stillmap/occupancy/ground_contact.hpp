@@ -22,6 +22,7 @@ struct GroundContactInput {
   const bool* is_obstacle;     // part of an obstacle, not of the ground
   const float* p_static;       // P(static)
   const float* ground_height;  // metres, height of the ground below
+  const bool* at_any_height;   // beams that end on it are relabelled however low they end
   int32_t column_cells;        // edge of a ground column, in cells
   double max_ground_height;    // metres above the ground up to which a mean counts as ground
   double min_end_height;  // metres above the ground from which on an end point is off the ground
@@ -92,7 +93,7 @@ class GroundContact {
       const size_t c =
           columns.find_column(ground_column(cell_of<3>(beam.end), input_.column_cells));
       if (c == p_static.size() || p_static[c] >= 0.5) continue;
-      if (on_ground(k) && height(k, beam.end) > input_.min_end_height)
+      if (on_ground(k) && (input_.at_any_height[k] || height(k, beam.end) > input_.min_end_height))
         out[n] = static_cast<float>(p_static[c]);
     }
   }
