@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core.chunks import ScanBeams, iter_beams
+from stillmap.core.parallel import counting_threads
 from stillmap.core.recording import Recording
 from stillmap.em import surroundings
 from stillmap.em.mixture import MAX_FIT_ROWS
@@ -185,7 +186,8 @@ def build_surfel_map(
     kind = _core.SurfelMap2D if recording.dimension == 2 else _core.SurfelMap3D
     surfel_map = kind(resolution)
     for scans, _, data in iter_beams(recording, poses):
-        surfel_map.add_end_points(*data, None if time_bin is None else time_bin[scans], threads)
+        bins = None if time_bin is None else time_bin[scans]
+        surfel_map.add_end_points(*data, bins, counting_threads(len(data.hit), threads))
     surfel_map.fit(threads)
     return surfel_map
 
