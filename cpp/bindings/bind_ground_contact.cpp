@@ -73,9 +73,8 @@ void bind_ground_contact(nb::module_& m) {
       "column_cells cells by the same sweep; NaN where it is 1/2 or more, and for all other beams. "
       "surfel (M,) int32 is the surfel of each beam, -1: none; is_obstacle (E,) bool; p_static "
       "(E,) float32; ground_height (E,) float32, metres, below each surfel. Ground surfels lie at "
-      "most max_ground_height above the ground, the beams end more than min_end_height above it, "
-      "or "
-      "anywhere on surfels that are at_any_height (E,) bool.");
+      "most max_ground_height above the ground, the beams end more than min_end_height above it; "
+      "where at_any_height (E,) bool, they may end lower.");
 }
 
 }  // namespace stillmap::bindings

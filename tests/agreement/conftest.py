@@ -1,6 +1,7 @@
 """Random beams and rooms on which kernels and twins must agree."""
 
 import resource
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,6 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))  # for what the tests share
 
 
 @dataclass(frozen=True)

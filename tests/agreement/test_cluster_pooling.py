@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import reference
 from marks import slow_params
+from surfel_maps import fit_both, order
 
 from stillmap import _core
 
@@ -26,17 +27,7 @@ def scattered(seed, n=900, scans=6):
 
 
 def surfaces(beams, resolution=0.2):
-    made = []
-    for kernels in (_core, reference):
-        surface = kernels.SurfelMap3D(resolution)
-        surface.add_end_points(*beams)
-        surface.fit()
-        made.append(surface)
-    return made
-
-
-def order(surface):
-    return np.lexsort(surface.surfels()[0].T)
+    return fit_both("SurfelMap3D", resolution, *beams)
 
 
 @pytest.mark.parametrize("seed", [0, *slow_params(1, 2)])

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import reference
 from marks import slow_params
+from surfel_maps import fit_both, order
 
 from stillmap import _core
 from stillmap.em.spatial_coupling import _MEAN_FIELD as MEAN_FIELD
@@ -19,17 +20,7 @@ def surfaces(seed):
     look = np.sort(rng.integers(0, 30, len(ends)))
     T = np.tile(np.eye(4), (len(ends), 1, 1))
     beams = rng.permutation(ends), np.ones(len(ends), bool), np.arange(len(ends) + 1), T
-    made = []
-    for kernels in (_core, reference):
-        surface = kernels.SurfelMap3D(0.3)
-        surface.add_end_points(*beams, look)
-        surface.fit()
-        made.append(surface)
-    return made
-
-
-def order(surface):
-    return np.lexsort(surface.surfels()[0].T)
+    return fit_both("SurfelMap3D", 0.3, *beams, look)
 
 
 @pytest.mark.parametrize("seed", [0, *slow_params(1, 2)])

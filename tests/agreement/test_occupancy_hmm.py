@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import reference
 from reference.observation import HIT, SURE
+from surfel_maps import fit_both, order
 
 from stillmap import _core
 from stillmap.em.observations import HmmClasses
@@ -23,11 +24,6 @@ CLASSES = HmmClasses(view_rho=(0.65,)).grid()
 def room(request, a_room):
     dimension, seed, resolution, scans, beams = request.param
     return a_room(seed, dimension, resolution, scans, beams)
-
-
-def order(surface):
-    """Order of the surfels by cell."""
-    return np.lexsort(surface.surfels()[0].T)
 
 
 def assert_same_surfels(core, plain):
@@ -86,13 +82,7 @@ def see_both_faces(apart, noise, y_other=1.5, dated=None):
     time_bin = None
     if dated is not None:
         time_bin = np.concatenate([dated(x), np.zeros(len(others))]).astype(np.int64)
-    found = []
-    for kernels in (_core, reference):
-        surface = kernels.SurfelMap2D(0.05)
-        surface.add_end_points(*beams, time_bin)
-        surface.fit()
-        found.append(surface)
-    return found
+    return fit_both("SurfelMap2D", 0.05, *beams, time_bin)
 
 
 def compare_normals(core, plain):

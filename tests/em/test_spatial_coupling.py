@@ -12,8 +12,8 @@ from stillmap.em import spatial_coupling
 from stillmap.em.ground import ground_from_surfels
 from stillmap.em.spatial_coupling import (
     apply_pooled_evidence,
+    label_far_ground,
     pool_clusters,
-    raise_ground,
     select_obstacles,
 )
 from stillmap.em.types import GroundMap
@@ -145,7 +145,7 @@ def test_ground_has_at_least_its_mean_p_static():
     p, _ = labelled(surface, front)
     p[ground] = np.random.default_rng(0).uniform(0.3, 1.0, ground.sum())
     before, mean = p.copy(), np.float32(p[ground].mean(dtype=np.float64))
-    found, raised = raise_ground(p, obstacles)
+    found, raised = label_far_ground(p, obstacles)
     np.testing.assert_array_equal(p, before)
     np.testing.assert_array_equal(found, np.where(ground, np.maximum(p, mean), p))
     np.testing.assert_array_equal(raised.was_dynamic, ground & (p < 0.5))
@@ -161,7 +161,7 @@ def test_what_is_hit_below_a_mover_goes_with_it():
     obstacles = select_obstacles(FLAT, surface)
     hidden = np.linalg.norm(means - sole[0], axis=1) < 0.12
     p[hidden] = 0.1
-    found, raised = raise_ground(p, obstacles)
+    found, raised = label_far_ground(p, obstacles)
     assert (found[hidden] > 0.5).all()
     data = recording.points, recording.hit, recording.offset, T
     surfel = surface.associate_beams(*data)
@@ -176,7 +176,7 @@ def test_without_surfels_on_the_ground_none_are_raised():
     _, _, surface = standing(CAR)
     high = dataclasses.replace(FLAT, height=FLAT.height - 50.0)
     p = np.full(surface.size, 0.3, np.float32)
-    np.testing.assert_array_equal(raise_ground(p, select_obstacles(high, surface))[0], p)
+    np.testing.assert_array_equal(label_far_ground(p, select_obstacles(high, surface))[0], p)
 
 
 def test_ground_from_static_surfels():

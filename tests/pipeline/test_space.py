@@ -74,7 +74,7 @@ def share_of_far_ground_called_dynamic(street, result):
 
 @pytest.mark.slow
 def test_single_rings_on_far_ground_are_static(street, mapped, monkeypatch):
-    monkeypatch.setattr("stillmap.em.spatial_coupling.raise_ground", lambda *same: same)
+    monkeypatch.setattr("stillmap.em.spatial_coupling.label_far_ground", lambda *same: same)
     other = stillmap.build(street.recording, poses=street.truth.T_world_base)
     now, before = (share_of_far_ground_called_dynamic(street, one) for one in (mapped, other))
     assert now < 0.001

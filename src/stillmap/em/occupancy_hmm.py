@@ -103,7 +103,7 @@ def e_step_3d(
         p_static = spatial_coupling.pool_clusters(
             p_static, change, obstacles, recording, poses, threads
         )
-        p_static, obstacles = spatial_coupling.raise_ground(p_static, obstacles)
+        p_static, obstacles = spatial_coupling.label_far_ground(p_static, obstacles)
     found = label_beams(observations, None, fit, recording, poses, p_static, obstacles)
     changed_cells = None
     if options.change_detection_3d:

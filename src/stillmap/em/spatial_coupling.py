@@ -62,13 +62,13 @@ def smooth_mean_field(
 
 @dataclass(frozen=True, eq=False)
 class ObstacleSurfels:
-    """Surfels above the ground.
+    """Which surfels are on the ground, and which above it.
 
     Attributes:
         surfel_map: E surfels in 3D.
         is_obstacle: (E,) bool, 0.2 to 3 m above the ground.
-        is_ground: (E,) bool, as far above or below it as end points on it may be.
-        was_dynamic: (E,) bool, on the ground, and dynamic until `raise_ground`.
+        is_ground: (E,) bool, at most `min_end_height` above or below the ground.
+        was_dynamic: (E,) bool, on the ground, and dynamic before `label_far_ground`.
         ground_height: (E,) float32 metres, of the ground below each surfel.
         column_cells: voxels, edge of the columns that touch within a cluster.
     """
@@ -137,19 +137,21 @@ def _clearance(surfel_map: _core.SurfelMap3D) -> float:
     return max(GROUND_CLEARANCE, _CLEARANCE_STD * surfel_map.noise_std)
 
 
-def raise_ground(
+def label_far_ground(
     p_static: NDArray[np.float32], obstacles: ObstacleSurfels
 ) -> tuple[NDArray[np.float32], ObstacleSurfels]:
-    """(E,) P(static) of each surfel, of those on the ground at least their mean.
+    """Raise P(static) of the surfels on the ground to at least their mean.
 
     Far away the rings of a lidar lie metres apart on the ground: no plane can be fitted, and as the
     robot moves, beams of one ring graze where those of another ended, which then seems to be empty.
-    The obstacles note which were dynamic: what is hit while one that moves is above it is labelled
-    by that.
 
     Args:
         p_static: (E,) of each surfel.
         obstacles: of the same surfels.
+
+    Returns:
+        (E,) P(static); the obstacles with `was_dynamic`, so that beams that end there below a mover
+        are labelled by it (`ObstacleSurfels.label_ground_contact`).
     """
     is_ground = obstacles.is_ground
     if not is_ground.any():

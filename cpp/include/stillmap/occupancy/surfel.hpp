@@ -44,7 +44,9 @@ struct TimeSpan {
 template <int D>
 struct EndPointSums {
   static constexpr int kProducts = D * (D + 1) / 2;
-  static constexpr bool kHasFaces = D == 2;  // see SurfelMap::fit_faces
+  // In 2D, where cells are small, both faces of a thin wall may lie in one window: what tells them
+  // apart is summed, too, see SurfelMap::fit_faces.
+  static constexpr bool kHasFaces = D == 2;
 
   Cell<D> cell;
   int64_t count = 0;

@@ -35,13 +35,9 @@ class SurfelMap : public SurfaceIndex<D> {
   static constexpr double kOffPlaneSigmas = 2.0;  // of plane noise, for the mean of a cell
   static constexpr double kEndPointSigmas = 3.0;  // of noise_std, for a single end point
   static constexpr double kMinOffPlane = 0.2;     // cells: closer points are on the plane
-  // Both faces of a thin wall may lie in one window, in 2D, where cells are small; cells of one
-  // face are at most that far from it.
-  static constexpr bool kWallsHaveTwoFaces = D == 2;
-  static constexpr double kMaxFaceOffset = 1.0;
-  static constexpr double kMaxStray = 0.1;  // share of the beams that are of neither face
-  // of a wall, whose cells are in view for as long as each other: .3 to .7 differ little
-  static constexpr double kMinSpanShare = 0.5;
+  static constexpr double kMaxFaceOffset = 1.0;   // cells, of a cell of a face from its plane
+  static constexpr double kMaxStray = 0.1;        // share of the beams that are of neither face
+  static constexpr double kMinSpanShare = 0.5;    // mean hit span of a cell over that of the face
 
   using Index = SurfaceIndex<D>;
   using Block = typename Index::Block;
@@ -114,8 +110,8 @@ class SurfelMap : public SurfaceIndex<D> {
     const RowMasks<D> masks(*this);
     for (const int radius : {2, 4, 6}) {
       const bool are_planar = fit_normals(radius, masks, threads) >= 0.5;
-      if (kWallsHaveTwoFaces && are_planar && 2.0 * noise_std_ <= kMaxFaceOffset)
-        fit_faces(radius, masks, threads);
+      if constexpr (EndPointSums<D>::kHasFaces)
+        if (are_planar && 2.0 * noise_std_ <= kMaxFaceOffset) fit_faces(radius, masks, threads);
       if (are_planar) break;
     }
     cells_.reserve(size());
@@ -256,8 +252,8 @@ class SurfelMap : public SurfaceIndex<D> {
   }
 
   // Fits planes to the faces of walls that are so thin that both of them lie in one window. They
-  // are seen from opposite sides, or every cell of them is hit for most of the time: the feet of
-  // people who walk along a line hit one cell after the other.
+  // are seen from opposite sides, or each of their cells is hit for much of the time for which the
+  // face is: the feet of people who walk along a line hit one cell after the other.
   void fit_faces(int radius, const RowMasks<D>& masks, int threads) {
     parallel_for_ranges(split_evenly(size(), threads), [&](size_t, size_t first, size_t last) {
       WindowQuery<D> query(*this, masks);
