@@ -17,7 +17,7 @@ from common import add_arguments, built, options_of, outcomes
 from tables import grouped, markdown
 
 from stillmap.io import read
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 
 WANTED = 0.03  # of the beams, at most
 

@@ -14,7 +14,7 @@ import numpy as np
 from common import add_seed_arguments, seeds_of
 from tables import markdown
 
-from stillmap.preprocessing import self_filter
+from stillmap.prepare import self_filter
 from stillmap.sim import scene_by_name, simulate
 from stillmap.sim.lidar import ROBOT
 

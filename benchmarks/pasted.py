@@ -22,7 +22,7 @@ from stillmap.core.camera import Camera
 from stillmap.io import rgbd
 from stillmap.io.images import read_image
 from stillmap.io.rgbd_folders import list_frames
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -30,7 +30,7 @@ from stillmap.eval.model_readers import RECORD, read_record
 from stillmap.mesh.texture.views import View
 from stillmap.mesh.texture.visibility import find_visible_faces
 from stillmap.mesh.triangle_mesh import Mesh
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 
 Mask = NDArray[np.bool_]
 

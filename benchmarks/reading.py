@@ -25,7 +25,7 @@ from stillmap.io.ros.bag import open_bag
 from stillmap.io.ros.bag_types import ENDINGS
 from stillmap.io.ros.collect import collect_messages, select_topics
 from stillmap.pipeline.result import map_recording
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 from stillmap.sim import scene_by_name, simulate
 
 FORMS = (".bag", ".db3", ".mcap", ".log", ".log.gz", "")

@@ -37,7 +37,7 @@ ROOMS = (
     Room("slam", 8, 4.5, 8, "M-step: poses, loops"),
     Room("io", 8, 8.5, 12, "formats to Recording"),
     Room("em", 9, 0, 8, "E-steps: P(static) of every beam, occupancy map, bound"),
-    Room("preprocessing", 9, 8.5, 12, "self filter, range limits"),
+    Room("prepare", 9, 8.5, 12, "self filter, range limits"),
     Room("core", 10, 0, 12, "Recording, camera, SE(2)/SE(3), config, errors, files, parallel"),
 )
 ARROWS = (  # from, to, column
@@ -61,9 +61,9 @@ ARROWS = (  # from, to, column
     ("sim", "io", 10.6),
     ("mapping", "em", 2),
     ("slam", "em", 6.25),
-    ("io", "preprocessing", 10.25),
+    ("io", "prepare", 10.25),
     ("em", "core", 4),
-    ("preprocessing", "core", 10.25),
+    ("prepare", "core", 10.25),
 )
 
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from stillmap.places.build import merge
     from stillmap.places.records import PlaceSession, SessionChange
     from stillmap.places.saved_place import SavedPlace, load
-    from stillmap.preprocessing.options import ReadOptions
+    from stillmap.prepare.options import ReadOptions
     from stillmap.results.build import build
     from stillmap.results.result import BuiltResult, Result
     from stillmap.results.saved import SavedResult
@@ -67,7 +67,7 @@ _MODULES = {
     "Models": "mesh.build",
     "Options": "pipeline.options",
     "PlaceSession": "places.records",
-    "ReadOptions": "preprocessing.options",
+    "ReadOptions": "prepare.options",
     "Recording": "core.recording",
     "Result": "results.result",
     "SavedPlace": "places.saved_place",
@@ -92,7 +92,7 @@ _ROOMS = (
     "mesh",
     "pipeline",
     "places",
-    "preprocessing",
+    "prepare",
     "results",
     "rig",
     "sim",

@@ -21,7 +21,7 @@ def label(
     Returns:
         The recording, and (M,) whether beams are dynamic.
     """
-    from stillmap.preprocessing.options import ReadOptions
+    from stillmap.prepare.options import ReadOptions
 
     recording = read(source, ReadOptions(**(options or {})))
     rng = np.random.default_rng(5)

@@ -12,7 +12,7 @@ from stillmap.core.config import iter_options
 from stillmap.em import Estimator, MapState
 from stillmap.eval.relations import MAX_DT
 from stillmap.pipeline.options import MapMode, Options
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 from stillmap.sim import SCENES, CrowdOptions
 
 TOP = parser()

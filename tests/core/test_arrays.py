@@ -10,7 +10,7 @@ from stillmap.core import arrays
 from stillmap.core.array_builder import ArrayBuilder, append_together
 from stillmap.io import builder
 from stillmap.io.builder import ReadContext, RecordingBuilder
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 
 
 @pytest.fixture

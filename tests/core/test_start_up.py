@@ -7,7 +7,7 @@ import pytest
 
 
 @pytest.mark.parametrize(
-    "module", ["core.errors", "core.files", "core.config", "preprocessing.options", "cli.main"]
+    "module", ["core.errors", "core.files", "core.config", "prepare.options", "cli.main"]
 )
 def test_numpy_is_not_imported(module):
     code = f"import sys, stillmap.{module}; print('numpy' in sys.modules)"

@@ -24,7 +24,7 @@ from stillmap.io import read
 from stillmap.io.ros import reader as reader_module  # noqa: F401  (instrumented at import)
 from stillmap.io.trajectory import read_tum
 from stillmap.pipeline.options import Options
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 from stillmap.results import reader as result_reader
 from stillmap.results.folder import open_result
 from stillmap.results.labels import read_labels

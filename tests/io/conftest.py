@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from stillmap.core.recording import Recording
 from stillmap.io import read
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from stillmap.core.errors import InputError
 from stillmap.io import read
 from stillmap.io.point_cloud import threedtk
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 
 
 def write(folder, number, text, pose="0 0 0\n0 0 0\n"):

@@ -9,7 +9,7 @@ from stillmap.cli.recording_info import summarize_recording
 from stillmap.core.errors import InputError
 from stillmap.io import read, write
 from stillmap.io.camera_file import read_camera_file as read_file
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 
 ROW = "1 0 0 0 0 1 0 0 0 0 1 0\n"
 LENS = "fx = 20.0\nfy = 21\ncx = 7.5\ncy = 5.5\n"

@@ -10,7 +10,7 @@ from stillmap.core.recording import Recording
 from stillmap.io import read, writers
 from stillmap.io import write as write_folder
 from stillmap.io.point_cloud import kitti, las, pcd, ply
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 
 WRITERS = {"KITTI": kitti.write, "PCD": pcd.write, "own": write_folder}
 

@@ -6,7 +6,7 @@ from PIL import Image
 
 from stillmap.io import read
 from stillmap.io.rgbd import T_BASE_CAMERA
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 
 W, H = 320, 240
 DEPTH = (292.5, 160.0, 120.0, 0.0, 0.0)  # focal length, centre, metres to the right and down

@@ -16,7 +16,7 @@ from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.io import read, write
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 
 ARRAYS = (
     "stamp_ns",

@@ -20,7 +20,7 @@ from stillmap.eval import readers
 from stillmap.io import read, stillmap_folder, text_lines, writers
 from stillmap.io.carmen import log as log_module
 from stillmap.io.trajectory import read_tum
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 from stillmap.results import reader
 
 FLASER = "FLASER 2 1.0 2.0 0 0 0 0 0 0 1 host 1\n"

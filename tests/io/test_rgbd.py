@@ -16,7 +16,7 @@ from stillmap.core.recording import Recording
 from stillmap.io import read, rgbd
 from stillmap.io.rgbd import T_BASE_CAMERA
 from stillmap.io.rgbd_folders import SCENES, TUM, detect_layout
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 
 READ = """
 import sys

@@ -9,7 +9,7 @@ from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.io import read, writers
 from stillmap.io.ros import laser_scan
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 
 FORMS_2D = {"carmen": ".clf", "bag": ".bag", "db3": ".db3", "mcap": ".mcap", "stillmap": ""}
 FORMS_3D = {"mcap": ".mcap", "kitti": "", "pcd": "", "stillmap": ""}

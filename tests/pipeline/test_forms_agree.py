@@ -5,7 +5,7 @@ import pytest
 
 from stillmap import build
 from stillmap.io import read, writers
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 
 FREE = 6.0  # m: bags and logs only say that nothing came back, not how far away that was
 

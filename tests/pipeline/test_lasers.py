@@ -9,7 +9,7 @@ import pytest
 import stillmap
 from stillmap.core import se2
 from stillmap.io import read
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 from stillmap.sim import Simulation, scene_by_name, simulate
 
 TURNED = math.radians(20.0)

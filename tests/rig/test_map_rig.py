@@ -10,9 +10,9 @@ import trimesh
 from stillmap.cli.main import main
 from stillmap.io import read, stillmap_folder
 from stillmap.io.trajectory import read_tum
-from stillmap.preprocessing.options import ReadOptions
-from stillmap.preprocessing.overrides import select_time
-from stillmap.preprocessing.time_window import TimeWindow
+from stillmap.prepare.options import ReadOptions
+from stillmap.prepare.overrides import select_time
+from stillmap.prepare.time_window import TimeWindow
 from stillmap.sim import load_truth, scene_by_name, simulate_rig, write_rig
 
 QUICK = ("--quiet", "--threads", "1", "--set", "em.max_iterations=1")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stillmap.core.recording import Recording
-from stillmap.preprocessing.tilting_laser import assemble_tilting_laser, sweep_indices
+from stillmap.prepare.tilting_laser import assemble_tilting_laser, sweep_indices
 from stillmap.sim import scene_by_name, simulate_rig
 
 

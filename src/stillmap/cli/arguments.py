@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from stillmap.core.errors import InputError, cannot_write
 
 if TYPE_CHECKING:
-    from stillmap.preprocessing.options import ReadOptions
+    from stillmap.prepare.options import ReadOptions
 
 _FLAGS = (
     *("min_range", "max_range", "zero_means", "spin", "cameras", "start", "end"),
@@ -139,7 +139,7 @@ def read_changes(args: argparse.Namespace) -> dict[str, Any]:
 def read_options(args: argparse.Namespace) -> "ReadOptions":
     """The options of reading by the given flags."""
     from stillmap.core.config import override
-    from stillmap.preprocessing.options import ReadOptions
+    from stillmap.prepare.options import ReadOptions
 
     return override(ReadOptions(), read_changes(args).get("read", {}))
 

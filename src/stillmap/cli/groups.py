@@ -6,7 +6,7 @@ from pathlib import Path
 from stillmap.cli.console import show_share
 from stillmap.core.errors import InputError
 from stillmap.io.input_groups import InputGroup, group_inputs
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 
 _FOR_ONE_RUN = (
     "tilting",

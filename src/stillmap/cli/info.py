@@ -12,7 +12,7 @@ from stillmap.cli.console import print_lines, show_share
 
 if TYPE_CHECKING:
     from stillmap.io.input_groups import InputGroup
-    from stillmap.preprocessing.options import ReadOptions
+    from stillmap.prepare.options import ReadOptions
 
 _LINES_SHOWN = 10
 DESCRIPTION = (

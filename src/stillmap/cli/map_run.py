@@ -25,9 +25,9 @@ from stillmap.pipeline.estimate import EmState
 from stillmap.pipeline.map_frame import objects_to_local
 from stillmap.pipeline.options import Options, resolve_options
 from stillmap.pipeline.result import MappingResult, map_recording
-from stillmap.preprocessing.options import ReadOptions
-from stillmap.preprocessing.overrides import select_time
-from stillmap.preprocessing.time_window import TimeWindow
+from stillmap.prepare.options import ReadOptions
+from stillmap.prepare.overrides import select_time
+from stillmap.prepare.time_window import TimeWindow
 from stillmap.results.region import crop_result, require_overlap
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import arrays, se2
 from stillmap.core.recording import Recording
-from stillmap.preprocessing.max_range import RangeRule
+from stillmap.prepare.max_range import RangeRule
 
 _MAX_SAMPLE = 1 << 24  # beams used for quantiles of ranges
 _MIN_SCANS = 100  # scans that a sample needs

@@ -15,7 +15,7 @@ from stillmap.em.occupancy_grid import ObservedCells, observed_cells
 from stillmap.em.options import EmOptions
 from stillmap.em.people_tracker import label_people
 from stillmap.em.types import EStepResult, Float, Grid, NoReturnModel, fill_beams
-from stillmap.preprocessing.floor_detection import find_floor_returns
+from stillmap.prepare.floor_detection import find_floor_returns
 
 Estimator = Literal["stillmap", "paper", "hit-ratio", "tracker"]
 

@@ -3,6 +3,6 @@
 from stillmap.core.recording import Recording
 from stillmap.io.reader import read
 from stillmap.io.stillmap_folder import write
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 
 __all__ = ["ReadOptions", "Recording", "read", "write"]

@@ -16,7 +16,7 @@ from stillmap.core.arrays import empty
 from stillmap.core.recording import Recording
 from stillmap.core.timestamps import MAX_BEAM_TIME
 from stillmap.io.text_lines import Progress, share_progress
-from stillmap.preprocessing.options import MAX_POINT_DISTANCE, ReadOptions
+from stillmap.prepare.options import MAX_POINT_DISTANCE, ReadOptions
 
 _BLOCK = 1 << 20  # points of a scan at a time
 

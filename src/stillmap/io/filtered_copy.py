@@ -15,7 +15,7 @@ from stillmap.core.files import atomic_file, atomic_folder
 from stillmap.core.input_files import copy_file
 from stillmap.core.recording import Recording
 from stillmap.io.text_lines import Progress
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 
 Mask = NDArray[np.bool_]
 # (file, its new copy, (n,) beams to blank of each of its scans; None: the scan was not read)

@@ -18,9 +18,9 @@ from stillmap.io.array_checks import (
     to_array,
 )
 from stillmap.io.builder import ReadContext, RecordingBuilder
-from stillmap.preprocessing import self_filter
-from stillmap.preprocessing.max_range import RangeRule, apply_range_rule, infer_range_rule
-from stillmap.preprocessing.options import MAX_PLAUSIBLE_RANGE, ReadOptions
+from stillmap.prepare import self_filter
+from stillmap.prepare.max_range import RangeRule, apply_range_rule, infer_range_rule
+from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE, ReadOptions
 
 Float = NDArray[np.float64]
 

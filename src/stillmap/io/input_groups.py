@@ -14,9 +14,9 @@ from stillmap.io.parts.joining import join_recordings
 from stillmap.io.reader import explain_failure, prepare
 from stillmap.io.registry import Format, detect_format
 from stillmap.io.text_lines import Progress
-from stillmap.preprocessing.options import ReadOptions
-from stillmap.preprocessing.overrides import select_time
-from stillmap.preprocessing.time_window import TimeWindow
+from stillmap.prepare.options import ReadOptions
+from stillmap.prepare.overrides import select_time
+from stillmap.prepare.time_window import TimeWindow
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from stillmap.io.builder import ReadContext
 from stillmap.io.recording_checks import require_mounts
 from stillmap.io.registry import detect_format
 from stillmap.io.text_lines import Progress
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 
 
 def read(
@@ -85,8 +85,8 @@ def explain_failure(path: Path) -> Iterator[None]:
 def _prepare_3d(recording: Recording, options: ReadOptions, scratch: Path | None) -> Recording:
     """Add beam times and cameras, and remove returns from the robot itself."""
     from stillmap.io import cameras  # nothing that a 2D recording needs
-    from stillmap.preprocessing import self_filter
-    from stillmap.preprocessing.scan_timing import SPIN_KEY, add_beam_times
+    from stillmap.prepare import self_filter
+    from stillmap.prepare.scan_timing import SPIN_KEY, add_beam_times
 
     recording = add_beam_times(replace(recording, scratch=scratch), options.spin)
     if options.spin == "none" and recording.beam_time is None:

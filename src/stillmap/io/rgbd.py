@@ -27,7 +27,7 @@ from stillmap.io.images import read_image, read_image_size
 from stillmap.io.point_cloud.gravity_alignment import align_to_gravity
 from stillmap.io.point_cloud.scans import Cloud, CloudSource, DatasetInfo, build_recording, reject
 from stillmap.io.rgbd_folders import Frames
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 
 Float = NDArray[np.float64]
 

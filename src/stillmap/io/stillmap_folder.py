@@ -23,7 +23,7 @@ from stillmap.core.schema import SchemaError, check
 from stillmap.io.images import read_image, write_png
 from stillmap.io.notes import prune_notes
 from stillmap.io.rigid_transforms import MAX_TRANSLATION
-from stillmap.preprocessing.options import MAX_POINT_DISTANCE
+from stillmap.prepare.options import MAX_POINT_DISTANCE
 
 _IMAGES = "images"
 

@@ -21,8 +21,8 @@ from stillmap.io.array_checks import (
     to_array,
 )
 from stillmap.io.recording_checks import MAX_MOUNT
-from stillmap.preprocessing.max_range import MAX_ZERO_RANGE
-from stillmap.preprocessing.options import MAX_PLAUSIBLE_RANGE
+from stillmap.prepare.max_range import MAX_ZERO_RANGE
+from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE
 
 Float = NDArray[np.float64]
 

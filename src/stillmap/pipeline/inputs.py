@@ -18,7 +18,7 @@ from stillmap.io.recording_checks import require_plausible
 from stillmap.io.text_lines import Progress, share_progress
 from stillmap.io.trajectory import poses_from_tum
 from stillmap.pipeline.options import Options
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 
 RECORDED = "recording"  # poses: those that the recording states
 

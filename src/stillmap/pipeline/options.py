@@ -9,7 +9,7 @@ from stillmap.core.recording import Recording
 from stillmap.em import EmOptions
 from stillmap.em.options import MapState
 from stillmap.mesh.options import MeshOptions
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 from stillmap.rig.options import RigOptions
 from stillmap.slam import SlamOptions
 from stillmap.tracking import ObjectOptions

@@ -17,7 +17,7 @@ from stillmap.io.rigid_transforms import MAX_TRANSLATION
 from stillmap.mesh.options import MeshOptions
 from stillmap.pipeline.options import MapMode, Options, OutputOptions
 from stillmap.pipeline.quality import Quality
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 from stillmap.results.run_json import EXTENDS, LOCAL_ORIGIN, RECORD
 from stillmap.slam import SlamOptions
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 import stillmap._core as _core
 from stillmap.core import se2, se3
 from stillmap.core.recording import Recording
-from stillmap.preprocessing.options import MAX_POINT_DISTANCE
+from stillmap.prepare.options import MAX_POINT_DISTANCE
 from stillmap.slam.lidar_odometry import register_sweeps
 from stillmap.slam.local_map import LocalMap
 from stillmap.slam.motion_model import compute_odometry_steps, odometry_prior

@@ -8,7 +8,7 @@ import pytest
 from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.io import read, write
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 
 HEADER = "0 -1.0 2.0 0.5 20.0 0.01 0"  # five beams, half a radian apart
 RAW = f"{HEADER} 5 1 2 3 4 5 0"

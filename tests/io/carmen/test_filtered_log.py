@@ -8,7 +8,7 @@ import pytest
 from stillmap.core.errors import InputError
 from stillmap.io import read
 from stillmap.io.carmen.filtered_log import find_no_return_code, write_filtered_log
-from stillmap.preprocessing.max_range import RangeRule
+from stillmap.prepare.max_range import RangeRule
 
 # real readings, and a code that repeats in several directions
 READINGS = [[1.5, 81.83, 3.25, 4.0], [1.5, 2.0, 81.83, 4.0], [81.83, 2.0, 3.0, 81.83]]

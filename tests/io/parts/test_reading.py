@@ -15,7 +15,7 @@ from stillmap.io import read, writers
 from stillmap.io.input_groups import group_inputs, read_parts
 from stillmap.io.parts.joining import join_recordings
 from stillmap.pipeline import inputs
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 
 FORMS = {
     2: {

@@ -10,7 +10,7 @@ from stillmap.io import read
 from stillmap.io.filtered_copy import FilterJob, Omissions
 from stillmap.io.ros.filtered_bag import write_filtered
 from stillmap.io.ros.messages import load_typestore
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 
 START = 1_700_000_000_000_000_000
 SECOND = 10**9

@@ -18,7 +18,7 @@ from stillmap.io.ros import limits, scan_beams
 from stillmap.io.ros.bag_types import Channel, Message
 from stillmap.io.ros.collect import TopicSelection, collect_messages
 from stillmap.io.ros.laser_scan import LaserScans, ScanShape
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 
 START = 1_700_000_000_000_000_000
 ENDLESS = "WITH RECURSIVE r(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM r) SELECT x AS id"

@@ -12,7 +12,7 @@ from stillmap.cli.recording_info import summarize_recording
 from stillmap.core.errors import InputError
 from stillmap.io import read
 from stillmap.io.ros import point_cloud2
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 
 START = 1_700_000_000_000_000_000
 SECOND = 10**9

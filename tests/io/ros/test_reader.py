@@ -6,7 +6,7 @@ import pytest
 from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.io import read
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 
 START = 1_700_000_000_000_000_000
 SECOND = 10**9

@@ -14,7 +14,7 @@ from stillmap.io import read, writers
 from stillmap.io.builder import ReadContext
 from stillmap.io.ros.bag import open_bag
 from stillmap.io.ros.reader import read_tilting, read_tilting_parts
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 from stillmap.sim import RigOptions, load_truth, scene_by_name, simulate_rig, write_rig
 from stillmap.sim.laser import compute_beam_angles
 from stillmap.sim.lidar import compute_joint_angle

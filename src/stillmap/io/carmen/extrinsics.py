@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from stillmap.core import se2
 from stillmap.io.carmen.log import LaserLog
 from stillmap.io.carmen.scan_selection import laser_position, param_number
-from stillmap.preprocessing.options import LaserOptions
+from stillmap.prepare.options import LaserOptions
 
 # differences between laser and robot pose that agree: old logs round to cm. A corrected pose in
 # the laser field differs by metres, and differently in each scan

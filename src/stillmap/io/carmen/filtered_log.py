@@ -13,9 +13,9 @@ from stillmap.io.carmen.log import BYTE_ORDER_MARK, read_log
 from stillmap.io.carmen.messages import SCAN_PARSERS
 from stillmap.io.carmen.scan_selection import Sensor, scan_order, select_scans
 from stillmap.io.text_lines import read_lines, write_atomically
-from stillmap.preprocessing.max_range import find_max_range
-from stillmap.preprocessing.options import MAX_PLAUSIBLE_RANGE, ReadOptions
-from stillmap.preprocessing.time_window import TimeWindow
+from stillmap.prepare.max_range import find_max_range
+from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE, ReadOptions
+from stillmap.prepare.time_window import TimeWindow
 
 _OVERFLOW = 81.91  # m: a value that SICK lasers report for no return
 _FIRST_READING = {b"FLASER": 2, b"RLASER": 2}  # index of its field; the name is field 0

@@ -20,8 +20,8 @@ from stillmap.io.carmen.messages import (
 )
 from stillmap.io.parts.repeats import RepeatFilter
 from stillmap.io.text_lines import Line, Progress, read_lines, share_progress
-from stillmap.preprocessing.options import ReadOptions
-from stillmap.preprocessing.time_window import TimeWindow
+from stillmap.prepare.options import ReadOptions
+from stillmap.prepare.time_window import TimeWindow
 
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 CUT_LINE = "cut last line"

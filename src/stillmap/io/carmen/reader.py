@@ -19,9 +19,9 @@ from stillmap.io.carmen.log import CarmenLog, read_logs
 from stillmap.io.carmen.messages import SCAN_PARSERS, flaser_config
 from stillmap.io.carmen.scan_selection import Sensor, scan_order, select_scans
 from stillmap.io.text_lines import Line, is_gzip, read_head
-from stillmap.preprocessing import max_range
-from stillmap.preprocessing.options import LaserOptions, ReadOptions
-from stillmap.preprocessing.time_window import TimeWindow
+from stillmap.prepare import max_range
+from stillmap.prepare.options import LaserOptions, ReadOptions
+from stillmap.prepare.time_window import TimeWindow
 
 _HEAD = 1 << 18  # bytes with the PARAM lines of a log
 

@@ -15,8 +15,8 @@ from stillmap.core.timestamps import format_seconds
 from stillmap.io.carmen.extrinsics import is_stated_by_lines
 from stillmap.io.carmen.messages import flaser_config
 from stillmap.io.text_lines import write_atomically
-from stillmap.preprocessing import laser_scan
-from stillmap.preprocessing.max_range import MIN_ZERO_SHARE
+from stillmap.prepare import laser_scan
+from stillmap.prepare.max_range import MIN_ZERO_SHARE
 
 Float = NDArray[np.float64]
 

@@ -14,8 +14,8 @@ from stillmap.io.builder import ReadContext, RecordingBuilder, SkippedRecords
 from stillmap.io.point_cloud.origin import Origin
 from stillmap.io.point_cloud.time_field import Clock, convert_times, detect_clock
 from stillmap.io.scan_files import list_files, stamps_from_names, strip_extension
-from stillmap.preprocessing.options import MAX_POINT_DISTANCE, ReadOptions
-from stillmap.preprocessing.time_window import TimeWindow
+from stillmap.prepare.options import MAX_POINT_DISTANCE, ReadOptions
+from stillmap.prepare.time_window import TimeWindow
 
 _MAX_NAMES = 5  # of skipped files in a warning
 

@@ -11,7 +11,7 @@ from stillmap.io.builder import SkippedRecords
 from stillmap.io.ros.collect import BagContent
 from stillmap.io.ros.laser_scan import LaserScans
 from stillmap.io.ros.tf import Lookup, Odometry, TransformTree
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 
 Float = NDArray[np.float64]
 

@@ -25,8 +25,8 @@ from stillmap.io.ros.messages import (
 )
 from stillmap.io.ros.point_cloud2 import CloudCollector
 from stillmap.io.ros.tf import Odometry, TransformTree
-from stillmap.preprocessing.options import ReadOptions
-from stillmap.preprocessing.time_window import TimeWindow
+from stillmap.prepare.options import ReadOptions
+from stillmap.prepare.time_window import TimeWindow
 
 _SCAN_TYPES = (LASER_SCAN, MULTI_ECHO, POINT_CLOUD)
 _PROGRESS_INTERVAL = 2000  # messages

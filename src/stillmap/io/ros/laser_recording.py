@@ -16,7 +16,7 @@ from stillmap.io.ros import base_frame, scan_beams
 from stillmap.io.ros.base_frame import LaserSelection
 from stillmap.io.ros.collect import BagContent
 from stillmap.io.ros.laser_scan import LaserScans
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 
 Float = NDArray[np.float64]
 

@@ -23,7 +23,7 @@ from stillmap.io.ros.laser_scan import TIME_BACKWARDS
 from stillmap.io.ros.lent_transforms import lend_transforms
 from stillmap.io.ros.limits import limit_output
 from stillmap.io.ros.point_cloud2 import CloudCollector
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 
 _BuildFromLasers = Callable[[BagContent, ReadContext], Recording]
 

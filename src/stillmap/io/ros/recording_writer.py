@@ -18,7 +18,7 @@ from stillmap.io.ros.messages import (
     POINT_CLOUD,
     TF,
 )
-from stillmap.preprocessing import laser_scan
+from stillmap.prepare import laser_scan
 
 
 def write_recording(

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.arrays import release_pages, release_periodically
 from stillmap.io.ros.laser_scan import LaserScans, ScanShape
-from stillmap.preprocessing import max_range
-from stillmap.preprocessing.options import MAX_PLAUSIBLE_RANGE, ReadOptions
+from stillmap.prepare import max_range
+from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE, ReadOptions
 
 _SAMPLE = 1 << 22  # readings from which the range rule is inferred
 _BLOCK = 1 << 18  # beams at a time: these fit into the CPU caches

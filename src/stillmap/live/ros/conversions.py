@@ -15,7 +15,7 @@ from stillmap.io.ros.messages import frame_name, stamp_ns
 from stillmap.live.scan import Scan as PushedScan
 from stillmap.live.scan import ScanBeams, to_beams
 from stillmap.pipeline.options import MapMode
-from stillmap.preprocessing.options import MAX_PLAUSIBLE_RANGE
+from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE
 from stillmap.results.map_server import raw_pixels
 from stillmap.results.reader import FREE_THRESH, OCCUPIED_THRESH
 

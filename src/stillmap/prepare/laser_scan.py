@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.preprocessing.max_range import DECLARED, GIVEN
+from stillmap.prepare.max_range import DECLARED, GIVEN
 
 Float = NDArray[np.float64]
 

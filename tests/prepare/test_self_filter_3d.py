@@ -10,8 +10,8 @@ from stillmap.cli.main import main
 from stillmap.cli.recording_info import summarize_recording
 from stillmap.core.recording import Recording
 from stillmap.io import read, stillmap_folder, writers
-from stillmap.preprocessing import self_filter
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare import self_filter
+from stillmap.prepare.options import ReadOptions
 from stillmap.sim import Simulation, scene_by_name, simulate
 
 pytestmark = pytest.mark.slow

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from stillmap.core.camera import Images
 from stillmap.core.errors import InputError
 from stillmap.core.timestamps import format_seconds
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.options import ReadOptions
 
 ABSOLUTE = 1e8  # s: times from here on are stamps; no recording lasts three years
 

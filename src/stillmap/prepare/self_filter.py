@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import arrays
 from stillmap.core.recording import Recording
-from stillmap.preprocessing.ground_segmentation import (
+from stillmap.prepare.ground_segmentation import (
     BODY_RADIUS,
     MIN_SCANS,
     PLANE_MARGIN,
@@ -24,7 +24,7 @@ from stillmap.preprocessing.ground_segmentation import (
     sample_hits,
     select_distinct_scans,
 )
-from stillmap.preprocessing.options import MAX_PLAUSIBLE_RANGE
+from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]

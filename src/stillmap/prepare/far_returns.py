@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from stillmap.core import arrays
 from stillmap.core.advice import advise
 from stillmap.core.recording import Recording
-from stillmap.preprocessing.options import MAX_PLAUSIBLE_RANGE
+from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE
 
 # m, and cells, by dimension: a beam is followed up to the greater of both. Planar lasers of robots
 # reach 80 m, lidars 300 m; 2000 cells in all directions take half a gigabyte in 2D

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from stillmap.preprocessing import max_range, self_filter
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare import max_range, self_filter
+from stillmap.prepare.options import ReadOptions
 
 
 @pytest.fixture

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from stillmap.core import arrays, se2
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.preprocessing.options import LaserOptions, ReadOptions
-from stillmap.preprocessing.time_window import TimeWindow
+from stillmap.prepare.options import LaserOptions, ReadOptions
+from stillmap.prepare.time_window import TimeWindow
 
 
 def apply_options(recording: Recording, options: ReadOptions) -> Recording:

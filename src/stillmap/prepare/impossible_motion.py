@@ -9,7 +9,7 @@ from stillmap.core import arrays, se2, se3
 from stillmap.core.advice import advise
 from stillmap.core.recording import Recording
 from stillmap.core.square_box import find_busiest
-from stillmap.preprocessing.options import MAX_POINT_DISTANCE
+from stillmap.prepare.options import MAX_POINT_DISTANCE
 
 Float = NDArray[np.float64]
 

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.advice import advise
-from stillmap.preprocessing import self_filter
-from stillmap.preprocessing.options import MAX_PLAUSIBLE_RANGE, ReadOptions
-from stillmap.preprocessing.self_filter import SelfSector
+from stillmap.prepare import self_filter
+from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE, ReadOptions
+from stillmap.prepare.self_filter import SelfSector
 
 MAX_ZERO_RANGE = 0.02  # m: smaller than the housing of a laser, so such a reading is a code
 MIN_ZERO_SHARE = 0.005  # of the readings: zero is a code

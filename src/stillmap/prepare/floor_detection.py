@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.recording import Recording
-from stillmap.preprocessing.scan_views import AGREED, PASSED, ScanViews
+from stillmap.prepare.scan_views import AGREED, PASSED, ScanViews
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]

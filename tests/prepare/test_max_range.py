@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from stillmap.preprocessing.max_range import apply_range_rule, find_max_range, infer_range_rule
-from stillmap.preprocessing.options import ReadOptions
+from stillmap.prepare.max_range import apply_range_rule, find_max_range, infer_range_rule
+from stillmap.prepare.options import ReadOptions
 
 T, N = 200, 181
 

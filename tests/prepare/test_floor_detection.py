@@ -13,7 +13,7 @@ from stillmap.core import se2
 from stillmap.core.config import override
 from stillmap.core.recording import Recording
 from stillmap.em.options import EmOptions
-from stillmap.preprocessing.floor_detection import find_floor_returns
+from stillmap.prepare.floor_detection import find_floor_returns
 from stillmap.sim import Scene, Simulation, scene_by_name, simulate
 from stillmap.sim.mishaps import FLOOR
 from stillmap.sim.walls import box
