@@ -32,7 +32,7 @@ SIMULATED = {
     "street": "street --lidar 16 --scans 25 --seed 6",
     "crossing": "crossing --lidar 32 --scans 12 --seed 7 --camera",
     "tilting": "hall --lidar tilting --rate 37.5 --scans 400 --seed 8",
-    "days": "office-moved --scans 200 --sessions 2 --seed 9",
+    "days": "office --scans 200 --sessions 2 --seed 9",
 }
 RECORDED = {
     "belgioioso": "laser2d/belgioioso.clf.gz",
