@@ -12,7 +12,7 @@ import stillmap
 from stillmap.core.errors import InputError
 from stillmap.io import read, writers
 from stillmap.pipeline import result
-from stillmap.pipeline.checkpoint_files import identify_run
+from stillmap.pipeline.checkpoint import identify_run
 from stillmap.pipeline.em_loop import iterate
 from stillmap.pipeline.inputs import read as read_run
 from stillmap.prepare.options import ReadOptions

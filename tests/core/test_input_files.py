@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from stillmap.core import arrays
-from stillmap.core.array_files import open_npy
+from stillmap.core.array_folder import open_npy
 from stillmap.core.errors import InputError
 from stillmap.core.input_files import (
     InputFile,
@@ -168,7 +168,7 @@ import os, sys
 from pathlib import Path
 import numpy as np
 from stillmap.core import arrays
-from stillmap.core.array_files import open_npy
+from stillmap.core.array_folder import open_npy
 from stillmap.core.errors import InputError
 path = Path(sys.argv[1])
 np.save(path, np.ones(1 << 23))

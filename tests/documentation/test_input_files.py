@@ -18,7 +18,7 @@ ALLOWED = {
     ("core/arrays.py", "os.open"): "a new file without a name",
     ("core/arrays.py", "zipfile.ZipFile"): "a new file",
     ("core/arrays.py", "open"): "a part of a new archive",
-    ("core/array_files.py", "np.load"): "an open InputFile",
+    ("core/array_folder.py", "np.load"): "an open InputFile",
     ("core/memory.py", "read_text"): "what the system says of memory",
     ("core/extras.py", "read_text"): "the metadata of the package",
     ("cli/main.py", "os.open"): "the null device",

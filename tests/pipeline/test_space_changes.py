@@ -8,7 +8,6 @@ from choices import options
 
 import stillmap
 from stillmap.core.config import override
-from stillmap.pipeline.checkpoint_files import pack_state, unpack_state
 from stillmap.pipeline.options import Options
 from stillmap.pipeline.result import map_recording
 from stillmap.results.save import save
@@ -43,16 +42,11 @@ def hall():
 
 @pytest.fixture(scope="module")
 def built(hall):
-    """The result, and the state of the run after its only iteration."""
-    states = []
-    result = map_recording(
-        hall.recording, LISTED, poses=hall.truth.T_world_base, checkpoint=states.append
-    )
-    return result, states[-1]
+    return map_recording(hall.recording, LISTED, poses=hall.truth.T_world_base)
 
 
 def test_both_are_listed_and_nothing_else(built):
-    result, _ = built
+    result = built
     assert {one.kind for one in result.changes} == {"left", "came"}
     start = result.recording.stamp_ns[0]
     for kind, (x, y) in (("left", LEFT), ("came", CAME)):
@@ -64,7 +58,7 @@ def test_both_are_listed_and_nothing_else(built):
 
 
 def test_the_files_say_so(built, tmp_path):
-    result, _ = built
+    result = built
     save(result, tmp_path / "out")
     changes = json.loads((tmp_path / "out/run.json").read_text())["changes"]
     for one, known in zip(changes, result.changes, strict=True):
@@ -83,21 +77,6 @@ def test_the_files_say_so(built, tmp_path):
     z, size = result.changes[0].z, result.changes[0].size
     assert f", {z:.2f}</td>" in section
     assert f"{size[0]:.2f} x {size[1]:.2f} x {size[2]:.2f}" in section
-
-
-def test_a_run_that_goes_on_knows_them(built, hall):
-    result, state = built
-    values, arrays = pack_state(state)
-    again = unpack_state(json.loads(json.dumps(values)), arrays, state.options)
-    resumed = map_recording(hall.recording, LISTED, poses=hall.truth.T_world_base, resume=again)
-    kept, known = again.best.e_step.ground, state.best.e_step.ground
-    np.testing.assert_array_equal(kept.height, known.height)
-    np.testing.assert_array_equal(kept.corner, known.corner)
-    assert (kept.sensor_height, kept.observed) == (known.sensor_height, True)
-    assert len(resumed.changes) == len(result.changes) == 2
-    for one, known in zip(resumed.changes, result.changes, strict=True):
-        assert (one.x, one.y, one.z, one.stamp_ns) == (known.x, known.y, known.z, known.stamp_ns)
-        np.testing.assert_array_equal(one.cells, known.cells)
 
 
 def test_nothing_is_listed_that_was_not_asked_for(hall):

@@ -152,8 +152,7 @@ def make_parents(output: Path) -> Iterator[None]:
         InputError: they cannot be created, or the output cannot be written there; before anything
             is read.
     """
-    from stillmap.core.files import temporary_folder
-    from stillmap.core.output_place import resolve_output
+    from stillmap.core.files import resolve_output, temporary_folder
 
     parent = resolve_output(output).parent
     created: list[Path] = []

@@ -18,7 +18,7 @@ from stillmap.cli.convert_result import (
     given_zone_flags,
 )
 from stillmap.core.errors import InputError
-from stillmap.core.output_place import workplace
+from stillmap.core.files import workplace
 
 # copies for the help: the modules that define them take long to load
 ENDINGS = (

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, get_args
 from stillmap.cli.arguments import read_changes, require_apart
 from stillmap.cli.console import show_share
 from stillmap.core.errors import InputError
-from stillmap.core.output_place import workplace
+from stillmap.core.files import workplace
 
 if TYPE_CHECKING:
     from stillmap.results import point_cloud

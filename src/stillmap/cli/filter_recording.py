@@ -71,7 +71,7 @@ def write_filtered(
     Raises:
         InputError: labels and recording cannot be read, or do not belong together.
     """
-    from stillmap.core.output_place import workplace
+    from stillmap.core.files import workplace
     from stillmap.io.filtered_copy import FilterJob
 
     scratch = workplace(output)

@@ -14,7 +14,6 @@ FLAGS = {
     "map_state=": "--map-state ",
     "tilting=": "--tilting ",
     "estimator=": "--estimator ",
-    "memory=GB": "--memory GB",
     'poses="FILE.tum"': "--poses FILE.tum",
     'poses="recording"': "--poses recording",
 }

@@ -17,16 +17,8 @@ from stillmap.cli.console import (
     write_line,
 )
 from stillmap.cli.flags import in_flags
-from stillmap.cli.map_flags import require_memory_flag
 from stillmap.cli.parser import COMMANDS, EXIT_INPUT, parser
-from stillmap.core.errors import InputError, closest_match
-from stillmap.core.memory import (
-    GIGABYTE,
-    default_memory,
-    is_out_of_memory,
-    limit_memory,
-    memory_error,
-)
+from stillmap.core.errors import InputError, closest_match, is_out_of_memory, memory_error
 from stillmap.core.printable import printable
 
 EXIT_DEFECT = 1
@@ -47,7 +39,7 @@ def main(argv: list[str] | None = None) -> int:
         args = _parse(sys.argv[1:] if argv is None else argv)
         _set_up_logging(args)
         handle_signals(main.__code__)
-        status = _run(args)
+        status: int = args.run(args)
         if sys.stdout is not None:  # None: closed before the start
             sys.stdout.flush()
         return status
@@ -55,24 +47,6 @@ def main(argv: list[str] | None = None) -> int:
         return _report_failure(error, args)
     except KeyboardInterrupt:
         return _report_interrupt()
-
-
-def _run(args: argparse.Namespace) -> int:
-    """Run the command, within the memory that it may use if it maps."""
-    if not hasattr(args, "memory"):
-        status: int = args.run(args)
-        return status
-    if args.memory is not None:
-        require_memory_flag(args.memory)
-    allowed = default_memory() if args.memory is None else round(GIGABYTE * args.memory)
-    with limit_memory(allowed):
-        try:
-            status = args.run(args)
-        except Exception as error:
-            if is_out_of_memory(error):
-                raise memory_error(error) from error
-            raise
-    return status
 
 
 def _report_failure(error: Exception, args: argparse.Namespace) -> int:

@@ -19,8 +19,7 @@ from stillmap.cli.map_flags import (
     option_changes,
 )
 from stillmap.cli.map_summary import print_summary, summarize
-from stillmap.core.errors import InputError
-from stillmap.core.memory import is_out_of_memory, memory_error
+from stillmap.core.errors import InputError, is_out_of_memory, memory_error
 
 if TYPE_CHECKING:
     from stillmap.core.profiling import StageTimer
@@ -102,7 +101,6 @@ def run(args: argparse.Namespace) -> int:
                 result,
                 output,
                 args.overwrite or args.resume,
-                staging_folder=checkpoints.folder,
                 tilting=tilting,
                 models=models,
             )
@@ -150,8 +148,7 @@ def _merge_sessions(args: argparse.Namespace, groups: "list[InputGroup]") -> int
 
 def _require_usable_output(args: argparse.Namespace, output: Path) -> None:
     """Refuse an output that is taken, holds an input or cannot be written, before any work."""
-    from stillmap.core.files import require_new
-    from stillmap.core.output_place import workplace
+    from stillmap.core.files import require_new, workplace
     from stillmap.results.run_json import RECORD
 
     require_new(output, RECORD, args.overwrite or args.resume)

@@ -11,13 +11,6 @@ def add_run_flags(p: argparse.ArgumentParser) -> None:
     p.add_argument(
         "--threads", metavar="N", type=int, help="0: one per processor; same result (default: 0)"
     )
-    p.add_argument(
-        "--memory",
-        metavar="GB",
-        type=float,
-        help="memory that the command may use (default: 0.8 of what is available); one line says "
-        "when it does not suffice",
-    )
     p.add_argument("--json", action="store_true", help="a summary as one JSON object on stdout")
     p.add_argument("--quiet", action="store_true", help="no progress, no summary")
 

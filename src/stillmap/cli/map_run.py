@@ -19,8 +19,7 @@ from stillmap.io.input_groups import InputGroup
 from stillmap.io.registry import detect_format
 from stillmap.io.text_lines import Progress as ReadProgress
 from stillmap.pipeline import inputs
-from stillmap.pipeline.checkpoint import CheckpointFolder, DamagedCheckpoint
-from stillmap.pipeline.checkpoint_files import identify_run
+from stillmap.pipeline.checkpoint import CheckpointFolder, identify_run
 from stillmap.pipeline.estimate import EmState
 from stillmap.pipeline.map_frame import objects_to_local
 from stillmap.pipeline.options import Options, resolve_options
@@ -206,12 +205,7 @@ def _load_checkpoint(
             say("an earlier run was interrupted: starts anew; --resume would continue it")
         checkpoints.clear()
         return None
-    try:
-        state = checkpoints.load(run_id, found.options, found.recording, stages)
-    except DamagedCheckpoint as error:
-        say(f"warning: {error}; starts anew")
-        checkpoints.clear()
-        return None
+    state = checkpoints.load(run_id, found.options, found.recording, stages)
     if state is not None and not args.quiet:
         say(f"continues after iteration {len(state.records)}")
     return state

@@ -174,8 +174,7 @@ def run(args: argparse.Namespace) -> int:
     """
     import numpy as np
 
-    from stillmap.core.files import require_new
-    from stillmap.core.output_place import workplace
+    from stillmap.core.files import require_new, workplace
     from stillmap.sim import scene_by_name, simulate, simulate_rig
     from stillmap.sim.writer import MARK, RIG_MARK, require_carmen, write_rig, write_simulation
 

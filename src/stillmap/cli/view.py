@@ -83,13 +83,11 @@ def _find_report(folder: Path) -> Path:
     Raises:
         InputError: there is none.
     """
-    from stillmap.core.output_place import require_finished
     from stillmap.places.inputs import is_place
 
     hint = "DIR is what `stillmap map` or `merge` wrote"
     if not folder.exists():
         raise InputError("does not exist", where=str(folder), hint=hint)
-    require_finished(folder)
     report = Path(os.path.abspath(folder)) / _REPORT
     place = report.parent.parent.parent  # of a session, in its folder `sessions`
     if not report.is_file() and report.parent.parent.name == "sessions" and is_place(place):

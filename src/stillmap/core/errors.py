@@ -1,5 +1,6 @@
 """InputError, the one exception for invalid input or calls, and import of optional libraries."""
 
+import errno
 from collections.abc import Iterable
 from importlib import import_module
 from typing import Any
@@ -78,3 +79,17 @@ def import_extra(module: str, path: object, action: str = "read", *, group: str 
         raise MissingExtra(
             f"needs {package} to be {action}", where=str(path), hint=install_hint(package, group)
         ) from error
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """True if memory ran out, whichever library says so."""
+    if isinstance(error, OSError):
+        return error.errno == errno.ENOMEM
+    no_thread = isinstance(error, RuntimeError) and "start new thread" in str(error)
+    return no_thread or isinstance(error, MemoryError)
+
+
+def memory_error(error: BaseException) -> InputError:
+    """The error for memory that ran out."""
+    hint = "coarser slam.resolution, a shorter read.max_range or a part of the recording takes less"
+    return InputError(f"not enough memory{': ' if str(error) else ''}{error}", hint=hint)

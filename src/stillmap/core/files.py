@@ -1,30 +1,77 @@
-"""Atomic output of files and folders."""
+"""Outputs that appear whole or not at all.
 
+Work lies under a hidden name beside the output, from where a rename makes it appear. A folder that
+cannot be renamed, as a mount point, has the hidden name inside, and its entries are exchanged: the
+file that marks what the folder is goes first and comes last.
+"""
+
+import errno
+import fcntl
+import hashlib
 import os
+import re
 import secrets
+import shutil
 import tempfile
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from fnmatch import fnmatch
 from pathlib import Path
 
 from stillmap.core.errors import InputError, cannot_write
 from stillmap.core.interrupts import defer_signals
-from stillmap.core.output_place import (
-    UNFINISHED,
-    hidden_path,
-    list_entries,
-    require_finished,
-    resolve_output,
-)
-from stillmap.core.publishing import (
-    finish_exchange,
-    hold,
-    keep,
-    publish_file,
-    publish_folder,
-    remove,
-    remove_stale,
-)
+
+PREFIX = ".stillmap."  # of hidden names inside an output
+# mount points, other disks, folders that must not be changed
+_NO_RENAME = (errno.EBUSY, errno.EXDEV, errno.EPERM, errno.EACCES, errno.EROFS)
+_MAX_STEM = 100  # bytes of a name to which something is added
+_RANDOM = re.compile(r"[0-9a-f]{16}\.(part|old)")
+_MIN_AGE = 10.0  # s, at most, between the steps of a process that is alive
+_OF_DISKS = "lost+found"  # in the uppermost folder of a disk
+
+
+def resolve_output(path: Path) -> Path:
+    """The absolute path of an output without links: what they point to is replaced, not they.
+
+    Raises:
+        InputError: links lead to each other, or no file can have such a name there.
+    """
+    target = Path(os.path.realpath(path))
+    try:
+        if target.is_symlink():
+            raise InputError("is a link that leads to itself", where=str(path))
+    except OSError as error:
+        raise cannot_write(error, path) from error
+    return target
+
+
+def workplace(output: Path) -> Path:
+    """The folder for temporary files of an output, on its disk where that is possible."""
+    target = resolve_output(output)
+    parent = target.parent
+    is_writable = not parent.exists() or os.access(parent, os.W_OK | os.X_OK)
+    if target.is_dir() and (os.path.ismount(target) or not is_writable):
+        return target
+    return parent if is_writable or not target.is_file() else Path(tempfile.gettempdir())
+
+
+def hidden_path(output: Path, suffix: str) -> Path:
+    """A hidden name for what belongs to an output, in `workplace`; the same for equal arguments."""
+    target, folder = resolve_output(output), workplace(output)
+    if folder == target:
+        return folder / f"{PREFIX}{suffix}"
+    return folder / f".{shorten(target.name)}.{suffix}"
+
+
+def shorten(name: str) -> str:
+    """A name to which something can be added; the same for equal names, another for others."""
+    if len(os.fsencode(name)) <= _MAX_STEM:
+        return name
+    digest = hashlib.sha256(os.fsencode(name)).hexdigest()[:8]
+    while len(os.fsencode(name)) > _MAX_STEM - len(digest) - 1:
+        name = name[:-1]
+    return f"{name}-{digest}"
 
 
 def require_new(path: Path, marker: str, overwrite: bool = False) -> None:
@@ -43,15 +90,13 @@ def require_new(path: Path, marker: str, overwrite: bool = False) -> None:
         return
     if not target.is_dir():
         raise InputError("is in the way: not a folder", where=str(path))
-    if not overwrite:
-        require_finished(target)
-    if not list_entries(target) or os.path.lexists(target / UNFINISHED):
+    if not _list_entries(target):
         return
     if not overwrite:
         raise InputError(
             "already holds something", where=str(path), hint="choose another or give overwrite=True"
         )
-    if not any(target.glob(marker)):
+    if not any(target.glob(marker)) and not any(target.glob(f"{PREFIX}*.part")):
         what = f"holds other things: only a folder with {marker} is replaced"
         raise InputError(what, where=str(path), hint="choose another")
 
@@ -79,116 +124,48 @@ def require_new_file(path: Path, overwrite: bool = False) -> None:
 
 
 @contextmanager
-def atomic_folder(
-    path: Path, marker: str, overwrite: bool = False, *, staging_folder: Path | None = None
-) -> Iterator[Path]:
+def atomic_folder(path: Path, marker: str, overwrite: bool = False) -> Iterator[Path]:
     """Context manager of a temporary folder that takes the place of `path` on success.
 
-    A link is followed. Where `path` cannot be renamed, as a mount point, its files are exchanged
-    under a journal; see `output_place.require_finished`.
-
     Args:
-        path: the output folder.
+        path: the output folder; a link is followed.
         marker, overwrite: see `require_new`.
-        staging_folder: parent of the temporary folder, on the same file system; None: see
-            `output_place.workplace`.
 
     Raises:
         InputError: `path` is taken, or its parent cannot be written. A folder that was finished
             but cannot take its place is kept: the message says where.
     """
     given, path = path, resolve_output(path)
-    remove_stale(path)
+    _remove_stale(path)
     require_new(given, marker, overwrite)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        finish_exchange(path)
-        with temporary_folder(path, staging_folder) as work:
+        with temporary_folder(path) as work:
             yield work
             work.chmod(0o777 & ~_umask())
             with _kept_on_failure(work, given):
                 require_new(given, marker, overwrite)  # it may have appeared meanwhile
-                publish_folder(work, path, marker)
+                _publish_folder(work, path, marker)
     except OSError as error:
         raise cannot_write(error, given) from error
 
 
 @contextmanager
 @defer_signals
-def temporary_folder(output: Path, parent: Path | None = None) -> Iterator[Path]:
-    """Context manager of a folder for work on an output, removed at the end.
-
-    Args:
-        output: file or folder.
-        parent: where it lies; None: see `output_place.workplace`.
+def temporary_folder(output: Path) -> Iterator[Path]:
+    """Context manager of a folder in `workplace` for work on an output, removed at the end.
 
     Raises:
         OSError: it cannot be made.
     """
     # named before it is made: an interruption right after that finds it
     work = hidden_path(output, f"{secrets.token_hex(8)}.part")
-    work = work if parent is None else parent / work.name
-    with _removed_at_the_end(work, resolve_output(output)):
+    try:
         work.mkdir(mode=0o700)
-        with hold(work):
+        with _held(work):
             yield work
-
-
-@contextmanager
-def atomic_file(path: Path) -> Iterator[Path]:
-    """Context manager of a temporary file that takes the place of `path` on success.
-
-    A link is followed. The temporary file is there, and empty.
-
-    Raises:
-        InputError: it cannot be written, or something else has this name.
-    """
-    given, path = path, resolve_output(path)
-    require_new_file(given, overwrite=True)
-    free = not path.exists()
-    try:
-        remove_stale(path)
-        work = hidden_path(path, f"{secrets.token_hex(8)}.part")
-        with _removed_at_the_end(work, path):
-            os.close(os.open(work, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
-            with hold(work):
-                yield work
-                if free and path.exists():
-                    what, hint = "has appeared meanwhile", "choose another"
-                    raise InputError(what, where=str(given), hint=hint)
-                publish_file(work, path)
-    except OSError as error:
-        raise cannot_write(error, given) from error
-
-
-@contextmanager
-@defer_signals
-def _removed_at_the_end(work: Path, path: Path) -> Iterator[None]:
-    try:
-        yield
     finally:
-        # otherwise the rest of an exchange lies there
-        if path not in work.parents or not os.path.lexists(path / UNFINISHED):
-            remove(work)
-
-
-@contextmanager
-def _kept_on_failure(work: Path, path: Path) -> Iterator[None]:
-    """Keep what was finished where it cannot take its place.
-
-    Raises:
-        InputError: it cannot; says where it lies.
-    """
-    try:
-        yield
-    except (OSError, InputError) as error:
-        what = (error if isinstance(error, InputError) else cannot_write(error, path)).what
-        if os.path.lexists(resolve_output(path) / UNFINISHED):
-            hint = "its new files lie inside; overwrite=True goes on"
-        else:
-            kept = keep(work, path)
-            hint = "" if kept is None else f"what was made is kept in {kept}"
-        raise InputError(what, where=str(path), hint=hint) from error
+        remove(work)
 
 
 @contextmanager
@@ -213,6 +190,34 @@ def new_folder(prefix: str, parent: Path | None = None) -> Iterator[Path]:
         raise
 
 
+@contextmanager
+@defer_signals
+def atomic_file(path: Path) -> Iterator[Path]:
+    """Context manager of an empty temporary file that takes the place of `path` on success.
+
+    Raises:
+        InputError: it cannot be written, or something else has this name.
+    """
+    given, path = path, resolve_output(path)
+    require_new_file(given, overwrite=True)
+    is_free = not path.exists()
+    try:
+        _remove_stale(path)
+        work = hidden_path(path, f"{secrets.token_hex(8)}.part")
+        try:
+            os.close(os.open(work, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
+            with _held(work):
+                yield work
+                if is_free and path.exists():
+                    what, hint = "has appeared meanwhile", "choose another"
+                    raise InputError(what, where=str(given), hint=hint)
+                _publish_file(work, path)
+        finally:
+            remove(work)
+    except OSError as error:
+        raise cannot_write(error, given) from error
+
+
 def sync(path: Path) -> None:
     """Wait until a file or folder is on the disk."""
     handle = os.open(path, os.O_RDONLY)
@@ -220,12 +225,6 @@ def sync(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
 
 
 def nearest_folder_above(path: str | os.PathLike[str]) -> Path:
@@ -241,3 +240,148 @@ def to_encodable(text: str) -> str:
 def write_text(path: Path, text: str) -> None:
     """Write a text as UTF-8; see `to_encodable`."""
     path.write_bytes(to_encodable(text).encode("utf-8"))
+
+
+@contextmanager
+def _held(work: Path) -> Iterator[None]:
+    """Lock unfinished work while the block runs: `_remove_stale` leaves it alone."""
+    handle = os.open(work, os.O_RDONLY)
+    try:
+        with suppress(OSError):  # a file system without locks
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(handle)
+
+
+def _remove_stale(output: Path) -> None:
+    """Remove work of processes that were killed; what they had moved aside comes back."""
+    head, target = hidden_path(output, "").name, resolve_output(output)
+    with suppress(OSError):
+        for entry in workplace(output).iterdir():
+            is_work = entry.name.startswith(head) and _RANDOM.fullmatch(entry.name[len(head) :])
+            if is_work and not entry.is_symlink():
+                with suppress(OSError):
+                    _remove_unless_held(entry, target)
+
+
+def _remove_unless_held(entry: Path, output: Path) -> None:
+    if time.time() - entry.lstat().st_ctime < _MIN_AGE:
+        return
+    handle = os.open(entry, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if entry.suffix == ".old" and not output.exists():
+            os.rename(entry, output)
+        else:
+            remove(entry)
+    finally:
+        os.close(handle)
+
+
+@defer_signals
+def remove(path: Path) -> None:
+    """Remove a file, a link, or a folder with all in it, as far as that is possible."""
+    try:
+        _remove_once(path)
+    except BaseException:  # Ctrl-C, where `defer_signals` is of no use
+        _remove_once(path)
+        raise
+
+
+def _remove_once(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with suppress(OSError):  # read-only file systems refuse this, too
+            path.unlink()
+
+
+@defer_signals
+def _publish_folder(work: Path, path: Path, marker: str) -> None:
+    """Move a finished folder to its place, which may hold an earlier one."""
+    old = work.with_suffix(".old")
+    try:
+        if path in work.parents:
+            raise OSError(errno.EBUSY, os.strerror(errno.EBUSY))
+        if path.exists():
+            os.rename(path, old)
+        os.rename(work, path)
+    except OSError as error:
+        if error.errno not in _NO_RENAME:
+            raise
+        if os.path.lexists(old):
+            os.rename(old, path)
+        _exchange_entries(work, path, marker)
+    finally:
+        if os.path.lexists(path):
+            remove(old)
+        elif os.path.lexists(old):
+            os.rename(old, path)
+
+
+@defer_signals
+def _exchange_entries(work: Path, path: Path, marker: str) -> None:
+    """Move the entries of a folder to the place of those of another one."""
+    inside, is_new = work, not path.exists()
+    if path not in work.parents:
+        inside = path / f"{PREFIX}{secrets.token_hex(8)}.part"
+        path.mkdir(exist_ok=True)
+    try:
+        if inside != work:
+            shutil.copytree(work, inside, symlinks=True)
+        marked = marker.partition("/")[0]
+        for name in sorted(_list_entries(path), key=lambda name: not fnmatch(name, marked)):
+            remove(path / name)
+        for name in sorted(os.listdir(inside), key=lambda name: fnmatch(name, marked)):
+            os.rename(inside / name, path / name)
+    finally:
+        remove(inside)
+        if is_new:
+            with suppress(OSError):  # something is in it
+                path.rmdir()
+
+
+def _list_entries(folder: Path) -> list[str]:
+    """Names in a folder, without the hidden ones of unfinished work."""
+    names = os.listdir(folder)
+    return [name for name in names if not name.startswith(PREFIX) and name != _OF_DISKS]
+
+
+@defer_signals
+def _publish_file(work: Path, path: Path) -> None:
+    """Move a finished file to its place; a mount point is filled."""
+    try:
+        os.replace(work, path)
+    except OSError as error:
+        if error.errno not in _NO_RENAME or not path.is_file():
+            raise
+        try:
+            shutil.copyfile(work, path)
+        except BaseException:
+            os.truncate(path, 0)
+            raise
+
+
+@contextmanager
+def _kept_on_failure(work: Path, path: Path) -> Iterator[None]:
+    """Keep what was finished where it cannot take its place.
+
+    Raises:
+        InputError: it cannot; says where it lies.
+    """
+    try:
+        yield
+    except (OSError, InputError) as error:
+        what = (error if isinstance(error, InputError) else cannot_write(error, path)).what
+        kept, hint = work.with_name(f"{work.stem.lstrip('.')}.kept"), ""
+        with suppress(OSError):
+            os.rename(work, kept)
+            hint = f"what was made is kept in {kept}"
+        raise InputError(what, where=str(path), hint=hint) from error
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.array_files import open_npy, read_npz
+from stillmap.core.array_folder import open_npy, read_npz
 from stillmap.core.errors import InputError, import_extra
 from stillmap.core.input_files import read_bytes
 from stillmap.core.json import read_json

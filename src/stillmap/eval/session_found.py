@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.array_files import read_npz
+from stillmap.core.array_folder import read_npz
 from stillmap.core.errors import InputError
 from stillmap.eval.session_cells import ChangeTruth
 from stillmap.eval.session_poses import PlacedSession, read_json

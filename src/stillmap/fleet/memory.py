@@ -1,10 +1,9 @@
 """Memory that a recording needs to be mapped, told from its summary, and that of the machine."""
 
 import math
+import os
 from collections.abc import Iterable, Mapping
 from typing import Any
-
-from stillmap.core.memory import total_memory
 
 # an upper figure: of 13 recordings of 60 to 100 000 scans none needed more (docs/fleet.md)
 _BASE = {2: 200 << 20, 3: 300 << 20}  # bytes: interpreter, libraries, arrays that do not grow
@@ -30,7 +29,8 @@ def estimate_memory(info: Mapping[str, Any], resolution: float) -> int:
 
 def machine_memory() -> int:
     """Bytes that processes of this machine, or container, may use together."""
-    return round(total_memory() * (1 - _KEPT_FREE))
+    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return round(total * (1 - _KEPT_FREE))
 
 
 def fitting_jobs(estimates: Iterable[int], jobs: int, memory: int) -> int:

@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Protocol
 
 from stillmap.core.errors import InputError
-from stillmap.core.files import sync
+from stillmap.core.files import resolve_output, sync
 from stillmap.core.input_files import read_bytes
 from stillmap.core.interrupts import defer_signals
-from stillmap.core.output_place import resolve_output
 from stillmap.fleet.scratch import remove_stale, scratch_folder
 
 STATE = ".fleet"  # folder of the journal, of the labels of results, and of unfinished results

@@ -16,9 +16,8 @@ import numpy as np
 from stillmap.core import arrays
 from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.errors import InputError
-from stillmap.core.files import require_new, require_new_file
+from stillmap.core.files import require_new, require_new_file, workplace
 from stillmap.core.json import count_skipped
-from stillmap.core.output_place import workplace
 from stillmap.core.recording import Recording
 from stillmap.io import stillmap_folder, writers
 from stillmap.io.filtered_copy import FilterJob, Mask, Omissions

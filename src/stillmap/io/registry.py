@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 from stillmap.core.errors import InputError
-from stillmap.core.output_place import require_finished
 from stillmap.core.recording import Recording
 from stillmap.io import stillmap_folder
 from stillmap.io.builder import ReadContext
@@ -176,7 +175,6 @@ def detect_format(path: Path) -> Format:
         if path.exists():
             raise InputError("is no regular file", where=str(path), hint=_FORMATS_HINT)
         raise InputError("does not exist", where=str(path))
-    require_finished(path)
     start = read_head(path, _HEAD) if is_file else None
     for known in FORMATS:
         if known.matches(path, start):

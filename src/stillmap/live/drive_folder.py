@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from stillmap.core import config
-from stillmap.core.array_files import open_npy
+from stillmap.core.array_folder import open_npy
 from stillmap.core.arrays import iter_bytes, map_file, write_npy
 from stillmap.core.config import Limits
 from stillmap.core.errors import InputError

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
-from stillmap.core.array_files import open_npy
+from stillmap.core.array_folder import open_npy
 from stillmap.core.errors import InputError
 from stillmap.core.local_frame import LocalFrame
 from stillmap.em import CellProbabilities, GroundMap

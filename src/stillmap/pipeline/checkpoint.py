@@ -1,63 +1,49 @@
-"""The folder beside a result in which a run keeps its checkpoints, locked while it runs.
+"""What `--resume` goes on from: poses and P(static) of the last finished iteration of a run.
 
-`.NAME.resume/` beside NAME (`.stillmap.resume/` inside, where NAME is a mount point) holds `lock`,
-and `iteration-K/` once iteration K is finished: flat arrays and `state.json`, which knows the
-checksum of each. A checkpoint is written beside the one before, which goes only when the new one is
-whole and on the disk.
+They lie in `.NAME.resume/iteration-K/` beside the output NAME, with the key of the run: version,
+options, and a hash of its input. The folder is locked while the run lasts.
 """
 
+import dataclasses
 import fcntl
-import json
+import hashlib
 import os
-import re
 import shutil
-import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, Annotated, Any, NotRequired, TypedDict
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.array_files import open_npy
-from stillmap.core.arrays import iter_bytes, write_npy
-from stillmap.core.config import Limits
+from stillmap import em, slam
+from stillmap.core.array_folder import read_model, read_poses, read_probabilities, write_arrays
+from stillmap.core.arrays import iter_bytes
+from stillmap.core.config import iter_options
 from stillmap.core.errors import InputError, cannot_write
-from stillmap.core.files import sync
+from stillmap.core.files import hidden_path, remove, resolve_output
 from stillmap.core.interrupts import defer_signals
-from stillmap.core.json import read_json
+from stillmap.core.json import to_jsonable
 from stillmap.core.locks import open_lock
-from stillmap.core.output_place import hidden_path, resolve_output
 from stillmap.core.profiling import StageTimer
-from stillmap.core.publishing import finish_exchange
 from stillmap.core.recording import Recording
-from stillmap.core.schema import check
-from stillmap.pipeline.checkpoint_checks import check_state
-from stillmap.pipeline.checkpoint_files import pack_state, require_same_run, unpack_state
-from stillmap.pipeline.estimate import EmState
+from stillmap.core.version import package_version
+from stillmap.io.rigid_transforms import MAX_TRANSLATION
+from stillmap.pipeline.estimate import EmState, Estimate, IterationRecord
 from stillmap.pipeline.options import Options
 
-_FORMAT_VERSION = 3
-_STATE, _LOCK = "state.json", "lock"
-_NAME = re.compile(r"[A-Za-z0-9_.-]+")
-_LARGEST_STATE = 1 << 30  # bytes
-_IN_MEMORY = 1 << 20  # bytes of an array that is read at once instead of mapped
+_RECORD, _LOCK = "checkpoint.json", "lock"
+_NO_MATTER = ("threads", "output.region")  # options on which no iteration depends
 
 
-_Seconds = Annotated[float, Limits(ge=0.0)]
+@dataclasses.dataclass(frozen=True)
+class _Record:
+    """`checkpoint.json`."""
 
-
-class _Stage(TypedDict):
-    """Of a StageTimer."""
-
-    seconds: _Seconds
-    cpu_seconds: _Seconds
-    peak_memory_bytes: NotRequired[Annotated[int, Limits(ge=0)]]
-
-
-class DamagedCheckpoint(Exception):
-    """A checkpoint that cannot be used; names the file and the reason."""
+    key: dict[str, Any]
+    iterations: list[IterationRecord]
+    stages: dict[str, dict[str, float]]
 
 
 class CheckpointFolder:
@@ -65,122 +51,85 @@ class CheckpointFolder:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._arrays: dict[str, dict[str, Any]] = {}  # those of the present checkpoint
         self.is_in_use = False  # the newest checkpoint is of this run
 
     @property
     def newest(self) -> Path | None:
         """The last complete checkpoint; None where there is none."""
-        if not self.folder.is_dir():  # somebody has removed it
-            return None
-        numbers = [
-            int(path.name.removeprefix("iteration-"))
-            for path in self.folder.iterdir()
-            if re.fullmatch(r"iteration-[0-9]{1,9}", path.name)
-        ]
-        return self.folder / f"iteration-{max(numbers)}" if numbers else None
+        folders = self.folder.glob("iteration-[0-9]*")
+        complete = [one for one in folders if one.name.removeprefix("iteration-").isdecimal()]
+        return max(complete, key=lambda one: int(one.name.removeprefix("iteration-")), default=None)
 
     def load(
-        self,
-        identity: Mapping[str, Any],
-        options: Options,
-        recording: Recording,
-        stages: StageTimer,
+        self, key: dict[str, Any], options: Options, recording: Recording, stages: StageTimer
     ) -> EmState | None:
-        """The state of the run at its last checkpoint; None where there is none.
+        """The state from which the run goes on; None: there is none.
+
+        At least one iteration is left to be done. Of earlier ones their numbers are known.
 
         Args:
-            identity: of the run, see `identify_run`.
+            key: of the run, see `identify_run`.
             options: of the run, resolved.
-            recording: that is mapped.
+            recording: T scans with M beams.
             stages: the time that the run took so far is added here.
 
         Raises:
-            InputError: it is of another recording or other options.
-            DamagedCheckpoint: a file differs from what was written.
+            InputError: it is damaged, or of another recording or other options.
         """
-        if self.newest is None:
+        folder = self.newest
+        if folder is None:
             return None
-        state = _state(self.newest / _STATE)
-        try:
-            require_same_run(state["identity"], dict(identity), str(self.folder))
-            arrays = {
-                name: _array(self.newest / f"{name}.npy", about)
-                for name, about in state["arrays"].items()
-            }
-            run = unpack_state(state["state"], arrays, options)
-            check_state(run, recording)
-            check(state["stages"], dict[str, _Stage], "stages")
-            stages.add(state["stages"])
-        except (InputError, DamagedCheckpoint):
-            raise
-        except Exception as error:  # whatever comes of values that no run has written
-            raise DamagedCheckpoint(f"{self.newest / _STATE}: {error!r}") from error
-        self._arrays, self.is_in_use = state["arrays"], True
-        return run
+        record = read_model(folder / _RECORD, _Record)
+        _require_same_run(record.key, key, str(self.folder))
+        D, T, M = recording.dimension, recording.n_scans, recording.n_beams
+        poses = read_poses(folder / "poses.npy", T, D, MAX_TRANSLATION)
+        p_static = read_probabilities(folder / "p_static.npy", M)
+        records = record.iterations[: em.max_iterations(options.estimator, options.em) - 1]
+        if not records:
+            return None
+        stages.add(record.stages)
+        dof = 3 * (D - 1)
+        m_step = slam.MStepResult(
+            poses,
+            np.full((T, dof, dof), np.nan),
+            em.make_grid(D, options.slam.resolution),
+            np.full(T, np.nan),
+        )
+        likelihood = em.Likelihood(records[-1].expected_log_likelihood, records[-1].bound)
+        e_step = em.EStepResult(p_static, likelihood)
+        self.is_in_use = True
+        return EmState(options, records, latest=Estimate(len(records), p_static, m_step, e_step))
 
-    def save(self, run: EmState, identity: Mapping[str, Any], stages: StageTimer) -> None:
-        """Writes a checkpoint, which replaces the one before.
+    def save(self, state: EmState, key: dict[str, Any], stages: StageTimer) -> None:
+        """Write a checkpoint, which replaces the one before.
 
         Raises:
-            InputError: it cannot be written, e.g. the disk is full; the checkpoint before remains.
+            InputError: it cannot be written, e.g. the disk is full; the one before remains.
         """
-        before, number = self.newest, len(run.records)
-        work, final = self.folder / "new.part", self.folder / f"iteration-{number}"
+        before, latest = self.newest, state.latest
+        assert latest is not None
+        work, final = self.folder / "new.part", self.folder / f"iteration-{len(state.records)}"
+        record = _Record(key, state.records, stages.to_dict())
         try:
-            self._clear(work)
+            remove(work)
             work.mkdir()
-            values, arrays = pack_state(run)
-            about = {name: self._put(work, before, name, a) for name, a in arrays.items()}
-            state = {"identity": dict(identity), "arrays": about, "state": values}
-            _write_state(work / _STATE, {**state, "stages": stages.to_dict()})
-            sync(work)
+            arrays: dict[str, NDArray[Any]] = {"poses": latest.poses, "p_static": latest.p_static}
+            write_arrays(work, arrays, _RECORD, dataclasses.asdict(record))
+            remove(final)
             os.rename(work, final)
-            sync(self.folder)
-        except BaseException as error:
-            self._clear(work)
-            if not isinstance(error, OSError):
-                raise
+        except OSError as error:
+            remove(work)
             what = f"no checkpoint can be written: {error.strerror or error}"
             raise InputError(what, where=str(self.folder)) from error
-        self._arrays, self.is_in_use = about, True
-        self._clear(
-            *(path for path in self.folder.iterdir() if path.name not in (_LOCK, final.name))
-        )
-
-    def _put(
-        self, work: Path, before: Path | None, name: str, array: NDArray[Any]
-    ) -> dict[str, Any]:
-        """Writes an array, unless the checkpoint before has it; its checksum, shape and dtype."""
-        if before is not None and name in self._arrays and name.startswith("e-"):
-            os.link(before / f"{name}.npy", work / f"{name}.npy")
-            return self._arrays[name]
-        write_npy(work / f"{name}.npy", array)
-        sync(work / f"{name}.npy")
-        return {"crc32": _checksum(array), "shape": array.shape, "dtype": array.dtype.str}
+        self.is_in_use = True
+        if before not in (None, final):
+            remove(before)
 
     def clear(self) -> None:
-        """Removes what earlier runs left."""
-        self._clear(*(path for path in self.folder.iterdir() if path.name != _LOCK))
-
-    def recover(self, output: Path) -> None:
-        """Removes the leftovers of a killed run; puts back a result that it had moved aside."""
-        for path in list(self.folder.iterdir()):
-            if path.name.endswith(".old") and not output.exists():
-                os.rename(path, output)
-            elif path.name.endswith((".part", ".old")):
-                self._clear(path)
-
-    @defer_signals
-    def _clear(self, *paths: Path) -> None:
-        for path in paths:
-            if path.is_dir() and not path.is_symlink():
-                if not path.name.endswith(".part"):
-                    # an interruption in the middle must not leave half a checkpoint
-                    path = path.rename(self.folder / f"{path.name}.gone.part")
-                shutil.rmtree(path, ignore_errors=True)
-            else:
-                path.unlink(missing_ok=True)
+        """Remove what earlier runs left."""
+        for path in self.folder.iterdir():
+            if path.name != _LOCK:
+                remove(path)
 
 
 @contextmanager
@@ -194,96 +143,74 @@ def lock_checkpoints(output: Path) -> Iterator[CheckpointFolder]:
         InputError: another run holds the lock, or the folder cannot be made.
     """
     given, output = output, resolve_output(output)
-    folder = hidden_path(output, "resume")
-    made = [path for path in (*reversed(output.parents),) if not path.exists()]
+    checkpoints = CheckpointFolder(hidden_path(output, "resume"))
+    made = [path for path in output.parents if not path.exists()]
     try:
-        file = _open_lock(folder, given)
+        file = _lock(checkpoints.folder, given)
     except OSError as error:
         raise cannot_write(error, given) from error
-    checkpoints = CheckpointFolder(folder)
     try:
-        finish_exchange(output)
-        checkpoints.recover(output)
         yield checkpoints
     finally:
         if checkpoints.newest is None:
-            shutil.rmtree(folder, ignore_errors=True)
-            for path in reversed(made):
-                with suppress(OSError):
+            shutil.rmtree(checkpoints.folder, ignore_errors=True)
+            with suppress(OSError):
+                for path in made:
                     path.rmdir()
         file.close()
 
 
-def _open_lock(folder: Path, output: Path) -> IO[bytes]:
+def _lock(folder: Path, output: Path) -> IO[bytes]:
     """The open lock file, which the kernel unlocks when this process ends."""
     while True:
         folder.mkdir(parents=True, exist_ok=True)
-        try:
+        with suppress(FileNotFoundError):  # the run that had it has just ended
             file = open_lock(folder / _LOCK)
-        except FileNotFoundError:  # the run that had it has just ended
-            continue
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                file.close()
+                what, hint = "another run is writing there", "wait for it, or stop it"
+                raise InputError(what, where=str(output), hint=hint) from error
+            except OSError:
+                pass  # a file system without locks
+            if os.path.samestat(os.stat(folder / _LOCK), os.fstat(file.fileno())):
+                return file
             file.close()
-            raise InputError(
-                "another run is writing there", where=str(output), hint="wait for it, or stop it"
-            ) from error
-        except OSError:
-            pass  # a file system without locks
-        if _is_there(folder / _LOCK, file):
-            return file
-        file.close()
 
 
-def _is_there(path: Path, file: IO[bytes]) -> bool:
-    """True if an open file still has its name."""
-    try:
-        return os.path.samestat(path.stat(), os.fstat(file.fileno()))
-    except OSError:
-        return False
+def identify_run(
+    recording: Recording, options: Options, poses: NDArray[np.float64] | None
+) -> dict[str, Any]:
+    """The key of a run: its version, options, and a hash of the arrays of its input."""
+    found = hashlib.blake2b(digest_size=16)
+    names = ("stamp_ns", "offset", "points", "hit", "beam_time", "T_base_sensor", "sensor")
+    for array in (*(getattr(recording, name) for name in names), recording.T_odom_base, poses):
+        found.update(b"none" if array is None else f"{array.dtype.str} {array.shape}".encode())
+        for part in () if array is None else iter_bytes(array):
+            found.update(part)
+    options_now = {
+        one.name: to_jsonable(one.value)
+        for one in iter_options(options)
+        if one.name not in _NO_MATTER
+    }
+    return {"version": package_version(), **options_now, "input": found.hexdigest()}
 
 
-def _write_state(path: Path, state: Mapping[str, Any]) -> None:
-    text = json.dumps({"format_version": _FORMAT_VERSION, **state})
-    whole = {"crc32": zlib.crc32(text.encode()), "text": text}
-    path.write_text(json.dumps(whole), encoding="utf-8")
-    sync(path)
+def _require_same_run(before: dict[str, Any], now: dict[str, Any], where: str) -> None:
+    """Refuse to go on with the run of something else.
 
-
-def _state(path: Path) -> dict[str, Any]:
-    try:
-        whole = read_json(path, _LARGEST_STATE)
-        text = whole["text"]
-        if zlib.crc32(text.encode()) != whole["crc32"]:
-            raise DamagedCheckpoint(f"{path}: its checksum differs")
-        state: dict[str, Any] = json.loads(text)
-    except InputError as error:
-        raise DamagedCheckpoint(str(error)) from error
-    except (ValueError, KeyError, TypeError, RecursionError, AttributeError) as error:
-        raise DamagedCheckpoint(f"{path}: {error!r}") from error
-    if not isinstance(state, dict) or state.get("format_version") != _FORMAT_VERSION:
-        version = state.get("format_version") if isinstance(state, dict) else None
-        raise DamagedCheckpoint(f"{path}: format_version {version!r} is unknown here")
-    return state
-
-
-def _array(path: Path, about: Mapping[str, Any]) -> NDArray[Any]:
-    if not _NAME.fullmatch(path.name):
-        raise DamagedCheckpoint(f"{path}: no name of an array")
-    try:
-        found = open_npy(path)
-    except InputError as error:
-        raise DamagedCheckpoint(str(error)) from error
-    if list(found.shape) != about["shape"] or found.dtype.str != about["dtype"]:
-        raise DamagedCheckpoint(f"{path}: not the array that was written")
-    if _checksum(found) != about["crc32"]:
-        raise DamagedCheckpoint(f"{path}: its checksum differs")
-    return np.array(found) if found.nbytes < _IN_MEMORY else found
-
-
-def _checksum(array: NDArray[Any]) -> int:
-    found = 0
-    for part in iter_bytes(array):
-        found = zlib.crc32(part, found)
-    return found
+    Raises:
+        InputError: it names what differs.
+    """
+    names = sorted(name for name in {*before, *now} if before.get(name) != now.get(name))
+    if not names:
+        return
+    differ = [
+        "another recording, odometry or poses"
+        if name == "input"
+        else f"{name} was {before.get(name)!r}, is {now.get(name)!r}"
+        for name in names
+    ]
+    hint = "give the same as before, or start anew without resume=True"
+    raise InputError(f"cannot be resumed: {'; '.join(differ)}", where=where, hint=hint)

@@ -34,7 +34,6 @@ from stillmap.pipeline.map_frame import (
     snapshots_to_map,
     traffic_to_map,
 )
-from stillmap.pipeline.memory_need import require_map_memory
 from stillmap.pipeline.options import DEFAULTS, Options, resolve_options
 from stillmap.pipeline.pose_sources import better_source
 from stillmap.pipeline.quality import Quality, rate_quality
@@ -172,7 +171,6 @@ def map_recording(
 
     Raises:
         ValueError: a recording without scans, or poses of another shape.
-        InputError: the map takes more memory than may be used.
         OSError: the disk of `scratch` is full.
     """
     if recording.n_scans == 0:
@@ -192,7 +190,6 @@ def map_recording(
         max_range = options.read.max_range or stated_max_range(recording)
         recording, more = leave_out_far_returns(recording, cell, max_range)
         notes += more
-        require_map_memory(recording, poses, cell, counts_beams=em.needs_counts(options.estimator))
         recording, options, more = time_sweeps(recording, options)
         notes += more
         if poses is None:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays
-from stillmap.core.array_files import read_npz
+from stillmap.core.array_folder import read_npz
 from stillmap.core.errors import InputError
 from stillmap.core.json import read_json
 from stillmap.places.checksums import check_checksums

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays
-from stillmap.core.array_files import open_npy
+from stillmap.core.array_folder import open_npy
 from stillmap.core.arrays import write_npy
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording

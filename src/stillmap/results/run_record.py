@@ -10,7 +10,6 @@ from stillmap.core import config
 from stillmap.core.errors import InputError
 from stillmap.core.json import read_json
 from stillmap.core.local_frame import LocalFrame
-from stillmap.core.output_place import require_finished
 from stillmap.core.region import Region
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io.rigid_transforms import MAX_TRANSLATION
@@ -190,7 +189,6 @@ def read_record(result: Path) -> dict[str, Any]:
         InputError: it is missing or damaged.
     """
     path = result / RECORD
-    require_finished(result)
     record = read_json(path, _MAX_RUN, "a result is what `stillmap map` wrote")
     if not isinstance(record, dict) or not isinstance(record.get("input"), dict):
         raise InputError("is no record of a run: no input named", where=str(path))

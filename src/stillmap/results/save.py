@@ -34,7 +34,6 @@ def save(
     path: Path,
     overwrite: bool = False,
     *,
-    staging_folder: Path | None = None,
     tilting: "TiltingResult | None" = None,
     models: "Models | None" = None,
     write_more: Callable[[Path], None] | None = None,
@@ -45,7 +44,6 @@ def save(
         result: the mapped recording.
         path: the folder; it must not exist or be empty unless `overwrite` is given.
         overwrite: replace an earlier result once the new folder is complete.
-        staging_folder: where the new folder is written until then; None: beside `path`.
         tilting: 3D data of a rig's second laser.
         models: meshes of the place and of the moving objects.
         write_more: called with the folder before it appears, to write other files into it.
@@ -56,7 +54,7 @@ def save(
     """
     result, region = crop_result(result), result.options.output.region
     colors = None if models is None or models.point_colors is None else models.point_colors.colors
-    with atomic_folder(path, RECORD, overwrite, staging_folder=staging_folder) as folder:
+    with atomic_folder(path, RECORD, overwrite) as folder:
         write_map_server(folder, result.map, result.options.output.map_mode)
         write_map_npz(folder / "map.npz", result.map, result.changes, result.evidence)
         write_tum(folder / "trajectory.tum", result.recording.stamp_ns, result.poses)

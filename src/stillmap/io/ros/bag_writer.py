@@ -20,8 +20,13 @@ from rosbags.interfaces import (
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from stillmap.core.errors import InputError
-from stillmap.core.files import atomic_file, atomic_folder, temporary_folder
-from stillmap.core.output_place import resolve_output, shorten
+from stillmap.core.files import (
+    atomic_file,
+    atomic_folder,
+    resolve_output,
+    shorten,
+    temporary_folder,
+)
 from stillmap.io.ros.bag_types import BagKind, Channel
 from stillmap.io.ros.messages import load_typestore
 

@@ -8,7 +8,7 @@ from typing import Any, cast
 import numpy as np
 
 from stillmap.core.errors import InputError
-from stillmap.core.output_place import workplace
+from stillmap.core.files import workplace
 from stillmap.core.recording import Recording
 from stillmap.io.filtered_copy import FilterJob, Mask, Omissions, other_recording_error
 from stillmap.io.ros.bag import open_bag
