@@ -19,7 +19,7 @@ from seeds import REPORTING, TUNING
 
 import stillmap
 from stillmap import em
-from stillmap.core import config, config_toml
+from stillmap.core import config
 from stillmap.em import beam_counting
 from stillmap.eval.labels import score_labels
 from stillmap.eval.map import score_map
@@ -121,9 +121,7 @@ def options_of(method: str, settings: Iterable[str]) -> stillmap.Options:
         InputError: an option that is not there or has another type.
     """
     beam_counting.MIN_HIT_RATIO = MIN_HIT_RATIO.get(method, 0.25)
-    changes = config.merge_nested(
-        METHODS[method], *(config_toml.parse_assignment(s) for s in settings)
-    )
+    changes = config.merge_nested(METHODS[method], *(config.parse_assignment(s) for s in settings))
     return config.override(stillmap.Options(), {"threads": 1, **changes})
 
 

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from tables import markdown
 
-from stillmap.core import config, config_toml, se2, se3
+from stillmap.core import config, se2, se3
 from stillmap.core.recording import Recording
 from stillmap.eval.trajectory import compute_absolute_errors, compute_relative_errors
 from stillmap.io.reader import read
@@ -180,7 +180,7 @@ def main() -> None:
     p.add_argument("--beam-times-from-azimuth", action="store_true")
     p.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", dest="settings")
     args = p.parse_args()
-    changes = config.merge_nested(*(config_toml.parse_assignment(text) for text in args.settings))
+    changes = config.merge_nested(*(config.parse_assignment(text) for text in args.settings))
     chosen = config.override(Options(), changes)
     lines = []
     for path in args.recordings:

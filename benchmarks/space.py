@@ -37,7 +37,7 @@ from space_scores import scores_of
 from sweep import in_fresh_process
 from tables import Column, Row, grouped, markdown
 
-from stillmap.core import config_toml
+from stillmap.core import config
 
 _COST = ("seconds", "label_seconds", "cpu", "peak", "label_peak")
 LABELS = (
@@ -102,7 +102,7 @@ def _arguments() -> argparse.Namespace:
 
 def _run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     for text in args.set:
-        config_toml.parse_assignment(text)  # refuses before hours have passed
+        config.parse_assignment(text)  # refuses before hours have passed
     methods = chosen_methods(args.methods, args.peer_python is not None, args.estimated_poses)
     lidar = {"sweep": not args.at_once, "columns": args.columns}
     cases = simulated(args.worlds, args.lidar, seeds_of(args), args.scans, lidar, args.stops)

@@ -30,7 +30,7 @@ from sweep import in_fresh_process
 from tables import markdown
 
 import stillmap
-from stillmap.core import config, config_toml
+from stillmap.core import config
 from stillmap.core.profiling import StageTimer, peak_memory_bytes
 from stillmap.io import stillmap_folder
 from stillmap.pipeline.result import map_recording
@@ -77,7 +77,7 @@ def main() -> None:
 
 
 def options_of(settings: Sequence[str], threads: int) -> stillmap.Options:
-    changes = config.merge_nested(*(config_toml.parse_assignment(text) for text in settings))
+    changes = config.merge_nested(*(config.parse_assignment(text) for text in settings))
     return config.override(stillmap.Options(), {"threads": threads, **changes})
 
 

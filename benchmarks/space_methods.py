@@ -16,7 +16,7 @@ import numpy as np
 from common import Scores
 
 import stillmap
-from stillmap.core import config, config_toml
+from stillmap.core import config
 from stillmap.core.profiling import StageTimer, peak_memory_bytes
 from stillmap.pipeline.result import map_recording
 
@@ -43,7 +43,7 @@ def of_ours(work: Path, method: str, settings: tuple[str, ...], threads: int, ou
     changes = config.merge_nested(
         {"read": {"spin": "none"}},
         OURS.get(method, {}),
-        *(config_toml.parse_assignment(text) for text in settings),
+        *(config.parse_assignment(text) for text in settings),
     )
     chosen = config.override(stillmap.Options(), {"threads": threads, **changes})
     poses = None if method == ESTIMATED else np.load(work / "poses.npy")

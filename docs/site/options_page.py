@@ -26,7 +26,6 @@ TITLES = {
     "slam": "Poses and map",
     "slam.odometry": "Noise of wheel odometry",
     "objects": "Moving objects",
-    "rig": "Planar and tilting laser",
     "mesh": "Models of 3D recordings",
     "output": "Result folder",
 }

@@ -1,6 +1,5 @@
 """What files hold never reaches a terminal as control characters."""
 
-import ast
 import json
 import logging
 from pathlib import Path
@@ -8,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import stillmap
 from stillmap.cli.console import fail, print_lines, say
 from stillmap.cli.main import main
 from stillmap.core.errors import InputError
@@ -126,24 +124,3 @@ def test_result_that_is_mapped(evil_recording, capsys, tmp_path):
     said = capsys.readouterr()
     require_clean(said.out + said.err)
     assert status in (0, 2)
-
-
-# what prints otherwise: (module, argument)
-_OTHERS = {
-    ("completion", "shellcode(['stillmap'], shell=args.shell)"),
-    ("parser", "f'stillmap {__version__}'"),
-    ("view", "printable(str(report)) if is_terminal(sys.stdout) else report"),
-}
-
-
-def test_commands_print_by_the_console():
-    found = set()
-    for path in sorted((Path(stillmap.__file__).parent / "cli").glob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            name = ast.unparse(node.func) if isinstance(node, ast.Call) else ""
-            if name not in ("print", "sys.stderr.write", "sys.stdout.write"):
-                continue
-            argument = ast.unparse(node.args[0])
-            if path.stem != "console" and not argument.startswith("json.dumps("):
-                found.add((path.stem, argument))
-    assert found == _OTHERS

@@ -15,7 +15,7 @@ from PIL import Image
 from stillmap.core import se2
 from stillmap.core.arrays import write_npz
 from stillmap.core.camera import Camera, Images
-from stillmap.core.config_toml import to_toml
+from stillmap.core.config import to_toml
 from stillmap.core.recording import Recording
 from stillmap.io import stillmap_folder, writers
 from stillmap.io.point_cloud.las import _make_header

@@ -15,8 +15,7 @@ import numpy as np
 import parts
 
 from stillmap.cli.recording_info import summarize_recording
-from stillmap.core.config import override
-from stillmap.core.config_toml import load_toml
+from stillmap.core.config import load_toml, override
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.eval import readers

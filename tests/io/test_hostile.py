@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stillmap.core.config import override
-from stillmap.core.config_toml import load_toml, parse_assignment
+from stillmap.core.config import load_toml, override, parse_assignment
 from stillmap.core.errors import InputError
 from stillmap.eval import readers
 from stillmap.io import read, stillmap_folder, text_lines, writers

@@ -109,5 +109,5 @@ def test_a_second_sensor_may_begin_earlier(tmp_path):
 
 @pytest.mark.parametrize("changes", [{"start": -1.0}, {"end": -0.1}, {"start": 1e11}])
 def test_limits_that_cannot_be(changes):
-    with pytest.raises(ValueError, match="must be 0 to 9000000000"):
+    with pytest.raises(ValueError, match=r"equal to (9000000000|0)"):
         ReadOptions(**changes)

@@ -9,7 +9,7 @@ import pytest
 from stillmap import slam
 from stillmap.cli.main import main
 from stillmap.cli.recording_info import summarize_recording
-from stillmap.core import config, config_toml
+from stillmap.core import config
 from stillmap.core.errors import InputError
 from stillmap.io import read, stillmap_folder, writers
 from stillmap.pipeline.options import Options
@@ -135,7 +135,7 @@ def test_the_flag(tmp_path, timeless, capsys):
 @pytest.mark.parametrize("text", ["spin='left'", "spin=1", "spin_rate=10"])
 def test_odd_options(text):
     with pytest.raises((InputError, ValueError)):
-        config.override(Options(), config_toml.parse_assignment(f"read.{text}"))
+        config.override(Options(), config.parse_assignment(f"read.{text}"))
 
 
 def test_recordings_in_the_plane_are_refused(tmp_path):

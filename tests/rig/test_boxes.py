@@ -7,7 +7,6 @@ from stillmap.core.recording import Recording
 from stillmap.em import EmOptions
 from stillmap.rig import build
 from stillmap.rig.build import PlanarResult, apply_boxes, build_tilting
-from stillmap.rig.options import RigOptions
 from stillmap.rig.removal import BoxBeams, object_height
 from stillmap.tracking import MovingObject
 from stillmap.tracking.boxes import fit_boxes
@@ -118,8 +117,7 @@ def built(points, ms, objects):
     )
     seen = flat_recording([[9.0, 9.0]], np.append(np.zeros(len(STAMPS)), 1))
     flat = PlanarResult(seen, standing(), np.full(1, 0.9, np.float32), objects)
-    options = RigOptions(margin=0.1), EmOptions()
-    found = build_tilting(flat, recording, *options, use_evidence=False)
+    found = build_tilting(flat, recording, EmOptions(), use_evidence=False)
     return found, found.p_static[-n:]
 
 

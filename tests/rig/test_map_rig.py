@@ -161,7 +161,6 @@ def test_wrong_dimensions_are_refused(rig, tmp_path, capsys):
 
 def test_wrong_options_and_folders_are_refused(rig, tmp_path, capsys):
     words = ("map", rig / "horizontal", "--tilting", rig / "tilting", "-o")
-    assert "rig.margin" in refused(capsys, *words, tmp_path / "out", "--set", "rig.margin=-1")
     assert "holds" in refused(capsys, *words, rig, "--overwrite")
     nowhere = ("map", rig / "horizontal", "--tilting", tmp_path / "nowhere", "-o", tmp_path / "out")
     assert "nowhere" in refused(capsys, *nowhere)

@@ -1,7 +1,6 @@
 """`stillmap config`: print every option; the flags `--config` and `--set` of all commands."""
 
 import argparse
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,14 +14,12 @@ def add_option_flags(p: argparse.ArgumentParser) -> None:
     """Add `--config` and `--set`."""
     group = p.add_argument_group("any other option, see `stillmap config`")
     group.add_argument("--config", metavar="FILE.toml", help="options from a TOML file")
-    add_set_flag(
-        group, "one option, e.g. em.prior=0.8; can be given again"
-    ).completer = _assignments  # type: ignore[attr-defined]
+    add_set_flag(group, "one option, e.g. em.prior=0.8; can be given again")
 
 
-def add_set_flag(p: argparse._ActionsContainer, help: str) -> argparse.Action:
+def add_set_flag(p: argparse._ActionsContainer, help: str) -> None:
     """Add `--set`; the last value of an option counts."""
-    return p.add_argument(
+    p.add_argument(
         "--set",
         dest="assignments",
         metavar="SECTION.KEY=VALUE",
@@ -38,8 +35,7 @@ def options_from_args(args: argparse.Namespace, *flags: dict[str, Any]) -> "Opti
     Raises:
         InputError: an unknown key or a wrong value, and where it came from.
     """
-    from stillmap.core.config import merge_nested, override
-    from stillmap.core.config_toml import load_toml, parse_assignment
+    from stillmap.core.config import load_toml, merge_nested, override, parse_assignment
     from stillmap.pipeline.options import Options
 
     options = Options()
@@ -47,33 +43,6 @@ def options_from_args(args: argparse.Namespace, *flags: dict[str, Any]) -> "Opti
         options = override(options, load_toml(Path(args.config)), args.config)
     options = override(options, merge_nested(*map(parse_assignment, args.assignments)), "--set")
     return override(options, merge_nested(*flags))
-
-
-def complete_option_names(**_: Any) -> Iterator[str]:
-    """Yield names of options and sections, for shell completion."""
-    from stillmap.core.config import iter_names
-    from stillmap.pipeline.options import DEFAULTS
-
-    return iter_names(DEFAULTS)
-
-
-def _assignments(prefix: str, **_: Any) -> Iterator[str]:
-    from stillmap.pipeline.options import DEFAULTS
-
-    return complete_assignments(DEFAULTS, prefix)
-
-
-def complete_assignments(options: Any, prefix: str) -> Iterator[str]:
-    """Complete an argument of --set: names of options, or values of the named option."""
-    from stillmap.core.config import iter_options
-
-    name, equals, _ = prefix.partition("=")
-    for one in iter_options(options):
-        if not equals:
-            yield f"{one.name}="
-        elif one.name == name:
-            values = one.choices or (("true", "false") if "bool" in one.kind else ())
-            yield from (f"{one.name}={value}" for value in values)
 
 
 DESCRIPTION = (
@@ -90,21 +59,20 @@ EPILOG = """examples:
 
 def add_arguments(p: argparse.ArgumentParser) -> None:
     """Add the flags and arguments."""
-    only = p.add_argument(
+    p.add_argument(
         "only",
         metavar="NAME",
         nargs="?",
         default="",
         help="one section or option, e.g. slam.odometry",
     )
-    only.completer = complete_option_names  # type: ignore[attr-defined]
     p.add_argument("--json", action="store_true", help="one JSON object on stdout, by option")
     add_option_flags(p)
 
 
 def run(args: argparse.Namespace) -> int:
     """Print the options."""
-    from stillmap.core.config_toml import to_toml
+    from stillmap.core.config import to_toml
 
     options = options_from_args(args)
     text = to_toml(options, args.only)  # raises for unknown names

@@ -32,10 +32,6 @@ def main(argv: list[str] | None = None) -> int:
         sys.stdout.reconfigure(errors="backslashreplace")
     args = argparse.Namespace()
     try:
-        if "_ARGCOMPLETE" in os.environ:
-            from stillmap.cli.completion import answer_shell
-
-            answer_shell(parser(os.environ.get("COMP_LINE", "").split()))
         args = _parse(sys.argv[1:] if argv is None else argv)
         _set_up_logging(args)
         handle_signals(main.__code__)

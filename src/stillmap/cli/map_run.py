@@ -226,5 +226,5 @@ def _map_tilting_laser(
         objects_to_local(result.objects, frame),
     )
     threads = resolve_threads(options.threads)
-    found = build_tilting(planar, tilting, options.rig, options.em, threads)
+    found = build_tilting(planar, tilting, options.em, threads)
     return shift_tilting(found, frame.origin)

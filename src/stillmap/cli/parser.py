@@ -113,7 +113,6 @@ COMMANDS = {
     "simulate": "a recording with truth, for tests and demos",
     "eval": "score a trajectory, labels or a map",
     "config": "every option with its default, unit and meaning, as TOML",
-    "completion": "the completion script of a shell",
 }
 
 _COMMANDS_EPILOG = """examples:

@@ -2,12 +2,11 @@
 
 import argparse
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stillmap.cli.arguments import make_parents
-from stillmap.cli.config import add_set_flag, complete_assignments
+from stillmap.cli.config import add_set_flag
 from stillmap.cli.console import list_files, print_json, say, show_share
 from stillmap.core.errors import InputError
 
@@ -95,8 +94,7 @@ _ODOMETRY_ERRORS = (
 
 def add_arguments(p: argparse.ArgumentParser) -> None:
     """Add the flags and arguments."""
-    scene = p.add_argument("scene", metavar="SCENE", help="one of those listed below")
-    scene.completer = _scene_names  # type: ignore[attr-defined]
+    p.add_argument("scene", metavar="SCENE", help="one of those listed below")
     _add_output_flags(p)
     groups = {section: p.add_argument_group(title) for section, title in _GROUPS.items()}
     for flag, metavar, kind, section, _, text in _FLAGS:
@@ -125,7 +123,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
         help="factor on the default errors of odometry; 0: perfect (default: %(default)g)",
     )
     others = p.add_argument_group("any other option of the scene, see docs/simulation.md")
-    add_set_flag(others, "e.g. traffic.vehicles=3; can be given again").completer = _assignments  # type: ignore[attr-defined]
+    add_set_flag(others, "e.g. traffic.vehicles=3; can be given again")
 
 
 def _add_output_flags(p: argparse.ArgumentParser) -> None:
@@ -152,18 +150,6 @@ def _add_output_flags(p: argparse.ArgumentParser) -> None:
     )
     p.add_argument("--json", action="store_true", help="the summary as one JSON object on stdout")
     p.add_argument("--quiet", action="store_true", help="no progress, no summary")
-
-
-def _scene_names(**_: Any) -> Iterator[str]:
-    yield from _SCENES
-    yield from (f"{name}-empty" for name in _SCENES if not name.endswith("-crowd"))
-
-
-def _assignments(prefix: str, **_: Any) -> Iterator[str]:
-    from stillmap.sim import scene_by_name
-
-    found = complete_assignments(scene_by_name("hall"), prefix)
-    return (text for text in found if "." in text)  # names without a section are geometry
 
 
 def run(args: argparse.Namespace) -> int:
@@ -235,8 +221,7 @@ def _run_sessions(scene: "Scene", args: argparse.Namespace, output: Path) -> int
 
 
 def _option_changes(args: argparse.Namespace) -> dict[str, Any]:
-    from stillmap.core.config import merge_nested
-    from stillmap.core.config_toml import parse_assignment
+    from stillmap.core.config import merge_nested, parse_assignment
     from stillmap.sim import scene_by_name
 
     changes: dict[str, dict[str, Any]] = {}

@@ -1,17 +1,36 @@
-"""Options as frozen dataclasses with ranges, and overrides of them."""
+"""Options: frozen pydantic dataclasses, changes of them, and the same as TOML.
+
+An option is a field with its default, range and meaning:
+
+    @dataclass(frozen=True, config=STRICT)
+    class EmOptions:
+        prior: float = option(0.9, "Prior probability p(c = 1) that a beam is static.", gt=0, lt=1)
+"""
 
 import dataclasses
-import sys
-import types
+import json
+import re
+import tomllib
 import typing
 from collections.abc import Iterator, Mapping
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple, TypeVar
+
+from pydantic import ConfigDict, Field, ValidationError
+from pydantic.fields import FieldInfo
 
 from stillmap.core.errors import InputError, closest_match
+from stillmap.core.input_files import read_text
 
 T = TypeVar("T")
 
+STRICT = ConfigDict(strict=True, allow_inf_nan=False, extra="forbid")
+
 _MAX_INTEGER = 2**31 - 1  # the compiled core counts in 32 bits
+
+Count = Annotated[int, Field(le=_MAX_INTEGER)]
+
+_MAX_FILE_SIZE = 64 << 10  # bytes; Python needs minutes for more of nested keys
 
 
 class Limits(NamedTuple):
@@ -32,8 +51,6 @@ class Limits(NamedTuple):
         )
 
     def __str__(self) -> str:
-        if self.ge is not None and self.le is not None:
-            return f"{self.ge:.10g} to {self.le:.10g}"
         words = ("at least", "more than", "at most", "less than")
         return " and ".join(
             f"{word} {limit:.10g}"
@@ -42,43 +59,36 @@ class Limits(NamedTuple):
         )
 
 
-def option(default: Any, doc: str, **limits: float) -> Any:
-    """A dataclass field with the meaning, unit and range that `stillmap config` prints.
+def option(default: Any, doc: str, **limits: Any) -> Any:
+    """A field of a pydantic dataclass.
 
     Args:
-        default: the default value; None where the option may be unset.
+        default: None where the option may be unset.
         doc: meaning and unit.
-        limits: `ge`, `gt`, `le`, `lt`; see Limits.
+        limits: `ge`, `gt`, `le`, `lt`, and whatever else `pydantic.Field` takes.
     """
-    return dataclasses.field(default=default, metadata={"doc": doc, "limits": Limits(**limits)})
+    return Field(default=default, description=doc, **limits)
 
 
-class Section:
-    """Base of the option dataclasses: checks the range of every `option` that is set.
+class OptionInfo(NamedTuple):
+    """One option.
 
-    `class EmOptions(Section, section="em")` names the section in messages.
-
-    Raises:
-        ValueError: a value is outside its range, or `check` rejects it.
+    Attributes:
+        name: as in `em.prior`.
+        value, default: present and default value.
+        kind: its type, in words.
+        choices: allowed values; empty where there is a range or none.
+        limits: range of a number, in words.
+        doc: meaning and unit.
     """
 
-    _section: ClassVar[str] = ""
-
-    def __init_subclass__(cls, section: str = "", **kwargs: Any) -> None:
-        super().__init_subclass__(**kwargs)
-        cls._section = section
-
-    def __post_init__(self) -> None:
-        prefix = f"{self._section}." if self._section else ""
-        for field in dataclasses.fields(self):  # type: ignore[arg-type]
-            limits: Limits = field.metadata.get("limits", Limits())
-            value = getattr(self, field.name)
-            if value is not None and not limits.contain(value):
-                raise ValueError(f"'{prefix}{field.name}' must be {limits}, got {value!r}")
-        self.check()
-
-    def check(self) -> None:
-        """Checks relations between options; raises ValueError."""
+    name: str
+    value: Any
+    default: Any
+    kind: str
+    choices: tuple[Any, ...]
+    limits: str
+    doc: str
 
 
 def override(options: T, changes: Mapping[str, Any], where: str = "") -> T:
@@ -97,77 +107,51 @@ def override(options: T, changes: Mapping[str, Any], where: str = "") -> T:
 
 
 def _override(options: T, changes: Mapping[str, Any], where: str, prefix: str, top: Any) -> T:
-    fields = {f.name: f for f in dataclasses.fields(options)}  # type: ignore[arg-type]
-    hints = typing.get_type_hints(type(options))
     values: dict[str, Any] = {}
     for key, value in changes.items():
         name = f"{prefix}{key}"
-        if key not in fields:
+        if not isinstance(key, str) or key not in _names(options):
             near = closest_match(name, iter_names(top), min_similarity=0.0)
             raise InputError(f"unknown option '{name}'", where=where, hint=f"nearest: '{near}'")
         current = getattr(options, key)
-        if dataclasses.is_dataclass(current):
-            if not isinstance(value, Mapping):
-                raise InputError(f"'{name}' is a section, not a value", where=where)
-            values[key] = _override(current, value, where, f"{name}.", top)
-        else:
-            if isinstance(value, Mapping):
-                raise InputError(f"'{name}' is a value, not a section", where=where)
-            values[key] = _convert(value, hints[key], name, where)
+        if dataclasses.is_dataclass(current) != isinstance(value, Mapping):
+            is_what = ("a value", "a section")[:: -1 if dataclasses.is_dataclass(current) else 1]
+            raise InputError(f"'{name}' is {is_what[0]}, not {is_what[1]}", where=where)
+        is_section = isinstance(value, Mapping)
+        values[key] = _override(current, value, where, f"{name}.", top) if is_section else value
     try:
         return dataclasses.replace(options, **values)  # type: ignore[type-var]
-    except ValueError as error:
+    except ValidationError as error:
+        raise InputError(_describe(error, prefix), where=where) from error
+    except ValueError as error:  # of what holds the sections, or digits without end
         raise InputError(str(error), where=where) from error
 
 
-def _convert(value: Any, hint: Any, name: str, where: str) -> Any:
-    """A value as the type hint of its option wants it."""
-    for kind in _alternatives(hint):
-        if value in _choices(kind) or (kind is type(None) and value is None):
-            return value
-        if typing.get_origin(kind) is tuple and isinstance(value, list | tuple):
-            parts = typing.get_args(kind)
-            if len(value) == len(parts):
-                return tuple(
-                    _convert(one, part, name, where) for one, part in zip(value, parts, strict=True)
-                )
-        if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
-            if not abs(value) <= sys.float_info.max:  # nan, inf, and integers beyond them
-                what = f"'{name}' must be a finite number, got {_format(value)}"
-                raise InputError(what, where=where)
-            return float(value)
-        if kind in (int, bool, str) and type(value) is kind:
-            if kind is str and "\0" in value:
-                raise InputError(f"'{name}' must hold no NUL", where=where)
-            if kind is int and abs(value) > _MAX_INTEGER:
-                raise InputError(f"'{name}' is too large: {_format(value)}", where=where)
-            return value
-    raise InputError(f"'{name}' must be {_type_name(hint)}, got {_format(value)}", where=where)
+_SHORTER = {
+    "greater than or equal to": "at least",
+    "greater than": "more than",
+    "less than or equal to": "at most",
+}
+
+
+def _describe(error: ValidationError, prefix: str) -> str:
+    """The first fault on one line."""
+    fault = error.errors(include_url=False)[0]
+    if fault["type"] == "value_error":  # of a check between options, which names them
+        return str(fault["ctx"]["error"])
+    name = prefix + str(fault["loc"][0])
+    what = fault["msg"].replace("Input should be", "must be")
+    for words, short in _SHORTER.items():
+        what = what.replace(words, short)
+    return f"'{name}' {what}, got {_format(fault['input'])}"
 
 
 def _format(value: Any) -> str:
     try:
-        return repr(value)
+        text = repr(value)
     except ValueError:  # Python writes no number of thousands of digits
         return "a huge number"
-
-
-def _alternatives(hint: Any) -> tuple[Any, ...]:
-    return typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
-
-
-def _choices(hint: Any) -> tuple[Any, ...]:
-    return typing.get_args(hint) if typing.get_origin(hint) is typing.Literal else ()
-
-
-def _type_name(hint: Any) -> str:
-    if isinstance(hint, types.UnionType):
-        return " or ".join(map(_type_name, _alternatives(hint)))
-    if typing.get_origin(hint) is tuple:
-        return f"a list of {len(typing.get_args(hint))} numbers"
-    if choices := _choices(hint):
-        return " | ".join(map(repr, choices))
-    return "unset" if hint is type(None) else str(getattr(hint, "__name__", hint))
+    return text if len(text) < 80 else f"{text[:76]} ..."
 
 
 def nest(changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -198,53 +182,43 @@ def to_dict(options: Any) -> dict[str, Any]:
     return dataclasses.asdict(options)
 
 
-class OptionInfo(NamedTuple):
-    """One option.
-
-    Attributes:
-        name: as in `em.prior`.
-        value, default: present and default value.
-        kind: its type, in words.
-        choices: allowed values; empty where there is a range or none.
-        limits: range of a number.
-        doc: meaning and unit.
-    """
-
-    name: str
-    value: Any
-    default: Any
-    kind: str
-    choices: tuple[Any, ...]
-    limits: Limits
-    doc: str
-
-
 def iter_options(options: Any, prefix: str = "") -> Iterator[OptionInfo]:
     """All options, section by section; options of a section come before its sub-sections."""
-    hints = typing.get_type_hints(type(options))
-    fields, sections = _split_fields(options)
-    for f in fields:
-        kinds = _alternatives(hints[f.name])
-        yield OptionInfo(
-            name=f"{prefix}{f.name}",
-            value=getattr(options, f.name),
-            default=f.default,
-            kind=" or ".join("str" if _choices(kind) else _type_name(kind) for kind in kinds),
-            choices=tuple(choice for kind in kinds for choice in _choices(kind)),
-            limits=f.metadata.get("limits", Limits()),
-            doc=f.metadata.get("doc", ""),
-        )
-    for f in sections:
-        yield from iter_options(getattr(options, f.name), f"{prefix}{f.name}.")
+    sections = _section_names(options)
+    for name, info in _fields(options).items():
+        if name not in sections:
+            yield _describe_option(f"{prefix}{name}", getattr(options, name), info)
+    for name in sections:
+        yield from iter_options(getattr(options, name), f"{prefix}{name}.")
+
+
+def _describe_option(name: str, value: Any, info: FieldInfo) -> OptionInfo:
+    kinds = [kind for kind in typing.get_args(info.annotation) if kind is not type(None)]
+    kind: Any = kinds[0] if len(kinds) == 1 else info.annotation
+    is_choice = typing.get_origin(kind) is typing.Literal
+    choices = typing.get_args(kind) if is_choice else ()
+    word = "list" if typing.get_origin(kind) is tuple else getattr(kind, "__name__", "str")
+    doc = info.description or ""
+    word = ("str" if is_choice else word) + " or unset" * (info.default is None)
+    return OptionInfo(name, value, info.default, word, choices, _limits(info), doc)
+
+
+def _limits(info: FieldInfo) -> str:
+    """The range of a number in words; what every integer has to fit into is none."""
+    words = {"ge": "at least", "gt": "more than", "le": "at most", "lt": "less than"}
+    bounds = {key: getattr(m, key) for m in info.metadata for key in words if hasattr(m, key)}
+    if bounds.get("le") == _MAX_INTEGER:
+        del bounds["le"]
+    return " and ".join(f"{words[key]} {bounds[key]:.10g}" for key in words if key in bounds)
 
 
 def iter_names(options: Any, prefix: str = "") -> Iterator[str]:
     """Names of all options and sections."""
-    fields, sections = _split_fields(options)
-    yield from (f"{prefix}{f.name}" for f in fields)
-    for f in sections:
-        yield f"{prefix}{f.name}"
-        yield from iter_names(getattr(options, f.name), f"{prefix}{f.name}.")
+    sections = _section_names(options)
+    yield from (f"{prefix}{name}" for name in _fields(options) if name not in sections)
+    for name in sections:
+        yield f"{prefix}{name}"
+        yield from iter_names(getattr(options, name), f"{prefix}{name}.")
 
 
 def is_within(name: str, section: str) -> bool:
@@ -252,8 +226,99 @@ def is_within(name: str, section: str) -> bool:
     return not section or name == section or name.startswith(f"{section}.")
 
 
-def _split_fields(options: Any) -> tuple[list[Any], list[Any]]:
-    """Fields that are values, and those that are sections."""
-    fields = dataclasses.fields(options)
-    sections = [f for f in fields if dataclasses.is_dataclass(getattr(options, f.name))]
-    return [f for f in fields if f not in sections], sections
+def load_toml(path: Path) -> dict[str, Any]:
+    """Reads a TOML file.
+
+    Raises:
+        InputError: it cannot be read, is not TOML, or is too large for a file of options.
+    """
+    try:
+        return tomllib.loads(read_text(path, _MAX_FILE_SIZE))
+    except (ValueError, RecursionError) as error:  # ValueError: numbers of thousands of digits too
+        line = re.search(r" \(at line (\d+), column \d+\)$", str(error))
+        what = str(error)[: line.start()] if line else str(error)
+        where = f"{path}:{line[1]}" if line else str(path)
+        raise InputError(f"is not TOML: {what}", where=where) from error
+
+
+def parse_assignment(text: str) -> dict[str, Any]:
+    """Parses `section.key=value` to a nested dictionary; the value is TOML, else a string.
+
+    Numbers may lack a zero that TOML requires, as in `.5`.
+    """
+    key, equals, value = text.partition("=")
+    if not equals or not key.strip():
+        raise InputError(f"an option is set by section.key=value, got '{text}'")
+    try:
+        parsed = tomllib.loads(f"value = {value}")
+    except (ValueError, RecursionError):
+        parsed = {}
+    # more than one key: the value had several lines, and only looked like TOML
+    return nest(
+        {key.strip(): parsed["value"] if len(parsed) == 1 else _number_or_text(value.strip())}
+    )
+
+
+def _number_or_text(value: str) -> float | str:
+    return float(value) if re.fullmatch(r"[+-]?(\d+\.|\.\d+)(e[+-]?\d+)?", value, re.I) else value
+
+
+def to_toml(options: Any, only: str = "") -> str:
+    """All options with value, meaning and range, as TOML that `--config` reads back.
+
+    Args:
+        options: see `override`.
+        only: name of a section or option; "": all.
+
+    Raises:
+        InputError: there is no section or option of that name.
+    """
+    if only and only not in (known := list(iter_names(options))):
+        near = closest_match(only, known, min_similarity=0.0)
+        raise InputError(f"there is no option or section '{only}'", hint=f"nearest: '{near}'")
+    return "\n".join(_toml_lines(options, only)).lstrip("\n") + "\n"
+
+
+def _toml_lines(options: Any, only: str) -> Iterator[str]:
+    section = ""
+    for option in iter_options(options):
+        if not is_within(option.name, only):
+            continue
+        before, (section, _, key) = section, option.name.rpartition(".")
+        if section != before:
+            yield from _heading(options, section)
+        # a description that explains every choice lists them already
+        explained = all(str(choice) in option.doc for choice in option.choices)
+        allowed = option.limits if explained else " | ".join(map(str, option.choices))
+        doc = option.doc + (f" ({allowed})" if allowed else "")
+        # TOML has no null: an option that is unset becomes a comment
+        is_unset = option.value is None
+        start = f"# {key} is not set" if is_unset else f"{key} = {_toml_value(option.value)}"
+        yield f"{start}  # {doc}"
+
+
+def _toml_value(value: Any) -> str:
+    # TOML has neither JSON's pairs of escapes for one character nor a bare DEL
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def _heading(options: Any, section: str) -> Iterator[str]:
+    for name in section.split("."):
+        options = getattr(options, name)
+    summary = (type(options).__doc__ or "").partition("\n")[0]
+    yield from ("", f"# {summary}", f"[{section}]")
+
+
+def _fields(options: Any) -> dict[str, FieldInfo]:
+    """Options of pydantic; of a plain dataclass its sections."""
+    declared: dict[str, FieldInfo] = getattr(options, "__pydantic_fields__", {})
+    return declared
+
+
+def _section_names(options: Any) -> list[str]:
+    names = [field.name for field in dataclasses.fields(options)]
+    return [name for name in names if dataclasses.is_dataclass(getattr(options, name))]
+
+
+def _names(options: Any) -> set[str]:
+    return {*_fields(options), *_section_names(options)}

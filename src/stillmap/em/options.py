@@ -1,20 +1,22 @@
 """Options of the EM loop and of the occupancy HMM."""
 
-from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Self
 
-from stillmap.core.config import Section, option
+from pydantic import model_validator
+from pydantic.dataclasses import dataclass
+
+from stillmap.core.config import STRICT, Count, option
 
 # state of changed places in the map: the last one, or the one held longest
 MapState = Literal["last", "majority", "open", "shut"]
 
 
-@dataclass(frozen=True)
-class EmOptions(Section, section="em"):
+@dataclass(frozen=True, config=STRICT)
+class EmOptions:
     """The EM loop (Fig. 2), the occupancy HMM, and the detection of changes."""
 
     prior: float = option(0.9, "Prior probability p(c = 1) that a beam is static.", gt=0.0, lt=1.0)
-    max_iterations: int = option(6, "Maximum number of EM iterations.", ge=1)
+    max_iterations: Count = option(6, "Maximum number of EM iterations.", ge=1)
     tolerance: float = option(
         1e-3,
         "Stop when the held-out likelihood (without one, the bound) gains less than this per "
@@ -28,8 +30,8 @@ class EmOptions(Section, section="em"):
         ge=0.0,
         le=1.0,
     )
-    patience: int = option(1, "Stop after this many iterations without a gain.", ge=1)
-    held_out: int = option(
+    patience: Count = option(1, "Stop after this many iterations without a gain.", ge=1)
+    held_out: Count = option(
         20, "Leave every n-th scan out of the map and score the map with it; 0: none.", ge=0
     )
     time_bin: float = option(
@@ -48,7 +50,9 @@ class EmOptions(Section, section="em"):
         False, "List changes of 3D recordings as 3D boxes as well; takes more time and memory."
     )
 
-    def check(self) -> None:
+    @model_validator(mode="after")
+    def _check(self) -> Self:
         """Checks that one held-out scan in n leaves others."""
         if self.held_out == 1:
             raise ValueError("'em.held_out' must be 0, or at least 2")
+        return self

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.camera import Camera
-from stillmap.core.config_toml import load_toml
+from stillmap.core.config import load_toml
 from stillmap.core.errors import InputError, closest_match
 from stillmap.io.rigid_transforms import rigid_transform
 

@@ -1,12 +1,12 @@
 """Options of meshes."""
 
-from dataclasses import dataclass
+from pydantic.dataclasses import dataclass
 
-from stillmap.core.config import Section, option
+from stillmap.core.config import STRICT, option
 
 
-@dataclass(frozen=True)
-class MeshOptions(Section, section="mesh"):
+@dataclass(frozen=True, config=STRICT)
+class MeshOptions:
     """Meshes of 3D recordings: the static surface and the moving objects; see docs/mesh.md."""
 
     enabled: bool | None = option(

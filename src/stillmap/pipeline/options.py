@@ -1,24 +1,26 @@
 """All options of a run, and their resolution for a recording."""
 
 import dataclasses
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import field
+from typing import Literal, Self
 
-from stillmap.core.config import Section, option
+from pydantic import model_validator
+from pydantic.dataclasses import dataclass
+
+from stillmap.core.config import STRICT, option
 from stillmap.core.recording import Recording
 from stillmap.em import EmOptions
 from stillmap.em.options import MapState
 from stillmap.mesh.options import MeshOptions
 from stillmap.prepare.options import ReadOptions
-from stillmap.rig.options import RigOptions
 from stillmap.slam import SlamOptions
 from stillmap.tracking import ObjectOptions
 
 MapMode = Literal["trinary", "scale", "raw"]
 
 
-@dataclass(frozen=True)
-class OutputOptions(Section, section="output"):
+@dataclass(frozen=True, config=STRICT)
+class OutputOptions:
     """Options of the result folder."""
 
     map_mode: MapMode = option(
@@ -45,9 +47,11 @@ class OutputOptions(Section, section="output"):
         None,
         "Part of the map frame that is written: x0, y0, x1, y1 in metres. Poses and labels are of "
         "all scans; unset: everything.",
+        strict=False,  # TOML and JSON have lists
     )
 
-    def check(self) -> None:
+    @model_validator(mode="after")
+    def _check(self) -> Self:
         """Refuses an empty band of heights, and an empty region."""
         if self.region is not None:
             x0, y0, x1, y1 = self.region
@@ -60,10 +64,11 @@ class OutputOptions(Section, section="output"):
             raise ValueError(
                 "'output.min_obstacle_height' must be less than 'output.max_obstacle_height'"
             )
+        return self
 
 
-@dataclass(frozen=True)
-class Options(Section):
+@dataclass(frozen=True, config=STRICT)
+class Options:
     """All options of a run."""
 
     threads: int = option(
@@ -79,7 +84,6 @@ class Options(Section):
     em: EmOptions = field(default=EmOptions())
     slam: SlamOptions = field(default=SlamOptions())
     objects: ObjectOptions = field(default=ObjectOptions())
-    rig: RigOptions = field(default=RigOptions())
     mesh: MeshOptions = field(default=MeshOptions())
     output: OutputOptions = field(default=OutputOptions())
 

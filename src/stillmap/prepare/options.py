@@ -1,10 +1,12 @@
 """Options of reading: the meaning of ranges, laser poses, cameras, and topics of a bag."""
 
 import math
-from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, Self
 
-from stillmap.core.config import Section, option
+from pydantic import model_validator
+from pydantic.dataclasses import dataclass
+
+from stillmap.core.config import STRICT, option
 from stillmap.core.errors import InputError
 
 # m: beyond the reach of any 2D laser; drivers write 1e10 or FLT_MAX for +inf
@@ -37,8 +39,8 @@ class LaserOptions(NamedTuple):
         return self.x, self.y, self.theta
 
 
-@dataclass(frozen=True)
-class ReadOptions(Section, section="read"):
+@dataclass(frozen=True, config=STRICT)
+class ReadOptions:
     """Options of `stillmap.read`."""
 
     min_range: float = option(
@@ -145,7 +147,8 @@ class ReadOptions(Section, section="read"):
         None, "Odometry frame in a bag; unset: found in the transforms."
     )
 
-    def check(self) -> None:
+    @model_validator(mode="after")
+    def _check(self) -> Self:
         """Checks that ranges lie above `min_range` and that names are not blank."""
         for name in ("max_range", "free_range"):
             value = getattr(self, name)
@@ -156,8 +159,9 @@ class ReadOptions(Section, section="read"):
                 )
         for name in ("topic", "tilting_topic", "base_frame", "odom_frame", "cameras"):
             value = getattr(self, name)
-            if value is not None and not value.strip():
-                raise ValueError(f"'read.{name}' must not be blank")
+            if value is not None and (not value.strip() or "\0" in value):
+                raise ValueError(f"'read.{name}' must not be blank, and hold no NUL")
+        return self
 
     def laser(self, number: int) -> LaserOptions:
         """Options of a laser, counted from 0; all unset from the third one on."""

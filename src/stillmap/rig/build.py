@@ -20,7 +20,6 @@ from stillmap.core.short_repr import ShortRepr
 from stillmap.em import EmOptions, EStepResult, GroundMap, estimate_ground, occupancy_hmm
 from stillmap.em.spatial_coupling import GROUND_CLEARANCE
 from stillmap.em.types import DYNAMIC_BELOW, MIN_PROBABILITY
-from stillmap.rig.options import RigOptions
 from stillmap.rig.removal import BoxBeams, select_box_beams
 from stillmap.rig.trajectory import PosedRecording, pose_recording
 from stillmap.tracking import MovingObject
@@ -32,6 +31,7 @@ Float = NDArray[np.float64]
 
 HOLD = 0.5  # s for which an object persists before its first and after its last detection
 _VOXEL = 0.1  # m, edge of the voxels of the occupancy evidence
+_MARGIN = 0.15  # m around the box of an object, where points are probably dynamic
 _P_INSIDE, _P_AROUND = 0.99, 0.9  # P(dynamic) of end points in a box and in its margin
 _TOP_PERCENTILE = 98.0  # of an object's end points, which gives its height
 
@@ -104,7 +104,6 @@ def check_rig(planar: Recording, tilting: Recording, where: str) -> None:
 def build_tilting(
     planar: PlanarResult,
     recording: Recording,
-    options: RigOptions,
     em_options: EmOptions,
     threads: int = 1,
     *,
@@ -115,7 +114,6 @@ def build_tilting(
     Args:
         planar: result of the planar laser.
         recording: 3D, of the same robot by the same clock.
-        options: margin of the boxes.
         em_options: of the occupancy evidence.
         threads: the result does not depend on it.
         use_evidence: whether the tilting laser's own occupancy evidence counts.
@@ -140,7 +138,7 @@ def build_tilting(
         HOLD,
     )
     start_ns = int(planar.deskewed.stamp_ns[0])
-    in_boxes = select_box_beams(boxes, recording, posed, ground, start_ns, options.margin)
+    in_boxes = select_box_beams(boxes, recording, posed, ground, start_ns, _MARGIN)
     p_static = apply_boxes(static, in_boxes, share, recording.scratch)
     return TiltingResult(
         recording,

@@ -1,10 +1,12 @@
 """Parameters of a scene: sensors, robot, odometry, people, doors, vehicles, ground and heights."""
 
 import math
-from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Self
 
-from stillmap.core.config import Section, option
+from pydantic import model_validator
+from pydantic.dataclasses import dataclass
+
+from stillmap.core.config import STRICT, Count, option
 
 Shape = Literal["legs", "bodies", "mixed"]
 
@@ -27,11 +29,11 @@ def require(condition: bool, message: str) -> None:
         raise ValueError(message)
 
 
-@dataclass(frozen=True)
-class CrowdOptions(Section, section="crowd"):
+@dataclass(frozen=True, config=STRICT)
+class CrowdOptions:
     """The people."""
 
-    people: int = option(15, "Number of people.", ge=0)
+    people: Count = option(15, "Number of people.", ge=0)
     # spelled out: ruff takes the default for mutable under an alias
     shape: Literal["legs", "bodies", "mixed"] = option(
         "mixed", "Cross section of people at the height of the laser: legs, bodies, or half each."
@@ -42,14 +44,16 @@ class CrowdOptions(Section, section="crowd"):
     min_stop: float = option(2.0, "Minimum duration of a stop, s.", ge=0)
     max_stop: float = option(20.0, "Maximum duration of a stop, s.", ge=0)
 
-    def check(self) -> None:
+    @model_validator(mode="after")
+    def _check(self) -> Self:
         """Refuses empty ranges."""
         require(self.min_speed <= self.max_speed, "speeds must satisfy min_speed <= max_speed")
         require(self.min_stop <= self.max_stop, "stops must satisfy min_stop <= max_stop")
+        return self
 
 
-@dataclass(frozen=True)
-class DoorOptions(Section, section="doors"):
+@dataclass(frozen=True, config=STRICT)
+class DoorOptions:
     """Durations of the states of doors, log-uniformly distributed."""
 
     min_open: float = option(4.0, "Minimum time a door stays open, s.", gt=0)
@@ -58,32 +62,36 @@ class DoorOptions(Section, section="doors"):
     max_closed: float = option(120.0, "Maximum time a door stays closed, s.", gt=0)
     swing: float = option(1.5, "Time from closed to open, s.", gt=0)
 
-    def check(self) -> None:
+    @model_validator(mode="after")
+    def _check(self) -> Self:
         """Refuses empty ranges."""
         for low, high in ((self.min_open, self.max_open), (self.min_closed, self.max_closed)):
             require(low <= high, "times of doors must satisfy min <= max")
+        return self
 
 
-@dataclass(frozen=True)
-class TrafficOptions(Section, section="traffic"):
+@dataclass(frozen=True, config=STRICT)
+class TrafficOptions:
     """The vehicles on the lanes of a scene, besides queues."""
 
-    vehicles: int = option(10, "Number of vehicles, spread over the lanes.", ge=0)
+    vehicles: Count = option(10, "Number of vehicles, spread over the lanes.", ge=0)
     min_speed: float = option(7.0, "Minimum desired speed, m/s.", gt=0)
     max_speed: float = option(12.0, "Maximum desired speed, m/s.", gt=0)
     stopping_share: float = option(0.2, "Share of vehicles that stop at times.", ge=0, le=1)
     max_stop: float = option(12.0, "Maximum duration of a stop, s.", ge=3)
 
-    def check(self) -> None:
+    @model_validator(mode="after")
+    def _check(self) -> Self:
         """Refuses empty ranges."""
         require(self.min_speed <= self.max_speed, "speeds must satisfy min_speed <= max_speed")
+        return self
 
 
-@dataclass(frozen=True)
-class LaserOptions(Section, section="laser"):
+@dataclass(frozen=True, config=STRICT)
+class LaserOptions:
     """The planar laser scanner and its pose on the robot."""
 
-    beams: int = option(180, "Beams per scan.", ge=2)
+    beams: Count = option(180, "Beams per scan.", ge=2)
     fov: float = option(math.pi, "Field of view about the sensor's x axis, rad.", gt=0, le=_TURN)
     max_range: float = option(30.0, "Maximum range, m; beyond there is no return.", gt=0)
     range_noise: float = option(0.02, "Standard deviation of ranges, m.", ge=0)
@@ -109,7 +117,9 @@ class LaserOptions(Section, section="laser"):
         None, "yaw as the recorder has it, rad; unset: the true one."
     )
     height: float = option(0.3, "Height above the floor, m.", gt=0)
-    blind_stretches: int = option(0, "Number of stretches without returns, at random times.", ge=0)
+    blind_stretches: Count = option(
+        0, "Number of stretches without returns, at random times.", ge=0
+    )
     blind_at: float | None = option(
         None, "Share of the recording at which one more such stretch begins.", ge=0, lt=1
     )
@@ -131,8 +141,8 @@ class LaserOptions(Section, section="laser"):
         return 2 if self.second_laser else 1
 
 
-@dataclass(frozen=True)
-class RobotOptions(Section, section="robot"):
+@dataclass(frozen=True, config=STRICT)
+class RobotOptions:
     """Motion of the robot, scan rate, and mishaps."""
 
     speed: float = option(0.5, "Speed on a free way, m/s.", gt=0)
@@ -142,7 +152,7 @@ class RobotOptions(Section, section="robot"):
     turn_rate: float = option(0.8, "Maximum turn rate, rad/s.", gt=0)
     radius: float = option(0.22, "Radius of the circular footprint, m.")
     scan_rate: float = option(5.0, "Scans per second of each laser, Hz.", gt=0)
-    scans: int | None = option(
+    scans: Count | None = option(
         None, "Number of scans, repeating the route; unset: the route once.", ge=1
     )
     carried_at: float | None = option(
@@ -178,8 +188,8 @@ class RobotOptions(Section, section="robot"):
     )
 
 
-@dataclass(frozen=True)
-class OdometryOptions(Section, section="odometry"):
+@dataclass(frozen=True, config=STRICT)
+class OdometryOptions:
     """Errors of differential-drive odometry; all 0: perfect odometry."""
 
     wheel_radius_error: float = option(
@@ -205,7 +215,7 @@ class OdometryOptions(Section, section="odometry"):
     slip_length: float = option(0.5, "Distance over which a wheel slips, m.", gt=0)
     stall_rate: float = option(0.0, "Odometry stalls per minute: motion is missed.", ge=0)
     stall_time: float = option(5.0, "Duration of a stall, s.", gt=0)
-    resets: int = option(0, "Number of resets to the origin, at random times.", ge=0)
+    resets: Count = option(0, "Number of resets to the origin, at random times.", ge=0)
     scale: float = option(1.0, "Factor on all distances.", gt=0)
     rotation_gain: float = option(1.0, "Factor on all rotations.", gt=0)
     latency: float = option(
@@ -213,14 +223,14 @@ class OdometryOptions(Section, section="odometry"):
     )
 
 
-@dataclass(frozen=True)
-class CameraOptions(Section, section="camera"):
+@dataclass(frozen=True, config=STRICT)
+class CameraOptions:
     """Identical cameras on the robot with a global shutter."""
 
     enabled: bool = option(False, "Add cameras.")
-    count: int = option(1, "Number of cameras, evenly spread in yaw.", ge=1, le=16)
-    width: int = option(640, "Image width, pixels.", ge=2, le=8192)
-    height: int = option(480, "Image height, pixels.", ge=2, le=8192)
+    count: Count = option(1, "Number of cameras, evenly spread in yaw.", ge=1, le=16)
+    width: Count = option(640, "Image width, pixels.", ge=2, le=8192)
+    height: Count = option(480, "Image height, pixels.", ge=2, le=8192)
     fov: float = option(1.4, "Horizontal field of view, rad.", gt=0, le=_MAX_CAMERA_FOV)
     rate: float = option(2.0, "Images per second of each camera, Hz.", gt=0)
     x: float = option(0.1, "First camera ahead of the base, m; the others are rotated about it.")
@@ -235,7 +245,7 @@ class CameraOptions(Section, section="camera"):
     p2: float = option(0.0, "Distortion coefficient.", ge=-0.05, le=0.05)
     noise: float = option(2.0, "Standard deviation of pixel values, of 255.", ge=0)
     exposure: float = option(0.0, "Standard deviation of the relative exposure of images.", ge=0)
-    antialias: int = option(1, "Rays per pixel in each direction.", ge=1, le=4)
+    antialias: Count = option(1, "Rays per pixel in each direction.", ge=1, le=4)
 
     @property
     def distortion(self) -> tuple[float, ...]:
@@ -244,12 +254,12 @@ class CameraOptions(Section, section="camera"):
         return (*values, 0.0) if any(values) else ()
 
 
-@dataclass(frozen=True)
-class LidarOptions(Section, section="lidar"):
+@dataclass(frozen=True, config=STRICT)
+class LidarOptions:
     """A spinning lidar, which replaces the planar laser, and its pose on the robot."""
 
-    channels: int = option(0, "Number of channels; 0: no lidar.", ge=0)
-    columns: int = option(1875, "Azimuths per turn.", ge=4)
+    channels: Count = option(0, "Number of channels; 0: no lidar.", ge=0)
+    columns: Count = option(1875, "Azimuths per turn.", ge=4)
     rate: float = option(10.0, "Turns per second, Hz.", gt=0)
     low: float | None = option(
         None,
@@ -287,10 +297,12 @@ class LidarOptions(Section, section="lidar"):
     roof_width: float | None = option(None, "Width of the roof, m; unset: 0.8 of that.", gt=0)
     roof_below: float = option(0.35, "Height of the sensor above the roof, m.", gt=0)
 
-    def check(self) -> None:
+    @model_validator(mode="after")
+    def _check(self) -> Self:
         """Refuses an empty field of view."""
         low, high = self.field
         require(low <= high, "elevations must satisfy low <= high")
+        return self
 
     @property
     def field(self) -> tuple[float, float]:
@@ -299,8 +311,8 @@ class LidarOptions(Section, section="lidar"):
         return (low if self.low is None else self.low, high if self.high is None else self.high)
 
 
-@dataclass(frozen=True)
-class RigOptions(Section, section="rig"):
+@dataclass(frozen=True, config=STRICT)
+class RigOptions:
     """Two lasers like `laser`: one horizontal, one tilting about the robot's y axis."""
 
     tilts: bool = option(False, "There are two lasers, one of which tilts.")
@@ -311,14 +323,16 @@ class RigOptions(Section, section="rig"):
     amplitude: float = option(0.7, "Tilt to either side of the mean, rad.", ge=0)
     period: float = option(4.0, "Period of the tilting at constant rate, s.", gt=0)
 
-    def check(self) -> None:
+    @model_validator(mode="after")
+    def _check(self) -> Self:
         """Refuses too large angles."""
         angle = abs(self.middle) + self.amplitude
         require(angle <= _MAX_ELEVATION, "the laser must not tilt by more than 85 degrees")
+        return self
 
 
-@dataclass(frozen=True)
-class GroundOptions(Section, section="ground"):
+@dataclass(frozen=True, config=STRICT)
+class GroundOptions:
     """The ground: a plane or paraboloid, with pavements above it."""
 
     slope_x: float = option(0.0, "Slope to the east at the origin, m/m.", ge=-0.3, le=0.3)
@@ -328,8 +342,8 @@ class GroundOptions(Section, section="ground"):
     kerb: float = option(0.12, "Height of pavements above the street, m.", ge=0, le=0.5)
 
 
-@dataclass(frozen=True)
-class HeightOptions(Section, section="heights"):
+@dataclass(frozen=True, config=STRICT)
+class HeightOptions:
     """Heights of ceiling, walls, doors and furniture."""
 
     ceiling: float | None = option(2.8, "Height of the ceiling, m; unset: open sky.", gt=0)

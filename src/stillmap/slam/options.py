@@ -1,12 +1,14 @@
 """Options of the M-step over poses and map."""
 
-from dataclasses import dataclass, field
+from dataclasses import field
 
-from stillmap.core.config import Section, option
+from pydantic.dataclasses import dataclass
+
+from stillmap.core.config import STRICT, option
 
 
-@dataclass(frozen=True)
-class OdometryOptions(Section, section="slam.odometry"):
+@dataclass(frozen=True, config=STRICT)
+class OdometryOptions:
     """Noise of wheel odometry."""
 
     translation_per_metre: float = option(
@@ -23,8 +25,8 @@ class OdometryOptions(Section, section="slam.odometry"):
     )
 
 
-@dataclass(frozen=True)
-class SlamOptions(Section, section="slam"):
+@dataclass(frozen=True, config=STRICT)
+class SlamOptions:
     """Poses and map."""
 
     resolution: float = option(0.05, "Edge of a map cell, in metres.", ge=0.005, le=10)

@@ -1,12 +1,12 @@
 """Options of the tracking of moving objects."""
 
-from dataclasses import dataclass
+from pydantic.dataclasses import dataclass
 
-from stillmap.core.config import Section, option
+from stillmap.core.config import STRICT, option
 
 
-@dataclass(frozen=True)
-class ObjectOptions(Section, section="objects"):
+@dataclass(frozen=True, config=STRICT)
+class ObjectOptions:
     """Tracking of moving objects; see `docs/objects.md`."""
 
     enabled: bool = option(True, "Detect and track moving objects.")
