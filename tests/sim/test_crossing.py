@@ -9,7 +9,8 @@ from marks import slow_params
 from stillmap.sim import Simulation, scene_by_name, simulate
 from stillmap.sim.geometry import BOX, CYLINDER, ELLIPSOID, Ground
 from stillmap.sim.world_3d import make_static_world, trace_loops
-from stillmap.sim.worlds.street import INNER, OUTER
+
+INNER, OUTER = 1.75, 5.25  # m, from the middle of the road to the middles of the lanes
 
 
 @functools.cache

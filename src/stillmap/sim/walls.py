@@ -1,12 +1,11 @@
-"""Drawing worlds: common pieces of buildings as wall segments x0, y0, x1, y1, movable objects."""
+"""Drawing worlds: common pieces of buildings as wall segments x0, y0, x1, y1."""
 
-import dataclasses
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal
 
-from stillmap.sim.scene import Door, Point, Scene, Segment, Stay, Thing
+from stillmap.sim.scene import Door, Point, Segment
 
 Side = Literal["north", "south", "east", "west"]
 
@@ -135,41 +134,24 @@ def leaf(
     return Door(hinge, opening.width - 2 * gap, closed, closed + turn)
 
 
-class MovedObject(NamedTuple):
-    """An object that stands in another world for good, and here until `until`.
-
-    Attributes:
-        at: metres, center of a rectangle that contains it and nothing else.
-        size: metres, of the rectangle.
-        until: seconds since the beginning of the recording.
-        then: stays afterwards; none: it is taken away.
-    """
-
-    at: Point
-    size: Point
-    until: float
-    then: tuple[Stay, ...] = ()
+def _line(*points: Point) -> list[Segment]:
+    return polyline(points)
 
 
-def add_objects(scene: Scene, lifted: Iterable[MovedObject], others: Iterable[Thing]) -> Scene:
-    """The scene with movable objects, some of them made of its walls."""
-    walls, things = scene.walls, []
-    for one in lifted:
-        faces, walls = split_walls(walls, one.at, one.size)
-        x, y = one.at
-        about = tuple((a - x, b - y, c - x, d - y) for a, b, c, d in faces)
-        things.append(Thing(about, (Stay(x, y, until=one.until), *one.then)))
-    return dataclasses.replace(scene, walls=walls, things=(*things, *others))
+def _wall(start: Point, length: float, side: Side, openings: Sequence[Any] = ()) -> list[Segment]:
+    return wall(start, length, side, [Opening(*o) for o in openings])
 
 
-def split_walls(
-    walls: Sequence[Segment], at: Point, size: Point
-) -> tuple[tuple[Segment, ...], tuple[Segment, ...]]:
-    """The walls within a rectangle, and all others."""
-    held: list[Segment] = []
-    others: list[Segment] = []
-    for wall in walls:
-        ends = (wall[:2], wall[2:])
-        inside = all(abs(x - at[0]) < size[0] / 2 and abs(y - at[1]) < size[1] / 2 for x, y in ends)
-        (held if inside else others).append(wall)
-    return tuple(held), tuple(others)
+def _room(start: Point, side: Side, along: Any, depth: float, door: Sequence[Any]) -> list[Segment]:
+    return room(start, side, along, depth, Opening(*door))
+
+
+# how the data files of worlds call them
+PIECES: dict[str, Callable[..., list[Segment]]] = {
+    "line": _line,
+    "box": box,
+    "box_along": box_along,
+    "pillar": pillar,
+    "wall": _wall,
+    "room": _room,
+}

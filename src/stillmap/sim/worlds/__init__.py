@@ -1,53 +1,107 @@
-"""The worlds by name. Metres; x to the east, y to the north."""
+"""The worlds by name: data files beside this module. Metres; x to the east, y to the north.
+
+A file draws its world from pieces of `walls.py`, one row each: `["box", x, y, width, height]`.
+`extends` names a world of which it says only what differs; `lifted` are objects made of walls of
+that world. `building` alone is computed: it grows with the number of scans.
+"""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from importlib import resources
 from typing import Any
 
 from stillmap.core.config import override
 from stillmap.core.errors import InputError, closest_match
-from stillmap.sim.scene import Scene
-from stillmap.sim.worlds.drive import drive, street_turn
-from stillmap.sim.worlds.gallery import gallery
-from stillmap.sim.worlds.indoor import corridor, hall, warehouse, warehouse_moved
-from stillmap.sim.worlds.large import building
-from stillmap.sim.worlds.loops import rounds, ten_corridors
-from stillmap.sim.worlds.office import office, office_moved
-from stillmap.sim.worlds.oncoming import street_oncoming
-from stillmap.sim.worlds.street import crossing, street, street_jam, street_moved
-from stillmap.sim.worlds.wings import lookalike, two_wings
+from stillmap.sim.scene import Lane, Light, Scene, Segment, Stay, Thing
+from stillmap.sim.walls import PIECES, Opening, leaf
+from stillmap.sim.worlds.building import building
 
 _EMPTY = "-empty"
+_FOLDER = resources.files(__name__)
+_WORLDS = sorted(f.name[:-5] for f in _FOLDER.iterdir() if f.name.endswith(".toml"))
 
-_WORLDS: dict[str, Callable[[], Scene]] = {
-    "hall": hall,
-    "corridor": corridor,
-    "office": office,
-    "warehouse": warehouse,
-    "gallery": gallery,
-    "street": street,
-    "street-turn": street_turn,
-    "street-jam": street_jam,
-    "street-oncoming": street_oncoming,
-    "crossing": crossing,
-    "drive": drive,
-    "building": building,
-    "ten-corridors": ten_corridors,
-    "rounds": rounds,
-    "lookalike-1": partial(lookalike, 1),
-    "lookalike-2": partial(lookalike, 2),
-    "two-wings": two_wings,
-    "office-moved": office_moved,
-    "street-moved": street_moved,
-    "warehouse-moved": warehouse_moved,
+
+def load_world(name: str) -> Scene:
+    """The world of a data file."""
+    tree = tomllib.loads((_FOLDER / f"{name}.toml").read_text(encoding="utf-8"))
+    base = tree.pop("extends", None)
+    sections = {key: tree.pop(key) for key in list(tree) if isinstance(tree[key], dict)}
+    lifted, brought = tree.pop("lifted", []), map(_read_thing, tree.pop("things", []))
+    values: dict[str, Any] = {key: _READ.get(key, _to_tuple)(rows) for key, rows in tree.items()}
+    values["name"] = name
+    scene = Scene(**values) if base is None else dataclasses.replace(load_world(base), **values)
+    walls, things = scene.walls, []
+    for moved in lifted:
+        thing, walls = _lift(walls, **moved)
+        things.append(thing)
+    scene = dataclasses.replace(scene, walls=walls, things=(*things, *brought))
+    for section in sections.values():
+        section.update({key: None for key, value in section.items() if value == "unset"})
+    return override(scene, sections)
+
+
+def _draw(rows: list[list[Any]]) -> tuple[Segment, ...]:
+    return tuple(segment for kind, *values in rows for segment in PIECES[kind](*values))
+
+
+def _to_tuple(value: list[Any]) -> tuple[Any, ...]:
+    return tuple(_to_tuple(item) if isinstance(item, list) else item for item in value)
+
+
+def _read_lights(rows: list[dict[str, Any]]) -> tuple[Light, ...]:
+    return tuple(Light(_to_tuple(row["at"]), _to_tuple(row["red"]), row["cycle"]) for row in rows)
+
+
+def _read_lanes(rows: list[dict[str, Any]]) -> tuple[Lane, ...]:
+    for row in rows:
+        row["lights"] = _read_lights(row.get("lights", []))
+        row.update({key: _to_tuple(row[key]) for key in ("path", "go") if key in row})
+    return tuple(Lane(**row) for row in rows)
+
+
+def _read_doorways(rows: list[list[Any]]) -> tuple[Any, ...]:
+    return tuple(leaf(start, side, Opening(*door), *swing) for start, side, door, *swing in rows)
+
+
+def _read_thing(row: dict[str, Any]) -> Thing:
+    return Thing(_draw(row["faces"]), tuple(Stay(**stay) for stay in row["stays"]))
+
+
+_READ: dict[str, Callable[[Any], Any]] = {
+    "walls": _draw,
+    "kerbs": _draw,
+    "lights": _read_lights,
+    "lanes": _read_lanes,
+    "leaves": _read_doorways,
 }
 
 
-def _with_people(world: Callable[[], Scene], people: int) -> Scene:
-    scene = world()
-    crowd = dataclasses.replace(scene.crowd, people=people)
-    return dataclasses.replace(scene, name=f"{scene.name}-crowd", crowd=crowd)
+def _lift(
+    walls: Sequence[Segment],
+    at: Sequence[float],
+    size: Sequence[float],
+    until: float,
+    then: Sequence[dict[str, Any]] = (),
+) -> tuple[Thing, tuple[Segment, ...]]:
+    """The walls within a rectangle as an object, and all others.
+
+    Args:
+        walls: of the world that it stands in for good.
+        at, size: metres, center and size of the rectangle.
+        until: seconds, when it is taken away from there.
+        then: stays afterwards.
+    """
+    (x, y), (width, height) = at, size
+
+    def is_within(wall: Segment) -> bool:
+        ends = (wall[:2], wall[2:])
+        return all(abs(u - x) < width / 2 and abs(v - y) < height / 2 for u, v in ends)
+
+    about = tuple((a - x, b - y, c - x, d - y) for a, b, c, d in filter(is_within, walls))
+    stays = (Stay(x, y, until=until), *(Stay(**stay) for stay in then))
+    return Thing(about, stays), tuple(wall for wall in walls if not is_within(wall))
 
 
 def _empty(world: Callable[[], Scene]) -> Scene:
@@ -65,10 +119,13 @@ def _empty(world: Callable[[], Scene]) -> Scene:
 
 
 SCENES: dict[str, Callable[[], Scene]] = {
-    **_WORLDS,
-    "hall-crowd": partial(_with_people, hall, 60),
-    "corridor-crowd": partial(_with_people, corridor, 40),
-    **{f"{name}{_EMPTY}": partial(_empty, world) for name, world in _WORLDS.items()},
+    "building": building,
+    **{name: partial(load_world, name) for name in _WORLDS},
+}
+SCENES |= {
+    f"{name}{_EMPTY}": partial(_empty, world)
+    for name, world in SCENES.items()
+    if not name.endswith("-crowd")
 }
 
 
