@@ -29,8 +29,9 @@ def load_world(name: str) -> Scene:
     base = tree.pop("extends", None)
     sections = {key: tree.pop(key) for key in list(tree) if isinstance(tree[key], dict)}
     lifted, brought = tree.pop("lifted", []), map(_read_thing, tree.pop("things", []))
-    values: dict[str, Any] = {key: _READ.get(key, _to_tuple)(rows) for key, rows in tree.items()}
-    values["name"] = name
+    values: dict[str, Any] = {"name": name}
+    for key, rows in tree.items():
+        values[key] = _READ[key](rows) if key in _READ else _to_tuple(rows)
     scene = Scene(**values) if base is None else dataclasses.replace(load_world(base), **values)
     walls, things = scene.walls, []
     for moved in lifted:
