@@ -35,14 +35,14 @@ _WALLS = (
 
 
 def record_days(folder: Path) -> None:
-    """Write a recording of each day: 100 scans of 180 beams."""
+    """Write a recording of each day: 100 scans of 360 beams."""
     for seed, (day, route) in enumerate(ROUTES.items(), start=1):
         scene = Scene(
             "flat",
             walls=(*_WALLS, *(() if day == "day1" else CHEST)),
             route=route,
             crowd=CrowdOptions(people=1),
-            laser=LaserOptions(beams=180, range_noise=0.01, max_range=12.0),
+            laser=LaserOptions(beams=360, range_noise=0.01, max_range=12.0),
             robot=RobotOptions(scans=100),
         )
         made = simulate(scene, np.random.default_rng(seed))

@@ -38,7 +38,7 @@ def test_what_a_place_has(merged, flat_days):
     # a chest of 0.8 m about (0.5, 2.5), seen from a start at (-5, 0)
     np.testing.assert_allclose(change.box, (5.1, 2.1, 5.9, 2.9), atol=0.15)
     assert 0.5 < change.probability <= 1.0
-    assert merged.p_static.shape == merged.hit.shape == (36_000,)
+    assert merged.p_static.shape == merged.hit.shape == (72_000,)
     assert merged.map.p_occupied.shape == merged.map.occupied.shape
     assert merged.options.threads == 1
     assert merged.warnings == []
