@@ -172,7 +172,7 @@ def test_what_happens_while_reading(log, monkeypatch, error):
     def fails(*_):
         raise error
 
-    monkeypatch.setattr("stillmap.io.carmen.reader.read_logs", fails)
+    monkeypatch.setattr("stillmap.io.carmen.reader.read_log", fails)
     with pytest.raises(InputError, match=r"cannot be read: gone|does not fit into memory"):
         read(log([FLASER]))
 

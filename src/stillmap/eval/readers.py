@@ -199,7 +199,7 @@ def read_odometry(path: Path) -> Float:
     _, is_log = _first_row(path, f"a CARMEN log or {_POSE}")
     if not is_log:
         return read_planar_trajectory(path)
-    log = read_log(path)
+    log = read_log([path])
     if log.skipped_odometry.total:
         _log.warning("%s: odometry skipped: %s", path, log.skipped_odometry.summary())
     rows = _log_rows(log)
@@ -221,7 +221,7 @@ def _log_rows(log: CarmenLog) -> Float:
         stamps, poses = np.asarray(log.odom_stamp_ns), np.asarray(log.odom_poses).reshape(-1, 3)
         return np.column_stack([to_seconds(stamps), poses])
     for laser in log.lasers.values():
-        if laser.has_poses:
+        if len(laser.poses):
             poses = np.asarray(laser.poses).reshape(-1, 6)[:, 3:]
             return np.column_stack([to_seconds(np.asarray(laser.stamp_ns)), poses])
     return np.zeros((0, 4))

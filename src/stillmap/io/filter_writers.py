@@ -91,13 +91,6 @@ def _write_stillmap(job: FilterJob) -> Omissions:
     return Omissions()
 
 
-def _write_log(job: FilterJob) -> Omissions:
-    from stillmap.io.carmen.filtered_log import write_filtered_log
-
-    omitted = write_filtered_log(job.source, job.output, job.recording, job.blank, job.options)
-    return Omissions(omitted)
-
-
 def _check_depth(source: Path, output: Path) -> None:  # noqa: ARG001
     from stillmap.io import filtered_depth
 
@@ -140,7 +133,7 @@ FILTER_WRITERS = {
         _writer("point_cloud.filtered.las"), _patterns(signatures.LAS_EXTENSIONS), _check_las
     ),
     "PLY": FilterWriter(_writer("point_cloud.filtered.ply"), _patterns(signatures.PLY_EXTENSIONS)),
-    "CARMEN log": FilterWriter(_write_log),
+    "CARMEN log": FilterWriter(_writer("carmen.writer")),
 }
 
 

@@ -14,7 +14,7 @@ from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.io import stillmap_folder
 from stillmap.io.builder import ReadContext
-from stillmap.io.carmen.messages import SCAN_PARSERS
+from stillmap.io.carmen.log import SCAN_KINDS
 from stillmap.io.point_cloud import signatures
 from stillmap.io.ros import bag_types
 from stillmap.io.scan_files import contains_files, has_extension
@@ -53,7 +53,7 @@ class Format(NamedTuple):
 
 
 def _is_carmen(path: Path, start: bytes | None) -> bool:  # noqa: ARG001
-    words = {*SCAN_PARSERS, b"ODOM", b"PARAM"}
+    words = {*SCAN_KINDS, b"ODOM", b"PARAM"}
     first_words = (line.split(maxsplit=1)[:1] for line in (start or b"").splitlines())
     return any(word in words for first in first_words for word in first)
 

@@ -7,8 +7,6 @@ import pytest
 
 from stillmap.core import se2
 from stillmap.core.errors import InputError
-from stillmap.io import read, write
-from stillmap.prepare.options import ReadOptions
 
 HEADER = "0 -1.0 2.0 0.5 20.0 0.01 0"  # five beams, half a radian apart
 RAW = f"{HEADER} 5 1 2 3 4 5 0"
@@ -80,13 +78,6 @@ def test_fields_of_view(read_log, flaser, n, fov, last, step):
     assert math.degrees(noted["angle_step"]) == pytest.approx(step)
 
 
-def test_declared_angles_override_the_field_of_view(read_log):
-    line = f"RAWLASER1 {RAW} 1.0 h 1"
-    recording = read_log([line], laser_fov=1.0)
-    np.testing.assert_array_equal(recording.points, read_log([line]).points)
-    assert any("field of view is not used" in text for text in recording.source["warnings"])
-
-
 def test_the_second_laser(read_log, flaser):
     lines = [flaser(1.0), flaser(1.1, kind="RLASER"), "PARAM robot_rearlaser_offset -0.3"]
     options = {"laser2_y": 0.1, "laser2_theta": 3.0, "laser2_upside_down": True}
@@ -98,36 +89,3 @@ def test_the_second_laser(read_log, flaser):
     assert [s["upside_down"] for s in recording.source["sensors"]] == [False, True]
     with pytest.raises(InputError, match="laser2_"):
         read_log(lines[:1], **options)
-
-
-def test_four_raw_lasers(read_log):
-    lines = [f"RAWLASER{k} {RAW} {k}.0 h 1" for k in (1, 2, 3, 4)]
-    recording = read_log(lines)
-    assert recording.sensor.tolist() == [0, 1, 2, 3]
-    x = np.degrees(se2.parameters(recording.T_base_sensor)[:, 2])
-    np.testing.assert_allclose(np.abs(x), 0)
-    unknown = [w for w in recording.source["warnings"] if "does not state its pose" in w]
-    assert len(unknown) == 3
-
-
-def test_options_for_recording_folders(read_log, flaser, tmp_path):
-    lines = [flaser(1.0), flaser(1.1, kind="RLASER"), flaser(1.2)]
-    recording = read_log(lines)
-    write(recording, tmp_path / "rec")
-    changed = read(tmp_path / "rec", ReadOptions(laser2_upside_down=True, laser2_x=-0.2))
-    rear = recording.beams_of(1)
-    expected = recording.points.copy()
-    expected[rear] = mirrored(recording)[rear]
-    np.testing.assert_array_equal(changed.points, expected)
-    np.testing.assert_allclose(se2.parameters(changed.T_base_sensor)[:, 0], [0, -0.2])
-    assert changed.source["read_options"] == {"laser2_upside_down": True, "laser2_x": -0.2}
-    write(read_log(lines[:1]), tmp_path / "one")
-    with pytest.raises(InputError, match="laser2_"):
-        read(tmp_path / "one", ReadOptions(laser2_x=-0.2))
-
-
-@pytest.mark.parametrize("options", [{"laser_fov": 0.0}, {"laser2_fov": 6.5}, {"laser2_x": 2e3}])
-def test_refused(options):
-    (name,) = options
-    with pytest.raises(ValueError, match=name):
-        ReadOptions(**options)

@@ -7,8 +7,10 @@ import pytest
 
 from stillmap.core.errors import InputError
 from stillmap.io import read
-from stillmap.io.carmen.filtered_log import find_no_return_code, write_filtered_log
+from stillmap.io.carmen.writer import find_no_return_code, write_filtered
+from stillmap.io.filtered_copy import FilterJob
 from stillmap.prepare.max_range import RangeRule
+from stillmap.prepare.options import ReadOptions
 
 # real readings, and a code that repeats in several directions
 READINGS = [[1.5, 81.83, 3.25, 4.0], [1.5, 2.0, 81.83, 4.0], [81.83, 2.0, 3.0, 81.83]]
@@ -32,7 +34,7 @@ def blanked(source, out, which):
     recording = read(source)
     blank = np.zeros(recording.n_beams, bool)
     blank[which] = True
-    return recording, write_filtered_log(source, out, recording, blank)
+    return recording, write_filtered(FilterJob(source, out, recording, blank, ReadOptions())).scans
 
 
 def test_other_bytes_are_unchanged(made, tmp_path):
@@ -60,13 +62,6 @@ def test_only_blanked_beams_differ(made, tmp_path):
     np.testing.assert_array_equal(again.points[expected], recording.points[expected])
     np.testing.assert_array_equal(again.stamp_ns, recording.stamp_ns)
     np.testing.assert_array_equal(again.T_odom_base, recording.T_odom_base)
-
-
-def test_without_blanked_beams(made, tmp_path):
-    source, out = made(), tmp_path / "out.log"
-    blanked(source, out, [])
-    lines = source.read_bytes().splitlines(keepends=True)
-    assert out.read_bytes() == b"".join(lines[:7] + lines[8:])
 
 
 @pytest.mark.parametrize(("given", "wanted"), [("a.log.gz", "b.log"), ("a.log", "b.log.gz")])
@@ -109,8 +104,10 @@ def test_unused_scan_lines_are_omitted(log, tmp_path):
 def test_another_log_is_refused(made, log, flaser, tmp_path):
     recording = read(made())
     other = log([flaser(k, READINGS[0]) for k in (5, 6, 7)], "other.log")
-    with pytest.raises(InputError, match="not the log that was mapped"):
-        write_filtered_log(other, tmp_path / "out.log", recording, np.zeros(12, bool))
+    blank = np.zeros(12, bool)
+    job = FilterJob(other, tmp_path / "out.log", recording, blank, ReadOptions())
+    with pytest.raises(InputError, match="not the recording that was mapped"):
+        write_filtered(job)
     assert not (tmp_path / "out.log").exists()
 
 

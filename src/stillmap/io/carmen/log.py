@@ -1,35 +1,169 @@
-"""Collects the records of a CARMEN log in compact arrays."""
+"""Parses CARMEN logs, and collects their records in compact arrays.
 
+One message per line: name, content, then `ipc_timestamp hostname logger_timestamp`, of which old
+logs omit the last one or two. The first of the two stamps is the record's time.
+
+    FLASER, RLASER  n r*n  laser_pose  robot_pose
+    RAWLASER1-4     header n r*n  m remission*m
+    ROBOTLASER1-2   header n r*n  m remission*m  laser_pose robot_pose
+                    tv rv forward_safety side_safety turn_axis
+    ODOM            x y theta tv rv acceleration
+    PARAM           name value
+    header          laser_type start_angle field_of_view angular_resolution maximum_range
+                    accuracy remission_mode
+
+Source: the header that CARMEN's logger writes, and logs: the header omits ROBOTLASER's remissions.
+"""
+
+import math
 from array import array
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import NamedTuple
 
 from stillmap.core.errors import InputError
+from stillmap.core.timestamps import parse_ns
 from stillmap.io.builder import SkippedRecords
-from stillmap.io.carmen.messages import (
-    SCAN_PARSERS,
-    BadRecord,
-    OdometryLine,
-    ScanConfig,
-    ScanLine,
-    parse_odom,
-)
-from stillmap.io.parts.repeats import RepeatFilter
 from stillmap.io.text_lines import Line, Progress, read_lines, share_progress
 from stillmap.prepare.options import ReadOptions
 from stillmap.prepare.time_window import TimeWindow
 
+BAD_LINE = "line that cannot be read"
+WRONG_COUNT = "other number of readings than most scans"
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"
-CUT_LINE = "cut last line"
-DAMAGED_STREAM = "damaged gzip stream"
-LONG_LINE = "over-long line"
+
+# fields of the poses, and what follows them, between the readings and the stamp, by kind of line
+_FIXED_FIELDS = {
+    **dict.fromkeys((b"FLASER", b"RLASER"), 6),
+    **dict.fromkeys((b"RAWLASER1", b"RAWLASER2", b"RAWLASER3", b"RAWLASER4"), 0),
+    **dict.fromkeys((b"ROBOTLASER1", b"ROBOTLASER2"), 11),
+}
+SCAN_KINDS = tuple(_FIXED_FIELDS)
+WITHOUT_ANGLES = ("FLASER", "RLASER")
+_HEADER_FIELDS = 7
+_MAX_POSE = 1e7  # m or rad, far beyond any odometry
 _COMMENT = (b"#", b"//")
 _MAX_UNKNOWN_LINES = 5_000_000  # in a row; one in ten lines of a log is a scan or a pose
 _MAX_UNKNOWN_KINDS = 50  # counted one by one; a text that is no log has thousands
+
+
+class ScanConfig(NamedTuple):
+    """Beam angles of a scan, and its declared maximum range."""
+
+    start_angle: float  # rad
+    angle_step: float  # rad
+    max_range: float | None = None  # m
+    field_of_view: float | None = None  # rad, as declared
+
+
+class ScanLine(NamedTuple):
+    """A laser line. `poses` are x, y, theta of laser and robot, () for kinds without them.
+
+    An ODOM line has the pose of the robot alone, and no ranges.
+    """
+
+    stamp_ns: int
+    ranges: list[float]
+    config: ScanConfig
+    poses: tuple[float, ...]
+    stamp: list[bytes]  # 1 to 3 fields `ipc_timestamp hostname logger_timestamp`
+
+
+def flaser_config(n: int, fov: float = math.pi) -> ScanConfig:
+    """Beam angles of a FLASER or RLASER line, which declares none: a half circle from -90 degrees.
+
+    The step is 180 / n degrees for even n, which omits the last beam, and 180 / (n - 1) for odd n.
+    Likewise for another field of view `fov`, in radians.
+    """
+    steps = n if n % 2 == 0 else max(n - 1, 1)
+    return ScanConfig(-fov / 2, fov / steps)
+
+
+def first_reading(kind: bytes) -> int:
+    """Index of the first reading among the fields of a scan line, of which the name is field 0."""
+    return 2 if kind.decode() in WITHOUT_ANGLES else _HEADER_FIELDS + 2
+
+
+def parse_scan(kind: bytes, fields: list[bytes]) -> ScanLine:
+    """Parse a laser line, `fields` without the name.
+
+    Raises:
+        ValueError: the line cannot be used.
+    """
+    first, n_fixed = first_reading(kind) - 1, _FIXED_FIELDS[kind]
+    n, header = _parse_count(fields, first - 1), fields[: first - 1]
+    tail = fields[first + n :]
+    if header:  # remissions
+        tail = tail[1 + _parse_count(tail, 0, least=0) :]
+    stamp = tail[n_fixed:]
+    if n > len(fields) - first - 1 or not _is_stamp(stamp):
+        raise ValueError(BAD_LINE)
+    ranges = _parse_numbers(fields[first : first + n])
+    config = _parse_header(header, n) if header else flaser_config(n)
+    poses = (*_parse_pose(tail[0:3]), *_parse_pose(tail[3:6])) if n_fixed else ()
+    return ScanLine(parse_ns(stamp[0].decode("ascii")), ranges, config, poses, stamp)
+
+
+def _parse_odometry(fields: list[bytes]) -> ScanLine:
+    """Parse an ODOM line likewise."""
+    if not _is_stamp(fields[6:]):
+        raise ValueError(BAD_LINE)
+    pose, stamp_ns = _parse_pose(fields[0:3]), parse_ns(fields[6].decode("ascii"))
+    return ScanLine(stamp_ns, [], ScanConfig(0.0, 0.0), tuple(pose), fields[6:])
+
+
+def _parse_count(fields: list[bytes], at: int, least: int = 1) -> int:
+    if len(fields) <= at or not fields[at].isdigit() or len(fields[at]) > 9:
+        raise ValueError(BAD_LINE)
+    if int(fields[at]) < least:
+        raise ValueError(BAD_LINE)
+    return int(fields[at])
+
+
+def _is_stamp(fields: list[bytes]) -> bool:
+    """True if `fields` have the form `ipc_timestamp [hostname [logger_timestamp]]`.
+
+    A host name is no number, or an integer followed by the logger's stamp: so a wrong number of
+    readings is noticed even where stamps are missing.
+    """
+    if len(fields) == 3:
+        is_host = fields[1].isdigit() or not is_number(fields[1])
+        return is_host and is_number(fields[2])
+    return len(fields) == 1 or (len(fields) == 2 and not is_number(fields[1]))
+
+
+def is_number(field: bytes) -> bool:
+    try:
+        float(field)
+    except ValueError:
+        return False
+    return True
+
+
+def _parse_numbers(fields: list[bytes]) -> list[float]:
+    if b"_" in b" ".join(fields):  # Python reads 1_000 as a number
+        raise ValueError(BAD_LINE)
+    return [float(field) for field in fields]
+
+
+def _parse_pose(fields: list[bytes]) -> list[float]:
+    pose = _parse_numbers(fields)
+    # written so that NaN fails too
+    if not all(abs(value) < _MAX_POSE for value in pose):
+        raise ValueError(BAD_LINE)
+    return pose
+
+
+def _parse_header(header: list[bytes], n: int) -> ScanConfig:
+    """Start, step and declared maximum; a missing step follows from the field of view."""
+    start, fov, step, max_range = _parse_numbers(header[1:5])
+    stated_fov = fov if 0.0 < fov <= 2.1 * math.pi else None
+    if not 0.0 < step < math.pi and stated_fov is not None:
+        step = stated_fov / max(n - 1, 1)
+    if not (0.0 < step < math.pi and abs(start) <= 4.0 * math.pi):
+        raise ValueError(BAD_LINE)
+    return ScanConfig(start, step, max_range if 0.0 < max_range < math.inf else None, stated_fov)
 
 
 class LaserLog:
@@ -37,120 +171,82 @@ class LaserLog:
 
     def __init__(self, kind: str) -> None:
         self.kind = kind
-        self.line = array("q")
-        self.stamp_ns = array("q")
+        self.line, self.stamp_ns = array("q"), array("q")
         self.count = array("q")  # readings per scan
-        self.host_is_number = array("b")
+        self.host_is_number = array("b")  # in a log with named hosts a sign of shifted fields
         self.ranges = array("f")  # readings of all scans, one after the other
         self.config = array("q")  # index into configs
         self.configs: dict[ScanConfig, int] = {}
-        self.poses = array("d")  # laser x y theta, robot x y theta of each scan
-        self.has_poses = False
+        self.poses = array("d")  # laser x y theta, robot x y theta of each scan, if there are any
 
     def add(self, line: int, scan: ScanLine) -> None:
         self.line.append(line)
         self.stamp_ns.append(scan.stamp_ns)
         self.count.append(len(scan.ranges))
-        self.host_is_number.append(scan.host_is_number)
+        self.host_is_number.append(len(scan.stamp) > 1 and is_number(scan.stamp[1]))
         self.ranges.extend(scan.ranges)
         self.config.append(self.configs.setdefault(scan.config, len(self.configs)))
-        if scan.poses is not None:
-            self.has_poses = True
-            self.poses.extend(scan.poses)
-
-    def typical_count(self) -> int:
-        """The most frequent number of readings per scan, the larger of equally frequent ones."""
-        return max(Counter(self.count).items(), key=lambda item: (item[1], item[0]))[0]
-
-    def stack_readings(self, scans: NDArray[np.intp]) -> NDArray[np.float32]:
-        """(len(scans), n) float32 readings of scans with the same number of readings."""
-        count = np.asarray(self.count)
-        start = np.concatenate([[0], np.cumsum(count)[:-1]])
-        n = int(count[scans[0]])
-        flat = np.frombuffer(self.ranges, np.float32)
-        if len(scans) * n == len(flat):
-            return flat.reshape(-1, n)
-        return np.asarray(flat[start[scans][:, None] + np.arange(n)])
+        self.poses.extend(scan.poses)
 
 
 class CarmenLog:
-    """The records of a CARMEN log, or of the parts of one.
-
-    Attributes:
-        repeats: recognises measurements that earlier parts hold already; None: there is one part.
-    """
+    """The records of a CARMEN log, or of the parts of one."""
 
     def __init__(self, window: TimeWindow) -> None:
         self._window = window
         self.lasers: dict[str, LaserLog] = {}
-        self.odom_stamp_ns = array("q")
-        self.odom_poses = array("d")
+        self.odom_stamp_ns, self.odom_poses = array("q"), array("d")
         self.params: dict[str, str] = {}
         self.records: Counter[str] = Counter()
         self.ignored: Counter[str] = Counter()
         self.skipped = SkippedRecords()  # lines of unknown kind
         self.skipped_scans: dict[str, SkippedRecords] = {}  # by kind of line
         self.skipped_odometry = SkippedRecords()
-        self.n_lines = self.n_repeated = 0
-        self.repeats: RepeatFilter | None = None
+        self.n_lines = 0
         self._stamp_fields: dict[bytes, int] = {}
 
     def add(self, line: Line) -> None:
         """Add a line; one that cannot be used is counted."""
         self.n_lines = line.number
-        if line.damaged:
-            self.skipped.add(DAMAGED_STREAM, line.number)
-            return
-        if line.too_long:
-            self.skipped.add(LONG_LINE, line.number)
+        fields = line.text.split()
+        if line.damaged or line.too_long:
+            self.skipped.add(BAD_LINE, line.number)
         elif line.text.lstrip().startswith(_COMMENT):
             self.ignored["comments"] += 1
-        elif fields := line.text.split():
-            self._add_record(line, fields[0], fields[1:])
-
-    def _add_record(self, line: Line, name: bytes, fields: list[bytes]) -> None:
-        if name == b"PARAM":
+        elif fields and fields[0] == b"PARAM":
             self.records["PARAM"] += 1
-            if len(fields) >= 2:
-                self.params[_text(fields[0])] = _text(fields[1])
-            return
-        if name == b"ODOM":
-            skipped = self.skipped_odometry
-        elif name in SCAN_PARSERS:
-            skipped = self.skipped_scans.setdefault(_text(name), SkippedRecords())
-        else:
-            self._ignore(line, name)
-            return
-        try:
-            stamp_fields = self._add_measurement(line, name, fields)
-        except BadRecord as bad:
-            skipped.add(bad.reason if line.ended else CUT_LINE, line.number)
-        else:
-            self.records[_text(name)] += 1
-            self._stamp_fields[name] = stamp_fields
+            if len(fields) >= 3:
+                self.params[_text(fields[1])] = _text(fields[2])
+        elif fields and fields[0] in (*SCAN_KINDS, b"ODOM"):
+            self._add_measurement(line, fields[0], fields[1:])
+        elif fields:
+            self._ignore(line, fields[0])
 
-    def _add_measurement(self, line: Line, name: bytes, fields: list[bytes]) -> int:
-        """Add a scan or pose; returns the number of its stamp fields."""
-        record = parse_odom(fields) if name == b"ODOM" else SCAN_PARSERS[name](fields)
-        # a line without an end may have lost fields, or digits of its stamp, unnoticed
-        if not line.ended and record.stamp_fields < self._stamp_fields.get(name, 1):
-            raise BadRecord(CUT_LINE)
-        if self.repeats is not None and _is_repeated(self.repeats, name, record):
-            self.n_repeated += 1
-            return record.stamp_fields
-        if isinstance(record, ScanLine):
-            if not self._window.select(record.stamp_ns):
-                return record.stamp_fields
-            kind = _text(name)
-            self.lasers.setdefault(kind, LaserLog(kind)).add(line.number, record)
-        else:
+    def _add_measurement(self, line: Line, name: bytes, fields: list[bytes]) -> None:
+        """Add a scan or pose."""
+        kind, is_pose = _text(name), name == b"ODOM"
+        skipped = self.skipped_odometry
+        if not is_pose:
+            skipped = self.skipped_scans.setdefault(kind, SkippedRecords())
+        try:
+            record = _parse_odometry(fields) if is_pose else parse_scan(name, fields)
+            # a line without an end may have lost fields, or digits of its stamp, unnoticed
+            if not line.ended and len(record.stamp) < self._stamp_fields.get(name, 1):
+                raise ValueError(BAD_LINE)
+        except ValueError:
+            skipped.add(BAD_LINE, line.number)
+            return
+        self.records[kind] += 1
+        self._stamp_fields[name] = len(record.stamp)
+        if is_pose:
             self.odom_stamp_ns.append(record.stamp_ns)
-            self.odom_poses.extend(record.pose)
-        return record.stamp_fields
+            self.odom_poses.extend(record.poses)
+        elif self._window.select(record.stamp_ns):
+            self.lasers.setdefault(kind, LaserLog(kind)).add(line.number, record)
 
     def _ignore(self, line: Line, name: bytes) -> None:
-        if not line.ended and any(kind.startswith(name) for kind in (*SCAN_PARSERS, b"ODOM")):
-            self.skipped.add(CUT_LINE, line.number)
+        if not line.ended and any(kind.startswith(name) for kind in (*SCAN_KINDS, b"ODOM")):
+            self.skipped.add(BAD_LINE, line.number)
             return
         kind = _text(name)
         known = kind in self.ignored or len(self.ignored) < _MAX_UNKNOWN_KINDS
@@ -158,16 +254,9 @@ class CarmenLog:
 
 
 def read_log(
-    path: Path, progress: Progress | None = None, window: TimeWindow | None = None
-) -> CarmenLog:
-    """Read a CARMEN log, plain or gzip; see `read_logs`."""
-    return read_logs([path], progress, window)
-
-
-def read_logs(
     paths: Sequence[Path], progress: Progress | None = None, window: TimeWindow | None = None
 ) -> CarmenLog:
-    """Read the parts of a CARMEN log, plain or gzip. Lines are counted through all parts.
+    """Read a CARMEN log, plain or gzip, or its parts. Lines are counted through all parts.
 
     Args:
         paths: the files, in order of time.
@@ -180,34 +269,19 @@ def read_logs(
     """
     window = window or TimeWindow(ReadOptions())
     log = CarmenLog(window)
-    if len(paths) > 1:
-        log.repeats = RepeatFilter()
     for number, path in enumerate(paths):
-        if log.repeats is not None:
-            log.repeats.begin_part()
-        _add_file(log, path, share_progress(progress, number, len(paths)))
+        first, known = log.n_lines, log.records.total()
+        for line in read_lines(path, share_progress(progress, number, len(paths))):
+            if line.number == 1:
+                line = line._replace(text=line.text.removeprefix(BYTE_ORDER_MARK))
+            log.add(line._replace(number=first + line.number))
+            if line.number % _MAX_UNKNOWN_LINES == 0:
+                before, known = known, log.records.total()
+                if known == before:
+                    what = f"has {_MAX_UNKNOWN_LINES} lines in a row that are no records"
+                    raise InputError(what, where=f"{path}:{line.number}")
     window.require_scans(str(paths[0]))
     return log
-
-
-def _add_file(log: CarmenLog, path: Path, progress: Progress | None) -> None:
-    first, known = log.n_lines, log.records.total()
-    for line in read_lines(path, progress):
-        if line.number == 1:
-            line = line._replace(text=line.text.removeprefix(BYTE_ORDER_MARK))
-        log.add(line._replace(number=first + line.number))
-        if line.number % _MAX_UNKNOWN_LINES == 0:
-            before, known = known, log.records.total()
-            if known == before:
-                what = f"has {_MAX_UNKNOWN_LINES} lines in a row that are no records"
-                raise InputError(what, where=f"{path}:{line.number}")
-
-
-def _is_repeated(repeats: RepeatFilter, name: bytes, record: ScanLine | OdometryLine) -> bool:
-    """True if an earlier part has the measurement; the time of logging may be another."""
-    values = record.ranges if isinstance(record, ScanLine) else record.pose
-    stamp = str(record.stamp_ns).encode()
-    return repeats.is_repeated(record.stamp_ns, name, stamp, array("d", values).tobytes())
 
 
 def _text(field: bytes) -> str:

@@ -1,8 +1,11 @@
-"""Reads CARMEN logs (`.log`, `.clf`, plain or gzip) as recordings."""
+"""Reads CARMEN logs (`.log`, `.clf`, plain or gzip)."""
 
+import math
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from sys import maxsize
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,21 +14,39 @@ from stillmap.core import se2
 from stillmap.core.advice import advise
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
+from stillmap.core.timestamps import longest_non_decreasing
 from stillmap.io import trajectory
 from stillmap.io.builder import ReadContext
-from stillmap.io.carmen import extrinsics
-from stillmap.io.carmen.extrinsics import Extrinsics
-from stillmap.io.carmen.log import CarmenLog, read_logs
-from stillmap.io.carmen.messages import SCAN_PARSERS, flaser_config
-from stillmap.io.carmen.scan_selection import Sensor, scan_order, select_scans
-from stillmap.io.text_lines import Line, is_gzip, read_head
-from stillmap.prepare import max_range
+from stillmap.io.carmen.log import (
+    SCAN_KINDS,
+    WITHOUT_ANGLES,
+    WRONG_COUNT,
+    CarmenLog,
+    LaserLog,
+    flaser_config,
+    read_log,
+)
+from stillmap.io.text_lines import is_gzip
+from stillmap.prepare.lasers import (
+    LaserPose,
+    RawLaser,
+    RawLasers,
+    place_beams,
+    scan_order,
+    unit_vectors,
+)
 from stillmap.prepare.options import LaserOptions, ReadOptions
 from stillmap.prepare.time_window import TimeWindow
 
-_HEAD = 1 << 18  # bytes with the PARAM lines of a log
+Float = NDArray[np.float64]
 
-_Beams = tuple[NDArray[np.float32], NDArray[np.bool_]]  # points (..., 2) in the sensor frame, hits
+TIME_BACKWARDS = "time running backwards"
+_KIND_ORDER = ("ROBOTLASER", "FLASER", "RLASER", "RAWLASER")  # preference for the same laser
+# differences between laser and robot pose that agree: old logs round to cm. A corrected pose in
+# the laser field differs by metres, and differently in each scan
+_SAME_DISTANCE, _SAME_ANGLE = 0.02, 0.01  # m, rad
+_MAX_OFFSET = 3.0  # m on a robot
+_MIN_OFFSET = 0.002  # m or rad: less is rounding
 
 
 def read(path: Path, context: ReadContext) -> Recording:
@@ -34,214 +55,330 @@ def read(path: Path, context: ReadContext) -> Recording:
 
 
 def read_parts(
-    paths: Sequence[Path], context: ReadContext, others: Sequence[Path] = ()
+    paths: Sequence[Path],
+    context: ReadContext,
+    others: Sequence[Path] = (),  # noqa: ARG001
 ) -> Recording:
-    """Read the parts of a CARMEN log as one.
+    """Read the parts of a CARMEN log, in order of time, as one.
 
-    Bad records are counted in `source["skipped"]` (scans) and `source["skipped_odometry"]`, by
-    reason and with line numbers, which count through all parts.
-
-    Args:
-        paths: the files, in order of time.
-        context: see ReadContext.
-        others: files that may be further parts: PARAM lines are in the first part alone, so that
-            one without any takes those of another.
+    Bad records are counted in `source["skipped"]` (scans) and `source["skipped_odometry"]`, with
+    line numbers, which count through all parts.
 
     Raises:
         InputError: a file cannot be read, or they hold no usable scan.
     """
-    path = paths[0]
     window = TimeWindow(context.options)
-    log = read_logs(paths, context.progress, window)
-    if others and not log.params:
-        log.params = _find_params(others)
-    sensors, notes = select_scans(log)
-    if not sensors:
-        raise _no_scan_error(path, log)
-    recording = _build_recording(sensors, log, context.options)
-    recording.source.update(path=str(path), format="carmen", gzip=is_gzip(path))
-    if log.n_repeated:
-        notes.append(f"{log.n_repeated} lines that earlier parts hold already")
-    recording.source.update(duplicates=notes, **window.notes())
-    return recording
-
-
-def _find_params(paths: Sequence[Path]) -> dict[str, str]:
-    """The PARAMs at the beginning of the first file that has any."""
-    for path in paths:
-        log = CarmenLog(TimeWindow(ReadOptions()))
-        for text in read_head(path, _HEAD).splitlines():
-            if text.startswith(b"PARAM"):
-                log.add(Line(1, text))
-        if log.params:
-            return log.params
-    return {}
+    log = read_log(paths, context.progress, window)
+    scans, duplicates = select_scans(log)
+    if not scans:
+        raise _no_scan_error(paths[0], log)
+    raw = _describe_lasers(scans, log, context.options)
+    raw.source.update(
+        path=str(paths[0]),
+        format="carmen",
+        gzip=is_gzip(paths[0]),
+        duplicates=duplicates,
+        **window.notes(),
+    )
+    return place_beams(raw, context.options, context.scratch)
 
 
 def _no_scan_error(path: Path, log: CarmenLog) -> InputError:
-    kinds = ", ".join(name.decode() for name in SCAN_PARSERS)
     skipped = log.skipped.merge(*log.skipped_scans.values())
+    what = "holds no laser line" if log.n_lines else "is empty"
     if skipped.total:
         what = f"holds no usable laser scan: {skipped.summary()}"
-    else:
-        what = "holds no laser line" if log.n_lines else "is empty"
+    kinds = ", ".join(name.decode() for name in SCAN_KINDS)
     return InputError(what, where=str(path), hint=f"a CARMEN log has lines of {kinds}")
 
 
-def _build_recording(sensors: list[Sensor], log: CarmenLog, options: ReadOptions) -> Recording:
-    """The recording of all lasers' scans, ordered by stamp."""
-    options.check_laser_count(len(sensors))
-    skipped = log.skipped.merge(*(log.skipped_scans[s.laser.kind] for s in sensors))
-    warnings = skipped.loss_warnings(sum(len(s.stamp_ns) for s in sensors))
-    parts, poses, infos = [], [], []
-    for number, sensor in enumerate(sensors):
-        part, pose, info = _convert_sensor(sensor, log, options, options.laser(number), warnings)
-        parts.append(part)
-        poses.append(pose.matrix())
-        infos.append(info)
-    odometry, odometry_info = _find_odometry(sensors, log, warnings)
-    sensor_of = np.repeat(np.arange(len(sensors)), [len(s.stamp_ns) for s in sensors])
-    stamp_ns = np.concatenate([s.stamp_ns for s in sensors])
-    order = scan_order(sensors)
-    beams = np.array([s.ranges.shape[1] for s in sensors], np.int64)[sensor_of[order]]
-    offset = np.concatenate([[0], np.cumsum(beams)]).astype(np.int64)
-    points, hit = _interleave(parts, sensor_of[order], offset)
+class LaserLines(NamedTuple):
+    """T usable scan lines of one laser with n readings each.
+
+    Attributes:
+        log: of its kind of line.
+        scans: (T,) indices in the log.
+        line: (T,) line numbers, from 1.
+        stamp_ns: (T,).
+        poses: (T, 6) laser and robot pose on the lines; None: they have none.
+    """
+
+    log: LaserLog
+    scans: NDArray[np.intp]
+    line: NDArray[np.int64]
+    stamp_ns: NDArray[np.int64]
+    poses: Float | None
+
+    @property
+    def n_readings(self) -> int:
+        return int(self.log.count[self.scans[0]])
+
+    def raw_laser(self, directions: list[Float], max_range: float | None = None) -> RawLaser:
+        """The scans with the directions (n, 2) of each of the log's configs."""
+        count = np.asarray(self.log.count)
+        return RawLaser(
+            self.log.kind,
+            self.stamp_ns,
+            np.frombuffer(self.log.ranges, np.float32),
+            (np.cumsum(count) - count)[self.scans],
+            np.asarray(self.log.config)[self.scans],
+            list(directions),
+            max_range=max_range,
+            sample=maxsize,
+        )
+
+
+def select_scans(log: CarmenLog) -> tuple[list[LaserLines], list[str]]:
+    """The usable scans of each laser, and sentences on dropped kinds of lines.
+
+    One kind of line per laser is used: newer logs hold each scan raw and with the robot's pose.
+    """
+    by_position: dict[str, list[LaserLog]] = {}
+    for laser in log.lasers.values():
+        by_position.setdefault(_position(laser.kind, log.params), []).append(laser)
+    used, notes = [], []
+    for same in by_position.values():
+        most = max(len(laser.line) for laser in same)
+        # a kind with only a few of the scans cannot replace the others
+        complete = [laser for laser in same if 2 * len(laser.line) >= most]
+        best = min(complete, key=lambda laser: _KIND_ORDER.index(laser.kind.rstrip("1234")))
+        used.append(best)
+        notes += [
+            f"{laser.kind}: {len(laser.line)} scans not used, {best.kind} shows the same laser"
+            for laser in same
+            if laser is not best
+        ]
+    used.sort(key=lambda laser: SCAN_KINDS.index(laser.kind.encode()))
+    return [_select_usable_scans(laser, log) for laser in used], notes
+
+
+def _select_usable_scans(laser: LaserLog, log: CarmenLog) -> LaserLines:
+    """The scans with the typical number of readings and non-decreasing stamps.
+
+    The longest non-decreasing subsequence of the laser's stamps is kept, so that a stamp that jumps
+    ahead costs one scan. Stamps of different lasers need not be in order.
+    """
+    count, line = np.asarray(laser.count), np.asarray(laser.line)
+    # the most frequent number, the larger of equally frequent ones
+    typical = max(Counter(laser.count).items(), key=lambda item: (item[1], item[0]))[0]
+    shifted = np.asarray(laser.host_is_number, np.bool_)
+    # a number in place of the host name: the fields before it are shifted
+    usable = (count == typical) & ~(shifted & (shifted.mean() < 0.5))
+    skipped = log.skipped_scans[laser.kind]
+    skipped.add_all(WRONG_COUNT, line[~usable])
+    scans = np.flatnonzero(usable)
+    stamp_ns = np.asarray(laser.stamp_ns, np.int64)[scans]
+    forward = longest_non_decreasing(stamp_ns.tolist())
+    skipped.add_all(TIME_BACKWARDS, np.delete(line[scans], forward))
+    scans = scans[forward]
+    poses = np.asarray(laser.poses).reshape(-1, 6)[scans] if len(laser.poses) else None
+    return LaserLines(laser, scans, line[scans], stamp_ns[forward], poses)
+
+
+def _describe_lasers(lines: list[LaserLines], log: CarmenLog, options: ReadOptions) -> RawLasers:
+    options.check_laser_count(len(lines))
+    skipped = log.skipped.merge(*(log.skipped_scans[own.log.kind] for own in lines))
+    warnings = skipped.loss_warnings(sum(len(own.stamp_ns) for own in lines))
+    lasers, poses, sensors = [], [], []
+    for number, own in enumerate(lines):
+        given, kind = options.laser(number), own.log.kind
+        pose = find_pose(own, log.params, warnings).override(given)
+        upside_down, upside_down_how = _find_upside_down(kind, log.params, given)
+        angles = _find_angles(own, log.params, given, warnings)
+        angles = -angles if upside_down else angles
+        every = angles[:, :1] + angles[:, 1:] * np.arange(own.n_readings)
+        max_range = _find_max_range(own.log, log.params)
+        laser = own.raw_laser([unit_vectors(row) for row in every], max_range)
+        first, step = angles[laser.typical_shape].tolist()
+        lasers.append(laser)
+        poses.append(pose.matrix()[None])
+        sensors.append(
+            {
+                "name": kind,
+                "scans": len(own.stamp_ns),
+                "beams_per_scan": own.n_readings,
+                "start_angle": first,
+                "angle_step": step,
+                "upside_down": upside_down,
+                "upside_down_how": upside_down_how,
+                "extrinsics": pose._asdict(),
+            }
+        )
+    odometry, odometry_notes = _find_odometry(lines, log, warnings)
+    T_odom_base = None if odometry is None else se2.matrix(*odometry[scan_order(lasers)].T)
     params = {k: v for k, v in log.params.items() if k.startswith("robot_") and "laser" in k}
-    return Recording(
-        stamp_ns=stamp_ns[order],
-        offset=offset,
-        points=points,
-        hit=hit,
-        T_base_sensor=np.stack(poses),
-        sensor=sensor_of[order].astype(np.int32),
-        T_odom_base=None if odometry is None else se2.matrix(*odometry[order].T),
-        source={
-            "lines": log.n_lines,
-            "records": dict(log.records),
-            "ignored": dict(log.ignored),
-            "sensors": infos,
-            "odometry": odometry_info,
-            "params": params,
-            "skipped_odometry": log.skipped_odometry.to_dict(),
-            "skipped": skipped.to_dict(),
-            "warnings": warnings,
-        },
-    )
-
-
-def _convert_sensor(
-    sensor: Sensor, log: CarmenLog, options: ReadOptions, given: LaserOptions, warnings: list[str]
-) -> tuple[_Beams, Extrinsics, dict[str, Any]]:
-    """End points and hits of a laser, its pose on the robot, and notes for `source`."""
-    kind = sensor.laser.kind
-    pose, more = extrinsics.find_extrinsics(sensor.laser, sensor.poses, log.params)
-    pose = extrinsics.override(pose, given)
-    warnings += more
-    upside_down, upside_down_how = extrinsics.find_upside_down(kind, log.params, given)
-    angles = _find_angles(sensor, log, given, warnings)
-    if upside_down:
-        angles = -angles
-    declared = extrinsics.find_max_range(sensor.laser, log.params)
-    rule, more = max_range.infer_range_rule(sensor.ranges, declared, options)
-    warnings += [f"{kind}: {text}" for text in more + _angle_warning(sensor)]
-    length, hit = max_range.apply_range_rule(sensor.ranges, rule)
-    angle = angles[:, :1] + angles[:, 1:] * np.arange(length.shape[1])
-    points = np.empty((*length.shape, 2), np.float32)
-    points[..., 0] = length * np.cos(angle)[sensor.config]
-    points[..., 1] = length * np.sin(angle)[sensor.config]
-    first, step = angles[int(np.bincount(sensor.config).argmax())]
-    info = {
-        "name": kind,
-        "scans": len(sensor.stamp_ns),
-        "beams_per_scan": sensor.ranges.shape[1],
-        "start_angle": float(first),
-        "angle_step": float(step),
-        "upside_down": upside_down,
-        "upside_down_how": upside_down_how,
-        "extrinsics": pose._asdict(),
-        "ranges": rule.to_dict(),
+    source = {
+        "lines": log.n_lines,
+        "records": dict(log.records),
+        "ignored": dict(log.ignored),
+        "sensors": sensors,
+        "odometry": odometry_notes,
+        "params": params,
+        "skipped_odometry": log.skipped_odometry.to_dict(),
+        "skipped": skipped.to_dict(),
+        "warnings": warnings,
     }
-    return (points, hit), pose, info
+    return RawLasers(lasers, poses, T_odom_base, source)
+
+
+def _param(params: dict[str, str], name: str) -> float | None:
+    """The PARAM of this name as a finite number; None if there is none."""
+    try:
+        value = float(params[name])
+    except (KeyError, ValueError):
+        return None
+    return value if abs(value) < 1e6 else None
+
+
+def _position(kind: str, params: dict[str, str]) -> str:
+    """`front`, `rear` or the kind itself: kinds of the same position show the same laser."""
+    if kind in ("FLASER", "ROBOTLASER1"):
+        return "front"
+    if kind in ("RLASER", "ROBOTLASER2"):
+        return "rear"
+    for position, default in (("front", 1.0), ("rear", 2.0)):
+        stated = _param(params, f"robot_{position}laser_id")
+        if float(kind[-1]) == (default if stated is None else stated):
+            return position
+    return kind
+
+
+def find_pose(lines: LaserLines, params: dict[str, str], warnings: list[str]) -> LaserPose:
+    """The pose of a laser on the robot; adds warnings.
+
+    In this order: the median pose of the laser relative to the robot on the scan lines, if scans
+    agree on it; PARAMs; facing backwards for RLASER; the robot's center.
+    """
+    kind = lines.log.kind
+    if lines.poses is not None:
+        offset, alike = _median_offset(lines.poses)
+        x, y, theta = (round(float(value), 6) for value in offset)
+        if alike and is_stated_by_lines(x, y, theta):
+            return LaserPose(x, y, theta, "scan lines")
+        if not alike:
+            warnings.append(
+                f"{kind}: the laser poses on the scan lines do not keep to one place on the "
+                "robot (a corrected log?): not used"
+            )
+    position = _position(kind, params)
+    names = ("offset", "side_offset", "angular_offset")
+    stated = [_param(params, f"robot_{position}laser_{name}") for name in names]
+    if any(value is not None for value in stated):
+        turn = math.pi if position == "rear" else 0.0
+        if stated[2] is not None:  # some logs write degrees
+            degrees = abs(stated[2]) > 2.0 * math.pi
+            turn = math.radians(stated[2]) if degrees else stated[2]
+        return LaserPose(stated[0] or 0.0, stated[1] or 0.0, turn, "PARAM")
+    if kind == "RLASER":
+        return LaserPose(0.0, 0.0, math.pi, "a rear laser faces backwards")
+    if kind in ("RAWLASER2", "RAWLASER3", "RAWLASER4"):
+        warnings.append(f"{kind}: the log does not state its pose: robot center assumed")
+    return LaserPose(0.0, 0.0, 0.0, "robot center assumed")
+
+
+def is_stated_by_lines(x: float, y: float, theta: float) -> bool:
+    """True if a pose from scan lines is plausible: on the robot, and not at its center."""
+    distance = math.hypot(x, y)
+    return distance < _MAX_OFFSET and max(distance, abs(theta)) > _MIN_OFFSET
+
+
+def _median_offset(poses: Float) -> tuple[Float, bool]:
+    """Median (x, y, theta) of the laser in the robot's frame, and whether scans agree on it."""
+    T_odom_sensor, T_odom_base = se2.matrix(*poses[:, :3].T), se2.matrix(*poses[:, 3:].T)
+    offsets = se2.parameters(se2.inverse(T_odom_base) @ T_odom_sensor)
+    # unwrap about the first: angles near pi lie on both sides of the cut
+    offsets[:, 2] = offsets[0, 2] + se2.wrap(offsets[:, 2] - offsets[0, 2])
+    middle = np.median(offsets, axis=0)
+    off = np.abs(offsets - middle)
+    alike = np.mean((off[:, :2].max(axis=1) < _SAME_DISTANCE) & (off[:, 2] < _SAME_ANGLE)) > 0.9
+    return middle, bool(alike) and bool(np.hypot(*middle[:2]) < _MAX_OFFSET)
+
+
+def _find_upside_down(kind: str, params: dict[str, str], given: LaserOptions) -> tuple[bool, str]:
+    """Whether a laser is mounted upside down, its beams turning clockwise, and the source.
+
+    CARMEN's own laser_..._flipped does not tell: its laser server reverses such readings before
+    they are logged.
+    """
+    if given.upside_down is not None:
+        return given.upside_down, "given"
+    stated = _param(params, f"robot_{_position(kind, params)}laser_flipped")
+    return (False, "assumed") if stated is None else (stated != 0.0, "PARAM")
 
 
 def _find_angles(
-    sensor: Sensor, log: CarmenLog, given: LaserOptions, warnings: list[str]
-) -> NDArray[np.float64]:
+    lines: LaserLines, params: dict[str, str], given: LaserOptions, warnings: list[str]
+) -> Float:
     """(C, 2) first angle and step in radians of each of the laser's configs, as declared."""
-    angles = np.array([config[:2] for config in sensor.laser.configs])
-    fov = extrinsics.find_field_of_view(sensor.laser.kind, log.params, given)
-    if sensor.laser.kind in ("FLASER", "RLASER"):
+    kind, n, configs = lines.log.kind, lines.n_readings, list(lines.log.configs)
+    angles = np.array([config[:2] for config in configs])
+    if kind in WITHOUT_ANGLES:
+        fov = given.fov
+        degrees = _param(params, f"laser_{_position(kind, params)}_laser_fov")
+        if fov is None and degrees is not None and 0.0 < degrees <= 360.0:
+            fov = math.radians(degrees)
         if fov is not None:
-            angles[:] = flaser_config(sensor.ranges.shape[1], fov)[:2]
+            angles[:] = flaser_config(n, fov)[:2]
     elif given.fov is not None:
         text = "its lines declare their angles: the given field of view is not used"
-        warnings.append(f"{sensor.laser.kind}: {text}")
+        warnings.append(f"{kind}: {text}")
+    for config in configs:
+        fov = n * config.angle_step  # or one step less: both are in use
+        if config.field_of_view and abs(fov - config.field_of_view) > 3.0 * config.angle_step:
+            warnings.append(
+                f"{kind}: {n} readings {np.degrees(config.angle_step):.3g} deg apart are not the "
+                f"declared field of view of {np.degrees(config.field_of_view):.4g} deg"
+            )
+            break
     return angles
 
 
-def _angle_warning(sensor: Sensor) -> list[str]:
-    n = sensor.ranges.shape[1]
-    for config in sensor.laser.configs:
-        fov = n * config.angle_step  # or one step less: both are in use
-        if config.field_of_view and abs(fov - config.field_of_view) > 3.0 * config.angle_step:
-            return [
-                f"{n} readings {np.degrees(config.angle_step):.3g} deg apart are not the declared "
-                f"field of view of {np.degrees(config.field_of_view):.4g} deg"
-            ]
-    return []
-
-
-def _interleave(
-    parts: list[_Beams], sensor_of: NDArray[np.intp], offset: NDArray[np.int64]
-) -> _Beams:
-    """Points (M, 2) and hits (M,) of all sensors, in the order of the scans."""
-    if len(parts) == 1:
-        return parts[0][0].reshape(-1, 2), parts[0][1].reshape(-1)
-    points = np.empty((offset[-1], 2), np.float32)
-    hit = np.empty(offset[-1], np.bool_)
-    for number, (part_points, part_hit) in enumerate(parts):
-        rows = offset[:-1][sensor_of == number][:, None] + np.arange(part_hit.shape[1])
-        points[rows], hit[rows] = part_points, part_hit
-    return points, hit
+def _find_max_range(laser: LaserLog, params: dict[str, str]) -> float | None:
+    """The declared maximum range in metres, the smaller of PARAM and headers; None: not stated."""
+    in_headers = [config.max_range for config in laser.configs if config.max_range is not None]
+    in_params = _param(params, f"robot_{_position(laser.kind, params)}_laser_max")
+    # single headers may be damaged: the largest is the most cautious
+    stated = [max(in_headers)] if in_headers else []
+    if in_params is not None and in_params > 0.0:
+        stated.append(in_params)
+    return min(stated) if stated else None
 
 
 def _find_odometry(
-    sensors: list[Sensor], log: CarmenLog, warnings: list[str]
-) -> tuple[NDArray[np.float64] | None, dict[str, Any]]:
-    """Robot poses (T, 3) at the scans of all sensors, one sensor after the other.
+    lines: list[LaserLines], log: CarmenLog, warnings: list[str]
+) -> tuple[Float | None, dict[str, Any]]:
+    """Robot poses (T, 3) at the scans of all lasers, one laser after the other.
 
     The pose on the scan line comes first, else ODOM lines, else poses on other lasers' lines are
     interpolated. Poses on scan lines that never change while ODOM lines do are ignored.
     """
     odom_ns = np.asarray(log.odom_stamp_ns, np.int64)
     odom = np.asarray(log.odom_poses).reshape(-1, 3)
-    own = {i: s.poses[:, 3:] for i, s in enumerate(sensors) if s.poses is not None}
-    if len(odom) and own and not any(_moves(p) for p in own.values()) and _moves(odom):
+    own = {k: laser.poses[:, 3:] for k, laser in enumerate(lines) if laser.poses is not None}
+    if len(odom) and own and not any(map(_moves, own.values())) and _moves(odom):
         own = {}
     if not len(odom) and own:
-        odom_ns = np.concatenate([sensors[i].stamp_ns for i in own])
+        odom_ns = np.concatenate([lines[k].stamp_ns for k in own])
         odom = np.concatenate(list(own.values()))
     if not len(odom):
         return None, {"from": None, "outside": 0}
     poses, outside = [], 0
-    for i, sensor in enumerate(sensors):
-        if i in own:
-            poses.append(own[i])
-        else:
-            at_scans, n_outside = trajectory.interpolate(odom_ns, odom, sensor.stamp_ns)
-            poses.append(at_scans)
-            outside += n_outside
+    for k, laser in enumerate(lines):
+        at_scans, n_outside = own.get(k), 0
+        if at_scans is None:
+            at_scans, n_outside = trajectory.interpolate(odom_ns, odom, laser.stamp_ns)
+        poses.append(at_scans)
+        outside += n_outside
     out = np.concatenate(poses)
     interpolated = "ODOM lines" if len(log.odom_stamp_ns) else "other lasers' scan lines"
-    kinds = (["scan lines"] if own else []) + ([interpolated] if len(own) < len(sensors) else [])
+    kinds = (["scan lines"] if own else []) + ([interpolated] if len(own) < len(lines) else [])
     if outside:
         warnings.append(f"{outside} scans outside the time of the odometry: nearest pose")
     if len(out) > 1 and not _moves(out):
-        warnings.append(
-            advise("the odometry never moves", "if the robot did, map without odometry")
-        )
+        todo = "if the robot did, map without odometry"
+        warnings.append(advise("the odometry never moves", todo))
     return out, {"from": " and ".join(kinds), "outside": outside}
 
 
-def _moves(poses: NDArray[np.float64]) -> bool:
+def _moves(poses: Float) -> bool:
     return bool(np.any(poses != poses[0]))

@@ -1,9 +1,11 @@
-"""Writes 2D recordings as CARMEN logs."""
+"""Writes 2D recordings as CARMEN logs, and logs again with some beams blanked."""
 
 import math
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +14,20 @@ from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.core.timestamps import format_seconds
-from stillmap.io.carmen.extrinsics import is_stated_by_lines
-from stillmap.io.carmen.messages import flaser_config
-from stillmap.io.text_lines import write_atomically
+from stillmap.io.carmen.log import (
+    BYTE_ORDER_MARK,
+    SCAN_KINDS,
+    first_reading,
+    flaser_config,
+    read_log,
+)
+from stillmap.io.carmen.reader import LaserLines, is_stated_by_lines, select_scans
+from stillmap.io.filtered_copy import FilterJob, Omissions, other_recording_error
+from stillmap.io.text_lines import read_lines, write_atomically
 from stillmap.prepare import laser_scan
-from stillmap.prepare.max_range import MIN_ZERO_SHARE
+from stillmap.prepare.max_range import MIN_ZERO_SHARE, find_max_range
+from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE
+from stillmap.prepare.time_window import TimeWindow
 
 Float = NDArray[np.float64]
 
@@ -32,6 +43,8 @@ _DIGITS = 4  # of ranges in metres
 _MIN_CODE = 81.82  # m: from here on a FLASER reading means "no return"
 _SAME_ANGLE = 1e-5  # rad
 _UNKNOWN_LASER = 99  # CARMEN's laser_type
+_OVERFLOW = 81.91  # m: a value that SICK lasers report for no return
+_FIELD = re.compile(rb"\S+")
 _ALTERNATIVE = "write a bag or a recording folder instead"
 
 
@@ -224,3 +237,82 @@ def _extrinsics_params(
     names = ("offset", "side_offset", "angular_offset")
     values = zip(names, (x, y, theta), strict=True)
     return {f"robot_{position}laser_{name}": f"{value:.6f}" for name, value in values}
+
+
+def write_filtered(job: FilterJob) -> Omissions:
+    """Copy a log with some readings replaced by "no return", gzip by its name.
+
+    Scan lines that the recording lacks are left out: nothing is known of their beams.
+
+    Raises:
+        InputError: the source is not the log that was read, or the output cannot be written.
+    """
+    recording = job.recording
+    lasers, _ = select_scans(read_log([job.source], window=TimeWindow(job.options)))
+    scan_of = _number_lines(job, lasers)
+    codes = [
+        find_no_return_code(
+            own.raw_laser([np.empty((own.n_readings, 2))] * len(own.log.configs)).sample_readings(),
+            notes["ranges"],
+        )
+        for own, notes in zip(lasers, recording.source["sensors"], strict=True)
+    ]
+    omitted = 0
+    with write_atomically(job.output) as file:
+        for line in read_lines(job.source):
+            t = scan_of.get(line.number)
+            name = line.text.removeprefix(BYTE_ORDER_MARK).split(maxsplit=1)[:1]
+            if t is not None:
+                blank, code = job.blank[recording.beams_of(t)], codes[recording.sensor[t]]
+                file.write(_blank_readings(line.text, blank, code))
+            elif line.damaged or line.too_long or (name and name[0] in SCAN_KINDS):
+                omitted += 1
+            else:
+                file.write(line.text)
+    return Omissions(omitted)
+
+
+def find_no_return_code(readings: NDArray[np.float32], rule: dict[str, Any]) -> bytes:
+    """The reading that means "no return" for a laser.
+
+    Args:
+        readings: (T, n) metres.
+        rule: its RangeRule as a dict.
+    """
+    if np.any(readings >= MAX_PLAUSIBLE_RANGE):
+        return b"inf"
+    detected = find_max_range(readings)
+    if detected.coded and detected.threshold is not None:
+        codes = readings[readings >= np.float32(detected.threshold)]
+        values, count = np.unique(codes, return_counts=True)
+        # the most frequent one: a further code would hide from readers that it is one
+        return str(values[count.argmax()]).encode("ascii")
+    if rule["zero_means"] == "max-range":
+        return b"0.00"
+    longest = max(float(rule["threshold"] or 0.0), float(readings.max(initial=0.0)))
+    return f"{_OVERFLOW if longest < _OVERFLOW else 10.0 * longest:.2f}".encode("ascii")
+
+
+def _number_lines(job: FilterJob, lasers: list[LaserLines]) -> dict[int, int]:
+    """The scan of the recording by line number."""
+    if lasers:
+        stamp_ns = np.concatenate([own.stamp_ns for own in lasers])
+        order = np.argsort(stamp_ns, kind="stable")
+        if np.array_equal(stamp_ns[order], job.recording.stamp_ns):
+            line = np.concatenate([own.line for own in lasers])[order]
+            return {number: t for t, number in enumerate(line.tolist())}
+    raise other_recording_error(job.source)
+
+
+def _blank_readings(text: bytes, blank: NDArray[np.bool_], code: bytes) -> bytes:
+    """A scan line with the readings `blank` (n,) replaced by the code."""
+    if not blank.any():
+        return text
+    at = len(BYTE_ORDER_MARK) if text.startswith(BYTE_ORDER_MARK) else 0
+    fields, parts = list(_FIELD.finditer(text, at)), [text[:at]]
+    first = first_reading(fields[0].group())
+    for k in np.flatnonzero(blank).tolist():
+        begin, end = fields[first + k].span()
+        parts += [text[at:begin], code]
+        at = end
+    return b"".join([*parts, text[at:]])

@@ -10,12 +10,11 @@ from stillmap.core import arrays, se2
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.io.builder import ReadContext, SkippedRecords
-from stillmap.io.carmen import extrinsics
-from stillmap.io.carmen.extrinsics import Extrinsics
 from stillmap.io.ros import base_frame, scan_beams
 from stillmap.io.ros.base_frame import LaserSelection
 from stillmap.io.ros.collect import BagContent
 from stillmap.io.ros.laser_scan import LaserScans
+from stillmap.prepare.lasers import LaserPose
 from stillmap.prepare.options import ReadOptions
 
 Float = NDArray[np.float64]
@@ -100,10 +99,10 @@ def _find_mountings(
         if not _moves(flat) or given.pose != (None, None, None):
             same = scans.frame == base
             how = "the laser is the robot's frame" if same else f"TF from {base} to {scans.frame}"
-            pose = extrinsics.override(Extrinsics(x, y, theta, how), given)
+            pose = LaserPose(x, y, theta, how).override(given)
             flat = pose.matrix()[None]
         else:
-            pose = Extrinsics(x, y, theta, "TF, it moves: at its first scan")
+            pose = LaserPose(x, y, theta, "TF, it moves: at its first scan")
         upside_down_how = "TF"
         if given.upside_down is not None:
             upside_down, upside_down_how = given.upside_down, "given"
