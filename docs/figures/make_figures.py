@@ -8,10 +8,8 @@ is simulated with a fixed seed, so the figures can be drawn again at any time.
 
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib import pyplot as plt
-from matplotlib.axes import Axes
 
 import stillmap
 from stillmap.sim import scene_by_name, simulate
@@ -61,7 +59,7 @@ def observe(result: stillmap.Result, centre: np.ndarray) -> tuple[np.ndarray, np
     recording, poses = result.deskewed, result.poses
     seconds = (recording.stamp_ns - recording.stamp_ns[0]) * 1e-9
     sensors = recording.T_map_sensor(poses)
-    found: dict[int, bool] = {}
+    hit_in_bin: dict[int, bool] = {}
     for t in range(recording.n_scans):
         beams = recording.beams_of(t)
         hit = recording.hit[beams]
@@ -76,9 +74,9 @@ def observe(result: stillmap.Result, centre: np.ndarray) -> tuple[np.ndarray, np
         passed = ((along > 0) & (aside < CELL / 2) & (length > along + BEHIND)).any()
         if ended or passed:
             number = int(seconds[t] / BIN)
-            found[number] = found.get(number, False) or bool(ended)
-    numbers = sorted(found)
-    return BIN * np.array(numbers), np.array([found[k] for k in numbers])
+            hit_in_bin[number] = hit_in_bin.get(number, False) or bool(ended)
+    numbers = sorted(hit_in_bin)
+    return BIN * np.array(numbers), np.array([hit_in_bin[k] for k in numbers])
 
 
 def end_points(result: stillmap.Result) -> np.ndarray:
@@ -119,12 +117,12 @@ def draw_maps(result: stillmap.Result) -> None:
     low, high = static.min(axis=0) - 1, static.max(axis=0) + 1
     maps = (result.raw_map, result.map)
     titles = ("every hit counted as static", "hits weighted by P(static)")
-    for axis, one, title in zip(axes, maps, titles, strict=True):
-        height, width = one.p_occupied.shape
-        x, y, r = one.origin[0], one.origin[1], one.resolution
+    for axis, grid, title in zip(axes, maps, titles, strict=True):
+        height, width = grid.p_occupied.shape
+        x, y, r = grid.origin[0], grid.origin[1], grid.resolution
         # a walker leaves a few per cent in a cell: the gamma shows them
-        ink = np.nan_to_num(one.p_occupied, nan=0.0).clip(0, 1) ** 0.4
-        shown = np.where(np.isfinite(one.p_occupied), 1.0 - ink, 0.85)
+        ink = np.nan_to_num(grid.p_occupied, nan=0.0).clip(0, 1) ** 0.4
+        shown = np.where(np.isfinite(grid.p_occupied), 1.0 - ink, 0.85)
         axis.imshow(
             shown,
             origin="lower",
@@ -208,31 +206,8 @@ def _with_predictions(
     return np.concatenate(t), np.concatenate(q)
 
 
-def draw_bound(numbers: list[int], bounds: list[float], changed: list[float]) -> None:
-    """The bound and the share of labels that changed, over the iterations."""
-    figure, axes = plt.subplots(1, 2, figsize=(7.5, 2.6), layout="constrained")
-    _draw_curve(axes[0], numbers, bounds, "bound, nats per hit")
-    best = int(np.argmax(bounds))
-    axes[0].plot(numbers[best], bounds[best], "o", mfc="none", mec=ORANGE, ms=11, label="kept")
-    axes[0].legend(fontsize=8)
-    _draw_curve(axes[1], numbers, [100 * c for c in changed], "labels that changed, %")
-    axes[1].set_yscale("log")
-    figure.savefig(HERE / "bound.svg", metadata={"Date": None})
-    plt.close(figure)
-
-
-def _draw_curve(axis: Axes, numbers: list[int], values: list[float], label: str) -> None:
-    axis.plot(numbers, values, "o-", color=BLUE, linewidth=1.2, markersize=4)
-    axis.set_xlabel("iteration", fontsize=9)
-    axis.set_ylabel(label, fontsize=9)
-    axis.set_xticks(numbers)
-    axis.tick_params(labelsize=8)
-    axis.grid(alpha=0.3)
-
-
 def main() -> None:
     """Simulate, map, draw."""
-    mpl.rcParams["svg.hashsalt"] = "stillmap"
     changes = {
         "crowd": {"people": 40},
         "laser": {"max_range": 8.0},
@@ -242,15 +217,6 @@ def main() -> None:
     result = stillmap.build(recording)
     draw_maps(result)
     draw_timeline(result)
-    n_hits = int(np.count_nonzero(recording.hit))
-    records = []
-    for iteration in stillmap.iterate(recording):
-        record = iteration.record
-        records.append((record.number, record.bound, record.changed_share))
-        if record.number == 5:
-            break
-    numbers, bounds, changed = zip(*records, strict=True)
-    draw_bound(list(numbers), [b / n_hits for b in bounds], list(changed))
 
 
 if __name__ == "__main__":

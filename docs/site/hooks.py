@@ -1,12 +1,12 @@
-"""MkDocs hooks: pages that lie outside docs/, links between them, and notebooks with their results.
+"""MkDocs hooks: root pages, the page of options, and links that hold in the repository.
 
 The Markdown files are written for a code host, where links may lead to any file of the repository.
-The site has pages only: root pages are added to it, and links are turned to where their target
-lies there.
+The site has pages only, so links are turned to where their target lies there.
 """
 
 import posixpath
 import re
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -15,23 +15,28 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
-sys.path.insert(0, str(Path(__file__).parent))
-from notebook_page import render_notebook
-
 ROOT = Path(__file__).resolve().parents[2]
 ROOT_PAGES = ("BENCHMARK.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md")
 LINK = re.compile(r"(\]\()(?!\w+:|#)([^)#\s]+)")
+OPTIONS = """# Options
+
+What `stillmap config` prints: every option with its default, unit and meaning. Set one with `--set em.prior=0.8`, or several in
+the file of `--config options.toml`.
+
+```toml
+{}
+```
+"""
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the root pages, and a page for each notebook in place of its file."""
-    for name in ROOT_PAGES:
-        files.append(File.generated(config, name, content=(ROOT / name).read_text("utf-8")))
-    for file in [file for file in files if file.src_uri.endswith(".ipynb")]:
-        files.remove(file)
-        name = file.src_uri.removesuffix(".ipynb") + ".md"
-        page = render_notebook(Path(config.docs_dir) / file.src_uri)
-        files.append(File.generated(config, name, content=page))
+    """Add the root pages and the page of options."""
+    pages = {name: (ROOT / name).read_text("utf-8") for name in ROOT_PAGES}
+    command = [sys.executable, "-m", "stillmap", "config"]
+    options = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    pages["options.md"] = OPTIONS.format(options.strip())
+    for name, content in pages.items():
+        files.append(File.generated(config, name, content=content))
     return files
 
 
@@ -44,7 +49,7 @@ def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
         target = posixpath.normpath(posixpath.join(folder, link[2]))
         target = "docs/README.md" if target == "README.md" else target
         if target.startswith("docs/"):
-            target = re.sub(r"\.ipynb$", ".md", target.removeprefix("docs/"))
+            target = target.removeprefix("docs/")
         elif target not in ROOT_PAGES:
             return link[0]
         return link[1] + posixpath.relpath(target, posixpath.dirname(here) or ".")

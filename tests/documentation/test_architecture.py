@@ -1,19 +1,15 @@
-"""The rooms of the package are those of docs/architecture.md, and imports run downwards."""
+"""Imports of the package run downwards: no rooms, folders or modules import in a circle."""
 
 import ast
-import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-PACKAGE = ROOT / "src" / "stillmap"
 MODULES = {
     ".".join(path.relative_to(ROOT / "src").with_suffix("").parts).removesuffix(".__init__"): path
-    for path in PACKAGE.rglob("*.py")
+    for path in (ROOT / "src" / "stillmap").rglob("*.py")
 }
-ROOMS = sorted(path.name for path in PACKAGE.iterdir() if (path / "__init__.py").is_file())
 # constructors of a class, which call what stands above it
 UPWARDS = {("stillmap.core.recording", "stillmap.io.from_arrays")}
 
@@ -27,13 +23,10 @@ def imported(module: str) -> set[str]:
         elif isinstance(node, ast.ImportFrom) and node.module:
             inside = {f"{node.module}.{name.name}" for name in node.names} & MODULES.keys()
             out |= inside or {node.module}
-    return (out & MODULES.keys()) - {module}
+    return {target for target in out & MODULES.keys() if (module, target) not in UPWARDS}
 
 
-IMPORTS = {
-    module: {other for other in imported(module) if (module, other) not in UPWARDS}
-    for module in MODULES
-}
+IMPORTS = {module: imported(module) - {module} for module in MODULES}
 
 
 def room_of(module: str) -> str:
@@ -45,19 +38,13 @@ def part_of(module: str) -> str:
     return ".".join(module.split(".")[:3])
 
 
-def listed_rooms() -> list[str]:
-    """The rooms in the table of the documentation, from the bottom up."""
-    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
-    table = text.split("## Rooms, bottom to top")[1].split("\n\n")[1]
-    return re.findall(r"^\| `(\w+)` \|", table, flags=re.MULTILINE)
-
-
-def listed_modules(room: str) -> dict[str, int]:
-    """Modules and folders of a room, and their row in the table that lists them."""
-    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
-    rows = text.split(f"Modules of `{room}`")[1].split("\n\n")[1].split("\n")[2:]
-    names = {k: re.findall(r"`(\w+)/?`", row.split("|")[1]) for k, row in enumerate(rows)}
-    return {name: k for k, row in names.items() for name in row}
+def group(key) -> dict[str, set[str]]:
+    """What groups of modules import; the package and the rooms as wholes are left out."""
+    graph: dict[str, set[str]] = {}
+    for module, targets in IMPORTS.items():
+        if room_of(module) and not module.endswith(f".{room_of(module)}"):
+            graph.setdefault(key(module), set()).update(map(key, targets))
+    return {node: targets - {node} for node, targets in graph.items()}
 
 
 def find_circle(graph: dict[str, set[str]]) -> list[str]:
@@ -72,49 +59,9 @@ def find_circle(graph: dict[str, set[str]]) -> list[str]:
     return []
 
 
-def upward_imports(order: list[str]) -> Iterator[tuple[str, str]]:
-    floor = {name: k for k, name in enumerate(order)}
-    for module, others in IMPORTS.items():
-        for other in others:
-            here, there = room_of(module), room_of(other)
-            if {here, there} <= floor.keys() and floor[there] > floor[here]:
-                yield module, other
-
-
-def test_every_room_is_listed():
-    assert sorted(listed_rooms()) == ROOMS
-
-
-def test_rooms_import_only_rooms_below_them():
-    assert list(upward_imports(listed_rooms())) == []
-
-
-def test_an_upward_import_is_found():
-    assert list(upward_imports(listed_rooms()[::-1]))
-
-
-def test_modules_do_not_import_each_other():
-    assert find_circle(IMPORTS) == []
-
-
-def test_folders_in_a_room_do_not_import_each_other():
-    graph: dict[str, set[str]] = {}
-    for module, others in IMPORTS.items():
-        parts = {part_of(other) for other in others if room_of(other) == room_of(module)}
-        if not module.endswith(f".{room_of(module)}"):  # what a room offers as a whole
-            graph.setdefault(part_of(module), set()).update(parts - {part_of(module)})
-    assert find_circle(graph) == []
-
-
-@pytest.mark.parametrize("room", ["places", "fleet", "live"])
-def test_modules_of_a_room_are_listed_from_the_bottom_up(room):
-    row = listed_modules(room)
-    own = {name for name in MODULES if name.startswith(f"stillmap.{room}.")}
-    assert row.keys() == {part_of(name).split(".")[2] for name in own}
-    for module in own:
-        for other in IMPORTS[module] & own:
-            here, there = (part_of(name).split(".")[2] for name in (module, other))
-            assert row[there] <= row[here], f"{here} imports {there}"
+@pytest.mark.parametrize("key", [room_of, part_of, str])
+def test_imports_run_downwards(key):
+    assert find_circle(group(key)) == []
 
 
 @pytest.mark.parametrize("graph", [{"a": {"b"}, "b": {"a"}}, {"a": {"b"}, "b": {"c"}, "c": {"b"}}])

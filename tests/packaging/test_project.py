@@ -1,7 +1,6 @@
-"""Citation, changelog, links of the docs, and the check of build tools."""
+"""Citation, changelog, and the check of build tools."""
 
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -22,15 +21,6 @@ def test_citation_and_changelog_name_the_version():
     assert {"message", "title", "authors"} <= citation.keys()
     assert {"type", "title", "authors"} <= citation["preferred-citation"].keys()
     assert f"## [{VERSION}]" in (ROOT / "CHANGELOG.md").read_text()
-
-
-@pytest.mark.parametrize(
-    "page",
-    sorted(str(p.relative_to(ROOT)) for p in [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")]),
-)
-def test_links_exist(page):
-    links = re.findall(r"\]\((?!\w+:|#)([^)#]+)", (ROOT / page).read_text())
-    assert [link for link in links if not ((ROOT / page).parent / link).exists()] == []
 
 
 def lacking(path, python="python3", **environment):
