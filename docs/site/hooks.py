@@ -20,8 +20,8 @@ ROOT_PAGES = ("BENCHMARK.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md")
 LINK = re.compile(r"(\]\()(?!\w+:|#)([^)#\s]+)")
 OPTIONS = """# Options
 
-What `stillmap config` prints: every option with its default, unit and meaning. Set one with `--set em.prior=0.8`, or several in
-the file of `--config options.toml`.
+What `stillmap config` prints: every option with its default, unit and meaning. Set one with
+`--set em.prior=0.8`, or several in the file of `--config options.toml`.
 
 ```toml
 {}
