@@ -39,7 +39,7 @@ def drive(recording, place, mode="localise"):
 
 
 # m: rounding moves single scans, as their cost has steps where end points leave observed space
-# (docs/lab/cost.md#rounding), and in a map that grows the scans after them
+# and in a map that grows the scans after them
 @pytest.mark.parametrize(("mode", "rounding"), [("localise", 2e-3), ("extend", 4e-3)])
 def test_what_is_told_is_in_the_frame_of_the_map(hall, tmp_path, mode, rounding):
     recording, folder = hall

@@ -1,4 +1,4 @@
-"""NDT map and point-to-plane registration of sweeps; see docs/registration3d.md."""
+"""NDT map and point-to-plane registration of sweeps; see docs/poses.md."""
 
 import itertools
 from dataclasses import dataclass
@@ -114,7 +114,7 @@ def linearise_sweep(
     level: int,
     slack: float,
 ) -> QuadraticModel:
-    """(4) to (6) of docs/registration3d.md, beam by beam."""
+    """The objective of docs/poses.md, beam by beam."""
     q = QuadraticModel(np.zeros((12, 12)), np.zeros(12))
     still = transform_by_twist(points, times, twist)
     for p, e, tau in zip(still, weights.astype(float), times.astype(float), strict=True):

@@ -23,7 +23,7 @@ _PARQUET, _RRD = ".parquet", ".rrd"
 def add_zone_flags(p: argparse.ArgumentParser) -> None:
     """Add the flags for maps and masks."""
     group = p.add_argument_group(
-        "maps and masks of a result for nav2, in a folder (docs/how-to/nav2-masks.md)"
+        "maps and masks of a result for nav2, in a folder (docs/tutorials/2d-bag-to-nav2.md)"
     )
     group.add_argument(
         "--mask",

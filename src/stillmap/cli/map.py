@@ -51,7 +51,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
         metavar="INPUT",
         nargs="+",
         help="a CARMEN log, a ROS bag, a stillmap recording folder, ...: see docs/input.md; "
-        "several: the parts of one run, in any order (docs/input/parts.md)",
+        "several: the parts of one run, in any order (docs/input.md)",
     )
     p.add_argument(
         "--tilting",

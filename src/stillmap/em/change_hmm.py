@@ -1,6 +1,6 @@
 """Change points of cells: Viterbi paths of the change HMM.
 
-Its three states are object, empty and passer-by. `docs/estimator/changes.md` has the
+Its three states are object, empty and passer-by. `docs/estimator.md` has the
 three-state HMM.
 """
 

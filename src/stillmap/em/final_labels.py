@@ -1,7 +1,7 @@
 """The E-step at the final poses: additional classes, and in 2D the shapes of what is hit.
 
 Within the loop a view-dependent class would explain walls duplicated by pose error, and preserve
-that error. `docs/estimator/map.md` and `docs/estimator/shapes.md` have the equations.
+that error. `docs/estimator.md` has the equations.
 """
 
 from dataclasses import replace

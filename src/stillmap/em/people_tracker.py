@@ -1,7 +1,7 @@
 """Tracking of people by probabilistic data association (PDA), and the beams on them: a baseline.
 
 After D. Haehnel, D. Schulz, W. Burgard, *Map Building with Mobile Robots in Populated
-Environments*, IROS 2002; docs/tracker.md lists what is simpler here.
+Environments*, IROS 2002; docs/estimator.md has it in short.
 
 Bar-Shalom and Fortmann, *Tracking and Data Association* (1988), for one track. Where tracks compete
 for a detection its weight is shared as in R. J. Fitzgerald, *Development of practical PDA logic for

@@ -1,7 +1,6 @@
 """Quality of a map: which cells are known from few observations, and its held-out score.
 
-The score is the likelihood of scans that the map was not made from. `docs/quality.md` says what it
-means and how it was validated.
+The score is the likelihood of scans that the map was not made from (`docs/estimator.md`).
 """
 
 from dataclasses import dataclass

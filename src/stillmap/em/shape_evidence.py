@@ -4,7 +4,7 @@ A place that was looked at once, or that stayed occupied until it was out of sig
 that tells a wall from a person. Their shapes differ: how wide the segments of the scan are that
 end there, what lies beside their ends, and whether static surface goes on along a line. How often
 either has each shape is learned from the places of the same recording whose history does tell.
-See `docs/estimator/shapes.md`.
+See `docs/estimator.md`.
 """
 
 import numpy as np

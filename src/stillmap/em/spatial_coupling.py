@@ -1,7 +1,7 @@
 """Spatial coupling of surfels in 3D: mean field, cluster pooling, far ground, ground contact.
 
 Objects are larger than a voxel, so neighbouring voxels and the clusters of a sweep are labelled
-together. `docs/estimator/spatial.md` has the equations.
+together. `docs/estimator.md` has the equations.
 """
 
 from dataclasses import dataclass, replace

@@ -2,7 +2,7 @@
 
 Where something moved away, its whole place is empty. A hedge, the inside of a parked car behind its
 windows, a post thinner than a voxel, or what pose errors shift by decimetres, is passed by some
-beams while others end beside it, whenever one looks. See `docs/estimator/spatial.md`.
+beams while others end beside it, whenever one looks. See `docs/estimator.md`.
 """
 
 import functools

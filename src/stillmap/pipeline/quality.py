@@ -1,4 +1,4 @@
-"""Quality of labels and of geometry from 0 to 100, without truth; `docs/quality.md` defines it.
+"""Quality of labels and of geometry from 0 to 100, without truth; `docs/estimator.md` defines it.
 
 Every figure comes from the same evidence, in metres and shares, whatever estimator, resolution or
 sensor made the result.

@@ -1,7 +1,7 @@
 """Lidar odometry: sweeps of a spinning lidar registered one after the other to a local map.
 
 Point-to-plane registration of pose and twist together, so that the motion during each sweep is
-part of the estimate; what is minimized is in `docs/registration3d.md`.
+part of the estimate; what is minimized is in `docs/poses.md`.
 """
 
 from dataclasses import dataclass

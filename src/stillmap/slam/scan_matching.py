@@ -1,7 +1,7 @@
 """Scan matching in 2D, (9): the pose of one scan given the map so far and the motion prior.
 
 Likelihood field around end points, correlative search, Newton refinement; what is maximized is in
-`docs/registration.md`.
+`docs/poses.md`.
 """
 
 import dataclasses

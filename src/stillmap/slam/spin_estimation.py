@@ -33,7 +33,7 @@ _P_STATIC = 0.9  # of every return: labels are not known yet
 # m by which a sweep must be distorted at _LEVER_ARM for the directions to differ
 _MIN_DISTORTION, _LEVER_ARM = 0.1, 10.0
 # contrast: logarithm of the ratio of the cells that the two directions occupy, mean of the windows,
-# and in standard errors; docs/registration/deskewing.md has what simulated drives show
+# and in standard errors; docs/poses.md has what simulated drives show
 _MIN_CONTRAST, _MIN_SCORE = 0.012, 4.0
 
 

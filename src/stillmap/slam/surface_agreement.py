@@ -2,7 +2,7 @@
 
 Returns are grouped by cube of a fixed size in metres and by stretch of travel. Where two stretches
 show a plane (in 2D a line) in the same cube, its displacement across the surface is what the poses
-of the two stretches contradict each other by. `docs/quality.md` has the definition.
+of the two stretches contradict each other by. `docs/estimator.md` has the definition.
 """
 
 from typing import NamedTuple

@@ -1,5 +1,5 @@
 // Change detection per cell: a three-state HMM (object, empty, passer-by) that finds objects that
-// were placed or removed, and when. See docs/estimator/changes.md.
+// were placed or removed, and when. See docs/estimator.md.
 //
 // Objects stay for a time tau, passers-by for seconds; when an object leaves, the cell is as if it
 // had never been there. The forward algorithm gives the likelihood of all observations, the Viterbi

@@ -1,7 +1,7 @@
 // Pools values of surfels, such as P(dynamic), over the connected clusters of each sweep.
 //
 // The surfels that a sweep hit belong to one cluster if their ground columns touch. Sums over
-// sweeps are integers and so do not depend on their order. See docs/space.md.
+// sweeps are integers and so do not depend on their order. See docs/estimator.md.
 #pragma once
 
 #include <algorithm>

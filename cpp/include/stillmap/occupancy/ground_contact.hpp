@@ -1,6 +1,6 @@
 // Relabels beams that end just above the ground next to a moving object: a voxel on the ground also
 // holds the lower edges of wheels and shoes and would label them static. See
-// docs/estimator/spatial.md.
+// docs/estimator.md.
 #pragma once
 
 #include <cmath>

@@ -1,5 +1,5 @@
 // Support of a surfel by static surfels on a line through it: walls go on, what stands alone does
-// not. See docs/estimator/shapes.md.
+// not. See docs/estimator.md.
 #pragma once
 
 #include <algorithm>

@@ -2,7 +2,7 @@
 //
 // A static neighbour counts by the share of time in which both surfels were hit, a dynamic
 // neighbour by the share of the surfel's own time; both by how coplanar the two surfels are. See
-// docs/space.md.
+// docs/estimator.md.
 #pragma once
 
 #include <algorithm>

@@ -2,7 +2,7 @@
 //
 // What moves leaves its whole place empty. A hedge, the inside of a car behind its windows, a post
 // thinner than a cell, or anything that pose errors shift by decimetres does not: beams that pass
-// one of its surfels end on others. See docs/estimator/spatial.md.
+// one of its surfels end on others. See docs/estimator.md.
 #pragma once
 
 #include <algorithm>
