@@ -29,7 +29,7 @@ from stillmap.core import se2
 from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.recording import Recording
 from stillmap.io import stillmap_folder
-from stillmap.sim import SCENES, episode, laser, scene_by_name, simulator
+from stillmap.sim import SCENES, episode, laser, planar, scene_by_name
 from stillmap.sim.dynamics import Motion, simulate_motion
 from stillmap.sim.scene import Scene
 
@@ -109,7 +109,7 @@ def looked(
     """End points (m, 2) in the sensor's frame, and whether something reflected each beam (m,)."""
     o, T = scene.laser, len(motion.robot)
     walls = np.array([*scene.walls, *scene.glass, *motion.still], float)
-    exact = simulator.cast_sweeps(motion, walls, np.tile(se2.matrix(o.x, o.y, o.yaw), (T, 1, 1)), o)
+    exact = planar.cast_sweeps(motion, walls, np.tile(se2.matrix(o.x, o.y, o.yaw), (T, 1, 1)), o)
     is_glass = laser.find_glass(exact.wall, scene)
     ranges, hit = laser.simulate_measurement(exact.range, is_glass, o, rng)
     angles = laser.compute_beam_angles(o.beams, o.fov)

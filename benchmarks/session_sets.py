@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from session_pairs import OVERLAPS, plan_pair, plan_strangers, plan_wings
 
 from stillmap.core.errors import InputError
 from stillmap.sim import scene_by_name
-from stillmap.sim.session_pairs import OVERLAPS, plan_pair, plan_strangers, plan_wings
-from stillmap.sim.session_writer import write_sessions
 from stillmap.sim.sessions import SessionOptions, SessionPlan, plan_sessions
+from stillmap.sim.writer import write_sessions
 
 # most robots see to their sides: beams, rad
 LASER = {"laser": {"beams": 270, "fov": math.radians(270)}}

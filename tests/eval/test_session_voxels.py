@@ -8,8 +8,8 @@ from stillmap.eval.session_found import FoundChange
 from stillmap.eval.session_voxels import VOXEL, Voxels, VoxelTruth, collect_voxels
 from stillmap.sim import scene_by_name
 from stillmap.sim.session_truth import SessionTruth, load_session_truth
-from stillmap.sim.session_writer import write_sessions
 from stillmap.sim.sessions import SessionOptions, plan_sessions
+from stillmap.sim.writer import write_sessions
 
 SWEEPS = {"lidar": {"channels": 12, "columns": 120}, "robot": {"scans": 12}}
 SESSIONS = [0, 1, 2]

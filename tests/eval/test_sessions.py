@@ -16,10 +16,9 @@ from stillmap.eval.session_changes import ChangeScores
 from stillmap.eval.sessions import PlaceScores, score_place
 from stillmap.io.stillmap_folder import read
 from stillmap.sim import scene_by_name
-from stillmap.sim.session_pairs import plan_strangers
 from stillmap.sim.session_truth import SessionTruth, load_session_truth
-from stillmap.sim.session_writer import write_sessions
 from stillmap.sim.sessions import SessionOptions, plan_sessions
+from stillmap.sim.writer import write_sessions
 
 QUICK = {"laser": {"beams": 180}, "robot": {"scans": 300}, "crowd": {"people": 2}}
 
@@ -123,7 +122,8 @@ def test_a_shifted_session_is_found(truth, perfect, tmp_path, shift, verdict) ->
 @pytest.mark.slow
 def test_sessions_of_another_place_must_be_refused(tmp_path: Path) -> None:
     scenes = [scene_by_name(f"lookalike-{k}", QUICK) for k in (1, 2)]
-    write_sessions(plan_strangers(*scenes), tmp_path / "days")
+    plans = [plan_sessions(scene, SessionOptions(1)) for scene in scenes]
+    write_sessions(plans, tmp_path / "days")
     truth = load_session_truth(tmp_path / "days")
     write_place(tmp_path / "merged", truth)
     write_place(tmp_path / "refused", truth, refused=(1,))

@@ -13,7 +13,7 @@ from stillmap.core.config import override
 from stillmap.mapping.mirrors import Mirror
 from stillmap.mapping.reflections import find_mirrors, find_reflections, remove_reflections
 from stillmap.sim import Scene, Simulation, scene_by_name, simulate
-from stillmap.sim.mirrors import MIRRORED
+from stillmap.sim.planar import MIRRORED
 from stillmap.sim.walls import box
 
 CELL = 0.05

@@ -11,8 +11,8 @@ from stillmap.core.errors import InputError
 from stillmap.eval.sessions import PlaceScores, score_place
 from stillmap.sim import scene_by_name
 from stillmap.sim.session_truth import load_session_truth
-from stillmap.sim.session_writer import write_sessions
 from stillmap.sim.sessions import SessionOptions, plan_sessions
+from stillmap.sim.writer import write_sessions
 
 pytestmark = pytest.mark.slow  # a minute: three sessions are simulated, mapped and merged twice
 

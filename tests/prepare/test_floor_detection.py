@@ -15,7 +15,7 @@ from stillmap.core.recording import Recording
 from stillmap.em.options import EmOptions
 from stillmap.prepare.floor_detection import find_floor_returns
 from stillmap.sim import Scene, Simulation, scene_by_name, simulate
-from stillmap.sim.mishaps import FLOOR
+from stillmap.sim.planar import FLOOR
 from stillmap.sim.walls import box
 
 Bool = NDArray[np.bool_]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from stillmap.core.errors import InputError
 from stillmap.sim import LaserOptions, RobotOptions, Simulation, scene_by_name, simulate
 from stillmap.sim.laser import Returns
-from stillmap.sim.mishaps import FLOOR, Bumps, add_floor, find_blind_scans, simulate_bumps
+from stillmap.sim.planar import FLOOR, Bumps, add_floor, find_blind_scans, simulate_bumps
 
 Float = NDArray[np.float64]
 EXACT = {"beams": 90, "range_noise": 0.0, "no_return_share": 0.0, "glass_no_return_share": 0.0}

@@ -19,7 +19,7 @@ from stillmap.sim import (
     simulate,
     write_simulation,
 )
-from stillmap.sim.lidar import make_pose
+from stillmap.sim.geometry import make_pose
 from stillmap.sim.walls import box, pillar
 
 Float = NDArray[np.float64]

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from stillmap.core.config import override
 from stillmap.sim import Scene, Simulation, load_truth, scene_by_name, simulate, write_simulation
-from stillmap.sim.mirrors import MIRRORED
+from stillmap.sim.planar import MIRRORED
 from stillmap.sim.walls import box, polyline
 
 Float = NDArray[np.float64]

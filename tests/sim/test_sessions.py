@@ -1,6 +1,5 @@
 """Sessions: one world on several days, what stands where, and what each beam hit."""
 
-import dataclasses
 import functools
 import json
 from pathlib import Path
@@ -13,19 +12,11 @@ from stillmap.core.errors import InputError
 from stillmap.eval.map import distance_to_walls
 from stillmap.io.stillmap_folder import read
 from stillmap.sim import Scene, scene_by_name
-from stillmap.sim.furniture import Floor, Place, cross_rectangle, split_movable
 from stillmap.sim.objects import place_faces
-from stillmap.sim.session_overlap import compute_overlap, observe
-from stillmap.sim.session_pairs import (
-    OVERLAPS,
-    measure_overlap,
-    plan_pair,
-    plan_strangers,
-    plan_wings,
-)
+from stillmap.sim.session_layout import Floor, Place, cross_rectangle, split_movable
 from stillmap.sim.session_truth import list_changes, load_session_truth
-from stillmap.sim.session_writer import write_sessions
 from stillmap.sim.sessions import SessionOptions, SessionPlan, plan_sessions, simulate_sessions
+from stillmap.sim.writer import write_sessions
 
 Float = NDArray[np.float64]
 
@@ -215,17 +206,9 @@ def test_robots_stay_in_their_regions() -> None:
         assert x.max() < region[2]
 
 
-@pytest.mark.slow
-def test_wings_share_a_door_only() -> None:
-    plan = plan_wings(1)
-    scenes = [dataclasses.replace(s, crowd=quick_scene().crowd) for s in plan.scenes]
-    sights = [observe(one) for one in simulate_sessions(plan._replace(scenes=tuple(scenes)))]
-    assert compute_overlap(sights, [0, 0])[0, 1] < 0.1
-    assert compute_overlap(sights, [0, 0])[0, 0] > 0.98
-
-
 def test_places_have_nothing_in_common(tmp_path: Path) -> None:
-    plans = plan_strangers(quick_scene("lookalike-1"), quick_scene("lookalike-2"))
+    scenes = [quick_scene("lookalike-1"), quick_scene("lookalike-2")]
+    plans = [plan_sessions(scene, SessionOptions(1)) for scene in scenes]
     write_sessions(plans, tmp_path / "days")
     truth = load_session_truth(tmp_path / "days")
     np.testing.assert_array_equal(truth.place, [0, 1])
@@ -236,13 +219,6 @@ def test_lookalikes_look_alike_but_are_not_the_same() -> None:
     first, second = (scene_by_name(f"lookalike-{k}") for k in (1, 2))
     same = len(set(first.walls) & set(second.walls)) / len(first.walls)
     assert 0.2 < same < 0.8
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("overlap", OVERLAPS, ids=lambda overlap: overlap.name)
-def test_pairs_overlap_as_wanted(overlap) -> None:
-    plan = plan_pair(scene_by_name("office"), overlap, 3)
-    assert overlap.low <= measure_overlap(plan, with_people=True) < overlap.high
 
 
 def test_parked_cars_change_in_a_street_in_3d() -> None:

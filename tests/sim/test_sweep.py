@@ -12,7 +12,7 @@ from stillmap.core.errors import InputError
 from stillmap.sim import LaserOptions, Scene, Simulation, scene_by_name, simulate
 from stillmap.sim.dynamics import Motion
 from stillmap.sim.laser import Movers, Outlines
-from stillmap.sim.simulator import Sweep, cast_sweeps
+from stillmap.sim.planar import Sweep, cast_sweeps
 from stillmap.sim.walls import box, pillar
 
 Float = NDArray[np.float64]

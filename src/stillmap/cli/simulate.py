@@ -196,8 +196,8 @@ def run(args: argparse.Namespace) -> int:
 def _run_sessions(scene: "Scene", args: argparse.Namespace, output: Path) -> int:
     from stillmap.core.files import require_new
     from stillmap.sim.session_truth import MARK
-    from stillmap.sim.session_writer import write_sessions
     from stillmap.sim.sessions import SessionOptions, plan_sessions
+    from stillmap.sim.writer import write_sessions
 
     if args.format == "carmen":
         raise InputError("sessions are written as recording folders", hint="no --format carmen")

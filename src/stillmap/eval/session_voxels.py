@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from stillmap.core.recording import Recording
 from stillmap.eval.session_cells import MIN_BEAMS, SHORT, Seen
-from stillmap.sim.furniture import Place
+from stillmap.sim.session_layout import Place
 from stillmap.sim.session_truth import SessionTruth
 from stillmap.slam import deskew_recording
 from stillmap.slam.options import SlamOptions

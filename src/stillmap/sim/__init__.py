@@ -17,7 +17,6 @@ from stillmap.sim.options import (
 from stillmap.sim.scene import Door, Lane, Light, Scene, Stay, Thing
 from stillmap.sim.simulator import RigSimulation, Simulation, simulate, simulate_rig
 from stillmap.sim.truth import ImageTruth, Truth, load_image_truth, load_truth
-from stillmap.sim.truth_surfaces import sample_mover
 from stillmap.sim.worlds import SCENES, scene_by_name
 from stillmap.sim.writer import write_rig, write_simulation
 
@@ -47,7 +46,6 @@ __all__ = [
     "compute_static_color",
     "load_image_truth",
     "load_truth",
-    "sample_mover",
     "scene_by_name",
     "simulate",
     "simulate_rig",

@@ -10,8 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.sim.geometry import BOX, ELLIPSOID, Float
-from stillmap.sim.lidar import make_pose
+from stillmap.sim.geometry import BOX, ELLIPSOID, Float, make_pose
 
 Color = NDArray[np.uint8]
 

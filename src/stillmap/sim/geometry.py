@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from stillmap.sim.options import GroundOptions, HeightOptions
+from stillmap.sim.options import HeightOptions
 
 Float = NDArray[np.float64]
 
@@ -34,11 +34,6 @@ class Faces(NamedTuple):
         share = ((x - x0) * ux + (y - y0) * uy) / np.maximum(ux * ux + uy * uy, 1e-12)
         share = np.clip(share, 0.0, 1.0)
         return np.asarray(np.hypot(x0 + share * ux - x, y0 + share * uy - y))
-
-    def sag(self, ground: "Ground") -> Float:
-        """(F,) metres, by how much bent ground departs from the line between a face's ends."""
-        x0, y0, x1, y1 = self.ends.T
-        return np.asarray(np.abs(ground.bend).max() * ((x1 - x0) ** 2 + (y1 - y0) ** 2) / 8)
 
 
 class Solids(NamedTuple):
@@ -135,31 +130,39 @@ def assemble(parts: Sequence[tuple[int, int, Part]]) -> Assembly:
     )
 
 
+def make_pose(xyz: ArrayLike, roll: ArrayLike, pitch: ArrayLike, yaw: ArrayLike) -> Float:
+    """(..., 4, 4) poses, rotated by roll about x, then pitch about y, then yaw about z.
+
+    Args:
+        xyz: (..., 3) metres.
+        roll, pitch, yaw: (...) rad; a positive pitch is nose down.
+    """
+    angles = np.array([roll, pitch, yaw], float)
+    (a, b, c), (u, v, w) = np.cos(angles), np.sin(angles)
+    T = np.zeros((*np.shape(yaw), 4, 4))
+    T[..., 0, :3] = np.stack([c * b, c * v * u - w * a, c * v * a + w * u], axis=-1)
+    T[..., 1, :3] = np.stack([w * b, w * v * u + c * a, w * v * a - c * u], axis=-1)
+    T[..., 2, :3] = np.stack([-v, b * u, b * a], axis=-1)
+    T[..., :3, 3], T[..., 3, 3] = xyz, 1.0
+    return T
+
+
 class Ground(NamedTuple):
-    """z = slope . (x, y) + bend . (x^2, y^2) / 2, and `kerb` more on the pavements.
+    """z = slope . (x, y), and `kerb` more on the pavements.
 
     Attributes:
         slope: (2,) metres per metre.
-        bend: (2,) per metre.
         pavements: (R, 4) rectangles x0, y0, x1, y1.
         kerb: metres.
     """
 
     slope: Float
-    bend: Float
     pavements: Float
     kerb: float
 
-    @classmethod
-    def of(cls, options: GroundOptions, pavements: Float) -> "Ground":
-        """The ground that the options describe."""
-        slope, bend = (options.slope_x, options.slope_y), (options.bend_x, options.bend_y)
-        return cls(np.array(slope), np.array(bend), pavements, options.kerb)
-
     def level(self, x: Float, y: Float) -> Float:
         """(...) metres, height of the street at points (...), also below pavements."""
-        (sx, sy), (bx, by) = self.slope, self.bend
-        return np.asarray(x * (sx + bx / 2 * x) + y * (sy + by / 2 * y))
+        return np.asarray(x * self.slope[0] + y * self.slope[1])
 
     def height(self, x: Float, y: Float) -> Float:
         """(...) metres, height of the floor at points (...)."""
@@ -172,11 +175,6 @@ class Ground(NamedTuple):
             inside |= (x >= x0) & (x <= x1) & (y >= y0) & (y <= y1)
         return inside
 
-    def gradient(self, x: Float, y: Float) -> tuple[Float, Float]:
-        """Slopes to the east and north at points (...), metres per metre."""
-        (sx, sy), (bx, by) = self.slope, self.bend
-        return np.asarray(sx + bx * x), np.asarray(sy + by * y)
-
     def distance(self, origin: Float, direction: Float, above: float = 0.0) -> Float:
         """(...) metres along rays to the surface `above` the street; inf: no intersection.
 
@@ -186,16 +184,10 @@ class Ground(NamedTuple):
             above: metres; the surface is hit from both sides.
         """
         (x, y, z), (dx, dy, dz) = origin, direction
-        gx, gy = self.gradient(x, y)
-        a = -(self.bend[0] * dx * dx + self.bend[1] * dy * dy) / 2
-        b = dz - gx * dx - gy * dy
-        c = z - self.level(x, y) - above
-        # a t^2 + b t + c = 0 for the height over the level; its sign is made positive at t = 0
-        sign = np.where(c >= 0, 1.0, -1.0)
-        root = b * b - 4 * a * c
+        falls = dz - self.slope[0] * dx - self.slope[1] * dy
         with np.errstate(divide="ignore", invalid="ignore"):
-            t = 2 * c * sign / (np.sqrt(root) - sign * b)
-        return np.asarray(np.where((root >= 0) & (t > 0), t, np.inf))
+            t = -(z - self.level(x, y) - above) / falls
+        return np.asarray(np.where(t > 0, t, np.inf))
 
 
 VAN = 5.2  # m, minimum length of a van

@@ -1,18 +1,18 @@
 """3D sensors: beam patterns, poses and measurements."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from stillmap.core import se2
 from stillmap.sim import laser, ray_casting
-from stillmap.sim.geometry import BOX, Faces, Float, Ground, Part, assemble
-from stillmap.sim.options import GroundOptions, LaserOptions, LidarOptions, RigOptions
+from stillmap.sim.geometry import BOX, Faces, Float, Ground, Part, assemble, make_pose
+from stillmap.sim.options import LaserOptions, LidarOptions, RigOptions
 from stillmap.sim.ray_casting import RayReturns, Rays
 from stillmap.sim.scene import Scene
 from stillmap.sim.truth_surfaces import StaticSurfaces
+from stillmap.sim.world_3d import World
 
 ROBOT = -2  # the mover's number of the robot itself
 
@@ -79,6 +79,17 @@ class Sensor(NamedTuple):
     leaves_out: bool = False
     own: RayReturns | None = None
 
+    def cast_rays(self, world: World, pattern: Pattern, scan: int) -> RayReturns:
+        """Exact returns of the beams of one scan."""
+        moment = world.moment(np.full(len(pattern.azimuth), scan), pattern.seconds)
+        rays = transform_rays(pattern, world.T_world_base(moment) @ self.T_base_sensor)
+        exact = ray_casting.cast_rays(rays, world.static, world.movers.at(moment, scan))
+        if self.own is None:
+            return exact
+        nearer = self.own.range < exact.range
+        both: Any = zip(self.own, exact, strict=True)
+        return RayReturns._make(np.where(nearer, *pair) for pair in both)
+
 
 def make_spinning_lidar(scene: Scene) -> Sensor:
     """The lidar of a scene."""
@@ -115,44 +126,6 @@ def compute_joint_angle(seconds: Float, rig: RigOptions) -> Float:
     return np.asarray(rig.middle + rig.amplitude * (1.0 - 4.0 * np.abs(share - 0.5)))
 
 
-def make_pose(xyz: ArrayLike, roll: ArrayLike, pitch: ArrayLike, yaw: ArrayLike) -> Float:
-    """(..., 4, 4) poses, rotated by roll about x, then pitch about y, then yaw about z.
-
-    Args:
-        xyz: (..., 3) metres.
-        roll, pitch, yaw: (...) rad; a positive pitch is nose down.
-    """
-    angles = np.array([roll, pitch, yaw], float)
-    (a, b, c), (u, v, w) = np.cos(angles), np.sin(angles)
-    T = np.zeros((*np.shape(yaw), 4, 4))
-    T[..., 0, :3] = np.stack([c * b, c * v * u - w * a, c * v * a + w * u], axis=-1)
-    T[..., 1, :3] = np.stack([w * b, w * v * u + c * a, w * v * a - c * u], axis=-1)
-    T[..., 2, :3] = np.stack([-v, b * u, b * a], axis=-1)
-    T[..., :3, 3], T[..., 3, 3] = xyz, 1.0
-    return T
-
-
-def compute_robot_poses(
-    robot: Float, ground: Ground, o: LidarOptions, rng: np.random.Generator
-) -> Float:
-    """(T, 6) x, y, z, roll, pitch, yaw of a robot on the ground, with vibration.
-
-    Args:
-        robot: (T, 3) x, y, theta in the plane.
-        ground: the ground.
-        o: standard deviations of the vibration.
-        rng: of the vibration.
-    """
-    x, y, yaw = robot.T
-    gx, gy = ground.gradient(x, y)
-    ahead, left = gx * np.cos(yaw) + gy * np.sin(yaw), gy * np.cos(yaw) - gx * np.sin(yaw)
-    shaking = rng.standard_normal((3, len(robot)))
-    shaking *= np.array([[o.vibration_roll], [o.vibration_pitch], [o.vibration_z]])
-    pitch = -np.arctan(ahead) + shaking[1]
-    roll = np.arctan(left * np.cos(np.arctan(ahead))) + shaking[0]
-    return np.stack([x, y, ground.height(x, y) + shaking[2], roll, pitch, yaw], axis=-1)
-
-
 def transform_rays(pattern: Pattern, T_world_sensor: Float) -> Rays:
     """The beams of one turn in the world.
 
@@ -182,10 +155,11 @@ def cast_robot_body(scene: Scene, pattern: Pattern, T_base_sensor: Float) -> Ray
     aside = 0.8 * radius if o.roof_width is None else 0.5 * o.roof_width
     box = assemble([(0, ROBOT, Part(BOX, 0.0, 0.0, (ahead, aside), (0.0, top)))])
     body = box.at(np.zeros((1, 1, 3)), np.zeros((1, 1)))
-    nothing = Faces(np.empty((0, 4)), np.empty((0, 2)), np.empty(0, bool))
-    below = Ground.of(GroundOptions(), np.empty((0, 4)))
-    robot = StaticSurfaces(nothing, body, below, None)
-    seen = ray_casting.cast_rays(transform_rays(pattern, T_base_sensor[None]), robot)
+    nothing = assemble([]).at(np.empty((1, 0, 3)), np.empty((1, 0)))
+    faces = Faces(np.empty((0, 4)), np.empty((0, 2)), np.empty(0, bool))
+    level = Ground(np.zeros(2), np.empty((0, 4)), 0.0)
+    static = StaticSurfaces(faces, nothing, level, None)
+    seen = ray_casting.cast_rays(transform_rays(pattern, T_base_sensor[None]), static, body)
     return seen._replace(range=np.where(seen.mover == ROBOT, seen.range, np.inf))
 
 

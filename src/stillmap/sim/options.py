@@ -1,26 +1,25 @@
 """Parameters of a scene: sensors, robot, odometry, people, doors, vehicles, ground and heights."""
 
 import math
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
-from pydantic import model_validator
+from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from stillmap.core.config import STRICT, Count, option
 
 Shape = Literal["legs", "bodies", "mixed"]
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Share = Annotated[float, Field(ge=0, le=1)]
 
 _TURN = 2 * math.pi + 1e-9
 _MAX_ELEVATION = math.radians(85.0)
+Elevation = Annotated[float, Field(ge=-_MAX_ELEVATION, le=_MAX_ELEVATION)]
 _MAX_CAMERA_FOV = math.radians(150.0)
 
 # degrees, elevations of the lowest and highest channel of common sensors, by number of channels
-_ELEVATIONS = {
-    16: (-15.0, 15.0),
-    32: (-30.67, 10.67),
-    64: (-24.8, 2.0),
-    128: (-25.0, 15.0),
-}
+_ELEVATIONS = {16: (-15.0, 15.0), 32: (-30.67, 10.67), 64: (-24.8, 2.0), 128: (-25.0, 15.0)}
 
 
 def require(condition: bool, message: str) -> None:
@@ -34,15 +33,14 @@ class CrowdOptions:
     """The people."""
 
     people: Count = option(15, "Number of people.", ge=0)
-    # spelled out: ruff takes the default for mutable under an alias
     shape: Literal["legs", "bodies", "mixed"] = option(
-        "mixed", "Cross section of people at the height of the laser: legs, bodies, or half each."
+        "mixed", "Cross section at the laser: legs, bodies, or half each."
     )
-    min_speed: float = option(0.4, "Minimum walking speed, m/s.", gt=0)
-    max_speed: float = option(1.6, "Maximum walking speed, m/s.", gt=0)
-    stopping_share: float = option(0.33, "Share of people who stop at times.", ge=0, le=1)
-    min_stop: float = option(2.0, "Minimum duration of a stop, s.", ge=0)
-    max_stop: float = option(20.0, "Maximum duration of a stop, s.", ge=0)
+    min_speed: Positive = option(0.4, "Minimum walking speed, m/s.")
+    max_speed: Positive = option(1.6, "Maximum walking speed, m/s.")
+    stopping_share: Share = option(0.33, "Share of people who stop at times.")
+    min_stop: NotNegative = option(2.0, "Minimum duration of a stop, s.")
+    max_stop: NotNegative = option(20.0, "Maximum duration of a stop, s.")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -56,11 +54,11 @@ class CrowdOptions:
 class DoorOptions:
     """Durations of the states of doors, log-uniformly distributed."""
 
-    min_open: float = option(4.0, "Minimum time a door stays open, s.", gt=0)
-    max_open: float = option(60.0, "Maximum time a door stays open, s.", gt=0)
-    min_closed: float = option(5.0, "Minimum time a door stays closed, s.", gt=0)
-    max_closed: float = option(120.0, "Maximum time a door stays closed, s.", gt=0)
-    swing: float = option(1.5, "Time from closed to open, s.", gt=0)
+    min_open: Positive = option(4.0, "Minimum time a door stays open, s.")
+    max_open: Positive = option(60.0, "Maximum time a door stays open, s.")
+    min_closed: Positive = option(5.0, "Minimum time a door stays closed, s.")
+    max_closed: Positive = option(120.0, "Maximum time a door stays closed, s.")
+    swing: Positive = option(1.5, "Time from closed to open, s.")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -75,9 +73,9 @@ class TrafficOptions:
     """The vehicles on the lanes of a scene, besides queues."""
 
     vehicles: Count = option(10, "Number of vehicles, spread over the lanes.", ge=0)
-    min_speed: float = option(7.0, "Minimum desired speed, m/s.", gt=0)
-    max_speed: float = option(12.0, "Maximum desired speed, m/s.", gt=0)
-    stopping_share: float = option(0.2, "Share of vehicles that stop at times.", ge=0, le=1)
+    min_speed: Positive = option(7.0, "Minimum desired speed, m/s.")
+    max_speed: Positive = option(12.0, "Maximum desired speed, m/s.")
+    stopping_share: Share = option(0.2, "Share of vehicles that stop at times.")
     max_stop: float = option(12.0, "Maximum duration of a stop, s.", ge=3)
 
     @model_validator(mode="after")
@@ -93,37 +91,28 @@ class LaserOptions:
 
     beams: Count = option(180, "Beams per scan.", ge=2)
     fov: float = option(math.pi, "Field of view about the sensor's x axis, rad.", gt=0, le=_TURN)
-    max_range: float = option(30.0, "Maximum range, m; beyond there is no return.", gt=0)
-    range_noise: float = option(0.02, "Standard deviation of ranges, m.", ge=0)
-    no_return_share: float = option(0.002, "Share of beams lost anywhere.", ge=0, le=1)
-    glass_no_return_share: float = option(0.3, "Share of beams lost on glass.", ge=0, le=1)
-    mirror_return_share: float = option(
-        0.05, "Share of beams that mirrors return instead of reflecting them.", ge=0, le=1
-    )
-    sweep_time: float = option(0.0, "Duration of a scan, s; 0: all beams at once.", ge=0)
+    max_range: Positive = option(30.0, "Maximum range, m; beyond there is no return.")
+    range_noise: NotNegative = option(0.02, "Standard deviation of ranges, m.")
+    no_return_share: Share = option(0.002, "Share of beams lost anywhere.")
+    glass_no_return_share: Share = option(0.3, "Share of beams lost on glass.")
+    mirror_return_share: Share = option(0.05, "Share of beams that mirrors return.")
+    sweep_time: NotNegative = option(0.0, "Duration of a scan, s; 0: all beams at once.")
     x: float = option(0.08, "Sensor ahead of the base, m.")
     y: float = option(0.0, "Sensor to the left of the base, m.")
     yaw: float = option(0.0, "Yaw of the sensor on the base, rad.")
-    # spelled out: see CrowdOptions.shape
     upside_down: Literal["no", "known", "unknown"] = option(
-        "no", "Mounted upside down: no; known to the recorder; or unknown, which mirrors its scans."
+        "no", "Mounted upside down; unknown: scans are mirrored."
     )
-    second_laser: bool = option(
-        False, "Add a laser that looks backwards from the opposite side of the base."
-    )
-    recorded_x: float | None = option(None, "x as the recorder has it, m; unset: the true one.")
-    recorded_y: float | None = option(None, "y as the recorder has it, m; unset: the true one.")
-    recorded_yaw: float | None = option(
-        None, "yaw as the recorder has it, rad; unset: the true one."
-    )
-    height: float = option(0.3, "Height above the floor, m.", gt=0)
-    blind_stretches: Count = option(
-        0, "Number of stretches without returns, at random times.", ge=0
-    )
+    second_laser: bool = option(False, "Add a laser that looks backwards.")
+    recorded_x: float | None = option(None, "x as recorded, m; unset: the true one.")
+    recorded_y: float | None = option(None, "y as recorded, m; unset: the true one.")
+    recorded_yaw: float | None = option(None, "yaw as recorded, rad; unset: the true one.")
+    height: Positive = option(0.3, "Height above the floor, m.")
+    blind_stretches: Count = option(0, "Number of stretches without returns.", ge=0)
     blind_at: float | None = option(
-        None, "Share of the recording at which one more such stretch begins.", ge=0, lt=1
+        None, "Share of the recording when one more begins.", ge=0, lt=1
     )
-    blind_time: float = option(30.0, "Duration of a stretch without returns, s.", gt=0)
+    blind_time: Positive = option(30.0, "Duration of a stretch without returns, s.")
 
     @property
     def recorded_mount(self) -> tuple[float, float, float]:
@@ -145,82 +134,46 @@ class LaserOptions:
 class RobotOptions:
     """Motion of the robot, scan rate, and mishaps."""
 
-    speed: float = option(0.5, "Speed on a free way, m/s.", gt=0)
-    acceleration: float | None = option(
-        None, "Maximum acceleration, longitudinal and lateral, m/s^2; unset: unlimited.", gt=0
-    )
-    turn_rate: float = option(0.8, "Maximum turn rate, rad/s.", gt=0)
+    speed: Positive = option(0.5, "Speed on a free way, m/s.")
+    acceleration: Positive | None = option(None, "Of driving and turning, m/s^2; unset: any.")
+    turn_rate: Positive = option(0.8, "Maximum turn rate, rad/s.")
     radius: float = option(0.22, "Radius of the circular footprint, m.")
-    scan_rate: float = option(5.0, "Scans per second of each laser, Hz.", gt=0)
-    scans: Count | None = option(
-        None, "Number of scans, repeating the route; unset: the route once.", ge=1
-    )
+    scan_rate: Positive = option(5.0, "Scans per second of each laser, Hz.")
+    scans: Count | None = option(None, "Number of scans; unset: the route once.", ge=1)
     carried_at: float | None = option(
-        None,
-        "Share of the recording at which the robot is switched off, carried to another place of "
-        "its route and set down with any heading; unset: never.",
-        gt=0,
-        lt=1,
+        None, "Share of the recording when it is carried elsewhere.", gt=0, lt=1
     )
-    carried_by: float | None = option(
-        None,
-        "Distance along its route by which the robot is then carried, m; negative: back; unset: to "
-        "any distant place.",
-    )
-    carried_turn: float | None = option(
-        None, "Heading against the route where it is set down, rad; unset: any."
-    )
-    carried_time: float = option(20.0, "Time without scans while it is carried, s.", ge=0)
-    bump_rate: float = option(0.0, "Bumps per metre driven, which tilt a planar laser.", ge=0)
-    bump_pitch: float = option(
-        0.05, "Pitch at the peak of a bump, up or down, rad, times 0.5 to 1.5.", ge=0, le=0.5
-    )
-    bump_roll: float = option(
-        0.0, "Standard deviation of the roll at the peak of a bump, rad.", ge=0, le=0.1
-    )
-    bump_time: float = option(0.6, "Duration of a bump, s, times 0.5 to 1.5.", gt=0)
-    pause_at: float | None = option(
-        None, "Recording time at which the robot stops for a pause, s; unset: never.", gt=0
-    )
-    pause: float = option(28_800.0, "Duration of the pause without recording, s.", ge=0)
-    stamp_rounding: float = option(
-        0.0, "Stamps are rounded to multiples of this, s; 0: to nanoseconds.", ge=0
-    )
+    carried_by: float | None = option(None, "Distance along its route, m; unset: any far place.")
+    carried_turn: float | None = option(None, "Heading against the route then, rad; unset: any.")
+    carried_time: NotNegative = option(20.0, "Time without scans while it is carried, s.")
+    bump_rate: NotNegative = option(0.0, "Bumps per metre driven, which tilt a planar laser.")
+    bump_pitch: float = option(0.05, "Pitch of bumps, rad, times 0.5 to 1.5.", ge=0, le=0.5)
+    bump_roll: float = option(0.0, "Standard deviation of their roll, rad.", ge=0, le=0.1)
+    bump_time: Positive = option(0.6, "Duration of a bump, s, times 0.5 to 1.5.")
+    pause_at: Positive | None = option(None, "Time of a pause, s; unset: never.")
+    pause: NotNegative = option(28_800.0, "Duration of the pause without recording, s.")
+    stamp_rounding: NotNegative = option(0.0, "Resolution of stamps, s; 0: nanoseconds.")
 
 
 @dataclass(frozen=True, config=STRICT)
 class OdometryOptions:
     """Errors of differential-drive odometry; all 0: perfect odometry."""
 
-    wheel_radius_error: float = option(
-        0.0005, "Standard deviation of the relative error of each wheel radius.", ge=0
-    )
-    wheel_base_error: float = option(
-        0.01, "Standard deviation of the relative error of the wheel base.", ge=0
-    )
-    wheel_base: float = option(0.4, "Distance between the wheels, m.", gt=0)
-    translation_noise: float = option(
-        0.01, "Standard deviation of the distance, m per sqrt(m) driven.", ge=0
-    )
-    rotation_noise: float = option(
-        0.02, "Standard deviation of the heading, rad per sqrt(rad) turned.", ge=0
-    )
-    drift_noise: float = option(
-        0.008, "Standard deviation of the heading, rad per sqrt(m) driven.", ge=0
-    )
-    slip_rate: float = option(0.0, "Wheel slips per metre driven.", ge=0)
-    slip: float = option(
-        0.3, "Relative excess rotation of a slipping wheel, times 0.5 to 1.5.", ge=0
-    )
-    slip_length: float = option(0.5, "Distance over which a wheel slips, m.", gt=0)
-    stall_rate: float = option(0.0, "Odometry stalls per minute: motion is missed.", ge=0)
-    stall_time: float = option(5.0, "Duration of a stall, s.", gt=0)
+    wheel_radius_error: NotNegative = option(0.0005, "Relative error of each wheel radius (sigma).")
+    wheel_base_error: NotNegative = option(0.01, "Relative error of the wheel base (sigma).")
+    wheel_base: Positive = option(0.4, "Distance between the wheels, m.")
+    translation_noise: NotNegative = option(0.01, "Sigma of the distance, m per sqrt(m) driven.")
+    rotation_noise: NotNegative = option(0.02, "Sigma of the heading, rad per sqrt(rad) turned.")
+    drift_noise: NotNegative = option(0.008, "Sigma of the heading, rad per sqrt(m) driven.")
+    slip_rate: NotNegative = option(0.0, "Wheel slips per metre driven.")
+    slip: NotNegative = option(0.3, "Excess rotation of a slipping wheel, times 0.5 to 1.5.")
+    slip_length: Positive = option(0.5, "Distance over which a wheel slips, m.")
+    stall_rate: NotNegative = option(0.0, "Odometry stalls per minute: motion is missed.")
+    stall_time: Positive = option(5.0, "Duration of a stall, s.")
     resets: Count = option(0, "Number of resets to the origin, at random times.", ge=0)
-    scale: float = option(1.0, "Factor on all distances.", gt=0)
-    rotation_gain: float = option(1.0, "Factor on all rotations.", gt=0)
-    latency: float = option(
-        0.0, "Age of the odometry at the stamp that it is recorded with, s.", ge=0
-    )
+    scale: Positive = option(1.0, "Factor on all distances.")
+    rotation_gain: Positive = option(1.0, "Factor on all rotations.")
+    latency: NotNegative = option(0.0, "Age of odometry at its stamp, s.")
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -232,10 +185,10 @@ class CameraOptions:
     width: Count = option(640, "Image width, pixels.", ge=2, le=8192)
     height: Count = option(480, "Image height, pixels.", ge=2, le=8192)
     fov: float = option(1.4, "Horizontal field of view, rad.", gt=0, le=_MAX_CAMERA_FOV)
-    rate: float = option(2.0, "Images per second of each camera, Hz.", gt=0)
+    rate: Positive = option(2.0, "Images per second of each camera, Hz.")
     x: float = option(0.1, "First camera ahead of the base, m; the others are rotated about it.")
     y: float = option(0.0, "First camera to the left of the base, m.")
-    z: float = option(1.2, "Height above the floor, m.", gt=0)
+    z: Positive = option(1.2, "Height above the floor, m.")
     yaw: float = option(0.0, "Yaw of the first camera, rad.")
     pitch: float = option(0.05, "Pitch, nose down, rad.", gt=-math.pi / 2, lt=math.pi / 2)
     # beyond these limits a lens bends rays back: several would meet one pixel
@@ -243,9 +196,8 @@ class CameraOptions:
     k2: float = option(0.0, "Distortion coefficient.", ge=-0.4, le=0.4)
     p1: float = option(0.0, "Distortion coefficient.", ge=-0.05, le=0.05)
     p2: float = option(0.0, "Distortion coefficient.", ge=-0.05, le=0.05)
-    noise: float = option(2.0, "Standard deviation of pixel values, of 255.", ge=0)
-    exposure: float = option(0.0, "Standard deviation of the relative exposure of images.", ge=0)
-    antialias: Count = option(1, "Rays per pixel in each direction.", ge=1, le=4)
+    noise: NotNegative = option(2.0, "Standard deviation of pixel values, of 255.")
+    exposure: NotNegative = option(0.0, "Standard deviation of the relative exposure of images.")
 
     @property
     def distortion(self) -> tuple[float, ...]:
@@ -260,42 +212,27 @@ class LidarOptions:
 
     channels: Count = option(0, "Number of channels; 0: no lidar.", ge=0)
     columns: Count = option(1875, "Azimuths per turn.", ge=4)
-    rate: float = option(10.0, "Turns per second, Hz.", gt=0)
-    low: float | None = option(
-        None,
-        "Elevation of the lowest channel, rad; unset: as of common sensors.",
-        ge=-_MAX_ELEVATION,
-        le=_MAX_ELEVATION,
-    )
-    high: float | None = option(
-        None,
-        "Elevation of the highest channel, rad; unset: as of common sensors.",
-        ge=-_MAX_ELEVATION,
-        le=_MAX_ELEVATION,
-    )
-    max_range: float = option(100.0, "Maximum range, m; beyond there is no return.", gt=0)
-    range_noise: float = option(0.02, "Standard deviation of ranges, m.", ge=0)
-    no_return_share: float = option(0.002, "Share of beams lost anywhere.", ge=0, le=1)
-    glass_no_return_share: float = option(0.3, "Share of beams lost on glass.", ge=0, le=1)
-    # spelled out: see CrowdOptions.shape
-    no_returns: Literal["kept", "left out"] = option(
-        "kept", "Beams without return: kept at the maximum range, or left out as drivers do."
-    )
+    rate: Positive = option(10.0, "Turns per second, Hz.")
+    low: Elevation | None = option(None, "Elevation of the lowest channel, rad; unset: usual.")
+    high: Elevation | None = option(None, "Elevation of the highest channel, rad; unset: usual.")
+    max_range: Positive = option(100.0, "Maximum range, m; beyond there is no return.")
+    range_noise: NotNegative = option(0.02, "Standard deviation of ranges, m.")
+    no_return_share: Share = option(0.002, "Share of beams lost anywhere.")
+    glass_no_return_share: Share = option(0.3, "Share of beams lost on glass.")
+    no_returns: Literal["kept", "left out"] = option("kept", "Beams without return.")
     sweep: bool = option(True, "Beams of a turn are taken one after the other, else at once.")
     x: float = option(0.0, "Sensor ahead of the base, m.")
     y: float = option(0.0, "Sensor to the left of the base, m.")
-    z: float = option(1.8, "Sensor above the floor, m.", gt=0)
+    z: Positive = option(1.8, "Sensor above the floor, m.")
     yaw: float = option(0.0, "Yaw of the sensor on the base, rad.")
     pitch: float = option(0.0, "Pitch of the sensor on the base, nose down, rad.")
-    vibration_roll: float = option(0.0, "Standard deviation of the robot's roll, rad.", ge=0)
-    vibration_pitch: float = option(0.0, "Standard deviation of the robot's pitch, rad.", ge=0)
-    vibration_z: float = option(0.0, "Standard deviation of the robot's height, m.", ge=0)
+    vibration_roll: NotNegative = option(0.0, "Standard deviation of the robot's roll, rad.")
+    vibration_pitch: NotNegative = option(0.0, "Standard deviation of the robot's pitch, rad.")
+    vibration_z: NotNegative = option(0.0, "Standard deviation of the robot's height, m.")
     sees_robot: bool = option(False, "Some beams hit the roof of the robot itself.")
-    roof_length: float | None = option(
-        None, "Length of that roof, m; unset: twice the robot's radius.", gt=0
-    )
-    roof_width: float | None = option(None, "Width of the roof, m; unset: 0.8 of that.", gt=0)
-    roof_below: float = option(0.35, "Height of the sensor above the roof, m.", gt=0)
+    roof_length: Positive | None = option(None, "Its length, m; unset: twice the robot's radius.")
+    roof_width: Positive | None = option(None, "Width of the roof, m; unset: 0.8 of that.")
+    roof_below: Positive = option(0.35, "Height of the sensor above the roof, m.")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -316,12 +253,12 @@ class RigOptions:
     """Two lasers like `laser`: one horizontal, one tilting about the robot's y axis."""
 
     tilts: bool = option(False, "There are two lasers, one of which tilts.")
-    low_z: float = option(0.35, "Horizontal laser above the floor, m.", gt=0)
+    low_z: Positive = option(0.35, "Horizontal laser above the floor, m.")
     pivot_x: float = option(0.1, "Tilt axis ahead of the base, m.")
-    pivot_z: float = option(0.9, "Tilt axis above the floor, m.", gt=0)
+    pivot_z: Positive = option(0.9, "Tilt axis above the floor, m.")
     middle: float = option(0.1, "Mean tilt, nose down, rad.")
-    amplitude: float = option(0.7, "Tilt to either side of the mean, rad.", ge=0)
-    period: float = option(4.0, "Period of the tilting at constant rate, s.", gt=0)
+    amplitude: NotNegative = option(0.7, "Tilt to either side of the mean, rad.")
+    period: Positive = option(4.0, "Period of the tilting at constant rate, s.")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -333,12 +270,10 @@ class RigOptions:
 
 @dataclass(frozen=True, config=STRICT)
 class GroundOptions:
-    """The ground: a plane or paraboloid, with pavements above it."""
+    """The ground: a plane, with pavements above it."""
 
     slope_x: float = option(0.0, "Slope to the east at the origin, m/m.", ge=-0.3, le=0.3)
     slope_y: float = option(0.0, "Slope to the north at the origin, m/m.", ge=-0.3, le=0.3)
-    bend_x: float = option(0.0, "Change of the slope to the east, 1/m.", ge=-0.01, le=0.01)
-    bend_y: float = option(0.0, "Change of the slope to the north, 1/m.", ge=-0.01, le=0.01)
     kerb: float = option(0.12, "Height of pavements above the street, m.", ge=0, le=0.5)
 
 
@@ -346,10 +281,10 @@ class GroundOptions:
 class HeightOptions:
     """Heights of ceiling, walls, doors and furniture."""
 
-    ceiling: float | None = option(2.8, "Height of the ceiling, m; unset: open sky.", gt=0)
-    walls: float = option(9.0, "Height of walls under the open sky, m.", gt=0)
-    doors: float = option(2.05, "Height of doors, m; above there is a lintel.", gt=0)
-    furniture: float = option(1.0, "Height of furniture, m.", gt=0)
+    ceiling: Positive | None = option(2.8, "Height of the ceiling, m; unset: open sky.")
+    walls: Positive = option(9.0, "Height of walls under the open sky, m.")
+    doors: Positive = option(2.05, "Height of doors, m; above there is a lintel.")
+    furniture: Positive = option(1.0, "Height of furniture, m.")
 
     @property
     def top(self) -> float:

@@ -14,7 +14,7 @@ from stillmap.sim.geometry import BOX, CYLINDER, Faces, Float, Ground, Solids
 from stillmap.sim.laser import MIN_RANGE
 from stillmap.sim.truth_surfaces import StaticSurfaces
 
-Window = tuple[int, slice, slice]
+Window = tuple[slice, slice]  # columns, channels
 
 
 _SLACK = 1e-9  # rad, so that no beam passes between two faces that share an edge
@@ -40,22 +40,29 @@ class Rays(NamedTuple):
     elevation: Float
     tilt: float
 
+    def within(self, window: Window) -> tuple[Float, Float]:
+        """Origins (3, k, 1) and directions (3, k, c) of the beams in a window."""
+        columns, channels = window
+        return self.origin[:, columns], self.direction[:, columns, channels]
+
 
 class RayReturns(NamedTuple):
     """The nearest surface on each of (n, C) beams.
 
     Attributes:
         range: metres, inf without a hit.
+        part: int32, number of the moving solid, -1: none.
         mover: int32 id of the mover, -1: none.
         on_glass: bool.
     """
 
     range: Float
+    part: NDArray[np.int32]
     mover: NDArray[np.int32]
     on_glass: NDArray[np.bool_]
 
 
-def cast_rays(rays: Rays, static: StaticSurfaces, *moving: Solids) -> RayReturns:
+def cast_rays(rays: Rays, static: StaticSurfaces, moving: Solids) -> RayReturns:
     """Intersect beams with a world.
 
     Args:
@@ -65,24 +72,25 @@ def cast_rays(rays: Rays, static: StaticSurfaces, *moving: Solids) -> RayReturns
     """
     faces, ground = static.faces, static.ground
     range = intersect_ground(rays.origin, rays.direction, ground, static.ceiling)
-    mover = np.full(range.shape, -1, np.int32)
-    on_glass = np.zeros(range.shape, bool)
-    for k, columns, channels in _windows_of_faces(rays, faces, ground):
-        origin, direction = rays.origin[:, columns], rays.direction[:, columns, channels]
+    part, glass = np.full(range.shape, -1, np.int32), np.zeros(range.shape, bool)
+
+    def keep_nearer(window: Window, t: Float, number: int, is_glass: bool) -> None:
+        nearer = t < range[window]
+        range[window][nearer] = t[nearer]
+        part[window][nearer] = number
+        glass[window][nearer] = is_glass
+
+    for k, window in _windows_of_faces(rays, faces, ground):
+        origin, direction = rays.within(window)
         t = intersect_face(origin, direction, faces.ends[k], faces.z[k], ground)
-        nearer = t < range[columns, channels]
-        range[columns, channels][nearer] = t[nearer]
-        on_glass[columns, channels][nearer] = faces.is_glass[k]
-    for group in (static.solids, *moving):
-        for k, columns, channels in _windows_of_solids(rays, group):
-            pose = group.pose[columns if len(group.pose) > 1 else slice(None), k]
-            origin, direction = rays.origin[:, columns], rays.direction[:, columns, channels]
-            t = intersect_solid(origin, direction, group, k, pose)
-            nearer = t < range[columns, channels]
-            range[columns, channels][nearer] = t[nearer]
-            mover[columns, channels][nearer] = group.mover[k]
-            on_glass[columns, channels][nearer] = False
-    return RayReturns(range, mover, on_glass)
+        keep_nearer(window, t, -1, bool(faces.is_glass[k]))
+    for group in (static.solids, moving):
+        for k, window in _windows_of_solids(rays, group):
+            pose = group.pose[window[0] if len(group.pose) > 1 else slice(None), k]
+            t = intersect_solid(*rays.within(window), group, k, pose)
+            keep_nearer(window, t, k if group is moving else -1, False)
+    mover = np.append(moving.mover, np.int32(-1))[part]  # part -1 is the last one
+    return RayReturns(range, part, mover, glass)
 
 
 def intersect_ground(
@@ -141,8 +149,8 @@ def intersect_solid(origin: Float, direction: Float, solids: Solids, k: int, pos
 
 def _slab(u: Float, du: Float) -> tuple[Float, Float]:
     """Distances at which rays enter and leave -1 <= u <= 1."""
-    one = 1.0 / du  # infinite for rays along it: within from -inf to inf, or never
-    near, far = (-1.0 - u) * one, (1.0 - u) * one
+    per = 1.0 / du  # infinite for rays along it: within from -inf to inf, or never
+    near, far = (-1.0 - u) * per, (1.0 - u) * per
     return np.minimum(near, far), np.maximum(near, far)
 
 
@@ -152,11 +160,11 @@ def _sphere(squares: Float, product: Float, rest: Float) -> tuple[Float, Float]:
     return (-product - root) / squares, (-product + root) / squares
 
 
-def _intersect(one: tuple[Float, Float], other: tuple[Float, Float]) -> tuple[Float, Float]:
-    return np.maximum(one[0], other[0]), np.minimum(one[1], other[1])
+def _intersect(a: tuple[Float, Float], b: tuple[Float, Float]) -> tuple[Float, Float]:
+    return np.maximum(a[0], b[0]), np.minimum(a[1], b[1])
 
 
-def _windows_of_faces(rays: Rays, faces: Faces, ground: Ground) -> Iterator[Window]:
+def _windows_of_faces(rays: Rays, faces: Faces, ground: Ground) -> Iterator[tuple[int, Window]]:
     """Number of each face, and the columns and channels that may hit it."""
     if not len(faces.ends):
         return
@@ -166,14 +174,13 @@ def _windows_of_faces(rays: Rays, faces: Faces, ground: Ground) -> Iterator[Wind
     turn = (other - bearing + np.pi) % (2 * np.pi) - np.pi
     far = np.maximum(np.hypot(x0 - ox, y0 - oy), np.hypot(x1 - ox, y1 - oy))
     levels = np.stack([ground.level(x0, y0), ground.level(x1, y1)])
-    sag = faces.sag(ground)
-    low = levels.min(axis=0) - sag + faces.z[:, 0] - oz
-    high = levels.max(axis=0) + sag + faces.z[:, 1] - oz
+    low = levels.min(axis=0) + faces.z[:, 0] - oz
+    high = levels.max(axis=0) + faces.z[:, 1] - oz
     near, middle = faces.distance(ox, oy), bearing + turn / 2
     yield from _windows(rays, middle, np.abs(turn) / 2, near, far, (low, high), move)
 
 
-def _windows_of_solids(rays: Rays, solids: Solids) -> Iterator[Window]:
+def _windows_of_solids(rays: Rays, solids: Solids) -> Iterator[tuple[int, Window]]:
     """Number of each solid, and the columns and channels that may hit it."""
     if not len(solids.form):
         return
@@ -207,7 +214,7 @@ def _windows(
     far: Float,
     heights: tuple[Float, Float],
     move: float,
-) -> Iterator[Window]:
+) -> Iterator[tuple[int, Window]]:
     """Columns and channels that may hit P surfaces.
 
     Args:
@@ -236,4 +243,4 @@ def _windows(
     start[all_round], stop[all_round] = 0, [n, 0, 0]
     use = (start < stop) & (begin < end)[:, None]
     for k, turn in np.argwhere(use).tolist():
-        yield k, slice(start[k, turn], stop[k, turn]), slice(begin[k], end[k])
+        yield k, (slice(start[k, turn], stop[k, turn]), slice(begin[k], end[k]))

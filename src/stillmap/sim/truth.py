@@ -1,6 +1,5 @@
 """The truth of a simulation: read by the scores, never by the mapping."""
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,24 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.array_folder import open_npy, read_npz
-from stillmap.core.arrays import write_npy, write_npz
 from stillmap.core.errors import InputError
 from stillmap.core.json import read_json
 from stillmap.io.images import read_image
-from stillmap.io.trajectory import write_tum
 from stillmap.sim.geometry import Faces, Float, Ground, Solids
 from stillmap.sim.truth_surfaces import MovingSurfaces, StaticSurfaces
 
 FOLDER = "truth"
-IMAGES = "images"  # in it
-_STANDING, _MOVING, _POSE = "standing.npz", "moving.npz", "moving_pose.npy"
-_CAMERAS = "T_world_camera.npy"
+SCENE = "scene.json"
+ARRAYS = ("static", "mover", "T_world_base", "walls", "movers")
+OPTIONAL = ("lasting", "T_base_sensor", "thing")
+IMAGES, CAMERAS = "images", "T_world_camera.npy"
+STANDING, MOVING, POSE = "standing.npz", "moving.npz", "moving_pose.npy"
 _MAX_SCENE, _MAX_ARRAY = 64 << 20, 1 << 31  # bytes of the file, of an unpacked array
-_SCENE = "scene.json"
-_ARRAYS = ("static", "mover", "T_world_base", "walls", "movers")
-_LASTING = "lasting"  # only where there are any
-_MOUNT = "T_base_sensor"  # only where the recorder is wrong about it
-_THING = "thing"  # only where movable objects stand still
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,30 +57,17 @@ class Truth:
     thing: NDArray[np.int32] | None = None
 
 
-def write_truth(truth: Truth, stamp_ns: NDArray[np.int64], folder: Path) -> None:
-    """Write the `truth` folder into an existing folder."""
-    inside = folder / FOLDER
-    inside.mkdir()
-    optional = [_LASTING] if len(truth.lasting) else []
-    optional += [name for name in (_MOUNT, _THING) if getattr(truth, name) is not None]
-    for name in (*_ARRAYS, *optional):
-        write_npy(inside / f"{name}.npy", np.asarray(getattr(truth, name)))
-    write_tum(inside / "trajectory.tum", stamp_ns, truth.T_world_base)
-    (inside / _SCENE).write_text(json.dumps(truth.scene, indent=1) + "\n", encoding="utf-8")
-
-
 def load_truth(path: str | Path) -> Truth:
     """Load the truth of a simulation, given its folder or the `truth` folder inside.
 
     Raises:
         InputError: there is none, or it is damaged.
     """
-    folder = _find_folder(path, _SCENE, "truth", "")
-    optional = [name for name in (_LASTING, _MOUNT, _THING) if (folder / f"{name}.npy").exists()]
-    names = (*_ARRAYS, *optional)
+    folder = _find_folder(path, SCENE, "truth", "")
+    names = (*ARRAYS, *(name for name in OPTIONAL if (folder / f"{name}.npy").exists()))
     try:
         arrays = {name: np.array(open_npy(folder / f"{name}.npy")) for name in names}
-        return Truth(**arrays, scene=read_json(folder / _SCENE, _MAX_SCENE))
+        return Truth(**arrays, scene=read_json(folder / SCENE, _MAX_SCENE))
     except (TypeError, ValueError) as error:
         raise InputError(f"is damaged: {error}", where=str(folder)) from error
 
@@ -112,42 +93,22 @@ class ImageTruth:
     distance: Callable[[int], NDArray[np.float32]]
 
 
-def write_image_truth(truth: ImageTruth, folder: Path) -> None:
-    """Write all but masks and distances into an existing folder."""
-    faces, solids, ground, ceiling = truth.standing
-    standing: dict[str, NDArray[Any]] = {
-        "faces_ends": faces.ends,
-        "faces_z": faces.z,
-        "faces_glass": faces.is_glass,
-        **{f"solids_{name}": value for name, value in solids._asdict().items()},
-        **{f"ground_{name}": np.asarray(value) for name, value in ground._asdict().items()},
-        "ceiling": np.array(np.nan if ceiling is None else ceiling),
-        "colour_seed": np.array(truth.colour_seed),
-    }
-    write_npz(folder / _STANDING, standing)
-    moving = truth.moving.solids._asdict()
-    write_npy(folder / _POSE, moving.pop("pose"))
-    write_npz(folder / _MOVING, {"stamp_ns": truth.moving.stamp_ns, **moving})
-    write_npy(folder / _CAMERAS, truth.T_world_camera)
-
-
 def load_image_truth(path: str | Path) -> ImageTruth:
     """Load the truth about images, given the folder of a simulation or the `truth` inside.
 
     Raises:
         InputError: there is none, or it is damaged.
     """
-    folder = _find_folder(path, _STANDING, "truth about images", " with cameras")
+    folder = _find_folder(path, STANDING, "truth about images", " with cameras")
     try:
-        of, moves = _arrays(folder / _STANDING), _arrays(folder / _MOVING)
+        of, moves = (read_npz(folder / name, None, _MAX_ARRAY) for name in (STANDING, MOVING))
         faces = Faces(of["faces_ends"], of["faces_z"], of["faces_glass"])
         solids = Solids(*(of[f"solids_{name}"] for name in Solids._fields))
-        kerb = float(of["ground_kerb"])
-        ground = Ground(of["ground_slope"], of["ground_bend"], of["ground_pavements"], kerb)
+        ground = Ground(of["ground_slope"], of["ground_pavements"], float(of["ground_kerb"]))
         ceiling, seed = float(of["ceiling"]), int(of["colour_seed"])
-        parts = Solids(open_npy(folder / _POSE), *(moves[name] for name in Solids._fields[1:]))
+        parts = Solids(open_npy(folder / POSE), *(moves[name] for name in Solids._fields[1:]))
         moving = MovingSurfaces(moves["stamp_ns"], parts)
-        T_world_camera = np.array(open_npy(folder / _CAMERAS))
+        T_world_camera = np.array(open_npy(folder / CAMERAS))
     except (TypeError, ValueError, KeyError, OverflowError) as error:
         raise InputError(f"is damaged: {error}", where=str(folder)) from error
     standing = StaticSurfaces(faces, solids, ground, None if np.isnan(ceiling) else ceiling)
@@ -180,7 +141,3 @@ def _find_folder(path: str | Path, mark: str, what: str, how: str) -> Path:
 def image_files(folder: Path, image: int) -> tuple[Path, Path]:
     """Mask and distances of an image, in a truth folder."""
     return folder / IMAGES / f"{image:06d}.png", folder / IMAGES / f"{image:06d}-distance.png"
-
-
-def _arrays(path: Path) -> dict[str, NDArray[Any]]:
-    return read_npz(path, None, _MAX_ARRAY)

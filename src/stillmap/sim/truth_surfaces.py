@@ -115,8 +115,7 @@ def _middle_and_half(solids: Solids, k: int) -> tuple[Float, Float]:
 def _on_ground(points: Float, ground: Ground, ceiling: float | None) -> Float:
     """Projection to street, pavements and ceiling."""
     x, y, z = points.T
-    level = ground.level(x, y)
-    gx, gy = ground.gradient(x, y)
+    level, (gx, gy) = ground.level(x, y), ground.slope
     steep = 1.0 + gx * gx + gy * gy
     above = [ground.kerb * ground.is_paved(x, y)]
     if ceiling is not None:
@@ -182,9 +181,6 @@ def _on_ellipsoid(p: Float, half: Float) -> Float:
     return np.asarray(np.copysign(found, p))
 
 
-_MIN_DEPTH = 1e-6  # m, of a point inside another part
-
-
 class MovingSurfaces(NamedTuple):
     """The parts of the movers at T scans.
 
@@ -216,94 +212,3 @@ class MovingSurfaces(NamedTuple):
         stays = np.where(share < 1.0, before, before + change)
         pose = np.where(goes_on[..., None], before + share * change, stays)
         return self.solids._replace(pose=self.solids.pose[:1]).select(parts)._replace(pose=pose)
-
-
-def sample_mover(
-    moving: MovingSurfaces, mover: int, stamp_ns: int, spacing: float
-) -> tuple[Float, NDArray[np.intp]]:
-    """Sample the surface of a mover at one time, without points inside another of its parts.
-
-    Args:
-        moving: the movers.
-        mover: number of the mover.
-        stamp_ns: time.
-        spacing: approximate distance between points, metres.
-
-    Returns:
-        (n, 3) metres in the world, none while absent; (n,) index into `moving.parts(mover)`.
-    """
-    parts = moving.parts(mover)
-    solids = moving.at(parts, stamp_ns)
-    points, which = [np.empty((0, 3))], [np.empty(0, np.intp)]
-    for k in np.flatnonzero(np.isfinite(solids.pose[0]).all(axis=1)).tolist():
-        on = to_world(_samples(solids, k, spacing), solids.pose[0, k])
-        outside = np.ones(len(on), bool)
-        for other in range(len(parts)):
-            if other != k:
-                outside &= ~_is_within(on, solids, other)
-        points.append(on[outside])
-        which.append(np.full(len(points[-1]), k, np.intp))
-    return np.concatenate(points), np.concatenate(which)
-
-
-def _is_within(points: Float, solids: Solids, k: int) -> NDArray[np.bool_]:
-    (a, b), (z0, z1) = solids.half[k] - _MIN_DEPTH, solids.z[k] + (_MIN_DEPTH, -_MIN_DEPTH)
-    u, v, w = to_local(points, solids.pose[0, k]).T
-    h, up = (z1 - z0) / 2, w - (z0 + z1) / 2
-    if solids.form[k] == BOX:
-        return np.asarray((np.abs(u) < a) & (np.abs(v) < b) & (np.abs(up) < h))
-    flat = (u / a) ** 2 + (v / b) ** 2
-    if solids.form[k] == CYLINDER:
-        return np.asarray((flat < 1.0) & (np.abs(up) < h))
-    return np.asarray(flat + (up / h) ** 2 < 1.0)
-
-
-def _samples(solids: Solids, k: int, spacing: float) -> Float:
-    """(n, 3) points on the surface of solid k, in its frame."""
-    middle, half = _middle_and_half(solids, k)
-    samples = {BOX: _box_samples, CYLINDER: _cylinder_samples}
-    return np.asarray(samples.get(solids.form[k], _ellipsoid_samples)(half, spacing) + middle)
-
-
-def _cylinder_samples(half: Float, spacing: float) -> Float:
-    flat, h = half[:2], half[2]
-    around = _even(2 * np.pi * flat.max(), spacing) * 2 * np.pi
-    angle, up = np.meshgrid(around, _along(h, spacing))
-    rim = [half[0] * np.cos(angle), half[1] * np.sin(angle), up]
-    disc = np.stack(np.meshgrid(*(_along(one, spacing) for one in flat)), axis=-1).reshape(-1, 2)
-    disc = disc[((disc / flat) ** 2).sum(axis=1) <= 1.0]
-    caps = [np.column_stack([disc, np.full(len(disc), end)]) for end in (-h, h)]
-    return np.concatenate([np.stack(rim, axis=-1).reshape(-1, 3), *caps])
-
-
-def _ellipsoid_samples(half: Float, spacing: float) -> Float:
-    rows = []
-    for tilt in ((_even(np.pi * half.max(), spacing) - 0.5) * np.pi).tolist():
-        round_it = 2 * np.pi * half[:2].max() * np.cos(tilt)
-        angle = _even(round_it, spacing) * 2 * np.pi
-        flat = np.cos(tilt) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        rows.append(half * np.column_stack([flat, np.full(len(angle), np.sin(tilt))]))
-    return np.concatenate(rows)
-
-
-def _box_samples(half: Float, spacing: float) -> Float:
-    sides = []
-    for axis in range(3):
-        others = [(axis + 1) % 3, (axis + 2) % 3]
-        grid = np.meshgrid(*(_along(half[one], spacing) for one in others))
-        for end in (-half[axis], half[axis]):
-            side = np.full((grid[0].size, 3), end)
-            side[:, others] = np.stack(grid, axis=-1).reshape(-1, 2)
-            sides.append(side)
-    return np.concatenate(sides)
-
-
-def _along(half: float, spacing: float) -> Float:
-    """Centers of equal parts of -half to half."""
-    return half * (2.0 * _even(2.0 * half, spacing) - 1.0)
-
-
-def _even(length: float, spacing: float) -> Float:
-    """Centers of equal parts of 0 to 1, each at most `spacing` / `length` long."""
-    n = max(1, int(np.ceil(length / spacing - 1e-9)))
-    return np.asarray((np.arange(n) + 0.5) / n)

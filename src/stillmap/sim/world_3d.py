@@ -5,13 +5,15 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stillmap.sim import geometry
 from stillmap.sim.dynamics import Moment, Motion
-from stillmap.sim.geometry import BOX, Faces, Ground, Part, Solids, assemble
-from stillmap.sim.options import HeightOptions
+from stillmap.sim.episode import Episode
+from stillmap.sim.geometry import BOX, Faces, Float, Ground, Part, Solids, assemble, make_pose
+from stillmap.sim.options import HeightOptions, LidarOptions
 from stillmap.sim.scene import Scene, Segment
-from stillmap.sim.truth_surfaces import StaticSurfaces
+from stillmap.sim.truth_surfaces import MovingSurfaces, StaticSurfaces
 from stillmap.sim.walls import polyline
 
 _MAX_SIZE = 6.0  # m, of a loop that is not a room or a house
@@ -186,3 +188,63 @@ def _place_part(part: Part, loop: Loop) -> Part:
     ahead = loop.x + c * part.ahead - s * part.aside
     aside = loop.y + s * part.ahead + c * part.aside
     return part._replace(ahead=ahead, aside=aside, turn=loop.heading + part.turn)
+
+
+class World(NamedTuple):
+    """A simulated scene in 3D.
+
+    Attributes:
+        episode: the motion, in the plane.
+        static: the static surfaces.
+        movers: their solids.
+        robot: (T, 6) x, y, z, roll, pitch, yaw.
+    """
+
+    episode: Episode
+    static: StaticSurfaces
+    movers: MoverSolids
+    robot: Float
+
+    @classmethod
+    def of(cls, episode: Episode) -> "World":
+        """The 3D world of an episode, with heights of people and vibration of the robot."""
+        scene, rng = episode.scene, episode.body_rng
+        slope = np.array((scene.ground.slope_x, scene.ground.slope_y))
+        pavements = np.reshape(scene.pavements, (-1, 4)).astype(float)
+        ground = Ground(slope, pavements, scene.ground.kerb)
+        movers = MoverSolids(scene, episode.motion, ground, rng)
+        robot = _shake(episode.motion.robot, ground, scene.lidar, rng)
+        return cls(episode, make_static_world(scene, ground), movers, robot)
+
+    def moment(self, scans: NDArray[np.int64], seconds: Float) -> Moment:
+        """N times: `seconds` after the stamps of scans."""
+        return Moment(self.episode.motion, scans, seconds)
+
+    def T_world_base(self, moment: Moment) -> Float:
+        """(N, 4, 4) pose of the robot at the times of a moment."""
+        x, y, z, *angles = moment.interpolate(self.robot).T
+        return make_pose(np.stack([x, y, z], axis=-1), *angles)
+
+    def collect_surfaces(self) -> tuple[StaticSurfaces, MovingSurfaces]:
+        """The surfaces at the stamps of the scans; movers that never moved are static."""
+        poses = []
+        for scan in range(len(self.robot)):
+            solids = self.movers.at(self.moment(np.array([scan]), np.zeros(1)), scan)
+            poses.append(solids.pose[0])
+        solids = solids._replace(pose=np.stack(poses))
+        moves = solids.mover >= 0
+        never = solids._replace(pose=solids.pose[:1]).select(~moves)
+        static = self.static._replace(solids=self.static.solids.concatenate(never))
+        return static, MovingSurfaces(self.episode.exact_ns, solids.select(moves))
+
+
+def _shake(robot: Float, ground: Ground, o: LidarOptions, rng: np.random.Generator) -> Float:
+    """(T, 6) x, y, z, roll, pitch, yaw of a robot (T, 3) on the ground, with vibration."""
+    x, y, yaw = robot.T
+    gx, gy = ground.slope
+    ahead, left = gx * np.cos(yaw) + gy * np.sin(yaw), gy * np.cos(yaw) - gx * np.sin(yaw)
+    shaking = rng.standard_normal((3, len(robot)))
+    shaking *= np.array([[o.vibration_roll], [o.vibration_pitch], [o.vibration_z]])
+    pitch = -np.arctan(ahead) + shaking[1]
+    roll = np.arctan(left * np.cos(np.arctan(ahead))) + shaking[0]
+    return np.stack([x, y, ground.height(x, y) + shaking[2], roll, pitch, yaw], axis=-1)

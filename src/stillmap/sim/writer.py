@@ -1,14 +1,16 @@
-"""A simulation as a folder: the recording and, beside it, the truth."""
+"""Simulations as folders: recordings and, beside them, the truth."""
 
+import json
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.arrays import write_npy
+from stillmap.core.arrays import write_npy, write_npz
 from stillmap.core.camera import Images
 from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_folder
@@ -16,10 +18,14 @@ from stillmap.io import stillmap_folder
 from stillmap.io.carmen import writer
 from stillmap.io.images import write_png
 from stillmap.io.registry import RIG_FOLDERS
+from stillmap.io.trajectory import write_tum
+from stillmap.sim import session_truth, truth
 from stillmap.sim.camera import CameraSimulator
 from stillmap.sim.scene import Scene
+from stillmap.sim.session_truth import compute_overlap, list_changes, observe
+from stillmap.sim.sessions import SessionPlan, simulate_sessions
 from stillmap.sim.simulator import RigSimulation, Simulation
-from stillmap.sim.truth import FOLDER, IMAGES, image_files, write_image_truth, write_truth
+from stillmap.sim.truth import ImageTruth, Truth, image_files
 
 Format = Literal["stillmap", "carmen"]
 
@@ -54,9 +60,9 @@ def write_simulation(
     with atomic_folder(Path(path), MARK, overwrite) as work:
         if format == "carmen":
             _write_carmen(simulation, work / CARMEN_LOG)
-            write_truth(simulation.truth, simulation.recording.stamp_ns, work)
+            _write_truth(simulation.truth, simulation.recording.stamp_ns, work)
         else:
-            write_folder(simulation, work)
+            _write_folder(simulation, work)
 
 
 def write_rig(rig: RigSimulation, path: str | Path, *, overwrite: bool = False) -> None:
@@ -69,34 +75,141 @@ def write_rig(rig: RigSimulation, path: str | Path, *, overwrite: bool = False) 
         InputError: the folder holds something already or cannot be written to.
     """
     with atomic_folder(Path(path), RIG_MARK, overwrite) as work:
-        for name, one in zip(RIG_FOLDERS, (rig.horizontal, rig.tilting), strict=True):
+        for name, simulation in zip(RIG_FOLDERS, (rig.horizontal, rig.tilting), strict=True):
             (work / name).mkdir()
-            write_folder(one, work / name)
+            _write_folder(simulation, work / name)
         write_npy(work / "joint_angle.npy", rig.joint_angle)
 
 
-def write_folder(one: Simulation, work: Path) -> None:
+def write_sessions(
+    plans: Sequence[SessionPlan],
+    path: str | Path,
+    *,
+    seed: int = 0,
+    overwrite: bool = False,
+    tell: Callable[[float], None] | None = None,
+) -> list[dict[str, Any]]:
+    """Simulate sessions and write them into one folder that appears complete or not at all.
+
+    Args:
+        plans: most often one; sessions of several plans are those of different places.
+        path: the folder: session-1, session-2 ... and sessions.json.
+        seed: of the plan, for the record.
+        overwrite: replace earlier sessions.
+        tell: called with the completed share.
+
+    Returns:
+        Of each session its name and numbers of scans, beams, hits and hits on movers.
+
+    Raises:
+        InputError: no room for robot or people, or the folder holds something already.
+    """
+    total = sum(len(plan.scenes) for plan in plans)
+    about: list[dict[str, Any]] = []
+    sights, counts = [], []
+    with atomic_folder(Path(path), session_truth.MARK, overwrite) as work:
+        for place, plan in enumerate(plans):
+            for simulation in simulate_sessions(plan):
+                name = f"session-{len(about) + 1}"
+                (work / name).mkdir()
+                _write_folder(simulation, work / name)
+                about.append({"name": name, "place": place, **_describe(simulation)})
+                sights.append(observe(simulation))
+                counts.append({"name": name, **_count(simulation)})
+                if tell is not None:
+                    tell(len(about) / total)
+        names, places = ([session[key] for session in about] for key in ("name", "place"))
+        objects, scene = plans[0].objects if len(plans) == 1 else (), plans[0].scenes[0]
+        changes = list_changes(objects, scene.heights if scene.in_3d else None)
+        tree = {
+            "format_version": 1,
+            "scene": [plan.name for plan in plans],
+            "seed": seed,
+            "sessions": about,
+            "objects": [item.to_dict(number) for number, item in enumerate(objects)],
+            "changes": [change.to_dict(number, names) for number, change in enumerate(changes)],
+            "overlap": np.round(compute_overlap(sights, places), 4).tolist(),
+        }
+        text = json.dumps(tree, indent=1) + "\n"
+        (work / session_truth.FILE).write_text(text, encoding="utf-8")
+    return counts
+
+
+def _describe(simulation: Simulation) -> dict[str, Any]:
+    scene, recording = simulation.scene, simulation.recording
+    sensor = scene.lidar if scene.in_3d else scene.laser
+    return {
+        "T_world_session": simulation.truth.T_world_base[0].tolist(),
+        "first_stamp_ns": int(recording.stamp_ns[0]),
+        "scans": recording.n_scans,
+        "beams_per_scan": scene.lidar.columns if scene.in_3d else scene.laser.beams,
+        "fov": 2 * np.pi if scene.in_3d else scene.laser.fov,
+        "mount": [sensor.x, sensor.y, sensor.yaw],
+    }
+
+
+def _count(simulation: Simulation) -> dict[str, int]:
+    return {
+        "scans": simulation.recording.n_scans,
+        "beams": simulation.recording.n_beams,
+        "hits": int(np.count_nonzero(simulation.recording.hit)),
+        "dynamic": int(np.count_nonzero(simulation.truth.mover >= 0)),
+    }
+
+
+def _write_folder(simulation: Simulation, work: Path) -> None:
     """A recording folder with its truth, and pictures with theirs, into an existing folder."""
-    recording = one.recording
-    write_truth(one.truth, recording.stamp_ns, work)
-    if one.photographs is not None and one.surfaces is not None:
-        write_image_truth(one.surfaces, work / FOLDER)
-        images = _write_truth_on_read(one.photographs, work / FOLDER)
+    recording = simulation.recording
+    _write_truth(simulation.truth, recording.stamp_ns, work)
+    if simulation.photographs is not None and simulation.surfaces is not None:
+        _write_image_truth(simulation.surfaces, work / truth.FOLDER)
+        images = _write_truth_on_read(simulation.photographs, work / truth.FOLDER)
         recording = replace(recording, images=images)
     stillmap_folder.write_into(recording, work)
 
 
+def _write_truth(of_beams: Truth, stamp_ns: NDArray[np.int64], folder: Path) -> None:
+    inside = folder / truth.FOLDER
+    inside.mkdir()
+    for name in (*truth.ARRAYS, *truth.OPTIONAL):
+        array = getattr(of_beams, name)
+        if array is not None and (name in truth.ARRAYS or len(array)):
+            write_npy(inside / f"{name}.npy", np.asarray(array))
+    write_tum(inside / "trajectory.tum", stamp_ns, of_beams.T_world_base)
+    scene = json.dumps(of_beams.scene, indent=1) + "\n"
+    (inside / truth.SCENE).write_text(scene, encoding="utf-8")
+
+
+def _write_image_truth(surfaces: ImageTruth, folder: Path) -> None:
+    """All but masks and distances."""
+    faces, solids, ground, ceiling = surfaces.standing
+    standing: dict[str, NDArray[Any]] = {
+        "faces_ends": faces.ends,
+        "faces_z": faces.z,
+        "faces_glass": faces.is_glass,
+        **{f"solids_{name}": value for name, value in solids._asdict().items()},
+        **{f"ground_{name}": np.asarray(value) for name, value in ground._asdict().items()},
+        "ceiling": np.array(np.nan if ceiling is None else ceiling),
+        "colour_seed": np.array(surfaces.colour_seed),
+    }
+    write_npz(folder / truth.STANDING, standing)
+    moving = surfaces.moving.solids._asdict()
+    write_npy(folder / truth.POSE, moving.pop("pose"))
+    write_npz(folder / truth.MOVING, {"stamp_ns": surfaces.moving.stamp_ns, **moving})
+    write_npy(folder / truth.CAMERAS, surfaces.T_world_camera)
+
+
 def _write_truth_on_read(photographs: CameraSimulator, folder: Path) -> Images:
     """The images; reading one writes its truth, so that each is rendered once only."""
-    (folder / IMAGES).mkdir()
+    (folder / truth.IMAGES).mkdir()
 
     def load(image: int) -> NDArray[np.uint8]:
-        one = photographs.render(image)
+        seen = photographs.render(image)
         mask, distance = image_files(folder, image)
-        write_png(one.mask, mask)
-        near = np.where(one.distance < _MAX_DISTANCE, one.distance, 0.0)
+        write_png(seen.mask, mask)
+        near = np.where(seen.distance < _MAX_DISTANCE, seen.distance, 0.0)
         write_png(np.rint(1e3 * near).astype(np.uint16), distance)
-        return one.color
+        return seen.color
 
     images = photographs.images
     return Images(images.stamp_ns, images.camera, images.cameras, load)

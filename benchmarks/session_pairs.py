@@ -8,9 +8,14 @@ import numpy as np
 
 from stillmap.core.errors import InputError
 from stillmap.sim.scene import Scene
-from stillmap.sim.session_overlap import compute_overlap, observe
-from stillmap.sim.session_routes import Region
-from stillmap.sim.sessions import SessionOptions, SessionPlan, plan_sessions, simulate_sessions
+from stillmap.sim.session_truth import compute_overlap, observe
+from stillmap.sim.sessions import (
+    Region,
+    SessionOptions,
+    SessionPlan,
+    plan_sessions,
+    simulate_sessions,
+)
 from stillmap.sim.worlds import scene_by_name
 
 _STARTS, _HALVINGS = 8, 7  # of two regions, and of what they share until it is as wanted
