@@ -122,7 +122,7 @@ def test_a_shifted_session_is_found(truth, perfect, tmp_path, shift, verdict) ->
 @pytest.mark.slow
 def test_sessions_of_another_place_must_be_refused(tmp_path: Path) -> None:
     scenes = [scene_by_name(f"lookalike-{k}", QUICK) for k in (1, 2)]
-    plans = [plan_sessions(scene, SessionOptions(1)) for scene in scenes]
+    plans = [plan_sessions(scene, SessionOptions(1), k) for k, scene in enumerate(scenes)]
     write_sessions(plans, tmp_path / "days")
     truth = load_session_truth(tmp_path / "days")
     write_place(tmp_path / "merged", truth)

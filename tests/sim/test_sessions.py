@@ -208,7 +208,7 @@ def test_robots_stay_in_their_regions() -> None:
 
 def test_places_have_nothing_in_common(tmp_path: Path) -> None:
     scenes = [quick_scene("lookalike-1"), quick_scene("lookalike-2")]
-    plans = [plan_sessions(scene, SessionOptions(1)) for scene in scenes]
+    plans = [plan_sessions(scene, SessionOptions(1), k) for k, scene in enumerate(scenes)]
     write_sessions(plans, tmp_path / "days")
     truth = load_session_truth(tmp_path / "days")
     np.testing.assert_array_equal(truth.place, [0, 1])
