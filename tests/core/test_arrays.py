@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from stillmap.core import arrays
-from stillmap.core.array_builder import ArrayBuilder, append_together
+from stillmap.core.array_builder import ArrayBuilder
 from stillmap.io import builder
 from stillmap.io.builder import ReadContext, RecordingBuilder
 from stillmap.prepare.options import ReadOptions
@@ -66,71 +66,14 @@ def test_a_full_disk_is_an_error(monkeypatch):
             ArrayBuilder(np.float32).append(np.ones(3))
 
 
-def test_what_could_not_be_written_is_written_once_there_is_room(tmp_path, rng, limit_files):
-    column = ArrayBuilder(np.float32, (3,), tmp_path, in_memory=1000)
-    rows = rng.normal(size=(4000, 3)).astype(np.float32)
-    limit_files(20_001)  # amid a row
-    failures, views = 0, []
-    for first in range(0, 4000, 10):
-        try:
-            column.append(rows[first : first + 10])
-        except OSError:
-            failures += 1
-        assert len(column) == first + 10
-        if first % 500 == 0:
-            views.append((first + 10, column.view(), column.parts()))
-        if first == 3000:
-            limit_files(None)
-    assert 1 <= failures < 30  # not tried at every row
-    assert column.memory_bytes <= 1000
-    for length, view, parts in views:
-        np.testing.assert_array_equal(view, rows[:length])
-        np.testing.assert_array_equal(np.concatenate(parts), rows[:length])
-    for at in (0, 1600, 3995, 3999):
-        np.testing.assert_array_equal(column.row(at), rows[at])
-    np.testing.assert_array_equal(column.finish(), rows)
-
-
-@pytest.mark.parametrize("last", [3, 200, 4000])
-def test_some_of_the_last_rows_are_dropped(tmp_path, rng, last):
-    """In memory, and in the file."""
-    column = ArrayBuilder(np.float32, (3,), tmp_path, in_memory=1000)
-    rows = rng.normal(size=(4000, 3)).astype(np.float32)
-    column.append(rows[:3990])
-    column.append(rows[3990:])
-    assert column.written == 3990
-    column.select_last(np.arange(last) % 2 == 0)
-    expected = np.concatenate([rows[: 4000 - last], rows[4000 - last :: 2]])
-    np.testing.assert_array_equal(np.concatenate(column.parts()), expected)
-    column.append(rows)
-    np.testing.assert_array_equal(column.finish(), np.concatenate([expected, rows]))
-
-
-def test_arrays_that_grow_together_stay_of_one_length(tmp_path, limit_files):
-    both = {row: ArrayBuilder(np.int64, row, tmp_path, in_memory=0) for row in ((8,), ())}
-    limit_files(1000)
-    failures = 0
-    for number in range(100):
-        try:
-            append_together((array, np.full((1, *row), number)) for row, array in both.items())
-        except OSError:
-            failures += 1
-        assert {len(array) for array in both.values()} == {number + 1}
-    assert failures
-    for array in both.values():
-        np.testing.assert_array_equal(array.view().reshape(100, -1)[:, 0], np.arange(100))
-        array.close()
-
-
-def test_small_parts_and_structures(tmp_path):
+def test_small_parts_and_structures(tmp_path, monkeypatch):
+    monkeypatch.setattr(arrays, "MAX_BYTES_IN_MEMORY", 40_000)
     kind = np.dtype([("number", np.int32), ("pose", float, (2, 2))], align=True)
-    column = ArrayBuilder(kind, (), tmp_path, in_memory=40_000)
+    column = ArrayBuilder(kind, (), tmp_path)
     rows = np.zeros(3000, kind)
     rows["number"], rows["pose"] = np.arange(3000), np.arange(12_000.0).reshape(-1, 2, 2)
     for at in range(3000):
         column.append(rows[at : at + 1])
-        assert column.row(at) == rows[at]
-    assert len(column.parts()) == 2
     np.testing.assert_array_equal(column.view(), rows)
     column.close()
 

@@ -7,13 +7,9 @@ import pytest
 
 from stillmap.core.errors import InputError
 from stillmap.fleet.summary import summarize_result
-from stillmap.live.drive_folder import keep_drive, read_drive
 from stillmap.live.known_cloud import KnownCloud
 from stillmap.live.known_map import KnownMap
-from stillmap.live.mapper import LiveMapper
-from stillmap.live.replay import iter_beams
 from stillmap.results.reader import read_grid
-from stillmap.sim import scene_by_name, simulate
 
 VERTEX = np.dtype([(name, "<f4") for name in ("x", "y", "z", "p_static")])
 
@@ -126,114 +122,6 @@ def test_poses_from_where_it_was_made(place, route):
     np.save(place / "live/known_route.npy", route)
     with pytest.raises(InputError, match=r"known_route\.npy"):
         open_cloud(place)
-
-
-@pytest.mark.parametrize(
-    "extended",
-    [
-        {},
-        {"origin": 0.0, "resolution": 0.1},
-        {"origin": [0.0, 0.0], "resolution": 0.1},
-        {"origin": [0.0, 0.0, 1e300], "resolution": 0.1},
-        {"origin": [0.0, 0.0, 0.0], "resolution": [0.1]},
-        {"origin": [0.0, 0.0, 0.0], "resolution": 0.0},
-    ],
-)
-def test_the_known_map_of_a_kept_drive(kept_drive, extended):
-    for name in ("p_occupied", "hits"):
-        np.save(kept_drive / f"{name}.npy", np.ones((3, 3), np.float32))
-    record = json.loads((kept_drive / "drive.json").read_text())
-    (kept_drive / "drive.json").write_text(json.dumps({**record, "extended": extended}))
-    with pytest.raises(InputError, match=r"drive\.json: is damaged"):
-        read_drive(kept_drive)
-
-
-def test_layers_of_a_kept_drive(kept_drive):
-    for name in ("p_occupied", "hits"):
-        np.save(kept_drive / f"{name}.npy", np.full(3, "x"))
-    extended = {"origin": [0.0, 0.0, 0.0], "resolution": 0.1}
-    record = json.loads((kept_drive / "drive.json").read_text())
-    (kept_drive / "drive.json").write_text(json.dumps({**record, "extended": extended}))
-    with pytest.raises(InputError, match="its known map does not fit"):
-        read_drive(kept_drive)
-
-
-def spoil(field, value):
-    """A change of the answers."""
-
-    def change(answers):
-        answers[field] = value
-        return answers
-
-    return change
-
-
-@pytest.mark.parametrize(
-    ("name", "change", "said"),
-    [
-        ("number", lambda a: a[0], "do not fit"),
-        ("number", lambda a: a[::-1], "do not rise"),
-        ("number", lambda a: a - 9, "do not rise"),
-        ("counts", lambda a: a * 0 + 2**62, "do not fit"),
-        ("submap", lambda a: a + 2**62, "submap"),
-        ("submap", lambda a: a - 2, "submap"),
-        ("poses", lambda a: a * np.nan, "pose"),
-        ("poses", lambda a: a * 1e300, "pose"),
-        ("answers", spoil("stamp_ns", 2**62), "stamps"),
-        ("answers", spoil("pose", np.inf), "pose"),
-        ("answers", lambda a: a[::-1], "stamps"),
-        ("answers", spoil("twist", np.nan), "twist"),
-        ("answers", spoil("sensor", 7), "sensor"),
-    ],
-)
-def test_scans_of_a_kept_drive(kept_drive, name, change, said):
-    path = kept_drive / f"{name}.npy"
-    np.save(path, change(np.load(path)))
-    with pytest.raises(InputError, match=rf"drive\.json: is damaged: .*{said}"):
-        read_drive(kept_drive)
-
-
-@pytest.mark.parametrize(
-    ("name", "kind", "value"),
-    [
-        ("points", np.float32, np.inf),
-        ("points", np.float32, 1e30),
-        ("p_static", np.float32, 3.0),
-        ("time", np.float32, np.nan),
-    ],
-)
-def test_beams_of_a_kept_drive(kept_drive, name, kind, value):
-    path = kept_drive / f"{name}-0"
-    beams = np.fromfile(path, kind)
-    beams[7] = value
-    path.unlink()  # beside it the drive has its own
-    beams.tofile(path)
-    with pytest.raises(InputError, match=r"drive\.json: is damaged: a beam"):
-        read_drive(kept_drive)
-
-
-@pytest.mark.parametrize("value", [-1.0, 2.0, 1e30, np.inf])
-def test_values_of_the_map_of_a_kept_drive(kept_drive, value):
-    np.save(kept_drive / "hits.npy", np.ones((3, 3), np.float32))
-    np.save(kept_drive / "p_occupied.npy", np.full((3, 3), value, np.float32))
-    extended = {"origin": [0.0, 0.0, 0.0], "resolution": 0.1}
-    record = json.loads((kept_drive / "drive.json").read_text())
-    (kept_drive / "drive.json").write_text(json.dumps({**record, "extended": extended}))
-    with pytest.raises(InputError, match="its known map holds"):
-        read_drive(kept_drive)
-
-
-def test_a_kept_drive_is_read(kept_drive):
-    assert len(read_drive(kept_drive).kept.number) == 5
-
-
-@pytest.fixture
-def kept_drive(tmp_path):
-    recording = simulate(scene_by_name("corridor", {"robot": {"scans": 5}}), 3).recording
-    with LiveMapper({"threads": 1}) as mapper:
-        for beams in iter_beams(recording):
-            mapper.push(beams)
-        return keep_drive(mapper.snapshot(), tmp_path)
 
 
 @pytest.mark.parametrize("changes", [5, None, "many", {"kind": "door"}])

@@ -3,11 +3,9 @@ away does not, what is new comes in, and nobody who walked through."""
 
 import json
 from dataclasses import replace
-from itertools import islice
 
 import numpy as np
 import pytest
-from result_contents import contents
 from rooms_3d import (
     AND_BACK,
     BOTH_ROOMS,
@@ -31,7 +29,6 @@ from stillmap.em import OccupancyMap
 from stillmap.io import stillmap_folder
 from stillmap.io.point_cloud.ply import read_layout
 from stillmap.live.cloud_extension import KeptCloud, write_extended_cloud
-from stillmap.live.drive_folder import keep_drive, read_drive
 from stillmap.live.known_cloud import KnownCloud
 from stillmap.live.known_map import KnownMap
 from stillmap.live.map_extension import KeptMap, extend_map
@@ -164,22 +161,6 @@ def test_it_is_converted_with_what_was_known(rooms, drive, tmp_path):
     words = ["convert", str(folder), "--input", str(tmp_path / "in"), "--only", "static", "-o"]
     assert main([*words, str(tmp_path / "out.ply")]) == 0
     assert read_layout(tmp_path / "out.ply").rows == read_layout(folder / "static.ply").rows
-
-
-def test_a_drive_that_was_kept_makes_the_same(rooms, tmp_path):
-    _, known, second = rooms
-    options = {"threads": 1, "objects.enabled": False}
-    with LiveMapper(options, place=known, mode="extend") as mapper:
-        for beams in islice(iter_beams(second.recording), 35):
-            update = mapper.push(beams)
-        assert "lost" not in update.doubts
-        kept = keep_drive(mapper.snapshot(), tmp_path)
-        mapper.save(tmp_path / "at once")
-    read_drive(kept).save(tmp_path / "later")
-    assert contents(tmp_path / "later") == contents(tmp_path / "at once")
-    np.save(kept / "known_points.npy", np.zeros((3, 2)))
-    with pytest.raises(InputError, match="known cloud does not fit"):
-        read_drive(kept)
 
 
 def test_it_can_be_extended_again(rooms, drive):

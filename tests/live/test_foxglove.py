@@ -16,12 +16,12 @@ import pytest
 pytest.importorskip("foxglove")
 
 from foxglove_client import Client, grid_of, points_of, pose_of, stamp_of
+from stillmap.live.foxglove.server import FoxgloveServer
+from stillmap.live.foxglove.tile_map import TileMap
 
 from stillmap.cli.main import main
 from stillmap.core.errors import InputError, MissingExtra
 from stillmap.live.causal_labels import MapChange
-from stillmap.live.foxglove.server import FoxgloveServer
-from stillmap.live.foxglove.tile_map import TileMap
 from stillmap.live.movers import Mover
 from stillmap.live.scan import Scan, to_beams
 from stillmap.live.update import Update

@@ -6,14 +6,14 @@ import pytest
 foxglove = pytest.importorskip("foxglove")
 
 from foxglove_client import Schemas, grid_of, points_of, pose_of, stamp_of, to_matrix  # noqa: E402
-
-import stillmap  # noqa: E402
-from stillmap.core import se2, se3  # noqa: E402
-from stillmap.live.causal_labels import MapChange  # noqa: E402
 from stillmap.live.foxglove import schemas  # noqa: E402
 from stillmap.live.foxglove.answer import Answer, Movers, pack_answer, unpack_answer  # noqa: E402
 from stillmap.live.foxglove.mailbox import Mailbox  # noqa: E402
 from stillmap.live.foxglove.tile_map import TileMap, join_cells, to_percent  # noqa: E402
+
+import stillmap  # noqa: E402
+from stillmap.core import se2, se3  # noqa: E402
+from stillmap.live.causal_labels import MapChange  # noqa: E402
 
 NAN = np.nan
 STAMP = 1_700_000_000_123_456_789

@@ -5,7 +5,7 @@ import io
 import numpy as np
 import pytest
 
-from stillmap.live.messages import read_message, write_message
+from stillmap.live.loop_process import read_message, write_message
 
 
 def written(arrays):

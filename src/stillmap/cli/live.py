@@ -1,22 +1,23 @@
 """`stillmap live`: map while scans arrive, from a robot in ROS 2 or from a recording."""
 
 import argparse
+import math
 import tempfile
-import threading
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from stillmap.cli.arguments import add_read_flags, make_parents, read_changes, require_apart
 from stillmap.cli.config import add_option_flags, options_from_args
 from stillmap.cli.console import print_json, say, show_progress, show_share
-from stillmap.cli.live_foxglove import add_foxglove_flags, serve
 from stillmap.cli.map_flags import add_map_mode_flag, add_run_flags, shared_changes
-from stillmap.core.errors import InputError
+from stillmap.core.errors import InputError, import_extra
 
 if TYPE_CHECKING:
     from stillmap.core.recording import Recording
-    from stillmap.live.replay import Latency
+    from stillmap.live.replay import Latency, Show
     from stillmap.pipeline.options import Options
 
 DESCRIPTION = (
@@ -24,7 +25,9 @@ DESCRIPTION = (
     "follow from what is known at the time. Alone it is a node in ROS 2, which must be sourced "
     "first; Ctrl-C ends it and writes DIR. With --replay the scans of a recording are pushed as "
     "fast as possible, and the result is the same to the bit every time. DIR has what `stillmap "
-    "map` writes, of what is known at the end, and in live/ what was answered at the time."
+    "map` writes, of what is known at the end, and in live/ what was answered at the time. The "
+    "drive itself is written to DIR/recording while it lasts: `stillmap map DIR/recording` reads "
+    "it, whatever has happened."
 )
 EPILOG = """examples:
   stillmap live --replay log.clf.gz -o out
@@ -32,65 +35,43 @@ EPILOG = """examples:
   stillmap live --replay log.bag -o out --rate 1
   stillmap live --replay log.bag -o out --rate 1 --foxglove
   stillmap live --replay tuesday.bag --map monday -o out
-  stillmap live --drive /tmp/stillmap-drive-abc -o elsewhere
   stillmap live -o out --ros-args -p base_frame:=base_link -r scan:=front/scan
 """
 
 
 def add_arguments(p: argparse.ArgumentParser) -> None:
     """Add the flags and arguments."""
-    p.add_argument(
-        "--replay",
-        metavar="INPUT",
-        help="a recording (default: a ROS 2 node that maps until Ctrl-C)",
-    )
-    p.add_argument(
-        "--drive",
-        metavar="FOLDER",
-        help="write the result of a drive that was kept because its disk was full, and remove "
-        "FOLDER; the options are those of the drive",
-    )
+
+    def add(flag: str, metavar: str | None, text: str, **more: Any) -> None:
+        if metavar is None and not more:
+            more = {"action": "store_true"}
+        elif metavar is not None:
+            more["metavar"] = metavar
+        p.add_argument(flag, help=text, **more)
+
+    add("--replay", "INPUT", "a recording (default: a ROS 2 node that maps until Ctrl-C)")
     p.add_argument("-o", "--output", metavar="DIR", required=True, help="result folder")
-    p.add_argument("--overwrite", action="store_true", help="replace what is in DIR")
-    p.add_argument(
-        "--rate",
-        metavar="X",
-        type=float,
-        help="push scans at X times the speed of the recording, loops closed beside; a scan that "
-        "is due while earlier ones wait is dropped (default: one after another, the same to the "
-        "bit every time)",
-    )
-    p.add_argument(
-        "--map",
-        metavar="DIR",
-        help="a result or a place in whose map the robot is localized (default: map anew)",
-    )
-    p.add_argument(
-        "--mode",
-        choices=("localise", "extend"),
-        default="localise",
-        help="whether the map of --map stays as it is, or what is seen is added "
-        "(default: localise)",
-    )
-    p.add_argument(
-        "--max-scratch",
-        metavar="GB",
-        type=float,
-        help="disk, about, that the beams of all scans may take in temporary files: beyond, every "
-        "second one of the scans that lie most densely is dropped (default: all are kept)",
-    )
-    p.add_argument("--no-odometry", action="store_true", help="ignore odometry in the recording")
-    p.add_argument(
-        "--resolution", metavar="M", type=float, help="edge of a map cell in metres (default: 0.05)"
-    )
-    add_foxglove_flags(p)
-    add_map_mode_flag(p)
-    add_run_flags(p)
-    add_read_flags(p)
-    add_option_flags(p)
-    p.add_argument(
-        "--ros-args", nargs=argparse.REMAINDER, default=[], help="of the node, up to the end"
-    )
+    add("--overwrite", None, "replace what is in DIR")
+    text = "push scans at X times the speed of the recording, loops closed beside; a scan that is "
+    text += "due while earlier ones wait is dropped (default: one after another, the same to the "
+    add("--rate", "X", text + "bit every time)", type=float)
+    text = "a result or a place in whose map the robot is localized (default: map anew)"
+    add("--map", "DIR", text)
+    text = "whether the map of --map stays as it is, or what is seen is added (default: localise)"
+    add("--mode", None, text, choices=("localise", "extend"), default="localise")
+    text = "disk, about, that the beams of the drive may take: beyond, poses go on, but no scan is "
+    add("--max-scratch", "GB", text + "kept (default: all are)", type=float)
+    add("--no-odometry", None, "ignore odometry in the recording")
+    add("--resolution", "M", "edge of a map cell in metres (default: 0.05)", type=float)
+    text = "serve map, scans, pose and path to Foxglove or Lichtblick on this machine, over a "
+    add("--foxglove", None, text + "WebSocket; needs the extra `live`")
+    text = "where --foxglove listens; who reaches it can watch (default: 127.0.0.1)"
+    add("--host", "ADDRESS", text)
+    add("--port", "N", "port of --foxglove; 0: a free one (default: 8765)", type=int)
+    for add_more in (add_map_mode_flag, add_run_flags, add_read_flags, add_option_flags):
+        add_more(p)
+    text = "of the node, up to the end"
+    p.add_argument("--ros-args", nargs=argparse.REMAINDER, default=[], help=text)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -100,80 +81,98 @@ def run(args: argparse.Namespace) -> int:
         InputError: ROS is missing, the recording cannot be read or does not suit the map, or the
             output is taken.
     """
-    if args.drive is not None:
-        return _save_drive(args)
-    if args.replay is None:
-        from stillmap.cli.live_node import run_node
-
-        return run_node(args)
-    return _replay(args)
-
-
-def _replay(args: argparse.Namespace) -> int:
-    from stillmap.cli.live_node import mapper_settings
-    from stillmap.core.files import require_new
-    from stillmap.live.last_save import save_last
-    from stillmap.live.mapper import LiveMapper
-    from stillmap.live.replay import replay
-    from stillmap.results.run_json import RECORD
+    from stillmap.live.history import FOLDER
+    from stillmap.live.saving import require_place_for_drive
 
     options = options_from_args(args, read_changes(args), shared_changes(args))
+    output, limit = Path(args.output), args.max_scratch
     if args.rate is not None and not args.rate > 0.0:
         raise InputError(f"--rate: expected a positive number, got {args.rate:g}")
-    settings, output = mapper_settings(args), Path(args.output)
-    require_new(output, RECORD, args.overwrite)
-    require_apart(output, Path(args.replay))
+    if limit is not None and not 1e-4 <= limit < math.inf:
+        raise InputError(f"--max-scratch: expected at least 0.0001 GB, got {limit:g}")
+    require_place_for_drive(output, args.overwrite)
+    if args.replay is not None:
+        require_apart(output, Path(args.replay))
+    elif args.no_odometry or args.json or args.rate is not None:
+        raise InputError("--no-odometry, --rate and --json are for --replay")
     with (
         make_parents(output),
         tempfile.TemporaryDirectory(prefix="stillmap-") as scratch,
-        serve(args) as show,
+        _serve(args) as show,
     ):
-        recording = _read(args, options, Path(scratch))
-        in_background = args.rate is not None
-        with (
-            LiveMapper(options, **settings, background=in_background, scratch=scratch) as mapper,
-            show_progress(args.quiet, 1) as progress,
-            _stop_flag(args) as stop,
-        ):
-            latency = replay(recording, mapper, progress, args.rate, show, stop)
-            has_scans = len(latency.seconds) > 0
-            if has_scans:
-                save_last(mapper.snapshot(), output, overwrite=args.overwrite, progress=progress)
+        settings = {
+            "place": args.map,
+            "mode": args.mode,
+            "background": args.replay is None or args.rate is not None,
+            "folder": output / FOLDER,
+            "scratch": scratch,
+            "max_scratch": None if limit is None else math.ceil(1e9 * limit),
+        }
+        work = _run_node if args.replay is None else _replay
+        return work(args, options, settings, show)
+
+
+def _replay(
+    args: argparse.Namespace, options: "Options", settings: dict[str, Any], show: "Show | None"
+) -> int:
+    from stillmap.live.mapper import LiveMapper
+    from stillmap.live.replay import replay, signal_flag
+
+    recording = _read(args, options, Path(settings["scratch"]))
+    # Ctrl-C ends the drive then, not the command
+    stops = args.foxglove or args.rate is not None
+    with (
+        LiveMapper(options, **settings) as mapper,
+        show_progress(args.quiet, 1) as progress,
+        signal_flag() if stops else nullcontext() as stop,
+    ):
+        latency = replay(recording, mapper, progress, args.rate, show, stop)
+        has_scans = len(latency.seconds) > 0
+        if has_scans:
+            mapper.save(args.output, overwrite=args.overwrite, progress=progress)
     if not args.quiet:
         say(describe(latency))
-        say(f"wrote {output}" if has_scans else "no scan was mapped: nothing was written")
+        say(f"wrote {args.output}" if has_scans else "no scan was mapped: nothing was written")
     if args.json:
-        print_json({"output": str(output) if has_scans else None, **latency.to_dict()})
+        print_json({"output": args.output if has_scans else None, **latency.to_dict()})
     return 0
 
 
-def _save_drive(args: argparse.Namespace) -> int:
-    from stillmap.core.files import require_new
-    from stillmap.live.drive_folder import read_drive, remove_drive
-    from stillmap.results.run_json import RECORD
+def _run_node(
+    args: argparse.Namespace, options: "Options", settings: dict[str, Any], show: "Show | None"
+) -> int:
+    """Map until Ctrl-C or SIGTERM, then write the result."""
+    from stillmap.live.mapper import LiveMapper
+    from stillmap.live.ros.run import run
 
-    output, folder = Path(args.output), Path(args.drive)
-    if args.replay is not None or args.map is not None or args.config or args.assignments:
-        raise InputError("--drive excludes --replay, --map, --config and --set")
-    require_new(output, RECORD, args.overwrite)
-    require_apart(output, folder)
-    with make_parents(output), show_progress(args.quiet, 1) as progress:
-        read_drive(folder).save(output, overwrite=args.overwrite, progress=progress)
-    remove_drive(folder)
+    scans = run(
+        options,
+        Path(args.output),
+        ["--ros-args", *args.ros_args],
+        overwrite=args.overwrite,
+        make_mapper=partial(LiveMapper, **settings),
+        show_progress=partial(show_progress, args.quiet, 1),
+        show=show,
+    )
     if not args.quiet:
-        say(f"wrote {output}, and removed {folder}")
-    if args.json:
-        print_json({"output": str(output)})
+        say(f"wrote {args.output}" if scans else "no scan arrived: nothing was written")
     return 0
 
 
-def _stop_flag(
-    args: argparse.Namespace,
-) -> "AbstractContextManager[threading.Event | None]":
-    """An event that Ctrl-C sets with --rate or --foxglove: it ends the drive, not the command."""
-    from stillmap.live.stopping import signal_flag
+@contextmanager
+def _serve(args: argparse.Namespace) -> "Iterator[Show | None]":
+    """A function to call with each scan and its update; None without --foxglove."""
+    if not args.foxglove:
+        if args.host is not None or args.port is not None:
+            raise InputError("--host and --port are for --foxglove")
+        yield None
+        return
+    import_extra("foxglove", "the live view", "served", group="live")
+    from stillmap.live.foxglove_server import HOST, PORT, FoxgloveServer
 
-    return signal_flag() if args.foxglove or args.rate is not None else nullcontext()
+    with FoxgloveServer(args.host or HOST, PORT if args.port is None else args.port) as server:
+        say(f"seen live at {server.url}, in Foxglove or Lichtblick")
+        yield server.show
 
 
 def _read(args: argparse.Namespace, options: "Options", scratch: Path) -> "Recording":

@@ -132,7 +132,7 @@ def read_model(path: Path, kind: type[Model], hint: str = "") -> Model:
     return parse(record, kind, path, hint)
 
 
-def open_npy(path: Path, scratch: Path | None = None) -> NDArray[Any]:
+def open_npy(path: Path, scratch: Path | None = None, rows: int | None = None) -> NDArray[Any]:
     """Read a `.npy` file: an array that cannot be written, memory-mapped where it is large.
 
     What is mapped is a copy, for the file may become shorter; see `core.input_files`.
@@ -140,6 +140,7 @@ def open_npy(path: Path, scratch: Path | None = None) -> NDArray[Any]:
     Args:
         path: the file.
         scratch: folder of the copy; None: the system's.
+        rows: how many there are, of a file that still grows; None: as its header says.
 
     Raises:
         InputError: it is missing, damaged, or holds Python objects.
@@ -147,6 +148,8 @@ def open_npy(path: Path, scratch: Path | None = None) -> NDArray[Any]:
     with InputFile(path) as file:
         try:
             shape, is_fortran, dtype = _read_npy_header(file)
+            if rows is not None:
+                shape = (rows, *shape[1:])
             size = math.prod(shape) * dtype.itemsize
             if dtype.hasobject or size > file.size - file.tell():
                 raise ValueError(f"no {shape} {dtype} follow its header")
@@ -163,6 +166,22 @@ def open_npy(path: Path, scratch: Path | None = None) -> NDArray[Any]:
             raise InputError(f"is damaged: {error}", where=str(path)) from error
     array.flags.writeable = False
     return array
+
+
+def count_rows(path: Path) -> int:
+    """Rows of a `.npy` file that still grows, by its size.
+
+    Raises:
+        InputError: it is missing or damaged.
+    """
+    with InputFile(path) as file:
+        try:
+            shape, _, dtype = _read_npy_header(file)
+            return (file.size - file.tell()) // (math.prod(shape[1:]) * dtype.itemsize)
+        except InputError:
+            raise
+        except Exception as error:  # the header parser fails in many ways
+            raise InputError(f"is damaged: {error}", where=str(path)) from error
 
 
 def _read_npy_header(file: InputFile) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:

@@ -1,5 +1,6 @@
 """stillmap's recording folder: `recording.json`, arrays as `.npy` files, images as PNG files.
 
+While a drive lasts the header says `open`, and the files count: the last whole scan ends it.
 Images of floats (depth in metres) are `.npy` files of float32.
 """
 
@@ -11,7 +12,7 @@ from typing import Annotated, Any, Literal, NotRequired, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.array_folder import open_npy
+from stillmap.core.array_folder import count_rows, open_npy
 from stillmap.core.arrays import iter_blocks, write_npy
 from stillmap.core.camera import Camera, Images
 from stillmap.core.config import Limits
@@ -129,6 +130,7 @@ class _Header(TypedDict):
     odometry: NotRequired[bool]
     beam_times: NotRequired[bool]
     recorded_poses: NotRequired[bool]
+    open: NotRequired[bool]
     images: NotRequired[_Count]
     cameras: NotRequired[list[_CameraHeader]]
 
@@ -187,19 +189,22 @@ def read(path: Path, scratch: Path | None = None) -> Recording:
         InputError: a file is missing, damaged, or inconsistent with the others.
     """
     header = _read_header(path / HEADER)
+    grows = bool(header.get("open"))
+    if grows:
+        header |= _count_whole_scans(path, header)
     T, M, S, D = (header[key] for key in ("scans", "beams", "sensors", "dimension"))
     T_odom_base = T_recorded_base = beam_time = None
     if header.get("odometry"):
-        T_odom_base = _read_poses(path, "T_odom_base", T, D)
+        T_odom_base = _read_poses(path, "T_odom_base", T, D, grows)
     if header.get("recorded_poses"):
-        T_recorded_base = _read_poses(path, "T_recorded_base", T, D)
+        T_recorded_base = _read_poses(path, "T_recorded_base", T, D, grows)
     if header.get("beam_times"):
-        beam_time = _open_array(path, "beam_time", (M,), np.float32, scratch)
-    stamp_ns = np.array(_open_array(path, "stamp_ns", (T,), np.int64))
-    offset = np.array(_open_array(path, "offset", (T + 1,), np.int64))
-    points = _open_array(path, "points", (M, D), np.float32, scratch)
-    hit = _open_array(path, "hit", (M,), np.bool_, scratch)
-    sensor = np.array(_open_array(path, "sensor", (T,), np.int32))
+        beam_time = _open_array(path, "beam_time", (M,), np.float32, scratch, grows)
+    stamp_ns = np.array(_open_array(path, "stamp_ns", (T,), np.int64, grows=grows))
+    offset = np.array(_open_array(path, "offset", (T + 1,), np.int64, grows=grows))
+    points = _open_array(path, "points", (M, D), np.float32, scratch, grows)
+    hit = _open_array(path, "hit", (M,), np.bool_, scratch, grows)
+    sensor = np.array(_open_array(path, "sensor", (T,), np.int32, grows=grows))
     # np.diff could overflow
     if np.any(stamp_ns[1:] < stamp_ns[:-1]):
         raise _damaged_error(path, "stamp_ns", "stamps decrease")
@@ -212,7 +217,7 @@ def read(path: Path, scratch: Path | None = None) -> Recording:
             offset=offset,
             points=points,
             hit=hit,
-            T_base_sensor=_read_poses(path, "T_base_sensor", S, D),
+            T_base_sensor=_read_poses(path, "T_base_sensor", S, D, grows),
             sensor=sensor,
             T_odom_base=T_odom_base,
             source=prune_notes(header.get("source")),
@@ -222,6 +227,26 @@ def read(path: Path, scratch: Path | None = None) -> Recording:
         )
     except ValueError as error:
         raise InputError(f"is damaged: {error}", where=str(path)) from error
+
+
+def _count_whole_scans(path: Path, header: dict[str, Any]) -> dict[str, int]:
+    """Scans and beams of a folder that is still written, or whose writing was interrupted.
+
+    Raises:
+        InputError: there is none, or a file is missing.
+    """
+    names = ["stamp_ns", "sensor", *(["T_odom_base"] if header.get("odometry") else [])]
+    scans = min(count_rows(path / f"{name}.npy") for name in names)
+    names = ["points", "hit", *(["beam_time"] if header.get("beam_times") else [])]
+    beams = min(count_rows(path / f"{name}.npy") for name in names)
+    ends = min(count_rows(path / "offset.npy"), scans + 1)
+    offset = open_npy(path / "offset.npy", rows=ends)
+    if offset.dtype != np.int64 or offset.ndim != 1 or np.any(offset[1:] < offset[:-1]):
+        raise _damaged_error(path, "offset", "must rise")
+    scans = int(np.searchsorted(offset, beams, side="right")) - 1
+    if scans < 1:
+        raise InputError("holds no whole scan", where=str(path))
+    return {"scans": scans, "beams": int(offset[scans])}
 
 
 def has_beam_times(path: Path) -> bool:
@@ -248,18 +273,25 @@ def _read_header(path: Path) -> dict[str, Any]:
 
 
 def _open_array(
-    path: Path, name: str, shape: tuple[int, ...], dtype: type, scratch: Path | None = None
+    path: Path,
+    name: str,
+    shape: tuple[int, ...],
+    dtype: type,
+    scratch: Path | None = None,
+    grows: bool = False,
 ) -> NDArray[Any]:
-    """The content of one `.npy` file of exactly this shape and type."""
-    loaded = open_npy(path / f"{name}.npy", scratch)
+    """The content of one `.npy` file of exactly this shape and type; of one that grows a part."""
+    loaded = open_npy(path / f"{name}.npy", scratch, shape[0] if grows else None)
     if loaded.shape != shape or loaded.dtype != np.dtype(dtype):
         what = f"expected {shape} {np.dtype(dtype)}, got {loaded.shape} {loaded.dtype}"
         raise _damaged_error(path, name, what)
     return np.ascontiguousarray(loaded)
 
 
-def _read_poses(path: Path, name: str, count: int, D: int) -> NDArray[np.float64]:
-    T = np.array(_open_array(path, name, (count, D + 1, D + 1), np.float64))
+def _read_poses(
+    path: Path, name: str, count: int, D: int, grows: bool = False
+) -> NDArray[np.float64]:
+    T = np.array(_open_array(path, name, (count, D + 1, D + 1), np.float64, grows=grows))
     R = T[:, :D, :D]
     far = np.flatnonzero(~(np.abs(T) < MAX_TRANSLATION).all(axis=(1, 2)))
     if len(far):

@@ -1,26 +1,29 @@
-"""All scans, and the poses and labels returned for them, in temporary files."""
+"""The drive so far: its recording, written while it lasts, and what was answered to its scans."""
 
+import json
+import logging
+import os
+import shutil
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
-from stillmap.core.array_builder import QUICKLY_WRITTEN, ArrayBuilder
-from stillmap.core.errors import InputError
+from stillmap.core.errors import InputError, cannot_write
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
-from stillmap.live.beam_store import BeamStore, join_parts
-from stillmap.live.row_numbers import RowNumbers
+from stillmap.io.stillmap_folder import FORMAT, FORMAT_VERSION, HEADER
+from stillmap.live.growing_array import GrowingArray
 from stillmap.live.scan import ScanBeams
 
 Float = NDArray[np.float64]
 
-# bytes of answers in memory while the disk is full, 25 minutes of 40 Hz: beyond, those to scans
-# that were dropped are dropped as well, but for spaced ones; share of them, the last, that stays
-_IN_MEMORY_IF_FULL, _RECENT = 16 << 20, 0.5
+FOLDER = "recording"  # of a drive, in its result folder
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,14 +31,12 @@ class Answers(ShortRepr):
     """Poses and labels returned by `push` for T scans with M beams.
 
     Attributes:
-        number: (T,) of the scans, as they were pushed: all, unless some were dropped.
         poses: (T, D+1, D+1) T_map_base as it was given.
         local: (T, D+1, D+1) in the frame of the odometry by scans, which never jumps.
         anchor: (T,) the last spaced scan at the time; -1: none yet.
         p_static: (M,) float32.
     """
 
-    number: NDArray[np.int64]
     poses: Float
     local: Float
     anchor: NDArray[np.int64]
@@ -43,106 +44,87 @@ class Answers(ShortRepr):
 
 
 @dataclass(frozen=True, eq=False)
-class KeptScans(ShortRepr):
-    """The scans that are kept at a time, while more are appended.
+class Placement(ShortRepr):
+    """Poses of T scans, each in the map or in a submap.
 
     Attributes:
-        number: (T,) of the scans, as they were pushed.
-        counts: (T,) number of beams of each.
-        answers: (T,) of `answer_type`.
-        parts: points, hit, P(static) and time of the beams, each in parts one after another.
-        files: the open file that holds each of the parts; None: it is in memory.
-        sensors: name and T_base_sensor of each.
-        has_odometry: every scan had it.
-        has_times: the beams have times.
-        warnings: about scans that are missing.
-        disk_was_full: that of the temporary files.
+        poses: (T, D+1, D+1) T_map_base, in the frame of the submap.
+        submap: (T,) 0: the map. From 1 on: a submap that nothing ties to it, one for each time that
+            the robot was lost and not found. -1: the pose is not known.
     """
 
-    number: NDArray[np.int64]
-    counts: NDArray[np.int64]
-    answers: NDArray[Any]
-    parts: list[list[NDArray[Any]]]
-    files: list[list[IO[bytes] | None]]
-    sensors: list[tuple[str, Float]]
-    has_odometry: bool
-    has_times: bool
-    warnings: list[str]
-    disk_was_full: bool
+    poses: Float
+    submap: NDArray[np.int64]
 
-    def load(self, folder: Path | None) -> tuple[Recording, Answers]:
-        """The scans and what was answered, in temporary files in a folder (None: the system's);
-        takes long where some scans were dropped, and may be called in another thread.
-
-        Raises:
-            OSError: the disk is full.
-        """
-        points, hit, p_static, times = join_parts(self.parts, folder)
-        sensors = [{"name": name, "extrinsics": {"how": "given"}} for name, _ in self.sensors]
-        answers = self.answers
-        recording = Recording(
-            stamp_ns=answers["stamp_ns"].copy(),
-            offset=np.concatenate([np.zeros(1, np.int64), np.cumsum(self.counts)]),
-            points=points,
-            hit=hit,
-            T_base_sensor=np.array([T for _, T in self.sensors]),
-            sensor=answers["sensor"].copy(),
-            T_odom_base=answers["T_odom_base"].copy() if self.has_odometry else None,
-            source={"format": "live", "sensors": sensors, "warnings": self.warnings},
-            beam_time=times if self.has_times else None,
-            scratch=folder,
-        )
-        return recording, Answers(self.number, *_split(answers), p_static)
-
-
-def answer_type(dimension: int) -> np.dtype[Any]:
-    """A scan and the answer to it, in D dimensions."""
-    T = (np.float64, (dimension + 1, dimension + 1))
-    fields = [
-        ("stamp_ns", np.int64),
-        ("anchor", np.int64),
-        ("T_odom_base", *T),
-        ("pose", *T),
-        ("local", *T),
-        ("twist", np.float64, 3 if dimension == 2 else 6),
-        ("sensor", np.int32),
-    ]
-    return np.dtype(fields, align=True)
-
-
-def beam_fields(dimension: int) -> list[tuple[DTypeLike, tuple[int, ...]]]:
-    """Type and shape of a row of points, hit, P(static) and time of the beams."""
-    return [(np.float32, (dimension,)), (np.bool_, ()), (np.float32, ()), (np.float32, ())]
+    def known_poses(self) -> Float:
+        """(T, D+1, D+1) T_map_base; NaN where the place in the map is not known."""
+        return np.where((self.submap == 0)[:, None, None], self.poses, np.nan)
 
 
 class History:
-    """Scans and answers, appended.
+    """Scans and answers, appended. Where the disk is full, or the bound is reached, it ends there.
 
     Args:
         dimension: 2 or 3.
-        folder: of the temporary files; None: the system's.
-        max_bytes: about, of the beams, 17 bytes each, in 3D 21: beyond, every second one of the
-            scans that lie most densely is dropped; None: unbounded.
+        folder: a new one, for the recording of the drive; None: it has no name, and goes with this
+            object.
+        scratch: folder of temporary files; None: the system's.
+        max_bytes: about, of the beams, 17 bytes each, in 3D 21; None: unbounded.
+
+    Raises:
+        InputError: the folder cannot be made.
     """
 
     def __init__(
-        self, dimension: int, folder: Path | None = None, max_bytes: int | None = None
+        self,
+        dimension: int,
+        folder: Path | None = None,
+        scratch: Path | None = None,
+        max_bytes: int | None = None,
     ) -> None:
-        self._answer = answer_type(dimension)
-        self._answers = ArrayBuilder(self._answer, (), folder, QUICKLY_WRITTEN)
-        self._beams = BeamStore(beam_fields(dimension), folder, max_bytes)
-        self._count, self._rows, self._due = 0, RowNumbers(), _IN_MEMORY_IF_FULL
+        self._dimension, self.folder, self._scratch = dimension, folder, scratch
+        self._max_bytes = np.inf if max_bytes is None else max_bytes
+        self._count, self._beam_count, self._is_full = 0, 0, False
         self._mounts: dict[str | int, Float] = {}
         self._has_odometry, self._has_times = True, False
-        self._folder = folder
+        try:
+            if folder is not None:
+                shutil.rmtree(folder, ignore_errors=True)
+                folder.mkdir(parents=True)
+            self._make_arrays(folder)
+        except OSError as error:
+            raise cannot_write(error, folder or scratch or "") from error
 
-    def close(self) -> None:
-        """Remove the files."""
-        self._beams.close()
-        self._answers.close()
+    def _make_arrays(self, folder: Path | None) -> None:
+        D = self._dimension
+        T = (D + 1, D + 1)
+
+        def make(name: str, dtype: Any, row: tuple[int, ...] = ()) -> GrowingArray:
+            path = None if folder is None else folder / f"{name}.npy"
+            return GrowingArray(dtype, row, path, self._scratch)
+
+        self._points = make("points", np.float32, (D,))
+        self._hit = make("hit", np.bool_)
+        self._times = make("beam_time", np.float32)
+        self._sensors = make("T_base_sensor", np.float64, T)
+        self._odometry = make("T_odom_base", np.float64, T)
+        self._sensor = make("sensor", np.int32)
+        self._stamps = make("stamp_ns", np.int64)
+        self._offset = make("offset", np.int64)  # the last: a scan is whole where its end is there
+        self._offset.append(np.zeros(1, np.int64))
+        pose = (np.float64, T)
+        fields = [("pose", *pose), ("local", *pose), ("anchor", np.int64)]
+        answer = np.dtype([*fields, ("twist", np.float64, 3 if D == 2 else 6)], align=True)
+        self._p_static = GrowingArray(np.float32, (), None, self._scratch)
+        self._answers = GrowingArray(answer, (), None, self._scratch)
 
     def __len__(self) -> int:
         return self._count
+
+    @property
+    def kept(self) -> int:
+        """Number of the first scans that are kept: all, unless the disk was full."""
+        return len(self._offset) - 1
 
     def append(
         self,
@@ -165,104 +147,157 @@ class History:
             anchor: a spaced scan.
             twist: (3,) or (6,) m/s and rad/s of the base during the scan, in its own frame.
         """
-        self._mounts.setdefault(beams.sensor, beams.T_base_sensor)
-        self._has_odometry &= T_odom_base is not None
-        self._has_times |= beams.beam_time is not None
-        times = beams.beam_time
-        if times is None:
-            times = np.zeros(len(beams.points), np.float32)
-        answer = np.zeros(1, self._answer)
-        answer["stamp_ns"], answer["anchor"] = beams.stamp_ns, anchor
-        answer["T_odom_base"] = np.nan if T_odom_base is None else T_odom_base
-        answer["pose"], answer["local"], answer["twist"] = pose, local, twist
-        answer["sensor"] = list(self._mounts).index(beams.sensor)
-        number = len(self)
-        with suppress(OSError):  # it stays in memory, as the beams do, which say so
-            self._answers.append(answer)
-        self._rows.append(number)
         self._count += 1
-        self._beams.append(number, [beams.points, beams.hit, p_static, times])
-        if self._answers.memory_bytes > self._due:
-            self._drop_answers()
-
-    def _drop_answers(self) -> None:
-        """Drop the answers to scans that were dropped, of those in memory: the disk is full."""
-        with suppress(OSError):
-            self._answers.write()  # perhaps there is room again
-        if self._answers.memory_bytes <= self._due:
+        if self._is_full:
             return
-        kept = self._beams.has(self._rows.numbers()[self._answers.written :])
-        anchor = self._answers.parts()[-1]["anchor"]  # in memory there is one part
-        kept |= np.diff(anchor, append=anchor[-1]) != 0  # spaced scans: the poses between follow
-        kept[int(_RECENT * len(kept)) :] = True
-        self._answers.select_last(kept)
-        self._rows.select_last(kept)
-        self._due = max(_IN_MEMORY_IF_FULL, 2 * self._answers.memory_bytes)
+        try:
+            self._append_answer(p_static, pose, local, anchor, twist)
+            self._append_scan(beams, T_odom_base)
+        except OSError as error:
+            self._end(error.strerror or str(error))
+            return
+        row_bytes = 9 + 4 * self._dimension
+        if self._beam_count * row_bytes > self._max_bytes:
+            self._end(f"{self._max_bytes / 1e9:g} GB of beams are kept")
+
+    def _append_answer(
+        self, p_static: NDArray[np.float32], pose: Float, local: Float, anchor: int, twist: Float
+    ) -> None:
+        answer = np.zeros(1, self._answers.dtype)
+        answer["pose"], answer["local"] = pose, local
+        answer["anchor"], answer["twist"] = anchor, twist
+        self._p_static.append(p_static)
+        self._answers.append(answer)
+
+    def _append_scan(self, beams: ScanBeams, T_odom_base: Float | None) -> None:
+        times = beams.beam_time
+        self._points.append(beams.points)
+        self._hit.append(beams.hit)
+        self._times.append(np.zeros(len(beams.points), np.float32) if times is None else times)
+        known = len(self._mounts), self._has_odometry, self._has_times
+        if beams.sensor not in self._mounts:
+            self._sensors.append(beams.T_base_sensor[None])
+            self._mounts[beams.sensor] = beams.T_base_sensor
+        self._has_odometry &= T_odom_base is not None
+        self._has_times |= times is not None
+        if known != (len(self._mounts), self._has_odometry, self._has_times):
+            self._write_header(is_open=True)
+        nowhere = np.full(beams.T_base_sensor.shape, np.nan)
+        self._odometry.append((nowhere if T_odom_base is None else T_odom_base)[None])
+        self._sensor.append(np.array([list(self._mounts).index(beams.sensor)]))
+        self._stamps.append(np.array([beams.stamp_ns]))
+        self._offset.append(np.array([self._beam_count + len(beams.points)]))
+        self._beam_count += len(beams.points)
+
+    def _end(self, why: str) -> None:
+        """Keep no more scans: what was begun of the last one goes."""
+        self._is_full = True
+        for array in (self._points, self._hit, self._times, self._p_static):
+            array.truncate(self._beam_count)
+        for array in (self._odometry, self._sensor, self._stamps, self._answers):
+            array.truncate(self.kept)
+        where = self.folder or self._scratch or "temporary files"
+        _log.error("%s: %s: poses go on, but from here on no scan is kept", where, why)
+
+    def _write_header(self, *, is_open: bool) -> None:
+        """Write `recording.json`; it always is whole.
+
+        Raises:
+            OSError: the disk is full.
+        """
+        if self.folder is None:
+            return
+        header = {
+            "format": FORMAT,
+            "format_version": FORMAT_VERSION,
+            "dimension": self._dimension,
+            "scans": self.kept,
+            "beams": self._beam_count,
+            "sensors": len(self._mounts),
+            "odometry": self._has_odometry,
+            "beam_times": self._has_times,
+            "open": is_open,
+            "source": self._source(),
+        }
+        work = self.folder / f".{HEADER}"
+        work.write_text(json.dumps(header, indent=1) + "\n", encoding="utf-8")
+        os.replace(work, self.folder / HEADER)
+
+    def _source(self) -> dict[str, Any]:
+        sensors = [{"name": str(name), "extrinsics": {"how": "given"}} for name in self._mounts]
+        missing = f"the disk was full: of {self._count} scans {self.kept} were kept"
+        warnings = [missing] if self.kept < self._count else []
+        path = {} if self.folder is None else {"path": os.path.abspath(self.folder)}
+        return {**path, "format": "live", "sensors": sensors, "warnings": warnings}
+
+    def finish(self) -> None:
+        """Enter what is in the recording folder into its headers; appending may go on.
+
+        Raises:
+            OSError: the disk is full.
+        """
+        if self.folder is None:
+            return
+        for array in self._recorded:
+            array.write_length()
+        self._write_header(is_open=False)
+
+    def move(self, folder: Path) -> None:
+        """Move the recording folder.
+
+        Raises:
+            OSError: it cannot be moved.
+        """
+        assert self.folder is not None
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        os.replace(self.folder, folder)
+        self.folder = folder
 
     @property
-    def was_full(self) -> bool:
-        """True if the disk was full: scans may be missing."""
-        return self._beams.was_full
+    def _recorded(self) -> list[GrowingArray]:
+        """The arrays of the recording."""
+        of_beams = [self._points, self._hit, self._times]
+        return [*of_beams, self._sensors, self._odometry, self._sensor, self._stamps, self._offset]
 
-    def has(self, number: int) -> bool:
-        """True if the answer to a scan is kept: all are, unless the disk was full."""
-        return self._rows.has(number)
+    def close(self) -> None:
+        """Close the files; the recording folder says how long they are."""
+        with suppress(OSError):
+            self.finish()
+        for array in (*self._recorded, self._p_static, self._answers):
+            array.close()
 
     def at(self, number: int) -> tuple[int, Float]:
-        """Anchor and local pose of a scan, see `Answers`."""
-        answer = self._answers.row(self._row_of(number))
+        """Anchor and local pose of a scan that is kept, see `Answers`."""
+        answer = self._answer(number)
         return int(answer["anchor"]), np.array(answer["local"])
 
     def twist_at(self, number: int) -> Float:
-        """(3,) or (6,) m/s and rad/s of the base during a scan."""
-        return np.array(self._answers.row(self._row_of(number))["twist"])
+        """(3,) or (6,) m/s and rad/s of the base during a scan that is kept."""
+        return np.array(self._answer(number)["twist"])
 
-    def _row_of(self, number: int) -> int:
-        if not self.has(number):
-            raise InputError(f"scan {number}: was dropped while the disk was full")
-        return int(self._rows.find(np.array([number]))[0])
+    def _answer(self, number: int) -> Any:
+        if number >= self.kept:
+            raise InputError(f"scan {number}: is not kept, for the disk was full")
+        return self._answers.row(number)
+
+    def answers(self) -> Answers:
+        """The answers to the scans that are kept."""
+        rows, p_static = self._answers.view(), self._p_static.view()
+        poses, local, anchor = (rows[name].copy() for name in ("pose", "local", "anchor"))
+        return Answers(poses, local, anchor, p_static)
 
     def recording(self) -> Recording:
-        """The scans that are kept. Odometry only if every scan had it. If the disk was full,
-        temporary files are in the system's folder."""
-        return self.snapshot().load(None if self.was_full else self._folder)[0]
-
-    def snapshot(self) -> KeptScans:
-        """The scans that are kept, and what `push` has returned for them."""
-        beams, warnings = self._beams, list[str]()
-        kept = beams.kept
-        if self.was_full and len(kept) < len(self):
-            warnings.append(
-                f"the disk of temporary files was full: of {len(self)} scans {len(kept)} were kept"
-            )
-        return KeptScans(
-            kept,
-            beams.counts,
-            self._answers.view()[self._rows.find(kept)],
-            beams.parts(),
-            beams.files(),
-            [(str(name), T) for name, T in self._mounts.items()],
-            self._has_odometry,
-            self._has_times,
-            warnings,
-            self.was_full,
+        """The scans that are kept, while more are appended; odometry only if all have it."""
+        return Recording(
+            stamp_ns=np.array(self._stamps.view()),
+            offset=np.array(self._offset.view()),
+            points=self._points.view(),
+            hit=self._hit.view(),
+            T_base_sensor=np.array(list(self._mounts.values())),
+            sensor=np.array(self._sensor.view()),
+            T_odom_base=np.array(self._odometry.view()) if self._has_odometry else None,
+            source=self._source(),
+            beam_time=self._times.view() if self._has_times else None,
+            scratch=self._scratch,
         )
-
-    def poses(self) -> tuple[Float, Float, NDArray[np.int64]]:
-        """`poses`, `local` and `anchor` of all scans, see `Answers`; of one whose answer was
-        dropped those of the last one before it."""
-        answers = self._answers.view()
-        if len(self._rows) < len(self):
-            answers = answers[self._rows.find(np.arange(len(self)))]
-        return _split(answers)
-
-    @property
-    def dropped(self) -> NDArray[np.int64]:
-        """(K,) numbers of the scans the answers to which were dropped."""
-        if len(self._rows) == len(self):
-            return np.zeros(0, np.int64)
-        return np.setdiff1d(np.arange(len(self)), self._rows.numbers(), assume_unique=True)
-
-
-def _split(answers: NDArray[Any]) -> tuple[Float, Float, NDArray[np.int64]]:
-    return answers["pose"].copy(), answers["local"].copy(), answers["anchor"].copy()

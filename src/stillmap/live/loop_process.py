@@ -6,10 +6,16 @@ Not in a thread: GTSAM holds Python's lock while it solves a pose graph.
 import itertools
 import json
 import logging
+import os
 import queue
+import struct
+import subprocess
 import sys
 import threading
+import traceback
 from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import IO, Any
@@ -19,20 +25,121 @@ from numpy.typing import NDArray
 
 from stillmap.core import config
 from stillmap.core.heap import trim_heap
-from stillmap.live.child_process import ChildProcess, serve
 from stillmap.live.local_map import MappedScan
 from stillmap.live.loop_closer import Correction, LoopCloser
-from stillmap.live.messages import read_message, write_message
 from stillmap.live.scan import ScanBeams
 from stillmap.live.sweep_loop_closer import LiveSweepLoopCloser
 from stillmap.slam.options import SlamOptions
 
 Float = NDArray[np.float64]
+Arrays = Mapping[str, NDArray[Any]]
 
 _log = logging.getLogger(__name__)
 
 _NUMBERS = list[str | int](range(256))  # of sensors, which stand for their names in the child
 _TRIM_EVERY = 64  # scans after which the child gives freed memory back
+_SECONDS_TO_END = 5.0  # before the process is killed
+_LENGTH = struct.Struct("<Q")
+_MAX_HEADER = 1 << 26  # bytes: a correction in a large hall has thousands of scans
+
+
+def write_message(stream: IO[bytes], arrays: Arrays) -> None:
+    """Write named arrays of numbers and flush."""
+    plain = {name: np.asarray(array, order="C") for name, array in arrays.items()}
+    fields = [[name, a.dtype.str, list(a.shape)] for name, a in plain.items()]
+    header = json.dumps(fields).encode()
+    stream.write(_LENGTH.pack(len(header)) + header)
+    for array in plain.values():
+        stream.write(array.reshape(-1).view(np.uint8).data)
+    stream.flush()
+
+
+def read_message(stream: IO[bytes]) -> dict[str, NDArray[Any]] | None:
+    """Read named arrays; None: the stream has ended, perhaps amid a message.
+
+    Raises:
+        ValueError: these are no arrays.
+    """
+    start = stream.read(_LENGTH.size)
+    if len(start) < _LENGTH.size:
+        return None
+    (length,) = _LENGTH.unpack(start)
+    if length > _MAX_HEADER:
+        raise ValueError(f"header: expected at most {_MAX_HEADER} bytes, got {length}")
+    header = stream.read(length)
+    if len(header) < length:
+        return None
+    out = {}
+    for name, dtype, shape in json.loads(header):
+        kind = np.dtype(dtype)
+        if kind.hasobject:
+            raise ValueError(f"{name}: expected numbers")
+        size = int(np.prod(shape, dtype=np.int64)) * kind.itemsize
+        data = stream.read(size)
+        if len(data) < size:
+            return None
+        out[name] = np.frombuffer(data, kind).reshape(shape)
+    return out
+
+
+class ChildProcess:
+    """Runs a module, which calls `serve`, in a process of its own.
+
+    Args:
+        module: its name.
+        arguments: of the command line.
+
+    Attributes:
+        stdin, stdout, id: of the process.
+    """
+
+    def __init__(self, module: str, *arguments: str) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", module, *arguments],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            process_group=0,  # Ctrl-C is for this process alone
+        )
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self.stdin, self.stdout = self._process.stdin, self._process.stdout
+        self.id = self._process.pid
+        self._threads: list[threading.Thread] = []
+
+    @property
+    def has_ended(self) -> bool:
+        return self._process.poll() is not None
+
+    def start(self, *work: Callable[[], None]) -> None:
+        """Start threads: one that sends, and one that reads until the process ends."""
+        self._threads = [threading.Thread(target=run, daemon=True) for run in work]
+        for thread in self._threads:
+            thread.start()
+
+    def send(self, messages: Iterable[Arrays]) -> None:
+        """Write messages until there are no more, or the process has ended."""
+        with suppress(BrokenPipeError):
+            for message in messages:
+                write_message(self.stdin, message)
+        self._close_stdin()
+
+    def stop(self) -> None:
+        """Wait for the end of the process, which `send` has no more for; kill it after a while."""
+        if not self._threads:
+            self._close_stdin()
+        try:
+            self._process.wait(_SECONDS_TO_END)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        for thread in self._threads:
+            thread.join()
+        self._close_stdin()
+        self.stdout.close()
+
+    def _close_stdin(self) -> None:
+        with suppress(BrokenPipeError):
+            self.stdin.close()
 
 
 class LoopProcess:
@@ -173,6 +280,17 @@ def _close_loops(settings: dict[str, Any], source: IO[bytes], target: IO[bytes])
             write_message(target, {**_pack_scans(found.near, _NUMBERS), **poses, **untied})
             del found, message
             trim_heap()
+
+
+def serve(work: Callable[[], None]) -> None:
+    """Work for the process that started this one, until that ends."""
+    try:
+        work()
+    except OSError:
+        os._exit(0)  # the other process has ended, or the disk is full: it says so
+    except Exception:
+        traceback.print_exc()
+        os._exit(1)  # at once: a thread still reads
 
 
 if __name__ == "__main__":

@@ -1,5 +1,7 @@
 """Pose of the frame of the odometry by scans in the map, as closed loops correct it."""
 
+import logging
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -8,7 +10,7 @@ from stillmap.core.heap import trim_heap
 from stillmap.live.causal_labels import CausalLabels
 from stillmap.live.front_end import FrontEnd, Registration
 from stillmap.live.local_map import MappedScan, thin_scan
-from stillmap.live.loop_closer import LoopCloser, NoLoops
+from stillmap.live.loop_closer import Correction, LoopCloser, NoLoops
 from stillmap.live.loop_process import LoopProcess
 from stillmap.live.map_correction import SPACED_PER_TAG, LabelledScan, MapCorrection
 from stillmap.live.sweep_loop_closer import LiveSweepLoopCloser
@@ -16,6 +18,8 @@ from stillmap.slam import local_map
 
 Float = NDArray[np.float64]
 LoopClosing = LoopCloser | LiveSweepLoopCloser | LoopProcess | NoLoops
+
+_log = logging.getLogger(__name__)
 
 # beams of a spaced scan in 2D and 3D, for loops and for the local map after them
 _MAX_KEPT_BEAMS = {2: 400, 3: 20_000}
@@ -90,7 +94,10 @@ class MapFrame:
         if self._count % _TRIM_EVERY == 0:
             trim_heap()
         kept = thin_scan(scan, _MAX_KEPT_BEAMS[self._dimension])
-        self._closer.add(kept, found.explained, self._drift)
+        try:
+            self._closer.add(kept, found.explained, self._drift)
+        except OSError as error:
+            self._give_up_loops(error)
         self._drift = np.zeros((3, 3))
 
     def correct(
@@ -113,7 +120,7 @@ class MapFrame:
                 self._correction.note_labelled(labelled)
             if added is not None:
                 self._correction.note_added(added)
-        elif (found := self._closer.poll()) is not None and len(found.poses) > self._outdated:
+        elif (found := self._poll()) is not None and len(found.poses) > self._outdated:
             spaced = self._spaced[: self._count].copy()
             tagged = np.array(self._tagged)
             new = MapCorrection(found, labels, spaced, self.spaced_poses(), tagged)
@@ -121,6 +128,19 @@ class MapFrame:
             if new.is_small:
                 self._keep_untied(new)
         self._go_on(labels, odometry, to_the_end=not self._in_background)
+
+    def _poll(self) -> Correction | None:
+        try:
+            return self._closer.poll()
+        except OSError as error:
+            self._give_up_loops(error)
+            return None
+
+    def _give_up_loops(self, error: OSError) -> None:
+        """The disk is full, and no scan can be kept for later loops."""
+        _log.error("%s: poses go on, but loops are no longer closed", error.strerror or error)
+        self._closer.stop()
+        self._closer = NoLoops()
 
     def enter(self, covariance: Float) -> None:
         """Go on elsewhere in the map, where the robot was found: corrections that were begun
@@ -177,18 +197,23 @@ class MapFrame:
         moved = self._corrected[anchor] @ se2.inverse(self._spaced[anchor])
         return np.asarray(moved @ local)
 
-    def to_map_all(self, local: Float, anchor: NDArray[np.int64]) -> Float:
-        """(T, D+1, D+1) the same of all scans; between spaced ones corrections are blended."""
-        if not self._count:
+    def to_map_all(self, local: Float, anchor: NDArray[np.int64], is_whole: bool = True) -> Float:
+        """(T, D+1, D+1) the same of all scans, or of the first ones; between spaced ones
+        corrections are blended."""
+        count = self._count if is_whole else min(self._count, int(anchor[-1:].sum()) + 1)
+        if not count or not len(local):
             return np.asarray(self.T_map_local @ local)
         # the scan after which each spaced one is the last: itself, but for the first
-        scans = np.searchsorted(anchor, np.arange(self._count) - 1, side="right") - 1
+        scans = np.searchsorted(anchor, np.arange(count) - 1, side="right") - 1
         every, kept = np.unique(np.maximum(scans, 0), return_index=True)
-        poses = self.spaced_poses()
+        poses, last = self.spaced_poses(), len(local) - 1
         known = dict(zip(every.tolist(), poses[kept], strict=True))
-        known.setdefault(len(local) - 1, self.T_map_local @ local[-1])
+        now = self.T_map_local @ local[-1]
+        known.setdefault(last, now if is_whole else self.to_map(local[-1], int(anchor[-1]), last))
         motion = poses @ se2.inverse(self._spaced[: self._count])
         for scan, first in self._breaks:  # nothing is blended across
+            if scan > last:
+                break
             if first > 0:
                 known.setdefault(scan - 1, motion[first - 1] @ local[scan - 1])
             if first < self._count:

@@ -46,12 +46,12 @@ class LiveMapper:
         mode: "localise": that map stays as it is; "extend": what is seen is added to it.
         background: close loops in a process of their own, so that no scan waits for them; else
             between two scans, the same to the bit every time.
-        scratch: folder of the files in which all scans are kept for `save` and `finish`; None: the
-            system's temporary folder. While its disk is full scans are kept in memory: beyond
-            128 MB every second one is dropped.
-        max_scratch: bytes, about, that their beams may take, 17 each, in 3D 21: beyond, every
-            second one of the scans that lie most densely is dropped, the oldest first; None: all
-            are kept.
+        folder: a new one, in which the drive is written as a recording while it lasts: whatever
+            happens, `stillmap.read` reads what is there; None: scans are kept in files without a
+            name. Where the disk is full, poses go on, and the scans up to then are kept.
+        scratch: folder of temporary files; None: the system's.
+        max_scratch: bytes, about, that the beams may take which are kept, 17 each, in 3D 21:
+            beyond, poses go on alone; None: all are kept.
         lag: s after which each scan is labelled once more, see `Update.hindsight`; None: it is not.
 
     Raises:
@@ -73,6 +73,7 @@ class LiveMapper:
         place: str | os.PathLike[str] | None = None,
         mode: Mode = "localise",
         background: bool = False,
+        folder: str | os.PathLike[str] | None = None,
         scratch: str | os.PathLike[str] | None = None,
         max_scratch: int | None = None,
         lag: float | None = None,
@@ -87,6 +88,7 @@ class LiveMapper:
         if self._known is not None and mode == "extend":
             self.options = adopt_resolution(self.options, self._known)
         self._in_background, self._max_scratch, self._lag = background, max_scratch, lag
+        self._folder = None if folder is None else Path(folder)
         self._scratch = None if scratch is None else Path(scratch)
         self._mapping: OnlineSlam | None = None  # since the first scan
         self._last_ns: int | None = None
@@ -137,8 +139,9 @@ class LiveMapper:
 
     @property
     def poses(self) -> Float:
-        """(T, D+1, D+1) T_map_base of all scans, as they are known now; NaN where the place in the
-        map is not known: while the robot is lost, or if it was carried away before it was found."""
+        """(T, D+1, D+1) T_map_base of the scans that are kept, as they are known now; NaN where the
+        place in the map is not known: while the robot is lost, or if it was carried away before it
+        was found."""
         return np.zeros((0, 3, 3)) if self._slam is None else self._slam.placement().known_poses()
 
     @property
@@ -215,10 +218,22 @@ class LiveMapper:
             InputError: no scan was pushed.
         """
         slam = self._pushed
-        kept = slam.history.snapshot()
-        placement = slam.placement().select(kept.number)
+        history = slam.history
+        if not history.kept:
+            raise InputError("no scan could be kept: the disk was full")
+        recording, answers = history.recording(), history.answers()
         kept_map = slam.keep_map() if self._mode == "extend" else None
-        return Snapshot(kept, placement, self.options, self._scratch, kept_map)
+        return Snapshot(
+            recording, answers, slam.placement(), self.options, history.folder, kept_map
+        )
+
+    def move_folder(self, folder: Path) -> None:
+        """Move the recording of the drive, which goes on there.
+
+        Raises:
+            OSError: it cannot be moved.
+        """
+        self._pushed.history.move(folder)
 
     def finish(self, progress: Progress = no_progress) -> BuiltResult:
         """The result of `stillmap.build` on all scans: poses, labels and map refined.
@@ -254,6 +269,7 @@ class LiveMapper:
             self.options,
             place,
             in_background=self._in_background,
+            folder=self._folder,
             scratch=self._scratch,
             max_scratch=self._max_scratch,
             lag=self._lag,
@@ -262,6 +278,8 @@ class LiveMapper:
     @property
     def _slam(self) -> OnlineSlam | None:
         """The mapping that began with the first scan, with all that the last one changes."""
+        if self._is_closed:
+            raise ValueError("mapper: expected one that is not closed")
         self.update_map()
         return self._mapping
 
@@ -275,8 +293,6 @@ class LiveMapper:
     def _require_next(self, beams: ScanBeams) -> None:
         """Check a scan against those before."""
         D = beams.dimension
-        if self._is_closed:
-            raise ValueError("mapper: expected one that is not closed")
         if self._slam is None or self._last_ns is None:
             return
         if self._slam.dimension != D:

@@ -14,7 +14,7 @@ from stillmap.core.parallel import resolve_threads
 from stillmap.live.causal_labels import CausalLabels, MapChange
 from stillmap.live.front_end import FrontEnd, Registration
 from stillmap.live.hindsight import Hindsight, LaterLabels
-from stillmap.live.history import History
+from stillmap.live.history import History, Placement
 from stillmap.live.local_map import MappedScan
 from stillmap.live.loop_closer import NoLoops
 from stillmap.live.loop_process import start_closer
@@ -24,7 +24,6 @@ from stillmap.live.map_frame import LoopClosing, MapFrame, rotate_covariance
 from stillmap.live.movers import Mover, MoverTracker
 from stillmap.live.observation import BeamSelector, Observation, find_margins
 from stillmap.live.place import PlaceTracker
-from stillmap.live.placement import Placement
 from stillmap.live.robot_finder import RobotFinder
 from stillmap.live.scan import ScanBeams, deskew
 from stillmap.live.scan_hits import normals_of, thin
@@ -47,8 +46,9 @@ class OnlineSlam:
         options: see Options.
         place: localization in a known map; None: the map begins empty.
         in_background: close loops in a process of their own; else between two scans.
+        folder: a new one, for the recording of the drive; None: it has no name.
         scratch: folder of temporary files; None: the system's.
-        max_scratch: bytes that all beams may take there, about; None: any number.
+        max_scratch: bytes of beams that are kept, about; None: any number.
         lag: s after which each scan is labelled once more; None: it is not.
 
     Attributes:
@@ -67,6 +67,7 @@ class OnlineSlam:
         place: PlaceTracker | None = None,
         *,
         in_background: bool = False,
+        folder: Path | None = None,
         scratch: Path | None = None,
         max_scratch: int | None = None,
         lag: float | None = None,
@@ -79,7 +80,7 @@ class OnlineSlam:
             ScanOdometry(slam) if D == 2 else SweepOdometry(slam, threads, spacing)
         )
         self.labels = CausalLabels(D, slam.resolution, options.em, threads)
-        self.history = History(D, scratch, max_scratch)
+        self.history = History(D, folder, scratch, max_scratch)
         self._selector = BeamSelector(options.em.time_bin)
         self._movers = MoverTracker(D)
         self._place, self._finder = place, RobotFinder(place, D)
@@ -149,13 +150,12 @@ class OnlineSlam:
         return self.labels.label(deskew(beams, self.history.twist_at(number)), pose)
 
     def placement(self) -> Placement:
-        """Poses and submaps of all scans, as they are estimated now."""
-        _, local, anchor = self.history.poses()
-        moved = self._finder.move_all(local)
-        # in a known map that frame is the map's
-        poses = moved if self._place is not None else self.frame.to_map_all(moved, anchor)
+        """Poses and submaps of the scans that are kept, as they are estimated now."""
+        answers, is_whole = self.history.answers(), self.history.kept == len(self.history)
+        poses = self._finder.move_all(answers.local)
+        if self._place is None:  # in a known map that frame is the map's
+            poses = self.frame.to_map_all(poses, answers.anchor, is_whole)
         submaps = self._finder.submaps(len(poses))
-        submaps[self.history.dropped] = -1
         if self._place is not None and self._place.frame.is_shifted:
             poses = np.where((submaps == 0)[:, None, None], self._place.frame.to_map(poses), poses)
         return Placement(poses, submaps)
@@ -187,6 +187,7 @@ class OnlineSlam:
 
     def close(self) -> None:
         """Forget all scans, and end the process that closes loops, if there is one."""
+        self.update_map()
         self.frame.stop()
         self.history.close()
 
@@ -287,7 +288,7 @@ class OnlineSlam:
             [
                 LaterLabels(n, self.label(one, n))
                 for n, one in self._hindsight.take(stamp_ns)
-                if self.history.has(n)
+                if n < self.history.kept
             ],
         )
 

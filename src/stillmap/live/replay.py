@@ -1,20 +1,26 @@
 """A recording pushed through the live mapper, as fast as possible or at its own pace."""
 
 import resource
+import signal
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from types import FrameType
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.interrupts import defers_signals_in, send_again
 from stillmap.core.profiling import Progress, no_progress
 from stillmap.core.recording import Recording
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.scan import ScanBeams
 from stillmap.live.update import Update
+
+Show = Callable[[LiveMapper, ScanBeams, Update], None]
 
 _MAXRSS_UNIT = 1 if sys.platform == "darwin" else 1024  # bytes
 
@@ -53,7 +59,7 @@ def replay(
     mapper: LiveMapper,
     progress: Progress = no_progress,
     rate: float | None = None,
-    show: Callable[[LiveMapper, ScanBeams, Update], None] | None = None,
+    show: Show | None = None,
     stop: threading.Event | None = None,
 ) -> Latency:
     """Push the scans of a recording.
@@ -104,3 +110,35 @@ def iter_beams(recording: Recording) -> Iterator[ScanBeams]:
             sensor,
             None if recording.beam_time is None else np.array(recording.beam_time[beams]),
         )
+
+
+@contextmanager
+def signal_flag() -> Iterator[threading.Event]:
+    """An event that Ctrl-C, SIGTERM and SIGHUP, the end of the terminal, set.
+
+    `ros2 launch` sends SIGTERM some seconds after Ctrl-C, and a terminal sends Ctrl-C to the node
+    and to launch alike: what comes while the result is written must not end it. Only Ctrl-C more
+    than a second after the first one does.
+    """
+    stop, since = threading.Event(), [0.0]
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        if number == signal.SIGINT and stop.is_set() and time.monotonic() - since[0] > 1.0:
+            if defers_signals_in(frame):
+                send_again(number)
+                return
+            raise KeyboardInterrupt
+        if not stop.is_set():
+            since[0] = time.monotonic()
+            stop.set()
+
+    numbers = [signal.SIGTERM, signal.SIGHUP, signal.SIGINT]
+    before = {number: signal.getsignal(number) for number in numbers}
+    for number, handler in before.items():
+        if handler is not signal.SIG_IGN:  # as a shell script leaves it in the background
+            signal.signal(number, handle)
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -2,32 +2,49 @@
 
 import logging
 import os
+import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.advice import advise
-from stillmap.core.arrays import write_npy
-from stillmap.core.files import nearest_folder_above
+from stillmap.core.arrays import empty, iter_blocks, release_pages, write_npy
+from stillmap.core.errors import InputError, cannot_write
+from stillmap.core.files import require_new
 from stillmap.core.profiling import Progress, no_progress
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
+from stillmap.io.stillmap_folder import HEADER
 from stillmap.io.trajectory import write_tum
-from stillmap.live.history import Answers, KeptScans
+from stillmap.live.history import FOLDER as RECORDING
+from stillmap.live.history import Answers, Placement
 from stillmap.live.map_extension import KeptMap, write_extended
-from stillmap.live.placement import Placement, take_scans
 from stillmap.pipeline.options import Options
 from stillmap.pipeline.result import map_recording
 from stillmap.results.result import BuiltResult
-from stillmap.results.run_json import EXTENDS
+from stillmap.results.run_json import EXTENDS, RECORD
 from stillmap.results.save import save
 
 FOLDER = "live"
 SUBMAPS = "live/submaps"  # of where the robot was lost, each in a folder with its number
 
+_MIN_SCANS = 20  # of a submap with a result of its own
+_DRIVE = f"{RECORDING}/{HEADER}"  # of a folder with a drive, perhaps without a result
+
 _log = logging.getLogger(__name__)
+
+
+def require_place_for_drive(output: Path, overwrite: bool) -> None:
+    """Reject an output folder that is taken, unless there is a result or a drive to overwrite.
+
+    Raises:
+        InputError: it is taken.
+    """
+    if not (overwrite and (output / _DRIVE).is_file()):
+        require_new(output, RECORD, overwrite)
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,27 +52,29 @@ class Snapshot(ShortRepr):
     """All scans so far and what is known of them, which stays while more scans are pushed.
 
     Attributes:
-        kept: the scans, and what was answered at the time.
+        recording: the scans.
+        answers: to them, at the time.
         placement: where they were taken.
         options: see Options.
-        scratch: folder of temporary files; None: the system's.
+        folder: of the recording, where it has one.
         kept_map: what is kept of the known map that is extended; None: there is none.
     """
 
-    kept: KeptScans
+    recording: Recording
+    answers: Answers
     placement: Placement
     options: Options
-    scratch: Path | None
+    folder: Path | None = None
     kept_map: KeptMap | None = None
 
     def build(self, progress: Progress = no_progress) -> BuiltResult:
         """Labels, map and objects of the scans that are in the map, at these poses."""
-        scratch = self._usable_scratch(None)
-        return self._build(*self.kept.load(scratch), self.placement.main, progress)[0]
+        main, _ = _find_submaps(self.placement)
+        return self._build(self.recording, main, progress)[0]
 
     def refine(self, progress: Progress = no_progress) -> BuiltResult:
         """The result of `stillmap.build` on all scans: poses, too."""
-        return self._map(self.kept.load(self._usable_scratch(None))[0], None, progress)
+        return self._map(self.recording, None, progress)
 
     def save(
         self,
@@ -65,79 +84,89 @@ class Snapshot(ShortRepr):
         progress: Progress = no_progress,
     ) -> None:
         """Write the result folder, as `LiveMapper.save` does; may run in a thread of its own.
-        If the disk of `scratch` was full, temporary files lie where the result goes.
 
-        In it are `live/trajectory.tum` and `live/beams/p_static.npy` with the answers; with a known
-        map that is extended, the map is that one with what was seen. Scans whose place in the map
-        is not known are left out, which a warning says; where they make a submap of their own, its
-        result is in `live/submaps/N`. If there are none but such, the result is the largest submap.
+        In it are `live/trajectory.tum` and `live/beams/p_static.npy` with the answers, and the
+        recording where that lies in the folder; with a known map that is extended, the map is that
+        one with what was seen. Scans whose place in the map is not known are left out, which a
+        warning says; where they make a submap of their own, its result is in `live/submaps/N`. If
+        there are none but such, the result is the largest submap.
 
         Raises:
             InputError: the folder is taken or cannot be written to.
         """
-        self.prepare(path, progress).write(path, overwrite)
-
-    def prepare(
-        self, path: str | os.PathLike[str], progress: Progress = no_progress
-    ) -> "LiveResult":
-        """Build the result that `save` writes. Temporary files lie where the result goes if the
-        disk of `scratch` was full, or is now.
-
-        Raises:
-            OSError: no disk has room for them.
-        """
-        beside = nearest_folder_above(path)
-        scratch = self._usable_scratch(beside)
         try:
-            return self._prepare(scratch, progress)
-        except OSError:
-            if scratch == beside:
-                raise
-            return self._prepare(beside, progress)
+            self._save(Path(path), overwrite, progress)
+        except (InputError, OSError) as error:
+            failure = cannot_write(error, path) if isinstance(error, OSError) else error
+            hints = [failure.hint, *([] if self.folder is None else [self._hint])]
+            hint = "; ".join(filter(None, hints))
+            raise InputError(failure.what, where=failure.where, hint=hint) from error
+        except BaseException:  # an interruption, or a defect: nobody drives the same way again
+            if self.folder is not None:
+                _log.warning(self._hint)
+            raise
 
-    def _prepare(self, scratch: Path | None, progress: Progress) -> "LiveResult":
-        recording, answers = self.kept.load(scratch)
-        main, others = self.placement.main, self.placement.others()
-        warnings = self._describe_lost(recording.stamp_ns, len(others))
+    @property
+    def _hint(self) -> str:
+        return f"the drive is kept: stillmap map {self.folder} makes a map of it"
+
+    def _save(self, path: Path, overwrite: bool, progress: Progress) -> None:
+        main, others = _find_submaps(self.placement)
+        warnings = self._describe_lost(len(others), main)
         for text in warnings:
             _log.warning(text)
         kept_map = self.kept_map if main == 0 else None
-        source = {**recording.source, "warnings": [*recording.source["warnings"], *warnings]}
+        source = dict(self.recording.source)
+        plain = replace(self.recording, source={**source, "warnings": []})
+        source["warnings"] = [*source["warnings"], *warnings]
         if warnings:
             source["lost_scans"] = int(np.count_nonzero(self.placement.submap))
         if kept_map is not None and kept_map.cloud is not None:
             source[EXTENDS] = True
-        built = self._build(replace(recording, source=source), answers, main, progress)
-        recording = replace(recording, source={**recording.source, "warnings": []})
-        submaps = [self._build(recording, answers, one, no_progress) for one in others]
-        return LiveResult(*built, submaps, kept_map)
+        result, answers = self._build(replace(self.recording, source=source), main, progress)
+        submaps = [self._build(plain, number, no_progress) for number in others]
+        is_inside = self.folder is not None and self.folder == path / RECORDING
+
+        def write_more(folder: Path) -> None:
+            _write_answers(answers, result.recording.stamp_ns, folder)
+            if kept_map is not None:
+                write_extended(folder, kept_map, result.map, result.options.output.map_mode)
+            for number, (submap, given) in enumerate(submaps, 1):
+                inside = folder / SUBMAPS / str(number)
+                inside.parent.mkdir(exist_ok=True)
+                save(submap, inside)
+                _write_answers(given, submap.recording.stamp_ns, inside)
+            if is_inside:
+                shutil.copytree(path / RECORDING, folder / RECORDING, copy_function=_link)
+
+        if not is_inside:
+            save(result, path, overwrite, write_more=write_more)
+            return
+        # the folder holds the drive already, and perhaps an earlier result of it
+        save(result, path, True, marker=_DRIVE, write_more=write_more)
 
     def _build(
-        self, recording: Recording, answers: Answers, submap: int, progress: Progress
+        self, recording: Recording, submap: int, progress: Progress
     ) -> tuple[BuiltResult, Answers]:
         """The result of the scans of a submap, and the answers to them."""
         scans = np.flatnonzero(self.placement.submap == submap)
-        taken, given = take_scans(recording, answers, scans, recording.scratch)
+        taken, given = _take_scans(recording, self.answers, scans)
         return self._map(taken, self.placement.poses[scans], progress), given
 
     def _map(
         self, recording: Recording, poses: NDArray[np.float64] | None, progress: Progress
     ) -> BuiltResult:
-        found = map_recording(
+        mapped = map_recording(
             recording, self.options, poses=poses, progress=progress, scratch=recording.scratch
         )
-        return BuiltResult(**vars(found))
+        return BuiltResult(**vars(mapped))
 
-    def _usable_scratch(self, other: Path | None) -> Path | None:
-        """The folder of temporary files, or another one if its disk was full."""
-        return other if self.kept.disk_was_full else self.scratch
-
-    def _describe_lost(self, stamp_ns: NDArray[np.int64], submaps: int) -> list[str]:
+    def _describe_lost(self, submaps: int, main: int) -> list[str]:
         """Warnings about scans whose pose in the map is unknown."""
-        lost = np.flatnonzero(self.placement.submap)
+        lost, stamp_ns = np.flatnonzero(self.placement.submap), self.recording.stamp_ns
         if not len(lost):
             return []
-        if self.placement.main:
+        if main:
             return [
                 "the robot was never found in the map: poses and map are in a frame of their own"
             ]
@@ -151,35 +180,50 @@ class Snapshot(ShortRepr):
         return [advise(text, f"see their own map{'s' * (submaps > 1)} in {SUBMAPS}")]
 
 
-@dataclass(frozen=True, eq=False)
-class LiveResult(ShortRepr):
-    """Result of a drive, ready to be written.
+def _find_submaps(placement: Placement) -> tuple[int, list[int]]:
+    """Number of the map, or of the largest submap, if no scan is in the map; and of the others that
+    are large enough for a map of their own."""
+    counts = np.bincount(placement.submap[placement.submap >= 0])
+    main = 0 if not len(counts) or counts[0] else int(np.argmax(counts))
+    large = np.flatnonzero(counts >= _MIN_SCANS).tolist()
+    return main, [number for number in large if number != main]
 
-    Attributes:
-        result: labels, map and objects.
-        given: what was answered at the time.
-        submaps: the same of where the robot was lost.
-        kept_map: see `Snapshot`.
-    """
 
-    result: BuiltResult
-    given: Answers
-    submaps: list[tuple[BuiltResult, Answers]]
-    kept_map: KeptMap | None
+def _take_scans(
+    recording: Recording, answers: Answers, scans: NDArray[np.intp]
+) -> tuple[Recording, Answers]:
+    """A recording of some of the scans (n,), rising, and the answers to them."""
+    if len(scans) == recording.n_scans:
+        return recording, answers
+    runs = np.split(scans, np.flatnonzero(np.diff(scans) > 1) + 1) if len(scans) else []
+    spans = [slice(recording.offset[run[0]], recording.offset[run[-1] + 1]) for run in runs]
+    counts = np.diff(recording.offset)[scans]
+    offset = np.concatenate([np.zeros(1, np.int64), np.cumsum(counts, dtype=np.int64)])
 
-    def write(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
-        """Write the result folder; see `Snapshot.save`."""
-        save(self.result, Path(path), overwrite, write_more=self._write_more)
+    def take(array: NDArray[Any]) -> NDArray[Any]:
+        out = empty((int(offset[-1]), *array.shape[1:]), array.dtype, recording.scratch)
+        first = 0
+        for span in spans:
+            part = array[span]
+            for block in iter_blocks(part):
+                out[first + block.start : first + block.stop] = part[block]
+                release_pages(out)
+            first += len(part)
+        return out
 
-    def _write_more(self, folder: Path) -> None:
-        _write_answers(self.given, self.result.recording.stamp_ns, folder)
-        if self.kept_map is not None:
-            mode = self.result.options.output.map_mode
-            write_extended(folder, self.kept_map, self.result.map, mode)
-        for number, (result, given) in enumerate(self.submaps, 1):
-            inside = folder / SUBMAPS / str(number)
-            inside.parent.mkdir(exist_ok=True)
-            LiveResult(result, given, [], None).write(inside)
+    times, odometry = recording.beam_time, recording.T_odom_base
+    taken = replace(
+        recording,
+        stamp_ns=recording.stamp_ns[scans],
+        offset=offset,
+        points=take(recording.points),
+        hit=take(recording.hit),
+        sensor=recording.sensor[scans],
+        T_odom_base=None if odometry is None else odometry[scans],
+        beam_time=None if times is None else take(times),
+    )
+    poses, local, anchor = answers.poses[scans], answers.local[scans], answers.anchor[scans]
+    return taken, Answers(poses, local, anchor, take(answers.p_static))
 
 
 def _write_answers(answers: Answers, stamp_ns: NDArray[np.int64], folder: Path) -> None:
@@ -187,3 +231,11 @@ def _write_answers(answers: Answers, stamp_ns: NDArray[np.int64], folder: Path) 
     (inside / "beams").mkdir(parents=True)
     write_tum(inside / "trajectory.tum", stamp_ns, answers.poses)
     write_npy(inside / "beams/p_static.npy", answers.p_static)
+
+
+def _link(source: str, target: str) -> None:
+    """A second name of a file, or a copy where there can be none."""
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copy2(source, target)

@@ -34,6 +34,7 @@ def save(
     path: Path,
     overwrite: bool = False,
     *,
+    marker: str = RECORD,
     tilting: "TiltingResult | None" = None,
     models: "Models | None" = None,
     write_more: Callable[[Path], None] | None = None,
@@ -44,6 +45,7 @@ def save(
         result: the mapped recording.
         path: the folder; it must not exist or be empty unless `overwrite` is given.
         overwrite: replace an earlier result once the new folder is complete.
+        marker: glob of a file that every folder has which may be replaced.
         tilting: 3D data of a rig's second laser.
         models: meshes of the place and of the moving objects.
         write_more: called with the folder before it appears, to write other files into it.
@@ -54,7 +56,7 @@ def save(
     """
     result, region = crop_result(result), result.options.output.region
     colors = None if models is None or models.point_colors is None else models.point_colors.colors
-    with atomic_folder(path, RECORD, overwrite) as folder:
+    with atomic_folder(path, marker, overwrite) as folder:
         write_map_server(folder, result.map, result.options.output.map_mode)
         write_map_npz(folder / "map.npz", result.map, result.changes, result.evidence)
         write_tum(folder / "trajectory.tum", result.recording.stamp_ns, result.poses)

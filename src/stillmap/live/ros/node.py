@@ -12,7 +12,7 @@ import numpy as np
 from stillmap.core import config
 from stillmap.core.errors import InputError
 from stillmap.core.profiling import Progress
-from stillmap.live.last_save import save_last
+from stillmap.live.history import FOLDER
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.ros import publishers
 from stillmap.live.ros.installation import Ros
@@ -125,8 +125,7 @@ class LiveNode:
             InputError: the folder cannot be written to; says where the result is.
         """
         with self._save_lock:
-            snapshot = self._mapper.snapshot()
-            save_last(snapshot, self._output, overwrite=self._overwrite, progress=progress)
+            self._mapper.save(self._output, overwrite=self._overwrite, progress=progress)
 
     def _declare(self, options: Options) -> Parameters:
         descriptor = self._ros.message("rcl_interfaces/msg/ParameterDescriptor")
@@ -247,6 +246,7 @@ class LiveNode:
         if self._former is not None:
             self._former.join()
         with self._lock:
+            self._mapper.move_folder(folder / FOLDER)
             former, self._mapper = self._mapper, self._make_mapper(self._options)
             self.scans = 0
         self._map_due = 0.0  # updates are of the new map
@@ -256,7 +256,7 @@ class LiveNode:
     def _save_former(self, mapper: LiveMapper, folder: Path) -> None:
         with self._save_lock:  # a request to save it may not have been done yet
             try:
-                save_last(mapper.snapshot(), folder, overwrite=True)
+                mapper.save(folder, overwrite=True)
             except (InputError, OSError) as error:
                 self.node.get_logger().error(str(error))
             finally:

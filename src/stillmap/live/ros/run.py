@@ -9,9 +9,9 @@ from typing import Any
 from stillmap.core.errors import InputError
 from stillmap.core.profiling import Progress
 from stillmap.live.mapper import LiveMapper
+from stillmap.live.replay import signal_flag
 from stillmap.live.ros.installation import Ros
 from stillmap.live.ros.node import LiveNode, Show
-from stillmap.live.stopping import signal_flag
 from stillmap.pipeline.options import Options
 
 _SPIN = 0.1  # s after which a signal is seen at the latest
