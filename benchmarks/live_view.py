@@ -16,8 +16,8 @@ import time
 from contextlib import contextmanager, nullcontext
 
 import numpy as np
-
 from stillmap.live.foxglove.server import FoxgloveServer
+
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.replay import iter_beams
 from stillmap.sim import scene_by_name, simulate
