@@ -28,7 +28,7 @@ import stillmap
 from stillmap.eval.map import GHOST_DISTANCE, distance_to_walls
 from stillmap.eval.trajectory import align
 from stillmap.mapping.changed_objects import cell_keys
-from stillmap.mapping.door import Door
+from stillmap.mapping.doors import Door
 from stillmap.pipeline import final_map
 from stillmap.results.reader import moved
 from stillmap.sim import Simulation, simulate

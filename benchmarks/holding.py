@@ -39,7 +39,10 @@ MIN_HITS = 20
 ABLATION = (
     Variant("defaults"),
     Variant("odometry noise is not learned", constants={"motion_model._MIN_NOISE_SHARE": 1.0}),
-    Variant("one contradicting scan is a break", constants={"kidnapping._MIN_CONTRADICTING": 1}),
+    Variant(
+        "one contradicting scan is a break",
+        constants={"relocalization._MIN_CONTRADICTING_SCANS": 1},
+    ),
     Variant(
         "the first place that fits is taken",
         constants={"relocalization._MARGIN": 0, "relocalization._MARGIN_SHARE": 0.0},

@@ -5,8 +5,8 @@ import pytest
 from made_up_scans import ANGLES, before, poses, recording, wall
 
 from stillmap.core import se2
-from stillmap.em import people_detector as detector
-from stillmap.em.people_detector import detect_segments, find_changed
+from stillmap.em import people_tracker as detector
+from stillmap.em.people_tracker import detect_segments, find_changed
 
 
 def interval(monkeypatch, seconds):

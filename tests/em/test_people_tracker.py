@@ -8,9 +8,9 @@ from made_up_scans import before, crossing, poses, recording, wall
 
 from stillmap import _core, em
 from stillmap.em import people_tracker as tracker
-from stillmap.em.people_detector import detect_segments
 from stillmap.em.people_tracker import (
     Tracks,
+    detect_segments,
     find_beams_in_boxes,
     label_people,
     track_people,

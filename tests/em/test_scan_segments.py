@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stillmap.core.chunks import ScanBeams
-from stillmap.em.scan_segments import (
+from stillmap.em.shape_evidence import (
     _BOTH_FARTHER,
     _BOTH_NEARER,
     _ONE_FARTHER,

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from stillmap import _core, em
-from stillmap.em.scan_segments import N_SEGMENT_TYPES
 from stillmap.em.shape_evidence import (
     _MAX_LOG_RATIO,
+    N_SEGMENT_TYPES,
     ShapeEvidence,
     _fit_shapes,
     count_segments,

@@ -7,7 +7,7 @@ import pytest
 from stillmap import em
 from stillmap.em import occupancy_hmm
 from stillmap.em.change_hmm import _MixtureClasses
-from stillmap.em.surroundings import likelihood_of_misses
+from stillmap.em.observations import likelihood_of_misses
 
 STATIC_THINGS = {"hedge": street.HEDGE, "post": street.POST, "car": street.CAR}
 

@@ -8,8 +8,8 @@ from stillmap.live.heading_drift import WallDirections, correct_heading
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.replay import iter_beams
 from stillmap.sim import scene_by_name, simulate
+from stillmap.slam.heading_alignment import HeadingOffset
 from stillmap.slam.scan_hits import Scan
-from stillmap.slam.wall_directions import HeadingOffset
 
 
 def look(normals_deg, weight=1.0):

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 from synthetic_histories import RESOLUTION, recording
 
-from stillmap.mapping.leaf_lines import find_leaf_lines
+from stillmap.mapping.lone_leaves import find_leaf_lines
 
 ROW = np.column_stack([np.arange(10, 20), np.full(10, -7)])
 SLANTED = np.array([[k, 40 + k] for k in range(7)])

@@ -6,8 +6,7 @@ from synthetic_histories import block, course, together
 
 from stillmap.mapping import Change
 from stillmap.mapping.changed_objects import find_shown_cells
-from stillmap.mapping.door import Door, DoorState
-from stillmap.mapping.doors import is_row
+from stillmap.mapping.doors import Door, DoorState, is_row
 
 CELL = 0.05
 ROW, OTHER_ROW, BOX = block(0, 0, 17, 2), block(40, 0, 2, 15), block(80, 0, 12, 9)

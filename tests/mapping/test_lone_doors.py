@@ -11,12 +11,12 @@ import pytest
 import stillmap
 from stillmap import _core
 from stillmap.core.config import override
-from stillmap.mapping.door import Door, DoorState
 from stillmap.mapping.door_states import list_runs
+from stillmap.mapping.doors import Door, DoorState
 from stillmap.mapping.doorways import find_doorways
+from stillmap.mapping.lone_doors import compute_p_moved
 from stillmap.mapping.lone_leaves import find_open_leaf, is_thin
 from stillmap.mapping.shut_leaves import estimate_p_door, estimate_shut_share, find_shut_leaf
-from stillmap.mapping.swing_rate import compute_p_moved
 from stillmap.pipeline.options import Options
 from stillmap.sim import CrowdOptions, LaserOptions, RobotOptions, Scene, simulate
 from stillmap.sim.walls import box

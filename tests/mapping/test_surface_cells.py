@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stillmap.mapping.surface_cells import iter_lines
+from stillmap.mapping.mirrors import iter_lines
 
 RESOLUTION = 0.05
 

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from stillmap.mapping import Change, Door
-from stillmap.mapping.door import DoorState
+from stillmap.mapping.doors import DoorState
 from stillmap.results.map_npz import changed_cells, write_map_npz
 from stillmap.results.report import maps
 from stillmap.results.report.maps import changes_data, draw_filtered_map

@@ -9,10 +9,9 @@ import pytest
 from stillmap import _core
 from stillmap.core import se2
 from stillmap.sim import scene_by_name, simulate
-from stillmap.slam import kidnapping
-from stillmap.slam.kidnapping import Evidence
+from stillmap.slam import relocalization
 from stillmap.slam.motion_model import gaussian_prior
-from stillmap.slam.relocalization import Placement
+from stillmap.slam.relocalization import Evidence, Placement
 from stillmap.slam.scan_hits import add_scan, make_scan, select_hits
 from stillmap.slam.scan_matching import accept_prior
 
@@ -35,7 +34,7 @@ def mapped(scans):
 
 def look_ahead(grid, e, T, t, pose):
     increments = se2.inverse(T[:-1]) @ T[1:]
-    return kidnapping.look_ahead(office().recording, e, grid, increments, t, pose, 0.9)
+    return relocalization.look_ahead(office().recording, e, grid, increments, t, pose, 0.9)
 
 
 def test_scans_at_their_place_agree():
@@ -64,9 +63,9 @@ def test_a_scan_of_an_unknown_place_says_nothing():
     far = se2.matrix(500.0, 0.0, 0.0)
     scan = select_hits(office().recording, e, 5)
     poor = dataclasses.replace(accept_prior(gaussian_prior(far, 0.1, 0.1)), explained=0.0)
-    assert kidnapping.judge_scan(grid, scan, poor, 1.0) is Evidence.UNKNOWN
+    assert relocalization.judge_scan(grid, scan, poor, 1.0) is Evidence.UNKNOWN
     blind = make_scan(np.zeros((0, 2), np.float32), np.zeros(0, np.float32), np.eye(3))
-    assert kidnapping.judge_scan(grid, blind, poor, 1.0) is Evidence.UNKNOWN
+    assert relocalization.judge_scan(grid, blind, poor, 1.0) is Evidence.UNKNOWN
 
 
 @pytest.mark.parametrize(
@@ -93,6 +92,6 @@ def test_one_of_many_places_has_to_be_much_better():
 
 
 def test_time_to_carry_the_robot():
-    assert not kidnapping.is_gap(5.0, 0.1)
-    assert kidnapping.is_gap(5.1, 0.1)
-    assert not kidnapping.is_gap(15.0, 1.0)  # a sparse recording
+    assert not relocalization.is_gap(5.0, 0.1)
+    assert relocalization.is_gap(5.1, 0.1)
+    assert not relocalization.is_gap(15.0, 1.0)  # a sparse recording

@@ -27,8 +27,7 @@ from stillmap.slam.loop_candidates import (
     split_stages,
     view_centers,
 )
-from stillmap.slam.loop_closure import close_loops
-from stillmap.slam.loop_consistency import reject_inconsistent, reject_inconsistent_since
+from stillmap.slam.loop_closure import close_loops, reject_inconsistent, reject_inconsistent_since
 from stillmap.slam.types import LoopCandidate, LoopClosure, LoopContext, MStepResult
 
 OPTIONS = SlamOptions()

@@ -16,14 +16,12 @@ from stillmap.slam import (
     SlamOptions,
     local_map,
     loop_candidates,
-    loop_consistency,
     loop_verification,
     m_step,
     odometry_2d,
 )
 from stillmap.slam.loop_candidates import odometry_constraints
-from stillmap.slam.loop_closure import close_loops
-from stillmap.slam.loop_consistency import reject_inconsistent
+from stillmap.slam.loop_closure import close_loops, reject_inconsistent
 from stillmap.slam.types import LoopClosure, LoopContext, MStepResult
 
 OPTIONS = SlamOptions()
@@ -157,7 +155,7 @@ def test_rejections_carry_reasons(monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(loop_verification, "MIN_EXPLAINED", 1.0)
         assert {c.rejected for c in mapped(square()).loops} == {"explains too little"}
-    monkeypatch.setattr(loop_consistency, "_MIN_AGREEING", 100)
+    monkeypatch.setattr("stillmap.slam.loop_closure._MIN_AGREEING", 100)
     assert "" not in {c.rejected for c in mapped(square()).loops}
 
 

@@ -5,8 +5,7 @@ import pytest
 
 from stillmap.core import se2
 from stillmap.core.recording import Recording
-from stillmap.slam.mount_calibration import Calibration, Parameter
-from stillmap.slam.mount_refinement import refine_positions
+from stillmap.slam.mount_calibration import Calibration, Parameter, refine_positions
 
 T = 300
 TRUE = (0.35, -0.05, 0.0)  # x, y, yaw of the laser

@@ -3,7 +3,7 @@
 import numpy as np
 
 from stillmap.core.recording import Recording
-from stillmap.slam.scan_subset import thin_scans
+from stillmap.slam.scan_hits import thin_scans
 
 
 def scans(*counts):

@@ -7,7 +7,7 @@ import pytest
 
 from stillmap import Recording
 from stillmap.tracking import MovingObject
-from stillmap.tracking.attachment import count_neighbors, drop_surface_parts
+from stillmap.tracking.displacement import count_neighbors, drop_surface_parts
 
 SCANS = 6
 ACROSS, UP = np.meshgrid(np.radians(np.arange(-20, 20.1, 1.0)), np.radians(np.arange(-9, 10, 2.0)))

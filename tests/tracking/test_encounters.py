@@ -4,7 +4,7 @@ import numpy as np
 from synthetic_tracks import watched
 
 from stillmap.tracking.detections import collect_centroids
-from stillmap.tracking.encounters import assign_to_paths, cut_tracks
+from stillmap.tracking.tracklets import assign_to_paths, cut_tracks
 
 NONE = np.zeros(0, int)
 

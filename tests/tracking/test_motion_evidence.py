@@ -5,7 +5,7 @@ import pytest
 
 from stillmap.core.recording import Recording
 from stillmap.tracking.clustering import extract_dynamic_points
-from stillmap.tracking.learned_share import fit_share
+from stillmap.tracking.explained_hits import fit_share
 from stillmap.tracking.motion_evidence import (
     TrackEvidence,
     apply_motion_evidence,

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.interpolate import make_smoothing_spline
 
-from stillmap.tracking import smoother
-from stillmap.tracking.smoother import smooth_track
+from stillmap.tracking import vehicle_filter as smoother
+from stillmap.tracking.vehicle_filter import smooth_track
 
 
 @pytest.mark.parametrize("n", [5, 6, 40, 300])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stillmap.tracking.steady_motion import _fit_lines, count_steady_windows
+from stillmap.tracking.walker_paths import _fit_lines, count_steady_windows
 
 RATE = 10.0
 

@@ -1,5 +1,6 @@
 """The E-step: labels of beams, the occupancy map and the likelihood. No I/O."""
 
+from stillmap.em.beam_counting import beam_boxes, count_in_window
 from stillmap.em.change_hmm import CellHistories
 from stillmap.em.estimator import (
     ESTIMATORS_3D,
@@ -37,7 +38,6 @@ from stillmap.em.types import (
     Likelihood,
     NoReturnModel,
 )
-from stillmap.em.window_counts import beam_boxes, count_in_window
 
 __all__ = [
     "ESTIMATORS_3D",

@@ -4,6 +4,8 @@ All beams of a cell within one time bin make at most one observation. `docs/esti
 observation model; the kernels follow it.
 """
 
+import functools
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -15,7 +17,6 @@ import stillmap._core as _core
 from stillmap.core.chunks import ScanBeams, iter_beams
 from stillmap.core.parallel import counting_threads
 from stillmap.core.recording import Recording
-from stillmap.em import surroundings
 from stillmap.em.mixture import MAX_FIT_ROWS
 from stillmap.em.options import EmOptions
 from stillmap.em.types import Float
@@ -127,7 +128,7 @@ class Observations:
     def likelihood_of_surroundings(self, rows: Rows) -> NDArray[np.float32]:
         """(K, 2) of the misses of some surfels; see `surroundings.likelihood_of_misses`."""
         assert isinstance(self.hmm, _core.OccupancyHmm3D)
-        return surroundings.likelihood_of_misses(self.hmm.miss_counts(rows))
+        return likelihood_of_misses(self.hmm.miss_counts(rows))
 
     def sample_rows(self) -> Rows:
         """Every k-th surfel, enough of them to fit mixture weights."""
@@ -162,7 +163,7 @@ def collect_observations(
         hmm.track_changes(**changes)
     if with_surroundings:
         assert isinstance(hmm, _core.OccupancyHmm3D)
-        hmm.track_surroundings(surroundings.EDGE)
+        hmm.track_surroundings(EDGE)
     add_observations(recording, poses, hmm, options.time_bin, threads, without_blank=blind)
     hmm.release_buffers()
     rho, tau, view_angle = (np.array(values) for values in classes.grid())
@@ -309,3 +310,41 @@ def probability_in_cell(surfel_map: SurfelMap) -> NDArray[np.float32]:
         without_plane = np.minimum(prominence / _MIN_PROMINENCE, 1.0)
         out[slice(*rows)] = np.where(normals.any(axis=1), in_plane, without_plane)
     return out
+
+
+EDGE = 0.3  # m, of the cells that surroundings are made of: they reach 0.3 to 0.6 m
+_LASTING = 9.0  # Beta(9, 1): share of the misses during which lasting surroundings are hit
+_MAX_MISSES = 20  # that count; more of one surfel are not independent
+
+
+def likelihood_of_misses(counts: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Likelihood (K, 2) of the misses of surfels if their surroundings last, and if they empty.
+
+    Args:
+        counts: (K, 2) misses, and those during which something was hit in the surroundings.
+
+    Both are beta-binomial: the share of the latter is distributed as Beta(9, 1) and Beta(1, 9).
+    They are relative to the larger one.
+    """
+    misses, surrounded = counts.astype(np.float64).T
+    scale = np.minimum(1.0, _MAX_MISSES / np.maximum(misses, 1.0))
+    n = np.rint(misses * scale).astype(np.intp)
+    k = np.minimum(np.rint(surrounded * scale).astype(np.intp), n)
+    return np.asarray(_table()[n, k])
+
+
+@functools.cache
+def _table() -> NDArray[np.float32]:
+    """(N, N, 2) by the numbers of misses and of those with hits in the surroundings."""
+    size = _MAX_MISSES + 1
+    logs = np.zeros((size, size, 2))
+    for n in range(size):
+        for k in range(n + 1):
+            logs[n, k] = _log_beta(k + _LASTING, n - k + 1.0), _log_beta(k + 1.0, n - k + _LASTING)
+    table = np.asarray(np.exp(logs - logs.max(axis=2, keepdims=True)), np.float32)
+    table.setflags(write=False)
+    return table
+
+
+def _log_beta(a: float, b: float) -> float:
+    return math.lgamma(a) + math.lgamma(b) - math.lgamma(a + b)

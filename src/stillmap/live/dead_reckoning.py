@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core import se2
-from stillmap.slam import kidnapping
-from stillmap.slam.kidnapping import Evidence
+from stillmap.slam import relocalization
 from stillmap.slam.motion_model import MotionPrior
+from stillmap.slam.relocalization import Evidence
 from stillmap.slam.scan_hits import Scan
 from stillmap.slam.scan_matching import MIN_GAIN, ScanMatch, occluded_share, search_pose
 
@@ -94,7 +94,7 @@ class DeadReckoning:
         alike = dataclasses.replace(scan, weights=np.ones_like(scan.weights))
         window = _WINDOW_STDS * metres, min(_WINDOW_STDS * radians, _MAX_ROTATION)
         match = search_pose(grid, alike, wide, *window)
-        evidence = kidnapping.judge_scan(grid, alike, match, usual)
+        evidence = relocalization.judge_scan(grid, alike, match, usual)
         if evidence is Evidence.CONTRADICTS:
             occluded = occluded_share(grid, alike, prior.T_map_base)
             # odometry may have led the robot to where nothing is mapped

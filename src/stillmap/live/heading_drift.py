@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.slam.heading_alignment import DirectionDensity, Directions, HeadingOffset
 from stillmap.slam.scan_hits import Scan
-from stillmap.slam.wall_directions import DirectionDensity, Directions, HeadingOffset
 
 Float = NDArray[np.float64]
 

@@ -14,11 +14,11 @@ from stillmap.live.local_map import Labeller, LocalMap, MappedScan, MatchMap, te
 from stillmap.live.odometry_faults import OdometryFaults, is_plausible
 from stillmap.live.scan import ScanBeams, deskew
 from stillmap.live.scan_hits import select_hits, thin
-from stillmap.slam import kidnapping, motion_model
+from stillmap.slam import motion_model, relocalization
 from stillmap.slam.deskew import MAX_SPEED, MAX_TURN_RATE
-from stillmap.slam.kidnapping import Evidence
 from stillmap.slam.motion_model import MotionPrior, OdometryNoise, VelocityNoise
 from stillmap.slam.options import SlamOptions
+from stillmap.slam.relocalization import Evidence
 from stillmap.slam.scan_hits import Scan
 from stillmap.slam.scan_matching import (
     ScanMatch,
@@ -206,7 +206,7 @@ class ScanOdometry:
         if wider.widened and is_sure and self._is_reachable(beams, wider.T_map_base):
             is_slipping = prior.is_odometry and is_inconsistent(prior, wider.T_map_base)
             return wider, is_slipping, False
-        evidence = kidnapping.judge_scan(grid, scan, match, usual)
+        evidence = relocalization.judge_scan(grid, scan, match, usual)
         if match.explained < _NOTHING * usual:
             evidence = Evidence.CONTRADICTS
         self._weigh_evidence(evidence)

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from stillmap.core.recording import Recording
 from stillmap.mapping.change_detection import Change
 from stillmap.mapping.changed_objects import cell_keys
-from stillmap.mapping.door import Door
 from stillmap.mapping.door_states import is_passage_observed, observe_states
-from stillmap.mapping.doors import Sector, fit_sector
+from stillmap.mapping.doors import Door, Sector, fit_sector
 from stillmap.mapping.resting_leaf import find_resting_leaf
 
 Cells = NDArray[np.int64]

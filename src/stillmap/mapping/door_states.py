@@ -11,7 +11,7 @@ from stillmap.core.arrays import iter_blocks
 from stillmap.core.components import group_indices
 from stillmap.core.recording import Recording
 from stillmap.mapping.changed_objects import cell_keys
-from stillmap.mapping.door import Door, DoorState, Position
+from stillmap.mapping.doors import Door, DoorState, Position
 
 Float = NDArray[np.float64]
 Cells = NDArray[np.int64]

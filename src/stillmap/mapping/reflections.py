@@ -20,11 +20,12 @@ from stillmap.mapping.mirrors import (
     Beams,
     CrossingBeams,
     Mirror,
+    SurfaceCells,
     check_mirror,
+    iter_lines,
     reflect,
     tangent_of,
 )
-from stillmap.mapping.surface_cells import SurfaceCells, iter_lines
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.mapping.door import Door
+from stillmap.mapping.doors import Door
 from stillmap.mapping.doorways import Doorway
 from stillmap.mapping.lone_leaves import LoneLeaf
 from stillmap.mapping.resting_leaf import SurfaceField

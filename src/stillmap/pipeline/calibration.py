@@ -22,8 +22,8 @@ from stillmap.slam.mount_calibration import (
     Calibration,
     Parameter,
     calibrate_mounts,
+    refine_positions,
 )
-from stillmap.slam.mount_refinement import refine_positions
 from stillmap.slam.spin_estimation import estimate_spin
 
 

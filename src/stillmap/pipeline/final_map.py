@@ -28,7 +28,7 @@ from stillmap.mapping import (
     relabel_lone_doors,
     update_occupancy,
 )
-from stillmap.mapping.leaf_lines import find_leaf_lines
+from stillmap.mapping.lone_leaves import find_leaf_lines
 from stillmap.mapping.projection import project_cells, project_to_plane
 from stillmap.mapping.reflections import P_REFLECTED, remove_reflections
 from stillmap.pipeline.estimate import Estimate

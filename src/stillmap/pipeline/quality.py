@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.recording import Recording
-from stillmap.em import OccupancyMap, label_quality
-from stillmap.mapping.fragments import count_small_pieces
+from stillmap.em import OccupancyMap, final_labels
+from stillmap.mapping.projection import count_small_pieces
 from stillmap.slam import rematching, surface_agreement
 
 Float = NDArray[np.float64]
@@ -105,11 +105,11 @@ def rate_quality(
         for part in window.split(_JUDGED_SCANS):
             of_part = p_static[part.beams]
             counts.append(
-                label_quality.count_expected(part.recording, _candidates(part), of_part, threads)
+                final_labels.count_expected(part.recording, _candidates(part), of_part, threads)
             )
     evidence = replace(
         _measure_geometry(deskewed, poses, occupancy),
-        expected_f1=label_quality.expected_f1(counts),
+        expected_f1=final_labels.expected_f1(counts),
         disagreement=float(np.median(apart)) if apart else None,
     )
     return _grade(evidence, deskewed.dimension)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from stillmap.core import se2, se3
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
-from stillmap.slam.scan_subset import beams_of_scans, select_beams
+from stillmap.slam.scan_hits import beams_of_scans, select_beams
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]

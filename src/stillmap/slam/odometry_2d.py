@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 import stillmap._core as _core
 from stillmap.core import se2
 from stillmap.core.recording import Recording
-from stillmap.slam import bare_stretches, kidnapping, motion_model
-from stillmap.slam.kidnapping import Evidence
+from stillmap.slam import bare_stretches, motion_model, relocalization
 from stillmap.slam.local_map import LocalMap
 from stillmap.slam.motion_model import MotionPrior, VelocityNoise
 from stillmap.slam.odometry_faults import SlipDetector, SlipHypothesis
 from stillmap.slam.options import SlamOptions
+from stillmap.slam.relocalization import Evidence
 from stillmap.slam.scan_hits import FREE_SPACE_MARGIN, Scan, select_hits
 from stillmap.slam.scan_matching import (
     FAULT_GAIN,
@@ -183,7 +183,7 @@ class _ScanOdometry:
         grid, usual = self.local_map.grid, self.usual[self.recording.sensor[t]]
         if len(scan.points) == 0 or usual == 0.0:
             return match, False
-        if kidnapping.is_gap(float(self.seconds_before[t]), self.seconds):
+        if relocalization.is_gap(float(self.seconds_before[t]), self.seconds):
             return self._start_segment(t, prior), False
         if is_poor(match, usual):
             match = self._match_late_odometry(t, scan, match, usual)
@@ -199,7 +199,7 @@ class _ScanOdometry:
                 return wider, False
         if not is_poor(match, usual):
             return match, False
-        contradicts = kidnapping.judge_scan(grid, scan, match, usual) is Evidence.CONTRADICTS
+        contradicts = relocalization.judge_scan(grid, scan, match, usual) is Evidence.CONTRADICTS
         if (
             not contradicts
             or t <= self.compared_until
@@ -238,7 +238,7 @@ class _ScanOdometry:
 
     def _is_consistent_ahead(self, t: int, match: ScanMatch, usual: float) -> bool:
         """True if the scans after t do not contradict the map if the robot goes on from a match."""
-        ahead = kidnapping.look_ahead(
+        ahead = relocalization.look_ahead(
             self.recording,
             self.e,
             self.local_map.grid,

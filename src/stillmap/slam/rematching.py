@@ -14,9 +14,14 @@ from stillmap.slam.lidar_odometry import register_sweeps
 from stillmap.slam.local_map import LocalMap
 from stillmap.slam.motion_model import compute_odometry_steps, odometry_prior
 from stillmap.slam.options import SlamOptions
-from stillmap.slam.scan_hits import FREE_SPACE_MARGIN, select_hits
+from stillmap.slam.scan_hits import (
+    FREE_SPACE_MARGIN,
+    beams_of_scans,
+    sees_all_round,
+    select_beams,
+    select_hits,
+)
 from stillmap.slam.scan_matching import refine_pose, search_pose
-from stillmap.slam.scan_subset import beams_of_scans, sees_all_round, select_beams
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]

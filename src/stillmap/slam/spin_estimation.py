@@ -19,7 +19,7 @@ from stillmap.prepare.scan_timing import add_beam_times
 from stillmap.slam.deskew import deskew_recording
 from stillmap.slam.lidar_odometry import LidarOdometry, register_sweeps
 from stillmap.slam.options import SlamOptions
-from stillmap.slam.scan_subset import beams_of_scans, sees_all_round, select_beams
+from stillmap.slam.scan_hits import beams_of_scans, sees_all_round, select_beams
 
 Float = NDArray[np.float64]
 

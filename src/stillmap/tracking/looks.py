@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.recording import Recording
-from stillmap.em.scan_segments import find_lost_beams
+from stillmap.em.shape_evidence import find_lost_beams
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]

@@ -22,14 +22,12 @@ from stillmap.mapping import MoverPoints
 from stillmap.tracking.association import MAX_GAP, assign_tracks, regress_velocity
 from stillmap.tracking.clustering import DynamicPoints, extract_dynamic_points
 from stillmap.tracking.detections import compute_centroids, iterate_tracks
-from stillmap.tracking.explained_hits import explain_hits, find_mover_hits
+from stillmap.tracking.explained_hits import explain_hits, find_mover_hits, fit_share
 from stillmap.tracking.fast_movers import find_fast_movers, tracks_of_paths
-from stillmap.tracking.learned_share import fit_share
 from stillmap.tracking.looks import Look, classify_looks
 from stillmap.tracking.mover_path import MoverPath
-from stillmap.tracking.steady_motion import count_steady_windows
 from stillmap.tracking.tracklets import join_tracklets
-from stillmap.tracking.walker_paths import iterate_walker_paths
+from stillmap.tracking.walker_paths import count_steady_windows, iterate_walker_paths
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]

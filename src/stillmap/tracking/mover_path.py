@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.tracking.clustering import DynamicPoints
-from stillmap.tracking.smoother import smooth_track
-from stillmap.tracking.vehicle_filter import EdgeLooks
+from stillmap.tracking.vehicle_filter import EdgeLooks, smooth_track
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]

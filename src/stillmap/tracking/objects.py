@@ -22,8 +22,8 @@ from stillmap.tracking.detections import compute_centroids, iterate_tracks
 from stillmap.tracking.fast_movers import find_fast_movers, tracks_of_paths
 from stillmap.tracking.mover_path import MoverPath
 from stillmap.tracking.options import ObjectOptions
-from stillmap.tracking.smoother import smooth_track
 from stillmap.tracking.tracklets import stitch_tracklets
+from stillmap.tracking.vehicle_filter import smooth_track
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]

@@ -19,9 +19,8 @@ from stillmap.core.recording import Recording
 from stillmap.em import GroundMap
 from stillmap.mapping.projection import DIRECTIONS, make_planar_recording
 from stillmap.tracking import MovingObject, ObjectOptions, track_objects
-from stillmap.tracking.attachment import drop_surface_parts
 from stillmap.tracking.clustering import MIN_P_DYNAMIC
-from stillmap.tracking.displacement import select_movers
+from stillmap.tracking.displacement import drop_surface_parts, select_movers
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
