@@ -22,8 +22,8 @@ from stillmap.core.recording import Recording
 from stillmap.io import read, writers
 from stillmap.io.builder import ReadContext
 from stillmap.io.ros.bag import open_bag
-from stillmap.io.ros.bag_types import ENDINGS
-from stillmap.io.ros.collect import collect_messages, select_topics
+from stillmap.io.ros.messages import ENDINGS
+from stillmap.io.ros.reader import collect_messages, select_topics
 from stillmap.pipeline.result import map_recording
 from stillmap.prepare.options import ReadOptions
 from stillmap.sim import scene_by_name, simulate

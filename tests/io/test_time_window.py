@@ -8,7 +8,7 @@ import pytest
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.io import read, writers
-from stillmap.io.ros import laser_scan
+from stillmap.io.ros import lasers
 from stillmap.prepare.options import ReadOptions
 
 FORMS_2D = {"carmen": ".clf", "bag": ".bag", "db3": ".db3", "mcap": ".mcap", "stillmap": ""}
@@ -82,8 +82,8 @@ def test_an_empty_part_names_the_span(dimension, form, tmp_path):
 def test_scans_outside_are_not_decoded(form, tmp_path, monkeypatch):
     path = written(2, form, tmp_path)
     decoded = []
-    decode = laser_scan.decode
-    monkeypatch.setattr(laser_scan, "decode", lambda one: decoded.append(one) or decode(one))
+    decode = lasers.decode
+    monkeypatch.setattr(lasers, "decode", lambda one: decoded.append(one) or decode(one))
     assert read(path, ReadOptions(start=1.0, end=1.2)).n_scans == 3
     assert len(decoded) == 3
 

@@ -191,7 +191,7 @@ def _convert_to_bag(
     args: argparse.Namespace, result: "ResultFolder", output: Path
 ) -> tuple[list[str], str]:
     from stillmap.io import writers
-    from stillmap.io.ros.bag_types import BagKind
+    from stillmap.io.ros.messages import BagKind
     from stillmap.results.export import bag, obj
 
     clouds = f"{', '.join(CLOUDS)}, {obj.ENDING}"

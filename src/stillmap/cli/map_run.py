@@ -113,14 +113,14 @@ def _read_topic(
     paths: tuple[str, ...], options: ReadOptions, progress: ReadProgress | None, scratch: Path
 ) -> Recording:
     from stillmap.io.builder import ReadContext
-    from stillmap.io.ros.reader import read_tilting_parts  # message types take long to load
+    from stillmap.io.ros.reader import read_parts  # message types take long to load
 
     bags = [Path(path) for path in paths]
     for path in bags:
         if detect_format(path).name != "ROS bag":
             raise InputError("--tilting-topic is for bags", where=str(path))
     with np.errstate(over="ignore", invalid="ignore"):
-        return read_tilting_parts(bags, ReadContext(options, progress, scratch))
+        return read_parts(bags, ReadContext(options, progress, scratch), tilting=True)
 
 
 def build_all(

@@ -23,7 +23,7 @@ from stillmap.io import stillmap_folder, writers
 from stillmap.io.filtered_copy import FilterJob, Mask, Omissions
 from stillmap.io.point_cloud import signatures
 from stillmap.io.registry import FORMATS, Format, detect_format
-from stillmap.io.ros.bag_types import detect_kind
+from stillmap.io.ros.messages import detect_kind
 from stillmap.prepare.scan_timing import SPIN_KEY
 
 Write = Callable[[FilterJob], Omissions]
@@ -119,7 +119,7 @@ _RGBD_MARKERS = ("depth.txt", "frame-*.depth.*")
 
 FILTER_WRITERS = {
     "stillmap recording": FilterWriter(_write_stillmap, (stillmap_folder.HEADER,)),
-    "ROS bag": FilterWriter(_writer("ros.filtered_bag"), ("metadata.yaml",)),
+    "ROS bag": FilterWriter(_writer("ros.filtered"), ("metadata.yaml",)),
     "KITTI folder": FilterWriter(_writer("point_cloud.filtered.kitti"), _KITTI_MARKERS),
     "RGB-D folder": FilterWriter(_writer("filtered_depth"), _RGBD_MARKERS, _check_depth),
     "PCD": FilterWriter(_writer("point_cloud.filtered.pcd"), _patterns(signatures.PCD_EXTENSIONS)),

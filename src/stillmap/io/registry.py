@@ -16,7 +16,7 @@ from stillmap.io import stillmap_folder
 from stillmap.io.builder import ReadContext
 from stillmap.io.carmen.log import SCAN_KINDS
 from stillmap.io.point_cloud import signatures
-from stillmap.io.ros import bag_types
+from stillmap.io.ros import messages
 from stillmap.io.scan_files import contains_files, has_extension
 from stillmap.io.text_lines import read_head
 from stillmap.prepare.overrides import apply_options
@@ -133,8 +133,8 @@ FORMATS = (
     ),
     Format(
         "ROS bag",
-        bag_types.ENDINGS,
-        bag_types.is_bag,
+        messages.ENDINGS,
+        messages.is_bag,
         _reader("ros.reader"),
         _parts_reader("ros.reader"),
     ),

@@ -17,7 +17,7 @@ from stillmap.io import stillmap_folder
 from stillmap.io.carmen.writer import write_log
 from stillmap.io.point_cloud import kitti, las, pcd, ply
 from stillmap.io.point_cloud.origin import place_clouds
-from stillmap.io.ros.recording_writer import write_recording as write_bag
+from stillmap.io.ros.writer import write_recording as write_bag
 
 # (recording, path, overwrite=...) -> what could not be written, a sentence each
 Write = Callable[..., list[str]]

@@ -14,10 +14,9 @@ from small_bags import Messages, write_bag
 from stillmap.core.errors import InputError
 from stillmap.io import read
 from stillmap.io.builder import ReadContext
-from stillmap.io.ros import limits, scan_beams
-from stillmap.io.ros.bag_types import Channel, Message
-from stillmap.io.ros.collect import TopicSelection, collect_messages
-from stillmap.io.ros.laser_scan import LaserScans, ScanShape
+from stillmap.io.ros import limits
+from stillmap.io.ros.messages import Channel, Message
+from stillmap.io.ros.reader import TopicSelection, collect_messages
 from stillmap.prepare.options import ReadOptions
 
 START = 1_700_000_000_000_000_000
@@ -63,25 +62,6 @@ def test_invalid_poses(bag, messages, place):
     assert recording.source["skipped_odometry"]["transform that is none"]["count"] == 5
 
 
-@pytest.mark.parametrize(
-    "script",
-    [
-        f"DROP TABLE messages; CREATE VIEW messages AS {ENDLESS}, 1 AS topic_id, 1 AS timestamp, "
-        "x'00' AS data FROM r",
-        f"DROP TABLE topics; CREATE VIEW topics AS {ENDLESS}, '/scan' AS name, 'x' AS type, "
-        "'cdr' AS serialization_format FROM r",
-        f"DROP TABLE message_definitions; CREATE VIEW message_definitions AS {ENDLESS}, "
-        "'a' AS topic_type, 'ros2msg' AS encoding, '' AS encoded_message_definition FROM r",
-        "DROP TABLE messages; CREATE VIRTUAL TABLE messages USING fts5(topic_id, timestamp, data)",
-        "DROP TABLE messages; CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, "
-        "timestamp INTEGER, data AS (zeroblob(900000000)))",
-    ],
-)
-def test_invalid_tables(db3, script):
-    with pytest.raises(InputError, match=r"is no bag: its .* are no plain table"):
-        read(db3(script))
-
-
 def test_values_of_other_types(db3):
     changes = (
         "UPDATE messages SET timestamp = 'x' WHERE id = 1;",
@@ -118,12 +98,6 @@ def test_tree_with_a_shared_page(db3, monkeypatch):
     recording = read(path)
     assert recording.source["damage"]["rows that cannot be read"]["count"] == 1
     assert recording.n_scans <= 3  # the others repeat stamps and readings
-
-
-def test_names_of_any_bytes(db3, tmp_path):
-    path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/not\xfftext?#%41.db3"))
-    db3().rename(path)
-    assert read(path).n_scans == 3
 
 
 def _record(fields: dict[bytes, bytes], content: bytes) -> bytes:
@@ -201,18 +175,6 @@ def test_recursive_metadata(tmp_path):
     os.mkfifo(path / "tiny_1.db3")
     with pytest.raises(InputError, match="is no regular file"):
         read(path)
-
-
-def test_long_scan_among_many_short_ones(monkeypatch):
-    monkeypatch.setattr(scan_beams, "_SAMPLE", 1000)
-    shapes = [ScanShape(0.0, 1e-4, n, 0.1, 9.0, 0.0) for n in (5000, 1)]
-    shape = np.array([0] + [1] * 4000, np.int32)
-    n = np.where(shape == 0, 5000, 1)
-    stamps = np.arange(len(shape), dtype=np.int64)
-    ranges = np.ones(n.sum(), np.float32)
-    start = np.cumsum(n) - n
-    scans = LaserScans("/scan", "", stamps, stamps, start, shape, shapes, ranges, [])
-    assert scan_beams._sample_readings(scans).size <= 5 * 1000
 
 
 def test_messages_of_a_topic_that_nobody_wanted():

@@ -109,18 +109,6 @@ def test_beam_times(bag, messages):
     np.testing.assert_allclose(recording.beam_time, np.tile(0.01 * np.arange(5), 3), rtol=1e-6)
 
 
-def test_implausible_time_increments_are_ignored(bag, messages):
-    scans = [
-        (
-            "/scan",
-            START + k * SECOND,
-            messages.scan(START + k * SECOND, ranges_at(k), time_increment=1.0),
-        )
-        for k in range(3)
-    ]
-    assert read(bag(scans)).beam_time is None
-
-
 def test_upside_down_laser(bag, messages):
     """Its angles rise to the right of the robot, seen from above."""
     over = messages.transform(0, "base_link", "laser", (0.1, 0.2, 0.3), turned(0.3, np.pi))
@@ -133,20 +121,6 @@ def test_upside_down_laser(bag, messages):
     angle = np.arctan2(recording.points[:5, 1], recording.points[:5, 0])
     np.testing.assert_allclose(angle, [0.5, 0.25, 0, -0.25, -0.5], atol=1e-6)
     assert recording.source["sensors"][0]["upside_down"]
-
-
-def test_clockwise_angles(bag, messages):
-    scans = [
-        (
-            "/scan",
-            START + k,
-            messages.scan(START + k, ranges_at(k), angle_min=0.5, angle_increment=-0.25),
-        )
-        for k in range(2)
-    ]
-    recording = read(bag(scans))
-    angle = np.arctan2(recording.points[:5, 1], recording.points[:5, 0])
-    np.testing.assert_allclose(angle, [0.5, 0.25, 0, -0.25, -0.5], atol=1e-6)
 
 
 def test_two_lasers_interleave(bag, messages):
@@ -201,20 +175,6 @@ def test_duplicate_topics_are_dropped(bag, messages):
     ]
 
 
-def test_rare_topics_are_dropped(bag, messages):
-    content = [
-        ("/tf_static", START, messages.tf(messages.transform(0, "laser", "camera", (0, 0, 0))))
-    ]
-    for k in range(12):
-        stamp = START + k * SECOND
-        content.append(("/scan", stamp, messages.scan(stamp, ranges_at(k))))
-        if k < 2:
-            content.append(("/depth", stamp, messages.scan(stamp, ranges_at(k), "camera")))
-    recording = read(bag(content))
-    assert len(recording.T_base_sensor) == 1
-    assert recording.source["duplicates"] == ["/depth: 2 scans are too few"]
-
-
 def test_moving_laser(bag, messages):
     content = []
     for k in range(5):
@@ -261,30 +221,6 @@ def test_missing_topics(bag, messages):
     assert read(path, ReadOptions(topic="scan")).n_scans == 10
 
 
-def test_bag_without_scans(bag, messages):
-    path = bag([("/tf", START, messages.tf(messages.transform(START, "a", "b", (0, 0, 0))))])
-    with pytest.raises(InputError, match=r"holds no scans \(it has /tf \(TFMessage\)\)"):
-        read(path)
-
-
-def test_odometry_with_a_gap(bag, messages):
-    content = [
-        one
-        for one in drive(messages, 60)
-        if one[0] != "/tf" or not 1.0 < (one[1] - START) / 1e9 < 4.0
-    ]
-    recording = read(bag(content))
-    x = se2.parameters(recording.T_odom_base)[:, 0]
-    np.testing.assert_allclose(x, 0.1 * np.arange(60) + 0.025, atol=1e-6)
-    assert any("no odometry for 3.0 s" in text for text in recording.source["warnings"])
-
-
-def test_scans_outside_the_odometry(bag, messages):
-    content = [one for one in drive(messages) if one[0] != "/tf" or one[1] < START + SECOND // 2]
-    warnings = read(bag(content)).source["warnings"]
-    assert any("scans outside the time of the odometry" in text for text in warnings)
-
-
 def test_echoes(bag, messages):
     echo = messages.store.types["sensor_msgs/msg/LaserEcho"]
     kind = "sensor_msgs/msg/MultiEchoLaserScan"
@@ -303,14 +239,3 @@ def test_echoes(bag, messages):
     length = np.linalg.norm(recording.points[:5], axis=1)
     np.testing.assert_array_equal(recording.hit[:5], [1, 0, 1, 0, 1])
     np.testing.assert_allclose(length[[0, 2, 4]], [1.0, 2.0, 4.0], rtol=1e-6)
-
-
-def test_order_of_scans_does_not_depend_on_where_arrays_lie(bag, messages, monkeypatch):
-    from stillmap.core import arrays
-
-    path = bag(drive(messages, 40))
-    before = read(path)
-    monkeypatch.setattr(arrays, "MAX_BYTES_IN_MEMORY", 0)
-    after = read(path)
-    np.testing.assert_array_equal(before.points, after.points)
-    np.testing.assert_array_equal(before.hit, after.hit)

@@ -10,11 +10,10 @@ from rosbags.interfaces import QosDurability
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from stillmap.core.camera import Images
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.io import writers
-from stillmap.io.ros.recording_writer import LaserScanEncoder, write_recording
+from stillmap.io.ros.writer import LaserScanEncoder, write_recording
 from stillmap.sim import scene_by_name, simulate
 
 KINDS = {"bag": "out.bag", "ros2": "out", "db3": "out.db3", "mcap": "out.mcap"}
@@ -106,16 +105,6 @@ def test_laser_scans(tmp_path, driven, kind):
         assert qos.durability is QosDurability.TRANSIENT_LOCAL
 
 
-def test_decreasing_angles(tmp_path):
-    scene = scene_by_name("hall", {"robot": {"scans": 2}, "laser": {"upside_down": "known"}})
-    recording = simulate(scene, 1).recording
-    write_recording(recording, tmp_path / "a.mcap", "mcap")
-    (_, scan), _ = decoded(tmp_path / "a.mcap")[0]["/scan"]
-    first, last = (np.arctan2(*recording.points[k][::-1]) for k in (0, len(scan.ranges) - 1))
-    np.testing.assert_allclose([scan.angle_min, scan.angle_max], [first, last], atol=1e-6)
-    assert scan.angle_increment < 0
-
-
 def clouds(beam_time=None):
     rng = np.random.default_rng(0)
     points = rng.normal(0, 10, (50, 3)).astype(np.float32)
@@ -165,18 +154,6 @@ def test_clouds(tmp_path, kind, timed):
     np.testing.assert_allclose(T, recording.T_base_sensor[0], atol=1e-12)
 
 
-def test_without_odometry(tmp_path, driven):
-    write_recording(driven.without_odometry(), tmp_path / "a.mcap", "mcap")
-    assert set(decoded(tmp_path / "a.mcap")[0]) == {"/scan", "/scan2", "/tf_static"}
-
-
-def test_uneven_beam_times_are_left_out(tmp_path, driven):
-    late = dataclasses.replace(driven, beam_time=driven.beam_time - np.float32(0.05))
-    [lost] = write_recording(late, tmp_path / "a.mcap", "mcap")
-    assert lost.startswith("beam times of 12 scans are left out")
-    assert decoded(tmp_path / "a.mcap")[0]["/scan"][0][1].time_increment == 0.0
-
-
 def test_scans_with_equal_stamps_share_the_odometry(tmp_path, driven):
     stamp_ns, T = np.array(driven.stamp_ns), np.array(driven.T_odom_base)
     stamp_ns[1], T[1] = stamp_ns[0], T[0]
@@ -221,26 +198,6 @@ def test_stamps_out_of_range(tmp_path, driven, kind, first, last):
     with pytest.raises(InputError, match="do not fit into a ROS bag"):
         write_recording(odd, tmp_path / KINDS[kind], kind)
     assert not list(tmp_path.iterdir())
-
-
-def test_uneven_directions_are_refused(tmp_path, driven):
-    points = np.array(driven.points)
-    points[100] = (5.0, 5.0)
-    with pytest.raises(InputError, match="not evenly spaced"):
-        write_recording(dataclasses.replace(driven, points=points), tmp_path / "a.bag", "bag")
-    assert not list(tmp_path.iterdir())
-
-
-def test_unsupported_fields_are_reported(tmp_path, driven):
-    images = Images(np.zeros(0, np.int64), np.zeros(0, np.int32), (), lambda _: np.zeros((1, 1)))
-    more = dataclasses.replace(
-        driven, images=images, T_recorded_base=np.tile(np.eye(3), (12, 1, 1))
-    )
-    lost = writers.write(more, tmp_path / "a.mcap")
-    assert lost == [
-        "its images are left out",
-        "its recorded poses are left out",
-    ]
 
 
 def test_a_recording_without_scans_is_refused(tmp_path, driven):

@@ -9,11 +9,10 @@ from small_bags import Messages, write_bag
 
 from stillmap.cli.main import main
 from stillmap.core import se2
-from stillmap.core.errors import InputError
-from stillmap.io import read, writers
+from stillmap.io import writers
 from stillmap.io.builder import ReadContext
 from stillmap.io.ros.bag import open_bag
-from stillmap.io.ros.reader import read_tilting, read_tilting_parts
+from stillmap.io.ros.reader import read_parts
 from stillmap.prepare.options import ReadOptions
 from stillmap.sim import RigOptions, load_truth, scene_by_name, simulate_rig, write_rig
 from stillmap.sim.laser import compute_beam_angles
@@ -88,6 +87,10 @@ def bag_of(folder, rig, joint_ns=None, kind="mcap"):
     return write_bag(folder, kind, messages, sorted(content, key=lambda one: one[1]), "rig")
 
 
+def read_tilting(path, context):
+    return read_parts([path], context, tilting=True)
+
+
 @pytest.fixture(scope="module")
 def path(rig, tmp_path_factory):
     return bag_of(tmp_path_factory.mktemp("bag"), rig)
@@ -112,23 +115,9 @@ def test_points_follow_the_joint(rig, path):
     np.testing.assert_allclose(down, rig.joint_angle, atol=1e-4)
 
 
-@pytest.mark.parametrize("kind", ["bag", "folder"])
-def test_other_kinds_of_bags(rig, path, tmp_path, kind):
-    found = read_tilting(bag_of(tmp_path, rig, kind=kind), TILT)
-    np.testing.assert_array_equal(found.points, read_tilting(path, TILT).points)
-
-
-def test_not_used_for_the_map(rig, path):
-    flat = read(path, ReadOptions(tilting_topic="/tilt_scan"))
-    assert flat.dimension == 2
-    assert flat.n_scans == rig.horizontal.recording.n_scans
-    (why,) = (t["why"] for t in flat.source["topics"] if t["topic"] == "/tilt_scan")
-    assert "tilts" in why
-
-
 def test_a_bag_in_parts(path, tmp_path):
     messages = Messages("cdr")
-    with closing(open_bag(path, None, trusted=True)) as whole:
+    with closing(open_bag([path], None, trusted=True)) as whole:
         content = [
             (message.channel.topic, message.log_ns, (message.channel.type, message.raw))
             for message in whole.messages({channel.topic for channel in whole.channels})
@@ -138,7 +127,7 @@ def test_a_bag_in_parts(path, tmp_path):
         write_bag(tmp_path, "mcap", messages, part, name)
         for name, part in (("a", content[:half]), ("b", content[half:]))
     ]
-    found, wanted = read_tilting_parts(parts, TILT), read_tilting(path, TILT)
+    found, wanted = read_parts(parts, TILT, tilting=True), read_tilting(path, TILT)
     np.testing.assert_array_equal(found.stamp_ns, wanted.stamp_ns)
     np.testing.assert_array_equal(found.points, wanted.points)
     np.testing.assert_array_equal(found.T_base_sensor, wanted.T_base_sensor)
@@ -191,22 +180,3 @@ def refused(capsys, *words):
     assert out == ""
     assert err.count("\n") == 1
     return err
-
-
-def test_wrong_topics(rig, path, tmp_path, capsys):
-    words = ("map", path, "-o", tmp_path / "out", "--tilting-topic")
-    assert "is not there" in refused(capsys, *words, "/nod")
-    assert "no scans" in refused(capsys, *words, "/tf")
-    assert "exclude each other" in refused(capsys, *words, "/tilt_scan", "--tilting", path)
-    write_rig(rig, tmp_path / "sim")
-    words = ("map", tmp_path / "sim/horizontal", "--tilting-topic", "/a", "-o", tmp_path / "out")
-    assert "is for bags" in refused(capsys, *words)
-    (tmp_path / "a.log").write_text("FLASER 2 1 2 0 0 0 0 0 0 1.0 host 1.0\n" * 3)
-    words = ("map", tmp_path / "a.log", "--tilting-topic", "/a", "-o", tmp_path / "out")
-    assert "is for bags" in refused(capsys, *words)
-
-
-def test_fixed_laser_is_refused(path):
-    flat = ReadContext(ReadOptions(topic="/scan", base_frame="base_link"))
-    with pytest.raises(InputError, match="does not tilt"):
-        read_tilting(path, flat)

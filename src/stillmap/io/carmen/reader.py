@@ -26,7 +26,7 @@ from stillmap.io.carmen.log import (
     flaser_config,
     read_log,
 )
-from stillmap.io.text_lines import is_gzip
+from stillmap.io.text_lines import Line, is_gzip, read_head
 from stillmap.prepare.lasers import (
     LaserPose,
     RawLaser,
@@ -41,6 +41,7 @@ from stillmap.prepare.time_window import TimeWindow
 Float = NDArray[np.float64]
 
 TIME_BACKWARDS = "time running backwards"
+_HEAD = 1 << 18  # bytes with the PARAM lines of a log
 _KIND_ORDER = ("ROBOTLASER", "FLASER", "RLASER", "RAWLASER")  # preference for the same laser
 # differences between laser and robot pose that agree: old logs round to cm. A corrected pose in
 # the laser field differs by metres, and differently in each scan
@@ -57,18 +58,23 @@ def read(path: Path, context: ReadContext) -> Recording:
 def read_parts(
     paths: Sequence[Path],
     context: ReadContext,
-    others: Sequence[Path] = (),  # noqa: ARG001
+    others: Sequence[Path] = (),
 ) -> Recording:
     """Read the parts of a CARMEN log, in order of time, as one.
 
     Bad records are counted in `source["skipped"]` (scans) and `source["skipped_odometry"]`, with
-    line numbers, which count through all parts.
+    line numbers, which count through all parts. PARAM lines are in the first part alone: without
+    any, those of one of the `others` count.
 
     Raises:
         InputError: a file cannot be read, or they hold no usable scan.
     """
     window = TimeWindow(context.options)
     log = read_log(paths, context.progress, window)
+    for path in others if not log.params else ():
+        for text in read_head(path, _HEAD).splitlines():
+            if text.startswith(b"PARAM"):
+                log.add(Line(log.n_lines, text))
     scans, duplicates = select_scans(log)
     if not scans:
         raise _no_scan_error(paths[0], log)

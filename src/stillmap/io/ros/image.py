@@ -16,8 +16,15 @@ from stillmap.core import se2
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
 from stillmap.io.rigid_transforms import rigid_transform
-from stillmap.io.ros.bag_types import Bag, Message
-from stillmap.io.ros.messages import CAMERA_INFO, COMPRESSED_IMAGE, decode, frame_name, stamp_ns
+from stillmap.io.ros.messages import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    Bag,
+    Message,
+    decode,
+    frame_name,
+    stamp_ns,
+)
 from stillmap.io.ros.tf import TransformTree
 
 _MAX_PIXELS = 1 << 27

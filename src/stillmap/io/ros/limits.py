@@ -13,14 +13,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 from urllib.parse import quote
 
 import apsw
 import lz4.frame  # type: ignore[import-untyped]
 
 from stillmap.core.errors import InputError
-from stillmap.core.input_files import require_regular
+from stillmap.core.input_files import InputFile, require_regular
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -29,16 +29,14 @@ else:
 
 MAX_CHUNK = 256 << 20  # bytes of one chunk or message; recorders write chunks of about one megabyte
 RECORD_COST = 64  # bytes that a record counts for, even an empty one
-ZstdError = zstd.ZstdError
 
 _DECOMPRESSORS: dict[str, Callable[[], Any]] = {
     "bz2": bz2.BZ2Decompressor,
     "lz4": lz4.frame.LZ4FrameDecompressor,
     "zstd": zstd.ZstdDecompressor,
 }
-
 _MAX_RATIO, _MIN_LIMIT = 300, 512 << 20  # output of a bag: times its size; bytes
-
+_PIECE = 1 << 20  # bytes
 _TABLES = ("topics", "messages", "schema", "message_definitions")
 _STEP_INTERVAL = 1000  # virtual machine steps between two calls of the progress handler
 _STEPS_PER_BYTE = 30  # a row takes about 20 steps, and has at least as many bytes
@@ -79,11 +77,6 @@ def count_output(count: int) -> None:
         raise OutputLimitError(f"is damaged: it expands to more than {_MAX_RATIO} times its size")
 
 
-def open_zstd(compressed: IO[bytes]) -> Any:
-    """A readable stream over a file of zstd frames; a context manager."""
-    return zstd.open(compressed, "rb")
-
-
 def decompress(compression: str, data: bytes) -> bytes:
     """Decompress up to `MAX_CHUNK` bytes of a compression in `_DECOMPRESSORS`.
 
@@ -100,6 +93,25 @@ def decompress(compression: str, data: bytes) -> bytes:
     return out
 
 
+def decompress_file(path: Path, out: Path) -> bool:
+    """Decompress a file of zstd frames; False if only its beginning could be, as it is damaged.
+
+    Raises:
+        InputError: it becomes too large.
+    """
+    with InputFile(path) as source, zstd.open(source, "rb") as stream, out.open("wb") as file:
+        limit = max(_MAX_RATIO * source.size, _MIN_LIMIT)
+        try:
+            while piece := stream.read(_PIECE):
+                file.write(piece)
+                if file.tell() > limit:
+                    what = f"decompresses to more than {_MAX_RATIO} times its size"
+                    raise InputError(what, where=str(path))
+        except (zstd.ZstdError, EOFError):
+            return False
+    return True
+
+
 def database_path(path: Path) -> str:
     """The path quoted for a SQLite URI, in which ?, # and % have a meaning."""
     return quote(os.path.realpath(os.fsencode(path)))
@@ -110,14 +122,20 @@ def open_database(path: Path) -> sqlite3.Connection:
 
     Raises:
         sqlite3.Error: it cannot be read.
-        InputError: see `_require_plain_tables`.
+        InputError: a table is a view, a virtual table or has generated columns.
     """
     require_regular(path)
     database = sqlite3.connect(f"file:{database_path(path)}?immutable=1&mode=ro", uri=True)
     try:
         database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_CHUNK)
         database.set_progress_handler(_step_counter(path), _STEP_INTERVAL)
-        _require_plain_tables(database)
+        query = "SELECT name, type, sql FROM sqlite_master WHERE name = ? COLLATE NOCASE"
+        for table in _TABLES:
+            for name, kind, sql in database.execute(query, (table,)).fetchall():
+                plain = kind == "table" and str(sql).upper().startswith("CREATE TABLE")
+                info = f"PRAGMA table_xinfo({table})"
+                if not plain or any(column[-1] for column in database.execute(info).fetchall()):
+                    raise InputError(f"is no bag: its {name} are no plain table")
     except BaseException:
         database.close()
         raise
@@ -154,18 +172,3 @@ def _step_counter(path: Path) -> Callable[[], bool]:
         return left < 0
 
     return exceeded
-
-
-def _require_plain_tables(database: sqlite3.Connection) -> None:
-    """Refuse views, virtual tables and generated columns.
-
-    Raises:
-        InputError: there is one.
-    """
-    for table in _TABLES:
-        query = "SELECT type, sql FROM sqlite_master WHERE name = ? COLLATE NOCASE"
-        for kind, sql in database.execute(query, (table,)).fetchall():
-            plain = kind == "table" and str(sql).upper().startswith("CREATE TABLE")
-            columns = database.execute(f"PRAGMA table_xinfo({table})").fetchall() if plain else []
-            if not plain or any(column[-1] for column in columns):
-                raise InputError(f"is no bag: its {table} are no plain table")

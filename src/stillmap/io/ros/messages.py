@@ -1,26 +1,152 @@
-"""Message types that are read, and decoding of their bytes.
+"""Kinds of bags, their channels and messages, and decoding of bytes.
 
-Definitions in a bag are only compared with the known ones, never turned into code.
+Definitions in a bag are only compared with the known ones, never turned into code. Detection of a
+bag by its first bytes loads none of the libraries.
 """
 
+import re
 import struct
+from collections.abc import Iterator
 from functools import cache
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from rosbags.typesys.store import Typestore
+from stillmap.core.errors import InputError
+from stillmap.core.input_files import InputFile
+from stillmap.io.builder import SkippedRecords
 
-from stillmap.io.ros import limits
-from stillmap.io.ros.bag_types import ZSTD_MAGIC, Channel, Message
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
+
+BagKind = Literal["bag", "ros2", "db3", "mcap"]
+
+ENDINGS = (".bag", ".db3", ".mcap")
+BAG1_MAGIC = b"#ROSBAG V"
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+DB3_MAGIC = b"SQLite format 3\0"
+_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 LASER_SCAN, MULTI_ECHO = "sensor_msgs/msg/LaserScan", "sensor_msgs/msg/MultiEchoLaserScan"
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
+SCAN_TYPES = (LASER_SCAN, MULTI_ECHO, POINT_CLOUD)
 ODOMETRY = "nav_msgs/msg/Odometry"
 TF, ROS1_TF = "tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"
 IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 
+UNREADABLE = "message that cannot be decoded"
+TIME_BACKWARDS = "time running backwards"
+
 _TF_DEFINITION = "geometry_msgs/TransformStamped[] transforms"
+
+
+class DamagedBagError(Exception):
+    """A bag turned out to be damaged or without its index."""
+
+
+class Channel(NamedTuple):
+    """One topic as one publisher wrote it.
+
+    Attributes:
+        id: within its bag.
+        topic: name.
+        type: of its messages, as `sensor_msgs/msg/LaserScan`.
+        encoding: `ros1` or `cdr`.
+        n_messages: number of messages.
+        digest: hash of the type definition, "" where the bag has none.
+        definition: text of the type definition, "" where the bag has none.
+        latched: late subscribers still get the last message.
+        publisher: name of the ROS 1 node that wrote it, "" where it is not known.
+        qos: profiles that ROS 2 publishers offered, as rosbags has them.
+    """
+
+    id: int
+    topic: str
+    type: str
+    encoding: str
+    n_messages: int = 0
+    digest: str = ""
+    definition: str = ""
+    latched: bool = False
+    publisher: str = ""
+    qos: tuple[Any, ...] = ()
+
+
+class Message(NamedTuple):
+    """One message: channel, log time in ns, content."""
+
+    channel: Channel
+    log_ns: int
+    raw: bytes
+
+
+class Bag(Protocol):
+    """An open bag.
+
+    Attributes:
+        kind: readable name.
+        channels: all channels.
+        damage: unreadable parts by reason and byte position.
+    """
+
+    kind: str
+    channels: list[Channel]
+    damage: SkippedRecords
+
+    def messages(self, topics: set[str], since_ns: int | None = None) -> Iterator[Message]:
+        """Messages of these topics, roughly by log time; with `since_ns` no earlier ones.
+
+        Raises:
+            DamagedBagError: an indexed bag is damaged.
+        """
+        ...
+
+    def close(self) -> None:
+        """Close the files."""
+        ...
+
+
+def is_bag(path: Path, start: bytes | None) -> bool:
+    """True if a file with these first bytes, or a folder (None), is a bag.
+
+    The files of a folder must be one recording, which recorders split into X_0, X_1, ...
+    """
+    if start is not None:
+        return start.startswith((BAG1_MAGIC, MCAP_MAGIC, DB3_MAGIC)) or is_compressed(path, start)
+    files = storage_files(path)
+    if (path / "metadata.yaml").is_file():
+        return bool(files)
+    return len({re.sub(r"_\d+$", "", file.name.partition(".")[0]) for file in files}) == 1
+
+
+def is_compressed(path: Path, start: bytes) -> bool:
+    """True if a file of a ROS 2 folder is compressed as a whole."""
+    return path.name.endswith((".db3.zstd", ".mcap.zstd")) and start.startswith(_ZSTD_MAGIC)
+
+
+def detect_kind(path: Path) -> tuple[BagKind, bool]:
+    """The kind of a bag, and whether it stores messages as MCAP."""
+    if path.is_dir():
+        return "ros2", any(".mcap" in file.name for file in storage_files(path))
+    with InputFile(path) as file:
+        start = file.read(len(DB3_MAGIC))
+    if start.startswith(BAG1_MAGIC):
+        return "bag", False
+    is_mcap = ".mcap" in path.name or start.startswith(MCAP_MAGIC)
+    return ("mcap", True) if is_mcap else ("db3", False)
+
+
+def storage_files(folder: Path) -> list[Path]:
+    """The files of a ROS 2 folder that hold messages, bag_2 before bag_10."""
+
+    def natural_order(path: Path) -> tuple[list[int], str]:
+        return [int(digits[:18]) for digits in re.findall("[0-9]+", path.name)], path.name
+
+    try:
+        files = sorted(folder.iterdir(), key=natural_order)
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", where=str(folder)) from error
+    return [f for f in files if f.name.removesuffix(".zstd").endswith((".db3", ".mcap"))]
 
 
 def decode(message: Message) -> Any:
@@ -39,8 +165,11 @@ def decode(message: Message) -> Any:
 def decompress(message: Message) -> bytes:
     """The content of a message, which ROS 2 may have compressed one by one."""
     # a CDR message begins with a zero byte
-    compressed = message.channel.encoding != "ros1" and message.raw.startswith(ZSTD_MAGIC)
-    return limits.decompress("zstd", message.raw) if compressed else message.raw
+    if message.channel.encoding == "ros1" or not message.raw.startswith(_ZSTD_MAGIC):
+        return message.raw
+    from stillmap.io.ros import limits
+
+    return limits.decompress("zstd", message.raw)
 
 
 def find_fault(channel: Channel) -> str | None:
@@ -55,8 +184,10 @@ def find_fault(channel: Channel) -> str | None:
 
 
 @cache
-def load_typestore(encoding: str) -> Typestore:
+def load_typestore(encoding: str) -> "Typestore":
     """The message definitions of an encoding, `ros1` or `cdr`."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
     if encoding != "ros1":
         return get_typestore(Stores.ROS2_HUMBLE)
     store = get_typestore(Stores.ROS1_NOETIC)

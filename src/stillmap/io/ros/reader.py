@@ -1,33 +1,46 @@
-"""Reads ROS bags as recordings, without ROS."""
+"""Reads ROS bags as recordings, without ROS: selects topics, and collects their messages once."""
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from contextlib import closing
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any, NamedTuple
 
 from stillmap.core.advice import advise
+from stillmap.core.camera import Images
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.core.timestamps import longest_non_decreasing
 from stillmap.io.builder import ReadContext, SkippedRecords
-from stillmap.io.ros import base_frame
-from stillmap.io.ros.bag import JoinedBag, bag_size, open_parts
-from stillmap.io.ros.bag_types import Bag, DamagedBagError
-from stillmap.io.ros.collect import BagContent, collect_messages, select_topics
-from stillmap.io.ros.laser_recording import build_laser_recording, build_tilting_recording
-from stillmap.io.ros.laser_scan import TIME_BACKWARDS
-from stillmap.io.ros.lent_transforms import lend_transforms
-from stillmap.io.ros.limits import limit_output
-from stillmap.io.ros.point_cloud2 import CloudCollector
+from stillmap.io.ros.bag import bag_size, open_bag
+from stillmap.io.ros.clouds import CloudCollector, read_clouds
+from stillmap.io.ros.image import ImageCollector
+from stillmap.io.ros.lasers import LaserCollector, read_lasers, read_tilting_laser
+from stillmap.io.ros.limits import count_output, limit_output
+from stillmap.io.ros.messages import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    ODOMETRY,
+    POINT_CLOUD,
+    ROS1_TF,
+    SCAN_TYPES,
+    TF,
+    UNREADABLE,
+    Bag,
+    Channel,
+    DamagedBagError,
+    Message,
+    decode,
+    find_fault,
+    peek_stamp_ns,
+)
+from stillmap.io.ros.tf import Frames, Odometry, TransformTree
 from stillmap.prepare.options import ReadOptions
+from stillmap.prepare.time_window import TimeWindow
 
-_BuildFromLasers = Callable[[BagContent, ReadContext], Recording]
-
-_STILL = 1e-3  # m and entries of a rotation matrix: a sensor that moves less is fixed
+_STATIC = "tf_static"
+_PROGRESS_INTERVAL = 2000  # messages
 
 
 def read(path: Path, context: ReadContext) -> Recording:
@@ -39,7 +52,8 @@ def read_parts(
     paths: Sequence[Path],
     context: ReadContext,
     others: Sequence[Path] = (),
-    build: _BuildFromLasers = build_laser_recording,
+    *,
+    tilting: bool = False,
 ) -> Recording:
     """Read bags that are parts of one run as one.
 
@@ -50,74 +64,56 @@ def read_parts(
         paths: of the bags, in order of time.
         context: see ReadContext.
         others: bags that may be further parts: recorders write static transforms into the first
-            part alone, so that one without any takes those of the part before.
-        build: builds the recording of laser scans.
+            part alone, so that one without any takes those of another.
+        tilting: the laser tilts or pans: its scans become 3D points, by the transforms. The option
+            `topic` names them, or clouds made from them; `base_frame` the robot.
 
     Raises:
         InputError: one cannot be read, or they hold no usable scan.
     """
-    path = paths[0]
-    damage, size = "", sum(bag_size(one) for one in (*paths, *others))
+    where, damage, size = str(paths[0]), "", bag_size([*paths, *others])
     for trusted in (True, False):
-        reopen = partial(_open, paths, others, context.scratch, trusted=trusted)
+        reopen = partial(open_bag, paths, context.scratch, trusted=trusted)
         try:
             with limit_output(size), closing(reopen()) as bag:
-                recording = _build_recording(bag, context, reopen, build)
+                recording = _read_bag(bag, context, reopen, others, tilting)
         except DamagedBagError as error:
-            damage = str(error)
+            damage = str(error).rstrip(".")
         except InputError as error:
-            if damage and not error.where:
-                what = f"{error.what}; it is damaged: {damage}"
-                raise InputError(what, where=str(path), hint=error.hint) from error
-            raise InputError(error.what, where=error.where or str(path), hint=error.hint) from error
+            what = f"{error.what}; it is damaged: {damage}" if damage else error.what
+            raise InputError(what, where=error.where or where, hint=error.hint) from error
         else:
-            recording.source.update(path=str(path), format=bag.kind)
+            recording.source.update(path=where, format=bag.kind)
             if damage:
-                reason = damage.rstrip(".")
-                text = advise(
-                    f"the bag is cut or damaged ({reason}): what could be read is used",
-                    "copy it again; if it was recorded so, the map ends where the bag does",
-                )
-                recording.source["warnings"].insert(0, text)
+                what = f"the bag is cut or damaged ({damage}): what could be read is used"
+                todo = "copy it again; if it was recorded so, the map ends where the bag does"
+                recording.source["warnings"].insert(0, advise(what, todo))
             return recording
-    raise InputError(f"is damaged: {damage}", where=str(path))
+    raise InputError(f"is damaged: {damage}", where=where)
 
 
-def _open(
-    paths: Sequence[Path], others: Sequence[Path], scratch: Path | None, *, trusted: bool
-) -> Bag:
-    bag = open_parts(paths, scratch, trusted=trusted)
-    return lend_transforms(bag, others, scratch) if others else bag
-
-
-def read_tilting(path: Path, context: ReadContext) -> Recording:
-    """Read the scans of a tilting laser; see `read_tilting_parts`."""
-    return read_tilting_parts([path], context)
-
-
-def read_tilting_parts(paths: Sequence[Path], context: ReadContext) -> Recording:
-    """Read the scans of a laser that tilts or pans as 3D points, by the bag's transform tree.
-
-    Args:
-        paths: of the bag, or of its parts in order of time.
-        context: the option `topic` names the scans, or clouds made from them; `base_frame` the
-            robot.
-
-    Raises:
-        InputError: it cannot be read, or transforms do not say how the laser moves.
-    """
-    return read_parts(paths, context, build=build_tilting_recording)
-
-
-def _build_recording(
-    bag: Bag, context: ReadContext, reopen: Callable[[], Bag], build: _BuildFromLasers
+def _read_bag(
+    bag: Bag,
+    context: ReadContext,
+    reopen: Callable[[], Bag],
+    others: Sequence[Path],
+    tilting: bool,
 ) -> Recording:
     topics = select_topics(bag, context.options)
     content = collect_messages(bag, topics, context)
+    if others and not _static_topics(bag):
+        _lend_transforms(content.transforms, others, context.scratch)
+    frames = Frames(content.transforms, content.odometry)
     if topics.has_clouds:
-        recording = _build_cloud_recording(content, context.options, reopen)
+
+        def find_images(base: str) -> Images | None:
+            images = content.images.build_images(content.transforms, base, reopen)
+            return content.window.select_images(images)
+
+        recording = read_clouds(content.clouds, frames, context.options, find_images)
     else:
-        recording = build(content, context)
+        read_scans = read_tilting_laser if tilting else read_lasers
+        recording = read_scans(content.lasers, frames, context)
     recording.source.update(
         topics=topics.notes,
         skipped_unit="message",
@@ -125,114 +121,181 @@ def _build_recording(
         skipped_odometry=content.skipped_odometry.to_dict(),
         **content.window.notes(),
     )
-    if isinstance(bag, JoinedBag) and bag.repeated:
-        text = f"{bag.repeated} messages that earlier parts hold already"
-        recording.source["duplicates"].append(text)
     return recording
 
 
-def _build_cloud_recording(
-    content: BagContent, options: ReadOptions, reopen: Callable[[], Bag]
-) -> Recording:
-    """Build the 3D recording of all point clouds.
+def _static_topics(bag: Bag) -> set[str]:
+    return {c.topic for c in bag.channels if c.n_messages and c.topic.endswith(_STATIC)}
+
+
+def _lend_transforms(tree: TransformTree, others: Sequence[Path], scratch: Path | None) -> None:
+    """Add the static transforms of the first of several bags that has any."""
+    for path in others:
+        try:
+            with closing(open_bag([path], scratch, trusted=True)) as bag:
+                for message in bag.messages(_static_topics(bag)):
+                    tree.add_message(decode(message), static=True)
+                if _static_topics(bag):
+                    return
+        except (DamagedBagError, InputError, OSError):
+            continue  # it is reported when it is read itself
+
+
+class TopicSelection(NamedTuple):
+    """Topics by their use.
+
+    Attributes:
+        uses: "scans", "images", "transforms" or "odometry", by topic.
+        has_clouds: whether scans are point clouds.
+        notes: type, number of messages and use of every topic of the bag.
+    """
+
+    uses: dict[str, str]
+    has_clouds: bool
+    notes: list[dict[str, Any]]
+
+
+def select_topics(bag: Bag, options: ReadOptions) -> TopicSelection:
+    """Select the topics to read: laser scans, else point clouds, and what belongs to them.
 
     Raises:
-        InputError: none can be used.
+        InputError: no topic has scans, or a topic that the options name has none.
     """
-    clouds = content.clouds
-    if not len(clouds.scans):
-        total = SkippedRecords().merge(*clouds.skipped.values())
-        raise InputError(f"holds no usable cloud: {total.summary('message')}")
-    names = list(clouds.sensors)
-    counts = np.bincount(np.asarray(clouds.scans.sensor), minlength=len(names)).tolist()
-    used, omitted = _select_sensors(clouds, counts, named=options.topic is not None)
-    stamps = np.asarray(clouds.scans.stamp_ns, np.int64)
-    scans = [_select_forward_scans(clouds, names[k][0], k, stamps) for k in used]
-    frames = [(names[k][1], stamps[rows]) for k, rows in zip(used, scans, strict=True)]
-    poses = base_frame.find_sensor_poses(content, frames, options)
-    T, selection, warnings = _place_sensors(poses, names, used, scans, options, omitted)
-    odom, origin = base_frame.find_odometry(content, poses.base, stamps, options, warnings)
-    skipped = SkippedRecords().merge(*clouds.skipped.values())
-    sensors = [
-        {"name": topic, "frame": frame, "scans": n}
-        for (topic, frame), n in zip(names, counts, strict=True)
-    ]
-    recording = clouds.scans.build(
-        T,
-        selection=selection,
-        T_odom_base=odom,
-        images=content.window.select_images(
-            content.images.build_images(content.transforms, poses.base, reopen)
-        ),
-        record=np.asarray(clouds.number, np.int64),
-        source={
-            "sensors": sensors,
-            "base_frame": poses.base,
-            "base_frame_how": poses.how,
-            "odometry": origin,
-            "skipped": skipped.to_dict(),
-            "duplicates": omitted,
-            "warnings": poses.warnings + warnings,
-        },
-    )
-    timed = clouds.timed.intersection(used)
-    return recording if timed else dataclasses.replace(recording, beam_time=None)
+    usable = [c for c in bag.channels if c.n_messages and find_fault(c) is None]
+    tilting = {f"{slash}{options.tilting_topic}" for slash in ("", "/")}
+    scans = _find_named(usable, bag, options) or [c for c in usable if c.type in SCAN_TYPES]
+    scans = [c for c in scans if c.topic not in tilting]
+    if not scans:
+        of_scans = [c for c in bag.channels if c.type in SCAN_TYPES]
+        faults = [f"{c.topic} {fault}" for c in of_scans if (fault := find_fault(c))]
+        faults += [f"{c.topic} is empty" for c in of_scans if not c.n_messages]
+        what = f"holds no scans: {faults[0]}" if faults else "holds no scans"
+        raise InputError(what, hint=_list_topics(bag.channels))
+    lasers = [c for c in scans if c.type != POINT_CLOUD]
+    further = {"odometry": (ODOMETRY,), "transforms": (TF, ROS1_TF)}
+    if not lasers:
+        further["images"] = (IMAGE, COMPRESSED_IMAGE, CAMERA_INFO)
+    uses = {c.topic: use for use, types in further.items() for c in usable if c.type in types}
+    uses |= dict.fromkeys((c.topic for c in lasers or scans), "scans")
+    notes = [_describe_topic(c, uses.get(c.topic), tilting) for c in bag.channels]
+    return TopicSelection(uses, not lasers, notes)
 
 
-def _select_sensors(
-    clouds: CloudCollector, counts: list[int], *, named: bool
-) -> tuple[list[int], list[str]]:
-    """The sensors to use, most points first: other clouds are derived from these."""
-    names = list(clouds.sensors)
-    sensor, beams = np.asarray(clouds.scans.sensor), np.asarray(clouds.scans.length)
-    points = [int(beams[sensor == k].sum()) for k in range(len(names))]
-    order = sorted(range(len(names)), key=lambda k: (-points[k], names[k]))
-    candidates = [(*names[k], counts[k]) for k in order]
-    chosen, omitted = base_frame.drop_duplicates(candidates, "clouds", named=named)
-    return [order[k] for k in chosen], omitted
+def _find_named(usable: list[Channel], bag: Bag, options: ReadOptions) -> list[Channel]:
+    """The channels of the topics that the options name."""
+    named = []
+    for name in (options.topic or "").split(",") if options.topic is not None else ():
+        own = [c for c in bag.channels if c.topic in (name.strip(), f"/{name.strip()}")]
+        scans = [c for c in own if c in usable and c.type in SCAN_TYPES]
+        if not scans:
+            faults = [find_fault(c) or f"has {c.type}, no scans" for c in own if c.n_messages]
+            fault = faults[0] if faults else ("is empty" if own else "is not there")
+            raise InputError(f"topic {name.strip()!r} {fault}", hint=_list_topics(bag.channels))
+        named += scans
+    if len({c.type == POINT_CLOUD for c in named}) > 1:
+        raise InputError("laser scans and point clouds cannot be used together", hint="name either")
+    return named
 
 
-def _place_sensors(
-    poses: base_frame.SensorPoses,
-    names: list[tuple[str, str]],
-    used: list[int],
-    scans: list[NDArray[np.intp]],
-    options: ReadOptions,
-    omitted: list[str],
-) -> tuple[NDArray[np.float64], NDArray[np.intp], list[str]]:
-    """T_base_sensor (S, 4, 4), the scans of sensors with a known pose, and warnings.
+def _list_topics(channels: list[Channel]) -> str:
+    if not channels:
+        return "it has no topics"
+    of_scans = [c for c in channels if c.type in SCAN_TYPES and c.n_messages]
+    shown = [f"{c.topic} ({c.type.rpartition('/')[2]})" for c in (of_scans or channels)[:12]]
+    return f"{'topics with scans:' if of_scans else 'it has'} {', '.join(shown)}"
 
-    Sensors without one are added to `omitted`.
+
+def _describe_topic(channel: Channel, use: str | None, tilting: set[str]) -> dict[str, Any]:
+    why = "not used" if use is None else f"read for {use}"
+    if channel.n_messages == 0:
+        why = "empty"
+    elif use is None and channel.type in (*SCAN_TYPES, ODOMETRY, TF, ROS1_TF):
+        if fault := find_fault(channel):
+            why = fault
+        elif channel.topic in tilting:
+            why = "not for the map: its laser tilts"
+        elif channel.type == POINT_CLOUD:
+            why = "not used: the laser scans are (name it to use it instead)"
+        elif channel.type in SCAN_TYPES:
+            why = "not used: others are named"
+    return {
+        "topic": channel.topic,
+        "type": channel.type,
+        "messages": channel.n_messages,
+        "used": use is not None,
+        "why": why,
+    }
+
+
+@dataclass
+class BagContent:
+    """The content of the selected topics."""
+
+    lasers: LaserCollector
+    clouds: CloudCollector
+    window: TimeWindow
+    images: ImageCollector = field(default_factory=ImageCollector)
+    transforms: TransformTree = field(default_factory=TransformTree)
+    odometry_by_topic: dict[str, Odometry] = field(default_factory=dict)
+    unreadable: SkippedRecords = field(default_factory=SkippedRecords)
+
+    @property
+    def odometry(self) -> list[Odometry]:
+        """The Odometry topics with at least one pose."""
+        return [topic for topic in self.odometry_by_topic.values() if len(topic.stamp_ns)]
+
+    @property
+    def skipped_odometry(self) -> SkippedRecords:
+        """Transforms and poses that could not be used."""
+        of_topics = (topic.skipped for topic in self.odometry_by_topic.values())
+        return self.unreadable.merge(self.transforms.skipped, *of_topics)
+
+    def add(self, message: Message, use: str | None, number: int) -> None:
+        """Add a message; scans and images outside the time window are not decoded."""
+        topic = message.channel.topic
+        if use == "scans":
+            stamp = peek_stamp_ns(message) if self.window else None
+            skip = stamp is not None and not self.window.select(stamp)
+            scans = self.clouds if message.channel.type == POINT_CLOUD else self.lasers
+            scans.add_message(message, skip=skip)
+        elif use == "images":
+            # one CameraInfo holds for all images
+            whole = not self.window or message.channel.type == CAMERA_INFO
+            stamp = None if whole else peek_stamp_ns(message)
+            if stamp is None or self.window.contains(stamp):
+                self.images.add_message(message)
+        else:
+            try:
+                self._add_pose(message, use)
+            except Exception:  # any error of rosbags about damaged bytes
+                self.unreadable.add(f"{UNREADABLE} ({topic})", number)
+
+    def _add_pose(self, message: Message, use: str | None) -> None:
+        topic = message.channel.topic
+        if use == "transforms":
+            static = topic.endswith(_STATIC)
+            self.transforms.add_message(decode(message), static=static)
+        elif use == "odometry":
+            odometry = self.odometry_by_topic.setdefault(topic, Odometry(topic))
+            odometry.add_message(decode(message))
+        else:  # of a damaged bag whose connections have the number of others
+            raise ValueError(topic)
+
+
+def collect_messages(bag: Bag, selection: TopicSelection, context: ReadContext) -> BagContent:
+    """Read the selected topics.
+
+    Raises:
+        DamagedBagError: an indexed bag is damaged.
+        InputError: no scan lies in the window.
     """
-    T = np.tile(np.eye(4), (len(names), 1, 1))
-    kept: list[NDArray[np.intp]] = []
-    topics: list[str] = []
-    warnings = []
-    for k, rows, found in zip(used, scans, poses.T_base_sensor, strict=True):
-        topic, frame = names[k]
-        if found is None and (kept or options.base_frame is not None):
-            text = f"no transform connects {frame!r} with {poses.base!r}"
-            if not kept:
-                raise InputError(text)
-            omitted.append(f"{topic}: {len(rows)} clouds, {text}")
-            continue
-        kept.append(rows)
-        topics.append(topic)
-        if found is not None:
-            T[k] = found[0]
-            if np.abs(found - found[0]).max() > _STILL:
-                warnings.append(f"{topic}: the sensor moves on the robot: its first pose is used")
-    base_frame.require_named_topics(topics, omitted, options)
-    return T, np.sort(np.concatenate(kept)), warnings
-
-
-def _select_forward_scans(
-    clouds: CloudCollector, topic: str, sensor: int, stamps: NDArray[np.int64]
-) -> NDArray[np.intp]:
-    """The scans of a sensor with non-decreasing stamps; others are counted."""
-    rows = np.flatnonzero(np.asarray(clouds.scans.sensor) == sensor)
-    keep = longest_non_decreasing(stamps[rows].tolist())
-    number = np.asarray(clouds.number)[rows]
-    skipped = clouds.skipped.setdefault(topic, SkippedRecords())
-    skipped.add_all(TIME_BACKWARDS, np.delete(number, keep))
-    return rows[keep]
+    window = TimeWindow(context.options)
+    content = BagContent(LaserCollector(context), CloudCollector(context), window)
+    total = sum(c.n_messages for c in bag.channels if c.topic in selection.uses)
+    for number, message in enumerate(bag.messages(set(selection.uses)), start=1):
+        count_output(len(message.raw))
+        content.add(message, selection.uses.get(message.channel.topic), number)
+        if context.progress is not None and number % _PROGRESS_INTERVAL == 0:
+            context.progress(min(number / max(total, 1), 1.0))
+    window.require_scans()
+    return content

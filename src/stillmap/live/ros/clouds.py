@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.io.ros.clouds import parse_cloud
 from stillmap.io.ros.messages import stamp_ns
-from stillmap.io.ros.point_cloud2 import parse_cloud
 from stillmap.live.ros.conversions import fill_header, shape_of
 from stillmap.live.scan import Scan, ScanBeams, to_beams
 

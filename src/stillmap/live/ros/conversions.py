@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from stillmap.core import se2
 from stillmap.core.grid_map import GridMap
-from stillmap.io.ros.laser_scan import ScanShape
+from stillmap.io.ros.lasers import ScanShape
 from stillmap.io.ros.messages import frame_name, stamp_ns
 from stillmap.live.scan import Scan as PushedScan
 from stillmap.live.scan import ScanBeams, to_beams

@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from stillmap.core import se2
 from stillmap.core.short_repr import ShortRepr
-from stillmap.io.ros.base_frame import project_to_plane
+from stillmap.io.ros.clouds import find_layout
 from stillmap.io.ros.messages import frame_name, stamp_ns
-from stillmap.io.ros.point_cloud2 import find_layout
+from stillmap.io.ros.tf import project_to_plane
 from stillmap.live.ros.clouds import to_cloud_beams
 from stillmap.live.ros.conversions import (
     Mount,

@@ -8,12 +8,17 @@ import numpy as np
 from stillmap.core import se2
 from stillmap.core.local_frame import LocalFrame
 from stillmap.core.region import limit_hits
-from stillmap.io.ros import message_writer
-from stillmap.io.ros.bag_types import BagKind
-from stillmap.io.ros.bag_writer import BagWriter, new_bag, require_stamps
-from stillmap.io.ros.message_writer import BASE, MAP, ODOM
-from stillmap.io.ros.messages import ODOMETRY, POINT_CLOUD, TF
-from stillmap.io.ros.recording_writer import write_sensor_frames
+from stillmap.io.ros import writer as ros
+from stillmap.io.ros.messages import ODOMETRY, POINT_CLOUD, TF, BagKind
+from stillmap.io.ros.writer import (
+    BASE,
+    MAP,
+    ODOM,
+    BagWriter,
+    new_bag,
+    require_stamps,
+    write_sensor_frames,
+)
 from stillmap.results.export.bag_objects import make_object_writer
 from stillmap.results.export.bag_scans import LaserWriter, LidarWriter, make_cloud_message
 from stillmap.results.folder import Exported
@@ -80,14 +85,14 @@ def _write_latched_topics(bag: BagWriter, result: Exported) -> None:
     """Map and trajectory, as one latched message each."""
     stamp_ns, grid = result.recording.stamp_ns, result.map
     first = int(stamp_ns[0])
-    send = bag.add_topic("/map", message_writer.GRID, latched=True)
+    send = bag.add_topic("/map", ros.GRID, latched=True)
     corner = se2.matrix(*grid.origin)
     send(
         first,
-        message_writer.make_occupancy_grid(bag, first, grid.p_occupied, corner, grid.resolution),
+        ros.make_occupancy_grid(bag, first, grid.p_occupied, corner, grid.resolution),
     )
-    send = bag.add_topic("/trajectory", message_writer.PATH, latched=True)
-    send(first, message_writer.make_path(bag, stamp_ns, result.poses))
+    send = bag.add_topic("/trajectory", ros.PATH, latched=True)
+    send(first, ros.make_path(bag, stamp_ns, result.poses))
 
 
 def _write_static_points(
@@ -120,8 +125,8 @@ def _make_frame_writer(bag: BagWriter, result: Exported) -> Callable[[int], None
             T = T_odom_base[t]
             T_map_odom = T_map_base @ se2.inverse(T)
         poses = [(MAP, ODOM, T_map_odom), (ODOM, BASE, T)]
-        send_tf(stamp, message_writer.make_transforms(bag, stamp, poses))
+        send_tf(stamp, ros.make_transforms(bag, stamp, poses))
         if send_odometry is not None:
-            send_odometry(stamp, message_writer.make_odometry(bag, stamp, T))
+            send_odometry(stamp, ros.make_odometry(bag, stamp, T))
 
     return write_frames

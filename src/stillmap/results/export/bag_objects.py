@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.io.ros import message_writer
-from stillmap.io.ros.bag_writer import BagWriter
-from stillmap.io.ros.message_writer import MAP
+from stillmap.io.ros import writer as ros
+from stillmap.io.ros.writer import MAP, BagWriter
 from stillmap.results.object_poses import interpolate_pose, iter_present_tracks
 from stillmap.results.reader import Track
 
@@ -28,7 +27,7 @@ def make_object_writer(
 
     Each message begins with a marker that removes the earlier ones.
     """
-    send = bag.add_topic("/objects", message_writer.MARKERS)
+    send = bag.add_topic("/objects", ros.MARKERS)
     present_at, shown = iter_present_tracks(tracks, stamp_ns), list[int]()
 
     def write_markers(t: int) -> None:
@@ -40,7 +39,7 @@ def make_object_writer(
         markers = [_make_marker(bag, stamp, {"action": _DELETE_ALL})]
         for n in shown:
             markers += _markers_of(bag, stamp, tracks[n])
-        send(stamp, bag.make(message_writer.MARKERS, markers=markers))
+        send(stamp, bag.make(ros.MARKERS, markers=markers))
 
     return write_markers
 
@@ -71,7 +70,7 @@ def _make_marker(bag: BagWriter, stamp: int, more: dict[str, Any], T: Float | No
         "id": 0,
         "type": _CUBE,
         "action": _ADD,
-        "pose": message_writer.make_pose(bag, np.eye(4) if T is None else T),
+        "pose": ros.make_pose(bag, np.eye(4) if T is None else T),
         "scale": bag.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
         "color": bag.make("std_msgs/msg/ColorRGBA", r=r, g=g, b=b, a=a),
         "lifetime": bag.make("builtin_interfaces/msg/Duration", sec=0, nanosec=0),

@@ -7,10 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.em.types import DYNAMIC_BELOW
-from stillmap.io.ros import message_writer
-from stillmap.io.ros.bag_writer import BagWriter, Send
+from stillmap.io.ros import writer as ros
 from stillmap.io.ros.messages import LASER_SCAN, POINT_CLOUD
-from stillmap.io.ros.recording_writer import LaserScanEncoder, number_names
+from stillmap.io.ros.writer import BagWriter, LaserScanEncoder, Send, number_names
 from stillmap.results.folder import Exported
 from stillmap.results.point_cloud import Block
 from stillmap.results.points import FIELDS, PACKED_COLOUR, make_vertices
@@ -91,4 +90,4 @@ class LidarWriter:
 def make_cloud_message(bag: BagWriter, stamp_ns: int, frame: str, block: Block) -> Any:
     """A PointCloud2 of points in a frame: x, y, z, `p_static`, and `rgb` for colours."""
     fields = FIELDS if block.colors is None else FIELDS + PACKED_COLOUR
-    return message_writer.make_point_cloud(bag, stamp_ns, frame, make_vertices(block, fields))
+    return ros.make_point_cloud(bag, stamp_ns, frame, make_vertices(block, fields))

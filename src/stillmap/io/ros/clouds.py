@@ -1,0 +1,219 @@
+"""PointCloud2 messages: collected by topic and frame, as a 3D recording."""
+
+from array import array
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.camera import Images
+from stillmap.core.errors import InputError
+from stillmap.core.recording import Recording
+from stillmap.core.timestamps import longest_non_decreasing
+from stillmap.io.builder import ReadContext, RecordingBuilder, SkippedRecords
+from stillmap.io.point_cloud import time_field
+from stillmap.io.point_cloud.binary_table import record_dtype
+from stillmap.io.point_cloud.scans import Cloud
+from stillmap.io.ros import tf
+from stillmap.io.ros.messages import (
+    TIME_BACKWARDS,
+    UNREADABLE,
+    Message,
+    decode,
+    frame_name,
+    stamp_ns,
+)
+from stillmap.prepare.options import ReadOptions
+
+NO_COORDINATES = "cloud without x, y and z"
+WRONG_SIZE = "cloud whose size is not what it states"
+
+_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+_MAX_STEP = 1 << 16  # bytes of one point
+_STILL = 1e-3  # m and entries of a rotation matrix: a sensor that moves less is fixed
+
+
+class CloudLayout(NamedTuple):
+    """The layout of the points in the data of a message.
+
+    Attributes:
+        columns: type and byte offset of the fields that are read, by name in lower case.
+        time: name of the time field; None: there is none.
+        shape: rows and columns of points.
+        strides: bytes from row to row, and from point to point.
+    """
+
+    columns: dict[str, tuple[str, int]]
+    time: str | None
+    shape: tuple[int, int]
+    strides: tuple[int, int]
+
+    @property
+    def n_points(self) -> int:
+        """Number of points of the message."""
+        return self.shape[0] * self.shape[1]
+
+    def view(self, data: NDArray[np.uint8]) -> NDArray[Any]:
+        """The fields that are read, (rows, columns), as a view of the data of a message."""
+        dtype = record_dtype(self.columns, self.strides[1])
+        return np.ndarray(self.shape, dtype, data, strides=self.strides)
+
+
+def find_layout(message: Any) -> CloudLayout | str:
+    """The layout of a PointCloud2 message with fields in any order, or why it cannot be used."""
+    fields = {str(f.name).lower(): f for f in message.fields}
+    step, width, height = int(message.point_step), int(message.width), int(message.height)
+    row = int(message.row_step) or width * step
+    if not 0 < step <= _MAX_STEP or row < width * step:
+        return WRONG_SIZE
+    end = (height - 1) * row + width * step if width and height else 0
+    if end > len(message.data):
+        return WRONG_SIZE
+    time = time_field.find_time_column(fields)
+    order = ">" if message.is_bigendian else "<"
+    columns: dict[str, tuple[str, int]] = {}
+    for name in ("x", "y", "z", time):
+        if name is not None and name in fields:
+            kind, offset = _TYPES.get(int(fields[name].datatype)), int(fields[name].offset)
+            if kind is not None and offset + int(kind[1]) <= step:
+                columns[name] = f"{order}{kind}", offset
+    if not columns.keys() >= set("xyz"):
+        return NO_COORDINATES
+    return CloudLayout(columns, time if time in columns else None, (height, width), (row, step))
+
+
+def parse_cloud(message: Any) -> Cloud | str:
+    """The cloud of a PointCloud2 message, or why it cannot be used.
+
+    Its times are in seconds after the stamp; points are not finite for no return.
+    """
+    layout = find_layout(message)
+    if isinstance(layout, str):
+        return layout
+    if layout.n_points == 0:
+        return Cloud(np.empty((0, 3), np.float32))
+    values = layout.view(message.data).reshape(-1)
+    points = np.stack([values[name].astype(np.float32) for name in "xyz"], axis=1)
+    clock = None if layout.time is None else time_field.detect_clock(values[layout.time], None)
+    if layout.time is None or clock is None:
+        return Cloud(points)
+    usable = np.asarray(np.isfinite(points).all(axis=1))
+    stamp = stamp_ns(message.header)
+    times = time_field.convert_times(values[layout.time], usable, clock, stamp)[1]
+    return Cloud(points, times=times)
+
+
+class CloudCollector:
+    """Collects the scans of all sensors: one topic may carry several, by frame.
+
+    Attributes:
+        sensors: number of each sensor, by topic and frame.
+        timed: sensors with beam times.
+        number: (T,) number of the message of each scan on its topic, from 1.
+        scans: stamps, sensors and points.
+        skipped: messages that were skipped, by topic.
+    """
+
+    def __init__(self, context: ReadContext) -> None:
+        self._count: Counter[str] = Counter()  # messages by topic
+        self.skipped: dict[str, SkippedRecords] = {}
+        self.sensors: dict[tuple[str, str], int] = {}
+        self.timed: set[int] = set()
+        self.number = array("q")
+        self.scans = RecordingBuilder(3, context, beam_times=True)
+
+    def add_message(self, message: Message, *, skip: bool = False) -> None:
+        """Add a message, or `skip` it undecoded; one that cannot be used is counted."""
+        topic = message.channel.topic
+        self._count[topic] += 1
+        if skip:
+            return
+        frame, stamp = "", 0
+        cloud: Cloud | str
+        try:
+            raw = decode(message)
+            frame, stamp = frame_name(raw.header.frame_id), stamp_ns(raw.header)
+            cloud = parse_cloud(raw)
+        except Exception:  # any error of rosbags about damaged bytes
+            cloud = UNREADABLE
+        if isinstance(cloud, str):
+            self.skipped.setdefault(topic, SkippedRecords()).add(cloud, self._count[topic])
+            return
+        stamp = stamp or message.log_ns  # some drivers leave it unset
+        sensor = self.sensors.setdefault((topic, frame), len(self.sensors))
+        if cloud.times is not None:
+            self.timed.add(sensor)
+        self.scans.add_scan(stamp, cloud.points, sensor=sensor, beam_time=cloud.times)
+        self.number.append(self._count[topic])
+
+    def by_points(self) -> list[int]:
+        """The sensors, most points first: other clouds are derived from these."""
+        names = list(self.sensors)
+        points = np.bincount(np.asarray(self.scans.sensor), np.asarray(self.scans.length))
+        return sorted(range(len(names)), key=lambda k: (-points[k], names[k]))
+
+    def forward_scans(self, sensor: int) -> NDArray[np.intp]:
+        """The scans of a sensor with non-decreasing stamps; others are counted."""
+        rows = np.flatnonzero(np.asarray(self.scans.sensor) == sensor)
+        keep = longest_non_decreasing(np.asarray(self.scans.stamp_ns)[rows].tolist())
+        topic, _ = list(self.sensors)[sensor]
+        skipped = self.skipped.setdefault(topic, SkippedRecords())
+        skipped.add_all(TIME_BACKWARDS, np.delete(np.asarray(self.number)[rows], keep))
+        return rows[keep]
+
+
+def read_clouds(
+    clouds: CloudCollector,
+    frames: tf.Frames,
+    options: ReadOptions,
+    find_images: Callable[[str], Images | None],
+) -> Recording:
+    """The 3D recording of all point clouds; `find_images` gives the images by the base frame.
+
+    Raises:
+        InputError: none can be used.
+    """
+    names = list(clouds.sensors)
+    if not names:
+        total = SkippedRecords().merge(*clouds.skipped.values())
+        raise InputError(f"holds no usable cloud: {total.summary('message')}")
+    counts = np.bincount(np.asarray(clouds.scans.sensor), minlength=len(names)).tolist()
+    order = clouds.by_points()
+    named = options.topic is not None
+    chosen, omitted = tf.drop_duplicates([(*names[k], counts[k]) for k in order], named=named)
+    chosen = [order[k] for k in chosen]
+    rows = [clouds.forward_scans(k) for k in chosen]
+    stamps = np.asarray(clouds.scans.stamp_ns, np.int64)
+    sensors = [tf.Sensor(*names[k], stamps[own]) for k, own in zip(chosen, rows, strict=True)]
+    poses = tf.place_sensors(frames, sensors, options, omitted)
+    T, warnings = np.tile(np.eye(4), (len(names), 1, 1)), list(poses.warnings)
+    for k, of_scans in zip(poses.used, poses.T_base_sensor, strict=True):
+        T[chosen[k]] = of_scans[0]
+        if np.abs(of_scans - of_scans[0]).max() > _STILL:
+            text = "the sensor moves on the robot: its first pose is used"
+            warnings.append(f"{sensors[k].topic}: {text}")
+    odom, origin = tf.find_odometry(frames, poses.base, stamps, options, warnings)
+    described = zip(names, counts, strict=True)
+    recording = clouds.scans.build(
+        T,
+        selection=np.sort(np.concatenate([rows[k] for k in poses.used])),
+        T_odom_base=odom,
+        images=find_images(poses.base),
+        record=np.asarray(clouds.number, np.int64),
+        source={
+            "sensors": [
+                {"name": name, "frame": frame, "scans": n} for (name, frame), n in described
+            ],
+            "base_frame": poses.base,
+            "base_frame_how": poses.how,
+            "odometry": origin,
+            "skipped": SkippedRecords().merge(*clouds.skipped.values()).to_dict(),
+            "duplicates": omitted,
+            "warnings": warnings,
+        },
+    )
+    timed = clouds.timed.intersection(chosen)
+    return recording if timed else replace(recording, beam_time=None)

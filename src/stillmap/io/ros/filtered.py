@@ -1,0 +1,133 @@
+"""Filtered copies of bags: readings replaced by "no return", points removed, all else as it was."""
+
+import math
+from contextlib import closing
+from typing import Any, cast
+
+import numpy as np
+
+from stillmap.core.errors import InputError
+from stillmap.core.files import workplace
+from stillmap.io.filtered_copy import FilterJob, Mask, Omissions, other_recording_error
+from stillmap.io.ros.bag import open_bag
+from stillmap.io.ros.clouds import find_layout
+from stillmap.io.ros.messages import (
+    MULTI_ECHO,
+    POINT_CLOUD,
+    SCAN_TYPES,
+    Bag,
+    BagKind,
+    DamagedBagError,
+    Message,
+    decode,
+    decompress,
+    detect_kind,
+    frame_name,
+)
+from stillmap.io.ros.writer import new_bag
+
+_PROGRESS_INTERVAL = 200  # messages
+
+
+def write_filtered(job: FilterJob) -> Omissions:
+    """Copy a bag with some readings or points blanked.
+
+    Readings of laser scans become +inf (REP 117), or zero for lasers that use zero: further
+    infinities would make readers take the zeros for unusable. Points are removed; those of
+    organised clouds become NaN.
+
+    Raises:
+        InputError: the source is not the bag that was read, or the output cannot be written.
+    """
+    for trusted in (True, False):
+        try:
+            scratch = workplace(job.output)
+            with closing(open_bag([job.source], scratch, trusted=trusted)) as bag:
+                return _copy(bag, job)
+        except DamagedBagError:
+            continue
+    raise InputError("is damaged", where=str(job.source))
+
+
+def _copy(bag: Bag, job: FilterJob) -> Omissions:
+    kind, mcap = detect_kind(job.source)
+    kind = cast(BagKind, job.kind) if job.kind else kind
+    topics, scan_of = _number_scans(job)
+    count, omitted, left = dict.fromkeys(topics, 0), 0, len(scan_of)
+    total = max(sum(c.n_messages for c in bag.channels), 1)
+    options = {"overwrite": job.overwrite, "mcap": mcap and kind == "ros2"}
+    with new_bag(job.output, kind, **options) as copy:
+        sends = {c.id: copy.copy_topic(c) for c in bag.channels}
+        for number, message in enumerate(bag.messages({c.topic for c in bag.channels})):
+            channel, send = message.channel, sends[message.channel.id]
+            raw = decompress(message)
+            if channel.topic in topics:
+                count[channel.topic] += 1
+                scan = scan_of.get((channel.topic, count[channel.topic]))
+                if scan is None:  # it was not read
+                    omitted += 1
+                    continue
+                left -= 1
+                mask = job.blank[job.recording.beams_of(scan)]
+                if mask.any():
+                    raw = copy.serialize(_blank(message, mask, job), channel.type)
+            if send is not None:
+                send(message.log_ns, raw)
+            if number % _PROGRESS_INTERVAL == 0:
+                job.report(min(number / total, 1.0))
+        if left:
+            raise other_recording_error(job.source)
+    unknown = {c.topic for c in bag.channels if sends[c.id] is None and c.n_messages}
+    unfiltered = {c.topic for c in bag.channels if c.type in SCAN_TYPES} - topics - unknown
+    why = "left out: the bag does not say what its messages are made of"
+    notes = [f"{topic} is as it was: it was not mapped" for topic in sorted(unfiltered)]
+    return Omissions(omitted, (*notes, *(f"{topic} {why}" for topic in sorted(unknown))))
+
+
+def _number_scans(job: FilterJob) -> tuple[set[str], dict[tuple[str, int], int]]:
+    """The topics that were read, and the scan of each message on them, by topic and number."""
+    recording, sensors = job.recording, job.recording.source["sensors"]
+    if recording.record is None:
+        raise other_recording_error(job.source)
+    names = np.repeat([s["name"] for s in sensors], [s.get("places", 1) for s in sensors])
+    topic = names[recording.sensor].tolist()
+    keys = zip(topic, recording.record.tolist(), strict=True)
+    return set(topic), {key: scan for scan, key in enumerate(keys)}
+
+
+def _blank(message: Message, mask: Mask, job: FilterJob) -> Any:
+    """The content of a message without the readings or points `mask` (n,)."""
+    content, topic = decode(message), message.channel.topic
+    if message.channel.type == POINT_CLOUD:
+        _blank_points(content, mask, topic)
+        return content
+    key = topic, frame_name(content.header.frame_id)
+    sensors = {(s["name"], s["frame"]): s["ranges"] for s in job.recording.source["sensors"]}
+    code = np.float32(0.0 if sensors[key]["zero_means"] == "max-range" else math.inf)
+    if message.channel.type == MULTI_ECHO:
+        for k in np.flatnonzero(mask):
+            content.ranges[k].echoes = np.array([code])
+    else:
+        content.ranges = np.where(mask, code, content.ranges)
+    return content
+
+
+def _blank_points(cloud: Any, mask: Mask, topic: str) -> None:
+    """Remove points of a PointCloud2, or their coordinates where it has rows of points."""
+    layout = find_layout(cloud)
+    if isinstance(layout, str) or layout.n_points != len(mask):
+        raise InputError(f"has another cloud on {topic} than was mapped")
+    data = np.array(cloud.data, np.uint8)
+    if layout.shape[0] > 1:
+        points = layout.view(data)
+        for axis in "xyz":
+            is_float = points[axis].dtype.kind == "f"
+            points[axis][mask.reshape(layout.shape)] = np.nan if is_float else 0
+        cloud.data, cloud.is_dense = data, False
+        return
+    step = layout.strides[1]
+    end, removed = len(mask) * step, int(np.count_nonzero(mask))
+    kept = data[:end].reshape(-1, step)[~mask].reshape(-1)
+    cloud.data = np.concatenate([kept, data[end:]])
+    cloud.width -= removed
+    cloud.row_step = max(cloud.row_step - removed * step, 0)

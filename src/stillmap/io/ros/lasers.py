@@ -1,0 +1,420 @@
+"""LaserScan and MultiEchoLaserScan messages: collected by topic and frame, as raw lasers.
+
+The scans of a laser that tilts become a 3D recording, by the transforms at the times of its beams.
+"""
+
+import math
+from array import array
+from collections import Counter
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core import arrays, se2
+from stillmap.core.advice import advise
+from stillmap.core.array_builder import ArrayBuilder
+from stillmap.core.errors import InputError
+from stillmap.core.recording import Recording
+from stillmap.core.timestamps import longest_non_decreasing
+from stillmap.io.builder import ReadContext, SkippedRecords
+from stillmap.io.ros import tf
+from stillmap.io.ros.messages import (
+    MULTI_ECHO,
+    TIME_BACKWARDS,
+    UNREADABLE,
+    Message,
+    decode,
+    frame_name,
+    stamp_ns,
+)
+from stillmap.prepare import lasers
+from stillmap.prepare.lasers import Beams, LaserPose, RawLaser, RawLasers
+from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE, ReadOptions
+
+Float = NDArray[np.float64]
+
+REPEATED = "scan that was recorded twice"
+
+_TURN = 2.0 * math.pi
+_MAX_READINGS = 1 << 20
+_MAX_SCAN_TIME = 1.0  # s
+_STILL_DISTANCE, _STILL_ANGLE = 1e-3, 1e-3  # m, rad: a sensor that moves less is fixed
+_MIN_TILT = 0.02  # rad: a laser that turns by less does not tilt
+_MAX_PAUSE = 500_000_000  # ns between transforms over which the joint's angle is interpolated
+_BLOCK = 1 << 14  # beams at a time
+
+
+class ScanShape(NamedTuple):
+    """Beam geometry that scans of one laser share, in radians, metres and seconds."""
+
+    angle_min: float
+    angle_increment: float
+    n: int
+    range_min: float
+    range_max: float
+    time_increment: float
+
+    def find_fault(self) -> str | None:
+        """Why such a scan cannot be used."""
+        if self.n == 0 or self.n > _MAX_READINGS:
+            return "scan without readings"
+        known = abs(self.angle_min) < 1e3 and abs(self.angle_increment) < 1e3
+        # a full turn may repeat its first beam at the end, or go a few steps further
+        turns = (self.n - 4) * abs(self.angle_increment) > _TURN
+        if not known or turns or (self.angle_increment == 0.0 and self.n > 1):
+            return "scan with angles that are none"
+        return None
+
+    def angles(self) -> Float:
+        """(n,) beam angles."""
+        return self.angle_min + self.angle_increment * np.arange(self.n, dtype=np.float64)
+
+
+class LaserScans(NamedTuple):
+    """T usable scans of one laser, ordered by their stamps.
+
+    Attributes:
+        topic, frame: of the messages.
+        stamp_ns: (T,) int64.
+        number: (T,) int64 number of the message on its topic, from 1.
+        start: (T,) int64 index of the first reading of each in `ranges`.
+        shape: (T,) int32 index into `shapes`.
+        shapes: distinct beam geometries.
+        ranges: (N,) float32 metres, of all scans; may be memory-mapped.
+        warnings: sentences.
+    """
+
+    topic: str
+    frame: str
+    stamp_ns: NDArray[np.int64]
+    number: NDArray[np.int64]
+    start: NDArray[np.int64]
+    shape: NDArray[np.int32]
+    shapes: list[ScanShape]
+    ranges: NDArray[np.float32]
+    warnings: list[str]
+
+    @property
+    def n_scans(self) -> int:
+        return len(self.stamp_ns)
+
+    @property
+    def typical_shape(self) -> ScanShape:
+        """The shape of most scans."""
+        return self.shapes[int(np.bincount(self.shape, minlength=len(self.shapes)).argmax())]
+
+    def to_raw(self, upside_down: bool = False) -> RawLaser:
+        """The scans as they are interpreted; upside down, angles change their sign."""
+        sign = -1.0 if upside_down else 1.0
+        usual = self.typical_shape
+        return RawLaser(
+            self.topic,
+            self.stamp_ns,
+            self.ranges,
+            self.start,
+            self.shape,
+            [lasers.unit_vectors(sign * s.angles()).astype(np.float32) for s in self.shapes],
+            self._beam_steps(),
+            usual.range_min,
+            usual.range_max if 0.0 < usual.range_max < MAX_PLAUSIBLE_RANGE else None,
+        )
+
+    def _beam_steps(self) -> tuple[float, ...]:
+        """Seconds from beam to beam of each shape; 0 where missing or implausible."""
+        span = float(self.stamp_ns[-1] - self.stamp_ns[0]) / 1e9 if self.n_scans > 1 else 0.0
+        # 1 / rate, as it was always rounded
+        period = 1.0 / ((self.n_scans - 1) / span) if span > 0.0 else _MAX_SCAN_TIME
+        steps = np.array([s.time_increment for s in self.shapes])
+        duration = np.abs(steps) * np.array([max(s.n - 1, 1) for s in self.shapes])
+        # many drivers leave the field unset or wrong
+        plausible = np.isfinite(steps) & (duration <= min(_MAX_SCAN_TIME, 1.5 * period))
+        return tuple(np.where(plausible, steps, 0.0).tolist())
+
+
+class _ScanBuffer:
+    """The scans of one laser on one topic, in recorded order."""
+
+    def __init__(self, topic: str, frame: str, scratch: Path | None) -> None:
+        self.topic, self.frame = topic, frame
+        self.stamp_ns, self.log_ns, self.number = array("q"), array("q"), array("q")
+        self.shape = array("i")  # index into shapes
+        self.shapes: dict[ScanShape, int] = {}
+        self.ranges = ArrayBuilder(np.float32, (), scratch)
+
+    def add(
+        self, message: Any, ranges: NDArray[np.float32], log_ns: int, number: int
+    ) -> str | None:
+        """Add a scan; returns the reason if it cannot be used."""
+        names = ("range_min", "range_max", "time_increment")
+        more = (getattr(message, name) for name in names)
+        shape = ScanShape(message.angle_min, message.angle_increment, len(ranges), *more)
+        if shape not in self.shapes and (fault := shape.find_fault()) is not None:
+            return fault
+        self.shape.append(self.shapes.setdefault(shape, len(self.shapes)))
+        self.stamp_ns.append(stamp_ns(message.header))
+        self.log_ns.append(log_ns)
+        self.number.append(number)
+        self.ranges.append(ranges)
+        return None
+
+    def finish(self, skipped: SkippedRecords) -> LaserScans:
+        """The scans with non-decreasing stamps, without repeated ones; others are counted."""
+        ranges, shapes = self.ranges.finish(), list(self.shapes)
+        shape = np.asarray(self.shape, np.int32)
+        n = np.array([s.n for s in shapes], np.int64)[shape]
+        start = np.cumsum(n) - n
+        stamps, warnings = np.asarray(self.stamp_ns, np.int64), []
+        if np.mean(stamps == 0) > 0.5:
+            stamps = np.asarray(self.log_ns, np.int64)
+            what = f"{self.topic}: headers have no stamps: log times are used"
+            todo = "let the driver stamp its scans: log times come later and jitter"
+            warnings.append(advise(what, todo))
+        keep = longest_non_decreasing(stamps.tolist())
+        number = np.asarray(self.number)
+        skipped.add_all(TIME_BACKWARDS, np.delete(number, keep))
+        repeated = np.zeros(len(keep), np.bool_)
+        for k in np.flatnonzero(np.diff(stamps[keep]) == 0) + 1:
+            a, b = (ranges[start[t] : start[t] + n[t]] for t in keep[[k - 1, k]])
+            repeated[k] = np.array_equal(a, b, equal_nan=True)
+        skipped.add_all(REPEATED, number[keep[repeated]])
+        keep = keep[~repeated]
+        return LaserScans(
+            self.topic,
+            self.frame,
+            stamps[keep],
+            number[keep],
+            start[keep],
+            shape[keep],
+            shapes,
+            ranges,
+            warnings,
+        )
+
+
+class LaserCollector:
+    """Collects the scans of all lasers: one topic may carry several, by frame."""
+
+    def __init__(self, context: ReadContext) -> None:
+        self._scratch = context.scratch
+        self._lasers: dict[tuple[str, str], _ScanBuffer] = {}
+        self.skipped: dict[str, SkippedRecords] = {}
+        self._count: Counter[str] = Counter()  # messages by topic
+
+    def add_message(self, message: Message, *, skip: bool = False) -> None:
+        """Add a message, or `skip` it undecoded; one that cannot be used is counted."""
+        topic = message.channel.topic
+        self._count[topic] += 1
+        if skip:
+            return
+        try:
+            scan = decode(message)
+            frame = frame_name(scan.header.frame_id)
+            ranges = _first_echoes(scan) if message.channel.type == MULTI_ECHO else scan.ranges
+        except Exception:  # any error of rosbags about damaged bytes
+            fault: str | None = UNREADABLE
+        else:
+            known = self._lasers.get((topic, frame))
+            laser = known or _ScanBuffer(topic, frame, self._scratch)
+            fault = laser.add(scan, ranges, message.log_ns, self._count[topic])
+            if fault is None:
+                self._lasers[topic, frame] = laser
+        if fault is not None:
+            self.skipped.setdefault(topic, SkippedRecords()).add(fault, self._count[topic])
+
+    def finish(self) -> list[LaserScans]:
+        """The lasers with at least one usable scan: most scans first, then most beams.
+
+        Raises:
+            InputError: there is none.
+        """
+        of_all = [
+            laser.finish(self.skipped.setdefault(laser.topic, SkippedRecords()))
+            for laser in self._lasers.values()
+        ]
+        usable = [scans for scans in of_all if scans.n_scans]
+        if not usable:
+            total = SkippedRecords().merge(*self.skipped.values())
+            raise InputError(f"holds no usable laser scan: {total.summary('message')}")
+        return sorted(usable, key=lambda s: (-s.n_scans, -s.shapes[s.shape[0]].n, s.topic))
+
+
+def _first_echoes(scan: Any) -> NDArray[np.float32]:
+    """(n,) the first echo of each beam: glass and rain return further ones."""
+    return np.array([e.echoes[0] if len(e.echoes) else np.nan for e in scan.ranges], np.float32)
+
+
+def _select_lasers(
+    collector: LaserCollector, frames: tf.Frames, options: ReadOptions
+) -> tuple[list[LaserScans], tf.SensorPoses, list[str]]:
+    """The lasers whose pose on the robot is known, their poses, and sentences on the others."""
+    scans = collector.finish()
+    named = options.topic is not None
+    order, omitted = tf.drop_duplicates([(s.topic, s.frame, s.n_scans) for s in scans], named=named)
+    sensors = [tf.Sensor(scans[k].topic, scans[k].frame, scans[k].stamp_ns) for k in order]
+    poses = tf.place_sensors(frames, sensors, options, omitted)
+    return [scans[order[k]] for k in poses.used], poses, omitted
+
+
+def read_lasers(collector: LaserCollector, frames: tf.Frames, context: ReadContext) -> Recording:
+    """The 2D recording of all lasers.
+
+    Raises:
+        InputError: no scan can be used, or options do not fit the lasers.
+    """
+    options = context.options
+    used, poses, omitted = _select_lasers(collector, frames, options)
+    options.check_laser_count(len(used))
+    warnings = [w for s in used for w in s.warnings] + poses.warnings
+    raw, mounts, sensors = [], [], []
+    for number, scans in enumerate(used):
+        mount, notes = _find_mount(scans, poses, number, options, warnings)
+        raw.append(scans.to_raw(notes["upside_down"]))
+        mounts.append(mount)
+        sensors.append(notes)
+    order = lasers.scan_order(raw)
+    stamps = np.concatenate([s.stamp_ns for s in used])[order]
+    odom, origin = tf.find_odometry(frames, poses.base, stamps, options, warnings)
+    skipped = SkippedRecords().merge(*(collector.skipped[t] for t in {s.topic for s in used}))
+    warnings += skipped.loss_warnings(sum(s.n_scans for s in used), "message")
+    source = {
+        "sensors": sensors,
+        "base_frame": poses.base,
+        "base_frame_how": poses.how,
+        "odometry": origin,
+        "skipped": skipped.to_dict(),
+        "duplicates": omitted,
+        "warnings": warnings,
+    }
+    T_odom_base = None if odom is None else tf.project_to_plane(odom)[0]
+    record = np.concatenate([s.number for s in used])[order]
+    whole = RawLasers(raw, mounts, T_odom_base, source, record)
+    return lasers.place_beams(whole, options, context.scratch)
+
+
+def _find_mount(
+    scans: LaserScans, poses: tf.SensorPoses, number: int, options: ReadOptions, warnings: list[str]
+) -> tuple[Float, dict[str, Any]]:
+    """T_base_sensor (1, 3, 3) of a laser, or (T, 3, 3) where it moves, and notes on it."""
+    flat, upside_down, tilts = tf.project_to_plane(poses.T_base_sensor[number])
+    given, upside_down_how = options.laser(number), "TF"
+    if tilts:
+        warnings.append(f"{scans.topic}: the laser is tilted; its scans are treated as level")
+    x, y, theta = se2.parameters(flat)[0].tolist()
+    offset = np.abs(se2.parameters(se2.inverse(flat[:1]) @ flat))
+    moves = offset[:, :2].max() > _STILL_DISTANCE or offset[:, 2].max() > _STILL_ANGLE
+    pose = LaserPose(x, y, theta, "TF, it moves: at its first scan")
+    if not moves or given.pose != (None, None, None):
+        how = f"TF from {poses.base} to {scans.frame}"
+        how = "the laser is the robot's frame" if scans.frame == poses.base else how
+        pose = pose._replace(how=how).override(given)
+        flat = pose.matrix()[None]
+    if given.upside_down is not None:
+        upside_down, upside_down_how = given.upside_down, "given"
+    shape, sign = scans.typical_shape, -1.0 if upside_down else 1.0
+    return flat, {
+        "name": scans.topic,
+        "frame": scans.frame,
+        "scans": scans.n_scans,
+        "beams_per_scan": shape.n,
+        "start_angle": sign * shape.angle_min,
+        "angle_step": sign * shape.angle_increment,
+        "upside_down": upside_down,
+        "upside_down_how": upside_down_how,
+        "extrinsics": pose._asdict(),
+        "places": len(flat),
+    }
+
+
+def read_tilting_laser(
+    collector: LaserCollector, frames: tf.Frames, context: ReadContext
+) -> Recording:
+    """The 3D recording of a laser that tilts or pans.
+
+    Every scan has a sensor of its own at the laser's pose at the scan's stamp; beams are placed by
+    the laser's pose at their own times. Where transforms are missing, beams are unusable.
+
+    Raises:
+        InputError: there are several lasers, or this one does not move on the robot.
+    """
+    used, poses, _ = _select_lasers(collector, frames, context.options)
+    scans, T_base_sensor = used[0], poses.T_base_sensor[0]
+    if len(used) > 1:
+        raise InputError(f"{scans.topic}: scans of several lasers: only one can tilt")
+    trace = np.einsum("ij,nij->n", T_base_sensor[0, :3, :3], T_base_sensor[:, :3, :3])
+    if np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0)).max() < _MIN_TILT:
+        hint = "transforms must say how the joint moves, as robot_state_publisher does"
+        what = f"{scans.topic}: {scans.frame!r} does not tilt in {poses.base!r}"
+        raise InputError(what, hint=hint)
+    raw = scans.to_raw()
+    rule, more = lasers.find_range_rule(raw, context.options)
+    beams = lasers.convert_to_beams([raw], [rule], context.scratch)
+    tree, points = frames.tree, arrays.empty((len(beams.points), 3), np.float32, context.scratch)
+    n_lost = _convert_to_3d(tree, poses.base, scans, beams, T_base_sensor, points)
+    warnings = [*scans.warnings, *(f"{scans.topic}: {text}" for text in more)]
+    if n_lost:
+        warnings.append(f"{n_lost} beams where transforms do not say how the laser is tilted")
+    skipped = collector.skipped[scans.topic]
+    notes = {
+        "name": scans.topic,
+        "frame": scans.frame,
+        "scans": scans.n_scans,
+        "places": scans.n_scans,
+        "ranges": rule.to_dict(),
+    }
+    source = {
+        "sensors": [notes],
+        "base_frame": poses.base,
+        "base_frame_how": poses.how,
+        "skipped": skipped.to_dict(),
+        "warnings": warnings + skipped.loss_warnings(scans.n_scans, "message"),
+    }
+    return Recording(
+        stamp_ns=scans.stamp_ns,
+        offset=beams.offset,
+        points=points,
+        hit=beams.hit & ~np.isnan(points[:, 0]),
+        T_base_sensor=T_base_sensor,
+        sensor=np.arange(scans.n_scans, dtype=np.int32),
+        T_odom_base=None,
+        beam_time=beams.beam_time,
+        source=source,
+    )
+
+
+def _convert_to_3d(
+    tree: tf.TransformTree,
+    base: str,
+    scans: LaserScans,
+    beams: Beams,
+    T_base_sensor: Float,
+    points: NDArray[np.float32],
+) -> int:
+    """Set points (M, 3) in the laser's frame at its scan's stamp; the number of lost beams."""
+    stamps, M, n_lost = np.sort(tree.stamps_between(base, scans.frame)), len(points), 0
+    for first in range(0, M, _BLOCK):
+        block = slice(first, min(first + _BLOCK, M))
+        scan = np.searchsorted(beams.offset, np.arange(block.start, block.stop), side="right") - 1
+        at_ns = scans.stamp_ns[scan]
+        if beams.beam_time is not None:
+            after_ns = np.round(1e9 * beams.beam_time[block].astype(np.float64))
+            at_ns = at_ns + after_ns.astype(np.int64)
+        pose = tree.lookup(base, scans.frame, at_ns)
+        assert pose is not None  # connected at the stamps, so connected
+        T = se2.inverse(T_base_sensor[scan]) @ pose.T
+        ends = np.einsum("nij,nj->ni", T[:, :3, :2], beams.points[block].astype(np.float64))
+        is_lost = ~_is_covered(stamps, at_ns)
+        n_lost += int(np.count_nonzero(is_lost & np.isfinite(ends[:, 0])))
+        points[block] = np.where(is_lost[:, None], np.nan, ends + T[:, :3, 3])
+        arrays.release_pages(points)
+    return n_lost
+
+
+def _is_covered(stamps: NDArray[np.int64], at_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """(n,) whether times lie on, or between close, sorted stamps."""
+    after = np.searchsorted(stamps, at_ns)
+    inside = (after > 0) & (after < len(stamps))
+    k = np.clip(after, 1, len(stamps) - 1)
+    exact = stamps[np.minimum(after, len(stamps) - 1)] == at_ns
+    return np.asarray(exact | (inside & (stamps[k] - stamps[k - 1] <= _MAX_PAUSE)))
