@@ -10,7 +10,7 @@ from PIL import Image
 
 from stillmap.cli import info
 from stillmap.cli import recording_info as module
-from stillmap.cli.arguments import add_read_flags, read_changes
+from stillmap.cli.arguments import add_read_flags, flag_changes
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
@@ -129,8 +129,8 @@ def test_flag_out_of_range(path):
 def test_only_given_flags_are_changes():
     parser = argparse.ArgumentParser()
     add_read_flags(parser)
-    assert read_changes(parser.parse_args([])) == {}
-    changes = read_changes(parser.parse_args(["--zero-means", "unusable", "--min-range", "0"]))
+    assert flag_changes(parser.parse_args([])) == {}
+    changes = flag_changes(parser.parse_args(["--zero-means", "unusable", "--min-range", "0"]))
     assert changes == {"read": {"zero_means": "unusable", "min_range": 0.0}}
 
 

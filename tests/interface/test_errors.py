@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import stillmap
-from stillmap.cli.flags import FLAGS
+from stillmap.cli.console import _IN_HINTS as FLAGS
 from stillmap.cli.main import main
 from stillmap.cli.parser import COMMANDS, parser
 

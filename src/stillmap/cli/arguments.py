@@ -1,75 +1,92 @@
-"""Arguments shared by the commands: flags for reading a recording, checks of output paths."""
+"""Flags made from the options, and checks of output paths; shared by the commands."""
 
 import argparse
 import math
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from stillmap.core.config import (
+    OptionInfo,
+    iter_options,
+    load_toml,
+    merge_nested,
+    nest,
+    override,
+    parse_assignment,
+)
 from stillmap.core.errors import InputError, cannot_write
 
 if TYPE_CHECKING:
+    from stillmap.pipeline.options import Options
     from stillmap.prepare.options import ReadOptions
 
-_FLAGS = (
-    *("min_range", "max_range", "zero_means", "spin", "cameras", "start", "end"),
-    *("base_frame", "odom_frame"),
-)
+# flag -> option, which gives help, type, choices and default
+_READ_FLAGS = {
+    "--min-range": "read.min_range",
+    "--max-range": "read.max_range",
+    "--zero-means": "read.zero_means",
+    "--spin": "read.spin",
+    "--cameras": "read.cameras",
+    "--topic": "read.topic",
+    "--base-frame": "read.base_frame",
+    "--odom-frame": "read.odom_frame",
+    "--laser-upside-down": "read.laser_upside_down",
+    "--laser2-upside-down": "read.laser2_upside_down",
+    "--from": "read.start",
+}
+_END = "read.end"  # its flag is --to or --until: `convert --to` is a format
+_RUN_FLAGS = {"--threads": "threads"}
+_MAP_MODE = {"--map-mode": "output.map_mode"}
+_RESOLUTION = {"--resolution": "slam.resolution"}
+_MAP_FLAGS = {
+    "--mesh": "mesh.enabled",
+    **_RESOLUTION,
+    **_MAP_MODE,
+    "--region": "output.region",
+    "--map-state": "output.map_state",
+}
+_UNITS = {"metre": "M", "second": "S", "file": "FILE.toml", "topic": "TOPIC", "frame": "FRAME"}
 
-_LASERS = {"laser": "first", "laser2": "second"}  # flags and options begin with the name
+
+def add_flags(
+    group: argparse._ActionsContainer, flags: Mapping[str, str], options: Any, prefix: str = ""
+) -> None:
+    """Add flags that set options; the name of the option is the argument's."""
+    infos = {info.name: info for info in iter_options(options, prefix)}
+    for flag, name in flags.items():
+        group.add_argument(*flag.split(), dest=name, **_settings(infos[name]))
+
+
+def _settings(info: OptionInfo) -> dict[str, Any]:
+    """Arguments of `add_argument` for an option."""
+    kind, default = info.kind.removesuffix(" or unset"), info.default
+    shown = "" if default is None or kind == "bool" else f" (default: {default})"
+    settings: dict[str, Any] = {"help": info.doc.replace("%", "%%") + shown}
+    if info.choices:
+        return settings | {"choices": info.choices}
+    if kind == "bool":
+        return settings | {"action": argparse.BooleanOptionalAction}
+    if kind == "list":
+        return settings | {"type": float, "nargs": 4, "metavar": ("X0", "Y0", "X1", "Y1")}
+    if info.name == "read.topic":
+        settings["action"] = "append"
+    unit = next((short for word, short in _UNITS.items() if word in info.doc.lower()), "N")
+    return settings | {"type": {"float": float, "int": int}.get(kind, str), "metavar": unit}
 
 
 def add_read_flags(
-    parser: argparse.ArgumentParser, end_flags: tuple[str, ...] = ("--to", "--until")
+    p: argparse.ArgumentParser, end_flags: tuple[str, ...] = ("--to", "--until")
 ) -> None:
     """Add the flags for reading a recording to a command; `end_flags` name the end of its part."""
-    group = parser.add_argument_group("reading the recording")
-    group.add_argument(
-        "--min-range",
-        type=float,
-        metavar="M",
-        help="shorter readings are unusable, say from the robot itself (default: 0)",
-    )
-    group.add_argument(
-        "--max-range",
-        type=float,
-        metavar="M",
-        help="readings of M and more are maximum-range beams (default: estimated)",
-    )
-    group.add_argument(
-        "--zero-means",
-        choices=("auto", "unusable", "max-range"),
-        help="meaning of a reading of zero (default: auto)",
-    )
-    group.add_argument(
-        "--spin",
-        choices=("none", "clockwise", "counter-clockwise"),
-        help="rotation of a lidar without beam times, seen from above (default: estimated)",
-    )
-    group.add_argument(
-        "--cameras",
-        metavar="FILE.toml",
-        help="calibration and images that the recording lacks (docs/input.md)",
-    )
-    group.add_argument(
-        "--topic",
-        action="append",
-        metavar="TOPIC",
-        help="scans of a bag; can be given again (default: by type and rate)",
-    )
-    group.add_argument(
-        "--base-frame", metavar="FRAME", help="robot frame of a bag (default: detected)"
-    )
-    group.add_argument(
-        "--odom-frame", metavar="FRAME", help="odometry frame of a bag (default: detected)"
-    )
-    _add_time_flags(group, end_flags)
-    _add_laser_flags(group)
+    from stillmap.prepare.options import ReadOptions
 
-
-def _add_laser_flags(group: argparse._ArgumentGroup) -> None:
-    for laser, which in _LASERS.items():
+    group = p.add_argument_group("reading the recording")
+    add_flags(group, _READ_FLAGS | {" ".join(end_flags): _END}, ReadOptions(), "read.")
+    for laser in ("laser", "laser2"):
+        which = "second" if laser == "laser2" else "first"
         group.add_argument(
             f"--{laser}-offset",
             type=float,
@@ -78,70 +95,120 @@ def _add_laser_flags(group: argparse._ArgumentGroup) -> None:
             help=f"pose of the {which} laser on the robot: m ahead, m left, degrees to the left",
         )
         group.add_argument(
-            f"--{laser}-upside-down",
-            action="store_true",
-            help=f"the {which} laser is mounted upside down: its beams turn clockwise",
-        )
-        group.add_argument(
             f"--{laser}-fov",
-            type=float,
+            dest=f"read.{laser}_fov",
+            type=_radians,
             metavar="DEG",
             help=f"field of view of the {which} laser in FLASER and RLASER lines (default: 180)",
         )
 
 
-def _add_time_flags(group: argparse._ArgumentGroup, end_flags: tuple[str, ...]) -> None:
-    group.add_argument(
-        "--from",
-        dest="start",
-        type=_parse_seconds,
-        metavar="S",
-        help="leave out scans before S: seconds from the first scan, from 1e8 on a stamp",
+def _radians(degrees: str) -> float:
+    return math.radians(float(degrees))
+
+
+def add_run_flags(p: argparse.ArgumentParser) -> None:
+    """Add the flags of how the command itself runs and what it prints."""
+    from stillmap.pipeline.options import DEFAULTS
+
+    add_flags(p, _RUN_FLAGS, DEFAULTS)
+    p.add_argument("--json", action="store_true", help="a summary as one JSON object on stdout")
+    p.add_argument("--quiet", action="store_true", help="no progress, no summary")
+
+
+def add_method_flags(p: argparse._ArgumentGroup) -> None:
+    """Add the flags that choose how poses and labels are estimated."""
+    from stillmap.pipeline.options import DEFAULTS
+
+    either = p.add_mutually_exclusive_group()
+    either.add_argument(
+        "--paper",
+        dest="estimator",
+        action="store_const",
+        const="paper",
+        help="the method exactly as printed",
     )
-    group.add_argument(
-        *end_flags,
-        dest="end",
-        type=_parse_seconds,
-        metavar="S",
-        help="leave out scans after S, likewise",
+    add_flags(either, {"--estimator": "estimator"}, DEFAULTS)
+    p.add_argument(
+        "--poses",
+        metavar="FILE.tum",
+        help="keep these poses; `recording`: the poses stored in the recording",
+    )
+    p.add_argument("--no-odometry", action="store_true", help="ignore odometry in the recording")
+
+
+def add_map_mode_flag(p: argparse._ActionsContainer) -> None:
+    """Add the flag of how the map image is written."""
+    from stillmap.pipeline.options import DEFAULTS
+
+    add_flags(p, _MAP_MODE, DEFAULTS)
+
+
+def add_map_flags(p: argparse._ActionsContainer, *, whole: bool = True) -> None:
+    """Add the flags of the map that is written; `whole`: all of them, not of a place alone."""
+    from stillmap.pipeline.options import DEFAULTS
+
+    add_flags(p, _MAP_FLAGS if whole else _RESOLUTION | _MAP_MODE, DEFAULTS)
+
+
+def add_option_flags(p: argparse.ArgumentParser) -> None:
+    """Add `--config` and `--set`."""
+    group = p.add_argument_group("any other option, see `stillmap config`")
+    group.add_argument("--config", metavar="FILE.toml", help="options from a TOML file")
+    add_set_flag(group, "one option, e.g. em.prior=0.8; can be given again")
+
+
+def add_set_flag(p: argparse._ActionsContainer, help: str) -> None:
+    """Add `--set`; the last value of an option counts."""
+    p.add_argument(
+        "--set",
+        dest="assignments",
+        metavar="SECTION.KEY=VALUE",
+        action="append",
+        default=[],
+        help=help,
     )
 
 
-def _parse_seconds(text: str) -> float:
-    try:
-        seconds = float(text)
-    except ValueError:
-        seconds = math.nan
-    if not 0.0 <= seconds < math.inf:
-        raise argparse.ArgumentTypeError(f"wants seconds from 0 on, got '{text}'")
-    return seconds
+def flag_changes(args: argparse.Namespace) -> dict[str, Any]:
+    """The options that flags set, as nested changes."""
+    given = {name: value for name, value in vars(args).items() if value is not None}
+    named = {name: value for name, value in given.items() if re.fullmatch(r"[a-z]+\.\w+", name)}
+    named |= {name: given[name] for name in ("threads", "estimator") if name in given}
+    if "slam.resolution" in named:
+        named["slam.voxel_size"] = named["slam.resolution"]
+    if "read.topic" in named:
+        named["read.topic"] = ",".join(named["read.topic"])
+    for laser in ("laser", "laser2"):
+        if offset := given.get(f"{laser}_offset"):
+            x, y, degrees = offset
+            keys = (f"read.{laser}_x", f"read.{laser}_y", f"read.{laser}_theta")
+            named |= zip(keys, (x, y, math.radians(degrees)), strict=True)
+    return nest(named)
 
 
-def read_changes(args: argparse.Namespace) -> dict[str, Any]:
-    """The given flags as changes of options: `{"read": {...}}`, `{}` for none."""
-    changes: dict[str, Any] = {
-        name: value for name in _FLAGS if (value := getattr(args, name)) is not None
-    }
-    if args.topic:
-        changes["topic"] = ",".join(args.topic)
-    for laser in _LASERS:
-        offset, fov = getattr(args, f"{laser}_offset"), getattr(args, f"{laser}_fov")
-        if offset is not None:
-            place = (*offset[:2], math.radians(offset[2]))
-            changes.update(zip((f"{laser}_x", f"{laser}_y", f"{laser}_theta"), place, strict=True))
-        if getattr(args, f"{laser}_upside_down"):
-            changes[f"{laser}_upside_down"] = True
-        if fov is not None:
-            changes[f"{laser}_fov"] = math.radians(fov)
-    return {"read": changes} if changes else {}
+def options_from_args(args: argparse.Namespace) -> "Options":
+    """Resolve options by precedence: default < file < --set < flag.
+
+    Raises:
+        InputError: an unknown key or a wrong value, and where it came from.
+    """
+    from stillmap.pipeline.options import Options
+
+    options = Options()
+    if args.config:
+        options = override(options, load_toml(Path(args.config)), args.config)
+    options = override(options, merge_nested(*map(parse_assignment, args.assignments)), "--set")
+    return override(options, flag_changes(args))
 
 
 def read_options(args: argparse.Namespace) -> "ReadOptions":
-    """The options of reading by the given flags."""
-    from stillmap.core.config import override
+    """The options of reading; the others take long to load, and are only for --config, --set."""
     from stillmap.prepare.options import ReadOptions
 
-    return override(ReadOptions(), read_changes(args).get("read", {}))
+    if getattr(args, "config", None) or getattr(args, "assignments", None):
+        return options_from_args(args).read
+    return override(ReadOptions(), flag_changes(args).get("read", {}))
 
 
 @contextmanager
@@ -176,20 +243,17 @@ def make_parents(output: Path) -> Iterator[None]:
         raise
 
 
-def require_apart(output: Path, recording: Path, result: Path | None = None) -> None:
+def require_apart(output: Path, *inputs: Path) -> None:
     """Refuse to overwrite what is read, or a folder that holds it.
 
     Raises:
-        InputError: the output is the recording or the result, or one of them lies inside.
+        InputError: the output is the first input, or holds one of them.
     """
-    from stillmap.io import stillmap_folder
-
-    if recording.name == stillmap_folder.HEADER:
-        recording = recording.parent
-    target, inputs = output.resolve(), [recording.resolve()]
-    if target == inputs[0]:
+    is_header = inputs[0].name == "recording.json"  # stands for its folder
+    sources = [(inputs[0].parent if is_header else inputs[0]).resolve()]
+    sources += [path.resolve() for path in inputs[1:]]
+    target = output.resolve()
+    if target == sources[0]:
         raise InputError("is the recording itself", where=str(output))
-    if result is not None:
-        inputs.append(result.resolve())
-    if any(target == path or target in path.parents for path in inputs):
+    if any(target == path or target in path.parents for path in sources):
         raise InputError("holds the recording or the result", where=str(output))

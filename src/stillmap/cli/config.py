@@ -1,49 +1,9 @@
-"""`stillmap config`: print every option; the flags `--config` and `--set` of all commands."""
+"""`stillmap config`: print every option."""
 
 import argparse
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
+from stillmap.cli.arguments import add_option_flags, options_from_args
 from stillmap.cli.console import print_json, print_lines
-
-if TYPE_CHECKING:
-    from stillmap.pipeline.options import Options
-
-
-def add_option_flags(p: argparse.ArgumentParser) -> None:
-    """Add `--config` and `--set`."""
-    group = p.add_argument_group("any other option, see `stillmap config`")
-    group.add_argument("--config", metavar="FILE.toml", help="options from a TOML file")
-    add_set_flag(group, "one option, e.g. em.prior=0.8; can be given again")
-
-
-def add_set_flag(p: argparse._ActionsContainer, help: str) -> None:
-    """Add `--set`; the last value of an option counts."""
-    p.add_argument(
-        "--set",
-        dest="assignments",
-        metavar="SECTION.KEY=VALUE",
-        action="append",
-        default=[],
-        help=help,
-    )
-
-
-def options_from_args(args: argparse.Namespace, *flags: dict[str, Any]) -> "Options":
-    """Resolve options by precedence: default < file < --set < flag.
-
-    Raises:
-        InputError: an unknown key or a wrong value, and where it came from.
-    """
-    from stillmap.core.config import load_toml, merge_nested, override, parse_assignment
-    from stillmap.pipeline.options import Options
-
-    options = Options()
-    if args.config:
-        options = override(options, load_toml(Path(args.config)), args.config)
-    options = override(options, merge_nested(*map(parse_assignment, args.assignments)), "--set")
-    return override(options, merge_nested(*flags))
-
 
 DESCRIPTION = (
     "Print every option with its default, meaning and range, as TOML for --config."
@@ -72,29 +32,23 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the options."""
-    from stillmap.core.config import to_toml
+    from stillmap.core.config import is_within, iter_options, to_toml
 
     options = options_from_args(args)
     text = to_toml(options, args.only)  # raises for unknown names
-    if args.json:
-        print_json(_describe(options, args.only))
-    else:
+    if not args.json:
         print_lines(text.splitlines())
+        return 0
+    described = {}
+    for info in iter_options(options):
+        if is_within(info.name, args.only):
+            described[info.name] = {
+                "value": info.value,
+                "default": info.default,
+                "type": info.kind,
+                "choices": list(info.choices) or None,
+                "range": info.limits or None,
+                "doc": info.doc,
+            }
+    print_json(described)
     return 0
-
-
-def _describe(options: "Options", only: str) -> dict[str, Any]:
-    from stillmap.core.config import is_within, iter_options
-
-    return {
-        one.name: {
-            "value": one.value,
-            "default": one.default,
-            "type": one.kind,
-            "choices": list(one.choices) or None,
-            "range": str(one.limits) or None,
-            "doc": one.doc,
-        }
-        for one in iter_options(options)
-        if is_within(one.name, only)
-    }

@@ -11,6 +11,7 @@ from pathlib import Path
 from types import CodeType, FrameType
 from typing import IO, TYPE_CHECKING, Any
 
+from stillmap.core.errors import InputError
 from stillmap.core.interrupts import defers_signals_in, send_again
 from stillmap.core.printable import printable
 from stillmap.core.progress_bar import Step, make_bar, terminal_bar
@@ -242,3 +243,28 @@ def _must_defer(frame: FrameType | None, command: CodeType) -> bool:
             return True
         frame = frame.f_back
     return False
+
+
+# argument, as hints of Python name it -> flag
+_IN_HINTS = {
+    "overwrite=True": "--overwrite",
+    "resume=True": "--resume",
+    "recording=PATH": "--input",
+    "max_dt=SECONDS": "--max-dt",
+    "port=0 takes any free one": "without --port any free one is used",
+    "name=FORMAT": "--to",
+    "frame=": "--frame ",
+    "map_state=": "--map-state ",
+    "tilting=": "--tilting ",
+    "estimator=": "--estimator ",
+    'poses="FILE.tum"': "--poses FILE.tum",
+    'poses="recording"': "--poses recording",
+}
+
+
+def in_flags(error: InputError) -> InputError:
+    """The error with flags in its hint instead of arguments."""
+    hint = error.hint
+    for argument, flag in _IN_HINTS.items():
+        hint = hint.replace(argument, flag)
+    return InputError(error.what, where=error.where, hint=hint)

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
-from stillmap.cli.arguments import read_changes, require_apart
+from stillmap.cli.arguments import flag_changes, require_apart
 from stillmap.cli.console import show_share
 from stillmap.core.errors import InputError
 from stillmap.core.files import workplace
@@ -63,7 +63,7 @@ def convert_result(args: argparse.Namespace, source: Path, output: Path) -> tupl
     from stillmap.results.export import obj, point_cloud_files
     from stillmap.results.folder import open_result
 
-    if read_changes(args):
+    if flag_changes(args):
         text = "a result's recording is read as it was for the map: no flags for reading it"
         raise InputError(text, where=str(source))
     if is_place(source):

@@ -9,15 +9,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stillmap.cli.arguments import add_read_flags, read_changes
-from stillmap.cli.config import add_option_flags, options_from_args
-from stillmap.cli.console import fail, print_json, say, show_tasks
-from stillmap.cli.map_flags import (
+from stillmap.cli.arguments import (
     add_map_flags,
     add_method_flags,
-    option_changes,
-    require_memory_flag,
+    add_option_flags,
+    add_read_flags,
+    options_from_args,
 )
+from stillmap.cli.console import fail, print_json, say, show_tasks
 from stillmap.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -118,10 +117,7 @@ def _read_request(args: argparse.Namespace) -> "Request":
         raise InputError(f"--jobs must be 1 to 1024, got {args.jobs}")
     if args.jobs is not None and args.scheduler:
         raise InputError("--jobs and --scheduler exclude each other")
-    if args.memory_of_tasks is not None:
-        require_memory_flag(args.memory_of_tasks)
-    args.tilting_topic = None  # a flag of `map` alone
-    options = options_from_args(args, read_changes(args), option_changes(args))
+    options = options_from_args(args)
     return Request(
         entries=_read_entries(args),
         output=args.output,

@@ -6,13 +6,11 @@ import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from stillmap.cli.arguments import add_read_flags, read_changes, read_options
-from stillmap.cli.config import add_option_flags, options_from_args
+from stillmap.cli.arguments import add_option_flags, add_read_flags, read_options
 from stillmap.cli.console import print_lines, show_share
 
 if TYPE_CHECKING:
     from stillmap.io.input_groups import InputGroup
-    from stillmap.prepare.options import ReadOptions
 
 _LINES_SHOWN = 10
 DESCRIPTION = (
@@ -56,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     """
     from stillmap.cli.groups import find_groups
 
-    groups = find_groups(args, _read_options(args), None)
+    groups = find_groups(args, read_options(args), None)
     found = [_summarize_group(group, args) for group in groups]
     if args.json:
         print(json.dumps(_to_json(groups, found), indent=2, allow_nan=False))
@@ -71,7 +69,7 @@ def _summarize_group(group: "InputGroup", args: argparse.Namespace) -> dict[str,
     from stillmap.io import read
     from stillmap.io.input_groups import read_parts
 
-    options, paths = _read_options(args), group.paths
+    options, paths = read_options(args), group.paths
     with show_share(args.quiet, "reading") as progress:
         if len(paths) == 1:
             recording = read(paths[0], options, progress=progress)
@@ -102,13 +100,6 @@ def _format_groups(groups: "list[InputGroup]", found: list[dict[str, Any]]) -> I
         if several:
             yield describe_group(group)
         yield from _format_summary(summary)
-
-
-def _read_options(args: argparse.Namespace) -> "ReadOptions":
-    """The options of reading; those of --config and --set, too, where they are given."""
-    if not args.config and not args.assignments:
-        return read_options(args)  # without all other options, which take long to load
-    return options_from_args(args, read_changes(args)).read
 
 
 def _format_summary(found: dict[str, Any]) -> Iterator[str]:

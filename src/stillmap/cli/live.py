@@ -9,10 +9,16 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stillmap.cli.arguments import add_read_flags, make_parents, read_changes, require_apart
-from stillmap.cli.config import add_option_flags, options_from_args
+from stillmap.cli.arguments import (
+    add_map_mode_flag,
+    add_option_flags,
+    add_read_flags,
+    add_run_flags,
+    make_parents,
+    options_from_args,
+    require_apart,
+)
 from stillmap.cli.console import print_json, say, show_progress, show_share
-from stillmap.cli.map_flags import add_map_mode_flag, add_run_flags, shared_changes
 from stillmap.core.errors import InputError, import_extra
 
 if TYPE_CHECKING:
@@ -84,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
     from stillmap.live.history import FOLDER
     from stillmap.live.saving import require_place_for_drive
 
-    options = options_from_args(args, read_changes(args), shared_changes(args))
+    options = options_from_args(args)
     output, limit = Path(args.output), args.max_scratch
     if args.rate is not None and not args.rate > 0.0:
         raise InputError(f"--rate: expected a positive number, got {args.rate:g}")

@@ -13,10 +13,10 @@ from stillmap.cli.console import (
     EXIT_TERMINATED,
     fail,
     handle_signals,
+    in_flags,
     say,
     write_line,
 )
-from stillmap.cli.flags import in_flags
 from stillmap.cli.parser import COMMANDS, EXIT_INPUT, parser
 from stillmap.core.errors import InputError, closest_match, is_out_of_memory, memory_error
 from stillmap.core.printable import printable

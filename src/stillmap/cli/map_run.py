@@ -2,22 +2,24 @@
 
 import argparse
 import dataclasses
+import shlex
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.cli.console import say, show_share
-from stillmap.core.advice import advise
+from stillmap.cli.console import list_files, say, show_share
+from stillmap.core.advice import advise, split_advice
 from stillmap.core.errors import InputError, MissingExtra
 from stillmap.core.parallel import limit_blas_threads, resolve_threads
 from stillmap.core.profiling import Progress, StageTimer
 from stillmap.core.recording import Recording
 from stillmap.io import read
-from stillmap.io.input_groups import InputGroup
+from stillmap.io.builder import ReadContext
 from stillmap.io.registry import detect_format
-from stillmap.io.text_lines import Progress as ReadProgress
+from stillmap.mapping.beam_statistics import count_beams
 from stillmap.pipeline import inputs
 from stillmap.pipeline.checkpoint import CheckpointFolder, identify_run
 from stillmap.pipeline.estimate import EmState
@@ -28,6 +30,7 @@ from stillmap.prepare.options import ReadOptions
 from stillmap.prepare.overrides import select_time
 from stillmap.prepare.time_window import TimeWindow
 from stillmap.results.region import crop_result, require_overlap
+from stillmap.results.run_record import read_record
 
 if TYPE_CHECKING:
     from stillmap.mesh.build import Models
@@ -43,113 +46,99 @@ class Inputs(NamedTuple):
     tilting: Recording | None
 
 
-def read_inputs(
-    args: argparse.Namespace,
-    group: InputGroup,
-    options: Options,
-    scratch: Path,
-    stages: StageTimer,
-) -> Inputs:
-    """Read the inputs, one recording or its parts, and resolve the options for them."""
-    with stages.measure("read"):
-        with show_share(args.quiet, "reading") as progress:
-            recording = inputs.read_group(group, options.read, progress=progress, scratch=scratch)
-        if args.no_odometry:
-            recording = recording.without_odometry()
-        poses = inputs.read_poses(args.poses or None, recording)
-        inputs.require_mappable(recording, options, poses)
-        with show_share(args.quiet, "reading") as progress:
-            tilting = _read_tilting_laser(
-                group.paths, args.tilting, recording, options, progress, scratch
-            )
-        return Inputs(recording, resolve_options(options, recording), poses, tilting)
+def read_inputs(args: argparse.Namespace, options: Options, scratch: Path) -> Inputs:
+    """Read the recording, or the parts of one, and resolve the options for it.
+
+    Raises:
+        InputError: something cannot be read, or the inputs do not follow each other.
+    """
+    with show_share(args.quiet, "reading") as progress:
+        source = args.input if len(args.input) > 1 else args.input[0]
+        recording = inputs.read(source, options.read, progress=progress, scratch=scratch)
+    if len(args.input) > 1 and not args.quiet:
+        say(f"{len(args.input)} parts of one run, in the order of their stamps")
+    if args.no_odometry:
+        recording = recording.without_odometry()
+    poses = inputs.read_poses(args.poses or None, recording)
+    inputs.require_mappable(recording, options, poses)
+    tilting = _read_tilting_laser(args, recording, options.read, scratch)
+    return Inputs(recording, resolve_options(options, recording), poses, tilting)
 
 
 def _read_tilting_laser(
-    planar_paths: tuple[str, ...],
-    tilting_path: str | None,
-    planar: Recording,
-    options: Options,
-    progress: ReadProgress | None,
-    scratch: Path,
+    args: argparse.Namespace, planar: Recording, options: ReadOptions, scratch: Path
 ) -> Recording | None:
     """Read the tilting laser from its own recording, or from a topic of the planar one's bag.
-
-    Returns:
-        The recording, None where neither `tilting_path` nor `read.tilting_topic` is given.
 
     Raises:
         InputError: it cannot be read, or is not of the same robot and time as the planar one.
     """
-    topic = options.read.tilting_topic
-    if tilting_path and topic is not None:
+    path, topic = args.tilting, options.tilting_topic
+    if path and topic is not None:
         raise InputError("--tilting and --tilting-topic exclude each other")
-    if not tilting_path and topic is None:
+    if not path and topic is None:
         return None
     if planar.dimension != 2:
         what = "the planar laser decides which objects move, but this recording is 3D"
-        raise InputError(what, where=planar_paths[0])
-    # the part to be mapped counts from the start of the planar recording
-    whole = dataclasses.replace(options.read, start=None, end=None)
-    if topic is not None:
-        base_frame = planar.source.get("base_frame") or None
-        read_as = dataclasses.replace(whole, topic=topic, tilting_topic=None, base_frame=base_frame)
-        tilting = _read_topic(planar_paths, read_as, progress, scratch)
-    else:
-        # a topic chosen for INPUT is not in the other recording
-        read_as = dataclasses.replace(whole, topic=None)
-        tilting = read(Path(str(tilting_path)), read_as, progress=progress, scratch=scratch)
+        raise InputError(what, where=args.input[0])
     from stillmap.rig.build import check_rig  # only a rig needs it
 
-    path = tilting_path or planar_paths[0]
+    paths = [part["path"] for part in planar.source.get("parts", ())] or args.input
+
+    # the part to be mapped counts from the start of the planar recording, which has the topics
+    read_as = dataclasses.replace(options, start=None, end=None, topic=None, tilting_topic=None)
+    with show_share(args.quiet, "reading") as progress:
+        if topic is None:
+            tilting = read(Path(path), read_as, progress=progress, scratch=scratch)
+        else:
+            base_frame = planar.source.get("base_frame") or None
+            read_as = dataclasses.replace(read_as, topic=topic, base_frame=base_frame)
+            tilting = _read_topic(paths, ReadContext(read_as, progress, scratch))
+    where = path or paths[0]
     if "part" in planar.source:
         origin_ns = planar.source["part"]["first_stamp_ns"]
-        tilting = select_time(tilting, TimeWindow(options.read, origin_ns), path)
-    check_rig(planar, tilting, path)
-    return dataclasses.replace(tilting, source={**tilting.source, "path": path})
+        tilting = select_time(tilting, TimeWindow(options, origin_ns), where)
+    check_rig(planar, tilting, where)
+    return dataclasses.replace(tilting, source={**tilting.source, "path": where})
 
 
-def _read_topic(
-    paths: tuple[str, ...], options: ReadOptions, progress: ReadProgress | None, scratch: Path
-) -> Recording:
-    from stillmap.io.builder import ReadContext
+def _read_topic(paths: Sequence[str], context: ReadContext) -> Recording:
     from stillmap.io.ros.reader import read_parts  # message types take long to load
 
-    bags = [Path(path) for path in paths]
-    for path in bags:
-        if detect_format(path).name != "ROS bag":
-            raise InputError("--tilting-topic is for bags", where=str(path))
+    for path in paths:
+        if detect_format(Path(path)).name != "ROS bag":
+            raise InputError("--tilting-topic is for bags", where=path)
     with np.errstate(over="ignore", invalid="ignore"):
-        return read_parts(bags, ReadContext(options, progress, scratch), tilting=True)
+        return read_parts([Path(path) for path in paths], context, tilting=True)
 
 
 def build_all(
     args: argparse.Namespace,
-    found: Inputs,
+    given: Inputs,
     checkpoints: CheckpointFolder,
     progress: Progress,
     stages: StageTimer,
 ) -> "tuple[MappingResult, TiltingResult | None, Models | None]":
     """EM with a checkpoint per iteration, then the tilting laser and the meshes."""
-    options = found.options
+    options = given.options
     with stages.measure("read"):
-        run_id = identify_run(found.recording, options, found.poses)
+        run_id = identify_run(given.recording, options, given.poses)
     result = map_recording(
-        found.recording,
+        given.recording,
         options,
-        poses=found.poses,
+        poses=given.poses,
         progress=progress,
         stages=stages,
         scratch=checkpoints.folder,
-        resume=_load_checkpoint(args, checkpoints, run_id, found, stages),
+        resume=_load_checkpoint(args, checkpoints, run_id, given, stages),
         checkpoint=lambda state: checkpoints.save(state, run_id, stages),
     )
     require_overlap(result.map, options.output.region)
     tilting = None
-    if found.tilting is not None:
+    if given.tilting is not None:
         progress("removing moving objects", 0, 0, 0)
         with stages.measure("tilting"):
-            tilting = _map_tilting_laser(result, found.tilting, options)
+            tilting = _map_tilting_laser(result, given.tilting, options)
     models, warnings = _build_models(result, tilting, progress, stages)
     warnings = [*result.warnings, *warnings]
     result = dataclasses.replace(result, warnings=warnings, stages=stages.to_dict())
@@ -194,7 +183,7 @@ def _load_checkpoint(
     args: argparse.Namespace,
     checkpoints: CheckpointFolder,
     run_id: dict[str, Any],
-    found: Inputs,
+    given: Inputs,
     stages: StageTimer,
 ) -> EmState | None:
     """The state of an interrupted run, where there is one and `--resume` is given."""
@@ -205,7 +194,7 @@ def _load_checkpoint(
             say("an earlier run was interrupted: starts anew; --resume would continue it")
         checkpoints.clear()
         return None
-    state = checkpoints.load(run_id, found.options, found.recording, stages)
+    state = checkpoints.load(run_id, given.options, given.recording, stages)
     if state is not None and not args.quiet:
         say(f"continues after iteration {len(state.records)}")
     return state
@@ -226,5 +215,64 @@ def _map_tilting_laser(
         objects_to_local(result.objects, frame),
     )
     threads = resolve_threads(options.threads)
-    found = build_tilting(planar, tilting, options.em, threads)
-    return shift_tilting(found, frame.origin)
+    return shift_tilting(build_tilting(planar, tilting, options.em, threads), frame.origin)
+
+
+_IN_SUMMARY = ("version", "converged", "best_iteration", "counts", "area", "seconds", "warnings")
+
+
+def summarize(output: Path) -> dict[str, Any]:
+    """The main entries of `run.json`, and the files of the result."""
+    record = read_record(output)
+    return {
+        "output": str(output),
+        "files": list_files(output),
+        "iterations": len(record["iterations"]),
+        **{key: record[key] for key in (*_IN_SUMMARY, "tilting") if key in record},
+    }
+
+
+def print_summary(
+    result: MappingResult, tilting: "TiltingResult | None", models: "Models | None", output: Path
+) -> None:
+    """Print what was found, what is to be known about it, and where it lies."""
+    say(f"{result.recording.n_scans} scans, {_describe_hits(result.recording, result.p_static)}")
+    for line in _describe_result(result):
+        say(line)
+    if tilting is not None:
+        left_out = f"; {tilting.unposed_beams} left out: the robot's pose is not known there"
+        hits = _describe_hits(tilting.deskewed, tilting.p_static)
+        say(f"in 3D {hits}{left_out if tilting.unposed_beams else ''}")
+    for warning in result.warnings:
+        # a warning where the user can do something
+        say(f"{'warning' if split_advice(warning)[1] else 'note'}: {warning}")
+    in_3d = tilting is not None or result.recording.dimension == 3
+    if in_3d and models is None and result.options.mesh.enabled is None:
+        say("no surface model: the recording has no pictures, --mesh makes a grey one")
+    say(f"wrote {output}: open {output / 'report.html'}")
+    say(f"see it over time: stillmap view {shlex.quote(str(output))}")
+
+
+def _describe_result(result: MappingResult) -> Iterator[str]:
+    """Iterations, quality and changes."""
+    n, quality, changed = len(result.iterations), result.quality, len(result.changes)
+    if n == 1 and result.converged:
+        yield "converged after one iteration"
+    else:
+        ending = "" if result.converged else ", which had not converged"
+        yield f"kept iteration {result.best_iteration} of {n}{ending}"
+    if quality.overall is not None:
+        parts = {"labels": quality.labels, "geometry": quality.geometry}
+        known = [f"{name} {value:.0f}" for name, value in parts.items() if value is not None]
+        yield f"quality {quality.overall:.0f} of 100: {', '.join(known)}"
+    if changed:
+        last = result.options.output.map_state == "last"
+        state = "its last state" if last else "the state that it was in for longest"
+        each = "it" if changed == 1 else "each"
+        yield f"{changed} place{'s' * (changed > 1)} changed, the map shows {each} in {state}"
+
+
+def _describe_hits(recording: Recording, p_static: NDArray[np.float32]) -> str:
+    counts = count_beams(recording, p_static)
+    share = 100.0 * counts["dynamic"] / max(counts["hits"], 1)
+    return f"{counts['hits']} beams that hit something, {share:.1f} % of them dynamic"

@@ -5,10 +5,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stillmap.cli.arguments import add_read_flags, make_parents, read_changes, require_apart
-from stillmap.cli.config import add_option_flags, options_from_args
+from stillmap.cli.arguments import (
+    add_map_flags,
+    add_option_flags,
+    add_read_flags,
+    add_run_flags,
+    make_parents,
+    options_from_args,
+    require_apart,
+)
 from stillmap.cli.console import list_files, print_json, say, show_progress
-from stillmap.cli.map_flags import add_map_mode_flag, add_run_flags, option_changes, shared_changes
 from stillmap.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -55,10 +61,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
         help="state of what changed that the map shows: last, majority, the name of a session, "
         "or a date such as 2026-05-31 (default: last)",
     )
-    add_map_mode_flag(p)
-    p.add_argument(
-        "--resolution", metavar="M", type=float, help="edge of a map cell in metres (default: 0.05)"
-    )
+    add_map_flags(p, whole=False)
     p.add_argument("--no-odometry", action="store_true", help="ignore odometry in recordings")
     add_run_flags(p)
     add_read_flags(p)
@@ -73,25 +76,12 @@ def run(args: argparse.Namespace) -> int:
     """
     from stillmap.places.inputs import is_place
 
-    options = options_from_args(args, read_changes(args), shared_changes(args))
+    options = options_from_args(args)
     base = Path(args.input[0]) if is_place(Path(args.input[0])) else None
     paths = args.input if base is None else args.input[1:]
     if not paths:
         raise InputError("names no session to add", where=args.input[0])
     return _merge(args, base, _group(args, paths, options), options)
-
-
-def merge_groups(args: argparse.Namespace, groups: Sequence[Sequence[str]]) -> int:
-    """Merge the sessions that `stillmap map` was given, with its flags.
-
-    Args:
-        args: of `stillmap map`.
-        groups: paths of each session, several where it was recorded in parts.
-    """
-    args.frame, state, args.map_state = None, args.map_state or "last", None
-    options = options_from_args(args, read_changes(args), option_changes(args))
-    args.map_state = state  # of the place, not of each session
-    return _merge(args, None, groups, options)
 
 
 def _group(
@@ -145,22 +135,16 @@ def _merge(
 
 def _print_summary(job: "MergeJob", result: "PlaceResult", output: Path) -> None:
     """Print which sessions were placed, what changed, and where the result lies."""
-    placed = result.place.sessions
-    say(f"{len(placed)} sessions in one map, {len(result.place.ties)} constraints between them")
-    for one in result.refusals:
-        say(f"warning: {one.name} is not in the place: {one.why}")
-    say(_describe_changes(result, job.map_state))
-    say(f"wrote {output}")
-
-
-def _describe_changes(result: "PlaceResult", map_state: str) -> str:
-    count = len(result.changes)
-    if not count:
-        return "nothing changed between sessions"
+    sessions, ties = result.place.sessions, result.place.ties
+    say(f"{len(sessions)} sessions in one map, {len(ties)} constraints between them")
+    for refusal in result.refusals:
+        say(f"warning: {refusal.name} is not in the place: {refusal.why}")
     kinds = [change.kind for change in result.changes]
     words = {"appeared": "appeared", "gone": "are gone", "moved": "moved", "door": "are doors"}
-    told = [f"{kinds.count(kind)} {text}" for kind, text in words.items() if kind in kinds]
-    return f"{count} changes between sessions: {', '.join(told)}; the map shows {map_state}"
+    counts = [f"{kinds.count(kind)} {text}" for kind, text in words.items() if kind in kinds]
+    what = f"{len(kinds)} changes between sessions: {', '.join(counts)}"
+    say(f"{what}; the map shows {job.map_state}" if kinds else "nothing changed between sessions")
+    say(f"wrote {output}")
 
 
 def _summarize(result: "PlaceResult", output: Path) -> dict[str, Any]:

@@ -5,8 +5,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stillmap.cli.arguments import make_parents
-from stillmap.cli.config import add_set_flag
+from stillmap.cli.arguments import add_set_flag, make_parents
 from stillmap.cli.console import list_files, print_json, say, show_share
 from stillmap.core.errors import InputError
 

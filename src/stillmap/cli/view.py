@@ -8,8 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stillmap.cli.console import is_terminal, say, show_share
-from stillmap.cli.flags import in_flags
+from stillmap.cli.console import in_flags, is_terminal, say, show_share
 from stillmap.core.errors import InputError, MissingExtra, import_extra
 from stillmap.core.printable import printable
 

@@ -88,7 +88,7 @@ def _read_run(
     groups = group_inputs(paths, options, progress=share, scratch=scratch)
     if len(groups) > 1:
         what = f"is no part of the same run as {groups[0].paths[0]}: {groups[1].why}"
-        hint = "sessions are read one by one"
+        hint = "stillmap merge makes one map of sessions"
         raise InputError(what, where=groups[1].paths[0], hint=hint)
     share = share_progress(progress, 1, 2) if len(paths) > 1 else progress
     return read_group(groups[0], options, progress=share, scratch=scratch)

@@ -122,7 +122,10 @@ class ReadOptions:
         le=MAX_TIME,
     )
     end: float | None = option(
-        None, "Leave out scans after this time, likewise; unset: none.", ge=0.0, le=MAX_TIME
+        None,
+        "Leave out scans after this time, in seconds likewise; unset: none.",
+        ge=0.0,
+        le=MAX_TIME,
     )
     cameras: str | None = option(
         None, "TOML file with camera calibrations that the recording lacks, and further images."
