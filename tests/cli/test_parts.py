@@ -167,7 +167,7 @@ def test_an_interrupted_run_of_parts_continues(call, room, tmp_path, monkeypatch
     done = call(*shlex.split(told))
     assert done.returncode == 0, done.stderr
     assert "continues after iteration 1" in done.stderr
-    assert f"parts of one run: {parts[2]} begins" in done.stderr
+    assert "3 parts of one run" in done.stderr
     assert contents(tmp_path / "a") == contents(tmp_path / "b")
 
 
@@ -209,32 +209,12 @@ def test_info_says_what_belongs_together(call, room, day_after, tmp_path):
     assert len(one["groups"]) == 1
 
 
-@pytest.mark.parametrize("flags", [("--poses", "a.tum"), ("--region", 0, 0, 4, 4)])
-def test_flags_for_one_recording(call, room, day_after, tmp_path, nothing_left, flags):
-    done = call("map", room, day_after, "-o", tmp_path / "out", *flags, *QUICK)
+def test_sessions_are_for_merge(call, room, day_after, tmp_path, nothing_left):
+    done = call("map", room, day_after, "-o", tmp_path / "out", *QUICK)
     refused(
-        done,
-        f"{flags[0]} is for one recording: these are 2 sessions",
-        f"{day_after} begins 24.0 h after",
+        done, "is no part of the same run", f"{day_after} begins 24.0 h after", "stillmap merge"
     )
     nothing_left("tuesday")
-
-
-def test_sessions_and_their_parts_are_merged(call, room, day_after, tmp_path, monkeypatch):
-    taken = []
-
-    def merge(args, base, groups, options):  # noqa: ARG001
-        taken.append((args.output, groups, args.map_state, options.estimator))
-        assert options.output.map_state == "last"
-        return 0
-
-    monkeypatch.setattr("stillmap.cli.merge._merge", merge)
-    parts = cut_folder(room, tmp_path)
-    flags = ("-o", tmp_path / "out", "--estimator", "hit-ratio", "--map-state", "majority")
-    done = call("map", parts[0], day_after, *parts[1:], *flags, *QUICK)
-    assert done.returncode == 0, done.stderr
-    in_order = [str(parts[k]) for k in (1, 2, 0)]
-    assert taken == [(str(tmp_path / "out"), [in_order, [str(day_after)]], "majority", "hit-ratio")]
 
 
 def test_inputs_that_cannot_be_read(call, room, tmp_path, nothing_left):

@@ -25,9 +25,9 @@ for words in {calls!r}:
 
 
 def test_help_version_load_nothing_heavy(command):
-    calls = [["--version"], ["--help"], ["map", "--help"]]
+    calls = [["--version"], ["--help"]]
     calls += [["info", "--help"], ["simulate", "--help"], ["eval", "map", "--help"]]
-    calls += [["config", "--help"], ["view", "--help"], ["filter", "--help"], ["convert", "--help"]]
+    calls += [["view", "--help"], ["filter", "--help"], ["convert", "--help"]]
     program = PROGRAM.format(calls=calls, heavy=HEAVY)
     done = subprocess.run([command[0], "-c", program], capture_output=True, text=True, timeout=60)
     assert done.stderr == ""

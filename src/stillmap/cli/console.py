@@ -3,22 +3,17 @@
 import os
 import signal
 import sys
-import threading
-import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import CodeType, FrameType
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, Any
 
+from stillmap.core import profiling
 from stillmap.core.errors import InputError
 from stillmap.core.interrupts import defers_signals_in, send_again
 from stillmap.core.printable import printable
-from stillmap.core.progress_bar import Step, make_bar, terminal_bar
-
-if TYPE_CHECKING:
-    from stillmap.core.profiling import Progress
-
+from stillmap.core.profiling import Progress, is_terminal
 
 _STYLES = {"error": "1;31", "warning": "33"}  # bold red, yellow
 
@@ -32,20 +27,11 @@ def uses_color(stream: IO[str]) -> bool:
     return is_terminal(stream)
 
 
-def is_terminal(stream: IO[str] | None) -> bool:
-    """True if a stream is a terminal that supports control sequences."""
-    return stream is not None and stream.isatty() and os.environ.get("TERM") != "dumb"
-
-
 def colorize(text: str, style: str, stream: IO[str] | None) -> str:
     """The text in the color of a style, "error" or "warning", if the stream shows colors."""
     if stream is None or not uses_color(stream):
         return text
     return f"\x1b[{_STYLES[style]}m{text}\x1b[0m"
-
-
-_MIN_RATED = 0.01  # s: shorter steps show no rate
-_LINE_PERIOD = 10.0  # s between lines of progress without a terminal
 
 
 def say(line: str) -> None:
@@ -73,117 +59,35 @@ def write_line(line: str) -> None:
 
 
 @contextmanager
-def show_progress(quiet: bool, iterations: int) -> "Iterator[Progress]":
-    """A Progress that shows step, iteration, scans, rate and time left."""
+def show_progress(quiet: bool, iterations: int) -> Iterator[Progress]:
+    """A Progress that shows step, iteration, scans, rate and time left; nothing if quiet."""
     if quiet or sys.stderr is None:  # None: closed before the start
-        from stillmap.core.profiling import no_progress
-
-        yield no_progress
-    elif is_terminal(sys.stderr):
-        with terminal_bar(iterations) as progress:
-            yield progress
+        yield profiling.no_progress
     else:
-        with _Lines(iterations) as lines:
-            yield lines
+        with profiling.show_progress(iterations, say) as progress:
+            yield progress
 
 
 @contextmanager
-def show_share(quiet: bool, what: str) -> "Iterator[Callable[[float], None] | None]":
+def show_share(quiet: bool, what: str) -> Iterator[Callable[[float], None] | None]:
     """A function that shows the share of a job that is done, 0 to 1; None if quiet."""
     if quiet or sys.stderr is None:
         yield None
-    elif is_terminal(sys.stderr):
-        bar = make_bar()
-        task = bar.add_task(what, total=1.0, counted="")
-
-        def update(share: float) -> None:
-            bar.start()  # not before the first progress
-            bar.update(task, completed=share, counted=f"{100.0 * share:.0f} %")
-
-        try:
-            yield update
-        finally:
-            bar.stop()
     else:
-        last = time.monotonic()
-
-        def print_line(share: float) -> None:
-            nonlocal last
-            if time.monotonic() - last >= _LINE_PERIOD:
-                last = time.monotonic()
-                say(f"{what}: {100.0 * share:.0f} %")
-
-        yield print_line
+        with profiling.show_steps(say) as show:
+            yield lambda share: show(what, float(share), 1.0)
 
 
 @contextmanager
-def show_tasks(quiet: bool) -> "Iterator[Callable[[str, int, int, str], None]]":
+def show_tasks(quiet: bool) -> Iterator[Callable[[str, int, int, str], None]]:
     """A function that shows what is done, how many of how many tasks, and the last one's name."""
     if quiet or sys.stderr is None:
         yield lambda *_: None
     elif is_terminal(sys.stderr):
-        bar = make_bar()
-        tasks: dict[str, Any] = {}
-
-        def update(what: str, done: int, total: int, name: str) -> None:  # noqa: ARG001
-            bar.start()  # not before the first progress
-            if what not in tasks:
-                for finished in tasks.values():
-                    bar.update(finished, visible=False)
-                tasks[what] = bar.add_task(what, total=total, counted="")
-            bar.update(tasks[what], completed=done, counted=f"{done} of {total}", refresh=True)
-
-        try:
-            yield update
-        finally:
-            bar.stop()
+        with profiling.show_steps(say) as show:
+            yield lambda what, done, total, name: show(what, done, total)  # noqa: ARG005
     else:
         yield lambda what, done, total, name: say(f"{what}: {done} of {total}, {name}")
-
-
-class _Lines:
-    """Print progress every `_LINE_PERIOD` seconds, and at the end of each iteration."""
-
-    def __init__(self, iterations: int) -> None:
-        self._iterations, self._reported = iterations, 0
-        self._now = Step("preparing", 0, iterations), 0, 0
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
-
-    def __enter__(self) -> "_Lines":
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stop.set()
-        self._thread.join()
-
-    def __call__(self, what: str, iteration: int, done: int, total: int) -> None:
-        step = self._now[0]
-        if step.key != (what, iteration):
-            step = Step(what, iteration, self._iterations)
-        self._now = step, done, total
-        if 0 < total == done and iteration > self._reported:
-            self._reported = iteration
-            self._report()
-
-    def _run(self) -> None:
-        while not self._stop.wait(_LINE_PERIOD):
-            self._report()
-
-    def _report(self) -> None:
-        step, done, total = self._now
-        if not total:
-            say(f"{step.name}: {step.seconds():.0f} s so far")
-            return
-        text, rate = f"{step.name}: {done} of {total}", step.rate(done)
-        if step.of_scans:
-            text += " scans"
-            if step.seconds() > _MIN_RATED:
-                text += f", {rate:.0f}/s"
-        if done < total:
-            text += f", {(total - done) / max(rate, 1e-3):.0f} s left"
-        say(text)
 
 
 def print_lines(lines: Iterable[str]) -> None:

@@ -52,14 +52,17 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         InputError: the recording cannot be read.
     """
-    from stillmap.cli.groups import find_groups
+    from stillmap.cli.groups import describe_group, find_groups
 
     groups = find_groups(args, read_options(args), None)
-    found = [_summarize_group(group, args) for group in groups]
+    summaries = [_summarize_group(group, args) for group in groups]
+    several = len(args.input) > 1
     if args.json:
-        print(json.dumps(_to_json(groups, found), indent=2, allow_nan=False))
-    else:
-        print_lines(_format_groups(groups, found))
+        print(json.dumps(_to_json(groups, summaries), indent=2, allow_nan=False))
+        return 0
+    for number, (group, summary) in enumerate(zip(groups, summaries, strict=True)):
+        blank, heading = [""] * (number > 0), [describe_group(group)] * several
+        print_lines([*blank, *heading, *_format_summary(summary)])
     return 0
 
 
@@ -78,28 +81,16 @@ def _summarize_group(group: "InputGroup", args: argparse.Namespace) -> dict[str,
     return {"input": paths[0], **summarize_recording(recording), "parts": list(group.parts)}
 
 
-def _to_json(groups: "list[InputGroup]", found: list[dict[str, Any]]) -> dict[str, Any]:
+def _to_json(groups: "list[InputGroup]", summaries: list[dict[str, Any]]) -> dict[str, Any]:
     """One input: its summary; several: also which belong together; sessions: one summary each."""
     if len(groups) == len(groups[0].paths) == 1:
-        return found[0]
+        return summaries[0]
     together = [
         {"inputs": list(group.paths), "kind": group.kind, "why": group.why} for group in groups
     ]
     if len(groups) == 1:
-        return {**found[0], "groups": together}
-    return {"groups": together, "recordings": found}
-
-
-def _format_groups(groups: "list[InputGroup]", found: list[dict[str, Any]]) -> Iterator[str]:
-    from stillmap.cli.groups import describe_group
-
-    several = sum(len(group.paths) for group in groups) > 1
-    for number, (group, summary) in enumerate(zip(groups, found, strict=True)):
-        if number:
-            yield ""
-        if several:
-            yield describe_group(group)
-        yield from _format_summary(summary)
+        return {**summaries[0], "groups": together}
+    return {"groups": together, "recordings": summaries}
 
 
 def _format_summary(found: dict[str, Any]) -> Iterator[str]:

@@ -118,13 +118,26 @@ def _explain_failure(args: argparse.Namespace, checkpoints: "CheckpointFolder") 
     """Say after a failure or an interruption how to go on, where there is something to go on."""
     try:
         yield
-    except BaseException as error:
-        is_stopped = isinstance(error, KeyboardInterrupt | SystemExit)
-        if checkpoints.newest is not None and (checkpoints.is_in_use or is_stopped):
-            given = [word for word in args.words if word not in ("--resume", "--overwrite")]
-            number = checkpoints.newest.name.rpartition("-")[2]
-            command = shlex.join(["stillmap", *given, "--resume"])
-            say(f"continue after iteration {number}: {command}")
-        elif is_stopped and not args.quiet:
-            say("no iteration was finished: nothing was written, and there is nothing to resume")
+    except (KeyboardInterrupt, SystemExit):
+        if not args.quiet:
+            say(_describe_continuation(args.words, checkpoints))
         raise
+    except InputError as error:
+        if not checkpoints.is_in_use:
+            raise
+        hints = filter(None, (error.hint, _describe_continuation(args.words, checkpoints)))
+        raise InputError(error.what, where=error.where, hint="; ".join(hints)) from error
+    except Exception:
+        if checkpoints.is_in_use:
+            say(_describe_continuation(args.words, checkpoints))
+        raise
+
+
+def _describe_continuation(words: list[str], checkpoints: "CheckpointFolder") -> str:
+    """The command that continues a run that ended early, with these words on its command line."""
+    if checkpoints.newest is None:
+        return "no iteration was finished: nothing was written, and there is nothing to resume"
+    given = [word for word in words if word not in ("--resume", "--overwrite")]
+    number = checkpoints.newest.name.rpartition("-")[2]
+    command = shlex.join(["stillmap", *given, "--resume"])
+    return f"continue after iteration {number}: {command}"

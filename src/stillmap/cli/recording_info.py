@@ -1,6 +1,5 @@
 """Summary statistics of a recording, for `stillmap info`."""
 
-import dataclasses
 from collections.abc import Iterator
 from typing import Any
 
@@ -9,65 +8,41 @@ from numpy.typing import NDArray
 
 from stillmap.core import arrays, se2
 from stillmap.core.recording import Recording
-from stillmap.prepare.max_range import RangeRule
 
 _MAX_SAMPLE = 1 << 24  # beams used for quantiles of ranges
 _MIN_SCANS = 100  # scans that a sample needs
-_DAMAGE = ("skipped", "skipped_odometry", "damage")
-_TABLES = ("records", "ignored", "params", "read_options")
-_LISTS = ("duplicates", "warnings", "topics")
-_WORDS = ("base_frame", "base_frame_how")
+_TABLES = ("skipped", "skipped_odometry", "damage", "records", "ignored", "params", "read_options")
+_LISTS = ("duplicates", "warnings", "topics", "self_filter")
+_WORDS = ("path", "format", "base_frame", "base_frame_how")
 _SENSOR_NOTES = (
     *("name", "beams_per_scan", "start_angle", "angle_step", "extrinsics", "ranges"),
     *("upside_down", "upside_down_how", "frame"),
 )
-_RANGE_RULE = {field.name for field in dataclasses.fields(RangeRule)}
 
 
 def summarize_recording(recording: Recording) -> dict[str, Any]:
     """Summarize a recording for `stillmap info`, JSON-able, in metres, seconds and degrees."""
-    source = _read_notes(recording.source)
-    beams = np.diff(recording.offset)
+    notes = recording.source
     return {
-        "path": source.get("path"),
-        "format": source.get("format"),
         "dimension": recording.dimension,
         "scans": recording.n_scans,
         "beams": recording.n_beams,
-        "beams_per_scan": _quantiles(beams, ("min", "median", "max")),
+        "beams_per_scan": _quantiles(np.diff(recording.offset), ("min", "median", "max")),
         "counts": _count_beams(recording),
         "hit_ranges_m": _quantiles(_sample_hit_ranges(recording), ("min", "median", "p99", "max")),
         "time": _summarize_time(recording.stamp_ns),
-        "part": source["part"],
+        "part": notes.get("part") or {},
         "beam_times_s": _beam_time_range(recording.beam_time),
-        "spin": source["spin"].get("direction"),
-        "odometry": _summarize_odometry(recording, source["odometry"]),
+        "spin": (notes.get("spin") or {}).get("direction"),
+        "odometry": _summarize_odometry(recording, notes.get("odometry") or {}),
         "recorded_poses": _summarize_path(recording.T_recorded_base),
         "images": _summarize_images(recording),
-        "sensors": _summarize_sensors(recording, source["sensors"]),
-        "self_filter": [noted for noted in source["self_filter"] if _is_box(noted)],
-        **{key: source[key] for key in (*_DAMAGE, "skipped_unit", *_TABLES, *_LISTS, *_WORDS)},
+        "sensors": _summarize_sensors(recording, notes.get("sensors") or []),
+        "skipped_unit": notes.get("skipped_unit") or "line",
+        **{key: notes.get(key) or {} for key in _TABLES},
+        **{key: notes.get(key) or [] for key in _LISTS},
+        **{key: notes.get(key) for key in _WORDS},
     }
-
-
-def _read_notes(source: dict[str, Any]) -> dict[str, Any]:
-    """Notes of the reader by key; those of unexpected type (other writers) are dropped."""
-    tables = {key: source.get(key) for key in (*_DAMAGE, *_TABLES, "odometry", "spin", "part")}
-    notes: dict[str, Any] = {k: v if isinstance(v, dict) else {} for k, v in tables.items()}
-    lists = {key: source.get(key) for key in (*_LISTS, "sensors", "self_filter")}
-    notes.update({k: v if isinstance(v, list) else [] for k, v in lists.items()})
-    for key in _DAMAGE:
-        notes[key] = {
-            reason: damage
-            for reason, damage in notes[key].items()
-            if isinstance(damage, dict)
-            and isinstance(damage.get("count"), int)
-            and isinstance(damage.get("lines"), list)
-        }
-    words = {key: source.get(key) for key in ("path", "format", "skipped_unit", *_WORDS)}
-    notes.update({k: v if isinstance(v, str) else None for k, v in words.items()})
-    notes["skipped_unit"] = notes["skipped_unit"] or "line"
-    return notes
 
 
 def _sample_hit_ranges(recording: Recording) -> NDArray[np.float32]:
@@ -140,16 +115,14 @@ def _summarize_odometry(recording: Recording, noted: dict[str, Any]) -> dict[str
     T = recording.T_odom_base
     if T is None:
         return None
-    found = {key: noted[key] for key in ("from", "outside") if noted.get(key) is not None}
     metres, degrees = _step_lengths(T)
-    at = int(metres.argmax()) if len(metres) else 0
     return {
-        **found,
+        **{key: noted[key] for key in ("from", "outside") if noted.get(key) is not None},
         "path_length_m": float(metres.sum()),
         "turned_deg": float(degrees.sum()),
         "largest_step_m": float(metres.max(initial=0.0)),
         "largest_step_deg": float(degrees.max(initial=0.0)),
-        "largest_step_at_ns": int(recording.stamp_ns[at]) if len(metres) else None,
+        "largest_step_at_ns": int(recording.stamp_ns[metres.argmax()]) if len(metres) else None,
     }
 
 
@@ -197,15 +170,15 @@ def _summarize_images(recording: Recording) -> dict[str, Any] | None:
     }
 
 
-def _summarize_sensors(recording: Recording, noted: list[Any]) -> list[dict[str, Any]]:
+def _summarize_sensors(recording: Recording, noted: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Summaries of all sensors; a moving sensor has several extrinsics and one note."""
-    out, first, number = [], 0, 0
+    out: list[dict[str, Any]] = []
+    first = 0
     while first < len(recording.T_base_sensor):
-        notes = noted[number] if number < len(noted) and isinstance(noted[number], dict) else {}
-        places = notes.get("places", 1)
-        places = places if isinstance(places, int) and places > 0 else 1
-        out.append(_summarize_sensor(recording, range(first, first + places), notes))
-        first, number = first + places, number + 1
+        notes = noted[len(out)] if len(out) < len(noted) else {}
+        stop = first + notes.get("places", 1)
+        out.append(_summarize_sensor(recording, range(first, stop), notes))
+        first = stop
     return out
 
 
@@ -217,38 +190,12 @@ def _summarize_sensor(
     scans = np.flatnonzero(of_sensor)
     out: dict[str, Any] = {"scans": len(scans)}
     out.update((key, noted[key]) for key in _SENSOR_NOTES if key in noted)
-    if not _is_range_rule(out.get("ranges")):
-        out.pop("ranges", None)
     if recording.dimension == 2:
         x, y, theta = (float(v) for v in se2.parameters(recording.T_base_sensor[numbers.start]))
-        place = out.get("extrinsics")
-        how = str(place.get("how", "")) if isinstance(place, dict) else "as recorded"
+        how = noted["extrinsics"].get("how", "") if "extrinsics" in noted else "as recorded"
         out["extrinsics"] = {"x": x, "y": y, "theta_deg": float(np.degrees(theta)), "how": how}
         out["field_of_view_deg"] = _field_of_view(recording, scans, out)
     return out
-
-
-def _is_range_rule(noted: Any) -> bool:
-    return (
-        isinstance(noted, dict)
-        and set(noted) | {"self_filter"} == _RANGE_RULE  # older recordings lack it
-        and all(isinstance(noted[k], float | int | None) for k in ("threshold", "free_range"))
-        and all(_is_triple(part) for part in noted.get("self_filter", ()))
-    )
-
-
-def _is_triple(noted: Any) -> bool:
-    numbers = list(noted) if isinstance(noted, list | tuple) else []
-    return len(numbers) == 3 and all(isinstance(number, float | int) for number in numbers)
-
-
-def _is_box(noted: Any) -> bool:
-    """True if a note of the reader is a valid self-filter box of a 3D recording."""
-    return (
-        isinstance(noted, dict)
-        and all(isinstance(noted.get(key), int) for key in ("sensor", "beams"))
-        and all(_is_triple(noted.get(key)) for key in ("low", "high"))
-    )
 
 
 def _field_of_view(

@@ -8,9 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stillmap.cli.console import in_flags, is_terminal, say, show_share
+from stillmap.cli.console import in_flags, say, show_share
 from stillmap.core.errors import InputError, MissingExtra, import_extra
 from stillmap.core.printable import printable
+from stillmap.core.profiling import is_terminal
 
 if TYPE_CHECKING:
     from stillmap.results.folder import ResultFolder

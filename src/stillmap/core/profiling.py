@@ -1,14 +1,25 @@
 """Progress, time and memory of the stages of a run."""
 
+import os
 import resource
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from typing import IO, Any, Protocol
 
 # stage, iteration (0: outside the loop), scans done, of how many (0: not counted)
 Progress = Callable[[str, int, int, int], None]
+
+_LINE_PERIOD = 10.0  # s between lines of progress without a terminal
+_MIN_RATED = 0.01  # s: shorter steps show no rate
+
+
+class Show(Protocol):
+    """Shows a step, how much of it is done, and of how much (0: not counted); `unit` is counted."""
+
+    def __call__(self, step: str, done: float, total: float, unit: str = "") -> None: ...
 
 
 def no_progress(stage: str, iteration: int, done: int, total: int) -> None:
@@ -35,12 +46,12 @@ class StageTimer:
 
     def add(self, earlier: Mapping[str, Mapping[str, Any]]) -> None:
         """Add the stages of the run that this one resumes, as `to_dict` returned them."""
-        for name, one in earlier.items():
+        for name, before in earlier.items():
             stage = self._stages.setdefault(name, {"seconds": 0.0, "cpu_seconds": 0.0})
-            stage["seconds"] += one["seconds"]
-            stage["cpu_seconds"] += one["cpu_seconds"]
+            stage["seconds"] += before["seconds"]
+            stage["cpu_seconds"] += before["cpu_seconds"]
             known = stage.get("peak_memory_bytes", 0)
-            stage["peak_memory_bytes"] = max(known, one["peak_memory_bytes"])
+            stage["peak_memory_bytes"] = max(known, before["peak_memory_bytes"])
 
     def to_dict(self) -> dict[str, dict[str, Any]]:
         """`seconds`, `cpu_seconds` and `peak_memory_bytes` (of the process so far) by stage."""
@@ -51,3 +62,128 @@ def peak_memory_bytes() -> int:
     """Peak resident memory of this process."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024
+
+
+def is_terminal(stream: IO[str] | None) -> bool:
+    """True if a stream is a terminal that supports control sequences."""
+    return stream is not None and stream.isatty() and os.environ.get("TERM") != "dumb"
+
+
+def print_line(line: str) -> None:
+    """Print a line to stderr."""
+    print(line, file=sys.stderr, flush=True)
+
+
+@contextmanager
+def show_progress(iterations: int, say: Callable[[str], None] = print_line) -> Iterator[Progress]:
+    """A Progress that shows step, iteration, scans, rate and time left.
+
+    Args:
+        iterations: of EM, at most.
+        say: prints a line where stderr is no terminal.
+    """
+    with show_steps(say) as show:
+
+        def progress(what: str, iteration: int, done: int, total: int) -> None:
+            name = f"{what} {iteration}/{iterations}" if iteration else what
+            show(name, done, total, "scans" if iteration else "")
+
+        yield progress
+
+
+@contextmanager
+def show_steps(say: Callable[[str], None] = print_line) -> Iterator[Show]:
+    """What shows steps on stderr: a bar on a terminal, elsewhere a line now and then."""
+    if is_terminal(sys.stderr) or os.environ.get("FORCE_COLOR"):
+        with _show_bar() as show:
+            yield show
+    else:
+        with _Lines(say) as lines:
+            yield lines.update
+
+
+@contextmanager
+def _show_bar() -> Iterator[Show]:
+    from rich.console import Console
+    from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bar
+    from rich.table import Column
+
+    columns = (
+        TextColumn("{task.description}", table_column=Column(no_wrap=True)),
+        BarColumn(bar_width=None),
+        TextColumn("{task.fields[counted]}", table_column=Column(no_wrap=True)),
+        TimeRemainingColumn(table_column=Column(no_wrap=True)),
+    )
+    bar = Bar(*columns, console=Console(stderr=True), transient=True, expand=True)
+    shown = ""
+
+    def update(step: str, done: float, total: float, unit: str = "") -> None:  # noqa: ARG001
+        nonlocal shown
+        bar.start()  # not before the first progress
+        if step != shown:
+            for task in bar.task_ids:
+                bar.remove_task(task)
+            bar.add_task(step, total=total or None, counted="")
+            shown = step
+        counted = f"{100.0 * done:.0f} %" if isinstance(done, float) else f"{done}/{total}"
+        # a finished step is shown even if it was short
+        bar.update(
+            bar.task_ids[0],
+            completed=done,
+            counted=counted if total else "",
+            refresh=done == total,
+        )
+
+    try:
+        yield update
+    finally:
+        bar.stop()
+
+
+class _Lines:
+    """Print progress every `_LINE_PERIOD` seconds, and once when scans of a new iteration end."""
+
+    def __init__(self, say: Callable[[str], None]) -> None:
+        self._say = say
+        self._now: tuple[str, float, float, str] = ("preparing", 0, 0, "")
+        self._started, self._ended = time.monotonic(), ""
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self) -> "_Lines":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def update(self, step: str, done: float, total: float, unit: str = "") -> None:
+        if step != self._now[0]:
+            self._started = time.monotonic()
+        self._now = step, done, total, unit
+        iteration = step.rpartition(" ")[2]
+        if unit == "scans" and 0 < total == done and iteration != self._ended:
+            self._ended = iteration
+            self._report()
+
+    def _run(self) -> None:
+        while not self._stop.wait(_LINE_PERIOD):
+            self._report()
+
+    def _report(self) -> None:
+        (step, done, total, unit), seconds = self._now, time.monotonic() - self._started
+        if not total:
+            self._say(f"{step}: {seconds:.0f} s so far")
+            return
+        if isinstance(done, float):
+            self._say(f"{step}: {100.0 * done:.0f} %")
+            return
+        rate = done / max(seconds, 1e-3)
+        text = f"{step}: {done} of {total}{' ' if unit else ''}{unit}"
+        if unit == "scans" and seconds > _MIN_RATED:
+            text += f", {rate:.0f}/s"
+        self._say(
+            text if done == total else f"{text}, {(total - done) / max(rate, 1e-3):.0f} s left"
+        )

@@ -12,8 +12,7 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from stillmap.core import config
-from stillmap.core.profiling import Progress, StageTimer, no_progress
-from stillmap.core.progress_bar import show_bar
+from stillmap.core.profiling import Progress, StageTimer, no_progress, show_progress
 from stillmap.core.recording import Recording
 from stillmap.pipeline import inputs
 from stillmap.pipeline.options import DEFAULTS, Options
@@ -108,7 +107,7 @@ def report_to(progress: bool | Progress, iterations: int) -> Iterator[Progress]:
     if callable(progress):
         yield progress
     elif progress:
-        with show_bar(iterations) as bar:
+        with show_progress(iterations) as bar:
             yield bar
     else:
         yield no_progress
