@@ -32,10 +32,10 @@ def test_long_steps_are_reported_periodically(lines):
     with console.show_progress(False, 6) as progress:
         assert another("preparing: ").endswith("s so far")
         progress("matching scans", 1, 20, 80)
-        assert "matching scans 1/6: 20 of 80 scans, " in another("20 of 80")
+        assert "matching scans, iteration 1 of at most 6: 20 of 80 scans, " in another("20 of 80")
         assert another("20 of 80").endswith("s left")
         progress("labelling beams", 1, 0, 0)
-        another("labelling beams 1/6: 0 s so far")
+        another("labelling beams, iteration 1 of at most 6: 0 s so far")
         progress("choosing pictures", 0, 3, 12)
         line = another("choosing pictures")
         assert line.startswith("choosing pictures: 3 of 12, ")
@@ -56,7 +56,9 @@ def test_short_iteration_is_reported_once(lines, monkeypatch):
                 for done in range(1, 4):
                     progress(what, iteration, done, 3)
             progress("labelling beams", iteration, 0, 0)
-    assert [line.split(":")[0] for line in printed] == ["matching scans 1/3", "matching scans 2/3"]
+    assert [line.split(":")[0] for line in printed] == [
+        f"matching scans, iteration {k} of at most 3" for k in (1, 2)
+    ]
     assert all("3 of 3 scans" in line and "left" not in line for line in printed)
 
 

@@ -77,7 +77,7 @@ def test_dumb_terminal_gets_lines(on_a_terminal, room, tmp_path):
     _, written = on_a_terminal(*words, "-o", tmp_path / "b", TERM="dumb")
     assert "\x1b" not in written
     assert "stillmap: note: no odometry" in written
-    assert "stillmap: matching scans 1/1" in written
+    assert "stillmap: matching scans, iteration 1" in written
 
 
 def test_warnings_are_yellow_on_a_terminal(on_a_terminal, room, tmp_path):

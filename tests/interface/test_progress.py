@@ -69,7 +69,7 @@ def test_ctrl_c_while_saving_leaves_no_half_result(built, tmp_path, monkeypatch,
 
 
 @pytest.mark.slow  # starts a kernel of Jupyter
-def test_a_bar_in_a_notebook(folder, tmp_path):
+def test_a_notebook(folder, tmp_path):
     nbclient = pytest.importorskip("nbclient")
     nbformat = pytest.importorskip("nbformat")
     pytest.importorskip("ipykernel")
@@ -78,18 +78,11 @@ def test_a_bar_in_a_notebook(folder, tmp_path):
         "result",
     ]
     book = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(cell) for cell in cells])
-    shown = []
-
-    class Client(nbclient.NotebookClient):
-        def process_message(self, message, cell, index):
-            if message["msg_type"] in ("display_data", "update_display_data"):
-                shown.append(message["content"]["data"].get("text/html", ""))
-            return super().process_message(message, cell, index)
-
-    Client(book, timeout=120, resources={"metadata": {"path": str(tmp_path)}}).execute()
-    assert any("<progress" in page and "matching scans, iteration 1" in page for page in shown)
+    client = nbclient.NotebookClient(
+        book, timeout=120, resources={"metadata": {"path": str(tmp_path)}}
+    )
+    client.execute()
     first, second = (cell["outputs"] for cell in book["cells"])
-    # the bar is gone, and nothing was printed
-    assert [one["data"].get("text/html") for one in first] == [""]
+    assert {one["name"] for one in first} <= {"stderr"}  # lines of progress
     assert "data:image/png;base64" in second[0]["data"]["text/html"]
     assert second[0]["data"]["text/plain"].startswith("<BuiltResult: 60 scans")

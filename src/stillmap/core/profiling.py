@@ -2,6 +2,7 @@
 
 import os
 import resource
+import shutil
 import sys
 import threading
 import time
@@ -13,6 +14,7 @@ from typing import IO, Any, Protocol
 Progress = Callable[[str, int, int, int], None]
 
 _LINE_PERIOD = 10.0  # s between lines of progress without a terminal
+_WIDE = 100  # columns of a terminal: from there on with longer texts
 _MIN_RATED = 0.01  # s: shorter steps show no rate
 
 
@@ -82,10 +84,15 @@ def show_progress(iterations: int, say: Callable[[str], None] = print_line) -> I
         iterations: of EM, at most.
         say: prints a line where stderr is no terminal.
     """
+    is_wide = not is_terminal(sys.stderr) or shutil.get_terminal_size().columns >= _WIDE
     with show_steps(say) as show:
 
         def progress(what: str, iteration: int, done: int, total: int) -> None:
-            name = f"{what} {iteration}/{iterations}" if iteration else what
+            name = what
+            if iteration and is_wide:
+                name += f", iteration {iteration} of at most {iterations}"
+            elif iteration:
+                name += f" {iteration}/{iterations}"
             show(name, done, total, "scans" if iteration else "")
 
         yield progress
@@ -163,7 +170,7 @@ class _Lines:
         if step != self._now[0]:
             self._started = time.monotonic()
         self._now = step, done, total, unit
-        iteration = step.rpartition(" ")[2]
+        iteration = step.rpartition(",")[2]
         if unit == "scans" and 0 < total == done and iteration != self._ended:
             self._ended = iteration
             self._report()
