@@ -1,9 +1,6 @@
 """Tracked people are labelled, what stands is not."""
 
-import dataclasses
-
 import numpy as np
-import pytest
 from made_up_scans import before, crossing, poses, recording, wall
 
 from stillmap import _core, em
@@ -45,37 +42,6 @@ def test_standing_objects_are_not_labelled():
     assert not labelled(recording(ranges + rng.normal(scale=0.02, size=ranges.shape))).any()
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("_MIN_DISPLACEMENT", 10.0),
-        ("MIN_TRACK_SCANS", 100),
-        ("_MIN_CHANGED_SHARE", 1.0),
-        ("_MAX_MISSED", 0.05),
-    ],
-)
-def test_what_confirms_a_track(monkeypatch, name, value):
-    ranges, on = crossing(TIMES)
-    if name == "_MIN_CHANGED_SHARE":  # he stands, then goes
-        ranges[:8] = crossing(TIMES[:8], speed=0.0)[0]
-    r = recording(ranges)
-    if name != "_MIN_CHANGED_SHARE":
-        assert labelled(r)[on].any()
-    monkeypatch.setattr(tracker, name, value)
-    assert not labelled(r).any()
-
-
-def test_the_size_of_the_box(monkeypatch):
-    ranges, on = crossing(TIMES, x=5.7)  # close to the wall
-    shares = []
-    for box in (0.0, 0.4, 1.0):
-        monkeypatch.setattr(tracker, "_HALF_BOX", box)
-        off = labelled(recording(ranges))
-        shares.append((off[on].mean(), off[~on].mean()))
-    assert shares[0][0] < shares[1][0]
-    assert shares[1][1] < shares[2][1]
-
-
 def test_only_hits_are_labelled(monkeypatch):
     monkeypatch.setattr(tracker, "_HALF_BOX", 1.0)
     ranges = np.full((1, 181), np.inf)
@@ -105,43 +71,6 @@ def test_crossing_walkers():
     off = labelled(recording(np.minimum(one, two)))
     assert off[on_one].mean() > 0.9
     assert off[on_two & ~on_one].mean() > 0.85
-
-
-@pytest.mark.parametrize("gap", [3.0, 1e5])
-def test_a_large_gap_ends_all_tracks(gap):
-    ranges, on = crossing(TIMES)
-    seconds = TIMES + np.where(np.arange(len(TIMES)) < 9, 0.0, gap)
-    off = labelled(recording(ranges, seconds))
-    assert len(np.unique(tracks_of(recording(ranges, seconds)).track)) == 2
-    assert off[on].mean() > 0.9
-
-
-def test_repeated_and_irregular_stamps():
-    ranges, on = crossing(TIMES)
-    twice = recording(np.repeat(ranges, 2, axis=0), np.repeat(TIMES, 2))
-    assert labelled(twice)[np.repeat(on, 2, axis=0)].mean() > 0.9
-    times = np.sort(np.random.default_rng(3).uniform(0.0, 3.4, 25))
-    ranges, on = crossing(times)
-    assert labelled(recording(ranges, times))[on].mean() > 0.9
-
-
-def test_degenerate_recordings():
-    ranges, _ = crossing(TIMES)
-    one = recording(ranges[:1])
-    assert not labelled(one).any()
-    nothing = recording(np.full(ranges.shape, np.inf))
-    assert not labelled(nothing).any()
-    unusable = recording(np.full(ranges.shape, np.nan))
-    assert not labelled(unusable).any()
-    r = recording(ranges)
-    none = dataclasses.replace(
-        r, points=r.points[:0], hit=r.hit[:0], offset=np.zeros_like(r.offset)
-    )
-    assert label_people(none, poses(none)).shape == (0,)
-    few = dataclasses.replace(
-        r, points=r.points[: 2 * 17], hit=r.hit[: 2 * 17], offset=2 * np.arange(18)
-    )
-    assert not label_people(few, poses(few)).any()
 
 
 def e_step(r, threads=1, **options):
@@ -187,11 +116,3 @@ def test_the_same_to_the_bit_with_any_number_of_threads():
         assert again.p_static.tobytes() == first.p_static.tobytes()
         assert again.likelihood == first.likelihood
         assert again.occupied.p_occupied.tobytes() == first.occupied.p_occupied.tobytes()
-
-
-def test_two_iterations_from_all_static():
-    r = recording(wall())
-    assert em.max_iterations("tracker", em.EmOptions()) == 2
-    assert em.max_iterations("tracker", em.EmOptions(max_iterations=1)) == 1
-    assert em.fixed_iterations("stillmap") is em.fixed_iterations("paper") is None
-    assert (em.initial_p_static(r, "tracker", em.EmOptions()) == 1).all()

@@ -19,11 +19,6 @@ def labels_without(seen, poses, p_static, places, resolution):
     return out
 
 
-def beside(cells):
-    """The same, so many cells farther along x."""
-    return block(10 + cells, 20, 4, 3)
-
-
 INSIDE = [1.25, 2.15]
 
 
@@ -59,39 +54,12 @@ def test_a_door_is_no_object_at_any_time():
     assert left_out(door, at=[1.45, 2.55]) == []
 
 
-def test_what_comes_and_goes_without_being_a_door_may_be_people():
-    assert left_out(course(BOX, False, (10, 12), (80, 82), count=5)) == []
-
-
-def test_something_that_came_beside_them_takes_none_of_them_along():
-    wait = course(beside(6), False, (10, 12), (80, 82), count=5)
-    came = course(BOX, True, (40, 43))
-    assert left_out(came, wait, at=[1.85, 2.15]) == []
-    assert left_out(came, wait) == [*range(41, 100)]
-
-
 def test_who_walks_there_before_it_came_and_after_it_left_stays_an_object():
     assert left_out(course(BOX, False, (20, 22), (60, 64))) == [*range(21, 61)]
 
 
 def test_who_walks_there_while_it_is_away_stays_an_object():
     assert left_out(course(BOX, True, (20, 22), (60, 64))) == [*range(21), *range(61, 100)]
-
-
-def test_a_neighbour_that_left_takes_nothing_along():
-    # what stands beside it goes on standing, also in the cells on the border
-    gone = course(beside(4), False, (60, 64))
-    came = course(BOX, True, (20, 22))
-    for x in (1.15, 1.25, 1.35):
-        assert left_out(came, gone, at=[x, 2.15])[-1] == 99
-
-
-@pytest.mark.parametrize(
-    ("at", "beside"),
-    [((0.95, 1.95), True), ((1.45, 2.35), True), ((0.85, 2.1), False), ((1.2, 2.45), False)],
-)
-def test_a_cell_beside_it_is_of_it(at, beside):
-    assert bool(left_out(course(BOX, True, (40, 43)), at=list(at))) == beside
 
 
 def test_only_cells_that_changed_count_and_not_what_lies_between():

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from synthetic_histories import RESOLUTION, block, course, found
+from synthetic_histories import block
 
 from stillmap.mapping.doors import _fit_two_lines, fit_sector
 
@@ -62,18 +62,6 @@ def test_a_door_sweeps_a_sector(first, swing):
     assert not without & got
 
 
-@pytest.mark.parametrize("first", [135, 170, -135])
-def test_the_bow_is_swept_and_not_only_the_triangle(first):
-    # also where directions jump by a whole turn
-    first, swing = np.radians([first, 90])
-    middle = first + swing / 2
-    u = np.array([np.cos(middle), np.sin(middle)])
-    bow = np.round(HINGE + (LENGTH - 2) * u).astype(int)
-    cells = door(first, swing)
-    assert tuple(bow) in held(compute_swept_cells(cells, LEAF))
-    assert bow @ u > (cells @ u).max()  # beyond the line from tip to tip
-
-
 def test_where_the_cells_lie_and_their_order_change_nothing():
     cells = door(0.3, 1.4)
     one = compute_swept_cells(cells, LEAF)
@@ -103,57 +91,6 @@ def alone(cells):
     """Nothing beside the cells, and they in their order."""
     np.testing.assert_array_equal(compute_swept_cells(cells, LEAF), cells)
     return True
-
-
-def test_a_blob_is_its_cells():
-    x, y = block(-8, -8, 17, 17).T
-    disc = np.column_stack([x, y])[np.hypot(x, y) < 8]
-    ring = disc[np.hypot(*disc.T) > 5]
-    assert _fit_two_lines(ring) is None
-    assert alone(disc)
-    assert alone(ring)  # and not what it goes round
-
-
-def test_two_bays_beside_each_other_are_their_cells():
-    bays = np.concatenate([block(0, 0, 6, 3), block(12, 0, 6, 3)])
-    assert _fit_two_lines(bays) is None
-    assert alone(bays)
-
-
-def test_a_wide_shelf_round_a_corner_is_its_cells():
-    # thicker than a leaf
-    shelf = np.concatenate([block(0, 0, 20, 7), block(0, 7, 7, 13)])
-    assert _fit_two_lines(shelf) is None
-    assert alone(shelf)
-
-
-@pytest.mark.parametrize("thick", [2, 3, 4])
-@pytest.mark.parametrize("length", [10, 18, 40])
-@pytest.mark.parametrize("angle", [0.0, 0.4, 2.0])
-def test_one_leaf_alone_is_no_door(angle, length, thick):
-    # a gate that slides, a bay: not two leaves that point away from each other
-    assert alone(leaf(angle, length, thick=thick))
-
-
-@pytest.mark.parametrize(
-    "cells",
-    [
-        [[4, -2]],
-        [[4, -2], [5, -2]],
-        block(3, 3, 12, 1),
-        block(3, 3, 1, 12),
-        np.arange(9)[:, None] * [2, 3],
-    ],
-)
-def test_cells_in_a_line_are_all_there_is(cells):
-    assert alone(np.array(cells, np.int64))
-
-
-def test_changes_are_their_cells_until_they_are_known_as_doors():
-    cells = door(0.0, np.pi / 2, length=9.0)
-    (often,) = found(course(cells, True, (10, 12), (80, 82), count=5))
-    assert often.resolution == RESOLUTION
-    assert held(often.swept_cells) == held(cells)
 
 
 def test_both_directions_and_the_nearer_one_of_cells():

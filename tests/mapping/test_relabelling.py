@@ -120,13 +120,6 @@ def test_the_map_says_there_what_is_shown_as_far_as_it_covers_the_cell(known, st
     assert occupied.free_prior == known.occupied.free_prior
 
 
-def test_what_it_is_given_stays_as_it_was(known):
-    before = known.p_static.tobytes(), known.occupied.p_occupied.tobytes()
-    p_static, occupied = known.relabelled()
-    assert (known.p_static.tobytes(), known.occupied.p_occupied.tobytes()) == before
-    assert (p_static.tobytes(), occupied.p_occupied.tobytes()) != before
-
-
 @pytest.mark.parametrize("beams", [50, 10**6])
 @pytest.mark.parametrize("threads", [1, 2, 3])
 def test_pieces_and_threads_change_no_bit(known, monkeypatch, beams, threads):
@@ -137,22 +130,10 @@ def test_pieces_and_threads_change_no_bit(known, monkeypatch, beams, threads):
     assert of_one.p_occupied.tobytes() == of_other.p_occupied.tobytes()
 
 
-def test_the_order_of_the_changes_does_not_matter(known):
-    one, other = known.relabelled(), known.relabelled(CHANGES[::-1])
-    assert one[0].tobytes() == other[0].tobytes()
-    assert one[1].p_occupied.tobytes() == other[1].p_occupied.tobytes()
-
-
 def test_where_nothing_is_listed_nothing_is_touched(known):
     p_static, occupied = known.relabelled([])
     assert p_static is known.p_static
     assert occupied is known.occupied
-
-
-def test_a_change_where_no_beam_ended_changes_nothing(known):
-    p_static, occupied = known.relabelled([change(block(40, 40, 2, 2))])
-    np.testing.assert_array_equal(p_static, known.p_static)
-    np.testing.assert_array_equal(occupied.p_occupied, known.occupied.p_occupied)
 
 
 @pytest.mark.parametrize("wrong", ["fewer", "others"])

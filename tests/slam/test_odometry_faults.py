@@ -93,64 +93,6 @@ def test_slip_while_driving():
     assert set(disagreeing) <= set(range(16, 41))
 
 
-@pytest.mark.parametrize("seed", [0, *slow_params(1, 2)])
-def test_slip_in_office_corridors(seed):
-    options = {"robot": {"scans": 500}, "odometry": {"stall_rate": 2.0}}
-    simulation = simulate(scene_by_name("office", options), seed)
-    recording, T = simulation.recording, simulation.truth.T_world_base
-    assert metres(T)[metres(recording.T_odom_base) == 0.0].sum() > 3.0
-    assert compute_absolute_errors(followed(recording).poses, T).rmse < 0.05
-
-
-def metres(T):
-    return np.linalg.norm((T[1:] - T[:-1])[:, :2, 2], axis=1)
-
-
-def test_stop_between_bare_walls_is_no_slip():
-    corridor = Scene(
-        "corridor",
-        walls=box(0, 0, 60, 2.4),
-        route=((-8.0, 0.3), (8.0, 0.3)),
-        crowd=CrowdOptions(people=0),
-        laser=LaserOptions(range_noise=0.02, max_range=8.0),
-        robot=RobotOptions(scans=150),
-        odometry=OdometryOptions(),
-    )
-    simulation = simulate(corridor, 3)
-    recording, T = simulation.recording, simulation.truth.T_world_base
-    stood = np.r_[np.arange(60), np.full(40, 60)]
-    again = picked(recording, stood)
-    noise = np.random.default_rng(0).normal(0.0, 0.01, again.points.shape).astype(np.float32)
-    again = dataclasses.replace(again, points=again.points + noise)
-    found = followed(again)
-    assert found.diagnostics.odometry_faults == []
-    assert compute_absolute_errors(found.poses, T[stood]).rmse < 0.1
-
-
-def test_kidnapped_robot_that_stands_is_no_slip():
-    office = simulate(scene_by_name("office", {"robot": {"scans": 300}}), 1)
-    scans = np.r_[70:100, 280, 280, 280, 280:300]
-    recording, T = picked(office.recording, scans), office.truth.T_world_base[scans]
-    odom = recording.T_odom_base.copy()
-    odom[30:] = (
-        odom[29] @ se2.inverse(odom[30]) @ odom[30:]
-    )  # wheels do not turn when it is carried
-    found = followed(dataclasses.replace(recording, T_odom_base=odom))
-    assert found.diagnostics.breaks == [30]
-    assert found.diagnostics.odometry_faults == []
-    assert compute_absolute_errors(found.poses[30:], T[30:]).rmse < 0.02
-
-
-def test_no_slip_hypothesis_without_hits():
-    scans = np.r_[:20, np.full(30, 20)]
-    recording = picked(room().recording, scans)
-    hit = recording.hit.copy()
-    hit[recording.offset[20] :] = False
-    found = followed(dataclasses.replace(recording, hit=hit))
-    assert found.diagnostics.odometry_faults == []
-    np.testing.assert_allclose(found.poses[20:], found.poses[20:21].repeat(30, axis=0), atol=1e-9)
-
-
 @pytest.mark.parametrize("times", [3.5, 0.0, -1.0], ids=["spinning", "blocked", "backwards"])
 def test_wrong_wheel_odometry(times):
     moved = se2.parameters(steps())

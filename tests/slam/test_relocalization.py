@@ -12,7 +12,6 @@ from stillmap.sim import RobotOptions, Scene, scene_by_name, simulate
 from stillmap.sim.options import CrowdOptions, LaserOptions, OdometryOptions
 from stillmap.sim.walls import box, pillar
 from stillmap.slam import SlamOptions, m_step
-from stillmap.slam.relocalization import separate_segments
 
 OPTIONS = SlamOptions()
 
@@ -92,17 +91,6 @@ def one_after_the_other(a, b):
     )
 
 
-def ends(recording, poses, scans):
-    """(N, 2) end points of scans in the map."""
-    out = []
-    for t in scans:
-        beams = recording.beams_of(t)
-        T = poses[t] @ recording.T_base_sensor[recording.sensor[t]]
-        points = recording.points[beams][recording.hit[beams]]
-        out.append(points @ T[:2, :2].T + T[:2, 2])
-    return np.concatenate(out)
-
-
 @pytest.fixture(scope="module")
 def rooms():
     one = in_room(
@@ -118,29 +106,6 @@ def rooms():
     return one, other, one_after_the_other(one.recording, other.recording)
 
 
-def test_unconnected_segment_is_put_beside(rooms):
-    one, other, recording = rooms
-    found = mapped(recording)
-    assert found.diagnostics.breaks == [60]
-    assert found.diagnostics.unconnected == [60]
-    # nobody knows how the robot came there: no loop says so, and the step itself says nothing
-    assert all(closure.rejected for closure in found.loops if closure.later >= 60 > closure.earlier)
-    across = [r for r in found.graph.constraints if found.graph.keyframes[r.second] == 60]
-    assert [np.linalg.eigvalsh(r.covariance).min() > 90.0 for r in across] == [True]
-    # each room is as good as alone, and the two maps have 10 m between them
-    assert compute_absolute_errors(found.poses[:60], one.truth.T_world_base).rmse < 0.01
-    assert compute_absolute_errors(found.poses[60:], other.truth.T_world_base).rmse < 0.01
-    left = ends(recording, found.poses, range(60))
-    right = ends(recording, found.poses, range(60, 120))
-    assert right[:, 0].min() > left[:, 0].max() + 5.0
-
-
-def test_unconnected_segments_are_reproducible(rooms):
-    one, other = mapped(rooms[2]), mapped(rooms[2])
-    np.testing.assert_array_equal(one.poses, other.poses)
-    assert one.diagnostics == other.diagnostics
-
-
 def test_return_to_the_same_room(rooms):
     # carried back to where it was, turned about: 5 m from where odometry goes on
     one = rooms[0]
@@ -150,10 +115,3 @@ def test_return_to_the_same_room(rooms):
     assert found.diagnostics.unconnected == []
     truth = np.concatenate([one.truth.T_world_base] * 2)
     assert compute_absolute_errors(found.poses, truth).rmse < 0.02
-
-
-def test_breaks_separate_travel():
-    travelled = np.arange(6.0)
-    got = separate_segments(travelled, [2, 5], 30.0)
-    np.testing.assert_array_equal(got, [0, 1, 32, 33, 34, 65])
-    np.testing.assert_array_equal(travelled, np.arange(6.0))

@@ -115,21 +115,6 @@ def test_turned_and_moved_worlds_give_the_same():
     np.testing.assert_array_equal(found(other), found(points))
 
 
-def test_time_that_stands_still_is_no_trouble():
-    points, _ = watched([straight(2, 1, 0.2, 0.1)], seconds=3.0)
-    same = dataclasses.replace(points, seconds=np.zeros_like(points.seconds))
-    assert (assign_tracks(same, MAX_GAP) == 0).all()
-    assert (found(same) == -1).all()  # nothing lasts
-
-
-def test_how_many_costs_are_held_at_once_changes_nothing(monkeypatch):
-    ways = [straight(3, y, 0.7, 0.05 * y) for y in (-2.0, -1.2, 0.0, 0.9, 2.5)]
-    points, _ = watched(ways)
-    expected = assign_tracks(points, MAX_GAP)
-    monkeypatch.setattr("stillmap.tracking.association._MAX_COSTS", 1)
-    assert np.array_equal(assign_tracks(points, MAX_GAP), expected)
-
-
 @pytest.mark.parametrize("angle", [0.5, 0.7, 1.0])
 def test_tracks_that_were_exchanged_behind_one_another_are_set_right(angle):
     vx, vy = 1.2 * np.cos(angle), 1.2 * np.sin(angle)
@@ -144,15 +129,6 @@ def test_tracks_that_were_exchanged_behind_one_another_are_set_right(angle):
     apart = np.abs(points.seconds[points.scan] - 4.0) > 1.5
     assert one_each(owner[apart], who[apart])
     assert (p_identity[np.unique(owner[apart])] > 0.8).all()
-
-
-@pytest.mark.parametrize("pairs", [1, 50, 2000])
-def test_strips_in_which_tracks_are_compared_make_no_difference(monkeypatch, pairs):
-    ways = [straight(3 * k, -4 + k, 0.3 * (-1) ** k, 1.1 - 0.4 * k) for k in range(4)]
-    points, _ = watched(ways)
-    whole = assign_tracks(points, MAX_GAP)
-    monkeypatch.setattr(association, "_MAX_PAIRS", pairs)
-    np.testing.assert_array_equal(assign_tracks(points, MAX_GAP), whole)
 
 
 def test_points_go_to_the_track_with_most_of_their_cluster():

@@ -4,16 +4,11 @@ import numpy as np
 import pytest
 
 from stillmap.core.recording import Recording
-from stillmap.tracking.clustering import extract_dynamic_points
-from stillmap.tracking.explained_hits import fit_share
 from stillmap.tracking.motion_evidence import (
     TrackEvidence,
     apply_motion_evidence,
-    collect_evidence,
     compute_log_ratio,
-    weigh_tracks,
 )
-from stillmap.tracking.mover_path import MoverPath
 
 ANGLES = np.radians(np.arange(-180.0, 180.0, 0.5))
 ROOM = 8.0  # m to the wall
@@ -36,28 +31,6 @@ def test_each_kind_of_evidence_counts_in_its_direction():
     assert log_ratio(moving=3) > log_ratio(moving=1) > log_ratio()
     assert log_ratio(missed=20) < log_ratio(missed=4) < log_ratio()
     assert log_ratio(open_ends=2) < log_ratio(open_ends=1) < log_ratio()
-
-
-def test_a_thin_mover_may_be_missed_where_a_thick_one_may_not():
-    assert log_ratio(hits=1.2, missed=15) > log_ratio(hits=6.0, missed=15)
-
-
-def test_a_single_detection_says_next_to_nothing():
-    assert abs(log_ratio(looks=1, windows=0)) < 0.01
-
-
-def test_the_share_decides_what_is_undecided():
-    undecided = np.zeros(10)
-    for others, low, high in ((5.0, 0.9, 1.0), (-5.0, 0.0, 0.1)):
-        p = fit_share(np.append(undecided, np.full(20, others)), np.full(30, 10.0))
-        assert low <= p[0] <= high
-
-
-def test_a_decided_track_outweighs_the_share():
-    ratio = np.append(np.full(50, -6.0), 9.0)
-    p = fit_share(ratio, np.full(51, 10.0))
-    assert p[-1] > 0.9
-    assert p[0] < 0.1
 
 
 def recorded(things, seconds=20.0):
@@ -127,52 +100,6 @@ def test_walkers_stay_dynamic_and_furniture_becomes_static():
     near_chair = np.linalg.norm(movers.xy[:, None] - [[-1.3, -1.5]], axis=-1).min()
     assert len(movers.xy) > 20
     assert near_chair > 0.5
-
-
-def sliding_track(width, speed):
-    """The dynamic end points on a part of a wall, or of something that wide, that slides along."""
-    rng = np.random.default_rng(5)
-    seconds = np.arange(0.0, 6.0, 1.0 / RATE)
-    along = speed * seconds[:, None] + np.linspace(-0.15, 0.15, 6)
-    across = rng.normal(0.0, width, along.shape)
-    n = len(seconds)
-    recording = Recording(
-        stamp_ns=(1e9 * seconds).astype(np.int64),
-        offset=np.arange(n + 1, dtype=np.int64) * 6,
-        points=np.stack([along, 3.0 + across], axis=-1).reshape(-1, 2).astype(np.float32),
-        hit=np.ones(6 * n, bool),
-        T_odom_base=None,
-        T_base_sensor=np.eye(3)[None],
-        sensor=np.zeros(n, np.int32),
-    )
-    poses = np.tile(np.eye(3), (n, 1, 1))
-    points = extract_dynamic_points(recording, poses, np.zeros(6 * n, np.float32), 0.5)
-    owner = np.zeros(len(points.scan), np.intp)
-    return recording, poses, points, owner
-
-
-def sliding_patch(width, speed=0.15):
-    """Evidence of that track."""
-    return collect_evidence(*sliding_track(width, speed), NOISE_STD)[1]
-
-
-def test_a_part_of_a_wall_that_slides_along_it_shows_no_motion():
-    walks, slides = sliding_patch(0.05), sliding_patch(NOISE_STD)
-    assert (walks.slides[0], slides.slides[0]) == (0, 1)
-    assert compute_log_ratio(slides)[0] < compute_log_ratio(walks)[0] - 3.0
-
-
-def test_the_straight_side_of_a_car_does_not_slide():
-    recording, poses, points, owner = sliding_track(NOISE_STD, 0.15)
-    assert weigh_tracks(recording, poses, points, owner, NOISE_STD)[1] == [0]
-    t = points.seconds
-    side = MoverPath(t, np.column_stack([0.15 * t, 0.0 * t]), np.ones((len(t), 2)), 4.0, 2.0)
-    assert weigh_tracks(recording, poses, points, owner, NOISE_STD, {0: side})[1] == []
-
-
-@pytest.mark.parametrize("speed", [0.0, 0.5])
-def test_what_stands_or_walks_does_not_slide(speed):
-    assert sliding_patch(NOISE_STD, speed).slides[0] == 0
 
 
 def test_where_nobody_walks_all_is_furniture():
