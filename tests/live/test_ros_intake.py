@@ -1,14 +1,24 @@
 """Scans that wait for their mount, for odometry and for other lasers; no ROS."""
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
-from ros_messages import laser_scan, odometry, point_cloud, tf, transform
+from ros_messages import laser_scan, odometry, point_cloud, transform
 
 from stillmap.core import se2
 from stillmap.live.ros import intake
 from stillmap.live.ros.intake import ScanIntake
 from stillmap.live.ros.parameters import Parameters
-from stillmap.live.ros.transforms import TransformBuffer, to_plane
+from stillmap.live.ros.transforms import Tf2, Transforms
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "ros"))
+import tf2_ros
+
+TF2 = Tf2(
+    tf2_ros.Buffer, tf2_ros.TransformException, tf2_ros.Fields, tf2_ros.Time, tf2_ros.Duration
+)
 
 S = 10**9
 POSE = {"laser_pose": (0.1, 0.0, 0.5)}
@@ -16,7 +26,18 @@ RANGES = [1.0, 2.0]
 
 
 def make(**values):
-    return ScanIntake(Parameters(**values))
+    parameters = Parameters(**values)
+    return ScanIntake(parameters, Transforms(parameters, TF2))
+
+
+def add_odometry(scans, message):
+    scans._transforms.add_odometry(message)
+
+
+def add_transforms(scans, *transforms, static=False):
+    buffer = scans._transforms.buffer
+    for one in transforms:
+        (buffer.set_transform_static if static else buffer.set_transform)(one, "test")
 
 
 def take_all(scans, now):
@@ -34,20 +55,20 @@ def feed(scans, *stamps_ns, topic="scan", now=0.0):
 
 def test_a_scan_waits_for_the_odometry_around_it():
     scans = make(**POSE)
-    scans.add_odometry(odometry(1 * S, x=1.0))
+    add_odometry(scans, odometry(1 * S, x=1.0))
     feed(scans, 1 * S + S // 4)
     assert scans.take(0.0) is None
-    scans.add_odometry(odometry(2 * S, x=2.0))
+    add_odometry(scans, odometry(2 * S, x=2.0))
     arrival = scans.take(0.01)
     np.testing.assert_allclose(arrival.T_odom_base, se2.matrix(1.25, 0.0, 0.0))
     np.testing.assert_allclose(arrival.beams.T_base_sensor, se2.matrix(0.1, 0.0, 0.5))
-    assert scans.odometry.source == "odom"
+    assert scans._transforms.source == "odom"
     assert scans.take(0.01) is None
 
 
 def test_odometry_that_stops_is_waited_for_once():
     scans = make(**POSE)
-    scans.add_odometry(odometry(1 * S))
+    add_odometry(scans, odometry(1 * S))
     feed(scans, 1 * S)
     assert scans.take(0.0).T_odom_base is not None
     feed(scans, 2 * S, now=1.0)
@@ -56,7 +77,7 @@ def test_odometry_that_stops_is_waited_for_once():
     feed(scans, 3 * S, now=2.0)
     assert scans.take(2.0).T_odom_base is None
     assert scans.counts == {intake.NO_ODOMETRY: 2}
-    scans.add_odometry(odometry(4 * S - 1))
+    add_odometry(scans, odometry(4 * S - 1))
     feed(scans, 4 * S, now=3.0)  # it has come again
     assert scans.take(3.0) is None
 
@@ -71,12 +92,12 @@ def test_the_first_scans_wait_longer_for_odometry():
 def test_mapping_begins_with_odometry():
     scans = make(**POSE)
     feed(scans, 1 * S, 2 * S)
-    scans.add_odometry(odometry(2 * S))
+    add_odometry(scans, odometry(2 * S))
     assert stamps(take_all(scans, 0.0)) == [2 * S]
     assert scans.counts == {intake.EARLY: 1}
     of_tf = make(**POSE)
     feed(of_tf, 1 * S, 2 * S)
-    of_tf.add_transforms(tf(transform("odom", "base_footprint", 2 * S)), static=False)
+    add_transforms(of_tf, transform("odom", "base_footprint", 2 * S), static=False)
     assert stamps(take_all(of_tf, 0.0)) == [2 * S]
 
 
@@ -89,33 +110,32 @@ def test_a_robot_without_odometry():
 
 def test_tf_has_mount_and_odometry():
     scans = make()
-    scans.add_odometry(odometry(1 * S, x=9.0))
-    scans.add_transforms(
-        tf(
-            transform("base_footprint", "base_link", 0),
-            transform("base_link", "laser", 0, x=0.2, yaw=1.0, roll=np.pi),
-        ),
+    add_odometry(scans, odometry(1 * S, x=9.0))
+    add_transforms(
+        scans,
+        transform("base_footprint", "base_link", 0),
+        transform("base_link", "laser", 0, x=0.2, yaw=1.0, roll=np.pi),
         static=True,
     )
-    scans.add_transforms(tf(transform("odom", "base_footprint", 1 * S, x=3.0)), static=False)
+    add_transforms(scans, transform("odom", "base_footprint", 1 * S, x=3.0), static=False)
     feed(scans, 1 * S)
     arrival = scans.take(0.0)
     np.testing.assert_allclose(arrival.T_odom_base, se2.matrix(3.0, 0.0, 0.0), atol=1e-12)
     np.testing.assert_allclose(arrival.beams.T_base_sensor, se2.matrix(0.2, 0.0, 1.0), atol=1e-12)
     # upside down: the first beam is on the left
     assert arrival.beams.points[0, 1] > 0.0
-    assert scans.odometry.source == "TF"
+    assert scans._transforms.source == "TF"
 
 
 def test_two_sources_of_odometry_are_not_mixed():
     scans = make(**POSE)
-    scans.add_odometry(odometry(1 * S, x=9.0))
+    add_odometry(scans, odometry(1 * S, x=9.0))
     feed(scans, 1 * S)
     assert scans.take(0.0).T_odom_base[0, 2] == 9.0
-    scans.add_transforms(tf(transform("odom", "base_footprint", 2 * S, x=3.0)), static=False)
+    add_transforms(scans, transform("odom", "base_footprint", 2 * S, x=3.0), static=False)
     feed(scans, 2 * S, now=1.0)
     assert scans.take(1.0) is None
-    scans.add_odometry(odometry(2 * S, x=9.5))
+    add_odometry(scans, odometry(2 * S, x=9.5))
     assert scans.take(1.0).T_odom_base[0, 2] == 9.5
 
 
@@ -187,15 +207,15 @@ def test_a_clock_that_catches_up_was_not_set_back():
 
 def test_transforms_from_before_the_clock_was_set_back_are_forgotten():
     scans = make()
-    scans.add_transforms(tf(transform("base_footprint", "laser", 0, x=0.2)), static=True)
+    add_transforms(scans, transform("base_footprint", "laser", 0, x=0.2), static=True)
     for stamp in (100, 102):
-        scans.add_transforms(tf(transform("odom", "base_footprint", stamp * S)), static=False)
+        add_transforms(scans, transform("odom", "base_footprint", stamp * S), static=False)
     feed(scans, 102 * S)
     assert scans.take(0.0) is not None
     scans.begin_anew()
     for stamp, x in ((95, 1.0), (96, 1.0)):  # less ago than transforms are kept
         moved = transform("odom", "base_footprint", stamp * S, x=x)
-        scans.add_transforms(tf(moved), static=False)
+        add_transforms(scans, moved, static=False)
     feed(scans, 96 * S)
     arrival = scans.take(0.0)
     assert arrival.T_odom_base[0, 2] == 1.0
@@ -206,9 +226,9 @@ def test_clouds_have_mount_and_odometry_in_space():
     scans = make(cloud_topic=("points",))
     mount = transform("base_footprint", "lidar", 0, x=0.2, roll=0.3)
     mount.transform.translation.z = 1.5
-    scans.add_transforms(tf(mount), static=True)
+    add_transforms(scans, mount, static=True)
     odom = transform("odom", "base_footprint", 1 * S, x=3.0, roll=0.1)
-    scans.add_transforms(tf(odom), static=False)
+    add_transforms(scans, odom, static=False)
     points = [[1.0, 2.0, 3.0], [np.nan, 0.0, 0.0], [4.0, 0.0, 0.0]]
     scans.add_scan("points", point_cloud(1 * S, points, times=[0.0, 0.05, 0.1]), 0.0)
     arrival = scans.take(0.0)
@@ -221,7 +241,7 @@ def test_clouds_have_mount_and_odometry_in_space():
     assert beams.T_base_sensor[2, 1] == pytest.approx(np.sin(0.3))
     assert arrival.T_odom_base.shape == (4, 4)
     assert arrival.T_odom_base[2, 1] == pytest.approx(np.sin(0.1))
-    scans.add_odometry(odometry(2 * S))
+    add_odometry(scans, odometry(2 * S))
     broken = point_cloud(2 * S, points)
     broken.fields = broken.fields[:2]
     scans.add_scan("points", broken, 0.0)
@@ -230,7 +250,7 @@ def test_clouds_have_mount_and_odometry_in_space():
 
 def test_the_mount_of_a_cloud_by_a_parameter():
     scans = make(cloud_topic="points", laser_pose=(0.1, 0.2, 0.3, 0.0, 0.0, np.pi / 2))
-    scans.add_odometry(odometry(1 * S, x=2.0))
+    add_odometry(scans, odometry(1 * S, x=2.0))
     scans.add_scan("points", point_cloud(1 * S, [[9.0, 0.0, 0.0], [2.0, 0.0, 0.0]]), 0.0)
     arrival = scans.take(0.0)
     expected = np.eye(4)
@@ -273,58 +293,10 @@ def test_every_third_scan():
     assert stamps(take_all(scans, 0.0)) == [1 * S, 4 * S, 7 * S]
 
 
-def test_what_we_say_ourselves_is_not_taken_for_odometry():
-    scans = make(map_frame="world")
-    scans.add_transforms(tf(transform("world", "odom", 1, x=5.0)), static=False)
-    assert scans.transforms.frames == set()
-
-
-class TestTransforms:
-    def add(self, buffer, parent, child, stamp, x, yaw=0.0, static=False):
-        values = (x, 0.0, 0.0, 0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2))
-        assert buffer.add(parent, child, stamp, values, static=static)
-
-    def test_between_two_stamps_on_the_shorter_arc(self):
-        buffer = TransformBuffer(30 * S)
-        self.add(buffer, "odom", "base", 0, 0.0, yaw=3.0)
-        self.add(buffer, "odom", "base", S, 1.0, yaw=-3.0)
-        x, _, yaw = se2.parameters(to_plane(buffer.lookup("odom", "base", S // 2)))
-        assert x == pytest.approx(0.5)
-        assert abs(yaw) == pytest.approx(np.pi)
-
-    def test_not_outside_what_is_known(self):
-        buffer = TransformBuffer(30 * S)
-        self.add(buffer, "odom", "base", S, 0.0)
-        self.add(buffer, "odom", "base", 2 * S, 1.0)
-        assert buffer.lookup("odom", "base", S - 1) is None
-        assert buffer.lookup("odom", "base", 2 * S + 1) is None
-        assert buffer.lookup("map", "base", S) is None
-        self.add(buffer, "odom", "base", 40 * S, 1.0)
-        assert buffer.lookup("odom", "base", 2 * S) is None  # forgotten
-
-    def test_through_a_common_parent(self):
-        buffer = TransformBuffer(30 * S)
-        self.add(buffer, "base", "left", 0, 1.0, static=True)
-        self.add(buffer, "base", "right", 0, -1.0, static=True)
-        assert buffer.lookup("left", "right", 5)[0, 3] == -2.0
-
-    def test_out_of_order_and_time_that_begins_anew(self):
-        buffer = TransformBuffer(30 * S)
-        for stamp in (100, 102, 101):
-            self.add(buffer, "odom", "base", stamp * S, float(stamp))
-        assert buffer.lookup("odom", "base", 101 * S)[0, 3] == 101.0
-        self.add(buffer, "odom", "base", 1 * S, 1.0)
-        assert buffer.lookup("odom", "base", 101 * S) is None
-        assert buffer.lookup("odom", "base", 1 * S)[0, 3] == 1.0
-
-    @pytest.mark.parametrize(
-        "values",
-        [
-            (0.0,) * 7,
-            (np.nan, 0, 0, 0, 0, 0, 1),
-            (0, 0, 0, np.nan, 0, 0, 1),
-            (1e12, 0, 0, 0, 0, 0, 1),
-        ],
-    )
-    def test_what_is_no_transform(self, values):
-        assert not TransformBuffer(S).add("odom", "base", 0, values, static=False)
+@pytest.mark.parametrize("x", [np.nan, 1e12])
+def test_odometry_that_is_none(x):
+    scans = make(**POSE)
+    add_odometry(scans, odometry(1 * S, x=x))
+    feed(scans, 1 * S)
+    assert scans.take(1.9) is None
+    assert scans.take(2.1).T_odom_base is None

@@ -60,6 +60,6 @@ def test_without_ros_one_line_says_how_to_get_it(tmp_path, capsys):
     arguments = ["live", "-o", str(tmp_path / "out"), "--ros-args", "--params-file", "my.yaml"]
     assert main(arguments) == 2
     line = capsys.readouterr().err
-    assert "rclpy of ROS 2 is not in this environment" in line
+    assert "rclpy is not in this environment" in line
     assert "source /opt/ros/" in line
     assert line.count("\n") == 1

@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 from ros_messages import laser_scan, point_cloud
 
+from stillmap.core import se2
 from stillmap.core.grid_map import GridMap
 from stillmap.live.causal_labels import MapChange
 from stillmap.live.movers import Mover
-from stillmap.live.ros.clouds import to_cloud_beams
-from stillmap.live.ros.conversions import Mount, to_scan_beams
-from stillmap.live.ros.map_updates import MapPublisher
-from stillmap.live.ros.mover_markers import MoverPublisher
+from stillmap.live.ros.messages import Mount, to_cloud_beams, to_scan_beams
 from stillmap.live.ros.parameters import Parameters
-from stillmap.live.ros.scan_publishers import ScanPublishers
+from stillmap.live.ros.publishers import MapPublisher, Publishers
+from stillmap.live.update import Update
 
 NAN = math.nan
 
@@ -26,20 +25,40 @@ class FakeRos:
 
     def __init__(self, *missing):
         self.missing, self.sent, self.listeners = missing, {}, 1
+        self.tf2_ros = Fields(TransformBroadcaster=self.make_broadcaster)
 
     def message(self, name):
         return None if name.split("/")[0] in self.missing else MagicMock
 
+    def geometry(self, _):
+        return MagicMock
+
     def module(self, _):
         return MagicMock()
 
-    def create_publisher(self, _, kind, topic, __):
-        if self.message(kind) is None:
-            return None
+    def create_publisher(self, _, topic, __):
         self.sent[topic] = []
         return Fields(
             publish=self.sent[topic].append, get_subscription_count=lambda: self.listeners
         )
+
+    def make_broadcaster(self, _):
+        return Fields(sendTransform=self.sent.setdefault("/tf", []).append)
+
+    def get_logger(self):
+        return MagicMock()
+
+
+def publishers(ros, **parameters):
+    return Publishers(ros, ros, Parameters(**parameters))
+
+
+def map_publisher(ros):
+    return MapPublisher(ros, ros, Parameters(), "trinary")
+
+
+def heading(q):
+    return 2.0 * math.atan2(q.z, q.w)
 
 
 def make_mover(number, position=(1.0, 2.0), velocity=(0.0, 1.0)):
@@ -50,7 +69,7 @@ def make_mover(number, position=(1.0, 2.0), velocity=(0.0, 1.0)):
 class TestMovers:
     def test_each_has_a_body_an_arrow_and_its_number(self):
         ros = FakeRos()
-        MoverPublisher(ros, None, "map").publish([make_mover(7)], 3_000_000_005)
+        publishers(ros)._publish_movers([make_mover(7)], 3_000_000_005)
         (message,) = ros.sent["movers"]
         body, arrow, text = message.markers
         assert {m.id for m in message.markers} == {7}
@@ -67,18 +86,17 @@ class TestMovers:
 
     def test_markers_of_those_that_are_gone_are_removed_once(self):
         ros = FakeRos()
-        publisher = MoverPublisher(ros, None, "map")
+        publisher = publishers(ros)
         for movers in ([make_mover(1), make_mover(2)], [make_mover(2)], [], []):
-            publisher.publish(movers, 1)
+            publisher._publish_movers(movers, 1)
         deleted = [[m.id for m in one.markers if m.action == 2] for one in ros.sent["movers"]]
         assert deleted == [[], [1, 1, 1], [2, 2, 2]]
 
     def test_poses_are_headed_where_they_move_and_tell_that_there_is_nobody(self):
-        ros = FakeRos("visualization_msgs")
-        publisher = MoverPublisher(ros, None, "map")
-        publisher.publish([make_mover(1)], 1)
-        publisher.publish([], 2)
-        assert "movers" not in ros.sent
+        ros = FakeRos()
+        publisher = publishers(ros)
+        publisher._publish_movers([make_mover(1)], 1)
+        publisher._publish_movers([], 2)
         first, second = ros.sent["mover_poses"]
         (pose,) = first.poses
         q = pose.orientation
@@ -88,7 +106,7 @@ class TestMovers:
     def test_in_space_they_have_their_own_height(self):
         ros = FakeRos()
         mover = make_mover(1, (1.0, 2.0, 3.0), (0.0, 0.0, 0.5))
-        MoverPublisher(ros, None, "map").publish([mover], 1)
+        publishers(ros)._publish_movers([mover], 1)
         body, arrow, _ = ros.sent["movers"][0].markers
         assert body.pose.position.z == 3.0
         assert arrow.points[1].z == 3.5
@@ -96,7 +114,7 @@ class TestMovers:
     def test_nothing_is_sent_where_nobody_listens(self):
         ros = FakeRos()
         ros.listeners = 0
-        MoverPublisher(ros, None, "map").publish([make_mover(1)], 1)
+        publishers(ros)._publish_movers([make_mover(1)], 1)
         assert not any(ros.sent.values())
 
 
@@ -109,7 +127,7 @@ class TestMap:
 
     def test_what_changed_is_one_rectangle_of_the_last_whole_map(self):
         ros = FakeRos()
-        publisher = MapPublisher(ros, None, "map", "map", "trinary")
+        publisher = map_publisher(ros)
         publisher.publish(self.grid(), 1)
         changes = [self.change(-5, 10, 1.0), self.change(-2, 12, NAN)]
         assert publisher.publish_changes(changes, 2_000_000_000)
@@ -134,7 +152,7 @@ class TestMap:
     @pytest.mark.parametrize("at", [(-6, 10), (0, 12), (-5, 9), (-5, 13)])
     def test_a_whole_map_is_due_where_it_has_grown(self, at):
         ros = FakeRos()
-        publisher = MapPublisher(ros, None, "map", "map", "trinary")
+        publisher = map_publisher(ros)
         assert not publisher.publish_changes([self.change(0, 0, 1.0)], 1)  # there is none yet
         publisher.publish(self.grid(), 1)
         assert not publisher.publish_changes([self.change(*at, 1.0)], 2_000_000_000)
@@ -142,9 +160,21 @@ class TestMap:
         ros.listeners = 0  # to updates: the whole map comes when it is due
         assert publisher.publish_changes([self.change(*at, 1.0)], 4_000_000_000)
 
+    def test_the_whole_map(self):
+        ros = FakeRos()
+        grid = GridMap(np.array([[0.0, 1.0, NAN]], np.float32), (-2.0, 3.0, 0.0), 0.05)
+        map_publisher(ros).publish(grid, 7_000_000_009)
+        (out,) = ros.sent["map"]
+        assert (out.info.width, out.info.height, out.info.resolution) == (3, 1, 0.05)
+        assert (out.info.origin.position.x, out.info.origin.position.y) == (-2.0, 3.0)
+        assert out.info.origin.orientation.w == 1.0
+        assert out.data.typecode == "b"
+        assert list(out.data) == [0, 100, -1]
+        assert (out.header.frame_id, out.header.stamp.sec) == ("map", 7)
+
     def test_without_map_msgs(self):
         ros = FakeRos("map_msgs")
-        publisher = MapPublisher(ros, None, "map", "map", "trinary")
+        publisher = map_publisher(ros)
         publisher.publish(self.grid(), 1)
         assert publisher.publish_changes([self.change(50, 50, 1.0)], 2)
         assert list(ros.sent) == ["map"]
@@ -170,7 +200,7 @@ class TestScans:
         beams = to_scan_beams(message, "scan", Mount(np.eye(3), is_upside_down=True))
         arrival = Fields(topic="scan", message=message, beams=beams)
         p_static = np.array([0.9, 0.5, 0.2, NAN], np.float32)
-        ScanPublishers(ros, None, Parameters()).publish(arrival, p_static)
+        publishers(ros)._publish_scan(arrival, p_static)
         (cloud,) = ros.sent["scan_points"]
         assert (cloud.header.frame_id, cloud.header.stamp.sec) == ("laser", 5)
         expected = [[1.0, 0.0, 0.0, 0.9], [2 * np.cos(0.2), 2 * np.sin(0.2), 0.0, 0.2]]
@@ -182,15 +212,57 @@ class TestScans:
         ros = FakeRos()
         points = [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0], [NAN, 0.0, 0.0], [0.0, 90.0, 0.0]]
         message = point_cloud(5, points)
-        beams = to_cloud_beams(message, "points", np.eye(4), max_range=50.0)
+        beams = to_cloud_beams(message, "points", Mount(np.eye(4)), max_range=50.0)
         np.testing.assert_array_equal(beams.hit, [True, True, False, False])
         np.testing.assert_allclose(beams.points[3], [0.0, 50.0, 0.0])
         arrival = Fields(topic="points", message=message, beams=beams)
         p_static = np.array([0.9, 0.1, NAN, 0.5], np.float32)
-        ScanPublishers(ros, None, Parameters(cloud_topic="points")).publish(arrival, p_static)
+        publishers(ros, cloud_topic="points")._publish_scan(arrival, p_static)
         static, dynamic, every = (
             read_cloud(ros.sent[f"points_{name}"][0]) for name in ("static", "dynamic", "points")
         )
         np.testing.assert_allclose(static, [[1.0, 2.0, 3.0, 0.9]], rtol=1e-6)
         np.testing.assert_allclose(dynamic, [[4.0, 5.0, 6.0, 0.1]], rtol=1e-6)
         np.testing.assert_allclose(every, np.concatenate([static, dynamic]))
+
+
+class TestPoses:
+    def publish(self, ros, T, covariance, T_map_odom, doubts=()):
+        message = laser_scan(5_000_000_001, [1.0])
+        beams = to_scan_beams(message, "scan", Mount(np.eye(3)))
+        update = Update(T, covariance, np.ones(1, np.float32), T_map_odom, doubts)
+        arrival = Fields(topic="scan", message=message, beams=beams)
+        publishers(ros).publish_answer(arrival, update)
+
+    def test_in_the_plane(self):
+        ros, T = FakeRos(), se2.matrix(1.0, -2.0, -3.0)
+        self.publish(ros, T, np.arange(9.0).reshape(3, 3), se2.matrix(3.0, 4.0, 0.5))
+        (pose,), (transform,) = ros.sent["pose"], ros.sent["/tf"]
+        assert (pose.pose.pose.position.x, pose.pose.pose.position.y) == (1.0, -2.0)
+        assert pose.pose.pose.position.z == 0.0
+        assert heading(pose.pose.pose.orientation) == pytest.approx(-3.0)
+        covariance = np.reshape(pose.pose.covariance, (6, 6))
+        rows = np.ix_([0, 1, 5], [0, 1, 5])
+        np.testing.assert_array_equal(covariance[rows].ravel(), np.arange(9.0))
+        assert np.count_nonzero(covariance) == 8
+        assert (transform.header.frame_id, transform.child_frame_id) == ("map", "odom")
+        assert transform.header.stamp.nanosec == 200_000_001  # it holds a little longer
+        assert (transform.transform.translation.x, transform.transform.translation.y) == (3.0, 4.0)
+        assert heading(transform.transform.rotation) == pytest.approx(0.5)
+
+    def test_in_space(self):
+        ros, T = FakeRos(), np.eye(4)
+        T[:3, :3] = [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
+        T[:3, 3] = 1.0, 2.0, 3.0
+        self.publish(ros, T, np.arange(36.0).reshape(6, 6), None)
+        (pose,) = ros.sent["pose"]
+        q = pose.pose.pose.orientation
+        assert pose.pose.pose.position.z == 3.0
+        np.testing.assert_allclose([q.x, q.y, q.z, q.w], [0.5**0.5, 0.0, 0.0, 0.5**0.5])
+        np.testing.assert_array_equal(pose.pose.covariance, np.arange(36.0))
+        assert ros.sent["/tf"] == []  # this scan had no odometry
+
+    def test_nothing_in_the_map_while_the_robot_is_lost(self):
+        ros = FakeRos()
+        self.publish(ros, np.eye(3), np.eye(3), np.eye(3), ("lost",))
+        assert ros.sent["pose"] == ros.sent["/tf"] == []

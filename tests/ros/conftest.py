@@ -35,7 +35,8 @@ def environment(domain, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def tf_environment(environment):
-    """The same, with tf2_msgs and map_msgs, which were built: the package index has neither."""
+    """The same, with tf2_msgs and map_msgs, which were built, and a part of tf2_ros, which lies
+    here: the package index has none of them."""
     folder = Path(sys.prefix) / "messages"
     version = f"python{sys.version_info.major}.{sys.version_info.minor}"
     if not folder.is_dir():
@@ -46,7 +47,7 @@ def tf_environment(environment):
 
     return {
         **environment,
-        "PYTHONPATH": extend("PYTHONPATH", folder / "lib" / version / "site-packages"),
+        "PYTHONPATH": extend("PYTHONPATH", f"{folder / 'lib' / version / 'site-packages'}:{HERE}"),
         "LD_LIBRARY_PATH": extend("LD_LIBRARY_PATH", folder / "lib"),
     }
 

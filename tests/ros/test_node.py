@@ -184,8 +184,8 @@ def check_map(simulation, grid):
         ("resolution=", "arguments of ROS"),
     ],
 )
-def test_wrong_parameters_are_told_in_one_line(environment, start_node, parameter, says):
-    node = start_node(environment, parameter)
+def test_wrong_parameters_are_told_in_one_line(tf_environment, start_node, parameter, says):
+    node = start_node(tf_environment, parameter)
     assert node.wait() == 2
     assert says in node.text
     assert "Traceback" not in node.text

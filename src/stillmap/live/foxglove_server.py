@@ -1,5 +1,6 @@
 """A live mapper seen in Foxglove or Lichtblick: its answers on channels of foxglove-sdk."""
 
+import logging
 import math
 import time
 from collections.abc import Iterator, Sequence
@@ -60,6 +61,8 @@ class FoxgloveServer(ServerListener):
     def __init__(self, host: str = HOST, port: int = PORT) -> None:
         if not 0 <= port < 1 << 16:
             raise InputError(f"--port wants 0 to 65535, got {port}")
+        # it has a line about each client whose request is malformed
+        logging.getLogger("foxglove").setLevel(logging.CRITICAL)
         self._context = context = Context()
         self._map = channels.GridChannel("/map", context=context)
         self._voxels = channels.PointCloudChannel("/map_points", context=context)

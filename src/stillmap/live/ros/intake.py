@@ -1,4 +1,7 @@
-"""Scans as they arrive, until all that is needed to map them is there; no ROS in it."""
+"""Scans as they arrive, until all that is needed to map them is there; no ROS in it.
+
+message_filters has no such queue in Python: it pairs messages, and loses those without a partner.
+"""
 
 import heapq
 import itertools
@@ -8,24 +11,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from stillmap.core import se2
 from stillmap.core.short_repr import ShortRepr
-from stillmap.io.ros.clouds import find_layout
 from stillmap.io.ros.messages import frame_name, stamp_ns
-from stillmap.io.ros.tf import project_to_plane
-from stillmap.live.ros.clouds import to_cloud_beams
-from stillmap.live.ros.conversions import (
-    Mount,
-    scan_frame,
-    shape_of,
-    to_scan_beams,
-    transform_values,
-)
-from stillmap.live.ros.odometry import Odometry
+from stillmap.io.ros.clouds import find_layout
+from stillmap.live.ros.messages import Mount, shape_of, to_cloud_beams, to_scan_beams
 from stillmap.live.ros.parameters import Parameters
-from stillmap.live.ros.transforms import TransformBuffer
+from stillmap.live.ros.transforms import Transforms
 from stillmap.live.scan import ScanBeams
 
 Float = NDArray[np.float64]
@@ -38,7 +30,6 @@ EARLY = "scan before the first odometry"
 NO_MOUNT = "no transform from the robot to the laser"
 OVERFLOW = "more scans than can wait"
 NO_ODOMETRY = "scan without odometry"
-BAD_TRANSFORM = "transform that is none"
 SET_BACK = "clock set back"
 
 _FIRST_ODOMETRY = 2.0  # s for which the first scan waits for odometry
@@ -90,58 +81,38 @@ class ScanIntake:
 
     Args:
         parameters: see Parameters.
+        transforms: of the robot.
 
     Attributes:
-        counts: scans and messages that were left out, by the reason.
+        counts: scans that were left out, by the reason.
         set_back: s by which the clock of all scans was set back for good; 0: it was not.
     """
 
-    def __init__(self, parameters: Parameters) -> None:
-        self._parameters = parameters
-        self.transforms = TransformBuffer(round(1e9 * parameters.tf_buffer_duration))
-        self.odometry = Odometry(parameters, self.transforms)
+    def __init__(self, parameters: Parameters, transforms: Transforms) -> None:
+        self._parameters, self._transforms = parameters, transforms
         self.counts = Counter[str]()
-        self._lasers: dict[str, _Laser] = {}
-        self._mounts: dict[tuple[str, str], Mount] = {}
-        self._waiting: list[_Waiting] = []
         self._numbers = itertools.count()
+        self._mounts: dict[tuple[str, str], Mount] = {}
+        self._begin()
+
+    def _begin(self) -> None:
+        self._lasers: dict[str, _Laser] = {}
+        self._waiting: list[_Waiting] = []
         self._last_ns, self._last_topics = 0, set[str]()  # of the last scan that was mapped
         self._first_arrived: float | None = None
-        self._awaits_odometry = True
+        self._silent_ns = -1  # the last odometry when a scan waited for it in vain
         self._behind_since: float | None = None
         self.set_back = 0.0
 
     def begin_anew(self) -> None:
         """Forget scans, odometry and transforms that are not static: time has begun anew."""
-        self._lasers.clear()
-        self._waiting.clear()
-        self._last_ns, self._last_topics = 0, set()
-        self._first_arrived, self._awaits_odometry = None, True
-        self._behind_since, self.set_back = None, 0.0
-        self.transforms.forget()
-        self.odometry.forget()
+        self._begin()
+        self._transforms.forget()
 
     @property
     def has_waiting(self) -> bool:
-        """True while scans wait: look again after a while."""
+        """True while scans wait: try again after a while."""
         return bool(self._waiting)
-
-    def add_transforms(self, message: Any, *, static: bool) -> None:
-        """Add a TFMessage; what we ourselves say about the map is left out."""
-        for one in message.transforms:
-            parent, child = frame_name(one.header.frame_id), frame_name(one.child_frame_id)
-            if parent == self._parameters.map_frame:
-                continue
-            values, stamp = transform_values(one.transform), stamp_ns(one.header)
-            if not self.transforms.add(parent, child, stamp, values, static=static):
-                self.counts[BAD_TRANSFORM] += 1
-        self._awaits_odometry = True
-
-    def add_odometry(self, message: Any) -> None:
-        """Add an Odometry message."""
-        if not self.odometry.add_message(message):
-            self.counts[BAD_TRANSFORM] += 1
-        self._awaits_odometry = True
 
     def add_scan(self, topic: str, message: Any, now: float) -> None:
         """Add a LaserScan or PointCloud2 that arrived now, in seconds of a steady clock."""
@@ -170,12 +141,12 @@ class ScanIntake:
             first = self._waiting[0]
             has_waited = now - first.arrived >= self._parameters.transform_timeout
             mount = self._find_mount(first)
-            fault = NO_MOUNT if mount is None and has_waited else self._find_fault(first)
+            pose = self._transforms.odometry_at(first.stamp_ns)
+            fault = NO_MOUNT if mount is None and has_waited else self._find_fault(first, pose)
             if fault is not None:
                 heapq.heappop(self._waiting)
                 self.counts[fault] += 1
                 continue
-            pose = self.odometry.pose_at(first.stamp_ns)
             if mount is None or self._must_wait(first, pose, now, has_waited):
                 return None
             return self._release(mount, pose)
@@ -187,6 +158,15 @@ class ScanIntake:
         layout = find_layout(message)
         return layout if isinstance(layout, str) else None
 
+    def _find_mount(self, scan: _Waiting) -> Mount | None:
+        key = scan.topic, frame_name(scan.message.header.frame_id)
+        if key not in self._mounts:
+            mount = self._transforms.find_mount(*key, scan.stamp_ns)
+            if mount is None:
+                return None
+            self._mounts[key] = mount
+        return self._mounts[key]
+
     def _check_set_back(self, stamp: int, now: float) -> None:
         """One scan with an old stamp means nothing, but a while in which there are no others."""
         if stamp >= self._last_ns - _LEAP_NS:
@@ -197,48 +177,9 @@ class ScanIntake:
             self.counts[SET_BACK] += self.set_back == 0.0
             self.set_back = 1e-9 * (self._last_ns - stamp)
 
-    def _find_fault(self, scan: _Waiting) -> str | None:
-        """Why a scan cannot be mapped after those that were."""
-        if scan.stamp_ns < self._last_ns:
-            return BACKWARDS
-        if scan.stamp_ns == self._last_ns and scan.topic in self._last_topics:
-            return REPEATED
-        if not self._last_topics and self.odometry.begins_after(scan.stamp_ns):
-            return EARLY
-        return None
-
-    def _must_wait(self, scan: _Waiting, pose: Float | None, now: float, has_waited: bool) -> bool:
-        if not has_waited and not self._is_in_order(scan, now):
-            return True
-        if pose is not None or not self.odometry.is_expected:
-            return False
-        if self.odometry.source is None:  # nothing yet: the robot has just been switched on
-            assert self._first_arrived is not None
-            return now - self._first_arrived < _FIRST_ODOMETRY
-        # odometry that failed once is not waited for until it comes again
-        return self._awaits_odometry and not has_waited
-
-    def _release(self, mount: Mount, pose: Float | None) -> Arrival:
-        scan = heapq.heappop(self._waiting)
-        if scan.stamp_ns > self._last_ns:
-            self._last_ns, self._last_topics = scan.stamp_ns, set()
-        self._last_topics.add(scan.topic)
-        if pose is None and self.odometry.is_expected:
-            self.counts[NO_ODOMETRY] += 1
-            self._awaits_odometry = False
-        limits = self._parameters.min_laser_range, self._parameters.max_laser_range
-        if self._parameters.dimension == 2:
-            beams = to_scan_beams(scan.message, scan.topic, mount, *limits)
-        else:
-            beams = to_cloud_beams(scan.message, scan.topic, mount.T_base_sensor, *limits)
-        return Arrival(scan.topic, scan.message, beams, pose, scan.arrived)
-
     def _check_leap(self, topic: str, stamp: int, now: float) -> str | None:
         """A single stamp far ahead would make all later ones too late: another must confirm it."""
-        laser = self._lasers.get(topic)
-        if laser is None:
-            self._lasers[topic] = _Laser(stamp, now)
-            return None
+        laser = self._lasers.setdefault(topic, _Laser(stamp, now))
         elapsed = round(1e9 * (now - laser.arrived))
         is_leap = stamp - laser.newest_ns > _LEAP_NS + elapsed
         is_confirmed = laser.leap_ns is not None and 0 < stamp - laser.leap_ns <= _LEAP_NS
@@ -249,42 +190,41 @@ class ScanIntake:
         laser.newest_ns, laser.arrived = max(laser.newest_ns, stamp), now
         return None
 
-    def _is_in_order(self, scan: _Waiting, now: float) -> bool:
-        """True if no other laser may still tell of something earlier."""
-        return all(
+    def _find_fault(self, scan: _Waiting, pose: Float | None) -> str | None:
+        """Why a scan cannot be mapped after those that were."""
+        if scan.stamp_ns < self._last_ns:
+            return BACKWARDS
+        if scan.stamp_ns == self._last_ns and scan.topic in self._last_topics:
+            return REPEATED
+        is_first = not self._last_topics and self._parameters.odom_frame
+        if is_first and pose is None and self._transforms.last_odometry_ns > scan.stamp_ns:
+            return EARLY
+        return None
+
+    def _must_wait(self, scan: _Waiting, pose: Float | None, now: float, has_waited: bool) -> bool:
+        # another laser may still have something earlier
+        if not has_waited and not all(
             laser.newest_ns >= scan.stamp_ns or now - laser.arrived > _SILENCE
             for laser in self._lasers.values()
-        )
+        ):
+            return True
+        if pose is not None or not self._parameters.odom_frame:
+            return False
+        if self._transforms.source is None:  # the robot has just been switched on
+            assert self._first_arrived is not None
+            return now - self._first_arrived < _FIRST_ODOMETRY
+        # odometry that failed once is not waited for until it comes again
+        return self._silent_ns != self._transforms.last_odometry_ns and not has_waited
 
-    def _find_mount(self, scan: _Waiting) -> Mount | None:
-        frame = scan_frame(scan.message)
-        key = (scan.topic, frame)
-        if key not in self._mounts:
-            mount = self._given_mount(scan.topic) or self._tf_mount(frame, scan.stamp_ns)
-            if mount is None:
-                return None
-            self._mounts[key] = mount
-        return self._mounts[key]
-
-    def _tf_mount(self, frame: str, stamp: int) -> Mount | None:
-        """The mount that TF tells."""
-        base = self._parameters.base_frame
-        T = np.eye(4) if frame == base else self.transforms.lookup(base, frame, stamp)
-        if T is None:
-            return None
-        if self._parameters.dimension == 3:
-            return Mount(T)
-        flat, is_upside_down, _ = project_to_plane(T[None])
-        return Mount(flat[0], is_upside_down)
-
-    def _given_mount(self, topic: str) -> Mount | None:
-        """The mount that a parameter tells."""
-        if not self._parameters.laser_pose:
-            return None
-        k = self._parameters.topics.index(topic)
-        if self._parameters.dimension == 2:
-            return Mount(se2.matrix(*self._parameters.laser_pose[3 * k : 3 * k + 3]))
-        T, values = np.eye(4), self._parameters.laser_pose[6 * k : 6 * k + 6]
-        T[:3, :3] = Rotation.from_euler("xyz", values[3:]).as_matrix()  # about fixed axes
-        T[:3, 3] = values[:3]
-        return Mount(T)
+    def _release(self, mount: Mount, pose: Float | None) -> Arrival:
+        scan = heapq.heappop(self._waiting)
+        if scan.stamp_ns > self._last_ns:
+            self._last_ns, self._last_topics = scan.stamp_ns, set()
+        self._last_topics.add(scan.topic)
+        if pose is None and self._parameters.odom_frame:
+            self.counts[NO_ODOMETRY] += 1
+            self._silent_ns = self._transforms.last_odometry_ns
+        limits = self._parameters.min_laser_range, self._parameters.max_laser_range
+        convert = to_scan_beams if self._parameters.dimension == 2 else to_cloud_beams
+        beams = convert(scan.message, scan.topic, mount, *limits)
+        return Arrival(scan.topic, scan.message, beams, pose, scan.arrived)

@@ -11,11 +11,11 @@ import numpy as np
 
 from stillmap.core import config
 from stillmap.core.errors import InputError
-from stillmap.core.profiling import Progress
+from stillmap.core.profiling import Progress, no_progress
 from stillmap.live.history import FOLDER
 from stillmap.live.mapper import LiveMapper
+from stillmap.live.replay import Show
 from stillmap.live.ros import publishers
-from stillmap.live.ros.installation import Ros
 from stillmap.live.ros.intake import (
     BACKWARDS,
     NO_MOUNT,
@@ -25,23 +25,17 @@ from stillmap.live.ros.intake import (
     ScanIntake,
 )
 from stillmap.live.ros.parameters import Parameters, declare
-from stillmap.live.ros.publishers import TF_MESSAGE, Publishers
-from stillmap.live.scan import ScanBeams
-from stillmap.live.update import DOUBTS, Update
+from stillmap.live.ros.publishers import MapPublisher, Publishers
+from stillmap.live.ros.run import Ros
+from stillmap.live.ros.transforms import Tf2, Transforms
+from stillmap.live.update import DOUBTS
 from stillmap.pipeline.options import Options
 
 _NAME = "stillmap"
-_TF_DEPTH, _ODOMETRY_DEPTH = 100, 50
-_POLL = 0.02  # s between two looks at scans that wait
+_ODOMETRY_DEPTH = 50
+_POLL = 0.005  # s after which scans that wait are tried again
 _STATUS_PERIOD = 1.0  # s
-_LATENCIES = 1000  # scans over which latency is told
-_OPTIONAL = {
-    TF_MESSAGE: "/tf is neither read nor written. Mounts come from the parameter laser_pose, "
-    "odometry from odom_topic; the pose is on the topic pose.",
-    "visualization_msgs/msg/MarkerArray": "movers are published as mover_poses alone",
-    "map_msgs/msg/OccupancyGridUpdate": "the map is published whole, without updates",
-}
-Show = Callable[[LiveMapper, ScanBeams, Update], None]
+_LATENCIES = 1000  # scans over which latency is given
 
 
 class LiveNode:
@@ -79,8 +73,14 @@ class LiveNode:
         if resolution != options.slam.resolution:
             changes = {"resolution": resolution, "voxel_size": resolution}
             options = config.override(options, {"slam": changes}, "parameter")
-        self._intake = ScanIntake(self.parameters)
-        self._publishers = Publishers(ros, self.node, self.parameters, options.output.map_mode)
+        tf2, time = ros.tf2_ros, ros.module("time")
+        classes = tf2.Buffer, tf2.TransformException, ros.geometry("TransformStamped")
+        duration = ros.module("duration").Duration
+        self._transforms = Transforms(self.parameters, Tf2(*classes, time.Time, duration))
+        self._intake = ScanIntake(self.parameters, self._transforms)
+        self._publishers = Publishers(ros, self.node, self.parameters)
+        mode = options.output.map_mode
+        self._map_publisher = MapPublisher(ros, self.node, self.parameters, mode)
         self._is_simulated = bool(self.node.get_parameter("use_sim_time").value)
         self._options, self._make_mapper = options, make_mapper
         self._former: threading.Thread | None = None  # writes the map before this one
@@ -89,7 +89,6 @@ class LiveNode:
         self._stamp_ns, self.scans, self._map_due, self._is_map_old = 0, 0, 0.0, False
         self._doubts, self._reported = Counter[str](), Counter[str]()
         self._subscribe()
-        self._tell_what_is_missing()
         self.save_node = self._make_save_node()
         self._mapper = make_mapper(options)
 
@@ -101,8 +100,11 @@ class LiveNode:
         self.save_node.destroy_node()
         self.node.destroy_node()
 
-    def save(self) -> None:
-        """Write the result folder, as known now. Mapping goes on meanwhile.
+    def save(self, progress: Progress = no_progress) -> None:
+        """Write the result folder, as known now. Mapping may go on meanwhile.
+
+        Args:
+            progress: shows how far it is written.
 
         Raises:
             InputError: there is nothing to save yet, or the folder cannot be written to.
@@ -112,20 +114,8 @@ class LiveNode:
                 raise InputError("no scan has been mapped yet")
             with self._lock:
                 snapshot = self._mapper.snapshot()
-            snapshot.save(self._output, overwrite=self._overwrite)
+            snapshot.save(self._output, overwrite=self._overwrite, progress=progress)
             self._overwrite = True  # the next one replaces ours
-
-    def save_last(self, progress: Progress) -> None:
-        """Write the result folder at the end of the drive, or keep it elsewhere.
-
-        Args:
-            progress: shows how far it is written.
-
-        Raises:
-            InputError: the folder cannot be written to; says where the result is.
-        """
-        with self._save_lock:
-            self._mapper.save(self._output, overwrite=self._overwrite, progress=progress)
 
     def _declare(self, options: Options) -> Parameters:
         descriptor = self._ros.message("rcl_interfaces/msg/ParameterDescriptor")
@@ -151,7 +141,7 @@ class LiveNode:
                 depth=_ODOMETRY_DEPTH, reliability=qos.ReliabilityPolicy.BEST_EFFORT
             )
             node.create_subscription(odometry, names.odom_topic, self._on_odometry, deep)
-        self._subscribe_to_tf(qos)
+        self._listener = self._ros.tf2_ros.TransformListener(self._transforms.buffer, node)
         clock = self._ros.module("clock")
         steady = clock.Clock(clock_type=clock.ClockType.STEADY_TIME)
         self._poll = node.create_timer(_POLL, self._answer_all, clock=steady)
@@ -167,26 +157,9 @@ class LiveNode:
             start_parameter_services=False,
             enable_rosout=False,
         )
-        trigger = self._ros.message("std_srvs/srv/Trigger")
-        if trigger is not None:
-            name = f"{self.node.get_fully_qualified_name()}/save_map"
-            node.create_service(trigger, name, self._on_save)
+        name = f"{self.node.get_fully_qualified_name()}/save_map"
+        node.create_service(self._ros.message("std_srvs/srv/Trigger"), name, self._on_save)
         return node
-
-    def _tell_what_is_missing(self) -> None:
-        """Packages of messages without which something is not published."""
-        for package, lost in _OPTIONAL.items():
-            if self._ros.message(package) is None:
-                name = package.split("/", maxsplit=1)[0]
-                self.node.get_logger().warning(f"{name} is missing: {lost}")
-
-    def _subscribe_to_tf(self, qos: Any) -> None:
-        message = self._ros.message(TF_MESSAGE)
-        if message is None:
-            return
-        latched = qos.QoSProfile(depth=_TF_DEPTH, durability=qos.DurabilityPolicy.TRANSIENT_LOCAL)
-        self.node.create_subscription(message, "/tf", self._on_tf, _TF_DEPTH)
-        self.node.create_subscription(message, "/tf_static", self._on_tf_static, latched)
 
     def _scan_callback(self, topic: str) -> Any:
         def add(message: Any) -> None:
@@ -198,15 +171,8 @@ class LiveNode:
         return add
 
     def _on_odometry(self, message: Any) -> None:
-        self._intake.add_odometry(message)
+        self._transforms.add_odometry(message)
         self._answer_all()
-
-    def _on_tf(self, message: Any) -> None:
-        self._intake.add_transforms(message, static=False)
-        self._answer_all()
-
-    def _on_tf_static(self, message: Any) -> None:
-        self._intake.add_transforms(message, static=True)
 
     def _on_save(self, _: Any, response: Any) -> Any:
         try:
@@ -231,7 +197,7 @@ class LiveNode:
             self._map_due, self._is_map_old = now + self.parameters.map_update_interval, False
             with self._lock:
                 grid = self._mapper.map
-            self._publishers.publish_map(grid, self._stamp_ns)
+            self._map_publisher.publish(grid, self._stamp_ns)
 
     def _begin_anew(self) -> None:
         """Begin a new map: a simulation or the replay of a bag was started again. The one so far is
@@ -268,7 +234,7 @@ class LiveNode:
         self._publishers.publish_answer(arrival, update)
         self._latency.append(time.monotonic() - arrival.arrived)
         self._stamp_ns, self._is_map_old = arrival.beams.stamp_ns, True
-        if not self._publishers.publish_map_changes(update.changes, self._stamp_ns):
+        if not self._map_publisher.publish_changes(update.changes, self._stamp_ns):
             self._map_due = time.monotonic()
         self.scans += 1
         self._doubts.update(update.doubts)
@@ -288,7 +254,7 @@ class LiveNode:
             "scans": str(self.scans),
             "latency median (ms)": f"{np.median(ms):.1f}",
             "latency 99 % (ms)": f"{np.quantile(ms, 0.99):.1f}",
-            "odometry": self._intake.odometry.source or "none",
+            "odometry": self._transforms.source or "none",
             **{reason: str(n) for reason, n in sorted(counts.items())},
             **{DOUBTS[doubt]: str(n) for doubt, n in sorted(doubts.items())},
         }
@@ -304,10 +270,9 @@ class LiveNode:
 
     def _warn(self, new: Counter[str]) -> None:
         """Say once in the log what keeps scans from being mapped."""
-        names = self.parameters
-        frames = ", ".join(sorted(self._intake.transforms.frames)) or "none"
+        names, frames = self.parameters, self._transforms.frames
         hints = {
-            NO_MOUNT: f"base_frame is '{names.base_frame}'; frames of TF: {frames}",
+            NO_MOUNT: f"base_frame is '{names.base_frame}'; TF: {frames}",
             NO_ODOMETRY: f"neither TF from '{names.odom_frame}' to '{names.base_frame}' nor "
             f"'{names.odom_topic}'; scans are mapped without",
             BACKWARDS: "such scans are left out",

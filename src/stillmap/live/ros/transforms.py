@@ -1,8 +1,7 @@
-"""The last seconds of the transform tree (TF), as it arrives."""
+"""Mounts and odometry from TF, by the user's own tf2_ros, and odometry from Odometry messages."""
 
-import bisect
 import math
-from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,140 +9,141 @@ from scipy.spatial.transform import Rotation
 
 from stillmap.core import se2
 from stillmap.io.rigid_transforms import MAX_TRANSLATION
+from stillmap.io.ros.tf import project_to_plane
+from stillmap.io.ros.messages import frame_name
+from stillmap.live.ros.messages import Mount, to_matrix
+from stillmap.live.ros.parameters import Parameters
 
 Float = NDArray[np.float64]
 
-_NORM_TOLERANCE = 0.05  # of a quaternion
+_MESSAGES, _ROBOT = "odometry", "robot"  # frames of Odometry messages in a buffer of their own
 
 
-class _Edge:
-    """The transform from a frame to its parent over time; `stamps` is empty if it is static."""
+class Tf2(NamedTuple):
+    """What is used of the user's ROS: classes of tf2_ros, geometry_msgs and rclpy."""
 
-    def __init__(self, parent: str) -> None:
-        self.parent = parent
-        self.stamps: list[int] = []
-        self.values: list[Float] = []  # x y z, quaternion x y z w
-
-    def set_static(self, values: Float) -> None:
-        self.stamps, self.values = [], [values]
-
-    def insert(self, stamp_ns: int, values: Float, duration_ns: int) -> None:
-        if self.values and not self.stamps:
-            return  # a static transform stays
-        if self.stamps and stamp_ns < self.stamps[-1] - duration_ns:
-            self.stamps, self.values = [], []  # time has begun anew
-        k = bisect.bisect_left(self.stamps, stamp_ns)
-        if k < len(self.stamps) and self.stamps[k] == stamp_ns:
-            self.values[k] = values
-            return
-        self.stamps.insert(k, stamp_ns)
-        self.values.insert(k, values)
-        old = bisect.bisect_left(self.stamps, self.stamps[-1] - duration_ns)
-        del self.stamps[:old], self.values[:old]
-
-    def at(self, stamp_ns: int) -> Float | None:
-        """(4, 4); None: the stamp lies outside the known ones."""
-        if not self.stamps:
-            return _to_matrix(self.values[0])
-        if not self.stamps[0] <= stamp_ns <= self.stamps[-1]:
-            return None
-        k = bisect.bisect_left(self.stamps, stamp_ns)
-        after = self.values[k]
-        if self.stamps[k] == stamp_ns:
-            return _to_matrix(after)
-        before = self.values[k - 1]
-        share = (stamp_ns - self.stamps[k - 1]) / (self.stamps[k] - self.stamps[k - 1])
-        sign = np.copysign(1.0, before[3:] @ after[3:])  # the shorter of both arcs
-        between = before * (1.0 - share) + after * np.r_[np.ones(3), np.full(4, sign)] * share
-        return _to_matrix(between)
+    Buffer: Any
+    TransformException: Any
+    TransformStamped: Any
+    Time: Any
+    Duration: Any
 
 
-class TransformBuffer:
-    """A forest of frames of which the last seconds are known.
+class Transforms:
+    """What TF and Odometry messages have said in the last seconds.
+
+    The source of odometry that is first able to give a pose is kept: two of them may differ by any
+    offset.
 
     Args:
-        duration_ns: how long a transform is kept.
+        parameters: names of the frames.
+        tf2: classes of the user's ROS.
+
+    Attributes:
+        buffer: of tf2_ros, for a listener.
+        source: of odometry: "TF", the topic, or None: no pose could be given so far.
     """
 
-    def __init__(self, duration_ns: int) -> None:
-        self._duration_ns = duration_ns
-        self._edges: dict[str, _Edge] = {}  # by child
+    def __init__(self, parameters: Parameters, tf2: Tf2) -> None:
+        self._parameters, self._tf2 = parameters, tf2
+        duration = tf2.Duration(seconds=parameters.tf_buffer_duration)
+        self.buffer, self._messages = tf2.Buffer(duration), tf2.Buffer(duration)
+        self._child = ""
+        self.source: str | None = None
 
     @property
-    def frames(self) -> set[str]:
-        """All frames."""
-        return set(self._edges) | {edge.parent for edge in self._edges.values()}
-
-    def add(
-        self, parent: str, child: str, stamp_ns: int, values: Sequence[float], *, static: bool
-    ) -> bool:
-        """Add T_parent_child: x y z in metres and a quaternion x y z w; False: it is none."""
-        if not (_is_pose(values) and parent and child and parent != child):
-            return False
-        edge = self._edges.get(child)
-        if edge is None or edge.parent != parent:
-            edge = self._edges[child] = _Edge(parent)
-        pose = np.array(values, np.float64)
-        if static:
-            edge.set_static(pose)
-        else:
-            edge.insert(stamp_ns, pose, self._duration_ns)
-        return True
+    def frames(self) -> str:
+        """All frames of TF, in words."""
+        return " ".join(self.buffer.all_frames_as_string().split()) or "none"
 
     def forget(self) -> None:
         """Forget all but the static transforms: time has begun anew."""
-        self._edges = {child: edge for child, edge in self._edges.items() if not edge.stamps}
+        self.buffer.clear()
+        self._messages.clear()
 
-    def lookup(self, target: str, source: str, stamp_ns: int) -> Float | None:
-        """(4, 4) T_target_source; None: the frames are not connected, or not at this time."""
-        up, down = self._path(source), self._path(target)
-        common = next((name for name in up if name in down), None)
-        if common is None:
+    def add_odometry(self, message: Any) -> None:
+        """Add an Odometry message."""
+        self._child = frame_name(message.child_frame_id)
+        transform, pose = self._tf2.TransformStamped(), message.pose.pose
+        transform.header.stamp, transform.header.frame_id = message.header.stamp, _MESSAGES
+        transform.child_frame_id = _ROBOT
+        for axis in "xyz":
+            setattr(transform.transform.translation, axis, getattr(pose.position, axis))
+        transform.transform.rotation = pose.orientation
+        self._messages.set_transform(transform, "stillmap")
+
+    def odometry_at(self, stamp: int) -> Float | None:
+        """(D+1, D+1) T_odom_base; None: it is not known (yet)."""
+        names = self._parameters
+        if not names.odom_frame:
             return None
-        rising = self._compose(up[: up.index(common)], stamp_ns)
-        falling = self._compose(down[: down.index(common)], stamp_ns)
-        if rising is None or falling is None:
-            return None
-        return se2.inverse(falling) @ rising
+        if self.source in (None, "TF"):
+            T = self._lookup(self.buffer, names.odom_frame, names.base_frame, stamp)
+            if T is not None:
+                self.source = "TF"
+                return self._flatten(T)
+        if self.source in (None, names.odom_topic):
+            T = self._lookup(self._messages, _MESSAGES, _ROBOT, stamp)
+            if T is not None:
+                self.source = names.odom_topic
+                return self._flatten(T @ self._child_to_base(stamp))
+        return None
 
-    def begins_after(self, target: str, source: str, stamp_ns: int) -> bool:
-        """True if the frames are connected, but are known for later times alone."""
-        up = self._path(source)
-        if target not in up:
-            return False
-        edges = (self._edges[child] for child in up[: up.index(target)])
-        return any(edge.stamps and edge.stamps[0] > stamp_ns for edge in edges)
+    @property
+    def last_odometry_ns(self) -> int:
+        """Stamp of the last odometry; 0: there is none."""
+        names = self._parameters
+        of_tf = self._last(self.buffer, names.odom_frame, names.base_frame)
+        return max(of_tf, self._last(self._messages, _MESSAGES, _ROBOT))
 
-    def _path(self, child: str) -> list[str]:
-        """A frame, its parent, and so on to the root."""
-        path = [child]
-        while (edge := self._edges.get(path[-1])) is not None and edge.parent not in path:
-            path.append(edge.parent)
-        return path
-
-    def _compose(self, path: list[str], stamp_ns: int) -> Float | None:
+    def find_mount(self, topic: str, frame: str, stamp: int) -> Mount | None:
+        """Where a sensor is on the robot: by a parameter, else by TF; None: it is not known."""
+        names = self._parameters
+        if names.laser_pose:
+            return self._given_mount(names.topics.index(topic))
         T = np.eye(4)
-        for child in path:
-            step = self._edges[child].at(stamp_ns)
-            if step is None:
+        if frame != names.base_frame:
+            looked_up = self._lookup(self.buffer, names.base_frame, frame, stamp)
+            if looked_up is None:
                 return None
-            T = step @ T
-        return T
+            T = looked_up
+        if names.dimension == 3:
+            return Mount(T)
+        flat, is_upside_down, _ = project_to_plane(T[None])
+        return Mount(flat[0], is_upside_down)
 
+    def _given_mount(self, k: int) -> Mount:
+        values = self._parameters.laser_pose
+        if self._parameters.dimension == 2:
+            return Mount(se2.matrix(*values[3 * k : 3 * k + 3]))
+        T, values = np.eye(4), values[6 * k : 6 * k + 6]
+        T[:3, :3] = Rotation.from_euler("xyz", values[3:]).as_matrix()  # about fixed axes
+        T[:3, 3] = values[:3]
+        return Mount(T)
 
-def to_plane(T: Float) -> Float:
-    """(3, 3) the position and heading of a pose (4, 4) in space."""
-    return se2.matrix(T[0, 3], T[1, 3], math.atan2(T[1, 0], T[0, 0]))
+    def _lookup(self, buffer: Any, target: str, source: str, stamp: int) -> Float | None:
+        """(4, 4) T_target_source; None: it is not known at this time."""
+        try:
+            found = buffer.lookup_transform_core(target, source, self._tf2.Time(nanoseconds=stamp))
+        except self._tf2.TransformException:
+            return None
+        T = to_matrix(found.transform.translation, found.transform.rotation)
+        return T if (np.abs(T) < MAX_TRANSLATION).all() else None
 
+    def _last(self, buffer: Any, target: str, source: str) -> int:
+        try:
+            return int(buffer.get_latest_common_time(target, source).nanoseconds)
+        except self._tf2.TransformException:
+            return 0
 
-def _to_matrix(values: Float) -> Float:
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_quat(values[3:]).as_matrix()
-    T[:3, 3] = values[:3]
-    return T
+    def _flatten(self, T: Float) -> Float:
+        if self._parameters.dimension == 3:
+            return T
+        return se2.matrix(T[0, 3], T[1, 3], math.atan2(T[1, 0], T[0, 0]))
 
-
-def _is_pose(values: Sequence[float]) -> bool:
-    # each by itself: max() of several, NaN among them, may return any of them
-    near = all(abs(value) < MAX_TRANSLATION for value in values[:3])
-    return near and abs(math.hypot(*values[3:]) - 1.0) < _NORM_TOLERANCE
+    def _child_to_base(self, stamp: int) -> Float:
+        """(4, 4) T_child_base, the base frame in the child frame of the messages; the identity if
+        no transform says otherwise."""
+        base = self._parameters.base_frame
+        T = self._lookup(self.buffer, self._child, base, stamp) if self._child else None
+        return np.eye(4) if T is None else T

@@ -1,0 +1,232 @@
+"""Between ROS messages and our arrays. Messages are any objects with their fields."""
+
+import array
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from stillmap.io.ros.laser_scan import ScanShape
+from stillmap.io.ros.messages import stamp_ns
+from stillmap.io.ros.clouds import parse_cloud
+from stillmap.live.scan import Scan, ScanBeams, to_beams
+from stillmap.pipeline.options import MapMode
+from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE
+from stillmap.results.map_server import raw_pixels
+from stillmap.results.reader import FREE_THRESH, OCCUPIED_THRESH
+
+Float = NDArray[np.float64]
+
+_MAX_SCAN_TIME = 1.0  # s: time increments that make scans longer are none
+_FLOAT32 = 7  # of PointField
+
+
+class Mount(NamedTuple):
+    """A laser or a lidar on the robot.
+
+    Attributes:
+        T_base_sensor: (3, 3), of a lidar (4, 4).
+        is_upside_down: its angles change their sign.
+    """
+
+    T_base_sensor: Float
+    is_upside_down: bool = False
+
+
+def shape_of(message: Any) -> ScanShape:
+    """The beams of a LaserScan; `find_fault` says why they cannot be used."""
+    return ScanShape(
+        message.angle_min,
+        message.angle_increment,
+        len(message.ranges),
+        message.range_min,
+        message.range_max,
+        message.time_increment,
+    )
+
+
+def to_scan_beams(
+    message: Any, topic: str, mount: Mount, min_range: float = 0.0, max_range: float = 0.0
+) -> ScanBeams:
+    """The beams of a LaserScan, in its order.
+
+    Args:
+        message: a LaserScan without fault.
+        topic: where it came from: each is a sensor of its own.
+        mount: of the laser.
+        min_range: m, nearer readings are unusable.
+        max_range: m, farther readings count as free space up to here; 0: the laser's own maximum.
+    """
+    shape = shape_of(message)
+    angles = shape.angles()
+    times, duration = None, shape.time_increment * shape.n
+    if 0.0 < duration <= _MAX_SCAN_TIME:
+        times = shape.time_increment * np.arange(shape.n)
+    nearest = shape.range_min if 0.0 < shape.range_min < MAX_PLAUSIBLE_RANGE else 0.0
+    reach = [r for r in (shape.range_max, max_range) if 0.0 < r < MAX_PLAUSIBLE_RANGE]
+    return to_beams(
+        Scan(
+            stamp_ns(message.header),
+            np.asarray(message.ranges, np.float64),
+            -angles if mount.is_upside_down else angles,
+            sensor=topic,
+            sensor_pose=mount.T_base_sensor,
+            beam_times=times,
+            min_range=max(nearest, min_range),
+            max_range=min(reach, default=None),
+        )
+    )
+
+
+def to_cloud_beams(
+    message: Any, topic: str, mount: Mount, min_range: float = 0.0, max_range: float = 0.0
+) -> ScanBeams:
+    """The beams of a PointCloud2 with a layout, in its order; see `to_scan_beams`.
+
+    Args:
+        message: with x, y, z, and perhaps times of the points.
+        topic: where it came from.
+        mount: of the lidar.
+        min_range: m, nearer points are unusable.
+        max_range: m, farther points count as free space up to here; 0: none do.
+    """
+    cloud = parse_cloud(message)
+    if isinstance(cloud, str):
+        raise TypeError(cloud)  # `find_layout` has said so
+    points, hit = cloud.points, np.ones(len(cloud.points), np.bool_)
+    if max_range > 0.0:
+        length = np.linalg.norm(points, axis=1)
+        hit = ~(length > max_range)  # what is no number stays what it is
+        points = points.copy()
+        with np.errstate(invalid="ignore"):  # infinite ones become NaN: unusable
+            points[~hit] *= (max_range / length[~hit])[:, None]
+    times = None
+    if cloud.times is not None:
+        times = np.where(np.isfinite(cloud.times), cloud.times, 0.0)  # of unusable points
+    return to_beams(
+        Scan(
+            stamp_ns(message.header),
+            points=points,
+            hit=hit,
+            sensor=topic,
+            sensor_pose=mount.T_base_sensor,
+            beam_times=times,
+            min_range=min_range,
+        )
+    )
+
+
+def to_matrix(translation: Any, rotation: Any) -> Float:
+    """(4, 4) of a translation, or position, and a quaternion."""
+    T = np.eye(4)
+    T[:3, 3] = translation.x, translation.y, translation.z
+    q = rotation
+    T[:3, :3] = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
+    return T
+
+
+def fill_header(header: Any, frame: str, stamp: int) -> None:
+    """Set frame and stamp (nanoseconds)."""
+    header.frame_id = frame
+    header.stamp.sec, header.stamp.nanosec = divmod(stamp, 10**9)
+
+
+def fill_point(point: Any, values: Any) -> None:
+    """Set x, y and z; in the plane z is 0."""
+    point.x, point.y, point.z = (*map(float, values), 0.0)[:3]
+
+
+def fill_rotation(q: Any, T: Float) -> None:
+    """Set a quaternion to the rotation of a pose (D+1, D+1)."""
+    R = np.eye(3)
+    R[: len(T) - 1, : len(T) - 1] = T[:-1, :-1]
+    q.x, q.y, q.z, q.w = Rotation.from_matrix(R).as_quat(canonical=True).tolist()
+
+
+def fill_heading(q: Any, velocity: Float) -> None:
+    """Set a quaternion to the heading of a velocity."""
+    half = 0.5 * math.atan2(velocity[1], velocity[0])
+    q.x, q.y, q.z, q.w = 0.0, 0.0, math.sin(half), math.cos(half)
+
+
+def spread_covariance(covariance: Float) -> Float:
+    """(36,) of a covariance (3, 3) of x, y and yaw, or (6, 6)."""
+    out = np.zeros((6, 6))
+    rows = [0, 1, 5] if len(covariance) == 3 else list(range(6))
+    out[np.ix_(rows, rows)] = covariance
+    return out.ravel()
+
+
+def to_cells(p_occupied: NDArray[np.float32], mode: MapMode) -> NDArray[np.int8]:
+    """(H, W) cells of an OccupancyGrid: 0 free, 100 occupied, -1 unknown; in mode raw per cent.
+
+    nav2 takes all between 0 and 100 for free unless it is told otherwise, hence the modes.
+    """
+    if mode == "trinary":
+        cells = np.full(p_occupied.shape, -1, np.int8)
+        cells[p_occupied > OCCUPIED_THRESH] = 100
+        cells[p_occupied < FREE_THRESH] = 0
+        return cells
+    return raw_pixels(p_occupied).view(np.int8)  # 255 is -1
+
+
+def to_data(values: NDArray[Any], code: str) -> "array.array[Any]":
+    """An array of the kind that rclpy takes without a check of each element."""
+    return array.array(code, values.tobytes())
+
+
+def split_ranges(
+    ranges: NDArray[np.float32], hit: NDArray[np.bool_], p_static: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """The ranges (N,) of what is static and of what is dynamic.
+
+    Dynamic beams are +inf among the static ones, where readings that met nothing stay as they are.
+    Only beams that ended on movers are finite among the dynamic ones.
+    """
+    is_dynamic = hit & (p_static < 0.5)
+    none = np.float32(math.inf)
+    return np.where(is_dynamic, none, ranges), np.where(is_dynamic, ranges, none)
+
+
+def copy_scan(message: Any, source: Any, ranges: NDArray[np.float32]) -> None:
+    """Set a LaserScan to another one, with other ranges."""
+    fill_header(message.header, source.header.frame_id, stamp_ns(source.header))
+    for name in (
+        *("angle_min", "angle_max", "angle_increment", "time_increment", "scan_time"),
+        *("range_min", "range_max", "intensities"),
+    ):
+        setattr(message, name, getattr(source, name))
+    message.ranges = to_data(ranges.astype(np.float32), "f")
+
+
+def end_points(message: Any, beams: ScanBeams, chosen: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """(n, 3) end points of the chosen beams (N,) of a scan in the frame of its message."""
+    if beams.dimension == 3:
+        return beams.points[chosen]
+    ranges = np.asarray(message.ranges, np.float64)[chosen]
+    angles = shape_of(message).angles()[chosen]
+    flat = np.stack([np.cos(angles), np.sin(angles), np.zeros(len(angles))], axis=1)
+    return np.asarray(ranges[:, None] * flat, np.float32)
+
+
+def fill_cloud(
+    message: Any,
+    source: Any,
+    points: NDArray[np.float32],
+    p_static: NDArray[np.float32],
+    make_field: Any,
+) -> None:
+    """Set a PointCloud2 to points (N, 3) with P(static) (N,), with the header of another message;
+    `make_field` makes a PointField."""
+    fill_header(message.header, source.header.frame_id, stamp_ns(source.header))
+    message.fields = []
+    for k, name in enumerate(("x", "y", "z", "p_static")):
+        field = make_field()
+        field.name, field.offset, field.datatype, field.count = name, 4 * k, _FLOAT32, 1
+        message.fields.append(field)
+    message.height, message.width = 1, len(points)
+    message.is_bigendian, message.is_dense = False, True
+    message.point_step, message.row_step = 16, 16 * len(points)
+    message.data = to_data(np.column_stack([points, p_static]).astype("<f4"), "B")
