@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.short_repr import ShortRepr
-from stillmap.io.ros.messages import frame_name, stamp_ns
 from stillmap.io.ros.clouds import find_layout
+from stillmap.io.ros.messages import frame_name, stamp_ns
 from stillmap.live.ros.messages import Mount, shape_of, to_cloud_beams, to_scan_beams
 from stillmap.live.ros.parameters import Parameters
 from stillmap.live.ros.transforms import Transforms

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from stillmap.io.ros.laser_scan import ScanShape
-from stillmap.io.ros.messages import stamp_ns
 from stillmap.io.ros.clouds import parse_cloud
+from stillmap.io.ros.lasers import ScanShape
+from stillmap.io.ros.messages import stamp_ns
 from stillmap.live.scan import Scan, ScanBeams, to_beams
 from stillmap.pipeline.options import MapMode
 from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE

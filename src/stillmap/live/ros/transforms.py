@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from stillmap.core import se2
 from stillmap.io.rigid_transforms import MAX_TRANSLATION
-from stillmap.io.ros.tf import project_to_plane
 from stillmap.io.ros.messages import frame_name
+from stillmap.io.ros.tf import project_to_plane
 from stillmap.live.ros.messages import Mount, to_matrix
 from stillmap.live.ros.parameters import Parameters
 
