@@ -35,8 +35,8 @@ from stillmap.core.recording import Recording
 from stillmap.eval.trajectory import compute_absolute_errors, compute_relative_errors
 from stillmap.io.reader import read
 from stillmap.pipeline.options import Options
+from stillmap.prepare.beam_times import add_beam_times
 from stillmap.prepare.options import ReadOptions
-from stillmap.prepare.scan_timing import add_beam_times
 from stillmap.sim import load_truth
 from stillmap.sim.truth import FOLDER
 from stillmap.slam import lidar_odometry

@@ -19,7 +19,7 @@ from common import outcomes
 from tables import markdown
 
 import stillmap
-from stillmap.prepare.scan_timing import SPIN_KEY, add_beam_times
+from stillmap.prepare.beam_times import SPIN_KEY, add_beam_times
 from stillmap.sim import scene_by_name, simulate
 from stillmap.slam import deskew_recording, spin_estimation
 from stillmap.slam.options import SlamOptions

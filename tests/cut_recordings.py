@@ -9,8 +9,7 @@ from stillmap.core import se2
 from stillmap.core.recording import Recording
 from stillmap.io import writers
 from stillmap.prepare.options import ReadOptions
-from stillmap.prepare.overrides import select_time
-from stillmap.prepare.time_window import TimeWindow
+from stillmap.prepare.time_window import TimeWindow, select_time
 
 START = 1_600_000_000  # s
 PERIOD = 0.1  # s between scans

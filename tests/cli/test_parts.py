@@ -16,8 +16,7 @@ from stillmap.pipeline.checkpoint import identify_run
 from stillmap.pipeline.em_loop import iterate
 from stillmap.pipeline.inputs import read as read_run
 from stillmap.prepare.options import ReadOptions
-from stillmap.prepare.overrides import select_time
-from stillmap.prepare.time_window import TimeWindow
+from stillmap.prepare.time_window import TimeWindow, select_time
 
 QUICK = ("--set", "em.max_iterations=1", "--quiet")
 CUTS = ((0, 13), (14, 24), (25, 39))  # scans of the room

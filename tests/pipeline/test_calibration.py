@@ -10,7 +10,7 @@ import stillmap
 from stillmap.core import config, se2
 from stillmap.pipeline import calibration
 from stillmap.pipeline.calibration import calibrate_recording
-from stillmap.prepare.overrides import mirror_beams
+from stillmap.prepare.lasers import mirror_beams
 from stillmap.sim import scene_by_name, simulate
 
 OPTIONS = config.override(stillmap.Options(), {"threads": 1})

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from stillmap.core.recording import Recording
-from stillmap.prepare.far_returns import (
+from stillmap.prepare.plausibility import (
     leave_out_far_returns,
     mapped_range,
     shorten_far_beams,
+    stated_max_range,
 )
-from stillmap.prepare.laser_scan import stated_max_range
 
 
 def scan(lengths, hit, dimension=2):

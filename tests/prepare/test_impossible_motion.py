@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stillmap.core.recording import Recording
-from stillmap.prepare.impossible_motion import leave_out_far_scans, remove_leaps
+from stillmap.prepare.plausibility import leave_out_far_scans, remove_leaps
 
 T, N = 20, 3
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stillmap.core import se2
-from stillmap.prepare.late_odometry import interpolate_late_odometry
+from stillmap.prepare.plausibility import interpolate_late_odometry
 
 STEP = 0.2  # s
 

@@ -13,8 +13,8 @@ from stillmap.core import config
 from stillmap.core.errors import InputError
 from stillmap.io import read, stillmap_folder, writers
 from stillmap.pipeline.options import Options
+from stillmap.prepare.beam_times import add_beam_times, turns_since_stamp
 from stillmap.prepare.options import ReadOptions
-from stillmap.prepare.scan_timing import add_beam_times, turns_since_stamp
 from stillmap.sim import scene_by_name, simulate
 
 LEFT = "counter-clockwise"

@@ -11,8 +11,7 @@ from stillmap.cli.main import main
 from stillmap.io import read, stillmap_folder
 from stillmap.io.trajectory import read_tum
 from stillmap.prepare.options import ReadOptions
-from stillmap.prepare.overrides import select_time
-from stillmap.prepare.time_window import TimeWindow
+from stillmap.prepare.time_window import TimeWindow, select_time
 from stillmap.sim import load_truth, scene_by_name, simulate_rig, write_rig
 
 QUICK = ("--quiet", "--threads", "1", "--set", "em.max_iterations=1")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stillmap.core.recording import Recording
-from stillmap.prepare.tilting_laser import assemble_tilting_laser, sweep_indices
+from stillmap.prepare.beam_times import assemble_tilting_laser
 from stillmap.sim import scene_by_name, simulate_rig
 
 
@@ -66,11 +66,3 @@ def test_laser_beside_the_joint():
     np.testing.assert_allclose(nods.points, [[0.0, 0.0, -2.5]], atol=1e-6)
     with pytest.raises(ValueError, match="1 stamps, 2 angles"):
         assemble_tilting_laser(flat, flat.stamp_ns, np.zeros(2), (0.0, 1.0, 0.0), np.eye(4))
-
-
-def test_sweeps_end_where_the_joint_reverses():
-    joint = np.array([0.0, 0.1, 0.2, 0.195, 0.3, 0.2, 0.1, 0.0, 0.0, 0.1, 0.2])
-    assert sweep_indices(joint).tolist() == [0, 0, 0, 0, 0, 1, 1, 1, 1, 2, 2]
-    assert sweep_indices(np.zeros(4)).tolist() == [0, 0, 0, 0]
-    n = sweep_indices(rig().joint_angle)
-    assert (n.max(), np.diff(n).min()) == (1, 0)  # 3 s of a period of 4 s, from the middle on

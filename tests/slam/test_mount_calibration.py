@@ -9,7 +9,7 @@ import pytest
 
 from stillmap.core import se2
 from stillmap.core.recording import Recording
-from stillmap.prepare.overrides import mirror_beams
+from stillmap.prepare.lasers import mirror_beams
 from stillmap.sim import scene_by_name, simulate
 from stillmap.slam.hand_eye import correct_odometry
 from stillmap.slam.mount_calibration import Calibration, calibrate_mounts

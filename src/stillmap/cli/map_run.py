@@ -27,8 +27,7 @@ from stillmap.pipeline.map_frame import objects_to_local
 from stillmap.pipeline.options import Options, resolve_options
 from stillmap.pipeline.result import MappingResult, map_recording
 from stillmap.prepare.options import ReadOptions
-from stillmap.prepare.overrides import select_time
-from stillmap.prepare.time_window import TimeWindow
+from stillmap.prepare.time_window import TimeWindow, select_time
 from stillmap.results.region import crop_result, require_overlap
 from stillmap.results.run_record import read_record
 

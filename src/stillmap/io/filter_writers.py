@@ -24,7 +24,7 @@ from stillmap.io.filtered_copy import FilterJob, Mask, Omissions
 from stillmap.io.point_cloud import signatures
 from stillmap.io.registry import FORMATS, Format, detect_format
 from stillmap.io.ros.messages import detect_kind
-from stillmap.prepare.scan_timing import SPIN_KEY
+from stillmap.prepare.beam_times import SPIN_KEY
 
 Write = Callable[[FilterJob], Omissions]
 

@@ -15,8 +15,7 @@ from stillmap.io.reader import explain_failure, prepare
 from stillmap.io.registry import Format, detect_format
 from stillmap.io.text_lines import Progress
 from stillmap.prepare.options import ReadOptions
-from stillmap.prepare.overrides import select_time
-from stillmap.prepare.time_window import TimeWindow
+from stillmap.prepare.time_window import TimeWindow, select_time
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from stillmap.io.recording_checks import require_mounts
 from stillmap.io.registry import detect_format
 from stillmap.io.text_lines import Progress
 from stillmap.prepare.options import ReadOptions
+from stillmap.prepare.prepare import prepare as prepare_recording
 
 
 def read(
@@ -52,15 +53,18 @@ def prepare(
     """
     require_mounts(recording, where)
     if recording.dimension == 3:
-        return _prepare_3d(recording, options, scratch)
-    for name, given in (
-        ("spin", options.spin not in ("auto", "none")),
-        ("cameras", options.cameras),
-    ):
-        if given:
-            what = f"read.{name} is for 3D recordings, this one is in 2D"
-            raise InputError(what, where=where)
-    return recording
+        recording = replace(recording, scratch=scratch)
+    try:
+        recording = prepare_recording(recording, options)
+    except InputError as error:
+        raise InputError(error.what, where=where, hint=error.hint) from error
+    if recording.dimension == 2:
+        return recording
+    from stillmap.io import cameras  # nothing that a 2D recording needs
+
+    if options.cameras is not None:
+        recording = cameras.apply_camera_file(recording, Path(options.cameras))
+    return cameras.add_calibration_warnings(recording)
 
 
 @contextmanager
@@ -80,19 +84,3 @@ def explain_failure(path: Path) -> Iterator[None]:
         raise InputError(what, where=str(error.filename or path)) from error
     except MemoryError as error:
         raise InputError("does not fit into memory", where=str(path)) from error
-
-
-def _prepare_3d(recording: Recording, options: ReadOptions, scratch: Path | None) -> Recording:
-    """Add beam times and cameras, and remove returns from the robot itself."""
-    from stillmap.io import cameras  # nothing that a 2D recording needs
-    from stillmap.prepare import self_filter
-    from stillmap.prepare.scan_timing import SPIN_KEY, add_beam_times
-
-    recording = add_beam_times(replace(recording, scratch=scratch), options.spin)
-    if options.spin == "none" and recording.beam_time is None:
-        source = {**recording.source, SPIN_KEY: {"direction": "none"}}
-        recording = replace(recording, source=source)
-    if options.cameras is not None:
-        recording = cameras.apply_camera_file(recording, Path(options.cameras))
-    recording = cameras.add_calibration_warnings(recording)
-    return self_filter.remove_self_returns(recording) if options.self_filter else recording

@@ -19,7 +19,7 @@ from stillmap.io.point_cloud import signatures
 from stillmap.io.ros import messages
 from stillmap.io.scan_files import contains_files, has_extension
 from stillmap.io.text_lines import read_head
-from stillmap.prepare.overrides import apply_options
+from stillmap.prepare.prepare import apply_options
 
 RIG_FOLDERS = ("horizontal", "tilting")  # of the two recordings of a simulated robot
 

@@ -26,7 +26,7 @@ from stillmap.live.saving import Snapshot
 from stillmap.live.scan import Scan, ScanBeams, drop_cover, to_beams
 from stillmap.live.update import Update
 from stillmap.pipeline.options import Options, resolve_resolution
-from stillmap.prepare.far_returns import mapped_range, shorten_far_beams
+from stillmap.prepare.plausibility import mapped_range, shorten_far_beams
 from stillmap.results.build import to_options
 from stillmap.results.result import BuiltResult
 from stillmap.tracking import MovingObject

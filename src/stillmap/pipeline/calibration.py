@@ -10,9 +10,9 @@ from stillmap.core import se2
 from stillmap.core.parallel import resolve_threads
 from stillmap.core.recording import Recording
 from stillmap.pipeline.options import Options
-from stillmap.prepare.late_odometry import interpolate_late_odometry
-from stillmap.prepare.overrides import mirror_beams
-from stillmap.prepare.scan_timing import SPIN_KEY, add_beam_times
+from stillmap.prepare.beam_times import SPIN_KEY, add_beam_times
+from stillmap.prepare.lasers import mirror_beams
+from stillmap.prepare.plausibility import interpolate_late_odometry
 from stillmap.slam.hand_eye import GAIN, SCALE, correct_odometry
 from stillmap.slam.mount_calibration import (
     LATENCY,

@@ -38,9 +38,12 @@ from stillmap.pipeline.options import DEFAULTS, Options, resolve_options
 from stillmap.pipeline.pose_sources import better_source
 from stillmap.pipeline.quality import Quality, rate_quality
 from stillmap.pipeline.snapshots import Snapshot
-from stillmap.prepare.far_returns import leave_out_far_returns
-from stillmap.prepare.impossible_motion import leave_out_far_scans, remove_leaps
-from stillmap.prepare.laser_scan import stated_max_range
+from stillmap.prepare.plausibility import (
+    leave_out_far_returns,
+    leave_out_far_scans,
+    remove_leaps,
+    stated_max_range,
+)
 from stillmap.slam.mount_calibration import Calibration
 from stillmap.tracking import FlowMap, MovingObject, compute_flow_map
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core import se2
+from stillmap.core import arrays, se2
 from stillmap.core.array_builder import ArrayBuilder
 from stillmap.core.arrays import release_pages, release_periodically
 from stillmap.core.recording import Recording
@@ -254,3 +254,12 @@ def _convert_run(
         np.multiply(length, directions[:, axis], out=points[..., axis], casting="same_kind")
     release_pages(laser.ranges)
     return points.reshape(-1, 2), hit.reshape(-1)
+
+
+def mirror_beams(recording: Recording, number: int) -> Recording:
+    """Negate the y coordinate of all points of one laser."""
+    points = arrays.copy(recording.points, recording.scratch)
+    scans = np.flatnonzero(recording.sensor == number).tolist()
+    for t in arrays.release_periodically(scans, lambda: arrays.release_pages(points)):
+        points[recording.beams_of(t), 1] *= -1.0
+    return replace(recording, points=points)

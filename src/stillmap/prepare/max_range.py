@@ -4,6 +4,7 @@ Drivers encode "no return" as a value above all real readings (81.91 m on a SICK
 maximum range itself (a clipped sensor), as +inf, or as zero. The readings show which.
 """
 
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -11,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.advice import advise
-from stillmap.prepare import self_filter
 from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE, ReadOptions
-from stillmap.prepare.self_filter import SelfSector
+
+SelfSector = tuple[int, int, float]  # first and last beam, maximum range (m) of self returns
 
 MAX_ZERO_RANGE = 0.02  # m: smaller than the housing of a laser, so such a reading is a code
 MIN_ZERO_SHARE = 0.005  # of the readings: zero is a code
@@ -26,6 +27,13 @@ GIVEN, DECLARED = "given", "declared in the recording"
 _CODE_WINDOW = 0.2  # m below the largest reading: noise of a code
 _REFERENCE_WINDOW = 1.0  # m below that: real readings
 _SICK_CODES = (81.825, 81.92)  # m: overflow values of the LMS 2xx, 8183 to 8191 cm
+
+_MAX_SELF_RANGE_2D = 1.0  # m
+_SAME_RANGE = (0.03, 0.01)  # m plus share of the range
+_MIN_SHARE_2D = 0.75  # share of scans in which a beam repeats its median range
+_MAX_REPEATED = 0.3  # median share over all beams: more is a standing robot
+_NEIGHBOURS = 2  # beams beside, which graze the same edge
+_RANGE_MARGIN = 0.1  # m: edges are measured too far
 
 
 @dataclass(frozen=True)
@@ -162,7 +170,7 @@ def infer_range_rule(
     sectors: tuple[SelfSector, ...] = ()
     if options.self_filter:
         min_range = max(options.min_range, MAX_ZERO_RANGE)
-        sectors = self_filter.find_self_sectors(np.atleast_2d(ranges), min_range)
+        sectors = find_self_sectors(np.atleast_2d(ranges), min_range)
     rule = RangeRule(
         threshold, how, zero_means, zero_how, free, free_how, options.min_range, sectors
     )
@@ -221,10 +229,50 @@ def apply_range_rule(
     no_return = (ranges >= threshold) | (zero & (rule.zero_means == "max-range"))
     min_range: Any = np.float32(max(rule.min_range, MAX_ZERO_RANGE))
     if rule.self_filter:
-        min_range = np.maximum(
-            min_range, self_filter.min_ranges(rule.self_filter, ranges.shape[-1])
-        )
+        min_range = np.maximum(min_range, min_ranges(rule.self_filter, ranges.shape[-1]))
     hit = (ranges >= min_range) & (ranges < threshold)
     free = np.nan if rule.free_range is None else rule.free_range
     length = np.where(no_return, np.float32(free), np.where(hit, ranges, np.float32(np.nan)))
     return length.astype(np.float32, copy=False), hit
+
+
+def find_self_sectors(ranges: NDArray[np.float32], min_range: float) -> tuple[SelfSector, ...]:
+    """Find the beams of a 2D laser that end on the robot itself; () for a standing robot.
+
+    Args:
+        ranges: (T, n) metres, one column per beam direction.
+        min_range: m, ranges below are unusable.
+    """
+    T, n = ranges.shape
+    if T < 20 or n < 2:
+        return ()
+    # codes for no return are as large as float32 allows
+    valid = np.where(
+        (ranges >= min_range) & (ranges < MAX_PLAUSIBLE_RANGE), ranges, np.float32(np.inf)
+    )
+    median = np.median(valid, axis=0)
+    with np.errstate(invalid="ignore"):
+        deviation = np.abs(valid - median)
+    repeated = np.mean(deviation < _SAME_RANGE[0] + _SAME_RANGE[1] * median, axis=0)
+    measured = np.isfinite(median)
+    if not measured.any() or np.median(repeated[measured]) > _MAX_REPEATED:
+        return ()
+    on_robot = np.flatnonzero((repeated >= _MIN_SHARE_2D) & (median < _MAX_SELF_RANGE_2D))
+    gaps = np.flatnonzero(np.diff(on_robot) > 2 * _NEIGHBOURS) + 1
+    groups = np.split(on_robot, gaps) if len(on_robot) else []
+    return tuple(
+        (
+            max(int(group[0]) - _NEIGHBOURS, 0),
+            min(int(group[-1]) + _NEIGHBOURS, n - 1),
+            round(float(median[group].max()) + _RANGE_MARGIN, 3),
+        )
+        for group in groups
+    )
+
+
+def min_ranges(sectors: Iterable[SelfSector], n: int) -> NDArray[np.float32]:
+    """(n,) range of each beam in metres below which readings are returns from the robot."""
+    out = np.zeros(n, np.float32)
+    for first, last, limit in sectors:
+        out[first : last + 1] = np.maximum(out[first : last + 1], np.float32(limit))
+    return out

@@ -1,5 +1,6 @@
 """Restriction of a recording to a part of its time: the options `read.start` and `read.end`."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -7,6 +8,7 @@ from numpy.typing import NDArray
 
 from stillmap.core.camera import Images
 from stillmap.core.errors import InputError
+from stillmap.core.recording import Recording
 from stillmap.core.timestamps import format_seconds
 from stillmap.prepare.options import ReadOptions
 
@@ -110,3 +112,34 @@ class TimeWindow:
             return {}
         span = {"first_stamp_ns": self.first_ns, "last_stamp_ns": self.last_ns}
         return {"part": {"start": self._start, "end": self._end, "omitted": self.omitted, **span}}
+
+
+def select_time(recording: Recording, window: TimeWindow, where: str = "") -> Recording:
+    """The scans and images of a recording in a window; `where` is its path, for messages.
+
+    Raises:
+        InputError: there is no such scan.
+    """
+    inside = window.select_all(recording.stamp_ns)
+    window.require_scans(where)
+    scans = np.flatnonzero(inside)
+    if not len(scans):
+        return recording
+    rows = slice(int(scans[0]), int(scans[-1]) + 1)  # stamps do not decrease
+    beams = slice(int(recording.offset[rows.start]), int(recording.offset[rows.stop]))
+    return replace(
+        recording,
+        stamp_ns=recording.stamp_ns[rows],
+        offset=recording.offset[rows.start : rows.stop + 1] - recording.offset[rows.start],
+        points=recording.points[beams],
+        hit=recording.hit[beams],
+        sensor=recording.sensor[rows],
+        T_odom_base=None if recording.T_odom_base is None else recording.T_odom_base[rows],
+        T_recorded_base=(
+            None if recording.T_recorded_base is None else recording.T_recorded_base[rows]
+        ),
+        beam_time=None if recording.beam_time is None else recording.beam_time[beams],
+        images=window.select_images(recording.images),
+        record=None if recording.record is None else recording.record[rows],
+        source={**recording.source, **window.notes()},
+    )

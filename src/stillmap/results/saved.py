@@ -19,7 +19,7 @@ from stillmap.core.recording import Recording
 from stillmap.io.trajectory import read_tum
 from stillmap.pipeline.options import Options
 from stillmap.pipeline.quality import Quality
-from stillmap.prepare.scan_timing import add_beam_times
+from stillmap.prepare.beam_times import add_beam_times
 from stillmap.results.folder import ResultFolder, match_labels, open_result
 from stillmap.results.labels import Labels, read_labels
 from stillmap.results.reader import Grid, Track, read_grid, read_tracks

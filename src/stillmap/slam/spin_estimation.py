@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core.recording import Recording
-from stillmap.prepare.scan_timing import add_beam_times
+from stillmap.prepare.beam_times import add_beam_times
 from stillmap.slam.deskew import deskew_recording
 from stillmap.slam.lidar_odometry import LidarOdometry, register_sweeps
 from stillmap.slam.options import SlamOptions

@@ -14,6 +14,7 @@ from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.core.timestamps import format_seconds
+from stillmap.io import laser_scan
 from stillmap.io.carmen.log import (
     BYTE_ORDER_MARK,
     SCAN_KINDS,
@@ -24,7 +25,6 @@ from stillmap.io.carmen.log import (
 from stillmap.io.carmen.reader import LaserLines, is_stated_by_lines, select_scans
 from stillmap.io.filtered_copy import FilterJob, Omissions, other_recording_error
 from stillmap.io.text_lines import read_lines, write_atomically
-from stillmap.prepare import laser_scan
 from stillmap.prepare.max_range import MIN_ZERO_SHARE, find_max_range
 from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE
 from stillmap.prepare.time_window import TimeWindow

@@ -26,9 +26,8 @@ from stillmap.io.point_cloud.origin import place_clouds
 from stillmap.io.point_cloud.scans import Cloud, CloudSource, DatasetInfo, build_recording, reject
 from stillmap.io.rigid_transforms import pose_from_row, rigid_transform
 from stillmap.io.scan_files import assign_rows, list_files, read_times, require_nonempty_file
-from stillmap.prepare.overrides import select_time
-from stillmap.prepare.scan_timing import STAMP_AZIMUTH_KEY, add_beam_times
-from stillmap.prepare.time_window import TimeWindow
+from stillmap.prepare.beam_times import STAMP_AZIMUTH_KEY, add_beam_times
+from stillmap.prepare.time_window import TimeWindow, select_time
 
 Poses = list[NDArray[np.float64]]
 

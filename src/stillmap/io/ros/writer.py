@@ -31,6 +31,7 @@ from stillmap.core.files import (
     temporary_folder,
 )
 from stillmap.core.recording import Recording
+from stillmap.io import laser_scan
 from stillmap.io.ros.messages import (
     LASER_SCAN,
     ODOMETRY,
@@ -40,7 +41,6 @@ from stillmap.io.ros.messages import (
     Channel,
     load_typestore,
 )
-from stillmap.prepare import laser_scan
 
 Float = NDArray[np.float64]
 Send = Callable[[int, Any], None]  # stamp in ns, message

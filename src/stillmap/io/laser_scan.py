@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.prepare.max_range import DECLARED, GIVEN
 
 Float = NDArray[np.float64]
 
@@ -123,21 +122,6 @@ def time_increments(recording: Recording) -> tuple[Float, int]:
         else:
             uneven += 1
     return out, uneven
-
-
-def stated_max_range(recording: Recording) -> float | None:
-    """The longest maximum range of its lasers, in metres, that the user or the recording states.
-
-    None: nobody does; a code among the readings says nothing about the reach of a laser.
-    """
-    stated = []
-    for notes in _sensor_entries(recording):
-        threshold = _range_threshold(notes)
-        if threshold is not None and str(notes["ranges"].get("threshold_how")).startswith(
-            (GIVEN, DECLARED)
-        ):
-            stated.append(threshold)
-    return max(stated, default=None)
 
 
 def _sensor_entries(recording: Recording) -> list[dict[str, Any]]:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.prepare import laser_scan
+from stillmap.io import laser_scan
 
 
 def recording(scans, *, hit=None, sensors=(), sensor=None, beam_time=None):

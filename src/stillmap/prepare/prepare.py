@@ -1,4 +1,4 @@
-"""Reading options applied to a recording whose ranges are already interpreted."""
+"""From what a reader returns to a recording that can be mapped."""
 
 from dataclasses import replace
 
@@ -8,8 +8,31 @@ from numpy.typing import NDArray
 from stillmap.core import arrays, se2
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
+from stillmap.prepare.beam_times import SPIN_KEY, add_beam_times
+from stillmap.prepare.lasers import mirror_beams
 from stillmap.prepare.options import LaserOptions, ReadOptions
-from stillmap.prepare.time_window import TimeWindow
+from stillmap.prepare.self_filter import remove_self_returns
+from stillmap.prepare.time_window import TimeWindow, select_time
+
+
+def prepare(recording: Recording, options: ReadOptions) -> Recording:
+    """What follows from all scans: beam times of spinning lidars, no returns from the robot itself.
+
+    In 2D the range rules (`lasers.place_beams`) have seen to that.
+
+    Raises:
+        InputError: options are for recordings of another dimension.
+    """
+    if recording.dimension == 2:
+        if options.spin not in ("auto", "none") or options.cameras is not None:
+            name = "cameras" if options.spin in ("auto", "none") else "spin"
+            raise InputError(f"read.{name} is for 3D recordings, this one is in 2D")
+        return recording
+    recording = add_beam_times(recording, options.spin)
+    if options.spin == "none" and recording.beam_time is None:
+        source = {**recording.source, SPIN_KEY: {"direction": "none"}}
+        recording = replace(recording, source=source)
+    return remove_self_returns(recording) if options.self_filter else recording
 
 
 def apply_options(recording: Recording, options: ReadOptions) -> Recording:
@@ -40,37 +63,6 @@ def apply_options(recording: Recording, options: ReadOptions) -> Recording:
     for number in range(min(len(recording.T_base_sensor), 2)):
         changed = _apply_laser_options(changed, number, options.laser(number))
     return changed
-
-
-def select_time(recording: Recording, window: TimeWindow, where: str = "") -> Recording:
-    """The scans and images of a recording in a window; `where` is its path, for messages.
-
-    Raises:
-        InputError: there is no such scan.
-    """
-    inside = window.select_all(recording.stamp_ns)
-    window.require_scans(where)
-    scans = np.flatnonzero(inside)
-    if not len(scans):
-        return recording
-    rows = slice(int(scans[0]), int(scans[-1]) + 1)  # stamps do not decrease
-    beams = slice(int(recording.offset[rows.start]), int(recording.offset[rows.stop]))
-    return replace(
-        recording,
-        stamp_ns=recording.stamp_ns[rows],
-        offset=recording.offset[rows.start : rows.stop + 1] - recording.offset[rows.start],
-        points=recording.points[beams],
-        hit=recording.hit[beams],
-        sensor=recording.sensor[rows],
-        T_odom_base=None if recording.T_odom_base is None else recording.T_odom_base[rows],
-        T_recorded_base=(
-            None if recording.T_recorded_base is None else recording.T_recorded_base[rows]
-        ),
-        beam_time=None if recording.beam_time is None else recording.beam_time[beams],
-        images=window.select_images(recording.images),
-        record=None if recording.record is None else recording.record[rows],
-        source={**recording.source, **window.notes()},
-    )
 
 
 def _limit_ranges(recording: Recording, options: ReadOptions) -> Recording:
@@ -104,12 +96,3 @@ def _apply_laser_options(recording: Recording, number: int, laser: LaserOptions)
     T[number] = se2.matrix(*pose)
     changed = replace(recording, T_base_sensor=T)
     return mirror_beams(changed, number) if laser.upside_down else changed
-
-
-def mirror_beams(recording: Recording, number: int) -> Recording:
-    """Negate the y coordinate of all points of one laser."""
-    points = arrays.copy(recording.points, recording.scratch)
-    scans = np.flatnonzero(recording.sensor == number).tolist()
-    for t in arrays.release_periodically(scans, lambda: arrays.release_pages(points)):
-        points[recording.beams_of(t), 1] *= -1.0
-    return replace(recording, points=points)

@@ -1,4 +1,4 @@
-"""Per-beam times of a spinning lidar, computed from azimuths where the recording has none."""
+"""Times of the beams of a spinning lidar, and assembly of a tilting laser by its joint."""
 
 import math
 from dataclasses import replace
@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.beam_times import beam_stamps_ns
 from stillmap.core.recording import Recording
 
 Float = NDArray[np.float64]
@@ -17,6 +18,7 @@ _SIGN = {"clockwise": -1.0, "counter-clockwise": 1.0}
 _TURN = 2.0 * math.pi
 _SPIN_START = math.pi  # rad, azimuth at which a revolution begins: behind the robot
 _RATES = (0.5, 200.0)  # 1/s, revolutions of lidars; stamps farther apart miss scans
+_BLOCK = 1 << 16  # beams transformed at once
 
 
 def add_beam_times(recording: Recording, direction: str) -> Recording:
@@ -76,3 +78,61 @@ def _spin_rate(recording: Recording, sensor: int) -> float | None:
 def _with_warning(recording: Recording, what: str) -> Recording:
     warnings = [*recording.source.get("warnings", []), what]
     return replace(recording, source={**recording.source, "warnings": warnings})
+
+
+def assemble_tilting_laser(
+    recording: Recording,
+    joint_ns: NDArray[np.int64],
+    joint_angle: Float,
+    axis: tuple[float, float, float],
+    T_base_joint: Float,
+    T_joint_laser: Float | None = None,
+) -> Recording:
+    """Transform a 2D recording to 3D points in the frame of the joint's fixed part.
+
+    The angle is interpolated linearly between readings, and constant outside them.
+
+    Args:
+        recording: 2D, of a laser on a joint.
+        joint_ns: (J,) stamps of the joint readings, non-decreasing, on the same clock; J > 0.
+        joint_angle: (J,) rad, right-handed about `axis`.
+        axis: unit vector in the frame of the joint.
+        T_base_joint: (4, 4).
+        T_joint_laser: (4, 4) at angle zero; None: identity.
+
+    Raises:
+        ValueError: the recording is not 2D, or counts of stamps and angles differ.
+    """
+    if recording.dimension != 2:
+        raise ValueError(f"recording: expected 2 dimensions, got {recording.dimension}")
+    if len(joint_ns) != len(joint_angle) or not len(joint_ns):
+        raise ValueError(f"joint: {len(joint_ns)} stamps, {len(joint_angle)} angles")
+    T = np.eye(4) if T_joint_laser is None else T_joint_laser
+    points = recording.allocate_per_beam(np.float32, (3,))
+    seconds = 1e-9 * (joint_ns - joint_ns[0])
+    step = max(1, _BLOCK * recording.n_scans // max(recording.n_beams, 1))
+    for first in range(0, recording.n_scans, step):
+        scans = slice(first, min(first + step, recording.n_scans))
+        beams = slice(int(recording.offset[scans.start]), int(recording.offset[scans.stop]))
+        seconds_of_beams = 1e-9 * (beam_stamps_ns(recording, scans) - joint_ns[0])
+        flat = recording.points[beams].astype(np.float64)
+        local = flat @ T[:3, :2].T + T[:3, 3]
+        points[beams] = rotate_about_axis(
+            local, np.array(axis), np.interp(seconds_of_beams, seconds, joint_angle)
+        )
+        recording.release_pages(points)
+    return replace(
+        recording,
+        points=points,
+        T_base_sensor=np.asarray(T_base_joint, np.float64)[None],
+        sensor=np.zeros(recording.n_scans, np.int32),
+        T_odom_base=None,
+        T_recorded_base=None,
+    )
+
+
+def rotate_about_axis(points: Float, axis: Float, angle: Float) -> Float:
+    """(n, 3) points rotated about a unit axis (3,) by angles (n,) in rad: Rodrigues' formula."""
+    c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    along = (points @ axis)[:, None] * axis
+    return np.asarray(along + c * (points - along) + s * np.cross(axis, points))
