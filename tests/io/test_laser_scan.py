@@ -1,13 +1,10 @@
 """2D recordings in the form of LaserScan messages."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.io import laser_scan
 
@@ -64,22 +61,6 @@ def test_what_the_reader_noted_comes_first():
     assert laser_scan.beam_angles(one).tolist() == [[-1.0, 0.1]]
 
 
-@pytest.mark.parametrize(
-    "noted", [{"start_angle": -2.0, "angle_step": 0.1}, {"start_angle": "x"}, None, 7]
-)
-def test_notes_that_do_not_fit_are_not_believed(noted):
-    angles = np.linspace(-1.0, 1.0, 21)
-    one = recording([(angles, np.full(21, 5.0))], sensors=[noted])
-    np.testing.assert_allclose(laser_scan.beam_angles(one), [[-1.0, 0.1]], atol=1e-7)
-
-
-def test_every_scan_may_have_its_own():
-    scans = [(s + d * np.arange(n), np.full(n, 3.0)) for s, d, n in [(0, 0.1, 9), (1, -0.02, 9)]]
-    scans += [(2 + 0.3 * np.arange(4), np.full(4, 3.0)), scans[0]]
-    found = laser_scan.beam_angles(recording(scans))
-    np.testing.assert_allclose(found, [[0, 0.1], [1, -0.02], [2, 0.3], [0, 0.1]], atol=1e-6)
-
-
 def test_a_scan_that_tells_nothing_has_the_angles_of_the_others():
     angles, blind = np.linspace(-1.0, 1.0, 21), np.full(21, np.nan)
     scans = [(angles, blind), (angles, np.full(21, 5.0)), (angles, blind)]
@@ -91,29 +72,6 @@ def test_a_scan_that_tells_nothing_has_the_angles_of_the_others():
     first, step = laser_scan.beam_angles(recording([(angles, lone)]))[0]
     assert np.isclose(first + 3 * step, angles[3])
     assert np.isfinite(laser_scan.beam_angles(recording([(angles, blind)]))).all()
-
-
-def test_directions_that_no_driver_states_are_refused():
-    angles = np.linspace(-1.0, 1.0, 21)
-    even = (angles, np.full(21, 5.0))
-    angles = angles.copy()
-    angles[7] += 0.01
-    with pytest.raises(InputError, match=r"scan 1: the directions .* not evenly spaced"):
-        laser_scan.beam_angles(recording([even, (angles, np.full(21, 5.0))]))
-
-
-def test_clouds_are_refused():
-    flat = recording([([0.0], [1.0])])
-    cloud = dataclasses.replace(
-        flat, points=np.ones((1, 3), np.float32), T_base_sensor=np.eye(4)[None]
-    )
-    with pytest.raises(InputError, match="3D"):
-        laser_scan.beam_angles(cloud)
-
-
-def test_ranges():
-    one = recording([([0.0, 1.0, 2.0], [3.0, 7.0, np.nan])], hit=[True, False, False])
-    np.testing.assert_allclose(laser_scan.beam_ranges(one, 0, np.inf), [3.0, np.inf, np.nan])
 
 
 def test_how_far_lasers_see():

@@ -56,10 +56,6 @@ def test_what_is_said_of_the_laser_is_believed(how, stated):
     assert stated_max_range(recording) == stated
 
 
-def test_nothing_is_said():
-    assert stated_max_range(scan([5.0], [True])) is None
-
-
 def test_what_is_near_stays():
     near = scan([1.0, 81.9, np.nan, 99.9], [True, True, False, False])
     found, notes = leave_out_far_returns(near, 0.05)
@@ -76,12 +72,6 @@ def test_far_returns_are_not_used(dimension, far):
     assert sentence.startswith("2 of 3 returns are farther than ")
     assert ("read.max_range" if dimension == 2 else "slam.voxel_size") in sentence
     assert recording.hit.sum() == 3  # the input stays
-
-
-def test_only_beams_without_a_return_are_far():
-    found, (sentence,) = leave_out_far_returns(scan([800.0, 60.0], [False, False]), 0.05)
-    np.testing.assert_allclose(found.points[:, 1], [100.0, 60.0])
-    assert sentence.startswith("1 beam without a return")
 
 
 def test_beams_of_one_scan():

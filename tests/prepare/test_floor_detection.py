@@ -60,25 +60,6 @@ def test_most_floor_is_found_and_little_else(
     assert run.truth.static[found].mean() < 0.03
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "changes"),
-    [
-        ("hall", {"crowd": {"people": 60}}),
-        ("corridor", {"odometry": {**POOR, "slip_rate": 0.3, "stall_rate": 4.0}}),
-        ("office", {"odometry": POOR}),
-        ("warehouse", {"laser": {"fov": 2 * math.pi, "beams": 360}}),
-        ("street", {}),
-        ("hall-empty", {"laser": {"fov": 1.2, "max_range": 5.0}, "odometry": POOR}),
-    ],
-)
-@pytest.mark.parametrize("seed", [1, *slow_params(2, 3)])
-def test_level_robots_see_none(name: str, changes: dict[str, dict[str, object]], seed: int) -> None:
-    run = drive(name, seed, **changes)
-    # who stands around a narrow view may look like floor, but walls do not
-    assert np.count_nonzero(find(run) & run.truth.static) <= 1e-4 * run.recording.n_beams
-
-
 def to_and_fro(speed: float, seed: int, **changes: dict[str, object]) -> Simulation:
     """A robot that drives at the walls of a bare room."""
     route = ((-8.0, 0.0), (8.5, 0.0), (-8.5, 0.3), (8.5, 0.5), (0.0, 3.5), (0.0, -3.5))
@@ -111,40 +92,6 @@ def test_wrong_odometry_makes_no_floor_of_walls() -> None:
         found = find_floor_returns(run.recording, once).reshape(300, -1)
         n_found += np.delete(found, scan, axis=0).sum()
     assert n_found <= 1e-4 * 40 * run.recording.n_beams
-
-
-def test_order_and_number_of_beams_do_not_matter() -> None:
-    run = drive("hall", laser={"beams": 120}, robot=ROUGH)
-    recording, odometry = run.recording, run.recording.T_odom_base
-    assert odometry is not None
-    found = find(run)
-    rng, T = np.random.default_rng(1), recording.n_scans
-    order = np.concatenate([120 * t + rng.permutation(120) for t in range(T)])
-    keep = rng.random(len(order)) > 0.1
-    offset = np.concatenate([[0], np.cumsum(keep.reshape(T, -1).sum(axis=1))])
-    points = recording.points[order][keep]
-    other = dataclasses.replace(
-        recording, points=points, hit=recording.hit[order][keep], offset=offset
-    )
-    differ = find_floor_returns(other, odometry) != found[order][keep]
-    assert differ.mean() < 0.01
-
-
-def test_unusable_beams_and_short_recordings() -> None:
-    run = drive("hall", laser={"beams": 60}, robot={**ROUGH, "scans": 120})
-    recording, odometry = run.recording, run.recording.T_odom_base
-    assert odometry is not None
-    points, hit = recording.points.copy(), recording.hit.copy()
-    points[::7], hit[::7] = np.nan, False
-    found = find_floor_returns(dataclasses.replace(recording, points=points, hit=hit), odometry)
-    assert found.any()
-    assert not found[::7].any()
-    for T in (0, 1, 2):
-        assert not find_floor_returns(first_scans(recording, T), odometry[:T]).any()
-    none = dataclasses.replace(
-        recording, points=points[:0], hit=hit[:0], offset=np.zeros_like(recording.offset)
-    )
-    assert len(find_floor_returns(none, odometry)) == 0
 
 
 def first_scans(recording: Recording, T: int) -> Recording:

@@ -42,22 +42,6 @@ def test_odometry_goes_on_as_before(dimension):
     assert "1 scan, first before scan 8 by 1.414e+06 m in 0.1 s" in sentence
 
 
-def test_there_and_back():
-    true = drive()
-    odd = shifted(shifted(true, 8, 1e4), 9, -1e4)
-    found, (sentence,) = remove_leaps(odd)
-    np.testing.assert_allclose(found.T_odom_base, true.T_odom_base, atol=1e-6)
-    assert "2 scans" in sentence
-
-
-def test_odometry_that_only_leaps_stands_still():
-    climbing = drive()
-    climbing.T_odom_base[:, 0, 2] *= 1e4
-    found, (sentence,) = remove_leaps(climbing)
-    np.testing.assert_array_equal(found.T_odom_base[:, :2, 2], 0.0)
-    assert "19 scans" in sentence
-
-
 @pytest.mark.parametrize(("metres", "hours"), [(50.0, 0.0), (5000.0, 1.0)])
 def test_what_is_possible_stays(metres, hours):
     recording = shifted(drive(), 8, metres)
@@ -81,13 +65,6 @@ def test_beams_of_far_scans_are_unusable(dimension):
     assert recording.hit.all()
     assert not np.isnan(recording.points).any()
     assert "first scan 5 at (1, 1e+07) m" in sentence
-
-
-def test_near_scans_are_used():
-    recording = drive()
-    poses = recording.T_odom_base.copy()
-    poses[5, 0, 2] = 9e4
-    assert leave_out_far_scans(recording, poses, 0.05) == (recording, [])
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

@@ -42,33 +42,6 @@ def test_corridor_end_read_over_and_over_is_no_code(noise, quantum):
     assert find_max_range(ranges.astype(np.float32)).threshold is None
 
 
-def test_far_wall_seen_by_three_beams_only():
-    rng = np.random.default_rng(7)
-    ranges = rng.uniform(1.0, 5.0, (T, N))
-    ranges[:, 90:93] = np.round(9.8 + rng.normal(0, 0.01, (T, 3)), 2)
-    assert find_max_range(ranges.astype(np.float32)).threshold is None
-
-
-@pytest.mark.parametrize("noise", [0.01, 0.02, 0.03])
-def test_round_room_read_in_all_directions_is_no_code(noise):
-    ranges = np.round(9.8 + np.random.default_rng(10).normal(0, noise, (T, N)), 2)
-    assert find_max_range(ranges.astype(np.float32)).threshold is None
-
-
-@pytest.mark.parametrize(("repeats", "coded"), [(200, True), (5, True), (4, False)])
-def test_rare_code_among_dense_readings(repeats, coded):
-    # 4500 readings to the metre, no two alike: a value repeated in several directions is a code
-    ranges = np.linspace(2.0, 9.999, T * N).reshape(N, T).T.copy()
-    ranges.ravel()[: 40 * repeats : 40] = 10.0
-    assert find_max_range(ranges.astype(np.float32)).coded == coded
-
-
-def test_readings_in_millimetres_that_repeat_by_chance_are_no_code():
-    rng = np.random.default_rng(11)
-    ranges = np.round(rng.uniform(2.0, 10.0, (T, N)), 3)
-    assert not find_max_range(ranges.astype(np.float32)).coded
-
-
 @pytest.mark.parametrize("clip", [3.5, 5.0, 8.0])
 @pytest.mark.parametrize("noise", [0.005, 0.02])
 def test_clipped_sensor(clip, noise):
@@ -179,18 +152,3 @@ def test_given_maximum_range():
     assert rule.free_range < 4.0
     rule, warnings = infer_range_rule(ranges, None, ReadOptions(max_range=90.0))
     assert "81.83" in warnings[0]
-
-
-def test_no_reading_says_anything():
-    ranges = np.full((2, 3), np.inf, np.float32)
-    rule, warnings = infer_range_rule(ranges, None, ReadOptions())
-    assert warnings
-    assert np.isnan(apply_range_rule(ranges, rule)[0]).all()
-
-
-@pytest.mark.parametrize(
-    "options", [{"min_range": -1.0}, {"max_range": 0.0}, {"free_range": float("nan")}]
-)
-def test_options_out_of_range(options):
-    with pytest.raises(ValueError, match=next(iter(options))):
-        ReadOptions(**options)

