@@ -275,7 +275,7 @@ def test_fault(call, inputs, tmp_path, monkeypatch, writer, fault):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in FAULTS if name not in ("vanishes", "mount")])
 def test_fleet(call, room, tmp_path, name):
-    """Its tasks are processes of their own, where faults cannot be set from here."""
+    """Its tasks run in processes of their own, where faults cannot be set from here."""
     fault, writer = FAULTS[name], Writer(())
     with fault.make(tmp_path, fault.stem, writer) as output:
         known = _names(tmp_path)

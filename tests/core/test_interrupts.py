@@ -16,10 +16,9 @@ import pytest
 
 from stillmap.cli import arguments, console
 from stillmap.core import files
-from stillmap.fleet import scratch
 from stillmap.pipeline import checkpoint
 
-_MODULES = (files, arguments, scratch, checkpoint)
+_MODULES = (files, arguments, checkpoint)
 CALLS_ONLY = {__file__, contextlib.__file__, tempfile.__file__}
 # a signal within what they call comes to the same
 TRACED = {*CALLS_ONLY, *(module.__file__ for module in _MODULES)}
@@ -134,7 +133,6 @@ def all_at_once(path):
     """What is removed at the end, whatever happens."""
     with (
         files.temporary_folder(path / "out") as work,
-        scratch.scratch_folder(path / "scratch"),
         checkpoint.lock_checkpoints(path / "made/out"),
         tempfile.TemporaryDirectory(dir=path),
     ):

@@ -5,22 +5,27 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
+import distributed
 import numpy as np
 import pytest
 
+import stillmap
 from stillmap.cli.main import main
-from stillmap.fleet import child
 from stillmap.sim import CrowdOptions, LaserOptions, RobotOptions, Scene, simulate, write_simulation
 from stillmap.sim.walls import box
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))  # for what the tests share
 
-from fleets import NAMES, wait_until
+import stand_in as stand_ins
 from result_contents import contents
 
+NAMES = ("hall", "office", "yard")  # of the recordings
 COMMAND = [sys.executable, "-m", "stillmap"]
 
 
@@ -83,11 +88,23 @@ def by_hand(
     return {name: contents(folder / name) for name in NAMES}
 
 
+@pytest.fixture(scope="session")
+def workers() -> Iterator[str]:
+    """Two workers in this process; the address of their scheduler."""
+    settings = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": "127.0.0.1:0"}
+    with distributed.LocalCluster(processes=False, memory_limit=None, **settings) as cluster:
+        yield cluster.scheduler_address
+
+
 @pytest.fixture
-def stand_in(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Tasks run `stand_in.py` instead of stillmap: what it does is written in the recordings."""
-    script = Path(__file__).with_name("stand_in.py")
-    monkeypatch.setattr(child, "_STILLMAP", (sys.executable, str(script)))
+def stand_in(workers: str, monkeypatch: pytest.MonkeyPatch, call) -> Callable[..., Any]:
+    """Calls `stillmap fleet` on workers that run `stand_in.py` instead of stillmap."""
+    monkeypatch.setattr("stillmap.cli.fleet.run_command", stand_ins.run_command)
+
+    def run(*words: object) -> subprocess.CompletedProcess[str]:
+        return call("fleet", *words, "--scheduler", workers)
+
+    return run
 
 
 def free_port() -> int:
@@ -132,17 +149,37 @@ def _answers(port: int) -> bool:
         return one.connect_ex(("127.0.0.1", port)) == 0
 
 
+def wait_until(condition: Callable[[], object], seconds: float = 60.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "waited for too long"
+        time.sleep(0.01)
+
+
+def children_of(pid: int) -> set[int]:
+    """The living processes below a process (Linux)."""
+    parents = {}
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):
+            state, parent = path.read_text().rpartition(")")[2].split()[:2]
+            if state != "Z":
+                parents[int(path.parent.name)] = int(parent)
+    below = {pid}
+    while new := {child for child, parent in parents.items() if parent in below} - below:
+        below |= new
+    return below - {pid}
+
+
 @pytest.fixture
 def dask_cluster(tmp_path: Path) -> Iterator[tuple[str, list[int]]]:
     """A scheduler and two workers as processes; its address and the ids of the workers."""
-    pytest.importorskip("distributed")
     port, processes = free_port(), []
     address = f"tcp://127.0.0.1:{port}"
     # found from any working directory, where stillmap is not installed
-    environment = {**os.environ, "PYTHONPATH": str(Path(child.__file__).parents[2])}
+    environment = {**os.environ, "PYTHONPATH": str(Path(stillmap.__file__).parents[1])}
 
     def run(*words: str) -> None:
-        command = [sys.executable, "-m", "distributed.cli." + words[0], *words[1:]]
+        command = [sys.executable, "-m", f"distributed.cli.{words[0]}", *words[1:]]
         quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
         processes.append(
             subprocess.Popen(

@@ -17,7 +17,7 @@ from stillmap.cli.main import main
 from stillmap.cli.parser import COMMANDS, parser
 
 PACKAGE = Path(stillmap.__file__).parent
-COMMAND_LINES = PACKAGE / "fleet" / "settings.py"  # of child processes
+COMMAND_LINES = PACKAGE / "fleet" / "tasks.py"  # of what workers run
 LIBRARY = [
     path for path in PACKAGE.rglob("*.py") if path.parent.name != "cli" and path != COMMAND_LINES
 ]

@@ -1,12 +1,9 @@
 """Known maps that hold what no map does are refused in one line that names the file."""
 
-import json
-
 import numpy as np
 import pytest
 
 from stillmap.core.errors import InputError
-from stillmap.fleet.summary import summarize_result
 from stillmap.live.known_cloud import KnownCloud
 from stillmap.live.known_map import KnownMap
 from stillmap.results.reader import read_grid
@@ -122,20 +119,3 @@ def test_poses_from_where_it_was_made(place, route):
     np.save(place / "live/known_route.npy", route)
     with pytest.raises(InputError, match=r"known_route\.npy"):
         open_cloud(place)
-
-
-@pytest.mark.parametrize("changes", [5, None, "many", {"kind": "door"}])
-@pytest.mark.parametrize("warnings", [5, None, [[1], {}]])
-def test_the_page_of_a_fleet_shows_what_can_be_shown(place, changes, warnings):
-    record = {"input": {}, "changes": changes, "warnings": warnings, "counts": 3, "area": [1]}
-    (place / "run.json").write_text(json.dumps({**record, "quality": {"overall": "good"}}))
-    shown = summarize_result(place)
-    assert shown["map"].startswith("data:image/png")
-    assert (shown["changes"], shown["warnings"], shown["quality"]) == (0, [], {})
-
-
-def test_a_turned_map_is_not_drawn(place):
-    put_map(place, origin=np.array([0.0, 0.0, 1.0]))
-    (place / "run.json").write_text('{"input": {}}')
-    with pytest.raises(InputError, match="turned by 1 rad"):
-        summarize_result(place)

@@ -4,9 +4,8 @@ import argparse
 import json
 import os
 import shlex
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stillmap.cli.arguments import (
@@ -21,7 +20,7 @@ from stillmap.core.errors import InputError
 
 if TYPE_CHECKING:
     from stillmap.fleet import Fleet, Request
-    from stillmap.fleet.manifest import Entry
+    from stillmap.fleet.inputs import Entry
     from stillmap.pipeline.options import Options
 
 EXIT_SOME_FAILED = 3
@@ -51,10 +50,10 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
         "inputs",
         metavar="INPUT",
         nargs="*",
-        help="a recording, a folder of recordings, a pattern in quotes; s3://BUCKET/... likewise",
+        help="a recording, a folder of recordings, a pattern in quotes; a URL likewise",
     )
     p.add_argument(
-        "-o", "--output", metavar="DIR", required=True, help="folder or s3:// URL of all results"
+        "-o", "--output", metavar="DIR", required=True, help="folder or URL of all results"
     )
     p.add_argument(
         "--manifest", metavar="FILE", help="list of recordings, each with its place: CSV or JSON"
@@ -72,14 +71,6 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument(
         "--threads", metavar="N", type=int, default=1, help="of each recording (default: 1)"
     )
-    p.add_argument(
-        "--memory",
-        dest="memory_of_tasks",
-        metavar="GB",
-        type=float,
-        help="memory of all recordings at once (default: what the machine has): fewer run at once, "
-        "and none takes more",
-    )
     p.add_argument("--json", action="store_true", help="the content of fleet.json on stdout")
     p.add_argument("--quiet", action="store_true", help="no progress, no summary")
     add_method_flags(p.add_argument_group("method"))
@@ -90,12 +81,10 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Map the recordings."""
-    from stillmap.fleet import Reporter, run_fleet
+    from stillmap.fleet import run_fleet
 
-    request = _read_request(args)
     with _explain_interruption(args), show_tasks(args.quiet) as progress:
-        report = Reporter(_ignore if args.quiet else say, fail, progress)
-        fleet = run_fleet(request, report)
+        fleet = run_fleet(_read_request(args, progress))
     if not args.quiet:
         _print_summary(fleet, args.output)
     if args.json:
@@ -103,13 +92,24 @@ def run(args: argparse.Namespace) -> int:
     return EXIT_SOME_FAILED if fleet.failed else 0
 
 
-def _ignore(line: str) -> None:
-    """Drop a line."""
+def run_command(words: list[str]) -> None:
+    """Run a command line of stillmap on a worker.
+
+    Raises:
+        InputError: an input is at fault.
+    """
+    from stillmap.cli.parser import parser
+
+    args = parser([words[0]]).parse_args(words)
+    args.words = words
+    args.run(args)
 
 
-def _read_request(args: argparse.Namespace) -> "Request":
+def _read_request(
+    args: argparse.Namespace, progress: Callable[[str, int, int, str], None]
+) -> "Request":
     from stillmap.core.parallel import resolve_threads
-    from stillmap.fleet import Request, Settings
+    from stillmap.fleet import Request
 
     if args.poses not in (None, "recording"):
         raise InputError("--poses FILE is for one recording", hint="--poses recording is possible")
@@ -117,14 +117,17 @@ def _read_request(args: argparse.Namespace) -> "Request":
         raise InputError(f"--jobs must be 1 to 1024, got {args.jobs}")
     if args.jobs is not None and args.scheduler:
         raise InputError("--jobs and --scheduler exclude each other")
-    options = options_from_args(args)
+    options = _changed_options(options_from_args(args))
+    odometry = ["--no-odometry"] if args.no_odometry else []
+    poses = ["--poses", "recording"] if args.poses else []
     return Request(
         entries=_read_entries(args),
         output=args.output,
-        settings=Settings(
-            _changed_options(options), not args.no_odometry, bool(args.poses), args.memory_of_tasks
-        ),
-        resolution=options.slam.resolution,
+        command=run_command,
+        fail=fail,
+        progress=progress,
+        map_flags=(*options, *odometry, *poses),
+        merge_flags=tuple(options),
         jobs=args.jobs or resolve_threads(0),
         scheduler=args.scheduler,
     )
@@ -132,29 +135,30 @@ def _read_request(args: argparse.Namespace) -> "Request":
 
 def _read_entries(args: argparse.Namespace) -> "list[Entry]":
     """The recordings that the command line and the manifest name."""
-    from stillmap.fleet.inputs import entries_of
-    from stillmap.fleet.manifest import read_manifest
+    from stillmap.fleet.inputs import Entry, read_manifest
+    from stillmap.fleet.locations import absolute
 
     if not args.inputs and not args.manifest:
         raise InputError("names no recording", hint="give INPUTs or --manifest FILE")
     if args.merge and args.manifest:
         raise InputError("--merge is for INPUTs", hint="the manifest names the place of each")
-    entries = [] if args.manifest is None else read_manifest(Path(args.manifest))
-    return [*entries, *entries_of(args.inputs, _ALL if args.merge else None)]
+    place = _ALL if args.merge else None
+    entries = [Entry(absolute(location), place) for location in args.inputs]
+    return [*(read_manifest(args.manifest) if args.manifest else ()), *entries]
 
 
-def _changed_options(options: "Options") -> tuple[tuple[str, str], ...]:
-    """Name and JSON value of every option that is not the default."""
+def _changed_options(options: "Options") -> list[str]:
+    """A flag for every option that is not the default."""
     from stillmap.core.config import iter_options
 
-    changed = []
-    for one in iter_options(options):
-        value = one.value
-        if one.name == "read.cameras" and value is not None:
+    flags = []
+    for option in iter_options(options):
+        value = option.value
+        if option.name == "read.cameras" and value is not None:
             value = os.path.abspath(value)
-        if value != one.default:
-            changed.append((one.name, json.dumps(value, ensure_ascii=False)))
-    return tuple(changed)
+        if value != option.default:
+            flags.append(f"--set={option.name}={json.dumps(value, ensure_ascii=False)}")
+    return flags
 
 
 @contextmanager
@@ -169,7 +173,7 @@ def _explain_interruption(args: argparse.Namespace) -> Iterator[None]:
 
 
 def _print_summary(fleet: "Fleet", output: str) -> None:
-    done = sum(job.is_done for job in fleet.jobs)
+    done = sum(job.outcome.is_done for job in fleet.jobs)
     lines = [f"mapped {done} of {len(fleet.jobs)} recordings"]
     if fleet.places:
         merged = sum(place.is_done for place in fleet.places)

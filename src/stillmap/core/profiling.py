@@ -7,7 +7,8 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import IO, Any, Protocol
 
 # stage, iteration (0: outside the loop), scans done, of how many (0: not counted)
@@ -194,3 +195,9 @@ class _Lines:
         self._say(
             text if done == total else f"{text}, {(total - done) / max(rate, 1e-3):.0f} s left"
         )
+
+
+def reset_peak_memory() -> None:
+    """Forget the peak memory of this process so far; without effect where there is no Linux."""
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")

@@ -1,7 +1,6 @@
-"""Many recordings mapped, and merged per place: `stillmap fleet`."""
+"""Many recordings mapped, and merged per place, by Dask: `stillmap fleet`."""
 
-from stillmap.fleet.jobs import Fleet, Reporter, Request
+from stillmap.fleet.jobs import Fleet, Request
 from stillmap.fleet.run import run_fleet
-from stillmap.fleet.settings import Settings
 
-__all__ = ["Fleet", "Reporter", "Request", "Settings", "run_fleet"]
+__all__ = ["Fleet", "Request", "run_fleet"]

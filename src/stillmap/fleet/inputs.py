@@ -1,46 +1,122 @@
 """From folders, patterns, URLs and manifests to single recordings, each with a name."""
 
-import glob
-import os
-from collections.abc import Iterable, Iterator
+import csv
+import io
+import json
+import re
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
 
 from stillmap.core.errors import InputError
-from stillmap.fleet.manifest import Entry
-from stillmap.fleet.storage import RECORD
-from stillmap.fleet.urls import (
-    has_wildcards,
-    is_url,
-    make_absolute,
-    make_unique,
-    short_name,
+from stillmap.core.input_files import read_text
+from stillmap.fleet.locations import (
+    absolute,
+    explain,
+    is_component,
+    is_folder_name,
+    is_local,
+    list_files,
+    open_location,
 )
 from stillmap.io.registry import FORMATS, is_recording
 
+_MAX_MANIFEST = 64 << 20  # bytes
 # no other files than recordings have them; the second only mostly
 _SURE_ENDINGS = (".bag", ".db3", ".mcap", ".clf", ".clf.gz", ".pcd", ".las", ".laz", ".e57")
 _USUAL_ENDINGS = (".log", ".log.gz", ".ply", ".3d", ".3d.gz")
-_PLACEHOLDERS = 200  # files of a folder that are enough to recognise its format
+# endings that are left out of a name, one after the other
+_ENDINGS = re.compile(
+    r"(\.(log|clf|txt|gz|bag|db3|mcap|pcd|ply|las|laz|e57|3d|zstd|zst))+$", re.IGNORECASE
+)
 
 
-class Source(NamedTuple):
-    """A recording of the fleet.
+class Entry(NamedTuple):
+    """A recording, or a folder or pattern of several.
 
     Attributes:
         input: absolute path, or URL.
-        name: of its result; unique.
-        place: name of the place that it is merged into; None: it is not merged.
+        place: name of the place it is merged into; None: it is not merged.
+        where: the manifest and its line; empty: from the command line.
     """
+
+    input: str
+    place: str | None
+    where: str = ""
+
+
+class Source(NamedTuple):
+    """A recording of the fleet: its absolute path or URL, the unique name of its result, and the
+    place that it is merged into, if any."""
 
     input: str
     name: str
     place: str | None
 
 
-def entries_of(inputs: Iterable[str], place: str | None) -> list[Entry]:
-    """Inputs of the command line, all of the same place."""
-    return [Entry(make_absolute(one), place, "") for one in inputs]
+def read_manifest(location: str) -> list[Entry]:
+    """Read a list of recordings, each with its place; relative paths count from its folder.
+
+    Args:
+        location: path or URL of a CSV file with a heading `input` or `input,place`, or of a JSON
+            file with a list of objects with these keys.
+
+    Raises:
+        InputError: names the line, or in JSON the number of the entry.
+    """
+    fs, path = open_location(location)
+    try:
+        if is_local(location):
+            text = read_text(Path(path), _MAX_MANIFEST)
+        else:
+            with explain(location, "read"):
+                text = fs.cat_file(path, end=_MAX_MANIFEST).decode()
+    except UnicodeDecodeError as error:
+        raise InputError("is not UTF-8", where=location) from error
+    rows = _read_json if location.lower().endswith(".json") else _read_csv
+    folder = absolute(location).rpartition("/")[0]
+    entries = [_entry(folder, row, where) for row, where in rows(location, text)]
+    if not entries:
+        raise InputError("names no recording", where=location)
+    return entries
+
+
+def _read_csv(location: str, text: str) -> Iterator[tuple[Any, str]]:
+    reader = csv.DictReader(io.StringIO(text.removeprefix("\ufeff"), newline=""), strict=True)
+    try:
+        for row in reader:
+            where = f"{location}:{reader.line_num}"
+            if None in row or None in row.values():
+                raise InputError("has another number of columns than the heading", where=where)
+            yield row, where
+    except csv.Error as error:
+        where = f"{location}:{reader.reader.line_num}"
+        raise InputError(f"is not CSV: {error}", where=where) from error
+
+
+def _read_json(location: str, text: str) -> Iterator[tuple[Any, str]]:
+    try:
+        rows = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"is not JSON: {error}", where=location) from error
+    for number, row in enumerate(rows if isinstance(rows, list) else [rows], 1):
+        yield row, f"{location}: entry {number}"
+
+
+def _entry(folder: str, row: Any, where: str) -> Entry:
+    if not isinstance(row, dict) or "input" not in row or row.keys() - {"input", "place"}:
+        raise InputError("has not the columns `input` and `place`", where=where)
+    source, place = row["input"], row.get("place") or None
+    if not isinstance(source, str) or not source.strip():
+        raise InputError("names no recording", where=where)
+    if place is not None and not (isinstance(place, str) and is_folder_name(place)):
+        hint = "letters, digits, and - _ . inside"
+        raise InputError(f"place {place!r} is no name of a folder", where=where, hint=hint)
+    source = source.strip()
+    if "://" not in source and not source.startswith("/"):
+        source = f"{folder}/{source}"
+    return Entry(absolute(source), place, where)
 
 
 def find_sources(entries: Iterable[Entry], names: dict[str, str]) -> list[Source]:
@@ -48,125 +124,92 @@ def find_sources(entries: Iterable[Entry], names: dict[str, str]) -> list[Source
 
     Args:
         entries: recordings, folders of recordings, and patterns.
-        names: those of earlier runs by input; they stay.
+        names: those of earlier runs by input; they stay, even of recordings not given now.
 
     Raises:
-        InputError: a folder or pattern without a recording, a bucket that cannot be read, or a
+        InputError: a folder or pattern without a recording, storage that cannot be read, or a
             recording that is given to two places.
     """
     places: dict[str, str | None] = {}
     for entry in entries:
-        for found in _expand(entry):
-            if found in places and places[found] != entry.place:
-                what = f"{found} is in two places: {places[found]} and {entry.place}"
+        for source in _expand(entry.input):
+            if places.setdefault(source, entry.place) != entry.place:
+                what = f"{source} is in two places: {places[source]} and {entry.place}"
                 raise InputError(what, where=entry.where)
-            places[found] = entry.place
-    # a result of an earlier run keeps its name even if it is not asked for now
-    taken, given = {name.casefold() for name in names.values()}, set[str]()
-    sources = []
-    for one, place in places.items():
-        name = names.get(one, "")
-        if not name or name.casefold() in given:
-            name = make_unique(short_name(one), taken)
-        given.add(name.casefold())
-        sources.append(Source(one, name, place))
+    taken = {name.casefold() for name in names.values()}
+    return [
+        Source(source, names.get(source) or make_unique(short_name(source), taken), place)
+        for source, place in places.items()
+    ]
+
+
+def short_name(location: str) -> str:
+    """The last part of a path or URL without the endings of recordings, fit for a folder's name."""
+    last = location.rstrip("/").rpartition("/")[2]
+    stem = re.sub(r"[^\w.-]", "_", _ENDINGS.sub("", last) or last).lstrip(".-")[:100]
+    return stem or "recording"
+
+
+def make_unique(name: str, taken: set[str]) -> str:
+    """`name`, or `name-2`, `name-3`, ... where it is taken; case does not matter."""
+    unique, number = name, 1
+    while unique.casefold() in taken:
+        number += 1
+        unique = f"{name}-{number}"
+    taken.add(unique.casefold())
+    return unique
+
+
+def _expand(location: str) -> list[str]:
+    fs, path = open_location(location)
+    with explain(location, "read"):
+        is_pattern = re.search(r"[*?[]", location) is not None and not fs.exists(path)
+        matches = sorted(fs.glob(path)) if is_pattern else [path]
+        if not matches:
+            raise InputError("matches no file or folder", where=location)
+        sources = [source for match in matches for source in _inside(fs, match, is_pattern)]
+    if not sources:
+        hint = "`stillmap info -h` lists formats"
+        raise InputError("holds no recording", where=location, hint=hint)
     return sources
 
 
-def _expand(entry: Entry) -> list[str]:
-    try:
-        return _expand_url(entry.input) if is_url(entry.input) else _expand_path(entry.input)
-    except InputError as error:
-        if not entry.where:
-            raise
-        raise InputError(f"{error.where}: {error.what}", where=entry.where) from error
-
-
-def _expand_path(text: str) -> list[str]:
-    if os.path.lexists(text) or not has_wildcards(text):
-        return list(_inside(text))
-    found = sorted(glob.glob(text))
-    if not found:
-        raise InputError("matches no file or folder", where=text)
-    return _require_some(text, [one for path in found for one in _inside(path, is_pattern=True)])
-
-
-def _inside(text: str, is_pattern: bool = False) -> Iterator[str]:
+def _inside(fs: Any, path: str, is_pattern: bool) -> list[str]:
     """A recording itself, or those in a folder. A missing file fails later, alone."""
-    path = Path(text)
-    if not path.is_dir() or _is_candidate(path):
-        if not is_pattern or _is_candidate(path):
-            yield text
-        return
-    found = [str(one) for one in _list_folder(path) if _is_candidate(one)]
-    yield from found if is_pattern else _require_some(text, found)
+    local = "file" in fs.protocol
+    url = path if local else str(fs.unstrip_protocol(path))
+    if not fs.isdir(path):
+        is_candidate = _is_candidate if local else _is_named_like_one
+        return [url] if not is_pattern or is_candidate(Path(path)) else []
+    if local:
+        names = _recordings_in(Path(path), _is_candidate)
+    else:
+        with TemporaryDirectory(prefix="stillmap-") as scratch:
+            for name in list_files(url):  # the formats of folders are recognised by names alone
+                (Path(scratch) / name).parent.mkdir(parents=True, exist_ok=True)
+                (Path(scratch) / name).touch()
+            names = _recordings_in(Path(scratch), _is_named_like_one)
+    return [f"{url}/{name}" if name else url for name in names]
+
+
+def _recordings_in(folder: Path, is_candidate: Callable[[Path], bool]) -> list[str]:
+    """Names of the recordings in a folder; an empty one: it is a recording itself."""
+    if is_candidate(folder):
+        return [""]
+    inside = (path for path in folder.iterdir() if not path.name.startswith("."))
+    return sorted(path.name for path in inside if is_component(path.name) and is_candidate(path))
 
 
 def _is_candidate(path: Path) -> bool:
     """Whether an entry of a folder is to be mapped; damaged files are, to be reported."""
     if path.is_dir():
-        return is_recording(path) and not (path / RECORD).is_file()  # clouds of a result
+        return is_recording(path) and not (path / "run.json").is_file()  # clouds of a result
     return path.name.lower().endswith(_SURE_ENDINGS) or is_recording(path)
 
 
-def _list_folder(path: Path) -> list[Path]:
-    try:
-        return sorted(one for one in path.iterdir() if not one.name.startswith("."))
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
-
-
-def _require_some(text: str, found: list[str]) -> list[str]:
-    if not found:
-        raise InputError("holds no recording", where=text, hint="`stillmap info -h` lists formats")
-    return found
-
-
-def _expand_url(url: str) -> list[str]:
-    from stillmap.fleet import bucket
-
-    matches = bucket.expand_pattern(url) if has_wildcards(url) else [url]
-    if not matches:
-        raise InputError("matches no file or folder", where=url)
-    found: list[str] = []
-    for match in matches:
-        files = [one.name for one in bucket.list_files(match)]
-        if files in ([], [""]):  # nothing, which fails later, or a file
-            found += [match] if match == url or _has_name_of_file(match) else []
-        else:
-            found += _recordings_below(match, files)
-    return _require_some(url, found)
-
-
-def _recordings_below(url: str, names: list[str]) -> list[str]:
-    """The recordings in a listing, recognised by names alone: its folders as empty files."""
-    from stillmap.fleet.bucket import local_scratch
-
-    with local_scratch() as scratch:
-        _make_placeholders(scratch, names)
-        if any(known.matches(scratch, None) for known in FORMATS):
-            return [url]
-        return [f"{url}/{one.name}" for one in _list_folder(scratch) if _is_named_so(one)]
-
-
-def _make_placeholders(folder: Path, names: list[str]) -> None:
-    count: dict[Path, int] = {}
-    for name in names:
-        path = folder / name
-        number = count[path.parent] = count.get(path.parent, 0) + 1
-        # files directly below may be recordings each
-        if number <= _PLACEHOLDERS or path.parent == folder:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.touch()
-
-
-def _is_named_so(path: Path) -> bool:
+def _is_named_like_one(path: Path) -> bool:
     """Whether an empty file or folder has the name, or the inside, of a recording."""
     if path.is_dir():
-        return any(known.matches(path, None) for known in FORMATS)
-    return _has_name_of_file(path.name)
-
-
-def _has_name_of_file(text: str) -> bool:
-    """Whether a path or URL ends as files of recordings do."""
-    return text.lower().endswith((*_SURE_ENDINGS, *_USUAL_ENDINGS))
+        matches = any(known.matches(path, None) for known in FORMATS)
+        return matches and not (path / "run.json").is_file()
+    return path.name.lower().endswith((*_SURE_ENDINGS, *_USUAL_ENDINGS))

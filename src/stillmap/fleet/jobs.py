@@ -1,14 +1,13 @@
-"""The job of a fleet, the state of its recordings and places, and its result."""
+"""The job of a fleet, how its tasks end, and its result."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
-from stillmap.fleet.artifacts import PLACES, RESULTS
-from stillmap.fleet.inputs import Source
-from stillmap.fleet.manifest import Entry
-from stillmap.fleet.outcomes import Outcome
-from stillmap.fleet.settings import Settings
+from stillmap.fleet.inputs import Entry, Source
+
+_FACTS = ("scans", "beams", "duration_s", "bytes")  # in `fleet.json`
+RESULTS, PLACES = "results", "places"  # folders of the fleet
 
 
 class Request(NamedTuple):
@@ -17,61 +16,58 @@ class Request(NamedTuple):
     Attributes:
         entries: recordings, folders and patterns of them, with their places.
         output: folder or URL of the fleet.
-        settings: how the recordings are mapped.
-        resolution: edge of a cell in metres.
+        command: runs a command line of stillmap on a worker; a function of a module.
+        map_flags, merge_flags: flags of `map` and `merge`.
         jobs: local processes at once.
         scheduler: address of a Dask scheduler; empty: local processes.
-    """
-
-    entries: Sequence[Entry]
-    output: str
-    settings: Settings
-    resolution: float
-    jobs: int
-    scheduler: str = ""
-
-
-class Reporter(NamedTuple):
-    """Where a fleet reports to.
-
-    Attributes:
-        say: takes a line about the whole.
         fail: takes a line about a recording or a place that failed.
         progress: takes what is done, how many of how many have ended, and the name of the last one.
     """
 
-    say: Callable[[str], None]
+    entries: Sequence[Entry]
+    output: str
+    command: Callable[[list[str]], None]
     fail: Callable[[str], None]
     progress: Callable[[str, int, int, str], None]
+    map_flags: tuple[str, ...] = ()
+    merge_flags: tuple[str, ...] = ()
+    jobs: int = 1
+    scheduler: str = ""
 
 
-@dataclass
-class Job:
-    """A recording on its way through the fleet.
+@dataclass(frozen=True)
+class Outcome:
+    """How a task ended.
 
     Attributes:
-        source: the recording.
-        fingerprint: see `content.fingerprint`.
-        info: its summary, see `stillmap info --json`; empty where it cannot be read.
-        key: of its result.
-        outcome: how inspecting it failed, or mapping it ended; None: not yet.
+        status: `done` or `failed`.
+        why: one line; empty where it is done.
+        key: of what the result was made from.
+        input: its recording, or the first of them.
+        cpu_seconds: of its worker meanwhile.
+        peak_memory_bytes: of its worker.
+        summary: of the result, JSON-able.
     """
 
-    source: Source
-    fingerprint: str = ""
-    info: dict[str, Any] = field(default_factory=dict)
+    status: Literal["done", "failed"]
+    why: str = ""
     key: str = ""
-    outcome: Outcome | None = None
+    input: str = ""
+    cpu_seconds: float = 0.0
+    peak_memory_bytes: int = 0
+    summary: dict[str, Any] = field(default_factory=dict)
 
     @property
     def is_done(self) -> bool:
-        """Whether its result is there."""
-        return self.outcome is not None and self.outcome.status == "done"
+        """Whether the result is there."""
+        return self.status == "done"
 
-    @property
-    def duration(self) -> float:
-        """Seconds from its first scan to its last; 0 where it is not known."""
-        return float(self.info.get("time", {}).get("duration_s") or 0.0)
+
+class Job(NamedTuple):
+    """A recording, and how mapping it ended."""
+
+    source: Source
+    outcome: Outcome
 
 
 class Place(NamedTuple):
@@ -84,14 +80,14 @@ class Place(NamedTuple):
     @property
     def is_done(self) -> bool:
         """Whether its result is there."""
-        return self.outcome is not None and self.outcome.status == "done"
+        return self.outcome is not None and self.outcome.is_done
 
     @property
     def why(self) -> str:
         """Why there is no result."""
         if self.outcome is not None:
             return self.outcome.why
-        n = sum(job.is_done for job in self.jobs)
+        n = sum(job.outcome.is_done for job in self.jobs)
         return f"merging takes two maps, this place has {n or 'none'}"
 
 
@@ -104,32 +100,28 @@ class Fleet(NamedTuple):
     @property
     def failed(self) -> int:
         """How many recordings and places failed."""
-        outcomes = [*(job.outcome for job in self.jobs), *(one.outcome for one in self.places)]
-        return sum(one is not None and one.status != "done" for one in outcomes)
+        merged = [place.outcome for place in self.places if place.outcome is not None]
+        return sum(not one.is_done for one in [*(job.outcome for job in self.jobs), *merged])
 
     def to_list(self) -> list[dict[str, Any]]:
         """The content of `fleet.json`: an entry for each recording."""
-        places = {one.name: one for one in self.places}
+        places = {place.name: place for place in self.places}
         return [_describe(job, places.get(job.source.place or "")) for job in self.jobs]
 
 
 def _describe(job: Job, place: Place | None) -> dict[str, Any]:
-    outcome = job.outcome or Outcome("failed", "was not mapped")
+    source, outcome = job.source, job.outcome
     merged = place is not None and place.is_done
     return {
-        "input": job.source.input,
-        "name": job.source.name,
-        "place": job.source.place,
-        "status": "done" if job.is_done else "failed",
+        "input": source.input,
+        "name": source.name,
+        "place": source.place,
+        "status": outcome.status,
         "why": outcome.why,
-        "result": f"{RESULTS}/{job.source.name}" if job.is_done else None,
+        "result": f"{RESULTS}/{source.name}" if outcome.is_done else None,
         "cpu_seconds": round(outcome.cpu_seconds, 3),
         "peak_memory_bytes": outcome.peak_memory_bytes,
-        "scans": job.info.get("scans"),
-        "beams": job.info.get("beams"),
-        "duration_s": job.duration,
-        "bytes": job.info.get("bytes"),
-        "inspect_cpu_seconds": job.info.get("inspect_cpu_seconds"),
-        "place_result": f"{PLACES}/{place.name}" if place is not None and merged else None,
+        **{name: outcome.summary.get(name) for name in _FACTS},
+        "place_result": f"{PLACES}/{source.place}" if merged else None,
         "place_why": "" if place is None or merged else place.why,
     }

@@ -1,80 +1,214 @@
-"""A fleet from its inputs to its page: expand, inspect, plan, map, merge, write."""
+"""A fleet from its inputs to its page: find the recordings, map, merge, write."""
 
-from stillmap.core.files import to_encodable
+import hashlib
+import logging
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from stillmap.core.errors import InputError, import_extra
+from stillmap.core.files import atomic_file, to_encodable
 from stillmap.core.json import to_json
-from stillmap.fleet.backends import open_storage
-from stillmap.fleet.inputs import find_sources
-from stillmap.fleet.jobs import Fleet, Job, Reporter, Request
-from stillmap.fleet.journal import Journal
-from stillmap.fleet.local_executor import Executor, LocalExecutor
-from stillmap.fleet.manifest import is_file_name
-from stillmap.fleet.output import explain_full_disk, lock_output, require_fleet
+from stillmap.core.version import package_version
+from stillmap.fleet.inputs import Source, find_sources
+from stillmap.fleet.jobs import PLACES, RESULTS, Fleet, Job, Outcome, Place, Request
+from stillmap.fleet.locations import absolute, explain, is_folder_name, is_local, open_location
 from stillmap.fleet.page import render_page
-from stillmap.fleet.phases import inspect, map_recordings, merge_places, plan
-from stillmap.fleet.storage import Storage
+from stillmap.fleet.tasks import MADE, STAGING, Task, read_made, run_task
 
 LIST, PAGE = "fleet.json", "fleet.html"
+# Ctrl-C at a terminal reaches all processes: the client alone ends its workers
+_PRELOAD = ["import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"]
+_TIMEOUT = 15  # s for the scheduler to answer
 
 
-def run_fleet(request: Request, report: Reporter) -> Fleet:
+def run_fleet(request: Request) -> Fleet:
     """Map every recording, merge each place, and write `fleet.json` and `fleet.html`.
 
     Raises:
-        InputError: the output is taken or in use, an input holds no recording, a disk is full, a
-            bucket refuses, no scheduler answers. What was finished stays, and the same request goes
-            on from there.
+        InputError: the output is taken or in use, an input holds no recording, the storage refuses,
+            no scheduler answers. What was finished stays, and the same request goes on from there.
         KeyboardInterrupt: likewise.
     """
-    storage = open_storage(request.output)
-    journal = Journal(storage)
-    require_fleet(storage, journal)
-    jobs = [Job(source) for source in find_sources(request.entries, _known_names(journal))]
-    with lock_output(storage), explain_full_disk(storage):
-        executor = _open_executor(request, storage)
-        try:
-            _note_start(jobs, journal)
-            inspect(jobs, request, executor, journal, report)
-            waiting = plan(jobs, request, executor, storage, report)
-            map_recordings(waiting, request, storage, executor, journal, report)
-            places = merge_places(jobs, request, storage, executor, journal, report)
-        finally:
-            executor.close()
-        fleet = Fleet(jobs, places)
-        _write(fleet, storage)
-        return fleet
+    root = absolute(request.output)
+    _require_fleet(root)
+    sources = find_sources(request.entries, _known_names(root))
+    with _remove_unfinished(root, request), _open_client(request) as client:
+        tasks = [
+            Task("map", source.name, (source.input,), root, request.map_flags)
+            for source in sorted(sources, key=_size, reverse=True)
+        ]
+        mapped = _run_tasks(client, tasks, request)
+        jobs = [Job(source, mapped[source.name]) for source in sources]
+        places = _merge_places(client, jobs, root, request)
+    fleet = Fleet(jobs, places)
+    _write(root, LIST, to_json(fleet.to_list(), indent=2) + "\n")
+    _write(root, PAGE, to_encodable(render_page(fleet)))
+    return fleet
 
 
-def _open_executor(request: Request, storage: Storage) -> Executor:
+def _require_fleet(root: str) -> None:
+    """Refuse an output that holds other things than a fleet."""
+    fs, path = open_location(root)
+    with explain(root, "read"):
+        if not fs.exists(path):
+            return
+        if not fs.isdir(path):
+            raise InputError("is in the way: not a folder", where=root)
+        names = {str(one).rstrip("/").rpartition("/")[2] for one in fs.ls(path, detail=False)}
+    if names - {RESULTS, PLACES, LIST, PAGE, path.rpartition("/")[2]}:
+        hint = "choose another; a fleet's own folder is continued"
+        raise InputError("already holds something", where=root, hint=hint)
+
+
+def _known_names(root: str) -> dict[str, str]:
+    """The names of the results that are there, by input."""
+    fs, path = open_location(root)
+    with explain(root, "read"):
+        names = [str(one).split("/")[-2] for one in fs.glob(f"{path}/{RESULTS}/*/{MADE}")]
+    known = {name: read_made(root, f"{RESULTS}/{name}") for name in names if is_folder_name(name)}
+    return {made.input: name for name, made in known.items() if made is not None}
+
+
+def _size(source: Source) -> int:
+    """Bytes of a recording: the largest are mapped first."""
+    with suppress(Exception):  # it fails later, alone
+        fs, path = open_location(source.input)
+        return int(fs.du(path))
+    return 0
+
+
+@contextmanager
+def _remove_unfinished(root: str, request: Request) -> Iterator[None]:
+    """Remove what killed workers left, at the end of the block."""
+    ended = not request.scheduler  # an interruption does not end the tasks of a scheduler
+    try:
+        yield
+        ended = True
+    finally:
+        folder = Path(open_location(root)[1])
+        for path in folder.glob(f"*/{STAGING}*") if ended and is_local(root) else ():
+            shutil.rmtree(path, ignore_errors=True)
+
+
+@contextmanager
+def _open_client(request: Request) -> Iterator[Any]:
+    """A client of the given scheduler, or of worker processes of this machine."""
+    dask = import_extra("distributed", "stillmap fleet", "run", group="fleet")
+    for name in ("distributed", "distributed.client", "tornado", "asyncio"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # outcomes say what they report
     if not request.scheduler:
-        storage.remove_unfinished()
-        return LocalExecutor(request.jobs)
-    from stillmap.fleet.dask_executor import DaskExecutor
+        with (
+            dask.LocalCluster(
+                n_workers=request.jobs,
+                threads_per_worker=1,
+                memory_limit=None,
+                dashboard_address="127.0.0.1:0",
+                security=True,
+                silence_logs=logging.CRITICAL,
+                preload=_PRELOAD,
+            ) as cluster,
+            dask.Client(cluster, set_as_default=False) as client,
+        ):
+            yield client
+        return
+    try:
+        client = dask.Client(request.scheduler, timeout=_TIMEOUT, set_as_default=False)
+    except (OSError, TimeoutError, ValueError, TypeError) as error:
+        what, hint = f"no Dask scheduler answers: {error}", "as in tcp://HOST:8786"
+        raise InputError(what, where=request.scheduler, hint=hint) from error
+    with client:
+        if not client.nthreads():
+            hint = f"start some: dask worker {request.scheduler}"
+            raise InputError("this scheduler has no worker", where=request.scheduler, hint=hint)
+        _require_version(client, request.scheduler)
+        yield client
 
-    return DaskExecutor(request.scheduler)
+
+def _require_version(client: Any, address: str) -> None:
+    hint = "install this version, and what else the client has, on all of them"
+    try:
+        versions = set(client.run(package_version).values())
+    except Exception as error:
+        what = f"a worker does not know stillmap: {error}"
+        raise InputError(what, where=address, hint=hint) from error
+    if versions != {package_version()}:
+        what = f"the workers have stillmap {', '.join(sorted(versions))}, not {package_version()}"
+        raise InputError(what, where=address, hint=hint)
 
 
-def _known_names(journal: Journal) -> dict[str, str]:
-    """The names of recordings by input, as earlier runs gave them."""
-    return {
-        entry["input"]: entry["name"]
-        for entry in journal.find("named")
-        if isinstance(entry.get("input"), str)
-        and isinstance(entry.get("name"), str)
-        and is_file_name(entry["name"])
-    }
+def _run_tasks(client: Any, tasks: Sequence[Task], request: Request) -> dict[str, Outcome]:
+    """Run tasks, never more at once than there are threads: a worker that dies takes no other with
+    it. Dask runs its task again, as often as `distributed.scheduler.allowed-failures` says.
+    """
+    dask = import_extra("distributed", "stillmap fleet", "run", group="fleet")
+    waiting, running = list(reversed(tasks)), dict[Any, Task]()
+    ended, outcomes = dask.as_completed(loop=client.loop), dict[str, Outcome]()
+    while waiting or running:
+        while waiting and len(running) < max(1, sum(client.nthreads().values())):
+            task = waiting.pop()
+            key = f"{task.command}-{hashlib.sha256(repr(task).encode()).hexdigest()}"
+            future = client.submit(run_task, task, request.command, key=key)
+            running[future] = task
+            ended.add(future)
+        future = next(ended)
+        task = running.pop(future)
+        outcome = outcomes[task.name] = _outcome(future, client, request)
+        if not outcome.is_done:
+            request.fail(f"{'place ' * (task.command == 'merge')}{task.name}: {outcome.why}")
+        what = "mapping" if task.command == "map" else "merging"
+        request.progress(what, len(outcomes), len(tasks), task.name)
+    return outcomes
 
 
-def _note_start(jobs: list[Job], journal: Journal) -> None:
-    known = _known_names(journal)
-    journal.note("started", recordings=len(jobs))
+def _outcome(future: Any, client: Any, request: Request) -> Outcome:
+    """How a task ended.
+
+    Raises:
+        InputError: the scheduler is gone.
+    """
+    dask = import_extra("distributed", "stillmap fleet", "run", group="fleet")
+    try:
+        outcome: Outcome = future.result()
+        return outcome
+    except dask.KilledWorker as error:
+        attempts = error.allowed_failures + 1
+        return Outcome("failed", f"its worker died {attempts} times: is there enough memory?")
+    except (Exception, dask.CancelledError) as error:
+        if client.status != "running" or future.cancelled():
+            hint = "start it, then continue with the same command"
+            what = "the Dask scheduler is gone"
+            raise InputError(what, where=request.scheduler, hint=hint) from error
+        return Outcome("failed", f"its worker could not run it: {error}")
+
+
+def _merge_places(client: Any, jobs: Sequence[Job], root: str, request: Request) -> list[Place]:
+    """Merge the results of every place that has two of them."""
+    members: dict[str, list[Job]] = {}
     for job in jobs:
-        if known.get(job.source.input) != job.source.name:
-            journal.note("named", input=job.source.input, name=job.source.name)
+        if job.source.place is not None:
+            members.setdefault(job.source.place, []).append(job)
+    tasks = []
+    for name, of_place in members.items():
+        done = [job for job in of_place if job.outcome.is_done]
+        if len(done) < 2:
+            continue
+        sources = tuple(job.source.input for job in done)
+        results = tuple(job.source.name for job in done)
+        keys = tuple(job.outcome.key for job in done)
+        tasks.append(Task("merge", name, sources, root, request.merge_flags, results, keys))
+    outcomes = _run_tasks(client, tasks, request)
+    return [Place(name, of_place, outcomes.get(name)) for name, of_place in members.items()]
 
 
-def _write(fleet: Fleet, storage: Storage) -> None:
-    """Write the list and the page, and remove what killed processes left."""
-    content = to_json(fleet.to_list(), indent=2)
-    storage.write(LIST, content.encode() + b"\n")
-    storage.write(PAGE, to_encodable(render_page(fleet)).encode())
-    storage.remove_unfinished()
+def _write(root: str, name: str, text: str) -> None:
+    """Write a file of the fleet, whole or not at all."""
+    fs, path = open_location(root)
+    if is_local(root):
+        with atomic_file(Path(path, name)) as work:
+            work.write_text(text, encoding="utf-8")
+        return
+    with explain(f"{root}/{name}", "written"):
+        fs.pipe_file(f"{path}/{name}", text.encode())

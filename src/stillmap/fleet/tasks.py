@@ -1,253 +1,222 @@
-"""The tasks of a fleet: inspect a recording, map it, merge the results of a place.
+"""The tasks of a fleet, which Dask's workers run: map a recording, merge the results of a place.
 
-A task is a few strings, so that it can be sent to another machine, where `run_task` runs it. The
-work is done by `stillmap` itself in a child process. Nothing of a task that was killed counts: its
-result appears whole or not at all.
+A result is made in a hidden folder beside its place (locally) or in a temporary one (for a URL) and
+then takes its place; `made.json` in it says what it was made from. It is made again only where that
+differs.
 """
 
 import hashlib
 import html
 import json
-import threading
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+import logging
+import os
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
+from typing import Any, Literal
 
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
+
+from stillmap.core.advice import split_advice
 from stillmap.core.errors import InputError
-from stillmap.core.files import to_encodable, write_text
-from stillmap.core.input_files import read_bytes, read_text
+from stillmap.core.files import write_text
+from stillmap.core.input_files import read_text
 from stillmap.core.json import to_json
+from stillmap.core.profiling import peak_memory_bytes, reset_peak_memory
 from stillmap.core.version import package_version
-from stillmap.fleet.artifacts import PLACES, RESULTS, find_result, write_label
-from stillmap.fleet.backends import open_storage
-from stillmap.fleet.child import Stopped, run_stillmap
-from stillmap.fleet.content import fingerprint, hash_content
-from stillmap.fleet.outcomes import Outcome, outcome_of, outcome_of_error
-from stillmap.fleet.settings import Settings, info_command, map_command, merge_command
-from stillmap.fleet.storage import RECORD, Storage
-from stillmap.fleet.summary import summarize_result, summarize_sessions
-from stillmap.fleet.urls import is_url
+from stillmap.fleet.jobs import PLACES, RESULTS, Outcome
+from stillmap.fleet.locations import explain, fetch, hash_content, is_local, open_location
+from stillmap.results.reader import read_grid
+from stillmap.results.report.figures import data_uri, draw_map, map_window
+from stillmap.results.run_record import read_record
 
+MADE = "made.json"  # of each result of a fleet
+STAGING = ".part-"  # begins the names of unfinished results
 _MAX_BYTES = 1 << 30  # of a record or report
-
-Stop = threading.Event | None
-
-
-@dataclass(frozen=True)
-class Inspect:
-    """Find out what a recording holds.
-
-    Attributes:
-        name: of the recording in the fleet.
-        source: its absolute path, or URL.
-        fingerprint: see `content.fingerprint`.
-        settings: how it is read.
-        version: of stillmap on the machine that asks.
-    """
-
-    name: str
-    source: str
-    fingerprint: str
-    settings: Settings
-    version: str = package_version()
-
-    def run(self, stop: Stop) -> Outcome:
-        with _local_source(self.source) as path, ThreadPoolExecutor(1) as pool:
-            # both at once: what one of them has read, the other one finds in memory
-            hashing = pool.submit(hash_content, path)
-            ended = run_stillmap(info_command(path, self.settings), stop)
-            content = hashing.result()
-            outcome = _with_urls(outcome_of(ended), self.source, path)
-        if outcome.status != "done":
-            return outcome
-        found = {**json.loads(ended.stdout), "digest": content.digest, "bytes": content.size}
-        return replace(outcome, found=found)
+_outcome = TypeAdapter(Outcome)
+_PIXELS, _GREYS = 90_000, 16  # of the small map of the page, at most
 
 
 @dataclass(frozen=True)
-class Map:
-    """Map a recording into `results/NAME`.
+class Task:
+    """Make `results/NAME` or `places/NAME`.
 
     Attributes:
-        name: of the result.
-        source, fingerprint: see `Inspect`.
-        settings: how it is mapped.
-        key: see `artifacts.key_of`.
+        command: what is run.
+        name: of the result or place.
+        sources: absolute paths or URLs of the recordings.
+        results: names of the results that are merged, in the order of `sources`.
+        content: their keys.
+        flags: of the command.
         root: folder or URL of the fleet.
-        version: of stillmap on the machine that asks.
     """
 
+    command: Literal["map", "merge"]
     name: str
-    source: str
-    fingerprint: str
-    settings: Settings
-    key: str
-    root: str
-    version: str = package_version()
-
-    def run(self, stop: Stop) -> Outcome:
-        storage, name = open_storage(self.root), f"{RESULTS}/{self.name}"
-        if label := find_result(storage, name, self.key):
-            return outcome_of_label(label)
-        if fingerprint(self.source) != self.fingerprint:
-            hint = "give the same command again"
-            raise InputError("has changed while the fleet ran", where=self.source, hint=hint)
-        with storage.attempt() as work, _local_source(self.source) as path:
-            result = work / "result"
-            ended = run_stillmap(map_command(path, result, self.settings), stop)
-            outcome = _with_urls(outcome_of(ended), self.source, path)
-            if outcome.status != "done":
-                return outcome
-            _replace_in_texts(result, {str(path): self.source})
-            return _publish(storage, name, self.key, result, summarize_result(result), outcome)
-
-
-@dataclass(frozen=True)
-class Merge:
-    """Merge the results of a place into `places/NAME`.
-
-    Attributes:
-        name: of the place.
-        results: names of the results.
-        sources: paths or URLs of their recordings, in the same order.
-        settings, key, root, version: see `Map`.
-    """
-
-    name: str
-    results: tuple[str, ...]
     sources: tuple[str, ...]
-    settings: Settings
-    key: str
     root: str
-    version: str = package_version()
+    flags: tuple[str, ...] = ()
+    results: tuple[str, ...] = ()
+    content: tuple[str, ...] = ()
 
-    def run(self, stop: Stop) -> Outcome:
-        storage, name = open_storage(self.root), f"{PLACES}/{self.name}"
-        if label := find_result(storage, name, self.key):
-            return outcome_of_label(label)
-        with storage.attempt() as work, ExitStack() as copies:
-            place, texts, folders = work / "result", dict[str, str](), list[Path]()
-            for result, source in zip(self.results, self.sources, strict=True):
-                folder = storage.local_folder(f"{RESULTS}/{result}", work)
-                if is_url(source):
-                    path = copies.enter_context(_local_source(source))
-                    folder = _point_to_copy(folder, work / "sessions" / result, source, path)
-                    texts[str(path)] = source
-                texts[str(folder)] = f"{storage.root}/{RESULTS}/{result}"
-                folders.append(folder)
-            ended = run_stillmap(merge_command(folders, place, self.settings), stop)
-            outcome = outcome_of(ended)
-            if outcome.status != "done":
-                return replace(outcome, why=_replace_all(outcome.why, texts))
-            _replace_in_texts(place, texts)
-            summary = {**summarize_result(place), "sessions": summarize_sessions(place)}
-            return _publish(storage, name, self.key, place, summary, outcome)
+    @property
+    def folder(self) -> str:
+        """The result, relative to the fleet."""
+        return f"{RESULTS if self.command == 'map' else PLACES}/{self.name}"
 
 
-Task = Inspect | Map | Merge
+def run_task(task: Task, command: Callable[[list[str]], None]) -> Outcome:
+    """Make a result unless it is there; errors become an outcome.
 
-
-def identify(task: Task) -> str:
-    """A text that is equal for equal tasks alone."""
-    digest = hashlib.sha256(repr(task).encode()).hexdigest()
-    return f"{type(task).__name__.lower()}-{task.name}-{digest[:32]}"
-
-
-def run_task(task: Task, stop: Stop = None) -> Outcome:
-    """Run a task on this machine; errors become an outcome.
-
-    Raises:
-        Stopped: `stop` was set.
+    Args:
+        task: what is made.
+        command: runs a command line of stillmap in this process.
     """
-    if task.version != package_version():
-        what = f"this worker has stillmap {package_version()}, the caller {task.version}"
-        return Outcome("failed", what)
+    logging.getLogger().addHandler(logging.NullHandler())  # `run.json` has what is to be said
     try:
-        return task.run(stop)
-    except Stopped:
-        raise
-    except (InputError, OSError) as error:
-        return outcome_of_error(error)
+        return _make(task, command)
+    except InputError as error:
+        return Outcome("failed", str(error))
+    except OSError as error:
+        return Outcome("failed", f"{error.filename or 'the result'}: {error.strerror or error}")
     except Exception as error:  # of one task: the others go on
         return Outcome("failed", f"a defect of stillmap: {error!r}")
 
 
-def outcome_of_label(label: dict[str, Any]) -> Outcome:
-    """The outcome of a task whose result is there."""
-    return Outcome(
-        "done",
-        found=dict(label.get("summary", {})),
-        cpu_seconds=float(label.get("cpu_seconds", 0.0)),
-        peak_memory_bytes=int(label.get("peak_memory_bytes", 0)),
-    )
+def _make(task: Task, command: Callable[[list[str]], None]) -> Outcome:
+    if task.command == "map":
+        content, size = hash_content(task.sources[0])
+    else:
+        content, size = repr(list(zip(task.results, task.content, strict=True))), 0
+    flags = [flag for flag in task.flags if not flag.startswith("--set=threads=")]
+    text = json.dumps([task.command, content, flags, package_version()])
+    key = hashlib.sha256(text.encode()).hexdigest()
+    known = read_made(task.root, task.folder)
+    if known is not None and known.key == key:
+        return known
+    parent = None
+    if is_local(task.root):
+        parent = Path(open_location(task.root)[1], task.folder).parent
+        parent.mkdir(parents=True, exist_ok=True)
+    reset_peak_memory()
+    started = time.process_time()
+    with TemporaryDirectory(prefix=f"{STAGING}{task.name}-", dir=parent) as scratch:
+        inputs, texts = _prepare(task, Path(scratch))
+        result = Path(scratch, task.name)
+        try:
+            command([task.command, *map(str, inputs), "-o", str(result), "--quiet", *task.flags])
+        except InputError as error:
+            raise InputError(_replace(str(error), texts)) from error
+        _replace_in_files(result, texts)
+        summary = {**_summarize(result), "bytes": size}
+        cost = time.process_time() - started, peak_memory_bytes()
+        outcome = Outcome("done", "", key, task.sources[0], *cost, summary)
+        write_text(result / MADE, to_json(asdict(outcome)))
+        _publish(result, task)
+    return outcome
 
 
-def _publish(
-    storage: Storage, name: str, key: str, folder: Path, summary: dict[str, Any], outcome: Outcome
-) -> Outcome:
-    """Put a finished result with its label in its place."""
-    label = {
-        "summary": summary,
-        "cpu_seconds": outcome.cpu_seconds,
-        "peak_memory_bytes": outcome.peak_memory_bytes,
-    }
-    # the label fits the record of this result alone: until the result is there, it says nothing
-    write_label(storage, name, key, read_bytes(folder / RECORD, _MAX_BYTES), label)
-    storage.publish(folder, name)
-    return outcome_of_label(label)
+def read_made(root: str, folder: str) -> Outcome | None:
+    """How the result in a folder of a fleet was made; None where there is no whole one."""
+    fs, path = open_location(root)
+    with explain(f"{root}/{folder}", "read"):
+        try:
+            return _outcome.validate_json(fs.cat_file(f"{path}/{folder}/{MADE}"))
+        except (FileNotFoundError, NotADirectoryError, ValidationError):
+            return None
 
 
-@contextmanager
-def _local_source(source: str) -> Iterator[Path]:
-    """A recording as a local path: a temporary copy of one in a bucket."""
-    if not is_url(source):
-        yield Path(source)
+def _prepare(task: Task, scratch: Path) -> tuple[list[Path], dict[str, str]]:
+    """The inputs of the command as local paths, and which folders stand for which URLs."""
+    copies, texts = list[Path](), dict[str, str]()
+    for number, source in enumerate(task.sources):
+        copies.append(_local(source, folder := scratch / f"input-{number}"))
+        texts[str(folder)] = source.rpartition("/")[0]
+    if task.command == "map":
+        return copies, texts
+    results, folder = list[Path](), scratch / RESULTS
+    for name, source, copy in zip(task.results, task.sources, copies, strict=True):
+        path = _local(f"{task.root}/{RESULTS}/{name}", folder)
+        if not is_local(source):  # merging reads the recording of a result again
+            if is_local(task.root):
+                path = Path(shutil.copytree(path, folder / name))
+            _replace_in_files(path, {source: str(copy)})
+        results.append(path)
+    return results, {**texts, str(folder): f"{task.root}/{RESULTS}"}
+
+
+def _local(url: str, folder: Path) -> Path:
+    """A path as it is, a URL as a copy in a folder."""
+    return Path(open_location(url)[1]) if is_local(url) else fetch(url, folder)
+
+
+def _publish(result: Path, task: Task) -> None:
+    """Put a whole result in its place; at a URL `made.json` goes first and comes last."""
+    fs, root = open_location(task.root)
+    target = f"{root}/{task.folder}"
+    if is_local(task.root):
+        old = result.with_name("old")
+        if os.path.lexists(target):
+            os.rename(target, old)
+        os.rename(result, target)
         return
-    from stillmap.fleet.bucket import fetch, local_scratch
-
-    with local_scratch() as scratch:
-        yield fetch(source, scratch)
-
-
-def _with_urls(outcome: Outcome, source: str, path: Path) -> Outcome:
-    """The outcome with the URL of a recording instead of the path of its copy."""
-    return replace(outcome, why=_replace_all(outcome.why, {str(path): source}))
-
-
-def _point_to_copy(folder: Path, new: Path, source: str, path: Path) -> Path:
-    """A result whose recording is a local copy: links to its files, but for its record."""
-    new.mkdir(parents=True)
-    for one in folder.iterdir():
-        if one.name != RECORD:
-            (new / one.name).symlink_to(one)
-    text = read_text(folder / RECORD, _MAX_BYTES)
-    write_text(new / RECORD, _replace_all(text, {source: str(path)}))
-    return new
+    with explain(f"{task.root}/{task.folder}", "written"):
+        if fs.exists(f"{target}/{MADE}"):
+            fs.rm_file(f"{target}/{MADE}")
+        if fs.exists(target):
+            fs.rm(target, recursive=True)
+        paths = [path for path in sorted(result.rglob("*")) if path.is_file()]
+        for path in sorted(paths, key=lambda path: path == result / MADE):
+            name = f"{target}/{path.relative_to(result).as_posix()}"
+            fs.makedirs(name.rpartition("/")[0], exist_ok=True)
+            fs.put_file(str(path), name)
 
 
-def _replace_in_texts(folder: Path, texts: dict[str, str]) -> None:
-    """Replace paths of copies in the JSON and HTML files of a result."""
-    texts = {old: new for old, new in texts.items() if old != new}
-    for path in folder.rglob("*") if texts else ():
+def _replace_in_files(folder: Path, texts: dict[str, str]) -> None:
+    """Replace paths, which need no escapes, in the JSON and HTML files of a result."""
+    for path in folder.rglob("*"):
         if path.suffix in (".json", ".html") and path.is_file():
+            escape = html.escape if path.suffix == ".html" else _escape_json
             text = read_text(path, _MAX_BYTES)
-            write_text(path, _replace_all(text, texts))
+            replaced = _replace(text, {old: escape(new) for old, new in texts.items()})
+            if replaced != text:
+                write_text(path, replaced)
 
 
-def _replace_all(text: str, texts: dict[str, str]) -> str:
-    """Replace texts, as they are and as JSON and HTML write them; the longest first."""
-    for old in sorted(texts, key=len, reverse=True):
-        for write in (str, _in_json, html.escape, _in_html):
-            text = text.replace(write(old), write(texts[old]))
+def _replace(text: str, texts: dict[str, str]) -> str:
+    for old, new in texts.items():
+        text = text.replace(old, new)
     return text
 
 
-def _in_html(text: str) -> str:
-    return to_encodable(html.escape(text))
-
-
-def _in_json(text: str) -> str:
+def _escape_json(text: str) -> str:
     return to_json(text)[1:-1]
+
+
+def _summarize(folder: Path) -> dict[str, Any]:
+    """The JSON-able summary of a result: a small map, figures, warnings, sessions."""
+    record = read_record(folder)
+    warnings = [split_advice(text) for text in record.get("warnings", ())]
+    stamps, grid = np.load(folder / "beams/stamp_ns.npy", mmap_mode="r"), read_grid(folder)
+    picture = None
+    if grid.p_occupied.size:
+        drawn = draw_map(grid, map_window([grid]), _PIXELS).convert("L")
+        picture = data_uri(drawn.quantize(_GREYS), optimize=True)
+    sessions = folder / "sessions.json"
+    listed = json.loads(read_text(sessions, _MAX_BYTES)) if sessions.is_file() else []
+    return {
+        "scans": record.get("counts", {}).get("scans"),
+        "beams": record.get("counts", {}).get("beams"),
+        "duration_s": float(stamps[-1] - stamps[0]) / 1e9 if len(stamps) else 0.0,
+        "area": record.get("area", {}),
+        "quality": record.get("quality", {}),
+        "changes": len(record.get("changes", ())),
+        "warnings": [what for what, todo in warnings if todo],
+        "notes": [what for what, todo in warnings if not todo],
+        "map": picture,
+        "sessions": [{key: one.get(key) for key in ("name", "accepted", "why")} for one in listed],
+    }
