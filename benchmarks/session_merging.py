@@ -16,8 +16,8 @@ import numpy as np
 from stillmap.core.errors import InputError
 from stillmap.core.se2 import inverse
 from stillmap.eval.session_poses import PoseScores, read_sessions, score_poses
+from stillmap.eval.session_truth import load_session_truth
 from stillmap.results.reader import read_grid
-from stillmap.sim.session_truth import load_session_truth
 
 _MAXRSS_UNIT = 1 if sys.platform == "darwin" else 1024  # bytes
 REFUSED = 2  # exit status: fewer than two sessions could be placed

@@ -11,8 +11,8 @@ import pytest
 from stillmap import io
 from stillmap.cli import simulate
 from stillmap.core.errors import InputError
+from stillmap.eval.session_truth import load_session_truth
 from stillmap.sim import load_truth
-from stillmap.sim.session_truth import load_session_truth
 
 QUICK = ("--scans", "20", "--beams", "90", "--people", "3")
 
@@ -63,7 +63,7 @@ def test_sessions_are_recordings_with_truth_in_common(tmp_path: Path, capsys) ->
 @pytest.mark.parametrize(
     ("flags", "error"),
     [
-        (("--sessions", "0"), "--sessions wants 1 or more"),
+        (("--sessions", "0"), "must be 1 or more"),
         (("--sessions", "2", "--format", "carmen"), "sessions are written as recording folders"),
         (("--sessions", "2", "--lidar", "tilting"), "one laser or lidar"),
     ],
@@ -182,9 +182,7 @@ def test_carmen_log_equals_recording_folder(tmp_path: Path) -> None:
 
 
 def test_unknown_scene(tmp_path: Path) -> None:
-    with pytest.raises(
-        InputError, match=r"'hull'.*hall, corridor, office, .*street-turn, .*hall-empty"
-    ):
+    with pytest.raises(InputError, match=r"'hull'.*'hall'.*corridor.*hall.*hall-empty"):
         call("hull", "-o", str(tmp_path / "sim"))
     assert not list(tmp_path.iterdir())
 

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.eval.session_cells import CELL, collect_cells
+from stillmap.eval.session_truth import SessionTruth
 from stillmap.io.stillmap_folder import read
 from stillmap.io.trajectory import write_tum
-from stillmap.sim.session_truth import SessionTruth
 
 Float = NDArray[np.float64]
 

@@ -29,10 +29,10 @@ from stillmap.eval.object_models import (
     match_mover,
     score_object_models,
 )
+from stillmap.eval.true_surfaces import place_parts
 from stillmap.sim.appearance import compute_static_color
 from stillmap.sim.camera import SKY
-from stillmap.sim.geometry import BOX, Faces, Ground, Solids
-from stillmap.sim.truth_surfaces import MovingSurfaces, StaticSurfaces
+from stillmap.sim.geometry import BOX, Faces, Ground, MovingSurfaces, Solids, StaticSurfaces
 
 Float = NDArray[np.float64]
 
@@ -46,7 +46,7 @@ NONE = Solids(
 FLOOR = StaticSurfaces(
     Faces(np.empty((0, 4)), np.empty((0, 2)), np.empty(0, bool)),
     NONE,
-    Ground(np.zeros(2), np.zeros(2), np.empty((0, 4)), 0.0),
+    Ground(np.zeros(2), np.empty((0, 4)), 0.0),
     None,
 )
 # 3 m above the floor, looking straight down; 4 x 3 m fill the picture
@@ -329,5 +329,5 @@ def test_movers_seen_well_are_met_by_many_beams_at_once() -> None:
 
 def test_distances_to_solids() -> None:
     points = np.array([(0.0, 0.0, 1.5), (0.0, 0.7, 0.5), (0.0, 0.4, 0.5)])
-    found = distance_to_solids(points, DRIVES.at(DRIVES.parts(0), 0))
+    found = distance_to_solids(points, place_parts(DRIVES, DRIVES.parts(0), 0))
     assert np.allclose(found, [0.5, 0.2, 0.1])

@@ -13,10 +13,10 @@ from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.eval.session_cells import CELL, Lattice, collect_cells, count_beams, widen
 from stillmap.eval.session_changes import ChangeScores
+from stillmap.eval.session_truth import SessionTruth, load_session_truth
 from stillmap.eval.sessions import PlaceScores, score_place
 from stillmap.io.stillmap_folder import read
 from stillmap.sim import scene_by_name
-from stillmap.sim.session_truth import SessionTruth, load_session_truth
 from stillmap.sim.sessions import SessionOptions, plan_sessions
 from stillmap.sim.writer import write_sessions
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from stillmap.core.errors import InputError
 from stillmap.sim import LaserOptions, RobotOptions, Simulation, scene_by_name, simulate
 from stillmap.sim.laser import Returns
 from stillmap.sim.planar import FLOOR, Bumps, add_floor, find_blind_scans, simulate_bumps
@@ -78,36 +77,6 @@ def test_bumps_shorten_beams_only_and_the_floor_is_not_static() -> None:
         assert np.ptp(x[scan, floor[scan]]) < 1e-4
 
 
-@pytest.mark.parametrize(("rate", "low", "high"), [(0.5, 0.02, 0.07), (2.5, 0.13, 0.24)])
-def test_few_and_many_scans_show_the_floor(rate: float, low: float, high: float) -> None:
-    laser = {"beams": 60}
-    run = hall(robot={"scans": 1500, "bump_rate": rate}, laser=laser, crowd={"people": 0})
-    share = (run.truth.mover == FLOOR).reshape(1500, -1).any(axis=1).mean()
-    assert low < share < high
-
-
-def test_a_sweep_is_tilted_as_it_goes() -> None:
-    laser = {**EXACT, "sweep_time": 0.2}
-    run = hall(laser=laser, robot={"bump_rate": 1.5}, crowd={"people": 0})
-    floor = (run.truth.mover == FLOOR).reshape(300, -1)
-    x = run.recording.points[:, 0].reshape(300, -1)
-    assert max(np.ptp(x[scan, floor[scan]]) for scan in np.flatnonzero(floor.any(axis=1))) > 1.0
-
-
-@pytest.mark.parametrize("upside_down", ["no", "known"])
-def test_a_laser_that_looks_backwards_sees_floor_behind(upside_down: str) -> None:
-    laser = {**EXACT, "yaw": math.pi - 0.3, "upside_down": upside_down}
-    run = hall(laser=laser, robot={"bump_rate": 1.5}, crowd={"people": 0})
-    floor = run.truth.mover == FLOOR
-    points = run.recording.points.astype(float) @ run.recording.T_base_sensor[0, :2, :2].T
-    scan = np.repeat(np.arange(300), 90)
-    assert floor.any()
-    for t in np.unique(scan[floor]):
-        # across the robot, not across the laser
-        assert np.ptp(points[floor & (scan == t), 0]) < 1e-4
-        assert points[floor & (scan == t), 0].max() < 0
-
-
 def test_blind_stretches_take_their_time() -> None:
     seconds = np.arange(2000) * 0.2
     options = LaserOptions(blind_stretches=4, blind_time=30.0, blind_at=0.1)
@@ -131,26 +100,3 @@ def test_nothing_returns_in_a_blind_stretch() -> None:
     np.testing.assert_allclose(ranges(run)[blind], 30.0, rtol=1e-6)
     np.testing.assert_array_equal(ranges(run)[~blind], ranges(plain)[~blind])
     assert not run.truth.static.reshape(300, -1)[blind].any()
-
-
-def test_whole_scans_see_nothing_at_short_range() -> None:
-    run = hall(laser={"beams": 60, "max_range": 2.0}, crowd={"people": 0})
-    assert (~run.recording.hit.reshape(300, -1).any(axis=1)).mean() > 0.02
-
-
-@pytest.mark.parametrize(
-    ("section", "key", "value"),
-    [
-        ("robot", "bump_rate", -1.0),
-        ("robot", "bump_time", 0.0),
-        ("laser", "height", 0.0),
-        ("laser", "blind_at", 1.0),
-        ("laser", "blind_stretches", -1),
-        ("odometry", "latency", -0.1),
-        ("odometry", "scale", 0.0),
-        ("robot", "carried_time", -1.0),
-    ],
-)
-def test_values_out_of_range_are_refused(section: str, key: str, value: float) -> None:
-    with pytest.raises(InputError, match=key):
-        scene_by_name("hall", {section: {key: value}})

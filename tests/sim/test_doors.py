@@ -10,7 +10,7 @@ from stillmap.core.config import override
 from stillmap.sim import Door, DoorOptions, Scene, Simulation, simulate
 from stillmap.sim.objects import Doors, split_into_segments
 from stillmap.sim.planner import compute_segment_distance
-from stillmap.sim.walls import Opening, box, leaf
+from stillmap.sim.walls import box
 
 Float = NDArray[np.float64]
 
@@ -64,13 +64,6 @@ def test_a_leaf_swings_evenly_and_stays_as_long_as_it_may(seed: int) -> None:
     np.testing.assert_allclose(spans[~rests], 1.5, atol=0.11)
 
 
-def test_no_leaf_closes_onto_somebody() -> None:
-    beside = np.array([[1.4, 2.9]])  # where the leaf would sweep
-    doors = until(1.0)
-    np.testing.assert_array_equal(followed(doors, 3000, beside)[:, 0], np.pi / 2)
-    assert followed(doors, 20, FAR)[-1, 0] == pytest.approx(0.0)
-
-
 def test_a_closing_leaf_stops_for_somebody() -> None:
     doors = until(1.0)
     while doors.share[0] == 1.0:
@@ -88,20 +81,6 @@ def test_a_door_opens_for_whoever_comes_but_not_for_who_goes_by() -> None:
     doors = until(0.0, options=options)
     np.testing.assert_array_equal(followed(doors, 100, standing, by), 0.0)
     assert followed(doors, 16, standing, through)[-1, 0] == pytest.approx(np.pi / 2)
-
-
-def test_leaves_of_all_four_walls_open_into_the_room() -> None:
-    door = Opening(2.0, 1.0, 0.2, is_open=True)
-    for side, out in (("south", (0, -1)), ("north", (0, 1)), ("west", (-1, 0)), ("east", (1, 0))):
-        for at_end in (False, True):
-            made = leaf((0, 0), side, door, np.pi / 2, at_end)
-            x0, y0, x1, y1 = made.leaf(made.opened)
-            np.testing.assert_allclose(
-                np.array([x1 - x0, y1 - y0]), 0.96 * np.array(out), atol=1e-9
-            )
-            closed = np.array(made.leaf(made.closed)).reshape(2, 2)
-            along = closed @ np.abs(np.array([out[1], out[0]]))
-            np.testing.assert_allclose(sorted(along), [2.02, 2.98])
 
 
 def standing_before_a_door(**doors: float) -> Simulation:
@@ -140,10 +119,3 @@ def test_beams_meet_the_leaf_where_it_is(
             # closed, straight ahead, one metre wide at 3.4 m: 16 degrees, a beam every two
             assert 7 <= len(mine) <= 9
     assert not truth.static[truth.mover == 0].any()
-
-
-def test_a_door_that_never_moves_is_a_wall() -> None:
-    run = standing_before_a_door(min_closed=1e4, max_closed=1e5, min_open=1e4, max_open=1e5)
-    assert (run.truth.mover == -1).all()
-    assert len(run.truth.walls) == len(run.scene.walls) + 1
-    assert run.truth.movers.shape == (600, 1, 3)

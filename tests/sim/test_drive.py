@@ -1,135 +1,16 @@
 """The drive through a town: a car that accelerates, waits at a light and slows down to turn."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from stillmap.core import se2
-from stillmap.sim import Light, RobotOptions, Simulation, scene_by_name
+from stillmap.sim import Light, RobotOptions
 from stillmap.sim.vehicles import SpeedProfile
-
-pytestmark = pytest.mark.slow
 
 Float = NDArray[np.float64]
 
 STRAIGHT = np.stack([np.arange(0, 300.01, 0.05), np.zeros(6001)], axis=-1)
 CAR = RobotOptions(speed=15.0, acceleration=2.5)
-
-
-@pytest.fixture
-def drive(run: Callable[[str], Simulation]) -> Simulation:
-    """The whole route at 10 Hz."""
-    return run("drive")
-
-
-def motion(simulation: Simulation) -> tuple[Float, Float, Float]:
-    """(T - 1,) metres per second, and (T,) x, y and heading."""
-    x, y, heading = se2.parameters(simulation.truth.T_world_base).T
-    speed = np.hypot(np.diff(x), np.diff(y)) * simulation.scene.robot.scan_rate
-    return speed, np.stack([x, y], axis=-1), heading
-
-
-@pytest.mark.slow
-def test_it_is_a_kilometre_with_one_corner(drive: Simulation) -> None:
-    speed, xy, heading = motion(drive)
-    assert 950 < speed.sum() / 10 < 1050
-    assert heading[0] == pytest.approx(0.0, abs=0.02)
-    assert heading[-1] == pytest.approx(-np.pi / 2, abs=0.02)
-    assert np.degrees(np.abs(np.diff(heading)).sum()) < 130
-    assert np.ptp(xy[:, 0]) > 400
-    assert np.ptp(xy[:, 1]) > 400
-
-
-def test_it_drives_as_a_car_does(drive: Simulation) -> None:
-    speed, _, heading = motion(drive)
-    assert 15.5 < speed.max() < 15.6 + 1e-6
-    assert (speed > 15.0).mean() > 0.3
-    gain = np.diff(speed[:-1]) * 10
-    assert gain.max() < 2.5 + 0.05
-    assert gain.min() > -4.0
-    turning = np.abs(np.diff(heading)) * 10 > 0.2
-    assert speed[turning].min() > 2.0
-    assert speed[turning].max() < 5.5
-    sideways = speed * np.abs(np.diff(heading)) * 10
-    assert sideways.max() < 2.5 + 0.5
-
-
-def test_it_waits_at_the_light_until_it_is_green(drive: Simulation) -> None:
-    speed, xy, _ = motion(drive)
-    (light,) = drive.scene.lights
-    stands = np.flatnonzero(speed < 0.02)
-    off = np.hypot(*(xy[stands[1:-1]] - light.at).T)
-    assert off.max() < 0.6
-    # from some time after it turned red to shortly after it turned green
-    assert light.red[0] < stands[1] / 10 < light.red[1] - 8.0
-    assert light.red[1] - 0.2 < stands[-1] / 10 < light.red[1] + 0.5
-    assert np.all(np.diff(stands[1:]) == 1)
-
-
-def test_cars_wait_at_the_light_in_view_and_drive_on_in_view(drive: Simulation) -> None:
-    truth, rate = drive.truth, 10
-    scan = np.repeat(np.arange(drive.recording.n_scans), np.diff(drive.recording.offset))
-    speed = np.hypot(*np.moveaxis(np.diff(truth.movers[..., :2], axis=0), -1, 0)) * rate
-    speed = np.concatenate([speed, speed[-1:]])
-    people, waited = drive.scene.crowd.people, 0
-    queue = drive.scene.lanes[-1].waiting
-    for car in range(people, truth.movers.shape[1] - queue):
-        seen = np.unique(scan[truth.mover == car])
-        stood = seen[speed[seen, car] < 0.01]
-        waited += len(stood) > 2 * rate and bool((speed[seen[seen > stood[-1]], car] > 3).any())
-    assert waited >= 2
-
-
-def test_cars_come_and_go_in_both_directions(drive: Simulation) -> None:
-    truth = drive.truth
-    met = np.unique(truth.mover[truth.mover >= drive.scene.crowd.people])
-    assert len(met) > 20
-    scan = np.repeat(np.arange(drive.recording.n_scans), np.diff(drive.recording.offset))
-    hit = np.flatnonzero(truth.mover >= drive.scene.crowd.people)
-    step = np.diff(truth.movers[..., :2], axis=0)
-    last = np.minimum(scan[hit], len(step) - 1)
-    _, _, heading = motion(drive)
-    ahead = np.stack([np.cos(heading), np.sin(heading)], axis=-1)[last]
-    along = np.einsum("nd,nd->n", step[last, truth.mover[hit]] * 10, ahead)
-    assert (along > 5).sum() > 300
-    assert (along < -5).sum() > 300
-
-
-def test_cars_do_not_run_red_lights(drive: Simulation) -> None:
-    """On no lane does a car cross the stop line while it is red, but those too fast to stop."""
-    truth = drive.truth
-    seconds = np.arange(len(truth.movers)) / 10
-    for lane in drive.scene.lanes:
-        for light in lane.lights:
-            along = np.array(lane.path[1]) - lane.path[0]
-            along = along / np.hypot(*along)
-            offset = truth.movers[..., :2] - light.at
-            ahead, aside = offset @ along, offset @ [-along[1], along[0]]
-            near = (np.abs(aside) < 0.2) & (np.abs(ahead) < 20)
-            crosses = near[:-1] & near[1:] & (ahead[:-1] < 0) & (ahead[1:] >= 0)
-            for scan, _ in np.argwhere(crosses):
-                late = (seconds[scan] - light.red[0]) % light.cycle
-                assert late > light.red[1] - light.red[0] or late < 3.0
-
-
-def test_the_queue_at_the_corner_stands_while_it_is_seen(drive: Simulation) -> None:
-    truth = drive.truth
-    waiting = drive.scene.lanes[-1].waiting
-    scan = np.repeat(np.arange(drive.recording.n_scans), np.diff(drive.recording.offset))
-    for car in range(truth.movers.shape[1] - waiting, truth.movers.shape[1]):
-        hits = scan[truth.mover == car]
-        assert len(hits) > 50
-        moved = np.abs(truth.movers[:, car] - truth.movers[0, car]).max(axis=1) > 1e-9
-        assert not moved[hits].any()
-        assert moved[-1]
-
-
-def test_75_hz_is_the_usual_rate_and_10_an_option() -> None:
-    assert scene_by_name("drive").robot.scan_rate == 75.0
-    assert scene_by_name("drive").laser.beams == 181
-    assert scene_by_name("drive", {"robot": {"scan_rate": 10.0}}).robot.scan_rate == 10.0
 
 
 def driven(pace: SpeedProfile, steps: int, dt: float, way: Float = STRAIGHT) -> Float:

@@ -5,11 +5,8 @@ import itertools
 import numpy as np
 import pytest
 
-from stillmap.core.errors import InputError
 from stillmap.sim.planner import FreeSpace, Planner, compute_segment_distance
 from stillmap.sim.walls import Opening, box, room, wall
-
-ROOM = np.array(box(5, 5, 10, 10))
 
 
 def test_clearance_is_the_distance_from_the_nearest_wall_up_to_its_limit() -> None:
@@ -20,12 +17,6 @@ def test_clearance_is_the_distance_from_the_nearest_wall_up_to_its_limit() -> No
     np.testing.assert_allclose(clear, np.minimum(true, 1.5), atol=0.051)
     beside = (xy[:, 0] > 0.2) & (xy[:, 0] < 1.3) & (xy[:, 1] > 2) & (xy[:, 1] < 8)
     np.testing.assert_allclose(gradient[beside], [[1, 0]] * beside.sum(), atol=1e-9)
-
-
-def test_distance_from_a_segment_by_hand() -> None:
-    points = np.array([[0.5, 2.0], [-3.0, 4.0], [2.0, 0.0], [0.3, 0.0]])
-    got = compute_segment_distance(points, np.array([0.0, 0.0, 1.0, 0.0]))
-    np.testing.assert_allclose(got, [2.0, 5.0, 1.0, 0.0])
 
 
 def test_the_way_goes_around_a_wall_and_keeps_its_distance() -> None:
@@ -48,11 +39,6 @@ def test_only_the_part_that_can_be_reached_counts() -> None:
     inside = np.all(np.abs(points - 5) < 2, axis=1)
     assert not inside.any()
     assert len(points) == pytest.approx((9.4**2 - 4.6**2) / 0.04, rel=0.1)
-
-
-def test_no_room_is_said() -> None:
-    with pytest.raises(InputError, match=r"no room .* at \(0.1, 5\)"):
-        Planner(FreeSpace(ROOM), np.array([0.1, 5.0]), 0.3)
 
 
 def test_a_room_behind_an_open_door_can_be_entered_and_a_niche_cannot() -> None:

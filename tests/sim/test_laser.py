@@ -62,16 +62,6 @@ def by_brute_force(poses: Float, angles: Float, walls: Float, movers: Movers) ->
     return out
 
 
-def test_random_worlds_show_walls_and_movers() -> None:
-    """Else the comparison below would say little."""
-    angles = compute_beam_angles(60, 2 * np.pi)
-    for seed in range(4):
-        walls, poses, movers = random_world(np.random.default_rng(seed))
-        found = by_brute_force(poses, angles, walls, movers)
-        assert (found.wall >= 0).mean() > 0.3
-        assert (found.mover >= 0).mean() > 0.05
-
-
 def random_world(rng: np.random.Generator) -> tuple[Float, Float, Movers]:
     scans, parts = 6, 9
     walls = rng.uniform(-6, 6, (12, 4))
@@ -142,23 +132,6 @@ def test_no_ray_slips_through_the_corners_of_a_closed_polygon() -> None:
     assert np.isfinite(cast_beams(poses, angles, walls, nobody).range).all()
 
 
-def test_scans_beyond_one_chunk_see_their_own_movers() -> None:
-    scans = 2300
-    along = np.arange(scans) * 1e-3
-    movers = Movers(
-        np.stack([3.0 + along, np.zeros(scans)], axis=-1)[:, None],
-        np.zeros((scans, 1)),
-        np.array([[0.2, 0.2]]),
-        np.array([9], np.int32),
-    )
-    returns = cast_beams(
-        np.zeros((scans, 3)), compute_beam_angles(3, 1.0), np.empty((0, 4)), movers
-    )
-    np.testing.assert_allclose(returns.range[:, 1], 2.8 + along)
-    assert np.isinf(returns.range[:, [0, 2]]).all()
-    np.testing.assert_array_equal(returns.mover[:, 1], 9)
-
-
 @pytest.mark.parametrize(
     ("beams", "fov", "first", "last"),
     [
@@ -199,11 +172,3 @@ def test_beams_get_lost_at_their_rates_and_end_at_maximum_range() -> None:
         )
         assert 1 - hit.mean() == pytest.approx(share, rel=0.1)
         np.testing.assert_array_equal(ranges[~hit], 20.0)
-
-
-def test_what_lies_beyond_maximum_range_gives_no_return() -> None:
-    options = LaserOptions(max_range=8.0, no_return_share=0.0, range_noise=0.0)
-    true = np.array([[7.9, 8.0, 8.1, np.inf]])
-    ranges, hit = simulate_measurement(true, on_glass(true), options, np.random.default_rng(4))
-    np.testing.assert_array_equal(hit, [[True, False, False, False]])
-    np.testing.assert_array_equal(ranges, [[7.9, 8.0, 8.0, 8.0]])

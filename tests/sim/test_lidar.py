@@ -1,23 +1,18 @@
 """Recordings of a spinning lidar: truth of each point, time within a turn, options, files."""
 
 import functools
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from stillmap import io as recordings
 from stillmap.core.config import override
-from stillmap.core.errors import InputError
 from stillmap.sim import (
     Scene,
     Simulation,
-    load_truth,
     scene_by_name,
     simulate,
-    write_simulation,
 )
 from stillmap.sim.geometry import make_pose
 from stillmap.sim.walls import box, pillar
@@ -149,17 +144,6 @@ def test_a_wall_is_straight_once_the_turn_is_undone() -> None:
     assert np.quantile(off[~around], 0.95) > 0.05
 
 
-def test_all_beams_at_once() -> None:
-    run = street(sweep=False)
-    assert run.recording.beam_time is None
-    np.testing.assert_array_equal(run.truth.T_world_base, street().truth.T_world_base)
-    assert not np.array_equal(run.recording.points, street().recording.points)
-    ends, _, _ = in_world(run)
-    x, y, z = ends[run.truth.static].T
-    road = (np.abs(y) < 5.9) & (x > -29) & (x < 209) & (z < 1)
-    np.testing.assert_allclose(z[road], 0.0, atol=1e-4)
-
-
 @pytest.mark.slow
 def test_the_robot_stands_on_the_slope_and_shakes() -> None:
     lidar = {**SMALL, "vibration_roll": 0.01, "vibration_pitch": 0.02, "vibration_z": 0.03}
@@ -174,18 +158,6 @@ def test_the_robot_stands_on_the_slope_and_shakes() -> None:
     np.testing.assert_allclose(
         T[:, :3, :3] @ T[:, :3, :3].transpose(0, 2, 1), np.tile(np.eye(3), (80, 1, 1)), atol=1e-12
     )
-
-
-def test_a_plane_that_slopes_is_level_for_who_stands_on_it() -> None:
-    lidar = {**SMALL, **EXACT, "sweep": False}
-    ground = {"slope_x": 0.1, "slope_y": 0.2, "kerb": 0.0}
-    run = simulate(
-        scene_by_name("street", {"lidar": lidar, "ground": ground, "robot": {"scans": 5}}), 1
-    )
-    points = run.recording.points[run.truth.static]
-    road = (np.abs(points[:, 1]) < 1.7) & (points[:, 2] < -1.0)
-    assert road.sum() > 200
-    np.testing.assert_allclose(points[road, 2], -1.8, atol=1e-3)
 
 
 def test_beams_without_return_may_be_left_out() -> None:
@@ -223,48 +195,3 @@ def test_doors_have_lintels_and_rooms_have_ceilings() -> None:
     leaf = use & (run.truth.mover >= 0) & (kinds[run.truth.mover] == "door")
     assert leaf.sum() > 50
     assert ends[leaf, 2].max() < 2.05 + 1e-4
-
-
-def test_the_same_seed_gives_the_same_bytes() -> None:
-    a, b, c = yard(4), yard(4), yard(5)
-    for name in ("points", "hit", "beam_time", "stamp_ns", "T_odom_base"):
-        x, y = getattr(a.recording, name), getattr(b.recording, name)
-        assert x.tobytes() == y.tobytes()
-    assert a.truth.mover.tobytes() == b.truth.mover.tobytes()
-    assert a.recording.points.tobytes() != c.recording.points.tobytes()
-
-
-def test_a_folder_holds_it_all(tmp_path: Path) -> None:
-    run = yard()
-    write_simulation(run, tmp_path / "sim")
-    read, truth = recordings.read(tmp_path / "sim"), load_truth(tmp_path / "sim")
-    np.testing.assert_array_equal(read.points, run.recording.points)
-    np.testing.assert_array_equal(truth.mover, run.truth.mover)
-    np.testing.assert_array_equal(truth.T_world_base, run.truth.T_world_base)
-    assert truth.scene["lidar"]["channels"] == 16
-    assert len(truth.scene["mover_sizes"]) == len(truth.scene["mover_kinds"])
-    with pytest.raises(InputError, match="3D"):
-        write_simulation(run, tmp_path / "log", format="carmen")
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"channels": -1},
-        {"columns": 2},
-        {"rate": 0.0},
-        {"low": 0.5, "high": 0.1},
-        {"z": 0.0},
-        {"range_noise": -1.0},
-        {"no_return_share": 1.5},
-        {"no_returns": "lost"},
-    ],
-)
-def test_what_no_lidar_can_have_is_refused(wrong: dict[str, Any]) -> None:
-    with pytest.raises(InputError):
-        scene_by_name("hall", {"lidar": wrong})
-
-
-def test_planar_scenes_say_nothing_of_heights() -> None:
-    run = simulate(scene_by_name("street", {"robot": {"scans": 2}}), 1)
-    assert not {"lidar", "ground", "heights", "pavements"} & set(run.truth.scene)

@@ -8,11 +8,8 @@ from marks import slow_params
 from numpy.typing import NDArray
 
 from stillmap.core import se2
-from stillmap.core.config import override
-from stillmap.core.errors import InputError
-from stillmap.sim import OdometryOptions, Scene, Simulation, scene_by_name, simulate
-from stillmap.sim.episode import add_faults, remove_jump
-from stillmap.sim.walls import box
+from stillmap.sim import OdometryOptions, Simulation, scene_by_name, simulate
+from stillmap.sim.episode import add_faults
 
 Float = NDArray[np.float64]
 
@@ -32,12 +29,6 @@ def moves(T: Float) -> Float:
 def short(seed: int = 3, name: str = "hall", **changes: dict[str, object]) -> Simulation:
     usual: dict[str, dict[str, object]] = {"robot": {"scans": 400}, "laser": {"beams": 30}}
     return simulate(scene_by_name(name, {**usual, **changes}), seed)
-
-
-def test_odometry_that_neither_stalls_nor_resets_is_what_it_was() -> None:
-    T = round_a_ring()
-    options = OdometryOptions(stall_time=9.0)
-    assert add_faults(T, SECONDS, options, np.random.default_rng(0)) is T
 
 
 def test_a_stall_misses_what_the_robot_does_for_its_time() -> None:
@@ -70,12 +61,6 @@ def test_a_reset_begins_again_at_the_origin() -> None:
     assert np.hypot(*got[again, :2].T).max() > 1.0
 
 
-def test_more_resets_than_scans_are_as_many_as_there_can_be() -> None:
-    options = dataclasses.replace(PERFECT, resets=50)
-    odometry = add_faults(round_a_ring()[:4], SECONDS[:4], options, np.random.default_rng(1))
-    np.testing.assert_allclose(odometry[1:], np.eye(3)[None].repeat(3, axis=0), atol=1e-12)
-
-
 @pytest.mark.slow
 def test_nothing_but_the_odometry_changes_when_it_lies() -> None:
     plain = short()
@@ -88,17 +73,6 @@ def test_nothing_but_the_odometry_changes_when_it_lies() -> None:
     assert b is not None
     same = np.abs(moves(a) - moves(b)).max(axis=1) < 1e-9
     assert 0.4 < same.mean() < 0.95
-
-
-def test_without_the_jump_the_robot_never_left() -> None:
-    T = round_a_ring()
-    carried = np.concatenate([T[:100], se2.matrix(7.0, -3.0, 2.0) @ T[100:]])
-    back = remove_jump(carried, 100)
-    true = moves(T)
-    got = moves(back)
-    np.testing.assert_allclose(np.delete(got, 99, axis=0), np.delete(true, 99, axis=0), atol=1e-9)
-    np.testing.assert_allclose(got[99], 0.0, atol=1e-9)
-    assert remove_jump(T, len(T)) is T
 
 
 @pytest.mark.parametrize("seed", [0, *slow_params(1, 2, 3)])
@@ -127,34 +101,6 @@ def test_a_carried_robot_goes_on_elsewhere_and_odometry_knows_nothing(seed: int)
     assert np.hypot(*np.diff(after, axis=0).T).sum() > 8.0
 
 
-@pytest.mark.slow
-def test_everybody_else_goes_on_while_the_robot_is_carried() -> None:
-    run = short(robot={"scans": 400, "carried_at": 0.5})
-    scan = run.truth.scene["carried_at_scan"]
-    step = np.hypot(*np.moveaxis(np.diff(run.truth.movers[..., :2], axis=0), -1, 0))
-    assert np.delete(step, scan - 1, axis=0).max() < 1.7 / 5
-    assert 2.0 < step[scan - 1].mean() < 1.6 * 20.2
-    robot = run.truth.T_world_base[:, None, :2, 2]
-    off = np.hypot(*np.moveaxis(run.truth.movers[..., :2] - robot, -1, 0))
-    assert off.min() > 0.22 + 0.25
-    before = short(robot={"scans": 400}).truth
-    np.testing.assert_array_equal(before.T_world_base[:scan], run.truth.T_world_base[:scan])
-
-
-@pytest.mark.slow
-def test_a_carried_robot_gets_to_the_end_of_its_route() -> None:
-    walls = tuple(box(0, 0, 40, 20))
-    route = ((-18.0, -8.0), (18.0, -8.0), (18.0, 8.0), (-18.0, 8.0))
-    scene = Scene(name="hall", walls=walls, route=route)
-    changes = {"robot": {"carried_at": 0.3}, "crowd": {"people": 0}, "laser": {"beams": 4}}
-    ends = []
-    for seed in range(6):
-        run = simulate(override(scene, changes), seed)
-        ends.append(np.hypot(*(run.truth.T_world_base[-1, :2, 2] - route[-1])))
-        assert run.recording.n_scans > run.truth.scene["carried_at_scan"] + 100
-    assert max(ends) < 0.2
-
-
 @pytest.mark.parametrize("tick", [0.1, 1.0, 0.03])
 def test_stamps_are_rounded(tick: float) -> None:
     robot = {"scans": 100, "scan_rate": 7.0}
@@ -164,27 +110,3 @@ def test_stamps_are_rounded(tick: float) -> None:
     assert np.abs(rounded - exact).max() <= tick * 1e9 / 2 + 1
     assert np.abs(rounded - exact).max() > tick * 1e9 / 4
     assert np.all(np.diff(rounded) >= 0)
-
-
-def test_usually_nothing_of_the_kind_happens() -> None:
-    run = short(robot={"scans": 30})
-    assert run.truth.scene["carried_at_scan"] is None
-    assert run.scene.odometry.stall_rate == 0
-    assert run.scene.odometry.resets == 0
-    assert run.recording.stamp_ns[-1] - run.recording.stamp_ns[0] == 58 * 10**8
-
-
-@pytest.mark.parametrize(
-    ("section", "key", "value"),
-    [
-        ("robot", "carried_at", 0.0),
-        ("robot", "carried_at", 1.0),
-        ("robot", "stamp_rounding", -0.1),
-        ("odometry", "stall_rate", -1.0),
-        ("odometry", "stall_time", 0.0),
-        ("odometry", "resets", -1),
-    ],
-)
-def test_values_out_of_range_are_refused(section: str, key: str, value: float) -> None:
-    with pytest.raises(InputError, match=key):
-        scene_by_name("hall", {section: {key: value}})

@@ -6,11 +6,19 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from stillmap.sim import GroundOptions, LidarOptions, ray_casting
-from stillmap.sim.geometry import BOX, CYLINDER, ELLIPSOID, Faces, Ground, Solids
-from stillmap.sim.lidar import Pattern, make_pose, transform_rays
-from stillmap.sim.ray_casting import RayReturns, Rays
-from stillmap.sim.truth_surfaces import StaticSurfaces
+from stillmap.sim import LidarOptions, ray_casting
+from stillmap.sim.geometry import (
+    BOX,
+    CYLINDER,
+    ELLIPSOID,
+    Faces,
+    Ground,
+    Solids,
+    StaticSurfaces,
+    make_pose,
+)
+from stillmap.sim.lidar import Pattern, transform_rays
+from stillmap.sim.ray_casting import RayReturns, Rays, Window
 
 Float = NDArray[np.float64]
 
@@ -19,7 +27,7 @@ NO_PAVEMENT = np.empty((0, 4))
 
 
 def flat(kerb: float = 0.0, pavements: Float = NO_PAVEMENT) -> Ground:
-    return Ground.of(GroundOptions(kerb=kerb), pavements)
+    return Ground(np.zeros(2), pavements, kerb)
 
 
 def lidar(
@@ -43,7 +51,7 @@ def cast(
     beams: Rays, faces: Faces, moving: list[Solids], ground: Ground, ceiling: float | None
 ) -> RayReturns:
     static = StaticSurfaces(faces, NO_SOLIDS, ground, ceiling)
-    return ray_casting.cast_rays(beams, static, *moving)
+    return ray_casting.cast_rays(beams, static, moving[0] if moving else NO_SOLIDS)
 
 
 def ends(beams: Rays, seen: RayReturns, which: NDArray[np.bool_]) -> Float:
@@ -60,13 +68,12 @@ def test_flat_ground_lies_as_far_as_the_elevation_says() -> None:
     assert np.isinf(seen.range[:, ~down]).all()
 
 
-def test_sloping_and_bent_ground_and_its_ceiling() -> None:
-    options = GroundOptions(slope_x=0.03, slope_y=-0.02, bend_x=0.002, bend_y=-0.001)
-    ground = Ground.of(options, NO_PAVEMENT)
+def test_sloping_ground_and_its_ceiling() -> None:
+    ground = Ground(np.array([0.03, -0.02]), NO_PAVEMENT, 0.0)
     _, beams = lidar(3.0, -2.0, z=float(ground.level(np.array(3.0), np.array(-2.0))) + 1.8)
     seen = cast(beams, NO_FACES, [], ground, 4.0)
     x, y, z = ends(beams, seen, np.isfinite(seen.range))
-    above = z - (0.03 * x - 0.02 * y + 0.001 * x**2 - 0.0005 * y**2)
+    above = z - (0.03 * x - 0.02 * y)
     near = np.minimum(np.abs(above), np.abs(above - 4.0))
     assert near.max() < 1e-9 * 1e3
     assert (np.abs(above) < 1e-6).sum() > 5000 < (np.abs(above - 4.0) < 1e-6).sum() + 4000
@@ -88,36 +95,6 @@ def test_an_upright_face_has_a_lower_and_an_upper_edge() -> None:
     assert ((x > 5.5) & (np.abs(z) < 1e-9)).sum() > 30
 
 
-def test_a_cylinder_and_an_ellipse() -> None:
-    _, beams = lidar()
-    seen = cast(
-        beams, NO_FACES, [solid(CYLINDER, [4, 3, 0.5, 0.1], (0.3, 0.6), (0, 1.5))], flat(), None
-    )
-    x, y, z = ends(beams, seen, seen.mover == 7)
-    c, s = np.cos(0.5), np.sin(0.5)
-    u, v = ((x - 4) * c + (y - 3) * s) / 0.3, ((y - 3) * c - (x - 4) * s) / 0.6
-    np.testing.assert_allclose(u**2 + v**2 * 1.0, np.where(z < 1.6 - 1e-9, 1.0, u**2 + v**2))
-    assert 0.1 <= z.min() < 0.2
-    assert z.max() == pytest.approx(1.6, abs=0.1)
-    # straight ahead: as far as its surface
-    _, beams = lidar(z=0.8)
-    seen = cast(beams, NO_FACES, [solid(CYLINDER, [0, 6, 0, 0], (0.5, 0.5), (0, 2))], flat(), None)
-    assert seen.range[seen.mover == 7].min() == pytest.approx(5.5, abs=0.01)
-
-
-def test_a_box_has_sides_and_a_top() -> None:
-    _, beams = lidar(z=3.0)
-    seen = cast(beams, NO_FACES, [solid(BOX, [5, -2, 0.3, 0.2], (2, 1), (0, 1))], flat(), None)
-    x, y, z = ends(beams, seen, seen.mover == 7)
-    c, s = np.cos(0.3), np.sin(0.3)
-    u, v = (x - 5) * c + (y + 2) * s, (y + 2) * c - (x - 5) * s
-    off = np.abs(np.stack([np.abs(u) - 2, np.abs(v) - 1, z - 1.2]))
-    assert off.min(axis=0).max() < 1e-9
-    assert (off[2] < 1e-9).sum() > 50 < (off[1] < 1e-9).sum() + (off[0] < 1e-9).sum()
-    assert (np.abs(u) < 2 + 1e-9).all()
-    assert z.min() > 0.2 - 1e-9
-
-
 @pytest.mark.parametrize("form", [BOX, CYLINDER, ELLIPSOID])
 def test_level_beams_along_an_axis_meet_what_is_in_their_way(form: int) -> None:
     pattern = Pattern.of(LidarOptions(channels=1, columns=4, low=0.0, high=0.0))
@@ -126,15 +103,6 @@ def test_level_beams_along_an_axis_meet_what_is_in_their_way(form: int) -> None:
     np.testing.assert_allclose(seen.range[:, 0], [np.inf, np.inf, 4.0, np.inf])
     above = solid(form, [5, 0, 0, 1.5], (1, 2), (0, 2))
     assert np.isinf(cast(beams, NO_FACES, [above], flat(), None).range).all()
-
-
-def test_an_ellipsoid_hangs_above_what_passes_under_it() -> None:
-    _, beams = lidar()
-    crown = solid(ELLIPSOID, [8, 0, 0, 0], (2, 3), (2.2, 4.2))
-    seen = cast(beams, NO_FACES, [crown], flat(), None)
-    x, y, z = ends(beams, seen, seen.mover == 7)
-    np.testing.assert_allclose((x - 8) ** 2 / 4 + y**2 / 9 + (z - 3.2) ** 2, 1.0)
-    assert len(x) > 100
 
 
 def test_pavements_are_a_kerb_higher() -> None:
@@ -163,8 +131,8 @@ def clutter(rng: np.random.Generator, n: int, moving: bool) -> tuple[Faces, Soli
     return faces, Solids(poses, form, half, z, np.arange(n, dtype=np.int32))
 
 
-def everything(beams: Rays, count: int) -> Iterator[tuple[int, slice, slice]]:
-    yield from ((k, slice(0, 360), slice(0, len(beams.elevation))) for k in range(count))
+def everything(beams: Rays, count: int) -> Iterator[tuple[int, Window]]:
+    yield from ((k, (slice(0, 360), slice(0, len(beams.elevation)))) for k in range(count))
 
 
 @pytest.mark.parametrize("roll", [0.0, 0.05, -0.2])
@@ -178,7 +146,7 @@ def test_nothing_is_missed(monkeypatch: pytest.MonkeyPatch, roll: float, moving:
     xyz = np.stack([0.8 * t, -0.4 * t, 1.8 + 0.1 * t], axis=-1)
     T = make_pose(xyz, roll * np.ones(360), 0.5 * roll * t, 3.0 + 0.2 * t)
     beams = transform_rays(pattern, T)
-    ground = Ground.of(GroundOptions(slope_x=0.02, bend_y=0.003), NO_PAVEMENT)
+    ground = Ground(np.array([0.02, 0.003]), NO_PAVEMENT, 0.0)
     fast = cast(beams, faces, [solids], ground, None)
     monkeypatch.setattr(
         ray_casting, "_windows_of_faces", lambda b, f, _: everything(b, len(f.ends))

@@ -45,13 +45,6 @@ def test_only_the_recorded_mount_is_wrong(tmp_path: Path) -> None:
     assert not (tmp_path / "told" / "truth" / "T_base_sensor.npy").exists()
 
 
-def test_a_second_laser_is_where_the_recorder_has_the_first() -> None:
-    run = hall(laser={"beams": 60, "second_laser": True, "yaw": 0.1, "recorded_yaw": -0.1})
-    front, rear = run.recording.T_base_sensor
-    np.testing.assert_allclose(front, se2.matrix(0.08, 0.0, -0.1))
-    np.testing.assert_allclose(rear, se2.matrix(0.0, 0.0, np.pi) @ front, atol=1e-12)
-
-
 def moves(T: Float) -> Float:
     return se2.parameters(se2.inverse(T[:-1]) @ T[1:])
 
@@ -82,14 +75,6 @@ def test_late_odometry_is_that_of_then() -> None:
     assert delay_odometry(T, seconds, 0.0) is T
 
 
-def test_late_odometry_jumps_at_resets_only() -> None:
-    T = ring(40)
-    T = np.concatenate([T[:20], se2.inverse(T[20]) @ T[20:]])
-    late = delay_odometry(T, np.arange(40) * 0.2, 0.3)
-    x = np.hypot(*moves(late)[:, :2].T)
-    assert np.count_nonzero(x > 0.11) == 1
-
-
 @pytest.mark.parametrize("by", [8.0, -8.0])
 def test_a_robot_is_carried_as_far_as_said(by: float) -> None:
     robot = {"scans": 200, "carried_at": 0.7, "carried_by": by, "carried_turn": 0.0}
@@ -103,14 +88,3 @@ def test_a_robot_is_carried_as_far_as_said(by: float) -> None:
     path = np.concatenate([np.eye(3)[None], T])[1:, :2, 2]
     before = np.hypot(*(path[:scan] - path[scan]).T).min()
     assert (before < 0.3) == (by < 0)
-
-
-@pytest.mark.slow
-def test_a_robot_is_not_put_down_on_somebody() -> None:
-    robot = {"scans": 120, "carried_at": 0.5, "carried_by": 10.0}
-    for seed in range(3):
-        changes = {"robot": robot, "crowd": {"people": 60}, "laser": {"beams": 10}}
-        run = simulate(scene_by_name("hall", changes), seed)
-        scan = run.truth.scene["carried_at_scan"]
-        off = run.truth.movers[:, :, :2] - run.truth.T_world_base[:, None, :2, 2]
-        assert np.hypot(*np.moveaxis(off[scan], -1, 0)).min() > 0.4

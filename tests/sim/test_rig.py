@@ -13,12 +13,9 @@ from stillmap.sim import (
     RigSimulation,
     load_truth,
     scene_by_name,
-    simulate,
     simulate_rig,
     write_rig,
 )
-from stillmap.sim.lidar import compute_joint_angle
-from stillmap.sim.planner import compute_segment_distance
 
 
 @functools.cache
@@ -43,21 +40,6 @@ def test_both_have_the_same_clock_robot_and_movers() -> None:
         assert b is not None
         np.testing.assert_allclose(a[:, :2, 2], b[:, :2, 3])
         np.testing.assert_allclose(a[:, :2, :2], b[:, :2, :2])
-
-
-def test_the_flat_one_sees_walls_where_they_are() -> None:
-    flat = run().horizontal
-    recording = flat.recording
-    scan = np.repeat(np.arange(recording.n_scans), np.diff(recording.offset))
-    T = recording.T_map_sensor(flat.truth.T_world_base)[scan]
-    xy = np.einsum("nij,nj->ni", T[:, :2, :2], recording.points.astype(float)) + T[:, :2, 2]
-    near = np.full(len(xy), np.inf)
-    for wall in flat.truth.walls:
-        np.minimum(near, compute_segment_distance(xy, wall), out=near)
-    # columns are round here
-    assert near[flat.truth.static].max() < 0.04
-    assert flat.truth.static.mean() > 0.7
-    assert (flat.truth.mover >= 0).sum() > 100
 
 
 def test_each_scan_is_a_plane_at_the_angle_of_its_joint() -> None:
@@ -90,17 +72,6 @@ def test_floor_ceiling_and_walls_are_seen_in_3d() -> None:
     assert np.hypot(*(ends[person, :2] - at).T).max() < 0.6
 
 
-def test_while_it_looks_the_joint_goes_on() -> None:
-    recording, rig = run(0.1).tilting.recording, RigOptions()
-    assert recording.beam_time is not None
-    scan = np.repeat(np.arange(100), np.diff(recording.offset))
-    angle = compute_joint_angle(scan / 10 + recording.beam_time.astype(float), rig)
-    x, _, z = recording.points.T.astype(float)
-    assert np.abs(z * np.cos(angle) + x * np.sin(angle)).max() < 1e-4
-    still = run(0.1).joint_angle[scan]
-    assert np.abs(z * np.cos(still) + x * np.sin(still)).max() > 0.1
-
-
 def test_a_folder_of_both(tmp_path: Path) -> None:
     write_rig(run(), tmp_path / "rig")
     for name, one in (("horizontal", run().horizontal), ("tilting", run().tilting)):
@@ -111,16 +82,3 @@ def test_a_folder_of_both(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="already"):
         write_rig(run(), tmp_path / "rig")
     write_rig(run(), tmp_path / "rig", overwrite=True)
-
-
-def test_what_makes_no_rig_is_refused() -> None:
-    for changes in ({"lidar": {"channels": 16}}, {"laser": {"second_laser": True}}):
-        with pytest.raises(InputError):
-            scene_by_name("hall", {"rig": {"tilts": True}, **changes})
-    for wrong in ({"amplitude": 1.5}, {"period": 0.0}, {"pivot_z": 0.0}):
-        with pytest.raises(InputError):
-            scene_by_name("hall", {"rig": wrong})
-    with pytest.raises(InputError, match="simulate_rig"):
-        simulate(scene_by_name("hall", {"rig": {"tilts": True}}))
-    with pytest.raises(InputError, match="tilts"):
-        simulate_rig(scene_by_name("hall"))

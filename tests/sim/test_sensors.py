@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from stillmap import io
 from stillmap.core import se2
-from stillmap.core.errors import InputError
 from stillmap.sim import Simulation, scene_by_name, simulate, write_simulation
 
 Float = NDArray[np.float64]
@@ -54,25 +53,6 @@ def test_whoever_does_not_know_it_sees_its_mirror_image() -> None:
     np.testing.assert_array_equal(unknown.recording.T_odom_base, known.recording.T_odom_base)
 
 
-@pytest.mark.parametrize("beams", [60, 61, 200])
-def test_upside_down_it_sweeps_from_left_to_right(
-    beams: int, wall_distance: Distance, end_points: EndPoints
-) -> None:
-    run = taken(beams, upside_down="known", sweep_time=0.2)
-    assert run.recording.beam_time is not None
-    times = run.recording.beam_time.reshape(60, -1)
-    assert (np.diff(times, axis=1) >= 0).all()
-    xy, scan = end_points(run)
-    static = run.truth.static & (scan < 59)
-    off = wall_distance(xy, run.truth.walls).reshape(60, -1)
-    early, late = off[:, :6][static.reshape(60, -1)[:, :6]], off[:, -6:]
-    # at its stamp the robot is where it takes the first beams, on its left
-    assert np.quantile(early, 0.9) < 0.02
-    assert np.quantile(late[static.reshape(60, -1)[:, -6:]], 0.9) > np.quantile(early, 0.9)
-    left = run.recording.points.reshape(60, -1, 2)[:, 0]
-    assert (left[:, 1] > 0).all()
-
-
 @pytest.mark.parametrize("sweep_time", [0.0, 0.2])
 def test_a_second_laser_looks_backwards_by_turns(sweep_time: float) -> None:
     run = taken(second_laser=True, sweep_time=sweep_time, scans=100)
@@ -101,15 +81,6 @@ def test_hits_of_both_lasers_lie_on_the_walls(
     assert set(run.recording.sensor[scan[hit]]) == {0, 1}
 
 
-@pytest.mark.slow
-def test_each_of_two_lasers_has_the_rate_and_the_way_takes_as_long() -> None:
-    changes = {"crowd": {"people": 0}, "laser": {"beams": 4}}
-    one = simulate(scene_by_name("hall", changes), 0)
-    two = simulate(scene_by_name("hall", {**changes, "laser": {"beams": 4, "second_laser": True}}))
-    assert two.recording.n_scans == pytest.approx(2 * one.recording.n_scans, rel=0.02)
-    assert np.ptp(two.recording.stamp_ns) == pytest.approx(np.ptp(one.recording.stamp_ns), rel=0.02)
-
-
 def test_two_lasers_survive_as_a_carmen_log(tmp_path: Path) -> None:
     run = taken(60, second_laser=True)
     write_simulation(run, tmp_path / "sim", format="carmen")
@@ -118,17 +89,3 @@ def test_two_lasers_survive_as_a_carmen_log(tmp_path: Path) -> None:
     np.testing.assert_array_equal(log.stamp_ns, own.stamp_ns)
     np.testing.assert_allclose(log.points[log.hit], own.points[own.hit], atol=0.0051)
     np.testing.assert_allclose(log.T_base_sensor, own.T_base_sensor, atol=2e-5)
-
-
-def test_a_carmen_log_cannot_say_that_a_laser_hangs_upside_down(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="upside down"):
-        write_simulation(taken(60, upside_down="known"), tmp_path / "sim", format="carmen")
-    run = taken(60, upside_down="unknown")
-    write_simulation(run, tmp_path / "sim", format="carmen")
-    log = io.read(tmp_path / "sim/recording.log")
-    np.testing.assert_allclose(log.points[log.hit], run.recording.points[log.hit], atol=0.0051)
-
-
-def test_unknown_words_are_refused() -> None:
-    with pytest.raises(InputError, match="upside_down"):
-        scene_by_name("hall", {"laser": {"upside_down": "maybe"}})

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.config import override
-from stillmap.core.errors import InputError
-from stillmap.sim import LaserOptions, Scene, Simulation, scene_by_name, simulate
+from stillmap.sim import LaserOptions, Scene, Simulation, simulate
 from stillmap.sim.dynamics import Motion
 from stillmap.sim.laser import Movers, Outlines
 from stillmap.sim.planar import Sweep, cast_sweeps
@@ -85,15 +84,6 @@ def test_people_are_where_they_are_at_the_beam_time() -> None:
     assert behind[late].mean() > np.hypot(*(xy - centre).T)[late].mean() + 0.02
 
 
-def test_the_time_of_a_sweep_changes_nothing_but_the_beams() -> None:
-    still, swept = yard(0.0), yard(0.1)
-    np.testing.assert_array_equal(still.truth.T_world_base, swept.truth.T_world_base)
-    np.testing.assert_array_equal(still.recording.T_odom_base, swept.recording.T_odom_base)
-    np.testing.assert_array_equal(still.recording.stamp_ns, swept.recording.stamp_ns)
-    assert still.recording.beam_time is None
-    assert not np.array_equal(still.recording.points, swept.recording.points)
-
-
 @pytest.mark.parametrize("beams", [2, 3, 90, 181, 361])
 @pytest.mark.parametrize("fov", [np.pi, 2 * np.pi])
 def test_beam_times_grow_with_the_angle(beams: int, fov: float) -> None:
@@ -141,42 +131,6 @@ def test_beams_of_a_sweep_meet_what_comes_by_meanwhile() -> None:
     assert (returns.mover == 0).all()
 
 
-def test_what_begins_its_lane_again_is_not_seen_on_the_way_back() -> None:
-    leaping = np.array([[[10.0, -50, 10, 50]], [[-90.0, -50, -90, 50]]])
-    motion = standing_before(leaping)
-    options = LaserOptions(beams=101, fov=1.0, sweep_time=0.2, range_noise=0.0)
-    returns = cast_sweeps(motion, np.empty((0, 4)), np.eye(3)[None].repeat(2, 0), options)
-    np.testing.assert_allclose(returns.range[0] * np.cos(np.linspace(-0.5, 0.5, 101)), 10.0)
-    assert np.isinf(returns.range[1]).all()
-
-
-def test_cars_are_seen_where_they_are() -> None:
-    """With cars at 10 m/s a sweep of 0.1 s shows them up to a metre on."""
-    changes = {"robot": {"scans": 60}, "laser": {"beams": 91, "sweep_time": 0.1, **EXACT}}
-    run = simulate(scene_by_name("street", changes), 3)
-    poses, scan, when = at_beam_times(run)
-    kinds = np.array(run.truth.scene["mover_kinds"])
-    car = (run.truth.mover >= 0) & (kinds[run.truth.mover] == "car") & (scan < 59)
-    hit = np.flatnonzero(car)
-    T = se2.matrix(*poses[hit].T)
-    xy = np.einsum("nij,nj->ni", T[:, :2, :2], run.recording.points[hit]) + T[:, :2, 2]
-    mover = run.truth.movers[:, run.truth.mover[hit]]
-    before, n = np.floor(when[hit]).astype(int), np.arange(len(hit))
-    share = (when[hit] - before)[:, None]
-    centre = (1 - share) * mover[before, n, :2] + share * mover[before + 1, n, :2]
-    ahead = np.abs(xy[:, 0] - centre[:, 0])
-    assert ahead.max() < 5.6 * 1.06 / 2 + 0.01
-    assert len(hit) > 300
-
-
-def test_a_sweep_longer_than_from_scan_to_scan_is_refused() -> None:
-    with pytest.raises(InputError, match="sweep_time"):
-        scene_by_name("hall", {"laser": {"sweep_time": 0.3}})
-    with pytest.raises(InputError, match="sweep_time"):
-        scene_by_name("hall", {"laser": {"sweep_time": -0.1}})
-    scene_by_name("hall", {"laser": {"sweep_time": 0.3}, "robot": {"scan_rate": 3.0}})
-
-
 def test_a_robot_that_is_carried_away_is_not_seen_to_move() -> None:
     """The last scan before goes on as it began, and so does the first one after."""
     walls = tuple(box(0, 0, 40, 30))
@@ -196,8 +150,3 @@ def test_a_robot_that_is_carried_away_is_not_seen_to_move() -> None:
     jumps = np.abs(np.diff(ranges[[carried - 1, carried]], axis=1)).max(axis=1)
     usual = np.abs(np.diff(ranges[carried - 20 : carried - 1], axis=1)).max()
     assert jumps[0] < usual + 0.5
-
-
-def test_one_scan_alone_is_swept_too() -> None:
-    changes = {"robot": {"scans": 1}, "laser": {"sweep_time": 0.2}}
-    assert simulate(scene_by_name("hall", changes), 0).recording.hit.any()

@@ -1,6 +1,5 @@
 """Things that are moved, brought and taken away, and a robot that stands overnight."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -8,7 +7,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from stillmap.core import se2
 from stillmap.core.config import override
 from stillmap.sim import (
     Scene,
@@ -115,13 +113,6 @@ def test_a_thing_that_never_changes_is_a_wall() -> None:
     assert np.isnan(early.truth.movers[:, 2]).all()
 
 
-def test_things_are_counted_after_all_others() -> None:
-    run = yard(crowd={"people": 3}, robot={"scans": 120})
-    assert run.truth.scene["mover_kinds"] == ["person"] * 3 + ["thing"] * 4
-    assert set(np.unique(run.truth.mover)) >= {3, 5}
-    assert (run.truth.mover < 7).all()
-
-
 def test_everybody_keeps_clear_of_every_place() -> None:
     """At both ends of its way a thing is in the way throughout, also while it is not there."""
     wide = tuple(box(0, 0, 9.0, 0.2))
@@ -136,25 +127,6 @@ def test_everybody_keeps_clear_of_every_place() -> None:
         for face in faces_at_all_places(things):
             for xy in everybody:
                 assert compute_segment_distance(xy, face).min() > 0.2
-
-
-def test_places_and_times_are_part_of_the_truth() -> None:
-    told = json.loads(json.dumps(yard(robot={"scans": 5}).truth.scene, allow_nan=False))
-    assert told["things"][1]["stays"] == [
-        {"x": 0.0, "y": 3.0, "yaw": 0.0, "since": 0.0, "until": 30.0}
-    ]
-    assert len(told["things"][0]["faces"]) == 4
-
-
-def test_stays_come_one_after_the_other() -> None:
-    with pytest.raises(ValueError, match="one after the other"):
-        Thing(CRATE, (Stay(0, 0, until=5.0), Stay(1, 0, since=4.0)))
-    with pytest.raises(ValueError, match="one after the other"):
-        Thing(CRATE, (Stay(0, 0), Stay(1, 0, since=4.0)))
-    with pytest.raises(ValueError, match="end after"):
-        Stay(0, 0, since=3.0, until=3.0)
-    with pytest.raises(ValueError, match="faces"):
-        Thing((), (Stay(0, 0),))
 
 
 def paused(pause: float, **changes: dict[str, object]) -> Simulation:
@@ -177,23 +149,6 @@ def test_a_pause_is_a_leap_of_the_stamps_and_of_nothing_else() -> None:
 
 
 @pytest.mark.slow
-def test_nobody_is_where_he_was_before_the_pause() -> None:
-    run, carries_on = paused(28_800.0), paused(0.0)
-    np.testing.assert_array_equal(run.truth.movers[:100], carries_on.truth.movers[:100])
-    way = np.hypot(*np.diff(run.truth.movers[..., :2], axis=0).transpose(2, 0, 1))
-    assert np.median(way[99]) > 2.0
-    assert np.delete(way, 99, axis=0).max() < 0.5
-
-
-def test_without_a_pause_nothing_is_told_of_one() -> None:
-    run = simulate(scene_by_name("hall", {"robot": {"scans": 5}}), 4)
-    assert run.truth.scene["paused_at_scan"] is None
-    late = simulate(scene_by_name("hall", {"robot": {"scans": 5, "pause_at": 20.0}}), 4)
-    assert late.truth.scene["paused_at_scan"] is None
-    np.testing.assert_array_equal(run.recording.points, late.recording.points)
-
-
-@pytest.mark.slow
 def test_nothing_goes_on_evenly_through_a_pause() -> None:
     """The beams of the last scan before it meet people where they were then."""
     still = paused(0.0, laser={"beams": 60, "sweep_time": 0.2, "range_noise": 0.0})
@@ -209,19 +164,3 @@ def test_nothing_goes_on_evenly_through_a_pause() -> None:
     centre = run.truth.movers[scan[hit], run.truth.mover[hit], :2]
     assert hit.any()
     assert np.hypot(*(xy - centre).T).max() < 0.48 + 0.2 * 1.6
-
-
-def test_what_changes_overnight_follows_the_clock() -> None:
-    night = Thing(CRATE, (Stay(2.0, 1.0, until=4 * 3600.0),))
-    run = yard((night,), robot={"pause_at": 20.0})
-    np.testing.assert_array_equal(np.isnan(run.truth.movers[:, 0, 0]), np.arange(200) >= 100)
-
-
-def test_odometry_goes_on_after_a_pause() -> None:
-    run = paused(28_800.0)
-    assert run.recording.T_odom_base is not None
-    true, got = (
-        se2.parameters(se2.inverse(T[:-1]) @ T[1:])
-        for T in (run.truth.T_world_base, run.recording.T_odom_base)
-    )
-    np.testing.assert_allclose(got[99], true[99], atol=0.02)

@@ -27,15 +27,6 @@ def traffic(lane: Lane, seed: int = 0, **options: float) -> Traffic:
     return Traffic((lane,), TrafficOptions(**options), np.random.default_rng(seed))
 
 
-def test_alone_it_drives_at_its_speed_and_comes_back() -> None:
-    alone = traffic(STRAIGHT, vehicles=1, min_speed=8.0, max_speed=8.0, stopping_share=0.0)
-    poses = driven(alone, 1000)[:, 0]
-    step = np.diff(poses[:, 0])
-    assert np.count_nonzero(step < 0) == 2
-    np.testing.assert_allclose(np.median(step), 0.8)
-    np.testing.assert_allclose(poses[:, 1:], 0.0, atol=1e-9)
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_on_one_lane_nobody_touches(seed: int) -> None:
     busy = traffic(RING, seed, vehicles=10, stopping_share=0.5, min_speed=3.0, max_speed=12.0)
@@ -53,17 +44,6 @@ def test_on_one_lane_nobody_touches(seed: int) -> None:
     tangent = np.arctan2(poses[..., 1], poses[..., 0]) + np.pi / 2
     off = (poses[..., 2] - tangent + np.pi) % (2 * np.pi) - np.pi
     assert np.abs(off).max() < 0.05
-
-
-def test_faces_are_the_sides_of_the_vehicle() -> None:
-    one = traffic(RING, vehicles=1)
-    driven(one, 7)
-    x, y, heading = one.poses()[0]
-    corners = one.faces().reshape(4, 2, 2)
-    np.testing.assert_allclose(corners[:, 1], np.roll(corners[:, 0], -1, axis=0))
-    c, s = np.cos(heading), np.sin(heading)
-    local = (corners[:, 0] - [x, y]) @ np.array([[c, -s], [s, c]])
-    np.testing.assert_allclose(np.abs(local), np.broadcast_to(one.size / 2, (4, 2)))
 
 
 def test_it_brakes_for_the_robot_on_its_lane() -> None:
@@ -107,16 +87,6 @@ def test_it_stops_at_a_red_light_and_goes_on_when_it_is_green() -> None:
     np.testing.assert_allclose(front[red], front[300], atol=0.2)
     assert 150.0 - 3.0 < front[300] < 150.0
     assert front[401:600].max() > 200.0
-
-
-def test_whoever_is_too_near_to_the_light_drives_on() -> None:
-    lane = Lane(STRAIGHT.path, lights=(Light((150.0, 0.0), (0.0, 1e4), 1e5),))
-    one = traffic(lane, 1, vehicles=1, stopping_share=0.0, min_speed=12.0, max_speed=12.0)
-    reach = one.poses()[0, 0]
-    near = Light((reach + one.size[0, 0] / 2 + 6.0, 0.0), (0.0, 1e4), 1e5)
-    late = traffic(Lane(STRAIGHT.path, lights=(near,)), 1, vehicles=1, stopping_share=0.0,
-                   min_speed=12.0, max_speed=12.0)  # fmt: skip
-    assert driven(late, 20)[-1, 0, 0] > reach + 15.0
 
 
 def test_whoever_cuts_in_is_not_run_over() -> None:

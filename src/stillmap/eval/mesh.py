@@ -14,9 +14,10 @@ from stillmap.core.camera import Camera, is_in_image, project
 from stillmap.core.errors import import_extra
 from stillmap.eval import mesh_distance
 from stillmap.eval.labels import NAN, Bool, Float, Scores, mean
+from stillmap.eval.true_surfaces import project_to_static
 from stillmap.sim.appearance import compute_static_color
 from stillmap.sim.camera import SKY
-from stillmap.sim.truth_surfaces import StaticSurfaces
+from stillmap.sim.geometry import StaticSurfaces
 
 Index = NDArray[np.int32]
 
@@ -120,7 +121,7 @@ def score_surface(
         T_world_map: (4, 4).
     """
     on_mesh = mesh_distance.sample_surface(vertices, faces, SAMPLES).points
-    distance, _ = standing.project(transform_points(T_world_map, on_mesh))
+    distance, _ = project_to_static(standing, transform_points(T_world_map, on_mesh))
     in_world = transform_points(T_world_map, vertices)
     gaps = mesh_distance.distance_to_mesh(places, in_world, faces, COMPLETE)
     return SurfaceScores(
@@ -229,7 +230,7 @@ def compute_color_errors(
     Raises:
         MissingExtra: scikit-image is not installed.
     """
-    _, places = standing.project(transform_points(T_world_map, coloured.points))
+    _, places = project_to_static(standing, transform_points(T_world_map, coloured.points))
     return compute_color_difference(coloured.color, compute_static_color(places, colour_seed))
 
 

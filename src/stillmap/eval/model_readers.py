@@ -15,6 +15,7 @@ from stillmap.core.json import read_json
 from stillmap.eval import mesh_distance, readers
 from stillmap.eval.mesh import SAMPLES, ColoredPoints, TextureRecord, TrueImages
 from stillmap.eval.object_models import Model, MoverHits, Track
+from stillmap.eval.true_surfaces import project_to_static
 from stillmap.sim.truth import ImageTruth, load_image_truth
 from stillmap.slam.deskew import deskew_recording
 from stillmap.slam.options import SlamOptions
@@ -51,7 +52,7 @@ class CameraSimulation(NamedTuple):
         recording = self.truth.recording
         use = recording.hit & self.truth.static()
         use &= np.linalg.norm(recording.points, axis=1) <= max_range
-        _, places = self.image_truth.standing.project(self.end_points[use])
+        _, places = project_to_static(self.image_truth.standing, self.end_points[use])
         return places[mesh_distance.first_per_voxel(places, _VOXEL)]
 
     def mover_hits(self) -> MoverHits:

@@ -17,8 +17,8 @@ from stillmap.eval.mesh import (
     look_up_texture_source,
     transform_points,
 )
-from stillmap.sim.geometry import Solids
-from stillmap.sim.truth_surfaces import MovingSurfaces, project_to_solid, to_local, to_world
+from stillmap.eval.true_surfaces import place_parts, project_to_solid, to_world
+from stillmap.sim.geometry import MovingSurfaces, Solids, to_local
 
 _SAMPLES = 20_000
 _VOXEL = 0.02  # m, for thinning the observed points
@@ -203,7 +203,7 @@ def score_model(
     T_world_map: Float,
 ) -> ModelScores:
     """Score one model; for arguments see `score_object_models`."""
-    solids = moving.at(moving.parts(mover), model.stamp_ns)
+    solids = place_parts(moving, moving.parts(mover), model.stamp_ns)
     T = T_world_map @ model.T_map_object
     on_model = mesh_distance.sample_surface(model.vertices, model.faces, _SAMPLES).points
     accuracy = mean(distance_to_solids(transform_points(T, on_model), solids))
@@ -245,7 +245,7 @@ def collect_observed_points(
     use = (sighted.mover == mover) & (sighted.stamp_ns >= first) & (sighted.stamp_ns <= last)
     points, stamps = sighted.points[use], sighted.stamp_ns[use]
     parts = moving.parts(mover)
-    then, now = moving.at(parts, stamps), moving.at(parts, stamp_ns)
+    then, now = place_parts(moving, parts, stamps), place_parts(moving, parts, stamp_ns)
     nearest, found = np.full(len(points), np.inf), np.full((len(points), 3), np.nan)
     for k in range(len(parts)):
         on = project_to_solid(points, then, k)

@@ -8,8 +8,8 @@ import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
 
 from stillmap.core.recording import Recording
+from stillmap.eval.session_truth import SessionTruth
 from stillmap.sim.objects import place_faces
-from stillmap.sim.session_truth import SessionTruth
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]

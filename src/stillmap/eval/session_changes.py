@@ -10,7 +10,7 @@ from stillmap.eval.labels import Scores
 from stillmap.eval.session_cells import MIN_BEAMS, ChangeTruth, Seen
 from stillmap.eval.session_events import Event, list_events
 from stillmap.eval.session_found import FoundChange
-from stillmap.sim.session_truth import SessionTruth
+from stillmap.eval.session_truth import SessionTruth
 
 Bool = NDArray[np.bool_]
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.eval.session_cells import MIN_BEAMS, ChangeTruth
-from stillmap.sim.session_truth import SessionTruth
+from stillmap.eval.session_truth import SessionTruth
 
 Bool = NDArray[np.bool_]
 

@@ -10,9 +10,9 @@ from stillmap.core.errors import InputError
 from stillmap.eval.labels import LabelScores, Scores, score_labels
 from stillmap.eval.session_cells import MIN_BEAMS
 from stillmap.eval.session_poses import PlacedSession
+from stillmap.eval.session_truth import SessionTruth
 from stillmap.eval.session_voxels import VoxelTruth
 from stillmap.results.labels import read_labels
-from stillmap.sim.session_truth import SessionTruth
 
 Bool = NDArray[np.bool_]
 

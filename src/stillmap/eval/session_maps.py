@@ -13,9 +13,9 @@ from stillmap.eval.map import GHOST_DISTANCE, distance_to_walls, is_near_occupie
 from stillmap.eval.readers import read_trajectory
 from stillmap.eval.session_cells import MIN_BEAMS, CellTruth, widen
 from stillmap.eval.session_poses import FRAME_DT
+from stillmap.eval.session_truth import SessionTruth
 from stillmap.eval.trajectory import align, associate_trajectories, planar
 from stillmap.results.reader import Grid, moved, read_grid
-from stillmap.sim.session_truth import SessionTruth
 
 Float = NDArray[np.float64]
 

@@ -13,8 +13,8 @@ from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.eval.labels import Scores
 from stillmap.eval.readers import read_trajectory
+from stillmap.eval.session_truth import SessionTruth
 from stillmap.eval.trajectory import align, associate_trajectories
-from stillmap.sim.session_truth import SessionTruth
 
 Float = NDArray[np.float64]
 Verdict = Literal["right", "coarse", "wrong", "refused", "refused rightly"]

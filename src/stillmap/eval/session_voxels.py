@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from stillmap.core.recording import Recording
 from stillmap.eval.session_cells import MIN_BEAMS, SHORT, Seen
+from stillmap.eval.session_truth import SessionTruth
 from stillmap.sim.session_layout import Place
-from stillmap.sim.session_truth import SessionTruth
 from stillmap.slam import deskew_recording
 from stillmap.slam.options import SlamOptions
 

@@ -21,9 +21,9 @@ from stillmap.eval.session_poses import (
     read_sessions,
     score_poses,
 )
+from stillmap.eval.session_truth import SessionTruth, load_session_truth
 from stillmap.eval.session_voxels import collect_voxels
 from stillmap.results.reader import read_grid, require_there
-from stillmap.sim.session_truth import SessionTruth, load_session_truth
 
 Float = NDArray[np.float64]
 

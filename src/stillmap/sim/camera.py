@@ -10,11 +10,10 @@ from stillmap.core.camera import Camera, Images, unproject
 from stillmap.core.errors import InputError
 from stillmap.sim import appearance
 from stillmap.sim.appearance import Color, SurfacePoints
-from stillmap.sim.geometry import Float, Solids, make_pose
+from stillmap.sim.geometry import Float, Solids, make_pose, to_local
 from stillmap.sim.options import CameraOptions
 from stillmap.sim.ray_casting import Rays, cast_rays
 from stillmap.sim.truth import ImageTruth
-from stillmap.sim.truth_surfaces import to_local
 from stillmap.sim.world_3d import World
 
 SKY = 65535  # in masks

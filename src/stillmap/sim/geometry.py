@@ -190,6 +190,45 @@ class Ground(NamedTuple):
         return np.asarray(np.where(t > 0, t, np.inf))
 
 
+class StaticSurfaces(NamedTuple):
+    """The static surfaces of a world.
+
+    Attributes:
+        faces, solids: static ones; the solids at all times.
+        ground: the ground.
+        ceiling: metres above it; None: open sky.
+    """
+
+    faces: Faces
+    solids: Solids
+    ground: Ground
+    ceiling: float | None
+
+
+class MovingSurfaces(NamedTuple):
+    """The parts of the movers at T scans.
+
+    Attributes:
+        stamp_ns: (T,) by the clock of the scans.
+        solids: the parts, at these times.
+    """
+
+    stamp_ns: NDArray[np.int64]
+    solids: Solids
+
+    def parts(self, mover: int) -> NDArray[np.intp]:
+        """The numbers of a mover's parts."""
+        return np.flatnonzero(self.solids.mover == mover)
+
+
+def to_local(points: Float, pose: Float) -> Float:
+    """(n, 3) points in the frame of a solid at poses (4,) or (n, 4): x, y, heading, foot."""
+    x, y, heading, foot = np.moveaxis(pose, -1, 0)
+    c, s = np.cos(heading), np.sin(heading)
+    u, v = points[:, 0] - x, points[:, 1] - y
+    return np.stack([c * u + s * v, c * v - s * u, points[:, 2] - foot], axis=1)
+
+
 VAN = 5.2  # m, minimum length of a van
 LEAF = 0.04  # m, thickness of doors
 

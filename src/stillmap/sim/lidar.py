@@ -7,11 +7,19 @@ import numpy as np
 
 from stillmap.core import se2
 from stillmap.sim import laser, ray_casting
-from stillmap.sim.geometry import BOX, Faces, Float, Ground, Part, assemble, make_pose
+from stillmap.sim.geometry import (
+    BOX,
+    Faces,
+    Float,
+    Ground,
+    Part,
+    StaticSurfaces,
+    assemble,
+    make_pose,
+)
 from stillmap.sim.options import LaserOptions, LidarOptions, RigOptions
 from stillmap.sim.ray_casting import RayReturns, Rays
 from stillmap.sim.scene import Scene
-from stillmap.sim.truth_surfaces import StaticSurfaces
 from stillmap.sim.world_3d import World
 
 ROBOT = -2  # the mover's number of the robot itself

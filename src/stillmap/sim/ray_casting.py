@@ -10,9 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.sim.geometry import BOX, CYLINDER, Faces, Float, Ground, Solids
+from stillmap.sim.geometry import BOX, CYLINDER, Faces, Float, Ground, Solids, StaticSurfaces
 from stillmap.sim.laser import MIN_RANGE
-from stillmap.sim.truth_surfaces import StaticSurfaces
 
 Window = tuple[slice, slice]  # columns, channels
 

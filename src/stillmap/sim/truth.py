@@ -12,8 +12,7 @@ from stillmap.core.array_folder import open_npy, read_npz
 from stillmap.core.errors import InputError
 from stillmap.core.json import read_json
 from stillmap.io.images import read_image
-from stillmap.sim.geometry import Faces, Float, Ground, Solids
-from stillmap.sim.truth_surfaces import MovingSurfaces, StaticSurfaces
+from stillmap.sim.geometry import Faces, Float, Ground, MovingSurfaces, Solids, StaticSurfaces
 
 FOLDER = "truth"
 SCENE = "scene.json"

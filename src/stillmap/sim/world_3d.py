@@ -10,10 +10,20 @@ from numpy.typing import NDArray
 from stillmap.sim import geometry
 from stillmap.sim.dynamics import Moment, Motion
 from stillmap.sim.episode import Episode
-from stillmap.sim.geometry import BOX, Faces, Float, Ground, Part, Solids, assemble, make_pose
+from stillmap.sim.geometry import (
+    BOX,
+    Faces,
+    Float,
+    Ground,
+    MovingSurfaces,
+    Part,
+    Solids,
+    StaticSurfaces,
+    assemble,
+    make_pose,
+)
 from stillmap.sim.options import HeightOptions, LidarOptions
 from stillmap.sim.scene import Scene, Segment
-from stillmap.sim.truth_surfaces import MovingSurfaces, StaticSurfaces
 from stillmap.sim.walls import polyline
 
 _MAX_SIZE = 6.0  # m, of a loop that is not a room or a house

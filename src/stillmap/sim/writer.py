@@ -32,6 +32,7 @@ Format = Literal["stillmap", "carmen"]
 CARMEN_LOG = "recording.log"
 MARK = "truth"  # every simulation has it
 RIG_MARK = "tilting/truth"  # every one of two lasers has it
+SESSIONS_MARK = "session-1/truth"  # every folder of simulated sessions has it, no place does
 _MAX_DISTANCE = 65.535  # m, of a 16-bit image in millimetres
 
 
@@ -107,7 +108,7 @@ def write_sessions(
     total = sum(len(plan.scenes) for plan in plans)
     about: list[dict[str, Any]] = []
     sights, counts = [], []
-    with atomic_folder(Path(path), session_truth.MARK, overwrite) as work:
+    with atomic_folder(Path(path), SESSIONS_MARK, overwrite) as work:
         for place, plan in enumerate(plans):
             for simulation in simulate_sessions(plan):
                 name = f"session-{len(about) + 1}"
@@ -115,7 +116,7 @@ def write_sessions(
                 _write_folder(simulation, work / name)
                 about.append({"name": name, "place": place, **_describe(simulation)})
                 sights.append(observe(simulation))
-                counts.append({"name": name, **_count(simulation)})
+                counts.append({"name": name, **count_beams(simulation)})
                 if tell is not None:
                     tell(len(about) / total)
         names, places = ([session[key] for session in about] for key in ("name", "place"))
@@ -148,7 +149,8 @@ def _describe(simulation: Simulation) -> dict[str, Any]:
     }
 
 
-def _count(simulation: Simulation) -> dict[str, int]:
+def count_beams(simulation: Simulation) -> dict[str, int]:
+    """Numbers of scans, beams, hits, and hits on movers."""
     return {
         "scans": simulation.recording.n_scans,
         "beams": simulation.recording.n_beams,

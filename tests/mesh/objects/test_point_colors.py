@@ -14,6 +14,7 @@ from stillmap.cli.main import main
 from stillmap.core.camera import Images
 from stillmap.eval.mesh import compute_color_difference
 from stillmap.eval.model_readers import read_camera_simulation
+from stillmap.eval.true_surfaces import project_to_static
 from stillmap.io import stillmap_folder
 from stillmap.io.trajectory import poses_from_tum
 from stillmap.mesh import build
@@ -52,7 +53,7 @@ def test_colours_of_what_stands_still_are_the_true_ones(room, result):
     assert not has[~hit].any()
     assert 0.1 < has[still].mean() < 0.5  # the lidar looks round about, the camera does not
     use = np.flatnonzero(still & has & seen.truth.static())
-    _, places = seen.image_truth.standing.project(seen.end_points[use])
+    _, places = project_to_static(seen.image_truth.standing, seen.end_points[use])
     true = compute_static_color(places, seen.image_truth.colour_seed)
     difference = compute_color_difference(colours[use], true)
     assert np.median(difference) < 5.0

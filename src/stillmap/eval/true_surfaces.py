@@ -1,69 +1,69 @@
-"""True surfaces of a simulated world: projection of points to static ones, samples of movers."""
+"""True surfaces of a simulated world: projection of points to them, places of movers."""
 
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.sim.dynamics import MAX_SPEED
-from stillmap.sim.geometry import BOX, CYLINDER, Faces, Float, Ground, Solids
+from stillmap.sim.geometry import (
+    BOX,
+    CYLINDER,
+    Float,
+    Ground,
+    MovingSurfaces,
+    Solids,
+    StaticSurfaces,
+    to_local,
+)
 
 _SQUARE = 4.0  # m, points within one share their candidate surfaces
 _BISECTIONS = 80  # of the root for the nearest point of an ellipse, to the last digit
 
 
-class StaticSurfaces(NamedTuple):
-    """The static surfaces of a world.
+def project_to_static(surfaces: StaticSurfaces, points: Float) -> tuple[Float, Float]:
+    """Project points to the nearest static surface.
 
-    Attributes:
-        faces, solids: static ones; the solids at all times.
-        ground: the ground.
-        ceiling: metres above it; None: open sky.
+    Exact for solids, and for faces and ground where the ground is level; where it slopes, up
+    to the square of the slope. Hidden surfaces count, as the floor below a cupboard.
+
+    Args:
+        surfaces: of the world.
+        points: (n, 3) metres.
+
+    Returns:
+        Distances (n,) in metres, and the projected points (n, 3).
     """
+    places = _on_ground(points, surfaces.ground, surfaces.ceiling)
+    distance = np.linalg.norm(places - points, axis=1)
+    a, b, center = (
+        surfaces.faces.ends[:, :2],
+        surfaces.faces.ends[:, 2:],
+        surfaces.solids.pose[0, :, :2],
+    )
+    reach = np.hypot(*surfaces.solids.half.T)[:, None]
+    lowest = np.concatenate([np.minimum(a, b), center - reach])
+    highest = np.concatenate([np.maximum(a, b), center + reach])
+    for part in _in_squares(points):
+        some, d, at = points[part], distance[part], places[part]
+        off = _gap(some[:, :2].min(axis=0), some[:, :2].max(axis=0), lowest, highest)
+        for k in np.flatnonzero(off < d.max() ** 2).tolist():
+            near = np.flatnonzero(_gap(some[:, :2], some[:, :2], lowest[k], highest[k]) < d * d)
+            if len(near):
+                found = _project_to(surfaces, k, some[near])
+                off_found = np.linalg.norm(found - some[near], axis=1)
+                better = off_found < d[near]
+                d[near[better]], at[near[better]] = off_found[better], found[better]
+        distance[part], places[part] = d, at
+    return distance, places
 
-    faces: Faces
-    solids: Solids
-    ground: Ground
-    ceiling: float | None
 
-    def project(self, points: Float) -> tuple[Float, Float]:
-        """Project points to the nearest surface.
-
-        Exact for solids, and for faces and ground where the ground is level; where it slopes, up
-        to the square of the slope. Hidden surfaces count, as the floor below a cupboard.
-
-        Args:
-            points: (n, 3) metres.
-
-        Returns:
-            Distances (n,) in metres, and the projected points (n, 3).
-        """
-        places = _on_ground(points, self.ground, self.ceiling)
-        distance = np.linalg.norm(places - points, axis=1)
-        a, b, center = self.faces.ends[:, :2], self.faces.ends[:, 2:], self.solids.pose[0, :, :2]
-        reach = np.hypot(*self.solids.half.T)[:, None]
-        lowest = np.concatenate([np.minimum(a, b), center - reach])
-        highest = np.concatenate([np.maximum(a, b), center + reach])
-        for part in _in_squares(points):
-            some, d, at = points[part], distance[part], places[part]
-            off = _gap(some[:, :2].min(axis=0), some[:, :2].max(axis=0), lowest, highest)
-            for k in np.flatnonzero(off < d.max() ** 2).tolist():
-                near = np.flatnonzero(_gap(some[:, :2], some[:, :2], lowest[k], highest[k]) < d * d)
-                if len(near):
-                    found = self._project_to(k, some[near])
-                    off_found = np.linalg.norm(found - some[near], axis=1)
-                    better = off_found < d[near]
-                    d[near[better]], at[near[better]] = off_found[better], found[better]
-            distance[part], places[part] = d, at
-        return distance, places
-
-    def _project_to(self, k: int, points: Float) -> Float:
-        """Project points to face k or, counted after the faces, a solid."""
-        first = len(self.faces.ends)
-        if k >= first:
-            return project_to_solid(points, self.solids, k - first)
-        return _on_face(points, self.faces.ends[k], self.faces.z[k], self.ground)
+def _project_to(surfaces: StaticSurfaces, k: int, points: Float) -> Float:
+    """Project points to face k or, counted after the faces, a solid."""
+    first = len(surfaces.faces.ends)
+    if k >= first:
+        return project_to_solid(points, surfaces.solids, k - first)
+    return _on_face(points, surfaces.faces.ends[k], surfaces.faces.z[k], surfaces.ground)
 
 
 def _in_squares(points: Float) -> Iterator[NDArray[np.intp]]:
@@ -89,14 +89,6 @@ def to_world(local: Float, pose: Float) -> Float:
     c, s = np.cos(heading), np.sin(heading)
     u, v, w = local.T
     return np.stack([x + c * u - s * v, y + s * u + c * v, foot + w], axis=1)
-
-
-def to_local(points: Float, pose: Float) -> Float:
-    """The inverse of `to_world`."""
-    x, y, heading, foot = np.moveaxis(pose, -1, 0)
-    c, s = np.cos(heading), np.sin(heading)
-    u, v = points[:, 0] - x, points[:, 1] - y
-    return np.stack([c * u + s * v, c * v - s * u, points[:, 2] - foot], axis=1)
 
 
 def project_to_solid(points: Float, solids: Solids, k: int) -> Float:
@@ -181,34 +173,21 @@ def _on_ellipsoid(p: Float, half: Float) -> Float:
     return np.asarray(np.copysign(found, p))
 
 
-class MovingSurfaces(NamedTuple):
-    """The parts of the movers at T scans.
-
-    Attributes:
-        stamp_ns: (T,) by the clock of the scans.
-        solids: the parts, at these times.
-    """
-
-    stamp_ns: NDArray[np.int64]
-    solids: Solids
-
-    def parts(self, mover: int) -> NDArray[np.intp]:
-        """The numbers of a mover's parts."""
-        return np.flatnonzero(self.solids.mover == mover)
-
-    def at(self, parts: NDArray[np.intp], stamp_ns: NDArray[np.int64] | int) -> Solids:
-        """Some parts at n times; interpolated between scans, extrapolated after the last one."""
-        at_ns, last = np.atleast_1d(np.asarray(stamp_ns, np.int64)), len(self.stamp_ns) - 1
-        t = np.clip(np.searchsorted(self.stamp_ns, at_ns, side="right") - 1, 0, max(last - 1, 0))
-        after = np.minimum(t + 1, last)
-        span, since = self.stamp_ns[after] - self.stamp_ns[t], at_ns - self.stamp_ns[t]
-        share = np.clip(since / np.where(span > 0, span, np.inf), 0.0, 2.0)[:, None, None]
-        before = self.solids.pose[t[:, None], parts]
-        change = self.solids.pose[after[:, None], parts] - before
-        change[..., 2] = (change[..., 2] + np.pi) % (2 * np.pi) - np.pi
-        way = np.hypot(change[..., 0], change[..., 1])
-        goes_on = way < MAX_SPEED * 1e-9 * np.maximum(span, 1)[:, None]
-        # a jump between scans is not interpolated
-        stays = np.where(share < 1.0, before, before + change)
-        pose = np.where(goes_on[..., None], before + share * change, stays)
-        return self.solids._replace(pose=self.solids.pose[:1]).select(parts)._replace(pose=pose)
+def place_parts(
+    moving: MovingSurfaces, parts: NDArray[np.intp], stamp_ns: NDArray[np.int64] | int
+) -> Solids:
+    """Some parts at n times; interpolated between scans, extrapolated after the last one."""
+    at_ns, last = np.atleast_1d(np.asarray(stamp_ns, np.int64)), len(moving.stamp_ns) - 1
+    t = np.clip(np.searchsorted(moving.stamp_ns, at_ns, side="right") - 1, 0, max(last - 1, 0))
+    after = np.minimum(t + 1, last)
+    span, since = moving.stamp_ns[after] - moving.stamp_ns[t], at_ns - moving.stamp_ns[t]
+    share = np.clip(since / np.where(span > 0, span, np.inf), 0.0, 2.0)[:, None, None]
+    before = moving.solids.pose[t[:, None], parts]
+    change = moving.solids.pose[after[:, None], parts] - before
+    change[..., 2] = (change[..., 2] + np.pi) % (2 * np.pi) - np.pi
+    way = np.hypot(change[..., 0], change[..., 1])
+    goes_on = way < MAX_SPEED * 1e-9 * np.maximum(span, 1)[:, None]
+    # a jump between scans is not interpolated
+    stays = np.where(share < 1.0, before, before + change)
+    pose = np.where(goes_on[..., None], before + share * change, stays)
+    return moving.solids._replace(pose=moving.solids.pose[:1]).select(parts)._replace(pose=pose)
