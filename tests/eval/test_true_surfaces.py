@@ -6,7 +6,7 @@ from marks import slow_params
 from scipy.spatial import KDTree
 from trimesh import creation
 
-from stillmap.eval.true_surfaces import place_parts, project_to_solid, to_world
+from stillmap.eval.true_surfaces import place_parts, project_to_solid, project_to_static, to_world
 from stillmap.sim.geometry import (
     BOX,
     CYLINDER,
