@@ -26,7 +26,7 @@ from sweep import in_fresh_process
 from tables import markdown
 
 from stillmap.core import se2
-from stillmap.core.array_builder import ArrayBuilder
+from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.recording import Recording
 from stillmap.io import stillmap_folder
 from stillmap.sim import SCENES, episode, laser, planar, scene_by_name

@@ -18,7 +18,7 @@ from pathlib import Path
 from tables import markdown
 
 import stillmap
-from stillmap.core.heap import trim_heap
+from stillmap.core.parallel import trim_heap
 from stillmap.live.replay import iter_beams
 
 OPTIONS = {"threads": 1}

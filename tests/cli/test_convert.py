@@ -10,7 +10,7 @@ from refusals import refused
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from stillmap.core.extras import install_command
+from stillmap.core.errors import install_command
 from stillmap.io import read, stillmap_folder
 from stillmap.io.trajectory import read_tum
 

@@ -9,8 +9,7 @@ import pytest
 
 from stillmap.cli.console import fail, print_lines, say
 from stillmap.cli.main import main
-from stillmap.core.errors import InputError
-from stillmap.core.printable import printable
+from stillmap.core.errors import InputError, printable
 from stillmap.core.recording import Recording
 from stillmap.io import stillmap_folder
 

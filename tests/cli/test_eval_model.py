@@ -13,7 +13,7 @@ from PIL import Image
 
 from stillmap.cli.main import main
 from stillmap.core import se2
-from stillmap.core.extras import install_command
+from stillmap.core.errors import install_command
 from stillmap.eval import mesh as mesh_module
 from stillmap.io import read
 from stillmap.io.trajectory import write_tum

@@ -12,8 +12,13 @@ import pytest
 
 from stillmap.cli.main import main
 from stillmap.cli.parser import COMMANDS
-from stillmap.core.errors import InputError, MissingExtra, closest_match, import_extra
-from stillmap.core.extras import install_command
+from stillmap.core.errors import (
+    InputError,
+    MissingExtra,
+    closest_match,
+    import_extra,
+    install_command,
+)
 
 
 def refusal(capsys, *words: object) -> str:
@@ -293,8 +298,8 @@ def test_extra_of_sources_that_are_not_installed(monkeypatch, tmp_path):
         raise PackageNotFoundError(name)
 
     monkeypatch.setattr("importlib.metadata.distribution", missing)
-    module = tmp_path / "src/stillmap/core/extras.py"
-    monkeypatch.setattr("stillmap.core.extras.__file__", str(module))
+    module = tmp_path / "src/stillmap/core/errors.py"
+    monkeypatch.setattr("stillmap.core.errors.__file__", str(module))
     assert shlex.split(install_command("viewer"))[-1] == "stillmap[viewer]"
     (tmp_path / "pyproject.toml").write_text("")
     assert shlex.split(install_command("viewer"))[-1] == f"{tmp_path}[viewer]"

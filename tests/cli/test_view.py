@@ -13,7 +13,7 @@ import urllib.request
 import pytest
 
 from stillmap.core import errors
-from stillmap.core.extras import install_command
+from stillmap.core.errors import install_command
 
 SCREENS = ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")
 

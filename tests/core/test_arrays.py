@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from stillmap.core import arrays
-from stillmap.core.array_builder import ArrayBuilder
+from stillmap.core.arrays import ArrayBuilder
 from stillmap.io import builder
 from stillmap.io.builder import ReadContext, RecordingBuilder
 from stillmap.prepare.options import ReadOptions

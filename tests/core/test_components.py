@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from stillmap.core import components
-from stillmap.core.components import adjacent_pairs, connected_components, neighbor_pairs
+from stillmap.core import square_box as components
+from stillmap.core.square_box import adjacent_pairs, connected_components, neighbor_pairs
 
 
 def held(pairs):

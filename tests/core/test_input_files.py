@@ -17,11 +17,11 @@ from stillmap.core.input_files import (
     InputPath,
     ShorterFileError,
     copy_content,
+    open_lock,
     read_bytes,
     read_text,
 )
 from stillmap.core.json import read_json
-from stillmap.core.locks import open_lock
 
 LARGE = 1 << 20  # bytes, more than are read at once
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
-from stillmap.core.extras import has_wheels, install_hint
+from stillmap.core.errors import has_wheels, install_hint
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "src" / "stillmap"

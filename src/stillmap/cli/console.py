@@ -10,9 +10,8 @@ from types import CodeType, FrameType
 from typing import IO, Any
 
 from stillmap.core import profiling
-from stillmap.core.errors import InputError
+from stillmap.core.errors import InputError, printable
 from stillmap.core.interrupts import defers_signals_in, send_again
-from stillmap.core.printable import printable
 from stillmap.core.profiling import Progress, is_terminal
 
 _STYLES = {"error": "1;31", "warning": "33"}  # bold red, yellow

@@ -241,7 +241,7 @@ def _convert_to_cloud(
 def _build_cloud(
     args: argparse.Namespace, result: "ResultFolder", scratch: Path
 ) -> "point_cloud.Cloud":
-    from stillmap.core.region import limit_hits
+    from stillmap.core.grid_map import limit_hits
     from stillmap.io.trajectory import poses_from_tum
     from stillmap.results import point_cloud
     from stillmap.results.labels import read_colors

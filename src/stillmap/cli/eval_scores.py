@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.errors import InputError
-from stillmap.core.region import is_inside
+from stillmap.core.grid_map import is_inside
 from stillmap.eval import readers, trajectory
 from stillmap.eval.labels import LabelScores, score_labels
 from stillmap.eval.map import MapScores, extract_wall_cells, extract_wall_cells_from_hits, score_map

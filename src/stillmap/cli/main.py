@@ -18,8 +18,13 @@ from stillmap.cli.console import (
     write_line,
 )
 from stillmap.cli.parser import COMMANDS, EXIT_INPUT, parser
-from stillmap.core.errors import InputError, closest_match, is_out_of_memory, memory_error
-from stillmap.core.printable import printable
+from stillmap.core.errors import (
+    InputError,
+    closest_match,
+    is_out_of_memory,
+    memory_error,
+    printable,
+)
 
 EXIT_DEFECT = 1
 

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.cli.console import list_files, say, show_share
-from stillmap.core.advice import advise, split_advice
-from stillmap.core.errors import InputError, MissingExtra
+from stillmap.core.errors import InputError, MissingExtra, advise, split_advice
 from stillmap.core.parallel import limit_blas_threads, resolve_threads
 from stillmap.core.profiling import Progress, StageTimer
 from stillmap.core.recording import Recording

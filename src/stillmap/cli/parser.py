@@ -8,8 +8,7 @@ from importlib import import_module
 from typing import Any, NoReturn
 
 from stillmap.cli.console import colorize
-from stillmap.core.errors import closest_match
-from stillmap.core.printable import printable
+from stillmap.core.errors import closest_match, printable
 
 EXIT_INPUT = 2
 

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stillmap.cli.console import in_flags, say, show_share
-from stillmap.core.errors import InputError, MissingExtra, import_extra
-from stillmap.core.printable import printable
+from stillmap.core.errors import InputError, MissingExtra, import_extra, printable
 from stillmap.core.profiling import is_terminal
 
 if TYPE_CHECKING:

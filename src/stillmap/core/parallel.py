@@ -1,5 +1,6 @@
 """Thread counts and ordered parallel map; results do not depend on the number of threads."""
 
+import ctypes
 import os
 import sys
 from collections import deque
@@ -107,3 +108,16 @@ def work_beside(work: Callable[[], _Outcome], threads: int) -> Iterator[Callable
         return
     with ThreadPoolExecutor(1) as pool:
         yield pool.submit(work).result
+
+
+def trim_heap() -> None:
+    """Give freed memory back to the system, after a stage that needed much of it.
+
+    The blocks of the kernels' grids are small: the allocator keeps them when a grid goes, one heap
+    per thread, and the next stage takes others. Only glibc does so and has a function against it.
+    """
+    if sys.platform != "linux":
+        return
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.components import connected_components, neighbor_pairs
 from stillmap.core.parallel import map_ordered
 from stillmap.core.recording import Recording
+from stillmap.core.square_box import connected_components, neighbor_pairs
 from stillmap.em.mixture import fit_weights, posterior
 from stillmap.em.observations import (
     HALF_TIME_RHO,

@@ -10,9 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.advice import advise
-from stillmap.core.array_builder import ArrayBuilder
-from stillmap.core.arrays import empty
+from stillmap.core.arrays import ArrayBuilder, empty
+from stillmap.core.errors import advise
 from stillmap.core.recording import Recording
 from stillmap.core.timestamps import MAX_BEAM_TIME
 from stillmap.io.text_lines import Progress, share_progress

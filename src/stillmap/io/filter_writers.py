@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stillmap.core import arrays
-from stillmap.core.array_builder import ArrayBuilder
+from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.errors import InputError
 from stillmap.core.files import require_new, require_new_file, workplace
 from stillmap.core.json import count_skipped

@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from stillmap.core import camera as camera_module
 from stillmap.core import se2
-from stillmap.core.advice import advise
 from stillmap.core.camera import Camera, Images
-from stillmap.core.errors import InputError
+from stillmap.core.errors import InputError, advise
 from stillmap.core.recording import Recording
 from stillmap.io import camera_file, cameras, rgbd_folders
 from stillmap.io.builder import ReadContext

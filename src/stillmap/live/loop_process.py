@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import config
-from stillmap.core.heap import trim_heap
+from stillmap.core.parallel import trim_heap
 from stillmap.live.local_map import MappedScan
 from stillmap.live.loop_closer import Correction, LoopCloser
 from stillmap.live.scan import ScanBeams

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
-from stillmap.core.heap import trim_heap
+from stillmap.core.parallel import trim_heap
 from stillmap.live.causal_labels import CausalLabels
 from stillmap.live.front_end import FrontEnd, Registration
 from stillmap.live.local_map import MappedScan, thin_scan

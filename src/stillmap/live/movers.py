@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import kalman
-from stillmap.core.components import adjacent_pairs, component_labels
 from stillmap.core.short_repr import ShortRepr
+from stillmap.core.square_box import adjacent_pairs, component_labels
 from stillmap.live.scan import ScanBeams
 
 Float = NDArray[np.float64]

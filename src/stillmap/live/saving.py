@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.advice import advise
 from stillmap.core.arrays import empty, iter_blocks, release_pages, write_npy
-from stillmap.core.errors import InputError, cannot_write
+from stillmap.core.errors import InputError, advise, cannot_write
 from stillmap.core.files import require_new
 from stillmap.core.profiling import Progress, no_progress
 from stillmap.core.recording import Recording

@@ -7,9 +7,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.components import connected_components, neighbor_pairs
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
+from stillmap.core.square_box import connected_components, neighbor_pairs
 from stillmap.em import CellHistories, ChangedCells, time_bin_index
 from stillmap.em.change_hmm import MIN_RECURRING_CHANGES
 from stillmap.mapping.doors import Door

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from stillmap import em
 from stillmap.core import arrays
-from stillmap.core.array_builder import ArrayBuilder
+from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.chunks import iter_beams
 from stillmap.core.recording import Recording
 from stillmap.em.types import DYNAMIC_BELOW

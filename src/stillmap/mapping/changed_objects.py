@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import em
-from stillmap.core.components import connected_components, neighbor_pairs
+from stillmap.core.square_box import connected_components, neighbor_pairs
 from stillmap.mapping.change_detection import Change
 from stillmap.mapping.doors import is_row
 

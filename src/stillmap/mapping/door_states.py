@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.arrays import iter_blocks
-from stillmap.core.components import group_indices
 from stillmap.core.recording import Recording
+from stillmap.core.square_box import group_indices
 from stillmap.mapping.changed_objects import cell_keys
 from stillmap.mapping.doors import Door, DoorState, Position
 

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core.arrays import iter_blocks
-from stillmap.core.components import adjacent_pairs, component_labels, group_indices
 from stillmap.core.recording import Recording
+from stillmap.core.square_box import adjacent_pairs, component_labels, group_indices
 from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.mapping.doorways import Doorway
 from stillmap.mapping.resting_leaf import SurfaceField

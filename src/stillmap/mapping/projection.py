@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 import stillmap._core as _core
 from stillmap import em
 from stillmap.core import se2
-from stillmap.core.array_builder import ArrayBuilder
-from stillmap.core.arrays import unique_cells
-from stillmap.core.components import adjacent_pairs, component_labels
+from stillmap.core.arrays import ArrayBuilder, unique_cells
 from stillmap.core.parallel import map_ordered
 from stillmap.core.recording import Recording
+from stillmap.core.square_box import adjacent_pairs, component_labels
 from stillmap.core.tiles import tiles_of
 from stillmap.em import GroundMap, OccupancyMap
 from stillmap.em.types import GROUND_SQUARE

@@ -8,8 +8,8 @@ from functools import partial
 import numpy as np
 
 from stillmap.core.errors import import_extra
+from stillmap.core.grid_map import Region, is_inside
 from stillmap.core.profiling import Progress, StageTimer, no_progress
-from stillmap.core.region import Region, is_inside
 from stillmap.core.short_repr import ShortRepr
 from stillmap.mesh.inputs import MeshInputs
 from stillmap.mesh.objects.merging import ObjectTrack, collect_tracks, merge_tracks

@@ -7,9 +7,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from stillmap.core.beam_times import beam_stamps_ns, max_scan_duration_ns
 from stillmap.core.camera import Images
-from stillmap.core.recording import Recording
+from stillmap.core.recording import Recording, beam_stamps_ns, max_scan_duration_ns
 from stillmap.mesh.range_image import is_row_scanner
 from stillmap.mesh.tracked_boxes import TrackedBox
 from stillmap.mesh.types import Bool, Float, Float32, Index, Int64

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stillmap.core.components import component_labels
 from stillmap.core.short_repr import ShortRepr
+from stillmap.core.square_box import component_labels
 from stillmap.mesh.types import Bool, Float, Index, Int32
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.advice import advise
+from stillmap.core.errors import advise
 from stillmap.core.json import count_skipped
 from stillmap.core.recording import Recording
 from stillmap.pipeline.estimate import Estimate, IterationRecord
@@ -19,7 +19,7 @@ _LOST = 0.2  # explained share of a scan's beams below which its pose cannot be 
 def find_warnings(
     best: Estimate, recording: Recording, records: Sequence[IterationRecord] = ()
 ) -> list[str]:
-    """One sentence per warning, those of the reader first; see `core.advice`.
+    """One sentence per warning, those of the reader first; see `core.errors`.
 
     Args:
         best: the estimate that was kept.

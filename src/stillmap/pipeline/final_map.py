@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap import em, slam
-from stillmap.core.heap import trim_heap
-from stillmap.core.parallel import resolve_threads
+from stillmap.core.parallel import resolve_threads, trim_heap
 from stillmap.core.profiling import Progress, StageTimer
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr

@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import em, slam
-from stillmap.core.heap import trim_heap
 from stillmap.core.local_frame import LocalFrame
-from stillmap.core.parallel import limit_blas_threads, resolve_threads, work_beside
+from stillmap.core.parallel import limit_blas_threads, resolve_threads, trim_heap, work_beside
 from stillmap.core.profiling import Progress, StageTimer, no_progress
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr

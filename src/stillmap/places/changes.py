@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.components import connected_components, neighbor_pairs
+from stillmap.core.square_box import connected_components, neighbor_pairs
 from stillmap.places.leaves import Leaf, fit_leaf, is_hinged, turn_about_hinge
 from stillmap.places.place_change import Kind, PlaceChange
 from stillmap.places.place_states import PlaceStates

@@ -12,8 +12,7 @@ from stillmap.core.arrays import iter_blocks
 from stillmap.core.config import to_dict
 from stillmap.core.errors import InputError
 from stillmap.core.files import write_text
-from stillmap.core.json import write_json
-from stillmap.core.version import package_version
+from stillmap.core.json import package_version, write_json
 from stillmap.em import OccupancyMap
 from stillmap.pipeline.options import Options
 from stillmap.places.changes import detect_place_changes

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.components import neighbor_pairs
 from stillmap.core.short_repr import ShortRepr
+from stillmap.core.square_box import neighbor_pairs
 from stillmap.places import session_hmm
 from stillmap.places.beam_cells import cell_keys
 from stillmap.places.evidence import BLOCK, Bytes, Evidence, crop_without_gaps, to_sums

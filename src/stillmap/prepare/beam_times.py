@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.beam_times import beam_stamps_ns
-from stillmap.core.recording import Recording
+from stillmap.core.recording import Recording, beam_stamps_ns
 
 Float = NDArray[np.float64]
 

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays, se2
-from stillmap.core.array_builder import ArrayBuilder
-from stillmap.core.arrays import release_pages, release_periodically
+from stillmap.core.arrays import ArrayBuilder, release_pages, release_periodically
 from stillmap.core.recording import Recording
 from stillmap.prepare import max_range
 from stillmap.prepare.max_range import RangeRule

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.advice import advise
+from stillmap.core.errors import advise
 from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE, ReadOptions
 
 SelfSector = tuple[int, int, float]  # first and last beam, maximum range (m) of self returns

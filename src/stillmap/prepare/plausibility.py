@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays, se2, se3
-from stillmap.core.advice import advise
+from stillmap.core.errors import advise
 from stillmap.core.recording import Recording
 from stillmap.core.square_box import find_busiest
 from stillmap.prepare.max_range import DECLARED, GIVEN

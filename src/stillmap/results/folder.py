@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from stillmap.core import arrays
 from stillmap.core.errors import InputError
+from stillmap.core.grid_map import Region, shift_region
 from stillmap.core.local_frame import LocalFrame
 from stillmap.core.recording import Recording
-from stillmap.core.region import Region, shift_region
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io import read
 from stillmap.io.input_groups import read_parts

@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays
-from stillmap.core.beam_times import beam_stamps_ns
 from stillmap.core.chunks import Chunk, iter_chunks
 from stillmap.core.errors import InputError
 from stillmap.core.local_frame import FAR, LocalFrame
-from stillmap.core.recording import Recording
+from stillmap.core.recording import Recording, beam_stamps_ns
 from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.io.point_cloud import ply
 from stillmap.io.point_cloud.binary_table import TableLayout, read_columns

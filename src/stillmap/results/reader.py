@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from stillmap.core import se2
 from stillmap.core.array_folder import read_npz
 from stillmap.core.arrays import iter_blocks
-from stillmap.core.errors import InputError
-from stillmap.core.extras import install_command
+from stillmap.core.errors import InputError, install_command
 from stillmap.core.grid_map import GridMap
 from stillmap.core.json import read_json
 from stillmap.core.short_repr import ShortRepr

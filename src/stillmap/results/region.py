@@ -6,8 +6,7 @@ from typing import TypeVar
 import numpy as np
 
 from stillmap.core.errors import InputError
-from stillmap.core.grid_map import GridMap
-from stillmap.core.region import Region, is_inside
+from stillmap.core.grid_map import GridMap, Region, is_inside
 from stillmap.core.tiles import Block, cut
 from stillmap.pipeline.result import MappingResult
 from stillmap.pipeline.snapshots import extent

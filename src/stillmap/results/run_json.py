@@ -5,8 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stillmap.core.config import to_dict
-from stillmap.core.json import count_skipped, to_jsonable, write_json
-from stillmap.core.version import package_version
+from stillmap.core.json import count_skipped, package_version, to_jsonable, write_json
 from stillmap.mapping import Change, Door
 from stillmap.mapping.beam_statistics import count_beams
 from stillmap.pipeline.estimate import IterationRecord

@@ -8,9 +8,9 @@ import numpy as np
 
 from stillmap.core import config
 from stillmap.core.errors import InputError
+from stillmap.core.grid_map import Region
 from stillmap.core.json import read_json
 from stillmap.core.local_frame import LocalFrame
-from stillmap.core.region import Region
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io.rigid_transforms import MAX_TRANSLATION
 from stillmap.mesh.options import MeshOptions

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.files import atomic_folder, write_text
+from stillmap.core.grid_map import Region, limit_hits
 from stillmap.core.parallel import resolve_threads
-from stillmap.core.region import Region, limit_hits
 from stillmap.io.trajectory import write_tum
 from stillmap.pipeline.result import MappingResult
 from stillmap.results.labels import write_labels

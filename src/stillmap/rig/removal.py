@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.arrays import iter_blocks
-from stillmap.core.beam_times import beam_stamps_ns
-from stillmap.core.recording import Recording
+from stillmap.core.recording import Recording, beam_stamps_ns
 from stillmap.em import GroundMap
 from stillmap.em.spatial_coupling import GROUND_CLEARANCE
 from stillmap.rig.trajectory import PosedRecording

@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
-from stillmap.core.beam_times import beam_stamps_ns
-from stillmap.core.recording import Recording
+from stillmap.core.recording import Recording, beam_stamps_ns
 from stillmap.slam.deskew import MAX_SPEED
 
 Float = NDArray[np.float64]

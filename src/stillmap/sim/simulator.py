@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from stillmap.core import se2
-from stillmap.core.array_builder import ArrayBuilder
+from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.sim import lidar

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays
-from stillmap.core.array_builder import ArrayBuilder
+from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.tracking.association import ACCELERATION, MAX_GAP, assign_tracks

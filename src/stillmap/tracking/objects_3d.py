@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
-from stillmap.core.array_builder import ArrayBuilder
-from stillmap.core.arrays import take_rows, unique_cells
-from stillmap.core.components import component_labels, neighbor_pairs
+from stillmap.core.arrays import ArrayBuilder, take_rows, unique_cells
 from stillmap.core.parallel import map_ordered
 from stillmap.core.recording import Recording
+from stillmap.core.square_box import component_labels, neighbor_pairs
 from stillmap.em import GroundMap
 from stillmap.mapping.projection import DIRECTIONS, make_planar_recording
 from stillmap.tracking import MovingObject, ObjectOptions, track_objects

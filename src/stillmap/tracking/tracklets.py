@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays
-from stillmap.core.components import component_labels
+from stillmap.core.square_box import component_labels
 from stillmap.em.people_tracker import MIN_TRACK_SCANS
 from stillmap.tracking.association import HORIZON, regress_velocity
 from stillmap.tracking.clustering import DynamicPoints

@@ -15,7 +15,7 @@ import stillmap
 from stillmap.cli.main import main
 from stillmap.core import se2
 from stillmap.core.camera import project
-from stillmap.core.extras import install_command
+from stillmap.core.errors import install_command
 from stillmap.io import stillmap_folder
 from stillmap.io.trajectory import poses_from_tum
 from stillmap.mesh.place import assign_views

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
-from stillmap.core.advice import advise
-from stillmap.core.errors import InputError
+from stillmap.core.errors import InputError, advise
 from stillmap.core.recording import Recording
 from stillmap.core.timestamps import longest_non_decreasing
 from stillmap.io import trajectory

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays
-from stillmap.core.array_builder import ArrayBuilder
+from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.camera import Images
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording

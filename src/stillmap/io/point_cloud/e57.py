@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.array_builder import ArrayBuilder
+from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.errors import InputError, MissingExtra, import_extra
 from stillmap.core.input_files import InputFile
 from stillmap.core.recording import Recording

@@ -11,7 +11,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.array_builder import ArrayBuilder
+from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.errors import InputError, import_extra
 from stillmap.core.files import atomic_file
 from stillmap.core.input_files import InputFile

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.array_builder import ArrayBuilder
+from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_file
 from stillmap.core.input_files import InputFile

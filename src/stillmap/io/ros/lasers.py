@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays, se2
-from stillmap.core.advice import advise
-from stillmap.core.array_builder import ArrayBuilder
-from stillmap.core.errors import InputError
+from stillmap.core.arrays import ArrayBuilder
+from stillmap.core.errors import InputError, advise
 from stillmap.core.recording import Recording
 from stillmap.core.timestamps import longest_non_decreasing
 from stillmap.io.builder import ReadContext, SkippedRecords

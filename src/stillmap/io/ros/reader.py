@@ -7,9 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from stillmap.core.advice import advise
 from stillmap.core.camera import Images
-from stillmap.core.errors import InputError
+from stillmap.core.errors import InputError, advise
 from stillmap.core.recording import Recording
 from stillmap.io.builder import ReadContext, SkippedRecords
 from stillmap.io.ros.bag import bag_size, open_bag

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stillmap.core.components import component_labels
+from stillmap.core.square_box import component_labels
 from stillmap.mesh.objects.segmentation import (
     LINK,
     SPACING,

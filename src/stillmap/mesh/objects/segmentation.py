@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from stillmap.core import arrays
-from stillmap.core.components import component_labels
+from stillmap.core.square_box import component_labels
 from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.mesh.inputs import MeshInputs
 from stillmap.mesh.objects.sweep_surface import ObjectBeams

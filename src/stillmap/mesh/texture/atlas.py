@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stillmap.core.camera import project
-from stillmap.core.components import component_labels
 from stillmap.core.errors import import_extra
 from stillmap.core.short_repr import ShortRepr
+from stillmap.core.square_box import component_labels
 from stillmap.mesh.texture.views import View
 from stillmap.mesh.triangle_mesh import Mesh
 from stillmap.mesh.types import Bool, Float, Image, Index, Int32, Int64

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.grid_map import GridMap
-from stillmap.core.version import package_version
+from stillmap.core.json import package_version
 from stillmap.io.trajectory import read_tum
 from stillmap.pipeline.options import MapMode
 from stillmap.places.pictures import KIND_COLORS, PlacePictures

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from stillmap.core import se2
+from stillmap.core.grid_map import limit_hits
 from stillmap.core.local_frame import LocalFrame
-from stillmap.core.region import limit_hits
 from stillmap.io.ros import writer as ros
 from stillmap.io.ros.messages import ODOMETRY, POINT_CLOUD, TF, BagKind
 from stillmap.io.ros.writer import (

@@ -4,8 +4,7 @@ import importlib
 from pathlib import Path
 from typing import Any
 
-from stillmap.core.errors import InputError
-from stillmap.core.extras import install_command
+from stillmap.core.errors import InputError, install_command
 from stillmap.core.files import atomic_file
 from stillmap.core.recording import Recording
 from stillmap.results.folder import Exported

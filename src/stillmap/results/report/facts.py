@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from stillmap.core.advice import split_advice
+from stillmap.core.errors import split_advice
 from stillmap.core.json import count_skipped, to_jsonable
 from stillmap.mapping.beam_statistics import count_beams
 from stillmap.pipeline.quality import describe_quality
