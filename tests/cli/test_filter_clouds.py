@@ -1,11 +1,10 @@
 """`stillmap filter` of point clouds: points go, every other byte stays."""
 
-import gzip
 import struct
 
 import numpy as np
 import pytest
-from labelled import RNG, N, check_same_but, cloud, files, label, run
+from labelled import N, check_same_but, cloud, files, label, run
 
 from stillmap.io import read
 
@@ -162,38 +161,3 @@ def test_ply(call, tmp_path, form, faces):
         np.testing.assert_array_equal(again.hit, recording.hit & ~blank)
     else:
         check_same_but(recording, tmp_path / "clean", blank)
-
-
-@pytest.mark.parametrize(
-    ("ending", "heading"), [(".3d", "40\n"), (".3d.gz", ""), (".3d", "# a b\n")]
-)
-def test_3dtk(call, tmp_path, ending, heading):
-    (tmp_path / "scans").mkdir()
-    lines = {}
-    for k in range(2):
-        rows = 100.0 * RNG.uniform(-8.0, 8.0, (N, 4))
-        lines[k] = [" ".join(f"{v:.2f}" for v in row) + "\r\n" for row in rows]
-        text = (heading + "".join(lines[k])).encode()
-        path = tmp_path / f"scans/scan00{k}{ending}"
-        path.write_bytes(gzip.compress(text) if ending.endswith("gz") else text)
-        (tmp_path / f"scans/scan00{k}.pose").write_text(f"{100 * k} 0 0\n0 0 0\n")
-    recording, blank = label(tmp_path / "scans", tmp_path / "out")
-    run(call, tmp_path / "out", tmp_path / "clean")
-    after = files(tmp_path / "clean")
-    for k in range(2):
-        gone = blank[recording.beams_of(k)]
-        data = after[f"scan00{k}{ending}"]
-        text = (gzip.decompress(data) if ending.endswith("gz") else data).decode()
-        kept = [line for line, is_gone in zip(lines[k], gone, strict=True) if not is_gone]
-        assert text == heading.replace("40", str(len(kept))) + "".join(kept)
-    check_same_but(recording, tmp_path / "clean", blank)
-
-
-def test_single_3dtk_scan_keeps_its_pose(call, tmp_path):
-    rows = 100.0 * RNG.uniform(-8.0, 8.0, (N, 3))
-    np.savetxt(tmp_path / "scan000.3d", rows, "%.2f")
-    (tmp_path / "scan000.pose").write_text("100 0 0\n0 90 0\n")
-    recording, blank = label(tmp_path / "scan000.3d", tmp_path / "out")
-    run(call, tmp_path / "out", tmp_path / "clean.3d.gz")
-    assert gzip.decompress((tmp_path / "clean.3d.gz").read_bytes()).count(b"\n") == N - blank.sum()
-    check_same_but(recording, tmp_path / "clean.3d.gz", blank)

@@ -85,7 +85,7 @@ def test_refusals_come_before_anything_is_read(call, tmp_path):
     (source / "times.txt").unlink()  # reading it would fail
     for output, words in (
         ("clean.log", ("clean.log", "2D at most", "3D")),
-        ("clean.pcd", ("clean.pcd", "KITTI folder", "another ending")),
+        ("clean.pcd", ("clean.pcd", "not written")),
         ("drive/clean", ("lies in the folder of the recording",)),
         (".", ("holds the recording",)),
     ):

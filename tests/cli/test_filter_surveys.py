@@ -1,11 +1,11 @@
-"""`stillmap filter` of LAS, LAZ and E57 files."""
-
-import re
+"""`stillmap filter` of LAS and LAZ files, and of formats that come back as others."""
 
 import numpy as np
 import pytest
 from labelled import RNG, N, check_same_but, label, run
 from refusals import refused
+
+from stillmap.io import read
 
 
 def las_file(path, version="1.4", point_format=7):
@@ -65,143 +65,62 @@ def test_las(call, tmp_path, name, version, point_format, single):
     check_same_but(recording, out, blank)
 
 
-def test_las_keeps_its_ending(call, tmp_path):
+def test_las_is_packed_by_its_name(call, tmp_path):
+    laspy = pytest.importorskip("laspy")
     las_file(tmp_path / "a.las")
-    label(tmp_path / "a.las", tmp_path / "out")
-    done = call("filter", tmp_path / "out", "-o", tmp_path / "clean.laz")
-    refused(done, "clean.laz", ".las")
+    recording, blank = label(tmp_path / "a.las", tmp_path / "out")
+    run(call, tmp_path / "out", tmp_path / "clean.laz")
+    assert laspy.open(tmp_path / "clean.laz").header.are_points_compressed
+    check_same_but(recording, tmp_path / "clean.laz", blank)
 
 
-def e57_file(path, organised=False):
-    """Two scans with every type of field, an image and an extension."""
-    library = pytest.importorskip("pye57.libe57")
-    file = library.ImageFile(str(path), "w")
-    file.extensionsAdd("", library.E57_V1_0_URI)
-    file.extensionsAdd("own", "http://example.org/own")
-    root = file.root()
-    for name in ("formatName", "guid"):
-        root.set(name, library.StringNode(file, "ASTM E57 3D Imaging Data File"))
-    root.set("own:number", library.IntegerNode(file, 7, 0, 9))
-    scans, images = library.VectorNode(file, True), library.VectorNode(file, True)
-    root.set("data3D", scans)
-    root.set("images2D", images)
-    blob = library.BlobNode(file, 3)
-    picture = library.StructureNode(file)
-    images.append(picture)
-    picture.set("jpegImage", blob)
-    blob.write(np.array([1, 2, 3], np.uint8), 0, 3)
-    for scan in range(2):
-        node, prototype = library.StructureNode(file), library.StructureNode(file)
-        scans.append(node)
-        pose, xyz = library.StructureNode(file), library.StructureNode(file)
-        node.set("pose", pose)
-        pose.set("translation", xyz)
-        for axis in "xyz":
-            xyz.set(axis, library.FloatNode(file, 1.0 + scan))
-        single = library.FloatPrecision.E57_SINGLE
-        prototype.set("cartesianX", library.FloatNode(file, 0.0, single, -9.0, 9.0))
-        prototype.set("cartesianY", library.ScaledIntegerNode(file, 0, -9000, 9000, 0.001, 0.5))
-        prototype.set("cartesianZ", library.FloatNode(file, 0.0))
-        prototype.set("cartesianInvalidState", library.IntegerNode(file, 0, 0, 2))
-        prototype.set("intensity", library.FloatNode(file, 0.0))
-        prototype.set("own:ring", library.IntegerNode(file, 0, 0, 99))
-        values = {
-            "cartesianX": RNG.uniform(-8, 8, N).astype(np.float32),
-            "cartesianY": RNG.integers(-8000, 8000, N),
-            "cartesianZ": RNG.uniform(-8, 8, N),
-            "cartesianInvalidState": (np.arange(N) == 4).astype(np.int64),
-            "intensity": RNG.random(N),
-            "own:ring": np.arange(N),
-        }
-        if organised:
-            prototype.set("rowIndex", library.IntegerNode(file, 0, 0, N))
-            values["rowIndex"] = np.arange(N)
-        points = library.CompressedVectorNode(file, prototype, library.VectorNode(file, True))
-        node.set("points", points)
-        buffers = library.VectorSourceDestBuffer()
-        for name, array in values.items():
-            buffers.append(library.SourceDestBuffer(file, name, array, N, False, False))
-        writer = points.writer(buffers)
-        writer.write(N)
-        writer.close()
-    file.close()
+def e57_file(path):
+    pye57 = pytest.importorskip("pye57")
+    with pye57.E57(str(path), "w") as file:
+        for scan in range(2):
+            columns = dict(zip("XYZ", RNG.uniform(-8.0, 8.0, (3, N)), strict=True))
+            columns = {f"cartesian{axis}": values for axis, values in columns.items()}
+            file.write_scan_raw(columns, translation=np.array([1.0 + scan, 0.0, 0.0]))
 
 
-def e57_content(path):
-    """The description of a file without byte counts, and the stored values of each scan."""
-    library = pytest.importorskip("pye57.libe57")
-    content = path.read_bytes()
-    start, length = (int.from_bytes(content[at : at + 8], "little") for at in (24, 32))
-    first = start // 1024 * 1024
-    pages = range(first, len(content), 1024)
-    xml = b"".join(content[at : at + 1020] for at in pages)[start - first :][:length].decode()
-    for attribute in ("fileOffset", "recordCount"):
-        xml = re.sub(rf'{attribute}="\d+"', "", xml)
-    file = library.ImageFile(str(path), "r")
-    tables = []
-    for scan in range(len(file.root()["data3D"])):
-        points = file.root()["data3D"][scan]["points"]
-        prototype = library.StructureNode(points.prototype())
-        names = [prototype.get(k).elementName() for k in range(prototype.childCount())]
-        floats = {"cartesianX": "f", "cartesianZ": "d", "intensity": "d"}
-        table = {name: np.zeros(N, floats.get(name, "q")) for name in names}
-        buffers = library.VectorSourceDestBuffer()
-        for name, array in table.items():
-            buffers.append(library.SourceDestBuffer(file, name, array, N, False, False))
-        reader = points.reader(buffers)
-        n = reader.read()
-        reader.close()
-        tables.append({name: array[:n] for name, array in table.items()})
-    blob, piece = file.root()["images2D"][0]["jpegImage"], np.zeros(3, np.uint8)
-    blob.read(piece, 0, 3)
-    file.close()
-    return xml.strip(), tables, piece.tolist()
+def threedtk_folder(path):
+    path.mkdir()
+    for k in range(2):
+        np.savetxt(path / f"scan00{k}.3d", 100.0 * RNG.uniform(-8.0, 8.0, (N, 3)), "%.2f")
+        (path / f"scan00{k}.pose").write_text(f"{100 * k} 0 0\n0 0 0\n")
 
 
-@pytest.mark.parametrize("organised", [False, True])
-@pytest.mark.parametrize("single", [True, False])
-def test_e57(call, tmp_path, organised, single):
-    """Every node and every stored value; points of grids stay and are marked as invalid."""
-    pytest.importorskip("pye57")
-    (tmp_path / "scans").mkdir()
-    e57_file(tmp_path / "scans/a.e57", organised)
-    if not single:
-        (tmp_path / "scans/b.e57").write_bytes(b"ASTM-E57 and no more")
-    source = tmp_path / "scans/a.e57" if single else tmp_path / "scans"
-    out = tmp_path / ("clean.e57" if single else "clean")
-    recording, blank = label(source, tmp_path / "out")
-    assert run(call, tmp_path / "out", out)["scans_left_out"] == (not single)
-    before, after = (
-        e57_content(path) for path in (tmp_path / "scans/a.e57", out if single else out / "a.e57")
+def depth_folder(path):
+    images = pytest.importorskip("PIL.Image")
+    path.mkdir()
+    for k in range(2):
+        depth = RNG.integers(500, 4000, (13, 20)).astype(np.uint16)
+        images.fromarray(depth).save(path / f"frame-{k:06d}.depth.png")
+
+
+@pytest.mark.parametrize(
+    ("name", "write", "form"),
+    [
+        ("a.e57", e57_file, "E57"),
+        ("scans", threedtk_folder, "3DTK"),
+        ("frames", depth_folder, "RGB-D folder"),
+    ],
+)
+def test_formats_that_come_back_as_others(call, tmp_path, name, write, form):
+    """As a folder of PCD files, one a scan at its pose, or as one PLY file; and it is said so."""
+    write(tmp_path / name)
+    recording, blank = label(tmp_path / name, tmp_path / "out")
+    done = call("filter", tmp_path / "out", "-o", tmp_path / "clean")
+    assert done.returncode == 0, done.stderr
+    assert (
+        f"the format {form} is not written again: it comes back as a folder of PCD" in done.stderr
     )
-    assert before[0] == after[0]
-    assert before[2] == after[2] == [1, 2, 3]
-    for scan, (old, new) in enumerate(zip(before[1], after[1], strict=True)):
-        gone = blank[recording.beams_of(scan)]
-        assert gone.any()
-        for name in old:
-            expected = old[name][~gone]
-            if organised:
-                marks = {"cartesianInvalidState": 2, "intensity": old[name], "own:ring": old[name]}
-                marks["rowIndex"] = old[name]
-                expected = np.where(gone, marks.get(name, 0), old[name])
-            np.testing.assert_array_equal(new[name], expected)
-    if not organised:
-        check_same_but(recording, out, blank)
-
-
-def test_e57_with_texts_is_refused_at_once(call, tmp_path):
-    library = pytest.importorskip("pye57.libe57")
-    e57_file(tmp_path / "a.e57")
-    label(tmp_path / "a.e57", tmp_path / "out")
-    file = library.ImageFile(str(tmp_path / "a.e57"), "w")
-    scans, node = library.VectorNode(file, True), library.StructureNode(file)
-    file.root().set("data3D", scans)
-    scans.append(node)
-    prototype = library.StructureNode(file)
-    prototype.set("remark", library.StringNode(file, ""))
-    codecs = library.VectorNode(file, True)
-    node.set("points", library.CompressedVectorNode(file, prototype, codecs))
-    file.close()
-    done = call("filter", tmp_path / "out", "-o", tmp_path / "clean.e57")
-    refused(done, "a.e57", "its points have texts", "--to")
+    again, kept = read(tmp_path / "clean"), recording.hit & ~blank
+    assert again.source["format"] == "PCD"
+    np.testing.assert_allclose(again.points[again.hit], recording.points[kept], atol=1e-6)
+    if recording.T_recorded_base is not None:
+        np.testing.assert_allclose(again.T_recorded_base, recording.T_recorded_base, atol=1e-9)
+    done = call("filter", tmp_path / "out", "-o", tmp_path / "clean.ply")
+    assert "it comes back as a PLY file" in done.stderr
+    assert read(tmp_path / "clean.ply").hit.sum() == kept.sum()
+    refused(call("filter", tmp_path / "out", "-o", tmp_path / "new.e57"), "new.e57", "--to")

@@ -186,34 +186,12 @@ def test_python_takes_a_list(room, tmp_path):
     assert repr(stillmap.read([room])) == repr(stillmap.read(room))
 
 
-def test_info_says_what_belongs_together(call, room, day_after, tmp_path):
-    parts = cut_folder(room, tmp_path)
-    done = call("info", *parts, day_after)
-    assert done.returncode == 0, done.stderr
-    first, rest = done.stdout.split("\n", 1)
-    in_order = ", ".join(str(parts[k]) for k in (1, 2, 0))
-    assert first.startswith(f"{in_order}: parts of one run: {parts[2]} begins 0.")
-    assert "odometry 0." in first
-    assert rest.count("after " + str(parts[0]) + " ends") == 1
-    assert f"{day_after}: a session of its own: " in rest
-    assert "scans             40 with 120 beams each" in rest
-    found = json.loads(call("info", *parts, day_after, "--json").stdout)
-    assert [group["kind"] for group in found["groups"]] == ["parts", "recording"]
-    assert found["groups"][0]["inputs"] == [str(parts[k]) for k in (1, 2, 0)]
-    assert found["groups"][1]["why"].endswith("24.0 h after " + str(parts[0]) + " ends")
-    assert [one["scans"] for one in found["recordings"]] == [40, 40]
-    one = json.loads(call("info", *parts, "--json").stdout)
-    assert one["scans"] == 40
-    assert [part["scans"] for part in one["parts"]] == [14, 11, 15]
-    assert len(one["groups"]) == 1
-
-
-def test_sessions_are_for_merge(call, room, day_after, tmp_path, nothing_left):
-    done = call("map", room, day_after, "-o", tmp_path / "out", *QUICK)
-    refused(
-        done, "is no part of the same run", f"{day_after} begins 24.0 h after", "stillmap merge"
-    )
+def test_sessions_are_refused_and_merge_named(call, room, day_after, tmp_path, nothing_left):
+    done = call("map", day_after, room, "-o", tmp_path / "out", *QUICK)
+    refused(done, f"{day_after}: does not follow {room}", f"stillmap merge {room} {day_after}")
     nothing_left("tuesday")
+    both = json.loads(call("info", room, day_after, "--json").stdout)
+    assert [one["scans"] for one in both["recordings"]] == [40, 40]
 
 
 def test_inputs_that_cannot_be_read(call, room, tmp_path, nothing_left):

@@ -15,7 +15,7 @@ from stillmap.cli.main import main
 from stillmap.core.recording import Recording
 from stillmap.io import stillmap_folder
 from stillmap.io.point_cloud import ply
-from stillmap.io.point_cloud.binary_table import read_columns
+from stillmap.io.point_cloud.table import read_columns
 from stillmap.io.trajectory import read_tum
 
 

@@ -14,7 +14,7 @@ from stillmap.cli.main import main
 from stillmap.core.errors import InputError
 from stillmap.io import read, stillmap_folder
 from stillmap.io.point_cloud import pcd, ply
-from stillmap.io.point_cloud.binary_table import read_columns
+from stillmap.io.point_cloud.table import read_columns
 from stillmap.results import point_cloud
 from stillmap.results.export import point_cloud_files
 

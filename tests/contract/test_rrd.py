@@ -104,7 +104,7 @@ def test_timelines_and_poses(case, request):
 def test_scans_are_those_of_the_labels(of_street, mapped_street):
     """Through base and lidar, the points with p_static of all scans are those of the clouds."""
     from stillmap.io.point_cloud import ply
-    from stillmap.io.point_cloud.binary_table import read_columns
+    from stillmap.io.point_cloud.table import read_columns
 
     [mount] = of_street["/map/base/lidar",]
     points = []

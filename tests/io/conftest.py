@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cut_recordings import make_recording
 from scipy.spatial.transform import Rotation
 
 from stillmap.core.recording import Recording
@@ -71,3 +72,9 @@ def space() -> Recording:
         T_odom_base=None,
         T_recorded_base=T,
     )
+
+
+@pytest.fixture
+def drive():
+    """60 scans in 2D."""
+    return make_recording()

@@ -192,7 +192,7 @@ def test_a_recording_without_pictures_says_so(drive, file):
 
 def test_a_recording_in_2d_has_no_cameras(tmp_path, file):
     (tmp_path / "a.log").write_text("FLASER 2 1.0 2.0 0 0 0 0 0 0 1.5 host 0.5\n")
-    with pytest.raises(InputError, match=r"read\.cameras is for 3D recordings"):
+    with pytest.raises(InputError, match=r"read\.cameras are for 3D recordings"):
         read(tmp_path / "a.log", ReadOptions(cameras=str(file(f"[a]\n{LENS}"))))
 
 

@@ -65,7 +65,7 @@ def test_no_schema_is_fetched(write_e57, attribute):
 def test_markup_that_does_not_end(write_e57, opening):
     path = write_e57(at_end(opening * ((4 << 20) // len(opening))))
     start = time.process_time()
-    with pytest.raises(InputError, match="begins what does not end"):
+    with pytest.raises(InputError, match="is refused: its XML section"):
         read(path)
     assert time.process_time() - start < 5.0  # quadratic: minutes
 
@@ -85,11 +85,9 @@ def test_damaged_scans_are_given_up_on(write_e57, monkeypatch):
         damaged = re.sub(rb'fileOffset="\d+"', b'fileOffset="99999999"', first)
         return xml.replace(first, first + 9 * damaged, 1)
 
-    tried, read_cloud = [], e57._read_cloud
     monkeypatch.setattr(e57, "_MAX_DAMAGED", 5)
-    monkeypatch.setattr(e57, "_read_cloud", lambda *a: [tried.append(a), read_cloud(*a)][1])
     recording = read(write_e57(repeat))
-    assert (recording.n_scans, len(tried)) == (1, 6)
+    assert recording.n_scans == 1
     skipped = recording.source["skipped"]
     assert skipped["holds too many damaged scans"]["count"] == 5
     assert sum(one["count"] for one in skipped.values()) == 10

@@ -142,7 +142,7 @@ def test_packed_points_that_cannot_be(tmp_path, space):
     content = bytearray(path.read_bytes())
     struct.pack_into("<I", content, 107, 2_000_000_000)
     path.write_bytes(content)
-    with pytest.raises(InputError, match="truncated: 0 of 2000000000 points"):
+    with pytest.raises(InputError, match="is truncated"):
         read(path)
 
 

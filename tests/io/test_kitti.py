@@ -71,7 +71,10 @@ def test_poses_of_the_camera_become_those_of_the_laser(folder):
         ({"poses.txt": "1 0 0 0 0 1 0 0 0 0 1 0\n" * 3}, "no calib.txt"),
         ({"poses_lidar.txt": "1 0 0 0 0 1 0 0 0 0 1 0\n" * 2}, "has 2 for 3"),
         ({"poses_lidar.txt": "1 0 0 0 0 1 0 0 0 0 1\n" * 3}, "is damaged"),
-        ({"poses_lidar.txt": "1 0 0 0 0 1 0 0 0 0 1 0\n2 0 0 0 0 1 0 0 0 0 1 0\n"}, ":2"),
+        (
+            {"poses_lidar.txt": "1 0 0 0 0 1 0 0 0 0 1 0\n2 0 0 0 0 1 0 0 0 0 1 0\n"},
+            "no rotation matrix",
+        ),
         ({"poses_lidar.txt": "1 0 0 nan 0 1 0 0 0 0 1 0\n" * 3}, "not finite"),
         ({"calib.txt": "Tr: 1 2 3\n"}, "calibration is ignored"),
     ],

@@ -1,18 +1,29 @@
 """`stillmap filter`: write a result's recording again with its dynamic beams blanked."""
 
 import argparse
+import dataclasses
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from stillmap.cli.arguments import make_parents
-from stillmap.cli.console import print_json, say
+from stillmap.cli.arguments import make_parents, require_apart
+from stillmap.cli.console import print_json, say, show_share
 from stillmap.cli.convert import NAMES
 from stillmap.core.errors import InputError
 
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from stillmap.core.recording import Recording
+    from stillmap.io.filter_writers import FilterTarget
+    from stillmap.results.folder import ResultFolder
+
 DESCRIPTION = (
     "Write the recording again with dynamic beams blanked, 2D or 3D: for mapping and localization "
-    "programs that assume a static world. It keeps its own format, in which nothing else changes, "
-    "unless FILE has the ending of another one or --to names it. Parts of one run become one "
-    "recording. Of a place FILE is a folder, with a recording for each of its sessions."
+    "programs that assume a static world. Bags, CARMEN logs, KITTI folders, PCD, PLY, LAS and LAZ "
+    "files keep their format, in which nothing else changes, unless FILE has the ending of another "
+    "one or --to names it; E57, 3DTK and depth images come back as PLY or PCD. Parts of one run "
+    "become one recording. Of a place FILE is a folder, with a recording for each of its sessions."
 )
 EPILOG = """examples:
   stillmap filter out -o clean.clf.gz
@@ -23,6 +34,8 @@ EPILOG = """examples:
   stillmap filter place -o clean          a folder with a recording of every session
   stillmap filter place/sessions/monday -o monday.bag
 """
+
+_INDEX = "filtered.json"  # the list of what the folder of a place holds
 
 
 def add_arguments(p: argparse.ArgumentParser) -> None:
@@ -61,39 +74,175 @@ def run(args: argparse.Namespace) -> int:
     output = Path(args.output)
     with make_parents(output):
         if is_place(Path(args.result)):
-            from stillmap.cli.filter_place import filter_place
-
-            filter_place(args, Path(args.result), output)
+            _filter_place(args, Path(args.result), output)
         else:
             _filter_result(args, output)
     return 0
 
 
 def _filter_result(args: argparse.Namespace, output: Path) -> None:
-    from stillmap.cli.filter_recording import find_target, write_filtered
     from stillmap.io import filter_writers
     from stillmap.results.folder import open_result
 
     result = open_result(Path(args.result), args.input)
-    _ = result.read_options  # refused before the recording is looked for
-    target = find_target(result, output, args.to)
+    target = _find_target(result, output, args.to)
     filter_writers.require_free(target, output, result.source, args.overwrite)
-    done = write_filtered(result, target, output, args)
+    done = _write_filtered(result, target, output, "", args)
     if args.json:
-        parts = {"parts": list(map(str, result.parts))} if result.parts else {}
-        print_json(
+        print_json({"output": str(output), **done})
+
+
+def _filter_place(args: argparse.Namespace, place: Path, output: Path) -> None:
+    """Write a folder with the filtered recording of every session, complete or not at all.
+
+    Raises:
+        InputError: a recording is not there any more, or the output is taken.
+    """
+    from stillmap.core.files import atomic_folder, require_new
+    from stillmap.core.json import write_json
+    from stillmap.places.reader import read_sessions
+
+    if args.input is not None:
+        hint = f"one by one: stillmap filter {place}/sessions/NAME -o FILE --input FILE"
+        raise InputError("has several recordings: --input names one", where=str(place), hint=hint)
+    require_apart(output, place)
+    require_new(output, _INDEX, args.overwrite)
+    names = [record["name"] for record in read_sessions(place) if record["accepted"]]
+    # what cannot be written is refused before any is read
+    plans = [_plan_session(place, name, output, args.to) for name in names]
+    with atomic_folder(output, _INDEX, args.overwrite) as folder:
+        records = [
             {
-                "output": str(output),
-                "input": str(result.source),
-                **parts,
-                "hits": done.hits,
-                "blanked": done.blanked,
-                "scans_left_out": done.left_out,
+                "name": name,
+                "file": file,
+                **_write_filtered(result, target, folder / file, file, args),
             }
-        )
+            for name, (result, file, target) in zip(names, plans, strict=True)
+        ]
+        write_json(folder / _INDEX, records)
+    if args.json:
+        print_json({"output": str(output), "sessions": records})
     if not args.quiet:
-        say(f"wrote {output}: {done.describe()}")
-        if done.left_out:
-            say(f"{done.left_out} scans left out that were not mapped")
-        for note in done.notes:
-            say(f"warning: {note}")
+        say(f"wrote {output}")
+
+
+def _plan_session(
+    place: Path, name: str, output: Path, to: str | None
+) -> "tuple[ResultFolder, str, FilterTarget]":
+    """The folder of a session, the name of its filtered recording, and how it is written.
+
+    Raises:
+        InputError: its recording is not there, or cannot be written so.
+    """
+    from stillmap.io import filter_writers
+    from stillmap.results.folder import open_result
+
+    try:
+        result = open_result(place / "sessions" / name)
+        result.require_source()
+    except InputError as error:
+        hint = f"stillmap filter {place}/sessions/{name} -o FILE --input FILE finds it elsewhere"
+        raise InputError(error.what, where=error.where, hint=hint) from error
+    file = name + filter_writers.find_ending(None if result.parts else result.source, to)
+    for source in result.sources:
+        require_apart(output, source, place)
+        filter_writers.require_outside(output, source)
+    return result, file, _find_target(result, output / file, to)
+
+
+def _find_target(result: "ResultFolder", output: Path, to: str | None) -> "FilterTarget":
+    """Find how the filtered recording of a result is written.
+
+    Raises:
+        InputError: it cannot be; before anything long is done.
+    """
+    from stillmap.io import filter_writers, writers
+
+    _ = result.read_options  # refused before the recording is looked for
+    source = result.require_source()
+    for path in result.sources:
+        require_apart(output, path, result.folder)
+    target = filter_writers.find_target(None if result.parts else source, output, to)
+    if target.writer is not None:
+        writers.require_fit(output, target.writer, result.dimension, result.n_sensors)
+    return target
+
+
+def _write_filtered(
+    result: "ResultFolder",
+    target: "FilterTarget",
+    output: Path,
+    prefix: str,
+    args: argparse.Namespace,
+) -> dict[str, Any]:
+    """Write the recording of a result without its dynamic beams, and say what was done.
+
+    Raises:
+        InputError: labels and recording cannot be read, or do not belong together.
+    """
+    from stillmap.core.files import workplace
+    from stillmap.io.filtered_copy import FilterJob
+
+    scratch = workplace(output)
+    with show_share(args.quiet, "reading") as progress:
+        recording, labels = result.read(progress, scratch, left_out=True)
+    if target.takes_poses and recording.T_recorded_base is None:
+        recording = _place(recording, result, target)
+    blank, hits, blanked = _select_beams(recording, labels.p_static, args.below, scratch)
+    with show_share(args.quiet, "writing") as progress:
+        job = FilterJob(
+            result.source,
+            output,
+            recording,
+            blank,
+            result.read_options,
+            target.marker,
+            args.overwrite,
+            (Path(args.result),),
+            progress,
+        )
+        left_out, notes = target.write(job)
+    if not args.quiet:
+        share = 100.0 * blanked / max(hits, 1)
+        words = prefix or f"wrote {output}: "
+        say(f"{words}{blanked} beams blanked, {share:.1f} % of the hits")
+        if left_out:
+            say(f"{prefix}{left_out} scans left out that were not mapped")
+        for note in notes:
+            say(f"warning: {prefix}{note}")
+    return {
+        "input": str(result.source),
+        **({"parts": list(map(str, result.parts))} if result.parts else {}),
+        "hits": hits,
+        "blanked": blanked,
+        "scans_left_out": left_out,
+    }
+
+
+def _place(recording: "Recording", result: "ResultFolder", target: "FilterTarget") -> "Recording":
+    """The recording at the poses of the map; in one cloud, without the motion during its scans."""
+    from stillmap.slam import deskew_recording
+
+    poses, recording = result.read_poses(recording), result.calibrate(recording)
+    if not target.is_folder:
+        recording = deskew_recording(recording, poses, result.slam_options)
+    return dataclasses.replace(recording, T_recorded_base=poses)
+
+
+def _select_beams(
+    recording: "Recording", p_static: "NDArray[np.float32]", below: float, scratch: Path
+) -> "tuple[NDArray[np.bool_], int, int]":
+    """(M,) the beams to blank; how many hit something, and how many of these are blanked."""
+    import numpy as np
+
+    from stillmap.core import arrays
+
+    hits = blanked = 0
+    blank = arrays.empty(recording.hit.shape, np.bool_, scratch)
+    for block in arrays.iter_blocks(recording.hit, p_static, blank):
+        hit = recording.hit[block]
+        # p_static of unusable beams is NaN: never blanked
+        blank[block] = hit & (p_static[block] < below)
+        hits += int(np.count_nonzero(hit))
+        blanked += int(np.count_nonzero(blank[block]))
+    return blank, hits, blanked

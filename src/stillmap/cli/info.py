@@ -1,22 +1,18 @@
-"""`stillmap info INPUT...`: print summaries of recordings, and which belong together."""
+"""`stillmap info INPUT...`: print summaries of recordings."""
 
 import argparse
 import json
 import math
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from stillmap.cli.arguments import add_option_flags, add_read_flags, read_options
 from stillmap.cli.console import print_lines, show_share
 
-if TYPE_CHECKING:
-    from stillmap.io.input_groups import InputGroup
-
 _LINES_SHOWN = 10
 DESCRIPTION = (
     "Show what is in a recording: scans, beams, field of view, ranges, duration, "
-    "odometry and damage; values estimated from the readings are marked. Several inputs: which are "
-    "parts of one run, and why."
+    "odometry and damage; values estimated from the readings are marked."
 )
 EPILOG = """examples:
   stillmap info log.clf.gz
@@ -38,7 +34,7 @@ formats:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the flags and arguments."""
     parser.add_argument(
-        "input", metavar="INPUT", nargs="+", help="a file or folder with a recording, or its parts"
+        "input", metavar="INPUT", nargs="+", help="a file or folder with a recording"
     )
     parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
     parser.add_argument("--quiet", action="store_true", help="no progress")
@@ -52,51 +48,27 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         InputError: the recording cannot be read.
     """
-    from stillmap.cli.groups import describe_group, find_groups
-
-    groups = find_groups(args, read_options(args), None)
-    summaries = [_summarize_group(group, args) for group in groups]
-    several = len(args.input) > 1
+    summaries = [_summarize(path, args) for path in args.input]
     if args.json:
-        print(json.dumps(_to_json(groups, summaries), indent=2, allow_nan=False))
+        content = summaries[0] if len(summaries) == 1 else {"recordings": summaries}
+        print(json.dumps(content, indent=2, allow_nan=False))
         return 0
-    for number, (group, summary) in enumerate(zip(groups, summaries, strict=True)):
-        blank, heading = [""] * (number > 0), [describe_group(group)] * several
-        print_lines([*blank, *heading, *_format_summary(summary)])
+    for number, summary in enumerate(summaries):
+        print_lines([*([""] * (number > 0)), *_format_summary(summary)])
     return 0
 
 
-def _summarize_group(group: "InputGroup", args: argparse.Namespace) -> dict[str, Any]:
-    """The summary of a recording, or of the parts of one."""
+def _summarize(path: str, args: argparse.Namespace) -> dict[str, Any]:
     from stillmap.cli.recording_info import summarize_recording
     from stillmap.io import read
-    from stillmap.io.input_groups import read_parts
 
-    options, paths = read_options(args), group.paths
     with show_share(args.quiet, "reading") as progress:
-        if len(paths) == 1:
-            recording = read(paths[0], options, progress=progress)
-        else:
-            recording = read_parts(paths, options, progress=progress)
-    return {"input": paths[0], **summarize_recording(recording), "parts": list(group.parts)}
-
-
-def _to_json(groups: "list[InputGroup]", summaries: list[dict[str, Any]]) -> dict[str, Any]:
-    """One input: its summary; several: also which belong together; sessions: one summary each."""
-    if len(groups) == len(groups[0].paths) == 1:
-        return summaries[0]
-    together = [
-        {"inputs": list(group.paths), "kind": group.kind, "why": group.why} for group in groups
-    ]
-    if len(groups) == 1:
-        return {**summaries[0], "groups": together}
-    return {"groups": together, "recordings": summaries}
+        recording = read(path, read_options(args), progress=progress)
+    return {"input": path, **summarize_recording(recording)}
 
 
 def _format_summary(found: dict[str, Any]) -> Iterator[str]:
     yield f"{found['input']}: {found['format'] or 'stillmap recording'}, {found['dimension']}D"
-    for part in found["parts"]:
-        yield _row("part", _format_span(part))
     if found["path"] not in (None, found["input"]):
         yield _row("made from", str(found["path"]))
     beams = found["beams_per_scan"]

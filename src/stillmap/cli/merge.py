@@ -81,25 +81,7 @@ def run(args: argparse.Namespace) -> int:
     paths = args.input if base is None else args.input[1:]
     if not paths:
         raise InputError("names no session to add", where=args.input[0])
-    return _merge(args, base, _group(args, paths, options), options)
-
-
-def _group(
-    args: argparse.Namespace, paths: list[str], options: "Options"
-) -> Sequence[Sequence[str]]:
-    """Recordings that are parts of one run belong together; results stand alone."""
-    from stillmap.cli.groups import find_groups
-    from stillmap.results.run_record import is_result
-
-    results = [[path] for path in paths if is_result(Path(path))]
-    recordings = [path for path in paths if not is_result(Path(path))]
-    if len(recordings) < 2:
-        return [[path] for path in paths]
-    found = find_groups(
-        argparse.Namespace(**{**vars(args), "input": recordings}), options.read, None
-    )
-    groups = [list(group.paths) for group in found] + results
-    return sorted(groups, key=lambda group: min(paths.index(path) for path in group))
+    return _merge(args, base, [[path] for path in paths], options)
 
 
 def _merge(

@@ -94,12 +94,17 @@ def images_from_files(files: Sequence[tuple[int, Path]], camera: Camera) -> Imag
 
 
 def merge_images(parts: Sequence[Images]) -> Images:
-    """All images of several cameras, ordered by stamp."""
+    """All images, ordered by stamp; cameras of the same name are one."""
     if len(parts) == 1:
         return parts[0]
-    first = np.cumsum([0, *(len(part.cameras) for part in parts)])
+    cameras: dict[str, Camera] = {}
+    for one in (camera for part in parts for camera in part.cameras):
+        cameras.setdefault(one.name, one)
+    numbers = {name: number for number, name in enumerate(cameras)}
     stamp_ns = np.concatenate([part.stamp_ns for part in parts])
-    camera = np.concatenate([part.camera + n for part, n in zip(parts, first[:-1], strict=True)])
+    camera = np.concatenate(
+        [np.array([numbers[one.name] for one in part.cameras])[part.camera] for part in parts]
+    )
     part_of = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
     number = np.concatenate([np.arange(len(part)) for part in parts])
     order = np.argsort(stamp_ns, kind="stable")
@@ -107,7 +112,7 @@ def merge_images(parts: Sequence[Images]) -> Images:
     return Images(
         stamp_ns[order],
         camera[order].astype(np.int32),
-        tuple(one for part in parts for one in part.cameras),
+        tuple(cameras.values()),
         lambda image: parts[part_of[image]].read(number[image]),
     )
 

@@ -1,15 +1,14 @@
-"""The table of formats that are written again with beams blanked (`FILTER_WRITERS`).
+"""Formats in which a recording is written again with beams blanked: its own, or another one.
 
-A recording is written in its own format with all that is not a blanked beam as it was, or in
-another one by a writer of `writers.py`.
+In its own format all that is not a blanked beam stays as it was; another one is written by a writer
+of `writers.py`.
 """
 
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from importlib import import_module
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,10 +18,9 @@ from stillmap.core.errors import InputError
 from stillmap.core.files import require_new, require_new_file, workplace
 from stillmap.core.json import count_skipped
 from stillmap.core.recording import Recording
-from stillmap.io import stillmap_folder, writers
+from stillmap.io import filtered_clouds, stillmap_folder, writers
 from stillmap.io.filtered_copy import FilterJob, Mask, Omissions
-from stillmap.io.point_cloud import signatures
-from stillmap.io.registry import FORMATS, Format, detect_format
+from stillmap.io.registry import FORMATS, detect_format
 from stillmap.io.ros.messages import detect_kind
 from stillmap.prepare.beam_times import SPIN_KEY
 
@@ -30,20 +28,6 @@ Write = Callable[[FilterJob], Omissions]
 
 _ROS2 = ("ros2", "db3", "mcap")  # kinds of bags that hold the same messages
 _OF_RANGES = ("stillmap", "carmen", "ros2", "bag", "db3", "mcap")  # they hold misses of 2D lasers
-
-
-class FilterWriter(NamedTuple):
-    """A format that is written again.
-
-    Attributes:
-        write: writes the copy.
-        markers: patterns of files, one of which every folder of the format holds.
-        check: refuses a recording that cannot be written to a path, before it is read.
-    """
-
-    write: Write
-    markers: tuple[str, ...] = ()
-    check: Callable[[Path, Path], None] = lambda source, output: None  # noqa: ARG005
 
 
 class FilterTarget(NamedTuple):
@@ -61,7 +45,7 @@ class FilterTarget(NamedTuple):
     marker: str
     is_folder: bool
     write: Write
-    writer: writers.Writer | None
+    writer: writers.Writer | None = None
 
     @property
     def takes_poses(self) -> bool:
@@ -69,16 +53,6 @@ class FilterTarget(NamedTuple):
         if self.writer is None or self.writer.name == "stillmap":
             return False
         return "T_recorded_base" in self.writer.fields
-
-
-def _writer(module: str, function: str = "write_filtered") -> Write:
-    """A function of a module of this room, which is loaded when it is called."""
-
-    def write(job: FilterJob) -> Omissions:
-        omissions: Omissions = getattr(import_module(f"stillmap.io.{module}"), function)(job)
-        return omissions
-
-    return write
 
 
 def _write_stillmap(job: FilterJob) -> Omissions:
@@ -91,146 +65,88 @@ def _write_stillmap(job: FilterJob) -> Omissions:
     return Omissions()
 
 
-def _check_depth(source: Path, output: Path) -> None:  # noqa: ARG001
-    from stillmap.io import filtered_depth
+def _write_log(job: FilterJob) -> Omissions:
+    from stillmap.io.carmen import writer
 
-    filtered_depth.check(source)
-
-
-def _check_e57(source: Path, output: Path) -> None:  # noqa: ARG001
-    from stillmap.io.point_cloud.filtered import e57
-
-    e57.check(source)
+    return writer.write_filtered(job)
 
 
-def _check_las(source: Path, output: Path) -> None:
-    ending = source.suffix.lower()
-    if source.is_file() and output.suffix.lower() not in (ending, ""):
-        hint = f"name it {output.stem}{ending}: `laszip` packs and unpacks such files"
-        raise InputError("a LAS file is not packed or unpacked", where=str(output), hint=hint)
+def _write_bag(job: FilterJob) -> Omissions:
+    from stillmap.io.ros import filtered
+
+    return filtered.write_filtered(job)
 
 
-def _patterns(extensions: tuple[str, ...]) -> tuple[str, ...]:
-    return tuple(f"*{case}" for one in extensions for case in (one, one.upper()))
-
-
-_KITTI_MARKERS = ("velodyne", "velodyne_points")
-_RGBD_MARKERS = ("depth.txt", "frame-*.depth.*")
-
-FILTER_WRITERS = {
-    "stillmap recording": FilterWriter(_write_stillmap, (stillmap_folder.HEADER,)),
-    "ROS bag": FilterWriter(_writer("ros.filtered"), ("metadata.yaml",)),
-    "KITTI folder": FilterWriter(_writer("point_cloud.filtered.kitti"), _KITTI_MARKERS),
-    "RGB-D folder": FilterWriter(_writer("filtered_depth"), _RGBD_MARKERS, _check_depth),
-    "PCD": FilterWriter(_writer("point_cloud.filtered.pcd"), _patterns(signatures.PCD_EXTENSIONS)),
-    "3DTK": FilterWriter(
-        _writer("point_cloud.filtered.threedtk"), _patterns(signatures.THREEDTK_EXTENSIONS)
-    ),
-    "E57": FilterWriter(
-        _writer("point_cloud.filtered.e57"), _patterns(signatures.E57_EXTENSIONS), _check_e57
-    ),
-    "LAS": FilterWriter(
-        _writer("point_cloud.filtered.las"), _patterns(signatures.LAS_EXTENSIONS), _check_las
-    ),
-    "PLY": FilterWriter(_writer("point_cloud.filtered.ply"), _patterns(signatures.PLY_EXTENSIONS)),
-    "CARMEN log": FilterWriter(_writer("carmen.writer")),
+# by format: its name in `writers.py`, pattern of a file that every such folder holds, writer
+_OWN: dict[str, tuple[str, str, Write]] = {
+    "stillmap recording": ("stillmap", stillmap_folder.HEADER, _write_stillmap),
+    "ROS bag": ("", "metadata.yaml", _write_bag),
+    "CARMEN log": ("carmen", "", _write_log),
+    "KITTI folder": ("kitti", "velodyne*", filtered_clouds.write_kitti),
+    "PCD": ("pcd", "*.[pP][cC][dD]", filtered_clouds.write_pcd),
+    "PLY": ("ply", "*.[pP][lL][yY]", filtered_clouds.write_ply),
+    "LAS": ("las", "*.[lL][aA][sSzZ]", filtered_clouds.write_las),
 }
 
 
-def find_target(source: Path, output: Path, name: str | None = None) -> FilterTarget:
+def find_target(source: Path | None, output: Path, name: str | None = None) -> FilterTarget:
     """Find how a filtered recording is written.
 
     Args:
-        source: the recording.
+        source: the recording; None: it is joined from parts, and written as a recording folder
+            unless another format is named.
         output: its filtered copy, of the recording's own format unless its ending is that of
-            another one.
+            another one. A format that is not written comes back as a folder of PCD files.
         name: of the format, as in `writers.py`; None: by the output's ending.
 
     Raises:
-        InputError: there is no such format, or the recording cannot be written again.
+        InputError: there is no such format, or the recording cannot be written so.
     """
-    form = detect_format(source).name
-    own = _own_writer_name(source, form)
-    wanted = name or writers.format_of_ending(output)
+    if source is None:
+        return _make_target(writers.find_writer(output, name))
+    form, wanted = detect_format(source).name, name or writers.format_of_ending(output)
+    if form not in _OWN:
+        if wanted is None:
+            _require_ending(output, ())
+        note = f"a recording of the format {form} is not written again: it comes back as "
+        return _make_target(writers.find_writer(output, wanted or "pcd"), note)
+    own, marker, write = _OWN[form]
+    own = detect_kind(source)[0] if form == "ROS bag" else own
     is_folder = source.is_dir() or source.name == stillmap_folder.HEADER
     if wanted is not None:
         writer = writers.find_writer(output, wanted)
         if own in _ROS2 and writer.name in _ROS2:
-            return _own_target(source, output, form, bool(writer.marker), writer.name)
-        if writer.name != own or bool(writer.marker) != is_folder:
-            write = partial(_convert, writer=writer)
-            folder = bool(writer.marker)
-            return FilterTarget(writer.description, writer.marker, folder, write, writer)
+            own, is_folder = writer.name, bool(writer.marker)
+        elif writer.name != own or bool(writer.marker) != is_folder:
+            return _make_target(writer)
     elif is_folder or form != "CARMEN log":
-        _require_own_ending(output, source, form, is_folder)
-    return _own_target(source, output, form, is_folder, own)
+        endings = next(known.endings for known in FORMATS if known.name == form)
+        _require_ending(output, () if is_folder else endings)
+
+    def write_own(job: FilterJob) -> Omissions:
+        return write(replace(job, kind=own))
+
+    return FilterTarget(form, marker if is_folder else "", is_folder, write_own)
 
 
-def find_joined_target(output: Path, name: str | None = None) -> FilterTarget:
-    """Find how a filtered recording is written whose parts are several inputs: as one recording.
-
-    Args:
-        output: the recording; a recording folder where it has no ending.
-        name: of the format, as in `writers.py`; None: by the output's ending.
-
-    Raises:
-        InputError: there is no such format.
-    """
-    writer = writers.find_writer(output, name)
-    write, is_folder = partial(_convert, writer=writer), bool(writer.marker)
-    return FilterTarget(writer.description, writer.marker, is_folder, write, writer)
+def _make_target(writer: writers.Writer, note: str = "") -> FilterTarget:
+    """The target that another format than the recording's own is."""
+    write = partial(_convert, writer=writer, note=note)
+    return FilterTarget(writer.description, writer.marker, bool(writer.marker), write, writer)
 
 
-def _own_target(source: Path, output: Path, form: str, is_folder: bool, kind: str) -> FilterTarget:
-    entry = FILTER_WRITERS.get(form)
-    if entry is None:
-        hint = f"other formats by name=FORMAT: {', '.join(w.name for w in writers.WRITERS)}"
-        raise InputError(f"a {form} cannot be written again", where=str(source), hint=hint)
-    entry.check(source, output)
-    marker = ""
-    if is_folder:
-        of_source = (m for m in entry.markers if source.is_dir() and any(source.glob(m)))
-        marker = next(of_source, entry.markers[0])
-
-    def write(job: FilterJob) -> Omissions:
-        return entry.write(replace(job, kind=kind))
-
-    return FilterTarget(form, marker, is_folder, write, None)
-
-
-def _own_writer_name(source: Path, form: str) -> str:
-    """The name that `writers.py` has for the format of a recording; "" where it has none."""
-    if form == "ROS bag":
-        return detect_kind(source)[0]
-    names = {
-        "stillmap recording": "stillmap",
-        "CARMEN log": "carmen",
-        "KITTI folder": "kitti",
-        "PCD": "pcd",
-        "PLY": "ply",
-        "LAS": "las",
-    }
-    return names.get(form, "")
-
-
-def _require_own_ending(output: Path, source: Path, form: str, is_folder: bool) -> None:
-    """Refuse a name that ends as those of files of a format which is not written.
+def _require_ending(output: Path, endings: tuple[str, ...]) -> None:
+    """Refuse a name that ends as those of files of a format which would not be written.
 
     Raises:
-        InputError: it does.
+        InputError: it does, and has none of the `endings`.
     """
-    ends_as = {known.name: output.name.lower().endswith(_file_endings(known)) for known in FORMATS}
-    if (ends_as[form] and not is_folder) or not any(ends_as.values()):
-        return
-    what = f"would be a {form}{' folder' * is_folder} like {source.name}, but has another ending"
-    others = "; ".join(", ".join(w.endings) for w in writers.WRITERS if w.endings)
-    raise InputError(
-        what, where=str(output), hint=f"other formats by name: {others}; or by name=FORMAT"
-    )
-
-
-def _file_endings(form: Format) -> tuple[str, ...]:
-    return tuple(one for one in form.endings if one.startswith("."))
+    name = output.name.lower()
+    known = (end for form in FORMATS for end in form.endings if end.startswith("."))
+    if name.endswith(tuple(known)) and not name.endswith(endings or "/"):
+        others = ", ".join(end for writer in writers.WRITERS for end in writer.endings)
+        hint = f"other formats by name: {others}; or by name=FORMAT"
+        raise InputError("is not written in the format of that name", where=str(output), hint=hint)
 
 
 def require_free(target: FilterTarget, output: Path, source: Path, overwrite: bool) -> None:
@@ -257,14 +173,15 @@ def require_outside(output: Path, source: Path) -> None:
         raise InputError("lies in the folder of the recording", where=str(output), hint=hint)
 
 
-def _convert(job: FilterJob, writer: writers.Writer) -> Omissions:
+def _convert(job: FilterJob, writer: writers.Writer, note: str) -> Omissions:
     """Write the recording without the blanked beams in another format."""
     if writer.name == "stillmap" or (job.recording.dimension == 2 and writer.name in _OF_RANGES):
         recording = _to_misses(job)
     else:
         recording = _without_beams(job)
     losses = writers.write(recording, job.output, name=writer.name, overwrite=job.overwrite)
-    return Omissions(count_skipped(job.recording.source), tuple(losses))
+    notes = [*([note + writer.description] if note else []), *losses]
+    return Omissions(count_skipped(job.recording.source), tuple(notes))
 
 
 def _to_misses(job: FilterJob) -> Recording:
@@ -278,22 +195,37 @@ def _to_misses(job: FilterJob) -> Recording:
 def _without_beams(job: FilterJob) -> Recording:
     """The recording without the blanked beams."""
     recording, scratch = job.recording, workplace(job.output)
-    points = ArrayBuilder(np.float32, (recording.dimension,), scratch)
-    hit = ArrayBuilder(np.bool_, (), scratch)
-    times = ArrayBuilder(np.float32, (), scratch)
+    columns = {"points": recording.points, "hit": recording.hit, "beam_time": recording.beam_time}
+    kept = {
+        name: ArrayBuilder(column.dtype, column.shape[1:], scratch)
+        for name, column in columns.items()
+        if column is not None
+    }
     length = np.zeros(recording.n_scans + 1, np.int64)
     for scan in recording.iter_scans(range(recording.n_scans), job.blank):
         beams = recording.beams_of(scan)
-        kept: Mask = ~job.blank[beams]
-        points.append(recording.points[beams][kept])
-        hit.append(recording.hit[beams][kept])
-        if recording.beam_time is not None:
-            times.append(recording.beam_time[beams][kept])
-        length[scan + 1] = np.count_nonzero(kept)
-    return replace(
-        recording,
-        offset=np.cumsum(length),
-        points=points.finish(),
-        hit=hit.finish(),
-        beam_time=None if recording.beam_time is None else times.finish(),
-    )
+        stays: Mask = ~job.blank[beams]
+        for name, builder in kept.items():
+            builder.append(getattr(recording, name)[beams][stays])
+        length[scan + 1] = np.count_nonzero(stays)
+    finished: dict[str, Any] = {name: builder.finish() for name, builder in kept.items()}
+    return replace(recording, offset=np.cumsum(length), **finished)
+
+
+def find_ending(source: Path | None, to: str | None) -> str:
+    """The ending of a recording's own format, or of another one; "" of folders.
+
+    Args:
+        source: the recording; None: it is joined from parts.
+        to: name of the other format; None: its own.
+    """
+    own, is_folder = "", source is None or source.is_dir() or source.name == stillmap_folder.HEADER
+    form = "" if source is None or is_folder else detect_format(source).name
+    if source is not None and form in _OWN:
+        known = next(known.endings for known in FORMATS if known.name == form)
+        lengths = [len(end) for end in known if source.name.lower().endswith(end)]
+        own = source.name[len(source.name) - max(lengths) :] if lengths else source.suffix
+    if to is None:
+        return own
+    endings = writers.find_writer(Path(), to).endings
+    return own if own.lower() in endings else next(iter(endings), "")

@@ -1,4 +1,4 @@
-"""Filtered copies of recordings: what a writer of one gets and returns, and copies of folders."""
+"""Filtered copies of recordings: what their writers get and return, and copies of folders."""
 
 import os
 from collections.abc import Callable, Collection, Sequence
@@ -18,8 +18,8 @@ from stillmap.io.text_lines import Progress
 from stillmap.prepare.options import ReadOptions
 
 Mask = NDArray[np.bool_]
-# (file, its new copy, (n,) beams to blank of each of its scans; None: the scan was not read)
-FilterFile = Callable[[Path, Path, list[Mask | None]], None]
+# (file, its new copy, (n,) points to remove)
+FilterFile = Callable[[Path, Path, Mask], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,11 +32,11 @@ class FilterJob:
         recording: as it was read from `source`.
         blank: (M,) beams to blank.
         options: with which it was read.
-        kind: of the bag to write, as `writers.py` names it; "": that of the source, or no bag.
         marker: pattern of a file that every folder of the format holds; "": unused, for files.
         overwrite: replace what is there.
         omit: folders inside `source` that are not copied.
         progress: called with the share of the copy that is written, 0 to 1.
+        kind: of the bag to write, as `writers.py` names it; "": that of the source, or no bag.
     """
 
     source: Path
@@ -88,76 +88,56 @@ def other_recording_error(path: Path) -> InputError:
     return InputError("is not the recording that was mapped: other scans", where=str(path))
 
 
-def require_rows(mask: Mask, rows: int, path: Path) -> None:
-    """Refuse a file with another number of points than were read.
-
-    Raises:
-        InputError: it has `rows` points, and `mask` is of another length.
-    """
-    if len(mask) != rows:
-        raise other_recording_error(path)
-
-
 def write_files(
     job: FilterJob,
     files: Sequence[Path],
     filter_file: FilterFile,
-    scans_of: Sequence[int] | None = None,
     write_unread: Callable[[Path, Path], None] | None = None,
 ) -> Omissions:
-    """Write a folder, or one file, with every file of scans filtered and all others copied.
+    """Write a folder, or one file, with every file of a scan filtered and all others copied.
 
     Args:
         job: see FilterJob.
         files: those of scans, in the order of the reader.
-        filter_file: writes the copy of a file with scans that were read.
-        scans_of: count of scans of each file; None: one each.
-        write_unread: writes the copy of a file without any; None: it is left out.
+        filter_file: writes the copy of a file.
+        write_unread: writes the copy of a file that was not read; None: it is left out.
     """
-    counts = [1] * len(files) if scans_of is None else list(scans_of)
-    masks = job.scan_masks(sum(counts))
-    starts = np.cumsum([0, *counts]).tolist()
+    masks = job.scan_masks(len(files))
     omissions = Omissions(sum(mask is None for mask in masks))
     if job.source.is_file():
         with atomic_file(job.output) as work:
-            _filter_file(filter_file, files[0], work, masks, job.output.suffix)
+            if masks[0] is not None:
+                _write_file(files[0], work, masks[0], filter_file, job.output.suffix)
         return omissions
     with atomic_folder(job.output, job.marker, job.overwrite) as folder:
-        copy_others(job.source, folder, set(files), job.omit)
-        for number, file in enumerate(files):
+        _copy_others(job.source, folder, set(files), job.omit)
+        for number, (file, mask) in enumerate(zip(files, masks, strict=True)):
             new = folder / file.relative_to(job.source)
-            of_file = masks[starts[number] : starts[number + 1]]
-            if any(mask is not None for mask in of_file):
-                _filter_file(filter_file, file, new, of_file, file.suffix)
+            if mask is not None:
+                _write_file(file, new, mask, filter_file, file.suffix)
             elif write_unread is not None:
                 write_unread(file, new)
             job.report((number + 1) / len(files))
     return omissions
 
 
-def _filter_file(
-    filter_file: FilterFile, file: Path, new: Path, masks: list[Mask | None], suffix: str
-) -> None:
+def _write_file(file: Path, new: Path, mask: Mask, filter_file: FilterFile, suffix: str) -> None:
     """Write the copy of a file; the file itself where no beam is blanked and `suffix` is its."""
-    is_whole = not any(mask is None or mask.any() for mask in masks)
     try:
-        if is_whole and file.suffix.lower() == suffix.lower():
+        if not mask.any() and file.suffix.lower() == suffix.lower():
             copy_file(file, new)
         else:
-            filter_file(file, new, masks)
+            filter_file(file, new, mask)
     except MemoryError as error:
         raise InputError("does not fit into memory", where=str(file)) from error
 
 
-def copy_others(
-    source: Path, target: Path, files: Collection[Path], omit: Collection[Path] = ()
+def _copy_others(
+    source: Path, target: Path, files: Collection[Path], omit: Collection[Path]
 ) -> None:
     """Copy what a folder holds, but not `files` (their folders are made) nor folders `omit`.
 
     Symbolic links to other places stay links.
-
-    Raises:
-        OSError: something cannot be read or written.
     """
     left_out = {os.path.realpath(path) for path in omit}
     folders = {parent for file in files for parent in file.parents}
@@ -169,6 +149,6 @@ def copy_others(
             new.symlink_to(os.path.realpath(entry))
         elif entry.is_dir():
             new.mkdir()
-            copy_others(entry, new, files, omit)
+            _copy_others(entry, new, files, omit)
         elif entry.is_file():
             copy_file(entry, new)

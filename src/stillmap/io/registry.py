@@ -1,6 +1,7 @@
 """The table of formats that are read (`FORMATS`), and detection of a file's format.
 
 The table of formats that are written is in `writers.py`; `reader.py` reads a recording by this one.
+Modules of formats are loaded for a recording of theirs alone.
 """
 
 import shlex
@@ -8,14 +9,14 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 from itertools import islice
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.io import stillmap_folder
+from stillmap.io import rgbd_folders, stillmap_folder
 from stillmap.io.builder import ReadContext
 from stillmap.io.carmen.log import SCAN_KINDS
-from stillmap.io.point_cloud import signatures
+from stillmap.io.point_cloud import e57, kitti, las, pcd, ply, threedtk
 from stillmap.io.ros import messages
 from stillmap.io.scan_files import contains_files, has_extension
 from stillmap.io.text_lines import read_head
@@ -74,90 +75,51 @@ def _read_stillmap_folder(path: Path, context: ReadContext) -> Recording:
 
 
 def _is_kitti_folder(path: Path, start: bytes | None) -> bool:
-    if start is not None:
-        return False
-    from stillmap.io.point_cloud.kitti import is_kitti_folder
-
-    return is_kitti_folder(path)
+    return start is None and kitti.is_kitti_folder(path)
 
 
 def _is_rgbd_folder(path: Path, start: bytes | None) -> bool:
-    if start is not None:
-        return False
-    from stillmap.io.rgbd_folders import detect_layout
-
-    return detect_layout(path) is not None
+    return start is None and rgbd_folders.detect_layout(path) is not None
 
 
-def _reader(module: str) -> Reader:
-    """`read` of a module of this room, which is loaded for a recording of its format alone."""
+def _load(module: str, function: str = "read") -> Any:
+    """A function of a module of this room, which is loaded when it is called."""
 
-    def read(path: Path, context: ReadContext) -> Recording:
-        recording: Recording = import_module(f"stillmap.io.{module}").read(path, context)
-        return recording
+    def call(*args: Any) -> Any:
+        return getattr(import_module(f"stillmap.io.{module}"), function)(*args)
 
-    return read
-
-
-def _parts_reader(module: str) -> PartsReader:
-    """`read_parts` of a module of this room, likewise."""
-
-    def read_parts(
-        paths: Sequence[Path], context: ReadContext, others: Sequence[Path]
-    ) -> Recording:
-        read = import_module(f"stillmap.io.{module}").read_parts
-        recording: Recording = read(paths, context, others)
-        return recording
-
-    return read_parts
+    return call
 
 
 def _point_cloud_format(
-    name: str, endings: tuple[str, ...], has_magic: Callable[[bytes], bool] | None, module: str
+    name: str, endings: tuple[str, ...], read: Reader, has_magic: Callable[[bytes], bool] = bool
 ) -> Format:
     """A format of files, detected by first bytes or by name, and of folders of such files."""
 
     def matches(path: Path, start: bytes | None) -> bool:
         if start is None:
             return contains_files(path, endings)
-        if has_magic is None:
-            return has_extension(path, endings) and len(start) > 0
-        return has_magic(start)
+        return has_magic(start) and (has_magic is not bool or has_extension(path, endings))
 
-    return Format(name, endings, matches, _reader(f"point_cloud.{module}"))
+    return Format(name, endings, matches, read)
 
+
+_ROS, _CARMEN = "ros.reader", "carmen.reader"
+_LOGS = (".log", ".clf", ".txt", ".log.gz", ".clf.gz", ".txt.gz", ".gz")
 
 FORMATS = (
     Format(
         "stillmap recording", (stillmap_folder.HEADER,), _is_stillmap_folder, _read_stillmap_folder
     ),
-    Format(
-        "ROS bag",
-        messages.ENDINGS,
-        messages.is_bag,
-        _reader("ros.reader"),
-        _parts_reader("ros.reader"),
-    ),
-    Format(
-        "KITTI folder",
-        ("velodyne/", "velodyne_points/"),
-        _is_kitti_folder,
-        _reader("point_cloud.kitti"),
-        _parts_reader("point_cloud.kitti"),
-    ),
-    Format("RGB-D folder", ("frame-*.depth.png", "depth.txt"), _is_rgbd_folder, _reader("rgbd")),
-    _point_cloud_format("PCD", signatures.PCD_EXTENSIONS, signatures.is_pcd, "pcd"),
-    _point_cloud_format("3DTK", signatures.THREEDTK_EXTENSIONS, None, "threedtk"),
-    _point_cloud_format("E57", signatures.E57_EXTENSIONS, signatures.is_e57, "e57"),
-    _point_cloud_format("LAS", signatures.LAS_EXTENSIONS, signatures.is_las, "las"),
-    _point_cloud_format("PLY", signatures.PLY_EXTENSIONS, signatures.is_ply, "ply"),
-    Format(
-        "CARMEN log",
-        (".log", ".clf", ".txt", ".log.gz", ".clf.gz", ".txt.gz", ".gz"),
-        _is_carmen,
-        _reader("carmen.reader"),
-        _parts_reader("carmen.reader"),
-    ),
+    Format("ROS bag", messages.ENDINGS, messages.is_bag, _load(_ROS), _load(_ROS, "read_parts")),
+    Format("KITTI folder", ("velodyne/", "velodyne_points/"), _is_kitti_folder, kitti.read),
+    Format("RGB-D folder", ("frame-*.depth.png", "depth.txt"), _is_rgbd_folder, _load("rgbd")),
+    _point_cloud_format("PCD", pcd.EXTENSIONS, pcd.read, pcd.is_pcd),
+    _point_cloud_format("3DTK", threedtk.EXTENSIONS, threedtk.read),
+    _point_cloud_format("E57", e57.EXTENSIONS, e57.read, e57.is_e57),
+    _point_cloud_format("LAS", las.EXTENSIONS, las.read, las.is_las),
+    _point_cloud_format("PLY", ply.EXTENSIONS, ply.read, ply.is_ply),
+    Format("CARMEN log", _LOGS, _is_carmen, _load(_CARMEN), _load(_CARMEN, "read_parts")),
 )
 
 
@@ -172,9 +134,8 @@ def detect_format(path: Path) -> Format:
     except (OSError, ValueError) as error:
         raise InputError(f"is no usable path: {error}", where=repr(str(path))) from error
     if not is_folder and not is_file:
-        if path.exists():
-            raise InputError("is no regular file", where=str(path), hint=_FORMATS_HINT)
-        raise InputError("does not exist", where=str(path))
+        what = "is no regular file" if path.exists() else "does not exist"
+        raise InputError(what, where=str(path))
     start = read_head(path, _HEAD) if is_file else None
     for known in FORMATS:
         if known.matches(path, start):
@@ -184,9 +145,7 @@ def detect_format(path: Path) -> Format:
     what = "is no recording that stillmap reads"
     if path.stat().st_size == 0:
         what = "is empty"
-    elif b"\0" in start:
-        what = "is binary, no recording that stillmap reads"
-    else:
+    elif b"\0" not in start:
         for known in FORMATS:
             if path.name.lower().endswith(known.endings):
                 return known
@@ -200,24 +159,22 @@ def _no_recording_error(path: Path) -> InputError:
     inside = _find_recordings(path)
     if not inside:
         return InputError("is a folder without a recording", where=str(path), hint=_FORMATS_HINT)
-    more = f" and {len(inside) - _MAX_LISTED} more" if len(inside) > _MAX_LISTED else ""
-    shown = ", ".join(map(_describe_entry, inside[:_MAX_LISTED])) + more
-    if tuple(one.name for one in inside) == RIG_FOLDERS:
-        flat, tilting = inside
-        hint = f"both: {flat} with tilting={tilting}"
+    shown = ", ".join(map(str, inside[:_MAX_LISTED])) + ", ..." * (len(inside) > _MAX_LISTED)
+    if tuple(entry.name for entry in inside) == RIG_FOLDERS:
+        hint = f"both: {inside[0]} with tilting={inside[1]}"
     else:
-        which = "it" if len(inside) == 1 else "one of them"
-        hint = f"name {which}: stillmap map {shlex.quote(str(inside[0]))} -o DIR"
-    what = "a recording" if len(inside) == 1 else "several recordings"
-    return InputError(f"is no recording but holds {what}: {shown}", where=str(path), hint=hint)
+        hint = f"name one: stillmap map {shlex.quote(str(inside[0]))} -o DIR"
+    what = f"is no recording but holds {len(inside)}: {shown}"
+    return InputError(what, where=str(path), hint=hint)
 
 
 def _find_recordings(path: Path) -> list[Path]:
     """The entries of a folder that are recordings, by name."""
     try:
-        return [one for one in sorted(islice(path.iterdir(), _MAX_ENTRIES)) if is_recording(one)]
+        entries = sorted(islice(path.iterdir(), _MAX_ENTRIES))
     except OSError:
         return []
+    return [entry for entry in entries if is_recording(entry)]
 
 
 def is_recording(path: Path) -> bool:
@@ -226,20 +183,8 @@ def is_recording(path: Path) -> bool:
         if path.is_dir():
             return any(known.matches(path, None) for known in FORMATS)
         name = path.name.lower()
-        named = [one for one in FORMATS if name.endswith(one.endings) and path.is_file()]
+        named = [known for known in FORMATS if name.endswith(known.endings) and path.is_file()]
         start = read_head(path, _HEAD) if named else b""
     except (OSError, InputError):
         return False
     return any(known.matches(path, start) for known in named)
-
-
-def _describe_entry(path: Path) -> str:
-    """An entry of a folder, with the size of a file."""
-    if path.is_dir():
-        return str(path)
-    size = float(path.stat().st_size)
-    for unit in ("bytes", "kB", "MB"):
-        if size < 1000:
-            return f"{path} ({size:.3g} {unit})"
-        size /= 1000
-    return f"{path} ({size:.3g} GB)"

@@ -22,9 +22,9 @@ from stillmap.io import camera_file, cameras, rgbd_folders
 from stillmap.io.builder import ReadContext
 from stillmap.io.camera_file import CameraOverride
 from stillmap.io.extrinsic_calibration import calibrate_color_camera
+from stillmap.io.gravity_alignment import align_to_gravity
 from stillmap.io.images import read_image, read_image_size
-from stillmap.io.point_cloud.gravity_alignment import align_to_gravity
-from stillmap.io.point_cloud.scans import Cloud, CloudSource, DatasetInfo, build_recording, reject
+from stillmap.io.point_cloud.clouds import Cloud, CloudSource, DatasetInfo, build_recording, reject
 from stillmap.io.rgbd_folders import Frames
 from stillmap.prepare.options import ReadOptions
 

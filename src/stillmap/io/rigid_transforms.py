@@ -6,6 +6,7 @@ from numpy.typing import ArrayLike, NDArray
 _TOLERANCE = 0.02  # rotations printed with three decimals deviate less
 
 MAX_TRANSLATION = 1e9  # m
+MAX_MOUNT = 1e5  # m from the robot's base to a sensor; the kernels' cells end at a few hundred km
 
 
 def rigid_transform(R: ArrayLike, t: ArrayLike) -> NDArray[np.float64]:

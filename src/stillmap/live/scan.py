@@ -20,7 +20,7 @@ from stillmap.io.array_checks import (
     stamps_to_ns,
     to_array,
 )
-from stillmap.io.recording_checks import MAX_MOUNT
+from stillmap.io.rigid_transforms import MAX_MOUNT
 from stillmap.prepare.max_range import MAX_ZERO_RANGE
 from stillmap.prepare.options import MAX_PLAUSIBLE_RANGE
 

@@ -13,9 +13,9 @@ from stillmap import io as formats
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.io.array_checks import poses_to_matrices
-from stillmap.io.input_groups import InputGroup, group_inputs, read_parts
-from stillmap.io.recording_checks import require_plausible
-from stillmap.io.text_lines import Progress, share_progress
+from stillmap.io.parts import read_parts
+from stillmap.io.reader import require_plausible
+from stillmap.io.text_lines import Progress
 from stillmap.io.trajectory import poses_from_tum
 from stillmap.pipeline.options import Options
 from stillmap.prepare.options import ReadOptions
@@ -49,7 +49,10 @@ def read(
         >>> recording = stillmap.read(["log_0.bag", "log_1.bag"])
     """
     if not isinstance(path, str | os.PathLike):
-        return _read_run([os.fspath(one) for one in path], options, progress, scratch)
+        if len(path) != 1:
+            parts = [Path(part) for part in path]
+            return read_parts(parts, options, progress=progress, scratch=scratch)
+        path = path[0]
     recording = formats.read(Path(path), options, progress=progress, scratch=scratch)
     here = os.fspath(path)
     original = recording.source.get("path", here)
@@ -57,41 +60,6 @@ def read(
     if original != here:
         source["made_from"] = original
     return dataclasses.replace(recording, source=source)
-
-
-def read_group(
-    group: InputGroup,
-    options: ReadOptions | None = None,
-    *,
-    progress: Progress | None = None,
-    scratch: Path | None = None,
-) -> Recording:
-    """Read inputs that belong together as one recording; arguments as of `read`."""
-    if len(group.paths) == 1:
-        return read(group.paths[0], options, progress=progress, scratch=scratch)
-    recording = read_parts(group.paths, options, progress=progress, scratch=scratch)
-    source = {**recording.source, "path": group.paths[0], "parts": list(group.parts)}
-    return dataclasses.replace(recording, source=source)
-
-
-def _read_run(
-    paths: list[str], options: ReadOptions | None, progress: Progress | None, scratch: Path | None
-) -> Recording:
-    """Read the parts of one run.
-
-    Raises:
-        InputError: they are none, or parts of several.
-    """
-    if not paths:
-        raise InputError("no recording is named")
-    share = share_progress(progress, 0, 2)  # each part is read twice
-    groups = group_inputs(paths, options, progress=share, scratch=scratch)
-    if len(groups) > 1:
-        what = f"is no part of the same run as {groups[0].paths[0]}: {groups[1].why}"
-        hint = "stillmap merge makes one map of sessions"
-        raise InputError(what, where=groups[1].paths[0], hint=hint)
-    share = share_progress(progress, 1, 2) if len(paths) > 1 else progress
-    return read_group(groups[0], options, progress=share, scratch=scratch)
 
 
 def read_poses(

@@ -12,6 +12,7 @@ Float = NDArray[np.float64]
 
 # in Recording.source: beam times were computed here; rad, azimuth at the stamp where it is known
 SPIN_KEY, STAMP_AZIMUTH_KEY = "spin", "stamp_azimuth"
+DIRECTION_KEY = "spin_direction"  # as the format states it, until beam times are added
 
 _SIGN = {"clockwise": -1.0, "counter-clockwise": 1.0}
 _TURN = 2.0 * math.pi

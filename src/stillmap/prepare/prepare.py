@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from stillmap.core import arrays, se2
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.prepare.beam_times import SPIN_KEY, add_beam_times
+from stillmap.prepare.beam_times import DIRECTION_KEY, SPIN_KEY, add_beam_times
 from stillmap.prepare.lasers import mirror_beams
 from stillmap.prepare.options import LaserOptions, ReadOptions
 from stillmap.prepare.self_filter import remove_self_returns
@@ -28,7 +28,8 @@ def prepare(recording: Recording, options: ReadOptions) -> Recording:
             name = "cameras" if options.spin in ("auto", "none") else "spin"
             raise InputError(f"read.{name} is for 3D recordings, this one is in 2D")
         return recording
-    recording = add_beam_times(recording, options.spin)
+    stated = recording.source.pop(DIRECTION_KEY, "auto")
+    recording = add_beam_times(recording, stated if options.spin == "auto" else options.spin)
     if options.spin == "none" and recording.beam_time is None:
         source = {**recording.source, SPIN_KEY: {"direction": "none"}}
         recording = replace(recording, source=source)

@@ -16,7 +16,7 @@ from stillmap.core.local_frame import LocalFrame
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io import read
-from stillmap.io.input_groups import read_parts
+from stillmap.io.parts import read_parts
 from stillmap.io.text_lines import Progress
 from stillmap.io.trajectory import poses_from_tum
 from stillmap.pipeline.calibration import apply_calibration
@@ -124,7 +124,9 @@ class ResultFolder(RunRecord):
         read_as, labels = self.read_options, read_labels(self.folder)
         source = self.require_source()
         if self.parts:
-            recording = read_parts(self.parts, read_as, progress=progress, scratch=scratch)
+            recording = read_parts(
+                self.parts, read_as, progress=progress, scratch=scratch, in_order=True
+            )
         else:
             recording = read(source, read_as, progress=progress, scratch=scratch)
         mapped = match_labels(recording, labels, str(source))

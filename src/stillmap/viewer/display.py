@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from stillmap.core.arrays import sample_indices
 from stillmap.core.errors import InputError
 from stillmap.io.point_cloud import ply
-from stillmap.io.point_cloud.binary_table import read_columns
+from stillmap.io.point_cloud.table import read_columns
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,46 +1,143 @@
 """KITTI folders: odometry sequences (`velodyne/`, `times.txt`), raw drives, and their poses."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import replace
+import re
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
 
 from stillmap.core import se2
+from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_folder
 from stillmap.core.input_files import read_bytes
 from stillmap.core.recording import Recording
 from stillmap.core.timestamps import format_seconds
-from stillmap.io.builder import ReadContext, part_context
-from stillmap.io.parts.joining import join_recordings
-from stillmap.io.point_cloud import kitti_cameras
-from stillmap.io.point_cloud.binary_table import iter_text_lines, parse_numbers, truncated_error
-from stillmap.io.point_cloud.hits import require_single_sensor, scan_hits, sensor_poses
-from stillmap.io.point_cloud.kitti_cameras import Calibration, find_images
-from stillmap.io.point_cloud.origin import place_clouds
-from stillmap.io.point_cloud.scans import Cloud, CloudSource, DatasetInfo, build_recording, reject
+from stillmap.io import cameras, images
+from stillmap.io.builder import ReadContext
+from stillmap.io.point_cloud import clouds, table
+from stillmap.io.point_cloud.clouds import Cloud, CloudSource, DatasetInfo
+from stillmap.io.point_cloud.origin import require_single_sensor, scan_hits, sensor_poses
+from stillmap.io.point_cloud.table import Field, TableLayout, parse_numbers
 from stillmap.io.rigid_transforms import pose_from_row, rigid_transform
-from stillmap.io.scan_files import assign_rows, list_files, read_times, require_nonempty_file
-from stillmap.prepare.beam_times import STAMP_AZIMUTH_KEY, add_beam_times
-from stillmap.prepare.time_window import TimeWindow, select_time
+from stillmap.io.scan_files import assign_rows, list_files, read_times
+from stillmap.prepare.beam_times import DIRECTION_KEY, STAMP_AZIMUTH_KEY
 
-Poses = list[NDArray[np.float64]]
+Float = NDArray[np.float64]
+
+MARKER = "times.txt"  # only folders with this file are overwritten
 
 _EARTH = 6378137.0  # m
-
 _STAMP_AZIMUTH = 0.0  # rad: the laser faces ahead at the stamp
-
 _MAX_POSES = 10_000_000  # of a file
+_MAX_CALIBRATION = 1 << 20  # bytes of a file
+_FIELDS = tuple(Field(name, np.dtype("<f4")) for name in ("x", "y", "z", "reflectance"))
+_RECORD = 16  # bytes of a point
+_CAMERA_FOLDER = re.compile(r"image_0?([0-3])")
+_RAW = Path("velodyne_points/data")
+_LAYOUTS = (  # scans and their stamps
+    (Path("velodyne"), Path("times.txt")),
+    (_RAW, Path("velodyne_points/timestamps.txt")),
+)
 
 
-def read_poses(
+class Calibration(NamedTuple):
+    """Contents of the calibration files.
+
+    Attributes:
+        T_camera_laser: (4, 4), of the first rectified camera; None: unknown.
+        projection: (3, 4) matrices of the rectified cameras by number.
+        T_laser_imu: (4, 4); None: unknown.
+        warnings: on files that could not be read.
+    """
+
+    T_camera_laser: Float | None = None
+    projection: dict[int, Float] = {}  # noqa: RUF012
+    T_laser_imu: Float | None = None
+    warnings: tuple[str, ...] = ()
+
+
+def is_kitti_folder(path: Path) -> bool:
+    """True if a folder has one of the KITTI layouts."""
+    return any((path / scans).is_dir() for scans, _ in _LAYOUTS)
+
+
+def list_scans(path: Path) -> list[Path]:
+    """The files of scans in the folder of a recording, by number.
+
+    Raises:
+        InputError: the folder cannot be read.
+    """
+    return list_files(path / _find_layout(path)[0], (".bin",))
+
+
+def _find_layout(path: Path) -> tuple[Path, Path]:
+    return next(layout for layout in _LAYOUTS if (path / layout[0]).is_dir())
+
+
+def read(path: Path, context: ReadContext) -> Recording:
+    """Read an odometry sequence or a raw drive; the laser is the base of the robot.
+
+    Scans of odometry sequences are deskewed, those of raw drives are not: their laser turns
+    clockwise and faces ahead at the stamp.
+
+    Raises:
+        InputError: there are no stamps, or no scan can be read.
+    """
+    scans, times_file = _find_layout(path)
+    files = list_scans(path)
+    if not files:
+        raise InputError("holds no scan (*.bin)", where=str(path / scans))
+    if not (path / times_file).is_file():
+        hint = "one line per scan: its stamp in seconds"
+        raise InputError("does not exist", where=str(path / times_file), hint=hint)
+    times = read_times(path / times_file)
+    rows = assign_rows(files, len(times), path / times_file)
+    calibration = find_calibration(path)
+    poses, pose_warnings, by_line = _read_poses(path, calibration, len(times), len(files))
+    pictures, image_warnings = _find_images(path, calibration, times)
+    warnings = [*calibration.warnings, *pose_warnings, *image_warnings]
+    sources = []
+    for number, (file, row) in enumerate(zip(files, rows, strict=True)):
+        stamp_ns = None if row is None else times[row]
+        index = row if by_line else number
+        read_cloud = partial(_read_scan, file, None if index is None else poses.get(index))
+        if stamp_ns is None:
+            read_cloud = partial(clouds.reject, file, "has no stamp")
+        sources.append(CloudSource(file.name, read_cloud, stamp_ns))
+    info = DatasetInfo(path, "KITTI", warnings)
+    recording = clouds.build_recording(sources, info, context, images=pictures)
+    recording.source[STAMP_AZIMUTH_KEY] = _STAMP_AZIMUTH
+    if scans == _RAW:
+        recording.source[DIRECTION_KEY] = "clockwise"
+    return recording
+
+
+def scan_layout(path: Path) -> TableLayout:
+    """The layout of the points of a scan.
+
+    Raises:
+        InputError: it is empty, or ends within a point.
+    """
+    with table.open_table(path) as file:
+        if file.size % _RECORD:
+            raise table.truncated_error(path)
+        return TableLayout(path, _FIELDS, file.size // _RECORD)
+
+
+def _read_scan(path: Path, T: Float | None) -> Cloud:
+    points, _ = table.gather_points(table.read_columns(scan_layout(path), "xyz"), np.asarray)
+    return Cloud(points, T)
+
+
+def _read_poses(
     folder: Path, calibration: Calibration, lines: int, files: int
-) -> tuple[dict[int, NDArray[np.float64]], list[str], bool]:
+) -> tuple[dict[int, Float], list[str], bool]:
     """Read the laser poses of a folder.
 
     Args:
@@ -61,7 +158,7 @@ def read_poses(
     return dict(enumerate(poses)), [], len(poses) == lines
 
 
-def _read_pose_file(folder: Path, calibration: Calibration) -> tuple[Poses, str]:
+def _read_pose_file(folder: Path, calibration: Calibration) -> tuple[list[Float], str]:
     if (folder / "poses_lidar.txt").is_file():
         return _read_rows(folder / "poses_lidar.txt"), "poses_lidar.txt"
     if (folder / "poses.txt").is_file():
@@ -77,27 +174,23 @@ def _read_pose_file(folder: Path, calibration: Calibration) -> tuple[Poses, str]
     return [], ""
 
 
-def _read_rows(path: Path) -> Poses:
-    numbers = parse_numbers(iter_text_lines(path), _MAX_POSES, range(12), path)
-    out = []
-    for i, row in enumerate(numbers):
-        try:
-            out.append(pose_from_row(row))
-        except ValueError as error:
-            raise InputError(str(error), where=f"{path}:{i + 1}") from error
-    return out
+def _read_rows(path: Path) -> list[Float]:
+    numbers = parse_numbers(table.iter_text_lines(path), _MAX_POSES, range(12), path)
+    try:
+        return [pose_from_row(row) for row in numbers]
+    except ValueError as error:
+        raise InputError(str(error), where=str(path)) from error
 
 
-def _read_oxts(folder: Path) -> Poses:
+def _read_oxts(folder: Path) -> list[Float]:
     """T_map_imu of files of latitude, longitude (degrees), height (m), roll, pitch, yaw (rad).
 
     East, north and up from the first pose, in the Mercator projection that is to scale there.
     """
-    out: Poses = []
+    out: list[Float] = []
     scale = first = None
     for path in list_files(folder, (".txt",)):
-        require_nonempty_file(path)
-        numbers = parse_numbers(iter_text_lines(path), 1, range(6), path)
+        numbers = parse_numbers(table.iter_text_lines(path), 1, range(6), path)
         if not len(numbers):
             raise InputError("is empty", where=str(path))
         latitude, longitude, height, *angles = numbers[0]
@@ -114,106 +207,114 @@ def _read_oxts(folder: Path) -> Poses:
     return out
 
 
-MARKER = "times.txt"  # only folders with this file are overwritten
-
-RECORD = 16  # bytes of a point: float32 x y z reflectance
-MAX_SCAN = 4 << 30  # bytes of a file
-
-_RAW = Path("velodyne_points/data")
-
-_LAYOUTS = (  # scans and their stamps
-    (Path("velodyne"), Path("times.txt")),
-    (_RAW, Path("velodyne_points/timestamps.txt")),
-)
-
-
-def is_kitti_folder(path: Path) -> bool:
-    """True if a folder has one of the KITTI layouts."""
-    return any((path / scans).is_dir() for scans, _ in _LAYOUTS)
+def find_calibration(folder: Path) -> Calibration:
+    """Read the calibration of an odometry folder, or of a raw drive or its parent folder."""
+    try:
+        if (folder / "calib.txt").is_file():
+            return _read_odometry_calibration(_read_entries(folder / "calib.txt"))
+        for place in (folder, Path(folder.absolute()).parent):
+            if (place / "calib_velo_to_cam.txt").is_file():
+                return _read_raw_calibration(place)
+    except (InputError, ValueError, KeyError) as error:
+        return Calibration(warnings=(f"the calibration is ignored: it is damaged: {error}",))
+    return Calibration()
 
 
-def list_scans(path: Path) -> list[Path]:
-    """The files of scans in the folder of a recording, by number.
+def _read_odometry_calibration(entries: dict[str, Float]) -> Calibration:
+    rows = [entries[name] for name in ("Tr", "Tr_velo_cam", "Tr_velo_to_cam") if name in entries]
+    projection = {n: _to_projection(entries[f"P{n}"]) for n in range(4) if f"P{n}" in entries}
+    return Calibration(pose_from_row(rows[0]) if rows else None, projection)
 
-    Raises:
-        InputError: the folder cannot be read.
+
+def _read_raw_calibration(folder: Path) -> Calibration:
+    laser = _read_entries(folder / "calib_velo_to_cam.txt")
+    T, projection, T_laser_imu = rigid_transform(laser["R"], laser["T"]), {}, None
+    if (folder / "calib_cam_to_cam.txt").is_file():
+        rectified = _read_entries(folder / "calib_cam_to_cam.txt")
+        T = rigid_transform(rectified["R_rect_00"], np.zeros(3)) @ T
+        named = {n: rectified.get(f"P_rect_{n:02d}") for n in range(4)}
+        projection = {n: _to_projection(P) for n, P in named.items() if P is not None}
+    if (folder / "calib_imu_to_velo.txt").is_file():
+        imu = _read_entries(folder / "calib_imu_to_velo.txt")
+        T_laser_imu = rigid_transform(imu["R"], imu["T"])
+    return Calibration(T, projection, T_laser_imu)
+
+
+def _to_projection(numbers: Float) -> Float:
+    P = numbers.reshape(3, 4)
+    if not np.isfinite(P).all():
+        raise ValueError("a projection is not finite")
+    return P
+
+
+def _read_entries(path: Path) -> dict[str, Float]:
+    """Numbers by the key before the colon; other lines are skipped."""
+    text = read_bytes(path, _MAX_CALIBRATION).decode("ascii", "replace")
+    out = {}
+    for line in text.splitlines():
+        name, _, numbers = line.partition(":")
+        with suppress(ValueError):
+            out[name.strip()] = np.array([float(word) for word in numbers.split()])
+    return out
+
+
+def _find_images(
+    folder: Path, calibration: Calibration, times: list[int | None]
+) -> tuple[Images | None, list[str]]:
+    """The images of all cameras, and warnings on those that are ignored.
+
+    Args:
+        folder: the recording.
+        calibration: intrinsics and extrinsics.
+        times: stamps of the scans, for images without stamps of their own.
     """
-    return list_files(path / _find_layout(path)[0], (".bin",))
+    parts: list[Images] = []
+    warnings: list[str] = []
+    for place in sorted(folder.iterdir()):
+        match = _CAMERA_FOLDER.fullmatch(place.name)
+        if match is None or not place.is_dir():
+            continue
+        try:
+            files = _list_images(place, times)
+            camera = _make_camera(place.name, int(match[1]), files, calibration)
+        except InputError as error:
+            warnings.append(f"the images in {place.name} are ignored: {error}")
+            continue
+        parts.append(cameras.images_from_files(files, camera))
+    return cameras.merge_images(parts) if parts else None, warnings
 
 
-def _find_layout(path: Path) -> tuple[Path, Path]:
-    return next(one for one in _LAYOUTS if (path / one[0]).is_dir())
+def _list_images(place: Path, times: list[int | None]) -> list[tuple[int, Path]]:
+    """Stamps and files of the images of one camera."""
+    inner = place / "data" if (place / "data").is_dir() else place
+    files = list_files(inner, images.EXTENSIONS)
+    own = place / "timestamps.txt"
+    times = read_times(own) if own.is_file() else times
+    rows = assign_rows(files, len(times), place) if files else []
+    stamps = (None if row is None else times[row] for row in rows)
+    return [(stamp, file) for stamp, file in zip(stamps, files, strict=True) if stamp is not None]
 
 
-def read(path: Path, context: ReadContext) -> Recording:
-    """Read an odometry sequence or a raw drive; the laser is the base of the robot.
+def _make_camera(
+    name: str, number: int, files: list[tuple[int, Path]], calibration: Calibration
+) -> Camera:
+    """The camera of some images.
 
-    Scans of odometry sequences are deskewed, those of raw drives are not: their laser turns
-    clockwise and faces ahead at the stamp.
-
-    Raises:
-        InputError: there are no stamps, or no scan can be read.
+    P = K [I | t] projects points of the first rectified camera; t is the offset between both.
     """
-    return _add_times(_read_untimed(path, context), path, context)
-
-
-def read_parts(
-    paths: Sequence[Path],
-    context: ReadContext,
-    others: Sequence[Path] = (),  # noqa: ARG001
-) -> Recording:
-    """Read pieces of a drive, in order of time, as one; see `read`."""
-    parts = (
-        _read_untimed(path, part_context(context, number, len(paths)))
-        for number, path in enumerate(paths)
-    )
-    joined = join_recordings(parts, [str(path) for path in paths], context.scratch)
-    window = TimeWindow(context.options)
-    recording = select_time(joined, window, str(paths[0])) if window else joined
-    return _add_times(recording, paths[0], context)
-
-
-def _add_times(recording: Recording, path: Path, context: ReadContext) -> Recording:
-    """Add times of beams, by the rate of all scans."""
-    spin = context.options.spin
-    direction = "clockwise" if spin == "auto" and _find_layout(path)[0] == _RAW else spin
-    source = {**recording.source, STAMP_AZIMUTH_KEY: _STAMP_AZIMUTH}
-    return add_beam_times(replace(recording, source=source), direction)
-
-
-def _read_untimed(path: Path, context: ReadContext) -> Recording:
-    scans, times_file = _find_layout(path)
-    files = list_scans(path)
     if not files:
-        raise InputError("holds no scan (*.bin)", where=str(path / scans))
-    if not (path / times_file).is_file():
-        hint = "one line per scan: its stamp in seconds"
-        raise InputError("does not exist", where=str(path / times_file), hint=hint)
-    times = read_times(path / times_file)
-    rows = assign_rows(files, len(times), path / times_file)
-    calibration = kitti_cameras.find_calibration(path)
-    poses, pose_warnings, by_line = read_poses(path, calibration, len(times), len(files))
-    images, image_warnings = find_images(path, calibration, times)
-    warnings = [*calibration.warnings, *pose_warnings, *image_warnings]
-    info = DatasetInfo(path, "KITTI", warnings)
-    sources = []
-    for number, (file, row) in enumerate(zip(files, rows, strict=True)):
-        stamp_ns = None if row is None else times[row]
-        index = row if by_line else number
-        T = None if index is None else poses.get(index)
-        read_cloud = partial(_read_scan, file, T)
-        if stamp_ns is None:
-            read_cloud = partial(reject, file, "has no stamp")
-        sources.append(CloudSource(file.name, read_cloud, stamp_ns))
-    return build_recording(sources, info, context, images=images)
-
-
-def _read_scan(path: Path, T: NDArray[np.float64] | None) -> Cloud:
-    require_nonempty_file(path)
-    content = read_bytes(path, MAX_SCAN)
-    if len(content) % RECORD:
-        raise truncated_error(path, len(content) // RECORD, len(content) // RECORD + 1)
-    return Cloud(np.frombuffer(content, "<f4").reshape(-1, 4)[:, :3], T)
+        raise InputError("there are none")
+    width, height = images.read_image_size(files[0][1])
+    P, T_camera_laser = calibration.projection.get(number), calibration.T_camera_laser
+    K, T_laser_camera = None if P is None else P[:, :3].copy(), None
+    if P is not None and T_camera_laser is not None:
+        T = np.eye(4)
+        try:
+            T[:3, 3] = np.linalg.solve(P[:, :3], P[:, 3])
+            T_laser_camera = se2.inverse(T @ T_camera_laser)
+        except np.linalg.LinAlgError:
+            K = None
+    return Camera(name, width, height, K, "", np.zeros(0), T_laser_camera)
 
 
 def write(recording: Recording, path: str | Path, *, overwrite: bool = False) -> None:
@@ -226,7 +327,7 @@ def write(recording: Recording, path: str | Path, *, overwrite: bool = False) ->
     """
     require_single_sensor(recording, str(path))
     T = recording.T_odom_base if recording.T_recorded_base is None else recording.T_recorded_base
-    T = sensor_poses(recording, place_clouds(recording, T))
+    T = sensor_poses(recording, T)
     digits = max(6, len(str(recording.n_scans)))
     with atomic_folder(Path(path), MARKER, overwrite) as folder:
         (folder / "velodyne").mkdir()

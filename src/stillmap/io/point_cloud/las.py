@@ -11,19 +11,16 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.errors import InputError, import_extra
 from stillmap.core.files import atomic_file
 from stillmap.core.input_files import InputFile
 from stillmap.core.recording import Recording
 from stillmap.io.builder import ReadContext
-from stillmap.io.point_cloud.binary_table import truncated_error
-from stillmap.io.point_cloud.hits import iter_map_points
-from stillmap.io.point_cloud.library_errors import library_errors
-from stillmap.io.point_cloud.origin import Origin
-from stillmap.io.point_cloud.scans import Cloud, read_clouds
-from stillmap.io.point_cloud.signatures import LAS_EXTENSIONS, LAS_MAGIC
-from stillmap.io.scan_files import require_nonempty_file
+from stillmap.io.point_cloud.clouds import Cloud, library_errors, read_clouds
+from stillmap.io.point_cloud.origin import Origin, iter_map_points
+from stillmap.io.point_cloud.table import gather_points, open_table, require_all, truncated_error
+
+EXTENSIONS, MAGIC = (".las", ".laz"), b"LASF"
 
 _BLOCK, _BLOCK_BYTES = 1 << 16, 8 << 20  # points and bytes read at once
 _MAX_POINTS_PER_BYTE, _MIN_POINT_LIMIT = 20, 10_000_000  # compressed points take a byte or more
@@ -42,15 +39,20 @@ def read(path: Path, context: ReadContext) -> Recording:
         InputError: no cloud can be read, or laspy is missing.
     """
     import_extra("laspy", path)
-    return read_clouds(path, "LAS", LAS_EXTENSIONS, _read_cloud, context)
+    return read_clouds(path, "LAS", EXTENSIONS, _read_cloud, context)
+
+
+def is_las(head: bytes) -> bool:
+    """True if a file with these first bytes is a LAS or LAZ file."""
+    return head.startswith(MAGIC)
 
 
 def _read_cloud(path: Path, origin: Origin, scratch: Path | None) -> Cloud:
-    points = ArrayBuilder(np.float32, (3,), scratch)
     with open_las_reader(path) as reader:
-        for block in iter_blocks(reader, path):
-            points.append(origin.shift(np.stack([block.x, block.y, block.z], axis=1)))
-    return Cloud(points.finish())
+        columns = ([block.x, block.y, block.z] for block in iter_blocks(reader, path))
+        blocks = require_all(columns, reader.header.point_count, path)
+        points, _ = gather_points(blocks, origin.shift, scratch)
+    return Cloud(points)
 
 
 @contextmanager
@@ -60,7 +62,6 @@ def open_las_reader(path: Path) -> Iterator[Any]:
     Raises:
         InputError: it is no LAS file, damaged, or laspy or lazrs is missing.
     """
-    require_nonempty_file(path)
     _check_header(path)
     laspy = import_extra("laspy", path)
     # single-threaded: the parallel backend trusts chunk sizes
@@ -73,23 +74,21 @@ def open_las_reader(path: Path) -> Iterator[Any]:
 
 
 def iter_blocks(reader: Any, path: Path) -> Iterator[Any]:
-    """Yield the points of an open file in blocks.
+    """Yield the points of an open file in blocks; there may be fewer than its header states.
 
     Raises:
-        InputError: the file is truncated.
+        InputError: the file is damaged.
     """
-    expected, found = reader.header.point_count, 0
-    if expected > max(_MAX_POINTS_PER_BYTE * path.stat().st_size, _MIN_POINT_LIMIT):
-        raise truncated_error(path, 0, expected)
+    if reader.header.point_count > max(
+        _MAX_POINTS_PER_BYTE * path.stat().st_size, _MIN_POINT_LIMIT
+    ):
+        raise truncated_error(path)
     rows = max(1, min(_BLOCK, _BLOCK_BYTES // reader.header.point_format.size))
     with library_errors(path):
         for block in reader.chunk_iterator(rows):
             if len(block) > rows:
                 raise InputError("is damaged: the size of its points", where=str(path))
-            found += len(block)
             yield block
-    if found < expected:
-        raise truncated_error(path, found, expected)
 
 
 def _check_header(path: Path) -> None:
@@ -98,9 +97,9 @@ def _check_header(path: Path) -> None:
     Raises:
         InputError: the header is invalid, or lazrs is missing.
     """
-    with InputFile(path) as file:
+    with open_table(path) as file:
         size, head = file.size, file.read(_HEADER)
-        if len(head) < _HEADER or head[:4] != LAS_MAGIC:
+        if len(head) < _HEADER or head[:4] != MAGIC:
             raise InputError("is no LAS file", where=str(path))
         header_size, start, extras, kind = struct.unpack_from("<HIIB", head, 94)
         if not header_size + _VLR * extras <= start <= size:

@@ -1,16 +1,19 @@
-"""The common origin of the clouds of a recording, whose coordinates may be those of a country."""
+"""Coordinates of clouds, perhaps those of a country: their common origin, and hits to write."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.arrays import finite_rows
+from stillmap.core.errors import InputError
 from stillmap.core.local_frame import LocalFrame
 from stillmap.core.recording import Recording
-from stillmap.io.rigid_transforms import MAX_TRANSLATION
+from stillmap.io.rigid_transforms import MAX_TRANSLATION, embed_in_3d
 
 _KEY = "origin"  # in the source of a recording
+_BLOCK = 1 << 20  # beams transformed at once
 _MAX_COORDINATE = 4096.0  # m: float32 resolves half a millimetre up to there
 
 
@@ -86,3 +89,53 @@ def _find_origin(points: NDArray[np.float64]) -> NDArray[np.float64] | None:
     # column by column: np.median(axis=0) takes several times as long
     middle = np.array([np.median(column) for column in finite.T])
     return np.round(middle) if np.abs(middle).max() > _MAX_COORDINATE else np.zeros(3)
+
+
+def require_single_sensor(recording: Recording, where: str) -> None:
+    """Refuse recordings of several sensors, for formats that hold one.
+
+    Raises:
+        InputError: there are several sensors.
+    """
+    n = len(recording.T_base_sensor)
+    if n != 1:
+        what = f"cannot be written: the recording has {n} sensors, the format holds one"
+        raise InputError(what, where=where)
+
+
+def sensor_poses(
+    recording: Recording, T_map_base: NDArray[np.float64] | None
+) -> NDArray[np.float64] | None:
+    """(T, 4, 4) sensor poses of robot poses (T, D+1, D+1), for writing; see `place_clouds`."""
+    T = place_clouds(recording, T_map_base)
+    return None if T is None else embed_in_3d(recording.T_map_sensor(T))
+
+
+def scan_hits(
+    recording: Recording, scan: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+    """(n, 3) hits of a scan in the sensor frame, and their times (n,) or None."""
+    beams = recording.beams_of(scan)
+    hit = recording.hit[beams]
+    times = None if recording.beam_time is None else recording.beam_time[beams][hit]
+    return _to_3d(recording.points[beams][hit]), times
+
+
+def iter_map_points(
+    recording: Recording, T_map_base: NDArray[np.float64]
+) -> Iterator[NDArray[np.float64]]:
+    """Yield all hits in the map frame in blocks (n, 3), in recording order.
+
+    Args:
+        recording: 2D hits lie at z = 0.
+        T_map_base: (T, D+1, D+1).
+    """
+    for start in range(0, recording.n_beams, _BLOCK):
+        hit = start + np.flatnonzero(recording.hit[start : start + _BLOCK])
+        yield _to_3d(recording.end_points(hit, T_map_base))
+
+
+def _to_3d(points: NDArray[Any]) -> NDArray[Any]:
+    if points.shape[1] == 3:
+        return points
+    return np.column_stack([points, np.zeros(len(points), points.dtype)])

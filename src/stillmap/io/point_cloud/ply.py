@@ -4,23 +4,26 @@ The reason is in CONTRIBUTING.md.
 """
 
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_file
-from stillmap.core.input_files import InputFile
 from stillmap.core.recording import Recording
 from stillmap.io.builder import ReadContext
-from stillmap.io.point_cloud.binary_table import Field, TableLayout, read_columns, split_header
-from stillmap.io.point_cloud.hits import iter_map_points
-from stillmap.io.point_cloud.origin import Origin
-from stillmap.io.point_cloud.scans import Cloud, read_clouds
-from stillmap.io.point_cloud.signatures import PLY_EXTENSIONS
-from stillmap.io.scan_files import require_nonempty_file
+from stillmap.io.point_cloud.clouds import Cloud, read_clouds
+from stillmap.io.point_cloud.origin import Origin, iter_map_points
+from stillmap.io.point_cloud.table import (
+    Field,
+    TableLayout,
+    gather_points,
+    open_table,
+    read_columns,
+    split_header,
+)
+
+EXTENSIONS = (".ply",)
 
 _MAX_HEADER = 1 << 16  # bytes
 _ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
@@ -31,42 +34,33 @@ _TYPES = {
 }
 
 
+def is_ply(head: bytes) -> bool:
+    """True if a file with these first bytes is a PLY file."""
+    return head.startswith((b"ply\n", b"ply\r"))
+
+
 def read(path: Path, context: ReadContext) -> Recording:
     """Read the vertices of one PLY file or of a folder of them.
 
     Raises:
         InputError: no cloud can be read.
     """
-    return read_clouds(path, "PLY", PLY_EXTENSIONS, _read_cloud, context)
+    return read_clouds(path, "PLY", EXTENSIONS, _read_cloud, context)
 
 
 def _read_cloud(path: Path, origin: Origin, scratch: Path | None) -> Cloud:
-    points = ArrayBuilder(np.float32, (3,), scratch)
-    for block in read_columns(read_layout(path), ("x", "y", "z")):
-        points.append(origin.shift(np.stack(block, axis=1)))
-    return Cloud(points.finish())
-
-
-class PlyHeader(NamedTuple):
-    """Layout of the vertices, and whether other elements may refer to them by their number."""
-
-    layout: TableLayout
-    indexed: bool
+    blocks = read_columns(read_layout(path), ("x", "y", "z"))
+    points, _ = gather_points(blocks, origin.shift, scratch)
+    return Cloud(points)
 
 
 def read_layout(path: Path) -> TableLayout:
-    """Read the header: the layout of the vertices. Errors as `read_header`."""
-    return read_header(path).layout
-
-
-def read_header(path: Path) -> PlyHeader:
-    """Read the header.
+    """Read the header: the layout of the vertices, ordered where others may refer to them.
 
     Raises:
         InputError: it is no PLY file, or its vertices cannot be located.
     """
-    require_nonempty_file(path)
-    with InputFile(path) as file:
+    with open_table(path) as file:
         head = file.read(_MAX_HEADER)
     lines, start = split_header(path, head, lambda words: words == ["end_header"])
     if lines[0] != ["ply"]:
@@ -77,8 +71,8 @@ def read_header(path: Path) -> PlyHeader:
         raise InputError(f"is damaged: its header: {error}", where=str(path)) from error
 
 
-def _parse_header(path: Path, lines: list[list[str]], start: int) -> PlyHeader:
-    encoding, order, header = "", "", start
+def _parse_header(path: Path, lines: list[list[str]], header: int) -> TableLayout:
+    encoding, order = "", ""
     elements: list[tuple[str, int, list[Field | None]]] = []  # None: a list property
     for words in lines[1:-1]:
         if words[:1] == ["format"]:
@@ -89,18 +83,16 @@ def _parse_header(path: Path, lines: list[list[str]], start: int) -> PlyHeader:
             is_list = words[1] == "list"
             field = None if is_list else Field(words[2], np.dtype(order + _TYPES[words[1]]))
             elements[-1][2].append(field)
-    text, before = encoding == "ascii", len(lines)
+    text, start, before = encoding == "ascii", header, len(lines)
     for name, rows, fields in elements:
         if rows < 0:
             raise ValueError("a negative count of points")
         plain = tuple(field for field in fields if field is not None)
+        if len(plain) < len(fields) and (name == "vertex" or not text):
+            raise ValueError("its vertices have list properties, or follow such")
         if name == "vertex":
-            if len(plain) < len(fields):
-                raise ValueError("its vertices have list properties")
             indexed = any(count > 0 for other, count, _ in elements if other != name)
-            return PlyHeader(TableLayout(path, plain, header, rows, start, before, text), indexed)
-        if len(plain) < len(fields) and not text:
-            raise ValueError("list properties precede its vertices")
+            return TableLayout(path, plain, rows, header, start, before, text, ordered=indexed)
         start += rows * sum(field.size for field in plain)
         before += rows
     raise ValueError("no vertices")

@@ -13,23 +13,30 @@ import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
 
 from stillmap.core.errors import InputError
-from stillmap.core.input_files import InputFile
+from stillmap.core.input_files import read_bytes
 from stillmap.core.recording import Recording
 from stillmap.io.builder import ReadContext
-from stillmap.io.point_cloud.binary_table import iter_text_lines, parse_numbers
-from stillmap.io.point_cloud.scans import Cloud, CloudSource, DatasetInfo, build_recording, files_of
-from stillmap.io.point_cloud.signatures import THREEDTK_EXTENSIONS
+from stillmap.io.point_cloud.clouds import (
+    Cloud,
+    CloudSource,
+    DatasetInfo,
+    build_recording,
+    files_of,
+)
+from stillmap.io.point_cloud.table import Field, TableLayout, is_blank, read_columns, require_all
 from stillmap.io.rigid_transforms import rigid_transform
-from stillmap.io.scan_files import require_nonempty_file, strip_extension
+from stillmap.io.scan_files import strip_extension
+from stillmap.io.text_lines import read_lines
 
-_MAX_UNPACKED = 1 << 30  # bytes
+EXTENSIONS = (".3d", ".3d.gz")
+
 _MAX_POSE = 1 << 12  # bytes
-_BLOCK = 1 << 18  # lines parsed at once
 _METRES = 0.01
 # maximum-range code: width of the values and gap to the hits (m), minimum share of the points
 _CODE_WIDTH, _CODE_GAP, _MIN_CODE_SHARE = 0.012, 0.3, 0.001
 # rotation from the axes of 3DTK to ours
 _AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+_FIELDS = tuple(Field(name, np.dtype("<f8")) for name in "xyz")
 
 
 def read(path: Path, context: ReadContext) -> Recording:
@@ -38,7 +45,7 @@ def read(path: Path, context: ReadContext) -> Recording:
     Raises:
         InputError: no scan can be read.
     """
-    files, options = files_of(path, THREEDTK_EXTENSIONS), context.options
+    files, options = files_of(path, EXTENSIONS), context.options
     info = DatasetInfo(path, "3DTK", [], single=path.is_file())
     code = _find_max_range_code(files) if options.max_range is None else None
     if code is not None:
@@ -63,45 +70,41 @@ def _find_max_range_code(files: list[Path]) -> float | None:
         top = length.max(initial=0.0)
         codes = int(np.count_nonzero(length > top - _CODE_WIDTH))
         below = int(np.count_nonzero(length > top - _CODE_WIDTH - _CODE_GAP)) - codes
-        found = codes > _MIN_CODE_SHARE * len(length) and codes >= 20 and 20 * below < codes
-        return float(np.floor(100.0 * (top - _CODE_WIDTH)) / 100.0) if found else None
+        is_code = codes > _MIN_CODE_SHARE * len(length) and codes >= 20 and 20 * below < codes
+        return float(np.floor(100.0 * (top - _CODE_WIDTH)) / 100.0) if is_code else None
     return None
 
 
 def _read_cloud(path: Path) -> Cloud:
-    require_nonempty_file(path)
-    lines = iter_text_lines(path, limit=_MAX_UNPACKED)
-    blocks = []
-    # the first line may be a size or a heading
-    first = next(lines, b"")
-    if is_point(first):
-        blocks.append(parse_numbers(iter([first]), 1, (0, 1, 2), path))
-    while len(block := parse_numbers(lines, _BLOCK, (0, 1, 2), path)):
-        blocks.append(block)
-    points = np.concatenate(blocks) if blocks else np.empty((0, 3))
+    lines, rows = _read_heading(path)
+    layout = TableLayout(path, _FIELDS, -1, lines=lines, text=True)
+    columns = require_all(read_columns(layout, "xyz"), rows, path)
+    blocks = [np.stack(block, axis=1) for block in columns]
+    points = np.concatenate([np.empty((0, 3)), *blocks])
     return Cloud(_METRES * points @ _AXES.T, _read_pose(path))
 
 
-def is_point(first_line: bytes) -> bool:
-    """True if the first line of a scan is a point."""
-    return len(first_line.split()) >= 3 and not first_line.lstrip().startswith(b"#")
+def _read_heading(path: Path) -> tuple[int, int]:
+    """Number of lines before the first point, and count of points that the first one states.
 
-
-def pose_file(path: Path) -> Path:
-    """The file beside a scan that holds its pose."""
-    return path.with_name(strip_extension(path.name, THREEDTK_EXTENSIONS) + ".pose")
+    Raises:
+        InputError: there are none.
+    """
+    for line in read_lines(path):
+        if not is_blank(line.text):
+            words = line.text.split()
+            is_point = len(words) >= 3 and not words[0].startswith(b"#")
+            is_count = len(words) == 1 and words[0].isdigit() and len(words[0]) < 10
+            return line.number - is_point, int(words[0]) if is_count else -1
+    raise InputError("is empty", where=str(path))
 
 
 def _read_pose(path: Path) -> NDArray[np.float64] | None:
     """(4, 4) pose in the file beside a scan; None where there is no valid one."""
-    file = pose_file(path)
+    file = path.with_name(strip_extension(path.name, EXTENSIONS) + ".pose")
     try:
-        if not file.is_file():
-            return None
-        with InputFile(file) as opened:
-            words = opened.read(_MAX_POSE).split()
-        numbers = np.array([float(word) for word in words[:6]])
-        position, angles = numbers.reshape(2, 3)
+        words = read_bytes(file, _MAX_POSE).split()
+        position, angles = np.array([float(word) for word in words[:6]]).reshape(2, 3)
         R = scipy.spatial.transform.Rotation.from_euler("XYZ", angles, degrees=True).as_matrix()
         return rigid_transform(_AXES @ R @ _AXES.T, _METRES * _AXES @ position)
     except (InputError, OSError, ValueError):

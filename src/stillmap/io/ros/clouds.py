@@ -14,9 +14,13 @@ from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.core.timestamps import longest_non_decreasing
 from stillmap.io.builder import ReadContext, RecordingBuilder, SkippedRecords
-from stillmap.io.point_cloud import time_field
-from stillmap.io.point_cloud.binary_table import record_dtype
-from stillmap.io.point_cloud.scans import Cloud
+from stillmap.io.point_cloud.clouds import (
+    Cloud,
+    convert_times,
+    detect_clock,
+    find_time_column,
+)
+from stillmap.io.point_cloud.table import record_dtype
 from stillmap.io.ros import tf
 from stillmap.io.ros.messages import (
     TIME_BACKWARDS,
@@ -72,7 +76,7 @@ def find_layout(message: Any) -> CloudLayout | str:
     end = (height - 1) * row + width * step if width and height else 0
     if end > len(message.data):
         return WRONG_SIZE
-    time = time_field.find_time_column(fields)
+    time = find_time_column(fields)
     order = ">" if message.is_bigendian else "<"
     columns: dict[str, tuple[str, int]] = {}
     for name in ("x", "y", "z", time):
@@ -97,12 +101,12 @@ def parse_cloud(message: Any) -> Cloud | str:
         return Cloud(np.empty((0, 3), np.float32))
     values = layout.view(message.data).reshape(-1)
     points = np.stack([values[name].astype(np.float32) for name in "xyz"], axis=1)
-    clock = None if layout.time is None else time_field.detect_clock(values[layout.time], None)
+    clock = None if layout.time is None else detect_clock(values[layout.time], None)
     if layout.time is None or clock is None:
         return Cloud(points)
     usable = np.asarray(np.isfinite(points).all(axis=1))
     stamp = stamp_ns(message.header)
-    times = time_field.convert_times(values[layout.time], usable, clock, stamp)[1]
+    times = convert_times(values[layout.time], usable, clock, stamp)[1]
     return Cloud(points, times=times)
 
 

@@ -1,9 +1,9 @@
-"""Point tables of PCD and PLY files: text lines or binary records.
+"""Tables of points in files: text lines or binary records, with columns by name.
 
 Counts in a header are checked against the size of the file before memory is allocated.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -12,13 +12,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.errors import InputError
 from stillmap.core.input_files import InputFile
 from stillmap.io.text_lines import read_lines
 
 _BLOCK = 1 << 18  # points read at once
 _MAX_RECORD = 1 << 16  # bytes of one point
-_MAX_COLUMNS = 1 << 12  # of text
+
+Columns = Sequence[NDArray[Any]]  # values (k,) of each column
 
 
 @dataclass(frozen=True)
@@ -41,25 +43,36 @@ class TableLayout:
     Attributes:
         path: the file.
         fields: the columns in order.
+        rows: point count of the header; negative: text up to the end of the file.
         header: bytes of the header.
-        rows: point count of the header.
         start: byte offset of the first point.
         lines: line count before the first point, of text.
         text: points are text, one line each.
+        compressed: columns follow each other, in one compressed block.
+        ordered: points are found by their number: none can be taken out.
     """
 
     path: Path
     fields: tuple[Field, ...]
-    header: int
     rows: int
-    start: int
-    lines: int
-    text: bool
+    header: int = 0
+    start: int = 0
+    lines: int = 0
+    text: bool = False
+    compressed: bool = False
+    ordered: bool = False
 
     @property
     def record(self) -> int:
-        """Bytes of one point."""
-        return sum(field.size for field in self.fields)
+        """Bytes of one point.
+
+        Raises:
+            InputError: none or implausibly many.
+        """
+        size = sum(field.size for field in self.fields)
+        if not 0 < size <= _MAX_RECORD:
+            raise InputError(f"is damaged: a point of {size} bytes", where=str(self.path))
+        return size
 
     def find_column(self, name: str) -> tuple[Field, int, int]:
         """The first column of a name, its byte offset and its value index within a point.
@@ -75,29 +88,65 @@ class TableLayout:
         raise InputError(f"has no column '{name}'", where=str(self.path))
 
 
-def read_columns(layout: TableLayout, wanted: Sequence[str]) -> Iterator[list[NDArray[Any]]]:
-    """Yield values (k,) of the wanted columns, block by block; text as float64.
+def read_columns(layout: TableLayout, names: Sequence[str]) -> Iterator[Columns]:
+    """Yield values (k,) of the named columns, block by block; text as float64.
 
     Raises:
         InputError: a column is missing, or the file is truncated or damaged.
     """
-    return _read_text(layout, wanted) if layout.text else _read_records(layout, wanted)
+    blocks = _read_text(layout, names) if layout.text else _read_records(layout, names)
+    return require_all(blocks, layout.rows, layout.path)
 
 
-def check_record_size(layout: TableLayout) -> None:
-    """Refuse records of zero or implausible size.
+def require_all(blocks: Iterable[Columns], rows: int, path: Path) -> Iterator[Columns]:
+    """Yield the blocks of a table of `rows` points; negative: any number.
 
     Raises:
-        InputError: the size of a point is invalid.
+        InputError: there are fewer.
     """
-    if not 0 < layout.record <= _MAX_RECORD:
-        what = f"is damaged: a point of {layout.record} bytes"
-        raise InputError(what, where=str(layout.path))
+    count = 0
+    for block in blocks:
+        count += len(block[0])
+        yield block
+    if count < rows:
+        raise truncated_error(path)
 
 
-def truncated_error(path: Path, found: int, expected: int) -> InputError:
+def gather_points(
+    blocks: Iterable[Columns],
+    convert: Callable[[NDArray[Any]], NDArray[Any]],
+    scratch: Path | None = None,
+) -> tuple[NDArray[np.float32], list[NDArray[Any]]]:
+    """Points (n, 3) of blocks of x, y, z and further columns, and those columns.
+
+    Args:
+        blocks: of a table.
+        convert: of points (k, 3) as they are in the file.
+        scratch: folder for memory-mapped buffers; None: the system's temporary folder.
+    """
+    points, further = ArrayBuilder(np.float32, (3,), scratch), []
+    for block in blocks:
+        points.append(convert(np.stack(block[:3], axis=1)))
+        further.append(block[3:])
+    return points.finish(), [np.concatenate(parts) for parts in zip(*further, strict=True)]
+
+
+def open_table(path: Path) -> InputFile:
+    """Open a file that is not empty.
+
+    Raises:
+        InputError: it is, or cannot be opened.
+    """
+    file = InputFile(path)
+    if not file.size:
+        file.close()
+        raise InputError("is empty", where=str(path))
+    return file
+
+
+def truncated_error(path: Path) -> InputError:
     """The error for a file with fewer points than its header states."""
-    return InputError(f"is truncated: {found} of {expected} points are there", where=str(path))
+    return InputError("is truncated: points are missing", where=str(path))
 
 
 def split_header(
@@ -127,59 +176,38 @@ def record_dtype(columns: Mapping[str, tuple[DTypeLike, int]], size: int) -> np.
     )
 
 
-def _read_records(layout: TableLayout, wanted: Sequence[str]) -> Iterator[list[NDArray[Any]]]:
-    check_record_size(layout)
-    columns = [layout.find_column(name) for name in wanted]
+def _read_records(layout: TableLayout, names: Sequence[str]) -> Iterator[Columns]:
+    columns = [layout.find_column(name) for name in names]
     by_name = {str(i): (field.dtype, byte) for i, (field, byte, _) in enumerate(columns)}
-    dtype = record_dtype(by_name, layout.record)
+    size, rows = layout.record, layout.rows
+    dtype = record_dtype(by_name, size)
     with InputFile(layout.path) as file:
-        available = (file.size - layout.start) // layout.record
-        if available < layout.rows:
-            raise truncated_error(layout.path, max(available, 0), layout.rows)
+        if file.size < layout.start + rows * size:
+            raise truncated_error(layout.path)
         file.seek(layout.start)
-        for first in range(0, layout.rows, _BLOCK):
-            n = min(_BLOCK, layout.rows - first)
-            rows = np.frombuffer(file.read(n * layout.record), np.uint8)
-            if len(rows) < n * layout.record:
-                raise truncated_error(layout.path, first + len(rows) // layout.record, layout.rows)
-            yield [rows.view(dtype)[name] for name in by_name]
+        for first in range(0, rows, _BLOCK):
+            records = np.frombuffer(file.read(min(_BLOCK, rows - first) * size), dtype)
+            yield [records[name] for name in by_name]
 
 
-def _read_text(layout: TableLayout, wanted: Sequence[str]) -> Iterator[list[NDArray[Any]]]:
-    numbers = [layout.find_column(name)[2] for name in wanted]
-    if max(numbers) >= _MAX_COLUMNS:
-        raise InputError("is damaged: too many columns", where=str(layout.path))
+def _read_text(layout: TableLayout, names: Sequence[str]) -> Iterator[Columns]:
+    numbers = [layout.find_column(name)[2] for name in names]
     lines = iter_text_lines(layout.path, layout.lines)
-    for first in range(0, layout.rows, _BLOCK):
-        n = min(_BLOCK, layout.rows - first)
-        block = parse_numbers(lines, n, numbers, layout.path)
-        if len(block):
-            yield list(block.T)
-        if len(block) < n:
-            raise truncated_error(layout.path, first + len(block), layout.rows)
+    lines = lines if layout.rows < 0 else islice(lines, layout.rows)
+    while len(block := parse_numbers(lines, _BLOCK, numbers, layout.path)):
+        yield list(block.T)
 
 
-def iter_text_lines(path: Path, skip: int = 0, limit: int | None = None) -> Iterator[bytes]:
-    """Yield lines that are not empty, of a text or gzip file.
-
-    Args:
-        path: the file.
-        skip: count of lines to skip.
-        limit: maximum size of the unpacked text in bytes.
+def iter_text_lines(path: Path, skip: int = 0) -> Iterator[bytes]:
+    """Yield lines that are not empty, of a text or gzip file, without the first `skip` ones.
 
     Raises:
-        InputError: a line is too long, the gzip stream is damaged, or the text is too large.
+        InputError: a line is too long, or the gzip stream is damaged or too large.
     """
-    size = 0
     for line in read_lines(path):
-        size += len(line.text)
-        if line.damaged:
-            raise InputError("is a damaged gzip file", where=f"{path}:{line.number}")
-        if line.too_long:
-            raise InputError("is damaged: a line is too long", where=f"{path}:{line.number}")
-        if limit is not None and size > limit:
-            what = f"is too large: more than {limit >> 20} MiB when unpacked"
-            raise InputError(what, where=str(path))
+        if line.damaged or line.too_long:
+            what = "is a damaged gzip file" if line.damaged else "is damaged: a line is too long"
+            raise InputError(what, where=f"{path}:{line.number}")
         if line.number > skip and not is_blank(line.text):
             yield line.text
 

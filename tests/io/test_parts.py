@@ -1,6 +1,5 @@
 """Parts of every format, read as one recording: the same as the one that was cut."""
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,8 +11,7 @@ from stillmap.core import arrays, se2
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
 from stillmap.io import read, writers
-from stillmap.io.input_groups import group_inputs, read_parts
-from stillmap.io.parts.joining import join_recordings
+from stillmap.io.parts import join_recordings, read_parts
 from stillmap.pipeline import inputs
 from stillmap.prepare.options import ReadOptions
 
@@ -54,26 +52,13 @@ def test_parts_in_any_order_are_the_whole(dimension, form, tmp_path):
     ending, recording = FORMS[dimension][form], make_recording(dimension)
     paths = write_parts(recording, tmp_path, form, ending, *SPANS)
     whole = read(write_whole(recording, tmp_path, form, ending))
-    shuffled = [paths[k] for k in (2, 0, 1)]
-    [group] = group_inputs(shuffled)
-    assert (list(group.paths), group.kind) == (paths, "parts")
-    joined = inputs.read(shuffled)
+    joined = inputs.read([paths[k] for k in (2, 0, 1)])
     require_equal(joined, whole)
     noted = joined.source["parts"]
     assert [part["path"] for part in noted] == paths
     assert [part["scans"] for part in noted] == [20, 15, 25]
     assert noted[1]["first_stamp_ns"] == START * 10**9 + 20 * int(1e9 * PERIOD)
     assert joined.source["path"] == paths[0]
-
-
-@pytest.mark.parametrize(("dimension", "form"), CASES)
-def test_what_parts_repeat_is_read_once(dimension, form, tmp_path):
-    ending, recording = FORMS[dimension][form], make_recording(dimension)
-    paths = write_parts(recording, tmp_path, form, ending, (0.0, 2.5), (1.5, 4.5), (4.0, 5.9))
-    joined = inputs.read(paths[::-1])
-    require_equal(joined, read(write_whole(recording, tmp_path, form, ending)))
-    assert any("hold already" in text for text in joined.source["duplicates"])
-    assert not joined.source.get("skipped")
 
 
 @pytest.mark.slow
@@ -87,19 +72,6 @@ def test_the_time_window_counts_from_the_first_part(dimension, form, tmp_path):
     assert joined.n_scans == 21
     with pytest.raises(InputError, match=r"has no scan from 50 s .*spans 0 to 5\.90 s"):
         inputs.read(paths, ReadOptions(start=50.0))
-
-
-def test_parts_of_different_formats(tmp_path, drive):
-    first = write_parts(cut(drive, 0.0, 1.9), tmp_path, "carmen", ".log", (0.0, 9.0))
-    second = str(tmp_path / "second.mcap")
-    named = {"sensors": [{"name": "FLASER"}]}
-    writers.write(replace(cut(drive, 2.0, 5.9), source=named), Path(second))
-    groups = group_inputs([*first, second])
-    assert len(groups) == 2  # FLASER is no topic
-    joined = read_parts([*first, second])
-    np.testing.assert_array_equal(joined.stamp_ns, drive.stamp_ns)
-    assert joined.n_beams == drive.n_beams
-    assert joined.source["format"] == "carmen, MCAP"
 
 
 def test_lines_that_the_first_part_of_a_log_alone_has(tmp_path, drive):
@@ -128,18 +100,6 @@ def test_damage_in_a_later_part_is_counted_at_its_line(tmp_path, drive):
     assert damage["lines"] == [before + 1]
 
 
-def test_sessions_are_refused_with_the_reason(tmp_path, drive):
-    paths = write_parts(drive, tmp_path, "carmen", ".log", (0.0, 5.9))
-    writers.write(make_recording(start=START + 86400), tmp_path / "next.log")
-    with pytest.raises(
-        InputError, match=r"no part of the same run.*begins 24\.0 h after"
-    ) as caught:
-        inputs.read([paths[0], tmp_path / "next.log"])
-    assert caught.value.where == str(tmp_path / "next.log")
-    with pytest.raises(InputError, match="no recording is named"):
-        inputs.read([])
-
-
 def test_an_unreadable_part_is_named(tmp_path, drive):
     paths = write_parts(drive, tmp_path, "carmen", ".log", (0.0, 5.9))
     with pytest.raises(InputError, match="does not exist") as caught:
@@ -152,7 +112,7 @@ def test_large_parts_are_joined_in_files(tmp_path, drive, monkeypatch):
     monkeypatch.setattr(arrays, "BLOCK", 100)
     scratch = tmp_path / "scratch"
     scratch.mkdir()
-    paths = write_parts(drive, tmp_path, "stillmap", "", (0.0, 2.5), (1.5, 5.9))
+    paths = write_parts(drive, tmp_path, "stillmap", "", (0.0, 2.5), (2.6, 5.9))
     joined = read_parts(paths, scratch=scratch)
     assert isinstance(joined.points, np.ndarray)
     assert not joined.points.flags.owndata  # mapped
@@ -170,21 +130,6 @@ def pictures(stamps, value, name="front"):
     return Images(stamp_ns, np.zeros(len(stamps), np.int32), (camera,), load)
 
 
-def test_images_and_sensors_of_parts():
-    whole = make_recording(3)
-    first = replace(cut(whole, 0.0, 2.9), images=pictures([10, 30], 0))
-    second = replace(cut(whole, 3.0, 5.9), images=pictures([20, 30, 40], 100))
-    joined = join_recordings([first, second], ["a", "b"], None)
-    assert joined.images.stamp_ns.tolist() == [10, 20, 30, 40]
-    assert [joined.images.read(k)[0, 0] for k in range(4)] == [0, 100, 1, 102]
-    assert len(joined.images.cameras) == 1
-    assert len(joined.T_base_sensor) == 1
-    other = replace(second, images=pictures([20], 7, "rear"))
-    joined = join_recordings([first, other], ["a", "b"], None)
-    assert [camera.name for camera in joined.images.cameras] == ["front", "rear"]
-    assert joined.images.camera.tolist() == [0, 1, 0]
-
-
 def test_recorded_poses_that_do_not_continue_are_left_out():
     whole = make_recording(3)
     first, second = cut(whole, 0.0, 2.9), cut(whole, 3.0, 5.9)
@@ -197,31 +142,6 @@ def test_recorded_poses_that_do_not_continue_are_left_out():
     joined = join_recordings([posed[0], anew], ["a", "b"], None)
     assert joined.T_recorded_base is None
     assert any("do not continue" in text for text in joined.source["warnings"])
-    joined = join_recordings([posed[0], second.without_odometry()], ["a", "b"], None)
-    assert joined.T_odom_base is None
-    assert len(joined.source["warnings"]) == 2
-
-
-def test_parts_that_do_not_fit_are_refused():
-    flat, space = make_recording(2), make_recording(3, start=START + 6)
-    with pytest.raises(InputError, match="is 3D, the parts before it are 2D"):
-        join_recordings([flat, space], ["a", "b"], None)
-    first, second = cut(make_recording(3), 0.0, 2.9), cut(make_recording(3), 3.0, 5.9)
-    far = replace(second, source={"origin": [1e6, 0.0, 0.0]})
-    with pytest.raises(InputError, match="another origin"):
-        join_recordings([first, far], ["a", "b"], None)
-
-
-def test_interleaved_scans_are_put_in_order(drive):
-    joined = join_recordings([cut(drive, 0.0, 3.0), cut(drive, 2.95, 5.9)], ["a", "b"], None)
-    np.testing.assert_array_equal(joined.stamp_ns, drive.stamp_ns)
-    scans = [3, 1, 2, 0]
-    rows = np.concatenate([np.arange(N) + N * k for k in scans])
-    late = replace(cut(drive, 0.0, 0.3), stamp_ns=drive.stamp_ns[:4] + 50_000_000)
-    joined = join_recordings([cut(drive, 0.0, 0.3), late], ["a", "b"], None)
-    assert np.all(np.diff(joined.stamp_ns) > 0)
-    np.testing.assert_array_equal(joined.points[: 2 * N], np.tile(drive.points[:N], (2, 1)))
-    assert len(rows) == 4 * N
 
 
 def test_a_raw_kitti_drive_in_pieces(tmp_path):
@@ -242,4 +162,59 @@ def test_a_raw_kitti_drive_in_pieces(tmp_path):
     joined = inputs.read([tmp_path / "b", tmp_path / "a"])
     require_equal(joined, read(whole))
     assert joined.beam_time is not None
-    shutil.rmtree(tmp_path / "b")
+
+
+def test_images_of_parts():
+    whole = make_recording(3)
+    first = replace(cut(whole, 0.0, 2.9), images=pictures([10, 30], 0))
+    second = replace(cut(whole, 3.0, 5.9), images=pictures([20, 40], 100))
+    joined = join_recordings([first, second], ["a", "b"], None)
+    assert joined.images.stamp_ns.tolist() == [10, 20, 30, 40]
+    assert [joined.images.read(k)[0, 0] for k in range(4)] == [0, 100, 1, 101]
+    assert len(joined.images.cameras) == len(joined.T_base_sensor) == 1
+
+
+def test_interleaved_scans_are_put_in_order(drive):
+    late = replace(cut(drive, 0.0, 0.3), stamp_ns=drive.stamp_ns[:4] + 50_000_000)
+    joined = join_recordings([cut(drive, 0.0, 0.3), late], ["a", "b"], None)
+    assert np.all(np.diff(joined.stamp_ns) > 0)
+    np.testing.assert_array_equal(joined.points[: 2 * N], np.tile(drive.points[:N], (2, 1)))
+
+
+def anew(recording):
+    """The recording with odometry that begins at zero."""
+    T = recording.T_odom_base
+    return replace(recording, T_odom_base=se2.inverse(T[:1]) @ T)
+
+
+def breaks(whole):
+    """Recordings that do not go on where the first three seconds of a whole one end."""
+    second = cut(whole, 3.0, 5.9)
+    return {
+        "it begins 864": make_recording(start=START + 86403),
+        "it is of the same time": cut(whole, 2.0, 5.9),
+        "it is 3D": cut(make_recording(3), 3.0, 5.9),
+        "one of them has no odometry": second.without_odometry(),
+        "its odometry begins 1.4": anew(second),
+        "it has other sensors": replace(second, source={"sensors": [{"name": "/front"}]}),
+    }
+
+
+@pytest.mark.parametrize("why", breaks(make_recording()))
+def test_what_does_not_follow_is_refused_and_merge_named(tmp_path, drive, why):
+    first, second = tmp_path / "first", tmp_path / "second"
+    writers.write(cut(drive, 0.0, 2.9), first)
+    writers.write(breaks(drive)[why], second)
+    with pytest.raises(InputError, match=f"does not follow {first}: {why}") as caught:
+        inputs.read([second, first])
+    assert f"stillmap merge {first} {second} -o DIR" in caught.value.hint
+    assert caught.value.where == str(second)
+
+
+@pytest.mark.parametrize("speed", [0.5, 20.0])
+def test_a_pause_is_bridged(tmp_path, speed):
+    whole = make_recording(speed=speed)
+    paths = write_parts(whole, tmp_path, "stillmap", "", (0.0, 1.9), (2.9, 5.9))
+    assert inputs.read(paths).n_scans == 20 + 31
+    with pytest.raises(InputError, match="no recording is named"):
+        inputs.read([])

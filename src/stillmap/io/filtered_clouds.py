@@ -1,0 +1,205 @@
+"""Filtered copies of KITTI folders and of PCD, PLY, LAS and LAZ files: points removed, in the
+encoding that they have, all else as it was."""
+
+import re
+import shutil
+import struct
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.errors import InputError, import_extra
+from stillmap.core.input_files import InputFile
+from stillmap.io.filtered_copy import FilterJob, Mask, Omissions, other_recording_error, write_files
+from stillmap.io.point_cloud import kitti, las, pcd, ply, table
+from stillmap.io.point_cloud.clouds import files_of
+from stillmap.io.point_cloud.table import TableLayout
+
+_BLOCK_BYTES = 8 << 20  # of points copied at once
+_WORD = re.compile(rb"\S+")
+_LABEL = 4  # bytes of a label of SemanticKITTI
+
+
+def write_kitti(job: FilterJob) -> Omissions:
+    """Copy a folder with points removed, and with their labels where it has those of SemanticKITTI.
+
+    Scans that were not read become empty files: numbers of scans, stamps, poses and images still
+    belong together.
+
+    Raises:
+        InputError: the source has changed since it was read, or the output cannot be written.
+    """
+
+    def filter_file(path: Path, new: Path, mask: Mask) -> None:
+        _copy_table(kitti.scan_layout(path), new, mask, bytes)
+        labels = job.source / "labels" / f"{path.stem}.label"
+        if labels.is_file() and labels.stat().st_size == _LABEL * len(mask):
+            folder = new.parents[len(path.relative_to(job.source).parts) - 1]
+            values = np.frombuffer(labels.read_bytes(), f"V{_LABEL}")[~mask]
+            (folder / "labels" / labels.name).write_bytes(values.tobytes())
+
+    files = kitti.list_scans(job.source)
+    return write_files(job, files, filter_file, write_unread=lambda _, new: new.touch())
+
+
+def write_pcd(job: FilterJob) -> Omissions:
+    """Copy a file or folder; points of organised clouds become NaN, others are removed."""
+
+    def filter_file(path: Path, new: Path, mask: Mask) -> None:
+        layout = pcd.read_header(path).layout
+        _copy_table(layout, new, mask, _counts(layout, mask, {b"WIDTH": 1, b"POINTS": 1}))
+
+    return write_files(job, files_of(job.source, pcd.EXTENSIONS), filter_file)
+
+
+def write_ply(job: FilterJob) -> Omissions:
+    """Copy a file or folder; vertices are removed, or become NaN where other elements, such as
+    faces, may refer to them by their number."""
+
+    def filter_file(path: Path, new: Path, mask: Mask) -> None:
+        layout = ply.read_layout(path)
+        _copy_table(layout, new, mask, _counts(layout, mask, {b"element vertex": 2}))
+
+    return write_files(job, files_of(job.source, ply.EXTENSIONS), filter_file)
+
+
+def write_las(job: FilterJob) -> Omissions:
+    """Copy a file or folder with points removed: version, format of points and records stay."""
+    ending = job.output.suffix.lower()
+    packed = ending == ".laz" if job.source.is_file() and ending in las.EXTENSIONS else None
+    filter_file = partial(_filter_las, packed=packed)
+    return write_files(job, files_of(job.source, las.EXTENSIONS), filter_file)
+
+
+def _filter_las(path: Path, new: Path, mask: Mask, packed: bool | None) -> None:
+    laspy = import_extra("laspy", path)
+    with las.open_las_reader(path) as reader:
+        header, first = reader.header, 0
+        if any(vlr.user_id == "copc" for vlr in header.vlrs):
+            raise InputError("is a COPC file, an index of points by place", where=str(path))
+        if header.point_count != len(mask):
+            raise other_recording_error(path)
+        packed = header.are_points_compressed if packed is None else packed
+        with las.open_las_writer(new, laspy, header, packed) as writer:
+            for block in las.iter_blocks(reader, path):
+                writer.write_points(block[~mask[first : first + len(block)]])
+                first += len(block)
+            if first < len(mask):
+                raise table.truncated_error(path)
+            if header.number_of_evlrs:
+                reader.read_evlrs()
+                writer.write_evlrs(reader.evlrs)
+
+
+EditLine = Callable[[bytes], bytes]
+
+
+def _counts(layout: TableLayout, mask: Mask, words: dict[bytes, int]) -> EditLine:
+    """Sets the count of points in lines of a header that begin so, at the word of this index."""
+    count = len(mask) - int(np.count_nonzero(mask))
+
+    def edit(line: bytes) -> bytes:
+        for begin, word in words.items():
+            if line.split()[: begin.count(b" ") + 1] == begin.split():
+                return _replace_words(line, {word: count})
+        return line
+
+    return bytes if layout.ordered else edit
+
+
+def _replace_words(line: bytes, values: dict[int, Any]) -> bytes:
+    """A line with the words of some indices replaced; all else stays."""
+    words, parts, at = list(_WORD.finditer(line)), [], 0
+    for index in sorted(values):
+        begin, end = words[index].span()
+        parts += [line[at:begin], str(values[index]).encode("ascii")]
+        at = end
+    return b"".join([*parts, line[at:]])
+
+
+def _copy_table(layout: TableLayout, new: Path, mask: Mask, edit_line: EditLine) -> None:
+    """Copy a file without the points of a mask; where they are ordered, they stay without
+    coordinates: NaN, or 0 in columns of integers.
+
+    Args:
+        layout: of the file.
+        new: its copy.
+        mask: (n,) points to remove.
+        edit_line: changes counts in a line of the header.
+
+    Raises:
+        InputError: the file has another number of points, or is damaged.
+    """
+    if layout.rows != len(mask):
+        raise other_recording_error(layout.path)
+    copy = _copy_lines if layout.text else _copy_records
+    copy = _copy_columns if layout.compressed else copy
+    with InputFile(layout.path) as source, new.open("wb") as target:
+        header = source.read(layout.header)
+        target.write(b"".join(edit_line(line) for line in header.splitlines(keepends=True)))
+        copy(source, target, layout, mask)
+        shutil.copyfileobj(source, target)
+
+
+def _unknown(dtype: np.dtype[Any]) -> Any:
+    """The value of a coordinate that is not known."""
+    return np.nan if dtype.kind == "f" else 0
+
+
+def _blank_records(
+    layout: TableLayout, records: NDArray[np.uint8], removed: Mask
+) -> NDArray[np.uint8]:
+    """Records (n, size) without those of a mask, or without their coordinates."""
+    if not layout.ordered:
+        return records[~removed]
+    records = records.copy()
+    for field, byte, _ in map(layout.find_column, "xyz"):
+        value = np.array(_unknown(field.dtype), field.dtype)
+        records[removed, byte : byte + value.itemsize] = np.frombuffer(value.tobytes(), np.uint8)
+    return records
+
+
+def _copy_records(source: IO[bytes], target: IO[bytes], layout: TableLayout, mask: Mask) -> None:
+    target.write(source.read(layout.start - layout.header))
+    step = max(1, _BLOCK_BYTES // layout.record)
+    for first in range(0, len(mask), step):
+        removed = mask[first : first + step]
+        rows = np.frombuffer(source.read(len(removed) * layout.record), np.uint8)
+        if len(rows) < len(removed) * layout.record:
+            raise table.truncated_error(layout.path)
+        target.write(_blank_records(layout, rows.reshape(len(removed), -1), removed).tobytes())
+
+
+def _copy_columns(source: IO[bytes], target: IO[bytes], layout: TableLayout, mask: Mask) -> None:
+    records = _blank_records(layout, np.hstack(pcd.unpack_columns(layout)), mask)
+    ends = np.cumsum([field.size for field in layout.fields])[:-1]
+    data = b"".join(column.tobytes() for column in np.hsplit(records, ends))
+    # room for more bytes than LZF makes of any data: else it refuses what it cannot shorten
+    room = len(data) + len(data) // 8 + 64
+    packed = import_extra("lzf", layout.path).compress(data, room) if data else b""
+    target.write(struct.pack("<II", len(packed), len(data)) + packed)
+    source.seek(int.from_bytes(source.read(8)[:4], "little"), 1)
+
+
+def _copy_lines(source: IO[bytes], target: IO[bytes], layout: TableLayout, mask: Mask) -> None:
+    source.seek(0)
+    header_lines, row = source.read(layout.header).count(b"\n"), 0
+    for _ in range(layout.lines - header_lines):
+        target.write(source.readline())
+    unknown = {value: _unknown(field.dtype) for field, _, value in map(layout.find_column, "xyz")}
+    while row < len(mask):
+        line = source.readline()
+        if not line:
+            raise table.truncated_error(layout.path)
+        if table.is_blank(line):
+            target.write(line)
+            continue
+        if not mask[row]:
+            target.write(line)
+        elif layout.ordered:
+            target.write(_replace_words(line, unknown))
+        row += 1

@@ -1,1 +1,0 @@
-"""Parts of one run: recognised by stamps and odometry, and read as one recording."""

@@ -1,1 +1,0 @@
-"""Filtered copies of point clouds: points removed, all other bytes unchanged."""
