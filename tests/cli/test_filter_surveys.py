@@ -70,7 +70,8 @@ def test_las_is_packed_by_its_name(call, tmp_path):
     las_file(tmp_path / "a.las")
     recording, blank = label(tmp_path / "a.las", tmp_path / "out")
     run(call, tmp_path / "out", tmp_path / "clean.laz")
-    assert laspy.open(tmp_path / "clean.laz").header.are_points_compressed
+    with laspy.open(tmp_path / "clean.laz") as file:
+        assert file.header.are_points_compressed
     check_same_but(recording, tmp_path / "clean.laz", blank)
 
 

@@ -119,14 +119,6 @@ def _format_time(time: dict[str, Any]) -> Iterator[str]:
     yield _row("stamps", f"{first} to {last}")
 
 
-def _format_span(part: dict[str, Any]) -> str:
-    """A part of a run."""
-    from stillmap.core.timestamps import format_seconds
-
-    first, last = (format_seconds(part[key]) for key in ("first_stamp_ns", "last_stamp_ns"))
-    return f"{part['path']}: {part['scans']} scans, stamps {first} to {last}"
-
-
 def _format_part(part: dict[str, Any]) -> str:
     """The scans that the time window leaves out of a recording."""
     from stillmap.core.timestamps import format_seconds
