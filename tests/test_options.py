@@ -110,11 +110,6 @@ def test_an_unknown_key_names_the_nearest(
     assert refusal(changes) == f"file.toml: unknown option '{unknown}' (nearest: '{nearest}')"
 
 
-def test_a_key_like_no_other_is_refused() -> None:
-    assert "unknown option '#'" in refusal({"#": 1})
-    assert "unknown option ''" in refusal({"": 1})
-
-
 def test_integers_are_taken_for_floats() -> None:
     width = override(Outer(), {"inner": {"width": 2}}).inner.width
     assert (type(width), width) == (float, 2.0)

@@ -49,18 +49,6 @@ def test_to_a_recording_folder(call, room, tmp_path):
     assert after.source == before.source
 
 
-def test_read_flags_apply(call, room, tmp_path):
-    assert call("convert", room, "-o", tmp_path / "a", "--max-range", "3").returncode == 0
-    length = np.linalg.norm(stillmap_folder.read(tmp_path / "a").points, axis=1)
-    assert length.max() <= 3.00001
-    assert np.linalg.norm(stillmap_folder.read(room).points, axis=1).max() > 5
-
-
-def test_format_by_name(call, room, tmp_path):
-    assert call("convert", room, "-o", tmp_path / "a.xyz", "--to", "carmen").returncode == 0
-    assert read(tmp_path / "a.xyz").source["format"] == "carmen"
-
-
 def test_losses_are_reported(call, tmp_path, nothing_left):
     call("simulate", "hall", "-o", tmp_path / "s", "--scans", 3, "--sweep-time", 0.1, "--quiet")
     done = call("convert", tmp_path / "s", "-o", tmp_path / "a.log")
@@ -120,13 +108,6 @@ def test_unwritable_output_is_named(call, room, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("name", ["a.log", "a.mcap", "a"])
-def test_overwrite_flag(call, room, tmp_path, name):
-    for more, status in (((), 0), ((), 2), (("--overwrite",), 0)):
-        to = ["--to", "ros2"] if name == "a" else []
-        assert call("convert", room, "-o", tmp_path / name, *to, *more).returncode == status
-
-
 @pytest.mark.parametrize("name", ["a.bag", "a.db3", "a.mcap", "a"])
 def test_result_as_bag(call, mapped, tmp_path, nothing_left, name):
     to = ["--to", "ros2"] if name == "a" else []
@@ -165,13 +146,6 @@ def test_result_as_table(call, room, mapped, tmp_path):
     assert (tmp_path / "a.parquet").read_bytes() == (tmp_path / "b.parquet").read_bytes()
 
 
-def test_table_needs_pyarrow(call, mapped, tmp_path, monkeypatch, nothing_left):
-    monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
-    done = call("convert", mapped, "-o", tmp_path / "a.parquet")
-    refused(done, "needs the package pyarrow", install_command("io"))
-    nothing_left()
-
-
 def test_formats_that_results_do_not_have(call, room, mapped, tmp_path, nothing_left):
     refused(call("convert", mapped, "-o", tmp_path / "a.log"), "as a CARMEN log", "filter")
     refused(call("convert", mapped, "-o", tmp_path / "a"), "as a recording folder")
@@ -180,13 +154,6 @@ def test_formats_that_results_do_not_have(call, room, mapped, tmp_path, nothing_
     for output in (mapped, mapped.parent, room):
         done = call("convert", mapped, "-o", output, "--overwrite", "--to", "ros2")
         refused(done, "recording")
-    nothing_left()
-
-
-@pytest.mark.parametrize("ending", [".las", ".laz", ".e57", ".pcd", ".ply", ".xyz"])
-def test_2d_results_have_no_clouds(call, mapped, tmp_path, nothing_left, ending):
-    done = call("convert", mapped, "-o", tmp_path / f"a{ending}")
-    refused(done, "out: is a 2D result", ".parquet")
     nothing_left()
 
 
@@ -246,14 +213,3 @@ def test_damaged_objects(call, mapped, tmp_path, text, words):
     refused(call("convert", result, "-o", tmp_path / "a.mcap"), words)
     shutil.rmtree(result / "objects")  # --set objects.enabled=false
     assert call("convert", result, "-o", tmp_path / "a.mcap").returncode == 0
-
-
-def test_help_lists_every_format():
-    from stillmap.cli import convert
-    from stillmap.io.writers import WRITERS
-    from stillmap.results.export.point_cloud_files import FORMATS
-
-    assert [end for form in FORMATS for end in form.endings] == list(convert.CLOUDS)
-
-    assert [writer.name for writer in WRITERS] == list(convert.NAMES)
-    assert sorted(e for writer in WRITERS for e in writer.endings) == sorted(convert.ENDINGS)

@@ -1,12 +1,8 @@
 """Suggestions for bad calls; reports of defects."""
 
 import json
-import logging
-import os
 import shlex
-import subprocess
 import sys
-from importlib.metadata import PackageNotFoundError
 
 import pytest
 
@@ -15,7 +11,6 @@ from stillmap.cli.parser import COMMANDS
 from stillmap.core.errors import (
     InputError,
     MissingExtra,
-    closest_match,
     import_extra,
     install_command,
 )
@@ -55,35 +50,6 @@ def test_suggestions(capsys, words, said, meant):
     assert meant in message
 
 
-@pytest.mark.parametrize(
-    "words", [("zzzz",), ("map", "log", "-o", "out", "--zzzz"), ("map", "a", "b", "-o", "out")]
-)
-def test_no_suggestion_without_similar_name(capsys, words):
-    assert "did you mean" not in refusal(capsys, *words)
-
-
-@pytest.mark.parametrize(
-    ("assignment", "said"),
-    [
-        ("em.prior.x=1", "'em.prior' is a value, not a section"),
-        ("em=1", "'em' is a section, not a value"),
-        ("slam=1", "'slam' is a section, not a value"),
-        ("em.prior=[1]", "'em.prior' must be a valid number, got [1]"),
-        ("em.prior=2020-01-01", "'em.prior' must be a valid number"),
-        ("threads=1.5", "'threads' must be a valid integer, got 1.5"),
-        ("em..prior=1", "unknown option 'em.'"),
-        ("em.prior=1\nthreads=2", "'em.prior' must be a valid number"),
-    ],
-)
-def test_invalid_options(capsys, assignment, said):
-    assert said in refusal(capsys, "config", "--set", assignment)
-
-
-def test_error_for_multiline_flag_is_one_line(capsys):
-    refusal(capsys, "map", "log", "-o", "out", "--a\nb")
-    refusal(capsys, "info", "no\nsuch\nfile")
-
-
 def test_similar_file_name_is_suggested(capsys, tmp_path):
     (tmp_path / "walk.log").write_text("")
     (tmp_path / "options.toml").write_text("")
@@ -116,38 +82,6 @@ def test_empty_argument_is_refused(capsys, tmp_path, monkeypatch, words):
     monkeypatch.chdir(tmp_path)
     assert "an argument is empty" in refusal(capsys, *words)
     assert (tmp_path / "mine").read_text() == "mine"
-
-
-def test_closest_match():
-    assert closest_match("resoluton", ["paper", "resolution"]) == "resolution"
-    assert closest_match("PAPER", ["paper"]) == "paper"
-    assert closest_match("xyz", ["paper"]) is None
-    assert closest_match("xyz", ["paper"], min_similarity=0.0) == "paper"
-    assert closest_match("x", []) is None
-
-
-def test_no_command_lists_commands(stillmap):
-    done = stillmap()
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith("usage: stillmap ")
-    assert "the main job" in done.stderr
-    assert len(done.stderr.splitlines()) < 20
-
-
-def test_defect_is_reported_after_its_trace(command):
-    program = (
-        "import sys, stillmap.cli.config as c\n"
-        "def fail(args): raise RuntimeError('ours')\n"
-        "c.run = fail\n"
-        "from stillmap.cli.main import main\n"
-        "sys.exit(main(['config']))\n"
-    )
-    done = subprocess.run([command[0], "-c", program], capture_output=True, text=True, timeout=60)
-    assert (done.returncode, done.stdout) == (1, "")
-    *trace, last = done.stderr.splitlines()
-    assert trace[0].startswith("Traceback")
-    assert trace[-1] == "RuntimeError: ours"
-    assert last.startswith("stillmap: this is a defect of stillmap")
 
 
 @pytest.mark.parametrize(
@@ -193,18 +127,6 @@ def test_verbose_and_quiet_anywhere(monkeypatch, words, verbose, quiet):
         monkeypatch.setattr(f"stillmap.cli.{name}.run", lambda args: got.append(args) or 0)
     assert main(list(words)) == 0
     assert (got[0].verbose, got[0].quiet) == (verbose, quiet)
-
-
-def test_verbose_prints_more_to_stderr(monkeypatch, capsys):
-    def run(_):
-        logging.getLogger("stillmap.pipeline.result").info("iteration %d", 3)
-        return 0
-
-    monkeypatch.setattr("stillmap.cli.config.run", run)
-    main(["config"])
-    assert capsys.readouterr() == ("", "")
-    main(["-v", "config"])
-    assert capsys.readouterr() == ("", "stillmap: iteration 3\n")
 
 
 CALLS = [
@@ -291,35 +213,3 @@ def test_extra_from_index_and_repository(installed_from):
     url = "https://example.org/stillmap.git"
     installed_from({"url": url, "vcs_info": {"vcs": "git", "commit_id": "abc"}})
     assert wanted(install_command("mesh")) == f"stillmap[mesh] @ git+{url}@abc"
-
-
-def test_extra_of_sources_that_are_not_installed(monkeypatch, tmp_path):
-    def missing(name):
-        raise PackageNotFoundError(name)
-
-    monkeypatch.setattr("importlib.metadata.distribution", missing)
-    module = tmp_path / "src/stillmap/core/errors.py"
-    monkeypatch.setattr("stillmap.core.errors.__file__", str(module))
-    assert shlex.split(install_command("viewer"))[-1] == "stillmap[viewer]"
-    (tmp_path / "pyproject.toml").write_text("")
-    assert shlex.split(install_command("viewer"))[-1] == f"{tmp_path}[viewer]"
-
-
-def test_pip_of_the_environment_is_named_briefly(monkeypatch, tmp_path):
-    pip = tmp_path / "pip"
-    pip.write_text("#!/bin/sh\n")
-    pip.chmod(0o755)
-    monkeypatch.setenv("PATH", str(tmp_path))
-    assert install_command("io").startswith(f"{shlex.quote(sys.executable)} -m pip install ")
-    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
-    assert install_command("io").startswith("pip install ")
-
-
-@pytest.mark.slow
-def test_command_for_the_viewer_works_here():
-    """Nothing is fetched: pip resolves this installation's own origin, without dependencies."""
-    flags = ["--dry-run", "--no-deps", "--no-index", "--no-build-isolation", "--quiet"]
-    words = [*shlex.split(install_command("viewer")), *flags]
-    environment = {**os.environ, "PIP_DISABLE_PIP_VERSION_CHECK": "1"}
-    done = subprocess.run(words, capture_output=True, text=True, env=environment, timeout=300)
-    assert done.returncode == 0, done.stderr

@@ -10,7 +10,6 @@ from PIL import Image
 
 from stillmap.cli import info
 from stillmap.cli import recording_info as module
-from stillmap.cli.arguments import add_read_flags, flag_changes
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
@@ -62,8 +61,8 @@ def test_json(path, capsys):
     assert sensor["extrinsics"]["x"] == 0.25
     assert sensor["field_of_view_deg"] == pytest.approx([-90.0, 45.0])
     assert sensor["ranges"]["threshold"] == 81.83
-    assert found["skipped"] == {"wrong number of readings": {"count": 1, "lines": [4]}}
-    assert found["skipped_odometry"] == {"pose not finite": {"count": 1, "lines": [7]}}
+    assert found["skipped"] == {"line that cannot be read": {"count": 1, "lines": [4]}}
+    assert found["skipped_odometry"] == {"line that cannot be read": {"count": 1, "lines": [7]}}
 
 
 def test_text(path, capsys):
@@ -79,8 +78,8 @@ def test_text(path, capsys):
         "path 5.00 m",
         "x 0.250 m, y 0.000 m, turned 0.00 deg (PARAM)",
         "robot_frontlaser_offset 0.25",
-        "1 wrong number of readings (line 4)",
-        "1 pose not finite (line 7)",
+        "1 line that cannot be read (line 4)",
+        "1 line that cannot be read (line 7)",
         "warning",
     ):
         assert part in out, part
@@ -106,32 +105,6 @@ def test_upside_down_laser(path, capsys):
     run(path, "--json", "--laser-upside-down")
     (sensor,) = json.loads(capsys.readouterr().out)["sensors"]
     assert (sensor["upside_down"], sensor["upside_down_how"]) == (True, "given")
-
-
-def test_flags_of_the_second_laser(path, capsys):
-    with pytest.raises(InputError, match="has one laser"):
-        run(path, "--laser2-upside-down")
-    with path.open("a") as file:
-        file.write("RLASER 4 1 2 3 4 3 4 0.5 3 4 0.5 102.0 host 0.1\n")
-    run(path, "--json", "--laser2-offset", -1, 0, 90, "--laser2-upside-down", "--laser2-fov", 90)
-    first, second = json.loads(capsys.readouterr().out)["sensors"]
-    assert (first["upside_down"], second["upside_down"]) == (False, True)
-    place = second["extrinsics"]
-    assert (place["x"], place["y"], place["theta_deg"]) == pytest.approx((-1, 0, 90))
-    assert second["field_of_view_deg"] == pytest.approx([-22.5, 45.0])
-
-
-def test_flag_out_of_range(path):
-    with pytest.raises(InputError, match="min_range"):
-        run(path, "--min-range", "-1")
-
-
-def test_only_given_flags_are_changes():
-    parser = argparse.ArgumentParser()
-    add_read_flags(parser)
-    assert flag_changes(parser.parse_args([])) == {}
-    changes = flag_changes(parser.parse_args(["--zero-means", "unusable", "--min-range", "0"]))
-    assert changes == {"read": {"zero_means": "unusable", "min_range": 0.0}}
 
 
 def test_recording_folder_gives_same_summary(path, tmp_path, capsys):
@@ -229,19 +202,6 @@ def test_poses_and_images(path, tmp_path, capsys):
     found = json.loads(capsys.readouterr().out)
     assert found["recorded_poses"]["path_length_m"] == pytest.approx(7.0)
     assert (found["images"]["count"], found["images"]["cameras"][1]["count"]) == (5, 2)
-
-
-def test_skipped_files(tmp_path, capsys):
-    (tmp_path / "velodyne").mkdir()
-    (tmp_path / "velodyne" / "0.bin").write_bytes(np.ones(8, "<f4").tobytes())
-    (tmp_path / "velodyne" / "1.bin").write_bytes(b"cut")
-    (tmp_path / "times.txt").write_text("0\n1\n")
-    run(tmp_path)
-    out = capsys.readouterr().out
-    assert "KITTI, 3D" in out
-    assert "1 is truncated (file 2)" in out
-    run(tmp_path, "--json")
-    assert json.loads(capsys.readouterr().out)["skipped_unit"] == "file"
 
 
 @pytest.mark.parametrize("few", [1, 100])

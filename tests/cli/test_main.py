@@ -5,9 +5,7 @@ import os
 import subprocess
 
 import pytest
-from refusals import refused
 
-from stillmap.cli import main as main_module
 from stillmap.cli.main import main
 
 COMMANDS = [
@@ -70,11 +68,6 @@ def test_bad_call_is_one_line(words, said, capsys):
     assert err.count("\n") == 1
     assert said in err
     assert "--help" in err
-
-
-def test_bad_call_as_process_is_one_line(stillmap, tmp_path):
-    refused(stillmap("info", tmp_path / "absent.log"), str(tmp_path / "absent.log"))
-    refused(stillmap("frobnicate"), "frobnicate")
 
 
 def test_only_json_on_stdout(stillmap, tmp_path):
@@ -155,12 +148,3 @@ def test_interrupt_behind_another_error(monkeypatch, capsys, stop, status, said,
     monkeypatch.setattr("stillmap.cli.config.run", fail)
     assert main(["config"]) == status
     assert capsys.readouterr() == ("", said)
-
-
-def test_errors_that_are_raised_from_each_other_end():
-    """As laspy's, when a file cannot be closed: their chain has no end."""
-    first, second = OSError(27, "File too large"), RuntimeError("while closing")
-    first.__cause__, second.__cause__ = second, first
-    assert main_module._find_interrupt(first) is None
-    second.__cause__ = KeyboardInterrupt()
-    assert main_module._find_interrupt(first) is second.__cause__

@@ -42,19 +42,6 @@ def test_recording_is_not_overwritten(call, room, tmp_path):
     assert list_files(recording) == before
 
 
-def test_empty_folder_is_accepted(call, room, tmp_path, nothing_left):
-    (tmp_path / "out").mkdir()
-    assert call("map", room, "-o", tmp_path / "out", *QUICK).returncode == 0
-    assert list_files(tmp_path / "out") >= FILES
-    nothing_left("out")
-
-
-def test_existing_file_is_refused(call, room, tmp_path):
-    (tmp_path / "out").write_text("mine")
-    refused(call("map", room, "-o", tmp_path / "out", "--overwrite"), tmp_path / "out")
-    assert (tmp_path / "out").read_text() == "mine"
-
-
 def test_unwritable_folder_is_refused_before_the_work(call, room, tmp_path):
     (tmp_path / "file").write_text("")
     places = [tmp_path / "file/out"]

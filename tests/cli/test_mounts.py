@@ -79,42 +79,6 @@ def test_killed_in_a_mount_point_and_resumed(mounted, hall, tmp_path, nothing_le
 
 
 @pytest.mark.slow
-def test_other_commands_write_into_a_mount_point(mounted, room, mapped, tmp_path):
-    for words in ("simulate hall --scans 9", "convert $IN", "convert $IN --to ros2", "filter $MAP"):
-        done = mounted(f"$S {words} -o out --quiet", IN=room, MAP=mapped)
-        assert (done.returncode, done.stderr) == (0, "")
-        names = os.listdir(tmp_path / "disk")
-        assert names
-        assert not [name for name in names if name.startswith(".")]
-        shutil.rmtree(tmp_path / "disk")
-        (tmp_path / "disk").mkdir()
-
-
-def test_file_that_is_a_mount_point(mounted, room, tmp_path):
-    for name in ("file", "bound.log"):
-        (tmp_path / name).write_text("old")
-    script = "mount --bind file bound.log; $S convert $IN -o bound.log --quiet"
-    done = mounted(script, IN=room)
-    assert done.returncode == 2
-    assert "is there already" in done.stderr
-    done = mounted(f"{script} --overwrite", IN=room)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert "FLASER" in (tmp_path / "file").read_text()
-    assert sorted(os.listdir(tmp_path)) == ["bound.log", "disk", "file", "out"]
-
-
-def test_only_the_output_can_be_written(mounted, room, tmp_path):
-    script = "mkdir view; mount --bind . view; mount --bind disk view/out; "
-    script += "mount -o remount,ro,bind view; "
-    done = mounted(f"{script} $S map $IN -o view/out --quiet {shlex.join(QUICK)}", IN=room)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert list_files(tmp_path / "disk") >= FILES
-    done = mounted(f"{script.replace('mkdir', 'ls')} $S convert $IN -o view/x.log", IN=room)
-    assert done.returncode == 2
-    assert done.stderr == "stillmap: view/x.log: cannot be written: Read-only file system\n"
-
-
-@pytest.mark.slow
 def test_full_mount_point_is_one_line(mounted, room):
     script = "mount -t tmpfs -o size=400k none out; "
     done = mounted(f"{script} $S map $IN -o out --quiet {shlex.join(QUICK)}", IN=room)

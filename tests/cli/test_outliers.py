@@ -106,16 +106,6 @@ def test_one_far_pose(map_it, room, poses, far):
     assert (out / "report.html").stat().st_size > 10_000
 
 
-def test_poses_all_over_the_country(map_it, room, poses):
-    rng = np.random.default_rng(0)
-    status, said, peak, out = map_it(
-        room, "--poses", poses(lambda xy: rng.uniform(-9e4, 9e4, xy.shape))
-    )
-    assert (status, said) == (0, [])
-    assert peak < MOST
-    assert np.prod(size_of_map(out)) < 2e8
-
-
 @pytest.mark.parametrize("leap", [1e4, 1e6])
 def test_odometry_that_leaps(map_it, changed, leap):
     def change(T):
@@ -171,13 +161,6 @@ def test_memory_that_runs_out_later(map_it, room, tmp_path):
     (line,) = said
     assert "not enough memory: it takes more than the 0.001 GB that may be used" in line
     assert os.listdir(tmp_path) == []
-
-
-@pytest.mark.parametrize("given", ["0", "-1", "nan", "inf"])
-def test_no_amount_of_memory(map_it, room, given):
-    status, said, _, _ = map_it(room, f"--memory={given}")
-    assert status == 2
-    assert said[-1].startswith("stillmap: --memory must be a positive number of GB")
 
 
 def test_what_was_computed_is_resumed(room, tmp_path, monkeypatch, capsys):

@@ -89,12 +89,3 @@ def test_main_job(boxed, room, tmp_path):
     assert sorted(os.listdir(tmp_path)) == ["out", "tmp"]
     assert not [one for one in os.listdir(tmp_path / "out") if one.startswith(".")]
     assert os.listdir(tmp_path / "tmp") == []
-
-
-def test_main_job_in_3d(boxed, stillmap, tmp_path_factory, tmp_path):
-    street = tmp_path_factory.mktemp("recording") / "street"
-    words = ("--lidar", 8, "--scans", 4, "--camera", "--quiet")
-    assert stillmap("simulate", "street", "-o", street, *words).returncode == 0
-    done = boxed("-m", "stillmap", "map", street, "-o", tmp_path / "out", *QUICK)
-    assert done.returncode == 0, done.stderr
-    assert list_files(tmp_path / "out") >= FILES | {"static.ply", "mesh.glb"}

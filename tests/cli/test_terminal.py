@@ -8,7 +8,6 @@ from maps import ENDLESS
 
 from stillmap.cli.console import (
     colorize,
-    is_terminal,
     show_progress,
     show_share,
     uses_color,
@@ -49,11 +48,6 @@ def test_uses_color(monkeypatch, environment, on_terminal, elsewhere):
     assert colorize("no", "error", Terminal()) == (f"{RED}no{PLAIN}" if on_terminal else "no")
 
 
-def test_closed_stream_is_no_terminal():
-    assert not is_terminal(None)
-    assert colorize("no", "error", None) == "no"
-
-
 @pytest.mark.parametrize(
     ("words", "prefix"), [(("info", "nowhere"), "stillmap:"), (("map",), "stillmap map:")]
 )
@@ -66,10 +60,6 @@ def test_errors_are_red_on_a_terminal(on_a_terminal, words, prefix):
     assert coloured_line.replace(RED, "").replace(PLAIN, "") == plain_line
 
 
-def test_errors_are_plain_without_terminal(stillmap):
-    assert "\x1b" not in stillmap("info", "nowhere").stderr
-
-
 def test_dumb_terminal_gets_lines(on_a_terminal, room, tmp_path):
     words = ("map", room, "--no-odometry", "--set", "em.max_iterations=1")
     _, written = on_a_terminal(*words, "-o", tmp_path / "a")
@@ -78,14 +68,6 @@ def test_dumb_terminal_gets_lines(on_a_terminal, room, tmp_path):
     assert "\x1b" not in written
     assert "stillmap: note: no odometry" in written
     assert "stillmap: matching scans, iteration 1" in written
-
-
-def test_warnings_are_yellow_on_a_terminal(on_a_terminal, room, tmp_path):
-    words = ("convert", room, "-o")
-    _, written = on_a_terminal(*words, tmp_path / "a.ply")
-    assert "stillmap: \x1b[33mwarning:\x1b[0m the cloud is placed by odometry" in written
-    _, written = on_a_terminal(*words, tmp_path / "b.ply", NO_COLOR="1")
-    assert "stillmap: warning: the cloud is placed by odometry" in written
 
 
 def test_log_messages_appear_above_the_bar(on_a_terminal, room, tmp_path):

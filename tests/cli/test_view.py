@@ -134,24 +134,6 @@ def test_port(start, mapped):
     assert ended(process)[0] == 0
 
 
-@pytest.mark.usefixtures("elsewhere")
-def test_taken_port_is_refused(call, mapped):
-    pytest.importorskip("viser")
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        one.listen()
-        done = call("view", mapped, "--no-beams", "--port", one.getsockname()[1])
-    assert (done.returncode, done.stdout) == (2, "")
-    assert "is taken" in done.stderr.splitlines()[-1]
-
-
-@pytest.mark.parametrize("port", [-1, 65_536])
-def test_invalid_port_is_refused(call, report, port):
-    done = call("view", report, "--port", port)
-    assert done.returncode == 2
-    assert "--port wants 0 to 65535" in done.stderr
-
-
 def test_missing_recording_shows_no_beams(start, mapped, room, tmp_path):
     pytest.importorskip("viser")
     out = shutil.copytree(mapped, tmp_path / "out")
@@ -187,20 +169,6 @@ def test_report_without_the_extra(call, report):
     first, second = done.stderr.splitlines()
     assert install_command("viewer") in first
     assert str(report / "report.html") in second
-
-
-def test_prints_path_of_report(call, report, monkeypatch):
-    monkeypatch.chdir(report.parent)
-    done = call("view", "a result", "--print")
-    assert (done.returncode, done.stdout, done.stderr) == (0, f"{report / 'report.html'}\n", "")
-
-
-@pytest.mark.skipif(sys.platform == "darwin", reason="there is always a screen")
-@pytest.mark.usefixtures("elsewhere")
-def test_path_of_report_without_screen(call, report):
-    done = call("view", report, "--report")
-    assert (done.returncode, done.stdout) == (0, "")
-    assert str(report / "report.html") in done.stderr
 
 
 def test_opens_report_in_browser(stillmap, report, browser):

@@ -39,15 +39,6 @@ def test_a_column_is_what_was_added(limit, tmp_path, rng):
     assert list(tmp_path.iterdir()) == []  # a file without a name leaves nothing behind
 
 
-def test_an_empty_column(limit, tmp_path):  # noqa: ARG001
-    assert ArrayBuilder(np.int32, (), tmp_path).finish().shape == (0,)
-
-
-def test_wrong_rows_are_refused():
-    with pytest.raises(ValueError, match=r"expected \(n, \*\(2,\)\)"):
-        ArrayBuilder(np.float32, (2,)).append(np.zeros((4, 3)))
-
-
 def test_new_arrays_keep_what_is_written(limit, tmp_path):  # noqa: ARG001
     values = arrays.empty((40, 2), np.float32, tmp_path)
     values[:] = np.arange(80).reshape(40, 2)
@@ -64,18 +55,6 @@ def test_a_full_disk_is_an_error(monkeypatch):
         monkeypatch.setattr(arrays, "open_unlinked", lambda _: file)
         with pytest.raises(OSError, match="No space left"):
             ArrayBuilder(np.float32).append(np.ones(3))
-
-
-def test_small_parts_and_structures(tmp_path, monkeypatch):
-    monkeypatch.setattr(arrays, "MAX_BYTES_IN_MEMORY", 40_000)
-    kind = np.dtype([("number", np.int32), ("pose", float, (2, 2))], align=True)
-    column = ArrayBuilder(kind, (), tmp_path)
-    rows = np.zeros(3000, kind)
-    rows["number"], rows["pose"] = np.arange(3000), np.arange(12_000.0).reshape(-1, 2, 2)
-    for at in range(3000):
-        column.append(rows[at : at + 1])
-    np.testing.assert_array_equal(column.view(), rows)
-    column.close()
 
 
 def test_a_temporary_folder_that_is_gone(tmp_path, caplog, limit):
@@ -147,14 +126,6 @@ def test_blocks_are_all_rows_once(limit, tmp_path):  # noqa: ARG001
     assert values[:, 0].tolist() == [0] * 4 + [4] * 4 + [8] * 2
 
 
-def test_copies_are_apart(limit, tmp_path):  # noqa: ARG001
-    values = np.arange(12.0).reshape(6, 2)
-    copy = arrays.copy(values, tmp_path)
-    copy[0] = 7.0
-    np.testing.assert_array_equal(copy[1:], values[1:])
-    assert values[0, 0] == 0.0
-
-
 @pytest.mark.parametrize("items", [0, 1, 7])
 def test_items_in_turn_are_the_same(items, monkeypatch):
     monkeypatch.setattr(arrays, "ITEMS_PER_RELEASE", 3)
@@ -164,16 +135,6 @@ def test_items_in_turn_are_the_same(items, monkeypatch):
     assert got == list(range(items))
     # at first for what was looked at before, and what is left at the end
     assert let_go_after == [*range(0, items, 3), items]
-
-
-@pytest.mark.parametrize(("rows", "together"), [(100.0, 5), (400.0, 2), (1e9, 1), (0.0, 5)])
-def test_of_large_items_fewer_are_held(rows, together, monkeypatch):
-    monkeypatch.setattr(arrays, "ITEMS_PER_RELEASE", 5)
-    monkeypatch.setattr(arrays, "BLOCK", 1000)
-    got, let_go_after = [], []
-    for item in arrays.release_periodically(range(11), lambda: let_go_after.append(len(got)), rows):
-        got.append(item)
-    assert let_go_after == [*range(0, 11, together), 11]
 
 
 @pytest.mark.parametrize("rows", [1, 3, 1000])

@@ -21,7 +21,6 @@ from stillmap.core.input_files import (
     read_bytes,
     read_text,
 )
-from stillmap.core.json import read_json
 
 LARGE = 1 << 20  # bytes, more than are read at once
 
@@ -85,11 +84,6 @@ def test_pipe_that_comes_meanwhile(file, monkeypatch):
         InputFile(file)
 
 
-def test_file_without_end_that_says_it_is_empty():
-    with InputFile("/proc/self/status") as opened:
-        assert opened.read() == b""
-
-
 @pytest.mark.parametrize("read", [InputFile.read, lambda file: file.read(LARGE), list])
 def test_file_that_becomes_shorter(file, read):
     with InputFile(file) as opened:
@@ -114,13 +108,6 @@ def test_limit_of_size(file):
         read_bytes(file, LARGE - 1024)
 
 
-@pytest.mark.parametrize("text", ["{", "NaN", "[1, Infinity]", "[" * 100_000, "9" * 5000, "\xff"])
-def test_what_is_no_json(tmp_path, text):
-    (tmp_path / "a").write_bytes(text.encode("latin1"))
-    with pytest.raises(InputError, match="is not JSON"):
-        read_json(tmp_path / "a", LARGE)
-
-
 @pytest.mark.parametrize("limit", [0, 1 << 30])
 @pytest.mark.parametrize("order", ["C", "F"])
 def test_arrays_are_copies(tmp_path, monkeypatch, limit, order):
@@ -133,12 +120,6 @@ def test_arrays_are_copies(tmp_path, monkeypatch, limit, order):
     np.testing.assert_array_equal(found, array)
     assert found.dtype == np.float32
     assert not found.flags.writeable
-
-
-@pytest.mark.parametrize("shape", [(0,), (0, 3), (3, 0)])
-def test_arrays_of_nothing(tmp_path, shape):
-    np.save(tmp_path / "a.npy", np.empty(shape))
-    assert open_npy(tmp_path / "a.npy").shape == shape
 
 
 def test_arrays_that_cannot_be(tmp_path):

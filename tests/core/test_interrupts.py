@@ -162,22 +162,6 @@ def test_clean_up(tmp_path, work):
     assert at_every_step(work, tmp_path, {}) == {"{}"}
 
 
-def test_folders_that_are_left_by_success(tmp_path):
-    def make_parents(path):
-        with arguments.make_parents(path / "a/b"):
-            pass
-
-    def make_folder(path):
-        with files.new_folder("new-", path.parent) as folder:
-            folder.rename(path)
-
-    (tmp_path / "parents").mkdir()
-    (tmp_path / "folder").mkdir()
-    made = {str({"out": ""}), str({"out": "", "out/a": ""})}
-    assert at_every_step(make_parents, tmp_path / "parents", {}) == {"{}", *made}
-    assert at_every_step(make_folder, tmp_path / "folder", {}) == {"{}", str({"out": ""})}
-
-
 @pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit])
 def test_foreign_handlers(tmp_path, monkeypatch, error):
     """As in notebooks: the exception comes in the middle of the removal."""
@@ -193,17 +177,3 @@ def test_foreign_handlers(tmp_path, monkeypatch, error):
     with pytest.raises(error), files.temporary_folder(tmp_path / "out"):
         pass
     assert list(tmp_path.iterdir()) == []
-
-
-def test_foreign_handler_between_renames(tmp_path, monkeypatch):
-    rename = os.rename
-
-    def interrupted(source, target):
-        rename(source, target)
-        raise KeyboardInterrupt
-
-    put(tmp_path, OLD)
-    monkeypatch.setattr("os.rename", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        write_folder(tmp_path / "out")
-    assert state(tmp_path) == OLD

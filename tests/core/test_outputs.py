@@ -4,7 +4,6 @@ import contextlib
 import errno
 import os
 import shutil
-import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,7 +14,6 @@ from stillmap.core.errors import InputError
 from stillmap.core.files import (
     atomic_file,
     atomic_folder,
-    hidden_path,
     require_new,
     require_new_file,
 )
@@ -126,52 +124,6 @@ def test_long_names(tmp_path, name):
     assert os.listdir(tmp_path) == [name]
 
 
-def test_names_that_are_too_long_have_one_line(tmp_path):
-    for check in (write, lambda path: atomic_file(path).__enter__()):
-        with pytest.raises((InputError, OSError), match="File name too long"):
-            check(tmp_path / ("n" * 256))
-
-
-def test_hidden_names_of_long_names_differ(tmp_path):
-    first, second = tmp_path / ("n" * 230 + "a"), tmp_path / ("n" * 230 + "b")
-    assert hidden_path(first, "resume") != hidden_path(second, "resume")
-    assert hidden_path(first, "resume") == hidden_path(first, "resume")
-    assert hidden_path(tmp_path / "out", "resume") == tmp_path / ".out.resume"
-
-
-def test_two_threads_write_one_file(tmp_path):
-    path, both = tmp_path / "file", threading.Barrier(2)
-    path.write_text("old")
-    failed = []
-
-    def put(letter: str) -> None:
-        try:
-            with atomic_file(path) as work:
-                both.wait(10)
-                work.write_text(letter * 100_000)
-                both.wait(10)
-        except Exception as error:
-            failed.append(error)
-
-    threads = [threading.Thread(target=put, args=(letter,)) for letter in "ab"]
-    for one in threads:
-        one.start()
-    for one in threads:
-        one.join()
-    assert failed == []
-    assert path.read_text() in ("a" * 100_000, "b" * 100_000)
-    assert os.listdir(tmp_path) == ["file"]
-
-
-def test_temporary_name_cannot_be_taken_before(tmp_path, monkeypatch):
-    monkeypatch.setattr("secrets.token_hex", lambda _: "0" * 16)
-    (tmp_path / "victim").write_text("mine")
-    (tmp_path / f".file.{'0' * 16}.part").symlink_to("victim")
-    with pytest.raises(InputError, match="File exists"):
-        write_file(tmp_path / "file", "new")
-    assert (tmp_path / "victim").read_text() == "mine"
-
-
 def test_folder_that_cannot_be_renamed(fixed, tmp_path):
     write(fixed)
     assert content(fixed) == NEW
@@ -181,20 +133,6 @@ def test_folder_that_cannot_be_renamed(fixed, tmp_path):
     write(fixed, OLD, overwrite=True)
     assert content(fixed) == OLD | {"lost+found/x": "of the disk"}
     assert os.listdir(tmp_path) == ["fixed"]
-
-
-def test_failure_before_the_exchange_leaves_the_earlier_folder(fixed):
-    write(fixed, OLD)
-    with pytest.raises(RuntimeError, match="stop"):
-        write(fixed, NEW, True, stop)
-    assert content(fixed) == OLD
-
-
-def test_other_things_on_a_mount_point_stay(fixed):
-    fill(fixed, {"mine": "mine"})
-    with pytest.raises(InputError, match="holds other things"):
-        write(fixed, overwrite=True)
-    assert content(fixed) == {"mine": "mine"}
 
 
 @pytest.mark.parametrize("step", range(9))

@@ -1,7 +1,5 @@
 """Ordered parallel map."""
 
-import threading
-
 import pytest
 import scipy.linalg  # noqa: F401  (its BLAS is loaded before threads are counted)
 from threadpoolctl import threadpool_info, threadpool_limits
@@ -13,18 +11,6 @@ from stillmap.core.parallel import limit_blas_threads, map_ordered, work_beside
 def test_outcomes_keep_the_order_of_the_items(threads):
     assert list(map_ordered(lambda i: i * i, range(100), threads)) == [i * i for i in range(100)]
     assert list(map_ordered(str, [], threads)) == []
-
-
-def test_work_goes_on_side_by_side():
-    both = threading.Barrier(2, timeout=30.0)  # one alone would never pass
-    assert len(list(map_ordered(lambda _: both.wait(), range(4), 2))) == 4
-
-
-def test_work_is_done_during_the_block():
-    both = threading.Barrier(2, timeout=30.0)
-    with work_beside(lambda: both.wait() >= 0, 2) as done:
-        both.wait()
-        assert done()
 
 
 def test_one_thread_does_work_when_it_is_asked_for():

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from stillmap.core import tiles
-from stillmap.core.arrays import write_npz
 from stillmap.core.tiles import TILE, TiledArray
 
 SHAPE = (2 * TILE + 30, 3 * TILE + 7)
@@ -71,12 +70,6 @@ def test_functions_of_every_element(pair):
     assert tiles.as_type(tiled, np.float64).dtype == np.float64
 
 
-def test_written_as_plain_arrays_are(pair, tmp_path):
-    for name, layer in zip(("tiled", "plain"), pair, strict=True):
-        write_npz(tmp_path / name, {"p": layer})
-    assert (tmp_path / "tiled").read_bytes() == (tmp_path / "plain").read_bytes()
-
-
 def test_large_ones_lie_in_files(monkeypatch, tmp_path):
     monkeypatch.setattr(tiles, "MAX_DENSE_BYTES", 3 * 4 * TILE**2)
     tiled = TiledArray((9 * TILE, TILE), np.float32, 0.0, tmp_path)
@@ -95,9 +88,3 @@ def test_tiles_around_squares():
     found = tiles.tiles_around(lowest, 32, SHAPE)
     assert found == [(0, 0), (0, 1), (0, 3), (2, 0)]
     assert tiles.tiles_around(np.zeros((0, 2), np.int64), 32, SHAPE) == []
-
-
-def test_empty():
-    empty = TiledArray((0, 0), np.float32, np.nan)
-    assert np.asarray(empty).shape == (0, 0)
-    assert list(tiles.rows_of(np.asarray(empty))) == []

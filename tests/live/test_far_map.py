@@ -12,7 +12,7 @@ from stillmap.live.replay import iter_beams
 from stillmap.results.reader import read_grid
 from stillmap.sim import scene_by_name, simulate
 
-UTM = np.array([500_000.0, 5_300_000.0])
+UTM = np.array([477_123.4567, 5_312_345.678])
 SCANS = 60
 
 
@@ -23,7 +23,7 @@ def hall(tmp_path_factory):
     made = simulate(scene_by_name("hall", {"crowd": {"people": 0}, "robot": {"scans": 400}}), 2)
     for name, by in (("near", np.zeros(2)), ("far", UTM)):
         poses = made.truth.T_world_base.copy()
-        poses[:, :2, 2] += by
+        poses[:, :2, 2] += by - made.truth.T_world_base[0, :2, 2]
         stillmap.build(made.recording, {"threads": 1, "em.max_iterations": 1}, poses=poses).save(
             folder / name
         )

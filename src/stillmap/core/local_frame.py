@@ -17,10 +17,6 @@ Float = NDArray[np.float64]
 
 FAR = 1e4  # m, beyond which coordinates are shifted
 
-# m, of which the origin has multiples, along x, y and z: cells of most maps have edges that divide
-# them, so that the same robot elsewhere sees the same cells
-_STEP = np.array([1000.0, 1000.0, 100.0])
-
 
 @dataclass(frozen=True, eq=False)
 class LocalFrame(ShortRepr):
@@ -36,8 +32,8 @@ class LocalFrame(ShortRepr):
     def near(cls, poses: Float) -> "LocalFrame":
         """The map frame itself, unless poses (T, D+1, D+1) are far from its origin.
 
-        Then its origin is the first pose that is near most of the others, rounded: a receiver may
-        state zeros until it knows where it is.
+        Then its origin is the first pose that is near most of the others, so that the same robot
+        elsewhere sees the same cells: a receiver may state zeros until it knows where it is.
         """
         dimension = poses.shape[-1] - 1
         origin, positions = np.zeros(3), poses[:, :dimension, dimension]
@@ -47,8 +43,7 @@ class LocalFrame(ShortRepr):
             if np.abs(middle).max() > FAR:
                 apart = np.abs(positions - middle).max(axis=1)
                 first = np.argmax(apart <= max(FAR, float(np.median(apart))))
-                step = _STEP[:dimension]
-                origin[:dimension] = np.round(positions[first] / step) * step
+                origin[:dimension] = positions[first]
         return cls(origin)
 
     @property

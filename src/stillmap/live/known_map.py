@@ -30,6 +30,8 @@ from stillmap.results.reader import (
     read_grid,
     read_hit_sums,
 )
+from stillmap.results.run_json import LOCAL_ORIGIN, RECORD
+from stillmap.results.run_record import read_frame, read_record
 from stillmap.slam import scan_hits
 
 Float = NDArray[np.float64]
@@ -62,7 +64,7 @@ class KnownMap:
         else:
             self.grid = read_grid(Path(source))
             self.hits = read_hit_sums(Path(source), self.grid.p_occupied.shape)
-        self.frame = LocalFrame.near(se2.matrix(*self.grid.origin)[None])
+        self.frame = _find_frame(source, self.grid)
         corner = self.frame.corner_to_local(self.grid.origin)
         self.grid = dataclasses.replace(self.grid, origin=corner)
         if not self.grid.occupied.any():
@@ -207,3 +209,12 @@ def _free_runs(grid: Grid) -> tuple[Float, Float]:
     poses[:, :2, :2] = [[c, -s], [s, c]]
     poses[:, :2, 2] = begins
     return poses, np.asarray((last - first - 1) * grid.resolution, np.float64)
+
+
+def _find_frame(source: str | os.PathLike[str] | GridMap, grid: GridMap) -> LocalFrame:
+    """The frame in which a result was computed, with whose cells those of its map agree."""
+    if not isinstance(source, GridMap) and (Path(source) / RECORD).is_file():
+        noted = read_frame(Path(source), read_record(Path(source)), LOCAL_ORIGIN)
+        if noted.is_shifted:
+            return noted
+    return LocalFrame.near(se2.matrix(*grid.origin)[None])
