@@ -21,7 +21,7 @@ from stillmap.core import camera as camera_module
 from stillmap.core.camera import Camera
 from stillmap.io import rgbd
 from stillmap.io.images import read_image
-from stillmap.io.rgbd_folders import list_frames
+from stillmap.io.rgbd import list_frames
 from stillmap.prepare.options import ReadOptions
 
 Float = NDArray[np.float64]

@@ -51,7 +51,7 @@ def of_e57(path: Path) -> np.ndarray:
 
 
 def of_pcd(path: Path) -> np.ndarray:
-    return np.stack(pcd.read_values(pcd.read_header(path), list(FIELDS)), axis=1)
+    return np.stack(next(pcd.read_columns(pcd.read_header(path).layout, list(FIELDS))), axis=1)
 
 
 def of_xyz(path: Path) -> np.ndarray:

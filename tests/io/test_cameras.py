@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from stillmap.cli.recording_info import summarize_recording
 from stillmap.core.errors import InputError
 from stillmap.io import read, write
-from stillmap.io.camera_file import read_camera_file as read_file
+from stillmap.io.cameras import read_camera_file as read_file
 from stillmap.prepare.options import ReadOptions
 
 ROW = "1 0 0 0 0 1 0 0 0 0 1 0\n"
@@ -192,7 +192,7 @@ def test_a_recording_without_pictures_says_so(drive, file):
 
 def test_a_recording_in_2d_has_no_cameras(tmp_path, file):
     (tmp_path / "a.log").write_text("FLASER 2 1.0 2.0 0 0 0 0 0 0 1.5 host 0.5\n")
-    with pytest.raises(InputError, match=r"read\.cameras are for 3D recordings"):
+    with pytest.raises(InputError, match=r"read\.cameras is for 3D recordings"):
         read(tmp_path / "a.log", ReadOptions(cameras=str(file(f"[a]\n{LENS}"))))
 
 

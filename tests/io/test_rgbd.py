@@ -14,8 +14,7 @@ from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.io import read, rgbd
-from stillmap.io.rgbd import T_BASE_CAMERA
-from stillmap.io.rgbd_folders import SCENES, TUM, detect_layout
+from stillmap.io.rgbd import SCENES, T_BASE_CAMERA, TUM, detect_layout
 from stillmap.prepare.options import ReadOptions
 
 READ = """

@@ -1,7 +1,6 @@
 """Image files, read and written with Pillow."""
 
 import io
-import struct
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from stillmap.core.errors import InputError
-from stillmap.core.input_files import InputFile, read_bytes
+from stillmap.core.input_files import InputFile
 
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".pgm")
 # whatever the name: for EPS, Pillow starts Ghostscript
@@ -71,50 +70,6 @@ def write_png(image: NDArray[Any], path: Path, compress_level: int = 1) -> None:
     buffer = io.BytesIO()  # Pillow does not notice that a disk is full
     Image.fromarray(image).save(buffer, format="PNG", compress_level=compress_level)
     path.write_bytes(buffer.getbuffer())
-
-
-_MAX_FILE = 1 << 30  # bytes
-_PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
-_PNG_PIXELS = (b"IHDR", b"IDAT", b"IEND")  # chunks that follow from the pixels
-
-
-def is_png(path: Path) -> bool:
-    """True if a file begins as a PNG image."""
-    with InputFile(path) as file:
-        return file.read(len(_PNG_MAGIC)) == _PNG_MAGIC
-
-
-def rewrite_png(path: Path, image: NDArray[Any]) -> bytes:
-    """A PNG file of an image of integers with the other content (text, scale) of an existing one.
-
-    Raises:
-        InputError: the existing file is damaged.
-    """
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, format="PNG")
-    new = list(_iter_png_chunks(buffer.getvalue(), path))
-    old = list(_iter_png_chunks(read_bytes(path, _MAX_FILE), path))
-    first_pixels = next((k for k, (kind, _) in enumerate(old) if kind == b"IDAT"), len(old))
-    before, after = (
-        [data for kind, data in part if kind not in _PNG_PIXELS]
-        for part in (old[:first_pixels], old[first_pixels:])
-    )
-    head, *body, end = (data for kind, data in new if kind in _PNG_PIXELS)
-    return b"".join([_PNG_MAGIC, head, *before, *body, *after, end])
-
-
-def _iter_png_chunks(content: bytes, path: Path) -> Iterator[tuple[bytes, bytes]]:
-    """Name and bytes of each chunk of a PNG file."""
-    at, kind = len(_PNG_MAGIC), b""
-    while kind != b"IEND":
-        if at + 12 > len(content):
-            raise InputError("is a damaged PNG image", where=str(path))
-        size, kind = struct.unpack_from(">I4s", content, at)
-        chunk = content[at : at + 12 + size]
-        if len(chunk) < 12 + size:
-            raise InputError("is a damaged PNG image", where=str(path))
-        yield kind, chunk
-        at += len(chunk)
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.io import rgbd_folders, stillmap_folder
+from stillmap.io import rgbd, stillmap_folder
 from stillmap.io.builder import ReadContext
 from stillmap.io.carmen.log import SCAN_KINDS
 from stillmap.io.point_cloud import e57, kitti, las, pcd, ply, threedtk
@@ -79,7 +79,7 @@ def _is_kitti_folder(path: Path, start: bytes | None) -> bool:
 
 
 def _is_rgbd_folder(path: Path, start: bytes | None) -> bool:
-    return start is None and rgbd_folders.detect_layout(path) is not None
+    return start is None and rgbd.detect_layout(path) is not None
 
 
 def _load(module: str, function: str = "read") -> Any:
@@ -113,7 +113,7 @@ FORMATS = (
     ),
     Format("ROS bag", messages.ENDINGS, messages.is_bag, _load(_ROS), _load(_ROS, "read_parts")),
     Format("KITTI folder", ("velodyne/", "velodyne_points/"), _is_kitti_folder, kitti.read),
-    Format("RGB-D folder", ("frame-*.depth.png", "depth.txt"), _is_rgbd_folder, _load("rgbd")),
+    Format("RGB-D folder", ("frame-*.depth.png", "depth.txt"), _is_rgbd_folder, rgbd.read),
     _point_cloud_format("PCD", pcd.EXTENSIONS, pcd.read, pcd.is_pcd),
     _point_cloud_format("3DTK", threedtk.EXTENSIONS, threedtk.read),
     _point_cloud_format("E57", e57.EXTENSIONS, e57.read, e57.is_e57),

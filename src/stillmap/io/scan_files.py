@@ -32,22 +32,6 @@ def list_files(folder: Path, extensions: tuple[str, ...]) -> list[Path]:
     return sorted(entries, key=lambda entry: (_natural_key(entry.name), entry.name))
 
 
-def require_nonempty_file(path: Path) -> None:
-    """Refuse paths that are no regular file, and empty files.
-
-    Raises:
-        InputError: the path is neither readable nor a non-empty file.
-    """
-    try:
-        if not path.is_file():
-            what = "is no regular file" if path.exists() else "does not exist"
-            raise InputError(what, where=str(path))
-        if path.stat().st_size == 0:
-            raise InputError("is empty", where=str(path))
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
-
-
 def strip_extension(name: str, extensions: tuple[str, ...]) -> str:
     """The name without its extension."""
     for extension in extensions:

@@ -55,14 +55,7 @@ def write_atomically(path: Path) -> Iterator[IO[bytes] | gzip.GzipFile]:
     Equal texts give equal bytes.
     """
     compressed = path.name.lower().endswith(".gz")
-    with atomic_file(path) as work, open_new_text(work, compressed) as file:
-        yield file
-
-
-@contextmanager
-def open_new_text(path: Path, compressed: bool) -> Iterator[IO[bytes] | gzip.GzipFile]:
-    """A new file, gzip where `compressed`. Equal texts give equal bytes."""
-    with path.open("wb") as file:
+    with atomic_file(path) as work, work.open("wb") as file:
         if not compressed:
             yield file
             return

@@ -5,6 +5,7 @@ CONTRIBUTING.md.
 """
 
 import struct
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -136,11 +137,14 @@ def unpack_columns(layout: TableLayout) -> list[NDArray[np.uint8]]:
     return columns
 
 
-def _read_compressed(layout: TableLayout, names: list[str]) -> Columns:
-    """Values of columns that are stored one after the other in one LZF block."""
+def read_columns(layout: TableLayout, names: Sequence[str]) -> Iterator[Columns]:
+    """Yield values (k,) of the named columns, block by block; see `table.read_columns`."""
+    if not layout.compressed:
+        yield from table.read_columns(layout, names)
+        return
     fields = [layout.find_column(name)[0] for name in names]
     columns = unpack_columns(layout)
-    return [columns[layout.fields.index(field)].view(field.dtype)[:, 0] for field in fields]
+    yield [columns[layout.fields.index(field)].view(field.dtype)[:, 0] for field in fields]
 
 
 def read(path: Path, context: ReadContext) -> Recording:
@@ -181,11 +185,7 @@ def _read_cloud(path: Path, in_map_frame: bool, origin: Origin) -> Cloud:
             return points
         return points.astype(np.float64) @ T_sensor_map[:3, :3].T + T_sensor_map[:3, 3]
 
-    blocks = (
-        [_read_compressed(layout, names)]
-        if layout.compressed
-        else table.read_columns(layout, names)
-    )
+    blocks = read_columns(layout, names)
     points, times = table.gather_points(blocks, to_sensor)
     return Cloud(points, T, times[0] if times else None)
 
