@@ -71,7 +71,7 @@ def _scored(run: Run) -> Scores:
     return scores_of(stillmap.build(simulation.recording, options, poses=poses), simulation)
 
 
-def scores_of(result: stillmap.BuiltResult, simulation: Simulation) -> Scores:
+def scores_of(result: stillmap.Result, simulation: Simulation) -> Scores:
     """Scores of the map and the changes of one result."""
     truth, stays, beams = simulation.truth, stays_of(simulation), beams_of(simulation)
     T_world_map = align(result.poses, truth.T_world_base)

@@ -129,14 +129,14 @@ def built(
     recording: stillmap.Recording,
     chosen: stillmap.Options,
     poses: NDArray[np.float64] | None = None,
-) -> tuple[stillmap.BuiltResult, float]:
+) -> tuple[stillmap.Result, float]:
     """What a user gets, and the CPU time in ms per scan that it took."""
     started = time.process_time()
     result = stillmap.build(recording, chosen, poses=poses)
     return result, 1e3 * (time.process_time() - started) / recording.n_scans
 
 
-def result_scores(result: stillmap.BuiltResult, cpu_ms: float, run: Prepared) -> Scores:
+def result_scores(result: stillmap.Result, cpu_ms: float, run: Prepared) -> Scores:
     """Scores of what was kept, with what it cost and what the method itself says about it."""
     kept = result.iterations[result.best_iteration - 1]
     return {

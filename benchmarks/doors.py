@@ -89,7 +89,7 @@ def _scored(run: Run) -> Scores:
     return {**scores_of(result, simulation), "cost": 100.0 * seconds / (whole - seconds)}
 
 
-def scores_of(result: stillmap.BuiltResult, simulation: Simulation) -> Scores:
+def scores_of(result: stillmap.Result, simulation: Simulation) -> Scores:
     """Scores of the doors of one result."""
     doors = [one.door for one in result.changes if one.door is not None]
     leaves = simulation.scene.leaves
@@ -130,7 +130,7 @@ def _is_at_leaf(door: Door, simulation: Simulation, T_world_map: NDArray[np.floa
 
 
 def _count_ghosts(
-    result: stillmap.BuiltResult, simulation: Simulation, T_world_map: NDArray[np.float64]
+    result: stillmap.Result, simulation: Simulation, T_world_map: NDArray[np.float64]
 ) -> Scores:
     """Ghosts per 100 m2 of free space: all, and those that no door of the result explains."""
     grid, truth = grid_of(result.map), simulation.truth

@@ -103,7 +103,7 @@ def _mapped(recording: stillmap.Recording, run: Prepared, job: Job) -> Iterator[
     yield "hit ratio", _scores(stillmap.build(recording, counting), run)
 
 
-def _scores(result: stillmap.BuiltResult, run: Prepared) -> Scores:
+def _scores(result: stillmap.Result, run: Prepared) -> Scores:
     truth = run.simulation.truth
     T_world_map = align(result.poses, truth.T_world_base)
     grid = grid_of(result.map)

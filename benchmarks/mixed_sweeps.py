@@ -109,7 +109,7 @@ def drifted(poses: Float, drift: float, rng: np.random.Generator) -> Float:
     return se3.normalize(out)
 
 
-def scores_of(result: stillmap.BuiltResult, simulation: Simulation) -> Scores:
+def scores_of(result: stillmap.Result, simulation: Simulation) -> Scores:
     """Labels against the truth, poses against the true ones, the map against that of the truth.
 
     Walls are the occupied cells of the map that true poses and true labels give.
@@ -128,7 +128,7 @@ def scores_of(result: stillmap.BuiltResult, simulation: Simulation) -> Scores:
     }
 
 
-def _map_of_truth(result: stillmap.BuiltResult, simulation: Simulation) -> stillmap.em.OccupancyMap:
+def _map_of_truth(result: stillmap.Result, simulation: Simulation) -> stillmap.em.OccupancyMap:
     """The map, with the options of a result, of true poses and labels."""
     truth, estimate, options = simulation.truth, result.estimate, result.options
     m_step = dataclasses.replace(estimate.m_step, poses=truth.T_world_base)

@@ -66,7 +66,7 @@ def _row_of_sweeps(seed: int) -> dict[str, Any]:
     return _row(drawn, result, scored)
 
 
-def _row(drawn: object, result: stillmap.BuiltResult, scored: Mapping[str, Any]) -> dict[str, Any]:
+def _row(drawn: object, result: stillmap.Result, scored: Mapping[str, Any]) -> dict[str, Any]:
     """What was drawn, the quality, its share of the CPU time, and the scores."""
     quality = result.quality
     seconds = [float(stage.get("cpu_seconds") or 0) for stage in result.stages.values()]

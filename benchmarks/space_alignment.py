@@ -32,17 +32,15 @@ from numpy.typing import NDArray
 from session_sets import STRETCHES, prepare_street
 from tables import markdown
 
+import stillmap
 from stillmap.core import se2
 from stillmap.eval.trajectory import align
 from stillmap.io.trajectory import read_tum
-from stillmap.places.grow import add_session, start_place
-from stillmap.places.inputs import load_mapped
-from stillmap.places.lifting import lift_alignment
-from stillmap.places.place import Place
-from stillmap.places.place_graph import fit_alignment
+from stillmap.places.grow import add_session, lift_alignment, start_place
+from stillmap.places.inputs import to_session
+from stillmap.places.keyframes import Session
+from stillmap.places.place import Place, fit_alignment
 from stillmap.places.placement import find_placement
-from stillmap.places.prepare import make_session
-from stillmap.places.session import Session
 
 Float = NDArray[np.float64]
 
@@ -120,7 +118,8 @@ def load_session(data: Path, path: Path) -> Mapped:
     if not (result / "run.json").exists():
         program = [*merging.default_program(), "map", str(path), "-o", str(result)]
         subprocess.run([*program, "--quiet", "--threads", "1"], check=True)
-    session = make_session(load_mapped(name, result, 1)[0])
+    loaded = stillmap.load(result)
+    session = to_session(name, loaded, loaded.deskewed, 1)
     if not cloud.exists():
         cloud.parent.mkdir(parents=True, exist_ok=True)
         np.save(cloud, static_points(session))

@@ -19,20 +19,16 @@ if TYPE_CHECKING:
     from stillmap.pipeline.em_loop import iterate
     from stillmap.pipeline.estimate import Iteration
     from stillmap.pipeline.inputs import read
-    from stillmap.pipeline.models import build_models
     from stillmap.pipeline.options import Options
-    from stillmap.places.build import merge
-    from stillmap.places.records import PlaceSession, SessionChange
-    from stillmap.places.saved_place import SavedPlace, load
+    from stillmap.places.merge import merge
     from stillmap.prepare.options import ReadOptions
-    from stillmap.results.build import build
-    from stillmap.results.result import BuiltResult, Result
-    from stillmap.results.saved import SavedResult
+    from stillmap.results.models import build_models
+    from stillmap.results.result import Result, build, load
+    from stillmap.results.timeline import PlaceSession, SessionChange
 
     __version__: str
 
 __all__ = [
-    "BuiltResult",
     "InputError",
     "Iteration",
     "LiveMapper",
@@ -43,8 +39,6 @@ __all__ = [
     "ReadOptions",
     "Recording",
     "Result",
-    "SavedPlace",
-    "SavedResult",
     "Scan",
     "SessionChange",
     "Update",
@@ -59,27 +53,24 @@ __all__ = [
 
 # loaded when they are first used: `stillmap --help` has no use for them, and they take long
 _MODULES = {
-    "BuiltResult": "results.result",
     "InputError": "core.errors",
     "Iteration": "pipeline.estimate",
     "LiveMapper": "live.mapper",
     "MissingExtra": "core.errors",
     "Models": "mesh.build",
     "Options": "pipeline.options",
-    "PlaceSession": "places.records",
+    "PlaceSession": "results.timeline",
     "ReadOptions": "prepare.options",
     "Recording": "core.recording",
     "Result": "results.result",
-    "SavedPlace": "places.saved_place",
-    "SavedResult": "results.saved",
     "Scan": "live.scan",
-    "SessionChange": "places.records",
+    "SessionChange": "results.timeline",
     "Update": "live.update",
-    "build": "results.build",
-    "build_models": "pipeline.models",
+    "build": "results.result",
+    "build_models": "results.models",
     "iterate": "pipeline.em_loop",
-    "load": "places.saved_place",
-    "merge": "places.build",
+    "load": "results.result",
+    "merge": "places.merge",
     "read": "pipeline.inputs",
 }
 _ROOMS = (

@@ -10,7 +10,7 @@ from stillmap.cli.main import main
 from stillmap.core import se2
 from stillmap.io import stillmap_folder
 from stillmap.io.trajectory import write_tum
-from stillmap.results.map_npz import write_map_npz
+from stillmap.results.map_server import write_map_npz
 from stillmap.results.reader import Grid
 from stillmap.sim import (
     CrowdOptions,

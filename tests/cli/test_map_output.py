@@ -10,7 +10,7 @@ import pytest
 from maps import ENDLESS, FILES, QUICK, list_files
 from refusals import refused
 
-import stillmap.results.save
+import stillmap.results.writer
 
 
 def test_non_empty_folder_is_refused(call, room, tmp_path):
@@ -66,7 +66,7 @@ def test_failure_at_the_end_keeps_what_was_computed(call, room, tmp_path, monkey
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with monkeypatch.context() as patch:
-        patch.setattr(f"stillmap.results.save.{step}", fail)
+        patch.setattr(f"stillmap.results.writer.{step}", fail)
         done = call("map", room, "-o", out, *words)
     refused(
         done, f"{out}: cannot be written: No space left on device (continue after iteration 1: "
@@ -85,7 +85,7 @@ def test_defect_at_the_end_keeps_what_was_computed(call, room, tmp_path, monkeyp
     def fail(*_, **__):
         raise RuntimeError("a defect")
 
-    monkeypatch.setattr("stillmap.results.save.render_report", fail)
+    monkeypatch.setattr("stillmap.results.writer.render_report", fail)
     done = call("map", room, "-o", tmp_path / "out", "--quiet", *QUICK)
     assert done.returncode == 1
     assert "stillmap: continue after iteration 1: stillmap map" in done.stderr
@@ -95,14 +95,14 @@ def test_defect_at_the_end_keeps_what_was_computed(call, room, tmp_path, monkeyp
 
 def test_folder_that_appears_meanwhile(call, room, tmp_path, monkeypatch):
     """Neither that nor what was computed is lost."""
-    out, save = tmp_path / "out", stillmap.results.save.render_report
+    out, save = tmp_path / "out", stillmap.results.writer.render_report
 
     def render(*words):
         out.mkdir()
         (out / "mine").write_text("mine")
         return save(*words)
 
-    monkeypatch.setattr("stillmap.results.save.render_report", render)
+    monkeypatch.setattr("stillmap.results.writer.render_report", render)
     done = call("map", room, "-o", out, "--quiet", *QUICK)
     refused(done, "already holds something", "what was made is kept in ")
     kept = done.stderr.partition("what was made is kept in ")[2].partition(";")[0]

@@ -169,7 +169,7 @@ def test_what_was_computed_is_resumed(room, tmp_path, monkeypatch, capsys):
 
     words = ["map", str(room), "-o", str(tmp_path / "out"), "--quiet", *QUICK]
     with monkeypatch.context() as patched:
-        patched.setattr("stillmap.results.save.write_labels", fail)
+        patched.setattr("stillmap.results.writer.write_labels", fail)
         assert main(words) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "not enough memory" in line

@@ -16,9 +16,9 @@ from PIL import Image
 from small_place import RECORD, make_place
 
 from stillmap.cli.main import main
-from stillmap.places.report.page import render_place_report
 from stillmap.results.map_server import write_map_server
 from stillmap.results.reader import read_grid
+from stillmap.results.report.place import render_place_report
 from stillmap.sim import scene_by_name, simulate, write_simulation
 
 pytestmark = pytest.mark.slow

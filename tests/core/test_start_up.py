@@ -26,7 +26,7 @@ def loaded(code, *arguments):
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
 
-@pytest.mark.parametrize("module", ["cli.map_run", "results.save", "io", "tracking"])
+@pytest.mark.parametrize("module", ["cli.map_run", "results.writer", "io", "tracking"])
 def test_heavy_modules_are_loaded_on_demand(module):
     assert loaded(f"import stillmap.{module}") == "[]"
 

@@ -26,8 +26,7 @@ from stillmap.pipeline.options import Options
 from stillmap.prepare.options import ReadOptions
 from stillmap.results import reader as result_reader
 from stillmap.results.folder import open_result
-from stillmap.results.labels import read_labels
-from stillmap.results.reader import read_tracks
+from stillmap.results.reader import read_labels, read_tracks
 from stillmap.sim import load_truth
 
 Run = Callable[[bytes, Path], None]

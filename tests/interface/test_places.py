@@ -20,7 +20,7 @@ def merged(flat_days):
 
 
 def test_what_a_place_has(merged, flat_days):
-    assert isinstance(merged, stillmap.SavedPlace)
+    assert isinstance(merged, stillmap.Result)
     assert isinstance(merged, stillmap.Result)
     first, second = merged.sessions
     assert (first.name, first.input, first.accepted) == ("map1", str(flat_days / "map1"), True)
@@ -63,7 +63,7 @@ def test_saved_and_loaded(merged, flat_place, tmp_path):
     merged.save(tmp_path / "place")
     assert files_of(tmp_path / "place") == files_of(flat_place)  # merged with the same options
     loaded = stillmap.load(tmp_path / "place")
-    assert isinstance(loaded, stillmap.SavedPlace)
+    assert isinstance(loaded, stillmap.Result)
     assert loaded.changes == merged.changes
     np.testing.assert_array_equal(loaded.poses, merged.poses)
     with pytest.raises(stillmap.InputError, match="overwrite=True"):

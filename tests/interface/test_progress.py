@@ -61,7 +61,7 @@ def test_ctrl_c_while_saving_leaves_no_half_result(built, tmp_path, monkeypatch,
     def press(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("stillmap.results.save.write_run_json", press)
+    monkeypatch.setattr("stillmap.results.writer.write_map_npz", press)
     with pytest.raises(KeyboardInterrupt):
         built.save(out, overwrite=earlier)
     assert sorted(tmp_path.iterdir()) == ([out] if earlier else [])
@@ -85,4 +85,4 @@ def test_a_notebook(folder, tmp_path):
     first, second = (cell["outputs"] for cell in book["cells"])
     assert {one["name"] for one in first} <= {"stderr"}  # lines of progress
     assert "data:image/png;base64" in second[0]["data"]["text/html"]
-    assert second[0]["data"]["text/plain"].startswith("<BuiltResult: 60 scans")
+    assert second[0]["data"]["text/plain"].startswith("<Result: 60 scans")

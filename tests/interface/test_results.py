@@ -135,7 +135,7 @@ def test_every_repr_is_short(built, saved):
     assert {name for name in long if not name.endswith("Options")} == set()
     assert repr(built.recording) == "<Recording: 60 scans with 10800 beams in 2D, 11.8 s, odometry>"
     assert re.fullmatch(
-        r"<BuiltResult: 60 scans with 10800 beams, \d+ moving objects?, \d+ warnings?, "
+        r"<Result: 60 scans with 10800 beams, \d+ moving objects?, \d+ warnings?, "
         r"<OccupancyMap: \d+ x \d+ cells of 0.1 m, [\d.]+ m x [\d.]+ m>>",
         repr(built),
     )

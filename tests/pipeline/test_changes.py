@@ -10,7 +10,7 @@ from stillmap import em
 from stillmap.core.config import override
 from stillmap.mapping.changed_objects import cell_keys, find_shown_cells, pool_states
 from stillmap.pipeline.options import Options
-from stillmap.results.map_npz import CHANGED, changed_cells
+from stillmap.results.map_server import CHANGED, changed_cells
 from stillmap.sim import (
     CrowdOptions,
     Door,

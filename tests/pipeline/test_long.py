@@ -9,7 +9,7 @@ import pytest
 import stillmap
 from stillmap.core import arrays, chunks, tiles
 from stillmap.core.config import override
-from stillmap.results.save import save
+from stillmap.results.writer import save
 
 ESTIMATORS = ("stillmap", "paper", "hit-ratio", "tracker")
 

@@ -14,7 +14,7 @@ from stillmap.eval.trajectory import compute_absolute_errors
 from stillmap.pipeline import pose_sources
 from stillmap.pipeline.estimate import EmState
 from stillmap.pipeline.options import DEFAULTS, resolve_options
-from stillmap.results.save import save
+from stillmap.results.writer import save
 
 
 @pytest.fixture

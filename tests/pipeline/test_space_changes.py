@@ -10,7 +10,7 @@ import stillmap
 from stillmap.core.config import override
 from stillmap.pipeline.options import Options
 from stillmap.pipeline.result import map_recording
-from stillmap.results.save import save
+from stillmap.results.writer import save
 from stillmap.sim import CrowdOptions, LidarOptions, RobotOptions, Scene, simulate
 from stillmap.sim.scene import Stay, Thing
 from stillmap.sim.walls import box

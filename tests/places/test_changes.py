@@ -3,10 +3,9 @@
 import numpy as np
 
 from stillmap.places import changes
-from stillmap.places.beam_cells import BeamCells
-from stillmap.places.place_states import PlaceStates
-from stillmap.places.session_hmm import CellStates
-from stillmap.places.shown_state import ShownState, label_session
+from stillmap.places.evidence import BeamCells
+from stillmap.places.place_map import ShownState, label_session
+from stillmap.places.place_states import CellStates, PlaceStates
 
 S = 6
 

@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 
 from stillmap.core import se2
-from stillmap.places.alignment import propose_alignments
-from stillmap.places.map_refinement import MapRefiner
-from stillmap.places.map_search import search_alignments
+from stillmap.places.alignment import MapRefiner, propose_alignments, search_alignments
 from stillmap.places.surface_map import SurfaceMap, compare_maps, find_sides
 
 EDGE = 0.1

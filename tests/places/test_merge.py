@@ -11,9 +11,8 @@ from stillmap.cli.main import main
 from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.io.trajectory import read_tum
-from stillmap.places.reader import read_place
-from stillmap.results.labels import read_labels
-from stillmap.results.reader import read_grid
+from stillmap.places.store import read_place
+from stillmap.results.reader import read_grid, read_labels
 
 # what a result of one recording has, and what a place adds
 FILES = {

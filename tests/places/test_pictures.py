@@ -11,9 +11,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from small_place import BOX, CELL, CHAIR, DOOR, OPEN, ORIGIN, SIZE, make_place
 
-from stillmap.places.pictures import KIND_COLORS, PlacePictures
-from stillmap.places.timeline_reader import read_timeline
 from stillmap.results.reader import read_grid
+from stillmap.results.report.place import KIND_COLORS, PlacePictures
+from stillmap.results.timeline import read_timeline
 
 WHITE, BLACK = (255, 255, 255), (0, 0, 0)
 CAME, LEFT = KIND_COLORS["appeared"], KIND_COLORS["gone"]

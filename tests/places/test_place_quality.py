@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from stillmap.places.keyframes import select_keyframes
-from stillmap.places.quality import rate_place
+from stillmap.pipeline.quality import rate_geometry
+from stillmap.places.keyframes import join_keyframes, select_keyframes
 from stillmap.sim import scene_by_name, simulate
 
 SCANS = 200
@@ -19,19 +19,15 @@ def rate():
     nodes = np.arange(0, SCANS, 10)
     p_static = run.truth.static.astype(np.float32)
     keyframes = select_keyframes(run.recording, run.truth.T_world_base, p_static, nodes)
-    session = SimpleNamespace(keyframes=keyframes)
     p_occupied = np.zeros((200, 200), np.float32)
     p_occupied[:, 0] = 1.0
 
     def rate(apart=0.0, p_occupied=p_occupied):
         moved = keyframes.poses.copy()
         moved[:, :2, 2] += apart
-        sessions = [
-            SimpleNamespace(session=session, keyframe_poses=poses)
-            for poses in (keyframes.poses, moved)
-        ]
+        joined = join_keyframes([keyframes, keyframes]).recording
         occupancy = SimpleNamespace(p_occupied=p_occupied, resolution=0.05)
-        return rate_place(SimpleNamespace(sessions=sessions), occupancy)
+        return rate_geometry(joined, np.concatenate([keyframes.poses, moved]), occupancy)
 
     return rate
 

@@ -19,11 +19,10 @@ from report_page import Page
 from small_place import RECORD, make_place
 
 from stillmap.cli.main import main
-from stillmap.places.report.marks import place_marks
-from stillmap.places.report.page import render_place_report
-from stillmap.places.timeline_reader import read_timeline
 from stillmap.results.reader import read_grid
 from stillmap.results.report.figures import MapView
+from stillmap.results.report.place import place_marks, render_place_report
+from stillmap.results.timeline import read_timeline
 from stillmap.sim import (
     CrowdOptions,
     LaserOptions,
@@ -262,7 +261,7 @@ def test_merge_writes_the_report(merged):
 
 
 def test_map_as_of_the_last_session_is_the_map(merged):
-    from stillmap.places.pictures import PlacePictures
+    from stillmap.results.report.place import PlacePictures
 
     timeline = read_timeline(merged)
     pictures = PlacePictures(read_grid(merged), timeline)

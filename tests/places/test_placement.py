@@ -10,7 +10,7 @@ from stillmap.core import se2
 from stillmap.core.recording import Recording
 from stillmap.places.evidence import measure_evidence
 from stillmap.places.grow import add_session, start_place
-from stillmap.places.prepare import MappedRecording, make_session
+from stillmap.places.inputs import make_session
 from stillmap.places.surface_map import compare_maps, is_determined, make_surface_map
 
 # corners of rooms, in order; metres
@@ -59,8 +59,7 @@ def session(name, corners, way, n=40):
     recording = scan(corners, world)
     poses = se2.inverse(world[0]) @ world
     p_static = np.where(recording.hit, np.float32(1.0), np.float32(np.nan))
-    mapped = MappedRecording(name, recording, poses, p_static, None, (0.2, 1.8))
-    return make_session(mapped), world[0]
+    return make_session(name, recording, poses, p_static, None, (0.2, 1.8)), world[0]
 
 
 def grow(first, second):
@@ -102,7 +101,7 @@ def test_a_session_without_a_return_is_refused(empty_first):
     nothing = np.full_like(seen.points, np.nan)
     blind = replace(seen, points=nothing, hit=np.zeros_like(seen.hit))
     unknown = np.full(len(nothing), np.nan, np.float32)
-    empty = make_session(MappedRecording("empty", blind, poses, unknown, None, (0.2, 1.8)))
+    empty = make_session("empty", blind, poses, unknown, None, (0.2, 1.8))
     growth = grow(*((empty, full) if empty_first else (full, empty)))
     assert growth.refused == "no part of it looks like the place"
 

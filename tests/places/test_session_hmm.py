@@ -5,10 +5,10 @@ import itertools
 import numpy as np
 import pytest
 
-from stillmap.places import session_hmm
-from stillmap.places.session_hmm import estimate_states, fit_weights, weigh_evidence
+from stillmap.places import place_states
+from stillmap.places.place_states import estimate_states, fit_weights, weigh_evidence
 
-SWITCH = session_hmm._SWITCH
+SWITCH = place_states._SWITCH
 
 
 def brute_force(evidence, weights):

@@ -12,8 +12,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 from small_place import CELL, CHAIR, NAMES, SIZE, box_of, make_changes, make_place, write_states
 
 from stillmap.core.errors import InputError
-from stillmap.places.timeline import format_date, format_date_time
-from stillmap.places.timeline_reader import read_timeline
+from stillmap.results.timeline import format_date, format_date_time, read_timeline
 
 
 @pytest.fixture

@@ -55,7 +55,7 @@ def room(person=False):
 
 def turning(n):
     """(n, 4, 4) T_camera_map of a camera that turns in the middle, 1.4 m high."""
-    from stillmap.results.report.renderer import look_at
+    from stillmap.results.report.point_view import look_at
 
     eye = np.array([0.0, 0.0, 1.4])
     angles = 2 * np.pi * np.arange(n) / n

@@ -13,7 +13,7 @@ from PIL import Image
 
 from stillmap.mapping import Change, Door
 from stillmap.mapping.doors import DoorState
-from stillmap.results.map_npz import changed_cells, write_map_npz
+from stillmap.results.map_server import changed_cells, write_map_npz
 from stillmap.results.report import maps
 from stillmap.results.report.maps import changes_data, draw_filtered_map
 from stillmap.results.report.page import render_report

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from stillmap.results.labels import write_labels
+from stillmap.results.writer import write_labels
 
 
 def test_arrays_can_be_mapped_and_hold_the_labels(tmp_path, result):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stillmap.core.arrays import write_npz
-from stillmap.results.map_npz import write_map_npz
+from stillmap.results.map_server import write_map_npz
 
 
 def test_content(tmp_path, result):

@@ -12,8 +12,7 @@ from PIL import Image
 from stillmap.core.recording import Recording
 from stillmap.results.colors import ORANGE
 from stillmap.results.report.page import render_report
-from stillmap.results.report.point_view import draw_points_3d, find_ceiling, points_data
-from stillmap.results.report.renderer import look_at
+from stillmap.results.report.point_view import draw_points_3d, find_ceiling, look_at, points_data
 
 WHITE, RED = (255, 255, 255), (255, 0, 0)
 

@@ -14,7 +14,7 @@ from stillmap.pipeline.quality import Quality, describe_quality
 from stillmap.results.colors import ORANGE
 from stillmap.results.map_server import write_map_server
 from stillmap.results.report import formatting
-from stillmap.results.report.curves import curve_of, round_down
+from stillmap.results.report.estimation import curve_of, round_down
 from stillmap.results.report.figures import UNKNOWN, VEIL_ALPHA, VIOLET
 from stillmap.results.report.page import render_report
 from stillmap.slam.mount_calibration import Calibration, Parameter

@@ -16,7 +16,7 @@ from stillmap.results.report.figures import (
     draw_thinly_observed,
     map_window,
 )
-from stillmap.results.report.written_map import draw_written_map
+from stillmap.results.report.maps import draw_written_map
 
 
 def small_map(result, p):

@@ -8,7 +8,7 @@ from stillmap.core.errors import InputError
 from stillmap.io.trajectory import read_tum
 from stillmap.pipeline.options import OutputOptions
 from stillmap.results import save as save_module
-from stillmap.results.save import save
+from stillmap.results.writer import save
 from stillmap.tracking import ObjectOptions
 
 FILES = {

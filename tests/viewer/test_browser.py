@@ -10,10 +10,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stillmap.mesh.texture.atlas import TexturedMesh
-from stillmap.places.pictures import KIND_COLORS
-from stillmap.results.colors import TEAL
+from stillmap.results.colors import BACKGROUND, TEAL
 from stillmap.results.gltf import write_glb
-from stillmap.results.report.renderer import BACKGROUND
+from stillmap.results.report.place import KIND_COLORS
 from stillmap.viewer.scene import read_scene
 
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")

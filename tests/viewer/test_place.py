@@ -12,7 +12,7 @@ from small_place import CHAIR, DAY, NAMES, START, make_place
 
 from stillmap.cli.main import main
 from stillmap.core.errors import InputError
-from stillmap.places.pictures import KIND_COLORS
+from stillmap.results.report.place import KIND_COLORS
 from stillmap.viewer.scene import read_scene
 
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")

@@ -77,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
         InputError: it cannot be read, or FILE cannot hold it.
     """
     from stillmap.io.registry import detect_format
-    from stillmap.results.run_record import is_result
+    from stillmap.results.reader import is_result
 
     source = Path(args.input)
     if is_result(source):

@@ -59,9 +59,9 @@ def given_zone_flags(args: argparse.Namespace) -> dict[str, object]:
 
 def convert_result(args: argparse.Namespace, source: Path, output: Path) -> tuple[list[str], str]:
     """Write a result for other programs; return what was lost, and what was written."""
-    from stillmap.places.inputs import is_place
     from stillmap.results.export import obj, point_cloud_files
     from stillmap.results.folder import open_result
+    from stillmap.results.reader import is_place
 
     if flag_changes(args):
         text = "a result's recording is read as it was for the map: no flags for reading it"
@@ -97,10 +97,10 @@ def _convert_place(args: argparse.Namespace, place: Path, output: Path) -> tuple
     """
     from stillmap.results.export import point_cloud_files
     from stillmap.results.folder import ResultFolder
-    from stillmap.results.run_record import read_record
+    from stillmap.results.reader import read_run
 
     require_apart(output, place)
-    result = ResultFolder(place, read_record(place), Path(), False)
+    result = ResultFolder(place, read_run(place), Path(), False)
     if args.to == NAV2 or given_zone_flags(args):
         return _convert_to_nav2(args, result, output)
     form = point_cloud_files.format_for(output, args.to)
@@ -221,10 +221,9 @@ def _convert_to_cloud(
     args: argparse.Namespace, result: "ResultFolder", output: Path, form: "point_cloud_files.Format"
 ) -> str:
     from stillmap.core.files import require_new_file
-    from stillmap.places.inputs import is_place
     from stillmap.results import point_cloud
     from stillmap.results.export import point_cloud_files
-    from stillmap.results.run_json import TILTING
+    from stillmap.results.reader import TILTING, is_place
 
     require_new_file(output, args.overwrite)
     point_cloud_files.require_extras(form, output)
@@ -244,7 +243,7 @@ def _build_cloud(
     from stillmap.core.grid_map import limit_hits
     from stillmap.io.trajectory import poses_from_tum
     from stillmap.results import point_cloud
-    from stillmap.results.labels import read_colors
+    from stillmap.results.reader import read_colors
     from stillmap.slam import deskew_recording
 
     with show_share(args.quiet, "reading") as progress:

@@ -16,10 +16,14 @@ from stillmap.eval.map import MapScores, extract_wall_cells, extract_wall_cells_
 from stillmap.eval.readers import Truth, read_truth, require_same_beams
 from stillmap.eval.relations import RelationErrors, compute_relation_errors
 from stillmap.eval.trajectory import read_paired_poses
-from stillmap.places.inputs import is_place
-from stillmap.results.labels import read_labels
-from stillmap.results.reader import moved, read_grid, require_there
-from stillmap.results.run_record import read_region
+from stillmap.results.reader import (
+    is_place,
+    moved,
+    read_grid,
+    read_labels,
+    read_region,
+    require_there,
+)
 
 Scores = tuple[dict[str, Any], Iterable[str]]  # as JSON, as lines of text
 

@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         InputError: the result or its recording is not there, or the output is taken.
     """
-    from stillmap.places.inputs import is_place
+    from stillmap.results.reader import is_place
 
     if not 0.0 <= args.below <= 1.0:
         raise InputError(f"--below wants 0 to 1, got {args.below:g}")
@@ -100,14 +100,14 @@ def _filter_place(args: argparse.Namespace, place: Path, output: Path) -> None:
     """
     from stillmap.core.files import atomic_folder, require_new
     from stillmap.core.json import write_json
-    from stillmap.places.reader import read_sessions
+    from stillmap.results.timeline import read_sessions
 
     if args.input is not None:
         hint = f"one by one: stillmap filter {place}/sessions/NAME -o FILE --input FILE"
         raise InputError("has several recordings: --input names one", where=str(place), hint=hint)
     require_apart(output, place)
     require_new(output, _INDEX, args.overwrite)
-    names = [record["name"] for record in read_sessions(place) if record["accepted"]]
+    names = [one.name for one in read_sessions(place) if record["accepted"]]
     # what cannot be written is refused before any is read
     plans = [_plan_session(place, name, output, args.to) for name in names]
     with atomic_folder(output, _INDEX, args.overwrite) as folder:

@@ -77,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
     from stillmap.cli.map_run import build_all, print_summary, read_inputs, summarize
     from stillmap.core.profiling import StageTimer
     from stillmap.pipeline.checkpoint import lock_checkpoints
-    from stillmap.results.save import save
+    from stillmap.results.writer import save
 
     options = options_from_args(args)
     output, stages = Path(args.output), StageTimer()
@@ -101,7 +101,7 @@ def run(args: argparse.Namespace) -> int:
 def _require_usable_output(args: argparse.Namespace, output: Path) -> None:
     """Refuse an output that is taken, holds an input or cannot be written, before any work."""
     from stillmap.core.files import require_new, workplace
-    from stillmap.results.run_json import RECORD
+    from stillmap.results.reader import RECORD
 
     require_new(output, RECORD, args.overwrite or args.resume)
     for source in filter(None, (*args.input, args.tilting)):

@@ -28,7 +28,7 @@ from stillmap.pipeline.result import MappingResult, map_recording
 from stillmap.prepare.options import ReadOptions
 from stillmap.prepare.time_window import TimeWindow, select_time
 from stillmap.results.region import crop_result, require_overlap
-from stillmap.results.run_record import read_record
+from stillmap.results.reader import read_run
 
 if TYPE_CHECKING:
     from stillmap.mesh.build import Models
@@ -149,7 +149,7 @@ def _build_models(
     """Build the meshes of a 3D recording where they are wanted; return them and warnings."""
     if not _wants_models(result, tilting):
         return None, []
-    from stillmap.pipeline.models import build_models  # meshes take long to load
+    from stillmap.results.models import build_models  # meshes take long to load
 
     try:
         models = build_models(result, tilting=tilting, progress=progress, stages=stages)

@@ -20,7 +20,7 @@ from stillmap.core.errors import InputError
 if TYPE_CHECKING:
     from stillmap.pipeline.options import Options
     from stillmap.places.merge import MergeJob
-    from stillmap.places.writer import PlaceResult
+    from stillmap.places.finish import PlaceResult
 
 DESCRIPTION = (
     "Merge sessions of one place, hours or months apart and from any start, into one map. Each "
@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         InputError: an input or the output is at fault, or fewer than two sessions could be placed.
     """
-    from stillmap.places.inputs import is_place
+    from stillmap.results.reader import is_place
 
     options = options_from_args(args)
     base = Path(args.input[0]) if is_place(Path(args.input[0])) else None
@@ -93,14 +93,14 @@ def _merge(
     from stillmap.core.files import require_new
     from stillmap.places.inputs import list_sessions
     from stillmap.places.merge import MergeJob, merge_sessions
-    from stillmap.places.reader import read_sessions
-    from stillmap.results.run_json import RECORD
+    from stillmap.results.timeline import read_sessions
+    from stillmap.results.reader import RECORD
 
     output = Path(args.output)
     require_new(output, RECORD, args.overwrite)
     for path in [*([] if base is None else [base]), *(Path(p) for group in groups for p in group)]:
         require_apart(output, path)
-    taken = [] if base is None else [record["name"] for record in read_sessions(base)]
+    taken = [] if base is None else [one.name for one in read_sessions(base)]
     sessions = list_sessions(groups, taken)
     job = MergeJob(base, sessions, options, args.frame, args.map_state, not args.no_odometry)
     with (
@@ -130,7 +130,7 @@ def _print_summary(job: "MergeJob", result: "PlaceResult", output: Path) -> None
 
 
 def _summarize(result: "PlaceResult", output: Path) -> dict[str, Any]:
-    from stillmap.places.writer import session_records
+    from stillmap.places.finish import session_records
 
     return {
         "output": str(output),

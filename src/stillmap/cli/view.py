@@ -82,7 +82,7 @@ def _find_report(folder: Path) -> Path:
     Raises:
         InputError: there is none.
     """
-    from stillmap.places.inputs import is_place
+    from stillmap.results.reader import is_place
 
     hint = "DIR is what `stillmap map` or `merge` wrote"
     if not folder.exists():
@@ -123,7 +123,7 @@ def _serve(args: argparse.Namespace, folder: Path) -> None:
     Raises:
         InputError: a file of the result is damaged, or the recording that was named is another.
     """
-    from stillmap.places.inputs import is_place
+    from stillmap.results.reader import is_place
     from stillmap.viewer.scene import read_scene
     from stillmap.viewer.window import Window
 

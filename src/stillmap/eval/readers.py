@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays, se2
+from stillmap.core.array_folder import read_array
 from stillmap.core.errors import InputError
 from stillmap.core.input_files import read_text
 from stillmap.core.recording import Recording
@@ -19,7 +20,7 @@ from stillmap.io.registry import RIG_FOLDERS
 from stillmap.io.stillmap_folder import read as read_folder
 from stillmap.io.text_lines import read_head
 from stillmap.io.trajectory import MAX_BYTES, read_tum
-from stillmap.results.labels import Labels, read_array
+from stillmap.results.reader import Labels
 
 Bool = NDArray[np.bool_]
 
@@ -35,14 +36,14 @@ class Truth:
 
     def static(self) -> Bool:
         """(M,) True where a static object reflected the beam; meaningful for hits."""
-        return read_array(self.folder / "truth/static.npy", (self.recording.n_beams,), "b")
+        return read_array(self.folder / "truth/static.npy", (self.recording.n_beams,), np.bool_)
 
     def walls(self) -> Float:
         """(W, 4) segments x0, y0, x1, y1 in the world frame, W >= 1; of planar recordings."""
         if self.recording.dimension != 2:
             raise InputError("is not a planar recording", where=str(self.folder))
         path = self.folder / "truth/walls.npy"
-        walls = _finite(path, read_array(path, (None, 4), "f"))
+        walls = _finite(path, read_array(path, (None, 4), np.float64))
         if not len(walls):
             raise InputError("holds no walls", where=str(path))
         return walls
@@ -52,13 +53,13 @@ class Truth:
         path = self.folder / "truth/lasting.npy"
         if not path.exists():
             return np.empty((0, 4))
-        return _finite(path, read_array(path, (None, 4), "f"))
+        return _finite(path, read_array(path, (None, 4), np.float64))
 
     def poses(self) -> Float:
         """(T, D+1, D+1) T_world_base."""
         path = self.folder / "truth/T_world_base.npy"
         n = self.recording.dimension + 1
-        return _finite(path, read_array(path, (self.recording.n_scans, n, n), "f"))
+        return _finite(path, read_array(path, (self.recording.n_scans, n, n), np.float64))
 
     def static_hits(self) -> Float:
         """(N, D) end points in the world frame, at true poses, of the static beams that hit."""
@@ -66,7 +67,7 @@ class Truth:
         path = self.folder / "truth/T_base_sensor.npy"
         if path.exists():  # the recorder was wrong about its mount
             shape = recording.T_base_sensor.shape
-            T_base_sensor = _finite(path, read_array(path, shape, "f"))
+            T_base_sensor = _finite(path, read_array(path, shape, np.float64))
             recording = replace(recording, T_base_sensor=T_base_sensor)
         return recording.end_points(use, self.poses())
 

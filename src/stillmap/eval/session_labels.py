@@ -12,7 +12,7 @@ from stillmap.eval.session_cells import MIN_BEAMS
 from stillmap.eval.session_poses import PlacedSession
 from stillmap.eval.session_truth import SessionTruth
 from stillmap.eval.session_voxels import VoxelTruth
-from stillmap.results.labels import read_labels
+from stillmap.results.reader import read_labels
 
 Bool = NDArray[np.bool_]
 

@@ -30,7 +30,7 @@ from stillmap.fleet.jobs import PLACES, RESULTS, Outcome
 from stillmap.fleet.locations import explain, fetch, hash_content, is_local, open_location
 from stillmap.results.reader import read_grid
 from stillmap.results.report.figures import data_uri, draw_map, map_window
-from stillmap.results.run_record import read_record
+from stillmap.results.reader import read_run
 
 MADE = "made.json"  # of each result of a fleet
 STAGING = ".part-"  # begins the names of unfinished results

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from stillmap.core.arrays import write_npy
 from stillmap.core.short_repr import ShortRepr
-from stillmap.places.beam_cells import cell_keys
+from stillmap.places.evidence import cell_keys
 from stillmap.results.point_cloud import Block, cloud_from_folder
 from stillmap.results.points import append_vertices
 

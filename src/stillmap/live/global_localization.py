@@ -13,7 +13,7 @@ from stillmap.core import se2
 from stillmap.core.grid_map import GridMap
 from stillmap.core.short_repr import ShortRepr
 from stillmap.live.known_map import KnownMap, to_surface_map
-from stillmap.places.map_search import search_alignments
+from stillmap.places.alignment import search_alignments
 from stillmap.places.surface_map import CONFLICT_WEIGHT, SurfaceMap, compare_surfaces
 from stillmap.results.reader import OCCUPIED_THRESH
 from stillmap.slam import motion_model, scan_matching

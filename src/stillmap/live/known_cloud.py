@@ -20,7 +20,7 @@ from stillmap.live.cloud_extension import ROUTE, KeptCloud
 from stillmap.live.known_map import LOG_RATIO, KnownMap
 from stillmap.live.map_extension import KeptMap
 from stillmap.live.map_view import STANDS, is_level
-from stillmap.places.beam_cells import cell_keys
+from stillmap.places.evidence import cell_keys
 from stillmap.results.point_cloud import cloud_from_folder
 from stillmap.slam import lidar_odometry
 

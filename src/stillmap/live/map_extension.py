@@ -11,8 +11,7 @@ from stillmap.core.short_repr import ShortRepr
 from stillmap.em import OccupancyMap
 from stillmap.live.cloud_extension import KeptCloud, write_extended_cloud
 from stillmap.pipeline.options import MapMode
-from stillmap.results.map_npz import write_map_npz
-from stillmap.results.map_server import write_map_server
+from stillmap.results.map_server import write_map_npz, write_map_server
 
 Layer = NDArray[np.float32]
 

@@ -27,8 +27,7 @@ from stillmap.live.scan import Scan, ScanBeams, drop_cover, to_beams
 from stillmap.live.update import Update
 from stillmap.pipeline.options import Options, resolve_resolution
 from stillmap.prepare.plausibility import mapped_range, shorten_far_beams
-from stillmap.results.build import to_options
-from stillmap.results.result import BuiltResult
+from stillmap.results.result import Result, to_options
 from stillmap.tracking import MovingObject
 
 Float = NDArray[np.float64]
@@ -191,7 +190,8 @@ class LiveMapper:
     @property
     def objects(self) -> list[MovingObject]:
         """Moving objects, from the labels and poses of all scans so far."""
-        return self.snapshot().build().objects
+        mapping = self.snapshot().build().mapping
+        return [] if mapping is None else mapping.objects
 
     def save(
         self,
@@ -235,7 +235,7 @@ class LiveMapper:
         """
         self._pushed.history.move(folder)
 
-    def finish(self, progress: Progress = no_progress) -> BuiltResult:
+    def finish(self, progress: Progress = no_progress) -> Result:
         """The result of `stillmap.build` on all scans: poses, labels and map refined.
 
         Raises:

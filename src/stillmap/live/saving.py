@@ -22,10 +22,10 @@ from stillmap.live.history import FOLDER as RECORDING
 from stillmap.live.history import Answers, Placement
 from stillmap.live.map_extension import KeptMap, write_extended
 from stillmap.pipeline.options import Options
-from stillmap.pipeline.result import map_recording
-from stillmap.results.result import BuiltResult
-from stillmap.results.run_json import EXTENDS, RECORD
-from stillmap.results.save import save
+from stillmap.pipeline.result import MappingResult, map_recording
+from stillmap.results.reader import EXTENDS, RECORD
+from stillmap.results.result import Result
+from stillmap.results.writer import save
 
 FOLDER = "live"
 SUBMAPS = "live/submaps"  # of where the robot was lost, each in a folder with its number
@@ -66,14 +66,14 @@ class Snapshot(ShortRepr):
     folder: Path | None = None
     kept_map: KeptMap | None = None
 
-    def build(self, progress: Progress = no_progress) -> BuiltResult:
+    def build(self, progress: Progress = no_progress) -> Result:
         """Labels, map and objects of the scans that are in the map, at these poses."""
         main, _ = _find_submaps(self.placement)
-        return self._build(self.recording, main, progress)[0]
+        return Result.of(self._build(self.recording, main, progress)[0])
 
-    def refine(self, progress: Progress = no_progress) -> BuiltResult:
+    def refine(self, progress: Progress = no_progress) -> Result:
         """The result of `stillmap.build` on all scans: poses, too."""
-        return self._map(self.recording, None, progress)
+        return Result.of(self._map(self.recording, None, progress))
 
     def save(
         self,
@@ -146,7 +146,7 @@ class Snapshot(ShortRepr):
 
     def _build(
         self, recording: Recording, submap: int, progress: Progress
-    ) -> tuple[BuiltResult, Answers]:
+    ) -> tuple[MappingResult, Answers]:
         """The result of the scans of a submap, and the answers to them."""
         scans = np.flatnonzero(self.placement.submap == submap)
         taken, given = _take_scans(recording, self.answers, scans)
@@ -154,11 +154,10 @@ class Snapshot(ShortRepr):
 
     def _map(
         self, recording: Recording, poses: NDArray[np.float64] | None, progress: Progress
-    ) -> BuiltResult:
-        mapped = map_recording(
+    ) -> MappingResult:
+        return map_recording(
             recording, self.options, poses=poses, progress=progress, scratch=recording.scratch
         )
-        return BuiltResult(**vars(mapped))
 
     def _describe_lost(self, submaps: int, main: int) -> list[str]:
         """Warnings about scans whose pose in the map is unknown."""

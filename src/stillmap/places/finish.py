@@ -2,43 +2,98 @@
 
 import datetime
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from stillmap.core.arrays import iter_blocks
+from stillmap.core.array_folder import FORMAT_VERSION
+from stillmap.core.arrays import iter_blocks, write_npy, write_npz
 from stillmap.core.config import to_dict
 from stillmap.core.errors import InputError
 from stillmap.core.files import write_text
-from stillmap.core.json import package_version, write_json
+from stillmap.core.input_files import read_bytes
+from stillmap.core.json import write_json
+from stillmap.core.local_frame import LocalFrame
+from stillmap.core.short_repr import ShortRepr
+from stillmap.core.json import package_version
 from stillmap.em import OccupancyMap
+from stillmap.em.types import DYNAMIC_BELOW
+from stillmap.io.trajectory import MAX_BYTES, write_tum
 from stillmap.pipeline.options import Options
-from stillmap.places.changes import detect_place_changes
-from stillmap.places.checksums import write_checksums
-from stillmap.places.clouds import write_place_clouds
+from stillmap.pipeline.quality import rate_geometry
+from stillmap.places.changes import (
+    PlaceChange,
+    change_cells,
+    change_records,
+    detect_place_changes,
+)
 from stillmap.places.grow import estimate_planar
+from stillmap.places.keyframes import join_keyframes
 from stillmap.places.objects import write_objects
-from stillmap.places.place import Place, Refusal
-from stillmap.places.place_map import make_place_map
+from stillmap.places.place import Place, PlacedSession
+from stillmap.places.place_map import (
+    ShownState,
+    changed_cell_table,
+    label_session,
+    make_place_map,
+    show_state,
+)
 from stillmap.places.place_states import estimate_place
-from stillmap.places.quality import rate_place
-from stillmap.places.report.page import render_place_report
-from stillmap.places.shown_state import show_state
-from stillmap.places.writer import PlaceResult, write_place_files, write_sessions
-from stillmap.results.labels import read_array
-from stillmap.results.map_npz import write_map_npz
-from stillmap.results.map_server import write_map_server
-from stillmap.results.run_json import FORMAT_VERSION, LOCAL_ORIGIN, RECORD, quality_record
+from stillmap.places.store import (
+    TIES,
+    read_beam_cells,
+    write_joined_beams,
+    write_placement,
+    write_ties,
+)
+from stillmap.results.map_server import write_map_npz, write_map_server
+from stillmap.results.points import write_clouds
+from stillmap.results.pose_graph_g2o import write_g2o
+from stillmap.results.reader import LOCAL_ORIGIN, RECORD, SESSIONS, read_labels
+from stillmap.results.report.place import render_place_report
+from stillmap.results.run_json import quality_record
+from stillmap.results.timeline import CHANGES, STATES, PlaceSession
+from stillmap.slam import PoseGraph
+from stillmap.slam.pose_graph import Constraint
+
+Float = NDArray[np.float64]
 
 LAST, MAJORITY = "last", "majority"
 _STATES_HINT = "map_state=last, majority, the name of a session, or a date such as 2026-05-31"
 _DAY_NS = 86_400 * 10**9
 
 
+@dataclass(frozen=True, eq=False)
+class PlaceResult(ShortRepr):
+    """A merged place, ready to be written.
+
+    Attributes:
+        place: its sessions.
+        refusals: sessions that are not in it.
+        order: names of all inputs, accepted or not, as they were given.
+        changes: between sessions, in the order of time.
+        shown: state of the cells in D dimensions.
+        planar: state of the cells in the plane; in 2D the same.
+    """
+
+    place: Place
+    refusals: list[PlaceSession]
+    order: list[str]
+    changes: list[PlaceChange]
+    shown: ShownState
+    planar: ShownState
+
+    @property
+    def names_in_time(self) -> list[str]:
+        """Names of the sessions in the order of time."""
+        return [self.place.sessions[k].session.name for k in self.place.in_time()]
+
+
 def finish_place(
-    place: Place, refusals: list[Refusal], order: list[str], map_state: str
+    place: Place, refusals: list[PlaceSession], order: list[str], map_state: str
 ) -> PlaceResult:
     """States, changes and the shown state of a place.
 
@@ -114,18 +169,22 @@ def write_place(folder: Path, result: PlaceResult, options: Options, map_state: 
         options: of mapping, and of the map.
         map_state: see `MergeJob`.
     """
-    place = result.place
-    write_sessions(folder, result)
-    for one in place.sessions:
-        write_checksums(folder / "sessions" / one.session.name)
-    write_place_files(folder, result)
+    place, frame = result.place, result.place.local_frame
+    for time, k in enumerate(place.in_time()):
+        _write_session(folder, result, place.sessions[k], time)
+    _write_place_files(folder, result)
     write_objects(folder, place)
+    joined = join_keyframes([one.session.keyframes for one in place.sessions]).recording
+    poses = np.concatenate([one.keyframe_poses for one in place.sessions])
     if place.dimension == 3:
-        write_place_clouds(folder, result)
+        labels = np.concatenate([_label_keyframes(one, result.shown) for one in place.sessions])
+        write_clouds(folder, joined, frame.to_map(poses), labels)
     planar = [place.sessions[k].require_evidence()[1] for k in place.in_time()]
     occupancy = make_place_map(planar, result.planar)
     record = place_record(folder, result, options, map_state, occupancy)
-    occupancy = replace(occupancy, origin=place.local_frame.corner_to_map(occupancy.origin))
+    # labels are not rated: keyframes are too far apart for that
+    record["quality"] = quality_record(rate_geometry(joined, poses, occupancy))
+    occupancy = replace(occupancy, origin=frame.corner_to_map(occupancy.origin))
     write_map_server(folder, occupancy, options.output.map_mode)
     write_map_npz(folder / "map.npz", occupancy)
     page = render_place_report(folder, occupancy, options.output.map_mode, record)
@@ -159,7 +218,7 @@ def place_record(
         "counts": _count(folder),
         "area": {"known": round(known * place.resolution**2, 6)},
         "warnings": [f"{one.name} is not in the place: {one.why}" for one in result.refusals],
-        "quality": quality_record(rate_place(place, occupancy)),
+        "quality": {},
         "place": {
             "resolution": place.resolution,
             "voxel_size": place.voxel_size,
@@ -174,19 +233,120 @@ def place_record(
 
 def _count(folder: Path) -> dict[str, int]:
     """Scans, beams and hits of a place, and how many of the hits are dynamic."""
-    stamps = read_array(folder / "beams" / "stamp_ns.npy", (None,), "i")
-    hit = read_array(folder / "beams" / "hit.npy", (None,), "b")
-    p_static = read_array(folder / "beams" / "p_static.npy", (len(hit),), "f")
+    labels = read_labels(folder)
+    hit, p_static = labels.hit, labels.p_static
     hits = dynamic = unusable = 0
     for block in iter_blocks(hit, p_static):
         hits += int(np.count_nonzero(hit[block]))
-        dynamic += int(np.count_nonzero(hit[block] & (p_static[block] < 0.5)))
+        dynamic += int(np.count_nonzero(hit[block] & (p_static[block] < DYNAMIC_BELOW)))
         unusable += int(np.count_nonzero(np.isnan(p_static[block])))
     return {
-        "scans": len(stamps),
+        "scans": len(labels.stamp_ns),
         "beams": len(hit),
         "hits": hits,
         "max_range": len(hit) - hits - unusable,
         "unusable": unusable,
         "dynamic": dynamic,
+    }
+
+
+def _write_session(folder: Path, result: PlaceResult, one: PlacedSession, time: int) -> None:
+    """Write what differs from merge to merge into `sessions/NAME/`; `time` is its index there."""
+    place, home = result.place, folder / "sessions" / one.session.name
+    write_tum(home / "trajectory.tum", one.session.stamp_ns, place.local_frame.to_map(one.poses))
+    n_beams = int(np.load(home / "beams" / "offset.npy", mmap_mode="r")[-1])
+    beams = read_beam_cells(home, n_beams, place.voxel_size)
+    centres = beams.place_centres(one.session.node_poses, one.nodes)
+    write_npy(home / "beams" / "p_static.npy", label_session(result.shown, beams, centres, time))
+    write_placement(home, one)
+
+
+def _label_keyframes(one: PlacedSession, shown: ShownState) -> NDArray[np.float32]:
+    """(M,) P(static) of the beams of a session's keyframes, as the map shows the place."""
+    keyframes = one.session.keyframes
+    beams = np.flatnonzero(keyframes.recording.hit)
+    ends = keyframes.recording.end_points(beams, one.keyframe_poses)
+    # look_up gives 0 where nothing ever stood clearly: those beams keep their own label
+    p_gone = shown.place.look_up(ends, 1.0 - shown.p_shown)
+    labels = np.array(keyframes.e)
+    labels[beams] *= (1.0 - p_gone).astype(np.float32)
+    return labels
+
+
+def _write_place_files(folder: Path, result: PlaceResult) -> None:
+    """Write the files of the place as a whole, but the map, the report and `run.json`."""
+    place, frame, names = result.place, result.place.local_frame, result.names_in_time
+    homes = [folder / "sessions" / one.session.name for one in place.sessions]
+    poses = frame.to_map(np.concatenate([one.poses for one in place.sessions]))
+    with (folder / "trajectory.tum").open("wb") as file:
+        for home in homes:
+            file.write(read_bytes(home / "trajectory.tum", MAX_BYTES))
+    write_joined_beams(folder / "beams", homes)
+    write_g2o(folder / "graph.g2o", _join_graphs(place), poses)
+    write_json(folder / SESSIONS, session_records(result))
+    write_json(folder / CHANGES, change_records(result.changes, names, frame))
+    write_npz(folder / "changes.npz", change_cells(result.changes, result.shown.place, frame))
+    write_npz(folder / STATES, changed_cell_table(result.planar, names, frame))
+    write_ties(folder / TIES, place.ties, place.dimension)
+
+
+def _join_graphs(place: Place) -> PoseGraph:
+    """The pose graph of all sessions; scans are numbered through all of them."""
+    keyframes, constraints, first_scan = [], list[Constraint](), 0
+    first_node = np.cumsum([0, *(len(one.nodes) for one in place.sessions)])
+    for k, one in enumerate(place.sessions):
+        graph, base = one.session.graph, int(first_node[k])
+        keyframes.append(graph.keyframes + first_scan)
+        constraints += [
+            Constraint(base + c.first, base + c.second, c.T, c.covariance)
+            for c in graph.constraints
+        ]
+        first_scan += len(one.session.stamp_ns)
+    constraints += [
+        Constraint(
+            int(first_node[tie.first]) + tie.first_node,
+            int(first_node[tie.second]) + tie.second_node,
+            tie.T,
+            tie.covariance,
+        )
+        for tie in place.ties
+    ]
+    nodes = np.concatenate([one.nodes for one in place.sessions])
+    return PoseGraph(np.concatenate(keyframes), nodes, constraints)
+
+
+def session_records(result: PlaceResult) -> list[dict[str, Any]]:
+    """The entries of `sessions.json`, in the order in which the inputs were given."""
+    placed = {one.session.name: one for one in result.place.sessions}
+    refused = {one.name: one for one in result.refusals}
+    counts = [len(one.session.stamp_ns) for one in result.place.sessions]
+    first_scan = dict(zip(placed, np.cumsum([0, *counts]).tolist(), strict=False))
+    return [
+        _placed_record(placed[name], first_scan[name], result.place.local_frame)
+        if name in placed
+        else {
+            "name": name,
+            "input": refused[name].input,
+            "accepted": False,
+            "why": refused[name].why,
+        }
+        for name in result.order
+        if name in placed or name in refused
+    ]
+
+
+def _placed_record(one: PlacedSession, first_scan: int, frame: LocalFrame) -> dict[str, Any]:
+    """The entry of a session whose scans begin at `first_scan` of those of the place."""
+    stamp_ns = one.session.stamp_ns
+    return {
+        "name": one.session.name,
+        "input": one.session.input,
+        "accepted": True,
+        "T_place_session": one.between_maps(one.T, frame).tolist(),
+        "covariance": one.known_covariance.tolist(),
+        "overlap": round(one.overlap, 4),
+        "first_stamp_ns": int(stamp_ns[0]),
+        "last_stamp_ns": int(stamp_ns[-1]),
+        "first_scan": first_scan,
+        "scans": len(stamp_ns),
     }

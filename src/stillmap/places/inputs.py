@@ -1,37 +1,63 @@
-"""The inputs of a merge: recordings, result folders, or a place."""
+"""Sessions on their way into a place: each is mapped, and what the place keeps of it is written."""
 
 import dataclasses
 import os
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
+from stillmap import em
+from stillmap.core import se2
+from stillmap.core.array_folder import write_arrays
 from stillmap.core.errors import InputError
 from stillmap.core.json import write_json
 from stillmap.core.local_frame import LocalFrame
+from stillmap.core.parallel import resolve_threads
+from stillmap.core.profiling import Progress
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io.registry import detect_format
-from stillmap.places.prepare import MappedRecording
-from stillmap.places.session import Session
+from stillmap.mapping.projection import project_to_plane
+from stillmap.pipeline.options import Options
+from stillmap.places.evidence import find_beam_cells
+from stillmap.places.keyframes import Keyframes, Session, select_keyframes
+from stillmap.places.objects import copy_objects
+from stillmap.places.store import (
+    MAX_DISTANCE,
+    SESSION_ORIGIN,
+    STATE,
+    read_session,
+    write_session,
+)
 from stillmap.results.folder import open_result
 from stillmap.results.pose_graph_g2o import read_g2o
-from stillmap.results.reader import SESSIONS as SESSIONS  # of places, found there as well
-from stillmap.results.result import BuiltResult
-from stillmap.results.run_json import LOCAL_ORIGIN, RECORD, TILTING
-from stillmap.results.run_record import is_result, read_record
-from stillmap.results.saved import SavedResult, load
-from stillmap.slam import deskew_recording
+from stillmap.results.reader import (
+    LOCAL_ORIGIN,
+    RECORD,
+    TILTING,
+    RunRecord,
+    is_place,
+    is_result,
+    read_run,
+)
+from stillmap.results.result import Result, build, input_stem, load
+from stillmap.slam import PoseGraph, deskew_recording, local_map
+from stillmap.slam.local_map import KEYFRAME_ANGLE
+from stillmap.slam.pose_graph import Constraint
 
-TIES = "ties.npz"  # constraints between the sessions of a place
-# in the record of a session: of the frame that a place has it in, in the map frame of its result
-SESSION_ORIGIN = "session_origin"
-MAX_DISTANCE = 1e6  # m, of poses from the origin of their session: no place is larger
+Float = NDArray[np.float64]
+Given: TypeAlias = Sequence[str | os.PathLike[str]] | Recording | Result
 
-Given: TypeAlias = Sequence[str | os.PathLike[str]] | Recording | BuiltResult | SavedResult
+_VOXEL_SIZE = 0.15  # m, of the evidence of 3D sessions, unless the options say another
+_NODE_DISTANCE = {2: 1.0, 3: 2.0}  # m between the nodes of a session without a pose graph
+# of a step between them: m and rad, at least, and per root of a metre
+_STEP_STD, _MIN_STEP = (0.01, 0.002), 0.05
+_PLANAR_CELL = 0.1  # m, in which one planar hit per direction is kept
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,25 +74,17 @@ class SessionInput(ShortRepr):
     name: str
     parts: tuple[Path, ...] = ()
     is_result: bool = False
-    given: Recording | BuiltResult | SavedResult | None = None
+    given: Recording | Result | None = None
 
     @property
     def path(self) -> str | None:
         """Its path, of several parts the first; None: it has none."""
-        if isinstance(self.given, SavedResult):
-            return str(self.given.path)
+        if isinstance(self.given, Result):
+            return None if self.given.path is None else str(self.given.path)
         return str(self.parts[0]) if self.parts else None
 
 
-def is_place(path: Path) -> bool:
-    """True if a folder is a place, also one from which a file was taken."""
-    return (path / "sessions").is_dir() and any((path / one).is_file() for one in (SESSIONS, TIES))
-
-
-def list_sessions(
-    groups: Sequence[Given],
-    taken: Sequence[str] = (),
-) -> list[SessionInput]:
+def list_sessions(groups: Sequence[Given], taken: Sequence[str] = ()) -> list[SessionInput]:
     """The sessions of inputs, each a group of paths that belong together.
 
     Args:
@@ -78,7 +96,7 @@ def list_sessions(
     """
     out, names = list[SessionInput](), set(taken)
     for group in groups:
-        if isinstance(group, Recording | BuiltResult | SavedResult):
+        if isinstance(group, Recording | Result):
             one = SessionInput(_unique(_name_given(group), names), given=group)
         else:
             one = _find_session(tuple(Path(path) for path in group), names)
@@ -97,7 +115,7 @@ def _find_session(paths: tuple[Path, ...], names: set[str]) -> SessionInput:
     mapped = len(paths) == 1 and is_result(paths[0])
     if mapped:
         _require_recording(paths[0])
-    return SessionInput(_unique(_stem(paths[0]), names), paths, mapped)
+    return SessionInput(_unique(input_stem(paths[0]), names), paths, mapped)
 
 
 def _require_recording(result: Path) -> None:
@@ -115,20 +133,13 @@ def _require_recording(result: Path) -> None:
         raise InputError(error.what, where=error.where, hint=hint) from error
 
 
-def _name_given(given: Recording | BuiltResult | SavedResult) -> str:
+def _name_given(given: Recording | Result) -> str:
     """The stem of a result's folder or of where a recording was read from, else `session`."""
-    if isinstance(given, SavedResult):
-        return _stem(given.path)
+    if isinstance(given, Result) and given.path is not None:
+        return input_stem(given.path)
     recording = given if isinstance(given, Recording) else given.recording
     path = recording.source.get("path")
-    return _stem(Path(path)) if isinstance(path, str) and path else "session"
-
-
-def _stem(path: Path) -> str:
-    """The name of an input without endings."""
-    name = Path(os.path.abspath(path)).name
-    stem = name.split(".")[0] or name
-    return stem.replace("/", "_")
+    return input_stem(Path(path)) if isinstance(path, str) and path else "session"
 
 
 def _unique(stem: str, names: set[str]) -> str:
@@ -137,52 +148,194 @@ def _unique(stem: str, names: set[str]) -> str:
     return next(name for k in range(2, len(names) + 3) if (name := f"{stem}-{k}") not in names)
 
 
-def load_mapped(
-    name: str, folder: Path, threads: int, recording: Recording | None = None
-) -> tuple[MappedRecording, SavedResult]:
-    """A result folder as a session, in the frame near the robot in which it was computed.
+def prepare_sessions(
+    inputs: Sequence[SessionInput],
+    options: Options,
+    odometry: bool,
+    folder: Path,
+    progress: Progress,
+) -> list[Session]:
+    """The sessions, each mapped where it was not, with what the place keeps of it written.
 
     Args:
-        name: of the session.
-        folder: the result.
-        threads: number of threads.
-        recording: as it was mapped; None: read again.
+        inputs: to be merged.
+        options: of mapping, and of the map.
+        odometry: whether odometry in recordings is used.
+        folder: of the place; `sessions/NAME` are made.
+        progress: as of `merge_sessions`.
 
     Raises:
-        InputError: a file is missing or damaged, or the recording is not there any more.
+        InputError: an input cannot be read or mapped.
     """
-    result = load(folder)
-    graph = folder / "graph.g2o"
-    output = result.options.output
+    out = []
+    for number, one in enumerate(inputs, start=1):
+
+        def report(stage: str, iteration: int, done: int, total: int, number: int = number) -> None:
+            progress(f"session {number}: {stage}", iteration, done, total)
+
+        out.append(_prepare_session(one, options, odometry, folder, report))
+    return out
+
+
+def _prepare_session(
+    one: SessionInput, options: Options, odometry: bool, folder: Path, report: Progress
+) -> Session:
+    given = one.given
+    if one.is_result:
+        return _keep_session(one, one.parts[0], folder, options)
+    if isinstance(given, Result) and given.path is not None:
+        return _keep_session(one, given.path, folder, options, given.recording)
+    with tempfile.TemporaryDirectory(prefix=".mapped-", dir=folder) as scratch:
+        if isinstance(given, Result):
+            result = given
+        else:
+            paths = [str(path) for path in one.parts]
+            result = build(
+                given or (paths[0] if len(paths) == 1 else paths),
+                options,
+                odometry=odometry,
+                progress=report,
+                scratch=scratch,
+            )
+        mapped = Path(scratch) / "result"
+        result.save(mapped)
+        recording = result.recording
+        del result
+        return _keep_session(one, mapped, folder, options, recording)
+
+
+def _keep_session(
+    one: SessionInput,
+    mapped: Path,
+    folder: Path,
+    options: Options,
+    recording: Recording | None = None,
+) -> Session:
+    """Write what the place keeps of a mapped session, and open it again from there.
+
+    Args:
+        one: the session.
+        mapped: its result.
+        folder: of the place.
+        options: of mapping, and of the map.
+        recording: as it was mapped; None: read again.
+    """
+    result = load(mapped)
     if recording is None:
         deskewed = result.deskewed
     else:
-        deskewed = deskew_recording(recording, result.poses, result.folder.slam_options)
-    frame, pose_graph = result.folder.frame, read_g2o(graph) if graph.is_file() else None
-    if not frame.is_shifted:  # a session of a place does not say
-        frame = LocalFrame.near(result.poses)
-    poses = frame.to_local(result.poses)
+        slam_options = RunRecord(mapped, result.run).slam_options
+        deskewed = deskew_recording(recording, result.poses, slam_options)
+    session = to_session(one.name, result, deskewed, resolve_threads(options.threads))
+    cell, p_static = cell_size(options, session.dimension), np.asarray(result.p_static)
+    beams = find_beam_cells(deskewed, session.poses, p_static, session.graph, cell)
+    home = folder / "sessions" / one.name
+    home.mkdir()
+    _copy_record(mapped, home, session)
+    (home / "beams").mkdir()
+    offset = np.asarray(deskewed.offset, np.int64)
+    arrays = {"stamp_ns": np.asarray(result.stamp_ns), "offset": offset, "hit": result.hit}
+    write_arrays(home / "beams", arrays)
+    write_session(home, session, beams)
+    copy_objects(mapped, home / STATE)
+    return read_session(home, one.path, np.array(session.stamp_ns))
+
+
+def to_session(name: str, result: Result, deskewed: Recording, threads: int) -> Session:
+    """A result that was loaded as a session, in the frame near the robot in which it was computed.
+
+    Args:
+        name: of the session.
+        result: T scans with M beams.
+        deskewed: its recording without the motion during its scans.
+        threads: number of threads.
+
+    Raises:
+        InputError: its record or pose graph is damaged.
+    """
+    assert result.path is not None
+    record, output = RunRecord(result.path, result.run), result.options.output
+    frame = record.frame if record.frame.is_shifted else LocalFrame.near(result.poses)
+    poses, graph = frame.to_local(result.poses), None
     if not (np.abs(poses) < MAX_DISTANCE).all():
-        raise InputError("local_origin is far from its trajectory", where=str(folder / RECORD))
-    if pose_graph is not None:
-        pose_graph = dataclasses.replace(pose_graph, poses=frame.to_local(pose_graph.poses))
-    mapped = MappedRecording(
-        name,
-        deskewed,
-        poses,
-        np.asarray(result.p_static),
-        pose_graph,
-        (output.min_obstacle_height, output.max_obstacle_height),
-        threads,
-        frame,
-    )
-    return mapped, result
+        where = str(result.path / RECORD)
+        raise InputError("local_origin is far from its trajectory", where=where)
+    if (result.path / "graph.g2o").is_file():
+        graph = read_g2o(result.path / "graph.g2o")
+        graph = dataclasses.replace(graph, poses=frame.to_local(graph.poses))
+    band = (output.min_obstacle_height, output.max_obstacle_height)
+    p_static = np.asarray(result.p_static)
+    session = make_session(name, deskewed, poses, p_static, graph, band, threads)
+    return dataclasses.replace(session, frame=frame)
 
 
-def copy_record(result: Path, folder: Path, session: Session) -> None:
+def make_session(
+    name: str,
+    deskewed: Recording,
+    poses: Float,
+    p_static: NDArray[np.float32],
+    graph: PoseGraph | None,
+    band: tuple[float, float],
+    threads: int = 1,
+) -> Session:
+    """The session of a mapped recording.
+
+    Args:
+        name: unique in its place.
+        deskewed: T scans with M beams, without the motion during its scans.
+        poses: (T, D+1, D+1) T_map_base.
+        p_static: (M,) P(static).
+        graph: the pose graph; None: there is none.
+        band: m above the ground, lowest and greatest height of obstacles.
+        threads: number of threads.
+    """
+    graph = graph or chain_poses(poses)
+    keyframes = select_keyframes(deskewed, poses, p_static, graph.keyframes)
+    planar, clearance = keyframes, np.zeros(len(keyframes))
+    if keyframes.dimension == 3:
+        planar, clearance = _project(keyframes, band, threads)
+    return Session(name, None, deskewed.stamp_ns, poses, graph, keyframes, planar, clearance)
+
+
+def chain_poses(poses: Float) -> PoseGraph:
+    """A pose graph of poses (T, D+1, D+1) that no graph came with: steps between keyframes."""
+    D = poses.shape[-1] - 1
+    nodes = local_map.select_keyframes(poses, _NODE_DISTANCE[D], KEYFRAME_ANGLE)
+    steps = se2.inverse(poses[nodes[:-1]]) @ poses[nodes[1:]]
+    metres = np.linalg.norm(steps[:, :D, D], axis=1) + _MIN_STEP
+    turns = D * (D - 1) // 2
+    unit = np.diag(np.square([_STEP_STD[0]] * D + [_STEP_STD[1]] * turns))
+    chain = [
+        Constraint(k, k + 1, T, length * unit)
+        for k, (T, length) in enumerate(zip(steps, metres.tolist(), strict=True))
+    ]
+    return PoseGraph(nodes, poses[nodes], chain)
+
+
+def _project(
+    keyframes: Keyframes, band: tuple[float, float], threads: int
+) -> tuple[Keyframes, Float]:
+    """Keyframes of a 3D session in the plane, and the clearance (K,) of each above the ground."""
+    recording, poses = keyframes.recording, keyframes.poses
+    ground = em.estimate_ground(recording, poses, keyframes.e, threads)
+    plan = project_to_plane(recording, poses, ground, band, _PLANAR_CELL, False, threads)
+    e = keyframes.e[plan.beam]
+    planar = Keyframes(plan.recording, keyframes.scans, plan.poses, e, keyframes.nodes)
+    xy = np.ascontiguousarray(poses[:, :2, 3])
+    return planar, poses[:, 2, 3] - ground.height_at(xy)
+
+
+def _copy_record(result: Path, folder: Path, session: Session) -> None:
     """Copy what describes how a session was read and mapped."""
-    record = {**read_record(result), "dimension": session.dimension}
+    record = {**read_run(result), "dimension": session.dimension}
     record.pop(LOCAL_ORIGIN, None)  # what is written of a session is in the frame of its place
     if session.frame.is_shifted:
         record[SESSION_ORIGIN] = session.frame.origin.tolist()
     write_json(folder / RECORD, record, indent=2)
+
+
+def cell_size(options: Options, dimension: int) -> float:
+    """m, edge of a cell of the evidence."""
+    if dimension == 2:
+        return options.slam.resolution
+    return options.slam.voxel_size or _VOXEL_SIZE

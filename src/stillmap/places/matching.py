@@ -1,5 +1,7 @@
-"""Constraints between two sessions in the plane: keyframes of one matched with submaps of the
-other, by the evidence that also verifies loops."""
+"""Constraints between two sessions: keyframes of one registered to submaps of the other.
+
+In the plane by the evidence that also verifies loops, in 3D sweep by sweep.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -10,8 +12,11 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.places.keyframes import Keyframes, join_keyframes
+from stillmap.places.place import PlacedSession
 from stillmap.slam import loop_candidates, loop_verification, scan_matching
+from stillmap.slam.lidar_odometry import LidarOdometry
 from stillmap.slam.local_map import travelled_distance
+from stillmap.slam.loop_closure_3d import SweepLoopCloser
 from stillmap.slam.types import LoopCandidate, LoopClosure, LoopContext
 
 Float = NDArray[np.float64]
@@ -166,3 +171,62 @@ def _judge(node: int, other: int, closure: LoopClosure, occluded: float) -> Keyf
         occluded,
         verdict,
     )
+
+
+_REACH = 20.0  # m between a node and the one of the other session whose submap it is matched with
+_USUAL_EXPLAINED_3D = 0.8  # share of a sweep that the map of its own session explains
+_MAX_NODES = 40  # that are registered: each takes long, and neighbours say the same
+
+
+def match_sweeps(
+    reference: PlacedSession,
+    placed: PlacedSession,
+    std: tuple[float, float],
+    nodes: list[int],
+    threads: int,
+) -> list[KeyframeMatch]:
+    """Registers nodes of a session to submaps of a reference session.
+
+    Args:
+        reference: a session of the place.
+        placed: a session at its predicted poses in the place.
+        std: m and rad, of these poses.
+        nodes: indices into the nodes of the session.
+        threads: the result does not depend on it.
+    """
+    one, other = reference.session.keyframes, placed.session.keyframes
+    both = join_keyframes([one, other])
+    poses = np.concatenate([reference.keyframe_poses, placed.keyframe_poses])
+    travelled = travelled_distance(poses)
+    travelled[len(one) :] += SESSION_GAP
+    T = len(poses)
+    odometry = LidarOdometry(
+        poses, np.zeros((T, 6)), np.zeros((T, 6, 6)), np.full(T, _USUAL_EXPLAINED_3D)
+    )
+    closer = SweepLoopCloser(
+        both.recording, both.e, odometry, travelled, np.arange(T), _REACH, threads
+    )
+    theirs = poses[one.nodes, :3, 3]
+    out = []
+    step = max(-(-len(nodes) // _MAX_NODES), 1)
+    for node in nodes[::step]:
+        later = len(one) + int(other.nodes[node])
+        distance = np.linalg.norm(theirs - poses[later, :3, 3], axis=1)
+        nearest = int(np.argmin(distance))
+        if distance[nearest] > _REACH:
+            continue
+        earlier = int(one.nodes[nearest])
+        closure = closer.verify(earlier, later, se2.inverse(poses[earlier]) @ poses[later], *std)
+        out.append(
+            KeyframeMatch(
+                node,
+                nearest,
+                closure.T,
+                closure.covariance,
+                closure.explained,
+                1.0,
+                0.0,
+                Verdict.CONTRADICTS if closure.rejected else Verdict.FITS,
+            )
+        )
+    return out

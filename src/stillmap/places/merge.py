@@ -1,28 +1,36 @@
 """Merge sessions to a place: map each, add one after the other, then write what all of them say."""
 
+# signatures name the types of sessions instead of spelling them out
+from __future__ import annotations
+
+import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, TypeAlias
 
 from stillmap.core import se2
 from stillmap.core.config import override
 from stillmap.core.errors import InputError
-from stillmap.core.files import atomic_folder
+from stillmap.core.files import atomic_folder, new_folder
 from stillmap.core.parallel import limit_blas_threads, resolve_threads
 from stillmap.core.profiling import Progress, no_progress
+from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.pipeline.options import DEFAULTS, Options
-from stillmap.places.finish import finish_place, require_map_state, write_place
+from stillmap.places.finish import PlaceResult, finish_place, require_map_state, write_place
 from stillmap.places.grow import add_session, start_place
-from stillmap.places.inputs import SessionInput
-from stillmap.places.map_sessions import cell_size, prepare_sessions
-from stillmap.places.place import Place, Refusal, update_evidence
-from stillmap.places.reader import read_place
-from stillmap.places.session import Session
-from stillmap.places.store import copy_session
-from stillmap.places.writer import PlaceResult
-from stillmap.results.run_json import RECORD
+from stillmap.places.inputs import SessionInput, cell_size, list_sessions, prepare_sessions
+from stillmap.places.keyframes import Session
+from stillmap.places.place import Place, update_evidence
+from stillmap.places.store import copy_session, read_place
+from stillmap.results.reader import RECORD, is_place
+from stillmap.results.result import Result, load, remove_with, report_to, to_options
+from stillmap.results.timeline import PlaceSession, read_sessions
+
+Paths: TypeAlias = Sequence[str | os.PathLike[str]]
+SessionLike: TypeAlias = str | os.PathLike[str] | Paths | Recording | Result
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +99,7 @@ def merge_sessions(
     return result
 
 
-def _open_base(job: MergeJob, folder: Path) -> tuple[Place | None, list[Refusal], list[str]]:
+def _open_base(job: MergeJob, folder: Path) -> tuple[Place | None, list[PlaceSession], list[str]]:
     """The place to which sessions are added, what it keeps copied; nothing for a new place."""
     if job.base is None:
         return None, [], []
@@ -124,14 +132,14 @@ def _grow(
     job: MergeJob,
     threads: int,
     progress: Progress,
-) -> tuple[Place, list[Refusal]]:
+) -> tuple[Place, list[PlaceSession]]:
     """The place with all sessions that could be placed, and the others.
 
     A new place starts with the first session; if no other one fits it, with the next.
     """
     if place is not None:
         return _add_all(place, sessions, threads, progress)
-    best: tuple[Place, list[Refusal]] | None = None
+    best: tuple[Place, list[PlaceSession]] | None = None
     for number, seed in enumerate(sessions):
         cell = cell_size(job.options, seed.dimension)
         start = start_place(seed, job.options.slam.resolution, cell, threads)
@@ -149,9 +157,9 @@ def _grow(
 
 def _add_all(
     place: Place, sessions: Sequence[Session], threads: int, progress: Progress
-) -> tuple[Place, list[Refusal]]:
+) -> tuple[Place, list[PlaceSession]]:
     """Adds sessions in their order; those that do not fit are tried again after others did."""
-    pending, refusals, grew = list(sessions), dict[str, Refusal](), True
+    pending, refusals, grew = list(sessions), dict[str, PlaceSession](), True
     while pending and grew:
         grew = False
         for session in list(pending):
@@ -162,7 +170,7 @@ def _add_all(
                 growth = add_session(place, session, threads, _step(progress, session))
                 place, why = growth.place, growth.refused
             if why:
-                refusals[session.name] = Refusal(session.name, session.input, why)
+                refusals[session.name] = PlaceSession(session.name, session.input, False, why)
             else:
                 pending.remove(session)
                 refusals.pop(session.name, None)
@@ -208,6 +216,87 @@ def _no_frame(name: str, known: Sequence[str]) -> InputError:
     return InputError(f"cannot have the frame of {name}: no such session in the place", hint=hint)
 
 
-def _describe_failure(refusals: Sequence[Refusal]) -> str:
+def _describe_failure(refusals: Sequence[PlaceSession]) -> str:
     reasons = "; ".join(f"{one.name}: {one.why}" for one in refusals)
     return f"fewer than two sessions could be placed: {reasons}"
+
+
+def merge(
+    sessions: Sequence[SessionLike],
+    *,
+    options: Options | Mapping[str, Any] | None = None,
+    frame: str | None = None,
+    map_state: str = "last",
+    odometry: bool = True,
+    output: str | os.PathLike[str] | None = None,
+    overwrite: bool = False,
+    progress: bool | Progress = False,
+) -> Result:
+    """Merge sessions of one place into one map with dated changes.
+
+    A session that cannot be placed for certain is left out; `sessions` of the place has the reason.
+
+    Args:
+        sessions: each the path of a recording, the paths of its parts, the folder of a result, or a
+            recording or result itself. The first may be a place that is to grow, or its folder.
+        options: as of `stillmap.build`, for what is mapped, and for the map.
+        frame: name of the session whose frame the place has; None: the first one, or as it was.
+        map_state: what changed is shown as it was in the "last" session, in the "majority" of them,
+            in the one of this name, or at a date (ISO 8601).
+        odometry: whether odometry in recordings is used.
+        output: folder of the place; None: a temporary one, which goes with the returned object.
+        overwrite: replace an earlier place in `output`.
+        progress: as of `stillmap.build`.
+
+    Raises:
+        InputError: an input cannot be read, the output cannot be written, or fewer than two
+            sessions could be placed.
+
+    Examples:
+        >>> place = stillmap.merge(["monday", "tuesday"])
+        >>> place.save("place")
+    """
+    if isinstance(sessions, str | os.PathLike):
+        raise TypeError("sessions: expected a list of sessions, got one path")
+    chosen, (base, others) = to_options(options), _split_base(sessions)
+    taken = [] if base is None else [one.name for one in read_sessions(base)]
+    job = MergeJob(base, list_sessions(others, taken), chosen, frame, map_state, odometry)
+    with report_to(progress, chosen.em.max_iterations) as report:
+        if output is not None:
+            _require_apart(Path(output), job)
+            merge_sessions(job, Path(output), overwrite, report)
+            return load(Path(output))
+        return _merge_temporarily(job, report)
+
+
+def _split_base(
+    sessions: Sequence[SessionLike],
+) -> tuple[Path | None, list[Paths | Recording | Result]]:
+    """The place that grows, if there is one, and the sessions."""
+    given = [[one] if isinstance(one, str | os.PathLike) else one for one in sessions]
+    first = given[0] if given else None
+    if isinstance(first, Result) and first.path is not None and len(first.sessions) > 1:
+        return first.path, given[1:]
+    if isinstance(first, list) and len(first) == 1 and is_place(Path(first[0])):
+        return Path(first[0]), given[1:]
+    return None, given
+
+
+def _require_apart(output: Path, job: MergeJob) -> None:
+    """Refuse an output that is an input, or holds one.
+
+    Raises:
+        InputError: it does.
+    """
+    inputs = [path for one in job.sessions for path in one.parts]
+    for path in inputs if job.base is None else [job.base, *inputs]:
+        if output.resolve() in (path.resolve(), *path.resolve().parents):
+            raise InputError("is one of the sessions, or holds one", where=str(output))
+
+
+def _merge_temporarily(job: MergeJob, report: Progress) -> Result:
+    with new_folder("stillmap-place-") as home:
+        merge_sessions(job, home / "place", progress=report)
+        place = load(home / "place")
+        remove_with(place, home)
+    return place

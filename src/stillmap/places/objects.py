@@ -12,8 +12,7 @@ from stillmap.core.errors import InputError
 from stillmap.core.input_files import copy_content, read_bytes
 from stillmap.core.json import read_json
 from stillmap.core.local_frame import LocalFrame
-from stillmap.places.place import Place, PlacedSession
-from stillmap.places.place_graph import fit_alignment
+from stillmap.places.place import Place, PlacedSession, fit_alignment
 from stillmap.results.objects import MILLIMETRES, OBJECT_FIELDS, write_traffic
 from stillmap.results.points import coordinate_fields, ply_header
 from stillmap.results.reader import read_tracks
@@ -39,18 +38,6 @@ def copy_objects(result: Path, state: Path) -> None:
     for path in sorted(source.iterdir()):
         if path.name == _LIST or path.suffix == ".ply":
             copy_content(path, target / path.name)
-
-
-def check_objects(state: Path) -> None:
-    """Refuse objects in the state of a session that cannot be put into a place.
-
-    Raises:
-        InputError: a file of them is damaged.
-    """
-    source = state / _ORIGINAL
-    read_tracks(source / _LIST)
-    for path in source.glob("*.ply"):
-        _split_cloud(path, read_bytes(path, _MAX_CLOUD))
 
 
 def write_objects(folder: Path, place: Place) -> None:

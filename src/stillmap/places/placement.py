@@ -11,11 +11,9 @@ from stillmap.core import se2, se3
 from stillmap.core.short_repr import ShortRepr
 from stillmap.places.alignment import Hypothesis, propose_alignments, spread_evenly
 from stillmap.places.evidence import measure_evidence
-from stillmap.places.keyframes import Keyframes
+from stillmap.places.keyframes import Keyframes, Session
 from stillmap.places.matching import REACH, KeyframeMatch, Verdict, match_sessions
-from stillmap.places.place import PlacedSession
-from stillmap.places.place_graph import Tie
-from stillmap.places.session import Session
+from stillmap.places.place import PlacedSession, Tie
 from stillmap.places.surface_map import is_determined, make_surface_map
 
 Float = NDArray[np.float64]

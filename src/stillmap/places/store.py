@@ -1,61 +1,107 @@
-"""The state of a session in its place, `sessions/NAME/state/`: enough to merge further sessions
-without its recording."""
+"""What a place keeps: `sessions/NAME/` is enough to merge further ones without the recording.
+
+`state/` holds flat arrays, the keyframes as recording folders, and evidence; `ties.npz` of the
+place the constraints between sessions.
+"""
 
 import os
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Gt, Lt
 from numpy.typing import NDArray
 
 from stillmap.core import arrays
-from stillmap.core.arrays import write_npy
+from stillmap.core.array_folder import parse, read_array, read_npz, read_poses, write_arrays
+from stillmap.core.arrays import write_npy, write_npz
 from stillmap.core.errors import InputError
 from stillmap.core.input_files import copy_content
 from stillmap.io import stillmap_folder
 from stillmap.io.stillmap_folder import read as read_recording
-from stillmap.places.beam_cells import BeamCells
-from stillmap.places.inputs import MAX_DISTANCE, SESSION_ORIGIN
-from stillmap.places.keyframes import Keyframes
-from stillmap.places.session import Session
-from stillmap.results.labels import read_array
+from stillmap.places.evidence import BLOCK, BeamCells, Evidence
+from stillmap.places.keyframes import Keyframes, Session
+from stillmap.places.place import Place, PlacedSession, Tie, to_planar
 from stillmap.results.pose_graph_g2o import read_g2o, write_g2o
-from stillmap.results.run_json import RECORD
-from stillmap.results.run_record import read_frame, read_record
+from stillmap.results.reader import RECORD, SESSIONS, RunRecord, read_labels, read_run, read_tracks
+from stillmap.results.timeline import HINT, PlaceSession, read_sessions
 
 Float = NDArray[np.float64]
 
-STATE = "state"
-BEAMS = ("stamp_ns", "offset", "hit")  # of `beams/`; labels are written anew by every merge
-# of the state, by every merge
-WRITTEN_ANEW = (
-    *("nodes.npy", "covariance.npy", "measured_at.npy"),
-    *("evidence.npz", "planar_evidence.npz"),
-)
-HINT = "merge the sessions anew"
-_COPIED_AT_ONCE = 1 << 20  # bytes
+STATE, TIES = "state", "ties.npz"
+# in the record of a session: of the frame that a place has it in, in the map frame of its result
+SESSION_ORIGIN = "session_origin"
+MAX_DISTANCE = 1e6  # m, of poses from the origin of their session: no place is larger
+_BEAMS = ("stamp_ns", "offset", "hit")  # of `beams/`; labels are written anew by every merge
+_MAX_ARRAY = 1 << 31  # bytes of an array in an archive when it is unpacked
 _KEYFRAMES, _PLANAR, _GRAPH = "keyframes", "planar", "graph.g2o"
+_TIES = ("first", "first_node", "second", "second_node")
+
+_Edge = Annotated[float, Gt(0.0), Lt(100.0)]
 
 
-def write_session(folder: Path, session: Session, beams: BeamCells) -> None:
-    """Write the state of a session into an existing folder of the session.
+@dataclass(frozen=True)
+class _Settings:
+    """`place` of the record of a place."""
 
-    Args:
-        folder: `sessions/NAME`.
-        session: T scans.
-        beams: the cells in which its beams ended, and its own labels.
-    """
-    state = folder / STATE
+    resolution: _Edge
+    voxel_size: _Edge
+    frame: str
+
+
+def write_session(home: Path, session: Session, beams: BeamCells) -> None:
+    """Write the state of a session into its existing folder `sessions/NAME`."""
+    state = home / STATE
     state.mkdir()
-    write_npy(state / "poses.npy", session.poses)
-    write_npy(state / "clearance.npy", session.clearance)
+    write_arrays(
+        state,
+        {
+            "poses": session.poses,
+            "clearance": session.clearance,
+            "cells": beams.cells,
+            "cell_node": beams.node,
+            "beam_cell": beams.of_beam,
+            "p_static": beams.p_static,
+        },
+    )
     write_g2o(state / _GRAPH, session.graph, session.poses)
     _write_keyframes(state / _KEYFRAMES, session.keyframes)
     if session.dimension == 3:
         _write_keyframes(state / _PLANAR, session.planar)
-    write_npy(state / "cells.npy", beams.cells)
-    write_npy(state / "cell_node.npy", beams.node)
-    write_npy(state / "beam_cell.npy", beams.of_beam)
-    write_npy(state / "p_static.npy", beams.p_static)
+
+
+def _write_keyframes(folder: Path, keyframes: Keyframes) -> None:
+    folder.mkdir()
+    stillmap_folder.write_into(keyframes.recording, folder)
+    of = {"scans": keyframes.scans.astype(np.int64), "nodes": keyframes.nodes.astype(np.int64)}
+    write_arrays(folder, {**of, "poses": keyframes.poses, "e": keyframes.e})
+
+
+def write_placement(home: Path, one: PlacedSession) -> None:
+    """Write where a session lies in its place, and its evidence there."""
+    state = home / STATE
+    evidence, planar = one.require_evidence()
+    of = {"nodes": one.nodes, "covariance": one.known_covariance, "measured_at": one.measured_at}
+    write_arrays(state, of)
+    _write_evidence(state / "evidence.npz", evidence)
+    if planar is not evidence:
+        _write_evidence(state / "planar_evidence.npz", planar)
+
+
+def _write_evidence(path: Path, evidence: Evidence) -> None:
+    of = {name: getattr(evidence, name) for name in ("corner", "hits", "passes")}
+    write_npz(path, {**of, "resolution": np.array(evidence.resolution)})
+
+
+def write_ties(path: Path, ties: Sequence[Tie], D: int) -> None:
+    """Write the constraints between sessions in D dimensions."""
+    dof = 3 * (D - 1)
+    columns = {name: np.array([getattr(tie, name) for tie in ties], np.int64) for name in _TIES}
+    T = np.array([tie.T for tie in ties]).reshape(-1, D + 1, D + 1)
+    covariance = np.array([tie.covariance for tie in ties]).reshape(-1, dof, dof)
+    write_npz(path, {**columns, "T": T, "covariance": covariance})
 
 
 def copy_session(source: Path, target: Path) -> None:
@@ -72,7 +118,7 @@ def copy_session(source: Path, target: Path) -> None:
     """
     target.mkdir()
     (target / "beams").mkdir()
-    names = [RECORD, *(f"beams/{name}.npy" for name in BEAMS)]
+    names = [RECORD, *(f"beams/{name}.npy" for name in _BEAMS)]
     for folder, _, files in os.walk(source / STATE):
         part = os.path.relpath(folder, source)
         os.mkdir(target / part)
@@ -81,33 +127,86 @@ def copy_session(source: Path, target: Path) -> None:
         copy_content(f"{source}/{name}", f"{target}/{name}")
 
 
-def _write_keyframes(folder: Path, keyframes: Keyframes) -> None:
-    folder.mkdir()
-    stillmap_folder.write_into(keyframes.recording, folder)
-    write_npy(folder / "scans.npy", keyframes.scans.astype(np.int64))
-    write_npy(folder / "poses.npy", keyframes.poses)
-    write_npy(folder / "e.npy", keyframes.e)
-    write_npy(folder / "nodes.npy", keyframes.nodes.astype(np.int64))
+def read_place(folder: Path) -> tuple[Place, list[PlaceSession], list[str]]:
+    """A place, the sessions that are not in it, and the names of all in their order.
+
+    Args:
+        folder: which `stillmap merge` wrote.
+
+    Raises:
+        InputError: a file is missing or damaged.
+    """
+    run, records = read_run(folder), read_sessions(folder)
+    settings = parse(run.get("place"), _Settings, folder / RECORD, HINT)
+    accepted = {one.name: one for one in records if one.accepted}
+    order = run["input"].get("sessions")
+    if not isinstance(order, list) or not order or sorted(map(str, order)) != sorted(accepted):
+        what = "names other sessions than run.json: one of them was changed by hand"
+        raise InputError(what, where=str(folder / SESSIONS), hint=HINT)
+    if settings.frame not in accepted:
+        raise InputError("is no record of a place", where=str(folder / RECORD), hint=HINT)
+    sessions = [
+        _read_placed(folder / "sessions" / name, accepted[name], settings.voxel_size)
+        for name in order
+    ]
+    if len({one.session.dimension for one in sessions}) != 1:
+        raise InputError("has sessions in 2D and in 3D", where=str(folder), hint=HINT)
+    # that of the first one stays by itself: its first pose is what the pose graph holds
+    frame = None if settings.frame == order[0] else settings.frame
+    ties = _read_ties(folder / TIES, sessions)
+    place = Place(sessions, ties, settings.resolution, settings.voxel_size, frame)
+    refused = [one for one in records if not one.accepted]
+    return place, refused, [one.name for one in records]
 
 
-def read_session(folder: Path, path: str | None, stamp_ns: NDArray[np.int64]) -> Session:
+def _read_placed(home: Path, record: PlaceSession, voxel_size: float) -> PlacedSession:
+    stamp_ns, n_beams = _read_beams(home / "beams")
+    session, state = read_session(home, record.input, stamp_ns), home / STATE
+    _check_beam_cells(home, read_beam_cells(home, n_beams, voxel_size), session)
+    read_tracks(state / "objects" / "objects.json")
+    D, N, K = session.dimension, len(session.graph.keyframes), len(session.keyframes)
+    nodes = read_poses(state / "nodes.npy", N, D, MAX_DISTANCE)
+    measured_at = read_poses(state / "measured_at.npy", K, D, MAX_DISTANCE)
+    covariance = np.array(read_array(state / "covariance.npy", (3 * (D - 1),) * 2, np.float64))
+    if not np.isfinite(covariance).all():
+        raise InputError("is not finite", where=str(state / "covariance.npy"), hint=HINT)
+    evidence = planar = _read_evidence(state / "evidence.npz", session.keyframes, measured_at)
+    if D == 3:
+        at = to_planar(session, measured_at)
+        planar = _read_evidence(state / "planar_evidence.npz", session.planar, at)
+    return PlacedSession(session, nodes, covariance, record.overlap, evidence, planar, measured_at)
+
+
+def _read_beams(folder: Path) -> tuple[NDArray[np.int64], int]:
+    """(T,) stamps of the scans of a session, and the number of its beams."""
+    stamp_ns = np.array(read_array(folder / "stamp_ns.npy", (None,), np.int64))
+    offset = np.array(read_array(folder / "offset.npy", (len(stamp_ns) + 1,), np.int64))
+    if offset[0] != 0 or np.any(np.diff(offset) < 0):
+        raise InputError("does not rise from 0", where=str(folder / "offset.npy"), hint=HINT)
+    if np.any(stamp_ns[1:] < stamp_ns[:-1]) or not len(stamp_ns):
+        raise InputError("stamps decrease", where=str(folder / "stamp_ns.npy"), hint=HINT)
+    read_array(folder / "hit.npy", (int(offset[-1]),), np.bool_)
+    return stamp_ns, int(offset[-1])
+
+
+def read_session(home: Path, path: str | None, stamp_ns: NDArray[np.int64]) -> Session:
     """The session that `write_session` wrote; arrays are memory-mapped.
 
     Args:
-        folder: `sessions/NAME` of a place.
+        home: `sessions/NAME` of a place.
         path: of its input, as it was given; None: it had none.
         stamp_ns: (T,) stamps of its scans.
 
     Raises:
         InputError: a file is missing, damaged, or inconsistent with the others.
     """
-    state = folder / STATE
+    state = home / STATE
     keyframes = _read_keyframes(state / _KEYFRAMES)
     D, K = keyframes.dimension, len(keyframes)
     planar = _read_keyframes(state / _PLANAR) if D == 3 else keyframes
-    poses = read_poses(state / "poses.npy", len(stamp_ns), D)
+    poses = read_poses(state / "poses.npy", len(stamp_ns), D, MAX_DISTANCE)
     graph = read_g2o(state / _GRAPH)
-    clearance = np.array(read_array(state / "clearance.npy", (K,), "f"), np.float64)
+    clearance = np.array(read_array(state / "clearance.npy", (K,), np.float64))
     if (
         planar.dimension != 2
         or len(planar) != K
@@ -118,95 +217,127 @@ def read_session(folder: Path, path: str | None, stamp_ns: NDArray[np.int64]) ->
         or not (np.abs(clearance) < MAX_DISTANCE).all()
     ):
         raise _inconsistent(state)
-    frame = read_frame(folder, read_record(folder), SESSION_ORIGIN)
-    return Session(folder.name, path, stamp_ns, poses, graph, keyframes, planar, clearance, frame)
-
-
-def read_poses(path: Path, count: int, D: int) -> Float:
-    """(count, D+1, D+1) rigid transforms of an `.npy` file.
-
-    Raises:
-        InputError: it is missing or damaged, or holds something else.
-    """
-    poses = np.array(read_array(path, (count, D + 1, D + 1), "f"), np.float64)
-    if not is_rigid(poses):
-        raise InputError("holds no rigid transforms", where=str(path), hint=HINT)
-    return poses
-
-
-def is_rigid(poses: Float) -> bool:
-    """Whether all of (N, D+1, D+1) are rigid transforms within a possible distance."""
-    D = poses.shape[-1] - 1
-    R = poses[:, :D, :D]
-    return bool(
-        (np.abs(poses) < MAX_DISTANCE).all()
-        and (poses[:, D] == np.eye(D + 1)[D]).all()
-        and np.allclose(R @ R.swapaxes(1, 2), np.eye(D), atol=1e-6)
-    )
+    frame = RunRecord(home, read_run(home)).read_frame(SESSION_ORIGIN)
+    return Session(home.name, path, stamp_ns, poses, graph, keyframes, planar, clearance, frame)
 
 
 def _read_keyframes(folder: Path) -> Keyframes:
     recording = read_recording(folder)
-    K = recording.n_scans
-    scans = np.array(read_array(folder / "scans.npy", (K,), "i"), np.intp)
-    poses = np.array(read_array(folder / "poses.npy", (K, None, None), "f"), np.float64)
-    e = read_array(folder / "e.npy", (recording.n_beams,), "f")
-    nodes = np.array(read_array(folder / "nodes.npy", (None,), "i"), np.intp)
+    K, name = recording.n_scans, folder / "poses.npy"
+    scans = np.array(read_array(folder / "scans.npy", (K,), np.int64), np.intp)
+    nodes = np.array(read_array(folder / "nodes.npy", (None,), np.int64), np.intp)
+    D = read_array(name, (K, None, None), np.float64).shape[1] - 1
+    poses = read_poses(name, K, D, MAX_DISTANCE) if D in (2, 3) else np.zeros(0)
+    e = read_array(folder / "e.npy", (recording.n_beams,), np.float32)
     if not K or not len(nodes) or np.any(np.diff(scans) <= 0) or np.any(np.diff(nodes) <= 0):
         raise _inconsistent(folder)
-    if nodes[0] < 0 or nodes[-1] >= K or scans[0] < 0 or poses.shape[1] not in (3, 4):
+    if nodes[0] < 0 or nodes[-1] >= K or scans[0] < 0 or not ((e >= 0.0) & (e <= 1.0)).all():
         raise _inconsistent(folder)
-    if poses.shape[1] != poses.shape[2] or not is_rigid(poses):
-        raise _inconsistent(folder)
-    if e.dtype != np.float32 or not ((e >= 0.0) & (e <= 1.0)).all():
-        raise InputError("holds no probabilities", where=str(folder / "e.npy"), hint=HINT)
     return Keyframes(recording, scans, poses, e, nodes)
 
 
-def read_beam_cells(folder: Path, n_beams: int, resolution: float) -> BeamCells:
-    """The cells in which the beams of a session ended; the files are memory-mapped.
-
-    Args:
-        folder: `sessions/NAME` of a place.
-        n_beams: of the session.
-        resolution: m, edge of a cell.
+def read_beam_cells(home: Path, n_beams: int, resolution: float) -> BeamCells:
+    """The cells, of edges of `resolution` m, in which the beams of a session ended; mapped files.
 
     Raises:
         InputError: a file is missing, damaged, or inconsistent with the others.
     """
-    state = folder / STATE
-    cells = read_array(state / "cells.npy", (None, None), "i")
-    node = read_array(state / "cell_node.npy", (len(cells),), "i")
-    of_beam = read_array(state / "beam_cell.npy", (n_beams,), "i")
-    return BeamCells(
-        cells, node, of_beam, read_array(state / "p_static.npy", (n_beams,), "f"), resolution
-    )
+    state = home / STATE
+    cells = read_array(state / "cells.npy", (None, None), np.int32)
+    node = read_array(state / "cell_node.npy", (len(cells),), np.int32)
+    of_beam = read_array(state / "beam_cell.npy", (n_beams,), np.int32)
+    p_static = read_array(state / "p_static.npy", (n_beams,), np.float16)
+    return BeamCells(cells, node, of_beam, p_static, resolution)
 
 
-def check_beam_cells(folder: Path, beams: BeamCells, session: Session) -> None:
-    """Refuse cells and labels of beams that cannot be those of a session.
-
-    Raises:
-        InputError: names the file.
-    """
-    count, state = len(beams.cells), folder / STATE
+def _check_beam_cells(home: Path, beams: BeamCells, session: Session) -> None:
+    """Refuse cells and labels of beams that cannot be those of a session."""
     if beams.cells.shape[1:] != (session.dimension,):
-        raise _inconsistent(state)
-    for name, values, last in (
-        ("cell_node", beams.node, len(session.graph.keyframes) - 1),
-        ("beam_cell", beams.of_beam, count - 1),
+        raise _inconsistent(home / STATE)
+    for values, first, last in (
+        (beams.node, 0, len(session.graph.keyframes) - 1),
+        (beams.of_beam, -1, len(beams.cells) - 1),
+        (beams.p_static, 0, 1),
     ):
-        first = -1 if name == "beam_cell" else 0
         for block in arrays.iter_blocks(values):
             if ((values[block] < first) | (values[block] > last)).any():
-                what = "names what is not there"
-                raise InputError(what, where=str(state / f"{name}.npy"), hint=HINT)
-    for block in arrays.iter_blocks(beams.p_static):
-        if ((beams.p_static[block] < 0.0) | (beams.p_static[block] > 1.0)).any():
-            what = "holds no probabilities"
-            raise InputError(what, where=str(state / "p_static.npy"), hint=HINT)
+                raise _inconsistent(home / STATE)
+
+
+def _read_evidence(path: Path, keyframes: Keyframes, poses: Float) -> Evidence:
+    """The evidence of keyframes that lay at poses (K, D+1, D+1) when it was measured."""
+    D = poses.shape[-1] - 1
+    corner, hits, passes, resolution = read_npz(
+        path, ("corner", "hits", "passes", "resolution"), _MAX_ARRAY, HINT
+    ).values()
+    shape = (len(corner), *(BLOCK[D],) * D)
+    fits = corner.shape == (len(corner), D) and hits.shape == shape and passes.shape == shape
+    kinds = corner.dtype == np.int32 and hits.dtype == np.uint8 and passes.dtype == np.uint8
+    if not (fits and kinds and resolution.shape == () and 0.0 < float(resolution) < 100.0):
+        raise InputError("is damaged", where=str(path), hint=HINT)
+    low = corner.min(axis=0, initial=0) * float(resolution)
+    high = (corner.max(axis=0, initial=0) + BLOCK[D]) * float(resolution)
+    if np.any(corner % BLOCK[D]) or not _end_within(keyframes, poses, low, high):
+        raise InputError("is not that of the keyframes", where=str(path), hint=HINT)
+    return Evidence(corner, hits, passes, float(resolution))
+
+
+def _end_within(keyframes: Keyframes, poses: Float, low: Float, high: Float) -> bool:
+    """Whether all beams that hit something end in a box of corners (D,), metres."""
+    recording = keyframes.recording
+    for block in arrays.iter_blocks(recording.hit):
+        beams = block.start + np.flatnonzero(recording.hit[block])
+        ends = recording.end_points(beams, poses)
+        if ((ends < low) | (ends > high)).any():
+            return False
+    return True
+
+
+def _read_ties(path: Path, sessions: list[PlacedSession]) -> list[Tie]:
+    D = sessions[0].session.dimension
+    *columns, T, covariance = read_npz(path, (*_TIES, "T", "covariance"), _MAX_ARRAY, HINT).values()
+    L, counts = len(columns[0]), np.array([len(one.nodes) for one in sessions])
+    shapes = [(L,)] * 4 + [(L, D + 1, D + 1), (L, 3 * (D - 1), 3 * (D - 1))]
+    every = [*columns, T, covariance]
+    if [one.shape for one in every] != shapes or any(one.dtype.kind != "i" for one in columns):
+        raise InputError("is damaged: arrays of other shapes", where=str(path), hint=HINT)
+    first, first_node, second, second_node = columns
+    for session, node in ((first, first_node), (second, second_node)):
+        inside = (session >= 0) & (session < len(sessions)) & (node >= 0)
+        if not inside.all() or (node >= counts[session]).any() or (first == second).any():
+            raise InputError("names a session or node that is not there", where=str(path))
+    usable = bool((np.abs(T) < MAX_DISTANCE).all()) and bool(np.isfinite(covariance).all())
+    if not usable or (L and np.linalg.eigvalsh(covariance).min() <= 0.0):
+        raise InputError("is damaged: no transforms or covariances", where=str(path), hint=HINT)
+    ends = zip(*(column.tolist() for column in columns), strict=True)
+    return [Tie(a, i, b, j, T[k], covariance[k]) for k, (a, i, b, j) in enumerate(ends)]
 
 
 def _inconsistent(folder: Path) -> InputError:
     what = "is damaged or was changed by hand: its arrays do not belong together"
     return InputError(what, where=str(folder), hint=HINT)
+
+
+def write_joined_beams(folder: Path, homes: list[Path]) -> None:
+    """Write `beams/` of a place: the labels of its sessions one after the other."""
+    folder.mkdir()
+    every = [read_labels(home) for home in homes]
+    offsets, first = [np.zeros(1, np.int64)], 0
+    for labels in every:
+        offsets.append(labels.offset[1:] + first)
+        first += int(labels.offset[-1])
+    write_npy(folder / "stamp_ns.npy", np.concatenate([one.stamp_ns for one in every]))
+    write_npy(folder / "offset.npy", np.concatenate(offsets))
+    _write_joined(folder / "p_static.npy", [one.p_static for one in every])
+    _write_joined(folder / "hit.npy", [one.hit for one in every])
+
+
+def _write_joined(path: Path, parts: Sequence[NDArray[Any]]) -> None:
+    """Write arrays one after the other as one, without all of them in memory."""
+    header = np.lib.format.header_data_from_array_1_0(np.empty(0, parts[0].dtype))
+    with path.open("wb") as file:
+        shape = (sum(len(part) for part in parts),)
+        np.lib.format.write_array_header_1_0(file, {**header, "shape": shape})
+        for part in parts:
+            for block in arrays.iter_bytes(part):
+                file.write(block)

@@ -12,6 +12,7 @@ Rgb = tuple[int, int, int]
 BLUE, ORANGE = (36, 99, 168), (240, 120, 0)  # static, and the robot's trajectory; dynamic
 GREY = (205, 205, 205)  # undecided
 TEAL = (0, 150, 136)  # rays
+BACKGROUND = (236, 238, 241)  # of views in 3D
 
 # at P(static) = 0, 0.5, 1; distinguishable to color-blind readers
 _P_STATIC_COLORS = (ORANGE, GREY, BLUE)

@@ -20,10 +20,19 @@ from stillmap.io.parts import read_parts
 from stillmap.io.text_lines import Progress
 from stillmap.io.trajectory import poses_from_tum
 from stillmap.pipeline.calibration import apply_calibration
-from stillmap.results.labels import Labels, read_colors, read_labels
-from stillmap.results.reader import Grid, Track, read_grid, read_tracks
-from stillmap.results.run_json import RECORD, read_calibration
-from stillmap.results.run_record import RunRecord, read_record
+from stillmap.results.reader import (
+    RECORD,
+    Grid,
+    Labels,
+    RunRecord,
+    Track,
+    read_colors,
+    read_grid,
+    read_labels,
+    read_run,
+    read_tracks,
+)
+from stillmap.results.run_json import read_calibration
 from stillmap.slam import SlamOptions, deskew_recording
 
 
@@ -219,7 +228,7 @@ def open_result(
     Raises:
         InputError: it is none, or names no recording.
     """
-    record = read_record(result)
+    record = read_run(result)
     if recording:
         paths = [recording] if isinstance(recording, str) else [os.fspath(one) for one in recording]
     else:

@@ -1,6 +1,6 @@
-"""Maps and masks of costmap filters, as map_server and nav2 read them: image and YAML file."""
+"""The map: `map.npz`, and image and YAML file as map_server and nav2 read them; their masks."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -8,11 +8,17 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from stillmap.core.arrays import write_npz
 from stillmap.core.grid_map import GridMap
-from stillmap.core.tiles import Layer, rows_of
+from stillmap.core.tiles import Layer, TiledArray, as_type, compact, rows_of
+from stillmap.em import Coverage, OccupancyMap
 from stillmap.io.images import write_png
+from stillmap.mapping import Change
 from stillmap.pipeline.options import MapMode
 from stillmap.results.reader import FREE_THRESH, OCCUPIED_THRESH
+
+# what `changed` of `map.npz` says of a cell
+CHANGED = {"came": 1, "left": 2, "comes and goes": 3, "door": 4}
 
 ToPixels = Callable[[NDArray[Any]], NDArray[np.uint8]]
 
@@ -129,3 +135,47 @@ def _write_pgm(path: Path, layer: Layer, to_pixels: ToPixels) -> None:
             end -= rows.size
             file.seek(end)
             file.write(to_pixels(rows[::-1]).tobytes())
+
+
+def write_map_npz(
+    path: Path,
+    occupancy: OccupancyMap,
+    changes: Sequence[Change] = (),
+    evidence: Coverage | None = None,
+) -> None:
+    """Write `p_occupied`, `alpha`, `beta` (H, W), `origin` (x, y, yaw), `resolution` in metres.
+
+    Also `changed` (H, W) uint8: 0, or how the cell changed, see CHANGED; and where evidence is
+    given: `looks`, `clear_looks`, `thin` (H, W).
+    """
+    arrays: dict[str, Layer] = {
+        "p_occupied": as_type(occupancy.p_occupied, np.float32),
+        "alpha": as_type(occupancy.alpha, np.float32),
+        "beta": as_type(occupancy.beta, np.float32),
+        "changed": changed_cells(occupancy, changes),
+    }
+    if evidence is not None:
+        arrays |= {
+            "looks": as_type(evidence.observations, np.uint16),
+            "clear_looks": as_type(evidence.unobstructed, np.uint16),
+            "thin": as_type(evidence.thinly_observed, np.bool_),
+        }
+    arrays |= {
+        "origin": np.asarray(occupancy.origin, np.float64),
+        "resolution": np.asarray(occupancy.resolution, np.float64),
+    }
+    write_npz(path, arrays)
+
+
+def changed_cells(occupancy: OccupancyMap, changes: Sequence[Change]) -> Layer:
+    """(H, W) uint8 code of the last change of each cell; 0: unchanged."""
+    height, width = occupancy.p_occupied.shape
+    out = TiledArray((height, width), np.uint8, 0)
+    first = np.round(np.array(occupancy.origin[:2]) / occupancy.resolution).astype(np.int64)
+    for change in sorted(changes, key=lambda one: one.last_ns):
+        column, row = (change.swept_cells - first).T
+        inside = (row >= 0) & (column >= 0) & (row < height) & (column < width)
+        code = np.full(int(inside.sum()), CHANGED[change.kind], np.uint8)
+        out.put(row[inside], column[inside], code)
+    codes: Layer = compact(out)
+    return codes

@@ -14,10 +14,13 @@ from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.mapping.beam_statistics import sample_dynamic_points
 from stillmap.pipeline.quality import Quality
 from stillmap.results.report.figures import MapView, data_uri, draw_map, map_window
-from stillmap.results.result_data import ResultData
+from stillmap.results.report.place import KIND_COLORS
+from stillmap.results.timeline import SessionChange
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+    from stillmap.results.result import Result
 
 _BLUE, _ORANGE = "#1f6feb", "#f07800"
 _MAX_POINTS = 50_000  # dynamic returns in a figure
@@ -25,7 +28,7 @@ _PREVIEW_PIXELS = 420  # longest edge in a notebook
 
 
 def plot_result(
-    result: ResultData, ax: "Axes | None", *, trajectory: bool, dynamic: bool
+    result: "Result", ax: "Axes | None", *, trajectory: bool, dynamic: bool, changes: bool
 ) -> "Axes":
     """See `Result.plot`."""
     if ax is None:
@@ -33,11 +36,18 @@ def plot_result(
     window = map_window([result.map])
     image = draw_map(result.map, window).convert("RGB")
     ax.imshow(np.asarray(image), extent=_extent(result, image), interpolation="nearest")
+    placed = [one for one in result.sessions if one.accepted]
     if dynamic:
-        draw_dynamic(result, ax)
+        for one in placed:
+            _draw_dynamic(result.load_session(one.name), ax)
     if trajectory:
-        x, y = _track(result).T
-        ax.plot(x, y, color=_BLUE, linewidth=1.0, label="trajectory")
+        for one in placed:
+            x, y = _track(result)[one.scans].T
+            color = _BLUE if len(placed) == 1 else None
+            label = "trajectory" if len(placed) == 1 else one.name
+            ax.plot(x, y, color=color, linewidth=1.0, label=label)
+    if changes and result.changes:
+        _draw_changes(result.changes, ax)
     ax.set_aspect("equal")
     ax.set_xlim(window[0], window[2])
     ax.set_ylim(window[1], window[3])
@@ -63,7 +73,7 @@ def _make_axes() -> "Axes":
     return axes
 
 
-def draw_dynamic(result: ResultData, ax: "Axes") -> None:
+def _draw_dynamic(result: "Result", ax: "Axes") -> None:
     """Draw returns from what moves."""
     points = sample_dynamic_points(
         result.deskewed, result.poses, result.p_static, limit=_MAX_POINTS
@@ -71,7 +81,23 @@ def draw_dynamic(result: ResultData, ax: "Axes") -> None:
     ax.plot(points[:, 0], points[:, 1], ".", color=_ORANGE, markersize=1.5, label="dynamic returns")
 
 
-def _extent(result: ResultData, image: Image.Image) -> tuple[float, float, float, float]:
+def _draw_changes(changes: list[SessionChange], ax: "Axes") -> None:
+    """Draw a box around what changed, and an arrow from where it stood before."""
+    patches = import_extra("matplotlib.patches", "a plot", "drawn", group="notebook")
+    for one in changes:
+        color = tuple(level / 255.0 for level in KIND_COLORS[one.kind])
+        (low, high), *earlier = one.boxes
+        width, height = (high - low)[:2].tolist()
+        style = {"fill": False, "edgecolor": color, "linewidth": 1.2}
+        ax.add_patch(patches.Rectangle(tuple(low[:2]), width, height, **style))
+        for box in earlier:
+            before, after = np.mean(box, axis=0)[:2], 0.5 * (low + high)[:2]
+            ax.annotate(
+                "", tuple(after), tuple(before), arrowprops={"arrowstyle": "->", "color": color}
+            )
+
+
+def _extent(result: "Result", image: Image.Image) -> tuple[float, float, float, float]:
     """Left, right, bottom and top of the picture of a map, in metres.
 
     Pixels are whole squares of cells: the last ones may reach beyond the window.
@@ -82,7 +108,7 @@ def _extent(result: ResultData, image: Image.Image) -> tuple[float, float, float
     return x0, x0 + image.width * edge, y0, y0 + image.height * edge
 
 
-def summarize_as_html(result: ResultData) -> str:
+def summarize_as_html(result: "Result") -> str:
     """A small picture of the map and the key facts; needs neither matplotlib nor a network."""
     rows = "".join(
         f"<tr><th style='text-align:left'>{html.escape(name)}</th>"
@@ -99,7 +125,7 @@ def summarize_as_html(result: ResultData) -> str:
     )
 
 
-def key_facts(result: ResultData) -> dict[str, str]:
+def key_facts(result: "Result") -> dict[str, str]:
     """The key figures of a result, by their names."""
     stamps, grid = result.stamp_ns, result.map
     height, width = (n * grid.resolution for n in grid.p_occupied.shape)
@@ -143,7 +169,7 @@ def _count_hits(hit: NDArray[np.bool_], p_static: NDArray[np.float32]) -> tuple[
     return hits, dynamic
 
 
-def _preview(result: ResultData) -> Image.Image:
+def _preview(result: "Result") -> Image.Image:
     """The map with the trajectory, small."""
     window = map_window([result.map])
     image = draw_map(result.map, window).convert("RGB")
@@ -158,6 +184,6 @@ def _preview(result: ResultData) -> Image.Image:
     return image.quantize(64)
 
 
-def _track(result: ResultData) -> NDArray[np.float64]:
+def _track(result: "Result") -> NDArray[np.float64]:
     """(T, 2) positions of the robot in metres."""
     return result.poses[:, :2, -1]

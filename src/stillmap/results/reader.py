@@ -1,30 +1,59 @@
-"""A result folder read again, beside the recording that it was made from."""
+"""The files of a result folder read again; a place of several sessions has the same ones."""
 
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 import numpy as np
+from annotated_types import Ge, Le
 from numpy.typing import NDArray
 
-from stillmap.core import se2
-from stillmap.core.array_folder import read_npz
+from stillmap.core import config, se2
+from stillmap.core.array_folder import (
+    parse,
+    read_array,
+    read_npz,
+    read_probabilities,
+    read_record,
+)
 from stillmap.core.arrays import iter_blocks
 from stillmap.core.errors import InputError, install_command
 from stillmap.core.grid_map import GridMap
 from stillmap.core.json import read_json
+from stillmap.core.local_frame import LocalFrame
+from stillmap.core.grid_map import Region
 from stillmap.core.short_repr import ShortRepr
-from stillmap.results.labels import shape_text
+from stillmap.io.rigid_transforms import MAX_TRANSLATION
+from stillmap.mesh.options import MeshOptions
+from stillmap.pipeline.options import MapMode, Options, OutputOptions
+from stillmap.pipeline.quality import Quality
+from stillmap.prepare.options import ReadOptions
+from stillmap.slam import SlamOptions
 
 Float = NDArray[np.float64]
 Origin = tuple[float, float, float]
+T = TypeVar("T")
 
+RECORD = "run.json"  # every result has it
+SESSIONS = "sessions.json"  # every place of several sessions has it
+EXTENDS = "extends_map"  # of the input: the result holds what still stands of a known map, too
+LOCAL_ORIGIN = "local_origin"  # of the record, where it was not computed in the map frame
+TILTING = "tilting"  # of the record, and the folder, of 3D data of a rig's tilting laser
+HINT = "a result is what `stillmap map` or `merge` wrote"
 
 # of map_server and nav2: what reads the map sees it as they load it
 OCCUPIED_THRESH = 0.65
 # map_server reads pixel 205 as p = 50 / 255 = 0.19608: any larger threshold turns unknown into free
 FREE_THRESH = 0.196
+
+_MIN_RESOLUTION, _MAX_RESOLUTION = 1e-4, 1e3  # m
+_MAX_MAP = 1 << 29  # bytes of a map when it is unpacked: a thousand times what they take packed
+_MAX_HITS = 1e30  # in a cell: single precision holds it
+_ROWS = 256  # of a map that are checked at a time
+_MAX_OBJECTS = 256 << 20  # bytes of an objects.json
+
+Stamp = Annotated[int, Ge(-(2**63)), Le(2**63 - 1)]
 
 
 class Grid(GridMap):
@@ -48,12 +77,8 @@ class Grid(GridMap):
         return moved(se2.matrix(*self.origin), (cells[:, ::-1] + np.float64(0.5)) * self.resolution)
 
 
-SESSIONS = "sessions.json"  # every place has it
-_MAX_ORIGIN = 1e9  # m, farther than any map projection has
-_MIN_RESOLUTION, _MAX_RESOLUTION = 1e-4, 1e3  # m
-_ROWS = 256  # of a map that are checked at a time
-_MAX_HITS = 1e30  # in a cell: single precision holds it
-_MAX_MAP = 1 << 29  # bytes of a map when it is unpacked: a thousand times what they take packed
+def moved(T: Float, points: Float) -> Float:
+    return np.asarray(points @ T[:2, :2].T + T[:2, 2])
 
 
 def require_there(*paths: Path) -> None:
@@ -81,11 +106,62 @@ def require_model(result: Path) -> Path:
     return path
 
 
-def _find_map(result: Path) -> Path:
-    """The folder in which the map of a result lies: of a session of a place, that of the place."""
-    home = Path(os.path.abspath(result)).parent
-    is_session = home.name == "sessions" and (home.parent / SESSIONS).is_file()
-    return home.parent if is_session else result
+def is_result(path: Path) -> bool:
+    """True if a folder is a result."""
+    return (path / RECORD).is_file()
+
+
+def is_place(path: Path) -> bool:
+    """True if a folder is a place of several sessions, also one from which a file was taken."""
+    return (path / "sessions").is_dir() and any(
+        (path / one).is_file() for one in (SESSIONS, "ties.npz")
+    )
+
+
+# arrays
+
+
+@dataclass(frozen=True, eq=False)
+class Labels(ShortRepr):
+    """`beams/` of a result of T scans with M beams.
+
+    Attributes:
+        stamp_ns: (T,) nanoseconds.
+        offset: (T+1,) scan t owns the beams offset[t]:offset[t+1].
+        p_static: (M,) P(c = 1); NaN: unusable.
+        hit: (M,) whether the beam ended on something.
+    """
+
+    stamp_ns: NDArray[np.int64]
+    offset: NDArray[np.int64]
+    p_static: NDArray[np.float32]
+    hit: NDArray[np.bool_]
+
+
+def read_labels(result: Path) -> Labels:
+    """The labels of a result folder.
+
+    Raises:
+        InputError: files are missing, damaged, or of inconsistent lengths.
+    """
+    folder = result / "beams"
+    stamp_ns = read_array(folder / "stamp_ns.npy", (None,), np.int64)
+    offset = read_array(folder / "offset.npy", (len(stamp_ns) + 1,), np.int64)
+    beams = int(offset[-1])
+    if offset[0] != 0 or np.any(offset[1:] < offset[:-1]):
+        raise InputError("does not rise from 0", where=str(folder / "offset.npy"))
+    p_static = read_probabilities(folder / "p_static.npy", beams)
+    return Labels(stamp_ns, offset, p_static, read_array(folder / "hit.npy", (beams,), np.bool_))
+
+
+def read_colors(result: Path, beams: int) -> NDArray[np.uint8] | None:
+    """(M, 3) colors of the end points of a result's beams; None where there are none.
+
+    Raises:
+        InputError: they are damaged, or of another number of beams.
+    """
+    path = result / "beams" / "colour.npy"
+    return read_array(path, (beams, 3), np.uint8) if path.exists() else None
 
 
 def read_grid(result: Path) -> Grid:
@@ -97,30 +173,23 @@ def read_grid(result: Path) -> Grid:
     path = _find_map(result) / "map.npz"
     p_occupied, origin, resolution = _read_layer(path, "p_occupied")
     if p_occupied.ndim != 2 or p_occupied.dtype.kind != "f":
-        raise InputError(
-            f"p_occupied is {shape_text(p_occupied.shape)} {p_occupied.dtype}",
-            where=str(path),
-            hint="scores are for maps in the plane",
-        )
+        what = f"p_occupied is {p_occupied.shape} {p_occupied.dtype}"
+        raise InputError(what, where=str(path), hint="scores are for maps in the plane")
     if not is_probability(p_occupied):
         raise InputError("p_occupied is no probability", where=str(path))
     return Grid(p_occupied.astype(np.float32, copy=False), origin, resolution)
 
 
 def read_hit_sums(result: Path, shape: tuple[int, ...]) -> NDArray[np.floating[Any]]:
-    """`alpha` of the map that `read_grid` reads: (H, W) sums of hits on what stands.
-
-    Args:
-        result: the folder.
-        shape: of the map.
+    """`alpha` (H, W) of the map that `read_grid` reads: sums of hits on what stands.
 
     Raises:
-        InputError: it is missing or damaged.
+        InputError: it is missing or damaged, or of another shape.
     """
     path = _find_map(result) / "map.npz"
     alpha: NDArray[np.floating[Any]] = _read_layer(path, "alpha")[0]
     if alpha.shape != shape or alpha.dtype.kind != "f":
-        what = f"alpha is {shape_text(alpha.shape)} {alpha.dtype}, p_occupied {shape_text(shape)}"
+        what = f"alpha is {alpha.shape} {alpha.dtype}, p_occupied {shape}"
         raise InputError(what, where=str(path))
     if not is_hit_sum(alpha):
         raise InputError("alpha is no sum of hits", where=str(path))
@@ -172,8 +241,15 @@ def read_crossings(result: Path) -> Crossings:
     crossings = Crossings(*_read_layer(path, "crossings"))
     number = crossings.number
     if number.ndim != 2 or number.dtype.kind not in "iu":
-        raise InputError(f"crossings is {shape_text(number.shape)} {number.dtype}", where=str(path))
+        raise InputError(f"crossings is {number.shape} {number.dtype}", where=str(path))
     return crossings
+
+
+def _find_map(result: Path) -> Path:
+    """The folder in which the map of a result lies: of a session of a place, that of the place."""
+    home = Path(os.path.abspath(result)).parent
+    is_session = home.name == "sessions" and (home.parent / SESSIONS).is_file()
+    return home.parent if is_session else result
 
 
 def _read_layer(path: Path, name: str) -> tuple[NDArray[Any], Origin, float]:
@@ -184,18 +260,13 @@ def _read_layer(path: Path, name: str) -> tuple[NDArray[Any], Origin, float]:
         resolution = float(edge)
     except (TypeError, ValueError) as error:
         raise InputError(f"is damaged: {error}", where=str(path)) from error
-    inside = np.abs((x, y, yaw)) < _MAX_ORIGIN
+    inside = np.abs((x, y, yaw)) < MAX_TRANSLATION
     if not (inside.all() and _MIN_RESOLUTION < resolution < _MAX_RESOLUTION):
         raise InputError("origin or resolution is no usable number", where=str(path))
     return layer, (x, y, yaw), resolution
 
 
-def moved(T: Float, points: Float) -> Float:
-    return np.asarray(points @ T[:2, :2].T + T[:2, 2])
-
-
-_MAX_OBJECTS = 256 << 20  # bytes of an objects.json
-_MAX_ID = 2**31 - 1  # as messages of ROS hold it
+# objects
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,6 +298,31 @@ class Track(ShortRepr):
     p_identity: float | None = None
 
 
+@dataclass(frozen=True)
+class _Positions:
+    """`track` of an entry of `objects.json`."""
+
+    stamp_ns: list[Stamp]
+    x: list[float]
+    y: list[float]
+    vx: list[float]
+    vy: list[float]
+    z: list[float] | None = None
+
+
+@dataclass(frozen=True)
+class _Object:
+    """An entry of `objects.json`."""
+
+    id: Annotated[int, Ge(0), Le(2**31 - 1)]  # as messages of ROS hold it
+    size: tuple[float, float] | tuple[float, float, float]
+    track: _Positions
+    beams: int | None = None
+    p_dynamic: float | None = None
+    p_identity: float | None = None
+    session: str = ""
+
+
 def read_tracks(path: Path) -> list[Track]:
     """Reads the tracks of `objects.json`; empty where the file is missing.
 
@@ -235,30 +331,190 @@ def read_tracks(path: Path) -> list[Track]:
     """
     if not os.path.lexists(path):
         return []
+    objects = parse(read_json(path, _MAX_OBJECTS), list[_Object], path)
     try:
-        return [_track(one) for one in read_json(path, _MAX_OBJECTS)]
-    except (ValueError, TypeError, KeyError, OverflowError) as error:
-        raise InputError(f"is damaged: {error!r}", where=str(path)) from error
+        return [_to_track(one) for one in objects]
+    except ValueError as error:
+        raise InputError(f"is damaged: {error}", where=str(path)) from error
 
 
-def _track(one: dict[str, Any]) -> Track:
-    track = one["track"]
-    stamp_ns = np.array(track["stamp_ns"], np.int64)
-    x, y, vx, vy = (np.array(track[name], np.float64) for name in ("x", "y", "vx", "vy"))
-    numbers = np.stack([x, y, vx, vy], axis=-1)
-    z = np.array(track["z"], np.float64) if "z" in track else None
-    size = tuple(float(metres) for metres in one["size"])
-    if len(size) != (2 if z is None else 3):
-        raise ValueError(f"a size of {len(size)} lengths")
-    if len(numbers) != len(stamp_ns) or not len(stamp_ns) or (z is not None and z.shape != x.shape):
+def _to_track(one: _Object) -> Track:
+    track = one.track
+    numbers = np.stack([np.array(c, np.float64) for c in (track.x, track.y, track.vx, track.vy)], 1)
+    z = None if track.z is None else np.array(track.z)
+    if len(numbers) != len(track.stamp_ns) or not len(numbers):
         raise ValueError("columns of unequal length")
-    if not np.isfinite([*numbers.ravel(), *size, *([] if z is None else z)]).all():
+    if not np.isfinite([*numbers.ravel(), *one.size, *([] if z is None else z)]).all():
         raise ValueError("a number is not finite")
-    if not 0 <= int(one["id"]) <= _MAX_ID:
-        raise ValueError(f"an id of {one['id']}")
-    beams = None if one.get("beams") is None else int(one["beams"])
-    p_dynamic = None if one.get("p_dynamic") is None else float(one["p_dynamic"])
-    p_identity = None if one.get("p_identity") is None else float(one["p_identity"])
-    xy, velocity, session = numbers[:, :2], numbers[:, 2:], str(one.get("session", ""))
-    known = (beams, p_dynamic, session, p_identity)
-    return Track(int(one["id"]), size, stamp_ns, xy, velocity, z, *known)
+    if len(one.size) != (2 if z is None else 3) or (z is not None and len(z) != len(numbers)):
+        raise ValueError(f"a size of {len(one.size)} lengths")
+    stamp_ns, xy, velocity = np.array(track.stamp_ns, np.int64), numbers[:, :2], numbers[:, 2:]
+    known = (one.beams, one.p_dynamic, one.session, one.p_identity)
+    return Track(one.id, one.size, stamp_ns, xy, velocity, z, *known)
+
+
+# run.json
+
+
+@dataclass(frozen=True)
+class _Quality:
+    overall: float | None = None
+    labels: float | None = None
+    geometry: float | None = None
+
+
+@dataclass(frozen=True)
+class _Run:
+    """What is read of `run.json`."""
+
+    input: dict[str, Any]
+    options: dict[str, dict[str, Any] | Any] | None = None
+    warnings: list[str] | None = None
+    quality: _Quality | None = None
+    dimension: int | None = None
+
+
+@dataclass(frozen=True)
+class RunRecord(ShortRepr):
+    """The record of a result.
+
+    Attributes:
+        folder: of the result.
+        record: the content of its run.json.
+    """
+
+    folder: Path
+    record: dict[str, Any]
+
+    @property
+    def options(self) -> Options:
+        """Every option as it was resolved for the map.
+
+        Raises:
+            InputError: the record has options that this version does not know.
+        """
+        return self._override(Options(), self.record.get("options") or {})
+
+    @property
+    def read_options(self) -> ReadOptions:
+        """The options with which its recording was read: the same beams have the same numbers.
+
+        Raises:
+            InputError: the record does not say so.
+        """
+        read_as = self._section("read")
+        if not read_as:
+            raise InputError("names no options", where=str(self.folder / RECORD))
+        return self._override(ReadOptions(), read_as)
+
+    @property
+    def slam_options(self) -> SlamOptions:
+        """The options that deskew its recording as it was deskewed for the map."""
+        return SlamOptions(deskew=self._section("slam").get("deskew") is not False)
+
+    @property
+    def texture_quality(self) -> int:
+        """JPEG quality of the texture pages; the default where the record does not have it."""
+        quality = self._section("mesh").get("texture_quality")
+        return self._override(MeshOptions(), {"texture_quality": quality}).texture_quality
+
+    @property
+    def quality(self) -> Quality:
+        """Quality of the result; unknown where the record does not say so."""
+        return Quality(**(self.record.get("quality") or {}))
+
+    @property
+    def region(self) -> Region | None:
+        """The part of the map frame that it shows; None: everything."""
+        region = self._section("output").get("region")
+        return self._override(OutputOptions(), {"region": region}).region
+
+    @property
+    def frame(self) -> LocalFrame:
+        """The frame in which it was computed.
+
+        Raises:
+            InputError: the record has an origin that cannot be.
+        """
+        return self.read_frame(LOCAL_ORIGIN)
+
+    def read_frame(self, name: str) -> LocalFrame:
+        """The frame whose origin (3,) is the entry of a name; without one the map frame.
+
+        Raises:
+            InputError: it is no place.
+        """
+        if self.record.get(name) is None:
+            return LocalFrame()
+        origin = parse(self.record[name], tuple[float, float, float], self.folder / RECORD)
+        if not (np.abs(origin) < MAX_TRANSLATION).all():
+            raise InputError(f"{name} is no place", where=str(self.folder / RECORD))
+        return LocalFrame(np.array(origin))
+
+    @property
+    def map_mode(self) -> MapMode:
+        """Mode of its map image; the default where the record does not say."""
+        mode = self._section("output").get("map_mode")
+        return self._override(OutputOptions(), {"map_mode": mode}).map_mode
+
+    @property
+    def dimension(self) -> int:
+        """Dimension of its recording, 2 or 3."""
+        noted = self.record.get("dimension")  # of a session of a place
+        if noted in (2, 3):
+            return int(noted)
+        return 3 if (self.folder / "static.ply").is_file() else 2
+
+    @property
+    def extends_map(self) -> bool:
+        """True if its clouds hold what its recording does not show: it extends a known map."""
+        return self.record["input"].get(EXTENDS) is True
+
+    @property
+    def n_sensors(self) -> int:
+        """Number of sensors of its recording that the record lists, at least 1."""
+        sensors = self.record["input"].get("sensors")
+        return max(len(sensors), 1) if isinstance(sensors, list) else 1
+
+    def _section(self, name: str) -> dict[str, Any]:
+        """A section of the options in the record; empty where there is none."""
+        section = (self.record.get("options") or {}).get(name)
+        return section if isinstance(section, dict) else {}
+
+    def _override(self, options: T, changes: dict[str, Any]) -> T:
+        """The options with those of the record that are set."""
+        try:
+            return config.override(options, _drop_unset(changes))
+        except InputError as error:
+            where = str(self.folder)
+            raise InputError(f"has options that cannot be: {error}", where=where) from error
+
+
+def _drop_unset(changes: dict[str, Any]) -> dict[str, Any]:
+    """Nested options without those that are None."""
+    return {
+        key: _drop_unset(value) if isinstance(value, dict) else value
+        for key, value in changes.items()
+        if value is not None
+    }
+
+
+def read_region(result: Path) -> Region | None:
+    """The part of the map frame that a result shows; None: everything, or the record is missing.
+
+    Raises:
+        InputError: the record is damaged.
+    """
+    return RunRecord(result, read_run(result)).region if is_result(result) else None
+
+
+def read_run(result: Path) -> dict[str, Any]:
+    """The `run.json` of a result folder.
+
+    Raises:
+        InputError: it is missing or damaged.
+    """
+    path = result / RECORD
+    record = read_record(path, HINT)
+    parse(record, _Run, path)
+    return record

@@ -1,20 +1,61 @@
-"""The public result of mapping: what it can do, whether just built or loaded from its folder."""
+"""`stillmap.Result`: a mapped place of one session or several, just made or loaded."""
+
+# signatures name ArrayLike instead of spelling it out
+from __future__ import annotations
 
 import os
+import shutil
+import weakref
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from stillmap.core.errors import import_extra
-from stillmap.pipeline.result import MappingResult
+from stillmap.core import config, se2
+from stillmap.core.errors import InputError, import_extra
+from stillmap.core.files import atomic_folder
+from stillmap.core.grid_map import GridMap
+from stillmap.core.input_files import copy_file
+from stillmap.core.profiling import Progress, StageTimer, no_progress
+from stillmap.core.progress_bar import show_bar
+from stillmap.core.recording import Recording
+from stillmap.io.trajectory import read_tum
+from stillmap.pipeline import inputs
+from stillmap.pipeline.options import DEFAULTS, Options
+from stillmap.pipeline.quality import Quality
+from stillmap.pipeline.result import MappingResult, map_recording
+from stillmap.prepare.beam_times import add_beam_times
+from stillmap.results.folder import ResultFolder, match_labels, open_result
 from stillmap.results.plot import plot_result, summarize_as_html
-from stillmap.results.result_data import ResultData
+from stillmap.results.reader import (
+    RECORD,
+    SESSIONS,
+    TILTING,
+    Labels,
+    Track,
+    is_place,
+    read_grid,
+    read_labels,
+    read_run,
+    read_tracks,
+)
 from stillmap.results.run_json import run_record
-from stillmap.results.save import save
 from stillmap.results.tables import TableName, make_table
+from stillmap.results.timeline import (
+    PlaceSession,
+    SessionChange,
+    read_changes,
+    read_sessions,
+    read_states,
+)
+from stillmap.results.writer import save
+from stillmap.slam import deskew_recording
+from stillmap.tracking import MovingObject
 
 if TYPE_CHECKING:
     import pandas
@@ -23,23 +64,186 @@ if TYPE_CHECKING:
 
     from stillmap.mesh.build import Models
 
+Float = NDArray[np.float64]
+PathLike: TypeAlias = str | os.PathLike[str]
+Source: TypeAlias = Recording | PathLike | Sequence[PathLike]
 
-class Result(ResultData):
-    """A mapped recording of T scans with M beams in D dimensions.
 
-    `stillmap.build` makes a `BuiltResult`, `stillmap.load` opens a `SavedResult`; both have what
-    stands here.
+@dataclass(eq=False, repr=False)
+class Result:
+    """A mapped place: T scans with M beams in D dimensions, of one session or several.
+
+    Of several, poses, stamps and labels are those of the sessions one after the other. One that was
+    just built also has the attributes of its `mapping`.
+
+    Attributes:
+        map: of what is static: `p_occupied` (H, W), `origin`, `resolution` in m.
+        poses: (T, D+1, D+1) T_map_base.
+        stamp_ns: (T,) stamps of the scans in nanoseconds.
+        p_static: (M,) P(c = 1); NaN: unusable, the prior at maximum range.
+        hit: (M,) whether a beam ended on something.
+        objects: movers: `id`, `stamp_ns` (L,), `xy`, `velocity` (L, 2), `size`, `p_dynamic`,
+            `p_identity`.
+        sessions: that were merged, accepted or not, in the order in which they were given.
+        changes: what changed between sessions, in the order of time.
+        mapping: what was just built, which has more than the folder keeps; None: it was loaded.
+        folder: that it was loaded from; None: it was built.
+        source: the recording, its path or those of its parts, where it was given; None: as the
+            record says.
     """
 
+    map: GridMap
+    poses: Float
+    stamp_ns: NDArray[np.int64]
+    p_static: NDArray[np.float32]
+    hit: NDArray[np.bool_]
+    objects: Sequence[MovingObject | Track]
+    sessions: list[PlaceSession]
+    changes: list[SessionChange]
+    mapping: MappingResult | None = None
+    folder: ResultFolder | None = None
+    source: Recording | str | Sequence[PathLike] | None = None
+
+    @classmethod
+    def of(cls, mapping: MappingResult) -> Result:
+        """A recording that was just mapped."""
+        recording = mapping.recording
+        return cls(
+            map=mapping.map,
+            poses=mapping.poses,
+            stamp_ns=recording.stamp_ns,
+            p_static=mapping.p_static,
+            hit=recording.hit,
+            objects=mapping.objects,
+            sessions=[_only_session(recording.source, recording.stamp_ns, mapping.poses)],
+            changes=[],
+            mapping=mapping,
+        )
+
+    def __getattr__(self, name: str) -> Any:
+        mapping = None if name.startswith("__") else self.__dict__.get("mapping")
+        if mapping is None:
+            raise AttributeError(f"a {type(self).__name__} has no {name}")
+        return getattr(mapping, name)
+
+    @property
+    def path(self) -> Path | None:
+        """The folder that it was loaded from; None: it was built."""
+        return None if self.folder is None else self.folder.folder
+
+    @property
+    def run(self) -> dict[str, Any]:
+        """The content of `run.json`."""
+        return self._loaded.record if self.mapping is None else run_record(self.mapping)
+
+    @property
+    def quality(self) -> Quality:
+        """Of labels and geometry, from 0 to 100; None where it cannot be told."""
+        return self._loaded.quality if self.mapping is None else self.mapping.quality
+
+    @property
+    def warnings(self) -> list[str]:
+        """One sentence each."""
+        if self.mapping is not None:
+            return self.mapping.warnings
+        return list(self.run.get("warnings") or [])
+
+    @property
+    def options(self) -> Options:
+        """Every option as resolved.
+
+        Raises:
+            InputError: this version does not know them.
+        """
+        return self._loaded.options if self.mapping is None else self.mapping.options
+
+    @cached_property
+    def recording(self) -> Recording:
+        """The recording as it was mapped; of one that was loaded, read when it is first used.
+
+        Raises:
+            InputError: it is not there, is not the one that was mapped, or there are several.
+        """
+        if self.mapping is not None:
+            return self.mapping.recording
+        folder = self._loaded
+        if len(self._stretches()) > 1:
+            hint = "load_session(NAME).recording is that of one session"
+            raise InputError("is a place of several recordings", where=str(self.path), hint=hint)
+        if isinstance(self.source, Recording):
+            mapped = match_labels(self.source, read_labels(folder.folder), "recording")
+            # read from a file, it would have them already
+            recording = add_beam_times(mapped, folder.read_options.spin)
+        else:
+            recording, _ = open_result(folder.folder, self.source).read()
+        if recording.dimension != self.poses.shape[-1] - 1:
+            what = f"is in {recording.dimension}D, another dimension than the result"
+            raise InputError(what, where="recording")
+        return folder.calibrate(recording)
+
+    @property
+    def deskewed(self) -> Recording:
+        """The recording without the motion during its scans, computed at every call."""
+        if self.mapping is not None:
+            return self.mapping.deskewed
+        return deskew_recording(self.recording, self.poses, self._loaded.slam_options)
+
+    def load_session(self, name: str, *, recording: Source | None = None) -> Result:
+        """One session as a result, in the frame of the place and with its map.
+
+        Args:
+            name: of an accepted session.
+            recording: as of `stillmap.load`.
+
+        Raises:
+            InputError: there is no such session, or a file of it is missing or damaged.
+        """
+        known = [one.name for one in self.sessions if one.accepted]
+        if name not in known:
+            hint = f"there are {', '.join(known)}"
+            raise InputError(f"has no session {name}", where=str(self.path), hint=hint)
+        if len(known) == 1 or self.path is None:
+            return self
+        return load(self.path / "sessions" / name, recording=recording)
+
+    def save(
+        self, path: PathLike, *, overwrite: bool = False, models: Models | None = None
+    ) -> None:
+        """Write the folder, complete or not at all; `stillmap.load` opens it.
+
+        Args:
+            path: the folder; must not exist or be empty unless `overwrite`.
+            overwrite: replace an earlier result.
+            models: the meshes that `build_models` made of a result that was just built.
+
+        Raises:
+            InputError: the folder is taken or cannot be written, or lies in the result.
+        """
+        target = Path(path)
+        if self.mapping is not None:
+            save(self.mapping, target, overwrite, models=models)
+            return
+        source = self._loaded.folder
+        if source.resolve() in (target.resolve(), *target.resolve().parents):
+            raise InputError("is the result itself, or inside", where=str(target))
+        with atomic_folder(target, RECORD, overwrite) as folder:
+            shutil.copytree(source, folder, dirs_exist_ok=True, copy_function=copy_file)
+
     def plot(
-        self, ax: "Axes | None" = None, *, trajectory: bool = True, dynamic: bool = False
-    ) -> "Axes":
+        self,
+        ax: Axes | None = None,
+        *,
+        trajectory: bool = True,
+        dynamic: bool = False,
+        changes: bool = True,
+    ) -> Axes:
         """Draw the map with matplotlib, in metres.
 
         Args:
             ax: axes to draw into; None: new ones.
-            trajectory: draw the way of the robot.
-            dynamic: draw returns from what moves; a saved result reads its recording for it.
+            trajectory: draw the way of the robot in each session.
+            dynamic: draw returns from what moves; reads recordings for it.
+            changes: draw boxes around what changed between sessions.
 
         Returns:
             The axes.
@@ -47,9 +251,9 @@ class Result(ResultData):
         Raises:
             MissingExtra: matplotlib is not installed.
         """
-        return plot_result(self, ax, trajectory=trajectory, dynamic=dynamic)
+        return plot_result(self, ax, trajectory=trajectory, dynamic=dynamic, changes=changes)
 
-    def to_arrow(self, table: TableName = "beams") -> "pyarrow.Table":
+    def to_arrow(self, table: TableName = "beams") -> pyarrow.Table:
         """One of the result's tables.
 
         Args:
@@ -63,7 +267,7 @@ class Result(ResultData):
         """
         return make_table(self, table)
 
-    def to_dataframe(self, table: TableName = "beams") -> "pandas.DataFrame":
+    def to_dataframe(self, table: TableName = "beams") -> pandas.DataFrame:
         """A table of `to_arrow` as a pandas DataFrame.
 
         Raises:
@@ -74,52 +278,207 @@ class Result(ResultData):
         return self.to_arrow(table).to_pandas()
 
     def __repr__(self) -> str:
-        n, notes = len(self.objects), len(self.warnings)
+        n, notes, m = len(self.objects), len(self.warnings), len(self.changes)
+        placed, given = len(self._stretches()), len(self.sessions)
+        of = f"{placed} of {given} sessions with " if given > 1 else ""
+        between = f"{m} change{'s' * (m != 1)} between them, " if given > 1 else ""
         return (
-            f"<{type(self).__name__}: {len(self.stamp_ns)} scans with {len(self.p_static)} beams, "
-            f"{n} moving object{'s' * (n != 1)}, {notes} warning{'s' * (notes != 1)}, {self.map}>"
+            f"<{type(self).__name__}: {of}{len(self.stamp_ns)} scans with {len(self.p_static)} "
+            f"beams, {n} moving object{'s' * (n != 1)}, {between}"
+            f"{notes} warning{'s' * (notes != 1)}, {self.map}>"
         )
 
     def _repr_html_(self) -> str:
         return summarize_as_html(self)
 
-
-@dataclass(frozen=True, eq=False, repr=False)
-class BuiltResult(MappingResult, Result):
-    """A recording that was just mapped; further fields are those of `MappingResult`."""
-
-    __repr__ = Result.__repr__
-
     @property
-    def stamp_ns(self) -> NDArray[np.int64]:
-        """(T,) stamps of the scans in nanoseconds."""
-        return self.recording.stamp_ns
+    def _loaded(self) -> ResultFolder:
+        assert self.folder is not None
+        return self.folder
 
-    @property
-    def hit(self) -> NDArray[np.bool_]:
-        """(M,) whether a beam ended on something."""
-        return self.recording.hit
+    def _stretches(self) -> list[slice]:
+        """The scans of each session that is in the place, in their order."""
+        placed = [one.scans for one in self.sessions if one.accepted]
+        return sorted(placed, key=lambda scans: int(scans.start))
 
-    @property
-    def run(self) -> dict[str, Any]:
-        """The content of `run.json`, computed at every call."""
-        return run_record(self)
 
-    def save(
-        self,
-        path: str | os.PathLike[str],
-        *,
-        overwrite: bool = False,
-        models: "Models | None" = None,
-    ) -> None:
-        """Write the result folder, complete or not at all; `stillmap.load` opens it.
+def _only_session(
+    source: Mapping[str, Any], stamp_ns: NDArray[np.int64], poses: Float
+) -> PlaceSession:
+    """The session of a result of one recording, whose frame is the map frame."""
+    path, D = source.get("path"), poses.shape[-1] - 1
+    path = path if isinstance(path, str) and path else None
+    times = (int(stamp_ns[0]), int(stamp_ns[-1])) if len(stamp_ns) else (0, 0)
+    return PlaceSession(
+        input_stem(Path(path)) if path else "session",
+        path,
+        True,
+        T_place_session=np.eye(D + 1),
+        covariance=np.zeros((3 * (D - 1), 3 * (D - 1))),
+        scans=slice(0, len(stamp_ns)),
+        first_ns=times[0],
+        last_ns=times[1],
+    )
 
-        Args:
-            path: the folder; must not exist or be empty unless `overwrite`.
-            overwrite: replace an earlier result.
-            models: the meshes that `build_models` made of this result; None: without.
 
-        Raises:
-            InputError: the folder is taken or cannot be written.
-        """
-        save(self, Path(path), overwrite, models=models)
+def input_stem(path: Path) -> str:
+    """The name of an input without endings."""
+    name = Path(os.path.abspath(path)).name
+    return name.split(".")[0] or name
+
+
+def build(
+    recording: Recording | PathLike | Sequence[PathLike],
+    options: Options | Mapping[str, Any] | None = None,
+    *,
+    resolution: float | None = None,
+    odometry: bool = True,
+    poses: ArrayLike | PathLike | None = None,
+    progress: bool | Progress = False,
+    scratch: PathLike | None = None,
+) -> Result:
+    """Map a recording: poses, P(static) of every beam, the map of what is static, what moved.
+
+    Models of a 3D recording are made by `stillmap.build_models`.
+
+    Args:
+        recording: a `Recording`, or the path of one in any format that `stillmap.read` reads, or
+            the paths of the parts of one run.
+        options: `Options`, or the options to change, as in `{"em.prior": 0.8, "threads": 1}`;
+            `stillmap config` prints all of them. None: the defaults.
+        resolution: metres, edge of a map cell, in 3D of a voxel; None: as the options say.
+        odometry: whether the recording's odometry is used.
+        poses: poses to keep instead of estimating them: (T, D+1, D+1) T_map_base, in 2D also
+            (T, 3) x, y (m), theta (rad); the path of a TUM trajectory; or "recording" for those
+            that the recording states.
+        progress: show a bar, in notebooks below the cell; or a function that is called with the
+            stage, the iteration (0: outside the loop), the work done, and of how much.
+        scratch: folder for arrays that are too large for memory; None: the system's temporary one.
+
+    Raises:
+        InputError: the recording or the trajectory cannot be read or mapped, or an option is
+            unknown or out of range.
+        ValueError: a recording without scans, poses of another shape.
+        OSError: the disk of `scratch` is full.
+
+    Examples:
+        >>> result = stillmap.build("log.bag", resolution=0.1)
+        >>> result.save("out")
+    """
+    chosen = to_options(options)
+    if resolution is not None:
+        edge = float(resolution)
+        chosen = config.override(chosen, {"slam": {"resolution": edge, "voxel_size": edge}})
+    stages, folder = StageTimer(), None if scratch is None else Path(scratch)
+    with report_to(progress, chosen.em.max_iterations) as report:
+        if not isinstance(recording, Recording):
+            with stages.measure("read"):
+                recording = inputs.read(
+                    recording, chosen.read, progress=_percent(report), scratch=folder
+                )
+        elif not recording.n_scans:
+            raise ValueError("recording: expected at least one scan")
+        if not odometry:
+            recording = recording.without_odometry()
+        kept = inputs.read_poses(poses, recording)
+        inputs.require_mappable(recording, chosen, kept)
+        return Result.of(
+            map_recording(
+                recording, chosen, poses=kept, progress=report, stages=stages, scratch=folder
+            )
+        )
+
+
+def load(path: PathLike, *, recording: Source | None = None) -> Result:
+    """Open a folder that `stillmap map`, `stillmap merge` or `save` wrote.
+
+    Args:
+        path: the folder of a result or of a place, or `sessions/NAME` in one.
+        recording: what was mapped, or where it lies now, all parts in order of time; None: where
+            it was then. It is read when it is first used, say for `deskewed` or the table of beams.
+
+    Raises:
+        InputError: there is no result, or a file of it is missing or damaged.
+
+    Examples:
+        >>> result = stillmap.load("out")
+        >>> result.plot()
+    """
+    folder, has_several = Path(path), is_place(Path(path))
+    if has_several and recording is not None:
+        hint = "load_session(NAME, recording=PATH) says where that of one session is"
+        raise InputError("is a place of several recordings", where=str(path), hint=hint)
+    record, labels = read_run(folder), read_labels(folder)
+    opened = ResultFolder(folder, record, Path(), recording is not None)
+    poses, changes = _read_poses(opened, labels), list[SessionChange]()
+    sessions = [_only_session(record["input"], labels.stamp_ns, poses)]
+    if has_several:
+        sessions = read_sessions(folder)
+        changes = read_changes(folder, read_states(folder)[1])
+    result = Result(
+        map=read_grid(folder),
+        poses=poses,
+        stamp_ns=labels.stamp_ns,
+        p_static=labels.p_static,
+        hit=labels.hit,
+        objects=read_tracks(folder / "objects" / "objects.json"),
+        sessions=sessions,
+        changes=changes,
+        folder=opened,
+        source=os.fspath(recording) if isinstance(recording, os.PathLike) else recording,
+    )
+    stretches = result._stretches()
+    ends = [0, *(scans.stop for scans in stretches)]
+    if [scans.start for scans in stretches] != ends[:-1] or ends[-1] != len(poses):
+        what = "is damaged: its scans are not those of the place"
+        raise InputError(what, where=str(folder / SESSIONS))
+    return result
+
+
+def _read_poses(opened: ResultFolder, labels: Labels) -> Float:
+    """(T, D+1, D+1) T_map_base."""
+    path = opened.folder / "trajectory.tum"
+    stamp_ns, poses = read_tum(path)
+    if not np.array_equal(stamp_ns, labels.stamp_ns):
+        what = f"has {len(stamp_ns)} poses, not one for each of {len(labels.stamp_ns)} scans"
+        raise InputError(what, where=str(path))
+    # a rig with a tilting laser writes clouds, but its map is that of the planar one
+    is_3d = opened.dimension == 3 and not (opened.folder / TILTING).is_dir()
+    return poses if is_3d else se2.project_to_plane(poses)
+
+
+def remove_with(result: Result, folder: Path) -> None:
+    """Remove a temporary folder when the result in it is no longer used."""
+    weakref.finalize(result, shutil.rmtree, folder, ignore_errors=True)
+
+
+def to_options(options: Options | Mapping[str, Any] | None) -> Options:
+    """The options that a caller gave: all of them, those to change, or none.
+
+    Raises:
+        InputError: there is no such option, or a value is out of range.
+    """
+    if options is None:
+        return DEFAULTS
+    if isinstance(options, Options):
+        return options
+    if isinstance(options, Mapping):
+        return config.override(DEFAULTS, config.nest(options))
+    raise TypeError(f"options: expected Options or a mapping, got {type(options).__name__}")
+
+
+@contextmanager
+def report_to(progress: bool | Progress, iterations: int) -> Iterator[Progress]:
+    """The callback that was given as `progress`, a bar, or nothing."""
+    if callable(progress):
+        yield progress
+    elif progress:
+        with show_bar(iterations) as bar:
+            yield bar
+    else:
+        yield no_progress
+
+
+def _percent(report: Progress) -> Any:
+    """Progress of reading, as a share, reported in percent."""
+    return lambda share: report("reading", 0, round(100.0 * share), 100)

@@ -1,25 +1,28 @@
 """`run.json`: the input, the resolved options, the iterations, counts, times and warnings."""
 
-from collections.abc import Mapping
-from pathlib import Path
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.array_folder import FORMAT_VERSION
 from stillmap.core.config import to_dict
-from stillmap.core.json import count_skipped, package_version, to_jsonable, write_json
+from stillmap.core.json import count_skipped, to_jsonable
+from stillmap.core.tiles import Layer, tiles_of
+from stillmap.core.json import package_version
 from stillmap.mapping import Change, Door
 from stillmap.mapping.beam_statistics import count_beams
 from stillmap.pipeline.estimate import IterationRecord
 from stillmap.pipeline.quality import Quality
 from stillmap.pipeline.result import MappingResult
-from stillmap.results.map_npz import known_area
 from stillmap.results.objects import MILLIMETRES
+from stillmap.results.reader import LOCAL_ORIGIN
 from stillmap.slam import BareStretch, LoopClosure
 from stillmap.slam.mount_calibration import UPSIDE_DOWN, Calibration, Parameter
 
 if TYPE_CHECKING:
     from stillmap.rig.build import TiltingResult
-
-FORMAT_VERSION = 1
 
 
 def run_record(result: MappingResult, more: Mapping[str, Any] | None = None) -> dict[str, Any]:
@@ -79,17 +82,16 @@ def quality_record(quality: Quality) -> dict[str, float | None]:
     return {name: getattr(quality, name) for name in ("overall", "labels", "geometry")}
 
 
-RECORD = "run.json"  # every result has it
-EXTENDS = "extends_map"  # of the input: the result holds what still stands of a known map, too
-LOCAL_ORIGIN = "local_origin"  # its entry, where what it was computed in was not the map frame
-TILTING = "tilting"  # its entry, and the folder, of 3D data of a rig's tilting laser
+def known_area(result: MappingResult) -> dict[str, float]:
+    """`known`: m2 of the map of which beams tell something; `thin`: of these on thin evidence."""
+    cell = float(result.map.resolution) ** 2
+    known = _count(result.map.p_occupied, lambda p: ~np.isnan(p))
+    thin = _count(result.evidence.thinly_observed, lambda thin: thin)
+    return {"known": round(cell * known, 6), "thin": round(cell * thin, 6)}
 
 
-def write_run_json(
-    path: Path, result: MappingResult, more: Mapping[str, Any] | None = None
-) -> None:
-    """Write `run_record` to `path`."""
-    write_json(path, run_record(result, more), indent=2)
+def _count(layer: Layer, select: Callable[[NDArray[Any]], NDArray[np.bool_]]) -> int:
+    return sum(int(np.count_nonzero(select(part))) for _, part in tiles_of(layer))
 
 
 def tilting_record(tilting: "TiltingResult") -> dict[str, Any]:

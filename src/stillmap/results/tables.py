@@ -13,12 +13,13 @@ from stillmap.core.local_frame import LocalFrame
 from stillmap.core.recording import Recording
 from stillmap.io.trajectory import pose_rows
 from stillmap.results.reader import Track
-from stillmap.results.result_data import ResultData
 from stillmap.tracking import MovingObject
 from stillmap.tracking.objects import mean_speed, track_length
 
 if TYPE_CHECKING:
     import pyarrow
+
+    from stillmap.results.result import Result
 
 Float = NDArray[np.float64]
 TableName = Literal["beams", "poses", "objects", "tracks"]
@@ -26,7 +27,7 @@ TableName = Literal["beams", "poses", "objects", "tracks"]
 _ROWS = 1 << 20  # of a part of the beams, approximately
 
 
-def make_table(result: ResultData, name: TableName) -> "pyarrow.Table":
+def make_table(result: "Result", name: TableName) -> "pyarrow.Table":
     """See `Result.to_arrow`.
 
     Raises:
@@ -108,7 +109,7 @@ def split_scans(recording: Recording) -> Iterator[slice]:
         first = end
 
 
-def _pose_columns(result: ResultData) -> dict[str, NDArray[Any]]:
+def _pose_columns(result: "Result") -> dict[str, NDArray[Any]]:
     """A row per scan: `stamp_ns`, `x`, `y` and `theta`, or in 3D `z` and a quaternion."""
     poses = result.poses
     if poses.shape[-1] == 4:
@@ -119,7 +120,7 @@ def _pose_columns(result: ResultData) -> dict[str, NDArray[Any]]:
     return {"stamp_ns": np.asarray(result.stamp_ns), **columns}
 
 
-def _object_columns(result: ResultData) -> dict[str, Any]:
+def _object_columns(result: "Result") -> dict[str, Any]:
     """A row per object: `id`, `first_stamp_ns`, `last_stamp_ns`, `length`, `width`, in 3D `height`
     (m), `distance` (m along its track), `speed` (m/s, mean), `beams`, `p_dynamic`, `p_identity`."""
     objects = result.objects
@@ -140,7 +141,7 @@ def _object_columns(result: ResultData) -> dict[str, Any]:
     }
 
 
-def _track_columns(result: ResultData) -> dict[str, NDArray[Any]]:
+def _track_columns(result: "Result") -> dict[str, NDArray[Any]]:
     """A row per position of an object: `id`, `stamp_ns`, `x`, `y`, in 3D `z`, `vx`, `vy`."""
     objects = result.objects
     columns: dict[str, list[Any]] = {

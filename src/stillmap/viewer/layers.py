@@ -10,6 +10,7 @@ from stillmap.core.arrays import sample_indices
 from stillmap.mesh.texture.atlas import GRAY
 from stillmap.results import gltf
 from stillmap.results.colors import (
+    BACKGROUND,
     BLUE,
     ORANGE,
     TEAL,
@@ -17,7 +18,6 @@ from stillmap.results.colors import (
     color_by_p_static,
     color_static,
 )
-from stillmap.results.report.renderer import BACKGROUND
 from stillmap.viewer.beams import Beams
 from stillmap.viewer.display import Points
 from stillmap.viewer.nodes import NO_SHADOWS, Nodes, node_path

@@ -4,7 +4,6 @@ import html
 import math
 from collections.abc import Sequence
 
-from stillmap.places.pictures import KIND_COLORS
 from stillmap.results.colors import (
     BLUE,
     GREY,
@@ -16,6 +15,7 @@ from stillmap.results.colors import (
     color_by_id,
 )
 from stillmap.results.report.figures import UNKNOWN
+from stillmap.results.report.place import KIND_COLORS
 from stillmap.viewer.layers import HEIGHT, PICTURES, Layers
 from stillmap.viewer.shortcuts import KEYS, PLACE_KEYS
 from stillmap.viewer.text import TEXT_STYLE

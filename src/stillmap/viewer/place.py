@@ -9,9 +9,8 @@ from PIL import Image
 
 from stillmap.core.grid_map import GridMap
 from stillmap.io.trajectory import read_tum
-from stillmap.places.pictures import PlacePictures
-from stillmap.places.timeline import Timeline
-from stillmap.places.timeline_reader import read_timeline
+from stillmap.results.report.place import PlacePictures
+from stillmap.results.timeline import Timeline, read_timeline
 
 Float = NDArray[np.float64]
 

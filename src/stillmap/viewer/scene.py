@@ -15,10 +15,9 @@ from stillmap.core.json import read_json
 from stillmap.core.se2 import inverse
 from stillmap.io.trajectory import read_tum
 from stillmap.pipeline.snapshots import Window
-from stillmap.places.inputs import is_place
 from stillmap.results import gltf
 from stillmap.results.object_poses import interpolate_pose
-from stillmap.results.reader import Grid, Track, read_grid, read_tracks
+from stillmap.results.reader import Grid, Track, is_place, read_grid, read_tracks
 from stillmap.results.report.figures import UNKNOWN, draw_map, map_window
 from stillmap.viewer.display import Points, sample_ply
 from stillmap.viewer.place import ViewedPlace, read_viewed_place

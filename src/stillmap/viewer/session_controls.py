@@ -43,7 +43,7 @@ class SessionControls:
         self._slider.value = session + 1
         self._title.content = f"**{escape_markdown(timeline.title(session))}**"
         changes = self._nodes.changes
-        rows = [(one.label, f"{one.kind}, {_place_of(one.low, one.high)}") for one in changes]
+        rows = [(one.label, f"{one.kind}, {_place_of(*one.boxes[0])}") for one in changes]
         more = len(rows) - _MAX_ROWS
         rows = [*rows[:_MAX_ROWS], ("", f"and {more} more")] if more > 0 else rows
         none = "it is the first session" if session == 0 else "nothing"

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.arrays import sample_indices
-from stillmap.places.pictures import KIND_COLORS
-from stillmap.places.timeline import ChangeRecord
 from stillmap.results.colors import color_by_id
 from stillmap.results.object_poses import ObjectPoses
+from stillmap.results.report.place import KIND_COLORS
+from stillmap.results.timeline import SessionChange
 from stillmap.viewer.nodes import Nodes, node_path
 from stillmap.viewer.place import ViewedPlace
 from stillmap.viewer.tracks import box_edges
@@ -51,7 +51,7 @@ class SessionNodes:
         self.session = len(place) - 1
 
     @property
-    def changes(self) -> list[ChangeRecord]:
+    def changes(self) -> list[SessionChange]:
         """The changes since the session before."""
         return self._place.timeline.changes_at(self.session)
 
@@ -97,7 +97,7 @@ class SessionNodes:
                 drawn = np.concatenate(outlines) - self._nodes.origin(3)
                 node.points = drawn.astype(np.float32)
 
-    def _draw_labels(self, changes: list[ChangeRecord]) -> None:
+    def _draw_labels(self, changes: list[SessionChange]) -> None:
         """Labels are created on demand and reused."""
         while len(self._labels) < len(changes):
             path = node_path("Change labels", f"{len(self._labels)}")
@@ -106,17 +106,18 @@ class SessionNodes:
             label.visible = n < len(changes)
             if label.visible:
                 label.text = f"{changes[n].label} {changes[n].kind}"
-                low, high = (_in_space(of) for of in (changes[n].low, changes[n].high))
+                low, high = (_in_space(of) for of in changes[n].boxes[0])
                 middle = 0.5 * (low + high)
                 label.position = np.array([middle[0], high[1], high[2]]) - self._nodes.origin(4)
 
 
-def _outline(change: ChangeRecord, height: float) -> Float:
+def _outline(change: SessionChange, height: float) -> Float:
     """Line segments (n, 2, 3) m of a change: its box; of what moved both boxes and an arrow."""
-    edges = _box_edges(change.low, change.high)
+    box, *earlier = change.boxes
+    edges = _box_edges(*box)
     out = [_make_dashes(edges, _DASHES[change.kind], height)]
-    if change.from_low is not None and change.from_high is not None:
-        start = _box_edges(change.from_low, change.from_high)
+    for before in earlier:
+        start = _box_edges(*before)
         out += [
             _make_dashes(start, _DASHES["from"], height),
             _arrow(start.mean((0, 1)), edges.mean((0, 1)), height),

@@ -298,11 +298,11 @@ def test_interrupted_on_full_disks_and_gone_on_with(room, result, tmp_path, monk
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr("stillmap.pipeline.models.build_models", interrupted)
+        patch.setattr("stillmap.results.models.build_models", interrupted)
         assert main(words) == 130
     assert [path.name for path in tmp_path.iterdir()] == [".out.resume"]
     with monkeypatch.context() as patch:
-        patch.setattr("stillmap.results.object_models.write_models", full)
+        patch.setattr("stillmap.results.models.write_models", full)
         assert main([*words, "--resume"]) == 2
     assert "No space left" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == [".out.resume"]

@@ -62,7 +62,7 @@ def test_colours_of_what_stands_still_are_the_true_ones(room, result):
 
 
 @pytest.fixture(scope="module")
-def told(room) -> Callable[..., tuple[stillmap.BuiltResult, np.ndarray]]:
+def told(room) -> Callable[..., tuple[stillmap.Result, np.ndarray]]:
     """The room with pictures of what is to be seen in place of colours: red is what moves; gives
     which beams have the colour of something that moves, and which any."""
     recording, truth = stillmap.read(room), load_image_truth(room)

@@ -17,7 +17,6 @@ from stillmap.core.tiles import release, tiles_of
 from stillmap.pipeline.snapshots import Snapshot, Value, Window, cut_layer, extent
 from stillmap.results.colors import ORANGE
 from stillmap.results.reader import OCCUPIED_THRESH
-from stillmap.results.report.curves import round_down
 
 Color = tuple[int, int, int]
 Mask = NDArray[np.bool_]
@@ -87,6 +86,12 @@ class MapView:
     def svg_points(self, points: NDArray[np.float64]) -> str:
         """The `points` attribute of a polyline through map points (K, 2)."""
         return " ".join(f"{x:.1f},{y:.1f}" for x, y in self.to_pixels(points).tolist())
+
+
+def round_down(value: float) -> float:
+    """The largest of 1, 2 and 5 times a power of ten that is at most `value` > 0."""
+    power = 10.0 ** math.floor(math.log10(value))
+    return max((step * power for step in (1, 2, 5) if step * power <= value), default=power)
 
 
 def map_window(maps: Sequence[GridMap]) -> Window:

@@ -5,6 +5,7 @@ import functools
 import hashlib
 import os
 import sys
+from collections.abc import Mapping
 from importlib.util import cache_from_source
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,7 +33,7 @@ from stillmap.results.report.objects import objects_data, rig_data
 if TYPE_CHECKING:
     from jinja2 import BytecodeCache, Environment
 
-    from stillmap.results.report.previews import ModelPreviews
+    from stillmap.mesh.build import Models
     from stillmap.rig.build import TiltingResult
 
 _TEMPLATES = Path(__file__).parent / "templates"
@@ -41,7 +42,7 @@ _TEMPLATES = Path(__file__).parent / "templates"
 def render_report(
     result: MappingResult,
     tilting: "TiltingResult | None" = None,
-    previews: "ModelPreviews | None" = None,
+    models: "Models | None" = None,
     folder: Path | None = None,
 ) -> str:
     """The page, of a few megabytes at most: no outside request, images and script inline.
@@ -49,7 +50,7 @@ def render_report(
     Args:
         result: the mapped recording.
         tilting: 3D data of a rig's second laser.
-        previews: renders of the models.
+        models: of the place and of moving objects.
         folder: the result folder, to whose files the page links; None: no links.
     """
     filtered = draw_filtered_map(result)
@@ -62,7 +63,7 @@ def render_report(
         "objects": objects_data(result, filtered),
         "points": _points_data(result, tilting),
         "rig": rig_data(tilting, filtered),
-        "models": _models_data(previews),
+        "models": None if models is None else _models_data(models),
         "fitted": fitted_data(result),
         "calibration": calibration_data(result),
         "convergence": convergence_data(result),
@@ -70,10 +71,14 @@ def render_report(
         "source": source_data(result),
         "stages": stages_data(result),
         "options": [(one.name, one.value) for one in iter_options(result.options)],
-        "version": package_version(),
-        **script_data(),
     }
-    return environment().get_template("report.html.j2").render(data)
+    return render_page("report.html.j2", data)
+
+
+def render_page(template: str, data: Mapping[str, Any]) -> str:
+    """A page from one of the templates."""
+    found = environment().get_template(template)
+    return found.render({**data, "version": package_version(), **script_data()})
 
 
 def _points_data(result: MappingResult, tilting: "TiltingResult | None") -> dict[str, Any] | None:
@@ -85,13 +90,15 @@ def _points_data(result: MappingResult, tilting: "TiltingResult | None") -> dict
     return points_data(result, tilting)
 
 
-def _models_data(previews: "ModelPreviews | None") -> dict[str, Any] | None:
-    """See `previews.models_data`, whose renderer is loaded only where there are models."""
-    if previews is None:
-        return None
-    from stillmap.results.report.previews import models_data
+def _models_data(models: "Models") -> dict[str, Any]:
+    """The record of the models, and why no image could texture anything; see `models_record`."""
+    from stillmap.results.models import models_record  # meshes take long to load
 
-    return models_data(previews)
+    record = models_record(models)
+    pictures = record["pictures"]
+    reasons = {**pictures["left_out"], "damaged": len(pictures["unread"])}
+    listed = "; ".join(f"{count:,}: {why}" for why, count in reasons.items() if count)
+    return {**record, "untextured_reason": "" if record["area_painted"] else listed}
 
 
 @functools.cache

@@ -11,11 +11,11 @@ from stillmap.mapping.beam_statistics import sample_dynamic_points, sample_stati
 from stillmap.pipeline.result import MappingResult
 from stillmap.results.colors import ORANGE, color_by_height
 from stillmap.results.report.figures import data_uri
-from stillmap.results.report.renderer import Float, camera_matrix, fit_camera
 
 if TYPE_CHECKING:
     from stillmap.rig.build import TiltingResult
 
+Float = NDArray[np.float64]
 Points = NDArray[np.float32]
 
 _SIZE = (1280, 720)  # pixels
@@ -31,6 +31,8 @@ _CEILING_DENSITY = 2.0  # times as many points as at the same thickness of wall 
 _WALL_BANDS = 3  # of that thickness, below the ceiling
 _BACKGROUND = (16, 20, 26)
 _JPEG_QUALITY = 88
+_NEAR = 0.05  # m, near plane
+_MARGIN = 1.05  # around fitted points
 
 
 def points_data(
@@ -124,3 +126,51 @@ def _choose_view(points: Points) -> Float:
     direction = np.array([math.cos(yaw), math.sin(yaw), math.tan(_ELEVATION)])
     K = camera_matrix(_SIZE, _FIELD_OF_VIEW)
     return fit_camera(inside if len(inside) else some, direction, K, _SIZE)
+
+
+def camera_matrix(size: tuple[int, int], field_of_view: float) -> Float:
+    """K (3, 3) of a (width, height) image with a horizontal field of view in rad.
+
+    Pixel centers have integer coordinates.
+    """
+    width, height = size
+    f = 0.5 * width / math.tan(0.5 * field_of_view)
+    return np.array([[f, 0.0, 0.5 * width - 0.5], [0.0, f, 0.5 * height - 0.5], [0.0, 0.0, 1.0]])
+
+
+def fit_camera(points: Float, direction: Float, K: Float, size: tuple[int, int]) -> Float:
+    """T_camera_map (4, 4) of the closest camera whose image contains all points (n, 3), centered.
+
+    In camera axes, with s the slope of the edge of the field of view, a point (x, y, z) is inside
+    the right edge of a camera at e if x - e_x <= s (z - e_z), and inside the left edge if
+    e_x - x <= s (z - e_z). The extreme points of both conditions bound e_z; likewise for y.
+
+    Args:
+        points: m.
+        direction: (3,) from the points towards the camera.
+        K: (3, 3) camera matrix.
+        size: width and height in pixels.
+    """
+    T = look_at(direction, np.zeros(3))
+    local = points @ T[:3, :3].T
+    slopes = 0.5 * np.array(size) / np.array([K[0, 0], K[1, 1]]) / _MARGIN
+    right = (local[:, :2] - slopes * local[:, 2:]).max(axis=0)
+    left = (-local[:, :2] - slopes * local[:, 2:]).max(axis=0)
+    z = min(float((-(left + right) / (2.0 * slopes)).min()), local[:, 2].min() - 2.0 * _NEAR)
+    eye = T[:3, :3].T @ np.array([*(0.5 * (right - left)), z])
+    return look_at(eye, eye - direction)
+
+
+def look_at(eye: Float, target: Float) -> Float:
+    """T_camera_map (4, 4) of a camera at `eye` (3,) that looks at `target` (3,).
+
+    Up in the image is z of the map, or y for a camera that looks straight down.
+    """
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    up = np.array([0.0, 0.0, 1.0]) if abs(forward[2]) < 0.999 else np.array([0.0, 1.0, 0.0])
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, :3] = right, np.cross(forward, right), forward
+    T[:3, 3] = -T[:3, :3] @ eye
+    return T

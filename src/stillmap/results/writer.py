@@ -3,29 +3,29 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.array_folder import write_arrays
 from stillmap.core.files import atomic_folder, write_text
+from stillmap.core.json import write_json
+from stillmap.core.recording import Recording
 from stillmap.core.grid_map import Region, limit_hits
-from stillmap.core.parallel import resolve_threads
 from stillmap.io.trajectory import write_tum
 from stillmap.pipeline.result import MappingResult
-from stillmap.results.labels import write_labels
-from stillmap.results.map_npz import write_map_npz
-from stillmap.results.map_server import write_map_server
+from stillmap.results.map_server import write_map_npz, write_map_server
 from stillmap.results.objects import write_objects, write_traffic
 from stillmap.results.points import write_clouds
 from stillmap.results.pose_graph_g2o import write_g2o
+from stillmap.results.reader import RECORD, TILTING
 from stillmap.results.region import crop_result, passes
 from stillmap.results.report.page import render_report
-from stillmap.results.run_json import RECORD, TILTING, tilting_record, write_run_json
+from stillmap.results.run_json import run_record, tilting_record
 
 if TYPE_CHECKING:
     from stillmap.mesh.build import Models
-    from stillmap.results.report.previews import ModelPreviews
     from stillmap.rig.build import TiltingResult
 
 
@@ -75,18 +75,46 @@ def save(
             _write_tilting(folder, tilting, colors, region)
             more[TILTING] = tilting_record(tilting)
         if models is not None:
-            from stillmap.results.object_models import models_record, write_models
+            from stillmap.results.models import models_record, write_models
 
             images = (result if tilting is None else tilting).recording.images
             count = 0 if images is None else len(images)
             write_models(folder, models, count, result.options.mesh.texture_quality)
             more["models"] = models_record(models)
-        write_run_json(folder / RECORD, result, more)
-        previews = None if models is None else _previews(models, result.options.threads)
-        page = render_report(result, tilting, previews, folder)
-        write_text(folder / "report.html", page)
+        write_text(folder / "report.html", render_report(result, tilting, models, folder))
         if write_more is not None:
             write_more(folder)
+        write_json(folder / RECORD, run_record(result, more), indent=2)
+
+
+def write_labels(
+    folder: Path,
+    recording: Recording,
+    p_static: NDArray[np.float32],
+    colors: NDArray[np.uint8] | None = None,
+) -> None:
+    """Writes `stamp_ns`, `offset`, `p_static` and `hit` as .npy files into the new `folder`.
+
+    Args:
+        folder: `beams/` of a result; it is made.
+        recording: T scans with M beams.
+        p_static: (M,) P(c = 1).
+        colors: (M, 3) of the end points, written as `colour`; None: without.
+
+    Raises:
+        ValueError: labels of another number of beams.
+    """
+    if p_static.shape != (recording.n_beams,):
+        raise ValueError(f"p_static: expected ({recording.n_beams},), got {p_static.shape}")
+    folder.mkdir()
+    arrays: dict[str, NDArray[Any] | None] = {
+        "stamp_ns": np.asarray(recording.stamp_ns, np.int64),
+        "offset": np.asarray(recording.offset, np.int64),
+        "p_static": np.asarray(p_static, np.float32),
+        "hit": np.asarray(recording.hit, np.bool_),
+        "colour": colors,
+    }
+    write_arrays(folder, arrays)
 
 
 def _write_tilting(
@@ -105,17 +133,3 @@ def _write_tilting(
     write_labels(inside / "beams", tilting.recording, tilting.p_static, colors)
     write_tum(inside / "trajectory.tum", tilting.recording.stamp_ns, tilting.poses)
     write_objects(inside / "objects", tilting)
-
-
-def _previews(models: "Models", threads: int) -> "ModelPreviews":
-    """Previews of the meshes for the report."""
-    from stillmap.results.report.previews import render_previews
-
-    return render_previews(
-        models.textured,
-        models.unfiltered,
-        np.array([view.T_camera_map for view in models.views]).reshape(-1, 4, 4),
-        {one.shape.id: one.textured for one in models.objects},
-        resolve_threads(threads),
-        models.left_out,
-    )

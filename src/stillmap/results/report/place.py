@@ -1,0 +1,434 @@
+"""`report.html` of a place of several sessions: pictures of its map, and the data of its page."""
+
+import math
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from stillmap.core.grid_map import GridMap
+from stillmap.io.trajectory import read_tum
+from stillmap.pipeline.options import MapMode
+from stillmap.pipeline.snapshots import Window, extent
+from stillmap.results.colors import color_by_id
+from stillmap.results.report.facts import files_data
+from stillmap.results.report.figures import (
+    MAX_PIXELS,
+    UNKNOWN_LEVEL,
+    MapView,
+    color_levels,
+    data_uri,
+    map_levels,
+    map_window,
+    reduction_factor,
+)
+from stillmap.results.report.maps import written_data
+from stillmap.results.report.page import render_page
+from stillmap.results.timeline import (
+    Kind,
+    PlaceSession,
+    SessionChange,
+    Timeline,
+    format_date_time,
+    read_timeline,
+)
+
+Float = NDArray[np.float64]
+Box = tuple[float, float, float, float]  # left, top, right, bottom
+
+# RGB of kinds of changes, told apart by color-blind readers too
+KIND_COLORS = {
+    "appeared": (20, 120, 60),
+    "gone": (190, 40, 120),
+    "moved": (40, 90, 200),
+    "door": (150, 92, 0),
+}
+_OCCUPIED_LEVEL = 100
+_CAME, _LEFT, _CLEAR = UNKNOWN_LEVEL + 2, UNKNOWN_LEVEL + 3, UNKNOWN_LEVEL + 4
+_MARGIN = 8  # cells around changed cells that a picture shows at least
+_MAX_PATH_POINTS = 1000  # of a session
+_THUMBNAIL_PIXELS = 60_000  # 300 x 200, about 5 kB as PNG
+_MAX_ROWS = 100  # changes listed and marked between two sessions
+_KINDS: tuple[Kind, ...] = get_args(Kind)
+# of one change and of several
+_WORDS = {
+    "appeared": ("appeared", "appeared"),
+    "gone": ("gone", "gone"),
+    "moved": ("moved", "moved"),
+    "door": ("door otherwise", "doors otherwise"),
+}
+_FILES = {
+    "sessions.json": "the sessions, and where each lies in the place",
+    "changes.json": "what changed between which sessions",
+    "changes.npz": "the cells of every change",
+    "states.npz": "changed cells and their states in every session",
+}
+_FONT_SHARE, _PAD_SHARE, _HEAD_SHARE = 1 / 45, 1 / 160, 1 / 60  # of the longer edge of the view
+_LETTER_WIDTH = 0.68  # of the size of the font
+
+
+def render_place_report(
+    folder: Path, occupancy: GridMap, mode: MapMode, record: Mapping[str, Any]
+) -> str:
+    """The page, of a few megabytes at most: no outside request, images and script inline.
+
+    Args:
+        folder: of the place, with all its other files but `run.json`.
+        occupancy: its map.
+        mode: how the map file is written.
+        record: the content of `run.json`.
+
+    Raises:
+        InputError: a file of the place is damaged.
+    """
+    timeline = read_timeline(folder, str(record["place"]["map_state"]))
+    pictures = PlacePictures(occupancy, timeline) if occupancy.p_occupied.size else None
+    data = {
+        "place": _place_data(timeline, record),
+        "maps": _map_data(folder, timeline, occupancy, mode, pictures),
+        "sessions": [_session_data(timeline, k) for k in range(len(timeline.sessions))],
+        "refused": timeline.refused,
+        "thumbnails": _thumbnails_data(occupancy, timeline),
+        "steps": [_step_data(timeline, k, pictures) for k in range(1, len(timeline.sessions))],
+        "kinds": [(kind, _WORDS[kind][0], KIND_COLORS[kind]) for kind in _KINDS],
+        "files": files_data(folder, _FILES),
+    }
+    return render_page("place.html.j2", data)
+
+
+def _place_data(timeline: Timeline, record: Mapping[str, Any]) -> dict[str, Any]:
+    """Headline figures."""
+    first, last = (
+        format_date_time(pick(getattr(one, f"{end}_ns") for one in timeline.sessions))
+        for pick, end in ((min, "first"), (max, "last"))
+    )
+    counts = record["counts"]
+    return {
+        "dimension": record["dimension"],
+        "first": first,
+        "last": last,
+        "counts": _count_kinds(timeline.changes),
+        "changes": len(timeline.changes),
+        "scans": counts["scans"],
+        "hits": counts["hits"],
+        "dynamic": counts["dynamic"],
+        "constraints": record["place"]["constraints"],
+        "area": record["area"]["known"],
+        "geometry": record["quality"]["geometry"],
+        "map_state": timeline.map_state,
+    }
+
+
+def _count_kinds(changes: list[SessionChange]) -> list[tuple[str, int]]:
+    """Words and number of each kind of which there are changes."""
+    counts = Counter(one.kind for one in changes)
+    return [(_WORDS[kind][counts[kind] > 1], counts[kind]) for kind in _KINDS if counts[kind]]
+
+
+def _map_data(
+    folder: Path,
+    timeline: Timeline,
+    occupancy: GridMap,
+    mode: MapMode,
+    pictures: "PlacePictures | None",
+) -> dict[str, Any] | None:
+    """The map as written with the trajectories; None for a map without cells."""
+    if pictures is None:
+        return None
+    view = pictures.view
+    return {
+        "view": view,
+        "image": data_uri(pictures.draw_map()),
+        "meters": tuple(n * occupancy.resolution for n in occupancy.p_occupied.shape[::-1]),
+        "cell": occupancy.resolution,
+        "written": written_data(occupancy, mode, view),
+        "font_size": max(view.size) / 45,
+        "paths": [_path_data(folder, one, k, view) for k, one in enumerate(timeline.sessions)],
+    }
+
+
+def _path_data(folder: Path, one: PlaceSession, number: int, view: MapView) -> dict[str, Any]:
+    _, poses = read_tum(folder / "sessions" / one.name / "trajectory.tum")
+    every = max(1, math.ceil(len(poses) / _MAX_PATH_POINTS))
+    points: NDArray[np.float64] = poses[::every, :2, 3]
+    return {
+        "points": view.svg_points(points),
+        "start": view.to_pixels(points[:1])[0].tolist(),
+        "color": _session_color(number),
+    }
+
+
+def _session_color(number: int) -> tuple[int, int, int]:
+    red, green, blue = color_by_id([number])[0].tolist()
+    return red, green, blue
+
+
+def _session_data(timeline: Timeline, number: int) -> dict[str, Any]:
+    one = timeline.sessions[number]
+    T = one.T_place_session
+    assert T is not None
+    position = ", ".join(f"{v:.2f}" for v in T[:-1, -1])
+    return {
+        "name": one.name,
+        "input": one.input,
+        "color": _session_color(number),
+        "date": format_date_time(one.first_ns),
+        "seconds": 1e-9 * (one.last_ns - one.first_ns),
+        "overlap": one.overlap,
+        "position": position,
+        # + 0.0 turns a negative zero into zero
+        "heading": round(math.degrees(math.atan2(T[1, 0], T[0, 0])), 1) + 0.0,
+    }
+
+
+def _thumbnails_data(occupancy: GridMap, timeline: Timeline) -> list[dict[str, Any]]:
+    """A small picture of the map as of every session."""
+    if not occupancy.p_occupied.size:
+        return []
+    pictures = PlacePictures(occupancy, timeline, _THUMBNAIL_PIXELS)
+    return [
+        {
+            "view": pictures.view,
+            "image": data_uri(pictures.draw(k)),
+            "name": one.name,
+            "date": timeline.date(k),
+            "counts": _count_kinds(timeline.changes_at(k)),
+        }
+        for k, one in enumerate(timeline.sessions)
+    ]
+
+
+def _step_data(timeline: Timeline, number: int, pictures: "PlacePictures | None") -> dict[str, Any]:
+    """The changes from the session before to one, in a table and on the map."""
+    before, after = (timeline.sessions[k] for k in (number - 1, number))
+    changes = timeline.changes_at(number)
+    listed = changes[:_MAX_ROWS]
+    data: dict[str, Any] = {
+        "number": number,
+        "names": (before.name, after.name),
+        "dates": (timeline.date(number - 1), timeline.date(number)),
+        "counts": _count_kinds(changes),
+        "total": len(changes),
+        "rows": [_change_row(one, timeline) for one in listed],
+        "marks": None,
+    }
+    if pictures is not None and changes:
+        patch = pictures.draw_difference(number)
+        data["marks"] = place_marks(listed, pictures.view)
+        data["patch"] = (
+            None if patch is None else (*patch[:2], *patch.image.size, data_uri(patch.image))
+        )
+    return data
+
+
+def _change_row(change: SessionChange, timeline: Timeline) -> dict[str, Any]:
+    def center(low: Float, high: Float) -> str:
+        return ", ".join(f"{v:.2f}" for v in 0.5 * (low + high))
+
+    (low, high), *earlier = change.boxes
+    names = [one.name for one in timeline.sessions]
+    before, after = (names.index(name) for name in change.between)
+    return {
+        "label": change.label,
+        "kind": change.kind,
+        "center": center(low, high),
+        "start": center(*earlier[0]) if earlier else "",
+        "size": " x ".join(f"{v:.2f}" for v in high - low),
+        "since": "" if before == after - 1 else change.between[0],
+        "probability": change.probability,
+    }
+
+
+class Patch(NamedTuple):
+    """A part of a picture: column and row of its upper left pixel."""
+
+    left: int
+    top: int
+    image: Image.Image
+
+
+class PlacePictures:
+    """Draws the map of a place as of its sessions.
+
+    Attributes:
+        view: window and size of the pictures.
+    """
+
+    def __init__(self, occupancy: GridMap, timeline: Timeline, max_pixels: int = MAX_PIXELS):
+        """Draw the map as it was written.
+
+        Args:
+            occupancy: the map of the place, with at least one cell.
+            timeline: of the place.
+            max_pixels: of a picture.
+        """
+        cells, self._timeline = timeline.cells, timeline
+        window = _window_of(occupancy, timeline)
+        factor = reduction_factor(window, occupancy.resolution, max_pixels)
+        at = np.floor((cells.centers - np.array(window[:2])) / occupancy.resolution)
+        local = at.astype(np.int64)
+        self._levels = map_levels(occupancy, window, max_pixels=max_pixels)
+        self._cleared = map_levels(occupancy, window, local, max_pixels)
+        height, width = self._levels.shape
+        self.view = MapView(window, (width, height), factor > 1)
+        row, column = height - 1 - local[:, 1] // factor, local[:, 0] // factor
+        inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+        self._drawn = np.flatnonzero(inside)
+        self._row, self._column = row[inside], column[inside]
+
+    def draw_map(self) -> Image.Image:
+        """The map as it was written."""
+        return color_levels(self._levels)
+
+    def draw(self, session: int) -> Image.Image:
+        """The map as of a session, in color what came and left since the one before."""
+        colors = KIND_COLORS["appeared"], KIND_COLORS["gone"]
+        return color_levels(self._levels_as_of(session), *colors)
+
+    def draw_difference(self, session: int) -> Patch | None:
+        """The difference of `draw` of a session from `draw_map`, transparent elsewhere."""
+        levels = self._levels_as_of(session)
+        differs = levels != self._levels
+        if not differs.any():
+            return None
+        rows, columns = (np.flatnonzero(differs.any(axis=axis)) for axis in (1, 0))
+        part = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+        pixels = np.where(differs, levels, np.uint8(_CLEAR))[part]
+        image = color_levels(pixels, KIND_COLORS["appeared"], KIND_COLORS["gone"], (0, 0, 0))
+        image.info["transparency"] = _CLEAR
+        return Patch(int(columns[0]), int(rows[0]), image)
+
+    def _levels_as_of(self, session: int) -> NDArray[np.uint8]:
+        now, came, left = (one[self._drawn] for one in self._timeline.cells_as_of(session))
+        out, at = self._levels.copy(), (self._row, self._column)
+        redrawn = np.zeros(out.shape, np.bool_)
+        differs = now != self._timeline.cells.shown[self._drawn]
+        redrawn[self._row[differs], self._column[differs]] = True
+        out[redrawn] = self._cleared[redrawn]
+        for cells, level in (
+            (now & redrawn[at], _OCCUPIED_LEVEL),
+            (left, _LEFT),
+            (came, _CAME),
+        ):
+            out[self._row[cells], self._column[cells]] = level
+        return out
+
+
+def _window_of(occupancy: GridMap, timeline: Timeline) -> Window:
+    """The window of the map, widened by changed cells at its border."""
+    x0, y0, x1, y1 = map_window([occupancy])
+    cells, whole = timeline.cells, extent(occupancy)
+    if not len(cells.cells):
+        return x0, y0, x1, y1
+    low = (cells.cells.min(axis=0) - _MARGIN) * cells.resolution
+    high = (cells.cells.max(axis=0) + 1 + _MARGIN) * cells.resolution
+    left, bottom = np.minimum([x0, y0], np.maximum(low, whole[:2])).tolist()
+    right, top = np.maximum([x1, y1], np.minimum(high, whole[2:])).tolist()
+    return left, bottom, right, top
+
+
+class Mark(NamedTuple):
+    """A change on the map.
+
+    Attributes:
+        kind: of the change.
+        label: letter and number.
+        box: `d` attribute of the box where it is, or was.
+        start: of the box where it was before it moved; empty otherwise.
+        arrow: of the line from there to here; empty otherwise.
+        x, y: left end of the label's base line.
+    """
+
+    kind: str
+    label: str
+    box: str
+    start: str
+    arrow: str
+    x: float
+    y: float
+
+
+class Marks(NamedTuple):
+    """Marks of several changes, and the size of the font of their labels in pixels."""
+
+    marks: list[Mark]
+    font_size: float
+
+
+def place_marks(changes: list[SessionChange], view: MapView) -> Marks:
+    """Marks of changes; labels avoid each other and the boxes where there is space."""
+    longest = max(view.size)
+    font, pad = longest * _FONT_SHARE, longest * _PAD_SHARE
+    boxes = [[_to_box(low, high, view, pad) for low, high in one.boxes] for one in changes]
+    taken = [box for of in boxes for box in of]
+    out = []
+    for change, of in zip(changes, boxes, strict=True):
+        width = _LETTER_WIDTH * font * len(change.label)
+        label = _find_space(of[0], (width, font), taken, view)
+        taken.append(label)
+        start = arrow = ""
+        if len(of) == 2:
+            start, arrow = _box_path(of[1]), _arrow_path(of[1], of[0], longest * _HEAD_SHARE)
+        x, y = label[0], label[3] - 0.15 * font
+        out.append(Mark(change.kind, change.label, _box_path(of[0]), start, arrow, x, y))
+    return Marks(out, font)
+
+
+def _to_box(low: Float, high: Float, view: MapView, pad: float) -> Box:
+    (left, bottom), (right, top) = view.to_pixels(np.stack([low[:2], high[:2]])).tolist()
+    return left - pad, top - pad, right + pad, bottom + pad
+
+
+def _box_path(box: Box) -> str:
+    left, top, right, bottom = box
+    return f"M{left:.1f} {top:.1f}H{right:.1f}V{bottom:.1f}H{left:.1f}Z"
+
+
+def _arrow_path(start: Box, end: Box, size: float) -> str:
+    """A line from the middle of a box to that of another one, with a head."""
+    a, b = (np.array([(box[0] + box[2]) / 2, (box[1] + box[3]) / 2]) for box in (start, end))
+    length = float(np.linalg.norm(b - a))
+    if length < 1e-6:
+        return ""
+    angle = math.atan2(b[1] - a[1], b[0] - a[0])
+    size = min(size, 0.6 * length)
+    head = [
+        b - size * np.array([math.cos(angle + turn), math.sin(angle + turn)])
+        for turn in (0.5, -0.5)
+    ]
+    points = [f"{x:.1f} {y:.1f}" for x, y in (a, b, *head)]
+    return f"M{points[0]}L{points[1]}M{points[2]}L{points[1]}L{points[3]}"
+
+
+def _find_space(box: Box, size: tuple[float, float], taken: list[Box], view: MapView) -> Box:
+    """Find the place beside a box where a label of a width and height covers least."""
+    width, height = size
+    left, top, right, bottom = box
+    gap = 0.2 * height
+    corners = [
+        (right + gap, top),
+        (left - gap - width, top),
+        (left, top - gap - height),
+        (left, bottom + gap),
+        (right + gap, bottom - height),
+        (left - gap - width, bottom - height),
+    ]
+
+    others = np.array(taken)
+
+    def cost(label: Box) -> float:
+        outside = -min(0.0, label[0], label[1], view.size[0] - label[2], view.size[1] - label[3])
+        return float(_overlap(np.array(label), others).sum()) + 1e3 * outside
+
+    return min(((x, y, x + width, y + height) for x, y in corners), key=cost)
+
+
+def _overlap(box: Float, others: Float) -> Float:
+    """(n,) areas that a box (4,) shares with others (n, 4)."""
+    sides = np.minimum(box[2:], others[:, 2:]) - np.maximum(box[:2], others[:, :2])
+    out: Float = np.maximum(sides, 0.0).prod(axis=1)
+    return out
