@@ -21,8 +21,7 @@ from stillmap.core.errors import InputError, import_extra
 from stillmap.core.files import atomic_folder
 from stillmap.core.grid_map import GridMap
 from stillmap.core.input_files import copy_file
-from stillmap.core.profiling import Progress, StageTimer, no_progress
-from stillmap.core.progress_bar import show_bar
+from stillmap.core.profiling import Progress, StageTimer, no_progress, show_progress
 from stillmap.core.recording import Recording
 from stillmap.io.trajectory import read_tum
 from stillmap.pipeline import inputs
@@ -473,7 +472,7 @@ def report_to(progress: bool | Progress, iterations: int) -> Iterator[Progress]:
     if callable(progress):
         yield progress
     elif progress:
-        with show_bar(iterations) as bar:
+        with show_progress(iterations) as bar:
             yield bar
     else:
         yield no_progress
