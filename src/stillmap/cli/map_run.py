@@ -27,8 +27,8 @@ from stillmap.pipeline.options import Options, resolve_options
 from stillmap.pipeline.result import MappingResult, map_recording
 from stillmap.prepare.options import ReadOptions
 from stillmap.prepare.time_window import TimeWindow, select_time
-from stillmap.results.region import crop_result, require_overlap
 from stillmap.results.reader import read_run
+from stillmap.results.region import crop_result, require_overlap
 
 if TYPE_CHECKING:
     from stillmap.mesh.build import Models
@@ -221,7 +221,7 @@ _IN_SUMMARY = ("version", "converged", "best_iteration", "counts", "area", "seco
 
 def summarize(output: Path) -> dict[str, Any]:
     """The main entries of `run.json`, and the files of the result."""
-    record = read_record(output)
+    record = read_run(output)
     return {
         "output": str(output),
         "files": list_files(output),

@@ -30,7 +30,6 @@ from stillmap.fleet.jobs import PLACES, RESULTS, Outcome
 from stillmap.fleet.locations import explain, fetch, hash_content, is_local, open_location
 from stillmap.results.reader import read_grid
 from stillmap.results.report.figures import data_uri, draw_map, map_window
-from stillmap.results.reader import read_run
 
 MADE = "made.json"  # of each result of a fleet
 STAGING = ".part-"  # begins the names of unfinished results
@@ -197,7 +196,7 @@ def _escape_json(text: str) -> str:
 
 def _summarize(folder: Path) -> dict[str, Any]:
     """The JSON-able summary of a result: a small map, figures, warnings, sessions."""
-    record = read_record(folder)
+    record = read_run(folder)
     warnings = [split_advice(text) for text in record.get("warnings", ())]
     stamps, grid = np.load(folder / "beams/stamp_ns.npy", mmap_mode="r"), read_grid(folder)
     picture = None

@@ -7,9 +7,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.square_box import connected_components, neighbor_pairs
 from stillmap.core.local_frame import LocalFrame
 from stillmap.core.short_repr import ShortRepr
+from stillmap.core.square_box import connected_components, neighbor_pairs
 from stillmap.places.place_states import PlaceStates
 
 Float = NDArray[np.float64]

@@ -15,10 +15,9 @@ from stillmap.core.config import to_dict
 from stillmap.core.errors import InputError
 from stillmap.core.files import write_text
 from stillmap.core.input_files import read_bytes
-from stillmap.core.json import write_json
+from stillmap.core.json import package_version, write_json
 from stillmap.core.local_frame import LocalFrame
 from stillmap.core.short_repr import ShortRepr
-from stillmap.core.json import package_version
 from stillmap.em import OccupancyMap
 from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.io.trajectory import MAX_BYTES, write_tum

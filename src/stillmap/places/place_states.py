@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.short_repr import ShortRepr
+from stillmap.core.square_box import neighbor_pairs
 from stillmap.places.evidence import BLOCK, Bytes, Evidence, cell_keys, crop_without_gaps, to_sums
 
 Float = NDArray[np.float64]

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.arrays import write_npz
+from stillmap.core.grid_map import is_inside, shift_region
 from stillmap.core.local_frame import LocalFrame
 from stillmap.core.parallel import limit_blas_threads, resolve_threads
 from stillmap.core.profiling import Progress, StageTimer, no_progress
-from stillmap.core.grid_map import is_inside, shift_region
 from stillmap.em import estimate_ground
 from stillmap.mesh import build
 from stillmap.mesh.build import Models

@@ -19,10 +19,9 @@ from stillmap.core.array_folder import (
 )
 from stillmap.core.arrays import iter_blocks
 from stillmap.core.errors import InputError, install_command
-from stillmap.core.grid_map import GridMap
+from stillmap.core.grid_map import GridMap, Region
 from stillmap.core.json import read_json
 from stillmap.core.local_frame import LocalFrame
-from stillmap.core.grid_map import Region
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io.rigid_transforms import MAX_TRANSLATION
 from stillmap.mesh.options import MeshOptions

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from stillmap.core.array_folder import write_arrays
 from stillmap.core.files import atomic_folder, write_text
+from stillmap.core.grid_map import Region, limit_hits
 from stillmap.core.json import write_json
 from stillmap.core.recording import Recording
-from stillmap.core.grid_map import Region, limit_hits
 from stillmap.io.trajectory import write_tum
 from stillmap.pipeline.result import MappingResult
 from stillmap.results.map_server import write_map_npz, write_map_server
