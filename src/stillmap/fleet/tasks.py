@@ -28,7 +28,7 @@ from stillmap.core.json import package_version, to_json
 from stillmap.core.profiling import peak_memory_bytes, reset_peak_memory
 from stillmap.fleet.jobs import PLACES, RESULTS, Outcome
 from stillmap.fleet.locations import explain, fetch, hash_content, is_local, open_location
-from stillmap.results.reader import read_grid
+from stillmap.results.reader import read_grid, read_run
 from stillmap.results.report.figures import data_uri, draw_map, map_window
 
 MADE = "made.json"  # of each result of a fleet
