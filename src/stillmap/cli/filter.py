@@ -107,7 +107,7 @@ def _filter_place(args: argparse.Namespace, place: Path, output: Path) -> None:
         raise InputError("has several recordings: --input names one", where=str(place), hint=hint)
     require_apart(output, place)
     require_new(output, _INDEX, args.overwrite)
-    names = [one.name for one in read_sessions(place) if record["accepted"]]
+    names = [one.name for one in read_sessions(place) if one.accepted]
     # what cannot be written is refused before any is read
     plans = [_plan_session(place, name, output, args.to) for name in names]
     with atomic_folder(output, _INDEX, args.overwrite) as folder:

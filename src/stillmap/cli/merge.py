@@ -19,8 +19,8 @@ from stillmap.core.errors import InputError
 
 if TYPE_CHECKING:
     from stillmap.pipeline.options import Options
-    from stillmap.places.merge import MergeJob
     from stillmap.places.finish import PlaceResult
+    from stillmap.places.merge import MergeJob
 
 DESCRIPTION = (
     "Merge sessions of one place, hours or months apart and from any start, into one map. Each "
@@ -93,8 +93,8 @@ def _merge(
     from stillmap.core.files import require_new
     from stillmap.places.inputs import list_sessions
     from stillmap.places.merge import MergeJob, merge_sessions
-    from stillmap.results.timeline import read_sessions
     from stillmap.results.reader import RECORD
+    from stillmap.results.timeline import read_sessions
 
     output = Path(args.output)
     require_new(output, RECORD, args.overwrite)
