@@ -26,12 +26,13 @@ from stillmap.places.surface_map import SurfaceMap, find_sides
 from stillmap.results.reader import (
     FREE_THRESH,
     OCCUPIED_THRESH,
+    RECORD,
     Grid,
+    RunRecord,
     read_grid,
     read_hit_sums,
+    read_run,
 )
-from stillmap.results.run_json import LOCAL_ORIGIN, RECORD
-from stillmap.results.run_record import read_frame, read_record
 from stillmap.slam import scan_hits
 
 Float = NDArray[np.float64]
@@ -214,7 +215,7 @@ def _free_runs(grid: Grid) -> tuple[Float, Float]:
 def _find_frame(source: str | os.PathLike[str] | GridMap, grid: GridMap) -> LocalFrame:
     """The frame in which a result was computed, with whose cells those of its map agree."""
     if not isinstance(source, GridMap) and (Path(source) / RECORD).is_file():
-        noted = read_frame(Path(source), read_record(Path(source)), LOCAL_ORIGIN)
+        noted = RunRecord(Path(source), read_run(Path(source))).frame
         if noted.is_shifted:
             return noted
     return LocalFrame.near(se2.matrix(*grid.origin)[None])
