@@ -30,8 +30,8 @@ NAMES = ("stillmap", "ros2", "carmen", "bag", "db3", "mcap", "kitti", "pcd", "pl
 DESCRIPTION = (
     "Write a recording in another format, by the ending of FILE: "
     f"{', '.join(ENDINGS)}; else a folder. A result of `stillmap map` becomes a bag (.mcap for "
-    "Foxglove), a file for rerun (.rrd), in 2D a table of its beams (.parquet), in 3D a point "
-    f"cloud with p_static and colours ({', '.join(CLOUDS)}) or the model of the place (.obj), "
+    "Foxglove), in 2D a table of its beams (.parquet), in 3D a point "
+    f"cloud with p_static and colours ({', '.join(CLOUDS)}), "
     "or maps and masks for nav2. A place becomes maps and masks, in 3D also a "
     "cloud; its sessions, PLACE/sessions/NAME, all of this."
 )
@@ -40,10 +40,8 @@ EPILOG = """examples:
   stillmap convert log.bag -o log --to ros2   a folder for ROS 2
   stillmap convert log.bag -o part.bag --from 60 --until 120    a minute of it
   stillmap convert out -o out.mcap            a result for Foxglove
-  stillmap convert out -o out.rrd             a result for rerun
   stillmap convert out -o beams.parquet       every beam of a 2D result with its label
   stillmap convert out -o static.laz --only static    static points of a 3D result
-  stillmap convert out -o model.obj           model of the place with its textures
   stillmap convert out -o maps --mask zones.geojson   edited map and masks for nav2
 """
 

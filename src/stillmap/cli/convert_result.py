@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 # a copy for the help: the module that defines them takes long to load
 CLOUDS = (".las", ".laz", ".e57", ".pcd", ".ply", ".xyz")
 NAV2 = "nav2"  # the format of maps and masks
-_PARQUET, _RRD = ".parquet", ".rrd"
+_PARQUET = ".parquet"
 
 
 def add_zone_flags(p: argparse.ArgumentParser) -> None:
@@ -59,7 +59,7 @@ def given_zone_flags(args: argparse.Namespace) -> dict[str, object]:
 
 def convert_result(args: argparse.Namespace, source: Path, output: Path) -> tuple[list[str], str]:
     """Write a result for other programs; return what was lost, and what was written."""
-    from stillmap.results.export import obj, point_cloud_files
+    from stillmap.results.export import point_cloud_files
     from stillmap.results.folder import open_result
     from stillmap.results.reader import is_place
 
@@ -79,11 +79,6 @@ def convert_result(args: argparse.Namespace, source: Path, output: Path) -> tupl
         hint = ", ".join(CLOUDS)
         raise InputError("--only is for clouds of points", where=str(output), hint=hint)
     ending = output.suffix.lower() if args.to is None else None
-    if ending == obj.ENDING:
-        faces, pages = obj.write_obj(source, output, result.texture_quality, args.overwrite)
-        return [], f"{faces} faces and {pages} page{'s' * (pages != 1)} of texture"
-    if ending == _RRD:
-        return [], _convert_to_rrd(args, result, output)
     if ending == _PARQUET:
         return [], _convert_to_table(args, result, output)
     return _convert_to_bag(args, result, output)
@@ -163,23 +158,10 @@ def _convert_to_table(args: argparse.Namespace, result: "ResultFolder", output: 
         raise InputError(
             "is of a 3D recording: no table",
             where=str(result.folder),
-            hint=f"its points as a cloud ({', '.join(CLOUDS)}), all of it as a bag (.mcap, .bag), "
-            "its model (.obj)",
+            hint=f"its points as a cloud ({', '.join(CLOUDS)}), all of it as a bag (.mcap, .bag)",
         )
     parquet.write(exported, exported.deskew(), output)
     return f"{exported.recording.n_beams} beams"
-
-
-def _convert_to_rrd(args: argparse.Namespace, result: "ResultFolder", output: Path) -> str:
-    from stillmap.core.files import require_new_file
-    from stillmap.results.export import rrd
-
-    require_new_file(output, args.overwrite)
-    rrd.require_rerun(output)
-    exported = _read_result(args, result, output)
-    with show_share(args.quiet, "writing") as progress:
-        rrd.write(exported, output, progress)
-    return _describe(exported)
 
 
 def _describe(exported: "Exported") -> str:
@@ -192,10 +174,9 @@ def _convert_to_bag(
 ) -> tuple[list[str], str]:
     from stillmap.io import writers
     from stillmap.io.ros.messages import BagKind
-    from stillmap.results.export import bag, obj
+    from stillmap.results.export import bag
 
-    clouds = f"{', '.join(CLOUDS)}, {obj.ENDING}"
-    hint = f"a bag, .mcap for Foxglove, {_RRD}, {_PARQUET}, or in 3D {clouds}"
+    hint = f"a bag, .mcap for Foxglove, {_PARQUET}, or in 3D {', '.join(CLOUDS)}"
     try:
         writer = writers.find_writer(output, args.to)
     except InputError as error:
