@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from stillmap.eval.trajectory import compute_absolute_errors
-from stillmap.live.crowd import Crowd
+from stillmap.live.front_end import Crowd
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.replay import iter_beams
 from stillmap.sim import scene_by_name, simulate

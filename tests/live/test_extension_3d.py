@@ -28,10 +28,8 @@ from stillmap.core.grid_map import GridMap
 from stillmap.em import OccupancyMap
 from stillmap.io import stillmap_folder
 from stillmap.io.point_cloud.ply import read_layout
-from stillmap.live.cloud_extension import KeptCloud, write_extended_cloud
 from stillmap.live.known_cloud import KnownCloud
-from stillmap.live.known_map import KnownMap
-from stillmap.live.map_extension import KeptMap, extend_map
+from stillmap.live.known_map import KeptCloud, KeptMap, KnownMap, extend_map, write_extended_cloud
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.replay import iter_beams
 from stillmap.results.point_cloud import Block, cloud_from_folder

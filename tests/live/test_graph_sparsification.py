@@ -9,11 +9,10 @@ import stillmap
 from stillmap.core import se2
 from stillmap.core.recording import Recording
 from stillmap.live import graph_sparsification, loop_closer
-from stillmap.live.anchored_poses import AnchoredPoses
-from stillmap.live.local_map import MappedScan
+from stillmap.live.graph_sparsification import AnchoredPoses
+from stillmap.live.local_map import MappedScan, SpacedView
 from stillmap.live.loop_closer import LoopCloser
 from stillmap.live.scan import to_beams
-from stillmap.live.spaced_scans import SpacedView
 from stillmap.slam.loop_closure import LoopState
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.types import LoopClosure

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from stillmap.core import se2
-from stillmap.live.heading_drift import WallDirections, correct_heading
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.replay import iter_beams
+from stillmap.live.scan_odometry import WallDirections, correct_heading
 from stillmap.sim import scene_by_name, simulate
 from stillmap.slam.heading_alignment import HeadingOffset
 from stillmap.slam.scan_hits import Scan

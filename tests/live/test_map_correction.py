@@ -8,7 +8,7 @@ from stillmap.core import se2
 from stillmap.em.options import EmOptions
 from stillmap.live.causal_labels import CausalLabels, take_over
 from stillmap.live.loop_closer import Correction
-from stillmap.live.map_correction import LabelledScan, MapCorrection
+from stillmap.live.map_frame import LabelledScan, MapCorrection
 from stillmap.live.observation import Observation
 from stillmap.live.scan import to_beams
 

@@ -10,8 +10,7 @@ from stillmap.live.causal_labels import CausalLabels
 from stillmap.live.front_end import Registration
 from stillmap.live.local_map import LocalMap, MappedScan
 from stillmap.live.loop_closer import Correction
-from stillmap.live.map_correction import LabelledScan
-from stillmap.live.map_frame import MapFrame
+from stillmap.live.map_frame import LabelledScan, MapFrame
 from stillmap.live.observation import Observation
 from stillmap.live.scan import to_beams
 

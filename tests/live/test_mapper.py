@@ -16,8 +16,7 @@ from stillmap.em.options import EmOptions
 from stillmap.eval.trajectory import compute_absolute_errors
 from stillmap.live.causal_labels import CausalLabels, take_over
 from stillmap.live.loop_closer import Correction
-from stillmap.live.map_correction import MapCorrection
-from stillmap.live.map_frame import rotate_covariance
+from stillmap.live.map_frame import MapCorrection, rotate_covariance
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.observation import Observation
 from stillmap.live.replay import iter_beams

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stillmap.live.place_recognition import find_alike, view_from_above
+from stillmap.live.sweep_loop_closer import find_alike, view_from_above
 
 
 def make_place(rng):

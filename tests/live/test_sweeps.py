@@ -8,8 +8,8 @@ from conftest import Run, simulate_sweeps
 
 import stillmap
 from stillmap.core import se2
+from stillmap.live.causal_labels import find_pixel_size
 from stillmap.live.mapper import LiveMapper
-from stillmap.live.pixel_size import find_pixel_size
 from stillmap.live.replay import iter_beams
 from stillmap.sim import scene_by_name, simulate
 

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.arrays import GrowingArray
 from stillmap.core.errors import InputError, cannot_write
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
 from stillmap.io.stillmap_folder import FORMAT, FORMAT_VERSION, HEADER
-from stillmap.live.growing_array import GrowingArray
 from stillmap.live.scan import ScanBeams
 
 Float = NDArray[np.float64]

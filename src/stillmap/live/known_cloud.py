@@ -16,15 +16,15 @@ from stillmap.em import CellProbabilities, GroundMap
 from stillmap.em.ground import fit_ground
 from stillmap.io.rigid_transforms import are_rigid
 from stillmap.io.trajectory import read_tum
-from stillmap.live.cloud_extension import ROUTE, KeptCloud
-from stillmap.live.known_map import LOG_RATIO, KnownMap
-from stillmap.live.map_extension import KeptMap
-from stillmap.live.map_view import STANDS, is_level
+from stillmap.live.known_map import LOG_RATIO, ROUTE, KeptCloud, KeptMap, KnownMap
+from stillmap.live.sweep_view import STANDS, is_level
 from stillmap.places.evidence import cell_keys
 from stillmap.results.point_cloud import cloud_from_folder
 from stillmap.slam import lidar_odometry
 
 Float = NDArray[np.float64]
+
+_STATIC = 0.5  # P(static) of the points that are added: over hours others would fill the cells
 Index = NDArray[np.int64]
 
 # m from the origin of the local frame: squares and cubes of all cells are numbered in 64 bits
@@ -35,6 +35,36 @@ _RAISE = 1.0
 _ROUTE_SPACING = 0.5  # m between the poses that are kept of a route
 _NEIGHBOUR_WEIGHT = 0.5  # of what was seen of a voxel, for each of those around it
 _GROUND_CELL = 0.3  # m, of the level surface that shows the ground
+
+
+class KnownPlanes:
+    """A known map that sweeps are registered to.
+
+    Args:
+        planes: of the map.
+        extends: whether sweeps are added to it.
+    """
+
+    def __init__(self, planes: _core.NdtMap3D, extends: bool) -> None:
+        self.planes = planes
+        self._extends = extends
+        # poses of the base when sweeps were added, one in each cube: they grow with the area
+        self._route = dict[tuple[int, ...], Float]()
+
+    def add(
+        self, points: NDArray[np.float32], weights: NDArray[np.float32], T_map_base: Float
+    ) -> None:
+        """Add points (N, 3) in the base frame with weights P(static), if the map is extended."""
+        if self._extends:
+            static = weights >= _STATIC
+            self.planes.add(points[static], weights[static], T_map_base)
+            cube = np.floor(T_map_base[:3, 3] / _ROUTE_SPACING).astype(np.int64)
+            self._route.setdefault(tuple(cube.tolist()), T_map_base)
+
+    @property
+    def route(self) -> Float:
+        """(K, 4, 4) T_map_base from where it was extended."""
+        return np.array(list(self._route.values())).reshape(-1, 4, 4)
 
 
 class KnownVoxels(NamedTuple):

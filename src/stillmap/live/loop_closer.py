@@ -8,10 +8,8 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.short_repr import ShortRepr
-from stillmap.live.anchored_poses import AnchoredPoses
-from stillmap.live.graph_sparsification import select_scans, select_state
-from stillmap.live.local_map import MappedScan
-from stillmap.live.spaced_scans import SpacedScans, SpacedView
+from stillmap.live.graph_sparsification import AnchoredPoses, select_scans, select_state
+from stillmap.live.local_map import MappedScan, SpacedScans, SpacedView
 from stillmap.slam import local_map, loop_candidates, loop_closure
 from stillmap.slam.loop_closure import LoopState
 from stillmap.slam.options import SlamOptions

@@ -19,11 +19,11 @@ from stillmap.core.profiling import Progress, no_progress
 from stillmap.em import CellProbabilities
 from stillmap.io.array_checks import poses_to_matrices
 from stillmap.live.known_map import KnownMap
-from stillmap.live.map_view import empty_map, project_obstacles
 from stillmap.live.online_slam import OnlineSlam
 from stillmap.live.place import Mode, adopt_resolution, make_tracker
 from stillmap.live.saving import Snapshot
 from stillmap.live.scan import Scan, ScanBeams, drop_cover, to_beams
+from stillmap.live.sweep_view import empty_map, project_obstacles
 from stillmap.live.update import Update
 from stillmap.pipeline.options import Options, resolve_resolution
 from stillmap.prepare.plausibility import mapped_range, shorten_far_beams

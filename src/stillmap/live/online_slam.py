@@ -13,23 +13,20 @@ from stillmap.core.local_frame import LocalFrame
 from stillmap.core.parallel import resolve_threads
 from stillmap.live.causal_labels import CausalLabels, MapChange
 from stillmap.live.front_end import FrontEnd, Registration
-from stillmap.live.hindsight import Hindsight, LaterLabels
 from stillmap.live.history import History, Placement
+from stillmap.live.known_map import KeptMap
 from stillmap.live.local_map import MappedScan
 from stillmap.live.loop_closer import NoLoops
 from stillmap.live.loop_process import start_closer
-from stillmap.live.map_correction import LabelledScan
-from stillmap.live.map_extension import KeptMap
-from stillmap.live.map_frame import LoopClosing, MapFrame, rotate_covariance
+from stillmap.live.map_frame import LabelledScan, LoopClosing, MapFrame, rotate_covariance
 from stillmap.live.movers import Mover, MoverTracker
-from stillmap.live.observation import BeamSelector, Observation, find_margins
+from stillmap.live.observation import BeamSelector, Observation, find_margins, normals_of, thin
 from stillmap.live.place import PlaceTracker
 from stillmap.live.robot_finder import RobotFinder
 from stillmap.live.scan import ScanBeams, deskew
-from stillmap.live.scan_hits import normals_of, thin
 from stillmap.live.scan_odometry import ScanOdometry
 from stillmap.live.sweep_odometry import SweepOdometry
-from stillmap.live.update import Update
+from stillmap.live.update import Hindsight, LaterLabels, Update
 from stillmap.pipeline.options import Options, resolve_resolution
 from stillmap.slam.scan_hits import Scan as PlanarHits
 

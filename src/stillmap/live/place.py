@@ -14,8 +14,7 @@ from stillmap.core.parallel import resolve_threads
 from stillmap.live.causal_labels import CausalLabels, OccupancyFilter, take_over
 from stillmap.live.global_localization import MIN_AGREE_ANYWHERE, GlobalLocalizer, Localization
 from stillmap.live.known_cloud import KnownCloud
-from stillmap.live.known_map import KnownLocalMap, KnownMap
-from stillmap.live.map_extension import KeptMap
+from stillmap.live.known_map import KeptMap, KnownLocalMap, KnownMap
 from stillmap.live.sweep_localization import SweepLocalizer
 from stillmap.pipeline.options import DEFAULTS, Options
 from stillmap.slam.scan_hits import Scan

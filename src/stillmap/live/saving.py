@@ -20,7 +20,7 @@ from stillmap.io.stillmap_folder import HEADER
 from stillmap.io.trajectory import write_tum
 from stillmap.live.history import FOLDER as RECORDING
 from stillmap.live.history import Answers, Placement
-from stillmap.live.map_extension import KeptMap, write_extended
+from stillmap.live.known_map import KeptMap, write_extended
 from stillmap.pipeline.options import Options
 from stillmap.pipeline.result import MappingResult, map_recording
 from stillmap.results.reader import EXTENDS, RECORD

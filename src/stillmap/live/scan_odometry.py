@@ -6,16 +6,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
-from stillmap.live.crowd import Crowd
 from stillmap.live.dead_reckoning import DeadReckoning
-from stillmap.live.front_end import Registration
-from stillmap.live.heading_drift import WallDirections, correct_heading
+from stillmap.live.front_end import Crowd, Registration
 from stillmap.live.local_map import Labeller, LocalMap, MappedScan, MatchMap, tend
+from stillmap.live.observation import select_hits, thin
 from stillmap.live.odometry_faults import OdometryFaults, is_plausible
 from stillmap.live.scan import ScanBeams, deskew
-from stillmap.live.scan_hits import select_hits, thin
 from stillmap.slam import motion_model, relocalization
 from stillmap.slam.deskew import MAX_SPEED, MAX_TURN_RATE
+from stillmap.slam.heading_alignment import DirectionDensity, Directions, HeadingOffset
 from stillmap.slam.motion_model import MotionPrior, OdometryNoise, VelocityNoise
 from stillmap.slam.options import SlamOptions
 from stillmap.slam.relocalization import Evidence
@@ -31,6 +30,11 @@ from stillmap.slam.scan_matching import (
 
 Float = NDArray[np.float64]
 
+_KERNEL = np.radians(1.0)  # std of the normals about the direction of a wall
+_MIN_TRAVEL = 8.0  # m after which directions are known
+# normals of one wall share their errors: evidence of each; std of a building's walls about its
+# directions, rad, which one metre of travel shows once
+_EVIDENCE, _MIN_STD = 0.1, np.radians(0.3)
 _FAST = 0.05  # s between fast scans: work that is due for several ones would delay their poses
 _EXPLAINED_RATE = 0.1  # weight of one scan in the running average of the explained share
 # scans that contradict the map more than others agree, after which the robot was carried; at most
@@ -38,6 +42,41 @@ _CARRIED_AFTER, _MAX_STRAY = 20.0, 30.0
 # of them that a scan outweighs which agrees, and one that says nothing; share of the usual
 # explained one below which nothing of a scan is in the local map, though the robot moved on
 _AGREEMENT, _NO_EVIDENCE, _NOTHING = 4.0, 0.25, 0.15
+
+
+class WallDirections:
+    """Directions of the walls so far, weighted by travel."""
+
+    def __init__(self) -> None:
+        self._seen, self._travelled = Directions(), 0.0
+
+    def add(self, scan: Scan, T: Float, metres: float) -> None:
+        """Add the normals of a scan at a pose (3, 3), `metres` after the last one."""
+        directions = Directions.of_scan(scan, float(se2.parameters(T)[2]))
+        self._seen.weights += min(metres, 1.0) * directions.weights
+        self._travelled += min(metres, 1.0)
+
+    def rotate(self, angle: float) -> None:
+        """Rotate the frame, in which directions are, by `angle` rad."""
+        self._seen = self._seen.rotate(angle)
+
+    def measure(self, scan: Scan, T: Float) -> HeadingOffset | None:
+        """Correction of the heading of a scan at a pose T (3, 3); None: it is not defined."""
+        if self._travelled < _MIN_TRAVEL or not self._seen.weights.any():
+            return None
+        density = DirectionDensity(self._seen, _KERNEL)
+        directions = Directions.of_scan(scan, float(se2.parameters(T)[2]))
+        offset = density.measure(directions, _EVIDENCE)
+        if offset is None:
+            return None
+        return offset._replace(variance=max(offset.variance, _MIN_STD**2))
+
+
+def correct_heading(T: Float, covariance: Float, offset: HeadingOffset) -> Float:
+    """A pose (3, 3) with covariance (3, 3) after a Kalman update by its heading's offset."""
+    gain = covariance[:, 2] / (covariance[2, 2] + offset.variance)
+    out: Float = se2.matrix(*(se2.parameters(T) + offset.value * gain))
+    return out
 
 
 class ScanOdometry:

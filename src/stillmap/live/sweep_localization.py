@@ -8,13 +8,10 @@ import stillmap._core as _core
 from stillmap.core import se2
 from stillmap.live.causal_labels import CausalLabels, OccupancyFilter
 from stillmap.live.global_localization import GlobalLocalizer, Localization
-from stillmap.live.known_cloud import KnownCloud, KnownVoxels
-from stillmap.live.known_map import KnownMap
-from stillmap.live.known_planes import KnownPlanes
+from stillmap.live.known_cloud import KnownCloud, KnownPlanes, KnownVoxels
+from stillmap.live.known_map import KeptMap, KnownMap, overlay
 from stillmap.live.local_map import MappedScan
-from stillmap.live.map_extension import KeptMap, overlay
-from stillmap.live.map_view import project_obstacles
-from stillmap.live.sweep_view import SweepView
+from stillmap.live.sweep_view import SweepView, project_obstacles
 from stillmap.pipeline.options import Options, resolve_resolution
 from stillmap.slam import lidar_odometry
 from stillmap.slam.constant_velocity import State

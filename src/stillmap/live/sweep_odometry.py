@@ -4,9 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2, se3
-from stillmap.live.crowd import Crowd
-from stillmap.live.front_end import Registration
-from stillmap.live.known_planes import KnownPlanes
+from stillmap.live.front_end import Crowd, Registration
+from stillmap.live.known_cloud import KnownPlanes
 from stillmap.live.local_map import Labeller, MappedScan
 from stillmap.live.scan import ScanBeams, take_beams
 from stillmap.slam import constant_velocity, lidar_odometry

@@ -44,8 +44,9 @@ class Buffer:
             known = self._edges[child] = parent, {}
         stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
         known[1][stamp] = T
-        for old in [one for one in known[1] if one < max(known[1]) - self._duration]:
-            del known[1][old]
+        oldest = max(known[1]) - self._duration
+        for stamp in [stamp for stamp in known[1] if stamp < oldest]:
+            del known[1][stamp]
 
     def clear(self):
         """Forget all but the static ones."""
