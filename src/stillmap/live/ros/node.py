@@ -5,7 +5,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -26,10 +26,12 @@ from stillmap.live.ros.intake import (
 )
 from stillmap.live.ros.parameters import Parameters, declare
 from stillmap.live.ros.publishers import MapPublisher, Publishers
-from stillmap.live.ros.run import Ros
 from stillmap.live.ros.transforms import Tf2, Transforms
 from stillmap.live.update import DOUBTS
 from stillmap.pipeline.options import Options
+
+if TYPE_CHECKING:
+    from stillmap.live.ros.run import Ros
 
 _NAME = "stillmap"
 _ODOMETRY_DEPTH = 50
@@ -57,7 +59,7 @@ class LiveNode:
 
     def __init__(
         self,
-        ros: Ros,
+        ros: "Ros",
         options: Options,
         output: Path,
         *,

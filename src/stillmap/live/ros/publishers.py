@@ -1,7 +1,7 @@
 """Publishers of the node: pose, transform, movers, labelled scans, diagnostics and the map."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +14,11 @@ from stillmap.live.movers import Mover
 from stillmap.live.ros import messages
 from stillmap.live.ros.intake import Arrival
 from stillmap.live.ros.parameters import Parameters
-from stillmap.live.ros.run import Ros
 from stillmap.live.update import Update
 from stillmap.pipeline.options import MapMode
+
+if TYPE_CHECKING:
+    from stillmap.live.ros.run import Ros
 
 OK, WARN, ERROR = b"\x00", b"\x01", b"\x02"  # levels of DiagnosticStatus
 
@@ -41,7 +43,7 @@ class Publishers:
         parameters: see Parameters.
     """
 
-    def __init__(self, ros: Ros, node: Any, parameters: Parameters) -> None:
+    def __init__(self, ros: "Ros", node: Any, parameters: Parameters) -> None:
         self._ros, self._node, self._parameters = ros, node, parameters
         publish = node.create_publisher
         self._pose = publish(ros.geometry("PoseWithCovarianceStamped"), "pose", _DEPTH)
@@ -215,7 +217,7 @@ class MapPublisher:
         mode: how it is written.
     """
 
-    def __init__(self, ros: Ros, node: Any, parameters: Parameters, mode: MapMode) -> None:
+    def __init__(self, ros: "Ros", node: Any, parameters: Parameters, mode: MapMode) -> None:
         self._ros, self._frame, self._mode = ros, parameters.map_frame, mode
         topic, qos = parameters.map_name, ros.module("qos")
         latched = qos.QoSProfile(depth=1, durability=qos.DurabilityPolicy.TRANSIENT_LOCAL)

@@ -6,16 +6,14 @@ from contextlib import AbstractContextManager
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from stillmap.core.errors import InputError
 from stillmap.core.profiling import Progress
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.replay import Show, signal_flag
+from stillmap.live.ros.node import LiveNode
 from stillmap.pipeline.options import Options
-
-if TYPE_CHECKING:
-    from stillmap.live.ros.node import LiveNode
 
 _SPIN = 0.1  # s after which a signal is seen at the latest
 _NEEDED = (
@@ -96,8 +94,6 @@ def run(
         InputError: ROS is not there, a parameter is wrong, or the result cannot be written.
         KeyboardInterrupt: Ctrl-C again while the result is written.
     """
-    from stillmap.live.ros.node import LiveNode
-
     ros = Ros()
     no_handlers = ros.module("signals").SignalHandlerOptions.NO
     try:
@@ -123,7 +119,7 @@ def run(
         ros.rclpy.try_shutdown()
 
 
-def _spin(ros: Ros, live: "LiveNode", stop: threading.Event) -> None:
+def _spin(ros: Ros, live: LiveNode, stop: threading.Event) -> None:
     """Answer until `stop`; requests to save in a thread of their own, so that mapping goes on.
 
     Not by an executor of several threads: that of rclpy hands a callback that waits to its threads
