@@ -97,7 +97,7 @@ def __getattr__(name: str) -> Any:
     if name in _MODULES:
         value = getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
     elif name == "__version__":
-        from stillmap.core.json import package_version
+        from stillmap.core.files import package_version
 
         value = package_version()
     elif name in _ROOMS:

@@ -109,7 +109,3 @@ def test_regions_that_cannot_be(call, room, tmp_path, nothing_left):
     nothing_left()
     done = call("map", room, "-o", tmp_path / "out", "--region", 50, 50, 60, 60, *QUICK)
     refused(done, "50 50 60 60 lies outside the map", "the map spans 0.05 to 6.55 m in x")
-    # nothing has to be computed again
-    done = call("map", room, "-o", tmp_path / "out", "--resume", "--region", 0, 0, 1, 1, *QUICK[:2])
-    assert done.returncode == 0, done.stderr
-    assert "continues after iteration 1" in done.stderr

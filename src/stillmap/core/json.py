@@ -84,14 +84,3 @@ def to_json(value: Any, indent: int | None = None) -> str:
 def write_json(path: Path, value: Any, indent: int | None = 1) -> None:
     """Write a value as a file of JSON; see `to_json`."""
     write_text(path, f"{to_json(value, indent)}\n")
-
-
-def package_version() -> str:
-    """The installed version of stillmap."""
-    from importlib.metadata import PackageNotFoundError
-    from importlib.metadata import version as installed_version
-
-    try:
-        return installed_version("stillmap")
-    except PackageNotFoundError:  # run from a source tree that is not installed
-        return "0+unknown"

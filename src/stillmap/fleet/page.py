@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from stillmap.core.json import package_version
+from stillmap.core.files import package_version
 from stillmap.fleet.jobs import Fleet
 from stillmap.results.report.page import environment
 

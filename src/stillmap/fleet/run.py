@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from stillmap.core.errors import InputError, import_extra
-from stillmap.core.files import atomic_file, to_encodable
-from stillmap.core.json import package_version, to_json
+from stillmap.core.files import atomic_file, package_version, to_encodable
+from stillmap.core.json import to_json
 from stillmap.fleet.inputs import Source, find_sources
 from stillmap.fleet.jobs import PLACES, RESULTS, Fleet, Job, Outcome, Place, Request
 from stillmap.fleet.locations import absolute, explain, is_folder_name, is_local, open_location

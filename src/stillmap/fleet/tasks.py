@@ -22,9 +22,9 @@ import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from stillmap.core.errors import InputError, split_advice
-from stillmap.core.files import write_text
+from stillmap.core.files import package_version, write_text
 from stillmap.core.input_files import read_text
-from stillmap.core.json import package_version, to_json
+from stillmap.core.json import to_json
 from stillmap.core.profiling import peak_memory_bytes, reset_peak_memory
 from stillmap.fleet.jobs import PLACES, RESULTS, Outcome
 from stillmap.fleet.locations import explain, fetch, hash_content, is_local, open_location

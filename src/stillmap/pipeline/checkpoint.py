@@ -22,10 +22,10 @@ from stillmap.core.array_folder import read_model, read_poses, read_probabilitie
 from stillmap.core.arrays import iter_bytes
 from stillmap.core.config import iter_options
 from stillmap.core.errors import InputError, cannot_write
-from stillmap.core.files import hidden_path, remove, resolve_output
+from stillmap.core.files import hidden_path, package_version, remove, resolve_output
 from stillmap.core.input_files import open_lock
 from stillmap.core.interrupts import defer_signals
-from stillmap.core.json import package_version, to_jsonable
+from stillmap.core.json import to_jsonable
 from stillmap.core.profiling import StageTimer
 from stillmap.core.recording import Recording
 from stillmap.io.rigid_transforms import MAX_TRANSLATION

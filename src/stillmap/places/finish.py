@@ -13,9 +13,9 @@ from stillmap.core.array_folder import FORMAT_VERSION
 from stillmap.core.arrays import iter_blocks, write_npy, write_npz
 from stillmap.core.config import to_dict
 from stillmap.core.errors import InputError
-from stillmap.core.files import write_text
+from stillmap.core.files import package_version, write_text
 from stillmap.core.input_files import read_bytes
-from stillmap.core.json import package_version, write_json
+from stillmap.core.json import write_json
 from stillmap.core.local_frame import LocalFrame
 from stillmap.core.short_repr import ShortRepr
 from stillmap.em import OccupancyMap

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from stillmap.core.array_folder import FORMAT_VERSION
 from stillmap.core.config import to_dict
-from stillmap.core.json import count_skipped, package_version, to_jsonable
+from stillmap.core.files import package_version
+from stillmap.core.json import count_skipped, to_jsonable
 from stillmap.core.tiles import Layer, tiles_of
 from stillmap.mapping import Change, Door
 from stillmap.mapping.beam_statistics import count_beams

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stillmap.core.config import iter_options
-from stillmap.core.json import package_version
+from stillmap.core.files import package_version
 from stillmap.pipeline.result import MappingResult
 from stillmap.results.report.estimation import calibration_data, convergence_data, fitted_data
 from stillmap.results.report.facts import (
