@@ -115,7 +115,7 @@ def test_maps_and_masks(call, flat_place, tmp_path):
 
 
 def test_what_a_place_does_not_become(call, flat_place, tmp_path, nothing_left):
-    for name in ("place.mcap", "beams.parquet", "place.rrd", "place.las", "model.obj", "folder"):
+    for name in ("place.mcap", "beams.parquet", "place.las", "folder"):
         done = call("convert", flat_place, "-o", tmp_path / name)
         refused(done, "a place of several recordings", "sessions/NAME -o FILE")
     nothing_left()

@@ -71,15 +71,15 @@ WRITERS = {
     },
     **{
         f"export{ending}": _file("convert", "RESULT", ending, is_quick=ending == ".parquet")
-        for ending in (".parquet", ".rrd", ".mcap", ".bag", ".db3")
+        for ending in (".parquet", ".mcap", ".bag", ".db3")
     },
     **{
         f"cloud{ending}": _file("convert", "SPACE_RESULT", ending, is_quick=ending == ".pcd")
-        for ending in (".ply", ".pcd", ".las", ".laz", ".e57", ".xyz", ".obj", ".mcap")
+        for ending in (".ply", ".pcd", ".las", ".laz", ".e57", ".xyz", ".mcap")
     },
     **{f"filter{ending}": _file("filter", "RESULT", ending) for ending in (".log", ".mcap")},
 }
-_NEEDS = {".las": "laspy", ".laz": "lazrs", ".e57": "pye57", ".obj": "trimesh", ".rrd": "rerun"}
+_NEEDS = {".las": "laspy", ".laz": "lazrs", ".e57": "pye57"}
 
 
 @contextmanager

@@ -7,7 +7,6 @@ from opening_models import shown, validated
 
 from stillmap.mesh.texture.baking import bake_texture
 from stillmap.mesh.triangle_mesh import concatenate_meshes
-from stillmap.results.export.obj import encode_obj
 from stillmap.results.gltf import write_glb
 
 trimesh = pytest.importorskip("trimesh")
@@ -95,25 +94,6 @@ def test_large_coordinates_keep_their_millimetres(written):
     found = np.sort(scene.to_mesh().vertices[:, [0, 2, 1]] * [1, -1, 1], axis=0)
     wall = rectangle([4e5, 5e6, 100.0], [4, 0, 0], [0, 0, 3]).vertices
     np.testing.assert_allclose(found, np.sort(wall, axis=0), atol=1e-6)
-
-
-def test_trimesh_reads_obj_back(room, tmp_path):
-    files = encode_obj(room, 90, "mesh")
-    for name, data in files.items():
-        (tmp_path / name).write_bytes(data)
-    pages = {f"page{k}.jpg" for k in range(len(room.pages))}
-    assert set(files) == {"mesh.obj", "mesh.mtl"} | pages
-    scene = trimesh.load(tmp_path / "mesh.obj")
-    assert sum(len(part.faces) for part in scene.geometry.values()) == len(room)
-    shapes = sorted(
-        np.asarray(part.visual.material.image).shape
-        for name, part in scene.geometry.items()
-        if "grey" not in name
-    )
-    assert shapes == sorted(page.shape for page in room.pages)
-    part = scene.geometry["page0"]
-    uv = part.visual.uv[part.faces] * [1, -1] + [0, 1]
-    np.testing.assert_allclose(uv, room.uv[room.faces[room.page == 0]], atol=1e-6)
 
 
 def test_browser_shows_photographed_colors(written, tmp_path):

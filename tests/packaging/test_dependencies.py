@@ -18,11 +18,9 @@ PACKAGE = ROOT / "src" / "stillmap"
 # modules that are imported only where their extra is in use
 NEEDS_EXTRA = {
     "viewer/server.py": "viewer",
-    "results/export/rrd.py": "rerun",
     **{f"live/foxglove/{name}.py": "live" for name in ("publisher", "schemas")},
     # for type checkers alone
     **{f"results/{name}.py": "notebook" for name in ("plot", "result", "tables")},
-    **{f"places/{name}.py": "notebook" for name in ("plot", "saved_place")},
 }
 SINCE_PYTHON_3_14 = {"compression"}  # the standard library's zstd; before, backports.zstd
 

@@ -72,7 +72,7 @@ def make_place(folder, *, names=NAMES, step=DAY):
         write_tum(home / "trajectory.tum", stamp_ns, T)
         stamps.append(stamp_ns)
         poses.append(T)
-        sessions.append(_session(name, stamp_ns, 0.1 * k))
+        sessions.append(_session(name, stamp_ns, 0.1 * k, 5 * k))
     sessions.insert(
         1,
         {"name": "lost", "input": "/logs/lost.bag", "accepted": False, "why": "no <i>overlap</i>"},
@@ -89,6 +89,8 @@ def make_place(folder, *, names=NAMES, step=DAY):
 
 
 RECORD = {
+    "format_version": 1,
+    "dimension": 2,
     "input": {"format": "stillmap place", "path": None},
     "options": {},
     "counts": {"scans": 20, "beams": 2000, "hits": 1800, "dynamic": 90},
@@ -98,7 +100,7 @@ RECORD = {
 }
 
 
-def _session(name, stamp_ns, yaw):
+def _session(name, stamp_ns, yaw, first):
     c, s = float(np.cos(yaw)), float(np.sin(yaw))
     return {
         "name": name,
@@ -109,6 +111,8 @@ def _session(name, stamp_ns, yaw):
         "overlap": 0.75,
         "first_stamp_ns": int(stamp_ns[0]),
         "last_stamp_ns": int(stamp_ns[-1]),
+        "first_scan": first,
+        "scans": len(stamp_ns),
     }
 
 

@@ -12,7 +12,6 @@ import pytest
 from stillmap.core.errors import InputError
 from stillmap.mesh.texture.atlas import TexturedMesh
 from stillmap.mesh.triangle_mesh import Mesh
-from stillmap.results.export.obj import encode_obj
 from stillmap.results.gltf import write_glb
 
 pytest.importorskip("trimesh")
@@ -26,12 +25,6 @@ def textured():
     page = np.random.default_rng(0).integers(0, 255, (32, 48, 3)).astype(np.uint8)
     of_face = np.array([0, -1], np.int32)
     return TexturedMesh(vertices, faces, uv, of_face, (page,), of_face)
-
-
-def write_obj(folder, mesh):
-    folder.mkdir()
-    for name, data in encode_obj(mesh, 90, "mesh").items():
-        (folder / name).write_bytes(data)
 
 
 def tree_of(path):
@@ -78,9 +71,8 @@ MAKE = """
 import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
-from test_meshes import textured, write_glb, write_obj
+from test_meshes import textured, write_glb
 write_glb(Path(sys.argv[2]) / "a.glb", textured())
-write_obj(Path(sys.argv[2]) / "obj", textured())
 """
 
 
@@ -96,18 +88,8 @@ def test_the_same_bytes_every_time(tmp_path):
         subprocess.run(words, check=True, env=environment, timeout=120)
         files = sorted(path for path in folder.rglob("*") if path.is_file())
         made.append({str(path.relative_to(folder)): path.read_bytes() for path in files})
-    assert set(made[0]) == {"a.glb", "obj/mesh.obj", "obj/mesh.mtl", "obj/page0.jpg"}
+    assert set(made[0]) == {"a.glb"}
     assert made[0] == made[1]
-
-
-def test_a_mesh_without_pictures_as_obj(tmp_path):
-    mesh = Mesh(np.array([[0.0, 0, 0], [1, 2, 3], [0, 2, 0]]), np.array([[0, 1, 2]], np.int32))
-    write_obj(tmp_path / "obj", mesh)
-    assert {path.name for path in (tmp_path / "obj").iterdir()} == {"mesh.obj", "mesh.mtl"}
-    lines = (tmp_path / "obj" / "mesh.obj").read_text().splitlines()
-    found = [list(map(float, line.split()[1:])) for line in lines if line.startswith("v ")]
-    assert found == [[0, 0, 0], [1, 3, -2], [0, 0, -2]]
-    assert [line for line in lines if line.startswith("f ")] == ["f 1 2 3"]
 
 
 def test_whole_or_not_at_all(tmp_path, monkeypatch):

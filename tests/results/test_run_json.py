@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from stillmap.core.json import count_skipped, to_jsonable
-from stillmap.results.run_json import write_run_json
+from stillmap.core.json import count_skipped, to_jsonable, write_json
+from stillmap.results.run_json import run_record
 from stillmap.slam.mount_calibration import Calibration, Parameter
 
 
@@ -14,7 +14,7 @@ def no_constant(name):
 
 
 def written(tmp_path, result):
-    write_run_json(tmp_path / "run.json", result)
+    write_json(tmp_path / "run.json", run_record(result))
     text = (tmp_path / "run.json").read_text(encoding="utf-8")
     return json.loads(text, parse_constant=no_constant)
 

@@ -7,7 +7,7 @@ import pytest
 from stillmap.core.errors import InputError
 from stillmap.io.trajectory import read_tum
 from stillmap.pipeline.options import OutputOptions
-from stillmap.results import save as save_module
+from stillmap.results import writer as save_module
 from stillmap.results.writer import save
 from stillmap.tracking import ObjectOptions
 
@@ -83,7 +83,7 @@ def test_a_save_that_fails_leaves_nothing(tmp_path, result, monkeypatch, kind):
     def fail(*_):
         raise kind
 
-    monkeypatch.setattr(save_module, "write_run_json", fail)
+    monkeypatch.setattr(save_module, "run_record", fail)
     with pytest.raises(kind):
         save(result, tmp_path / "out")
     assert list(tmp_path.iterdir()) == []
