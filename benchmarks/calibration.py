@@ -2,7 +2,6 @@
 
 python benchmarks/calibration.py [--cases populated "everyone stops"] [--methods stillmap]
     [--seeds tuning|reporting] [--n-seeds 1] [--set section.key=value ...] [--true-poses]
-    [--png FILE]
 
 A look is a second in which beams passed through, or ended in, the cell in which a beam ended.
 All beams of a cell share its fate, so few cells make many beams: what a perfectly calibrated answer
@@ -13,7 +12,6 @@ import argparse
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from cases import POPULATED, STOPS
@@ -64,7 +62,6 @@ def main() -> None:
     )
     add_arguments(p, ["stillmap"])
     add_run_arguments(p, [POPULATED, STOPS, "street-oncoming", "corridor-40-once"])
-    p.add_argument("--png", type=Path, help="reliability diagrams; the method's name is added")
     args = p.parse_args()
     done = list(outcomes(_beams_of, runs_of(args, args.methods), args.processes))
     for method, some in grouped(done, lambda pair: pair[0].method).items():
@@ -73,8 +70,6 @@ def main() -> None:
         print(f"\n## {method}: {len(some)} runs, {len(beams.p)} beams that hit something\n")
         named += [("all", beams), ("all but doors", beams.of(~beams.door))]
         print("\n\n".join([*_tables(beams), *_by_run(named)]))
-        if args.png:
-            _draw(beams, args.png.with_stem(f"{args.png.stem}-{method}"))
 
 
 def joined(parts: Sequence[Beams]) -> Beams:
@@ -233,30 +228,6 @@ def _by_run(runs: Sequence[tuple[str, Beams]]) -> Iterator[str]:
             found = [f"{_ece(unsure):.3f}", f"{if_calibrated(unsure, rng):.3f}"]
             lines.append([name, *counted, *found])
     yield markdown(["run", "unsure beams", "their cells", "ECE", "if calibrated"], lines)
-
-
-def _draw(beams: Beams, path: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure, axes = plt.subplots(1, len(SPLITS), figsize=(15, 5), sharey=True)
-    for axis, (title, name, edges) in zip(axes, SPLITS, strict=True):
-        axis.plot([0, 1], [0, 1], color="grey", linewidth=1)
-        values = getattr(beams, name)
-        for low, high in itertools.pairwise([*edges, np.inf]):
-            some = beams.of((values >= low) & (values < high))
-            of_bin = np.searchsorted(FIXED, some.p, side="right") - 1
-            bins = [k for k in np.unique(of_bin) if np.sum(of_bin == k) >= 50]
-            x = [some.p[of_bin == k].mean() for k in bins]
-            y = [some.static[of_bin == k].mean() for k in bins]
-            axis.plot(x, y, marker="o", markersize=3, label=f"from {low:g}")
-        axis.set(xlabel="P(static)", title=title)
-        axis.legend()
-    axes[0].set(ylabel="truly static")
-    figure.tight_layout()
-    figure.savefig(path, dpi=120)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 import argparse
 import itertools
+import multiprocessing
 import os
 import subprocess
 import sys
@@ -54,6 +55,13 @@ class Run:
     method: str
     settings: tuple[str, ...]
     true_poses: bool
+
+
+def in_fresh_process(work: Callable[..., Outcome], *args: object) -> Outcome:
+    """What `work` returns, from a process that has done nothing else."""
+    # Linux hands the peak of a process down to the one that it starts, not to what that one forks
+    with multiprocessing.get_context("forkserver").Pool(1) as pool:
+        return pool.apply(work, args)
 
 
 def add_arguments(p: argparse.ArgumentParser, methods: Iterable[str]) -> None:

@@ -2,7 +2,7 @@
 
 python benchmarks/crowds.py [--worlds corridor hall-8m] [--people 0 10 20 40 80]
     [--logs NAME.clf.gz ...] [--seeds tuning|reporting] [--n-seeds 5] [--iterations 3]
-    [--true-labels] [--set section.key=value ...] [--processes 2] [--png FILE]
+    [--true-labels] [--set section.key=value ...] [--processes 2]
 
 "e" is stillmap's loop: what the E-step before found weighs every beam in registration and in the
 verification of loops. "prior" takes as many M-steps, robust kernel and loops included, but all hits
@@ -71,15 +71,12 @@ def main() -> None:
     p.add_argument("--logs", nargs="+", type=Path, default=[])
     p.add_argument("--iterations", type=int, default=3, help="M-steps")
     p.add_argument("--true-labels", action="store_true", help="also with the truth as weights")
-    p.add_argument("--png", type=Path, help="draw the curves")
     args = p.parse_args()
     done = sorted(
         outcomes(rows_of, jobs_of(args), args.processes), key=lambda pair: _order(pair[0])
     )
     rows = [row for _, rows in done for row in rows]
     print(table(rows))
-    if args.png:
-        draw([row for row in rows if row["place"] in WORLDS], args.png)
 
 
 def jobs_of(args: argparse.Namespace) -> list[Job]:
@@ -173,30 +170,6 @@ def table(rows: Sequence[Row]) -> str:
         ).items()
     ]
     return markdown(["place", "people", "weights", *(c.title for c in COLUMNS)], lines)
-
-
-def draw(rows: Sequence[Row], path: Path) -> None:
-    """Mean relation error over the crowd, a curve for every kind of weights, from seed to seed."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
-    places = grouped(rows, lambda row: row["place"])
-    figure, axes = plt.subplots(1, len(places), figsize=(6 * len(places), 4.5), squeeze=False)
-    for axis, (place, of_place) in zip(axes[0], places.items(), strict=True):
-        for weights, some in grouped(of_place, lambda row: row["weights"]).items():
-            of_crowd = grouped(some, lambda row: row["people"])
-            people = sorted(of_crowd)
-            errors = [[row["translation"] for row in of_crowd[n]] for n in people]
-            (line,) = axis.plot(people, [np.mean(e) for e in errors], marker="o", label=weights)
-            low, high = [min(e) for e in errors], [max(e) for e in errors]
-            axis.fill_between(people, low, high, color=line.get_color(), alpha=0.2, linewidth=0)
-        axis.set(title=place, xlabel="people", ylabel="mean relation error, m", yscale="log")
-        axis.legend()
-    figure.tight_layout()
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
 
 
 if __name__ == "__main__":

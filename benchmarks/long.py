@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from common import in_fresh_process
 from numpy.typing import NDArray
-from sweep import in_fresh_process
 from tables import markdown
 
 from stillmap.core import se2
@@ -149,7 +149,7 @@ def write_beginning(whole: Path, scans: int, beginning: Path) -> None:
 def first_scans(recording: Recording, scans: int) -> Recording:
     """The beginning of a recording."""
     beams = slice(0, int(recording.offset[scans]))
-    odometry = recording.T_odom_base
+    odometry, times = recording.T_odom_base, recording.beam_time
     return dataclasses.replace(
         recording,
         stamp_ns=recording.stamp_ns[:scans],
@@ -158,6 +158,7 @@ def first_scans(recording: Recording, scans: int) -> Recording:
         hit=recording.hit[beams],
         sensor=recording.sensor[:scans],
         T_odom_base=None if odometry is None else odometry[:scans],
+        beam_time=None if times is None else times[beams],
     )
 
 

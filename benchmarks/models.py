@@ -4,7 +4,7 @@ python benchmarks/models.py [--seeds tuning|reporting] [--n-seeds 3] [--worlds h
     [--set section.key=value ...] [--processes 1] [--keep DIR]
 
 Each world is recorded for a minute with a camera: hall and corridor by a rig of two lasers, the
-street by a spinning lidar. `stillmap map` makes the models, `stillmap eval model` scores them.
+street by a spinning lidar. `stillmap map` makes the models, `model_scores.py` scores them.
 Surface: mean and 95 % of how far it is off, cm, and the share of the places that the sensor saw, or
 saw from within 10 m, that lie within 5 cm of it. Texture: the share that shows movers, the share of
 what some picture sees without movers, or sees from within 10 m, that is textured, and CIEDE2000.
@@ -14,7 +14,7 @@ anything else.
 """
 
 import argparse
-import json
+import math
 import subprocess
 import sys
 import tempfile
@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 from common import Scores, add_arguments, add_seed_arguments, options_of, outcomes, seeds_of
+from model_scores import score_model
 from tables import Column, means_and_worst
 
 from stillmap.sim import (
@@ -142,10 +143,9 @@ def _rows(job: Job, folder: Path) -> Scores:
     started = time.monotonic()
     _stillmap("map", *inputs, "-o", result, "--mesh", "--overwrite", "--quiet", *flags)
     seconds = time.monotonic() - started
-    found = json.loads(_stillmap("eval", "model", result, sim, "--json"))
-    near = json.loads(_stillmap("eval", "model", result, sim, "--json", "--within", _NEAR))
+    near = score_model(result, sim, _NEAR)
     return {
-        **flat(found),
+        **flat(score_model(result, sim, math.inf)),
         "complete_near": flat(near)["complete"],
         "covered_near": flat(near)["covered"],
         "walkers": 100.0 * share,
@@ -153,13 +153,12 @@ def _rows(job: Job, folder: Path) -> Scores:
     }
 
 
-def _stillmap(*args: object) -> str:
-    command = [sys.executable, "-m", "stillmap", *(str(arg) for arg in args)]
-    return subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
+def _stillmap(*args: object) -> None:
+    subprocess.run([sys.executable, "-m", "stillmap", *map(str, args)], check=True)
 
 
 def flat(found: dict[str, Any]) -> Scores:
-    """What `eval model --json` says, in percent and centimetres; NaN for what it does not."""
+    """What `score_model` says, in percent and centimetres; NaN for what it does not."""
     merged = {}
     for part in ("surface", "texture", "movers"):
         merged.update(found.get(part, {}))

@@ -16,7 +16,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import model_surface
 import numpy as np
+from model_readers import RECORD, read_record
+from model_surface import GREY, SAMPLES, TextureRecord, TrueImages, look_up_texture_source
 from numpy.typing import NDArray
 from tables import Column, markdown
 
@@ -24,9 +27,6 @@ import stillmap
 from stillmap.core import camera as camera_module
 from stillmap.core.camera import Images
 from stillmap.core.errors import InputError
-from stillmap.eval import mesh_distance
-from stillmap.eval.mesh import GREY, SAMPLES, TextureRecord, TrueImages, look_up_texture_source
-from stillmap.eval.model_readers import RECORD, read_record
 from stillmap.mesh.texture.views import View
 from stillmap.mesh.texture.visibility import find_visible_faces
 from stillmap.mesh.triangle_mesh import Mesh
@@ -78,14 +78,14 @@ def scores(record: TextureRecord, images: Images, people: Mask) -> Scores:
     def distance(image: int) -> NDArray[np.float32]:
         raise NotImplementedError("how far pixels see is not looked up")
 
-    at = mesh_distance.sample_surface(record.vertices, record.faces, SAMPLES)
+    at = model_surface.sample_surface(record.vertices, record.faces, SAMPLES)
     places = np.full((len(images), 4, 4), np.nan)
     shows = look_up_texture_source(
         record, at, TrueImages(images.cameras, images.camera, places, mask, distance)
     )
     painted, free = shows != GREY, _free(record, at, images, people)
     return Scores(
-        area=float(mesh_distance.triangle_areas(record.vertices, record.faces).sum()),
+        area=float(model_surface.triangle_areas(record.vertices, record.faces).sum()),
         painted=_mean(painted),
         free=_mean(free),
         covered=_mean(painted[free]),
@@ -94,7 +94,7 @@ def scores(record: TextureRecord, images: Images, people: Mask) -> Scores:
 
 
 def _free(
-    record: TextureRecord, at: mesh_distance.SurfaceSamples, images: Images, people: Mask
+    record: TextureRecord, at: model_surface.SurfaceSamples, images: Images, people: Mask
 ) -> Mask:
     """(n,) whether a picture that sees a sample's whole face shows no person there."""
     out, mesh = np.zeros(len(at.face), bool), Mesh(record.vertices, record.faces)

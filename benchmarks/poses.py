@@ -31,13 +31,13 @@ from common import (
     add_arguments,
     add_seed_arguments,
     built,
+    in_fresh_process,
     options_of,
     outcomes,
     seeds_of,
 )
 from numpy.typing import NDArray
 from pairs import errors_of, near_pairs
-from sweep import in_fresh_process
 from tables import Column, Row, grouped, markdown
 
 import stillmap

@@ -2,18 +2,16 @@
 
 python benchmarks/rig.py [--seeds tuning|reporting] [--n-seeds 3] [--worlds hall corridor office]
     [--set section.key=value ...] [--processes 1]
-python benchmarks/rig.py --figures DIR [--worlds hall] [--seeds reporting]
 
 Simulated rigs for 80 s each; people walk, and every third stops now and then. Poses and labels of
 the flat laser are estimated. Of the points of the tilting laser: SA, the share of the static ones
 that is kept; DA, the share of the dynamic ones that is removed; HA, their harmonic mean; percent.
 Beams on doors count in the last two columns only: one that is seen in one state stands still for
-every laser. --figures draws the first seed: all points, those kept, and the objects.
+every laser.
 """
 
 import argparse
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -67,17 +65,9 @@ def main() -> None:
     add_arguments(p, [])
     add_seed_arguments(p)
     p.add_argument("--worlds", nargs="+", choices=WORLDS, default=list(WORLDS))
-    p.add_argument("--figures", type=Path, metavar="DIR", help="draw instead of scoring")
     p.set_defaults(n_seeds=3, processes=1)
     args = p.parse_args()
     options_of("stillmap", args.set)  # refuses before hours have passed
-    if args.figures:
-        from rig_figures import draw  # needs matplotlib
-
-        for world in args.worlds:
-            rig, _, built = run(Job(world, seeds_of(args)[0], tuple(args.set)))
-            draw(args.figures, world, rig, built[WAYS[1]])
-        return
     jobs = [Job(world, seed, tuple(args.set)) for world in args.worlds for seed in seeds_of(args)]
     done = sorted(outcomes(rows, jobs, args.processes), key=lambda pair: jobs.index(pair[0]))
     print("Means over worlds and seeds, in brackets the worst.")

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from place_poses import PoseScores, read_sessions, score_poses
+from place_truth import load_session_truth
 
 from stillmap.core.errors import InputError
 from stillmap.core.se2 import inverse
-from stillmap.eval.session_poses import PoseScores, read_sessions, score_poses
-from stillmap.eval.session_truth import load_session_truth
 from stillmap.results.reader import read_grid
 
 _MAXRSS_UNIT = 1 if sys.platform == "darwin" else 1024  # bytes

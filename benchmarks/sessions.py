@@ -37,14 +37,14 @@ from pathlib import Path
 
 import numpy as np
 import session_merging as merging
+from place_poses import FRAME_DT, PoseScores
+from place_scores import score_place
 from session_laps import write_cuts, write_laps, write_pieces
 from session_sets import LASER, PairSet, prepare_days, prepare_pairs
 from tables import markdown
 
 from stillmap.eval.readers import read_planar_trajectory, read_relations, read_trajectory
 from stillmap.eval.relations import compute_relation_errors
-from stillmap.eval.session_poses import FRAME_DT, PoseScores
-from stillmap.eval.sessions import score_place
 from stillmap.eval.trajectory import ErrorStats, associate_trajectories, compute_absolute_errors
 from stillmap.sim import scene_by_name, simulate, write_simulation
 

@@ -30,11 +30,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import Scores, add_seed_arguments, finite, seeds_of
+from common import Scores, add_seed_arguments, finite, in_fresh_process, seeds_of
 from space_cases import WORLDS, Case, prepare, simulated
 from space_methods import CERTAIN, ESTIMATED, OURS, PEERS, of_ours, of_peer
 from space_scores import scores_of
-from sweep import in_fresh_process
 from tables import Column, Row, grouped, markdown
 
 from stillmap.core import config

@@ -14,7 +14,6 @@ sweep not at all.
 """
 
 import argparse
-import dataclasses
 import json
 import shutil
 import sys
@@ -25,8 +24,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from common import in_fresh_process
+from long import first_scans
 from numpy.typing import NDArray
-from sweep import in_fresh_process
 from tables import markdown
 
 import stillmap
@@ -88,18 +88,7 @@ def write(whole: Path, world: str, changes: dict[str, Any], seed: int) -> None:
 def write_beginning(whole: Path, sweeps: int, first: Path) -> dict[str, float]:
     """Writes the first sweeps and their true poses; how far the robot went, how much it saw."""
     recording, poses = stillmap_folder.read(whole), load_truth(whole).T_world_base[:sweeps]
-    beams = slice(0, int(recording.offset[sweeps]))
-    times = recording.beam_time
-    part = dataclasses.replace(
-        recording,
-        stamp_ns=recording.stamp_ns[:sweeps],
-        offset=recording.offset[: sweeps + 1],
-        points=recording.points[beams],
-        hit=recording.hit[beams],
-        sensor=recording.sensor[:sweeps],
-        T_odom_base=None,
-        beam_time=None if times is None else times[beams],
-    )
+    part = first_scans(recording, sweeps).without_odometry()
     stillmap_folder.write(part, first)
     np.save(first / _POSES, poses)
     return size_of(part, poses)

@@ -1,4 +1,5 @@
-"""Settings and fixtures of all tests; tests/reference and tests/marks.py can be imported."""
+"""Settings and fixtures of all tests; tests/reference, tests/marks.py and benchmarks can be
+imported."""
 
 import gc
 import resource
@@ -11,6 +12,7 @@ import pytest
 # thousands of collected tests are alive: walking them at every collection costs 8 % of the time
 gc.set_threshold(50_000, 50, 50)
 sys.path.append(str(Path(__file__).resolve().parent))
+sys.path.append(str(Path(__file__).resolve().parents[1] / "benchmarks"))
 
 
 @pytest.fixture(scope="session")

@@ -1,6 +1,6 @@
-"""The benchmarks are scripts: their helpers are imported as they import one another."""
+"""The made-up place is imported by the tests beside it."""
 
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
+sys.path.insert(0, str(Path(__file__).resolve().parent))

@@ -15,8 +15,6 @@ SCRIPTS = sorted(path.stem for path in FOLDER.glob("*.py") if not path.stem.ends
 def test_script(name, monkeypatch, capsys):
     if name in ("pasted", "pasted_scores"):
         pytest.importorskip("PIL")
-    if name in ("calibration", "crowds", "rig", "rig_figures"):
-        pytest.importorskip("matplotlib")
     module = importlib.import_module(name)
     if hasattr(module, "main"):
         monkeypatch.setattr(sys, "argv", [f"{name}.py", "--help"])

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from place_truth import load_session_truth
 
 from stillmap import io
 from stillmap.cli import simulate
 from stillmap.core.errors import InputError
-from stillmap.eval.session_truth import load_session_truth
 from stillmap.sim import load_truth
 
 QUICK = ("--scans", "20", "--beams", "90", "--people", "3")

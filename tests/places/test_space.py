@@ -4,12 +4,12 @@ import filecmp
 from pathlib import Path
 
 import pytest
+from place_scores import PlaceScores, score_place
+from place_truth import load_session_truth
 
 import stillmap
 from stillmap.core import se2
 from stillmap.core.errors import InputError
-from stillmap.eval.session_truth import load_session_truth
-from stillmap.eval.sessions import PlaceScores, score_place
 from stillmap.sim import scene_by_name
 from stillmap.sim.sessions import SessionOptions, plan_sessions
 from stillmap.sim.writer import write_sessions

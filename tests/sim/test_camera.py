@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from marks import slow_params
 from numpy.typing import NDArray
+from true_surfaces import place_parts, project_to_solid, project_to_static
 
 from stillmap import io as recordings
 from stillmap.core.errors import InputError
-from stillmap.eval.true_surfaces import place_parts, project_to_solid, project_to_static
 from stillmap.sim import (
     RigSimulation,
     Scene,

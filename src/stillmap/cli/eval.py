@@ -1,4 +1,4 @@
-"""`stillmap eval`: score trajectories, labels, maps and models, as text or as JSON."""
+"""`stillmap eval`: score trajectories, labels and maps, as text or as JSON."""
 
 import argparse
 from pathlib import Path
@@ -16,7 +16,7 @@ _MAX_DT_TRAJECTORY = 0.02  # s between the stamps of two systems for one scan
 
 DESCRIPTION = (
     "Score a result, as text or with --json as one object on stdout. `relations` "
-    "and `trajectory` compare poses with a reference; `labels`, `map` and `model` compare a "
+    "and `trajectory` compare poses with a reference; `labels` and `map` compare a "
     "result with the truth that `stillmap simulate` writes."
 )
 EPILOG = """examples:
@@ -24,8 +24,6 @@ EPILOG = """examples:
   stillmap eval trajectory out/trajectory.tum truth.tum --json
   stillmap eval labels out sim
   stillmap eval map out sim
-  stillmap eval model out sim
-  stillmap eval sessions place days
 """
 
 
@@ -56,26 +54,11 @@ _SCORES = {
         "out sim",
         "out sim --reference out-empty --reference-truth sim-empty",
     ),
-    "model": (
-        "surface, texture and object models, against a simulation's truth",
-        "Distance of the mesh from the true surface, and its completeness; colour errors of the "
-        "texture, and its share that shows movers; shapes and textures of object models. The "
-        "simulation needs cameras.",
-        "out sim",
-        "out sim --within 20 --json",
-    ),
-    "sessions": (
-        "alignment, changes and map of a place, against simulated sessions",
-        "Errors of the poses of each session, cells and objects that changed between sessions, and "
-        "the map of what stands there last, against the truth of `stillmap simulate --sessions`.",
-        "place days",
-        "place days --single out-1 --single out-2 --json",
-    ),
 }
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the six scores."""
+    """Add the four scores."""
     scores = parser.add_subparsers(title="scores", dest="score", required=True, metavar="SCORE")
     for name, (about, description, *examples) in _SCORES.items():
         epilog = "\n".join(
@@ -86,8 +69,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             _add_relations(score)
         elif name == "trajectory":
             _add_trajectory(score)
-        elif name == "sessions":
-            _add_sessions(score)
         else:
             _add_simulation(score, name)
         score.add_argument("--json", action="store_true", help="one JSON object on stdout")
@@ -165,31 +146,6 @@ def _add_simulation(parser: argparse.ArgumentParser, score: str) -> None:
             metavar="DIR",
             help="truth of that other run (default: TRUTH_DIR)",
         )
-    if score == "model":
-        parser.add_argument(
-            "--within",
-            type=_positive,
-            default=float("inf"),
-            metavar="M",
-            help="expect only what beams and images saw from at most M metres (default: all)",
-        )
-
-
-def _add_sessions(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "place", type=Path, metavar="PLACE", help="folder that `stillmap merge` wrote"
-    )
-    parser.add_argument(
-        "truth", type=Path, metavar="TRUTH_DIR", help="folder that `simulate --sessions` wrote"
-    )
-    parser.add_argument(
-        "--single",
-        type=Path,
-        action="append",
-        default=[],
-        metavar="RESULT_DIR",
-        help="result of one of the sessions, whose map is scored too; can be given again",
-    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -207,14 +163,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _compute_scores(args: argparse.Namespace) -> "Scores":
-    if args.score == "model":
-        from stillmap.cli.eval_model import score_model
-
-        return score_model(args.result, args.truth, args.within)
-    if args.score == "sessions":
-        from stillmap.cli.eval_sessions import score_sessions
-
-        return score_sessions(args.place, args.truth, args.single)
     from stillmap.cli import eval_scores
 
     if args.score == "relations":

@@ -1,4 +1,4 @@
-"""Compute and format the scores of `stillmap eval`, but for models."""
+"""Compute and format the scores of `stillmap eval`."""
 
 from collections.abc import Iterable
 from pathlib import Path

@@ -8,13 +8,13 @@ from unittest import mock
 
 import numpy as np
 import pytest
+from model_readers import read_camera_simulation
+from model_surface import compute_color_difference
+from true_surfaces import project_to_static
 
 import stillmap
 from stillmap.cli.main import main
 from stillmap.core.camera import Images
-from stillmap.eval.mesh import compute_color_difference
-from stillmap.eval.model_readers import read_camera_simulation
-from stillmap.eval.true_surfaces import project_to_static
 from stillmap.io import stillmap_folder
 from stillmap.io.trajectory import poses_from_tum
 from stillmap.mesh import build

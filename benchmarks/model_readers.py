@@ -5,17 +5,18 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import model_surface
 import numpy as np
+from model_objects import Model, MoverHits, Track
+from model_surface import SAMPLES, ColoredPoints, TextureRecord, TrueImages
 from numpy.typing import NDArray
+from true_surfaces import project_to_static
 
 from stillmap.core.array_folder import open_npy, read_npz
 from stillmap.core.errors import InputError, import_extra
 from stillmap.core.input_files import read_bytes
 from stillmap.core.json import read_json
-from stillmap.eval import mesh_distance, readers
-from stillmap.eval.mesh import SAMPLES, ColoredPoints, TextureRecord, TrueImages
-from stillmap.eval.object_models import Model, MoverHits, Track
-from stillmap.eval.true_surfaces import project_to_static
+from stillmap.eval import readers
 from stillmap.sim.truth import ImageTruth, load_image_truth
 from stillmap.slam.deskew import deskew_recording
 from stillmap.slam.options import SlamOptions
@@ -53,7 +54,7 @@ class CameraSimulation(NamedTuple):
         use = recording.hit & self.truth.static()
         use &= np.linalg.norm(recording.points, axis=1) <= max_range
         _, places = project_to_static(self.image_truth.standing, self.end_points[use])
-        return places[mesh_distance.first_per_voxel(places, _VOXEL)]
+        return places[model_surface.first_per_voxel(places, _VOXEL)]
 
     def mover_hits(self) -> MoverHits:
         """The hits on movers."""
@@ -145,7 +146,7 @@ def _parts(scene: Any) -> Iterator[_Part]:
 def _concatenate(parts: list[_Part], n: int) -> GlbContent:
     vertices, faces, first = [np.empty((0, 3))], [np.empty((0, 3), np.int32)], 0
     points, colour = [np.empty((0, 3))], [np.empty((0, 3), np.uint8)]
-    area = [float(mesh_distance.triangle_areas(one.vertices, one.faces).sum()) for one in parts]
+    area = [float(model_surface.triangle_areas(one.vertices, one.faces).sum()) for one in parts]
     total = sum(a for a, one in zip(area, parts, strict=True) if one.uv is not None)
     for a, one in zip(area, parts, strict=True):
         vertices.append(one.vertices)
@@ -153,7 +154,7 @@ def _concatenate(parts: list[_Part], n: int) -> GlbContent:
         first += len(one.vertices)
         if one.uv is not None and one.picture is not None and a > 0.0:
             count = max(1, round(n * a / total))
-            some = mesh_distance.sample_surface(one.vertices, one.faces, count)
+            some = model_surface.sample_surface(one.vertices, one.faces, count)
             uv = np.einsum("nk,nkd->nd", some.weight, one.uv[one.faces[some.face]])
             points.append(some.points)
             colour.append(_texels(one.picture, uv))

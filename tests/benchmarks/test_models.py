@@ -2,34 +2,29 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
-
-from stillmap.core.camera import Camera
-from stillmap.eval.mesh import (
+from model_objects import (
+    Model,
+    MoverHits,
+    Track,
+    match_mover,
+    score_object_models,
+)
+from model_surface import (
     GREY,
     NOTHING,
     ColoredPoints,
     TextureRecord,
     TrueImages,
-    compute_color_difference,
-    compute_color_errors,
+    distance_to_mesh,
     find_visible_samples,
     look_up_texture_source,
+    sample_surface,
     score_surface,
     score_texture,
 )
-from stillmap.eval.mesh_distance import sample_surface
-from stillmap.eval.object_models import (
-    Model,
-    MoverHits,
-    Track,
-    collect_observed_points,
-    count_max_beams,
-    distance_to_solids,
-    match_mover,
-    score_object_models,
-)
-from stillmap.eval.true_surfaces import place_parts
+from numpy.typing import NDArray
+
+from stillmap.core.camera import Camera
 from stillmap.sim.appearance import compute_static_color
 from stillmap.sim.camera import SKY
 from stillmap.sim.geometry import BOX, Faces, Ground, MovingSurfaces, Solids, StaticSurfaces
@@ -104,13 +99,6 @@ def test_a_surface_with_holes_is_less_complete() -> None:
     assert found.complete == pytest.approx((2.0 + 0.05) / 4.0, abs=0.01)
 
 
-def test_no_surface_has_no_score_and_shows_nothing() -> None:
-    none = np.empty((0, 3)), np.empty((0, 3), np.int32)
-    found = score_surface(*none, FLOOR, np.zeros((3, 3)), T_WORLD_MAP)
-    assert np.isnan(found.mean)
-    assert found.complete == 0.0
-
-
 def test_texture_shows_what_the_pictures_do() -> None:
     mask = np.zeros((30, 40), np.uint16)
     mask[:, :10], mask[:, 30:35] = 5, SKY  # a quarter and an eighth of what the picture shows
@@ -123,16 +111,6 @@ def test_texture_shows_what_the_pictures_do() -> None:
     assert np.mean(painted == 4) == pytest.approx(0.25, abs=0.01)
     assert np.mean(painted == NOTHING) == pytest.approx(0.125, abs=0.01)
     assert np.mean(painted == -1) == pytest.approx(0.625, abs=0.01)
-
-
-def test_what_a_picture_does_not_reach_is_grey() -> None:
-    record = _record(*_floor((2.5, 4), (-1.5, 1.5)))
-    shows = look_up_texture_source(
-        record,
-        sample_surface(record.vertices, record.faces, 100),
-        _pictures(np.zeros((30, 40), np.uint16)),
-    )
-    assert (shows == GREY).all()
 
 
 @pytest.mark.parametrize(
@@ -156,14 +134,6 @@ def test_what_pictures_see_without_movers(z: float, turned: bool, off: float, sh
     assert free.mean() == pytest.approx(share, abs=0.02)
 
 
-def test_what_pictures_see_from_far_away_does_not_count() -> None:
-    record = _record(*_floor((-2, 2), (-1.5, 1.5)))
-    of_mesh = sample_surface(record.vertices, record.faces, 20_000)
-    none = _pictures(np.zeros((30, 40), np.uint16))
-    free = find_visible_samples(record, of_mesh, none, T_WORLD_MAP, max_distance=10**0.5)
-    assert free.mean() == pytest.approx(np.pi / 12, abs=0.01)  # a circle of 1 m
-
-
 def test_texture_scores_of_a_half_painted_floor() -> None:
     pytest.importorskip("skimage")
     mask = np.zeros((30, 40), np.uint16)
@@ -179,24 +149,6 @@ def test_texture_scores_of_a_half_painted_floor() -> None:
     assert found.mover == found.nothing == found.colour_median == found.colour_p95 == 0.0
     assert found.in_view == pytest.approx(0.75, abs=0.01)
     assert found.covered == pytest.approx(2 / 3, abs=0.01)
-
-
-def test_colours_that_differ_are_told() -> None:
-    pytest.importorskip("skimage")
-    places = np.column_stack([np.random.default_rng(2).uniform(-1, 1, (500, 2)), np.zeros(500)])
-    in_map = places @ T_MAP_WORLD[:3, :3].T + T_MAP_WORLD[:3, 3]
-    right = compute_static_color(places, 3)
-    darker = (0.9 * right).astype(np.uint8)
-    errors = compute_color_errors(ColoredPoints(in_map, darker), FLOOR, 3, T_WORLD_MAP)
-    assert np.array_equal(errors, compute_color_difference(darker, right))
-    assert 2.0 < np.median(errors) < 6.0
-
-
-def test_differences_of_colours() -> None:
-    pytest.importorskip("skimage")
-    black, white = np.zeros((1, 3), np.uint8), np.full((1, 3), 255, np.uint8)
-    assert compute_color_difference(black, white) == pytest.approx(100.0, abs=1e-3)
-    assert compute_color_difference(white, white) == 0.0
 
 
 # a box of 2 x 1 x 1 m that drives along x at 1 m/s
@@ -256,14 +208,6 @@ def test_a_model_that_is_too_large_is_off_by_that(grown: float) -> None:
     assert np.isnan(found.background)
 
 
-def test_what_was_seen_goes_with_the_mover() -> None:
-    places = collect_observed_points(DRIVES, 0, 2 * 10**9, (0, 10**9), _seen_box())
-    assert np.allclose(places[:, 1], 0.5)  # without the noise
-    assert 1.0 <= places[:, 0].min() < 1.1
-    assert 2.9 < places[:, 0].max() <= 3.0
-    assert not len(collect_observed_points(DRIVES, 0, 0, (10**9, 2 * 10**9), _seen_box()))
-
-
 def test_background_on_a_mover_is_told() -> None:
     mask = np.full((30, 40), 1, np.uint16)  # mover 0
     mask[:, :20] = 0
@@ -285,23 +229,6 @@ def test_background_on_a_mover_is_told() -> None:
     assert found.models[0].textured == 1.0
 
 
-def test_tracks_are_those_of_the_movers_they_follow() -> None:
-    stamps = np.array([0, 10**9, 2 * 10**9])
-    movers = np.zeros((3, 3, 3))
-    movers[:, 0, 0] = [0.0, 1.0, 2.0]
-    movers[:, 1, 1] = 5.0
-    movers[:, 2] = np.nan  # nowhere
-    length = np.array([np.nan, 4.0, np.nan])
-
-    def follows(x: float, y: float) -> int:
-        xy = np.stack([x + np.arange(3.0), np.full(3, y)], 1)
-        return match_mover(Track(0, stamps, xy), stamps, movers, length)
-
-    assert follows(0.1, 0.5) == 0
-    assert follows(-0.5, 3.0) == 1  # 2 m beside the middle of what is 4 m long
-    assert follows(0.0, 1.0) == -1
-
-
 def test_a_model_is_of_whom_the_track_was_on_then() -> None:
     stamps = np.array([0, 10**9, 2 * 10**9, 3 * 10**9])
     movers = np.zeros((4, 2, 3))
@@ -315,19 +242,24 @@ def test_a_model_is_of_whom_the_track_was_on_then() -> None:
     assert len(track.within((-(2**62), 2**62)).xy) == 4
 
 
-def test_movers_seen_well_are_met_by_many_beams_at_once() -> None:
-    stamps = np.arange(500) * 10**8  # ten in a second, one more where the next begins
-    rare = MoverHits(np.zeros(500, np.int32), stamps, np.zeros((500, 3)))
-    assert count_max_beams(rare, 0) == 11
-    assert count_max_beams(rare, 1) == 0
-    found = score_object_models(
-        {1: 0}, {}, ["car"], DRIVES, rare, _pictures(np.zeros((30, 40), np.uint16)), T_WORLD_MAP
-    )
-    assert (found.tracked, found.modelled, found.seen_well) == (1, 0.0, 0)
-    assert np.isnan(found.modelled_well)
+SQUARE = (
+    np.array([(0.0, 0, 0), (2, 0, 0), (2, 1, 0), (0, 1, 0)]),
+    np.array([(0, 1, 2), (0, 2, 3)], np.int32),
+)
 
 
-def test_distances_to_solids() -> None:
-    points = np.array([(0.0, 0.0, 1.5), (0.0, 0.7, 0.5), (0.0, 0.4, 0.5)])
-    found = distance_to_solids(points, place_parts(DRIVES, DRIVES.parts(0), 0))
-    assert np.allclose(found, [0.5, 0.2, 0.1])
+def test_distances_to_corners_edges_and_inside() -> None:
+    points = np.array([(1.0, 0.5, 0.3), (-0.3, 0.5, 0.4), (2.3, 1.4, 0.0), (0.5, 0.5, 0.0)])
+    distances = distance_to_mesh(points, *SQUARE, 0.1)
+    assert np.allclose(distances, [0.3, 0.5, 0.5, 0.0])
+
+
+def test_samples_are_as_dense_everywhere() -> None:
+    vertices, faces = SQUARE
+    vertices = np.vstack([vertices, vertices + np.array([5.0, 0, 0])])
+    faces = np.vstack([faces, [(4, 5, 6)]]).astype(np.int32)  # half as large as the square
+    samples = sample_surface(vertices, faces, 3000)
+    assert np.bincount(samples.face).tolist() == [1000, 1000, 1000]
+    of_square = samples.points[samples.face < 2]
+    assert np.allclose(of_square.mean(axis=0), (1.0, 0.5, 0.0), atol=0.03)
+    assert np.allclose(of_square.std(axis=0), (2 / 12**0.5, 1 / 12**0.5, 0.0), atol=0.02)

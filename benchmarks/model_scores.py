@@ -1,17 +1,26 @@
-"""Compute and format the scores of `stillmap eval model`."""
+"""Scores of the surface, texture and object models of a result, against a simulation's truth.
 
-import math
-from collections.abc import Iterable
+python benchmarks/model_scores.py RESULT TRUTH [--within M]
+
+Distance of the mesh from the true surface, and its completeness; colour errors of the texture, and
+its share that shows movers; shapes and textures of object models. The simulation needs cameras;
+--within expects only what beams and images saw from at most M metres. Prints JSON.
+"""
+
+import argparse
+import json
 from pathlib import Path
 from typing import Any
 
+import model_readers
 import numpy as np
+from model_objects import MoverScores, match_mover, score_object_models
+from model_readers import CameraSimulation
+from model_surface import score_surface, score_texture
 from numpy.typing import NDArray
 
-from stillmap.eval import model_readers, trajectory
-from stillmap.eval.mesh import SurfaceScores, TextureScores, score_surface, score_texture
-from stillmap.eval.model_readers import CameraSimulation
-from stillmap.eval.object_models import MoverScores, match_mover, score_object_models
+from stillmap.core.json import to_jsonable
+from stillmap.eval import trajectory
 from stillmap.eval.trajectory import read_paired_poses
 from stillmap.results.reader import require_model, require_there
 from stillmap.rig.trajectory import lift_poses
@@ -20,9 +29,18 @@ from stillmap.sim.truth import load_truth
 Float = NDArray[np.float64]
 
 
-def score_model(
-    result: Path, truth_folder: Path, max_distance: float
-) -> tuple[dict[str, Any], Iterable[str]]:
+def main() -> None:
+    p = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    p.add_argument("result", type=Path, metavar="RESULT")
+    p.add_argument("truth", type=Path, metavar="TRUTH")
+    p.add_argument("--within", type=float, default=float("inf"), metavar="M")
+    args = p.parse_args()
+    print(json.dumps(to_jsonable(score_model(args.result, args.truth, args.within))))
+
+
+def score_model(result: Path, truth_folder: Path, max_distance: float) -> dict[str, Any]:
     """Scores of surface, texture and object models, of those that the result has.
 
     Args:
@@ -34,12 +52,10 @@ def score_model(
     seen = model_readers.read_camera_simulation(truth_folder)
     T_world_map = _align(result, seen)
     scores: dict[str, Any] = {"alignment": T_world_map.tolist()}
-    lines: list[str] = []
     glb = model_readers.read_glb(require_model(result))
     standing, places = seen.image_truth.standing, seen.observed_places(max_distance)
     surface = score_surface(glb.vertices, glb.faces, standing, places, T_world_map)
     scores["surface"] = surface.to_dict()
-    lines += _format_surface(surface)
     n = len(seen.images.camera)
     record = model_readers.read_record(result / model_readers.RECORD, n)
     if record is not None:
@@ -48,12 +64,10 @@ def score_model(
             record, glb.colored, seen.images, standing, seed, T_world_map, max_distance
         )
         scores["texture"] = texture.to_dict()
-        lines += _format_texture(texture)
     if (model_readers.find_objects_folder(result) / "objects.json").exists():
         movers = _score_movers(result, seen, T_world_map)
         scores["movers"] = movers.to_dict()
-        lines += _format_movers(movers)
-    return scores, lines
+    return scores
 
 
 def _align(result: Path, seen: CameraSimulation) -> Float:
@@ -84,42 +98,5 @@ def _score_movers(result: Path, seen: CameraSimulation, T_world_map: Float) -> M
     return score_object_models(tracked, models, kinds, moving, sighted, seen.images, T_world_map)
 
 
-def _format_surface(s: SurfaceScores) -> Iterable[str]:
-    yield f"surface      {s.faces} faces, {s.area:.1f} m2"
-    yield f"off truth    mean {_cm(s.mean)}, 95 % below {_cm(s.p95)}"
-    yield f"complete     {_percent(s.complete)} of {s.places} places within 5 cm"
-
-
-def _format_texture(t: TextureScores) -> Iterable[str]:
-    yield (
-        f"textured     {_percent(t.textured)} of the area, {_percent(t.covered)} of the "
-        f"{_percent(t.in_view)} that an image sees without a mover"
-    )
-    yield f"shows        movers {_percent(t.mover)}, nothing {_percent(t.nothing)}"
-    yield f"CIEDE2000    median {t.colour_median:.2f}, 95 % below {t.colour_p95:.2f}"
-
-
-def _format_movers(m: MoverScores) -> Iterable[str]:
-    yield (
-        f"movers       {m.tracked} tracked, {_percent(m.modelled)} with a model; "
-        f"of {m.seen_well} seen by 100 beams in a second {_percent(m.modelled_well)}"
-    )
-    yield (
-        f"models       {len(m.models)}: chamfer {_cm(m.chamfer)} on average, "
-        f"{_percent(m.good)} within 5 cm; background {_percent(m.background)}; "
-        f"of what is no mover {m.nothing} more"
-    )
-    for one in m.models:
-        yield (
-            f"  {one.id:04d}       {one.kind} {one.mover}: to truth {_cm(one.accuracy)}, "
-            f"from truth {_cm(one.completeness)}, textured {_percent(one.textured)}, "
-            f"background {_percent(one.background)}"
-        )
-
-
-def _cm(metres: float) -> str:
-    return "-" if math.isnan(metres) else f"{100 * metres:.2f} cm"
-
-
-def _percent(share: float) -> str:
-    return "-" if math.isnan(share) else f"{100 * share:.2f} %"
+if __name__ == "__main__":
+    main()

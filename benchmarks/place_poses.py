@@ -7,13 +7,13 @@ from typing import Any, Literal
 import numpy as np
 import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
+from place_truth import SessionTruth
 
 from stillmap.core import json as json_files
 from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.eval.labels import Scores
 from stillmap.eval.readers import read_trajectory
-from stillmap.eval.session_truth import SessionTruth
 from stillmap.eval.trajectory import align, associate_trajectories
 
 Float = NDArray[np.float64]

@@ -5,10 +5,10 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
+from place_cells import MIN_BEAMS, SHORT, Seen
+from place_truth import SessionTruth
 
 from stillmap.core.recording import Recording
-from stillmap.eval.session_cells import MIN_BEAMS, SHORT, Seen
-from stillmap.eval.session_truth import SessionTruth
 from stillmap.sim.session_layout import Place
 from stillmap.slam import deskew_recording
 from stillmap.slam.options import SlamOptions

@@ -5,8 +5,8 @@ import pytest
 from marks import slow_params
 from scipy.spatial import KDTree
 from trimesh import creation
+from true_surfaces import place_parts, project_to_solid, project_to_static, to_world
 
-from stillmap.eval.true_surfaces import place_parts, project_to_solid, project_to_static, to_world
 from stillmap.sim.geometry import (
     BOX,
     CYLINDER,

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from place_cells import CELL, collect_cells
+from place_truth import SessionTruth
 
 from stillmap.core import se2
-from stillmap.eval.session_cells import CELL, collect_cells
-from stillmap.eval.session_truth import SessionTruth
 from stillmap.io.stillmap_folder import read
 from stillmap.io.trajectory import write_tum
 

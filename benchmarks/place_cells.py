@@ -6,9 +6,9 @@ from typing import NamedTuple, Protocol
 import numpy as np
 import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
+from place_truth import SessionTruth
 
 from stillmap.core.recording import Recording
-from stillmap.eval.session_truth import SessionTruth
 from stillmap.sim.objects import place_faces
 
 Float = NDArray[np.float64]

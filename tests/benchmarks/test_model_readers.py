@@ -1,10 +1,10 @@
 """Models as `stillmap map` writes them, read to be scored."""
 
+import model_surface
 import numpy as np
 import pytest
+from model_readers import read_glb
 
-from stillmap.eval import mesh_distance
-from stillmap.eval.model_readers import read_glb
 from stillmap.mesh.texture.atlas import TexturedMesh
 from stillmap.mesh.triangle_mesh import Mesh
 from stillmap.results.gltf import write_glb
@@ -34,8 +34,8 @@ def test_colours_stay_where_they_are(tmp_path):
     found = read_glb(tmp_path / "mesh.glb", n=2000)
     assert len(found.faces) == 3
     assert np.allclose(
-        mesh_distance.triangle_areas(found.vertices, found.faces).sum(),
-        mesh_distance.triangle_areas(vertices, model.faces).sum(),
+        model_surface.triangle_areas(found.vertices, found.faces).sum(),
+        model_surface.triangle_areas(vertices, model.faces).sum(),
     )
     assert 1900 < len(found.colored.points) <= 2000
     basis = np.stack([along, up, np.cross(along, up)], axis=1)

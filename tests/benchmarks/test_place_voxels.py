@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
+from place_changes import ChangeScores, FoundChange, score_changes
+from place_truth import SessionTruth, load_session_truth
+from place_voxels import VOXEL, Voxels, VoxelTruth, collect_voxels
 
-from stillmap.eval.session_changes import ChangeScores, score_changes
-from stillmap.eval.session_found import FoundChange
-from stillmap.eval.session_truth import SessionTruth, load_session_truth
-from stillmap.eval.session_voxels import VOXEL, Voxels, VoxelTruth, collect_voxels
 from stillmap.sim import scene_by_name
 from stillmap.sim.sessions import SessionOptions, plan_sessions
 from stillmap.sim.writer import write_sessions

@@ -4,12 +4,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import model_surface
 import numpy as np
-from numpy.typing import NDArray
-
-from stillmap.eval import mesh_distance
-from stillmap.eval.labels import NAN, Float, Scores, mean
-from stillmap.eval.mesh import (
+from model_surface import (
     GREY,
     Index,
     TextureRecord,
@@ -17,7 +14,10 @@ from stillmap.eval.mesh import (
     look_up_texture_source,
     transform_points,
 )
-from stillmap.eval.true_surfaces import place_parts, project_to_solid, to_world
+from numpy.typing import NDArray
+from true_surfaces import place_parts, project_to_solid, to_world
+
+from stillmap.eval.labels import NAN, Float, Scores, mean
 from stillmap.sim.geometry import MovingSurfaces, Solids, to_local
 
 _SAMPLES = 20_000
@@ -205,14 +205,14 @@ def score_model(
     """Score one model; for arguments see `score_object_models`."""
     solids = place_parts(moving, moving.parts(mover), model.stamp_ns)
     T = T_world_map @ model.T_map_object
-    on_model = mesh_distance.sample_surface(model.vertices, model.faces, _SAMPLES).points
+    on_model = model_surface.sample_surface(model.vertices, model.faces, _SAMPLES).points
     accuracy = mean(distance_to_solids(transform_points(T, on_model), solids))
     places = collect_observed_points(moving, mover, model.stamp_ns, model.span_ns, sighted)
     vertices = transform_points(T, model.vertices)
-    completeness = mean(mesh_distance.distance_to_mesh(places, vertices, model.faces, _SPACING))
+    completeness = mean(model_surface.distance_to_mesh(places, vertices, model.faces, _SPACING))
     textured = background = NAN
     if (record := model.record) is not None:
-        of_record = mesh_distance.sample_surface(record.vertices, record.faces, _SAMPLES)
+        of_record = model_surface.sample_surface(record.vertices, record.faces, _SAMPLES)
         source = look_up_texture_source(record, of_record, pictures)
         textured = mean(source != GREY)
         background = mean(source[source != GREY] != mover)
@@ -254,7 +254,7 @@ def collect_observed_points(
         moved = to_world(to_local(on, then.pose[:, k]), now.pose[:, k])
         nearest[better], found[better] = off[better], moved[better]
     found = found[np.isfinite(found).all(axis=1)]
-    return np.asarray(found[mesh_distance.first_per_voxel(found, _VOXEL)])
+    return np.asarray(found[model_surface.first_per_voxel(found, _VOXEL)])
 
 
 def _drop_nan(values: Sequence[float]) -> Float:

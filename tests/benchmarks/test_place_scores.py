@@ -7,14 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from made_up_place import write_place
+from place_cells import CELL, Lattice, collect_cells, count_beams
+from place_changes import ChangeScores
+from place_scores import PlaceScores, score_place
+from place_truth import SessionTruth, load_session_truth
 
-from stillmap.cli.main import main
 from stillmap.core import se2
 from stillmap.core.errors import InputError
-from stillmap.eval.session_cells import CELL, Lattice, collect_cells, count_beams, widen
-from stillmap.eval.session_changes import ChangeScores
-from stillmap.eval.session_truth import SessionTruth, load_session_truth
-from stillmap.eval.sessions import PlaceScores, score_place
 from stillmap.io.stillmap_folder import read
 from stillmap.sim import scene_by_name
 from stillmap.sim.sessions import SessionOptions, plan_sessions
@@ -75,21 +74,6 @@ def test_a_perfect_place_is_perfect(perfect: Path, truth: SessionTruth) -> None:
     assert own.walls_kept == 1.0
     assert own.ghost_cells == 0
     assert own.wall_cells > 500
-
-
-def test_the_frame_is_that_of_the_first_accepted_session(
-    truth: SessionTruth, tmp_path: Path
-) -> None:
-    write_place(tmp_path / "place", truth, refused=(0,), made_up=False)
-    (tmp_path / "place/changes.json").write_text("[]")
-    shutil.copy(_map_of(truth, tmp_path), tmp_path / "place/map.npz")
-    scores = score_place(tmp_path / "place", truth.folder)
-    assert [one.verdict for one in scores.sessions] == ["refused", "right", "right"]
-
-
-def _map_of(truth: SessionTruth, folder: Path) -> Path:
-    write_place(folder / "other", truth)
-    return folder / "other/map.npz"
 
 
 @pytest.mark.slow
@@ -157,16 +141,6 @@ def test_changes_of_another_date_are_neither_found_nor_right(place, truth) -> No
 
 
 @pytest.mark.slow
-def test_boxes_where_nothing_changed_are_spurious(place: Path, truth: SessionTruth) -> None:
-    extra = {"kind": "gone", "box": [400.0, 400.0, 401.0, 401.0], "between": list(truth.names[:2])}
-    before = changes_of(score_place(place, truth.folder))
-    edit_changes(place, lambda changes: [*changes, {"id": 999, **extra}])
-    after = changes_of(score_place(place, truth.folder))
-    assert after.spurious == before.spurious + 1
-    assert after.f1 == before.f1
-
-
-@pytest.mark.slow
 def test_cells_of_changes_take_the_place_of_boxes(place: Path, truth: SessionTruth) -> None:
     cells = collect_cells(truth, [0, 1, 2])
     T = np.linalg.inv(truth.T_world_session[0])
@@ -197,52 +171,6 @@ def test_ghosts_and_missing_walls_show_in_the_map(place: Path, truth: SessionTru
     (own,) = score_place(place, truth.folder).maps
     assert 0.3 < own.walls_kept < 0.7
     assert (own.ghost_cells, own.avoidable_ghosts) == (1, 1)
-
-
-@pytest.mark.slow
-def test_gone_objects_in_the_map_are_ghosts_avoidable_where_a_later_session_looked(
-    place, truth
-) -> None:
-    cells = collect_cells(truth, [0, 1, 2])
-    gone = cells.surfaces[0] & ~cells.surfaces[2] & ~widen(widen(widen(cells.surfaces[2])))
-    looked = gone & ((cells.seen[1].passes > 30) | (cells.seen[2].passes > 30))
-    with np.load(place / "map.npz") as file:
-        arrays = dict(file)
-    arrays["p_occupied"][gone] = 0.9
-    np.savez_compressed(place / "map.npz", **arrays)
-    (own,) = score_place(place, truth.folder).maps
-    assert 0 < looked.sum() <= own.avoidable_ghosts < own.ghost_cells <= gone.sum()
-
-
-@pytest.mark.slow
-def test_single_sessions_are_scored_beside(perfect: Path, truth: SessionTruth, tmp_path) -> None:
-    single = tmp_path / "out-2"
-    single.mkdir()
-    shutil.copy(perfect / "sessions/session-2/trajectory.tum", single)
-    shutil.copy(perfect / "map.npz", single)
-    own, other = score_place(perfect, truth.folder, [single]).maps
-    assert (own.name, other.name) == ("perfect", "out-2")
-    assert other.wall_cells < own.wall_cells
-    assert other.ghost_cells >= own.ghost_cells
-    shutil.copy(truth.folder / "session-1/truth/trajectory.tum", single)
-    text = (single / "trajectory.tum").read_text().replace("10000", "20000")
-    (single / "trajectory.tum").write_text(text)
-    with pytest.raises(InputError, match="no result of these sessions"):
-        score_place(perfect, truth.folder, [single])
-
-
-def test_scores_as_text_and_as_json(perfect: Path, truth: SessionTruth, capsys) -> None:
-    words = ["eval", "sessions", str(perfect), str(truth.folder)]
-    assert main(words) == 0
-    text = capsys.readouterr().out
-    assert "3: 3 right, 0 coarse, 0 wrong, 0 refused" in text
-    assert "dates right 100.0 %" in text
-    assert main([*words, "--json"]) == 0
-    scores = json.loads(capsys.readouterr().out)
-    assert [one["verdict"] for one in scores["sessions"]] == ["right"] * 3
-    assert scores["maps"][0]["walls_kept"] == 1.0
-    assert main(["eval", "sessions", str(truth.folder), str(perfect)]) == 2
-    assert "is damaged" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -1,20 +1,19 @@
-"""`stillmap eval model` on made-up results of a small rig with a camera."""
+"""Scores of a made-up model of a small rig with a camera."""
 
-import io
 import json
+import math
 import shutil
-from contextlib import redirect_stdout
 from pathlib import Path
 
+import model_surface
 import numpy as np
 import pytest
+from model_scores import score_model
 from numpy.typing import NDArray
 from PIL import Image
 
-from stillmap.cli.main import main
 from stillmap.core import se2
-from stillmap.core.errors import install_command
-from stillmap.eval import mesh as mesh_module
+from stillmap.core.errors import InputError
 from stillmap.io import read
 from stillmap.io.trajectory import write_tum
 from stillmap.sim import (
@@ -39,7 +38,7 @@ SIZE = 64  # texels
 def _fewer_points():
     """A floor of a few square metres needs no more."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mesh_module, "SAMPLES", 20_000)
+        patch.setattr(model_surface, "SAMPLES", 20_000)
         yield
 
 
@@ -86,15 +85,6 @@ def made(simulated, tmp_path_factory) -> Path:
 def result(made, tmp_path) -> Path:
     """The same, to be changed."""
     return Path(shutil.copytree(made, tmp_path / "result"))
-
-
-@pytest.fixture(scope="module")
-def scored(made, simulated) -> dict:
-    """Its scores."""
-    out = io.StringIO()
-    with redirect_stdout(out):
-        assert main(["eval", "model", str(made), str(simulated), "--json"]) == 0
-    return json.loads(out.getvalue())
 
 
 def _floor() -> tuple[Float, NDArray[np.int32], Float]:
@@ -149,25 +139,9 @@ def _write_person(folder: Path, simulated: Path, T_map_world: Float) -> None:
     (folder / "0003.json").write_text(json.dumps(about), encoding="utf-8")
 
 
-def _scores(capsys, *args: object) -> dict:
-    assert main(["eval", "model", *(str(arg) for arg in args), "--json"]) == 0
-    out, err = capsys.readouterr()
-    assert err == ""
-    return json.loads(out)
-
-
-@pytest.mark.slow
-def test_raised_floor(made, simulated, scored, capsys) -> None:
-    found = scored
-    assert found["surface"]["mean"] == pytest.approx(UP, abs=1e-3)
-    assert found["surface"]["area"] == pytest.approx(16.0, abs=1e-3)
-    assert 0.0 < found["surface"]["complete"] < 0.3
-    assert found["texture"]["colour_median"] < 2.5  # between texels of 6 cm
-    assert found["texture"]["mover"] < 0.5
-    assert found["texture"]["textured"] > 0.3
-    # what the picture sees it paints, but for what people stand before
-    assert found["texture"]["covered"] > 0.5
-    assert _scores(capsys, made, simulated / "tilting") == found
+@pytest.fixture(scope="module")
+def scored(made, simulated) -> dict:
+    return score_model(made, simulated, math.inf)
 
 
 def test_person_modelled_as_box(scored) -> None:
@@ -180,80 +154,32 @@ def test_person_modelled_as_box(scored) -> None:
     assert one["background"] is None
 
 
-def test_within_limits_beam_length(made, simulated, scored, capsys) -> None:
-    everything = scored["surface"]
-    near = _scores(capsys, made, simulated, "--within", 3)["surface"]
-    assert near["places"] < everything["places"]
-    assert near["complete"] > everything["complete"]
+@pytest.mark.slow
+def test_raised_floor(scored) -> None:
+    surface, texture = scored["surface"], scored["texture"]
+    assert surface["mean"] == pytest.approx(UP, abs=1e-3)
+    assert surface["area"] == pytest.approx(16.0, abs=1e-3)
+    assert 0.0 < surface["complete"] < 0.3
+    assert texture["colour_median"] < 2.5  # between texels of 6 cm
+    assert texture["mover"] < 0.5
+    assert texture["textured"] > 0.3
+    # what the picture sees it paints, but for what people stand before
+    assert texture["covered"] > 0.5
 
 
-def test_text(made, simulated, capsys) -> None:
-    assert main(["eval", "model", str(made), str(simulated)]) == 0
-    text = capsys.readouterr().out
-    assert "off truth    mean 2.9" in text
-    assert "textured -, background -" in text
-    assert "1 tracked, 100.00 % with a model; of " in text
+def test_within_limits_beam_length(made, simulated, scored) -> None:
+    near = score_model(made, simulated, 3.0)["surface"]
+    assert near["places"] < scored["surface"]["places"]
+    assert near["complete"] > scored["surface"]["complete"]
 
 
-def test_missing_parts_are_not_scored(result, simulated, capsys) -> None:
+def test_missing_parts_are_not_scored(result, simulated) -> None:
     (result / "mesh_faces.npz").unlink()
     (result / "tilting/objects/objects.json").unlink()
-    assert set(_scores(capsys, result, simulated)) == {"alignment", "surface"}
+    assert set(score_model(result, simulated, math.inf)) == {"alignment", "surface"}
 
 
-@pytest.mark.parametrize(
-    ("name", "what"),
-    [
-        ("mesh.glb", "is damaged"),
-        ("mesh_faces.npz", "is damaged"),
-        ("tilting/objects/objects.json", "is not JSON"),
-        ("tilting/objects/0003.json", "is not JSON"),
-        ("tilting/objects/0003.glb", "is damaged"),
-    ],
-)
-def test_damaged_files_are_named(name: str, what: str, result, simulated, capsys) -> None:
-    (result / name).write_bytes(b"nonsense")
-    assert main(["eval", "model", str(result), str(simulated)]) == 2
-    err = capsys.readouterr().err
-    assert what in err
-    assert name in err
-
-
-def test_result_without_mesh_is_refused(result, simulated, capsys) -> None:
-    (result / "mesh.glb").unlink()
-    assert main(["eval", "model", str(result), str(simulated)]) == 2
-    err = capsys.readouterr().err
-    assert f"{result}: holds no model" in err
-    assert install_command("mesh") in err
-
-
-def test_result_of_another_recording_is_refused(result, simulated, tmp_path, capsys) -> None:
-    other = shutil.copytree(simulated, tmp_path / "other")
-    stamps = np.load(other / "tilting/stamp_ns.npy")
-    np.save(other / "tilting/stamp_ns.npy", stamps + 10**12)
-    assert main(["eval", "model", str(result), str(other)]) == 2
-    err = capsys.readouterr().err
-    assert f"{result}: is not of the recording in {other / 'tilting'}" in err
-    assert "--max-dt" not in err
-
-
-@pytest.mark.parametrize("missing", [0, 1])
-def test_missing_folders_are_named(missing, result, simulated, tmp_path, capsys) -> None:
-    words = [str(result), str(simulated)]
-    words[missing] = str(tmp_path / "nothere")
-    assert main(["eval", "model", *words]) == 2
-    assert f"{tmp_path / 'nothere'}: does not exist" in capsys.readouterr().err
-
-
-def test_records_of_other_images_are_refused(result, simulated, capsys) -> None:
-    with np.load(result / "mesh_faces.npz") as archive:
-        arrays = dict(archive)
-    arrays["T_camera_map"] = arrays["T_camera_map"][:1]
-    np.savez(result / "mesh_faces.npz", **arrays)
-    assert main(["eval", "model", str(result), str(simulated)]) == 2
-    assert "has 1 images" in capsys.readouterr().err
-
-
-def test_simulation_without_cameras_is_refused(result, simulated, capsys) -> None:
-    assert main(["eval", "model", str(result), str(simulated / "horizontal")]) == 2
-    assert "no truth about images" in capsys.readouterr().err
+def test_damaged_model_is_named(result, simulated) -> None:
+    (result / "mesh.glb").write_bytes(b"nonsense")
+    with pytest.raises(InputError, match=r"mesh\.glb: is damaged"):
+        score_model(result, simulated, math.inf)
