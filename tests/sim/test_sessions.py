@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from place_truth import list_changes, load_session_truth
+from place_truth import load_session_truth
 
 from stillmap.core.errors import InputError
 from stillmap.eval.map import distance_to_walls
@@ -14,6 +14,7 @@ from stillmap.io.stillmap_folder import read
 from stillmap.sim import Scene, scene_by_name
 from stillmap.sim.objects import place_faces
 from stillmap.sim.session_layout import Floor, cross_rectangle
+from stillmap.sim.session_truth import list_changes
 from stillmap.sim.sessions import SessionOptions, SessionPlan, plan_sessions, simulate_sessions
 from stillmap.sim.writer import write_sessions
 
