@@ -163,7 +163,8 @@ def test_the_temporary_folder_goes_with_the_place(flat_days, tmp_path, monkeypat
 
 def test_a_place_is_shown(merged):
     assert repr(merged) == (
-        f"<SavedPlace: 2 of 2 sessions with 200 scans, 1 change between them, {merged.map!r}>"
+        f"<Result: 2 of 2 sessions with 200 scans with {len(merged.hit)} beams, "
+        f"{len(merged.objects)} moving objects, 1 change between them, 0 warnings, {merged.map!r}>"
     )
     page = merged._repr_html_()
     assert "src='data:image/png;base64," in page

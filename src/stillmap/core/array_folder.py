@@ -4,6 +4,7 @@ A JSON file says what the folder is, in which `format_version`; it is written la
 written whole by `core.files.atomic_folder`.
 """
 
+import json
 import math
 import warnings
 from collections.abc import Mapping, Sequence
@@ -117,7 +118,8 @@ def parse(content: Any, kind: type[Model], path: Path, hint: str = "") -> Model:
     from pydantic import TypeAdapter, ValidationError  # slow to load
 
     try:
-        return TypeAdapter(kind).validate_python(content)
+        # in strict mode, which takes no text for a number; of JSON, whose lists may be tuples
+        return TypeAdapter(kind).validate_json(json.dumps(content), strict=True)
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"]))

@@ -155,6 +155,8 @@ def read_changes(folder: Path, names: Sequence[str]) -> list[SessionChange]:
     path = folder / CHANGES
     changes = parse(read_json(path, _MAX_JSON, HINT), list[SessionChange], path, HINT)
     try:
+        if len({len(box) for one in changes for box in (one.box, one.from_box or one.box)}) > 1:
+            raise ValueError("boxes in 2D and in 3D")
         for one in changes:
             before, after = (list(names).index(name) for name in one.between)
             if before >= after:
@@ -166,8 +168,6 @@ def read_changes(folder: Path, names: Sequence[str]) -> list[SessionChange]:
             corners = np.array(one.boxes)
             if not np.isfinite(corners).all() or not (corners[:, 0] <= corners[:, 1]).all():
                 raise ValueError("a box whose corners are exchanged, or not finite")
-        if len({len(box) for one in changes for box in (one.box, one.from_box or one.box)}) > 1:
-            raise ValueError("boxes in 2D and in 3D")
         if len({one.id for one in changes}) < len(changes):
             raise ValueError("two changes have one id")
     except ValueError as error:
