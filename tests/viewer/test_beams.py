@@ -1,7 +1,5 @@
 """Beams of a scan in the viewer."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -9,7 +7,7 @@ from stillmap.io import read
 from stillmap.io.trajectory import poses_from_tum
 from stillmap.slam import SlamOptions, deskew_recording
 from stillmap.viewer import beams as module
-from stillmap.viewer.beams import Beams, slice_scans
+from stillmap.viewer.beams import Beams
 
 
 @pytest.fixture(params=[(2, False), (2, True), (3, False), (3, True)])
@@ -42,13 +40,6 @@ def test_number_of_beams_is_limited(beams):
     assert all((every.ends == end).all(axis=1).any() for end in seen.ends)
 
 
-def test_slice_scans(beams):
-    some = slice_scans(beams.recording, 2, 4)
-    assert (some.n_scans, some.T_odom_base) == (2, None)
-    assert np.array_equal(some.points, beams.recording.points[80:160])
-    assert some.offset.tolist() == [0, 40, 80]
-
-
 def test_dynamic_ends(beams, monkeypatch):
     """Whatever the blocks, they are the dynamic end points of all scans."""
     D = beams.recording.dimension
@@ -63,12 +54,3 @@ def test_dynamic_ends(beams, monkeypatch):
         assert beams.dynamic_ends(1000) == pytest.approx(ends, abs=1e-5)
         monkeypatch.setattr(module, "_MAX_READ", 80)  # one block of three
         assert 0 < len(beams.dynamic_ends(1000)) < len(ends)
-
-
-def test_scan_without_beams(beams):
-    recording = beams.recording
-    nothing = replace(recording, hit=np.zeros(recording.n_beams, bool))
-    seen = replace(beams, recording=nothing).scan_view(0)
-    assert (seen.ends.shape, seen.p_static.shape) == ((0, 3), (0,))
-    nothing = replace(beams, recording=nothing).dynamic_ends(9)
-    assert nothing.shape == (0, recording.dimension)

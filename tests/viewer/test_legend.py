@@ -1,6 +1,5 @@
 """Legend and scale bar."""
 
-import math
 import re
 
 import pytest
@@ -9,13 +8,10 @@ pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 
 from stillmap.results.colors import BLUE, ORANGE, TEAL
 from stillmap.viewer.legend import (
-    help_html,
     legend_html,
-    scale_html,
     scale_length,
 )
 from stillmap.viewer.scene import read_scene
-from stillmap.viewer.text import table_html
 
 
 def colors(html):
@@ -57,20 +53,3 @@ def test_2d_legend_says_what_is_unknown(result_of, opened):
 )
 def test_scale_length(longest, length):
     assert scale_length(longest) == pytest.approx(length)
-
-
-def test_scale_bar_has_its_length_on_the_page():
-    """The view is 20 m high: 5 m are a quarter of the page."""
-    html = scale_html(10.0, 2.0 * math.atan(1.0))
-    assert float(re.search(r"width:([\d.]+)vh", html)[1]) == pytest.approx(25.0)
-    assert html.endswith("5 m</div>")
-    assert "20 cm" in scale_html(0.5, 2.0 * math.atan(1.0))
-
-
-def test_texts_are_escaped():
-    assert "<b>1</b>" not in table_html([("<b>1</b>", "<b>1</b>")])
-
-
-def test_help_names_the_keys():
-    for key in ("Space", "Esc", "Ctrl K", "1 to 0"):
-        assert f"<b>{key}" in help_html()

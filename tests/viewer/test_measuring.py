@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stillmap.viewer.picking import Ray
+from stillmap.viewer.measuring import Ray
 
 
 def test_measured_distances_are_shown_and_cleared(window):
@@ -16,7 +16,7 @@ def test_measured_distances_are_shown_and_cleared(window):
     for goal in ([30.0, 40.0, z], [30.0, 43.0, z]):
         way = np.array(goal) - eye
         measuring.add(Ray(eye, way / np.linalg.norm(way)), 0.001)
-    assert measuring.ruler.distances == pytest.approx([3.0])
+    assert measuring.distances == pytest.approx([3.0])
     assert window._server.scene.get_handle_by_name("/measured_2/distance").text == "3.00 m"
     assert measuring._text.content.startswith(r"3\.00 m")
     # an object is not selected meanwhile
@@ -25,7 +25,7 @@ def test_measured_distances_are_shown_and_cleared(window):
     assert not window._facts_folder.visible
     act["Clear"]()
     window.step()
-    assert measuring.ruler.points == []
+    assert measuring.points == []
     assert window._server.scene.get_handle_by_name("/measured_2/distance") is None
     assert not measuring._text.visible
 
@@ -37,7 +37,7 @@ def test_click_beside_everything_measures_nothing(window):
     window.step()
     measuring.add(up, 0.01)
     window.step()
-    assert measuring.ruler.points == []
+    assert measuring.points == []
     assert "no point there" in measuring._text.content
 
 
@@ -59,5 +59,5 @@ def test_clicked_point_is_one_of_what_is_visible(window):
 
 def test_clicks_after_the_end_of_measuring_are_left_out(window):
     window._measuring.add(Ray(np.array([0.0, 0.0, 50.0]), np.array([0.0, 0.0, -1.0])), 0.01)
-    assert window._measuring.ruler.points == []
+    assert window._measuring.points == []
     assert not window._measuring._text.visible

@@ -8,7 +8,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "places"))
 
-from small_place import CHAIR, DAY, NAMES, START, make_place
+from small_place import CHAIR, NAMES, make_place
 
 from stillmap.cli.main import main
 from stillmap.core.errors import InputError
@@ -16,8 +16,6 @@ from stillmap.results.report.place import KIND_COLORS
 from stillmap.viewer.scene import read_scene
 
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
-
-from stillmap.viewer import shortcuts
 
 PLACE_LAYERS = ["Sessions", "Changes", "Change labels"]
 
@@ -47,27 +45,12 @@ def chair_color(window):
     return tuple(picture[int((y1 - y) * scale), int((x - x0) * scale), :3].tolist())
 
 
-def test_scans_are_those_of_the_sessions(place):
-    scene = read_scene(place)
-    assert scene.name == "place"
-    assert len(scene.stamp_ns) == 20
-    assert [scene.place.scans_of(k) for k in (0, 3)] == [range(5), range(15, 20)]
-    assert scene.stamp_ns[[0, 5]].tolist() == [START, START + DAY]
-
-
 def test_last_session_is_shown_at_first(window):
     assert window._sessions.session == 3
     assert "session 4 of 4" in window._session_controls._title.content
     assert window._clock.value == "0.0 of 4.0 s"
     assert list(window._boxes)[-3:] == PLACE_LAYERS
     assert [window._boxes[name].value for name in PLACE_LAYERS] == [True, True, False]
-
-
-def test_single_results_have_no_sessions(result_of, opened):
-    single = opened(read_scene(result_of(2)), None)
-    assert single._session_controls is None
-    assert not {*PLACE_LAYERS} & {*single._boxes}
-    assert "Next session" not in single._actions()
 
 
 def test_slider_shows_map_scans_and_changes_of_a_session(window):
@@ -112,26 +95,6 @@ def test_boxes_are_those_of_what_changed_since_the_session_before(window):
     assert 0.3 * 2.0 < lengths.sum() < 0.9 * 2.0
 
 
-def test_labels_are_shown_on_demand(window):
-    window.show_session(2)
-    assert node(window, "/change_labels/0") is None
-    window._boxes["Change labels"].value = True
-    window.step()
-    assert [node(window, f"/change_labels/{n}").text for n in (0, 1)] == ["M1 moved", "D2 door"]
-    window.show_session(3)
-    assert node(window, "/change_labels/0").text == "G3 gone"
-    assert not node(window, "/change_labels/1").visible
-    window._boxes["Change labels"].value = False
-    window.step()
-    assert not node(window, "/change_labels").visible
-
-
-def test_trajectories_have_a_line_for_every_session(window):
-    for k in range(4):
-        line = node(window, f"/sessions/{k}").points
-        assert line[..., 1] == pytest.approx(0.2 * k)
-
-
 def test_objects_are_those_of_the_session(window):
     window.show_session(1)
     window.show(2)
@@ -155,25 +118,6 @@ def test_objects_of_another_session_at_the_same_time_are_not_shown(tmp_path, ope
         assert {*node_count} <= {session}
 
 
-def test_playback_stays_in_the_session(window):
-    window.show_session(1)
-    window._speed.value = "10 x"
-    window.play(True)
-    seen = set()
-    for _ in range(8):
-        window.step()
-        seen.add(window._scans[window.scan])
-    assert seen <= {*range(5, 10)}
-    assert len(seen) > 1
-
-
-def test_scan_of_a_longer_session_becomes_the_last_one(window):
-    window.show_session(1)
-    window._slider.value = 4000
-    window.step()
-    assert window.scan == window._slider.value == 4
-
-
 def test_keys_step_through_sessions(window):
     act = window._actions()
 
@@ -184,14 +128,6 @@ def test_keys_step_through_sessions(window):
 
     assert [after("Previous session") for _ in range(4)] == [2, 1, 0, 0]
     assert [after("Next session") for _ in range(4)] == [1, 2, 3, 3]
-    keys = [
-        *shortcuts.LAYER_KEYS.values(),
-        *shortcuts.PLACE_LAYER_KEYS.values(),
-        *shortcuts._ACTION_KEYS.values(),
-        *shortcuts._PLACE_ACTION_KEYS.values(),
-    ]
-    assert len({*keys}) == len(keys)
-    assert not {*keys} & {*"WASDQE", "arrowup", "arrowdown"}
 
 
 def test_legend_explains_colors_while_they_are_shown(window):

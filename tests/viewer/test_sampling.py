@@ -6,27 +6,13 @@ import pytest
 from stillmap.core.arrays import sample_indices
 from stillmap.core.errors import InputError
 from stillmap.results.points import ply_header
-from stillmap.viewer.display import sample_ply
-
-
-def test_few_points_are_all_taken():
-    assert sample_indices(5, 9).tolist() == [0, 1, 2, 3, 4]
-
-
-def test_sample_is_sorted_and_even():
-    use = sample_indices(10_000, 100)
-    assert (np.diff(use) > 0).all()
-    assert (use // 100).tolist() == list(range(100))
+from stillmap.viewer.scene import sample_ply
 
 
 def test_sample_contains_every_lidar_ring():
     """At even steps 16 rings that come in turn would show one of them."""
     rings = np.bincount(sample_indices(160_000, 10_000) % 16, minlength=16)
     assert rings.min() > 400
-
-
-def test_sample_is_deterministic():
-    assert np.array_equal(sample_indices(10_000, 77), sample_indices(10_000, 77))
 
 
 def written(path, rows, fields):

@@ -1,26 +1,11 @@
 """Reading a result folder for the viewer."""
 
-import json
-
 import numpy as np
 import pytest
 
 from stillmap.core.errors import InputError
-from stillmap.results.report.figures import UNKNOWN
-from stillmap.viewer import scene as module
+from stillmap.viewer.nodes import default_view
 from stillmap.viewer.scene import read_scene
-from stillmap.viewer.view import default_view
-
-
-def test_2d_result(result_of):
-    scene = read_scene(result_of(2))
-    assert scene.is_2d
-    assert (scene.name, scene.folder) == ("out2", "out2")
-    assert (scene.clouds, scene.surface, scene.models, scene.notes) == ({}, None, [], [])
-    assert scene.poses.shape == (6, 4, 4)
-    assert scene.tracks[0].z is None
-    assert (scene.map_image.picture[..., 3] == 255).all()
-    assert (scene.map_image.picture[0, 0, :3] == UNKNOWN).all()
 
 
 def test_map_image_has_the_orientation_of_the_map(result_of):
@@ -48,13 +33,6 @@ def test_3d_result(result_of):
     assert [one.track.id for one in scene.models] == [7]
     z = scene.clouds["static"].points[:, 2]
     assert z.min() <= scene.ground <= np.median(z)
-
-
-def test_number_of_points_is_limited(result_of, monkeypatch):
-    monkeypatch.setitem(module.MAX_POINTS, "static", 11)
-    static = read_scene(result_of(3)).clouds["static"]
-    assert len(static.points) == 11
-    assert static.total > 11
 
 
 def test_models_move_along_their_tracks(result_of):
@@ -87,23 +65,6 @@ def test_unusable_model_is_noted(result_of, name, content, said):
     assert len(scene.notes) == 1
     assert said in scene.notes[0]
     assert (scene.surface is None) == (name == "mesh.glb")
-
-
-def test_invalid_pose_is_noted(result_of):
-    out = result_of(3, with_models=True)
-    place = {"T_map_object": np.diag([2.0, 2.0, 2.0, 1.0]).tolist(), "stamp_ns": 0}
-    (out / "objects/0007.json").write_text(json.dumps(place))
-    scene = read_scene(out)
-    assert (scene.models, len(scene.notes)) == ([], 1)
-    assert "not a pose" in scene.notes[0]
-
-
-def test_total_size_of_models_is_limited(result_of, glb, monkeypatch):
-    out = result_of(3, with_models=True)
-    monkeypatch.setattr(module, "_MAX_MODELS", len(glb) - 1)
-    scene = read_scene(out)
-    assert scene.models == []
-    assert "0007.glb" in scene.notes[0]
 
 
 @pytest.mark.parametrize("name", ["map.npz", "trajectory.tum", "objects/objects.json"])

@@ -12,7 +12,7 @@ from stillmap.results.object_poses import (
     object_poses_at,
 )
 from stillmap.results.reader import Track
-from stillmap.viewer.tracks import box_edges, describe_object, track_segments
+from stillmap.viewer.objects import box_edges, describe_object
 
 NOW = 1_700_000_000_000_000_000
 
@@ -31,16 +31,6 @@ def test_heading_is_kept_while_standing():
     assert angles[2] == pytest.approx(0.75 * np.pi)  # half-way on its turn
 
 
-def test_heading_turns_the_short_way():
-    a = np.radians([170.0, -170.0])
-    angles = headings(2.0 * np.stack([np.cos(a), np.sin(a)], 1))
-    assert angles[1] - angles[0] == pytest.approx(np.radians(20.0))
-
-
-def test_heading_without_motion():
-    assert headings(np.zeros((3, 2))).tolist() == [0.0, 0.0, 0.0]
-
-
 def test_position_is_interpolated():
     one = track([0, 1], [[0, 0], [4, 0]], [[4, 0], [4, 0]])
     T = interpolate_pose(one, NOW + 250_000_000)
@@ -48,12 +38,6 @@ def test_position_is_interpolated():
     assert T[:3, :3] == pytest.approx(np.eye(3))
     assert interpolate_pose(one, NOW - 10**9)[:2, 3].tolist() == [0.0, 0.0]
     assert interpolate_pose(one, NOW + 10**10)[:2, 3].tolist() == [4.0, 0.0]
-
-
-def test_nanoseconds_are_resolved():
-    """A double holds stamps of today to a quarter of a microsecond only."""
-    one = track([0, 1e-7], [[0, 0], [1, 0]], [[1, 0], [1, 0]])
-    assert interpolate_pose(one, NOW + 50)[0, 3] == pytest.approx(0.5)
 
 
 def test_object_poses_at_a_time():
@@ -80,24 +64,6 @@ def test_box_edges():
     # it goes along y: its length lies along y
     assert corners.min(axis=0) == pytest.approx([2.5, 3.0, 0.7 - 0.75])
     assert corners.max(axis=0) == pytest.approx([3.5, 5.0, 0.7 + 0.75])
-
-
-def test_box_edges_2d():
-    one = track([0, 1], [[0, 0], [1, 0]], [[1, 0], [1, 0]], size=(2.0, 1.0), z=None)
-    lines = box_edges(object_poses_at([one], NOW))
-    assert lines.shape == (1, 4, 2, 3)
-    assert not lines[..., 2].any()
-
-
-def test_track_segments():
-    a = track([0, 1, 2], [[0, 0], [1, 0], [2, 0]], np.ones((3, 2)))
-    b = track([0], [[9, 9]], np.ones((1, 2)))
-    c = track([0, 1], [[5, 5], [6, 6]], np.ones((2, 2)), z=None)
-    pieces, whose = track_segments([a, b, c])
-    assert whose.tolist() == [0, 0, 2]
-    assert pieces[1].tolist() == [[1, 0, 0.7], [2, 0, 0.7]]
-    assert pieces[2].tolist() == [[5, 5, 0], [6, 6, 0]]
-    assert track_segments([])[0].shape == (0, 2, 3)
 
 
 def test_facts_of_an_object():

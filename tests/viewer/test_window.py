@@ -6,30 +6,17 @@ import numpy as np
 import pytest
 
 from stillmap.results.colors import ORANGE
-from stillmap.results.points import COLOURS, FIELDS, ply_header, put_colours
-from stillmap.viewer import scene as scenes
-from stillmap.viewer import shortcuts
 from stillmap.viewer.scene import read_scene
 
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 
-from stillmap.viewer.text import escape_markdown
+from stillmap.viewer.legend import ACTION_KEYS, LAYER_KEYS
+from stillmap.viewer.nodes import escape_markdown
 
 
 def node(window, path):
     """A node of viser."""
     return window._server.scene.get_handle_by_name(path)
-
-
-def test_layers_without_data_are_left_out(result_of, opened, window):
-    flat = opened(read_scene(result_of(2)), None)
-    objects = ["Objects", "Object tracks", "Object ids"]
-    assert list(flat._boxes) == ["Map", "Robot", *objects]
-    clouds = ["Static points", "Dynamic points"]
-    assert list(window._boxes) == [
-        *("Map", "Surface", *clouds, "Robot", "Beams", "Rays"),
-        *("Objects", "Object tracks", "Object models", "Object ids"),
-    ]
 
 
 def test_show_scan(result_of, beams_of, opened):
@@ -48,12 +35,6 @@ def test_show_scan(result_of, beams_of, opened):
         assert node(window, "/object_models/0007").visible is there
         assert node(window, "/objects/sides").visible is there
         assert len(node(window, "/objects/lines").points) == (12 if there else 0)
-
-
-def test_slider(window):
-    window._slider.value = 4
-    window.step()
-    assert window.scan == 4
 
 
 def test_default_layers_with_a_surface(window):
@@ -97,45 +78,6 @@ def test_points_are_colored_by_label_or_height(window):
     assert (static.colors == labels).all()
 
 
-def test_points_are_colored_by_pictures(result_of, opened):
-    out, (grey, red) = result_of(3), ((128, 128, 128), (200, 0, 0))
-    for part in ("static", "dynamic"):
-        rows = np.zeros(2, FIELDS + COLOURS)
-        put_colours(rows, np.array([grey, red], np.uint8))
-        (out / f"{part}.ply").write_bytes(ply_header(FIELDS + COLOURS, 2) + rows.tobytes())
-    window = opened(read_scene(out), None)
-    assert window._coloring.options == ("label", "height", "pictures")
-    window._coloring.value = "pictures"
-    window.step()
-    assert node(window, "/static_points/points").colors.tolist() == [[*grey], [*red]]
-    # grey is what no picture shows
-    assert node(window, "/dynamic_points/points").colors.tolist() == [[*ORANGE], [*red]]
-
-
-def test_map_lies_below_the_surface(result_of, opened, window):
-    def height(of):
-        return float(node(of, "/map/plan").position[2]) + of._scene.origin[2]
-
-    assert -0.3 < height(window) - window._scene.ground < -0.05
-    flat = opened(read_scene(result_of(2)), None)
-    assert height(flat) == flat._scene.ground
-
-
-def test_notes_are_shown_with_their_layers(result_of, beams_of, opened, monkeypatch):
-    monkeypatch.setitem(scenes.MAX_POINTS, "static", 11)
-    out = result_of(3, with_models=True)
-    window = opened(read_scene(out), beams_of(out))
-
-    def told():
-        return [note.content for note in window._notes.values() if note.visible]
-
-    (text,) = told()
-    assert text.startswith("11 of ")
-    window._boxes["Static points"].value = False
-    window.step()
-    assert told() == []
-
-
 def test_check_boxes_show_and_hide(window):
     window.show(2)
     window._boxes["Surface"].value = True
@@ -146,14 +88,6 @@ def test_check_boxes_show_and_hide(window):
     window._boxes["Surface"].value = False
     window.step()
     assert not node(window, "/surface").visible
-
-
-def test_point_size(window):
-    ends = node(window, "/beams/points")
-    before = ends.point_size
-    window._size.value = 2.0
-    window.step()
-    assert ends.point_size == pytest.approx(2 * before)
 
 
 def test_playback_starts_again_at_the_end(window):
@@ -172,16 +106,6 @@ def test_playback_starts_again_at_the_end(window):
     window.step()
     window.step()
     assert window.scan == 0
-
-
-def test_result_of_one_scan(result_of, opened):
-    from dataclasses import replace
-
-    scene = read_scene(result_of(2))
-    one = opened(replace(scene, stamp_ns=scene.stamp_ns[:1], poses=scene.poses[:1]), None)
-    one.play(True)
-    one.step()
-    assert one.scan == 0
 
 
 def test_markdown_is_escaped():
@@ -207,21 +131,11 @@ def test_actions_of_keys_step_and_pause(window):
     assert not window._playing
 
 
-def test_actions_of_keys_show_and_hide_every_layer(window):
-    act = window._actions()
-    for name, box in window._boxes.items():
-        before = box.value
-        act[name]()
-        window.step()
-        assert box.value is window._layers.is_shown(name) is not before
-
-
 def test_keys_are_distinct_and_not_those_of_the_camera(window):
-    keys = [*shortcuts.LAYER_KEYS.values(), *shortcuts._ACTION_KEYS.values()]
+    keys = [*LAYER_KEYS.values(), *ACTION_KEYS.values()]
     assert len(set(keys)) == len(keys)
     assert not set(keys) & {*"WASDQE", "arrowup", "arrowdown"}
-    names = {*shortcuts.LAYER_KEYS, *shortcuts._ACTION_KEYS}
-    assert set(window._actions()) == names
+    assert {*window._boxes, "Play or pause", "Measure"} <= set(window._actions())
 
 
 def test_click_on_a_box_that_is_gone_selects_nothing(window):

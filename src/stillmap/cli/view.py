@@ -137,8 +137,7 @@ def _serve(args: argparse.Namespace, folder: Path) -> None:
     window = Window(scene, beams, args.port)
     try:
         # some browsers block until they are closed
-        address = window.make_single_url()
-        threading.Thread(target=_open_browser, args=(address,), daemon=True).start()
+        threading.Thread(target=_open_browser, args=(window.url,), daemon=True).start()
         prefix = "" if _has_screen() else "no browser found; "
         say(f"{prefix}{folder} is at {window.url}, until Ctrl-C")
         while True:

@@ -19,11 +19,10 @@ from stillmap.results.colors import (
     color_static,
 )
 from stillmap.viewer.beams import Beams
-from stillmap.viewer.display import Points
+from stillmap.viewer.measuring import Ray, pick_plane, pick_point
 from stillmap.viewer.nodes import NO_SHADOWS, Nodes, node_path
 from stillmap.viewer.objects import ObjectNodes
-from stillmap.viewer.picking import Ray, pick_plane, pick_point
-from stillmap.viewer.scene import MAX_POINTS, to_rgba
+from stillmap.viewer.scene import MAX_POINTS, Points, to_rgba
 from stillmap.viewer.sessions import SessionNodes
 
 _MAX_TRAJECTORY_POINTS = 5_000
@@ -67,7 +66,12 @@ class Layers:
         self._points: dict[str, tuple[Any, float]] = {}
         self._parents: dict[str, Any] = {}
         self.clouds = self._read_clouds()
-        self.heights, self.colorings = self._heights(), self._colorings()
+        self.heights: tuple[float, float] = (0.0, 0.0)
+        self.colorings: tuple[str, ...] = (LABEL,)
+        if (static := self.clouds.get("Static points")) is not None:
+            low, high = np.quantile(static.points[:, 2].astype(np.float64), _HEIGHT_QUANTILES)
+            self.heights = float(low + nodes.scene.origin[2]), float(high + nodes.scene.origin[2])
+            self.colorings = (LABEL, HEIGHT) + (PICTURES,) * (static.colors is not None)
         self.default_visibility: dict[str, bool] = {}
         self.notes = {
             f"{name.capitalize()} points": f"{len(one.points):,} of {one.total:,} {name} points "
@@ -88,7 +92,7 @@ class Layers:
         """Name, default visibility, whether there is data, and the function that creates it."""
         scene, beams, moving = self._scene, self._beams is not None, bool(self._scene.tracks)
         static, dynamic = "Static points", "Dynamic points"
-        return [
+        definitions = [
             ("Map", True, scene.map_image is not None, self._make_map),
             # it would cover the points
             ("Surface", False, scene.surface is not None, self._make_surface),
@@ -101,19 +105,16 @@ class Layers:
             ("Object tracks", False, moving, self._objects.make_tracks),
             ("Object models", True, bool(scene.models), self._objects.make_models),
             ("Object ids", False, moving, lambda: None),
-            *self._place_definitions(),
         ]
-
-    def _place_definitions(self) -> list[tuple[str, bool, bool, Callable[[], None]]]:
-        """Those that only a place has."""
-        if self._sessions is None or self._scene.place is None:
-            return []
-        several = len(self._scene.place) > 1
-        return [
-            ("Sessions", True, True, self._sessions.make_trajectories),
-            ("Changes", True, several, self._sessions.make_boxes),
-            ("Change labels", False, several, lambda: None),
-        ]
+        place, sessions = scene.place, self._sessions
+        if place is not None and sessions is not None:
+            several = len(place) > 1
+            definitions += [
+                ("Sessions", True, True, sessions.make_trajectories),
+                ("Changes", True, several, sessions.make_boxes),
+                ("Change labels", False, several, lambda: None),
+            ]
+        return definitions
 
     def is_shown(self, name: str) -> bool:
         """True if the layer exists and is visible."""
@@ -165,11 +166,11 @@ class Layers:
         """Show the map and the trajectory of a session of a place."""
         place = self._scene.place
         assert place is not None
-        drawn = place.draw_map(session)
-        if drawn is not None:
+        if place.pictures is not None:
+            drawn = place.pictures.draw(session)
             self._map.image = to_rgba(drawn, transparent=not self._scene.is_2d)
         self._path.points = self._trajectory(place.scans_of(session)).astype(np.float32)
-        self._objects.session = place.name_of(session)
+        self._objects.session = place.timeline.sessions[session].name
 
     def _read_clouds(self) -> dict[str, Points]:
         """Clouds by name of their layer; in 2D the dynamic points are those of the recording."""
@@ -180,19 +181,6 @@ class Layers:
             points[:, :2] += ends
             clouds["Dynamic points"] = Points(points.astype(np.float32), None, len(ends))
         return {name: one for name, one in clouds.items() if len(one.points)}
-
-    def _heights(self) -> tuple[float, float]:
-        static = self.clouds.get("Static points")
-        if static is None:
-            return 0.0, 0.0
-        low, high = np.quantile(static.points[:, 2].astype(np.float64), _HEIGHT_QUANTILES)
-        return float(low + self._scene.origin[2]), float(high + self._scene.origin[2])
-
-    def _colorings(self) -> tuple[str, ...]:
-        static = self.clouds.get("Static points")
-        if static is None:
-            return (LABEL,)
-        return (LABEL, HEIGHT) if static.colors is None else (LABEL, HEIGHT, PICTURES)
 
     def _cloud_colors(self, name: str, cloud: Points, by: str) -> NDArray[np.uint8]:
         """(n, 3) of the points of a layer."""
@@ -260,8 +248,8 @@ class Layers:
         self._points["Beams"] = self._ends, self._ends.point_size
 
     def _make_rays(self) -> None:
-        color = np.array(TEAL, np.uint8)
-        self._ray = self._nodes.lines("Rays", np.zeros((1, 2, 3)), color, 1.0)
+        none = np.zeros((1, 2, 3))
+        self._ray = self._nodes.lines("Rays", none, np.array(TEAL, np.uint8), 1.0)
 
     def _draw_beams(self, scan: int) -> None:
         assert self._beams is not None

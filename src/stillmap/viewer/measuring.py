@@ -1,72 +1,130 @@
-"""The controls of measuring: while it lasts, clicks are ends of distances."""
+"""Measuring: while it lasts, clicks are ends of distances."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from queue import SimpleQueue
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from stillmap.viewer.layers import Layers
-from stillmap.viewer.picking import Ray
-from stillmap.viewer.ruler import Ruler, format_length
-from stillmap.viewer.server import Server
-from stillmap.viewer.text import escape_markdown
+from stillmap.viewer.nodes import Nodes, escape_markdown, node_path
+
+Float = NDArray[np.float64]
 
 _CLICK_RADIUS = 0.01  # of a click on a point, as a share of the height of the view
-_MEASURE, _STOP = "Measure", "Stop measuring"
+_MARK_SIZE = 0.006  # of a clicked point, likewise
+_RED = np.array((200, 0, 60), np.uint8)
+
+
+class Ray(NamedTuple):
+    """A ray of sight through a pixel, from (3,) m along a unit vector (3,)."""
+
+    origin: Float
+    direction: Float
+
+
+def pick_point(ray: Ray, clouds: Iterable[NDArray[np.floating]], tangent: float) -> Float | None:
+    """The point (3,) of the clouds that a ray meets first; None where it meets none.
+
+    Of the points within the cone around the ray, those about as far away as the nearest one belong
+    to the same surface; of these it is the one closest to the ray.
+
+    Args:
+        ray: of the click.
+        clouds: each (n, 3) m.
+        tangent: of the angle between axis and side of the cone.
+    """
+    points = np.concatenate([np.zeros((0, 3)), *(cloud.astype(np.float64) for cloud in clouds)])
+    offset = points - ray.origin
+    depth = offset @ ray.direction
+    across = np.linalg.norm(offset - depth[:, None] * ray.direction, axis=1)
+    within = np.flatnonzero((depth > 0.0) & (across <= depth * tangent))
+    if not len(within):
+        return None
+    near = within[depth[within] <= depth[within].min() * (1.0 + 2.0 * tangent)]
+    return np.asarray(points[near[np.argmin(across[near] / depth[near])]])
+
+
+def pick_plane(ray: Ray, z: float) -> Float | None:
+    """The point (3,) where a ray meets the horizontal plane at height z; None where it does not."""
+    rise = float(ray.direction[2])
+    depth = (z - float(ray.origin[2])) / rise if abs(rise) > 1e-9 else 0.0
+    return np.asarray(ray.origin + depth * ray.direction) if depth > 0.0 else None
 
 
 class Measuring:
-    """Buttons, distances and clicks.
+    """Buttons, clicked points, and the distance between every two of them.
 
     Attributes:
-        ruler: what was measured.
         active: whether clicks are points.
+        points: (3,) m each, relative to the scene's origin.
     """
 
     def __init__(
-        self, server: Server, layers: Layers, ruler: Ruler, events: SimpleQueue[Callable[[], None]]
+        self,
+        nodes: Nodes,
+        pick: Callable[[Ray, float], Float | None],
+        events: SimpleQueue[Callable[[], None]],
     ) -> None:
         """Add the controls.
 
         Args:
-            server: the page.
-            layers: on which points are.
-            ruler: measures.
+            nodes: draws what was measured.
+            pick: the visible point that a ray meets; see `Layers.pick`.
             events: takes what is to be done, in place of viser's threads.
         """
-        self._server, self._layers, self.ruler, self._events = server, layers, ruler, events
-        self.active = False
-        self._button = server.gui.add_button(_MEASURE)
+        self._nodes, self._pick, self._events = nodes, pick, events
+        self.active, self.points, self._drawn = False, list[Float](), list[Any]()
+        gui = nodes.server.gui
+        self._button = gui.add_button("Measure")
         self._button.on_click(lambda _event: events.put(self.toggle))
-        self._text: Any = server.gui.add_markdown("", visible=False)
-        self._clear_button = server.gui.add_button("Clear", visible=False)
+        self._text: Any = gui.add_markdown("", visible=False)
+        self._clear_button = gui.add_button("Clear", visible=False)
         self._clear_button.on_click(lambda _event: events.put(self.clear))
+
+    @property
+    def distances(self) -> list[float]:
+        """In m, of the pairs that are complete."""
+        ends = zip(self.points[::2], self.points[1::2], strict=False)
+        return [float(np.linalg.norm(b - a)) for a, b in ends]
 
     def toggle(self) -> None:
         """Start or stop measuring; what was measured stays."""
         self.active = not self.active
+        scene = self._nodes.server.scene
         if self.active:
-            self._server.scene.on_click()(self._click)
+            scene.on_click()(self._click)
         else:
-            self._server.scene.remove_click_callback(self._click)
-        self._button.label = _STOP if self.active else _MEASURE
+            scene.remove_click_callback(self._click)
+        self._button.label = "Stop measuring" if self.active else "Measure"
         self._show()
 
     def clear(self) -> None:
         """Remove what was measured."""
-        self.ruler.clear()
+        for node in self._drawn:
+            node.remove()
+        self._drawn, self.points = [], []
         self._show()
 
     def add(self, ray: Ray, tangent: float) -> None:
-        """Add the visible point that a ray meets; see `Layers.pick`."""
+        """Add the visible point that a ray meets."""
         if not self.active:
             return
-        point = self._layers.pick(ray, tangent)
+        point = self._pick(ray, tangent)
         if point is not None:
-            self.ruler.add(point)
+            self.points.append(point)
+            self._draw(f"Measured {len(self.points)}")
         self._show("" if point is not None else "There is no point there. ")
+
+    def _draw(self, layer: str) -> None:
+        """Draw the last point, and the distance that it ends."""
+        self._drawn.append(self._nodes.cloud(layer, self.points[-1][None], _RED[None], _MARK_SIZE))
+        if len(self.points) % 2 == 0:
+            ends = np.stack(self.points[-2:])
+            label = self._nodes.label(node_path(layer, "distance"))
+            label.text, label.position = f"{self.distances[-1]:.2f} m", ends.mean(axis=0)
+            self._drawn += [self._nodes.lines(layer, ends[None], _RED, 3.0), label]
 
     def _click(self, event: Any) -> None:
         """Called by viser, in one of its threads."""
@@ -76,10 +134,10 @@ class Measuring:
 
     def _show(self, message: str = "") -> None:
         """Show the distances, and what the next click will be."""
-        lines = [format_length(length) for length in self.ruler.distances]
+        lines = [f"{length:.2f} m" for length in self.distances]
         if self.active:
-            wanted = ("first", "second")[len(self.ruler.points) % 2]
-            lines.append(f"{message}Click on the {wanted} point.")
+            end = ("first", "second")[len(self.points) % 2]
+            lines.append(f"{message}Click on the {end} point.")
         self._text.content = "  \n".join(escape_markdown(line) for line in lines)
         self._text.visible = bool(lines)
-        self._clear_button.visible = bool(self.ruler.points)
+        self._clear_button.visible = bool(self.points)

@@ -1,6 +1,10 @@
-"""Creation of viser nodes in the frame of a scene."""
+"""Creation of viser nodes in the frame of a scene, and its default view."""
 
-from typing import Any
+import html
+import math
+import re
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy  # submodules load on first use
@@ -9,10 +13,64 @@ from numpy.typing import NDArray
 from stillmap.viewer.scene import Scene
 from stillmap.viewer.server import Server
 
+FIELD_OF_VIEW = math.radians(60.0)  # vertical
+MIN_ASPECT = 1.1  # width / height of the page beside the controls
+_MARGIN = 1.1
+_EXTENT_QUANTILES = (0.03, 0.97)  # of the points, without far outliers
+_DIRECTION_3D = np.array([-0.45, -0.7, 0.62])  # from the scene to the camera
+_SCALE_3D = 0.95  # of the height: what lies behind the center appears smaller
+_MIN_EXTENT = 5.0  # m
 Float = NDArray[np.float64]
-
 NO_SHADOWS: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
 _LAYER_STEP = 0.02  # m between the map and what is drawn on it in 2D
+
+
+class DefaultView(NamedTuple):
+    """The initial camera.
+
+    Attributes:
+        position, look_at: (3,) m relative to the scene's origin.
+        height: height of the view in m at `look_at`.
+        near, far: distances of the clipping planes in m.
+    """
+
+    position: NDArray[np.float64]
+    look_at: NDArray[np.float64]
+    height: float
+    near: float
+    far: float
+
+    def position_for(self, aspect: float) -> NDArray[np.float64]:
+        """Position (3,) from which a page of this width / height shows as much."""
+        further = max(1.0, MIN_ASPECT / aspect)
+        return np.asarray(self.look_at + further * (self.position - self.look_at))
+
+
+def default_view(scene: Scene) -> DefaultView:
+    """The camera that shows the whole scene: 2D from above, north up; 3D at a slant."""
+    low, high = _bounds(scene)
+    center, (width, height) = 0.5 * (low + high), np.maximum(high - low, _MIN_EXTENT)[:2]
+    shown = _MARGIN * max(height, width / MIN_ASPECT) * (1.0 if scene.is_2d else _SCALE_3D)
+    distance = 0.5 * shown / math.tan(0.5 * FIELD_OF_VIEW)
+    if scene.is_2d:
+        # not exactly vertical, which would leave the direction of north undefined
+        offset = np.array([0.0, -0.01, 1.0]) * distance
+    else:
+        offset = _DIRECTION_3D / np.linalg.norm(_DIRECTION_3D) * distance
+    return DefaultView(center + offset, center, shown, 2e-3 * distance, 20.0 * distance)
+
+
+def _bounds(scene: Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Lower and upper corner (3,) of the visible content in m, relative to the scene's origin."""
+    static = scene.clouds.get("static")
+    if static is not None and len(static.points):
+        low, high = np.quantile(static.points.astype(np.float64), _EXTENT_QUANTILES, axis=0)
+        return low, high
+    positions = scene.poses[:, :3, 3] - scene.origin
+    if scene.map_image is None:
+        return np.asarray(positions.min(axis=0)), np.asarray(positions.max(axis=0))
+    x0, y0, x1, y1 = scene.map_image.window
+    return np.array([x0, y0, 0.0]) - scene.origin, np.array([x1, y1, 0.0]) - scene.origin
 
 
 class Nodes:
@@ -54,21 +112,12 @@ class Nodes:
         )
 
     def lines(
-        self,
-        layer: str,
-        pieces: Float,
-        colors: NDArray[np.uint8],
-        pixels: float,
-        part: str = "lines",
+        self, layer: str, pieces: Float, colors: NDArray[np.uint8], pixels: float, part: str = ""
     ) -> Any:
         """Line segments (n, 2, 3) in m, relative to the scene's origin; colors (3,) or alike."""
-        return self.server.scene.add_line_segments(
-            node_path(layer, part),
-            pieces.astype(np.float32),
-            colors,
-            thickness=pixels,
-            thickness_units="screen",
-        )
+        points, path = pieces.astype(np.float32), node_path(layer, part or "lines")
+        add = self.server.scene.add_line_segments
+        return add(path, points, colors, thickness=pixels, thickness_units="screen")
 
     def label(self, path: str) -> Any:
         """A text above its position, empty at first."""
@@ -77,6 +126,23 @@ class Nodes:
     def place(self, node: Any, T: Float) -> None:
         """Place a node at a pose (4, 4) in the map frame."""
         node.wxyz, node.position = quaternions(T[:3, :3]), T[:3, 3] - self.scene.origin
+
+
+class Labels:
+    """The labels of a layer, created on demand and reused."""
+
+    def __init__(self, nodes: Nodes, layer: str) -> None:
+        self._nodes, self._layer = nodes, layer
+        self._labels: list[Any] = []
+
+    def show(self, texts: Sequence[tuple[str, Float]]) -> None:
+        """Show these texts alone, each with its position (3,)."""
+        while len(self._labels) < len(texts):
+            self._labels.append(self._nodes.label(node_path(self._layer, str(len(self._labels)))))
+        for n, label in enumerate(self._labels):
+            label.visible = n < len(texts)
+            if label.visible:
+                label.text, label.position = texts[n]
 
 
 def quaternions(R: Float) -> Float:
@@ -88,3 +154,21 @@ def quaternions(R: Float) -> Float:
 def node_path(layer: str, part: str = "") -> str:
     """Path of a layer's node, or of a node below it."""
     return "/" + layer.lower().replace(" ", "_") + (f"/{part}" if part else "")
+
+
+TEXT_STYLE = "font-size:.8em;line-height:1.5;padding:0 .9em"
+
+
+def escape_markdown(text: str) -> str:
+    """Text escaped for Markdown."""
+    return re.sub(r"([\\`*_{}\[\]()<>#+\-.!|~&$:])", r"\\\1", text)
+
+
+def table_html(rows: Sequence[tuple[str, str]]) -> str:
+    """A table of names and values."""
+    cells = "".join(
+        f'<tr><td style="padding-right:1em;opacity:.7">{html.escape(name)}</td>'
+        f"<td>{html.escape(value)}</td></tr>"
+        for name, value in rows
+    )
+    return f'<table style="{TEXT_STYLE}">{cells}</table>'

@@ -10,20 +10,73 @@ from numpy.typing import NDArray
 from stillmap.core.arrays import sample_indices
 from stillmap.results.colors import color_by_id
 from stillmap.results.object_poses import ObjectPoses, is_present, object_poses_at
-from stillmap.viewer import tracks
-from stillmap.viewer.nodes import NO_SHADOWS, Nodes, node_path, quaternions
+from stillmap.results.reader import Track
+from stillmap.viewer.nodes import NO_SHADOWS, Labels, Nodes, node_path, quaternions
 
+Float = NDArray[np.float64]
+# corners of a box that each edge joins; bits 0 to 2 of a corner are its side in x, y, z
+_EDGES = np.array([(a, a | bit) for bit in (1, 2, 4) for a in range(8) if not a & bit])
+_FLOOR = _EDGES[(_EDGES < 4).all(axis=1)]
 _MAX_TRACK_SEGMENTS = 100_000
 _MAX_NUMBERS = 60
 _FILL_OPACITY = 0.25
 _MIN_THICKNESS = 0.01  # m of the boxes in 2D, which a click must hit
-
 # the unit cube: corners as in `tracks`, sides counterclockwise from outside
 _CORNERS = ((np.arange(8)[:, None] >> np.arange(3)) & 1) - 0.5
 _QUADS = np.array(
     [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
 )
 _TRIANGLES = np.concatenate([_QUADS[:, [0, 1, 2]], _QUADS[:, [0, 2, 3]]])
+
+
+def box_edges(objects: ObjectPoses) -> Float:
+    """Both ends of the box edges, (n, 12, 2, 3) m in the map frame; (n, 4, 2, 3) in 2D."""
+    edges = _EDGES if objects.size[:, 2].any() else _FLOOR
+    sides = ((np.arange(8)[:, None] >> np.arange(3)) & 1) - 0.5  # (8, 3)
+    corners = sides * objects.size[:, None]
+    R, t = objects.T_map_object[:, :3, :3], objects.T_map_object[:, :3, 3]
+    return np.asarray((corners @ R.transpose(0, 2, 1) + t[:, None])[:, edges])
+
+
+def track_segments(tracks: Sequence[Track]) -> tuple[Float, NDArray[np.intp]]:
+    """Line segments (m, 2, 3) in m of all tracks, and the index (m,) of their tracks."""
+    lines = [
+        np.column_stack([one.xy, np.zeros(len(one.xy)) if one.z is None else one.z])
+        for one in tracks
+    ]
+    segments = [np.stack([row[:-1], row[1:]], axis=1) for row in lines]
+    index = np.repeat(np.arange(len(lines)), [len(one) for one in segments])
+    return np.concatenate([np.zeros((0, 2, 3)), *segments]), index
+
+
+def describe_object(track: Track, stamp_ns: int, start_ns: int) -> list[tuple[str, str]]:
+    """Names and values of what is known about an object, for a person to read.
+
+    Args:
+        track: of the object.
+        stamp_ns: the time that is shown.
+        start_ns: stamp of the first scan; times are in s since then.
+    """
+    first, last = (1e-9 * int(track.stamp_ns[n] - start_ns) for n in (0, -1))
+    speed = np.linalg.norm(track.velocity, axis=1)
+    now = "not seen"
+    if is_present(track, stamp_ns):
+        at = np.interp(0.0, 1e-9 * (track.stamp_ns - stamp_ns), speed)
+        now = f"{at:.1f} m/s"
+    facts = [
+        ("Seen", f"{first:.1f} s to {last:.1f} s ({last - first:.1f} s)"),
+        ("Scans", f"{len(track.stamp_ns)}"),
+        ("Speed now", now),
+        ("Mean, highest", f"{speed.mean():.1f}, {speed.max():.1f} m/s"),
+        ("Size", " x ".join(f"{length:.2f}" for length in track.size) + " m"),
+    ]
+    if track.beams is not None:
+        facts.append(("Beams", f"{track.beams:,}"))
+    if track.p_dynamic is not None:
+        facts.append(("Mean P(dynamic)", f"{track.p_dynamic:.3f}"))
+    if track.p_identity is not None:
+        facts.append(("P(one mover)", f"{track.p_identity:.3f}"))
+    return facts
 
 
 class ObjectNodes:
@@ -43,7 +96,7 @@ class ObjectNodes:
         """
         self._nodes, self._tracks, self._on_click = nodes, nodes.scene.tracks, on_click
         self._drawn: Sequence[int] = ()
-        self._labels: list[Any] = []
+        self._labels = Labels(nodes, "Object ids")
         self._models: list[Any] = []
         self.selected: int | None = None
         self.session = ""
@@ -83,7 +136,7 @@ class ObjectNodes:
 
     def make_tracks(self) -> None:
         """Create the lines of whole tracks."""
-        segments, index = tracks.track_segments(self._tracks)
+        segments, index = track_segments(self._tracks)
         use = sample_indices(len(segments), _MAX_TRACK_SEGMENTS)
         lines = segments[use] - self._nodes.origin(1)
         color = np.repeat(self._colors(index[use])[:, None], 2, axis=1)
@@ -110,18 +163,17 @@ class ObjectNodes:
                 node.visible = is_present(model.track, stamp_ns)
                 if node.visible:
                     self._nodes.place(node, model.pose_at(stamp_ns))
-        objects = self._objects_at(stamp_ns)
+        objects = object_poses_at(self._tracks, stamp_ns)
+        # those of the session: clocks of robots may agree
+        own = [self._tracks[n].session == self.session for n in objects.track]
+        objects = _select(objects, np.flatnonzero(own))
         if shown("Objects"):
             self._draw_boxes(objects)
         if self._tracks:
-            self._draw_numbers(objects, _MAX_NUMBERS if shown("Object ids") else 0)
+            count = min(_MAX_NUMBERS, len(objects.track)) if shown("Object ids") else 0
+            ids = [str(self._tracks[n].id) for n in objects.track[:count]]
+            self._labels.show([(id, self._top(objects, n)) for n, id in enumerate(ids)])
             self._draw_mark(objects)
-
-    def _objects_at(self, stamp_ns: int) -> ObjectPoses:
-        """Those of the session: clocks of robots may agree."""
-        found = object_poses_at(self._tracks, stamp_ns)
-        own = np.array([self._tracks[n].session == self.session for n in found.track], np.bool_)
-        return ObjectPoses(found.track[own], found.T_map_object[own], found.size[own])
 
     def _colors(self, index: NDArray[np.intp]) -> NDArray[np.uint8]:
         return color_by_id([self._tracks[n].id for n in index])
@@ -139,29 +191,17 @@ class ObjectNodes:
             self._sides.batched_colors = color
 
     def _draw_edges(self, node: Any, objects: ObjectPoses, color: NDArray[np.uint8]) -> None:
-        lines = tracks.box_edges(objects) - self._nodes.origin(2)
+        lines = box_edges(objects) - self._nodes.origin(2)
         colors = np.broadcast_to(color[:, None, None], lines.shape)
         node.points = lines.reshape(-1, 2, 3).astype(np.float32)
         node.colors = colors.reshape(-1, 2, 3)
-
-    def _draw_numbers(self, objects: ObjectPoses, count: int) -> None:
-        """Show ids as labels; labels are created on demand and reused."""
-        use = objects.track[:count]
-        while len(self._labels) < len(use):
-            path = node_path("Object ids", f"{len(self._labels)}")
-            self._labels.append(self._nodes.label(path))
-        for n, label in enumerate(self._labels):
-            label.visible = n < len(use)
-            if label.visible:
-                label.text = str(self._tracks[use[n]].id)
-                label.position = self._top(objects, n)
 
     def _draw_mark(self, objects: ObjectPoses) -> None:
         """Mark the selected object where it is there."""
         at = [n for n, one in enumerate(objects.track) if self._tracks[one].id == self.selected]
         self._mark.visible = self._mark_label.visible = bool(at)
         if at:
-            only = ObjectPoses(objects.track[at], objects.T_map_object[at], objects.size[at])
+            only = _select(objects, np.array(at, np.intp))
             self._draw_edges(self._mark, only, self._colors(only.track))
             self._mark_label.text = f"object {self.selected}"
             self._mark_label.position = self._top(objects, at[0])
@@ -170,3 +210,7 @@ class ObjectNodes:
         """(3,) m, relative to the scene's origin."""
         top = np.array([0.0, 0.0, 0.5 * float(objects.size[n, 2])])
         return np.asarray(objects.T_map_object[n, :3, 3] - self._nodes.scene.origin + top)
+
+
+def _select(objects: ObjectPoses, use: NDArray[np.intp]) -> ObjectPoses:
+    return ObjectPoses(objects.track[use], objects.T_map_object[use], objects.size[use])

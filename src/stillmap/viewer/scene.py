@@ -1,4 +1,4 @@
-"""The content of a result folder as arrays, subsampled to what a browser can draw."""
+"""The content of a result folder or a place as arrays, subsampled to what a browser can draw."""
 
 import math
 from collections.abc import Callable
@@ -10,18 +10,23 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from stillmap.core.arrays import sample_indices
 from stillmap.core.errors import InputError
+from stillmap.core.grid_map import GridMap
 from stillmap.core.json import read_json
 from stillmap.core.se2 import inverse
+from stillmap.io.point_cloud import ply
+from stillmap.io.point_cloud.table import read_columns
 from stillmap.io.trajectory import read_tum
 from stillmap.pipeline.snapshots import Window
 from stillmap.results import gltf
 from stillmap.results.object_poses import interpolate_pose
 from stillmap.results.reader import Grid, Track, is_place, read_grid, read_tracks
 from stillmap.results.report.figures import UNKNOWN, draw_map, map_window
-from stillmap.viewer.display import Points, sample_ply
-from stillmap.viewer.place import ViewedPlace, read_viewed_place
+from stillmap.results.report.place import PlacePictures
+from stillmap.results.timeline import Timeline, read_timeline
 
+Float = NDArray[np.float64]
 MAX_POINTS = {"static": 500_000, "dynamic": 200_000}
 _MAX_MESH = 512 << 20  # bytes of mesh.glb
 _MAX_MODELS = 256 << 20  # bytes of all object models
@@ -30,9 +35,85 @@ _MAX_COORDINATE = 8_000.0  # m; beyond it float32 loses millimeters, and the ori
 _GROUND_QUANTILE = 0.05  # of the heights near the trajectory
 _GROUND_RADIUS = 15.0  # m around the trajectory
 _MIN_IMAGE_SIZE = 2_000  # pixels; browsers blur smaller images
-
-Float = NDArray[np.float64]
 Value = TypeVar("Value")
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """A subsampled point cloud.
+
+    Attributes:
+        points: (n, 3) m in the map frame.
+        colors: (n, 3) uint8; None where the file has none.
+        total: number of points in the file.
+    """
+
+    points: NDArray[np.floating]
+    colors: NDArray[np.uint8] | None
+    total: int
+
+
+def sample_ply(path: Path, max_count: int) -> Points:
+    """At most `max_count` points of a PLY file, read block by block.
+
+    Raises:
+        InputError: it is missing or damaged.
+    """
+    layout = ply.read_layout(path)
+    has_colors = {"red", "green", "blue"} <= {field.name for field in layout.fields}
+    wanted = ("x", "y", "z", *(("red", "green", "blue") if has_colors else ()))
+    use, first = sample_indices(layout.rows, max_count), 0
+    points, colors = np.empty((len(use), 3)), np.empty((len(use), 3), np.uint8)
+    for block in read_columns(layout, wanted):
+        end = first + len(block[0])
+        into = slice(*np.searchsorted(use, [first, end]).tolist())
+        for n, values in enumerate(block):
+            (points if n < 3 else colors)[into, n % 3] = values[use[into] - first]
+        first = end
+    if not np.isfinite(points).all():
+        raise InputError("holds a point that is not finite", where=str(path))
+    return Points(points, colors if has_colors else None, layout.rows)
+
+
+@dataclass(frozen=True, eq=False)
+class ViewedPlace:
+    """A place of S sessions in the order of time.
+
+    Attributes:
+        timeline: what changed between them.
+        first_scan: (S + 1,) session s has the scans first_scan[s]:first_scan[s + 1] of the scene.
+        pictures: of the map; None for an empty one.
+    """
+
+    timeline: Timeline
+    first_scan: NDArray[np.intp]
+    pictures: PlacePictures | None
+
+    def __len__(self) -> int:
+        return len(self.timeline.sessions)
+
+    def scans_of(self, session: int) -> range:
+        """Indices of the scans of a session in the scene."""
+        return range(int(self.first_scan[session]), int(self.first_scan[session + 1]))
+
+
+def read_viewed_place(folder: Path, grid: GridMap) -> tuple[ViewedPlace, NDArray[np.int64], Float]:
+    """The sessions of a place, and stamps (T,) and poses (T, 4, 4) of all their scans.
+
+    Args:
+        folder: of the place.
+        grid: its map.
+
+    Raises:
+        InputError: a file is missing or damaged.
+    """
+    timeline = read_timeline(folder)
+    homes = [folder / "sessions" / one.name for one in timeline.sessions]
+    trajectories = [read_tum(home / "trajectory.tum") for home in homes]
+    stamp_ns, poses = (np.concatenate(part) for part in zip(*trajectories, strict=True))
+    first_scan = np.cumsum([0, *(len(stamps) for stamps, _ in trajectories)])
+    pictures = PlacePictures(grid, timeline) if grid.p_occupied.size else None
+    return ViewedPlace(timeline, first_scan, pictures), stamp_ns, poses
 
 
 @dataclass(frozen=True, eq=False)

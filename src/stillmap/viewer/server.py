@@ -1,8 +1,9 @@
-"""A viser server for this machine only, and for those who know its address.
+"""A viser server for this machine only, and for those who know the token in its address.
 
-Every page in a browser of the machine can reach a port of the loopback interface. Requests of other
-pages are recognized by `Origin`, DNS rebinding by `Host`, those of other users by the lack of the
-token (see `access`); a content security policy keeps the page itself from requests to elsewhere.
+Every page in a browser of the machine, and every user, can reach a port of the loopback interface.
+Requests of other pages are recognized by `Origin`, DNS rebinding by `Host`, those of other users by
+the lack of the token, the first segment of the path; a content security policy keeps the page
+itself from requests to elsewhere.
 """
 
 import gzip
@@ -10,8 +11,10 @@ import html
 import logging
 import os
 import re
+import secrets
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from hmac import compare_digest
 from http import HTTPStatus
 from typing import Any
 
@@ -20,9 +23,10 @@ import viser
 import websockets.asyncio.server
 
 from stillmap.core.errors import InputError
-from stillmap.viewer.access import Access
 
 HOST = "127.0.0.1"
+_TOKEN_BYTES = 24
+_PORT_VARIABLE = "_VISER_PORT_OVERRIDE"  # of the environment
 
 # any port: a tunnel may use another one
 _LOCAL_HOST = re.compile(r"(127\.0\.0\.1|localhost)(:\d{1,5})?")
@@ -34,20 +38,12 @@ def is_local_request(headers: Mapping[str, str]) -> bool:
     return bool(_LOCAL_HOST.fullmatch(host)) and origin in (None, f"http://{host}")
 
 
-def content_security_policy(host: str) -> str:
-    """The `Content-Security-Policy` of the page at `host`: requests to its own server only."""
-    local = "'self' data: blob:"
-    return "; ".join(
-        (
-            f"default-src {local} 'unsafe-inline'",
-            # viser uses WebAssembly and inline scripts
-            f"script-src {local} 'unsafe-inline' 'unsafe-eval'",
-            f"connect-src {local} ws://{host}",
-            "frame-ancestors 'none'",
-            "form-action 'none'",
-            "base-uri 'none'",
-        )
-    )
+# viser uses WebAssembly and inline scripts; the page asks its own server only
+_LOCAL = "'self' data: blob:"
+_POLICY = (
+    f"default-src {_LOCAL} 'unsafe-inline'; script-src {_LOCAL} 'unsafe-inline' 'unsafe-eval'; "
+    f"connect-src {_LOCAL} ws://%s; frame-ancestors 'none'; form-action 'none'; base-uri 'none'"
+)
 
 
 # viser applies ACES filmic tone mapping to meshes, which darkens photographs, and has no option for
@@ -92,22 +88,19 @@ def adapt_page(response: Any, title: str) -> None:
     response.headers["Content-Length"] = str(len(response.body))
 
 
-_PORT_VARIABLE = "_VISER_PORT_OVERRIDE"  # environment variable that overrides viser's port
-
-
 class Server(viser.ViserServer):
     """Without sharing of the page through a remote server.
 
     Attributes:
-        access: the secrets in its addresses.
+        token: first segment of the path of every request.
     """
 
-    access: Access
+    token: str
 
     @property
-    def address(self) -> str:
-        """Of the server, without a path."""
-        return f"http://{self.get_host()}:{self.get_port()}"
+    def url(self) -> str:
+        """Address of the page."""
+        return f"http://{self.get_host()}:{self.get_port()}/{self.token}"
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         del verbose
@@ -126,14 +119,15 @@ def start_server(port: int, title: str) -> Server:
     """
     # websockets logs malformed requests with a traceback
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
-    port_override, access = os.environ.pop(_PORT_VARIABLE, None), Access()
+    token = secrets.token_urlsafe(_TOKEN_BYTES)
+    override = os.environ.pop(_PORT_VARIABLE, None)  # of viser's port
     try:
-        with _quiet_console(), _guard_servers(title, access) as ports:
+        with _quiet_console(), _guard_servers(title, token) as ports:
             server = Server(HOST, port, label="stillmap", verbose=False)
-            server.access = access
+            server.token = token
     finally:
-        if port_override is not None:
-            os.environ[_PORT_VARIABLE] = port_override
+        if override is not None:
+            os.environ[_PORT_VARIABLE] = override
     if not ports:
         stop_server(server)
         raise RuntimeError("this version of viser does not use websockets.asyncio.server.serve")
@@ -162,7 +156,7 @@ def _quiet_console() -> Iterator[None]:
 
 
 @contextmanager
-def _guard_servers(title: str, access: Access) -> Iterator[list[int]]:
+def _guard_servers(title: str, token: str) -> Iterator[list[int]]:
     """Within the context, new servers check requests and send the policy; yields their ports."""
     module, ports = websockets.asyncio.server, list[int]()
     original = module.serve
@@ -171,22 +165,20 @@ def _guard_servers(title: str, access: Access) -> Iterator[list[int]]:
         ports.append(port)
 
         def answer(connection: Any, request: Any) -> Any:
-            if not is_local_request(request.headers):
-                return connection.respond(HTTPStatus.FORBIDDEN, "not from this page\n")
-            path, is_page = access.strip(request.path), "Upgrade" not in request.headers
-            if access.redeem(request.path) or (is_page and path == ""):
+            given, slash, rest = request.path.removeprefix("/").partition("/")
+            # in a time that does not show how much of it is right
+            known = compare_digest(given.encode("utf-8", "surrogateescape"), token.encode())
+            if not known or not is_local_request(request.headers):
+                return connection.respond(HTTPStatus.FORBIDDEN, "not the page's own request\n")
+            if not slash and "Upgrade" not in request.headers:
                 response = connection.respond(HTTPStatus.FOUND, "")
-                response.headers["Location"] = f"/{access.token}/"
+                response.headers["Location"] = f"/{token}/"
                 return response
-            if path is None:
-                return connection.respond(HTTPStatus.FORBIDDEN, "the address has no token\n")
-            request.path = path or "/"
+            request.path = f"/{rest}"
             response = process_request(connection, request)
             if response is not None:
                 adapt_page(response, title)
-                response.headers["Content-Security-Policy"] = content_security_policy(
-                    request.headers["Host"]
-                )
+                response.headers["Content-Security-Policy"] = _POLICY % request.headers["Host"]
                 response.headers["Referrer-Policy"] = "no-referrer"
             return response
 

@@ -1,4 +1,4 @@
-"""The sessions of a place as viser nodes: trajectories, boxes of changes and their labels."""
+"""The sessions of a place: trajectories, boxes of changes and their labels, and a slider."""
 
 from typing import Any
 
@@ -10,12 +10,12 @@ from stillmap.results.colors import color_by_id
 from stillmap.results.object_poses import ObjectPoses
 from stillmap.results.report.place import KIND_COLORS
 from stillmap.results.timeline import SessionChange
-from stillmap.viewer.nodes import Nodes, node_path
-from stillmap.viewer.place import ViewedPlace
-from stillmap.viewer.tracks import box_edges
+from stillmap.viewer.nodes import Labels, Nodes, escape_markdown, table_html
+from stillmap.viewer.objects import box_edges
+from stillmap.viewer.scene import ViewedPlace
 
+_MAX_ROWS = 25
 Float = NDArray[np.float64]
-
 _MAX_TRAJECTORY_POINTS = 20_000  # of all sessions together
 _MAX_LABELS = 100
 _MARGIN = 0.05  # m around what changed
@@ -46,7 +46,7 @@ class SessionNodes:
             place: the sessions.
         """
         self._nodes, self._place = nodes, place
-        self._labels: list[Any] = []
+        self._labels = Labels(nodes, "Change labels")
         self._lines: dict[str, Any] = {}
         self.session = len(place) - 1
 
@@ -84,8 +84,14 @@ class SessionNodes:
         """
         if with_boxes:
             self._draw_boxes()
-        if len(self._place) > 1:
-            self._draw_labels(self.changes[:_MAX_LABELS] if with_labels else [])
+        shown = self.changes[:_MAX_LABELS] if with_labels else []
+        self._labels.show([(f"{one.label} {one.kind}", self._top(one)) for one in shown])
+
+    def _top(self, change: SessionChange) -> Float:
+        """(3,) m above the upper side of a box, relative to the scene's origin."""
+        low, high = (_in_space(corner) for corner in change.boxes[0])
+        middle = 0.5 * float(low[0] + high[0])
+        return np.asarray(np.array([middle, high[1], high[2]]) - self._nodes.origin(4))
 
     def _draw_boxes(self) -> None:
         for kind, node in self._lines.items():
@@ -97,18 +103,52 @@ class SessionNodes:
                 drawn = np.concatenate(outlines) - self._nodes.origin(3)
                 node.points = drawn.astype(np.float32)
 
-    def _draw_labels(self, changes: list[SessionChange]) -> None:
-        """Labels are created on demand and reused."""
-        while len(self._labels) < len(changes):
-            path = node_path("Change labels", f"{len(self._labels)}")
-            self._labels.append(self._nodes.label(path))
-        for n, label in enumerate(self._labels):
-            label.visible = n < len(changes)
-            if label.visible:
-                label.text = f"{changes[n].label} {changes[n].kind}"
-                low, high = (_in_space(of) for of in changes[n].boxes[0])
-                middle = 0.5 * (low + high)
-                label.position = np.array([middle[0], high[1], high[2]]) - self._nodes.origin(4)
+
+class SessionControls:
+    """A slider over the sessions of a place."""
+
+    def __init__(self, gui: Any, place: ViewedPlace, nodes: SessionNodes) -> None:
+        """Add the controls to the page.
+
+        Args:
+            gui: of the server.
+            place: the sessions.
+            nodes: what is shown of them.
+        """
+        self._place, self._nodes, last = place, nodes, len(place)
+        self._title: Any = gui.add_markdown("")
+        self._slider: Any = gui.add_slider("Session", 1, max(last, 2), 1, last, disabled=last < 2)
+        self._folder: Any = gui.add_folder("Changed since the session before")
+        with self._folder:
+            self._table: Any = gui.add_html("")
+        self.show()
+
+    @property
+    def wanted(self) -> int:
+        """Index of the session that the slider is at."""
+        return min(int(self._slider.value), len(self._place)) - 1
+
+    def go_to(self, session: int) -> None:
+        """Move the slider to the session that is nearest to an index."""
+        self._slider.value = min(max(session, 0), len(self._place) - 1) + 1
+
+    def show(self) -> None:
+        """Show title and changes of the session that is shown."""
+        session, timeline = self._nodes.session, self._place.timeline
+        self._slider.value = session + 1
+        self._title.content = f"**{escape_markdown(timeline.title(session))}**"
+        changes = self._nodes.changes
+        rows = [(one.label, _describe(one)) for one in changes]
+        more = len(rows) - _MAX_ROWS
+        rows = [*rows[:_MAX_ROWS], ("", f"and {more} more")] if more > 0 else rows
+        none = "it is the first session" if session == 0 else "nothing"
+        self._table.content = table_html(rows or [("", none)])
+
+
+def _describe(change: SessionChange) -> str:
+    low, high = change.boxes[0]
+    x, y = 0.5 * (low[:2] + high[:2])
+    return f"{change.kind}, x {x:.1f} m, y {y:.1f} m"
 
 
 def _outline(change: SessionChange, height: float) -> Float:

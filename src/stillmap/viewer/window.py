@@ -11,20 +11,26 @@ from numpy.typing import NDArray
 
 from stillmap.viewer.beams import Beams
 from stillmap.viewer.layers import Layers
-from stillmap.viewer.legend import help_html, legend_html
-from stillmap.viewer.legend_panels import LegendPanels
+from stillmap.viewer.legend import (
+    ACTION_KEYS,
+    LAYER_KEYS,
+    LegendPanels,
+    help_html,
+    legend_html,
+)
 from stillmap.viewer.measuring import Measuring
-from stillmap.viewer.nodes import Nodes
-from stillmap.viewer.objects import ObjectNodes
-from stillmap.viewer.ruler import Ruler
+from stillmap.viewer.nodes import (
+    FIELD_OF_VIEW,
+    MIN_ASPECT,
+    Nodes,
+    default_view,
+    escape_markdown,
+    table_html,
+)
+from stillmap.viewer.objects import ObjectNodes, describe_object
 from stillmap.viewer.scene import Scene
 from stillmap.viewer.server import start_server, stop_server
-from stillmap.viewer.session_controls import SessionControls
-from stillmap.viewer.sessions import SessionNodes
-from stillmap.viewer.shortcuts import LAYER_KEYS, PLACE_LAYER_KEYS, add_shortcuts
-from stillmap.viewer.text import escape_markdown, table_html
-from stillmap.viewer.tracks import describe_object
-from stillmap.viewer.view import FIELD_OF_VIEW, MIN_ASPECT, default_view
+from stillmap.viewer.sessions import SessionControls, SessionNodes
 
 _FRAME_TIME = 0.1  # s between updates while playing
 _IDLE_TIME = 0.05  # s between polls of the controls
@@ -63,8 +69,12 @@ class Window:
                 self._sessions = SessionNodes(nodes, place)
             self._layers = Layers(nodes, beams, self._objects, self._sessions)
             self._legends = LegendPanels(self._server)
-            self._add_controls(Ruler(nodes))
-            add_shortcuts(self._server.gui, self._actions())
+            self._add_controls(nodes)
+            for action, act in self._actions().items():
+                is_layer = action in LAYER_KEYS
+                label = f"Show or hide: {action.lower()}" if is_layer else action
+                key: Any = (LAYER_KEYS | ACTION_KEYS)[action]
+                self._server.gui.add_command(label, hotkey=key).on_trigger(act)
             self.show(0)
             if place is not None:
                 self.show_session(len(place) - 1)
@@ -75,11 +85,7 @@ class Window:
     @property
     def url(self) -> str:
         """Address of the page: who knows it can see the page."""
-        return f"{self._server.address}/{self._server.access.token}"
-
-    def make_single_url(self) -> str:
-        """An address that works once, for the command line of a browser, which others can read."""
-        return f"{self._server.address}/{self._server.access.issue_ticket()}"
+        return self._server.url
 
     def close(self) -> None:
         """Stop the server."""
@@ -170,7 +176,7 @@ class Window:
         """A callback for viser that lets `step` act."""
         return lambda *_event: self._events.put(act)
 
-    def _actions(self) -> dict[str, Callable[[], None]]:
+    def _actions(self) -> dict[str, Callable[..., None]]:
         """The actions of keys, by name of the action or layer."""
         last = len(self._seconds) - 1
         actions: dict[str, Callable[[], None]] = {
@@ -234,7 +240,7 @@ class Window:
         self._measuring.clear()
         self._select(None)
 
-    def _add_controls(self, ruler: Ruler) -> None:
+    def _add_controls(self, nodes: Nodes) -> None:
         gui, last, scene = self._server.gui, len(self._seconds) - 1, self._scene
         gui.set_panel_label("stillmap")
         gui.main_panel.dock_right()  # beside the scene, not over it
@@ -249,7 +255,7 @@ class Window:
         self._speed = gui.add_dropdown("Speed", tuple(_SPEEDS))
         self._button = gui.add_button("Play", disabled=not last)
         self._button.on_click(self._defer(lambda: self.play(not self._playing)))
-        self._measuring = Measuring(self._server, self._layers, ruler, self._events)
+        self._measuring = Measuring(nodes, self._layers.pick, self._events)
         self._facts_folder: Any = gui.add_folder("Object", visible=False)
         with self._facts_folder:
             self._facts: Any = gui.add_html("")
@@ -261,10 +267,9 @@ class Window:
 
     def _add_layer_controls(self) -> None:
         gui, visible = self._server.gui, self._layers.default_visibility
-        keys = LAYER_KEYS | PLACE_LAYER_KEYS
         with gui.add_folder("Show"):
             self._boxes: dict[str, Any] = {
-                name: gui.add_checkbox(f"{keys[name]} {name}", shown)
+                name: gui.add_checkbox(f"{LAYER_KEYS[name]} {name}", shown)
                 for name, shown in visible.items()
             }
             colorings = self._layers.colorings
