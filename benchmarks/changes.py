@@ -35,7 +35,7 @@ from stillmap.eval.trajectory import align, compute_absolute_errors
 from stillmap.mapping import Change
 from stillmap.results.reader import moved
 from stillmap.sim import Simulation, simulate
-from stillmap.sim.objects import place_faces
+from stillmap.sim.dynamics import place_faces
 
 _IN_TIME = 2.0  # s
 _BESIDE_DOOR = 0.2  # m

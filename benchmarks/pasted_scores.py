@@ -27,9 +27,9 @@ import stillmap
 from stillmap.core import camera as camera_module
 from stillmap.core.camera import Images
 from stillmap.core.errors import InputError
-from stillmap.mesh.texture.views import View
-from stillmap.mesh.texture.visibility import find_visible_faces
 from stillmap.mesh.triangle_mesh import Mesh
+from stillmap.mesh.views import View
+from stillmap.mesh.visibility import find_visible_faces
 from stillmap.prepare.options import ReadOptions
 
 Mask = NDArray[np.bool_]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from place_truth import SessionTruth
 
 from stillmap.core.recording import Recording
-from stillmap.sim.objects import place_faces
+from stillmap.sim.dynamics import place_faces
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from stillmap.core.errors import InputError
 from stillmap.core.json import read_json
-from stillmap.sim.objects import place_faces
+from stillmap.sim.dynamics import place_faces
 from stillmap.sim.planner import Float
 from stillmap.sim.session_layout import ObjectKind, Place, StandingObject
-from stillmap.sim.session_truth import FILE, TrueChange
+from stillmap.sim.sessions import SESSIONS_FILE, TrueChange
 from stillmap.sim.truth import Truth, load_truth
 
 _MAX_BYTES = 64 << 20
@@ -81,7 +81,7 @@ def load_session_truth(folder: str | Path) -> SessionTruth:
     Raises:
         InputError: there is none, or it is damaged.
     """
-    path = Path(folder) / FILE
+    path = Path(folder) / SESSIONS_FILE
     if not path.is_file():
         hint = "a folder of sessions that 'stillmap simulate' wrote"
         raise InputError("holds no truth about sessions", where=str(folder), hint=hint)

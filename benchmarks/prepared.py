@@ -12,7 +12,7 @@ from stillmap.core.recording import Recording
 from stillmap.eval.map import MapScores, extract_wall_cells, score_map
 from stillmap.results.reader import Grid
 from stillmap.sim import Simulation, laser, simulate
-from stillmap.sim.objects import transform_faces
+from stillmap.sim.dynamics import transform_faces
 
 Float = NDArray[np.float64]
 

@@ -8,11 +8,12 @@ import numpy as np
 
 from stillmap.core.errors import InputError
 from stillmap.sim.scene import Scene
-from stillmap.sim.session_truth import compute_overlap, observe
 from stillmap.sim.sessions import (
     Region,
     SessionOptions,
     SessionPlan,
+    compute_overlap,
+    observe,
     plan_sessions,
     simulate_sessions,
 )

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from model_readers import read_glb
 
-from stillmap.mesh.texture.atlas import TexturedMesh
+from stillmap.mesh.texture import TexturedMesh
 from stillmap.mesh.triangle_mesh import Mesh
 from stillmap.results.gltf import write_glb
 

@@ -25,8 +25,7 @@ from model_surface import (
 from numpy.typing import NDArray
 
 from stillmap.core.camera import Camera
-from stillmap.sim.appearance import compute_static_color
-from stillmap.sim.camera import SKY
+from stillmap.sim.camera import SKY, compute_static_color
 from stillmap.sim.geometry import BOX, Faces, Ground, MovingSurfaces, Solids, StaticSurfaces
 
 Float = NDArray[np.float64]

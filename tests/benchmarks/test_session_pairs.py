@@ -4,8 +4,7 @@ import pytest
 from session_pairs import OVERLAPS, measure_overlap, plan_pair, plan_wings
 
 from stillmap.sim import scene_by_name
-from stillmap.sim.session_truth import compute_overlap, observe
-from stillmap.sim.sessions import simulate_sessions
+from stillmap.sim.sessions import compute_overlap, observe, simulate_sessions
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ import os
 import numpy as np
 import pytest
 
-from stillmap.mesh.texture.atlas import TexturedMesh
+from stillmap.mesh.texture import TexturedMesh
 from stillmap.mesh.triangle_mesh import Mesh
 from stillmap.results.gltf import write_glb
 

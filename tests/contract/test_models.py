@@ -5,7 +5,7 @@ import pytest
 from made_up_rooms import all_round, furnished, looking, photograph, rectangle, sharpest
 from opening_models import shown, validated
 
-from stillmap.mesh.texture.baking import bake_texture
+from stillmap.mesh.texture import bake_texture
 from stillmap.mesh.triangle_mesh import concatenate_meshes
 from stillmap.results.gltf import write_glb
 

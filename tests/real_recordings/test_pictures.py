@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import stillmap
 from stillmap.core import camera
-from stillmap.mesh.texture.views import View, find_views, read_color_image
+from stillmap.mesh.views import View, find_views, read_color_image
 
 pytestmark = pytest.mark.slow
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from stillmap.core.errors import InputError
-from stillmap.mesh.texture.atlas import TexturedMesh
+from stillmap.mesh.texture import TexturedMesh
 from stillmap.mesh.triangle_mesh import Mesh
 from stillmap.results.gltf import write_glb
 

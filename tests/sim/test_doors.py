@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from stillmap.core.config import override
 from stillmap.sim import Door, DoorOptions, Scene, Simulation, simulate
-from stillmap.sim.objects import Doors, split_into_segments
+from stillmap.sim.dynamics import Doors, split_into_segments
 from stillmap.sim.planner import compute_segment_distance
 from stillmap.sim.walls import box
 

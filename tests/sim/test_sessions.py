@@ -12,10 +12,15 @@ from stillmap.core.errors import InputError
 from stillmap.eval.map import distance_to_walls
 from stillmap.io.stillmap_folder import read
 from stillmap.sim import Scene, scene_by_name
-from stillmap.sim.objects import place_faces
+from stillmap.sim.dynamics import place_faces
 from stillmap.sim.session_layout import Floor, cross_rectangle
-from stillmap.sim.session_truth import list_changes
-from stillmap.sim.sessions import SessionOptions, SessionPlan, plan_sessions, simulate_sessions
+from stillmap.sim.sessions import (
+    SessionOptions,
+    SessionPlan,
+    list_changes,
+    plan_sessions,
+    simulate_sessions,
+)
 from stillmap.sim.writer import write_sessions
 
 QUICK = {"laser": {"beams": 90}, "robot": {"scans": 150}, "crowd": {"people": 3}}

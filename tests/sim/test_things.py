@@ -18,7 +18,7 @@ from stillmap.sim import (
     simulate,
     write_simulation,
 )
-from stillmap.sim.objects import faces_at_all_places, place_faces
+from stillmap.sim.dynamics import faces_at_all_places, place_faces
 from stillmap.sim.planner import compute_segment_distance
 from stillmap.sim.walls import box
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stillmap.mesh.texture.atlas import TexturedMesh
+from stillmap.mesh.texture import TexturedMesh
 from stillmap.results.colors import BACKGROUND, TEAL
 from stillmap.results.gltf import write_glb
 from stillmap.results.report.place import KIND_COLORS

@@ -172,7 +172,7 @@ def _wants_models(result: MappingResult, tilting: "TiltingResult | None") -> boo
         return False
     if enabled or recording.images is None:
         return bool(enabled)
-    from stillmap.mesh.texture.views import usable_images  # takes long to load
+    from stillmap.mesh.views import usable_images  # takes long to load
 
     return bool(usable_images(recording)[0].any())
 

@@ -147,7 +147,7 @@ def _summarize_images(recording: Recording) -> dict[str, Any] | None:
     images = recording.images
     if images is None:
         return None
-    from stillmap.mesh.texture.views import usable_images  # takes long to load
+    from stillmap.mesh.views import usable_images  # takes long to load
 
     used, left_out = usable_images(recording)
     taken = np.bincount(images.camera, minlength=len(images.cameras))

@@ -12,31 +12,28 @@ from stillmap.core.grid_map import Region, is_inside
 from stillmap.core.profiling import Progress, StageTimer, no_progress
 from stillmap.core.short_repr import ShortRepr
 from stillmap.mesh.inputs import MeshInputs
-from stillmap.mesh.objects.merging import ObjectTrack, collect_tracks, merge_tracks
-from stillmap.mesh.objects.reconstruction import ObjectShape, reconstruct_object
-from stillmap.mesh.objects.segmentation import DynamicReturns
-from stillmap.mesh.objects.texturing import TexturedViews, assign_object_views, times_in_view
+from stillmap.mesh.merging import ObjectTrack, collect_tracks, merge_tracks
 from stillmap.mesh.options import MeshOptions
 from stillmap.mesh.place import Background, ViewAssignment, assign_views
 from stillmap.mesh.point_colors import PointColors, color_points
-from stillmap.mesh.texture.atlas import TexturedMesh, replace_faces
-from stillmap.mesh.texture.baking import bake_texture
-from stillmap.mesh.texture.view_selection import apply_gains
-from stillmap.mesh.texture.views import (
+from stillmap.mesh.reconstruction import ObjectShape, reconstruct_object
+from stillmap.mesh.segmentation import DynamicReturns
+from stillmap.mesh.texture import TexturedMesh, bake_texture
+from stillmap.mesh.texturing import TexturedViews, assign_object_views, times_in_view
+from stillmap.mesh.triangle_mesh import Float, Int32, Mesh, Tell
+from stillmap.mesh.tsdf import build_surface
+from stillmap.mesh.view_selection import apply_gains
+from stillmap.mesh.views import (
     UNREADABLE,
     View,
     filter_readable,
     find_views,
     read_color_image,
 )
-from stillmap.mesh.triangle_mesh import Mesh
-from stillmap.mesh.tsdf import build_surface
-from stillmap.mesh.types import Float, Int32, Tell
 
 Bake = Callable[[Mesh, Int32, list[View]], TexturedMesh]
 
 _LIBRARIES = ("skimage.measure", "pyfqmr", "xatlas", "trimesh")  # of the extra `mesh`
-_MAX_P_SPOILED = 0.5  # that an image shows static surface only: below, a mover is in front
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +64,6 @@ class Models(ShortRepr):
     Attributes:
         assignment: the static surface, and which of `views` textures each face.
         textured: the textured surface.
-        unfiltered: the same with the sharpest image on faces where that probably shows a mover, as
-            without labels; None where there are no such faces.
         views: usable images.
         left_out: number of other images, by reason.
         unread: one line for each image that could not be read.
@@ -80,7 +75,6 @@ class Models(ShortRepr):
 
     assignment: ViewAssignment
     textured: TexturedMesh
-    unfiltered: TexturedMesh | None
     views: list[View]
     left_out: dict[str, int]
     unread: list[str]
@@ -142,7 +136,6 @@ def build_models(
         bake = partial(bake_texture, read=images.read, texture_size=options.texture_size)
         shown = place if region is None else place.select(is_inside(place.mesh.centers, region))
         textured = bake(shown.mesh, shown.view, views)
-        unfiltered = _bake_unfiltered(textured, shown, views, bake)
     background = Background(place, views, partial(read_color_image, images))
     with stages.measure("movers"):
         models, returns = [], DynamicReturns.collect(inputs)
@@ -152,20 +145,7 @@ def build_models(
     if views:
         with stages.measure("points"):
             colors = color_points(textured, background, returns, threads, tell("coloring points"))
-    return Models(
-        shown, textured, unfiltered, views, left_out, unread, models, len(inputs.objects), colors
-    )
-
-
-def _bake_unfiltered(
-    textured: TexturedMesh, place: ViewAssignment, views: list[View], bake: Bake
-) -> TexturedMesh | None:
-    """The mesh with the sharpest image on the faces where that probably shows a mover."""
-    spoiled = (place.sharpest >= 0) & (place.p_sharpest < _MAX_P_SPOILED)
-    if not spoiled.any():
-        return None
-    baked = bake(place.mesh.select(spoiled), place.sharpest[spoiled], views)
-    return replace_faces(textured, spoiled, baked)
+    return Models(shown, textured, views, left_out, unread, models, len(inputs.objects), colors)
 
 
 def _model_objects(

@@ -11,7 +11,7 @@ from stillmap.core.camera import Images
 from stillmap.core.recording import Recording, beam_stamps_ns, max_scan_duration_ns
 from stillmap.mesh.range_image import is_row_scanner
 from stillmap.mesh.tracked_boxes import TrackedBox
-from stillmap.mesh.types import Bool, Float, Float32, Index, Int64
+from stillmap.mesh.triangle_mesh import Bool, Float, Float32, Index, Int64
 from stillmap.tracking import MovingObject
 
 _SCANS_AROUND = 1  # before and after a time, whose beams may be of it

@@ -12,10 +12,21 @@ from stillmap.core.camera import is_in_image, project, unproject
 from stillmap.core.parallel import map_ordered
 from stillmap.core.short_repr import ShortRepr
 from stillmap.mesh.inputs import LidarReturns, MeshInputs
-from stillmap.mesh.simplification import subdivide
-from stillmap.mesh.texture.baking import sample_bilinear
-from stillmap.mesh.texture.occlusion import build_occlusion_mask
-from stillmap.mesh.texture.view_selection import (
+from stillmap.mesh.texture import sample_bilinear
+from stillmap.mesh.tracked_boxes import boxes_at, is_in_or_behind_box, occlusion_probability
+from stillmap.mesh.triangle_mesh import (
+    Bool,
+    Float,
+    Float32,
+    Image,
+    Index,
+    Int32,
+    Mesh,
+    Tell,
+    no_tell,
+    subdivide,
+)
+from stillmap.mesh.view_selection import (
     Candidates,
     estimate_gains,
     reject_inconsistent_views,
@@ -23,18 +34,16 @@ from stillmap.mesh.texture.view_selection import (
     select_views,
     view_utility,
 )
-from stillmap.mesh.texture.views import View, read_color_image
-from stillmap.mesh.texture.visibility import (
+from stillmap.mesh.views import View, read_color_image
+from stillmap.mesh.visibility import (
     DEPTH_SCALE,
     NEAR,
     DepthBuffer,
+    build_occlusion_mask,
     find_visible_faces,
     project_pinhole,
     render_depth,
 )
-from stillmap.mesh.tracked_boxes import boxes_at, is_in_or_behind_box, occlusion_probability
-from stillmap.mesh.triangle_mesh import Mesh
-from stillmap.mesh.types import Bool, Float, Float32, Image, Index, Int32, Tell, no_tell
 
 CANDIDATES = 6  # views compared for each face
 SEAM_COST = 1.0  # e-folds of resolution where two images meet
@@ -58,16 +67,12 @@ class ViewAssignment(ShortRepr):
         view: (F,) number of the view; -1: none shows it without a mover in front.
         p_static: (F,) probability that this view shows static surface only; 0 without a view.
         visible: (F,) whether any view shows it at all.
-        sharpest: (F,) number of the view with most pixels, movers or not.
-        p_sharpest: (F,) probability that this one shows static surface only.
     """
 
     mesh: Mesh
     view: Int32
     p_static: Float32
     visible: Bool
-    sharpest: Int32
-    p_sharpest: Float32
 
     def select(self, kept: Bool) -> "ViewAssignment":
         """That of the faces marked in `kept` (F,)."""
@@ -76,8 +81,6 @@ class ViewAssignment(ShortRepr):
             self.view[kept],
             self.p_static[kept],
             self.visible[kept],
-            self.sharpest[kept],
-            self.p_sharpest[kept],
         )
 
 
@@ -87,7 +90,6 @@ def assign_views(
     inputs: MeshInputs,
     threads: int = 1,
     tell: Tell = no_tell,
-    use_occlusion: bool = True,
 ) -> tuple[ViewAssignment, Float]:
     """Chooses for each face the view that most likely shows static surface only (Sect. 4.4).
 
@@ -97,7 +99,6 @@ def assign_views(
         inputs: beams and objects.
         threads: same result with any number.
         tell: called with the number of views done and the total.
-        use_occlusion: without, the sharpest view is taken, movers or not.
 
     Returns:
         The view of each face; (N, 3) gains for the colors of N views.
@@ -106,7 +107,7 @@ def assign_views(
         mesh, _ = subdivide(mesh, partial(max_edge_at, views))
     returns, areas = LidarReturns(inputs), mesh.areas()
     candidates = Candidates.empty(len(mesh), min(CANDIDATES, max(len(views), 1)))
-    sharpest = Candidates.empty(len(mesh), 1)
+    visible = np.zeros(len(mesh), np.bool_)
 
     def evaluate(view: View) -> tuple[Index, Float, Float]:
         pixels = find_visible_faces(mesh, view)
@@ -115,17 +116,16 @@ def assign_views(
         return faces, pixels[faces].astype(np.float64), p
 
     for number, (faces, pixels, p) in enumerate(map_ordered(evaluate, views, threads)):
-        candidates.add(number, faces, view_utility(p, pixels, areas[faces], use_occlusion), p)
-        sharpest.add(number, faces, pixels, p)
+        candidates.add(number, faces, view_utility(p, pixels, areas[faces]), p)
+        visible[faces] = True
         tell(number + 1, len(views))
     gains, read = np.ones((len(views), 3)), partial(read_color_image, inputs.images)
     if views:
         colors = sample_face_colors(mesh, candidates, views, read)
         gains = estimate_gains(candidates.view, colors, len(views))
         colors *= gains[candidates.view]  # NaN where there is no view
-        if use_occlusion:
-            candidates = reject_inconsistent_views(candidates, colors, _MAX_COLOR_DIFFERENCE)
-    return resolve_assignment(mesh, candidates, sharpest), gains
+        candidates = reject_inconsistent_views(candidates, colors, _MAX_COLOR_DIFFERENCE)
+    return resolve_assignment(mesh, candidates, visible), gains
 
 
 def max_edge_at(views: Sequence[View], points: Float) -> Float:
@@ -139,24 +139,18 @@ def max_edge_at(views: Sequence[View], points: Float) -> Float:
     return np.asarray(np.maximum(_MAX_FACE_EDGE, wide), np.float64)
 
 
-def resolve_assignment(mesh: Mesh, candidates: Candidates, sharpest: Candidates) -> ViewAssignment:
+def resolve_assignment(mesh: Mesh, candidates: Candidates, visible: Bool) -> ViewAssignment:
     """Selects the view of each of F faces from its candidates, with few seams.
 
     Args:
         mesh: F faces.
         candidates: the best views of each.
-        sharpest: the view of each with most pixels.
+        visible: (F,) whether any view shows it.
     """
     view = select_views(candidates, mesh.adjacent_faces(), SEAM_COST)
     p_static = np.where(candidates.view == view[:, None], candidates.p_static, 0.0).max(axis=1)
-    return ViewAssignment(
-        mesh,
-        view,
-        np.where(view >= 0, p_static, 0.0).astype(np.float32),
-        sharpest.view[:, 0] >= 0,
-        sharpest.view[:, 0],
-        sharpest.p_static[:, 0],
-    )
+    p_static = np.where(view >= 0, p_static, 0.0).astype(np.float32)
+    return ViewAssignment(mesh, view, p_static, visible)
 
 
 def p_unoccluded(mesh: Mesh, faces: Index, view: View, returns: LidarReturns) -> Float:

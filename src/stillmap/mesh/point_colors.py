@@ -14,17 +14,15 @@ from stillmap.core.parallel import map_ordered
 from stillmap.core.short_repr import ShortRepr
 from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.mesh.inputs import MeshInputs
-from stillmap.mesh.objects.segmentation import NO_OWNER, DynamicReturns
-from stillmap.mesh.objects.sweep_surface import IMAGE_WINDOW
-from stillmap.mesh.objects.texturing import OUTLINE_DRIFT, outline_depth
 from stillmap.mesh.place import Background
-from stillmap.mesh.texture.atlas import GRAY, TexturedMesh
-from stillmap.mesh.texture.baking import TextureSampler, avoid_gray, sample_bilinear
-from stillmap.mesh.texture.view_selection import MIN_P_VISIBLE
-from stillmap.mesh.texture.views import View
-from stillmap.mesh.texture.visibility import IMAGE_MARGIN, NEAR
+from stillmap.mesh.segmentation import IMAGE_WINDOW, NO_OWNER, DynamicReturns
+from stillmap.mesh.texture import GRAY, TexturedMesh, TextureSampler, avoid_gray, sample_bilinear
+from stillmap.mesh.texturing import OUTLINE_DRIFT, outline_depth
 from stillmap.mesh.tracked_boxes import OUTLINE_MARGIN, TrackedBox, boxes_at, occlusion_probability
-from stillmap.mesh.types import Bool, Float, Float32, Image, Index, Tell, no_tell
+from stillmap.mesh.triangle_mesh import Bool, Float, Float32, Image, Index, Tell, no_tell
+from stillmap.mesh.view_selection import MIN_P_VISIBLE
+from stillmap.mesh.views import View
+from stillmap.mesh.visibility import IMAGE_MARGIN, NEAR
 
 _MAX_SURFACE_DISTANCE = 0.1  # m of a static point from the surface
 _OUTLINE_INSET = 0.02  # m inside an object's outline, where an image may show the background

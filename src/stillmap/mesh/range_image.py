@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 from scipy.spatial import Delaunay, QhullError
 
 from stillmap.core.recording import Recording
+from stillmap.mesh.triangle_mesh import Bool, Float, Index, Int32
 from stillmap.mesh.triangulation import (
     filter_faces,
     split_rows,
     triangulate_grid,
     triangulate_strips,
 )
-from stillmap.mesh.types import Bool, Float, Index, Int32
 from stillmap.rig.trajectory import MAX_SCAN_GAP
 
 _MAX_SPACING_RATIO = 3.0  # of an unordered triangle's longest edge to the median: else a hole

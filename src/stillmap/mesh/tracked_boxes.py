@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stillmap.em import GroundMap
-from stillmap.mesh.types import Bool, Float, Index
+from stillmap.mesh.triangle_mesh import Bool, Float, Index
 from stillmap.rig.build import HOLD
 from stillmap.rig.removal import MAX_OBJECT_HEIGHT, MIN_VEHICLE_LENGTH
 from stillmap.tracking import MovingObject

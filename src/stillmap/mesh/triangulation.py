@@ -5,8 +5,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stillmap.mesh.triangle_mesh import cross_columns, dot_columns, normalize_columns, row_lengths
-from stillmap.mesh.types import Bool, Float, Index, Int32
+from stillmap.mesh.triangle_mesh import (
+    Bool,
+    Float,
+    Index,
+    Int32,
+    cross_columns,
+    dot_columns,
+    normalize_columns,
+    row_lengths,
+)
 
 _MAX_EDGE = 1.5  # m: longer edges span holes
 _MAX_EDGE_SHARE = 0.15  # of the range, likewise

@@ -17,7 +17,7 @@ from PIL import Image
 from stillmap.core.errors import InputError, import_extra
 from stillmap.core.files import atomic_file
 from stillmap.core.input_files import read_bytes
-from stillmap.mesh.texture.atlas import GRAY, TexturedMesh
+from stillmap.mesh.texture import GRAY, TexturedMesh
 from stillmap.mesh.triangle_mesh import Mesh
 
 Float = NDArray[np.float64]

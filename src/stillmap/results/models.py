@@ -19,10 +19,10 @@ from stillmap.mesh import build
 from stillmap.mesh.build import Models
 from stillmap.mesh.inputs import MeshInputs
 from stillmap.mesh.place import ViewAssignment
-from stillmap.mesh.texture.atlas import TexturedMesh
-from stillmap.mesh.texture.views import View
+from stillmap.mesh.texture import TexturedMesh
 from stillmap.mesh.tracked_boxes import box_objects, extrude_boxes
 from stillmap.mesh.triangle_mesh import Mesh
+from stillmap.mesh.views import View
 from stillmap.pipeline.map_frame import objects_to_local
 from stillmap.pipeline.result import MappingResult
 from stillmap.results.gltf import write_glb

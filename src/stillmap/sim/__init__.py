@@ -1,6 +1,6 @@
 """Simulated recordings of places with people, doors and vehicles, with the truth of each beam."""
 
-from stillmap.sim.appearance import compute_static_color
+from stillmap.sim.camera import compute_static_color
 from stillmap.sim.options import (
     CameraOptions,
     CrowdOptions,

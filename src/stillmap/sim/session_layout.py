@@ -9,7 +9,7 @@ import numpy as np
 import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
 
-from stillmap.sim.objects import place_faces
+from stillmap.sim.dynamics import place_faces
 from stillmap.sim.planner import Float, FreeSpace, compute_segment_distance
 from stillmap.sim.scene import Door, Scene, Segment, Stay, Thing
 from stillmap.sim.walls import box

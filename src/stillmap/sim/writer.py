@@ -19,11 +19,17 @@ from stillmap.io.carmen import writer
 from stillmap.io.images import write_png
 from stillmap.io.registry import RIG_FOLDERS
 from stillmap.io.trajectory import write_tum
-from stillmap.sim import session_truth, truth
+from stillmap.sim import truth
 from stillmap.sim.camera import CameraSimulator
 from stillmap.sim.scene import Scene
-from stillmap.sim.session_truth import compute_overlap, list_changes, observe
-from stillmap.sim.sessions import SessionPlan, simulate_sessions
+from stillmap.sim.sessions import (
+    SESSIONS_FILE,
+    SessionPlan,
+    compute_overlap,
+    list_changes,
+    observe,
+    simulate_sessions,
+)
 from stillmap.sim.simulator import RigSimulation, Simulation
 from stillmap.sim.truth import ImageTruth, Truth, image_files
 
@@ -132,7 +138,7 @@ def write_sessions(
             "overlap": np.round(compute_overlap(sights, places), 4).tolist(),
         }
         text = json.dumps(tree, indent=1) + "\n"
-        (work / session_truth.FILE).write_text(text, encoding="utf-8")
+        (work / SESSIONS_FILE).write_text(text, encoding="utf-8")
     return counts
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.arrays import sample_indices
-from stillmap.mesh.texture.atlas import GRAY
+from stillmap.mesh.texture import GRAY
 from stillmap.results import gltf
 from stillmap.results.colors import (
     BACKGROUND,

@@ -1,23 +1,20 @@
 """Colours of points on what moves: one board that is carried before a camera."""
 
-import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from stillmap.core.camera import Camera, Images
-from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.mesh import point_colors
 from stillmap.mesh.inputs import MeshInputs
-from stillmap.mesh.objects.segmentation import DynamicReturns
 from stillmap.mesh.place import Background, ViewAssignment
 from stillmap.mesh.point_colors import TrackedReturns, color_moving
-from stillmap.mesh.texture.atlas import GRAY
-from stillmap.mesh.texture.views import View, read_color_image
+from stillmap.mesh.segmentation import DynamicReturns
+from stillmap.mesh.texture import GRAY
 from stillmap.mesh.tracked_boxes import TrackedBox
 from stillmap.mesh.triangle_mesh import Mesh
+from stillmap.mesh.views import View, read_color_image
 from stillmap.tracking.boxes import Box
 
 SPEED, AHEAD = 2.0, 3.0  # m/s to the right, along x; m from the camera, along y
@@ -84,9 +81,7 @@ def tint(moving, views, load=columns, place=NOTHING):
     n = moving.inputs.recording.n_beams
     out, late = np.full((n, 3), GRAY[0], np.uint8), np.full(n, np.inf, np.float32)
     images, none = pictures(load), np.full(len(place), -1)
-    still = ViewAssignment(
-        place, none, np.zeros(len(place), np.float32), none < 0, none, none * 0.0
-    )
+    still = ViewAssignment(place, none, np.zeros(len(place), np.float32), none < 0)
     ahead = Background(still, views, lambda one: read_color_image(images, one))
     for number in range(len(views)):
         color_moving(out, late, moving, number, ahead)
@@ -106,20 +101,6 @@ def test_points_are_looked_up_where_the_thing_has_gone_to():
         needed = 0.02 + 0.1 * SPEED * (0.3 - time)
         assert inside[has].min() > needed - 0.04
         assert has[inside > needed + 0.04].all()
-
-
-def test_the_nearest_in_time_counts_whatever_the_order():
-    views = [view(1, -0.2), view(2, 0.04), view(3, 0.07), view(4, 0.4)]
-    for order in (views, views[::-1]):
-        colours, _ = tint(board_seen(), order)
-        assert set(colours[0, INNER, 1].tolist()) == {40}
-        assert set(colours[1, INNER, 1].tolist()) == {60}
-
-
-def test_pictures_long_before_or_after_do_not_count(monkeypatch):
-    assert (tint(board_seen(), [view(1, 0.61), view(2, -0.51)])[0] == GRAY).all()
-    monkeypatch.setattr(point_colors, "IMAGE_WINDOW", 0.7)
-    assert (tint(board_seen(), [view(1, 0.61)])[0] != GRAY).any()
 
 
 def wall(y: float) -> Mesh:
@@ -145,36 +126,3 @@ def test_another_thing_hides_what_is_behind_it():
     assert (alone[0, INNER] != GRAY).any()
     far, _ = tint(board_seen(thing(8, 0.0, 4.5, (0.05, 0.05), 0.0)), [view(1, 0.0)])
     np.testing.assert_array_equal(far, alone)
-
-
-def test_what_is_of_no_track_and_what_stands_still_are_left_alone():
-    moving = board_seen()
-    moving.inputs.p_static[:100] = 0.9
-    moving.inputs.objects[0].beams = np.arange(200, 2 * len(BOARD))
-    again = TrackedReturns.collect(DynamicReturns.collect(moving.inputs))
-    colours, _ = tint(again, [view(1, 0.05)])
-    assert (colours[0, :200] == GRAY).all()
-    assert (colours[0, 200:] != GRAY).any()
-
-
-def test_a_damaged_picture_colours_nothing_and_another_one_takes_its_place():
-    def load(image):
-        if image == 2:
-            raise InputError("is damaged", where="2.png")
-        return columns(image)
-
-    colours, _ = tint(board_seen(), [view(1, 0.2), view(2, 0.0)], load)
-    assert set(colours[0, INNER, 1].tolist()) == {20}
-
-
-def test_a_picture_in_which_nothing_is_seen_is_not_read():
-    def load(image):
-        raise AssertionError(f"{image} is read")
-
-    away = dataclasses.replace(view(1, 0.0), T_camera_map=np.diag([1.0, -1, -1, 1]) @ T_CAMERA_MAP)
-    assert (tint(board_seen(), [away, view(2, 5.0)], load)[0] == GRAY).all()
-
-
-def test_grey_pictures_give_a_grey_that_is_none_of_no_colour():
-    colours, _ = tint(board_seen(), [view(1, 0.0)], lambda _: np.full((240, 320, 3), 128, np.uint8))
-    assert (colours[0, INNER] == (128, 128, 127)).all()

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from stillmap.mesh.objects import merging
-from stillmap.mesh.objects.merging import PairCounts, ScanClusters, count_pairs, group_tracks
+from stillmap.mesh.merging import PairCounts, group_tracks
 
 
 def _pairs(*rows: tuple[int, int, int, int]) -> PairCounts:
@@ -15,26 +14,6 @@ def _wholes(pairs: PairCounts, n: int, may: list[bool] | None = None) -> list[li
     allowed = np.ones(len(pairs.connected), np.bool_) if may is None else np.array(may)
     whole = group_tracks(pairs, allowed, n)
     return [np.flatnonzero(whole == k).tolist() for k in np.unique(whole)]
-
-
-def test_pairs_are_counted_as_in_a_square_of_all(monkeypatch) -> None:
-    monkeypatch.setattr(merging, "_SCANS_PER_BLOCK", 3)
-    rng = np.random.default_rng(0)
-    for _ in range(50):
-        n, scans = int(rng.integers(1, 12)), []
-        met, both = np.zeros((n, n), np.intp), np.zeros((n, n), np.intp)
-        for _ in range(int(rng.integers(0, 20))):
-            there = np.flatnonzero(rng.random(n) < 0.6)
-            piece, beams = rng.integers(0, 3, len(there)), rng.integers(1, 50, len(there))
-            scans.append(ScanClusters(there, piece, beams))
-            fewer = np.minimum(beams[:, None], beams)
-            met[np.ix_(there, there)] += (piece[:, None] == piece) * fewer
-            both[np.ix_(there, there)] += fewer
-        pairs = count_pairs(scans, n)
-        ends = np.argwhere(np.triu(both > 0, 1))
-        np.testing.assert_array_equal(pairs.pairs, ends)
-        np.testing.assert_array_equal(pairs.connected, met[ends[:, 0], ends[:, 1]])
-        np.testing.assert_array_equal(pairs.observed, both[ends[:, 0], ends[:, 1]])
 
 
 def test_what_always_hangs_together_is_one_however_long_the_chain() -> None:
@@ -53,9 +32,3 @@ def test_wholes_are_weighed_against_each_other() -> None:
     assert _wholes(_pairs(*rows), 4) == [[0, 1], [2, 3]]
     rows[-1] = (0, 3, 0, 30)
     assert _wholes(_pairs(*rows), 4) == [[0, 1, 2, 3]]
-
-
-def test_those_that_may_not_are_joined_by_nobody() -> None:
-    pairs = _pairs((0, 1, 9, 9), (0, 2, 9, 9))
-    assert _wholes(pairs, 3, [True, False]) == [[0, 1], [2]]
-    assert _wholes(_pairs(), 3) == [[0], [1], [2]]

@@ -1,36 +1,20 @@
 """`stillmap map` of small simulated recordings with pictures: models from start to end."""
 
 import dataclasses
-import errno
-import functools
 import json
 import shutil
-import sys
 
 import numpy as np
 import pytest
 import trimesh
 
-import stillmap
 from stillmap.cli.main import main
 from stillmap.core import se2
 from stillmap.core.camera import project
-from stillmap.core.errors import install_command
 from stillmap.io import stillmap_folder
-from stillmap.io.trajectory import poses_from_tum
-from stillmap.mesh.place import assign_views
 from stillmap.sim import load_image_truth
 
-pytestmark = pytest.mark.slow
-
 QUICK = ("--quiet", "--threads", "1", "--set", "em.max_iterations=1")
-MODELS = ("mesh.glb", "mesh_faces.npz", "objects/*.glb", "objects/*_faces.npz", "objects/????.json")
-
-
-def models_in(out):
-    """The bytes of all that is told of models."""
-    found = {p.name: p.read_bytes() for pattern in MODELS for p in sorted(out.glob(pattern))}
-    return found, record_of(out)
 
 
 def record_of(out):
@@ -55,19 +39,6 @@ def spoiled(out, recording):
         assert ((u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)).all()
         bad[mine] = truth.mask(image)[v, u] > 0
     return area[bad].sum() / area[faces["image"] >= 0].sum()
-
-
-@pytest.mark.slow
-def test_the_texture_shows_no_people_unless_beams_are_not_believed(
-    room, result, mapped, monkeypatch
-):
-    assert spoiled(result, room) < 0.03
-    without = functools.partial(assign_views, use_occlusion=False)
-    monkeypatch.setattr("stillmap.mesh.build.assign_views", without)
-    careless = mapped("careless")
-    assert spoiled(careless, room) > 0.1
-    assert record_of(careless)["area_painted"] == record_of(careless)["area_seen"]
-    assert record_of(result)["area_painted"] < record_of(result)["area_seen"]
 
 
 def test_the_model_opens_and_is_textured(result):
@@ -135,27 +106,6 @@ def test_movers_have_models_where_they_were(result):
         assert faces["T_camera_object"].shape[1:] == (4, 4)
 
 
-@pytest.mark.slow
-def test_threads_and_another_time_change_no_bit(result, mapped):
-    assert models_in(mapped("again", "--threads", "2")) == models_in(result)
-
-
-@pytest.mark.slow
-def test_the_same_from_python(room, result, tmp_path):
-    recording = stillmap.read(room)
-    poses = poses_from_tum(room / "truth/trajectory.tum", recording)
-    record = json.loads((result / "run.json").read_text())
-    changed = stillmap.Options(threads=1)
-    found = stillmap.build(recording, changed, poses=poses)
-    assert len(found.iterations) == len(record["iterations"])
-    models = stillmap.build_models(found)
-    assert isinstance(models, stillmap.Models)
-    found.save(tmp_path / "out", models=models)
-    assert models_in(tmp_path / "out") == models_in(result)
-    found.save(tmp_path / "without")
-    assert not list(tmp_path.glob("without/**/*.glb"))
-
-
 def test_without_pictures_the_surface_is_grey_and_lit(room, result, mapped, tmp_path):
     bare = tmp_path / "bare"
     stillmap_folder.write(dataclasses.replace(stillmap_folder.read(room), images=None), bare)
@@ -201,19 +151,6 @@ def test_damaged_pictures_are_told_of_and_others_paint_in_their_place(
     assert (colours[:, :3] == 128).all(axis=1).mean() < 0.01
 
 
-def test_without_the_libraries_all_the_rest_is_written(mapped, monkeypatch):
-    monkeypatch.setitem(sys.modules, "pyfqmr", None)  # importing it fails
-    out = mapped("poor")
-    record = json.loads((out / "run.json").read_text())
-    assert "models" not in record
-    said = [one for one in record["warnings"] if one.startswith("no models: ")]
-    assert len(said) == 1
-    assert "needs pyfqmr" in said[0]
-    assert install_command("mesh") in said[0]
-    assert (out / "static.ply").exists()
-    assert not list(out.glob("**/*.glb"))
-
-
 def test_without_pictures_there_are_models_by_request_alone(room, tmp_path, capsys):
     bare = tmp_path / "bare"
     stillmap_folder.write(dataclasses.replace(stillmap_folder.read(room), images=None), bare)
@@ -230,38 +167,6 @@ def test_without_pictures_there_are_models_by_request_alone(room, tmp_path, caps
     assert not any("models" in one for one in record["warnings"])
 
 
-def test_a_region_limits_clouds_and_models(room, result, mapped, tmp_path):
-    region = (-1.0, -2.0, 2.0, 1.0)
-    low, high = np.array(region[:2]), np.array(region[2:])
-    out = mapped("region", "--region", *region)
-    for name in ("static.ply", "dynamic.ply"):
-        points, whole = (trimesh.load(one / name).vertices for one in (out, result))
-        inside = ((whole[:, :2] >= low) & (whole[:, :2] <= high)).all(axis=1)
-        assert 0 < inside.sum() < len(whole)
-        np.testing.assert_array_equal(points, whole[inside])
-    faces, of_all = (np.load(one / "mesh_faces.npz") for one in (out, result))
-    centers = faces["vertices"][faces["faces"]].mean(axis=1)[:, :2]
-    assert ((centers >= low) & (centers <= high)).all()
-    assert 0 < len(faces["faces"]) < len(of_all["faces"])
-    # the rest of the place hides what it hid: each face is painted from the same picture
-    part, whole = ((f["vertices"][f["faces"]].mean(axis=1), f["image"]) for f in (faces, of_all))
-    same = {tuple(place): image for place, image in zip(*whole, strict=True)}
-    assert [same[tuple(place)] for place in part[0]] == part[1].tolist()
-    assert spoiled(out, room) < 0.03
-    cloud = tmp_path / "cloud.ply"
-    assert main(["convert", str(out), "-o", str(cloud), "--quiet"]) == 0
-    count = sum(len(trimesh.load(out / f"{name}.ply").vertices) for name in ("static", "dynamic"))
-    assert len(trimesh.load(cloud).vertices) == count
-
-
-@pytest.mark.parametrize("words", [("--no-mesh",), ("--set", "mesh.enabled=false")])
-def test_none_where_they_are_not_wanted(mapped, words):
-    out = mapped(f"unwanted{len(words)}", *words)
-    assert not list(out.glob("**/*.glb"))
-    assert not (out / "mesh_faces.npz").exists()
-    assert "models" not in json.loads((out / "run.json").read_text())
-
-
 @pytest.mark.slow
 def test_a_laser_that_tilts_and_pictures_beside_it(rig, tmp_path):
     out = tmp_path / "out"
@@ -272,41 +177,3 @@ def test_a_laser_that_tilts_and_pictures_beside_it(rig, tmp_path):
     assert record["area_painted"] > 0.5 * record["area_seen"] > 5.0
     assert spoiled(out, rig / "tilting") < 0.03
     assert "page0" in trimesh.load(out / "mesh.glb").geometry
-    assert "The static surface" in (out / "report.html").read_text()
-
-
-def test_results_in_the_plane_have_none(rig, tmp_path):
-    out = tmp_path / "out"
-    assert main(["map", str(rig / "horizontal"), "-o", str(out), *QUICK]) == 0
-    assert not list(out.glob("**/*.glb"))
-    assert "models" not in json.loads((out / "run.json").read_text())
-    flat = stillmap.build(stillmap.read(rig / "horizontal"), stillmap.Options(threads=1))
-    with pytest.raises(ValueError, match="in 3D"):
-        stillmap.build_models(flat)
-
-
-def test_interrupted_on_full_disks_and_gone_on_with(room, result, tmp_path, monkeypatch, capsys):
-    truth = room / "truth/trajectory.tum"
-    out = tmp_path / "out"
-    words = [str(word) for word in ("map", room, "-o", out, "--poses", truth, *QUICK)]
-
-    def interrupted(*_, **__):
-        raise KeyboardInterrupt
-
-    def full(place, *_):
-        (place / "mesh.glb").write_bytes(b"half")
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr("stillmap.results.models.build_models", interrupted)
-        assert main(words) == 130
-    assert [path.name for path in tmp_path.iterdir()] == [".out.resume"]
-    with monkeypatch.context() as patch:
-        patch.setattr("stillmap.results.models.write_models", full)
-        assert main([*words, "--resume"]) == 2
-    assert "No space left" in capsys.readouterr().err
-    assert [path.name for path in tmp_path.iterdir()] == [".out.resume"]
-    assert not list(tmp_path.glob("**/mesh.glb"))
-    assert main([*words, "--resume"]) == 0
-    assert [path.name for path in tmp_path.iterdir()] == ["out"]
-    assert models_in(out) == models_in(result)

@@ -1,17 +1,16 @@
 """Whether what was followed moved."""
 
 import dataclasses
-import functools
 
 import numpy as np
 import pytest
 from made_up_street import Car, Part, street
 
+from stillmap.mesh import reconstruction
 from stillmap.mesh.inputs import MeshInputs
-from stillmap.mesh.objects import reconstruction
-from stillmap.mesh.objects.merging import collect_tracks
-from stillmap.mesh.objects.reconstruction import ObjectShape, mean_p_dynamic, reconstruct_object
-from stillmap.mesh.objects.segmentation import DynamicReturns
+from stillmap.mesh.merging import collect_tracks
+from stillmap.mesh.reconstruction import ObjectShape, mean_p_dynamic, reconstruct_object
+from stillmap.mesh.segmentation import DynamicReturns
 from stillmap.mesh.tracked_boxes import ObjectFrame
 from stillmap.mesh.triangle_mesh import Mesh
 
@@ -44,20 +43,6 @@ def test_a_part_of_what_stands_still_has_none(monkeypatch: pytest.MonkeyPatch) -
     assert _shape(sources) is None
     monkeypatch.setattr(reconstruction, "_MIN_P_DYNAMIC", 0.05)
     assert _shape(sources) is not None
-
-
-def test_static_things_farther_away_do_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
-    beside = Car((8.0, 1.5), (0.0, 0.0), (0.6, 0.4, 1.5))
-    sources = street([STANDS, beside], [Part(0)])
-    every = np.arange(sources.deskewed.n_beams)
-    met = np.abs(sources.deskewed.end_points(every, sources.poses)[:, 1] - 1.5) < 0.25
-    p_static = np.where(met, np.float32(0.95), sources.p_static)
-    sources = dataclasses.replace(sources, p_static=p_static)
-    assert _shape(sources) is not None
-    monkeypatch.setattr(reconstruction, "_MIN_P_DYNAMIC", 0.9)
-    wide = functools.partial(mean_p_dynamic, max_distance=1.0)
-    monkeypatch.setattr(reconstruction, "mean_p_dynamic", wide)
-    assert _shape(sources) is None
 
 
 def _face(height: float) -> tuple[MeshInputs, Mesh, ObjectFrame]:
@@ -95,29 +80,6 @@ def test_the_mean_is_that_of_beams_near_the_surface(reach: float) -> None:
     assert found > 0.7499
 
 
-def test_other_times_do_not_count() -> None:
-    sources, mesh, way = _face(0.9)
-    later = np.arange(sources.deskewed.n_beams) >= sources.deskewed.offset[3]
-    sources = _set(sources, later, 1.0)
-    assert mean_p_dynamic(mesh, way, (0.0, 0.25), sources, 0.2) == 1.0
-    assert mean_p_dynamic(mesh, way, (0.35, 0.65), sources, 0.2) == 0.0
-    assert mean_p_dynamic(mesh, way, (0.15, 0.35), sources, 0.2) == pytest.approx(0.5)
-
-
-def test_what_goes_on_leaves_what_it_passed_behind() -> None:
-    goes = Car((8.0, -2.0), (0.0, 10.0), (0.6, 1.0, 1.5))
-    wall = Car((9.0, -2.0), (0.0, 0.0), (0.6, 1.0, 1.5))
-    sources = street([goes, wall], [Part(0), Part(1)], scans=6)
-    x = _local(sources, ObjectFrame.from_track(sources.boxes[1]))[:, 0]
-    sources = _set(sources, np.abs(x + 0.3) < 0.05, 1.0)
-    way = ObjectFrame.from_track(sources.boxes[0])
-    corners = np.array([[-0.3, -0.4, 0.2], [-0.3, 0.4, 0.2], [-0.3, 0.4, 1.2]])
-    mesh = Mesh(corners, np.array([[0, 2, 1]], np.int32))
-    standing = way._replace(box=way.box._replace(box=sources.boxes[1].box))
-    assert mean_p_dynamic(mesh, way, (0.15, 0.45), sources, 0.2) == 1.0
-    assert mean_p_dynamic(mesh, standing, (0.15, 0.45), sources, 0.2) < 0.5
-
-
 def test_the_ground_does_not_count() -> None:
     sources, mesh, way = _face(0.9)
     low = _local(sources, way)[:, 2] < 0.1
@@ -125,11 +87,3 @@ def test_the_ground_does_not_count() -> None:
     assert mean_p_dynamic(mesh, way, (0.0, 0.05), _set(sources, low, 1.0), 0.2) == 1.0
     _, flat, _ = _face(0.04)
     assert np.isnan(mean_p_dynamic(flat, way, (0.0, 0.05), sources, 0.05))
-
-
-def test_flat_objects_on_the_ground_have_no_model(monkeypatch: pytest.MonkeyPatch) -> None:
-    low = Car((8.0, 0.0), (0.0, 0.0), (0.6, 2.0, 0.09))
-    sources = street([low], [Part(0)], rows=200)
-    monkeypatch.setattr(reconstruction, "_MIN_HEIGHT", 0.0)
-    monkeypatch.setattr(reconstruction, "_MIN_AREA", 0.0)
-    assert _shape(sources) is None

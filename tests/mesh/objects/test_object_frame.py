@@ -20,14 +20,6 @@ def _way() -> ObjectFrame:
     return ObjectFrame(thing, np.array([0.0, 2.0]), np.array([[0.0, 0.0, 0.0], [0.2, -0.4, 0.1]]))
 
 
-def test_without_offsets_the_frame_is_that_of_the_track() -> None:
-    way = ObjectFrame.from_track(_way().box)
-    T = way.T_map_object(1.5)
-    np.testing.assert_allclose(T[:3, 3], [2.0, 1.0, 0.2])
-    np.testing.assert_allclose(T[:3, 0], [0.0, 1.0, 0.0], atol=1e-12)
-    np.testing.assert_allclose(T[:3, 2], [0.0, 0.0, 1.0], atol=1e-12)
-
-
 def test_points_go_there_and_back() -> None:
     way, rng = _way(), np.random.default_rng(0)
     points = rng.normal(size=(20, 3))
@@ -36,15 +28,6 @@ def test_points_go_there_and_back() -> None:
         local = way.to_object(np.full(20, seconds), points)
         np.testing.assert_allclose(local @ T[:3, :3].T + T[:3, 3], points, atol=1e-9)
         np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-9)
-
-
-def test_each_point_goes_by_its_own_time() -> None:
-    way = _way()
-    points = np.array([[0.4, 0.3, 1.0], [2.0, 1.9, 0.5]])
-    both = way.to_object(np.array([0.2, 1.9]), points)
-    for k, seconds in enumerate((0.2, 1.9)):
-        alone = way.to_object(np.array([seconds]), points[k : k + 1])
-        np.testing.assert_allclose(both[k], alone[0])
 
 
 def test_offsets_are_those_of_the_frame() -> None:

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from made_up_street import Car, Part, by_several, street
+from made_up_street import Car, Part, street
 
+from stillmap.mesh import reconstruction
 from stillmap.mesh.inputs import MeshInputs
-from stillmap.mesh.objects import reconstruction, registration
-from stillmap.mesh.objects.merging import collect_tracks, merge_tracks
-from stillmap.mesh.objects.reconstruction import ObjectShape, reconstruct_object, straighten_track
-from stillmap.mesh.objects.registration import (
+from stillmap.mesh.merging import collect_tracks, merge_tracks
+from stillmap.mesh.reconstruction import ObjectShape, reconstruct_object
+from stillmap.mesh.registration import (
     PartialScan,
     PartialSurface,
     motion_transform,
@@ -16,8 +16,7 @@ from stillmap.mesh.objects.registration import (
     surface_distance,
     triangulate_partial_scan,
 )
-from stillmap.mesh.objects.segmentation import DynamicReturns
-from stillmap.mesh.objects.sweep_surface import ObjectBeams
+from stillmap.mesh.segmentation import DynamicReturns, ObjectBeams
 from stillmap.mesh.triangle_mesh import Mesh
 
 LATER = (-0.4, -0.2, 0.0, 0.2, 0.4)
@@ -100,25 +99,6 @@ def test_where_nothing_tells_the_track_counts() -> None:
     assert motion[1] == pytest.approx(-0.2, abs=0.03)
 
 
-def test_few_points_say_nothing() -> None:
-    rng = np.random.default_rng(5)
-    few = Mesh(rng.normal(size=(5, 3)), np.array([[0, 1, 2], [2, 3, 4]], np.int32))
-    sweeps = [PartialSurface.from_mesh(few, np.zeros(3), later) for later in (-0.1, 0.0)]
-    np.testing.assert_array_equal(register_surfaces(sweeps, 1), 0.0)
-    assert np.isnan(surface_distance(sweeps[0], sweeps[1]))
-    nothing = Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
-    assert np.isnan(
-        surface_distance(sweeps[0], PartialSurface.from_mesh(nothing, np.zeros(3), 0.0))
-    )
-
-
-def test_a_patch_knows_how_far_away_its_planes_are() -> None:
-    patch = _seen(np.random.default_rng(6), np.zeros(6))[2].to_patch()
-    rear = np.flatnonzero(patch.points[:, 0] < -1.9)
-    assert np.median(patch.standoff[rear]) == pytest.approx(6.0, abs=0.2)
-    np.testing.assert_array_equal(patch.origin, np.tile([-8.0, 6.0, 1.0], (len(patch.points), 1)))
-
-
 CAR = Car((7.0, -3.5), (5.0, 0.0))
 WRONG = Part(0, drift=(0.6, 0.2))
 
@@ -156,29 +136,6 @@ def test_several_looks_are_better_than_one(monkeypatch: pytest.MonkeyPatch) -> N
     np.testing.assert_allclose((T[1] - T[0])[:2] / 0.4, CAR.velocity, atol=0.25)
 
 
-def test_looks_that_do_not_lie_over_each_other_leave_the_best_one(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    sources = street([CAR], [WRONG], scans=9, noise=0.03)
-    monkeypatch.setattr(reconstruction, "_MAX_VIEW_OFFSET", 0.001)
-    shape = _shape(sources)
-    assert not shape.rigid
-
-
-def test_people_are_seen_at_once() -> None:
-    person = Car((5.0, 0.0), (1.0, 0.3), (0.4, 0.5, 1.7))
-    assert not _shape(street([person], [Part(0)])).rigid
-
-
-def test_going_on_evenly() -> None:
-    thing = street([CAR], [WRONG]).boxes[0]
-    even = straighten_track(thing, 0.25, 0.5)
-    at = np.array([0.0, 0.25, 0.7])
-    np.testing.assert_allclose(even.box.center_at(at), thing.box.center_at(at), atol=1e-9)
-    np.testing.assert_array_equal(even.box.heading[0], thing.box.heading[2])
-    assert even.bottom.tolist() == [thing.bottom[2]] * 2
-
-
 def test_the_side_of_a_car_is_bridged_where_people_are_not() -> None:
     """A side at a flat angle: beams lie 0.1 m apart across, and more than 0.6 m along."""
     turn, rise = (a.ravel() for a in np.meshgrid(np.arange(4) * 0.01, np.arange(-3, 4) * 0.01))
@@ -190,34 +147,3 @@ def test_the_side_of_a_car_is_bridged_where_people_are_not() -> None:
     assert len(triangulate_partial_scan(look, True, 3.0)) == 36
     assert len(triangulate_partial_scan(look, False, 3.0)) < 36
     assert len(triangulate_partial_scan(look, True, 0.3)) < 36
-
-
-def test_looks_of_several_lidars_follow_one_another() -> None:
-    # each sees one half of it, the second one earlier
-    sources = by_several(street([Car((14.0, 0.0), (-6.0, 0.0))], [Part(0)], noise=0.01), 2)
-    shape = _shape(sources)
-    assert shape.rigid
-    assert len(shape.frame.seconds) > 8
-    assert (np.diff(shape.frame.seconds) >= 0.0).all()
-
-
-@pytest.mark.parametrize(
-    ("constants", "any_model"),
-    [
-        ({}, True),
-        ({"_MIN_AREA": 0.0, "MIN_COMPONENT_AREA": 1000.0}, False),  # no surface
-        ({"_MIN_AREA": 50.0}, False),
-        ({"_MIN_HEIGHT": 0.8}, True),
-        ({"_MIN_HEIGHT": 2.0}, False),  # a car is not so high
-    ],
-)
-def test_without_enough_of_a_surface_there_is_no_model(
-    constants: dict[str, float], any_model: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for module in (reconstruction, registration):
-        for name in constants.keys() & vars(module).keys():
-            monkeypatch.setattr(module, name, constants[name])
-    sources = street([Car((8.0, -2.0), (6.0, 0.0))], [Part(0)])
-    moves = DynamicReturns.collect(sources)
-    (whole,) = merge_tracks(collect_tracks(moves), moves)
-    assert (reconstruct_object(whole, moves, [np.zeros(0)]) is not None) == any_model

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from made_up_rooms import looking, rectangle
 
-from stillmap.mesh.objects import texturing
-from stillmap.mesh.objects.reconstruction import ObjectShape
-from stillmap.mesh.objects.texturing import assign_object_views, times_in_view
+from stillmap.mesh import texturing
 from stillmap.mesh.place import Background, ViewAssignment
+from stillmap.mesh.reconstruction import ObjectShape
+from stillmap.mesh.texturing import assign_object_views
 from stillmap.mesh.tracked_boxes import ObjectFrame, TrackedBox
 from stillmap.mesh.triangle_mesh import concatenate_meshes
 from stillmap.tracking.boxes import Box
@@ -51,7 +51,7 @@ def place_of(mesh=WALL, painter=1):
     n = len(mesh)
     of_all = np.full(n, painter, np.int32)
     p = np.ones(n, np.float32)
-    return ViewAssignment(mesh, of_all, p, np.ones(n, np.bool_), of_all, p)
+    return ViewAssignment(mesh, of_all, p, np.ones(n, np.bool_))
 
 
 def pictures(gap=0.0, there=(0,), shift=0.0):
@@ -95,13 +95,6 @@ def test_a_thing_is_painted_by_what_shows_it():
     )
 
 
-def test_what_lies_at_its_outline_is_not(monkeypatch):
-    monkeypatch.setattr(texturing, "_OUTLINE_INSET", 0.1)
-    x, z = painted_at(dress([view(0, 0.0), view(1, 30.0)])).T
-    assert 0.1 < np.abs(x).max() < 0.15
-    assert 0.1 < z.min() < z.max() < 0.9
-
-
 def test_and_more_of_it_the_farther_it_went(monkeypatch):
     monkeypatch.setattr(texturing, "_OUTLINE_INSET", 0.05)
     monkeypatch.setattr(texturing, "OUTLINE_DRIFT", 0.25)
@@ -122,54 +115,6 @@ def test_what_looks_like_the_place_behind_is_not_painted(monkeypatch):
     assert area_painted(found) == pytest.approx(0.5)
 
 
-def test_a_view_in_which_much_of_it_looks_like_the_place_behind_shows_it_elsewhere():
-    views = [view(0, 0.0), view(1, 30.0)]
-    assert area_painted(dress(views, colours=pictures(shift=0.15))) == 0.0
-    assert area_painted(dress(views, colours=pictures(gap=0.1))) == 0.0
-
-
-def test_the_place_behind_is_compared_where_it_is_seen_from_elsewhere():
-    """The wall has another colour right of x = 0.5 m; the other picture is taken from 1 m aside."""
-
-    def colours(one):
-        out, x = pictures()(one), 4.0 * (np.arange(400) - 199.5) / 300.0
-        wall = (x + (1.0 if one.image else 0.0) > 0.5)[None] & (out == WALLS).all(axis=2)
-        out[wall] = (20, 60, 90)
-        return out
-
-    views = [view(0, 0.0), view(1, 30.0, place=(1.0, 0.0, 0.0))]
-    ahead = Background(place_of(), views, colours)
-    on_wall = np.array([[-1.0, 4.0, 0.3], [0.4, 4.0, 1.2], [0.7, 4.0, -0.9], [1.5, 4.0, 0.5]])
-    np.testing.assert_allclose(ahead.color_difference(0, 0.6 * on_wall), 0.0, atol=1e-3)
-    expected = np.linalg.norm(np.subtract(WALLS, CLOTHES))
-    np.testing.assert_allclose(
-        ahead.color_difference(0, np.array([[0.1, 2.0, 0.2]])), expected, rtol=1e-5
-    )
-
-
-@pytest.mark.parametrize("why", ["grey", "by the same picture", "damaged", "nothing is there"])
-def test_where_nobody_knows_what_is_behind_it_lies_farther_within(why, monkeypatch):
-    views, place, colours = [view(0, 0.0), view(1, 30.0)], place_of(), pictures()
-    if why == "grey":
-        place = place_of(painter=-1)
-    elif why == "by the same picture":
-        place = place_of(painter=0)
-    elif why == "damaged":
-        colours = lambda one: None if one.image else pictures()(one)  # noqa: E731
-    else:
-        place = place_of(rectangle([-8.0, 4.0, 2.0], [16.0, 0, 0], [0, 0, 1.0]))
-    monkeypatch.setattr(texturing, "_UNCERTAIN_INSET", 0.1)
-    found = dress(views, place, colours)
-    x, z = painted_at(found).T
-    assert 0.1 < np.abs(x).max() < 0.17
-    assert 0.08 < z.min() < z.max() < 0.92
-    monkeypatch.setattr(texturing, "_UNCERTAIN_INSET", 10.0)
-    assert area_painted(dress(views, place, colours)) == 0.0
-    monkeypatch.setattr(texturing, "_MIN_BACKGROUND_DIFFERENCE", 0.0)
-    monkeypatch.setattr(texturing, "_UNCERTAIN_INSET", 0.0)
-    assert area_painted(dress(views, place, colours)) == pytest.approx(0.5)
-
-
 @pytest.mark.parametrize(("right", "painted"), [(-0.1, 0.45), (0.0, 0.0)], ids=["little", "half"])
 def test_what_the_place_hides_is_not_painted(right, painted):
     """Nor what is beside it, where that is little."""
@@ -179,43 +124,9 @@ def test_what_the_place_hides_is_not_painted(right, painted):
     assert area_painted(found) == pytest.approx(painted, abs=0.03)
 
 
-def test_nor_is_what_another_thing_may_hide():
-    other = thing(id=4, y=1.0)
-    assert area_painted(dress([view(0, 0.0), view(1, 30.0)], others=[other])) == 0.0
-    behind = thing(id=4, y=3.5)
-    found = dress([view(0, 0.0), view(1, 30.0)], others=[behind])
-    assert area_painted(found) == pytest.approx(0.5)
-
-
 def test_pictures_taken_too_late_do_not_paint(monkeypatch):
     views = [view(0, 0.6), view(1, 30.0)]
     colours = pictures(shift=0.6)
     assert area_painted(dress(views, colours=colours)) == 0.0
     monkeypatch.setattr(texturing, "IMAGE_WINDOW", 0.7)
     assert area_painted(dress(views, colours=colours)) == pytest.approx(0.5)
-
-
-def test_of_two_as_sharp_the_one_nearer_in_time_paints():
-    views = [view(0, 0.3), view(1, 30.0), view(2, 0.1), view(3, -0.2)]
-
-    def colours(one):
-        return pictures(there=(0, 2, 3), shift=1e-9 * one.stamp_ns)(one)
-
-    found = dress(views, colours=colours)
-    used = np.unique(found.assignment.view[found.assignment.view >= 0])
-    assert [found.views[k].image for k in used] == [2]
-
-
-def test_scraps_are_no_picture_of_it(monkeypatch):
-    monkeypatch.setattr(texturing, "_OUTLINE_INSET", 0.15)
-    assert area_painted(dress([view(0, 0.0), view(1, 30.0)])) == pytest.approx(0.14, rel=0.3)
-    monkeypatch.setattr(texturing, "_OUTLINE_INSET", 0.24)
-    assert area_painted(dress([view(0, 0.0), view(1, 30.0)])) == 0.0  # 2 %
-
-
-def test_when_it_is_in_view():
-    # at x = 2.5 m it is beyond the edge, 2 m ahead
-    views = [view(0, 0.0), view(1, 1.0), view(2, 2.5), view(3, 30.0), view(4, -0.4)]
-    np.testing.assert_allclose(
-        times_in_view(thing(), views, 0), [0.0, 1.0, np.nan, np.nan, -0.4], atol=1e-9
-    )

@@ -7,8 +7,8 @@ from made_up_rooms import looking, rectangle
 from stillmap.core.recording import Recording
 from stillmap.mesh.inputs import LidarReturns, MeshInputs
 from stillmap.mesh.place import _P_UNOBSERVED, p_unoccluded
-from stillmap.mesh.texture.view_selection import MIN_P_VISIBLE
 from stillmap.mesh.tracked_boxes import TrackedBox
+from stillmap.mesh.view_selection import MIN_P_VISIBLE
 from stillmap.tracking.boxes import Box
 
 # 4 m ahead of a camera at the origin; faces of 0.2 m

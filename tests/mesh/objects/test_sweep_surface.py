@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stillmap.mesh.objects.sweep_surface import ObjectBeams, find_best_interval, triangulate_beams
+from stillmap.mesh.segmentation import ObjectBeams, triangulate_beams
 
 
 def _beams(hit_at: float, step: float, rows: int = 21) -> tuple[ObjectBeams, ObjectBeams]:
@@ -24,14 +24,6 @@ def test_a_board_is_a_surface_that_faces_the_sensor() -> None:
     assert (mesh.normals()[:, 0] < -0.9).all()
     width, height = np.ptp(own.points[:, 1]), np.ptp(own.points[:, 2])
     assert mesh.areas().sum() == pytest.approx(width * height, rel=0.05)
-
-
-def test_noise_along_the_line_of_sight_becomes_less() -> None:
-    own, others = _beams(3.0, 0.02)
-    noise = np.random.default_rng(0).normal(0.0, 0.02, len(own.points))
-    noisy = own._replace(points=own.points * (1.0 + noise / 3.0)[:, None])
-    mesh = triangulate_beams(noisy, others, 2.5, 0.6)
-    assert np.abs(mesh.vertices[:, 0] - 3.0).mean() < 0.6 * np.abs(noise).mean()
 
 
 def test_there_is_no_surface_where_beams_passed() -> None:
@@ -59,12 +51,3 @@ def test_steps_and_few_beams_are_no_surface() -> None:
     line = ObjectBeams(own.points[:3], own.origin[:3])
     line.points[:] = np.outer([1.0, 1.1, 1.2], [3.0, 0.0, 0.1])
     assert len(triangulate_beams(line, others, 2.5, 0.6)) == 0
-
-
-def test_most_beams_count_and_a_picture_nearby() -> None:
-    seconds = np.concatenate([np.full(10, 1.0), np.full(30, 2.0), np.full(20, 3.0)])
-    look = np.repeat([4, 5, 9], [10, 30, 20])
-    none = np.zeros(0)
-    assert find_best_interval(seconds, look, 0.0, none) == (2.0, 2.0, 30.0)
-    assert find_best_interval(seconds, look, 0.0, np.array([3.0])) == (3.0, 3.0, 20.0)
-    assert find_best_interval(seconds, look, 1.0, none) == (2.0, 3.0, 50.0)

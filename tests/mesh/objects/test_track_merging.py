@@ -1,22 +1,20 @@
 """Which tracks are of one thing."""
 
 import dataclasses
-import tracemalloc
 
 import numpy as np
 from made_up_street import Car, Part, street
 
+from stillmap.mesh import merging
 from stillmap.mesh.inputs import MeshInputs
-from stillmap.mesh.objects import merging
-from stillmap.mesh.objects.merging import (
+from stillmap.mesh.merging import (
     MAJORITY,
-    cluster_points,
     collect_tracks,
     count_pairs,
     merge_tracks,
 )
-from stillmap.mesh.objects.reconstruction import reconstruct_object
-from stillmap.mesh.objects.segmentation import DynamicReturns
+from stillmap.mesh.reconstruction import reconstruct_object
+from stillmap.mesh.segmentation import DynamicReturns
 from stillmap.mesh.tracked_boxes import TrackedBox
 from stillmap.tracking.boxes import fit_box
 
@@ -72,12 +70,6 @@ def test_cars_that_pass_each_other_are_two() -> None:
     assert _wholes(street(passing, [Part(0), Part(1)])) == [[0], [1]]
 
 
-def test_people_stay_alone() -> None:
-    size = (0.4, 0.4, 1.7)
-    pair = [Car((6.0, 0.0), (1.0, 0.0), size), Car((6.0, 0.7), (1.0, 0.0), size)]
-    assert _wholes(street(pair, [Part(0), Part(1)])) == [[0], [1]]
-
-
 def test_what_is_left_over_of_a_car_is_no_thing() -> None:
     stands = Part(0, 0.6, 0.8, (2, 6), drift=(-6.0, 0.0))
     assert _wholes(street([CAR], [Part(0, 0.0, 0.6), stands])) == [[0]]
@@ -96,28 +88,3 @@ def test_one_model_shows_all_of_a_car_that_was_followed_in_parts() -> None:
     rear = CAR.start[0] - 2.0 + 6.0 * shape.seconds
     assert there[:, 0].min() < rear + 0.1
     assert there[:, 0].max() > rear + 3.6
-
-
-def test_points_hang_together_as_far_as_beams_are_apart() -> None:
-    place = np.zeros(3)
-    for away, apart, together in ((5.0, 0.6, True), (5.0, 1.2, False), (45.0, 1.6, True)):
-        points = np.array([[away, 0.0, 0.0], [away, apart, 0.0]])
-        one, other = cluster_points(points, place, 0.5)
-        assert (one == other) == together
-    assert len(cluster_points(np.zeros((0, 3)), place, 0.5)) == 0
-
-
-def test_many_tracks_that_never_meet_need_no_room() -> None:
-    sources = street([CAR], [Part(0)])
-    moves = DynamicReturns.collect(sources)
-    (one,) = collect_tracks(moves)
-    far = [
-        one._replace(object=dataclasses.replace(one.object, id=k, beams=one.object.beams[:0]))
-        for k in range(1, 3000)
-    ]
-    tracemalloc.start()
-    found = merge_tracks([one, *far], moves)
-    _, most = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert len(found) == 3000
-    assert most < 10e6

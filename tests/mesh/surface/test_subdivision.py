@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from stillmap.mesh.simplification import subdivide
-from stillmap.mesh.triangle_mesh import Mesh
+from stillmap.mesh.triangle_mesh import Mesh, subdivide
 
 
 def _some(rng: np.random.Generator) -> Mesh:
@@ -36,20 +35,6 @@ def test_edges_become_short_and_the_surface_stays() -> None:
     np.testing.assert_allclose(np.bincount(of, fine.areas()), mesh.areas(), rtol=1e-9)
     np.testing.assert_allclose(fine.normals(), mesh.normals()[of], atol=1e-6)
     np.testing.assert_array_equal(fine.vertices[: len(mesh.vertices)], mesh.vertices)
-
-
-def test_there_are_no_gaps_between_the_parts() -> None:
-    mesh = _some(np.random.default_rng(4))
-    fine, _ = subdivide(mesh, 0.9)
-    assert len(fine) > len(mesh)
-    assert _has_no_gaps(fine)
-
-
-def test_what_is_short_stays_as_it_is() -> None:
-    mesh = _some(np.random.default_rng(5))
-    same, of = subdivide(mesh, 10.0)
-    np.testing.assert_array_equal(same.faces, mesh.faces)
-    np.testing.assert_array_equal(of, np.arange(len(mesh)))
 
 
 def test_edges_may_be_longer_in_some_places_without_gaps() -> None:

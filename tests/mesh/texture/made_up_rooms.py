@@ -7,9 +7,9 @@ import numpy as np
 from stillmap import _core
 from stillmap.core import camera as camera_module
 from stillmap.core.camera import Camera
-from stillmap.mesh.texture.views import View
-from stillmap.mesh.texture.visibility import find_visible_faces
 from stillmap.mesh.triangle_mesh import Mesh, concatenate_meshes
+from stillmap.mesh.views import View
+from stillmap.mesh.visibility import find_visible_faces
 
 K = np.array([[300.0, 0.0, 199.5], [0.0, 300.0, 149.5], [0.0, 0.0, 1.0]])
 

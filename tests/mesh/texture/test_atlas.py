@@ -7,9 +7,9 @@ from scipy import ndimage
 
 from stillmap import _core
 from stillmap.core import camera
-from stillmap.mesh.texture import atlas
-from stillmap.mesh.texture.atlas import build_layout, find_charts
-from stillmap.mesh.triangle_mesh import Mesh, concatenate_meshes
+from stillmap.mesh import texture
+from stillmap.mesh.texture import build_layout, find_charts
+from stillmap.mesh.triangle_mesh import concatenate_meshes
 
 pytest.importorskip("xatlas")
 
@@ -18,11 +18,6 @@ pytest.importorskip("xatlas")
 def room():
     mesh, views = furnished(), all_round()
     return mesh, views, sharpest(mesh, views)
-
-
-def areas(corners):
-    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    return 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 
 def in_picture(mesh, views, view_of_face, faces):
@@ -34,7 +29,7 @@ def in_picture(mesh, views, view_of_face, faces):
 
 
 def test_texels_are_pixels(room, monkeypatch):
-    monkeypatch.setattr(atlas, "_MIN_TEXEL", 1e-5)
+    monkeypatch.setattr(texture, "_MIN_TEXEL", 1e-5)
     mesh, views, view = room
     layout = build_layout(mesh, view, views)
     painted = np.flatnonzero(view >= 0)
@@ -66,8 +61,8 @@ def chart_of_texel(mesh, layout, page):
 @pytest.mark.parametrize("gutter", [2, 4])
 def test_charts_keep_apart(room, gutter, monkeypatch):
     mesh, views, view = room
-    monkeypatch.setattr(atlas, "GUTTER", gutter)
-    monkeypatch.setattr(atlas, "_MIN_TEXEL", 0.01)
+    monkeypatch.setattr(texture, "GUTTER", gutter)
+    monkeypatch.setattr(texture, "_MIN_TEXEL", 0.01)
     layout = build_layout(mesh, view, views, 512)
     charts = set()
     for page in range(len(layout.sizes)):
@@ -85,38 +80,6 @@ def test_charts_keep_apart(room, gutter, monkeypatch):
     assert len(charts) > 8
 
 
-def test_pages_are_as_many_as_needed_and_no_more_than_allowed(room, monkeypatch):
-    mesh, views, view = room
-    painted = view >= 0
-    before = None
-    for pages in (20, 3, 1):
-        monkeypatch.setattr(atlas, "_MAX_PAGES", pages)
-        monkeypatch.setattr(atlas, "_MIN_TEXEL", 1e-5)
-        layout = build_layout(mesh, view, views, 256)
-        assert 1 <= len(layout.sizes) <= pages
-        assert (layout.sizes <= 256).all()
-        uv = layout.uv[layout.faces[painted]]
-        assert (uv >= 0).all()
-        assert (uv <= layout.sizes[layout.page[painted], None]).all()
-        scale = layout.scale[painted].max()
-        assert before is None or scale < before
-        before = scale
-    monkeypatch.setattr(atlas, "_MAX_PAGES", 8)
-    assert len(build_layout(mesh, view, views).sizes) == 1
-
-
-def test_texels_are_no_finer_than_asked_for(room, monkeypatch):
-    monkeypatch.setattr(atlas, "_MIN_TEXEL", 0.02)
-    mesh, views, view = room
-    layout = build_layout(mesh, view, views)
-    painted = view >= 0
-    assert (layout.scale[painted] < 1.0).all()
-    chart = find_charts(mesh, view)
-    texels = np.bincount(chart[painted], areas(layout.uv[layout.faces[painted]]))
-    metres = np.bincount(chart[painted], mesh.areas()[painted])
-    np.testing.assert_allclose(np.sqrt(metres / texels), 0.02, rtol=1e-6)
-
-
 def test_faces_that_their_picture_does_not_show_are_grey():
     wall = rectangle([-1.0, 3.0, -1.0], [2, 0, 0], [0, 0, 2], 2)
     behind = rectangle([-1.0, -3.0, -1.0], [2, 0, 0], [0, 0, 2], 2)
@@ -128,35 +91,3 @@ def test_faces_that_their_picture_does_not_show_are_grey():
     assert (layout.page[len(wall) :] == -1).all()
     assert (layout.view[len(wall) :] == -1).all()
     np.testing.assert_array_equal(layout.vertex[layout.faces], mesh.faces)
-
-
-def test_pictures_from_one_place_and_charts_that_touch_stay_apart():
-    # alternating as on a chessboard: charts of one picture meet in corners, and where pictures
-    # from the same place meet, their pixels are the same
-    wall = rectangle([-1.0, 3.0, -1.0], [2, 0, 0], [0, 0, 2], 6)
-    square = np.tile(np.arange(36), 2)
-    view = ((square // 6 + square % 6) % 2).astype(np.int32)
-    views = [looking([0, 0, 0], [0, 1, 0], i) for i in range(2)]
-    layout = build_layout(wall, view, views)
-    assert len(np.unique(find_charts(wall, view))) == 36
-    assert (layout.page == 0).all()
-    assert len(layout.vertex) == 36 * 4
-    chart = chart_of_texel(wall, layout, 0)
-    covered = np.bincount(chart[chart >= 0], minlength=36)
-    np.testing.assert_allclose(covered, (300 / 9) ** 2, rtol=0.1)
-
-
-def test_no_faces_and_no_pictures():
-    nothing = Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
-    layout = build_layout(nothing, np.zeros(0, np.int32), [])
-    assert len(layout.faces) == len(layout.sizes) == 0
-    wall = rectangle([-1.0, 3.0, -1.0], [2, 0, 0], [0, 0, 2])
-    layout = build_layout(wall, np.full(2, -1, np.int32), [])
-    np.testing.assert_array_equal(layout.vertex[layout.faces], wall.faces)
-    assert len(layout.sizes) == 0
-
-
-def test_it_is_the_same_every_time(room):
-    mesh, views, view = room
-    one, two = (build_layout(mesh, view, views) for _ in range(2))
-    assert all(a.tobytes() == b.tobytes() for a, b in zip(one, two, strict=True))

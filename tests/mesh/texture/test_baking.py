@@ -2,16 +2,19 @@
 
 import numpy as np
 import pytest
-from made_up_rooms import all_round, camera, colour, furnished, looking, photograph, rectangle
+from made_up_rooms import all_round, camera, colour, furnished, photograph
 from made_up_rooms import sharpest as best_of
 from marks import slow_params
 
 from stillmap import _core
 from stillmap.core.errors import InputError
-from stillmap.mesh.texture import atlas
-from stillmap.mesh.texture.atlas import GRAY
-from stillmap.mesh.texture.baking import bake_texture, downsample, fill_gutters, sample_bilinear
-from stillmap.mesh.triangle_mesh import Mesh
+from stillmap.mesh import texture
+from stillmap.mesh.texture import (
+    GRAY,
+    bake_texture,
+    fill_gutters,
+    sample_bilinear,
+)
 
 pytest.importorskip("xatlas")
 SMALL = np.array([[200.0, 0, 139.5], [0, 200, 104.5], [0, 0, 1]])
@@ -50,7 +53,7 @@ def errors(textured):
 
 @pytest.mark.parametrize("kind", ["pinhole", "fisheye", *slow_params("barrel")])
 def test_every_texel_has_the_colour_of_its_place(kind, monkeypatch):
-    monkeypatch.setattr(atlas, "_MIN_TEXEL", 1e-5)
+    monkeypatch.setattr(texture, "_MIN_TEXEL", 1e-5)
     mesh, views = furnished(), all_round(camera(280, 210, SMALL, **LENSES[kind]))
     view = best_of(mesh, views)
     reads = []
@@ -68,34 +71,6 @@ def test_every_texel_has_the_colour_of_its_place(kind, monkeypatch):
     assert len(error) > 100_000
     assert np.median(error) < 1.0
     assert np.quantile(error, 0.99) < 4.0
-
-
-def test_coarse_texels_are_means_of_pixels(monkeypatch):
-    monkeypatch.setattr(atlas, "_MIN_TEXEL", 0.04)  # four pixels each
-    wall = rectangle([-1.0, 3.0, -1.0], [2, 0, 0], [0, 0, 2], 4)
-    views = [looking([0, 0, 0], [0, 1, 0])]
-    # columns, black and white: any single pixel is far from their mean
-    picture = np.zeros((300, 400, 3), np.uint8)
-    picture[:, ::2] = 200
-    textured = bake_texture(wall, np.zeros(32, np.int32), views, lambda _: picture)
-    face = face_of_texel(textured)
-    assert 2000 < np.sum(face >= 0) < 3000
-    np.testing.assert_allclose(textured.pages[0][face >= 0], 100, atol=1)
-
-
-def test_coarse_texels_lie_where_fine_ones_do(monkeypatch):
-    monkeypatch.setattr(atlas, "_MIN_TEXEL", 0.04)
-    wall = rectangle([-0.4, 3.0, -0.4], [0.8, 0, 0], [0, 0, 0.8], 4)
-    views = [looking([0, 0, 0], [0, 1, 0])]
-    ramp = np.clip((np.arange(400) - 149.5) * 2.5, 0, 255).round().astype(np.uint8)
-    picture = np.broadcast_to(ramp[None, :, None], (300, 400, 3))
-    textured = bake_texture(wall, np.zeros(32, np.int32), views, lambda _: picture)
-    face = face_of_texel(textured)
-    row, column = np.nonzero(face >= 0)
-    # 0.8 m are 80 pixels, and 20 texels
-    left = textured.uv[:, 0].min() * face.shape[1]
-    at = 199.5 - 40 + 4.0 * (column + 0.5 - left)
-    np.testing.assert_allclose(textured.pages[0][row, column, 0], (at - 149.5) * 2.5, atol=1.1)
 
 
 def test_a_picture_that_cannot_be_read_leaves_grey():
@@ -119,21 +94,6 @@ def test_a_picture_that_cannot_be_read_leaves_grey():
     assert np.median(errors(textured)) < 1.0
 
 
-def test_grey_pictures_have_three_colours():
-    wall = rectangle([-1.0, 3.0, -1.0], [2, 0, 0], [0, 0, 2])
-    views = [looking([0, 0, 0], [0, 1, 0])]
-    picture = np.full((300, 400), 77, np.uint8)
-    textured = bake_texture(wall, np.zeros(2, np.int32), views, lambda _: picture)
-    assert (textured.pages[0] == 77).all()
-
-
-def test_without_pictures_all_is_grey():
-    wall = rectangle([-1.0, 3.0, -1.0], [2, 0, 0], [0, 0, 2])
-    textured = bake_texture(wall, np.full(2, -1, np.int32), [], lambda _: None)
-    assert textured.pages == ()
-    assert (textured.page == -1).all()
-
-
 def test_gutters_have_the_colours_beside_them():
     page = np.zeros((20, 30, 3), np.uint8)
     page[5:9, 4:9], page[12:15, 20:28] = (200, 10, 30), (20, 240, 90)
@@ -152,18 +112,3 @@ def test_between_pixels():
     np.testing.assert_allclose(found, np.array([100, 50, 75, 200, 0])[:, None].repeat(3, axis=1))
     single = np.full((1, 1, 3), 9, np.uint8)
     assert (sample_bilinear(single, at) == 9).all()
-
-
-def test_halves_are_means_of_squares():
-    picture = np.arange(5 * 4 * 3).reshape(5, 4, 3).astype(np.uint8)
-    half = downsample(picture, 1)
-    assert half.shape == (3, 2, 3)
-    np.testing.assert_allclose(half[0, 0], picture[:2, :2].mean(axis=(0, 1)))
-    np.testing.assert_allclose(half[2, 1], picture[4, 2:4].mean(axis=0))
-    assert downsample(picture, 0).tolist() == picture.tolist()
-
-
-def test_nothing_to_paint_is_nothing_painted():
-    none = Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
-    model = bake_texture(none, np.zeros(0, np.int32), [], lambda _: np.zeros(0))
-    assert len(model) == len(model.pages) == len(model.unread) == 0

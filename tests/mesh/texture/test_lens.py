@@ -77,23 +77,6 @@ def test_pixels_are_those_of_opencv(model, distortion, expected):
     np.testing.assert_allclose(uv, expected, atol=1e-9)
 
 
-def test_a_pinhole_camera_divides_by_the_way_ahead():
-    uv, ok = camera_module.project(camera(), np.array([[1.0, -0.5, 2.0], [0.0, 0.0, 7.0]]))
-    np.testing.assert_array_equal(uv, [[570.5, 119.25], [320.5, 239.25]])
-    assert ok.all()
-
-
-def test_zeros_for_parameters_are_no_distortion_but_a_fisheye_stays_one():
-    plain, _ = camera_module.project(camera(), POINTS)
-    np.testing.assert_array_equal(
-        camera_module.project(camera("plumb_bob", [0.0] * 5), POINTS)[0], plain
-    )
-    fisheye, _ = camera_module.project(
-        camera("equidistant", [0.0] * 4), np.array([[1.0, 0.0, 1.0]])
-    )
-    np.testing.assert_allclose(fisheye, [[320.5 + 500.0 * np.pi / 4.0, 239.25]])
-
-
 @pytest.mark.parametrize("model", ["", "plumb_bob", "rational_polynomial", "equidistant"])
 def test_what_lies_behind_or_beside_is_not_seen(model):
     points = np.array(
@@ -102,20 +85,6 @@ def test_what_lies_behind_or_beside_is_not_seen(model):
     uv, ok = camera_module.project(camera(model), points)
     assert not ok.any()
     assert np.isnan(uv).all()
-
-
-def test_the_limit_of_one_coefficient_by_hand():
-    # r (1 - 0.3 r^2) rises up to r^2 = 1 / 0.9
-    folding = camera("plumb_bob", [-0.3, 0.0, 0.0, 0.0])
-    edge = np.sqrt(1.0 / 0.9)
-    _, ok = camera_module.project(
-        folding, np.array([[edge - 2e-3, 0.0, 1.0], [0.0, edge + 1e-6, 1.0]])
-    )
-    assert ok.tolist() == [True, False]
-    # the formula alone puts this one, 61 degrees from the axis, near the picture's centre
-    far = 1.8
-    assert abs(500.0 * far * (1.0 - 0.3 * far**2)) < 30.0
-    assert not camera_module.project(folding, np.array([[far, 0.0, 1.0]]))[1][0]
 
 
 @pytest.mark.parametrize(("model", "distortion"), FOLDING)
@@ -129,18 +98,6 @@ def test_no_two_directions_share_a_pixel(model, distortion):
     np.testing.assert_allclose(found[:, :2], points[ok][:, :2] / points[ok][:, 2:], atol=1e-4)
 
 
-@pytest.mark.parametrize(("model", "distortion"), FOLDING)
-def test_the_limit_is_no_narrower_than_needed(model, distortion):
-    # just outside of it, in some direction, a step out leads back in the picture
-    limit = camera_module._limit(camera_module._lens(camera(model, distortion)))
-    r, around = np.tan(limit + np.radians([0.1, 0.12])), np.linspace(0.0, 2.0 * np.pi, 64)
-    u = np.column_stack([np.cos(around), np.sin(around)])
-    a, b = (
-        camera_module._distort(camera_module._lens(camera(model, distortion)), one * u) for one in r
-    )
-    assert (np.sum((b - a) * u, axis=1) < 1e-6).any()
-
-
 @pytest.mark.parametrize(("model", "distortion", "_"), [*BY_OPENCV, ("", [], [])])
 def test_rays_lead_through_their_pixels(model, distortion, _):
     seen_by = camera(model, distortion)
@@ -151,34 +108,6 @@ def test_rays_lead_through_their_pixels(model, distortion, _):
     again, ok = camera_module.project(seen_by, 3.7 * directions)
     assert ok.all()
     np.testing.assert_allclose(again, uv, atol=1e-6)
-
-
-def test_pixels_beyond_the_fold_have_no_ray():
-    # the farthest that this lens shows is 2/3 sqrt(1/0.9) focal lengths from the centre
-    folding = camera("plumb_bob", [-0.3, 0.0, 0.0, 0.0])
-    reach = 500.0 * 2.0 / 3.0 * np.sqrt(1.0 / 0.9)
-    found = camera_module.unproject(
-        folding, np.array([[320.5 + reach - 1.0, 239.25], [321.5 + reach, 239.25]])
-    )
-    assert np.isfinite(found[0]).all()
-    assert np.isnan(found[1]).all()
-
-
-def test_a_skewed_sensor():
-    skewed = K.copy()
-    skewed[0, 1] = 5.0
-    one = Camera("c", 640, 480, skewed, "plumb_bob", np.array([-0.2, 0.01, 0.0, 0.0]), None)
-    uv, _ = camera_module.project(one, POINTS)
-    straight, _ = camera_module.project(camera("plumb_bob", [-0.2, 0.01, 0.0, 0.0]), POINTS)
-    np.testing.assert_allclose(uv[:, 0] - straight[:, 0], 5.0 * (straight[:, 1] - 239.25) / 480.0)
-    np.testing.assert_allclose(
-        camera_module.unproject(one, uv)[:, :2], POINTS[:, :2] / POINTS[:, 2:], atol=1e-9
-    )
-
-
-def test_a_picture_reaches_to_the_edges_of_its_outermost_pixels():
-    uv = np.array([[-0.5, 0.0], [639.49, 479.49], [639.5, 0.0], [0.0, -0.51], [np.nan, 0.0]])
-    assert camera_module.is_in_image(camera(), uv).tolist() == [True, True, False, False, False]
 
 
 @pytest.mark.parametrize(

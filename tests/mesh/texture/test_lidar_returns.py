@@ -89,17 +89,6 @@ def test_what_is_of_a_thing_goes_on_with_it() -> None:
     np.testing.assert_allclose(ends, [[4, 10, 0], [5.04, 10.08, 0], [6, 10, 0]], atol=1e-6)
 
 
-def test_beams_that_hit_nothing_say_nothing() -> None:
-    recording = _recording(None)
-    recording.hit[4] = False
-    ends, _ = near_time(_beams(recording), 100_000_000, 0.01)
-    np.testing.assert_allclose(ends[:, 0], [4.0, 6.0])
-
-
-def test_there_may_be_none() -> None:
-    assert len(near_time(_beams(_recording(None)), 9_000_000_000, 0.1)[0]) == 0
-
-
 def _row(p: list[float], planar: bool) -> LidarReturns:
     """Four rows, 0.1 s apart; beams 0, 3, 6, 9 are of a thing that goes 1 m/s along y."""
     box = Box(
@@ -124,16 +113,3 @@ def test_of_a_row_what_moves_is_told_longer_and_goes_on() -> None:
     np.testing.assert_allclose(ends[:, 0], [1.0, 4.0, 5.0, 6.0, 7.0])
     np.testing.assert_allclose(ends[:, 1], [0.1, 0.0, 0.0, 0.0, -0.1], atol=1e-6)
     np.testing.assert_allclose(p, [0.2, 0.3, 1.0, 1.0, 0.4])
-
-
-def test_what_rather_stands_still_is_not_carried() -> None:
-    windows = 0.01, 0.01, 0.15
-    ends, _ = near_time(_row([0.9, 0.3, 0.4, 0.1], planar=True), 100_000_000, *windows)
-    np.testing.assert_allclose(ends[:, 0], [4.0, 5.0, 6.0, 7.0])
-
-
-def test_rows_have_a_window_of_their_own() -> None:
-    windows = 0.01, 0.11, 0.0
-    assert len(near_time(_row([0.2] * 4, planar=True), 100_000_000, *windows)[0]) == 9
-    ends, _ = near_time(_row([0.2] * 4, planar=False), 100_000_000, *windows)
-    np.testing.assert_allclose(ends[:, 0], [4.0, 5.0, 6.0])

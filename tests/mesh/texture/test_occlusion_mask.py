@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from stillmap.core.camera import Camera
-from stillmap.mesh.texture import occlusion
-from stillmap.mesh.texture.occlusion import build_occlusion_mask
-from stillmap.mesh.texture.views import View
+from stillmap.mesh import visibility
+from stillmap.mesh.views import View
+from stillmap.mesh.visibility import build_occlusion_mask
 
 CAMERA = Camera(
     "eye",
@@ -23,7 +23,7 @@ AHEAD = View(0, 0, CAMERA, np.eye(4))
 
 @pytest.fixture(autouse=True)
 def wide_outlines(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(occlusion, "OUTLINE_MARGIN", 0.15)
+    monkeypatch.setattr(visibility, "OUTLINE_MARGIN", 0.15)
 
 
 def _shown(points: np.ndarray, p: np.ndarray, asked: np.ndarray) -> np.ndarray:
@@ -56,17 +56,3 @@ def test_beams_that_end_on_what_stands_still_speak_for_a_picture() -> None:
     got = _shown(wall, np.ones(4000), asked)
     assert got[0] > 0.99
     assert got[1] < 0.91
-
-
-def test_the_nearest_of_two_things_counts() -> None:
-    two = np.array([[0.0, 0, 8.0], [0.0, 0, 3.0], [0.0, 0, 6.0]])
-    found = build_occlusion_mask(AHEAD, two, np.array([0.1, 0.2, 0.3], np.float32))
-    at = tuple(int(x) for x in (240 / found.cell, 320 / found.cell))
-    assert found.depth[at] == 3.0
-    assert abs(found.dynamic[at] - 0.8) < 1e-6
-
-
-def test_what_is_behind_the_camera_says_nothing() -> None:
-    found = build_occlusion_mask(AHEAD, np.array([[0.0, 0, -3.0]]), np.zeros(1, np.float32))
-    assert np.isinf(found.depth).all()
-    assert not found.support.any()

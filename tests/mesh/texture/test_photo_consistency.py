@@ -3,7 +3,7 @@
 import numpy as np
 from made_up_rooms import looking, rectangle
 
-from stillmap.mesh.texture.view_selection import (
+from stillmap.mesh.view_selection import (
     Candidates,
     reject_inconsistent_views,
     sample_face_colors,
@@ -42,7 +42,3 @@ def test_of_two_nobody_knows():
 
 def test_where_most_do_not_agree_all_stay():
     assert left([10, 80, 150, 220]) == [0, 1, 2, 3]
-
-
-def test_damaged_pictures_say_nothing():
-    assert left([200, 100, None]) == [0, 1, 2]

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from stillmap.mesh.texture.atlas import GRAY, TexturedMesh
-from stillmap.mesh.texture.baking import TextureSampler, avoid_gray
+from stillmap.mesh.texture import TexturedMesh, TextureSampler
 
 ABOVE = np.array([0.5, 0.5, 9.0])
 
@@ -52,52 +51,3 @@ def test_what_is_too_far_off_or_seen_from_behind_has_none(gradient):
     assert has.tolist() == [True, False, True, False]
     _, has = painted.colors(points, from_above(points) * [1.0, 1.0, -1.0])
     assert not has.any()
-
-
-def test_the_side_that_was_seen_counts_though_the_other_one_is_nearer():
-    """A thin wall, painted green to one side and red to the other."""
-    red, green = (np.full((8, 8, 3), colour, np.uint8) for colour in ((200, 0, 0), (0, 200, 0)))
-    up, down = square(red, z=0.02), square(green)
-    whole = TexturedMesh(
-        np.concatenate([up.vertices, down.vertices]),
-        np.concatenate([up.faces, down.faces[:, ::-1] + np.int32(4)]),
-        np.concatenate([up.uv, down.uv]),
-        np.array([0, 0, 1, 1], np.int32),
-        (red, green),
-        np.zeros(4, np.int32),
-    )
-    points = np.array([[0.5, 0.3, 0.0], [0.5, 0.3, 0.02]])
-    painted = TextureSampler(whole, 0.05)
-    assert painted.colors(points, from_above(points))[0].tolist() == [[200, 0, 0]] * 2
-    below = from_above(points) * [1.0, 1.0, -1.0]
-    assert painted.colors(points, below)[0].tolist() == [[0, 200, 0]] * 2
-
-
-def test_grey_faces_give_no_colour_and_grey_texels_one_beside_grey():
-    grey = np.full((8, 8, 3), GRAY, np.uint8)
-    points = np.array([[0.5, 0.3, 0.0]])
-    colours, has = TextureSampler(square(grey), 0.05).colors(points, from_above(points))
-    assert has.all()
-    assert colours.tolist() == [[128, 128, 127]]
-    assert (
-        not TextureSampler(square(grey, view=-1), 0.05).colors(points, from_above(points))[1].any()
-    )
-    unread = square(grey)
-    unread.view[:] = -1  # its picture turned out to be damaged
-    assert not TextureSampler(unread, 0.05).colors(points, from_above(points))[1].any()
-    some = np.array([[128, 128, 128], [128, 128, 127], [0, 128, 128]], np.uint8)
-    assert avoid_gray(some).tolist() == [[128, 128, 127], [128, 128, 127], [0, 128, 128]]
-
-
-def test_nothing_is_not_painted():
-    none = np.zeros((0, 3))
-    empty = TexturedMesh(
-        none,
-        np.zeros((0, 3), np.int32),
-        np.zeros((0, 2)),
-        np.zeros(0, np.int32),
-        (),
-        np.zeros(0, np.int32),
-    )
-    points = np.zeros((4, 3))
-    assert not TextureSampler(empty, 0.1).colors(points, points + 1.0)[1].any()

@@ -9,13 +9,11 @@ from stillmap.core import se2, se3
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.mesh.texture import views as views_module
-from stillmap.mesh.texture.views import (
+from stillmap.mesh import views as views_module
+from stillmap.mesh.views import (
     filter_readable,
     find_views,
-    interpolate_poses,
     read_color_image,
-    usable_images,
 )
 
 S = 10**9
@@ -94,37 +92,6 @@ def test_in_a_gap_between_scans_only_a_robot_at_rest_is_known(monkeypatch):
     assert len(find_views(recording(scans, images(taken)), poses)[0]) == 4
 
 
-def test_before_a_pause_nothing_is_told_of_the_time_before():
-    poses = screw([0.0, 1.0])
-    T, why = interpolate_poses(np.array([0, 5 * S]), poses, np.array([-S // 20, 5 * S + S // 20]))
-    assert why == ["", ""]
-    np.testing.assert_array_equal(T[0], poses[0])
-    np.testing.assert_allclose(T[1], poses[1], atol=1e-12)
-
-
-def test_where_poses_leap_only_the_scans_themselves_are_known():
-    scans = [0.0, 0.1, 0.2]
-    poses = np.tile(np.eye(4), (3, 1, 1))
-    poses[2, 0, 3] = 50.0
-    views, left_out = find_views(recording(scans, images([0.05, 0.15, 0.2])), poses)
-    assert [view.image for view in views] == [0, 2]
-    assert left_out == {"taken where the trajectory jumps": 1}
-
-
-@pytest.mark.parametrize("stamps", [[7], [7, 7], [0, 0, 5, 5]])
-def test_scans_that_share_a_stamp(stamps):
-    stamp_ns = np.array(stamps, np.int64) * 10**7
-    poses = screw(stamp_ns / S)
-    T, why = interpolate_poses(stamp_ns, poses, stamp_ns)
-    assert not any(why)
-    np.testing.assert_allclose(T, poses, atol=1e-12)
-    around = np.array([stamp_ns[0] - 10**6, stamp_ns[-1] + 10**6])
-    T, why = interpolate_poses(stamp_ns, poses, around)
-    assert why == ["", ""]
-    seconds = around / S if len(set(stamps)) > 1 else stamp_ns[[0, -1]] / S
-    np.testing.assert_allclose(T, screw(seconds), atol=1e-12)
-
-
 def test_without_scans_or_pictures_there_are_no_views():
     poses = np.empty((0, 4, 4))
     what = {"taken outside the time of the scans": 1}
@@ -184,22 +151,3 @@ def test_damaged_pictures_are_found_when_they_are_wanted():
 
     views, left_out = find_views(recording([0.0], images([0.0] * 9, load=never)), screw([0.0]))
     assert (views, left_out) == ([], {"images that cannot be read": 9})
-
-
-def test_grey_pictures_have_colours_too_and_a_size_may_be_found():
-    grey = np.arange(192, dtype=np.uint8).reshape(12, 16)
-    unsized = replace(CAMERA, width=0, height=0)
-    pictures = images([0.0], (unsized,), load=lambda _: grey)
-    (view,), _ = find_views(recording([0.0], pictures), screw([0.0]))
-    assert (view.camera.width, view.camera.height) == (16, 12)
-    found = read_color_image(pictures, view)
-    assert found is not None
-    np.testing.assert_array_equal(found, grey[..., None].repeat(3, axis=2))
-
-
-def test_what_could_be_used_is_known_without_poses():
-    both = images([0.0, 0.05, 0.1, 9.0], (CAMERA, replace(CAMERA, K=None)), [0, 1, 0, 0])
-    found, left_out = usable_images(recording([0.0, 0.1], both))
-    assert found.tolist() == [True, False, True, False]
-    assert sorted(left_out.values()) == [1, 1]
-    assert usable_images(recording([0.0], None))[1] == {}

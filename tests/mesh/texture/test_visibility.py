@@ -3,14 +3,13 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from made_up_rooms import K, box, camera, looking, rectangle
 
 from stillmap import _core
 from stillmap.core import camera as camera_module
-from stillmap.mesh.texture import visibility
-from stillmap.mesh.texture.visibility import find_visible_faces, scale_intrinsics
+from stillmap.mesh import visibility
 from stillmap.mesh.triangle_mesh import Mesh, concatenate_meshes
+from stillmap.mesh.visibility import find_visible_faces, scale_intrinsics
 
 # seen from where y is less
 WALL = rectangle([-4.0, 4.0, -3.0], [8.0, 0, 0], [0, 0, 6.0], 24)
@@ -65,41 +64,6 @@ def test_what_stands_before_a_wall_hides_it():
     assert (seen[len(WALL) :] > 0).sum() == 2
 
 
-def test_a_pole_before_the_middle_of_a_large_face_hides_it():
-    # neither corners nor centres of the two faces are behind it
-    wall = rectangle([-2.0, 4.0, -1.5], [4.0, 0, 0], [0, 0, 3.0])
-    pole = box([0.40, 2.0, -2.0], [0.45, 2.05, 2.0])
-    assert find_visible_faces(wall, AHEAD).all()
-    assert not find_visible_faces(concatenate_meshes([wall, pole]), AHEAD)[:2].any()
-
-
-def test_edges_are_known_to_a_pixel_only(monkeypatch):
-    mesh = concatenate_meshes([WALL, box([-0.6, 2.0, -0.5], [0.4, 2.6, 0.7])])
-    wide = find_visible_faces(mesh, AHEAD) > 0
-    monkeypatch.setattr(visibility, "_DILATION", 0)
-    close = find_visible_faces(mesh, AHEAD) > 0
-    assert close[wide].all()
-    lost = WALL.centers[np.flatnonzero(close & ~wide)]
-    assert 10 < len(lost) < 200
-    # the box's shadow on the wall, and one face more
-    low, high = np.array([-1.2, -1.0]) - 0.4, np.array([0.8, 1.4]) + 0.4
-    assert ((lost[:, [0, 2]] > low) & (lost[:, [0, 2]] < high)).all()
-
-
-def test_what_lies_flat_hides_what_is_under_it():
-    floor = rectangle([-2.0, 1.0, -1.2], [4, 0, 0], [0, 5, 0], 50)
-    mesh = concatenate_meshes([floor, rectangle([-0.7, 2.2, -1.16], [1.4, 0, 0], [0, 1.5, 0], 4)])
-    view = looking([0.0, 0, 0], [0.0, 3, -1.0])
-    alone, seen = (
-        find_visible_faces(floor, view) > 0,
-        find_visible_faces(mesh, view)[: len(floor)] > 0,
-    )
-    hidden = hidden_share(mesh, view, len(floor))
-    assert np.sum(alone & (hidden > 0.9)) > 300
-    assert not seen[hidden > 0.9].any()
-    assert seen[alone & (hidden == 0.0)].mean() > 0.9
-
-
 def test_a_noisy_surface_does_not_hide_itself():
     rng = np.random.default_rng(0)
     floor = rectangle([-4.0, 0.5, -1.2], [8.0, 0, 0], [0, 8.0, 0], 80)
@@ -130,16 +94,3 @@ def test_the_margin(monkeypatch):
     far = find_visible_faces(WALL, AHEAD) > 0
     assert 0 < far.sum() < near.sum()
     assert near[far].all()
-
-
-def test_nothing_there():
-    seen = find_visible_faces(Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32)), AHEAD)
-    assert len(seen) == 0
-
-
-def test_a_scaled_picture_has_its_edges_where_they_were():
-    half = scale_intrinsics(K, 0.5)
-    # the left edge of the picture, half a pixel beside the first centre, and the right one
-    for u, u_ in ((-0.5, -0.5), (399.5, 199.5), (99.5, 49.5)):
-        x = (u - K[0, 2]) / K[0, 0]
-        assert half[0, 0] * x + half[0, 2] == pytest.approx(u_)

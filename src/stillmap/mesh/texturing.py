@@ -7,8 +7,6 @@ import numpy as np
 from scipy import ndimage
 
 from stillmap.core.camera import is_in_image, project
-from stillmap.mesh.objects.reconstruction import ObjectShape
-from stillmap.mesh.objects.sweep_surface import IMAGE_WINDOW
 from stillmap.mesh.place import (
     CANDIDATES,
     Background,
@@ -16,13 +14,13 @@ from stillmap.mesh.place import (
     resolve_assignment,
     sample_buffer,
 )
-from stillmap.mesh.simplification import subdivide
-from stillmap.mesh.texture.view_selection import NONE, Candidates, view_utility
-from stillmap.mesh.texture.views import View
-from stillmap.mesh.texture.visibility import DEPTH_SCALE, find_visible_faces, render_depth
+from stillmap.mesh.reconstruction import ObjectShape
+from stillmap.mesh.segmentation import IMAGE_WINDOW
 from stillmap.mesh.tracked_boxes import TrackedBox, boxes_at, occlusion_probability
-from stillmap.mesh.triangle_mesh import Mesh
-from stillmap.mesh.types import Bool, Float, Index
+from stillmap.mesh.triangle_mesh import Bool, Float, Index, Mesh, subdivide
+from stillmap.mesh.view_selection import NONE, Candidates, view_utility
+from stillmap.mesh.views import View
+from stillmap.mesh.visibility import DEPTH_SCALE, find_visible_faces, render_depth
 
 _OUTLINE_CELL = 0.01  # m
 _MAX_OUTLINE_CELLS = 1 << 10  # along an edge, beyond which cells are larger
@@ -79,7 +77,7 @@ def assign_object_views(
     """
     mesh, _ = subdivide(shape.mesh, _MAX_FACE_EDGE)
     candidates = Candidates.empty(len(mesh), CANDIDATES)
-    sharpest, own = Candidates.empty(len(mesh), 1), list[View]()
+    visible, own = np.zeros(len(mesh), np.bool_), list[View]()
     others = [one for one in boxes if one.box.object_id != shape.id]
     seconds = times_in_view(shape.frame.box, background.views, start_ns)
     for number, (view, now) in enumerate(zip(background.views, seconds.tolist(), strict=True)):
@@ -103,9 +101,9 @@ def assign_object_views(
         if not shape.rigid:  # people change their shape
             utility -= away / IMAGE_WINDOW
         candidates.add(len(own), faces, utility, p_free)
-        sharpest.add(len(own), faces, pixels, p_free)
+        visible[faces] = True
         own.append(moved)
-    assignment = resolve_assignment(mesh, candidates, sharpest)
+    assignment = resolve_assignment(mesh, candidates, visible)
     areas = mesh.areas()
     if areas[assignment.view >= 0].sum() < _MIN_TEXTURED_SHARE * areas.sum():
         assignment = replace(assignment, view=np.full_like(assignment.view, NONE))

@@ -14,10 +14,9 @@ from scipy.sparse import coo_array, eye_array
 from scipy.sparse.linalg import spsolve
 
 from stillmap.core.camera import Images, project
-from stillmap.mesh.texture.baking import sample_bilinear
-from stillmap.mesh.texture.views import View
-from stillmap.mesh.triangle_mesh import Mesh
-from stillmap.mesh.types import Float, Float32, Image, Index, Int32
+from stillmap.mesh.texture import sample_bilinear
+from stillmap.mesh.triangle_mesh import Float, Float32, Image, Index, Int32, Mesh
+from stillmap.mesh.views import View
 
 NONE = -1
 MIN_P_VISIBLE = 0.6  # probability below which an image does not texture a face
@@ -72,18 +71,15 @@ class Candidates(NamedTuple):
             array[faces] = np.column_stack([array[faces], new])[row, order]
 
 
-def view_utility(p_static: Float, pixels: Float, area: Float, use_occlusion: bool = True) -> Float:
+def view_utility(p_static: Float, pixels: Float, area: Float) -> Float:
     """(n,) utility of an image for faces, in e-folds of resolution; -inf: not to be used.
 
     Args:
         p_static: (n,) probability that it shows static surface only.
         pixels: (n,) area of each face in it: resolution and angle in one.
         area: (n,) square metres of each face.
-        use_occlusion: without, resolution alone counts.
     """
     sharpness = 0.5 * np.log(np.maximum(pixels, _MIN_POSITIVE) / np.maximum(area, _MIN_POSITIVE**2))
-    if not use_occlusion:
-        return np.asarray(sharpness)
     certainty = _OCCLUSION_WEIGHT * np.log(np.maximum(p_static, _MIN_POSITIVE))
     return np.where(p_static >= MIN_P_VISIBLE, sharpness + certainty, -np.inf)
 

@@ -13,18 +13,18 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from stillmap.mesh.objects.segmentation import (
+from stillmap.mesh.range_image import Patch
+from stillmap.mesh.segmentation import (
     SPACING,
     DynamicReturns,
+    ObjectBeams,
     beams_in_frame,
     grow_segment,
     in_viewing_cone,
+    triangulate_beams,
 )
-from stillmap.mesh.objects.sweep_surface import ObjectBeams, triangulate_beams
-from stillmap.mesh.range_image import Patch
 from stillmap.mesh.tracked_boxes import ObjectFrame
-from stillmap.mesh.triangle_mesh import Mesh, remove_small_components
-from stillmap.mesh.types import Float, Index
+from stillmap.mesh.triangle_mesh import Float, Index, Mesh, remove_small_components
 
 MIN_COMPONENT_AREA = 0.005  # m2: smaller components of an object's surface are dropped
 _MAX_SPACING_RATIO = 2.5  # edge over median edge of an object's surface

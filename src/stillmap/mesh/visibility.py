@@ -1,20 +1,26 @@
-"""Faces of a mesh that are visible in an image.
+"""Faces of a mesh that are visible in an image, and what movers hide of it."""
 
-Occlusion is tested against the z-buffer of an ideal (undistorted) image; the camera model decides
-what lies within the image.
-"""
-
-from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
 
 import stillmap._core as _core
-from stillmap.core.camera import Camera, project, unproject
-from stillmap.mesh.texture.views import View
-from stillmap.mesh.triangle_mesh import Mesh, cross_columns, dot_columns, normalize_columns
-from stillmap.mesh.types import Bool, Float, Float32, Index, Int32
+from stillmap.core.camera import project
+from stillmap.mesh.tracked_boxes import OUTLINE_MARGIN
+from stillmap.mesh.triangle_mesh import (
+    Bool,
+    Float,
+    Float32,
+    Index,
+    Int32,
+    Mesh,
+    cross_columns,
+    dot_columns,
+    normalize_columns,
+)
+from stillmap.mesh.views import View
 
 DEPTH_SCALE = 0.5  # pixels of the z-buffer per pixel of the image
 NEAR = 0.05  # m ahead of a camera: nothing nearer is visible
@@ -25,11 +31,15 @@ _DEPTH_TOLERANCE = 0.01  # m by which a face may lie behind the z-buffer
 _RELATIVE_TOLERANCE = 0.005  # m more per metre of distance
 _SLOPE_TOLERANCE = 0.05  # m per metre of distance, at most, for slanted faces
 _DILATION = 1  # pixels around a face in which much nearer depth occludes it: poses are inexact
-_SAMPLE_SPACING = 8.0  # pixels of the z-buffer between samples of a large face
-_CORNER_INSET = 0.2  # share of the way to the center by which samples at corners are pulled in
-_SEARCH_MARGIN = 1.05  # times the field of view in which points are projected
-_BORDER_SAMPLES = 33  # along each edge of an image, for its field of view
-_MAX_SUBDIVISION = 32  # sample intervals along the edge of a large face
+
+
+# weights of the corners at the samples of a face: center, near corners, near middles of edges
+_SAMPLES = (
+    np.array(
+        [[3, 3, 3], [7, 1, 1], [1, 7, 1], [1, 1, 7], [4, 4, 1], [1, 4, 4], [4, 1, 4]], np.float64
+    )
+    / 9.0
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +78,7 @@ def find_visible_faces(mesh: Mesh, view: View) -> Float32:
         view: with a calibration that `calibration_error` accepts.
     """
     points = view.to_camera(mesh.vertices)
-    uv, inside = _project_near(view, points)
+    uv, inside = _project_inside(view, points)
     a, b, c = mesh.faces.T
     faces = np.flatnonzero(inside[a] & inside[b] & inside[c])
     columns = np.ascontiguousarray(points.T)
@@ -140,32 +150,13 @@ def project_pinhole(K: Float, points: Float) -> tuple[Float, Float]:
     return K[0, 0] * x + K[0, 1] * y + K[0, 2], K[1, 1] * y + K[1, 2]
 
 
-def _project_near(view: View, points: Float) -> tuple[Float, Bool]:
-    """(V, 2) pixels of points (V, 3) in the camera's frame, and whether they are in the image.
-
-    NaN far outside of the field of view, where lens models do not hold.
-    """
-    uv, ok = np.full((len(points), 2), np.nan), np.zeros(len(points), np.bool_)
-    x, y, z = points.T
-    tangent = _SEARCH_MARGIN * _max_view_tangent(view.camera)
-    near = np.flatnonzero((z > 0.0) & (x * x + y * y <= (tangent * z) ** 2))
-    uv[near], ok[near] = project(view.camera, points[near])
-    u, v = uv.T
-    width, height = view.camera.width - 1.0 - IMAGE_MARGIN, view.camera.height - 1.0 - IMAGE_MARGIN
+def _project_inside(view: View, points: Float) -> tuple[Float, Bool]:
+    """(V, 2) pixels of points (V, 3) in the camera's frame, and whether they are in the image."""
+    uv, ok = project(view.camera, points)
+    size = np.array([view.camera.width, view.camera.height])
     with np.errstate(invalid="ignore"):  # NaN: not in the image
-        ok &= (u >= IMAGE_MARGIN) & (u <= width) & (v >= IMAGE_MARGIN) & (v <= height)
+        ok &= ((uv >= IMAGE_MARGIN) & (uv <= size - 1.0 - IMAGE_MARGIN)).all(axis=1)
     return uv, ok
-
-
-def _max_view_tangent(camera: Camera) -> float:
-    """Tangent of the widest angle between the optical axis and a ray; inf: unknown."""
-    t = np.linspace(0.0, 1.0, _BORDER_SAMPLES)
-    low, high = np.zeros_like(t), np.ones_like(t)
-    u, v = np.concatenate([t, t, low, high]), np.concatenate([low, high, t, t])
-    size = np.array([camera.width - 1.0, camera.height - 1.0])
-    found = unproject(camera, np.column_stack([u, v]) * size)
-    far = float(np.hypot(found[:, 0], found[:, 1]).max())
-    return far if np.isfinite(far) else np.inf
 
 
 def _view_cosines(corners: Float) -> Float32:
@@ -194,34 +185,10 @@ def _is_unoccluded(buffer: DepthBuffer, corners: Float) -> Bool:
     normal = _face_normals(corners)
     # (h, w) minimum depth within some pixels along rows and columns
     around = ndimage.minimum_filter(buffer.depth, 2 * _DILATION + 1, mode="nearest")
-    for chosen, weights in _sample_faces(buffer, corners):
-        left, of, normals = chosen, corners[..., chosen], normal[:, chosen]
-        for weight in weights:
-            point = weight[0] * of[0] + weight[1] * of[1] + weight[2] * of[2]
-            passes = _passes_depth_test(buffer, around, point, normals)
-            if not passes.all():
-                free[left[~passes]] = False
-                left, of, normals = left[passes], of[..., passes], normals[:, passes]
+    for weight in _SAMPLES:
+        point = np.einsum("k,kin->in", weight, corners[..., free])
+        free[free] = _passes_depth_test(buffer, around, point, normal[:, free])
     return free
-
-
-def _sample_faces(buffer: DepthBuffer, corners: Float) -> Iterator[tuple[Index, Float]]:
-    """Faces by number, and the weights (k, 3) of their corners at their samples.
-
-    Larger faces have more samples: `_SAMPLE_SPACING` pixels apart along the longest edge.
-    """
-    uv = [project_pinhole(buffer.K, corner) for corner in corners]
-    edges = [np.hypot(uv[k][0] - uv[k - 1][0], uv[k][1] - uv[k - 1][1]) for k in range(3)]
-    edge = np.maximum(np.maximum(edges[0], edges[1]), edges[2])
-    halvings = np.ceil(np.log2(np.maximum(edge / _SAMPLE_SPACING, 1.0)))
-    halvings = np.minimum(halvings, np.log2(_MAX_SUBDIVISION)).astype(np.intp)
-    for times in np.flatnonzero(np.bincount(halvings)):
-        n = 2**times
-        i, j = (a.ravel() for a in np.mgrid[: n + 1, : n + 1])
-        lattice = np.stack([i, j, n - i - j], axis=1)[i + j <= n] / n
-        center = np.full((1, 3), 1.0 / 3.0)
-        inset = lattice + _CORNER_INSET * (center - lattice)
-        yield np.flatnonzero(halvings == times), np.concatenate([center, inset])
 
 
 def _passes_depth_test(buffer: DepthBuffer, around: Float32, points: Float, normals: Float) -> Bool:
@@ -245,3 +212,118 @@ def _passes_depth_test(buffer: DepthBuffer, around: Float32, points: Float, norm
     return np.asarray(
         inside & (z <= buffer.depth.ravel()[at] + here) & (z <= around.ravel()[at] + beside)
     )
+
+
+_COLUMNS = 80  # cells over the width of an image
+_BEAM_DIVERGENCE = 0.01  # m per metre by which the footprint of a return grows
+_SUPPORT_SIGMA = 1.5  # cells over which a static return supports its neighbors
+_MIN_DEPTH = 0.05  # m from the camera: nearer returns are the camera itself
+_MAX_RADIUS = 12  # cells by which a return is dilated
+
+
+class OcclusionMask(NamedTuple):
+    """Depth map of movers in an image, on a grid of h by w cells.
+
+    Attributes:
+        cell: pixels, edge of a cell.
+        depth: (h, w) metres ahead of the camera, nearest dynamic return; inf: none.
+        dynamic: (h, w) its P(dynamic).
+        support: (h, w) approximate number of static returns.
+    """
+
+    cell: float
+    depth: Float
+    dynamic: Float
+    support: Float
+
+    def p_unoccluded(self, uv: Float, depth: Float, prior: Float) -> Float:
+        """(n,) probability that the image shows static surface at each point.
+
+        Static returns raise the prior: each shows that no mover is in front. A dynamic return in
+        front limits it to 1 - P(dynamic).
+
+        Args:
+            uv: (n, 2) pixels within the image.
+            depth: (n,) metres ahead of the camera.
+            prior: (n,) probability where no return tells.
+        """
+        h, w = self.depth.shape
+        column = np.clip((uv[:, 0] / self.cell).astype(np.intp), 0, w - 1)
+        row = np.clip((uv[:, 1] / self.cell).astype(np.intp), 0, h - 1)
+        static = 1.0 - (1.0 - prior) * np.exp(-self.support[row, column])
+        hidden = self.depth[row, column] < depth + OUTLINE_MARGIN
+        return np.where(hidden, np.minimum(static, 1.0 - self.dynamic[row, column]), static)
+
+
+def build_occlusion_mask(view: View, points: Float, p_static: Float32) -> OcclusionMask:
+    """The occlusion mask of an image from the returns near its timestamp.
+
+    Args:
+        view: the image.
+        points: (n, 3) metres in the map frame, motion-compensated returns.
+        p_static: (n,) their P(c = 1); those below one half occlude.
+    """
+    camera = view.camera
+    assert camera.K is not None
+    cell = camera.width / _COLUMNS
+    shape = max(round(camera.height / cell), 1), _COLUMNS
+    local = view.to_camera(points)
+    uv, ok = project(camera, local)
+    ok &= local[:, 2] > _MIN_DEPTH
+    is_dynamic = p_static < 0.5
+    support = _count_support(uv[ok & ~is_dynamic], cell, shape)
+    depth, dynamic = np.full(shape, np.inf), np.zeros(shape)
+    seen = np.flatnonzero(ok & is_dynamic)
+    seen = seen[_nearest_per_cell(uv[seen] / cell, local[seen, 2])]
+    away = local[seen, 2]
+    radius = (OUTLINE_MARGIN / away + _BEAM_DIVERGENCE) * (float(camera.K[0, 0]) / cell)
+    _draw_discs(depth, dynamic, uv[seen] / cell, away, 1.0 - p_static[seen], radius)
+    return OcclusionMask(cell, depth, dynamic, support)
+
+
+def _count_support(uv: Float, cell: float, shape: tuple[int, int]) -> Float:
+    """(h, w) static returns per cell, smoothed; a lone return counts 1 in its own cell."""
+    column, row = np.floor(uv / cell).astype(np.intp).T
+    inside = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
+    at = row[inside] * shape[1] + column[inside]
+    count = np.bincount(at, minlength=shape[0] * shape[1]).reshape(shape)
+    near = ndimage.gaussian_filter(count.astype(np.float64), _SUPPORT_SIGMA, mode="constant")
+    return np.asarray(near * (2.0 * np.pi * _SUPPORT_SIGMA**2))
+
+
+def _nearest_per_cell(at: Float, away: Float) -> Index:
+    """Numbers of the nearest points (n, 2) of each cell."""
+    cells = np.floor(at).astype(np.int64)
+    order = np.lexsort((away, cells[:, 0], cells[:, 1]))
+    new = np.any(np.diff(cells[order], axis=0, prepend=cells[order[:1]] - 1) != 0, axis=1)
+    return order[new]
+
+
+def _draw_discs(
+    depth: Float, dynamic: Float, at: Float, away: Float, p_dynamic: Float32, radius: Float
+) -> None:
+    """Draws discs around dynamic returns; the nearest one wins in each cell.
+
+    Args:
+        depth, dynamic: (h, w), changed.
+        at: (n, 2) in cells.
+        away: (n,) metres ahead of the camera.
+        p_dynamic: (n,).
+        radius: (n,) in cells, at most `_MAX_RADIUS` counts.
+    """
+    h, w = depth.shape
+    radius = np.minimum(radius, _MAX_RADIUS)
+    parts = []
+    for whole in range(_MAX_RADIUS + 1):
+        of = np.flatnonzero(np.ceil(radius - 0.5).astype(np.intp) == whole)
+        dy, dx = np.mgrid[-whole : whole + 1, -whole : whole + 1]
+        disc = dx**2 + dy**2 <= (whole + 0.5) ** 2
+        column = np.floor(at[of, 0]).astype(np.intp)[:, None] + dx[disc]
+        row = np.floor(at[of, 1]).astype(np.intp)[:, None] + dy[disc]
+        inside = (column >= 0) & (column < w) & (row >= 0) & (row < h)
+        point = np.repeat(of, inside.sum(axis=1))
+        parts.append(np.stack([(row * w + column)[inside], point], axis=1))
+    cell, point = np.concatenate(parts).T
+    order = np.lexsort((point, -away[point]))  # the nearest is written last
+    depth.flat[cell[order]] = away[point[order]]
+    dynamic.flat[cell[order]] = p_dynamic[point[order]]

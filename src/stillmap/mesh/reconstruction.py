@@ -13,8 +13,9 @@ from scipy.spatial import cKDTree
 
 from stillmap.core.short_repr import ShortRepr
 from stillmap.mesh.inputs import MeshInputs
-from stillmap.mesh.objects.merging import ObjectTrack
-from stillmap.mesh.objects.registration import (
+from stillmap.mesh.merging import ObjectTrack
+from stillmap.mesh.range_image import Patch
+from stillmap.mesh.registration import (
     MIN_COMPONENT_AREA,
     PartialScan,
     PartialSurface,
@@ -25,14 +26,10 @@ from stillmap.mesh.objects.registration import (
     triangulate_partial_scan,
     within_time,
 )
-from stillmap.mesh.objects.segmentation import HALF_CAR, DynamicReturns
-from stillmap.mesh.objects.sweep_surface import find_best_interval
-from stillmap.mesh.range_image import Patch
-from stillmap.mesh.simplification import subdivide
+from stillmap.mesh.segmentation import HALF_CAR, DynamicReturns, find_best_interval
 from stillmap.mesh.tracked_boxes import ObjectFrame, TrackedBox
-from stillmap.mesh.triangle_mesh import Mesh
+from stillmap.mesh.triangle_mesh import Float, Index, Mesh, subdivide
 from stillmap.mesh.tsdf import TsdfParameters, integrate_patches
-from stillmap.mesh.types import Float, Index
 
 MERGE_WINDOW = 0.5  # s before and after the best partial scan, of those registered to it
 _MAX_VIEW_OFFSET = 0.05  # m of a partial surface from the best one: else it is left out

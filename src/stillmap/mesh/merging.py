@@ -11,19 +11,12 @@ from typing import NamedTuple
 import numpy as np
 
 from stillmap.core.square_box import component_labels
-from stillmap.mesh.objects.segmentation import (
-    LINK,
-    SPACING,
-    DynamicReturns,
-    cluster_cells,
-    segment_object,
-)
+from stillmap.mesh.segmentation import LINK, SPACING, DynamicReturns, cluster_cells, segment_object
 from stillmap.mesh.tracked_boxes import TrackedBox
-from stillmap.mesh.types import Bool, Float, Index
+from stillmap.mesh.triangle_mesh import Bool, Float, Index
 from stillmap.tracking import MovingObject
 
 MAJORITY = 0.5
-_SCANS_PER_BLOCK = 1000  # after which pairs are counted
 _VELOCITY_SAMPLES = 9  # times at which velocities are compared
 _REMNANT_RATIO = 2.0  # returns on an object over those on its remnant, at least
 _MAX_SPEED_SHARE = 0.5  # of the faster one's speed by which velocities may differ
@@ -106,18 +99,18 @@ def merge_tracks(tracks: Sequence[ObjectTrack], returns: DynamicReturns) -> list
 def count_pairs(scans: Sequence[ScanClusters], n: int) -> PairCounts:
     """All pairs of n objects that some scan saw together."""
     # of many objects most never meet: a list of pairs, no matrix
-    key, connected, observed = (np.zeros(0, np.intp) for _ in range(3))
-    for first in range(0, len(scans), _SCANS_PER_BLOCK):
-        keys, together, seen = [key], [connected], [observed]
-        for objects, cluster, beams in scans[first : first + _SCANS_PER_BLOCK]:
-            a, b = np.triu_indices(len(objects), 1)
-            fewer = np.minimum(beams[a], beams[b])
-            keys.append(objects[a] * n + objects[b])
-            together.append(np.where(cluster[a] == cluster[b], fewer, 0))
-            seen.append(fewer)
-        key, number = np.unique(np.concatenate(keys), return_inverse=True)
-        connected = np.bincount(number, np.concatenate(together), len(key)).astype(np.intp)
-        observed = np.bincount(number, np.concatenate(seen), len(key)).astype(np.intp)
+    keys, together, seen = ([np.zeros(0, np.intp)] for _ in range(3))
+    for objects, cluster, beams in scans:
+        a, b = np.triu_indices(len(objects), 1)
+        fewer = np.minimum(beams[a], beams[b])
+        keys.append(objects[a] * n + objects[b])
+        together.append(np.where(cluster[a] == cluster[b], fewer, 0))
+        seen.append(fewer)
+    key, number = np.unique(np.concatenate(keys), return_inverse=True)
+    connected, observed = (
+        np.bincount(number, np.concatenate(counts), len(key)).astype(np.intp)
+        for counts in (together, seen)
+    )
     return PairCounts(np.stack([key // n, key % n], axis=1), connected, observed)
 
 
@@ -133,34 +126,15 @@ def group_tracks(counts: PairCounts, may: Bool, n: int) -> Index:
         n: number of objects.
     """
     group = np.arange(n)
-    members = [[k] for k in range(n)]
-    # of each group, the counts with each other group that was seen with it
-    links: list[dict[int, tuple[int, int]]] = [{} for _ in range(n)]
-    for (a, b), connected, observed in zip(
-        counts.pairs.tolist(), counts.connected.tolist(), counts.observed.tolist(), strict=True
-    ):
-        links[a][b] = links[b][a] = connected, observed
     candidates = np.flatnonzero(may & (counts.connected > 0))
     for k in candidates[np.argsort(-counts.connected[candidates], kind="stable")].tolist():
-        a, b = sorted(group[counts.pairs[k]].tolist())
-        if a == b:
-            continue
-        connected, observed = links[a][b]
-        if connected >= MAJORITY * observed:
-            _merge_links(a, b, links)
-            members[a] += members[b]
-            group[members[b]] = a
+        groups = np.sort(group[counts.pairs], axis=1)
+        a, b = groups[k].tolist()
+        between = (groups == (a, b)).all(axis=1)
+        connected, observed = counts.connected[between].sum(), counts.observed[between].sum()
+        if a != b and connected >= MAJORITY * observed:
+            group[group == b] = a
     return group
-
-
-def _merge_links(a: int, b: int, links: list[dict[int, tuple[int, int]]]) -> None:
-    """Adds the counts of group b to those of group a."""
-    del links[a][b], links[b][a]
-    for other, (connected, observed) in links[b].items():
-        m, n = links[a].get(other, (0, 0))
-        links[a][other] = links[other][a] = m + connected, n + observed
-        links[other].pop(b)
-    links[b].clear()
 
 
 def _cluster_scans(

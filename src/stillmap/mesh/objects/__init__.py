@@ -1,1 +1,0 @@
-"""Models of moving objects: segmentation, merging, registration, reconstruction, texturing."""

@@ -1,1 +1,0 @@
-"""Texturing: visibility, occlusion, view selection, exposure, atlas, baking."""
