@@ -61,7 +61,7 @@ _MODULES = {
     "Options": "pipeline.options",
     "PlaceSession": "results.timeline",
     "ReadOptions": "prepare.options",
-    "Recording": "core.recording",
+    "Recording": "io",
     "Result": "results.result",
     "Scan": "live.scan",
     "SessionChange": "results.timeline",

@@ -10,8 +10,6 @@ MODULES = {
     ".".join(path.relative_to(ROOT / "src").with_suffix("").parts).removesuffix(".__init__"): path
     for path in (ROOT / "src" / "stillmap").rglob("*.py")
 }
-# constructors of a class, which call what stands above it
-UPWARDS = {("stillmap.core.recording", "stillmap.io.from_arrays")}
 
 
 def imported(module: str, for_types: bool) -> set[str]:
@@ -26,7 +24,7 @@ def imported(module: str, for_types: bool) -> set[str]:
         elif isinstance(node, ast.ImportFrom) and node.module:
             inside = {f"{node.module}.{name.name}" for name in node.names} & MODULES.keys()
             out |= inside or {node.module}
-    return {target for target in out & MODULES.keys() if (module, target) not in UPWARDS}
+    return out & MODULES.keys()
 
 
 def room_of(module: str) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -130,10 +130,7 @@ class Recording(ShortRepr):
             >>> recording = stillmap.Recording.from_scans(stamps, ranges, angles, odometry)
             >>> result = stillmap.build(recording)
         """
-        # the one import upwards: a constructor belongs to its class, what readings mean to `io`
-        from stillmap.io.from_arrays import recording_from_scans
-
-        return recording_from_scans(
+        return _constructors["from_scans"](
             stamps,
             ranges,
             angles,
@@ -176,9 +173,7 @@ class Recording(ShortRepr):
             >>> sweeps = (numpy.load(file) for file in files)
             >>> recording = stillmap.Recording.from_clouds(stamps, sweeps)
         """
-        from stillmap.io.from_arrays import recording_from_clouds
-
-        return recording_from_clouds(
+        return _constructors["from_clouds"](
             stamps,
             clouds,
             odometry,
@@ -260,6 +255,17 @@ class Recording(ShortRepr):
     def without_odometry(self) -> Recording:
         """The recording without odometry."""
         return replace(self, T_odom_base=None)
+
+
+# a constructor belongs to its class, what readings mean to rooms above: they enter themselves
+_constructors: dict[str, Callable[..., Recording]] = {}
+
+
+def register_constructors(
+    from_scans: Callable[..., Recording], from_clouds: Callable[..., Recording]
+) -> None:
+    """Enter what `Recording.from_scans` and `from_clouds` call; `stillmap.io` does."""
+    _constructors.update(from_scans=from_scans, from_clouds=from_clouds)
 
 
 def _check(name: str, array: NDArray[Any], shape: tuple[int, ...], dtype: type) -> None:

@@ -17,7 +17,7 @@ from stillmap.core.grid_map import GridMap
 from stillmap.core.local_frame import LocalFrame
 from stillmap.core.profiling import Progress, no_progress
 from stillmap.em import CellProbabilities
-from stillmap.io.array_checks import poses_to_matrices
+from stillmap.io.from_arrays import poses_to_matrices
 from stillmap.live.known_map import KnownMap
 from stillmap.live.online_slam import OnlineSlam
 from stillmap.live.place import Mode, adopt_resolution, make_tracker

@@ -13,7 +13,7 @@ from stillmap.core import se2, se3
 from stillmap.core.arrays import finite_rows
 from stillmap.core.short_repr import ShortRepr
 from stillmap.core.timestamps import MAX_BEAM_TIME
-from stillmap.io.array_checks import (
+from stillmap.io.from_arrays import (
     poses_to_matrices,
     require_all,
     require_length,

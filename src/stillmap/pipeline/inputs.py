@@ -12,7 +12,7 @@ from stillmap import em
 from stillmap import io as formats
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.io.array_checks import poses_to_matrices
+from stillmap.io.from_arrays import poses_to_matrices
 from stillmap.io.parts import read_parts
 from stillmap.io.reader import require_plausible
 from stillmap.io.text_lines import Progress
