@@ -22,7 +22,7 @@ for module in pkgutil.walk_packages(stillmap.__path__, "stillmap."):
     try:
         importlib.import_module(module.name)
     except ModuleNotFoundError as error:
-        extra = {"viser": "viewer", "websockets": "viewer", "foxglove": "live.foxglove"}
+        extra = {"viser": "viewer", "websockets": "viewer", "foxglove": "live.foxglove_server"}
         if extra.get(error.name, " ") not in module.name:
             print(module.name, error.name)
 """

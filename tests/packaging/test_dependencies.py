@@ -18,7 +18,7 @@ PACKAGE = ROOT / "src" / "stillmap"
 # modules that are imported only where their extra is in use
 NEEDS_EXTRA = {
     "viewer/server.py": "viewer",
-    **{f"live/foxglove/{name}.py": "live" for name in ("publisher", "schemas")},
+    "live/foxglove_server.py": "live",
     # for type checkers alone
     **{f"results/{name}.py": "notebook" for name in ("plot", "result", "tables")},
 }
