@@ -4,6 +4,7 @@ import re
 from dataclasses import dataclass, field
 
 import numpy as np
+import pydantic
 import pytest
 
 from stillmap.core.local_frame import LocalFrame
@@ -36,14 +37,14 @@ WALLS = [
 ]
 
 
-@dataclass(frozen=True)
+@pydantic.dataclasses.dataclass(frozen=True)
 class EmOptions:
     prior: float = 0.9
     note: str = "a <b>bold</b> & 'quoted' note"
     seed: int | None = None
 
 
-@dataclass(frozen=True)
+@pydantic.dataclasses.dataclass(frozen=True)
 class FakeOptions:
     estimator: str = "stillmap"
     em: EmOptions = field(default_factory=EmOptions)

@@ -72,6 +72,10 @@ def is_terminal(stream: IO[str] | None) -> bool:
     return stream is not None and stream.isatty() and os.environ.get("TERM") != "dumb"
 
 
+def _shows_bar() -> bool:
+    return is_terminal(sys.stderr) or bool(os.environ.get("FORCE_COLOR"))
+
+
 def print_line(line: str) -> None:
     """Print a line to stderr."""
     print(line, file=sys.stderr, flush=True)
@@ -85,7 +89,7 @@ def show_progress(iterations: int, say: Callable[[str], None] = print_line) -> I
         iterations: of EM, at most.
         say: prints a line where stderr is no terminal.
     """
-    is_wide = not is_terminal(sys.stderr) or shutil.get_terminal_size().columns >= _WIDE
+    is_wide = not _shows_bar() or shutil.get_terminal_size().columns >= _WIDE
     with show_steps(say) as show:
 
         def progress(what: str, iteration: int, done: int, total: int) -> None:
@@ -102,7 +106,7 @@ def show_progress(iterations: int, say: Callable[[str], None] = print_line) -> I
 @contextmanager
 def show_steps(say: Callable[[str], None] = print_line) -> Iterator[Show]:
     """What shows steps on stderr: a bar on a terminal, elsewhere a line now and then."""
-    if is_terminal(sys.stderr) or os.environ.get("FORCE_COLOR"):
+    if _shows_bar():
         with _show_bar() as show:
             yield show
     else:

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
 
 from stillmap.core.camera import Camera
@@ -86,12 +85,13 @@ def calibrate_color_camera(
 
 def _maximize_score(guess: Float, edges: Sequence[_Edges]) -> Float:
     """Parameters of the best score near the guess (Nelder-Mead); the guess if they are far off."""
+    from scipy.optimize import fmin
 
     def cost(numbers: Any) -> float:
         return -_score(numbers, edges)
 
     steps = np.array([0.005, 0.005, *(guess[2] * np.array([0.01, 0.006, 0.006]))])
-    found = scipy.optimize.fmin(
+    found = fmin(
         cost,
         guess,
         xtol=0.02,  # pixels
@@ -105,6 +105,8 @@ def _maximize_score(guess: Float, edges: Sequence[_Edges]) -> Float:
 
 
 def _find_edges(K: Float, scale: float, pairs: Sequence[tuple[Path, Path]]) -> list[_Edges]:
+    from scipy.ndimage import gaussian_filter
+
     chosen = np.unique(np.linspace(0, len(pairs) - 1, min(_MAX_IMAGES, len(pairs))).astype(np.intp))
     out = []
     for pair in chosen.tolist():
@@ -116,7 +118,7 @@ def _find_edges(K: Float, scale: float, pairs: Sequence[tuple[Path, Path]]) -> l
         if not is_pair or min(depth.shape) < _MIN_SIZE:
             continue
         grey = color.astype(np.float32).mean(axis=2) if color.ndim == 3 else color
-        smooth = scipy.ndimage.gaussian_filter(grey.astype(np.float32), 1.0)
+        smooth = gaussian_filter(grey.astype(np.float32), 1.0)
         for axis in (0, 1):
             gradient = np.abs(np.gradient(smooth, axis=axis))
             out.append(_Edges(_depth_edges(depth / scale, K, axis), gradient))

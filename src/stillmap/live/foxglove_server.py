@@ -60,7 +60,7 @@ class FoxgloveServer(ServerListener):
 
     def __init__(self, host: str = HOST, port: int = PORT) -> None:
         if not 0 <= port < 1 << 16:
-            raise InputError(f"--port wants 0 to 65535, got {port}")
+            raise InputError(f"the port is from 0 to 65535, not {port}")
         # it has a line about each client whose request is malformed
         logging.getLogger("foxglove").setLevel(logging.CRITICAL)
         self._context = context = Context()

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
 
 from stillmap.core import se2
@@ -187,6 +186,8 @@ def _read_oxts(folder: Path) -> list[Float]:
 
     East, north and up from the first pose, in the Mercator projection that is to scale there.
     """
+    from scipy.spatial.transform import Rotation
+
     out: list[Float] = []
     scale = first = None
     for path in list_files(folder, (".txt",)):
@@ -200,7 +201,7 @@ def _read_oxts(folder: Path) -> list[Float]:
             y = scale * _EARTH * math.log(math.tan(math.pi * (90.0 + latitude) / 360.0))
             position = np.array([x, y, height])
             first = position if first is None else first
-            R = scipy.spatial.transform.Rotation.from_euler("ZYX", angles[::-1]).as_matrix()
+            R = Rotation.from_euler("ZYX", angles[::-1]).as_matrix()
             out.append(rigid_transform(R, position - first))
         except ValueError as error:
             raise InputError(f"is damaged: {error}", where=str(path)) from error

@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
 
 from stillmap.core.errors import InputError
@@ -101,11 +100,13 @@ def _read_heading(path: Path) -> tuple[int, int]:
 
 def _read_pose(path: Path) -> NDArray[np.float64] | None:
     """(4, 4) pose in the file beside a scan; None where there is no valid one."""
+    from scipy.spatial.transform import Rotation
+
     file = path.with_name(strip_extension(path.name, EXTENSIONS) + ".pose")
     try:
         words = read_bytes(file, _MAX_POSE).split()
         position, angles = np.array([float(word) for word in words[:6]]).reshape(2, 3)
-        R = scipy.spatial.transform.Rotation.from_euler("XYZ", angles, degrees=True).as_matrix()
+        R = Rotation.from_euler("XYZ", angles, degrees=True).as_matrix()
         return rigid_transform(_AXES @ R @ _AXES.T, _METRES * _AXES @ position)
     except (InputError, OSError, ValueError):
         return None
