@@ -77,7 +77,7 @@ def test_nearest_places_of_faces_and_ground() -> None:
         ]
     )
     wanted = [0.3, 0.5, 0.2, 0.05, 0.07, 0.1]
-    distance, places = StaticSurfaces(wall, none, STREET, 3.0).project_to_static(points)
+    distance, places = project_to_static(StaticSurfaces(wall, none, STREET, 3.0), points)
     assert np.allclose(distance, wanted)
     assert np.allclose(np.linalg.norm(places - points, axis=1), wanted)
     assert np.allclose(
@@ -89,9 +89,8 @@ def test_distance_to_a_slope_is_at_right_angles() -> None:
     slope = Ground(np.array([0.1, 0.0]), np.empty((0, 4)), 0.0)
     nothing = Faces(np.empty((0, 4)), np.empty((0, 2)), np.empty(0, bool))
     none = _solid(BOX, (1.0, 1.0), (0.0, 1.0)).select(np.zeros(1, bool))
-    distance, places = StaticSurfaces(nothing, none, slope, None).project_to_static(
-        np.array([[10.0, 3.0, 2.0]])
-    )
+    plane = StaticSurfaces(nothing, none, slope, None)
+    distance, places = project_to_static(plane, np.array([[10.0, 3.0, 2.0]]))
     assert np.allclose(distance, 1.0 / np.sqrt(1.01))
     assert np.allclose(places[:, 2], 0.1 * places[:, 0])
 
