@@ -80,7 +80,7 @@ def scores_of(result: stillmap.Result, simulation: Simulation) -> Scores:
     things = score_things(
         grid_of(result.map), stays, beams, truth.walls, T_world_map, majority=majority
     )
-    found = _of_things(result.changes, simulation, T_world_map)
+    found = _of_things(result.mapping.changes, simulation, T_world_map)
     times = score_change_times(found, list_true_changes(stays, beams), T_world_map)
     off = np.array(times.errors)
     return {

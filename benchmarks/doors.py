@@ -91,7 +91,7 @@ def _scored(run: Run) -> Scores:
 
 def scores_of(result: stillmap.Result, simulation: Simulation) -> Scores:
     """Scores of the doors of one result."""
-    doors = [one.door for one in result.changes if one.door is not None]
+    doors = [one.door for one in result.mapping.changes if one.door is not None]
     leaves = simulation.scene.leaves
     T_world_map = align(result.poses, simulation.truth.T_world_base)
     hinges = moved(T_world_map, np.array([one.hinge for one in doors]).reshape(-1, 2))

@@ -70,7 +70,7 @@ def found(job: Job) -> Found:
         scans=recording.n_scans,
         of_beams=float(np.mean(dynamic)),
         of_hits=float(np.mean(dynamic[recording.hit])),
-        changes=len(result.changes),
+        changes=len(result.mapping.changes),
         objects=len(result.objects),
         cpu_ms=cpu_ms,
     )

@@ -99,7 +99,7 @@ def test_the_map_follows_from_the_labels(room, fixed):
     np.testing.assert_allclose(m.p_occupied[passed], free[passed], atol=1e-6)
     assert np.isnan(e[100:110]).all()
     assert np.ptp(e[hit]) > 0.5
-    assert result.changes == []
+    assert result.mapping.changes == []
     poses, chosen = result.poses, result.options.em
     again, courses = em.final_e_step(recording, poses, m.resolution, chosen, threads=2)
     noise_std = courses.surfel_map.noise_std

@@ -71,7 +71,7 @@ def seconds(change):
 
 
 def only(kind, stay):
-    (one,) = [one for one in built().changes if one.kind == kind and near(one, stay)]
+    (one,) = [one for one in built().mapping.changes if one.kind == kind and near(one, stay)]
     return one
 
 
@@ -90,7 +90,7 @@ def test_what_was_moved_left_one_place_and_came_to_another():
         assert before < after
     taken = only("left", Stay(-2.6, -2.0))
     assert seconds(taken)[1] == pytest.approx(GONE, abs=2.0)
-    assert len([one for one in built().changes if one.kind in ("came", "left")]) == 3
+    assert len([one for one in built().mapping.changes if one.kind in ("came", "left")]) == 3
 
 
 def test_the_map_is_that_of_its_state():
@@ -100,8 +100,8 @@ def test_the_map_is_that_of_its_state():
     assert (shown(built(), left.cells) < 0.2).mean() > 0.9
     assert (shown(most, came.cells) < 0.2).mean() > 0.9
     assert (shown(most, left.cells) > 0.65).mean() > 0.5
-    assert [(one.kind, one.stamp_ns) for one in most.changes] == [
-        (one.kind, one.stamp_ns) for one in built().changes
+    assert [(one.kind, one.stamp_ns) for one in most.mapping.changes] == [
+        (one.kind, one.stamp_ns) for one in built().mapping.changes
     ]
 
 
@@ -109,7 +109,7 @@ def test_the_map_is_that_of_its_state():
 def test_an_object_is_shown_in_one_state(state):
     occupied = [
         (shown(built(state), one.cells) > 0.5).mean()
-        for one in built().changes
+        for one in built().mapping.changes
         if one.kind in ("came", "left")
     ]
     # corners of cells that hardly hold any surface stay free
@@ -132,7 +132,7 @@ def test_what_is_not_listed_stays_what_it_is_without_changes():
     _, courses = em.final_e_step(
         result.deskewed, result.poses, result.map.resolution, result.options.em
     )
-    cells = {tuple(cell) for one in result.changes for cell in one.cells.tolist()}
+    cells = {tuple(cell) for one in result.mapping.changes for cell in one.cells.tolist()}
     element = courses.surfel_map.associate_beams(
         result.deskewed.points, result.deskewed.hit, result.deskewed.offset,
         result.deskewed.T_map_sensor(result.poses),
@@ -140,14 +140,14 @@ def test_what_is_not_listed_stays_what_it_is_without_changes():
     of_cells = np.array([tuple(cell) in cells for cell in courses.cells.tolist()])
     there = (element >= 0) & of_cells[element]
     assert 0.01 < there.mean() < 0.3
-    pooled = pool_states(courses, result.changes, "last")
+    pooled = pool_states(courses, result.mapping.changes, "last")
     shown = courses.p_in_map("last", pooled)[element]
     on_leaf = np.zeros(len(courses.cells), bool)
     for leaf in (swing().door.open_cells, swing().door.shut_cells):
         on_leaf |= np.isin(cell_keys(courses.cells), cell_keys(leaf))
     there |= (element >= 0) & on_leaf[element]
     shown[on_leaf[element]] = 0.0
-    shown *= 1.0 - find_shown_cells(courses, result.changes, "last").p_leaf[element]
+    shown *= 1.0 - find_shown_cells(courses, result.mapping.changes, "last").p_leaf[element]
     noise_std = courses.surfel_map.noise_std
     others, _ = apply_motion_evidence(result.deskewed, result.poses, without.p_static, noise_std)
     np.testing.assert_array_equal(result.p_static, np.where(there, shown, others))
@@ -163,11 +163,11 @@ def test_a_crate_is_no_object_on_its_way_and_people_are():
 
 
 def swing():
-    return next(one for one in built().changes if one.kind == "door")
+    return next(one for one in built().mapping.changes if one.kind == "door")
 
 
 def test_a_door_that_swings_is_one_place():
-    (door,) = [one for one in built().changes if one.kind not in ("came", "left")]
+    (door,) = [one for one in built().mapping.changes if one.kind not in ("came", "left")]
     assert door.kind == "door"
     assert door.times >= 3
     assert seconds(door)[1] < door.last_ns * 1e-9
@@ -219,7 +219,7 @@ def test_where_a_door_swings_the_map_is_free_and_marked(state):
     result = built(state)
     cells = in_the_sector(0.1)
     assert len(cells) > 120
-    layer = changed_cells(result.map, result.changes)
+    layer = changed_cells(result.map, result.mapping.changes)
     first = np.round(np.array(result.map.origin[:2]) / result.map.resolution).astype(int)
     column, row = (cells - first).T
     assert (layer[row, column] == CHANGED["door"]).mean() > 0.95
@@ -246,8 +246,8 @@ def test_threads_change_no_bit():
     one, other = built(), built(threads=2)
     assert one.p_static.tobytes() == other.p_static.tobytes()
     assert one.map.p_occupied.tobytes() == other.map.p_occupied.tobytes()
-    assert len(one.changes) == len(other.changes)
-    for a, b in zip(one.changes, other.changes, strict=True):
+    assert len(one.mapping.changes) == len(other.mapping.changes)
+    for a, b in zip(one.mapping.changes, other.mapping.changes, strict=True):
         assert (a.kind, a.x, a.y, a.size, a.before_ns, a.stamp_ns, a.last_ns, a.times) == (
             b.kind, b.x, b.y, b.size, b.before_ns, b.stamp_ns, b.last_ns, b.times,
         )  # fmt: skip
@@ -260,5 +260,5 @@ def test_it_takes_its_time_in_a_stage_of_its_own():
 
 def test_they_may_be_left_alone():
     result = built(changes=False)
-    assert result.changes == []
+    assert result.mapping.changes == []
     assert "changing" not in result.learned

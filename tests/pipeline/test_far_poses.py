@@ -54,8 +54,8 @@ def require_shifted(far, near, dimension):
     assert len(far.objects) == len(near.objects)
     for one, other in zip(far.objects, near.objects, strict=True):
         np.testing.assert_allclose(one.xy - UTM[:2], other.xy, rtol=0, atol=1e-5)
-    assert [(c.kind, len(c.cells)) for c in far.changes] == [
-        (c.kind, len(c.cells)) for c in near.changes
+    assert [(c.kind, len(c.cells)) for c in far.mapping.changes] == [
+        (c.kind, len(c.cells)) for c in near.mapping.changes
     ]
 
 

@@ -82,5 +82,5 @@ def test_the_files_say_so(built, tmp_path):
 def test_nothing_is_listed_that_was_not_asked_for(hall):
     chosen = options("stillmap", change_detection=False)
     result = stillmap.build(hall.recording, chosen, poses=hall.truth.T_world_base)
-    assert result.changes == []
+    assert result.mapping.changes == []
     assert "changing" not in result.learned
