@@ -5,9 +5,7 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +21,9 @@ from stillmap.sim.walls import box
 sys.path.insert(0, str(Path(__file__).resolve().parent))  # for what the tests share
 
 import stand_in as stand_ins
+from fleet_processes import NAMES, wait_until
 from result_contents import contents
 
-NAMES = ("hall", "office", "yard")  # of the recordings
 COMMAND = [sys.executable, "-m", "stillmap"]
 
 
@@ -147,27 +145,6 @@ def s3_environment(s3_server: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
 def _answers(port: int) -> bool:
     with socket.socket() as one:
         return one.connect_ex(("127.0.0.1", port)) == 0
-
-
-def wait_until(condition: Callable[[], object], seconds: float = 60.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "waited for too long"
-        time.sleep(0.01)
-
-
-def children_of(pid: int) -> set[int]:
-    """The living processes below a process (Linux)."""
-    parents = {}
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        with suppress(OSError):
-            state, parent = path.read_text().rpartition(")")[2].split()[:2]
-            if state != "Z":
-                parents[int(path.parent.name)] = int(parent)
-    below = {pid}
-    while new := {child for child, parent in parents.items() if parent in below} - below:
-        below |= new
-    return below - {pid}
 
 
 @pytest.fixture

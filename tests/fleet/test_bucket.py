@@ -6,7 +6,7 @@ import re
 import urllib.request
 
 import pytest
-from conftest import NAMES
+from fleet_processes import NAMES
 from result_contents import contents
 
 from stillmap.core.errors import InputError

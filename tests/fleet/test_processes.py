@@ -9,7 +9,7 @@ from html.parser import HTMLParser
 
 import pytest
 import stand_in
-from conftest import NAMES, children_of, wait_until
+from fleet_processes import NAMES, children_of, wait_until
 from result_contents import contents
 
 from stillmap.fleet import Request, run_fleet

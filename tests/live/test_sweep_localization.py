@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import simulate_sweeps
+from live_runs import simulate_sweeps
 
 import stillmap
 from stillmap.core import se2

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import Run, simulate_sweeps
+from live_runs import Run, simulate_sweeps
 
 import stillmap
 from stillmap.core import se2
