@@ -204,7 +204,7 @@ def test_decompression_bombs(name, pack, monkeypatch):
         (b"\x89MCAP0\r\n", "holds no scans"),
         (b"SQLite format 3\0" + bytes(100), "holds no scans"),
         (b"", "is empty"),
-        (b"\0\1\2\3", "is binary, no recording"),
+        (b"\0\1\2\3", "is no recording that stillmap reads"),
     ],
 )
 def test_other_files(tmp_path, content, text):
