@@ -143,19 +143,18 @@ class TransformListener:
         from rclpy.qos import DurabilityPolicy, QoSProfile
         from tf2_msgs.msg import TFMessage
 
+        self.buffer = buffer
         static = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        for topic, add, qos in (
-            ("/tf", buffer.set_transform, 100),
-            ("/tf_static", buffer.set_transform_static, static),
-        ):
-            node.create_subscription(TFMessage, topic, self._callback(add), qos)
+        node.create_subscription(TFMessage, "/tf", self.callback, 100)
+        node.create_subscription(TFMessage, "/tf_static", self.static_callback, static)
 
-    def _callback(self, add):
-        def callback(message):
-            for transform in message.transforms:
-                add(transform, "default_authority")
+    def callback(self, message):
+        for transform in message.transforms:
+            self.buffer.set_transform(transform, "default_authority")
 
-        return callback
+    def static_callback(self, message):
+        for transform in message.transforms:
+            self.buffer.set_transform_static(transform, "default_authority")
 
 
 class TransformBroadcaster:

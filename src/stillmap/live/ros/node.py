@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 _NAME = "stillmap"
 _ODOMETRY_DEPTH = 50
-_POLL = 0.005  # s after which scans that wait are tried again
+_POLL = 0.02  # s after which scans that wait are tried again
 _STATUS_PERIOD = 1.0  # s
 _LATENCIES = 1000  # scans over which latency is given
 
@@ -143,11 +143,22 @@ class LiveNode:
                 depth=_ODOMETRY_DEPTH, reliability=qos.ReliabilityPolicy.BEST_EFFORT
             )
             node.create_subscription(odometry, names.odom_topic, self._on_odometry, deep)
-        self._listener = self._ros.tf2_ros.TransformListener(self._transforms.buffer, node)
+        self._listener = self._listen_to_tf()
         clock = self._ros.module("clock")
         steady = clock.Clock(clock_type=clock.ClockType.STEADY_TIME)
         self._poll = node.create_timer(_POLL, self._answer_all, clock=steady)
         node.create_timer(_STATUS_PERIOD, self._report, clock=steady)
+
+    def _listen_to_tf(self) -> Any:
+        """A listener of tf2_ros: what comes may be what scans wait for."""
+        answer_all = self._answer_all
+
+        class Listener(self._ros.tf2_ros.TransformListener):  # type: ignore[misc, name-defined]
+            def callback(self, message: Any) -> None:
+                super().callback(message)
+                answer_all()
+
+        return Listener(self._transforms.buffer, self.node)
 
     def _make_save_node(self) -> Any:
         """A hidden node with the service ~/save_map, to be spun beside the other one."""
