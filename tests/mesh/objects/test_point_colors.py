@@ -1,5 +1,6 @@
 """Colours of points, from start to end: what was seen of a small room with people in it."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -7,7 +8,10 @@ from model_readers import read_camera_simulation
 from model_surface import compute_color_difference
 from true_surfaces import project_to_static
 
+import stillmap
+from stillmap.core.camera import Images
 from stillmap.io import stillmap_folder
+from stillmap.io.trajectory import poses_from_tum
 from stillmap.mesh.texture import GRAY
 from stillmap.results.points import COLOURS, FIELDS
 from stillmap.sim.camera import compute_static_color
@@ -48,9 +52,21 @@ def test_colours_of_what_stands_still_are_the_true_ones(room, result):
     assert np.median(mixed) > 3.0 * np.median(difference)
 
 
-def test_what_moves_has_colours_of_what_moves(told, room):
-    found, colours = told(True)
-    use = found.recording.hit & (found.p_static < 0.5) & coloured(colours)
+def test_what_moves_has_colours_of_what_moves(room):
+    """Of pictures that are red where something moves."""
+    recording, truth = stillmap.read(room), read_camera_simulation(room).image_truth
+
+    def paint(image):
+        moves = truth.mask(image) > 0
+        return np.stack([np.where(moves, 250, 10)] + 2 * [np.full(moves.shape, 30)], 2).astype("u1")
+
+    images = recording.images
+    painted = Images(images.stamp_ns, images.camera, images.cameras, paint)
+    recording = dataclasses.replace(recording, images=painted)
+    poses = poses_from_tum(room / "truth/trajectory.tum", recording)
+    result = stillmap.build(recording, stillmap.Options(threads=1), poses=poses)
+    colours = stillmap.build_models(result).point_colors.colors
+    use = recording.hit & (result.p_static < 0.5) & coloured(colours)
     use &= np.load(room / "truth/mover.npy") >= 0
     assert use.sum() > 100
     assert (colours[use, 0] > 130).mean() > 0.9
