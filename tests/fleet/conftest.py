@@ -1,6 +1,5 @@
 """Fixtures: small recordings, results made by hand, a stand-in for stillmap, S3, Dask."""
 
-import os
 import signal
 import socket
 import subprocess
@@ -13,7 +12,6 @@ import distributed
 import numpy as np
 import pytest
 
-import stillmap
 from stillmap.cli.main import main
 from stillmap.sim import CrowdOptions, LaserOptions, RobotOptions, Scene, simulate, write_simulation
 from stillmap.sim.walls import box
@@ -145,32 +143,3 @@ def s3_environment(s3_server: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
 def _answers(port: int) -> bool:
     with socket.socket() as one:
         return one.connect_ex(("127.0.0.1", port)) == 0
-
-
-@pytest.fixture
-def dask_cluster(tmp_path: Path) -> Iterator[tuple[str, list[int]]]:
-    """A scheduler and two workers as processes; its address and the ids of the workers."""
-    port, processes = free_port(), []
-    address = f"tcp://127.0.0.1:{port}"
-    # found from any working directory, where stillmap is not installed
-    environment = {**os.environ, "PYTHONPATH": str(Path(stillmap.__file__).parents[1])}
-
-    def run(*words: str) -> None:
-        command = [sys.executable, "-m", f"distributed.cli.{words[0]}", *words[1:]]
-        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        processes.append(
-            subprocess.Popen(
-                command, cwd=tmp_path, env=environment, start_new_session=True, **quiet
-            )
-        )
-
-    try:
-        run("dask_scheduler", "--port", str(port), "--no-dashboard", "--host", "127.0.0.1")
-        wait_until(lambda: _answers(port))
-        for _ in range(2):
-            run("dask_worker", address, "--nthreads", "1", "--no-dashboard", "--no-nanny")
-        yield address, [process.pid for process in processes[1:]]
-    finally:
-        for process in processes:
-            process.kill()
-            process.wait()

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from stillmap.core.array_folder import FORMAT_VERSION
 from stillmap.core.errors import InputError
 
 
@@ -42,7 +43,13 @@ def run_command(words):
 def write(output, more):
     (output / "beams").mkdir(parents=True)
     counts = {"scans": 10, "beams": 1000}
-    record = {"counts": counts, "warnings": [], "quality": {"overall": 80.0}, **more}
+    record = {
+        "format_version": FORMAT_VERSION,
+        "counts": counts,
+        "warnings": [],
+        "quality": {"overall": 80.0},
+        **more,
+    }
     (output / "run.json").write_text(json.dumps(record))
     np.save(output / "beams/stamp_ns.npy", np.array([10, 46], np.int64) * 10**9)
     # a map without cells

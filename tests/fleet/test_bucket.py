@@ -90,15 +90,6 @@ def test_goes_on(stand_in, s3):
     assert names == set("abc")
 
 
-def test_changed_object_is_mapped_again(stand_in, s3):
-    fill(s3, a="fine")
-    assert stand_in(*LOGS_TO_OUT).returncode == 0
-    before = s3.cat("robots/out/results/a/made.json")
-    fill(s3, a="fine\n")
-    assert stand_in(*LOGS_TO_OUT).returncode == 0
-    assert json.loads(s3.cat("robots/out/results/a/made.json"))["key"] != json.loads(before)["key"]
-
-
 def test_half_an_upload_is_no_result(stand_in, s3):
     fill(s3, a="fine")
     assert stand_in(*LOGS_TO_OUT).returncode == 0
@@ -139,14 +130,6 @@ def test_manifest_and_missing_object(stand_in, s3, tmp_path):
     done = stand_in("--manifest", "s3://robots/logs/m.csv", "-o", tmp_path / "out", "--quiet")
     assert done.returncode == 3
     assert done.stderr == "stillmap: b: s3://robots/logs/b.clf: does not exist\n"
-
-
-def test_folder_with_other_things(call, s3):
-    fill(s3, a="fine")
-    done = call("fleet", "s3://robots/logs", "-o", "s3://robots/logs")
-    assert done.returncode == 2
-    assert "s3://robots/logs: already holds something" in done.stderr
-    assert listed(s3) == ["logs/a.clf"]
 
 
 @pytest.mark.usefixtures("s3")

@@ -4,8 +4,7 @@ import argparse
 import json
 import os
 import shlex
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from stillmap.cli.arguments import (
@@ -83,8 +82,13 @@ def run(args: argparse.Namespace) -> int:
     """Map the recordings."""
     from stillmap.fleet import run_fleet
 
-    with _explain_interruption(args), show_tasks(args.quiet) as progress:
-        fleet = run_fleet(_read_request(args, progress))
+    try:
+        with show_tasks(args.quiet) as progress:
+            fleet = run_fleet(_read_request(args, progress))
+    except (KeyboardInterrupt, SystemExit):
+        if not args.quiet:
+            say(f"continue with the same command: {shlex.join(['stillmap', *args.words])}")
+        raise
     if not args.quiet:
         _print_summary(fleet, args.output)
     if args.json:
@@ -161,23 +165,10 @@ def _changed_options(options: "Options") -> list[str]:
     return flags
 
 
-@contextmanager
-def _explain_interruption(args: argparse.Namespace) -> Iterator[None]:
-    """Say after an interruption how to go on."""
-    try:
-        yield
-    except (KeyboardInterrupt, SystemExit):
-        if not args.quiet:
-            say(f"continue with the same command: {shlex.join(['stillmap', *args.words])}")
-        raise
-
-
 def _print_summary(fleet: "Fleet", output: str) -> None:
     done = sum(job.outcome.is_done for job in fleet.jobs)
-    lines = [f"mapped {done} of {len(fleet.jobs)} recordings"]
+    say(f"mapped {done} of {len(fleet.jobs)} recordings")
     if fleet.places:
         merged = sum(place.is_done for place in fleet.places)
-        lines.append(f"merged {merged} of {len(fleet.places)} places")
-    lines.append(f"wrote {output}: open {output.rstrip('/')}/fleet.html")
-    for line in lines:
-        say(line)
+        say(f"merged {merged} of {len(fleet.places)} places")
+    say(f"wrote {output}: open {output.rstrip('/')}/fleet.html")

@@ -15,7 +15,7 @@ from stillmap.fleet.inputs import Source, find_sources
 from stillmap.fleet.jobs import PLACES, RESULTS, Fleet, Job, Outcome, Place, Request
 from stillmap.fleet.locations import absolute, explain, is_folder_name, is_local, open_location
 from stillmap.fleet.page import render_page
-from stillmap.fleet.tasks import MADE, STAGING, Task, read_made, run_task
+from stillmap.fleet.tasks import STAGING, Task, read_made, run_task
 
 LIST, PAGE = "fleet.json", "fleet.html"
 # Ctrl-C at a terminal reaches all processes: the client alone ends its workers
@@ -65,8 +65,10 @@ def _require_fleet(root: str) -> None:
 def _known_names(root: str) -> dict[str, str]:
     """The names of the results that are there, by input."""
     fs, path = open_location(root)
+    folder = f"{path}/{RESULTS}"
     with explain(root, "read"):
-        names = [str(one).split("/")[-2] for one in fs.glob(f"{path}/{RESULTS}/*/{MADE}")]
+        paths = fs.ls(folder, detail=False) if fs.isdir(folder) else []
+    names = [str(one).rstrip("/").rpartition("/")[2] for one in paths]
     known = {name: read_made(root, f"{RESULTS}/{name}") for name in names if is_folder_name(name)}
     return {made.input: name for name, made in known.items() if made is not None}
 
