@@ -116,7 +116,7 @@ def test_a_region_is_in_the_map_frame(room):
     result = stillmap.build(room.recording, chosen, poses=poses)
     from stillmap.results.region import crop_result
 
-    cropped = crop_result(result)
+    cropped = crop_result(result.mapping)
     assert cropped.map.origin[:2] == pytest.approx(region[:2], abs=1e-6)
     assert cropped.map.p_occupied.shape == (50, 60)
 
