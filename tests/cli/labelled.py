@@ -41,7 +41,11 @@ def label(
     write_tum(folder / "trajectory.tum", recording.stamp_ns, poses)
     if recording.dimension == 3:
         (folder / "static.ply").write_text("")
-    record = {"input": {"path": str(source)}, "options": {"read": options or {}}}
+    record = {
+        "format_version": 1,
+        "input": {"path": str(source)},
+        "options": {"read": options or {}},
+    }
     (folder / "run.json").write_text(json.dumps(record))
     return recording, blank
 

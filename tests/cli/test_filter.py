@@ -178,11 +178,14 @@ def test_overwrite_flag(call, mapped, tmp_path):
     ("content", "words"),
     [
         ("{", "not JSON"),
-        ("[]", "no input named"),
-        ('{"input": {}}', "names no recording"),
-        ('{"input": {"path": null}}', "names no recording"),
-        ('{"input": {"path": "x"}}', "names no options"),
-        ('{"input": {"path": "x"}, "options": {"read": {"no_such": 1}}}', "options that cannot be"),
+        ("[]", "run.json"),
+        ('{"format_version": 1, "input": {}}', "names no recording"),
+        ('{"format_version": 1, "input": {"path": null}}', "names no recording"),
+        ('{"format_version": 1, "input": {"path": "x"}}', "names no options"),
+        (
+            '{"format_version": 1, "input": {"path": "x"}, "options": {"read": {"no_such": 1}}}',
+            "options that cannot be",
+        ),
     ],
 )
 def test_damaged_run_json(call, mapped, tmp_path, content, words):

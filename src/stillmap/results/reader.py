@@ -402,7 +402,7 @@ class RunRecord(ShortRepr):
             InputError: the record does not say so.
         """
         read_as = self._section("read")
-        if not read_as:
+        if "read" not in (self.record.get("options") or {}):
             raise InputError("names no options", where=str(self.folder / RECORD))
         return self._override(ReadOptions(), read_as)
 
