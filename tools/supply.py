@@ -17,11 +17,11 @@ from pathlib import Path
 from packaging.requirements import Requirement
 
 PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
-RUNTIME = ("io", "mesh", "viewer", "notebook", "rerun", "live", "fleet", "s3")
+RUNTIME = ("io", "mesh", "viewer", "notebook", "live", "fleet", "s3")
 
 PERMISSIVE = {
-    *("MIT", "MIT-CMU", "BSD", "BSD-2-Clause", "BSD-3-Clause", "0BSD", "Apache-2.0", "ISC"),
-    *("PSF-2.0", "Zlib", "CC0-1.0", "HPND", "Unlicense"),
+    *("MIT", "MIT-0", "MIT-CMU", "BSD", "BSD-2-Clause", "BSD-3-Clause", "0BSD", "Apache-2.0"),
+    *("PSF-2.0", "Zlib", "CC0-1.0", "HPND", "ISC", "Unlicense"),
 }
 # as packages spell them without SPDX
 NAMES = {
