@@ -288,7 +288,7 @@ def test_a_port_that_is_taken_is_said_in_one_line(server, hall, tmp_path, capsys
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (["--foxglove", "--port", "70000"], "--port"),
+        (["--foxglove", "--port", "70000"], "port is from 0"),
         (["--foxglove", "--port", "0", "--host", "192.0.2.1"], "192.0.2.1"),
         (["--port", "8765"], "--foxglove"),
         (["--host", "0.0.0.0"], "--foxglove"),
