@@ -60,7 +60,10 @@ def perfect(simulation: Simulation, state: str) -> SimpleNamespace:
         for c in list_true_changes(stays, beams) if c.observed_ns is not None
     ]  # fmt: skip
     options = SimpleNamespace(output=SimpleNamespace(map_state="last"))
-    return SimpleNamespace(poses=truth.T_world_base, map=occupancy, changes=found, options=options)
+    mapping = SimpleNamespace(changes=found)
+    return SimpleNamespace(
+        poses=truth.T_world_base, map=occupancy, mapping=mapping, options=options
+    )
 
 
 def test_what_is_right_scores_full_marks(street: Simulation) -> None:
