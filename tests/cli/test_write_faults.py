@@ -16,7 +16,7 @@ import pytest
 from maps import QUICK
 
 import stillmap
-from stillmap.core import files, output_place
+from stillmap.core import files
 from stillmap.io import write
 from stillmap.mesh.triangle_mesh import Mesh
 from stillmap.results.gltf import write_glb
@@ -159,7 +159,7 @@ def _mount(folder: Path, name: str, writer: Writer) -> Iterator[Path]:
     else:
         path.write_text("old")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(output_place, "_mount_points", lambda: {os.fsencode(path)})
+        patch.setattr(files, "_mount_points", lambda: {os.fsencode(path)})
         for function in ("rename", "replace"):
             original = getattr(os, function)
 
