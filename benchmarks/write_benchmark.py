@@ -6,6 +6,7 @@ Each row of a CSV file is one figure: question, case, figure, value, unit, comma
 the figure was entered), seeds, machine. Files named more_*.csv are listed, not shown.
 """
 
+import argparse
 import csv
 from itertools import groupby
 from pathlib import Path
@@ -27,6 +28,7 @@ Row = dict[str, str]
 
 def main() -> None:
     """Write the page."""
+    argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0]).parse_args()
     PAGE.write_text(render_page(), encoding="utf-8")
 
 
