@@ -169,8 +169,8 @@ def test_far_mounts_are_named(dimension, metres):
 @pytest.mark.parametrize(
     ("name", "value", "what"),
     [
-        *[("T_base_sensor", {"x": x}, "the mount of sensor 0 is not finite") for x in NOT_FINITE],
-        *[("T_base_sensor", {"x": x}, "sensor 0 is mounted") for x in (1e30, 1e300)],
+        *[("T_base_sensor", {"x": x}, "no rigid transform") for x in NOT_FINITE],
+        *[("T_base_sensor", {"x": x}, "no rigid transform") for x in (1e30, 1e300)],
         *[("T_base_sensor", {"rotation": r}, "no rigid transform") for r in (0.0, -1.0, 2.0)],
         *[("T_odom_base", {"x": x}, "odometry: expected") for x in (1e10, 1e300, *NOT_FINITE)],
         *[("T_odom_base", {"rotation": r}, "odometry: expected") for r in (0.0, 3.0, np.nan)],
