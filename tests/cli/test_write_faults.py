@@ -248,7 +248,7 @@ def _names(folder: Path) -> set[str]:
 
 
 @pytest.mark.parametrize(("writer", "fault"), list(_cases()))
-def test_fault(call, inputs, tmp_path, monkeypatch, writer, fault):
+def test_fault(call, inputs, tmp_path, writer, fault):
     if writer.ending in _NEEDS:
         pytest.importorskip(_NEEDS[writer.ending])
     stem = fault.stem[: len(fault.stem) - len(writer.ending)] if len(fault.stem) > 9 else fault.stem
