@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from maps import QUICK
+from maps import QUICK, TWO_ITERATIONS
 
 from stillmap.cli.main import main
 
@@ -144,9 +144,7 @@ def test_what_was_computed_is_resumed(room, tmp_path, monkeypatch, capsys):
     def fail(*_):
         raise MemoryError("std::bad_alloc")
 
-    words = ["map", str(room), "-o", str(tmp_path / "out")]
-    for setting in ("max_iterations=2", "patience=9", "tolerance=0", "label_tolerance=0"):
-        words += ["--set", f"em.{setting}"]
+    words = ["map", str(room), "-o", str(tmp_path / "out"), *TWO_ITERATIONS]
     with monkeypatch.context() as patched:
         patched.setattr("stillmap.results.writer.write_labels", fail)
         assert main([*words, "--quiet"]) == 2
