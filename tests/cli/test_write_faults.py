@@ -261,8 +261,12 @@ def test_fault(call, inputs, tmp_path, writer, fault):
         if done.returncode == 0:
             _check_output(output, writer)
         else:
-            assert done.stderr.count("\n") == 1
-            assert done.stderr.startswith("stillmap: ")
+            lines = done.stderr.splitlines()
+            assert all(line.startswith("stillmap: ") for line in lines)
+            if writer is WRITERS["live"] and fault is FAULTS["full"]:  # says so when it happens
+                assert "poses go on" in lines.pop(0)
+                assert "loops are no longer closed" in lines.pop(0)
+            assert len(lines) == 1
         left = _names(tmp_path) - known
     assert {name: _stamps(path) for name, path in inputs.items()} == before
     _check_what_is_left(left, done, output)
@@ -272,6 +276,8 @@ def test_fault(call, inputs, tmp_path, writer, fault):
 @pytest.mark.parametrize("name", [name for name in FAULTS if name not in ("vanishes", "mount")])
 def test_fleet(call, room, tmp_path, name):
     """Its tasks run in processes of their own, where faults cannot be set from here."""
+    if name == "denied" and os.geteuid() == 0:
+        pytest.skip("workers of root may write everywhere")
     fault = FAULTS[name]
     with fault.make(tmp_path, fault.stem, Writer(())) as output:
         known = _names(tmp_path)
@@ -281,8 +287,11 @@ def test_fleet(call, room, tmp_path, name):
             assert (output / "fleet.html").is_file()
             assert os.listdir(output / "results") == ["room"]
         else:
-            assert done.stderr.count("\n") == 1
-            assert done.stderr.startswith("stillmap: ")
+            lines = done.stderr.splitlines()
+            if name == "full":  # the recording that failed, then the fleet itself
+                assert lines.pop(0).startswith("stillmap: room: ")
+            assert len(lines) == 1
+            assert lines[0].startswith("stillmap: ")
         left = {one.split("/")[0] for one in _names(tmp_path) - known}
     # what a fleet has noted stays: the same command goes on
     assert left <= {output.name, "disk"}
@@ -310,7 +319,7 @@ def _check_what_is_left(left: set[str], done: object, output: Path) -> None:
     assert not [name for name in left if name.endswith(".part") or name.endswith(".old")]
     if done.returncode == 2:
         others = left - hidden
-        assert not others or "is kept in" in done.stderr, others
+        assert not others or "is kept in" in done.stderr or "drive is kept" in done.stderr, others
     else:
         stem = output.name.removesuffix(output.suffix)
         places = {name.split("/")[0] for name in left - hidden} - {"disk"}
