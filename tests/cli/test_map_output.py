@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from maps import ENDLESS, FILES, QUICK, list_files
+from maps import ENDLESS, FILES, QUICK, TWO_ITERATIONS, list_files
 from refusals import refused
 
 import stillmap.results.writer
@@ -57,10 +57,10 @@ def test_failed_write_is_refused_after_the_work(call, room):
     refused(call("map", room, "-o", "/proc/out", "--quiet", *QUICK), "/proc/out: cannot be written")
 
 
-@pytest.mark.parametrize("step", ["render_report", "write_labels", "write_run_json"])
+@pytest.mark.parametrize("step", ["render_report", "write_labels", "write_json"])
 def test_failure_at_the_end_keeps_what_was_computed(call, room, tmp_path, monkeypatch, step):
     """One line says how to go on; the same command with --resume does."""
-    out, words = tmp_path / "out", ("--quiet", *QUICK)
+    out, words = tmp_path / "out", ("--quiet", *TWO_ITERATIONS)
 
     def fail(*_, **__):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -69,14 +69,14 @@ def test_failure_at_the_end_keeps_what_was_computed(call, room, tmp_path, monkey
         patch.setattr(f"stillmap.results.writer.{step}", fail)
         done = call("map", room, "-o", out, *words)
     refused(
-        done, f"{out}: cannot be written: No space left on device (continue after iteration 1: "
+        done, f"{out}: cannot be written: No space left on device (continue after iteration 2: "
     )
-    command = shlex.split(done.stderr.partition("iteration 1: ")[2].rstrip(")\n"))
+    command = shlex.split(done.stderr.partition("iteration 2: ")[2].rstrip(")\n"))
     assert command == ["stillmap", "map", str(room), "-o", str(out), *words, "--resume"]
-    assert list_files(tmp_path) >= {".out.resume/iteration-1/state.json"}
-    done = call("map", room, "-o", out, *QUICK, "--resume")
+    assert list_files(tmp_path) >= {".out.resume/iteration-2/checkpoint.json"}
+    done = call("map", room, "-o", out, *TWO_ITERATIONS, "--resume")
     assert done.returncode == 0
-    assert "continues after iteration 1" in done.stderr
+    assert "continues after iteration 1" in done.stderr  # the last one is done again
     assert list_files(out) >= FILES
     assert os.listdir(tmp_path) == ["out"]
 
@@ -90,7 +90,7 @@ def test_defect_at_the_end_keeps_what_was_computed(call, room, tmp_path, monkeyp
     assert done.returncode == 1
     assert "stillmap: continue after iteration 1: stillmap map" in done.stderr
     assert "this is a defect of stillmap" in done.stderr
-    assert list_files(tmp_path) >= {".out.resume/iteration-1/state.json"}
+    assert list_files(tmp_path) >= {".out.resume/iteration-1/checkpoint.json"}
 
 
 def test_folder_that_appears_meanwhile(call, room, tmp_path, monkeypatch):

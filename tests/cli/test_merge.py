@@ -127,7 +127,7 @@ def test_what_is_refused(call, flat_days, flat_place, tmp_path, nothing_left):
     copy = tmp_path / "copy"
     shutil.copytree(flat_place, copy)
     (copy / "sessions" / "map1" / "state" / "nodes.npy").write_bytes(b"")
-    refused(call("merge", copy, flat_days / "map3", "-o", out), "nodes.npy")
+    refused(call("merge", copy, flat_days / "map3", "-o", out), "nodes.npy: is damaged")
     (copy / "sessions.json").unlink()
     refused(call("merge", copy, flat_days / "map3", "-o", out), "sessions.json: cannot be read")
     nothing_left("copy")

@@ -97,7 +97,7 @@ def test_all_sessions_or_none(call, flat_place, tmp_path, nothing_left):
     (copy / "sessions" / "map2" / "beams" / "p_static.npy").write_bytes(b"")
     refused(call("filter", copy, "-o", out, "--quiet"), "p_static.npy: is damaged")
     refused(call("filter", copy, "-o", out, "--input", tmp_path), "has several recordings")
-    refused(call("filter", copy, "-o", copy, "--overwrite"), "filtered.json is replaced")
+    refused(call("filter", copy, "-o", copy, "--overwrite"), "is the recording itself")
     nothing_left("copy")
 
 

@@ -19,7 +19,7 @@ from result_contents import contents
 from stillmap.core import array_folder
 from stillmap.pipeline import result
 from stillmap.pipeline.em_loop import iterate
-from stillmap.results import labels
+from stillmap.results import writer
 
 WORDS = ("--set", "em.max_iterations=4", "--set", "em.patience=9", "--set", "em.tolerance=0")
 WORDS += ("--set", "em.label_tolerance=0", "--threads", "1")
@@ -211,12 +211,12 @@ class _Full:
     def __init__(self, write, after: int) -> None:
         self._write, self._left = write, after
 
-    def __call__(self, path, array) -> None:
+    def __call__(self, path, *more) -> None:
         self._left -= 1
         if self._left < 0:
             path.write_bytes(b"half of it")
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
-        self._write(path, array)
+        self._write(path, *more)
 
 
 @pytest.mark.parametrize("after", [0, 1])
@@ -239,7 +239,7 @@ def test_full_disk_keeps_earlier_result(call, room, tmp_path, whole, monkeypatch
     out.mkdir()
     (out / "run.json").write_text("old")
     with monkeypatch.context() as here:
-        here.setattr(labels, "write_npy", _Full(labels.write_npy, 2))
+        here.setattr(writer, "write_labels", _Full(writer.write_labels, 0))
         done = call("map", room, "-o", out, "--overwrite", "--quiet", *WORDS)
     assert done.returncode == 2
     assert "No space left" in done.stderr

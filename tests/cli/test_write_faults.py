@@ -159,8 +159,7 @@ def _mount(folder: Path, name: str, writer: Writer) -> Iterator[Path]:
     else:
         path.write_text("old")
     with pytest.MonkeyPatch.context() as patch:
-        is_mount = os.path.ismount
-        patch.setattr(os.path, "ismount", lambda at: Path(at) == path or is_mount(at))
+        patch.setattr(os.path, "ismount", lambda other: Path(other) == path)
         for function in ("rename", "replace"):
             original = getattr(os, function)
 
@@ -262,8 +261,12 @@ def test_fault(call, inputs, tmp_path, writer, fault):
         if done.returncode == 0:
             _check_output(output, writer)
         else:
-            assert done.stderr.count("\n") == 1
-            assert done.stderr.startswith("stillmap: ")
+            lines = done.stderr.splitlines()
+            assert all(line.startswith("stillmap: ") for line in lines)
+            if writer is WRITERS["live"] and fault is FAULTS["full"]:  # says so when it happens
+                assert "poses go on" in lines.pop(0)
+                assert "loops are no longer closed" in lines.pop(0)
+            assert len(lines) == 1
         left = _names(tmp_path) - known
     assert {name: _stamps(path) for name, path in inputs.items()} == before
     _check_what_is_left(left, done, output)
@@ -273,8 +276,10 @@ def test_fault(call, inputs, tmp_path, writer, fault):
 @pytest.mark.parametrize("name", [name for name in FAULTS if name not in ("vanishes", "mount")])
 def test_fleet(call, room, tmp_path, name):
     """Its tasks run in processes of their own, where faults cannot be set from here."""
-    fault, writer = FAULTS[name], Writer(())
-    with fault.make(tmp_path, fault.stem, writer) as output:
+    if name == "denied" and os.geteuid() == 0:
+        pytest.skip("workers of root may write everywhere")
+    fault = FAULTS[name]
+    with fault.make(tmp_path, fault.stem, Writer(())) as output:
         known = _names(tmp_path)
         done = call("fleet", room, "-o", output, "--quiet", *QUICK)
         assert done.returncode in fault.statuses, done.stderr
@@ -282,10 +287,11 @@ def test_fleet(call, room, tmp_path, name):
             assert (output / "fleet.html").is_file()
             assert os.listdir(output / "results") == ["room"]
         else:
-            waits = writer is WRITERS["live"] and fault is FAULTS["full"]  # for room, and says so
-            assert done.stderr.count("\n") == (2 if waits else 1)
-            assert ("Trying again" in done.stderr) == waits
-            assert done.stderr.startswith("stillmap: ")
+            lines = done.stderr.splitlines()
+            if name == "full":  # the recording that failed, then the fleet itself
+                assert lines.pop(0).startswith("stillmap: room: ")
+            assert len(lines) == 1
+            assert lines[0].startswith("stillmap: ")
         left = {one.split("/")[0] for one in _names(tmp_path) - known}
     # what a fleet has noted stays: the same command goes on
     assert left <= {output.name, "disk"}
@@ -313,7 +319,7 @@ def _check_what_is_left(left: set[str], done: object, output: Path) -> None:
     assert not [name for name in left if name.endswith(".part") or name.endswith(".old")]
     if done.returncode == 2:
         others = left - hidden
-        assert not others or "is kept in" in done.stderr, others
+        assert not others or "is kept in" in done.stderr or "drive is kept" in done.stderr, others
     else:
         stem = output.name.removesuffix(output.suffix)
         places = {name.split("/")[0] for name in left - hidden} - {"disk"}

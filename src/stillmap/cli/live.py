@@ -87,6 +87,7 @@ def run(args: argparse.Namespace) -> int:
         InputError: ROS is missing, the recording cannot be read or does not suit the map, or the
             output is taken.
     """
+    from stillmap.core.files import resolve_output
     from stillmap.live.history import FOLDER
     from stillmap.live.saving import require_place_for_drive
 
@@ -110,7 +111,7 @@ def run(args: argparse.Namespace) -> int:
             "place": args.map,
             "mode": args.mode,
             "background": args.replay is None or args.rate is not None,
-            "folder": output / FOLDER,
+            "folder": resolve_output(output) / FOLDER,
             "scratch": scratch,
             "max_scratch": None if limit is None else math.ceil(1e9 * limit),
         }

@@ -19,7 +19,7 @@ from stillmap.cli.arguments import (
     require_apart,
 )
 from stillmap.cli.console import print_json, say, show_progress
-from stillmap.core.errors import InputError
+from stillmap.core.errors import InputError, is_out_of_memory, memory_error
 
 if TYPE_CHECKING:
     from stillmap.pipeline.checkpoint import CheckpointFolder
@@ -122,15 +122,16 @@ def _explain_failure(args: argparse.Namespace, checkpoints: "CheckpointFolder") 
         if not args.quiet:
             say(_describe_continuation(args.words, checkpoints))
         raise
-    except InputError as error:
+    except Exception as error:
+        failure = memory_error(error) if is_out_of_memory(error) else error
         if not checkpoints.is_in_use:
             raise
-        hints = filter(None, (error.hint, _describe_continuation(args.words, checkpoints)))
-        raise InputError(error.what, where=error.where, hint="; ".join(hints)) from error
-    except Exception:
-        if checkpoints.is_in_use:
-            say(_describe_continuation(args.words, checkpoints))
-        raise
+        continuation = _describe_continuation(args.words, checkpoints)
+        if not isinstance(failure, InputError):
+            say(continuation)
+            raise
+        hint = "; ".join(filter(None, (failure.hint, continuation)))
+        raise InputError(failure.what, where=failure.where, hint=hint) from error
 
 
 def _describe_continuation(words: list[str], checkpoints: "CheckpointFolder") -> str:

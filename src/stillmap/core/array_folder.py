@@ -119,7 +119,11 @@ def parse(content: Any, kind: type[Model], path: Path, hint: str = "") -> Model:
 
     try:
         # in strict mode, which takes no text for a number; of JSON, whose lists may be tuples
-        return TypeAdapter(kind).validate_json(json.dumps(content), strict=True)
+        adapter, text = TypeAdapter(kind), json.dumps(content, ensure_ascii=False)
+        encoded = text.encode("utf-8", "replace")
+        value = adapter.validate_json(encoded, strict=True)
+        # file names that are no UTF-8 hold what pydantic's JSON cannot: the types are right by now
+        return value if encoded.decode("utf-8") == text else adapter.validate_python(content)
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"]))

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from stillmap.core.errors import InputError, import_extra
-from stillmap.core.files import atomic_file, package_version, to_encodable
+from stillmap.core.files import atomic_file, package_version, resolve_output, to_encodable
 from stillmap.core.json import to_json
 from stillmap.fleet.inputs import Source, find_sources
 from stillmap.fleet.jobs import PLACES, RESULTS, Fleet, Job, Outcome, Place, Request
@@ -32,6 +32,8 @@ def run_fleet(request: Request) -> Fleet:
         KeyboardInterrupt: likewise.
     """
     root = absolute(request.output)
+    if is_local(request.output):
+        root = str(resolve_output(Path(root)))
     _require_fleet(root)
     sources = find_sources(request.entries, _known_names(root))
     with _remove_unfinished(root, request), _open_client(request) as client:

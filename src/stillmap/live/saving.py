@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from stillmap.core.arrays import empty, iter_blocks, release_pages, write_npy
 from stillmap.core.errors import InputError, advise, cannot_write
-from stillmap.core.files import require_new
+from stillmap.core.files import require_new, resolve_output
 from stillmap.core.profiling import Progress, no_progress
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
@@ -124,7 +124,8 @@ class Snapshot(ShortRepr):
             source[EXTENDS] = True
         result, answers = self._build(replace(self.recording, source=source), main, progress)
         submaps = [self._build(plain, number, no_progress) for number in others]
-        is_inside = self.folder is not None and self.folder == path / RECORDING
+        path = resolve_output(path)
+        is_inside = self.folder is not None and self.folder.resolve() == path / RECORDING
 
         def write_more(folder: Path) -> None:
             _write_answers(answers, result.recording.stamp_ns, folder)
