@@ -36,9 +36,13 @@ def test_every_module_is_installed_and_nothing_else(installed):
     own = {file for file in installed if ".dist-info/" not in file}
     extra = sorted(own - modules)
     assert modules <= own
-    templates = [file for file in extra if re.search(r"/report/templates/\w+\.(\w+\.j2|js)$", file)]
-    extra = [file for file in extra if file not in templates]
-    assert "stillmap/results/report/templates/report.html.j2" in templates
+    kinds = ("results/report/templates/*.j2", "results/report/templates/*.js", "sim/worlds/*.toml")
+    data = {
+        str(path.relative_to(source)) for kind in kinds for path in (source / "stillmap").glob(kind)
+    }
+    assert data <= own
+    assert {"report", "hall"} <= {Path(file).name.partition(".")[0] for file in data}
+    extra = [file for file in extra if file not in data]
     assert len(extra) == 4
     assert extra[0].endswith("bin/stillmap")
     assert re.fullmatch(r"stillmap/_core\.[\w-]+\.so", extra[1])
