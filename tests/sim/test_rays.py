@@ -131,8 +131,10 @@ def clutter(rng: np.random.Generator, n: int, moving: bool) -> tuple[Faces, Soli
     return faces, Solids(poses, form, half, z, np.arange(n, dtype=np.int32))
 
 
-def everything(beams: Rays, count: int) -> Iterator[tuple[int, Window]]:
-    yield from ((k, (slice(0, 360), slice(0, len(beams.elevation)))) for k in range(count))
+def everything(beams: Rays, count: int) -> Iterator[tuple[float, int, Window]]:
+    """Everywhere and not far away, as if nothing were known of any surface."""
+    window = (slice(0, 360), slice(0, len(beams.elevation)))
+    return ((0.0, k, window) for k in range(count))
 
 
 @pytest.mark.parametrize("roll", [0.0, 0.05, -0.2])
@@ -148,10 +150,8 @@ def test_nothing_is_missed(monkeypatch: pytest.MonkeyPatch, roll: float, moving:
     beams = transform_rays(pattern, T)
     ground = Ground(np.array([0.02, 0.003]), NO_PAVEMENT, 0.0)
     fast = cast(beams, faces, [solids], ground, None)
-    monkeypatch.setattr(
-        ray_casting, "_windows_of_faces", lambda b, f, _: everything(b, len(f.ends))
-    )
-    monkeypatch.setattr(ray_casting, "_windows_of_solids", lambda b, s: everything(b, len(s.form)))
+    monkeypatch.setattr(ray_casting, "_find_faces", lambda b, f, _: everything(b, len(f.ends)))
+    monkeypatch.setattr(ray_casting, "_find_solids", lambda b, s: everything(b, len(s.form)))
     slow = cast(beams, faces, [solids], ground, None)
     np.testing.assert_array_equal(fast.range, slow.range)
     np.testing.assert_array_equal(fast.mover, slow.mover)

@@ -1,10 +1,11 @@
 """Exact ranges of the beams of one lidar turn to faces, solids, ground and ceiling.
 
 A surface covers an interval of columns and one of channels. Only the beams within both are
-intersected with it, all at once.
+intersected with it, all at once, unless they all end at nearer surfaces: the nearest come first.
 """
 
 from collections.abc import Iterator
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ from stillmap.sim.geometry import BOX, CYLINDER, Faces, Float, Ground, Solids, S
 from stillmap.sim.laser import MIN_RANGE
 
 Window = tuple[slice, slice]  # columns, channels
-
+Candidate = tuple[float, int, Window]  # metres that a surface is away at least, its number
 
 _SLACK = 1e-9  # rad, so that no beam passes between two faces that share an edge
 _ABSENT = 1e9  # m, position of absent solids
@@ -72,22 +73,24 @@ def cast_rays(rays: Rays, static: StaticSurfaces, moving: Solids) -> RayReturns:
     faces, ground = static.faces, static.ground
     range = intersect_ground(rays.origin, rays.direction, ground, static.ceiling)
     part, glass = np.full(range.shape, -1, np.int32), np.zeros(range.shape, bool)
-
-    def keep_nearer(window: Window, t: Float, number: int, is_glass: bool) -> None:
-        nearer = t < range[window]
-        range[window][nearer] = t[nearer]
-        part[window][nearer] = number
-        glass[window][nearer] = is_glass
-
-    for k, window in _windows_of_faces(rays, faces, ground):
-        origin, direction = rays.within(window)
-        t = intersect_face(origin, direction, faces.ends[k], faces.z[k], ground)
-        keep_nearer(window, t, -1, bool(faces.is_glass[k]))
-    for group in (static.solids, moving):
-        for k, window in _windows_of_solids(rays, group):
-            pose = group.pose[window[0] if len(group.pose) > 1 else slice(None), k]
-            t = intersect_solid(*rays.within(window), group, k, pose)
-            keep_nearer(window, t, k if group is moving else -1, False)
+    surfaces: list[tuple[float, int, Window, Solids | None]] = [
+        *((*candidate, None) for candidate in _find_faces(rays, faces, ground)),
+        *((*candidate, static.solids) for candidate in _find_solids(rays, static.solids)),
+        *((*candidate, moving) for candidate in _find_solids(rays, moving)),
+    ]
+    for near, k, window, solids in sorted(surfaces, key=itemgetter(0)):
+        before, (origin, direction) = range[window], rays.within(window)
+        if before.max() <= near:
+            continue
+        if solids is None:
+            t = intersect_face(origin, direction, faces.ends[k], faces.z[k], ground)
+        else:
+            pose = solids.pose[window[0] if len(solids.pose) > 1 else slice(None), k]
+            t = intersect_solid(origin, direction, solids, k, pose)
+        nearer = t < before
+        before[nearer] = t[nearer]
+        part[window][nearer] = k if solids is moving else -1
+        glass[window][nearer] = solids is None and faces.is_glass[k]
     mover = np.append(moving.mover, np.int32(-1))[part]  # part -1 is the last one
     return RayReturns(range, part, mover, glass)
 
@@ -163,8 +166,8 @@ def _intersect(a: tuple[Float, Float], b: tuple[Float, Float]) -> tuple[Float, F
     return np.maximum(a[0], b[0]), np.minimum(a[1], b[1])
 
 
-def _windows_of_faces(rays: Rays, faces: Faces, ground: Ground) -> Iterator[tuple[int, Window]]:
-    """Number of each face, and the columns and channels that may hit it."""
+def _find_faces(rays: Rays, faces: Faces, ground: Ground) -> Iterator[Candidate]:
+    """The faces that beams may hit."""
     if not len(faces.ends):
         return
     ox, oy, oz, move = _middle(rays)
@@ -179,8 +182,8 @@ def _windows_of_faces(rays: Rays, faces: Faces, ground: Ground) -> Iterator[tupl
     yield from _windows(rays, middle, np.abs(turn) / 2, near, far, (low, high), move)
 
 
-def _windows_of_solids(rays: Rays, solids: Solids) -> Iterator[tuple[int, Window]]:
-    """Number of each solid, and the columns and channels that may hit it."""
+def _find_solids(rays: Rays, solids: Solids) -> Iterator[Candidate]:
+    """The solids that beams may hit."""
     if not len(solids.form):
         return
     ox, oy, oz, move = _middle(rays)
@@ -213,7 +216,7 @@ def _windows(
     far: Float,
     heights: tuple[Float, Float],
     move: float,
-) -> Iterator[tuple[int, Window]]:
+) -> Iterator[Candidate]:
     """Columns and channels that may hit P surfaces.
 
     Args:
@@ -242,4 +245,4 @@ def _windows(
     start[all_round], stop[all_round] = 0, [n, 0, 0]
     use = (start < stop) & (begin < end)[:, None]
     for k, turn in np.argwhere(use).tolist():
-        yield k, (slice(start[k, turn], stop[k, turn]), slice(begin[k], end[k]))
+        yield float(near[k]) - _SLACK, k, (slice(start[k, turn], stop[k, turn]), slice(begin[k], end[k]))

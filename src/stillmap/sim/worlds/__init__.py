@@ -2,7 +2,7 @@
 
 A file draws its world from pieces of `walls.py`, one row each: `["box", x, y, width, height]`.
 `extends` names a world of which it says only what differs; `lifted` are objects made of walls of
-that world. `building` alone is computed: it grows with the number of scans.
+that world.
 """
 
 import dataclasses
@@ -16,7 +16,6 @@ from stillmap.core.config import override
 from stillmap.core.errors import InputError, closest_match
 from stillmap.sim.scene import Lane, Light, Scene, Segment, Stay, Thing
 from stillmap.sim.walls import PIECES, Opening, leaf
-from stillmap.sim.worlds.building import building
 
 _EMPTY = "-empty"
 _FOLDER = resources.files(__name__)
@@ -119,10 +118,7 @@ def _empty(world: Callable[[], Scene]) -> Scene:
     )
 
 
-SCENES: dict[str, Callable[[], Scene]] = {
-    "building": building,
-    **{name: partial(load_world, name) for name in _WORLDS},
-}
+SCENES: dict[str, Callable[[], Scene]] = {name: partial(load_world, name) for name in _WORLDS}
 SCENES |= {
     f"{name}{_EMPTY}": partial(_empty, world)
     for name, world in SCENES.items()
@@ -133,8 +129,6 @@ SCENES |= {
 def scene_by_name(name: str, changes: Mapping[str, Any] | None = None) -> Scene:
     """The scene of that name, with `changes` such as `{"laser": {"beams": 360}}` applied.
 
-    A building grows with the number of scans in `changes`.
-
     Raises:
         InputError: there is no such scene or option, or a value is out of range.
     """
@@ -143,10 +137,4 @@ def scene_by_name(name: str, changes: Mapping[str, Any] | None = None) -> Scene:
         meant = closest_match(name, SCENES)
         hint = f"did you mean '{meant}'? {known}" if meant else known
         raise InputError(f"there is no scene '{name}'", hint=hint)
-    robot = (changes or {}).get("robot")
-    scans = robot.get("scans") if isinstance(robot, Mapping) else None
-    world = SCENES[name]
-    if name.removesuffix(_EMPTY) == "building" and type(scans) is int and scans >= 1:
-        grown = partial(building, scans)
-        world = partial(_empty, grown) if name.endswith(_EMPTY) else grown
-    return override(world(), changes or {})
+    return override(SCENES[name](), changes or {})
