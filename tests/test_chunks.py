@@ -2,22 +2,16 @@
 
 import numpy as np
 import pytest
+from recordings import of_one_sensor
 
 from stillmap.core import chunks
-from stillmap.core.recording import Recording
 
 GROUPS = np.array([0, 0, 0, 1, 1, 4, 5, 5, 5, 5])
 
 
 def ten_scans():
-    return Recording(
-        stamp_ns=np.arange(10),
-        offset=100 * np.arange(11),
-        points=np.zeros((1000, 2), np.float32),
-        hit=np.ones(1000, bool),
-        T_base_sensor=np.eye(3)[None],
-        sensor=np.zeros(10, np.int32),
-        T_odom_base=None,
+    return of_one_sensor(
+        np.arange(10), 100 * np.arange(11), np.zeros((1000, 2), np.float32), np.ones(1000, bool)
     )
 
 

@@ -7,9 +7,9 @@ from cases import Case
 from common import scores
 from marks import slow_params
 from prepared import Prepared, counts, prepare, without_people
+from recordings import of_one_sensor
 
 from stillmap import em
-from stillmap.core.recording import Recording
 
 
 @pytest.fixture(scope="module")
@@ -90,14 +90,11 @@ def test_without_people_only_what_they_hid_differs(run: Prepared) -> None:
 def test_looks_count_seconds_in_which_a_cell_was_seen() -> None:
     ends = [[2.02, 0.02], [2.02, 0.02], [3.02, 0.02], [1.02, 0.02]]
     seconds = [0.0, 0.5, 7.2, 9.1]
-    recording = Recording(
-        stamp_ns=np.array([int(s * 1e9) for s in seconds]),
-        offset=np.arange(5),
-        points=np.array(ends, np.float32),
-        hit=np.ones(4, bool),
-        T_base_sensor=np.eye(3)[None],
-        sensor=np.zeros(4, np.int32),
-        T_odom_base=None,
+    recording = of_one_sensor(
+        np.array([int(s * 1e9) for s in seconds]),
+        np.arange(5),
+        np.array(ends, np.float32),
+        np.ones(4, bool),
     )
     poses = np.tile(np.eye(3), (4, 1, 1))
     poses[:, :2, 2] = 0.02

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from PIL import Image
+from recordings import of_one_sensor
 
 from stillmap.cli import info
 from stillmap.cli import recording_info as module
@@ -210,14 +211,11 @@ def test_ranges_of_huge_recordings_are_sampled(monkeypatch, few):
     rng = np.random.default_rng(0)
     points = np.zeros((20_000, 2), np.float32)
     points[:, 0] = rng.uniform(1, 11, 20_000)
-    recording = Recording(
-        stamp_ns=np.arange(400, dtype=np.int64),
-        offset=np.concatenate([[0], np.cumsum(counts)]),
-        points=points,
-        hit=np.ones(20_000, bool),
-        T_base_sensor=np.eye(3)[None],
-        sensor=np.zeros(400, np.int32),
-        T_odom_base=None,
+    recording = of_one_sensor(
+        np.arange(400, dtype=np.int64),
+        np.concatenate([[0], np.cumsum(counts)]),
+        points,
+        np.ones(20_000, bool),
     )
     exact = module.summarize_recording(recording)
     assert exact["hit_ranges_m"]["max"] == pytest.approx(points.max(), abs=1e-4)

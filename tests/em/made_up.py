@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from recordings import of_one_sensor
 
 from stillmap import _core, em
 from stillmap.core.recording import Recording
@@ -125,14 +126,11 @@ def watch(
         what.append(np.where(seen, nearest, -1))
         r = np.where(seen, r + rng.normal(scale=noise, size=len(u)), most)
         points.append(u * r[:, None])
-    what_hit, D = np.concatenate(what), u.shape[1]
-    recording = Recording(
-        stamp_ns=np.round(times * 1e9).astype(np.int64),
-        offset=np.array(offset),
-        points=np.concatenate(points).astype(np.float32),
-        hit=what_hit >= 0,
-        T_base_sensor=np.eye(D + 1)[None],
-        sensor=np.zeros(len(times), np.int32),
-        T_odom_base=None,
+    what_hit = np.concatenate(what)
+    recording = of_one_sensor(
+        np.round(times * 1e9).astype(np.int64),
+        np.array(offset),
+        np.concatenate(points).astype(np.float32),
+        what_hit >= 0,
     )
     return Watched(recording, what_hit)

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 from made_up import Ball, Wall, watch
+from recordings import of_one_sensor
 
 from stillmap import _core, em
-from stillmap.core.recording import Recording
 from stillmap.em import beam_counting
 from stillmap.em.beam_counting import hit_ratio_e_step
 
@@ -15,15 +15,7 @@ def lane(hits, passes):
     n = hits + passes
     points = np.zeros((n, 2), np.float32)
     points[:, 0] = [3.0] * hits + [6.0] * passes
-    return Recording(
-        stamp_ns=np.zeros(1, np.int64),
-        offset=np.array([0, n]),
-        points=points,
-        hit=np.arange(n) < hits,
-        T_base_sensor=np.eye(3)[None],
-        sensor=np.zeros(1, np.int32),
-        T_odom_base=None,
-    )
+    return of_one_sensor(np.zeros(1, np.int64), np.array([0, n]), points, np.arange(n) < hits)
 
 
 def counted(recording):

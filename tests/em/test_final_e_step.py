@@ -6,9 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from made_up_scans import ANGLES
+from recordings import of_one_sensor
 
 from stillmap import _core, em
-from stillmap.core.recording import Recording
 from stillmap.em import final_labels as module
 
 POST, RADIUS, WALL = (5.0, 3.0), 0.15, 5.0
@@ -31,14 +31,11 @@ def seen(at, hit_mask):
     T = np.tile(np.eye(3), (len(at), 1, 1))
     T[:, 0, 2] = at
     points = ranges[..., None] * directions
-    recording = Recording(
-        stamp_ns=np.round(1e9 * SECONDS * np.arange(len(at))).astype(np.int64),
-        offset=len(ANGLES) * np.arange(len(at) + 1),
-        points=points.reshape(-1, 2).astype(np.float32),
-        hit=np.isfinite(ranges).ravel(),
-        T_base_sensor=np.eye(3)[None],
-        sensor=np.zeros(len(at), np.int32),
-        T_odom_base=None,
+    recording = of_one_sensor(
+        np.round(1e9 * SECONDS * np.arange(len(at))).astype(np.int64),
+        len(ANGLES) * np.arange(len(at) + 1),
+        points.reshape(-1, 2).astype(np.float32),
+        np.isfinite(ranges).ravel(),
     )
     return recording, T, on.ravel()
 

@@ -4,10 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
+from recordings import of_one_sensor
 
 from stillmap import em
 from stillmap.core import chunks, se2
-from stillmap.core.recording import Recording
 from stillmap.em.quality import select_held_out_scans
 from stillmap.sim import CrowdOptions, LaserOptions, RobotOptions, Scene, simulate
 from stillmap.sim.walls import box
@@ -94,14 +94,11 @@ def test_in_three_dimensions():
     rng = np.random.default_rng(1)
     directions = rng.normal(size=(3 * 4000, 3))
     points = (2 * directions / np.abs(directions).max(axis=1, keepdims=True)).astype(np.float32)
-    recording = Recording(
-        stamp_ns=np.arange(3, dtype=np.int64),
-        offset=np.arange(4, dtype=np.int64) * 4000,
-        points=points,
-        hit=np.ones(len(points), bool),
-        T_base_sensor=np.eye(4)[None],
-        sensor=np.zeros(3, np.int32),
-        T_odom_base=None,
+    recording = of_one_sensor(
+        np.arange(3, dtype=np.int64),
+        np.arange(4, dtype=np.int64) * 4000,
+        points,
+        np.ones(len(points), bool),
     )
     poses = np.tile(np.eye(4), (3, 1, 1))
     e = np.ones(len(points), np.float32)

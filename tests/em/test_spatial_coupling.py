@@ -4,10 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
+from recordings import of_one_sensor
 
 from stillmap import _core
 from stillmap.core.chunks import ScanBeams
-from stillmap.core.recording import Recording
 from stillmap.em import spatial_coupling
 from stillmap.em.ground import ground_from_surfels
 from stillmap.em.spatial_coupling import (
@@ -39,14 +39,11 @@ def standing(*things, scans=3):
     ground = np.stack(np.meshgrid(*[np.arange(-8, 8, 0.1)] * 2), axis=-1).reshape(-1, 2)
     ends = np.concatenate([np.column_stack([ground, np.zeros(len(ground))]), *things])
     n = len(ends)
-    recording = Recording(
-        stamp_ns=np.arange(scans) * 10**8,
-        offset=np.arange(scans + 1) * n,
-        points=np.tile(ends, (scans, 1)).astype(np.float32),
-        hit=np.ones(scans * n, bool),
-        sensor=np.zeros(scans, np.int32),
-        T_base_sensor=np.eye(4)[None],
-        T_odom_base=None,
+    recording = of_one_sensor(
+        np.arange(scans) * 10**8,
+        np.arange(scans + 1) * n,
+        np.tile(ends, (scans, 1)).astype(np.float32),
+        np.ones(scans * n, bool),
     )
     T = np.tile(np.eye(4), (scans, 1, 1))
     surface = _core.SurfelMap3D(0.15)

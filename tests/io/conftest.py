@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cut_recordings import make_recording
+from recordings import of_one_sensor
 from scipy.spatial.transform import Rotation
 
 from stillmap.core.recording import Recording
@@ -62,14 +63,11 @@ def space() -> Recording:
     T = np.tile(np.eye(4), (4, 1, 1))
     T[:, :3, :3] = Rotation.random(4, rng=rng).as_matrix()
     T[:, :3, 3] = rng.normal(0, 3, (4, 3))
-    return Recording(
-        stamp_ns=1_700_000_000_123_456_789 + np.array([0, 1, 100_000_007, 2**33], np.int64),
-        offset=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
-        points=rng.normal(0, 20, (counts.sum(), 3)).astype(np.float32),
-        hit=np.ones(counts.sum(), bool),
-        T_base_sensor=np.eye(4)[None],
-        sensor=np.zeros(4, np.int32),
-        T_odom_base=None,
+    return of_one_sensor(
+        1_700_000_000_123_456_789 + np.array([0, 1, 100_000_007, 2**33], np.int64),
+        np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        rng.normal(0, 20, (counts.sum(), 3)).astype(np.float32),
+        np.ones(counts.sum(), bool),
         T_recorded_base=T,
     )
 

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from recordings import of_one_sensor
 
 from stillmap.core.errors import InputError
-from stillmap.core.recording import Recording
 from stillmap.io import read, writers
 from stillmap.io import write as write_folder
 from stillmap.io.point_cloud import kitti, las, pcd, ply
@@ -102,14 +102,11 @@ def test_stamps_that_repeat_or_are_negative(space, tmp_path):
 
 
 def test_a_recording_of_the_plane_lies_at_height_zero(tmp_path):
-    plane = Recording(
-        stamp_ns=np.array([1], np.int64),
-        offset=np.array([0, 2]),
-        points=np.array([[1, 2], [3, 4]], np.float32),
-        hit=np.ones(2, bool),
-        T_base_sensor=np.eye(3)[None],
-        sensor=np.zeros(1, np.int32),
-        T_odom_base=None,
+    plane = of_one_sensor(
+        np.array([1], np.int64),
+        np.array([0, 2]),
+        np.array([[1, 2], [3, 4]], np.float32),
+        np.ones(2, bool),
         T_recorded_base=np.array([[[0.0, -1, 5], [1, 0, 6], [0, 0, 1]]]),
     )
     pcd.write(plane, tmp_path / "p")

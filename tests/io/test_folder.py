@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from recordings import of_one_sensor
 
 from stillmap.core import arrays, se2
 from stillmap.core.camera import Camera, Images
@@ -257,15 +258,7 @@ def test_flipped_bytes_are_refused_or_harmless(data, tmp_path_factory):
 def test_options_narrow_a_folder(tmp_path):
     points = np.array([[0.1, 0], [2, 0], [6, 8], [30, 40], [np.nan] * 2], np.float32)
     hit = np.array([True, True, True, False, False])
-    recording = Recording(
-        stamp_ns=np.zeros(1, np.int64),
-        offset=np.array([0, 5]),
-        points=points,
-        hit=hit,
-        T_base_sensor=np.eye(3)[None],
-        sensor=np.zeros(1, np.int32),
-        T_odom_base=None,
-    )
+    recording = of_one_sensor(np.zeros(1, np.int64), np.array([0, 5]), points, hit)
     write(recording, tmp_path / "rec")
     options = ReadOptions(min_range=0.5, max_range=5.0, laser_x=0.3)
     narrowed = read(tmp_path / "rec", options)

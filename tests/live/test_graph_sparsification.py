@@ -4,10 +4,10 @@ import itertools
 
 import numpy as np
 import pytest
+from recordings import of_one_sensor
 
 import stillmap
 from stillmap.core import se2
-from stillmap.core.recording import Recording
 from stillmap.live import graph_sparsification, loop_closer
 from stillmap.live.graph_sparsification import AnchoredPoses
 from stillmap.live.local_map import MappedScan, SpacedView
@@ -34,14 +34,8 @@ def drive(laps):
 
 def view_of(poses, travelled):
     n = len(poses)
-    recording = Recording(
-        stamp_ns=np.arange(n) * 10**9,
-        offset=np.arange(n + 1),
-        points=np.ones((n, 2), np.float32),
-        hit=np.ones(n, np.bool_),
-        T_base_sensor=np.eye(3)[None],
-        sensor=np.zeros(n, np.int32),
-        T_odom_base=None,
+    recording = of_one_sensor(
+        np.arange(n) * 10**9, np.arange(n + 1), np.ones((n, 2), np.float32), np.ones(n, np.bool_)
     )
     flat = np.zeros((n, 3, 3))
     return SpacedView(recording, np.ones(n, np.float32), poses, travelled, np.ones(n), flat)

@@ -6,6 +6,7 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
+from recordings import of_one_sensor
 
 from stillmap import em
 from stillmap.core.recording import Recording
@@ -67,14 +68,11 @@ def together(*parts: em.CellHistories) -> em.CellHistories:
 def recording(stamps: Sequence[float], beams: int = 0) -> Recording:
     """Scans at these seconds, of so many beams each that met nothing."""
     T = len(stamps)
-    return Recording(
-        stamp_ns=np.round(np.array(stamps) * S).astype(np.int64) + 5 * S,
-        offset=np.arange(T + 1, dtype=np.int64) * beams,
-        points=np.full((T * beams, 2), 9.0, np.float32),
-        hit=np.zeros(T * beams, bool),
-        T_base_sensor=np.eye(3)[None],
-        sensor=np.zeros(T, np.int32),
-        T_odom_base=None,
+    return of_one_sensor(
+        np.round(np.array(stamps) * S).astype(np.int64) + 5 * S,
+        np.arange(T + 1, dtype=np.int64) * beams,
+        np.full((T * beams, 2), 9.0, np.float32),
+        np.zeros(T * beams, bool),
     )
 
 

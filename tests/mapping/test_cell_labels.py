@@ -4,9 +4,9 @@ import dataclasses
 
 import numpy as np
 import pytest
+from recordings import of_one_sensor
 from synthetic_histories import course
 
-from stillmap.core.recording import Recording
 from stillmap.em import CellProbabilities
 from stillmap.mapping import update_occupancy
 
@@ -22,14 +22,11 @@ class _SurfelOfBeams:
 
 def updated(before, after, share):
     n = 2
-    recording = Recording(
-        stamp_ns=np.arange(n, dtype=np.int64) * 10**8,
-        offset=np.arange(n + 1, dtype=np.int64) * 5,
-        points=np.ones((5 * n, 2), np.float32),
-        hit=np.ones(5 * n, bool),
-        T_odom_base=None,
-        T_base_sensor=np.eye(3)[None],
-        sensor=np.zeros(n, np.int32),
+    recording = of_one_sensor(
+        np.arange(n, dtype=np.int64) * 10**8,
+        np.arange(n + 1, dtype=np.int64) * 5,
+        np.ones((5 * n, 2), np.float32),
+        np.ones(5 * n, bool),
     )
     cells = np.array([[1, 1], [5, 5]])
     histories = course(cells, True, share=share)

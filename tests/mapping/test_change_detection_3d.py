@@ -4,9 +4,9 @@ import dataclasses
 
 import numpy as np
 import pytest
+from recordings import of_one_sensor
 from synthetic_histories import EVERY_SECOND, S, course, recording, seconds, together
 
-from stillmap.core.recording import Recording
 from stillmap.em.change_hmm import select_changed_cells
 from stillmap.mapping import Change, detect_changes_3d
 from stillmap.mapping.change_detection import measure_dwell_times
@@ -26,14 +26,11 @@ def watching(cells, *stands):
     """A lidar at the origin that meets every one of these cells from one second to another."""
     met = [any(first <= t <= last for first, last in stands) for t in range(100)]
     n, ends = len(cells), ((cells + 0.5) * VOXEL).astype(np.float32)
-    return Recording(
-        stamp_ns=EVERY_SECOND.stamp_ns,
-        offset=np.concatenate([[0], np.cumsum(np.multiply(met, n))]).astype(np.int64),
-        points=np.tile(ends, (sum(met), 1)),
-        hit=np.ones(sum(met) * n, bool),
-        T_base_sensor=np.eye(4)[None],
-        sensor=np.zeros(100, np.int32),
-        T_odom_base=None,
+    return of_one_sensor(
+        EVERY_SECOND.stamp_ns,
+        np.concatenate([[0], np.cumsum(np.multiply(met, n))]).astype(np.int64),
+        np.tile(ends, (sum(met), 1)),
+        np.ones(sum(met) * n, bool),
     )
 
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from recordings import of_one_sensor
 
 from stillmap import em
-from stillmap.core.recording import Recording
 from stillmap.em.types import GroundMap
 from stillmap.mapping.projection import project_cells, project_to_plane
 
@@ -21,14 +21,11 @@ def sweep(ends, hit=None, z=0.0):
     ends = np.asarray(ends, np.float64)
     T = np.eye(4)
     T[2, 3] = SENSOR + z
-    recording = Recording(
-        stamp_ns=np.zeros(1, np.int64),
-        offset=np.array([0, len(ends)], np.int64),
-        points=(ends - [0, 0, SENSOR]).astype(np.float32),
-        hit=np.ones(len(ends), bool) if hit is None else np.asarray(hit),
-        T_base_sensor=np.eye(4)[None],
-        sensor=np.zeros(1, np.int32),
-        T_odom_base=None,
+    recording = of_one_sensor(
+        np.zeros(1, np.int64),
+        np.array([0, len(ends)], np.int64),
+        (ends - [0, 0, SENSOR]).astype(np.float32),
+        np.ones(len(ends), bool) if hit is None else np.asarray(hit),
     )
     return recording, T[None]
 

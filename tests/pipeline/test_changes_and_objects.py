@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from recordings import of_one_sensor
 
-from stillmap.core.recording import Recording
 from stillmap.pipeline.final_map import _is_change
 from stillmap.tracking import MovingObject
 
@@ -14,14 +14,11 @@ BEAMS = 10  # of each scan, all of them on the object
 
 def made_up(xy):
     n = len(xy)
-    recording = Recording(
-        stamp_ns=np.arange(n) * 10**8,
-        offset=BEAMS * np.arange(n + 1),
-        points=np.ones((BEAMS * n, 2), np.float32),
-        hit=np.ones(BEAMS * n, bool),
-        T_base_sensor=np.eye(3)[None],
-        sensor=np.zeros(n, np.int32),
-        T_odom_base=None,
+    recording = of_one_sensor(
+        np.arange(n) * 10**8,
+        BEAMS * np.arange(n + 1),
+        np.ones((BEAMS * n, 2), np.float32),
+        np.ones(BEAMS * n, bool),
     )
     one = MovingObject(
         id=0,

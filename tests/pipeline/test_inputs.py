@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from choices import options, with_any_estimator
+from recordings import of_one_sensor
 
 import stillmap
 from stillmap.core import se2
@@ -60,14 +61,11 @@ def test_recordings_of_next_to_nothing(short, tmp_path, how, odometry, estimator
 
 
 def test_what_cannot_be_mapped_is_refused():
-    empty = Recording(
-        stamp_ns=np.zeros(0, np.int64),
-        offset=np.zeros(1, np.int64),
-        points=np.zeros((0, 2), np.float32),
-        hit=np.zeros(0, bool),
-        T_base_sensor=np.eye(3)[None],
-        sensor=np.zeros(0, np.int32),
-        T_odom_base=None,
+    empty = of_one_sensor(
+        np.zeros(0, np.int64),
+        np.zeros(1, np.int64),
+        np.zeros((0, 2), np.float32),
+        np.zeros(0, bool),
     )
     with pytest.raises(ValueError, match="at least one scan"):
         stillmap.build(empty)

@@ -10,10 +10,10 @@ import yaml
 from choices import options
 from marks import slow_params
 from PIL import Image
+from recordings import of_one_sensor
 
 import stillmap
 from stillmap.cli.main import main
-from stillmap.core.recording import Recording
 from stillmap.io.trajectory import read_tum
 from stillmap.pipeline.options import Options
 from stillmap.results.report.page import render_report
@@ -222,14 +222,11 @@ def test_sweeps_that_say_nothing_are_mapped_all_the_same(how, given, tmp_path):
     n = 0 if how == "none" else 50
     points = np.zeros((5 * n, 3), np.float32)
     points[:, 0] = {"nothing came back": 30.0, "all unusable": np.nan}.get(how, 0.0)
-    recording = Recording(
-        stamp_ns=np.arange(5, dtype=np.int64) * 10**8,
-        offset=np.arange(6, dtype=np.int64) * n,
-        points=points,
-        hit=np.full(5 * n, how == "all at the sensor"),
-        T_base_sensor=np.eye(4)[None],
-        sensor=np.zeros(5, np.int32),
-        T_odom_base=None,
+    recording = of_one_sensor(
+        np.arange(5, dtype=np.int64) * 10**8,
+        np.arange(6, dtype=np.int64) * n,
+        points,
+        np.full(5 * n, how == "all at the sensor"),
     )
     poses = np.tile(np.eye(4), (5, 1, 1)) if given else None
     result = stillmap.build(recording, poses=poses)

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from recordings import of_one_sensor
 
 from stillmap import places
 from stillmap.core import se2
-from stillmap.core.recording import Recording
 from stillmap.places.evidence import measure_evidence
 from stillmap.places.grow import add_session, start_place
 from stillmap.places.inputs import make_session
@@ -38,15 +38,7 @@ def scan(corners, poses, n_beams=180, max_range=25.0):
     points = np.concatenate(points).astype(np.float32)
     hit = np.linalg.norm(points, axis=1) < max_range
     points[~hit] = np.nan
-    return Recording(
-        stamp_ns=np.arange(T) * 1_000_000_000,
-        offset=np.arange(T + 1) * n_beams,
-        points=points,
-        hit=hit,
-        T_base_sensor=np.eye(3)[None],
-        sensor=np.zeros(T, np.int32),
-        T_odom_base=None,
-    )
+    return of_one_sensor(np.arange(T) * 1_000_000_000, np.arange(T + 1) * n_beams, points, hit)
 
 
 def session(name, corners, way, n=40):

@@ -8,8 +8,8 @@ import math
 import numpy as np
 import pytest
 from PIL import Image
+from recordings import of_one_sensor
 
-from stillmap.core.recording import Recording
 from stillmap.results.colors import ORANGE
 from stillmap.results.report.page import render_report
 from stillmap.results.report.point_view import draw_points_3d, find_ceiling, look_at, points_data
@@ -65,15 +65,11 @@ def corridor(result):
         [rng.uniform(9, 9.5, n), rng.uniform(-0.3, 0.3, n), rng.uniform(0, 1.7, n)], 1
     )
     points = np.concatenate([floor, walls, person]).astype(np.float32)
-    recording = Recording(
-        stamp_ns=np.zeros(1, np.int64),
-        offset=np.array([0, len(points)], np.int64),
-        points=points,
-        hit=np.ones(len(points), bool),
-        T_base_sensor=np.eye(4)[None],
-        sensor=np.zeros(1, np.int32),
-        T_odom_base=None,
-        source={},
+    recording = of_one_sensor(
+        np.zeros(1, np.int64),
+        np.array([0, len(points)], np.int64),
+        points,
+        np.ones(len(points), bool),
     )
     p_static = np.repeat(np.array([0.9, 0.9, 0.1], np.float32), n)
     return dataclasses.replace(

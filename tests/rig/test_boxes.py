@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from recordings import of_one_sensor
 
 from stillmap.core.recording import Recording
 from stillmap.em import EmOptions
@@ -33,14 +34,11 @@ def walker(seconds, size=(0.6, 0.4)):
 
 def flat_recording(points, offset, stamps=STAMPS):
     """Of a laser at the origin that stands."""
-    return Recording(
-        stamp_ns=stamps,
-        offset=np.asarray(offset, np.int64),
-        points=np.asarray(points, np.float32).reshape(-1, 2),
-        hit=np.ones(int(offset[-1]), bool),
-        T_base_sensor=np.eye(3)[None],
-        sensor=np.zeros(len(stamps), np.int32),
-        T_odom_base=None,
+    return of_one_sensor(
+        stamps,
+        np.asarray(offset, np.int64),
+        np.asarray(points, np.float32).reshape(-1, 2),
+        np.ones(int(offset[-1]), bool),
     )
 
 

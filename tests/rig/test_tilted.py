@@ -4,6 +4,7 @@ import functools
 
 import numpy as np
 import pytest
+from recordings import of_one_sensor
 
 from stillmap.core.recording import Recording
 from stillmap.prepare.beam_times import assemble_tilting_laser
@@ -48,14 +49,11 @@ def test_simulated_rig_from_planar_scans():
 
 
 def test_laser_beside_the_joint():
-    flat = Recording(
-        stamp_ns=np.array([0], np.int64),
-        offset=np.array([0, 1]),
-        points=np.array([[2.0, 0.0]], np.float32),
-        hit=np.ones(1, bool),
-        T_base_sensor=np.eye(3)[None],
-        sensor=np.zeros(1, np.int32),
-        T_odom_base=None,
+    flat = of_one_sensor(
+        np.array([0], np.int64),
+        np.array([0, 1]),
+        np.array([[2.0, 0.0]], np.float32),
+        np.ones(1, bool),
     )
     T = np.eye(4)
     T[0, 3] = 0.5

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from recordings import of_one_sensor
 
 from stillmap.core import se2, se3
 from stillmap.core.recording import Recording
@@ -117,14 +118,11 @@ def recorded(
     stamps = begin + lidar.period * np.arange(sweeps)
     parts = [sweep(boxes, lidar, way, t, rng) for t in stamps]
     points, hit, tau, moving = (np.concatenate(p) for p in zip(*parts, strict=True))
-    recording = Recording(
-        stamp_ns=np.round(stamps * 1e9).astype(np.int64),
-        offset=np.cumsum([0] + [len(p[1]) for p in parts]).astype(np.int64),
-        points=points.astype(np.float32),
-        hit=hit,
-        T_base_sensor=np.eye(4)[None],
-        sensor=np.zeros(sweeps, np.int32),
-        T_odom_base=None,
+    recording = of_one_sensor(
+        np.round(stamps * 1e9).astype(np.int64),
+        np.cumsum([0] + [len(p[1]) for p in parts]).astype(np.int64),
+        points.astype(np.float32),
+        hit,
         beam_time=tau.astype(np.float32),
     )
     truth = way.at(stamps)

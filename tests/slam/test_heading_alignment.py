@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from recordings import of_one_sensor
 
 import stillmap
 from stillmap.core import se2
-from stillmap.core.recording import Recording
 from stillmap.eval.trajectory import align
 from stillmap.sim import scene_by_name, simulate
 from stillmap.slam import loop_closure
@@ -37,14 +37,11 @@ def drive(drift, walls, headings):
     K, rng = len(drift), np.random.default_rng(0)
     scans = [look_at_room(*pair, rng) for pair in zip(headings, walls, strict=True)]
     n = len(BEARINGS)
-    recording = Recording(
-        stamp_ns=np.arange(K, dtype=np.int64) * 10**9,
-        offset=np.arange(K + 1, dtype=np.int64) * n,
-        points=np.concatenate(scans).astype(np.float32),
-        hit=np.ones(K * n, np.bool_),
-        T_base_sensor=np.eye(3)[None],
-        sensor=np.zeros(K, np.int32),
-        T_odom_base=None,
+    recording = of_one_sensor(
+        np.arange(K, dtype=np.int64) * 10**9,
+        np.arange(K + 1, dtype=np.int64) * n,
+        np.concatenate(scans).astype(np.float32),
+        np.ones(K * n, np.bool_),
     )
     poses = se2.matrix(np.arange(K), np.zeros(K), np.asarray(headings) + drift)
     steps = se2.inverse(poses[:-1]) @ poses[1:]

@@ -4,9 +4,9 @@ from itertools import accumulate, pairwise
 
 import numpy as np
 import pytest
+from recordings import of_one_sensor
 
 from stillmap.core import se2
-from stillmap.core.recording import Recording
 from stillmap.sim import RobotOptions, Scene, simulate
 from stillmap.sim.options import CrowdOptions, LaserOptions, OdometryOptions
 from stillmap.sim.walls import box
@@ -30,15 +30,8 @@ SURE = np.diag([0.03**2, 0.03**2, 0.006**2])
 def make_context(poses):
     """Poses (K, 3, 3) a metre of travel apart, each a keyframe."""
     n = len(poses)
-    recording = Recording(
-        stamp_ns=np.arange(n),
-        offset=np.zeros(n + 1, np.int64),
-        points=np.zeros((0, 2), np.float32),
-        hit=np.zeros(0, bool),
-        T_base_sensor=np.eye(3)[None],
-        sensor=np.zeros(n, np.int32),
-        T_odom_base=None,
-        source={},
+    recording = of_one_sensor(
+        np.arange(n), np.zeros(n + 1, np.int64), np.zeros((0, 2), np.float32), np.zeros(0, bool)
     )
     return LoopContext(
         recording,

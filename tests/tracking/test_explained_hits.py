@@ -3,8 +3,8 @@
 import dataclasses
 
 import numpy as np
+from recordings import of_one_sensor
 
-from stillmap.core.recording import Recording
 from stillmap.tracking.explained_hits import compute_log_ratio, explain_hits, find_mover_hits
 from stillmap.tracking.mover_path import MoverPath
 
@@ -18,14 +18,11 @@ def recorded():
     on_car = np.column_stack([5.0 * SECONDS, np.zeros(len(SECONDS))]) + CAR
     points = np.stack([on_car, np.tile(POST, (len(SECONDS), 1))], axis=1).reshape(-1, 2)
     n = len(SECONDS)
-    return Recording(
-        stamp_ns=(SECONDS * 1e9).astype(np.int64),
-        offset=np.arange(n + 1, dtype=np.int64) * 2,
-        points=points.astype(np.float32),
-        hit=np.ones(2 * n, bool),
-        T_odom_base=None,
-        T_base_sensor=np.eye(3)[None],
-        sensor=np.zeros(n, np.int32),
+    return of_one_sensor(
+        (SECONDS * 1e9).astype(np.int64),
+        np.arange(n + 1, dtype=np.int64) * 2,
+        points.astype(np.float32),
+        np.ones(2 * n, bool),
     )
 
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from recordings import of_one_sensor
 
-from stillmap.core.recording import Recording
 from stillmap.tracking.motion_evidence import (
     TrackEvidence,
     apply_motion_evidence,
@@ -57,14 +57,11 @@ def recorded(things, seconds=20.0):
     rng = np.random.default_rng(0)
     ranges += rng.normal(0.0, 0.01, ranges.shape)
     points = ranges[..., None] * np.stack([np.cos(ANGLES), np.sin(ANGLES)], axis=-1)
-    recording = Recording(
-        stamp_ns=(times * 1e9).astype(np.int64),
-        offset=np.arange(len(times) + 1, dtype=np.int64) * len(ANGLES),
-        points=points.reshape(-1, 2).astype(np.float32),
-        hit=np.ones(ranges.size, bool),
-        T_odom_base=None,
-        T_base_sensor=np.eye(3)[None],
-        sensor=np.zeros(len(times), np.int32),
+    recording = of_one_sensor(
+        (times * 1e9).astype(np.int64),
+        np.arange(len(times) + 1, dtype=np.int64) * len(ANGLES),
+        points.reshape(-1, 2).astype(np.float32),
+        np.ones(ranges.size, bool),
     )
     return recording, who.ravel()
 

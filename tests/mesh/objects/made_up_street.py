@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from recordings import of_one_sensor
 
 from stillmap.core.recording import Recording
 from stillmap.mesh.inputs import MeshInputs
@@ -58,14 +59,11 @@ def street(
         ranges = ranges + rng.normal(0.0, noise, n) * (met >= 0)
         ends.append(looking * ranges[:, None])
         whose.append(met)
-    recording = Recording(
-        stamp_ns=(10**9 * np.arange(scans) / RATE).astype(np.int64),
-        offset=n * np.arange(scans + 1, dtype=np.int64),
-        points=np.concatenate(ends).astype(np.float32),
-        hit=np.ones(n * scans, np.bool_),
-        T_base_sensor=np.eye(4)[None],
-        sensor=np.zeros(scans, np.int32),
-        T_odom_base=None,
+    recording = of_one_sensor(
+        (10**9 * np.arange(scans) / RATE).astype(np.int64),
+        n * np.arange(scans + 1, dtype=np.int64),
+        np.concatenate(ends).astype(np.float32),
+        np.ones(n * scans, np.bool_),
     )
     poses = np.tile(np.eye(4), (scans, 1, 1))
     poses[:, 2, 3] = 1.0

@@ -4,9 +4,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from recordings import of_one_sensor
 
 from stillmap.core.camera import Camera, Images
-from stillmap.core.recording import Recording
 from stillmap.mesh.inputs import MeshInputs
 from stillmap.mesh.place import Background, ViewAssignment
 from stillmap.mesh.point_colors import TrackedReturns, color_moving
@@ -40,14 +40,11 @@ def board_seen(*others: TrackedBox) -> TrackedReturns:
     ends = [
         np.column_stack([BOARD[:, 0] + SPEED * t, np.full(n, AHEAD), BOARD[:, 1]]) for t in TIMES
     ]
-    recording = Recording(
-        stamp_ns=np.array([round(1e9 * t) for t in TIMES]),
-        offset=np.array([0, n, 2 * n]),
-        points=np.concatenate(ends).astype(np.float32),
-        hit=np.ones(2 * n, np.bool_),
-        T_base_sensor=np.eye(4)[None],
-        sensor=np.zeros(2, np.int32),
-        T_odom_base=None,
+    recording = of_one_sensor(
+        np.array([round(1e9 * t) for t in TIMES]),
+        np.array([0, n, 2 * n]),
+        np.concatenate(ends).astype(np.float32),
+        np.ones(2 * n, np.bool_),
     )
     sources = MeshInputs(
         recording=recording,

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 from made_up_rooms import looking, rectangle
+from recordings import of_one_sensor
 
-from stillmap.core.recording import Recording
 from stillmap.mesh.inputs import LidarReturns, MeshInputs
 from stillmap.mesh.place import _P_UNOBSERVED, p_unoccluded
 from stillmap.mesh.tracked_boxes import TrackedBox
@@ -19,14 +19,11 @@ VIEW = looking([0.0, 0, 0], [0.0, 1, 0])
 def beams(ends, p, beside=0.3):
     """One scan from a laser to the left of the camera."""
     points = np.add(ends, [beside, 0.0, 0.0])
-    recording = Recording(
-        stamp_ns=np.zeros(1, np.int64),
-        offset=np.array([0, len(points)]),
-        points=points.astype(np.float32),
-        hit=np.ones(len(points), np.bool_),
-        T_base_sensor=np.eye(4)[None],
-        sensor=np.zeros(1, np.int32),
-        T_odom_base=None,
+    recording = of_one_sensor(
+        np.zeros(1, np.int64),
+        np.array([0, len(points)]),
+        points.astype(np.float32),
+        np.ones(len(points), np.bool_),
     )
     T = np.eye(4)[None].copy()
     T[0, 0, 3] = -beside

@@ -4,8 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-
-from stillmap.core.recording import Recording
+from recordings import of_one_sensor
 
 ROOM = np.array([[-3.0, -2.0, -1.2], [5.0, 3.0, 1.6]])  # its lowest and its highest corner
 
@@ -31,14 +30,11 @@ def scans(looking, poses, noise=0.0, box=None, seed=0, step_ns=10**8):
     for d, pose in zip(looking, poses, strict=True):
         r = ranges(pose[:3, 3], d @ pose[:3, :3].T, box)
         points.append((r + noise * rng.standard_normal(len(r)))[:, None] * d)
-    return Recording(
-        stamp_ns=np.arange(T, dtype=np.int64) * step_ns,
-        offset=np.arange(T + 1, dtype=np.int64) * looking.shape[1],
-        points=np.concatenate(points).astype(np.float32),
-        hit=np.ones(T * looking.shape[1], np.bool_),
-        T_base_sensor=np.eye(4)[None],
-        sensor=np.zeros(T, np.int32),
-        T_odom_base=None,
+    return of_one_sensor(
+        np.arange(T, dtype=np.int64) * step_ns,
+        np.arange(T + 1, dtype=np.int64) * looking.shape[1],
+        np.concatenate(points).astype(np.float32),
+        np.ones(T * looking.shape[1], np.bool_),
     )
 
 

@@ -4,6 +4,7 @@ from types import SimpleNamespace
 from unittest import mock
 
 import numpy as np
+from recordings import of_one_sensor
 
 from stillmap.core.recording import Recording
 from stillmap.mesh import inputs
@@ -16,14 +17,11 @@ def _recording(times: np.ndarray | None) -> Recording:
     T, n = 4, 3
     points = np.zeros((T * n, 3), np.float32)
     points[:, 0] = np.arange(T * n) + 1.0
-    return Recording(
-        stamp_ns=np.arange(T) * 100_000_000,
-        offset=np.arange(T + 1, dtype=np.int64) * n,
-        points=points,
-        hit=np.ones(T * n, np.bool_),
-        T_base_sensor=np.eye(4)[None],
-        sensor=np.zeros(T, np.int32),
-        T_odom_base=None,
+    return of_one_sensor(
+        np.arange(T) * 100_000_000,
+        np.arange(T + 1, dtype=np.int64) * n,
+        points,
+        np.ones(T * n, np.bool_),
         beam_time=times,
     )
 

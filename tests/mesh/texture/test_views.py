@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from recordings import of_one_sensor
 
 from stillmap.core import se2, se3
 from stillmap.core.camera import Camera, Images
@@ -38,14 +39,11 @@ def images(seconds, cameras=(CAMERA,), camera=None, load=colours) -> Images:
 
 def recording(seconds, pictures: Images | None) -> Recording:
     T = len(seconds)
-    return Recording(
-        stamp_ns=np.array([round(s * S) for s in seconds], np.int64),
-        offset=np.arange(T + 1, dtype=np.int64),
-        points=np.ones((T, 3), np.float32),
-        hit=np.ones(T, bool),
-        T_base_sensor=np.eye(4)[None],
-        sensor=np.zeros(T, np.int32),
-        T_odom_base=None,
+    return of_one_sensor(
+        np.array([round(s * S) for s in seconds], np.int64),
+        np.arange(T + 1, dtype=np.int64),
+        np.ones((T, 3), np.float32),
+        np.ones(T, bool),
         images=pictures,
     )
 
