@@ -245,4 +245,5 @@ def _windows(
     start[all_round], stop[all_round] = 0, [n, 0, 0]
     use = (start < stop) & (begin < end)[:, None]
     for k, turn in np.argwhere(use).tolist():
-        yield float(near[k]) - _SLACK, k, (slice(start[k, turn], stop[k, turn]), slice(begin[k], end[k]))
+        window = (slice(start[k, turn], stop[k, turn]), slice(begin[k], end[k]))
+        yield float(near[k]) - _SLACK, k, window
