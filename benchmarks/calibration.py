@@ -21,7 +21,7 @@ from prepared import RESOLUTION, counts
 from tables import grouped, markdown
 
 from stillmap.core.recording import Recording
-from stillmap.eval.labels import UNSURE, assign_equal_mass_bins, compute_calibration_error
+from stillmap.results.eval.labels import UNSURE, assign_equal_mass_bins, compute_calibration_error
 from stillmap.sim import simulate
 
 Float = NDArray[np.float64]

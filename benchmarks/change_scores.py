@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.se2 import inverse
-from stillmap.eval.labels import Scores
-from stillmap.eval.map import GHOST_DISTANCE, MIN_HITS, distance_to_walls, is_near_occupied
+from stillmap.results.eval.labels import Scores
+from stillmap.results.eval.map import GHOST_DISTANCE, MIN_HITS, distance_to_walls, is_near_occupied
 from stillmap.results.reader import Grid, moved
 
 Float = NDArray[np.float64]

@@ -31,8 +31,8 @@ from prepared import grid_of
 from tables import Column, means_and_worst
 
 import stillmap
-from stillmap.eval.trajectory import align, compute_absolute_errors
 from stillmap.mapping import Change
+from stillmap.results.eval.trajectory import align, compute_absolute_errors
 from stillmap.results.reader import moved
 from stillmap.sim import Simulation, simulate
 from stillmap.sim.dynamics import place_faces

@@ -22,9 +22,9 @@ import stillmap
 from stillmap import em
 from stillmap.core import config
 from stillmap.em import beam_counting
-from stillmap.eval.labels import score_labels
-from stillmap.eval.map import score_map
-from stillmap.eval.trajectory import align, compute_absolute_errors
+from stillmap.results.eval.labels import score_labels
+from stillmap.results.eval.map import score_map
+from stillmap.results.eval.trajectory import align, compute_absolute_errors
 
 METHODS: dict[str, dict[str, Any]] = {
     "stillmap": {"estimator": "stillmap"},

@@ -25,11 +25,11 @@ from prepared import grid_of
 from tables import Column, means_and_worst
 
 import stillmap
-from stillmap.eval.map import GHOST_DISTANCE, distance_to_walls
-from stillmap.eval.trajectory import align
 from stillmap.mapping.changed_objects import cell_keys
 from stillmap.mapping.doors import Door
 from stillmap.pipeline import final_map
+from stillmap.results.eval.map import GHOST_DISTANCE, distance_to_walls
+from stillmap.results.eval.trajectory import align
 from stillmap.results.reader import moved
 from stillmap.sim import Simulation, simulate
 

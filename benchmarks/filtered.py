@@ -24,8 +24,8 @@ from prepared import Prepared, grid_of, prepare
 from tables import Column, Row, grouped, markdown
 
 import stillmap
-from stillmap.eval.map import score_map
-from stillmap.eval.trajectory import align
+from stillmap.results.eval.map import score_map
+from stillmap.results.eval.trajectory import align
 
 COLUMNS = (
     Column("translation", "relations, m: mean", ".4f"),

@@ -27,7 +27,7 @@ from tables import Row, grouped, markdown
 
 import stillmap
 from stillmap.core.config import merge_nested
-from stillmap.eval.trajectory import compute_absolute_errors
+from stillmap.results.eval.trajectory import compute_absolute_errors
 from stillmap.sim import load_truth
 
 SCANS = 1500

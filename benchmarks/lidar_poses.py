@@ -32,11 +32,11 @@ from tables import markdown
 
 from stillmap.core import config, se2, se3
 from stillmap.core.recording import Recording
-from stillmap.eval.trajectory import compute_absolute_errors, compute_relative_errors
 from stillmap.io.reader import read
 from stillmap.pipeline.options import Options
 from stillmap.prepare.beam_times import add_beam_times
 from stillmap.prepare.options import ReadOptions
+from stillmap.results.eval.trajectory import compute_absolute_errors, compute_relative_errors
 from stillmap.sim import load_truth
 from stillmap.sim.truth import FOLDER
 from stillmap.slam import lidar_odometry

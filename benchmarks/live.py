@@ -33,11 +33,11 @@ from tables import markdown
 
 from stillmap import build, load
 from stillmap.core import se2
-from stillmap.eval.labels import assign_equal_mass_bins, compute_calibration_error
-from stillmap.eval.map import GHOST_DISTANCE, distance_to_walls
-from stillmap.eval.trajectory import align, compute_absolute_errors
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.replay import iter_beams
+from stillmap.results.eval.labels import assign_equal_mass_bins, compute_calibration_error
+from stillmap.results.eval.map import GHOST_DISTANCE, distance_to_walls
+from stillmap.results.eval.trajectory import align, compute_absolute_errors
 from stillmap.results.reader import Grid, moved
 from stillmap.sim import scene_by_name, simulate
 

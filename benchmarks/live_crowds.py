@@ -25,10 +25,10 @@ from particle_filter import ParticleFilter
 from tables import markdown
 
 from stillmap.core import se2
-from stillmap.eval.trajectory import compute_absolute_errors
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.online_slam import OnlineSlam
 from stillmap.live.replay import iter_beams
+from stillmap.results.eval.trajectory import compute_absolute_errors
 from stillmap.results.reader import read_grid
 from stillmap.sim import scene_by_name, simulate
 

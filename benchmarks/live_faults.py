@@ -26,9 +26,9 @@ from live import build_known_map
 from tables import markdown
 
 from stillmap.core import se2
-from stillmap.eval.trajectory import align
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.replay import iter_beams
+from stillmap.results.eval.trajectory import align
 from stillmap.sim import scene_by_name, simulate
 
 _BEFORE, _FAULT, _AFTER = 150, 50, 200  # scans, 5 a second

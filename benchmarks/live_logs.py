@@ -15,10 +15,10 @@ from pairs import timed_poses
 from tables import markdown
 
 import stillmap
-from stillmap.eval.readers import read_planar_trajectory, read_relations
-from stillmap.eval.relations import compute_relation_errors
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.replay import iter_beams, replay
+from stillmap.results.eval.readers import read_planar_trajectory, read_relations
+from stillmap.results.eval.relations import compute_relation_errors
 
 Float = NDArray[np.float64]
 _LOGS = ("intel", "aces", "belgioioso", "edmonton", "fr101", "seattle")

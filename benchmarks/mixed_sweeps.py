@@ -14,10 +14,10 @@ import stillmap
 from stillmap import slam
 from stillmap.core import se2, se3
 from stillmap.core.profiling import StageTimer, no_progress
-from stillmap.eval.labels import score_labels
-from stillmap.eval.map import GHOST_DISTANCE, is_near_occupied
-from stillmap.eval.trajectory import align, compute_absolute_errors
 from stillmap.pipeline.final_map import make_maps
+from stillmap.results.eval.labels import score_labels
+from stillmap.results.eval.map import GHOST_DISTANCE, is_near_occupied
+from stillmap.results.eval.trajectory import align, compute_absolute_errors
 from stillmap.results.reader import Grid, moved
 from stillmap.sim import Simulation, scene_by_name, simulate
 

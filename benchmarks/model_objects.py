@@ -17,7 +17,7 @@ from model_surface import (
 from numpy.typing import NDArray
 from true_surfaces import place_parts, project_to_solid, to_world
 
-from stillmap.eval.labels import NAN, Float, Scores, mean
+from stillmap.results.eval.labels import NAN, Float, Scores, mean
 from stillmap.sim.geometry import MovingSurfaces, Solids, to_local
 
 _SAMPLES = 20_000

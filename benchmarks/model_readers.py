@@ -16,7 +16,7 @@ from stillmap.core.array_folder import open_npy, read_npz
 from stillmap.core.errors import InputError, import_extra
 from stillmap.core.input_files import read_bytes
 from stillmap.core.json import read_json
-from stillmap.eval import readers
+from stillmap.results.eval import readers
 from stillmap.sim.truth import ImageTruth, load_image_truth
 from stillmap.slam.deskew import deskew_recording
 from stillmap.slam.options import SlamOptions

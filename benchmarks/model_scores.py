@@ -20,8 +20,8 @@ from model_surface import score_surface, score_texture
 from numpy.typing import NDArray
 
 from stillmap.core.json import to_jsonable
-from stillmap.eval import trajectory
-from stillmap.eval.trajectory import read_paired_poses
+from stillmap.results.eval import trajectory
+from stillmap.results.eval.trajectory import read_paired_poses
 from stillmap.results.reader import require_model, require_there
 from stillmap.rig.trajectory import lift_poses
 from stillmap.sim.truth import load_truth

@@ -14,7 +14,7 @@ from true_surfaces import project_to_static
 
 from stillmap.core.camera import Camera, is_in_image, project
 from stillmap.core.errors import import_extra
-from stillmap.eval.labels import NAN, Bool, Float, Scores, mean
+from stillmap.results.eval.labels import NAN, Bool, Float, Scores, mean
 from stillmap.sim.camera import SKY, compute_static_color
 from stillmap.sim.geometry import StaticSurfaces
 

@@ -25,8 +25,8 @@ from common import Scores, add_seed_arguments, built, options_of, outcomes, seed
 from tables import Column, Row, grouped, markdown
 
 from stillmap.core.config import merge_nested
-from stillmap.eval.trajectory import compute_absolute_errors
 from stillmap.pipeline import result
+from stillmap.results.eval.trajectory import compute_absolute_errors
 from stillmap.sim import Simulation, scene_by_name, simulate
 from stillmap.slam.mount_calibration import Calibration
 

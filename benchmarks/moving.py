@@ -29,8 +29,8 @@ from tables import Column, means_and_worst
 
 from stillmap.core import se2
 from stillmap.core.profiling import StageTimer
-from stillmap.eval.trajectory import align
 from stillmap.pipeline.result import MappingResult, map_recording
+from stillmap.results.eval.trajectory import align
 from stillmap.sim import Simulation, simulate
 from stillmap.tracking import compute_flow_map
 

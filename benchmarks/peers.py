@@ -31,8 +31,8 @@ from real_logs import split
 from tables import markdown
 
 import stillmap
-from stillmap.eval.readers import read_planar_trajectory
-from stillmap.eval.relations import RelationErrors, compute_relation_errors
+from stillmap.results.eval.readers import read_planar_trajectory
+from stillmap.results.eval.relations import RelationErrors, compute_relation_errors
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from place_truth import SessionTruth
 
 from stillmap.core.array_folder import read_npz
 from stillmap.core.errors import InputError
-from stillmap.eval.labels import Scores
+from stillmap.results.eval.labels import Scores
 
 Bool = NDArray[np.bool_]
 MIN_CELLS = 5  # of an object's surface, seen before and after: its change could be found

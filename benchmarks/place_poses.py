@@ -12,9 +12,9 @@ from place_truth import SessionTruth
 from stillmap.core import json as json_files
 from stillmap.core import se2
 from stillmap.core.errors import InputError
-from stillmap.eval.labels import Scores
-from stillmap.eval.readers import read_trajectory
-from stillmap.eval.trajectory import align, associate_trajectories
+from stillmap.results.eval.labels import Scores
+from stillmap.results.eval.readers import read_trajectory
+from stillmap.results.eval.trajectory import align, associate_trajectories
 
 Float = NDArray[np.float64]
 Verdict = Literal["right", "coarse", "wrong", "refused", "refused rightly"]

@@ -29,10 +29,10 @@ from place_voxels import VoxelTruth, collect_voxels
 from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.core.json import to_jsonable
-from stillmap.eval.labels import LabelScores, Scores, score_labels
-from stillmap.eval.map import GHOST_DISTANCE, distance_to_walls, is_near_occupied
-from stillmap.eval.readers import read_trajectory
-from stillmap.eval.trajectory import align, associate_trajectories, planar
+from stillmap.results.eval.labels import LabelScores, Scores, score_labels
+from stillmap.results.eval.map import GHOST_DISTANCE, distance_to_walls, is_near_occupied
+from stillmap.results.eval.readers import read_trajectory
+from stillmap.results.eval.trajectory import align, associate_trajectories, planar
 from stillmap.results.reader import Grid, moved, read_grid, read_labels, require_there
 
 Bool = NDArray[np.bool_]

@@ -44,7 +44,7 @@ import stillmap
 from stillmap import slam
 from stillmap.core import se2
 from stillmap.core.profiling import peak_memory_bytes
-from stillmap.eval.trajectory import compute_absolute_errors
+from stillmap.results.eval.trajectory import compute_absolute_errors
 from stillmap.sim import load_truth, simulate, write_simulation
 from stillmap.slam import scan_hits
 from stillmap.slam.local_map import travelled_distance

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from stillmap import _core, em
 from stillmap.core import se2
 from stillmap.core.recording import Recording
-from stillmap.eval.map import MapScores, extract_wall_cells, score_map
+from stillmap.results.eval.map import MapScores, extract_wall_cells, score_map
 from stillmap.results.reader import Grid
 from stillmap.sim import Simulation, laser, simulate
 from stillmap.sim.dynamics import transform_faces

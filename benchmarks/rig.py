@@ -21,7 +21,7 @@ from tables import Column, means_and_worst
 
 import stillmap
 from stillmap.core import config
-from stillmap.eval.labels import score_labels
+from stillmap.results.eval.labels import score_labels
 from stillmap.rig.build import PlanarResult, TiltingResult, build_tilting
 from stillmap.sim import RigSimulation, scene_by_name, simulate_rig
 

@@ -109,7 +109,7 @@ def largest_difference(one: Path, other: Path) -> float:
 
 
 def _poses(place: Path) -> dict[str, np.ndarray]:
-    from stillmap.eval.readers import read_trajectory
+    from stillmap.results.eval.readers import read_trajectory
 
     names = [o["name"] for o in json.loads((place / "sessions.json").read_text()) if o["accepted"]]
     keep = np.array([0, 1, 3])

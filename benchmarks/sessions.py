@@ -43,9 +43,13 @@ from session_laps import write_cuts, write_laps, write_pieces
 from session_sets import LASER, PairSet, prepare_days, prepare_pairs
 from tables import markdown
 
-from stillmap.eval.readers import read_planar_trajectory, read_relations, read_trajectory
-from stillmap.eval.relations import compute_relation_errors
-from stillmap.eval.trajectory import ErrorStats, associate_trajectories, compute_absolute_errors
+from stillmap.results.eval.readers import read_planar_trajectory, read_relations, read_trajectory
+from stillmap.results.eval.relations import compute_relation_errors
+from stillmap.results.eval.trajectory import (
+    ErrorStats,
+    associate_trajectories,
+    compute_absolute_errors,
+)
 from stillmap.sim import scene_by_name, simulate, write_simulation
 
 _STRANGERS = (("aces", "fr101"), ("fr101", "edmonton"), ("aces", "seattle"))

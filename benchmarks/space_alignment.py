@@ -34,13 +34,13 @@ from tables import markdown
 
 import stillmap
 from stillmap.core import se2
-from stillmap.eval.trajectory import align
 from stillmap.io.trajectory import read_tum
 from stillmap.places.grow import add_session, lift_alignment, start_place
 from stillmap.places.inputs import to_session
 from stillmap.places.keyframes import Session
 from stillmap.places.place import Place, fit_alignment
 from stillmap.places.placement import find_placement
+from stillmap.results.eval.trajectory import align
 
 Float = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from common import Scores
 from numpy.typing import NDArray
 from space_cases import LASTING, NOBODY, Known, known_of_given
 
-from stillmap.eval.labels import score_labels
+from stillmap.results.eval.labels import score_labels
 
 _NAN = float("nan")
 

@@ -76,7 +76,6 @@ _MODULES = {
 _ROOMS = (
     "core",
     "em",
-    "eval",
     "io",
     "live",
     "mapping",
@@ -89,7 +88,6 @@ _ROOMS = (
     "sim",
     "slam",
     "tracking",
-    "viewer",
 )
 
 

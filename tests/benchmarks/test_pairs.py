@@ -5,7 +5,7 @@ import pytest
 from pairs import errors_of, known_relations, name_of, near_pairs, relations_beside, relations_of
 
 from stillmap.core import se2
-from stillmap.eval.readers import read_relations
+from stillmap.results.eval.readers import read_relations
 from stillmap.sim import scene_by_name, simulate, write_simulation
 
 

@@ -12,8 +12,8 @@ from flat import files_of
 from maps import ENDLESS
 from refusals import refused
 
-from stillmap.eval.readers import read_trajectory
-from stillmap.eval.trajectory import align
+from stillmap.results.eval.readers import read_trajectory
+from stillmap.results.eval.trajectory import align
 
 QUICK = ("--threads", "1", "--quiet")
 

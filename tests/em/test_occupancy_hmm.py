@@ -10,7 +10,7 @@ from stillmap import _core, em
 from stillmap.core import chunks
 from stillmap.em import occupancy_hmm
 from stillmap.em.observations import LOOP_CLASSES, build_surfel_map
-from stillmap.eval.labels import assign_equal_width_bins, compute_calibration_error
+from stillmap.results.eval.labels import assign_equal_width_bins, compute_calibration_error
 from stillmap.sim import CrowdOptions, LaserOptions, RobotOptions, Scene, simulate
 from stillmap.sim.walls import box
 

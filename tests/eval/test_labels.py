@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stillmap.eval.labels import (
+from stillmap.results.eval.labels import (
     assign_equal_mass_bins,
     assign_equal_width_bins,
     compute_average_precision,

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from stillmap.core import se2
-from stillmap.eval.map import (
+from stillmap.results.eval.map import (
     distance_to_walls,
     extract_wall_cells,
     extract_wall_cells_from_hits,

@@ -6,14 +6,14 @@ import pytest
 from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.core.timestamps import parse_ns
-from stillmap.eval.readers import (
+from stillmap.io.trajectory import write_tum
+from stillmap.results.eval.readers import (
     read_odometry,
     read_planar_trajectory,
     read_relations,
     read_trajectory,
     to_seconds,
 )
-from stillmap.io.trajectory import write_tum
 
 ODOM = "ODOM {x} 0 0 0 0 0 {t} host 0.1\n"
 FLASER = "FLASER 3 1.0 1.0 1.0 9 9 9 {x} 0 0 {t} host 0.1\n"

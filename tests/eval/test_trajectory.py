@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from stillmap.core import se2
 from stillmap.core.errors import InputError
-from stillmap.eval.trajectory import (
+from stillmap.results.eval.trajectory import (
     align,
     align_points,
     associate_trajectories,

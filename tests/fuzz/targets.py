@@ -18,13 +18,13 @@ from stillmap.cli.recording_info import summarize_recording
 from stillmap.core.config import load_toml, override
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.eval import readers
 from stillmap.io import read
 from stillmap.io.ros import reader as reader_module  # noqa: F401  (instrumented at import)
 from stillmap.io.trajectory import read_tum
 from stillmap.pipeline.options import Options
 from stillmap.prepare.options import ReadOptions
 from stillmap.results import reader as result_reader
+from stillmap.results.eval import readers
 from stillmap.results.folder import open_result
 from stillmap.results.reader import read_labels, read_tracks
 from stillmap.sim import load_truth

@@ -15,12 +15,12 @@ import pytest
 
 from stillmap.core.config import load_toml, override, parse_assignment
 from stillmap.core.errors import InputError
-from stillmap.eval import readers
 from stillmap.io import read, stillmap_folder, text_lines, writers
 from stillmap.io.carmen import log as log_module
 from stillmap.io.trajectory import read_tum
 from stillmap.prepare.options import ReadOptions
 from stillmap.results import reader
+from stillmap.results.eval import readers
 
 FLASER = "FLASER 2 1.0 2.0 0 0 0 0 0 0 1 host 1\n"
 

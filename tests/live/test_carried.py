@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from stillmap.core import se2
-from stillmap.eval.trajectory import align
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.replay import iter_beams
+from stillmap.results.eval.trajectory import align
 from stillmap.sim import scene_by_name, simulate
 
 BEFORE, AFTER = 300, 60

@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stillmap.eval.trajectory import compute_absolute_errors
 from stillmap.live.front_end import Crowd
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.replay import iter_beams
+from stillmap.results.eval.trajectory import compute_absolute_errors
 from stillmap.sim import scene_by_name, simulate
 
 STEP, PERIOD_NS = 0.1, 200_000_000

@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 
 from stillmap.core import se2
-from stillmap.eval.trajectory import compute_absolute_errors
 from stillmap.live.dead_reckoning import DeadReckoning
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.replay import iter_beams
+from stillmap.results.eval.trajectory import compute_absolute_errors
 from stillmap.sim import scene_by_name, simulate
 
 

@@ -9,9 +9,9 @@ import pytest
 
 import stillmap
 from stillmap.core import se2
-from stillmap.eval.trajectory import align
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.replay import iter_beams
+from stillmap.results.eval.trajectory import align
 from stillmap.sim import scene_by_name, simulate
 
 BEFORE, ELSEWHERE, AGAIN = 120, 170, 230  # scans, until it is carried on

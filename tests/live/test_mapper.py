@@ -13,7 +13,6 @@ import stillmap
 from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.em.options import EmOptions
-from stillmap.eval.trajectory import compute_absolute_errors
 from stillmap.live.causal_labels import CausalLabels, take_over
 from stillmap.live.loop_closer import Correction
 from stillmap.live.map_frame import MapCorrection, rotate_covariance
@@ -21,6 +20,7 @@ from stillmap.live.mapper import LiveMapper
 from stillmap.live.observation import Observation
 from stillmap.live.replay import iter_beams
 from stillmap.live.scan import to_beams
+from stillmap.results.eval.trajectory import compute_absolute_errors
 
 
 @pytest.fixture

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from stillmap.core import se2
-from stillmap.eval.trajectory import compute_absolute_errors
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.odometry_faults import standing_prior
 from stillmap.live.replay import iter_beams
+from stillmap.results.eval.trajectory import compute_absolute_errors
 from stillmap.sim import scene_by_name, simulate
 
 FIRST, SPINNING, PERIOD_NS = 90, 20, 200_000_000

@@ -12,7 +12,7 @@ from marks import slow_params
 import stillmap
 from stillmap import _core, em, slam
 from stillmap.core.config import override
-from stillmap.eval.trajectory import compute_absolute_errors
+from stillmap.results.eval.trajectory import compute_absolute_errors
 from stillmap.sim import scene_by_name, simulate
 
 AT_ONCE = {"slam": {"deskew": False}}

@@ -7,7 +7,7 @@ from choices import RESOLUTION, options
 import stillmap
 from stillmap import _core, em
 from stillmap.em import beam_counting
-from stillmap.eval.labels import score_labels
+from stillmap.results.eval.labels import score_labels
 
 
 @pytest.fixture

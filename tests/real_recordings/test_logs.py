@@ -9,9 +9,9 @@ import pytest
 import stillmap
 from stillmap.core import se2
 from stillmap.core.config import override
-from stillmap.eval.readers import read_odometry, read_relations, to_seconds
-from stillmap.eval.relations import compute_relation_errors
 from stillmap.pipeline.options import Options
+from stillmap.results.eval.readers import read_odometry, read_relations, to_seconds
+from stillmap.results.eval.relations import compute_relation_errors
 
 pytestmark = pytest.mark.slow
 

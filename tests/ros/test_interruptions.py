@@ -15,7 +15,7 @@ from judge import laser_pose, poses_of, stamp_of, truth_at
 
 import stillmap
 from stillmap.core import se2
-from stillmap.eval.trajectory import compute_absolute_errors
+from stillmap.results.eval.trajectory import compute_absolute_errors
 
 
 def test_lost_swapped_and_odd_stamps_and_a_robot_that_dies(

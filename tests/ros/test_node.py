@@ -14,7 +14,7 @@ from judge import planar, poses_of, stamp_of, truth_at
 
 import stillmap
 from stillmap.core import se2
-from stillmap.eval.trajectory import compute_absolute_errors
+from stillmap.results.eval.trajectory import compute_absolute_errors
 
 
 def test_a_whole_run_with_tf(simulation, judge, tf_environment, start_node, start_robot, tmp_path):

@@ -14,7 +14,7 @@ from judge import poses_of, stamp_of, truth_at
 
 import stillmap
 from stillmap.core import se2
-from stillmap.eval.trajectory import compute_absolute_errors
+from stillmap.results.eval.trajectory import compute_absolute_errors
 
 
 def test_a_robot_without_odometry_is_mapped_too(

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from stillmap.core import se2
-from stillmap.eval.readers import read_truth
+from stillmap.results.eval.readers import read_truth
 from stillmap.sim import (
     OdometryOptions,
     Simulation,

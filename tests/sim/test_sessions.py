@@ -9,8 +9,8 @@ import pytest
 from place_truth import load_session_truth
 
 from stillmap.core.errors import InputError
-from stillmap.eval.map import distance_to_walls
 from stillmap.io.stillmap_folder import read
+from stillmap.results.eval.map import distance_to_walls
 from stillmap.sim import Scene, scene_by_name
 from stillmap.sim.dynamics import place_faces
 from stillmap.sim.session_layout import Floor, cross_rectangle

@@ -6,7 +6,7 @@ from recordings import of_one_sensor
 
 import stillmap
 from stillmap.core import se2
-from stillmap.eval.trajectory import align
+from stillmap.results.eval.trajectory import align
 from stillmap.sim import scene_by_name, simulate
 from stillmap.slam import loop_closure
 from stillmap.slam.heading_alignment import align_headings

@@ -7,7 +7,7 @@ import pytest
 from marks import slow_params
 
 import stillmap
-from stillmap.eval.trajectory import compute_absolute_errors
+from stillmap.results.eval.trajectory import compute_absolute_errors
 from stillmap.sim import scene_by_name, simulate
 from stillmap.slam import SlamOptions, m_step
 

@@ -8,7 +8,7 @@ from boxes import Boxes, Lidar, Way, at_once, recorded
 
 from stillmap import _core
 from stillmap.core import se2, se3
-from stillmap.eval.trajectory import compute_absolute_errors, compute_relative_errors
+from stillmap.results.eval.trajectory import compute_absolute_errors, compute_relative_errors
 from stillmap.slam import constant_velocity, lidar_odometry
 from stillmap.slam.options import OdometryOptions
 

@@ -7,7 +7,7 @@ import pytest
 from boxes import Boxes, Lidar, Way, recorded
 
 from stillmap.core import se2, se3
-from stillmap.eval.trajectory import compute_absolute_errors
+from stillmap.results.eval.trajectory import compute_absolute_errors
 from stillmap.slam import SlamOptions, lidar_odometry, loop_closure_3d
 from stillmap.slam.options import OdometryOptions
 from stillmap.slam.pose_graph import Constraint, optimize_poses, squared_mahalanobis

@@ -7,7 +7,7 @@ import pytest
 from marks import slow_params
 
 from stillmap.core import se2
-from stillmap.eval.trajectory import compute_absolute_errors
+from stillmap.results.eval.trajectory import compute_absolute_errors
 from stillmap.sim import RobotOptions, Scene, scene_by_name, simulate
 from stillmap.sim.options import CrowdOptions, LaserOptions, OdometryOptions
 from stillmap.sim.walls import box, pillar

@@ -12,10 +12,10 @@ from stillmap.core import se2
 from stillmap.core.arrays import write_npz
 from stillmap.io.trajectory import poses_from_tum, write_tum
 from stillmap.results.points import write_clouds
+from stillmap.results.viewer.beams import Beams
+from stillmap.results.viewer.scene import read_scene
 from stillmap.results.writer import write_labels
 from stillmap.slam import SlamOptions
-from stillmap.viewer.beams import Beams
-from stillmap.viewer.scene import read_scene
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))  # for what the tests share
 
@@ -86,7 +86,7 @@ def beams_of():
 def opened():
     """Opens windows, which are closed after the test."""
     pytest.importorskip("viser", reason="the extra `viewer` is not installed")
-    from stillmap.viewer.window import Window
+    from stillmap.results.viewer.window import Window
 
     windows = []
 

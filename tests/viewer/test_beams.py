@@ -5,9 +5,9 @@ import pytest
 
 from stillmap.io import read
 from stillmap.io.trajectory import poses_from_tum
+from stillmap.results.viewer import beams as module
+from stillmap.results.viewer.beams import Beams
 from stillmap.slam import SlamOptions, deskew_recording
-from stillmap.viewer import beams as module
-from stillmap.viewer.beams import Beams
 
 
 @pytest.fixture(params=[(2, False), (2, True), (3, False), (3, True)])

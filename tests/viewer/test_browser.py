@@ -13,7 +13,7 @@ from stillmap.mesh.texture import TexturedMesh
 from stillmap.results.colors import BACKGROUND, TEAL
 from stillmap.results.gltf import write_glb
 from stillmap.results.report.place import KIND_COLORS
-from stillmap.viewer.scene import read_scene
+from stillmap.results.viewer.scene import read_scene
 
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 pytest.importorskip("websockets.sync.client")
@@ -22,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "places"))
 from browser_tab import BROWSER, HEIGHT, Tab
 from small_place import make_place
 
-from stillmap.viewer.window import Window
+from stillmap.results.viewer.window import Window
 
 pytestmark = [
     pytest.mark.slow,

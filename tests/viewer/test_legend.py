@@ -7,11 +7,11 @@ import pytest
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 
 from stillmap.results.colors import BLUE, ORANGE, TEAL
-from stillmap.viewer.legend import (
+from stillmap.results.viewer.legend import (
     legend_html,
     scale_length,
 )
-from stillmap.viewer.scene import read_scene
+from stillmap.results.viewer.scene import read_scene
 
 
 def colors(html):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stillmap.viewer.measuring import Ray
+from stillmap.results.viewer.measuring import Ray
 
 
 def test_measured_distances_are_shown_and_cleared(window):

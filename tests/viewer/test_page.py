@@ -11,13 +11,13 @@ from urllib.parse import urlsplit
 import pytest
 
 from stillmap.core.errors import InputError
-from stillmap.viewer.scene import read_scene
+from stillmap.results.viewer.scene import read_scene
 
 viser = pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 sockets = pytest.importorskip("websockets.sync.client")
 
-from stillmap.viewer import server as module  # noqa: E402
-from stillmap.viewer.window import Window  # noqa: E402
+from stillmap.results.viewer import server as module  # noqa: E402
+from stillmap.results.viewer.window import Window  # noqa: E402
 
 
 def port_of(window):

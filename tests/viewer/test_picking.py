@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stillmap.viewer.measuring import Ray, pick_plane, pick_point
+from stillmap.results.viewer.measuring import Ray, pick_plane, pick_point
 
 EYE = np.array([1.0, 2.0, 3.0])
 AHEAD = Ray(EYE, np.array([1.0, 0.0, 0.0]))

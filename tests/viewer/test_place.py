@@ -13,7 +13,7 @@ from small_place import CHAIR, NAMES, make_place
 from stillmap.cli.main import main
 from stillmap.core.errors import InputError
 from stillmap.results.report.place import KIND_COLORS
-from stillmap.viewer.scene import read_scene
+from stillmap.results.viewer.scene import read_scene
 
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 
@@ -131,7 +131,7 @@ def test_keys_step_through_sessions(window):
 
 
 def test_legend_explains_colors_while_they_are_shown(window):
-    from stillmap.viewer.legend import legend_html
+    from stillmap.results.viewer.legend import legend_html
 
     def told():
         return legend_html(window._layers, "label", True)

@@ -6,7 +6,7 @@ import pytest
 from stillmap.core.arrays import sample_indices
 from stillmap.core.errors import InputError
 from stillmap.results.points import ply_header
-from stillmap.viewer.scene import sample_ply
+from stillmap.results.viewer.scene import sample_ply
 
 
 def test_sample_contains_every_lidar_ring():

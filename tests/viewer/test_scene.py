@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from stillmap.core.errors import InputError
-from stillmap.viewer.nodes import default_view
-from stillmap.viewer.scene import read_scene
+from stillmap.results.viewer.nodes import default_view
+from stillmap.results.viewer.scene import read_scene
 
 
 def test_map_image_has_the_orientation_of_the_map(result_of):

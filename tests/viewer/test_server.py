@@ -2,7 +2,7 @@
 
 import pytest
 
-from stillmap.viewer.server import is_local_request
+from stillmap.results.viewer.server import is_local_request
 
 
 @pytest.mark.parametrize(

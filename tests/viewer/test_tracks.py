@@ -12,7 +12,7 @@ from stillmap.results.object_poses import (
     object_poses_at,
 )
 from stillmap.results.reader import Track
-from stillmap.viewer.objects import box_edges, describe_object
+from stillmap.results.viewer.objects import box_edges, describe_object
 
 NOW = 1_700_000_000_000_000_000
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from stillmap.results.colors import ORANGE
-from stillmap.viewer.scene import read_scene
+from stillmap.results.viewer.scene import read_scene
 
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 
-from stillmap.viewer.legend import ACTION_KEYS, LAYER_KEYS
-from stillmap.viewer.nodes import escape_markdown
+from stillmap.results.viewer.legend import ACTION_KEYS, LAYER_KEYS
+from stillmap.results.viewer.nodes import escape_markdown
 
 
 def node(window, path):

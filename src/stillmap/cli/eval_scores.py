@@ -10,12 +10,17 @@ from numpy.typing import NDArray
 from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.core.grid_map import is_inside
-from stillmap.eval import readers, trajectory
-from stillmap.eval.labels import LabelScores, score_labels
-from stillmap.eval.map import MapScores, extract_wall_cells, extract_wall_cells_from_hits, score_map
-from stillmap.eval.readers import Truth, read_truth, require_same_beams
-from stillmap.eval.relations import RelationErrors, compute_relation_errors
-from stillmap.eval.trajectory import read_paired_poses
+from stillmap.results.eval import readers, trajectory
+from stillmap.results.eval.labels import LabelScores, score_labels
+from stillmap.results.eval.map import (
+    MapScores,
+    extract_wall_cells,
+    extract_wall_cells_from_hits,
+    score_map,
+)
+from stillmap.results.eval.readers import Truth, read_truth, require_same_beams
+from stillmap.results.eval.relations import RelationErrors, compute_relation_errors
+from stillmap.results.eval.trajectory import read_paired_poses
 from stillmap.results.reader import (
     is_place,
     moved,

@@ -162,9 +162,9 @@ class _Version(argparse.Action):
     """Print the version, looked up on demand."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
-        from stillmap import __version__
+        from stillmap.core.files import package_version
 
-        print(f"stillmap {__version__}")
+        print(f"stillmap {package_version()}")
         parser.exit()
 
 

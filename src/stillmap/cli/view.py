@@ -14,8 +14,8 @@ from stillmap.core.profiling import is_terminal
 
 if TYPE_CHECKING:
     from stillmap.results.folder import ResultFolder
-    from stillmap.viewer.beams import Beams
-    from stillmap.viewer.scene import Scene
+    from stillmap.results.viewer.beams import Beams
+    from stillmap.results.viewer.scene import Scene
 
 
 _REPORT = "report.html"
@@ -124,8 +124,8 @@ def _serve(args: argparse.Namespace, folder: Path) -> None:
         InputError: a file of the result is damaged, or the recording that was named is another.
     """
     from stillmap.results.reader import is_place
-    from stillmap.viewer.scene import read_scene
-    from stillmap.viewer.window import Window
+    from stillmap.results.viewer.scene import read_scene
+    from stillmap.results.viewer.window import Window
 
     if is_place(folder):
         if args.input:
@@ -151,7 +151,7 @@ def _serve(args: argparse.Namespace, folder: Path) -> None:
 def _read_result(args: argparse.Namespace, folder: Path) -> tuple["Scene", "Beams | None"]:
     """The result of one recording; without beams where that cannot be read and is not named."""
     from stillmap.results.folder import open_result
-    from stillmap.viewer.scene import read_scene
+    from stillmap.results.viewer.scene import read_scene
 
     result = open_result(folder, args.input)
     scene = read_scene(folder, result.source.name)
@@ -169,7 +169,7 @@ def _read_result(args: argparse.Namespace, folder: Path) -> tuple["Scene", "Beam
 
 def _read_beams(result: "ResultFolder", quiet: bool) -> "Beams":
     from stillmap.io.trajectory import poses_from_tum
-    from stillmap.viewer.beams import Beams
+    from stillmap.results.viewer.beams import Beams
 
     with show_share(quiet, "reading") as progress:
         recording, labels = result.read(progress)

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.errors import InputError
-from stillmap.eval import readers
-from stillmap.eval.labels import Float, Scores
-from stillmap.eval.readers import Truth
+from stillmap.results.eval import readers
+from stillmap.results.eval.labels import Float, Scores
+from stillmap.results.eval.readers import Truth
 
 Unit = Literal["m", "frames"]
 

@@ -10,8 +10,8 @@ import numpy as np
 import scipy  # submodules load on first use
 from numpy.typing import NDArray
 
-from stillmap.viewer.scene import Scene
-from stillmap.viewer.server import Server
+from stillmap.results.viewer.scene import Scene
+from stillmap.results.viewer.server import Server
 
 FIELD_OF_VIEW = math.radians(60.0)  # vertical
 MIN_ASPECT = 1.1  # width / height of the page beside the controls

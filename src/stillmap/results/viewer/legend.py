@@ -20,9 +20,9 @@ from stillmap.results.colors import (
 )
 from stillmap.results.report.figures import UNKNOWN
 from stillmap.results.report.place import KIND_COLORS
-from stillmap.viewer.layers import HEIGHT, PICTURES, Layers
-from stillmap.viewer.nodes import TEXT_STYLE
-from stillmap.viewer.server import Server
+from stillmap.results.viewer.layers import HEIGHT, PICTURES, Layers
+from stillmap.results.viewer.nodes import TEXT_STYLE
+from stillmap.results.viewer.server import Server
 
 # W, A, S, D, Q, E and the vertical arrows move viser's camera
 LAYER_KEYS = {

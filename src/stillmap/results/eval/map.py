@@ -7,7 +7,7 @@ import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
 
 from stillmap.core import se2
-from stillmap.eval.labels import Scores
+from stillmap.results.eval.labels import Scores
 from stillmap.results.reader import Float, Grid, moved
 
 GHOST_DISTANCE = 2.0  # cells from the nearest wall

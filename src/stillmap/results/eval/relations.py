@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
-from stillmap.eval.labels import Float, Scores
-from stillmap.eval.trajectory import nearest_index
+from stillmap.results.eval.labels import Float, Scores
+from stillmap.results.eval.trajectory import nearest_index
 
 MAX_DT = 0.1  # seconds, as in the authors' program
 

@@ -10,9 +10,9 @@ from stillmap.results.colors import color_by_id
 from stillmap.results.object_poses import ObjectPoses
 from stillmap.results.report.place import KIND_COLORS
 from stillmap.results.timeline import SessionChange
-from stillmap.viewer.nodes import Labels, Nodes, escape_markdown, table_html
-from stillmap.viewer.objects import box_edges
-from stillmap.viewer.scene import ViewedPlace
+from stillmap.results.viewer.nodes import Labels, Nodes, escape_markdown, table_html
+from stillmap.results.viewer.objects import box_edges
+from stillmap.results.viewer.scene import ViewedPlace
 
 _MAX_ROWS = 25
 Float = NDArray[np.float64]

@@ -11,7 +11,7 @@ from stillmap.core.arrays import sample_indices
 from stillmap.results.colors import color_by_id
 from stillmap.results.object_poses import ObjectPoses, is_present, object_poses_at
 from stillmap.results.reader import Track
-from stillmap.viewer.nodes import NO_SHADOWS, Labels, Nodes, node_path, quaternions
+from stillmap.results.viewer.nodes import NO_SHADOWS, Labels, Nodes, node_path, quaternions
 
 Float = NDArray[np.float64]
 # corners of a box that each edge joins; bits 0 to 2 of a corner are its side in x, y, z

@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.viewer.beams import Beams
-from stillmap.viewer.layers import Layers
-from stillmap.viewer.legend import (
+from stillmap.results.viewer.beams import Beams
+from stillmap.results.viewer.layers import Layers
+from stillmap.results.viewer.legend import (
     ACTION_KEYS,
     LAYER_KEYS,
     LegendPanels,
     help_html,
     legend_html,
 )
-from stillmap.viewer.measuring import Measuring
-from stillmap.viewer.nodes import (
+from stillmap.results.viewer.measuring import Measuring
+from stillmap.results.viewer.nodes import (
     FIELD_OF_VIEW,
     MIN_ASPECT,
     Nodes,
@@ -27,10 +27,10 @@ from stillmap.viewer.nodes import (
     escape_markdown,
     table_html,
 )
-from stillmap.viewer.objects import ObjectNodes, describe_object
-from stillmap.viewer.scene import Scene
-from stillmap.viewer.server import start_server, stop_server
-from stillmap.viewer.sessions import SessionControls, SessionNodes
+from stillmap.results.viewer.objects import ObjectNodes, describe_object
+from stillmap.results.viewer.scene import Scene
+from stillmap.results.viewer.server import start_server, stop_server
+from stillmap.results.viewer.sessions import SessionControls, SessionNodes
 
 _FRAME_TIME = 0.1  # s between updates while playing
 _IDLE_TIME = 0.05  # s between polls of the controls

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.viewer.nodes import Nodes, escape_markdown, node_path
+from stillmap.results.viewer.nodes import Nodes, escape_markdown, node_path
 
 Float = NDArray[np.float64]
 

@@ -18,12 +18,12 @@ from stillmap.results.colors import (
     color_by_p_static,
     color_static,
 )
-from stillmap.viewer.beams import Beams
-from stillmap.viewer.measuring import Ray, pick_plane, pick_point
-from stillmap.viewer.nodes import NO_SHADOWS, Nodes, node_path
-from stillmap.viewer.objects import ObjectNodes
-from stillmap.viewer.scene import MAX_POINTS, Points, to_rgba
-from stillmap.viewer.sessions import SessionNodes
+from stillmap.results.viewer.beams import Beams
+from stillmap.results.viewer.measuring import Ray, pick_plane, pick_point
+from stillmap.results.viewer.nodes import NO_SHADOWS, Nodes, node_path
+from stillmap.results.viewer.objects import ObjectNodes
+from stillmap.results.viewer.scene import MAX_POINTS, Points, to_rgba
+from stillmap.results.viewer.sessions import SessionNodes
 
 _MAX_TRAJECTORY_POINTS = 5_000
 _MAX_RAYS = 1_500
