@@ -79,9 +79,9 @@ def test_a_place_grows_and_keeps_its_frame(call, flat_days, flat_place, tmp_path
     before, after = (
         measure_errors(one, flat_days, "2") for one in (flat_place, tmp_path / "grown")
     )
-    # two cells; over thirty seeds at most 0.057 m
+    # two cells; over thirty seeds at most 0.072 m, and the mean grows by at most 0.0017 m
     assert max(*before, *after) < 0.1
-    assert np.mean(after) < np.mean(before) + 0.02
+    assert np.mean(after) < np.mean(before) + 0.005
     assert max(measure_errors(tmp_path / "grown", flat_days, "3")) < 0.1
     refused(call(*words), "already holds something", "--overwrite")
     refused(call(*words, "--overwrite", "--resolution", "0.1", "--quiet"), "cells of 0.05 m")

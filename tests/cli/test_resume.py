@@ -1,4 +1,4 @@
-"""`stillmap map --resume`: the result is that of an uninterrupted run."""
+"""`stillmap map --resume`: the result equals that of an uninterrupted run to the bit."""
 
 import errno
 import fcntl
@@ -77,25 +77,17 @@ def interrupted(call, room, tmp_path, stop_after):
     return tmp_path / ".out.resume"
 
 
-def assert_alike(result, whole) -> None:
-    """The map of a run that went on is that of one which nobody interrupted."""
-    labels, known = (np.load(one / "beams/p_static.npy") < 0.5 for one in (result, whole))
-    assert np.mean(labels != known) < 0.01
-    poses, true = (np.loadtxt(one / "trajectory.tum") for one in (result, whole))
-    np.testing.assert_allclose(poses[:, 1:3], true[:, 1:3], atol=0.03)
-    run = json.loads((result / "run.json").read_text())
-    assert [one["number"] for one in run["iterations"]] == [*range(1, ALL + 1)]
-
-
 @pytest.mark.parametrize("number", [1, 2, 3])
-def test_result_is_that_of_an_uninterrupted_run(call, room, tmp_path, stop_after, whole, number):
+def test_result_equals_that_of_an_uninterrupted_run(
+    call, room, tmp_path, stop_after, whole, number
+):
     stop_after(number)
     assert call("map", room, "-o", tmp_path / "out", *WORDS).returncode == 130
     stop_after(ALL)
     done = call("map", room, "-o", tmp_path / "out", "--resume", *WORDS)
     assert done.returncode == 0, done.stderr
     assert f"continues after iteration {number}" in done.stderr
-    assert_alike(tmp_path / "out", whole)
+    assert contents(tmp_path / "out") == contents(whole)
     assert os.listdir(tmp_path) == ["out"]
 
 
@@ -106,7 +98,7 @@ def test_repeated_interruptions(call, room, tmp_path, stop_after, whole):
         assert done.returncode == 130
     stop_after(ALL)
     assert call("map", room, "-o", tmp_path / "out", "--resume", *WORDS).returncode == 0
-    assert_alike(tmp_path / "out", whole)
+    assert contents(tmp_path / "out") == contents(whole)
 
 
 def test_given_poses(call, room, tmp_path, stop_after):
@@ -176,10 +168,14 @@ def test_resume_with_other_threads(call, room, tmp_path, interrupted, whole):
     words = (*WORDS[:-1], "2")
     assert call("map", room, "-o", tmp_path / "out", "--resume", *words).returncode == 0
     assert not interrupted.exists()
-    assert_alike(tmp_path / "out", whole)
+    mine, theirs = contents(tmp_path / "out"), contents(whole)
+    differ = {name for name in theirs if mine[name] != theirs[name]}
+    assert differ <= {"run.json", "report.html"}  # they name the number of threads
 
 
-@pytest.mark.parametrize("name", ["checkpoint.json", "poses.npy", "p_static.npy"])
+@pytest.mark.parametrize(
+    "name", ["checkpoint.json", "state.latest.m_step.poses.npy", "state.best.e_step.p_static.npy"]
+)
 def test_damaged_checkpoint_is_named(call, room, tmp_path, interrupted, name):
     path = interrupted / "iteration-2" / name
     path.write_bytes(path.read_bytes()[:-7])
@@ -231,7 +227,7 @@ def test_full_disk_keeps_previous_checkpoint(
     assert "No space left" in done.stderr
     assert sorted(os.listdir(interrupted)) == ["iteration-2", "lock"]
     assert call("map", room, "-o", tmp_path / "out", "--resume", *WORDS).returncode == 0
-    assert_alike(tmp_path / "out", whole)
+    assert contents(tmp_path / "out") == contents(whole)
 
 
 def test_full_disk_keeps_earlier_result(call, room, tmp_path, whole, monkeypatch):
@@ -246,7 +242,7 @@ def test_full_disk_keeps_earlier_result(call, room, tmp_path, whole, monkeypatch
     assert os.listdir(out) == ["run.json"]
     assert sorted(os.listdir(tmp_path / ".out.resume")) == [f"iteration-{ALL}", "lock"]
     assert call("map", room, "-o", out, "--resume", *WORDS).returncode == 0
-    assert_alike(out, whole)
+    assert contents(out) == contents(whole)
 
 
 @pytest.mark.slow
@@ -263,5 +259,5 @@ def test_resume_after_kill(start, room, tmp_path, whole):
     begun = time.monotonic()
     _, err = process.communicate()
     assert process.returncode == 0, (err, time.monotonic() - begun)
-    assert_alike(tmp_path / "out", whole)
+    assert contents(tmp_path / "out") == contents(whole)
     assert os.listdir(tmp_path) == ["out"]

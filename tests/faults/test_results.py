@@ -167,7 +167,9 @@ def checkpoint(interrupted, tmp_path) -> Path:
     return tmp_path / "in" / ".out.resume" / "iteration-2"
 
 
-@pytest.mark.parametrize("name", ["checkpoint.json", "poses.npy", "p_static.npy"])
+@pytest.mark.parametrize(
+    "name", ["checkpoint.json", "state.best.m_step.poses.npy", "state.latest.e_step.p_static.npy"]
+)
 @pytest.mark.parametrize(
     "fault",
     [
@@ -190,8 +192,9 @@ def test_pipe_as_lock(checkpoint, tmp_path, capsys):
 
 CHANGES = {
     "another version": lambda state: state.update(format_version=99),
-    "no numbers": lambda state: state.update(iterations=[]),
-    "text for a number": lambda state: state["iterations"][0].update(seconds="long"),
+    "no best": lambda state: state["state"].update(best=None),
+    "text for a number": lambda state: state["state"]["records"][0].update(seconds="long"),
+    "another file": lambda state: state["state"]["best"].update(weights={"__file__": "../lock"}),
     "no key": lambda state: state.pop("key"),
     "no stages": lambda state: state.update(stages={"read": 3}),
 }
@@ -209,12 +212,12 @@ def test_record_that_no_run_has_written(checkpoint, tmp_path, capsys, change):
 @pytest.mark.parametrize(
     ("name", "change"),
     [
-        ("poses", lambda a: a[:-1]),
-        ("poses", lambda a: np.full_like(a, np.nan)),
-        ("poses", lambda a: 1e300 * a),
-        ("p_static", lambda a: a[:-1]),
-        ("p_static", lambda a: a - 2),
-        ("p_static", lambda a: a.astype("U4")),
+        ("state.latest.m_step.poses", lambda a: a[:-1]),
+        ("state.latest.m_step.poses", lambda a: np.full_like(a, np.nan)),
+        ("state.latest.m_step.poses", lambda a: 1e300 * a),
+        ("state.best.e_step.p_static", lambda a: a[:-1]),
+        ("state.best.e_step.p_static", lambda a: a - 2),
+        ("state.best.e_step.p_static", lambda a: a.astype("U4")),
     ],
 )
 def test_array_that_no_run_has_written(checkpoint, tmp_path, capsys, name, change):

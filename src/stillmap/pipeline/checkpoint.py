@@ -1,12 +1,13 @@
-"""What `--resume` goes on from: poses and P(static) of the last finished iteration of a run.
+"""What `--resume` goes on from: the state of EM after the last finished iteration of a run.
 
-They lie in `.NAME.resume/iteration-K/` beside the output NAME, with the key of the run: version,
+It lies in `.NAME.resume/iteration-K/` beside the output NAME, with the key of the run: version,
 options, and a hash of its input. The folder is locked while the run lasts.
 """
 
 import dataclasses
 import fcntl
 import hashlib
+import math
 import os
 import shutil
 from collections.abc import Iterator
@@ -16,9 +17,11 @@ from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ConfigDict, TypeAdapter
 
-from stillmap import em, slam
-from stillmap.core.array_folder import read_model, read_poses, read_probabilities, write_arrays
+import stillmap._core as _core
+from stillmap import em
+from stillmap.core.array_folder import open_npy, read_record, write_arrays
 from stillmap.core.arrays import iter_bytes
 from stillmap.core.config import iter_options
 from stillmap.core.errors import InputError, cannot_write
@@ -28,21 +31,13 @@ from stillmap.core.interrupts import defer_signals
 from stillmap.core.json import to_jsonable
 from stillmap.core.profiling import StageTimer
 from stillmap.core.recording import Recording
-from stillmap.io.rigid_transforms import MAX_TRANSLATION
-from stillmap.pipeline.estimate import EmState, Estimate, IterationRecord
+from stillmap.pipeline.estimate import EmState
 from stillmap.pipeline.options import Options
 
 _RECORD, _LOCK = "checkpoint.json", "lock"
 _NO_MATTER = ("threads", "output.region")  # options on which no iteration depends
-
-
-@dataclasses.dataclass(frozen=True)
-class _Record:
-    """`checkpoint.json`."""
-
-    key: dict[str, Any]
-    iterations: list[IterationRecord]
-    stages: dict[str, dict[str, float]]
+_INLINE = 64  # numbers: larger arrays have a file of their own
+_FILE, _ARRAY, _GRID = "__file__", "__array__", "__grid__"  # what stands for arrays in JSON
 
 
 class CheckpointFolder:
@@ -62,9 +57,7 @@ class CheckpointFolder:
     def load(
         self, key: dict[str, Any], options: Options, recording: Recording, stages: StageTimer
     ) -> EmState | None:
-        """The state from which the run goes on; None: there is none.
-
-        At least one iteration is left to be done. Of earlier ones their numbers are known.
+        """The state of the run at its last checkpoint; None: there is none.
 
         Args:
             key: of the run, see `identify_run`.
@@ -78,26 +71,21 @@ class CheckpointFolder:
         folder = self.newest
         if folder is None:
             return None
-        record = read_model(folder / _RECORD, _Record)
-        _require_same_run(record.key, key, str(self.folder))
-        D, T, M = recording.dimension, recording.n_scans, recording.n_beams
-        poses = read_poses(folder / "poses.npy", T, D, MAX_TRANSLATION)
-        p_static = read_probabilities(folder / "p_static.npy", M)
-        records = record.iterations[: em.max_iterations(options.estimator, options.em) - 1]
-        if not records:
-            return None
-        stages.add(record.stages)
-        dof = 3 * (D - 1)
-        m_step = slam.MStepResult(
-            poses,
-            np.full((T, dof, dof), np.nan),
-            em.make_grid(D, options.slam.resolution),
-            np.full(T, np.nan),
-        )
-        likelihood = em.Likelihood(records[-1].expected_log_likelihood, records[-1].bound)
-        e_step = em.EStepResult(p_static, likelihood)
+        path = folder / _RECORD
+        record = read_record(path)
+        try:
+            _require_same_run(record["key"], key, str(self.folder))
+            state = _unpack_state(record["state"], options, folder, record["digests"])
+            _require_fit(state, recording)
+            stages.add(record["stages"])
+        except InputError:
+            raise
+        except Exception as error:  # what no run has written fails in many ways
+            raise InputError(
+                f"is damaged: {error!r}".replace("\n", " "), where=str(path)
+            ) from error
         self.is_in_use = True
-        return EmState(options, records, latest=Estimate(len(records), p_static, m_step, e_step))
+        return state
 
     def save(self, state: EmState, key: dict[str, Any], stages: StageTimer) -> None:
         """Write a checkpoint, which replaces the one before.
@@ -105,15 +93,16 @@ class CheckpointFolder:
         Raises:
             InputError: it cannot be written, e.g. the disk is full; the one before remains.
         """
-        before, latest = self.newest, state.latest
-        assert latest is not None
+        before = self.newest
         work, final = self.folder / "new.part", self.folder / f"iteration-{len(state.records)}"
-        record = _Record(key, state.records, stages.to_dict())
+        arrays: dict[str, NDArray[Any]] = {}
+        values = _pack({**vars(state), "options": None}, "state", arrays)
+        digests = {name: _digest(array) for name, array in arrays.items()}
+        record = {"key": key, "state": values, "digests": digests, "stages": stages.to_dict()}
         try:
             remove(work)
             work.mkdir()
-            arrays: dict[str, NDArray[Any]] = {"poses": latest.poses, "p_static": latest.p_static}
-            write_arrays(work, arrays, _RECORD, dataclasses.asdict(record))
+            write_arrays(work, arrays, _RECORD, record)
             remove(final)
             os.rename(work, final)
         except OSError as error:
@@ -178,22 +167,95 @@ def _lock(folder: Path, output: Path) -> IO[bytes]:
             file.close()
 
 
+def _pack(value: Any, name: str, arrays: dict[str, NDArray[Any]]) -> Any:
+    """A tree of dataclasses as JSON values; its large arrays go into `arrays` by name."""
+    if isinstance(value, np.ndarray):
+        if value.size > _INLINE:
+            arrays[name] = value
+            return {_FILE: name}
+        return {_ARRAY: [value.dtype.str, value.shape, _pack(value.ravel().tolist(), name, arrays)]}
+    if isinstance(value, em.Grid):  # always empty here
+        return {_GRID: [2 if isinstance(value, _core.OccupancyGrid2D) else 3, value.resolution]}
+    if dataclasses.is_dataclass(value):
+        value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    if isinstance(value, dict):
+        return {key: _pack(item, f"{name}.{key}", arrays) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_pack(item, f"{name}.{k}", arrays) for k, item in enumerate(value)]
+    is_special = isinstance(value, float) and not math.isfinite(value)
+    return str(value) if is_special else value
+
+
+def _unpack_state(values: Any, options: Options, folder: Path, digests: dict[str, str]) -> EmState:
+    """The state that `_pack` was given.
+
+    Raises:
+        InputError: an array is not that which was written.
+        Exception: what else is not.
+    """
+
+    def unpack(value: Any) -> Any:
+        if isinstance(value, list):
+            return [unpack(item) for item in value]
+        if not isinstance(value, dict):
+            return value
+        if _FILE in value:
+            return _read_array(folder, value[_FILE], digests)
+        if _ARRAY in value:
+            dtype, shape, content = value[_ARRAY]
+            return np.array(content, np.dtype(dtype)).reshape(shape)
+        if _GRID in value:
+            return em.make_grid(*value[_GRID])
+        return {key: unpack(item) for key, item in value.items()}
+
+    adapter = TypeAdapter(list[EmState], config=ConfigDict(arbitrary_types_allowed=True))
+    [state] = adapter.validate_python([{**unpack(values), "options": options}])
+    return state
+
+
+def _read_array(folder: Path, name: str, digests: dict[str, str]) -> NDArray[Any]:
+    path = folder / f"{Path(name).name}.npy"
+    array = open_npy(path)
+    if _digest(array) != digests[name]:
+        raise InputError("is damaged: not the array that was written", where=str(path))
+    return array
+
+
+def _require_fit(state: EmState, recording: Recording) -> None:
+    """Refuse a state of something else than this recording, though their keys are equal.
+
+    Raises:
+        ValueError: it is.
+    """
+    shape = (recording.n_scans, recording.dimension + 1, recording.dimension + 1)
+    for estimate in (state.require_best(), state.latest):
+        n_labels = 0 if estimate is None else len(estimate.p_static)
+        if estimate is None or estimate.poses.shape != shape or n_labels != recording.n_beams:
+            raise ValueError("poses or labels of another recording")
+
+
 def identify_run(
     recording: Recording, options: Options, poses: NDArray[np.float64] | None
 ) -> dict[str, Any]:
     """The key of a run: its version, options, and a hash of the arrays of its input."""
-    found = hashlib.blake2b(digest_size=16)
     names = ("stamp_ns", "offset", "points", "hit", "beam_time", "T_base_sensor", "sensor")
-    for array in (*(getattr(recording, name) for name in names), recording.T_odom_base, poses):
-        found.update(b"none" if array is None else f"{array.dtype.str} {array.shape}".encode())
-        for part in () if array is None else iter_bytes(array):
-            found.update(part)
+    arrays = (*(getattr(recording, name) for name in names), recording.T_odom_base, poses)
     options_now = {
         one.name: to_jsonable(one.value)
         for one in iter_options(options)
         if one.name not in _NO_MATTER
     }
-    return {"version": package_version(), **options_now, "input": found.hexdigest()}
+    return {"version": package_version(), **options_now, "input": _digest(*arrays)}
+
+
+def _digest(*arrays: NDArray[Any] | None) -> str:
+    """Of the types, shapes and values of arrays."""
+    digest = hashlib.blake2b(digest_size=16)
+    for array in arrays:
+        digest.update(b"none" if array is None else f"{array.dtype.str} {array.shape}".encode())
+        for part in () if array is None else iter_bytes(array):
+            digest.update(part)
+    return digest.hexdigest()
 
 
 def _require_same_run(before: dict[str, Any], now: dict[str, Any], where: str) -> None:
