@@ -159,7 +159,7 @@ def _mount(folder: Path, name: str, writer: Writer) -> Iterator[Path]:
     else:
         path.write_text("old")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(os.path, "ismount", lambda other: Path(other) == path)
+        patch.setattr(files, "_is_mount_point", lambda folder: folder == path)
         for function in ("rename", "replace"):
             original = getattr(os, function)
 

@@ -124,7 +124,7 @@ def test_folders_that_cannot_be_renamed(tmp_path, monkeypatch, before, number):
 
 
 def test_exchanges_in_place(tmp_path, monkeypatch):
-    monkeypatch.setattr("os.path.ismount", lambda path: Path(path).name == "out")
+    monkeypatch.setattr(files, "_is_mount_point", lambda folder: folder.name == "out")
     assert at_every_step(write_folder, tmp_path, OLD) == {str(OLD), str(NEW)}
 
 

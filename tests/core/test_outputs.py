@@ -62,7 +62,7 @@ def fixed(tmp_path, monkeypatch) -> Path:
     """A folder that cannot be renamed."""
     path = tmp_path / "fixed"
     path.mkdir()
-    monkeypatch.setattr("os.path.ismount", lambda one: Path(one) == path)
+    monkeypatch.setattr(files, "_is_mount_point", lambda folder: folder == path)
     rename = os.rename
 
     def refuse(source, target):

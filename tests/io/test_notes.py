@@ -31,3 +31,22 @@ def test_notes_of_our_readers_stay(tmp_path, reader):
 @pytest.mark.parametrize("source", [None, [], 3, "x", {"sensors": 1, "warnings": [1], "path": {}}])
 def test_notes_of_others(source):
     assert prune_notes(source) == {}
+
+
+def test_damaged_entries_go_alone():
+    skipped = {"damaged": {"count": 1, "lines": [3]}}
+    sensor = {"name": "laser", "scans": 2}
+    box = {"sensor": 0, "beams": 2, "low": [0, 0, 1.5], "high": [1, 1, 2]}
+    source = {
+        "skipped": {**skipped, "late": {"count": -1, "lines": []}, "early": {"count": 1}},
+        "sensors": [{**sensor, "frame": 3, "extrinsics": {"x": 1e400, "how": "default"}}],
+        "self_filter": [box, {**box, "low": [0, 1]}],
+        "part": {"scans": 2**70, "omitted": True, "path": "x"},
+        "unknown": 1,
+    }
+    assert prune_notes(source) == {
+        "skipped": skipped,
+        "sensors": [{**sensor, "extrinsics": {"how": "default"}}],
+        "part": {"path": "x"},
+        "unknown": 1,
+    }

@@ -44,14 +44,18 @@ def write_arrays(
 
 
 def read_array(
-    path: Path, shape: tuple[int | None, ...], dtype: DTypeLike, scratch: Path | None = None
+    path: Path,
+    shape: tuple[int | None, ...],
+    dtype: DTypeLike,
+    scratch: Path | None = None,
+    grows: bool = False,
 ) -> NDArray[Any]:
     """The array of a file, of this shape (None: any length) and type; see `open_npy`.
 
     Raises:
-        InputError: it is missing, damaged, or another one.
+        InputError: it is missing, damaged, or another one; where it grows, shorter.
     """
-    array = open_npy(path, scratch)
+    array = open_npy(path, scratch, shape[0] if grows else None)
     fits = len(array.shape) == len(shape) and all(
         size in (None, given) for given, size in zip(array.shape, shape, strict=True)
     )
@@ -59,16 +63,18 @@ def read_array(
         target = f"({', '.join('any' if n is None else str(n) for n in shape)}) {np.dtype(dtype)}"
         what = f"is damaged: expected {target}, got {array.shape} {array.dtype}"
         raise InputError(what, where=str(path))
-    return array
+    return np.ascontiguousarray(array)
 
 
-def read_poses(path: Path, count: int, D: int, largest: float) -> NDArray[np.float64]:
+def read_poses(
+    path: Path, count: int, D: int, largest: float, grows: bool = False
+) -> NDArray[np.float64]:
     """(count, D+1, D+1) rigid transforms of a file, with translations of less than `largest` m.
 
     Raises:
         InputError: it is missing or damaged, or holds something else.
     """
-    T = np.array(read_array(path, (count, D + 1, D + 1), np.float64))
+    T = np.array(read_array(path, (count, D + 1, D + 1), np.float64, grows=grows))
     R = T[:, :D, :D]
     far = np.flatnonzero(~(np.abs(T) < largest).all(axis=(1, 2)))
     if len(far):

@@ -33,32 +33,6 @@ Count = Annotated[int, Field(le=_MAX_INTEGER)]
 _MAX_FILE_SIZE = 64 << 10  # bytes; Python needs minutes for more of nested keys
 
 
-class Limits(NamedTuple):
-    """Range of a number: `ge` <= x <= `le`, `gt` < x < `lt`; None is no limit."""
-
-    ge: float | None = None
-    gt: float | None = None
-    le: float | None = None
-    lt: float | None = None
-
-    def contain(self, value: float) -> bool:
-        """True if a number lies within the range; NaN lies in no range that has a limit."""
-        return (
-            (self.ge is None or value >= self.ge)
-            and (self.gt is None or value > self.gt)
-            and (self.le is None or value <= self.le)
-            and (self.lt is None or value < self.lt)
-        )
-
-    def __str__(self) -> str:
-        words = ("at least", "more than", "at most", "less than")
-        return " and ".join(
-            f"{word} {limit:.10g}"
-            for word, limit in zip(words, self, strict=True)
-            if limit is not None
-        )
-
-
 def option(default: Any, doc: str, **limits: Any) -> Any:
     """A field of a pydantic dataclass.
 

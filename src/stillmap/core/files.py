@@ -51,9 +51,20 @@ def workplace(output: Path) -> Path:
     target = resolve_output(output)
     parent = target.parent
     is_writable = not parent.exists() or os.access(parent, os.W_OK | os.X_OK)
-    if target.is_dir() and (os.path.ismount(target) or not is_writable):
+    if target.is_dir() and (_is_mount_point(target) or not is_writable):
         return target
     return parent if is_writable or not target.is_file() else Path(tempfile.gettempdir())
+
+
+def _is_mount_point(folder: Path) -> bool:
+    """True if something is mounted there; `ismount` misses folders bound from the same disk."""
+    name = os.fsencode(folder)
+    for special in b"\\\n\t ":  # as the kernel escapes them, the backslash first
+        name = name.replace(bytes([special]), b"\\%03o" % special)
+    with suppress(OSError):  # no Linux
+        mounts = Path("/proc/self/mountinfo").read_bytes().splitlines()
+        return name in (line.split(b" ")[4] for line in mounts)
+    return os.path.ismount(folder)
 
 
 def hidden_path(output: Path, suffix: str) -> Path:

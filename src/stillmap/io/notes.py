@@ -3,20 +3,21 @@
 What other programs note in another form is left out: no result depends on it.
 """
 
-from typing import Annotated, Any, TypedDict
+import json
+from typing import Annotated, Any
 
-from stillmap.core.config import Limits
-from stillmap.core.schema import prune
+from pydantic import Field, FiniteFloat, TypeAdapter, ValidationError
+from typing_extensions import TypedDict
 
-_Count = Annotated[int, Limits(ge=0)]
-_Vector = tuple[float, float, float]
+_Count = Annotated[int, Field(ge=0, lt=1 << 63)]
+_Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 
 class _Ranges(TypedDict, total=False):
-    min_range: float
-    threshold: float | None
+    min_range: FiniteFloat
+    threshold: FiniteFloat | None
     threshold_how: str
-    free_range: float | None
+    free_range: FiniteFloat | None
     free_how: str
     zero_means: str
     zero_how: str
@@ -24,9 +25,9 @@ class _Ranges(TypedDict, total=False):
 
 
 class _Extrinsics(TypedDict, total=False):
-    x: float
-    y: float
-    theta: float
+    x: FiniteFloat
+    y: FiniteFloat
+    theta: FiniteFloat
     how: str
 
 
@@ -34,10 +35,10 @@ class _Sensor(TypedDict, total=False):
     name: str
     frame: str
     scans: _Count
-    places: Annotated[int, Limits(ge=1)]
+    places: Annotated[int, Field(ge=1, lt=1 << 63)]
     beams_per_scan: _Count
-    start_angle: float
-    angle_step: float
+    start_angle: FiniteFloat
+    angle_step: FiniteFloat
     grid: tuple[_Count, _Count]
     extrinsics: _Extrinsics
     ranges: _Ranges
@@ -52,8 +53,8 @@ class _Skipped(TypedDict):
 
 class _Spin(TypedDict, total=False):
     direction: str
-    stamp: float
-    start: float
+    stamp: FiniteFloat
+    start: FiniteFloat
 
 
 class _Part(TypedDict, total=False):
@@ -99,10 +100,34 @@ class _Notes(TypedDict, total=False):
     parts: list[_Part]
     part: _Part
     spin: _Spin
-    stamp_azimuth: float
-    origin: list[float]
+    stamp_azimuth: FiniteFloat
+    origin: list[FiniteFloat]
 
 
 def prune_notes(source: Any) -> dict[str, Any]:
-    """The notes that have the form in which readers write them."""
-    return prune(source, _Notes) if isinstance(source, dict) else {}
+    """The notes that have the form in which readers write them; others are removed from them."""
+    if not isinstance(source, dict):
+        return {}
+    while True:
+        try:
+            text = json.dumps(source, ensure_ascii=False).encode("utf-8", "replace")
+            TypeAdapter(_Notes).validate_json(text, strict=True)
+            return source
+        except ValidationError as error:
+            faults = [_innermost_entry(source, fault["loc"]) for fault in error.errors()]
+            for mapping, key in faults:
+                mapping.pop(key, None)
+
+
+def _innermost_entry(notes: dict[str, Any], path: tuple[int | str, ...]) -> tuple[Any, int | str]:
+    """The mapping and key of the last entry of a mapping on the path to a fault."""
+    node: Any = notes
+    entry = node, path[0]
+    for step in path:
+        is_entry = isinstance(node, dict) and step in node
+        if is_entry:
+            entry = node, step
+        elif not (isinstance(node, list) and isinstance(step, int) and step < len(node)):
+            break
+        node = node[step]
+    return entry

@@ -7,20 +7,20 @@ Images of floats (depth in metres) are `.npy` files of float32.
 import json
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal, NotRequired, TypedDict
+from typing import Annotated, Any, Literal, NotRequired
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, FiniteFloat
+from typing_extensions import TypedDict
 
-from stillmap.core.array_folder import count_rows, open_npy
+from stillmap.core.array_folder import count_rows, open_npy, parse, read_array, read_poses
 from stillmap.core.arrays import iter_blocks, write_npy
 from stillmap.core.camera import Camera, Images
-from stillmap.core.config import Limits
 from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_folder
 from stillmap.core.json import read_json
 from stillmap.core.recording import Recording
-from stillmap.core.schema import SchemaError, check
 from stillmap.io.images import read_image, write_png
 from stillmap.io.notes import prune_notes
 from stillmap.io.rigid_transforms import MAX_TRANSLATION
@@ -68,8 +68,8 @@ def _read_images(path: Path, header: dict[str, Any]) -> Images | None:
     if "images" not in header:
         return None
     N = header["images"]
-    stamp_ns = np.array(_open_array(path, "image_stamp_ns", (N,), np.int64))
-    camera = np.array(_open_array(path, "image_camera", (N,), np.int32))
+    stamp_ns = np.array(read_array(path / "image_stamp_ns.npy", (N,), np.int64))
+    camera = np.array(read_array(path / "image_camera.npy", (N,), np.int32))
     try:
         cameras = tuple(_camera_from_dict(one) for one in header.get("cameras", ()))
         return Images(stamp_ns, camera, cameras, partial(_load_image, path / _IMAGES))
@@ -107,9 +107,9 @@ def _load_image(folder: Path, image: int) -> NDArray[Any]:
 HEADER = "recording.json"
 FORMAT = "stillmap-recording"
 FORMAT_VERSION = 1
-_Count = Annotated[int, Limits(ge=0, lt=1 << 60)]
-_Pixels = Annotated[int, Limits(ge=1, le=1 << 16)]
-_Row = list[float]
+_Count = Annotated[int, Field(ge=0, lt=1 << 60)]
+_Pixels = Annotated[int, Field(ge=1, le=1 << 16)]
+_Row = list[FiniteFloat]
 
 
 class _CameraHeader(TypedDict):
@@ -118,7 +118,7 @@ class _CameraHeader(TypedDict):
     height: _Pixels
     K: list[_Row] | None
     model: str
-    distortion: list[float]
+    distortion: _Row
     T_base_camera: list[_Row] | None
 
 
@@ -193,37 +193,40 @@ def read(path: Path, scratch: Path | None = None) -> Recording:
     if grows:
         header |= _count_whole_scans(path, header)
     T, M, S, D = (header[key] for key in ("scans", "beams", "sensors", "dimension"))
-    T_odom_base = T_recorded_base = beam_time = None
-    if header.get("odometry"):
-        T_odom_base = _read_poses(path, "T_odom_base", T, D, grows)
-    if header.get("recorded_poses"):
-        T_recorded_base = _read_poses(path, "T_recorded_base", T, D, grows)
-    if header.get("beam_times"):
-        beam_time = _open_array(path, "beam_time", (M,), np.float32, scratch, grows)
-    stamp_ns = np.array(_open_array(path, "stamp_ns", (T,), np.int64, grows=grows))
-    offset = np.array(_open_array(path, "offset", (T + 1,), np.int64, grows=grows))
-    points = _open_array(path, "points", (M, D), np.float32, scratch, grows)
-    hit = _open_array(path, "hit", (M,), np.bool_, scratch, grows)
-    sensor = np.array(_open_array(path, "sensor", (T,), np.int32, grows=grows))
+
+    def read_own(name: str, *shape: int, dtype: type, scratch: Path | None = None) -> NDArray[Any]:
+        return read_array(path / f"{name}.npy", shape, dtype, scratch, grows)
+
+    def read_own_poses(name: str, count: int) -> NDArray[np.float64]:
+        return read_poses(path / f"{name}.npy", count, D, MAX_TRANSLATION, grows)
+
+    stamp_ns = np.array(read_own("stamp_ns", T, dtype=np.int64))
+    offset = np.array(read_own("offset", T + 1, dtype=np.int64))
     # np.diff could overflow
     if np.any(stamp_ns[1:] < stamp_ns[:-1]):
         raise _damaged_error(path, "stamp_ns", "stamps decrease")
     if offset[0] != 0 or offset[-1] != M or np.any(offset[1:] < offset[:-1]):
         raise _damaged_error(path, "offset", f"must rise from 0 to {M}")
+    points = read_own("points", M, D, dtype=np.float32, scratch=scratch)
+    hit = read_own("hit", M, dtype=np.bool_, scratch=scratch)
     _check_points(path, points, hit)
+    optional: dict[str, Any] = {"T_odom_base": None}
+    for key, name in (("odometry", "T_odom_base"), ("recorded_poses", "T_recorded_base")):
+        if header.get(key):
+            optional[name] = read_own_poses(name, T)
+    if header.get("beam_times"):
+        optional["beam_time"] = read_own("beam_time", M, dtype=np.float32, scratch=scratch)
     try:
         return Recording(
             stamp_ns=stamp_ns,
             offset=offset,
             points=points,
             hit=hit,
-            T_base_sensor=_read_poses(path, "T_base_sensor", S, D, grows),
-            sensor=sensor,
-            T_odom_base=T_odom_base,
+            T_base_sensor=read_own_poses("T_base_sensor", S),
+            sensor=np.array(read_own("sensor", T, dtype=np.int32)),
             source=prune_notes(header.get("source")),
-            beam_time=beam_time,
-            T_recorded_base=T_recorded_base,
             images=_read_images(path, header),
+            **optional,
         )
     except ValueError as error:
         raise InputError(f"is damaged: {error}", where=str(path)) from error
@@ -265,44 +268,8 @@ def _read_header(path: Path) -> dict[str, Any]:
     if header.get("format_version") != FORMAT_VERSION:
         what = f"format_version {header.get('format_version')!r} is unknown here"
         raise InputError(what, where=str(path), hint=f"this version reads {FORMAT_VERSION}")
-    try:
-        check(header, _Header)
-    except SchemaError as error:
-        raise InputError(f"is damaged: {error}", where=str(path)) from error
+    parse(header, _Header, path)
     return header
-
-
-def _open_array(
-    path: Path,
-    name: str,
-    shape: tuple[int, ...],
-    dtype: type,
-    scratch: Path | None = None,
-    grows: bool = False,
-) -> NDArray[Any]:
-    """The content of one `.npy` file of exactly this shape and type; of one that grows a part."""
-    loaded = open_npy(path / f"{name}.npy", scratch, shape[0] if grows else None)
-    if loaded.shape != shape or loaded.dtype != np.dtype(dtype):
-        what = f"expected {shape} {np.dtype(dtype)}, got {loaded.shape} {loaded.dtype}"
-        raise _damaged_error(path, name, what)
-    return np.ascontiguousarray(loaded)
-
-
-def _read_poses(
-    path: Path, name: str, count: int, D: int, grows: bool = False
-) -> NDArray[np.float64]:
-    T = np.array(_open_array(path, name, (count, D + 1, D + 1), np.float64, grows=grows))
-    R = T[:, :D, :D]
-    far = np.flatnonzero(~(np.abs(T) < MAX_TRANSLATION).all(axis=(1, 2)))
-    if len(far):
-        what = f"not rigid transforms: pose {far[0]} is not finite, or a million kilometres away"
-        raise _damaged_error(path, name, what)
-    if not (
-        np.all(T[:, D] == np.eye(D + 1)[D])
-        and np.allclose(R @ R.transpose(0, 2, 1), np.eye(D), atol=1e-6)
-    ):
-        raise _damaged_error(path, name, "not rigid transforms")
-    return T
 
 
 def _check_points(path: Path, points: NDArray[np.float32], hit: NDArray[np.bool_]) -> None:
