@@ -17,7 +17,6 @@ void bind_cluster_pooling(nanobind::module_& m);
 void bind_ground_contact(nanobind::module_& m);
 void bind_held_out_likelihood(nanobind::module_& m);
 void bind_observation_counts(nanobind::module_& m);
-void bind_mesh_distance(nanobind::module_& m);
 void bind_plane_projection(nanobind::module_& m);
 void bind_plane_registration(nanobind::module_& m);
 void bind_pose_refinement(nanobind::module_& m);

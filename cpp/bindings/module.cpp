@@ -23,7 +23,6 @@ NB_MODULE(_core, m) {
   stillmap::bindings::bind_ground_contact(m);
   stillmap::bindings::bind_held_out_likelihood(m);
   stillmap::bindings::bind_observation_counts(m);
-  stillmap::bindings::bind_mesh_distance(m);
   stillmap::bindings::bind_plane_projection(m);
   stillmap::bindings::bind_plane_registration(m);
   stillmap::bindings::bind_pose_refinement(m);

@@ -30,7 +30,6 @@ from reference.likelihood_field import (
 )
 from reference.line_support import line_support
 from reference.mean_field import smooth_mean_field
-from reference.mesh_distance import MeshDistance
 from reference.ndt_map import (
     NdtMap3D,
     linearise_sweep,
@@ -58,7 +57,6 @@ __all__ = [
     "EmStep",
     "Lattice",
     "MeasurementModel",
-    "MeshDistance",
     "NdtMap3D",
     "ObservationCounts",
     "ObservationCounts2D",

@@ -8,13 +8,25 @@ import numpy as np
 import PIL.Image
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 import stillmap._core as _core
 from stillmap.core.camera import project
 from stillmap.core.errors import InputError, import_extra
 from stillmap.core.short_repr import ShortRepr
 from stillmap.core.square_box import component_labels
-from stillmap.mesh.triangle_mesh import Bool, Float, Float32, Image, Index, Int32, Int64, Mesh
+from stillmap.mesh.triangle_mesh import (
+    Bool,
+    Float,
+    Float32,
+    Image,
+    Index,
+    Int32,
+    Int64,
+    Mesh,
+    row_lengths,
+    subdivide,
+)
 from stillmap.mesh.views import View, as_color_image
 
 GRAY = (128, 128, 128)  # of faces that no image textures
@@ -24,6 +36,8 @@ _MIN_TEXEL = 0.001  # m, edge of a texel where pixels are finer
 _MIN_AREA = 1e-4  # square pixels of a textured face
 _FILL = 0.6  # share of the pages that charts are expected to fill
 _SHRINK = 0.85  # of the scale, each time charts need too many pages
+_SAMPLE_EDGE = 0.15  # m, edges of the parts of faces among which the nearest is looked up
+_SAMPLES = 4  # nearest of these parts that are compared
 
 
 class AtlasLayout(NamedTuple):
@@ -373,12 +387,13 @@ class TextureSampler:
     """
 
     def __init__(self, textured: TexturedMesh, max_distance: float) -> None:
-        self._of = textured
-        self._mesh = _core.MeshDistance(
-            textured.vertices, textured.faces, max_distance=max_distance
-        )
-        # the last entry stands for no face
-        self._page = np.append(np.where(textured.view >= 0, textured.page, -1), -1)
+        self._of, self._max_distance = textured, max_distance
+        self._mesh = Mesh(textured.vertices, textured.faces)
+        self._normals = self._mesh.normals()
+        shown = np.flatnonzero((textured.view >= 0) & (textured.page >= 0))
+        samples, of = subdivide(self._mesh.subset(shown), _SAMPLE_EDGE)
+        self._face = shown[of]
+        self._samples = cKDTree(samples.centers)
 
     def colors(self, points: Float, origins: Float) -> tuple[Image, Bool]:
         """(n, 3) uint8 colors, none of them GRAY, and whether (n,) there are any.
@@ -389,17 +404,43 @@ class TextureSampler:
             points: (n, 3) metres.
             origins: (n, 3) position of the sensor for each.
         """
-        places = np.ascontiguousarray(points), np.ascontiguousarray(origins)
-        face, weight = self._mesh.closest_faces(*places)
-        found = self._page[face]
+        face, weight = self._closest_faces(points, origins)
         out = np.zeros((len(points), 3), np.uint8)
         for page, texels in enumerate(self._of.pages):
-            mine = np.flatnonzero(found == page)
-            corner, share = self._of.faces[face[mine]], weight[mine]
-            uv = sum(share[:, k, None] * self._of.uv[corner[:, k]] for k in range(3))
+            mine = np.flatnonzero((face >= 0) & (self._of.page[face] == page))
+            uv = np.einsum("nk,nkd->nd", weight[mine], self._of.uv[self._of.faces[face[mine]]])
             h, w = texels.shape[:2]
             out[mine] = np.rint(sample_bilinear(texels, uv * np.array([w, h], np.float64) - 0.5))
-        return avoid_gray(out), found >= 0
+        return avoid_gray(out), face >= 0
+
+    def _closest_faces(self, points: Float, origins: Float) -> tuple[Index, Float]:
+        """(n,) the textured face, -1: none, and (n, 3) the weights of its corners at the place."""
+        best, face = np.full(len(points), np.inf), np.full(len(points), -1)
+        weight = np.zeros((len(points), 3))
+        reach = self._max_distance + _SAMPLE_EDGE
+        _, nearest = self._samples.query(points, _SAMPLES, distance_upper_bound=reach)
+        for sample in np.asarray(nearest).T:
+            some = np.flatnonzero(sample < self._samples.n)
+            mine = self._face[sample[some]]
+            share = barycentric(self._mesh.corners[mine], points[some])
+            place = np.einsum("nk,nkd->nd", share, self._mesh.corners[mine])
+            away = row_lengths(points[some] - place)
+            facing = np.einsum("nd,nd->n", self._normals[mine], origins[some] - place) > 0.0
+            better = facing & (away <= self._max_distance) & (away < best[some])
+            best[some[better]], face[some[better]] = away[better], mine[better]
+            weight[some[better]] = share[better]
+        return face, weight
+
+
+def barycentric(corners: Float, points: Float) -> Float:
+    """(n, 3) weights of the corners of triangles (n, 3, 3) at points (n, 3), within each."""
+    ab, ac = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    normal, off = np.cross(ab, ac), points - corners[:, 0]
+    square = np.maximum(np.einsum("nd,nd->n", normal, normal), 1e-300)
+    b = np.einsum("nd,nd->n", np.cross(off, ac), normal) / square
+    c = np.einsum("nd,nd->n", np.cross(ab, off), normal) / square
+    weight = np.maximum(np.stack([1.0 - b - c, b, c], axis=1), 0.0)
+    return np.asarray(weight / weight.sum(axis=1, keepdims=True))
 
 
 def avoid_gray(colors: Image) -> Image:
