@@ -109,7 +109,7 @@ def _convert_recording(
     options = read_options(args)
     require_apart(output, source)
     writer = writers.find_writer(output, args.to)
-    writers.require_free(output, writer, args.overwrite)
+    writers.require_free(output, writer.marker, args.overwrite)
     with show_share(args.quiet, "reading") as progress:
         recording = read(source, options, progress=progress, scratch=workplace(output))
     if not recording.n_scans:

@@ -186,7 +186,7 @@ def _convert_to_bag(
         text = f"a result cannot be written as {writer.description}"
         hint += "; `stillmap filter` writes its recording"
         raise InputError(text, where=str(output), hint=hint)
-    writers.require_free(output, writer, args.overwrite)
+    writers.require_free(output, writer.marker, args.overwrite)
     exported = _read_result(args, result, output)
     with show_share(args.quiet, "writing") as progress:
         losses = bag.write(exported, output, kind, overwrite=args.overwrite, progress=progress)

@@ -67,32 +67,27 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         InputError: the result or its recording is not there, or the output is taken.
     """
+    from stillmap.io import filter_writers
+    from stillmap.results.folder import open_result
     from stillmap.results.reader import is_place
 
     if not 0.0 <= args.below <= 1.0:
         raise InputError(f"--below wants 0 to 1, got {args.below:g}")
-    output = Path(args.output)
+    folder, output = Path(args.result), Path(args.output)
     with make_parents(output):
-        if is_place(Path(args.result)):
-            _filter_place(args, Path(args.result), output)
+        if is_place(folder):
+            summary = _filter_place(args, folder, output)
         else:
-            _filter_result(args, output)
+            result = open_result(folder, args.input)
+            target = _find_target(result, output, args.to)
+            filter_writers.require_free(target, output, result.source, args.overwrite)
+            summary = _write_filtered(result, target, output, "", args)
+    if args.json:
+        print_json({"output": str(output), **summary})
     return 0
 
 
-def _filter_result(args: argparse.Namespace, output: Path) -> None:
-    from stillmap.io import filter_writers
-    from stillmap.results.folder import open_result
-
-    result = open_result(Path(args.result), args.input)
-    target = _find_target(result, output, args.to)
-    filter_writers.require_free(target, output, result.source, args.overwrite)
-    done = _write_filtered(result, target, output, "", args)
-    if args.json:
-        print_json({"output": str(output), **done})
-
-
-def _filter_place(args: argparse.Namespace, place: Path, output: Path) -> None:
+def _filter_place(args: argparse.Namespace, place: Path, output: Path) -> dict[str, Any]:
     """Write a folder with the filtered recording of every session, complete or not at all.
 
     Raises:
@@ -107,23 +102,18 @@ def _filter_place(args: argparse.Namespace, place: Path, output: Path) -> None:
         raise InputError("has several recordings: --input names one", where=str(place), hint=hint)
     require_apart(output, place)
     require_new(output, _INDEX, args.overwrite)
-    names = [one.name for one in read_sessions(place) if one.accepted]
+    names = [session.name for session in read_sessions(place) if session.accepted]
     # what cannot be written is refused before any is read
     plans = [_plan_session(place, name, output, args.to) for name in names]
+    records = []
     with atomic_folder(output, _INDEX, args.overwrite) as folder:
-        records = [
-            {
-                "name": name,
-                "file": file,
-                **_write_filtered(result, target, folder / file, file, args),
-            }
-            for name, (result, file, target) in zip(names, plans, strict=True)
-        ]
+        for name, (result, file, target) in zip(names, plans, strict=True):
+            record = _write_filtered(result, target, folder / file, file, args)
+            records.append({"name": name, "file": file, **record})
         write_json(folder / _INDEX, records)
-    if args.json:
-        print_json({"output": str(output), "sessions": records})
     if not args.quiet:
         say(f"wrote {output}")
+    return {"sessions": records}
 
 
 def _plan_session(
@@ -224,7 +214,7 @@ def _place(recording: "Recording", result: "ResultFolder", target: "FilterTarget
     from stillmap.slam import deskew_recording
 
     poses, recording = result.read_poses(recording), result.calibrate(recording)
-    if not target.is_folder:
+    if not target.marker:
         recording = deskew_recording(recording, poses, result.slam_options)
     return dataclasses.replace(recording, T_recorded_base=poses)
 

@@ -151,7 +151,7 @@ def atomic_folder(path: Path, marker: str, overwrite: bool = False) -> Iterator[
     require_new(given, marker, overwrite)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with temporary_folder(path) as work:
+        with temporary_folder(path) as work, _naming_output(work, given):
             yield work
             work.chmod(0o777 & ~_umask())
             with _kept_on_failure(work, given):
@@ -217,7 +217,7 @@ def atomic_file(path: Path) -> Iterator[Path]:
         work = hidden_path(path, f"{secrets.token_hex(8)}.part")
         try:
             os.close(os.open(work, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
-            with _held(work):
+            with _held(work), _naming_output(work, given):
                 yield work
                 if is_free and path.exists():
                     what, hint = "has appeared meanwhile", "choose another"
@@ -229,13 +229,16 @@ def atomic_file(path: Path) -> Iterator[Path]:
         raise cannot_write(error, given) from error
 
 
-def sync(path: Path) -> None:
-    """Wait until a file or folder is on the disk."""
-    handle = os.open(path, os.O_RDONLY)
+@contextmanager
+def _naming_output(work: Path, output: Path) -> Iterator[None]:
+    """Errors about unfinished work name the place where it will be."""
     try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+        yield
+    except InputError as error:
+        if not error.where.startswith(str(work)):
+            raise
+        where = f"{output}{error.where.removeprefix(str(work))}"
+        raise InputError(error.what, where=where, hint=error.hint) from error
 
 
 def nearest_folder_above(path: str | os.PathLike[str]) -> Path:

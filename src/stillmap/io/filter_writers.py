@@ -15,12 +15,14 @@ import numpy as np
 from stillmap.core import arrays
 from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.errors import InputError
-from stillmap.core.files import require_new, require_new_file, workplace
+from stillmap.core.files import workplace
 from stillmap.core.json import count_skipped
 from stillmap.core.recording import Recording
 from stillmap.io import filtered_clouds, stillmap_folder, writers
+from stillmap.io.carmen import writer as carmen
 from stillmap.io.filtered_copy import FilterJob, Mask, Omissions
 from stillmap.io.registry import FORMATS, detect_format
+from stillmap.io.ros import filtered as filtered_bags
 from stillmap.io.ros.messages import detect_kind
 from stillmap.prepare.beam_times import SPIN_KEY
 
@@ -36,23 +38,20 @@ class FilterTarget(NamedTuple):
     Attributes:
         description: of the format, in words.
         marker: see FilterJob.
-        is_folder: whether it is a folder.
         write: writes it.
         writer: of another format than the recording's own; None: its own.
     """
 
     description: str
     marker: str
-    is_folder: bool
     write: Write
     writer: writers.Writer | None = None
 
     @property
     def takes_poses(self) -> bool:
         """True of formats of points at poses: those of the map, where none are recorded."""
-        if self.writer is None or self.writer.name == "stillmap":
-            return False
-        return "T_recorded_base" in self.writer.fields
+        is_other = self.writer is not None and self.writer.name != "stillmap"
+        return is_other and "T_recorded_base" in self.writer.fields  # type: ignore[union-attr]
 
 
 def _write_stillmap(job: FilterJob) -> Omissions:
@@ -65,23 +64,11 @@ def _write_stillmap(job: FilterJob) -> Omissions:
     return Omissions()
 
 
-def _write_log(job: FilterJob) -> Omissions:
-    from stillmap.io.carmen import writer
-
-    return writer.write_filtered(job)
-
-
-def _write_bag(job: FilterJob) -> Omissions:
-    from stillmap.io.ros import filtered
-
-    return filtered.write_filtered(job)
-
-
 # by format: its name in `writers.py`, pattern of a file that every such folder holds, writer
 _OWN: dict[str, tuple[str, str, Write]] = {
     "stillmap recording": ("stillmap", stillmap_folder.HEADER, _write_stillmap),
-    "ROS bag": ("", "metadata.yaml", _write_bag),
-    "CARMEN log": ("carmen", "", _write_log),
+    "ROS bag": ("", "metadata.yaml", filtered_bags.write_filtered),
+    "CARMEN log": ("carmen", "", carmen.write_filtered),
     "KITTI folder": ("kitti", "velodyne*", filtered_clouds.write_kitti),
     "PCD": ("pcd", "*.[pP][cC][dD]", filtered_clouds.write_pcd),
     "PLY": ("ply", "*.[pP][lL][yY]", filtered_clouds.write_ply),
@@ -104,35 +91,42 @@ def find_target(source: Path | None, output: Path, name: str | None = None) -> F
     """
     if source is None:
         return _make_target(writers.find_writer(output, name))
-    form, wanted = detect_format(source).name, name or writers.format_of_ending(output)
+    form, given = detect_format(source).name, name or writers.format_of_ending(output)
     if form not in _OWN:
-        if wanted is None:
+        if given is None:
             _require_ending(output, ())
         note = f"a recording of the format {form} is not written again: it comes back as "
-        return _make_target(writers.find_writer(output, wanted or "pcd"), note)
+        return _make_target(writers.find_writer(output, given or "pcd"), note)
     own, marker, write = _OWN[form]
     own = detect_kind(source)[0] if form == "ROS bag" else own
-    is_folder = source.is_dir() or source.name == stillmap_folder.HEADER
-    if wanted is not None:
-        writer = writers.find_writer(output, wanted)
+    is_folder = _is_folder(source)
+    if given is not None:
+        writer = writers.find_writer(output, given)
         if own in _ROS2 and writer.name in _ROS2:
             own, is_folder = writer.name, bool(writer.marker)
         elif writer.name != own or bool(writer.marker) != is_folder:
             return _make_target(writer)
     elif is_folder or form != "CARMEN log":
-        endings = next(known.endings for known in FORMATS if known.name == form)
-        _require_ending(output, () if is_folder else endings)
+        _require_ending(output, () if is_folder else _endings(form))
 
     def write_own(job: FilterJob) -> Omissions:
         return write(replace(job, kind=own))
 
-    return FilterTarget(form, marker if is_folder else "", is_folder, write_own)
+    return FilterTarget(form, marker if is_folder else "", write_own)
 
 
 def _make_target(writer: writers.Writer, note: str = "") -> FilterTarget:
     """The target that another format than the recording's own is."""
     write = partial(_convert, writer=writer, note=note)
-    return FilterTarget(writer.description, writer.marker, bool(writer.marker), write, writer)
+    return FilterTarget(writer.description, writer.marker, write, writer)
+
+
+def _is_folder(source: Path) -> bool:
+    return source.is_dir() or source.name == stillmap_folder.HEADER
+
+
+def _endings(form: str) -> tuple[str, ...]:
+    return next(known.endings for known in FORMATS if known.name == form)
 
 
 def _require_ending(output: Path, endings: tuple[str, ...]) -> None:
@@ -144,8 +138,7 @@ def _require_ending(output: Path, endings: tuple[str, ...]) -> None:
     name = output.name.lower()
     known = (end for form in FORMATS for end in form.endings if end.startswith("."))
     if name.endswith(tuple(known)) and not name.endswith(endings or "/"):
-        others = ", ".join(end for writer in writers.WRITERS for end in writer.endings)
-        hint = f"other formats by name: {others}; or by name=FORMAT"
+        hint = f"other formats by name: {writers.ENDINGS}; or by name=FORMAT"
         raise InputError("is not written in the format of that name", where=str(output), hint=hint)
 
 
@@ -155,10 +148,7 @@ def require_free(target: FilterTarget, output: Path, source: Path, overwrite: bo
     Raises:
         InputError: it is.
     """
-    if target.is_folder:
-        require_new(output, target.marker, overwrite)
-    else:
-        require_new_file(output, overwrite)
+    writers.require_free(output, target.marker, overwrite)
     require_outside(output, source)
 
 
@@ -219,12 +209,12 @@ def find_ending(source: Path | None, to: str | None) -> str:
         source: the recording; None: it is joined from parts.
         to: name of the other format; None: its own.
     """
-    own, is_folder = "", source is None or source.is_dir() or source.name == stillmap_folder.HEADER
-    form = "" if source is None or is_folder else detect_format(source).name
-    if source is not None and form in _OWN:
-        known = next(known.endings for known in FORMATS if known.name == form)
-        lengths = [len(end) for end in known if source.name.lower().endswith(end)]
-        own = source.name[len(source.name) - max(lengths) :] if lengths else source.suffix
+    own = ""
+    if source is not None and not _is_folder(source):
+        form, name = detect_format(source).name, source.name
+        lengths = [len(end) for end in _endings(form) if name.lower().endswith(end)]
+        if form in _OWN:
+            own = name[len(name) - max(lengths) :] if lengths else source.suffix
     if to is None:
         return own
     endings = writers.find_writer(Path(), to).endings

@@ -1,10 +1,11 @@
 """Filtered copies of KITTI folders and of PCD, PLY, LAS and LAZ files: points removed, in the
 encoding that they have, all else as it was."""
 
+import os
 import re
 import shutil
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from pathlib import Path
 from typing import IO, Any
@@ -13,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.errors import InputError, import_extra
-from stillmap.core.input_files import InputFile
-from stillmap.io.filtered_copy import FilterJob, Mask, Omissions, other_recording_error, write_files
+from stillmap.core.files import atomic_file, atomic_folder
+from stillmap.core.input_files import InputFile, copy_file
+from stillmap.io.filtered_copy import FilterJob, Mask, Omissions, other_recording_error
 from stillmap.io.point_cloud import kitti, las, pcd, ply, table
 from stillmap.io.point_cloud.clouds import files_of
 from stillmap.io.point_cloud.table import TableLayout
@@ -22,6 +24,9 @@ from stillmap.io.point_cloud.table import TableLayout
 _BLOCK_BYTES = 8 << 20  # of points copied at once
 _WORD = re.compile(rb"\S+")
 _LABEL = 4  # bytes of a label of SemanticKITTI
+
+# (file, its new copy, (n,) points to remove)
+FilterFile = Callable[[Path, Path, Mask], None]
 
 
 def write_kitti(job: FilterJob) -> Omissions:
@@ -43,7 +48,7 @@ def write_kitti(job: FilterJob) -> Omissions:
             (folder / "labels" / labels.name).write_bytes(values.tobytes())
 
     files = kitti.list_scans(job.source)
-    return write_files(job, files, filter_file, write_unread=lambda _, new: new.touch())
+    return _write_files(job, files, filter_file, write_unread=lambda _, new: new.touch())
 
 
 def write_pcd(job: FilterJob) -> Omissions:
@@ -53,7 +58,7 @@ def write_pcd(job: FilterJob) -> Omissions:
         layout = pcd.read_header(path).layout
         _copy_table(layout, new, mask, _counts(layout, mask, {b"WIDTH": 1, b"POINTS": 1}))
 
-    return write_files(job, files_of(job.source, pcd.EXTENSIONS), filter_file)
+    return _write_files(job, files_of(job.source, pcd.EXTENSIONS), filter_file)
 
 
 def write_ply(job: FilterJob) -> Omissions:
@@ -64,7 +69,7 @@ def write_ply(job: FilterJob) -> Omissions:
         layout = ply.read_layout(path)
         _copy_table(layout, new, mask, _counts(layout, mask, {b"element vertex": 2}))
 
-    return write_files(job, files_of(job.source, ply.EXTENSIONS), filter_file)
+    return _write_files(job, files_of(job.source, ply.EXTENSIONS), filter_file)
 
 
 def write_las(job: FilterJob) -> Omissions:
@@ -72,7 +77,70 @@ def write_las(job: FilterJob) -> Omissions:
     ending = job.output.suffix.lower()
     packed = ending == ".laz" if job.source.is_file() and ending in las.EXTENSIONS else None
     filter_file = partial(_filter_las, packed=packed)
-    return write_files(job, files_of(job.source, las.EXTENSIONS), filter_file)
+    return _write_files(job, files_of(job.source, las.EXTENSIONS), filter_file)
+
+
+def _write_files(
+    job: FilterJob,
+    files: Sequence[Path],
+    filter_file: FilterFile,
+    write_unread: Callable[[Path, Path], None] | None = None,
+) -> Omissions:
+    """Write a folder, or one file, with every file of a scan filtered and all others copied.
+
+    Args:
+        job: see FilterJob.
+        files: those of scans, in the order of the reader.
+        filter_file: writes the copy of a file.
+        write_unread: writes the copy of a file that was not read; None: it is left out.
+    """
+    masks = job.scan_masks(len(files))
+    omissions = Omissions(sum(mask is None for mask in masks))
+    if job.source.is_file():
+        with atomic_file(job.output) as work:
+            if masks[0] is not None:
+                _write_file(files[0], work, masks[0], filter_file, job.output.suffix)
+        return omissions
+    with atomic_folder(job.output, job.marker, job.overwrite) as folder:
+        _copy_others(job.source, folder, set(files), job.omit)
+        for number, (file, mask) in enumerate(zip(files, masks, strict=True)):
+            new = folder / file.relative_to(job.source)
+            if mask is not None:
+                _write_file(file, new, mask, filter_file, file.suffix)
+            elif write_unread is not None:
+                write_unread(file, new)
+            job.report((number + 1) / len(files))
+    return omissions
+
+
+def _write_file(file: Path, new: Path, mask: Mask, filter_file: FilterFile, suffix: str) -> None:
+    """Write the copy of a file; the file itself where no beam is blanked and `suffix` is its."""
+    if not mask.any() and file.suffix.lower() == suffix.lower():
+        copy_file(file, new)
+    else:
+        filter_file(file, new, mask)
+
+
+def _copy_others(
+    source: Path, target: Path, files: Collection[Path], omit: Collection[Path]
+) -> None:
+    """Copy what a folder holds, but not `files` (their folders are made) nor folders `omit`.
+
+    Symbolic links to other places stay links.
+    """
+    left_out = {os.path.realpath(path) for path in omit}
+    folders = {parent for file in files for parent in file.parents}
+    for entry in sorted(source.iterdir()):
+        new = target / entry.name
+        if entry in files or os.path.realpath(entry) in left_out:
+            continue
+        if entry.is_symlink() and entry not in folders:
+            new.symlink_to(os.path.realpath(entry))
+        elif entry.is_dir():
+            new.mkdir()
+            _copy_others(entry, new, files, omit)
+        elif entry.is_file():
+            copy_file(entry, new)
 
 
 def _filter_las(path: Path, new: Path, mask: Mask, packed: bool | None) -> None:

@@ -1,7 +1,5 @@
-"""Filtered copies of recordings: what their writers get and return, and copies of folders."""
+"""Filtered copies of recordings: the job of their writers, and what they left out."""
 
-import os
-from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -11,15 +9,11 @@ from numpy.typing import NDArray
 
 from stillmap.core.arrays import release_pages
 from stillmap.core.errors import InputError
-from stillmap.core.files import atomic_file, atomic_folder
-from stillmap.core.input_files import copy_file
 from stillmap.core.recording import Recording
 from stillmap.io.text_lines import Progress
 from stillmap.prepare.options import ReadOptions
 
 Mask = NDArray[np.bool_]
-# (file, its new copy, (n,) points to remove)
-FilterFile = Callable[[Path, Path, Mask], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,69 +80,3 @@ class Omissions(NamedTuple):
 def other_recording_error(path: Path) -> InputError:
     """The error for a file or folder that has changed since it was read."""
     return InputError("is not the recording that was mapped: other scans", where=str(path))
-
-
-def write_files(
-    job: FilterJob,
-    files: Sequence[Path],
-    filter_file: FilterFile,
-    write_unread: Callable[[Path, Path], None] | None = None,
-) -> Omissions:
-    """Write a folder, or one file, with every file of a scan filtered and all others copied.
-
-    Args:
-        job: see FilterJob.
-        files: those of scans, in the order of the reader.
-        filter_file: writes the copy of a file.
-        write_unread: writes the copy of a file that was not read; None: it is left out.
-    """
-    masks = job.scan_masks(len(files))
-    omissions = Omissions(sum(mask is None for mask in masks))
-    if job.source.is_file():
-        with atomic_file(job.output) as work:
-            if masks[0] is not None:
-                _write_file(files[0], work, masks[0], filter_file, job.output.suffix)
-        return omissions
-    with atomic_folder(job.output, job.marker, job.overwrite) as folder:
-        _copy_others(job.source, folder, set(files), job.omit)
-        for number, (file, mask) in enumerate(zip(files, masks, strict=True)):
-            new = folder / file.relative_to(job.source)
-            if mask is not None:
-                _write_file(file, new, mask, filter_file, file.suffix)
-            elif write_unread is not None:
-                write_unread(file, new)
-            job.report((number + 1) / len(files))
-    return omissions
-
-
-def _write_file(file: Path, new: Path, mask: Mask, filter_file: FilterFile, suffix: str) -> None:
-    """Write the copy of a file; the file itself where no beam is blanked and `suffix` is its."""
-    try:
-        if not mask.any() and file.suffix.lower() == suffix.lower():
-            copy_file(file, new)
-        else:
-            filter_file(file, new, mask)
-    except MemoryError as error:
-        raise InputError("does not fit into memory", where=str(file)) from error
-
-
-def _copy_others(
-    source: Path, target: Path, files: Collection[Path], omit: Collection[Path]
-) -> None:
-    """Copy what a folder holds, but not `files` (their folders are made) nor folders `omit`.
-
-    Symbolic links to other places stay links.
-    """
-    left_out = {os.path.realpath(path) for path in omit}
-    folders = {parent for file in files for parent in file.parents}
-    for entry in sorted(source.iterdir()):
-        new = target / entry.name
-        if entry in files or os.path.realpath(entry) in left_out:
-            continue
-        if entry.is_symlink() and entry not in folders:
-            new.symlink_to(os.path.realpath(entry))
-        elif entry.is_dir():
-            new.mkdir()
-            _copy_others(entry, new, files, omit)
-        elif entry.is_file():
-            copy_file(entry, new)

@@ -4,7 +4,6 @@ The table of formats that are read is in `registry.py`.
 """
 
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,10 +16,11 @@ from stillmap.io import stillmap_folder
 from stillmap.io.carmen.writer import write_log
 from stillmap.io.point_cloud import kitti, las, pcd, ply
 from stillmap.io.point_cloud.origin import place_clouds
+from stillmap.io.ros.messages import BagKind
 from stillmap.io.ros.writer import write_recording as write_bag
 
-# (recording, path, overwrite=...) -> what could not be written, a sentence each
-Write = Callable[..., list[str]]
+# (recording, path, overwrite) -> what could not be written, a sentence each
+Write = Callable[[Recording, Path, bool], list[str]]
 
 # optional fields of a recording that most formats cannot hold, in words
 _OPTIONAL_FIELDS = {
@@ -28,9 +28,7 @@ _OPTIONAL_FIELDS = {
     "T_recorded_base": "recorded poses",
     "T_odom_base": "odometry readings",
 }
-
-_ODOMETRY = ("T_odom_base",)
-_POSES = ("T_recorded_base",)
+_ODOMETRY, _POSES = ("T_odom_base",), ("T_recorded_base",)
 
 
 class Writer(NamedTuple):
@@ -61,16 +59,18 @@ def _write_stillmap(recording: Recording, path: Path, overwrite: bool) -> list[s
     return []
 
 
-def _write_scans(
-    write: Callable[..., None], recording: Recording, path: Path, overwrite: bool
-) -> list[str]:
-    """Write a folder of point clouds, one per scan."""
-    write(recording, path, overwrite=overwrite)
+def _write_carmen(recording: Recording, path: Path, overwrite: bool) -> list[str]:  # noqa: ARG001
+    return write_log(recording, path)
+
+
+def _write_pcd(recording: Recording, path: Path, overwrite: bool) -> list[str]:
+    pcd.write(recording, path, overwrite=overwrite)
     return _describe_non_returns(recording)
 
 
 def _write_kitti(recording: Recording, path: Path, overwrite: bool) -> list[str]:
-    losses = _write_scans(kitti.write, recording, path, overwrite)
+    kitti.write(recording, path, overwrite=overwrite)
+    losses = _describe_non_returns(recording)
     if recording.T_odom_base is None:
         return losses
     if recording.T_recorded_base is None:
@@ -78,22 +78,27 @@ def _write_kitti(recording: Recording, path: Path, overwrite: bool) -> list[str]
     return ["its odometry readings are left out", *losses]
 
 
-def _write_cloud(
-    write: Callable[..., None],
-    recording: Recording,
-    path: Path,
-    overwrite: bool,  # noqa: ARG001
-) -> list[str]:
-    """Write all scans as one point cloud, by the poses that the recording has."""
-    T, losses = recording.T_recorded_base, []
-    if T is None:
-        T, losses = recording.T_odom_base, ["the cloud is placed by odometry: maps are better"]
-    if T is None:
-        D = recording.dimension
-        T = np.tile(np.eye(D + 1), (recording.n_scans, 1, 1))
-        losses = ["there are no poses: all scans lie at one place"] if len(T) > 1 else []
-    write(recording, path, place_clouds(recording, T))
-    return [*losses, *_describe_non_returns(recording)]
+def _bag_writer(kind: BagKind, description: str, ending: str, marker: str = "") -> Writer:
+    def write(recording: Recording, path: Path, overwrite: bool) -> list[str]:
+        return write_bag(recording, path, kind, overwrite=overwrite)
+
+    return Writer(kind, description, (ending,) if ending else (), marker, write, _ODOMETRY)
+
+
+def _cloud_writer(name: str, endings: tuple[str, ...], write_cloud: Callable[..., None]) -> Writer:
+    """A writer of all scans as one point cloud, by the poses that the recording has."""
+
+    def write(recording: Recording, path: Path, overwrite: bool) -> list[str]:  # noqa: ARG001
+        T, losses = recording.T_recorded_base, []
+        if T is None:
+            T, losses = recording.T_odom_base, ["the cloud is placed by odometry: maps are better"]
+        if T is None:
+            T = np.tile(np.eye(recording.dimension + 1), (recording.n_scans, 1, 1))
+            losses = ["there are no poses: all scans lie at one place"] if len(T) > 1 else []
+        write_cloud(recording, path, place_clouds(recording, T))
+        return [*losses, *_describe_non_returns(recording)]
+
+    return Writer(name, f"a {name.upper()} file", endings, "", write, _POSES + _ODOMETRY)
 
 
 def _describe_non_returns(recording: Recording) -> list[str]:
@@ -101,6 +106,7 @@ def _describe_non_returns(recording: Recording) -> list[str]:
     return [f"{n} beams without a return are left out"] if n else []
 
 
+_LOGS = (".log", ".clf", ".txt", ".log.gz", ".clf.gz", ".txt.gz")
 WRITERS = (
     Writer(
         "stillmap",
@@ -110,27 +116,11 @@ WRITERS = (
         _write_stillmap,
         tuple(_OPTIONAL_FIELDS),
     ),
-    Writer(
-        "ros2",
-        "a ROS 2 bag folder",
-        (),
-        "metadata.yaml",
-        partial(write_bag, kind="ros2"),
-        _ODOMETRY,
-    ),
-    Writer(
-        "carmen",
-        "a CARMEN log",
-        (".log", ".clf", ".txt", ".log.gz", ".clf.gz", ".txt.gz"),
-        "",
-        lambda recording, path, overwrite: write_log(recording, path),  # noqa: ARG005
-        _ODOMETRY,
-        max_dimension=2,
-        max_sensors=2,
-    ),
-    Writer("bag", "a ROS 1 bag", (".bag",), "", partial(write_bag, kind="bag"), _ODOMETRY),
-    Writer("db3", "a ROS 2 bag file", (".db3",), "", partial(write_bag, kind="db3"), _ODOMETRY),
-    Writer("mcap", "an MCAP file", (".mcap",), "", partial(write_bag, kind="mcap"), _ODOMETRY),
+    _bag_writer("ros2", "a ROS 2 bag folder", "", "metadata.yaml"),
+    Writer("carmen", "a CARMEN log", _LOGS, "", _write_carmen, _ODOMETRY, 2, max_sensors=2),
+    _bag_writer("bag", "a ROS 1 bag", ".bag"),
+    _bag_writer("db3", "a ROS 2 bag file", ".db3"),
+    _bag_writer("mcap", "an MCAP file", ".mcap"),
     Writer(
         "kitti",
         "a KITTI folder",
@@ -140,27 +130,11 @@ WRITERS = (
         _POSES + _ODOMETRY,
         max_sensors=1,
     ),
-    Writer(
-        "pcd",
-        "a folder of PCD files",
-        (),
-        pcd.MARKER,
-        partial(_write_scans, pcd.write),
-        _POSES,
-        max_sensors=1,
-    ),
-    Writer(
-        "ply", "a PLY file", (".ply",), "", partial(_write_cloud, ply.write), _POSES + _ODOMETRY
-    ),
-    Writer(
-        "las",
-        "a LAS file",
-        (".las", ".laz"),
-        "",
-        partial(_write_cloud, las.write),
-        _POSES + _ODOMETRY,
-    ),
+    Writer("pcd", "a folder of PCD files", (), pcd.MARKER, _write_pcd, _POSES, max_sensors=1),
+    _cloud_writer("ply", ply.EXTENSIONS, ply.write),
+    _cloud_writer("las", las.EXTENSIONS, las.write),
 )
+ENDINGS = ", ".join(ending for writer in WRITERS for ending in writer.endings)
 
 
 def format_of_ending(path: Path) -> str | None:
@@ -175,14 +149,13 @@ def find_writer(path: Path, name: str | None = None) -> Writer:
     Raises:
         InputError: no format has such a name or ending.
     """
-    wanted = name or format_of_ending(path)
+    target = name or format_of_ending(path)
     for writer in WRITERS:
-        if writer.name == wanted:
+        if writer.name == target:
             return writer
     if name or path.suffix:
-        known = ", ".join(end for writer in WRITERS for end in writer.endings)
         what = f"no format is called or ends in {name or path.suffix!r}"
-        hint = f"{known}, or a folder without an ending"
+        hint = f"{ENDINGS}, or a folder without an ending"
         raise InputError(what, where=str(path), hint=hint)
     return WRITERS[0]
 
@@ -221,7 +194,7 @@ def write(
             recording.
     """
     writer = find_writer(path, name)
-    require_free(path, writer, overwrite)
+    require_free(path, writer.marker, overwrite)
     if not recording.n_scans:
         raise InputError("holds no scan: there is nothing to write")
     lost = [
@@ -230,18 +203,18 @@ def write(
         if getattr(recording, field) is not None and field not in writer.fields
     ]
     try:
-        return [*lost, *writer.write(recording, path, overwrite=overwrite)]
+        return [*lost, *writer.write(recording, path, overwrite)]
     except InputError as error:
         raise InputError(error.what, where=error.where or str(path), hint=error.hint) from error
 
 
-def require_free(path: Path, writer: Writer, overwrite: bool) -> None:
+def require_free(path: Path, marker: str, overwrite: bool) -> None:
     """Refuse to overwrite anything but a file or folder of the same format.
 
     Raises:
         InputError: the path is taken.
     """
-    if writer.marker:
-        require_new(path, writer.marker, overwrite)
+    if marker:
+        require_new(path, marker, overwrite)
     else:
         require_new_file(path, overwrite)
