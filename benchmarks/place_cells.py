@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from place_truth import SessionTruth
 
 from stillmap.core.recording import Recording
-from stillmap.sim.dynamics import place_faces
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -196,10 +195,7 @@ class CellTruth(NamedTuple):
 
     def draw_object(self, truth: SessionTruth, number: int, session: int) -> Bool:
         """(H, W) the cells that an object fills in a session of the truth, without fixed ones."""
-        thing = truth.objects[number].thing(session)
-        if thing is None:
-            return np.zeros_like(self.fixed)
-        return self.lattice.draw(place_faces(thing, thing.stays[0])) & ~self.fixed
+        return self.lattice.draw(truth.objects[number].faces_in(session)) & ~self.fixed
 
 
 def collect_cells(truth: SessionTruth, sessions: list[int]) -> CellTruth:

@@ -1,15 +1,17 @@
 """The truth about simulated sessions, as scores read it."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from session_overlap import compute_overlap, observe
 
 from stillmap.core.errors import InputError
 from stillmap.core.json import read_json
-from stillmap.sim.dynamics import place_faces
+from stillmap.io import stillmap_folder
 from stillmap.sim.planner import Float
 from stillmap.sim.session_layout import ObjectKind, Place, StandingObject
 from stillmap.sim.sessions import SESSIONS_FILE, TrueChange
@@ -29,7 +31,6 @@ class SessionTruth:
         T_world_session: (S, D+1, D+1) first pose of the robot in each.
         objects: everything that may stand otherwise, with its places.
         changes: between successive sessions, in order.
-        overlap: (S, S) share of the static hits of session j in cells that session i observed.
     """
 
     folder: Path
@@ -38,12 +39,20 @@ class SessionTruth:
     T_world_session: Float
     objects: tuple[StandingObject, ...]
     changes: tuple[TrueChange, ...]
-    overlap: Float
 
     @property
     def dimension(self) -> int:
         """2 or 3."""
         return int(self.T_world_session.shape[-1]) - 1
+
+    @cached_property
+    def overlap(self) -> Float:
+        """(S, S) share of the static hits of session j in cells that session i observed."""
+        sights = [
+            observe(stillmap_folder.read(self.folder / name), self.beams(session))
+            for session, name in enumerate(self.names)
+        ]
+        return compute_overlap(sights, self.place.tolist())
 
     def beams(self, session: int) -> Truth:
         """The truth about the beams of a session; `thing` is an index of `objects`.
@@ -67,12 +76,8 @@ class SessionTruth:
 
     def faces(self, session: int, only: NDArray[np.bool_] | None = None) -> Float:
         """(K, 4) faces of the objects that stand there in a session; `only` some (O,) of them."""
-        found = [np.empty((0, 4))]
-        for number, one in enumerate(self.objects):
-            thing = one.thing(session)
-            if thing is not None and (only is None or only[number]):
-                found.append(place_faces(thing, thing.stays[0]))
-        return np.concatenate(found)
+        some = [item for k, item in enumerate(self.objects) if only is None or only[k]]
+        return np.concatenate([np.empty((0, 4)), *(item.faces_in(session) for item in some)])
 
 
 def load_session_truth(folder: str | Path) -> SessionTruth:
@@ -115,7 +120,6 @@ def _parse(folder: Path, tree: dict[str, Any]) -> SessionTruth:
         np.array([one["T_world_session"] for one in tree["sessions"]], np.float64),
         objects,
         changes,
-        np.array(tree["overlap"], np.float64),
     )
 
 
@@ -123,4 +127,4 @@ def _parse_object(tree: dict[str, Any]) -> StandingObject:
     kind: ObjectKind = tree["kind"]
     faces = tuple((float(a), float(b), float(c), float(d)) for a, b, c, d in tree["faces"])
     places = [None if at is None else Place(*map(float, at)) for at in tree["at"]]
-    return StandingObject(kind, faces, tuple(places))
+    return StandingObject(kind, faces, places)

@@ -5,19 +5,23 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from session_overlap import compute_overlap, observe
 
 from stillmap.core.errors import InputError
-from stillmap.sim.scene import Scene
+from stillmap.sim import Scene, scene_by_name
+from stillmap.sim.planner import Float
 from stillmap.sim.sessions import (
-    Region,
-    SessionOptions,
+    DrawRoute,
     SessionPlan,
-    compute_overlap,
-    observe,
+    draw_tour,
+    find_free_parts,
     plan_sessions,
     simulate_sessions,
 )
-from stillmap.sim.worlds import scene_by_name
+from stillmap.sim.walls import polyline
+
+Region = tuple[float, float, float, float]  # x0, y0, x1, y1 in metres
 
 _STARTS, _HALVINGS = 8, 7  # of two regions, and of what they share until it is as wanted
 _APART = -0.6  # of the shorter one's length, when they share least
@@ -25,6 +29,7 @@ _MARGIN = 6.0  # m around the route that belong to the world
 _LENGTHS = (0.35, 0.75)  # of the world's, of each region
 _SLACK = 0.02  # of the share, for what people hide
 _FAR = 1e3  # m, beyond any world
+_ANCHORS = 12  # random points of a region, the largest part around which the robot explores
 
 
 class OverlapClass(NamedTuple):
@@ -55,9 +60,9 @@ def plan_pair(scene: Scene, overlap: OverlapClass, seed: int = 0) -> SessionPlan
         low, high = _APART, 1.0
         for _ in range(_HALVINGS):
             shared = rng.uniform(0.3, 0.7) * (high - low) + low
-            options = SessionOptions(2, strips.regions(shared), odd_sensor=seed % 4 == 0)
+            routes = [stay_within(region) for region in strips.regions(shared)]
             try:
-                plan = plan_sessions(scene, options, own)
+                plan = plan_sessions(scene, 2, own, routes=routes, has_odd_sensor=seed % 4 == 0)
                 share = measure_overlap(plan)
             except InputError:  # no room in such a region
                 break
@@ -74,15 +79,11 @@ def measure_overlap(plan: SessionPlan, with_people: bool = False) -> float:
 
     Without people, who hide some of it, it takes half the time.
     """
-    empty = tuple(
-        dataclasses.replace(
-            scene,
-            crowd=dataclasses.replace(scene.crowd, people=0),
-        )
-        for scene in plan.scenes
-    )
-    scenes = plan.scenes if with_people else empty
-    sights = [observe(one) for one in simulate_sessions(plan._replace(scenes=scenes))]
+    if not with_people:
+        crowds = [dataclasses.replace(scene.crowd, people=0) for scene in plan.scenes]
+        pairs = zip(plan.scenes, crowds, strict=True)
+        plan = plan._replace(scenes=[dataclasses.replace(s, crowd=c) for s, c in pairs])
+    sights = [observe(made.recording, made.truth) for made in simulate_sessions(plan)]
     return float(compute_overlap(sights, [0] * len(sights))[0, 1])
 
 
@@ -94,13 +95,38 @@ def plan_wings(seed: int = 0, changes: Mapping[str, Any] | None = None) -> Sessi
     regions = ((0.0, -_FAR, _FAR, _FAR), (-_FAR, -_FAR, -0.15, _FAR))
     if seed % 2:
         regions = regions[::-1]
-    return plan_sessions(scene, SessionOptions(2, regions, odd_sensor=False), seed)
+    routes = [stay_within(region) for region in regions]
+    return plan_sessions(scene, 2, seed, routes=routes, has_odd_sensor=False)
 
 
 def plan_strangers(one: Scene, other: Scene, seed: int = 0) -> tuple[SessionPlan, SessionPlan]:
     """A session each in two places that have nothing in common."""
-    options = SessionOptions(1, has_changes=False)
-    return plan_sessions(one, options, 2 * seed), plan_sessions(other, options, 2 * seed + 1)
+    return plan_sessions(one, 1, 2 * seed), plan_sessions(other, 1, 2 * seed + 1)
+
+
+def stay_within(region: Region) -> DrawRoute:
+    """Tours of a region, around which a fence stands that no laser sees."""
+
+    def draw(scene: Scene, length: float, rng: np.random.Generator) -> Scene:
+        parts = find_free_parts(scene, np.array(scene.route, float))
+        nodes = np.concatenate([np.empty((0, 2)), *(part.point(part.nodes) for part in parts)])
+        nodes = nodes[is_within(nodes, region)]
+        if not len(nodes):
+            raise InputError("the robot finds no room in its region", hint="another region")
+        anchors = nodes[rng.integers(len(nodes), size=_ANCHORS)]
+        ends = np.reshape(scene.walls, (-1, 2)).astype(float)
+        x0, y0 = np.maximum(region[:2], ends.min(axis=0)).tolist()
+        x1, y1 = np.minimum(region[2:], ends.max(axis=0)).tolist()
+        fence = polyline([(x0, y0), (x1, y0), (x1, y1), (x0, y1)], closed=True)
+        scene = dataclasses.replace(scene, kerbs=(*scene.kerbs, *fence))
+        return draw_tour(scene, length, rng, anchors)
+
+    return draw
+
+
+def is_within(points: Float, region: Region) -> NDArray[np.bool_]:
+    """(N,) whether points (N, 2) lie in a region."""
+    return np.all((points > region[:2]) & (points < region[2:]), axis=1)
 
 
 class _Strips(NamedTuple):

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,7 @@ from session_pairs import OVERLAPS, plan_pair, plan_strangers, plan_wings
 
 from stillmap.core.errors import InputError
 from stillmap.sim import scene_by_name
-from stillmap.sim.sessions import SessionOptions, SessionPlan, plan_sessions
-from stillmap.sim.writer import write_sessions
+from stillmap.sim.sessions import SessionPlan, draw_piece, plan_sessions, write_sessions
 
 # most robots see to their sides: beams, rad
 LASER = {"laser": {"beams": 270, "fov": math.radians(270)}}
@@ -88,7 +88,7 @@ def prepare_days(
     changes = changes if people is None else {**changes, "crowd": {"people": people}}
 
     def plan():
-        return (plan_sessions(scene_by_name(world, changes), SessionOptions(count), seed),)
+        return (plan_sessions(scene_by_name(world, changes), count, seed),)
 
     what = f"{world}-{count}-{scans or 'all'}-{'usual' if people is None else people}-{seed}"
     return prepare(data / f"days-{what}", plan, seed)
@@ -105,6 +105,7 @@ def prepare_street(data: Path, name: str, seed: int) -> Path:
     begins = (first, first, first + _ON, back, back - _ON)
 
     def plan():
-        return (plan_sessions(scene, SessionOptions(5, begins=begins), seed),)
+        routes = [partial(draw_piece, begin=begin) for begin in begins]
+        return (plan_sessions(scene, 5, seed, routes=routes),)
 
     return prepare(data / f"{name}-{seed}", plan, seed)

@@ -16,8 +16,7 @@ from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.io.stillmap_folder import read
 from stillmap.sim import scene_by_name
-from stillmap.sim.sessions import SessionOptions, plan_sessions
-from stillmap.sim.writer import write_sessions
+from stillmap.sim.sessions import plan_sessions, write_sessions
 
 QUICK = {"laser": {"beams": 180}, "robot": {"scans": 300}, "crowd": {"people": 2}}
 
@@ -26,7 +25,7 @@ QUICK = {"laser": {"beams": 180}, "robot": {"scans": 300}, "crowd": {"people": 2
 def truth(tmp_path_factory: pytest.TempPathFactory) -> SessionTruth:
     """Three sessions of a corridor with six rooms."""
     folder = tmp_path_factory.mktemp("sessions") / "days"
-    plan = plan_sessions(scene_by_name("lookalike-1", QUICK), SessionOptions(3), 5)
+    plan = plan_sessions(scene_by_name("lookalike-1", QUICK), 3, 5)
     write_sessions([plan], folder)
     return load_session_truth(folder)
 
@@ -106,7 +105,7 @@ def test_a_shifted_session_is_found(truth, perfect, tmp_path, shift, verdict) ->
 @pytest.mark.slow
 def test_sessions_of_another_place_must_be_refused(tmp_path: Path) -> None:
     scenes = [scene_by_name(f"lookalike-{k}", QUICK) for k in (1, 2)]
-    plans = [plan_sessions(scene, SessionOptions(1), k) for k, scene in enumerate(scenes)]
+    plans = [plan_sessions(scene, 1, k) for k, scene in enumerate(scenes)]
     write_sessions(plans, tmp_path / "days")
     truth = load_session_truth(tmp_path / "days")
     write_place(tmp_path / "merged", truth)

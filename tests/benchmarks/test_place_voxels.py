@@ -1,5 +1,7 @@
 """Changes of places in 3D: right ones are found, wrong dates and places are not."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from place_changes import ChangeScores, FoundChange, score_changes
@@ -7,8 +9,7 @@ from place_truth import SessionTruth, load_session_truth
 from place_voxels import VOXEL, Voxels, VoxelTruth, collect_voxels
 
 from stillmap.sim import scene_by_name
-from stillmap.sim.sessions import SessionOptions, plan_sessions
-from stillmap.sim.writer import write_sessions
+from stillmap.sim.sessions import draw_piece, plan_sessions, write_sessions
 
 SWEEPS = {"lidar": {"channels": 12, "columns": 120}, "robot": {"scans": 12}}
 SESSIONS = [0, 1, 2]
@@ -18,8 +19,9 @@ SESSIONS = [0, 1, 2]
 def truth(tmp_path_factory: pytest.TempPathFactory) -> SessionTruth:
     """Three sessions of a piece of a street."""
     folder = tmp_path_factory.mktemp("sessions") / "days"
-    options = SessionOptions(3, begins=(40.0, 40.0, 42.0), odd_sensor=False)
-    write_sessions([plan_sessions(scene_by_name("street-empty", SWEEPS), options, 3)], folder)
+    routes = [partial(draw_piece, begin=begin) for begin in (40.0, 40.0, 42.0)]
+    street = scene_by_name("street-empty", SWEEPS)
+    write_sessions([plan_sessions(street, 3, 3, routes=routes, has_odd_sensor=False)], folder)
     return load_session_truth(folder)
 
 

@@ -1,6 +1,7 @@
 """Sessions of a street in 3D: where they lie, what changed, and that growing is merging."""
 
 import filecmp
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -11,8 +12,7 @@ import stillmap
 from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.sim import scene_by_name
-from stillmap.sim.sessions import SessionOptions, plan_sessions
-from stillmap.sim.writer import write_sessions
+from stillmap.sim.sessions import draw_piece, plan_sessions, write_sessions
 
 pytestmark = pytest.mark.slow  # a minute: three sessions are simulated, mapped and merged twice
 
@@ -34,7 +34,8 @@ def build(days: Path, name: str) -> Path:
 def days(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("street") / "days"
     scene = scene_by_name("street-empty", SWEEPS)
-    write_sessions([plan_sessions(scene, SessionOptions(3, begins=BEGINS), 3)], folder)
+    routes = [partial(draw_piece, begin=begin) for begin in BEGINS]
+    write_sessions([plan_sessions(scene, 3, 3, routes=routes)], folder)
     return folder
 
 
@@ -86,7 +87,7 @@ def test_growing_gives_the_same_files_as_merging_at_once(
 
 def test_another_street_is_refused(results: list[Path], tmp_path: Path) -> None:
     scene = scene_by_name("crossing-empty", SWEEPS)
-    plan = plan_sessions(scene, SessionOptions(1, begins=(60.0,)), 4)
+    plan = plan_sessions(scene, 1, 4, routes=[partial(draw_piece, begin=60.0)])
     write_sessions([plan], tmp_path / "days")
     other = build(tmp_path / "days", "session-1")
     with pytest.raises(InputError, match="fewer than two sessions"):

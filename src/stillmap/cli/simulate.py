@@ -91,8 +91,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
         "--format",
         choices=("stillmap", "carmen"),
         default="stillmap",
-        help="a recording folder, or recording.log with FLASER, RLASER and ODOM lines "
-        "(default: %(default)s)",
+        help="a recording folder, or a CARMEN log, recording.log (default: %(default)s)",
     )
     p.add_argument(
         "--seed", metavar="N", type=int, default=0, help="seed of the random numbers (default: 0)"
@@ -180,16 +179,16 @@ def _simulate(scene: "Scene", args: argparse.Namespace, output: Path) -> list[di
     from stillmap.sim import sessions, simulate, simulate_rig, writer
 
     is_carmen, is_rig = args.format == "carmen", scene.rig.tilts
-    if is_carmen:
-        writer.require_carmen(scene)
+    if is_carmen and scene.in_3d:
+        raise InputError("CARMEN logs hold no 3D scans", hint="the recording folder")
     if args.sessions is not None:
         if is_carmen:
             hint = "no --format carmen"
             raise InputError("sessions are written as recording folders", hint=hint)
-        require_new(output, writer.SESSIONS_MARK, args.overwrite)
-        plan = sessions.plan_sessions(scene, sessions.SessionOptions(args.sessions), args.seed)
+        require_new(output, sessions.SESSIONS_MARK, args.overwrite)
+        plan = sessions.plan_sessions(scene, args.sessions, args.seed)
         with show_share(args.quiet, "simulating") as progress:
-            return writer.write_sessions(
+            return sessions.write_sessions(
                 [plan], output, seed=args.seed, overwrite=args.overwrite, tell=progress
             )
     require_new(output, writer.RIG_MARK if is_rig else writer.MARK, args.overwrite)

@@ -1,8 +1,5 @@
 """Simulations as folders: recordings and, beside them, the truth."""
 
-import json
-import math
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -10,35 +7,24 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.array_folder import write_arrays
 from stillmap.core.arrays import write_npy, write_npz
 from stillmap.core.camera import Images
-from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_folder
+from stillmap.core.json import write_json
 from stillmap.io import stillmap_folder
-from stillmap.io.carmen import writer
+from stillmap.io.carmen.writer import write_log
 from stillmap.io.images import write_png
 from stillmap.io.registry import RIG_FOLDERS
 from stillmap.io.trajectory import write_tum
 from stillmap.sim import truth
 from stillmap.sim.camera import CameraSimulator
-from stillmap.sim.scene import Scene
-from stillmap.sim.sessions import (
-    SESSIONS_FILE,
-    SessionPlan,
-    compute_overlap,
-    list_changes,
-    observe,
-    simulate_sessions,
-)
 from stillmap.sim.simulator import RigSimulation, Simulation
 from stillmap.sim.truth import ImageTruth, Truth, image_files
-
-Format = Literal["stillmap", "carmen"]
 
 CARMEN_LOG = "recording.log"
 MARK = "truth"  # every simulation has it
 RIG_MARK = "tilting/truth"  # every one of two lasers has it
-SESSIONS_MARK = "session-1/truth"  # every folder of simulated sessions has it, no place does
 _MAX_DISTANCE = 65.535  # m, of a 16-bit image in millimetres
 
 
@@ -46,7 +32,7 @@ def write_simulation(
     simulation: Simulation,
     path: str | Path,
     *,
-    format: Format = "stillmap",
+    format: Literal["stillmap", "carmen"] = "stillmap",
     overwrite: bool = False,
 ) -> None:
     """Write recording and truth into one folder that appears complete or not at all.
@@ -54,22 +40,19 @@ def write_simulation(
     Args:
         simulation: what `simulate` returned.
         path: the folder.
-        format: "stillmap" writes the files of a recording folder, "carmen" a `recording.log`
-            with FLASER, RLASER and ODOM lines, ranges in whole centimetres.
+        format: "stillmap" writes the files of a recording folder, "carmen" a `recording.log`.
         overwrite: replace an earlier simulation.
 
     Raises:
         InputError: the folder holds something already or cannot be written to, or the format
             cannot say what the laser measures.
     """
-    if format == "carmen":
-        require_carmen(simulation.scene)
     with atomic_folder(Path(path), MARK, overwrite) as work:
         if format == "carmen":
-            _write_carmen(simulation, work / CARMEN_LOG)
+            write_log(simulation.recording, work / CARMEN_LOG)
             _write_truth(simulation.truth, simulation.recording.stamp_ns, work)
         else:
-            _write_folder(simulation, work)
+            write_folder(simulation, work)
 
 
 def write_rig(rig: RigSimulation, path: str | Path, *, overwrite: bool = False) -> None:
@@ -84,75 +67,8 @@ def write_rig(rig: RigSimulation, path: str | Path, *, overwrite: bool = False) 
     with atomic_folder(Path(path), RIG_MARK, overwrite) as work:
         for name, simulation in zip(RIG_FOLDERS, (rig.horizontal, rig.tilting), strict=True):
             (work / name).mkdir()
-            _write_folder(simulation, work / name)
+            write_folder(simulation, work / name)
         write_npy(work / "joint_angle.npy", rig.joint_angle)
-
-
-def write_sessions(
-    plans: Sequence[SessionPlan],
-    path: str | Path,
-    *,
-    seed: int = 0,
-    overwrite: bool = False,
-    tell: Callable[[float], None] | None = None,
-) -> list[dict[str, Any]]:
-    """Simulate sessions and write them into one folder that appears complete or not at all.
-
-    Args:
-        plans: most often one; sessions of several plans are those of different places.
-        path: the folder: session-1, session-2 ... and sessions.json.
-        seed: of the plan, for the record.
-        overwrite: replace earlier sessions.
-        tell: called with the completed share.
-
-    Returns:
-        Of each session its name and numbers of scans, beams, hits and hits on movers.
-
-    Raises:
-        InputError: no room for robot or people, or the folder holds something already.
-    """
-    total = sum(len(plan.scenes) for plan in plans)
-    about: list[dict[str, Any]] = []
-    sights, counts = [], []
-    with atomic_folder(Path(path), SESSIONS_MARK, overwrite) as work:
-        for place, plan in enumerate(plans):
-            for simulation in simulate_sessions(plan):
-                name = f"session-{len(about) + 1}"
-                (work / name).mkdir()
-                _write_folder(simulation, work / name)
-                about.append({"name": name, "place": place, **_describe(simulation)})
-                sights.append(observe(simulation))
-                counts.append({"name": name, **count_beams(simulation)})
-                if tell is not None:
-                    tell(len(about) / total)
-        names, places = ([session[key] for session in about] for key in ("name", "place"))
-        objects, scene = plans[0].objects if len(plans) == 1 else (), plans[0].scenes[0]
-        changes = list_changes(objects, scene.heights if scene.in_3d else None)
-        tree = {
-            "format_version": 1,
-            "scene": [plan.name for plan in plans],
-            "seed": seed,
-            "sessions": about,
-            "objects": [item.to_dict(number) for number, item in enumerate(objects)],
-            "changes": [change.to_dict(number, names) for number, change in enumerate(changes)],
-            "overlap": np.round(compute_overlap(sights, places), 4).tolist(),
-        }
-        text = json.dumps(tree, indent=1) + "\n"
-        (work / SESSIONS_FILE).write_text(text, encoding="utf-8")
-    return counts
-
-
-def _describe(simulation: Simulation) -> dict[str, Any]:
-    scene, recording = simulation.scene, simulation.recording
-    sensor = scene.lidar if scene.in_3d else scene.laser
-    return {
-        "T_world_session": simulation.truth.T_world_base[0].tolist(),
-        "first_stamp_ns": int(recording.stamp_ns[0]),
-        "scans": recording.n_scans,
-        "beams_per_scan": scene.lidar.columns if scene.in_3d else scene.laser.beams,
-        "fov": 2 * np.pi if scene.in_3d else scene.laser.fov,
-        "mount": [sensor.x, sensor.y, sensor.yaw],
-    }
 
 
 def count_beams(simulation: Simulation) -> dict[str, int]:
@@ -165,7 +81,7 @@ def count_beams(simulation: Simulation) -> dict[str, int]:
     }
 
 
-def _write_folder(simulation: Simulation, work: Path) -> None:
+def write_folder(simulation: Simulation, work: Path) -> None:
     """A recording folder with its truth, and pictures with theirs, into an existing folder."""
     recording = simulation.recording
     _write_truth(simulation.truth, recording.stamp_ns, work)
@@ -179,13 +95,12 @@ def _write_folder(simulation: Simulation, work: Path) -> None:
 def _write_truth(of_beams: Truth, stamp_ns: NDArray[np.int64], folder: Path) -> None:
     inside = folder / truth.FOLDER
     inside.mkdir()
-    for name in (*truth.ARRAYS, *truth.OPTIONAL):
-        array = getattr(of_beams, name)
-        if array is not None and (name in truth.ARRAYS or len(array)):
-            write_npy(inside / f"{name}.npy", np.asarray(array))
+    arrays = {name: getattr(of_beams, name) for name in (*truth.ARRAYS, *truth.OPTIONAL)}
+    if not len(of_beams.lasting):
+        del arrays["lasting"]
+    write_arrays(inside, arrays)
     write_tum(inside / "trajectory.tum", stamp_ns, of_beams.T_world_base)
-    scene = json.dumps(of_beams.scene, indent=1) + "\n"
-    (inside / truth.SCENE).write_text(scene, encoding="utf-8")
+    write_json(inside / truth.SCENE, of_beams.scene)
 
 
 def _write_image_truth(surfaces: ImageTruth, folder: Path) -> None:
@@ -221,35 +136,3 @@ def _write_truth_on_read(photographs: CameraSimulator, folder: Path) -> Images:
 
     images = photographs.images
     return Images(images.stamp_ns, images.camera, images.cameras, load)
-
-
-def require_carmen(scene: Scene) -> None:
-    """Refuse scans for FLASER lines, which hold half a circle and ranges below the SICK's code.
-
-    Raises:
-        InputError: they cannot.
-    """
-    if scene.in_3d:
-        raise InputError("CARMEN logs hold no 3D scans", hint="the recording folder")
-    laser = scene.laser
-    if abs(laser.fov - math.pi) > 1e-9:
-        raise InputError("FLASER lines hold half a circle", hint="a field of view of 180 degrees")
-    if laser.upside_down == "known":
-        what = "FLASER lines cannot say that the laser hangs upside down"
-        raise InputError(what, hint="laser.upside_down=unknown")
-    if laser.max_range > writer.NO_RETURN:
-        what = f"CARMEN logs hold ranges up to {writer.NO_RETURN} m"
-        raise InputError(what, hint="a lower max_range")
-
-
-def _write_carmen(simulation: Simulation, path: Path) -> None:
-    form = writer.LogFormat(
-        lasers=(writer.LaserFormat("FLASER"), writer.LaserFormat("RLASER")),
-        scan_angles=None,
-        params={},
-        comment=f"stillmap simulate {simulation.scene.name}",
-        host="simulated",
-        digits=2,
-    )
-    with path.open("w", encoding="ascii", newline="\n") as file:
-        file.writelines(writer.format_lines(simulation.recording, form))
