@@ -57,17 +57,13 @@ def test_a_full_disk_is_an_error(monkeypatch):
             ArrayBuilder(np.float32).append(np.ones(3))
 
 
-def test_a_temporary_folder_that_is_gone(tmp_path, caplog, limit):
+@pytest.mark.usefixtures("limit")
+def test_a_temporary_folder_that_is_gone(tmp_path):
     gone = tmp_path / "stillmap-1" / "more"
-    for _ in range(2):
-        column = ArrayBuilder(np.float32, (), gone)
-        column.append(np.arange(5))
-        np.testing.assert_array_equal(column.finish(), np.arange(5))
-        arrays.empty((7,), np.float64, gone)[:] = 1.0
-    expected = (
-        [f"{gone} does not exist any more: temporary files are in {tmp_path}"] if limit == 0 else []
-    )
-    assert [record.getMessage() for record in caplog.records] == expected
+    column = ArrayBuilder(np.float32, (), gone)
+    column.append(np.arange(5))
+    np.testing.assert_array_equal(column.finish(), np.arange(5))
+    arrays.empty((7,), np.float64, gone)[:] = 1.0
 
 
 @pytest.mark.parametrize("block", [4, 1 << 20])

@@ -137,13 +137,6 @@ def parse(content: Any, kind: type[Model], path: Path, hint: str = "") -> Model:
         raise InputError(what, where=str(path), hint=hint) from error
 
 
-def read_model(path: Path, kind: type[Model], hint: str = "") -> Model:
-    """The content of a JSON file of a folder as a dataclass; see `read_record` and `parse`."""
-    record = read_record(path, hint)
-    record.pop("format_version")
-    return parse(record, kind, path, hint)
-
-
 def open_npy(path: Path, scratch: Path | None = None, rows: int | None = None) -> NDArray[Any]:
     """Read a `.npy` file: an array that cannot be written, memory-mapped where it is large.
 

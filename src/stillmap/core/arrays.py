@@ -4,7 +4,6 @@ Large arrays lie in unlinked temporary files, which vanish with the last referen
 process is killed.
 """
 
-import logging
 import mmap
 import os
 import tempfile
@@ -17,8 +16,6 @@ from typing import IO, Any, Protocol, TypeVar, cast
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
-
-from stillmap.core.files import nearest_folder_above
 
 
 def write_npz(path: Path, arrays: Mapping[str, "Writable"]) -> None:
@@ -68,9 +65,6 @@ _SAMPLE_SEED = 1
 ITEMS_PER_RELEASE = 500  # items of the size of a 2D scan between two releases of pages
 
 _Item = TypeVar("_Item")
-
-_log = logging.getLogger(__name__)
-_reported = set[Path]()  # folders that are gone
 
 
 def empty(shape: tuple[int, ...], dtype: DTypeLike, folder: Path | None = None) -> NDArray[Any]:
@@ -153,36 +147,17 @@ def copy(array: NDArray[Any], folder: Path | None = None) -> NDArray[Any]:
 
 
 def open_unlinked(folder: Path | None) -> IO[bytes]:
-    """A new file without a name in a folder; None: the system's for temporary files.
-
-    If the folder is gone, as after a temporary folder was cleaned up, the file is in the nearest
-    one above that is left, or in the system's.
+    """A new file without a name in a folder; in the system's for temporary files if it is gone.
 
     Raises:
         OSError: no file can be made there.
     """
+    folder = folder if folder is not None and folder.is_dir() else Path(tempfile.gettempdir())
     try:
-        return _open_in(folder)
-    except FileNotFoundError:
-        if folder is None:
-            raise
-    above = nearest_folder_above(folder)
-    if folder not in _reported:
-        _reported.add(folder)
-        _log.warning("%s does not exist any more: temporary files are in %s", folder, above)
-    try:
-        return _open_in(above)
-    except OSError:
-        return _open_in(None)
-
-
-def _open_in(folder: Path | None) -> IO[bytes]:
-    try:  # unlike that of tempfile, this one can be given a name later
         flags = os.O_RDWR | os.O_TMPFILE | os.O_CLOEXEC
-        return os.fdopen(os.open(folder or tempfile.gettempdir(), flags, 0o600), "w+b")
+        return os.fdopen(os.open(folder, flags, 0o600), "w+b")
     except (AttributeError, OSError):  # the system, or the file system, has none such
-        pass
-    return cast(IO[bytes], tempfile.TemporaryFile(prefix="stillmap-", dir=folder))
+        return cast(IO[bytes], tempfile.TemporaryFile(prefix="stillmap-", dir=folder))
 
 
 def map_file(

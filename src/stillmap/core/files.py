@@ -241,11 +241,6 @@ def _naming_output(work: Path, output: Path) -> Iterator[None]:
         raise InputError(error.what, where=where, hint=error.hint) from error
 
 
-def nearest_folder_above(path: str | os.PathLike[str]) -> Path:
-    """The first folder above a path that is there."""
-    return next(one for one in Path(path).absolute().parents if one.is_dir())
-
-
 def to_encodable(text: str) -> str:
     """A text that UTF-8 can hold: bytes of file names that are no UTF-8 become escapes."""
     return text.encode("utf-8", "backslashreplace").decode("utf-8")

@@ -16,7 +16,6 @@ Progress = Callable[[str, int, int, int], None]
 
 _LINE_PERIOD = 10.0  # s between lines of progress without a terminal
 _WIDE = 100  # columns of a terminal: from there on with longer texts
-_MIN_RATED = 0.01  # s: shorter steps show no rate
 
 
 class Show(Protocol):
@@ -187,18 +186,15 @@ class _Lines:
     def _report(self) -> None:
         (step, done, total, unit), seconds = self._now, time.monotonic() - self._started
         if not total:
-            self._say(f"{step}: {seconds:.0f} s so far")
-            return
-        if isinstance(done, float):
-            self._say(f"{step}: {100.0 * done:.0f} %")
-            return
-        rate = done / max(seconds, 1e-3)
-        text = f"{step}: {done} of {total}{' ' if unit else ''}{unit}"
-        if unit == "scans" and seconds > _MIN_RATED:
-            text += f", {rate:.0f}/s"
-        self._say(
-            text if done == total else f"{text}, {(total - done) / max(rate, 1e-3):.0f} s left"
-        )
+            text = f"{seconds:.0f} s so far"
+        elif isinstance(done, float):
+            text = f"{100.0 * done:.0f} %"
+        else:
+            rate = done / max(seconds, 1e-3)
+            text = f"{done} of {total} {unit}, {rate:.0f}/s" if unit else f"{done} of {total}"
+            if done < total:
+                text += f", {(total - done) / max(rate, 1e-3):.0f} s left"
+        self._say(f"{step}: {text}")
 
 
 def reset_peak_memory() -> None:
