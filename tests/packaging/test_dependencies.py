@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "src" / "stillmap"
 # modules that are imported only where their extra is in use
 NEEDS_EXTRA = {
-    "viewer/server.py": "viewer",
+    "results/viewer/server.py": "viewer",
     "live/foxglove_server.py": "live",
     # for type checkers alone
     **{f"results/{name}.py": "notebook" for name in ("plot", "result", "tables")},
