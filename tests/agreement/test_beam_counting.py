@@ -76,14 +76,6 @@ def test_dense(beams):
         assert alpha.sum() + beta.sum() == pytest.approx(sums(grid, all_cells(grid)).sum())
 
 
-def test_dense_of_an_empty_grid(beams):
-    for kernels in (_core, reference):
-        grid = beams.empty_grid(kernels)
-        first, alpha, beta = grid.dense()
-        assert first.tolist() == [0] * beams.dimension
-        assert alpha.shape == beta.shape == (0,) * beams.dimension
-
-
 def test_dense_of_a_box(beams):
     rng = np.random.default_rng(3)
     for kernels in (_core, reference):
@@ -103,21 +95,6 @@ def test_dense_of_a_box(beams):
                 lowest = low[::-1] + 60
                 at = tuple(map(slice, lowest.tolist(), (lowest + size[::-1]).tolist()))
                 np.testing.assert_array_equal(part, padded[at])
-
-
-@pytest.mark.parametrize(
-    ("first", "shape"),
-    [
-        ((0, 0), None),
-        (None, (3, 3)),
-        ((0, 2**40), (3, 3)),
-        ((0, 0), (-1, 3)),
-        ((-(2**63), 0), (1, 1)),
-    ],
-)
-def test_invalid_boxes(first, shape):
-    with pytest.raises(ValueError, match="first_cell, shape"):
-        _core.OccupancyGrid2D(0.1).dense(first, shape)
 
 
 def test_block_cells(beams):

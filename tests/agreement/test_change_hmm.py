@@ -159,35 +159,3 @@ def test_two_observations_by_hand():
     hit_hit = sum(model.prior[a] * 0.97 * p[a, b] * 0.97 for a in (0, 2) for b in (0, 2))
     expected = np.log(hit_hit / (0.525 * 0.97))
     assert by_hand("HH").log_likelihood == pytest.approx(expected)
-
-
-def test_argument_errors():
-    seen, number = lanes()
-    with pytest.raises(ValueError, match="time_bin: expected 0 to 2147483647"):
-        changes_of(_core, seen, number - 100)
-    with pytest.raises(ValueError, match="time_bin: expected 0 to 2147483647"):
-        changes_of(_core, seen, number + 2**31)
-    surface = _core.SurfelMap2D(0.1)
-    surface.fit()
-    lengths = dict.fromkeys(
-        ("lateral_std", "margin", "hit_radius", "end_margin", "bin_seconds"), 0.1
-    )
-    hmm = _core.OccupancyHmm2D(surface, rho=[0.5], tau=[1.0], p_detection=0.9, **lengths)
-    with pytest.raises(ValueError, match="expected track_changes"):
-        hmm.changes()
-    for name, value in (
-        ("tau", 0.0),
-        ("tau", np.inf),
-        ("passer_by_tau", -1.0),
-        ("p_detection", 1.0),
-    ):
-        with pytest.raises(ValueError, match="expected p"):
-            hmm.track_changes(**{**MODEL, name: value})
-    hmm.track_changes(**MODEL, with_paths=False)
-    assert hmm.change_log_likelihood().shape == (0,)
-    with pytest.raises(ValueError, match="expected track_changes"):
-        hmm.changes([0, 0, 1])
-    none = np.empty((0, 2), np.float32), np.empty(0, bool), np.zeros(2, np.int64)
-    hmm.add(*none, np.eye(3)[None], np.array([0]))
-    with pytest.raises(ValueError, match="before the first observation"):
-        hmm.track_changes(**MODEL)

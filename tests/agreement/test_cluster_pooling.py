@@ -176,68 +176,6 @@ def test_ground_contact_within_one_sweep():
     assert np.isfinite(relabelled([leg, sole], **given)[1])
 
 
-@pytest.mark.parametrize(
-    ("changes", "match"),
-    [
-        ({"surfel": np.array([0], np.int32)}, "surfel: expected one per beam"),
-        ({"surfel": np.array([0, 2], np.int32)}, "surfel: out of range"),
-        ({"surfel": np.array([0, -2], np.int32)}, "surfel: out of range"),
-        ({"is_obstacle": np.ones(1, bool)}, "is_obstacle: expected one per surfel"),
-        ({"p_static": np.ones(3, np.float32)}, "p_static: expected one per surfel"),
-        ({"ground_height": np.ones(1, np.float32)}, "ground_height: expected one per surfel"),
-        ({"at_any_height": np.ones(1, bool)}, "at_any_height: expected one per surfel"),
-        ({"p_static": np.array([0.5, 1.5], np.float32)}, "p_static: expected a probability"),
-        ({"ground_height": np.array([0.0, np.nan], np.float32)}, "ground_height: not finite"),
-        ({"column_cells": 0}, "column_cells"),
-        ({"max_ground_height": np.inf}, "max_ground_height"),
-        ({"min_end_height": -1.0}, "min_end_height"),
-    ],
-)
-def test_ground_contact_argument_errors(changes, match):
-    beams = row_of(0, 1), np.ones(2, bool), np.array([0, 2]), IDENTITY
-    surface = _core.SurfelMap3D(1.0)
-    surface.add_end_points(*beams)
-    surface.fit()
-    given = {
-        "surfel": np.array([0, 1], np.int32),
-        "is_obstacle": np.ones(2, bool),
-        "p_static": np.ones(2, np.float32),
-        "ground_height": np.zeros(2, np.float32),
-        "at_any_height": np.zeros(2, bool),
-        "column_cells": 1,
-        "max_ground_height": 0.2,
-        "min_end_height": 0.0,
-    }
-    assert np.isnan(_core.relabel_ground_contact(surface, *beams, **given)).all()
-    with pytest.raises(ValueError, match=match):
-        _core.relabel_ground_contact(surface, *beams, **{**given, **changes})
-
-
-def test_ground_contact_with_unusable_beams():
-    points = row_of(0, 1)
-    surface = _core.SurfelMap3D(1.0)
-    surface.add_end_points(points, np.ones(2, bool), np.array([0, 2]), IDENTITY)
-    surface.fit()
-    points[1] = np.nan
-    one = np.ones(2, np.float32)
-    with pytest.raises(ValueError, match="unusable"):
-        _core.relabel_ground_contact(
-            surface,
-            points,
-            np.ones(2, bool),
-            np.array([0, 2]),
-            IDENTITY,
-            np.array([0, 1], np.int32),
-            is_obstacle=one.astype(bool),
-            p_static=one,
-            ground_height=one,
-            at_any_height=one.astype(bool),
-            column_cells=1,
-            max_ground_height=0.2,
-            min_end_height=0.0,
-        )
-
-
 def row_of(*x):
     """End points in the centres of cells of 1 m in a row."""
     return np.array([[v + 0.5, 0.5, 0.5] for v in x], np.float32)
@@ -279,31 +217,3 @@ def test_small_clusters_are_ignored():
     share = share_of([row_of(0, 1, 2), row_of(0, 1)], moving=[1, 2], fewest=3)
     assert share == pytest.approx({0: 2 / 3, 1: 2 / 3, 2: 2 / 3}, abs=1e-6)
     assert np.isnan(list(share_of([row_of(0, 1)], moving=[1], fewest=3).values())).all()
-
-
-def bad(**changes):
-    surface = _core.SurfelMap3D(1.0)
-    surface.add_end_points(row_of(0, 1), np.ones(2, bool), np.array([0, 2]), IDENTITY)
-    if not changes.pop("raw", False):
-        surface.fit()
-    given = {"is_obstacle": np.ones(2, bool), "values": np.ones((2, 1), np.float32)}
-    return _core.ClusterPooling3D(
-        surface, **{**given, "column_cells": 1, "min_surfels": 1, **changes}
-    )
-
-
-@pytest.mark.parametrize(
-    ("changes", "match"),
-    [
-        ({"raw": True}, "fit it first"),
-        ({"is_obstacle": np.ones(3, bool)}, "is_obstacle: expected one per surfel"),
-        ({"values": np.ones((1, 2), np.float32)}, "values: expected a row per surfel"),
-        ({"values": np.ones((2, 0), np.float32)}, "values: expected a row per surfel"),
-        ({"values": np.array([[0.5], [np.nan]], np.float32)}, "values: expected -1e6"),
-        ({"column_cells": 0}, "column_cells"),
-        ({"min_surfels": 0}, "min_surfels"),
-    ],
-)
-def test_argument_errors(changes, match):
-    with pytest.raises(ValueError, match=match):
-        bad(**changes)

@@ -127,44 +127,6 @@ def test_empty_map_scores_zero(kernels, dimension):
     assert beams == 2
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("stopping_rate", 0.0),
-        ("stopping_rate", float("inf")),
-        ("range_std", 0.0),
-        ("range_std", float("nan")),
-        ("mean_delay", -1.0),
-        ("late_share", 1.1),
-        ("outlier_share", 0.0),
-        ("outlier_share", 1.0),
-        ("is_held_out", np.zeros(1, bool)),
-        ("offset", np.array([0, 5])),
-    ],
-)
-def test_argument_errors(name, value):
-    good = {
-        "points": np.ones((5, 2), np.float32),
-        "hit": np.ones(5, bool),
-        "offset": np.array([0, 2, 5]),
-        "T_map_sensor": np.tile(np.eye(3), (2, 1, 1)),
-        "is_held_out": np.array([False, True]),
-    }
-    shares = _core.StaticFractionGrid2D(0.1)
-    _core.score_held_out(shares, **good, **MODEL)
-    with pytest.raises(ValueError, match=name):
-        _core.score_held_out(shares, **{**good, **MODEL, name: value})
-
-
-@pytest.mark.parametrize("e", [-0.1, 1.5, np.nan])
-def test_e_out_of_range(e):
-    scan = np.ones((1, 2), np.float32), np.array([True]), np.array([e], np.float32)
-    at = np.array([0, 1]), np.eye(3)[None]
-    _core.StaticFractionGrid2D(0.1).add(*scan, *at, np.array([True]))  # held out: not used
-    with pytest.raises(ValueError, match="e: "):
-        _core.StaticFractionGrid2D(0.1).add(*scan, *at, np.array([False]))
-
-
 def test_returns_near_the_largest_cell():
     # the traversal continues behind a return and would leave the range of cell indices
     points = np.array([[2.0**24 - 1, 0.5]], np.float32)

@@ -74,31 +74,3 @@ def test_threads_change_nothing():
     once = _core.line_support(surfels, p, **LINES)
     for threads in (2, 3):
         assert _core.line_support(surfels, p, **LINES, threads=threads).tobytes() == once.tobytes()
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"radius": 0.5}, "radius"),
-        ({"radius": 65.0}, "radius"),
-        ({"radius": np.nan}, "radius"),
-        ({"gap": -1.0}, "gap"),
-        ({"gap": 21.0}, "gap"),
-        ({"half_width": 0.0}, "half_width"),
-        ({"half_width": np.nan}, "half_width"),
-    ],
-)
-def test_values_are_checked(changes, message):
-    surfels = surfel_map(_core, end_points(5))
-    p = np.ones(surfels.size, np.float32)
-    with pytest.raises(ValueError, match=message):
-        _core.line_support(surfels, p, **{**LINES, **changes})
-
-
-def test_labels_are_checked():
-    surfels = surfel_map(_core, end_points(5))
-    for wrong in (np.ones(3), np.full(surfels.size, 1.5), np.full(surfels.size, np.nan)):
-        with pytest.raises(ValueError, match="p_static"):
-            _core.line_support(surfels, wrong.astype(np.float32), **LINES)
-    with pytest.raises(TypeError):
-        _core.line_support(surfels, np.ones(surfels.size), **LINES)

@@ -8,7 +8,6 @@ from surfel_maps import fit_both, order
 
 from stillmap import _core
 from stillmap.em.spatial_coupling import _MEAN_FIELD as MEAN_FIELD
-from stillmap.em.spatial_coupling import smooth_mean_field
 
 
 def surfaces(seed):
@@ -123,42 +122,3 @@ def test_surfels_off_the_plane_do_not_interact():
     assert off.sum() == 1
     p = _core.smooth_mean_field(surface, np.where(off, -4.0, 0.5).astype(np.float32), **MEAN_FIELD)
     np.testing.assert_array_equal(p < 0.5, off)
-
-
-def test_argument_errors():
-    core, _ = surfaces(0)
-    own = np.zeros(core.size, np.float32)
-    with pytest.raises(ValueError, match="log_odds: expected one per surfel"):
-        _core.smooth_mean_field(core, own[1:], **MEAN_FIELD)
-    with pytest.raises(ValueError, match="log_odds: not a number"):
-        _core.smooth_mean_field(core, own + np.float32(np.nan), **MEAN_FIELD)
-    with pytest.raises(TypeError):
-        _core.smooth_mean_field(core, own.astype(float), **MEAN_FIELD)
-    for name, value in (
-        ("radius", 0.5), ("radius", 9.0), ("coplanar_std", 0.0), ("tolerance", 2.0),
-        ("max_iterations", -1), ("min_log_odds", 4.0), ("static_coupling", -1.0),
-    ):  # fmt: skip
-        with pytest.raises(ValueError, match=name):
-            _core.smooth_mean_field(core, own, **{**MEAN_FIELD, name: value})
-    unfit, dateless = _core.SurfelMap3D(0.3), _core.SurfelMap3D(0.3)
-    with pytest.raises(ValueError, match="fit it first"):
-        _core.smooth_mean_field(unfit, own, **MEAN_FIELD)
-    one = np.ones((1, 3), np.float32), np.ones(1, bool), np.array([0, 1]), np.eye(4)[None]
-    dateless.add_end_points(*one)
-    with pytest.raises(ValueError, match="time_bin: expected in all calls, or in none"):
-        dateless.add_end_points(*one, np.array([1]))
-    dateless.fit()
-    with pytest.raises(ValueError, match="surfel_map: expected"):
-        _core.smooth_mean_field(dateless, own[:1], **MEAN_FIELD)
-    for look in ([1, 2], [-1], [2**31]):
-        with pytest.raises(ValueError, match="time_bin"):
-            _core.SurfelMap3D(0.3).add_end_points(*one, np.array(look))
-
-
-def test_2d_maps_are_rejected():
-    core, _ = surfaces(0)
-    smoothed = smooth_mean_field(np.linspace(0.0, 1.0, core.size).astype(np.float32), core)
-    assert smoothed.dtype == np.float32
-    assert np.isfinite(smoothed).all()
-    with pytest.raises(TypeError, match="3D"):
-        smooth_mean_field(np.zeros(0, np.float32), _core.SurfelMap2D(0.3))

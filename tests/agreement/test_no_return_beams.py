@@ -131,22 +131,3 @@ def test_short_runs_are_not_trusted():
         ):
             found = [grid.alpha_beta(row)[:, 1].tolist() for row in cells]
             assert found == [pytest.approx(row) for row in expected]
-
-
-def test_argument_errors():
-    grid, rest = _core.OccupancyGrid2D(0.1), _core.OccupancyGrid2D(0.1)
-    nothing = np.zeros((0, 2), np.float32), np.zeros(0, bool), np.zeros(1, np.int64)
-    poses, stops = np.zeros((0, 3, 3)), np.zeros((0, 2), np.int64)
-    for end_margin in (-0.1, np.nan):
-        with pytest.raises(ValueError, match="end_margin"):
-            _core.add_no_return_beams(grid, rest, *nothing, poses, stops, end_margin)
-        plain = reference.OccupancyGrid2D(0.1), reference.OccupancyGrid2D(0.1)
-        with pytest.raises(ValueError, match="end_margin"):
-            reference.add_no_return_beams(*plain, *nothing, poses, stops, end_margin)
-    for other in (grid, _core.OccupancyGrid2D(0.2)):
-        with pytest.raises(ValueError, match="rest"):
-            _core.add_no_return_beams(grid, other, *nothing, poses, stops, 0.1)
-    with pytest.raises(ValueError, match="cells"):
-        _core.add_no_return_beams(grid, rest, *nothing, poses, np.array([[2**40, 0]]), 0.1)
-    with pytest.raises(TypeError):
-        _core.add_no_return_beams(grid, rest, *nothing, poses, stops.astype(np.int32), 0.1)

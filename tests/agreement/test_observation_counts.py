@@ -120,9 +120,6 @@ def test_observed_where_the_sums_are_not_zero(beams, believed):
     np.testing.assert_array_equal(observed > 0, alpha + beta > 0)
 
 
-ROW = np.array([[x, 0] for x in range(8)])
-
-
 def row_of(kernels, scans, **options):
     """Observed and clear counts of eight cells of 1 m; scans: (range, hit, dynamic, time bin)."""
     counts = kernels.ObservationCounts2D(1.0, **{"radius": 1.0, **options})
@@ -184,79 +181,3 @@ def arguments():
         "T_map_sensor": np.tile(np.eye(3), (2, 1, 1)),
         "time_bin": np.array([3, 4]),
     }
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "error"),
-    [
-        ("points", np.ones((5, 2)), TypeError),
-        ("points", np.ones((5, 3), np.float32), TypeError),
-        ("points", np.full((5, 2), 1e30, np.float32), ValueError),
-        ("hit", np.ones(4, bool), ValueError),
-        ("hit", np.ones(5, np.uint8), TypeError),
-        ("is_dynamic", np.ones(4, bool), ValueError),
-        ("is_dynamic", np.ones(6, bool), ValueError),
-        ("is_dynamic", np.ones(5, np.float32), TypeError),
-        ("is_dynamic", np.ones((5, 1), bool), TypeError),
-        ("offset", np.array([0, 2, 4]), ValueError),
-        ("offset", np.array([0, 5]), ValueError),
-        ("T_map_sensor", np.tile(np.eye(3), (3, 1, 1)), ValueError),
-        ("T_map_sensor", np.tile(np.eye(4), (2, 1, 1)), TypeError),
-        ("T_map_sensor", np.full((2, 3, 3), np.nan), ValueError),
-        ("time_bin", np.array([3]), ValueError),
-        ("time_bin", np.array([3, 2]), ValueError),
-        ("time_bin", np.array([3, 4], np.int32), TypeError),
-    ],
-)
-@pytest.mark.usefixtures("bounded_memory")
-def test_argument_errors(name, value, error):
-    what = {"points": "end point|points", "T_map_sensor": "pose|T_map_sensor"}.get(name, name)
-    for threads in (1, 2):
-        counts = _core.ObservationCounts2D(0.5, radius=0.3)
-        with pytest.raises(error, match=what):
-            counts.add(**{**arguments(), name: value}, threads=threads)
-
-
-def test_repeated_time_bins():
-    counts = _core.ObservationCounts2D(0.5, radius=0.3)
-    counts.add(**arguments())
-    for time_bin in ([4, 5], [3, 5], [-1, 9]):
-        with pytest.raises(ValueError, match="time_bin"):
-            counts.add(**{**arguments(), "time_bin": np.array(time_bin)})
-    counts.add(**{**arguments(), "time_bin": np.array([5, 5])})
-    assert counts.dense([2, 2], [1, 1])[0].item() == 3
-    nothing = {"points": np.zeros((0, 2), np.float32), "hit": np.zeros(0, bool)}
-    nothing |= {"is_dynamic": nothing["hit"], "offset": np.zeros(1, np.int64)}
-    counts.add(**nothing, T_map_sensor=np.zeros((0, 3, 3)), time_bin=np.zeros(0, np.int64))
-
-
-@pytest.mark.parametrize("make", [_core.ObservationCounts2D, _core.ObservationCounts3D])
-@pytest.mark.parametrize(
-    ("options", "what"),
-    [
-        ({"resolution": 0.0}, "resolution"),
-        ({"resolution": -1.0}, "resolution"),
-        ({"resolution": np.nan}, "resolution"),
-        ({"radius": -0.1}, "radius"),
-        ({"radius": np.nan}, "radius"),
-        ({"radius": 1e9}, "radius"),
-        ({"end_margin": -0.1}, "end_margin"),
-        ({"end_margin": np.nan}, "end_margin"),
-    ],
-)
-def test_invalid_parameters(make, options, what):
-    with pytest.raises(ValueError, match=what):
-        make(**{"resolution": 0.1, "radius": 0.3, **options})
-
-
-def test_invalid_stop_cells_and_boxes():
-    with pytest.raises(TypeError):
-        _core.ObservationCounts2D(0.1, radius=0.3, stop_cells=np.zeros((1, 3), np.int64))
-    with pytest.raises(ValueError, match="cells"):
-        _core.ObservationCounts2D(0.1, radius=0.3, stop_cells=np.array([[2**40, 0]]))
-    counts = _core.ObservationCounts2D(0.1, radius=0.3)
-    assert (counts.resolution, counts.radius, counts.dimension) == (0.1, 0.3, 2)
-    for box in (([2**40, 0], [1, 1]), ([0, 0], [-1, 1])):
-        with pytest.raises(ValueError, match="first_cell"):
-            counts.dense(*box)
-    assert counts.dense([0, 0], [0, 4])[0].shape == (0, 4)

@@ -1,7 +1,6 @@
 """Share of beams through occupied cells, by hand."""
 
 import numpy as np
-import pytest
 
 from stillmap import _core
 from stillmap.core import se2
@@ -93,37 +92,3 @@ def test_3d():
     start[:3, 3] = 0.5
     share = _core.occluded_share(grid, points, np.ones(2, np.float32), np.eye(4), start, **MARGIN)
     assert share == 0.5
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "error"),
-    [
-        ("grid", None, TypeError),
-        ("points", np.ones((4, 2)), TypeError),
-        ("points", np.ones((4, 3), np.float32), TypeError),
-        ("weights", np.ones(3, np.float32), ValueError),
-        ("weights", np.ones(4), TypeError),
-        ("weights", np.full(4, 1.1, np.float32), ValueError),
-        ("T", np.eye(4), TypeError),
-        ("T", np.full((3, 3), np.nan), ValueError),
-        ("T_sensor", np.eye(4), TypeError),
-        ("T_sensor", np.full((3, 3), np.inf), ValueError),
-        ("margin", -0.1, ValueError),
-        ("margin", np.nan, ValueError),
-        ("min_occupancy", -0.1, ValueError),
-        ("min_occupancy", 1.1, ValueError),
-        ("min_occupancy", np.nan, ValueError),
-    ],
-)
-def test_argument_errors(name, value, error):
-    good = {
-        "grid": wall(),
-        "points": np.array(AHEAD, np.float32),
-        "weights": np.ones(4, np.float32),
-        "T": np.eye(3),
-        "T_sensor": np.eye(3),
-        **MARGIN,
-    }
-    assert _core.occluded_share(**good) == 0.25
-    with pytest.raises(error, match=name if error is ValueError else None):
-        _core.occluded_share(**{**good, name: value})

@@ -249,54 +249,6 @@ def test_maps_that_meet_have_the_last_views_of_both():
     assert near[0] == near[1]
 
 
-@pytest.mark.parametrize(
-    ("changes", "named"),
-    [
-        ({"rho": []}, "rho"),
-        ({"rho": [1.5, 0.9, 0.1, 0.1, 0.1]}, "rho"),
-        ({"tau": [1.0]}, "tau"),
-        ({"weights": [0.0] * 5}, "weights"),
-        ({"n_static": 5}, "n_static"),
-        ({"p_detection": 1.0}, "p_detection"),
-        ({"bin_seconds": 0.0}, "bin_seconds"),
-        ({"lateral_std": 0.0}, "lateral_std"),
-        ({"hit_radius": -1.0}, "hit_radius"),
-        ({"max_log_ratio": 0.0}, "max_log_ratio"),
-    ],
-)
-def test_wrong_options_are_named(changes, named):
-    with pytest.raises(ValueError, match=named):
-        make(_core, 2, **changes)
-
-
-def test_wrong_arguments_are_named():
-    core = make(_core, 2)
-    points, hit = np.ones((2, 2), np.float32), np.ones(2, bool)
-    offset, T = np.array([0, 2]), np.eye(3)[None]
-    margin = np.zeros(2, np.float32)
-    with pytest.raises(ValueError, match="margin"):
-        core.add(points, hit, margin[:1], offset, T, time_bin=0, tag=0)
-    with pytest.raises(ValueError, match="margin"):
-        core.add(points, hit, margin - 1, offset, T, time_bin=0, tag=0)
-    with pytest.raises(ValueError, match="time_bin"):
-        core.add(points, hit, margin, offset, T, time_bin=-1, tag=0)
-    with pytest.raises(ValueError, match="tag"):
-        core.add(points, hit, margin, offset, T, time_bin=0, tag=-1)
-    with pytest.raises(ValueError, match="prior"):
-        core.label(points, hit, offset, T, 1.5)
-    with pytest.raises(ValueError, match="motion"):
-        make(_core, 2).take_over(core, np.full((1, 3, 3), np.nan), 0, 1)
-    with pytest.raises(ValueError, match="other"):
-        core.take_over(core, T, 0, 1)
-    assert core.size == 0
-    of_sweeps, scan = make(_core, 3), (np.ones((2, 3), np.float32), hit, offset)
-    with pytest.raises(ValueError, match="pixel"):
-        of_sweeps.add(*scan, np.eye(4)[None], pixel=(0.001, 0.1), time_bin=0, tag=0)
-    two = np.stack([np.eye(4)] * 2)
-    with pytest.raises(ValueError, match="T_map_sensor"):
-        of_sweeps.add(*scan[:2], np.array([0, 1, 2]), two, pixel=PIXEL, time_bin=0, tag=0)
-
-
 def test_what_another_map_knows_counts_at_once():
     core = make(_core, 2)
     wall = np.array([[40, row] for row in range(-20, 20)])

@@ -279,34 +279,6 @@ def test_threads_and_chunks_give_the_same_bits(room, threads, cuts):
         assert a.tobytes() == b.tobytes()
 
 
-def test_intermediate_queries_change_nothing(room):
-    surface = room.surface(_core)
-    whole, asked = (room.hmm(_core, surface, *CLASSES, 0.97) for _ in range(2))
-    whole.add(*room.beams.arguments, np.arange(len(room.time_bin)))
-    for t in range(len(room.time_bin)):
-        asked.add(*room.scans(t, t + 1), np.array([t]))
-        asked.likelihood()
-    for a, b in zip(whole.likelihood(), asked.likelihood(), strict=True):
-        assert a.tobytes() == b.tobytes()
-
-
-def test_order_of_beams_within_a_time_bin(room):
-    surface = room.surface(_core)
-    values = []
-    for flip in (False, True):
-        hmm = room.hmm(_core, surface, *CLASSES, 0.97)
-        points, hit, offset, T = room.beams.arguments
-        if flip:
-            points, hit = points.copy(), hit.copy()
-            for a, b in pairwise(offset):
-                points[a:b], hit[a:b] = points[a:b][::-1].copy(), hit[a:b][::-1].copy()
-        hmm.add(points, hit, offset, T, room.time_bin)
-        values.append(hmm.likelihood())
-    for a, b in zip(*values, strict=True):
-        np.testing.assert_allclose(a, b, rtol=2e-2, atol=2e-2)
-        assert (a == b).mean() > 0.9  # the order of nearly certain crossings matters slightly
-
-
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_no_returns(a_room, dimension):
     far = a_room(1, dimension, 0.2, 4, 20)

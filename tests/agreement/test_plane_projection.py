@@ -65,17 +65,3 @@ def test_nothing_from_nothing():
     xy, is_hit, beam = _core.project_scan(*none, **kernel_settings(flat, 0.1, 2048, True))
     assert xy.shape == (0, 2)
     assert is_hit.shape == beam.shape == (0,)
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("height", np.zeros((0, 2))), ("corner_x", np.nan), ("edge", 0.0), ("low", 1.9),
-        ("cell", -1.0), ("directions", 0),
-    ],
-)  # fmt: skip
-def test_argument_errors(name, value):
-    flat = GroundMap(np.zeros((2, 2)), np.zeros(2), 1.6, True)
-    settings = kernel_settings(flat, 0.1, 2048, True) | {name: value}
-    with pytest.raises(ValueError, match=name.removesuffix("_x")):
-        _core.project_scan(np.zeros((1, 3), np.float32), np.ones(1, bool), np.eye(4), **settings)

@@ -147,34 +147,3 @@ def test_transform_by_twist_and_voxel_downsample():
     for edge in (0.1, 0.7):
         kept = _core.voxel_downsample(points, weights, edge)
         assert kept.tolist() == reference.voxel_downsample(points, weights, edge).tolist()
-
-
-def test_argument_errors(maps):
-    points, weights, times = cloud(1, 20)
-    core = maps[0]
-    eye, zeros, information = np.eye(4), np.zeros(6), np.eye(12)
-    with pytest.raises(ValueError, match="weights: expected 20 entries"):
-        core.add(points, weights[:5], eye)
-    with pytest.raises(ValueError, match=r"weights: expected values in \[0, 1\]"):
-        core.add(points, weights + 1.0, eye)
-    with pytest.raises(ValueError, match="T_map_base: not finite"):
-        core.add(points, weights, eye * np.nan)
-    with pytest.raises(ValueError, match="too far away"):
-        core.add(points + np.float32(1e9), weights, eye)
-    fit = {**FIT, "information_scale": 1.0, "start_level": 0, "start_slack": 0.0}
-    fit |= {"max_iterations": 3, "tolerance": 1e-3, "threads": 1}
-    with pytest.raises(ValueError, match="times: expected 20 entries"):
-        _core.register_sweep(core, points, weights, times[:3], eye, zeros, information, **fit)
-    with pytest.raises(ValueError, match="times: expected finite"):
-        _core.register_sweep(
-            core, points, weights, times * np.float32(np.nan), eye, zeros, information, **fit
-        )
-    with pytest.raises(ValueError, match="level"):
-        core.fit_planes(np.zeros((1, 3)), 3, **PLANE)
-    with pytest.raises(TypeError):
-        core.add(points.astype(float), weights, eye)
-    with pytest.raises(ValueError, match="voxel_size"):
-        _core.voxel_downsample(points, weights, 0.0)
-    for arguments in ((0.0, 3, 1.0), (0.5, 0, 1.0), (0.5, 3, 0.0)):
-        with pytest.raises(ValueError, match="expected"):
-            _core.NdtMap3D(*arguments)

@@ -109,27 +109,3 @@ def test_in_parts_it_is_the_same(watched):
         }
         so_far[first:last] = kernel(grid, *given, changed=part)[0]
     np.testing.assert_array_equal(so_far[1:], whole[0])
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("is_in_map", np.ones(3, bool)),
-        ("poses", np.tile(np.eye(3), (4, 1, 1))),
-        ("poses", np.full((31, 3, 3), np.nan)),
-        ("increments", np.tile(np.eye(3), (4, 1, 1))),
-        ("step_std", np.ones((3, 2))),
-        ("step_std", np.zeros((30, 2))),
-        ("has_step", np.ones(3, bool)),
-        ("own_pose_std", np.ones(3)),
-        ("offset", np.arange(3)),
-        ("hit", np.ones(3, bool)),
-        ("e", np.ones(3, np.float32)),
-    ],
-)
-def test_wrong_arguments(watched, name, value):
-    recording, poses, e = watched
-    given = arguments(recording, e, poses)
-    grid = grid_of(recording, e, given[2], poses)
-    with pytest.raises(ValueError, match=name):
-        kernel(grid, *given, changed={name: value})

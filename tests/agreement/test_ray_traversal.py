@@ -82,33 +82,3 @@ def test_degenerate_segments(start, end, resolution):
 )
 def test_long_segments_far_from_the_origin(start, end):
     assert_agree(start, end, 0.1)
-
-
-@pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize("kernels", [_core, reference])
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-@pytest.mark.usefixtures("bounded_memory")
-def test_points_that_are_not_finite_are_refused(kernels, dimension, bad):
-    for axis in range(dimension):
-        point = np.full(dimension, 0.5)
-        point[axis] = bad
-        for start, end in ((point, np.zeros(dimension)), (np.zeros(dimension), point)):
-            with pytest.raises(ValueError, match="end"):
-                kernels.traverse(start, end, 1.0)
-
-
-@pytest.mark.parametrize("kernels", [_core, reference])
-@pytest.mark.parametrize("resolution", [0.0, -1.0, np.nan])
-def test_bad_resolution_is_refused(kernels, resolution):
-    with pytest.raises(ValueError, match="resolution"):
-        kernels.traverse(np.zeros(2), np.ones(2), resolution)
-
-
-def test_wrong_arrays_are_refused():
-    for start, end, error in (
-        (np.zeros(2), np.zeros(3), ValueError),
-        (np.zeros(4), np.zeros(4), ValueError),
-        (np.zeros(2, np.float32), np.zeros(2, np.float32), TypeError),
-    ):
-        with pytest.raises(error, match="start"):
-            _core.traverse(start, end, 1.0)

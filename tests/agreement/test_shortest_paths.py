@@ -27,20 +27,3 @@ def test_of_edges_between_the_same_nodes_the_shortest_counts():
     edges = np.array([[0, 1], [1, 0], [1, 2]])
     found = _core.shortest_paths(edges, np.array([5.0, 2.0, 0.0]), 4, 0)
     assert found.tolist() == [0.0, 2.0, 2.0, np.inf]
-
-
-@pytest.mark.parametrize(
-    ("edges", "lengths", "count", "start"),
-    [
-        ([[0, 3]], [1.0], 3, 0),
-        ([[-1, 0]], [1.0], 3, 0),
-        ([[0, 1]], [-1.0], 3, 0),
-        ([[0, 1]], [np.nan], 3, 0),
-        ([[0, 1]], [1.0, 2.0], 3, 0),
-        ([[0, 1]], [1.0], 3, 3),
-        ([[0, 1]], [1.0], 0, 0),
-    ],
-)
-def test_wrong_arguments_are_refused(edges, lengths, count, start):
-    with pytest.raises(ValueError, match="expected"):
-        _core.shortest_paths(np.array(edges), np.array(lengths), count, start)

@@ -51,19 +51,6 @@ def test_empty_layers():
     assert _core.count_in_squares(np.zeros((3, 0), bool), 2).shape == (2, 0)
 
 
-@pytest.mark.parametrize("factor", [0, -1])
-def test_argument_errors(factor):
-    with pytest.raises(ValueError, match="factor"):
-        _core.reduce_occupancy(np.zeros((2, 2), np.float32), factor, 0.65, 101)
-    with pytest.raises(ValueError, match="factor"):
-        _core.count_in_squares(np.zeros((2, 2), bool), factor)
-
-
-def test_unknown_must_be_a_pixel():
-    with pytest.raises(ValueError, match="unknown"):
-        _core.reduce_occupancy(np.zeros((2, 2), np.float32), 1, 0.65, 256)
-
-
 def test_normal_distribution_function():
     x = np.concatenate([np.linspace(-9.0, 9.0, 5001), [-np.inf, np.inf, np.nan, 0.0]])
     np.testing.assert_allclose(_core.normal_cdf(x), ndtr(x), rtol=1e-12)

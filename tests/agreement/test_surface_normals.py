@@ -100,19 +100,3 @@ def test_covariance_agrees_with_the_twin():
     measured = np.linalg.inv(C) - np.diag(np.full(3, 4.0))
     share = np.diag(measured) / np.diag(0.2 / 0.04**2 * of_all)
     assert np.all((share > 0.75) & (share <= 1.0))
-
-
-def test_arguments_are_checked():
-    points, e = scans(0), np.ones(len(scans(0)), np.float32)
-    scan = make_scan(points, e, np.eye(3))
-    with pytest.raises(ValueError, match="normals: expected as many rows as points has"):
-        covariance_of(points, 0.5, {"normals": scan.normals[1:], "isotropy": scan.isotropy})
-    with pytest.raises(ValueError, match="isotropy: expected along with normals"):
-        covariance_of(points, 0.5, {"normals": scan.normals})
-    with pytest.raises(ValueError, match="isotropy"):
-        covariance_of(points, 0.5, {"normals": scan.normals, "isotropy": scan.isotropy[1:]})
-    with pytest.raises(ValueError, match="isotropy in"):
-        covariance_of(points, 0.5, {"normals": scan.normals, "isotropy": scan.isotropy + 2})
-    for wrong in ({"radius": 0.0}, {"max_gap": -1.0}, {"flat_below": 0.5}):
-        with pytest.raises(ValueError, match=next(iter(wrong))):
-            _core.estimate_normals(points, **{**OPTIONS, **wrong})

@@ -67,15 +67,3 @@ def test_rows(room):
     hmm.track_surroundings(0.9)
     hmm.add(*room.beams.arguments, room.time_bin)
     np.testing.assert_array_equal(hmm.miss_counts((3, 20, 4)), hmm.miss_counts()[3:20:4])
-
-
-def test_refused(room):
-    hmm = room.hmm(_core, room.surface(_core), [0.5], [1.0], p_detection=0.5)
-    with pytest.raises(ValueError, match="track_surroundings before"):
-        hmm.miss_counts()
-    for edge in (0.0, -1.0, np.nan, np.inf):
-        with pytest.raises(ValueError, match="edge"):
-            hmm.track_surroundings(edge)
-    hmm.add(*room.beams.arguments, room.time_bin)
-    with pytest.raises(ValueError, match="first observation"):
-        hmm.track_surroundings(0.9)

@@ -41,16 +41,3 @@ def test_triangle_without_texel_centre():
     assert texel.tolist() == [24, 0]
     assert face.tolist() == [0, 1]
     np.testing.assert_allclose(weight, 1.0 / 3.0)
-
-
-@pytest.mark.parametrize(
-    ("corners", "width", "said"),
-    [
-        (np.full((1, 3, 2), np.inf), 8, "corners: not finite"),
-        (np.zeros((1, 3, 2)), 0, "width, height"),
-        (np.zeros((1, 3, 2)), 1 << 16, "width, height"),
-    ],
-)
-def test_argument_errors(corners, width, said):
-    with pytest.raises(ValueError, match=said):
-        _core.rasterise_texels(corners, width, 4)

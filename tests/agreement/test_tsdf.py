@@ -137,43 +137,6 @@ def test_triangles_edge_on_or_from_behind_are_skipped():
     assert len(distances.blocks()) == 0
 
 
-def test_argument_errors():
-    good = wall()
-
-    def refused(place, value, match):
-        bad = [*good]
-        bad[place] = value
-        with pytest.raises(ValueError, match=match):
-            _core.TsdfVolume(VOXEL, **REACH).integrate(*bad)
-
-    refused(0, good[0] * np.nan, "points: not finite")
-    refused(1, good[1][:3], "origin: expected a row per point")
-    refused(2, good[2][:3], "standoff: expected one per point")
-    refused(2, good[2] * np.inf, "standoff: not finite")
-    refused(3, np.full((2, 3), 4, np.int32), "faces: point index out of range")
-    refused(3, np.full((2, 3), -1, np.int32), "faces: point index out of range")
-    refused(4, good[4][:1], "weight: expected one per face")
-    refused(4, -good[4], "weight: expected finite values")
-    refused(4, good[4] * np.nan, "weight: expected finite values")
-    refused(0, good[0] * 1e7, "points: too far away")
-    for bad in (
-        {"voxel": 0.0},
-        {"voxel": np.nan},
-        {"truncation_front": 0.0},
-        {"truncation_back": 10.0},
-    ):
-        with pytest.raises(ValueError, match=next(iter(bad))):
-            _core.TsdfVolume(**{"voxel": VOXEL, **REACH, **bad})
-
-
-def test_too_large_triangle():
-    points, origin, standoff, faces, weight = wall(2000.0, 1900.0)
-    with pytest.raises(ValueError, match="too large"):
-        _core.TsdfVolume(0.01, truncation_front=0.03, truncation_back=0.02).integrate(
-            points, origin, standoff, faces, weight
-        )
-
-
 @pytest.mark.parametrize("standoff", [1e-3, 1e-9, 1e-300])
 def test_extent_at_grazing_angles(standoff):
     points, origin, _, faces, weight = wall(20.0, 0.1)

@@ -197,12 +197,6 @@ def test_colours_are_packed_as_by_pcl(coloured, tmp_path):
     np.testing.assert_array_equal(channels, colours[hit])
 
 
-def test_same_bytes_again(mapped_street, tmp_path):
-    # a ROS 2 bag holds the name of its file
-    first, second = (convert(mapped_street, tmp_path / name / "a.mcap") for name in "ab")
-    assert first.read_bytes() == second.read_bytes()
-
-
 def test_large_static_clouds_are_sampled(mapped_street, tmp_path, monkeypatch):
     from stillmap.results.export import bag
 

@@ -50,8 +50,3 @@ def test_page_runs(page, tmp_path):
             check=False,
         )
         assert done.returncode == 0, f"{text}\n{done.stdout}\n{done.stderr}"
-
-
-def test_pages_have_commands_of_both_kinds():
-    languages = {language for page in PAGES for language, _ in blocks_of(page)}
-    assert languages == {"sh", "python"}

@@ -6,7 +6,6 @@ import pytest
 from stillmap import _core, em
 from stillmap.core import chunks, se2
 from stillmap.core.recording import Recording
-from stillmap.em import quality
 from stillmap.em.types import NoReturnModel
 
 RESOLUTION = 0.1
@@ -82,15 +81,6 @@ def test_obstructed_cells_are_thinly_observed(visitors):
     known = ~np.isnan(occupancy.p_occupied)
     np.testing.assert_array_equal(found.observations > 0, known)
     np.testing.assert_array_equal(found.thinly_observed, known & (found.unobstructed < 3))
-
-
-def test_thresholds(visitors, monkeypatch):
-    monkeypatch.setattr(quality, "MIN_OBSERVATIONS", 2)
-    monkeypatch.setattr(quality, "MOVER_RADIUS", 1.0)
-    occupancy, found = coverage_of(*visitors)
-    assert (found.min_observations, found.mover_radius) == (2, 1.0)
-    assert not at(occupancy, found.thinly_observed, 4.0, 1.8)
-    assert at(occupancy, found.unobstructed, 1.2, 0.5) == 2
 
 
 def test_scans_within_a_time_bin_are_one_observation(visitors):

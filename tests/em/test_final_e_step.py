@@ -1,7 +1,6 @@
 """The final E-step: view-dependent surface is no passer-by."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +8,6 @@ from made_up_scans import ANGLES
 from recordings import of_one_sensor
 
 from stillmap import _core, em
-from stillmap.em import final_labels as module
 
 POST, RADIUS, WALL = (5.0, 3.0), 0.15, 5.0
 SCANS, SECONDS = 80, 0.5
@@ -83,12 +81,6 @@ def test_alternation_before_a_standing_sensor_is_dynamic():
     assert np.median(last[on]) < 0.1
 
 
-def test_histories_know_view_dependent_surface():
-    recording, T, _ = seen(ROUNDS, by_views(ROUNDS))
-    _, histories = em.final_e_step(recording, T, 0.05, em.EmOptions())
-    assert histories.p_view_dependent.max() > 0.9
-
-
 APART = 1.2  # m, of two lasers
 # for seconds, half of the time
 COMES_AND_GOES = np.logical_xor.accumulate(np.random.default_rng(2).random(4 * SCANS) < 0.15)
@@ -111,15 +103,3 @@ def test_two_lasers_do_not_turn_the_view():
     T[:, 0, 2] = at
     last, _ = em.final_e_step(recording, T, 0.05, em.EmOptions())
     assert np.median(last.p_static[on]) < 0.1
-
-
-def test_label_classes_leave_out_crowds_waiting_and_half_time():
-    """A chair that a robot passes resembles them."""
-    rho, tau, _ = (np.array(values) for values in module._CHANGE_CLASSES.grid())
-    n_static = module._CHANGE_CLASSES.n_static
-    kept = module._label_classes(SimpleNamespace(rho=rho, tau=tau, n_static=n_static))
-    assert kept[:n_static].all()
-    movers = {(r, t) for r, t in zip(rho[n_static:], tau[n_static:], strict=True)}
-    left = set(zip(rho[kept][n_static:], tau[kept][n_static:], strict=True))
-    of_labels = {(r, t) for r in (0.01, 0.04, 0.15) for t in (0.5, 3.0, 12.0, 45.0)}
-    assert left == of_labels - {(0.15, 3.0)} < movers

@@ -92,8 +92,7 @@ def test_nothing_is_shown_where_walls_swallow_beams():
     assert (inside < 0.1).all()
 
 
-@pytest.mark.parametrize("threads", [1, 3])
-@pytest.mark.parametrize("beams", [1, 500])
+@pytest.mark.parametrize(("threads", "beams"), [(1, 1), (3, 500)])
 def test_chunks_and_threads_change_no_bit(monkeypatch, threads, beams):
     seen = room_with()
     lost = np.random.default_rng(1).random(len(seen.what)) < 0.2

@@ -4,11 +4,8 @@ import numpy as np
 from made_up_scans import before, crossing, poses, recording, wall
 
 from stillmap import _core, em
-from stillmap.em import people_tracker as tracker
 from stillmap.em.people_tracker import (
-    Tracks,
     detect_segments,
-    find_beams_in_boxes,
     label_people,
     track_people,
 )
@@ -40,16 +37,6 @@ def test_standing_objects_are_not_labelled():
     ranges = np.tile(before(wall(), PILLAR, (3.0, 0.0, 0.2)), (20, 1))
     rng = np.random.default_rng(0)
     assert not labelled(recording(ranges + rng.normal(scale=0.02, size=ranges.shape))).any()
-
-
-def test_only_hits_are_labelled(monkeypatch):
-    monkeypatch.setattr(tracker, "_HALF_BOX", 1.0)
-    ranges = np.full((1, 181), np.inf)
-    ranges[0, 90] = 20.0  # as far as the others, which end in the box with nothing
-    r = recording(ranges)
-    one = np.ones(1, bool)
-    somebody = Tracks(np.zeros(1, int), np.zeros(1, int), np.array([[20.0, 0.0]]), one, one)
-    assert find_beams_in_boxes(r, poses(r), somebody).nonzero()[0].tolist() == [90]
 
 
 def test_tracks_bridge_occlusion_and_end_at_the_last_detection():

@@ -1,15 +1,12 @@
 """Shapes tell people from walls where the history of a place does not."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from stillmap import _core, em
+from stillmap import em
 from stillmap.em.shape_evidence import (
     _MAX_LOG_RATIO,
     N_SEGMENT_TYPES,
-    ShapeEvidence,
     _fit_shapes,
     count_segments,
 )
@@ -149,14 +146,3 @@ def test_view_dependent_things_have_frequencies_of_their_own():
     log_ratio = _fit_shapes(p, segments, np.zeros(len(p), np.intp))
     assert (log_ratio[is_narrow, 1] > 1.0).all()
     assert (np.abs(log_ratio[is_narrow, 2] - log_ratio[is_narrow, 1]) < 0.4).all()
-
-
-def test_no_surfels():
-    surfels = _core.SurfelMap2D(RESOLUTION)
-    surfels.fit()
-    recording = simulate(scene_by_name("corridor-empty", {"robot": {"scans": 2}}), 0).recording
-    nothing = replace(recording, hit=np.zeros_like(recording.hit))
-    shapes = ShapeEvidence(surfels, nothing, np.tile(np.eye(3), (2, 1, 1)))
-    for _ in range(2):
-        shapes.fit(*np.zeros((2, 0), np.float32))
-    assert shapes.factors.shape == (0, 2)

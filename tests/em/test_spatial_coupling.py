@@ -124,15 +124,6 @@ def test_ground_and_crowns_are_no_obstacles():
     assert 100 < found.sum() < len(z)
 
 
-def test_the_clearance_follows_from_the_noise_of_end_points(monkeypatch):
-    _, _, surface = standing(CAR)
-    obstacles = select_obstacles(FLAT, surface)
-    assert obstacles.column_cells == 2  # of 0.15 m
-    for clearance, expected in ((0.06, 0.06), (0.0, 2.5 * surface.noise_std)):
-        monkeypatch.setattr(spatial_coupling, "GROUND_CLEARANCE", clearance)
-        assert obstacles.min_end_height == expected
-
-
 def test_ground_has_at_least_its_mean_p_static():
     _, _, surface = standing(CAR)
     obstacles = select_obstacles(FLAT, surface)
@@ -167,13 +158,6 @@ def test_what_is_hit_below_a_mover_goes_with_it():
     assert at_sole.any()
     np.testing.assert_allclose(above[at_sole], 0.02, atol=1e-6)
     assert np.isnan(obstacles.label_ground_contact(found, ScanBeams(*data), surfel)).all()
-
-
-def test_without_surfels_on_the_ground_none_are_raised():
-    _, _, surface = standing(CAR)
-    high = dataclasses.replace(FLAT, height=FLAT.height - 50.0)
-    p = np.full(surface.size, 0.3, np.float32)
-    np.testing.assert_array_equal(label_far_ground(p, select_obstacles(high, surface))[0], p)
 
 
 def test_ground_from_static_surfels():

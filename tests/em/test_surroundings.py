@@ -6,7 +6,6 @@ import pytest
 
 from stillmap import em
 from stillmap.em import occupancy_hmm
-from stillmap.em.change_hmm import _MixtureClasses
 from stillmap.em.observations import likelihood_of_misses
 
 STATIC_THINGS = {"hedge": street.HEDGE, "post": street.POST, "car": street.CAR}
@@ -79,29 +78,3 @@ def test_many_misses_count_as_twenty():
     few, many = likelihood_of_misses(counts((20, 15), (400, 300)))
     np.testing.assert_array_equal(few, many)
     assert np.isfinite(likelihood_of_misses(counts((1e6, 1e6), (1e6, 0)))).all()
-
-
-def classes(with_surroundings):
-    # two solid classes and a view-dependent one are static, one of two movers is half-time
-    view = np.array([False, False, True, False, False])
-    half_time = np.array([False, False, False, False, True])
-    return _MixtureClasses(view, half_time, 3, with_surroundings)
-
-
-def test_classes_without_surroundings():
-    of = classes(False)
-    np.testing.assert_array_equal(of.columns, np.arange(6))
-    assert of.n_static == 3
-    masks = np.array([of.static, of.view, of.half_time, of.changing]).astype(int)
-    np.testing.assert_array_equal(masks.argmax(axis=0)[masks.any(axis=0)], [0, 0, 1, 2, 3])
-
-
-def test_classes_with_surroundings():
-    of = classes(True)
-    # lasting: solid, solid, view, half time, change; emptied: solid, solid, view; then what moves
-    np.testing.assert_array_equal(of.columns, [0, 1, 2, 4, 5, 6, 7, 8, 3, 9, 10, 11])
-    assert of.n_static == 8
-    np.testing.assert_array_equal(np.flatnonzero(of.static), [0, 1, 3, 4, 5, 6])
-    np.testing.assert_array_equal(np.flatnonzero(of.view), [2, 7])
-    np.testing.assert_array_equal(np.flatnonzero(of.half_time), [10])
-    np.testing.assert_array_equal(np.flatnonzero(of.changing), [11])

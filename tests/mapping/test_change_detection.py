@@ -86,13 +86,6 @@ def test_what_came_and_left_again_is_both():
     np.testing.assert_array_equal(came.cells, left.cells)
 
 
-def test_what_left_and_came_back_is_both():
-    left, came = found(course(BOX, True, (20, 22), (60, 64)))
-    assert (left.kind, came.kind) == ("left", "came")
-    assert seconds(left)[1] == 22
-    assert seconds(came)[1] == 64
-
-
 def test_what_comes_and_goes():
     few = course(BOX[:6], True, (10, 12), (80, 82), count=5)
     many = course(BOX[6:], True, (14, 17), (70, 75), count=7)
@@ -154,15 +147,3 @@ def test_a_place_that_reaches_to_a_wall_keeps_all_its_cells():
     assert len(found(large, part, wall(24, 14, 6))) == 1
     assert len(found(large, part, wall(24, 14, 6))[0].cells) == len(BOX) + 6
     assert found(part, wall(24, 14, 6)) == []
-
-
-def test_the_order_of_cells_changes_nothing():
-    parts = course(BOX, True, (20, 22)), course(beside(4), True, (40, 43))
-    here, there = found(*parts), found(*parts[::-1])
-    for one, other in zip(here, there, strict=True):
-        assert (one.x, one.y, one.before_ns, one.stamp_ns) == (
-            other.x,
-            other.y,
-            other.before_ns,
-            other.stamp_ns,
-        )

@@ -106,12 +106,6 @@ def test_no_cells_and_hardly_any_scan(scans):
     assert things(nothing, seen=seen) == []
 
 
-def test_the_order_is_that_of_time():
-    parts = [course(box(30 * k, 0, 1, CAR), True, (t, t + 1)) for k, t in enumerate((60, 30, 45))]
-    stamps = [one.stamp_ns for one in things(*parts)]
-    assert stamps == [(5 + t) * S for t in (31, 46, 61)]
-
-
 @pytest.mark.parametrize(
     ("there", "between", "stands", "listed"),
     [

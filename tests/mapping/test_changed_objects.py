@@ -85,10 +85,3 @@ def test_poses_and_sensors_say_where_a_beam_ended():
     moved = left_out(course(BOX, True, (40, 43)), at=there[:2].tolist(), poses=poses)
     assert moved == [*range(41, 100)]
     assert left_out(course(BOX, True, (40, 43)), poses=poses) == []
-
-
-def test_where_nothing_changed_nothing_is_touched():
-    seen = recording(range(3), beams=1)
-    p = np.array([0.1, 0.2, np.nan], np.float32)
-    poses = np.tile(np.eye(3), (3, 1, 1))
-    assert not len(find_changed_object_beams(seen, poses, p, [], [], RESOLUTION))

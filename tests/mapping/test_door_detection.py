@@ -15,7 +15,6 @@ SHUT = np.column_stack([np.arange(20, 20 + LEAF + 1), np.full(LEAF + 1, 30)])
 OPEN = np.column_stack([np.full(LEAF, 20), np.arange(31, 31 + LEAF)])
 # the wall goes on beyond the shut leaf and behind the hinge
 WALL = np.array([[x, 30] for x in (*range(5, 19), *range(31, 45))])
-SCANS = 100
 
 
 def change(kind, cells, before, after, times=1):
@@ -126,7 +125,3 @@ def test_an_arrival_at_another_time_is_no_door():
     later = change("came", OPEN, 70, 75)
     found = joined([LEFT, later], WALL, *opened_once())
     assert [one.kind for one in found] == ["left", "came"]
-
-
-def test_nothing_changed():
-    assert joined([], WALL, *opened_once()) == []

@@ -87,12 +87,6 @@ def test_a_leaf_is_as_long_as_those_of_doors(length):
     assert [sweeps(metres) for metres in (0.3, 0.5, 1.8, 2.3)] == [False, True, True, False]
 
 
-def alone(cells):
-    """Nothing beside the cells, and they in their order."""
-    np.testing.assert_array_equal(compute_swept_cells(cells, LEAF), cells)
-    return True
-
-
 def test_both_directions_and_the_nearer_one_of_cells():
     sector = fit_sector(door(0.3, 1.4), LEAF)
     np.testing.assert_allclose(sorted(sector.directions), [0.3, 1.7], atol=0.1)

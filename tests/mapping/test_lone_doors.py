@@ -27,11 +27,6 @@ def row(start, angle, length):
     return np.unique(np.round(np.array(start) + t * along).astype(np.int64), axis=0)
 
 
-def wall(gap=GAP):
-    """Along x, with a doorway from x = 40 on."""
-    return [row((0, 0), 0, 41), row((40 + gap, 0), 0, 40)]
-
-
 def cells(*rows):
     return np.unique(np.concatenate(rows), axis=0)
 

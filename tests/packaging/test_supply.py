@@ -57,12 +57,6 @@ def test_other_licenses_are_faults(supply, monkeypatch, stated, fault):
     assert list(supply.check_licenses(["some"])) == [("some", stated, fault)]
 
 
-def test_licenses_that_were_looked_at_hold_for_what_was_stated(supply, monkeypatch):
-    assert [fault for *_, fault in supply.check_licenses(list(supply.REVIEWED))] == [""] * 3
-    monkeypatch.setattr(supply, "stated_license", lambda _: "GPL-3.0-only")
-    assert all(fault for *_, fault in supply.check_licenses(list(supply.REVIEWED)))
-
-
 def test_packages_that_are_not_installed_are_faults(supply):
     assert next(supply.check_licenses(["no-such-package"]))[2] == "unknown, or not installed"
 

@@ -210,12 +210,6 @@ def test_scans_without_beams():
     np.testing.assert_allclose(laid(seen, poses), posts[kept], atol=2e-5)
 
 
-def test_several_blocks():
-    recording, poses, posts = even((5.0, 0.3, 1.0), np.linspace(-0.02, 0.08, 500), T=40)
-    seen = deskew_recording(recording, poses, OPTIONS)
-    np.testing.assert_allclose(laid(seen, poses), posts, atol=5e-5)
-
-
 def test_a_drive_that_is_shorter_than_a_scan():
     """The scans are too close to each other for what they would say about that much time."""
     stamps, times = np.array([0.0, 0.1, 0.2]), np.tile(np.linspace(0.0, 15.0, 12), 3)

@@ -66,11 +66,6 @@ HEADINGS = 0.3 + 0.4 * np.sin(np.arange(60) / 5.0)  # rad
 DRIFT = np.linspace(0.0, 0.03, 60)  # rad
 
 
-def test_rooms_that_are_parallel_take_the_drift_away():
-    off = aligned(DRIFT, np.zeros(60), HEADINGS)
-    assert off.std() < 0.6 * DRIFT.std()
-
-
 def test_rooms_a_quarter_turn_apart_are_parallel():
     off = aligned(DRIFT, 0.5 * np.pi * (np.arange(60) % 3), HEADINGS)
     assert off.std() < 0.6 * DRIFT.std()
@@ -108,13 +103,6 @@ def test_precise_scan_matching_is_hardly_corrected():
         off = se2.parameters(found.poses)[:, 2] - se2.parameters(graph.poses)[:, 2]
         spread.append(off.std())
     assert spread[0] < 0.1 * spread[1]
-
-
-def test_exact_scan_matching_is_kept():
-    recording, graph = drive(DRIFT, np.zeros(60), HEADINGS)
-    e = np.ones(recording.n_beams, np.float32)
-    found = align_headings(recording, e, graph, matched(60, 0.0))
-    np.testing.assert_allclose(found.poses, graph.poses, atol=1e-3)
 
 
 def test_a_step_across_a_break_stays_as_it_was():

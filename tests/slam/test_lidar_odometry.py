@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from boxes import Boxes, Lidar, Way, at_once, recorded
 
-from stillmap import _core
 from stillmap.core import se2, se3
 from stillmap.results.eval.trajectory import compute_absolute_errors, compute_relative_errors
 from stillmap.slam import constant_velocity, lidar_odometry
@@ -157,21 +156,6 @@ def test_stamps_a_nanosecond_apart(room):
     stamp_ns[1:4] = stamp_ns[0] + np.arange(1, 4)
     found = built(replace(recording, stamp_ns=stamp_ns), e)
     assert compute_absolute_errors(found.poses, truth).rmse < 0.1
-
-
-def test_memory_is_bounded_by_the_radius(monkeypatch):
-    monkeypatch.setattr(lidar_odometry, "MAX_RANGE", 20.0)
-    street = Boxes.of([[0.0, 0.0, 1.0, 4000.0, 12.0, 5.0, 0, 0, 0]])
-    recording, _, e = recorded(street, SPARSE, wobbling(40, speed=30.0, turn=0.0), 40, seed=4)
-    local = _core.NdtMap3D(0.4, 4, 60.0)
-    sizes = []
-    for t, x in enumerate(np.arange(0.0, 120.0, 3.0)):
-        T = se3.exp(np.array([x, 0, 0, 0, 0, 0]))
-        sweep = lidar_odometry.select_sweep(recording, e, t)
-        local.add(sweep.points, sweep.weights, T)
-        local.crop(T, 20.0)
-        sizes.append(len(local))
-    assert max(sizes[20:]) < 1.2 * max(sizes[10:20])
 
 
 def test_fewer_points_find_the_same_way(room):

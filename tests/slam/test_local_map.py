@@ -59,17 +59,6 @@ def test_removal_is_exact():
     assert not any(sums.any() for sums in all_of_it.grid.dense()[1:])
 
 
-def test_removal_before_zero_travel_removes_nothing():
-    poses = hall().truth.T_world_base
-    one, other = empty(), empty()
-    for t in range(0, 120, 4):
-        one.add(t, poses[t], 0.1 * t)
-        other.add(t, poses[t], 0.1 * t)
-    one.remove_before(0.0)
-    one.remove_before(-np.inf)
-    assert_same(one.grid, other.grid)
-
-
 @pytest.mark.parametrize(
     ("move", "kept"),
     [
@@ -89,17 +78,6 @@ def test_scans_are_spaced(monkeypatch, move, kept):
     so_far.add(1, se2.matrix(*move), 0.2)
     before, after = (one.grid.dense()[1].sum() for one in (first, so_far))
     assert (after > before) == kept
-
-
-def test_spacing_in_time(monkeypatch):
-    # 0.2 per second: 24 scans are 4.8 s, 26 are 5.2 s and count as much as 1.04 m
-    monkeypatch.setattr(local_map, "SCAN_SPACING", 1.0)
-    for t, kept in ((24, False), (26, True)):
-        so_far = empty()
-        so_far.add(0, np.eye(3), 0.0)
-        before = so_far.grid.dense()[1].sum()
-        so_far.add(t, np.eye(3), 0.0)
-        assert (so_far.grid.dense()[1].sum() > before) == kept
 
 
 def test_remove_since():

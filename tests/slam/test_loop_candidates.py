@@ -1,15 +1,12 @@
 """Loop candidates, their drift by the graph, and stages."""
 
-from itertools import accumulate, pairwise
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from recordings import of_one_sensor
 
 from stillmap.core import se2
-from stillmap.sim import RobotOptions, Scene, simulate
-from stillmap.sim.options import CrowdOptions, LaserOptions, OdometryOptions
-from stillmap.sim.walls import box
 from stillmap.slam import (
     SlamOptions,
 )
@@ -113,29 +110,3 @@ def test_consistency_by_stages_equals_consistency_at_once():
             new = found[: first + stage]
             decided = reject_inconsistent_since(context, chain, new, decided, 21 + first)
         assert [c.rejected for c in decided] == at_once
-
-
-def rounds(drift=1.0):
-    """Four times round a square of corridors, 24 m each, in poses that drift."""
-    pillars = [
-        wall
-        for x in range(-4, 5, 2)
-        for at in ((x, -4.4), (4.4, x), (x + 1, 4.4), (-4.4, x))
-        for wall in box(*at, 0.2 + 0.03 * x, 0.3)
-    ]
-    scene = Scene(
-        "rounds",
-        walls=(*box(0, 0, 9, 9), *box(0, 0, 4, 4), *pillars),
-        route=((-3, -3), (3, -3), (3, 3), (-3, 3), (-3, -2.9)),
-        crowd=CrowdOptions(people=0),
-        laser=LaserOptions(beams=120, max_range=6.0),
-        robot=RobotOptions(scans=1100),
-        odometry=OdometryOptions(),
-    )
-    simulation = simulate(scene, 1)
-    truth = simulation.truth.T_world_base
-    truth = se2.inverse(truth[0]) @ truth
-    steps = (
-        se2.inverse(truth[:-1]) @ truth[1:] @ se2.matrix(*(drift * np.array([8e-4, 4e-4, 1e-4])))
-    )
-    return simulation.recording, truth, np.array([*accumulate(steps, np.matmul, initial=np.eye(3))])

@@ -12,7 +12,6 @@ from stillmap.sim.options import LaserOptions
 from stillmap.sim.walls import box
 from stillmap.slam import loop_candidates, loop_verification
 from stillmap.slam.loop_verification import (
-    _points_before_ends,
     _select_comparable,
     build_submap,
     verify_candidate,
@@ -97,19 +96,6 @@ def test_loops_close_across_a_street():
         assert np.linalg.norm((se2.inverse(T) @ closure.T)[:2, 2]) < 0.2
 
 
-def test_view_center_by_hand():
-    context = street()
-    k = 3
-    t = int(context.keyframes[k])
-    beams = context.recording.beams_of(t)
-    hit = context.recording.hit[beams]
-    # weights are all alike; the laser sits 8 cm ahead of the middle of the robot
-    expected = context.recording.points[beams][hit].mean(axis=0)
-    np.testing.assert_allclose(
-        loop_candidates.view_centers(context)[k] - (0.08, 0.0), expected, atol=1e-4
-    )
-
-
 def test_comparable_beams_were_observed_from_the_same_side():
     # one beam along x that ends at 5 m: the wall is seen from the left
     grid = _core.OccupancyGrid2D(0.1, 0.5)
@@ -126,19 +112,3 @@ def test_comparable_beams_were_observed_from_the_same_side():
     np.testing.assert_array_equal(part.weights, np.array([0.5, 0.0, 0.0], np.float32))
     assert share == pytest.approx(0.5)
     assert part.points is view.points
-
-
-def test_points_before_ends_by_hand():
-    scan = make_scan(
-        np.array([[5.0, 1.0], [1.0, 4.0], [1.0, 2.0]], np.float32),
-        np.ones(3, np.float32),
-        se2.matrix(1.0, 1.0, 0.3),
-    )
-    # 1 m back towards the sensor; half way where that would be farther
-    np.testing.assert_allclose(
-        _points_before_ends(scan, 1.0), [[4.0, 1.0], [1.0, 3.0], [1.0, 1.5]], atol=1e-6
-    )
-    np.testing.assert_allclose(
-        _points_before_ends(scan, 3.0), [[3.0, 1.0], [1.0, 2.5], [1.0, 1.5]], atol=1e-6
-    )
-    np.testing.assert_allclose(_points_before_ends(scan, 0.0), scan.points)

@@ -29,14 +29,6 @@ def test_a_constant_velocity_repeats_the_last_motion():
     assert not prior.is_odometry
 
 
-def test_velocity_noise_by_hand(monkeypatch):
-    # 0.75 * 0.4^2 + 0.25 * (0.2^2 + 0.4^2) / 2 = 0.145 m^2, 0.75 * 0.2^2 + 0.25 * 0.6^2 rad^2
-    monkeypatch.setattr(motion_model, "_FORGETTING", 0.25)
-    after = VelocityNoise(0.4, 0.2).update(np.array([0.2, -0.4, 0.6]), 0.1)
-    assert after.translation == pytest.approx(np.sqrt(0.145))
-    assert after.rotation == pytest.approx(np.sqrt(0.12))
-
-
 @pytest.mark.parametrize(
     ("seconds", "metres", "radians"),
     # 1/2 a t^2 of 2 m/s^2 and 4 rad/s^2: not below the floor of 0.02 m, not above 0.15
@@ -65,23 +57,6 @@ def test_standard_deviations_by_hand():
     assert prior.translation_std == pytest.approx(0.24)
     assert prior.rotation_std == pytest.approx(0.27)
     np.testing.assert_allclose(prior.information, np.diag([0.24**-2, 0.24**-2, 0.27**-2]))
-
-
-def test_standing_still_is_most_certain():
-    still = motion_model.odometry_prior(T0, np.eye(3), OPTIONS)
-    for increment in (se2.matrix(0.1, 0, 0), se2.matrix(0, 0, -0.1), se2.matrix(-0.1, 0, 0)):
-        moving = motion_model.odometry_prior(T0, increment, OPTIONS)
-        assert moving.translation_std > still.translation_std > 0
-        assert moving.rotation_std > still.rotation_std > 0
-
-
-def test_widened_prior_is_never_narrower():
-    prior = motion_model.odometry_prior(T0, se2.matrix(0.5, 0, 0), OPTIONS)
-    wide = motion_model.widen_prior(prior, 10 * prior.translation_std, 0.1 * prior.rotation_std)
-    assert wide.translation_std == pytest.approx(10 * prior.translation_std)
-    assert wide.rotation_std == prior.rotation_std
-    np.testing.assert_allclose(wide.T_map_base, prior.T_map_base, atol=1e-15)
-    np.testing.assert_allclose(np.diag(wide.information)[:2], wide.translation_std**-2)
 
 
 def test_long_chains_stay_orthonormal():

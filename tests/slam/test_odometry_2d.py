@@ -77,14 +77,6 @@ def test_populated_places(scene, odometry):
     assert np.abs(turn).max() < np.radians(1.0)
 
 
-def test_it_is_better_than_odometry_alone():
-    simulation = run_through("hall")
-    odometry = compute_absolute_errors(
-        simulation.recording.T_odom_base, simulation.truth.T_world_base
-    )
-    assert ate(build(simulation.recording), simulation) < 0.25 * odometry.rmse
-
-
 def test_the_map_frame_is_the_first_base():
     simulation = small_room()
     mapped = build(simulation.recording)
@@ -96,20 +88,6 @@ def test_the_map_frame_is_the_first_base():
     )
     # rounding may decide between two starts of a search: the same to less than a cell
     np.testing.assert_allclose(build(moved).poses, mapped.poses, atol=0.02)
-
-
-def test_the_grid_is_what_the_poses_make():
-    recording = small_room(people=2).recording
-    e = np.random.default_rng(0).random(recording.n_beams).astype(np.float32)
-    so_far = build(recording, e)
-    assert so_far.grid.dense()[1].size == 0  # it is made once, at the end
-    open_ends = SlamOptions(loop_closure=False)
-    mapped = m_step(recording, e, open_ends, None, 1, silent)
-    np.testing.assert_array_equal(mapped.poses, so_far.poses)
-    grid = _core.OccupancyGrid2D(OPTIONS.resolution)
-    em.add_recording(grid, recording, mapped.poses, e)
-    for ours, theirs in zip(mapped.grid.dense(), grid.dense(), strict=True):
-        np.testing.assert_array_equal(ours, theirs)  # to the bit: nobody has to keep the grid
 
 
 def test_covariances_are_covariances():
@@ -199,8 +177,9 @@ def blank(recording: Recording, scans, how: str) -> Recording:
     return dataclasses.replace(recording, points=points[~gone], hit=hit[~gone], offset=offset)
 
 
-@pytest.mark.parametrize("how", ["no hits", "unusable", "no beams"])
-@pytest.mark.parametrize("odometry", [True, False])
+@pytest.mark.parametrize(
+    ("how", "odometry"), [("no hits", True), ("unusable", False), ("no beams", True)]
+)
 def test_scans_without_hits_are_bridged(how, odometry):
     simulation = small_room()
     recording = blank(simulation.recording, [0, 20, 21, 59], how)
@@ -233,13 +212,6 @@ def test_one_scan():
     mapped = build(small_room(scans=1).recording)
     np.testing.assert_array_equal(mapped.poses, np.eye(3)[None])
     assert mapped.diagnostics.widened == []
-
-
-def test_progress_counts_every_scan():
-    recording = small_room(scans=10).recording
-    calls = []
-    odometry_2d.register_scans(recording, prior(recording), OPTIONS, lambda *at: calls.append(at))
-    assert calls == [(t, 10) for t in range(1, 11)]
 
 
 def test_given_poses_are_not_touched():

@@ -8,7 +8,6 @@ from stillmap.slam.motion_model import (
     OdometryNoise,
     blind_drift,
     fit_odometry_noise,
-    gaussian_prior,
     odometry_prior,
     odometry_std,
 )
@@ -96,10 +95,3 @@ def test_blind_steps_drift_as_odometry_does_and_others_do_not():
     assert along_a_wall[0, 0] == pytest.approx(blind[0, 0], rel=1e-3)
     assert along_a_wall[1, 1] < 0.01 * blind[1, 1]
     assert along_a_wall[2, 2] < 0.01 * blind[2, 2]
-
-
-def test_without_odometry_nothing_is_discounted():
-    prior = gaussian_prior(np.eye(3), 0.1, 0.05)
-    np.testing.assert_allclose(
-        blind_drift(prior, np.diag([0.01, 0.01, 0.0025])), np.diag([0.01, 0.01, 0.0025])
-    )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from synthetic_tracks import one_each, watched
 
-from stillmap.tracking import association, tracklets
+from stillmap.tracking import tracklets
 from stillmap.tracking.association import assign_tracks
 from stillmap.tracking.tracklets import stitch_tracklets
 
@@ -129,10 +129,3 @@ def test_tracks_that_were_exchanged_behind_one_another_are_set_right(angle):
     apart = np.abs(points.seconds[points.scan] - 4.0) > 1.5
     assert one_each(owner[apart], who[apart])
     assert (p_identity[np.unique(owner[apart])] > 0.8).all()
-
-
-def test_points_go_to_the_track_with_most_of_their_cluster():
-    claims = np.array([4, -1, 4, 2, -1, 3, 1, -1, -1])
-    cluster = np.array([0, 0, 0, 0, 1, 2, 2, 2, 3])
-    done = association._complete_clusters(claims, cluster, 5)
-    assert done.tolist() == [4, 4, 4, 2, -1, 3, 1, 1, -1]  # of equals the first track

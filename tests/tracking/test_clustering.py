@@ -62,14 +62,6 @@ def test_pieces_of_any_size_make_no_difference(monkeypatch, block):
         np.testing.assert_array_equal(getattr(pieces, name), getattr(whole, name))
 
 
-def test_distance_between_neighbors_grows_with_range(monkeypatch):
-    r = recording([[8.0] * 5])  # 0.8 m apart
-    p, poses = np.zeros(5, np.float32), np.eye(3)[None]
-    assert extract_dynamic_points(r, poses, p, MIN_P_DYNAMIC).cluster.tolist() == [0, 1, 2, 3, 4]
-    monkeypatch.setattr(clustering, "LINK_PER_METRE", 0.06)
-    assert extract_dynamic_points(r, poses, p, MIN_P_DYNAMIC).cluster.tolist() == [0] * 5
-
-
 def test_time_never_goes_back():
     r = recording([[2.0]] * 4, stamps=[5 * 10**9, 7 * 10**9, 6 * 10**9, 9 * 10**9])
     poses = np.tile(np.eye(3), (4, 1, 1))

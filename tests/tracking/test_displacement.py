@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stillmap import Recording
-from stillmap.tracking import MovingObject, displacement
+from stillmap.tracking import MovingObject
 from stillmap.tracking.displacement import select_movers
 
 SCANS, PERIOD, HEIGHT = 60, 0.1, 1.5
@@ -111,16 +111,3 @@ def test_ids_are_counted_anew():
     assert [one.id for one in found] == [0, 1]
     assert [np.ptp(one.xy[:, 1]) for one in found] == [1.0, 2.0]
     assert select_movers([], recording, poses) == []
-
-
-def test_beams_that_are_left_out_do_not_decide(monkeypatch):
-    def decide():
-        return [
-            len(select_movers([an_object(recording, 20, 40)], recording, poses))
-            for recording, poses in (street(scans(*ranges)) for ranges in seen)
-        ]
-
-    seen = [[(0, SCANS)], [(20, 40)], [(0, 40)], [(20, SCANS)], [(0, 21), (22, SCANS)]]
-    found = decide()
-    monkeypatch.setattr(displacement, "_find_near_line", lambda flat, *_: np.arange(flat.shape[1]))
-    assert decide() == found

@@ -117,7 +117,7 @@ def test_hits_here_and_there_are_no_fast_movers():
     assert not paths
 
 
-@pytest.mark.parametrize("pairs", [1, 7, 100])
+@pytest.mark.parametrize("pairs", [1, 7])
 def test_pairs_of_looks_in_pieces_make_no_difference(monkeypatch, pairs):
     points, _ = driven([oncoming(40.0, 9.0), oncoming(53.0, 9.0)], 3.0)
     owner, paths = found(points)

@@ -120,12 +120,6 @@ def test_an_edge_that_flickers_is_no_object():
     assert len(track_objects(recording, poses, p, anything)) > 0
 
 
-def test_twice_the_same():
-    for one, other in zip(found(room()), found(room()), strict=True):
-        for name in ("scan", "stamp_ns", "xy", "velocity", "beams"):
-            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
-
-
 def test_lengths_that_disagree_are_refused():
     simulation = room()
     poses, p = simulation.truth.T_world_base, labels(simulation)

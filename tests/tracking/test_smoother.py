@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy.interpolate import make_smoothing_spline
 
-from stillmap.tracking import vehicle_filter as smoother
 from stillmap.tracking.vehicle_filter import smooth_track
 
 
@@ -48,13 +47,3 @@ def test_noise_is_taken_out():
     assert np.sqrt(np.mean((found - way) ** 2)) < 0.05
     true = np.column_stack([np.ones(len(t)), 0.6 * np.cos(0.3 * t)])
     assert np.median(np.linalg.norm(v - true, axis=1)) < 0.1  # from place to place it would be 0.7
-
-
-@pytest.mark.parametrize("n", [3, 4, 5, 40])
-def test_short_tracks_are_smoothed_as_long_ones_are(n, monkeypatch):
-    rng = np.random.default_rng(n)
-    seconds, xy = np.cumsum(rng.uniform(0.05, 0.3, n)), rng.normal(size=(n, 2)).cumsum(axis=0)
-    short = smoother.smooth_track(seconds, xy, 0.3, 1.0)
-    monkeypatch.setattr(smoother, "_FEW", 0)
-    for one, other in zip(short, smoother.smooth_track(seconds, xy, 0.3, 1.0), strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-11)

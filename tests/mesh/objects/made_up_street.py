@@ -1,6 +1,5 @@
 """Boxes that pass a lidar that stands still before a wall, followed as told."""
 
-import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -74,25 +73,6 @@ def street(
     ]
     p_static = np.where(met >= 0, 0.05, 0.95).astype(np.float32)
     return MeshInputs(recording, recording, poses, p_static, objects, things, 0)
-
-
-def by_several(sources: MeshInputs, lidars: int, seconds: float = 0.09) -> MeshInputs:
-    """The same, each scan by some lidars that begin at once and turn for so long; each sees a part
-    of what is there."""
-    r, T = sources.recording, sources.recording.n_scans
-    n = int(r.offset[1])
-    ends = n * np.arange(1, lidars + 1) // lidars
-    times = [np.linspace(0.0, seconds, k) for k in np.diff(ends, prepend=0)]
-    seen = dataclasses.replace(
-        r,
-        stamp_ns=np.repeat(r.stamp_ns, lidars),
-        offset=np.append(0, (n * np.arange(T)[:, None] + ends).ravel()),
-        sensor=np.tile(np.arange(lidars, dtype=np.int32), T),
-        T_base_sensor=np.tile(np.eye(4), (lidars, 1, 1)),
-    )
-    recording = dataclasses.replace(seen, beam_time=np.tile(np.concatenate(times), T).astype("f4"))
-    poses = np.repeat(sources.poses, lidars, axis=0)
-    return dataclasses.replace(sources, recording=recording, deskewed=seen, poses=poses)
 
 
 def _to_box(looking: Float, middle: Float, half: Float) -> Float:
