@@ -240,5 +240,5 @@ def _build_cloud(
     colors = read_colors(result.folder, recording.n_beams)
     deskewed = limit_hits(deskewed, poses, result.region)
     return point_cloud.cloud_from_recording(
-        recording, deskewed, poses, labels.p_static, args.only, colors
+        recording, deskewed, poses, labels.p_static, args.only, colors, result.frame.origin
     )

@@ -4,7 +4,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.arrays import iter_blocks
-from stillmap.core.local_frame import LocalFrame
 from stillmap.core.recording import Recording
 from stillmap.em.types import DYNAMIC_BELOW
 
@@ -32,7 +31,7 @@ def sample_dynamic_points(
     poses: NDArray[np.float64],
     p_static: NDArray[np.float32],
     limit: int = 200_000,
-) -> NDArray[np.float32] | NDArray[np.float64]:
+) -> NDArray[np.float64]:
     """Sample the end points, in the map frame, of the hits with p_static < 0.5.
 
     Args:
@@ -42,15 +41,14 @@ def sample_dynamic_points(
         limit: maximum number of points; of more, evenly spaced ones are taken.
 
     Returns:
-        (K, D) float32 in metres, float64 where poses are far from the origin; in the recording's
-        order, K <= limit.
+        (K, D) metres, in the recording's order, K <= limit.
     """
     return _sample_points(recording, poses, p_static, limit, True)
 
 
 def sample_static_points(
     recording: Recording, poses: NDArray[np.float64], p_static: NDArray[np.float32], limit: int
-) -> NDArray[np.float32] | NDArray[np.float64]:
+) -> NDArray[np.float64]:
     """Those of the hits with p_static >= 0.5; arguments as of `sample_dynamic_points`."""
     return _sample_points(recording, poses, p_static, limit, False)
 
@@ -61,7 +59,7 @@ def _sample_points(
     p_static: NDArray[np.float32],
     limit: int,
     dynamic: bool,
-) -> NDArray[np.float32] | NDArray[np.float64]:
+) -> NDArray[np.float64]:
     arrays = recording.hit, p_static
 
     def is_chosen(block: slice) -> NDArray[np.bool_]:
@@ -78,5 +76,4 @@ def _sample_points(
         low, high = np.searchsorted(chosen, [start, end])
         found = np.flatnonzero(is_chosen(block))
         parts.append(block.start + found[chosen[low:high] - start])
-    ends = recording.end_points(np.concatenate(parts), poses)
-    return ends if LocalFrame.near(poses).is_shifted else ends.astype(np.float32)
+    return recording.end_points(np.concatenate(parts), poses)

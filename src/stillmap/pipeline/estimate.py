@@ -194,7 +194,7 @@ class EmState(ShortRepr):
             return
         resolution, poses = self.options.slam.resolution, estimate.poses
         boxes = em.beam_boxes(deskewed, poses)
-        points = sample_dynamic_points(deskewed, poses, estimate.p_static)
+        points = sample_dynamic_points(deskewed, poses, estimate.p_static).astype(np.float32)
         if self.window is None:
             self.window = choose_window(_extent(boxes, resolution), resolution, points)
         shown = {1, 2, self.require_best().number}  # and the last, whichever that will be

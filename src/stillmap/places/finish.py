@@ -177,7 +177,7 @@ def write_place(folder: Path, result: PlaceResult, options: Options, map_state: 
     poses = np.concatenate([one.keyframe_poses for one in place.sessions])
     if place.dimension == 3:
         labels = np.concatenate([_label_keyframes(one, result.shown) for one in place.sessions])
-        write_clouds(folder, joined, frame.to_map(poses), labels)
+        write_clouds(folder, joined, frame.to_map(poses), labels, origin=frame.origin)
     planar = [place.sessions[k].require_evidence()[1] for k in place.in_time()]
     occupancy = make_place_map(planar, result.planar)
     record = place_record(folder, result, options, map_state, occupancy)

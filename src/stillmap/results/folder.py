@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import arrays
 from stillmap.core.errors import InputError
-from stillmap.core.grid_map import Region, shift_region
+from stillmap.core.grid_map import Region
 from stillmap.core.local_frame import LocalFrame
 from stillmap.core.recording import Recording
 from stillmap.core.short_repr import ShortRepr
@@ -49,6 +49,7 @@ class Exported(ShortRepr):
         slam: the options of deskewing.
         colors: (M, 3) uint8 of the end points; None: without.
         region: the part of the map frame that is shown; None: everything.
+        frame: in which it was computed.
     """
 
     recording: Recording
@@ -59,27 +60,11 @@ class Exported(ShortRepr):
     slam: SlamOptions
     colors: NDArray[np.uint8] | None = None
     region: Region | None = None
+    frame: LocalFrame = field(default_factory=LocalFrame)
 
     def deskew(self) -> Recording:
         """The recording without the motion during its scans."""
         return deskew_recording(self.recording, self.poses, self.slam)
-
-    def to_local(self, frame: LocalFrame) -> "Exported":
-        """The same in a frame near the robot; itself if that is the map frame."""
-        if not frame.is_shifted:
-            return self
-        tracks = [
-            replace(
-                one,
-                xy=frame.points_to_local(one.xy),
-                z=None if one.z is None else one.z - frame.origin[2],
-            )
-            for one in self.tracks
-        ]
-        grid = replace(self.map, origin=frame.corner_to_local(self.map.origin))
-        region = None if self.region is None else shift_region(self.region, -frame.origin)
-        poses = frame.to_local(self.poses)
-        return replace(self, poses=poses, map=grid, tracks=tracks, region=region)
 
 
 @dataclass(frozen=True)
@@ -180,6 +165,7 @@ class ResultFolder(RunRecord):
             self.slam_options,
             read_colors(self.folder, recording.n_beams) if recording.dimension == 3 else None,
             self.region,
+            self.frame,
         )
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from stillmap.core import arrays
 from stillmap.core.chunks import Chunk, iter_chunks
 from stillmap.core.errors import InputError
-from stillmap.core.local_frame import FAR, LocalFrame
+from stillmap.core.local_frame import FAR
 from stillmap.core.recording import Recording, beam_stamps_ns
 from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.io.point_cloud import ply
@@ -103,6 +103,7 @@ def cloud_from_recording(
     p_static: NDArray[np.float32],
     only: Part | None = None,
     colors: NDArray[np.uint8] | None = None,
+    origin: NDArray[np.float64] | None = None,
 ) -> Cloud:
     """All returns, in the order of the recording; memory is that of a few scans.
 
@@ -113,13 +114,16 @@ def cloud_from_recording(
         p_static: (M,) P(c = 1).
         only: static or dynamic points; None: both.
         colors: (M, 3); None: without.
+        origin: (3,) of the frame in which the result was computed; None or zero: that of the map.
     """
     times = recording.beam_time
     earliest = 0.0
     if times is not None:
         for block in arrays.iter_blocks(times):
             earliest = min(earliest, float(times[block].min()))
-    T_map_sensor, near = deskewed.T_map_sensor(poses), LocalFrame.near(poses)
+    T_map_sensor = deskewed.T_map_sensor(poses)
+    if origin is None or not origin.any():
+        origin = np.round(poses[0, :3, 3])
 
     def make_blocks() -> Iterator[Block]:
         mapped = [one for one in (p_static, times, colors) if one is not None]
@@ -135,7 +139,7 @@ def cloud_from_recording(
             int(np.count_nonzero(_select(deskewed.hit[block], p_static[block], only)))
             for block in arrays.iter_blocks(deskewed.hit, p_static)
         ),
-        origin=near.origin if near.is_shifted else np.round(poses[0, :3, 3]),
+        origin=origin,
         start_ns=int(recording.stamp_ns[0]) + int(np.floor(1e9 * earliest)),
         make_blocks=make_blocks,
         has_colors=colors is not None,

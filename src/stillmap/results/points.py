@@ -27,6 +27,7 @@ def write_clouds(
     poses: NDArray[np.float64],
     p_static: NDArray[np.float32],
     colours: NDArray[np.uint8] | None = None,
+    origin: NDArray[np.float64] | None = None,
 ) -> None:
     """Write every hit to one of the two files; memory is that of a few scans.
 
@@ -36,12 +37,13 @@ def write_clouds(
         poses: (T, 4, 4) T_map_base.
         p_static: (M,) P(c = 1); below one half it is dynamic.
         colours: (M, 3), None: without.
+        origin: see `cloud_from_recording`.
     """
     dynamic = sum(
         int(np.count_nonzero(seen.hit[block] & (p_static[block] < DYNAMIC_BELOW)))
         for block in iter_blocks(seen.hit, p_static)
     )
-    cloud = cloud_from_recording(seen, seen, poses, p_static, colors=colours)
+    cloud = cloud_from_recording(seen, seen, poses, p_static, colors=colours, origin=origin)
     fields = cloud_fields(cloud, COLOURS)
     with (
         (folder / "static.ply").open("wb") as static,

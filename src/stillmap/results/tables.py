@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.errors import import_extra
-from stillmap.core.local_frame import LocalFrame
+from stillmap.core.local_frame import FAR
 from stillmap.core.recording import Recording
 from stillmap.io.trajectory import pose_rows
 from stillmap.results.reader import Track
@@ -54,7 +54,7 @@ def make_table(result: "Result", name: TableName) -> "pyarrow.Table":
 def beam_schema(poses: Float) -> "pyarrow.Schema":
     """Names and types of the columns of a beam; see `beam_columns`. `poses` (T, D+1, D+1)."""
     arrow = importlib.import_module("pyarrow")
-    length = arrow.float64() if LocalFrame.near(poses).is_shifted else arrow.float32()
+    length = arrow.float64() if _are_far(poses) else arrow.float32()
     kinds = {
         "scan": arrow.int32(),
         "stamp_ns": arrow.int64(),
@@ -65,6 +65,11 @@ def beam_schema(poses: Float) -> "pyarrow.Schema":
         "p_static": arrow.float32(),
     }
     return arrow.schema([arrow.field(name, kind, nullable=False) for name, kind in kinds.items()])
+
+
+def _are_far(poses: Float) -> bool:
+    """True if 32 bits do not hold positions of poses (T, D+1, D+1) to the millimetre."""
+    return bool(np.abs(poses[:, :-1, -1]).max(initial=0.0) > FAR)
 
 
 def beam_columns(
@@ -85,7 +90,7 @@ def beam_columns(
     scan = np.repeat(np.arange(scans.start, scans.stop, dtype=np.int32), np.diff(offset))
     number = np.arange(beams.start, beams.stop)
     ends = deskewed.end_points(number, poses)
-    if not LocalFrame.near(poses).is_shifted:
+    if not _are_far(poses):
         ends = ends.astype(np.float32)
     points = recording.points[beams].astype(np.float64)
     return {

@@ -66,13 +66,13 @@ def save(
         write_labels(folder / "beams", result.recording, result.p_static, colors if is_3d else None)
         if is_3d:
             seen = limit_hits(result.deskewed, result.poses, region)
-            write_clouds(folder, seen, result.poses, result.p_static, colors)
+            write_clouds(folder, seen, result.poses, result.p_static, colors, result.frame.origin)
         if result.options.objects.enabled:
             write_objects(folder / "objects", result)
             write_traffic(folder / "traffic.npz", result.traffic)
         more = {}
         if tilting is not None:
-            _write_tilting(folder, tilting, colors, region)
+            _write_tilting(folder, tilting, colors, region, result.frame.origin)
             more[TILTING] = tilting_record(tilting)
         if models is not None:
             from stillmap.results.models import models_record, write_models
@@ -122,10 +122,11 @@ def _write_tilting(
     tilting: "TiltingResult",
     colors: NDArray[np.uint8] | None,
     region: Region | None,
+    origin: NDArray[np.float64],
 ) -> None:
     """Write `static.ply`, `dynamic.ply` and `tilting/`: labels, poses and objects in 3D."""
     seen = limit_hits(tilting.deskewed, tilting.poses, region)
-    write_clouds(folder, seen, tilting.poses, tilting.p_static, colors)
+    write_clouds(folder, seen, tilting.poses, tilting.p_static, colors, origin)
     objects = [one for one in tilting.objects if passes(one, region)]
     tilting = replace(tilting, objects=objects)
     inside = folder / TILTING

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from stillmap.core.arrays import finite_rows
 from stillmap.core.errors import InputError
-from stillmap.core.local_frame import LocalFrame
 from stillmap.core.recording import Recording
 from stillmap.io.rigid_transforms import MAX_TRANSLATION, embed_in_3d
 
@@ -79,7 +78,9 @@ def place_clouds(
         return poses
     if poses is None:
         poses = np.tile(np.eye(4), (recording.n_scans, 1, 1))
-    return LocalFrame(origin).to_map(poses)
+    placed = np.array(poses)
+    placed[:, :3, 3] += origin
+    return placed
 
 
 def _find_origin(points: NDArray[np.float64]) -> NDArray[np.float64] | None:

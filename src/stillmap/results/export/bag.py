@@ -7,7 +7,6 @@ import numpy as np
 
 from stillmap.core import se2
 from stillmap.core.grid_map import limit_hits
-from stillmap.core.local_frame import LocalFrame
 from stillmap.io.ros import writer as ros
 from stillmap.io.ros.messages import ODOMETRY, POINT_CLOUD, TF, BagKind
 from stillmap.io.ros.writer import (
@@ -63,12 +62,12 @@ def write(
     require_stamps(stamps[0], stamps[-1], kind)
     scans = LaserWriter(result) if recording.dimension == 2 else LidarWriter(result)
     with new_bag(path, kind, overwrite=overwrite) as bag:
-        near = LocalFrame.near(result.poses)
+        near = result.frame
         more = [(MAP, _LOCAL, near.to_map(np.eye(4)))] if near.is_shifted else []
         frames = write_sensor_frames(bag, recording, more)
         _write_latched_topics(bag, result)
         if isinstance(scans, LidarWriter):
-            _write_static_points(bag, result, scans, near)
+            _write_static_points(bag, result, scans)
         scans.open(bag, frames)
         write_frames = _make_frame_writer(bag, result)
         write_objects = make_object_writer(bag, result.tracks, recording.stamp_ns)
@@ -95,11 +94,10 @@ def _write_latched_topics(bag: BagWriter, result: Exported) -> None:
     send(first, ros.make_path(bag, stamp_ns, result.poses))
 
 
-def _write_static_points(
-    bag: BagWriter, result: Exported, scans: LidarWriter, near: LocalFrame
-) -> None:
+def _write_static_points(bag: BagWriter, result: Exported, scans: LidarWriter) -> None:
     """At most `_MAX_POINTS` static points as one latched message, in a frame near the robot:
     programs expect coordinates of 32 bits."""
+    near = result.frame
     seen = limit_hits(scans.deskewed, result.poses, result.region)
     cloud = cloud_from_recording(
         result.recording, seen, result.poses, result.p_static, "static", result.colors
