@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,65 +18,26 @@ from stillmap.sim.scene import Door, Scene, Stay, Thing
 from stillmap.sim.vehicles import Traffic
 
 
-class PlacedObjects(NamedTuple):
-    """P movable objects at T scans.
-
-    Attributes:
-        poses: (T, P, 3) x, y in metres, yaw in rad; NaN where absent.
-        outlines: faces of those that move; of length 0 while absent.
-        still: (K, 4) faces of those that never move.
-        still_thing: (K,) index of the object that each of these faces belongs to.
-        moved: (P,) whether each ever moves.
-    """
-
-    poses: Float
-    outlines: Outlines
-    still: Float
-    still_thing: NDArray[np.int32]
-    moved: NDArray[np.bool_]
-
-
 def faces_at_all_places(things: tuple[Thing, ...]) -> Float:
     """(K, 4) faces of all objects at all their places."""
     faces = [place_faces(thing, stay) for thing in things for stay in thing.stays]
     return np.concatenate([np.empty((0, 4)), *faces])
 
 
-def place_objects(things: tuple[Thing, ...], seconds: Float, first: int) -> PlacedObjects:
-    """Poses and faces of P movable objects at each scan.
+def place_things(things: tuple[Thing, ...], seconds: Float) -> tuple[Float, Float, list[int]]:
+    """Poses (T, P, 3) of P movable objects at times (T,), their faces (T, K, 4), whose each is (K).
 
-    Args:
-        things: the objects.
-        seconds: (T,) since the beginning of the recording.
-        first: mover number of the first object.
+    Poses of absent objects are NaN, their faces of length 0.
     """
-    T, poses, still = len(seconds), [], [np.empty((0, 4))]
-    moving, mover = [np.empty((T, 0, 4))], [np.empty(0, np.int32)]
-    still_thing = [np.empty(0, np.int32)]
-    moved: list[bool] = []
-    for number, thing in enumerate(things, start=first):
-        at = np.full((T, 3), np.nan)
+    poses = np.full((len(seconds), len(things), 3), np.nan)
+    for number, thing in enumerate(things):
         for stay in thing.stays:
             end = np.inf if stay.until is None else stay.until
-            at[(seconds >= stay.since) & (seconds < end)] = (stay.x, stay.y, stay.yaw)
-        faces = transform_faces(thing, at)
-        poses.append(at)
-        moved.append(not np.array_equal(at, np.broadcast_to(at[0], at.shape)))
-        if not moved[-1]:
-            still.append(faces[0])
-            still_thing.append(np.full(len(thing.faces), number - first, np.int32))
-        else:
-            moving.append(faces)
-            mover.append(np.full(len(thing.faces), number, np.int32))
-    outlines = Outlines(np.concatenate(moving, axis=1), np.concatenate(mover))
-    by_scan = np.reshape(poses, (-1, T, 3)).swapaxes(0, 1)
-    return PlacedObjects(
-        by_scan,
-        outlines,
-        np.concatenate(still),
-        np.concatenate(still_thing),
-        np.array(moved, bool),
-    )
+            is_there = (seconds >= stay.since) & (seconds < end)
+            poses[is_there, number] = (stay.x, stay.y, stay.yaw)
+    faces = [transform_faces(thing, poses[:, number]) for number, thing in enumerate(things)]
+    owner = [number for number, thing in enumerate(things) for _ in thing.faces]
+    return poses, np.concatenate([np.empty((len(seconds), 0, 4)), *faces], axis=1), owner
 
 
 def place_faces(thing: Thing, stay: Stay) -> Float:
@@ -346,30 +306,35 @@ class _World:
         robot, poses, xy, heading, faces = map(np.stack, zip(*log, strict=True))
         persons, doors = len(self.crowd.xy), len(self.doors.share)
         kinds = ["person"] * persons + ["door"] * doors + self.traffic.kinds
-        placed = place_objects(self._things, seconds, first=len(kinds))
+        first = len(kinds)
         moved = np.any(np.ptp(poses, axis=0) > _MIN_MOTION, axis=1)
-        others = np.arange(persons, len(kinds), dtype=np.int32)
-        mover = np.concatenate([others[:doors], np.repeat(others[doors:], 4)])
-        moving = moved[mover]
-        sizes = np.full((len(kinds) + len(placed.moved), 2), np.nan)
+        things, thing_faces, owner = place_things(self._things, seconds)
+        moved = np.append(moved, np.any(things != things[:1], axis=(0, 2)))
+        vehicles = np.repeat(np.arange(persons + doors, first), 4)
+        of_doors, of_things = np.arange(persons, persons + doors), first + np.array(owner, int)
+        mover = np.concatenate([of_doors, vehicles, of_things]).astype(np.int32)
+        faces = np.concatenate([faces, thing_faces], axis=1)
+        moving, is_thing = moved[mover], mover >= first
+        parts = (moving & ~is_thing, moving & is_thing)
+        outlines, jumping = (Outlines(faces[:, part], mover[part]) for part in parts)
+        sizes = np.full((len(moved), 2), np.nan)
         sizes[persons : persons + doors] = np.column_stack([self.doors.width, np.zeros(doors)])
-        sizes[persons + doors : len(kinds)] = self.traffic.size
-        never = faces[0, ~moving]
+        sizes[persons + doors : first] = self.traffic.size
         return Motion(
             period,
             seconds,
             carried,
             paused,
             robot,
-            poses=np.concatenate([poses, placed.poses], axis=1),
-            kinds=kinds + ["thing"] * len(placed.moved),
+            poses=np.concatenate([poses, things], axis=1),
+            kinds=kinds + ["thing"] * len(self._things),
             people=Movers(xy, heading, self.figures.semi_axes, self.figures.mover),
-            outlines=Outlines(faces[:, moving], mover[moving]),
-            things=placed.outlines,
-            still=np.concatenate([never, placed.still]),
-            still_thing=np.concatenate([np.full(len(never), -1, np.int32), placed.still_thing]),
+            outlines=outlines,
+            things=jumping,
+            still=faces[0, ~moving],
+            still_thing=np.where(is_thing, mover - first, -1)[~moving].astype(np.int32),
             sizes=sizes,
-            moved=np.concatenate([moved, placed.moved]),
+            moved=moved,
         )
 
 

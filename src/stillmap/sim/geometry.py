@@ -90,16 +90,12 @@ class Assembly(NamedTuple):
     Attributes:
         carrier: (P,) carrier of each part.
         offset: (P, 3) metres ahead and to the left of the carrier's center, rad to the left.
-        form, half, z: see Solids.
-        mover: see Solids.
+        solids: the parts, at no time.
     """
 
     carrier: NDArray[np.int64]
     offset: Float
-    form: NDArray[np.int8]
-    half: Float
-    z: Float
-    mover: NDArray[np.int32]
+    solids: Solids
 
     def at(self, poses: Float, foot: Float) -> Solids:
         """The solids of all parts.
@@ -115,19 +111,21 @@ class Assembly(NamedTuple):
         at[..., 0] = x[:, self.carrier] + c * ahead - s * aside
         at[..., 1] = y[:, self.carrier] + s * ahead + c * aside
         at[..., 2], at[..., 3] = heading[:, self.carrier] + turn, foot[:, self.carrier]
-        return Solids(at, self.form, self.half, self.z, self.mover)
+        return self.solids._replace(pose=at)
 
 
 def assemble(parts: Sequence[tuple[int, int, Part]]) -> Assembly:
     """Assemble parts, given with the numbers of carrier and mover."""
-    return Assembly(
-        np.array([carrier for carrier, _, _ in parts], np.int64),
-        np.array([(p.ahead, p.aside, p.turn) for _, _, p in parts], float).reshape(-1, 3),
-        np.array([p.form for _, _, p in parts], np.int8),
-        np.array([p.half for _, _, p in parts], float).reshape(-1, 2),
-        np.array([p.z for _, _, p in parts], float).reshape(-1, 2),
-        np.array([mover for _, mover, _ in parts], np.int32),
+    carriers, movers, items = [*zip(*parts, strict=True)] if parts else ((), (), ())
+    solids = Solids(
+        np.empty((0, len(items), 4)),
+        np.array([part.form for part in items], np.int8),
+        np.array([part.half for part in items], float).reshape(-1, 2),
+        np.array([part.z for part in items], float).reshape(-1, 2),
+        np.array(movers, np.int32),
     )
+    offset = np.array([(part.ahead, part.aside, part.turn) for part in items], float)
+    return Assembly(np.array(carriers, np.int64), offset.reshape(-1, 3), solids)
 
 
 def make_pose(xyz: ArrayLike, roll: ArrayLike, pitch: ArrayLike, yaw: ArrayLike) -> Float:

@@ -181,15 +181,10 @@ def _cast_movers(
         ox, oy = ((-dx * c - dy * s) / a)[scan], ((dx * s - dy * c) / b)[scan]
         ux, uy = scans.cos[beam], scans.sin[beam]
         vx, vy = (ux * c[scan] + uy * s[scan]) / a, (uy * c[scan] - ux * s[scan]) / b
-        r = meet_unit_circle(ox, oy, vx, vy)
+        A, B = vx**2 + vy**2, ox * vx + oy * vy
+        rest = B**2 - A * (ox**2 + oy**2 - 1)
+        r = np.where(rest >= 0, (-B - np.sqrt(np.maximum(rest, 0))) / A, np.inf)
         which[_keep_nearer(r, beam, ranges)] = movers.mover[q]
-
-
-def meet_unit_circle(x: Float, y: Float, u: Float, v: Float) -> Float:
-    """(...) ranges along (u, v) from (x, y), outside it, to the unit circle; inf: none."""
-    A, B = u**2 + v**2, x * u + y * v
-    rest = B**2 - A * (x**2 + y**2 - 1)
-    return np.where(rest >= 0, (-B - np.sqrt(np.maximum(rest, 0))) / A, np.inf)
 
 
 def find_glass(walls: NDArray[np.int32], scene: Scene) -> NDArray[np.bool_]:

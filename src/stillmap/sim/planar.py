@@ -12,7 +12,7 @@ from stillmap.core.recording import Recording
 from stillmap.sim import laser
 from stillmap.sim.dynamics import Moment, Motion
 from stillmap.sim.episode import Episode
-from stillmap.sim.laser import MIN_RANGE, Float, Movers, Returns, meet_unit_circle
+from stillmap.sim.laser import Float, Movers, Returns
 from stillmap.sim.options import LaserOptions, RobotOptions
 from stillmap.sim.truth import Truth
 
@@ -21,10 +21,8 @@ MIRRORED = -4  # Truth.mover of beams that end on what a mirror shows
 
 _MAX_GROUPS = 64  # of simultaneous beams per scan
 _BLOCK = 1000  # groups of beams processed at once
-_MIRROR_BLOCK = 2000  # beams reflected at once
 _MAX_SIGMAS = 10.0  # of a range
 _SPREAD = (0.5, 1.5)  # of pitch and duration of a bump, times their options
-_SLACK = 1e-9  # of a wall's length, so that no beam passes between two walls that share a corner
 
 
 def record_planar(episode: Episode) -> tuple[Recording, Truth]:
@@ -177,8 +175,7 @@ def _reflect_beams(
 ) -> Returns:
     """Returns whose beams go on, from the mirror that they meet, to what it shows.
 
-    By brute force, as few beams are reflected. What lies behind a second mirror is not followed:
-    the beam ends there.
+    What lies behind a second mirror is not followed: the beam ends there.
 
     Args:
         exact: returns (T, n) that end at mirrors.
@@ -190,75 +187,33 @@ def _reflect_beams(
     motion, walls, o = episode.motion, episode.walls, episode.scene.laser
     seconds = Sweep.of(o).beam_times(o.beams).astype(np.float64)
     out = Returns(exact.range.copy(), exact.wall.copy(), exact.mover.copy())
-    all_scans, all_beams = np.nonzero(by)
-    for first in range(0, len(all_scans), _MIRROR_BLOCK):
-        part = slice(first, first + _MIRROR_BLOCK)
-        scan, beam = all_scans[part], all_beams[part]
-        now = Moment(motion, scan, seconds[beam])
-        x, y, theta = now.interpolate(motion.robot).T
-        c, s = np.cos(theta), np.sin(theta)
-        u, v = T_base_sensor[scan, :2, 2].T
-        sensor = np.stack([x + c * u - s * v, y + s * u + c * v], axis=-1)
-        heading = theta + bearing[scan, beam]
-        direction = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
-        mirror, to_mirror = exact.wall[scan, beam], exact.range[scan, beam]
-        origin = sensor + to_mirror[:, None] * direction
-        direction = _reflect(direction, walls[mirror])
-        people, outlines = now.interpolate_movers()
-        r = _segment_ranges(origin, direction, walls[None])
-        r[np.arange(len(r)), mirror] = np.inf
-        wall = np.argmin(r, axis=1).astype(np.int32)
-        r = r[np.arange(len(r)), wall]
-        people = _with_robot(people, x, y, episode.scene.robot.radius)
-        moving = np.minimum(
-            _people_ranges(origin, direction, people),
-            _segment_ranges(origin, direction, outlines.faces).min(axis=1, initial=np.inf),
-        )
-        wall = np.where((moving < r) | np.isinf(r), np.int32(-1), wall)
-        r = np.minimum(r, moving)
-        out.range[scan, beam], out.wall[scan, beam] = to_mirror + r, wall
-        out.mover[scan, beam] = np.where(np.isfinite(r), MIRRORED, -1)
+    scan, beam = np.nonzero(by)
+    now = Moment(motion, scan, seconds[beam])
+    robot = now.interpolate(motion.robot)
+    heading = robot[:, 2] + bearing[by]
+    to_mirror = exact.range[by][:, None]
+    origin = (se2.matrix(*robot.T) @ T_base_sensor[scan])[:, :2, 2]
+    origin = origin + to_mirror * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+    x0, y0, x1, y1 = walls[exact.wall[by]].T
+    reflected = 2.0 * np.arctan2(y1 - y0, x1 - x0) - heading
+    people, outlines = now.interpolate_movers()
+    people = _with_robot(people, robot[:, :2], episode.scene.robot.radius)
+    # each beam as a scan of its own, of which the second beam does not count
+    poses = np.column_stack([origin, reflected])
+    seen = laser.cast_beams(poses, np.array([0.0, 1.0]), walls, people, outlines)
+    range, wall, mover = (values[:, 0] for values in seen)
+    out.range[by] = to_mirror[:, 0] + range
+    out.wall[by] = np.where(mover == -1, wall, np.int32(-1))
+    out.mover[by] = np.where(np.isfinite(range), MIRRORED, -1)
     return out
 
 
-def _reflect(direction: Float, mirrors: Float) -> Float:
-    """(B, 2) directions after reflection by segments (B, 4)."""
-    along = mirrors[:, 2:] - mirrors[:, :2]
-    along = along / np.linalg.norm(along, axis=1, keepdims=True)
-    return np.asarray(2.0 * np.sum(direction * along, axis=1, keepdims=True) * along - direction)
-
-
-def _with_robot(people: Movers, x: Float, y: Float, radius: float) -> Movers:
-    """The people (B, Q) and the robot at (B,), which sees itself, as one more of them."""
-    xy = np.concatenate([people.xy, np.stack([x, y], axis=-1)[:, None]], axis=1)
-    heading = np.concatenate([people.heading, np.zeros((len(x), 1))], axis=1)
+def _with_robot(people: Movers, robot: Float, radius: float) -> Movers:
+    """The people (B, Q) and the robot (B, 2), which sees itself, as one more of them."""
+    xy = np.concatenate([people.xy, robot[:, None]], axis=1)
+    heading = np.pad(people.heading, ((0, 0), (0, 1)))
     semi_axes = np.concatenate([people.semi_axes, [[radius, radius]]])
     return Movers(xy, heading, semi_axes, np.append(people.mover, np.int32(MIRRORED)))
-
-
-def _segment_ranges(origin: Float, direction: Float, faces: Float) -> Float:
-    """(B, F) ranges of beams (B, 2) to segments (B, F, 4) or (1, F, 4); inf: none."""
-    origin, direction = origin[:, None], direction[:, None]
-    start, along = faces[..., :2] - origin, faces[..., 2:] - faces[..., :2]
-    # origin + r d = start + share along
-    area = direction[..., 0] * along[..., 1] - direction[..., 1] * along[..., 0]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        r = (start[..., 0] * along[..., 1] - start[..., 1] * along[..., 0]) / area
-        share = (start[..., 0] * direction[..., 1] - start[..., 1] * direction[..., 0]) / area
-        met = (r > MIN_RANGE) & (share >= -_SLACK) & (share <= 1 + _SLACK)
-    return np.where(met, r, np.inf)
-
-
-def _people_ranges(origin: Float, direction: Float, people: Movers) -> Float:
-    """(B,) ranges to elliptic cross sections (B, Q)."""
-    c, s = np.cos(people.heading), np.sin(people.heading)
-    dx, dy = np.moveaxis(origin[:, None] - people.xy, -1, 0)
-    a, b = people.semi_axes.T
-    ux, uy = direction[:, :1], direction[:, 1:]
-    r = meet_unit_circle(
-        (dx * c + dy * s) / a, (dy * c - dx * s) / b, (ux * c + uy * s) / a, (uy * c - ux * s) / b
-    )
-    return np.asarray(np.where(r > MIN_RANGE, r, np.inf).min(axis=1, initial=np.inf))
 
 
 @dataclass(frozen=True, eq=False)

@@ -101,9 +101,10 @@ def load_image_truth(path: str | Path) -> ImageTruth:
     folder = _find_folder(path, STANDING, "truth about images", " with cameras")
     try:
         of, moves = (read_npz(folder / name, None, _MAX_ARRAY) for name in (STANDING, MOVING))
-        faces = Faces(of["faces_ends"], of["faces_z"], of["faces_glass"])
-        solids = Solids(*(of[f"solids_{name}"] for name in Solids._fields))
-        ground = Ground(of["ground_slope"], of["ground_pavements"], float(of["ground_kerb"]))
+        faces, solids, ground = (
+            kind(*(of[f"{name}_{field}"] for field in kind._fields))
+            for name, kind in (("faces", Faces), ("solids", Solids), ("ground", Ground))
+        )
         ceiling, seed = float(of["ceiling"]), int(of["colour_seed"])
         parts = Solids(open_npy(folder / POSE), *(moves[name] for name in Solids._fields[1:]))
         moving = MovingSurfaces(moves["stamp_ns"], parts)

@@ -2,8 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from stillmap.sim.scene import Door, Point, Segment
 
@@ -18,8 +17,7 @@ _AXES: dict[Side, tuple[Point, Point]] = {
 }
 
 
-@dataclass(frozen=True)
-class Opening:
+class Opening(NamedTuple):
     """A piece of a wall that steps back.
 
     Attributes:
@@ -71,12 +69,15 @@ def box_along(
 
 
 def wall(
-    start: Point, length: float, side: Side, openings: Iterable[Opening] = ()
+    start: Point, length: float, side: Side, openings: Iterable[Sequence[Any]] = ()
 ) -> list[Segment]:
-    """A straight wall along +x or +y whose openings step back to `side`, in ascending order."""
+    """A straight wall along +x or +y whose openings step back to `side`, in ascending order.
+
+    Each opening is an `Opening`, or a row of its values.
+    """
     segments: list[Segment] = []
     line = [locate(start, side, 0.0)]
-    for o in openings:
+    for o in (Opening(*row) for row in openings):
         end = o.start + o.width
         line += [locate(start, side, o.start), locate(start, side, o.start, o.depth)]
         if o.is_open:
@@ -88,7 +89,7 @@ def wall(
 
 
 def room(
-    start: Point, side: Side, along: tuple[float, float], depth: float, door: Opening
+    start: Point, side: Side, along: tuple[float, float], depth: float, door: Sequence[Any]
 ) -> list[Segment]:
     """A room behind the open `door` of a wall that begins at `start`.
 
@@ -99,14 +100,15 @@ def room(
         depth: metres, inside, measured from the back of the doorway.
         door: the doorway, an opening of that same wall.
     """
-    near, far = door.depth, door.depth + depth
+    opening = Opening(*door)
+    near, far = opening.depth, opening.depth + depth
     corners = [
-        (door.start, near),
+        (opening.start, near),
         (along[0], near),
         (along[0], far),
         (along[1], far),
         (along[1], near),
-        (door.start + door.width, near),
+        (opening.start + opening.width, near),
     ]
     return polyline([locate(start, side, *corner) for corner in corners])
 
@@ -134,24 +136,12 @@ def leaf(
     return Door(hinge, opening.width - 2 * gap, closed, closed + turn)
 
 
-def _line(*points: Point) -> list[Segment]:
-    return polyline(points)
-
-
-def _wall(start: Point, length: float, side: Side, openings: Sequence[Any] = ()) -> list[Segment]:
-    return wall(start, length, side, [Opening(*o) for o in openings])
-
-
-def _room(start: Point, side: Side, along: Any, depth: float, door: Sequence[Any]) -> list[Segment]:
-    return room(start, side, along, depth, Opening(*door))
-
-
 # how the data files of worlds call them
 PIECES: dict[str, Callable[..., list[Segment]]] = {
-    "line": _line,
+    "line": lambda *points: polyline(points),
     "box": box,
     "box_along": box_along,
     "pillar": pillar,
-    "wall": _wall,
-    "room": _room,
+    "wall": wall,
+    "room": room,
 }

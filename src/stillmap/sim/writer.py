@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,16 +105,14 @@ def _write_truth(of_beams: Truth, stamp_ns: NDArray[np.int64], folder: Path) -> 
 
 def _write_image_truth(surfaces: ImageTruth, folder: Path) -> None:
     """All but masks and distances."""
-    faces, solids, ground, ceiling = surfaces.standing
-    standing: dict[str, NDArray[Any]] = {
-        "faces_ends": faces.ends,
-        "faces_z": faces.z,
-        "faces_glass": faces.is_glass,
-        **{f"solids_{name}": value for name, value in solids._asdict().items()},
-        **{f"ground_{name}": np.asarray(value) for name, value in ground._asdict().items()},
-        "ceiling": np.array(np.nan if ceiling is None else ceiling),
-        "colour_seed": np.array(surfaces.colour_seed),
+    *parts, ceiling = surfaces.standing
+    standing = {
+        f"{name}_{key}": np.asarray(value)
+        for name, part in zip(("faces", "solids", "ground"), parts, strict=True)
+        for key, value in part._asdict().items()
     }
+    standing["ceiling"] = np.array(np.nan if ceiling is None else ceiling)
+    standing["colour_seed"] = np.array(surfaces.colour_seed)
     write_npz(folder / truth.STANDING, standing)
     moving = surfaces.moving.solids._asdict()
     write_npy(folder / truth.POSE, moving.pop("pose"))

@@ -10,14 +10,17 @@ import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from importlib import resources
-from typing import Any
+from typing import Any, get_type_hints
+
+from pydantic import TypeAdapter
 
 from stillmap.core.config import override
 from stillmap.core.errors import InputError, closest_match
-from stillmap.sim.scene import Lane, Light, Scene, Segment, Stay, Thing
+from stillmap.sim.scene import Scene, Segment, Stay, Thing
 from stillmap.sim.walls import PIECES, Opening, leaf
 
 _EMPTY = "-empty"
+_TYPES = get_type_hints(Scene)
 _FOLDER = resources.files(__name__)
 _WORLDS = sorted(f.name[:-5] for f in _FOLDER.iterdir() if f.name.endswith(".toml"))
 
@@ -28,9 +31,7 @@ def load_world(name: str) -> Scene:
     base = tree.pop("extends", None)
     sections = {key: tree.pop(key) for key in list(tree) if isinstance(tree[key], dict)}
     lifted, brought = tree.pop("lifted", []), map(_read_thing, tree.pop("things", []))
-    values: dict[str, Any] = {"name": name}
-    for key, rows in tree.items():
-        values[key] = _READ[key](rows) if key in _READ else _to_tuple(rows)
+    values = {"name": name, **{key: _read(key, rows) for key, rows in tree.items()}}
     scene = Scene(**values) if base is None else dataclasses.replace(load_world(base), **values)
     walls, things = scene.walls, []
     for moved in lifted:
@@ -46,36 +47,18 @@ def _draw(rows: list[list[Any]]) -> tuple[Segment, ...]:
     return tuple(segment for kind, *values in rows for segment in PIECES[kind](*values))
 
 
-def _to_tuple(value: list[Any]) -> tuple[Any, ...]:
-    return tuple(_to_tuple(item) if isinstance(item, list) else item for item in value)
-
-
-def _read_lights(rows: list[dict[str, Any]]) -> tuple[Light, ...]:
-    return tuple(Light(_to_tuple(row["at"]), _to_tuple(row["red"]), row["cycle"]) for row in rows)
-
-
-def _read_lanes(rows: list[dict[str, Any]]) -> tuple[Lane, ...]:
-    for row in rows:
-        row["lights"] = _read_lights(row.get("lights", []))
-        row.update({key: _to_tuple(row[key]) for key in ("path", "go") if key in row})
-    return tuple(Lane(**row) for row in rows)
-
-
-def _read_doorways(rows: list[list[Any]]) -> tuple[Any, ...]:
-    return tuple(leaf(start, side, Opening(*door), *swing) for start, side, door, *swing in rows)
+def _read(key: str, rows: Any) -> Any:
+    """The value of a field of a scene."""
+    if key in ("walls", "kerbs"):
+        return _draw(rows)
+    if key == "leaves":
+        doors = ((start, side, Opening(*door), *swing) for start, side, door, *swing in rows)
+        return tuple(leaf(*door) for door in doors)
+    return TypeAdapter(_TYPES[key]).validate_python(rows)
 
 
 def _read_thing(row: dict[str, Any]) -> Thing:
     return Thing(_draw(row["faces"]), tuple(Stay(**stay) for stay in row["stays"]))
-
-
-_READ: dict[str, Callable[[Any], Any]] = {
-    "walls": _draw,
-    "kerbs": _draw,
-    "lights": _read_lights,
-    "lanes": _read_lanes,
-    "leaves": _read_doorways,
-}
 
 
 def _lift(
