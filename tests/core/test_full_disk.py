@@ -1,7 +1,6 @@
 """Writers that do not notice a full disk are not used: half a file would pass for a whole one."""
 
 import resource
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ from stillmap.core.files import write_text
 from stillmap.core.json import write_json
 from stillmap.io.images import write_png
 
-PACKAGE = Path(__file__).resolve().parents[2] / "src" / "stillmap"
 ARRAY = np.random.default_rng(0).integers(0, 255, (50, 50)).astype(np.uint8)
 
 

@@ -53,10 +53,6 @@ def write_file(path: Path, text: str, meanwhile: Callable[[], None] = lambda: No
         meanwhile()
 
 
-def stop() -> None:
-    raise RuntimeError("stop")
-
-
 @pytest.fixture
 def fixed(tmp_path, monkeypatch) -> Path:
     """A folder that cannot be renamed."""

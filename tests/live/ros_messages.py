@@ -38,10 +38,6 @@ def transform(parent, child, stamp_ns, x=0.0, y=0.0, yaw=0.0, roll=0.0):
     return Fields(header=header(stamp_ns, parent), child_frame_id=child, transform=values)
 
 
-def tf(*transforms):
-    return Fields(transforms=list(transforms))
-
-
 def odometry(stamp_ns, x=0.0, y=0.0, yaw=0.0, child="base_footprint"):
     pose = Fields(position=Fields(x=x, y=y, z=0.0), orientation=rotation(yaw))
     return Fields(header=header(stamp_ns, "odom"), child_frame_id=child, pose=Fields(pose=pose))

@@ -28,7 +28,6 @@ from stillmap.tracking.motion_evidence import apply_motion_evidence
 HINGE, WIDTH = (2.0, 0.9), 0.9
 CRATE = tuple(box(0, 0, 0.9, 0.6))
 AWAY, HERE, GONE = Stay(-2.0, 1.6, until=90.0), Stay(0.2, 2.1, 0.3, since=90.0), 60.0
-SECONDS = 150.0
 
 
 @functools.cache

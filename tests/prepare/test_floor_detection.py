@@ -1,6 +1,5 @@
 """Floor that bumps show is found by what scans before and after see; walls are not floor."""
 
-import dataclasses
 import math
 
 import numpy as np
@@ -11,7 +10,6 @@ from numpy.typing import NDArray
 from stillmap import em
 from stillmap.core import se2
 from stillmap.core.config import override
-from stillmap.core.recording import Recording
 from stillmap.em.options import EmOptions
 from stillmap.prepare.floor_detection import find_floor_returns
 from stillmap.sim import Scene, Simulation, scene_by_name, simulate
@@ -92,20 +90,6 @@ def test_wrong_odometry_makes_no_floor_of_walls() -> None:
         found = find_floor_returns(run.recording, once).reshape(300, -1)
         n_found += np.delete(found, scan, axis=0).sum()
     assert n_found <= 1e-4 * 40 * run.recording.n_beams
-
-
-def first_scans(recording: Recording, T: int) -> Recording:
-    odometry, M = recording.T_odom_base, int(recording.offset[T])
-    assert odometry is not None
-    return dataclasses.replace(
-        recording,
-        stamp_ns=recording.stamp_ns[:T],
-        offset=recording.offset[: T + 1],
-        points=recording.points[:M],
-        hit=recording.hit[:M],
-        sensor=recording.sensor[:T],
-        T_odom_base=odometry[:T],
-    )
 
 
 def test_floor_starts_with_a_low_p_static() -> None:

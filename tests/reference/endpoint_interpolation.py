@@ -4,13 +4,11 @@ from collections.abc import Iterator
 from math import ceil
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from reference.beam_counting import Beam, per_beam, usable_beams
 from reference.occupancy_grid import OccupancyGrid
 from reference.ray_traversal import cell_of
-
-Float = NDArray[np.float64]
 
 
 def interpolate_end_points(

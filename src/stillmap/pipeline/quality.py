@@ -49,16 +49,12 @@ class QualityEvidence:
         expected_f1: of the label dynamic, from 0 to 1.
         disagreement: metres between the poses and scans matched anew.
         displacement: metres, mean of surfaces seen again.
-        worst_scans: first scans of the two visits whose surfaces are displaced most.
-        worst_place: where, metres in the map.
         small_pieces: of the map, per 100 m2.
     """
 
     expected_f1: float | None = None
     disagreement: float | None = None
     displacement: float | None = None
-    worst_scans: tuple[int, int] | None = None
-    worst_place: tuple[float, ...] | None = None
     small_pieces: float | None = None
 
 
@@ -128,16 +124,9 @@ def _measure_geometry(
     deskewed: Recording, poses: Float, occupancy: OccupancyMap
 ) -> QualityEvidence:
     """The evidence of surfaces seen again and of small pieces of the map."""
-    pairs = surface_agreement.measure_displacements(deskewed, poses).of_later_visits()
-    pieces, displacement = count_small_pieces(occupancy), pairs.mean()
-    if displacement is None:
-        return QualityEvidence(small_pieces=pieces)
-    worst = pairs.worst()
     return QualityEvidence(
-        displacement=displacement,
-        worst_scans=(int(pairs.scan[worst, 0]), int(pairs.scan[worst, 1])),
-        worst_place=tuple(pairs.place[worst].tolist()),
-        small_pieces=pieces,
+        displacement=surface_agreement.mean_displacement(deskewed, poses),
+        small_pieces=count_small_pieces(occupancy),
     )
 
 

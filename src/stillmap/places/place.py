@@ -108,12 +108,6 @@ def fit_alignment(session_poses: Float, place_poses: Float) -> Float:
     return T
 
 
-def relative_pose(first: Float, second: Float) -> Float:
-    """(D+1, D+1) pose of the second in the frame of the first."""
-    out: Float = se2.inverse(first) @ second
-    return out
-
-
 # of a cell, by which keyframes may move before the evidence of their session is measured again
 MAX_MOTION = 0.5
 

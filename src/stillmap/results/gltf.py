@@ -149,11 +149,6 @@ def _y_up(points: Float) -> Float:
     return np.stack([points[..., 0], points[..., 2], -points[..., 1]], axis=-1)
 
 
-def to_z_up(points: Float) -> Float:
-    """(..., 3) points with y up in a frame with z up."""
-    return np.stack([points[..., 0], -points[..., 2], points[..., 1]], axis=-1)
-
-
 def flip_v(uv: Float) -> Float:
     """uv counted from the bottom, as in trimesh and OBJ."""
     return np.column_stack([uv[:, 0], 1.0 - uv[:, 1]])

@@ -29,45 +29,6 @@ _MAX_DISPLACEMENT = 0.2  # m, that more counts as: it may be another surface
 _MAX_RETURNS = 500_000  # of all scans; of longer recordings, every so many scans are used
 
 
-class Displacements(NamedTuple):
-    """Displacements of K pairs of surface patches.
-
-    Attributes:
-        across: (K,) metres across the surface.
-        stretches: (K,) stretches of travel between the two visits, at least 1.
-        weight: (K,) returns of the patch with fewer.
-        scan: (K, 2) the first scan of either visit that shows it.
-        place: (K, D) metres in the map.
-    """
-
-    across: Float
-    stretches: Index
-    weight: Index
-    scan: Index
-    place: Float
-
-    def of_later_visits(self) -> "Displacements":
-        """Those between visits far apart: in between, the poses had the time to drift."""
-        later = self.stretches > _ADJACENT
-        return Displacements(
-            self.across[later],
-            self.stretches[later],
-            self.weight[later],
-            self.scan[later],
-            self.place[later],
-        )
-
-    def mean(self) -> float | None:
-        """Weighted mean in metres; None of fewer than _MIN_PAIRS."""
-        if len(self.across) < _MIN_PAIRS:
-            return None
-        return float(np.average(np.minimum(self.across, _MAX_DISPLACEMENT), weights=self.weight))
-
-    def worst(self) -> int:
-        """Index of the pair with the largest displacement, among those with most returns."""
-        return int(np.argmax(self.weight * np.minimum(self.across, _MAX_DISPLACEMENT)))
-
-
 class _Patches(NamedTuple):
     """Planar patches, sorted by cube and then by stretch of travel."""
 
@@ -76,11 +37,13 @@ class _Patches(NamedTuple):
     returns: Index
     mean: Float
     normal: Float
-    scan: Index
 
 
-def measure_displacements(recording: Recording, poses: Float) -> Displacements:
-    """Displacements of all pairs of successive visits of a surface.
+def mean_displacement(recording: Recording, poses: Float) -> float | None:
+    """Mean displacement in metres of surfaces seen again on later visits; None of too few pairs.
+
+    Visits one after the other are left out: in between, the poses had no time to drift. Pairs of
+    patches are weighted by the returns of the patch with fewer.
 
     Args:
         recording: 2D or 3D, deskewed.
@@ -90,46 +53,45 @@ def measure_displacements(recording: Recording, poses: Float) -> Displacements:
     first = np.flatnonzero(patches.cube[:-1] == patches.cube[1:])
     second = first + 1
     cosine = np.abs(np.sum(patches.normal[first] * patches.normal[second], axis=1))
-    first, second = first[cosine > _MIN_COSINE], second[cosine > _MIN_COSINE]
+    used = cosine > _MIN_COSINE
+    used &= patches.stretch[second] - patches.stretch[first] > _ADJACENT
+    first, second = first[used], second[used]
+    if len(first) < _MIN_PAIRS:
+        return None
     step = patches.mean[second] - patches.mean[first]
-    return Displacements(
-        np.abs(np.sum(step * patches.normal[first], axis=1)),
-        patches.stretch[second] - patches.stretch[first],
-        np.minimum(patches.returns[first], patches.returns[second]),
-        np.stack([patches.scan[first], patches.scan[second]], axis=1),
-        patches.mean[second],
-    )
+    across = np.abs(np.sum(step * patches.normal[first], axis=1))
+    weight = np.minimum(patches.returns[first], patches.returns[second])
+    return float(np.average(np.minimum(across, _MAX_DISPLACEMENT), weights=weight))
 
 
-def _collect_returns(recording: Recording, poses: Float) -> tuple[Float, Index, Index]:
-    """End points (N, D) in the map, their stretches of travel and their scans (N,)."""
+def _collect_returns(recording: Recording, poses: Float) -> tuple[Float, Index]:
+    """End points (N, D) in the map, and their stretches of travel (N,)."""
     stretch = (travelled_distance(poses) / STRETCH).astype(np.int64)
     every = max(1, -(-recording.n_beams // _MAX_RETURNS))
-    points, scans = [], []
+    points, stretches = [], []
     for some, _, (ends, hit, offset, T) in iter_beams(recording, poses):
         scan = np.repeat(np.arange(some.start, some.stop), np.diff(offset))
         used = hit & (scan % every == 0)
         scan, T_used = scan[used], T[scan[used] - some.start]
         local = ends[used].astype(np.float64)
         points.append(np.einsum("nij,nj->ni", T_used[:, :-1, :-1], local) + T_used[:, :-1, -1])
-        scans.append(scan)
-    scan = np.concatenate(scans)
-    return np.concatenate(points), stretch[scan], scan
+        stretches.append(stretch[scan])
+    return np.concatenate(points), np.concatenate(stretches)
 
 
-def _fit_patches(points: Float, stretch: Index, scan: Index) -> _Patches:
+def _fit_patches(points: Float, stretch: Index) -> _Patches:
     """The planar patches among the returns of each cube and stretch."""
     D = points.shape[1]
     cubes = np.floor(points / CELL).astype(np.int64)
     keys = np.column_stack([cubes, stretch])
     order = np.lexsort(keys.T[::-1])
-    keys, points, scan = keys[order], points[order], scan[order]
+    keys, points = keys[order], points[order]
     is_first = np.ones(len(keys), np.bool_)
     is_first[1:] = np.any(keys[1:] != keys[:-1], axis=1)
     start = np.flatnonzero(is_first)
     if not len(start):
         none, flat = np.empty(0, np.int64), np.empty((0, D))
-        return _Patches(none, none, none, flat, flat, none)
+        return _Patches(none, none, none, flat, flat)
     count = np.diff(np.append(start, len(keys)))
     local = points - (keys[:, :D] + 0.5) * CELL  # small numbers: squares lose no digits
     mean = np.add.reduceat(local, start) / count[:, None]
@@ -146,5 +108,4 @@ def _fit_patches(points: Float, stretch: Index, scan: Index) -> _Patches:
         count[is_flat],
         (mean + (keys[start, :D] + 0.5) * CELL)[is_flat],
         axes[is_flat, :, 0],
-        scan[start][is_flat],
     )

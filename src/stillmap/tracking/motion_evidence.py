@@ -10,6 +10,7 @@ them (`explained_hits.py`). See `docs/objects.md`.
 
 import itertools
 from collections.abc import Iterator, Mapping
+from enum import IntEnum
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -18,13 +19,13 @@ from numpy.typing import NDArray
 
 from stillmap.core import arrays
 from stillmap.core.recording import Recording
+from stillmap.em.shape_evidence import find_lost_beams
 from stillmap.mapping import MoverPoints
 from stillmap.tracking.association import MAX_GAP, assign_tracks, regress_velocity
 from stillmap.tracking.clustering import DynamicPoints, extract_dynamic_points
 from stillmap.tracking.detections import compute_centroids, iterate_tracks
 from stillmap.tracking.explained_hits import explain_hits, find_mover_hits, fit_share
 from stillmap.tracking.fast_movers import find_fast_movers, tracks_of_paths
-from stillmap.tracking.looks import Look, classify_looks
 from stillmap.tracking.mover_path import MoverPath
 from stillmap.tracking.tracklets import join_tracklets
 from stillmap.tracking.walker_paths import count_steady_windows, iterate_walker_paths
@@ -44,6 +45,9 @@ _MAX_LINE_SPREAD = 1.25  # times the noise, across a straight surface
 _MIN_LINE, _MAX_SLIDE_SPEED = 0.75, 0.25  # m of it: people are less wide; m/s: they walk faster
 _P_WALKS_ON_LINE = 0.01  # that end points on who walks spread as little: 4 tracks of nine runs
 _BATCH = 1 << 12  # tracks whose looks are classified at once
+_DEPTH = 0.3  # m in front of and behind the place that count as the place
+_HALF_WIDTH = 0.08  # m to either side, of a leg
+_MAX_BEARING = 0.06  # rad to the nearest beam: farther off is out of view
 
 # Beta(1, 15): share of the windows in which clutter seems to move; also of half of the movers
 _STILL_WINDOWS = 15.0
@@ -222,7 +226,7 @@ def _count_passes(recording: Recording, T_map_sensor: Float, places: list[Places
     """(L,) looks that passed, of L lists of places."""
     of = np.repeat(np.arange(len(places)), [len(scan) for scan, _ in places])
     scan, xy = (np.concatenate(column) for column in zip(*places, strict=True))
-    look = classify_looks(recording, T_map_sensor, scan, xy)
+    look = _classify_looks(recording, T_map_sensor, scan, xy)
     passed = (look == Look.PASSED).astype(np.float64)
     return np.asarray(np.bincount(of, passed, minlength=len(places)), np.float64)
 
@@ -250,3 +254,59 @@ def _extrapolate_ends(seconds: Float, scan: Index, xy: Float) -> Iterator[Places
         some = scans[:: max(1, -(-len(scans) // _EDGE_LOOKS))]
         velocity = regress_velocity(t[end], xy[end], _REST_TIME)
         yield some, xy[at] + (seconds[some] - t[at])[:, None] * velocity
+
+
+class Look(IntEnum):
+    """Outcome of the beams in the direction of a place."""
+
+    HIDDEN = -1  # they end before it, or there are none
+    REACHED = 0  # they end there, or disagree
+    PASSED = 1  # they end behind it
+
+
+def _classify_looks(recording: Recording, T_map_sensor: Float, scan: Index, xy: Float) -> Index:
+    """(Q,) the Look of scans `scan` (Q,) at places `xy` (Q, 2), metres in the map frame.
+
+    The beam nearest in direction decides with those on either side of it that are less than 8 cm
+    off: most of them pass the place, or end before it. A beam without a return passes if more of
+    them are beside it.
+
+    Args:
+        recording: 2D.
+        T_map_sensor: (T, 3, 3) sensor poses.
+    """
+    out = np.full(len(scan), Look.HIDDEN, np.intp)
+    order = np.argsort(scan, kind="stable")
+    cuts = np.flatnonzero(np.diff(scan[order])) + 1
+    groups = np.split(order, cuts) if len(order) else []
+    for g in recording.iter_scans(range(len(groups))):
+        here = groups[g]
+        t = int(scan[here[0]])
+        R, origin = T_map_sensor[t, :2, :2], T_map_sensor[t, :2, 2]
+        beams = recording.beams_of(t)
+        points, hit = recording.points[beams], recording.hit[beams]
+        lost = find_lost_beams(hit, points, np.zeros(len(hit), np.intp))
+        out[here] = _look_at(points[~lost], (xy[here] - origin) @ R)
+    return out
+
+
+def _look_at(points: NDArray[np.float32], place: Float) -> Index:
+    """(n,) the Look of a scan with end points (N, 2) at places (n, 2), in the sensor frame."""
+    points = points[np.isfinite(points).all(axis=1)]
+    if not len(points):
+        return np.full(len(place), Look.HIDDEN, np.intp)
+    bearing = np.arctan2(points[:, 1], points[:, 0])
+    order = np.argsort(bearing)
+    bearing, distance = bearing[order], np.hypot(points[order, 0], points[order, 1])
+    wanted, far = np.arctan2(place[:, 1], place[:, 0]), np.hypot(place[:, 0], place[:, 1])
+    after = np.searchsorted(bearing, wanted)
+    beams = (after[:, None] + np.arange(-2, 2)) % len(bearing)
+    off = np.abs((bearing[beams] - wanted[:, None] + np.pi) % (2.0 * np.pi) - np.pi)
+    nearest = off.min(axis=1)
+    width = np.maximum(_HALF_WIDTH / np.maximum(far, _DEPTH), nearest)
+    near = off <= width[:, None]
+    count = near.sum(axis=1)
+    past = 2 * (near & (distance[beams] > far[:, None] + _DEPTH)).sum(axis=1) > count
+    before = 2 * (near & (distance[beams] < far[:, None] - _DEPTH)).sum(axis=1) > count
+    look = np.where(past, Look.PASSED, np.where(before, Look.HIDDEN, Look.REACHED))
+    return np.where(nearest > _MAX_BEARING, Look.HIDDEN, look).astype(np.intp)

@@ -20,7 +20,6 @@ from stillmap.io.ros.reader import TopicSelection, collect_messages
 from stillmap.prepare.options import ReadOptions
 
 START = 1_700_000_000_000_000_000
-ENDLESS = "WITH RECURSIVE r(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM r) SELECT x AS id"
 
 
 def scans_of(messages, n=3):

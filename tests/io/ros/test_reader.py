@@ -10,7 +10,6 @@ from stillmap.prepare.options import ReadOptions
 
 START = 1_700_000_000_000_000_000
 SECOND = 10**9
-LEVEL = (0.0, 0.0, 0.0, 1.0)
 
 
 def turned(theta, over=0.0):

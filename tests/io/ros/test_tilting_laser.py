@@ -171,12 +171,3 @@ def test_point_clouds_instead_of_scans(rig, tmp_path):
     found = read_tilting(tmp_path / "a.mcap", wanted)
     hit = rig.tilting.recording.hit
     np.testing.assert_array_equal(found.points[hit], rig.tilting.recording.points[hit])
-
-
-def refused(capsys, *words):
-    """The one line with which the command refuses."""
-    assert main([str(word) for word in (*words, *QUICK)]) == 2
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert err.count("\n") == 1
-    return err
