@@ -87,7 +87,7 @@ def size_of_map(out: Path) -> tuple[int, ...]:
         return npz["p_occupied"].shape
 
 
-@pytest.mark.parametrize("far", [1e4, 1e5, 1e7])
+@pytest.mark.parametrize("far", [1e4, 1e7])
 def test_one_far_pose(map_it, room, poses, far):
     def change(xy):
         xy[20] = far, -far

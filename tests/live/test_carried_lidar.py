@@ -44,6 +44,7 @@ def errors(poses, true):
     return np.linalg.norm((se2.inverse(true[0]) @ true - poses)[:, :3, 3], axis=1)
 
 
+@pytest.mark.slow
 def test_it_is_lost_until_it_recognizes_the_place(back):
     updates, _, _, true, _ = back
     doubts = [update.doubts for update in updates]
@@ -57,6 +58,7 @@ def test_it_is_lost_until_it_recognizes_the_place(back):
     assert all("lost" in one for one in doubts[carried:found])
 
 
+@pytest.mark.slow
 def test_poses_are_known_in_hindsight(back):
     _, _, poses, true, _ = back
     off = errors(poses, true)
@@ -66,6 +68,7 @@ def test_poses_are_known_in_hindsight(back):
     assert np.nanmax(off) < 0.3
 
 
+@pytest.mark.slow
 def test_nothing_is_drawn_over_the_map_until_then(back):
     updates, sizes, _, _, mapper = back
     lost = ["lost" in update.doubts for update in updates]

@@ -75,6 +75,7 @@ def share_near(points, others, most=EDGE):
     return float(np.isfinite(near).mean())
 
 
+@pytest.mark.slow
 def test_it_is_localized_beyond_the_known_map_and_back(rooms, drive):
     first, _, second = rooms
     _, updates, _ = drive
@@ -91,6 +92,7 @@ def test_it_is_localized_beyond_the_known_map_and_back(rooms, drive):
     assert off[-1] < 0.08
 
 
+@pytest.mark.slow
 def test_the_cloud_shows_old_and_new_in_one_frame(rooms, drive):
     first, known, second = rooms
     before, now = static_ends(first), static_ends(second)
@@ -102,6 +104,7 @@ def test_the_cloud_shows_old_and_new_in_one_frame(rooms, drive):
     assert share_near(voxels(extended), truth[::3], 0.25) > 0.995
 
 
+@pytest.mark.slow
 def test_what_was_not_seen_again_stays(rooms, drive):
     first, known, second = rooms
     before, now = static_ends(first), static_ends(second)
@@ -112,6 +115,7 @@ def test_what_was_not_seen_again_stays(rooms, drive):
     assert share_near(unseen, to_world(first, read_cloud(drive[2]))) > 0.95
 
 
+@pytest.mark.slow
 def test_what_was_taken_away_is_gone_and_what_was_brought_is_there(rooms, drive):
     first, known, _ = rooms
     mapper, _, folder = drive
@@ -141,6 +145,7 @@ def occupied_of(first, grid):
     return out
 
 
+@pytest.mark.slow
 def test_the_result_is_whole(drive):
     mapper, updates, folder = drive
     saved, run = stillmap.load(folder), json.loads((folder / "run.json").read_text())
@@ -152,6 +157,7 @@ def test_the_result_is_whole(drive):
     assert (folder / "live/trajectory.tum").is_file()
 
 
+@pytest.mark.slow
 def test_it_is_converted_with_what_was_known(rooms, drive, tmp_path):
     """Of which its recording shows nothing."""
     folder = drive[2]
@@ -161,6 +167,7 @@ def test_it_is_converted_with_what_was_known(rooms, drive, tmp_path):
     assert read_layout(tmp_path / "out.ply").rows == read_layout(folder / "static.ply").rows
 
 
+@pytest.mark.slow
 def test_it_can_be_extended_again(rooms, drive):
     """Which then goes on from the route of both runs, though nobody drives the first one again."""
     _, known, _ = rooms

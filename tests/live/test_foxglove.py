@@ -203,6 +203,7 @@ def test_several_lasers_have_topics_of_their_own(server, corridor):
         )
 
 
+@pytest.mark.slow
 def test_in_three_dimensions(server):
     """Of a mapper that answers with poses (4, 4), points (N, 3) and voxels."""
     T = np.eye(4)

@@ -174,6 +174,7 @@ def closers(monkeypatch):
         closer.stop()
 
 
+@pytest.mark.slow
 def test_poses_stay_right_while_scans_leave_the_graph(closers):
     closer, truth, _ = closers(8, 4 * LAP, 0.003)
     assert len(closer._scans) < 6 * LAP
@@ -186,6 +187,7 @@ def test_poses_stay_right_while_scans_leave_the_graph(closers):
     assert drift > 0.3  # of what was added
 
 
+@pytest.mark.slow
 def test_small_corrections_are_reported_every_25_metres(closers):
     _, truth, reported = closers(4, 10**6, 0.0002)
     counts = [len(one.poses) for one in reported]

@@ -96,6 +96,7 @@ def drift(simulation):
     return float(np.sqrt(np.square(off).sum(axis=1).mean()))
 
 
+@pytest.mark.slow
 def test_live_poses_drift_less(monkeypatch):
     changes = {
         "laser": {"beams": 180, "fov": np.pi},

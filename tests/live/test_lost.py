@@ -67,6 +67,7 @@ def test_poses_elsewhere_are_not_known(run):
     assert "lost" in doubts[-1]
 
 
+@pytest.mark.slow
 def test_the_saved_map_has_the_known_ones(run, worlds):
     poses, _, _, folder = run
     known = np.isfinite(poses).all(axis=(1, 2))
@@ -85,6 +86,7 @@ def test_the_saved_map_has_the_known_ones(run, worlds):
     assert np.mean(np.linalg.norm(off, axis=2).min(axis=1) > 0.2) < 0.01
 
 
+@pytest.mark.slow
 def test_what_was_left_out_is_told(run):
     poses, _, _, folder = run
     record = json.loads((folder / "run.json").read_text())
@@ -97,6 +99,7 @@ def test_what_was_left_out_is_told(run):
     assert "live/submaps" in text
 
 
+@pytest.mark.slow
 def test_other_places_have_maps_of_their_own(run):
     poses, true, _, folder = run
     lengths = []
@@ -116,6 +119,7 @@ def test_other_places_have_maps_of_their_own(run):
     assert not (folder / "live/submaps/3").exists()
 
 
+@pytest.mark.slow
 def test_a_robot_that_was_never_found_makes_a_map_of_its_own(worlds, run, tmp_path):
     *_, known = run
     with LiveMapper({"threads": 1}, place=known, mode="extend") as mapper:

@@ -76,6 +76,7 @@ def test_what_is_kept_is_bounded(hall, tmp_path, capsys):
     assert "--max-scratch" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_at_its_own_pace(hall, tmp_path, capsys):
     words = ["live", "--replay", str(hall), "-o", str(tmp_path / "out"), "--json", "--quiet"]
     assert main([*words, "--rate", "4"]) == 0

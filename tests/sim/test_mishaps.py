@@ -101,7 +101,7 @@ def test_a_carried_robot_goes_on_elsewhere_and_odometry_knows_nothing(seed: int)
     assert np.hypot(*np.diff(after, axis=0).T).sum() > 8.0
 
 
-@pytest.mark.parametrize("tick", [0.1, 1.0, 0.03])
+@pytest.mark.parametrize("tick", [0.1, 1.0])
 def test_stamps_are_rounded(tick: float) -> None:
     robot = {"scans": 100, "scan_rate": 7.0}
     exact = short(robot=robot).recording.stamp_ns

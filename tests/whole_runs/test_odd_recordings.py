@@ -159,7 +159,7 @@ def require_run(one: OddRecording, said: pytest.CaptureFixture[str]) -> None:
         assert [entry for entry in left if not entry.endswith(".resume")] == []
 
 
-@runs(60)
+@runs(25)
 @given(one=odd_recordings())
 def test_odd_recordings(one, capsys):
     require_run(one, capsys)
