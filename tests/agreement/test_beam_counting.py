@@ -31,14 +31,6 @@ def test_sums(beams):
     assert np.abs(sums(core, cells) - expected).max() <= len(beams.hit) * STEP
 
 
-def test_alpha_is_exact_when_e_is(beams):
-    e = np.random.default_rng(0).integers(0, 4097, len(beams.hit)) / np.float32(4096)
-    beams = beams.with_(e=e.astype(np.float32))
-    core, plain = beams.grid(_core), beams.grid(reference)
-    cells = all_cells(core, plain)
-    assert (sums(core, cells)[:, 0] == sums(plain, cells)[:, 0]).all()
-
-
 def test_updating_e_equals_adding_with_the_new_e(beams):
     other = beams.with_(e=np.ones(len(beams.hit), np.float32))
     points, hit, offset, T = beams.arguments
@@ -53,15 +45,6 @@ def test_updating_e_equals_adding_with_the_new_e(beams):
     np.testing.assert_allclose(sums(grids[1], cells), sums(other.grid(reference), cells), atol=1e-9)
 
 
-def test_unobserved_cells(beams):
-    core, plain = beams.grid(_core), beams.grid(reference)
-    cells = all_cells(core, plain)
-    touched = sums(plain, cells).sum(axis=1)
-    clear = (touched == 0) | (touched > STEP)  # the kernel may round shorter chords to zero
-    assert (touched == 0).any()
-    assert ((sums(core, cells).sum(axis=1) > 0) == (touched > 0))[clear].all()
-
-
 def test_dense(beams):
     for kernels in (_core, reference):
         grid = beams.grid(kernels)
@@ -74,41 +57,6 @@ def test_dense(beams):
         assert (alpha.ravel() == expected[:, 0]).all()
         assert (beta.ravel() == expected[:, 1]).all()
         assert alpha.sum() + beta.sum() == pytest.approx(sums(grid, all_cells(grid)).sum())
-
-
-def test_dense_of_a_box(beams):
-    rng = np.random.default_rng(3)
-    for kernels in (_core, reference):
-        grid = beams.grid(kernels)
-        first, shape = grid.bounding_box()
-        whole_first, *whole = grid.dense()
-        assert first.tolist() == whole_first.tolist()
-        assert tuple(shape) == whole[0].shape
-        # boxes that overlap the border, are disjoint from it, or empty
-        for _ in range(20):
-            low = rng.integers(-20, np.array(shape[::-1]) + 20)
-            size = rng.integers(0, 30, len(shape))
-            found_first, *found = grid.dense((first + low).tolist(), size[::-1].tolist())
-            assert found_first.tolist() == (first + low).tolist()
-            for part, of in zip(found, whole, strict=True):
-                padded = np.pad(of, 60)
-                lowest = low[::-1] + 60
-                at = tuple(map(slice, lowest.tolist(), (lowest + size[::-1]).tolist()))
-                np.testing.assert_array_equal(part, padded[at])
-
-
-def test_block_cells(beams):
-    # every observed cell lies in a block
-    grid = beams.grid(_core)
-    edge, lowest = (32 if beams.dimension == 2 else 8), grid.block_cells
-    assert (lowest % edge == 0).all()
-    first, alpha, beta = grid.dense()
-    cells = np.argwhere(alpha + beta > 0)[:, ::-1] + first
-    observed = np.unique(cells // edge * edge, axis=0)
-    known = set(map(tuple, lowest.tolist()))
-    assert set(map(tuple, observed.tolist())) <= known
-    assert len(known) == len(lowest) < 1.5 * len(observed)
-    assert beams.empty_grid(_core).block_cells.shape == (0, beams.dimension)
 
 
 def test_counts_without_moments(beams):

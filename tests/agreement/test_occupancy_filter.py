@@ -79,24 +79,6 @@ def test_agrees_with_the_twin(scans):
     np.testing.assert_array_equal(np.isnan(labels), np.isnan(points).any(axis=1))
 
 
-def test_the_cells_in_which_beams_ended_are_part_of_the_map(scans):
-    _, core, plain = scans
-    cells, p = core.known_cells()
-    assert len(cells) == core.size == len(plain.filters)
-    every = known(core)
-    assert [every[tuple(cell)] for cell in cells.tolist()] == p.tolist()
-
-
-def test_a_part_of_the_map_is_that_part_of_all(scans):
-    _, core, _ = scans
-    if isinstance(core, _core.SweepFilter3D):
-        pytest.skip("in 3D maps are lists of cells")
-    first, every = core.dense()
-    shape = [4] * every.ndim
-    _, part = core.dense((first + 2).tolist(), shape)
-    np.testing.assert_array_equal(part, every[(slice(2, 6),) * every.ndim])
-
-
 def test_changed_blocks_are_told_once(scans):
     room, core, _ = scans
     changed = core.changed_count
@@ -151,14 +133,6 @@ def sweep(filter_, distance, time_bin):
     """Labels of a sweep of a patch that is added."""
     filter_.add(*patch(distance), pixel=(0.03, 0.03), time_bin=time_bin, tag=0)
     return filter_.label(*patch(distance), 0.9)
-
-
-def test_what_appears_in_the_free_space_of_sweeps_moves():
-    core = make(_core, 3)
-    for time_bin in range(4):
-        assert sweep(core, 4.0, time_bin).min() > 0.8
-    assert np.mean(sweep(core, 2.0, 4) < 0.2) > 0.95
-    assert sweep(core, 4.0, 5).min() > 0.9
 
 
 def test_labels_and_sweeps_do_not_depend_on_the_threads():
@@ -278,13 +252,3 @@ def test_sweeps_go_on_from_what_another_map_knows(a_room):
     assert found.keys() == expected.keys()
     values = np.array([[found[cell], expected[cell]] for cell in found])
     np.testing.assert_allclose(values[:, 0], values[:, 1], atol=2e-3)
-
-
-def test_what_appears_where_another_map_is_free_moves():
-    core = make(_core, 3)
-    y, z = (one.ravel() for one in np.meshgrid(np.arange(-42, 42), np.arange(-42, 42)))
-    wall, free = (np.stack([np.full_like(y, x), y, z], axis=1) for x in (40, 20))
-    core.prime(np.concatenate([wall, free]), np.arange(2 * len(y)) < len(y), 8.0)
-    assert core.size == len(y)  # free voxels have no filter
-    assert np.median(sweep(core, 4.05, 0)) > 0.99
-    assert np.mean(sweep(core, 2.05, 1) < 0.2) > 0.9

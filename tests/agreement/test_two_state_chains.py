@@ -1,7 +1,7 @@
 """Two-state chains of one surfel in front of a sensor: kernel against twin."""
 
 from itertools import pairwise, product
-from math import inf, log
+from math import log
 
 import numpy as np
 import pytest
@@ -115,16 +115,6 @@ def test_very_unlikely_classes():
     np.testing.assert_allclose(alone, chain(seen, *CLASSES, 0.97)[poor], rtol=1e-4)
 
 
-@pytest.mark.parametrize("seconds", [1.0, 3.0])
-def test_flickering_chain(seconds):
-    for gap in (1, 2):
-        seen = [(gap * i, i % 2 == 0) for i in range(201)]
-        found, expected = (f(seen, *CLASSES, 0.97, seconds) for f in (lane, chain))
-        assert expected.max() < -100
-        likely = expected > expected.max() - 20
-        np.testing.assert_allclose(found[likely], expected[likely], atol=0.05)
-
-
 @pytest.mark.parametrize("detection", [0.6, 0.8, 0.9, 0.99])
 @pytest.mark.parametrize("misses", [3, 6, 20, 200])
 def test_many_misses(detection, misses):
@@ -132,13 +122,6 @@ def test_many_misses(detection, misses):
     found, expected = lane(seen, *CLASSES, detection), chain(seen, *CLASSES, detection)
     likely = expected > expected.max() - 20
     np.testing.assert_allclose(found[likely], expected[likely], atol=0.1)
-
-
-def test_chain_that_never_changes():
-    # tau beyond all measure: it is there or it is not, and one of the two has to have failed
-    seen = [(0, True), *((i, False) for i in range(1, 60)), (60, True)]
-    found = lane(seen, [0.5, 0.9], [1e12, 1e12], [inf, inf], 0.97)
-    assert np.isfinite(found).all()
 
 
 def test_chain_by_all_state_sequences():

@@ -45,14 +45,6 @@ def test_half_at_the_threshold(hits, passes, threshold, monkeypatch):
     assert found.occupied.cells.tolist() == [[3, 0]]
 
 
-def test_passed_cells_are_free():
-    grid, found = counted(lane(1, 1))
-    m = em.make_occupancy_map(grid, found.occupied)
-    known = m.alpha + m.beta > 0
-    assert (m.p_occupied[known & (m.alpha == 0)] == 0).all()
-    assert np.isnan(m.p_occupied[~known]).all()
-
-
 def test_monotone_in_the_hit_ratio():
     seen = watch([Wall((1, 0), 4.05), Ball(2.0, 0.0, 3, 5), Ball(2.0, 1.0, 5, 15)], 20)
     p = seen.e_step(estimator="hit-ratio").p_static

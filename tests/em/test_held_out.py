@@ -65,14 +65,6 @@ def test_held_out_beams_are_not_in_the_map(room):
     assert figure(room, np.where(of_held, e, 1 - e)) != figure(room, e)
 
 
-@pytest.mark.parametrize("every", [2, 7, 20, 120])
-def test_which_scans(every):
-    held = select_held_out_scans(120, every)
-    assert held.sum() == 120 // every + (120 % every > every // 2)
-    assert set(np.diff(np.flatnonzero(held))) <= {every}
-    assert 0 < np.flatnonzero(held)[0] < every
-
-
 def test_no_score_without_held_out_scans(room):
     assert figure(room, every=0) is None
     assert figure(room, every=121) is None

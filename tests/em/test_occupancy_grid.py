@@ -43,14 +43,6 @@ def test_surfaces_are_added_to_passed_cells(p):
     np.testing.assert_array_equal(np.isnan(m.p_occupied), ~known)
 
 
-def test_empty_grid():
-    m = em.make_occupancy_map(
-        _core.OccupancyGrid2D(1.0),
-        em.CellProbabilities(np.zeros((0, 2), np.int64), np.zeros(0, "f4"), 0.2),
-    )
-    assert m.p_occupied.shape == (0, 0)
-
-
 def at(m, points):
     """p_occupied where these points lie; NaN outside."""
     first = np.round(np.array(m.origin[:2]) / m.resolution).astype(int)

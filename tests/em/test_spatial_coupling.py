@@ -1,7 +1,5 @@
 """Cluster pooling and ground contact: a car of which only the front was observed to arrive."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from recordings import of_one_sensor
@@ -108,11 +106,6 @@ def test_a_person_at_a_wall_does_not_move_it():
     )
     assert (p < 0.5).sum() > 10
     np.testing.assert_array_equal(pooled(surface, p, 0 * p, recording, T), p)
-
-
-def test_no_obstacles_without_ground():
-    _, _, surface = standing(CAR)
-    assert select_obstacles(dataclasses.replace(FLAT, observed=False), surface) is None
 
 
 def test_ground_and_crowns_are_no_obstacles():

@@ -52,11 +52,6 @@ def test_a_cell_of_both_lies_between():
     assert both[0] == pytest.approx(0.5 * (0.05 + both[1]), abs=0.01)
 
 
-def test_static_beams_and_those_without_a_label_do_not_count():
-    labels = [0.9, np.nan, 0.6, 0.8, np.nan]
-    assert updated(labels, labels, share=0.5) == pytest.approx([0.05, 0.05])
-
-
 def test_a_cell_whose_beams_movers_explain_is_less_of_an_obstacle():
     before, after = [0.8, np.nan, 0.8, 0.8, 0.8], [0.2, np.nan, 0.8, 0.8, 0.8]
     explained, stays = updated(before, after, share=0.5)

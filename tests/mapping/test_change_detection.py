@@ -107,14 +107,6 @@ def test_a_door_beside_a_box_is_another_place():
     ]
 
 
-def test_the_order_is_that_of_time_and_then_of_place():
-    times = {30: (50, 52), 0: (10, 11), 60: (50, 52), 90: (30, 31)}
-    parts = [course(beside(x), True, between) for x, between in times.items()]
-    assert [round(one.x, 1) for one in found(*parts)] == [1.2, 10.2, 4.2, 7.2]
-    turned = [round(one.x, 1) for one in found(*parts[::-1])]
-    assert turned == [1.2, 10.2, 4.2, 7.2]
-
-
 def test_nothing_changed():
     assert found(course(np.empty((0, 2)), True)) == []
     assert found(course(BOX, True, count=0)) == []

@@ -83,13 +83,6 @@ def test_beam_times_are_used(room):
     assert errors[1] < 0.5 * errors[0]
 
 
-def test_threads_do_not_matter(room):
-    recording, _, e = room
-    one, many = built(recording, e, 1), built(recording, e, 3)
-    for a, b in zip(vars(one).values(), vars(many).values(), strict=True):
-        assert np.array_equal(a, b)
-
-
 def test_another_base_frame_moves_the_poses(room):
     """T_map_base of another base on the same robot: X T X^-1, up to what other cells make."""
     recording, _, e = room

@@ -256,19 +256,6 @@ def test_reproducible_with_any_number_of_threads(threads):
         np.testing.assert_array_equal(ours, theirs)
 
 
-def test_graph_holds_chain_and_accepted_loops():
-    found = mapped(square())
-    graph, accepted = found.graph, [c for c in found.loops if not c.rejected]
-    K = len(graph.keyframes)
-    assert len(graph.constraints) == K - 1 + len(accepted)
-    along = [(r.first, r.second) for r in graph.constraints[: K - 1]]
-    assert along == [(k, k + 1) for k in range(K - 1)]
-    for relation, closure in zip(graph.constraints[K - 1 :], accepted, strict=True):
-        ends = graph.keyframes[[relation.first, relation.second]]
-        assert ends.tolist() == [closure.earlier, closure.later]
-        np.testing.assert_array_equal(relation.T, closure.T)
-
-
 def test_without_loops_poses_are_incremental():
     simulation = square()
     e = np.full(simulation.recording.n_beams, 0.9, np.float32)

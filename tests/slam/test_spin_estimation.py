@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 import stillmap
-from stillmap.cli.main import main
 from stillmap.core import se3
 from stillmap.core.config import override
-from stillmap.io import stillmap_folder, writers
+from stillmap.io import writers
 from stillmap.pipeline.calibration import time_sweeps
 from stillmap.pipeline.options import Options
 from stillmap.pipeline.result import map_recording
@@ -81,11 +80,6 @@ def test_thinned_sweeps_stay_as_they_are():
     assert estimate_spin(drive("clockwise", pace=0.3, every=5), SlamOptions()) is None
 
 
-@pytest.mark.slow
-def test_slow_motion_shows_no_direction():
-    assert estimate_spin(drive("clockwise", pace=0.05), SlamOptions()) is None
-
-
 def test_sensors_that_look_one_way_do_not_spin():
     recording = drive("clockwise")
     ahead = dataclasses.replace(recording, hit=recording.hit & (recording.points[:, 0] > 0.0))
@@ -114,20 +108,6 @@ def test_saved_results_have_the_beam_times_again(tmp_path):
     np.testing.assert_array_equal(loaded.recording.beam_time, built.recording.beam_time)
     # poses are rounded to the digits of the file
     np.testing.assert_allclose(loaded.deskewed.points, built.deskewed.points, atol=1e-5)
-
-
-@pytest.mark.slow
-def test_filtered_copies(tmp_path):
-    """In its own format nothing is added; one cloud is deskewed as that of `convert`."""
-    stillmap_folder.write(drive("clockwise"), tmp_path / "drive")
-    out, copy = tmp_path / "out", tmp_path / "copy"
-    main(["map", str(tmp_path / "drive"), "-o", str(out), "--quiet", "--set", "threads=1"])
-    main(["filter", str(out), "-o", str(copy), "--below", "0", "--quiet"])
-    assert stillmap_folder.read(copy).beam_time is None
-    main(["filter", str(out), "-o", str(tmp_path / "a.ply"), "--below", "0", "--quiet"])
-    main(["convert", str(out), "-o", str(tmp_path / "b.ply"), "--quiet"])
-    a, b = (stillmap.read(tmp_path / name) for name in ("a.ply", "b.ply"))
-    np.testing.assert_allclose(a.points[a.hit], b.points[b.hit], atol=1e-4)
 
 
 def test_a_reader_that_was_told_of_no_spin_is_believed(tmp_path):

@@ -1,7 +1,5 @@
 """Tracks in 3D that are parts of static surfaces are no objects."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -76,12 +74,6 @@ def test_neighbors_that_move_do_not_count():
     assert drop_surface_parts([one], recording, p) == [one]
 
 
-def test_what_is_nearer_hides_and_does_not_count():
-    recording, p = room(np.where(PATCH, 5.0, 2.0))
-    one = an_object(recording, PATCH)
-    assert count_neighbors([one], recording, labelled(p, PATCH)).tolist() == [[0, 0]]
-
-
 def test_a_single_beam_and_no_object():
     recording, p = room(np.full(len(DIRECTIONS), 5.0))
     own = np.arange(len(DIRECTIONS)) == len(DIRECTIONS) // 2
@@ -89,11 +81,3 @@ def test_a_single_beam_and_no_object():
     assert on_it > 0
     assert behind == 0
     assert drop_surface_parts([], recording, p) == []
-
-
-def test_beams_that_hit_nothing_are_no_neighbors():
-    recording, p = room(np.full(len(DIRECTIONS), 5.0))
-    hit = np.tile(PATCH, SCANS)
-    one = an_object(recording, PATCH)
-    without = dataclasses.replace(recording, hit=hit)
-    assert count_neighbors([one], without, labelled(p, PATCH)).tolist() == [[0, 0]]

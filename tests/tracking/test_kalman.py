@@ -49,10 +49,3 @@ def test_update():
         ours, ours_P = whole(found, k)
         np.testing.assert_allclose(ours, state, atol=1e-12)
         np.testing.assert_allclose(ours_P, P, atol=1e-12)
-
-
-def test_of_nothing():
-    none = kalman.initialize(np.zeros((0, 2)), 1.0, 1.0)
-    assert len(kalman.predict(none, 1.0, 1.0)) == 0
-    assert len(kalman.update(none, np.zeros(0, bool), np.zeros((0, 2)), 1.0)) == 0
-    assert len(kalman.concatenate(none, some(np.random.default_rng(0)))) == 4
