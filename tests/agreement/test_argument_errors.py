@@ -63,13 +63,6 @@ def test_wrong_lengths_and_values(kernel, dimension, name, value):
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_number_of_poses_against_scans(kernel):
-    for poses in (0, 1, 3):
-        T = np.tile(np.eye(3), (poses, 1, 1))
-        assert_raises(kernel, ValueError, "T_map_sensor", T_map_sensor=T)
-
-
-@pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize(
     ("name", "value"),
     [
@@ -121,61 +114,3 @@ def test_end_points_far_away(kernel):
     points = np.ones((5, 2), np.float32)
     points[4, 1] = 1e30
     assert_raises(kernel, ValueError, "end point", points=points)
-
-
-@pytest.mark.parametrize("make", [_core.OccupancyGrid2D, _core.OccupancyGrid3D])
-@pytest.mark.parametrize("resolution", [0.0, -0.1, np.nan, np.inf])
-def test_grid_resolution(make, resolution):
-    with pytest.raises(ValueError, match="resolution"):
-        make(resolution)
-
-
-def surfel_map_of(dimension=2, fitted=True):
-    surface = (_core.SurfelMap2D if dimension == 2 else _core.SurfelMap3D)(0.5)
-    good = arguments("add_beams", dimension)
-    surface.add_end_points(*(good[k] for k in ("points", "hit", "offset", "T_map_sensor")))
-    if fitted:
-        surface.fit()
-    return surface
-
-
-def hmm_of(surface, **changes):
-    chosen = {
-        "rho": [0.9, 0.1],
-        "tau": [1.0, 2.0],
-        "p_detection": 0.9,
-        "bin_seconds": 1.0,
-        "lateral_std": 0.1,
-        "margin": 0.2,
-        "hit_radius": 0.3,
-        "end_margin": 0.4,
-    }
-    kind = _core.OccupancyHmm2D if surface.dimension == 2 else _core.OccupancyHmm3D
-    return kind(surface, **{**chosen, **changes})
-
-
-WRONG_BEAMS = [
-    ("points", np.ones((5, 2)), TypeError),
-    ("points", np.ones((5, 4), np.float32), TypeError),
-    ("hit", np.ones(4, bool), ValueError),
-    ("hit", np.ones(5, np.uint8), TypeError),
-    ("offset", np.array([0, 2, 6]), ValueError),
-    ("offset", np.array([1, 2, 5]), ValueError),
-    ("offset", np.array([0, 6, 5]), ValueError),
-    ("offset", np.array([0, 2, 5], np.int32), TypeError),
-    ("T_map_sensor", np.tile(np.eye(5), (2, 1, 1)), TypeError),
-    ("T_map_sensor", np.tile(np.eye(3), (1, 1, 1)), ValueError),
-]
-
-
-@pytest.mark.parametrize("call", ["add_end_points", "associate_beams", "add"])
-@pytest.mark.parametrize(("name", "value", "error"), WRONG_BEAMS)
-def test_beams_of_surfel_maps_and_hmms(call, name, value, error):
-    surface = surfel_map_of(fitted=call != "add_end_points")
-    beams = arguments("add_beams")
-    beams = {k: beams[k] for k in ("points", "hit", "offset", "T_map_sensor")}
-    target = hmm_of(surface) if call == "add" else surface
-    more = {"time_bin": np.arange(2)} if call == "add" else {}
-    getattr(target, call)(**beams, **more)
-    with pytest.raises(error, match=name):
-        getattr(target, call)(**{**beams, name: value}, **more)

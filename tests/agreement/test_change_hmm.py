@@ -145,12 +145,6 @@ def test_changes_by_hand(pattern, count, first, last):
     assert found.change_bins[0] == (first, last)
 
 
-def test_occupied_share():
-    assert by_hand("T" * 30 + "H" * 30).occupied_share == pytest.approx(29.5 / 59)
-    assert by_hand("H").occupied_share == 1
-    assert by_hand("T").occupied_share == 0
-
-
 def test_two_observations_by_hand():
     model = reference.ChangeModel(60.0, 0.05, 2.0, 0.97)
     p = model.transition(0.5)

@@ -116,66 +116,6 @@ def test_ground_contact_agreement(seed, column, least, share):
     assert np.nanmax(found[2]) < 0.5
 
 
-def relabelled(points, *, is_obstacle, p_static, ground=0.0, at_any_height=0, least=0.05, scans=1):
-    """Relabelled beams in cells of 1 m; surfels by ascending x, then z."""
-    points = np.array(points, np.float32)
-    hit, offset = np.ones(len(points), bool), np.linspace(0, len(points), scans + 1).astype(int)
-    T = np.repeat(IDENTITY, scans, axis=0)
-    surface = _core.SurfelMap3D(1.0)
-    surface.add_end_points(points, hit, offset, T)
-    surface.fit()
-    of = np.lexsort(surface.surfels()[0].T[[2, 1, 0]])
-    values = np.empty((4, surface.size), np.float32)
-    for row, given in zip(values, (is_obstacle, p_static, ground, at_any_height), strict=True):
-        row[of] = given
-    surfel = surface.associate_beams(points, hit, offset, T)
-    known = {
-        "is_obstacle": values[0].astype(bool),
-        "p_static": values[1],
-        "ground_height": values[2],
-        "at_any_height": values[3].astype(bool),
-    }
-    return _core.relabel_ground_contact(
-        surface,
-        points,
-        hit,
-        offset,
-        T,
-        surfel,
-        **known,
-        column_cells=1,
-        max_ground_height=0.3,
-        min_end_height=least,
-    )
-
-
-def test_sole_below_a_moving_leg():
-    leg, sole, below, beside = [0.5, 0.5, 1.2], [0.5, 0.5, 0.07], [0.5, 0.5, 0.04], [1.5, 0.5, 0.9]
-    given = {"is_obstacle": [0, 1, 0], "p_static": [0.9, 0.2, 0.9]}
-    found = relabelled([leg, sole, below, beside], **given)
-    np.testing.assert_array_equal(found, np.array([np.nan, 0.2, np.nan, np.nan], np.float32))
-    lower = relabelled([leg, sole, below, beside], **given, at_any_height=[1, 0, 1])
-    np.testing.assert_array_equal(lower, np.array([np.nan, 0.2, 0.2, np.nan], np.float32))
-    assert np.isnan(relabelled([leg, sole, below, beside], **given, ground=0.03)).all()
-    static = {**given, "p_static": [0.9, 0.6, 0.9]}
-    assert np.isnan(relabelled([leg, sole, below, beside], **static)).all()
-    known = {**given, "p_static": [0.4, 0.2, 0.9]}  # the surfel of the foot is dynamic
-    assert np.isnan(relabelled([leg, sole, below, beside], **known)).all()
-
-
-def test_beams_above_a_mover_are_kept():
-    leg, sole, crown = [0.5, 0.5, 1.2], [0.5, 0.5, 0.07], [0.5, 0.5, 4.2]
-    found = relabelled([leg, sole, crown], is_obstacle=[0, 1, 0], p_static=[0.9, 0.2, 0.9])
-    assert np.isfinite(found).tolist() == [False, True, False]
-
-
-def test_ground_contact_within_one_sweep():
-    leg, sole = [0.5, 0.5, 1.2], [0.5, 0.5, 0.07]
-    given = {"is_obstacle": [0, 1], "p_static": [0.9, 0.2]}
-    assert np.isnan(relabelled([leg, sole], **given, scans=2)).all()
-    assert np.isfinite(relabelled([leg, sole], **given)[1])
-
-
 def row_of(*x):
     """End points in the centres of cells of 1 m in a row."""
     return np.array([[v + 0.5, 0.5, 0.5] for v in x], np.float32)
@@ -202,18 +142,6 @@ def test_separate_clusters():
     assert share == {0: 0.25, 1: 0.25, 2: 0.25, 3: 0.25, 5: 0.0, 6: 0.0}
 
 
-def test_wide_columns_around_zero():
-    assert share_of([row_of(-5, -3, -1)], moving=[-5]) == pytest.approx({-5: 1, -3: 0, -1: 0})
-    share = share_of([row_of(-5, -3, -1)], moving=[-5], column=2)
-    assert share == pytest.approx({-5: 1 / 3, -3: 1 / 3, -1: 1 / 3}, abs=1e-6)
-
-
 def test_sweeps_have_equal_weights():
     share = share_of([row_of(0, 1), row_of(0), row_of(0), row_of(0)], moving=[1])
     assert share == {0: 0.125, 1: 0.5}
-
-
-def test_small_clusters_are_ignored():
-    share = share_of([row_of(0, 1, 2), row_of(0, 1)], moving=[1, 2], fewest=3)
-    assert share == pytest.approx({0: 2 / 3, 1: 2 / 3, 2: 2 / 3}, abs=1e-6)
-    assert np.isnan(list(share_of([row_of(0, 1)], moving=[1], fewest=3).values())).all()

@@ -62,20 +62,6 @@ def test_any_number_of_threads_gives_the_same_bits(beams, held, threads):
     assert one.tobytes() == many.tobytes()
 
 
-def test_any_order_of_scans_gives_the_same_bits(beams, held):
-    whole = filled(_core, beams, held)
-    piecewise = shares_of(_core, beams.dimension, beams.resolution)
-    for t in reversed(range(len(held))):
-        a, b = beams.offset[t], beams.offset[t + 1]
-        piecewise.add(
-            beams.points[a:b], beams.hit[a:b], beams.e[a:b], np.array([0, b - a]),
-            beams.T_map_sensor[t : t + 1], held[t : t + 1],
-        )  # fmt: skip
-    scans = *beams.arguments, held
-    gains = [_core.score_held_out(shares, *scans, **MODEL) for shares in (whole, piecewise)]
-    assert gains[0].tobytes() == gains[1].tobytes()
-
-
 def wall_and_clutter(kernels, dimension):
     """Returns around 3 m (e = 0.7) and 4 m (e = 1) along x, dynamic ones before them."""
     rng = np.random.default_rng(8)
@@ -112,19 +98,6 @@ def test_density_integrates_to_one(dimension, model):
     p = np.exp(gain + log_q)
     assert p[:-1].sum() * step + p[-1] == pytest.approx(1.0, abs=2e-3)
     assert p[:-1].max() > 3 * np.exp(log_q[:-1]).max()  # the map is informative
-
-
-@pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize("kernels", [_core, reference])
-def test_empty_map_scores_zero(kernels, dimension):
-    # no beams: one end per metre with and without the map
-    shares = shares_of(kernels, dimension, 0.1)
-    points = np.full((3, dimension), 0.7, np.float32)
-    points[2] = 0.0  # zero range
-    args = points, np.array([True, False, True]), np.array([0, 3]), np.eye(dimension + 1)[None]
-    gain, beams = kernels.score_held_out(shares, *args, np.array([True]), **MODEL)[0]
-    assert gain == pytest.approx(0.0, abs=1e-12)
-    assert beams == 2
 
 
 def test_returns_near_the_largest_cell():

@@ -75,15 +75,6 @@ def car_beside_wall(at_car, at_wall):
     return surface, cells[:, 1] == 10, cells[:, 0]
 
 
-def test_surfels_without_evidence_follow_their_neighbours():
-    # both ends are dynamic, the middle is unknown
-    surface, car, x = car_beside_wall([5, 6, 7], [0, 9])
-    own = np.where(car, np.where(abs(x - 7) > 2, -4.0, 1.5), 4.0).astype(np.float32)
-    p = _core.smooth_mean_field(surface, own, **MEAN_FIELD)
-    assert (p[car] < 0.5).all()
-    assert (p[~car] > 0.9).all()
-
-
 def test_disjoint_time_spans_do_not_interact():
     # the same, but the rest was hit before the mover came
     surface, car, x = car_beside_wall([5, 6, 7], [0, 9])
@@ -105,20 +96,3 @@ def test_disjoint_time_spans_do_not_interact():
     own = np.where(x < 4, -4.0, 1.5).astype(np.float32)
     p = _core.smooth_mean_field(other, own, **MEAN_FIELD)
     np.testing.assert_array_equal(p > 0.5, x >= 4)
-
-
-def test_surfels_off_the_plane_do_not_interact():
-    # a wheel that rolled by stands on the ground: 0.2 m above it, in the next cell
-    rng = np.random.default_rng(0)
-    ground = np.column_stack([rng.uniform(0, 3, (2000, 2)), np.full(2000, 0.1)])
-    wheel = np.column_stack([np.full(40, 1.5), np.full(40, 1.5), np.full(40, 0.33)])
-    ends = np.concatenate([ground, wheel]).astype(np.float32)
-    surface = _core.SurfelMap3D(0.2)
-    surface.add_end_points(
-        ends, np.ones(2040, bool), np.array([0, 2040]), np.eye(4)[None], np.array([3])
-    )
-    surface.fit()
-    off = surface.surfels()[0][:, 2] > 0
-    assert off.sum() == 1
-    p = _core.smooth_mean_field(surface, np.where(off, -4.0, 0.5).astype(np.float32), **MEAN_FIELD)
-    np.testing.assert_array_equal(p < 0.5, off)

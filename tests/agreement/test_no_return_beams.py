@@ -1,7 +1,5 @@
 """Beams without a return: kernel against twin, and by hand."""
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 import reference
@@ -68,20 +66,6 @@ def test_solid_cells(lossy):
     assert round_ones.solid_cells().shape == (0, room.beams.dimension)
 
 
-def test_nearer_stop_cells_trust_less(lossy):
-    room, beams = lossy
-    solid = room.hmm(_core, room.surface(_core), [0.5], [1.0]).solid_cells()
-    none = solid[:0]
-    cells = cells_of(beams.grid(reference))
-    beta = [
-        parts(_core, beams, stops, end_margin)[0].alpha_beta(cells)[:, 1]
-        for stops, end_margin in ((none, 0.0), (none, 0.3), (solid, 0.3), (solid, np.inf))
-    ]
-    for more, less in pairwise(beta):
-        assert (more >= less).all()
-        assert more.sum() > less.sum() + 5
-
-
 @pytest.mark.parametrize("threads", [1, 3])
 def test_parts_sum_up_exactly(lossy, threads):
     room, beams = lossy
@@ -92,21 +76,6 @@ def test_parts_sum_up_exactly(lossy, threads):
         grid.merge(part)
     for a, b in zip(grid.dense(), beams.grid(_core).dense(), strict=True):
         np.testing.assert_array_equal(a, b)
-
-
-@pytest.mark.parametrize("threads", [1, 3])
-def test_one_part_alone(lossy, threads):
-    room, beams = lossy
-    stops = room.hmm(_core, room.surface(_core), [0.5], [1.0]).solid_cells()
-    both = parts(_core, beams, stops, 0.3)
-    for k, expected in enumerate(both):
-        grids = [None, None]
-        grids[k] = beams.empty_grid(_core)
-        _core.add_no_return_beams(*grids, *beams.arguments, stops, 0.3, threads)
-        for a, b in zip(grids[k].dense(), expected.dense(), strict=True):
-            np.testing.assert_array_equal(a, b)
-    with pytest.raises(ValueError, match="at least one"):
-        _core.add_no_return_beams(None, None, *beams.arguments, stops, 0.3)
 
 
 def test_short_runs_are_not_trusted():

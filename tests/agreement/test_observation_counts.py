@@ -63,23 +63,6 @@ def test_agreement(beams, trust):
         assert np.abs(a.astype(int) - b).max() <= 1
 
 
-def test_clear_is_at_most_observed(beams):
-    time_bin, dynamic = time_bins_of(beams, 2)
-    box = box_of(beams)
-    observed, clear = counted(_core, beams, time_bin, dynamic).dense(*box)
-    assert (clear <= observed).all()
-    assert 0.05 < (clear < observed)[observed > 0].mean() < 0.9
-    for a, b in zip(
-        counted(_core, beams, time_bin, 0 * dynamic == 1).dense(*box),
-        (observed, observed),
-        strict=True,
-    ):
-        np.testing.assert_array_equal(a, b)
-    wider = counted(_core, beams, time_bin, dynamic, radius=4 * beams.resolution).dense(*box)[1]
-    assert (wider <= clear).all()
-    assert wider.sum() < clear.sum()
-
-
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([2, 3]), st.integers(2, 9))
 def test_threads_and_calls_give_the_same_counts(some_beams, seed, dimension, threads):
@@ -151,17 +134,6 @@ def test_by_hand(kernels):
     assert row_of(kernels, [(4.0, False, False, 0)], stop_cells=stops) == [[0] * 8] * 2
 
 
-@pytest.mark.parametrize("kernels", KERNELS, ids=["core", "reference"])
-def test_radius_of_whole_cells(kernels):
-    assert 0.3 / 0.1 < 3.0  # in floating point
-    counts = kernels.ObservationCounts2D(0.1, radius=0.3)
-    points, T = np.array([[0.75, 0.0]], np.float32), np.eye(3)[None].copy()
-    T[0, :2, 2] = 0.05
-    one = np.ones(1, bool)
-    counts.add(points, one, one, np.array([0, 1]), T, np.zeros(1, np.int64))
-    assert counts.dense([0, 0], (1, 9))[1].ravel().tolist() == [1] * 5 + [0] * 4
-
-
 def test_counts_saturate():
     counts = _core.ObservationCounts2D(1.0, radius=0.4)
     n = 70_000
@@ -170,14 +142,3 @@ def test_counts_saturate():
     hit, none = np.ones(n, bool), np.zeros(n, bool)
     counts.add(points, hit, none, np.arange(n + 1), T, np.arange(n), 3)
     assert [rows.tolist() for rows in counts.dense([0, 0], [1, 2])] == [[[65535] * 2]] * 2
-
-
-def arguments():
-    return {
-        "points": np.ones((5, 2), np.float32),
-        "hit": np.ones(5, bool),
-        "is_dynamic": np.zeros(5, bool),
-        "offset": np.array([0, 2, 5]),
-        "T_map_sensor": np.tile(np.eye(3), (2, 1, 1)),
-        "time_bin": np.array([3, 4]),
-    }

@@ -73,13 +73,6 @@ def test_beams_begin_at_the_sensor_and_move_with_the_pose():
     assert share(wall(), [[5.0, 0.5], [-5.0, 0.5]], T=about) == 0.5
 
 
-def test_no_beams():
-    assert share(wall(), np.zeros((0, 2))) == 0.0
-    assert share(wall(), AHEAD, np.zeros(4)) == 0.0
-    # outside the map
-    assert share(wall(), AHEAD, T=se2.matrix(1e12, 0.0, 0.0)) == 0.0
-
-
 def test_3d():
     grid = _core.OccupancyGrid3D(1.0)
     beam = np.array([[0.75, 0.0, 0.0]], np.float32)

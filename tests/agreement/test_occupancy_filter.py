@@ -195,18 +195,6 @@ def test_moved_cells_take_their_evidence_along():
     assert moved.size == core.size
 
 
-def test_cells_that_meet_add_their_evidence():
-    core = make(_core, 2)
-    look(core, 2.0, 0)
-    points = np.array([[2.0, 0.02]], np.float32)
-    args = points, np.ones(1, bool), np.array([0, 1]), np.eye(3)[None]
-    core.add(*args[:2], np.ones(1, np.float32), *args[2:], time_bin=1, tag=1)
-    onto = np.stack([np.eye(3), np.eye(3)])
-    onto[1, :2, 2] = -0.1, 0.3
-    moved = move(core, onto, 100)
-    assert moved.size < core.size
-
-
 def test_maps_that_meet_have_the_last_views_of_both():
     earlier, later = make(_core, 3), make(_core, 3)
     for time_bin in range(40):

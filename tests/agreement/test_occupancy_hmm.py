@@ -279,21 +279,6 @@ def test_threads_and_chunks_give_the_same_bits(room, threads, cuts):
         assert a.tobytes() == b.tobytes()
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_no_returns(a_room, dimension):
-    far = a_room(1, dimension, 0.2, 4, 20)
-    beams = far.beams.with_(hit=np.zeros(len(far.beams.hit), bool))
-    nothing = replace(far, beams=beams)
-    for kernels in (_core, reference):
-        surface = nothing.surface(kernels)
-        assert (surface.size, surface.noise_std) == (0, 0.0)
-        hmm = nothing.hmm(kernels, surface, *CLASSES)
-        hmm.add(*beams.arguments, nothing.time_bin)
-        relative, log_best = hmm.likelihood()
-        assert (relative.shape, log_best.shape) == ((0, len(CLASSES[0])), (0,))
-        assert (surface.associate_beams(*beams.arguments) == -1).all()
-
-
 def test_short_runs_are_not_observed():
     # runs of two beams without a return are skipped, runs of three within a scan are used
     surface = _core.SurfelMap2D(0.1), reference.SurfelMap2D(0.1)

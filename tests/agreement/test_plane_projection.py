@@ -57,11 +57,3 @@ def test_of_equals_the_first_is_kept():
     _, is_hit, beam = _core.project_scan(points, np.ones(4, bool), T, **settings)
     assert beam.tolist() == [0, 2]
     assert is_hit.tolist() == [0, 1]
-
-
-def test_nothing_from_nothing():
-    flat = GroundMap(np.zeros((2, 2)), np.zeros(2), 1.6, True)
-    none = np.zeros((0, 3), np.float32), np.zeros(0, bool), np.eye(4)
-    xy, is_hit, beam = _core.project_scan(*none, **kernel_settings(flat, 0.1, 2048, True))
-    assert xy.shape == (0, 2)
-    assert is_hit.shape == beam.shape == (0,)

@@ -114,29 +114,6 @@ def test_distances_from_a_wall_are_exact():
     np.testing.assert_allclose(weight[2, 3][known], behind[known], atol=1e-6)
 
 
-def test_distances_at_a_grazing_angle():
-    points, origin, _, faces, weight = wall()
-    origin = origin + np.array([1.6, -6.0, 0.0])
-    distances = _core.TsdfVolume(VOXEL, **REACH)
-    distances.integrate(points, origin, np.full(4, 0.4), faces, weight)
-    metres, _ = distances.dense([15, -5, -5], [10, 10, 8])
-    x = (np.arange(15, 23) + 0.5) * VOXEL
-    known = np.isfinite(metres)
-    assert known.sum() > 100
-    np.testing.assert_allclose(
-        metres[known], np.broadcast_to(2.0 - x, metres.shape)[known], atol=1e-6
-    )
-
-
-def test_triangles_edge_on_or_from_behind_are_skipped():
-    points, origin, standoff, faces, weight = wall()
-    distances = _core.TsdfVolume(VOXEL, **REACH)
-    distances.integrate(points, origin + np.array([2.0, 5.0, 0.0]), standoff, faces, weight)
-    distances.integrate(points, origin, -standoff, faces, weight)
-    distances.integrate(points, origin, standoff, faces, np.zeros(2, np.float32))
-    assert len(distances.blocks()) == 0
-
-
 @pytest.mark.parametrize("standoff", [1e-3, 1e-9, 1e-300])
 def test_extent_at_grazing_angles(standoff):
     points, origin, _, faces, weight = wall(20.0, 0.1)

@@ -82,29 +82,6 @@ def test_a_face_through_the_near_plane_by_hand():
     assert set(np.unique(face)) == {-1, 0, 1}
 
 
-def test_of_two_at_one_depth_the_lower_number_is_seen():
-    corners = np.array([[-1.0, -1, 2], [1, -1, 2], [0, 2, 2]])
-    faces = np.array([[0, 1, 2], [2, 1, 0], [1, 2, 0]], np.int32)
-    _, face = _core.render_z_buffer(corners, faces, K, np.eye(4), 64, 48, near=0.1)
-    assert set(np.unique(face)) == {-1, 0}
-
-
-def test_faces_seen_at_their_edge_and_without_area_are_nothing():
-    vertices = np.array([[0.0, 0, 1], [0, 0, 5], [0, 1, 3], [1, 1, 2]])
-    faces = np.array([[0, 1, 2], [3, 3, 3], [3, 3, 2]], np.int32)
-    at = np.array([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]])
-    _, face = _core.render_z_buffer(vertices, faces, at, np.eye(4), 64, 48, near=0.1)
-    assert (face < 0).all()
-
-
-def test_nothing_there():
-    none = np.zeros((0, 3)), np.zeros((0, 3), np.int32)
-    depth, face = _core.render_z_buffer(*none, K, np.eye(4), 5, 4, near=0.1)
-    assert depth.shape == face.shape == (4, 5)
-    assert np.isinf(depth).all()
-    assert (face == -1).all()
-
-
 def test_threads_change_nothing():
     vertices, faces = soup(9, 6000, 0.1)
     larger = np.diag([5.0, 5.0, 1.0]) @ K
