@@ -164,28 +164,6 @@ auto register_to_map(const NdtMap<D>& map, const Points<D>& points, const Flat<f
                          found.model.matched_weight, found.model.total_weight, found.iterations);
 }
 
-// Hessian, gradient, cost and the three weights of the data term at one state.
-template <int D>
-auto linearise_sweep(const NdtMap<D>& map, const Points<D>& points, const Flat<float>& weights,
-                     const Flat<float>& times, const OnePose<D>& T, const Tangents<D>& twist,
-                     double min_weight, double max_flatness, double min_extent, double range_std,
-                     double kernel_width, int level, double slack) {
-  const PlaneRegistrationOptions options{plane_options(min_weight, max_flatness, min_extent),
-                                         range_std,
-                                         kernel_width,
-                                         1.0,
-                                         level,
-                                         slack,
-                                         0,
-                                         1.0};
-  require(level >= 0 && level < map.levels(), "level: out of range");
-  const MotionState<D> at{checked_pose<D>(T, "T"), finite_tangent<D>(twist, "twist")};
-  const auto q =
-      linearise<D>(map, timed_points<D>(points, weights, times), at, level, slack, options, 1);
-  return std::make_tuple(square_of(q.hessian), vector_of(q.gradient), q.cost, q.inlier_weight,
-                         q.matched_weight, q.total_weight);
-}
-
 template <int D>
 auto transform_points(const Points<D>& points, const Flat<float>& times, const Tangents<D>& twist) {
   const size_t n = points.shape(0);
@@ -256,13 +234,6 @@ void bind_3d(nb::module_& m) {
         "the moving frame; information (2 dof, 2 dof) of both. Returns pose, twist, covariance (2 "
         "dof, 2 dof) in the moving frame, the weights of inliers, of points with a plane and of "
         "all points, and the number of Gauss-Newton steps.");
-  m.def("linearise_sweep", &linearise_sweep<D>, nb::arg("map"), nb::arg("points").noconvert(),
-        nb::arg("weights").noconvert(), nb::arg("times").noconvert(), nb::arg("T").noconvert(),
-        nb::arg("twist").noconvert(), nb::kw_only(), nb::arg("min_weight"), nb::arg("max_flatness"),
-        nb::arg("min_extent"), nb::arg("range_std"), nb::arg("kernel_width"), nb::arg("level"),
-        nb::arg("slack"),
-        "Hessian, gradient and cost of the data term of `register_sweep` at one state, and the "
-        "three weights.");
   m.def("transform_by_twist", &transform_points<D>, nb::arg("points").noconvert(),
         nb::arg("times").noconvert(), nb::arg("twist").noconvert(),
         "(N, D) float32: points transformed to the time of the pose, Exp(time twist) p.");

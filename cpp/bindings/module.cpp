@@ -27,7 +27,6 @@ NB_MODULE(_core, m) {
   stillmap::bindings::bind_plane_registration(m);
   stillmap::bindings::bind_pose_refinement(m);
   stillmap::bindings::bind_shortest_paths(m);
-  stillmap::bindings::bind_square_reduction(m);
   stillmap::bindings::bind_texel_raster(m);
   stillmap::bindings::bind_z_buffer(m);
 }

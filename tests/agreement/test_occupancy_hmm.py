@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import reference
 from reference.observation import HIT, SURE
+from scipy.special import ndtr
 from surfel_maps import fit_both, order
 
 from stillmap import _core
@@ -309,3 +310,8 @@ def test_short_runs_are_not_observed():
     expected = {"two": False, "three": True, "three at the end": True, "cut": False}
     expected["next to what is not usable"] = False
     assert seen == {name: [says, says] for name, says in expected.items()}
+
+
+def test_normal_distribution_function():
+    x = np.concatenate([np.linspace(-9.0, 9.0, 5001), [-np.inf, np.inf, np.nan, 0.0]])
+    np.testing.assert_allclose(_core.normal_cdf(x), ndtr(x), rtol=1e-12)

@@ -65,38 +65,6 @@ def test_crop(maps):
     assert known.tolist() == [plain.plane(place, 0, **PLANE) is not None for place in places]
 
 
-@pytest.mark.parametrize(("level", "slack"), [(0, 0.0), (1, 0.2)])
-def test_linearised(maps, level, slack):
-    points, weights, times = cloud(5, 400)
-    T, twist = pose(6, 0.03), np.array([1.0, -0.5, 0.2, 0.3, -0.2, 1.5])
-    core, plain = (
-        k.linearise_sweep(m, points, weights, times, T, twist, **FIT, level=level, slack=slack)
-        for k, m in zip((_core, reference), maps, strict=True)
-    )
-    hessian, gradient, *sums = core
-    assert hessian == pytest.approx(plain.hessian, rel=1e-6, abs=1e-6 * plain.hessian.max())
-    assert gradient == pytest.approx(plain.gradient, rel=1e-6, abs=1e-5)
-    assert sums == pytest.approx(
-        [plain.cost, plain.inlier_weight, plain.matched_weight, plain.total_weight], rel=1e-6
-    )
-    assert 0.0 < plain.inlier_weight <= plain.matched_weight < plain.total_weight
-
-
-def test_gradient_matches_the_cost(maps):
-    """Approximately: the gradient ignores the change of the planes."""
-    points, weights, _ = cloud(5)
-    times, T = np.zeros(len(points), np.float32), pose(6, 0.01)
-
-    def at(pose):
-        fit = {**FIT, "level": 2, "slack": 0.3}
-        return _core.linearise_sweep(maps[0], points, weights, times, pose, np.zeros(6), **fit)
-
-    gradient = at(T)[1][:6]
-    steps = np.eye(6) * 1e-3
-    slope = [(at(T @ se3.exp(d))[2] - at(T @ se3.exp(-d))[2]) / 2e-3 for d in steps]
-    assert np.linalg.norm(slope - gradient) < 0.3 * np.linalg.norm(gradient)
-
-
 def test_register_sweep(maps):
     points, weights, times = cloud(9, 600)
     prior, twist = pose(10, 0.03), np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.4])

@@ -33,7 +33,6 @@ from reference.line_support import line_support
 from reference.mean_field import smooth_mean_field
 from reference.ndt_map import (
     NdtMap3D,
-    linearise_sweep,
     register_sweep,
     transform_by_twist,
     voxel_downsample,

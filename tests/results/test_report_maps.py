@@ -3,6 +3,7 @@
 import dataclasses
 
 import numpy as np
+import pytest
 from PIL import Image
 
 from stillmap.results.colors import ORANGE
@@ -10,17 +11,35 @@ from stillmap.results.map_server import write_map_server
 from stillmap.results.report.figures import (
     UNKNOWN,
     MapView,
+    count_in_squares,
     draw_map,
     draw_points,
     draw_snapshot,
     draw_thinly_observed,
     map_window,
+    reduce_levels,
 )
 from stillmap.results.report.maps import draw_written_map
 
 
 def small_map(result, p):
     return dataclasses.replace(result.map, p_occupied=p, origin=(0.0, 0.0, 0.0), resolution=1.0)
+
+
+@pytest.mark.parametrize("factor", [1, 2, 7])
+def test_squares_of_cells(factor):
+    rng = np.random.default_rng(factor)
+    p = rng.beta(0.3, 0.8, (23, 31)).astype(np.float32)
+    p[rng.random(p.shape) < 0.6] = np.nan
+    levels, count = reduce_levels(p, factor), count_in_squares(p > 0.5, factor)
+    for i, j in np.ndindex(levels.shape):
+        square = p[i * factor :, j * factor :][:factor, :factor]
+        known = square[~np.isnan(square)].astype(np.float64)
+        expected = 101
+        if len(known):
+            expected = round(100 * (known.max() if known.max() > 0.65 else known.mean()))
+        assert levels[i, j] == expected
+        assert count[i, j] == (square > 0.5).sum()
 
 
 def test_map_colours(result):

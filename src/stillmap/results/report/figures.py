@@ -5,13 +5,12 @@ import io
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-import stillmap._core as _core
 from stillmap.core.grid_map import GridMap
 from stillmap.core.tiles import release, tiles_of
 from stillmap.pipeline.snapshots import Snapshot, Value, Window, cut_layer, extent
@@ -255,8 +254,19 @@ def iter_strips(
 
 def _mostly(cells: Mask, among: Mask, factor: int) -> Mask:
     """Squares of `factor` x `factor` cells of which half or more of the cells `among` are true."""
-    count = _core.count_in_squares(cells, factor)
-    return np.asarray((count > 0) & (2 * count >= _core.count_in_squares(among, factor)))
+    count = count_in_squares(cells, factor)
+    return np.asarray((count > 0) & (2 * count >= count_in_squares(among, factor)))
+
+
+def count_in_squares(cells: Mask, factor: int) -> NDArray[np.int64]:
+    """(h, w) number of true cells in squares of `factor` x `factor` cells."""
+    return np.asarray(_reduce_squares(np.add, cells, factor), np.int64)
+
+
+def _reduce_squares(ufunc: np.ufunc, cells: NDArray[Any], factor: int) -> NDArray[Any]:
+    """(h, w) values of squares of `factor` x `factor` cells, cut off at the borders."""
+    rows, columns = (np.arange(0, n, factor) for n in cells.shape)
+    return np.asarray(ufunc.reduceat(ufunc.reduceat(cells, rows, axis=0), columns, axis=1))
 
 
 def reduce_levels(cells: NDArray[np.float32], factor: int) -> NDArray[np.uint8]:
@@ -265,9 +275,12 @@ def reduce_levels(cells: NDArray[np.float32], factor: int) -> NDArray[np.uint8]:
     The maximum where a cell is occupied, so that thin walls stay visible; else the mean of the
     known cells.
     """
-    return _core.reduce_occupancy(
-        np.ascontiguousarray(cells), factor, OCCUPIED_THRESH, UNKNOWN_LEVEL
-    )
+    known = count_in_squares(~np.isnan(cells), factor)
+    total = _reduce_squares(np.add, np.nan_to_num(cells.astype(np.float64)), factor)
+    largest = _reduce_squares(np.fmax, cells, factor)
+    shown = np.where(largest > OCCUPIED_THRESH, largest, total / np.maximum(known, 1))
+    percent = np.rint(100.0 * np.clip(shown, 0.0, 1.0))
+    return np.where(known > 0, percent, UNKNOWN_LEVEL).astype(np.uint8)
 
 
 def color_levels(levels: NDArray[np.uint8], *colors: Color) -> Image.Image:

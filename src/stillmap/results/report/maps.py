@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-import stillmap._core as _core
 from stillmap.core import se2
 from stillmap.core.grid_map import GridMap
 from stillmap.core.tiles import tiles_of
@@ -23,6 +22,7 @@ from stillmap.results.report.figures import (
     UNKNOWN_LEVEL,
     MapView,
     color_by_index,
+    count_in_squares,
     data_uri,
     draw_map,
     draw_points,
@@ -78,10 +78,9 @@ def _reduce_states(p_occupied: NDArray[np.float32], factor: int) -> NDArray[np.u
     occupied, free = states == OCCUPIED, states == FREE
     if factor > 1:
         n_free, n_known = (
-            _core.count_in_squares(np.ascontiguousarray(cells), factor)
-            for cells in (free, ~np.isnan(p_occupied))
+            count_in_squares(cells, factor) for cells in (free, ~np.isnan(p_occupied))
         )
-        occupied = _core.count_in_squares(occupied, factor) > 0
+        occupied = count_in_squares(occupied, factor) > 0
         free = (n_free > 0) & (2 * n_free >= n_known)
     return np.where(occupied, 0, np.where(free, 2, 1)).astype(np.uint8)
 
