@@ -36,6 +36,9 @@ def run_fleet(request: Request) -> Fleet:
         root = str(resolve_output(Path(root)))
     _require_fleet(root)
     sources = find_sources(request.entries, _known_names(root))
+    if is_local(root):  # refused before anything is mapped
+        with explain(root, "written"):
+            Path(root).mkdir(parents=True, exist_ok=True)
     with _remove_unfinished(root, request), _open_client(request) as client:
         tasks = [
             Task("map", source.name, (source.input,), root, request.map_flags)
