@@ -7,7 +7,8 @@ written whole by `core.files.atomic_folder`.
 import json
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -150,27 +151,33 @@ def open_npy(path: Path, scratch: Path | None = None, rows: int | None = None) -
     Raises:
         InputError: it is missing, damaged, or holds Python objects.
     """
-    with InputFile(path) as file:
-        try:
-            shape, is_fortran, dtype = _read_npy_header(file)
-            if rows is not None:
-                shape = (rows, *shape[1:])
-            size = math.prod(shape) * dtype.itemsize
-            if dtype.hasobject or size > file.size - file.tell():
-                raise ValueError(f"no {shape} {dtype} follow its header")
-            content = empty((size,), np.uint8, scratch)
-            for block in iter_blocks(content):
-                file.readinto(content[block].data)
-            array = content.view(dtype).reshape(shape, order="F" if is_fortran else "C")
-        except InputError:
-            raise
-        except OSError as error:
-            what = f"cannot be read: {error.strerror or error}"
-            raise InputError(what, where=str(path)) from error
-        except Exception as error:  # the header parser fails in many ways
-            raise InputError(f"is damaged: {error}", where=str(path)) from error
+    with InputFile(path) as file, _explain_damage(path):
+        shape, is_fortran, dtype = _read_npy_header(file)
+        if rows is not None:
+            shape = (rows, *shape[1:])
+        size = math.prod(shape) * dtype.itemsize
+        if dtype.hasobject or size > file.size - file.tell():
+            raise ValueError(f"no {shape} {dtype} follow its header")
+        content = empty((size,), np.uint8, scratch)
+        for block in iter_blocks(content):
+            file.readinto(content[block].data)
+        array = content.view(dtype).reshape(shape, order="F" if is_fortran else "C")
     array.flags.writeable = False
     return array
+
+
+@contextmanager
+def _explain_damage(path: Path, hint: str = "") -> Iterator[None]:
+    """Turn whatever NumPy, zip and zlib make of damaged bytes into an InputError."""
+    try:
+        yield
+    except InputError:
+        raise
+    except OSError as error:
+        what = f"cannot be read: {error.strerror or error}"
+        raise InputError(what, where=str(path), hint=hint) from error
+    except Exception as error:
+        raise InputError(f"is damaged: {error}", where=str(path), hint=hint) from error
 
 
 def count_rows(path: Path) -> int:
@@ -179,14 +186,9 @@ def count_rows(path: Path) -> int:
     Raises:
         InputError: it is missing or damaged.
     """
-    with InputFile(path) as file:
-        try:
-            shape, _, dtype = _read_npy_header(file)
-            return (file.size - file.tell()) // (math.prod(shape[1:]) * dtype.itemsize)
-        except InputError:
-            raise
-        except Exception as error:  # the header parser fails in many ways
-            raise InputError(f"is damaged: {error}", where=str(path)) from error
+    with InputFile(path) as file, _explain_damage(path):
+        shape, _, dtype = _read_npy_header(file)
+        return (file.size - file.tell()) // (math.prod(shape[1:]) * dtype.itemsize)
 
 
 def _read_npy_header(file: InputFile) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
@@ -220,17 +222,15 @@ def read_npz(
     Raises:
         InputError: the file is missing or damaged, lacks an array, or one is too large.
     """
-    with InputFile(path) as file:
-        try:
-            with np.load(file, allow_pickle=False) as archive:
-                wanted = archive.files if names is None else names
-                for name in wanted:
-                    size = archive.zip.getinfo(f"{name}.npy").file_size
-                    if size > max_bytes:
-                        what = f"is too large: {size >> 20} MiB of {name} when unpacked"
-                        raise InputError(what, where=str(path))
-                return {name: np.asarray(archive[name]) for name in wanted}
-        except InputError:
-            raise
-        except Exception as error:  # whatever NumPy, zip and zlib make of damaged bytes
-            raise InputError(f"is damaged: {error}", where=str(path), hint=hint) from error
+    with (
+        InputFile(path) as file,
+        _explain_damage(path, hint),
+        np.load(file, allow_pickle=False) as archive,
+    ):
+        chosen = archive.files if names is None else names
+        for name in chosen:
+            size = archive.zip.getinfo(f"{name}.npy").file_size
+            if size > max_bytes:
+                what = f"is too large: {size >> 20} MiB of {name} when unpacked"
+                raise InputError(what, where=str(path))
+        return {name: np.asarray(archive[name]) for name in chosen}

@@ -39,10 +39,15 @@ def _write_array(file: Any, array: "Writable") -> None:
     if isinstance(array, np.ndarray):
         np.lib.format.write_array(file, array, allow_pickle=False)
         return
-    header = np.lib.format.header_data_from_array_1_0(np.empty((0, 0), array.dtype))
-    np.lib.format.write_array_header_1_0(file, {**header, "shape": array.shape})
+    _write_header(file, array.shape, array.dtype)
     for rows in array.iter_rows():
         file.write(rows.reshape(-1).view(np.uint8).data)
+
+
+def _write_header(file: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+    """Write the header of a `.npy` file, in which NumPy leaves room for a longer array."""
+    header = np.lib.format.header_data_from_array_1_0(np.empty((0,) * len(shape), dtype))
+    np.lib.format.write_array_header_1_0(file, {**header, "shape": shape})
 
 
 class RowSource(Protocol):
@@ -175,9 +180,8 @@ def write_npy(path: Path, array: NDArray[Any]) -> None:
 
     `np.save` and `ndarray.tofile` do not notice that a disk is full.
     """
-    header = np.lib.format.header_data_from_array_1_0(np.empty((0, *array.shape[1:]), array.dtype))
     with path.open("wb") as file:
-        np.lib.format.write_array_header_1_0(file, {**header, "shape": array.shape})
+        _write_header(file, array.shape, array.dtype)
         for part in iter_bytes(array):
             file.write(part)
 
@@ -354,7 +358,8 @@ class GrowingArray:
     ) -> None:
         self.dtype, self._row, self._length = np.dtype(dtype), row, 0
         self._file = open_unlinked(scratch) if path is None else path.open("w+b", buffering=0)
-        self._write_header()
+        _write_header(self._file, (0, *row), self.dtype)
+        self._file.flush()
         self._begin = self._file.tell()
         self._row_bytes = self.dtype.itemsize * int(np.prod(row, dtype=np.int64))
 
@@ -400,15 +405,9 @@ class GrowingArray:
             OSError: the disk is full.
         """
         self._file.seek(0)
-        self._write_header()
+        _write_header(self._file, (self._length, *self._row), self.dtype)
+        self._file.flush()
 
     def close(self) -> None:
         """Close the file; views stay as they are."""
         self._file.close()
-
-    def _write_header(self) -> None:
-        # NumPy leaves room in it for a longer array
-        empty = np.lib.format.header_data_from_array_1_0(np.empty((0, *self._row), self.dtype))
-        header = {**empty, "shape": (self._length, *self._row)}
-        np.lib.format.write_array_header_1_0(self._file, header)
-        self._file.flush()

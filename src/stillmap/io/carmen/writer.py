@@ -40,6 +40,7 @@ _WITHOUT_POSES = ("RAWLASER1", "RAWLASER2")
 
 _POSITIONS = ("front", "rear")
 _DIGITS = 4  # of ranges in metres
+_HOST = "stillmap"  # in each line
 _MIN_CODE = 81.82  # m: from here on a FLASER reading means "no return"
 _SAME_ANGLE = 1e-5  # rad
 _UNKNOWN_LASER = 99  # CARMEN's laser_type
@@ -59,8 +60,8 @@ class LaserFormat:
     """
 
     kind: str
-    no_return: float = NO_RETURN
-    unusable: float = 0.0
+    no_return: float
+    unusable: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,19 +70,13 @@ class LogFormat:
 
     Attributes:
         lasers: one or two.
-        scan_angles: (T, 2) first angle and step of each scan; None where lines have no angles.
+        scan_angles: (T, 2) first angle and step of each scan.
         params: PARAM lines.
-        comment: first line.
-        host: host name on each line.
-        digits: of ranges in metres.
     """
 
     lasers: tuple[LaserFormat, ...]
-    scan_angles: Float | None
+    scan_angles: Float
     params: dict[str, str]
-    comment: str
-    host: str
-    digits: int = _DIGITS
 
 
 def write_log(recording: Recording, path: Path) -> list[str]:
@@ -98,21 +93,19 @@ def write_log(recording: Recording, path: Path) -> list[str]:
     """
     form = _choose_format(recording)
     with write_atomically(path) as file:
-        for line in format_lines(recording, form):
+        for line in _format_lines(recording, form):
             file.write(line.encode("ascii"))
     if recording.beam_time is None:
         return []
     return ["beam times are left out: CARMEN logs cannot hold them"]
 
 
-def format_lines(recording: Recording, form: LogFormat) -> Iterator[str]:
+def _format_lines(recording: Recording, form: LogFormat) -> Iterator[str]:
     """The lines of a log with line ends: for every scan its odometry, then the scan."""
-    yield f"# {form.comment}\n"
-    if not recording.n_scans:
-        return
+    yield "# stillmap convert\n"
     first = int(recording.stamp_ns[0])
     for name, value in form.params.items():
-        yield f"PARAM {name} {value} {format_seconds(first)} {form.host} {format_seconds(0)}\n"
+        yield f"PARAM {name} {value} {format_seconds(first)} {_HOST} {format_seconds(0)}\n"
     T_odom_base = recording.T_odom_base
     if T_odom_base is not None:
         base = se2.parameters(T_odom_base)
@@ -120,26 +113,25 @@ def format_lines(recording: Recording, form: LogFormat) -> Iterator[str]:
     counts = np.diff(recording.offset)
     for t in recording.iter_scans(range(recording.n_scans)):
         stamp = int(recording.stamp_ns[t])
-        times = f"{format_seconds(stamp)} {form.host} {format_seconds(stamp - first)}\n"
+        times = f"{format_seconds(stamp)} {_HOST} {format_seconds(stamp - first)}\n"
         poses = ""
         if T_odom_base is not None:
             yield f"ODOM {_format_pose(base[t])} 0 0 0 {times}"
             poses = f"{_format_pose(laser[t])} {_format_pose(base[t])} "
         sensor = form.lasers[recording.sensor[t]]
         ranges = laser_scan.beam_ranges(recording, t, sensor.no_return)
-        readings = _format_readings(ranges, sensor, form.digits)
+        readings = _format_readings(ranges, sensor)
         if sensor.kind in _HALF_CIRCLE:
             yield f"{sensor.kind} {readings} {poses}{times}"
             continue
-        assert form.scan_angles is not None
         header = _format_header(form.scan_angles[t], int(counts[t]), sensor)
         velocities = "0 0 0 0 0 " if poses else ""
         yield f"{sensor.kind} {header} {readings} 0 {poses}{velocities}{times}"
 
 
-def _format_readings(ranges: Float, laser: LaserFormat, digits: int) -> str:
+def _format_readings(ranges: Float, laser: LaserFormat) -> str:
     ranges = np.where(np.isnan(ranges), laser.unusable, ranges)
-    form = " ".join([f"%.{digits}f"] * len(ranges))
+    form = " ".join([f"%.{_DIGITS}f"] * len(ranges))
     return f"{len(ranges)} {form % tuple(ranges.tolist())}"
 
 
@@ -178,7 +170,7 @@ def _choose_format(recording: Recording) -> LogFormat:
         lasers.append(LaserFormat(kinds[number], no_return, _unusable_reading(recording, number)))
         x, y, theta = se2.parameters(recording.T_base_sensor[number]).tolist()
         params |= _extrinsics_params(kinds[number], _POSITIONS[number], x, y, theta)
-    return LogFormat(tuple(lasers), angles, params, "stillmap convert", "stillmap")
+    return LogFormat(tuple(lasers), angles, params)
 
 
 def _require_one_count(counts: NDArray[np.int64]) -> None:
