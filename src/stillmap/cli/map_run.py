@@ -22,7 +22,6 @@ from stillmap.mapping.beam_statistics import count_beams
 from stillmap.pipeline import inputs
 from stillmap.pipeline.checkpoint import CheckpointFolder, identify_run
 from stillmap.pipeline.estimate import EmState
-from stillmap.pipeline.map_frame import objects_to_local
 from stillmap.pipeline.options import Options, resolve_options
 from stillmap.pipeline.result import MappingResult, map_recording
 from stillmap.prepare.options import ReadOptions
@@ -205,15 +204,9 @@ def _map_tilting_laser(
     """Map the tilting laser in 3D, given the labels and objects of the planar one."""
     from stillmap.rig.build import PlanarResult, build_tilting, shift_tilting
 
-    frame = result.frame
-    planar = PlanarResult(
-        result.deskewed,
-        frame.to_local(result.poses),
-        result.p_static,
-        objects_to_local(result.objects, frame),
-    )
-    threads = resolve_threads(options.threads)
-    return shift_tilting(build_tilting(planar, tilting, options.em, threads), frame.origin)
+    near, threads = result.near, resolve_threads(options.threads)
+    planar = PlanarResult(near.deskewed, near.poses, near.p_static, near.objects)
+    return shift_tilting(build_tilting(planar, tilting, options.em, threads), result.frame.origin)
 
 
 _IN_SUMMARY = ("version", "converged", "best_iteration", "counts", "area", "seconds", "warnings")

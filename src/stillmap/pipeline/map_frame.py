@@ -133,15 +133,7 @@ def snapshots_to_map(snapshots: Iterable[Snapshot], frame: LocalFrame) -> list[S
 
 def objects_to_map(objects: Iterable[Object], frame: LocalFrame) -> list[Object]:
     """Moving objects of a local frame in the map frame."""
-    return _move_objects(objects, frame.origin)
-
-
-def objects_to_local(objects: Iterable[Object], frame: LocalFrame) -> list[Object]:
-    """Moving objects of the map frame in a local frame."""
-    return _move_objects(objects, -frame.origin)
-
-
-def _move_objects(objects: Iterable[Object], by: Float) -> list[Object]:
+    by = frame.origin
     return [
         dataclasses.replace(one, xy=one.xy + by[:2], z=None if one.z is None else one.z + by[2])
         for one in objects

@@ -70,6 +70,7 @@ class MappingResult(ShortRepr):
         calibration: poses of the lasers and errors of odometry, as the motion shows them.
         quality: of labels and geometry, from 0 to 100.
         frame: in which it was computed; everything here is in the map frame.
+        local: the same in `frame`; None: that is the map frame.
     """
 
     recording: Recording
@@ -88,6 +89,12 @@ class MappingResult(ShortRepr):
     calibration: Calibration = field(default_factory=Calibration)
     quality: Quality = field(default_factory=Quality)
     frame: LocalFrame = field(default_factory=LocalFrame)
+    local: "MappingResult | None" = field(default=None, repr=False)
+
+    @property
+    def near(self) -> "MappingResult":
+        """The same in `frame`, near the robot, where coordinates of 32 bits are precise."""
+        return self if self.local is None else self.local
 
     @property
     def poses(self) -> Float:
@@ -323,4 +330,5 @@ def _to_map_frame(result: MappingResult, frame: LocalFrame) -> MappingResult:
         changes=changes_to_map(result.changes, frame, result.map),
         doors=doors_to_map(result.doors, frame, result.map),
         frame=frame,
+        local=result,
     )

@@ -23,7 +23,6 @@ from stillmap.mesh.texture import TexturedMesh
 from stillmap.mesh.tracked_boxes import box_objects, extrude_boxes
 from stillmap.mesh.triangle_mesh import Mesh
 from stillmap.mesh.views import View
-from stillmap.pipeline.map_frame import objects_to_local
 from stillmap.pipeline.result import MappingResult
 from stillmap.results.gltf import write_glb
 from stillmap.rig.build import TiltingResult, shift_tilting
@@ -62,28 +61,27 @@ def build_models(
         raise ValueError("result: expected one in 3D")
     build.require_extras()
     threads = resolve_threads(result.options.threads)
-    start_ns, frame = int(result.recording.stamp_ns[0]), result.frame
     mapped = result if isinstance(result, MappingResult) else result.mapping
     if mapped is None:
         raise ValueError("result: expected one that was just built")
-    seen = mapped if tilting is None else tilting
-    objects, poses = objects_to_local(seen.objects, frame), frame.to_local(seen.poses)
+    start_ns, origin = int(mapped.recording.stamp_ns[0]), mapped.frame.origin
+    seen: MappingResult | TiltingResult
     if tilting is None:
-        boxes = box_objects(objects, start_ns)
+        seen = mapped.near
+        boxes = box_objects(seen.objects, start_ns)
     else:  # the flat laser gives the tracks, the tilting laser the 3D data
-        near = shift_tilting(tilting, -frame.origin)
-        ground = estimate_ground(near.deskewed, near.poses, near.p_static, threads)
-        boxes = extrude_boxes(near.boxes, near.objects, ground)
-    region = result.options.output.region
+        seen = shift_tilting(tilting, -origin)
+        ground = estimate_ground(seen.deskewed, seen.poses, seen.p_static, threads)
+        boxes = extrude_boxes(seen.boxes, seen.objects, ground)
+    objects, region = seen.objects, result.options.output.region
     if region is not None:
-        region = shift_region(region, -frame.origin)
-    if region is not None:
+        region = shift_region(region, -origin)
         objects = [one for one in objects if is_inside(one.xy, region).any()]
     inputs = MeshInputs(
-        seen.recording, seen.deskewed, poses, seen.p_static, objects, boxes, start_ns
+        seen.recording, seen.deskewed, seen.poses, seen.p_static, objects, boxes, start_ns
     )
     models = build.build_models(inputs, result.options.mesh, threads, progress, stages, region)
-    return dataclasses.replace(models, origin=frame.origin) if frame.is_shifted else models
+    return dataclasses.replace(models, origin=origin) if origin.any() else models
 
 
 def write_models(folder: Path, models: Models, n_images: int, quality: int) -> None:
