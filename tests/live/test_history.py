@@ -141,7 +141,7 @@ def test_loops_closed_beside_end_quietly_when_the_disk_is_full(
         closer = mapper._slam.frame._closer
         assert isinstance(closer, LoopProcess)
         deadline = time.monotonic() + 20.0
-        while not closer._process.has_ended:
+        while closer._process.poll() is None:
             assert time.monotonic() < deadline
             time.sleep(0.05)
         mapper.push(corridor.beams[300], corridor.recording.T_odom_base[300])

@@ -2,8 +2,6 @@
 
 import itertools
 import json
-import os
-import signal
 import time
 
 import numpy as np
@@ -263,8 +261,8 @@ def test_mapping_goes_on_when_the_process_that_closes_loops_dies(corridor, fresh
     mapper = fresh(background=True)
     push_all(mapper, corridor.recording, 50)
     process = mapper._slam.frame._closer._process
-    os.kill(process.id, signal.SIGKILL)
-    while not process.has_ended:
+    process.kill()
+    while process.poll() is None:
         time.sleep(0.01)
     odometry = corridor.recording.T_odom_base
     waiting = []

@@ -1,7 +1,6 @@
 """ROS messages and arrays, without ROS: messages are objects with the same fields."""
 
 import math
-from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -66,16 +65,6 @@ def test_what_stands_and_what_moves():
     static, dynamic = messages.split_ranges(ranges, hit, p_static)
     np.testing.assert_array_equal(static, np.float32([1.0, INF, INF, NAN, 3.0]))
     np.testing.assert_array_equal(dynamic, np.float32([INF, 2.0, INF, INF, INF]))
-
-
-def test_a_scan_with_other_ranges():
-    source, out = laser_scan(3_000_000_001, [1.0, 2.0], scan_time=0.1), MagicMock()
-    messages.copy_scan(out, source, np.array([1.0, INF]))
-    assert (out.header.stamp.sec, out.header.stamp.nanosec) == (3, 1)
-    assert out.header.frame_id == "laser"
-    assert (out.angle_min, out.scan_time, out.range_max) == (-1.0, 0.1, 20.0)
-    assert out.ranges.typecode == "f"
-    assert list(out.ranges) == [1.0, INF]
 
 
 def test_cells_as_nav2_reads_them():

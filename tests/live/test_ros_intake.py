@@ -1,8 +1,6 @@
 """Scans that wait for their mount, for odometry and for other lasers; no ROS."""
 
-import sys
-from pathlib import Path
-
+import fake_ros
 import numpy as np
 import pytest
 from ros_messages import laser_scan, odometry, point_cloud, transform
@@ -11,14 +9,8 @@ from stillmap.core import se2
 from stillmap.live.ros import intake
 from stillmap.live.ros.intake import ScanIntake
 from stillmap.live.ros.parameters import Parameters
-from stillmap.live.ros.transforms import Tf2, Transforms
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "ros"))
-import tf2_ros
-
-TF2 = Tf2(
-    tf2_ros.Buffer, tf2_ros.TransformException, tf2_ros.Fields, tf2_ros.Time, tf2_ros.Duration
-)
+Transforms = fake_ros.load("transforms").Transforms
 
 S = 10**9
 POSE = {"laser_pose": (0.1, 0.0, 0.5)}
@@ -27,7 +19,7 @@ RANGES = [1.0, 2.0]
 
 def make(**values):
     parameters = Parameters(**values)
-    return ScanIntake(parameters, Transforms(parameters, TF2))
+    return ScanIntake(parameters, Transforms(parameters))
 
 
 def add_odometry(scans, message):

@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[2]
 IMPORT_ALL = """
 import importlib, pkgutil, stillmap
 for module in pkgutil.walk_packages(stillmap.__path__, "stillmap."):
-    if module.name == "stillmap.__main__":
+    if module.name == "stillmap.__main__" or module.name.startswith("stillmap.live.ros."):
         continue
     try:
         importlib.import_module(module.name)

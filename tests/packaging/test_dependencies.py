@@ -76,6 +76,7 @@ FOREIGN = sorted(
     {
         (module, group, str(path.relative_to(PACKAGE)))
         for path in PACKAGE.rglob("*.py")
+        if not path.is_relative_to(PACKAGE / "live" / "ros")  # the user's own ROS
         for module, group in imports(path)
         if is_foreign(module)
     }

@@ -237,20 +237,6 @@ class LoopCloser:
         return self._options.keyframe_distance or loop_closure.KEYFRAME_DISTANCE
 
 
-class NoLoops:
-    """In place of a `LoopCloser`: a known map needs no loops."""
-
-    def add(self, scan: MappedScan, explained: float, drift: Float) -> None:
-        """Nothing is kept."""
-
-    def poll(self) -> Correction | None:
-        """Nothing changes."""
-        return None
-
-    def stop(self) -> None:
-        """Nothing to end."""
-
-
 def _without_repetition(scans: NDArray[np.intp], poses: Float) -> tuple[NDArray[np.intp], Float]:
     kept = np.append(True, np.diff(scans) > 0)
     return scans[kept], poses[kept]

@@ -13,7 +13,7 @@ from stillmap.core.short_repr import ShortRepr
 from stillmap.live.causal_labels import CausalLabels, OccupancyFilter, take_over
 from stillmap.live.front_end import FrontEnd, Registration
 from stillmap.live.local_map import LocalMap, MappedScan, thin_scan
-from stillmap.live.loop_closer import Correction, LoopCloser, NoLoops, is_small
+from stillmap.live.loop_closer import Correction, LoopCloser, is_small
 from stillmap.live.loop_process import LoopProcess
 from stillmap.live.observation import Observation
 from stillmap.live.sweep_loop_closer import LiveSweepLoopCloser
@@ -28,7 +28,7 @@ _ADDED_PER_STEP = {2: 2, 3: 1}  # scans that came meanwhile
 SPACED_PER_TAG = {2: 4, 3: 1}
 _KEPT_EVERY_NS = {2: 0, 3: 500_000_000}  # between two of them
 _MIN_SHIFT = 0.5  # cells by which the map must move for its cells to be moved
-LoopClosing = LoopCloser | LiveSweepLoopCloser | LoopProcess | NoLoops
+LoopClosing = LoopCloser | LiveSweepLoopCloser | LoopProcess
 
 _log = logging.getLogger(__name__)
 
@@ -131,14 +131,14 @@ class MapFrame:
 
     Args:
         dimension: 2 or 3.
-        closer: what closes loops between them.
+        closer: what closes loops between them; None: nothing does.
         in_background: apply corrections in parts, one with each scan; else at once.
 
     Attributes:
         T_map_local: (D+1, D+1) of the frame of the odometry by scans.
     """
 
-    def __init__(self, dimension: int, closer: LoopClosing, in_background: bool) -> None:
+    def __init__(self, dimension: int, closer: LoopClosing | None, in_background: bool) -> None:
         D = dimension
         self.T_map_local = np.eye(D + 1)
         self._dimension, self._closer, self._in_background = D, closer, in_background
@@ -192,11 +192,12 @@ class MapFrame:
         self._count += 1
         if self._count % _TRIM_EVERY == 0:
             trim_heap()
-        kept = thin_scan(scan, _MAX_KEPT_BEAMS[self._dimension])
-        try:
-            self._closer.add(kept, found.explained, self._drift)
-        except OSError as error:
-            self._give_up_loops(error)
+        if self._closer is not None:
+            kept = thin_scan(scan, _MAX_KEPT_BEAMS[self._dimension])
+            try:
+                self._closer.add(kept, found.explained, self._drift)
+            except OSError as error:
+                self._give_up_loops(error)
         self._drift = np.zeros((3, 3))
 
     def correct(
@@ -230,7 +231,7 @@ class MapFrame:
 
     def _poll(self) -> Correction | None:
         try:
-            return self._closer.poll()
+            return None if self._closer is None else self._closer.poll()
         except OSError as error:
             self._give_up_loops(error)
             return None
@@ -238,8 +239,8 @@ class MapFrame:
     def _give_up_loops(self, error: OSError) -> None:
         """The disk is full, and no scan can be kept for later loops."""
         _log.error("%s: poses go on, but loops are no longer closed", error.strerror or error)
-        self._closer.stop()
-        self._closer = NoLoops()
+        self.stop()
+        self._closer = None
 
     def enter(self, covariance: Float) -> None:
         """Go on elsewhere in the map, where the robot was found: corrections that were begun
@@ -323,7 +324,8 @@ class MapFrame:
 
     def stop(self) -> None:
         """End the process that closes loops, if there is one."""
-        self._closer.stop()
+        if self._closer is not None:
+            self._closer.stop()
 
 
 def rotate_covariance(covariance: Float, T: Float) -> Float:

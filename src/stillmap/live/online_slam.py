@@ -16,9 +16,8 @@ from stillmap.live.front_end import FrontEnd, Registration
 from stillmap.live.history import History, Placement
 from stillmap.live.known_map import KeptMap
 from stillmap.live.local_map import MappedScan
-from stillmap.live.loop_closer import NoLoops
 from stillmap.live.loop_process import start_closer
-from stillmap.live.map_frame import LabelledScan, LoopClosing, MapFrame, rotate_covariance
+from stillmap.live.map_frame import LabelledScan, MapFrame, rotate_covariance
 from stillmap.live.movers import Mover, MoverTracker
 from stillmap.live.observation import BeamSelector, Observation, find_margins, normals_of, thin
 from stillmap.live.place import PlaceTracker
@@ -82,7 +81,7 @@ class OnlineSlam:
         self._movers = MoverTracker(D)
         self._place, self._finder = place, RobotFinder(place, D)
         self._hindsight = Hindsight(lag)
-        closer: LoopClosing = NoLoops()
+        closer = None
         if place is None and slam.loop_closure:
             closer = start_closer(slam, D, in_background, scratch, threads)
         self.frame = MapFrame(D, closer, in_background)

@@ -115,6 +115,9 @@ class Buffer:
 class Fields:
     """A message whose fields are made as they are asked for."""
 
+    def __init__(self, **fields):
+        self.__dict__.update(fields)
+
     def __getattr__(self, name):
         if name.startswith("__"):
             raise AttributeError(name)

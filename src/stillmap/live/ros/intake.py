@@ -7,7 +7,7 @@ import heapq
 import itertools
 from collections import Counter
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +17,10 @@ from stillmap.io.ros.clouds import find_layout
 from stillmap.io.ros.messages import frame_name, stamp_ns
 from stillmap.live.ros.messages import Mount, shape_of, to_cloud_beams, to_scan_beams
 from stillmap.live.ros.parameters import Parameters
-from stillmap.live.ros.transforms import Transforms
 from stillmap.live.scan import ScanBeams
+
+if TYPE_CHECKING:
+    from stillmap.live.ros.transforms import Transforms
 
 Float = NDArray[np.float64]
 
@@ -88,7 +90,7 @@ class ScanIntake:
         set_back: s by which the clock of all scans was set back for good; 0: it was not.
     """
 
-    def __init__(self, parameters: Parameters, transforms: Transforms) -> None:
+    def __init__(self, parameters: Parameters, transforms: "Transforms") -> None:
         self._parameters, self._transforms = parameters, transforms
         self.counts = Counter[str]()
         self._numbers = itertools.count()

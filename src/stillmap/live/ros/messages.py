@@ -1,12 +1,10 @@
-"""Between ROS messages and our arrays. Messages are any objects with their fields."""
+"""From ROS messages to our arrays, and arrays for ROS messages; no ROS in it."""
 
-import array
 import math
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from stillmap.io.ros.clouds import parse_cloud
 from stillmap.io.ros.lasers import ScanShape
@@ -20,7 +18,6 @@ from stillmap.results.reader import FREE_THRESH, OCCUPIED_THRESH
 Float = NDArray[np.float64]
 
 _MAX_SCAN_TIME = 1.0  # s: time increments that make scans longer are none
-_FLOAT32 = 7  # of PointField
 
 
 class Mount(NamedTuple):
@@ -118,39 +115,6 @@ def to_cloud_beams(
     )
 
 
-def to_matrix(translation: Any, rotation: Any) -> Float:
-    """(4, 4) of a translation, or position, and a quaternion."""
-    T = np.eye(4)
-    T[:3, 3] = translation.x, translation.y, translation.z
-    q = rotation
-    T[:3, :3] = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
-    return T
-
-
-def fill_header(header: Any, frame: str, stamp: int) -> None:
-    """Set frame and stamp (nanoseconds)."""
-    header.frame_id = frame
-    header.stamp.sec, header.stamp.nanosec = divmod(stamp, 10**9)
-
-
-def fill_point(point: Any, values: Any) -> None:
-    """Set x, y and z; in the plane z is 0."""
-    point.x, point.y, point.z = (*map(float, values), 0.0)[:3]
-
-
-def fill_rotation(q: Any, T: Float) -> None:
-    """Set a quaternion to the rotation of a pose (D+1, D+1)."""
-    R = np.eye(3)
-    R[: len(T) - 1, : len(T) - 1] = T[:-1, :-1]
-    q.x, q.y, q.z, q.w = Rotation.from_matrix(R).as_quat(canonical=True).tolist()
-
-
-def fill_heading(q: Any, velocity: Float) -> None:
-    """Set a quaternion to the heading of a velocity."""
-    half = 0.5 * math.atan2(velocity[1], velocity[0])
-    q.x, q.y, q.z, q.w = 0.0, 0.0, math.sin(half), math.cos(half)
-
-
 def spread_covariance(covariance: Float) -> Float:
     """(36,) of a covariance (3, 3) of x, y and yaw, or (6, 6)."""
     out = np.zeros((6, 6))
@@ -172,11 +136,6 @@ def to_cells(p_occupied: NDArray[np.float32], mode: MapMode) -> NDArray[np.int8]
     return raw_pixels(p_occupied).view(np.int8)  # 255 is -1
 
 
-def to_data(values: NDArray[Any], code: str) -> "array.array[Any]":
-    """An array of the kind that rclpy takes without a check of each element."""
-    return array.array(code, values.tobytes())
-
-
 def split_ranges(
     ranges: NDArray[np.float32], hit: NDArray[np.bool_], p_static: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -190,17 +149,6 @@ def split_ranges(
     return np.where(is_dynamic, none, ranges), np.where(is_dynamic, ranges, none)
 
 
-def copy_scan(message: Any, source: Any, ranges: NDArray[np.float32]) -> None:
-    """Set a LaserScan to another one, with other ranges."""
-    fill_header(message.header, source.header.frame_id, stamp_ns(source.header))
-    for name in (
-        *("angle_min", "angle_max", "angle_increment", "time_increment", "scan_time"),
-        *("range_min", "range_max", "intensities"),
-    ):
-        setattr(message, name, getattr(source, name))
-    message.ranges = to_data(ranges.astype(np.float32), "f")
-
-
 def end_points(message: Any, beams: ScanBeams, chosen: NDArray[np.bool_]) -> NDArray[np.float32]:
     """(n, 3) end points of the chosen beams (N,) of a scan in the frame of its message."""
     if beams.dimension == 3:
@@ -209,24 +157,3 @@ def end_points(message: Any, beams: ScanBeams, chosen: NDArray[np.bool_]) -> NDA
     angles = shape_of(message).angles()[chosen]
     flat = np.stack([np.cos(angles), np.sin(angles), np.zeros(len(angles))], axis=1)
     return np.asarray(ranges[:, None] * flat, np.float32)
-
-
-def fill_cloud(
-    message: Any,
-    source: Any,
-    points: NDArray[np.float32],
-    p_static: NDArray[np.float32],
-    make_field: Any,
-) -> None:
-    """Set a PointCloud2 to points (N, 3) with P(static) (N,), with the header of another message;
-    `make_field` makes a PointField."""
-    fill_header(message.header, source.header.frame_id, stamp_ns(source.header))
-    message.fields = []
-    for k, name in enumerate(("x", "y", "z", "p_static")):
-        field = make_field()
-        field.name, field.offset, field.datatype, field.count = name, 4 * k, _FLOAT32, 1
-        message.fields.append(field)
-    message.height, message.width = 1, len(points)
-    message.is_bigendian, message.is_dense = False, True
-    message.point_step, message.row_step = 16, 16 * len(points)
-    message.data = to_data(np.column_stack([points, p_static]).astype("<f4"), "B")

@@ -5,9 +5,18 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticStatus
+from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.clock import Clock, ClockType
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import LaserScan, PointCloud2
+from std_srvs.srv import Trigger
+from tf2_ros import TransformListener
 
 from stillmap.core import config
 from stillmap.core.errors import InputError
@@ -15,7 +24,6 @@ from stillmap.core.profiling import Progress, no_progress
 from stillmap.live.history import FOLDER
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.replay import Show
-from stillmap.live.ros import publishers
 from stillmap.live.ros.intake import (
     BACKWARDS,
     NO_MOUNT,
@@ -26,12 +34,9 @@ from stillmap.live.ros.intake import (
 )
 from stillmap.live.ros.parameters import Parameters, declare
 from stillmap.live.ros.publishers import MapPublisher, Publishers
-from stillmap.live.ros.transforms import Tf2, Transforms
+from stillmap.live.ros.transforms import Transforms
 from stillmap.live.update import DOUBTS
 from stillmap.pipeline.options import Options
-
-if TYPE_CHECKING:
-    from stillmap.live.ros.run import Ros
 
 _NAME = "stillmap"
 _ODOMETRY_DEPTH = 50
@@ -46,7 +51,6 @@ class LiveNode:
     `node` and `save_node` are to be spun, each in a thread of its own.
 
     Args:
-        ros: the user's installation.
         options: see Options.
         output: result folder.
         overwrite: replace what is there.
@@ -59,7 +63,6 @@ class LiveNode:
 
     def __init__(
         self,
-        ros: "Ros",
         options: Options,
         output: Path,
         *,
@@ -67,22 +70,17 @@ class LiveNode:
         make_mapper: Callable[[Options], LiveMapper],
         show: Show | None = None,
     ) -> None:
-        self.node = ros.rclpy.create_node(_NAME)
-        self._ros, self._output, self._overwrite = ros, output, overwrite
-        self._show = show
+        self.node = rclpy.create_node(_NAME)
+        self._output, self._overwrite, self._show = output, overwrite, show
         self.parameters = self._declare(options)
         resolution = self.parameters.resolution
         if resolution != options.slam.resolution:
             changes = {"resolution": resolution, "voxel_size": resolution}
             options = config.override(options, {"slam": changes}, "parameter")
-        tf2, time = ros.tf2_ros, ros.module("time")
-        classes = tf2.Buffer, tf2.TransformException, ros.geometry("TransformStamped")
-        duration = ros.module("duration").Duration
-        self._transforms = Transforms(self.parameters, Tf2(*classes, time.Time, duration))
+        self._transforms = Transforms(self.parameters)
         self._intake = ScanIntake(self.parameters, self._transforms)
-        self._publishers = Publishers(ros, self.node, self.parameters)
-        mode = options.output.map_mode
-        self._map_publisher = MapPublisher(ros, self.node, self.parameters, mode)
+        self._publishers = Publishers(self.node, self.parameters)
+        self._map_publisher = MapPublisher(self.node, self.parameters, options.output.map_mode)
         self._is_simulated = bool(self.node.get_parameter("use_sim_time").value)
         self._options, self._make_mapper = options, make_mapper
         self._former: threading.Thread | None = None  # writes the map before this one
@@ -120,50 +118,33 @@ class LiveNode:
             self._overwrite = True  # the next one replaces ours
 
     def _declare(self, options: Options) -> Parameters:
-        descriptor = self._ros.message("rcl_interfaces/msg/ParameterDescriptor")
-
         def declare_one(name: str, default: Any, meaning: str) -> Any:
-            about = descriptor(description=meaning, dynamic_typing=True, read_only=True)
+            about = ParameterDescriptor(description=meaning, dynamic_typing=True, read_only=True)
             return self.node.declare_parameter(name, default, about).value
 
         return declare(declare_one, resolution=options.slam.resolution)
 
     def _subscribe(self) -> None:
-        node, names, qos = self.node, self.parameters, self._ros.module("qos")
-        sensor = qos.QoSProfile(
-            depth=names.scan_queue_size, reliability=qos.ReliabilityPolicy.BEST_EFFORT
-        )
-        kind = "LaserScan" if names.dimension == 2 else "PointCloud2"
-        scan = self._ros.message(f"sensor_msgs/msg/{kind}")
+        node, names = self.node, self.parameters
+
+        def subscribe(kind: Any, topic: str, callback: Any, depth: int) -> None:
+            qos = QoSProfile(depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT)
+            node.create_subscription(kind, topic, callback, qos)
+
+        kind = LaserScan if names.dimension == 2 else PointCloud2
         for topic in names.topics:
-            node.create_subscription(scan, topic, self._scan_callback(topic), sensor)
-        odometry = self._ros.message("nav_msgs/msg/Odometry")
+            subscribe(kind, topic, self._scan_callback(topic), names.scan_queue_size)
         if names.odom_frame:
-            deep = qos.QoSProfile(
-                depth=_ODOMETRY_DEPTH, reliability=qos.ReliabilityPolicy.BEST_EFFORT
-            )
-            node.create_subscription(odometry, names.odom_topic, self._on_odometry, deep)
-        self._listener = self._listen_to_tf()
-        clock = self._ros.module("clock")
-        steady = clock.Clock(clock_type=clock.ClockType.STEADY_TIME)
+            subscribe(Odometry, names.odom_topic, self._on_odometry, _ODOMETRY_DEPTH)
+        self._listener = _Listener(self._transforms.buffer, node, self._answer_all)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._poll = node.create_timer(_POLL, self._answer_all, clock=steady)
         node.create_timer(_STATUS_PERIOD, self._report, clock=steady)
-
-    def _listen_to_tf(self) -> Any:
-        """A listener of tf2_ros: what comes may be what scans wait for."""
-        answer_all = self._answer_all
-
-        class Listener(self._ros.tf2_ros.TransformListener):  # type: ignore[misc, name-defined]
-            def callback(self, message: Any) -> None:
-                super().callback(message)
-                answer_all()
-
-        return Listener(self._transforms.buffer, self.node)
 
     def _make_save_node(self) -> Any:
         """A hidden node with the service ~/save_map, to be spun beside the other one."""
         # without arguments: a new name or namespace is meant for the other one
-        node = self._ros.rclpy.create_node(
+        node = rclpy.create_node(
             f"_{_NAME}_save",
             namespace=self.node.get_namespace(),
             use_global_arguments=False,
@@ -171,7 +152,7 @@ class LiveNode:
             enable_rosout=False,
         )
         name = f"{self.node.get_fully_qualified_name()}/save_map"
-        node.create_service(self._ros.message("std_srvs/srv/Trigger"), name, self._on_save)
+        node.create_service(Trigger, name, self._on_save)
         return node
 
     def _scan_callback(self, topic: str) -> Any:
@@ -201,10 +182,10 @@ class LiveNode:
     def _answer_all(self) -> None:
         while (arrival := self._intake.take(time.monotonic())) is not None:
             self._answer(arrival)
-        if self._intake.has_waiting and self._poll.is_canceled():
-            self._poll.reset()
-        elif not self._intake.has_waiting and not self._poll.is_canceled():
+        if not self._intake.has_waiting:
             self._poll.cancel()  # a timer that only ticks takes a tenth of a core
+        elif self._poll.is_canceled():
+            self._poll.reset()
         now = time.monotonic()
         if self._is_map_old and now >= self._map_due:
             self._map_due, self._is_map_old = now + self.parameters.map_update_interval, False
@@ -271,11 +252,12 @@ class LiveNode:
             **{reason: str(n) for reason, n in sorted(counts.items())},
             **{DOUBTS[doubt]: str(n) for doubt, n in sorted(doubts.items())},
         }
-        level, text = publishers.OK, "mapping" if self.scans else "waiting for scans"
+        level, text = DiagnosticStatus.OK, "mapping" if self.scans else "waiting for scans"
         if new or doubts:
-            level, text = publishers.WARN, "; ".join([*new, *(DOUBTS[name] for name in doubts)])
+            level = DiagnosticStatus.WARN
+            text = "; ".join([*new, *(DOUBTS[name] for name in doubts)])
         if new[BACKWARDS] or new[NO_MOUNT]:
-            level = publishers.ERROR
+            level = DiagnosticStatus.ERROR
         if self._intake.set_back:
             text = f"clock set back by {self._intake.set_back:.0f} s: no scan is mapped; {text}"
         self._publishers.publish_status(level, text, values)
@@ -296,3 +278,15 @@ class LiveNode:
             if self._intake.counts[reason] == new[reason]:  # for the first time
                 hint = f" ({hints[reason]})" if reason in hints else ""
                 self.node.get_logger().warning(f"{reason}{hint}")
+
+
+class _Listener(TransformListener):  # type: ignore[misc]
+    """A listener of tf2_ros: what comes may be what scans wait for."""
+
+    def __init__(self, buffer: Any, node: Any, answer: Callable[[], None]) -> None:
+        self._answer = answer
+        super().__init__(buffer, node)
+
+    def callback(self, message: Any) -> None:
+        super().callback(message)
+        self._answer()

@@ -1,76 +1,67 @@
 """The node's parameters; names and meanings are those of slam_toolbox and nav2."""
 
-import math
+import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Annotated, Any
 
-from stillmap.core.errors import InputError
+from pydantic import BeforeValidator, Field, model_validator
+from pydantic.dataclasses import dataclass
 
-
-def _parameter(default: Any, meaning: str) -> Any:
-    return field(default=default, metadata={"meaning": meaning})
+from stillmap.core.config import STRICT, option, override
 
 
-@dataclass(frozen=True)
+def _to_tuple(values: Any) -> tuple[Any, ...]:
+    """ROS gives lists; one name is plain."""
+    return (values,) if isinstance(values, str | float | int) else tuple(values or ())
+
+
+_Name = Annotated[str, Field(min_length=1)]
+_Names = Annotated[tuple[_Name, ...], BeforeValidator(_to_tuple)]
+_Numbers = Annotated[tuple[float, ...], BeforeValidator(_to_tuple)]
+
+
+@dataclass(frozen=True, config=STRICT)
 class Parameters:
-    """ROS parameters of the node.
+    """ROS parameters of the node."""
 
-    Raises:
-        InputError: a value is of the wrong type, or out of range.
-    """
-
-    scan_topic: tuple[str, ...] = _parameter(("scan",), "LaserScan topics: one name, or several")
-    cloud_topic: tuple[str, ...] = _parameter(
+    scan_topic: _Names = option(
+        ("scan",), "LaserScan topics: one name, or several", min_length=1, validate_default=True
+    )
+    cloud_topic: _Names = option(
         (), "PointCloud2 topics: one name, or several; where there are any, scan_topic is not read"
     )
-    odom_topic: str = _parameter("odom", "Odometry topic, used where TF has no odometry")
-    map_name: str = _parameter("map", "topic of the map")
-    map_frame: str = _parameter("map", "frame of the map")
-    odom_frame: str = _parameter("odom", "frame of the odometry; empty: there is none")
-    base_frame: str = _parameter("base_footprint", "frame of the robot")
-    laser_pose: tuple[float, ...] = _parameter(
+    odom_topic: str = option("odom", "Odometry topic, used where TF has no odometry")
+    map_name: _Name = option("map", "topic of the map")
+    map_frame: _Name = option("map", "frame of the map")
+    odom_frame: str = option("odom", "frame of the odometry; empty: there is none")
+    base_frame: _Name = option("base_footprint", "frame of the robot")
+    laser_pose: _Numbers = option(
         (),
         "x, y, yaw (m, rad) of each laser on the robot; x, y, z, roll, pitch, yaw of each topic of "
         "clouds; empty: from /tf_static",
     )
-    resolution: float = _parameter(0.05, "m, edge of a map cell")
-    min_laser_range: float = _parameter(0.0, "m, nearer readings are ignored")
-    max_laser_range: float = _parameter(
-        0.0, "m, farther readings count as free space up to here; 0: the laser's own maximum"
+    resolution: float = option(0.05, "m, edge of a map cell", gt=0)
+    min_laser_range: float = option(0.0, "m, nearer readings are ignored", ge=0)
+    max_laser_range: float = option(
+        0.0, "m, farther readings count as free space up to here; 0: the laser's own maximum", ge=0
     )
-    throttle_scans: int = _parameter(1, "every how many scans of a topic one is used")
-    scan_queue_size: int = _parameter(50, "scans that may wait")
-    map_update_interval: float = _parameter(5.0, "s between two maps")
-    transform_publish_period: float = _parameter(
-        0.05, "s at least between two transforms from the map to the odometry; 0: never"
+    throttle_scans: int = option(1, "every how many scans of a topic one is used", ge=1)
+    scan_queue_size: int = option(50, "scans that may wait", ge=1)
+    map_update_interval: float = option(5.0, "s between two maps", gt=0)
+    transform_publish_period: float = option(
+        0.05, "s at least between two transforms from the map to the odometry; 0: never", ge=0
     )
-    transform_timeout: float = _parameter(
-        0.2, "s that a scan waits for transforms and odometry, and that ours last"
+    transform_timeout: float = option(
+        0.2, "s that a scan waits for transforms and odometry, and that ours last", ge=0
     )
-    tf_buffer_duration: float = _parameter(30.0, "s that transforms are kept")
+    tf_buffer_duration: float = option(30.0, "s that transforms are kept", gt=0)
 
-    def __post_init__(self) -> None:
-        for one in fields(self):
-            object.__setattr__(self, one.name, _convert(one.name, one.default, self._raw(one.name)))
-        for name in ("resolution", "map_update_interval", "tf_buffer_duration"):
-            _require(self._raw(name) > 0.0, name, "more than 0", self._raw(name))
-        for name in (
-            "min_laser_range",
-            "max_laser_range",
-            "transform_publish_period",
-            "transform_timeout",
-        ):
-            _require(self._raw(name) >= 0.0, name, "0 or more", self._raw(name))
-        for name in ("throttle_scans", "scan_queue_size"):
-            _require(self._raw(name) >= 1, name, "1 or more", self._raw(name))
-        for name in ("map_frame", "base_frame", "map_name"):
-            _require(bool(self._raw(name)), name, "a name", self._raw(name))
-        names = self.scan_topic
-        _require(bool(names) and all(names), "scan_topic", "at least one name", names)
-        _require(all(self.cloud_topic), "cloud_topic", "names", self.cloud_topic)
+    @model_validator(mode="after")
+    def _check_laser_pose(self) -> "Parameters":
         n = len(self.topics) * (3 if self.dimension == 2 else 6)
-        _require(len(self.laser_pose) in (0, n), "laser_pose", f"{n} numbers", self.laser_pose)
+        if len(self.laser_pose) not in (0, n):
+            raise ValueError(f"'laser_pose' must be {n} numbers, got {self.laser_pose}")
+        return self
 
     @property
     def dimension(self) -> int:
@@ -81,9 +72,6 @@ class Parameters:
     def topics(self) -> tuple[str, ...]:
         """Names of the topics of the scans."""
         return self.cloud_topic or self.scan_topic
-
-    def _raw(self, name: str) -> Any:
-        return getattr(self, name)
 
 
 def declare(declare_one: Callable[[str, Any, str], Any], **defaults: Any) -> Parameters:
@@ -97,29 +85,10 @@ def declare(declare_one: Callable[[str, Any, str], Any], **defaults: Any) -> Par
         InputError: a value is of the wrong type, or out of range.
     """
     values = {}
-    for one in fields(Parameters):
-        default = defaults.get(one.name, one.default)
+    for field in dataclasses.fields(Parameters):
+        default = defaults.get(field.name, getattr(Parameters(), field.name))
         if isinstance(default, tuple):  # ROS knows lists; one name is plain
             default = default[0] if len(default) == 1 else list(default)
-        values[one.name] = declare_one(one.name, default, one.metadata["meaning"])
-    return Parameters(**values)
-
-
-def _convert(name: str, default: Any, value: Any) -> Any:
-    """A value of the type of the default; whole numbers do for floats, one value for several."""
-    if isinstance(default, tuple):
-        kind: Any = str if name.endswith("_topic") else float
-        several = [value] if isinstance(value, str | float | int) else list(value or ())
-        return tuple(_convert(name, kind(), one) for one in several)
-    if isinstance(default, float):
-        is_number = isinstance(value, float | int) and not isinstance(value, bool)
-        _require(is_number and math.isfinite(value), name, "a number", value)
-        return float(value)
-    wanted = "a whole number" if isinstance(default, int) else "text"
-    _require(type(value) is type(default), name, wanted, value)
-    return value
-
-
-def _require(holds: bool, name: str, expected: str, value: object) -> None:
-    if not holds:
-        raise InputError(f"parameter {name}: expected {expected}, got {value!r}")
+        meaning = Parameters.__pydantic_fields__[field.name].description
+        values[field.name] = declare_one(field.name, default, meaning or "")
+    return override(Parameters(), values, "parameters")

@@ -1,64 +1,71 @@
 """Publishers of the node: pose, transform, movers, labelled scans, diagnostics and the map."""
 
+import array
+import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from builtin_interfaces.msg import Duration, Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs import msg as geometry
+from nav_msgs.msg import MapMetaData, OccupancyGrid
 from numpy.typing import NDArray
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import LaserScan, PointCloud2, PointField
+from std_msgs.msg import ColorRGBA, Header
+from tf2_ros import TransformBroadcaster
+from visualization_msgs.msg import Marker, MarkerArray
 
 from stillmap.core import se2
 from stillmap.core.grid_map import GridMap
 from stillmap.io.ros.messages import stamp_ns
 from stillmap.live.causal_labels import MapChange
 from stillmap.live.movers import Mover
-from stillmap.live.ros import messages
 from stillmap.live.ros.intake import Arrival
+from stillmap.live.ros.messages import end_points, split_ranges, spread_covariance, to_cells
 from stillmap.live.ros.parameters import Parameters
 from stillmap.live.update import Update
 from stillmap.pipeline.options import MapMode
 
-if TYPE_CHECKING:
-    from stillmap.live.ros.run import Ros
+try:
+    from map_msgs.msg import OccupancyGridUpdate
+except ImportError:
+    OccupancyGridUpdate = None
 
-OK, WARN, ERROR = b"\x00", b"\x01", b"\x02"  # levels of DiagnosticStatus
+Float = NDArray[np.float64]
 
 _DEPTH, _SCAN_DEPTH = 10, 5  # messages kept for readers that fall behind
 _PERIOD_NS = 10**9  # between two updates of the map
-
-# of Marker
-_ARROW, _CYLINDER, _TEXT = 0, 3, 9
-_ADD, _DELETE = 0, 2
 _NAMES = ("mover", "velocity", "number")  # namespaces of the markers of a mover
 _HEIGHT = 1.7  # m, of a cylinder: nobody knows better in the plane
 _LETTERS = 0.3  # m, height of numbers
-_ORANGE, _WHITE = (1.0, 0.5, 0.0, 0.8), (1.0, 1.0, 1.0, 1.0)
+_ORANGE = {"r": 1.0, "g": 0.5, "b": 0.0, "a": 0.8}
+_WHITE = {"r": 1.0, "g": 1.0, "b": 1.0, "a": 1.0}
 
 
 class Publishers:
     """Publishers of answers and of diagnostics.
 
     Args:
-        ros: the user's installation.
         node: of rclpy.
         parameters: see Parameters.
     """
 
-    def __init__(self, ros: "Ros", node: Any, parameters: Parameters) -> None:
-        self._ros, self._node, self._parameters = ros, node, parameters
+    def __init__(self, node: Any, parameters: Parameters) -> None:
+        self._node, self._parameters = node, parameters
         publish = node.create_publisher
-        self._pose = publish(ros.geometry("PoseWithCovarianceStamped"), "pose", _DEPTH)
-        self._tf = ros.tf2_ros.TransformBroadcaster(node)
-        self._mover_poses = publish(ros.geometry("PoseArray"), "mover_poses", _DEPTH)
-        markers = ros.message("visualization_msgs/msg/MarkerArray")
-        self._markers = publish(markers, "movers", _DEPTH)
-        status = ros.message("diagnostic_msgs/msg/DiagnosticArray")
-        self._diagnostics = publish(status, "/diagnostics", _DEPTH)
-        cloud = ros.message("sensor_msgs/msg/PointCloud2")
-        scan = ros.message("sensor_msgs/msg/LaserScan") if parameters.dimension == 2 else cloud
+        self._pose = publish(geometry.PoseWithCovarianceStamped, "pose", _DEPTH)
+        self._tf = TransformBroadcaster(node)
+        self._mover_poses = publish(geometry.PoseArray, "mover_poses", _DEPTH)
+        self._markers = publish(MarkerArray, "movers", _DEPTH)
+        self._diagnostics = publish(DiagnosticArray, "/diagnostics", _DEPTH)
+        scan = LaserScan if parameters.dimension == 2 else PointCloud2
         self._scans = {
             topic: [
                 publish(kind, f"{topic}_{name}", _SCAN_DEPTH)
-                for name, kind in (("static", scan), ("dynamic", scan), ("points", cloud))
+                for name, kind in (("static", scan), ("dynamic", scan), ("points", PointCloud2))
             ]
             for topic in parameters.topics
         }
@@ -75,12 +82,10 @@ class Publishers:
         names, stamp = self._parameters, stamp_ns(arrival.message.header)
         is_lost = "lost" in update.doubts
         if not is_lost:
-            pose = self._ros.geometry("PoseWithCovarianceStamped")()
-            messages.fill_header(pose.header, names.map_frame, stamp)
-            messages.fill_point(pose.pose.pose.position, update.pose[:-1, -1])
-            messages.fill_rotation(pose.pose.pose.orientation, update.pose)
-            pose.pose.covariance = messages.spread_covariance(update.covariance)
-            self._pose.publish(pose)
+            covariance = spread_covariance(update.covariance)
+            pose = geometry.PoseWithCovariance(pose=_to_pose(update.pose), covariance=covariance)
+            header = _to_header(names.map_frame, stamp)
+            self._pose.publish(geometry.PoseWithCovarianceStamped(header=header, pose=pose))
             self._publish_transform(update, stamp)
         self._publish_movers([] if is_lost else update.movers, stamp)
         self._publish_scan(arrival, update.p_static)
@@ -97,64 +102,40 @@ class Publishers:
         if not names.transform_publish_period or stamp < self._tf_due_ns or T is None:
             return
         self._tf_due_ns = stamp + round(1e9 * names.transform_publish_period)
-        message = self._ros.geometry("TransformStamped")()
         until = stamp + round(1e9 * names.transform_timeout)
-        messages.fill_header(message.header, names.map_frame, until)
-        message.child_frame_id = names.odom_frame or names.base_frame
-        messages.fill_point(message.transform.translation, T[:-1, -1])
-        messages.fill_rotation(message.transform.rotation, T)
-        self._tf.sendTransform(message)
+        self._tf.sendTransform(
+            geometry.TransformStamped(
+                header=_to_header(names.map_frame, until),
+                child_frame_id=names.odom_frame or names.base_frame,
+                transform=geometry.Transform(
+                    translation=_to_vector(T[:-1, -1], geometry.Vector3), rotation=_to_rotation(T)
+                ),
+            )
+        )
 
     def _publish_movers(self, movers: Sequence[Mover], stamp: int) -> None:
         """The movers of a scan; markers of others are removed."""
+        header = _to_header(self._parameters.map_frame, stamp)
         if self._mover_poses.get_subscription_count():
-            message = self._ros.geometry("PoseArray")()
-            messages.fill_header(message.header, self._parameters.map_frame, stamp)
-            message.poses = []
-            for mover in movers:
-                pose = self._ros.geometry("Pose")()
-                messages.fill_point(pose.position, mover.position)
-                messages.fill_heading(pose.orientation, mover.velocity)
-                message.poses.append(pose)
-            self._mover_poses.publish(message)
+            poses = [
+                geometry.Pose(
+                    position=_to_vector(mover.position), orientation=_to_heading(mover.velocity)
+                )
+                for mover in movers
+            ]
+            self._mover_poses.publish(geometry.PoseArray(header=header, poses=poses))
         if not self._markers.get_subscription_count():
             return
         numbers = {mover.number for mover in movers}
         gone, self._shown = sorted(self._shown - numbers), numbers
-        if movers or gone:
-            message = self._ros.message("visualization_msgs/msg/MarkerArray")()
-            message.markers = [
-                self._marker(name, number, stamp, _DELETE) for number in gone for name in _NAMES
-            ]
-            for mover in movers:
-                message.markers += self._markers_of(mover, stamp)
-            self._markers.publish(message)
-
-    def _marker(self, name: str, number: int, stamp: int, action: int = _ADD) -> Any:
-        marker = self._ros.message("visualization_msgs/msg/Marker")()
-        messages.fill_header(marker.header, self._parameters.map_frame, stamp)
-        marker.ns, marker.id, marker.action = name, number, action
-        marker.lifetime.sec = 1  # s: markers vanish with a node that dies
-        marker.pose.orientation.w = 1.0
-        return marker
-
-    def _markers_of(self, mover: Mover, stamp: int) -> list[Any]:
-        """A cylinder, an arrow to where it is a second later, and the number."""
-        x, y, z = (*mover.position.tolist(), 0.5 * _HEIGHT)[:3]
-        every = body, arrow, text = [self._marker(name, mover.number, stamp) for name in _NAMES]
-        body.type, arrow.type, text.type = _CYLINDER, _ARROW, _TEXT
-        messages.fill_point(body.pose.position, (x, y, z))
-        messages.fill_point(text.pose.position, (x, y, z + 0.5 * _HEIGHT + _LETTERS))
-        messages.fill_point(body.scale, (2.0 * mover.radius, 2.0 * mover.radius, _HEIGHT))
-        messages.fill_point(arrow.scale, (0.06, 0.14, 0.0))  # m, diameters of shaft and head
-        text.scale.z, text.text = _LETTERS, str(mover.number)
-        vx, vy, vz = (*mover.velocity.tolist(), 0.0)[:3]
-        arrow.points = [self._ros.geometry("Point")() for _ in range(2)]
-        messages.fill_point(arrow.points[0], (x, y, z))
-        messages.fill_point(arrow.points[1], (x + vx, y + vy, z + vz))
-        for marker, color in zip(every, (_ORANGE, _WHITE, _WHITE), strict=True):
-            marker.color.r, marker.color.g, marker.color.b, marker.color.a = color
-        return every
+        markers = [
+            Marker(header=header, ns=name, id=number, action=Marker.DELETE)
+            for number in gone
+            for name in _NAMES
+        ]
+        markers += [marker for mover in movers for marker in _to_markers(mover, header)]
+        if markers:
+            self._markers.publish(MarkerArray(markers=markers))
 
     def _publish_scan(self, arrival: Arrival, p_static: NDArray[np.float32]) -> None:
         """TOPIC_static, TOPIC_dynamic and TOPIC_points of a scan with P(static) (N,), for those who
@@ -162,72 +143,49 @@ class Publishers:
         *parts, points = self._scans[arrival.topic]
         is_end = arrival.beams.hit & np.isfinite(p_static)
         if points.get_subscription_count():
-            self._publish_cloud(points, arrival, p_static, is_end)
+            points.publish(_to_cloud(arrival, p_static, is_end))
         if not any(publisher.get_subscription_count() for publisher in parts):
             return
         if arrival.beams.dimension == 3:
             for publisher, chosen in zip(parts, (p_static >= 0.5, p_static < 0.5), strict=True):
-                self._publish_cloud(publisher, arrival, p_static, is_end & chosen)
+                publisher.publish(_to_cloud(arrival, p_static, is_end & chosen))
             return
         ranges = np.asarray(arrival.message.ranges, np.float32)
-        split = messages.split_ranges(ranges, arrival.beams.hit, p_static)
+        split = split_ranges(ranges, arrival.beams.hit, p_static)
         for publisher, of_label in zip(parts, split, strict=True):
-            message = self._ros.message("sensor_msgs/msg/LaserScan")()
-            messages.copy_scan(message, arrival.message, of_label)
-            publisher.publish(message)
-
-    def _publish_cloud(
-        self,
-        publisher: Any,
-        arrival: Arrival,
-        p_static: NDArray[np.float32],
-        chosen: NDArray[np.bool_],
-    ) -> None:
-        """The chosen (N,) end points of a scan."""
-        message = self._ros.message("sensor_msgs/msg/PointCloud2")()
-        points = messages.end_points(arrival.message, arrival.beams, chosen)
-        field = self._ros.message("sensor_msgs/msg/PointField")
-        messages.fill_cloud(message, arrival.message, points, p_static[chosen], field)
-        publisher.publish(message)
+            publisher.publish(_copy_scan(arrival.message, of_label))
 
     def publish_status(self, level: bytes, text: str, values: dict[str, str]) -> None:
         """One line of diagnostics."""
-        ros = self._ros
-        message = ros.message("diagnostic_msgs/msg/DiagnosticArray")()
-        status = ros.message("diagnostic_msgs/msg/DiagnosticStatus")()
-        messages.fill_header(message.header, "", self._node.get_clock().now().nanoseconds)
-        status.name, status.level = f"{self._node.get_name()}: mapping", level
-        status.message, status.hardware_id = text, ""
-        entries = []
-        for key, value in values.items():
-            entry = ros.message("diagnostic_msgs/msg/KeyValue")()
-            entry.key, entry.value = key, value
-            entries.append(entry)
-        status.values, message.status = entries, [status]
-        self._diagnostics.publish(message)
+        status = DiagnosticStatus(
+            name=f"{self._node.get_name()}: mapping",
+            level=level,
+            message=text,
+            values=[KeyValue(key=key, value=value) for key, value in values.items()],
+        )
+        header = _to_header("", self._node.get_clock().now().nanoseconds)
+        self._diagnostics.publish(DiagnosticArray(header=header, status=[status]))
 
 
 class MapPublisher:
     """Publishes the map, and what changes in it where map_msgs is there.
 
     Args:
-        ros: the user's installation.
         node: of rclpy.
         parameters: topic and frame; updates are on TOPIC_updates, as RViz and nav2 expect.
         mode: how it is written.
     """
 
-    def __init__(self, ros: "Ros", node: Any, parameters: Parameters, mode: MapMode) -> None:
-        self._ros, self._frame, self._mode = ros, parameters.map_frame, mode
-        topic, qos = parameters.map_name, ros.module("qos")
-        latched = qos.QoSProfile(depth=1, durability=qos.DurabilityPolicy.TRANSIENT_LOCAL)
-        self._map = node.create_publisher(ros.message("nav_msgs/msg/OccupancyGrid"), topic, latched)
-        self._update = ros.message("map_msgs/msg/OccupancyGridUpdate")
+    def __init__(self, node: Any, parameters: Parameters, mode: MapMode) -> None:
+        self._frame, self._mode = parameters.map_frame, mode
+        topic = parameters.map_name
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._map = node.create_publisher(OccupancyGrid, topic, latched)
         self._updates = None
-        if self._update is None:
+        if OccupancyGridUpdate is None:
             node.get_logger().warning("map_msgs is missing: the map is published without updates")
         else:
-            self._updates = node.create_publisher(self._update, f"{topic}_updates", _DEPTH)
+            self._updates = node.create_publisher(OccupancyGridUpdate, f"{topic}_updates", _DEPTH)
         # the map as it was published, with all updates; column and row of its lowest cell
         self._cells, self._first = np.zeros((0, 0), np.int8), np.zeros(2, np.int64)
         self._waiting = dict[tuple[int, ...], MapChange]()
@@ -235,19 +193,19 @@ class MapPublisher:
 
     def publish(self, grid: GridMap, stamp: int) -> None:
         """The whole map; who comes later gets the last one."""
-        self._cells = messages.to_cells(grid.p_occupied, self._mode)
+        self._cells = to_cells(grid.p_occupied, self._mode)
         self._first = np.rint(np.array(grid.origin[:2]) / grid.resolution).astype(np.int64)
         self._waiting.clear()
-        message = self._ros.message("nav_msgs/msg/OccupancyGrid")()
-        messages.fill_header(message.header, self._frame, stamp)
-        message.info.map_load_time.sec = message.header.stamp.sec
-        message.info.map_load_time.nanosec = message.header.stamp.nanosec
-        message.info.resolution = float(grid.resolution)
-        message.info.height, message.info.width = self._cells.shape
-        messages.fill_point(message.info.origin.position, grid.origin[:2])
-        messages.fill_rotation(message.info.origin.orientation, se2.matrix(*grid.origin))
-        message.data = messages.to_data(self._cells, "b")
-        self._map.publish(message)
+        header, (height, width) = _to_header(self._frame, stamp), self._cells.shape
+        info = MapMetaData(
+            map_load_time=header.stamp,
+            resolution=float(grid.resolution),
+            width=width,
+            height=height,
+            origin=_to_pose(se2.matrix(*grid.origin)),
+        )
+        data = _to_data(self._cells, "b")
+        self._map.publish(OccupancyGrid(header=header, info=info, data=data))
 
     def publish_changes(self, changes: Sequence[MapChange], stamp: int) -> bool:
         """Publish the tiles that changed, once a second; False: the map has become larger, and a
@@ -264,12 +222,16 @@ class MapPublisher:
         self._published_ns = stamp
         is_heard = self._updates.get_subscription_count() > 0
         if box is not None and is_heard:
-            message, (rows, columns) = self._update(), box
-            messages.fill_header(message.header, self._frame, stamp)
-            message.x, message.y = columns.start, rows.start
-            message.height, message.width = self._cells[box].shape
-            message.data = messages.to_data(self._cells[box], "b")
-            self._updates.publish(message)
+            cells, (rows, columns) = self._cells[box], box
+            update = OccupancyGridUpdate(
+                header=_to_header(self._frame, stamp),
+                x=columns.start,
+                y=rows.start,
+                width=cells.shape[1],
+                height=cells.shape[0],
+                data=_to_data(cells, "b"),
+            )
+            self._updates.publish(update)
         return box is not None or not is_heard
 
     def _take_over(self, changes: Sequence[MapChange]) -> tuple[slice, slice] | None:
@@ -282,6 +244,98 @@ class MapPublisher:
         for (left, bottom), (right, top), change in zip(
             low.tolist(), high.tolist(), changes, strict=True
         ):
-            self._cells[bottom:top, left:right] = messages.to_cells(change.p_occupied, self._mode)
+            self._cells[bottom:top, left:right] = to_cells(change.p_occupied, self._mode)
         (left, bottom), (right, top) = low.min(axis=0).tolist(), high.max(axis=0).tolist()
         return slice(bottom, top), slice(left, right)
+
+
+def _to_markers(mover: Mover, header: Any) -> list[Any]:
+    """A cylinder, an arrow to where it is a second later, and the number."""
+    upright, width = geometry.Quaternion(w=1.0), 2.0 * mover.radius
+
+    def make(kind: int, name: str, color: dict[str, float], scale: Sequence[float], at: Any) -> Any:
+        return Marker(
+            header=header,
+            type=kind,
+            ns=name,
+            id=mover.number,
+            color=ColorRGBA(**color),
+            scale=_to_vector(scale, geometry.Vector3),
+            pose=geometry.Pose(position=at, orientation=upright),
+            lifetime=Duration(sec=1),  # markers vanish with a node that dies
+        )
+
+    x, y, z = (*mover.position.tolist(), 0.5 * _HEIGHT)[:3]
+    vx, vy, vz = (*mover.velocity.tolist(), 0.0)[:3]
+    at, end = _to_vector((x, y, z)), _to_vector((x + vx, y + vy, z + vz))
+    top, origin = _to_vector((x, y, z + 0.5 * _HEIGHT + _LETTERS)), geometry.Point()
+    diameters = (0.06, 0.14, 0.0)  # m, of shaft and head
+    body = make(Marker.CYLINDER, _NAMES[0], _ORANGE, (width, width, _HEIGHT), at)
+    arrow = make(Marker.ARROW, _NAMES[1], _WHITE, diameters, origin)
+    text = make(Marker.TEXT_VIEW_FACING, _NAMES[2], _WHITE, (0.0, 0.0, _LETTERS), top)
+    arrow.points, text.text = [at, end], str(mover.number)
+    return [body, arrow, text]
+
+
+def _to_cloud(arrival: Arrival, p_static: NDArray[np.float32], chosen: NDArray[np.bool_]) -> Any:
+    """A PointCloud2 of the chosen (N,) end points of a scan with their P(static)."""
+    points = end_points(arrival.message, arrival.beams, chosen)
+    rows, header = np.column_stack([points, p_static[chosen]]), arrival.message.header
+    return PointCloud2(
+        header=_to_header(header.frame_id, stamp_ns(header)),
+        height=1,
+        width=len(points),
+        fields=[
+            PointField(name=name, offset=4 * k, datatype=PointField.FLOAT32, count=1)
+            for k, name in enumerate(("x", "y", "z", "p_static"))
+        ],
+        is_bigendian=False,
+        point_step=16,
+        row_step=16 * len(points),
+        is_dense=True,
+        data=_to_data(rows.astype("<f4"), "B"),
+    )
+
+
+def _copy_scan(scan: Any, ranges: NDArray[np.float32]) -> Any:
+    """A LaserScan as another one, with other ranges."""
+    names = ("angle_min", "angle_max", "angle_increment", "time_increment", "scan_time")
+    names += ("range_min", "range_max", "intensities")
+    return LaserScan(
+        header=_to_header(scan.header.frame_id, stamp_ns(scan.header)),
+        ranges=_to_data(ranges.astype(np.float32), "f"),
+        **{name: getattr(scan, name) for name in names},
+    )
+
+
+def _to_header(frame: str, stamp: int) -> Any:
+    sec, nanosec = divmod(stamp, 10**9)
+    return Header(frame_id=frame, stamp=Time(sec=sec, nanosec=nanosec))
+
+
+def _to_pose(T: Float) -> Any:
+    return geometry.Pose(position=_to_vector(T[:-1, -1]), orientation=_to_rotation(T))
+
+
+def _to_vector(values: Sequence[float] | Float, kind: Any = geometry.Point) -> Any:
+    """A point, or a vector; in the plane z is 0."""
+    x, y, z = (*map(float, values), 0.0)[:3]
+    return kind(x=x, y=y, z=z)
+
+
+def _to_rotation(T: Float) -> Any:
+    """The rotation of a pose (D+1, D+1)."""
+    R = np.eye(3)
+    R[: len(T) - 1, : len(T) - 1] = T[:-1, :-1]
+    x, y, z, w = Rotation.from_matrix(R).as_quat(canonical=True).tolist()
+    return geometry.Quaternion(x=x, y=y, z=z, w=w)
+
+
+def _to_heading(velocity: Float) -> Any:
+    half = 0.5 * math.atan2(velocity[1], velocity[0])
+    return geometry.Quaternion(z=math.sin(half), w=math.cos(half))
+
+
+def _to_data(values: NDArray[Any], code: str) -> "array.array[Any]":
+    """An array of the kind that rclpy takes without a check of each element."""
+    return array.array(code, values.tobytes())

@@ -1,19 +1,20 @@
-"""The user's own ROS 2, and a node in it from its start to its end."""
+"""A node in the user's own ROS 2, from its start to its end."""
 
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from importlib import import_module
 from pathlib import Path
-from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from stillmap.core.errors import InputError
 from stillmap.core.profiling import Progress
 from stillmap.live.mapper import LiveMapper
 from stillmap.live.replay import Show, signal_flag
-from stillmap.live.ros.node import LiveNode
 from stillmap.pipeline.options import Options
+
+if TYPE_CHECKING:
+    from stillmap.live.ros.node import LiveNode
 
 _SPIN = 0.1  # s after which a signal is seen at the latest
 _NEEDED = (
@@ -26,47 +27,19 @@ _HINT = (
 )
 
 
-class Ros:
-    """rclpy, tf2_ros and the message packages, imported when a node is made.
-
-    Attributes:
-        rclpy: the module.
-        tf2_ros: the module.
+def require_ros() -> None:
+    """Refuse to go on without ROS.
 
     Raises:
         InputError: a package that is needed cannot be imported.
     """
-
-    def __init__(self) -> None:
-        for package in _NEEDED:
-            _import(package)
-        self.rclpy: Any = _import("rclpy")
-        self.tf2_ros: Any = _import("tf2_ros")
-
-    def message(self, name: str) -> Any:
-        """A class by its name, as `sensor_msgs/msg/LaserScan`; None: its package is missing."""
-        package, kind, type_name = name.split("/")
+    for name in _NEEDED:
         try:
-            return getattr(import_module(f"{package}.{kind}"), type_name)
-        except ImportError:
-            return None
-
-    def geometry(self, name: str) -> Any:
-        """A class of geometry_msgs."""
-        return self.message(f"geometry_msgs/msg/{name}")
-
-    def module(self, name: str) -> Any:
-        """A module of rclpy, as `qos`."""
-        return import_module(f"rclpy.{name}")
-
-
-def _import(name: str) -> ModuleType:
-    try:
-        return import_module(name)
-    except ImportError as error:  # it may be made for another Python
-        is_missing = isinstance(error, ModuleNotFoundError) and error.name == name
-        what = "is not in this environment" if is_missing else f"cannot be imported: {error}"
-        raise InputError(f"{name} {what}", hint=_HINT) from error
+            import_module(name)
+        except ImportError as error:  # it may be made for another Python
+            is_missing = isinstance(error, ModuleNotFoundError) and error.name == name
+            what = "is not in this environment" if is_missing else f"cannot be imported: {error}"
+            raise InputError(f"{name} {what}", hint=_HINT) from error
 
 
 def run(
@@ -94,20 +67,22 @@ def run(
         InputError: ROS is not there, a parameter is wrong, or the result cannot be written.
         KeyboardInterrupt: Ctrl-C again while the result is written.
     """
-    ros = Ros()
-    no_handlers = ros.module("signals").SignalHandlerOptions.NO
+    require_ros()
+    import rclpy
+    from rclpy.signals import SignalHandlerOptions
+
+    from stillmap.live.ros.node import LiveNode
+
     try:
-        ros.rclpy.init(args=list(ros_arguments), signal_handler_options=no_handlers)
+        rclpy.init(args=list(ros_arguments), signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:
         raise InputError(f"arguments of ROS: {error}") from error
     live = None
     try:
-        live = LiveNode(
-            ros, options, output, overwrite=overwrite, make_mapper=make_mapper, show=show
-        )
+        live = LiveNode(options, output, overwrite=overwrite, make_mapper=make_mapper, show=show)
         with signal_flag() as stop:
             try:
-                _spin(ros, live, stop)
+                _spin(live, stop)
             finally:  # whatever ended it: nobody drives the same way again
                 if live.scans:
                     with show_progress() as progress:
@@ -116,18 +91,19 @@ def run(
     finally:
         if live is not None:
             live.close()
-        ros.rclpy.try_shutdown()
+        rclpy.try_shutdown()
 
 
-def _spin(ros: Ros, live: LiveNode, stop: threading.Event) -> None:
+def _spin(live: "LiveNode", stop: threading.Event) -> None:
     """Answer until `stop`; requests to save in a thread of their own, so that mapping goes on.
 
     Not by an executor of several threads: that of rclpy hands a callback that waits to its threads
     over and over, and nothing else gets to run meanwhile.
     """
+    from rclpy.executors import SingleThreadedExecutor
 
     def spin(node: Any) -> None:
-        executor = ros.module("executors").SingleThreadedExecutor()
+        executor = SingleThreadedExecutor()
         executor.add_node(node)
         while not stop.is_set():
             executor.spin_once(timeout_sec=_SPIN)
